@@ -97,10 +97,6 @@ impl Core {
         rendezvous.evaluate(moment, |node| self.peers.current(node), |name| self.why_not(name));
         let mut answers = rendezvous.take_answers();
         answers.extend(self.pass_phases(moment));
-        for (app, correlation, answer) in answers {
-            let answer = within(answer, self.list_bytes_max);
-            self.outputs.push_back(Output::AnswerBarrier { app, correlation, answer });
-        }
         for to in rendezvous.take_due(moment.now, |node| self.peers.linked(node).is_some()) {
             let (said, left_out) = rendezvous.encoded();
             if left_out > 0 {
@@ -112,6 +108,11 @@ impl Core {
                 self.refuse("barriers", detail);
             }
             self.outputs.push_back(Output::PublishArrivals { to, said });
+        }
+        // Behind what others hear: they are farther away.
+        for (app, correlation, answer) in answers {
+            let answer = within(answer, self.list_bytes_max);
+            self.outputs.push_back(Output::AnswerBarrier { app, correlation, answer });
         }
         self.rendezvous = rendezvous;
     }

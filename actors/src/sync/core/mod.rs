@@ -138,6 +138,8 @@ pub(crate) struct Core {
     version: u64,
     /// The present list, once somebody needs it.
     encoded: Option<Bytes>,
+    /// Least time from the last one that somebody needed to the next one.
+    spacing: Duration,
     /// Outputs that were not taken: the release of an application, or its event about a name.
     not_taken: BTreeSet<(AppAddress, Option<String>)>,
     retry: Option<Time>,
@@ -167,6 +169,7 @@ impl Core {
             same_names: BTreeSet::new(),
             version: 1,
             encoded: None,
+            spacing: Duration::ZERO,
             not_taken: BTreeSet::new(),
             retry: None,
             respite: Respite::default(),
@@ -204,10 +207,11 @@ impl Core {
         }
         self.offer_again(now);
         self.answer_again(now);
+        // First of all who is farther away: what applications of this node do when they are let go takes the processor that would tell the others.
+        self.publish(now);
         let moment = self.respite.moment(now);
         self.evaluate(moment);
         self.report_overdue(moment);
-        self.publish(now);
         self.meet(moment);
         self.tell_watchers(now);
     }

@@ -3,7 +3,7 @@
 use bytes::Bytes;
 use sinew_runtime::{tid::AppAddress, time::Time};
 
-use super::{Core, Output};
+use super::{Core, Output, peers::spacing};
 use crate::sync::list::{ENTRIES_MAX, List};
 
 impl Core {
@@ -18,7 +18,7 @@ impl Core {
     pub(super) fn own_list_changed(&mut self, now: Time) {
         self.version += 1;
         self.encoded = None;
-        self.peers.make_due(now);
+        self.peers.make_due(now, self.spacing);
     }
 
     /// Sends the list to whom it is due. spec: SYNC-2
@@ -48,7 +48,7 @@ impl Core {
             );
             self.refuse("directory full", detail);
         }
-        self.encoded = Some(bytes.clone());
+        (self.encoded, self.spacing) = (Some(bytes.clone()), spacing(bytes.len()));
         bytes
     }
 }

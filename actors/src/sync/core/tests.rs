@@ -12,6 +12,8 @@ mod forms;
 mod lives;
 #[path = "phases_tests.rs"]
 mod phases;
+#[path = "publish_tests.rs"]
+mod publish;
 #[path = "stalls_tests.rs"]
 mod stalls;
 
