@@ -89,7 +89,7 @@ impl Attacker {
 
     /// Plays one trick. What the node answers to it, or that it closes, is no error.
     pub(super) fn play_one(&mut self) {
-        const TRICKS: [Trick; 25] = [
+        const TRICKS: [Trick; 27] = [
             Attacker::garbage,
             Attacker::mutants,
             Attacker::forged_sources,
@@ -115,6 +115,8 @@ impl Attacker {
             Attacker::lingering_link,
             Attacker::lingering_offer,
             Attacker::lingering_crowd,
+            Attacker::lingering_in_vain,
+            Attacker::lingering_meeting,
         ];
         self.tally.tricks += 1;
         let trick = TRICKS[self.dice.below(TRICKS.len() as u32) as usize];

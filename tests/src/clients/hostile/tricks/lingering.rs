@@ -2,13 +2,20 @@
 
 use std::{io, os::unix::net::UnixStream};
 
-use sinew_shm::{BellKind, Region};
+use sinew_shm::{BellKind, Offer, Region};
 
 use super::{Attacker, Stranger, ask_for_rings};
 use crate::clients::hostile::{
     lingering::{Passed, offer_with_full_bells, pass_copies, pass_lingering},
-    stranger::{DESCRIPTORS_MAX, Frame},
+    stranger::{DESCRIPTORS_MAX, Frame, pass},
 };
+
+/// The other's own memory, and in place of bells that once more.
+fn offer_no_rings(socket: &UnixStream, theirs: &Offer) -> io::Result<()> {
+    let memory = || theirs.descriptors()[0].try_clone();
+    let descriptors: io::Result<Vec<_>> = theirs.descriptors().iter().map(|_| memory()).collect();
+    pass(socket, &theirs.to_bytes(), &descriptors?)
+}
 
 impl Attacker {
     fn linger_on(&mut self, socket: &UnixStream, bytes: &[u8]) -> io::Result<()> {
@@ -60,6 +67,36 @@ impl Attacker {
         let socket = if is_bell { link.end.bell(bell)? } else { link.met.socket.try_clone()? };
         self.linger_on(&socket, &[1])?;
         link.end.take()
+    }
+
+    /// On a bell of the node's as soon as it is offered; and then no rings, or what are none.
+    pub(super) fn lingering_in_vain(&mut self) -> io::Result<()> {
+        self.tally.connections += 1;
+        let (stranger, theirs, _) = ask_for_rings(&self.socket)?;
+        self.linger_on_bell_of(&theirs)?;
+        if self.dice.once_in(2) {
+            offer_no_rings(&stranger.stream, &theirs)?;
+        }
+        self.wait_or_go(stranger)
+    }
+
+    /// The same with a host, which has agreed to a link.
+    pub(super) fn lingering_meeting(&mut self) -> io::Result<()> {
+        let mut met = self.meet()?;
+        let theirs = met.offer()?;
+        if theirs.bell() == BellKind::Socket {
+            self.linger_on_bell_of(&theirs)?;
+        }
+        if self.dice.once_in(2) {
+            offer_no_rings(&met.socket, &theirs)?;
+            met.switch()?;
+        }
+        Ok(())
+    }
+
+    fn linger_on_bell_of(&mut self, theirs: &Offer) -> io::Result<()> {
+        let bell = 1 + self.dice.below(2) as usize;
+        self.linger_on(&theirs.descriptors()[bell].try_clone()?.into(), &[1])
     }
 
     /// Where an offer is due: in as many copies as one message can carry.

@@ -50,7 +50,7 @@ impl Met {
     }
 
     /// Waits for what the victim offers.
-    fn offer(&self) -> io::Result<Offer> {
+    pub(super) fn offer(&self) -> io::Result<Offer> {
         let end = Instant::now() + OFFER;
         loop {
             match Offer::receive(&self.socket) {
@@ -65,7 +65,7 @@ impl Met {
         }
     }
 
-    fn switch(&mut self) -> io::Result<bool> {
+    pub(super) fn switch(&mut self) -> io::Result<bool> {
         let switch = Switch { peer: self.victim.bits(), number: self.number };
         self.tell_node(Kind::LNCL_SWITCH, Flags::CONFIRM, encode(&switch).to_vec(), self.number)
     }
@@ -119,7 +119,7 @@ impl Attacker {
     }
 
     /// Has itself introduced to an honest one.
-    fn meet(&mut self) -> io::Result<Met> {
+    pub(super) fn meet(&mut self) -> io::Result<Met> {
         let victim = self.one_of_the_hosts()?;
         let mut node = self.join_ring()?;
         let introduce = encode(&Introduce { to: victim.bits() }).to_vec();
