@@ -28,9 +28,17 @@ use std::{
     time::{Duration, Instant},
 };
 
-use self::{pair::Pair, report::Gaps};
+use sinew::Class;
+
+use self::{
+    pair::Pair,
+    report::{Gap, Gaps},
+};
 pub use self::{report::Report, trouble::Trouble};
 use crate::dice::Dice;
+
+/// All of them, in the order of their numbers.
+const CLASSES: [Class; 3] = [Class::Control, Class::Stream, Class::Bulk];
 
 /// What is to be done.
 #[derive(Clone, Debug)]
@@ -80,14 +88,14 @@ pub fn run(plan: &Plan) -> Report {
     let began = Instant::now();
     for fault in 0..plan.faults {
         let trouble = plan.troubles[fault as usize % plan.troubles.len()];
-        let _ = pair.gap();
+        let _ = pair.gaps();
         pair.strikes(trouble);
         let struck = Instant::now();
         pair.suffer(trouble, plan.hold);
         pair.wait_for_flow();
         let flows = struck.elapsed();
         // A new receiver does not know when its former life got the last one.
-        gaps.note(trouble, if trouble == Trouble::KillReceiver { flows } else { pair.gap() });
+        gaps.note(trouble, if trouble == Trouble::KillReceiver { Gap::of_all(flows) } else { pair.gaps() });
         let pause = plan.spacing + dice.time_below(plan.spacing / 2);
         std::thread::sleep(pause.saturating_sub(struck.elapsed()));
     }

@@ -27,7 +27,7 @@ struct Office {
     peer: Station,
     clerk: Clerk,
     numbers: Arc<Numbers>,
-    lull: Arc<Lull>,
+    lulls: Arc<Lulls>,
     pattern: Arc<Vec<u8>>,
     length: usize,
     /// Whether the peer's node is there, as far as this one was told.
@@ -51,13 +51,36 @@ impl Lull {
     }
 }
 
+/// The same of all messages, and of those of each class by itself: one that flows says nothing of another that stalls.
+#[derive(Debug, Default)]
+struct Lulls {
+    all: Lull,
+    /// In the order of [`CLASSES`](super::CLASSES).
+    each: [Lull; 3],
+}
+
+impl Lulls {
+    /// One of this class came.
+    fn end(&self, class: Class, now: Time) {
+        self.all.end(now);
+        self.each[class as usize].end(now);
+    }
+
+    /// The longest since this was asked last, in nanoseconds: of all, then of each class.
+    fn take(&self) -> String {
+        let all = std::iter::once(&self.all).chain(&self.each);
+        let all = all.map(|lull| lull.longest_ns.swap(0, Ordering::Relaxed).to_string());
+        all.collect::<Vec<_>>().join(" ")
+    }
+}
+
 impl Actor for Office {
     type Context = AppContext<Self>;
 }
 
 impl Office {
     fn got(&self, (class, life, number): (Class, u32, u64), filled: &[u8], is_awaited: bool) {
-        self.lull.end(Time::now());
+        self.lulls.end(class, Time::now());
         let from = Party { station: self.peer, life };
         if filled != filling(&self.pattern, number, self.length) {
             self.clerk.note(Note::Damaged { from, class, number });
@@ -125,16 +148,17 @@ pub(super) fn play(arguments: &[String]) {
     std::panic::set_hook(Box::new(|_| {}));
     let number = |at: usize| arguments[at].parse::<u64>().expect("a number");
     let (station, life, peer) = (number(1) as Station, number(2) as u32, number(3) as Station);
-    let (clerk, numbers, lull) = (Clerk::default(), Arc::new(Numbers::default()), Arc::new(Lull::default()));
+    let (clerk, numbers, lulls) =
+        (Clerk::default(), Arc::new(Numbers::default()), Arc::new(Lulls::default()));
     let length = number(4) as usize;
     let office = {
-        let (clerk, numbers, lull) = (clerk.clone(), numbers.clone(), lull.clone());
+        let (clerk, numbers, lulls) = (clerk.clone(), numbers.clone(), lulls.clone());
         let pattern = Arc::new(pattern());
         AppSpec::new(name(station).as_str(), move || Office {
             peer,
             clerk: clerk.clone(),
             numbers: numbers.clone(),
-            lull: lull.clone(),
+            lulls: lulls.clone(),
             pattern: pattern.clone(),
             length,
             is_peer_there: false,
@@ -146,12 +170,12 @@ pub(super) fn play(arguments: &[String]) {
     let node = Node::builder(config.name.clone()).config(config).app(office.own_thread()).app(desk);
     let node = node.start().expect("a node");
     node.handle().wait_until_running(DEADLINE).expect("it requires nothing");
-    serve(&node, Pacer { sender: key.sender(), clerk, numbers, to: peer, life, length }, &lull);
+    serve(&node, Pacer { sender: key.sender(), clerk, numbers, to: peer, life, length }, &lulls);
     node.stop();
 }
 
 /// Says where the node is, and does what it is told until it is told no more.
-fn serve(node: &Node, pacer: Pacer, lull: &Lull) {
+fn serve(node: &Node, pacer: Pacer, lulls: &Lulls) {
     let handle = node.handle();
     let address = |address: Option<std::net::SocketAddr>| address.expect("its layers are ready");
     println!("up {} {}", address(handle.gncl_address()), address(handle.ndl_address()));
@@ -162,7 +186,7 @@ fn serve(node: &Node, pacer: Pacer, lull: &Lull) {
         match words[..] {
             ["rate", rate] => numbers.rate.store(rate.parse().expect("a number"), Ordering::Relaxed),
             ["panic"] => println!("ready {}", panic_gncl(&handle).as_nanos()),
-            ["gap"] => println!("gap {}", lull.longest_ns.swap(0, Ordering::Relaxed)),
+            ["gap"] => println!("gap {}", lulls.take()),
             ["say"] => clerk.say(),
             ["wall"] => println!("wall {}", wall_seconds()),
             ["queues"] => println!("queues {}", queues(&handle)),
@@ -209,4 +233,26 @@ fn panic_gncl(node: &NodeHandle) -> Duration {
     until("GNCL is ready again", || (lives().readies > before).then_some(()));
     let lives = lives();
     lives.ready.expect("it is ready").since(lives.struck.expect("it was struck"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_class_that_stalls_shows_though_the_others_flow() {
+        let lulls = Lulls::default();
+        for ms in 0..=30 {
+            let now = Time::from_nanos(ms * 1_000_000);
+            lulls.end(Class::Bulk, now);
+            if ms % 10 == 0 {
+                lulls.end(Class::Stream, now);
+            }
+            if ms == 5 || ms == 28 {
+                lulls.end(Class::Control, now);
+            }
+        }
+        assert_eq!(lulls.take(), "1000000 23000000 10000000 1000000");
+        assert_eq!(lulls.take(), "0 0 0 0", "since it was asked last");
+    }
 }

@@ -22,6 +22,16 @@ use crate::{
 const TICK: Duration = Duration::from_millis(1);
 /// Of so many messages one is confirmed Control, one unconfirmed Control, one Stream; the others are Bulk.
 const SHARE: u64 = 20;
+/// How many of all messages are of this class, as a part of 1.
+pub(super) const fn share(class: Class) -> f64 {
+    let of_each = match class {
+        Class::Control => 2,
+        Class::Stream => 1,
+        Class::Bulk => SHARE - 3,
+    };
+    of_each as f64 / SHARE as f64
+}
+
 /// Confirmed messages under way at most.
 const WAITS_MAX: usize = 1_000;
 /// The time to live of what is confirmed: more than a run takes, so that each outcome is somebody's word and not the end of a wait.

@@ -14,9 +14,11 @@ use rustix::process::Signal;
 use sinew::{Audit, Class};
 
 use super::{
-    Plan,
+    CLASSES, Plan,
     node::wall_seconds,
+    pacer::share,
     progress::{self, Progress},
+    report::Gap,
     trouble::Trouble,
     wall_clock::{self, JUMP, WallClock},
 };
@@ -123,42 +125,50 @@ impl Pair {
         self.member(station).performer.tell(&format!("rate {rate}"));
     }
 
-    /// The last number that has come from the first node.
-    fn last_got(&self, from: Station, to: Station) -> u64 {
-        lock(&self.history).last_got(self.party(from), to, Class::Bulk)
+    /// The last number of this class that has come from `from`.
+    fn last_got(&self, (from, to, class): (Station, Station, Class)) -> u64 {
+        lock(&self.history).last_got(self.party(from), to, class)
     }
 
-    /// Waits until messages that are sent after this come, both ways.
+    /// Waits until messages that are sent after this come, both ways: those of each class at the second node, whose [gaps](Self::gaps) are
+    /// over then.
     ///
     /// What is sent is written down a little later: what was under way then is less than what this waits for.
     pub(super) fn wait_for_flow(&mut self) {
-        let ways = [(FIRST, SECOND, self.plan.rate), (SECOND, FIRST, self.plan.back_rate)];
-        for (from, to, rate) in ways.into_iter().filter(|(.., rate)| *rate > 0) {
-            let party = self.party(from);
-            let upto = lock(&self.history).last_sent(party, to, Class::Bulk) + rate / 200 + 1;
-            self.wait_to_get(upto, (from, to));
+        let there = CLASSES.map(|class| (FIRST, SECOND, class));
+        for way @ (from, to, class) in there.into_iter().chain([(SECOND, FIRST, Class::Bulk)]) {
+            let rate = if from == FIRST { self.plan.rate } else { self.plan.back_rate };
+            if rate > 0 {
+                let party = self.party(from);
+                let under_way = (rate as f64 * share(class) / 200.0) as u64;
+                let upto = lock(&self.history).last_sent(party, to, class) + under_way + 1;
+                self.wait_to_get(upto, way);
+            }
         }
     }
 
     /// Waits until this number has come, for as long as any come: where connections end faster than they carry what is sent, as with many
     /// flipped bits on a busy host, a full queue lies before it.
-    fn wait_to_get(&mut self, upto: u64, (from, to): (Station, Station)) {
-        let began = Instant::now();
-        let (mut got, mut since, mut network) = (self.last_got(from, to), began, self.proxy.counts());
+    fn wait_to_get(&mut self, upto: u64, way: (Station, Station, Class)) {
+        let (began, (from, to, class)) = (Instant::now(), way);
+        let (mut got, mut since, mut network) = (self.last_got(way), began, self.proxy.counts());
         while got < upto {
-            let now = self.last_got(from, to);
+            let now = self.last_got(way);
             if now > got {
                 (got, since, network) = (now, Instant::now(), self.proxy.counts());
             }
             assert!(
                 since.elapsed() < DEADLINE && began.elapsed() < BACKLOG_WITHIN,
-                "from {from} to {to}, {got} was got {:?} ago, and {upto} is waited for since {:?}; the network then and now:\n{network:?}\n{:?}",
+                "{class:?} from {from} to {to}, {got} was got {:?} ago, and {upto} is waited for since {:?}; the network then and now:\n{network:?}\n{:?}",
                 since.elapsed(),
                 began.elapsed(),
                 self.proxy.counts()
             );
             if self.progress.is_due(Instant::now()) {
-                self.say_progress(&format!("number {upto} from {from} to {to}, since {:?}", began.elapsed()));
+                self.say_progress(&format!(
+                    "number {upto} of {class:?} from {from} to {to}, since {:?}",
+                    began.elapsed()
+                ));
             }
             std::thread::sleep(LOOK);
         }
@@ -182,10 +192,12 @@ impl Pair {
         eprintln!("{}", self.progress.say(Instant::now(), ways, waits_for, &queues));
     }
 
-    /// The longest time without a message at the second node since this was asked last, or since it was started.
-    pub(super) fn gap(&mut self) -> Duration {
+    /// The longest times without a message at the second node since this was asked last, or since it was started.
+    pub(super) fn gaps(&mut self) -> Gap {
         let nanos = self.member(SECOND).ask("gap");
-        Duration::from_nanos(nanos.parse().expect("a number"))
+        let gaps: Vec<_> = nanos.split_whitespace().map(|nanos| nanos.parse().expect("a number")).collect();
+        let [all, each @ ..] = <[u64; 4]>::try_from(gaps).expect("one of all, and one of each class");
+        Gap { all: Duration::from_nanos(all), each: each.map(Duration::from_nanos) }
     }
 
     /// Something happens. Returns when it is over.
