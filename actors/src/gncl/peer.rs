@@ -446,24 +446,25 @@ impl Store {
 
     /// Settles what has expired while it waited, and outcomes that do not come any more.
     pub(super) async fn look_for_expired(stores: Arc<Stores>) {
-        let store = &stores.gncl;
+        let (store, mut peers) = (&stores.gncl, Vec::new());
         let look = || {
             let now = Time::now();
             // All of them, whatever the first says.
-            store.all_ways(|way| way.outlet.expire(now)) > 0
+            store.all_ways(&mut peers, |way| way.outlet.expire(now)) > 0
         };
         store.expiring.run(EXPIRY_PERIOD, look).await;
     }
 
     /// Acknowledges what came so seldom that nothing else did.
     pub(super) async fn acknowledge_late(stores: Arc<Stores>) {
-        let store = &stores.gncl;
-        store.acks.run(ACK_PERIOD, || store.all_ways(Way::acknowledge_if_owed) > 0).await;
+        let (store, mut peers) = (&stores.gncl, Vec::new());
+        store.acks.run(ACK_PERIOD, || store.all_ways(&mut peers, Way::acknowledge_if_owed) > 0).await;
     }
 
-    /// Of how many sessions `what` is true.
-    fn all_ways(&self, what: impl Fn(&Way) -> bool) -> usize {
-        self.peers().iter().flat_map(|peer| &peer.ways).filter(|way| what(way)).count()
+    /// Of how many sessions `what` is true. Nobody is kept in `peers`, whose memory is used again.
+    fn all_ways(&self, peers: &mut Vec<Arc<Peer>>, what: impl Fn(&Way) -> bool) -> usize {
+        self.list_peers(peers);
+        peers.drain(..).map(|peer| peer.ways.iter().filter(|way| what(way)).count()).sum()
     }
 
     /// Whoever carried Bulk is not needed any more.
