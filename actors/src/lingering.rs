@@ -18,11 +18,20 @@ use rustix::{
 
 /// Passes a descriptor beside these bytes.
 pub(crate) fn pass(socket: impl AsFd, bytes: &[u8], descriptor: impl AsFd) -> Result<usize, Errno> {
+    pass_by(SendFlags::empty(), socket, bytes, descriptor)
+}
+
+/// Passes a descriptor beside one byte that is urgent, which who looks at what is there does not see by itself.
+pub(crate) fn pass_urgent(socket: impl AsFd, descriptor: impl AsFd) -> Result<usize, Errno> {
+    pass_by(SendFlags::OOB, socket, &[1], descriptor)
+}
+
+fn pass_by(flags: SendFlags, socket: impl AsFd, bytes: &[u8], descriptor: impl AsFd) -> Result<usize, Errno> {
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
     let mut control = SendAncillaryBuffer::new(&mut space);
     let descriptors = [descriptor.as_fd()];
     assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)));
-    sendmsg(socket, &[IoSlice::new(bytes)], &mut control, SendFlags::empty())
+    sendmsg(socket, &[IoSlice::new(bytes)], &mut control, flags)
 }
 
 /// A connection whose last close waits until its peer has taken what is written, or has gone.

@@ -186,7 +186,7 @@ fn report(ended: Result<(), JoinError>) {
 /// Serves a connection from now on, or refuses it. Those that are served are bounded: as strangers here, as clients by the
 /// registry.
 fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) {
-    let connected = Connected { server: server.clone(), stream: Arc::new(stream) };
+    let connected = Connected::new(server, stream);
     let stream = connected.stream.clone();
     let credentials = match check_credentials(&server.stores, &stream) {
         Ok(credentials) => credentials,
@@ -209,6 +209,14 @@ fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) {
 struct Connected {
     server: Rc<Server>,
     stream: Arc<UnixStream>,
+}
+
+impl Connected {
+    fn new(server: &Rc<Server>, stream: UnixStream) -> Self {
+        // Before it is looked at for the first time; it fails for what is no socket alone. spec: LNCL-18
+        let _ = sinew_shm::keep_urgent_in_line(&stream);
+        Self { server: server.clone(), stream: Arc::new(stream) }
+    }
 }
 
 impl Drop for Connected {
@@ -279,29 +287,33 @@ mod tests {
         lncl::testing::WATCHDOG,
     };
 
-    // spec: LNCL-18
-    #[test]
-    fn who_ends_a_connection_does_not_wait_for_what_is_unread_in_it() {
-        // Given: a connection in which lies what does not close, and of which nobody has a copy.
+    /// Ends a connection in which lies what does not close, and of which nobody has a copy.
+    fn ends_with(pass: fn(&Plain, std::net::TcpStream)) {
+        // Given:
         let (ours, theirs) = Plain::pair().unwrap();
         ours.set_nonblocking(true).unwrap();
         let mut lingering = Lingering::new();
-        let passed = lingering.ours.take().expect("it is passed once");
-        lingering::pass(&theirs, b"S", passed).unwrap();
+        pass(&theirs, lingering.ours.take().expect("it is passed once"));
         // When:
         let (say, said) = sync_channel(1);
         std::thread::spawn(move || {
             let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
             let _inside = runtime.enter();
             let server = Server::new(Stores::for_test(NodeConfig::new("hip"), Incarnation(1)));
-            let stream = Arc::new(UnixStream::from_std(ours).unwrap());
-            drop(Connected { server, stream });
+            drop(Connected::new(&server, UnixStream::from_std(ours).unwrap()));
             // The test has ended, where this comes too late.
             let _ = say.send(());
         });
         // Then:
         assert_eq!(said.recv_timeout(WATCHDOG), Ok(()));
         lingering.let_go();
+    }
+
+    // spec: LNCL-18
+    #[test]
+    fn who_ends_a_connection_does_not_wait_for_what_is_unread_in_it() {
+        ends_with(|theirs, passed| assert_eq!(lingering::pass(theirs, b"S", passed), Ok(1)));
+        ends_with(|theirs, passed| assert_eq!(lingering::pass_urgent(theirs, passed), Ok(1)));
     }
 
     #[test]

@@ -25,6 +25,11 @@ pub(crate) fn receive(_: BorrowedFd<'_>) -> Result<Received, PassError> {
     Err(PassError::System(io::ErrorKind::Unsupported.into()))
 }
 
+pub(crate) fn keep_urgent_in_line(_: BorrowedFd<'_>) -> io::Result<()> {
+    // A unix socket has no urgent bytes but on Linux.
+    Ok(())
+}
+
 pub(crate) fn set_descriptors(_: BorrowedFd<'_>, _: Descriptors) -> io::Result<()> {
     Err(io::ErrorKind::Unsupported.into())
 }

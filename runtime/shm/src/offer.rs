@@ -155,6 +155,15 @@ pub fn set_descriptors(socket: impl AsFd, which: Descriptors) -> io::Result<()> 
     platform::set_descriptors(socket.as_fd(), which)
 }
 
+/// Says that a byte which is sent to `socket` as urgent comes in its place among the others. Else it is passed over by who looks at what is there,
+/// with the descriptors beside it, and closed with them by whoever reads on, or closes the socket. Holds for what has come already, too.
+///
+/// # Errors
+/// It is no socket.
+pub fn keep_urgent_in_line(socket: impl AsFd) -> io::Result<()> {
+    platform::keep_urgent_in_line(socket.as_fd())
+}
+
 fn take<const N: usize>(bytes: &[u8; OFFER_BYTES], from: usize) -> [u8; N] {
     std::array::from_fn(|index| bytes[from + index])
 }

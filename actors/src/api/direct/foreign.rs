@@ -15,7 +15,7 @@ use std::{
 };
 
 use rustix::net::{RecvFlags, recv};
-use sinew_shm::{Consumer, Descriptors, Offer, Producer, Received, set_descriptors};
+use sinew_shm::{Consumer, Descriptors, Offer, Producer, Received, keep_urgent_in_line, set_descriptors};
 
 use super::{descriptors::holds_something, hang_up};
 use crate::ring::{Exchange, ExchangeError};
@@ -33,6 +33,8 @@ pub(super) struct LinkEnd(Arc<UnixStream>);
 
 impl LinkEnd {
     pub(super) fn new(socket: UnixStream) -> Self {
+        // It fails for what is no socket alone. What has come already is seen from now on, too.
+        let _ = keep_urgent_in_line(&socket);
         Self(Arc::new(socket))
     }
 }
@@ -224,6 +226,17 @@ mod tests {
         let (ours, theirs) = UnixStream::pair().unwrap();
         let mut lingering = Lingering::new();
         pass(&mut lingering, &theirs);
+        let ours = LinkEnd::new(ours);
+        is_done_with(lingering, move || drop(ours));
+    }
+
+    // spec: LNCL-18
+    #[test]
+    fn who_ends_a_link_does_not_wait_for_what_its_peer_has_passed_beside_an_urgent_byte() {
+        let (ours, theirs) = UnixStream::pair().unwrap();
+        let mut lingering = Lingering::new();
+        let passed = lingering.ours.take().expect("it is passed once");
+        lingering::pass_urgent(&theirs, passed).expect("it comes");
         let ours = LinkEnd::new(ours);
         is_done_with(lingering, move || drop(ours));
     }

@@ -339,7 +339,8 @@ impl Drop for Standing {
         // A message in some thread's hand may hold the writer, and the socket with it, a little longer.
         hang_up(&self.socket);
         foreign::empty_bell(self.consumer.fd());
-        self.writer.with_bell(foreign::empty_bell);
+        // Where half a frame is written, it has the ring.
+        self.with_room_bell(foreign::empty_bell);
         match &self.rest {
             Some(rest) => rest.wake_peer(),
             None => self.writer.wake_peer(),

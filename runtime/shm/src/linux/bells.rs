@@ -13,10 +13,10 @@ use std::{
 use rustix::{
     event::{EventfdFlags, PollFd, PollFlags, eventfd, poll},
     fs::{Timespec, readlink},
-    io::{Errno, ReadWriteFlags, preadv2},
+    io::{Errno, ReadWriteFlags, ioctl_fionread, preadv2},
     net::{
         AddressFamily, RecvAncillaryBuffer, RecvFlags, ReturnFlags, SendFlags, Shutdown, SocketFlags,
-        SocketType, recv, recvmsg, send, shutdown, socketpair, sockopt,
+        SocketType, getpeername, recv, recvmsg, send, shutdown, socketpair, sockopt,
     },
     thread::futex,
 };
@@ -24,7 +24,7 @@ use rustix::{
 use super::{
     mapping::Mapping,
     memfd::{adopt_page, create_page},
-    rights::set_descriptors,
+    rights::{keep_urgent_in_line, set_descriptors},
 };
 use crate::{
     bell::{Bell, BellKind, Bells, CommonBell, Doorbell, Heard, Woken},
@@ -71,23 +71,24 @@ fn on_page(page: Arc<Mapping>) -> Both {
     (bell(MESSAGE_WORD), bell(ROOM_WORD))
 }
 
-fn pair_of<T: Doorbell + 'static>(make: fn() -> Result<(T, OwnedFd), Errno>) -> io::Result<Bells> {
+fn pair_of<T: Doorbell + 'static>(make: fn() -> io::Result<(T, OwnedFd)>) -> io::Result<Bells> {
     let ((message, message_button), (room, room_button)) = (make()?, make()?);
     let buttons = vec![message_button, room_button];
     Ok(Bells { message: Box::new(message), room: Box::new(room), buttons })
 }
 
-fn event() -> Result<(EventBell, OwnedFd), Errno> {
+fn event() -> io::Result<(EventBell, OwnedFd)> {
     let ear = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
     let button = rustix::io::fcntl_dupfd_cloexec(&ear, 0)?;
     Ok((EventBell(ear), button))
 }
 
-fn socket() -> Result<(SocketBell, OwnedFd), Errno> {
+fn socket() -> io::Result<(SocketBell, OwnedFd)> {
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
     let (ear, button) = socketpair(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
     // Who drains the ear would close them. Where the system does not know it (Linux before 6.16) it is looked at first.
     let looks = set_descriptors(ear.as_fd(), Descriptors::Refused).is_err();
+    keep_urgent_in_line(ear.as_fd())?;
     Ok((SocketBell { socket: ear, looks }, button))
 }
 
@@ -110,15 +111,20 @@ pub(crate) fn buttons(kind: BellKind, fds: Vec<OwnedFd>) -> Result<Both, Refused
     }
 }
 
-/// Whether it is a unix socket into which nothing was written: what lies there, descriptors among it, would be closed with it. Nothing
+/// Whether it is the end of a connection of unix sockets, in which nothing lies: that, descriptors beside it, would be closed with it. Nothing
 /// more comes: a button is rung, not read, and no copy of it that the peer has kept takes this back.
 fn is_button(fd: &OwnedFd) -> bool {
-    if sockopt::socket_domain(fd) != Ok(AddressFamily::UNIX) {
+    // One that has no other end could listen, now or later, and what waits to be accepted would be closed with it.
+    let is_end = sockopt::socket_domain(fd) == Ok(AddressFamily::UNIX)
+        && sockopt::socket_type(fd) == Ok(SocketType::STREAM)
+        && getpeername(fd).is_ok();
+    if !is_end {
         return false;
     }
-    // It fails where there is no other end, from which nothing comes either.
+    // It fails where the other end has gone, from which nothing comes either.
     let _ = shutdown(fd, Shutdown::Read);
-    !matches!(recv(fd, &mut [0; 1][..], RecvFlags::DONTWAIT | RecvFlags::PEEK), Ok((1.., _)))
+    // Counted, not looked at: an urgent byte is passed over by a look, and so is what lies before the place from where the peer has it look.
+    ioctl_fionread(fd) == Ok(0)
 }
 
 fn is_eventfd(fd: &OwnedFd) -> Result<bool, RefusedOffer> {

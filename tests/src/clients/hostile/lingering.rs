@@ -14,12 +14,12 @@ use std::{
 };
 
 use rustix::net::{
-    AddressFamily, SocketFlags, SocketType, socketpair,
+    AddressFamily, SendFlags, SocketFlags, SocketType, socketpair,
     sockopt::{set_socket_linger, set_socket_recv_buffer_size, set_socket_send_buffer_size},
 };
 use sinew_shm::Offer;
 
-use super::stranger::pass;
+use super::stranger::pass_by;
 
 /// So long the other end is kept: longer than anybody may be held up.
 pub(super) const KEPT: Duration = Duration::from_secs(3);
@@ -95,8 +95,23 @@ pub(super) fn pass_lingering(keeper: u16, socket: &UnixStream, bytes: &[u8]) -> 
     pass_copies(keeper, socket, bytes, 1)
 }
 
+/// The same, the last byte urgent: who looks at what is there passes that over, and the descriptor where it is the only byte.
+pub(super) fn pass_urgent(keeper: u16, socket: &UnixStream, bytes: &[u8]) -> io::Result<Passed> {
+    pass_copies_by(SendFlags::OOB, keeper, socket, bytes, 1)
+}
+
 /// Passes one with `bytes` in so many copies, and keeps none.
 pub(super) fn pass_copies(
+    keeper: u16,
+    socket: &UnixStream,
+    bytes: &[u8],
+    count: usize,
+) -> io::Result<Passed> {
+    pass_copies_by(SendFlags::empty(), keeper, socket, bytes, count)
+}
+
+fn pass_copies_by(
+    flags: SendFlags,
     keeper: u16,
     socket: &UnixStream,
     bytes: &[u8],
@@ -105,7 +120,7 @@ pub(super) fn pass_copies(
     let lingering = Lingering::connect(keeper)?.0;
     let copies: Vec<OwnedFd> =
         (0..count).map(|_| Ok(lingering.try_clone()?.into())).collect::<io::Result<_>>()?;
-    let passed = pass(socket, bytes, &copies);
+    let passed = pass_by(flags, socket, bytes, &copies);
     let is_refused = |error: &io::Error| error.raw_os_error() == Some(rustix::io::Errno::PERM.raw_os_error());
     let became = match passed {
         Ok(()) => Ok(Passed::Came),

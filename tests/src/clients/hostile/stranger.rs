@@ -119,11 +119,21 @@ impl Stranger {
 
 /// Writes the bytes to a socket, with descriptors beside them.
 pub(super) fn pass(socket: &UnixStream, bytes: &[u8], descriptors: &[OwnedFd]) -> io::Result<()> {
+    pass_by(SendFlags::empty(), socket, bytes, descriptors)
+}
+
+/// The same; with [`SendFlags::OOB`] the last byte is urgent.
+pub(super) fn pass_by(
+    flags: SendFlags,
+    socket: &UnixStream,
+    bytes: &[u8],
+    descriptors: &[OwnedFd],
+) -> io::Result<()> {
     let descriptors: Vec<BorrowedFd<'_>> =
         descriptors.iter().take(DESCRIPTORS_MAX).map(AsFd::as_fd).collect();
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(DESCRIPTORS_MAX))];
     let mut control = SendAncillaryBuffer::new(&mut space);
     assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)), "the space is for as many");
-    sendmsg(socket, &[IoSlice::new(bytes)], &mut control, SendFlags::NOSIGNAL)?;
+    sendmsg(socket, &[IoSlice::new(bytes)], &mut control, flags | SendFlags::NOSIGNAL)?;
     Ok(())
 }

@@ -14,11 +14,15 @@ fn pair() -> (OwnedFd, OwnedFd) {
 
 /// Rings with a descriptor beside it.
 fn pass(through: &OwnedFd, descriptor: &OwnedFd) -> Result<usize, Errno> {
+    pass_by(SendFlags::NOSIGNAL, through, descriptor)
+}
+
+fn pass_by(flags: SendFlags, through: &OwnedFd, descriptor: &OwnedFd) -> Result<usize, Errno> {
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
     let mut control = SendAncillaryBuffer::new(&mut space);
     let descriptors = [descriptor.as_fd()];
     assert!(control.push(SendAncillaryMessage::ScmRights(&descriptors)));
-    sendmsg(through, &[IoSlice::new(&[1])], &mut control, SendFlags::NOSIGNAL)
+    sendmsg(through, &[IoSlice::new(&[1])], &mut control, flags)
 }
 
 /// A descriptor, and the other end that hangs up when nobody has it any more.
@@ -78,4 +82,47 @@ fn a_button_in_which_something_lies_is_refused_and_nothing_comes_into_one_that_i
     assert_eq!(pass(&empty_ear, &given), Err(Errno::PIPE));
     assert_eq!(send(&empty, &[1], SendFlags::NOSIGNAL), Ok(1), "it can be rung");
     assert_eq!(recv(&empty_ear, &mut [0; 2][..], RecvFlags::DONTWAIT).map(|(_, count)| count), Ok(1));
+}
+
+#[test]
+fn a_button_is_refused_in_which_an_urgent_byte_lies_that_a_look_passes_over() {
+    let (button, ear) = pair();
+    let (given, _witness) = witnessed();
+    assert_eq!(pass_by(SendFlags::OOB | SendFlags::NOSIGNAL, &ear, &given), Ok(1));
+    let look = RecvFlags::DONTWAIT | RecvFlags::PEEK;
+    assert_eq!(recv(&button, &mut [0; 1][..], look).err(), Some(Errno::AGAIN), "a look passes it over");
+    assert!(!is_button(&button));
+}
+
+#[test]
+fn a_button_is_refused_that_is_no_end_of_a_connection() {
+    // Datagrams, of which one may be empty and have descriptors all the same.
+    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+    let (datagrams, _) =
+        socketpair(AddressFamily::UNIX, SocketType::DGRAM, flags, None).expect("two sockets");
+    assert!(!is_button(&datagrams));
+    // One that has no other end, before it listens and after.
+    let alone =
+        rustix::net::socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None).expect("a socket");
+    assert!(!is_button(&alone));
+    let nameless = rustix::net::SocketAddrUnix::new_unnamed();
+    rustix::net::bind(&alone, &nameless).expect("the system gives it a name");
+    rustix::net::listen(&alone, 1).expect("it listens");
+    assert!(!is_button(&alone));
+}
+
+#[test]
+fn an_urgent_byte_with_a_descriptor_is_seen_at_an_ear_before_it_is_drained() {
+    // Given: a system that cannot refuse it.
+    let (SocketBell { socket, .. }, button) = socket().expect("a bell");
+    let _ = set_descriptors(socket.as_fd(), Descriptors::Taken);
+    let ear = SocketBell { socket, looks: true };
+    let (given, witness) = witnessed();
+    // When:
+    assert_eq!(pass_by(SendFlags::OOB | SendFlags::NOSIGNAL, &button, &given), Ok(1));
+    drop(given);
+    assert_eq!(undescribed(&ear.socket, &mut [0; 1]), None);
+    ear.drain();
+    // Then:
+    assert!(!nobody_has_the_other_end_of(&witness), "it was not closed");
 }

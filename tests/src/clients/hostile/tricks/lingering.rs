@@ -6,7 +6,7 @@ use sinew_shm::{BellKind, Offer, Region};
 
 use super::{Attacker, Stranger, ask_for_rings};
 use crate::clients::hostile::{
-    lingering::{Passed, offer_with_full_bells, pass_copies, pass_lingering},
+    lingering::{Passed, offer_with_full_bells, pass_copies, pass_lingering, pass_urgent},
     stranger::{DESCRIPTORS_MAX, Frame, pass},
 };
 
@@ -19,7 +19,8 @@ fn offer_no_rings(socket: &UnixStream, theirs: &Offer) -> io::Result<()> {
 
 impl Attacker {
     fn linger_on(&mut self, socket: &UnixStream, bytes: &[u8]) -> io::Result<()> {
-        let passed = pass_lingering(self.keeper, socket, bytes)?;
+        let pass = if self.dice.once_in(3) { pass_urgent } else { pass_lingering };
+        let passed = pass(self.keeper, socket, bytes)?;
         self.tally.lingering += 1;
         self.tally.lingering_came += u64::from(passed == Passed::Came);
         Ok(())
