@@ -151,7 +151,8 @@ pub(crate) struct OutletLimits {
     pub(crate) queue_capacity: usize,
     /// Bytes of their payloads at most, each class by itself; one message waits however long it is. When full: likewise.
     pub(crate) queue_bytes: usize,
-    /// Confirmed messages at most whose outcome is not known yet, waiting or sent. When full: refused likewise.
+    /// Confirmed messages at most whose outcome is not known yet, waiting or sent; with a [`Session`] those of one destination that were sent, and
+    /// fewer where its peer has little room for outcomes. When full: refused likewise.
     pub(crate) unconfirmed_max: usize,
     /// Longest payload in bytes. Longer ones are refused with [`Rejection::TooLong`].
     pub(crate) payload_max: usize,

@@ -12,6 +12,7 @@ use super::{
     after::After,
     batch::SHORT,
     half::{Half, Link, Step},
+    outstanding::owed_by,
     partial::{Partial, Written},
 };
 
@@ -211,7 +212,7 @@ impl<S: Socket> Half<S> {
         let message = self.interrupted.take().or_else(|| self.queue.pop())?;
         after.room.extend(self.queue.room_made());
         if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
-            self.waiting_receipts -= usize::from(message.receipt.is_some());
+            self.receipts.waits_no_more(owed_by(&message));
             self.expired(message, after);
             return None;
         }

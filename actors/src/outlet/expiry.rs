@@ -8,7 +8,7 @@ use sinew_runtime::{
     wire::Message,
 };
 
-use super::{Socket, after::After, half::Half};
+use super::{Socket, after::After, half::Half, outstanding::owed_by};
 
 /// Time after a sent message's time to live in which its outcome may still come.
 const OUTCOME_GRACE: Duration = Duration::from_secs(1);
@@ -17,13 +17,15 @@ impl<S: Socket> Half<S> {
     pub(super) fn expired(&mut self, message: Message, after: &mut After) {
         self.counts.expired += 1;
         after.settle(message.receipt.map(|receipt| (receipt, Outcome::Expired)));
+        self.fewer_are_open(after);
     }
 
     /// Outcomes that are long overdue do not come any more; their places are needed. By then the senders have stopped
     /// waiting.
     fn give_up_overdue(&mut self, now: Time, after: &mut After) {
-        let overdue = self.sent_receipts.take_overdue(now, OUTCOME_GRACE);
+        let overdue = self.receipts.take_overdue(now, OUTCOME_GRACE);
         after.settle(overdue.into_iter().map(|receipt| (receipt, Outcome::Unknown)));
+        self.fewer_are_open(after);
     }
 
     /// Nobody waits any more for the reply to this request: its time is over, if it has not been begun. Returns whether it waited here.
@@ -32,7 +34,7 @@ impl<S: Socket> Half<S> {
         let waited = if is_interrupted { self.interrupted.take() } else { self.queue.take_request(ticket) };
         let Some(message) = waited.or_else(|| self.take_request_in_line(ticket)) else { return false };
         after.room.extend(self.queue.room_made());
-        self.waiting_receipts -= usize::from(message.receipt.is_some());
+        self.receipts.waits_no_more(owed_by(&message));
         self.expired(message, after);
         true
     }
@@ -43,7 +45,7 @@ impl<S: Socket> Half<S> {
         if now > self.next_expiry {
             self.expire_waiting(now, after);
         }
-        self.next_expiry != Time::MAX || self.sent_receipts.len() > 0
+        self.next_expiry != Time::MAX || self.receipts.len() > 0
     }
 
     fn expire_waiting(&mut self, now: Time, after: &mut After) {
@@ -53,7 +55,7 @@ impl<S: Socket> Half<S> {
             self.interrupted = self.keep_or_expire(message, now, after);
         }
         for message in self.queue.take_expired(now) {
-            self.waiting_receipts -= usize::from(message.receipt.is_some());
+            self.receipts.waits_no_more(owed_by(&message));
             self.expired(message, after);
         }
         self.next_expiry = self.next_expiry.min(self.queue.next_expiry());
@@ -61,7 +63,7 @@ impl<S: Socket> Half<S> {
 
     fn keep_or_expire(&mut self, message: Message, now: Time, after: &mut After) -> Option<Message> {
         if message.header.is_expired(now) {
-            self.waiting_receipts -= usize::from(message.receipt.is_some());
+            self.receipts.waits_no_more(owed_by(&message));
             self.expired(message, after);
             return None;
         }

@@ -17,14 +17,11 @@ use super::{
     after::After,
     batch::{Pace, is_left_to_the_drainer, is_patient},
     outcomes::messages_in,
-    outstanding::{Outstanding, Sent},
+    outstanding::{Outstanding, Sent, owed_by},
     partial::{Partial, Sort, Written},
     resume::Session,
     waiting::Waiting,
 };
-
-/// Of a session: times the bound for one destination, so many messages may be unconfirmed for all.
-const UNCONFIRMED_DESTINATIONS: usize = 8;
 
 pub(super) enum Link<S> {
     Down,
@@ -67,14 +64,12 @@ pub(super) struct Half<S> {
     /// What is sent when nothing waits any more, on whichever connection there is then; nothing is taken after it.
     pub(super) last: Option<Message>,
     finishing: bool,
-    /// Receipts of messages that wait.
-    pub(super) waiting_receipts: usize,
     /// No waiting message expires before this.
     pub(super) next_expiry: Time,
-    /// Receipts of messages that were sent.
-    pub(super) sent_receipts: Outstanding,
-    /// Who waits until fewer of them are open.
-    pub(super) outcomes_awaited: Option<Waker>,
+    /// Confirmed messages that wait, and receipts of those that were sent.
+    pub(super) receipts: Outstanding,
+    /// Who waits until fewer of them are open, and for which destination.
+    pub(super) outcomes_awaited: Option<(Tid, Waker)>,
     pub(super) drainer: Option<Waker>,
     pub(super) pace: Pace,
     pub(super) counts: OutletCounts,
@@ -98,9 +93,8 @@ impl<S: Socket> Half<S> {
             urgent: VecDeque::new(),
             last: None,
             finishing: false,
-            waiting_receipts: 0,
             next_expiry: Time::MAX,
-            sent_receipts: Outstanding::default(),
+            receipts: Outstanding::default(),
             outcomes_awaited: None,
             drainer: None,
             pace: Pace::new(),
@@ -167,8 +161,8 @@ impl<S: Socket> Half<S> {
 
     /// What was sent and not confirmed may have been handled or not.
     pub(super) fn unknown(&mut self, after: &mut After) {
-        after.settle(self.sent_receipts.take_all().map(|sent| (sent.receipt, Outcome::Unknown)));
-        after.room.extend(self.outcomes_awaited.take());
+        after.settle(self.receipts.take_all().map(|sent| (sent.receipt, Outcome::Unknown)));
+        after.room.extend(self.outcomes_awaited.take().map(|(_, waker)| waker));
     }
 
     /// The frame that was being written goes out on the next connection.
@@ -204,13 +198,13 @@ impl<S: Socket> Half<S> {
             self.counts.lost += 1;
             after.settle(message.receipt.map(|receipt| (receipt, Outcome::PeerLost)));
         }
-        self.waiting_receipts = 0;
+        self.receipts.none_waits();
         self.next_expiry = Time::MAX;
     }
 
     pub(super) fn end(&mut self, in_hand: Outcome, why: Rejection, after: &mut After) {
         let taken = if let Link::Up(socket) = &mut self.link { socket.account().taken } else { u64::MAX };
-        after.settle(self.sent_receipts.take_all().map(|Sent { receipt, written, .. }| {
+        after.settle(self.receipts.take_all().map(|Sent { receipt, written, .. }| {
             // What lay in its memory untaken was not handled.
             (receipt, if written > taken { Outcome::Rejected(why) } else { in_hand })
         }));
@@ -265,7 +259,7 @@ impl<S: Socket> Half<S> {
             return Ok(Step::Done);
         }
         let mut frame = self.frame(message);
-        self.waiting_receipts += usize::from(frame.message.receipt.is_some());
+        self.receipts.waits(owed_by(&frame.message));
         match self.write(&mut frame) {
             Written::Whole => {
                 self.sent(frame);
@@ -332,18 +326,9 @@ impl<S: Socket> Half<S> {
         self.wake_drainer(after);
     }
 
-    /// Where there is a session, a destination may have as many as the bound says, and all together a few times that, as far as the peer
-    /// has room for their outcomes: one that says nothing for long stops nobody else.
-    fn has_too_many_unconfirmed(&self, destination: Tid) -> bool {
-        let unconfirmed_max = self.limits.unconfirmed_max;
-        let Some(session) = &self.session else { return self.unconfirmed() >= unconfirmed_max };
-        self.sent_receipts.of(destination) >= unconfirmed_max
-            || self.unconfirmed() >= (UNCONFIRMED_DESTINATIONS * unconfirmed_max).min(session.answers_there)
-    }
-
     /// A frame that was to be written at once and could not be: it waits like any other.
     fn requeue(&mut self, frame: Partial, bound: Bound, after: &mut After) -> Result<(), Refused> {
-        self.waiting_receipts -= usize::from(frame.message.receipt.is_some());
+        self.receipts.waits_no_more(owed_by(&frame.message));
         self.take_back();
         self.enqueue(frame.message, bound)?;
         self.rouse(false, after);
@@ -372,8 +357,7 @@ impl<S: Socket> Half<S> {
     }
 
     fn enqueue(&mut self, message: Message, bound: Bound) -> Result<(), Refused> {
-        let confirmed = message.receipt.is_some();
-        let expiry = message.header.expiry();
+        let (owed_by, expiry) = (owed_by(&message), message.header.expiry());
         match bound {
             Bound::Waived => self.queue.push_beyond(message),
             Bound::Kept if !self.has_room_beside_lines(&message) => {
@@ -388,7 +372,7 @@ impl<S: Socket> Half<S> {
                 }
             },
         }
-        self.waiting_receipts += usize::from(confirmed);
+        self.receipts.waits(owed_by);
         self.next_expiry = self.next_expiry.min(expiry);
         Ok(())
     }
@@ -396,8 +380,9 @@ impl<S: Socket> Half<S> {
     /// What found no room is not refused: its sender keeps it.
     pub(super) fn is_offered_again(&mut self, message: &Message, room: Option<&Waker>, after: &mut After) {
         self.counts.refused -= 1;
-        if message.receipt.is_some() && self.has_too_many_unconfirmed(message.header.destination) {
-            self.outcomes_awaited = room.cloned();
+        let destination = message.header.destination;
+        if message.receipt.is_some() && self.has_too_many_unconfirmed(destination) {
+            self.outcomes_awaited = room.map(|room| (destination, room.clone()));
         } else {
             after.room.extend(room.and_then(|room| self.queue.offered(message, room)));
         }
@@ -454,9 +439,8 @@ impl<S: Socket> Half<S> {
         }
         let expiry = frame.message.header.expiry();
         if let Some(receipt) = frame.message.receipt {
-            self.waiting_receipts -= 1;
             let written = if let Link::Up(socket) = &mut self.link { socket.account().written } else { 0 };
-            self.sent_receipts.push(Sent { receipt, expiry, written });
+            self.receipts.sent(Sent { receipt, expiry, written });
         }
     }
 
@@ -470,7 +454,7 @@ impl<S: Socket> Half<S> {
     }
 
     pub(super) fn unconfirmed(&self) -> usize {
-        self.sent_receipts.len() + self.waiting_receipts
+        self.receipts.open()
     }
 
     pub(super) const fn counts(&self) -> OutletCounts {

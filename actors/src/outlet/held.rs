@@ -12,7 +12,7 @@ use sinew_runtime::{
     wire::{Class, Flags, Header, Kind, Message},
 };
 
-use super::{OutletLimits, Socket, after::After, batch::SHORT, half::Half};
+use super::{OutletLimits, Socket, after::After, batch::SHORT, half::Half, outstanding::owed_by};
 use crate::session::{ShelfLimits, Turn, Window};
 
 /// What waits in lines at the sender: as many lines as a receiver has. In messages the bound of a session's queue holds, and a quarter of it
@@ -101,10 +101,10 @@ impl<S: Socket> Half<S> {
             self.counts.refused += 1;
             return Err(Refused::new(message, Rejection::QueueFull));
         };
-        let (expiry, confirmed, bytes) = (message.header.expiry(), message.receipt.is_some(), message.size());
+        let (expiry, owed_by, bytes) = (message.header.expiry(), owed_by(&message), message.size());
         match session.held.put(key, message, bytes) {
             Ok(()) => {
-                self.waiting_receipts += usize::from(confirmed);
+                self.receipts.waits(owed_by);
                 self.next_expiry = self.next_expiry.min(expiry);
                 Ok(())
             }
@@ -141,7 +141,7 @@ impl<S: Socket> Half<S> {
         let expired = session.held.take_expired(now);
         self.next_expiry = self.next_expiry.min(session.held.next_expiry());
         for message in expired {
-            self.waiting_receipts -= usize::from(message.receipt.is_some());
+            self.receipts.waits_no_more(owed_by(&message));
             self.expired(message, after);
         }
     }

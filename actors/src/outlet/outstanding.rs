@@ -1,4 +1,4 @@
-//! Confirmed messages that were sent and whose outcome is not known yet, by destination: who is slow takes no place of others.
+//! Confirmed messages whose outcome is not known yet, by destination, and how many there may be: who is slow takes no place of others.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -9,12 +9,20 @@ use sinew_runtime::{
     outcome::{Outcome, Receipt, Ticket},
     tid::Tid,
     time::Time,
+    wire::Message,
 };
 
 use super::{Socket, after::After, half::Half};
 
+/// Of a session: times the bound for one destination, so many messages may be unconfirmed for all.
+const UNCONFIRMED_DESTINATIONS: usize = 8;
 /// Lines that are kept though nothing is in them: most destinations are sent to again.
 const EMPTY_LINES_MAX: usize = 64;
+
+/// Who owes the outcome of a message; `None` if nobody does.
+pub(super) fn owed_by(message: &Message) -> Option<Tid> {
+    message.receipt.as_ref().map(|receipt| receipt.ticket().destination)
+}
 
 /// A message whose outcome the peer owes.
 pub(super) struct Sent {
@@ -24,36 +32,86 @@ pub(super) struct Sent {
     pub(super) written: u64,
 }
 
-/// Of each destination the oldest first: outcomes come back in about this order.
+/// What one destination owes.
+#[derive(Default)]
+struct Line {
+    /// The oldest first: outcomes come back in about this order.
+    sent: VecDeque<Sent>,
+    /// How many wait to be sent, wherever they do.
+    waiting: usize,
+}
+
+impl Line {
+    fn is_empty(&self) -> bool {
+        self.sent.is_empty() && self.waiting == 0
+    }
+}
+
+/// Each that waits, until it is sent or given up, and each that was sent, until its outcome is known.
 #[derive(Default)]
 pub(super) struct Outstanding {
-    lines: BTreeMap<Tid, VecDeque<Sent>>,
-    count: usize,
+    lines: BTreeMap<Tid, Line>,
+    sent: usize,
+    waiting: usize,
 }
 
 impl Outstanding {
-    pub(super) fn push(&mut self, sent: Sent) {
-        self.lines.entry(sent.receipt.ticket().destination).or_default().push_back(sent);
-        self.count += 1;
+    /// A message that this destination owes the outcome of waits to be sent; nothing, if nobody owes one.
+    pub(super) fn waits(&mut self, owed_by: Option<Tid>) {
+        let Some(destination) = owed_by else { return };
+        self.lines.entry(destination).or_default().waiting += 1;
+        self.waiting += 1;
     }
 
-    /// All of them.
+    /// One that [waited](Self::waits) is not going to be sent.
+    pub(super) fn waits_no_more(&mut self, owed_by: Option<Tid>) {
+        let Some(destination) = owed_by else { return };
+        let lines = self.lines.len();
+        let Some(line) = self.lines.get_mut(&destination) else { return };
+        line.waiting -= 1;
+        self.waiting -= 1;
+        if line.is_empty() && lines > EMPTY_LINES_MAX {
+            self.lines.remove(&destination);
+        }
+    }
+
+    /// All that waited are not going to be sent.
+    pub(super) fn none_waits(&mut self) {
+        self.lines.values_mut().for_each(|line| line.waiting = 0);
+        self.waiting = 0;
+    }
+
+    /// One that [waited](Self::waits) was sent.
+    pub(super) fn sent(&mut self, sent: Sent) {
+        let line = self.lines.entry(sent.receipt.ticket().destination).or_default();
+        line.waiting -= 1;
+        line.sent.push_back(sent);
+        self.waiting -= 1;
+        self.sent += 1;
+    }
+
+    /// All that were sent.
     pub(super) const fn len(&self) -> usize {
-        self.count
+        self.sent
     }
 
-    /// Those of one destination.
-    pub(super) fn of(&self, destination: Tid) -> usize {
-        self.lines.get(&destination).map_or(0, VecDeque::len)
+    /// All that were sent or wait.
+    pub(super) const fn open(&self) -> usize {
+        self.sent + self.waiting
+    }
+
+    /// Those of one destination that were sent, and those that wait.
+    fn of(&self, destination: Tid) -> (usize, usize) {
+        self.lines.get(&destination).map_or((0, 0), |line| (line.sent.len(), line.waiting))
     }
 
     /// Takes out the one that `ticket` names.
     pub(super) fn take(&mut self, ticket: Ticket) -> Option<Receipt> {
         let lines = self.lines.len();
         let line = self.lines.get_mut(&ticket.destination)?;
-        let at = line.iter().position(|sent| sent.receipt.ticket() == ticket)?;
-        let sent = line.remove(at)?;
-        self.count -= 1;
+        let at = line.sent.iter().position(|sent| sent.receipt.ticket() == ticket)?;
+        let sent = line.sent.remove(at)?;
+        self.sent -= 1;
         if line.is_empty() && lines > EMPTY_LINES_MAX {
             self.lines.remove(&ticket.destination);
         }
@@ -67,44 +125,85 @@ impl Outstanding {
         let is_overdue = |sent: &Sent| sent.expiry != Time::MAX && now > sent.expiry + grace;
         for line in self.lines.values_mut() {
             // Nearly always there is none, and the line stays as it is.
-            let Some(first) = line.iter().position(is_overdue) else { continue };
-            for sent in line.split_off(first) {
+            let Some(first) = line.sent.iter().position(is_overdue) else { continue };
+            for sent in line.sent.split_off(first) {
                 if is_overdue(&sent) {
                     overdue.push(sent.receipt);
                 } else {
-                    line.push_back(sent);
+                    line.sent.push_back(sent);
                 }
             }
         }
-        self.count -= overdue.len();
+        self.sent -= overdue.len();
         if self.lines.len() > EMPTY_LINES_MAX {
             self.lines.retain(|_, line| !line.is_empty());
         }
         overdue
     }
 
-    /// Takes all out.
-    pub(super) fn take_all(&mut self) -> impl Iterator<Item = Sent> {
-        self.count = 0;
-        std::mem::take(&mut self.lines).into_values().flatten()
+    /// Takes all out that were sent.
+    pub(super) fn take_all(&mut self) -> std::vec::IntoIter<Sent> {
+        let mut all = Vec::with_capacity(self.sent);
+        self.lines.values_mut().for_each(|line| all.extend(line.sent.drain(..)));
+        self.lines.retain(|_, line| !line.is_empty());
+        self.sent = 0;
+        all.into_iter()
     }
 }
 
 impl<S: Socket> Half<S> {
     /// Settles those that were waited for, and leaves the others.
     pub(super) fn confirm_all(&mut self, outcomes: &mut Vec<(Ticket, Outcome)>, after: &mut After) {
-        if self.sent_receipts.len() > 0 {
+        if self.receipts.len() > 0 {
             outcomes.retain(|(ticket, outcome)| !self.confirm(*ticket, *outcome, after));
         }
     }
 
     pub(super) fn confirm(&mut self, ticket: Ticket, outcome: Outcome, after: &mut After) -> bool {
-        let Some(receipt) = self.sent_receipts.take(ticket) else { return false };
+        let Some(receipt) = self.receipts.take(ticket) else { return false };
         after.settle([(receipt, outcome)]);
-        if self.unconfirmed() <= self.limits.unconfirmed_max / 2 {
-            after.room.extend(self.outcomes_awaited.take());
-        }
+        self.fewer_are_open(after);
         true
+    }
+
+    /// Whoever waits for that is woken, once its destination has room for half of what it may have: others may owe all they can for ever.
+    pub(super) fn fewer_are_open(&mut self, after: &mut After) {
+        let Some((destination, _)) = &self.outcomes_awaited else { return };
+        if self.left_for_all() > 0 && 2 * self.left_for(*destination) >= self.share_of_one() {
+            after.room.extend(self.outcomes_awaited.take().map(|(_, waker)| waker));
+        }
+    }
+
+    /// Where there is a session, a destination may have as many as the bound says, and all together a few times that, as far as the peer
+    /// has room for their outcomes: one that says nothing for long stops nobody else.
+    pub(super) fn has_too_many_unconfirmed(&self, destination: Tid) -> bool {
+        self.left_for_all() == 0 || self.left_for(destination) == 0
+    }
+
+    /// How many more may be open, whoever owes them. Without a session each destination's bound is that of all.
+    fn left_for_all(&self) -> usize {
+        let bound = UNCONFIRMED_DESTINATIONS * self.limits.unconfirmed_max;
+        let bound = self.session.as_ref().map_or(usize::MAX, |session| bound.min(session.answers_there));
+        bound.saturating_sub(self.unconfirmed())
+    }
+
+    /// How many one destination may have open: of the room that the peer has for outcomes no larger part than of the bound for all.
+    fn share_of_one(&self) -> usize {
+        let answers_there = self.session.as_ref().map_or(usize::MAX, |session| session.answers_there);
+        self.limits.unconfirmed_max.min((answers_there / UNCONFIRMED_DESTINATIONS).max(1))
+    }
+
+    /// How many more of this destination may be open.
+    fn left_for(&self, destination: Tid) -> usize {
+        let (bound, share) = (self.limits.unconfirmed_max, self.share_of_one());
+        if self.session.is_none() {
+            return bound.saturating_sub(self.unconfirmed());
+        }
+        let (sent, waiting) = self.receipts.of(destination);
+        // What waits is bounded by the queue and by its line, and the bound for all is a few times that. Where the peer has less room, what
+        // waits for one destination alone could take all of it.
+        let open = if share < bound { sent + waiting } else { sent };
+        share.saturating_sub(open)
     }
 }
 
@@ -142,7 +241,8 @@ mod tests {
         for (correlation, (to, expiry)) in (0..).zip(sent) {
             let ticket = Ticket { source: tid(0), destination: tid(*to), correlation };
             let expiry = expiry.map_or(Time::MAX, Time::from_nanos);
-            outstanding.push(Sent { receipt: Receipt::new(sink.clone(), ticket), expiry, written: 0 });
+            outstanding.waits(Some(ticket.destination));
+            outstanding.sent(Sent { receipt: Receipt::new(sink.clone(), ticket), expiry, written: 0 });
         }
         outstanding
     }

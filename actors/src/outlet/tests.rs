@@ -30,6 +30,7 @@ mod many_held;
 mod outcomes;
 mod requests;
 mod room;
+mod shares;
 mod taking;
 
 /// A wire that takes `room` more bytes and keeps them.

@@ -214,6 +214,46 @@ fn no_more_is_open_than_the_peer_has_room_for_answers() {
     });
 }
 
+// spec: GNCL-12
+#[test]
+fn an_application_that_never_answers_takes_no_room_for_answers_from_another_one_of_its_node() {
+    run(async {
+        // Given a queue that is longer than all the room of the peer, which is what nodes say whose queue is no longer than usual.
+        const THERE: u64 = 8_192;
+        const OTHERS: u64 = 1_000_000;
+        let mut node = Node::start_with(1, |config| config.gncl.queue_capacity = 65_536).await;
+        let hello = Introduction { answers_max: THERE, ..introduction(node.address()) };
+        let mut peer = ByHand::greeting(&node, &hello).await;
+        within("the peer to be known", async {
+            while node.stores.gncl.peer(NINE).is_none() {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        let [stuck, other] = [0x1001, 0x1002].map(|app| Tid::new(NINE, AppAddress::new(app)));
+        // When
+        let is_refused = |sent: &u64| node.stores.router.send(node.confirmed(stuck, *sent)).is_err();
+        let taken = (0..THERE).find(is_refused);
+        node.stores.router.send(node.confirmed(other, OTHERS)).expect("there is room for its answer");
+        // Then
+        assert_eq!(taken, Some(THERE / 8), "one has its share");
+        let message = loop {
+            let message = peer.hear().await;
+            if message.header.destination == other {
+                break message;
+            }
+        };
+        peer.say(&ByHand::outcome(&message, Outcome::Delivered)).await;
+        let outcome = loop {
+            let (correlation, outcome) = next("an outcome", &mut node.settled).await;
+            if correlation == OTHERS {
+                break outcome;
+            }
+        };
+        assert_eq!(outcome, Outcome::Delivered);
+    });
+}
+
 #[test]
 fn a_node_says_for_how_many_answers_it_has_room_which_are_not_fewer_where_its_queue_is_short() {
     for (capacity, answers) in [(1, 8_192), (1_024, 8_192), (2_048, 16_384), (65_536, 524_288)] {
