@@ -31,6 +31,7 @@ use tokio::sync::{Notify, mpsc, oneshot};
 use self::{
     announcing::announced,
     paths::{Paths, Reader},
+    receiving::Pace,
 };
 use super::{
     Event,
@@ -161,6 +162,8 @@ struct Shell {
     to_probe: mpsc::Sender<Probe>,
     /// Until the task that tries them has it.
     probes: RefCell<Option<mpsc::Receiver<Probe>>>,
+    /// How fast its sockets are read, all together.
+    pace: RefCell<Pace>,
 }
 
 impl Shell {
@@ -191,8 +194,8 @@ impl Shell {
         };
         let (rewind, untold, refusals) = (Notify::new(), Notify::new(), stores.refusals.clone());
         let (to_probe, probes) = mpsc::channel(PROBES_MAX);
-        let probes = RefCell::new(Some(probes));
-        Ok((Self { stores, epoch, paths, rewind, untold, refusals, to_probe, probes }, readers))
+        let (probes, pace) = (RefCell::new(Some(probes)), RefCell::new(Pace::new(Time::now())));
+        Ok((Self { stores, epoch, paths, rewind, untold, refusals, to_probe, probes, pace }, readers))
     }
 
     /// Gives the core an input and does what it says; `false` when a later instance has taken over.
