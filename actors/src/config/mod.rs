@@ -106,7 +106,7 @@ pub struct GnclConfig {
     pub further: Vec<Ipv4Addr>,
     /// Messages that wait for one peer at most, each class by itself. 1 to 65,536; default 1,024. So many confirmed ones of one destination, and
     /// eight times as many of all of a class, may be without an outcome; and no more than the peer has room for the outcomes of, which is
-    /// eight times its own capacity, 8,192 at least.
+    /// eight times its own capacity, 8,192 at least; of one destination than an eighth of that.
     pub queue_capacity: usize,
     /// Bytes of their payloads at most, each class by itself; one message waits however long it is. 4 KiB to 1 GiB;
     /// default 16 MiB.
@@ -114,7 +114,8 @@ pub struct GnclConfig {
     /// Connections whose peer has not said who it is, at most; for a further one one of them is closed, first from where most
     /// come. 1 to 1,024; default 64.
     pub strangers_max: usize,
-    /// Time for a handshake. 10 ms to 60 s; default 2 s.
+    /// Time for a handshake. 10 ms to 60 s; default 2 s. Who floods the port has newcomers wait for a second until they are accepted: with less
+    /// than about 1.1 s none of them is linked as long as a flood lasts.
     pub handshake: Duration,
     /// First wait before dialling again; doubles to [`redial_max`](Self::redial_max). 1 ms to 10 s; default 10 ms.
     pub redial_min: Duration,

@@ -14,6 +14,7 @@ use std::{
     collections::BTreeMap,
     io,
     net::{Shutdown, SocketAddr},
+    rc::Rc,
     sync::{Arc, Mutex, atomic::Ordering},
     time::Duration,
 };
@@ -37,6 +38,7 @@ use super::{
     inbound::Inbound,
     link::{self, Ends, Mode, News, Reading, SharedMode, What},
     listener, marks,
+    pace::Pace,
     peer::{Store, frame},
     secure::Secure,
     spin::Spin,
@@ -372,8 +374,9 @@ impl Actor for Gncl {
             .unwrap_or_else(|error| panic!("{}", listener::why_not(&self.stores.config, &error)));
         self.cut_all();
         self.catch_up(ctx);
+        let pace = Rc::new(RefCell::new(Pace::new(Time::now())));
         for listener in listeners {
-            ctx.add_stream(listener::accepted(listener, self.stores.config.gncl.give_up));
+            ctx.add_stream(listener::accepted(listener, self.stores.config.gncl.give_up, pace.clone()));
         }
         #[cfg(target_os = "linux")]
         self.watch_interfaces(ctx);

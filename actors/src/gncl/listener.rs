@@ -1,8 +1,12 @@
 //! The accepting socket: waits when the system has no more to give, and never spins.
 
 use std::{
+    cell::RefCell,
+    future::poll_fn,
     io,
     net::{Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4},
+    rc::Rc,
+    task::{Context, Poll, ready},
     time::Duration,
 };
 
@@ -15,7 +19,8 @@ use tokio::net::{TcpListener, TcpStream};
 use super::pace::Pace;
 use crate::{config::NodeConfig, refusals::Refusals};
 
-/// Connections that wait to be accepted at most; the kernel refuses further ones.
+/// Connections that wait to be accepted at most, at all listeners together; the kernel refuses further ones. Those that 300 nodes make who all
+/// meet this one at once wait here, and are not made again a second later.
 const BACKLOG: i32 = 1_024;
 const BACK_OFF_MIN: Duration = Duration::from_millis(10);
 const BACK_OFF_MAX: Duration = Duration::from_millis(100);
@@ -148,6 +153,19 @@ pub(super) fn addresses_of(listeners: &[std::net::TcpListener]) -> Vec<SocketAdd
     addresses.collect()
 }
 
+/// Each of these has its part of what may wait: they share a [pace](Pace), and all that waits has been accepted a second later.
+///
+/// # Errors
+/// What the system says.
+pub(super) fn share_backlog(listeners: &[std::net::TcpListener]) -> io::Result<()> {
+    let backlog = backlog_of_one(listeners.len());
+    listeners.iter().try_for_each(|listener| SockRef::from(listener).listen(backlog))
+}
+
+fn backlog_of_one(listeners: usize) -> i32 {
+    i32::try_from(listeners).map_or(1, |listeners| (BACKLOG / listeners.max(1)).max(1))
+}
+
 fn new_socket(address: SocketAddr) -> io::Result<Socket> {
     Socket::new(Domain::for_address(address), Type::STREAM.nonblocking().cloexec(), None)
 }
@@ -164,24 +182,25 @@ fn begin_to_listen(socket: &Socket, address: SocketAddr) -> io::Result<std::net:
 }
 
 /// Each connection that is made to `listener`, and each error that made it wait. See [`tune`](super::link::tune). Links that stand share
-/// the thread: they have their turn between two connections, it rests at a [pace](Pace) that whoever connects cannot quicken, and who floods the
-/// port waits in the kernel.
+/// the thread: they have their turn between two connections, it rests at a [pace](Pace) that whoever connects cannot quicken, nor by more than one
+/// of the listeners, which share it, and who floods the port waits in the kernel.
 pub(super) fn accepted(
     listener: TcpListener,
     give_up: Duration,
+    pace: Rc<RefCell<Pace>>,
 ) -> impl Stream<Item = io::Result<TcpStream>> {
-    let pace = Pace::new(Time::now());
-    stream::unfold((listener, Duration::ZERO, pace), move |(listener, wait, mut pace)| async move {
+    stream::unfold((listener, Duration::ZERO, pace), move |(listener, wait, pace)| async move {
         if wait > Duration::ZERO {
             tokio::time::sleep(wait).await;
         }
-        while let Some(rest) = pace.rest(Time::now()) {
-            tokio::time::sleep(rest).await;
-        }
-        others_turn().await;
-        let accepted = listener.accept().await;
-        pace.took_one(Time::now());
-        let accepted = accepted.and_then(|(socket, _)| {
+        let accepted = loop {
+            others_turn().await;
+            match poll_fn(|cx| poll_accept(&listener, &pace, cx)).await {
+                Turn::Rest(rest) => tokio::time::sleep(rest).await,
+                Turn::Over(accepted) => break accepted,
+            }
+        };
+        let accepted = accepted.and_then(|socket| {
             super::link::tune(&socket, give_up)?;
             Ok(socket)
         });
@@ -192,6 +211,24 @@ pub(super) fn accepted(
         let wait = accepted.as_ref().err().map_or(Duration::ZERO, |error| wait_after(error, wait));
         Some((accepted, (listener, wait, pace)))
     })
+}
+
+/// What a listener that may accept one does.
+enum Turn {
+    /// It is too early.
+    Rest(Duration),
+    Over(io::Result<TcpStream>),
+}
+
+/// Accepts one when it comes, if the pace has one left then: another listener may have had it since this one began to wait.
+fn poll_accept(listener: &TcpListener, pace: &RefCell<Pace>, cx: &mut Context<'_>) -> Poll<Turn> {
+    let mut pace = pace.borrow_mut();
+    if let Some(rest) = pace.rest(Time::now()) {
+        return Poll::Ready(Turn::Rest(rest));
+    }
+    let accepted = ready!(listener.poll_accept(cx));
+    pace.took_one(Time::now());
+    Poll::Ready(Turn::Over(accepted.map(|(socket, _)| socket)))
 }
 
 /// Waits until what else is ready on the thread has had its turn. An actor looks at its streams again and again in one turn as long as there is
@@ -241,6 +278,12 @@ mod tests {
         super::pace::{IN_A_ROW_MAX, REST},
         *,
     };
+
+    const GIVE_UP: Duration = Duration::from_secs(1);
+
+    fn own_pace() -> Rc<RefCell<Pace>> {
+        Rc::new(RefCell::new(Pace::new(Time::now())))
+    }
 
     const LOOPBACK: &str = if cfg!(target_os = "linux") { "lo" } else { "lo0" };
 
@@ -346,7 +389,7 @@ mod tests {
     async fn a_socket_that_was_closed_in_order_is_no_fault_and_nobody_comes_any_more() {
         let listener = listen(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
         let theirs = TcpListener::from_std(listener.try_clone().unwrap()).unwrap();
-        let mut accepted = pin!(accepted(theirs, Duration::from_secs(1)));
+        let mut accepted = pin!(accepted(theirs, GIVE_UP, own_pace()));
         assert!(accepted.next().now_or_never().is_none());
         // As GNCL's store does when the node is stopped.
         SockRef::from(&listener).shutdown(std::net::Shutdown::Both).unwrap();
@@ -359,7 +402,7 @@ mod tests {
         const ROWS: u32 = 5;
         let listener = listen(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
         let address = listener.local_addr().unwrap();
-        let mut accepted = pin!(accepted(TcpListener::from_std(listener).unwrap(), Duration::from_secs(1)));
+        let mut accepted = pin!(accepted(TcpListener::from_std(listener).unwrap(), GIVE_UP, own_pace()));
         let began = Instant::now();
         for _ in 0..ROWS * IN_A_ROW_MAX {
             // The one before has been accepted, and is closed.
@@ -371,6 +414,33 @@ mod tests {
         assert!(began.elapsed() >= REST * (ROWS - 1), "{:?}", began.elapsed());
     }
 
+    #[tokio::test]
+    async fn a_row_is_followed_by_a_rest_also_where_each_of_its_connections_waits_at_a_listener_of_its_own() {
+        const LISTENERS: usize = 5;
+        let (pace, mut streams, mut dialled) = (own_pace(), Vec::new(), Vec::new());
+        for _ in 0..LISTENERS {
+            let listener = listen(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
+            let address = listener.local_addr().unwrap();
+            dialled.extend((0..IN_A_ROW_MAX).map(|_| std::net::TcpStream::connect(address).unwrap()));
+            let listener = TcpListener::from_std(listener).unwrap();
+            streams.push(Box::pin(accepted(listener, GIVE_UP, pace.clone())));
+        }
+        let began = Instant::now();
+        let all: Vec<_> = stream::select_all(streams).take(dialled.len()).collect().await;
+        assert!(all.iter().all(Result::is_ok), "{all:?}");
+        // A slow machine may make pauses of its own, and takes none away.
+        assert!(began.elapsed() >= REST * (LISTENERS as u32 - 1), "{:?}", began.elapsed());
+    }
+
+    #[test]
+    fn several_listeners_let_no_more_wait_together_than_one_and_each_of_them_some() {
+        for listeners in 1..=10_usize {
+            let each = backlog_of_one(listeners);
+            assert!(each >= 100 && each * listeners as i32 <= BACKLOG, "{listeners}: {each}");
+        }
+        assert_eq!((backlog_of_one(0), backlog_of_one(usize::MAX)), (BACKLOG, 1));
+    }
+
     /// Has a stream more for each connection, as the layer's shell has.
     struct Shell(Option<TcpListener>, SyncSender<u32>, Arc<AtomicU32>);
 
@@ -379,7 +449,7 @@ mod tests {
 
         fn started(&mut self, context: &mut Self::Context) {
             let listener = self.0.take().unwrap();
-            context.add_stream(accepted(listener, Duration::from_secs(1)));
+            context.add_stream(accepted(listener, GIVE_UP, own_pace()));
         }
     }
 

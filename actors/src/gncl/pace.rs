@@ -17,7 +17,7 @@ pub(super) const REST: Duration = Duration::from_millis(1);
 /// long run one is accepted each [`REST`]: those of 300 nodes within a second.
 pub(super) const SAVED_MAX: u32 = 64;
 
-/// The pace of one listener.
+/// The pace of all listeners of a node together: one thread accepts for all of them.
 #[derive(Debug)]
 pub(super) struct Pace {
     saved: u32,

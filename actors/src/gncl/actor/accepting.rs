@@ -35,6 +35,7 @@ impl Gncl {
             let ipv6 = listener::listen_at_ipv6(config, address);
             let all = std::iter::once(listener).chain(further).chain(ipv6);
             *kept = all.collect();
+            listener::share_backlog(&kept)?;
             for at in
                 kept.iter().filter_map(|listener| listener.local_addr().ok()).filter(SocketAddr::is_ipv6)
             {

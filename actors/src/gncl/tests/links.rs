@@ -1,17 +1,18 @@
 //! Links that break, are made again, and end in order.
 
-use std::{net::Ipv4Addr, sync::atomic::Ordering, time::Duration};
+use std::{cell::RefCell, net::Ipv4Addr, rc::Rc, sync::atomic::Ordering, time::Duration};
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
     tid::Tid,
+    time::Time,
     wire::Kind,
 };
 use socket2::SockRef;
 
 use super::bench::{ByHand, Cable, NINE, Node, next, pair, run};
 use crate::{
-    gncl::{LinkFact, core::write, link, listener, peer::frame},
+    gncl::{LinkFact, core::write, link, listener, pace::Pace, peer::frame},
     session::Ack,
 };
 
@@ -277,7 +278,8 @@ fn both_ends_of_a_connection_give_it_up_when_nothing_is_taken_any_more() {
         let listener = listener::listen(([127, 0, 0, 1], 0).into()).expect("loopback has a free port");
         let address = listener.local_addr().expect("it is bound");
         let listener = tokio::net::TcpListener::from_std(listener).expect("it does not block");
-        let mut accepted = Box::pin(listener::accepted(listener, give_up));
+        let pace = Rc::new(RefCell::new(Pace::new(Time::now())));
+        let mut accepted = Box::pin(listener::accepted(listener, give_up, pace));
         let dialled =
             link::connect(link::Ends { to: address, from: None }, give_up).await.expect("it listens");
         let accepted = next("a connection", &mut accepted).await.expect("it is accepted");
