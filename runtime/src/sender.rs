@@ -244,7 +244,7 @@ impl Sender {
 
     /// Sends a value and wants to know what becomes of it: the returned future ends in exactly one [`Outcome`]. The
     /// message expires where it waits once it is older than `within`; the future ends as [`Outcome::Unknown`] when
-    /// nobody has said anything by then, whenever it is polled first. No message lives longer than [`TIME_TO_LIVE_MAX`], 71 minutes and
+    /// nobody has said anything by then, whenever it is polled first. No message lives longer than [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX), 71 minutes and
     /// 35 s: a longer `within` counts as that.
     ///
     /// # Errors
@@ -266,7 +266,7 @@ impl Sender {
     }
 
     /// Sends a request; the returned future ends with the reply, an error, or at the deadline. A longer `within` than
-    /// [`TIME_TO_LIVE_MAX`], 71 minutes and 35 s, counts as that.
+    /// [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s, counts as that.
     ///
     /// # Errors
     /// Nobody took it.
