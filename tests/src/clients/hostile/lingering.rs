@@ -57,6 +57,8 @@ impl Keeper {
             }
             thread::sleep(LOOK);
         }
+        // Those of the last moment: whoever closes one waits as long as nobody has it here.
+        while self.0.accept().is_ok() {}
     }
 }
 
@@ -146,4 +148,22 @@ pub(super) fn offer_with_full_bells(keeper: u16, model: &Offer) -> io::Result<(O
     let offer =
         Offer::from_parts(&model.to_bytes(), vec![memory, message, room]).map_err(io::Error::other)?;
     Ok((offer, vec![ear.into(), room_ear]))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Read;
+
+    use super::*;
+
+    #[test]
+    fn of_what_was_passed_in_the_last_moment_nothing_is_kept_when_it_is_over() {
+        let keeper = Keeper::new();
+        let passed = Lingering::connect(keeper.port()).expect("it listens");
+        keeper.keep(&AtomicBool::new(true));
+        passed.0.set_nonblocking(false).expect("a connection");
+        passed.0.set_read_timeout(Some(Duration::from_secs(60))).expect("a connection");
+        let ended = (&passed.0).read(&mut [0; 1]).map_err(|error| error.kind());
+        assert!(matches!(ended, Ok(0) | Err(ErrorKind::ConnectionReset)), "{ended:?}");
+    }
 }
