@@ -198,7 +198,7 @@ fn ask(
     Ok(answers)
 }
 
-/// Takes another node's question, or its answer.
+/// Takes another node's question, or its answer. A question that is not answered is refused with an empty answer, so that nobody waits for one.
 ///
 /// # Errors
 /// What is wrong with it, in words.
@@ -207,16 +207,24 @@ pub(crate) fn receive(stores: &Arc<Stores>, from: NodeAddress, message: &Message
     if message.header.kind != Kind::SYNC_AUDIT_ASK {
         return stores.questions.answered(number, from, &message.payload);
     }
-    if !stores.questions.admits(from, Time::now()) {
-        return Err(format!(
+    let taken = if stores.questions.admits(from, Time::now()) {
+        answering::have_answered(stores, from, number)
+    } else {
+        Err(format!(
             "from {from}, more than {ANSWERS_MAX} questions for an audit in {PERIOD:?}, or of all more than {ANSWERS_ALL_MAX}"
-        ));
-    }
-    answering::have_answered(stores, from, number)
+        ))
+    };
+    taken.inspect_err(|_| {
+        // One who cannot be told waits as long as he said.
+        let _ = say(stores, from, (Kind::SYNC_AUDIT, number), Bytes::new());
+    })
 }
 
 /// What `from` says of itself.
 fn read(from: NodeAddress, answer: &Bytes) -> Result<NodeAudit, String> {
+    if answer.is_empty() {
+        return Err(format!("{from} refuses the question; it answers {ANSWERS_MAX} in {PERIOD:?} at most"));
+    }
     let said = words::read(answer).map_err(|error| format!("from {from}, {error}"))?;
     if said.node == from { Ok(said) } else { Err(format!("from {from}, an audit of {}", said.node)) }
 }
@@ -259,7 +267,10 @@ fn say(
 mod tests {
     use super::*;
     use crate::config::NodeConfig;
-    use sinew_runtime::tid::Incarnation;
+    use sinew_runtime::{
+        router::{Outlet, Refused},
+        tid::Incarnation,
+    };
 
     const OTHER: NodeAddress = NodeAddress::new(2);
 
@@ -321,6 +332,49 @@ mod tests {
         questions.close(number);
         drop(answered);
         assert_eq!(questions.unread.load(Ordering::Relaxed), 0);
+    }
+
+    /// The way to another node: it keeps what is to go there, and answers a question with nothing.
+    struct Refusing {
+        stores: Arc<Stores>,
+        said: Mutex<Vec<(Kind, u64, Bytes)>>,
+    }
+
+    impl Outlet for Refusing {
+        fn submit(&self, message: Message) -> Result<(), Refused> {
+            let Header { kind, correlation, .. } = message.header;
+            if kind == Kind::SYNC_AUDIT_ASK {
+                self.stores.questions.answered(correlation, OTHER, &Bytes::new()).unwrap();
+            }
+            lock(&self.said).push((kind, correlation, message.payload));
+            Ok(())
+        }
+    }
+
+    fn refusing(stores: &Arc<Stores>) -> Arc<Refusing> {
+        let other = Arc::new(Refusing { stores: stores.clone(), said: Mutex::default() });
+        stores.router.set_peer(OTHER, other.clone());
+        other
+    }
+
+    #[test]
+    fn who_is_refused_an_answer_is_told_and_does_not_wait_for_it() {
+        // Given
+        let stores = stores();
+        let other = refusing(&stores);
+        let source = Tid::new(OTHER, AppAddress::SYNC);
+        let mut header = Header::new(Kind::SYNC_AUDIT_ASK, source, Tid::new(stores.node, AppAddress::SYNC));
+        header.correlation = 7;
+        let question = Message::new(header, Bytes::new());
+        let now = Time::now() + Duration::from_secs(3_600);
+        assert!((0..ANSWERS_ALL_MAX).all(|asker| stores.questions.admits(NodeAddress::new(asker + 9), now)));
+        // When
+        assert!(receive(&stores, OTHER, &question).is_err());
+        // Then
+        assert_eq!(*lock(&other.said), [(Kind::SYNC_AUDIT, 7, Bytes::new())]);
+        // And: at the other end
+        let audit = audit(&stores, &BTreeSet::from([OTHER]), Duration::from_secs(3_600)).unwrap();
+        assert_eq!((audit.silent, audit.nodes.len()), (vec![OTHER], 1));
     }
 
     #[test]
