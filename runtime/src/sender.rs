@@ -92,6 +92,11 @@ pub enum SendError {
     /// Too many confirmed messages and requests wait for their end.
     #[error("too many confirmed messages and requests are under way; wait for some to end")]
     TooManyWaits,
+    /// Kinds below `0x8000_0000` are the layers' own; see [`Kind`].
+    #[error(
+        "the kind {0} belongs to Sinew's layers, which would end a connection; take one from `Kind::named`"
+    )]
+    NotYours(Kind),
     /// This life of the application has sent protected messages to 1,024 receivers.
     #[error(
         "this application sends protected messages to 1,024 receivers already, and can to no further one"
@@ -409,6 +414,12 @@ impl Sender {
         if self.is_over() {
             message.reject(Rejection::Closed);
             return Err(SendError::Over);
+        }
+        let kind = message.header.kind;
+        if !kind.is_user() {
+            // What layers say is asked of no guard, and ends a link where it makes no sense.
+            message.reject(Rejection::UnknownKind);
+            return Err(SendError::NotYours(kind));
         }
         if message.payload.len() > self.shared.payload_max {
             message.reject(Rejection::TooLong);

@@ -21,10 +21,10 @@ use sinew_runtime::{
     pending::{AppOutlet, Pending},
     post::Post,
     router::{LocalRoute, Router},
-    sender::{Directory, Sender},
+    sender::{Directory, SendError, Sender},
     supervision::{ChildId, ChildSpec, Input, Policy, Strategy, Supervisor, SupervisorFact, Threads},
     tid::{AppAddress, NodeAddress, Tid},
-    wire::{Class, Payload},
+    wire::{Class, Kind, Payload},
 };
 
 const NODE: NodeAddress = NodeAddress::new(0x7f00_0001);
@@ -412,6 +412,21 @@ fn a_handler_that_overruns_its_period_does_not_shut_the_mailbox_out() {
     for number in 0..10 {
         assert_eq!(heard.recv_timeout(DEADLINE), Ok(number));
     }
+    bench.stop();
+}
+
+#[test]
+fn an_application_does_not_speak_as_a_layer() {
+    let (say, heard) = sync_channel(100);
+    let spec = AppSpec::new("overrun", move || Overrun(say.clone())).handles::<Number>();
+    let bench = Bench::start(vec![spec.into()]);
+    bench.wait_for(&SupervisorFact::Ready(ChildId(0)));
+    let sender = &bench.senders[0];
+    let forged = sender.create_message(sender.tid(), Kind::NDL_LEAVE, 3).unwrap();
+    assert!(matches!(sender.send_message(forged), Err(SendError::NotYours(Kind::NDL_LEAVE))));
+    // And: what is its own still goes
+    sender.send(sender.tid(), &Number(1)).unwrap();
+    assert_eq!(heard.recv_timeout(DEADLINE), Ok(1));
     bench.stop();
 }
 
