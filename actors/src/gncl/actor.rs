@@ -321,6 +321,15 @@ impl Gncl {
             peer.cut();
         }
     }
+
+    /// The links of a former instance are down until this one has them back, which the network may not let it. NDL looks for itself when it
+    /// starts, which it does behind this layer; the sync manager, with its monitors and wills, has lived on.
+    fn tell_what_was_cut(&self) {
+        for peer in self.stores.gncl.peers() {
+            let fact = LinkFact::LinkBroken { node: peer.node, incarnation: peer.incarnation };
+            self.post(&self.stores.posts.sync, sync::Event::Link(fact));
+        }
+    }
 }
 
 /// What follows a frame that is written on a connection that is not a link.
@@ -373,6 +382,7 @@ impl Actor for Gncl {
             .listen()
             .unwrap_or_else(|error| panic!("{}", listener::why_not(&self.stores.config, &error)));
         self.cut_all();
+        self.tell_what_was_cut();
         self.catch_up(ctx);
         let pace = Rc::new(RefCell::new(Pace::new(Time::now())));
         for listener in listeners {

@@ -14,6 +14,7 @@ use super::bench::{ByHand, Cable, NINE, Node, next, pair, run};
 use crate::{
     gncl::{LinkFact, core::write, link, listener, pace::Pace, peer::frame},
     session::Ack,
+    sync,
 };
 
 #[test]
@@ -268,6 +269,21 @@ fn a_restarted_layer_listens_where_it_did_and_sends_what_waited_in_order() {
         for number in 0..20 {
             assert_eq!(next("a message that waited", &mut inbox).await.payload[..], [number]);
         }
+    });
+}
+
+#[test]
+fn the_sync_manager_hears_that_the_links_of_a_former_layer_are_down() {
+    run(async {
+        let (mut a, b) = pair().await;
+        a.stop_layer();
+        // What its first life has said is read; nothing of `b` comes back.
+        let mut told = Box::pin(a.stores.posts.sync.attach());
+        while !matches!(next("what was said", &mut told).await, sync::Event::Link(LinkFact::LinkUp { .. })) {}
+        drop(b);
+        a.start_layer().await;
+        let first = next("what the second life says", &mut told).await;
+        assert!(matches!(first, sync::Event::Link(LinkFact::LinkBroken { .. })), "{first:?}");
     });
 }
 
