@@ -339,7 +339,7 @@ impl Sender {
     /// Sends memory that [`create_message`](Self::create_message) lent (the paper's SendMessage).
     ///
     /// # Errors
-    /// Nobody took it.
+    /// Nobody took it, or its kind is one of the layers' own.
     pub fn send_message(&self, buffer: MessageBuffer) -> Result<(), SendError> {
         self.dispatch(buffer.freeze()).map(drop)
     }

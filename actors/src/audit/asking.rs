@@ -214,26 +214,36 @@ pub(crate) fn receive(stores: &Arc<Stores>, from: NodeAddress, message: &Message
             "from {from}, more than {ANSWERS_MAX} questions for an audit in {PERIOD:?}, or of all more than {ANSWERS_ALL_MAX}"
         ))
     };
-    taken.inspect_err(|_| {
-        // One who cannot be told waits as long as he said.
-        let _ = say(stores, from, (Kind::SYNC_AUDIT, number), Bytes::new());
-    })
+    taken.inspect_err(|_| refuse(stores, from, number))
+}
+
+/// Tells who has asked that there will be no answer.
+fn refuse(stores: &Stores, to: NodeAddress, number: u64) {
+    // One who cannot be told waits as long as he said.
+    let _ = say(stores, to, (Kind::SYNC_AUDIT, number), Bytes::new());
 }
 
 /// What `from` says of itself.
 fn read(from: NodeAddress, answer: &Bytes) -> Result<NodeAudit, String> {
     if answer.is_empty() {
-        return Err(format!("{from} refuses the question; it answers {ANSWERS_MAX} in {PERIOD:?} at most"));
+        return Err(format!(
+            "{from} refuses the question: it answers {ANSWERS_MAX} in {PERIOD:?} at most, and none that has no room in \
+             `node.payload_max` bytes, nor in {ANSWER_BYTES_MAX}"
+        ));
     }
     let said = words::read(answer).map_err(|error| format!("from {from}, {error}"))?;
     if said.node == from { Ok(said) } else { Err(format!("from {from}, an audit of {}", said.node)) }
 }
 
-/// Answers a question of another node, which takes the longer the more places there are.
+/// Answers a question of another node, which takes the longer the more places there are, or refuses it.
 ///
 /// # Errors
 /// It was not answered; why, in words.
 pub(super) fn answer(stores: &Stores, to: NodeAddress, number: u64) -> Result<(), String> {
+    try_to_answer(stores, to, number).inspect_err(|_| refuse(stores, to, number))
+}
+
+fn try_to_answer(stores: &Stores, to: NodeAddress, number: u64) -> Result<(), String> {
     let (audit, mut bytes_max) = (reading::read(stores), stores.config.payload_max);
     loop {
         let bytes = words::write(&audit, bytes_max).ok_or("an audit has no room in an answer")?;
@@ -372,6 +382,12 @@ mod tests {
         assert!(receive(&stores, OTHER, &question).is_err());
         // Then
         assert_eq!(*lock(&other.said), [(Kind::SYNC_AUDIT, 7, Bytes::new())]);
+        // And: one that has no room for an answer
+        let no_room =
+            Stores::for_test(NodeConfig { payload_max: 8, ..NodeConfig::new("test") }, Incarnation(1));
+        let other_there = refusing(&no_room);
+        assert!(answer(&no_room, OTHER, 8).is_err());
+        assert_eq!(*lock(&other_there.said), [(Kind::SYNC_AUDIT, 8, Bytes::new())]);
         // And: at the other end
         let audit = audit(&stores, &BTreeSet::from([OTHER]), Duration::from_secs(3_600)).unwrap();
         assert_eq!((audit.silent, audit.nodes.len()), (vec![OTHER], 1));
