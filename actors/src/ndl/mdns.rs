@@ -7,8 +7,8 @@
 
 use std::{
     collections::HashMap,
-    fmt,
-    net::{IpAddr, SocketAddr},
+    fmt, io,
+    net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr},
     thread,
     time::Duration,
 };
@@ -17,11 +17,12 @@ use mdns_sd::{
     DaemonEvent, IfKind, Metrics, Receiver, ResolvedService, ScopedIp, ServiceDaemon, ServiceEvent,
     ServiceInfo,
 };
-use sinew_runtime::wire::fnv1a;
+use sinew_runtime::{time::Time, wire::fnv1a};
+use socket2::{Domain, Socket, Type};
 use tokio::sync::oneshot;
 
 use super::{address::seen_from, datagram::Announcement};
-use crate::nicer::give_way;
+use crate::{nicer::give_way, refusals::Refusals};
 
 /// The type of Sinew's service.
 pub(super) const SERVICE: &str = "_sinew._udp.local.";
@@ -86,6 +87,7 @@ impl Mdns {
 
     fn publish(port: u16, udp: SocketAddr, me: &Announcement) -> Result<Self, MdnsError> {
         let service = service(udp, me)?;
+        can_have(port, udp).map_err(|error| MdnsError::Msg(error.to_string()))?;
         let daemon = ServiceDaemon::new_with_port(port)?;
         let (fullname, project) = (service.get_fullname().to_owned(), me.project.clone());
         let mdns = Self { daemon, fullname, project, own: life(me), here: udp };
@@ -101,9 +103,28 @@ impl Mdns {
         self.daemon.browse(SERVICE)
     }
 
-    /// What the daemon has to say about itself.
+    /// What the daemon has to say about itself. The receiver ends with the daemon, which it can be had from no more then.
     pub(super) fn monitor(&self) -> Result<Receiver<DaemonEvent>, MdnsError> {
         self.daemon.monitor()
+    }
+
+    /// Waits until the daemon has ended, and counts what it says that failed meanwhile.
+    pub(super) async fn ended(&self) {
+        let failures = Refusals::default();
+        loop {
+            match self.monitor() {
+                Ok(events) => {
+                    while let Ok(event) = events.recv_async().await {
+                        if let DaemonEvent::Error(error) = event {
+                            failures.count(Time::now(), "mDNS reports a fault", &error);
+                        }
+                    }
+                }
+                Err(MdnsError::DaemonShutdown) => return,
+                Err(error) => failures.count(Time::now(), "mDNS says nothing of itself", &error),
+            }
+            tokio::time::sleep(LOOK_GAP).await;
+        }
     }
 
     /// Waits until mdns-sd keeps more than `most`. It is not asked again before it has answered: one that is flooded without a pause, or gets
@@ -165,6 +186,25 @@ async fn made(make: impl FnOnce() -> Result<Mdns, MdnsError> + Send + 'static) -
         "mDNS has not begun after {SLOW:?}: its thread, which gives way to others, gets no processor; see which thread takes it (`top -H`)"
     );
     given.await.unwrap_or_else(panicked)
+}
+
+/// Whether mdns-sd can have its socket, which is bound as it binds its own. It says nothing of one that it does not get, and runs on without.
+///
+/// # Errors
+/// Why it cannot.
+fn can_have(port: u16, here: SocketAddr) -> io::Result<()> {
+    let any = match here {
+        SocketAddr::V4(_) => IpAddr::from(Ipv4Addr::UNSPECIFIED),
+        SocketAddr::V6(_) => Ipv6Addr::UNSPECIFIED.into(),
+    };
+    let socket = Socket::new(Domain::for_address(here), Type::DGRAM, None)?;
+    if here.is_ipv6() {
+        socket.set_only_v6(true)?;
+    }
+    socket.set_reuse_address(true)?;
+    #[cfg(unix)]
+    socket.set_reuse_port(true)?;
+    socket.bind(&SocketAddr::new(any, port).into())
 }
 
 /// 127.0.0.0/8 is one interface with one address, whichever of its addresses the node has. Two interfaces may have one link-local address.
@@ -295,6 +335,27 @@ mod tests {
         open.send(()).unwrap();
         // then
         ends(&events);
+    }
+
+    #[test]
+    fn a_port_that_somebody_has_for_himself_is_said_not_to_be_had() {
+        let taken = UdpSocket::bind("0.0.0.0:0").unwrap();
+        let port = taken.local_addr().unwrap().port();
+        let error = publish(port).err().expect("it is taken").to_string();
+        assert!(error.contains("in use"), "{error}");
+        drop(taken);
+        assert!(publish(port).is_ok());
+    }
+
+    #[test]
+    fn that_the_daemon_has_ended_by_itself_is_seen() {
+        let mdns = started();
+        run(async {
+            let mut ended = Box::pin(mdns.ended());
+            assert!(ended.as_mut().now_or_never().is_none(), "it runs");
+            mdns.daemon.shutdown().unwrap();
+            tokio::time::timeout(WATCHDOG, ended).await.expect("waited 60 s for its end to be seen");
+        });
     }
 
     #[test]
