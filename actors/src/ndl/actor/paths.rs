@@ -125,7 +125,7 @@ impl Paths {
             if !is_wanted {
                 path.readers.iter().for_each(AbortHandle::abort);
                 stores::lock(&stores.ndl_sockets).close(path.local);
-                crate::log::info!(udp = %path.here, "NDL does not ask there any more: the address is gone");
+                crate::log::info!(udp = %path.here, "NDL does not ask there any more: the address is gone, or its socket of no use");
             }
             is_wanted
         });
@@ -287,12 +287,19 @@ impl Shell {
         let wanted = wanted(&stores.config.ndl.interface, usable, &self.paths.locals());
         let (readers, unopened) = self.paths.open(stores, &wanted);
         self.paths.say_unopened(stores.config.ndl.port, &unopened);
+        let mut watched = self.paths.locals();
         for reader in readers {
+            let local = reader.local;
             match self.reading(reader) {
                 Ok(task) => tasks.push(task),
-                Err(error) => crate::log::error!("NDL's socket cannot be watched: {error}"),
+                Err(error) => {
+                    crate::log::error!(%local, "NDL's socket cannot be watched, and is opened anew at the next look: {error}");
+                    watched.retain(|other| *other != local);
+                }
             }
         }
+        // What nobody reads would be asked from, and every answer lost.
+        self.paths.close_all_but(stores, &watched);
         self.paths.renew(stores);
         self.paths.say_what_is_missing(stores, usable);
         let here = self.paths.here();
@@ -329,7 +336,6 @@ impl MdnsAt {
             is_there
         });
         for at in here {
-            // Where it does not start, that is said, and tried again only when the path is back.
             self.0.entry(at).or_insert_with(|| {
                 let (task, handle) = abortable(speak_mdns(shell.clone(), at));
                 tasks.push(task.map(drop).boxed_local());
