@@ -119,6 +119,24 @@ fn the_linked_life_of_a_node_is_heard_also_after_a_younger_double_of_it_has_spok
     assert!(outputs.contains(&answered(7, BarrierAnswer::Opened { generation: 1 })), "{outputs:?}");
 }
 
+// spec: SYNC-11
+#[test]
+fn what_a_nodes_new_life_did_not_take_is_said_again_also_where_its_former_one_is_lost_meanwhile() {
+    let mut bench = Bench::of_the_hip();
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("knee", true, &[])]));
+    bench.arrives("calibrated", 7);
+    bench.breaks(KNEE);
+    bench.links(KNEE, NEXT_LIFE);
+    bench.hears(Input::ArrivalsNotTaken { to: KNEE });
+    bench.lost(KNEE, LossReason::Restarted);
+    let outputs = bench.passes(RETRY);
+    assert!(
+        outputs.iter().any(|output| matches!(output, Output::PublishArrivals { to: KNEE, .. })),
+        "{outputs:?}"
+    );
+}
+
 #[test]
 fn the_end_of_a_double_that_is_linked_with_nobody_any_more_is_no_loss_of_the_node() {
     let mut bench = Bench::of_the_hip();

@@ -38,10 +38,11 @@ impl Voices {
         self.0.entry(node).or_default().due = has_news.then_some(now);
     }
 
-    /// What `node` said does not count before it says it again.
+    /// What `node` said does not count before it says it again. Our word is due there as before: it may be linked, in a life of which nothing
+    /// was heard yet.
     pub(super) fn silent(&mut self, node: NodeAddress) {
         if let Some(voice) = self.0.get_mut(&node) {
-            (voice.heard, voice.due) = (false, None);
+            voice.heard = false;
         }
     }
 
