@@ -5,7 +5,7 @@ use std::{
     sync::mpsc::{Receiver, SyncSender, sync_channel},
 };
 
-use sinew::{Rejection, SendError, prelude::*};
+use sinew::{Rejection, SendError, StartError, prelude::*};
 use sinew_tests::{DEADLINE, own_group};
 
 payload!("messages.question", Control => struct Question { number: u64 });
@@ -288,6 +288,28 @@ fn requirements_in_a_circle_are_refused_with_the_circle_spelled_out() {
         words.contains("first -> second -> first") || words.contains("second -> first -> second"),
         "{words}"
     );
+}
+
+#[test]
+fn a_circle_that_was_opened_on_another_node_is_told_of_no_more() {
+    // Given: two nodes whose applications require each other
+    let group = own_group();
+    let oracle = |name: &str| oracle(name).0;
+    let here =
+        node("here", 1, group).app(oracle("hip").requires(["knee"])).start().expect("the layers start");
+    let there =
+        node("there", 2, group).app(oracle("knee").requires(["hip"])).start().expect("the layers start");
+    let error = here.handle().wait_until_running(DEADLINE).expect_err("nobody can be the first");
+    assert!(matches!(error, StartError::Cycle(_)), "{error}");
+    // When: the other one requires it no more
+    there.handle().stop_app("knee").expect("it is there");
+    there.handle().remove_app("knee").expect("it has stopped");
+    there.handle().add_app(oracle("knee"), None).expect("its name is free");
+    here.handle().wait_until_running(DEADLINE).expect("both run");
+    // Then: who waits is not told of the circle
+    here.handle().add_app(oracle("late").requires(["never"]), None).expect("its name is free");
+    let error = here.handle().wait_until_running(Duration::from_millis(50)).expect_err("it waits");
+    assert!(matches!(error, StartError::Waiting { .. }), "{error}");
 }
 
 #[test]

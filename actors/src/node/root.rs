@@ -40,7 +40,10 @@ use super::{
     supervisor_spec::{Member, SupervisorSpec},
     wind_up::{self, Branch, Heirs},
 };
-use crate::{lncl, process, stores::Stores};
+use crate::{
+    lncl, process,
+    stores::{Stores, lock},
+};
 
 /// Confirmed messages and requests of one application under way at most.
 pub(crate) const WAITS_MAX: usize = 1_024;
@@ -410,8 +413,11 @@ impl Root {
             Phase::StoppingApps | Phase::StoppingLayers => return self.tell_when_running.clear(),
         }
         let is_running = self.app_supervisor.is_some() && self.apps.all_run();
-        // Once one of them is removed, the circle is open.
-        self.cycle.take_if(|cycle| !cycle.ours.iter().all(|id| self.apps.contains(*id)));
+        // Once one of them is removed, here or elsewhere, or requires less, the circle is open.
+        self.cycle.take_if(|cycle| {
+            !cycle.ours.iter().all(|id| self.apps.contains(*id))
+                || !lock(&self.stores.sync).has_cycle(&cycle.names)
+        });
         if is_running || self.cycle.is_some() {
             for asker in self.tell_when_running.drain(..) {
                 asker.answer(match &self.cycle {

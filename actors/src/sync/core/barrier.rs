@@ -17,7 +17,7 @@ use super::{
     cycles::Graph,
     respite::Moment,
 };
-use crate::sync::facts::Waiting;
+use crate::sync::facts::{Absence, Waiting};
 
 /// Time for which a requirement may be out of hearing, its node not lost, before a running application is told. A layer that is
 /// restarted, here or there, is heard of again within a few milliseconds; the application behind it has not stopped meanwhile.
@@ -98,8 +98,31 @@ impl Core {
     pub(super) fn wait_of(&self, now: Time, address: AppAddress) -> Option<Waiting> {
         let app = self.apps.get(address)?;
         let since = app.wait()?.since;
-        let missing = app.requires.iter().flat_map(|requirement| self.absences(now, address, requirement));
+        let missing = app.requires.iter().flat_map(|requirement| {
+            let absences = self.absences(now, address, requirement);
+            if absences.is_empty() {
+                self.held_by_circle(now.since(since), app, requirement)
+            } else {
+                absences
+            }
+        });
         Some(Waiting { application: app.title(address), missing: missing.collect(), since: now.since(since) })
+    }
+
+    /// Of a requirement that is met, as whoever it names runs by chance: why `app` is held all the same. spec: SYNC-7
+    fn held_by_circle(&self, since: Duration, app: &App, requirement: &Requirement) -> Vec<Absence> {
+        let Some(own) = app.name.as_deref() else { return Vec::new() };
+        let has = |circle: &Vec<String>, name: &str| circle.iter().any(|other| other == name);
+        let names = requirement
+            .alternatives()
+            .iter()
+            .filter(|name| self.cycles.iter().any(|circle| has(circle, own) && has(circle, name)));
+        names.map(|name| Absence { name: name.clone(), why: Reason::Cycle.words().into(), since }).collect()
+    }
+
+    /// Whether such a circle stands, spelled as [`Output::Cycle`] spells it.
+    pub(crate) fn has_cycle(&self, closed: &[String]) -> bool {
+        closed.split_last().is_some_and(|(_, names)| self.cycles.contains(names))
     }
 
     /// Reports who has waited for its deadline, and each time that it passes again. spec: SYNC-9

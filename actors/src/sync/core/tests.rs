@@ -357,7 +357,11 @@ fn a_cycle_through_two_nodes_is_seen() {
         [],
         "refused, even where it runs by chance"
     );
+    assert_eq!(bench.missing(), [("knee".to_owned(), "part of a cycle of requirements")]);
+    let names = ["hip", "knee", "hip"].map(str::to_owned);
+    assert!(bench.core.has_cycle(&names));
     assert_eq!(bench.list(KNEE, list(3, &[("knee", true, &[])])), [release(0)]);
+    assert!(!bench.core.has_cycle(&names));
 }
 
 // spec: SYNC-2
