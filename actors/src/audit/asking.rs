@@ -1,12 +1,13 @@
 //! Asks other nodes, and answers them. Not for who holds a lock of the node's.
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::{BTreeMap, BTreeSet, VecDeque},
     sync::{
         Arc, Mutex,
         atomic::{AtomicUsize, Ordering},
         mpsc::{Receiver, SyncSender, sync_channel},
     },
+    thread,
     time::Duration,
 };
 
@@ -33,6 +34,9 @@ const ANSWERS_MAX: u32 = 16;
 /// All of them together so often: an answer of a node with many applications takes a CPU for milliseconds.
 const ANSWERS_ALL_MAX: u32 = 64;
 const PERIOD: Duration = Duration::from_secs(1);
+/// This node asks so often in [`PERIOD`], and waits for its turn else. Half as often as it is answered: questions that wait on the way come
+/// closer to each other than they were asked, those of two periods in one at the worst.
+const ASKS_MAX: usize = 8;
 /// Bytes at most of answers that nobody has read yet, to all questions together. What finds no room is not kept, and its node counts as silent.
 const UNREAD_BYTES_MAX: usize = 16 << 20;
 /// Of a node whose longest payload is shorter than an answer: it is tried with half so many bytes, down to this.
@@ -53,6 +57,8 @@ struct Open {
     /// Number of the last question.
     last: u64,
     open: BTreeMap<u64, Question>,
+    /// When it was asked within the last [`PERIOD`], in turn.
+    asked: VecDeque<Time>,
     /// Who asked lately: since when, and how often it was answered. Of each node that is linked one at most.
     askers: BTreeMap<NodeAddress, (Time, u32)>,
 }
@@ -94,7 +100,7 @@ impl Drop for Share {
     }
 }
 
-/// Too many questions are open.
+/// Too many questions are open, or were asked lately for one more within its time.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct TooManyQuestions;
 
@@ -110,6 +116,24 @@ impl Questions {
         let (answers, answered) = sync_channel(awaited.len());
         questions.open.insert(number, Question { awaited, answers });
         Ok((number, answered))
+    }
+
+    /// Takes a turn to ask at `now`.
+    ///
+    /// # Errors
+    /// When there is one.
+    fn turn(&self, now: Time) -> Result<(), Time> {
+        let asked = &mut lock(&self.open).asked;
+        while asked.front().is_some_and(|at| now.since(*at) >= PERIOD) {
+            asked.pop_front();
+        }
+        match asked.front() {
+            Some(first) if asked.len() >= ASKS_MAX => Err(*first + PERIOD),
+            Some(_) | None => {
+                asked.push_back(now);
+                Ok(())
+            }
+        }
     }
 
     fn close(&self, number: u64) {
@@ -172,14 +196,23 @@ pub(crate) fn audit(
     Ok(Audit::of_readings(stores.node, others, &before, after))
 }
 
-/// What the others say of themselves within this time.
+/// What the others say of themselves within this time, and the wait for a turn to ask them.
 fn ask(
     stores: &Stores,
     others: &BTreeSet<NodeAddress>,
     within: Duration,
 ) -> Result<Vec<NodeAudit>, TooManyQuestions> {
-    let (number, answered) = stores.questions.open(others.clone())?;
+    if others.is_empty() {
+        return Ok(Vec::new());
+    }
     let began = Time::now();
+    while let Err(at) = stores.questions.turn(Time::now()) {
+        if at.since(began) >= within {
+            return Err(TooManyQuestions);
+        }
+        thread::sleep(at.since(Time::now()));
+    }
+    let (number, answered) = stores.questions.open(others.clone())?;
     // One that cannot be sent to does not answer.
     let sent =
         |other: &&NodeAddress| say(stores, **other, (Kind::SYNC_AUDIT_ASK, number), Bytes::new()).is_ok();
@@ -296,6 +329,28 @@ mod tests {
         assert!(!questions.admits(OTHER, begin));
         assert!(questions.admits(NodeAddress::new(3), begin), "others are");
         assert!(questions.admits(OTHER, begin + PERIOD));
+    }
+
+    #[test]
+    fn who_asks_waits_for_his_turn_and_so_is_answered_each_time() {
+        let (here, there) = (Questions::default(), Questions::default());
+        let (mut now, mut asked) = (Time::ZERO + PERIOD, 0);
+        let end = now + 10 * PERIOD;
+        while now < end {
+            match here.turn(now) {
+                Ok(()) => {
+                    // Some wait on the way.
+                    let on_the_way = Duration::from_millis(333) * (asked % 3);
+                    assert!(there.admits(OTHER, now + on_the_way), "{asked}");
+                    asked += 1;
+                }
+                Err(at) => {
+                    assert!(at > now && at <= now + PERIOD);
+                    now = at;
+                }
+            }
+        }
+        assert_eq!(asked as usize, 10 * ASKS_MAX);
     }
 
     #[test]

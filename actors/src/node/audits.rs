@@ -11,8 +11,10 @@ pub enum AuditError {
     /// The node does not run.
     #[error("the node does not run")]
     NotRunning,
-    /// So many threads are at it already; wait for one of them.
-    #[error("too many audits of this node are under way; wait for one of them")]
+    /// So many threads are at it already, or were so lately that the turn of one more is behind its time; wait for one of them, or longer.
+    #[error(
+        "too many audits of this node are under way, or were within the last second; wait for one of them, or longer"
+    )]
     TooMany,
 }
 
@@ -29,10 +31,10 @@ impl NodeHandle {
     /// answered; half of it for the first answers. Not for an actor's handler, which it would hold up: for a thread of its own.
     ///
     /// It costs each node what [`audit_here`](Self::audit_here) costs, twice, and two messages of class Bulk. A node answers 8 audits
-    /// a second of each other one, and 32 of all together.
+    /// a second of each other one, and 32 of all together; this one asks for 4 a second at most, and the next one waits for its turn.
     ///
     /// # Errors
-    /// The node does not run, or too many threads are at it already.
+    /// The node does not run, too many threads are at it already, or it is no one's turn within this time.
     pub fn audit(&self, within: Duration) -> Result<Audit, AuditError> {
         if self.is_bystander || self.stores.stopping.load(Ordering::Relaxed) {
             return Err(AuditError::NotRunning);
