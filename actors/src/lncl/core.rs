@@ -125,6 +125,14 @@ pub enum RegisterError {
         /// The limit in force.
         limit: usize,
     },
+    /// The node has not looked yet at what was registered and given back before.
+    #[error(
+        "the node has {waiting} changes of applications to look at, and takes no further one before; register again in a moment"
+    )]
+    Busy {
+        /// Changes that wait.
+        waiting: usize,
+    },
     /// The process has as many addresses as one process may have.
     #[error(
         "process {pid} has {limit} addresses, which is the limit for one process; unregister some, or raise \

@@ -18,7 +18,7 @@ use super::{
 use crate::{
     monitors::{self, Cause},
     ndl::{self, NodeEvent},
-    stores::{Stores, lock},
+    stores::{POST_CAPACITY, Stores, lock},
     sync,
 };
 
@@ -108,8 +108,16 @@ pub(crate) fn set_member(stores: &Stores, app: AppAddress, group: AppAddress, me
     }
 }
 
+/// So many events wait for the sync manager where no further process is registered. What is told of those that are is told once, and must find
+/// room however fast somebody comes and goes.
+const REGISTRATIONS_BELOW: usize = POST_CAPACITY / 2;
+
 /// Gives an application of another process its address. No message reaches it before [`open`].
 pub(super) fn register_client(stores: &Stores, request: Request) -> Result<AppAddress, RegisterError> {
+    let waiting = stores.posts.sync.len();
+    if waiting >= REGISTRATIONS_BELOW {
+        return Err(RegisterError::Busy { waiting });
+    }
     let (name, requires) = (request.name.clone(), request.requires.clone());
     let handled = request.kinds.iter().map(|name| Kind::named(name)).collect();
     let mut registry = lock(&stores.registry);
@@ -206,7 +214,7 @@ mod tests {
     };
 
     use super::*;
-    use crate::{NodeConfig, stores::POST_CAPACITY};
+    use crate::NodeConfig;
 
     #[test]
     fn a_name_is_free_when_its_address_is_given_back_whenever_the_sync_manager_hears_of_it() {
@@ -248,6 +256,40 @@ mod tests {
         stores.groups_are_looked_at();
         set_member(&stores, app, group, false);
         assert_eq!(stores.posts.sync.len(), 2);
+    }
+
+    #[test]
+    fn nobody_is_registered_faster_than_the_sync_manager_looks_and_of_those_who_are_it_hears_all() {
+        // given: a sync manager that reads nothing for now
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let request = |pid| Request {
+            address: Address::Dynamic,
+            name: None,
+            requires: vec![],
+            kinds: vec![],
+            owner: Owner::Client { id: lock(&stores.registry).new_client(), pid },
+        };
+        // when: processes come and go
+        let mut come_and_gone = 0;
+        let refused = loop {
+            match register_client(&stores, request(come_and_gone)) {
+                Ok(app) => {
+                    tell(&stores, AppFact::Ready { app });
+                    lock(&stores.registry).unregister(app);
+                    forget(&stores, app, Cause::new(DownClass::Killed, LNCL_ENDED));
+                    come_and_gone += 1;
+                }
+                Err(why) => break why,
+            }
+            assert!(usize::try_from(come_and_gone).unwrap() < POST_CAPACITY, "nobody is refused");
+        };
+        // then
+        assert!(matches!(refused, RegisterError::Busy { .. }), "{refused}");
+        assert_eq!(
+            stores.posts.sync.len(),
+            usize::try_from(3 * come_and_gone).unwrap(),
+            "each change was told"
+        );
     }
 
     #[test]
