@@ -184,6 +184,20 @@ mod tests {
     }
 
     #[test]
+    fn what_arrived_in_a_session_that_the_other_end_has_forgotten_is_not_under_way() {
+        let mut nodes = pair((10, 12), 1);
+        nodes[1].sessions[0].receiving.memory = 77;
+        let to_b = Place::ToNode { node: B, class: None };
+        let account = Account { taken: 12, delivered: 10, unacknowledged: 2, ..Account::default() };
+        nodes[0].entries.push(Entry { place: to_b, account });
+        nodes[1].entries.push(from_a(1, 1));
+        let former = Account { taken: 10, delivered: 10, ..Account::default() };
+        nodes[1].entries.push(Entry { place: Place::FromFormerNodes, account: former });
+        let total = Audit::of(A, &nodes.clone(), nodes, Vec::new()).total();
+        assert_eq!((total.unacknowledged, total.unexplained()), (2, 0), "{total:?}");
+    }
+
+    #[test]
     fn a_message_that_got_lost_behind_a_link_names_its_place() {
         let mut nodes = pair((10, 10), 10);
         nodes[1].entries.push(from_a(9, 8));

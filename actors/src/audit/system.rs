@@ -127,7 +127,8 @@ impl Audit {
 
     /// What became of the messages of all nodes: each is counted where it is, and none twice for having come from another node.
     ///
-    /// Exact once nothing moves and as long as no session was begun anew: of what ended as unknown some may have arrived.
+    /// Exact once nothing moves and as long as no session was begun anew: of what ended as unknown some may have arrived, and what had arrived in
+    /// the former session is counted twice.
     #[must_use]
     pub fn total(&self) -> Account {
         self.nodes
@@ -145,7 +146,10 @@ impl Audit {
                 Some(to) => {
                     let there = to.account(&Place::FromNode { node: node.node, class: *class }).taken;
                     let sent = account.delivered.wrapping_add(account.unacknowledged);
-                    Account { delivered: 0, unacknowledged: sent.saturating_sub(there), ..account }
+                    let not_there = sent.saturating_sub(there);
+                    // What is known to have arrived is under way no more: the other one has begun a session anew, and counts it elsewhere.
+                    let unacknowledged = account.unacknowledged.min(not_there);
+                    Account { delivered: not_there - unacknowledged, unacknowledged, ..account }
                 }
                 None => account,
             },

@@ -11,7 +11,7 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::{Audit, Class};
+use sinew::{Audit, Class, audit::Place};
 
 use super::{
     CLASSES, Plan,
@@ -297,16 +297,21 @@ impl Pair {
         (verdict, network, audit)
     }
 
-    /// What both nodes say of all messages, once none waits or is under way but perhaps the audit's own question and answer. A value
-    /// that went by datagram, and whose place a newer one took, is under way until its time is over.
+    /// What both nodes say of all messages, once none waits but perhaps the audit's own question and answer, which are Bulk, and no value is
+    /// under way: one that went by datagram, and whose place a newer one took, is so until its time is over.
     fn audit_once_quiet(&mut self) -> Audit {
         const OWN: u64 = 2;
         let first = self.member(FIRST);
         let end = Instant::now() + DEADLINE;
         loop {
             let audit: Audit = serde_json::from_str(&first.ask("audit")).expect("an audit");
-            let total = audit.total();
-            if audit.nodes.len() == 2 && total.waiting <= OWN && total.unacknowledged == 0 {
+            let values = audit
+                .nodes
+                .iter()
+                .flat_map(|node| &node.entries)
+                .filter(|entry| matches!(entry.place, Place::ToNode { class: Some(Class::Stream), .. }));
+            let values: u64 = values.map(|entry| entry.account.unacknowledged).sum();
+            if audit.nodes.len() == 2 && audit.total().waiting <= OWN && values == 0 {
                 return audit;
             }
             assert!(
