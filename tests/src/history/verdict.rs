@@ -192,15 +192,18 @@ impl Judge {
         source_was_killed: bool,
         last_killed: u32,
     ) {
-        let mut excuses = flow.excuses(last_killed);
-        for (first, last) in flow.holes(end) {
+        let (mut excuses, holes) = (flow.excuses(last_killed), flow.holes(end));
+        let had = format!("{excuses:?}");
+        for &(first, last) in &holes {
             let count = (first..=last).filter(|n| !flow.has_come(*n) && !flow.is_told(*n)).count() as u64;
             if path.class == Class::Stream && flow.last_got() > last {
                 self.0.superseded += count;
             } else if source_was_killed && last == end || excuses.take(flow, first) {
                 self.0.lost_with_node += count;
             } else {
-                let more = format!("to {last}; {count} in a row of {end}; {excuses:?} left");
+                let more = format!(
+                    "to {last}; {count} in a row of {end}; {excuses:?} left of {had} for the rows {holes:?}"
+                );
                 self.fault(path, Fault::Lost, first, more);
                 *self.0.faults.entry(Fault::Lost).or_default() += count - 1;
             }
