@@ -269,6 +269,11 @@ impl Peer {
 
 impl Outlet for Peer {
     fn submit(&self, message: Message) -> Result<(), Refused> {
+        // Who has been told that it is lost has nothing taken that nobody would hear of: GNCL itself is told at the same time, and may act later.
+        // SYNC: Acquire, see `fence`.
+        if self.is_over.load(Ordering::Acquire) {
+            return Err(Refused::new(message, Rejection::NoSuchNode));
+        }
         let has_a_time = message.header.time_to_live_us != 0 || message.receipt.is_some();
         let way = self.way_of(message.header.class);
         match &self.channel {

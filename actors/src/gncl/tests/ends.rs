@@ -4,6 +4,7 @@ use bytes::Bytes;
 use futures_util::{FutureExt as _, StreamExt as _};
 use sinew_runtime::{
     mailbox::About,
+    outcome::Rejection,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
     wire::{Header, Kind, Message},
@@ -60,6 +61,9 @@ fn of_a_life_that_is_over_nothing_more_is_taken() {
         peer.say(&from_nine(&node, b"too late")).await;
         has_read(&mut peer, &node).await;
         assert!(inbox.next().now_or_never().is_none());
+        // Nor is anything taken for it, though GNCL has not heard of its end.
+        let sent = node.stores.router.send(node.message(Tid::new(NINE, AppAddress::new(1)), b"for nobody"));
+        assert_eq!(sent, Err(Rejection::NoSuchNode));
     });
 }
 
