@@ -6,7 +6,7 @@ use std::{
 };
 
 use sinew::{Rejection, SendError, StartError, prelude::*};
-use sinew_tests::{DEADLINE, own_group};
+use sinew_tests::{DEADLINE, own_group, until};
 
 payload!("messages.question", Control => struct Question { number: u64 });
 payload!("messages.answer", Control => struct Answer { number: u64 });
@@ -305,7 +305,8 @@ fn a_circle_that_was_opened_on_another_node_is_told_of_no_more() {
     there.handle().stop_app("knee").expect("it is there");
     there.handle().remove_app("knee").expect("it has stopped");
     there.handle().add_app(oracle("knee"), None).expect("its name is free");
-    here.handle().wait_until_running(DEADLINE).expect("both run");
+    // Until `here` has heard of that the circle stands, as far as it knows.
+    until("both run", || here.handle().wait_until_running(DEADLINE).ok());
     // Then: who waits is not told of the circle
     here.handle().add_app(oracle("late").requires(["never"]), None).expect("its name is free");
     let error = here.handle().wait_until_running(Duration::from_millis(50)).expect_err("it waits");
