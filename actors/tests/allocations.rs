@@ -37,7 +37,7 @@ const WARM_UP: usize = 20;
 /// own work now and then: in most of the windows they have none.
 const WINDOW: usize = 200;
 /// Windows that are counted.
-const WINDOWS: usize = 60;
+const WINDOWS: usize = 30;
 /// Messages of a part of a window. Where others take the CPUs a window lasts so long that the layers, whose work goes by time and comes at once,
 /// do some in most of them; in most parts they do none.
 const PART: usize = 20;
