@@ -47,6 +47,7 @@ pub mod inspect;
 #[cfg(all(test, target_os = "linux"))]
 mod lingering;
 mod lncl;
+mod log_quotas;
 mod monitors;
 mod ndl;
 mod nicer;

@@ -20,7 +20,7 @@ use tokio::sync::watch;
 
 use crate::{
     access::Access, aftermath::Aftermath, audit, clocks::ClockOffsets, config::NodeConfig, gncl, lncl,
-    monitors, ndl, node, refusals::Refusals, secured::Secured, sync, wills,
+    log_quotas::LogQuotas, monitors, ndl, node, refusals::Refusals, secured::Secured, sync, wills,
 };
 
 /// What the layers of one node share.
@@ -76,6 +76,8 @@ pub(crate) struct Stores {
     groups_told: AtomicBool,
     /// Where messages are counted, beside GNCL's peers.
     pub(crate) book: audit::Book,
+    /// How many lines others may cause in the log.
+    pub(crate) log_quotas: LogQuotas,
     /// Who was asked for an audit, and who has asked.
     pub(crate) questions: audit::Questions,
     /// Who watches whom.
@@ -127,6 +129,7 @@ impl Stores {
             book: audit::Book::default(),
             questions: audit::Questions::default(),
             monitors: Mutex::new(monitors::Core::new(
+            log_quotas: LogQuotas::default(),
                 node,
                 incarnation,
                 config.ndl.nodes_max,

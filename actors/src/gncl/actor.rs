@@ -262,8 +262,10 @@ impl Gncl {
         }
     }
 
-    fn tell(&self, fact: LinkFact) {
-        crate::log::info!(?fact, "link");
+    fn tell(&mut self, fact: LinkFact, ctx: &mut Context<Self>) {
+        if let Some(suppressed) = self.stores.log_quotas.links.take(Time::now()) {
+            crate::log::info!(?fact, suppressed, "link");
+        }
         self.stores.gncl.notes.fact(Time::now(), &fact);
         if let LinkFact::PeerLeft { node, incarnation } = fact {
             self.stores.gncl.leaves(Time::now(), node, incarnation);

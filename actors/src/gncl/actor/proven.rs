@@ -34,8 +34,10 @@ impl Gncl {
 
     /// The connection is there, and `peer` at its other end, where that is asked.
     pub(super) fn proven(&mut self, connection: ConnectionId, transport: Transport, peer: Option<&Peer>) {
-        if let Some(warning) = peer.and_then(Peer::warning) {
-            crate::log::warn!("{warning}");
+        if let Some(warning) = peer.and_then(Peer::warning)
+            && let Some(suppressed) = self.stores.log_quotas.times.take(Time::now())
+        {
+            crate::log::warn!(suppressed, "{warning}");
         }
         if let Some(wire) = self.wires.get_mut(&connection) {
             wire.transport = Some(transport);

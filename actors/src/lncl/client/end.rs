@@ -171,7 +171,10 @@ impl Client {
     }
 
     fn log(&self, what: &str) {
-        crate::log::info!(tid = %self.tid, name = self.name, pid = self.peer.pid, "an application of another process {what}");
+        if let Some(suppressed) = self.server.stores.log_quotas.clients.take(Time::now()) {
+            let (tid, name, pid) = (self.tid, &self.name, self.peer.pid);
+            crate::log::info!(%tid, name, pid, suppressed, "an application of another process {what}");
+        }
     }
 }
 

@@ -39,7 +39,9 @@ impl Shell {
         if let MembershipFact::NodeLost { node, incarnation, .. } = *fact {
             self.stores.untold.is_fenced(node, incarnation);
         }
-        crate::log::info!(?fact, "membership");
+        if let Some(suppressed) = self.stores.log_quotas.members.take(Time::now()) {
+            crate::log::info!(?fact, suppressed, "membership");
+        }
         self.tell();
     }
 
