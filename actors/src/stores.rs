@@ -64,6 +64,8 @@ pub(crate) struct Stores {
     pub(crate) ndl: Mutex<ndl::Core>,
     /// What other layers have not been told of that, because their posts were full.
     pub(crate) untold: ndl::Untold,
+    /// The same of links.
+    pub(crate) untold_of_links: gncl::Untold,
     /// Where other processes come in.
     pub(crate) door: lncl::Door,
     /// Who is registered on this node.
@@ -121,6 +123,7 @@ impl Stores {
             aftermath: Aftermath::default(),
             ndl: Mutex::new(ndl::new_core(&config, node, incarnation)),
             untold: ndl::Untold::new(config.ndl.nodes_max),
+            untold_of_links: gncl::Untold::new(config.ndl.nodes_max),
             door: lncl::Door::default(),
             registry: Mutex::new(lncl::Registry::counting_links_from(RandomState::new().hash_one(()))),
             directory_changes: watch::Sender::default(),

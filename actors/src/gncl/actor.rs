@@ -21,7 +21,6 @@ use std::{
 
 use actix::{Actor, ActorFutureExt, AsyncContext, Context, Running, SpawnHandle, StreamHandler, fut};
 use sinew_runtime::{
-    post::Post,
     supervision::ReadyGate,
     tid::NodeAddress,
     time::Time,
@@ -47,14 +46,15 @@ use super::{
 };
 use crate::{
     config::NodeConfig,
-    ndl,
     outlet::Gathering,
     stores::{Stores, lock},
-    sync,
 };
 pub(crate) use leaving::LINGER;
 use proven::NOT_PROVEN;
 use wire::Wire;
+
+/// Time until a layer whose post was full is offered again what it had no room for.
+const RETRY: Duration = Duration::from_millis(10);
 
 /// GNCL's actor.
 pub(crate) struct Gncl {
@@ -66,6 +66,8 @@ pub(crate) struct Gncl {
     /// How peers prove who they are; `None`: they do not.
     secure: Option<Arc<Secure>>,
     alarm: Option<(Time, SpawnHandle)>,
+    /// A layer is to be told again what it had no room for.
+    tells_again: bool,
     /// When it goes, whoever has not hung up; set once the node is being stopped.
     goes_at: Option<Time>,
 }
@@ -76,8 +78,17 @@ impl Gncl {
         let seed = Time::now().as_nanos() ^ u64::from(stores.node.bits());
         let core = Core::new(settings(&stores), seed);
         let spin = Arc::new(Spin::new(stores.config.gncl.spin));
-        let wires = BTreeMap::new();
-        Self { stores, ready: Some(ready), core, wires, spin, secure: None, alarm: None, goes_at: None }
+        Self {
+            stores,
+            ready: Some(ready),
+            core,
+            wires: BTreeMap::new(),
+            spin,
+            secure: None,
+            alarm: None,
+            tells_again: false,
+            goes_at: None,
+        }
     }
 
     /// Whether the node is being stopped.
@@ -270,14 +281,21 @@ impl Gncl {
         if let LinkFact::PeerLeft { node, incarnation } = fact {
             self.stores.gncl.leaves(Time::now(), node, incarnation);
         }
-        self.post(&self.stores.posts.ndl, ndl::Event::Link(fact));
-        self.post(&self.stores.posts.sync, sync::Event::Link(fact));
+        self.stores.untold_of_links.note(fact);
+        self.tell_the_rest(ctx);
     }
 
-    fn post<E>(&self, post: &Post<E>, event: E) {
-        if post.post(event).is_err() {
-            let detail = "a layer does not read its events; a link's state was not told to it";
-            self.stores.gncl.refusals.count(Time::now(), "post full", &detail);
+    /// Tells other layers what they have not been told yet, until they have room for all of it.
+    fn tell_the_rest(&mut self, ctx: &mut Context<Self>) {
+        let Some(layer) = self.stores.untold_of_links.offer(&self.stores.posts) else { return };
+        let what = format_args!("{layer} does not read its events: it is told later which links stand");
+        self.stores.gncl.refusals.count(Time::now(), "a layer's post is full", &what);
+        if !self.tells_again {
+            self.tells_again = true;
+            ctx.run_later(RETRY, |actor, ctx| {
+                actor.tells_again = false;
+                actor.tell_the_rest(ctx);
+            });
         }
     }
 
@@ -324,13 +342,13 @@ impl Gncl {
         }
     }
 
-    /// The links of a former instance are down until this one has them back, which the network may not let it. NDL looks for itself when it
-    /// starts, which it does behind this layer; the sync manager, with its monitors and wills, has lived on.
-    fn tell_what_was_cut(&self) {
-        for peer in self.stores.gncl.peers() {
-            let fact = LinkFact::LinkBroken { node: peer.node, incarnation: peer.incarnation };
-            self.post(&self.stores.posts.sync, sync::Event::Link(fact));
-        }
+    /// What a former instance has connected is down.
+    fn tell_what_was_cut(&mut self, ctx: &mut Context<Self>) {
+        let peers = self.stores.gncl.peers();
+        let broken =
+            peers.iter().map(|peer| LinkFact::LinkBroken { node: peer.node, incarnation: peer.incarnation });
+        self.stores.untold_of_links.links_are_cut(broken);
+        self.tell_the_rest(ctx);
     }
 }
 
@@ -384,7 +402,7 @@ impl Actor for Gncl {
             .listen()
             .unwrap_or_else(|error| panic!("{}", listener::why_not(&self.stores.config, &error)));
         self.cut_all();
-        self.tell_what_was_cut();
+        self.tell_what_was_cut(ctx);
         self.catch_up(ctx);
         let pace = Rc::new(RefCell::new(Pace::new(Time::now())));
         for listener in listeners {

@@ -35,6 +35,7 @@
 //! | `courtesy.rs` | when that thread gives its CPU away |
 //! | `arrivals.rs` | what became of what came, counted |
 //! | `inbound.rs` | what is checked before a frame becomes a message of this node |
+//! | `untold.rs` | what other layers have not been told of links, because their posts were full |
 //! | `proofs.rs` | with which certificate each node was linked last |
 //! | `stream_way.rs` | how much of class Stream goes by datagram, for whoever asks |
 //! | `datagrams/` | values of class Stream by UDP, where they get through |
@@ -74,12 +75,14 @@ mod task;
 mod tests;
 mod ticks;
 mod transport;
+mod untold;
 mod way;
 
 pub(crate) use actor::{Gncl, LINGER};
 pub(crate) use facts::LinkFact;
 pub(crate) use peer::{Peer, Store};
 pub(crate) use stream_way::{ByDatagram, by_datagram};
+pub(crate) use untold::Untold;
 pub(crate) use way::{Arrived, WayAccount};
 
 use std::net::SocketAddr;

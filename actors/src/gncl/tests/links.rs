@@ -288,6 +288,27 @@ fn the_sync_manager_hears_that_the_links_of_a_former_layer_are_down() {
 }
 
 #[test]
+fn a_layer_whose_post_was_full_hears_later_that_a_link_stands() {
+    run(async {
+        // given: a sync manager that reads nothing
+        let (mut a, b) = (Node::start(1).await, Node::start(2).await);
+        while a.stores.posts.sync.post(sync::Event::Monitors).is_ok() {}
+        // when
+        a.find(b.address(), b.listens_at());
+        a.up().await;
+        a.counted("a layer's post is full").await;
+        // then
+        let mut told = Box::pin(a.stores.posts.sync.attach());
+        let fact = loop {
+            if let sync::Event::Link(fact) = next("what the sync manager is told", &mut told).await {
+                break fact;
+            }
+        };
+        assert!(matches!(fact, LinkFact::LinkUp { node, .. } if node == b.address()), "{fact:?}");
+    });
+}
+
+#[test]
 fn both_ends_of_a_connection_give_it_up_when_nothing_is_taken_any_more() {
     run(async {
         let give_up = Duration::from_millis(1_234);
