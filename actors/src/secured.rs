@@ -19,8 +19,8 @@ use sinew_runtime::{
 use crate::{
     config::NodeConfig,
     security::{
-        Checker, CredentialFaults, Credentials, DiscoveryKey, Identity, Sealer, Serial, Stamp, Tag, Tls,
-        Validity, Verdict,
+        Checker, CredentialFaults, Credentials, DiscoveryKey, Identity, Sealer, Serial, Stamp, Tag,
+        TimePolicy, Tls, Validity, Verdict,
     },
     stores::lock,
 };
@@ -33,6 +33,7 @@ pub(crate) struct Secured {
     pub(crate) tls: Tls,
     /// From when until when the node's own certificate counts.
     pub(crate) validity: Validity,
+    times: TimePolicy,
     seals: Mutex<Seals>,
     /// Where its files are.
     directory: PathBuf,
@@ -124,8 +125,13 @@ impl Secured {
         let nodes_max = NonZeroUsize::new(nodes_max).unwrap_or(NonZeroUsize::MIN);
         let seals = Seals::new(key, &identity.project, identity.address, incarnation, nodes_max);
         let (directory, serial) = (credentials.directory().to_owned(), credentials.serial().clone());
-        let (validity, seals) = (credentials.validity(), Mutex::new(seals));
-        Self { tls, validity, seals, directory, serial, reading: Mutex::default() }
+        let (validity, times, seals) = (credentials.validity(), credentials.policy(), Mutex::new(seals));
+        Self { tls, validity, times, seals, directory, serial, reading: Mutex::default() }
+    }
+
+    /// What is to be said of the times of this node's own certificate at `now`, and whether that has ended.
+    pub(crate) fn warning(&self, now: UnixTime) -> Option<(String, bool)> {
+        Some((self.times.warning(self.validity, now)?, now > self.validity.until))
     }
 
     /// Reads the deny list again and puts it in force, for every handshake and every HELLO from now on. Connections that stand end when

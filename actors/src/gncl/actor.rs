@@ -138,7 +138,7 @@ impl Gncl {
                 self.stores.router.remove_peer(node);
                 self.stores.gncl.forget(node);
             }
-            Output::Fact(fact) => self.tell(fact),
+            Output::Fact(fact) => self.tell(fact, ctx),
             Output::Count { cause, detail } => self.stores.gncl.refusals.count(Time::now(), cause, &detail),
         }
     }
@@ -398,6 +398,7 @@ impl Actor for Gncl {
 
     fn started(&mut self, ctx: &mut Context<Self>) {
         self.begin_to_prove();
+        self.mind_the_times(ctx);
         let listeners = self
             .listen()
             .unwrap_or_else(|error| panic!("{}", listener::why_not(&self.stores.config, &error)));

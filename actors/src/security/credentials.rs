@@ -15,7 +15,7 @@ use webpki::KeyUsage;
 
 use super::{
     Certificate, DenyList, DenyListFault, DiscoveryKey, Identity, Malformed, Serial, TimeFault, TimePolicy,
-    Validity, date,
+    Validity,
     files::{self, FileFault},
     tls,
     verifier::{self, Believed},
@@ -123,9 +123,6 @@ pub enum CredentialFault {
     },
 }
 
-/// Time before a certificate's end from which on a node says so, in seconds: 30 days.
-const LAST_DAYS: u64 = 30 * 24 * 3_600;
-
 impl Credentials {
     /// Reads the files of the node `configured` in `directory` (see [`files`]), and checks at the time `now` that they are protected, fit
     /// together, are this node's, and count.
@@ -171,7 +168,8 @@ impl Credentials {
         if !faults.is_empty() {
             return Err(CredentialFaults(faults));
         }
-        credentials.warnings = credentials.warnings_at(now);
+        credentials.warnings =
+            credentials.policy().warning(credentials.certificate.validity(), now).into_iter().collect();
         Ok(credentials)
     }
 
@@ -209,29 +207,10 @@ impl Credentials {
         }
     }
 
-    fn warnings_at(&self, now: UnixTime) -> Vec<String> {
-        let Believed { policy, floor, .. } = &self.believed;
-        let until = self.certificate.validity().until;
-        let mut warnings = Vec::new();
-        if *policy == TimePolicy::Ignored {
-            warnings.push(
-                "the times of certificates are not looked at (security.times = \"ignored\"): only the deny list ends one"
-                    .to_owned(),
-            );
-        } else if now < *floor {
-            warnings.push(format!(
-                "the clock says {}, but this node's certificate was made on {}: the clock is not set. Until it is, other \
-                 nodes' certificates count that had not ended on that day",
-                date(&now),
-                date(floor)
-            ));
-        } else if until.as_secs().saturating_sub(now.as_secs()) < LAST_DAYS {
-            warnings.push(format!(
-                "this node's certificate ends on {}, and then no other node takes it: make a new one with `sinew keys issue`",
-                date(&until)
-            ));
-        }
-        warnings
+    /// When certificates count here.
+    #[must_use]
+    pub const fn policy(&self) -> TimePolicy {
+        self.believed.policy
     }
 
     /// Reads the deny list in `directory` again, as [`load`](Self::load) does.

@@ -104,6 +104,43 @@ impl TimePolicy {
     }
 }
 
+/// Time before a certificate's end from which on a node says so, in seconds: 30 days.
+const LAST_DAYS: u64 = 30 * 24 * 3_600;
+
+impl TimePolicy {
+    /// What a node should say of the times of its `own` certificate at `now`: the clock is not set, times are not looked at, it ends soon or
+    /// has ended.
+    #[must_use]
+    pub fn warning(self, own: Validity, now: UnixTime) -> Option<String> {
+        let Validity { from: floor, until } = own;
+        if self == Self::Ignored {
+            let said = "the times of certificates are not looked at (security.times = \"ignored\"): only the deny list ends one";
+            return Some(said.to_owned());
+        }
+        if now < floor {
+            return Some(format!(
+                "the clock says {}, but this node's certificate was made on {}: the clock is not set. Until it is, other \
+                 nodes' certificates count that had not ended on that day",
+                date(&now),
+                date(&floor)
+            ));
+        }
+        if now > until {
+            return Some(format!(
+                "this node's certificate has ended, on {}: links that stand are left alone, and one that breaks does not come back, as no \
+                 other node takes it. Make a new one with `sinew keys issue`, and start the node with it",
+                date(&until)
+            ));
+        }
+        (until.as_secs() - now.as_secs() < LAST_DAYS).then(|| {
+            format!(
+                "this node's certificate ends on {}, and then no other node takes it: make a new one with `sinew keys issue`",
+                date(&until)
+            )
+        })
+    }
+}
+
 impl std::str::FromStr for TimePolicy {
     type Err = ();
 
@@ -182,6 +219,20 @@ mod tests {
         for part in ["1970-01-01T00:00:12Z", "2023-11-14T22:13:20Z", "set it", "until-set"] {
             assert!(words.contains(part), "{words}");
         }
+    }
+
+    #[test]
+    fn a_node_that_runs_on_says_that_its_certificate_ends_and_that_it_has_ended() {
+        let until = 100 * 24 * 3_600;
+        let said =
+            |policy: TimePolicy, now| policy.warning(validity(1_000, until), at(now)).unwrap_or_default();
+        for policy in [TimePolicy::Strict, TimePolicy::UntilSet] {
+            assert!(said(policy, 7).contains("the clock is not set"));
+            assert_eq!(said(policy, until - LAST_DAYS), "");
+            assert!(said(policy, until - LAST_DAYS + 1).contains("ends on 1970-04-11"));
+            assert!(said(policy, until + 1).contains("has ended, on 1970-04-11"));
+        }
+        assert!(said(TimePolicy::Ignored, until + 1).contains("not looked at"));
     }
 
     #[test]

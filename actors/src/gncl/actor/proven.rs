@@ -1,8 +1,9 @@
 //! What follows from who was proven to be at the other end of a connection, or was not.
 
-use std::sync::Arc;
+use std::{sync::Arc, time::Duration};
 
-use actix::Context;
+use actix::{AsyncContext, Context};
+use rustls::pki_types::UnixTime;
 use sinew_runtime::time::Time;
 
 use super::{
@@ -19,6 +20,9 @@ use crate::{
     security::{Peer, Stamp},
 };
 
+/// How often a node that has keys looks whether they still count.
+const HOUR: Duration = Duration::from_secs(3_600);
+
 /// Under which it is counted that a peer is not taken, or does not take this node.
 pub(super) const NOT_PROVEN: &str = "peer not proven";
 
@@ -30,6 +34,23 @@ impl Gncl {
             panic!("GNCL gets no thread for handshakes: {error}; raise `ulimit -n` or `ulimit -u`")
         });
         self.secure = Some(Arc::new(secure));
+    }
+
+    /// Says now and then that the node's certificate ends soon, or has ended: it runs for longer than anybody remembers its start.
+    pub(super) fn mind_the_times(&self, ctx: &mut Context<Self>) {
+        if self.secure.is_none() {
+            return;
+        }
+        let mut hours = 0_u32;
+        ctx.run_interval(HOUR, move |gncl, _| {
+            hours = hours.wrapping_add(1);
+            let warning = gncl.stores.secured.get().and_then(|secured| secured.warning(UnixTime::now()));
+            if let Some((warning, has_ended)) = warning
+                && (has_ended || hours.is_multiple_of(24))
+            {
+                crate::log::warn!("{warning}");
+            }
+        });
     }
 
     /// The connection is there, and `peer` at its other end, where that is asked.
