@@ -49,6 +49,26 @@ impl Clock {
         Ok(Self { now, days })
     }
 
+    /// Refuses what would count when its authority does not any more, `until`: nobody would take it then.
+    pub(super) fn must_end_before(self, until: UnixTime) -> Result<(), Fault> {
+        let left = until.as_secs().saturating_sub(self.now.as_secs()) / DAY.as_secs();
+        if u64::from(self.days) <= left {
+            return Ok(());
+        }
+        let until = date(&until);
+        Err(Fault::Keys(if left == 0 {
+            format!(
+                "the authority's certificate ends on {until}: make this robot's keys anew with `sinew keys init`"
+            )
+        } else {
+            format!(
+                "the authority's certificate counts until {until}, and these should count for {} days: say --days {left} at most, or make \
+                 this robot's keys anew with `sinew keys init`",
+                self.days
+            )
+        }))
+    }
+
     fn set(self, params: &mut CertificateParams, days: u64) {
         let since_1970 = Duration::from_secs(self.now.as_secs());
         let days = DAY * u32::try_from(days).unwrap_or(u32::MAX);
@@ -105,4 +125,23 @@ fn named(name: &str) -> DistinguishedName {
     let mut names = DistinguishedName::new();
     names.push(DnType::CommonName, name);
     names
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn clock(days: u32) -> Clock {
+        Clock::new(UnixTime::since_unix_epoch(Duration::from_secs(EARLIEST)), days).expect("it is set")
+    }
+
+    #[test]
+    fn no_certificate_outlives_the_authority_that_signs_it() {
+        let in_days = |days: u32| UnixTime::since_unix_epoch(Duration::from_secs(EARLIEST) + DAY * days);
+        assert!(clock(365).must_end_before(in_days(365)).is_ok());
+        let longer = clock(366).must_end_before(in_days(365)).expect_err("a day too many").to_string();
+        assert!(longer.contains("--days 365 at most"), "{longer}");
+        let ended = clock(1).must_end_before(in_days(0)).expect_err("it has ended").to_string();
+        assert!(ended.contains("ends on") && ended.contains("keys init"), "{ended}");
+    }
 }

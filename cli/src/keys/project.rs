@@ -173,6 +173,7 @@ impl Project {
 
     /// A key and a certificate for each node, in its directory. Each node's is there whole or not at all.
     pub(super) fn issue(&self, wanted: &[Wanted], clock: Clock) -> Result<Made, Fault> {
+        clock.must_end_before(certificate(&self.directory.join(AUTHORITY))?.validity().until)?;
         let names =
             |issued: &Issued| wanted.iter().any(|wanted| wanted.identity.name == issued.identity.name);
         let older = self.counting(clock.now)?.into_iter().filter(names).collect();
