@@ -181,21 +181,21 @@ impl Doorbell for FutexBell {
     }
 
     fn sleep(&self, heard: Heard, waiting: &Waiting<'_>) -> io::Result<Woken> {
-        loop {
-            let left = waiting.left(Instant::now());
-            let now = waiting.hang_up.map_or(left, |_| left.min(HANG_UP_LOOK));
-            match futex::wait(self.counter(), futex::Flags::empty(), heard.0, Some(&timespec(now))) {
-                // Rung before the sleep; a signal came. The caller looks again.
-                Ok(()) | Err(Errno::AGAIN | Errno::INTR) => return Ok(Woken::Rung),
-                Err(Errno::TIMEDOUT) => {}
-                Err(errno) => return Err(errno.into()),
-            }
-            if waiting.hang_up.map_or(Ok(false), has_ended)? {
-                return Ok(Woken::HungUp);
-            }
-            if now == left {
-                return Ok(Woken::TimedOut);
-            }
+        let left = waiting.left(Instant::now());
+        let now = waiting.hang_up.map_or(left, |_| left.min(HANG_UP_LOOK));
+        match futex::wait(self.counter(), futex::Flags::empty(), heard.0, Some(&timespec(now))) {
+            // Rung before the sleep; a signal came. The caller looks again.
+            Ok(()) | Err(Errno::AGAIN | Errno::INTR) => return Ok(Woken::Rung),
+            Err(Errno::TIMEDOUT) => {}
+            Err(errno) => return Err(errno.into()),
+        }
+        if waiting.hang_up.map_or(Ok(false), has_ended)? {
+            Ok(Woken::HungUp)
+        } else if now == left {
+            Ok(Woken::TimedOut)
+        } else {
+            // The caller looks again: another one who may write the word can have taken the ring, and put the number back.
+            Ok(Woken::Rung)
         }
     }
 

@@ -1,6 +1,6 @@
 //! What a hostile peer does to bells that are sockets, besides ringing them.
 
-use std::{io::IoSlice, mem::MaybeUninit};
+use std::{io::IoSlice, mem::MaybeUninit, os::unix::net::UnixStream};
 
 use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, sendmsg};
 
@@ -64,6 +64,18 @@ fn an_ear_at_which_they_can_come_is_not_drained_of_them_and_is_an_end_to_who_sle
     assert!(!nobody_has_the_other_end_of(&witness), "it was not closed");
     let waiting = Wait::within(Duration::from_secs(10)).begin(Instant::now());
     assert_eq!(ear.sleep(ear.listen(), &waiting).expect("it sleeps"), Woken::HungUp);
+}
+
+#[test]
+fn who_sleeps_at_a_word_has_a_look_now_and_then_whether_or_not_it_is_rung() {
+    // Given: another peer that takes each ring, and puts the word back.
+    let bells = SharedPage::create().and_then(|page| page.bells()).expect("a page");
+    let (peer, _its_end) = UnixStream::pair().expect("a pair");
+    let wait = Wait::within(Duration::from_secs(10)).or_hang_up(HangUp::Socket(peer.as_fd()));
+    // Then:
+    for bell in [bells.message, bells.room] {
+        assert_eq!(bell.sleep(bell.listen(), &wait.begin(Instant::now())).expect("it sleeps"), Woken::Rung);
+    }
 }
 
 #[test]
