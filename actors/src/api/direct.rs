@@ -37,7 +37,7 @@ use super::{
         ring::{self, NAP},
         socket,
     },
-    routes::{Answered, Directness, Farewell, Left, LinkNumber, Marked, Passed, Routes, Way},
+    routes::{Answered, Directness, Farewell, LINKS_MAX, Left, LinkNumber, Marked, Passed, Routes, Way},
 };
 use crate::{
     lncl::payload::{self, Gone, Introduce, Introduction, Registered, Switch},
@@ -106,6 +106,8 @@ pub(super) struct Direct {
     writing: Option<LinkNumber>,
     /// What was half written there when the link ended.
     cut: Option<Message>,
+    /// Values of a Stream that were lost with a link, and that the endpoint has not counted yet, for whom they were.
+    unsent: BTreeMap<Tid, u64>,
 }
 
 /// What became of a message that was to go directly.
@@ -180,6 +182,7 @@ impl Direct {
             flush_at: Time::ZERO,
             writing: None,
             cut: None,
+            unsent: BTreeMap::new(),
         }
     }
 
@@ -431,12 +434,41 @@ impl Direct {
         if self.writing == Some(number) {
             self.cut = self.standing(number).and_then(|link| link.cut());
         }
+        if let Some(link) = self.standing(number) {
+            link.tell_unsent();
+            let waiting = link.waiting() as u64;
+            self.note_unsent(peer, waiting);
+        }
         self.open.retain(|link| link.number != number);
         self.held.retain(|link| link.number != number);
         self.offered.retain(|link| link.number != number);
         if self.routes.link(peer) == Some(number) {
             self.routes.ended(peer, now);
         }
+    }
+}
+
+/// Of what is lost with a link.
+impl Direct {
+    /// So many values waited for room there.
+    fn note_unsent(&mut self, peer: Tid, values: u64) {
+        if values > 0 {
+            let is_full = self.unsent.len() >= LINKS_MAX && !self.unsent.contains_key(&peer);
+            *self.unsent.entry(if is_full { Tid::NONE } else { peer }).or_default() += values;
+        }
+    }
+
+    /// Ends all of them.
+    pub(super) fn end_all(&mut self) {
+        let links =
+            self.open.iter().chain(&self.held).map(|link| (link.peer, link.number)).collect::<Vec<_>>();
+        let now = Time::now();
+        links.into_iter().for_each(|(peer, number)| self.end(peer, number, now));
+    }
+
+    /// Values of a Stream that waited for room in a link that has ended, since the last call: for whom, and how many.
+    pub(super) fn take_unsent(&mut self) -> BTreeMap<Tid, u64> {
+        std::mem::take(&mut self.unsent)
     }
 }
 

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use sinew_runtime::{
+    outcome::Rejection,
     tid::Tid,
     time::Time,
     wire::{Header, Kind, Message},
@@ -16,6 +17,7 @@ use super::{
     link::{Read, Reader, ring::NAP},
     reactor::Until,
     routes::LinkNumber,
+    untaken::Untaken,
 };
 use crate::ring::Taken;
 
@@ -47,7 +49,15 @@ impl Endpoint {
         let answer = self.take_in_from_node(wanted, when_full, now);
         let answer = answer.map(|answer| answer.or_else(|| self.take_in_directly(wanted, when_full, now)));
         self.refusals.count_own(self.tid, self.inbox.take_untold(), now);
+        self.count_unsent(now);
         answer
+    }
+
+    /// Counts what was lost with direct links.
+    pub(super) fn count_unsent(&mut self, now: Time) {
+        for (destination, count) in self.direct.take_unsent() {
+            self.refusals.add(Untaken { destination, why: Rejection::Closed, count, since: now });
+        }
     }
 
     /// Sorts in what has come past the node.

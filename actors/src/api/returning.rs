@@ -211,6 +211,8 @@ impl Endpoint {
         } else {
             // Another address has no links. What has come on them is received.
             self.take_in_from_links();
+            self.direct.end_all();
+            self.count_unsent(Time::now());
             self.direct = Direct::new(terms, control);
         }
         self.tid = own;

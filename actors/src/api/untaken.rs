@@ -71,7 +71,8 @@ impl Refusals {
         }
     }
 
-    fn add(&mut self, untaken: Untaken) {
+    /// So many more.
+    pub(super) fn add(&mut self, untaken: Untaken) {
         let known = self.find(untaken.destination, untaken.why);
         let is_full = self.entries.len() >= ENTRIES_MAX;
         let destination = if known.is_none() && is_full { Tid::NONE } else { untaken.destination };

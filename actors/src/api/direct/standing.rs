@@ -135,14 +135,13 @@ impl Standing {
     pub(super) fn send_draft(&mut self, draft: Draft) -> Result<Put, (ApiError, Draft)> {
         let Draft { header, payload } = draft;
         match payload {
-            Content::InRing(loan) if loan.is_of(&self.writer) => {
-                if header.class == Class::Stream {
-                    // It is the newest: an older one that waits must not come later.
-                    self.parked.retain(|older| older.header.kind != header.kind);
-                }
+            Content::InRing(loan)
+                if loan.is_of(&self.writer) && (header.class != Class::Stream || self.parked.is_empty()) =>
+            {
                 loan.publish(&header);
                 Ok(Put::Taken)
             }
+            // Behind the values that wait it goes as a copy.
             payload @ (Content::Bytes(_) | Content::InRing(_)) => {
                 let message = Draft { header, payload }.into_message();
                 self.send(message).map_err(|(error, message)| (error, message.into()))
@@ -156,23 +155,30 @@ impl Standing {
     /// # Errors
     /// The link cannot be used any more, or its ring is lent; the message was not written.
     pub(super) fn send(&mut self, message: Message) -> Result<Put, (ApiError, Message)> {
-        if message.header.class == Class::Stream {
-            let same_kind = |other: &&mut Message| other.header.kind == message.header.kind;
-            if let Some(parked) = self.parked.iter_mut().find(same_kind) {
-                *parked = message;
-                self.flush();
-                return Ok(Put::Taken);
-            }
-        } else if !self.parked.is_empty() {
+        let is_stream = message.header.class == Class::Stream;
+        let same_kind = |other: &&mut Message| is_stream && other.header.kind == message.header.kind;
+        if let Some(parked) = self.parked.iter_mut().find(same_kind) {
+            *parked = message;
+            self.flush();
+            return Ok(Put::Taken);
+        }
+        if !self.parked.is_empty() {
             self.flush();
         }
-        match self.put(message)? {
-            Put::Full(message) if message.header.class == Class::Stream && self.parked.len() < PARKED_MAX => {
+        // What was sent earlier in its class goes first.
+        let put = if is_stream && !self.parked.is_empty() { Put::Full(message) } else { self.put(message)? };
+        match put {
+            Put::Full(message) if is_stream && self.parked.len() < PARKED_MAX => {
                 self.parked.push(message);
                 Ok(Put::Taken)
             }
             whole_or_full @ (Put::Taken | Put::Begun | Put::Full(_)) => Ok(whole_or_full),
         }
+    }
+
+    /// Values that wait for room.
+    pub(super) const fn waiting(&self) -> usize {
+        self.parked.len()
     }
 
     fn put(&mut self, message: Message) -> Result<Put, (ApiError, Message)> {

@@ -41,6 +41,14 @@ impl Payload for Setpoint {
     const CLASS: Class = Class::Stream;
 }
 
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Mode(u64);
+
+impl Payload for Mode {
+    const NAME: &'static str = "test.mode";
+    const CLASS: Class = Class::Stream;
+}
+
 fn register(node: &TestNode, registration: Registration) -> Endpoint {
     NodeApi::connect(node.path()).unwrap().register_transport_address(registration).unwrap()
 }

@@ -15,6 +15,7 @@ use crate::api::{
     },
     routes::LINKS_MAX,
 };
+use crate::lncl::payload::{self, Gone};
 
 #[test]
 fn of_a_stream_the_newest_value_waits_for_room_in_the_ring() {
@@ -35,6 +36,56 @@ fn of_a_stream_the_newest_value_waits_for_room_in_the_ring() {
         assert!(number > last, "{number} came after {last}");
         last = number;
     }
+}
+
+/// Sends values until one waits for room in the ring.
+fn fill(from: &mut Endpoint, to: Tid) -> u64 {
+    for number in 1.. {
+        from.send(to, &Setpoint(number)).unwrap();
+        if from.direct.open[0].owes() {
+            return number;
+        }
+    }
+    unreachable!("a ring takes no end of values")
+}
+
+#[test]
+fn a_value_of_another_kind_does_not_overtake_one_that_waits_for_room() {
+    // given: a value that waits, and room for it
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+    link(&mut one, &mut other);
+    let last = fill(&mut one, other.tid());
+    while other.receive(Duration::from_millis(1)).unwrap().is_some() {}
+    // when
+    one.send(other.tid(), &Mode(1)).unwrap();
+    // then
+    let first = other.receive(WATCHDOG).unwrap().expect("a value");
+    assert_eq!(first.decode::<Setpoint>().ok(), Some(Setpoint(last)));
+    let second = other.receive(WATCHDOG).unwrap().expect("a value");
+    assert_eq!(second.decode::<Mode>().ok(), Some(Mode(1)));
+}
+
+#[test]
+fn a_value_that_waits_when_its_link_ends_is_counted_as_untaken() {
+    // given
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+    link(&mut one, &mut other);
+    let to = other.tid();
+    fill(&mut one, to);
+    // when: it takes nothing, and the node says that it is dead
+    let gone = Gone { peer: to.bits(), number: one.direct.open[0].number.0 };
+    let lncl = payload::lncl_of(node.address());
+    node.stores.router.send(payload::frame(Kind::LNCL_GONE, lncl, one.tid(), &gone)).unwrap();
+    let deadline = Time::now() + WATCHDOG;
+    while !one.direct.open.is_empty() {
+        assert!(Time::now() < deadline, "waited for the end of the link");
+        drop(one.receive(Duration::from_millis(1)).unwrap());
+    }
+    // then
+    let untaken = one.untaken().expect("something was lost");
+    assert_eq!((untaken.destination, untaken.why, untaken.count), (to, Rejection::Closed, 1));
 }
 
 #[test]
