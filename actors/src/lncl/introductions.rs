@@ -23,8 +23,8 @@ use std::{
 use rustix::{
     io::Errno,
     net::{
-        AddressFamily, SendAncillaryBuffer, SendAncillaryMessage, SendFlags, SocketFlags, SocketType,
-        sendmsg, socketpair,
+        AddressFamily, SendAncillaryBuffer, SendAncillaryMessage, SendFlags, Shutdown, SocketFlags,
+        SocketType, sendmsg, socketpair,
     },
 };
 use sinew_runtime::{
@@ -280,8 +280,10 @@ impl Asked {
         answer.header.correlation = correlation;
         // Not taken: it is gone, or it does not read and goes on through the node.
         if asker.outlet.submit(answer).is_err() {
-            // It knows of no link, so nobody's death on it concerns it.
+            // It knows of no link, so nobody's death on it concerns it; and the other side sees that there is none.
             peer.met.forget(asker.tid.app);
+            // An error means that it has ended already.
+            let _ = rustix::net::shutdown(&end, Shutdown::Both);
         }
     }
 }

@@ -56,15 +56,17 @@ impl Direct {
     fn meet(&mut self, message: &Message, now: Time, node: &ToNode<'_>) {
         let Ok(Introduction { peer, number, pid: _ }) = payload::read(&message.payload) else { return };
         let (peer, number) = (Tid::from_bits(peer), LinkNumber(number));
+        // Taken in any case: each that is left lies in the socket, which has room for few.
+        let end = self.take_end(number);
         // A new life may ask before it was seen that the former one has ended.
         self.see_ends(now);
-        let met = self.routes.introduction(peer).and_then(|()| self.offer(peer, number));
+        let met = self.routes.introduction(peer).and_then(|()| self.offer(peer, number, end));
         let outcome = met.map_or_else(Outcome::Rejected, |()| Outcome::Delivered);
         node.answer(self.terms.own, message.header.source, message.header.correlation, outcome);
     }
 
-    fn offer(&mut self, peer: Tid, number: LinkNumber) -> Result<(), Rejection> {
-        let socket = self.take_end(number).ok_or(Rejection::QueueFull)?;
+    fn offer(&mut self, peer: Tid, number: LinkNumber, end: Option<LinkEnd>) -> Result<(), Rejection> {
+        let socket = end.ok_or(Rejection::QueueFull)?;
         if !self.has_room() {
             return Err(Rejection::Unsupported);
         }

@@ -135,6 +135,17 @@ fn who_is_refused_is_told_so_and_the_peer_sees_the_end_of_the_link() {
 }
 
 #[test]
+fn where_the_asker_has_no_room_for_the_answer_the_peer_sees_the_end_of_the_link() {
+    let introductions = Introductions::default();
+    let (asker, peer) = (join(&introductions, 1, 0), join(&introductions, 2, 4));
+    introductions.introduce(asker.tid, peer.tid, question(7, 99), NOW).unwrap();
+    let (_, theirs) = peer.end();
+    peer.next().settle(Outcome::Delivered);
+    // Though the other end lies in the asker's socket.
+    assert_eq!(recv(&theirs, &mut [0; 2][..], RecvFlags::DONTWAIT).map(|(count, _)| count), Ok(0));
+}
+
+#[test]
 fn who_is_not_there_or_oneself_cannot_be_met() {
     let introductions = Introductions::default();
     let asker = join(&introductions, 1, 4);

@@ -14,8 +14,8 @@ use sinew_runtime::wire::{Flags, Header, Message};
 
 use super::*;
 use crate::{
-    api::direct::Came,
-    lncl::payload::{self, Gone, Introduction, Switch},
+    api::direct::{Came, descriptors},
+    lncl::payload::{self, Gone, Introduce, Introduction, Switch},
 };
 
 #[test]
@@ -131,6 +131,31 @@ fn what_the_node_says_of_links_that_are_none_changes_nothing() {
     other.send(one.tid(), &Counted(5)).unwrap();
     let received = one.receive(WATCHDOG).unwrap().expect("a message");
     assert_eq!(received.decode::<Counted>().unwrap(), Counted(5));
+    assert!(has_link(&one, &other) && has_link(&other, &one));
+}
+
+#[test]
+fn an_introduction_that_is_refused_leaves_nothing_in_the_socket() {
+    // given: one that asks again for the link that it has
+    let node = TestNode::start();
+    let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+    link(&mut one, &mut other);
+    let app = node.local(1);
+    let introduce = Introduce { to: other.tid().bits() };
+    let lncl = payload::lncl_of(node.address());
+    for _ in 0..3 {
+        let again = payload::frame(Kind::LNCL_INTRODUCE, one.tid(), lncl, &introduce);
+        assert!(one.writer.try_write(&again));
+    }
+    one.send(app.tid, &Hurried(1)).unwrap();
+    drop(app.next());
+    let control = other.direct.control.clone().expect("the socket to the node");
+    assert!(descriptors::holds_something(&control), "ends of links are on their way");
+    // when: all that was said before this has been heard
+    node.stores.router.send(Message::typed(app.tid, other.tid(), &Hurried(2))).unwrap();
+    while other.receive(WATCHDOG).unwrap().expect("a message").decode::<Hurried>().ok() != Some(Hurried(2)) {}
+    // then
+    assert!(!descriptors::holds_something(&control), "an end is left");
     assert!(has_link(&one, &other) && has_link(&other, &one));
 }
 
