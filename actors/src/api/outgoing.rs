@@ -18,6 +18,7 @@ use super::{
     lent::{Draft, LentMessage},
     link::ring::NAP,
     patience::{Limit, Waiting},
+    returning::ANSWERED_WITHIN,
     routes::LinkNumber,
 };
 
@@ -127,8 +128,8 @@ impl Endpoint {
     /// Comes back first, where `limit` leaves the time for it.
     pub(super) fn be_ready(&mut self, limit: Limit) -> Result<(), ApiError> {
         self.lender.be_free()?;
-        if !limit.is_in_all() {
-            // To register takes as long as it takes.
+        if limit.leaves(ANSWERED_WITHIN) {
+            // To register takes that long.
             self.try_return();
         }
         Ok(())

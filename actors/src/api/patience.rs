@@ -31,9 +31,14 @@ impl Limit {
         Self { patience: self.patience, in_all: within }
     }
 
-    /// Whether the caller has said how long it takes in all.
+    /// Whether the caller has said how long it takes in all, whatever the peer takes.
     pub(super) const fn is_in_all(&self) -> bool {
         self.patience.is_none()
+    }
+
+    /// Whether it leaves `time` for something else than room: what is only to be tried at once does not, nor what ends before.
+    pub(super) fn leaves(&self, time: Duration) -> bool {
+        self.patience.is_some() && self.in_all >= time
     }
 
     fn patience_from(&self, now: Time) -> Time {

@@ -25,7 +25,7 @@ use crate::lncl::payload::{self, Group, Register};
 const PAUSE: (Duration, Duration) = (Duration::from_millis(10), Duration::from_secs(1));
 
 /// Time that a node has to answer in the call that asked it. Later calls look without waiting.
-const ANSWERED_WITHIN: Duration = Duration::from_millis(20);
+pub(super) const ANSWERED_WITHIN: Duration = Duration::from_millis(20);
 
 /// How often who registers on another thread looks whether that is still wanted.
 pub(super) const LOOK: Duration = Duration::from_millis(100);

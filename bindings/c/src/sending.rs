@@ -121,7 +121,8 @@ pub extern "C" fn sinew_send_bytes_within(
 /// Sends a message and waits for what becomes of it; `SINEW_UNKNOWN` when nobody has said so after `within_ns`. The message
 /// expires where it waits when it is older. `*outcome` is set if this returns `SINEW_OK`. The message is gone as with
 /// `sinew_send_message`. What comes meanwhile waits to be received. Blocks for `within_ns` at most, room included; a longer one
-/// counts as the longest time to live of a message, 71 minutes and 35 s. The endpoint's thread.
+/// counts as the longest time to live of a message, 71 minutes and 35 s. With less than 20 ms a node that has gone is not looked
+/// for here (`SINEW_ERROR_AWAY`): `sinew_receive_message` does. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_send_message_confirmed(
     endpoint: *mut Endpoint,
@@ -145,7 +146,8 @@ pub extern "C" fn sinew_send_message_confirmed(
 /// set if this returns `SINEW_OK`; settle it when it has been read. If it returns `SINEW_ERROR_NOT_HANDLED` and `outcome` is not
 /// NULL, `*outcome` says what became of the request. With 1024 received messages in hand there is no place for a reply:
 /// `SINEW_ERROR_TOO_MANY`, and nothing was sent. The message is gone as with `sinew_send_message`. A longer `within_ns` counts as
-/// the longest time to live of a message, 71 minutes and 35 s. The endpoint's thread.
+/// the longest time to live of a message, 71 minutes and 35 s; with less than 20 ms a node that has gone is not looked for here, as with
+/// `sinew_send_message_confirmed`. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_ask(
     endpoint: *mut Endpoint,

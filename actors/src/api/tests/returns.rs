@@ -150,6 +150,8 @@ fn a_send_of_whatever_patience_does_and_comes_back(under: Under) {
 }
 
 fn what_is_left_of_a_long_message_ends_with_the_connection_and_the_next_one_is_whole(under: Under) {
+        assert!(matches!(refused, Err(ApiError::Away(_))), "{refused:?}");
+        let refused = client.send_confirmed(Tid::NONE, &TORQUE, Duration::from_millis(1));
     const LONG: usize = 1 << 20;
     let mut node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
     let raw = Kind::named("test.raw");
