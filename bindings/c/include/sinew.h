@@ -477,9 +477,15 @@ typedef struct sinew_received {
      */
     uint64_t sequence;
     /**
-     * When it was sent, on the clock of `sinew_now_ns`; 0: nobody has measured the clock of the sender's host yet, or not well enough (32 s).
+     * When it was sent, on the clock of `sinew_now_ns`, as wrong as `sent_error_ns` says; 0: nobody has measured the clock of the sender's host
+     * yet, or not well enough (32 s).
      */
     uint64_t sent_ns;
+    /**
+     * The error of `sent_ns` at most: 0 for what was sent on this host, `UINT64_MAX` where `sent_ns` is 0. It grows while nothing is heard of the
+     * clock of the sender's host. Whoever uses only what is young adds it to the age.
+     */
+    uint64_t sent_error_ns;
     /**
      * For the library: by this it knows the message again.
      */
@@ -721,7 +727,8 @@ sinew_status sinew_send_bytes_within(struct sinew_endpoint *endpoint,
  * Sends a message and waits for what becomes of it; `SINEW_UNKNOWN` when nobody has said so after `within_ns`. The message
  * expires where it waits when it is older. `*outcome` is set if this returns `SINEW_OK`. The message is gone as with
  * `sinew_send_message`. What comes meanwhile waits to be received. Blocks for `within_ns` at most, room included; a longer one
- * counts as the longest time to live of a message, 71 minutes and 35 s. The endpoint's thread.
+ * counts as the longest time to live of a message, 71 minutes and 35 s. With less than 20 ms a node that has gone is not looked
+ * for here (`SINEW_ERROR_AWAY`): `sinew_receive_message` does. The endpoint's thread.
  */
 sinew_status sinew_send_message_confirmed(struct sinew_endpoint *endpoint,
                                           struct sinew_message *message,
@@ -733,7 +740,8 @@ sinew_status sinew_send_message_confirmed(struct sinew_endpoint *endpoint,
  * set if this returns `SINEW_OK`; settle it when it has been read. If it returns `SINEW_ERROR_NOT_HANDLED` and `outcome` is not
  * NULL, `*outcome` says what became of the request. With 1024 received messages in hand there is no place for a reply:
  * `SINEW_ERROR_TOO_MANY`, and nothing was sent. The message is gone as with `sinew_send_message`. A longer `within_ns` counts as
- * the longest time to live of a message, 71 minutes and 35 s. The endpoint's thread.
+ * the longest time to live of a message, 71 minutes and 35 s; with less than 20 ms a node that has gone is not looked for here, as with
+ * `sinew_send_message_confirmed`. The endpoint's thread.
  */
 sinew_status sinew_ask(struct sinew_endpoint *endpoint,
                        struct sinew_message *message,

@@ -166,13 +166,25 @@ public:
     sinew::kind kind() const noexcept { return raw_.kind; }
     std::uint64_t sequence() const noexcept { return raw_.sequence; }
     bool wants_reply() const noexcept { return raw_.wants_reply; }
-    /// Time since it was sent; `duration::max()` while nobody has measured the clock of the sender's host, or it is known too badly.
+    /// Time since it was sent, as wrong as age_error() says; `duration::max()` while nobody has measured the clock of the sender's host, or it is known too badly.
     duration age() const noexcept
     {
         if (raw_.sent_ns == 0)
             return duration::max();
         const std::uint64_t now = sinew_now_ns();
         return duration(now > raw_.sent_ns ? static_cast<std::int64_t>(now - raw_.sent_ns) : 0);
+    }
+    /// The error of the age at most: none for what was sent on this host, `duration::max()` where the age is not known.
+    duration age_error() const noexcept
+    {
+        constexpr auto most = static_cast<std::uint64_t>(duration::max().count());
+        return raw_.sent_error_ns < most ? duration(static_cast<std::int64_t>(raw_.sent_error_ns)) : duration::max();
+    }
+    /// The greatest age that it can have, for a loop that uses only what is young; `duration::max()` where that is not known.
+    duration age_at_most() const noexcept
+    {
+        const duration known = age(), error = age_error();
+        return error < duration::max() - known ? known + error : duration::max();
     }
 
     /// The payload as a plain struct; nothing if it has another size.

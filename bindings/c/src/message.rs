@@ -1,5 +1,7 @@
 //! Messages as C sees them: where the bytes are, and a number by which the library knows them again.
 
+use std::time::Duration;
+
 use sinew::{Class, Tid};
 
 use crate::words::code_of as outcome_code;
@@ -59,8 +61,12 @@ pub struct Received {
     pub destination: TidBits,
     /// The source's n-th message, from 1.
     pub sequence: u64,
-    /// When it was sent, on the clock of `sinew_now_ns`; 0: nobody has measured the clock of the sender's host yet, or not well enough (32 s).
+    /// When it was sent, on the clock of `sinew_now_ns`, as wrong as `sent_error_ns` says; 0: nobody has measured the clock of the sender's host
+    /// yet, or not well enough (32 s).
     pub sent_ns: u64,
+    /// The error of `sent_ns` at most: 0 for what was sent on this host, `UINT64_MAX` where `sent_ns` is 0. It grows while nothing is heard of the
+    /// clock of the sender's host. Whoever uses only what is young adds it to the age.
+    pub sent_error_ns: u64,
     /// For the library: by this it knows the message again.
     pub token: u64,
     /// Type of the payload: compare it with `sinew_kind_named`.
@@ -94,6 +100,11 @@ impl Message {
     pub(crate) const GONE: Self = Self { bytes: std::ptr::null_mut(), length: 0, token: 0 };
 }
 
+/// Whole nanoseconds; more than 584 years count as that.
+fn nanos(time: Duration) -> u64 {
+    u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
+}
+
 impl Received {
     /// As [`Message::GONE`].
     pub(crate) const GONE: Self = Self {
@@ -103,6 +114,7 @@ impl Received {
         destination: Tid::NONE.bits(),
         sequence: 0,
         sent_ns: 0,
+        sent_error_ns: 0,
         token: 0,
         kind: 0,
         message_class: 0,
@@ -118,6 +130,7 @@ impl Received {
             destination: received.destination().bits(),
             sequence: received.sequence(),
             sent_ns: received.sent().as_nanos(),
+            sent_error_ns: received.age_error().map_or(u64::MAX, nanos),
             token,
             kind: received.kind().bits(),
             message_class: code_of(received.class()),

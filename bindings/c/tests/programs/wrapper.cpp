@@ -65,6 +65,7 @@ static void scopes_settle(sinew::endpoint &sender, sinew::endpoint receiver)
         {
             auto message = receiver.receive(20s);
             EXPECT(message && message->as<pair>() && message->as<pair>()->b == 2 && !message->as<char>());
+            EXPECT(message->age_error() == 0ns && message->age_at_most() < sinew::duration::max());
             EXPECT(message->age() >= 0ns && message->end() - message->begin() == sizeof(pair));
         }
         try {
