@@ -200,6 +200,15 @@ impl LinkNumber {
     }
 }
 
+/// Who is left at the other end of a connection that is over.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Left {
+    /// Nobody takes anything any more: what was taken is [`Outcome::Failed`], and what lay in memory untaken was not handled.
+    Nobody,
+    /// A program that may take what lies in its memory yet, and handle it: all that was sent is [`Outcome::Unknown`].
+    Somebody,
+}
+
 /// The writing half of a connection, and the messages that wait for it. It outlives the connection: while there is
 /// none, messages wait.
 pub(crate) struct StreamOutlet<S> {
@@ -264,10 +273,10 @@ impl<S: Socket> StreamOutlet<S> {
         self.with(|half, after| half.close(why, after));
     }
 
-    /// The process at the other end has ended, and nothing takes its place: what it had in hand has the outcome
-    /// `in_hand`; what waits, and what is submitted from now on, is refused because of `why`.
-    pub(crate) fn end(&self, in_hand: Outcome, why: Rejection) {
-        self.with(|half, after| half.end(in_hand, why, after));
+    /// The connection is over, and nothing takes its place: what was sent ends by who is `left` at the other end; what waits, and what is
+    /// submitted from now on, is refused as [`Rejection::Closed`].
+    pub(crate) fn end(&self, left: Left) {
+        self.with(|half, after| half.end(left, after));
     }
 
     /// Writes what waits whenever the socket takes it. Resolves when this connection cannot be written to any more,

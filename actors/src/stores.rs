@@ -76,10 +76,10 @@ pub(crate) struct Stores {
     pub(crate) sync: Mutex<sync::Core>,
     /// The sync manager was told that groups have changed, and has not looked yet.
     groups_told: AtomicBool,
-    /// Where messages are counted, beside GNCL's peers.
-    pub(crate) book: audit::Book,
     /// How many lines others may cause in the log.
     pub(crate) log_quotas: LogQuotas,
+    /// Where messages are counted, beside GNCL's peers.
+    pub(crate) book: audit::Book,
     /// Who was asked for an audit, and who has asked.
     pub(crate) questions: audit::Questions,
     /// Who watches whom.
@@ -129,10 +129,10 @@ impl Stores {
             directory_changes: watch::Sender::default(),
             sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
             groups_told: AtomicBool::new(false),
+            log_quotas: LogQuotas::default(),
             book: audit::Book::default(),
             questions: audit::Questions::default(),
             monitors: Mutex::new(monitors::Core::new(
-            log_quotas: LogQuotas::default(),
                 node,
                 incarnation,
                 config.ndl.nodes_max,

@@ -42,7 +42,7 @@ use super::{
 use crate::{
     access::{Access, Applicant},
     monitors::Cause,
-    outlet::{LinkNumber, OutletLimits, StreamOutlet},
+    outlet::{Left, LinkNumber, OutletLimits, StreamOutlet},
     stores::{Stores, lock},
 };
 
@@ -170,6 +170,8 @@ struct Client {
     has_been_told: bool,
     /// How it ends, as far as it is known.
     cause: Cause,
+    /// Whether it takes what lies in its memory when it has ended here.
+    left: Left,
 }
 
 impl Client {
@@ -225,6 +227,7 @@ impl Client {
             leaves,
             has_been_told,
             cause,
+            left: Left::Somebody,
         })
     }
 

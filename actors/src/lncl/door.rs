@@ -11,7 +11,6 @@ use std::{
 };
 
 use rustix::net::Shutdown;
-use sinew_runtime::outcome::{Outcome, Rejection};
 use tokio::net::UnixStream;
 
 use super::{
@@ -19,7 +18,7 @@ use super::{
     core::ClientId,
     listener::{self, ListenError, Openers, SocketFile},
 };
-use crate::stores::lock;
+use crate::{outlet::Left, stores::lock};
 
 /// The door for other processes. Dropping it closes it for new ones.
 #[derive(Default)]
@@ -91,9 +90,9 @@ impl Door {
             if let Some(stream) = stream.upgrade() {
                 shut(&*stream);
             }
-            // spec: LNCL-7. A peer that sleeps at a ring is woken by its end.
+            // spec: LNCL-7. A peer that sleeps at a ring is woken by its end, and takes what lies in it.
             if let Some(outlet) = outlet.upgrade() {
-                outlet.end(Outcome::Failed, Rejection::Closed);
+                outlet.end(Left::Somebody);
             }
         }
     }

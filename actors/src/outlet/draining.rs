@@ -60,7 +60,7 @@ impl<S: Socket> Half<S> {
             let Link::Up(socket) = &mut self.link else { continue };
             match socket.poll_writable(cx) {
                 Poll::Pending => return Poll::Pending,
-                Poll::Ready(Err(error)) => self.link = Link::Failed(error),
+                Poll::Ready(Err(error)) => self.fail(error),
                 Poll::Ready(Ok(())) => bytes += self.gather_next(after),
             }
             if bytes >= BYTES_PER_WAKE {

@@ -12,7 +12,7 @@ use sinew_runtime::{
 };
 
 use super::{
-    LinkNumber, OutletCounts, OutletLimits, Socket,
+    Left, LinkNumber, OutletCounts, OutletLimits, Socket,
     account::{Tally, is_for_the_program},
     after::After,
     batch::{Pace, is_left_to_the_drainer, is_patient},
@@ -77,6 +77,8 @@ pub(super) struct Half<S> {
     pub(super) tally: Tally,
     /// What the socket had written when it had the last message for the program at the other end.
     pub(super) due: u64,
+    /// What the peer had taken when a write failed, where that can be known.
+    taken_at_last: u64,
 }
 
 impl<S: Socket> Half<S> {
@@ -101,6 +103,7 @@ impl<S: Socket> Half<S> {
             counts: OutletCounts::default(),
             tally: Tally::default(),
             due: 0,
+            taken_at_last: u64::MAX,
         }
     }
 
@@ -129,7 +132,7 @@ impl<S: Socket> Half<S> {
         self.number += 1;
         if !matches!(self.link, Link::Closed(_)) {
             self.link = Link::Up(socket);
-            self.due = 0;
+            (self.due, self.taken_at_last) = (0, u64::MAX);
             self.payload_max = self.limits.payload_max.min(payload_max);
             self.partial = preface.map(|message| self.frill(message));
         }
@@ -202,13 +205,20 @@ impl<S: Socket> Half<S> {
         self.next_expiry = Time::MAX;
     }
 
-    pub(super) fn end(&mut self, in_hand: Outcome, why: Rejection, after: &mut After) {
-        let taken = if let Link::Up(socket) = &mut self.link { socket.account().taken } else { u64::MAX };
+    pub(super) fn end(&mut self, left: Left, after: &mut After) {
+        let why = Rejection::Closed;
+        let taken =
+            if let Link::Up(socket) = &mut self.link { socket.account().taken } else { self.taken_at_last };
         after.settle(self.receipts.take_all().map(|Sent { receipt, written, .. }| {
-            // What lay in its memory untaken was not handled.
-            (receipt, if written > taken { Outcome::Rejected(why) } else { in_hand })
+            let outcome = match left {
+                Left::Somebody => Outcome::Unknown,
+                Left::Nobody if written > taken => Outcome::Rejected(why),
+                Left::Nobody => Outcome::Failed,
+            };
+            (receipt, outcome)
         }));
         self.cut(after);
+        // Nobody ever has the rest of a frame that was begun.
         let waiting = self.take_waiting();
         for message in waiting {
             self.counts.lost += 1;
@@ -424,8 +434,16 @@ impl<S: Socket> Half<S> {
         if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted) {
             return Written::InPart;
         }
-        self.link = Link::Failed(error);
+        self.fail(error);
         Written::Broken
+    }
+
+    /// The connection cannot be written to any more.
+    pub(super) fn fail(&mut self, error: io::Error) {
+        if let Link::Up(socket) = &mut self.link {
+            self.taken_at_last = socket.account().taken;
+        }
+        self.link = Link::Failed(error);
     }
 
     pub(super) fn sent(&mut self, frame: Partial) {

@@ -12,6 +12,7 @@ on_every_transport! {
     an_endpoint_comes_back_to_its_name_its_address_and_its_groups
     meanwhile_it_says_once_that_it_is_away_and_each_send_says_it_was_not_sent
     a_confirmed_message_that_its_node_took_along_is_unknown
+    what_an_endpoint_had_and_takes_after_its_node_has_gone_is_unknown_to_its_senders
     who_is_there_for_one_connection_does_not_come_back
     a_send_with_a_time_of_its_own_does_not_look_for_the_node
     a_send_of_whatever_patience_does_and_comes_back
@@ -104,6 +105,29 @@ fn a_confirmed_message_that_its_node_took_along_is_unknown(under: Under) {
     drop(in_hand);
 }
 
+fn what_an_endpoint_had_and_takes_after_its_node_has_gone_is_unknown_to_its_senders(under: Under) {
+    // Given: confirmed messages that a client has been given, and has not taken.
+    let mut node = TestNode::start();
+    let app = node.local(1);
+    let mut client = register(under, &node, on(under));
+    // The first one has been taken when the others are sent: what it is given by then goes to its ring.
+    let first = node.send_confirmed(app.tid, client.tid(), &TORQUE);
+    drop(client.receive(WATCHDOG).unwrap().expect("the first"));
+    assert_eq!(first.recv_timeout(WATCHDOG), Ok(Outcome::Delivered));
+    let outcomes: Vec<_> = (0..3).map(|_| node.send_confirmed(app.tid, client.tid(), &TORQUE)).collect();
+    // When: its node has gone, and it lives on.
+    node.stop();
+    // Then: what it still handles, nobody is told that it was not handled.
+    let told: Vec<_> = outcomes.iter().map(|outcome| outcome.recv_timeout(WATCHDOG)).collect();
+    let mut handled = 0;
+    while let Ok(Some(received)) = client.receive(Duration::from_millis(10)) {
+        drop(received);
+        handled += 1;
+    }
+    assert_eq!(handled, 3, "it takes what it was given");
+    assert_eq!(told, vec![Ok(Outcome::Unknown); 3]);
+}
+
 fn who_is_there_for_one_connection_does_not_come_back(under: Under) {
     let mut node = TestNode::start();
     let mut client = register(under, &node, on(under).for_one_connection());
@@ -126,6 +150,8 @@ fn a_send_with_a_time_of_its_own_does_not_look_for_the_node(under: Under) {
     let before = client.registrations();
     for _ in 0..100 {
         let refused = client.send_within(Tid::NONE, &TORQUE, Duration::from_millis(1));
+        assert!(matches!(refused, Err(ApiError::Away(_))), "{refused:?}");
+        let refused = client.send_confirmed(Tid::NONE, &TORQUE, Duration::from_millis(1));
         assert!(matches!(refused, Err(ApiError::Away(_))), "{refused:?}");
     }
     assert_eq!(client.registrations(), before);
@@ -150,8 +176,6 @@ fn a_send_of_whatever_patience_does_and_comes_back(under: Under) {
 }
 
 fn what_is_left_of_a_long_message_ends_with_the_connection_and_the_next_one_is_whole(under: Under) {
-        assert!(matches!(refused, Err(ApiError::Away(_))), "{refused:?}");
-        let refused = client.send_confirmed(Tid::NONE, &TORQUE, Duration::from_millis(1));
     const LONG: usize = 1 << 20;
     let mut node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
     let raw = Kind::named("test.raw");

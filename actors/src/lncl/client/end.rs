@@ -5,7 +5,6 @@ use std::{io, time::Duration};
 use rustix::net::Shutdown;
 use sinew_runtime::{
     monitor::DownClass,
-    outcome::{Outcome, Rejection},
     time::Time,
     wire::{FrameError, Kind, Message},
 };
@@ -13,6 +12,7 @@ use sinew_shm::PassError;
 
 use super::{
     super::{
+        introductions::Leaves,
         link::{ClientSocket, LinkError},
         payload::{self, Refusal},
         registrar,
@@ -21,6 +21,7 @@ use super::{
 };
 use crate::{
     monitors::Cause,
+    outlet::Left,
     ring::{ExchangeError, RingError},
 };
 
@@ -52,6 +53,14 @@ impl End {
             Self::Refused(sentence) | Self::Late(sentence) => {
                 Cause::new(DownClass::Killed, format!("its connection was ended: {sentence}"))
             }
+        }
+    }
+
+    /// Whether the client takes what lies in its memory yet.
+    const fn left(&self) -> Left {
+        match self {
+            Self::Unregistered | Self::HungUp(_) => Left::Nobody,
+            Self::Refused(_) | Self::Late(_) => Left::Somebody,
         }
     }
 
@@ -116,6 +125,7 @@ impl Client {
     pub(super) async fn finish(mut self, end: End) {
         self.has_been_told = true;
         self.cause = end.cause();
+        self.left = if self.leaves == Leaves::Dead { Left::Nobody } else { end.left() };
         match end {
             End::Unregistered => self.log("has unregistered"),
             End::HungUp(None) => self.log("has gone: its process closed the socket, or ended"),
@@ -189,8 +199,8 @@ impl Drop for Client {
         // Senders may hold the outlet, and with it the socket, a little longer; the peer is told now. An error means
         // that it is closed already.
         let _ = rustix::net::shutdown(&self.peer.stream, Shutdown::Both);
-        // spec: LNCL-7. A peer that sleeps at a ring is woken by its end.
-        self.outlet.end(Outcome::Failed, Rejection::Closed);
+        // spec: LNCL-7. A peer that sleeps at a ring is woken by its end, and takes what lies in it.
+        self.outlet.end(self.left);
         self.server.stores.book.remove_client(self.peer.id);
     }
 }
