@@ -300,7 +300,8 @@ impl Model {
         if fault.is_some() {
             self.good = 0;
         } else {
-            self.good += 1;
+            let is_silent = now >= self.heard + PROTECTION.within;
+            self.good = if is_silent { 1 } else { self.good + 1 };
             self.heard = now;
         }
         let verdict = match (fault, self.state, sealed) {

@@ -67,7 +67,7 @@ pub struct Protection {
     pub lost_max: u64,
     /// Bad ones that may be among the last 64; none of them is used.
     pub bad_max: u32,
-    /// Good ones in a row before the output may be armed.
+    /// Good ones in a row before the output may be armed: none bad among them, and from one to the next less than `within`.
     pub good_min: u32,
 }
 
@@ -153,7 +153,7 @@ pub enum ArmError {
         "{good} good messages in a row have come, the last one {silent:?} ago; wait for {wanted}, and for the next one to be in time"
     )]
     NotGood {
-        /// Good messages in a row that have come.
+        /// Good messages in a row that have come, [`Protection::within`] apart at most.
         good: u32,
         /// How many must have come.
         wanted: u32,

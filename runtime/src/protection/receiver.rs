@@ -29,7 +29,7 @@ pub(crate) struct Receiver {
     last: Option<(u64, u64)>,
     /// When that came.
     heard: Time,
-    /// Good messages in a row.
+    /// Good messages in a row: none bad among them, and no silence.
     good: u32,
     /// The last 64 messages, the newest at the lowest bit: 1 for a bad one.
     history: u64,
@@ -104,7 +104,9 @@ impl Receiver {
         let verdict = match self.examine(now, bytes) {
             Ok(payload) => {
                 self.history <<= 1;
-                self.good = self.good.saturating_add(1);
+                // A row ends with a silence that would have made a live output safe.
+                let is_next = now.since(self.heard) < self.protection.within;
+                self.good = if is_next { self.good.saturating_add(1) } else { 1 };
                 self.tally.good += 1;
                 self.heard = now;
                 if self.state == State::Live { Verdict::Apply(payload) } else { Verdict::Hold }

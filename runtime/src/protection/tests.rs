@@ -138,6 +138,31 @@ fn what_is_sealed_is_applied_once_armed_and_not_before() {
 }
 
 #[test]
+fn a_silence_ends_a_row_of_good_messages_while_the_output_is_safe() {
+    let mut bench = Bench::new();
+    for _ in 1..PROTECTION.good_min {
+        let message = bench.next();
+        assert_eq!(bench.take(&message), Verdict::Hold);
+    }
+    // When: nothing comes for just as long as a live output bears.
+    bench.now = bench.now + PROTECTION.within - MS;
+    let message = bench.next();
+    assert_eq!(bench.take(&message), Verdict::Hold);
+    // Then: that was the first one of a new row.
+    let wanted = PROTECTION.good_min;
+    assert_eq!(
+        bench.receiver.arm(bench.now),
+        Err(ArmError::NotGood { good: 1, wanted, silent: Duration::ZERO })
+    );
+    for good in 2..=wanted {
+        assert!(bench.receiver.arm(bench.now).is_err(), "{good}");
+        let message = bench.next();
+        assert_eq!(bench.take(&message), Verdict::Hold);
+    }
+    bench.receiver.arm(bench.now).expect("a row without a silence");
+}
+
+#[test]
 fn a_sender_that_hears_no_echo_is_not_believed() {
     let mut bench = Bench::new();
     for _ in 0..100 {
