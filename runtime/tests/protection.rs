@@ -8,7 +8,7 @@ mod stage;
 use std::{
     sync::{
         Arc, OnceLock,
-        atomic::{AtomicBool, Ordering},
+        atomic::{AtomicBool, AtomicU64, Ordering},
         mpsc::{Receiver, SyncSender, sync_channel},
     },
     time::Duration,
@@ -39,10 +39,23 @@ impl Payload for Torque {
     const PROTECTION: Option<Protection> = Some(Protection::of_period(PERIOD));
 }
 
+/// The same in the sender's next version, which the receiver does not have.
+#[derive(Debug, Serialize, Deserialize)]
+struct LaterTorque {
+    newton_metres: f64,
+}
+
+impl Payload for LaterTorque {
+    const NAME: &'static str = Torque::NAME;
+    const CLASS: Class = Torque::CLASS;
+    const PROTECTION: Option<Protection> = Torque::PROTECTION;
+}
+
 /// Sends a torque each period, while it may.
 struct Central {
     drive: Tid,
     sends: Arc<AtomicBool>,
+    is_later: Arc<AtomicBool>,
 }
 
 impl Actor for Central {
@@ -50,7 +63,9 @@ impl Actor for Central {
 
     fn started(&mut self, context: &mut Self::Context) {
         context.every(PERIOD, |central, _, context| {
-            if central.sends.load(Ordering::Relaxed) {
+            if central.is_later.load(Ordering::Relaxed) {
+                context.send(central.drive, &LaterTorque { newton_metres: 12.5 }).unwrap();
+            } else if central.sends.load(Ordering::Relaxed) {
                 context.send(central.drive, &Torque { nm: 12.5 }).unwrap();
             }
         });
@@ -76,6 +91,7 @@ struct Drive {
     central: Tid,
     motor: SyncSender<Seen>,
     mood: Receiver<Mood>,
+    arms: Arc<AtomicU64>,
     guard: Option<Guard<SyncSender<Seen>>>,
 }
 
@@ -90,7 +106,8 @@ impl Actor for Drive {
         assert!(twice.to_string().contains("guarded already"), "{twice}");
         // An operator who is quick.
         context.every(PERIOD, |drive, _, _| {
-            let _ = drive.guard.as_ref().unwrap().arm();
+            let is_armed = drive.guard.as_ref().unwrap().arm().is_ok();
+            drive.arms.fetch_add(is_armed.into(), Ordering::Relaxed);
         });
     }
 }
@@ -113,6 +130,9 @@ impl Handler<Delivery<Torque>> for Drive {
 struct Scene {
     stage: Stage,
     sends: Arc<AtomicBool>,
+    is_later: Arc<AtomicBool>,
+    /// How often the output was armed.
+    arms: Arc<AtomicU64>,
     seen: Receiver<Seen>,
     mood: SyncSender<Mood>,
 }
@@ -124,17 +144,25 @@ impl Scene {
         let (motor, seen) = sync_channel(100_000);
         let (mood, moods) = sync_channel(1);
         let moods = std::sync::Mutex::new(Some(moods));
-        let may_send = sends.clone();
-        let sender = AppSpec::new("central", move || Central { drive, sends: may_send.clone() });
+        let is_later = Arc::new(AtomicBool::new(false));
+        let (may_send, has_changed) = (sends.clone(), is_later.clone());
+        let sender = AppSpec::new("central", move || Central {
+            drive,
+            sends: may_send.clone(),
+            is_later: has_changed.clone(),
+        });
+        let arms = Arc::new(AtomicU64::new(0));
+        let counted = arms.clone();
         let receiver = AppSpec::new("drive", move || Drive {
             central,
+            arms: counted.clone(),
             motor: motor.clone(),
             mood: moods.lock().unwrap().take().unwrap_or_else(|| sync_channel(1).1),
             guard: None,
         });
         let apps = vec![sender.own_thread().into(), receiver.handles::<Torque>().own_thread().into()];
         let stage = Stage::start(apps);
-        let scene = Self { stage, sends, seen, mood };
+        let scene = Self { stage, sends, is_later, arms, seen, mood };
         assert_eq!(scene.next(), Seen::Safe(Cause::NotArmed), "the output is safe before anything else");
         scene.wait_for(|seen| *seen == Seen::Moved(12.5));
         scene
@@ -147,12 +175,16 @@ impl Scene {
     /// Waits until the output is safe because nothing comes, and nothing follows that: on a machine that is busy it may have been so
     /// before, for a while.
     fn wait_for_silence(&self) {
+        self.wait_for_last(|last| *last == Seen::Safe(Cause::Silent));
+    }
+
+    fn wait_for_last(&self, is_it: impl Fn(&Seen) -> bool) {
         let deadline = std::time::Instant::now() + DEADLINE;
         let mut last = self.next();
         loop {
             match self.seen.recv_timeout(PERIOD * 20) {
                 Ok(seen) => last = seen,
-                Err(_) if last == Seen::Safe(Cause::Silent) => return,
+                Err(_) if is_it(&last) => return,
                 Err(_) => assert!(std::time::Instant::now() < deadline, "{last:?} was the last"),
             }
         }
@@ -176,6 +208,19 @@ fn a_sender_that_falls_silent_leaves_the_output_safe() {
     // However often it is armed, nothing moves it while nothing comes.
     assert!(scene.seen.recv_timeout(PERIOD * 20).is_err(), "nothing moves it");
     scene.sends.store(true, Ordering::Relaxed);
+    scene.wait_for(|seen| *seen == Seen::Moved(12.5));
+}
+
+#[test]
+fn commands_that_cannot_be_read_leave_the_output_safe() {
+    let scene = Scene::start();
+    scene.is_later.store(true, Ordering::Relaxed);
+    // The second one is too many, unless the machine is slow.
+    scene.wait_for_last(|last| [Cause::TooManyBad, Cause::Silent].map(Seen::Safe).contains(last));
+    let armed = scene.arms.load(Ordering::Relaxed);
+    assert!(scene.seen.recv_timeout(PERIOD * 20).is_err(), "nothing moves it");
+    assert_eq!(scene.arms.load(Ordering::Relaxed), armed, "none of them counts as good");
+    scene.is_later.store(false, Ordering::Relaxed);
     scene.wait_for(|seen| *seen == Seen::Moved(12.5));
 }
 

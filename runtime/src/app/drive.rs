@@ -50,22 +50,21 @@ where
     A: Actor<Context = AppContext<A>> + Handler<Delivery<P>, Result = ()>,
     P: Payload,
 {
-    let decoded = match P::PROTECTION {
-        None => message.decode::<P>(),
-        Some(_) => decode_as(&unseal::<A, P>(context, message, now)?),
+    let payload = match P::PROTECTION {
+        None => message.decode::<P>().map_err(|error| {
+            context.warn_of_payload(message.header.source, &error, now);
+            Rejection::Malformed
+        })?,
+        Some(_) => unseal::<A, P>(context, message, now)?,
     };
-    let payload = decoded.map_err(|error| {
-        context.warn_of_payload(message.header.source, &error, now);
-        Rejection::Malformed
-    })?;
     // Only now: bytes that are no `P` are no sign of life of its sender.
     note_arrival(context, message, now);
     actor.handle(Delivery::new(payload, &message.header, now), context);
     Ok(())
 }
 
-/// The bytes of a protected payload, if they are good and its output is live.
-fn unseal<A, P>(context: &mut AppContext<A>, message: &Message, now: Time) -> Result<Bytes, Rejection>
+/// The value of a protected payload, if it is good and its output is live.
+fn unseal<A, P>(context: &mut AppContext<A>, message: &Message, now: Time) -> Result<P, Rejection>
 where
     A: Actor<Context = AppContext<A>>,
     P: Payload,
@@ -75,10 +74,16 @@ where
         context.warn_of_payload(source, &"it is protected, and nothing here is guarded for this sender", now);
         return Err(Rejection::Unsupported);
     };
-    match guard.take(&message.payload) {
-        Verdict::Apply(payload) => Ok(payload),
-        Verdict::Hold => Err(Rejection::ByHandler),
-        Verdict::Refused(fault) => {
+    let mut unread = None;
+    let read = |payload: Bytes| decode_as::<P>(&payload).map_err(|error| unread = Some(error)).ok();
+    match (guard.take(&message.payload, read), unread) {
+        (Verdict::Apply(value), _) => Ok(value),
+        (Verdict::Hold, _) => Err(Rejection::ByHandler),
+        (Verdict::Refused(Fault::Unreadable), Some(error)) => {
+            context.warn_of_payload(source, &error, now);
+            Err(Rejection::Malformed)
+        }
+        (Verdict::Refused(fault), _) => {
             context.warn_of_payload(source, &fault, now);
             Err(if fault == Fault::Corrupt { Rejection::Malformed } else { Rejection::ByHandler })
         }

@@ -2,6 +2,8 @@
 
 use std::{collections::BTreeSet, io, sync::Arc};
 
+use bytes::Bytes;
+
 use super::{Cause, Echo, Fault, Flows, Guard, Guarded, Verdict};
 use crate::{
     outcome::{Outcome, Rejection},
@@ -22,8 +24,17 @@ pub struct Ends {
 struct Held {
     guard: Arc<dyn Guarded>,
     kind: Kind,
+    /// Whether these bytes are a value of that type.
+    is_value: fn(&[u8]) -> bool,
     /// When its sender is to be told the next time to quote.
     echo_at: Time,
+}
+
+impl Held {
+    /// Takes a message in. It is read here and once more by who receives it: he may not, and then it must not count.
+    fn take(&self, bytes: &Bytes) -> Verdict<Bytes> {
+        self.guard.take(bytes, |payload| (self.is_value)(&payload).then_some(payload))
+    }
 }
 
 impl std::fmt::Debug for Held {
@@ -37,7 +48,7 @@ impl std::fmt::Debug for Held {
 pub enum Came {
     /// It is for the receiver, as it came: nothing here guards its kind.
     Plain(Message),
-    /// It is for the receiver, without its envelope: it is good, and its output is live.
+    /// It is for the receiver, without its envelope: it is good, which includes that it can be read, and its output is live.
     Good(Message),
     /// It is refused, or was not for the receiver; its sender is told.
     Settled,
@@ -116,7 +127,8 @@ impl Ends {
         }
         let guard = Guard::new::<P>(source, receiver, output, safe)?;
         self.kinds.insert(P::KIND);
-        self.held.push(Held { guard: guard.guarded(), kind: P::KIND, echo_at: now });
+        let is_value = |bytes: &[u8]| decode::<P>(bytes).is_ok();
+        self.held.push(Held { guard: guard.guarded(), kind: P::KIND, is_value, echo_at: now });
         Ok(guard)
     }
 
@@ -141,12 +153,12 @@ impl Ends {
         let is_of_it = |held: &&Held| held.kind == kind && held.guard.codename().source == source;
         let why = match self.held.iter().find(is_of_it) {
             None => Rejection::Unsupported,
-            Some(held) => match held.guard.take(&message.payload) {
+            Some(held) => match held.take(&message.payload) {
                 Verdict::Apply(payload) => {
                     message.payload = payload;
                     return Came::Good(message);
                 }
-                Verdict::Refused(Fault::Corrupt) => Rejection::Malformed,
+                Verdict::Refused(Fault::Corrupt | Fault::Unreadable) => Rejection::Malformed,
                 Verdict::Hold | Verdict::Refused(_) => Rejection::ByHandler,
             },
         };
@@ -247,6 +259,47 @@ mod tests {
         assert!(matches!(ends.take(from(3, Torque::KIND)), Came::Settled));
         assert_eq!((ends.held.len(), Arc::strong_count(&output)), (0, 1));
         assert!(matches!(ends.take(from(4, Torque::KIND)), Came::Settled));
+    }
+
+    /// For whom no machine is too slow.
+    #[derive(Serialize, Deserialize)]
+    struct Angle {
+        radians: f32,
+    }
+
+    impl Payload for Angle {
+        const NAME: &'static str = "test.angle_of_an_endpoint";
+        const PROTECTION: Option<Protection> = Some(Protection::of_period(Duration::from_secs(60)));
+    }
+
+    /// The sender's next version of it.
+    #[derive(Serialize, Deserialize)]
+    struct LaterAngle {
+        degrees: f32,
+    }
+
+    impl Payload for LaterAngle {
+        const NAME: &'static str = Angle::NAME;
+        const PROTECTION: Option<Protection> = Angle::PROTECTION;
+    }
+
+    #[test]
+    fn what_cannot_be_read_is_not_received_and_counts_as_bad() {
+        let (mut sender, mut receiver) = (Ends::new(NOW), Ends::new(NOW));
+        let guard = receiver.guard::<Angle, _>((tid(1), tid(9)), NOW, (), |(), _| {}).expect("a thread");
+        let angle = Angle { radians: 1.0 };
+        let good = |sender: &Ends| sender.message(tid(1), tid(9), tid(9), &angle).expect("it is for one");
+        good(&sender);
+        assert!(matches!(sender.take(receiver.echo(tid(9), NOW).expect("at once")), Came::Settled));
+        for _ in 0..8 {
+            assert!(matches!(receiver.take(good(&sender)), Came::Settled), "it is not armed");
+        }
+        guard.arm().expect("good ones have come");
+        assert!(matches!(receiver.take(good(&sender)), Came::Good(_)));
+        let later = sender.message(tid(1), tid(9), tid(9), &LaterAngle { degrees: 57.0 });
+        assert!(matches!(receiver.take(later.expect("it is for one")), Came::Settled));
+        assert_eq!((guard.tally().good, guard.tally().unreadable), (9, 1));
+        assert!(matches!(receiver.take(good(&sender)), Came::Good(_)), "one is borne, and none is missing");
     }
 
     #[test]

@@ -7,8 +7,10 @@ use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Cause, Codename, Echo, Fault, Protection, Stamp, State, envelope::seal, receiver::Receiver,
-    receiver::Verdict, sender::Flows,
+    Cause, Codename, Echo, Fault, Protection, Stamp, State,
+    envelope::seal,
+    receiver::{Opened, Receiver, Verdict},
+    sender::Flows,
 };
 use crate::{
     tid::{AppAddress, NodeAddress, Tid},
@@ -124,7 +126,7 @@ impl Play {
             now: Time::from_nanos(1_000_000_000),
             flows: Flows::new(Time::from_nanos(100)),
             next: Stamp { counter: 0, incarnation: 100, echo: Time::ZERO },
-            receiver: Receiver::new(codename(), PROTECTION),
+            receiver: Receiver::new(PROTECTION),
             model,
             kept: VecDeque::new(),
             applied: 0,
@@ -261,7 +263,9 @@ impl Play {
     fn comes(&mut self, bytes: &Bytes) {
         let sealed = self.kept.iter().find(|sealed| sealed.bytes == *bytes);
         let expected = self.model.take(self.now, sealed);
-        let verdict = self.receiver.take(self.now, bytes);
+        let read = |payload: Bytes| decode::<Torque>(&payload).is_ok().then_some(payload);
+        let (opened, payload) = Opened::of(&codename(), bytes, read);
+        let verdict = self.receiver.take(self.now, opened).of(payload);
         assert_eq!(verdict, expected, "{:?}", sealed.map(|sealed| sealed.stamp));
         self.applied += usize::from(matches!(verdict, Verdict::Apply(_)));
     }
@@ -292,9 +296,12 @@ impl Model {
     }
 
     /// What has to come of a message; `None`: nobody has sealed it so.
-    fn take(&mut self, now: Time, sealed: Option<&Sealed>) -> Verdict {
+    fn take(&mut self, now: Time, sealed: Option<&Sealed>) -> Verdict<Bytes> {
         self.expire(now);
-        let fault = sealed.map_or(Some(Fault::Corrupt), |sealed| self.fault(now, sealed.stamp));
+        let fault = sealed.map_or(Some(Fault::Corrupt), |sealed| {
+            let is_unreadable = decode::<Torque>(&sealed.payload).is_err();
+            self.fault(now, sealed.stamp).or_else(|| is_unreadable.then_some(Fault::Unreadable))
+        });
         self.window.push_front(fault.is_some());
         self.window.truncate(WINDOW);
         if fault.is_some() {

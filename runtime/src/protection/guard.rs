@@ -15,7 +15,7 @@ use bytes::Bytes;
 
 use super::{
     ArmError, Cause, Codename, Protection, State, Tally,
-    receiver::{Receiver, Verdict},
+    receiver::{Opened, Receiver, Verdict},
 };
 use crate::{supervision::Place, tid::Tid, time::Time, wire::Payload};
 
@@ -123,7 +123,7 @@ impl<O: Send + 'static> Guard<O> {
         const { assert!(P::PROTECTION.is_some(), "a guard is for a payload whose PROTECTION says what is borne") };
         let protection = P::PROTECTION.unwrap_or(Protection::of_period(Duration::ZERO));
         let codename = Codename::of::<P>(source, receiver);
-        let receiver = Receiver::new(codename, protection);
+        let receiver = Receiver::new(protection);
         let mut inner = Inner { codename, receiver, output, safe: Box::new(safe), owes: None };
         inner.make_safe(Cause::NotArmed);
         let watch = Watch {
@@ -250,14 +250,22 @@ pub(crate) trait Guarded: Send + Sync {
     fn codename(&self) -> Codename;
     /// Whether nobody has the guard any more.
     fn is_orphan(&self) -> bool;
-    /// Takes a message in.
-    fn take(&self, bytes: &Bytes) -> Verdict;
+    /// Takes in a message that is out of its envelope.
+    fn judge(&self, opened: Opened) -> Verdict<()>;
     /// The time that the sender is to quote.
     fn echo(&self) -> Time;
     /// The one that it was told last.
     fn last_echo(&self) -> Time;
     /// Time between two of them.
     fn echo_period(&self) -> Duration;
+}
+
+impl dyn Guarded {
+    /// Takes a message in. One that `read` makes no value of is a bad one. That is the user's code: the output's lock is not held meanwhile.
+    pub(crate) fn take<T>(&self, bytes: &Bytes, read: impl FnOnce(Bytes) -> Option<T>) -> Verdict<T> {
+        let (opened, value) = Opened::of(&self.codename(), bytes, read);
+        self.judge(opened).of(value)
+    }
 }
 
 impl<O: Send + 'static> Guarded for Shared<O> {
@@ -269,8 +277,8 @@ impl<O: Send + 'static> Guarded for Shared<O> {
         self.watch.is_orphan.load(Ordering::Acquire)
     }
 
-    fn take(&self, bytes: &Bytes) -> Verdict {
-        self.decide(|receiver, now| receiver.take(now, bytes))
+    fn judge(&self, opened: Opened) -> Verdict<()> {
+        self.decide(|receiver, now| receiver.take(now, opened))
     }
 
     fn echo(&self) -> Time {

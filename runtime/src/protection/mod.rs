@@ -143,6 +143,9 @@ pub enum Fault {
     /// Too many before it are missing.
     #[error("too many before it are missing")]
     Gap,
+    /// It is what was sealed, and no value of the receiver's type: its sender has another version of that.
+    #[error("it is no value of the receiver's type, of which its sender has another version")]
+    Unreadable,
 }
 
 /// Why an output cannot be armed.
@@ -182,6 +185,8 @@ pub struct Tally {
     pub restarted: u64,
     /// Those of [`Fault::Gap`].
     pub gaps: u64,
+    /// Those of [`Fault::Unreadable`].
+    pub unreadable: u64,
     /// Messages that are missing, by their numbers.
     pub lost: u64,
     /// How often the output went from live to safe.
@@ -197,6 +202,7 @@ impl Tally {
             Fault::Backwards => &mut self.backwards,
             Fault::Restarted => &mut self.restarted,
             Fault::Gap => &mut self.gaps,
+            Fault::Unreadable => &mut self.unreadable,
         };
         *counter += 1;
     }

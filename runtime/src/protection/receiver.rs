@@ -2,27 +2,62 @@
 
 use bytes::Bytes;
 
-use super::{ArmError, Cause, Fault, Protection, State, Tally, envelope};
-use crate::{protection::Codename, time::Time};
+use super::{ArmError, Cause, Codename, Fault, Protection, Stamp, State, Tally, envelope::open};
+use crate::time::Time;
 
 /// Echoes that a sender may answer with. One is sent each quarter of the longest age, so that the oldest is twice too old.
 const ECHOES: usize = 8;
 
+/// What is in a message, as far as that can be said without its receiver.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Opened {
+    /// Not what was sealed under this codename.
+    Corrupt,
+    /// What was sealed, and no value of the type that the receiver has.
+    Unreadable(Stamp),
+    /// A value.
+    Value(Stamp),
+}
+
+impl Opened {
+    /// Takes a message out of its envelope, and reads it. How it is read is the user's code: nobody else waits for it.
+    pub(crate) fn of<T>(
+        codename: &Codename,
+        bytes: &Bytes,
+        read: impl FnOnce(Bytes) -> Option<T>,
+    ) -> (Self, Option<T>) {
+        let Some((stamp, payload)) = open(codename, bytes) else { return (Self::Corrupt, None) };
+        let value = read(payload);
+        (if value.is_some() { Self::Value(stamp) } else { Self::Unreadable(stamp) }, value)
+    }
+}
+
 /// What comes of one message.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Verdict {
+pub(crate) enum Verdict<T> {
     /// It is good, and the output is live.
-    Apply(Bytes),
+    Apply(T),
     /// It is good, and the output is safe until it is armed again.
     Hold,
     /// It is not to be used.
     Refused(Fault),
 }
 
+impl Verdict<()> {
+    /// The same of the message's value.
+    pub(crate) fn of<T>(self, value: Option<T>) -> Verdict<T> {
+        match self {
+            // Only a value is ever good.
+            Self::Apply(()) => value.map_or(Verdict::Refused(Fault::Unreadable), Verdict::Apply),
+            Self::Hold => Verdict::Hold,
+            Self::Refused(fault) => Verdict::Refused(fault),
+        }
+    }
+}
+
 /// What is known of one flow of protected messages.
 #[derive(Debug)]
 pub(crate) struct Receiver {
-    codename: Codename,
     protection: Protection,
     state: State,
     /// Incarnation and counter of the last message that was believed.
@@ -38,9 +73,8 @@ pub(crate) struct Receiver {
 }
 
 impl Receiver {
-    pub(crate) fn new(codename: Codename, protection: Protection) -> Self {
+    pub(crate) fn new(protection: Protection) -> Self {
         Self {
-            codename,
             protection,
             state: State::Safe(Cause::NotArmed),
             last: None,
@@ -98,18 +132,18 @@ impl Receiver {
     }
 
     /// Takes one message in.
-    pub(crate) fn take(&mut self, now: Time, bytes: &Bytes) -> Verdict {
+    pub(crate) fn take(&mut self, now: Time, opened: Opened) -> Verdict<()> {
         // However late the thread is that keeps the watchdog.
         self.expire(now);
-        let verdict = match self.examine(now, bytes) {
-            Ok(payload) => {
+        let verdict = match self.examine(now, opened) {
+            Ok(()) => {
                 self.history <<= 1;
                 // A row ends with a silence that would have made a live output safe.
                 let is_next = now.since(self.heard) < self.protection.within;
                 self.good = if is_next { self.good.saturating_add(1) } else { 1 };
                 self.tally.good += 1;
                 self.heard = now;
-                if self.state == State::Live { Verdict::Apply(payload) } else { Verdict::Hold }
+                if self.state == State::Live { Verdict::Apply(()) } else { Verdict::Hold }
             }
             Err(fault) => {
                 self.history = self.history << 1 | 1;
@@ -126,15 +160,24 @@ impl Receiver {
         verdict
     }
 
-    fn examine(&mut self, now: Time, bytes: &Bytes) -> Result<Bytes, Fault> {
-        let (stamp, payload) = envelope::open(&self.codename, bytes).ok_or(Fault::Corrupt)?;
+    fn examine(&mut self, now: Time, opened: Opened) -> Result<(), Fault> {
+        match opened {
+            Opened::Corrupt => Err(Fault::Corrupt),
+            Opened::Value(stamp) => self.follow(now, stamp),
+            // It has come: none is missing because of it, and it does not come again.
+            Opened::Unreadable(stamp) => self.follow(now, stamp).and(Err(Fault::Unreadable)),
+        }
+    }
+
+    /// Whether this is a young message, and the next one.
+    fn follow(&mut self, now: Time, stamp: Stamp) -> Result<(), Fault> {
         let is_ours = stamp.echo != Time::ZERO && self.echoes.contains(&stamp.echo);
         if !is_ours || now.since(stamp.echo) > self.protection.age_max {
             return Err(Fault::TooOld);
         }
         let Some((incarnation, counter)) = self.last else {
             self.last = Some((stamp.incarnation, stamp.counter));
-            return Ok(payload);
+            return Ok(());
         };
         if stamp.incarnation != incarnation {
             self.last = Some((stamp.incarnation, stamp.counter));
@@ -155,7 +198,7 @@ impl Receiver {
             self.trip(Cause::TooMuchLost);
             return Err(Fault::Gap);
         }
-        Ok(payload)
+        Ok(())
     }
 
     /// Makes the output live.

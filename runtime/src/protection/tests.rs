@@ -15,7 +15,11 @@ use std::{
 
 use bytes::Bytes;
 
-use super::{receiver::Receiver, sender::Flows, *};
+use super::{
+    receiver::{Opened, Receiver},
+    sender::Flows,
+    *,
+};
 use crate::tid::{AppAddress, NodeAddress, Tid};
 
 const MS: Duration = Duration::from_millis(1);
@@ -60,7 +64,7 @@ impl Bench {
 
     fn of(protection: Protection) -> Self {
         let now = Time::from_nanos(1_000_000_000);
-        let receiver = Receiver::new(codename(), protection);
+        let receiver = Receiver::new(protection);
         let mut bench = Self { now, flows: Flows::new(LIFE), receiver, sent: 0, applied: Vec::new() };
         // The first message makes the flow that an echo is for.
         bench.seal();
@@ -101,8 +105,9 @@ impl Bench {
     }
 
     /// The only way to the output, for good messages and bad ones.
-    fn take(&mut self, bytes: &Bytes) -> Verdict {
-        let verdict = self.receiver.take(self.now, bytes);
+    fn take(&mut self, bytes: &Bytes) -> Verdict<Bytes> {
+        let (opened, payload) = Opened::of(&codename(), bytes, Some);
+        let verdict = self.receiver.take(self.now, opened).of(payload);
         if let Verdict::Apply(payload) = &verdict {
             self.applied.push(crate::wire::decode::<Torque>(payload).map_or(u64::MAX, |torque| torque.nm));
         }
@@ -160,6 +165,38 @@ fn a_silence_ends_a_row_of_good_messages_while_the_output_is_safe() {
         assert_eq!(bench.take(&message), Verdict::Hold);
     }
     bench.receiver.arm(bench.now).expect("a row without a silence");
+}
+
+#[test]
+fn what_cannot_be_read_keeps_no_output_live_and_arms_none() {
+    // Given: one that bears bad messages, from a sender of a later version.
+    let mut bench = Bench::live_of(Protection { bad_max: 64, ..PROTECTION });
+    let of_later_version = |bench: &mut Bench| {
+        let message = bench.next();
+        let (opened, value) = Opened::of(&codename(), &message, |_| None::<Bytes>);
+        bench.receiver.take(bench.now, opened).of(value)
+    };
+    let deadline = bench.receiver.deadline();
+    for _ in 1..3 {
+        assert_eq!(of_later_version(&mut bench), Verdict::Refused(Fault::Unreadable));
+        assert_eq!(bench.receiver.deadline(), deadline, "it is none that was waited for");
+    }
+    // And: it has come, so that nothing is missing.
+    assert_eq!(bench.receiver.tally().lost, 0);
+    assert_eq!(of_later_version(&mut bench), Verdict::Refused(Fault::Unreadable));
+    assert_eq!(bench.receiver.state(), State::Safe(Cause::Silent));
+    for _ in 0..2 * PROTECTION.good_min {
+        assert_eq!(of_later_version(&mut bench), Verdict::Refused(Fault::Unreadable));
+        assert!(bench.receiver.arm(bench.now).is_err());
+    }
+    let tally = bench.receiver.tally();
+    assert_eq!((tally.unreadable, tally.good), (3 + 2 * 8, 8));
+
+    let mut bench = Bench::live();
+    for _ in 0..=PROTECTION.bad_max {
+        of_later_version(&mut bench);
+    }
+    assert_eq!(bench.receiver.state(), State::Safe(Cause::TooManyBad), "they are bad ones like others");
 }
 
 #[test]
@@ -227,7 +264,7 @@ fn live_guard(slot: &Arc<Mutex<Option<Guard<()>>>>) -> Guard<()> {
     seal();
     for _ in 0..8 {
         flows.heard(tid(DRIVE), Echo::new(Patient::KIND, guarded.echo()));
-        assert_eq!(guarded.take(&seal()), Verdict::Hold);
+        assert_eq!(guarded.take(&seal(), Some), Verdict::Hold);
     }
     guard.arm().expect("good ones have come");
     guard

@@ -145,6 +145,7 @@ const fn all(tally: &Tally) -> u64 {
         + tally.backwards
         + tally.restarted
         + tally.gaps
+        + tally.unreadable
 }
 
 /// What the relay does, by its name; what it passes on last, and what that is counted as.

@@ -333,7 +333,7 @@ fn restart_of_the_sender_is_detected_whatever_number_it_begins_with() {
 fn restart_of_the_receiver_is_detected_by_what_was_under_way() {
     inject("restart of the receiver", PROTECTION, Aftermath::Safe(Cause::NotArmed), |trial, rng| {
         let under_way = trial.bench.next();
-        trial.bench.receiver = Receiver::new(codename(), PROTECTION);
+        trial.bench.receiver = Receiver::new(PROTECTION);
         for _ in 0..rng.random_range(0..4) {
             trial.bench.now = trial.bench.now + MS;
             trial.bench.receiver.echo(trial.bench.now);
