@@ -59,24 +59,31 @@ struct Inner<O> {
     receiver: Receiver,
     output: O,
     safe: MakeSafe<O>,
-    /// The output was to be made safe for this, and that has panicked.
-    owes: Option<Cause>,
+    owes: Option<Owed>,
+}
+
+/// The output was to be made safe, and that has panicked.
+#[derive(Clone, Copy)]
+struct Owed {
+    cause: Cause,
+    /// When it is tried again: what comes meanwhile puts it off no further.
+    retry: Time,
 }
 
 type MakeSafe<O> = Box<dyn FnMut(&mut O, Cause) + Send>;
 
 impl<O> Inner<O> {
     /// Lets the receiver change its mind, and makes the output safe if it did.
-    fn let_decide<R>(&mut self, decide: impl FnOnce(&mut Receiver) -> R) -> R {
+    fn let_decide<R>(&mut self, now: Time, decide: impl FnOnce(&mut Receiver) -> R) -> R {
         let before = self.receiver.state();
         let decided = decide(&mut self.receiver);
         if let (State::Live, State::Safe(cause)) = (before, self.receiver.state()) {
-            self.make_safe(cause);
+            self.make_safe(cause, now);
         }
         decided
     }
 
-    fn make_safe(&mut self, cause: Cause) {
+    fn make_safe(&mut self, cause: Cause, now: Time) {
         let Self { output, safe, owes, codename: Codename { source, name, .. }, .. } = self;
         let is_news = owes.is_none();
         if catch_unwind(AssertUnwindSafe(|| safe(output, cause))).is_ok() {
@@ -86,22 +93,22 @@ impl<O> Inner<O> {
             }
             return;
         }
-        *owes = Some(cause);
+        *owes = Some(Owed { cause, retry: now + SAFE_RETRY });
         if is_news {
             crate::log::error!(%source, of = *name, %cause, "what makes an output safe has panicked; it is tried again each millisecond");
         }
     }
 
     /// Calls again what has panicked.
-    fn pay(&mut self) {
-        if let Some(cause) = self.owes {
-            self.make_safe(cause);
+    fn pay(&mut self, now: Time) {
+        if let Some(Owed { cause, .. }) = self.owes {
+            self.make_safe(cause, now);
         }
     }
 
     /// When the thread has to look.
-    fn deadline(&self, now: Time) -> u64 {
-        let owed = self.owes.map(|_| now + SAFE_RETRY);
+    fn deadline(&self) -> u64 {
+        let owed = self.owes.map(|owed| owed.retry);
         owed.or_else(|| self.receiver.deadline()).map_or(u64::MAX, Time::as_nanos)
     }
 }
@@ -125,9 +132,9 @@ impl<O: Send + 'static> Guard<O> {
         let codename = Codename::of::<P>(source, receiver);
         let receiver = Receiver::new(protection);
         let mut inner = Inner { codename, receiver, output, safe: Box::new(safe), owes: None };
-        inner.make_safe(Cause::NotArmed);
+        inner.make_safe(Cause::NotArmed, Time::now());
         let watch = Watch {
-            deadline: AtomicU64::new(inner.deadline(Time::now())),
+            deadline: AtomicU64::new(inner.deadline()),
             is_tripped: AtomicBool::new(false),
             is_orphan: AtomicBool::new(false),
         };
@@ -161,7 +168,7 @@ impl<O: Send + 'static> Guard<O> {
     pub fn arm(&self) -> Result<(), ArmError> {
         {
             let mut inner = self.shared().lock();
-            inner.pay();
+            inner.pay(Time::now());
             if inner.owes.is_some() {
                 return Err(ArmError::SafeFails);
             }
@@ -232,14 +239,18 @@ impl<O> Shared<O> {
 
     fn decide_locked<R>(&self, inner: &mut Inner<O>, decide: impl FnOnce(&mut Receiver, Time) -> R) -> R {
         let now = Time::now();
-        let is_tripped = self.watch.is_tripped.swap(false, Ordering::AcqRel);
-        let decided = inner.let_decide(|receiver| {
+        let (is_tripped, owed) = (self.watch.is_tripped.swap(false, Ordering::AcqRel), inner.owes.is_some());
+        let decided = inner.let_decide(now, |receiver| {
             if is_tripped {
                 receiver.trip(Cause::Tripped);
             }
             decide(receiver, now)
         });
-        self.watch.deadline.store(inner.deadline(now), Ordering::Release);
+        self.watch.deadline.store(inner.deadline(), Ordering::Release);
+        if inner.owes.is_some() && !owed {
+            // The thread sleeps until the deadline that was, if there was any.
+            rouse();
+        }
         decided
     }
 }
@@ -307,7 +318,7 @@ impl<O: Send + 'static> Watched for Shared<O> {
             Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
             Err(TryLockError::WouldBlock) => return false,
         };
-        inner.pay();
+        inner.pay(Time::now());
         self.decide_locked(&mut inner, |receiver, now| receiver.expire(now));
         true
     }
@@ -395,5 +406,28 @@ impl Keeper {
             output.strong_count() > 0
         });
         (due, sleeps)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tid::{AppAddress, NodeAddress};
+
+    #[test]
+    fn messages_do_not_put_off_the_next_try_of_what_has_panicked() {
+        let tid = |app| Tid::new(NodeAddress::new(7), AppAddress::new(app));
+        let codename = Codename { source: tid(1), destination: tid(2), name: "test.torque" };
+        let receiver = Receiver::new(Protection::of_period(SAFE_RETRY));
+        let safe = Box::new(|(): &mut (), _| panic!("a planted panic"));
+        let mut inner = Inner { codename, receiver, output: (), safe, owes: None };
+        let begun = Time::from_nanos(1_000_000_000);
+        inner.make_safe(Cause::Tripped, begun);
+        let due = (begun + SAFE_RETRY).as_nanos();
+        for tenth in 0..20 {
+            let now = begun + SAFE_RETRY / 10 * tenth;
+            inner.let_decide(now, |receiver| receiver.take(now, Opened::Corrupt));
+            assert_eq!(inner.deadline(), due);
+        }
     }
 }

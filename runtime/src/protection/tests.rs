@@ -258,6 +258,11 @@ fn live_guard(slot: &Arc<Mutex<Option<Guard<()>>>>) -> Guard<()> {
             peer.trip();
         }
     };
+    live_with(safe)
+}
+
+/// A live output, and what makes it safe.
+fn live_with(safe: impl FnMut(&mut (), Cause) + Send + 'static) -> Guard<()> {
     let guard = Guard::new::<Patient>(tid(CENTRAL), tid(DRIVE), (), safe).expect("a thread");
     let (flows, guarded) = (Flows::new(Time::from_nanos(5)), guard.guarded());
     let seal = || flows.seal(tid(CENTRAL), tid(DRIVE), &Patient).expect("one flow");
@@ -298,4 +303,19 @@ fn guards_that_trip_each_other_are_both_safe_and_wait_for_nobody() {
         done.send(()).expect("the test waits");
     });
     is_done.recv_timeout(Duration::from_secs(60)).expect("nobody waits for somebody who waits for him");
+}
+
+/// Its watchdog sleeps for minutes, unless other tests of this process wake it: alone this fails where nobody wakes it.
+#[test]
+fn an_output_that_was_tripped_and_whose_making_safe_panics_is_tried_again_at_once() {
+    let (safe, made_safe) = std::sync::mpsc::sync_channel(1);
+    let mut fails = true;
+    let guard = live_with(move |(), cause| {
+        if cause == Cause::Tripped {
+            assert!(!std::mem::take(&mut fails), "a planted panic");
+            safe.send(()).expect("the test waits");
+        }
+    });
+    guard.trip();
+    made_safe.recv_timeout(Duration::from_secs(60)).expect("it is tried until it is done");
 }
