@@ -1,6 +1,6 @@
 //! Points in time: nanoseconds of the host's monotonic clock.
 //!
-//! The clock counts since the host booted and is the same for all processes of a host. Cores never read it: a time
+//! The clock counts since the host booted, without the time that the host slept, and is the same for all processes of a host. Cores never read it: a time
 //! comes in as an argument, so that a seed replays a failure. Only shells call [`Time::now`].
 
 use std::{
@@ -24,8 +24,27 @@ impl Time {
     /// The present moment. For shells only.
     #[must_use]
     pub fn now() -> Self {
-        let now = clock_gettime(ClockId::Monotonic);
-        // The monotonic clock starts at zero and cannot be negative.
+        Self::of(ClockId::Monotonic)
+    }
+
+    /// The present moment, and how long the host has slept at least since it booted, in which this clock stands. For shells only.
+    ///
+    /// A thread that is held up between its two looks at clocks finds less sleep than there was, never more. Elsewhere than on Linux it is
+    /// zero: there it is not known.
+    #[must_use]
+    pub fn now_and_asleep() -> (Self, Duration) {
+        #[cfg(target_os = "linux")]
+        let with_sleep = Self::of(ClockId::Boottime);
+        let now = Self::now();
+        #[cfg(target_os = "linux")]
+        return (now, with_sleep.since(now));
+        #[cfg(not(target_os = "linux"))]
+        return (now, Duration::ZERO);
+    }
+
+    fn of(clock: ClockId) -> Self {
+        let now = clock_gettime(clock);
+        // These clocks start at zero and cannot be negative.
         Self(now.tv_sec.unsigned_abs() * 1_000_000_000 + now.tv_nsec.unsigned_abs())
     }
 

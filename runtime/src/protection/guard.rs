@@ -238,9 +238,10 @@ impl<O> Shared<O> {
     }
 
     fn decide_locked<R>(&self, inner: &mut Inner<O>, decide: impl FnOnce(&mut Receiver, Time) -> R) -> R {
-        let now = Time::now();
+        let (now, asleep) = Time::now_and_asleep();
         let (is_tripped, owed) = (self.watch.is_tripped.swap(false, Ordering::AcqRel), inner.owes.is_some());
         let decided = inner.let_decide(now, |receiver| {
+            receiver.has_slept(asleep);
             if is_tripped {
                 receiver.trip(Cause::Tripped);
             }

@@ -114,6 +114,9 @@ pub enum Cause {
     /// The sender counts anew: it was restarted.
     #[error("the sender was restarted")]
     Restarted,
+    /// The receiver's host has slept: how old commands are that came meanwhile is not known.
+    #[error("the host has slept")]
+    Slept,
     /// The receiver said so.
     #[error("the receiver tripped it")]
     Tripped,

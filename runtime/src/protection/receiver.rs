@@ -1,5 +1,7 @@
 //! The receiving end without clock and thread: what is believed, and when the output has to be safe.
 
+use std::time::Duration;
+
 use bytes::Bytes;
 
 use super::{ArmError, Cause, Codename, Fault, Protection, Stamp, State, Tally, envelope::open};
@@ -7,6 +9,8 @@ use crate::time::Time;
 
 /// Echoes that a sender may answer with. One is sent each quarter of the longest age, so that the oldest is twice too old.
 const ECHOES: usize = 8;
+/// So much more sleep of the host than was known is one: less may be due to how it is read.
+const SLEEP_MIN: Duration = Duration::from_millis(5);
 
 /// What is in a message, as far as that can be said without its receiver.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -69,6 +73,8 @@ pub(crate) struct Receiver {
     /// The last 64 messages, the newest at the lowest bit: 1 for a bad one.
     history: u64,
     echoes: [Time; ECHOES],
+    /// How long the host has slept in all.
+    asleep: Duration,
     tally: Tally,
 }
 
@@ -82,6 +88,7 @@ impl Receiver {
             good: 0,
             history: 0,
             echoes: [Time::ZERO; ECHOES],
+            asleep: Duration::ZERO,
             tally: Tally::default(),
         }
     }
@@ -111,8 +118,18 @@ impl Receiver {
         self.echoes[0]
     }
 
-    pub(crate) const fn echo_period(&self) -> std::time::Duration {
+    pub(crate) const fn echo_period(&self) -> Duration {
         self.protection.echo_period()
+    }
+
+    /// The host has slept for so long in all. Clocks stand meanwhile: what was under way has an age that nobody knows, so nothing counts that
+    /// quotes an echo from before.
+    pub(crate) fn has_slept(&mut self, asleep: Duration) {
+        if asleep >= self.asleep + SLEEP_MIN {
+            self.echoes = [Time::ZERO; ECHOES];
+            self.trip(Cause::Slept);
+        }
+        self.asleep = self.asleep.max(asleep);
     }
 
     /// The output is safe if the watchdog's time is over.

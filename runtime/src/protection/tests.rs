@@ -212,6 +212,31 @@ fn a_sender_that_hears_no_echo_is_not_believed() {
 }
 
 #[test]
+fn what_was_under_way_while_the_host_slept_moves_nothing() {
+    let mut bench = Bench::live();
+    bench.receiver.has_slept(Duration::from_secs(7));
+    assert_eq!(bench.receiver.state(), State::Safe(Cause::Slept), "however long it had slept before");
+    bench.come_alive();
+    // Given: commands that wait, and an hour of sleep in which the clock stands.
+    let waiting: Vec<Bytes> = (0..=PROTECTION.good_min).map(|_| bench.seal()).collect();
+    bench.receiver.has_slept(Duration::from_secs(7) + MS);
+    assert_eq!(bench.receiver.state(), State::Live, "two clocks are never read at once");
+    bench.receiver.has_slept(Duration::from_secs(3_607));
+    assert_eq!(bench.receiver.state(), State::Safe(Cause::Slept));
+    for message in &waiting {
+        assert_eq!(bench.take(message), Verdict::Refused(Fault::TooOld));
+        assert!(bench.receiver.arm(bench.now).is_err());
+    }
+    // And: what is sent after an echo counts, behind those that are missing; and no sleep that is known counts twice.
+    bench.receiver.has_slept(Duration::from_secs(3_600));
+    let message = bench.next();
+    assert_eq!(bench.take(&message), Verdict::Refused(Fault::Gap));
+    bench.receiver.has_slept(Duration::from_secs(3_607));
+    bench.come_alive();
+    assert!(bench.applies_the_next());
+}
+
+#[test]
 fn one_bad_message_is_borne_and_the_second_of_64_is_not() {
     let mut bench = Bench::live();
     let bad = Bytes::from_static(b"noise");
