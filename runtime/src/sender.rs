@@ -97,9 +97,9 @@ pub enum SendError {
         "the kind {0} belongs to Sinew's layers, which would end a connection; take one from `Kind::named`"
     )]
     NotYours(Kind),
-    /// This life of the application has sent protected messages to 1,024 receivers.
+    /// This life of the application has sent protected messages to 1,024 receivers, to each of them within its type's `within` and `age_max`.
     #[error(
-        "this application sends protected messages to 1,024 receivers already, and can to no further one"
+        "this application sends protected messages to 1,024 receivers already, and can to no further one while it goes on with these"
     )]
     TooManyProtectedFlows,
 }
@@ -368,8 +368,8 @@ impl Sender {
             // Each receiver has its own echo, and its own codename.
             return Err(Rejection::Unsupported.into());
         }
-        let payload =
-            self.flows.seal(self.shared.tid, receiver, value).ok_or(SendError::TooManyProtectedFlows)?;
+        let payload = self.flows.seal(self.shared.tid, receiver, value, Time::now());
+        let payload = payload.ok_or(SendError::TooManyProtectedFlows)?;
         Ok(Message::of_type::<P>(self.shared.tid, destination, payload))
     }
 

@@ -88,7 +88,8 @@ impl Endpoint {
             // It may come back to another address, and it is sealed for the one that it has.
             self.be_ready(limit)?;
         }
-        Ok(self.ends.message(self.tid, destination, self.absolute(destination), value)?)
+        let ends = (self.tid, self.absolute(destination));
+        Ok(self.ends.message(ends, destination, value, Time::now())?)
     }
 
     /// What of a message is for the program.

@@ -62,8 +62,10 @@ pub enum SealError {
         "it is protected, and so for one application, not for a group or for all; send it to each by itself"
     )]
     ToMany,
-    /// There are 1,024 flows of protected messages, of one type to one receiver each.
-    #[error("this sender has 1024 flows of protected messages, which is the most; register another endpoint")]
+    /// There are 1,024 flows of protected messages, of one type to one receiver each, and all of them go on.
+    #[error(
+        "this sender goes on with 1024 flows of protected messages, which is the most; register another endpoint"
+    )]
     TooManyFlows,
 }
 
@@ -74,17 +76,17 @@ impl Ends {
         Self { flows: Flows::new(now), held: Vec::new(), kinds: BTreeSet::new() }
     }
 
-    /// A message of the value, in its envelope if its type is protected. `source` and `receiver` are absolute; `destination` is
-    /// `receiver` as the caller has said it.
+    /// A message of the value, in its envelope if its type is protected, sent at `now`. `source` and `receiver` are absolute; `destination`
+    /// is `receiver` as the caller has said it.
     ///
     /// # Errors
     /// Its type is protected, and it cannot be sealed. One that is sealed and not sent then uses up a number.
     pub fn message<P: Payload>(
         &self,
-        source: Tid,
+        (source, receiver): (Tid, Tid),
         destination: Tid,
-        receiver: Tid,
         value: &P,
+        now: Time,
     ) -> Result<Message, SealError> {
         if P::PROTECTION.is_none() {
             return Ok(Message::of_type::<P>(source, destination, encode(value)));
@@ -92,7 +94,7 @@ impl Ends {
         if !receiver.is_single() {
             return Err(SealError::ToMany);
         }
-        let payload = self.flows.seal(source, receiver, value).ok_or(SealError::TooManyFlows)?;
+        let payload = self.flows.seal(source, receiver, value, now).ok_or(SealError::TooManyFlows)?;
         Ok(Message::of_type::<P>(source, destination, payload))
     }
 
@@ -288,7 +290,8 @@ mod tests {
         let (mut sender, mut receiver) = (Ends::new(NOW), Ends::new(NOW));
         let guard = receiver.guard::<Angle, _>((tid(1), tid(9)), NOW, (), |(), _| {}).expect("a thread");
         let angle = Angle { radians: 1.0 };
-        let good = |sender: &Ends| sender.message(tid(1), tid(9), tid(9), &angle).expect("it is for one");
+        let good =
+            |sender: &Ends| sender.message((tid(1), tid(9)), tid(9), &angle, NOW).expect("it is for one");
         good(&sender);
         assert!(matches!(sender.take(receiver.echo(tid(9), NOW).expect("at once")), Came::Settled));
         for _ in 0..8 {
@@ -296,7 +299,7 @@ mod tests {
         }
         guard.arm().expect("good ones have come");
         assert!(matches!(receiver.take(good(&sender)), Came::Good(_)));
-        let later = sender.message(tid(1), tid(9), tid(9), &LaterAngle { degrees: 57.0 });
+        let later = sender.message((tid(1), tid(9)), tid(9), &LaterAngle { degrees: 57.0 }, NOW);
         assert!(matches!(receiver.take(later.expect("it is for one")), Came::Settled));
         assert_eq!((guard.tally().good, guard.tally().unreadable), (9, 1));
         assert!(matches!(receiver.take(good(&sender)), Came::Good(_)), "one is borne, and none is missing");
@@ -328,10 +331,10 @@ mod tests {
         assert_eq!(receiver.echo_due(), Some(NOW + PROTECTION.echo_period()));
         // Who sends it nothing that is protected has no use for it, and does not know it.
         assert!(matches!(sender.take(first), Came::Plain(_)));
-        sender.message(tid(1), tid(9), tid(9), &Torque(1.0)).expect("it is for one");
+        sender.message((tid(1), tid(9)), tid(9), &Torque(1.0), NOW).expect("it is for one");
         let second = receiver.echo(tid(9), NOW + PROTECTION.echo_period()).expect("it is due");
         assert!(matches!(sender.take(second), Came::Settled));
         let group = Tid::group("test.all");
-        assert_eq!(sender.message(tid(1), group, group, &Torque(1.0)).err(), Some(SealError::ToMany));
+        assert_eq!(sender.message((tid(1), group), group, &Torque(1.0), NOW).err(), Some(SealError::ToMany));
     }
 }

@@ -237,7 +237,7 @@ impl Play {
     fn send(&mut self) {
         self.next.counter += 1;
         let torque = Torque { number: self.next.counter };
-        let bytes = self.flows.seal(tid(1), tid(2), &torque).expect("one flow");
+        let bytes = self.flows.seal(tid(1), tid(2), &torque, self.now).expect("one flow");
         self.keep(self.next, encode(&torque));
         assert_eq!(self.kept.front().map(|sealed| &sealed.bytes), Some(&bytes), "the sender's own stamp");
     }

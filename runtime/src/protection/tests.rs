@@ -93,7 +93,7 @@ impl Bench {
 
     fn seal(&mut self) -> Bytes {
         self.sent += 1;
-        self.flows.seal(tid(CENTRAL), tid(DRIVE), &Torque { nm: self.sent }).expect("one flow")
+        self.flows.seal(tid(CENTRAL), tid(DRIVE), &Torque { nm: self.sent }, self.now).expect("one flow")
     }
 
     /// One period later: the sender's next message, with a fresh echo.
@@ -275,6 +275,39 @@ fn the_bytes_are_those_of_the_page() {
     assert_eq!(digest.sum64(), 0x995d_c9bb_df19_39fa);
 }
 
+#[test]
+fn a_flow_that_is_over_gives_its_place_up_and_comes_back_above_all_that_it_has_said() {
+    let mut bench = Bench::live();
+    let said = bench.sent;
+    // Given: as many receivers as there may be, all of them one after the other.
+    let to =
+        |bench: &Bench, app| bench.flows.seal(tid(CENTRAL), tid(DRIVE + app), &Torque { nm: 0 }, bench.now);
+    for app in 1..1_024 {
+        assert!(to(&bench, app).is_some(), "{app}");
+    }
+    // Then: nobody who goes on is forgotten; whoever is over is, the first one first.
+    let lasts = PROTECTION.within + PROTECTION.age_max;
+    bench.now = bench.now + lasts;
+    assert!(to(&bench, 1_024).is_none(), "all go on");
+    bench.now = bench.now + MS;
+    assert!(to(&bench, 1).is_some(), "it goes on");
+    for app in 1_024..=2_000 {
+        assert!(to(&bench, app).is_some(), "{app}: its place is that of one that is over");
+    }
+    // When: the first one comes back.
+    let echo = bench.receiver.echo(bench.now);
+    let message = bench.seal();
+    let (stamp, _) = open(&codename(), &message).expect("it is its own");
+    assert!(stamp.counter > said && stamp.incarnation == LIFE.as_nanos());
+    assert_eq!(stamp.echo, Time::ZERO, "what it had heard is forgotten");
+    assert_eq!(bench.take(&message), Verdict::Refused(Fault::TooOld));
+    assert_eq!(bench.receiver.state(), State::Safe(Cause::Silent), "since long ago");
+    // And: who has never heard of it begins there.
+    bench.flows.heard(tid(DRIVE), Echo::new(Torque::KIND, echo));
+    bench.come_alive();
+    assert!(bench.applies_the_next());
+}
+
 /// A live output, and whose `safe` is called with what is in its slot.
 fn live_guard(slot: &Arc<Mutex<Option<Guard<()>>>>) -> Guard<()> {
     let peer = slot.clone();
@@ -290,7 +323,7 @@ fn live_guard(slot: &Arc<Mutex<Option<Guard<()>>>>) -> Guard<()> {
 fn live_with(safe: impl FnMut(&mut (), Cause) + Send + 'static) -> Guard<()> {
     let guard = Guard::new::<Patient>(tid(CENTRAL), tid(DRIVE), (), safe).expect("a thread");
     let (flows, guarded) = (Flows::new(Time::from_nanos(5)), guard.guarded());
-    let seal = || flows.seal(tid(CENTRAL), tid(DRIVE), &Patient).expect("one flow");
+    let seal = || flows.seal(tid(CENTRAL), tid(DRIVE), &Patient, LIFE).expect("one flow");
     seal();
     for _ in 0..8 {
         flows.heard(tid(DRIVE), Echo::new(Patient::KIND, guarded.echo()));

@@ -322,7 +322,8 @@ fn restart_of_the_sender_is_detected_whatever_number_it_begins_with() {
         trial.bench.flows = Flows::new(life);
         // Half of them have just the number that the life before would have had.
         for _ in 0..if rng.random() { count } else { rng.random_range(1..=2 * count) } {
-            trial.bench.flows.seal(tid(CENTRAL), tid(DRIVE), &Torque { nm: 0 }).expect("one flow");
+            let Bench { flows, now, .. } = &trial.bench;
+            flows.seal(tid(CENTRAL), tid(DRIVE), &Torque { nm: 0 }, *now).expect("one flow");
         }
         let message = trial.bench.next();
         trial.inject(&message, Fault::Restarted);
