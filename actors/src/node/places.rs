@@ -1,17 +1,24 @@
 //! Whether the threads that applications ask for can be as they ask.
 
-use sinew_runtime::supervision::Place;
+use sinew_runtime::{protection::SAFE_OUTPUT_PRIORITY, supervision::Place};
 
 use super::StartError;
 
-/// Refuses the application `name` if it asks for a thread that has another priority or CPU: the node's own, or for one of
-/// `others`.
+/// Refuses the application `name` if it asks for a priority that what makes outputs safe has to be above, or for a thread that has another priority
+/// or CPU: the node's own, or for one of `others`.
 pub(super) fn check<'a>(
     name: &str,
     place: &Place,
     others: impl IntoIterator<Item = (&'a str, &'a Place)>,
 ) -> Result<(), StartError> {
     let clash = match Place::io().clash(place) {
+        _ if place.realtime_priority.max(place.at_best) >= Some(SAFE_OUTPUT_PRIORITY) => {
+            let most = SAFE_OUTPUT_PRIORITY - 1;
+            Some(format!(
+                "its thread is to have a real-time priority of {SAFE_OUTPUT_PRIORITY} or more, which what makes outputs safe would wait for; \
+                 take one of 1 to {most}"
+            ))
+        }
         Some(why) => {
             Some(format!("{why}; it is the node's: take `Place::thread` or `Place::own_thread` for that"))
         }
@@ -40,6 +47,17 @@ mod tests {
         );
         for place in [Place::io(), Place::thread("io").realtime(50), Place::process().realtime(50)] {
             assert!(check("control", &place, []).is_ok(), "{place:?}");
+        }
+    }
+
+    #[test]
+    fn nobody_has_a_priority_that_holds_up_what_makes_outputs_safe() {
+        for place in [Place::own_thread(), Place::process(), Place::thread("leg")] {
+            assert!(check("control", &place.clone().realtime(89), []).is_ok());
+            for high in [place.clone().realtime(90), place.clone().realtime(99), place.realtime_at_best(90)] {
+                let words = check("control", &high, []).expect_err("it is refused").to_string();
+                assert!(words.contains("'control'") && words.contains("take one of 1 to 89"), "{words}");
+            }
         }
     }
 

@@ -7,6 +7,7 @@ use rustix::{
     process::{Resource, getrlimit},
     thread::{CapabilitySet, capabilities},
 };
+use sinew::protection::SAFE_OUTPUT_PRIORITY;
 use thread_priority::{
     RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy,
     set_thread_priority_and_policy, thread_native_id,
@@ -58,30 +59,45 @@ pub(super) fn locked_memory() -> Check {
     )
 }
 
-/// Tried on a thread that ends with it: what the limits say is not always so (in containers).
+/// Tried on a thread that ends with it: what the limits say is not always so (in containers). What makes outputs safe wants the most of what
+/// a robot cannot be without; the node's watchdog would have a little more.
 pub(super) fn real_time() -> Check {
     const NAME: &str = "real-time rights";
-    let trial = || {
-        let level = ThreadPriorityValue::try_from(1).map_err(|_| thread_priority::Error::Priority("1"))?;
+    let trial = |priority: u8| {
+        let level = ThreadPriorityValue::try_from(priority)
+            .map_err(|_| thread_priority::Error::Priority("1 to 99"))?;
         let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
         set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(level), policy)
     };
+    let trials = move || (trial(1), trial(SAFE_OUTPUT_PRIORITY));
     let limit =
         getrlimit(Resource::Rtprio).current.map_or_else(|| "any".to_owned(), |limit| limit.to_string());
     let capability = if has(CapabilitySet::SYS_NICE) { "with" } else { "without" };
     let known = format!("RLIMIT_RTPRIO {limit}, {capability} CAP_SYS_NICE");
-    match std::thread::spawn(trial).join() {
-        Ok(Ok(())) => Check::fine(NAME, format!("a thread got SCHED_FIFO ({known}){}", throttled())),
-        Ok(Err(error)) => Check::finding(
-            NAME,
-            format!("a thread did not get SCHED_FIFO: {error:?} ({known})"),
-            format!(
-                "echo \"$USER - rtprio 80\" | sudo tee -a {LIMITS}, then log in again; or sudo setcap cap_sys_nice+ep PROGRAM; in a \
-                 container: --cap-add SYS_NICE --ulimit rtprio=80"
-            ),
+    let seen = match std::thread::spawn(trials).join() {
+        Ok((_, Ok(()))) => {
+            return Check::fine(
+                NAME,
+                format!("a thread got SCHED_FIFO {SAFE_OUTPUT_PRIORITY} ({known}){}", throttled()),
+            );
+        }
+        Ok((Ok(()), Err(error))) => format!(
+            "a thread got SCHED_FIFO 1, and not the {SAFE_OUTPUT_PRIORITY} of what makes outputs safe: {error:?} ({known}); that takes the \
+             highest that it gets, and comes too late where what it guards has a higher one"
         ),
-        Err(_) => Check::finding(NAME, "the trial panicked".to_owned(), "report it, please"),
-    }
+        Ok((Err(error), Err(_))) => format!("a thread did not get SCHED_FIFO: {error:?} ({known})"),
+        Err(_) => {
+            return Check::finding(NAME, "the trial panicked".to_owned(), "report it, please");
+        }
+    };
+    Check::finding(
+        NAME,
+        seen,
+        format!(
+            "echo \"$USER - rtprio 99\" | sudo tee -a {LIMITS}, then log in again; or LimitRTPRIO=99 in the service's unit; or sudo setcap \
+             cap_sys_nice+ep PROGRAM; in a container: --cap-add SYS_NICE --ulimit rtprio=99"
+        ),
+    )
 }
 
 /// The kernel takes the CPU from real-time threads that never sleep: good to know, not to be mended.

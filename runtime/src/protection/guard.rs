@@ -6,6 +6,7 @@ use std::{
     sync::{
         Arc, Mutex, MutexGuard, OnceLock, PoisonError, TryLockError, Weak,
         atomic::{AtomicBool, AtomicU64, Ordering},
+        mpsc::sync_channel,
     },
     thread::{self, Thread},
     time::Duration,
@@ -14,13 +15,11 @@ use std::{
 use bytes::Bytes;
 
 use super::{
-    ArmError, Cause, Codename, Protection, State, Tally,
+    ArmError, Cause, Codename, Protection, SAFE_OUTPUT_PRIORITY, State, Tally,
     receiver::{Opened, Receiver, Verdict},
 };
-use crate::{supervision::Place, tid::Tid, time::Time, wire::Payload};
+use crate::{supervision::make_foremost, tid::Tid, time::Time, wire::Payload};
 
-/// SCHED_FIFO priority of the thread that keeps the watchdogs: above all that controls.
-const PRIORITY: u8 = 90;
 /// Time after which an output is tried again that its application holds just then.
 const HELD: Duration = Duration::from_micros(100);
 /// Time after which what makes an output safe is called again, where it has panicked.
@@ -117,7 +116,7 @@ impl<O: Send + 'static> Guard<O> {
     /// The output of what `receiver` does with the values of type `P` from `source`, both absolute. `safe` is called with it now, and each
     /// time that it is not live any more: on the thread `safe-output`, on that of a message, or of whoever trips or drops the guard. It
     /// must be short and wait for nobody, as the outputs of all guards wait for it; of other guards it may [trip](Self::trip) any. One that
-    /// panics is called again.
+    /// panics is called again. The first guard of a process waits until that thread runs.
     ///
     /// # Errors
     /// The thread cannot be started.
@@ -346,10 +345,15 @@ fn keeper() -> io::Result<&'static Keeper> {
     let keeper = KEEPER.get_or_init(Keeper::default);
     let _one_at_a_time = STARTING.lock().unwrap_or_else(PoisonError::into_inner);
     if THREAD.get().is_none() {
-        let thread = thread::Builder::new().name("safe-output".to_owned()).spawn(|| {
-            Place::layer("safe-output").realtime(PRIORITY).prepare();
+        let (prepared, is_prepared) = sync_channel(1);
+        let thread = thread::Builder::new().name("safe-output".to_owned()).spawn(move || {
+            make_foremost("safe-output", SAFE_OUTPUT_PRIORITY);
+            // It is waited for.
+            let _ = prepared.send(());
             keeper.run()
         })?;
+        // Until it is prepared it has this thread's CPUs and priority: who never sleeps would never let it begin.
+        is_prepared.recv().map_err(|_| io::Error::other("the thread 'safe-output' has ended"))?;
         THREAD.get_or_init(|| thread.thread().clone());
     }
     Ok(keeper)

@@ -19,7 +19,7 @@
 //!
 //! The output belongs to a [`Guard`]. It is safe at first, live after [`Guard::arm`], and safe again, until it is armed again, once
 //! something is wrong that the type's [`Protection`] does not bear. The watchdog is kept by a thread of its own, `safe-output`,
-//! which needs no layer and no reactor. All outputs of a process share it: what makes one of them safe must be short.
+//! which needs no layer and no reactor, and has neither the CPUs nor the priority of whoever made the first guard. All outputs of a process share it: what makes one of them safe must be short.
 //!
 //! | file | what it is |
 //! | --- | --- |
@@ -54,6 +54,10 @@ use crate::{
     time::Time,
     wire::{Class, Kind, Payload},
 };
+
+/// SCHED_FIFO priority of the thread that makes outputs safe: above all that controls. An application's own is below it, and the system must
+/// grant it (`ulimit -r 99`, or CAP_SYS_NICE): where it does not, the thread has the highest that is granted, which the log says.
+pub const SAFE_OUTPUT_PRIORITY: u8 = 90;
 
 /// What a receiver of protected messages bears.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

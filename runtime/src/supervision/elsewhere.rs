@@ -19,3 +19,13 @@ pub(super) fn name_thread(_: &CStr) {}
 pub(super) fn keep_on(_: usize) -> io::Result<()> {
     Err(io::Error::new(io::ErrorKind::Unsupported, "this system keeps no thread on one CPU"))
 }
+
+/// It is kept on none.
+pub(super) fn keep_on_any() -> io::Result<()> {
+    Ok(())
+}
+
+/// There is no such limit: what is refused once stays so.
+pub(super) fn realtime_limit() -> u8 {
+    0
+}

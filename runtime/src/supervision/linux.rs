@@ -2,7 +2,10 @@
 
 use std::ffi::CStr;
 
-use rustix::thread::{CpuSet, gettid, sched_setaffinity, set_name};
+use rustix::{
+    process::{Resource, getrlimit},
+    thread::{CpuSet, gettid, sched_setaffinity, set_name},
+};
 use thread_priority::{NormalThreadSchedulePolicy, ThreadSchedulePolicy};
 
 /// Under this a thread runs only when the CPU has nothing else to do.
@@ -25,4 +28,17 @@ pub(super) fn keep_on(cpu: usize) -> std::io::Result<()> {
         set.set(cpu);
     }
     Ok(sched_setaffinity(None, &set)?)
+}
+
+/// Lets the calling thread run on any CPU, whatever whoever made it was kept on. The kernel leaves those out that the process may not use.
+pub(super) fn keep_on_any() -> std::io::Result<()> {
+    let mut set = CpuSet::new();
+    (0..CpuSet::MAX_CPU).for_each(|cpu| set.set(cpu));
+    Ok(sched_setaffinity(None, &set)?)
+}
+
+/// The highest real-time priority that this process's limit grants, 0 for none; with CAP_SYS_NICE it is no limit.
+pub(super) fn realtime_limit() -> u8 {
+    let limit = getrlimit(Resource::Rtprio).current.unwrap_or(u64::MAX);
+    u8::try_from(limit).unwrap_or(u8::MAX)
 }

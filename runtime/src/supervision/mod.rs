@@ -48,7 +48,6 @@ mod watchdog;
 use self::elsewhere as system;
 #[cfg(target_os = "linux")]
 use self::linux as system;
-pub(crate) use self::panics::writes_the_log;
 pub use self::{
     alone::{Alone, AloneHandle, alone, overseen},
     burial::Burials,
@@ -66,3 +65,4 @@ pub use self::{
     threads::{Threads, Turn},
     vitals::{at_fence, is_fenced},
 };
+pub(crate) use self::{panics::writes_the_log, place::make_foremost};

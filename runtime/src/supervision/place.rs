@@ -4,7 +4,7 @@ use std::ffi::CString;
 
 use thread_priority::{
     NormalThreadSchedulePolicy, RealtimeThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy,
-    set_thread_priority_and_policy, thread_native_id,
+    set_thread_priority_and_policy, thread_native_id, thread_schedule_policy_param,
 };
 
 use super::system;
@@ -17,7 +17,8 @@ pub struct Place {
     pub thread: String,
     /// Whose thread it is.
     pub owner: Owner,
-    /// SCHED_FIFO priority, 1 to 99. Where the system refuses it, the node says so once and goes on without.
+    /// SCHED_FIFO priority, 1 to 99; an application's is below [that of the thread which makes outputs
+    /// safe](crate::protection::SAFE_OUTPUT_PRIORITY). Where the system refuses it, the node says so once and goes on without.
     pub realtime_priority: Option<u8>,
     /// A priority for the node's own thread where the system grants one; nothing is said where it does not.
     pub at_best: Option<u8>,
@@ -86,7 +87,8 @@ impl Place {
         place
     }
 
-    /// The same thread under SCHED_FIFO with this priority, 1 to 99.
+    /// The same thread under SCHED_FIFO with this priority, 1 to 99; an application with 90 or more is refused by its node, as
+    /// [what makes outputs safe](crate::protection::SAFE_OUTPUT_PRIORITY) has to come before what it guards.
     #[must_use]
     pub const fn realtime(mut self, priority: u8) -> Self {
         self.realtime_priority = Some(priority);
@@ -174,6 +176,49 @@ impl Place {
     }
 }
 
+/// Makes the calling thread, which is new and has the CPUs and the priority of whoever made it, one that depends on neither: it may run on any
+/// CPU, under SCHED_FIFO with the priority `wanted`, or with the highest that is granted. The log says which it has.
+pub(crate) fn make_foremost(thread: &str, wanted: u8) {
+    if let Err(error) = system::keep_on_any() {
+        crate::log::warn!(thread, %error, "the thread stays on the CPUs of whoever made it");
+    }
+    let (policy, inherited) = schedule();
+    let granted = priorities(wanted, system::realtime_limit(), inherited)
+        .into_iter()
+        .flatten()
+        .any(|priority| make_realtime(priority).is_ok());
+    // Whoever made it may be one that waits for all others.
+    let gives_way = matches!(policy, Some(ThreadSchedulePolicy::Normal(normal)) if normal != NormalThreadSchedulePolicy::Other);
+    if !granted && gives_way {
+        make_ordinary();
+    }
+    let (_, has) = schedule();
+    if has >= wanted {
+        crate::log::info!(thread, priority = has, "has its real-time priority, and may run on any CPU");
+    } else {
+        crate::log::warn!(
+            thread,
+            wanted,
+            has,
+            "the system refuses this thread its real-time priority; it has another (0: none), and what has a higher one or, without one, a busy CPU makes \
+             it late; allow it with `ulimit -r 99` or `setcap cap_sys_nice+ep` on the program"
+        );
+    }
+}
+
+/// The real-time priorities to ask for, one after the other, of a thread that has inherited one, 0 for none: the one that is wanted, and the
+/// highest that the limit grants, where that is more than it has.
+fn priorities(wanted: u8, limit: u8, inherited: u8) -> [Option<u8>; 2] {
+    [Some(wanted), Some(limit.min(wanted)).filter(|granted| *granted > inherited)]
+}
+
+/// How the calling thread is scheduled, and its real-time priority, 0 for none.
+fn schedule() -> (Option<ThreadSchedulePolicy>, u8) {
+    thread_schedule_policy_param(thread_native_id()).map_or((None, 0), |(policy, params)| {
+        (Some(policy), u8::try_from(params.sched_priority).unwrap_or(0))
+    })
+}
+
 /// Puts the calling thread under SCHED_FIFO with this priority, 1 to 99.
 pub(super) fn make_realtime(priority: u8) -> Result<(), thread_priority::Error> {
     let level = priority
@@ -211,5 +256,16 @@ mod tests {
         let own = Place::own_thread().of_application("leg").realtime(40);
         assert_eq!(leg().clash(&own), None, "that is another thread");
         assert_eq!(Place::process().clash(&Place::process().realtime(40)), None, "each has its own");
+    }
+
+    #[test]
+    fn a_thread_that_is_refused_its_priority_takes_the_highest_that_is_granted() {
+        let asked = |limit, inherited| -> Vec<u8> {
+            priorities(90, limit, inherited).into_iter().flatten().collect()
+        };
+        assert_eq!(asked(0, 0), [90]);
+        assert_eq!(asked(80, 0), [90, 80]);
+        assert_eq!(asked(99, 0), [90, 90]);
+        assert_eq!(asked(40, 50), [90], "what it has is more");
     }
 }

@@ -68,7 +68,7 @@ pub enum ControlThread {
 pub struct Control {
     /// On which thread.
     pub thread: ControlThread,
-    /// `SCHED_FIFO` priority of that thread, 1 to 99; only for a thread of its own.
+    /// `SCHED_FIFO` priority of that thread, 1 to 89; only for a thread of its own.
     pub realtime_priority: Option<u8>,
     /// Who lets the person walk.
     pub release: ReleaseBy,

@@ -221,8 +221,8 @@ fn control(faults: &mut Faults, table: &ControlTable) -> Control {
         }
     };
     if let Some(priority) = table.realtime_priority {
-        faults.note((1..=99).contains(&priority), || {
-            format!("control.realtime_priority = {priority} is not within 1 to 99")
+        faults.note((1..=89).contains(&priority), || {
+            format!("control.realtime_priority = {priority} is not within 1 to 89")
         });
         faults.note(thread == ControlThread::Own, || {
             "control.realtime_priority needs control.thread = \"own\": the network must not run at it"
