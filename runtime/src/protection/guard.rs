@@ -20,6 +20,8 @@ use super::{
 };
 use crate::{supervision::make_foremost, tid::Tid, time::Time, wire::Payload};
 
+/// Time that the thread which keeps the watchdogs has to begin.
+const BEGINS_WITHIN: Duration = Duration::from_secs(5);
 /// Time after which an output is tried again that its application holds just then.
 const HELD: Duration = Duration::from_micros(100);
 /// Time after which what makes an output safe is called again, where it has panicked.
@@ -353,7 +355,11 @@ fn keeper() -> io::Result<&'static Keeper> {
             keeper.run()
         })?;
         // Until it is prepared it has this thread's CPUs and priority: who never sleeps would never let it begin.
-        is_prepared.recv().map_err(|_| io::Error::other("the thread 'safe-output' has ended"))?;
+        is_prepared.recv_timeout(BEGINS_WITHIN).map_err(|_| {
+            io::Error::other(format!(
+                "the thread 'safe-output' has not begun within {BEGINS_WITHIN:?}: does a thread of a higher real-time priority keep all CPUs?"
+            ))
+        })?;
         THREAD.get_or_init(|| thread.thread().clone());
     }
     Ok(keeper)

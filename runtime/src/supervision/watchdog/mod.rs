@@ -29,6 +29,7 @@ use super::{
     Reason,
     panics::{is_the_runtimes, words},
     place::make_realtime,
+    system,
     tenant::{Fate, Tenant},
     vitals::Neighbours,
 };
@@ -121,6 +122,8 @@ impl Drop for Watchdog {
 
 fn run(shared: &Weak<Shared>) {
     is_the_runtimes();
+    // Whoever woke it first may be kept on one CPU, and hang there. Refused, it stays there, too.
+    let _ = system::keep_on_any();
     if let Err(error) = make_realtime(PRIORITY) {
         static SAID: Once = Once::new();
         SAID.call_once(|| {
