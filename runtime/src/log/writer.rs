@@ -33,8 +33,7 @@ pub fn lost() -> u64 {
     LOST.load(Ordering::Relaxed)
 }
 
-/// Starts the log's thread, where it does not run. The first one who logs does it otherwise, and if his thread has a real-time
-/// priority or a CPU of its own, the log's has the same.
+/// Starts the log's thread, where it does not run. The first one who logs does it otherwise, in whatever he is in the middle of.
 pub fn begin() {
     let _ = queue();
 }
@@ -91,6 +90,8 @@ fn queue() -> Option<&'static SyncSender<Entry>> {
 
 fn write(entries: &Receiver<Entry>) {
     crate::supervision::writes_the_log();
+    // Who logged first may be one that all others give way to.
+    crate::supervision::make_like_any_other();
     let mut said = 0;
     for entry in entries {
         // A subscriber that panics is told by the panic hook, and has the next event all the same.

@@ -65,4 +65,7 @@ pub use self::{
     threads::{Threads, Turn},
     vitals::{at_fence, is_fenced},
 };
-pub(crate) use self::{panics::writes_the_log, place::make_foremost};
+pub(crate) use self::{
+    panics::writes_the_log,
+    place::{make_foremost, make_like_any_other},
+};

@@ -239,6 +239,13 @@ pub fn make_ordinary() {
     let _ = set_thread_priority_and_policy(thread_native_id(), level, policy);
 }
 
+/// The same, and on any CPU.
+pub(crate) fn make_like_any_other() {
+    // Refused, it stays where whoever made it is.
+    let _ = system::keep_on_any();
+    make_ordinary();
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
