@@ -20,6 +20,8 @@ use super::{
 };
 use crate::{supervision::make_foremost, tid::Tid, time::Time, wire::Payload};
 
+/// Outputs that nobody has any more and that are tried on, at most.
+const OWING_MAX: usize = 256;
 /// Time that the thread which keeps the watchdogs has to begin.
 const BEGINS_WITHIN: Duration = Duration::from_secs(5);
 /// Time after which an output is tried again that its application holds just then.
@@ -225,6 +227,10 @@ impl<O: Send + 'static> Drop for Owners<O> {
     fn drop(&mut self) {
         self.0.decide(|receiver, _| receiver.trip(Cause::Dropped));
         self.0.watch.is_orphan.store(true, Ordering::Release);
+        if self.0.owes() {
+            // Nobody else has it any more, and it is not safe yet.
+            KEEPER.get_or_init(Keeper::default).keep_owing(self.0.clone());
+        }
     }
 }
 
@@ -311,6 +317,8 @@ impl<O: Send + 'static> Guarded for Shared<O> {
 trait Watched: Send + Sync {
     /// Makes the output safe if its time is over. `false`: somebody has it in hand just now.
     fn try_expire(&self) -> bool;
+    /// Whether it was to be made safe, and that has panicked.
+    fn owes(&self) -> bool;
 }
 
 impl<O: Send + 'static> Watched for Shared<O> {
@@ -324,6 +332,10 @@ impl<O: Send + 'static> Watched for Shared<O> {
         self.decide_locked(&mut inner, |receiver, now| receiver.expire(now));
         true
     }
+
+    fn owes(&self) -> bool {
+        self.lock().owes.is_some()
+    }
 }
 
 /// One output, which its owners keep: it is dropped where the last of them is.
@@ -336,6 +348,8 @@ struct Kept {
 #[derive(Default)]
 struct Keeper {
     kept: Mutex<Vec<Kept>>,
+    /// Outputs that nobody has any more and that are not safe yet.
+    owing: Mutex<Vec<Arc<dyn Watched>>>,
 }
 
 static KEEPER: OnceLock<Keeper> = OnceLock::new();
@@ -347,12 +361,13 @@ fn keeper() -> io::Result<&'static Keeper> {
     let keeper = KEEPER.get_or_init(Keeper::default);
     let _one_at_a_time = STARTING.lock().unwrap_or_else(PoisonError::into_inner);
     if THREAD.get().is_none() {
-        let (prepared, is_prepared) = sync_channel(1);
+        let (prepared, is_prepared) = sync_channel(0);
         let thread = thread::Builder::new().name("safe-output".to_owned()).spawn(move || {
             make_foremost("safe-output", SAFE_OUTPUT_PRIORITY);
-            // It is waited for.
-            let _ = prepared.send(());
-            keeper.run()
+            // Where nobody waits any more, there will be another one.
+            if prepared.send(()).is_ok() {
+                keeper.run();
+            }
         })?;
         // Until it is prepared it has this thread's CPUs and priority: who never sleeps would never let it begin.
         is_prepared.recv_timeout(BEGINS_WITHIN).map_err(|_| {
@@ -382,8 +397,36 @@ impl Keeper {
         rouse();
     }
 
+    /// Tries an output on until it is safe, in place of its owners.
+    fn keep_owing(&self, output: Arc<dyn Watched>) {
+        let mut owing = self.owing.lock().unwrap_or_else(PoisonError::into_inner);
+        if owing.len() < OWING_MAX {
+            owing.push(output);
+        } else {
+            crate::log::error!(
+                "an output is given up that is not safe: what makes outputs safe panics for {OWING_MAX} others that nobody has any more"
+            );
+        }
+        drop(owing);
+        rouse();
+    }
+
+    /// Lets go of those that are safe by now: what is dropped with them is the user's, and no lock is held.
+    fn let_go(&self) {
+        let mut paid = Vec::new();
+        self.owing.lock().unwrap_or_else(PoisonError::into_inner).retain(|output| {
+            let owes = output.owes();
+            if !owes {
+                paid.push(output.clone());
+            }
+            owes
+        });
+        let _ = catch_unwind(AssertUnwindSafe(|| drop(paid)));
+    }
+
     fn run(&self) -> ! {
         loop {
+            self.let_go();
             let (due, sleeps) = self.look(Time::now());
             if due.is_empty() {
                 thread::park_timeout(sleeps);

@@ -363,6 +363,19 @@ fn guards_that_trip_each_other_are_both_safe_and_wait_for_nobody() {
     is_done.recv_timeout(Duration::from_secs(60)).expect("nobody waits for somebody who waits for him");
 }
 
+#[test]
+fn an_output_whose_guard_goes_and_whose_making_safe_panics_is_tried_again() {
+    let (safe, made_safe) = std::sync::mpsc::sync_channel(1);
+    let mut fails = true;
+    drop(live_with(move |(), cause| {
+        if cause == Cause::Dropped {
+            assert!(!std::mem::take(&mut fails), "a planted panic");
+            safe.send(()).expect("the test waits");
+        }
+    }));
+    made_safe.recv_timeout(Duration::from_secs(60)).expect("it is tried until it is done");
+}
+
 /// Its watchdog sleeps for minutes, unless other tests of this process wake it: alone this fails where nobody wakes it.
 #[test]
 fn an_output_that_was_tripped_and_whose_making_safe_panics_is_tried_again_at_once() {
