@@ -24,7 +24,7 @@ use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Rejection, Ticket},
     tid::Tid,
     time::Time,
-    wire::{Flags, Kind, Message},
+    wire::{Class, Flags, Kind, Message},
 };
 use sinew_shm::{Any, AnyError, Spin, Waiter};
 
@@ -434,10 +434,13 @@ impl Direct {
         if self.writing == Some(number) {
             self.cut = self.standing(number).and_then(|link| link.cut());
         }
+        // What its caller writes he has back.
+        let has_caller = self.writing == Some(number);
         if let Some(link) = self.standing(number) {
             link.tell_unsent();
-            let waiting = link.waiting() as u64;
-            self.note_unsent(peer, waiting);
+            let cut = link.cut().filter(|cut| !has_caller && cut.header.class == Class::Stream);
+            let waiting = link.waiting() + usize::from(cut.is_some());
+            self.note_unsent(peer, waiting as u64);
         }
         self.open.retain(|link| link.number != number);
         self.held.retain(|link| link.number != number);

@@ -242,6 +242,7 @@ impl Standing {
 
     /// Announces that a task waits for room for a frame of `length` bytes, or for the rest of the one that is begun.
     pub(super) fn arm_room(&mut self, length: usize) -> Armed {
+        let length = self.wanted(length);
         match &mut self.rest {
             Some(rest) => rest.arm(),
             None => self.writer.arm(length),
@@ -272,8 +273,14 @@ impl Standing {
         }
     }
 
+    /// What there has to be room for before a frame of `length` bytes goes out: what waits goes first.
+    fn wanted(&self, length: usize) -> usize {
+        self.parked.first().map_or(length, |first| length.max(HEADER_LEN + first.payload.len()))
+    }
+
     /// Waits until there is room, the peer's end, or `within` this time.
     pub(in crate::api) fn await_room(&mut self, length: usize, within: Duration) {
+        let length = self.wanted(length);
         match &mut self.rest {
             Some(rest) => rest.await_room(within),
             None => self.writer.await_room(length, within),

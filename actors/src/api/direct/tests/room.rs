@@ -58,6 +58,7 @@ fn a_value_of_another_kind_does_not_overtake_one_that_waits_for_room() {
     let last = fill(&mut one, other.tid());
     while other.receive(Duration::from_millis(1)).unwrap().is_some() {}
     // when
+    one.direct.flush_at = Time::MAX;
     one.send(other.tid(), &Mode(1)).unwrap();
     // then
     let first = other.receive(WATCHDOG).unwrap().expect("a value");
