@@ -182,6 +182,8 @@ impl Endpoint {
     /// whatever else waits for an answer: [`ask`](Self::ask), [`resolve`](Self::resolve), [`join`](Self::join),
     /// [`leave`](Self::leave).
     ///
+    /// With less than 20 ms a node that has gone is not looked for: [`receive`](Self::receive) does.
+    ///
     /// # Errors
     /// It was not sent. If the connection ends before the outcome is known that is [`Outcome::Unknown`].
     pub fn send_confirmed<P: Payload>(
@@ -195,7 +197,7 @@ impl Endpoint {
     }
 
     /// Sends a request and waits for the reply. A longer `within` than [`TIME_TO_LIVE_MAX`](sinew_runtime::wire::TIME_TO_LIVE_MAX),
-    /// 71 minutes and 35 s, counts as that.
+    /// 71 minutes and 35 s, counts as that. With less than 20 ms a node that has gone is not looked for: [`receive`](Self::receive) does.
     ///
     /// # Errors
     /// It was not sent or not handled, no reply came `within` this time, or the reply is not an `R`.
