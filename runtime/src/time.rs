@@ -1,6 +1,6 @@
 //! Points in time: nanoseconds of the host's monotonic clock.
 //!
-//! The clock counts since the host booted, without the time that the host slept, and is the same for all processes of a host. Cores never read it: a time
+//! The clock counts since the host booted, on Linux without the time that the host slept, and is the same for all processes of a host. Cores never read it: a time
 //! comes in as an argument, so that a seed replays a failure. Only shells call [`Time::now`].
 
 use std::{

@@ -49,7 +49,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "THREAD", default_value = "io")]
     pub(crate) control_thread: real_time::ThreadArgument,
     /// `SCHED_FIFO` priority of the control loops, 1 to 89; wants `--control-thread own`. Real time only.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=99))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=89))]
     pub(crate) realtime_priority: Option<u8>,
     /// Secure the links between nodes with the keys in this directory, made by `sinew keys init exoskeleton central hip knee ankle`. Real time only.
     #[arg(long, value_name = "DIR")]
