@@ -72,11 +72,6 @@ impl Process {
         self.doom.clone()
     }
 
-    /// What holds it, for who waits for its end after it was killed.
-    pub(super) fn pidfd(&self) -> Arc<OwnedFd> {
-        self.group.pidfd().clone()
-    }
-
     /// Waits for its end, for this time at most, on a thread that has nobody else to care for: it ends.
     pub(super) fn ends_at_once(&self, within: Duration) -> bool {
         let within = Timespec { tv_sec: 0, tv_nsec: i64::from(within.subsec_nanos()) };
@@ -112,17 +107,6 @@ impl Drop for Process {
         self.kill();
         spawn::reap(self.group.clone());
     }
-}
-
-/// Waits until a process that was killed has ended, for this time at most. Whoever kills it sees to it that it is reaped.
-pub(super) async fn is_dead(pidfd: Arc<OwnedFd>, within: Duration) -> bool {
-    #[expect(
-        deprecated,
-        reason = "sound for an OwnedFd, whose descriptor never changes; its successor is an unsafe fn, and unsafe code lives in sinew-shm and the C binding alone"
-    )]
-    let Ok(pidfd) = AsyncFd::new(pidfd) else { return false };
-    // Readable from its end on, whoever reaps it.
-    timeout(within, pidfd.readable()).await.is_ok_and(|ended| ended.is_ok())
 }
 
 fn in_words(status: &WaitIdStatus) -> String {

@@ -23,10 +23,10 @@ use tokio::{
 };
 
 use super::{
-    held::{Process, is_dead},
+    held::Process,
     link::{LastWords, Link},
     names::KnownNames,
-    spawn::{self, Started},
+    spawn,
     words::{self, Beat, Ending, Look, Names, Turn, WORDS_BYTES_MAX, Welcome},
 };
 use crate::{
@@ -81,20 +81,16 @@ impl Life for ProcessLife {
 }
 
 async fn run(hosted: Arc<Hosted>, ready: ReadyGate, stop: Rc<Notify>) -> Reason {
-    // This process finds the devices and ports of the one before it free.
-    if let Some(former) = hosted.link.take_former()
-        && !is_dead(former, ENDING).await
-    {
-        crate::log::warn!(
-            app = hosted.name,
-            "its former process was killed and has not ended; another one is started beside it"
-        );
+    let predecessor = hosted.link.predecessor();
+    if let Err(cause) = predecessor.has_ended(&hosted.name).await {
+        return Reason::ProcessEnded(format!(
+            "it could not be started: nobody can say whether its former process has ended: {cause}"
+        ));
     }
-    let started = match spawn::start(hosted.variable()).await {
-        Ok(started) => started,
+    let (group, socket) = match spawn::start(hosted.variable(), predecessor.clone()).await {
+        Ok(started) => started.keep(),
         Err(why) => return Reason::ProcessEnded(format!("it could not be started: {why}")),
     };
-    let Started { group, socket } = started;
     let pid = group.leader();
     let process = match Process::new(group) {
         Ok(process) => process,
@@ -142,9 +138,6 @@ impl Drop for Child {
         // Fenced, its supervisor does not wait for its end: it was not ready, or did not stop, in its time. What it still says
         // counts no more. This thread goes on with others; whoever comes next waits.
         let is_dead = !supervision::is_fenced() && self.process.ends_at_once(DYING);
-        if !is_dead {
-            self.hosted.link.set_former(self.process.pidfd());
-        }
         self.bury(is_dead);
     }
 }

@@ -4,7 +4,6 @@
 //! stays in the mailbox, where classes and newest values keep their meaning.
 
 use std::{
-    os::fd::OwnedFd,
     sync::{
         Arc, Mutex, OnceLock,
         atomic::{AtomicU64, Ordering},
@@ -30,6 +29,7 @@ use tokio::{
 use super::{
     held::Doom,
     life::{Hosted, process_life},
+    predecessor::Predecessor,
     window::{Left, NoSuchMessage, Room, Window},
     words::{Fate, Turn},
 };
@@ -50,8 +50,7 @@ pub(crate) struct Link {
     present: Mutex<Option<Present>>,
     /// Which process of this TID is the present one.
     lives: AtomicU64,
-    /// The process before it, if that was killed and nobody has seen its end.
-    former: Mutex<Option<Arc<OwnedFd>>>,
+    predecessor: Arc<Predecessor>,
     /// Sequence of the last message that came from the TID before that one.
     began: AtomicU64,
     /// Since when the present process's application is in one turn that lasts too long, in nanoseconds; 0: it is in none.
@@ -122,7 +121,7 @@ impl Link {
             outlet: StreamOutlet::new(limits),
             present: Mutex::new(None),
             lives: AtomicU64::new(0),
-            former: Mutex::new(None),
+            predecessor: Arc::default(),
             began: AtomicU64::new(0),
             stalled: AtomicU64::new(0),
             sender: OnceLock::new(),
@@ -147,14 +146,9 @@ impl Link {
         self.lives.fetch_add(1, Ordering::Relaxed) + 1
     }
 
-    /// This process was killed, and nobody waits for its end.
-    pub(super) fn set_former(&self, pidfd: Arc<OwnedFd>) {
-        *lock(&self.former) = Some(pidfd);
-    }
-
-    /// The process whose end nobody has seen, for the next one to wait for.
-    pub(super) fn take_former(&self) -> Option<Arc<OwnedFd>> {
-        lock(&self.former).take()
+    /// The last process of the TID, for the next one to wait for.
+    pub(super) fn predecessor(&self) -> &Arc<Predecessor> {
+        &self.predecessor
     }
 
     /// What this child says of its application's turn. What a former one says counts for nothing.

@@ -20,6 +20,7 @@
 //! | `life` | node | the child under supervision: started, listened to, stopped, killed |
 //! | `group` | node | a process and what it has started: killed together, reaped |
 //! | `held` | node | one process by its descriptor: killed, waited for, and how it ended |
+//! | `predecessor` | node | the process before: the next one waits for its end |
 //! | `spawn` | node | starts processes and reaps them |
 //! | `role` | child | whether this process is a node or such a child |
 //! | `host` | child | runs the application |
@@ -35,6 +36,7 @@ mod inbox;
 mod life;
 mod link;
 mod names;
+mod predecessor;
 mod role;
 mod spawn;
 mod window;

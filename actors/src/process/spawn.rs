@@ -21,7 +21,7 @@ use std::{
 use rustix::process::{Pid, PidfdFlags, Signal, kill_process_group, pidfd_open};
 use tokio::sync::oneshot;
 
-use super::{group::Group, words::VARIABLE};
+use super::{group::Group, predecessor::Predecessor, words::VARIABLE};
 
 /// Orders that wait for the thread at most. When full: a start fails and is tried again, and a process that has ended
 /// stays in the kernel's table.
@@ -30,17 +30,43 @@ const ORDERS_MAX: usize = 1_024;
 const REAPING_MIN: Duration = Duration::from_millis(2);
 const REAPING_MAX: Duration = Duration::from_millis(256);
 
-/// A process that has just been started.
+/// A process that has just been started. Dropping it kills the process: whoever ordered it may be gone when it comes.
 pub(super) struct Started {
-    /// It owns the process: whoever drops it hands it to [`reap`].
-    pub(super) group: Arc<Group>,
-    pub(super) socket: UnixStream,
+    newborn: Newborn,
+    socket: UnixStream,
+}
+
+struct Newborn {
+    group: Arc<Group>,
+    is_kept: bool,
+}
+
+impl Started {
+    fn new(group: Arc<Group>, socket: UnixStream) -> Self {
+        Self { newborn: Newborn { group, is_kept: false }, socket }
+    }
+
+    /// The process, and the other end of its standard input. Whoever has it sees to it that it is killed, and handed to [`reap`].
+    pub(super) fn keep(mut self) -> (Arc<Group>, UnixStream) {
+        self.newborn.is_kept = true;
+        (self.newborn.group.clone(), self.socket)
+    }
+}
+
+impl Drop for Newborn {
+    fn drop(&mut self) {
+        if !self.is_kept {
+            self.group.kill();
+            reap(self.group.clone());
+        }
+    }
 }
 
 enum Order {
-    /// Start this program again with this value of the variable.
+    /// Start this program again with this value of the variable, and let it be known to whoever starts the next one.
     Start {
         variable: String,
+        predecessor: Arc<Predecessor>,
         answer: oneshot::Sender<Result<Started, String>>,
     },
     Reap(Arc<Group>),
@@ -52,10 +78,10 @@ pub(super) fn begin_spawning() {
     let _ = thread();
 }
 
-/// Starts this program again, as a host.
-pub(super) async fn start(variable: String) -> Result<Started, String> {
+/// Starts this program again, as a host. It is the `predecessor` of the next one from then on, also where nobody hears of it.
+pub(super) async fn start(variable: String, predecessor: Arc<Predecessor>) -> Result<Started, String> {
     let (answer, started) = oneshot::channel();
-    order(Order::Start { variable, answer })?;
+    order(Order::Start { variable, predecessor, answer })?;
     started.await.map_err(|_| "the thread that starts processes has ended".to_owned())?
 }
 
@@ -96,14 +122,15 @@ fn run(inbox: &Receiver<Order>) {
         };
         pause = if order.is_ok() { REAPING_MIN } else { (pause * 2).min(REAPING_MAX) };
         match order {
-            Ok(Order::Start { variable, answer }) => {
+            // Who ordered it is gone: it was told to stop, or failed.
+            Ok(Order::Start { answer, .. }) if answer.is_closed() => {}
+            Ok(Order::Start { variable, predecessor, answer }) => {
                 // Nothing that one of them has started keeps what the next one needs.
                 doomed.retain(|group| !group.has_been_reaped());
-                if let Err(Ok(unwanted)) = answer.send(start_now(&variable)) {
-                    // Who ordered it is gone: it was told to stop, or failed.
-                    unwanted.group.kill();
-                    doomed.push(unwanted.group);
-                }
+                let started = start_now(&variable)
+                    .inspect(|started| predecessor.set(started.newborn.group.pidfd().clone()));
+                // Gone by now, it leaves the process to be killed.
+                drop(answer.send(started));
             }
             Ok(Order::Reap(group)) => doomed.push(group),
             Err(RecvTimeoutError::Timeout) => {}
@@ -131,7 +158,7 @@ fn start_now(variable: &str) -> Result<Started, String> {
     let pid = Pid::from_child(&child);
     // It is our child and has not been waited for, so nobody else has its id.
     match pidfd_open(pid, PidfdFlags::empty()) {
-        Ok(pidfd) => Ok(Started { group: Arc::new(Group::new(pid, pidfd)), socket }),
+        Ok(pidfd) => Ok(Started::new(Arc::new(Group::new(pid, pidfd)), socket)),
         Err(cause) => {
             let mut child = child;
             let _ = kill_process_group(pid, Signal::KILL);

@@ -62,8 +62,8 @@ fn say(what: &str) {
     println!("{} {what}", std::process::id());
 }
 
-/// Other processes of its node's that have not ended.
-fn brothers() -> usize {
+/// Other processes of its node's that have not ended, as the kernel tells of them.
+fn brothers() -> Vec<String> {
     let parent = std::os::unix::process::parent_id().to_string();
     let is_brother = |process: std::fs::DirEntry| {
         let stat = std::fs::read_to_string(process.path().join("stat")).ok()?;
@@ -73,10 +73,10 @@ fn brothers() -> usize {
         let has_ended = matches!(*words.first()?, "Z" | "X");
         // Not by the name `self`.
         let id: u32 = process.file_name().to_str()?.parse().ok()?;
-        (*words.get(1)? == parent && id != std::process::id() && !has_ended).then_some(())
+        (*words.get(1)? == parent && id != std::process::id() && !has_ended).then_some(stat)
     };
     let processes = std::fs::read_dir("/proc").expect("it is always there");
-    processes.filter_map(|process| is_brother(process.ok()?)).count()
+    processes.filter_map(|process| is_brother(process.ok()?)).collect()
 }
 
 impl Actor for Drive {
@@ -93,7 +93,7 @@ impl Actor for Drive {
             });
         }
         if let Some(mib) = self.swells {
-            say(if brothers() == 0 { "process has no brother" } else { "process has a brother" });
+            say(&format!("process has these brothers: {:?}", brothers()));
             // A process that has much to give back takes its time to die.
             std::mem::forget((vec![1_u8; mib << 20], context.hold_ready()));
             say("has swollen");
