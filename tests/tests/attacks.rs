@@ -11,7 +11,7 @@ use sinew_tests::{
 fn nobody_gets_in_is_lost_or_fills_memory_whatever_somebody_on_the_network_does() {
     let report = run(&Plan {
         program: program("attacks"),
-        lasts: Duration::from_secs(2),
+        lasts: Duration::from_secs(1),
         timed: Duration::from_millis(500),
         rounds: 1,
         only: Vec::new(),
