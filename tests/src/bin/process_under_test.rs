@@ -15,7 +15,7 @@
 use std::{
     os::unix::process::CommandExt,
     process::{Command, ExitCode, Stdio},
-    sync::atomic::{AtomicU64, Ordering},
+    sync::atomic::{AtomicBool, AtomicU64, Ordering},
 };
 
 use rustix::process::{Signal, getpid, kill_process};
@@ -269,17 +269,28 @@ fn leg(tree: &str, drive: AppSpec<Drive>) -> SupervisorSpec {
     }
 }
 
+/// Somebody was heard by the witness.
+static IS_HEARD: AtomicBool = AtomicBool::new(false);
+
 /// Blocks its thread in a timer.
-struct Neighbour(Duration);
+struct Neighbour {
+    time: Duration,
+    /// It waits until the witness has heard somebody.
+    listens: bool,
+    hangs: bool,
+}
 
 impl Actor for Neighbour {
     type Context = AppContext<Self>;
 
     fn started(&mut self, context: &mut Self::Context) {
         static LIVES: AtomicU64 = AtomicU64::new(0);
-        let (time, is_first) = (self.0, LIVES.fetch_add(1, Ordering::Relaxed) == 0);
-        // The drive is heard by then.
-        context.after(Duration::from_millis(500), move |_, _, _| {
+        let (time, is_first) = (self.time, LIVES.fetch_add(1, Ordering::Relaxed) == 0);
+        context.every(Duration::from_millis(500), move |neighbour, _, _| {
+            if neighbour.hangs || (neighbour.listens && !IS_HEARD.load(Ordering::Relaxed)) {
+                return;
+            }
+            neighbour.hangs = true;
             if time.is_zero() {
                 say("hangs");
                 std::thread::park_timeout(Duration::MAX);
@@ -292,8 +303,8 @@ impl Actor for Neighbour {
     }
 }
 
-fn neighbour(time: Duration) -> AppSpec<Neighbour> {
-    AppSpec::new("neighbour", move || Neighbour(time))
+fn neighbour(time: Duration, listens: bool) -> AppSpec<Neighbour> {
+    AppSpec::new("neighbour", move || Neighbour { time, listens, hangs: false })
         .requires(["drive"])
         .on_io_thread()
         .progress_within(Duration::from_millis(100))
@@ -311,6 +322,7 @@ impl Handler<Delivery<Count>> for Witness {
 
     fn handle(&mut self, count: Delivery<Count>, _: &mut Self::Context) {
         say(&format!("heard {} in {}", count.number, count.sequence));
+        IS_HEARD.store(true, Ordering::Relaxed);
     }
 }
 
@@ -409,7 +421,8 @@ fn main() -> ExitCode {
         builder = builder.app(AppSpec::new("witness", || Witness).handles::<Count>().own_thread());
     }
     if let Some(millis) = after("--neighbour-hangs") {
-        builder = builder.app(neighbour(Duration::from_millis(millis.parse().expect("a time"))));
+        let time = Duration::from_millis(millis.parse().expect("a time"));
+        builder = builder.app(neighbour(time, talks));
     }
     match builder.start() {
         Ok(node) => {

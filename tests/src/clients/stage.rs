@@ -126,7 +126,7 @@ impl Stage {
         let share = clients_max / 4;
         let text = format!(
             "[node]\nname = \"stage\"\nmailbox_capacity = {mailbox_capacity}\npayload_max = {payload_max}\n\
-             [lncl]\nsocket = {socket:?}\nclients_max = {clients_max}\nclients_per_process_max = {share}\n[ndl]\nmulticast = false\nmdns_port = false\n"
+             [lncl]\nsocket = {socket:?}\nclients_max = {clients_max}\nclients_per_process_max = {share}\n[supervision]\nlayer_restarts_max = 100\n[ndl]\nmulticast = false\nmdns_port = false\n"
         );
         std::fs::write(&config, text).expect("the test's own directory");
         let mut environment = environment(&directory);

@@ -74,7 +74,7 @@ fn a_will_is_sent_after_a_missed_start_and_not_after_an_orderly_end_unless_it_sa
                 }
             })
             .app("sleeper");
-        let sleeper = sleeper.start_within(Duration::from_millis(50)).last_will("heir", &Order { number: 7 });
+        let sleeper = sleeper.start_within(Duration::from_secs(2)).last_will("heir", &Order { number: 7 });
         let ((heir, seen), (desk, key)) = (heir(), desk("desk"));
         let node = Ground::new().node("node").app(heir).app(leaver).app(sleeper).app(desk);
         let node = node.start().expect("a node");

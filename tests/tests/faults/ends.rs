@@ -2,7 +2,7 @@
 
 use sinew::{NodeEnd, fault::Fault, prelude::*};
 use sinew_tests::{
-    Ground, all_run,
+    DEADLINE, Ground, all_run,
     puppet::{Job, Seen, Stage, desk, lives, outcome_of_job, send_jobs, wait_for_numbers},
     ready_for, until,
 };
@@ -19,7 +19,10 @@ fn gave_up(node: Node) -> String {
 #[test]
 fn as_many_restarts_as_are_allowed_are_survived_and_one_more_is_the_end() {
     let ((puppet, log), (desk, key)) = (Stage::new().app("puppet"), desk("desk"));
-    let node = Ground::new().node("node").configure(|config| config.supervision.app_restarts_max = 2);
+    // However long the restarts take.
+    let node = Ground::new().node("node").configure(|config| {
+        (config.supervision.app_restarts_max, config.supervision.app_window) = (2, 10 * DEADLINE);
+    });
     let node = node.app(puppet).app(desk).start().expect("a node");
     all_run(&[&node]);
     let sender = key.sender();
@@ -50,7 +53,8 @@ fn no_restart_allowed_means_that_the_first_fault_is_the_end() {
 fn restarts_of_layers_and_of_applications_are_counted_apart() {
     let (puppet, log) = Stage::new().app("puppet");
     let node = Ground::new().node("node").configure(|config| {
-        (config.supervision.layer_restarts_max, config.supervision.app_restarts_max) = (3, 3);
+        // Together they are more than either may have.
+        (config.supervision.layer_restarts_max, config.supervision.app_restarts_max) = (5, 5);
     });
     let node = node.app(puppet).start().expect("a node");
     all_run(&[&node]);

@@ -23,13 +23,15 @@ impl Scenario {
         Self { ground: Ground::new(), directory: OwnDirectory::new() }
     }
 
-    /// Addresses from 101 up: those from 1 up are the ground's own.
+    /// With a long time for everything: a machine that stands still for a moment loses nobody, and a process that fails at once fails too often
+    /// however long each life takes. Addresses from 101 up: those from 1 up are the ground's own.
     fn configuration(&self, name: &str, address: u8, more: &str) -> PathBuf {
         let path = self.directory.join(&format!("{name}.toml"));
         let group: SocketAddrV4 = self.ground.group;
         let text = format!(
             "[node]\nname = \"{name}\"\naddress = \"127.0.0.{address}\"\n\
-             [ndl]\nmulticast = \"{group}\"\nmdns_port = false\n{more}"
+             [ndl]\nmulticast = \"{group}\"\nmdns_port = false\nmissed_max = 40\n\
+             [supervision]\napp_window_ms = 3600000\n{more}"
         );
         std::fs::write(&path, text).expect("the test's own directory");
         path

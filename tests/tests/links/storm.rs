@@ -82,7 +82,7 @@ fn configuration(
     let path = directory.join(&format!("{name}.toml"));
     let text = format!(
         "[node]\nname = \"{name}\"\naddress = \"127.0.0.{address}\"\nproject = \"storm\"\n[gncl]\n{gncl}\n\
-         [ndl]\nmulticast = \"{group}\"\nmdns_port = false\n"
+         [ndl]\nmulticast = \"{group}\"\nmdns_port = false\nmissed_max = 20\n"
     );
     std::fs::write(&path, text).expect("the test's own directory");
     path

@@ -109,8 +109,11 @@ fn escalation_ends_the_node_and_says_who_failed_on_each_floor() {
     let (other, _) = member("other", &order);
     let leg = SupervisorSpec::new("leg").intensity(1, DEADLINE).app(knee);
     let node = Ground::new().node("node").app(other).supervisor(leg);
-    let node = node.configure(|config| config.supervision.app_restarts_max = 1).start();
-    let NodeEnd::GaveUp(why) = node.expect("its layers start").wait_for_end() else {
+    // However long the restarts take.
+    let node = node.configure(|config| {
+        (config.supervision.app_restarts_max, config.supervision.app_window) = (1, 10 * DEADLINE);
+    });
+    let NodeEnd::GaveUp(why) = node.start().expect("its layers start").wait_for_end() else {
         panic!("it stopped as if nothing had been");
     };
     assert!(why.contains("'leg'") && why.contains("'knee'") && why.contains("no bus"), "{why}");

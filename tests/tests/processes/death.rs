@@ -9,6 +9,9 @@ use sinew_tests::{OwnDirectory, orders::Order, process_under_test, until, wait_u
 use crate::fence::parent_of;
 use crate::scenario::{Scenario, Watched, configuration, signal};
 
+/// Its applications may be restarted as often as they fail.
+const RESTARTS: &str = "[supervision]\napp_restarts_max = 1000\napp_window_ms = 1\n";
+
 #[test]
 fn an_application_in_a_process_of_its_own_answers_from_there() {
     let mut scenario = Scenario::start(&[]);
@@ -55,7 +58,7 @@ fn every_death_is_survived_and_named_and_fails_the_message_in_hand() {
         (Order::Kill, "killed by signal 9 (SIGKILL)"),
         (Order::Segfault, "killed by signal 11 (SIGSEGV)"),
     ];
-    let mut scenario = Scenario::start(&[]);
+    let mut scenario = Scenario::start_with(RESTARTS, &[]);
     for (order, words) in deaths {
         let process = Watched::new(scenario.who().pid);
         assert_eq!(scenario.order_confirmed(order), Outcome::Failed);
@@ -88,10 +91,10 @@ fn a_process_that_was_stopped_is_killed_and_replaced() {
 
 #[test]
 fn a_process_that_is_only_busy_is_let_alone() {
-    let mut scenario = Scenario::start(&[]);
+    let mut scenario = Scenario::start(&["--turns-within", "2000"]);
     let pid = scenario.who().pid;
     // Twice its progress budget in all, and no single turn above it.
-    (0..20).for_each(|_| scenario.order(Order::Hold(100)));
+    (0..20).for_each(|_| scenario.order(Order::Hold(200)));
     assert_eq!(scenario.who().pid, pid);
 }
 
@@ -134,11 +137,13 @@ fn a_stopped_process_dies_with_its_node_too() {
 
 #[test]
 fn a_process_that_does_not_stop_in_its_time_is_killed() {
-    let mut scenario = Scenario::start(&[]);
+    // Its turn may last: only that it does not stop is held against it.
+    let mut scenario = Scenario::start(&["--turns-within", "600000"]);
     let process = Watched::new(scenario.who().pid);
-    scenario.order(Order::Hold(900));
+    scenario.order(Order::Hold(60_000));
     scenario.node.wait_for(&["holds"]);
     scenario.node.signal(Signal::TERM);
+    scenario.node.wait_for(&["its life is taken"]);
     process.wait_for_end();
     assert_eq!(scenario.node.wait_for_end(), Some(0));
 }
@@ -146,7 +151,9 @@ fn a_process_that_does_not_stop_in_its_time_is_killed() {
 #[test]
 fn a_process_that_dies_at_each_start_makes_the_node_give_up_and_say_of_what() {
     let directory = OwnDirectory::new();
-    let mut node = process_under_test(&configuration(&directory, ""), &["--dies-at-start", "3"]);
+    // However long each start takes.
+    let window = "[supervision]\napp_window_ms = 3600000\n";
+    let mut node = process_under_test(&configuration(&directory, window), &["--dies-at-start", "3"]);
     node.wait_for(&["gave up", "applications: more than 5 restarts", "its process ended: exit code 3"]);
     assert_eq!(node.wait_for_end(), Some(1));
 }
@@ -156,8 +163,7 @@ fn the_next_process_begins_when_the_one_that_was_killed_has_ended_however_long_t
     let directory = OwnDirectory::new();
     // Never ready, each is killed when its time is over, and has half a gibibyte to give back.
     // On a busy host some are killed before they say anything: it goes on until three have.
-    let intensity = "[supervision]\napp_restarts_max = 1000\napp_window_ms = 1\n";
-    let configuration = configuration(&directory, intensity);
+    let configuration = configuration(&directory, RESTARTS);
     let mut node = process_under_test(&configuration, &["--swells-at-start", "512"]);
     for _ in 0..3 {
         let line = node.wait_for(&["process has these brothers"]);
@@ -175,8 +181,7 @@ fn a_command_that_the_application_starts_is_no_host() {
 
 #[test]
 fn two_hundred_deaths_leave_nothing_behind() {
-    let intensity = "[supervision]\napp_restarts_max = 1000\napp_window_ms = 1\n";
-    let mut scenario = Scenario::start_with(intensity, &[]);
+    let mut scenario = Scenario::start_with(RESTARTS, &[]);
     let node = scenario.node.id();
     let die = |scenario: &mut Scenario| {
         let pid = scenario.who().pid;

@@ -18,7 +18,8 @@ fn sleeper(scenario: &mut Scenario, in_own_group: bool) -> Watched {
 
 #[test]
 fn what_a_process_has_started_ends_with_it_however_that_ends() {
-    let mut scenario = Scenario::start(&[]);
+    let restarts = "[supervision]\napp_restarts_max = 1000\napp_window_ms = 1\n";
+    let mut scenario = Scenario::start_with(restarts, &[]);
     for order in [Order::Kill, Order::Exit(0), Order::Panic, Order::Hang] {
         let sleeper = sleeper(&mut scenario, false);
         assert_eq!(scenario.order_confirmed(order), Outcome::Failed);

@@ -13,7 +13,7 @@ use sinew_tests::{
 use crate::scenario::{Scenario, Watched, configuration, signal};
 
 /// Longer than an application has for a turn, to start, or to stop.
-const STALL: Duration = Duration::from_millis(2_500);
+const STALL: Duration = Duration::from_millis(6_500);
 
 /// Nothing of the node and of its process runs for a while, or nothing of the node.
 fn stall(node: &Program, process: Option<u32>) {
@@ -47,7 +47,7 @@ fn a_process_that_starts_while_its_node_or_all_of_the_host_stands_still_is_not_k
         let directory = OwnDirectory::new();
         let mut node = process_under_test(
             &configuration(&directory, ""),
-            &["--starts-in", "500", "--starts-within", "2000"],
+            &["--starts-in", "500", "--starts-within", "6000"],
         );
         let pid = started(&mut node);
         stall(&node, with_process.then_some(pid));
@@ -64,7 +64,7 @@ fn a_process_that_starts_while_its_node_or_all_of_the_host_stands_still_is_not_k
 #[test]
 fn a_process_that_stops_while_its_node_or_all_of_the_host_stands_still_has_its_time() {
     for with_process in [false, true] {
-        let mut scenario = Scenario::start(&["--ramps-for", "300", "--stops-within", "2000"]);
+        let mut scenario = Scenario::start(&["--ramps-for", "300", "--stops-within", "6000"]);
         let pid = scenario.who().pid;
         let process = Watched::new(pid);
         scenario.node.signal(Signal::TERM);
@@ -115,13 +115,13 @@ fn an_application_that_stalls_in_its_process_is_named_to_other_nodes_until_its_n
     // Given: a node with an application in a process, and another node, whose application says what it hears.
     let free = UdpSocket::bind("127.0.0.1:0").expect("a port on loopback").local_addr().expect("it is bound");
     // Quick, and with time for a machine that stands still for a moment.
-    let more = format!("period_ms = 250\nport = {}\n", free.port());
+    let more = format!("period_ms = 250\nmissed_max = 40\nport = {}\n", free.port());
     let mut scenario = Scenario::start_with(&more, &["--turns-within", "600000"]);
     let directory = OwnDirectory::new();
     let path = directory.join("watcher.toml");
     let text = format!(
         "[node]\nname = \"watcher\"\naddress = \"127.0.0.2\"\nproject = \"processes\"\n\
-         [ndl]\nmulticast = false\nmdns_port = false\nperiod_ms = 250\nseeds = [\"{free}\"]\n"
+         [ndl]\nmulticast = false\nmdns_port = false\nperiod_ms = 250\nmissed_max = 40\nseeds = [\"{free}\"]\n"
     );
     std::fs::write(&path, text).expect("the test's own directory");
     let mut watcher = process_under_test(&path, &["--place", "thread"]);
