@@ -1,35 +1,23 @@
-//! An output that is safe unless good commands come, and the thread that sees to it.
+//! An output that is safe unless good commands come.
 
 use std::{
     io,
     panic::{AssertUnwindSafe, catch_unwind},
-    sync::{
-        Arc, Mutex, MutexGuard, OnceLock, PoisonError, TryLockError, Weak,
-        atomic::{AtomicBool, AtomicU64, Ordering},
-        mpsc::sync_channel,
-    },
-    thread::{self, Thread},
+    sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError, atomic::Ordering},
     time::Duration,
 };
 
 use bytes::Bytes;
 
 use super::{
-    ArmError, Cause, Codename, Protection, SAFE_OUTPUT_PRIORITY, State, Tally,
+    ArmError, Cause, Codename, Protection, State, Tally,
+    keeper::{self, Watch, Watched, rouse},
     receiver::{Opened, Receiver, Verdict},
 };
-use crate::{supervision::make_foremost, tid::Tid, time::Time, wire::Payload};
+use crate::{tid::Tid, time::Time, wire::Payload};
 
-/// Outputs that nobody has any more and that are tried on, at most.
-const OWING_MAX: usize = 256;
-/// Time that the thread which keeps the watchdogs has to begin.
-const BEGINS_WITHIN: Duration = Duration::from_secs(5);
-/// Time after which an output is tried again that its application holds just then.
-const HELD: Duration = Duration::from_micros(100);
 /// Time after which what makes an output safe is called again, where it has panicked.
 const SAFE_RETRY: Duration = Duration::from_millis(1);
-/// Longest sleep of the thread; it is woken when it has something to do.
-const IDLE: Duration = Duration::from_secs(3_600);
 
 /// The only way to an output of type `O`: commands pass while it is live, and it is made safe as soon as it is not.
 ///
@@ -45,16 +33,6 @@ struct Shared<O> {
     codename: Codename,
     inner: Mutex<Inner<O>>,
     watch: Arc<Watch>,
-}
-
-/// What the thread knows of an output without touching it.
-struct Watch {
-    /// When it has to look, in nanoseconds; `u64::MAX` while the output is safe.
-    deadline: AtomicU64,
-    /// Somebody trips the output who could not wait for it.
-    is_tripped: AtomicBool,
-    /// Nobody has the guard any more.
-    is_orphan: AtomicBool,
 }
 
 struct Inner<O> {
@@ -136,14 +114,10 @@ impl<O: Send + 'static> Guard<O> {
         let receiver = Receiver::new(protection);
         let mut inner = Inner { codename, receiver, output, safe: Box::new(safe), owes: None };
         inner.make_safe(Cause::NotArmed, Time::now());
-        let watch = Watch {
-            deadline: AtomicU64::new(inner.deadline()),
-            is_tripped: AtomicBool::new(false),
-            is_orphan: AtomicBool::new(false),
-        };
+        let watch = Watch::new(inner.deadline(), inner.owes.is_some());
         let shared = Arc::new(Shared { codename, inner: Mutex::new(inner), watch: Arc::new(watch) });
         let output: Arc<dyn Watched> = shared.clone();
-        keeper()?.keep(Kept { watch: shared.watch.clone(), output: Arc::downgrade(&output) });
+        keeper::begun()?.keep(shared.watch.clone(), Arc::downgrade(&output));
         Ok(Self { owners: Arc::new(Owners(shared)) })
     }
 
@@ -227,9 +201,9 @@ impl<O: Send + 'static> Drop for Owners<O> {
     fn drop(&mut self) {
         self.0.decide(|receiver, _| receiver.trip(Cause::Dropped));
         self.0.watch.is_orphan.store(true, Ordering::Release);
-        if self.0.owes() {
+        if self.0.watch.owes.load(Ordering::Acquire) {
             // Nobody else has it any more, and it is not safe yet.
-            KEEPER.get_or_init(Keeper::default).keep_owing(self.0.clone());
+            keeper::keep_owing(self.0.clone());
         }
     }
 }
@@ -255,6 +229,7 @@ impl<O> Shared<O> {
             decide(receiver, now)
         });
         self.watch.deadline.store(inner.deadline(), Ordering::Release);
+        self.watch.owes.store(inner.owes.is_some(), Ordering::Release);
         if inner.owes.is_some() && !owed {
             // The thread sleeps until the deadline that was, if there was any.
             rouse();
@@ -313,14 +288,6 @@ impl<O: Send + 'static> Guarded for Shared<O> {
     }
 }
 
-/// An output, as the thread sees it.
-trait Watched: Send + Sync {
-    /// Makes the output safe if its time is over. `false`: somebody has it in hand just now.
-    fn try_expire(&self) -> bool;
-    /// Whether it was to be made safe, and that has panicked.
-    fn owes(&self) -> bool;
-}
-
 impl<O: Send + 'static> Watched for Shared<O> {
     fn try_expire(&self) -> bool {
         let mut inner = match self.inner.try_lock() {
@@ -333,140 +300,34 @@ impl<O: Send + 'static> Watched for Shared<O> {
         true
     }
 
-    fn owes(&self) -> bool {
-        self.lock().owes.is_some()
-    }
-}
-
-/// One output, which its owners keep: it is dropped where the last of them is.
-struct Kept {
-    watch: Arc<Watch>,
-    output: Weak<dyn Watched>,
-}
-
-/// Who keeps the watchdogs of this process.
-#[derive(Default)]
-struct Keeper {
-    kept: Mutex<Vec<Kept>>,
-    /// Outputs that nobody has any more and that are not safe yet.
-    owing: Mutex<Vec<Arc<dyn Watched>>>,
-}
-
-static KEEPER: OnceLock<Keeper> = OnceLock::new();
-static THREAD: OnceLock<Thread> = OnceLock::new();
-
-/// The keeper, whose thread runs.
-fn keeper() -> io::Result<&'static Keeper> {
-    static STARTING: Mutex<()> = Mutex::new(());
-    let keeper = KEEPER.get_or_init(Keeper::default);
-    let _one_at_a_time = STARTING.lock().unwrap_or_else(PoisonError::into_inner);
-    if THREAD.get().is_none() {
-        let (prepared, is_prepared) = sync_channel(0);
-        let thread = thread::Builder::new().name("safe-output".to_owned()).spawn(move || {
-            make_foremost("safe-output", SAFE_OUTPUT_PRIORITY);
-            // Where nobody waits any more, there will be another one.
-            if prepared.send(()).is_ok() {
-                keeper.run();
-            }
-        })?;
-        // Until it is prepared it has this thread's CPUs and priority: who never sleeps would never let it begin.
-        is_prepared.recv_timeout(BEGINS_WITHIN).map_err(|_| {
-            io::Error::other(format!(
-                "the thread 'safe-output' has not begun within {BEGINS_WITHIN:?}: does a thread of a higher real-time priority keep all CPUs?"
-            ))
-        })?;
-        THREAD.get_or_init(|| thread.thread().clone());
-    }
-    Ok(keeper)
-}
-
-/// A deadline is nearer than the thread knows. Takes no lock.
-fn rouse() {
-    if let Some(thread) = THREAD.get() {
-        thread.unpark();
-    }
-}
-
-impl Keeper {
-    fn lock(&self) -> MutexGuard<'_, Vec<Kept>> {
-        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn keep(&self, kept: Kept) {
-        self.lock().push(kept);
-        rouse();
-    }
-
-    /// Tries an output on until it is safe, in place of its owners.
-    fn keep_owing(&self, output: Arc<dyn Watched>) {
-        let mut owing = self.owing.lock().unwrap_or_else(PoisonError::into_inner);
-        if owing.len() < OWING_MAX {
-            owing.push(output);
-        } else {
-            crate::log::error!(
-                "an output is given up that is not safe: what makes outputs safe panics for {OWING_MAX} others that nobody has any more"
-            );
-        }
-        drop(owing);
-        rouse();
-    }
-
-    /// Lets go of those that are safe by now: what is dropped with them is the user's, and no lock is held.
-    fn let_go(&self) {
-        let mut paid = Vec::new();
-        self.owing.lock().unwrap_or_else(PoisonError::into_inner).retain(|output| {
-            let owes = output.owes();
-            if !owes {
-                paid.push(output.clone());
-            }
-            owes
-        });
-        let _ = catch_unwind(AssertUnwindSafe(|| drop(paid)));
-    }
-
-    fn run(&self) -> ! {
-        loop {
-            self.let_go();
-            let (due, sleeps) = self.look(Time::now());
-            if due.is_empty() {
-                thread::park_timeout(sleeps);
-                continue;
-            }
-            // Without the lock: what makes an output safe is the user's, and may make, arm or drop guards.
-            let mut are_held = true;
-            for output in due {
-                // A panic of what makes it safe is caught where that is called; here an output may panic whose last owner has just gone.
-                let tried = catch_unwind(AssertUnwindSafe(|| {
-                    output.upgrade().is_none_or(|output| output.try_expire())
-                }));
-                are_held &= !tried.unwrap_or(true);
-            }
-            if are_held {
-                thread::park_timeout(HELD.min(sleeps));
-            }
-        }
-    }
-
-    /// Whose time is over, and the time until the next one's is.
-    fn look(&self, now: Time) -> (Vec<Weak<dyn Watched>>, Duration) {
-        let (mut due, mut sleeps) = (Vec::new(), IDLE);
-        self.lock().retain(|Kept { watch, output }| {
-            let left = Time::from_nanos(watch.deadline.load(Ordering::Acquire)).since(now);
-            if left.is_zero() || watch.is_tripped.load(Ordering::Acquire) {
-                due.push(output.clone());
-            } else {
-                sleeps = sleeps.min(left);
-            }
-            output.strong_count() > 0
-        });
-        (due, sleeps)
+    fn watch(&self) -> &Watch {
+        &self.watch
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::{
+        sync::{
+            atomic::AtomicBool,
+            mpsc::{Receiver as Receives, sync_channel},
+        },
+        thread,
+    };
+
     use super::*;
     use crate::tid::{AppAddress, NodeAddress};
+
+    /// Time after which a test that waits fails.
+    const WATCHDOG: Duration = Duration::from_secs(30);
+
+    #[derive(serde::Serialize, serde::Deserialize)]
+    struct Torque;
+
+    impl Payload for Torque {
+        const NAME: &'static str = "test.guard.torque";
+        const PROTECTION: Option<Protection> = Some(Protection::of_period(Duration::from_millis(20)));
+    }
 
     #[test]
     fn messages_do_not_put_off_the_next_try_of_what_has_panicked() {
@@ -483,5 +344,54 @@ mod tests {
             inner.let_decide(now, |receiver| receiver.take(now, Opened::Corrupt));
             assert_eq!(inner.deadline(), due);
         }
+    }
+
+    fn output(app: u32, safe: impl FnMut(&mut (), Cause) + Send + 'static) -> Guard<()> {
+        let tid = |app| Tid::new(NodeAddress::new(7), AppAddress::new(app));
+        Guard::new::<Torque>(tid(1), tid(app), (), safe).expect("there is the thread")
+    }
+
+    /// An output that is due all the time, and is made safe as soon as it is allowed; says so then.
+    fn due(app: u32) -> (Guard<()>, Arc<AtomicBool>, Receives<()>) {
+        let (is_allowed, (done, is_done)) = (Arc::new(AtomicBool::new(false)), sync_channel(1));
+        let (may, (tries, tried)) = (is_allowed.clone(), sync_channel(1));
+        let guard = output(app, move |(), _| {
+            let _ = tries.try_send(thread::current().name().map(str::to_owned));
+            assert!(may.load(Ordering::Acquire), "a planted panic");
+            let _ = done.try_send(());
+        });
+        // The thread has it from then on.
+        while tried.recv_timeout(WATCHDOG).expect("it is tried").as_deref() != Some("safe-output") {}
+        (guard, is_allowed, is_done)
+    }
+
+    #[test]
+    fn an_output_is_made_safe_while_who_makes_a_guard_is_kept_from_going_on() {
+        // given: an ordinary thread that was interrupted while it hands its guard to the thread
+        let (_guard, is_allowed, is_done) = due(11);
+        let interrupted = keeper::begun().expect("there is a guard").lock();
+        // when
+        is_allowed.store(true, Ordering::Release);
+        // then
+        is_done.recv_timeout(WATCHDOG).expect("it waits for no ordinary thread");
+        drop(interrupted);
+    }
+
+    #[test]
+    fn an_output_is_made_safe_while_who_holds_one_that_is_owed_is_kept_from_going_on() {
+        // given: an output that nobody has any more, that is not safe, and that its application judges a message for
+        let (_guard, is_allowed, is_done) = due(12);
+        let is_paid = Arc::new(AtomicBool::new(false));
+        let may = is_paid.clone();
+        let orphan = output(13, move |(), _| assert!(may.load(Ordering::Acquire), "a planted panic"));
+        let shared = orphan.shared().clone();
+        drop(orphan);
+        let interrupted = shared.lock();
+        // when
+        is_allowed.store(true, Ordering::Release);
+        // then
+        is_done.recv_timeout(WATCHDOG).expect("it waits for no ordinary thread");
+        is_paid.store(true, Ordering::Release);
+        drop(interrupted);
     }
 }

@@ -26,7 +26,8 @@
 //! | `envelope` | the bytes |
 //! | `sender` | counters and echoes of those who send |
 //! | `receiver` | what is believed, and when the output has to be safe |
-//! | `guard` | the output, and its thread |
+//! | `guard` | the output |
+//! | `keeper` | the thread that makes outputs safe |
 //! | `ends` | both ends for an endpoint of NodeAPI |
 
 mod ends;
@@ -35,6 +36,7 @@ mod envelope;
 #[doc(hidden)]
 pub mod fuzzing;
 mod guard;
+mod keeper;
 mod receiver;
 mod sender;
 #[cfg(test)]
