@@ -14,7 +14,7 @@ use std::{
 use sinew_runtime::{
     app::{AppWiring, DynApp},
     mailbox::Mailbox,
-    supervision::{Alone, AloneHandle, Place, ReadyGate, Reason, alone, tell_of_a_stop},
+    supervision::{Alone, AloneHandle, Place, ReadyGate, Reason, Watcher, alone, tell_of_a_stop},
     tid::Tid,
     time::Time,
     wire::{FrameCodec, HEADER_LEN, Header, Kind},
@@ -80,12 +80,13 @@ fn run(config: &NodeConfig, app: &DynApp, mut socket: StdStream) -> io::Result<(
     socket.set_nonblocking(true)?;
     // Before the application's priority and CPU are this thread's: who hangs there keeps no sign of life from being given.
     let beats = Beats::begin((welcome.beat_us > 0).then(|| Duration::from_micros(welcome.beat_us)))?;
+    let watcher = Watcher::begin();
     place(app).prepare();
     let system = actix::System::new();
     let stop = system.stop_future();
     system.block_on(async {
         actix_rt::spawn(tell_of_a_stop(stop));
-        live(config, app, socket, welcome, beats).await
+        live(config, app, socket, welcome, (watcher, beats)).await
     })
 }
 
@@ -119,7 +120,7 @@ async fn live(
     app: &DynApp,
     socket: StdStream,
     welcome: Welcome,
-    beats: Beats,
+    (watcher, beats): (Watcher, Beats),
 ) -> io::Result<()> {
     let socket = Arc::new(UnixStream::from_std(socket)?);
     // Other threads can write to it from now on: the reactor has seen it once. It has no turn while the application's
@@ -137,7 +138,7 @@ async fn live(
     let launch = app.launch(wiring);
     #[cfg(feature = "fault-points")]
     let launch = crate::node::arm_alone(app, launch);
-    let (handle, ended) = alone(&launch, ready, watched(app, &wire, tid));
+    let (handle, ended) = alone(&launch, ready, watched(watcher, app, &wire, tid));
     beats.of(handle.clone());
     let stopping = wire.clone();
     actix_rt::spawn(async move {
@@ -239,12 +240,13 @@ fn say_beat(wire: &Wire, stalled: Option<Time>) {
 }
 
 /// How the application is watched: the node kills its process when it hangs.
-fn watched(app: &DynApp, wire: &Arc<Wire>, tid: Tid) -> Alone {
+fn watched(watcher: Watcher, app: &DynApp, wire: &Arc<Wire>, tid: Tid) -> Alone {
     let wire = wire.clone();
     let on_hung = move |reason: &Reason| {
         wire.say(words::frame(Kind::HOST_HUNG, tid, payload::lncl_of(tid.node), &Ending::from(reason)));
     };
     Alone {
+        watcher,
         name: app.name().to_owned(),
         place: place(app),
         progress_within: app.policy().progress_within,

@@ -21,8 +21,25 @@ use super::{
 };
 use crate::post::lock;
 
+/// Who sees whether an actor that has no supervisor hangs: a thread, which is there from the beginning.
+#[derive(Debug)]
+pub struct Watcher(Arc<Watchdog>);
+
+impl Watcher {
+    /// Makes the thread. To be called before the calling one is [prepared](Place::prepare): an actor that hangs in its first turn, on a thread
+    /// with a real-time priority and one CPU, would keep a thread that is made there from ever beginning.
+    #[must_use]
+    pub fn begin() -> Self {
+        let watchdog = Arc::new(Watchdog::default());
+        watchdog.begin();
+        Self(watchdog)
+    }
+}
+
 /// How an actor that has no supervisor is watched.
 pub struct Alone {
+    /// Who watches it.
+    pub watcher: Watcher,
     /// Its name, for people.
     pub name: String,
     /// The calling thread's place.
@@ -72,12 +89,11 @@ pub fn alone(
     ready: ReadyGate,
     alone: Alone,
 ) -> (AloneHandle, impl Future<Output = Reason> + use<>) {
-    let Alone { name, place, progress_within, on_hung } = alone;
+    let Alone { watcher: Watcher(watchdog), name, place, progress_within, on_hung } = alone;
     let (report, ended) = report(on_hung);
     let vitals = Vitals::new(name);
     let seat = Seat::of_this_thread(&place);
     let tenant = Tenant::new(vitals.clone(), Some(seat), progress_within, report);
-    let watchdog = Arc::new(Watchdog::default());
     watchdog.watch(&tenant);
     let ready = ReadyGate::new(move || {
         vitals.set_ready();

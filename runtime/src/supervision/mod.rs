@@ -49,7 +49,7 @@ use self::elsewhere as system;
 #[cfg(target_os = "linux")]
 use self::linux as system;
 pub use self::{
-    alone::{Alone, AloneHandle, alone, overseen},
+    alone::{Alone, AloneHandle, Watcher, alone, overseen},
     burial::Burials,
     core::{
         AutoShutdown, BranchView, ChildId, ChildIds, ChildState, ChildView, Command, Flags, Generation,

@@ -15,6 +15,7 @@ use std::{
     sync::{
         Arc, Mutex, Once, Weak,
         atomic::{AtomicUsize, Ordering},
+        mpsc::{RecvTimeoutError, SyncSender, sync_channel},
     },
     thread::JoinHandle,
     time::Duration,
@@ -46,6 +47,8 @@ const REST_OF_BUDGET: u32 = 25;
 const PERIOD_MIN: Duration = Duration::from_millis(1);
 /// Above every actor: it runs for microseconds at a time.
 const PRIORITY: u8 = 95;
+/// Time that the thread has to begin, where somebody waits for that.
+const BEGINS_WITHIN: Duration = Duration::from_secs(5);
 /// Lives that are watched at once at most. One more lives unwatched, and that is said.
 const WATCHED_MAX: usize = 4_096;
 
@@ -96,14 +99,31 @@ impl Watchdog {
         reprieve
     }
 
+    /// Makes the thread, and waits until it depends on the calling one no more. Until then it has that one's CPUs and priority: whoever
+    /// never sleeps there would never let it begin.
+    pub(super) fn begin(&self) {
+        let (prepared, is_prepared) = sync_channel(1);
+        self.wake_or_make(Some(prepared));
+        // Where there is no thread, that has been said.
+        if is_prepared.recv_timeout(BEGINS_WITHIN) == Err(RecvTimeoutError::Timeout) {
+            crate::log::error!(
+                "the watchdog has not begun within {BEGINS_WITHIN:?}: does a thread of a higher real-time priority keep all CPUs?"
+            );
+        }
+    }
+
     /// Wakes the thread; makes one if there is none that lives.
     fn wake(&self) {
+        self.wake_or_make(None);
+    }
+
+    fn wake_or_make(&self, prepared: Option<SyncSender<()>>) {
         let mut thread = lock(&self.thread);
         if let Some(thread) = thread.as_ref().filter(|thread| !thread.is_finished()) {
             return thread.thread().unpark();
         }
         let shared = Arc::downgrade(&self.shared);
-        match std::thread::Builder::new().name("watchdog".to_owned()).spawn(move || run(&shared)) {
+        match std::thread::Builder::new().name("watchdog".to_owned()).spawn(move || run(&shared, prepared)) {
             Ok(new) => *thread = Some(new),
             Err(error) => crate::log::error!(%error, "no thread for the watchdog; nobody sees who hangs"),
         }
@@ -120,7 +140,7 @@ impl Drop for Watchdog {
     }
 }
 
-fn run(shared: &Weak<Shared>) {
+fn run(shared: &Weak<Shared>, prepared: Option<SyncSender<()>>) {
     is_the_runtimes();
     // Whoever woke it first may be kept on one CPU, and hang there. Refused, it stays there, too.
     let _ = system::keep_on_any();
@@ -132,6 +152,10 @@ fn run(shared: &Weak<Shared>) {
                 "the watchdog has no real-time priority: on a busy CPU it notices a hang late; allow it with `ulimit -r 99`"
             );
         });
+    }
+    if let Some(prepared) = prepared {
+        // Whoever waits no more has said so.
+        let _ = prepared.send(());
     }
     while let Some(shared) = shared.upgrade() {
         // A fault in here must not leave the node without a watchdog.
