@@ -66,7 +66,7 @@ impl Endpoint {
     /// ```
     ///
     /// # Errors
-    /// The thread that keeps the watchdogs cannot be started, this is guarded already, or the type bears no age at all.
+    /// The thread that keeps the watchdogs cannot be started or is not more urgent than this one, this is guarded already, or the type bears no age at all.
     pub fn guard<P: Payload, O: Send + 'static>(
         &mut self,
         source: Tid,
@@ -123,7 +123,7 @@ impl AsyncEndpoint {
     /// Has `output` moved by what `source` sends of type `P`, as [`Endpoint::guard`].
     ///
     /// # Errors
-    /// The thread that keeps the watchdogs cannot be started, this is guarded already, or the type bears no age at all.
+    /// The thread that keeps the watchdogs cannot be started or is not more urgent than this one, this is guarded already, or the type bears no age at all.
     pub fn guard<P: Payload, O: Send + 'static>(
         &mut self,
         source: Tid,

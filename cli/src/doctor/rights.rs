@@ -83,7 +83,7 @@ pub(super) fn real_time() -> Check {
         }
         Ok((Ok(()), Err(error))) => format!(
             "a thread got SCHED_FIFO 1, and not the {SAFE_OUTPUT_PRIORITY} of what makes outputs safe: {error:?} ({known}); that takes the \
-             highest that it gets, and comes too late where what it guards has a higher one"
+             highest that it gets, and comes too late where what it guards has one as high or higher: that is refused a guard"
         ),
         Ok((Err(error), Err(_))) => format!("a thread did not get SCHED_FIFO: {error:?} ({known})"),
         Err(_) => {

@@ -250,7 +250,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     /// of `P`; others are refused. The sender is sent an echo four times in the greatest age of a message.
     ///
     /// # Errors
-    /// The thread that keeps the watchdogs cannot be started, or this is guarded already.
+    /// The thread that keeps the watchdogs cannot be started or is not more urgent than this one, or this is guarded already.
     pub fn guard<P: Payload, O: Send + 'static>(
         &mut self,
         source: Tid,

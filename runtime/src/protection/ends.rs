@@ -102,7 +102,7 @@ impl Ends {
     /// [echoes](Self::echo).
     ///
     /// # Errors
-    /// The thread that keeps the watchdogs cannot be started, this is guarded already, or [`age_max`](super::Protection::age_max) of the
+    /// The thread that keeps the watchdogs cannot be started or is not more urgent than this one, this is guarded already, or [`age_max`](super::Protection::age_max) of the
     /// type is below 4 ns, so that no echo could be quoted in time.
     pub fn guard<P: Payload, O: Send + 'static>(
         &mut self,

@@ -101,7 +101,7 @@ impl<O: Send + 'static> Guard<O> {
     /// panics is called again. The first guard of a process waits until that thread runs.
     ///
     /// # Errors
-    /// The thread cannot be started.
+    /// The thread cannot be started, or this one has a real-time priority as high as that was granted, or higher: it would not run while this one hangs.
     pub fn new<P: Payload>(
         source: Tid,
         receiver: Tid,

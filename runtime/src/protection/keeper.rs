@@ -6,7 +6,7 @@ use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{
         Arc, Mutex, MutexGuard, OnceLock, PoisonError, TryLockError, Weak,
-        atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering},
+        atomic::{AtomicBool, AtomicU8, AtomicU64, AtomicUsize, Ordering},
         mpsc::sync_channel,
     },
     thread::{self, Thread},
@@ -14,7 +14,10 @@ use std::{
 };
 
 use super::SAFE_OUTPUT_PRIORITY;
-use crate::{supervision::make_foremost, time::Time};
+use crate::{
+    supervision::{make_foremost, realtime_priority},
+    time::Time,
+};
 
 /// Outputs that nobody has any more and that are tried on, at most.
 const OWING_MAX: usize = 256;
@@ -80,19 +83,43 @@ pub(super) struct Kept {
 
 static KEEPER: OnceLock<Keeper> = OnceLock::new();
 static THREAD: OnceLock<Thread> = OnceLock::new();
+/// The thread's real-time priority, 0 for none.
+static GRANTED: AtomicU8 = AtomicU8::new(0);
 
-/// The keeper, whose thread runs.
+/// The keeper, whose thread runs and comes before the calling one.
 ///
 /// # Errors
-/// The thread cannot be started, or does not begin.
+/// The thread cannot be started, or does not begin; or the calling one would keep it from running.
 pub(super) fn begun() -> io::Result<&'static Keeper> {
+    let keeper = start()?;
+    comes_first(GRANTED.load(Ordering::Acquire), realtime_priority())?;
+    Ok(keeper)
+}
+
+/// Refuses whoever would not be interrupted by the thread: the system lets no thread of its real-time schedule wait for another one that is as
+/// urgent, so an application that hangs would have its outputs as they are.
+fn comes_first(granted: u8, own: u8) -> io::Result<()> {
+    if own == 0 || own < granted {
+        return Ok(());
+    }
+    Err(io::Error::new(
+        io::ErrorKind::PermissionDenied,
+        format!(
+            "this thread has the real-time priority {own}, and what makes outputs safe was granted {granted} (0: none), so that it would not run while this \
+             one hangs: allow {SAFE_OUTPUT_PRIORITY} with `ulimit -r 99` or `setcap cap_sys_nice+ep` on the program, or take a lower one for this thread"
+        ),
+    ))
+}
+
+fn start() -> io::Result<&'static Keeper> {
     static STARTING: Mutex<()> = Mutex::new(());
     let keeper = KEEPER.get_or_init(Keeper::default);
     let _one_at_a_time = STARTING.lock().unwrap_or_else(PoisonError::into_inner);
     if THREAD.get().is_none() {
         let (prepared, is_prepared) = sync_channel(0);
         let thread = thread::Builder::new().name("safe-output".to_owned()).spawn(move || {
-            make_foremost("safe-output", SAFE_OUTPUT_PRIORITY);
+            let granted = make_foremost("safe-output", SAFE_OUTPUT_PRIORITY);
+            GRANTED.store(granted, Ordering::Release);
             // Where nobody waits any more, there will be another one.
             if prepared.send(()).is_ok() {
                 Rounds::default().go(keeper);
@@ -230,5 +257,21 @@ impl Rounds {
             output.strong_count() > 0
         });
         sleeps
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn whoever_is_as_urgent_as_what_makes_outputs_safe_has_no_guard() {
+        for (granted, own) in [(90, 89), (80, 79), (2, 1), (90, 0), (0, 0)] {
+            assert!(comes_first(granted, own).is_ok(), "{own} below {granted}");
+        }
+        for (granted, own) in [(90, 90), (80, 80), (80, 89), (0, 1)] {
+            let refused = comes_first(granted, own).expect_err("they would wait for each other");
+            assert!(refused.to_string().contains(&format!("priority {own}")), "{refused}");
+        }
     }
 }

@@ -67,5 +67,5 @@ pub use self::{
 };
 pub(crate) use self::{
     panics::writes_the_log,
-    place::{make_foremost, make_like_any_other},
+    place::{make_foremost, make_like_any_other, realtime_priority},
 };

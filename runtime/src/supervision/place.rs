@@ -177,8 +177,8 @@ impl Place {
 }
 
 /// Makes the calling thread, which is new and has the CPUs and the priority of whoever made it, one that depends on neither: it may run on any
-/// CPU, under SCHED_FIFO with the priority `wanted`, or with the highest that is granted. The log says which it has.
-pub(crate) fn make_foremost(thread: &str, wanted: u8) {
+/// CPU, under SCHED_FIFO with the priority `wanted`, or with the highest that is granted. Says which it has, as does the log.
+pub(crate) fn make_foremost(thread: &str, wanted: u8) -> u8 {
     if let Err(error) = system::keep_on_any() {
         crate::log::warn!(thread, %error, "the thread stays on the CPUs of whoever made it");
     }
@@ -200,10 +200,17 @@ pub(crate) fn make_foremost(thread: &str, wanted: u8) {
             thread,
             wanted,
             has,
-            "the system refuses this thread its real-time priority; it has another (0: none), and what has a higher one or, without one, a busy CPU makes \
-             it late; allow it with `ulimit -r 99` or `setcap cap_sys_nice+ep` on the program"
+            "the system refuses this thread its real-time priority; it has another (0: none), and what has one as high or higher or, without one, a busy CPU \
+             makes it late; allow it with `ulimit -r 99` or `setcap cap_sys_nice+ep` on the program"
         );
     }
+    has
+}
+
+/// The calling thread's real-time priority, 0 for none.
+pub(crate) fn realtime_priority() -> u8 {
+    let (_, priority) = schedule();
+    priority
 }
 
 /// The real-time priorities to ask for, one after the other, of a thread that has inherited one, 0 for none: the one that is wanted, and the
