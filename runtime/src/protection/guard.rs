@@ -11,8 +11,9 @@ use bytes::Bytes;
 
 use super::{
     ArmError, Cause, Codename, Protection, State, Tally,
-    keeper::{self, Watch, Watched, rouse},
+    keeper::{self, Tried, Watch, Watched, rouse},
     receiver::{Opened, Receiver, Verdict},
+    said::{Said, What},
 };
 use crate::{tid::Tid, time::Time, wire::Payload};
 
@@ -41,6 +42,8 @@ struct Inner<O> {
     output: O,
     safe: MakeSafe<O>,
     owes: Option<Owed>,
+    /// What is to be said when nobody has the output in hand any more.
+    said: Option<Said>,
 }
 
 /// The output was to be made safe, and that has panicked.
@@ -65,18 +68,19 @@ impl<O> Inner<O> {
     }
 
     fn make_safe(&mut self, cause: Cause, now: Time) {
-        let Self { output, safe, owes, codename: Codename { source, name, .. }, .. } = self;
+        let Self { output, safe, owes, said, codename: Codename { source, name, .. }, .. } = self;
+        let (source, name) = (*source, *name);
         let is_news = owes.is_none();
         if catch_unwind(AssertUnwindSafe(|| safe(output, cause))).is_ok() {
             *owes = None;
             if cause != Cause::NotArmed && cause != Cause::Dropped {
-                crate::log::warn!(%source, of = *name, %cause, "a guard is shut; its output, if it has one, is safe");
+                *said = Some(Said { source, name, cause, what: What::IsSafe });
             }
             return;
         }
         *owes = Some(Owed { cause, retry: now + SAFE_RETRY });
         if is_news {
-            crate::log::error!(%source, of = *name, %cause, "what makes an output safe has panicked; it is tried again each millisecond");
+            *said = Some(Said { source, name, cause, what: What::HasPanicked });
         }
     }
 
@@ -112,8 +116,9 @@ impl<O: Send + 'static> Guard<O> {
         let protection = P::PROTECTION.unwrap_or(Protection::of_period(Duration::ZERO));
         let codename = Codename::of::<P>(source, receiver);
         let receiver = Receiver::new(protection);
-        let mut inner = Inner { codename, receiver, output, safe: Box::new(safe), owes: None };
+        let mut inner = Inner { codename, receiver, output, safe: Box::new(safe), owes: None, said: None };
         inner.make_safe(Cause::NotArmed, Time::now());
+        inner.said.take().into_iter().for_each(Said::log);
         let watch = Watch::new(inner.deadline(), inner.owes.is_some());
         let shared = Arc::new(Shared { codename, inner: Mutex::new(inner), watch: Arc::new(watch) });
         let output: Arc<dyn Watched> = shared.clone();
@@ -130,12 +135,13 @@ impl<O: Send + 'static> Guard<O> {
     /// # Errors
     /// It is not, since this; it was not moved.
     pub fn apply<R>(&self, command: impl FnOnce(&mut O) -> R) -> Result<R, Cause> {
-        let mut inner = self.shared().lock();
-        self.shared().decide_locked(&mut inner, |receiver, now| receiver.expire(now));
-        match inner.receiver.state() {
-            State::Live => Ok(command(&mut inner.output)),
-            State::Safe(cause) => Err(cause),
-        }
+        self.shared().with(|inner| {
+            self.shared().decide_locked(inner, |receiver, now| receiver.expire(now));
+            match inner.receiver.state() {
+                State::Live => Ok(command(&mut inner.output)),
+                State::Safe(cause) => Err(cause),
+            }
+        })
     }
 
     /// Makes the output live: from now on commands pass. Somebody has seen that it is safe to; nothing does this by itself.
@@ -143,14 +149,13 @@ impl<O: Send + 'static> Guard<O> {
     /// # Errors
     /// Too few good messages have come, or the output could not be made safe.
     pub fn arm(&self) -> Result<(), ArmError> {
-        {
-            let mut inner = self.shared().lock();
+        self.shared().with(|inner| {
             inner.pay(Time::now());
             if inner.owes.is_some() {
                 return Err(ArmError::SafeFails);
             }
-            self.shared().decide_locked(&mut inner, |receiver, now| receiver.arm(now))?;
-        }
+            self.shared().decide_locked(inner, |receiver, now| receiver.arm(now))
+        })?;
         // The thread sleeps, as there was no deadline.
         rouse();
         Ok(())
@@ -159,8 +164,9 @@ impl<O: Send + 'static> Guard<O> {
     /// Makes the output safe: at once, or, while its application or another thread has it in hand, as soon as it has not.
     pub fn trip(&self) {
         self.shared().watch.is_tripped.store(true, Ordering::Release);
-        if !self.shared().try_expire() {
-            rouse();
+        match self.shared().try_expire() {
+            Tried::Held => rouse(),
+            Tried::Done(said) => said.into_iter().for_each(Said::log),
         }
     }
 
@@ -215,7 +221,17 @@ impl<O> Shared<O> {
     }
 
     fn decide<R>(&self, decide: impl FnOnce(&mut Receiver, Time) -> R) -> R {
-        self.decide_locked(&mut self.lock(), decide)
+        self.with(|inner| self.decide_locked(inner, decide))
+    }
+
+    /// Has the output in hand, and says then what is to be said.
+    fn with<R>(&self, step: impl FnOnce(&mut Inner<O>) -> R) -> R {
+        let mut inner = self.lock();
+        let result = step(&mut inner);
+        let said = inner.said.take();
+        drop(inner);
+        said.into_iter().for_each(Said::log);
+        result
     }
 
     fn decide_locked<R>(&self, inner: &mut Inner<O>, decide: impl FnOnce(&mut Receiver, Time) -> R) -> R {
@@ -289,15 +305,15 @@ impl<O: Send + 'static> Guarded for Shared<O> {
 }
 
 impl<O: Send + 'static> Watched for Shared<O> {
-    fn try_expire(&self) -> bool {
+    fn try_expire(&self) -> Tried {
         let mut inner = match self.inner.try_lock() {
             Ok(inner) => inner,
             Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
-            Err(TryLockError::WouldBlock) => return false,
+            Err(TryLockError::WouldBlock) => return Tried::Held,
         };
         inner.pay(Time::now());
         self.decide_locked(&mut inner, |receiver, now| receiver.expire(now));
-        true
+        Tried::Done(inner.said.take())
     }
 
     fn watch(&self) -> &Watch {
@@ -335,7 +351,7 @@ mod tests {
         let codename = Codename { source: tid(1), destination: tid(2), name: "test.torque" };
         let receiver = Receiver::new(Protection::of_period(SAFE_RETRY));
         let safe = Box::new(|(): &mut (), _| panic!("a planted panic"));
-        let mut inner = Inner { codename, receiver, output: (), safe, owes: None };
+        let mut inner = Inner { codename, receiver, output: (), safe, owes: None, said: None };
         let begun = Time::from_nanos(1_000_000_000);
         inner.make_safe(Cause::Tripped, begun);
         let due = (begun + SAFE_RETRY).as_nanos();

@@ -13,7 +13,10 @@ use std::{
     time::Duration,
 };
 
-use super::SAFE_OUTPUT_PRIORITY;
+use super::{
+    SAFE_OUTPUT_PRIORITY,
+    said::{self, Said, Unsaid},
+};
 use crate::{
     supervision::{make_foremost, realtime_priority},
     time::Time,
@@ -51,10 +54,18 @@ impl Watch {
     }
 }
 
+/// What came of a look at an output.
+pub(super) enum Tried {
+    /// Somebody has it in hand just now.
+    Held,
+    /// It was looked at, and this is to be said of it.
+    Done(Option<Said>),
+}
+
 /// An output, as the thread sees it.
 pub(super) trait Watched: Send + Sync {
-    /// Makes the output safe if its time is over. `false`: somebody has it in hand just now.
-    fn try_expire(&self) -> bool;
+    /// Makes the output safe if its time is over.
+    fn try_expire(&self) -> Tried;
     /// What is known of it without its lock.
     fn watch(&self) -> &Watch;
 }
@@ -116,6 +127,7 @@ fn start() -> io::Result<&'static Keeper> {
     let keeper = KEEPER.get_or_init(Keeper::default);
     let _one_at_a_time = STARTING.lock().unwrap_or_else(PoisonError::into_inner);
     if THREAD.get().is_none() {
+        said::begin()?;
         let (prepared, is_prepared) = sync_channel(0);
         let thread = thread::Builder::new().name("safe-output".to_owned()).spawn(move || {
             let granted = make_foremost("safe-output", SAFE_OUTPUT_PRIORITY);
@@ -182,6 +194,7 @@ struct Rounds {
     owing: Vec<Arc<dyn Watched>>,
     /// Those whose time is over in this round.
     due: Vec<Weak<dyn Watched>>,
+    unsaid: Unsaid,
 }
 
 impl Rounds {
@@ -196,7 +209,10 @@ impl Rounds {
 
     /// Makes safe what is due; how long there is nothing to do then, if nobody wakes the thread.
     fn round(&mut self, keeper: &Keeper) -> Duration {
-        let soon = if self.take_in(keeper) { IDLE } else { HELD };
+        let has_all = self.take_in(keeper);
+        // Of the round before: all that was due then is safe.
+        let has_said_all = self.unsaid.hand_over();
+        let soon = if has_all && has_said_all { IDLE } else { HELD };
         self.let_go(keeper);
         let sleeps = self.look(Time::now()).min(soon);
         if self.due.is_empty() {
@@ -205,9 +221,16 @@ impl Rounds {
         let mut are_held = true;
         for output in self.due.drain(..) {
             // A panic of what makes it safe is caught where that is called; here an output may panic whose last owner has just gone.
-            let tried =
-                catch_unwind(AssertUnwindSafe(|| output.upgrade().is_none_or(|output| output.try_expire())));
-            are_held &= !tried.unwrap_or(true);
+            let tried = catch_unwind(AssertUnwindSafe(|| {
+                output.upgrade().map_or(Tried::Done(None), |output| output.try_expire())
+            }));
+            match tried.unwrap_or(Tried::Done(None)) {
+                Tried::Held => {}
+                Tried::Done(said) => {
+                    are_held = false;
+                    self.unsaid.note(said);
+                }
+            }
         }
         if are_held { HELD.min(sleeps) } else { Duration::ZERO }
     }

@@ -28,6 +28,7 @@
 //! | `receiver` | what is believed, and when the output has to be safe |
 //! | `guard` | the output |
 //! | `keeper` | the thread that makes outputs safe |
+//! | `said` | what is said of that in the log |
 //! | `ends` | both ends for an endpoint of NodeAPI |
 
 mod ends;
@@ -38,6 +39,7 @@ pub mod fuzzing;
 mod guard;
 mod keeper;
 mod receiver;
+mod said;
 mod sender;
 #[cfg(test)]
 mod tests;
