@@ -98,6 +98,9 @@ impl Endpoint {
     /// Looks, and does not wait. The first refusal is told at once, those after it every 100 ms together, so that a flood
     /// of refusals wakes nobody for each. What is not told when the connection ends is not told.
     ///
+    /// Values of class Stream that waited for room in a direct link when that ended are counted here too, with their destination, as
+    /// [`Closed`](Rejection::Closed). What lay in its ring by then, and was sent without asking for its outcome, is not: nobody knows of it.
+    ///
     /// What this endpoint itself has refused without anybody's being told is counted here too, with itself as the destination.
     ///
     /// Whoever needs to know it of one message sends that one [confirmed](Self::send_confirmed).
