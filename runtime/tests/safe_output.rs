@@ -48,8 +48,11 @@ fn is_granted(priority: u8) -> bool {
 
 /// The number, and the real-time priority, of the thread of this process that is called so.
 fn thread(name: &str) -> (Pid, u8) {
-    let threads = fs::read_dir("/proc/self/task").unwrap().map(|thread| thread.unwrap().path());
-    let is_it = |path: &std::path::PathBuf| fs::read_to_string(path.join("comm")).unwrap().trim() == name;
+    let threads = fs::read_dir("/proc/self/task").unwrap().filter_map(|thread| Some(thread.ok()?.path()));
+    // Others may end meanwhile.
+    let is_it = |path: &std::path::PathBuf| {
+        fs::read_to_string(path.join("comm")).is_ok_and(|comm| comm.trim() == name)
+    };
     let path = threads.into_iter().find(is_it).unwrap();
     let number = path.file_name().unwrap().to_str().unwrap().parse().unwrap();
     let stat = fs::read_to_string(path.join("stat")).unwrap();

@@ -376,9 +376,19 @@ fn an_output_whose_guard_goes_and_whose_making_safe_panics_is_tried_again() {
     made_safe.recv_timeout(Duration::from_secs(60)).expect("it is tried until it is done");
 }
 
-/// Its watchdog sleeps for minutes, unless other tests of this process wake it: alone this fails where nobody wakes it.
+/// In a process of its own: in this one other tests wake the thread, which would sleep for minutes where nobody wakes it.
 #[test]
 fn an_output_that_was_tripped_and_whose_making_safe_panics_is_tried_again_at_once() {
+    let tests = std::env::current_exe().expect("it runs");
+    let alone = ["--exact", "--ignored", "protection::tests::a_tripped_output_alone_is_tried_again_at_once"];
+    let run = std::process::Command::new(tests).args(alone).output().expect("it can be run");
+    let said = String::from_utf8_lossy(&run.stdout);
+    assert!(run.status.success() && said.contains("1 passed"), "{said}");
+}
+
+#[test]
+#[ignore = "the test above runs it alone"]
+fn a_tripped_output_alone_is_tried_again_at_once() {
     let (safe, made_safe) = std::sync::mpsc::sync_channel(1);
     let mut fails = true;
     let guard = live_with(move |(), cause| {
