@@ -25,6 +25,11 @@ pub(super) fn keep_on_any() -> io::Result<()> {
     Ok(())
 }
 
+/// The same.
+pub(super) fn keep_on_the_processes() -> io::Result<()> {
+    Ok(())
+}
+
 /// There is no such limit: what is refused once stays so.
 pub(super) fn realtime_limit() -> u8 {
     0

@@ -1,10 +1,10 @@
 //! What only Linux does for a thread: a number, a name for people, one CPU, idle scheduling.
 
-use std::ffi::CStr;
+use std::{ffi::CStr, sync::OnceLock};
 
 use rustix::{
-    process::{Resource, getrlimit},
-    thread::{CpuSet, gettid, sched_setaffinity, set_name},
+    process::{Resource, getpid, getrlimit},
+    thread::{CpuSet, gettid, sched_getaffinity, sched_setaffinity, set_name},
 };
 use thread_priority::{NormalThreadSchedulePolicy, ThreadSchedulePolicy};
 
@@ -23,6 +23,8 @@ pub(super) fn name_thread(name: &CStr) {
 
 /// Keeps the calling thread on one CPU.
 pub(super) fn keep_on(cpu: usize) -> std::io::Result<()> {
+    // Before the first thread is kept anywhere.
+    the_processes();
     let mut set = CpuSet::new();
     if cpu < CpuSet::MAX_CPU {
         set.set(cpu);
@@ -30,11 +32,23 @@ pub(super) fn keep_on(cpu: usize) -> std::io::Result<()> {
     Ok(sched_setaffinity(None, &set)?)
 }
 
-/// Lets the calling thread run on any CPU, whatever whoever made it was kept on. The kernel leaves those out that the process may not use.
+/// Lets the calling thread run on any CPU, whatever whoever made it was kept on: on all of the process's cpuset, also those that `taskset` or
+/// systemd's `CPUAffinity=` left out, as for the kernel these are only what each thread begins with.
 pub(super) fn keep_on_any() -> std::io::Result<()> {
     let mut set = CpuSet::new();
     (0..CpuSet::MAX_CPU).for_each(|cpu| set.set(cpu));
     Ok(sched_setaffinity(None, &set)?)
+}
+
+/// Lets the calling thread run where the process was started to run, by `taskset` say, whatever whoever made it was kept on.
+pub(super) fn keep_on_the_processes() -> std::io::Result<()> {
+    the_processes().map_or_else(keep_on_any, |set| Ok(sched_setaffinity(None, set)?))
+}
+
+/// The CPUs of the first thread when this was asked for first.
+fn the_processes() -> Option<&'static CpuSet> {
+    static THE_PROCESSES: OnceLock<Option<CpuSet>> = OnceLock::new();
+    THE_PROCESSES.get_or_init(|| sched_getaffinity(Some(getpid())).ok()).as_ref()
 }
 
 /// The highest real-time priority that this process's limit grants, 0 for none; with CAP_SYS_NICE it is no limit.

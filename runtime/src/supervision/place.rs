@@ -246,10 +246,10 @@ pub fn make_ordinary() {
     let _ = set_thread_priority_and_policy(thread_native_id(), level, policy);
 }
 
-/// The same, and on any CPU.
+/// The same, and on the CPUs that the process was started with.
 pub(crate) fn make_like_any_other() {
     // Refused, it stays where whoever made it is.
-    let _ = system::keep_on_any();
+    let _ = system::keep_on_the_processes();
     make_ordinary();
 }
 
