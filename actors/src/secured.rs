@@ -2,6 +2,7 @@
 
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;
+mod reminder;
 
 use std::{
     num::NonZeroUsize,
@@ -16,6 +17,7 @@ use sinew_runtime::{
     time::Time,
 };
 
+use self::reminder::{Matter, Reminder};
 use crate::{
     config::NodeConfig,
     security::{
@@ -41,6 +43,8 @@ pub(crate) struct Secured {
     pub(crate) serial: Serial,
     /// Of two who have the deny list read again, the later one reads later.
     reading: Mutex<()>,
+    /// When it was said last that its certificate ends.
+    reminder: Mutex<Reminder>,
 }
 
 /// Why a node's deny list was not read again, or what else is to be done. Each says what is in force.
@@ -126,12 +130,19 @@ impl Secured {
         let seals = Seals::new(key, &identity.project, identity.address, incarnation, nodes_max);
         let (directory, serial) = (credentials.directory().to_owned(), credentials.serial().clone());
         let (validity, times, seals) = (credentials.validity(), credentials.policy(), Mutex::new(seals));
-        Self { tls, validity, times, seals, directory, serial, reading: Mutex::default() }
+        let reminder = Mutex::new(Reminder::new(Time::now()));
+        Self { tls, validity, times, seals, directory, serial, reading: Mutex::default(), reminder }
     }
 
-    /// What is to be said of the times of this node's own certificate at `now`, and whether that has ended.
-    pub(crate) fn warning(&self, now: UnixTime) -> Option<(String, bool)> {
-        Some((self.times.warning(self.validity, now)?, now > self.validity.until))
+    /// What is to be said again of the times of this node's own certificate at `at`, which the clock that may be set calls `now`. That
+    /// times are not looked at is said at the start, and of each peer.
+    pub(crate) fn reminder(&self, now: UnixTime, at: Time) -> Option<String> {
+        if self.times == TimePolicy::Ignored {
+            return None;
+        }
+        let warning = self.times.warning(self.validity, now)?;
+        let matter = if now > self.validity.until { Matter::HasEnded } else { Matter::EndsSoon };
+        lock(&self.reminder).is_due(matter, at).then_some(warning)
     }
 
     /// Reads the deny list again and puts it in force, for every handshake and every HELLO from now on. Connections that stand end when

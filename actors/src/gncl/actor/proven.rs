@@ -20,8 +20,9 @@ use crate::{
     security::{Peer, Stamp},
 };
 
-/// How often a node that has keys looks whether they still count.
-const HOUR: Duration = Duration::from_secs(3_600);
+/// How often a node that has keys looks whether there is something to be said of how long they count: more often than that is said, as each life
+/// of this layer begins anew.
+const MINDED: Duration = Duration::from_secs(60);
 
 /// Under which it is counted that a peer is not taken, or does not take this node.
 pub(super) const NOT_PROVEN: &str = "peer not proven";
@@ -41,13 +42,9 @@ impl Gncl {
         if self.secure.is_none() {
             return;
         }
-        let mut hours = 0_u32;
-        ctx.run_interval(HOUR, move |gncl, _| {
-            hours = hours.wrapping_add(1);
-            let warning = gncl.stores.secured.get().and_then(|secured| secured.warning(UnixTime::now()));
-            if let Some((warning, has_ended)) = warning
-                && (has_ended || hours.is_multiple_of(24))
-            {
+        ctx.run_interval(MINDED, |gncl, _| {
+            let secured = gncl.stores.secured.get();
+            if let Some(warning) = secured.and_then(|secured| secured.reminder(UnixTime::now(), Time::now())) {
                 crate::log::warn!("{warning}");
             }
         });
