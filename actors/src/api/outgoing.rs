@@ -194,7 +194,7 @@ impl Endpoint {
         limit: Limit,
         mut now: Time,
     ) -> Result<Option<Draft>, ApiError> {
-        let length = HEADER_LEN + draft.payload.len();
+        let room = Room { link, length: HEADER_LEN + draft.payload.len(), class: draft.header.class };
         // Who takes nothing costs a patience once, and not with each message.
         let has_stalled = self.direct.is_stalled(link);
         let mut waiting = if has_stalled { Waiting::after_a_stall(limit) } else { Waiting::new(limit) };
@@ -232,9 +232,9 @@ impl Endpoint {
             };
             self.take_in_while_writing(link, now);
             match self.form {
-                Form::Thread => self.direct.await_room(link, length, pause.min(until.since(now))),
+                Form::Thread => self.direct.await_room(room, pause.min(until.since(now))),
                 // Rung for room, and for what comes.
-                Form::Reactor(_) => self.wait_for_room(Room { link, length }, until, now).await,
+                Form::Reactor(_) => self.wait_for_room(room, until, now).await,
             }
             pause = (pause * 2).min(NAP);
         }

@@ -2,7 +2,7 @@
 
 use std::{os::fd::BorrowedFd, time::Duration};
 
-use sinew_runtime::{tid::Tid, time::Time};
+use sinew_runtime::{tid::Tid, time::Time, wire::Class};
 use sinew_shm::Armed;
 
 use super::{Direct, Writing, standing::Standing};
@@ -14,6 +14,8 @@ pub(in crate::api) struct Room {
     pub(in crate::api) link: LinkNumber,
     /// Bytes of its frame. Of one that has begun the link knows what is left.
     pub(in crate::api) length: usize,
+    /// Of a Stream what waits goes first.
+    pub(in crate::api) class: Class,
 }
 
 impl Direct {
@@ -58,16 +60,16 @@ impl Direct {
     }
 
     /// Waits until a link has room for the beginning of a frame of so many bytes, or ends, or `within` this time.
-    pub(in crate::api) fn await_room(&mut self, number: LinkNumber, length: usize, within: Duration) {
-        if let Some(link) = self.standing(number) {
-            link.await_room(length, within);
+    pub(in crate::api) fn await_room(&mut self, room: Room, within: Duration) {
+        if let Some(link) = self.standing(room.link) {
+            link.await_room(room.length, room.class, within);
         }
     }
 
     /// Announces that a task waits for room: when the peer has taken something it rings, once. [`Armed::Ready`]: there is room, or
     /// the link is of no more use, which shows when it is written.
     pub(in crate::api) fn arm_room(&mut self, room: Room) -> Armed {
-        self.standing(room.link).map_or(Armed::Ready, |link| link.arm_room(room.length))
+        self.standing(room.link).map_or(Armed::Ready, |link| link.arm_room(room.length, room.class))
     }
 
     /// Says that the task is awake.

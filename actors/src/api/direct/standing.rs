@@ -241,8 +241,8 @@ impl Standing {
     }
 
     /// Announces that a task waits for room for a frame of `length` bytes, or for the rest of the one that is begun.
-    pub(super) fn arm_room(&mut self, length: usize) -> Armed {
-        let length = self.wanted(length);
+    pub(super) fn arm_room(&mut self, length: usize, class: Class) -> Armed {
+        let length = self.wanted(length, class);
         match &mut self.rest {
             Some(rest) => rest.arm(),
             None => self.writer.arm(length),
@@ -273,14 +273,16 @@ impl Standing {
         }
     }
 
-    /// What there has to be room for before a frame of `length` bytes goes out: what waits goes first.
-    fn wanted(&self, length: usize) -> usize {
-        self.parked.first().map_or(length, |first| length.max(HEADER_LEN + first.payload.len()))
+    /// What there has to be room for before a frame of `length` bytes goes out: of a Stream what waits goes first. Of another class it goes
+    /// as soon as there is room for it, however long the values are that wait.
+    fn wanted(&self, length: usize, class: Class) -> usize {
+        let goes_first = self.parked.first().filter(|_| class == Class::Stream);
+        goes_first.map_or(length, |first| length.max(HEADER_LEN + first.payload.len()))
     }
 
     /// Waits until there is room, the peer's end, or `within` this time.
-    pub(in crate::api) fn await_room(&mut self, length: usize, within: Duration) {
-        let length = self.wanted(length);
+    pub(in crate::api) fn await_room(&mut self, length: usize, class: Class, within: Duration) {
+        let length = self.wanted(length, class);
         match &mut self.rest {
             Some(rest) => rest.await_room(within),
             None => self.writer.await_room(length, within),
@@ -290,7 +292,7 @@ impl Standing {
     /// Waits until there is room for what waits for it, the peer's end, or `within` this time.
     pub(super) fn await_owed(&mut self, within: Duration) {
         let first = self.parked.first().map_or(1, |parked| parked.payload.len());
-        self.await_room(HEADER_LEN + first, within);
+        self.await_room(HEADER_LEN + first, Class::Stream, within);
     }
 
     /// Says what waits for room and will find none any more.

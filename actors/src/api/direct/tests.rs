@@ -49,6 +49,14 @@ impl Payload for Mode {
     const CLASS: Class = Class::Stream;
 }
 
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Picture(String);
+
+impl Payload for Picture {
+    const NAME: &'static str = "test.picture";
+    const CLASS: Class = Class::Stream;
+}
+
 fn register(node: &TestNode, registration: Registration) -> Endpoint {
     NodeApi::connect(node.path()).unwrap().register_transport_address(registration).unwrap()
 }

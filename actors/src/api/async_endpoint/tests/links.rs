@@ -172,7 +172,7 @@ fn fill(from: &mut AsyncEndpoint, to: Tid) -> Room {
         let message = numbered(number, 1_000, from.endpoint.tid, to);
         match direct.send(link, message.into(), Time::now()).unwrap() {
             Sent::Taken => {}
-            Sent::Full(_) => return Room { link, length: HEADER_LEN + 1_000 },
+            Sent::Full(_) => return Room { link, length: HEADER_LEN + 1_000, class: Class::Bulk },
             Sent::Begun | Sent::Gone(_) => panic!("it fits, and the peer lives"),
         }
     }

@@ -2,13 +2,14 @@
 
 use sinew_runtime::{
     tid::Tid,
-    wire::{Header, Message},
+    wire::{HEADER_LEN, Header, Message},
 };
+use sinew_shm::Armed;
 
 use super::*;
 use crate::api::{
     direct::{
-        InTurn,
+        InTurn, Room,
         budget::Budget,
         early::Early,
         foreign::{CLOSING_MAX, Closing},
@@ -65,6 +66,27 @@ fn a_value_of_another_kind_does_not_overtake_one_that_waits_for_room() {
     assert_eq!(first.decode::<Setpoint>().ok(), Some(Setpoint(last)));
     let second = other.receive(WATCHDOG).unwrap().expect("a value");
     assert_eq!(second.decode::<Mode>().ok(), Some(Mode(1)));
+}
+
+#[test]
+fn who_waits_for_room_for_a_short_command_does_not_wait_for_that_of_a_long_value() {
+    // given: a long value that waits, and room for a short message
+    let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
+    let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+    link(&mut one, &mut other);
+    while !one.direct.open[0].owes() {
+        one.send(other.tid(), &Picture("long".repeat(250))).unwrap();
+    }
+    let link = one.direct.open[0].number;
+    let mut arm = |class| {
+        let room = Room { link, length: HEADER_LEN + 8, class };
+        let armed = one.direct.arm_room(room);
+        one.direct.disarm_room(room);
+        armed
+    };
+    // then
+    assert_eq!([Class::Control, Class::Bulk].map(&mut arm), [Armed::Ready; 2]);
+    assert_eq!(arm(Class::Stream), Armed::Sleep, "values keep their order");
 }
 
 #[test]
