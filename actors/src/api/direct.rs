@@ -5,6 +5,7 @@
 mod budget;
 mod descriptors;
 mod early;
+mod errand;
 mod foreign;
 mod meeting;
 mod room;
@@ -47,6 +48,8 @@ use crate::{
 use budget::{Budget, PROCESS, Share};
 use early::Early;
 pub(super) use early::InTurn;
+use errand::Errand;
+pub(super) use errand::{Fate, GONE_WITHIN};
 use foreign::{CLOSING, Closing, Half, LinkEnd};
 pub(super) use room::Room;
 use standing::{Alone, Pair, Put};
@@ -106,6 +109,8 @@ pub(super) struct Direct {
     writing: Option<LinkNumber>,
     /// What was half written there when the link ended.
     cut: Option<Message>,
+    /// The confirmed message whose answer is waited for, if it went on a link.
+    errand: Option<Errand>,
     /// Values of a Stream that were lost with a link, and that the endpoint has not counted yet, for whom they were.
     unsent: BTreeMap<Tid, u64>,
 }
@@ -182,6 +187,7 @@ impl Direct {
             flush_at: Time::ZERO,
             writing: None,
             cut: None,
+            errand: None,
             unsent: BTreeMap::new(),
         }
     }

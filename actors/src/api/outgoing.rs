@@ -11,7 +11,7 @@ use sinew_runtime::{
 
 use super::{
     ApiError, Endpoint, Received,
-    direct::{Room, Sent, ToNode, Writing},
+    direct::{Fate, GONE_WITHIN, Room, Sent, ToNode, Writing},
     form::Form,
     inbox::{Answer, Awaited},
     incoming::{Wanted, WhenFull},
@@ -86,18 +86,40 @@ impl Endpoint {
         message.header.correlation = self.correlation;
         message.header.flags = message.header.flags.with(flags);
         let (number, asked) = (self.correlation, message.header.destination);
-        let mut now = Time::now();
+        let now = Time::now();
         let deadline = now + within;
         // Who waits so long for the answer waits no longer for room.
         let way = self.dispatch(message, self.patience().and_in_all(within)).await?;
         let wanted = Wanted { number, what: awaited, of: self.absolute(asked) };
+        let answer = self.await_answer(wanted, way, deadline, now).await;
+        self.direct.awaits(None);
+        answer
+    }
+
+    /// Waits for the answer to what went this `way`; `None` at the deadline.
+    async fn await_answer(
+        &mut self,
+        wanted: Wanted,
+        way: Option<LinkNumber>,
+        mut deadline: Time,
+        mut now: Time,
+    ) -> Result<Option<Answer>, ApiError> {
+        // The link has ended, and what is not said by the deadline nobody knows.
+        let mut has_ended = false;
         loop {
             if let Some(answer) = self.take_in(Some(wanted), WhenFull::Refuse, now)? {
                 return Ok(Some(answer));
             }
-            // spec: LNCL-7. The link has ended with the message in the peer's hand.
-            if way.is_some_and(|link| !self.direct.has(link)) {
-                return Ok(Some(Answer::Outcome(Outcome::Failed)));
+            match way.map_or(Fate::Open, |link| self.direct.fate(link)) {
+                Fate::Open => {}
+                Fate::Known(outcome) => return Ok(Some(Answer::Outcome(outcome))),
+                Fate::Unsaid if self.ended.is_some() || (has_ended && now >= deadline) => {
+                    return Ok(Some(Answer::Outcome(Outcome::Unknown)));
+                }
+                Fate::Unsaid if !has_ended => {
+                    (has_ended, deadline) = (true, deadline.min(now + GONE_WITHIN));
+                }
+                Fate::Unsaid => {}
             }
             if way.is_none() && self.ended.is_some() {
                 // Nobody can say any more.
@@ -158,8 +180,13 @@ impl Endpoint {
         let destination = self.absolute(draft.header.destination);
         if let Some(link) = self.way(destination, now) {
             draft.header.destination = destination;
+            let is_awaited = draft.header.flags.has(Flags::CONFIRM);
+            let errand = if is_awaited { self.direct.errand(link) } else { None };
             match self.send_on(link, draft, limit, now).await? {
-                None => return Ok(Some(link)),
+                None => {
+                    self.direct.awaits(errand);
+                    return Ok(Some(link));
+                }
                 Some(back) => draft = back,
             }
         }

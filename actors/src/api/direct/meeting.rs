@@ -187,6 +187,7 @@ impl Direct {
     fn gone(&mut self, message: &Message) {
         let Ok(Gone { peer, number }) = payload::read(&message.payload) else { return };
         let (peer, number) = (Tid::from_bits(peer), LinkNumber(number));
+        self.is_dead(peer, number);
         if self.routes.link(peer) != Some(number) {
             return;
         }

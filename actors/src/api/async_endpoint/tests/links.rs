@@ -251,6 +251,6 @@ fn the_end_of_a_peer_on_a_link_ends_what_was_asked_of_it_and_the_rest_goes_throu
             drop(other);
         };
         let (outcomes, ()) = tokio::join!(asking, dying);
-        assert_eq!(outcomes, (Outcome::Failed, Outcome::Rejected(Rejection::NoSuchApplication)));
+        assert_eq!(outcomes, (Outcome::Unknown, Outcome::Rejected(Rejection::NoSuchApplication)));
     });
 }

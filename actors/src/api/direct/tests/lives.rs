@@ -1,11 +1,12 @@
 //! What is received when a peer, its former life or the node has gone, and what outcomes say then.
 
 use sinew_runtime::{
-    tid::AppAddress,
+    tid::{AppAddress, Tid},
     wire::{Flags, Message},
 };
 
 use super::*;
+use crate::lncl::payload::{self, Gone};
 
 #[test]
 fn what_a_peer_said_before_it_went_is_received_and_then_it_has_gone() {
@@ -86,7 +87,7 @@ fn what_was_taken_out_of_a_ring_and_found_no_room_is_received_after_its_senders_
 }
 
 #[test]
-fn a_message_in_the_hand_of_a_peer_that_goes_has_failed() {
+fn a_message_in_the_hand_of_a_peer_that_goes_is_unknown_while_its_process_lives() {
     let node = TestNode::start();
     let (mut one, mut other) = (endpoint(&node), endpoint(&node));
     link(&mut one, &mut other);
@@ -94,8 +95,44 @@ fn a_message_in_the_hand_of_a_peer_that_goes_has_failed() {
     let sending = thread::spawn(move || one.send_confirmed(to, &Counted(1), WATCHDOG).unwrap());
     let in_hand = other.receive(WATCHDOG).unwrap().expect("a message");
     drop(other);
-    assert_eq!(sending.join().unwrap(), Outcome::Failed);
+    assert_eq!(sending.join().unwrap(), Outcome::Unknown, "who has it may handle it yet");
     drop(in_hand);
+}
+
+/// What the node says to `one` when the process of its only peer has ended.
+fn say_gone(node: &TestNode, one: &Gone, to: Tid) {
+    let lncl = payload::lncl_of(node.address());
+    node.stores.router.send(payload::frame(Kind::LNCL_GONE, lncl, to, one)).unwrap();
+}
+
+#[test]
+fn of_a_peer_whose_process_has_ended_what_it_had_taken_has_failed_and_what_it_had_not_was_not_handled() {
+    for is_taken in [true, false] {
+        // given
+        let node = TestNode::start();
+        let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+        link(&mut one, &mut other);
+        let (from, to) = (one.tid(), other.tid());
+        let gone = Gone { peer: to.bits(), number: one.direct.open[0].number.0 };
+        let taken = one.direct.open[0].taken();
+        let sending = thread::spawn(move || {
+            let told = one.send_confirmed(to, &Counted(1), WATCHDOG).unwrap();
+            (told, one)
+        });
+        let in_hand = is_taken.then(|| other.receive(WATCHDOG).unwrap().expect("a message"));
+        let deadline = Time::now() + WATCHDOG;
+        while !other.direct.open[0].has_something() && !is_taken {
+            assert!(Time::now() < deadline, "waited for the message to be in the ring; {taken} were taken");
+            thread::yield_now();
+        }
+        // when
+        say_gone(&node, &gone, from);
+        // then
+        let (told, _one) = sending.join().unwrap();
+        let expected = if is_taken { Outcome::Failed } else { Outcome::Rejected(Rejection::Closed) };
+        assert_eq!(told, expected);
+        drop(in_hand);
+    }
 }
 
 /// A message of a former life may be handled after one of this life. Both have the same source, destination and way.

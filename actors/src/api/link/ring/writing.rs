@@ -72,6 +72,19 @@ impl Writer {
         producer.as_deref_mut().map_or(0, taken)
     }
 
+    /// How much was ever written; `None` while the ring is lent.
+    pub(in crate::api) fn published(&self) -> Option<u32> {
+        let producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
+        producer.as_deref().map(Producer::published)
+    }
+
+    /// How much of that the peer has taken; `None` where that is not known: while the ring is lent, or its memory says what cannot be.
+    pub(in crate::api) fn taken_so_far(&self) -> Option<u32> {
+        let mut producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
+        let producer = producer.as_deref_mut()?;
+        Some(producer.published().wrapping_sub(producer.untaken().ok()?))
+    }
+
     /// Waits until there is room for the beginning of a frame of so many bytes, the peer's end, or `within` this time.
     pub(in crate::api) fn await_room(&self, length: usize, within: Duration) {
         let mut producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
