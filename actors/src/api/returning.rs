@@ -227,17 +227,21 @@ impl Endpoint {
         if let Form::Reactor(reactor) = &mut self.form
             && let Err(why) = reactor.change(&self.reader, &self.writer)
         {
-            self.writer.close();
-            return self.end(Ended { why: why.to_string(), again: true });
+            return self.turn_back(why.to_string());
         }
         for group in &self.home.groups {
             let membership = Group { group: *group, member: true };
             let message: Message = payload::frame(Kind::LNCL_GROUP, self.tid, LNCL, &membership);
             if let Err(why) = self.writer.write(&message) {
-                // Half a return is none.
-                self.writer.close();
-                return self.end(Ended { why: why.to_string(), again: true });
+                return self.turn_back(why.to_string());
             }
         }
+    }
+
+    /// Half a return is none. What has come meanwhile is not taken: to the node who hangs up has not handled it.
+    fn turn_back(&mut self, why: String) {
+        self.writer.close();
+        self.reader.turn_away();
+        self.end(Ended { why, again: true });
     }
 }

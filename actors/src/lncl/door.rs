@@ -87,12 +87,13 @@ impl Door {
     pub(super) fn hang_up(&self) {
         let connections = std::mem::take(&mut *lock(&self.connections));
         for Connection { stream, outlet } in connections.into_values() {
-            if let Some(stream) = stream.upgrade() {
-                shut(&*stream);
-            }
-            // spec: LNCL-7. A peer that sleeps at a ring is woken by its end, and takes what lies in it.
+            // spec: LNCL-7. A peer that sleeps at a ring is woken by its end, and takes what lies in it. Before its socket hangs up: a life that
+            // comes back just now would take that for the peer's end.
             if let Some(outlet) = outlet.upgrade() {
                 outlet.end(Left::Somebody);
+            }
+            if let Some(stream) = stream.upgrade() {
+                shut(&*stream);
             }
         }
     }

@@ -321,6 +321,14 @@ impl Reader {
         }
     }
 
+    /// Takes nothing any more, of what is there already neither.
+    pub(super) fn turn_away(&mut self) {
+        match self {
+            Self::Socket(reader) => reader.turn_away(),
+            Self::Ring(reader) => reader.turn_away(),
+        }
+    }
+
     /// Reads what is there, without waiting.
     pub(super) fn read(&mut self, now: Time) -> Read {
         match self {

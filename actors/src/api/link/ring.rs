@@ -277,6 +277,8 @@ pub(in crate::api) struct Reader {
     look_at: Time,
     /// Why nothing will come any more, once what is there was taken.
     ended: Option<Ended>,
+    /// What is there is not taken either.
+    is_turned_away: bool,
 }
 
 /// What is waited for.
@@ -306,7 +308,14 @@ impl Ends for End {
 impl Reader {
     pub(super) fn new(socket: Arc<UnixStream>, consumer: Consumer, payload_max: usize, spin: Spin) -> Self {
         let (end, frames) = (End { socket, consumer }, RingFrames::new(payload_max));
-        Self { end, frames, waiter: Waiter::new(spin), look_at: Time::ZERO, ended: None }
+        Self {
+            end,
+            frames,
+            waiter: Waiter::new(spin),
+            look_at: Time::ZERO,
+            ended: None,
+            is_turned_away: false,
+        }
     }
 
     /// The next frame of those that were taken.
@@ -314,8 +323,17 @@ impl Reader {
         Ok(self.frames.next()?)
     }
 
+    /// Takes nothing any more.
+    pub(super) fn turn_away(&mut self) {
+        self.is_turned_away = true;
+        self.ended = Some(Ended::silently());
+    }
+
     /// Takes what is there, without waiting.
     pub(super) fn read(&mut self, now: Time) -> Read {
+        if let (true, Some(why)) = (self.is_turned_away, &self.ended) {
+            return Read::Ended(why.clone());
+        }
         match self.frames.take(&mut self.end.consumer, ENOUGH) {
             Err(corrupt) => {
                 Read::Ended(Ended::for_good(format!("shared memory holds what it cannot: {corrupt}")))

@@ -206,12 +206,20 @@ pub(in crate::api) struct Reader {
     codec: FrameCodec,
     buffer: BytesMut,
     chunk: Box<[u8]>,
+    /// Nothing is taken any more.
+    is_turned_away: bool,
 }
 
 impl Reader {
     pub(in crate::api) fn new(socket: Arc<UnixStream>, payload_max: usize) -> Self {
         let chunk = vec![0; READ_CHUNK].into();
-        Self { socket, codec: FrameCodec::new(payload_max), buffer: BytesMut::new(), chunk }
+        Self {
+            socket,
+            codec: FrameCodec::new(payload_max),
+            buffer: BytesMut::new(),
+            chunk,
+            is_turned_away: false,
+        }
     }
 
     /// The next frame of those that were read.
@@ -219,8 +227,17 @@ impl Reader {
         Ok(self.codec.decode(&mut self.buffer)?)
     }
 
+    /// Takes nothing any more.
+    pub(in crate::api) fn turn_away(&mut self) {
+        self.is_turned_away = true;
+        self.buffer.clear();
+    }
+
     /// Reads what is there, without waiting.
     pub(in crate::api) fn read(&mut self) -> Read {
+        if self.is_turned_away {
+            return Read::Ended(Ended::silently());
+        }
         let room = FrameCodec::room(&self.buffer, self.chunk.len());
         loop {
             match recv(&self.socket, &mut self.chunk[..room], RecvFlags::DONTWAIT) {

@@ -33,7 +33,7 @@ pub(super) const LAST_WORDS: Duration = Duration::from_millis(100);
 pub(super) enum End {
     /// It gave its address back.
     Unregistered,
-    /// The process closed its socket, or ended.
+    /// The process closed its socket, or ended; or, with a cause that says something else, this node could not read or write there.
     HungUp(Option<io::Error>),
     /// It was refused.
     Refused(String),
@@ -57,8 +57,10 @@ impl End {
     }
 
     /// Whether the client takes what lies in its memory yet.
-    const fn left(&self) -> Left {
+    fn left(&self) -> Left {
         match self {
+            Self::HungUp(Some(cause)) if !has_gone(cause) => Left::Somebody,
+            // Who closes its connection takes nothing more from it.
             Self::Unregistered | Self::HungUp(_) => Left::Nobody,
             Self::Refused(_) | Self::Late(_) => Left::Somebody,
         }
@@ -223,5 +225,20 @@ mod tests {
             assert!(matches!(ended(errno), End::Late(_)), "{errno}");
         }
         assert!(matches!(End::from(ExchangeError::Refused(RefusedOffer::Kind)), End::Refused(_)));
+    }
+
+    // spec: LNCL-7
+    #[test]
+    fn who_lives_when_this_node_is_short_of_something_takes_what_lies_in_its_memory_yet() {
+        for (errno, left) in [
+            (Errno::PIPE, Left::Nobody),
+            (Errno::CONNRESET, Left::Nobody),
+            (Errno::NOMEM, Left::Somebody),
+            (Errno::NOBUFS, Left::Somebody),
+        ] {
+            let read = End::from(FrameError::Io(errno.into()));
+            let written = End::of_write(errno.into());
+            assert_eq!([read.left(), written.left()], [left; 2], "{errno}");
+        }
     }
 }
