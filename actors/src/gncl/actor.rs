@@ -274,7 +274,11 @@ impl Gncl {
     }
 
     fn tell(&mut self, fact: LinkFact, ctx: &mut Context<Self>) {
-        if let Some(suppressed) = self.stores.log_quotas.links.take(Time::now()) {
+        let (LinkFact::LinkUp { node, .. }
+        | LinkFact::LinkBroken { node, .. }
+        | LinkFact::DialRefused { node, .. }
+        | LinkFact::PeerLeft { node, .. }) = &fact;
+        if let Some(suppressed) = self.stores.log_quotas.links.take(node, Time::now()) {
             crate::log::info!(?fact, suppressed, "link");
         }
         self.stores.gncl.notes.fact(Time::now(), &fact);

@@ -203,7 +203,7 @@ impl Client {
         let notices = Rc::new(Notices::new(tid, outlet.clone(), server.stores.config.payload_max));
         server.add_client(peer.id, outlet.clone(), notices.clone());
         server.stores.book.add_client(peer.id, app, &name, outlet.clone());
-        if let Some(suppressed) = server.stores.log_quotas.clients.take(Time::now()) {
+        if let Some(suppressed) = server.stores.log_quotas.clients.take(&name, Time::now()) {
             crate::log::info!(%tid, name, pid = peer.pid, suppressed, "an application of another process has registered");
         }
         let (link, events, has_been_told) = (None, events.into(), false);

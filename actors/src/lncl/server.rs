@@ -137,6 +137,7 @@ impl Server {
     /// what nobody has taken of theirs.
     pub(super) fn tick(&self, now: Time) {
         self.introductions.give_up(now);
+        self.stores.log_quotas.tick(now);
         for Served { outlet, notices } in self.clients.borrow().values() {
             outlet.expire(now);
             notices.tell(now);

@@ -44,7 +44,8 @@ impl Gncl {
         }
         ctx.run_interval(MINDED, |gncl, _| {
             let secured = gncl.stores.secured.get();
-            if let Some(warning) = secured.and_then(|secured| secured.reminder(UnixTime::now(), Time::now())) {
+            if let Some(warning) = secured.and_then(|secured| secured.reminder(UnixTime::now(), Time::now()))
+            {
                 crate::log::warn!("{warning}");
             }
         });
@@ -52,8 +53,9 @@ impl Gncl {
 
     /// The connection is there, and `peer` at its other end, where that is asked.
     pub(super) fn proven(&mut self, connection: ConnectionId, transport: Transport, peer: Option<&Peer>) {
-        if let Some(warning) = peer.and_then(Peer::warning)
-            && let Some(suppressed) = self.stores.log_quotas.times.take(Time::now())
+        if let Some(peer) = peer
+            && let Some(warning) = peer.warning()
+            && let Some(suppressed) = self.stores.log_quotas.times.take(&peer.identity.address, Time::now())
         {
             crate::log::warn!(suppressed, "{warning}");
         }

@@ -39,7 +39,8 @@ impl Shell {
         if let MembershipFact::NodeLost { node, incarnation, .. } = *fact {
             self.stores.untold.is_fenced(node, incarnation);
         }
-        if let Some(suppressed) = self.stores.log_quotas.members.take(Time::now()) {
+        let (MembershipFact::NodeFound { node, .. } | MembershipFact::NodeLost { node, .. }) = fact;
+        if let Some(suppressed) = self.stores.log_quotas.members.take(node, Time::now()) {
             crate::log::info!(?fact, suppressed, "membership");
         }
         self.tell();
