@@ -66,6 +66,8 @@ pub(crate) struct Stores {
     pub(crate) untold: ndl::Untold,
     /// The same of links.
     pub(crate) untold_of_links: gncl::Untold,
+    /// The same of this node's applications.
+    pub(crate) untold_of_apps: lncl::Untold,
     /// Where other processes come in.
     pub(crate) door: lncl::Door,
     /// Who is registered on this node.
@@ -124,6 +126,7 @@ impl Stores {
             ndl: Mutex::new(ndl::new_core(&config, node, incarnation)),
             untold: ndl::Untold::new(config.ndl.nodes_max),
             untold_of_links: gncl::Untold::new(config.ndl.nodes_max),
+            untold_of_apps: lncl::Untold::new(),
             door: lncl::Door::default(),
             registry: Mutex::new(lncl::Registry::counting_links_from(RandomState::new().hash_one(()))),
             directory_changes: watch::Sender::default(),
@@ -160,7 +163,7 @@ impl Stores {
         !self.groups_told.swap(true, Ordering::AcqRel)
     }
 
-    /// The sync manager is about to look at the groups, or could not be told: the next change is to be told.
+    /// The sync manager is about to look at the groups: the next change is to be told.
     pub(crate) fn groups_are_looked_at(&self) {
         // Not a store: what was changed before a word that was saved must be seen by whoever looks now.
         self.groups_told.swap(false, Ordering::AcqRel);

@@ -46,6 +46,7 @@ pub(crate) mod testing;
 #[cfg(test)]
 mod tests;
 mod untaken;
+mod untold;
 mod worker;
 
 pub(crate) use actor::Lncl;
@@ -58,6 +59,7 @@ pub(crate) use reader::Reader;
 pub(crate) use registrar::{
     LocalApp, app_down, app_ready, app_stopped, register_local, resolve, set_member, unregister_local,
 };
+pub(crate) use untold::Untold;
 
 use sinew_runtime::tid::AppAddress;
 

@@ -8,6 +8,7 @@ use sinew_runtime::{
     monitor::DownClass,
     router::{LocalRoute, Outlet},
     tid::{AppAddress, Tid},
+    time::Time,
     wire::{Kind, Payload},
 };
 
@@ -17,9 +18,8 @@ use super::{
 };
 use crate::{
     monitors::{self, Cause},
-    ndl::{self, NodeEvent},
+    ndl::NodeEvent,
     stores::{POST_CAPACITY, Stores, lock},
-    sync,
 };
 
 /// Why an application of another process is gone when LNCL is.
@@ -68,16 +68,19 @@ fn limits(stores: &Stores) -> Limits {
 
 /// The application has started and takes messages.
 pub(crate) fn app_ready(stores: &Stores, app: AppAddress) {
+    let _registry = lock(&stores.registry);
     tell(stores, AppFact::Ready { app });
 }
 
 /// The application has failed and is not started again yet; it keeps its address and its mailbox.
 pub(crate) fn app_down(stores: &Stores, app: AppAddress) {
+    let _registry = lock(&stores.registry);
     tell(stores, AppFact::Down { app });
 }
 
 /// The application was stopped or has ended in order; it keeps its address.
 pub(crate) fn app_stopped(stores: &Stores, app: AppAddress) {
+    let _registry = lock(&stores.registry);
     tell(stores, AppFact::Stopped { app });
 }
 
@@ -100,16 +103,13 @@ pub(crate) fn resolve(stores: &Stores, name: &str) -> Option<Tid> {
 
 /// Makes `app` a member of `group`, or no longer one.
 pub(crate) fn set_member(stores: &Stores, app: AppAddress, group: AppAddress, member: bool) {
-    if stores.router.set_member(group, app, member)
-        && stores.groups_are_to_be_told()
-        && !tell_sync(stores, AppFact::GroupsChanged)
-    {
-        stores.groups_are_looked_at();
+    if stores.router.set_member(group, app, member) && stores.groups_are_to_be_told() {
+        tell_sync(stores, AppFact::GroupsChanged);
     }
 }
 
-/// So many events wait for the sync manager where no further process is registered. What is told of those that are is told once, and must find
-/// room however fast somebody comes and goes.
+/// So many events wait for the sync manager where no further process is registered: however fast somebody comes and goes, what layers have to
+/// say finds room.
 const REGISTRATIONS_BELOW: usize = POST_CAPACITY / 2;
 
 /// Gives an application of another process its address. No message reaches it before [`open`].
@@ -144,7 +144,11 @@ fn tell_handled(stores: &Stores, app: AppAddress, kinds: Vec<Kind>) {
 
 /// Messages reach the application of another process from now on.
 pub(super) fn open(stores: &Stores, app: AppAddress, route: LocalRoute) {
-    let _registry = lock(&stores.registry);
+    let registry = lock(&stores.registry);
+    if registry.owner_of(app).is_none() {
+        // A later life of LNCL's actor has taken it back from this one, which hung.
+        return;
+    }
     stores.router.set_local(app, route);
     tell(stores, AppFact::Ready { app });
 }
@@ -178,43 +182,45 @@ fn forget(stores: &Stores, app: AppAddress, cause: Cause) {
 
 /// Tells the sync manager, and NDL where the application wants to know who is there.
 fn tell(stores: &Stores, fact: AppFact) {
-    let (AppFact::Ready { app }
+    if let AppFact::Ready { app }
     | AppFact::Down { app }
     | AppFact::Stopped { app }
-    | AppFact::Unregistered { app }) = fact
-    else {
-        tell_sync(stores, fact);
-        return;
-    };
-    let wants_nodes = stores.router.subscribes(app, NodeEvent::KIND);
-    if wants_nodes && stores.posts.ndl.post(ndl::Event::App(fact.clone())).is_err() {
-        crate::log::error!(?fact, "NDL's post is full and this was not told: does it hang?");
+    | AppFact::Unregistered { app } = fact
+        && stores.router.subscribes(app, NodeEvent::KIND)
+        && !stores.untold_of_apps.tell_ndl(&stores.posts, fact.clone())
+    {
+        does_not_read(stores, "NDL");
     }
     tell_sync(stores, fact);
 }
 
-/// Whether there was room for it.
-fn tell_sync(stores: &Stores, fact: AppFact) -> bool {
+fn tell_sync(stores: &Stores, fact: AppFact) {
     stores.directory_has_changed();
-    let told = stores.posts.sync.post(sync::Event::App(fact));
-    if let Err(event) = &told {
-        // Thousands of events wait for it then, so it has stood still for long.
-        crate::log::error!(?event, "the sync manager's post is full and this was not told: does it hang?");
+    if !stores.untold_of_apps.tell_sync(&stores.posts, fact) {
+        does_not_read(stores, "the sync manager");
     }
-    told.is_ok()
+}
+
+/// Thousands of events wait for this layer, so it has stood still for long.
+fn does_not_read(stores: &Stores, layer: &str) {
+    let what =
+        format_args!("{layer} does not read its events: it is told later what becomes of applications");
+    stores.refusals.count(Time::now(), "a layer's post is full", &what);
 }
 
 #[cfg(test)]
+mod standstill;
+#[cfg(test)]
 mod tests {
+    use futures_util::{FutureExt, StreamExt};
     use sinew_runtime::{
         mailbox::Mailbox,
         pending::{AppOutlet, Pending},
         tid::Incarnation,
-        time::Time,
     };
 
     use super::*;
-    use crate::NodeConfig;
+    use crate::{NodeConfig, sync};
 
     #[test]
     fn a_name_is_free_when_its_address_is_given_back_whenever_the_sync_manager_hears_of_it() {
@@ -293,14 +299,20 @@ mod tests {
     }
 
     #[test]
-    fn a_change_of_groups_that_found_no_room_is_told_with_the_next_one() {
+    fn a_change_of_groups_that_found_no_room_is_told_when_there_is_some() {
         // given: a post that is full
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
         let (app, group) = (AppAddress::new(0x1000), AppAddress::group("drives"));
         while stores.posts.sync.post(sync::Event::Monitors).is_ok() {}
-        // when
         set_member(&stores, app, group, true);
+        // when
+        let mut post = stores.posts.sync.attach();
+        let mut next = || post.next().now_or_never().flatten();
+        assert!(matches!(next(), Some(sync::Event::Monitors)));
+        assert!(stores.untold_of_apps.offer_to_sync(&stores.posts));
         // then
-        assert!(stores.groups_are_to_be_told(), "it is not taken for told");
+        let told = std::iter::from_fn(next).filter(|event| !matches!(event, sync::Event::Monitors));
+        let told: Vec<_> = told.collect();
+        assert!(matches!(told[..], [sync::Event::App(AppFact::GroupsChanged)]), "{told:?}");
     }
 }

@@ -25,5 +25,5 @@ mod tests;
 mod words;
 
 pub(crate) use core::{Core, Input};
-pub(crate) use shell::{change, drain, feed, next_wake, note, receive};
+pub(crate) use shell::{change, drain, feed, has_orders, next_wake, note, receive};
 pub(crate) use words::Cause;

@@ -100,6 +100,11 @@ fn note_undrained(stores: &Stores, input: Input) {
     }
 }
 
+/// Whether there is something to [carry out](drain).
+pub(crate) fn has_orders(stores: &Stores) -> bool {
+    lock(&stores.monitors).has_orders()
+}
+
 /// Carries out what the core orders.
 pub(crate) fn drain(stores: &Stores) {
     loop {

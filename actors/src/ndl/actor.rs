@@ -134,6 +134,7 @@ impl StreamHandler<Event> for NdlActor {
         if let Some(shell) = &self.shell {
             shell.feed(|core, now| core.handle(now, input));
         }
+        self.stores.untold_of_apps.offer_to_ndl(&self.stores.posts);
     }
 
     fn finished(&mut self, ctx: &mut Self::Context) {
@@ -341,6 +342,9 @@ async fn watch_progress(shell: Rc<Shell>) {
     let period = look_period(&shell.stores.config.ndl);
     loop {
         tokio::time::sleep(period).await;
+        // Whoever reads its post has this by itself; but where an instance of LNCL that was replaced kept something, no event need follow.
+        shell.stores.untold_of_apps.offer_to_sync(&shell.stores.posts);
+        shell.stores.untold_of_apps.offer_to_ndl(&shell.stores.posts);
         let (answer, answered) = oneshot::channel();
         if shell.stores.posts.root.post(node::RootEvent::TellProgress(answer)).is_err() {
             // The root has much to do: it is asked again.

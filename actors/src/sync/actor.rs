@@ -61,6 +61,7 @@ impl Actor for SyncManager {
         monitors::feed(&self.stores, monitors::Input::TimePassed);
         wills::feed(&self.stores, wills::Input::TimePassed);
         self.handle(Input::TimePassed, ctx);
+        self.make_up();
         if let Some(ready) = self.ready.take() {
             ready.reached();
         }
@@ -109,6 +110,7 @@ impl StreamHandler<Event> for SyncManager {
             }
             Event::Message(message) => self.receive(message, ctx),
         }
+        self.make_up();
     }
 
     /// The post has another reader: this actor was replaced.
@@ -118,6 +120,14 @@ impl StreamHandler<Event> for SyncManager {
 }
 
 impl SyncManager {
+    /// What found the post full waits for this actor to read on: there is room for it, or for some of it, now.
+    fn make_up(&self) {
+        self.stores.untold_of_apps.offer_to_sync(&self.stores.posts);
+        if monitors::has_orders(&self.stores) {
+            monitors::drain(&self.stores);
+        }
+    }
+
     fn core(&self) -> MutexGuard<'_, Core> {
         self.stores.sync.lock().unwrap_or_else(PoisonError::into_inner)
     }

@@ -12,11 +12,13 @@ use bytes::Bytes;
 use futures_util::StreamExt;
 use sinew_runtime::{
     app::RequirementEvent,
+    monitor::{Down, DownClass},
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     post::{Post, PostStream},
     router::{LocalRoute, Outlet, Refused},
     supervision::ReadyGate,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    time::Time,
     wire::{Flags, Header, Kind, Message, Payload},
 };
 
@@ -25,7 +27,7 @@ use super::{
     list::{Entry, List, Name},
     words::{ArriveAtBarrier, BarrierAnswer, BarrierKind, OnPartyLoss},
 };
-use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, node::RootEvent, stores::Stores};
+use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, monitors, node::RootEvent, stores::Stores};
 
 const HERE: NodeAddress = NodeAddress::new(0x7f00_0001);
 const KNEE: NodeAddress = NodeAddress::new(0x7f00_0002);
@@ -357,5 +359,27 @@ fn a_change_of_the_directory_is_counted_before_anybody_can_see_it() {
         }
         // Then
         assert_eq!(*looker.1.lock().unwrap_or_else(PoisonError::into_inner), [false]);
+    });
+}
+
+#[test]
+fn the_end_of_who_is_monitored_is_told_though_the_post_was_full_when_it_came() {
+    run(async {
+        // given: gait monitors a drive, and the manager's post is full of what is nothing to monitors
+        let bench = Bench::new().await;
+        let drive = AppAddress::new(0x1001);
+        let mailbox = Post::new(4);
+        let outlet = Arc::new(Mailbox(mailbox.clone()));
+        bench.stores.router.set_local(GAIT, LocalRoute { outlet, events: Arc::new([]) });
+        monitors::feed(&bench.stores, monitors::Input::Began { app: drive });
+        let set = |core: &mut monitors::Core| core.monitor(Time::now(), GAIT, Tid::new(HERE, drive));
+        monitors::change(&bench.stores, set).unwrap();
+        while bench.stores.posts.sync.post(Event::App(AppFact::Ready { app: GAIT })).is_ok() {}
+        // when: somebody who holds a lock notes that the drive has ended
+        let cause = monitors::Cause::new(DownClass::Killed, "its end");
+        monitors::note(&bench.stores, monitors::Input::Ended { app: drive, cause, is_gone: true });
+        // then
+        let down = within("the end of the drive", mailbox.attach().next()).await.unwrap();
+        assert_eq!(down.header.kind, Down::KIND);
     });
 }

@@ -37,7 +37,7 @@ mod words;
 pub(crate) use actor::SyncManager;
 pub(crate) use core::Core;
 #[cfg(test)]
-pub(crate) use core::Input;
+pub(crate) use core::{Input, Output};
 pub(crate) use facts::OwnApp;
 pub use facts::{Absence, DirectoryEntry, DirectoryEvent, Waiting};
 pub(crate) use list::{NAME_BYTES_MAX, Name, at_most};
