@@ -273,7 +273,7 @@ impl Shell {
             )),
             Output::Stalled { late } => crate::log::warn!(
                 late_ms = late.as_millis(),
-                "NDL was starved: its own timer came late, so nobody is counted as silent in this cycle"
+                "NDL was starved: its own timer came late, so of such cycles only one in four counts whoever is silent"
             ),
         }
     }

@@ -16,6 +16,8 @@ use crate::ndl::LossReason;
 
 /// Cycles between two queries to the address of a node that is gone, at most.
 const FORMER_WAIT_MAX: u32 = 16;
+/// Cycles in a row in which nobody is accused, and respites of a silence, at most: a timer that is always late puts nothing off for ever.
+pub(super) const IN_A_ROW_MAX: u32 = 3;
 /// Time between two reports that our own timer is late.
 const STALL_REPORT_PERIOD: Duration = Duration::from_secs(1);
 
@@ -24,6 +26,8 @@ const STALL_REPORT_PERIOD: Duration = Duration::from_secs(1);
 pub(super) struct Respite {
     pub(super) until: Time,
     lasts: Duration,
+    /// Counts those of one silence.
+    pub(super) in_a_row: u32,
 }
 
 impl Core {
@@ -39,7 +43,7 @@ impl Core {
         self.contests.clear();
         for (at, pace) in self.paces.iter_mut().enumerate() {
             let is_used = at == REST || self.members.values().any(|member| member.pace == at);
-            (pace.due, pace.respite) = (is_used.then_some(now), None);
+            (pace.due, pace.late_in_a_row, pace.respite) = (is_used.then_some(now), 0, None);
         }
         // spec: NDL-5.5
         if self.settles.is_none() {
@@ -62,18 +66,25 @@ impl Core {
         let Some(due) = pace.due.filter(|due| *due <= now) else { return };
         let late = now.since(due);
         // Lifeguard's rule: who was starved himself does not accuse others. The answers that came meanwhile are still
-        // in the socket. spec: NDL-4.2
-        if late > pace.period / 2 {
-            pace.due = Some(now + pace.period);
+        // in the socket. But where he always is, one cycle of four counts, or nobody would ever be lost. spec: NDL-4.2
+        let is_late = late > pace.period / 2;
+        pace.due = Some(if is_late { now } else { due } + pace.period);
+        let is_put_off = is_late && pace.late_in_a_row < IN_A_ROW_MAX;
+        pace.late_in_a_row = if is_put_off { pace.late_in_a_row + 1 } else { 0 };
+        if is_late {
             self.report_stall(now, late);
-        } else {
-            pace.due = Some(due + pace.period);
+        }
+        if !is_put_off {
             self.count_missed(now, at);
             self.drop_former_routes(now, at);
-            self.lose_the_silent(now, at, late, Duration::ZERO);
+            // A respite that lasts still, as it was renewed, ends for those who are silent now, too.
+            if self.paces[at].respite.is_none() {
+                self.lose_the_silent(now, at, late, None);
+            }
             self.tell_who_does_not_answer(at);
-            self.probe_the_suspected(at);
         }
+        // In any cycle: what their hosts and GNCL say is to be new when the next one counts.
+        self.probe_the_suspected(at);
         if at == REST {
             self.ask_everybody(now);
         } else {
@@ -97,19 +108,21 @@ impl Core {
         }
     }
 
-    /// Who missed too much is lost, unless our own timer was later than is `allowed`: then what waits in our socket is
-    /// read first. Each respite allows twice what made it, so that a timer that is always late puts nothing off for ever.
+    /// Who missed too much is lost, unless our own timer was late: then what waits in our socket is read first. A respite, the `former` one,
+    /// is renewed where its end came later than twice what made it, up to [`IN_A_ROW_MAX`] in a row.
     // spec: NDL-4.1, NDL-4.2
-    fn lose_the_silent(&mut self, now: Time, at: usize, late: Duration, allowed: Duration) {
+    fn lose_the_silent(&mut self, now: Time, at: usize, late: Duration, former: Option<Respite>) {
+        let (allowed, in_a_row) =
+            former.map_or((Duration::ZERO, 0), |former| (former.lasts * 2, former.in_a_row));
         let pace = &self.paces[at];
         let period = pace.period;
         let own = &self.own;
         let is_silent = |member: &Member| member.pace == at && member.is_silent(now, pace, own);
         let silent: Vec<NodeAddress> =
             self.members.iter().filter(|(_, member)| is_silent(member)).map(|(node, _)| *node).collect();
-        if late > allowed && !silent.is_empty() {
+        if late > allowed && in_a_row < IN_A_ROW_MAX && !silent.is_empty() {
             let lasts = late.min(period / 2);
-            self.paces[at].respite = Some(Respite { until: now + lasts, lasts });
+            self.paces[at].respite = Some(Respite { until: now + lasts, lasts, in_a_row: in_a_row + 1 });
             return;
         }
         for node in silent {
@@ -151,7 +164,7 @@ impl Core {
 
     fn end_respite(&mut self, now: Time, at: usize) {
         if let Some(respite) = self.paces[at].respite.take_if(|respite| respite.until <= now) {
-            self.lose_the_silent(now, at, now.since(respite.until), respite.lasts * 2);
+            self.lose_the_silent(now, at, now.since(respite.until), Some(respite));
         }
     }
 

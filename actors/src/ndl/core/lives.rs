@@ -12,6 +12,7 @@ use super::{
     clock::{Exchange, Measured, PeerClock},
     contact::{Contact, Role},
     contacts::ContactMut,
+    cycle::IN_A_ROW_MAX,
     recall::Loss,
     routes::Routes,
     troubles::Troubles,
@@ -48,6 +49,8 @@ impl Proof {
 pub(super) struct Contest {
     since: Time,
     pub(super) until: Time,
+    /// How often it was put off, as our own timer was late.
+    pub(super) put_off: u32,
     pub(super) newcomer: Proof,
 }
 
@@ -283,7 +286,8 @@ impl Core {
         if self.contests.contains_key(&node) {
             return;
         }
-        self.contests.insert(node, Contest { since: now, until: now + self.challenge(), newcomer });
+        let until = now + self.challenge();
+        self.contests.insert(node, Contest { since: now, until, put_off: 0, newcomer });
         self.challenge_member(now, node);
     }
 
@@ -309,8 +313,9 @@ impl Core {
     fn decide_contest(&mut self, now: Time, node: NodeAddress) {
         let challenge = self.challenge();
         let Some(contest) = self.contests.get_mut(&node) else { return };
-        // Starved ourselves, we may not have read the answer yet: ask again. spec: NDL-4.2
-        if now.since(contest.until) > challenge / 2 {
+        // Starved ourselves, we may not have read the answer yet: ask again, but not for ever. spec: NDL-4.2
+        if now.since(contest.until) > challenge / 2 && contest.put_off < IN_A_ROW_MAX {
+            contest.put_off += 1;
             contest.since = now;
             contest.until = now + challenge;
             self.challenge_member(now, node);

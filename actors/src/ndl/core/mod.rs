@@ -189,7 +189,7 @@ pub(crate) enum Output {
     AddressTaken {
         holder: Claimant,
     },
-    /// Our own timer was this late: nobody was counted as silent.
+    /// Our own timer was this late: nobody was counted as silent, unless it has been late for long.
     Stalled {
         late: Duration,
     },

@@ -22,13 +22,22 @@ pub(super) struct Pace {
     pub(super) missed_max: u32,
     /// When its members are asked next; `None` while nothing runs, and in a group while it has no members.
     pub(super) due: Option<Time>,
+    /// Cycles since the last one that counted, as our own timer was late.
+    pub(super) late_in_a_row: u32,
     pub(super) respite: Option<Respite>,
 }
 
 impl Pace {
     /// That of the rest, then those of the groups.
     pub(super) fn all_of(config: &NdlConfig) -> Vec<Self> {
-        let pace = |group, period, missed_max| Self { group, period, missed_max, due: None, respite: None };
+        let pace = |group, period, missed_max| Self {
+            group,
+            period,
+            missed_max,
+            due: None,
+            late_in_a_row: 0,
+            respite: None,
+        };
         let groups =
             config.watch.iter().map(|group| pace(Some(group.clone()), group.period, group.missed_max));
         std::iter::once(pace(None, config.period, config.missed_max)).chain(groups).collect()

@@ -37,6 +37,7 @@ fn crowd(nodes: usize) -> Plan {
             late_max: Duration::ZERO,
         },
         lateness: Duration::from_millis(2),
+        always_late: Duration::ZERO,
         clocks: vec![Clock { ahead_ns: 0, fast_ppm: 0 }; nodes],
         happenings: (0..nodes).map(start).collect(),
         end: Duration::ZERO,

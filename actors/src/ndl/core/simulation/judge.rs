@@ -3,7 +3,8 @@
 //! 1. No false loss: who is called silent did not answer `missed_max` questions in a row, each of which had half a
 //!    period, at each address where it has answered since it was found. An answer counts from when it is in the asker's socket: that it
 //!    was not read yet is the asker's own stall.
-//! 2. A loss is seen within `missed_max` plus one periods of the last sign, and the asker's own stalls.
+//! 2. A loss is seen within `missed_max` plus one periods of the last sign, and the asker's own stalls; by one whose timer is always late within
+//!    [`Plan::silence_max`].
 //! 3. A goodbye counts when it is heard, and is said to everybody who is known.
 //! 4. A life that ended never comes back after its loss or its goodbye, a former life never after a later one.
 //! 5. Found and lost alternate. Refused, left and restarted are said of lives that ended.
@@ -81,7 +82,7 @@ pub(super) struct Judge {
     missed_max: u32,
     /// The node that is watched at another pace.
     watched: Option<(NodeAddress, Duration, u32)>,
-    lateness: Duration,
+    plan: Plan,
     lives: Vec<Life>,
     /// Which of them is whose.
     numbers: BTreeMap<(NodeAddress, Incarnation), usize>,
@@ -96,7 +97,7 @@ impl Judge {
             watched: plan
                 .watched
                 .map(|(node, period, missed)| (super::world::node_address(node), period, missed)),
-            lateness: plan.lateness,
+            plan: plan.clone(),
             lives: Vec::new(),
             numbers: BTreeMap::new(),
             violations: Vec::new(),
@@ -164,7 +165,7 @@ impl Judge {
     }
 
     pub(super) fn stall_is_over(&mut self, now: Time, process: usize, lasted: Duration) {
-        if lasted > self.period * 2 + self.lateness && !self.lives[process].has_reported_a_stall {
+        if lasted > self.period * 2 + self.plan.lateness && !self.lives[process].has_reported_a_stall {
             self.violate(now, process, process, &format!("does not report its own stall of {lasted:?}"));
         }
     }
@@ -406,10 +407,8 @@ impl Judge {
             .sum();
         let shells = life.shells.iter().filter(|at| **at >= sight.read).count();
         let shells = period * u32::try_from(shells).expect("few restarts");
-        let periods = period * (missed_max + 1);
-        // Respites: each is more than twice as long as the one before, and none is longer than a timer was late.
-        let respites = self.lateness * 5;
-        let bound = periods + periods * DRIFT_PER_MILLE / 1_000 + respites + own + shells;
+        let periods = self.plan.silence_max(period, missed_max);
+        let bound = periods + periods * DRIFT_PER_MILLE / 1_000 + own + shells;
         let silent = now.since(sight.read);
         if silent > bound {
             let words = format!("was silent for {silent:?} and is lost only now; the bound is {bound:?}");

@@ -105,6 +105,8 @@ pub(super) struct Plan {
     pub(super) quality: Quality,
     /// How late a timer wakes a node that is not stalled, at most.
     pub(super) lateness: Duration,
+    /// How late each does at least.
+    pub(super) always_late: Duration,
     pub(super) clocks: Vec<Clock>,
     /// When what happens, in order of time.
     pub(super) happenings: Vec<(Duration, Happening)>,
@@ -131,6 +133,8 @@ impl Plan {
             shared: [None, Some(Host::Refuses), Some(Host::Accepts)][(seed % 3) as usize],
             quality: quality(&mut chance, period),
             lateness: chance.of(&[Duration::ZERO, period / 50, period / 4]),
+            // Of the seed alone, too.
+            always_late: always_late(seed, period),
             clocks: (0..nodes).map(|_| clock(&mut chance)).collect(),
             happenings: Vec::new(),
             end: Duration::ZERO,
@@ -149,11 +153,23 @@ impl Plan {
         // An address where nobody answered is asked every 16 periods at last.
         let found_again = if finding == Finding::Mdns { 18 } else { 3 };
         // A loss takes longer of a node that is watched more slowly.
-        let watched =
-            plan.watched.map_or(Duration::ZERO, |(_, period, missed_max)| period * (missed_max + 2));
-        let loss = watched.max(period * (missed_max + 2));
-        plan.end = heals + plan.quality.late_max + loss + period * found_again;
+        let watched = plan
+            .watched
+            .map_or(Duration::ZERO, |(_, period, missed_max)| plan.silence_max(period, missed_max) + period);
+        let loss = watched.max(plan.silence_max(period, missed_max) + period);
+        plan.end = heals + plan.quality.late_max + loss + (period + plan.always_late) * found_again;
         plan
+    }
+
+    /// How long a member that is watched so is silent before it is lost, at most: the bound, which those who are always late by more than half a
+    /// period stretch to four of their cycles for each, and their three respites.
+    pub(super) fn silence_max(&self, period: Duration, missed_max: u32) -> Duration {
+        if self.always_late <= period / 2 {
+            // Respites: each is more than twice as long as the one before, and none is longer than a timer was late.
+            return period * (missed_max + 1) + (self.lateness + self.always_late) * 5;
+        }
+        let late = self.always_late + self.lateness;
+        (period + late) * 4 * (missed_max + 1) + (period / 2 + late) * 3
     }
 
     /// Many nodes that find each other through the group, and so many faults that several happen at a time.
@@ -176,6 +192,7 @@ impl Plan {
             shared: None,
             quality,
             lateness: chance.of(&[Duration::ZERO, period / 50]),
+            always_late: Duration::ZERO,
             clocks: (0..nodes).map(|_| clock(&mut chance)).collect(),
             happenings: Vec::new(),
             end: Duration::ZERO,
@@ -350,6 +367,15 @@ fn quality(chance: &mut Chance, period: Duration) -> Quality {
         delay_max: chance.of(&[Duration::from_micros(200), period / 20, period / 3]),
         late_per_mille: chance.of(&[0, 0, 20, 200]),
         late_max: chance.of(&[period, period * 6]),
+    }
+}
+
+/// In an eighth of all plans by 0.6 or by 1.2 periods, as one that has no right to real time on a host that others have to themselves.
+fn always_late(seed: u64, period: Duration) -> Duration {
+    match seed % 16 {
+        5 => period * 6 / 10,
+        13 => period * 12 / 10,
+        _ => Duration::ZERO,
     }
 }
 

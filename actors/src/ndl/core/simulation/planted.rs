@@ -20,6 +20,8 @@ pub(super) enum Fault {
     ForgetsAnAnswer,
     /// A late timer is taken for a timely one.
     CountsItsOwnStall,
+    /// Who is always late himself accuses nobody for ever.
+    PutsOffForEver,
     /// A former life that answers replaces the present one.
     IgnoresIncarnation,
     /// A goodbye is not heard.
@@ -65,9 +67,10 @@ pub(super) enum Fault {
 }
 
 impl Fault {
-    pub(super) const ALL: [Self; 23] = [
+    pub(super) const ALL: [Self; 24] = [
         Self::ForgetsAnAnswer,
         Self::CountsItsOwnStall,
+        Self::PutsOffForEver,
         Self::IgnoresIncarnation,
         Self::DropsALeave,
         Self::SaysNoGoodbye,
@@ -179,6 +182,12 @@ impl Patient {
             && let Some(due) = self.core.next_wake().filter(|due| *due < now)
         {
             self.core.handle(due, Input::TimePassed);
+        }
+        if self.fault == Some(Fault::PutsOffForEver) {
+            for pace in &mut self.core.paces {
+                pace.late_in_a_row = 0;
+                pace.respite.iter_mut().for_each(|respite| respite.in_a_row = 0);
+            }
         }
         if self.fault == Some(Fault::JudgesByOneRoute) {
             for member in self.core.members.values_mut() {

@@ -128,6 +128,8 @@ struct Process {
     socket: VecDeque<Flying>,
     /// When it will look at its timer.
     wake: Option<Time>,
+    /// What was to be done then, by its clock.
+    wakes_for: Time,
     /// Whom mDNS need not tell it of.
     met: BTreeSet<SocketAddr>,
     /// Whom it said goodbye to.
@@ -456,12 +458,15 @@ impl World {
         let Some(due) = self.processes[process].patient.core.next_wake() else { return };
         let wait = self.until(process, due);
         let on_time = self.now + wait;
+        let late = self.plan.always_late;
         let is_set = self.processes[process].wake.is_some_and(|wake| {
-            wake >= on_time && wake <= on_time + self.plan.lateness + Duration::from_nanos(9)
+            let is_for_that = self.processes[process].wakes_for == due;
+            let latest = on_time + late + self.plan.lateness + Duration::from_nanos(9);
+            wake >= on_time && wake <= latest && (late.is_zero() || is_for_that)
         });
         if !is_set {
-            let wake = on_time + self.chance.between(Duration::ZERO, self.plan.lateness);
-            self.processes[process].wake = Some(wake);
+            let wake = on_time + late + self.chance.between(Duration::ZERO, self.plan.lateness);
+            (self.processes[process].wake, self.processes[process].wakes_for) = (Some(wake), due);
             self.push(wake, Event::Wake(process));
         }
     }

@@ -94,6 +94,26 @@ fn a_stall_that_is_long_for_the_leg_is_reported_and_costs_nobody() {
     }
 }
 
+// spec: NDL-4.2
+#[test]
+fn a_leg_that_is_gone_is_lost_though_our_own_timer_is_always_late_and_one_that_answers_is_not() {
+    for late in [0, 4, 6, 12, 25] {
+        // given: one that gets its processor late each time
+        let mut world = leg_and_console();
+        world.process(1).late = ms(late);
+        world.run(PERIOD * 10);
+        assert_eq!(losses(&world), [], "late by {late} ms");
+        // when
+        world.kill(2);
+        let took = world.run_until(PERIOD * 2, |world| !losses(world).is_empty());
+        // then: one cycle of four counts, two have to, and three respites may follow
+        let cycle = FAST + ms(late);
+        let bound = if late > 5 { cycle * 4 * 3 + (FAST / 2 + ms(late)) * 3 } else { cycle * 3 };
+        assert!(took <= bound, "late by {late} ms: lost after {took:?}");
+        assert_eq!(losses(&world)[0].0, 2);
+    }
+}
+
 #[test]
 fn a_leg_that_is_gone_is_asked_as_seldom_as_anybody_and_watched_again_when_it_is_back() {
     let mut world = leg_and_console();

@@ -109,6 +109,8 @@ pub(super) struct Process {
     further: Vec<SocketAddrV4>,
     clock_ns: i64,
     is_alive: bool,
+    /// By so much its timer is late, each time.
+    pub(super) late: Duration,
     /// Until then it gets no processor.
     stalled_until: Time,
     pub(super) facts: Vec<MembershipFact>,
@@ -183,6 +185,7 @@ impl World {
             further: spec.further.clone(),
             clock_ns: spec.clock_ns,
             is_alive: true,
+            late: Duration::ZERO,
             stalled_until: Time::ZERO,
             facts: Vec::new(),
             events: Vec::new(),
@@ -377,6 +380,6 @@ impl World {
 impl Process {
     /// When its timer wakes it, in the world's time.
     fn wake(&self) -> Option<Time> {
-        Some(self.core.next_wake()?.shifted(-self.clock_ns).max(self.stalled_until))
+        Some((self.core.next_wake()?.shifted(-self.clock_ns) + self.late).max(self.stalled_until))
     }
 }

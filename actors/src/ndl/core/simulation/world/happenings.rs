@@ -84,11 +84,11 @@ impl World {
             Some((watched, period, missed_max)) if watched == node => (period, missed_max),
             Some(_) | None => (self.plan.period, self.plan.missed_max),
         };
-        let bound = period * (missed_max + 1) + self.plan.lateness * 5;
+        let bound = self.plan.silence_max(period, missed_max);
         let was_stalled = stalled_since != Time::ZERO && stalled_until + bound > self.now;
         let changed = self.changed.get(&(here.min(node), here.max(node)));
-        let is_new =
-            changed.is_some_and(|at| *at + period * 2 + self.plan.lateness * 2 + WORD_MAX > self.now);
+        let late = self.plan.lateness + self.plan.always_late;
+        let is_new = changed.is_some_and(|at| *at + (period + late) * 2 + WORD_MAX > self.now);
         (!was_stalled && !is_new).then(|| self.host_of(process, node))
     }
 
@@ -133,7 +133,8 @@ impl World {
     ) -> bool {
         let Some(other) = self.current_of(node) else { return false };
         let Process { node: index, stalled_until, ref patient, .. } = self.processes[other];
-        let runs = stalled_until + (self.plan.period + self.plan.lateness) * 4 <= self.now;
+        let late = self.plan.lateness + self.plan.always_late;
+        let runs = stalled_until + (self.plan.period + late) * 4 <= self.now;
         let is_that_life = patient.core.announcement().incarnation == incarnation;
         self.plan.connections
             && is_that_life
@@ -183,6 +184,7 @@ impl World {
             stalled_since: Time::ZERO,
             socket: VecDeque::new(),
             wake: None,
+            wakes_for: Time::ZERO,
             met: BTreeSet::new(),
             goodbyes: BTreeSet::new(),
             troubles: Truth::default(),
