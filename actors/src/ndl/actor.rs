@@ -16,6 +16,7 @@ use std::{
     rc::Rc,
     sync::{Arc, MutexGuard, PoisonError, atomic::Ordering},
     task::Poll,
+    time::Duration,
 };
 
 use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, WrapFuture};
@@ -41,6 +42,7 @@ use super::{
     interfaces::{self, Usable},
     look_period,
     probe::{PROBES_MAX, Probe},
+    progress::{Progress, RootWatch},
 };
 use crate::{
     aftermath,
@@ -337,25 +339,61 @@ fn seeds(stores: &Stores, usable: Option<&Usable>) -> Vec<SocketAddr> {
     seeds.collect()
 }
 
-/// Asks the root, every period, what of this node does not get on. The root waits for nobody, and NDL not for the root.
+/// Asks the root, every period, what of this node does not get on. The root waits for nobody, and NDL not for the root: that it does not answer
+/// is said, and until it does it is asked nothing more.
 async fn watch_progress(shell: Rc<Shell>) {
     let period = look_period(&shell.stores.config.ndl);
+    let (mut root, mut question) = (RootWatch::new(Time::now()), None);
     loop {
-        tokio::time::sleep(period).await;
+        // A question that waits for its answer is looked at each period.
+        if question.is_none() {
+            tokio::time::sleep(period).await;
+        }
         // Whoever reads its post has this by itself; but where an instance of LNCL that was replaced kept something, no event need follow.
         shell.stores.untold_of_apps.offer_to_sync(&shell.stores.posts);
         shell.stores.untold_of_apps.offer_to_ndl(&shell.stores.posts);
-        let (answer, answered) = oneshot::channel();
-        if shell.stores.posts.root.post(node::RootEvent::TellProgress(answer)).is_err() {
-            // The root has much to do: it is asked again.
-            continue;
-        }
-        // A root that is gone, or is busy: what was known still holds.
-        let Ok(Ok(progress)) = tokio::time::timeout(period, answered).await else { continue };
-        if !shell.feed(|core, now| core.handle(now, Input::ProgressSeen(progress))) {
+        let said = ask_root(&shell.stores, &mut root, &mut question, period).await;
+        let is_current = shell.feed(|core, now| {
+            if let Some(said) = said {
+                core.handle(now, Input::ProgressSeen(said));
+            }
+        });
+        if !is_current {
             return;
         }
     }
+}
+
+/// What is to be said of this node from now on; `None`: nothing else than before. A question that is not answered is kept.
+async fn ask_root(
+    stores: &Stores,
+    root: &mut RootWatch,
+    question: &mut Option<oneshot::Receiver<Progress>>,
+    period: Duration,
+) -> Option<Progress> {
+    if stores.posts.root.is_closed() {
+        // The node ends.
+        return None;
+    }
+    root.asked(Time::now());
+    if question.is_none() {
+        let (answer, answered) = oneshot::channel();
+        // Where the root has so much to do that its post is full it is asked later.
+        *question = stores.posts.root.post(node::RootEvent::TellProgress(answer)).ok().map(|()| answered);
+    }
+    let answer = async {
+        match question {
+            Some(answered) => answered.await,
+            None => std::future::pending().await,
+        }
+    };
+    let Ok(answer) = tokio::time::timeout(period, answer).await else {
+        return root.not_answered(Time::now());
+    };
+    *question = None;
+    let said = answer.ok()?;
+    root.answered(Time::now(), said.clone());
+    Some(said)
 }
 
 /// Tries hosts, many at once.

@@ -41,6 +41,7 @@
 //! | NDL-6.1 | Answers some time apart measure how fast that clock drifts; an offset moves on with it, ever less exactly, while nobody answers. |
 //! | NDL-9 | Answers say what of the node does not get on; a change is told to applications. |
 //! | NDL-9.1 | They say, too, which clients take nothing of what waits for them; of that nobody is told, it is known. |
+//! | NDL-9.2 | Of a root that has not answered its own NDL three times in a row that is said, beside what it said last. |
 //! | NDL-7 | All memory and all work is bounded. |
 //! | NDL-7.1 | `nodes_max` members, as many candidates, as many that are gone; the oldest candidate makes room. |
 //! | NDL-7.2 | 50 datagrams/s from a stranger's address, 1,000 from all of them, 500 from each member or seed. |

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use sinew_runtime::tid::AppAddress;
+use sinew_runtime::{tid::AppAddress, time::Time};
 
 use super::Trouble;
 use crate::config::NdlConfig;
@@ -22,6 +22,46 @@ const CLIENT_NAME_MAX: usize = 24;
 /// Time between two looks of a node at what of it does not get on.
 pub(crate) fn look_period(config: &NdlConfig) -> Duration {
     config.period.max(LOOK_MIN)
+}
+
+/// Times in a row that a node's root has not answered when it was looked at, from which on that is said.
+const UNANSWERED: u32 = 3;
+/// What the root is called. It has no address: [`AppAddress::NONE`] stands for one.
+const ROOT: &str = "root";
+
+/// What the root said last of what does not get on, and whether it still says anything. It may hang itself, and what it said is old then.
+#[derive(Debug)]
+pub(crate) struct RootWatch {
+    said: Progress,
+    said_at: Time,
+    /// Since when it has been asked, and how often it had not answered when it was looked at.
+    silent: Option<(Time, u32)>,
+}
+
+impl RootWatch {
+    /// It has said nothing yet, and was not asked.
+    pub(crate) fn new(now: Time) -> Self {
+        Self { said: Progress::default(), said_at: now, silent: None }
+    }
+
+    /// It answered.
+    pub(crate) fn answered(&mut self, now: Time, said: Progress) {
+        *self = Self { said, said_at: now, silent: None };
+    }
+
+    /// It is asked, or would be if its post were not full.
+    pub(crate) fn asked(&mut self, now: Time) {
+        self.silent.get_or_insert((now, 0));
+    }
+
+    /// A period later it has not answered, or a further one. Looks count and not time: who got no processor himself has not looked. Returns what is
+    /// to be said, if it is to be said that it does not answer. // spec: NDL-9.2
+    pub(crate) fn not_answered(&mut self, now: Time) -> Option<Progress> {
+        let (since, times) = self.silent.as_mut()?;
+        *times = times.saturating_add(1);
+        let (silent, age) = (now.since(*since), now.since(self.said_at));
+        (*times >= UNANSWERED).then(|| self.said.clone().with_silent_root(silent, age))
+    }
 }
 
 /// Layers and applications that do not get on, and clients that take nothing. The latter are told apart, as anybody may start one whom the
@@ -131,6 +171,20 @@ impl Progress {
         Self { clients, ..self }
     }
 
+    /// The same, said `age` ago by a root that has not answered since it was asked, this long ago.
+    fn with_silent_root(mut self, silent: Duration, age: Duration) -> Self {
+        let millis = |time: Duration| u32::try_from(time.as_millis()).unwrap_or(u32::MAX);
+        self.parts.iter_mut().for_each(|part| part.since_ms = part.since_ms.saturating_add(millis(age)));
+        self.clients
+            .iter_mut()
+            .for_each(|client| client.since_ms = client.since_ms.saturating_add(millis(age)));
+        let (app, name, trouble) = (AppAddress::NONE, ROOT.to_owned(), Told(Trouble::Stalled));
+        self.parts.insert(0, Part { app, name, trouble, since_ms: millis(silent) });
+        self.parts.truncate(PARTS_MAX);
+        self.troubled = self.troubled.saturating_add(1);
+        self
+    }
+
     pub(crate) const fn is_nothing(&self) -> bool {
         self.troubled == 0 && self.idle == 0
     }
@@ -187,6 +241,36 @@ mod tests {
         let named: Vec<_> = progress.clients.iter().map(|client| client.app.bits()).collect();
         assert_eq!((progress.idle, &named[..]), (0x8000, &[0x1000, 0x1001][..]));
         assert!(!Progress::default().with_clients(vec![client(1)]).is_nothing());
+    }
+
+    // spec: NDL-9.2
+    #[test]
+    fn a_root_that_does_not_answer_three_times_is_told_with_what_it_said_last_as_old_as_that_is() {
+        let at = |ms: u64| Time::from_nanos((1_000 + ms) * 1_000_000);
+        let mut root = RootWatch::new(at(0));
+        let said = Progress::of((5..9).map(part).collect()).with_clients(vec![client(1)]);
+        root.asked(at(0));
+        root.answered(at(1), said);
+        // when: it hangs, or its post is full
+        root.asked(at(100));
+        assert_eq!(root.not_answered(at(200)), None);
+        root.asked(at(200));
+        assert_eq!(root.not_answered(at(300)), None);
+        let told = root.not_answered(at(401)).unwrap();
+        // then
+        assert!(told.is_fit() && !told.is_whole());
+        let named: Vec<_> = told.parts.iter().map(|part| (part.app.bits(), part.since_ms)).collect();
+        assert_eq!((told.troubled, &named[..]), (5, &[(0, 301), (5, 700), (6, 700), (7, 700)][..]));
+        assert_eq!((told.parts[0].name.as_str(), told.parts[0].trouble), (ROOT, Told(Trouble::Stalled)));
+        assert_eq!(told.clients[0].since_ms, 1_700);
+        // and when it answers again it has three times again
+        root.answered(at(500), Progress::default());
+        root.asked(at(600));
+        assert_eq!((root.not_answered(at(700)), root.not_answered(at(800))), (None, None));
+        // One that did not look for long has not looked twice.
+        root.answered(at(900), Progress::default());
+        root.asked(at(1_000));
+        assert_eq!(root.not_answered(at(99_000)), None);
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 mod mdns;
 mod remembered;
+mod root;
 
 use std::{
     net::{Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket},
@@ -24,11 +25,14 @@ use sinew_runtime::{
     wire::{Message, Payload},
 };
 
-use super::{Event, LossReason, MembershipFact, NdlActor, NodeEvent, Source, actor::lock, core::Input};
+use super::{
+    Event, LossReason, MembershipFact, NdlActor, NodeEvent, Progress, Source, actor::lock, core::Input,
+};
 use crate::{
     config::{NdlConfig, NodeConfig},
     gncl::{self, LinkFact},
     lncl,
+    node::RootEvent,
     stores::Stores,
     sync,
 };
@@ -72,6 +76,16 @@ struct Node {
     layer: Option<Arbiter>,
     facts: PostStream<gncl::Event>,
     events: PostStream<Message>,
+    /// One that says that all gets on; else it hangs.
+    has_root: bool,
+}
+
+async fn all_gets_on(mut root: PostStream<RootEvent>) {
+    while let Some(event) = root.next().await {
+        if let RootEvent::TellProgress(answer) = event {
+            drop(answer.send(Progress::default()));
+        }
+    }
 }
 
 impl Node {
@@ -102,7 +116,7 @@ impl Node {
         let route = LocalRoute { outlet: Arc::new(Inbox(inbox)), events: Arc::new([NodeEvent::KIND]) };
         stores.router.set_local(AppAddress::new(0x1000), route);
         lncl::app_ready(&stores, AppAddress::new(0x1000));
-        Self { stores, layer: None, facts, events }
+        Self { stores, layer: None, facts, events, has_root: true }
     }
 
     async fn start_layer(&mut self) {
@@ -110,6 +124,9 @@ impl Node {
         let gate = ReadyGate::new(move || say.send(()).expect("the test waits"));
         let (stores, layer) = (self.stores.clone(), Arbiter::new());
         layer.spawn_fn(move || drop(NdlActor::new(stores, gate).start()));
+        if self.has_root {
+            layer.spawn(all_gets_on(self.stores.posts.root.attach()));
+        }
         within("NDL to be ready", ready).await.expect("NDL says that it is ready");
         self.layer = Some(layer);
     }
