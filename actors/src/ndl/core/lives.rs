@@ -227,6 +227,8 @@ impl Core {
         let mut sought = gone.map_or_else(Vec::new, |gone| self.settle_gone(&gone, from, &announcement));
         self.contact_at(now, from).role = Role::Member(node);
         let pace = self.pace_for(now, &name);
+        // GNCL may have linked it when nobody here knew it.
+        let link_until = if self.proven.stands(node, incarnation) { Time::MAX } else { Time::ZERO };
         let mut member = Member {
             announcement,
             met: from.there,
@@ -242,7 +244,7 @@ impl Core {
             is_awaited: false,
             clock: PeerClock::default(),
             is_link_broken: false,
-            link_until: Time::ZERO,
+            link_until,
             since: now,
             fence,
         };

@@ -22,22 +22,24 @@ use crate::{
 /// For so long after the loss of a life no earlier one takes its place.
 const EARLIER_LIFE_BARRED: Duration = Duration::from_secs(15);
 
-/// Which lives have a connection that stands, of `nodes_max` nodes at most; none where nodes have no keys and connections prove nothing.
+/// Which lives have a connection that stands, of `nodes_max` nodes at most. GNCL may link a node before NDL knows it, so these are not members'
+/// own. What that proves is asked where nodes have keys, and nowhere else.
 #[derive(Debug)]
 pub(super) struct Proven {
     nodes_max: usize,
+    proves: bool,
     lives: BTreeMap<NodeAddress, Incarnation>,
 }
 
 impl Proven {
     pub(super) fn new(config: &NodeConfig) -> Self {
-        let nodes_max = if config.security.keys.is_some() { config.ndl.nodes_max } else { 0 };
-        Self { nodes_max, lives: BTreeMap::new() }
+        let (nodes_max, proves) = (config.ndl.nodes_max, config.security.keys.is_some());
+        Self { nodes_max, proves, lives: BTreeMap::new() }
     }
 
     /// Whether a connection proves who is at its other end.
     const fn is_asked(&self) -> bool {
-        self.nodes_max > 0
+        self.proves
     }
 
     fn note(&mut self, fact: LinkFact) {
@@ -57,7 +59,7 @@ impl Proven {
 
     /// NDL's own word ends the connection of this life.
     pub(super) fn lost(&mut self, node: NodeAddress, incarnation: Incarnation) {
-        if self.life_of(node) == Some(incarnation) {
+        if self.stands(node, incarnation) {
             self.lives.remove(&node);
         }
     }
@@ -67,13 +69,19 @@ impl Proven {
         self.lives.retain(|node, incarnation| stands(*node, *incarnation));
     }
 
+    /// Whether there is a connection with this life, whatever it proves.
+    pub(super) fn stands(&self, node: NodeAddress, incarnation: Incarnation) -> bool {
+        self.lives.get(&node) == Some(&incarnation)
+    }
+
+    /// The life that has proven itself.
     fn life_of(&self, node: NodeAddress) -> Option<Incarnation> {
-        self.lives.get(&node).copied()
+        self.lives.get(&node).copied().filter(|_| self.proves)
     }
 
     /// Whether any node holds this one for what it says that it is, now.
     pub(super) fn is_anybody(&self) -> bool {
-        !self.lives.is_empty()
+        self.proves && !self.lives.is_empty()
     }
 }
 

@@ -50,6 +50,32 @@ fn a_later_life_that_answers_in_a_members_place_ends_it_when_its_connection_is_b
     assert!(world.knows(1, 2));
 }
 
+// spec: NDL-5.2
+#[test]
+fn a_life_that_was_linked_before_it_was_known_bars_earlier_ones_when_it_is_lost() {
+    // given: GNCL accepts the node, and NDL's datagrams are lost at first
+    let mut world = World::new();
+    world.cut(1, 2);
+    world.cut(2, 1);
+    world.start(1, &with_keys(1));
+    world.start(2, &Spec { incarnation: 5, ..with_keys(2) });
+    world.run(ms(100));
+    world.link(1, up(5));
+    world.mend();
+    world.run_until(PERIOD * 2, |world| world.knows(1, 2));
+    world.kill(2);
+    world.run_until(PERIOD * 5, |world| !world.knows(1, 2));
+    world.forget_the_past();
+    // when: an earlier life answers where it was
+    world.start(2, &Spec { incarnation: 3, ..with_keys(2) });
+    world.run(ms(10_000));
+    // then: it is refused for 15 s
+    assert!(!world.knows(1, 2));
+    assert!(world.at(1).core.refusals().of("NDL answer of a former life") > 0);
+    world.run(ms(10_000));
+    assert!(world.knows(1, 2));
+}
+
 #[test]
 fn a_node_that_restarts_while_its_connection_seems_to_stand_is_found_again_after_its_loss_by_silence() {
     let mut world = linked();

@@ -58,6 +58,27 @@ fn a_silent_node_with_another_address_is_there_as_long_as_its_link_stands_or_is_
 }
 
 #[test]
+fn a_link_that_was_there_before_the_node_was_known_keeps_it_too_when_it_is_silent() {
+    // given: GNCL accepts the node when all of NDL's datagrams are lost still
+    let mut world = World::new();
+    world.cut(1, 2);
+    world.cut(2, 1);
+    world.start(1, &Spec::of(1));
+    world.start(2, &Spec { further: vec![FURTHER], ..Spec::of(2) });
+    world.link(1, up());
+    world.mend();
+    world.run_until(PERIOD * 2, |world| world.knows(1, 2));
+    // when
+    world.kill(2);
+    world.run(PERIOD * 8);
+    // then
+    assert_eq!(world.losses(1), []);
+    world.link(1, broken());
+    world.run(ms(1_000) + PERIOD);
+    assert_eq!(world.losses(1), [(2, LossReason::LinkDown)]);
+}
+
+#[test]
 fn a_silent_node_with_another_address_and_no_link_is_lost_like_any_other() {
     let mut world = two();
     world.kill(2);
