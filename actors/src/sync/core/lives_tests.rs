@@ -37,3 +37,71 @@ fn the_newest_version_of_the_newest_life_wins() {
     assert_eq!(bench.breaks(KNEE), [], "news of the former life");
     assert!(bench.core.directory()[0].ready);
 }
+
+fn found(bench: &mut Bench, incarnation: Incarnation) -> Vec<Output> {
+    let found = MembershipFact::NodeFound { node: KNEE, incarnation, gncl: Vec::new() };
+    bench.hears(Input::MembershipChanged(found))
+}
+
+// spec: SYNC-3
+#[test]
+fn a_node_that_is_found_in_its_next_life_brings_nothing_of_its_former_one_back() {
+    // Given: somebody hears of the directory, the knee's drive is ready and a member of a group
+    let mut bench = Bench::new();
+    bench.registers(9, "", &[]);
+    bench.hears(Input::DirectoryWanted { app: app(9) });
+    bench.registers(0, "gait", &["drive"]);
+    bench.links(KNEE, LIFE);
+    let groups = vec![AppAddress::group("legs")];
+    bench.list(KNEE, List { groups: groups.clone(), ..list(1, &[("drive", true, &[])]) });
+    bench.ready(0);
+    bench.breaks(KNEE);
+    bench.lost(KNEE, LossReason::Crashed);
+    // When
+    let outputs = found(&mut bench, NEXT_LIFE);
+    // Then
+    assert_eq!(outputs, [], "nobody hears that it is there, and no group has a member there");
+    assert!(bench.core.called("drive").is_empty());
+    assert!(bench.core.directory().iter().all(|entry| entry.tid.node == HERE));
+    assert_eq!(
+        in_words(bench.core.missing(bench.now, app(0))),
+        [("drive".to_owned(), "its node has restarted, its directory has not come yet")]
+    );
+    bench.links(KNEE, NEXT_LIFE);
+    let next = List { incarnation: NEXT_LIFE, groups, ..list(1, &[("drive", true, &[])]) };
+    assert!(bench.list(KNEE, next).contains(&met(0, "drive")));
+    assert_eq!(bench.core.called("drive").len(), 1);
+}
+
+// spec: SYNC-13
+#[test]
+fn who_does_not_wait_for_a_lost_party_is_told_of_the_loss_also_when_its_node_is_found_in_its_next_life() {
+    // Given: a wait for somebody whose life is over
+    let mut bench = Bench::of_the_hip();
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("knee", true, &[])]));
+    bench.arrives("calibrated", 7);
+    bench.breaks(KNEE);
+    bench.lost(KNEE, LossReason::Crashed);
+    // When
+    bench.passes(Duration::from_millis(49));
+    found(&mut bench, NEXT_LIFE);
+    let outputs = bench.passes(Duration::from_millis(1));
+    // Then
+    let lost = |output: &Output| {
+        matches!(output, Output::AnswerBarrier { correlation: 7, answer: BarrierAnswer::Lost { .. }, .. })
+    };
+    assert!(outputs.iter().any(lost), "{outputs:?}");
+}
+
+#[test]
+fn a_life_that_is_lost_and_found_again_is_what_was_known_of_it() {
+    let mut bench = Bench::new();
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("drive", true, &[])]));
+    bench.breaks(KNEE);
+    bench.lost(KNEE, LossReason::LinkDown);
+    assert!(bench.core.called("drive").is_empty());
+    found(&mut bench, LIFE);
+    assert_eq!(bench.core.called("drive"), [Tid::new(KNEE, app(0))]);
+}

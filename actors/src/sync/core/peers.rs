@@ -105,6 +105,13 @@ impl Peer {
         }
     }
 
+    /// It is in this life: a list about another one says nothing about it.
+    fn expect(&mut self, incarnation: Incarnation) {
+        if self.list.as_ref().is_some_and(|list| list.incarnation != incarnation) {
+            (self.heard, self.stale) = (false, true);
+        }
+    }
+
     /// Which life of it is known, by its link or else by its list, unless another life was linked after that: it may be an earlier one, of a
     /// host whose clock began anew.
     fn life(&self) -> Option<Incarnation> {
@@ -138,9 +145,7 @@ impl Peers {
     /// Messages can flow to this life of `node`; our list goes there first. Returns whether there was room for it.
     pub(super) fn link_up(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) -> bool {
         let Some(peer) = self.at(node) else { return false };
-        if peer.list.as_ref().is_some_and(|list| list.incarnation != incarnation) {
-            (peer.heard, peer.stale) = (false, true);
-        }
+        peer.expect(incarnation);
         (peer.linked, peer.lost, peer.due) = (Some(incarnation), None, now);
         true
     }
@@ -164,11 +169,12 @@ impl Peers {
         }
     }
 
-    /// `node` is there.
+    /// `node` is there. What was known of another life of it is over, and stays so before that one is heard. spec: SYNC-3
     pub(super) fn found(&mut self, node: NodeAddress, incarnation: Incarnation) {
         if let Some(peer) = self.nodes.get_mut(&node)
             && !peer.is_former(incarnation)
         {
+            peer.expect(incarnation);
             peer.lost = None;
         }
     }

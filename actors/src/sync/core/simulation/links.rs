@@ -85,13 +85,15 @@ impl World {
         self.seen.count("losses one way", u64::from(loss == Loss::OneWay));
     }
 
-    /// To the first, the second is lost, in the life that it was linked with last, if it was.
+    /// To the first, the second is lost, in the life that it was found or linked in last, if it was.
     fn lose(&mut self, (node, peer): Ends) {
         if self.paused.contains(&node) {
             return;
         }
         self.seen.count("losses", 1);
-        let life = self.met.get(&(node, peer)).copied().unwrap_or(self.incarnations[peer]);
+        let ends = (node, peer);
+        let known = self.present.get(&ends).copied().flatten().or_else(|| self.met.get(&ends).copied());
+        let life = known.unwrap_or(self.incarnations[peer]);
         let incarnation = Incarnation(life);
         let why = if self.paused.contains(&peer) { LossReason::Hung } else { LossReason::LinkDown };
         let lost = MembershipFact::NodeLost { node: address(peer), incarnation, why };
@@ -152,6 +154,77 @@ impl World {
         }
     }
 
+    /// NDL says that a node is there, and before it that the life which it knew is over; GNCL has not dialled it yet.
+    pub(super) fn find(&mut self, ends: Ends) {
+        let (node, peer) = ends;
+        if self.paused.contains(&node) || self.paused.contains(&peer) || self.up.contains(&sorted(ends)) {
+            return;
+        }
+        self.seen.count("found without a link", 1);
+        let (address, life) = (address(peer), self.incarnations[peer]);
+        let former = self.present.get(&ends).copied().flatten().filter(|former| *former != life);
+        if let Some(former) = former {
+            let (incarnation, why) = (Incarnation(former), LossReason::Restarted);
+            let lost = MembershipFact::NodeLost { node: address, incarnation, why };
+            self.tell(node, Input::MembershipChanged(lost));
+        }
+        let found =
+            MembershipFact::NodeFound { node: address, incarnation: Incarnation(life), gncl: Vec::new() };
+        self.tell(node, Input::MembershipChanged(found));
+    }
+
+    /// Whom a node is told of, if it is told of one.
+    pub(super) fn note_presence(&mut self, node: usize, input: &Input) -> Option<usize> {
+        let number = |address: &NodeAddress| (address.bits() - self::address(0).bits()) as usize;
+        let (peer, life, is_over) = match input {
+            Input::MembershipChanged(MembershipFact::NodeFound { node, incarnation, .. })
+            | Input::LinkChanged(LinkFact::LinkUp { node, incarnation }) => {
+                (number(node), incarnation.0, false)
+            }
+            Input::MembershipChanged(MembershipFact::NodeLost { node, incarnation, .. })
+            | Input::LinkChanged(LinkFact::PeerLeft { node, incarnation }) => {
+                (number(node), incarnation.0, true)
+            }
+            Input::LinkChanged(LinkFact::LinkBroken { node, .. } | LinkFact::DialRefused { node, .. }) => {
+                return Some(number(node));
+            }
+            Input::ListReceived { from, .. } => return Some(number(from)),
+            Input::AppChanged(_)
+            | Input::GroupsChanged(_)
+            | Input::Arrived { .. }
+            | Input::Left { .. }
+            | Input::AnswerNotTaken { .. }
+            | Input::ArrivalsReceived { .. }
+            | Input::ArrivalsNotTaken { .. }
+            | Input::DirectoryWanted { .. }
+            | Input::DirectoryNotTaken { .. }
+            | Input::ReleaseNotTaken { .. }
+            | Input::EventNotTaken { .. }
+            | Input::TimePassed => return None,
+        };
+        let present = self.present.entry((node, peer)).or_default();
+        if !is_over {
+            *present = Some(life);
+        } else if *present == Some(life) {
+            *present = None;
+        }
+        Some(peer)
+    }
+
+    /// No directory names applications of a life that its node was told is over, or that another one came after.
+    pub(super) fn judge_presence(&mut self, ends: Ends) {
+        let (node, peer) = ends;
+        let (core, address) = (&self.cores[node], address(peer));
+        let is_named = core.directory().iter().any(|entry| entry.tid.node == address);
+        let listed = core.names_elsewhere(Some(address)).next().map(|said| said.life.0);
+        let present = self.present.get(&ends).copied().flatten();
+        self.violate(!is_named || listed == present, || {
+            format!(
+                "the directory of node {node} names life {listed:?} of node {peer}, which is in {present:?}"
+            )
+        });
+    }
+
     pub(super) fn part(&mut self, side: u64, loss: Loss) {
         self.seen.count("parts", 1);
         let is_there = |node: usize| side >> (node % 64) & 1 == 1;
@@ -203,6 +276,7 @@ impl World {
         self.paused.remove(&node);
         self.unheard.retain(|(at, _), _| *at != node);
         self.met.retain(|(at, _), _| *at != node);
+        self.present.retain(|(at, _), _| *at != node);
         self.newest.remove(&node);
         self.incarnations[node] = match clock {
             Clock::GoesOn => self.incarnations[node] + 1,

@@ -59,6 +59,10 @@ pub(super) enum Step {
     Restore {
         ends: Ends,
     },
+    /// The first end hears that the second one is there, before a link carries anything.
+    Find {
+        ends: Ends,
+    },
     /// Every link between two sides is cut; the side of a node is a bit of this.
     Part {
         side: u64,
@@ -190,7 +194,7 @@ struct Draw {
 impl Draw {
     fn step(&mut self) -> Step {
         let (node, slot, ends) = (self.node(), self.chance.usize(..SLOTS), self.ends());
-        match self.chance.usize(..34) {
+        match self.chance.usize(..36) {
             0..4 => Step::Register { node, slot, requires: self.requires() },
             4..10 => Step::Start { node, slot },
             10..12 => Step::Fail { node, slot },
@@ -211,6 +215,7 @@ impl Draw {
             24 => Step::Drop { ends },
             25..29 => Step::Deliver { ends, count: self.chance.usize(1..4) },
             29..32 => Step::Hear { node, count: self.chance.usize(1..4) },
+            32..34 => Step::Find { ends },
             _ => Step::Pass { millis: self.chance.u64(1..3_000) },
         }
     }

@@ -18,7 +18,7 @@ pub(super) struct Life {
 pub(super) struct Seen(BTreeMap<&'static str, u64>);
 
 impl Seen {
-    const WHAT: [&'static str; 15] = [
+    const WHAT: [&'static str; 16] = [
         "nodes",
         "lists",
         "lists lost",
@@ -30,6 +30,7 @@ impl Seen {
         "restarts",
         "clocks anew",
         "goodbyes",
+        "found without a link",
         "pauses",
         "released",
         "shared names",
@@ -61,6 +62,8 @@ pub(super) struct World {
     pub(super) earliest: Vec<u64>,
     /// Which life of the second a node's link led to last.
     pub(super) met: BTreeMap<Ends, u64>,
+    /// Which life of the second the first was told of last; none where it was told that this one is over.
+    pub(super) present: BTreeMap<Ends, Option<u64>>,
     pub(super) apps: Vec<BTreeMap<usize, Life>>,
     /// Links that carry lists, the smaller end first.
     pub(super) up: BTreeSet<Ends>,
@@ -98,6 +101,7 @@ impl World {
             incarnations: vec![FIRST_LIFE; nodes],
             earliest: vec![FIRST_LIFE; nodes],
             met: BTreeMap::new(),
+            present: BTreeMap::new(),
             apps: vec![BTreeMap::new(); nodes],
             up: BTreeSet::new(),
             unheard: BTreeMap::new(),
@@ -178,7 +182,11 @@ impl World {
     }
 
     pub(super) fn tell(&mut self, node: usize, input: Input) {
+        let peer = self.note_presence(node, &input);
         self.cores[node].handle(self.now, input);
+        if let Some(peer) = peer {
+            self.judge_presence((node, peer));
+        }
         let mut lists = 0;
         while let Some(output) = self.cores[node].poll() {
             lists += usize::from(matches!(output, Output::Publish { .. }));
@@ -197,7 +205,7 @@ impl World {
         self.fault == Some(fault) && self.struck.is_multiple_of(3)
     }
 
-    fn violate(&mut self, is_so: bool, words: impl FnOnce() -> String) {
+    pub(super) fn violate(&mut self, is_so: bool, words: impl FnOnce() -> String) {
         self.violations.extend(require(is_so, words).err());
     }
 
@@ -269,6 +277,7 @@ impl World {
             Step::Unregister { node, slot } => self.unregister(node, slot),
             Step::Cut { ends, loss } => self.cut(ends, loss),
             Step::Restore { ends } => self.restore(ends),
+            Step::Find { ends } => self.find(ends),
             Step::Part { side, loss } => self.part(side, loss),
             Step::Join { node } => self.join(node),
             Step::Restart { node, clock } => self.restart(node, clock),
