@@ -30,7 +30,10 @@ pub struct Post<E> {
 
 #[derive(Debug)]
 struct Shared<E> {
-    queue: VecDeque<E>,
+    /// Each with its number.
+    queue: VecDeque<(u64, E)>,
+    /// How many it has taken.
+    taken: u64,
     capacity: usize,
     /// Nobody will read it any more.
     is_closed: bool,
@@ -38,7 +41,7 @@ struct Shared<E> {
     waker: Option<Waker>,
     refused: u64,
     /// A copy of the event that the reader handles now, where it wants that.
-    in_hand: Option<E>,
+    in_hand: Option<(u64, E)>,
     /// The first event in the queue was in the hand of a reader that failed.
     first_is_second_try: bool,
     /// The same of the event in hand.
@@ -57,6 +60,7 @@ impl<E> Post<E> {
     pub fn new(capacity: usize) -> Self {
         let shared = Shared {
             queue: VecDeque::new(),
+            taken: 0,
             capacity,
             is_closed: false,
             epoch: 0,
@@ -95,7 +99,9 @@ impl<E> Post<E> {
                 shared.refused += 1;
                 return Err(event);
             }
-            shared.queue.push_back(event);
+            shared.taken += 1;
+            let number = shared.taken;
+            shared.queue.push_back((number, event));
             shared.waker.take()
         };
         // Woken outside the lock, so that the woken thread does not run into it.
@@ -110,7 +116,7 @@ impl<E> Post<E> {
     pub fn close(&self) -> VecDeque<E> {
         let mut shared = lock(&self.shared);
         shared.is_closed = true;
-        std::mem::take(&mut shared.queue)
+        std::mem::take(&mut shared.queue).into_iter().map(|(_, event)| event).collect()
     }
 
     /// Whether it was [closed](Self::close).
@@ -174,7 +180,7 @@ impl<E> Shared<E> {
     fn give_back(&mut self) -> Option<E> {
         let event = self.in_hand.take()?;
         if self.in_hand_is_second_try {
-            return Some(event);
+            return Some(event.1);
         }
         self.queue.push_front(event);
         self.first_is_second_try = true;
@@ -182,11 +188,11 @@ impl<E> Shared<E> {
     }
 
     /// The next event, and what was kept of the one before it, which is handled.
-    fn take(&mut self, keep: Option<fn(&E) -> E>) -> (Option<E>, Option<E>) {
+    fn take(&mut self, keep: Option<fn(&E) -> E>) -> (Option<(u64, E)>, Option<(u64, E)>) {
         let handled = self.in_hand.take();
         let next = self.queue.pop_front();
-        if let (Some(keep), Some(event)) = (keep, &next) {
-            self.in_hand = Some(keep(event));
+        if let (Some(keep), Some((number, event))) = (keep, &next) {
+            self.in_hand = Some((*number, keep(event)));
             self.in_hand_is_second_try = std::mem::take(&mut self.first_is_second_try);
         }
         (next, handled)
@@ -203,10 +209,37 @@ pub struct PostStream<E> {
     reader: Option<Arc<Vitals>>,
 }
 
+/// The same reading end, which says of each event which of the post's it is, counted from 1: one that is read twice has the same number
+/// both times, so that its second reader can tell what of it the first one has done.
+#[derive(Debug)]
+pub struct Numbered<E>(PostStream<E>);
+
+impl<E> PostStream<E> {
+    /// Reads each event with its number.
+    #[must_use]
+    pub const fn numbered(self) -> Numbered<E> {
+        Numbered(self)
+    }
+}
+
 impl<E> Stream for PostStream<E> {
     type Item = E;
 
     fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<E>> {
+        self.poll_numbered(cx).map(|next| next.map(|(_, event)| event))
+    }
+}
+
+impl<E> Stream for Numbered<E> {
+    type Item = (u64, E);
+
+    fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<(u64, E)>> {
+        self.0.poll_numbered(cx)
+    }
+}
+
+impl<E> PostStream<E> {
+    fn poll_numbered(&self, cx: &Context<'_>) -> Poll<Option<(u64, E)>> {
         if let Some(reader) = &self.reader
             && reader.is_over()
         {
@@ -273,6 +306,14 @@ mod tests {
         assert_eq!(read(&mut third), None);
         let mut fourth = post.attach_keeping(Clone::clone);
         assert_eq!(read(&mut fourth), None, "the last event was handled: the third one came for more");
+    }
+
+    #[test]
+    fn an_event_that_is_read_twice_has_one_number() {
+        let post = Post::new(4);
+        let read = || post.attach_keeping(Clone::clone).numbered().next().now_or_never().flatten();
+        ['a', 'b'].into_iter().for_each(|event| post.post(event).unwrap());
+        assert_eq!([read(), read(), read()], [Some((1, 'a')), Some((1, 'a')), Some((2, 'b'))]);
     }
 
     #[test]

@@ -17,7 +17,7 @@ use sinew_runtime::{
 
 use super::{
     Event,
-    core::{Core, Input, Named, Output, Reason},
+    core::{Core, Input, Named, Output, Place, Reason},
     facts::DirectoryEvent,
     words::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier},
 };
@@ -36,6 +36,8 @@ pub(crate) struct SyncManager {
     stores: Arc<Stores>,
     ready: Option<ReadyGate>,
     refusals: Arc<Refusals>,
+    /// The event in hand, and how many inputs have come of it; `None`: the time has come for something.
+    in_hand: Option<Place>,
     /// The timer that is set, and for when.
     alarm: Option<(Time, SpawnHandle)>,
 }
@@ -44,7 +46,7 @@ impl SyncManager {
     /// A sync manager on the core in `stores`; it opens `ready` when messages reach it.
     pub(crate) fn new(stores: Arc<Stores>, ready: ReadyGate) -> Self {
         let refusals = stores.refusals.clone();
-        Self { stores, ready: Some(ready), refusals, alarm: None }
+        Self { stores, ready: Some(ready), refusals, in_hand: None, alarm: None }
     }
 }
 
@@ -52,10 +54,11 @@ impl Actor for SyncManager {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        ctx.add_stream(self.stores.posts.sync.attach_keeping(Event::copy));
+        ctx.add_stream(self.stores.posts.sync.attach_keeping(Event::copy).numbered());
         let outlet = Arc::new(PostOutlet(self.stores.posts.sync.clone()));
         self.stores.router.set_local(AppAddress::SYNC, LocalRoute { outlet, events: Arc::new([]) });
         // A predecessor may have failed between two of the core's orders, or before it heard of the groups.
+        self.core().replaced();
         self.stores.groups_are_looked_at();
         self.take_groups();
         monitors::feed(&self.stores, monitors::Input::TimePassed);
@@ -68,8 +71,21 @@ impl Actor for SyncManager {
     }
 }
 
-impl StreamHandler<Event> for SyncManager {
-    fn handle(&mut self, event: Event, ctx: &mut Self::Context) {
+impl StreamHandler<(u64, Event)> for SyncManager {
+    fn handle(&mut self, (number, event): (u64, Event), ctx: &mut Self::Context) {
+        self.in_hand = Some((number, 0));
+        self.take(event, ctx);
+        self.in_hand = None;
+    }
+
+    /// The post has another reader: this actor was replaced.
+    fn finished(&mut self, ctx: &mut Self::Context) {
+        ctx.stop();
+    }
+}
+
+impl SyncManager {
+    fn take(&mut self, event: Event, ctx: &mut Context<Self>) {
         match event {
             Event::App(fact) => {
                 if matches!(fact, AppFact::GroupsChanged) {
@@ -113,13 +129,6 @@ impl StreamHandler<Event> for SyncManager {
         self.make_up();
     }
 
-    /// The post has another reader: this actor was replaced.
-    fn finished(&mut self, ctx: &mut Self::Context) {
-        ctx.stop();
-    }
-}
-
-impl SyncManager {
     /// What found the post full waits for this actor to read on: there is room for it, or for some of it, now.
     fn make_up(&self) {
         self.stores.untold_of_apps.offer_to_sync(&self.stores.posts);
@@ -140,11 +149,16 @@ impl SyncManager {
     }
 
     fn handle(&mut self, input: Input, ctx: &mut Context<Self>) {
+        self.in_hand = self.in_hand.map(|(event, inputs)| (event, inputs + 1));
+        let place = self.in_hand;
         {
             let mut core = self.core();
             let (named, now) = (input.may_name(), Time::now());
             core.woken(now, self.stores.posts.sync.len());
-            core.handle(now, input);
+            match place {
+                Some(place) => core.handle_once(now, place, input),
+                None => core.handle(now, input),
+            }
             self.tell_access(&core, named);
             // Counted before anybody can see it: who is told of a name by whoever saw it first must find that it has changed.
             self.stores.directory_has_changed();

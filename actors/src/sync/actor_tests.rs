@@ -272,6 +272,66 @@ fn a_restarted_sync_manager_goes_on_where_the_former_one_ended() {
     });
 }
 
+/// Takes no message: whoever sends one fails.
+struct Mine;
+
+impl Outlet for Mine {
+    fn submit(&self, _: Message) -> Result<(), Refused> {
+        panic!("whoever answers this one fails, as this test wants it")
+    }
+}
+
+fn arrival(app: AppAddress, correlation: u64) -> Message {
+    let asked = ArriveAtBarrier {
+        kind: BarrierKind::Meeting,
+        barrier: "calibrated".to_owned(),
+        parties: vec!["gait".to_owned(), "drive".to_owned()],
+        within_ms: 60_000,
+        on_loss: OnPartyLoss::Wait,
+    };
+    let mut arrival = Message::typed(Tid::new(HERE, app), Tid::new(HERE, AppAddress::SYNC), &asked);
+    (arrival.header.flags, arrival.header.correlation) = (Flags::ASK, correlation);
+    arrival
+}
+
+// spec: SYNC-10
+#[test]
+fn an_arrival_that_the_successor_of_a_failed_manager_is_handed_again_counts_once_and_is_answered() {
+    run(async {
+        // Given: the last one arrives, and its manager fails when it gives it its answer
+        let mut bench = Bench::new().await;
+        let drive = AppAddress::new(0x1001);
+        let (of_gait, of_drive) = (Post::new(4), Post::new(4));
+        let mailbox = |post: &Post<Message>| Arc::new(Mailbox(post.clone()));
+        let no_events = || -> Arc<[Kind]> { Arc::new([]) };
+        bench.stores.router.set_local(GAIT, LocalRoute { outlet: mailbox(&of_gait), events: no_events() });
+        bench.stores.router.set_local(drive, LocalRoute { outlet: Arc::new(Mine), events: no_events() });
+        for (app, name) in [(GAIT, "gait"), (drive, "drive")] {
+            let name = Some(name.to_owned());
+            bench.tells(Event::App(AppFact::Registered { app, name, requires: Vec::new() }));
+            bench.released().await;
+        }
+        bench.stores.router.deliver(arrival(GAIT, 7)).unwrap();
+        bench.stores.router.deliver(arrival(drive, 9)).unwrap();
+        let mut inbox = of_gait.attach();
+        let answer = within("the answer of the first", inbox.next()).await.unwrap();
+        assert!(matches!(answer.decode().unwrap(), BarrierAnswer::Opened { generation: 1 }));
+        // When
+        bench.stores.router.set_local(drive, LocalRoute { outlet: mailbox(&of_drive), events: no_events() });
+        bench.start_manager().await;
+        // Then
+        let mut inbox = of_drive.attach();
+        let answer = within("the answer of the last", inbox.next()).await.unwrap();
+        assert_eq!(answer.header.correlation, 9);
+        assert!(matches!(answer.decode().unwrap(), BarrierAnswer::Opened { generation: 1 }));
+        let third = AppAddress::new(0x1002);
+        bench.tells(Event::App(AppFact::Registered { app: third, name: None, requires: Vec::new() }));
+        assert_eq!(bench.released().await, third, "all events before it were handled");
+        let core = bench.stores.sync.lock().unwrap_or_else(PoisonError::into_inner);
+        assert_eq!(core.barriers(sinew_runtime::time::Time::now()), [], "nobody waits for the next round");
+    });
+}
+
 #[derive(Default)]
 struct Ledger(Mutex<Vec<Outcome>>);
 

@@ -55,7 +55,7 @@ use super::{
 use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, ndl::MembershipFact};
 
 /// What has happened.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) enum Input {
     /// An application of this node came, became ready, failed, went.
     AppChanged(AppFact),
@@ -145,8 +145,15 @@ pub(crate) struct Core {
     retry: Option<Time>,
     respite: Respite,
     outputs: VecDeque<Output>,
+    /// The answer about a barrier that was taken last.
+    answer_in_hand: Option<Output>,
+    /// Which of the post's events was taken in last, and which input of it.
+    taken_in: Place,
     sequence: u64,
 }
+
+/// Which of the post's events, counted from 1, and which input that comes of it.
+pub(crate) type Place = (u64, u32);
 
 impl Core {
     /// Knows nobody yet. `config` is checked.
@@ -174,7 +181,18 @@ impl Core {
             retry: None,
             respite: Respite::default(),
             outputs: VecDeque::new(),
+            answer_in_hand: None,
+            taken_in: (0, 0),
             sequence: 0,
+        }
+    }
+
+    /// Takes in what has happened, unless this was done before. An event in the hand of an actor that failed is handed to its successor too,
+    /// and this core is both actors': an arrival that was counted again would open the next round in its application's absence.
+    pub(crate) fn handle_once(&mut self, now: Time, place: Place, input: Input) {
+        if place > self.taken_in {
+            self.handle(now, input);
+            self.taken_in = place;
         }
     }
 
@@ -218,7 +236,18 @@ impl Core {
 
     /// The next thing to be done; take until there is none.
     pub(crate) fn poll(&mut self) -> Option<Output> {
-        self.outputs.pop_front()
+        let output = self.outputs.pop_front();
+        let answer = output.as_ref().filter(|output| matches!(output, Output::AnswerBarrier { .. }));
+        self.answer_in_hand = answer.cloned();
+        output
+    }
+
+    /// The actor that took the last output was replaced. Whether it gave an answer about a barrier is not known, and nobody asks twice: it is
+    /// given again. Who has it counts the second one as a late reply.
+    pub(crate) fn replaced(&mut self) {
+        if let Some(answer) = self.answer_in_hand.take() {
+            self.outputs.push_front(answer);
+        }
     }
 
     /// When to come back with [`Input::TimePassed`].

@@ -75,10 +75,12 @@ enum Fault {
     OneVersionForAll,
     /// Of the lists of one turn two are sent: right among three.
     TwoListsATurn,
+    /// What the successor of an actor that failed is handed again is taken in again.
+    HandledAgain,
 }
 
 impl Fault {
-    const ALL: [Self; 10] = [
+    const ALL: [Self; 11] = [
         Self::ReadyTooEarly,
         Self::FailureNotTold,
         Self::EndNotTold,
@@ -89,6 +91,7 @@ impl Fault {
         Self::ReasonsKept,
         Self::OneVersionForAll,
         Self::TwoListsATurn,
+        Self::HandledAgain,
     ];
 }
 

@@ -65,6 +65,8 @@ enum Fault {
     YoungerBelieved,
     /// It is forgotten who was at a barrier before, so that it makes way for another one.
     VisitsForgotten,
+    /// What the successor of an actor that failed is handed again is taken in again.
+    HandledAgain,
 }
 
 /// Chance from a seed.
@@ -108,6 +110,8 @@ struct World {
     flying: BTreeMap<(usize, usize), VecDeque<(bool, Bytes)>>,
     judge: Judge,
     fault: Option<Fault>,
+    /// What cores were told, counted.
+    events: u64,
     ever: BTreeMap<usize, Arrivals>,
     trace: bool,
     /// In this seed only links break, so that nobody misses a generation.
@@ -166,6 +170,7 @@ impl World {
             flying: BTreeMap::new(),
             judge: Judge::new(seed.is_multiple_of(4)),
             fault,
+            events: 0,
             ever: BTreeMap::new(),
             trace,
             is_calm: seed.is_multiple_of(4),
@@ -212,7 +217,7 @@ impl World {
     fn tell(&mut self, node: usize, input: Input) {
         let heard = heard_generations(&input);
         let before = self.generations(node);
-        self.cores[node].handle(self.now, input);
+        self.handle(node, input);
         for (barrier, heard) in heard.into_iter().enumerate() {
             if let Some(known) = self.cores[node].rendezvous.known.get(&key(barrier)) {
                 let (generation, members) = (known.generation, known.members_of_last().collect());
@@ -224,6 +229,27 @@ impl World {
         }
         while let Some(output) = self.cores[node].poll() {
             self.carry_out(node, output);
+        }
+    }
+
+    /// In one case of eight the sync manager fails with its first order in its hand, and its successor is handed the same event.
+    fn handle(&mut self, node: usize, input: Input) {
+        self.events += 1;
+        let place = (self.events, 1);
+        let again = self.chance.once_in(8).then(|| input.clone());
+        self.cores[node].handle_once(self.now, place, input);
+        let Some(again) = again else { return };
+        self.judge.seen.handed_again += 1;
+        match self.cores[node].poll() {
+            // It is given again.
+            Some(Output::AnswerBarrier { .. }) | None => {}
+            Some(output) => self.carry_out(node, output),
+        }
+        self.cores[node].replaced();
+        if self.fault == Some(Fault::HandledAgain) {
+            self.cores[node].handle(self.now, again);
+        } else {
+            self.cores[node].handle_once(self.now, place, again);
         }
     }
 
@@ -476,11 +502,11 @@ fn a_seed_is_replayed() {
 #[test]
 fn each_planted_fault_is_found() {
     use Fault::{
-        DeparturesHidden, EarlierLeftOut, GenerationsConfused, MembersLeftOut, VisitsForgotten,
+        DeparturesHidden, EarlierLeftOut, GenerationsConfused, HandledAgain, MembersLeftOut, VisitsForgotten,
         YoungerBelieved,
     };
     let in_words = [GenerationsConfused, MembersLeftOut, EarlierLeftOut, DeparturesHidden];
-    for fault in in_words.into_iter().chain([YoungerBelieved, VisitsForgotten]) {
+    for fault in in_words.into_iter().chain([YoungerBelieved, VisitsForgotten, HandledAgain]) {
         let found = (0..SEEDS_FOR_A_FAULT).find(|number| !run(*number, Some(fault), false).0.is_empty());
         println!("{fault:?} is found by seed {found:?}");
         assert!(found.is_some(), "{fault:?} is not found");

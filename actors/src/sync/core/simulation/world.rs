@@ -18,7 +18,7 @@ pub(super) struct Life {
 pub(super) struct Seen(BTreeMap<&'static str, u64>);
 
 impl Seen {
-    const WHAT: [&'static str; 16] = [
+    const WHAT: [&'static str; 17] = [
         "nodes",
         "lists",
         "lists lost",
@@ -31,6 +31,7 @@ impl Seen {
         "clocks anew",
         "goodbyes",
         "found without a link",
+        "events handed over again",
         "pauses",
         "released",
         "shared names",
@@ -75,6 +76,8 @@ pub(super) struct World {
     /// What an application of each node knows of the directory, by what it was told and took.
     pub(super) views: Vec<BTreeMap<(String, Tid), bool>>,
     told: u64,
+    /// What cores were told, counted.
+    events: u64,
     pub(super) takes_all: bool,
     /// Applications that have run in any life.
     has_run: BTreeSet<usize>,
@@ -109,6 +112,7 @@ impl World {
             flying: BTreeMap::new(),
             views: vec![BTreeMap::new(); nodes],
             told: 0,
+            events: 0,
             takes_all: false,
             has_run: BTreeSet::new(),
             fault,
@@ -183,7 +187,7 @@ impl World {
 
     pub(super) fn tell(&mut self, node: usize, input: Input) {
         let peer = self.note_presence(node, &input);
-        self.cores[node].handle(self.now, input);
+        self.handle(node, input);
         if let Some(peer) = peer {
             self.judge_presence((node, peer));
         }
@@ -196,6 +200,25 @@ impl World {
             if !is_lost {
                 self.carry_out(node, output);
             }
+        }
+    }
+
+    /// In one case of eight the sync manager fails when it has carried out an order, and its successor is handed the same event.
+    fn handle(&mut self, node: usize, input: Input) {
+        self.events += 1;
+        let place = (self.events, 1);
+        let again = (self.chance.usize(..8) == 0).then(|| input.clone());
+        self.cores[node].handle_once(self.now, place, input);
+        let Some(again) = again else { return };
+        self.seen.count("events handed over again", 1);
+        if let Some(output) = self.cores[node].poll() {
+            self.carry_out(node, output);
+        }
+        self.cores[node].replaced();
+        if self.fault == Some(Fault::HandledAgain) {
+            self.cores[node].handle(self.now, again);
+        } else {
+            self.cores[node].handle_once(self.now, place, again);
         }
     }
 

@@ -46,6 +46,7 @@ pub(super) struct Seen {
     counted: u64,
     doubles: u64,
     pub(super) crowded_out: u64,
+    pub(super) handed_again: u64,
 }
 
 impl Seen {
@@ -62,12 +63,14 @@ impl Seen {
         self.counted += other.counted;
         self.doubles += other.doubles;
         self.crowded_out += other.crowded_out;
+        self.handed_again += other.handed_again;
     }
 
     pub(super) fn must_cover_everything(self) {
         let ends = [self.timed_out, self.lost, self.given_up, self.deaths];
-        let rest = [self.calm, self.waits_at_the_end, self.counted, self.doubles, self.crowded_out];
-        let counts = [ends.as_slice(), &rest].concat();
+        let rest = [self.calm, self.waits_at_the_end, self.counted, self.doubles];
+        let odd = [self.crowded_out, self.handed_again];
+        let counts = [ends.as_slice(), &rest, &odd].concat();
         assert!(
             counts.iter().chain(&self.opened).all(|count| *count > 10),
             "hardly anything happens: {self:?}"

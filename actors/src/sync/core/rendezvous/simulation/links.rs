@@ -70,7 +70,7 @@ impl World {
                 }
                 Fault::MembersLeftOut => barrier.members.clear(),
                 Fault::EarlierLeftOut => barrier.earlier.clear(),
-                Fault::YoungerBelieved | Fault::VisitsForgotten => {}
+                Fault::YoungerBelieved | Fault::VisitsForgotten | Fault::HandledAgain => {}
                 Fault::DeparturesHidden => {
                     let before = self.ever.get(&from).into_iter().flat_map(|said| &said.barriers);
                     let before =
