@@ -1,6 +1,7 @@
 //! Run-time barriers: several applications, on any nodes, go on together.
 
 use std::{
+    collections::VecDeque,
     future::Future,
     pin::Pin,
     task::{Context, Poll},
@@ -12,9 +13,11 @@ use sinew_runtime::{
     app::AppContext,
     sender::{AskError, Reply, SendError, Sender},
     tid::{AppAddress, Tid},
+    time::Time,
+    wire::Message,
 };
 
-use super::{ApiError, AsyncEndpoint, Endpoint};
+use super::{ApiError, AsyncEndpoint, Endpoint, form::at_once, link::Progress};
 use crate::sync::{ArriveAtBarrier, BarrierAnswer, BarrierKind, LeaveBarrier, OnPartyLoss};
 
 /// How much later than the barrier's own deadline its answer may come: the node says who is missing.
@@ -251,6 +254,44 @@ impl Drop for Meeting {
     }
 }
 
+/// Waits that were given up, of which the node is not told yet: as many as barriers at which an application waits at once.
+const LEAVES_MAX: usize = 16;
+
+/// Waits of an endpoint that were given up. The node is told as soon as there is room for it, which nobody waits for.
+#[derive(Debug, Default)]
+pub(super) struct Leaves(VecDeque<LeaveBarrier>);
+
+impl Leaves {
+    pub(super) fn are_to_be_told(&self) -> bool {
+        !self.0.is_empty()
+    }
+
+    fn add(&mut self, leave: LeaveBarrier) {
+        if self.0.len() >= LEAVES_MAX {
+            // The node lets nobody wait at more barriers than these.
+            self.0.pop_front();
+        }
+        self.0.push_back(leave);
+    }
+}
+
+/// A wait of an endpoint at a barrier. It leaves, unless its answer has come.
+struct Arrival<'endpoint> {
+    endpoint: &'endpoint mut Endpoint,
+    barrier: &'endpoint str,
+    is_answered: bool,
+}
+
+impl Drop for Arrival<'_> {
+    fn drop(&mut self) {
+        if !self.is_answered {
+            let (barrier, correlation) = (self.barrier.to_owned(), Some(self.endpoint.asked));
+            self.endpoint.leaves.add(LeaveBarrier { barrier, correlation });
+            self.endpoint.tell_leaves();
+        }
+    }
+}
+
 impl Endpoint {
     /// Arrives at the barrier and waits there. Returns the generation that opened. Messages that come meanwhile wait to be
     /// received, as with [`ask`](Self::ask).
@@ -258,21 +299,51 @@ impl Endpoint {
     /// # Errors
     /// Not all were there in time, a party was lost, or the node did not let it wait.
     pub fn meet(&mut self, barrier: &Barrier) -> Result<u64, BarrierError> {
-        let to = Tid::new(self.tid().node, AppAddress::SYNC);
-        let answer = self.ask(to, &barrier.request(), barrier.patience())?;
+        let answer = at_once(self.await_answer(barrier))?;
         barrier.judge(answer)
+    }
+
+    async fn await_answer(&mut self, barrier: &Barrier) -> Result<BarrierAnswer, ApiError> {
+        let to = Tid::new(self.tid().node, AppAddress::SYNC);
+        let request = Message::typed(self.tid(), to, &barrier.request());
+        let mut arrival = Arrival { endpoint: self, barrier: barrier.name(), is_answered: false };
+        let reply = arrival.endpoint.await_reply(request.into(), barrier.patience()).await?;
+        arrival.is_answered = true;
+        Ok(reply.decode()?)
+    }
+
+    /// Tells the node which waits were given up, as far as there is room now.
+    pub(super) fn tell_leaves(&mut self) {
+        if self.ended.is_some() {
+            // The connection has taken the waits with it.
+            self.leaves.0.clear();
+        }
+        // Nothing else goes out while memory is lent.
+        while self.lender.be_free().is_ok() && self.go_on() {
+            let Some(leave) = self.leaves.0.front() else { return };
+            let mut message = Message::typed(self.tid, Tid::new(self.tid.node, AppAddress::SYNC), leave);
+            self.sequence += 1;
+            (message.header.sequence, message.header.sent) = (self.sequence, Time::now());
+            if let Some(message) = self.writer.send_in_place(message.into()) {
+                match self.writer.begin(message) {
+                    Ok(Progress::Full(_)) => return,
+                    Ok(Progress::Part(rest)) => self.rest = rest,
+                    // An error shows itself again when the ring is read.
+                    Ok(Progress::Whole) | Err(_) => {}
+                }
+            }
+            self.leaves.0.pop_front();
+        }
     }
 }
 
 impl AsyncEndpoint {
-    /// Arrives at the barrier and waits there; see [`Endpoint::meet`]. If the future is dropped before, it still counts as
-    /// arrived, until the barrier's deadline.
+    /// Arrives at the barrier and waits there; see [`Endpoint::meet`]. If the future is dropped before, it leaves the barrier.
     ///
     /// # Errors
     /// Not all were there in time, a party was lost, or the node did not let it wait.
     pub async fn meet(&mut self, barrier: &Barrier) -> Result<u64, BarrierError> {
-        let to = Tid::new(self.tid().node, AppAddress::SYNC);
-        let answer = self.ask(to, &barrier.request(), barrier.patience()).await?;
+        let answer = self.endpoint.await_answer(barrier).await?;
         barrier.judge(answer)
     }
 }

@@ -13,6 +13,7 @@ use sinew_shm::{Bell, CommonBell};
 
 use super::{
     ApiError, Received, Registration, Transport,
+    barrier::Leaves,
     direct::{Direct, Terms},
     form::{Form, at_once},
     inbox::{Answer, Awaited, Inbox},
@@ -58,6 +59,9 @@ pub struct Endpoint {
     pub(super) rest: Option<Rest>,
     /// What the node had taken when a sender's patience with it was over.
     pub(super) stalled: Option<u32>,
+    /// The number of its last request.
+    pub(super) asked: u64,
+    pub(super) leaves: Leaves,
 }
 
 impl std::fmt::Debug for Endpoint {
@@ -105,6 +109,8 @@ impl Endpoint {
             ends: Ends::new(Time::now()),
             rest: None,
             stalled: None,
+            asked: 0,
+            leaves: Leaves::default(),
         }
     }
 
@@ -246,6 +252,9 @@ impl Endpoint {
         loop {
             // The socket first: what came just now may be more urgent or newer than what waits.
             self.take_in(None, WhenFull::Leave, now)?;
+            if self.leaves.are_to_be_told() {
+                self.tell_leaves();
+            }
             let echo_due = self.echo(now).await;
             let left = left.get_or_insert(self.inbox.len());
             if let Some(message) = self.inbox.pop(now) {

@@ -83,6 +83,7 @@ impl Endpoint {
         within: Duration,
     ) -> Result<Option<Answer>, ApiError> {
         self.correlation += 1;
+        self.asked = self.correlation;
         message.header.correlation = self.correlation;
         message.header.flags = message.header.flags.with(flags);
         let (number, asked) = (self.correlation, message.header.destination);
@@ -170,6 +171,9 @@ impl Endpoint {
         limit: Limit,
     ) -> Result<Option<LinkNumber>, ApiError> {
         self.be_ready(limit)?;
+        if self.leaves.are_to_be_told() {
+            self.tell_leaves();
+        }
         self.check_length(draft.payload.len())?;
         // A new connection may have another address.
         draft.header.source = self.tid;

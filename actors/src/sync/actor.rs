@@ -428,12 +428,17 @@ impl SyncManager {
 /// told once.
 const MESSAGES_MAX: usize = POST_CAPACITY / 2;
 
+/// The same where a message says that a wait at a barrier is given up, which nobody says again: the barrier would open with whoever has gone.
+const LEAVES_MAX: usize = POST_CAPACITY / 4 * 3;
+
 /// Puts messages for the sync manager's TID into its post.
 struct PostOutlet(Post<Event>);
 
 impl Outlet for PostOutlet {
     fn submit(&self, message: Message) -> Result<(), Refused> {
-        match self.0.post_below(MESSAGES_MAX, Event::Message(message)) {
+        let is_leave = message.header.kind == LeaveBarrier::KIND;
+        let most = if is_leave { LEAVES_MAX } else { MESSAGES_MAX };
+        match self.0.post_below(most, Event::Message(message)) {
             Err(Event::Message(message)) => Err(Refused::new(message, Rejection::QueueFull)),
             // A full post hands back what it was given: a message.
             Ok(()) | Err(Event::App(_) | Event::Membership(_) | Event::Link(_) | Event::Monitors) => Ok(()),

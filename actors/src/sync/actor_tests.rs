@@ -25,7 +25,7 @@ use sinew_runtime::{
 use super::{
     Event, SyncManager,
     list::{Entry, List, Name},
-    words::{ArriveAtBarrier, BarrierAnswer, BarrierKind, OnPartyLoss},
+    words::{ArriveAtBarrier, BarrierAnswer, BarrierKind, LeaveBarrier, OnPartyLoss},
 };
 use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, monitors, node::RootEvent, stores::Stores};
 
@@ -252,6 +252,25 @@ fn more_messages_than_it_reads_do_not_keep_out_what_layers_tell_it() {
         // when: it comes to none of them, as this has its thread
         while bench.stores.router.deliver(message()).is_ok() {}
         // then
+        bench.tells(Event::Link(LinkFact::LinkUp { node: KNEE, incarnation: LIFE }));
+    });
+}
+
+// spec: SYNC-10
+#[test]
+fn a_wait_that_is_given_up_is_taken_back_also_where_no_other_message_is_taken() {
+    run(async {
+        // Given: it comes to none of them, as this has its thread
+        let bench = Bench::new().await;
+        let message = || directory(Tid::new(KNEE, AppAddress::SYNC), Bytes::new());
+        while bench.stores.router.deliver(message()).is_ok() {}
+        // When
+        let leave = LeaveBarrier { barrier: "calibrated".to_owned(), correlation: Some(7) };
+        let leave = || Message::typed(Tid::new(HERE, GAIT), Tid::new(HERE, AppAddress::SYNC), &leave);
+        // Then
+        bench.stores.router.deliver(leave()).unwrap();
+        // And whoever leaves without end leaves room for layers
+        while bench.stores.router.deliver(leave()).is_ok() {}
         bench.tells(Event::Link(LinkFact::LinkUp { node: KNEE, incarnation: LIFE }));
     });
 }

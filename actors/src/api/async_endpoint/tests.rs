@@ -1,5 +1,6 @@
 //! What only a task can see: other tasks that run while it waits, and futures that are dropped half way.
 
+mod barriers;
 mod links;
 mod protected;
 
