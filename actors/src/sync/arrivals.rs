@@ -17,10 +17,18 @@ use super::list::{Name, at_most};
 pub(crate) const BARRIERS_MAX: usize = 256;
 /// Requirements that the parties of one barrier are, at most.
 pub(crate) const PARTIES_MAX: usize = 64;
+/// Bytes that the names of one barrier's parties have together, at most.
+pub(crate) const PARTIES_BYTES_MAX: usize = 4_096;
 /// Applications that wait at one barrier on one node, and that passed it together, at most.
 pub(crate) const ARRIVALS_MAX: usize = 1_024;
 /// Highest generation: whatever opens a million times a second gets there in 285 years.
 pub(crate) const GENERATION_MAX: u64 = 1 << 53;
+
+/// Highest generation that is believed of a barrier of which nothing was heard before: whoever said more would take the rest.
+pub(crate) const GENERATION_AT_FIRST_MAX: u64 = 1 << 52;
+/// So much higher than what was heard first may be what is heard later, besides one for each microsecond since: one that opens a thousand times
+/// a second is there in 34 years, so that a node which was away takes over what it has missed.
+pub(crate) const GENERATIONS_MISSED_MAX: u64 = 1 << 40;
 
 /// What a node says.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -161,6 +169,8 @@ impl BarrierSaid {
 pub(crate) fn fault_of_parties(parties: &[Requirement]) -> Option<&'static str> {
     if parties.is_empty() {
         Some("it has no parties; name who has to be there, or `3 of *` for any three")
+    } else if parties.iter().map(|party| party.as_str().len()).sum::<usize>() > PARTIES_BYTES_MAX {
+        Some("its parties have more than 4,096 bytes together; use patterns or counts")
     } else if parties.iter().any(|party| party.wait_max().is_some()) {
         Some("a party of a barrier has no wait limit: whoever waits has one for all")
     } else if parties.iter().any(|party| party.phase().is_some()) {
@@ -210,12 +220,16 @@ mod tests {
 
     #[test]
     fn what_no_node_can_mean_is_refused() {
-        let wrong: [fn(&mut BarrierSaid); 11] = [
+        let wrong: [fn(&mut BarrierSaid); 12] = [
             |barrier| barrier.parties.clear(),
             |barrier| barrier.parties.push("camera ?1s".parse().unwrap()),
             |barrier| barrier.parties.push(Requirement::at_least(ARRIVALS_MAX - 2, ["*"])),
             |barrier| barrier.parties.push("camera at homed".parse().unwrap()),
             |barrier| barrier.generation = u64::MAX,
+            |barrier| {
+                let party = |number| Requirement::any([format!("{number:a>63}"), format!("{number:b>63}")]);
+                barrier.parties.extend((0..32).map(party));
+            },
             |barrier| barrier.generation = 2,
             |barrier| barrier.arrivals.push(barrier.arrivals[0].clone()),
             |barrier| barrier.earlier = vec![passed(0)],

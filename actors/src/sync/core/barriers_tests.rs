@@ -4,7 +4,7 @@ use sinew_runtime::app::Requirement;
 
 use super::*;
 use crate::sync::{
-    arrivals::{Arrival, Arrivals, BARRIERS_MAX, BarrierSaid, Member, Passed},
+    arrivals::{Arrival, Arrivals, BARRIERS_MAX, BarrierSaid, GENERATION_MAX, Member, Passed},
     core::rendezvous::GRACE,
     list::Ended,
     words::{BarrierKind, OnPartyLoss},
@@ -345,4 +345,62 @@ fn an_answer_for_which_there_was_no_room_is_offered_again_as_long_as_its_applica
         assert_eq!(bench.hears(not_taken()), []);
     }
     assert!(matches!(bench.hears(not_taken())[..], [Output::Refused { cause: "barriers", .. }]));
+}
+
+fn is_refused(output: &Output) -> bool {
+    matches!(output, Output::Refused { cause: "barriers", .. })
+}
+
+// spec: SYNC-12
+#[test]
+fn one_word_of_a_generation_that_cannot_be_does_not_keep_a_barrier_shut() {
+    // Given: the hip and the knee meet, and have met five times
+    let mut bench = Bench::of_the_hip();
+    bench.links(KNEE, LIFE);
+    bench.links(ANKLE, LIFE);
+    bench.list(KNEE, list(1, &[("knee", true, &[])]));
+    bench.is_told(KNEE, LIFE, 1, vec![idle("calibrated", 5)]);
+    // When
+    let outputs = bench.is_told(ANKLE, LIFE, 1, vec![idle("calibrated", GENERATION_MAX), idle("other", 3)]);
+    // Then
+    assert!(outputs.iter().any(is_refused), "{outputs:?}");
+    bench.is_told(KNEE, LIFE, 2, vec![awaited("calibrated", 5)]);
+    let outputs = bench.arrives("calibrated", 7);
+    assert!(outputs.contains(&answered(7, BarrierAnswer::Opened { generation: 6 })), "{outputs:?}");
+    // And what else that node says is heard
+    bench.is_told(KNEE, LIFE, 3, vec![awaited("other", 3)]);
+    let outputs = bench.arrives("other", 8);
+    assert!(outputs.contains(&answered(8, BarrierAnswer::Opened { generation: 4 })), "{outputs:?}");
+}
+
+// spec: SYNC-12
+#[test]
+fn what_was_missed_in_years_is_taken_over() {
+    let mut bench = Bench::of_the_hip();
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("knee", true, &[])]));
+    bench.is_told(KNEE, LIFE, 1, vec![idle("calibrated", 1)]);
+    let missed = 1_000 * 60 * 60 * 24 * 365 * 30;
+    assert!(!bench.is_told(KNEE, LIFE, 2, vec![awaited("calibrated", missed)]).iter().any(is_refused));
+    let outputs = bench.arrives("calibrated", 7);
+    assert!(outputs.contains(&answered(7, BarrierAnswer::Opened { generation: missed + 1 })), "{outputs:?}");
+}
+
+// spec: SYNC-12
+#[test]
+fn who_waits_or_arrives_at_a_barrier_that_can_never_open_again_is_told_so() {
+    let mut bench = Bench::of_the_hip();
+    bench.arrives("calibrated", 7);
+    bench.core.rendezvous.known.values_mut().for_each(|known| known.generation = GENERATION_MAX);
+    let told = |outputs: &[Output], wanted: u64| {
+        let is_it = |output: &Output| {
+            matches!(output, Output::AnswerBarrier { correlation, answer: BarrierAnswer::Refused { why }, .. }
+                if *correlation == wanted && why.contains("which is the limit"))
+        };
+        outputs.iter().any(is_it)
+    };
+    let outputs = bench.passes(SPACING);
+    assert!(told(&outputs, 7), "{outputs:?}");
+    let outputs = bench.arrives("calibrated", 8);
+    assert!(told(&outputs, 8), "{outputs:?}");
 }

@@ -14,13 +14,11 @@ use super::{
     respite::Moment,
 };
 use crate::sync::{
-    arrivals::{Arrivals, PARTIES_MAX, fault_of_parties},
+    arrivals::{Arrivals, PARTIES_BYTES_MAX, PARTIES_MAX, fault_of_parties},
     list::Name,
     words::{ArriveAtBarrier, BarrierAnswer, BarrierKind, BarrierStatus},
 };
 
-/// Bytes that the names of one barrier's parties have together, at most.
-const PARTIES_BYTES_MAX: usize = 4_096;
 /// Bytes of an answer beside who is missing, at most.
 const ANSWER: usize = 32;
 /// Bytes beside the two texts of each who is missing, at most.

@@ -34,7 +34,10 @@ pub(super) use self::{known::Known, who_waits::WhoWaits};
 use self::{known::Wait, voices::Voices};
 use super::{Reason, respite::Moment};
 use crate::sync::{
-    arrivals::{ARRIVALS_MAX, Arrival, Arrivals, BARRIERS_MAX, BarrierSaid, GENERATION_MAX, Member, Passed},
+    arrivals::{
+        ARRIVALS_MAX, Arrival, Arrivals, BARRIERS_MAX, BarrierSaid, GENERATION_AT_FIRST_MAX, GENERATION_MAX,
+        GENERATIONS_MISSED_MAX, Member, Passed,
+    },
     facts::Absence,
     list::Name,
     words::{BarrierAnswer, OnPartyLoss},
@@ -43,6 +46,9 @@ use crate::sync::{
 /// Time from a party's loss until who does not want to wait for its return is told: the word that others have passed with it
 /// is on its way no longer.
 pub(super) const GRACE: Duration = Duration::from_millis(50);
+/// Of a barrier that has no generation left. Only a node whose word was wrong, and was heard first, brings it there.
+const EXHAUSTED: &str =
+    "it has opened 2^53 times, as far as is known here, which is the limit; use a barrier of another name";
 /// Barriers at which one application waits at once, at most.
 const WAITS_PER_APP_MAX: usize = 16;
 
@@ -128,6 +134,9 @@ impl Rendezvous {
         });
         self.recall(now, &key);
         let known = self.known.entry(key).or_insert_with(|| Known::new(parties));
+        if known.generation >= GENERATION_MAX {
+            return Err(EXHAUSTED.to_owned());
+        }
         if known.waiting.len() >= ARRIVALS_MAX {
             return Err(format!("{ARRIVALS_MAX} applications of this node wait there already"));
         }
@@ -232,13 +241,29 @@ impl Rendezvous {
         &mut self,
         now: Time,
         from: NodeAddress,
-        said: Arrivals,
+        mut said: Arrivals,
         linked: Option<Incarnation>,
     ) -> Result<(), &'static str> {
+        let count = said.barriers.len();
+        said.barriers.retain(|barrier| self.is_believed(now, barrier));
+        let is_believed = said.barriers.len() == count;
         for barrier in self.voices.hear(from, said, linked)? {
             self.hear(now, &barrier);
         }
-        Ok(())
+        let why = "a barrier has opened more often in its word than it can have since it was heard of first; nothing is believed of that one";
+        is_believed.then_some(()).ok_or(why)
+    }
+
+    /// Whether a barrier can have opened so often. The highest generation is everybody's, and outlives who said it: one word that is wrong would
+    /// leave no room for a next one, to nobody, ever. spec: SYNC-12
+    fn is_believed(&self, now: Time, said: &BarrierSaid) -> bool {
+        // Nobody asks which barrier it is of one that is so low.
+        said.generation <= GENERATIONS_MISSED_MAX
+            || said.generation
+                <= self
+                    .known
+                    .get(&said.key())
+                    .map_or(GENERATION_AT_FIRST_MAX, |known| known.believed_max(now))
     }
 
     /// Takes over which generation was opened, and who passed. spec: SYNC-12
@@ -252,7 +277,7 @@ impl Rendezvous {
         let (here, voices) = ((self.node, self.incarnation), &self.voices);
         let known = self.known.entry(key.clone()).or_insert_with(|| Known::new(said.parties.clone()));
         let before = known.generation;
-        if known.hear(said, |member| voices.knows(here, before, &key, member)) {
+        if known.hear(now, said, |member| voices.knows(here, before, &key, member)) {
             let passed = known.pass(here);
             self.answer_opened(passed);
             self.changed(now);

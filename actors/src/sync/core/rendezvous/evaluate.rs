@@ -15,6 +15,8 @@ enum Standing {
     Complete(Vec<Member>),
     /// Some are missing.
     Lacks(Lack),
+    /// It can never open again.
+    Exhausted,
 }
 
 /// What a barrier lacks.
@@ -49,6 +51,7 @@ impl Rendezvous {
             match standing {
                 Standing::Complete(present) => self.open(moment.now, &key, present),
                 Standing::Lacks(lack) => self.end_waits(moment, &key, lack),
+                Standing::Exhausted => self.refuse_waits(moment.now, &key),
             }
         }
     }
@@ -60,8 +63,11 @@ impl Rendezvous {
         linked: &impl Fn(NodeAddress) -> Option<Incarnation>,
         why_not: &impl Fn(&str) -> Option<Reason>,
     ) -> Standing {
+        if known.generation >= GENERATION_MAX {
+            return Standing::Exhausted;
+        }
         let present = self.present(key, known, linked);
-        if is_complete(&known.parties, &present) && known.generation < GENERATION_MAX {
+        if is_complete(&known.parties, &present) {
             return Standing::Complete(chosen(&known.parties, present));
         }
         let asks = known.waiting.values().any(|wait| wait.on_loss == OnPartyLoss::Fail);
@@ -112,6 +118,16 @@ impl Rendezvous {
             self.answers.push((*app, wait.correlation, answer));
         }
         over.into_iter().for_each(|app| self.renumber(app));
+        self.changed(now);
+    }
+
+    fn refuse_waits(&mut self, now: Time, key: &Key) {
+        let Some(known) = self.known.get_mut(key) else { return };
+        for (app, wait) in std::mem::take(&mut known.waiting) {
+            let answer = BarrierAnswer::Refused { why: EXHAUSTED.to_owned() };
+            self.answers.push((app, wait.correlation, answer));
+            self.renumber(app);
+        }
         self.changed(now);
     }
 

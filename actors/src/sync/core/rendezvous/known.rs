@@ -8,6 +8,8 @@ pub(in crate::sync::core) struct Known {
     pub(super) parties: Vec<Requirement>,
     /// How often it has opened, as far as is known here.
     pub(in crate::sync::core) generation: u64,
+    /// What was first heard of that from another node, and when.
+    heard_first: Option<(u64, Time)>,
     /// Who has passed, and which generation last: all who passed the last one, and of those who passed an earlier one whoever's
     /// node may not know it. At most `ARRIVALS_MAX`; the latest ones stay.
     pub(super) members: BTreeMap<Member, u64>,
@@ -48,6 +50,7 @@ impl Known {
         Self {
             parties,
             generation: 0,
+            heard_first: None,
             members: BTreeMap::new(),
             waiting: BTreeMap::new(),
             visitors: BTreeSet::new(),
@@ -65,8 +68,20 @@ impl Known {
         self.forget(knows);
     }
 
+    /// The highest generation that is believed now. // spec: SYNC-12
+    pub(super) fn believed_max(&self, now: Time) -> u64 {
+        let of_later = |(generation, at): (u64, Time)| {
+            let since = u64::try_from(now.since(at).as_micros()).unwrap_or(u64::MAX);
+            generation.saturating_add(GENERATIONS_MISSED_MAX).saturating_add(since)
+        };
+        self.heard_first.map_or(GENERATION_AT_FIRST_MAX, of_later)
+    }
+
     /// Takes over what another node knows, and returns whether it is news. spec: SYNC-12
-    pub(super) fn hear(&mut self, said: &BarrierSaid, knows: impl Fn(&Member) -> u64) -> bool {
+    pub(super) fn hear(&mut self, now: Time, said: &BarrierSaid, knows: impl Fn(&Member) -> u64) -> bool {
+        if said.generation > 0 {
+            self.heard_first.get_or_insert((said.generation, now));
+        }
         let is_later = said.generation > self.generation;
         self.generation = self.generation.max(said.generation);
         let mut is_news = is_later;
