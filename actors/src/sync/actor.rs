@@ -161,7 +161,9 @@ impl SyncManager {
             }
             self.tell_access(&core, named);
             // Counted before anybody can see it: who is told of a name by whoever saw it first must find that it has changed.
-            self.stores.directory_has_changed();
+            if core.take_directory_changed() {
+                self.stores.directory_has_changed();
+            }
         }
         // One at a time, and never with the lock in hand: an order may lead to a question to the directory.
         loop {

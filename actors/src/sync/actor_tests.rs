@@ -462,3 +462,32 @@ fn the_end_of_who_is_monitored_is_told_though_the_post_was_full_when_it_came() {
         assert_eq!(down.header.kind, Down::KIND);
     });
 }
+
+#[test]
+fn what_says_nothing_new_of_the_directory_wakes_nobody_who_has_a_copy_of_it() {
+    run(async {
+        // Given
+        let mut bench = Bench::new().await;
+        let _sent = bench.links_knee();
+        bench.registers_gait();
+        bench.knee_says(1, true);
+        assert_eq!(bench.released().await, GAIT);
+        let changes = bench.stores.directory_changes.subscribe();
+        let before = *changes.borrow();
+        // When: the knee says the same again, as it does every two seconds, and somebody waits
+        bench.knee_says(1, true);
+        bench.stores.router.deliver(arrival(GAIT, 7)).unwrap();
+        bench.tells(Event::Monitors);
+        while !bench.stores.posts.sync.is_empty() {
+            tokio::task::yield_now().await;
+        }
+        // Then
+        assert_eq!(*changes.borrow() - before, 0);
+        // And when it says something new
+        bench.knee_says(2, false);
+        while !bench.stores.posts.sync.is_empty() {
+            tokio::task::yield_now().await;
+        }
+        assert!(*changes.borrow() > before);
+    });
+}

@@ -93,29 +93,6 @@ impl Watcher {
     }
 }
 
-impl Input {
-    /// Whether afterwards somebody may be in the directory who was not, or otherwise.
-    pub(super) const fn may_change_directory(&self) -> bool {
-        match self {
-            Self::AppChanged(_)
-            | Self::MembershipChanged(_)
-            | Self::LinkChanged(_)
-            | Self::ListReceived { .. } => true,
-            Self::GroupsChanged(_)
-            | Self::Arrived { .. }
-            | Self::Left { .. }
-            | Self::AnswerNotTaken { .. }
-            | Self::ArrivalsReceived { .. }
-            | Self::ArrivalsNotTaken { .. }
-            | Self::DirectoryWanted { .. }
-            | Self::DirectoryNotTaken { .. }
-            | Self::ReleaseNotTaken { .. }
-            | Self::EventNotTaken { .. }
-            | Self::TimePassed => false,
-        }
-    }
-}
-
 /// Whose names an input may change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::sync) enum Named {
@@ -148,6 +125,12 @@ impl Input {
 }
 
 impl Core {
+    /// Somebody may be in the directory who was not, or otherwise.
+    pub(super) fn directory_changed(&mut self) {
+        self.has_changed = true;
+        self.watchers.directory_changed();
+    }
+
     /// Who is called how on other nodes, or on this one of them, as they have said last.
     pub(in crate::sync) fn names_elsewhere(
         &self,

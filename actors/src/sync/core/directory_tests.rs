@@ -131,3 +131,27 @@ fn what_a_node_has_called_its_applications_counts_for_the_access_list_until_it_s
     assert_eq!(names(&bench, Some(KNEE)), [(Tid::new(KNEE, app(0)), "drive".to_owned())]);
     assert_eq!(Input::TimePassed.may_name(), Named::Nobody);
 }
+
+#[test]
+fn only_what_changes_the_directory_has_it_read_anew() {
+    // Given: the knee is linked and its list is known
+    let mut bench = watched();
+    bench.hears(Input::DirectoryWanted { app: app(9) });
+    bench.links(KNEE, LIFE);
+    let same = || list(1, &[("knee", true, &[])]);
+    bench.list(KNEE, same());
+    assert!(bench.core.take_directory_changed());
+    // When
+    bench.list(KNEE, same());
+    bench.passes(REPEAT);
+    bench.arrives("calibrated", 7);
+    // Then
+    assert!(!bench.core.take_directory_changed());
+    // And what is known counts again after a break, so that it is read
+    bench.breaks(KNEE);
+    assert!(bench.core.take_directory_changed());
+    bench.links(KNEE, LIFE);
+    bench.core.take_directory_changed();
+    assert!(bench.list(KNEE, same()).contains(&is("knee", KNEE, 0, true)));
+    assert!(bench.core.take_directory_changed());
+}

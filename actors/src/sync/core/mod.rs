@@ -135,6 +135,8 @@ pub(crate) struct Core {
     /// The cycles that stand, each without its closing name.
     cycles: BTreeSet<Vec<String>>,
     same_names: BTreeSet<String>,
+    /// Whether the directory may have changed since somebody asked that.
+    has_changed: bool,
     version: u64,
     /// The present list, once somebody needs it.
     encoded: Option<Bytes>,
@@ -174,6 +176,7 @@ impl Core {
             seen: BTreeSet::new(),
             cycles: BTreeSet::new(),
             same_names: BTreeSet::new(),
+            has_changed: false,
             version: 1,
             encoded: None,
             spacing: Duration::ZERO,
@@ -198,9 +201,6 @@ impl Core {
 
     /// Takes in what has happened.
     pub(crate) fn handle(&mut self, now: Time, input: Input) {
-        if input.may_change_directory() {
-            self.watchers.directory_changed();
-        }
         match input {
             Input::AppChanged(fact) => self.app_changed(now, fact),
             Input::GroupsChanged(groups) => self.groups_changed(now, groups),
@@ -232,6 +232,12 @@ impl Core {
         self.report_overdue(moment);
         self.meet(moment);
         self.tell_watchers(now);
+    }
+
+    /// Whether since the last question somebody came into the directory, went out of it, or is there otherwise. Who has a copy of it makes a new
+    /// one, so what only repeats what is known must not say so.
+    pub(crate) fn take_directory_changed(&mut self) -> bool {
+        std::mem::take(&mut self.has_changed)
     }
 
     /// The next thing to be done; take until there is none.

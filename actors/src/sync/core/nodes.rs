@@ -14,6 +14,7 @@ const SAME_NAMES_MAX: usize = 1_024;
 
 impl Core {
     pub(super) fn membership_changed(&mut self, fact: MembershipFact) {
+        self.directory_changed();
         match fact {
             MembershipFact::NodeFound { node, incarnation, .. } => {
                 self.peers.found(node, incarnation);
@@ -39,6 +40,7 @@ impl Core {
     }
 
     pub(super) fn link_changed(&mut self, now: Time, fact: LinkFact) {
+        self.directory_changed();
         match fact {
             LinkFact::LinkUp { node, incarnation } => {
                 if !self.peers.link_up(now, node, incarnation) {
@@ -78,11 +80,13 @@ impl Core {
             Ok(list) => match self.peers.accept(from, list) {
                 Err(why) => self.refuse("directory", format!("from {from}: {why}")),
                 Ok(Accepted::New) => {
+                    self.directory_changed();
                     self.route_groups(from);
                     for name in self.peers.names_of(from) {
                         self.note_same_name(&name);
                     }
                 }
+                Ok(Accepted::Again) => self.directory_changed(),
                 Ok(Accepted::Same | Accepted::Old) => {}
             },
         }

@@ -130,6 +130,8 @@ impl Peer {
 pub(super) enum Accepted {
     /// It says something new.
     New,
+    /// It is the one that is known, and counts again: its node was not heard for a while.
+    Again,
     /// It is the one that is known.
     Same,
     /// A newer one is known.
@@ -194,8 +196,8 @@ impl Peers {
         match known.map(|known| (list.incarnation, list.version).cmp(&known)) {
             Some(std::cmp::Ordering::Less) => return Ok(Accepted::Old),
             Some(std::cmp::Ordering::Equal) => {
-                peer.heard = true;
-                return Ok(Accepted::Same);
+                let is_back = !std::mem::replace(&mut peer.heard, true);
+                return Ok(if is_back { Accepted::Again } else { Accepted::Same });
             }
             Some(std::cmp::Ordering::Greater) | None => {}
         }

@@ -18,6 +18,8 @@ impl Core {
     pub(super) fn own_list_changed(&mut self, now: Time) {
         self.version += 1;
         self.encoded = None;
+        // With the groups and phases in it, of which the directory says nothing; they seldom change.
+        self.directory_changed();
         self.peers.make_due(now, self.spacing);
     }
 
