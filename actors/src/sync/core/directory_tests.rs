@@ -155,3 +155,25 @@ fn only_what_changes_the_directory_has_it_read_anew() {
     assert!(bench.list(KNEE, same()).contains(&is("knee", KNEE, 0, true)));
     assert!(bench.core.take_directory_changed());
 }
+
+// spec: SYNC-6
+#[test]
+fn a_name_is_first_of_all_that_of_an_application_which_is_ready() {
+    // Given: the knee is before the ankle, and its camera is not ready
+    let mut bench = Bench::new();
+    for (node, is_ready) in [(KNEE, false), (ANKLE, true)] {
+        bench.links(node, LIFE);
+        bench.list(node, list(1, &[("camera", is_ready, &[])]));
+    }
+    let [knee, ankle, hip] = [KNEE, ANKLE, HERE].map(|node| Tid::new(node, app(0)));
+    assert_eq!(bench.registers(1, "gait", &["camera"]), [release(1)], "it is let go by the ankle's");
+    assert_eq!(bench.core.called("camera"), [ankle, knee]);
+    // When: this node has one, too
+    bench.registers(0, "camera", &[]);
+    // Then
+    assert_eq!(bench.core.called("camera"), [ankle, hip, knee]);
+    assert_eq!(bench.core.ready_elsewhere("camera", hip), Some(ankle));
+    bench.ready(0);
+    assert_eq!(bench.core.called("camera"), [hip, ankle, knee]);
+    assert_eq!(bench.core.ready_elsewhere("camera", hip), None);
+}

@@ -295,12 +295,10 @@ impl Peers {
         current.map(|(_, _, entry)| entry.requires.clone()).collect()
     }
 
-    /// The applications called `name` on nodes that are not lost: linked nodes first, then by address. spec: SYNC-6
-    pub(super) fn resolve(&self, name: &str) -> Vec<Tid> {
+    /// The applications called `name` on nodes that are not lost: whether each is ready, and whether its node is linked. spec: SYNC-6
+    pub(super) fn resolve(&self, name: &str) -> impl Iterator<Item = (Tid, bool, bool)> {
         let there = self.called(name).filter(|(_, peer, _)| peer.lost.is_none() && !peer.stale);
-        let mut found: Vec<(bool, Tid)> = there.map(|(tid, peer, _)| (peer.linked.is_none(), tid)).collect();
-        found.sort();
-        found.into_iter().map(|(_, tid)| tid).collect()
+        there.map(|(tid, peer, entry)| (tid, peer.why_not(entry, None).is_none(), peer.linked.is_some()))
     }
 
     /// Every application of every node that is not lost: name, address, whether it is ready, what it handles.

@@ -100,7 +100,7 @@ impl World {
         self.check_names(&there)
     }
 
-    /// A name is its own node's first, then that of the lowest address, for all nodes.
+    /// A name is that of one that is ready first; of those its own node's, then that of the lowest address, for all nodes.
     fn check_names(&self, there: &BTreeMap<usize, bool>) -> Result<(), String> {
         let mut names: BTreeMap<String, Vec<usize>> = BTreeMap::new();
         for index in there.keys() {
@@ -108,9 +108,13 @@ impl World {
         }
         for (node, core) in self.cores.iter().enumerate() {
             for (name, nodes) in &names {
-                let others = nodes.iter().filter(|other| **other != node);
-                let own = nodes.iter().filter(|other| **other == node);
-                let right: Vec<NodeAddress> = own.chain(others).map(|node| address(*node)).collect();
+                let is_ready = |other: usize| {
+                    let mut of_it = there.iter().filter(|(index, _)| self::name(**index) == *name);
+                    of_it.any(|(index, is_ready)| index / SLOTS == other && *is_ready)
+                };
+                let mut right = nodes.clone();
+                right.sort_by_key(|other| (!is_ready(*other), *other != node, *other));
+                let right: Vec<NodeAddress> = right.into_iter().map(address).collect();
                 let called: Vec<NodeAddress> = core.called(name).iter().map(|tid| tid.node).collect();
                 require(called == right, || {
                     format!("for node {node} {name} is of {called:?}, and is to be of {right:?}")
