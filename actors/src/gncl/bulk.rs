@@ -25,7 +25,7 @@ impl BulkThread {
     /// # Errors
     /// The system gives no thread, or no descriptors for its reactor.
     pub(super) fn begin(name: &str, courtesy: Courtesy) -> io::Result<Self> {
-        let runtime = Builder::new_current_thread().enable_io().build()?;
+        let runtime = Builder::new_current_thread().enable_all().build()?;
         let handle = runtime.handle().clone();
         let (is_wanted, is_to_end) = oneshot::channel();
         thread::Builder::new().name(name.to_owned()).spawn(move || {

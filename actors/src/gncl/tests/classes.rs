@@ -66,6 +66,33 @@ fn control_arrives_while_bulk_is_not_read() {
 }
 
 #[test]
+fn who_is_refused_on_its_bulk_connection_and_pours_on_ends_that_connection_alone() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut first = lane_by_hand(&node, Lane::Control, 1).await;
+        node.up().await;
+        let mut bulk = lane_by_hand(&node, Lane::Bulk, 2).await;
+        bulk.say_bytes(&[0xFF; 1_000]).await;
+        assert_eq!(bulk.hear().await.header.kind, Kind::GNCL_REFUSAL);
+        // Several turns of a reader, which rests between two of them.
+        bulk.say_bytes(&[7; 512 << 10]).await;
+        assert!(bulk.try_hear().await.is_none(), "the node has said its last word on it");
+        drop(bulk);
+        // The link stands: when that connection is over the node hears of another one for Bulk.
+        let mut again = lane_by_hand(&node, Lane::Bulk, 3).await;
+        let mut to = node.tid(1);
+        to.node = NINE;
+        node.stores
+            .router
+            .send(of_class(Class::Bulk, node.message(to, b"Bulk")))
+            .expect("the peer is linked");
+        assert_eq!(again.hear().await.payload[..], *b"Bulk");
+        node.send(to, b"Control");
+        assert_eq!(first.hear().await.payload[..], *b"Control");
+    });
+}
+
+#[test]
 fn a_bulk_connection_that_breaks_leaves_the_link_alone_and_loses_nothing() {
     run(async {
         let (mut a, b) = (Node::start(1).await, Node::start(2).await);
