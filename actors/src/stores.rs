@@ -153,7 +153,7 @@ impl Stores {
         self.door.close();
         self.router.remove_local(AppAddress::INSPECT);
         self.gncl.close();
-        self.gncl.end_bulk();
+        self.gncl.end_threads();
         lock(&self.ndl_sockets).close_all();
     }
 

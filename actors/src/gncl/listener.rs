@@ -4,7 +4,7 @@ use std::{
     cell::RefCell,
     future::poll_fn,
     io,
-    net::{Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4},
+    net::{Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4, TcpListener},
     rc::Rc,
     task::{Context, Poll, ready},
     time::Duration,
@@ -14,9 +14,9 @@ use futures_util::{Stream, stream};
 use rustix::io::Errno;
 use sinew_runtime::time::Time;
 use socket2::{Domain, SockRef, Socket, Type};
-use tokio::net::{TcpListener, TcpStream};
+use tokio::net::TcpStream;
 
-use super::pace::Pace;
+use super::{lent::Lent, pace::Pace};
 use crate::{config::NodeConfig, refusals::Refusals};
 
 /// Connections that wait to be accepted at most, at all listeners together; the kernel refuses further ones. Those that 300 nodes make who all
@@ -29,7 +29,7 @@ const BACK_OFF_MAX: Duration = Duration::from_millis(100);
 ///
 /// # Errors
 /// What the system says.
-pub(super) fn listen(address: SocketAddr) -> io::Result<std::net::TcpListener> {
+pub(super) fn listen(address: SocketAddr) -> io::Result<TcpListener> {
     begin_to_listen(&new_socket(address)?, address)
 }
 
@@ -39,7 +39,7 @@ pub(super) fn listen(address: SocketAddr) -> io::Result<std::net::TcpListener> {
 ///
 /// # Errors
 /// What the system says.
-pub(super) fn listen_first(config: &NodeConfig) -> io::Result<std::net::TcpListener> {
+pub(super) fn listen_first(config: &NodeConfig) -> io::Result<TcpListener> {
     let (address, chosen) = (first_of(config), &config.ndl.interface);
     let may_come = !chosen.are_ipv4_addresses() || chosen.iter().count() > 1;
     if may_come { listen_also_without(address) } else { listen(address) }
@@ -79,7 +79,7 @@ fn all_of_ipv6(config: &NodeConfig) -> Ipv6Addr {
 }
 
 /// Listens at an address that this host may not have yet.
-fn listen_also_without(address: SocketAddr) -> io::Result<std::net::TcpListener> {
+fn listen_also_without(address: SocketAddr) -> io::Result<TcpListener> {
     let socket = new_socket(address)?;
     #[cfg(target_os = "linux")]
     if address.is_ipv4() {
@@ -92,7 +92,7 @@ fn listen_also_without(address: SocketAddr) -> io::Result<std::net::TcpListener>
 
 /// Listens at the further addresses of this node. One that this host does not have now it may have later: an interface that is
 /// down, or has no address yet, keeps no node from its start. What cannot be listened at in any case is counted, and not announced.
-pub(super) fn listen_at_further(config: &NodeConfig, refusals: &Refusals) -> Vec<std::net::TcpListener> {
+pub(super) fn listen_at_further(config: &NodeConfig, refusals: &Refusals) -> Vec<TcpListener> {
     if !config.ndl.interface.are_ipv4_addresses() {
         return Vec::new();
     }
@@ -112,7 +112,7 @@ pub(super) fn listen_at_further(config: &NodeConfig, refusals: &Refusals) -> Vec
 
 /// Listens at all IPv6 addresses, too, where interfaces may have some beside those of IPv4: at the same port, if that is free or was asked for.
 /// A host without IPv6 goes on with what it has.
-pub(super) fn listen_at_ipv6(config: &NodeConfig, first: SocketAddr) -> Option<std::net::TcpListener> {
+pub(super) fn listen_at_ipv6(config: &NodeConfig, first: SocketAddr) -> Option<TcpListener> {
     if first.is_ipv6() || !config.ndl.interface.have_ipv6() {
         return None;
     }
@@ -145,7 +145,7 @@ fn has_no_ipv6(error: &io::Error) -> bool {
 }
 
 /// Where these listen by IPv4.
-pub(super) fn addresses_of(listeners: &[std::net::TcpListener]) -> Vec<SocketAddrV4> {
+pub(super) fn addresses_of(listeners: &[TcpListener]) -> Vec<SocketAddrV4> {
     let addresses = listeners.iter().filter_map(|listener| match listener.local_addr() {
         Ok(SocketAddr::V4(address)) => Some(address),
         Ok(SocketAddr::V6(_)) | Err(_) => None,
@@ -157,7 +157,7 @@ pub(super) fn addresses_of(listeners: &[std::net::TcpListener]) -> Vec<SocketAdd
 ///
 /// # Errors
 /// What the system says.
-pub(super) fn share_backlog(listeners: &[std::net::TcpListener]) -> io::Result<()> {
+pub(super) fn share_backlog(listeners: &[TcpListener]) -> io::Result<()> {
     let backlog = backlog_of_one(listeners.len());
     listeners.iter().try_for_each(|listener| SockRef::from(listener).listen(backlog))
 }
@@ -170,7 +170,7 @@ fn new_socket(address: SocketAddr) -> io::Result<Socket> {
     Socket::new(Domain::for_address(address), Type::STREAM.nonblocking().cloexec(), None)
 }
 
-fn begin_to_listen(socket: &Socket, address: SocketAddr) -> io::Result<std::net::TcpListener> {
+fn begin_to_listen(socket: &Socket, address: SocketAddr) -> io::Result<TcpListener> {
     socket.set_reuse_address(true)?;
     if address.is_ipv6() {
         // Beside one of IPv4 at the same port.
@@ -185,7 +185,7 @@ fn begin_to_listen(socket: &Socket, address: SocketAddr) -> io::Result<std::net:
 /// the thread: they have their turn between two connections, it rests at a [pace](Pace) that whoever connects cannot quicken, nor by more than one
 /// of the listeners, which share it, and who floods the port waits in the kernel.
 pub(super) fn accepted(
-    listener: TcpListener,
+    listener: Lent<TcpListener>,
     give_up: Duration,
     pace: Rc<RefCell<Pace>>,
 ) -> impl Stream<Item = io::Result<TcpStream>> {
@@ -204,7 +204,7 @@ pub(super) fn accepted(
             super::link::tune(&socket, give_up)?;
             Ok(socket)
         });
-        if accepted.is_err() && is_closed(&listener) {
+        if accepted.is_err() && is_closed(listener.socket()) {
             // The node is being stopped: nobody comes any more, which is no fault.
             std::future::pending::<()>().await;
         }
@@ -221,14 +221,18 @@ enum Turn {
 }
 
 /// Accepts one when it comes, if the pace has one left then: another listener may have had it since this one began to wait.
-fn poll_accept(listener: &TcpListener, pace: &RefCell<Pace>, cx: &mut Context<'_>) -> Poll<Turn> {
+fn poll_accept(listener: &Lent<TcpListener>, pace: &RefCell<Pace>, cx: &mut Context<'_>) -> Poll<Turn> {
     let mut pace = pace.borrow_mut();
     if let Some(rest) = pace.rest(Time::now()) {
         return Poll::Ready(Turn::Rest(rest));
     }
-    let accepted = ready!(listener.poll_accept(cx));
+    let accepted = ready!(listener.poll(cx, TcpListener::accept));
     pace.took_one(Time::now());
-    Poll::Ready(Turn::Over(accepted.map(|(socket, _)| socket)))
+    let accepted = accepted.and_then(|(socket, _)| {
+        socket.set_nonblocking(true)?;
+        TcpStream::from_std(socket)
+    });
+    Poll::Ready(Turn::Over(accepted))
 }
 
 /// Waits until what else is ready on the thread has had its turn. An actor looks at its streams again and again in one turn as long as there is
@@ -280,6 +284,10 @@ mod tests {
     };
 
     const GIVE_UP: Duration = Duration::from_secs(1);
+
+    fn lent(listener: TcpListener) -> Lent<TcpListener> {
+        Lent::of(&Arc::new(listener)).unwrap()
+    }
 
     fn own_pace() -> Rc<RefCell<Pace>> {
         Rc::new(RefCell::new(Pace::new(Time::now())))
@@ -359,7 +367,7 @@ mod tests {
             let chosen: Vec<_> = choices.iter().map(|choice| choice.parse().unwrap()).collect();
             config.ndl.interface = chosen.into();
             // The kernel asks this before it looks whether the host has the address.
-            let waits = |listener: &std::net::TcpListener| match listener.local_addr().unwrap() {
+            let waits = |listener: &TcpListener| match listener.local_addr().unwrap() {
                 SocketAddr::V4(_) => SockRef::from(listener).freebind_v4().unwrap(),
                 SocketAddr::V6(_) => SockRef::from(listener).freebind_v6().unwrap(),
             };
@@ -388,11 +396,12 @@ mod tests {
     #[tokio::test]
     async fn a_socket_that_was_closed_in_order_is_no_fault_and_nobody_comes_any_more() {
         let listener = listen(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
-        let theirs = TcpListener::from_std(listener.try_clone().unwrap()).unwrap();
+        let listener = Arc::new(listener);
+        let theirs = Lent::of(&listener).unwrap();
         let mut accepted = pin!(accepted(theirs, GIVE_UP, own_pace()));
         assert!(accepted.next().now_or_never().is_none());
         // As GNCL's store does when the node is stopped.
-        SockRef::from(&listener).shutdown(std::net::Shutdown::Both).unwrap();
+        SockRef::from(&*listener).shutdown(std::net::Shutdown::Both).unwrap();
         let told = tokio::time::timeout(Duration::from_millis(100), accepted.next()).await;
         assert!(told.is_err(), "{told:?}");
     }
@@ -402,7 +411,7 @@ mod tests {
         const ROWS: u32 = 5;
         let listener = listen(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
         let address = listener.local_addr().unwrap();
-        let mut accepted = pin!(accepted(TcpListener::from_std(listener).unwrap(), GIVE_UP, own_pace()));
+        let mut accepted = pin!(accepted(lent(listener), GIVE_UP, own_pace()));
         let began = Instant::now();
         for _ in 0..ROWS * IN_A_ROW_MAX {
             // The one before has been accepted, and is closed.
@@ -422,8 +431,7 @@ mod tests {
             let listener = listen(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
             let address = listener.local_addr().unwrap();
             dialled.extend((0..IN_A_ROW_MAX).map(|_| std::net::TcpStream::connect(address).unwrap()));
-            let listener = TcpListener::from_std(listener).unwrap();
-            streams.push(Box::pin(accepted(listener, GIVE_UP, pace.clone())));
+            streams.push(Box::pin(accepted(lent(listener), GIVE_UP, pace.clone())));
         }
         let began = Instant::now();
         let all: Vec<_> = stream::select_all(streams).take(dialled.len()).collect().await;
@@ -442,7 +450,7 @@ mod tests {
     }
 
     /// Has a stream more for each connection, as the layer's shell has.
-    struct Shell(Option<TcpListener>, SyncSender<u32>, Arc<AtomicU32>);
+    struct Shell(Option<Lent<TcpListener>>, SyncSender<u32>, Arc<AtomicU32>);
 
     impl Actor for Shell {
         type Context = Context<Self>;
@@ -471,7 +479,7 @@ mod tests {
             let (say, said) = sync_channel(IN_A_ROW_MAX as usize);
             let turns = Arc::new(AtomicU32::new(0));
             let counting = turns.clone();
-            let _shell = Shell(Some(TcpListener::from_std(listener).unwrap()), say, turns).start();
+            let _shell = Shell(Some(lent(listener)), say, turns).start();
             let other = tokio::task::spawn_local(async move {
                 loop {
                     counting.fetch_add(1, Ordering::Relaxed);

@@ -44,6 +44,7 @@
 //! | `ticks.rs` | looks at what has a time, only as long as there is something |
 //! | `marks.rs` | what the network is told about a class |
 //! | `listener.rs` | the accepting socket |
+//! | `lent.rs` | sockets that outlive this layer, as one life of it waits for them |
 //! | `pace.rs` | how fast it accepts |
 //! | `actor.rs`, `actor/` | the shell that ties them together; how it ends |
 
@@ -59,6 +60,7 @@ pub(crate) mod fuzzing;
 mod inbound;
 #[cfg(target_os = "linux")]
 mod interfaces;
+mod lent;
 mod link;
 mod listener;
 mod marks;

@@ -34,6 +34,7 @@ use super::{
     notes::Notes,
     owed::Owed,
     proofs::Proofs,
+    secure::Secure,
     task::{Move, Place},
     ticks::Ticks,
     transport::Transport,
@@ -360,9 +361,11 @@ pub(crate) struct Store {
     pub(super) held_up: Arc<Notify>,
     /// The thread of Bulk, from its first connection until the node ends.
     bulk: Mutex<Option<BulkThread>>,
+    /// How connections of a node that has keys are made, and the thread of that, from the first life of this layer until the node ends.
+    pub(super) secure: Mutex<Option<Arc<Secure>>>,
     /// The sockets that listen, that of the node's interface first. They stay open while this layer is restarted: a peer that is
     /// refused would say that this node is lost.
-    pub(super) listeners: Mutex<Vec<std::net::TcpListener>>,
+    pub(super) listeners: Mutex<Vec<Arc<std::net::TcpListener>>>,
     /// Who looks for what has expired, and who for what was taken and not acknowledged.
     expiring: Arc<Ticks>,
     acks: Arc<Ticks>,
@@ -472,9 +475,10 @@ impl Store {
         peers.drain(..).map(|peer| peer.ways.iter().filter(|way| what(way)).count()).sum()
     }
 
-    /// Whoever carried Bulk is not needed any more.
-    pub(crate) fn end_bulk(&self) {
+    /// The threads of Bulk and of handshakes are not needed any more.
+    pub(crate) fn end_threads(&self) {
         lock(&self.bulk).take();
+        lock(&self.secure).take();
     }
 
     /// Nobody connects any more, and the ports are free, whoever still holds the sockets.
@@ -482,7 +486,7 @@ impl Store {
         self.datagrams.close();
         for listener in lock(&self.listeners).drain(..) {
             // An error says that it does not listen any more.
-            let _ = SockRef::from(&listener).shutdown(Shutdown::Both);
+            let _ = SockRef::from(&*listener).shutdown(Shutdown::Both);
         }
     }
 

@@ -16,6 +16,8 @@ mod links;
 mod messages;
 mod outcomes;
 mod secured;
+#[cfg(target_os = "linux")]
+mod starved;
 mod takeovers;
 mod threads;
 mod ticks;

@@ -2,7 +2,7 @@
 
 use std::{
     io,
-    net::SocketAddr,
+    net::{SocketAddr, TcpListener},
     sync::{Arc, Mutex},
 };
 
@@ -13,6 +13,7 @@ use tokio::net::TcpStream;
 use super::{
     super::{
         core::Input,
+        lent::Lent,
         link::{self, Mode},
         listener,
         transport::Transport,
@@ -24,7 +25,7 @@ use crate::{ndl, stores::lock};
 
 impl Gncl {
     /// The listeners, one for each address: those that are open already, if this layer was restarted.
-    pub(super) fn listen(&self) -> io::Result<Vec<tokio::net::TcpListener>> {
+    pub(super) fn listen(&self) -> io::Result<Vec<Lent<TcpListener>>> {
         let mut kept = lock(&self.stores.gncl.listeners);
         if kept.is_empty() {
             let config = &self.stores.config;
@@ -33,18 +34,17 @@ impl Gncl {
             let further = listener::listen_at_further(config, &self.stores.gncl.refusals);
             self.stores.gncl_further.get_or_init(|| listener::addresses_of(&further));
             let ipv6 = listener::listen_at_ipv6(config, address);
-            let all = std::iter::once(listener).chain(further).chain(ipv6);
-            *kept = all.collect();
-            listener::share_backlog(&kept)?;
-            for at in
-                kept.iter().filter_map(|listener| listener.local_addr().ok()).filter(SocketAddr::is_ipv6)
+            let all: Vec<_> = std::iter::once(listener).chain(further).chain(ipv6).collect();
+            listener::share_backlog(&all)?;
+            for at in all.iter().filter_map(|listener| listener.local_addr().ok()).filter(SocketAddr::is_ipv6)
             {
                 self.stores.gncl_port6.get_or_init(|| at.port());
             }
-            self.bind_datagrams(&kept);
+            self.bind_datagrams(&all);
+            *kept = all.into_iter().map(Arc::new).collect();
             self.stores.gncl_listen.get_or_init(|| address);
         }
-        kept.iter().map(|listener| tokio::net::TcpListener::from_std(listener.try_clone()?)).collect()
+        kept.iter().map(Lent::of).collect()
     }
 
     /// Whether a connection came to an address of an interface that this node uses: where those are chosen by their names, it listens at

@@ -18,6 +18,7 @@ use super::{
 use crate::{
     secured::Secured,
     security::{Peer, Stamp},
+    stores::lock,
 };
 
 /// How often a node that has keys looks whether there is something to be said of how long they count: more often than that is said, as each life
@@ -28,13 +29,18 @@ const MINDED: Duration = Duration::from_secs(60);
 pub(super) const NOT_PROVEN: &str = "peer not proven";
 
 impl Gncl {
-    /// The start fails if it cannot: a node that has keys is never open.
+    /// With the thread of handshakes that there is, if this layer was restarted. The start fails if there is none: a node that has keys is never
+    /// open.
     pub(super) fn begin_to_prove(&mut self) {
         let Some(secured) = self.stores.secured.get() else { return };
-        let secure = Secure::begin(secured.tls.clone()).unwrap_or_else(|error| {
-            panic!("GNCL gets no thread for handshakes: {error}; raise `ulimit -n` or `ulimit -u`")
+        let mut kept = lock(&self.stores.gncl.secure);
+        let secure = kept.get_or_insert_with(|| {
+            let secure = Secure::begin(secured.tls.clone()).unwrap_or_else(|error| {
+                panic!("GNCL gets no thread for handshakes: {error}; raise `ulimit -n` or `ulimit -u`")
+            });
+            Arc::new(secure)
         });
-        self.secure = Some(Arc::new(secure));
+        self.secure = Some(secure.clone());
     }
 
     /// Says now and then that the node's certificate ends soon, or has ended: it runs for longer than anybody remembers its start.

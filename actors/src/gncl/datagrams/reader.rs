@@ -19,7 +19,7 @@ use super::{
     packet::{DATAGRAM_MAX, Prefix},
 };
 use crate::{
-    gncl::{core::Lane, inbound::Inbound, peer::Peer, spin::Spin},
+    gncl::{core::Lane, inbound::Inbound, lent::Lent, peer::Peer, spin::Spin},
     outlet::LinkNumber,
     stores::Stores,
     takeover::take_over,
@@ -89,14 +89,14 @@ fn refuse(stores: &Stores, error: &io::Error) {
 struct Reader {
     stores: Arc<Stores>,
     spin: Arc<Spin>,
-    socket: tokio::net::UdpSocket,
+    socket: Lent<UdpSocket>,
     /// Whose datagrams came in this turn.
     met: Vec<Arc<Peer>>,
 }
 
 impl Reader {
-    fn new(stores: &Arc<Stores>, spin: &Arc<Spin>, socket: &UdpSocket) -> io::Result<Self> {
-        let socket = tokio::net::UdpSocket::from_std(socket.try_clone()?)?;
+    fn new(stores: &Arc<Stores>, spin: &Arc<Spin>, socket: &Arc<UdpSocket>) -> io::Result<Self> {
+        let socket = Lent::of(socket)?;
         Ok(Self {
             stores: stores.clone(),
             spin: spin.clone(),
@@ -126,7 +126,7 @@ impl Reader {
         let now = Time::now();
         let mut result = Ok(());
         for _ in 0..DATAGRAMS_PER_WAKE {
-            match self.socket.try_recv_from(buffer) {
+            match self.socket.try_io(|socket| socket.recv_from(buffer)) {
                 // One that fills it was cut off, and is none of ours.
                 Ok((length, _)) => self.came(now, &buffer[..length]),
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => break,

@@ -1,6 +1,12 @@
 //! Links that break, are made again, and end in order.
 
-use std::{cell::RefCell, net::Ipv4Addr, rc::Rc, sync::atomic::Ordering, time::Duration};
+use std::{
+    cell::RefCell,
+    net::Ipv4Addr,
+    rc::Rc,
+    sync::{Arc, atomic::Ordering},
+    time::Duration,
+};
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
@@ -12,7 +18,7 @@ use socket2::SockRef;
 
 use super::bench::{ByHand, Cable, NINE, Node, next, pair, run};
 use crate::{
-    gncl::{LinkFact, core::write, link, listener, pace::Pace, peer::frame},
+    gncl::{LinkFact, core::write, lent::Lent, link, listener, pace::Pace, peer::frame},
     session::Ack,
     sync,
 };
@@ -314,7 +320,7 @@ fn both_ends_of_a_connection_give_it_up_when_nothing_is_taken_any_more() {
         let give_up = Duration::from_millis(1_234);
         let listener = listener::listen(([127, 0, 0, 1], 0).into()).expect("loopback has a free port");
         let address = listener.local_addr().expect("it is bound");
-        let listener = tokio::net::TcpListener::from_std(listener).expect("it does not block");
+        let listener = Lent::of(&Arc::new(listener)).expect("it does not block");
         let pace = Rc::new(RefCell::new(Pace::new(Time::now())));
         let mut accepted = Box::pin(listener::accepted(listener, give_up, pace));
         let dialled =

@@ -1,6 +1,6 @@
 //! Nodes that prove who they are, and what those are told that do not.
 
-use std::time::Duration;
+use std::{sync::Arc, time::Duration};
 
 use sinew_runtime::{
     outcome::Outcome,
@@ -45,21 +45,31 @@ impl Node {
         (keys, made_for): (&Authority, u32),
         set: impl FnOnce(&mut NodeConfig),
     ) -> Self {
-        let mut config = NodeConfig::new(format!("node-{number}"));
-        config.address = Some(NodeAddress::new(number));
-        set(&mut config);
-        let (project, name) = (config.project.clone(), format!("node-{made_for}"));
-        let made_for = Identity { project, address: NodeAddress::new(made_for), name };
-        let stores = Stores::for_test(config, life);
-        let credentials = keys.credentials_of(&made_for);
-        let secured = Secured::new(ground::tls(&credentials), &credentials, 8, life);
-        assert!(stores.secured.set(secured).is_ok(), "it is set once");
-        Self::begin(stores).await
+        Self::begin(secured_stores(life, number, (keys, made_for), set)).await
     }
 }
 
+/// The stores of such a node.
+pub(super) fn secured_stores(
+    life: Incarnation,
+    number: u32,
+    (keys, made_for): (&Authority, u32),
+    set: impl FnOnce(&mut NodeConfig),
+) -> Arc<Stores> {
+    let mut config = NodeConfig::new(format!("node-{number}"));
+    config.address = Some(NodeAddress::new(number));
+    set(&mut config);
+    let (project, name) = (config.project.clone(), format!("node-{made_for}"));
+    let made_for = Identity { project, address: NodeAddress::new(made_for), name };
+    let stores = Stores::for_test(config, life);
+    let credentials = keys.credentials_of(&made_for);
+    let secured = Secured::new(ground::tls(&credentials), &credentials, 8, life);
+    assert!(stores.secured.set(secured).is_ok(), "it is set once");
+    stores
+}
+
 /// As the name of its test nodes' project.
-fn keys() -> Authority {
+pub(super) fn keys() -> Authority {
     Authority::new("sinew")
 }
 

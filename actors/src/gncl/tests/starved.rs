@@ -1,0 +1,127 @@
+//! A life of this layer that begins while its process has no descriptor left.
+
+use std::{
+    cell::Cell,
+    fs::File,
+    process::{Command, Stdio},
+    rc::Rc,
+    sync::Arc,
+    thread,
+    time::Duration,
+};
+
+use actix::{Actor, ActorContext, Addr, AsyncContext};
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+use sinew_runtime::{
+    supervision::ReadyGate,
+    tid::{Incarnation, NodeAddress},
+    wire::Kind,
+};
+use tokio::net::TcpStream;
+
+use super::{
+    bench::{ByHand, NINE, introduction, run, within},
+    secured::{keys, secured_stores},
+};
+use crate::{
+    config::NodeConfig,
+    gncl::{Gncl, core::write, peer::frame},
+    stores::Stores,
+};
+
+/// Tells a test that it is alone in its process.
+const ALONE: &str = "SINEW_TEST_IS_ALONE";
+
+/// Runs the calling test in a process of its own: what it does there to its limits is nothing to other tests.
+fn alone(test: impl Future<Output = ()>) {
+    if std::env::var_os(ALONE).is_some() {
+        return run(test);
+    }
+    let this = thread::current();
+    let program = std::env::current_exe().expect("a test has a path");
+    let mut command = Command::new(program);
+    command.args(["--exact", this.name().expect("a test's thread has its name")]).env(ALONE, "1");
+    let ended = command.stdin(Stdio::null()).output().expect("a test can be started");
+    assert!(
+        ended.status.success(),
+        "{}\n{}",
+        String::from_utf8_lossy(&ended.stdout),
+        String::from_utf8_lossy(&ended.stderr)
+    );
+}
+
+/// A life of the layer on this thread, as the IO thread has them one after the other.
+struct Life(Addr<Gncl>, Rc<Cell<bool>>);
+
+impl Life {
+    async fn begin(stores: &Arc<Stores>) -> Self {
+        let (say, ready) = tokio::sync::oneshot::channel();
+        let gate = ReadyGate::new(move || say.send(()).expect("the test waits"));
+        let (stores, is_over) = (stores.clone(), Rc::new(Cell::new(false)));
+        let over = is_over.clone();
+        let layer = Gncl::create(move |ctx| {
+            ctx.run_interval(Duration::from_millis(1), move |_, ctx| {
+                if over.get() {
+                    ctx.stop();
+                }
+            });
+            Gncl::new(stores, gate)
+        });
+        within("GNCL to be ready", ready).await.expect("GNCL says that it is ready");
+        Self(layer, is_over)
+    }
+
+    async fn end(self) {
+        self.1.set(true);
+        within("the layer to end", async {
+            while self.0.connected() {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+    }
+}
+
+/// As long as it lives, no descriptor is left: those that there may be are its own.
+struct Starved(Rlimit, Vec<File>);
+
+impl Starved {
+    fn begin() -> Self {
+        const FEW: u64 = 256;
+        let limit = getrlimit(Resource::Nofile);
+        setrlimit(Resource::Nofile, Rlimit { current: Some(FEW), ..limit }).expect("less is always allowed");
+        let taken: Vec<_> = std::iter::from_fn(|| File::open("/dev/null").ok()).collect();
+        assert!(!taken.is_empty(), "the test has fewer than {FEW}");
+        Self(limit, taken)
+    }
+}
+
+impl Drop for Starved {
+    fn drop(&mut self) {
+        setrlimit(Resource::Nofile, self.0).expect("it was so before");
+        self.1.clear();
+    }
+}
+
+#[test]
+fn a_life_that_begins_while_no_descriptor_is_left_listens_as_the_former_one_did() {
+    alone(async {
+        let mut config = NodeConfig::new("node-1");
+        config.address = Some(NodeAddress::new(1));
+        let open = Stores::for_test(config, Incarnation(1));
+        let secured = secured_stores(Incarnation(1), 2, (&keys(), 2), |_| {});
+        for (stores, answer) in [(open, Kind::GNCL_WELCOME), (secured, Kind::GNCL_REFUSAL)] {
+            Life::begin(&stores).await.end().await;
+            let starved = Starved::begin();
+            let life = Life::begin(&stores).await;
+            drop(starved);
+            let at = *stores.gncl_listen.get().expect("GNCL listens");
+            let socket = within("a connection", TcpStream::connect(at)).await.expect("it listens");
+            let mut peer = ByHand::on(socket);
+            let hello = introduction(stores.node);
+            peer.say(&frame(NINE, stores.node, Kind::GNCL_HELLO, write(&hello))).await;
+            assert_eq!(peer.hear().await.header.kind, answer);
+            life.end().await;
+        }
+    });
+}
