@@ -11,8 +11,9 @@
 //!
 //! Messages that come faster than a write each would carry them wait, too: the drainer writes many at once (`batch.rs`).
 //!
-//! All of it stands under one mutex. Receipts are never settled and nobody is woken with it in hand, because whoever
-//! is told may submit to this very outlet.
+//! All of it stands under one mutex, but for what waits for its outcome (`outstanding.rs`): whoever writes holds it for as long as the system
+//! lets him, and who hears of outcomes may carry Control. Receipts are never settled and nobody is woken with it in hand, because whoever is
+//! told may submit to this very outlet.
 
 mod account;
 mod after;
@@ -36,7 +37,10 @@ mod waiting;
 use std::{
     future::poll_fn,
     io::{self, IoSlice},
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError, TryLockError,
+        atomic::{AtomicU32, AtomicU64, Ordering},
+    },
     task::{Context, Poll, Waker},
 };
 
@@ -55,9 +59,11 @@ pub(crate) use account::{OutletAccount, Taking};
 use after::After;
 pub(crate) use batch::Gathering;
 use draining::Drained;
+use expiry::OUTCOME_GRACE;
 use half::{Bound, Half, Step};
 pub(crate) use held::{destination_of, line_of};
 pub(crate) use outcomes::{OUTCOMES_MAX, read as read_outcomes};
+use outstanding::Open;
 pub(crate) use resume::Session;
 
 /// A non-blocking socket, or what is like one, that can be written to from any thread.
@@ -213,24 +219,39 @@ pub(crate) enum Left {
 /// none, messages wait.
 pub(crate) struct StreamOutlet<S> {
     half: Mutex<Half<S>>,
+    /// What waits for its outcome, without that lock.
+    open: Arc<Open>,
+    /// No waiting message expires before this, in nanoseconds, as was known when the lock was free last.
+    next_expiry: AtomicU64,
+    /// How often in a row the lock was not free when it was looked for what has expired.
+    passed_by: AtomicU32,
 }
+
+/// So often in a row it is not waited for somebody who writes when it is looked for what has expired. The next time it is.
+const PASSED_BY_MAX: u32 = 2;
 
 impl<S: Socket> StreamOutlet<S> {
     /// An outlet without a connection.
     pub(crate) fn new(limits: OutletLimits) -> Self {
-        Self { half: Mutex::new(Half::new(limits, None)) }
+        Self::of(Half::new(limits, None))
     }
 
     /// An outlet without a connection, whose waiting messages count in a budget that it shares with others.
     pub(crate) fn sharing(limits: OutletLimits, budget: Arc<Budget>) -> Self {
         let mut half = Half::new(limits, None);
         half.share(budget);
-        Self { half: Mutex::new(half) }
+        Self::of(half)
     }
 
     /// An outlet whose messages arrive once and in order, however many connections it takes.
     pub(crate) fn with_session(limits: OutletLimits, session: Session) -> Self {
-        Self { half: Mutex::new(Half::new(limits, Some(session))) }
+        Self::of(Half::new(limits, Some(session)))
+    }
+
+    fn of(half: Half<S>) -> Self {
+        let open = half.receipts.clone();
+        let next_expiry = AtomicU64::new(half.next_expiry.as_nanos());
+        Self { half: Mutex::new(half), open, next_expiry, passed_by: AtomicU32::new(0) }
     }
 
     /// The epoch in which it counts what it sends; 0 without a session.
@@ -370,18 +391,42 @@ impl<S: Socket> StreamOutlet<S> {
 
     /// Settles what has expired by `now` while it waited. Returns whether anything is left that can expire.
     pub(crate) fn expire(&self, now: Time) -> bool {
-        self.with(|half, after| half.expire(now, after))
+        let mut after = After::default();
+        self.open.give_up_overdue(now, OUTCOME_GRACE, &mut after);
+        after.run();
+        // SYNC: Relaxed; what was put there since is found the next time.
+        if self.open.len() > 0 && now.as_nanos() <= self.next_expiry.load(Ordering::Relaxed) {
+            return true;
+        }
+        let half = match self.half.try_lock() {
+            Ok(half) => half,
+            Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
+            // SYNC: Relaxed; one thread looks.
+            Err(TryLockError::WouldBlock)
+                if self.passed_by.fetch_add(1, Ordering::Relaxed) < PASSED_BY_MAX =>
+            {
+                return true;
+            }
+            Err(TryLockError::WouldBlock) => self.lock(),
+        };
+        self.passed_by.store(0, Ordering::Relaxed);
+        self.step(half, |half, after| half.expire(now, after))
     }
 
     /// The peer says what became of the message that `ticket` names. Returns whether that message was waited for.
     pub(crate) fn confirm(&self, ticket: Ticket, outcome: Outcome) -> bool {
-        self.with(|half, after| half.confirm(ticket, outcome, after))
+        let mut after = After::default();
+        let is_waited_for = self.open.confirm(ticket, outcome, &mut after);
+        after.run();
+        is_waited_for
     }
 
     /// The same of several, in one go; those that were not waited for are left.
     pub(crate) fn confirm_all(&self, outcomes: &mut Vec<(Ticket, Outcome)>) {
         if !outcomes.is_empty() {
-            self.with(|half, after| half.confirm_all(outcomes, after));
+            let mut after = After::default();
+            self.open.confirm_all(outcomes, &mut after);
+            after.run();
         }
     }
 
@@ -419,13 +464,28 @@ impl<S: Socket> StreamOutlet<S> {
 
     /// Confirmed messages whose outcome is not known yet.
     pub(crate) fn unconfirmed(&self) -> usize {
-        self.lock().unconfirmed()
+        self.open.len()
     }
 
     /// Runs `step` under the lock, and what it puts off after it.
     fn with<R>(&self, step: impl FnOnce(&mut Half<S>, &mut After) -> R) -> R {
+        self.step(self.lock(), step)
+    }
+
+    fn step<R>(
+        &self,
+        mut half: MutexGuard<'_, Half<S>>,
+        step: impl FnOnce(&mut Half<S>, &mut After) -> R,
+    ) -> R {
         let mut after = After::default();
-        let result = step(&mut self.lock(), &mut after);
+        let result = step(&mut half, &mut after);
+        if !half.said.is_empty() {
+            after.settle(half.said.drain(..));
+            half.receipts.fewer_are_open(&mut after);
+        }
+        // SYNC: Relaxed; see `expire`.
+        self.next_expiry.store(half.next_expiry.as_nanos(), Ordering::Relaxed);
+        drop(half);
         after.run();
         result
     }

@@ -11,21 +11,13 @@ use sinew_runtime::{
 use super::{Socket, after::After, half::Half, outstanding::owed_by};
 
 /// Time after a sent message's time to live in which its outcome may still come.
-const OUTCOME_GRACE: Duration = Duration::from_secs(1);
+pub(super) const OUTCOME_GRACE: Duration = Duration::from_secs(1);
 
 impl<S: Socket> Half<S> {
     pub(super) fn expired(&mut self, message: Message, after: &mut After) {
         self.counts.expired += 1;
         after.settle(message.receipt.map(|receipt| (receipt, Outcome::Expired)));
-        self.fewer_are_open(after);
-    }
-
-    /// Outcomes that are long overdue do not come any more; their places are needed. By then the senders have stopped
-    /// waiting.
-    fn give_up_overdue(&mut self, now: Time, after: &mut After) {
-        let overdue = self.receipts.take_overdue(now, OUTCOME_GRACE);
-        after.settle(overdue.into_iter().map(|receipt| (receipt, Outcome::Unknown)));
-        self.fewer_are_open(after);
+        self.receipts.fewer_are_open(after);
     }
 
     /// Nobody waits any more for the reply to this request: its time is over, if it has not been begun. Returns whether it waited here.
@@ -41,7 +33,6 @@ impl<S: Socket> Half<S> {
 
     /// Returns whether anything is left that can expire, or an outcome that may be overdue one day.
     pub(super) fn expire(&mut self, now: Time, after: &mut After) -> bool {
-        self.give_up_overdue(now, after);
         if now > self.next_expiry {
             self.expire_waiting(now, after);
         }

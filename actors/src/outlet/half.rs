@@ -4,9 +4,8 @@ use std::{collections::VecDeque, io, sync::Arc, task::Waker};
 
 use sinew_runtime::{
     mailbox::{Bounds, Budget, ClassQueue},
-    outcome::{Outcome, Rejection},
+    outcome::{Outcome, Receipt, Rejection},
     router::Refused,
-    tid::Tid,
     time::Time,
     wire::{Checksum, Class, Flags, Kind, Message},
 };
@@ -17,7 +16,7 @@ use super::{
     after::After,
     batch::{Pace, is_left_to_the_drainer, is_patient},
     outcomes::messages_in,
-    outstanding::{Outstanding, Sent, owed_by},
+    outstanding::{Open, Sent, Shares, owed_by},
     partial::{Partial, Sort, Written},
     resume::Session,
     waiting::Waiting,
@@ -67,9 +66,9 @@ pub(super) struct Half<S> {
     /// No waiting message expires before this.
     pub(super) next_expiry: Time,
     /// Confirmed messages that wait, and receipts of those that were sent.
-    pub(super) receipts: Outstanding,
-    /// Who waits until fewer of them are open, and for which destination.
-    pub(super) outcomes_awaited: Option<(Tid, Waker)>,
+    pub(super) receipts: Arc<Open>,
+    /// What the peer has said of messages before their writes had returned, to be settled when the lock is free again.
+    pub(super) said: Vec<(Receipt, Outcome)>,
     pub(super) drainer: Option<Waker>,
     pub(super) pace: Pace,
     pub(super) counts: OutletCounts,
@@ -83,6 +82,7 @@ pub(super) struct Half<S> {
 
 impl<S: Socket> Half<S> {
     pub(super) fn new(limits: OutletLimits, session: Option<Session>) -> Self {
+        let receipts = Arc::new(Open::new(Shares::of(limits, session.as_ref())));
         Self {
             limits,
             payload_max: limits.payload_max,
@@ -96,8 +96,8 @@ impl<S: Socket> Half<S> {
             last: None,
             finishing: false,
             next_expiry: Time::MAX,
-            receipts: Outstanding::default(),
-            outcomes_awaited: None,
+            receipts,
+            said: Vec::new(),
             drainer: None,
             pace: Pace::new(),
             counts: OutletCounts::default(),
@@ -165,7 +165,7 @@ impl<S: Socket> Half<S> {
     /// What was sent and not confirmed may have been handled or not.
     pub(super) fn unknown(&mut self, after: &mut After) {
         after.settle(self.receipts.take_all().map(|sent| (sent.receipt, Outcome::Unknown)));
-        after.room.extend(self.outcomes_awaited.take().map(|(_, waker)| waker));
+        after.room.extend(self.receipts.awaited_no_more());
     }
 
     /// The frame that was being written goes out on the next connection.
@@ -356,9 +356,7 @@ impl<S: Socket> Half<S> {
         } else if confirmed && message.header.class == Class::Stream {
             // It may be superseded, and then there is no outcome that tells the truth.
             Err(Rejection::Unsupported)
-        } else if confirmed
-            && bound == Bound::Kept
-            && self.has_too_many_unconfirmed(message.header.destination)
+        } else if confirmed && bound == Bound::Kept && self.receipts.has_too_many(message.header.destination)
         {
             Err(Rejection::QueueFull)
         } else {
@@ -391,9 +389,7 @@ impl<S: Socket> Half<S> {
     pub(super) fn is_offered_again(&mut self, message: &Message, room: Option<&Waker>, after: &mut After) {
         self.counts.refused -= 1;
         let destination = message.header.destination;
-        if message.receipt.is_some() && self.has_too_many_unconfirmed(destination) {
-            self.outcomes_awaited = room.map(|room| (destination, room.clone()));
-        } else {
+        if message.receipt.is_none() || !self.receipts.await_fewer(destination, room) {
             after.room.extend(room.and_then(|room| self.queue.offered(message, room)));
         }
     }
@@ -423,10 +419,18 @@ impl<S: Socket> Half<S> {
 
     pub(super) fn write(&mut self, frame: &mut Partial) -> Written {
         let Link::Up(socket) = &mut self.link else { return Written::Broken };
-        match frame.write_to(socket) {
+        let ticket = frame.message.receipt.as_ref().map(Receipt::ticket);
+        // Its outcome may come before the write has returned, and finds no lock that is held meanwhile.
+        ticket.into_iter().for_each(|ticket| self.receipts.writes(ticket));
+        let written = match frame.write_to(socket) {
             Ok(written) => written,
             Err(error) => self.note(error),
+        };
+        if ticket.is_some() && !matches!(written, Written::Whole) {
+            // Nobody can have handled it: who says so is not heeded.
+            self.receipts.writes_no_more();
         }
+        written
     }
 
     /// A write has failed: for now, or for good.
@@ -458,7 +462,7 @@ impl<S: Socket> Half<S> {
         let expiry = frame.message.header.expiry();
         if let Some(receipt) = frame.message.receipt {
             let written = if let Link::Up(socket) = &mut self.link { socket.account().written } else { 0 };
-            self.receipts.sent(Sent { receipt, expiry, written });
+            self.said.extend(self.receipts.sent(Sent { receipt, expiry, written }));
         }
     }
 
@@ -469,10 +473,6 @@ impl<S: Socket> Half<S> {
             + self.urgent.len()
             + self.behind()
             + single.into_iter().filter(|waits| *waits).count()
-    }
-
-    pub(super) fn unconfirmed(&self) -> usize {
-        self.receipts.open()
     }
 
     pub(super) const fn counts(&self) -> OutletCounts {

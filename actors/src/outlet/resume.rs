@@ -209,7 +209,7 @@ impl<S: Socket> Half<S> {
                 self.tally.void_superseded += 1;
             }
             if message.header.flags.has(Flags::CONFIRM) {
-                self.confirm(message.ticket(), Outcome::Expired, after);
+                self.receipts.confirm(message.ticket(), Outcome::Expired, after);
             }
         }
     }

@@ -24,6 +24,7 @@ use super::*;
 mod accounts;
 mod anew;
 mod audits;
+mod beside;
 mod floods;
 mod holding;
 mod many_held;
