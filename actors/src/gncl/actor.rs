@@ -19,7 +19,8 @@ use std::{
     time::Duration,
 };
 
-use actix::{Actor, ActorFutureExt, AsyncContext, Context, Running, SpawnHandle, StreamHandler, fut};
+use actix::{Actor, AsyncContext, Context, Running, SpawnHandle, StreamHandler, fut};
+use futures_util::stream;
 use sinew_runtime::{
     supervision::ReadyGate,
     tid::NodeAddress,
@@ -33,9 +34,10 @@ use super::{
         Attach, CANCEL, CLASSES, ConnectionId, Core, DATAGRAMS, Decline, GUARD, Input, Introduction, Lane,
         OUTCOMES, Output, Refusal, Settings, read, write,
     },
+    crowd::Crowd,
     datagrams,
     inbound::Inbound,
-    link::{self, Ends, Mode, News, Reading, SharedMode, What},
+    link::{self, Ends, Heard, Mode, News, Reading, SharedMode, What},
     listener, marks,
     pace::Pace,
     peer::{Store, frame},
@@ -62,6 +64,8 @@ pub(crate) struct Gncl {
     ready: Option<ReadyGate>,
     core: Core,
     wires: BTreeMap<ConnectionId, Wire>,
+    /// What they have to say.
+    crowd: Crowd<News>,
     spin: Arc<Spin>,
     /// How peers prove who they are; `None`: they do not.
     secure: Option<Arc<Secure>>,
@@ -83,6 +87,7 @@ impl Gncl {
             ready: Some(ready),
             core,
             wires: BTreeMap::new(),
+            crowd: Crowd::default(),
             spin,
             secure: None,
             alarm: None,
@@ -98,14 +103,29 @@ impl Gncl {
     }
 
     fn input(&mut self, input: Input, ctx: &mut Context<Self>) {
-        // News of life puts the next alarm off, or is followed by a ping in a second at the earliest: the link's own is due by then.
-        let may_wake_earlier = !matches!(input, Input::Heard(_));
+        self.say_who_was_heard(&input);
         self.core.handle(Time::now(), input);
         while let Some(output) = self.core.poll() {
             self.obey(output, ctx);
         }
-        if may_wake_earlier {
-            self.set_alarm(ctx);
+        self.set_alarm(ctx);
+    }
+
+    /// What follows from the time, or from a sign of life, depends on when messages came: the core is told so before, of whomever it is about,
+    /// and not with each message.
+    fn say_who_was_heard(&mut self, before: &Input) {
+        let Self { core, wires, .. } = self;
+        let mut say = |connection: ConnectionId, wire: &mut Wire| {
+            if let Some(at) = wire.heard() {
+                core.handle(at, Input::Heard(connection, at));
+            }
+        };
+        if matches!(before, Input::TimePassed) {
+            wires.iter_mut().for_each(|(connection, wire)| say(*connection, wire));
+        } else if let Input::PingReceived(connection) | Input::PongReceived(connection) = before
+            && let Some(wire) = wires.get_mut(connection)
+        {
+            say(*connection, wire);
         }
     }
 
@@ -125,10 +145,10 @@ impl Gncl {
 
     fn obey(&mut self, output: Output, ctx: &mut Context<Self>) {
         match output {
-            Output::Dial { connection, address } => self.dial(connection, address, ctx),
+            Output::Dial { connection, address } => self.dial(connection, address),
             Output::SendHello(connection, hello) => self.send_hello(connection, &hello, ctx),
-            Output::Attach(attach) => self.attach(&attach, ctx),
-            Output::Detach { connection, node, lane } => self.detach(connection, (node, lane), ctx),
+            Output::Attach(attach) => self.attach(&attach),
+            Output::Detach { connection, node, lane } => self.detach(connection, (node, lane)),
             Output::Refuse(connection, refusal) => self.refuse(connection, &refusal, ctx),
             Output::Close(connection) => self.close(connection, ctx),
             Output::SendPing(node, lane) => self.send(node, lane, Kind::GNCL_PING),
@@ -143,18 +163,20 @@ impl Gncl {
         }
     }
 
-    fn dial(&mut self, connection: ConnectionId, address: SocketAddr, ctx: &mut Context<Self>) {
+    fn dial(&mut self, connection: ConnectionId, address: SocketAddr) {
         let mode = Arc::new(Mutex::new(Mode::Handshake));
         let reading = self.reading(&mode);
         let ends = Ends::of(address, lock(&self.stores.ndl).paths());
-        let reader = ctx.add_stream(link::dial(connection, ends, reading));
-        self.wires.insert(connection, Wire::new(None, mode, reader, self.secure.is_none()));
+        let shared = (mode, reading.heard.clone());
+        let reader = self.crowd.join(link::dial(connection, ends, reading));
+        self.wires.insert(connection, Wire::new(None, shared, reader, self.secure.is_none()));
     }
 
     fn reading(&self, mode: &SharedMode) -> Reading {
         let NodeConfig { payload_max, gncl, .. } = &self.stores.config;
         let (payload_max, give_up) = (*payload_max, gncl.give_up);
-        Reading { mode: mode.clone(), payload_max, give_up, secure: self.secure.clone() }
+        let (mode, heard) = (mode.clone(), Heard::default());
+        Reading { mode, heard, payload_max, give_up, secure: self.secure.clone() }
     }
 
     fn send_hello(&mut self, connection: ConnectionId, hello: &Introduction, ctx: &mut Context<Self>) {
@@ -193,7 +215,7 @@ impl Gncl {
         wire.tasks.push(ctx.spawn(fut::wrap_future(task)));
     }
 
-    fn attach(&mut self, attach: &Attach, ctx: &mut Context<Self>) {
+    fn attach(&mut self, attach: &Attach) {
         let Attach { connection, node, lane, .. } = *attach;
         self.confirm(attach);
         let welcome = attach.welcome.clone().map(|words| {
@@ -225,23 +247,20 @@ impl Gncl {
                 way.outlet.drain_by_turns(link, || there.end_turn()).await;
             }
         });
-        let drainer = fut::wrap_future::<_, Self>(task::end_of(drainer));
-        let drainer = ctx.spawn(drainer.map(move |_, actor, ctx| actor.ended(connection, ctx)));
-        wire.link = Some((link, drainer));
+        let drainer = stream::once(async move {
+            task::end_of(drainer).await;
+            News { connection, what: What::Ended }
+        });
+        wire.link = Some((link, self.crowd.join(drainer)));
         if lane == Lane::Stream {
             self.announce_datagrams(attach);
         }
     }
 
-    fn detach(
-        &mut self,
-        connection: ConnectionId,
-        (node, lane): (NodeAddress, Lane),
-        ctx: &mut Context<Self>,
-    ) {
+    fn detach(&mut self, connection: ConnectionId, (node, lane): (NodeAddress, Lane)) {
         let Some(wire) = self.wires.get_mut(&connection) else { return };
-        let Some((link, drainer)) = wire.link.take() else { return };
-        ctx.cancel_future(drainer);
+        // The drainer goes with it.
+        let Some((link, _drainer)) = wire.link.take() else { return };
         if let Some(peer) = self.stores.gncl.peer(node)
             && let Some(way) = peer.way(lane)
         {
@@ -252,8 +271,8 @@ impl Gncl {
 
     fn close(&mut self, connection: ConnectionId, ctx: &mut Context<Self>) {
         let Some(wire) = self.wires.remove(&connection) else { return };
-        let drainer = wire.link.map(|(_, drainer)| drainer);
-        for task in wire.tasks.into_iter().chain(drainer) {
+        // Its reader goes with it.
+        for task in wire.tasks {
             ctx.cancel_future(task);
         }
         if let Some(transport) = wire.transport {
@@ -307,7 +326,7 @@ impl Gncl {
         let input =
             self.input_of(connection, message).unwrap_or_else(|decline| Input::Violated(connection, decline));
         if !matches!(input, Input::Violated(..) | Input::PingReceived(_) | Input::PongReceived(_)) {
-            self.input(Input::Heard(connection), ctx);
+            self.input(Input::Heard(connection, Time::now()), ctx);
             self.peer_speaks(message.header.source.node);
         }
         if matches!(input, Input::GoodbyeReceived(_)) {
@@ -407,6 +426,7 @@ impl Actor for Gncl {
             .listen()
             .unwrap_or_else(|error| panic!("{}", listener::why_not(&self.stores.config, &error)));
         self.cut_all();
+        ctx.add_stream(self.crowd.news());
         self.tell_what_was_cut(ctx);
         self.catch_up(ctx);
         let pace = Rc::new(RefCell::new(Pace::new(Time::now())));
@@ -477,7 +497,6 @@ impl StreamHandler<News> for Gncl {
                 self.close(connection, ctx);
             }
             What::Frame(message) => self.frame_came(connection, &message, ctx),
-            What::Heard => self.input(Input::Heard(connection), ctx),
             What::Carried => self.input(Input::Carried(connection), ctx),
             What::Violated(decline) => self.input(Input::Violated(connection, decline), ctx),
             What::Ended => self.ended(connection, ctx),

@@ -4,7 +4,10 @@ use std::{
     cmp::Reverse,
     io,
     net::{IpAddr, Ipv6Addr, SocketAddr},
-    sync::{Arc, Mutex},
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicU64, Ordering},
+    },
     time::Duration,
 };
 
@@ -66,8 +69,6 @@ pub(super) enum What {
     DialFailed(io::Error),
     /// A frame of GNCL itself.
     Frame(Message),
-    /// Frames came, and were delivered.
-    Heard,
     /// Messages pass on this link, one way or the other. Told once.
     Carried,
     /// Bytes came that cannot be used.
@@ -90,6 +91,21 @@ pub(super) enum Mode {
 
 /// Set by the shell while it handles the news of the connection, before the next frame is looked at.
 pub(super) type SharedMode = Arc<Mutex<Mode>>;
+
+/// When messages of the peer were read last, in nanoseconds; 0: never. The shell looks when it needs to know, and is not woken for it.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Heard(Arc<AtomicU64>);
+
+impl Heard {
+    // SYNC: Relaxed, here and below; nothing else becomes visible with it.
+    fn at(&self, now: Time) {
+        self.0.store(now.as_nanos(), Ordering::Relaxed);
+    }
+
+    pub(super) fn last(&self) -> Time {
+        Time::from_nanos(self.0.load(Ordering::Relaxed))
+    }
+}
 
 /// Where a dial goes, and from which address of this host; `None`: the system chooses.
 #[derive(Clone, Copy, Debug)]
@@ -147,6 +163,7 @@ pub(super) fn read(
 /// How a connection is read.
 pub(super) struct Reading {
     pub(super) mode: SharedMode,
+    pub(super) heard: Heard,
     /// Longest payload on a link, in bytes.
     pub(super) payload_max: usize,
     /// See [`tune`].
@@ -258,8 +275,6 @@ pub(super) struct Reader {
     codec: FrameCodec,
     reading: Reading,
     place: Place,
-    /// Frames were delivered of which the shell does not know yet.
-    heard: bool,
     /// The peer has said what it takes next.
     greeted: bool,
     /// The shell knows that messages pass.
@@ -290,7 +305,6 @@ impl Reader {
             codec: FrameCodec::new(HANDSHAKE_PAYLOAD_MAX),
             reading,
             place: Place::Here,
-            heard: false,
             greeted: false,
             carried: false,
             turn: 0,
@@ -307,7 +321,6 @@ impl Reader {
                 Look::Tell(what) => return Some(what),
                 Look::Again => self.give_way().await,
                 Look::Moves => return None,
-                Look::Empty if std::mem::take(&mut self.heard) => return Some(What::Heard),
                 Look::Empty => match self.fill().await {
                     Ok(()) => {}
                     // What came was not sealed by the peer, or says that it does not take this node.
@@ -368,7 +381,7 @@ impl Reader {
                     return Look::Tell(What::Violated(decline(&FrameError::TooLong { said, limit })));
                 }
                 (Ok(Some(message)), Mode::Linked(inbound)) if !is_for_the_shell(&message) => {
-                    self.heard = true;
+                    self.reading.heard.at(now);
                     let is_a_word = message.header.kind == Kind::GNCL_DATAGRAMS;
                     if let Err(decline) = inbound.receive(now, message) {
                         return Look::Tell(What::Violated(decline));
@@ -465,6 +478,7 @@ mod tests {
         let (socket, _) = listener.accept().await.unwrap();
         let reading = Reading {
             mode: Arc::new(Mutex::new(Mode::Discard)),
+            heard: Heard::default(),
             payload_max: HANDSHAKE_PAYLOAD_MAX,
             give_up: Duration::from_secs(5),
             secure: None,

@@ -33,6 +33,7 @@
 //! | `task.rs` | the tasks that read and write a link, one each |
 //! | `bulk.rs` | the thread of those of Bulk |
 //! | `courtesy.rs` | when that thread gives its CPU away |
+//! | `crowd.rs` | what all connections have to say to the shell, as one stream |
 //! | `arrivals.rs` | what became of what came, counted |
 //! | `inbound.rs` | what is checked before a frame becomes a message of this node |
 //! | `untold.rs` | what other layers have not been told of links, because their posts were full |
@@ -53,6 +54,7 @@ mod arrivals;
 mod bulk;
 mod core;
 mod courtesy;
+mod crowd;
 mod datagrams;
 mod facts;
 #[cfg(feature = "fuzzing")]

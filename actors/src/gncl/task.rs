@@ -1,7 +1,7 @@
 //! The tasks of a link: one reads and delivers, one writes what waits. They are no part of the actor, which hears of them only what
 //! it must know: a message costs the turn of one task, however many links there are.
 
-use std::{panic, sync::Arc, thread, time::Duration};
+use std::{panic, sync::Arc, thread};
 
 use sinew_runtime::time::Time;
 use tokio::{runtime::Handle, sync::mpsc, task};
@@ -15,8 +15,6 @@ use super::{
 
 /// News of a link that wait for the shell at most. While there are so many, nothing is read.
 const NEWS_MAX: usize = 8;
-/// How often the shell is told that the peer lives: a quarter of the time after which it would ask.
-const HEARD_PERIOD: Duration = Duration::from_millis(250);
 
 /// Where a link's tasks are.
 #[derive(Clone)]
@@ -103,15 +101,7 @@ impl ReadingTask {
 }
 
 async fn read(mut reader: Reader, say: mpsc::Sender<What>) {
-    let mut told = Time::ZERO;
     while let Some(what) = reader.next().await {
-        if matches!(what, What::Heard) {
-            let now = Time::now();
-            if now.since(told) < HEARD_PERIOD {
-                continue;
-            }
-            told = now;
-        }
         if say.send(what).await.is_err() {
             return;
         }

@@ -6,7 +6,7 @@ use std::{
     sync::{Arc, Mutex},
 };
 
-use actix::{AsyncContext, Context, StreamHandler};
+use actix::{Context, StreamHandler};
 use sinew_runtime::time::Time;
 use tokio::net::TcpStream;
 
@@ -63,8 +63,9 @@ impl Gncl {
         let (connection, transport) = (self.core.open(), Transport::open(socket));
         let mode = Arc::new(Mutex::new(Mode::Handshake));
         let reading = self.reading(&mode);
-        let reader = ctx.add_stream(link::read(connection, transport.clone(), reading));
-        self.wires.insert(connection, Wire::new(Some(transport), mode, reader, self.secure.is_none()));
+        let shared = (mode, reading.heard.clone());
+        let reader = self.crowd.join(link::read(connection, transport.clone(), reading));
+        self.wires.insert(connection, Wire::new(Some(transport), shared, reader, self.secure.is_none()));
         self.input(Input::Accepted(connection, from.ip()), ctx);
     }
 }

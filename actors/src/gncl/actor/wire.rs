@@ -1,9 +1,11 @@
 //! A connection as the shell has it.
 
 use actix::SpawnHandle;
+use sinew_runtime::time::Time;
 
 use super::super::{
-    link::{Mode, SharedMode},
+    crowd::Member,
+    link::{Heard, Mode, SharedMode},
     transport::Transport,
 };
 use crate::{outlet::LinkNumber, security::Peer, stores::lock};
@@ -17,20 +19,41 @@ pub(super) struct Wire {
     pub(super) datagrams_made: u64,
     pub(super) mode: SharedMode,
     /// Which of its peer's connections it is, and what writes there, as long as it is a link.
-    pub(super) link: Option<(LinkNumber, SpawnHandle)>,
+    pub(super) link: Option<(LinkNumber, Member)>,
     /// Whether what was written so far ends with a whole frame, so that words can follow; where peers prove who they are, not before that.
     pub(super) may_speak: bool,
     pub(super) tasks: Vec<SpawnHandle>,
+    heard: Heard,
+    /// Of that, what the core was told.
+    told: Time,
+    _reader: Member,
 }
 
 impl Wire {
     pub(super) fn new(
         transport: Option<Transport>,
-        mode: SharedMode,
-        reader: SpawnHandle,
+        (mode, heard): (SharedMode, Heard),
+        reader: Member,
         may_speak: bool,
     ) -> Self {
-        Self { transport, proven: None, datagrams_made: 0, mode, link: None, may_speak, tasks: vec![reader] }
+        Self {
+            transport,
+            proven: None,
+            datagrams_made: 0,
+            mode,
+            link: None,
+            may_speak,
+            tasks: Vec::new(),
+            heard,
+            told: Time::ZERO,
+            _reader: reader,
+        }
+    }
+
+    /// When messages were read last, if that was not said before.
+    pub(super) fn heard(&mut self) -> Option<Time> {
+        let last = self.heard.last();
+        (std::mem::replace(&mut self.told, last) < last).then_some(last)
     }
 
     pub(super) fn set_mode(&self, mode: Mode) {

@@ -65,12 +65,17 @@ pub(super) struct Link {
 /// When a connection was last known to live.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pulse {
-    pub(super) heard: Time,
+    heard: Time,
+    /// When more was heard than a sign of life.
+    carried: Time,
     /// Pings since something was heard.
-    pub(super) pings: u32,
+    pings: u32,
     /// What was heard says only that it lives, and it may be left alone for longer.
     is_at_rest: bool,
 }
+
+/// Pings are due at multiples of this: those of many links are one alarm. They are so much earlier at most.
+const GRID: Duration = Duration::from_millis(100);
 
 impl Acquaintance {
     pub(super) const fn new(now: Time, incarnation: Incarnation, settings: &Settings) -> Self {
@@ -184,18 +189,32 @@ impl Link {
 impl Pulse {
     /// Something was heard at `now`.
     pub(super) const fn beat(now: Time) -> Self {
-        Self { heard: now, pings: 0, is_at_rest: false }
+        Self { heard: now, carried: now, pings: 0, is_at_rest: false }
     }
 
-    /// A sign of life was heard at `now`, and nothing else goes on.
-    pub(super) const fn rest(now: Time) -> Self {
-        Self { heard: now, pings: 0, is_at_rest: true }
+    /// Something was heard then.
+    pub(super) fn heard(&mut self, at: Time) {
+        *self = Self::beat(self.heard.max(at));
+    }
+
+    /// A sign of life was heard at `now`. If nothing else was for as long as silence lasts before it is asked for one, it is at rest: a PING that
+    /// crosses what is carried, or is answered behind it, says nothing of that.
+    pub(super) fn lives(&mut self, now: Time, settings: &Settings) {
+        let is_at_rest = now.since(self.carried) >= settings.ping_period;
+        *self = Self { heard: now, carried: self.carried, pings: 0, is_at_rest };
+    }
+
+    /// Silence of `late` until `now` is not the peer's fault.
+    pub(super) fn forgive(&mut self, now: Time, late: Duration) {
+        self.heard = (self.heard + late).min(now.max(self.heard));
     }
 
     /// When the next ping is due, or the connection counts as broken.
     pub(super) fn ping_at(&self, settings: &Settings) -> Time {
         let silence = if self.is_at_rest { settings.side_rest } else { settings.ping_period };
-        self.heard + silence + settings.ping_period * self.pings
+        let at = self.heard + silence + settings.ping_period * self.pings;
+        let beyond = at.as_nanos() % GRID.as_nanos() as u64;
+        Time::from_nanos(at.as_nanos() - beyond)
     }
 
     /// Whether one more ping is sent at `now`; `None` if none is due, `Some(false)` if enough were.

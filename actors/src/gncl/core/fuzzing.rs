@@ -131,7 +131,7 @@ impl Play<'_> {
                 let refusal = Refusal { cause: "duplicate".to_owned(), sentence: "no".to_owned() };
                 Input::RefusalReceived(self.connection(), refusal)
             }
-            9 => Input::Heard(self.connection()),
+            9 => Input::Heard(self.connection(), self.now),
             10 => Input::Carried(self.connection()),
             11 => Input::PingReceived(self.connection()),
             12 => Input::Ended(self.connection()),

@@ -9,7 +9,7 @@ use sinew_runtime::{
 
 use super::{
     ConnectionId, Core, Lane, LinkFact, Output, Stage,
-    acquaintance::{Acquaintance, Lost, Pulse},
+    acquaintance::{Acquaintance, Lost},
 };
 
 impl Core {
@@ -169,24 +169,24 @@ impl Core {
         }
     }
 
-    pub(super) fn heard(&mut self, now: Time, connection: ConnectionId) {
+    pub(super) fn heard(&mut self, at: Time, connection: ConnectionId) {
         let Some((node, lane)) = self.linked(connection) else { return };
         let Some(link) = self.peers.get_mut(&node).and_then(|peer| peer.link.as_mut()) else { return };
         if let Some(pulse) = link.pulse_of(lane) {
-            *pulse = Pulse::beat(now);
+            pulse.heard(at);
         }
     }
 
-    /// The peer lives, as far as this connection tells; nothing else has come on it.
+    /// The peer lives, as far as this connection tells: it has said PING or PONG.
     pub(super) fn lives(&mut self, now: Time, connection: ConnectionId) {
         let Some((node, lane)) = self.linked(connection) else { return };
         let Some(link) = self.peers.get_mut(&node).and_then(|peer| peer.link.as_mut()) else { return };
         if let Some(pulse) = link.pulse_of(lane) {
-            *pulse = match lane {
+            match lane {
                 // Whoever asks whether the peer lives asks here.
-                Lane::Control => Pulse::beat(now),
-                Lane::Stream | Lane::Bulk => Pulse::rest(now),
-            };
+                Lane::Control => pulse.heard(now),
+                Lane::Stream | Lane::Bulk => pulse.lives(now, &self.settings),
+            }
         }
     }
 

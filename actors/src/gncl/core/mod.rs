@@ -102,8 +102,8 @@ pub(super) enum Input {
     Violated(ConnectionId, Decline),
     /// What this life of a node proved who it is with, when it was linked last, counts no more.
     Disproven { node: NodeAddress, incarnation: Incarnation },
-    /// Any frame came on a link but PING and PONG.
-    Heard(ConnectionId),
+    /// Frames came on a link, the last one then; PING and PONG are not counted. Said before what follows from the time, or from PING and PONG.
+    Heard(ConnectionId, Time),
     /// Messages pass on a link.
     Carried(ConnectionId),
     /// The peer asked for a sign of life.
@@ -269,7 +269,7 @@ impl Core {
             Input::RefusalReceived(connection, refusal) => self.refused(now, connection, &refusal),
             Input::Violated(connection, decline) => self.decline(now, connection, &decline),
             Input::Disproven { node, incarnation } => self.disproven(now, node, incarnation),
-            Input::Heard(connection) => self.heard(now, connection),
+            Input::Heard(connection, at) => self.heard(at, connection),
             Input::Carried(connection) => self.carried(connection),
             Input::PongReceived(connection) => self.lives(now, connection),
             Input::PingReceived(connection) => {
@@ -321,7 +321,7 @@ impl Core {
             return;
         }
         for link in self.peers.values_mut().filter_map(|peer| peer.link.as_mut()) {
-            link.pulses().for_each(|pulse| pulse.heard = pulse.heard + late);
+            link.pulses().for_each(|pulse| pulse.forgive(now, late));
         }
     }
 

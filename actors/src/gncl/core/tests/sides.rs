@@ -114,12 +114,42 @@ fn a_silent_side_is_broken_alone() {
     for second in 1..=3 {
         core.handle(millis(second * 1_000), Input::TimePassed);
         assert!(outputs(&mut core).contains(&Output::SendPing(HIGH, Lane::Bulk)));
-        core.handle(millis(second * 1_000), Input::Heard(link));
+        core.handle(millis(second * 1_000), Input::Heard(link, millis(second * 1_000)));
     }
     core.handle(millis(4_000), Input::TimePassed);
     let out = outputs(&mut core);
     assert!(out.contains(&Output::Close(bulk)), "{out:?}");
     assert!(!out.contains(&Output::Close(link)), "{out:?}");
+}
+
+// spec: GNCL-14
+#[test]
+fn a_side_that_carried_something_right_before_a_ping_is_not_at_rest_and_is_broken_soon() {
+    for sign in [Input::PingReceived, Input::PongReceived] {
+        let mut core = core();
+        let (link, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 10));
+        let (bulk, _) = greet(&mut core, millis(0), side_of(10, Lane::Bulk, 12));
+        core.handle(millis(950), Input::Heard(bulk, millis(950)));
+        core.handle(millis(1_000), sign(bulk));
+        outputs(&mut core);
+        assert_eq!(pinged(&mut core, [link, bulk], 60, false), [2, 3, 4]);
+    }
+}
+
+#[test]
+fn the_pings_of_many_links_are_due_together() {
+    let mut core = core();
+    let mut wakes = std::collections::BTreeSet::new();
+    for node in 0..10_u32 {
+        let hello = Introduction { node: NodeAddress::new(1_000 + node), ..hello_from(HIGH, 1, 10) };
+        greet(&mut core, millis(3 * u64::from(node)), hello);
+    }
+    while let Some(at) = core.next_wake().filter(|at| *at < millis(4_000)) {
+        wakes.insert(at);
+        core.handle(at, Input::TimePassed);
+        outputs(&mut core);
+    }
+    assert_eq!(wakes.into_iter().collect::<Vec<_>>(), [1_000, 2_000, 3_000].map(millis));
 }
 
 /// Seconds at which the side is pinged up to `end`, if the peer answers on its link and, as far as `answers` says, on the side.
@@ -153,7 +183,7 @@ fn a_side_at_rest_is_pinged_seldom_and_one_that_falls_silent_soon() {
     let (bulk, _) = greet(&mut core, millis(0), side_of(10, Lane::Bulk, 12));
     let both = [link, bulk];
     assert_eq!(pinged(&mut core, both, 25, true), [1, 11, 21], "nothing goes over it");
-    core.handle(millis(25_000), Input::Heard(bulk));
+    core.handle(millis(25_000), Input::Heard(bulk, millis(25_000)));
     assert_eq!(pinged(&mut core, both, 30, true), [26], "a message came, and then nothing");
     core.handle(millis(30_000), Input::PingReceived(bulk));
     outputs(&mut core);
