@@ -1,6 +1,9 @@
 //! The receiving half: which value is newer than all of its flow before, and what is to be acknowledged.
 
-use std::{collections::BTreeMap, time::Duration};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::Duration,
+};
 
 use sinew_runtime::time::Time;
 
@@ -18,6 +21,8 @@ const ACK_AT: usize = 32;
 pub(super) struct Incoming<K> {
     /// The number of the last value of each flow that was handed on.
     last: BTreeMap<K, u64>,
+    /// The same, the flow that has been silent longest first: whoever makes flows without end costs no look at all of them for each.
+    by_number: BTreeSet<(u64, K)>,
     flows_max: usize,
     /// A value of a flow that is not among them counts as old up to this number.
     floor: u64,
@@ -37,6 +42,7 @@ impl<K: Ord + Copy> Incoming<K> {
     pub(super) fn new(flows_max: usize) -> Self {
         Self {
             last: BTreeMap::new(),
+            by_number: BTreeSet::new(),
             flows_max,
             floor: 0,
             taken: 0,
@@ -85,7 +91,11 @@ impl<K: Ord + Copy> Incoming<K> {
         }
         if let Some(last) = self.last.get_mut(&key) {
             let is_new = number > *last;
-            *last = number.max(*last);
+            if is_new {
+                self.by_number.remove(&(*last, key));
+                self.by_number.insert((number, key));
+                *last = number;
+            }
             return is_new;
         }
         if number <= self.floor {
@@ -95,14 +105,14 @@ impl<K: Ord + Copy> Incoming<K> {
             self.give_one_up();
         }
         self.last.insert(key, number);
+        self.by_number.insert((number, key));
         true
     }
 
     /// What is known of the flow that has been silent longest is given up. Numbers are common to all flows, so no value of it that was sent
     /// before can be taken for a new one: it would be at the floor or below.
     fn give_one_up(&mut self) {
-        let oldest = self.last.iter().min_by_key(|(_, number)| **number).map(|(key, number)| (*key, *number));
-        if let Some((key, number)) = oldest {
+        if let Some((number, key)) = self.by_number.pop_first() {
             self.last.remove(&key);
             self.floor = self.floor.max(number);
         }
@@ -150,6 +160,7 @@ impl<K: Ord + Copy> Incoming<K> {
 
     #[cfg(test)]
     pub(super) fn flows(&self) -> usize {
+        assert_eq!(self.last.len(), self.by_number.len(), "each flow is in both");
         self.last.len()
     }
 }

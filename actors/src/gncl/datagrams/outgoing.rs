@@ -8,6 +8,7 @@
 
 use std::{
     collections::{BTreeMap, VecDeque},
+    ops::Bound,
     time::Duration,
 };
 
@@ -52,6 +53,8 @@ pub(super) enum Offered<V> {
     Refused,
 }
 
+/// Flows that are looked at for one that may be forgotten, of each that is new. Where none of these may, that one goes by the connection.
+const LOOKS_MAX: usize = 32;
 /// How often the connection is offered what it had no room for.
 const OFFER_PERIOD: Duration = Duration::from_millis(10);
 
@@ -129,6 +132,8 @@ pub(super) struct Outgoing<K, V> {
     /// Taken by the peer, as it said last, and by it before it forgot us.
     taken: u64,
     taken_before: u64,
+    /// The flow that was looked at last for one that may be forgotten.
+    looked_at: Option<K>,
     #[cfg(test)]
     pub(super) planted: super::simulation::Planted,
 }
@@ -149,6 +154,7 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
             counts: Counts::default(),
             taken: 0,
             taken_before: 0,
+            looked_at: None,
             #[cfg(test)]
             planted: super::simulation::Planted::Nothing,
         }
@@ -210,7 +216,19 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
     /// Makes room for one more flow: one that has nothing under way, either way, is known by nothing but its key.
     fn forget_one(&mut self) -> bool {
         let is_idle = |flow: &Flow<V>| flow.state == State::Idle && flow.elsewhere == 0;
-        let idle = self.flows.iter().find(|(_, flow)| is_idle(flow)).map(|(key, _)| *key);
+        // Behind those that were looked at before, and then from the first one on.
+        let from = self.looked_at.map_or(Bound::Unbounded, Bound::Excluded);
+        let behind = self.flows.range((from, Bound::Unbounded));
+        let looked_at = behind.chain(&self.flows).take(LOOKS_MAX.min(self.flows.len()));
+        let (mut last, mut idle) = (self.looked_at, None);
+        for (key, flow) in looked_at {
+            last = Some(*key);
+            if is_idle(flow) {
+                idle = last;
+                break;
+            }
+        }
+        self.looked_at = last;
         idle.is_some_and(|key| self.flows.remove(&key).is_some())
     }
 

@@ -164,6 +164,10 @@ impl Reader {
             Some(value) => value,
             None => None,
         };
+        // Before anything is kept of it: whoever may name any source could make flows at will. Nobody is told of it. spec: GNCL-11
+        if value.as_ref().is_some_and(|value| value.header.source.node != peer.node) {
+            return self.count(now, "forged source");
+        }
         let Some(way) = peer.way(Lane::Stream) else { return };
         let hand = value.as_ref().map(|_| way.take_datagram());
         if matches!(hand, Some(None)) {

@@ -282,6 +282,23 @@ fn a_peer_that_says_more_than_can_be_is_believed_as_far_as_it_can_be() {
 }
 
 #[test]
+fn a_flow_that_has_nothing_under_way_makes_room_for_another_however_many_others_have() {
+    const FLOWS: u32 = 1_000;
+    let mut outgoing = outgoing(2_000, 2_000_000, FLOWS as usize);
+    for key in 0..FLOWS {
+        outgoing.submit(key, 1, 100, Time::MAX).unwrap();
+    }
+    let numbers = sent(&mut outgoing, NOW);
+    assert_eq!(numbers.len(), FLOWS as usize);
+    // All but one are on their way.
+    outgoing.acknowledged(&said(&numbers[700..701], 1), 500);
+    let refused = (FLOWS..).take_while(|key| outgoing.submit(*key, 1, 100, Time::MAX).is_err()).count();
+    assert!(refused < FLOWS as usize, "a place is found, and not by looking at all of them at once");
+    assert!(outgoing.value(&700).is_none() && outgoing.value(&701).is_some());
+    assert!(outgoing.submit(2 * FLOWS, 1, 100, Time::MAX).is_err(), "there is no further one");
+}
+
+#[test]
 fn the_flow_that_is_given_up_when_the_table_is_full_never_goes_back_in_time() {
     let mut incoming = Incoming::new(3);
     for (key, number) in [(1, 10), (2, 20), (3, 30)] {

@@ -258,6 +258,28 @@ fn bytes_of_strangers_and_what_is_malformed_are_dropped_and_counted_and_do_no_ha
 }
 
 #[test]
+fn a_value_in_somebody_elses_name_is_neither_acknowledged_nor_a_flow_of_the_peer() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mate = Mate::open_to(&mut node).await;
+        let peer = node.stores.gncl.peer(NINE).expect("it is linked");
+        let forged = mate.value_bytes(node.tid(1), 2, node.tid(7));
+        mate.say(VALUE, &forged).await;
+        node.counted("forged source").await;
+        mate.say(PROBE, &[]).await;
+        let answer = loop {
+            let heard = mate.hear().await;
+            if heard.what & ACK != 0 {
+                break heard;
+            }
+        };
+        assert_eq!(answer.numbers, []);
+        let arrived = peer.accounts()[Class::Stream as usize].arrived;
+        assert_eq!((arrived.taken, arrived.refused), (0, 0), "{arrived:?}");
+    });
+}
+
+#[test]
 fn a_value_that_the_access_list_does_not_allow_is_refused_whichever_way_it_comes() {
     run(async {
         let mut node = Node::start(1).await;
