@@ -59,6 +59,14 @@ pub(super) const fn answers_max(queue_capacity: usize) -> usize {
     if answers > ANSWERS_MIN { answers } else { ANSWERS_MIN }
 }
 
+/// Outcomes at most that wait for a peer to which there are so many sessions: those of all sessions wait in the one of Control. Those that the
+/// peer has given up waiting for (their time to live was over long ago) it does not count any more: hence twice as many as may be open on
+/// each connection whose messages are confirmed, which is each but that of Stream. spec: GNCL-12
+pub(super) const fn outcomes_max(ways: usize, queue_capacity: usize) -> usize {
+    let confirmable = if ways > 1 { ways - 1 } else { 1 };
+    2 * confirmable * answers_max(queue_capacity)
+}
+
 /// What is to be done with a message that has come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Taken {
@@ -197,9 +205,7 @@ impl Way {
             is_fenced: false,
             is_abandoned: false,
         });
-        // Those that the peer has given up waiting for (their time to live was over long ago) it does not count any more: hence twice as
-        // many at least.
-        let outcomes_max = ends.ways.max(2) * answers_max(config.gncl.queue_capacity);
+        let outcomes_max = outcomes_max(ends.ways, config.gncl.queue_capacity);
         Self { outlet, inbox, window, longest, outcomes_max, ends, told: told.clone() }
     }
 

@@ -2,13 +2,20 @@
 
 use bytes::Bytes;
 use sinew_runtime::{
-    outcome::{Outcome, Rejection},
+    outcome::{Outcome, ReceiptSink as _, Rejection, Ticket},
     tid::{AppAddress, Tid},
     wire::{Kind, Message},
 };
 
-use super::bench::{ByHand, NINE, Node, introduction, next, pair, run, within};
-use crate::gncl::{core::Introduction, peer::frame, way::answers_max};
+use super::{
+    bench::{ByHand, NINE, Node, introduction, next, pair, run, within},
+    classes::lane_by_hand,
+};
+use crate::gncl::{
+    core::{Introduction, Lane},
+    peer::frame,
+    way::answers_max,
+};
 
 /// What peer 9 says of messages from the application 1 of node 1 to its own application 1: one frame, its bytes by hand.
 fn said(outcomes: &[(u64, u8)]) -> Message {
@@ -251,6 +258,34 @@ fn an_application_that_never_answers_takes_no_room_for_answers_from_another_one_
             }
         };
         assert_eq!(outcome, Outcome::Delivered);
+    });
+}
+
+// spec: GNCL-12
+#[test]
+fn all_outcomes_of_both_connections_wait_though_a_peer_that_gave_up_on_them_has_sent_as_many_again() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let first = lane_by_hand(&node, Lane::Control, 1).await;
+        node.up().await;
+        let peer = node.stores.gncl.peer(NINE).expect("it is linked");
+        drop(first);
+        node.broken().await;
+        let settle = |correlation| {
+            let ticket = Ticket {
+                source: Tid::new(NINE, AppAddress::new(0x1001)),
+                destination: node.tid(1),
+                correlation,
+            };
+            peer.settle(ticket, Outcome::Delivered);
+        };
+        // Control's and Bulk's, of messages that their sender waits for no more, and of those that it has sent in their place.
+        let all = 2 * 2 * answers_max(node.stores.config.gncl.queue_capacity) as u64;
+        (0..all).for_each(settle);
+        assert_eq!(node.stores.gncl.refusals.of("own frame not sent"), 0);
+        // Of a peer that heeds nothing the rest is counted.
+        settle(all);
+        assert_eq!(node.stores.gncl.refusals.of("own frame not sent"), 1);
     });
 }
 
