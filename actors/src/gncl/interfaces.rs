@@ -1,6 +1,9 @@
 //! Which of this host's addresses are lost, because their interface went down or they were taken away: the kernel says so (rtnetlink).
 //!
 //! A connection does not notice it by itself: what it writes waits for an interface to come back.
+//!
+//! Where the kernel has said more than there was room for, some of it is not known: then all is asked for again, and what is not there any more
+//! is lost as if it had been said.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -36,7 +39,11 @@ const NEW_LINK: u16 = 16;
 const GONE_LINK: u16 = 17;
 const NEW_ADDRESS: u16 = 20;
 const GONE_ADDRESS: u16 = 21;
+const GET_LINKS: u16 = 18;
 const GET_ADDRESSES: u16 = 22;
+/// `NLMSG_ERROR`, `NLMSG_DONE`: `linux/netlink.h`.
+const REFUSED: u16 = 2;
+const DONE: u16 = 3;
 const HEADER_LEN: usize = 16;
 /// An interface's index is in the same place of both bodies; its flags follow it, and an address's attributes.
 const INDEX_AT: usize = HEADER_LEN + 4;
@@ -53,20 +60,118 @@ const IPV6: u8 = 10;
 const GROUPS: u32 = 0x111;
 /// `NLM_F_REQUEST | NLM_F_DUMP`.
 const DUMP: u16 = 0x301;
+/// `NLM_F_MULTI`: part of what was asked for. `NLM_F_DUMP_INTR`: something changed meanwhile.
+const OF_A_DUMP: u16 = 0x2;
+const IS_SPOILT: u16 = 0x10;
+
+/// What is asked for at once; one answer is over before the next question.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Asked {
+    Addresses,
+    /// And their state.
+    Links,
+}
+
+/// All that there is, as far as the kernel has answered.
+#[derive(Debug)]
+struct Survey {
+    asked: Asked,
+    found: Interfaces,
+    /// It is not the first one: interfaces may have gone down unheard.
+    is_again: bool,
+    /// Something was not heard meanwhile.
+    is_spoilt: bool,
+}
+
+impl Survey {
+    fn new(is_again: bool) -> Self {
+        Self { asked: Asked::Addresses, found: Interfaces::default(), is_again, is_spoilt: false }
+    }
+}
+
+/// What is known, and what is being asked for.
+#[derive(Debug)]
+struct Known {
+    interfaces: Interfaces,
+    survey: Option<Survey>,
+}
+
+impl Known {
+    /// Nothing is; addresses are asked for.
+    fn new() -> Self {
+        Self { interfaces: Interfaces::default(), survey: Some(Survey::new(false)) }
+    }
+
+    /// Takes in what the kernel says; returns the addresses that are lost with it, and what is to be asked next.
+    fn hear(&mut self, mut said: &[u8]) -> (Vec<SocketAddr>, Option<Asked>) {
+        let (mut lost, mut asks) = (Vec::new(), None);
+        while let Some((message, rest)) = first_of(said) {
+            let (kind, flags) = (word(message, 4), word(message, 6));
+            match (kind, &mut self.survey) {
+                (DONE, _) => asks = self.answered(&mut lost),
+                // It goes on as before: what is lost unheard is found out by what is not answered.
+                (REFUSED, _) => self.survey = None,
+                (_, Some(survey)) if flags & OF_A_DUMP != 0 => {
+                    survey.is_spoilt |= flags & IS_SPOILT != 0;
+                    lost.extend(survey.found.hear_one(message).unwrap_or_default());
+                }
+                (_, survey) => {
+                    // It was said behind a part of the answer, or is in what is yet to come.
+                    let found = survey.as_mut().and_then(|survey| survey.found.hear_one(message));
+                    let known = self.interfaces.hear_one(message);
+                    lost.extend(known.into_iter().chain(found).flatten().collect::<BTreeSet<_>>());
+                }
+            }
+            said = rest;
+        }
+        (lost, asks)
+    }
+
+    /// More was said than there was room for. Returns what is to be asked now.
+    fn missed(&mut self) -> Option<Asked> {
+        if let Some(survey) = &mut self.survey {
+            survey.is_spoilt = true;
+            return None;
+        }
+        self.survey = Some(Survey::new(true));
+        Some(Asked::Addresses)
+    }
+
+    /// An answer is over. Returns what is to be asked next.
+    fn answered(&mut self, lost: &mut Vec<SocketAddr>) -> Option<Asked> {
+        let mut survey = self.survey.take()?;
+        if survey.is_spoilt {
+            self.survey = Some(Survey::new(true));
+            return Some(Asked::Addresses);
+        }
+        if survey.is_again && survey.asked == Asked::Addresses {
+            survey.asked = Asked::Links;
+            self.survey = Some(survey);
+            return Some(Asked::Links);
+        }
+        lost.extend(self.interfaces.without(&survey.found));
+        self.interfaces = survey.found;
+        None
+    }
+}
 
 /// The addresses of this host, by the index of their interface.
 #[derive(Debug, Default)]
 struct Interfaces(BTreeMap<u32, BTreeSet<IpAddr>>);
 
 impl Interfaces {
-    /// Takes in what the kernel says; returns the addresses that are lost with it.
-    fn hear(&mut self, mut said: &[u8]) -> Vec<SocketAddr> {
-        let mut lost = Vec::new();
-        while let Some((message, rest)) = first_of(said) {
-            lost.extend(self.hear_one(message).unwrap_or_default());
-            said = rest;
+    /// Those that are not among these any more; none where more were found than are kept.
+    fn without(&self, found: &Self) -> Vec<SocketAddr> {
+        if found.count() >= ADDRESSES_MAX {
+            return Vec::new();
         }
-        lost
+        let is_gone = |index: u32, ip: &IpAddr| !found.0.get(&index).is_some_and(|there| there.contains(ip));
+        let all = self.0.iter().flat_map(|(index, there)| there.iter().map(|ip| (*index, ip)));
+        all.filter(|(index, ip)| is_gone(*index, ip)).map(|(index, ip)| at(index, *ip)).collect()
+    }
+
+    fn count(&self) -> usize {
+        self.0.values().map(BTreeSet::len).sum()
     }
 
     /// `None`: it is about something else, or too short.
@@ -81,7 +186,7 @@ impl Interfaces {
             GONE_LINK => Some(self.0.remove(&index)?.into_iter().map(|ip| at(index, ip)).collect()),
             NEW_ADDRESS => {
                 let address = address_in(message)?;
-                if self.0.values().map(BTreeSet::len).sum::<usize>() < ADDRESSES_MAX {
+                if self.count() < ADDRESSES_MAX {
                     self.0.entry(index).or_default().insert(address);
                 }
                 None
@@ -140,17 +245,25 @@ fn address_in(message: &[u8]) -> Option<IpAddr> {
     local.or(address)
 }
 
+/// 0 where there is none.
+fn word(bytes: &[u8], at: usize) -> u16 {
+    field(bytes, at).map_or(0, u16::from_ne_bytes)
+}
+
 fn field<const N: usize>(bytes: &[u8], at: usize) -> Option<[u8; N]> {
     bytes.get(at..at + N)?.try_into().ok()
 }
 
-/// Asks for all addresses that there are.
-fn request() -> [u8; 24] {
-    let mut bytes = [0; 24];
-    bytes[..4].copy_from_slice(&24_u32.to_ne_bytes());
-    bytes[4..6].copy_from_slice(&GET_ADDRESSES.to_ne_bytes());
+/// Asks for all that there are. The rest of the body stays 0: those of all families.
+fn request(asked: Asked) -> [u8; 32] {
+    let kind = match asked {
+        Asked::Addresses => GET_ADDRESSES,
+        Asked::Links => GET_LINKS,
+    };
+    let mut bytes = [0; 32];
+    bytes[..4].copy_from_slice(&32_u32.to_ne_bytes());
+    bytes[4..6].copy_from_slice(&kind.to_ne_bytes());
     bytes[6..8].copy_from_slice(&DUMP.to_ne_bytes());
-    // The family of the body stays 0: those of all.
     bytes
 }
 
@@ -177,7 +290,7 @@ pub(super) fn lost() -> io::Result<impl Stream<Item = AddressLost>> {
 /// What the kernel says, and what is known from it.
 struct Watch {
     socket: AsyncFd<OwnedFd>,
-    interfaces: Interfaces,
+    known: Known,
     buffer: Vec<u8>,
 }
 
@@ -186,13 +299,19 @@ impl Watch {
         let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
         let socket = socket_with(AddressFamily::NETLINK, SocketType::RAW, flags, None)?;
         bind(&socket, &SocketAddrNetlink::new(0, GROUPS))?;
-        send(&socket, &request(), SendFlags::empty())?;
+        send(&socket, &request(Asked::Addresses), SendFlags::empty())?;
         #[expect(
             deprecated,
             reason = "sound for an OwnedFd, which keeps its descriptor; its successor is an unsafe fn, and unsafe code lives in sinew-shm and the C binding alone"
         )]
         let socket = AsyncFd::new(socket)?;
-        Ok(Self { socket, interfaces: Interfaces::default(), buffer: vec![0; BUFFER_LEN] })
+        Ok(Self { socket, known: Known::new(), buffer: vec![0; BUFFER_LEN] })
+    }
+
+    fn ask(&self, asked: Option<Asked>) -> io::Result<()> {
+        let Some(asked) = asked else { return Ok(()) };
+        send(self.socket.get_ref(), &request(asked), SendFlags::empty())?;
+        Ok(())
     }
 
     /// Waits for the kernel's next words; returns what is lost with them.
@@ -203,10 +322,16 @@ impl Watch {
             let read =
                 ready.try_io(|socket| Ok(recv(socket.get_ref(), &mut buffer[..], RecvFlags::empty())?.0));
             match read {
-                Ok(Ok(length)) => return Ok(self.interfaces.hear(&self.buffer[..length.min(BUFFER_LEN)])),
-                // More was said than there is room for: some of it is not known. What there is now is asked for again.
+                Ok(Ok(length)) => {
+                    let (lost, asks) = self.known.hear(&self.buffer[..length.min(BUFFER_LEN)]);
+                    drop(ready);
+                    self.ask(asks)?;
+                    return Ok(lost);
+                }
                 Ok(Err(error)) if error.raw_os_error() == Some(rustix::io::Errno::NOBUFS.raw_os_error()) => {
-                    send(self.socket.get_ref(), &request(), SendFlags::empty())?;
+                    drop(ready);
+                    let asks = self.known.missed();
+                    self.ask(asks)?;
                 }
                 Ok(Err(error)) if error.kind() == io::ErrorKind::Interrupted => {}
                 Ok(Err(error)) => return Err(error),
@@ -244,6 +369,16 @@ mod tests {
         message(kind, words.as_flattened())
     }
 
+    fn lost_of(known: &mut Known, said: &[u8]) -> Vec<SocketAddr> {
+        known.hear(said).0
+    }
+
+    /// As a part of an answer.
+    fn of_a_dump(mut message: Vec<u8>) -> Vec<u8> {
+        message[6..8].copy_from_slice(&OF_A_DUMP.to_ne_bytes());
+        message
+    }
+
     fn lost(address: Ipv4Addr) -> Vec<SocketAddr> {
         vec![(address, 0).into()]
     }
@@ -272,50 +407,106 @@ mod tests {
 
     #[test]
     fn the_addresses_of_an_interface_that_goes_down_are_lost_each_time_and_no_others() {
-        let mut interfaces = Interfaces::default();
+        let mut interfaces = Known::new();
         let said = [address(NEW_ADDRESS, ETH0, OURS), address(NEW_ADDRESS, 3, OTHER)].concat();
-        assert!(interfaces.hear(&said).is_empty());
+        assert!(lost_of(&mut interfaces, &said).is_empty());
         for _ in 0..2 {
-            assert!(interfaces.hear(&link(NEW_LINK, ETH0, UP | 0x1000)).is_empty());
-            assert_eq!(interfaces.hear(&link(NEW_LINK, ETH0, 0x1001)), lost(OURS), "it cannot carry packets");
+            assert!(lost_of(&mut interfaces, &link(NEW_LINK, ETH0, UP | 0x1000)).is_empty());
+            assert_eq!(
+                lost_of(&mut interfaces, &link(NEW_LINK, ETH0, 0x1001)),
+                lost(OURS),
+                "it cannot carry packets"
+            );
         }
-        assert_eq!(interfaces.hear(&link(GONE_LINK, ETH0, UP)), lost(OURS));
-        assert!(interfaces.hear(&link(GONE_LINK, ETH0, UP)).is_empty());
+        assert_eq!(lost_of(&mut interfaces, &link(GONE_LINK, ETH0, UP)), lost(OURS));
+        assert!(lost_of(&mut interfaces, &link(GONE_LINK, ETH0, UP)).is_empty());
     }
 
     #[test]
     fn an_address_that_is_taken_away_is_lost() {
-        let mut interfaces = Interfaces::default();
-        interfaces.hear(&address(NEW_ADDRESS, ETH0, OURS));
-        assert_eq!(interfaces.hear(&address(GONE_ADDRESS, ETH0, OURS)), lost(OURS));
-        assert!(interfaces.hear(&link(NEW_LINK, ETH0, 0)).is_empty());
+        let mut interfaces = Known::new();
+        lost_of(&mut interfaces, &address(NEW_ADDRESS, ETH0, OURS));
+        assert_eq!(lost_of(&mut interfaces, &address(GONE_ADDRESS, ETH0, OURS)), lost(OURS));
+        assert!(lost_of(&mut interfaces, &link(NEW_LINK, ETH0, 0)).is_empty());
     }
 
     #[test]
     fn a_link_local_address_that_two_interfaces_have_is_lost_on_one_of_them() {
-        let mut interfaces = Interfaces::default();
+        let mut interfaces = Known::new();
         let ours: Ipv6Addr = "fe80::1".parse().unwrap();
         let said = [ETH0, 3].map(|index| address6(NEW_ADDRESS, index, ours)).concat();
-        assert!(interfaces.hear(&said).is_empty());
+        assert!(lost_of(&mut interfaces, &said).is_empty());
         let of = |index: u32| vec![SocketAddr::from(SocketAddrV6::new(ours, 0, 0, index))];
-        assert_eq!(interfaces.hear(&link(NEW_LINK, 3, 0)), of(3));
-        assert_eq!(interfaces.hear(&address6(GONE_ADDRESS, ETH0, ours)), of(ETH0));
+        assert_eq!(lost_of(&mut interfaces, &link(NEW_LINK, 3, 0)), of(3));
+        assert_eq!(lost_of(&mut interfaces, &address6(GONE_ADDRESS, ETH0, ours)), of(ETH0));
     }
 
     #[test]
     fn more_addresses_than_are_kept_are_not_known() {
-        let mut interfaces = Interfaces::default();
+        let mut interfaces = Known::new();
         for number in 0..2 * ADDRESSES_MAX as u32 {
-            interfaces.hear(&address(NEW_ADDRESS, ETH0, Ipv4Addr::from(number)));
+            lost_of(&mut interfaces, &address(NEW_ADDRESS, ETH0, Ipv4Addr::from(number)));
         }
-        assert_eq!(interfaces.hear(&link(NEW_LINK, ETH0, 0)).len(), ADDRESSES_MAX);
+        assert_eq!(lost_of(&mut interfaces, &link(NEW_LINK, ETH0, 0)).len(), ADDRESSES_MAX);
+    }
+
+    #[test]
+    fn what_was_lost_unheard_is_lost_when_all_is_asked_for_again() {
+        let mut known = Known::new();
+        let there = [(ETH0, OURS), (3, OTHER), (4, Ipv4Addr::LOCALHOST)];
+        let first = there.map(|(index, ip)| of_a_dump(address(NEW_ADDRESS, index, ip))).concat();
+        assert_eq!(known.hear(&[first, message(DONE, &[])].concat()), (vec![], None));
+        // When: the first one is taken away, and the second one's interface goes down.
+        assert_eq!(known.missed(), Some(Asked::Addresses));
+        let left = there[1..].iter().flat_map(|(index, ip)| of_a_dump(address(NEW_ADDRESS, *index, *ip)));
+        let left: Vec<u8> = left.collect();
+        // More is missed meanwhile: what was answered may be old.
+        assert_eq!(known.missed(), None);
+        let done = message(DONE, &[]);
+        assert_eq!(known.hear(&[&left[..], &done].concat()), (vec![], Some(Asked::Addresses)));
+        assert_eq!(known.hear(&[&left[..], &done].concat()), (vec![], Some(Asked::Links)));
+        let links =
+            [(ETH0, UP), (3, 1), (4, UP)].map(|(index, flags)| of_a_dump(link(NEW_LINK, index, flags)));
+        let (told, asks) = known.hear(&[&links.concat()[..], &done].concat());
+        // Then
+        assert_eq!((told, asks), ([lost(OTHER), lost(OURS)].concat(), None));
+        assert_eq!(known.interfaces.count(), 2);
+        assert_eq!(known.missed(), Some(Asked::Addresses), "it can be asked again");
+    }
+
+    #[test]
+    fn what_goes_while_all_is_asked_for_is_not_there_afterwards() {
+        let mut known = Known::new();
+        let said = [
+            of_a_dump(address(NEW_ADDRESS, ETH0, OURS)),
+            address(GONE_ADDRESS, ETH0, OURS),
+            address(NEW_ADDRESS, 3, OTHER),
+            message(DONE, &[]),
+        ];
+        assert_eq!(known.hear(&said.concat()), (lost(OURS), None));
+        assert_eq!(known.hear(&link(NEW_LINK, 3, 0)).0, lost(OTHER));
+    }
+
+    #[tokio::test(flavor = "current_thread")]
+    async fn an_address_that_the_kernel_does_not_know_any_more_is_told_when_something_was_missed() {
+        let mut watch = Watch::begin().expect("any process may listen");
+        let told = async {
+            while watch.known.survey.is_some() {
+                watch.hear().await.expect("the kernel speaks");
+            }
+            watch.known.interfaces.0.entry(1).or_default().insert(OURS.into());
+            let asks = watch.known.missed();
+            watch.ask(asks).expect("it can be asked");
+            while !watch.hear().await.expect("the kernel speaks").contains(&(OURS, 0).into()) {}
+        };
+        tokio::time::timeout(Duration::from_secs(10), told).await.expect("it is told within 10 s");
     }
 
     proptest! {
         #[test]
         fn any_bytes_are_survived(bytes: Vec<u8>, cut in 0usize..60, word in 0usize..60, value: u8) {
-            let mut interfaces = Interfaces::default();
-            interfaces.hear(&bytes);
+            let mut interfaces = Known::new();
+            lost_of(&mut interfaces, &bytes);
             let mut said = if value % 2 == 0 {
                 address(NEW_ADDRESS, ETH0, OURS)
             } else {
@@ -325,7 +516,7 @@ mod tests {
             if let Some(byte) = said.get_mut(word) {
                 *byte = value;
             }
-            interfaces.hear(&said);
+            lost_of(&mut interfaces, &said);
         }
     }
 
@@ -333,7 +524,7 @@ mod tests {
     async fn the_kernel_says_which_addresses_there_are() {
         let mut watch = Watch::begin().expect("any process may listen");
         let known = async {
-            while !watch.interfaces.0.values().flatten().any(|address| address.is_loopback()) {
+            while !watch.known.interfaces.0.values().flatten().any(|address| address.is_loopback()) {
                 watch.hear().await.expect("the kernel speaks");
             }
         };

@@ -1,5 +1,7 @@
 //! Connections over an address that this host has lost: cut at once, and made again at whichever address there is.
 
+use std::time::Duration;
+
 use actix::{AsyncContext, Context, StreamHandler};
 use sinew_runtime::time::Time;
 
@@ -12,12 +14,19 @@ use crate::{
     ndl,
 };
 
+/// When the kernel is asked again that could not be.
+const AGAIN: Duration = Duration::from_secs(10);
+
 impl Gncl {
     /// Has the kernel say which addresses are lost. Where it does not, they are found out by what is not answered.
     pub(super) fn watch_interfaces(&self, ctx: &mut Context<Self>) {
         match interfaces::lost() {
             Ok(lost) => drop(ctx.add_stream(lost)),
-            Err(error) => self.stores.gncl.refusals.count(Time::now(), "interfaces not watched", &error),
+            Err(error) => {
+                self.stores.gncl.refusals.count(Time::now(), "interfaces not watched", &error);
+                // There may have been no descriptor left.
+                ctx.run_later(AGAIN, |actor, ctx| actor.watch_interfaces(ctx));
+            }
         }
     }
 
