@@ -28,6 +28,9 @@ pub struct Post<E> {
     shared: Arc<Mutex<Shared<E>>>,
 }
 
+/// An event with its number, if there is one.
+type Counted<E> = Option<(u64, E)>;
+
 #[derive(Debug)]
 struct Shared<E> {
     /// Each with its number.
@@ -41,7 +44,7 @@ struct Shared<E> {
     waker: Option<Waker>,
     refused: u64,
     /// A copy of the event that the reader handles now, where it wants that.
-    in_hand: Option<(u64, E)>,
+    in_hand: Counted<E>,
     /// The first event in the queue was in the hand of a reader that failed.
     first_is_second_try: bool,
     /// The same of the event in hand.
@@ -188,7 +191,7 @@ impl<E> Shared<E> {
     }
 
     /// The next event, and what was kept of the one before it, which is handled.
-    fn take(&mut self, keep: Option<fn(&E) -> E>) -> (Option<(u64, E)>, Option<(u64, E)>) {
+    fn take(&mut self, keep: Option<fn(&E) -> E>) -> (Counted<E>, Counted<E>) {
         let handled = self.in_hand.take();
         let next = self.queue.pop_front();
         if let (Some(keep), Some((number, event))) = (keep, &next) {

@@ -299,11 +299,11 @@ impl Endpoint {
     /// # Errors
     /// Not all were there in time, a party was lost, or the node did not let it wait.
     pub fn meet(&mut self, barrier: &Barrier) -> Result<u64, BarrierError> {
-        let answer = at_once(self.await_answer(barrier))?;
+        let answer = at_once(self.await_opening(barrier))?;
         barrier.judge(answer)
     }
 
-    async fn await_answer(&mut self, barrier: &Barrier) -> Result<BarrierAnswer, ApiError> {
+    async fn await_opening(&mut self, barrier: &Barrier) -> Result<BarrierAnswer, ApiError> {
         let to = Tid::new(self.tid().node, AppAddress::SYNC);
         let request = Message::typed(self.tid(), to, &barrier.request());
         let mut arrival = Arrival { endpoint: self, barrier: barrier.name(), is_answered: false };
@@ -343,7 +343,7 @@ impl AsyncEndpoint {
     /// # Errors
     /// Not all were there in time, a party was lost, or the node did not let it wait.
     pub async fn meet(&mut self, barrier: &Barrier) -> Result<u64, BarrierError> {
-        let answer = self.endpoint.await_answer(barrier).await?;
+        let answer = self.endpoint.await_opening(barrier).await?;
         barrier.judge(answer)
     }
 }

@@ -347,7 +347,7 @@ fn an_arrival_that_the_successor_of_a_failed_manager_is_handed_again_counts_once
         bench.tells(Event::App(AppFact::Registered { app: third, name: None, requires: Vec::new() }));
         assert_eq!(bench.released().await, third, "all events before it were handled");
         let core = bench.stores.sync.lock().unwrap_or_else(PoisonError::into_inner);
-        assert_eq!(core.barriers(sinew_runtime::time::Time::now()), [], "nobody waits for the next round");
+        assert_eq!(core.barriers(Time::now()), [], "nobody waits for the next round");
     });
 }
 
