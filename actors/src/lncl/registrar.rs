@@ -98,12 +98,8 @@ pub(crate) fn resolve(stores: &Stores, name: &str) -> Option<Tid> {
     let here = lock(&stores.registry).resolve(name).map(|app| Tid::new(stores.node, app));
     // The sync manager hears of this node's later: it may still have one that is gone.
     let is_elsewhere = |tid: &Tid| tid.node != stores.node;
-    let sync = lock(&stores.sync);
-    match here {
-        // spec: SYNC-6
-        Some(here) => sync.ready_elsewhere(name, here).or(Some(here)),
-        None => sync.called(name).into_iter().find(is_elsewhere),
-    }
+    // spec: SYNC-6
+    here.or_else(|| lock(&stores.sync).called(name).into_iter().find(is_elsewhere))
 }
 
 /// Makes `app` a member of `group`, or no longer one.

@@ -1,7 +1,7 @@
 //! What is told of messages while another thread writes to the same connection: it may be a flood's, and stand behind everybody else.
 
 use std::{
-    sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel},
+    sync::mpsc::{Receiver, SyncSender, sync_channel},
     thread,
 };
 
@@ -30,8 +30,8 @@ impl Socket for Arc<Slow> {
 }
 
 /// An outlet with such a wire, its writes, and what makes one go on.
-fn slow() -> (StreamOutlet<Arc<Slow>>, Receiver<()>, Sender<()>) {
-    let ((writes, written), (go_on, goes_on)) = (sync_channel(8), channel());
+fn slow() -> (StreamOutlet<Arc<Slow>>, Receiver<()>, SyncSender<()>) {
+    let ((writes, written), (go_on, goes_on)) = (sync_channel(8), sync_channel(8));
     let outlet = StreamOutlet::new(LIMITS);
     outlet.connect(Arc::new(Slow { writes, go_on: Mutex::new(goes_on) }), usize::MAX, None);
     (outlet, written, go_on)

@@ -154,14 +154,6 @@ pub(crate) struct Core {
     sequence: u64,
 }
 
-/// How near an application is to this node.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-enum Distance {
-    Here,
-    Linked,
-    Unlinked,
-}
-
 /// Which of the post's events, counted from 1, and which input that comes of it.
 pub(crate) type Place = (u64, u32);
 
@@ -284,26 +276,11 @@ impl Core {
         .min()
     }
 
-    /// The TIDs of the applications called `name`: who is ready comes first, as whoever requires the name is let go by it; then who is on this node, then
-    /// who is on a linked one, and then the lowest address. spec: SYNC-6
+    /// The TIDs of the applications called `name`: of this node first, ready or not, so that what a node sends to a name of its own never goes to
+    /// another's; then who is ready, then who is on a linked node, and then the lowest address. spec: SYNC-6
     pub(crate) fn called(&self, name: &str) -> Vec<Tid> {
-        let here = self
-            .apps
-            .called(name)
-            .map(|(app, known)| ((known.state != State::Ready, Distance::Here), Tid::new(self.node, app)));
-        let there = self.peers.resolve(name).map(|(tid, is_ready, is_linked)| {
-            ((!is_ready, if is_linked { Distance::Linked } else { Distance::Unlinked }), tid)
-        });
-        let mut found: Vec<_> = here.into_iter().chain(there).collect();
-        found.sort();
-        found.into_iter().map(|(_, tid)| tid).collect()
-    }
-
-    /// An application called `name` that is ready, on another node, if the one at `here` is not.
-    pub(crate) fn ready_elsewhere(&self, name: &str, here: Tid) -> Option<Tid> {
-        let is_ready = self.apps.get(here.app).is_some_and(|app| app.state == State::Ready);
-        let ready = self.peers.resolve(name).filter(|(_, is_ready, _)| *is_ready).map(|(tid, ..)| tid);
-        if is_ready { None } else { ready.min() }
+        let here = self.apps.called(name).map(|(app, _)| Tid::new(self.node, app));
+        here.into_iter().chain(self.peers.resolve(name)).collect()
     }
 
     /// Every application that has a name, on this node and on all that are known and not lost, by name and address.

@@ -295,10 +295,15 @@ impl Peers {
         current.map(|(_, _, entry)| entry.requires.clone()).collect()
     }
 
-    /// The applications called `name` on nodes that are not lost: whether each is ready, and whether its node is linked. spec: SYNC-6
-    pub(super) fn resolve(&self, name: &str) -> impl Iterator<Item = (Tid, bool, bool)> {
+    /// The applications called `name` on nodes that are not lost: those that are ready first, then those of linked nodes, then by address. spec: SYNC-6
+    pub(super) fn resolve(&self, name: &str) -> Vec<Tid> {
         let there = self.called(name).filter(|(_, peer, _)| peer.lost.is_none() && !peer.stale);
-        there.map(|(tid, peer, entry)| (tid, peer.why_not(entry, None).is_none(), peer.linked.is_some()))
+        let order = |(tid, peer, entry): (Tid, &Peer, &Entry)| {
+            (peer.why_not(entry, None).is_some(), peer.linked.is_none(), tid)
+        };
+        let mut found: Vec<_> = there.map(order).collect();
+        found.sort();
+        found.into_iter().map(|(.., tid)| tid).collect()
     }
 
     /// Every application of every node that is not lost: name, address, whether it is ready, what it handles.

@@ -409,7 +409,6 @@ fn a_name_belongs_to_this_node_then_to_the_linked_then_to_the_lowest() {
     bench.breaks(KNEE);
     assert_eq!(bench.core.called("imu").first().copied(), Some(Tid::new(ANKLE, app(0))));
     bench.registers(7, "imu", &[]);
-    bench.ready(7);
     assert_eq!(bench.core.called("imu").first().copied(), Some(Tid::new(HERE, app(7))));
     assert_eq!(bench.core.called("nobody").first().copied(), None);
     bench.hears(Input::AppChanged(AppFact::Unregistered { app: app(7) }));

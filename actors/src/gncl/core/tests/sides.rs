@@ -138,9 +138,9 @@ fn a_side_that_carried_something_right_before_a_ping_is_not_at_rest_and_is_broke
 
 #[test]
 fn the_pings_of_many_links_are_due_together() {
-    let mut core = core();
+    let mut core = Core::new(Settings { strangers_max: 100, peers_max: 100, ..settings(LOW, 1) }, 7);
     let mut wakes = std::collections::BTreeSet::new();
-    for node in 0..10_u32 {
+    for node in 0..15_u32 {
         let hello = Introduction { node: NodeAddress::new(1_000 + node), ..hello_from(HIGH, 1, 10) };
         greet(&mut core, millis(3 * u64::from(node)), hello);
     }

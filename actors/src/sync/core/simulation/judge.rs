@@ -100,7 +100,7 @@ impl World {
         self.check_names(&there)
     }
 
-    /// A name is that of one that is ready first; of those its own node's, then that of the lowest address, for all nodes.
+    /// A name is its own node's first, then that of one that is ready, then that of the lowest address, for all nodes.
     fn check_names(&self, there: &BTreeMap<usize, bool>) -> Result<(), String> {
         let mut names: BTreeMap<String, Vec<usize>> = BTreeMap::new();
         for index in there.keys() {
@@ -113,7 +113,7 @@ impl World {
                     of_it.any(|(index, is_ready)| index / SLOTS == other && *is_ready)
                 };
                 let mut right = nodes.clone();
-                right.sort_by_key(|other| (!is_ready(*other), *other != node, *other));
+                right.sort_by_key(|other| (*other != node, !is_ready(*other), *other));
                 let right: Vec<NodeAddress> = right.into_iter().map(address).collect();
                 let called: Vec<NodeAddress> = core.called(name).iter().map(|tid| tid.node).collect();
                 require(called == right, || {
