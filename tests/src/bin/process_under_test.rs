@@ -421,8 +421,7 @@ fn main() -> ExitCode {
         builder = builder.app(AppSpec::new("witness", || Witness).handles::<Count>().own_thread());
     }
     if let Some(millis) = after("--neighbour-hangs") {
-        let time = Duration::from_millis(millis.parse().expect("a time"));
-        builder = builder.app(neighbour(time, talks));
+        builder = builder.app(neighbour(Duration::from_millis(millis.parse().expect("a time")), talks));
     }
     match builder.start() {
         Ok(node) => {
