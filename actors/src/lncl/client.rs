@@ -2,7 +2,7 @@
 
 mod barrier;
 mod end;
-mod life;
+pub(super) mod life;
 mod notices;
 mod orders;
 mod outcomes;
@@ -241,7 +241,7 @@ impl Client {
             }
         };
         let mut served = Box::pin(served);
-        tokio::select! {
+        let end = tokio::select! {
             end = &mut served => end,
             // spec: LNCL-15
             () = life.ended() => {
@@ -250,9 +250,14 @@ impl Client {
                 let _ = rustix::net::shutdown(&stream, Shutdown::Both);
                 let end = tokio::time::timeout(LAST_WORDS, served).await.unwrap_or(End::HungUp(None));
                 self.leaves = Leaves::Dead;
-                end
+                return end;
             }
+        };
+        drop(served);
+        if matches!(end, End::HungUp(_)) {
+            self.leaves = Leaves::HungUp(life);
         }
+        end
     }
 
     /// The life of its process.

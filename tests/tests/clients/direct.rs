@@ -13,7 +13,7 @@ use rustix::{
     process::{Pid, Signal, kill_process},
     thread::gettid,
 };
-use sinew::{ApiError, Endpoint, NodeApi, Registration, prelude::*};
+use sinew::{ApiError, Endpoint, NodeApi, Registration, Rejection, prelude::*};
 use sinew_tests::{
     DEADLINE, Log,
     clients::{Performer, Stage, StageLimits},
@@ -131,9 +131,9 @@ fn the_death_of_a_peer_is_an_outcome_also_while_the_node_is_stopped() {
     // When: it is killed.
     assert!(echo.kill(), "it had lived until then");
 
-    // Then: the question has failed, and a new life is asked through the node, which goes on.
+    // Then: what became of the question nobody can say while the node does not, and a new life is asked through the node, which goes on.
     let (asking, answer) = waiting.join().expect("it does not panic");
-    assert!(matches!(answer, Err(ApiError::Ended(Outcome::Failed))), "{answer:?}");
+    assert!(matches!(answer, Err(ApiError::Ended(Outcome::Unknown))), "{answer:?}");
     let node = Pid::from_raw(i32::try_from(stage.node_id()).expect("a process id")).expect("a process id");
     kill_process(node, Signal::CONT).expect("the node runs");
     let echo = start_echo(&stage, &said, 2);
@@ -231,10 +231,10 @@ fn the_death_of_a_peer_is_an_outcome_also_where_a_child_of_its_holds_the_link() 
     });
     wait_until_asleep(begun.recv_timeout(DEADLINE).expect("the thread begins"));
 
-    // When: it is killed, then: the question has failed although the child is there.
+    // When: it is killed, then: it is known that it had not taken the question, although the child is there.
     assert!(echo.kill(), "it had lived until then");
     let (asking, answer) = waiting.join().expect("it does not panic");
-    assert!(matches!(answer, Err(ApiError::Ended(Outcome::Failed))), "{answer:?}");
+    assert!(matches!(answer, Err(ApiError::Ended(Outcome::Rejected(Rejection::Closed)))), "{answer:?}");
     kill_process(heir, Signal::KILL).expect("the child is there all the time");
 
     // And a new life is asked.

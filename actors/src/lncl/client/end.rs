@@ -127,7 +127,7 @@ impl Client {
     pub(super) async fn finish(mut self, end: End) {
         self.has_been_told = true;
         self.cause = end.cause();
-        self.left = if self.leaves == Leaves::Dead { Left::Nobody } else { end.left() };
+        self.left = if matches!(self.leaves, Leaves::Dead) { Left::Nobody } else { end.left() };
         match end {
             End::Unregistered => self.log("has unregistered"),
             End::HungUp(None) => self.log("has gone: its process closed the socket, or ended"),
@@ -192,7 +192,8 @@ impl Client {
 
 impl Drop for Client {
     fn drop(&mut self) {
-        self.server.introductions.remove(self.tid, self.leaves);
+        let leaves = std::mem::replace(&mut self.leaves, Leaves::WithItsLinks);
+        self.server.introductions.remove(self.tid, leaves);
         registrar::owner_gone(&self.server.stores, self.peer.owner(), &self.cause);
         self.server.remove_client(self.peer.id);
         if !self.has_been_told {

@@ -9,7 +9,7 @@ use rustix::{
 use tokio::io::{Interest, unix::AsyncFd};
 
 /// The process that has connected.
-pub(super) enum Life {
+pub(in crate::lncl) enum Life {
     /// It is watched: a descriptor that is readable when the process has ended, with all its threads.
     Watched(AsyncFd<OwnedFd>),
     /// It has ended already.
@@ -26,7 +26,7 @@ impl Life {
     ///
     /// # Errors
     /// The system does not let it be watched: there is no descriptor left, or a sandbox forbids it.
-    pub(super) fn of(pid: i32) -> io::Result<Self> {
+    pub(in crate::lncl) fn of(pid: i32) -> io::Result<Self> {
         let Some(pid) = Pid::from_raw(pid) else { return Ok(Self::Unknown) };
         let pidfd = match pidfd_open(pid, PidfdFlags::empty()) {
             Ok(pidfd) => pidfd,
@@ -41,7 +41,7 @@ impl Life {
     }
 
     /// Resolves when the process has ended; never, if that is not known.
-    pub(super) async fn ended(&self) {
+    pub(in crate::lncl) async fn ended(&self) {
         match self {
             Self::Watched(pidfd) => {
                 if pidfd.readable().await.is_err() {

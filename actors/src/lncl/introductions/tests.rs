@@ -11,7 +11,7 @@ use sinew_runtime::tid::{Incarnation, NodeAddress};
 use super::*;
 use crate::{
     NodeConfig,
-    lncl::{payload::Gone, server::Server},
+    lncl::{client::life::Life, payload::Gone, server::Server},
     stores::Stores,
 };
 
@@ -304,6 +304,42 @@ fn told_dead(client: &Client, dead: Tid) -> Vec<u64> {
         .inspect(|gone| assert_eq!(gone.peer, dead.bits()))
         .map(|gone| gone.number)
         .collect()
+}
+
+// spec: LNCL-17
+#[test]
+fn that_one_who_hung_up_is_dead_is_told_where_its_process_has_ended_too() {
+    let sleeper = || std::process::Command::new("sleep").arg("600").spawn().unwrap();
+    let life_of = |child: &std::process::Child| Life::of(i32::try_from(child.id()).unwrap()).unwrap();
+    actix_rt::System::new().block_on(async {
+        let introductions = Introductions::default();
+        let [dead, lives, asked] = [1, 2, 3].map(|app| join(&introductions, app, 4));
+        for (from, number) in [(&dead, 7), (&lives, 8)] {
+            introductions.introduce(from.tid, asked.tid, question(number, 1), NOW).unwrap();
+            asked.next().settle(Outcome::Delivered);
+        }
+        let [mut ends, mut stays] = [sleeper(), sleeper()];
+        let [ended, standing] = [life_of(&ends), life_of(&stays)];
+        // When: both hang up, and the process of one ends.
+        introductions.remove(lives.tid, Leaves::HungUp(standing));
+        introductions.remove(dead.tid, Leaves::HungUp(ended));
+        ends.kill().unwrap();
+        // Then: the time in which a process ends is over.
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+        let told = told_dead(&asked, dead.tid);
+        assert!(told.is_empty() || told == [7], "{told:?}");
+        stays.kill().unwrap();
+        [ends, stays].iter_mut().for_each(|child| _ = child.wait().unwrap());
+        // And: of one that had ended before it is told, however late anybody looks.
+        let [dead] = [4].map(|app| join(&introductions, app, 4));
+        introductions.introduce(dead.tid, asked.tid, question(9, 1), NOW).unwrap();
+        asked.next().settle(Outcome::Delivered);
+        introductions.remove(dead.tid, Leaves::HungUp(Life::Over));
+        for _ in 0..100 {
+            tokio::task::yield_now().await;
+        }
+        assert_eq!(told_dead(&asked, dead.tid), [9]);
+    });
 }
 
 // spec: LNCL-17
