@@ -24,11 +24,13 @@ pub(crate) const ARRIVALS_MAX: usize = 1_024;
 /// Highest generation: whatever opens a million times a second gets there in 285 years.
 pub(crate) const GENERATION_MAX: u64 = 1 << 53;
 
-/// Highest generation that is believed of a barrier of which nothing was heard before: whoever said more would take the rest.
-pub(crate) const GENERATION_AT_FIRST_MAX: u64 = 1 << 52;
-/// So much higher than what was heard first may be what is heard later, besides one for each microsecond since: one that opens a thousand times
-/// a second is there in 34 years, so that a node which was away takes over what it has missed.
+/// Every generation up to this is believed, by everybody: half of the room is left whoever said so.
+pub(crate) const GENERATION_FREE_MAX: u64 = 1 << 52;
+/// So much higher than that, or than what was heard first, may be what is heard later, besides one for each microsecond since: one that opens a
+/// thousand times a second is there in 34 years, so that a node which was away takes over what it has missed.
 pub(crate) const GENERATIONS_MISSED_MAX: u64 = 1 << 40;
+/// Highest generation that is believed of a barrier of which nothing was heard before: whoever said more would take the rest.
+pub(crate) const GENERATION_AT_FIRST_MAX: u64 = GENERATION_FREE_MAX + 2 * GENERATIONS_MISSED_MAX;
 
 /// What a node says.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]

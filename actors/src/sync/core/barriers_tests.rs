@@ -375,6 +375,32 @@ fn one_word_of_a_generation_that_cannot_be_does_not_keep_a_barrier_shut() {
 
 // spec: SYNC-12
 #[test]
+fn a_wrong_generation_that_leaves_room_does_not_part_those_who_had_heard_another_one_from_who_comes_later() {
+    for heard in [vec![], vec![5]] {
+        let mut bench = Bench::of_the_hip();
+        bench.links(KNEE, LIFE);
+        bench.links(ANKLE, LIFE);
+        bench.list(KNEE, list(1, &[("knee", true, &[])]));
+        let versions = (1..).zip(heard.iter().copied());
+        versions.for_each(|(version, heard)| {
+            _ = bench.is_told(KNEE, LIFE, version, vec![idle("calibrated", heard)])
+        });
+        // When
+        let wrong = 1 << 45;
+        let outputs = bench.is_told(ANKLE, LIFE, 1, vec![idle("calibrated", wrong)]);
+        // Then
+        assert!(!outputs.iter().any(is_refused), "{outputs:?}");
+        bench.is_told(KNEE, LIFE, 9, vec![awaited("calibrated", wrong)]);
+        let outputs = bench.arrives("calibrated", 7);
+        assert!(
+            outputs.contains(&answered(7, BarrierAnswer::Opened { generation: wrong + 1 })),
+            "{outputs:?}"
+        );
+    }
+}
+
+// spec: SYNC-12
+#[test]
 fn what_was_missed_in_years_is_taken_over() {
     let mut bench = Bench::of_the_hip();
     bench.links(KNEE, LIFE);

@@ -35,8 +35,8 @@ use self::{known::Wait, voices::Voices};
 use super::{Reason, respite::Moment};
 use crate::sync::{
     arrivals::{
-        ARRIVALS_MAX, Arrival, Arrivals, BARRIERS_MAX, BarrierSaid, GENERATION_AT_FIRST_MAX, GENERATION_MAX,
-        GENERATIONS_MISSED_MAX, Member, Passed,
+        ARRIVALS_MAX, Arrival, Arrivals, BARRIERS_MAX, BarrierSaid, GENERATION_AT_FIRST_MAX,
+        GENERATION_FREE_MAX, GENERATION_MAX, Member, Passed,
     },
     facts::Absence,
     list::Name,
@@ -255,10 +255,10 @@ impl Rendezvous {
     }
 
     /// Whether a barrier can have opened so often. The highest generation is everybody's, and outlives who said it: one word that is wrong would
-    /// leave no room for a next one, to nobody, ever. spec: SYNC-12
+    /// leave no room for a next one, to nobody, ever. What half of the room has is believed by everybody, whatever was heard before: else a wrong
+    /// word would part those who had heard another one first from those who came later. spec: SYNC-12
     fn is_believed(&self, now: Time, said: &BarrierSaid) -> bool {
-        // Nobody asks which barrier it is of one that is so low.
-        said.generation <= GENERATIONS_MISSED_MAX
+        said.generation <= GENERATION_FREE_MAX
             || said.generation
                 <= self
                     .known

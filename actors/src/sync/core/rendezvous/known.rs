@@ -1,6 +1,7 @@
 //! One barrier, as a node knows it: how often it has opened, who has passed it when, who of this node waits there.
 
 use super::*;
+use crate::sync::arrivals::GENERATIONS_MISSED_MAX;
 
 /// One barrier.
 #[derive(Debug)]
@@ -72,7 +73,7 @@ impl Known {
     pub(super) fn believed_max(&self, now: Time) -> u64 {
         let of_later = |(generation, at): (u64, Time)| {
             let since = u64::try_from(now.since(at).as_micros()).unwrap_or(u64::MAX);
-            generation.saturating_add(GENERATIONS_MISSED_MAX).saturating_add(since)
+            generation.max(GENERATION_FREE_MAX).saturating_add(GENERATIONS_MISSED_MAX).saturating_add(since)
         };
         self.heard_first.map_or(GENERATION_AT_FIRST_MAX, of_later)
     }
