@@ -8,7 +8,7 @@
 //! | --- | --- |
 //! | SYNC-1 | A list replaces what its node said before. The newest version of the newest incarnation wins; an older one is ignored. A list about another life than the linked one is refused. |
 //! | SYNC-2 | The whole list goes to a peer when its link comes up, at each change (not sooner than 1 ms after the one before, 5 ms if that had more than 4 KiB), and again every 2 s. |
-//! | SYNC-3 | An entry counts as ready while its list says so, its node's link is up, a list has come since it came up, and the node is not lost. When a node is found or linked in another life, what the former one said is over. |
+//! | SYNC-3 | An entry counts as ready while its list says so, its node's link is up, a list has come since it came up, and the node is not lost. When a node is linked in another life, or found in another that is not linked, what the former one said is over. |
 //! | SYNC-4 | A list has at most 1,024 entries of at most 64 requirements, and 1,024 groups; names have 1 to 63 bytes and no control characters; nothing stands in it twice. Another one is refused whole, counted and logged. |
 //! | SYNC-5 | An application is released once in each of its lives, when all that it requires is met. A life begins when it registers (not so again) and when it fails. |
 //! | SYNC-6 | A name belongs to the application of this node, ready or not; else to one that is ready; else to that of a linked node; else to that of a node whose link is down. Of several nodes the lowest address wins. Any application of the name satisfies a requirement. |

@@ -73,6 +73,47 @@ fn a_node_that_is_found_in_its_next_life_brings_nothing_of_its_former_one_back()
     assert_eq!(bench.core.called("drive").len(), 1);
 }
 
+// spec: SYNC-3
+#[test]
+fn a_double_that_is_found_while_the_node_itself_is_linked_takes_nothing_away_until_the_link_breaks() {
+    for is_unmasked in [true, false] {
+        // Given
+        let mut bench = Bench::new();
+        bench.registers(0, "gait", &["drive"]);
+        bench.links(KNEE, LIFE);
+        bench.list(KNEE, list(1, &[("drive", true, &[])]));
+        bench.ready(0);
+        // When
+        let outputs = found(&mut bench, NEXT_LIFE);
+        // Then
+        assert_eq!(outputs, []);
+        assert_eq!(bench.core.called("drive").len(), 1);
+        // And once messages do not reach the node any more, who was found last is there, unless it was no more than a double
+        if is_unmasked {
+            bench.hears(Input::MembershipChanged(MembershipFact::NodeLost {
+                node: KNEE,
+                incarnation: NEXT_LIFE,
+                why: LossReason::Duplicate,
+            }));
+        }
+        bench.breaks(KNEE);
+        assert_eq!(bench.core.called("drive").len(), usize::from(is_unmasked));
+    }
+}
+
+// spec: SYNC-3
+#[test]
+fn a_life_that_was_lost_is_over_also_where_the_end_of_its_link_is_heard_after_the_next_life_was_found() {
+    let mut bench = Bench::new();
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("drive", true, &[])]));
+    bench.lost(KNEE, LossReason::Crashed);
+    found(&mut bench, NEXT_LIFE);
+    assert!(bench.core.called("drive").is_empty());
+    bench.breaks(KNEE);
+    assert!(bench.core.called("drive").is_empty());
+}
+
 // spec: SYNC-13
 #[test]
 fn who_does_not_wait_for_a_lost_party_is_told_of_the_loss_also_when_its_node_is_found_in_its_next_life() {

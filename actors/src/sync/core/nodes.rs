@@ -22,7 +22,10 @@ impl Core {
             }
             // A double that nobody here takes for the node any more: messages reach the right one already.
             MembershipFact::NodeLost { node, incarnation, why: LossReason::Duplicate }
-                if self.peers.linked(node).is_some_and(|life| life != incarnation) => {}
+                if self.peers.linked(node).is_some_and(|life| life != incarnation) =>
+            {
+                self.peers.found_wrongly(node, incarnation);
+            }
             MembershipFact::NodeLost { node, incarnation, why } => {
                 let reason = match why {
                     LossReason::Left => Reason::NodeLeft,

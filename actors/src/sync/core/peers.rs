@@ -45,6 +45,8 @@ pub(super) struct Peers {
 struct Peer {
     /// Which life of it messages can reach now.
     linked: Option<Incarnation>,
+    /// Which life of it was found last, or linked after that.
+    found: Option<Incarnation>,
     /// Why it is not there, if it is not.
     lost: Option<Reason>,
     /// Whether it sent a list since the link came up or it was lost.
@@ -105,10 +107,11 @@ impl Peer {
         }
     }
 
-    /// It is in this life: a list about another one says nothing about it.
+    /// It is in this life: a list about another one says nothing about it, and one about this life does.
     fn expect(&mut self, incarnation: Incarnation) {
-        if self.list.as_ref().is_some_and(|list| list.incarnation != incarnation) {
-            (self.heard, self.stale) = (false, true);
+        if let Some(list) = &self.list {
+            self.stale = list.incarnation != incarnation;
+            self.heard &= !self.stale;
         }
     }
 
@@ -148,7 +151,8 @@ impl Peers {
     pub(super) fn link_up(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation) -> bool {
         let Some(peer) = self.at(node) else { return false };
         peer.expect(incarnation);
-        (peer.linked, peer.lost, peer.due) = (Some(incarnation), None, now);
+        (peer.linked, peer.found) = (Some(incarnation), Some(incarnation));
+        (peer.lost, peer.due) = (None, now);
         true
     }
 
@@ -158,6 +162,17 @@ impl Peers {
             && !peer.is_former(incarnation)
         {
             (peer.linked, peer.heard) = (None, false);
+            // Another one was found while this one was linked.
+            peer.found.into_iter().for_each(|found| peer.expect(found));
+        }
+    }
+
+    /// Who was found as this life of `node` was another process, and the one that is linked is the node.
+    pub(super) fn found_wrongly(&mut self, node: NodeAddress, incarnation: Incarnation) {
+        if let Some(peer) = self.nodes.get_mut(&node)
+            && peer.found == Some(incarnation)
+        {
+            peer.found = peer.linked;
         }
     }
 
@@ -171,12 +186,16 @@ impl Peers {
         }
     }
 
-    /// `node` is there. What was known of another life of it is over, and stays so before that one is heard. spec: SYNC-3
+    /// `node` is there. What was known of another life of it is over, and stays so before that one is heard; but not while messages reach that
+    /// one: who is linked is there, and who is found may be a double that does not know it. spec: SYNC-3
     pub(super) fn found(&mut self, node: NodeAddress, incarnation: Incarnation) {
         if let Some(peer) = self.nodes.get_mut(&node)
             && !peer.is_former(incarnation)
         {
-            peer.expect(incarnation);
+            peer.found = Some(incarnation);
+            if peer.lost.is_some() || peer.linked.is_none_or(|linked| linked == incarnation) {
+                peer.expect(incarnation);
+            }
             peer.lost = None;
         }
     }
