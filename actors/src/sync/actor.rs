@@ -58,7 +58,7 @@ impl Actor for SyncManager {
         let outlet = Arc::new(PostOutlet(self.stores.posts.sync.clone()));
         self.stores.router.set_local(AppAddress::SYNC, LocalRoute { outlet, events: Arc::new([]) });
         // A predecessor may have failed between two of the core's orders, or before it heard of the groups.
-        self.core().replaced();
+        self.core().replaced(Time::now());
         self.stores.groups_are_looked_at();
         self.take_groups();
         monitors::feed(&self.stores, monitors::Input::TimePassed);

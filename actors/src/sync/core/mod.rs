@@ -147,8 +147,8 @@ pub(crate) struct Core {
     retry: Option<Time>,
     respite: Respite,
     outputs: VecDeque<Output>,
-    /// The answer about a barrier that was taken last.
-    answer_in_hand: Option<Output>,
+    /// The output that was taken last, if it is one that is said once.
+    in_hand: Option<Output>,
     /// Which of the post's events was taken in last, and which input of it.
     taken_in: Place,
     sequence: u64,
@@ -184,7 +184,7 @@ impl Core {
             retry: None,
             respite: Respite::default(),
             outputs: VecDeque::new(),
-            answer_in_hand: None,
+            in_hand: None,
             taken_in: (0, 0),
             sequence: 0,
         }
@@ -243,16 +243,28 @@ impl Core {
     /// The next thing to be done; take until there is none.
     pub(crate) fn poll(&mut self) -> Option<Output> {
         let output = self.outputs.pop_front();
-        let answer = output.as_ref().filter(|output| matches!(output, Output::AnswerBarrier { .. }));
-        self.answer_in_hand = answer.cloned();
+        let is_said_once = |output: &&Output| {
+            matches!(
+                output,
+                Output::AnswerBarrier { .. }
+                    | Output::Release { .. }
+                    | Output::Tell { .. }
+                    | Output::TellDirectory { .. }
+            )
+        };
+        self.in_hand = output.as_ref().filter(is_said_once).cloned();
         output
     }
 
-    /// The actor that took the last output was replaced. Whether it gave an answer about a barrier is not known, and nobody asks twice: it is
-    /// given again. Who has it counts the second one as a late reply.
-    pub(crate) fn replaced(&mut self) {
-        if let Some(answer) = self.answer_in_hand.take() {
-            self.outputs.push_front(answer);
+    /// The actor that took the last output was replaced. Whether it carried that out is not known, and nobody asks twice: an answer about a barrier
+    /// is given again, and who has it counts the second one as a late reply; what else is said once counts as not taken.
+    pub(crate) fn replaced(&mut self, now: Time) {
+        match self.in_hand.take() {
+            Some(answer @ Output::AnswerBarrier { .. }) => self.outputs.push_front(answer),
+            Some(Output::Release { app }) => self.keep(now, app, None),
+            Some(Output::Tell { app, event, .. }) => self.keep(now, app, Some(event.name().to_owned())),
+            Some(Output::TellDirectory { app, event }) => self.directory_not_taken(now, app, event),
+            Some(_) | None => {}
         }
     }
 

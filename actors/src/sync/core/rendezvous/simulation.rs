@@ -242,10 +242,16 @@ impl World {
         self.judge.seen.handed_again += 1;
         match self.cores[node].poll() {
             // It is given again.
-            Some(Output::AnswerBarrier { .. }) | None => {}
+            Some(
+                Output::AnswerBarrier { .. }
+                | Output::Release { .. }
+                | Output::Tell { .. }
+                | Output::TellDirectory { .. },
+            )
+            | None => {}
             Some(output) => self.carry_out(node, output),
         }
-        self.cores[node].replaced();
+        self.cores[node].replaced(self.now);
         if self.fault == Some(Fault::HandledAgain) {
             self.cores[node].handle(self.now, again);
         } else {

@@ -203,7 +203,8 @@ impl World {
         }
     }
 
-    /// In one case of eight the sync manager fails when it has carried out an order, and its successor is handed the same event.
+    /// In one case of eight the sync manager fails with an order in hand, before it carries it out if it is one that is given once, and its successor
+    /// is handed the same event.
     fn handle(&mut self, node: usize, input: Input) {
         self.events += 1;
         let place = (self.events, 1);
@@ -211,10 +212,17 @@ impl World {
         self.cores[node].handle_once(self.now, place, input);
         let Some(again) = again else { return };
         self.seen.count("events handed over again", 1);
-        if let Some(output) = self.cores[node].poll() {
-            self.carry_out(node, output);
+        match self.cores[node].poll() {
+            Some(
+                Output::AnswerBarrier { .. }
+                | Output::Release { .. }
+                | Output::Tell { .. }
+                | Output::TellDirectory { .. },
+            )
+            | None => {}
+            Some(output) => self.carry_out(node, output),
         }
-        self.cores[node].replaced();
+        self.cores[node].replaced(self.now);
         if self.fault == Some(Fault::HandledAgain) {
             self.cores[node].handle(self.now, again);
         } else {
