@@ -326,7 +326,8 @@ impl Endpoint {
             (message.header.sequence, message.header.sent) = (self.sequence, Time::now());
             if let Some(message) = self.writer.send_in_place(message.into()) {
                 match self.writer.begin(message) {
-                    Ok(Progress::Full(_)) => return,
+                    // What is being sent just now has the ring in hand: the next call tells it.
+                    Ok(Progress::Full(_)) | Err(ApiError::Lent) => return,
                     Ok(Progress::Part(rest)) => self.rest = rest,
                     // An error shows itself again when the ring is read.
                     Ok(Progress::Whole) | Err(_) => {}

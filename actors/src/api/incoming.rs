@@ -236,6 +236,8 @@ impl Endpoint {
             None if !self.is_within_frame() => deadline,
             Some(_) | None => deadline.min(now + REST_AGAIN),
         };
+        // Nobody says when there is room for what the node is to be told.
+        let deadline = if self.leaves.are_to_be_told() { deadline.min(now + NAP) } else { deadline };
         let deadline = self.direct.wake_by(deadline, now, rings);
         match self.form {
             // It naps in any case.
