@@ -27,6 +27,15 @@ const LAST_LOOKS: usize = 64;
 /// First pause of a thread between two looks at what others send while a direct link has no room; doubled up to a nap. Room ends it.
 const ROOM_PAUSE: Duration = Duration::from_millis(1);
 
+/// Whoever waits for an answer; also one that is dropped before it comes keeps no link.
+struct Asking<'endpoint>(&'endpoint mut Endpoint);
+
+impl Drop for Asking<'_> {
+    fn drop(&mut self) {
+        self.0.direct.awaits(None);
+    }
+}
+
 impl Endpoint {
     /// Sends `message` and waits for its outcome, no longer than a message can live.
     pub(super) async fn confirm(
@@ -92,9 +101,8 @@ impl Endpoint {
         // Who waits so long for the answer waits no longer for room.
         let way = self.dispatch(message, self.patience().and_in_all(within)).await?;
         let wanted = Wanted { number, what: awaited, of: self.absolute(asked) };
-        let answer = self.await_answer(wanted, way, deadline, now).await;
-        self.direct.awaits(None);
-        answer
+        let asking = Asking(self);
+        asking.0.await_answer(wanted, way, deadline, now).await
     }
 
     /// Waits for the answer to what went this `way`; `None` at the deadline.
@@ -137,6 +145,9 @@ impl Endpoint {
 
     /// Lends memory for a payload of `length` bytes: in the ring that a message to `destination` goes into now, if it can.
     pub(super) fn lend(&mut self, header: Header, length: usize) -> Result<LentMessage, ApiError> {
+        if self.leaves.are_to_be_told() {
+            self.tell_leaves();
+        }
         let loan = self.lender.lend()?;
         let destination = self.absolute(header.destination);
         // Who has no link asks for one now: while the ring to the node is lent it cannot.
