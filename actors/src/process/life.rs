@@ -26,7 +26,7 @@ use super::{
     held::Process,
     link::{LastWords, Link},
     names::KnownNames,
-    spawn,
+    spawn::{self, Started},
     words::{self, Beat, Ending, Look, Names, Turn, WORDS_BYTES_MAX, Welcome},
 };
 use crate::{
@@ -81,13 +81,12 @@ impl Life for ProcessLife {
 }
 
 async fn run(hosted: Arc<Hosted>, ready: ReadyGate, stop: Rc<Notify>) -> Reason {
-    let predecessor = hosted.link.predecessor();
-    if let Err(cause) = predecessor.has_ended(&hosted.name).await {
-        return Reason::ProcessEnded(format!(
-            "it could not be started: nobody can say whether its former process has ended: {cause}"
-        ));
-    }
-    let (group, socket) = match spawn::start(hosted.variable(), predecessor.clone()).await {
+    // A stop is not for the process before to end.
+    let started = tokio::select! {
+        started = start(&hosted) => started,
+        () = stop.notified() => return Reason::Shutdown,
+    };
+    let (group, socket) = match started {
         Ok(started) => started.keep(),
         Err(why) => return Reason::ProcessEnded(format!("it could not be started: {why}")),
     };
@@ -101,6 +100,14 @@ async fn run(hosted: Arc<Hosted>, ready: ReadyGate, stop: Rc<Notify>) -> Reason 
         Ok(mut child) => child.accompany(&stop).await,
         Err(why) => Reason::ProcessEnded(format!("it could not be listened to: {why}")),
     }
+}
+
+/// Starts the process, as soon as the one before has ended.
+async fn start(hosted: &Hosted) -> Result<Started, String> {
+    let predecessor = hosted.link.predecessor();
+    let ended = predecessor.has_ended(&hosted.name).await;
+    ended.map_err(|cause| format!("nobody can say whether its former process has ended: {cause}"))?;
+    spawn::start(hosted.variable(), predecessor.clone()).await
 }
 
 impl Hosted {
