@@ -80,7 +80,7 @@ fn run(config: &NodeConfig, app: &DynApp, mut socket: StdStream) -> io::Result<(
     socket.set_nonblocking(true)?;
     // Before the application's priority and CPU are this thread's: who hangs there keeps no sign of life from being given.
     let beats = Beats::begin((welcome.beat_us > 0).then(|| Duration::from_micros(welcome.beat_us)))?;
-    let watcher = Watcher::begin();
+    let watcher = Watcher::begin(app.policy().progress_within.is_some());
     place(app).prepare();
     let system = actix::System::new();
     let stop = system.stop_future();

@@ -26,12 +26,14 @@ use crate::post::lock;
 pub struct Watcher(Arc<Watchdog>);
 
 impl Watcher {
-    /// Makes the thread. To be called before the calling one is [prepared](Place::prepare): an actor that hangs in its first turn, on a thread
+    /// Makes the thread, if the actor `is_watched`: has a progress budget. To be called before the calling one is [prepared](Place::prepare): an actor that hangs in its first turn, on a thread
     /// with a real-time priority and one CPU, would keep a thread that is made there from ever beginning.
     #[must_use]
-    pub fn begin() -> Self {
+    pub fn begin(is_watched: bool) -> Self {
         let watchdog = Arc::new(Watchdog::default());
-        watchdog.begin();
+        if is_watched {
+            watchdog.begin();
+        }
         Self(watchdog)
     }
 }
