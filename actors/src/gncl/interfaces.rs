@@ -292,6 +292,8 @@ struct Watch {
     socket: AsyncFd<OwnedFd>,
     known: Known,
     buffer: Vec<u8>,
+    /// The kernel had more to say than it could keep, and says nothing new before all that it has kept is read, nor that it does not.
+    has_missed: bool,
 }
 
 impl Watch {
@@ -305,7 +307,7 @@ impl Watch {
             reason = "sound for an OwnedFd, which keeps its descriptor; its successor is an unsafe fn, and unsafe code lives in sinew-shm and the C binding alone"
         )]
         let socket = AsyncFd::new(socket)?;
-        Ok(Self { socket, known: Known::new(), buffer: vec![0; BUFFER_LEN] })
+        Ok(Self { socket, known: Known::new(), buffer: vec![0; BUFFER_LEN], has_missed: false })
     }
 
     fn ask(&self, asked: Option<Asked>) -> io::Result<()> {
@@ -329,13 +331,18 @@ impl Watch {
                     return Ok(lost);
                 }
                 Ok(Err(error)) if error.raw_os_error() == Some(rustix::io::Errno::NOBUFS.raw_os_error()) => {
-                    drop(ready);
-                    let asks = self.known.missed();
-                    self.ask(asks)?;
+                    self.has_missed = true;
                 }
                 Ok(Err(error)) if error.kind() == io::ErrorKind::Interrupted => {}
                 Ok(Err(error)) => return Err(error),
-                Err(_would_block) => {}
+                Err(_would_block) => {
+                    drop(ready);
+                    // What is asked for before all is read misses what happens until then.
+                    if std::mem::take(&mut self.has_missed) {
+                        let asks = self.known.missed();
+                        self.ask(asks)?;
+                    }
+                }
             }
         }
     }
