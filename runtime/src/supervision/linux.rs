@@ -40,9 +40,11 @@ pub(super) fn keep_on_any() -> std::io::Result<()> {
     Ok(sched_setaffinity(None, &set)?)
 }
 
-/// Lets the calling thread run where the process was started to run, by `taskset` say, whatever whoever made it was kept on.
+/// Lets the calling thread run where the process was started to run, by `taskset` say, whatever whoever made it was kept on; on any CPU where
+/// none of those is left to the process.
 pub(super) fn keep_on_the_processes() -> std::io::Result<()> {
-    the_processes().map_or_else(keep_on_any, |set| Ok(sched_setaffinity(None, set)?))
+    let kept = the_processes().map(|set| sched_setaffinity(None, set));
+    if kept.is_some_and(|kept| kept.is_ok()) { Ok(()) } else { keep_on_any() }
 }
 
 /// The CPUs of the first thread when this was asked for first.
