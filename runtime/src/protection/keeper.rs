@@ -28,6 +28,8 @@ const OWING_MAX: usize = 256;
 const BEGINS_WITHIN: Duration = Duration::from_secs(5);
 /// Time after which is tried again what somebody holds just then: an output, or the queue to the thread.
 const HELD: Duration = Duration::from_micros(100);
+/// Time after which it hands over again what is to be dropped.
+const TIDIES: Duration = Duration::from_millis(10);
 /// Longest sleep of the thread; it is woken when it has something to do.
 const IDLE: Duration = Duration::from_secs(3_600);
 
@@ -84,6 +86,13 @@ pub(super) enum Arrival {
     Kept(Kept),
     /// One that nobody has any more and that is not safe yet.
     Owing(Arc<dyn Watched>),
+}
+
+/// What the thread has no use for any more.
+#[expect(dead_code, reason = "it is there to be dropped, by another thread")]
+pub(super) enum Rubbish {
+    Kept(Kept),
+    Output(Arc<dyn Watched>),
 }
 
 /// One output, which its owners keep: it is dropped where the last of them is.
@@ -195,6 +204,8 @@ struct Rounds {
     /// Those whose time is over in this round.
     due: Vec<Weak<dyn Watched>>,
     unsaid: Unsaid,
+    /// To give memory back can mean to wait for a thread that does so too: it is left to the one that speaks.
+    rubbish: Vec<Rubbish>,
 }
 
 impl Rounds {
@@ -211,10 +222,11 @@ impl Rounds {
     fn round(&mut self, keeper: &Keeper) -> Duration {
         let has_all = self.take_in(keeper);
         // Of the round before: all that was due then is safe.
-        let has_said_all = self.unsaid.hand_over();
+        let has_said_all = self.unsaid.hand_over(&mut self.rubbish);
         let soon = if has_all && has_said_all { IDLE } else { HELD };
         self.let_go(keeper);
         let sleeps = self.look(Time::now()).min(soon);
+        let sleeps = if self.rubbish.is_empty() { sleeps } else { sleeps.min(TIDIES) };
         if self.due.is_empty() {
             return sleeps;
         }
@@ -222,7 +234,12 @@ impl Rounds {
         for output in self.due.drain(..) {
             // A panic of what makes it safe is caught where that is called; here an output may panic whose last owner has just gone.
             let tried = catch_unwind(AssertUnwindSafe(|| {
-                output.upgrade().map_or(Tried::Done(None), |output| output.try_expire())
+                let Some(output) = output.upgrade() else { return Tried::Done(None) };
+                let tried = output.try_expire();
+                if Arc::strong_count(&output) == 1 {
+                    self.rubbish.push(Rubbish::Output(output));
+                }
+                tried
             }));
             match tried.unwrap_or(Tried::Done(None)) {
                 Tried::Held => {}
@@ -252,7 +269,7 @@ impl Rounds {
         true
     }
 
-    /// Lets go of those that are safe by now: what is dropped with them is the user's.
+    /// Lets go of those that are safe by now.
     fn let_go(&mut self, keeper: &Keeper) {
         let mut at = 0;
         while let Some(output) = self.owing.get(at) {
@@ -260,25 +277,28 @@ impl Rounds {
                 at += 1;
                 continue;
             }
-            let paid = self.owing.swap_remove(at);
+            self.rubbish.push(Rubbish::Output(self.owing.swap_remove(at)));
             keeper.owing.fetch_sub(1, Ordering::Relaxed);
-            let _ = catch_unwind(AssertUnwindSafe(|| drop(paid)));
         }
     }
 
     /// Notes whose time is over; the time until the next one's is.
     fn look(&mut self, now: Time) -> Duration {
-        let Self { kept, due, .. } = self;
-        let mut sleeps = IDLE;
-        kept.retain(|Kept { watch, output }| {
+        let Self { kept, due, rubbish, .. } = self;
+        let (mut sleeps, mut at) = (IDLE, 0);
+        while let Some(Kept { watch, output }) = kept.get(at) {
             let left = Time::from_nanos(watch.deadline.load(Ordering::Acquire)).since(now);
             if left.is_zero() || watch.is_tripped.load(Ordering::Acquire) {
                 due.push(output.clone());
             } else {
                 sleeps = sleeps.min(left);
             }
-            output.strong_count() > 0
-        });
+            if output.strong_count() > 0 {
+                at += 1;
+            } else {
+                rubbish.push(Rubbish::Kept(kept.swap_remove(at)));
+            }
+        }
         sleeps
     }
 }

@@ -1,8 +1,10 @@
 //! What is to be said of outputs: when they are safe, without a lock in hand, and not by the thread that makes them so. The queue to the log
-//! has a lock, which ordinary threads hold: that thread leaves what it has to say to one of those.
+//! has a lock, which ordinary threads hold, and so has memory that is given back: that thread leaves what it has to say, and what it has no use for,
+//! to one of those.
 
 use std::{
     io,
+    panic::{AssertUnwindSafe, catch_unwind},
     sync::{
         Mutex, OnceLock, PoisonError, TryLockError,
         atomic::{AtomicU64, Ordering},
@@ -10,7 +12,7 @@ use std::{
     thread::{self, Thread},
 };
 
-use super::Cause;
+use super::{Cause, keeper::Rubbish};
 use crate::{supervision::make_like_any_other, tid::Tid};
 
 /// What is left to be said at most. What comes then is counted.
@@ -55,8 +57,14 @@ pub(super) struct Unsaid {
     lost: u64,
 }
 
+struct Left {
+    said: Vec<Said>,
+    /// To be dropped.
+    rubbish: Vec<Rubbish>,
+}
+
 /// What is handed over.
-static LEFT: Mutex<Vec<Said>> = Mutex::new(Vec::new());
+static LEFT: Mutex<Left> = Mutex::new(Left { said: Vec::new(), rubbish: Vec::new() });
 static LOST: AtomicU64 = AtomicU64::new(0);
 static SPEAKER: OnceLock<Thread> = OnceLock::new();
 
@@ -76,9 +84,10 @@ impl Unsaid {
         }
     }
 
-    /// Leaves it to the thread that says it. `false`: somebody has that one's list in hand just now, or it is full.
-    pub(super) fn hand_over(&mut self) -> bool {
-        if self.own.is_empty() {
+    /// Leaves it to the thread that says it, and drops the rubbish, as far as there is room for that. `false`: somebody has that one's list in hand
+    /// just now, or there is more to be said than it takes.
+    pub(super) fn hand_over(&mut self, rubbish: &mut Vec<Rubbish>) -> bool {
+        if self.own.is_empty() && rubbish.is_empty() {
             return true;
         }
         let mut left = match LEFT.try_lock() {
@@ -86,8 +95,10 @@ impl Unsaid {
             Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
             Err(TryLockError::WouldBlock) => return false,
         };
-        let room = UNSAID_MAX.saturating_sub(left.len()).min(self.own.len());
-        left.extend(self.own.drain(..room));
+        let room = UNSAID_MAX.saturating_sub(left.said.len()).min(self.own.len());
+        left.said.extend(self.own.drain(..room));
+        let room = UNSAID_MAX.saturating_sub(left.rubbish.len()).min(rubbish.len());
+        left.rubbish.extend(rubbish.drain(..room));
         drop(left);
         LOST.fetch_add(std::mem::take(&mut self.lost), Ordering::Relaxed);
         if let Some(speaker) = SPEAKER.get() {
@@ -105,7 +116,10 @@ pub(super) fn begin() -> io::Result<()> {
     if SPEAKER.get().is_some() {
         return Ok(());
     }
-    LEFT.lock().unwrap_or_else(PoisonError::into_inner).reserve(UNSAID_MAX);
+    let mut left = LEFT.lock().unwrap_or_else(PoisonError::into_inner);
+    left.said.reserve(UNSAID_MAX);
+    left.rubbish.reserve(UNSAID_MAX);
+    drop(left);
     let speaker = thread::Builder::new().name("safe-output-log".to_owned()).spawn(speak)?;
     SPEAKER.get_or_init(|| speaker.thread().clone());
     Ok(())
@@ -114,9 +128,16 @@ pub(super) fn begin() -> io::Result<()> {
 fn speak() {
     make_like_any_other();
     let mut said = Vec::with_capacity(UNSAID_MAX);
+    let mut rubbish = Vec::with_capacity(UNSAID_MAX);
     loop {
-        said.append(&mut LEFT.lock().unwrap_or_else(PoisonError::into_inner));
+        {
+            let mut left = LEFT.lock().unwrap_or_else(PoisonError::into_inner);
+            said.append(&mut left.said);
+            rubbish.append(&mut left.rubbish);
+        }
         said.drain(..).for_each(Said::log);
+        // What is dropped is the user's, and may panic.
+        rubbish.drain(..).for_each(|rubbish| _ = catch_unwind(AssertUnwindSafe(|| drop(rubbish))));
         let lost = LOST.swap(0, Ordering::Relaxed);
         if lost > 0 {
             crate::log::warn!(lost, "more was to be said of outputs that were made safe than was kept");
@@ -137,11 +158,12 @@ mod tests {
         let mut unsaid = Unsaid::default();
         (0..UNSAID_MAX + 2).for_each(|_| unsaid.note(Some(said)));
         let in_hand = LEFT.lock().expect("nobody panics with it");
-        assert!(!unsaid.hand_over(), "it does not wait");
+        let mut rubbish = Vec::new();
+        assert!(!unsaid.hand_over(&mut rubbish), "it does not wait");
         assert_eq!((unsaid.own.len(), unsaid.lost), (UNSAID_MAX, 2));
         drop(in_hand);
         begin().expect("there is a thread");
-        while !unsaid.hand_over() {
+        while !unsaid.hand_over(&mut rubbish) {
             thread::yield_now();
         }
         assert_eq!(unsaid.lost, 0);
