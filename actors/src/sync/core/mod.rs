@@ -157,6 +157,19 @@ pub(crate) struct Core {
 /// Which of the post's events, counted from 1, and which input that comes of it.
 pub(crate) type Place = (u64, u32);
 
+impl Output {
+    /// Whether nobody asks for it again: in the hand of an actor that failed it would be lost.
+    fn is_said_once(&self) -> bool {
+        matches!(
+            self,
+            Self::AnswerBarrier { .. }
+                | Self::Release { .. }
+                | Self::Tell { .. }
+                | Self::TellDirectory { .. }
+        )
+    }
+}
+
 impl Core {
     /// Knows nobody yet. `config` is checked.
     #[must_use]
@@ -243,16 +256,7 @@ impl Core {
     /// The next thing to be done; take until there is none.
     pub(crate) fn poll(&mut self) -> Option<Output> {
         let output = self.outputs.pop_front();
-        let is_said_once = |output: &&Output| {
-            matches!(
-                output,
-                Output::AnswerBarrier { .. }
-                    | Output::Release { .. }
-                    | Output::Tell { .. }
-                    | Output::TellDirectory { .. }
-            )
-        };
-        self.in_hand = output.as_ref().filter(is_said_once).cloned();
+        self.in_hand = output.as_ref().filter(|output| output.is_said_once()).cloned();
         output
     }
 

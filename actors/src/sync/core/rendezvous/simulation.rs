@@ -240,16 +240,9 @@ impl World {
         self.cores[node].handle_once(self.now, place, input);
         let Some(again) = again else { return };
         self.judge.seen.handed_again += 1;
-        match self.cores[node].poll() {
-            // It is given again.
-            Some(
-                Output::AnswerBarrier { .. }
-                | Output::Release { .. }
-                | Output::Tell { .. }
-                | Output::TellDirectory { .. },
-            )
-            | None => {}
-            Some(output) => self.carry_out(node, output),
+        // What is said once is lost with the actor, and given again.
+        if let Some(output) = self.cores[node].poll().filter(|output| !output.is_said_once()) {
+            self.carry_out(node, output);
         }
         self.cores[node].replaced(self.now);
         if self.fault == Some(Fault::HandledAgain) {
