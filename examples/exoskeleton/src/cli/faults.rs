@@ -120,6 +120,9 @@ fn options(arguments: &FaultArguments) -> Result<FaultOptions, RunError> {
 fn words(report: &FaultReport) -> String {
     let mut text: String = report.skipped.iter().map(|words| format!("left out: {words}\n")).collect();
     text.extend(report.failures.iter().map(|words| format!("failed: {words}\n")));
+    text.extend(
+        report.claims.iter().filter(|claim| !claim.held).map(|claim| format!("did not hold: {claim}\n")),
+    );
     let counted = |functional: bool| {
         let claims = || report.claims.iter().filter(|claim| claim.expected.is_functional() == functional);
         format!("{} of {}", claims().filter(|claim| claim.held).count(), claims().count())

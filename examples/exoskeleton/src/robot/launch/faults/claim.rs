@@ -2,7 +2,7 @@
 //!
 //! Class A: real-time kernel, isolated core. Class B: plain Linux, idle. Class C: any machine, also a shared one.
 
-use std::fmt::Write;
+use std::fmt::{self, Write};
 
 use serde::Serialize;
 
@@ -169,6 +169,21 @@ impl<'a> Claims<'a> {
     }
 }
 
+/// One line for whoever reads only the end of a report.
+impl fmt::Display for Claim {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.step {
+            Some(step) => write!(f, "step {step}")?,
+            None => write!(f, "contrast")?,
+        }
+        let comma = if self.at.is_empty() { "" } else { ", " };
+        let kind = if self.expected.is_functional() { "function" } else { "time" };
+        let seen = self.seen.map_or_else(|| "never".to_owned(), number);
+        let expected = self.expected.words();
+        write!(f, "{comma}{}: {}: expected {expected}, seen {seen} ({kind})", self.at, self.name)
+    }
+}
+
 /// The claims as a table for people, lines of at most 100 characters.
 #[must_use]
 pub fn table(claims: &[Claim]) -> String {
@@ -178,7 +193,7 @@ pub fn table(claims: &[Claim]) -> String {
     text
 }
 
-fn write_table(out: &mut String, claims: &[Claim]) -> std::fmt::Result {
+fn write_table(out: &mut String, claims: &[Claim]) -> fmt::Result {
     writeln!(out, "{:-<100}", "")?;
     writeln!(out, "{:60} {:>17} {:>10}  holds", "step and claim", "expected A/B/C", "seen")?;
     let mut told = None;
@@ -222,6 +237,17 @@ mod tests {
             assert!(!expected.holds(None));
             assert_eq!(expected.classes(None), "NO");
         }
+    }
+
+    #[test]
+    fn claim_in_one_line_says_where_it_stands_and_what_kind_it_is() {
+        let mut out = Vec::new();
+        let mut claims = Claims::new(Step::KillDrive, "phase 0.62", &mut out);
+        claims.exactly("drives started anew", 1, 2);
+        claims.timing("output after, ms", [1.0, 2.0, 3.0], None);
+        let lines = out.iter().map(ToString::to_string).collect::<Vec<_>>();
+        assert_eq!(lines[0], "step 4, phase 0.62: drives started anew: expected 1, seen 2 (function)");
+        assert_eq!(lines[1], "step 4, phase 0.62: output after, ms: expected 1 / 2 / 3, seen never (time)");
     }
 
     #[test]
