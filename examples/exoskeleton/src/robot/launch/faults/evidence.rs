@@ -299,17 +299,18 @@ impl Evidence {
         rows.map(|row| joints.iter().filter(|joint| exceeds(row, **joint)).count()).sum()
     }
 
-    /// Samples of a device that damps by itself, once its ramp is over, with more than soft damping and 1 Nm.
+    /// Samples of a device that damps by itself, each time once its ramp is over, with more than soft damping and 1 Nm.
     pub(super) fn undamped_device(&self, joint: Joint, span: Span) -> usize {
         let rows = self.plant(span);
-        let Some(since) = rows.iter().find(|row| row.watchdog[joint.index()]).map(|row| row.t_ns) else {
-            return rows.len();
-        };
-        let damps = rows
-            .iter()
-            .filter(|row| row.t_ns > since + SAFE_RAMP_NS)
-            .take_while(|row| row.watchdog[joint.index()]);
-        damps.filter(|row| row.applied_nm[joint.index()].abs() > self.damping_max_nm(joint, row.t_ns)).count()
+        let i = joint.index();
+        if !rows.iter().any(|row| row.watchdog[i]) {
+            // Nothing seen is no proof.
+            return rows.len().max(1);
+        }
+        let damping = rows.chunk_by(|a, b| a.watchdog[i] == b.watchdog[i]).filter(|rows| rows[0].watchdog[i]);
+        let after_its_ramp =
+            damping.flat_map(|rows| rows.iter().skip_while(|row| row.t_ns <= rows[0].t_ns + SAFE_RAMP_NS));
+        after_its_ramp.filter(|row| row.applied_nm[i].abs() > self.damping_max_nm(joint, row.t_ns)).count()
     }
 
     fn damping_max_nm(&self, joint: Joint, t_ns: u64) -> f64 {

@@ -53,7 +53,7 @@ const STILL: Duration = Duration::from_secs(1);
 /// Time for things to happen that are looked at afterwards.
 const AFTERMATH: Duration = Duration::from_millis(300);
 /// Words of a kind at least and at most, and the time between them.
-const WORDS: u32 = 10;
+const WORDS: u32 = 20;
 const WORDS_MAX: u32 = 500;
 const WORD_PERIOD: Duration = Duration::from_millis(3);
 const RESET_PATIENCE: Duration = Duration::from_secs(60);
@@ -378,7 +378,8 @@ fn give(robot: &mut Robot, injection: &mut Injection, kind: Mark, words: &[Word]
             break;
         }
     }
-    robot.pass_until(Time::now() + 4 * WORD_PERIOD)
+    // So that none of these words is counted as one of the next kind.
+    robot.pass_until(Time::now() + AFTERMATH)
 }
 
 /// How many words of a kind the drive has counted.
