@@ -161,7 +161,7 @@ impl OwnRingMemory {
     }
 }
 
-#[cfg(test)]
+#[cfg(all(test, not(loom)))]
 impl OwnRingMemory {
     /// The same memory as a peer sees it. Nobody writes it any more.
     pub(super) fn into_peer(self) -> PeerMemory {

@@ -6,7 +6,7 @@ mod mapping;
 mod memfd;
 mod passing;
 mod rights;
-#[cfg(test)]
+#[cfg(all(test, not(loom)))]
 mod tests;
 
 pub(crate) use bells::{SharedPage, bells, buttons, which_ended};

@@ -32,8 +32,8 @@ use self::{
 };
 use crate::seeded::{Seed, number};
 
-/// Seeds in an ordinary run; without optimization a third of them takes as long.
-const SEEDS: u64 = if cfg!(debug_assertions) { 100 } else { 300 };
+/// Seeds in an ordinary run; without optimization a fifth of them takes as long.
+const SEEDS: u64 = if cfg!(debug_assertions) { 60 } else { 300 };
 /// How many instead; `docs/TESTING.md` has the command.
 pub(super) const SEEDS_VARIABLE: &str = "SINEW_NDL_SEEDS";
 /// The most nodes that are looked at: what they cost at 10, 100 and so on, how they get over faults if there are more than 100.

@@ -24,7 +24,7 @@ const ELDER: u16 = 11;
 const LATER: u16 = 12;
 const BOTH: u32 = 9;
 /// Seeds in an ordinary run, and those within which each fault must be found.
-const SEEDS: u64 = 200;
+const SEEDS: u64 = if cfg!(debug_assertions) { 100 } else { 200 };
 
 fn gave_up(world: &World, index: u16) -> bool {
     world.at(index).others.iter().any(|output| matches!(output, Output::AddressTaken { .. }))
