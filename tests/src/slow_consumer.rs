@@ -27,8 +27,6 @@ use crate::{
     own_group,
 };
 
-/// How long the reference takes: no Bulk, then a consumer that keeps up.
-const REFERENCE: Duration = Duration::from_secs(10);
 /// Longest time for which the consumer is slow beyond [`Plan::lasts`], as long as not enough was offered.
 const OFFERED_WITHIN: Duration = DEADLINE.saturating_mul(3);
 /// Memory of the sender that is not the messages': what the allocator keeps, threads, tables.
@@ -47,14 +45,8 @@ pub struct Plan {
     pub length: usize,
     /// What a slow consumer takes for each.
     pub takes: Duration,
-    /// Time of each reference; [`reference()`] if nothing speaks for another.
+    /// Time of each of the two references: no Bulk, a consumer that keeps up.
     pub reference: Duration,
-}
-
-/// A reference that is long enough for a p99.
-#[must_use]
-pub const fn reference() -> Duration {
-    REFERENCE
 }
 
 /// Plays the role that this process was started for; `None` if it is the director.

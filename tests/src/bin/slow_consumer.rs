@@ -7,7 +7,7 @@
 use std::{process::ExitCode, time::Duration};
 
 use clap::Parser;
-use sinew_tests::slow_consumer::{Plan, play, reference, run};
+use sinew_tests::slow_consumer::{Plan, play, run};
 
 /// Lets an application be too slow for what another node sends to it; measures both nodes' memory and others' round trips.
 #[derive(Parser)]
@@ -24,20 +24,23 @@ struct Arguments {
     /// What it takes for each, in milliseconds.
     #[arg(long, default_value_t = 10)]
     takes_ms: u64,
+    /// How long it is looked on without Bulk, and then with a consumer that keeps up, in seconds.
+    #[arg(long, default_value_t = 60)]
+    reference_s: u64,
 }
 
 fn main() -> ExitCode {
     if let Some(code) = play() {
         return code;
     }
-    let Arguments { minutes, rate, length, takes_ms } = Arguments::parse();
+    let Arguments { minutes, rate, length, takes_ms, reference_s } = Arguments::parse();
     let report = run(&Plan {
         program: std::env::current_exe().expect("a program has a path"),
         lasts: Duration::from_secs_f64(minutes * 60.0),
         rate,
         length: length as usize,
         takes: Duration::from_millis(takes_ms),
-        reference: reference(),
+        reference: Duration::from_secs(reference_s),
     });
     println!("{report}\n{}", report.json());
     if !report.is_bounded() {

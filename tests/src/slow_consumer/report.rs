@@ -80,7 +80,17 @@ impl Report {
     /// How much longer the others' questions took than beside a consumer that keeps up.
     #[must_use]
     pub fn ratio(&self) -> f64 {
-        self.slow.p99.as_secs_f64() / self.fast.p99.as_secs_f64().max(f64::MIN_POSITIVE)
+        self.ratio_to(&self.fast)
+    }
+
+    /// And than where no Bulk goes at all: beside what the slowness costs, what the messages themselves do.
+    #[must_use]
+    pub fn ratio_to_quiet(&self) -> f64 {
+        self.ratio_to(&self.quiet)
+    }
+
+    fn ratio_to(&self, reference: &Window) -> f64 {
+        self.slow.p99.as_secs_f64() / reference.p99.as_secs_f64().max(f64::MIN_POSITIVE)
     }
 
     /// Whether the others did not feel it.
@@ -104,6 +114,7 @@ impl Report {
             "length": self.plan.length, "quiet": window(&self.quiet), "fast": window(&self.fast),
             "slow": window(&self.slow), "taken": self.taken, "offered": self.offered, "refused": self.refused,
             "growth": self.growth(), "bounds": self.bounds, "p99_ratio": self.ratio(),
+            "p99_ratio_to_quiet": self.ratio_to_quiet(),
         })
     }
 }
@@ -141,12 +152,14 @@ impl fmt::Display for Report {
         let ([here, there], [here_max, there_max]) = (self.growth(), self.bounds);
         writeln!(
             f,
-            "sender +{} KiB of {}, receiver +{} KiB of {}; p99 {:.2} times that beside a consumer that keeps up",
+            "sender +{} KiB of {}, receiver +{} KiB of {}; p99 {:.2} times that beside a consumer that keeps up, {:.2} \
+             times that without Bulk",
             kib(here),
             kib(here_max),
             kib(there),
             kib(there_max),
-            self.ratio()
+            self.ratio(),
+            self.ratio_to_quiet()
         )?;
         write!(
             f,
