@@ -1,5 +1,6 @@
 //! Where messages go: the routing table of a node, read by senders without a lock.
 
+mod copies;
 pub mod guard;
 pub mod tap;
 
@@ -14,7 +15,7 @@ use std::{
 
 use arc_swap::ArcSwap;
 
-use self::{guard::Guard, tap::Tap};
+use self::{copies::Copies, guard::Guard, tap::Tap};
 use crate::{
     outcome::{Rejection, Ticket},
     post::lock,
@@ -89,14 +90,6 @@ struct Table {
 
 /// Who decides about one message; nobody: it may go anywhere.
 type Judge<'a> = Option<&'a Arc<dyn Guard>>;
-
-/// What became of the copies of a message to many.
-#[derive(Clone, Copy, Debug, Default)]
-struct Copies {
-    taken: usize,
-    /// The guard did not let so many through.
-    not_allowed: usize,
-}
 
 /// The routing table of a node. It is owned by the node, so that it outlives every layer.
 pub struct Router {
@@ -192,7 +185,9 @@ impl Router {
         let result = if message.header.destination.is_single() {
             submit_here(table, guard, message)
         } else {
-            self.fan_out(table, guard, app, &message);
+            let mut copies = Copies::default();
+            self.fan_out(table, guard, app, &message, &mut copies);
+            self.count(&copies);
             Ok(())
         };
         self.account(result)
@@ -289,34 +284,46 @@ impl Router {
     /// One copy for each node that has a member, and one for each member here.
     fn multicast(&self, table: &Table, message: Message) -> Result<(), Refused> {
         let Tid { node, app } = message.header.destination;
-        let mut taken = 0;
-        let mut not_allowed = false;
+        let mut copies = Copies::default();
         tap::saw_sent_to_many(table.tap.as_ref(), &message);
         if node == self.node || node == NodeAddress::ALL {
-            let here = self.fan_out(table, table.guard.as_ref(), app, &message);
-            taken += here.taken;
-            not_allowed = here.not_allowed > 0;
+            self.fan_out(table, table.guard.as_ref(), app, &message, &mut copies);
         }
+        let mut submit = |peer: &Arc<dyn Outlet>| {
+            copies.note(peer.submit(copy_of(&message)).err().map(|refused| refused.why));
+        };
         if node == NodeAddress::ALL && app.is_group() {
             let members = table.remote_groups.get(&app).map_or(&[][..], Vec::as_slice);
-            let peers = members.iter().filter_map(|member| table.peers.get(member));
-            taken += peers.filter(|peer| peer.submit(copy_of(&message)).is_ok()).count();
+            members.iter().filter_map(|member| table.peers.get(member)).for_each(submit);
         } else if node == NodeAddress::ALL {
-            taken += table.peers.values().filter(|peer| peer.submit(copy_of(&message)).is_ok()).count();
+            table.peers.values().for_each(submit);
         } else if let Some(peer) = table.peers.get(&node) {
-            taken += usize::from(peer.submit(copy_of(&message)).is_ok());
+            submit(peer);
         }
-        if taken > 0 {
+        if copies.is_taken() {
+            self.count(&copies);
             return Ok(());
         }
-        let why = if not_allowed { Rejection::NotAllowed } else { Rejection::NoSuchApplication };
-        Err(Refused::new(message, why))
+        Err(Refused::new(message, copies.why_none()))
+    }
+
+    /// Of a message to many that others took, so that its sender hears nothing: the copies for which there was no room.
+    fn count(&self, copies: &Copies) {
+        for (why, count) in copies.without_room() {
+            self.refused[why as usize].fetch_add(count, Ordering::Relaxed);
+        }
     }
 
     /// Copies for the members on this node, except the sender itself.
-    fn fan_out(&self, table: &Table, guard: Judge<'_>, app: AppAddress, message: &Message) -> Copies {
+    fn fan_out(
+        &self,
+        table: &Table,
+        guard: Judge<'_>,
+        app: AppAddress,
+        message: &Message,
+        copies: &mut Copies,
+    ) {
         let here = self.node;
-        let mut copies = Copies::default();
         let mut submit = |(member, outlet): (AppAddress, &Arc<dyn Outlet>)| {
             let is_sender = here == message.header.source.node && member == message.header.source.app;
             if is_sender {
@@ -328,8 +335,7 @@ impl Router {
                 outlet.submit(copy_of(message)).err().map(|refused| refused.why)
             };
             tap::saw_one_of_many(table.tap.as_ref(), Tid::new(here, member), message, refused);
-            copies.taken += usize::from(refused.is_none());
-            copies.not_allowed += usize::from(refused == Some(Rejection::NotAllowed));
+            copies.note(refused);
         };
         if app.is_group() {
             let members = table.groups.get(&app).map_or(&[][..], Vec::as_slice);
@@ -342,7 +348,6 @@ impl Router {
             // A broadcast to the application that has this address on every node.
             table.local.get(&app).into_iter().for_each(|route| submit((app, &route.outlet)));
         }
-        copies
     }
 
     fn change(&self, edit: impl FnOnce(&mut Table)) {

@@ -1,0 +1,119 @@
+//! What becomes of the copies of a message to many.
+
+use crate::outcome::Rejection;
+
+/// How many were taken, and why the others were not.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Copies {
+    taken: usize,
+    /// By [`Rejection`].
+    refused: [u64; Rejection::ALL.len()],
+}
+
+impl Copies {
+    pub(super) const fn note(&mut self, refused: Option<Rejection>) {
+        match refused {
+            None => self.taken += 1,
+            Some(why) => self.refused[why as usize] += 1,
+        }
+    }
+
+    /// Whether anybody took one.
+    pub(super) const fn is_taken(&self) -> bool {
+        self.taken > 0
+    }
+
+    /// Those for which there was no room. Whom a guard keeps out, or who is not there, is meant to get none.
+    pub(super) fn without_room(&self) -> impl Iterator<Item = (Rejection, u64)> {
+        [Rejection::QueueFull, Rejection::TooLong].into_iter().map(|why| (why, self.refused[why as usize]))
+    }
+
+    /// Why none was taken: what a sender can mend, and where there is nothing of that, nobody is there.
+    pub(super) fn why_none(&self) -> Rejection {
+        let mendable = [Rejection::NotAllowed, Rejection::TooLong, Rejection::QueueFull];
+        let found = mendable.into_iter().find(|why| self.refused[*why as usize] > 0);
+        found.unwrap_or(Rejection::NoSuchApplication)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use bytes::Bytes;
+
+    use crate::{
+        outcome::Rejection,
+        router::{LocalRoute, Outlet, Refused, Router},
+        tid::{AppAddress, NodeAddress, Tid},
+        wire::{Header, Kind, Message},
+    };
+
+    const NODE: NodeAddress = NodeAddress::new(0x7f00_0001);
+    const PEER: NodeAddress = NodeAddress::new(0x7f00_0002);
+    const MEMBER: AppAddress = AppAddress::new(0x1001);
+
+    /// Takes everything, or nothing.
+    struct Sink(Option<Rejection>);
+
+    impl Outlet for Sink {
+        fn submit(&self, message: Message) -> Result<(), Refused> {
+            self.0.map_or(Ok(()), |why| Err(Refused::new(message, why)))
+        }
+    }
+
+    /// A node with a member here and at a peer, which take what they are sent or not.
+    fn router(here: Option<Rejection>, there: Option<Rejection>) -> Router {
+        let (router, group) = (Router::new(NODE), AppAddress::group("legs"));
+        router.set_local(MEMBER, LocalRoute { outlet: Arc::new(Sink(here)), events: Arc::new([]) });
+        router.set_member(group, MEMBER, true);
+        router.set_peer(PEER, Arc::new(Sink(there)));
+        router.set_remote_groups(PEER, &[group]);
+        router
+    }
+
+    fn to_group() -> Message {
+        Message::new(Header::new(Kind::named("test.word"), Tid::NONE, Tid::group("legs")), Bytes::new())
+    }
+
+    #[test]
+    fn a_copy_without_room_is_counted_where_another_was_taken() {
+        for (here, there) in [(None, Some(Rejection::QueueFull)), (Some(Rejection::QueueFull), None)] {
+            let router = router(here, there);
+            assert_eq!(router.send(to_group()), Ok(()));
+            assert_eq!(router.refused_because(), [(Rejection::QueueFull, 1)]);
+        }
+    }
+
+    #[test]
+    fn whoever_is_not_there_or_may_not_have_it_is_no_loss() {
+        for why in [Rejection::Closed, Rejection::Away, Rejection::NotAllowed] {
+            let router = router(Some(why), None);
+            assert_eq!(router.send(to_group()), Ok(()));
+            assert_eq!(router.refused_because(), []);
+        }
+    }
+
+    #[test]
+    fn where_nobody_takes_one_the_sender_hears_what_it_can_mend() {
+        let full = Some(Rejection::QueueFull);
+        for (here, there, said) in [
+            (full, full, Rejection::QueueFull),
+            (Some(Rejection::Closed), full, Rejection::QueueFull),
+            (Some(Rejection::TooLong), full, Rejection::TooLong),
+            (Some(Rejection::NotAllowed), full, Rejection::NotAllowed),
+            (Some(Rejection::Closed), Some(Rejection::Closed), Rejection::NoSuchApplication),
+        ] {
+            let router = router(here, there);
+            assert_eq!(router.send(to_group()), Err(said));
+            assert_eq!(router.refused_because(), [(said, 1)], "the message is refused once");
+        }
+    }
+
+    #[test]
+    fn a_copy_of_what_another_node_sent_is_counted_too() {
+        let router = router(Some(Rejection::QueueFull), None);
+        assert_eq!(router.deliver(to_group()), Ok(()));
+        assert_eq!(router.refused_because(), [(Rejection::QueueFull, 1)]);
+    }
+}
