@@ -43,6 +43,8 @@ const ENDING: Duration = Duration::from_secs(1);
 /// Time that a killed process has to end while a thread of the node's waits for it that ends itself. It takes a fraction of a
 /// millisecond; what takes longer has much memory to give back, or hangs in the kernel.
 const DYING: Duration = Duration::from_millis(20);
+/// Time until a child that does not read is told again of the names that there was no room for.
+const NAMES_AGAIN: Duration = Duration::from_millis(20);
 /// Numbers of waits for each process of a TID: more than it can use up.
 const WAITS_PER_LIFE: u64 = 1 << 40;
 
@@ -129,6 +131,8 @@ struct Child {
     reader: Reader,
     session: Session,
     names: KnownNames,
+    /// When it is told again what there was no room for.
+    names_again: Option<Instant>,
     /// Changes of the directory since the names in the welcome were looked up.
     changes: watch::Receiver<u64>,
     number: LinkNumber,
@@ -197,6 +201,7 @@ impl Child {
             reader,
             session,
             names,
+            names_again: None,
             changes,
             number,
             said: None,
@@ -251,12 +256,15 @@ impl Child {
                 // Its last words are there already.
                 _ = &mut drain, if !drained => drained = true,
                 words = &mut ended => return Silence::Ended(words),
-                () = stop.notified() => self.say(words::bare(Kind::HOST_STOP, Tid::NONE, self.hosted.tid)),
+                () = stop.notified() => {
+                    self.say(words::bare(Kind::HOST_STOP, Tid::NONE, self.hosted.tid));
+                }
                 () = link.nudged(self.number) => {
                     self.tell_names();
                     link.hand_over_held();
                 }
                 () = changed(&mut changes) => self.tell_names(),
+                () = due(self.names_again) => self.tell_names(),
                 now = watch.tick() => {
                     if let Some(reason) = watch.judge(now, &mut self.heard) {
                         return Silence::Fault(reason);
@@ -322,7 +330,7 @@ impl Child {
             Kind::HOST_LOOK => {
                 let Look { name } = payload::read(&message.payload).map_err(|error| fault(&error))?;
                 let names = self.names.look(&self.hosted.stores, name);
-                self.tell(&names);
+                self.tell(names);
             }
             // Not an enum of ours: an open set of numbers.
             _ => return self.obey_like_a_client(message).map_err(|what| fault(&what)),
@@ -384,26 +392,42 @@ impl Child {
 
     fn tell_names(&mut self) {
         let seen = *self.hosted.stores.directory_changes.borrow();
+        self.names_again = None;
         if let Some(changes) = self.names.changes(&self.hosted.stores) {
-            self.tell(&changes);
+            self.tell(changes);
         }
-        self.hosted.link.directory_is_told(self.number, seen);
+        if self.names_again.is_none() {
+            self.hosted.link.directory_is_told(self.number, seen);
+        }
     }
 
-    fn tell(&self, names: &Names) {
+    fn tell(&mut self, names: Names) {
         let node = payload::lncl_of(self.hosted.tid.node);
-        self.say(words::frame(Kind::HOST_NAMES, node, self.hosted.tid, names));
+        if !self.say(words::frame(Kind::HOST_NAMES, node, self.hosted.tid, &names)) {
+            self.names.not_told(names);
+            self.names_again = Some(Instant::now() + NAMES_AGAIN);
+        }
     }
 
-    fn say(&self, message: Message) {
+    /// Returns whether the child hears it once it reads, or never will hear anything.
+    fn say(&self, message: Message) -> bool {
         match self.hosted.link.say_to(self.number, message) {
             // Closed: it is about to end.
-            Ok(()) | Err(sinew_runtime::router::Refused { why: Rejection::Closed, .. }) => {}
+            Ok(()) | Err(sinew_runtime::router::Refused { why: Rejection::Closed, .. }) => true,
             Err(refused) => {
                 let detail = format!("{} does not read its socket: {}", self.hosted.tid, refused.why);
                 self.hosted.stores.refusals.count(Time::now(), "hosted application does not listen", &detail);
+                false
             }
         }
+    }
+}
+
+/// Resolves at that time, or never.
+async fn due(at: Option<Instant>) {
+    match at {
+        Some(at) => tokio::time::sleep_until(at).await,
+        None => std::future::pending().await,
     }
 }
 

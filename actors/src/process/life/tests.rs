@@ -73,6 +73,48 @@ fn a_name_that_comes_between_the_welcome_and_the_listening_is_told() {
 }
 
 #[test]
+fn names_that_there_was_no_room_for_are_told_once_the_child_reads() {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        // Given: a child that does not read, for which no more can wait
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let hosted = Hosted {
+            stores: stores.clone(),
+            link: Link::new(&stores, Mailbox::new(8)),
+            tid: Tid::new(NodeAddress::HERE, AppAddress::fixed(1).unwrap()),
+            name: "child".to_owned(),
+            progress_within: None,
+        };
+        let (ours, theirs) = std::os::unix::net::UnixStream::pair().unwrap();
+        theirs.set_nonblocking(true).unwrap();
+        let mut child = Child::new(Arc::new(hosted), sleeper(), ReadyGate::new(|| {}), ours).unwrap();
+        let any = || words::bare(Kind::HOST_STOP, Tid::NONE, child.hosted.tid);
+        assert!((0..1_000_000).any(|_| !child.say(any())), "there is room without end");
+        registers(&stores, "late");
+        child.tell_names();
+        // When: it reads
+        let hears = async {
+            let (mut reader, theirs) = (Reader::new(WORDS_BYTES_MAX), UnixStream::from_std(theirs).unwrap());
+            loop {
+                let frame = reader.next(&theirs).await.unwrap().unwrap();
+                if frame.header.kind == Kind::HOST_NAMES {
+                    return payload::read::<Names>(&frame.payload).unwrap();
+                }
+            }
+        };
+        // Then
+        child.changes.mark_unchanged();
+        let stop = Notify::new();
+        tokio::select! {
+            ended = child.accompany(&stop) => panic!("it lives: {ended:?}"),
+            names = tokio::time::timeout(WITHIN, hears) => {
+                assert!(names.unwrap().names.iter().any(|name| name.name == "late"));
+            }
+        }
+    });
+}
+
+#[test]
 fn names_that_were_looked_up_for_a_former_child_do_not_reach_the_next_one() {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     runtime.block_on(async {
