@@ -230,7 +230,10 @@ impl Gncl {
             marks::mark(transport.socket(), lane);
         }
         let payload_max = usize::try_from(attach.payload_max).unwrap_or(usize::MAX);
-        let Move { place, transport } = self.stores.gncl.place(lane, transport);
+        let Some(Move { place, transport }) = self.stores.gncl.place(lane, transport.clone()) else {
+            // Its reader meets the end, and the core makes another one.
+            return transport.shut(Shutdown::Both);
+        };
         wire.transport = Some(transport.clone());
         let checksum = attach.checksum();
         let link = way.outlet.connect(Gathering::new(transport.clone(), checksum), payload_max, welcome);

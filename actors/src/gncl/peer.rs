@@ -428,15 +428,24 @@ impl Store {
         }
     }
 
-    /// Where the connections of a lane are read and written from now on, and this one, `transport`, as it is to be used there.
-    pub(super) fn place(&self, lane: Lane, transport: Transport) -> Move {
+    /// Where the connections of a lane are read and written from now on, and this one, `transport`, as it is to be used there. `None`: nowhere.
+    /// Bulk goes where it went before or not at all, as long as there is no descriptor for it: what reads the connection before may be in the
+    /// middle of a message on the thread of Bulk, and on another one the next message would overtake that.
+    pub(super) fn place(&self, lane: Lane, transport: Transport) -> Option<Move> {
         match lane {
-            Lane::Control | Lane::Stream => Move { place: Place::Here, transport },
-            Lane::Bulk => self.bulk_place(&transport).unwrap_or_else(|error| {
-                // It works there, too; only that Control may wait for Bulk.
-                self.refusals.count(Time::now(), "Bulk stays on the IO thread", &error);
-                Move { place: Place::Here, transport }
-            }),
+            Lane::Control | Lane::Stream => Some(Move { place: Place::Here, transport }),
+            Lane::Bulk => match self.bulk_place(&transport) {
+                Ok(there) => Some(there),
+                Err(error) if lock(&self.bulk).is_none() => {
+                    // It works there, too; only that Control may wait for Bulk.
+                    self.refusals.count(Time::now(), "Bulk stays on the IO thread", &error);
+                    Some(Move { place: Place::Here, transport })
+                }
+                Err(error) => {
+                    self.refusals.count(Time::now(), "no descriptor for a connection of Bulk", &error);
+                    None
+                }
+            },
         }
     }
 
