@@ -185,8 +185,7 @@ impl Router {
         let result = if message.header.destination.is_single() {
             submit_here(table, guard, message)
         } else {
-            let mut copies = Copies::default();
-            self.fan_out(table, guard, app, &message, &mut copies);
+            let copies = self.fan_out(table, guard, app, &message);
             self.count(&copies);
             Ok(())
         };
@@ -287,7 +286,7 @@ impl Router {
         let mut copies = Copies::default();
         tap::saw_sent_to_many(table.tap.as_ref(), &message);
         if node == self.node || node == NodeAddress::ALL {
-            self.fan_out(table, table.guard.as_ref(), app, &message, &mut copies);
+            copies = self.fan_out(table, table.guard.as_ref(), app, &message);
         }
         let mut submit = |peer: &Arc<dyn Outlet>| {
             copies.note(peer.submit(copy_of(&message)).err().map(|refused| refused.why));
@@ -315,14 +314,8 @@ impl Router {
     }
 
     /// Copies for the members on this node, except the sender itself.
-    fn fan_out(
-        &self,
-        table: &Table,
-        guard: Judge<'_>,
-        app: AppAddress,
-        message: &Message,
-        copies: &mut Copies,
-    ) {
+    fn fan_out(&self, table: &Table, guard: Judge<'_>, app: AppAddress, message: &Message) -> Copies {
+        let mut copies = Copies::default();
         let here = self.node;
         let mut submit = |(member, outlet): (AppAddress, &Arc<dyn Outlet>)| {
             let is_sender = here == message.header.source.node && member == message.header.source.app;
@@ -348,6 +341,7 @@ impl Router {
             // A broadcast to the application that has this address on every node.
             table.local.get(&app).into_iter().for_each(|route| submit((app, &route.outlet)));
         }
+        copies
     }
 
     fn change(&self, edit: impl FnOnce(&mut Table)) {
