@@ -17,8 +17,8 @@
 //! - `idle-N`: so many nodes that know each other and have nothing to do.
 //! - `control_beside_bulk_N`: round trips of 64 bytes in class Control, one every millisecond: first alone, then beside a
 //!   flood of Bulk messages of N bytes to another application of the other node, as fast as they are taken. What counts is the
-//!   p99 beside the flood by the p99 alone (`p99_ratio_percent`).
-//! - `control_beside_slow_consumer`: the same, and the application that is flooded takes a millisecond for each of its messages.
+//!   p99 beside the flood by the p99 alone (`p99_ratio_percent`). Then bare TCP: a connection beside another one on which as many bytes are written at once.
+//! - `control_beside_slow_consumer`: the same between nodes, and the application that is flooded takes a millisecond for each of its messages.
 //! - `stream_by_WAY-CHANNELS`: values of class Stream one way, one every millisecond on each of 1, 16 and 64 channels, by datagrams and by the connection
 //!   (`gncl.datagrams`): how old they are when they are handled. `cpu_ns_each_value` is what both processes needed, `acks_per_s` what this host sent of datagrams beside the
 //!   values that were handled (acknowledgements, repetitions, a few of NDL's). `superseded` are counted values that did not come; `superseded_on_the_way_with_warm_up` and
@@ -27,6 +27,7 @@
 //!   (network namespaces: needs root, `ip` and `tc`); `slow_link_priorities`: the hosts send by priority what waits.
 
 mod beside;
+mod beside_raw;
 mod crowd;
 mod crowd_raw;
 mod flood;
@@ -39,7 +40,11 @@ mod slow_link;
 mod stream_ends;
 mod stream_ways;
 
-use std::{process::ExitCode, time::Duration};
+use std::{
+    net::{Ipv4Addr, SocketAddrV4},
+    process::ExitCode,
+    time::Duration,
+};
 
 use sinew_figures::{Asked, Beside, End, Pace, Pinning, Rounds, process};
 use sinew_hosts::Queue;
@@ -191,6 +196,12 @@ impl Case {
                 let at = At::loopback();
                 let _other = process::Process::start(&format!("beside_echo {pause_us} {}", at.host(2)));
                 beside::measure(name, at, bulk_bytes, rounds);
+                // A stream whose other end takes a message a millisecond is no reference: it stands still.
+                if pause_us == 0 {
+                    let raw = SocketAddrV4::new(Ipv4Addr::LOCALHOST, at.port());
+                    let _other = process::Process::start(&format!("beside_raw_echo {raw}"));
+                    beside_raw::measure(name, raw, bulk_bytes, [rounds; 2]);
+                }
             }
             Self::Stream(plan) => stream_ways::measure(&self.name(), plan),
             Self::SlowLink(queue) => return slow_link::measure(&self.name(), queue),
@@ -299,7 +310,7 @@ fn play(role: &str) -> ExitCode {
             stream_ways::take(plan, At::read(at));
         }
         ["slow_nodes", case, at] => slow_link::nodes(case, At::read(at)),
-        ["slow_raw_echo", address] => slow_link::raw_echo(address.parse().expect("an address of ours")),
+        ["beside_raw_echo", address] => beside_raw::echo(address.parse().expect("an address of ours")),
         ["slow_raw", case, address] => slow_link::raw(case, address.parse().expect("an address of ours")),
         _ => {
             eprintln!("no such role: {role}");
