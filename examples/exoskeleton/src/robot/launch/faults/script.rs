@@ -57,10 +57,10 @@ const WORDS: u32 = 20;
 const WORDS_MAX: u32 = 500;
 const WORD_PERIOD: Duration = Duration::from_millis(3);
 const RESET_PATIENCE: Duration = Duration::from_secs(60);
-/// From [`PUSH_PHASE`] on, how long the same with the other sign is insane for sure.
-const PUSHES: Duration = Duration::from_millis(150);
+/// From [`PUSH_PHASE`] on, how long the same with the other sign is insane for sure; from [`QUIET_PHASE`] on, how long zero is sane.
+const SURELY: Duration = Duration::from_millis(150);
 /// Strides in which it is tried, at most: where the host has no time for the operator there are few words in each.
-const PUSHES_MAX: u32 = 20;
+const STRIDES_MAX: u32 = 20;
 
 /// One injected fault and what came of it, in the host's clock.
 #[derive(Debug, Clone)]
@@ -344,13 +344,12 @@ fn insane_commands(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), Fa
     let at = Time::now();
     out.push(Injection::begun(Step::InsaneCommands, "ankle", at));
     let injection = out.last_mut().expect("it was just pushed");
-    give(robot, injection, Mark::Sane, &[Word::Torque(0.0)])?;
+    give_at(QUIET_PHASE, robot, injection, Mark::Sane, &[Word::Torque(0.0)])?;
     // A number of long ago is one only right after one of now.
-    give(robot, injection, Mark::OldSequence, &[Word::Torque(0.0), Word::OldSequence(5.0)])?;
-    robot.walk_to_phase(PUSH_PHASE)?;
-    give(robot, injection, Mark::NotANumber, &[Word::Torque(f32::NAN)])?;
-    give(robot, injection, Mark::TooMuch, &[Word::Torque(500.0)])?;
-    give_reversed(robot, injection)?;
+    give_at(QUIET_PHASE, robot, injection, Mark::OldSequence, &[Word::Torque(0.0), Word::OldSequence(5.0)])?;
+    give(robot, injection, Mark::NotANumber, Word::Torque(f32::NAN))?;
+    give(robot, injection, Mark::TooMuch, Word::Torque(500.0))?;
+    give_at(PUSH_PHASE, robot, injection, Mark::Reversed, &[Word::Torque(40.0)])?;
     injection.mark(Mark::Stranger, Time::now());
     for _ in 0..WORDS {
         robot.operator()?.pretend_to_be_central()?;
@@ -363,18 +362,15 @@ fn insane_commands(robot: &mut Robot, out: &mut Vec<Injection>) -> Result<(), Fa
     Ok(())
 }
 
-/// Gives the words over and over until the drive has counted one of the kind: of a stream the newest wins, so that a
-/// word may be overtaken by the next.
-fn give(robot: &mut Robot, injection: &mut Injection, kind: Mark, words: &[Word]) -> Result<(), FaultError> {
-    let counted = |robot: &Robot| counted(robot, kind);
-    let before = counted(robot);
+/// Gives a word that is insane at any moment over and over, until the drive has counted one of the kind: of a stream the
+/// newest wins, so that a word may be overtaken by the next.
+fn give(robot: &mut Robot, injection: &mut Injection, kind: Mark, word: Word) -> Result<(), FaultError> {
+    let before = counted(robot, kind);
     injection.mark(kind, Time::now());
     for number in 1..=WORDS_MAX {
-        for word in words {
-            robot.operator()?.set_torque(Joint::Ankle, *word)?;
-        }
+        robot.operator()?.set_torque(Joint::Ankle, word)?;
         robot.pass_until(Time::now() + WORD_PERIOD)?;
-        if number >= WORDS && counted(robot) > before {
+        if number >= WORDS && counted(robot, kind) > before {
             break;
         }
     }
@@ -388,26 +384,33 @@ fn counted(robot: &Robot, kind: Mark) -> Option<u32> {
     drive.map(|drive| if kind == Mark::Sane { drive.commands_taken } else { drive.commands_refused })
 }
 
-/// The same with the sign that is wrong as long as the ankle pushes, and no longer; in as many strides as it takes.
-fn give_reversed(robot: &mut Robot, injection: &mut Injection) -> Result<(), FaultError> {
+/// Gives the words in turn in a phase in which they are sane, or insane, for sure, and no longer; in as many strides as it takes.
+fn give_at(
+    phase: f64,
+    robot: &mut Robot,
+    injection: &mut Injection,
+    kind: Mark,
+    words: &[Word],
+) -> Result<(), FaultError> {
     let mut before = None;
-    for _ in 0..PUSHES_MAX {
-        robot.walk_to_phase(PUSH_PHASE)?;
-        let pushes = Time::now();
+    for _ in 0..STRIDES_MAX {
+        robot.walk_to_phase(phase)?;
+        let begun = Time::now();
         if before.is_none() {
-            // A stride after the words before: all of them are counted.
-            before = counted(robot, Mark::Reversed);
-            injection.mark(Mark::Reversed, pushes);
+            // A while after the words before: all of them are counted.
+            before = counted(robot, kind);
+            injection.mark(kind, begun);
         }
-        for _ in 0..WORDS {
-            if Time::now().since(pushes) > PUSHES {
+        for word in words.iter().cycle().take(WORDS as usize * words.len()) {
+            if Time::now().since(begun) > SURELY {
                 break;
             }
-            robot.operator()?.set_torque(Joint::Ankle, Word::Torque(40.0))?;
+            robot.operator()?.set_torque(Joint::Ankle, *word)?;
+            // One that is overtaken by the next is not seen at all.
             robot.pass_until(Time::now() + WORD_PERIOD)?;
         }
         robot.pass_until(Time::now() + AFTERMATH)?;
-        if counted(robot, Mark::Reversed) > before {
+        if counted(robot, kind) > before {
             break;
         }
     }
