@@ -133,6 +133,8 @@ struct Child {
     names: KnownNames,
     /// When it is told again what there was no room for.
     names_again: Option<Instant>,
+    /// The last word to it found no room.
+    is_deaf: bool,
     /// Changes of the directory since the names in the welcome were looked up.
     changes: watch::Receiver<u64>,
     number: LinkNumber,
@@ -202,6 +204,7 @@ impl Child {
             session,
             names,
             names_again: None,
+            is_deaf: false,
             changes,
             number,
             said: None,
@@ -259,12 +262,18 @@ impl Child {
                 () = stop.notified() => {
                     self.say(words::bare(Kind::HOST_STOP, Tid::NONE, self.hosted.tid));
                 }
-                () = link.nudged(self.number) => {
+                () = link.nudged(self.number), if self.names_again.is_none() => {
                     self.tell_names();
-                    link.hand_over_held();
+                    self.hand_over_held();
                 }
-                () = changed(&mut changes) => self.tell_names(),
-                () = due(self.names_again) => self.tell_names(),
+                () = changed(&mut changes) => {
+                    self.tell_names();
+                    self.hand_over_held();
+                }
+                () = due(self.names_again) => {
+                    self.tell_names();
+                    self.hand_over_held();
+                }
                 now = watch.tick() => {
                     if let Some(reason) = watch.judge(now, &mut self.heard) {
                         return Silence::Fault(reason);
@@ -329,8 +338,9 @@ impl Child {
             }
             Kind::HOST_LOOK => {
                 let Look { name } = payload::read(&message.payload).map_err(|error| fault(&error))?;
+                let before = self.names.clone();
                 let names = self.names.look(&self.hosted.stores, name);
-                self.tell(names);
+                self.tell(&names, before);
             }
             // Not an enum of ours: an open set of numbers.
             _ => return self.obey_like_a_client(message).map_err(|what| fault(&what)),
@@ -390,33 +400,54 @@ impl Child {
         }
     }
 
+    /// What waits for the child to know the directory waits on while it cannot be told: to be asked again and again would take its thread's
+    /// whole time.
+    fn hand_over_held(&self) {
+        if self.names_again.is_none() {
+            self.hosted.link.hand_over_held();
+        }
+    }
+
+    /// Tells the child what has changed of the directory. A child that has not read for so long that no more
+    /// can wait for it is told a while later.
     fn tell_names(&mut self) {
         let seen = *self.hosted.stores.directory_changes.borrow();
-        self.names_again = None;
-        if let Some(changes) = self.names.changes(&self.hosted.stores) {
-            self.tell(changes);
-        }
-        if self.names_again.is_none() {
+        let before = self.names.clone();
+        let is_told = match self.names.changes(&self.hosted.stores) {
+            Some(changes) => self.tell(&changes, before),
+            None => true,
+        };
+        self.names_again = (!is_told).then(|| Instant::now() + NAMES_AGAIN);
+        if is_told {
             self.hosted.link.directory_is_told(self.number, seen);
         }
     }
 
-    fn tell(&mut self, names: Names) {
+    /// Returns whether the child hears it. If not, it knows what it knew `before`.
+    fn tell(&mut self, names: &Names, before: KnownNames) -> bool {
         let node = payload::lncl_of(self.hosted.tid.node);
-        if !self.say(words::frame(Kind::HOST_NAMES, node, self.hosted.tid, &names)) {
-            self.names.not_told(names);
-            self.names_again = Some(Instant::now() + NAMES_AGAIN);
+        let is_heard = self.say(words::frame(Kind::HOST_NAMES, node, self.hosted.tid, names));
+        if !is_heard {
+            self.names = before;
         }
+        is_heard
     }
 
     /// Returns whether the child hears it once it reads, or never will hear anything.
-    fn say(&self, message: Message) -> bool {
+    fn say(&mut self, message: Message) -> bool {
         match self.hosted.link.say_to(self.number, message) {
             // Closed: it is about to end.
-            Ok(()) | Err(sinew_runtime::router::Refused { why: Rejection::Closed, .. }) => true,
+            Ok(()) | Err(sinew_runtime::router::Refused { why: Rejection::Closed, .. }) => {
+                self.is_deaf = false;
+                true
+            }
             Err(refused) => {
-                let detail = format!("{} does not read its socket: {}", self.hosted.tid, refused.why);
-                self.hosted.stores.refusals.count(Time::now(), "hosted application does not listen", &detail);
+                // Once each time, however often it is tried again.
+                if !std::mem::replace(&mut self.is_deaf, true) {
+                    let detail = format!("{} does not read its socket: {}", self.hosted.tid, refused.why);
+                    let refusals = &self.hosted.stores.refusals;
+                    refusals.count(Time::now(), "hosted application does not listen", &detail);
+                }
                 false
             }
         }

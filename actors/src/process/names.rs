@@ -10,22 +10,12 @@ use crate::{
     stores::{Stores, lock},
 };
 
-/// What a child knows of the directory. All of it up to [`NAMES_MAX`] names; beyond that, the names that it asked for.
-#[derive(Debug, Default)]
+/// What a child knows of the directory. All of it up to [`NAMES_MAX`] names; beyond that, the names that it asked for. What it could not be told
+/// it does not know: then the copy of before is the right one.
+#[derive(Clone, Debug, Default)]
 pub(super) struct KnownNames {
-    known: BTreeMap<String, Known>,
+    known: BTreeMap<String, Option<u64>>,
     complete: bool,
-    /// The last word of whether this is complete did not reach the child.
-    is_unsure: bool,
-}
-
-/// What a child knows of a name.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Known {
-    /// Who has it, or that nobody has.
-    Told(Option<u64>),
-    /// The last word about it did not reach the child.
-    Unsure,
 }
 
 impl KnownNames {
@@ -43,18 +33,18 @@ impl KnownNames {
                 stays
             });
             for name in all {
-                self.known.entry(name).or_insert(Known::Told(None));
+                self.known.entry(name).or_insert(None);
             }
         }
         for (name, known) in &mut self.known {
             let tid = lncl::resolve(stores, name).map(Tid::bits);
-            let now = Known::Told(tid);
-            if std::mem::replace(known, now) != now {
+            if tid != *known {
+                *known = tid;
                 names.push(Name { name: name.clone(), tid, watched: true });
             }
         }
-        let is_news = !names.is_empty() || complete != self.complete || self.is_unsure;
-        (self.complete, self.is_unsure) = (complete, false);
+        let is_news = !names.is_empty() || complete != self.complete;
+        self.complete = complete;
         is_news.then_some(Names { names, complete })
     }
 
@@ -63,16 +53,9 @@ impl KnownNames {
         let tid = lncl::resolve(stores, &name).map(Tid::bits);
         let watched = self.known.len() < NAMES_MAX || self.known.contains_key(&name);
         if watched {
-            self.known.insert(name.clone(), Known::Told(tid));
+            self.known.insert(name.clone(), tid);
         }
         Names { names: vec![Name { name, tid, watched }], complete: self.complete }
-    }
-
-    /// These words did not reach the child, which has not read so many before: they are among the next changes.
-    pub(super) fn not_told(&mut self, names: Names) {
-        let watched = names.names.into_iter().filter(|name| name.watched);
-        self.known.extend(watched.map(|name| (name.name, Known::Unsure)));
-        self.is_unsure = true;
     }
 }
 

@@ -88,7 +88,8 @@ fn names_that_there_was_no_room_for_are_told_once_the_child_reads() {
         let (ours, theirs) = std::os::unix::net::UnixStream::pair().unwrap();
         theirs.set_nonblocking(true).unwrap();
         let mut child = Child::new(Arc::new(hosted), sleeper(), ReadyGate::new(|| {}), ours).unwrap();
-        let any = || words::bare(Kind::HOST_STOP, Tid::NONE, child.hosted.tid);
+        let tid = child.hosted.tid;
+        let any = || words::bare(Kind::HOST_STOP, Tid::NONE, tid);
         assert!((0..1_000_000).any(|_| !child.say(any())), "there is room without end");
         registers(&stores, "late");
         child.tell_names();
@@ -134,7 +135,7 @@ fn names_that_were_looked_up_for_a_former_child_do_not_reach_the_next_one() {
             (child, UnixStream::from_std(theirs).unwrap())
         };
         let (mut former, _theirs) = begin();
-        let (present, theirs) = begin();
+        let (mut present, theirs) = begin();
         registers(&stores, "late");
         // When: it goes on
         former.tell_names();
