@@ -231,7 +231,8 @@ impl Gncl {
         }
         let payload_max = usize::try_from(attach.payload_max).unwrap_or(usize::MAX);
         let Some(Move { place, transport }) = self.stores.gncl.place(lane, transport.clone()) else {
-            // Its reader meets the end, and the core makes another one.
+            // Its reader meets the end, whatever the peer has sent behind its welcome, and the core makes another one.
+            wire.set_mode(Mode::Discard);
             return transport.shut(Shutdown::Both);
         };
         wire.transport = Some(transport.clone());

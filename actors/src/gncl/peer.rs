@@ -429,8 +429,8 @@ impl Store {
     }
 
     /// Where the connections of a lane are read and written from now on, and this one, `transport`, as it is to be used there. `None`: nowhere.
-    /// Bulk goes where it went before or not at all, as long as there is no descriptor for it: what reads the connection before may be in the
-    /// middle of a message on the thread of Bulk, and on another one the next message would overtake that.
+    /// Once there is a thread of Bulk, Bulk goes there or not at all, as long as there is no descriptor for it: what reads the connection before may
+    /// be in the middle of a message there, and on another thread the next message would overtake that.
     pub(super) fn place(&self, lane: Lane, transport: Transport) -> Option<Move> {
         match lane {
             Lane::Control | Lane::Stream => Some(Move { place: Place::Here, transport }),
@@ -451,14 +451,18 @@ impl Store {
 
     fn bulk_place(&self, transport: &Transport) -> io::Result<Move> {
         let mut bulk = lock(&self.bulk);
-        if bulk.is_none() {
-            *bulk = Some(BulkThread::begin("bulk", Courtesy::default())?);
+        let there = |thread: &BulkThread| -> io::Result<Move> {
+            let socket = thread.adopt(transport.socket())?;
+            Ok(Move { place: thread.place(), transport: transport.with_socket(socket) })
+        };
+        if let Some(thread) = &*bulk {
+            return there(thread);
         }
-        let thread = bulk.as_ref().expect("it was made if there was none");
-        Ok(Move {
-            place: thread.place(),
-            transport: transport.with_socket(thread.adopt(transport.socket())?),
-        })
+        // It counts as one that was there before once it has read anything.
+        let thread = BulkThread::begin("bulk", Courtesy::default())?;
+        let moved = there(&thread)?;
+        *bulk = Some(thread);
+        Ok(moved)
     }
 
     /// Settles what has expired while it waited, and outcomes that do not come any more.
