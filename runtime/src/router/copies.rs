@@ -30,7 +30,7 @@ impl Copies {
 
     /// Why none was taken: what a sender can mend, and where there is nothing of that, nobody is there.
     pub(super) fn why_none(&self) -> Rejection {
-        let mendable = [Rejection::NotAllowed, Rejection::TooLong, Rejection::QueueFull];
+        let mendable = [Rejection::TooLong, Rejection::QueueFull, Rejection::NotAllowed];
         let found = mendable.into_iter().find(|why| self.refused[*why as usize] > 0);
         found.unwrap_or(Rejection::NoSuchApplication)
     }
@@ -101,7 +101,8 @@ mod tests {
             (full, full, Rejection::QueueFull),
             (Some(Rejection::Closed), full, Rejection::QueueFull),
             (Some(Rejection::TooLong), full, Rejection::TooLong),
-            (Some(Rejection::NotAllowed), full, Rejection::NotAllowed),
+            (Some(Rejection::NotAllowed), full, Rejection::QueueFull),
+            (Some(Rejection::NotAllowed), Some(Rejection::Closed), Rejection::NotAllowed),
             (Some(Rejection::Closed), Some(Rejection::Closed), Rejection::NoSuchApplication),
         ] {
             let router = router(here, there);
