@@ -35,7 +35,7 @@ fn seen(claims: &[serde_json::Value], name: &str) -> f64 {
 #[test]
 fn drive_that_is_killed_or_hangs_is_replaced_while_hip_and_ankle_walk_on() {
     let claims = claims_of("drive", "4,5");
-    assert!(seen(&claims, "the knee is flagged, if it was away for 200 ms") > 0.5);
+    assert!(seen(&claims, "the knee is flagged, if it died or was away for 50 ms") > 0.5);
     assert!(seen(&claims, "torques from stale inputs") < 0.5);
 }
 

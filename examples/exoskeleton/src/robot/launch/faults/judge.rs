@@ -29,10 +29,8 @@ const DEVIATION_DEG: [f64; 3] = [10.0; 3];
 const REJOIN_MIN_MS: f64 = 199.9;
 /// A drive that is not concerned assists on. On a host that is overloaded it damps now and then, as it must.
 const ASSISTED_MIN_PERCENT: f64 = 50.0;
-/// From the end of a drive's signs of life to its flag: 25 ms of silence, a status, a tick, and what the host adds.
-const FLAGGED_MS: [f64; 3] = [35.0, 50.0, 200.0];
-/// A drive that is away for longer is flagged on every host.
-const SILENT_MS: f64 = 200.0;
+/// A drive that is away for longer is flagged: 25 ms of silence, a status, a tick, and what a busy host adds, ms.
+const FLAGGED_AFTER_MS: f64 = 50.0;
 const SOON_NS: u64 = 300_000_000;
 /// Oldest input that may be used, us.
 const AGE_MAX_US: u32 = 10_000;
@@ -113,13 +111,13 @@ fn drive_away(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injectio
         evidence.undamped_device(Joint::Knee, whole.clone()),
     );
     let flagged = evidence.gait(whole.clone()).iter().find(|row| row.degraded & bit(Joint::Knee) != 0);
-    let flagged_ms = flagged.map(|row| ms_after(at, row.t_ns));
-    claims.timing("central flags the knee as degraded after, ms", FLAGGED_MS, flagged_ms);
-    // Whether news of an end come before those of the next life is a time too; that a long silence is noticed is none.
+    claims.told("central flags the knee as degraded after, ms", flagged.map(|row| ms_after(at, row.t_ns)));
     let back = injection.when(Mark::Continued).map_or(whole.start, Time::as_nanos)..whole.end;
     let away_ms = evidence.output_after_ms(Joint::Knee, back.clone()).map(|ms| ms + ms_after(at, back.start));
-    let is_silent = away_ms.is_none_or(|ms| ms > SILENT_MS);
-    claims.is_so("the knee is flagged, if it was away for 200 ms", flagged.is_some() || !is_silent);
+    // The end of a life is told at once; a hang that is over before central wonders is no news.
+    let is_told = injection.step == Step::KillDrive && !evidence.stalled_around(at.as_nanos());
+    let is_news = is_told || away_ms.is_none_or(|ms| ms > FLAGGED_AFTER_MS);
+    claims.is_so("the knee is flagged, if it died or was away for 50 ms", flagged.is_some() || !is_news);
     let not_the_knee =
         |row: &&GaitRow| row.degraded & !bit(Joint::Knee) != 0 && !evidence.stalled_around(row.t_ns);
     let others_flagged = evidence.gait(whole.clone()).iter().filter(not_the_knee).count();
@@ -296,8 +294,7 @@ fn back_to_walking(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Inj
     let after = span(released, injection.until);
     let walks = evidence.gait(after.clone()).iter().find(|row| row.mode == Some(GaitMode::Walk));
     let strikes = walks.map(|walks| {
-        // What central hears after the release may have happened before it.
-        let rows = evidence.plant(after.start.saturating_sub(SETTLED_NS)..walks.t_ns);
+        let rows = evidence.plant(after.start..walks.t_ns);
         let strides = |row: &PlantRow| row.strides.floor();
         rows.last().map_or(0.0, strides) - rows.first().map_or(0.0, strides)
     });
