@@ -27,6 +27,35 @@ fn sleeper() -> Rc<Process> {
     Rc::new(Process::new(Arc::new(Group::new(pid, pidfd_open(pid, PidfdFlags::empty()).unwrap()))).unwrap())
 }
 
+fn hosted(stores: &Arc<Stores>) -> Arc<Hosted> {
+    Arc::new(Hosted {
+        stores: stores.clone(),
+        link: Link::new(stores, Mailbox::new(8)),
+        tid: Tid::new(NodeAddress::HERE, AppAddress::fixed(1).unwrap()),
+        name: "child".to_owned(),
+        progress_within: None,
+    })
+}
+
+/// A life of it, and the child's end of the sockets.
+fn begin(hosted: &Arc<Hosted>) -> (Child, UnixStream) {
+    let (ours, theirs) = std::os::unix::net::UnixStream::pair().unwrap();
+    theirs.set_nonblocking(true).unwrap();
+    let child = Child::new(hosted.clone(), sleeper(), ReadyGate::new(|| {}), ours).unwrap();
+    (child, UnixStream::from_std(theirs).unwrap())
+}
+
+/// The first names that the child reads.
+async fn names_told(theirs: UnixStream) -> Names {
+    let mut reader = Reader::new(WORDS_BYTES_MAX);
+    loop {
+        let frame = reader.next(&theirs).await.unwrap().unwrap();
+        if frame.header.kind == Kind::HOST_NAMES {
+            return payload::read::<Names>(&frame.payload).unwrap();
+        }
+    }
+}
+
 fn registers(stores: &Stores, name: &str) {
     let outlet = Arc::new(AppOutlet { pending: Pending::new(1), inbox: Mailbox::new(1) });
     let (name, events) = (Some(name.to_owned()), Arc::new([]));
@@ -40,32 +69,14 @@ fn a_name_that_comes_between_the_welcome_and_the_listening_is_told() {
     runtime.block_on(async {
         // Given: a child that was welcomed
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
-        let hosted = Hosted {
-            stores: stores.clone(),
-            link: Link::new(&stores, Mailbox::new(8)),
-            tid: Tid::new(NodeAddress::HERE, AppAddress::fixed(1).unwrap()),
-            name: "child".to_owned(),
-            progress_within: None,
-        };
-        let (ours, theirs) = std::os::unix::net::UnixStream::pair().unwrap();
-        theirs.set_nonblocking(true).unwrap();
-        let mut child = Child::new(Arc::new(hosted), sleeper(), ReadyGate::new(|| {}), ours).unwrap();
+        let (mut child, theirs) = begin(&hosted(&stores));
         // When
         registers(&stores, "late");
         // Then
-        let hears = async {
-            let (mut reader, theirs) = (Reader::new(WORDS_BYTES_MAX), UnixStream::from_std(theirs).unwrap());
-            loop {
-                let frame = reader.next(&theirs).await.unwrap().unwrap();
-                if frame.header.kind == Kind::HOST_NAMES {
-                    return payload::read::<Names>(&frame.payload).unwrap();
-                }
-            }
-        };
         let stop = Notify::new();
         tokio::select! {
             ended = child.accompany(&stop) => panic!("it lives: {ended:?}"),
-            names = tokio::time::timeout(WITHIN, hears) => {
+            names = tokio::time::timeout(WITHIN, names_told(theirs)) => {
                 assert!(names.unwrap().names.iter().any(|name| name.name == "late"));
             }
         }
@@ -78,37 +89,18 @@ fn names_that_there_was_no_room_for_are_told_once_the_child_reads() {
     runtime.block_on(async {
         // Given: a child that does not read, for which no more can wait
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
-        let hosted = Hosted {
-            stores: stores.clone(),
-            link: Link::new(&stores, Mailbox::new(8)),
-            tid: Tid::new(NodeAddress::HERE, AppAddress::fixed(1).unwrap()),
-            name: "child".to_owned(),
-            progress_within: None,
-        };
-        let (ours, theirs) = std::os::unix::net::UnixStream::pair().unwrap();
-        theirs.set_nonblocking(true).unwrap();
-        let mut child = Child::new(Arc::new(hosted), sleeper(), ReadyGate::new(|| {}), ours).unwrap();
+        let (mut child, theirs) = begin(&hosted(&stores));
         let tid = child.hosted.tid;
         let any = || words::bare(Kind::HOST_STOP, Tid::NONE, tid);
         assert!((0..1_000_000).any(|_| !child.say(any())), "there is room without end");
         registers(&stores, "late");
         child.tell_names();
-        // When: it reads
-        let hears = async {
-            let (mut reader, theirs) = (Reader::new(WORDS_BYTES_MAX), UnixStream::from_std(theirs).unwrap());
-            loop {
-                let frame = reader.next(&theirs).await.unwrap().unwrap();
-                if frame.header.kind == Kind::HOST_NAMES {
-                    return payload::read::<Names>(&frame.payload).unwrap();
-                }
-            }
-        };
-        // Then
         child.changes.mark_unchanged();
+        // When: it reads
         let stop = Notify::new();
         tokio::select! {
             ended = child.accompany(&stop) => panic!("it lives: {ended:?}"),
-            names = tokio::time::timeout(WITHIN, hears) => {
+            names = tokio::time::timeout(WITHIN, names_told(theirs)) => {
                 assert!(names.unwrap().names.iter().any(|name| name.name == "late"));
             }
         }
@@ -121,21 +113,9 @@ fn names_that_were_looked_up_for_a_former_child_do_not_reach_the_next_one() {
     runtime.block_on(async {
         // Given: two lives of a child, the former with a supervisor that was held up
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
-        let hosted = Arc::new(Hosted {
-            stores: stores.clone(),
-            link: Link::new(&stores, Mailbox::new(8)),
-            tid: Tid::new(NodeAddress::HERE, AppAddress::fixed(1).unwrap()),
-            name: "child".to_owned(),
-            progress_within: None,
-        });
-        let begin = || {
-            let (ours, theirs) = std::os::unix::net::UnixStream::pair().unwrap();
-            theirs.set_nonblocking(true).unwrap();
-            let child = Child::new(hosted.clone(), sleeper(), ReadyGate::new(|| {}), ours).unwrap();
-            (child, UnixStream::from_std(theirs).unwrap())
-        };
-        let (mut former, _theirs) = begin();
-        let (mut present, theirs) = begin();
+        let hosted = hosted(&stores);
+        let (mut former, _theirs) = begin(&hosted);
+        let (mut present, theirs) = begin(&hosted);
         registers(&stores, "late");
         // When: it goes on
         former.tell_names();
