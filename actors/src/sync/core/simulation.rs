@@ -77,10 +77,14 @@ enum Fault {
     TwoListsATurn,
     /// What the successor of an actor that failed is handed again is taken in again.
     HandledAgain,
+    /// One broken link in three is not told.
+    BreakNotTold,
+    /// One lost node in three is not told.
+    LossNotTold,
 }
 
 impl Fault {
-    const ALL: [Self; 11] = [
+    const ALL: [Self; 13] = [
         Self::ReadyTooEarly,
         Self::FailureNotTold,
         Self::EndNotTold,
@@ -92,6 +96,8 @@ impl Fault {
         Self::OneVersionForAll,
         Self::TwoListsATurn,
         Self::HandledAgain,
+        Self::BreakNotTold,
+        Self::LossNotTold,
     ];
 }
 

@@ -12,8 +12,9 @@ impl World {
     pub(super) fn fly(&mut self, from: usize, to: NodeAddress, list: Bytes) {
         let ends = (from, (to.bits() - address(0).bits()) as usize);
         if !self.up.contains(&sorted(ends)) {
-            assert!(self.unheard.contains_key(&ends), "a list was sent over a link that is down");
-            return;
+            let is_unheard = self.unheard.contains_key(&ends);
+            let words = || format!("node {from} sends a list over a link that it knows to be down: {to}");
+            return self.violate(is_unheard, words);
         }
         let is_repeat = self.last.insert(ends, list.clone()).is_some_and(|last| last == list);
         if !(is_repeat && self.fault == Some(Fault::RepeatsLost)) {
@@ -176,19 +177,33 @@ impl World {
     /// Whom a node is told of, if it is told of one.
     pub(super) fn note_presence(&mut self, node: usize, input: &Input) -> Option<usize> {
         let number = |address: &NodeAddress| (address.bits() - self::address(0).bits()) as usize;
-        let (peer, life, is_over) = match input {
-            Input::MembershipChanged(MembershipFact::NodeFound { node, incarnation, .. })
-            | Input::LinkChanged(LinkFact::LinkUp { node, incarnation }) => {
-                (number(node), incarnation.0, false)
+        match input {
+            Input::MembershipChanged(MembershipFact::NodeFound { node: peer, incarnation, .. }) => {
+                let ends = (node, number(peer));
+                self.present.insert(ends, Some(incarnation.0));
+                Some(ends.1)
             }
-            Input::MembershipChanged(MembershipFact::NodeLost { node, incarnation, .. })
-            | Input::LinkChanged(LinkFact::PeerLeft { node, incarnation }) => {
-                (number(node), incarnation.0, true)
+            Input::LinkChanged(LinkFact::LinkUp { node: peer, incarnation }) => {
+                let ends = (node, number(peer));
+                self.present.insert(ends, Some(incarnation.0));
+                self.linked.insert(ends, incarnation.0);
+                Some(ends.1)
             }
-            Input::LinkChanged(LinkFact::LinkBroken { node, .. } | LinkFact::DialRefused { node, .. }) => {
-                return Some(number(node));
+            Input::MembershipChanged(MembershipFact::NodeLost { node: peer, incarnation, .. })
+            | Input::LinkChanged(LinkFact::PeerLeft { node: peer, incarnation }) => {
+                let ends = (node, number(peer));
+                let present = self.present.entry(ends).or_default();
+                present.take_if(|life| *life == incarnation.0);
+                self.unlink(ends, *incarnation);
+                Some(ends.1)
             }
-            Input::ListReceived { from, .. } => return Some(number(from)),
+            Input::LinkChanged(LinkFact::LinkBroken { node: peer, incarnation }) => {
+                let ends = (node, number(peer));
+                self.unlink(ends, *incarnation);
+                Some(ends.1)
+            }
+            Input::LinkChanged(LinkFact::DialRefused { node: peer, .. })
+            | Input::ListReceived { from: peer, .. } => Some(number(peer)),
             Input::AppChanged(_)
             | Input::GroupsChanged(_)
             | Input::Arrived { .. }
@@ -200,28 +215,34 @@ impl World {
             | Input::DirectoryNotTaken { .. }
             | Input::ReleaseNotTaken { .. }
             | Input::EventNotTaken { .. }
-            | Input::TimePassed => return None,
-        };
-        let present = self.present.entry((node, peer)).or_default();
-        if !is_over {
-            *present = Some(life);
-        } else if *present == Some(life) {
-            *present = None;
+            | Input::TimePassed => None,
         }
-        Some(peer)
     }
 
-    /// No directory names applications of a life that its node was told is over, or that another one came after.
+    fn unlink(&mut self, ends: Ends, life: Incarnation) {
+        if self.linked.get(&ends) == Some(&life.0) {
+            self.linked.remove(&ends);
+        }
+    }
+
+    /// No directory names applications of a life that its node was told is over, or that another one came after, and none of them as
+    /// ready while that node has no link to theirs.
     pub(super) fn judge_presence(&mut self, ends: Ends) {
         let (node, peer) = ends;
         let (core, address) = (&self.cores[node], address(peer));
-        let is_named = core.directory().iter().any(|entry| entry.tid.node == address);
+        let directory = core.directory();
+        let of_peer = || directory.iter().filter(|entry| entry.tid.node == address);
+        let (is_named, ready) = (of_peer().next().is_some(), of_peer().filter(|entry| entry.ready).count());
         let listed = core.names_elsewhere(Some(address)).next().map(|said| said.life.0);
         let present = self.present.get(&ends).copied().flatten();
         self.violate(!is_named || listed == present, || {
             format!(
                 "the directory of node {node} names life {listed:?} of node {peer}, which is in {present:?}"
             )
+        });
+        let is_linked = self.linked.contains_key(&ends);
+        self.violate(ready == 0 || is_linked, || {
+            format!("the directory of node {node} has {ready} of node {peer} ready, to which it has no link")
         });
     }
 
@@ -277,6 +298,7 @@ impl World {
         self.unheard.retain(|(at, _), _| *at != node);
         self.met.retain(|(at, _), _| *at != node);
         self.present.retain(|(at, _), _| *at != node);
+        self.linked.retain(|(at, _), _| *at != node);
         self.newest.remove(&node);
         self.incarnations[node] = match clock {
             Clock::GoesOn => self.incarnations[node] + 1,

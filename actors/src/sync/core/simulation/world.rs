@@ -65,6 +65,8 @@ pub(super) struct World {
     pub(super) met: BTreeMap<Ends, u64>,
     /// Which life of the second the first was told of last; none where it was told that this one is over.
     pub(super) present: BTreeMap<Ends, Option<u64>>,
+    /// To which life of the second the first has a link, as it was told.
+    pub(super) linked: BTreeMap<Ends, u64>,
     pub(super) apps: Vec<BTreeMap<usize, Life>>,
     /// Links that carry lists, the smaller end first.
     pub(super) up: BTreeSet<Ends>,
@@ -105,6 +107,7 @@ impl World {
             earliest: vec![FIRST_LIFE; nodes],
             met: BTreeMap::new(),
             present: BTreeMap::new(),
+            linked: BTreeMap::new(),
             apps: vec![BTreeMap::new(); nodes],
             up: BTreeSet::new(),
             unheard: BTreeMap::new(),
@@ -187,7 +190,9 @@ impl World {
 
     pub(super) fn tell(&mut self, node: usize, input: Input) {
         let peer = self.note_presence(node, &input);
-        self.handle(node, input);
+        if !self.is_kept_back(&input) {
+            self.handle(node, input);
+        }
         if let Some(peer) = peer {
             self.judge_presence((node, peer));
         }
@@ -200,6 +205,17 @@ impl World {
             if !is_lost {
                 self.carry_out(node, output);
             }
+        }
+    }
+
+    /// Whether a fault keeps it from the node.
+    fn is_kept_back(&mut self, input: &Input) -> bool {
+        if matches!(input, Input::LinkChanged(LinkFact::LinkBroken { .. })) {
+            self.strikes(Fault::BreakNotTold)
+        } else if matches!(input, Input::MembershipChanged(MembershipFact::NodeLost { .. })) {
+            self.strikes(Fault::LossNotTold)
+        } else {
+            false
         }
     }
 
