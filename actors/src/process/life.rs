@@ -1,5 +1,7 @@
 //! The child under supervision, as its supervisor's guard sees it: started, listened to, stopped, killed.
 
+mod signs;
+
 use std::{
     io,
     pin::Pin,
@@ -22,6 +24,7 @@ use tokio::{
     time::Instant,
 };
 
+use self::signs::Watch;
 use super::{
     held::Process,
     link::{LastWords, Link},
@@ -467,51 +470,6 @@ async fn changed(changes: &mut watch::Receiver<u64>) {
     if changes.changed().await.is_err() {
         // The stores outlive this.
         std::future::pending().await
-    }
-}
-
-/// Looks whether the child still gives signs of life.
-struct Watch {
-    within: Option<Duration>,
-    /// When it looked last.
-    looked: Instant,
-}
-
-impl Watch {
-    fn new(within: Option<Duration>) -> Self {
-        Self { within, looked: Instant::now() }
-    }
-
-    fn period(&self) -> Duration {
-        self.within.map_or(Duration::MAX, |within| (within / 8).max(Duration::from_millis(1)))
-    }
-
-    /// Resolves when it is time to look.
-    async fn tick(&self) -> Instant {
-        if self.within.is_none() {
-            return std::future::pending().await;
-        }
-        tokio::time::sleep_until(self.looked + self.period()).await;
-        Instant::now()
-    }
-
-    /// Whether the child, of which something was `heard` last then, hangs.
-    fn judge(&mut self, now: Instant, heard: &mut Option<Instant>) -> Option<Reason> {
-        let lateness = now - (self.looked + self.period());
-        self.looked = now;
-        let (within, last) = (self.within?, (*heard)?);
-        if lateness > self.period() {
-            // It was this node that stood still: what came meanwhile has not been read.
-            *heard = Some((last + lateness).min(now));
-            return None;
-        }
-        let silent = now.saturating_duration_since(last);
-        (silent > within).then(|| {
-            let silent = silent.as_millis();
-            Reason::Hung(format!(
-                "no sign of life of its process for {silent} ms: it was stopped, or has no CPU"
-            ))
-        })
     }
 }
 
