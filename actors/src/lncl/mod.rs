@@ -59,6 +59,7 @@ pub(crate) use reader::Reader;
 pub(crate) use registrar::{
     LocalApp, app_down, app_ready, app_stopped, register_local, resolve, set_member, unregister_local,
 };
+pub(crate) use untaken::is_fault;
 pub(crate) use untold::Untold;
 
 use sinew_runtime::tid::AppAddress;

@@ -201,6 +201,41 @@ fn who_sends_more_than_its_destination_takes_is_told_how_much_of_it_and_not_of_e
 }
 
 #[test]
+fn who_sends_to_a_group_whose_one_member_has_no_room_is_told() {
+    // What the application that the test plays takes.
+    const ROOM: u64 = 1_024;
+    let node = TestNode::start();
+    let (member, group) = (node.local(1), Tid::group("legs"));
+    node.stores.router.set_member(group.app, member.tid.app, true);
+    let (mut client, tid) = RawClient::register(&node, &Register::default());
+    for sequence in 1..=ROOM + 1 {
+        let mut message = Message::typed(tid, group, &Angle { degrees: 1.0 });
+        message.header.sequence = sequence;
+        client.send(&message);
+    }
+    let said = client.next().expect("what nobody has taken");
+    let Untaken { entries } = payload::read(&said.payload).unwrap();
+    let [entry] = &entries[..] else { panic!("{entries:?} of one destination") };
+    assert_eq!((entry.to, entry.count), (group.bits(), 1));
+    assert_eq!(Outcome::from_code(entry.why), Some(Outcome::Rejected(Rejection::QueueFull)));
+}
+
+#[test]
+fn who_sends_to_a_group_without_members_is_told_nothing() {
+    let node = TestNode::start();
+    let (mut client, tid) = RawClient::register(&node, &Register::default());
+    for (sequence, to) in [(1, Tid::group("legs")), (2, Tid::NONE)] {
+        let mut message = Message::typed(tid, to, &Angle { degrees: 1.0 });
+        message.header.sequence = sequence;
+        client.send(&message);
+    }
+    let said = client.next().expect("what nobody has taken");
+    let Untaken { entries } = payload::read(&said.payload).unwrap();
+    let told: Vec<u64> = entries.iter().map(|entry| entry.to).collect();
+    assert_eq!(told, [Tid::NONE.bits()]);
+}
+
+#[test]
 fn who_may_take_short_payloads_only_is_told_of_each_destination_all_the_same() {
     let node = TestNode::start_with(|config| config.payload_max = 64);
     let (mut client, tid) = RawClient::register(&node, &Register::default());

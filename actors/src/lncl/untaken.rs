@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
-    tid::Tid,
+    tid::{AppAddress, Tid},
     time::Time,
 };
 
@@ -21,6 +21,13 @@ const FRAME_BYTES: usize = 12;
 const ENTRY_BYTES: usize = 49;
 /// Shortest time between two frames.
 const PAUSE: Duration = Duration::from_millis(100);
+
+/// Whether the sender of an unconfirmed message misses something when nobody takes it. A group without members is no fault, nobody at all is
+/// one.
+pub(crate) fn is_fault(destination: Tid, why: Rejection) -> bool {
+    let is_to_many = !destination.is_single() && destination.app != AppAddress::NONE;
+    !is_to_many || why != Rejection::NoSuchApplication
+}
 
 /// What one client is to be told.
 #[derive(Debug)]

@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection, Ticket},
-    tid::{AppAddress, Tid},
+    tid::Tid,
     time::Time,
     wire::{Flags, Header, Kind, Message},
 };
@@ -15,6 +15,7 @@ use super::{
         payload::{self, Resolved},
         registrar,
         session::Order,
+        untaken,
     },
     Client,
     end::End,
@@ -61,9 +62,9 @@ impl Client {
         }
         if let Err(why) = router.send(message)
             && !is_confirmed
-            && (destination.is_single() || destination.app == AppAddress::NONE)
+            && untaken::is_fault(destination, why)
         {
-            // The source of a confirmed message knows; a group without members is no fault, nobody at all is one.
+            // The source of a confirmed message knows.
             let (detail, now) = (format!("from {} to {destination}: {why}", self.tid), Time::now());
             self.server.refusals.count(now, "unconfirmed message not taken", &detail);
             self.notices.count(destination, why, now);
