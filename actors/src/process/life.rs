@@ -342,8 +342,11 @@ impl Child {
             Kind::HOST_LOOK => {
                 let Look { name } = payload::read(&message.payload).map_err(|error| fault(&error))?;
                 let before = self.names.clone();
-                let names = self.names.look(&self.hosted.stores, name);
-                self.tell(&names, before);
+                let names = self.names.look(&self.hosted.stores, name.clone());
+                if !self.tell(&names, before) {
+                    self.names.owe(name);
+                    self.names_again = Some(Instant::now() + NAMES_AGAIN);
+                }
             }
             // Not an enum of ours: an open set of numbers.
             _ => return self.obey_like_a_client(message).map_err(|what| fault(&what)),
@@ -395,9 +398,9 @@ impl Child {
         }
         if let Err(why) = stores.router.send(message)
             && !is_confirmed
-            && destination.is_single()
+            && lncl::is_fault(destination, why)
         {
-            // The source of a confirmed message knows; a group without members is no fault.
+            // The source of a confirmed message knows.
             let detail = format!("from {tid} to {destination}: {why}");
             stores.refusals.count(Time::now(), "unconfirmed message not taken", &detail);
         }

@@ -222,8 +222,8 @@ impl Link {
         tokio::pin!(drain);
         std::future::poll_fn(|cx| {
             let drained = drain.as_mut().poll(cx);
-            // There may be room now for what waits in the mailbox.
-            self.pump();
+            // There may be room now for what is held, and for what waits in the mailbox.
+            self.hand_over_held();
             drained
         })
         .await
@@ -334,11 +334,14 @@ impl Link {
         }
     }
 
+    /// Hands it to the child, or holds it until there is room: who writes what waits tries again.
     fn hand_over(&self, present: &mut Present, message: Message) {
         let copy = Message::new(message.header, message.payload.clone());
-        present.window.lend(message);
-        // Not taken: the connection is broken, and the message goes to the next process.
-        let _ = self.outlet.submit_urgent(copy, EXPRESS_MAX);
+        match self.outlet.submit_urgent(copy, EXPRESS_MAX) {
+            Err(Refused { why: Rejection::QueueFull, .. }) => present.hold(message),
+            // Or the connection is broken, and the message goes to the next process.
+            Ok(()) | Err(_) => present.window.lend(message),
+        }
     }
 }
 

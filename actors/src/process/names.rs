@@ -57,6 +57,14 @@ impl KnownNames {
         }
         Names { names: vec![Name { name, tid, watched }], complete: self.complete }
     }
+
+    /// The child could not be told whose this name is: it is among the next [`changes`](Self::changes), if it is anybody's. Who hears nothing
+    /// takes it for nobody's.
+    pub(super) fn owe(&mut self, name: String) {
+        if self.known.len() < NAMES_MAX {
+            self.known.entry(name).or_insert(None);
+        }
+    }
 }
 
 fn all_names(stores: &Stores) -> BTreeSet<String> {

@@ -2,18 +2,22 @@
 
 use std::{os::unix::process::CommandExt, process::Command};
 
+use bytes::Bytes;
+use futures_util::FutureExt;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use sinew_runtime::{
     mailbox::Mailbox,
     pending::{AppOutlet, Pending},
+    router::Outlet,
     tid::{AppAddress, Incarnation, NodeAddress},
+    wire::Header,
 };
 
 use super::*;
 use crate::{
     NodeConfig,
-    lncl::{LocalApp, register_local},
-    process::group::Group,
+    lncl::{LocalApp, register_local, unregister_local},
+    process::{group::Group, words::NAMES_MAX},
 };
 
 /// Nothing takes longer, on a busy machine either.
@@ -56,11 +60,52 @@ async fn names_told(theirs: UnixStream) -> Names {
     }
 }
 
-fn registers(stores: &Stores, name: &str) {
+fn registers(stores: &Stores, name: &str) -> AppAddress {
     let outlet = Arc::new(AppOutlet { pending: Pending::new(1), inbox: Mailbox::new(1) });
     let (name, events) = (Some(name.to_owned()), Arc::new([]));
     let app = LocalApp { name, address: None, requires: vec![], kinds: vec![], outlet, events };
-    register_local(stores, app).unwrap();
+    register_local(stores, app).unwrap().app
+}
+
+/// Says so much to a child that does not read that no more can wait.
+fn fill(child: &mut Child) {
+    let tid = child.hosted.tid;
+    let any = || words::bare(Kind::HOST_STOP, Tid::NONE, tid);
+    assert!((0..1_000_000).any(|_| !child.say(any())), "there is room without end");
+}
+
+/// Reads its welcome, so that nothing waits for the child.
+async fn welcome(child: &Child, theirs: &UnixStream) {
+    let mut reader = Reader::new(WORDS_BYTES_MAX);
+    tokio::select! {
+        error = child.hosted.link.drain(child.number) => panic!("it reads: {error}"),
+        frame = reader.next(theirs) => assert_eq!(frame.unwrap().unwrap().header.kind, Kind::HOST_WELCOME),
+    }
+}
+
+/// A message to the child, which comes behind a name that it has not been told.
+fn message_behind_a_name(child: &Child) -> Kind {
+    let (kind, tid) = (Kind::named("test.word"), child.hosted.tid);
+    registers(&child.hosted.stores, "late");
+    child.hosted.link.submit(Message::new(Header::new(kind, Tid::NONE, tid), Bytes::new())).unwrap();
+    kind
+}
+
+/// What kinds the child reads, to the first of this one.
+async fn kinds_read(child: &mut Child, theirs: UnixStream, last: Kind) -> Vec<Kind> {
+    let mut reader = Reader::new(WORDS_BYTES_MAX);
+    let hears = async {
+        let mut kinds = Vec::new();
+        while !kinds.contains(&last) {
+            kinds.push(reader.next(&theirs).await.unwrap().unwrap().header.kind);
+        }
+        kinds
+    };
+    let stop = Notify::new();
+    tokio::select! {
+        ended = child.accompany(&stop) => panic!("it lives: {ended:?}"),
+        kinds = tokio::time::timeout(WITHIN, hears) => kinds.expect("it comes"),
+    }
 }
 
 #[test]
@@ -90,9 +135,7 @@ fn names_that_there_was_no_room_for_are_told_once_the_child_reads() {
         // Given: a child that does not read, for which no more can wait
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
         let (mut child, theirs) = begin(&hosted(&stores));
-        let tid = child.hosted.tid;
-        let any = || words::bare(Kind::HOST_STOP, Tid::NONE, tid);
-        assert!((0..1_000_000).any(|_| !child.say(any())), "there is room without end");
+        fill(&mut child);
         registers(&stores, "late");
         child.tell_names();
         child.changes.mark_unchanged();
@@ -135,5 +178,100 @@ fn names_that_were_looked_up_for_a_former_child_do_not_reach_the_next_one() {
             kinds = tokio::time::timeout(WITHIN, hears) => kinds.unwrap(),
         };
         assert_eq!(kinds, [Kind::HOST_WELCOME, Kind::HOST_STOP]);
+    });
+}
+
+#[test]
+fn a_name_that_is_asked_for_where_there_is_no_room_is_told_once_the_child_reads() {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        // Given: more names than a child is told, and a child that does not read
+        let mut config = NodeConfig::new("test");
+        config.lncl.apps_max = 2 * NAMES_MAX;
+        let stores = Stores::for_test(config, Incarnation(1));
+        for number in 0..=NAMES_MAX {
+            registers(&stores, &format!("number {number}"));
+        }
+        let (mut child, theirs) = begin(&hosted(&stores));
+        fill(&mut child);
+        // When: it asks for one, and reads
+        let look = Look { name: "number 7".to_owned() };
+        child.obey(words::frame(Kind::HOST_LOOK, child.hosted.tid, Tid::NONE, &look)).unwrap();
+        // Then
+        let stop = Notify::new();
+        tokio::select! {
+            ended = child.accompany(&stop) => panic!("it lives: {ended:?}"),
+            names = tokio::time::timeout(WITHIN, names_told(theirs)) => {
+                let [name] = &names.unwrap().names[..] else { panic!("it asked for one") };
+                assert!(name.name == "number 7" && name.tid.is_some(), "{name:?}");
+            }
+        }
+    });
+}
+
+#[test]
+fn names_that_come_and_go_while_the_child_does_not_read_do_not_pile_up() {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        // Given: a child that does not read
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let (mut child, theirs) = begin(&hosted(&stores));
+        fill(&mut child);
+        // When: many names come and go
+        for number in 0..100 {
+            let app = registers(&stores, &format!("passing {number}"));
+            child.tell_names();
+            unregister_local(&stores, app);
+        }
+        registers(&stores, "late");
+        // Then: it is told what there is
+        let stop = Notify::new();
+        tokio::select! {
+            ended = child.accompany(&stop) => panic!("it lives: {ended:?}"),
+            names = tokio::time::timeout(WITHIN, names_told(theirs)) => {
+                let names: Vec<_> = names.unwrap().names.into_iter().map(|name| name.name).collect();
+                assert_eq!(names, ["late"]);
+            }
+        }
+    });
+}
+
+#[test]
+fn a_message_behind_names_that_cannot_be_told_does_not_wake_its_thread_again_and_again() {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        // Given: a message behind a name, and no more room
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let (mut child, theirs) = begin(&hosted(&stores));
+        welcome(&child, &theirs).await;
+        let kind = message_behind_a_name(&child);
+        fill(&mut child);
+        let link = child.hosted.link.clone();
+        assert!(link.nudged(child.number).now_or_never().is_some(), "the message waits");
+        // When: the name is told in vain
+        child.tell_names();
+        child.hand_over_held();
+        // Then: nothing but time, or the child, helps
+        assert!(link.nudged(child.number).now_or_never().is_none(), "it is tried at once again");
+        let kinds = kinds_read(&mut child, theirs, kind).await;
+        assert!(kinds.contains(&Kind::HOST_NAMES), "the message came before the name");
+    });
+}
+
+#[test]
+fn a_message_that_was_held_waits_for_room_where_there_is_none() {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        // Given: a message behind a name that was told, and no more room
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let (mut child, theirs) = begin(&hosted(&stores));
+        welcome(&child, &theirs).await;
+        let kind = message_behind_a_name(&child);
+        child.tell_names();
+        fill(&mut child);
+        // When: it would go
+        child.hand_over_held();
+        // Then: it comes once the child reads
+        kinds_read(&mut child, theirs, kind).await;
     });
 }
