@@ -5,7 +5,10 @@ use std::{
     task::{Context, Poll},
 };
 
-use sinew_runtime::{time::Time, wire::HEADER_LEN};
+use sinew_runtime::{
+    time::Time,
+    wire::{HEADER_LEN, Message},
+};
 
 use super::{
     LinkNumber, Socket,
@@ -201,10 +204,7 @@ impl<S: Socket> Half<S> {
             return Some(again);
         }
         if self.queue.is_empty() && self.interrupted.is_none() {
-            if self.in_lines() > 0 {
-                return None;
-            }
-            return self.last.take().map(|last| self.frill(last));
+            return if self.is_last_due() { self.say_last() } else { None };
         }
         if !self.session_has_room() {
             return None;
@@ -255,6 +255,18 @@ impl<S: Socket> Half<S> {
             || !self.urgent.is_empty()
             || self.behind() > 0
             || waits && self.session_has_room()
-            || !waits && self.in_lines() == 0 && self.last.is_some() && self.session_is_through()
+            || !waits && self.is_last_due()
+    }
+
+    /// Whether the last frame goes behind all that the session still has, here or in what the peer asks for again.
+    fn is_last_due(&self) -> bool {
+        self.has_last_to_say() && self.in_lines() == 0 && self.session_is_through()
+    }
+
+    /// The last frame, once on each connection: it ends with one that breaks.
+    fn say_last(&mut self) -> Option<Partial> {
+        self.has_said_last = true;
+        let last = self.last.as_ref()?;
+        Some(self.frill(Message::new(last.header, last.payload.clone())))
     }
 }

@@ -62,6 +62,8 @@ pub(super) struct Half<S> {
     pub(super) urgent: VecDeque<Message>,
     /// What is sent when nothing waits any more, on whichever connection there is then; nothing is taken after it.
     pub(super) last: Option<Message>,
+    /// It was said on the present connection.
+    pub(super) has_said_last: bool,
     finishing: bool,
     /// No waiting message expires before this.
     pub(super) next_expiry: Time,
@@ -94,6 +96,7 @@ impl<S: Socket> Half<S> {
             queue: Waiting::new(ClassQueue::new(bounds(limits))),
             urgent: VecDeque::new(),
             last: None,
+            has_said_last: false,
             finishing: false,
             next_expiry: Time::MAX,
             receipts,
@@ -133,6 +136,7 @@ impl<S: Socket> Half<S> {
         if !matches!(self.link, Link::Closed(_)) {
             self.link = Link::Up(socket);
             (self.due, self.taken_at_last) = (0, u64::MAX);
+            self.has_said_last = false;
             self.payload_max = self.limits.payload_max.min(payload_max);
             self.partial = preface.map(|message| self.frill(message));
         }
@@ -468,11 +472,15 @@ impl<S: Socket> Half<S> {
 
     pub(super) fn waiting(&self) -> usize {
         let single =
-            [self.partial.is_some(), self.gathered() > 0, self.interrupted.is_some(), self.last.is_some()];
+            [self.partial.is_some(), self.gathered() > 0, self.interrupted.is_some(), self.has_last_to_say()];
         self.queue.len()
             + self.urgent.len()
             + self.behind()
             + single.into_iter().filter(|waits| *waits).count()
+    }
+
+    pub(super) const fn has_last_to_say(&self) -> bool {
+        self.last.is_some() && !self.has_said_last
     }
 
     pub(super) const fn counts(&self) -> OutletCounts {

@@ -316,6 +316,20 @@ fn the_last_frame_goes_behind_all_that_waits_and_nothing_is_taken_after_it() {
 }
 
 #[test]
+fn the_last_frame_is_said_again_where_its_connection_has_ended() {
+    let mut bench = Bench::new(PLENTY);
+    bench.outlet.finish(message(Class::Control, 100));
+    assert_eq!(bench.seen(), [100]);
+    bench.wire = Arc::default();
+    bench.wire.room.store(PLENTY, Ordering::Relaxed);
+    bench.link = bench.outlet.connect(bench.wire.clone(), usize::MAX, None);
+    bench.drain();
+    assert_eq!(bench.seen(), [100]);
+    bench.drain();
+    assert_eq!(bench.seen(), [100], "and once on each");
+}
+
+#[test]
 fn a_closed_outlet_says_that_what_waited_was_not_handled_and_refuses_the_rest() {
     let bench = Bench::new(74 + 30);
     for correlation in 1..=3 {

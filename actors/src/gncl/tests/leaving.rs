@@ -7,10 +7,30 @@ use sinew_runtime::{
 };
 
 use super::{
-    bench::{ByHand, NINE, Node, next, pair, run},
+    bench::{ByHand, NINE, Node, introduction, next, pair, run, within},
     classes::lane_by_hand,
 };
-use crate::gncl::core::Lane;
+use crate::{
+    gncl::{
+        core::{CLASSES, Introduction, Lane, read, write},
+        peer::frame,
+    },
+    session::Ack,
+};
+
+/// A connection for Bulk of a peer that has kept its memory, and takes the first message next.
+async fn bulk_by_hand(node: &Node, dial: u64) -> ByHand {
+    let mut lane = ByHand::dial(node).await;
+    let features = vec![CLASSES.to_owned()];
+    let hello = Introduction { lane: Lane::Bulk, link: 1, dial, features, ..introduction(node.address()) };
+    lane.say(&frame(NINE, node.address(), Kind::GNCL_HELLO, write(&hello))).await;
+    assert_eq!(lane.hear().await.header.kind, Kind::GNCL_WELCOME);
+    let theirs = lane.try_hear_any().await.expect("the node says what it takes next");
+    let Ack { epoch: of, .. } = read(&theirs.payload).expect("an ACK has a payload");
+    let ours = Ack { memory: 1, epoch: 1, of, next: 1, change: 0, held: Vec::new(), room: None };
+    lane.say(&frame(NINE, node.address(), Kind::GNCL_ACK, write(&ours))).await;
+    lane
+}
 
 fn bulk(mut message: Message) -> Message {
     message.header.class = Class::Bulk;
@@ -29,6 +49,36 @@ fn what_waits_for_a_connection_that_a_link_still_lacks_goes_out_before_its_node_
         assert_eq!(first.hear().await.header.kind, Kind::GNCL_GOODBYE);
         let mut last = lane_by_hand(&node, Lane::Bulk, 2).await;
         assert_eq!(last.hear().await.payload[..], *b"before it is gone");
+        assert_eq!(last.hear().await.header.kind, Kind::GNCL_GOODBYE);
+    });
+}
+
+#[test]
+fn what_a_peer_has_not_said_to_have_goes_out_again_before_its_node_is_gone() {
+    run(async {
+        // Given: a message that was written, on a connection that breaks before anybody says that it has come
+        let mut node = Node::start(1).await;
+        let mut first = lane_by_hand(&node, Lane::Control, 1).await;
+        node.up().await;
+        let mut lost = bulk_by_hand(&node, 2).await;
+        let to = Tid::new(NINE, node.tid(1).app);
+        node.stores.router.send(bulk(node.message(to, b"written"))).expect("the peer is linked");
+        assert_eq!(lost.hear().await.payload[..], *b"written");
+        drop(lost);
+        let peer = node.stores.gncl.peer(NINE).expect("it is linked");
+        let way = peer.way(Lane::Bulk).expect("it has one for Bulk");
+        within("the node to see that it is broken", async {
+            while way.outlet.is_connected() {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        // When
+        node.leave();
+        assert_eq!(first.hear().await.header.kind, Kind::GNCL_GOODBYE);
+        // Then
+        let mut last = bulk_by_hand(&node, 3).await;
+        assert_eq!(last.hear().await.payload[..], *b"written");
         assert_eq!(last.hear().await.header.kind, Kind::GNCL_GOODBYE);
     });
 }
