@@ -34,7 +34,7 @@ pub(super) struct App {
     pub(super) state: State,
     /// How its former life ended, while this one is not ready yet.
     pub(super) ended: Option<Ended>,
-    /// Of what it requires, what it was told is lost.
+    /// Of what it requires, what it was told is lost: while it waits, what its former life was told.
     pub(super) lost: BTreeSet<String>,
     /// Of what it requires, what is not met, and since when.
     pub(super) absent: BTreeMap<String, Time>,
@@ -88,6 +88,13 @@ impl App {
             State::Waiting(_) | State::Released => Some(self.ended.map_or(Reason::NotReady, Reason::from)),
             State::Ready => None,
         }
+    }
+
+    /// A life may start: it has been told nothing of what it requires. Returns what the life before was told is lost and what is met now:
+    /// an event may still be on its way, and this life has to hear the end of it.
+    pub(super) fn begin_life(&mut self, unmet: &[(String, Reason)]) -> Vec<String> {
+        let lost = std::mem::take(&mut self.lost);
+        lost.into_iter().filter(|name| !unmet.iter().any(|(other, _)| other == name)).collect()
     }
 
     /// Keeps since when each requirement is not met.

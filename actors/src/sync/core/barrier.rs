@@ -35,7 +35,9 @@ impl Core {
         for (address, app) in self.apps.iter_mut() {
             let unready = missing.remove(&address).unwrap_or_default();
             app.note_absent(moment.now, &unready);
-            if app.wait().is_none() {
+            if self.not_taken.contains(&(address, None)) {
+                // That it may start it hears first.
+            } else if app.wait().is_none() {
                 for (event, why) in changes(moment, app, &unready) {
                     // What it did not take about this name before is out of date.
                     self.not_taken.remove(&(address, Some(event.name().to_owned())));
@@ -46,10 +48,12 @@ impl Core {
             {
                 // spec: SYNC-5
                 app.state = State::Released;
-                released.push(address);
+                released.push(Output::Release { app: address });
+                let met = app.begin_life(&unready).into_iter().map(|name| RequirementEvent::Met { name });
+                released.extend(met.map(|event| Output::Tell { app: address, event, why: None }));
             }
         }
-        self.outputs.extend(released.into_iter().map(|app| Output::Release { app }));
+        self.outputs.extend(released);
     }
 
     /// What each application lacks of what it requires. Remembers which of the names that are required, or waited for at a barrier,

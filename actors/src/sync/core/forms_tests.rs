@@ -110,6 +110,20 @@ fn what_can_be_done_without_is_waited_for_only_so_long() {
     assert_eq!(bench.down(2), [without(Reason::Failed), release(2)]);
 }
 
+// spec: SYNC-8
+#[test]
+fn each_life_is_told_what_it_has_to_do_without() {
+    let mut bench = Bench::new();
+    bench.registers(0, "gait", &["camera ?500ms"]);
+    let event = RequirementEvent::Without { name: "camera ?500ms".to_owned() };
+    let without = Output::Tell { app: app(0), event, why: Some(Reason::NotThere) };
+    for life in 1..=3 {
+        assert_eq!(bench.passes(Duration::from_millis(500)), [release(0)], "life {life}");
+        assert_eq!(bench.ready(0), std::slice::from_ref(&without), "life {life}");
+        assert_eq!(bench.down(0), [], "it waits for a camera anew");
+    }
+}
+
 #[test]
 fn what_comes_within_its_time_is_not_done_without() {
     let mut bench = Bench::new();

@@ -84,7 +84,7 @@ impl Core {
         if let Some(app) = self.apps.get_mut(address)
             && app.wait().is_none()
         {
-            // What it was told is lost stays so: an event may still be on its way, and its next life has to hear the end of it.
+            // What it was told is lost stays until its next life begins, which has to hear the end of it.
             (app.state, app.ended) = (State::Waiting(wait), Some(how));
             app.silent.clear();
             app.phases.clear();

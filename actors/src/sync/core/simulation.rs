@@ -18,10 +18,10 @@ mod world;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-use sinew_runtime::app::Requirement;
+use sinew_runtime::app::{Requirement, RequirementEvent};
 
 use self::{
-    plan::{Clock, Ends, Loss, Plan, Step, Wanted},
+    plan::{Clock, Come, Ends, Loss, Plan, Step, Wanted},
     world::{Seen, World},
 };
 use super::*;
@@ -38,6 +38,10 @@ const SHARED: usize = APPS;
 const SLOTS: usize = APPS + 1;
 /// An application of each node that watches the directory.
 const WATCHER: usize = 99;
+/// The one phase that applications reach.
+const PHASE: &str = "homed";
+/// The longest wait for what can be done without, in milliseconds.
+const PATIENCE_MAX: u64 = 80;
 
 /// Seeds in an ordinary run.
 const SEEDS: u64 = 250;
@@ -81,10 +85,18 @@ enum Fault {
     BreakNotTold,
     /// One lost node in three is not told.
     LossNotTold,
+    /// One loss of a requirement in three is not told to whom it concerns.
+    LackNotTold,
+    /// One requirement in three that is met again is not told.
+    MetNotTold,
+    /// Who can do without something is released as if it were there.
+    NotWaitedFor,
+    /// A list of before is told as if it had come over the link that is up again.
+    FormerListTold,
 }
 
 impl Fault {
-    const ALL: [Self; 13] = [
+    const ALL: [Self; 17] = [
         Self::ReadyTooEarly,
         Self::FailureNotTold,
         Self::EndNotTold,
@@ -98,6 +110,10 @@ impl Fault {
         Self::HandledAgain,
         Self::BreakNotTold,
         Self::LossNotTold,
+        Self::LackNotTold,
+        Self::MetNotTold,
+        Self::NotWaitedFor,
+        Self::FormerListTold,
     ];
 }
 

@@ -258,8 +258,18 @@ fn an_application_that_failed_with_a_requirement_lost_is_told_in_its_next_life_t
     let mut bench = Bench::where_gait_runs_with_its_sensor();
     bench.down(1);
     assert_eq!(bench.down(0), []);
-    assert_eq!(bench.ready(1), [release(0)]);
-    assert_eq!(bench.ready(0), [met(0, "sensor")]);
+    assert_eq!(bench.ready(1), [release(0), met(0, "sensor")]);
+    assert_eq!(bench.ready(0), []);
+}
+
+// spec: SYNC-8
+#[test]
+fn what_is_lost_again_before_the_next_life_is_ready_is_told_to_that_life() {
+    let mut bench = Bench::where_gait_runs_with_its_sensor();
+    bench.down(1);
+    bench.down(0);
+    assert_eq!(bench.ready(1), [release(0), met(0, "sensor")]);
+    assert_eq!(bench.down(1), [lost(0, "sensor", Reason::Failed), release(1)]);
 }
 
 // spec: SYNC-8

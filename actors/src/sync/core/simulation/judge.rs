@@ -12,7 +12,8 @@ impl World {
         let shared = all.clone().filter(is_shared).filter(|index| self.life_of(*index).is_some());
         let mut possible: BTreeSet<usize> = shared.collect();
         for index in all.filter(|index| !is_shared(index)) {
-            let is_met = |wanted: &Wanted| wanted.is_met_by(self.nodes, |index| possible.contains(&index));
+            let come = |index: usize| if possible.contains(&index) { Come::Through } else { Come::Nowhere };
+            let is_met = |wanted: &Wanted| wanted.patience().is_some() || wanted.is_met_by(self.nodes, come);
             if self.life_of(index).is_some_and(|life| life.requires.iter().all(is_met)) {
                 possible.insert(index);
             }
@@ -32,7 +33,20 @@ impl World {
             require(is_well, || format!("{} of node {} can run, and does not", name(index), index / SLOTS))?;
         }
         (0..self.nodes * SLOTS).try_for_each(|index| self.check_reasons(index))?;
+        (0..self.nodes * SLOTS).try_for_each(|index| self.check_told(index))?;
         self.check_directories()
+    }
+
+    /// Who runs knows what it lacks and nothing else, whether or not it took what its lives before were told.
+    fn check_told(&self, index: usize) -> Result<(), String> {
+        let Some(life) = self.life_of(index).filter(|life| life.running) else { return Ok(()) };
+        let come = |index: usize| self.life_of(index).map_or(Come::Nowhere, Life::come);
+        let lacks = life.requires.iter().filter(|wanted| !wanted.is_met_by(self.nodes, come));
+        let lacks: BTreeSet<String> = lacks.map(|wanted| wanted.requirement().to_string()).collect();
+        let Life { told, inherited, .. } = life;
+        require(lacks == *told && lacks == *inherited, || {
+            format!("{} lacks {lacks:?}, and was told {told:?}, in all lives {inherited:?}", name(index))
+        })
     }
 
     /// Who waits is told for whom and why, and that is so.

@@ -1,10 +1,20 @@
 //! Links that break and heal, what is on its way over them, and nodes that are lost, paused, restarted and leave.
 
 use super::*;
-use crate::sync::list::List;
+use crate::sync::list::{Entry, List};
 
 const fn sorted((one, other): Ends) -> Ends {
     if one < other { (one, other) } else { (other, one) }
+}
+
+/// Which application of this node a list's entry is about, and how far it has come.
+fn come_of(node: usize, entry: &Entry) -> (usize, Come) {
+    let come = match (entry.ready, entry.phases.is_empty()) {
+        (false, _) => Come::Nowhere,
+        (true, true) => Come::Running,
+        (true, false) => Come::Through,
+    };
+    (index_of(Tid::new(address(node), entry.app)), come)
 }
 
 impl World {
@@ -149,10 +159,20 @@ impl World {
                 self.tell(node, Input::MembershipChanged(found.clone()));
             }
             self.tell(node, Input::LinkChanged(LinkFact::LinkUp { node: node_address, incarnation }));
+            if let Some(payload) = self.former_list((node, peer)) {
+                self.deceive(node, Input::ListReceived { from: node_address, payload });
+            }
             if is_after {
                 self.tell(node, Input::MembershipChanged(found));
             }
         }
+    }
+
+    /// What the second said to the first on a link before, if a fault has it told again.
+    fn former_list(&self, ends: Ends) -> Option<Bytes> {
+        let former = self.former.get(&ends).filter(|_| self.fault == Some(Fault::FormerListTold))?;
+        let life = List::parse(former).expect("a core has sent it").incarnation;
+        (life.0 == self.incarnations[ends.1]).then(|| former.clone())
     }
 
     /// NDL says that a node is there, and before it that the life which it knew is over; GNCL has not dialled it yet.
@@ -187,6 +207,17 @@ impl World {
                 let ends = (node, number(peer));
                 self.present.insert(ends, Some(incarnation.0));
                 self.linked.insert(ends, incarnation.0);
+                self.heard.remove(&ends);
+                Some(ends.1)
+            }
+            Input::ListReceived { from, payload } => {
+                let ends = (node, number(from));
+                if self.linked.contains_key(&ends) {
+                    let list = List::parse(payload).expect("a core has sent it");
+                    self.heard
+                        .insert(ends, list.entries.iter().map(|entry| come_of(ends.1, entry)).collect());
+                    self.former.insert(ends, payload.clone());
+                }
                 Some(ends.1)
             }
             Input::MembershipChanged(MembershipFact::NodeLost { node: peer, incarnation, .. })
@@ -202,8 +233,7 @@ impl World {
                 self.unlink(ends, *incarnation);
                 Some(ends.1)
             }
-            Input::LinkChanged(LinkFact::DialRefused { node: peer, .. })
-            | Input::ListReceived { from: peer, .. } => Some(number(peer)),
+            Input::LinkChanged(LinkFact::DialRefused { node: peer, .. }) => Some(number(peer)),
             Input::AppChanged(_)
             | Input::GroupsChanged(_)
             | Input::Arrived { .. }
@@ -222,6 +252,7 @@ impl World {
     fn unlink(&mut self, ends: Ends, life: Incarnation) {
         if self.linked.get(&ends) == Some(&life.0) {
             self.linked.remove(&ends);
+            self.heard.remove(&ends);
         }
     }
 
@@ -299,6 +330,8 @@ impl World {
         self.met.retain(|(at, _), _| *at != node);
         self.present.retain(|(at, _), _| *at != node);
         self.linked.retain(|(at, _), _| *at != node);
+        self.heard.retain(|(at, _), _| *at != node);
+        self.former.retain(|(at, _), _| *at != node);
         self.newest.remove(&node);
         self.incarnations[node] = match clock {
             Clock::GoesOn => self.incarnations[node] + 1,

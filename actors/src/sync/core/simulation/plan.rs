@@ -44,6 +44,11 @@ pub(super) enum Step {
         node: usize,
         slot: usize,
     },
+    /// It reaches the one phase that there is.
+    Reach {
+        node: usize,
+        slot: usize,
+    },
     Fail {
         node: usize,
         slot: usize,
@@ -108,6 +113,16 @@ pub(super) enum Step {
     },
 }
 
+/// How far an application has come in its present life.
+#[derive(Clone, Copy, Debug, Default, PartialEq, PartialOrd, Eq, Ord)]
+pub(super) enum Come {
+    #[default]
+    Nowhere,
+    Running,
+    /// It runs, and has reached the phase.
+    Through,
+}
+
 /// A requirement of any form.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Wanted {
@@ -117,6 +132,10 @@ pub(super) enum Wanted {
     OfNode { count: usize, node: usize },
     /// So many of the name that several nodes give.
     Shared { count: usize },
+    /// An application that has reached the phase.
+    Reached { of: usize },
+    /// One that can be done without after so many milliseconds.
+    Optional { of: usize, millis: u64 },
 }
 
 impl Wanted {
@@ -135,6 +154,15 @@ impl Wanted {
                 ((node + 1) * SLOTS <= index).then_some(Self::OfNode { count, node })
             }
             Self::Shared { count } => Some(Self::Shared { count }),
+            Self::Reached { of } | Self::Optional { of, .. } => (of < index).then_some(self),
+        }
+    }
+
+    /// How long it is waited for, if it can be done without.
+    pub(super) const fn patience(&self) -> Option<Duration> {
+        match self {
+            Self::Optional { millis, .. } => Some(Duration::from_millis(*millis)),
+            Self::AtLeast { .. } | Self::OfNode { .. } | Self::Shared { .. } | Self::Reached { .. } => None,
         }
     }
 
@@ -143,11 +171,17 @@ impl Wanted {
             Self::AtLeast { count, of } => Requirement::at_least(*count, of.iter().map(|index| name(*index))),
             Self::OfNode { count, node } => Requirement::at_least(*count, [format!("{node}.*")]),
             Self::Shared { count } => Requirement::at_least(*count, [name(SHARED)]),
+            Self::Reached { of } => Requirement::name(name(*of)).at(PHASE),
+            Self::Optional { of, millis } => {
+                Requirement::name(name(*of)).or_after(Duration::from_millis(*millis))
+            }
         }
     }
 
-    /// The judge's own reading of it, where there are so many nodes.
-    pub(super) fn is_met_by(&self, nodes: usize, is_there: impl Fn(usize) -> bool) -> bool {
+    /// The judge's own reading of it, where there are so many nodes. How far an application has come is asked; one that is not there has come
+    /// nowhere.
+    pub(super) fn is_met_by(&self, nodes: usize, come: impl Fn(usize) -> Come) -> bool {
+        let is_there = |index: usize| come(index) >= Come::Running;
         match self {
             Self::AtLeast { count, of } => of.iter().filter(|index| is_there(**index)).count() >= *count,
             Self::OfNode { count, node } => {
@@ -156,6 +190,8 @@ impl Wanted {
             Self::Shared { count } => {
                 (0..nodes).filter(|node| is_there(node * SLOTS + SHARED)).count() >= *count
             }
+            Self::Reached { of } => come(*of) == Come::Through,
+            Self::Optional { of, .. } => is_there(*of),
         }
     }
 }
@@ -194,7 +230,7 @@ struct Draw {
 impl Draw {
     fn step(&mut self) -> Step {
         let (node, slot, ends) = (self.node(), self.chance.usize(..SLOTS), self.ends());
-        match self.chance.usize(..36) {
+        match self.chance.usize(..38) {
             0..4 => Step::Register { node, slot, requires: self.requires() },
             4..10 => Step::Start { node, slot },
             10..12 => Step::Fail { node, slot },
@@ -216,6 +252,7 @@ impl Draw {
             25..29 => Step::Deliver { ends, count: self.chance.usize(1..4) },
             29..32 => Step::Hear { node, count: self.chance.usize(1..4) },
             32..34 => Step::Find { ends },
+            34..36 => Step::Reach { node, slot },
             _ => Step::Pass { millis: self.chance.u64(1..3_000) },
         }
     }
@@ -239,17 +276,23 @@ impl Draw {
     }
 
     fn wanted(&mut self) -> Wanted {
-        match self.chance.usize(..7) {
+        match self.chance.usize(..9) {
             0..3 => Wanted::AtLeast { count: 1, of: self.some(1) },
             3 => Wanted::AtLeast { count: 1, of: self.some(3) },
             4 => Wanted::AtLeast { count: 2, of: self.some(3) },
             5 => Wanted::OfNode { count: self.chance.usize(1..3), node: self.node() },
+            6 => Wanted::Reached { of: self.one() },
+            7 => Wanted::Optional { of: self.one(), millis: self.chance.u64(1..=PATIENCE_MAX) },
             _ => Wanted::Shared { count: self.chance.usize(1..3) },
         }
     }
 
     /// One to so many applications with names of their own.
     fn some(&mut self, most: usize) -> BTreeSet<usize> {
-        (0..most).map(|_| self.node() * SLOTS + self.chance.usize(..APPS)).collect()
+        (0..most).map(|_| self.one()).collect()
+    }
+
+    fn one(&mut self) -> usize {
+        self.node() * SLOTS + self.chance.usize(..APPS)
     }
 }

@@ -1,6 +1,7 @@
 //! The cores, their applications, and what becomes of what cores order.
 
 use super::{judge::require, *};
+use crate::sync::words::{BarrierKind, OnPartyLoss};
 
 /// Of each node; so large that clocks can begin anew.
 const FIRST_LIFE: u64 = 1_000_000;
@@ -11,6 +12,42 @@ pub(super) struct Life {
     pub(super) requires: Vec<Wanted>,
     pub(super) released: u32,
     pub(super) running: bool,
+    /// It has reached the phase.
+    pub(super) reached: bool,
+    /// Since when it waits, or waited.
+    since: Time,
+    /// What it was told it lacks.
+    pub(super) told: BTreeSet<String>,
+    /// The same, where all that lives before were told came to this one.
+    pub(super) inherited: BTreeSet<String>,
+}
+
+impl Life {
+    fn of(requires: Vec<Wanted>, since: Time) -> Self {
+        let (told, inherited) = (BTreeSet::new(), BTreeSet::new());
+        Self { requires, released: 0, running: false, reached: false, since, told, inherited }
+    }
+
+    pub(super) const fn come(&self) -> Come {
+        match (self.running, self.reached) {
+            (false, _) => Come::Nowhere,
+            (true, false) => Come::Running,
+            (true, true) => Come::Through,
+        }
+    }
+
+    fn hear(&mut self, event: RequirementEvent) {
+        for knows in [&mut self.told, &mut self.inherited] {
+            match &event {
+                RequirementEvent::Lost { name } | RequirementEvent::Without { name } => {
+                    knows.insert(name.clone());
+                }
+                RequirementEvent::Met { name } => {
+                    knows.remove(name);
+                }
+            }
+        }
+    }
 }
 
 /// How often what happened, so that a quiet simulation is noticed.
@@ -18,7 +55,7 @@ pub(super) struct Life {
 pub(super) struct Seen(BTreeMap<&'static str, u64>);
 
 impl Seen {
-    const WHAT: [&'static str; 17] = [
+    const WHAT: [&'static str; 20] = [
         "nodes",
         "lists",
         "lists lost",
@@ -34,6 +71,9 @@ impl Seen {
         "events handed over again",
         "pauses",
         "released",
+        "done without",
+        "phases reached",
+        "lacks told",
         "shared names",
         "crowds",
     ];
@@ -67,6 +107,10 @@ pub(super) struct World {
     pub(super) present: BTreeMap<Ends, Option<u64>>,
     /// To which life of the second the first has a link, as it was told.
     pub(super) linked: BTreeMap<Ends, u64>,
+    /// What the last list said that came over the present link: how far applications of the second have come, as the first was told.
+    pub(super) heard: BTreeMap<Ends, BTreeMap<usize, Come>>,
+    /// That list, also where the link has broken since.
+    pub(super) former: BTreeMap<Ends, Bytes>,
     pub(super) apps: Vec<BTreeMap<usize, Life>>,
     /// Links that carry lists, the smaller end first.
     pub(super) up: BTreeSet<Ends>,
@@ -81,8 +125,8 @@ pub(super) struct World {
     /// What cores were told, counted.
     events: u64,
     pub(super) takes_all: bool,
-    /// Applications that have run in any life.
-    has_run: BTreeSet<usize>,
+    /// How far applications have come in any life.
+    has_come: BTreeMap<usize, Come>,
     pub(super) fault: Option<Fault>,
     /// Orders that a fault may strike.
     struck: u64,
@@ -108,6 +152,8 @@ impl World {
             met: BTreeMap::new(),
             present: BTreeMap::new(),
             linked: BTreeMap::new(),
+            heard: BTreeMap::new(),
+            former: BTreeMap::new(),
             apps: vec![BTreeMap::new(); nodes],
             up: BTreeSet::new(),
             unheard: BTreeMap::new(),
@@ -117,7 +163,7 @@ impl World {
             told: 0,
             events: 0,
             takes_all: false,
-            has_run: BTreeSet::new(),
+            has_come: BTreeMap::new(),
             fault,
             struck: 0,
             last: BTreeMap::new(),
@@ -196,6 +242,16 @@ impl World {
         if let Some(peer) = peer {
             self.judge_presence((node, peer));
         }
+        self.carry_out_all(node);
+    }
+
+    /// Tells it something that is not so.
+    pub(super) fn deceive(&mut self, node: usize, input: Input) {
+        self.handle(node, input);
+        self.carry_out_all(node);
+    }
+
+    fn carry_out_all(&mut self, node: usize) {
         let mut lists = 0;
         while let Some(output) = self.cores[node].poll() {
             lists += usize::from(matches!(output, Output::Publish { .. }));
@@ -257,9 +313,19 @@ impl World {
             Output::Release { app } => self.released(node, app),
             Output::TellDirectory { event, .. } => self.told_of_directory(node, event),
             Output::Publish { to, list } => self.fly(node, to, list),
+            Output::Tell { event: RequirementEvent::Met { .. }, .. } if self.strikes(Fault::MetNotTold) => {}
+            Output::Tell {
+                event: RequirementEvent::Lost { .. } | RequirementEvent::Without { .. }, ..
+            } if self.strikes(Fault::LackNotTold) => {}
             Output::Tell { app, event, .. } => {
-                let released = self.life(node, app).1.released;
-                self.violate(released == 1, || format!("told before it was released: {event:?}"));
+                self.seen.count("lacks told", u64::from(!matches!(event, RequirementEvent::Met { .. })));
+                self.say(|| format!("{app} of node {node} is told {event:?}"));
+                let life = self.life(node, app).1;
+                let released = life.released;
+                life.hear(event.clone());
+                // That something is met again says nothing to who does not run yet.
+                let is_early = released == 0 && !matches!(event, RequirementEvent::Met { .. });
+                self.violate(!is_early, || format!("told before it was released: {event:?}"));
             }
             Output::Refused { cause, detail } => {
                 self.violations.push(format!("node {node} refuses because of {cause}: {detail}"));
@@ -278,26 +344,38 @@ impl World {
         (slot, self.apps[node].get_mut(&slot).expect("a release for who is not registered"))
     }
 
+    /// How far an application has come, by what this node was told since its link to that of the application is up.
+    fn heard_of(&self, node: usize, index: usize) -> Come {
+        let (peer, slot) = (index / SLOTS, index % SLOTS);
+        if peer == node {
+            return self.apps[node].get(&slot).map_or(Come::Nowhere, Life::come);
+        }
+        self.heard.get(&(node, peer)).and_then(|come| come.get(&index)).copied().unwrap_or_default()
+    }
+
     /// No release before all is ready, and one for each life.
     fn released(&mut self, node: usize, app: AppAddress) {
-        let directory = self.cores[node].directory();
-        let ready = directory.iter().filter(|entry| entry.ready).map(|entry| index_of(entry.tid));
-        let ready: BTreeSet<usize> = ready.collect();
+        let now = self.now;
         let (slot, life) = self.life(node, app);
         life.released += 1;
-        let (released, requires) = (life.released, life.requires.clone());
+        let (released, since, requires) = (life.released, life.since, life.requires.clone());
         let who = format!("{} of node {node}", name(node * SLOTS + slot));
         self.say(|| format!("{who} is released"));
         self.seen.count("released", 1);
         self.violate(released == 1, || format!("{who} is released twice in one life"));
         for wanted in requires {
-            let is_met = wanted.is_met_by(self.nodes, |index| ready.contains(&index));
-            self.violate(is_met, || {
-                format!("{who} is released early: {wanted:?} is not met, as its node sees it")
+            let is_met = wanted.is_met_by(self.nodes, |index| self.heard_of(node, index));
+            let is_done_without = wanted.patience().is_some_and(|patience| since + patience <= now);
+            self.seen.count("done without", u64::from(is_done_without && !is_met));
+            self.violate(is_met || is_done_without, || {
+                format!("{who} is released early: {wanted:?} is not met, as its node was told")
             });
             // What was heard last may be out of date, and was so once.
-            let has_been = wanted.is_met_by(self.nodes, |index| self.has_run.contains(&index));
-            self.violate(has_been, || format!("{who} is released early: {wanted:?} has never run"));
+            let come = |index: usize| self.has_come.get(&index).copied().unwrap_or_default();
+            let has_been = wanted.is_met_by(self.nodes, come);
+            self.violate(has_been || is_done_without, || {
+                format!("{who} is released early: {wanted:?} has never been so")
+            });
         }
     }
 
@@ -307,6 +385,7 @@ impl World {
             // Nothing of a process that is stopped goes on.
             Step::Register { node, .. }
             | Step::Start { node, .. }
+            | Step::Reach { node, .. }
             | Step::Fail { node, .. }
             | Step::Unregister { node, .. }
             | Step::Leave { node }
@@ -314,6 +393,7 @@ impl World {
                 if self.paused.contains(&node) => {}
             Step::Register { node, slot, requires } => self.register(node, slot, requires),
             Step::Start { node, slot } => drop(self.start(node, slot)),
+            Step::Reach { node, slot } => drop(self.reach(node, slot)),
             Step::Fail { node, slot } => self.fail(node, slot),
             Step::Unregister { node, slot } => self.unregister(node, slot),
             Step::Cut { ends, loss } => self.cut(ends, loss),
@@ -355,11 +435,13 @@ impl World {
         requires.dedup();
         self.seen.count("shared names", u64::from(slot == SHARED));
         // Told again, it is no new life.
-        if self.apps[node].get(&slot).is_none_or(|life| life.requires != requires) {
-            let life = Life { requires: requires.clone(), released: 0, running: false };
-            self.apps[node].insert(slot, life);
+        let former = self.apps[node].get(&slot);
+        if former.is_none_or(|life| life.requires != requires) {
+            // One that waits already has waited for that, too.
+            let since = former.filter(|life| life.released == 0).map_or(self.now, |life| life.since);
+            self.apps[node].insert(slot, Life::of(requires.clone(), since));
         }
-        let requires = requires.iter().map(|wanted| wanted.requirement().to_string()).collect();
+        let requires = requires.iter().map(|wanted| self.spelled(wanted)).collect();
         let address = app_address(slot);
         let fact = AppFact::Registered { app: address, name: Some(name(index)), requires };
         self.tell(node, Input::AppChanged(fact));
@@ -371,13 +453,40 @@ impl World {
         }
     }
 
+    /// As its node is told that it is wanted.
+    fn spelled(&self, wanted: &Wanted) -> String {
+        if let (Wanted::Optional { of, .. }, Some(Fault::NotWaitedFor)) = (wanted, self.fault) {
+            return Wanted::Optional { of: *of, millis: 1 }.requirement().to_string();
+        }
+        wanted.requirement().to_string()
+    }
+
     /// Whether it starts: one that was released.
     fn start(&mut self, node: usize, slot: usize) -> bool {
         let life = self.apps[node].get_mut(&slot).filter(|life| life.released == 1 && !life.running);
         let Some(life) = life else { return false };
         life.running = true;
-        self.has_run.insert(node * SLOTS + slot);
+        self.has_come.entry(node * SLOTS + slot).or_insert(Come::Running);
         self.tell(node, Input::AppChanged(AppFact::Ready { app: app_address(slot) }));
+        true
+    }
+
+    /// Whether it reaches the phase, and waits there for nobody else: one that runs.
+    fn reach(&mut self, node: usize, slot: usize) -> bool {
+        let life = self.apps[node].get_mut(&slot).filter(|life| life.running && !life.reached);
+        let Some(life) = life else { return false };
+        life.reached = true;
+        self.seen.count("phases reached", 1);
+        let index = node * SLOTS + slot;
+        self.has_come.insert(index, Come::Through);
+        let asked = ArriveAtBarrier {
+            barrier: PHASE.to_owned(),
+            parties: vec![name(index)],
+            within_ms: 1,
+            on_loss: OnPartyLoss::Fail,
+            kind: BarrierKind::Phase,
+        };
+        self.tell(node, Input::Arrived { app: app_address(slot), correlation: 1, asked });
         true
     }
 
@@ -385,7 +494,9 @@ impl World {
         let Some(life) = self.apps[node].get_mut(&slot) else { return };
         // One that waits goes on waiting in the same life.
         if life.released == 1 {
-            (life.released, life.running) = (0, false);
+            (life.released, life.running, life.reached) = (0, false, false);
+            life.since = self.now;
+            life.told.clear();
         }
         if self.fault != Some(Fault::FailureNotTold) {
             self.tell(node, Input::AppChanged(AppFact::Down { app: app_address(slot) }));
@@ -422,13 +533,17 @@ impl World {
     /// Until nothing has happened for as long as anything may take. Each round starts somebody, or ends what was begun.
     fn come_to_rest(&mut self) {
         let mut idle = Duration::ZERO;
-        for _ in 0..self.nodes * SLOTS + 20 {
+        let longest = Duration::from_millis(PATIENCE_MAX).max(barrier::SILENCE);
+        let rounds_each = longest.as_millis().div_ceil(barrier::RETRY.as_millis()) + 2;
+        for _ in 0..(self.nodes * SLOTS + 20) as u128 * rounds_each {
             self.pass(barrier::RETRY);
             let is_heard = self.hear_all();
             let slots = (0..self.nodes).flat_map(|node| (0..SLOTS).map(move |slot| (node, slot)));
-            let started = slots.filter(|(node, slot)| self.start(*node, *slot)).count();
-            idle = if is_heard || started > 0 { Duration::ZERO } else { idle + barrier::RETRY };
-            if idle > barrier::SILENCE {
+            let slots: Vec<_> = slots.collect();
+            let started = slots.iter().filter(|(node, slot)| self.start(*node, *slot)).count();
+            let reached = slots.iter().filter(|(node, slot)| self.reach(*node, *slot)).count();
+            idle = if is_heard || started + reached > 0 { Duration::ZERO } else { idle + barrier::RETRY };
+            if idle > longest {
                 return;
             }
         }
