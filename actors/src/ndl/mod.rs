@@ -24,7 +24,7 @@
 //! | NDL-4 | A member is lost |
 //! | NDL-4.1 | when it missed `missed_max` answers in a row on all routes; |
 //! | NDL-4.2 | but nobody is accused in a cycle to which our own timer came late by more than half a period; where it came late by less, as long again is given to read what was answered; of four such cycles in a row the fourth counts, and three respites are given; |
-//! | NDL-4.3 | when its connection broke and is refused: `Crashed`, until it answers a later query; |
+//! | NDL-4.3 | when its connection broke and is refused, and it answers no question of after that: `Crashed`, until it answers a later query; |
 //! | NDL-4.4 | when it says so, from its own address, in its own life: `Left`. |
 //! | NDL-4.6 | whose host is tried from its first missed answer on: `Hung` if it accepts, `Crashed` if it refuses, else `LinkDown`. |
 //! | NDL-4.7 | But not while GNCL reads of it: it lives, and is told to have an NDL that is not heard. |

@@ -127,6 +127,7 @@ impl Core {
         member.heard = now;
         (member.missed, member.host) = (0, None);
         member.is_awaited = false;
+        member.answered = member.answered.max(proof.asked);
         member.routes.answered(proof.from, proof.exchange.and_then(|exchange| exchange.round_trip()));
         self.note_addresses(now, node, proof.from, &proof.announcement);
         self.drop_unannounced_routes(now, node, proof.from);
@@ -243,7 +244,8 @@ impl Core {
             troubles: Troubles::default(),
             is_awaited: false,
             clock: PeerClock::default(),
-            is_link_broken: false,
+            answered: Time::ZERO,
+            link_broke: None,
             link_until,
             since: now,
             fence,
@@ -347,15 +349,21 @@ impl Core {
             return;
         };
         match fact {
-            LinkFact::LinkUp { .. } => (member.is_link_broken, member.link_until) = (false, Time::MAX),
+            LinkFact::LinkUp { .. } => (member.link_broke, member.link_until) = (None, Time::MAX),
             LinkFact::LinkBroken { .. } => {
-                (member.is_link_broken, member.link_until) = (true, now + LINK_GRACE);
+                (member.link_broke, member.link_until) = (Some(now), now + LINK_GRACE);
+                self.challenge_member(now, node);
             }
-            LinkFact::DialRefused { .. } if member.is_link_broken => {
-                self.lose(now, node, LossReason::Crashed);
-            }
-            // Never connected: its GNCL may not listen yet.
-            LinkFact::DialRefused { .. } => {}
+            LinkFact::DialRefused { .. } => match member.link_broke {
+                Some(then) if member.answered < then => self.lose(now, node, LossReason::Crashed),
+                // It lives: whoever refuses does it in its host's name, or its end is still to come.
+                Some(_) => {
+                    member.link_broke = Some(now);
+                    self.challenge_member(now, node);
+                }
+                // Never connected: its GNCL may not listen yet.
+                None => {}
+            },
             LinkFact::PeerLeft { .. } => self.lose(now, node, LossReason::Left),
         }
     }
@@ -364,11 +372,14 @@ impl Core {
     /// nobody. // spec: NDL-4.3, NDL-4.5
     pub(crate) fn look_at_links(&mut self, now: Time, stands: impl Fn(NodeAddress, Incarnation) -> bool) {
         self.proven.look_at_links(&stands);
+        let mut broken = Vec::new();
         for (node, member) in &mut self.members {
             if member.link_until == Time::MAX && !stands(*node, member.announcement.incarnation) {
-                (member.is_link_broken, member.link_until) = (true, now + LINK_GRACE);
+                (member.link_broke, member.link_until) = (Some(now), now + LINK_GRACE);
+                broken.push(*node);
             }
         }
+        broken.into_iter().for_each(|node| self.challenge_member(now, node));
     }
 
     /// A member is gone. Answers to earlier questions do not count any more.

@@ -41,8 +41,10 @@ pub(super) struct Member {
     /// The last query of the cycle is not answered yet.
     pub(super) is_awaited: bool,
     pub(super) clock: PeerClock,
-    /// Its connection ended and did not come back yet.
-    pub(super) is_link_broken: bool,
+    /// When the question was asked that it answered, the latest of them.
+    pub(super) answered: Time,
+    /// Its connection ended and did not come back yet: then, or it was refused then and answered all the same.
+    pub(super) link_broke: Option<Time>,
     /// Until then its connection stands, or is being made again.
     pub(super) link_until: Time,
     /// Since when it has been a member.

@@ -271,6 +271,26 @@ fn a_broken_and_refused_connection_is_a_loss_at_once() {
     assert_eq!(world.losses(1), [(2, LossReason::Crashed)]);
 }
 
+// spec: NDL-4.3
+#[test]
+fn who_answers_a_question_of_after_its_link_broke_is_not_lost_because_somebody_refuses_for_it() {
+    let mut world = World::of_members(2);
+    let (node, incarnation) = (node(2), Incarnation(1));
+    let refused = || LinkFact::DialRefused { node, incarnation };
+    world.link(1, LinkFact::LinkBroken { node, incarnation });
+    // Between two dials
+    for _ in 0..5 {
+        world.run(ms(10));
+        world.link(1, refused());
+    }
+    assert_eq!(world.losses(1), []);
+    // But when it has ended the next refusal says so.
+    world.kill(2);
+    world.run(ms(10));
+    world.link(1, refused());
+    assert_eq!(world.losses(1), [(2, LossReason::Crashed)]);
+}
+
 #[test]
 fn a_refused_node_that_answers_a_later_question_is_found_again() {
     // given: an answer to an earlier question is on its way
