@@ -44,7 +44,7 @@ pub(crate) struct Stores {
     pub(crate) secured: OnceLock<Secured>,
     /// Who may send what to whom; not set: everybody everything. Set before any layer starts.
     pub(crate) access: OnceLock<Arc<Access>>,
-    /// Address of GNCL's listener, known once it listens; announced by NDL. A restarted GNCL binds it again.
+    /// Address of GNCL's listener, known once it listens; announced by NDL. A restarted GNCL has the same listener.
     pub(crate) gncl_listen: OnceLock<SocketAddr>,
     /// Where GNCL listens besides; set with it.
     pub(crate) gncl_further: OnceLock<Vec<SocketAddrV4>>,

@@ -166,6 +166,20 @@ impl Paths {
         }
     }
 
+    /// For what there is no room, once as long as that is so.
+    fn say_left_out(&self, left_out: &[LocalAddress]) {
+        let mut said = self.said.borrow_mut();
+        said.retain(|(local, what)| *what != LEFT_OUT || left_out.contains(local));
+        for local in left_out {
+            if said.insert((*local, LEFT_OUT)) {
+                crate::log::warn!(
+                    %local,
+                    "NDL does not use this address: it uses {PATHS_MAX} at most, and this host has more; name those in `ndl.interface` over which                      other nodes are"
+                );
+            }
+        }
+    }
+
     /// Sockets whose interface was gone for a while, and has the address again, send and hear by it.
     fn renew(&self, stores: &Stores) {
         for path in self.open.borrow().iter().filter(|path| !path.local.ip.is_loopback()) {
@@ -219,6 +233,7 @@ impl Paths {
 const UNOPENED: &str = "it cannot be opened";
 const IN_DOUBT: &str = "another host may have it";
 const TAKEN: &str = "another host has it";
+const LEFT_OUT: &str = "there are too many";
 const UNJOINED: &str = "the group cannot be joined";
 
 fn open(stores: &Stores, local: LocalAddress) -> io::Result<Path> {
@@ -267,8 +282,16 @@ fn wanted(chosen: &Interfaces, usable: &Usable, open: &[LocalAddress]) -> Vec<Lo
             wanted.push(local);
         }
     }
-    wanted.truncate(PATHS_MAX);
     wanted
+}
+
+/// Takes those out that there is no room for, and returns them: what is open, and leads somewhere perhaps, stays ahead of what is new.
+fn leave_out(wanted: &mut Vec<LocalAddress>, open: &[LocalAddress]) -> Vec<LocalAddress> {
+    let is_open = |local: &&LocalAddress| open.contains(local);
+    let news = wanted.iter().filter(|local| !is_open(local));
+    let left_out: Vec<_> = wanted.iter().filter(is_open).chain(news).skip(PATHS_MAX).copied().collect();
+    wanted.retain(|local| !left_out.contains(local));
+    left_out
 }
 
 impl Shell {
@@ -284,7 +307,9 @@ impl Shell {
     /// Opens and closes paths as they come and go; `false` when a later instance has taken over.
     fn look_at_paths(self: &Rc<Self>, usable: &Usable, tasks: &FuturesUnordered<Task>) -> bool {
         let (stores, before) = (&self.stores, self.paths.here());
-        let wanted = wanted(&stores.config.ndl.interface, usable, &self.paths.locals());
+        let mut wanted = wanted(&stores.config.ndl.interface, usable, &self.paths.locals());
+        let left_out = leave_out(&mut wanted, &self.paths.locals());
+        self.paths.say_left_out(&left_out);
         let (readers, unopened) = self.paths.open(stores, &wanted);
         self.paths.say_unopened(stores.config.ndl.port, &unopened);
         let mut watched = self.paths.locals();
@@ -410,8 +435,19 @@ mod tests {
             "no carrier any more"
         );
         assert_eq!(wanted(&chosen, &usable(&[], &[]), &[named]), [by_address], "the address is gone");
+    }
+
+    #[test]
+    fn of_more_addresses_than_can_be_used_those_that_are_open_stay_and_the_others_are_said() {
         let many: Vec<_> = (0..20).map(|last| v4([10, 8, 1, last])).collect();
-        assert_eq!(wanted(&chosen, &usable(&many, &many), &[]).len(), PATHS_MAX);
+        let mut at_first = many.clone();
+        assert_eq!(leave_out(&mut at_first, &[]), many[PATHS_MAX..]);
+        assert_eq!(at_first, many[..PATHS_MAX]);
+        // When another one comes ahead of those that are open
+        let open = &many[1..=PATHS_MAX];
+        let mut wanted = many.clone();
+        assert!(leave_out(&mut wanted, open).contains(&many[0]));
+        assert_eq!(wanted, open);
     }
 
     #[test]
