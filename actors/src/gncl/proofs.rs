@@ -4,7 +4,10 @@ use std::{collections::BTreeMap, sync::Mutex};
 
 use sinew_runtime::tid::{Incarnation, NodeAddress};
 
-use crate::{security::Peer, stores::lock};
+use crate::{
+    security::Peer,
+    stores::{Stores, lock},
+};
 
 /// Of each node that was linked. It outlives links, what is forgotten of a peer, and restarts of this layer: the life that was linked bars
 /// earlier ones as long.
@@ -39,6 +42,12 @@ impl Proofs {
         let those = all.iter().filter(|(_, proof)| what(&proof.peer));
         those.map(|(node, proof)| (*node, proof.incarnation)).collect()
     }
+}
+
+/// Whether the certificate with which this life was linked is on the deny list.
+pub(crate) fn is_revoked(stores: &Stores, node: NodeAddress, incarnation: Incarnation) -> bool {
+    let Some(secured) = stores.secured.get() else { return false };
+    stores.gncl.proofs.of_those(|peer| secured.tls.denies(peer).is_some()).contains(&(node, incarnation))
 }
 
 #[cfg(test)]

@@ -38,6 +38,8 @@ pub(crate) enum Input {
     WasNobody { node: NodeAddress, incarnation: Incarnation },
     /// A node has left in order.
     NodeLeft { node: NodeAddress, incarnation: Incarnation },
+    /// The certificate with which this life was linked is revoked: whose words its wills are nobody knows.
+    Revoked { node: NodeAddress, incarnation: Incarnation },
     /// A node has told its wills.
     Told { from: NodeAddress, testament: Testament },
     /// The time of [`Core::next_wake`] has come.
@@ -115,8 +117,8 @@ impl Core {
             Input::NodeLost { node, incarnation } => self.execute(node, |life| life <= incarnation),
             // The node itself, in whatever life, may be alive. spec: WILL-2
             Input::WasNobody { node, incarnation } => self.execute(node, |life| life == incarnation),
-            Input::NodeLeft { node, incarnation } => {
-                // spec: WILL-2
+            // spec: WILL-2, WILL-5
+            Input::NodeLeft { node, incarnation } | Input::Revoked { node, incarnation } => {
                 drop(self.take_held(node, |life| life <= incarnation));
             }
             Input::Told { from, testament } => self.told(from, testament),

@@ -11,14 +11,15 @@
 //! | WILL-2 | A lost node's wills are executed once for each loss; not those of a node that left: it stops its applications itself. |
 //! | WILL-3 | That a node is there in a new life is the loss of the old one, whoever says so first. |
 //! | WILL-4 | A will of more than 1,024 bytes, and what is more than 256 wills of a node or than `payload_max` has room for, stays at home. One list is held of each of `ndl.nodes_max` nodes. |
+//! | WILL-5 | The wills of a node whose certificate is revoked are not executed, whatever becomes of it. |
 
 mod core;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;
 mod shell;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod words;
 
 pub(crate) use core::{Core, Input};
-pub(crate) use shell::{feed, next_wake, receive};
+pub(crate) use shell::{feed, next_wake, receive, revoke};

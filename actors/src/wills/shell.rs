@@ -12,7 +12,7 @@ use super::{
     words::{HeldWill, Testament},
 };
 use crate::{
-    gncl::LinkFact,
+    gncl::{self, LinkFact},
     ndl::{LossReason, MembershipFact},
     stores::{Stores, lock},
     sync,
@@ -92,8 +92,18 @@ pub(crate) fn receive(stores: &Stores, from: NodeAddress, message: &Message) -> 
     if !testament.wills.iter().all(|will| will.is_legal() && will.heir().is_some()) {
         return Err(format!("from {from}, wills: one of them is not what a will may be"));
     }
+    let incarnation = testament.incarnation;
     feed(stores, Input::Told { from, testament });
+    // Asked behind it: who has the certificate put on the list meanwhile drops what is there then.
+    if gncl::is_revoked(stores, from, incarnation) {
+        revoke(stores, from, incarnation);
+    }
     Ok(())
+}
+
+/// The certificate with which this life of a node was linked is revoked. spec: WILL-5
+pub(crate) fn revoke(stores: &Stores, node: NodeAddress, incarnation: Incarnation) {
+    feed(stores, Input::Revoked { node, incarnation });
 }
 
 fn tell(stores: &Stores, to: NodeAddress, testament: &Testament) {

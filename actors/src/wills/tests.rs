@@ -5,9 +5,9 @@ use std::sync::Arc;
 use bytes::Bytes;
 use sinew_runtime::{
     app::{Heir, LastWill, Will},
-    tid::{AppAddress, Incarnation, NodeAddress},
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
-    wire::{Class, Kind},
+    wire::{Class, Header, Kind, Message},
 };
 
 use super::{
@@ -42,6 +42,14 @@ fn held() -> HeldWill {
 
 fn told(incarnation: Incarnation, version: u64) -> Input {
     Input::Told { from: THERE, testament: Testament { incarnation, version, wills: vec![held()] } }
+}
+
+/// What a node says whose application has one will.
+pub(crate) fn said(incarnation: Incarnation, app: AppAddress, will: &Will) -> Message {
+    let wills = vec![HeldWill::new(app, will).expect("one that others hold")];
+    let payload =
+        rmp_serde::to_vec_named(&Testament { incarnation, version: 1, wills }).expect("it is plain");
+    Message::new(Header::new(Kind::SYNC_WILLS, Tid::NONE, Tid::NONE), payload.into())
 }
 
 struct Bench {
@@ -80,6 +88,24 @@ fn a_lost_nodes_wills_are_executed_once_for_each_loss_and_those_of_one_that_left
     bench.hears(told(LIFE, 3));
     assert_eq!(executed(&bench.hears(Input::NodeLeft { node: THERE, incarnation: LIFE })), 0);
     assert_eq!(executed(&bench.hears(LOST)), 0);
+}
+
+// spec: WILL-5
+#[test]
+fn the_wills_of_a_node_whose_certificate_is_revoked_are_not_executed() {
+    let revoked = || Input::Revoked { node: THERE, incarnation: LIFE };
+    for end in [LOST, Input::LinkUp { node: THERE, incarnation: NEXT_LIFE }, told(NEXT_LIFE, 1)] {
+        let mut bench = Bench::new();
+        bench.hears(UP);
+        bench.hears(told(LIFE, 1));
+        assert_eq!(executed(&bench.hears(revoked())), 0);
+        assert_eq!(executed(&bench.hears(end)), 0);
+    }
+    // Those of the next life, which has other keys, are.
+    let mut bench = Bench::new();
+    bench.hears(told(NEXT_LIFE, 1));
+    bench.hears(revoked());
+    assert_eq!(executed(&bench.hears(Input::NodeLost { node: THERE, incarnation: NEXT_LIFE })), 1);
 }
 
 // spec: WILL-2

@@ -19,6 +19,7 @@ use crate::{
     secured::Secured,
     security::{Peer, Stamp},
     stores::lock,
+    wills,
 };
 
 /// How often a node that has keys looks whether there is something to be said of how long they count: more often than that is said, as each life
@@ -157,6 +158,8 @@ impl Gncl {
     pub(super) fn disprove_the_denied(&mut self, ctx: &mut Context<Self>) {
         let denied = self.stores.gncl.proofs.of_those(|peer| self.denied(peer).is_some());
         for (node, incarnation) in denied {
+            // Before anybody hears that it is lost.
+            wills::revoke(&self.stores, node, incarnation);
             self.input(Input::Disproven { node, incarnation }, ctx);
         }
     }

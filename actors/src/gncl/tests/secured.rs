@@ -2,10 +2,12 @@
 
 use std::{sync::Arc, time::Duration};
 
+use bytes::Bytes;
 use sinew_runtime::{
+    app::{Heir, LastWill, Will},
     outcome::Outcome,
     tid::{Incarnation, NodeAddress},
-    wire::Class,
+    wire::{Class, Kind},
 };
 use tokio::net::TcpListener;
 
@@ -20,8 +22,8 @@ use crate::{
         tests::ground::{self, Authority},
     },
     stores::Stores,
+    wills,
 };
-use sinew_runtime::wire::Kind;
 
 impl Node {
     /// One that has keys of this project, made for a node of this number.
@@ -193,6 +195,34 @@ fn a_node_whose_certificate_is_revoked_is_refused_on_the_link_that_stands_and_on
         b.counted("refused by the peer").await;
         // And as NDL still holds it for present it is dialled, and not taken.
         a.counted("peer not proven").await;
+    });
+}
+
+// spec: WILL-5
+#[test]
+fn the_wills_of_a_node_whose_certificate_is_revoked_are_held_no_more_and_not_taken() {
+    run(async {
+        let (mut a, b, _cable) = two(&keys()).await;
+        let (node, incarnation) = (b.address(), Incarnation(1));
+        let mut heir = a.app(1);
+        let will = Will {
+            heir: Heir::Tid(a.tid(1)),
+            kind: Kind::named("stop"),
+            class: Class::Control,
+            payload: Bytes::new(),
+            when: LastWill::OnDeath,
+        };
+        let says = wills::tests::said(incarnation, b.tid(1).app, &will);
+        wills::receive(&a.stores, node, &says).expect("a legal one");
+        // When: it is revoked, says it again all the same, and is lost
+        revoke(&a, &b);
+        a.tell(Event::DenyListChanged);
+        a.broken().await;
+        wills::receive(&a.stores, node, &says).expect("a legal one");
+        wills::feed(&a.stores, wills::Input::NodeLost { node, incarnation });
+        // Then: what comes next is not its
+        a.send(a.tid(1), b"afterwards");
+        assert_eq!(next("a message", &mut heir).await.payload[..], *b"afterwards");
     });
 }
 
