@@ -30,6 +30,7 @@ extern crate self as sinew;
 // What the layers log stops nobody.
 use sinew_runtime::log;
 
+mod accept_pace;
 mod access;
 mod aftermath;
 pub mod api;

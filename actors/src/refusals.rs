@@ -16,6 +16,8 @@ use sinew_runtime::time::Time;
 const LOG_PERIOD: Duration = Duration::from_secs(1);
 /// What is kept of a detail, in characters: a peer's own words may be among it.
 const DETAIL_MAX: usize = 256;
+/// What of a detail is in the log at most, in characters: the longest sentence of this program, and a peer's in it.
+const LOGGED_MAX: usize = 1_024;
 
 /// Counters of refusals. The causes are literals of this program, so their number is bounded.
 #[derive(Debug, Default)]
@@ -62,7 +64,7 @@ impl Refusals {
         }
         entry.logged = Some(now);
         let suppressed = std::mem::take(&mut entry.suppressed);
-        let detail = detail.to_string();
+        let detail = in_one_line(detail);
         entry.detail = detail.chars().take(DETAIL_MAX).collect();
         // Whoever reads the log may be slow: nobody waits for it with the lock in hand.
         drop(causes);
@@ -124,9 +126,31 @@ impl Refusals {
     }
 }
 
+/// A detail as it is logged: nobody who has words of his in it ends its line or does things to a terminal, nor makes it longer than that.
+fn in_one_line(detail: &dyn Display) -> String {
+    let words = detail.to_string();
+    let mut plain = String::new();
+    for character in words.chars().take(LOGGED_MAX) {
+        if character.is_control() {
+            plain.extend(character.escape_default());
+        } else {
+            plain.push(character);
+        }
+    }
+    plain
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn words_from_outside_stay_in_one_line_of_a_length() {
+        let refusals = Refusals::default();
+        refusals.count(Time::ZERO, "garbage", &"a\nWARN all is lost\u{1b}[2J\u{85}b");
+        assert_eq!(refusals.told()[0].detail, "a\\nWARN all is lost\\u{1b}[2J\\u{85}b");
+        assert_eq!(in_one_line(&"a".repeat(100_000)).len(), LOGGED_MAX);
+    }
 
     #[test]
     fn every_refusal_is_counted_for_its_cause_and_one_a_second_is_logged() {

@@ -39,7 +39,6 @@ use super::{
     inbound::Inbound,
     link::{self, Ends, Heard, Mode, News, Reading, SharedMode, What},
     listener, marks,
-    pace::Pace,
     peer::{Store, frame},
     secure::Secure,
     spin::Spin,
@@ -47,6 +46,7 @@ use super::{
     way::answers_max,
 };
 use crate::{
+    accept_pace::Pace,
     config::NodeConfig,
     outlet::Gathering,
     stores::{Stores, lock},

@@ -16,8 +16,8 @@ use sinew_runtime::time::Time;
 use socket2::{Domain, SockRef, Socket, Type};
 use tokio::net::TcpStream;
 
-use super::{lent::Lent, pace::Pace};
-use crate::{config::NodeConfig, refusals::Refusals};
+use super::lent::Lent;
+use crate::{accept_pace::Pace, config::NodeConfig, refusals::Refusals};
 
 /// Connections that wait to be accepted at most, at all listeners together; the kernel refuses further ones. Those that 300 nodes make who all
 /// meet this one at once wait here, and are not made again a second later.
@@ -278,10 +278,8 @@ mod tests {
     use actix::{Actor, AsyncContext, Context, StreamHandler, System};
     use futures_util::{FutureExt, StreamExt};
 
-    use super::{
-        super::pace::{IN_A_ROW_MAX, REST},
-        *,
-    };
+    use super::*;
+    use crate::accept_pace::{IN_A_ROW_MAX, REST};
 
     const GIVE_UP: Duration = Duration::from_secs(1);
 

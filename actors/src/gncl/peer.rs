@@ -442,7 +442,11 @@ impl Store {
                     Some(Move { place: Place::Here, transport })
                 }
                 Err(error) => {
-                    self.refusals.count(Time::now(), "no descriptor for a connection of Bulk", &error);
+                    let words = format!(
+                        "{error}; what there is of Bulk for this peer waits, and it is tried again within a second: raise `ulimit -n`, or close \
+                         what this process holds open"
+                    );
+                    self.refusals.count(Time::now(), "no descriptor for a connection of Bulk", &words);
                     None
                 }
             },

@@ -30,6 +30,7 @@ use super::{
     strangers::{Bounds, NoPlace, Place, Strangers},
 };
 use crate::{
+    accept_pace::Pace,
     access::Applicant,
     refusals::Refusals,
     stores::{Stores, lock},
@@ -149,9 +150,14 @@ impl Server {
 pub(super) async fn accept(server: Rc<Server>, listener: UnixListener) {
     let mut clients = JoinSet::new();
     let mut backoff = ACCEPT_BACKOFF.0;
+    // Of those who may not come in at all: whoever connects as soon as he is refused has no more of this thread than that.
+    let mut neighbours = Pace::new(Time::now());
     loop {
         let accept = async {
             server.may_accept().await;
+            while let Some(rest) = neighbours.rest(Time::now()) {
+                tokio::time::sleep(rest).await;
+            }
             listener.accept().await
         };
         tokio::select! {
@@ -159,7 +165,9 @@ pub(super) async fn accept(server: Rc<Server>, listener: UnixListener) {
             accepted = accept => match accepted {
                 Ok((stream, _)) => {
                     backoff = ACCEPT_BACKOFF.0;
-                    admit(&server, stream, &mut clients);
+                    if admit(&server, stream, &mut clients) == Admitted::NoClient {
+                        neighbours.took_one(Time::now());
+                    }
                     // Who has said already who it is leaves the strangers before the next one comes.
                     tokio::task::yield_now().await;
                 }
@@ -184,18 +192,33 @@ fn report(ended: Result<(), JoinError>) {
     }
 }
 
+/// Whether a process may be a client of this node.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Admitted {
+    /// It is served, or refused for what it, or others, do too much.
+    Client,
+    /// Its user may not come in.
+    NoClient,
+}
+
 /// Serves a connection from now on, or refuses it. Those that are served are bounded: as strangers here, as clients by the
 /// registry.
-fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) {
+fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) -> Admitted {
     let connected = Connected::new(server, stream);
     let stream = connected.stream.clone();
     let credentials = match check_credentials(&server.stores, &stream) {
         Ok(credentials) => credentials,
-        Err(why) => return refuse(server, &stream, "credentials", &why),
+        Err(why) => {
+            refuse(server, &stream, "credentials", &why);
+            return Admitted::NoClient;
+        }
     };
     let place = match place_for(server, credentials) {
         Ok(place) => place,
-        Err(why) => return refuse(server, &stream, "too many strangers", &why),
+        Err(why) => {
+            refuse(server, &stream, "too many strangers", &why);
+            return Admitted::Client;
+        }
     };
     let id = lock(&server.stores.registry).new_client();
     server.stores.door.admit(id, &stream);
@@ -203,6 +226,7 @@ fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) {
         client::serve(connected.server.clone(), stream, credentials, id, place).await;
         connected.server.stores.door.dismiss(id);
     });
+    Admitted::Client
 }
 
 /// A connection that was taken. Dropping it ends it, and has what the peer left unread in it taken out by a thread that may wait: a

@@ -18,7 +18,8 @@ use socket2::SockRef;
 
 use super::bench::{ByHand, Cable, NINE, Node, next, pair, run};
 use crate::{
-    gncl::{LinkFact, core::write, lent::Lent, link, listener, pace::Pace, peer::frame},
+    accept_pace::Pace,
+    gncl::{LinkFact, core::write, lent::Lent, link, listener, peer::frame},
     session::Ack,
     sync,
 };

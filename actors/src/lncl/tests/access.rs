@@ -2,7 +2,7 @@
 
 use std::{
     sync::atomic::{AtomicBool, Ordering},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use sinew_runtime::{
@@ -13,6 +13,7 @@ use sinew_runtime::{
 
 use super::{Angle, confirmed, named, outcome_of};
 use crate::{
+    accept_pace::{REST, SAVED_MAX},
     api::{NodeApi, Registration},
     lncl::{
         AppFact,
@@ -154,6 +155,20 @@ fn another_user_of_whom_no_rule_speaks_is_not_let_in() {
     let refusal = as_stranger(|| RawClient::connect(&node).expect_refusal());
     if let Some(why) = refusal {
         assert!(why.contains("54321") && why.contains("[[client]]"), "{why}");
+    }
+}
+
+#[test]
+fn another_user_who_comes_again_as_soon_as_he_is_refused_is_refused_once_a_millisecond() {
+    const TIMES: u32 = SAVED_MAX + 200;
+    let node = TestNode::start_guarded("[[client]]\nuid = 12345\n");
+    let began = Instant::now();
+    let came = as_stranger(|| (0..TIMES).for_each(|_| drop(RawClient::connect(&node).expect_refusal())));
+    if came.is_some() {
+        let took = began.elapsed();
+        assert!(took >= REST * (TIMES - SAVED_MAX - 1), "{TIMES} were refused in {took:?}");
+        // The node's own come in meanwhile, and after it.
+        RawClient::register(&node, &Register::default());
     }
 }
 

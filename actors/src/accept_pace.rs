@@ -10,16 +10,16 @@ use sinew_runtime::time::Time;
 
 /// Connections that are accepted without a [`REST`] between them at most, each in a turn of its own: no message waits longer for one than for
 /// another one of 64 KiB.
-pub(super) const IN_A_ROW_MAX: u32 = 4;
+pub(crate) const IN_A_ROW_MAX: u32 = 4;
 /// One connection is saved up in each.
-pub(super) const REST: Duration = Duration::from_millis(1);
+pub(crate) const REST: Duration = Duration::from_millis(1);
 /// Connections that are saved up at most: those of 20 nodes that dial all they want at once wait for nothing but the rests between rows. In the
 /// long run one is accepted each [`REST`]: those of 300 nodes within a second.
-pub(super) const SAVED_MAX: u32 = 64;
+pub(crate) const SAVED_MAX: u32 = 64;
 
 /// The pace of all listeners of a node together: one thread accepts for all of them.
 #[derive(Debug)]
-pub(super) struct Pace {
+pub(crate) struct Pace {
     saved: u32,
     /// Until when it was saved up.
     as_of: Time,
@@ -30,18 +30,18 @@ pub(super) struct Pace {
 
 impl Pace {
     /// That of one that has all saved up.
-    pub(super) const fn new(now: Time) -> Self {
+    pub(crate) const fn new(now: Time) -> Self {
         Self { saved: SAVED_MAX, as_of: now, in_a_row: 0, last: now }
     }
 
     /// How long to wait before one is accepted at `now`; then it is to be asked again.
-    pub(super) fn rest(&mut self, now: Time) -> Option<Duration> {
+    pub(crate) fn rest(&mut self, now: Time) -> Option<Duration> {
         self.pass_time(now);
         (self.saved == 0 || self.in_a_row >= IN_A_ROW_MAX).then_some(REST)
     }
 
     /// One was accepted, or failed to be, at `now`: it may have been waited for long.
-    pub(super) fn took_one(&mut self, now: Time) {
+    pub(crate) fn took_one(&mut self, now: Time) {
         self.pass_time(now);
         (self.in_a_row, self.last) = (self.in_a_row + 1, now);
         self.saved = self.saved.saturating_sub(1);
