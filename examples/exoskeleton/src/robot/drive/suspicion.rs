@@ -2,15 +2,16 @@
 
 use sinew::protection::Tally;
 
-/// Good words after which a damaged one is forgotten: as many as the guard's own memory is long.
+/// Good words after which a wrong one is forgotten: as many as the guard's own memory is long.
 const GOOD_STRETCH: u64 = 64;
 
-/// Damaged words, or words that are not central's, since the last good stretch; whatever the guard was shut for. They are forgotten
+/// Words that were damaged, are not central's, or came twice or out of their order, since the last good stretch; whatever the guard was shut for.
+/// No network does that to what Sinew carries: late and lost are another thing. They are forgotten
 /// through an open guard only: one that falls silent while it is shut has not become trustworthy by that.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Suspicion {
-    /// Damaged words that are known of.
-    corrupt: u64,
+    /// Wrong words that are known of.
+    wrong: u64,
     /// Good words until the last one of them; `None` when they are forgotten.
     good: Option<u64>,
 }
@@ -18,8 +19,9 @@ pub(super) struct Suspicion {
 impl Suspicion {
     /// Takes in what the guard has counted until now.
     pub(super) fn note(&mut self, tally: &Tally, is_open: bool) {
-        if tally.corrupt > self.corrupt {
-            (self.corrupt, self.good) = (tally.corrupt, Some(tally.good));
+        let wrong = tally.corrupt + tally.repeated + tally.backwards;
+        if wrong > self.wrong {
+            (self.wrong, self.good) = (wrong, Some(tally.good));
         } else if is_open && self.good.is_some_and(|good| tally.good - good >= GOOD_STRETCH) {
             self.good = None;
         }
@@ -39,6 +41,18 @@ impl Suspicion {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_word_that_comes_twice_or_out_of_its_order_is_as_wrong_as_a_damaged_one() {
+        for wrong in [Tally { repeated: 1, ..Tally::default() }, Tally { backwards: 1, ..Tally::default() }] {
+            let mut suspicion = Suspicion::default();
+            suspicion.note(&wrong, true);
+            assert!(suspicion.is_there(), "{wrong:?}");
+        }
+        let mut suspicion = Suspicion::default();
+        suspicion.note(&Tally { too_old: 9, restarted: 1, gaps: 3, lost: 3, ..Tally::default() }, true);
+        assert!(!suspicion.is_there(), "late, lost and anew are what networks and nodes do");
+    }
 
     fn after(words: &[(u64, u64, bool)]) -> bool {
         let mut suspicion = Suspicion::default();
