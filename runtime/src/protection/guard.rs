@@ -112,7 +112,17 @@ impl<O: Send + 'static> Guard<O> {
         output: O,
         safe: impl FnMut(&mut O, Cause) + Send + 'static,
     ) -> io::Result<Self> {
-        const { assert!(P::PROTECTION.is_some(), "a guard is for a payload whose PROTECTION says what is borne") };
+        const {
+            match P::PROTECTION {
+                Some(protection) => {
+                    assert!(
+                        protection.good_min > 0,
+                        "an output is armed by good messages: `good_min` is at least 1"
+                    );
+                }
+                None => panic!("a guard is for a payload whose PROTECTION says what is borne"),
+            }
+        };
         let protection = P::PROTECTION.unwrap_or(Protection::of_period(Duration::ZERO));
         let codename = Codename::of::<P>(source, receiver);
         let receiver = Receiver::new(protection);

@@ -75,7 +75,7 @@ pub struct Protection {
     pub lost_max: u64,
     /// Bad ones that may be among the last 64; none of them is used.
     pub bad_max: u32,
-    /// Good ones in a row before the output may be armed: none bad among them, and from one to the next less than `within`.
+    /// Good ones in a row before the output may be armed, at least 1: none bad among them, and from one to the next less than `within`.
     pub good_min: u32,
 }
 
