@@ -6,6 +6,7 @@ use std::{
         atomic::{AtomicBool, AtomicU64, Ordering},
         mpsc::{SyncSender, sync_channel},
     },
+    thread::Thread,
     time::{Duration, Instant},
 };
 
@@ -110,6 +111,7 @@ struct Asker {
     rounds: u64,
     figures: Figures,
     flood: Arc<Flood>,
+    flooding: Option<Thread>,
     done: SyncSender<Seen>,
     alone: Option<Figures>,
     began: Instant,
@@ -121,7 +123,7 @@ impl Actor for Asker {
     fn started(&mut self, context: &mut Self::Context) {
         self.to = context.resolve("echo");
         let (sender, flood) = (context.sender(), self.flood.clone());
-        std::thread::spawn(move || flood.run(&sender));
+        self.flooding = Some(std::thread::spawn(move || flood.run(&sender)).thread().clone());
         context.every(PERIOD, |asker: &mut Self, _, context: &mut AppContext<Self>| asker.ask(context));
     }
 }
@@ -146,6 +148,7 @@ impl Asker {
             None => {
                 self.alone = Some(figures);
                 self.flood.runs.store(true, Ordering::Relaxed);
+                self.flooding.iter().for_each(Thread::unpark);
                 self.began = Instant::now();
             }
             Some(alone) => {
@@ -174,7 +177,7 @@ impl Handler<Delivery<Answer>> for Asker {
     }
 }
 
-/// A thread that sends Bulk as fast as it is taken.
+/// A thread that sends Bulk as fast as it is taken, and sleeps until it is to.
 struct Flood {
     runs: AtomicBool,
     bytes: AtomicU64,
@@ -185,7 +188,9 @@ impl Flood {
     fn run(&self, sender: &Sender) {
         let load = Load { block: vec![7; self.message_bytes] };
         loop {
-            if self.runs.load(Ordering::Relaxed) && sender.send("sink", &load).is_ok() {
+            if !self.runs.load(Ordering::Relaxed) {
+                std::thread::park();
+            } else if sender.send("sink", &load).is_ok() {
                 self.bytes.fetch_add(self.message_bytes as u64, Ordering::Relaxed);
             } else {
                 std::thread::sleep(Duration::from_micros(100));
@@ -219,6 +224,7 @@ pub(crate) fn measure(case: &str, at: At, bulk_bytes: usize, rounds: u64) {
         rounds,
         figures: Figures::new(),
         flood: flood.clone(),
+        flooding: None,
         done: done.clone(),
         alone: None,
         began: Instant::now(),

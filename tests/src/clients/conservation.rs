@@ -57,7 +57,7 @@ impl Report {
         self.audit.missing() == 0
             && self.account.holds()
             && self.account.of(Fate::Delivered) > 0
-            && self.account.confirmed > 0
+            && self.account.confirmed_delivered > 0
     }
 }
 

@@ -224,6 +224,9 @@ impl Ledger {
             }
         }
         account.confirmed = self.tracks.values().map(|track| track.asked.len() as u64).sum();
+        let outcomes = self.tracks.values().flat_map(|track| track.asked.values());
+        account.confirmed_delivered =
+            outcomes.filter(|outcome| **outcome == Some(Outcome::Delivered)).count() as u64;
         account.killed = self.lives.values().filter(|life| life.killed).count() as u64;
         account
     }
@@ -308,6 +311,8 @@ pub struct Account {
     pub ways: u64,
     /// Messages whose sender waited for their outcome.
     pub confirmed: u64,
+    /// Of these, those of which it is said that they were delivered.
+    pub confirmed_delivered: u64,
     /// Lives of posters that were killed.
     pub killed: u64,
     /// Messages that posters had in hand.
