@@ -3,7 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::{Value, json};
-use sinew::inspect::{AppReport, AppsReport, AskApps, BarrierReport, KindReport, Missing};
+use sinew::{
+    NodeAddress,
+    inspect::{AppReport, AppsReport, AskApps, BarrierReport, KindReport, Missing},
+};
 
 use crate::{
     Said,
@@ -32,15 +35,22 @@ pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
         ]);
         rows.push(app_json(node, app));
     }
-    let is_fine = is_complete(&answers) && all(&answers).all(|(_, app)| app.ready && app.missing.is_empty());
-    let text = table.text() + &silent(&answers);
-    Ok(Said { text, json: json!({ "apps": rows, "silent": silent_json(&answers) }), is_fine })
+    let shown = Shown::Apps;
+    let is_ready = all(&answers).all(|(_, app)| app.ready && app.missing.is_empty());
+    let is_fine = is_ready && shown.is_complete(&answers);
+    let text = table.text() + &shown.silent(&answers);
+    let (left_out, silent) = (shown.left_out_json(&answers), silent_json(&answers));
+    Ok(Said { text, json: json!({ "apps": rows, "left_out": left_out, "silent": silent }), is_fine })
 }
 
 /// Asks every node who waits there, and says who is waited for.
 pub(crate) fn barriers(system: &mut System) -> Result<Said, Fault> {
-    let answers = ask(system)?;
-    let waiting: Vec<_> = all(&answers).filter(|(_, app)| !app.missing.is_empty()).collect();
+    Ok(who_waits(&ask(system)?))
+}
+
+fn who_waits(answers: &[Answer<AppsReport>]) -> Said {
+    let shown = Shown::Barriers;
+    let waiting: Vec<_> = all(answers).filter(|(_, app)| !app.missing.is_empty()).collect();
     let mut blocked: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
     let mut reasons: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
     let mut since: BTreeMap<&str, Option<u64>> = BTreeMap::new();
@@ -53,16 +63,22 @@ pub(crate) fn barriers(system: &mut System) -> Result<Said, Fault> {
             *longest = missing.since_us.max(*longest);
         }
     }
-    let meetings = meetings(&answers);
-    let is_fine = waiting.is_empty() && meetings.is_empty() && is_complete(&answers);
+    let meetings = meetings(answers);
+    let is_anybody_told = !waiting.is_empty() || !meetings.is_empty();
+    let is_fine = !is_anybody_told && shown.is_complete(answers);
     let waiters = waiting.iter().map(|(node, app)| app_json(node, app)).collect::<Vec<_>>();
     let blockers = blocked
         .iter()
         .map(|(name, who)| json!({ "name": name, "since_us": since[name], "why": reasons[name], "blocks": who }))
         .collect::<Vec<_>>();
-    let json = json!({ "waiting": waiters, "missing": blockers, "barriers": meetings.iter().map(|(node, one)| meeting_json(node, one)).collect::<Vec<_>>(), "silent": silent_json(&answers) });
+    let json = json!({
+        "waiting": waiters, "missing": blockers, "barriers": meetings.iter().map(|(node, one)| meeting_json(node, one)).collect::<Vec<_>>(),
+        "left_out": shown.left_out_json(answers), "silent": silent_json(answers),
+    });
     let mut text = if waiting.is_empty() {
-        if meetings.is_empty() { "nobody waits\n".to_owned() } else { String::new() }
+        // Where somebody had no room, nobody knows.
+        let is_known = !is_anybody_told && shown.left_out(answers).is_empty();
+        if is_known { "nobody waits\n".to_owned() } else { String::new() }
     } else {
         let mut table = Table::new(["WAITS", "NODE", "SINCE", "FOR"]);
         for (node, app) in &waiting {
@@ -85,7 +101,7 @@ pub(crate) fn barriers(system: &mut System) -> Result<Said, Fault> {
         meetings.iter().for_each(|(node, one)| table.row(meeting_cells(node, one)));
         text += &(if text.is_empty() { table.text() } else { format!("\n{}", table.text()) });
     }
-    Ok(Said { text: text + &silent(&answers), json, is_fine })
+    Said { text: text + &shown.silent(answers), json, is_fine }
 }
 
 /// The run-time barriers at which somebody waits, each as every node sees it that has somebody there.
@@ -137,10 +153,6 @@ fn ask(system: &mut System) -> Result<Vec<Answer<AppsReport>>, Fault> {
 fn all(answers: &[Answer<AppsReport>]) -> impl Iterator<Item = (&str, &AppReport)> {
     let said = answers.iter().filter_map(|answer| answer.said.as_ref().ok());
     said.flat_map(|said| said.apps.iter().map(|app| (said.name.as_str(), app)))
-}
-
-fn is_complete(answers: &[Answer<AppsReport>]) -> bool {
-    answers.iter().all(|answer| answer.said.as_ref().is_ok_and(|said| said.left_out == 0))
 }
 
 const fn state(app: &AppReport) -> &'static str {
@@ -214,17 +226,65 @@ fn app_json(node: &str, app: &AppReport) -> Value {
     })
 }
 
-/// The nodes that have not answered, or not all.
-fn silent(answers: &[Answer<AppsReport>]) -> String {
-    let line = |answer: &Answer<AppsReport>| match &answer.said {
-        Ok(said) if said.left_out == 0 => None,
-        Ok(said) => Some(format!(
-            "{}: {} further applications had no room in its answer\n",
-            answer.node, said.left_out
-        )),
-        Err(why) => Some(format!("{} {}: {}\n", answer.node, clean(&answer.name), clean(why))),
-    };
-    answers.iter().filter_map(line).collect()
+/// What a command shows of the answers.
+#[derive(Clone, Copy)]
+enum Shown {
+    /// Applications alone.
+    Apps,
+    /// Applications that wait, and run-time barriers.
+    Barriers,
+}
+
+/// What had no room in the answer of a node.
+struct LeftOut {
+    node: NodeAddress,
+    apps: u64,
+    barriers: u64,
+}
+
+impl Shown {
+    /// Of what is shown, for each node that has left anything of it out.
+    fn left_out(self, answers: &[Answer<AppsReport>]) -> Vec<LeftOut> {
+        let of = |answer: &Answer<AppsReport>| {
+            let said = answer.said.as_ref().ok()?;
+            let barriers = match self {
+                Self::Apps => 0,
+                Self::Barriers => said.barriers_left_out,
+            };
+            let left_out = LeftOut { node: answer.node, apps: said.left_out, barriers };
+            (left_out.apps > 0 || left_out.barriers > 0).then_some(left_out)
+        };
+        answers.iter().filter_map(of).collect()
+    }
+
+    fn is_complete(self, answers: &[Answer<AppsReport>]) -> bool {
+        answers.iter().all(|answer| answer.said.is_ok()) && self.left_out(answers).is_empty()
+    }
+
+    /// The nodes that have not answered, or not all.
+    fn silent(self, answers: &[Answer<AppsReport>]) -> String {
+        let mut lines = String::new();
+        for LeftOut { node, apps, barriers } in self.left_out(answers) {
+            for (count, what) in [(apps, "applications"), (barriers, "barriers")] {
+                if count > 0 {
+                    lines += &format!("{node}: {count} further {what} had no room in its answer\n");
+                }
+            }
+        }
+        let silent = answers.iter().filter_map(|answer| Some((answer, answer.said.as_ref().err()?)));
+        lines.extend(
+            silent.map(|(answer, why)| format!("{} {}: {}\n", answer.node, clean(&answer.name), clean(why))),
+        );
+        lines
+    }
+
+    fn left_out_json(self, answers: &[Answer<AppsReport>]) -> Value {
+        let line = |LeftOut { node, apps, barriers }: LeftOut| match self {
+            Self::Apps => json!({ "node": node.to_string(), "apps": apps }),
+            Self::Barriers => json!({ "node": node.to_string(), "apps": apps, "barriers": barriers }),
+        };
+        self.left_out(answers).into_iter().map(line).collect()
+    }
 }
 
 fn silent_json(answers: &[Answer<AppsReport>]) -> Value {
@@ -236,9 +296,54 @@ fn silent_json(answers: &[Answer<AppsReport>]) -> Value {
 
 #[cfg(test)]
 mod tests {
-    use sinew::{AppAddress, Kind, NodeAddress, Tid};
+    use sinew::{AppAddress, Kind, Tid, inspect::WaitReport};
 
     use super::*;
+
+    /// A node that says this of its barriers, and has no application.
+    fn answer(barriers: Vec<BarrierReport>, [left_out, barriers_left_out]: [u64; 2]) -> Answer<AppsReport> {
+        let name = "knee".to_owned();
+        let said = AppsReport { name: name.clone(), apps: Vec::new(), left_out, barriers, barriers_left_out };
+        Answer { node: NodeAddress::new(2), name, said: Ok(said) }
+    }
+
+    fn barrier() -> BarrierReport {
+        BarrierReport {
+            name: "calibrated".to_owned(),
+            parties: vec!["hip".to_owned(), "knee".to_owned()],
+            is_phase: false,
+            generation: 0,
+            waiting: vec![WaitReport { name: "knee".to_owned(), waits_us: 1 }],
+            missing: vec![Missing { name: "hip".to_owned(), why: "not there".to_owned(), since_us: None }],
+        }
+    }
+
+    #[test]
+    fn barriers_that_had_no_room_in_an_answer_are_told_with_their_number() {
+        let line = "0.0.0.2: 6 further barriers had no room in its answer\n";
+        let said = who_waits(&[answer(vec![barrier()], [0, 6])]);
+        assert!(!said.is_fine && said.text.ends_with(line), "{}", said.text);
+        assert_eq!(said.json["left_out"], json!([{ "node": "0.0.0.2", "apps": 0, "barriers": 6 }]));
+        // Who waits at one that is not shown is not nobody.
+        let said = who_waits(&[answer(Vec::new(), [0, 6])]);
+        assert_eq!((said.is_fine, said.text.as_str()), (false, line));
+        let said = who_waits(&[answer(Vec::new(), [2, 0])]);
+        let line = "0.0.0.2: 2 further applications had no room in its answer\n";
+        assert_eq!((said.is_fine, said.text.as_str()), (false, line));
+        let said = who_waits(&[answer(Vec::new(), [0, 0])]);
+        assert_eq!((said.is_fine, said.text.as_str()), (true, "nobody waits\n"));
+        assert_eq!(said.json["left_out"], json!([]));
+    }
+
+    #[test]
+    fn applications_are_all_told_though_barriers_had_no_room_beside_them() {
+        let answers = [answer(Vec::new(), [0, 6])];
+        assert!(Shown::Apps.is_complete(&answers) && Shown::Apps.silent(&answers).is_empty());
+        assert_eq!(Shown::Apps.left_out_json(&answers), json!([]));
+        let answers = [answer(Vec::new(), [3, 6])];
+        assert!(!Shown::Apps.is_complete(&answers));
+        assert_eq!(Shown::Apps.left_out_json(&answers), json!([{ "node": "0.0.0.2", "apps": 3 }]));
+    }
 
     fn app(names: &[&str], kinds_left_out: u64) -> AppReport {
         let kind = |name: &&str| KindReport {

@@ -133,6 +133,7 @@ pub(crate) mod tests {
             udp: None,
             gncl: None,
             group: None,
+            groups: Vec::new(),
             seeds: Vec::new(),
             sources: Vec::new(),
             lost: Vec::new(),

@@ -126,8 +126,9 @@ impl System {
 
     /// An application's TID, a node's address, an application's name, a node's name: the first that it is. A node is its inspection.
     pub(crate) fn find(&mut self, whom: &str) -> Result<Tid, Fault> {
-        if whom.contains('/') {
-            return whom.parse().map_err(|why| Fault::Whom(format!("{why}")));
+        let tid = whom.parse::<Tid>();
+        if let Ok(tid) = tid {
+            return Ok(tid);
         }
         let inspection = |node: NodeAddress| Tid::new(node, AppAddress::INSPECT);
         if let Ok(node) = whom.parse::<NodeAddress>() {
@@ -139,10 +140,14 @@ impl System {
         }
         let here = self.here()?;
         let nobody = || {
-            let whom = clean(whom);
-            Fault::Whom(format!(
-                "no application and no node is called '{whom}'; `sinew apps` and `sinew nodes` show those that are there"
-            ))
+            // Who writes a slash means a TID, where nobody is called so.
+            let no_tid = tid.as_ref().err().filter(|_| whom.contains('/'));
+            let unknown = || {
+                format!(
+                    "no application and no node is called '{whom}'; `sinew apps` and `sinew nodes` show those that are there"
+                )
+            };
+            Fault::Whom(clean(&no_tid.map_or_else(unknown, ToString::to_string)))
         };
         let nodes = chosen(&here, Some(whom)).map_err(|_| nobody())?;
         nodes.first().map(|(node, _)| inspection(*node)).ok_or_else(nobody)

@@ -124,8 +124,9 @@ fn follow(system: &mut System, whom: &str, question: &mut AskWatch) {
     }
 }
 
+/// A name may have a slash in it, as a TID has.
 fn is_name(whom: &str) -> bool {
-    !whom.contains('/')
+    whom.parse::<Tid>().is_err()
 }
 
 fn ask(system: &mut System, question: &AskWatch) -> Result<WatchReport, String> {

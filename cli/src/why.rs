@@ -1,5 +1,6 @@
 //! `sinew why`: what stands in the way between two nodes or applications, looked at from both ends.
 
+mod called;
 mod facts;
 mod gathered;
 mod rules;

@@ -25,7 +25,7 @@ use super::reports::{
 use super::watches::{Fetched, Sight};
 use crate::{
     audit,
-    config::NdlConfig,
+    config::{Interfaces, NdlConfig},
     gncl::{self, ByDatagram, Peer},
     ndl::{IdleApp, KnownNode, KnownRoute, LossReason, LostNode, Source, SourceCounts, Trouble, TroubledApp},
     node::{CommandError, NodeHandle, Supervised},
@@ -69,7 +69,7 @@ impl Answers {
             peer.idle.truncate(idle_room);
             idle_room -= peer.idle.len();
         }
-        let ndl = Discovery::of(stores, now);
+        let (ndl, groups) = (Discovery::of(stores, now), groups(&stores.config.ndl));
         Ok(NodeReport {
             node: stores.node,
             name: stores.config.name.clone(),
@@ -85,7 +85,8 @@ impl Answers {
             is_interface_default: Some(stores.config.ndl.interface.are_default()),
             udp: ndl.udp,
             gncl: ndl.gncl,
-            group: group(&stores.config.ndl),
+            group: groups.first().cloned(),
+            groups,
             seeds: stores.config.ndl.seeds.iter().take(TOLD_MAX).map(ToString::to_string).collect(),
             sources: ndl.sources,
             lost: ndl.lost,
@@ -109,8 +110,11 @@ impl Answers {
         let name_of = |kind| registry.kind_name(kind).map(str::to_owned);
         let apps = apps.into_iter().map(|app| app_report(stores.node, app, name_of)).collect();
         drop(registry);
+        // spec: INSPECT-3
+        let barriers_left_out = barriers.len().saturating_sub(TOLD_MAX) as u64;
         let barriers = barriers.into_iter().take(TOLD_MAX).map(barrier_report).collect();
-        Ok(AppsReport { name: stores.config.name.clone(), apps, left_out: more as u64, barriers })
+        let name = stores.config.name.clone();
+        Ok(AppsReport { name, apps, left_out: more as u64, barriers, barriers_left_out })
     }
 
     pub(super) fn tree(&self, stores: &Arc<Stores>) -> Result<TreeReport, Rejection> {
@@ -164,14 +168,13 @@ struct Discovery {
     idle: Vec<IdleReport>,
 }
 
-/// The group that is asked: that of IPv6 where there is nothing else.
-fn group(ndl: &NdlConfig) -> Option<String> {
-    let ipv4 = ndl.multicast?;
-    if ndl.interface.have_ipv4() {
-        Some(ipv4.to_string())
-    } else {
-        ndl.multicast6.map(|group| group.to_string())
-    }
+/// The groups that are asked: none of either family where multicast is off, and none from loopback of IPv6.
+fn groups(ndl: &NdlConfig) -> Vec<String> {
+    let Some(ipv4) = ndl.multicast else { return Vec::new() };
+    let beyond: Vec<_> = ndl.interface.iter().filter(|interface| !interface.is_loopback()).cloned().collect();
+    let ipv4 = ndl.interface.have_ipv4().then(|| ipv4.to_string());
+    let ipv6 = ndl.multicast6.filter(|_| Interfaces::from(beyond).have_ipv6());
+    ipv4.into_iter().chain(ipv6.map(|group| group.to_string())).collect()
 }
 
 impl Discovery {

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use sinew_runtime::{
     outcome::Rejection,
     tid::{Incarnation, NodeAddress, Tid},
-    wire::{Class, Kind},
+    wire::{Class, Kind, encode},
 };
 
 use crate::{
@@ -32,7 +32,9 @@ pub const APPS_MAX: usize = 1_024;
 pub const TREE_MAX: usize = 1_024;
 /// Sources of addresses in one answer at most.
 const SOURCES_MAX: usize = 16;
-/// Lost nodes, or causes of refusals, in one answer at most.
+/// Multicast groups that a node asks at most: one of each family.
+const GROUPS_MAX: usize = 2;
+/// Lost nodes, causes of refusals, or barriers, in one answer at most.
 pub(super) const TOLD_MAX: usize = 64;
 /// Names that one application lacks at most: as many as it may require.
 pub(super) const MISSING_MAX: usize = 64;
@@ -126,9 +128,12 @@ payload!("sinew.inspect.node_report" =>
         /// Where its GNCL listens, as it announces it.
         #[serde(default)]
         pub gncl: Option<String>,
-        /// The multicast group that it asks, if it takes part.
+        /// The first of `groups`, for who does not know those; of a version that does not say them, the only one that it says.
         #[serde(default)]
         pub group: Option<String>,
+        /// The multicast groups that it asks, that of IPv4 before that of IPv6; none where it takes no part.
+        #[serde(default, deserialize_with = "at_most::<_, _, GROUPS_MAX>")]
+        pub groups: Vec<String>,
         /// The addresses that it was told to ask.
         #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
         pub seeds: Vec<String>,
@@ -185,9 +190,12 @@ payload!("sinew.inspect.apps_report" =>
         pub apps: Vec<AppReport>,
         /// Further ones that had no room.
         pub left_out: u64,
-        /// The run-time barriers at which applications of this node wait, as far as there is room.
+        /// The run-time barriers at which applications of this node wait.
         #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
         pub barriers: Vec<BarrierReport>,
+        /// Further ones that had no room.
+        #[serde(default)]
+        pub barriers_left_out: u64,
     }
 );
 
@@ -370,12 +378,12 @@ pub struct SeenMessage {
     pub refused: Option<Rejection>,
 }
 
-/// An answer that has a list, from which what has no room is left out.
+/// An answer that has lists, from which what has no room is left out.
 pub(super) trait Report {
     /// What it travels in.
     const TRAVELS: Class = Class::Control;
 
-    /// Leaves out the second half of its list; whether there was any.
+    /// Leaves out the second half of a list; whether there was any.
     fn halve(&mut self) -> bool;
 }
 
@@ -394,7 +402,8 @@ impl Report for NodeReport {
 }
 
 impl Report for AppsReport {
-    /// Before an application what they handle is left out.
+    /// Before an application or a barrier what the applications handle is left out; then of these two lists the one that takes more bytes is
+    /// halved, so that neither is lost to the other.
     fn halve(&mut self) -> bool {
         let mut had_kinds = false;
         for app in &mut self.apps {
@@ -402,7 +411,13 @@ impl Report for AppsReport {
             app.kinds_left_out += app.kinds.len() as u64;
             app.kinds.clear();
         }
-        had_kinds || halve(&mut self.apps, &mut self.left_out)
+        if had_kinds {
+            return true;
+        }
+        if encode(&self.barriers).len() > encode(&self.apps).len() {
+            return halve(&mut self.barriers, &mut self.barriers_left_out);
+        }
+        halve(&mut self.apps, &mut self.left_out)
     }
 }
 

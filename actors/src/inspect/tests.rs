@@ -13,23 +13,27 @@ use sinew_runtime::{
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     router::{LocalRoute, Outlet as _},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    time::Time,
     wire::{Flags, Header, Kind, Message, Payload as _, decode, encode},
 };
 
 use super::{
     inspector::{Inbox, WAITING_MAX},
     reports::{
-        AppReport, AppsReport, AskApps, AskNode, AskTree, KindReport, NodeReport, Report as _, SecurityReport,
+        AppReport, AppsReport, AskApps, AskNode, AskTree, BarrierReport, KindReport, Missing, NodeReport,
+        Report as _, SecurityReport, WaitReport,
     },
 };
 use crate::{
-    config::NodeConfig,
+    config::{Interface, NodeConfig},
+    lncl::AppFact,
     secured::Secured,
     security::{
         TimePolicy,
         tests::ground::{self, Authority},
     },
-    stores::Stores,
+    stores::{Stores, lock},
+    sync::{ArriveAtBarrier, BarrierKind, Input, OnPartyLoss},
 };
 
 fn question() -> Message {
@@ -52,6 +56,20 @@ fn report(count: u32) -> AppsReport {
         apps: (0..count).map(app).collect(),
         left_out: 0,
         barriers: Vec::new(),
+        barriers_left_out: 0,
+    }
+}
+
+/// A barrier of this node's at which the hip waits for the knee.
+fn barrier(number: u32) -> BarrierReport {
+    let missing = Missing { name: "knee".to_owned(), why: "not there".to_owned(), since_us: None };
+    BarrierReport {
+        name: format!("round {number}"),
+        parties: vec!["hip".to_owned(), "knee".to_owned()],
+        is_phase: false,
+        generation: 0,
+        waiting: vec![WaitReport { name: "hip".to_owned(), waits_us: 1 }],
+        missing: vec![missing],
     }
 }
 
@@ -91,6 +109,14 @@ fn what_has_no_room_in_an_answer_is_counted() {
     assert_eq!((apps.apps[0].kinds.len(), apps.apps[0].kinds_left_out), (0, 2));
     assert!(apps.halve());
     assert_eq!((apps.apps.len(), apps.left_out), (2, 3));
+    // Of barriers and applications those go first that take more room, and in the end all of both.
+    let mut apps = report(2);
+    apps.barriers = (0..16).map(barrier).collect();
+    assert!(apps.halve());
+    assert_eq!((apps.barriers.len(), apps.barriers_left_out, apps.left_out), (8, 8, 0));
+    while apps.halve() {}
+    assert_eq!((apps.barriers.len(), apps.barriers_left_out), (0, 16));
+    assert_eq!((apps.apps.len(), apps.left_out), (0, 2));
 }
 
 #[test]
@@ -219,6 +245,102 @@ fn an_answer_is_no_longer_than_a_payload_may_be() {
     assert_eq!(bench.outcome(AskNode::KIND, Flags::ASK), Outcome::Rejected(Rejection::TooLong));
     assert_eq!(bench.outcome(AskApps::KIND, Flags::ASK), Outcome::Delivered);
     assert!(bench.reply().payload.len() <= 64);
+}
+
+impl Bench {
+    /// The application of this number and name is ready, and waits at a barrier of each of these names for itself and these others.
+    fn waits(&self, (number, name): (u32, String), barriers: &[String], others: &[String]) {
+        let app = AppAddress::fixed(number).expect("a low number");
+        let mut sync = lock(&self.stores.sync);
+        let mut hears = |input| sync.handle(Time::now(), input);
+        let registered = AppFact::Registered { app, name: Some(name.clone()), requires: Vec::new() };
+        hears(Input::AppChanged(registered));
+        hears(Input::AppChanged(AppFact::Ready { app }));
+        for (correlation, barrier) in (1..).zip(barriers) {
+            let asked = ArriveAtBarrier {
+                kind: BarrierKind::Meeting,
+                barrier: barrier.clone(),
+                parties: [std::slice::from_ref(&name), others].concat(),
+                within_ms: 60_000,
+                on_loss: OnPartyLoss::Wait,
+            };
+            hears(Input::Arrived { app, correlation, asked });
+        }
+    }
+
+    fn apps(&self) -> AppsReport {
+        assert_eq!(self.outcome(AskApps::KIND, Flags::ASK), Outcome::Delivered);
+        self.reply().decode().expect("a report")
+    }
+}
+
+// spec: INSPECT-3
+#[test]
+fn barriers_that_have_no_room_in_an_answer_are_counted() {
+    // Given: more than an answer names
+    let bench = Bench::new(NodeConfig::new("knee"));
+    for number in 0..5 {
+        let barriers: Vec<_> = (0..14).map(|round| format!("round {number}.{round}")).collect();
+        bench.waits((number, format!("knee.{number}")), &barriers, &["hip".to_owned()]);
+    }
+    // When, then
+    let said = bench.apps();
+    assert_eq!((said.barriers.len(), said.barriers_left_out, said.apps.len()), (64, 6, 5));
+    // And: a version that counts none has left none out, as far as it says
+    let mut bytes = encode(&said).to_vec();
+    let key = b"barriers_left_out";
+    let at = bytes.windows(key.len()).position(|window| window == key).expect("a field of the map");
+    bytes[at] = b'x';
+    let older: AppsReport = decode(&bytes).expect("unknown fields are skipped");
+    assert_eq!((older.barriers.len(), older.barriers_left_out), (64, 0));
+}
+
+// spec: INSPECT-3
+#[test]
+fn a_barrier_that_is_longer_than_a_payload_may_be_does_not_keep_the_applications_from_being_told() {
+    // Given: a barrier of many long names, of which none is there
+    let mut config = NodeConfig::new("knee");
+    config.payload_max = 4_096;
+    let bench = Bench::new(config);
+    let others: Vec<_> = (0..27).map(|number| format!("{number:02}.{}", "a".repeat(60))).collect();
+    bench.waits((0, "knee.drive".to_owned()), &["calibrated".to_owned()], &others);
+    assert_eq!(lock(&bench.stores.sync).barriers(Time::now()).len(), 1, "it waits there");
+    // When, then
+    let said = bench.apps();
+    assert_eq!((said.barriers.len(), said.barriers_left_out), (0, 1));
+    assert_eq!((said.apps.len(), said.left_out), (1, 0));
+}
+
+#[test]
+fn a_node_says_each_group_that_it_asks() {
+    let said = |interface: &[&str], change: fn(&mut NodeConfig)| -> NodeReport {
+        let mut config = NodeConfig::new("knee");
+        let chosen = interface.iter().map(|text| text.parse::<Interface>().expect("an interface"));
+        config.ndl.interface = chosen.collect::<Vec<_>>().into();
+        change(&mut config);
+        let bench = Bench::new(config);
+        assert_eq!(bench.outcome(AskNode::KIND, Flags::ASK), Outcome::Delivered);
+        bench.reply().decode().expect("a report")
+    };
+    let (ipv4, ipv6) = ("239.255.83.119:6910", "[ff12::8000:5377]:6910");
+    let as_it_is: fn(&mut NodeConfig) = |_| {};
+    for (interface, change, groups) in [
+        (&["eth0"][..], as_it_is, &[ipv4, ipv6][..]),
+        (&["eth0/ipv4"], as_it_is, &[ipv4]),
+        (&["eth0/ipv6"], as_it_is, &[ipv6]),
+        (&["10.0.0.7", "fe80::7%eth0"], as_it_is, &[ipv4, ipv6]),
+        // There are no groups at ::1.
+        (&["lo"], as_it_is, &[ipv4]),
+        (&["::1"], as_it_is, &[]),
+        (&["lo", "eth0/ipv6"], as_it_is, &[ipv4, ipv6]),
+        (&["eth0"], |config| config.ndl.multicast6 = None, &[ipv4]),
+        (&["eth0"], |config| config.ndl.multicast = None, &[]),
+    ] {
+        let report = said(interface, change);
+        assert_eq!(report.groups, groups, "{interface:?}");
+        // Who knows `group` alone is told the first.
+        assert_eq!(report.group.as_deref(), groups.first().copied(), "{interface:?}");
+    }
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use sinew::{
-    NodeAddress,
+    NodeAddress, Tid,
     inspect::{AccessReport, AppReport, NodeReport, PeerReport, StreamReport, TreeLine},
 };
 
@@ -38,6 +38,19 @@ pub(super) struct End {
     pub(super) doubles: Vec<String>,
     /// If an application was meant.
     pub(super) app: Option<App>,
+    /// If several have its name.
+    pub(super) namesakes: Option<Namesakes>,
+}
+
+/// Several applications with one name.
+#[derive(Clone, Debug)]
+pub(super) struct Namesakes {
+    /// The one that is looked at.
+    pub(super) tid: Tid,
+    /// The node whose messages to the name reach that one.
+    pub(super) seen_from: String,
+    /// The others.
+    pub(super) others: Vec<Tid>,
 }
 
 /// An application.

@@ -12,7 +12,10 @@ use sinew::{
     payload,
 };
 
-use super::facts::{App, End, Facts};
+use super::{
+    called::{Called, by_whom_is_reached},
+    facts::{App, End, Facts, Namesakes},
+};
 use crate::{
     ping,
     system::{Fault, System},
@@ -120,14 +123,11 @@ impl<'a> Gathered<'a> {
 
     /// What the rules look at.
     pub(super) fn facts(&mut self, wanted: [&str; 2]) -> Facts {
-        let found = wanted.map(|wanted| self.find(wanted));
-        let ends = [self.end(wanted[0], found[0]), self.end(wanted[1], found[1])];
-        let targets = found.map(|found| {
-            let node = found.node?;
-            Some(Tid::new(node, found.app.map_or(AppAddress::INSPECT, |tid| tid.app)))
-        });
+        let found = self.find_both(wanted);
+        let ends = [self.end(wanted[0], &found[0]), self.end(wanted[1], &found[1])];
+        let targets = [found[0].target(), found[1].target()];
         let pings = [self.ping(found[0].at, targets[1]), self.ping(found[1].at, targets[0])];
-        let access = [self.access(found[0], found[1]), self.access(found[1], found[0])];
+        let access = [self.access(&found[0], &found[1]), self.access(&found[1], &found[0])];
         let waits = self.nodes.iter().flat_map(|asked| &asked.apps).filter(|app| !app.ready);
         let waits: BTreeMap<_, _> = waits
             .filter_map(|app| {
@@ -138,35 +138,71 @@ impl<'a> Gathered<'a> {
         Facts { ends, pings, streams, access, waits, shut: Vec::new() }
     }
 
-    /// An application's TID, a node's address, an application's name, a node's name: the first that it is.
-    fn find(&self, wanted: &str) -> Found {
+    /// Whom two words mean. A name that several applications have stands for the one that the other end's messages reach; where that is open, too,
+    /// the first word is resolved from the node through which we came.
+    fn find_both(&self, wanted: [&str; 2]) -> [Found; 2] {
+        let is_open = wanted.map(|wanted| self.called(wanted).len() > 1);
+        let here = &self.nodes[0];
+        if is_open == [true, false] {
+            let second = self.find(wanted[1], here);
+            return [self.find(wanted[0], self.seen_from(&second)), second];
+        }
+        let first = self.find(wanted[0], here);
+        let second = self.find(wanted[1], self.seen_from(&first));
+        [first, second]
+    }
+
+    /// The node where that end is; if it cannot be asked, the one through which we came.
+    fn seen_from(&self, end: &Found) -> &Asked {
+        let asked = end.at.map(|at| &self.nodes[at]);
+        asked.filter(|asked| asked.said.is_ok()).unwrap_or(&self.nodes[0])
+    }
+
+    /// The applications that have this name.
+    fn called(&self, name: &str) -> Vec<Called> {
+        let all =
+            self.nodes.iter().enumerate().flat_map(|(at, asked)| asked.apps.iter().map(move |app| (at, app)));
+        let named = all.filter(|(_, app)| app.name.as_deref() == Some(name));
+        named.map(|(at, app)| Called { at, tid: app.tid, is_ready: app.ready }).collect()
+    }
+
+    /// An application's TID, a node's address, an application's name as it is resolved from a node, a node's name: the first that it is.
+    fn find(&self, wanted: &str, seen_from: &Asked) -> Found {
         let at_address = |node| self.nodes.iter().position(|asked| asked.node == node);
         if let Ok(tid) = wanted.parse::<Tid>() {
-            return Found { at: at_address(tid.node), node: Some(tid.node), app: Some(tid) };
+            let (at, node) = (at_address(tid.node), Some(tid.node));
+            return Found { at, node, app: Some(tid), ..Found::default() };
         }
         if let Ok(node) = wanted.parse::<NodeAddress>() {
-            return Found { at: at_address(node), node: Some(node), app: None };
+            return Found { at: at_address(node), node: Some(node), ..Found::default() };
         }
-        for (at, asked) in self.nodes.iter().enumerate() {
-            if let Some(app) = asked.apps.iter().find(|app| app.name.as_deref() == Some(wanted)) {
-                return Found { at: Some(at), node: Some(asked.node), app: Some(app.tid) };
-            }
+        let mut called = self.called(wanted);
+        if let Ok(report) = &seen_from.said {
+            by_whom_is_reached(&mut called, report);
+        }
+        if let Some((&Called { at, tid, .. }, others)) = called.split_first() {
+            // Two processes with one address are told apart elsewhere.
+            let others: Vec<_> = others.iter().map(|other| other.tid).filter(|other| *other != tid).collect();
+            let namesakes = Namesakes { tid, seen_from: seen_from.name.clone(), others };
+            let namesakes = Some(namesakes).filter(|namesakes| !namesakes.others.is_empty());
+            return Found { at: Some(at), node: Some(tid.node), app: Some(tid), namesakes };
         }
         if let Some(at) = self.nodes.iter().position(|asked| asked.name == wanted) {
-            return Found { at: Some(at), node: Some(self.nodes[at].node), app: None };
+            return Found { at: Some(at), node: Some(self.nodes[at].node), ..Found::default() };
         }
         // Nobody who answers: one that was lost, or is of another project.
         let reports = || self.nodes.iter().filter_map(|asked| asked.said.as_ref().ok());
         let lost =
             reports().flat_map(|report| &report.lost).find(|lost| lost.name == wanted).map(|lost| lost.node);
         let foreign = || reports().flat_map(|report| &report.foreign).find(|other| other.name == wanted);
-        Found { at: None, node: lost.or_else(|| foreign().map(|other| other.node)), app: None }
+        Found { node: lost.or_else(|| foreign().map(|other| other.node)), ..Found::default() }
     }
 
-    fn end(&mut self, wanted: &str, Found { at, node, app }: Found) -> End {
-        let mut end = End { wanted: wanted.to_owned(), node, ..End::default() };
-        let Some(at) = at else {
-            end.app = app.map(|_| App::default());
+    fn end(&mut self, wanted: &str, found: &Found) -> End {
+        let (wanted, namesakes) = (wanted.to_owned(), found.namesakes.clone());
+        let mut end = End { wanted, node: found.node, namesakes, ..End::default() };
+        let Some(at) = found.at else {
+            end.app = found.app.map(|_| App::default());
             return end;
         };
         let asked = &self.nodes[at];
@@ -180,7 +216,7 @@ impl<'a> Gathered<'a> {
             .filter_map(|(_, other)| other.said.as_ref().ok())
             .map(|other| format!("node {} (process {})", other.name, other.pid))
             .collect();
-        if let Some(tid) = app {
+        if let Some(tid) = found.app {
             let report = asked.apps.iter().find(|app| app.tid == tid).cloned();
             end.app = Some(self.application(at, tid, report));
         }
@@ -211,7 +247,7 @@ impl<'a> Gathered<'a> {
     }
 
     /// Whether the access list of the target's node lets the source send to it, where both are applications.
-    fn access(&mut self, source: Found, target: Found) -> Option<AccessReport> {
+    fn access(&mut self, source: &Found, target: &Found) -> Option<AccessReport> {
         let asked = AskAccess { source: source.app?, target: target.app? };
         let there = &self.nodes[target.at?];
         if there.said.is_err() {
@@ -278,10 +314,18 @@ impl Gathered<'_> {
 }
 
 /// Whom a word means.
-#[derive(Clone, Copy)]
+#[derive(Default)]
 struct Found {
     /// Among those that were asked.
     at: Option<usize>,
     node: Option<NodeAddress>,
     app: Option<Tid>,
+    namesakes: Option<Namesakes>,
+}
+
+impl Found {
+    /// Whom a message goes to that is for it.
+    fn target(&self) -> Option<Tid> {
+        Some(Tid::new(self.node?, self.app.map_or(AppAddress::INSPECT, |tid| tid.app)))
+    }
 }

@@ -1,6 +1,7 @@
 //! From what two ends say to what stands in the way between them: facts in, steps out, nothing asked and nothing waited for.
 
 mod access;
+mod groups;
 mod places;
 mod stream;
 
@@ -12,7 +13,7 @@ use sinew::{
 };
 
 use self::places::{is_on_loopback, names};
-use super::facts::{App, End, Facts};
+use super::facts::{App, End, Facts, Namesakes};
 use crate::table::time;
 
 /// A step of the way, and how it is.
@@ -40,6 +41,8 @@ pub(super) enum State {
 
 /// Refusals that are older say nothing of now, in microseconds.
 const RECENT_US: u64 = 60_000_000;
+/// Further applications of one name that are told by their TIDs.
+const NAMESAKES_SHOWN: usize = 4;
 
 /// Every step from the one to the other and back, in the order in which a message meets them.
 pub(super) fn judge(facts: &Facts) -> Vec<Step> {
@@ -47,6 +50,7 @@ pub(super) fn judge(facts: &Facts) -> Vec<Step> {
     let [a, b] = &facts.ends;
     for end in [a, b] {
         steps.there(end, &facts.shut);
+        steps.meant(end);
     }
     steps.address(a, b);
     if a.node.is_some() && a.node != b.node {
@@ -112,6 +116,19 @@ impl Steps {
                  --other-socket PATH",
             ),
         }
+    }
+
+    /// Which application is looked at, where several have the name.
+    fn meant(&mut self, end: &End) {
+        let Some(Namesakes { tid, seen_from, others }) = &end.namesakes else { return };
+        let named: Vec<_> = others.iter().take(NAMESAKES_SHOWN).map(ToString::to_string).collect();
+        let more = others.len() - named.len();
+        let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+        self.note(
+            format!("{} is one of {}", end.label(), others.len() + 1),
+            format!("from node {seen_from} the name stands for {tid}, not for {}{more}", named.join(", ")),
+            "`sinew why` with the TID of another one looks at that",
+        );
     }
 
     /// No two processes have the address of one of them.
@@ -330,13 +347,12 @@ pub(crate) fn lost_in_words(lost: &LostReport) -> (String, &'static str) {
 /// Why `from` has never found `to`: in what their configurations do not meet.
 fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
     let ours = |report: &NodeReport| {
-        let group = report.group.as_deref().unwrap_or("no group");
         let seeds = if report.seeds.is_empty() {
             "no seeds".to_owned()
         } else {
             format!("seeds {}", report.seeds.join(", "))
         };
-        format!("{group} at {}, {seeds}", report.interface)
+        format!("{} at {}, {seeds}", groups::in_words(report), report.interface)
     };
     if let Some(foreign) = from.foreign.iter().find(|foreign| Some(foreign.node) == to.node) {
         let seen = format!(
@@ -363,17 +379,6 @@ fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
         let mend = "is UDP let through by the firewalls of both hosts (`sudo nft list ruleset`), and is `ndl.port` the one that the seed names?";
         return vec![("a seed names it, and no answer has come".to_owned(), mend.to_owned())];
     }
-    let udp = theirs.udp.as_deref().unwrap_or("ITS_ADDRESS:PORT");
-    let seed = format!("[ndl] seeds = [\"{udp}\"] in the configuration of {}", from.name);
-    let Some((one, other)) = from.group.as_ref().zip(theirs.group.as_ref()) else {
-        let who = if from.group.is_none() { &from.name } else { &theirs.name };
-        let seen = format!("{who} takes no part in multicast, and no seed names the other");
-        return vec![(seen, format!("{seed}; or [ndl] multicast in both"))];
-    };
-    if one != other {
-        let seen = format!("it asks in the group {one}, the other in {other}");
-        return vec![(seen, format!("set the same `multicast` under [ndl] in both; or {seed}"))];
-    }
     if is_on_loopback(&from.interface) != is_on_loopback(&theirs.interface) {
         let seen = format!(
             "it asks at {}, the other at {}: one of them on its own host only",
@@ -385,12 +390,9 @@ fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
                 .to_owned(),
         )];
     }
-    let mend = format!(
-        "does multicast pass between the two interfaces ({} and {})? `sinew doctor --interface ADDRESS` on both hosts, firewalls, IGMP \
-         snooping of the switch; or {seed}",
-        from.interface, theirs.interface
-    );
-    vec![(format!("both ask in the group {one}, and it has not heard the other"), mend)]
+    let udp = theirs.udp.as_deref().unwrap_or("ITS_ADDRESS:PORT");
+    let seed = format!("[ndl] seeds = [\"{udp}\"] in the configuration of {}", from.name);
+    vec![groups::why_unheard(from, theirs, &seed)]
 }
 
 fn dial_in_words(peer: &PeerReport) -> (String, String) {

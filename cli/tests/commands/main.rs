@@ -200,7 +200,7 @@ fn every_application_and_node_is_pinged_by_tid_and_by_name_from_either_node() {
     let tid = tid.split_once(' ').expect("it says its TID").1;
     let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
     let mut client =
-        api.register_transport_address(Registration::new().name("client")).expect("it is registered");
+        api.register_transport_address(Registration::new().name("leg/client")).expect("it is registered");
     let (say_over, over) = std::sync::mpsc::sync_channel(1);
     let receiving = std::thread::spawn(move || {
         while over.try_recv().is_err() {
@@ -209,10 +209,10 @@ fn every_application_and_node_is_pinged_by_tid_and_by_name_from_either_node() {
         }
     });
     scenario.until("the client is known on the hip", "hip", &["apps"], |said| {
-        named(&said["apps"], "client").is_some_and(|app| app["ready"] == true)
+        named(&said["apps"], "leg/client").is_some_and(|app| app["ready"] == true)
     });
     for here in ["hip", "knee"] {
-        for whom in [tid, "knee", "hip", "client", "127.0.0.1", "127.0.0.2", "127.0.0.2/inspect"] {
+        for whom in [tid, "knee", "hip", "leg/client", "127.0.0.1", "127.0.0.2", "127.0.0.2/inspect"] {
             // When
             let answer = scenario.sinew(here, &["ping", whom, "--count", "20", "--json"]);
             // Then

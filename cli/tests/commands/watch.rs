@@ -112,28 +112,30 @@ fn a_message_that_is_refused_is_seen_with_the_reason() {
 
 #[test]
 fn a_name_is_followed_to_where_its_application_is_started_again() {
-    // Given: an application of another process, which is watched by its name
     let scenario = Scenario::new();
     let _knee = scenario.start("knee", 2, &[]);
-    let register = || {
-        let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
-        api.register_transport_address(Registration::new().name("sensor")).expect("it is registered")
-    };
-    let send = || scenario.sinew("knee", &["send", "sensor", "test.any", "1", "--unconfirmed"]);
-    let first = register();
-    let mut watcher = Watcher::of(&scenario, "sensor");
-    let seen = watcher.message(send);
-    assert_eq!(seen["target"], first.tid().to_string());
-    // When: it ends, somebody else takes its address, and it comes again at another
-    first.unregister().expect("it gives its address back");
-    let other = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
-    let other = other.register_transport_address(Registration::new()).expect("it is registered");
-    let second = register();
-    assert_ne!(second.tid(), other.tid());
-    // Then
-    let target = second.tid().to_string();
-    while watcher.message(send)["target"] != target {}
-    drop(other);
+    for name in ["sensor", "leg/sensor"] {
+        // Given: an application of another process, which is watched by its name
+        let register = || {
+            let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
+            api.register_transport_address(Registration::new().name(name)).expect("it is registered")
+        };
+        let send = || scenario.sinew("knee", &["send", name, "test.any", "1", "--unconfirmed"]);
+        let first = register();
+        let mut watcher = Watcher::of(&scenario, name);
+        let seen = watcher.message(send);
+        assert_eq!(seen["target"], first.tid().to_string());
+        // When: it ends, somebody else takes its address, and it comes again at another
+        first.unregister().expect("it gives its address back");
+        let other = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
+        let other = other.register_transport_address(Registration::new()).expect("it is registered");
+        let second = register();
+        assert_ne!(second.tid(), other.tid());
+        // Then
+        let target = second.tid().to_string();
+        while watcher.message(send)["target"] != target {}
+        drop(other);
+    }
 }
 
 #[test]

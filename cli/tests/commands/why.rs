@@ -1,6 +1,15 @@
 //! `sinew why` between real nodes: the way is free, or what stands in it is named.
 
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Duration,
+};
+
 use serde_json::Value;
+use sinew::{NodeApi, Registration};
 
 use crate::scenario::{Scenario, named};
 
@@ -99,6 +108,48 @@ fn applications_that_wait_for_each_other_in_a_circle_are_told_the_circle() {
     // And: who is nowhere is said to be
     let answer = scenario.sinew("hip", &["why", "hip", "ankle"]);
     assert!(answer.code == Some(1) && answer.out.contains("'ankle'"), "{}", answer.out);
+}
+
+#[test]
+fn a_name_that_two_nodes_have_stands_for_the_one_that_the_other_end_reaches() {
+    // Given: two nodes, each with an application of one name
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let _knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["started"]);
+    let over = Arc::new(AtomicBool::new(false));
+    let drives = ["hip", "knee"].map(|node| {
+        let api = NodeApi::connect(scenario.socket(node)).expect("its socket");
+        let mut drive =
+            api.register_transport_address(Registration::new().name("drive")).expect("it is registered");
+        let over = over.clone();
+        std::thread::spawn(move || {
+            while !over.load(Ordering::Relaxed) {
+                let received = drive.receive(Duration::from_millis(10)).expect("its node lives");
+                assert!(received.is_none(), "a ping is answered without the program");
+            }
+        })
+    });
+    let step = |said: &Value, what: &str| {
+        let steps = said["steps"].as_array().cloned().unwrap_or_default();
+        steps.into_iter().find(|step| step["step"] == what).unwrap_or_default()
+    };
+    // Then: whichever is asked through, and whichever is named first
+    for here in ["hip", "knee"] {
+        for (end, node) in [("127.0.0.1", "hip"), ("knee", "knee")] {
+            for words in [["why", end, "drive"], ["why", "drive", end]] {
+                let said = scenario.until("the way is free", here, &words, |said| said["free"] == true);
+                let there = step(&said, "drive is there");
+                assert!(
+                    there["seen"].as_str().is_some_and(|seen| seen.starts_with(&format!("node {node} at"))),
+                    "through {here}, {words:?}: {said}"
+                );
+                assert_eq!(step(&said, "drive is one of 2")["state"], "note", "{said}");
+            }
+        }
+    }
+    over.store(true, Ordering::Relaxed);
+    drives.into_iter().for_each(|drive| drive.join().expect("it got nothing"));
 }
 
 #[test]

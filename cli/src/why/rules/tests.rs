@@ -69,6 +69,7 @@ fn report(number: u8, name: &str, other: u8) -> NodeReport {
         udp: Some(format!("{}:7000", node(number))),
         gncl: Some(format!("{}:7001", node(number))),
         group: Some("239.0.0.1:7000".to_owned()),
+        groups: vec!["239.0.0.1:7000".to_owned()],
         seeds: Vec::new(),
         sources: Vec::new(),
         lost: Vec::new(),
@@ -161,6 +162,12 @@ fn strangers(facts: &mut Facts) {
     knee(facts).peers.clear();
 }
 
+/// It asks these groups.
+fn asks(report: &mut NodeReport, groups: &[&str]) {
+    report.groups = groups.iter().map(|group| (*group).to_owned()).collect();
+    report.group = report.groups.first().cloned();
+}
+
 fn never_answered(facts: &mut Facts) {
     facts.ends[1] = End { wanted: "10.0.0.2".to_owned(), node: Some(node(2)), ..End::default() };
     hip(facts).peers.clear();
@@ -250,16 +257,65 @@ const CASES: &[Case] = &[
     Case(
         |facts| {
             strangers(facts);
-            knee(facts).group = Some("239.0.0.2:7000".to_owned());
+            asks(knee(facts), &["239.0.0.2:7000"]);
         },
         ["hip knows knee.drive", "the other in 239.0.0.2:7000", "same `multicast`"],
     ),
     Case(
         |facts| {
             strangers(facts);
-            knee(facts).group = None;
+            asks(knee(facts), &["239.0.0.2:7000"]);
+            // It is of a version that says one group alone.
+            hip(facts).groups.clear();
+        },
+        ["hip knows knee.drive", "in the group 239.0.0.1:7000, the other in 239.0.0.2", "same `multicast`"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            asks(knee(facts), &[]);
         },
         ["hip knows knee.drive", "knee takes no part in multicast", "seeds = [\"10.0.0.2:7000\"]"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            asks(hip(facts), &["239.0.0.1:7000", "[ff12::1]:7000"]);
+            asks(knee(facts), &["[ff12::1]:7000"]);
+        },
+        [
+            "hip knows knee.drive",
+            "both ask in the group [ff12::1]:7000, and it has not",
+            "firewalls, IGMP and MLD",
+        ],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            asks(hip(facts), &["239.0.0.1:7000", "[ff12::1]:7000"]);
+            asks(knee(facts), &["[ff12::2]:7000"]);
+        },
+        [
+            "hip knows knee.drive",
+            "239.0.0.1:7000 and [ff12::1]:7000, the other in [ff12::2]",
+            "same `multicast6`",
+        ],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            asks(knee(facts), &["[ff12::1]:7000"]);
+        },
+        ["hip knows knee.drive", "the other in [ff12::1]:7000", "both of IPv6"],
+    ),
+    // Its groups are of no use to whom nothing of it reaches.
+    Case(
+        |facts| {
+            strangers(facts);
+            asks(knee(facts), &[]);
+            knee(facts).interface = "::1".to_owned();
+        },
+        ["hip knows knee.drive", "its own host only", "`interface`"],
     ),
     Case(
         |facts| {
@@ -386,7 +442,7 @@ type Note = (fn(&mut Facts), &'static str);
 
 #[test]
 fn what_should_be_known_does_not_stand_in_the_way() {
-    let notes: [Note; 4] = [
+    let notes: [Note; 5] = [
         (|facts| hip(facts).peers[0].missed = 2, "missed its last 2 answers"),
         (|facts| facts.pings[1] = None, "not tried from there: this command has no socket of knee"),
         (|facts| drive(facts).refused = 9, "9 messages were refused"),
@@ -397,6 +453,14 @@ fn what_should_be_known_does_not_stand_in_the_way() {
                 drive(facts).report.as_mut().expect("it is there").missing.push(missing);
             },
             "it lost ankle",
+        ),
+        (
+            |facts| {
+                let tids = [2, 3, 4, 5, 6, 7].map(|number| Tid::new(node(number), AppAddress::new(0x1001)));
+                let (seen_from, others) = ("hip".to_owned(), tids[1..].to_vec());
+                facts.ends[1].namesakes = Some(Namesakes { tid: tids[0], seen_from, others });
+            },
+            "from node hip the name stands for 10.0.0.2/1001, not for 10.0.0.3/1001, 10.0.0.4/1001, 10.0.0.5/1001, 10.0.0.6/1001 and 1 more",
         ),
     ];
     for (change, seen) in notes {
