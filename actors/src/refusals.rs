@@ -18,6 +18,11 @@ const LOG_PERIOD: Duration = Duration::from_secs(1);
 const DETAIL_MAX: usize = 256;
 /// What of a detail is in the log at most, in characters: the longest sentence of this program, and a peer's in it.
 const LOGGED_MAX: usize = 1_024;
+/// What ends a line or turns it round and is no control character: separators of lines and paragraphs, overrides of direction.
+const LINE_BREAKERS: [char; 9] = [
+    '\u{2028}', '\u{2029}', '\u{202a}', '\u{202b}', '\u{202c}', '\u{202d}', '\u{202e}', '\u{2066}',
+    '\u{2067}',
+];
 
 /// Counters of refusals. The causes are literals of this program, so their number is bounded.
 #[derive(Debug, Default)]
@@ -129,15 +134,13 @@ impl Refusals {
 /// A detail as it is logged: nobody who has words of his in it ends its line or does things to a terminal, nor makes it longer than that.
 fn in_one_line(detail: &dyn Display) -> String {
     let words = detail.to_string();
-    let mut plain = String::new();
-    for character in words.chars().take(LOGGED_MAX) {
-        if character.is_control() {
-            plain.extend(character.escape_default());
-        } else {
-            plain.push(character);
-        }
-    }
-    plain
+    let is_plain = |character: char| !character.is_control() && !LINE_BREAKERS.contains(&character);
+    let escaped = words.chars().flat_map(|character| {
+        let (plain, escaped) =
+            if is_plain(character) { (Some(character), None) } else { (None, Some(character)) };
+        plain.into_iter().chain(escaped.into_iter().flat_map(char::escape_unicode))
+    });
+    escaped.take(LOGGED_MAX).collect()
 }
 
 #[cfg(test)]
@@ -148,8 +151,10 @@ mod tests {
     fn words_from_outside_stay_in_one_line_of_a_length() {
         let refusals = Refusals::default();
         refusals.count(Time::ZERO, "garbage", &"a\nWARN all is lost\u{1b}[2J\u{85}b");
-        assert_eq!(refusals.told()[0].detail, "a\\nWARN all is lost\\u{1b}[2J\\u{85}b");
-        assert_eq!(in_one_line(&"a".repeat(100_000)).len(), LOGGED_MAX);
+        assert_eq!(refusals.told()[0].detail, "a\\u{a}WARN all is lost\\u{1b}[2J\\u{85}b");
+        for long in ["a", "\u{1b}", "\u{202e}"] {
+            assert_eq!(in_one_line(&long.repeat(100_000)).chars().count(), LOGGED_MAX);
+        }
     }
 
     #[test]

@@ -84,7 +84,7 @@ mod way;
 pub(crate) use actor::{Gncl, LINGER};
 pub(crate) use facts::LinkFact;
 pub(crate) use peer::{Peer, Store};
-pub(crate) use proofs::is_revoked;
+pub(crate) use proofs::{is_revoked, proven_life};
 pub(crate) use stream_way::{ByDatagram, by_datagram};
 pub(crate) use untold::Untold;
 pub(crate) use way::{Arrived, WayAccount};

@@ -44,6 +44,11 @@ impl Proofs {
     }
 }
 
+/// The life of this node that was linked last, where nodes prove who they are.
+pub(crate) fn proven_life(stores: &Stores, node: NodeAddress) -> Option<Incarnation> {
+    lock(&stores.gncl.proofs.0).get(&node).map(|proof| proof.incarnation)
+}
+
 /// Whether the certificate with which this life was linked is on the deny list.
 pub(crate) fn is_revoked(stores: &Stores, node: NodeAddress, incarnation: Incarnation) -> bool {
     let Some(secured) = stores.secured.get() else { return false };

@@ -22,9 +22,10 @@ use super::{
     words::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier},
 };
 use crate::{
-    audit,
+    audit, gncl,
     lncl::AppFact,
     monitors,
+    ndl::MembershipFact,
     node::RootEvent,
     refusals::Refusals,
     stores::{POST_CAPACITY, Stores},
@@ -106,6 +107,12 @@ impl SyncManager {
             }
             Event::Membership(fact) => {
                 monitors::feed(&self.stores, (&fact).into());
+                if let MembershipFact::NodeLost { node, incarnation, .. } = fact
+                    && gncl::is_revoked(&self.stores, node, incarnation)
+                {
+                    // GNCL may not have read the list yet that is in force.
+                    wills::revoke(&self.stores, node, incarnation);
+                }
                 if let Some(input) = wills::Input::of_membership(&fact) {
                     wills::feed(&self.stores, input);
                 }

@@ -93,6 +93,9 @@ pub(crate) fn receive(stores: &Stores, from: NodeAddress, message: &Message) -> 
         return Err(format!("from {from}, wills: one of them is not what a will may be"));
     }
     let incarnation = testament.incarnation;
+    if gncl::proven_life(stores, from).is_some_and(|life| life != incarnation) {
+        return Err(format!("from {from}, wills: of another life than that which has proven itself"));
+    }
     feed(stores, Input::Told { from, testament });
     // Asked behind it: who has the certificate put on the list meanwhile drops what is there then.
     if gncl::is_revoked(stores, from, incarnation) {

@@ -214,12 +214,16 @@ fn the_wills_of_a_node_whose_certificate_is_revoked_are_held_no_more_and_not_tak
         };
         let says = wills::tests::said(incarnation, b.tid(1).app, &will);
         wills::receive(&a.stores, node, &says).expect("a legal one");
+        // Those of a life that is still to come would outlive it.
+        let of_the_next = wills::tests::said(Incarnation(2), b.tid(1).app, &will);
+        assert!(wills::receive(&a.stores, node, &of_the_next).is_err(), "it is another life that is linked");
         // When: it is revoked, says it again all the same, and is lost
         revoke(&a, &b);
         a.tell(Event::DenyListChanged);
         a.broken().await;
         wills::receive(&a.stores, node, &says).expect("a legal one");
         wills::feed(&a.stores, wills::Input::NodeLost { node, incarnation });
+        wills::feed(&a.stores, wills::Input::LinkUp { node, incarnation: Incarnation(9) });
         // Then: what comes next is not its
         a.send(a.tid(1), b"afterwards");
         assert_eq!(next("a message", &mut heir).await.payload[..], *b"afterwards");

@@ -167,7 +167,7 @@ fn another_user_who_comes_again_as_soon_as_he_is_refused_is_refused_once_a_milli
     if came.is_some() {
         let took = began.elapsed();
         assert!(took >= REST * (TIMES - SAVED_MAX - 1), "{TIMES} were refused in {took:?}");
-        // The node's own come in meanwhile, and after it.
+        // The node's own come in after it.
         RawClient::register(&node, &Register::default());
     }
 }

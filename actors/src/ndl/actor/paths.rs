@@ -129,7 +129,9 @@ impl Paths {
             }
             is_wanted
         });
-        self.said.borrow_mut().retain(|(local, what)| *what == IN_DOUBT || wanted.contains(local));
+        // What is said of those that are not used each clears itself.
+        let is_of_unused = |what: &str| [IN_DOUBT, TAKEN, LEFT_OUT].contains(&what);
+        self.said.borrow_mut().retain(|(local, what)| is_of_unused(what) || wanted.contains(local));
     }
 
     /// Joins the group on a path that has not joined it yet.
@@ -174,7 +176,8 @@ impl Paths {
             if said.insert((*local, LEFT_OUT)) {
                 crate::log::warn!(
                     %local,
-                    "NDL does not use this address: it uses {PATHS_MAX} at most, and this host has more; name those in `ndl.interface` over which                      other nodes are"
+                    "NDL does not use this address: it uses {PATHS_MAX} at most, and this host has more; name those in `ndl.interface` over which \
+                     other nodes are"
                 );
             }
         }
@@ -285,11 +288,13 @@ fn wanted(chosen: &Interfaces, usable: &Usable, open: &[LocalAddress]) -> Vec<Lo
     wanted
 }
 
-/// Takes those out that there is no room for, and returns them: what is open, and leads somewhere perhaps, stays ahead of what is new.
-fn leave_out(wanted: &mut Vec<LocalAddress>, open: &[LocalAddress]) -> Vec<LocalAddress> {
-    let is_open = |local: &&LocalAddress| open.contains(local);
-    let news = wanted.iter().filter(|local| !is_open(local));
-    let left_out: Vec<_> = wanted.iter().filter(is_open).chain(news).skip(PATHS_MAX).copied().collect();
+/// Takes those out that there is no room for, and returns them. What is `kept` comes first, in that order: what was chosen by its address, and
+/// what is open, which leads somewhere perhaps.
+fn leave_out(wanted: &mut Vec<LocalAddress>, kept: &[LocalAddress]) -> Vec<LocalAddress> {
+    let place = |local: &LocalAddress| kept.iter().position(|other| other == local).unwrap_or(usize::MAX);
+    let mut in_turn = wanted.clone();
+    in_turn.sort_by_key(place);
+    let left_out: Vec<_> = in_turn.into_iter().skip(PATHS_MAX).collect();
     wanted.retain(|local| !left_out.contains(local));
     left_out
 }
@@ -308,7 +313,9 @@ impl Shell {
     fn look_at_paths(self: &Rc<Self>, usable: &Usable, tasks: &FuturesUnordered<Task>) -> bool {
         let (stores, before) = (&self.stores, self.paths.here());
         let mut wanted = wanted(&stores.config.ndl.interface, usable, &self.paths.locals());
-        let left_out = leave_out(&mut wanted, &self.paths.locals());
+        let chosen = stores.config.ndl.interface.addresses().map(LocalAddress::from);
+        let kept: Vec<_> = chosen.chain(self.paths.locals()).collect();
+        let left_out = leave_out(&mut wanted, &kept);
         self.paths.say_left_out(&left_out);
         let (readers, unopened) = self.paths.open(stores, &wanted);
         self.paths.say_unopened(stores.config.ndl.port, &unopened);
@@ -448,6 +455,19 @@ mod tests {
         let mut wanted = many.clone();
         assert!(leave_out(&mut wanted, open).contains(&many[0]));
         assert_eq!(wanted, open);
+    }
+
+    #[test]
+    fn that_there_is_no_room_for_an_address_is_said_once_as_long_as_it_is_so() {
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let (paths, local) = (Paths::default(), v4([10, 8, 1, 9]));
+        for _ in 0..2 {
+            paths.say_left_out(&[local]);
+            paths.close_all_but(&stores, &[]);
+            assert!(paths.said.borrow().contains(&(local, LEFT_OUT)));
+        }
+        paths.say_left_out(&[]);
+        assert!(paths.said.borrow().is_empty(), "then it is said again the next time");
     }
 
     #[test]

@@ -79,7 +79,10 @@ async fn welcome(child: &Child, theirs: &UnixStream) {
     let mut reader = Reader::new(WORDS_BYTES_MAX);
     tokio::select! {
         error = child.hosted.link.drain(child.number) => panic!("it reads: {error}"),
-        frame = reader.next(theirs) => assert_eq!(frame.unwrap().unwrap().header.kind, Kind::HOST_WELCOME),
+        frame = tokio::time::timeout(WITHIN, reader.next(theirs)) => {
+            let frame = frame.expect("its welcome").unwrap().unwrap();
+            assert_eq!(frame.header.kind, Kind::HOST_WELCOME);
+        }
     }
 }
 

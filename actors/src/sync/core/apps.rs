@@ -36,6 +36,8 @@ pub(super) struct App {
     pub(super) ended: Option<Ended>,
     /// Of what it requires, what it was told is lost: while it waits, what its former life was told.
     pub(super) lost: BTreeSet<String>,
+    /// Of what its present life lacks and was not told yet, what a former one was told.
+    pub(super) owed: BTreeSet<String>,
     /// Of what it requires, what is not met, and since when.
     pub(super) absent: BTreeMap<String, Time>,
     /// Of what it requires, what nobody can hear of, and until when that is not told.
@@ -93,8 +95,12 @@ impl App {
     /// A life may start: it has been told nothing of what it requires. Returns what the life before was told is lost and what is met now:
     /// an event may still be on its way, and this life has to hear the end of it.
     pub(super) fn begin_life(&mut self, unmet: &[(String, Reason)]) -> Vec<String> {
-        let lost = std::mem::take(&mut self.lost);
-        lost.into_iter().filter(|name| !unmet.iter().any(|(other, _)| other == name)).collect()
+        let is_unmet = |name: &String| unmet.iter().any(|(other, _)| other == name);
+        let (unmet, met): (BTreeSet<_>, BTreeSet<_>) =
+            std::mem::take(&mut self.lost).into_iter().partition(is_unmet);
+        // It may be met before it is told: then the life has to hear that all the same.
+        self.owed = unmet;
+        met.into_iter().collect()
     }
 
     /// Keeps since when each requirement is not met.
@@ -135,11 +141,12 @@ impl Apps {
         let wait = former.as_ref().and_then(App::wait).copied().unwrap_or(wait);
         let (name, refused) = self.claim(app, name);
         let state = State::Waiting(wait);
-        let (phases, kinds, lost, silent) = (Vec::new(), Vec::new(), BTreeSet::new(), BTreeMap::new());
+        let (phases, kinds, silent) = (Vec::new(), Vec::new(), BTreeMap::new());
+        let (lost, owed) = (BTreeSet::new(), BTreeSet::new());
         let (ended, patience) = (None, None);
         // One that waits already has waited for that, too.
         let absent = former.map(|former| former.absent).unwrap_or_default();
-        let life = App { name, requires, phases, kinds, state, ended, lost, absent, silent, patience };
+        let life = App { name, requires, phases, kinds, state, ended, lost, owed, absent, silent, patience };
         self.apps.insert(app, life);
         refused
     }

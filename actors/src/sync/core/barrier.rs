@@ -180,6 +180,20 @@ impl Core {
         }
     }
 
+    /// The release of an application was not taken: what it would have been told behind it waits, too.
+    pub(super) fn release_not_taken(&mut self, now: Time, app: AppAddress) {
+        self.keep(now, app, None);
+        let not_taken = &mut self.not_taken;
+        self.outputs.retain(|output| {
+            let Output::Tell { app: other, event, .. } = output else { return true };
+            let is_its = *other == app;
+            if is_its {
+                not_taken.insert((app, Some(event.name().to_owned())));
+            }
+            !is_its
+        });
+    }
+
     pub(super) fn forget_not_taken(&mut self, app: AppAddress) {
         self.not_taken.retain(|(other, _)| *other != app);
     }
@@ -216,7 +230,7 @@ fn changes(
     app: &mut App,
     unready: &[(String, Reason)],
 ) -> Vec<(RequirementEvent, Option<Reason>)> {
-    let App { requires, lost, silent, .. } = app;
+    let App { requires, lost, owed, silent, .. } = app;
     let mut changes = Vec::new();
     for requirement in requires.iter() {
         let name = requirement.as_str();
@@ -229,12 +243,13 @@ fn changes(
                     && judged < *silent.entry(name.to_owned()).or_insert(now + SILENCE) => {}
             Some(reason) => {
                 silent.remove(name);
+                owed.remove(name);
                 lost.insert(name.to_owned());
                 changes.push((absence(requirement), Some(reason)));
             }
             None => {
                 silent.remove(name);
-                if lost.remove(name) {
+                if lost.remove(name) | owed.remove(name) {
                     changes.push((RequirementEvent::Met { name: name.to_owned() }, None));
                 }
             }

@@ -88,6 +88,11 @@ impl Core {
             (app.state, app.ended) = (State::Waiting(wait), Some(how));
             app.silent.clear();
             app.phases.clear();
+            let owed = std::mem::take(&mut app.owed);
+            app.lost.extend(owed);
+            // That it is met again was not taken, and that it is lost may have been.
+            let not_taken = self.not_taken.iter().filter(|(other, _)| *other == address);
+            app.lost.extend(not_taken.filter_map(|(_, name)| name.clone()));
             self.forget_not_taken(address);
             self.own_list_changed(now);
         }

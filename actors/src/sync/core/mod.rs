@@ -232,7 +232,7 @@ impl Core {
             Input::ListReceived { from, payload } => self.list_received(from, &payload),
             Input::DirectoryWanted { app } => self.watchers.add(app),
             Input::DirectoryNotTaken { app, event } => return self.directory_not_taken(now, app, event),
-            Input::ReleaseNotTaken { app } => self.keep(now, app, None),
+            Input::ReleaseNotTaken { app } => self.release_not_taken(now, app),
             Input::EventNotTaken { app, name } => self.keep(now, app, Some(name)),
             Input::TimePassed => {}
         }
@@ -265,7 +265,7 @@ impl Core {
     pub(crate) fn replaced(&mut self, now: Time) {
         match self.in_hand.take() {
             Some(answer @ Output::AnswerBarrier { .. }) => self.outputs.push_front(answer),
-            Some(Output::Release { app }) => self.keep(now, app, None),
+            Some(Output::Release { app }) => self.release_not_taken(now, app),
             Some(Output::Tell { app, event, .. }) => self.keep(now, app, Some(event.name().to_owned())),
             Some(Output::TellDirectory { app, event }) => self.directory_not_taken(now, app, event),
             Some(_) | None => {}

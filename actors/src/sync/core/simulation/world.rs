@@ -55,7 +55,7 @@ impl Life {
 pub(super) struct Seen(BTreeMap<&'static str, u64>);
 
 impl Seen {
-    const WHAT: [&'static str; 20] = [
+    const WHAT: [&'static str; 21] = [
         "nodes",
         "lists",
         "lists lost",
@@ -74,6 +74,7 @@ impl Seen {
         "done without",
         "phases reached",
         "lacks told",
+        "not taken",
         "shared names",
         "crowds",
     ];
@@ -302,6 +303,13 @@ impl World {
         self.fault == Some(fault) && self.struck.is_multiple_of(3)
     }
 
+    /// Whether there is no room for what is said once: one time in five, and not in the end.
+    fn is_refused(&mut self) -> bool {
+        let is_refused = !self.takes_all && self.chance.usize(..5) == 0;
+        self.seen.count("not taken", u64::from(is_refused));
+        is_refused
+    }
+
     pub(super) fn violate(&mut self, is_so: bool, words: impl FnOnce() -> String) {
         self.violations.extend(require(is_so, words).err());
     }
@@ -310,6 +318,9 @@ impl World {
         match output {
             Output::Release { app } if app == app_address(WATCHER) => {}
             Output::Release { .. } if self.strikes(Fault::ReleaseLost) => {}
+            Output::Release { app } if self.is_refused() => {
+                self.cores[node].handle(self.now, Input::ReleaseNotTaken { app });
+            }
             Output::Release { app } => self.released(node, app),
             Output::TellDirectory { event, .. } => self.told_of_directory(node, event),
             Output::Publish { to, list } => self.fly(node, to, list),
@@ -317,6 +328,10 @@ impl World {
             Output::Tell {
                 event: RequirementEvent::Lost { .. } | RequirementEvent::Without { .. }, ..
             } if self.strikes(Fault::LackNotTold) => {}
+            Output::Tell { app, event, .. } if self.is_refused() => {
+                let name = event.name().to_owned();
+                self.cores[node].handle(self.now, Input::EventNotTaken { app, name });
+            }
             Output::Tell { app, event, .. } => {
                 self.seen.count("lacks told", u64::from(!matches!(event, RequirementEvent::Met { .. })));
                 self.say(|| format!("{app} of node {node} is told {event:?}"));
