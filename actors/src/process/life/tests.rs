@@ -23,6 +23,11 @@ use crate::{
 /// Nothing takes longer, on a busy machine either.
 const WITHIN: Duration = Duration::from_secs(60);
 
+/// Runs a test on one thread.
+fn run(test: impl Future<Output = ()>) {
+    tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap().block_on(test);
+}
+
 /// A process that does nothing.
 #[expect(clippy::zombie_processes, reason = "whoever has the group reaps it")]
 fn sleeper() -> Rc<Process> {
@@ -113,8 +118,7 @@ async fn kinds_read(child: &mut Child, theirs: UnixStream, last: Kind) -> Vec<Ki
 
 #[test]
 fn a_name_that_comes_between_the_welcome_and_the_listening_is_told() {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    runtime.block_on(async {
+    run(async {
         // Given: a child that was welcomed
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
         let (mut child, theirs) = begin(&hosted(&stores));
@@ -133,8 +137,7 @@ fn a_name_that_comes_between_the_welcome_and_the_listening_is_told() {
 
 #[test]
 fn names_that_there_was_no_room_for_are_told_once_the_child_reads() {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    runtime.block_on(async {
+    run(async {
         // Given: a child that does not read, for which no more can wait
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
         let (mut child, theirs) = begin(&hosted(&stores));
@@ -155,8 +158,7 @@ fn names_that_there_was_no_room_for_are_told_once_the_child_reads() {
 
 #[test]
 fn names_that_were_looked_up_for_a_former_child_do_not_reach_the_next_one() {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    runtime.block_on(async {
+    run(async {
         // Given: two lives of a child, the former with a supervisor that was held up
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
         let hosted = hosted(&stores);
@@ -186,8 +188,7 @@ fn names_that_were_looked_up_for_a_former_child_do_not_reach_the_next_one() {
 
 #[test]
 fn a_name_that_is_asked_for_where_there_is_no_room_is_told_once_the_child_reads() {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    runtime.block_on(async {
+    run(async {
         // Given: more names than a child is told, and a child that does not read
         let mut config = NodeConfig::new("test");
         config.lncl.apps_max = 2 * NAMES_MAX;
@@ -214,8 +215,7 @@ fn a_name_that_is_asked_for_where_there_is_no_room_is_told_once_the_child_reads(
 
 #[test]
 fn names_that_come_and_go_while_the_child_does_not_read_do_not_pile_up() {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    runtime.block_on(async {
+    run(async {
         // Given: a child that does not read
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
         let (mut child, theirs) = begin(&hosted(&stores));
@@ -241,8 +241,7 @@ fn names_that_come_and_go_while_the_child_does_not_read_do_not_pile_up() {
 
 #[test]
 fn a_message_behind_names_that_cannot_be_told_does_not_wake_its_thread_again_and_again() {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    runtime.block_on(async {
+    run(async {
         // Given: a message behind a name, and no more room
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
         let (mut child, theirs) = begin(&hosted(&stores));
@@ -263,8 +262,7 @@ fn a_message_behind_names_that_cannot_be_told_does_not_wake_its_thread_again_and
 
 #[test]
 fn a_message_that_was_held_waits_for_room_where_there_is_none() {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    runtime.block_on(async {
+    run(async {
         // Given: a message behind a name that was told, and no more room
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
         let (mut child, theirs) = begin(&hosted(&stores));
