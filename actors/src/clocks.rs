@@ -3,13 +3,14 @@
 //! What is said here is right as long as two clocks do as clocks of hosts do: at each moment one runs at most [`DRIFT_PPB_MAX`] faster than the
 //! other, and by how much that is changes by [`WANDER_PPB_PER_S`] in a second at most. // spec: NDL-6.1
 
-use std::{
-    collections::BTreeMap,
-    sync::{Mutex, PoisonError},
-    time::Duration,
+use std::{collections::BTreeMap, sync::Mutex, time::Duration};
+
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
 };
 
-use sinew_runtime::{tid::NodeAddress, time::Time};
+use crate::stores::lock;
 
 /// Two quartz clocks drift apart by at most this, in billionths; datasheets say +-50 millionths for each, cold and old ones do worse.
 pub(crate) const DRIFT_PPB_MAX: u64 = 200_000;
@@ -115,24 +116,29 @@ impl ClockOffset {
     }
 }
 
-/// The offsets of the peers' clocks against ours.
+/// The offsets of the peers' clocks against ours, each of one life: the next life of a node may be on another host, whose clock began at
+/// another time.
 #[derive(Debug, Default)]
-pub(crate) struct ClockOffsets(Mutex<BTreeMap<NodeAddress, ClockOffset>>);
+pub(crate) struct ClockOffsets(Mutex<BTreeMap<NodeAddress, (Incarnation, ClockOffset)>>);
 
 impl ClockOffsets {
-    /// The offset of `node` as it was measured last, if it ever was.
-    pub(crate) fn get(&self, node: NodeAddress) -> Option<ClockOffset> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).get(&node).copied()
+    /// The offset of this life of `node`, if it is the one that was measured last. // spec: NDL-6
+    pub(crate) fn get(&self, node: NodeAddress, life: Incarnation) -> Option<ClockOffset> {
+        let (of, offset) = lock(&self.0).get(&node).copied()?;
+        (of == life).then_some(offset)
     }
 
-    /// Replaces the offset of `node`.
-    pub(crate) fn set(&self, node: NodeAddress, offset: ClockOffset) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).insert(node, offset);
+    /// Replaces the offset of `node`, whichever life that was of.
+    pub(crate) fn set(&self, node: NodeAddress, life: Incarnation, offset: ClockOffset) {
+        lock(&self.0).insert(node, (life, offset));
     }
 
-    /// Forgets `node`.
-    pub(crate) fn forget(&self, node: NodeAddress) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).remove(&node);
+    /// Forgets the offset of this life of `node`. It may be heard late that a life is over: that of another one stays.
+    pub(crate) fn forget(&self, node: NodeAddress, life: Incarnation) {
+        let mut offsets = lock(&self.0);
+        if offsets.get(&node).is_some_and(|(of, _)| *of == life) {
+            offsets.remove(&node);
+        }
     }
 }
 
@@ -200,5 +206,22 @@ mod tests {
         );
         assert_eq!(clock.in_our_clock(now, theirs(sent + 3 * SECOND)), None);
         assert_eq!(clock.in_our_clock(now, Time::MAX), None);
+    }
+
+    // spec: NDL-6
+    #[test]
+    fn an_offset_is_that_of_the_life_that_was_measured_last_and_of_no_other() {
+        let (offsets, node) = (ClockOffsets::default(), NodeAddress::new(7));
+        let [former, later] = [1, 2].map(Incarnation);
+        let of_both = || [former, later].map(|life| offsets.get(node, life));
+        offsets.set(node, former, offset(0, 0));
+        assert_eq!(of_both(), [Some(offset(0, 0)), None]);
+        offsets.set(node, later, offset(1, 0));
+        assert_eq!(of_both(), [None, Some(offset(1, 0))]);
+        // That the former one is over is heard late.
+        offsets.forget(node, former);
+        assert_eq!(of_both(), [None, Some(offset(1, 0))]);
+        offsets.forget(node, later);
+        assert_eq!(of_both(), [None, None]);
     }
 }

@@ -1,4 +1,4 @@
-//! Lines in the log that others cause by what they may do: connect, come and go. Many at once, one a second in the long run; and beside those a
+//! Lines in the log that others cause by what they may do: connect, come and go, move, leave wills. Many at once, one a second in the long run; and beside those a
 //! few of each one's own, so that who comes and goes without end leaves the others' ends in the log.
 
 use std::{collections::BTreeMap, sync::Mutex, time::Duration};
@@ -29,17 +29,26 @@ pub(crate) struct LogQuotas {
     pub(crate) clients: Quota<String>,
     /// Peers that are taken though the times of their certificates do not hold.
     pub(crate) times: Quota<NodeAddress>,
+    /// Nodes that listen elsewhere now.
+    pub(crate) moves: Quota<NodeAddress>,
+    /// Last wills of lost nodes that are executed.
+    pub(crate) wills: Quota<NodeAddress>,
+    /// Of these, those that were not taken.
+    pub(crate) wills_not_taken: Quota<NodeAddress>,
 }
 
 impl LogQuotas {
     /// Says now and then what was left out: nobody may have anything to say for long, and that is then not seen.
     pub(crate) fn tick(&self, now: Time) {
-        let Self { links, members, clients, times } = self;
+        let Self { links, members, clients, times, moves, wills, wills_not_taken } = self;
         let left_out = [
             ("link", links.left_out(now)),
             ("membership", members.left_out(now)),
             ("application", clients.left_out(now)),
             ("certificate", times.left_out(now)),
+            ("move", moves.left_out(now)),
+            ("last will", wills.left_out(now)),
+            ("last will not taken", wills_not_taken.left_out(now)),
         ];
         for (of, suppressed) in left_out.into_iter().filter(|(_, suppressed)| *suppressed > 0) {
             crate::log::warn!(of, suppressed, "so many lines were left out, as there are too many of them");

@@ -8,6 +8,7 @@ use std::{
     num::NonZeroUsize,
     path::PathBuf,
     sync::{Arc, Mutex},
+    time::Duration,
 };
 
 use bytes::BytesMut;
@@ -189,9 +190,9 @@ impl Secured {
         lock(&self.seals).made()
     }
 
-    /// That life of that node has proven itself, and said how many datagrams it had made.
-    pub(crate) fn confirm(&self, now: Time, said: Stamp) {
-        lock(&self.seals).confirm(now, said);
+    /// That life of that node has proven itself in a handshake that has `lasted` so long, and said in it how many datagrams it had made.
+    pub(crate) fn confirm(&self, now: Time, lasted: Duration, said: Stamp) {
+        lock(&self.seals).confirm(now, lasted, said);
     }
 }
 
@@ -244,8 +245,8 @@ impl Seals {
         self.sealer.made()
     }
 
-    fn confirm(&mut self, now: Time, said: Stamp) {
-        self.checker.confirm(now, said);
+    fn confirm(&mut self, now: Time, lasted: Duration, said: Stamp) {
+        self.checker.confirm(now, lasted, said);
     }
 }
 
@@ -307,7 +308,7 @@ mod tests {
         let (here, there) = (secured(&keys, 1), secured(&keys, 2));
         let before = sealed(&there, b"before");
         let said = Stamp { node: NODE, incarnation: Incarnation(2), number: there.made() };
-        here.confirm(Time::ZERO, said);
+        here.confirm(Time::ZERO, Duration::ZERO, said);
         let after = sealed(&there, b"after");
         assert!(opened(&here, &before).is_err());
         assert_eq!(opened(&here, &after), Ok(&b"after"[..]));

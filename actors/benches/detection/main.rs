@@ -27,7 +27,7 @@
 //! The table has p50, p99, p99.9 and the maximum in columns of their own; of 50 trials the 99th percentile is the maximum.
 //!
 //! Beside the times stand how many of the trials told the right reason first (`right`; of a restart the end or the new life), the bound of the
-//! settings (`bound_us`: for a stall 250 ms, one look at the node's progress, and one period), in how many trials a loss says of itself that
+//! settings (`bound_us`: for a stall 250 ms, one look at the node's progress, and one period), in how many trials a loss or a restart says of itself that
 //! the silence was within its own bound (`held`), in how many the application had the event within it (`in_time`, from the end of the act:
 //! NDL may have a real-time priority, the application has none), by how much either was missed at worst (`over_us`), events that belong to
 //! no act (`surprises`), and how often the observer said of itself that it was starved (`own_stalls`). Each trial that told a wrong reason,

@@ -177,13 +177,13 @@ impl<'a> Scene<'a> {
         let after = at.since(act.began);
         let (silent, bound) = match event {
             // What it says itself.
-            NodeEvent::NodeLost { silent_us, bound_us, .. } => {
+            NodeEvent::NodeLost { silent_us, bound_us, .. }
+            | NodeEvent::NodeRestarted { silent_us, bound_us, .. } => {
                 (Duration::from_micros(*silent_us), Duration::from_micros(*bound_us))
             }
-            NodeEvent::NodeFound { .. }
-            | NodeEvent::AppStalled { .. }
-            | NodeEvent::AppResumed { .. }
-            | NodeEvent::NodeRestarted { .. } => (Duration::ZERO, way.bound(setting)),
+            NodeEvent::NodeFound { .. } | NodeEvent::AppStalled { .. } | NodeEvent::AppResumed { .. } => {
+                (Duration::ZERO, way.bound(setting))
+            }
         };
         let since_the_act = at.since(act.over);
         self.seen.told.record(after);

@@ -237,10 +237,10 @@ impl Inbound {
     /// The time at which the peer sent it, in our clock; never later than `now`. And how wrong that may be: more, the longer NDL has not heard
     /// of the peer.
     ///
-    /// As long as nobody has measured the peer's clock, or it is elsewhere than it was measured, its time to live counts from `now`, and whoever gets it is told that its age is not
-    /// known.
+    /// As long as nobody has measured the clock of this life of the peer, or it is elsewhere than it was measured, its time to live counts from `now`, and whoever gets it is told that its age is not
+    /// known. That of another life says nothing: it may have been on another host.
     fn turn_to_our_clock(&self, now: Time, header: &mut Header) {
-        let measured = self.stores.clocks.get(self.peer.node);
+        let measured = self.stores.clocks.get(self.peer.node, self.peer.incarnation);
         let times = measured.and_then(|clock| clock.in_our_clock(now, header.sent));
         header.sent = times.map_or(now, |(sent, _)| sent);
         header.set_sent_error(times.map(|(_, error)| error));

@@ -254,16 +254,15 @@ impl Shell {
                 let _ = self.to_probe.try_send(Probe { node, incarnation, to, within });
             }
             Output::Fact(fact) => self.tell_layers(&fact),
-            Output::Moved { node, gncl, .. } => {
-                crate::log::info!(%node, ?gncl, "the node listens there now");
-                self.tell();
-            }
+            Output::Moved { node, gncl, .. } => self.tell_of_a_move(node, &gncl),
             Output::Forgotten { node, incarnation } => {
                 crate::log::warn!(%node, life = %incarnation, "the node is there in an earlier life than this one: its clock went back");
                 self.tell();
             }
             Output::Event { to, event } => self.tell_application(to, &event),
-            Output::ClockMeasured { node, offset } => self.stores.clocks.set(node, offset),
+            Output::ClockMeasured { node, incarnation, offset } => {
+                self.stores.clocks.set(node, incarnation, offset);
+            }
             Output::Collision { node, holder, newcomer } => crate::log::error!(
                 "node address {node} is used twice: by {holder}, and by {newcomer}, which is not let in; give one of \
                  them another `address`"

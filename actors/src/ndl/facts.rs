@@ -85,6 +85,13 @@ pub enum NodeEvent {
         name: String,
         /// Which life of it this is.
         incarnation: Incarnation,
+        /// Time since the last sign of the life before, in microseconds. It may be more than `bound_us` where that life was lost, or had left,
+        /// before this one came: that was told as [`NodeLost`](Self::NodeLost), unless the application was behind.
+        #[serde(default)]
+        silent_us: u64,
+        /// Time within which that life would have been lost for its silence, as in [`NodeLost`](Self::NodeLost), in microseconds.
+        #[serde(default)]
+        bound_us: u64,
     },
 }
 
@@ -121,4 +128,33 @@ pub enum LossReason {
     Restarted,
     /// Another process holds its node address, and held it before: nodes listen to that one.
     Duplicate,
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew_runtime::wire::{decode, encode};
+
+    use super::*;
+
+    /// As it was when it did not say yet how long the life before had been silent.
+    #[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
+    enum FormerEvent {
+        NodeRestarted { node: NodeAddress, name: String, incarnation: Incarnation },
+    }
+
+    #[test]
+    fn a_restart_is_understood_by_who_does_not_know_of_silences_and_from_him() {
+        let (node, incarnation) = (NodeAddress::new(7), Incarnation(2));
+        let name = || "knee".to_owned();
+        let former = FormerEvent::NodeRestarted { node, name: name(), incarnation };
+        let of_silence = |silent_us, bound_us| {
+            let name = name();
+            NodeEvent::NodeRestarted { node, name, incarnation, silent_us, bound_us }
+        };
+        let from_him: NodeEvent = decode(&encode(&former)).expect("what he does not say is 0");
+        assert_eq!(from_him, of_silence(0, 0));
+        let bytes = encode(&of_silence(5, 9));
+        let to_him: FormerEvent = decode(&bytes).expect("what he does not know is skipped");
+        assert_eq!(to_him, former);
+    }
 }

@@ -67,6 +67,8 @@ mod untold;
 pub(crate) use actor::{NdlActor, new_core};
 pub(crate) use address::is_same_host;
 pub(crate) use core::Core;
+#[cfg(test)]
+pub(crate) use core::Input;
 pub use core::{IdleApp, KnownNode, KnownRoute, OwnStalls, Source, TroubledApp};
 pub(crate) use core::{LostNode, SourceCounts};
 pub(crate) use datagram::{FURTHER_MAX, PATHS_MAX};

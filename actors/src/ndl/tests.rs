@@ -195,7 +195,8 @@ fn two_nodes_find_each_other_by_multicast_alone_and_know_their_clocks() {
         second.finds(&first).await;
         assert!(first.sources().contains(&Source::Multicast), "{:?}", first.sources());
         // One host has one clock: what is measured is the error, and it keeps to its bound.
-        let offset = first.stores.clocks.get(second.stores.node).expect("measured before the fact is told");
+        let (node, life) = (second.stores.node, second.stores.incarnation);
+        let offset = first.stores.clocks.get(node, life).expect("measured before the fact is told");
         assert!(offset.theirs_minus_ours_ns.unsigned_abs() as u128 <= offset.bound.as_nanos(), "{offset:?}");
     });
 }
@@ -245,7 +246,7 @@ fn an_application_hears_who_comes_and_who_falls_silent() {
         first.loses(&second, LossReason::Crashed).await;
         let lost: NodeEvent = first.event().await.decode().unwrap();
         assert!(matches!(lost, NodeEvent::NodeLost { why: LossReason::Crashed, .. }), "{lost:?}");
-        assert_eq!(first.stores.clocks.get(second.stores.node), None);
+        assert_eq!(first.stores.clocks.get(node, incarnation), None);
     });
 }
 
@@ -291,6 +292,8 @@ fn a_node_that_stops_says_goodbye_and_a_later_life_is_a_restart() {
         let third = Node::start_life(2, 2, |ndl| ndl.seeds = vec![seed.into()]).await;
         // then
         first.finds(&third).await;
+        let clock = |life| first.stores.clocks.get(third.stores.node, Incarnation(life));
+        assert!(clock(2).is_some() && clock(1).is_none(), "{:?}", [1, 2].map(clock));
         let event: NodeEvent = first.event().await.decode().unwrap();
         assert!(matches!(event, NodeEvent::NodeRestarted { incarnation: Incarnation(2), .. }), "{event:?}");
     });

@@ -4,6 +4,7 @@
 use std::{
     collections::{BTreeMap, BTreeSet, VecDeque},
     num::NonZeroUsize,
+    time::Duration,
 };
 
 use bytes::BytesMut;
@@ -156,7 +157,7 @@ impl Play {
     fn confirm(&mut self, index: usize) {
         let (node, incarnation) = (NODES[index], self.lives[index]);
         let number = self.nodes[index].made();
-        self.receiver.confirm(Time::ZERO, Stamp { node, incarnation, number });
+        self.receiver.confirm(Time::ZERO, Duration::ZERO, Stamp { node, incarnation, number });
         if self.proven.get(&node).is_none_or(|known| known.incarnation != incarnation) {
             let taken = BTreeSet::new();
             self.proven.insert(node, Proven { incarnation, highest: number, before: number, taken });

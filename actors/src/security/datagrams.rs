@@ -20,7 +20,7 @@
 //!
 //! Whether another life is later or earlier is not asked: a robot without a battery for its clock may come back with a smaller number.
 
-use std::{collections::BTreeMap, fmt, num::NonZeroUsize};
+use std::{collections::BTreeMap, fmt, num::NonZeroUsize, time::Duration};
 
 use ring::{
     hkdf, hmac,
@@ -38,6 +38,10 @@ use super::replay::Window;
 /// So many numbers up to the highest one that was taken of a life may still be taken.
 #[cfg(feature = "fuzzing")]
 pub(crate) const SPAN: u64 = Window::SPAN;
+
+/// A datagram takes its maker so long at least: one thread makes them all, with an HMAC and a call of the system for each. So no life makes more
+/// than a million in a second.
+const EACH_TAKES: Duration = Duration::from_micros(1);
 
 /// The project's key for datagrams, the same on all nodes.
 #[derive(Clone)]
@@ -216,15 +220,18 @@ impl Checker {
 
     /// A handshake has proven that this life of this node is there, and it has said in it how many datagrams it had made (`said.number`): of
     /// these none counts any more, whoever recorded them. Of a life that was confirmed already nothing is forgotten, unless a number was taken
-    /// that it has not come near to: somebody else made that one, to have it taken for repeating itself. Where there is no room,
-    /// the node that was silent longest is no longer confirmed, which costs it a dial.
-    pub fn confirm(&mut self, now: Time, said: Stamp) {
+    /// that it cannot have come near to since the handshake began, so long ago as this has `lasted`: somebody else made that one, to have it
+    /// taken for repeating itself. Its word may have been held up for all that time, and what it made meanwhile is its own. Where there is no
+    /// room, the node that was silent longest is no longer confirmed, which costs it a dial.
+    // spec: NDL-1.3
+    pub fn confirm(&mut self, now: Time, lasted: Duration, said: Stamp) {
         let Stamp { node, incarnation, number } = said;
         if let Some(life) = self.confirmed.get_mut(&node)
             && life.incarnation == incarnation
         {
             life.heard = now;
-            if life.window.is_beyond(number) {
+            let meanwhile = lasted.as_nanos() / EACH_TAKES.as_nanos();
+            if life.window.is_beyond(number, u64::try_from(meanwhile).unwrap_or(u64::MAX)) {
                 life.window = Window::after(number);
             }
             return;

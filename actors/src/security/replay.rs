@@ -29,10 +29,10 @@ impl Window {
         Self { highest: number, taken }
     }
 
-    /// Whether a number was taken that is so far after `made` that it hides the next ones. What is made between a handshake's word and its
-    /// arrival is much less.
-    pub(super) const fn is_beyond(&self, made: u64) -> bool {
-        self.highest.saturating_sub(made) > Self::SPAN
+    /// Whether a number was taken that is so far after `made` that it hides the next ones, also if `meanwhile` more were made since that was
+    /// said.
+    pub(super) const fn is_beyond(&self, made: u64, meanwhile: u64) -> bool {
+        self.highest.saturating_sub(made) > Self::SPAN.saturating_add(meanwhile)
     }
 
     const fn word(number: u64) -> usize {
@@ -107,6 +107,14 @@ mod tests {
             );
             assert!((made + 1..made + 200).all(|number| window.take(number)), "{made}");
         }
+    }
+
+    #[test]
+    fn a_number_is_beyond_what_was_made_if_it_hides_the_next_ones_and_cannot_have_been_made_meanwhile() {
+        let mut window = Window::after(0);
+        assert!(window.take(Window::SPAN + 101));
+        assert!(window.is_beyond(0, 100));
+        assert!(!window.is_beyond(0, 101) && !window.is_beyond(1, 100) && !window.is_beyond(0, u64::MAX));
     }
 
     proptest! {

@@ -138,6 +138,11 @@ impl Core {
         self.peers.values().filter_map(|peer| peer.due).min()
     }
 
+    /// The life of a node that was told to be linked last, if its link is not told to be broken.
+    pub(super) fn linked(&self, node: NodeAddress) -> Option<Incarnation> {
+        self.peers.get(&node)?.linked
+    }
+
     fn at(&mut self, node: NodeAddress) -> Option<&mut Peer> {
         if !self.peers.contains_key(&node) && self.peers.len() >= self.nodes_max {
             return None;

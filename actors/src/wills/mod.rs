@@ -12,6 +12,7 @@
 //! | WILL-3 | That a node is there in a new life is the loss of the old one, whoever says so first. |
 //! | WILL-4 | A will of more than 1,024 bytes, and what is more than 256 wills of a node or than `payload_max` has room for, stays at home. One list is held of each of `ndl.nodes_max` nodes. |
 //! | WILL-5 | The wills of a node whose certificate is revoked are not executed, whatever becomes of it. |
+//! | WILL-6 | A list about another life of its node than the one that is linked is refused in words, and counted. |
 
 mod core;
 #[cfg(feature = "fuzzing")]

@@ -93,8 +93,10 @@ pub(crate) fn receive(stores: &Stores, from: NodeAddress, message: &Message) -> 
         return Err(format!("from {from}, wills: one of them is not what a will may be"));
     }
     let incarnation = testament.incarnation;
-    if gncl::proven_life(stores, from).is_some_and(|life| life != incarnation) {
-        return Err(format!("from {from}, wills: of another life than that which has proven itself"));
+    if !is_linked(stores, from, incarnation) {
+        return Err(format!(
+            "from {from}, wills: they are of another life of its node than the one that is linked"
+        ));
     }
     feed(stores, Input::Told { from, testament });
     // Asked behind it: who has the certificate put on the list meanwhile drops what is there then.
@@ -102,6 +104,16 @@ pub(crate) fn receive(stores: &Stores, from: NodeAddress, message: &Message) -> 
         revoke(stores, from, incarnation);
     }
     Ok(())
+}
+
+/// Whether this life of a node is the one that is linked: as GNCL has it now or, of what came before that, as it was told behind what came
+/// before it. Where nodes prove who they are, only the one that did so last. spec: WILL-6
+fn is_linked(stores: &Stores, node: NodeAddress, life: Incarnation) -> bool {
+    if let Some(proven) = gncl::proven_life(stores, node) {
+        return proven == life;
+    }
+    let now = stores.gncl.peer(node).map(|peer| peer.incarnation);
+    now == Some(life) || lock(&stores.wills).linked(node) == Some(life)
 }
 
 /// The certificate with which this life of a node was linked is revoked. spec: WILL-5
@@ -119,7 +131,8 @@ fn tell(stores: &Stores, to: NodeAddress, testament: &Testament) {
     let _ = stores.router.send(Message::new(header, payload.into()));
 }
 
-/// Hands the will to those of our own applications that it is for.
+/// Hands the will to those of our own applications that it is for. One node may leave as many as it likes, again and again: each line in the
+/// log is one of so many.
 fn execute(stores: &Stores, (node, life): (NodeAddress, Incarnation), will: &HeldWill) {
     let (Some(heir), Some(class)) = (will.heir(), will.class()) else { return };
     let destination = match &heir {
@@ -135,14 +148,18 @@ fn execute(stores: &Stores, (node, life): (NodeAddress, Incarnation), will: &Hel
     let mut header = Header::new(will.kind, Tid::new(node, will.app), destination);
     header.class = class;
     header.sent = Time::now();
-    crate::log::warn!(source = %header.source, %destination, "the last will of an application of a lost node");
+    if let Some(suppressed) = stores.log_quotas.wills.take(&node, header.sent) {
+        crate::log::warn!(source = %header.source, %destination, suppressed, "the last will of an application of a lost node");
+    }
     let message = Message::new(header, will.payload());
     // The next life of the node may be here already, and call others so.
     let delivered = match stores.access.get().and_then(|access| access.of_life(node, life)) {
         Some(guard) => stores.router.deliver_judged_by(message, &guard),
         None => stores.router.deliver(message),
     };
-    if let Err(why) = delivered {
-        crate::log::error!(source = %header.source, %destination, %why, "a last will was not taken");
+    if let Err(why) = delivered
+        && let Some(suppressed) = stores.log_quotas.wills_not_taken.take(&node, header.sent)
+    {
+        crate::log::error!(source = %header.source, %destination, %why, suppressed, "a last will was not taken");
     }
 }

@@ -13,7 +13,12 @@ use sinew_runtime::{
 use super::{
     Core, Input,
     core::{Output, REPEAT},
+    feed, receive,
     words::{HeldWill, PAYLOAD_MAX, Testament, WILLS_MAX},
+};
+use crate::{
+    config::NodeConfig,
+    stores::{Stores, lock},
 };
 
 const THERE: NodeAddress = NodeAddress::new(0x7f00_0002);
@@ -106,6 +111,48 @@ fn the_wills_of_a_node_whose_certificate_is_revoked_are_not_executed() {
     bench.hears(told(NEXT_LIFE, 1));
     bench.hears(revoked());
     assert_eq!(executed(&bench.hears(Input::NodeLost { node: THERE, incarnation: NEXT_LIFE })), 1);
+}
+
+// spec: WILL-6
+#[test]
+fn a_list_of_another_life_than_the_linked_one_is_refused_in_words_and_has_none_executed() {
+    let stores = Stores::for_test(NodeConfig::new("hip"), LIFE);
+    let said = |life| said(Incarnation(life), app(0), &will(3));
+    assert!(receive(&stores, THERE, &said(5)).is_err(), "nobody is linked");
+    feed(&stores, UP);
+    receive(&stores, THERE, &said(5)).expect("of the life that is linked");
+    // When: it says that it is in ever later lives
+    for life in [4, 6, 7, u64::MAX] {
+        let refused = receive(&stores, THERE, &said(life)).expect_err("of another life");
+        assert!(refused.contains("another life"), "{refused}");
+    }
+    // Then: the list of its life is held still, and no other
+    let mut core = lock(&stores.wills);
+    let mut executed_at = |end| {
+        core.handle(Time::now(), end);
+        let outputs: Vec<_> = std::iter::from_fn(|| core.poll()).collect();
+        executed(&outputs)
+    };
+    assert_eq!(executed_at(LOST), 1);
+    assert_eq!(executed_at(Input::NodeLost { node: THERE, incarnation: Incarnation(u64::MAX) }), 0);
+}
+
+#[test]
+fn who_leaves_wills_without_end_has_so_many_lines_in_the_log_and_no_more() {
+    let stores = Stores::for_test(NodeConfig::new("hip"), LIFE);
+    // Nobody is there who takes them.
+    let heir = Heir::Tid(Tid::new(stores.node, app(1)));
+    let held = HeldWill::new(app(0), &Will { heir, ..will(3) }).expect("one that others hold");
+    for life in [5, 6, 7] {
+        let (node, incarnation) = (THERE, Incarnation(life));
+        let testament = Testament { incarnation, version: 1, wills: vec![held.clone(); WILLS_MAX] };
+        feed(&stores, Input::Told { from: node, testament });
+        feed(&stores, Input::NodeLost { node, incarnation });
+    }
+    let quotas = &stores.log_quotas;
+    for quota in [&quotas.wills, &quotas.wills_not_taken] {
+        assert_ne!(quota.take(&THERE, Time::now()), Some(0), "some were left out");
+    }
 }
 
 // spec: WILL-2

@@ -106,7 +106,9 @@ impl Gncl {
                 let known = |node| self.core.knows(node);
                 self.stores.gncl.proofs.note((node, incarnation), peer.clone(), nodes_max, known);
             }
-            secured.confirm(Time::now(), Stamp { node, incarnation, number: wire.datagrams_made });
+            let (now, said) = (Time::now(), Stamp { node, incarnation, number: wire.datagrams_made });
+            // Each end says so after the handshake of TLS, and so after this one knew the connection: however long its word was held up.
+            secured.confirm(now, now.since(wire.began), said);
         }
     }
 

@@ -15,6 +15,8 @@ pub(super) struct Wire {
     pub(super) transport: Option<Transport>,
     /// Who is at the other end, if its keys have proven it.
     pub(super) proven: Option<Peer>,
+    /// When it was accepted, or dialled.
+    pub(super) began: Time,
     /// Datagrams of discovery that the other end had made when it introduced itself.
     pub(super) datagrams_made: u64,
     pub(super) mode: SharedMode,
@@ -39,6 +41,7 @@ impl Wire {
         Self {
             transport,
             proven: None,
+            began: Time::now(),
             datagrams_made: 0,
             mode,
             link: None,

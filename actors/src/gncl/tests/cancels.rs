@@ -149,6 +149,7 @@ fn a_request_whose_time_is_over_is_not_handled_though_nobody_takes_it_back() {
         // Else it would count as sent when it came.
         b.stores.clocks.set(
             a.address(),
+            a.stores.incarnation,
             ClockOffset {
                 theirs_minus_ours_ns: 0,
                 bound: Duration::ZERO,

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
-    tid::{AppAddress, NodeAddress, Tid},
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
     wire::{Class, Flags, Kind, Message},
 };
@@ -101,7 +101,7 @@ fn times_are_in_our_clock_and_what_is_too_old_on_arrival_has_expired() {
         let hour = 3_600_000_000_000;
         let (at, drift) = (Time::now(), ClockDrift { ppb: 0, bound_ppb: 0 });
         let offset = ClockOffset { theirs_minus_ours_ns: hour, bound: Duration::from_millis(1), at, drift };
-        node.stores.clocks.set(NINE, offset);
+        node.stores.clocks.set(NINE, Incarnation(1), offset);
         let sent = Time::now() - Duration::from_secs(1);
 
         let mut fresh = from_nine(&node, b"fresh");
@@ -131,7 +131,7 @@ fn of_a_peer_whose_clock_nobody_measures_any_more_ages_are_known_ever_less_exact
         let drift = ClockDrift { ppb: 50_000, bound_ppb: 5_000 };
         let at = Time::now() - Duration::from_secs(60);
         let measured = ClockOffset { theirs_minus_ours_ns: 0, bound: Duration::from_micros(50), at, drift };
-        node.stores.clocks.set(NINE, measured);
+        node.stores.clocks.set(NINE, Incarnation(1), measured);
 
         // Its clock is 3 ms ahead by now.
         let sent = Time::now() - Duration::from_secs(1);
@@ -159,6 +159,31 @@ fn without_a_measured_clock_a_message_lives_from_when_it_came_and_is_of_unknown_
         message.header.sent = Time::from_nanos(1);
         message.header.time_to_live_us = 1_000_000;
         peer.say(&message).await;
+        let came = next("the message", &mut inbox).await.header;
+        assert!(before <= came.sent && came.sent <= Time::now());
+        assert_eq!((came.sent_error(), came.known_sent()), (None, Time::ZERO));
+    });
+}
+
+// spec: GNCL-11
+#[test]
+fn what_a_new_life_sends_has_no_age_by_the_clock_of_the_life_before_it() {
+    run(async {
+        // Given: the life before was on a host that has been up for an hour longer, and nobody has measured the clock of this one.
+        let mut node = Node::start(1).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let mut inbox = node.app(1);
+        let life = node.stores.gncl.peer(NINE).expect("it is linked").incarnation;
+        let (at, drift) = (Time::now(), ClockDrift { ppb: 0, bound_ppb: 0 });
+        let (theirs_minus_ours_ns, bound) = (3_600_000_000_000, Duration::from_micros(50));
+        let offset = ClockOffset { theirs_minus_ours_ns, bound, at, drift };
+        node.stores.clocks.set(NINE, Incarnation(life.0 - 1), offset);
+        // When
+        let before = Time::now();
+        let mut message = from_nine(&node, b"");
+        message.header.time_to_live_us = 60_000_000;
+        peer.say(&message).await;
+        // Then: it is not taken for an hour old
         let came = next("the message", &mut inbox).await.header;
         assert!(before <= came.sent && came.sent <= Time::now());
         assert_eq!((came.sent_error(), came.known_sent()), (None, Time::ZERO));

@@ -11,7 +11,7 @@ use sinew_runtime::{
 };
 use tokio::net::TcpListener;
 
-use super::bench::{ByHand, Cable, NINE, Node, introduction, next, run, within};
+use super::bench::{ByHand, Cable, NINE, Node, introduction, next, pair, run, within};
 use crate::{
     config::NodeConfig,
     gncl::{Event, LinkFact, core::write, peer::frame, secure::is_sealed},
@@ -205,13 +205,7 @@ fn the_wills_of_a_node_whose_certificate_is_revoked_are_held_no_more_and_not_tak
         let (mut a, b, _cable) = two(&keys()).await;
         let (node, incarnation) = (b.address(), Incarnation(1));
         let mut heir = a.app(1);
-        let will = Will {
-            heir: Heir::Tid(a.tid(1)),
-            kind: Kind::named("stop"),
-            class: Class::Control,
-            payload: Bytes::new(),
-            when: LastWill::OnDeath,
-        };
+        let will = will_for_app_1_of(&a);
         let says = wills::tests::said(incarnation, b.tid(1).app, &will);
         wills::receive(&a.stores, node, &says).expect("a legal one");
         // Those of a life that is still to come would outlive it.
@@ -225,6 +219,34 @@ fn the_wills_of_a_node_whose_certificate_is_revoked_are_held_no_more_and_not_tak
         wills::feed(&a.stores, wills::Input::NodeLost { node, incarnation });
         wills::feed(&a.stores, wills::Input::LinkUp { node, incarnation: Incarnation(9) });
         // Then: what comes next is not its
+        a.send(a.tid(1), b"afterwards");
+        assert_eq!(next("a message", &mut heir).await.payload[..], *b"afterwards");
+    });
+}
+
+fn will_for_app_1_of(node: &Node) -> Will {
+    Will {
+        heir: Heir::Tid(node.tid(1)),
+        kind: Kind::named("stop"),
+        class: Class::Control,
+        payload: Bytes::new(),
+        when: LastWill::OnDeath,
+    }
+}
+
+// spec: WILL-6
+#[test]
+fn wills_of_another_life_than_the_linked_one_are_not_taken_where_nobody_has_keys_either() {
+    run(async {
+        let (a, b) = pair().await;
+        let (mut heir, will) = (a.app(1), will_for_app_1_of(&a));
+        let says = |life| wills::tests::said(Incarnation(life), b.tid(1).app, &will);
+        wills::receive(&a.stores, b.address(), &says(1)).expect("of the life that is linked");
+        // When: on one link lists come of ever later lives
+        for life in 2..10 {
+            assert!(wills::receive(&a.stores, b.address(), &says(life)).is_err(), "of another life: {life}");
+        }
+        // Then: none was executed
         a.send(a.tid(1), b"afterwards");
         assert_eq!(next("a message", &mut heir).await.payload[..], *b"afterwards");
     });

@@ -1,11 +1,11 @@
 //! What the core has to say to layers and applications.
 
-use std::{rc::Rc, time::Duration};
+use std::{net::SocketAddr, rc::Rc, time::Duration};
 
 use sinew_runtime::{
     mailbox::About,
     outcome::Rejection,
-    tid::{AppAddress, Tid},
+    tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wire::Message,
 };
@@ -46,16 +46,32 @@ impl Shell {
         self.tell();
     }
 
+    /// A member listens elsewhere now. It may say so each second, for ever.
+    pub(super) fn tell_of_a_move(&self, node: NodeAddress, gncl: &[SocketAddr]) {
+        if let Some(suppressed) = self.stores.log_quotas.moves.take(&node, Time::now()) {
+            crate::log::info!(%node, ?gncl, suppressed, "the node listens there now");
+        }
+        self.tell();
+    }
+
     fn fence(&self, fact: &MembershipFact) {
         let MembershipFact::NodeLost { node, incarnation, why } = *fact else { return };
-        self.stores.clocks.forget(node);
         match why {
-            LossReason::Left => self.stores.gncl.leaves(Time::now(), node, incarnation),
+            LossReason::Left => {
+                // What it still sends has its age by its clock, until GNCL forgets it.
+                if self.stores.gncl.peer(node).is_none_or(|peer| peer.incarnation != incarnation) {
+                    self.stores.clocks.forget(node, incarnation);
+                }
+                self.stores.gncl.leaves(Time::now(), node, incarnation);
+            }
             LossReason::Crashed
             | LossReason::Hung
             | LossReason::LinkDown
             | LossReason::Restarted
-            | LossReason::Duplicate => self.stores.gncl.fence(node, incarnation),
+            | LossReason::Duplicate => {
+                self.stores.clocks.forget(node, incarnation);
+                self.stores.gncl.fence(node, incarnation);
+            }
         }
     }
 
@@ -103,5 +119,23 @@ const fn about(event: &NodeEvent) -> About {
         NodeEvent::NodeFound { node, .. }
         | NodeEvent::AppStalled { node, .. }
         | NodeEvent::AppResumed { node, .. } => About::Node(*node),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew_runtime::tid::Incarnation;
+
+    use super::*;
+    use crate::{config::NodeConfig, stores::Stores};
+
+    #[test]
+    fn a_node_that_moves_without_end_has_so_many_lines_in_the_log_and_no_more() {
+        let stores = Stores::for_test(NodeConfig::new("hip"), Incarnation(1));
+        stores.gncl_listen.get_or_init(|| ([127, 0, 0, 1], 1).into());
+        let (shell, _readers) = Shell::bind(stores.clone()).expect("any free port");
+        let (node, gncl) = (NodeAddress::new(0x0a00_0002), [SocketAddr::from(([10, 0, 0, 2], 5_000))]);
+        (0..1_000).for_each(|_| shell.tell_of_a_move(node, &gncl));
+        assert_ne!(stores.log_quotas.moves.take(&node, Time::now()), Some(0), "some were left out");
     }
 }

@@ -39,6 +39,7 @@ impl Questions {
         self.0.remove(at)
     }
 
+    #[cfg(test)]
     pub(super) fn newest(&self) -> Option<Question> {
         self.0.back().copied()
     }
@@ -69,6 +70,8 @@ pub(super) struct Contact {
     pub(super) since: Time,
     pub(super) sources: BTreeMap<Source, Time>,
     pub(super) questions: Questions,
+    /// When it was asked last because of something that was heard.
+    pub(super) looked_at: Option<Time>,
     /// Datagrams that it may send; only members and seeds have a budget of their own.
     pub(super) budget: Bucket,
     /// Answers to our questions that it may send.
@@ -83,6 +86,7 @@ impl Contact {
             since: now,
             sources: BTreeMap::from([(source, now)]),
             questions: Questions::default(),
+            looked_at: None,
             budget: Bucket::full(KNOWN, now),
             answers: Bucket::full(KNOWN, now),
         }

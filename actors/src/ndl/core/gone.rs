@@ -1,6 +1,6 @@
 //! Nodes that are gone: their last lives, which no former one follows, and where they are asked, for they may be back.
 
-use std::net::SocketAddr;
+use std::{net::SocketAddr, time::Duration};
 
 use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
@@ -13,10 +13,30 @@ use super::{
 };
 use crate::ndl::{LossReason, datagram::Announcement};
 
+/// How long a life has given no sign.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Silence {
+    pub(super) lasts: Duration,
+    /// Within how much of that a loss is known.
+    pub(super) bound: Duration,
+}
+
+impl Silence {
+    /// As events say it: how long it lasts, and its bound, in microseconds.
+    pub(super) fn micros(self) -> (u64, u64) {
+        let micros = |time: Duration| u64::try_from(time.as_micros()).unwrap_or(u64::MAX);
+        (micros(self.lasts), micros(self.bound))
+    }
+}
+
 /// The last life of a node that is gone.
 #[derive(Debug)]
 pub(super) struct Gone {
     pub(super) since: Time,
+    /// Its last sign of life.
+    heard: Time,
+    /// Time after that within which its loss was to be known.
+    bound: Duration,
     /// It said so, and is asked no more.
     pub(super) has_left: bool,
     /// Where it was asked.
@@ -26,6 +46,11 @@ pub(super) struct Gone {
 }
 
 impl Gone {
+    /// How long it has given no sign, before its end and since.
+    pub(super) const fn silence(&self, now: Time) -> Silence {
+        Silence { lasts: now.since(self.heard), bound: self.bound }
+    }
+
     /// Whether it is asked there because it is gone.
     pub(super) fn is_asked_at(&self, place: &Place) -> bool {
         !self.has_left && self.places.contains(place)
@@ -33,6 +58,11 @@ impl Gone {
 }
 
 impl Core {
+    /// How long a member has given no sign.
+    pub(super) fn silence(&self, now: Time, member: &Member) -> Silence {
+        Silence { lasts: now.since(member.heard), bound: self.paces[member.pace].bound() }
+    }
+
     /// Keeps the last life of a lost node, so that a former one never comes back. // spec: NDL-7.1
     pub(super) fn remember(&mut self, now: Time, member: &Member, why: LossReason) {
         if self.gone.len() >= self.nodes_max
@@ -47,7 +77,8 @@ impl Core {
             places.push(member.routes.best());
         }
         let has_left = why == LossReason::Left;
-        self.gone.insert(node, Gone { since: now, has_left, places, incarnation, boot_nonce });
+        let (heard, bound) = (member.heard, self.paces[member.pace].bound());
+        self.gone.insert(node, Gone { since: now, heard, bound, has_left, places, incarnation, boot_nonce });
     }
 
     /// Who was lost may be in reach from an address that we did not have; who has left is looked for nowhere.

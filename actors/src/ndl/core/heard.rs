@@ -3,7 +3,7 @@
 //! A datagram proves nothing: anybody can write any source address on it. An answer to a question that we asked at an
 //! address, and at no other, proves that somebody is at that address.
 
-use std::net::SocketAddr;
+use std::{net::SocketAddr, time::Duration};
 
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
@@ -29,8 +29,20 @@ enum Speaker {
     Stranger,
 }
 
-/// Time between two questions to one address outside the cycle, so that nobody makes us flood a third.
-const ASK_GAP_MS: u64 = 10;
+/// What somebody said whom we did not ask.
+#[derive(Clone, Copy, Debug)]
+struct Word {
+    from: Place,
+    source: Source,
+    /// Whose word it is.
+    node: NodeAddress,
+    speaker: Speaker,
+    /// When it was sent, in that one's clock.
+    sent: Time,
+}
+
+/// Time between two questions to one address because of something that was heard, so that nobody makes us flood a third.
+const ASK_GAP: Duration = Duration::from_millis(10);
 
 impl Core {
     /// Takes in a datagram, if its sender's budget allows. // spec: NDL-7.2
@@ -99,7 +111,7 @@ impl Core {
             Way::Unicast => Source::Query,
             Way::Multicast => Source::Multicast,
         };
-        self.heard(now, from, source, (announcement.node, speaker));
+        self.heard(now, Word { from, source, node: announcement.node, speaker, sent: query_sent });
     }
 
     // spec: NDL-3.1
@@ -118,8 +130,8 @@ impl Core {
             self.confirmed(now, Proof { from, asked: question.asked, announcement, exchange, progress });
         } else if self.group_questions.has(correlation) {
             // Who answers the group's question is asked by himself: only that proves his address.
-            let speaker = self.speaker(from, &answer.announcement);
-            self.heard(now, from, Source::Multicast, (answer.announcement.node, speaker));
+            let (node, speaker) = (answer.announcement.node, self.speaker(from, &answer.announcement));
+            self.heard(now, Word { from, source: Source::Multicast, node, speaker, sent: answer_sent });
         } else {
             let what = format_args!("{} answers what it was not asked, or twice, or too late", from.there);
             self.refusals.count(now, "NDL answer without a question", &what);
@@ -160,13 +172,16 @@ impl Core {
     }
 
     /// Somebody spoke who may be a node. // spec: NDL-2.2
-    fn heard(&mut self, now: Time, from: Place, source: Source, (node, speaker): (NodeAddress, Speaker)) {
+    fn heard(&mut self, now: Time, word: Word) {
+        let Word { from, source, node, speaker, sent } = word;
         match speaker {
             Speaker::MemberOnItsRoute => {}
             Speaker::MemberWhereItSays => self.look_at(now, from, source),
             Speaker::Stranger => return self.look_at(now, from, source),
         }
-        if let Some(member) = self.members.get_mut(&node) {
+        if self.is_a_sign(now, node, sent)
+            && let Some(member) = self.members.get_mut(&node)
+        {
             member.heard = now;
             if source == Source::Query {
                 // Who asks us lives, whatever becomes of our questions; he asks us as long as he hears our answers. spec: NDL-4.7
@@ -196,7 +211,7 @@ impl Core {
         places.into_iter().for_each(|place| self.look_at(now, place, source));
     }
 
-    /// Asks at `place` at once, unless it was asked just now.
+    /// Asks at `place` at once, unless something that was heard had it asked just now.
     fn look_at(&mut self, now: Time, place: Place, source: Source) {
         if !self.contacts.contains_key(&place) {
             self.make_room_for_a_candidate(now);
@@ -206,9 +221,12 @@ impl Core {
     }
 
     pub(super) fn ask_unless_just_asked(&mut self, now: Time, place: Place) {
-        let newest = self.contacts.get(&place).and_then(|contact| contact.questions.newest());
-        let asked = newest.map(|question| question.asked);
-        if asked.is_none_or(|asked| now.since(asked).as_millis() >= u128::from(ASK_GAP_MS)) {
+        let Some(mut contact) = self.contacts.get_mut(&place) else { return };
+        // What the cycle asked, or who was missed, does not count: the answer may have been due from a life that is over, and this one says
+        // that it has begun.
+        if contact.looked_at.is_none_or(|at| now.since(at) >= ASK_GAP) {
+            contact.looked_at = Some(now);
+            drop(contact);
             self.ask(now, place);
         }
     }

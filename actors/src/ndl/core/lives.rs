@@ -13,6 +13,7 @@ use super::{
     contact::{Contact, Role},
     contacts::ContactMut,
     cycle::IN_A_ROW_MAX,
+    gone::Silence,
     recall::Loss,
     routes::Routes,
     troubles::Troubles,
@@ -58,7 +59,8 @@ pub(super) struct Contest {
 #[derive(Clone, Copy, Debug)]
 enum Arrival {
     Found,
-    Restarted,
+    /// It was there before, in another life that has been silent since.
+    Restarted(Silence),
 }
 
 impl Core {
@@ -172,7 +174,8 @@ impl Core {
             }
         }
         if let Some(offset) = member.clock.offset(now) {
-            self.outputs.push_back(Output::ClockMeasured { node, offset });
+            let incarnation = member.announcement.incarnation;
+            self.outputs.push_back(Output::ClockMeasured { node, incarnation, offset });
         }
     }
 
@@ -184,7 +187,7 @@ impl Core {
             None => Arrival::Found,
             Some(gone) if claimed.incarnation > gone.incarnation => {
                 fence = Some(gone.incarnation);
-                Arrival::Restarted
+                Arrival::Restarted(gone.silence(now))
             }
             Some(gone)
                 if claimed.incarnation == gone.incarnation && claimed.boot_nonce == gone.boot_nonce =>
@@ -195,7 +198,7 @@ impl Core {
                 // GNCL knows nothing of that address any more, so that the earlier life may connect.
                 let (node, incarnation) = (claimed.node, gone.incarnation);
                 self.outputs.push_back(Output::Forgotten { node, incarnation });
-                Arrival::Restarted
+                Arrival::Restarted(gone.silence(now))
             }
             Some(gone) => {
                 self.refuse_stale(now, &proof, gone.incarnation);
@@ -264,7 +267,10 @@ impl Core {
         self.outputs.push_back(Output::Fact(MembershipFact::NodeFound { node, incarnation, gncl }));
         self.publish(&match arrival {
             Arrival::Found => NodeEvent::NodeFound { node, name, incarnation },
-            Arrival::Restarted => NodeEvent::NodeRestarted { node, name, incarnation },
+            Arrival::Restarted(silence) => {
+                let (silent_us, bound_us) = silence.micros();
+                NodeEvent::NodeRestarted { node, name, incarnation, silent_us, bound_us }
+            }
         });
         self.note_progress(node, progress);
         self.seek(now, node);
@@ -275,13 +281,14 @@ impl Core {
     fn replace(&mut self, now: Time, proof: Proof) {
         let node = proof.announcement.node;
         let Some(former) = self.members.remove(&node) else { return };
+        let silence = self.silence(now, &former);
         self.contests.remove(&node);
         let others = former.routes.places().filter(|place| *place != proof.from);
         others.for_each(|place| self.drop_contact(now, place));
         let incarnation = former.announcement.incarnation;
         let why = LossReason::Restarted;
         self.outputs.push_back(Output::Fact(MembershipFact::NodeLost { node, incarnation, why }));
-        self.join(now, proof, Arrival::Restarted, Some(incarnation));
+        self.join(now, proof, Arrival::Restarted(silence), Some(incarnation));
     }
 
     /// A newcomer with a member's address: has the member been restarted, or are there two? // spec: NDL-5.3
@@ -389,8 +396,8 @@ impl Core {
         let sources = self.sources(&member).into_keys().collect();
         // GNCL ends the connection of a life that is over.
         self.proven.lost(node, member.announcement.incarnation);
-        let bound = self.paces[member.pace].bound();
-        self.recall.lost(now, &member, sources, Loss { why, bound });
+        let silence = self.silence(now, &member);
+        self.recall.lost(now, &member, sources, Loss { why, bound: silence.bound });
         self.note_parted(node);
         self.is_lonely |= self.members.is_empty() && matches!(why, LossReason::Hung | LossReason::LinkDown);
         // An elder life has the address of a duplicate, which is no bar to that; one that nobody proves may never have been there.
@@ -415,8 +422,7 @@ impl Core {
             contact.questions.clear();
         }
         let Announcement { incarnation, name, .. } = member.announcement;
-        let micros = |time: Duration| u64::try_from(time.as_micros()).unwrap_or(u64::MAX);
-        let (silent_us, bound_us) = (micros(now.since(member.heard)), micros(bound));
+        let (silent_us, bound_us) = silence.micros();
         self.outputs.push_back(Output::Fact(MembershipFact::NodeLost { node, incarnation, why }));
         self.publish(&NodeEvent::NodeLost { node, name, incarnation, why, silent_us, bound_us });
         if why == LossReason::Crashed {

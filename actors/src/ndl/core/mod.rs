@@ -175,8 +175,10 @@ pub(crate) enum Output {
         to: AppAddress,
         event: NodeEvent,
     },
+    /// The clock of this life of a node is so far from ours.
     ClockMeasured {
         node: NodeAddress,
+        incarnation: Incarnation,
         offset: ClockOffset,
     },
     /// Two living processes have one node address; the newcomer is no member, or not any more.

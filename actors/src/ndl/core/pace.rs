@@ -55,6 +55,11 @@ impl Pace {
         ANSWERABLE_MIN.max(self.missed_max as usize + 1)
     }
 
+    /// How long a sign of life counts. // spec: NDL-4.7
+    pub(super) fn sign_counts_for(&self) -> Duration {
+        self.period * self.missed_max
+    }
+
     /// Time after its last sign of life within which a member is lost, if our own timer is on time. // spec: NDL-4.1
     pub(super) fn bound(&self) -> Duration {
         self.period * (self.missed_max + 1)

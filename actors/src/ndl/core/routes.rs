@@ -326,7 +326,7 @@ impl Core {
     pub(super) fn seek(&mut self, now: Time, node: NodeAddress) {
         for place in self.unknown_places_of(node) {
             self.contacts.insert(place, Contact::announced(now));
-            self.ask(now, place);
+            self.ask_unless_just_asked(now, place);
         }
     }
 

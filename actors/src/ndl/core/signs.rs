@@ -1,4 +1,7 @@
-//! A member that does not answer, and of which GNCL hears: it lives, and either its NDL hangs or datagrams do not get through.
+//! A member that does not answer, and of which GNCL hears, or that asks us: it lives, and either its NDL hangs or datagrams do not get through.
+//!
+//! Who asks says when. Where nodes have keys nobody else can say it, but what was recorded can be sent again, and what was held back can come when its
+//! sender has died: so it counts only of who is connected, and only if it is new by his clock.
 
 use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
@@ -15,7 +18,13 @@ impl Member {
     /// Whether GNCL heard of it as lately as a member has to be heard of. What is read of a process that has ended is what was under way,
     /// and no sign. // spec: NDL-4.7
     pub(super) fn has_given_a_sign(&self, now: Time, pace: &Pace) -> bool {
-        self.host != Some(Host::Refuses) && now.since(self.sign) < pace.period * pace.missed_max
+        self.host != Some(Host::Refuses) && now.since(self.sign) < pace.sign_counts_for()
+    }
+
+    /// Whether what it sent at this time of its clock may have been sent so lately that it is a sign, by what is known of that clock. // spec: NDL-4.7
+    fn may_have_sent_lately(&self, now: Time, sent: Time, pace: &Pace) -> bool {
+        let times = self.clock.offset(now).and_then(|offset| offset.in_our_clock(now, sent));
+        times.is_some_and(|(at, error)| now.since(at + error) < pace.sign_counts_for())
     }
 }
 
@@ -28,6 +37,16 @@ impl Core {
         };
         let members = self.members.values().filter(is_in_doubt);
         members.map(|member| (member.announcement.node, member.announcement.incarnation)).collect()
+    }
+
+    /// Whether what was sent in a member's name at this time of its clock says that it lives: where connections prove who is there, only of the
+    /// life whose connection stands, and only while it is new. Of a clock that was never measured nobody knows that. // spec: NDL-4.7
+    pub(super) fn is_a_sign(&self, now: Time, node: NodeAddress, sent: Time) -> bool {
+        if !self.proves_peers() {
+            return true;
+        }
+        let is_new = |member: &Member| member.may_have_sent_lately(now, sent, &self.paces[member.pace]);
+        self.is_proven(node) && self.members.get(&node).is_some_and(is_new)
     }
 
     pub(super) fn sign_seen(&mut self, now: Time, node: NodeAddress, incarnation: Incarnation, at: Time) {

@@ -6,6 +6,7 @@ mod memory;
 mod paces;
 mod properties;
 mod proven;
+mod replayed;
 mod routes;
 mod scenarios;
 mod several_addresses;

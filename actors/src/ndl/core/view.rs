@@ -30,7 +30,9 @@ pub struct KnownNode {
     pub gncl: Vec<SocketAddr>,
     /// Time between two of its queries.
     pub period: Duration,
-    /// How it was found, and when in each way first.
+    /// When it was found: since then this life of it has been there.
+    pub since: Time,
+    /// Who says that its addresses are to be asked, and when each did so first: long before it was found, perhaps, or in an earlier life of it.
     pub sources: BTreeMap<Source, Time>,
     /// Its last sign of life.
     pub heard: Time,
@@ -126,6 +128,7 @@ impl Core {
             routes: member.routes.iter().map(KnownRoute::of).collect(),
             gncl: member.gncl_addresses(&self.own),
             period: Duration::from_micros(member.announcement.period_us.into()),
+            since: member.since,
             sources: self.sources(member),
             heard: member.heard,
             missed: member.missed,
@@ -143,7 +146,7 @@ impl Core {
         views.collect()
     }
 
-    /// How a member was found, wherever it is asked, and when first.
+    /// Who says that a member is to be asked, wherever it is asked, and when each did so first.
     pub(super) fn sources(&self, member: &Member) -> BTreeMap<Source, Time> {
         let mut sources = BTreeMap::new();
         let contacts = member.routes.places().filter_map(|place| self.contacts.get(&place));
@@ -152,6 +155,12 @@ impl Core {
             *first = (*at).min(*first);
         }
         sources
+    }
+
+    /// How many layers and applications of this node do not get on, and the first of them. // spec: NDL-9
+    pub(crate) fn own_troubles(&self) -> (usize, Vec<TroubledApp>) {
+        let Progress { troubled: count, parts, .. } = &self.progress;
+        (*count as usize, parts.iter().map(|part| troubled(self.me.node, part)).collect())
     }
 
     /// How many clients of this node take nothing of what waits for them, and the first of them. // spec: NDL-9.1

@@ -1,6 +1,6 @@
 //! What nobody without the key can make, and nobody can use twice.
 
-use std::num::NonZeroUsize;
+use std::{num::NonZeroUsize, time::Duration};
 
 use proptest::prelude::*;
 use sinew_runtime::{
@@ -12,6 +12,8 @@ use super::{Checker, DiscoveryKey, Sealer, Stamp, Tag, Verdict};
 
 const HIP: [u8; 4] = [192, 168, 0, 11];
 const LIFE: Incarnation = Incarnation(0x0123_4567_89ab_cdef);
+/// How long a handshake lasts that nobody holds up.
+const AT_ONCE: Duration = Duration::ZERO;
 
 fn key(first: u8) -> DiscoveryKey {
     let digits: String = (0..32).map(|byte: u8| format!("{:02x}", byte.wrapping_add(first))).collect();
@@ -29,7 +31,7 @@ fn checker(nodes_max: usize) -> Checker {
 /// One that knows the hip's life.
 fn acquainted() -> Checker {
     let mut checker = checker(4);
-    checker.confirm(Time::ZERO, Stamp { node: HIP.into(), incarnation: LIFE, number: 0 });
+    checker.confirm(Time::ZERO, AT_ONCE, Stamp { node: HIP.into(), incarnation: LIFE, number: 0 });
     checker
 }
 
@@ -99,7 +101,7 @@ fn a_life_with_a_smaller_number_takes_over_when_it_has_proven_itself() {
     let (new, new_tag) = after.seal(b"here");
     assert_eq!(checker.check(at(1), new, new_tag, b"here"), Verdict::OtherLife);
     // When
-    checker.confirm(at(2), Stamp { number: 0, ..new });
+    checker.confirm(at(2), AT_ONCE, Stamp { number: 0, ..new });
     // Then: it counts, and what was recorded of its former life does not
     assert_eq!(checker.check(at(3), new, new_tag, b"here"), Verdict::Fresh);
     assert_eq!(checker.check(at(4), old, old_tag, b"here"), Verdict::OtherLife);
@@ -109,7 +111,7 @@ fn a_life_with_a_smaller_number_takes_over_when_it_has_proven_itself() {
 fn what_was_recorded_before_the_handshake_does_not_count_after_it() {
     let (mut sealer, mut checker) = (sealer(), checker(4));
     let (recorded, tag) = sealer.seal(b"here");
-    checker.confirm(at(1), Stamp { number: sealer.made(), ..recorded });
+    checker.confirm(at(1), AT_ONCE, Stamp { number: sealer.made(), ..recorded });
     assert_eq!(checker.check(at(2), recorded, tag, b"here"), Verdict::Replayed);
     let (stamp, tag) = sealer.seal(b"here");
     assert_eq!(checker.check(at(3), stamp, tag, b"here"), Verdict::Fresh);
@@ -120,7 +122,7 @@ fn to_confirm_a_life_again_forgets_nothing_of_it() {
     let (mut sealer, mut checker) = (sealer(), acquainted());
     let (stamp, tag) = sealer.seal(b"here");
     assert_eq!(checker.check(at(1), stamp, tag, b"here"), Verdict::Fresh);
-    checker.confirm(at(2), Stamp { number: 0, ..stamp });
+    checker.confirm(at(2), AT_ONCE, Stamp { number: 0, ..stamp });
     assert_eq!(checker.check(at(3), stamp, tag, b"here"), Verdict::Replayed);
 }
 
@@ -137,11 +139,47 @@ fn a_number_that_its_node_cannot_have_made_bars_it_until_the_next_handshake_and_
         let (stamp, tag) = sealer.seal(b"here");
         assert_eq!(checker.check(at(3), stamp, tag, b"here"), Verdict::Replayed);
         // When: it says in a handshake how many it has made
-        checker.confirm(at(4), Stamp { number: sealer.made(), ..stamp });
+        checker.confirm(at(4), AT_ONCE, Stamp { number: sealer.made(), ..stamp });
         // Then
         let (stamp, tag) = sealer.seal(b"here");
         assert_eq!(checker.check(at(5), stamp, tag, b"here"), Verdict::Fresh);
         assert_eq!(checker.check(at(6), recorded, recorded_tag, b"here"), Verdict::Replayed);
+    }
+}
+
+// spec: NDL-1.3
+#[test]
+fn a_handshake_that_somebody_holds_up_lets_nothing_count_again() {
+    // Given: a life says how many datagrams it has made, goes on to make 3,000 a second, and its word is under way for two seconds
+    let (mut sealer, mut checker) = (sealer(), acquainted());
+    let made = sealer.made();
+    let sent: Vec<_> = (0..6_000).map(|_| sealer.seal(b"here")).collect();
+    for (stamp, tag) in sent.iter().copied() {
+        assert_eq!(checker.check(at(1_000), stamp, tag, b"here"), Verdict::Fresh);
+    }
+    // When
+    let said = Stamp { node: HIP.into(), incarnation: LIFE, number: made };
+    checker.confirm(at(2_000), Duration::from_secs(2), said);
+    // Then
+    for (stamp, tag) in sent {
+        assert_eq!(checker.check(at(2_001), stamp, tag, b"here"), Verdict::Replayed, "{stamp:?}");
+    }
+    let (stamp, tag) = sealer.seal(b"here");
+    assert_eq!(checker.check(at(2_002), stamp, tag, b"here"), Verdict::Fresh);
+}
+
+// spec: NDL-1.3
+#[test]
+fn a_number_that_its_node_cannot_have_made_while_the_handshake_lasted_bars_it_no_longer() {
+    // 10 ms are as many microseconds as 10,000 numbers.
+    for (forged, verdict) in [(20_000, Verdict::Fresh), (9_000, Verdict::Replayed)] {
+        let (mut sealer, mut checker) = (sealer(), acquainted());
+        let stamp = Stamp { node: HIP.into(), incarnation: LIFE, number: forged };
+        let tag = Tag::of(&key(0).of_tags("walker"), stamp, b"gone");
+        assert_eq!(checker.check(at(1), stamp, tag, b"gone"), Verdict::Fresh);
+        checker.confirm(at(20), Duration::from_millis(10), Stamp { number: sealer.made(), ..stamp });
+        let (stamp, tag) = sealer.seal(b"here");
+        assert_eq!(checker.check(at(21), stamp, tag, b"here"), verdict, "{forged}");
     }
 }
 
@@ -151,12 +189,12 @@ fn memory_is_bounded_and_who_was_silent_longest_is_forgotten() {
     let node = |last: u8| NodeAddress::from([10, 0, 0, last]);
     let said = |last| Stamp { node: node(last), incarnation: LIFE, number: 0 };
     let mut sealers = [1, 2, 3].map(|last| Sealer::new(&key(0), "walker", node(last), LIFE));
-    checker.confirm(at(1), said(1));
-    checker.confirm(at(2), said(2));
+    checker.confirm(at(1), AT_ONCE, said(1));
+    checker.confirm(at(2), AT_ONCE, said(2));
     let (stamp, tag) = sealers[0].seal(b"1");
     assert_eq!(checker.check(at(3), stamp, tag, b"1"), Verdict::Fresh);
     // When: a third one comes
-    checker.confirm(at(4), said(3));
+    checker.confirm(at(4), AT_ONCE, said(3));
     // Then: the second, which was silent, is forgotten
     assert_eq!(checker.len(), 2);
     let verdicts = sealers.each_mut().map(|sealer| {

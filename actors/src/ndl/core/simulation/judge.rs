@@ -319,6 +319,22 @@ impl Judge {
         }
     }
 
+    /// The same of a life that is there now: for how long the one before it was silent.
+    pub(super) fn told_of_a_restart(
+        &mut self,
+        now: Time,
+        process: usize,
+        (node, incarnation): (NodeAddress, Incarnation),
+        said: [Duration; 2],
+    ) {
+        let sights = self.lives[process].sights.iter().map(|(other, sight)| (&self.lives[*other], sight));
+        let before = sights.filter(|(life, _)| life.node == node && life.incarnation != incarnation);
+        let last = before.max_by_key(|(_, sight)| sight.heard).map(|(life, _)| life.incarnation);
+        if let Some(last) = last {
+            self.told_of_a_loss(now, process, (node, last), said);
+        }
+    }
+
     fn check_reason(&mut self, now: Time, process: usize, other: usize, why: LossReason) {
         let lives = self.lives[other].ended.is_none();
         match why {

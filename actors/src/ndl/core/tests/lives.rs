@@ -1,21 +1,39 @@
 //! A node has one life at a time: restarts, former lives, two processes with one address.
 
-use sinew_runtime::tid::Incarnation;
+use sinew_runtime::{tid::Incarnation, time::Time};
 
 use super::world::{PERIOD, Spec, World, claimant, ms, node};
-use crate::ndl::{LossReason, MembershipFact, NodeEvent, core::Output};
+use crate::{
+    config::WatchGroup,
+    ndl::{LossReason, MembershipFact, NodeEvent, core::Output},
+};
+
+/// When the first process heard of node 2 last.
+fn last_sign(world: &World) -> Time {
+    world.at(1).core.members[&node(2)].heard
+}
+
+fn micros_since(world: &World, then: Time) -> u64 {
+    u64::try_from(world.now.since(then).as_micros()).expect("some seconds")
+}
 
 // spec: NDL-5.1
 #[test]
 fn a_restart_is_one_event_for_applications_and_two_facts_for_layers() {
     for (index, what) in [(2, "at the same port"), (3, "at another port")] {
         let mut world = World::of_members(2);
+        let heard = last_sign(&world);
         world.kill(2);
         world.run(ms(20));
         world.start(index, &Spec { incarnation: 2, ..Spec::of(2) });
         world.run_until(ms(150), |world| !world.at(1).events.is_empty());
-        let restarted =
-            NodeEvent::NodeRestarted { node: node(2), name: "node-2".into(), incarnation: Incarnation(2) };
+        let restarted = NodeEvent::NodeRestarted {
+            node: node(2),
+            name: "node-2".into(),
+            incarnation: Incarnation(2),
+            silent_us: micros_since(&world, heard),
+            bound_us: 2_000_000,
+        };
         assert_eq!(world.at(1).events, [restarted], "{what}");
         let [lost, found] = &world.at(1).facts[..] else { panic!("{what}: {:?}", world.at(1).facts) };
         let why = LossReason::Restarted;
@@ -26,14 +44,41 @@ fn a_restart_is_one_event_for_applications_and_two_facts_for_layers() {
     }
 }
 
+// spec: NDL-5.1
 #[test]
-fn a_new_life_after_a_loss_is_a_restart_too() {
+fn a_new_life_after_a_loss_is_a_restart_too_and_says_for_how_long_the_lost_one_was_not_heard() {
     let mut world = World::of_members(2);
+    let heard = last_sign(&world);
     world.kill(2);
     world.run(PERIOD * 5);
     world.start(2, &Spec { incarnation: 2, ..Spec::of(2) });
-    world.run(ms(10));
-    assert!(matches!(world.at(1).events[..], [NodeEvent::NodeLost { .. }, NodeEvent::NodeRestarted { .. }]));
+    world.run_until(ms(10), |world| world.at(1).events.len() == 2);
+    let [NodeEvent::NodeLost { silent_us: lost, .. }, NodeEvent::NodeRestarted { silent_us, bound_us, .. }] =
+        world.at(1).events[..]
+    else {
+        panic!("{:?}", world.at(1).events)
+    };
+    assert_eq!((silent_us, bound_us), (micros_since(&world, heard), 2_000_000));
+    assert!(lost <= bound_us && silent_us > bound_us, "{lost}, then {silent_us}");
+}
+
+// spec: NDL-5.1
+#[test]
+fn a_restart_is_bounded_by_the_pace_at_which_the_life_before_was_watched() {
+    let mut world = World::new();
+    let watch = vec![WatchGroup { nodes: vec!["node-2".to_owned()], period: ms(10), missed_max: 2 }];
+    world.start(1, &Spec { watch, ..Spec::of(1) });
+    world.start(2, &Spec::of(2));
+    world.run(ms(105));
+    world.forget_the_past();
+    world.kill(2);
+    world.run(ms(5));
+    world.start(2, &Spec { incarnation: 2, ..Spec::of(2) });
+    world.run_until(ms(20), |world| !world.at(1).events.is_empty());
+    let [NodeEvent::NodeRestarted { silent_us, bound_us: 30_000, .. }] = world.at(1).events[..] else {
+        panic!("{:?}", world.at(1).events)
+    };
+    assert!((5_000..=30_000).contains(&silent_us), "{silent_us}");
 }
 
 // spec: NDL-5.2
@@ -71,6 +116,7 @@ fn a_node_whose_clock_began_anew_is_refused_for_a_time_after_its_loss_and_then_f
     world.start(1, &Spec::of(1));
     world.start(2, &Spec { incarnation: 1_000_000, ..Spec::of(2) });
     world.run(ms(100));
+    let heard = last_sign(&world);
     world.kill(2);
     world.run_until(PERIOD * 5, |world| !world.knows(1, 2));
     world.forget_the_past();
@@ -79,14 +125,19 @@ fn a_node_whose_clock_began_anew_is_refused_for_a_time_after_its_loss_and_then_f
     world.run(ms(14_900));
     assert_eq!(world.at(1).facts, []);
     assert!(world.at(1).core.refusals().of("NDL answer of a former life") > 0);
-    world.run(PERIOD * 2);
+    world.run_until(PERIOD * 2, |world| !world.at(1).events.is_empty());
     // Then: what others knew of the later life bars it no more
     let [found] = &world.at(1).facts[..] else { panic!("{:?}", world.at(1).facts) };
     let forgotten = Output::Forgotten { node: node(2), incarnation: Incarnation(1_000_000) };
     assert_eq!(world.at(1).others, [forgotten], "GNCL, too, is told");
     assert!(matches!(found, MembershipFact::NodeFound { incarnation: Incarnation(3), .. }));
-    let restarted =
-        NodeEvent::NodeRestarted { node: node(2), name: "node-2".into(), incarnation: Incarnation(3) };
+    let restarted = NodeEvent::NodeRestarted {
+        node: node(2),
+        name: "node-2".into(),
+        incarnation: Incarnation(3),
+        silent_us: micros_since(&world, heard),
+        bound_us: 2_000_000,
+    };
     assert_eq!(world.at(1).events, [restarted]);
 }
 

@@ -81,6 +81,31 @@ fn a_seed_that_starts_late_is_found_when_it_starts() {
     assert!(took <= PERIOD + ms(1), "{took:?}");
 }
 
+#[test]
+fn a_node_is_known_since_this_life_of_it_was_found_and_not_since_its_address_was_named() {
+    // given: a seed at which nobody is for long
+    let mut world = World::new();
+    let second = |incarnation| Spec { incarnation, multicast: false, ..Spec::of(2) };
+    world.start(1, &Spec { multicast: false, seeds: vec![udp(2)], ..Spec::of(1) });
+    world.run(PERIOD * 100);
+    for incarnation in [1, 2] {
+        // when
+        let started = world.now;
+        world.start(2, &second(incarnation));
+        let known = |world: &World| {
+            let members = world.at(1).core.members(world.now);
+            members.into_iter().find(|known| known.incarnation == Incarnation(incarnation))
+        };
+        world.run_until(PERIOD * 2, |world| known(world).is_some());
+        // then
+        let known = known(&world).expect("it was found just now");
+        assert!(known.sources[&Source::Seed] < started, "life {incarnation}: {known:?}");
+        assert!((started..=world.now).contains(&known.since), "life {incarnation}: {known:?}");
+        world.kill(2);
+        world.run(ms(20));
+    }
+}
+
 // spec: NDL-2.3
 #[test]
 fn an_address_from_mdns_is_asked_at_once() {
@@ -289,6 +314,21 @@ fn who_answers_a_question_of_after_its_link_broke_is_not_lost_because_somebody_r
     world.run(ms(10));
     world.link(1, refused());
     assert_eq!(world.losses(1), [(2, LossReason::Crashed)]);
+}
+
+// spec: NDL-2.2
+#[test]
+fn who_is_started_again_at_the_same_address_is_found_at_once_though_its_former_life_was_asked_just_before() {
+    let mut world = World::of_members(2);
+    let (node, incarnation) = (node(2), Incarnation(1));
+    world.kill(2);
+    world.link(1, LinkFact::LinkBroken { node, incarnation });
+    world.run(ms(3));
+    world.start(2, &Spec { incarnation: 2, ..Spec::of(2) });
+    world.run(ms(5));
+    let is_back =
+        |fact: &MembershipFact| matches!(fact, MembershipFact::NodeFound { incarnation: Incarnation(2), .. });
+    assert!(world.at(1).facts.iter().any(is_back), "{:?}", world.at(1).facts);
 }
 
 #[test]

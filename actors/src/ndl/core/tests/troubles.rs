@@ -39,6 +39,8 @@ fn what_stalls_on_a_living_node_is_told_once_and_again_when_it_gets_on() {
     assert_eq!(told(&mut world), []);
     let known = &world.at(1).core.members(world.now)[0];
     assert_eq!((known.troubled, known.troubles[1].app), (2, Tid::new(node(2), AppAddress::new(0x2000))));
+    let own = world.at(2).core.own_troubles();
+    assert_eq!(own, (known.troubled, known.troubles.clone()), "it knows itself what it says");
     says(&mut world, vec![part(0x2000, away)]);
     assert_eq!(told(&mut world), [(3, None), (0x2000, Some(away))]);
     says(&mut world, vec![]);

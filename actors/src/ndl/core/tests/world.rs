@@ -352,7 +352,7 @@ impl World {
                 process.core.handle(now, Input::EventNotTaken { app: to });
             }
             Output::Event { event, .. } => process.events.push(event),
-            Output::ClockMeasured { node, offset } => drop(process.clocks.insert(node, offset)),
+            Output::ClockMeasured { node, offset, .. } => drop(process.clocks.insert(node, offset)),
             other @ (Output::Moved { .. }
             | Output::Forgotten { .. }
             | Output::Collision { .. }

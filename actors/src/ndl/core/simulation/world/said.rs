@@ -42,7 +42,7 @@ impl World {
                 self.push(at, Event::Tell(from, Box::new(Input::Probed { node, incarnation, host })));
             }
             Output::Fact(fact) => self.told(from, fact),
-            Output::ClockMeasured { node, offset } => {
+            Output::ClockMeasured { node, offset, .. } => {
                 let Some(peer) = self.current_of(node) else { return };
                 let truth =
                     self.local(peer).as_nanos().cast_signed() - self.local(from).as_nanos().cast_signed();
@@ -76,7 +76,11 @@ impl World {
             }
             NodeEvent::AppStalled { trouble: Trouble::Unheard, .. } => self.seen.unheard_told += 1,
             NodeEvent::AppStalled { .. } => self.seen.stalls_told += 1,
-            NodeEvent::NodeRestarted { .. } => self.seen.restarts_told += 1,
+            NodeEvent::NodeRestarted { node, incarnation, silent_us, bound_us, .. } => {
+                self.seen.restarts_told += 1;
+                let said = [silent_us, bound_us].map(Duration::from_micros);
+                self.judge.told_of_a_restart(self.now, process, (node, incarnation), said);
+            }
             NodeEvent::NodeFound { .. } | NodeEvent::AppResumed { .. } => {}
         }
         let truth = |node: NodeAddress, incarnation: Incarnation| {
