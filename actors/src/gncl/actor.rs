@@ -53,7 +53,7 @@ use crate::{
 };
 pub(crate) use leaving::LINGER;
 use proven::NOT_PROVEN;
-use wire::Wire;
+use wire::{Linked, Wire};
 
 /// Time until a layer whose post was full is offered again what it had no room for.
 const RETRY: Duration = Duration::from_millis(10);
@@ -148,7 +148,7 @@ impl Gncl {
             Output::Dial { connection, address } => self.dial(connection, address),
             Output::SendHello(connection, hello) => self.send_hello(connection, &hello, ctx),
             Output::Attach(attach) => self.attach(&attach),
-            Output::Detach { connection, node, lane } => self.detach(connection, (node, lane)),
+            Output::Detach { connection, node, .. } => self.detach(connection, node),
             Output::Refuse(connection, refusal) => self.refuse(connection, &refusal, ctx),
             Output::Close(connection) => self.close(connection, ctx),
             Output::SendPing(node, lane) => self.send(node, lane, Kind::GNCL_PING),
@@ -156,6 +156,9 @@ impl Gncl {
             Output::SendGoodbye(node) => self.say_goodbye(node),
             Output::Forget(node) => {
                 self.stores.router.remove_peer(node);
+                if let Some(left) = self.stores.gncl.peer(node).filter(|peer| peer.has_left()) {
+                    self.stores.clocks.forget(node, left.incarnation);
+                }
                 self.stores.gncl.forget(node);
             }
             Output::Fact(fact) => self.tell(fact, ctx),
@@ -230,17 +233,25 @@ impl Gncl {
             marks::mark(transport.socket(), lane);
         }
         let payload_max = usize::try_from(attach.payload_max).unwrap_or(usize::MAX);
-        let Some(Move { place, transport }) = self.stores.gncl.place(lane, transport.clone()) else {
-            // Its reader meets the end, whatever the peer has sent behind its welcome, and the core makes another one.
-            wire.set_mode(Mode::Discard);
-            return transport.shut(Shutdown::Both);
+        let Move { place, transport } = match self.stores.gncl.place(lane, transport.clone()) {
+            Ok(there) => there,
+            Err(error) => {
+                // Its reader meets the end, whatever the peer has sent behind its welcome, and the core makes another one.
+                wire.set_mode(Mode::Discard);
+                transport.shut(Shutdown::Both);
+                if listener::is_starved(&error) {
+                    // What that has done is done when this is.
+                    self.core.handle(Time::now(), Input::Starved);
+                }
+                return;
+            }
         };
         wire.transport = Some(transport.clone());
         let checksum = attach.checksum();
         let link = way.outlet.connect(Gathering::new(transport.clone(), checksum), payload_max, welcome);
         way.attach(link);
         let spin = if place.is_here() { self.spin.clone() } else { Arc::default() };
-        let (stores, peer_there) = (self.stores.clone(), peer.clone());
+        let (stores, peer_there, met) = (self.stores.clone(), peer.clone(), peer.clone());
         let outcomes = RefCell::default();
         let inbound = Inbound { stores, peer: peer_there, spin, lane, link, checksum, outcomes };
         wire.set_mode(Mode::Moves(inbound, Move { place: place.clone(), transport }));
@@ -255,20 +266,18 @@ impl Gncl {
             task::end_of(drainer).await;
             News { connection, what: What::Ended }
         });
-        wire.link = Some((link, self.crowd.join(drainer)));
+        wire.link = Some(Linked::new(&met, lane, link, self.crowd.join(drainer)));
         if lane == Lane::Stream {
             self.announce_datagrams(attach);
         }
     }
 
-    fn detach(&mut self, connection: ConnectionId, (node, lane): (NodeAddress, Lane)) {
+    fn detach(&mut self, connection: ConnectionId, node: NodeAddress) {
         let Some(wire) = self.wires.get_mut(&connection) else { return };
         // The drainer goes with it.
-        let Some((link, _drainer)) = wire.link.take() else { return };
-        if let Some(peer) = self.stores.gncl.peer(node)
-            && let Some(way) = peer.way(lane)
-        {
-            wire.may_speak = way.outlet.disconnect(link);
+        let Some(link) = wire.link.take() else { return };
+        wire.may_speak = link.disconnect();
+        if let Some(peer) = self.stores.gncl.peer(node) {
             peer.holds_what_may_expire();
         }
     }
@@ -286,6 +295,9 @@ impl Gncl {
 
     /// The connection has ended by itself.
     fn ended(&mut self, connection: ConnectionId, ctx: &mut Context<Self>) {
+        if self.wires.get_mut(&connection).is_some_and(|wire| std::mem::take(&mut wire.owes_the_last)) {
+            self.input(Input::GoodbyeReceived(connection), ctx);
+        }
         self.input(Input::Ended(connection), ctx);
         self.close(connection, ctx);
     }
@@ -334,7 +346,7 @@ impl Gncl {
             self.peer_speaks(message.header.source.node);
         }
         if matches!(input, Input::GoodbyeReceived(_)) {
-            self.acknowledge_the_last(connection);
+            return self.goodbye_came(connection, ctx);
         }
         self.input(input, ctx);
     }
@@ -469,9 +481,11 @@ impl Actor for Gncl {
 }
 
 impl Drop for Gncl {
-    /// Senders must not go on writing to the sockets of an actor that is gone.
+    /// Senders must not go on writing to the sockets of an actor that is gone. One that hung, and comes back, leaves those of its successor alone.
     fn drop(&mut self) {
-        self.cut_all();
+        for link in self.wires.values().filter_map(|wire| wire.link.as_ref()) {
+            link.disconnect();
+        }
     }
 }
 

@@ -106,6 +106,7 @@ impl Peer {
             node: attach.node,
             takes_outcomes: attach.takes_outcomes,
             answers_there: usize::try_from(attach.answers_max).unwrap_or(usize::MAX),
+            payload_max_there: usize::try_from(attach.payload_max).unwrap_or(usize::MAX),
             ways,
         };
         let Store { refusals, acks, fewer_owed, held_up, .. } = &stores.gncl;
@@ -200,8 +201,13 @@ impl Peer {
         if self.is_over.load(Ordering::Acquire) {
             return self.ways.iter().map(Way::owed).fold(Owed::NOBODY, Owed::and);
         }
+        if self.has_left() { Owed::Anyone } else { Owed::NOBODY }
+    }
+
+    /// Whether it has said that it leaves.
+    pub(super) fn has_left(&self) -> bool {
         // SYNC: Relaxed; a flag by itself.
-        if self.has_left.load(Ordering::Relaxed) != 0 { Owed::Anyone } else { Owed::NOBODY }
+        self.has_left.load(Ordering::Relaxed) != 0
     }
 
     /// Something waits here again that had gone out.
@@ -428,18 +434,20 @@ impl Store {
         }
     }
 
-    /// Where the connections of a lane are read and written from now on, and this one, `transport`, as it is to be used there. `None`: nowhere.
-    /// Once there is a thread of Bulk, Bulk goes there or not at all, as long as there is no descriptor for it: what reads the connection before may
+    /// Where the connections of a lane are read and written from now on, and this one, `transport`, as it is to be used there.
+    ///
+    /// # Errors
+    /// There is no descriptor for it, which was counted. Once there is a thread of Bulk, Bulk goes there or not at all, as long as there is no descriptor for it: what reads the connection before may
     /// be in the middle of a message there, and on another thread the next message would overtake that.
-    pub(super) fn place(&self, lane: Lane, transport: Transport) -> Option<Move> {
+    pub(super) fn place(&self, lane: Lane, transport: Transport) -> io::Result<Move> {
         match lane {
-            Lane::Control | Lane::Stream => Some(Move { place: Place::Here, transport }),
+            Lane::Control | Lane::Stream => Ok(Move { place: Place::Here, transport }),
             Lane::Bulk => match self.bulk_place(&transport) {
-                Ok(there) => Some(there),
+                Ok(there) => Ok(there),
                 Err(error) if lock(&self.bulk).is_none() => {
                     // It works there, too; only that Control may wait for Bulk.
                     self.refusals.count(Time::now(), "Bulk stays on the IO thread", &error);
-                    Some(Move { place: Place::Here, transport })
+                    Ok(Move { place: Place::Here, transport })
                 }
                 Err(error) => {
                     let words = format!(
@@ -447,7 +455,7 @@ impl Store {
                          what this process holds open"
                     );
                     self.refusals.count(Time::now(), "no descriptor for a connection of Bulk", &words);
-                    None
+                    Err(error)
                 }
             },
         }

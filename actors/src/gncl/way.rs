@@ -138,6 +138,8 @@ pub(super) struct Ends {
     pub(super) takes_outcomes: bool,
     /// Confirmed messages of this session at most for whose outcomes the peer has room.
     pub(super) answers_there: usize,
+    /// Longest payload that the peer takes.
+    pub(super) payload_max_there: usize,
     /// How many sessions there are between the two.
     pub(super) ways: usize,
 }
@@ -171,11 +173,13 @@ pub(crate) struct Way {
 impl Way {
     /// `now` numbers what is remembered: a later session with the same life of the peer has a larger number.
     pub(super) fn new(now: Time, ends: Ends, config: &NodeConfig, told: &Told) -> Self {
+        // What the peer does not take is not kept for a connection that is still to come: it would be sent on each one again, and refused.
+        let payload_max = config.payload_max.min(ends.payload_max_there);
         let limits = OutletLimits {
             queue_capacity: config.gncl.queue_capacity,
             queue_bytes: config.gncl.queue_bytes,
             unconfirmed_max: config.gncl.queue_capacity,
-            payload_max: config.payload_max,
+            payload_max,
         };
         let messages = config.gncl.queue_capacity.clamp(WINDOW_MESSAGES_MIN, WINDOW_MESSAGES_MAX);
         let window = Window { messages, bytes: WINDOW_BYTES };

@@ -64,6 +64,8 @@ pub(super) struct Half<S> {
     pub(super) last: Option<Message>,
     /// It was said on the present connection.
     pub(super) has_said_last: bool,
+    /// What the session takes next was said on the present connection, or is about to be.
+    has_begun: bool,
     finishing: bool,
     /// No waiting message expires before this.
     pub(super) next_expiry: Time,
@@ -97,6 +99,7 @@ impl<S: Socket> Half<S> {
             urgent: VecDeque::new(),
             last: None,
             has_said_last: false,
+            has_begun: false,
             finishing: false,
             next_expiry: Time::MAX,
             receipts,
@@ -136,7 +139,7 @@ impl<S: Socket> Half<S> {
         if !matches!(self.link, Link::Closed(_)) {
             self.link = Link::Up(socket);
             (self.due, self.taken_at_last) = (0, u64::MAX);
-            self.has_said_last = false;
+            (self.has_said_last, self.has_begun) = (false, false);
             self.payload_max = self.limits.payload_max.min(payload_max);
             self.partial = preface.map(|message| self.frill(message));
         }
@@ -301,6 +304,11 @@ impl<S: Socket> Half<S> {
         after: &mut After,
     ) -> Result<(), Refused> {
         if !matches!(self.link, Link::Up(_)) {
+            return Err(Refused::new(message, Rejection::Closed));
+        }
+        // Nothing of a session goes ahead of what it takes next, whichever thread has something to say. spec: SESSION-3
+        self.has_begun |= message.header.kind == Kind::GNCL_ACK || self.session.is_none();
+        if !self.has_begun {
             return Err(Refused::new(message, Rejection::Closed));
         }
         if message.header.kind == Kind::GNCL_ACK

@@ -11,13 +11,15 @@ use super::{
         link::Mode,
         peer::frame,
     },
-    Gncl,
+    Gncl, Linked,
 };
 use crate::stores::lock;
 
 /// Time that peers have, when the node is stopped, to take what waits for them and hang up. Whoever has more to send
 /// than goes over its network in this time loses it.
 pub(crate) const LINGER: Duration = Duration::from_secs(3);
+/// Time that a peer that has said goodbye on a connection has to read what is written there, and behind it that all was taken.
+const LAST_WITHIN: Duration = Duration::from_secs(1);
 /// How often it is looked whether they have.
 const LINGER_LOOK: Duration = Duration::from_millis(1);
 
@@ -74,8 +76,25 @@ impl Gncl {
         }
     }
 
-    /// The peer has said all: it hears what of it was taken, before it is left. spec: GNCL-10
-    pub(super) fn acknowledge_the_last(&self, connection: ConnectionId) {
+    /// The peer has said all on a connection: it is left there when it has been sent what of that was taken, for which it has a second to
+    /// read. spec: GNCL-10
+    pub(super) fn goodbye_came(&mut self, connection: ConnectionId, ctx: &mut Context<Self>) {
+        self.acknowledge_the_last(connection);
+        self.leave_when_said(connection, Time::now() + LAST_WITHIN, ctx);
+    }
+
+    fn leave_when_said(&mut self, connection: ConnectionId, until: Time, ctx: &mut Context<Self>) {
+        let Some(wire) = self.wires.get_mut(&connection) else { return };
+        let has_words_left = wire.link.as_ref().is_some_and(Linked::has_words_left);
+        wire.owes_the_last = has_words_left && Time::now() < until;
+        if wire.owes_the_last {
+            ctx.run_later(LINGER_LOOK, move |actor, ctx| actor.leave_when_said(connection, until, ctx));
+        } else {
+            self.input(Input::GoodbyeReceived(connection), ctx);
+        }
+    }
+
+    fn acknowledge_the_last(&self, connection: ConnectionId) {
         let Some(wire) = self.wires.get(&connection) else { return };
         if let Mode::Linked(inbound) | Mode::Moves(inbound, _) = &*lock(&wire.mode) {
             inbound.acknowledge();

@@ -1,14 +1,49 @@
 //! A connection as the shell has it.
 
+use std::sync::{Arc, Weak};
+
 use actix::SpawnHandle;
 use sinew_runtime::time::Time;
 
 use super::super::{
+    core::Lane,
     crowd::Member,
     link::{Heard, Mode, SharedMode},
+    peer,
     transport::Transport,
 };
 use crate::{outlet::LinkNumber, security::Peer, stores::lock};
+
+/// A connection that is a link.
+pub(super) struct Linked {
+    peer: Weak<peer::Peer>,
+    lane: Lane,
+    /// Which of its peer's connections it is.
+    number: LinkNumber,
+    /// What writes there.
+    _drainer: Member,
+}
+
+impl Linked {
+    pub(super) fn new(peer: &Arc<peer::Peer>, lane: Lane, number: LinkNumber, drainer: Member) -> Self {
+        Self { peer: Arc::downgrade(peer), lane, number, _drainer: drainer }
+    }
+
+    /// Nothing is written there any more, unless another connection has taken its place. Returns whether what was written ends with a whole
+    /// frame.
+    pub(super) fn disconnect(&self) -> bool {
+        let peer = self.peer.upgrade();
+        let Some(way) = peer.as_ref().and_then(|peer| peer.way(self.lane)) else { return true };
+        way.outlet.disconnect(self.number)
+    }
+
+    /// Whether words for the peer still wait there.
+    pub(super) fn has_words_left(&self) -> bool {
+        let peer = self.peer.upgrade();
+        let way = peer.as_ref().and_then(|peer| peer.way(self.lane));
+        way.is_some_and(|way| way.outlet.is_connected() && way.outlet.urgent_left() > 0)
+    }
+}
 
 /// One connection and what runs for it.
 pub(super) struct Wire {
@@ -20,8 +55,10 @@ pub(super) struct Wire {
     /// Datagrams of discovery that the other end had made when it introduced itself.
     pub(super) datagrams_made: u64,
     pub(super) mode: SharedMode,
-    /// Which of its peer's connections it is, and what writes there, as long as it is a link.
-    pub(super) link: Option<(LinkNumber, Member)>,
+    /// As long as it is a link.
+    pub(super) link: Option<Linked>,
+    /// The peer has said goodbye on it, and has not been sent yet that all was taken.
+    pub(super) owes_the_last: bool,
     /// Whether what was written so far ends with a whole frame, so that words can follow; where peers prove who they are, not before that.
     pub(super) may_speak: bool,
     pub(super) tasks: Vec<SpawnHandle>,
@@ -45,6 +82,7 @@ impl Wire {
             datagrams_made: 0,
             mode,
             link: None,
+            owes_the_last: false,
             may_speak,
             tasks: Vec::new(),
             heard,

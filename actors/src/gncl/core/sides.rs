@@ -101,11 +101,10 @@ impl Link {
 }
 
 impl Core {
-    /// Whether a peer is about to dial a connection for Stream or for Bulk.
+    /// Whether a peer may dial a connection for Stream or for Bulk: one that is not there, or breaks; the peer may know that before we do.
     pub(in crate::gncl) fn expects_sides(&self) -> bool {
         let accepted = self.peers.values().filter_map(|peer| peer.link).filter(|link| link.dialled.is_none());
-        let mut sides = accepted.filter_map(|link| link.sides).flatten();
-        sides.any(|side| matches!(side.state, SideState::Down) && !side.is_through)
+        accepted.filter_map(|link| link.sides).flatten().any(|side| !side.is_through)
     }
 
     /// A link stands: the sides are dialled by whoever dialled it.
@@ -215,7 +214,8 @@ impl Core {
     pub(super) fn side_over(&mut self, now: Time, node: NodeAddress, lane: Lane) {
         let (chance, redial_max) = (self.chance(), self.settings.redial_max);
         let Some(link) = self.peers.get_mut(&node).and_then(|peer| peer.link.as_mut()) else { return };
-        let is_dialled = link.dialled.is_some() && !link.has_left;
+        // Also of a peer that leaves: what it keeps for this connection comes on the next one. spec: GNCL-10
+        let is_dialled = link.dialled.is_some();
         if let Some(side) = link.side(lane) {
             // spec: GNCL-8
             side.state = if is_dialled && !side.is_through {

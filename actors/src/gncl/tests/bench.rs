@@ -136,6 +136,20 @@ impl Node {
         }
     }
 
+    /// From now on the layer does nothing, as one whose thread hangs.
+    pub(super) async fn hang_layer(&mut self) -> Hung {
+        let arbiter = self.arbiter.take().expect("there is a layer");
+        let (say, hangs) = tokio::sync::oneshot::channel();
+        let (release, held) = std::sync::mpsc::sync_channel::<()>(1);
+        arbiter.spawn_fn(move || {
+            say.send(()).expect("the test waits");
+            // Until the other end is dropped.
+            let _ = held.recv();
+        });
+        within("the layer to hang", hangs).await.expect("its thread says that it hangs");
+        Hung { arbiter, release }
+    }
+
     /// Has the layer end in order, as when its node is stopped.
     pub(super) fn leave(&self) {
         self.stores.stopping.store(true, Ordering::Relaxed);
@@ -246,6 +260,22 @@ impl Node {
             }
         })
         .await;
+    }
+}
+
+/// A layer whose thread hangs.
+pub(super) struct Hung {
+    arbiter: Arbiter,
+    release: std::sync::mpsc::SyncSender<()>,
+}
+
+impl Hung {
+    /// It comes back, and is dropped at once, as its successor is there.
+    pub(super) fn comes_back(self) {
+        let Self { arbiter, release } = self;
+        arbiter.stop();
+        drop(release);
+        arbiter.join().expect("the layer's thread ends without a panic");
     }
 }
 

@@ -1,7 +1,7 @@
 //! Connections for each class: what one of them does is nothing to the others.
 
 use sinew_runtime::{
-    outcome::Outcome,
+    outcome::{Outcome, Rejection},
     wire::{Class, Kind, Message},
 };
 
@@ -39,6 +39,23 @@ fn each_class_travels_on_its_own_connection() {
             node.stores.router.send(of_class(class, copy)).expect("the peer is linked");
             let there = lane.hear().await.header;
             assert_eq!((there.class, there.number), (class, 1), "each has its own numbers");
+        }
+    });
+}
+
+#[test]
+fn what_is_longer_than_the_peer_takes_is_refused_also_before_the_connection_of_its_class_is_there() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let features = vec![CLASSES.to_owned()];
+        let hello = Introduction { features, payload_max: 64, ..introduction(node.address()) };
+        let _control = ByHand::greeting(&node, &hello).await;
+        node.up().await;
+        let mut to = node.tid(1);
+        to.node = NINE;
+        for class in Class::ALL {
+            let refused = node.stores.router.send(of_class(class, node.message(to, &[0; 65])));
+            assert_eq!(refused, Err(Rejection::TooLong), "{class:?}");
         }
     });
 }

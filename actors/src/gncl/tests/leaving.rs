@@ -2,7 +2,8 @@
 
 use sinew_runtime::{
     outcome::Outcome,
-    tid::Tid,
+    tid::{Incarnation, Tid},
+    time::Time,
     wire::{Class, Kind, Message},
 };
 
@@ -11,7 +12,9 @@ use super::{
     classes::lane_by_hand,
 };
 use crate::{
+    clocks::{ClockDrift, ClockOffset},
     gncl::{
+        LinkFact,
         core::{CLASSES, Introduction, Lane, read, write},
         peer::frame,
     },
@@ -80,6 +83,82 @@ fn what_a_peer_has_not_said_to_have_goes_out_again_before_its_node_is_gone() {
         let mut last = bulk_by_hand(&node, 3).await;
         assert_eq!(last.hear().await.payload[..], *b"written");
         assert_eq!(last.hear().await.header.kind, Kind::GNCL_GOODBYE);
+    });
+}
+
+#[test]
+fn what_was_written_on_a_connection_that_breaks_behind_the_goodbye_goes_out_again_before_its_node_is_gone() {
+    run(async {
+        // Given: a link that lacks nothing
+        let mut node = Node::start(1).await;
+        let mut first = lane_by_hand(&node, Lane::Control, 1).await;
+        node.up().await;
+        let _stream = lane_by_hand(&node, Lane::Stream, 2).await;
+        let mut lost = bulk_by_hand(&node, 3).await;
+        let to = Tid::new(NINE, node.tid(1).app);
+        node.stores.router.send(bulk(node.message(to, b"written"))).expect("the peer is linked");
+        assert_eq!(lost.hear().await.payload[..], *b"written");
+        // When
+        node.leave();
+        assert_eq!(first.hear().await.header.kind, Kind::GNCL_GOODBYE);
+        drop(lost);
+        // Then
+        let mut last = bulk_by_hand(&node, 4).await;
+        assert_eq!(last.hear().await.payload[..], *b"written");
+        assert_eq!(last.hear().await.header.kind, Kind::GNCL_GOODBYE);
+    });
+}
+
+// spec: GNCL-10
+#[test]
+fn who_leaves_hears_that_its_last_message_was_taken_though_much_waits_for_it() {
+    run(async {
+        // Given: a peer that reads nothing until its socket is full
+        let mut node = Node::start_with(1, |config| config.gncl.queue_capacity = 64).await;
+        let mut inbox = node.app(1);
+        let _first = lane_by_hand(&node, Lane::Control, 1).await;
+        node.up().await;
+        let mut lane = bulk_by_hand(&node, 2).await;
+        let to = Tid::new(NINE, node.tid(1).app);
+        let long = vec![0; 256 << 10];
+        while node.stores.router.send(bulk(node.message(to, &long))).is_ok() {}
+        // When
+        let mut last = bulk(node.message(node.tid(1), b"the last word"));
+        last.header.source.node = NINE;
+        lane.say(&last).await;
+        lane.say(&frame(NINE, node.address(), Kind::GNCL_GOODBYE, bytes::Bytes::new())).await;
+        assert_eq!(next("the last word", &mut inbox).await.payload[..], *b"the last word");
+        // Then
+        let mut taken = 0;
+        while let Some(heard) = lane.try_hear_any().await {
+            if heard.header.kind == Kind::GNCL_ACK {
+                let Ack { next, .. } = read(&heard.payload).expect("an ACK has a payload");
+                taken = next;
+            }
+        }
+        assert_eq!(taken, 2, "what it takes next is behind the last word");
+    });
+}
+
+#[test]
+fn what_is_known_of_the_clock_of_who_leaves_is_forgotten_with_it() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let life = Incarnation(1);
+        let (at, bound) = (Time::now(), std::time::Duration::ZERO);
+        let offset = ClockOffset { theirs_minus_ours_ns: 0, bound, at, drift: ClockDrift::UNKNOWN };
+        node.stores.clocks.set(NINE, life, offset);
+        node.stores.gncl.leaves(Time::now(), NINE, life);
+        assert!(node.stores.clocks.get(NINE, life).is_some(), "what it still sends has an age");
+        peer.say(&frame(NINE, node.address(), Kind::GNCL_GOODBYE, bytes::Bytes::new())).await;
+        node.fact_that(|fact| matches!(fact, LinkFact::PeerLeft { .. })).await;
+        within("it to be forgotten", async {
+            while node.stores.clocks.get(NINE, life).is_some() {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
     });
 }
 

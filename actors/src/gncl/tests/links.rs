@@ -16,7 +16,7 @@ use sinew_runtime::{
 };
 use socket2::SockRef;
 
-use super::bench::{ByHand, Cable, NINE, Node, next, pair, run};
+use super::bench::{ByHand, Cable, NINE, Node, next, pair, run, within};
 use crate::{
     accept_pace::Pace,
     gncl::{LinkFact, core::write, lent::Lent, link, listener, peer::frame},
@@ -276,6 +276,26 @@ fn a_restarted_layer_listens_where_it_did_and_sends_what_waited_in_order() {
         for number in 0..20 {
             assert_eq!(next("a message that waited", &mut inbox).await.payload[..], [number]);
         }
+    });
+}
+
+#[test]
+fn a_layer_that_hung_and_comes_back_leaves_the_links_of_its_successor_alone() {
+    run(async {
+        let (mut a, b) = pair().await;
+        let hung = a.hang_layer().await;
+        a.start_layer().await;
+        a.up().await;
+        let peer = a.stores.gncl.peer(b.address()).expect("it is linked");
+        let is_linked = || peer.ways().iter().all(|way| way.outlet.is_connected());
+        within("all connections", async {
+            while !is_linked() {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        hung.comes_back();
+        assert!(is_linked());
     });
 }
 

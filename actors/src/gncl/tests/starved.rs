@@ -14,18 +14,24 @@ use actix::{Actor, ActorContext, Addr, AsyncContext};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use sinew_runtime::{
     supervision::ReadyGate,
-    tid::{Incarnation, NodeAddress},
-    wire::Kind,
+    tid::{Incarnation, NodeAddress, Tid},
+    wire::{Class, Kind},
 };
 use tokio::net::TcpStream;
 
 use super::{
-    bench::{ByHand, NINE, introduction, run, within},
+    bench::{ByHand, NINE, Node, introduction, run, within},
+    classes::{lane_by_hand, of_class},
     secured::{keys, secured_stores},
 };
 use crate::{
     config::NodeConfig,
-    gncl::{Gncl, core::write, peer::frame},
+    gncl::{
+        Gncl,
+        core::{CLASSES, Introduction, Lane, write},
+        peer::frame,
+        transport::Transport,
+    },
     stores::Stores,
 };
 
@@ -122,6 +128,50 @@ fn a_life_that_begins_while_no_descriptor_is_left_listens_as_the_former_one_did(
             peer.say(&frame(NINE, stores.node, Kind::GNCL_HELLO, write(&hello))).await;
             assert_eq!(peer.hear().await.header.kind, answer);
             life.end().await;
+        }
+    });
+}
+
+#[test]
+fn a_connection_of_bulk_for_which_no_descriptor_is_left_ends_alone_and_a_stranger_makes_room_for_the_next() {
+    alone(async {
+        // Given: a thread for Bulk, a stranger, and a peer
+        let mut node = Node::start_with(1, |config| config.gncl.handshake = Duration::from_mins(10)).await;
+        let connected = within("a connection", TcpStream::connect(node.listens_at())).await;
+        let stranger = Transport::open(connected.expect("the node listens"));
+        drop(node.stores.gncl.place(Lane::Bulk, stranger.clone()).expect("there are descriptors"));
+        let mut bulk = ByHand::dial(&node).await;
+        // It was accepted behind these two.
+        let mut first = lane_by_hand(&node, Lane::Control, 1).await;
+        node.up().await;
+        // When
+        let starved = Starved::begin();
+        let features = vec![CLASSES.to_owned()];
+        let hello =
+            Introduction { lane: Lane::Bulk, link: 1, dial: 2, features, ..introduction(node.address()) };
+        bulk.say(&frame(NINE, node.address(), Kind::GNCL_HELLO, write(&hello))).await;
+        // Then
+        assert!(bulk.try_hear_any().await.is_none(), "it is not welcomed");
+        assert_eq!(node.stores.gncl.refusals.of("no descriptor for a connection of Bulk"), 1);
+        assert_eq!(
+            node.stores.gncl.refusals.of("not accepted"),
+            0,
+            "nothing else has said that there is none"
+        );
+        let mut buffer = bytes::BytesMut::new();
+        let end = within("the stranger to go", stranger.read(&mut buffer, 1)).await;
+        assert_eq!(end.expect("it is closed in order"), 0);
+        drop(starved);
+        let mut again = lane_by_hand(&node, Lane::Bulk, 3).await;
+        let to = Tid::new(NINE, node.tid(1).app);
+        for (class, lane) in [(Class::Control, &mut first), (Class::Bulk, &mut again)] {
+            let message = of_class(class, node.message(to, b"goes on"));
+            node.stores.router.send(message).expect("the peer is linked");
+            let mut heard = lane.hear().await;
+            while heard.header.kind == Kind::GNCL_PING {
+                heard = lane.hear().await;
+            }
+            assert_eq!(heard.payload[..], *b"goes on", "{class:?}");
         }
     });
 }

@@ -117,7 +117,14 @@ mod tests {
     fn who_is_always_outrun_by_another_thread_leaves_it_to_who_looks_for_what_is_owed() {
         // Given: each time that one is said, another thread has made a newer one.
         let [here, node] = [1, 2].map(NodeAddress::new);
-        let ends = Ends { here, node, takes_outcomes: true, answers_there: 100, ways: 1 };
+        let ends = Ends {
+            here,
+            node,
+            takes_outcomes: true,
+            answers_there: 100,
+            payload_max_there: usize::MAX,
+            ways: 1,
+        };
         let way = Way::new(Time::now(), ends, &NodeConfig::new("hip"), &Told::default());
         let mut rounds = 0;
         let mut outrun = || {
@@ -141,7 +148,14 @@ mod tests {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("it is bound");
         let [here, node] = [1, 2].map(NodeAddress::new);
-        let ends = Ends { here, node, takes_outcomes: true, answers_there: 100, ways: 1 };
+        let ends = Ends {
+            here,
+            node,
+            takes_outcomes: true,
+            answers_there: 100,
+            payload_max_there: usize::MAX,
+            ways: 1,
+        };
         let way = Way::new(Time::now(), ends, &NodeConfig::new("hip"), &Told::default());
         // Given: a thread has made one, and is held up before it says it.
         let older = way.next_ack();
@@ -181,7 +195,14 @@ mod tests {
             filled += count;
         }
         let [here, node] = [1, 2].map(NodeAddress::new);
-        let ends = Ends { here, node, takes_outcomes: true, answers_there: 100, ways: 1 };
+        let ends = Ends {
+            here,
+            node,
+            takes_outcomes: true,
+            answers_there: 100,
+            payload_max_there: usize::MAX,
+            ways: 1,
+        };
         let config = NodeConfig::new("hip");
         let way = Way::new(Time::now(), ends, &config, &Told::default());
         let link = way.outlet.connect(Gathering::new(Transport::open(ours), Checksum::Crc), 1 << 16, None);

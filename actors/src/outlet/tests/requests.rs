@@ -41,6 +41,22 @@ fn kinds(bench: &Bench) -> Vec<Kind> {
     frames(&bench.wire.bytes.lock().unwrap()).iter().map(|message| message.header.kind).collect()
 }
 
+// spec: SESSION-3
+#[test]
+fn nothing_is_said_on_a_connection_before_what_is_taken_next() {
+    let bench = session(PLENTY);
+    let words = |kind| Message::new(Header::new(kind, tid(0), tid(1)), Bytes::new());
+    let ping =
+        || bench.outlet.submit_urgent(words(Kind::GNCL_PING), usize::MAX).map_err(|refused| refused.why);
+    assert_eq!(ping(), Err(Rejection::Closed));
+    bench.outlet.submit_urgent(words(Kind::GNCL_ACK), usize::MAX).expect("it is the first");
+    assert_eq!(ping(), Ok(()));
+    assert_eq!(kinds(&bench), [Kind::GNCL_ACK, Kind::GNCL_PING]);
+    // And on each one anew.
+    bench.outlet.connect(bench.wire.clone(), usize::MAX, None);
+    assert_eq!(ping(), Err(Rejection::Closed));
+}
+
 #[test]
 fn a_request_that_waits_for_the_socket_is_taken_back_and_the_others_keep_their_order() {
     let bench = session(0);

@@ -106,6 +106,34 @@ fn a_node_that_said_goodbye_and_hangs_up_has_left_whatever_its_other_connections
     assert_eq!(core.next_wake(), None);
 }
 
+// spec: GNCL-10
+#[test]
+fn a_side_that_breaks_when_the_peer_leaves_is_dialled_again_until_it_is_through() {
+    let (mut core, link, sides) = dialler();
+    let welcomed = |core: &mut Core, at: u64, connection: ConnectionId| {
+        let Introduction { lane, link, .. } = hello_on(core, millis(at), connection);
+        let welcome = Introduction { lane, link, ..hello_from(HIGH, 1, 0) };
+        core.handle(millis(at), Input::WelcomeReceived(connection, welcome));
+        outputs(core);
+    };
+    for side in &sides {
+        welcomed(&mut core, 3, *side);
+    }
+    let left = Output::Fact(LinkFact::PeerLeft { node: HIGH, incarnation: Incarnation(1) });
+    for connection in [link, sides[0]] {
+        core.handle(millis(4), Input::GoodbyeReceived(connection));
+    }
+    core.handle(millis(5), Input::Ended(sides[1]));
+    assert!(!outputs(&mut core).contains(&left), "what it keeps for Bulk has not come");
+    core.handle(millis(17), Input::TimePassed);
+    let again = dials(&mut core);
+    assert_eq!(again.len(), 1);
+    welcomed(&mut core, 18, again[0]);
+    core.handle(millis(19), Input::GoodbyeReceived(again[0]));
+    assert!(outputs(&mut core).contains(&left));
+    assert_eq!(core.next_wake(), None);
+}
+
 #[test]
 fn a_silent_side_is_broken_alone() {
     let mut core = core();
@@ -203,7 +231,9 @@ fn a_node_that_leaves_takes_the_connections_that_its_links_lack_and_no_others() 
         let (_, taken) = greet(&mut core, millis(2), side_of(1, lane, dial));
         assert!(taken.iter().any(|output| matches!(output, Output::Attach(_))), "{taken:?}");
     }
-    let last = core.open();
-    core.handle(millis(3), Input::Accepted(last, SOMEWHERE));
-    assert!(outputs(&mut core).contains(&Output::Close(last)), "no link lacks one any more");
+    // One that is there may break, and who dials it again may be the first to know.
+    let (_, again) = greet(&mut core, millis(3), side_of(1, Lane::Bulk, 4));
+    assert!(again.iter().any(|output| matches!(output, Output::Attach(_))), "{again:?}");
+    let (_, other) = greet(&mut core, millis(4), hello_from(NodeAddress::new(HIGH.bits() + 1), 1, 1));
+    assert_eq!(refusal(&other), Some("leaving"));
 }
