@@ -377,12 +377,16 @@ impl SyncManager {
         }
     }
 
-    /// Sends the list; where it is not taken, the next one comes within two seconds anyway.
+    /// Sends the list; what the queue does not take is said again in 10 ms.
     fn publish(&self, to: NodeAddress, list: Bytes) {
         let mut header = Header::new(Kind::SYNC_DIRECTORY, self.tid(), Tid::new(to, AppAddress::SYNC));
         self.stamp(&mut header);
         if let Err(why) = self.stores.router.send(Message::new(header, list)) {
             self.refuse("peer", &format_args!("{to} was not sent this node's directory, tried again: {why}"));
+            // One that takes shorter words than this node writes is not helped by haste.
+            if why != Rejection::TooLong {
+                self.core().handle(Time::now(), Input::ListNotTaken { to });
+            }
         }
     }
 

@@ -169,6 +169,43 @@ fn who_does_not_wait_for_a_lost_party_hears_of_its_failure_and_stop_on_another_n
     }
 }
 
+// spec: SYNC-13
+#[test]
+fn each_lost_party_has_its_own_time_to_return() {
+    let part = GRACE / 5;
+    for kind in [BarrierKind::Meeting, BarrierKind::Phase] {
+        let mut bench = Bench::of_the_hip();
+        for (index, name) in [(1, "knee"), (2, "ankle")] {
+            bench.registers(index, name, &[]);
+            bench.ready(index);
+        }
+        let asked = ArriveAtBarrier {
+            kind,
+            barrier: "calibrated".to_owned(),
+            parties: ["hip", "knee", "ankle"].map(str::to_owned).to_vec(),
+            within_ms: 60_000,
+            on_loss: OnPartyLoss::Fail,
+        };
+        bench.hears(Input::Arrived { app: app(0), correlation: 7, asked });
+        bench.down(1);
+        bench.passes(part);
+        bench.down(2);
+        bench.passes(part);
+        bench.ready(1);
+        let is_lost = |outputs: Vec<Output>| {
+            let is_lost = |output: &Output| {
+                matches!(output, Output::AnswerBarrier { answer: BarrierAnswer::Lost { .. }, .. })
+            };
+            outputs.iter().any(is_lost)
+        };
+        assert!(
+            !is_lost(bench.passes(GRACE - 2 * part)),
+            "{kind:?}: the knee is back, and the ankle has time"
+        );
+        assert!(is_lost(bench.passes(part)), "{kind:?}");
+    }
+}
+
 #[test]
 fn a_node_says_how_an_application_ended_until_it_is_ready_again() {
     let mut bench = Bench::of_the_hip();
@@ -199,6 +236,59 @@ fn who_counted_passes_also_when_its_node_hears_of_a_later_generation_first() {
     let again = BarrierSaid { earlier: vec![Passed::new(hip, 2)], ..idle("calibrated", 4) };
     let outputs = bench.is_told(KNEE, LIFE, 2, vec![again]);
     assert!(!outputs.iter().any(|output| matches!(output, Output::AnswerBarrier { .. })), "{outputs:?}");
+}
+
+// spec: SYNC-12
+#[test]
+fn who_passed_in_a_life_that_an_earlier_clock_gave_its_number_is_said_on() {
+    // Given: the knee was there in a later life, as its clock had it
+    let mut bench = Bench::of_the_hip();
+    bench.links(KNEE, DOUBLE);
+    bench.is_told(KNEE, DOUBLE, 7, vec![idle("calibrated", 0)]);
+    bench.hears(Input::LinkChanged(LinkFact::LinkBroken { node: KNEE, incarnation: DOUBLE }));
+    bench.links(ANKLE, LIFE);
+    // When: in its present one it has passed, as another node says that has met it, and it has not heard of that
+    let knee = Member { node: KNEE, incarnation: LIFE, party: 1 };
+    let passed = BarrierSaid { members: vec![knee], ..idle("calibrated", 1) };
+    bench.is_told(ANKLE, LIFE, 1, vec![passed]);
+    bench.is_told(ANKLE, LIFE, 2, vec![idle("calibrated", 2)]);
+    // Then
+    let words = bench.passes(Duration::from_secs(2));
+    let said = words.iter().rev().find_map(|output| {
+        let Output::PublishArrivals { said, .. } = output else { return None };
+        Some(Arrivals::parse(said).expect("a word of this node's"))
+    });
+    let said = said.expect("it is said again and again");
+    assert_eq!(said.barriers[0].earlier, [Passed::new(knee, 1)]);
+}
+
+#[test]
+fn since_when_a_party_is_missing_is_known_also_where_many_are_there() {
+    // Given: 40 applications of this node that wait for each other and for one more
+    let mut bench = Bench::new();
+    let names: Vec<String> = (0..40).map(|index| format!("drive.{index}")).collect();
+    let parties: Vec<String> = names.iter().cloned().chain(["gait".to_owned()]).collect();
+    for (index, name) in (0..).zip(&names) {
+        bench.registers(index, name, &[]);
+        bench.ready(index);
+        let asked = ArriveAtBarrier {
+            kind: BarrierKind::Meeting,
+            barrier: "calibrated".to_owned(),
+            parties: parties.clone(),
+            within_ms: 60_000,
+            on_loss: OnPartyLoss::Wait,
+        };
+        bench.hears(Input::Arrived { app: app(index), correlation: 7, asked });
+    }
+    // When: one leaves after a second
+    bench.passes(Duration::from_secs(1));
+    let barrier = "calibrated".to_owned();
+    bench.hears(Input::Left { app: app(39), barrier, correlation: None });
+    bench.passes(GRACE);
+    // Then
+    let status = bench.core.barriers(bench.now).remove(0);
+    let since: Vec<_> = status.missing.iter().map(|absence| (absence.name.as_str(), absence.since)).collect();
+    assert_eq!(since, [("drive.39", GRACE), ("gait", Duration::from_secs(1) + GRACE)]);
 }
 
 // spec: SYNC-12

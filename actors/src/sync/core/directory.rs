@@ -115,6 +115,7 @@ impl Input {
             | Self::AnswerNotTaken { .. }
             | Self::ArrivalsReceived { .. }
             | Self::ArrivalsNotTaken { .. }
+            | Self::ListNotTaken { .. }
             | Self::DirectoryWanted { .. }
             | Self::DirectoryNotTaken { .. }
             | Self::ReleaseNotTaken { .. }

@@ -73,6 +73,8 @@ pub(crate) enum Input {
     Left { app: AppAddress, barrier: String, correlation: Option<u64> },
     /// It did not take this answer to its request.
     AnswerNotTaken { app: AppAddress, correlation: u64, answer: BarrierAnswer },
+    /// The queue to `to` did not take this node's list.
+    ListNotTaken { to: NodeAddress },
     /// The sync manager of `from` said who waits at barriers.
     ArrivalsReceived { from: NodeAddress, payload: Bytes },
     /// The queue to `to` did not take who waits at barriers.
@@ -227,6 +229,7 @@ impl Core {
                 return self.answer_not_taken(now, app, correlation, answer);
             }
             Input::ArrivalsReceived { from, payload } => self.arrivals_received(now, from, &payload),
+            Input::ListNotTaken { to } => self.peers.not_taken(now, to),
             Input::ArrivalsNotTaken { to } => self.rendezvous.not_taken(now, to),
             Input::LinkChanged(fact) => self.link_changed(now, fact),
             Input::ListReceived { from, payload } => self.list_received(from, &payload),

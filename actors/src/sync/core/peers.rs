@@ -12,13 +12,13 @@ use sinew_runtime::{
     wire::Kind,
 };
 
-use super::reason::Reason;
+use super::{barrier::RETRY, reason::Reason};
 use crate::{
     access::Said,
     sync::list::{Entry, List, Name},
 };
 
-/// Time between two lists to a peer when nothing changed: the net beneath a list that a full queue refused.
+/// Time between two lists to a peer when nothing changed: the net beneath a list that was lost.
 pub(super) const REPEAT: Duration = Duration::from_secs(2);
 /// Least time between two lists to a peer, the first of them a long one: a burst of changes costs 200 of these a second, not one each.
 const SPACING_LONG: Duration = Duration::from_millis(5);
@@ -370,6 +370,13 @@ impl Peers {
         for peer in self.nodes.values_mut() {
             let earliest = peer.sent.map_or(now, |sent| now.max(sent + spacing));
             peer.due = peer.due.min(earliest);
+        }
+    }
+
+    /// Our list did not get into the queue to `node`: it is said again soon, as nothing of this node is ready for that one before. // spec: SYNC-2
+    pub(super) fn not_taken(&mut self, now: Time, node: NodeAddress) {
+        if let Some(peer) = self.nodes.get_mut(&node) {
+            peer.due = now + RETRY;
         }
     }
 

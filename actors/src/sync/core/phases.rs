@@ -40,8 +40,8 @@ struct Wait {
     since: Time,
     until: Time,
     on_loss: OnPartyLoss,
-    /// Since when a party is known to be lost that is not waited for.
-    lost: Option<Time>,
+    /// Of each party, since when it is known to be lost, if that is not waited for.
+    lost: Vec<Option<Time>>,
     /// Of its request.
     correlation: u64,
     /// Of each party, since when it is missing, if it is.
@@ -52,8 +52,8 @@ struct Wait {
 struct Standing {
     /// Who has not reached the phase, of which party, and the last that is known of each.
     missing: Vec<(usize, String, &'static str)>,
-    /// Whether one that is asked for by its name has ended.
-    has_lost: bool,
+    /// Of which parties one that is asked for by its name has ended.
+    lost: Vec<usize>,
 }
 
 impl Phases {
@@ -82,13 +82,15 @@ impl Phases {
 }
 
 impl Wait {
+    /// When its time is over, or that of the return of the party that was lost first.
     fn next(&self) -> Time {
-        self.lost.map_or(self.until, |lost| self.until.min(lost + GRACE))
+        let lost = self.lost.iter().copied().flatten().min();
+        lost.map_or(self.until, |lost| self.until.min(lost + GRACE))
     }
 
     /// Its answer, if its time has come.
     fn judge(&mut self, Moment { now, judged }: Moment, standing: Standing) -> Option<BarrierAnswer> {
-        let Standing { missing, has_lost } = standing;
+        let Standing { missing, lost } = standing;
         for (party, absent) in self.absent.iter_mut().enumerate() {
             let is_missing = missing.iter().any(|(other, ..)| *other == party);
             *absent = is_missing.then(|| absent.unwrap_or(now));
@@ -97,9 +99,10 @@ impl Wait {
         if missing.is_empty() {
             return Some(BarrierAnswer::Opened { generation: ONCE });
         }
-        match (self.on_loss, has_lost) {
-            (OnPartyLoss::Fail, true) => drop(self.lost.get_or_insert(now)),
-            (OnPartyLoss::Fail, false) | (OnPartyLoss::Wait, _) => self.lost = None,
+        let asks = self.on_loss == OnPartyLoss::Fail;
+        for (party, since) in self.lost.iter_mut().enumerate() {
+            let is_lost = asks && lost.contains(&party);
+            *since = is_lost.then(|| since.unwrap_or(now));
         }
         if self.until <= judged {
             Some(BarrierAnswer::TimedOut { missing })
@@ -137,8 +140,8 @@ impl Core {
         let texts = parties.iter().map(ToString::to_string).collect();
         let parties: Vec<Requirement> = parties.into_iter().map(|party| party.at(&*phase)).collect();
         let until = now + within;
-        let absent = vec![None; parties.len()];
-        let wait = Wait { texts, parties, since: now, until, on_loss, lost: None, correlation, absent };
+        let (absent, lost) = (vec![None; parties.len()], vec![None; parties.len()]);
+        let wait = Wait { texts, parties, since: now, until, on_loss, lost, correlation, absent };
         if let Some(former) = self.phases.0.insert((app, phase), wait) {
             let why = "this application has arrived there again; the later request stands".to_owned();
             let answer = BarrierAnswer::Refused { why };
@@ -163,14 +166,16 @@ impl Core {
     }
 
     fn standing_at_phase(&self, wait: &Wait) -> Standing {
-        let (mut missing, mut has_lost) = (Vec::new(), false);
+        let (mut missing, mut lost) = (Vec::new(), Vec::new());
         for (at, party) in wait.parties.iter().enumerate() {
             let Some(why) = self.standing(AppAddress::NONE, party).why_not(party) else { continue };
-            has_lost |= party.one_name().is_some() && why.is_end();
+            if party.one_name().is_some() && why.is_end() {
+                lost.push(at);
+            }
             let parts = self.missing_parts(AppAddress::NONE, party);
             missing.extend(parts.into_iter().map(|(part, why)| (at, part, why)));
         }
-        Standing { missing, has_lost }
+        Standing { missing, lost }
     }
 
     fn absent_at_phase(&self, now: Time, wait: &Wait) -> Vec<Absence> {
@@ -199,6 +204,11 @@ impl Core {
                 statuses.iter_mut().find(|status| status.barrier == **phase && status.parties == wait.texts);
             if let Some(same) = same {
                 same.waiting.push(waiting);
+                // All of them lack the same; who came first has lacked it for longest.
+                let longer = self.absent_at_phase(now, wait);
+                for (absence, longer) in same.missing.iter_mut().zip(longer) {
+                    absence.since = absence.since.max(longer.since);
+                }
                 continue;
             }
             let (barrier, parties) = (phase.to_string(), wait.texts.clone());

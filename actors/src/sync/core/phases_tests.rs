@@ -107,6 +107,26 @@ fn who_waits_at_a_phase_and_for_whom_is_to_be_seen_and_said_at_the_deadline() {
     assert_eq!(bench.core.barriers(bench.now), []);
 }
 
+#[test]
+fn of_several_who_wait_at_a_phase_the_first_says_since_when_a_party_is_missing() {
+    let mut bench = Bench::of_two_drives();
+    bench.registers(1, "foot.drive", &[]);
+    for index in [1, 0] {
+        let asked = ArriveAtBarrier {
+            barrier: "homed".to_owned(),
+            parties: ["*.drive", "knee.drive"].map(str::to_owned).to_vec(),
+            within_ms: 60_000,
+            on_loss: OnPartyLoss::Wait,
+            kind: BarrierKind::Phase,
+        };
+        bench.hears(Input::Arrived { app: app(index), correlation: 7, asked });
+        bench.passes(SECOND);
+    }
+    let status = bench.core.barriers(bench.now).remove(0);
+    assert_eq!((status.waiting.len(), status.missing.len()), (2, 1), "{status:?}");
+    assert_eq!(status.missing[0].since, 2 * SECOND);
+}
+
 // spec: SYNC-15
 #[test]
 fn who_does_not_wait_for_a_lost_party_at_a_phase_is_told() {

@@ -3,6 +3,7 @@
 use sinew_runtime::wire::Kind;
 
 use super::*;
+use crate::sync::core::barrier::RETRY;
 
 // spec: SYNC-2
 #[test]
@@ -25,6 +26,16 @@ fn a_change_follows_a_short_list_within_a_millisecond_and_a_long_one_within_five
             assert_eq!(said.len(), usize::from(millisecond == waits), "after {millisecond} ms of {waits}");
         }
     }
+}
+
+// spec: SYNC-2
+#[test]
+fn what_the_queue_to_a_peer_did_not_take_is_said_again_soon() {
+    let mut bench = Bench::new();
+    bench.registers(0, "sensor", &[]);
+    assert_eq!(published(&bench.links(KNEE, LIFE)).len(), 1);
+    bench.hears(Input::ListNotTaken { to: KNEE });
+    assert_eq!(published(&bench.passes(RETRY)).len(), 1);
 }
 
 // spec: SYNC-2

@@ -23,15 +23,15 @@ enum Standing {
 struct Lack {
     /// Who is missing, and the last that is known of each, where somebody is to be told.
     missing: Vec<(String, String)>,
-    /// Whether a party is lost that somebody does not want to wait for.
-    has_lost: bool,
+    /// Of each party since when it is lost, if somebody does not want to wait for it.
+    lost: Vec<Option<Time>>,
     /// Those who wait whose time is over.
     over: Vec<AppAddress>,
-    /// Of each party whether it is there, unless so many are that this is not looked at.
+    /// Of each party whether it is there.
     there: Vec<bool>,
 }
 
-/// Parties times those who are there, up to which it is looked at each time who is missing.
+/// Parties that are not one name, times those who are there, up to which it is looked at each time which of these is missing.
 const LOOKED_AT_MAX: usize = 1_024;
 
 impl Rendezvous {
@@ -71,15 +71,19 @@ impl Rendezvous {
             return Standing::Complete(chosen(&known.parties, present));
         }
         let asks = known.waiting.values().any(|wait| wait.on_loss == OnPartyLoss::Fail);
-        let has_lost = asks && known.parties.iter().any(|party| is_lost(party, &present, why_not));
-        let over = known.waiting.iter().filter(|(_, wait)| wait.is_over(moment, has_lost));
+        let parties = known.parties.iter().enumerate().filter(|_| asks);
+        let lost: Vec<Option<Time>> = parties
+            .map(|(at, party)| {
+                is_lost(party, &present, why_not).then(|| known.lost_since(at).unwrap_or(moment.now))
+            })
+            .collect();
+        let first = lost.iter().copied().flatten().min();
+        let over = known.waiting.iter().filter(|(_, wait)| wait.is_over(moment, first));
         let over: Vec<AppAddress> = over.map(|(app, _)| *app).collect();
         let missing = if over.is_empty() { Vec::new() } else { missing(&known.parties, &present, why_not) };
         let missing = missing.into_iter().map(|(_, name, why)| (name, why)).collect();
-        let is_little = known.parties.len() * present.len() <= LOOKED_AT_MAX;
-        let parties = known.parties.iter().filter(|_| is_little);
-        let there = parties.map(|party| arrived(party, &present) >= party.count()).collect();
-        Standing::Lacks(Lack { missing, has_lost, over, there })
+        let there = who_is_there(&known.parties, &present);
+        Standing::Lacks(Lack { missing, lost, over, there })
     }
 
     // spec: SYNC-11
@@ -97,12 +101,14 @@ impl Rendezvous {
         &mut self,
         Moment { now, judged }: Moment,
         key: &Key,
-        Lack { missing, has_lost, over, there }: Lack,
+        Lack { missing, lost, over, there }: Lack,
     ) {
         let Some(known) = self.known.get_mut(key) else { return };
         known.note_absent(now, &there);
+        let first = lost.iter().copied().flatten().min();
+        known.lost = lost;
         for wait in known.waiting.values_mut() {
-            wait.lost = wait.lost_since(now, has_lost);
+            wait.lost = wait.lost_since(first);
         }
         if over.is_empty() {
             return;
@@ -149,17 +155,14 @@ impl Rendezvous {
 }
 
 impl Wait {
-    /// Since when a party is known to be lost, if one is and this application does not wait for its return.
-    fn lost_since(&self, now: Time, has_lost: bool) -> Option<Time> {
-        match (self.on_loss, has_lost) {
-            (OnPartyLoss::Fail, true) => self.lost.or(Some(now)),
-            (OnPartyLoss::Fail, false) | (OnPartyLoss::Wait, _) => None,
-        }
+    /// Since when it does not wait for the return of the party that was lost first.
+    fn lost_since(&self, first: Option<Time>) -> Option<Time> {
+        first.filter(|_| self.on_loss == OnPartyLoss::Fail).map(|lost| lost.max(self.since))
     }
 
     /// Whether its time is over, or that of a lost party's return.
-    fn is_over(&self, Moment { now, judged }: Moment, has_lost: bool) -> bool {
-        let patience = self.lost_since(now, has_lost).map(|lost| lost + GRACE);
+    fn is_over(&self, Moment { judged, .. }: Moment, first: Option<Time>) -> bool {
+        let patience = self.lost_since(first).map(|lost| lost + GRACE);
         patience.map_or(self.until, |patience| self.until.min(patience)) <= judged
     }
 }
@@ -168,6 +171,18 @@ impl Wait {
 pub(super) fn arrived(party: &Requirement, present: &[Present<'_>]) -> usize {
     let there = present.iter().filter(|present| party.counts(present.name));
     there.take(party.count()).count()
+}
+
+/// Of each party whether it is there. Of those that take several names, where there are so many that it is not looked at: no.
+fn who_is_there(parties: &[Requirement], present: &[Present<'_>]) -> Vec<bool> {
+    let names: BTreeSet<&str> = present.iter().map(|present| present.name).collect();
+    let others = parties.iter().filter(|party| party.only_name().is_none()).count();
+    let is_little = others * present.len() <= LOOKED_AT_MAX;
+    let is_there = |party: &Requirement| match party.only_name() {
+        Some(name) => names.contains(name),
+        None => is_little && arrived(party, present) >= party.count(),
+    };
+    parties.iter().map(is_there).collect()
 }
 
 /// Whether all parties are there. spec: SYNC-11

@@ -21,6 +21,8 @@ pub(in crate::sync::core) struct Known {
     pub(super) visitors: BTreeSet<AppAddress>,
     /// Of each party, since when it is known not to wait there, as long as somebody of this node does.
     pub(super) absent: Vec<Option<Time>>,
+    /// Of each party, since when it is known to be lost, as long as somebody of this node does not want to wait for it.
+    pub(super) lost: Vec<Option<Time>>,
 }
 
 /// An application of this node waits at a barrier.
@@ -56,6 +58,7 @@ impl Known {
             waiting: BTreeMap::new(),
             visitors: BTreeSet::new(),
             absent: Vec::new(),
+            lost: Vec::new(),
         }
     }
 
@@ -63,6 +66,7 @@ impl Known {
     pub(super) fn open(&mut self, present: Vec<Member>, knows: impl Fn(&Member) -> u64) {
         self.generation += 1;
         self.absent.clear();
+        self.lost.clear();
         for member in present {
             self.note(member, self.generation);
         }
@@ -97,6 +101,8 @@ impl Known {
         }
         if is_later {
             self.absent.clear();
+            // Who waits for a lost party may have met it there. spec: SYNC-13
+            self.lost.clear();
             self.forget(knows);
         }
         is_news
@@ -106,6 +112,11 @@ impl Known {
     pub(super) fn absent_since(&self, party: usize) -> Option<Time> {
         let waits = self.waiting.values().map(|wait| wait.since).min();
         self.absent.get(party).copied().flatten().max(waits)
+    }
+
+    /// Since when a party is known to be lost.
+    pub(super) fn lost_since(&self, party: usize) -> Option<Time> {
+        self.lost.get(party).copied().flatten()
     }
 
     /// Notes which parties are there.

@@ -105,7 +105,8 @@ impl Voices {
         })
     }
 
-    /// The generation of a barrier that a member's node is known to know. A life that is over needs to know nothing.
+    /// The generation of a barrier that a member's node is known to know. A life that is over needs to know nothing: it is over where a later one
+    /// is heard. Where none is, the clock of the node's host may have begun anew, and this life came after that one. spec: SYNC-12
     pub(super) fn knows(
         &self,
         here: (NodeAddress, Incarnation),
@@ -116,11 +117,13 @@ impl Voices {
         if member.node == here.0 {
             return if member.incarnation == here.1 { own } else { u64::MAX };
         }
-        let Some(said) = self.0.get(&member.node).and_then(|voice| voice.said.as_ref()) else { return 0 };
+        let Some(voice) = self.0.get(&member.node) else { return 0 };
+        let Some(said) = &voice.said else { return 0 };
         match said.incarnation.cmp(&member.incarnation) {
             std::cmp::Ordering::Less => 0,
             std::cmp::Ordering::Equal => said.barriers.get(key).map_or(0, |barrier| barrier.generation),
-            std::cmp::Ordering::Greater => u64::MAX,
+            std::cmp::Ordering::Greater if voice.heard => u64::MAX,
+            std::cmp::Ordering::Greater => 0,
         }
     }
 

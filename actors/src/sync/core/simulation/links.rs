@@ -241,6 +241,7 @@ impl World {
             | Input::AnswerNotTaken { .. }
             | Input::ArrivalsReceived { .. }
             | Input::ArrivalsNotTaken { .. }
+            | Input::ListNotTaken { .. }
             | Input::DirectoryWanted { .. }
             | Input::DirectoryNotTaken { .. }
             | Input::ReleaseNotTaken { .. }

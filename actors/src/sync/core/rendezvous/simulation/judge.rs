@@ -7,7 +7,10 @@ use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
 };
 
-use super::{BARRIERS, BarrierAnswer, Member};
+use super::{
+    BARRIERS, BarrierAnswer, Member,
+    waits::{self, Asked, Waits},
+};
 
 /// The number of a request at a barrier that is not judged.
 pub(super) const ELSEWHERE: u64 = u64::MAX - 1;
@@ -34,7 +37,7 @@ struct Visit {
 }
 
 /// What happened at all, so that a quiet simulation is noticed.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Seen {
     opened: [u64; BARRIERS.len()],
     timed_out: u64,
@@ -47,10 +50,11 @@ pub(super) struct Seen {
     doubles: u64,
     pub(super) crowded_out: u64,
     pub(super) handed_again: u64,
+    waits: waits::Seen,
 }
 
 impl Seen {
-    pub(super) fn add(&mut self, other: Self) {
+    pub(super) fn add(&mut self, other: &Self) {
         for (sum, of_seed) in self.opened.iter_mut().zip(other.opened) {
             *sum += of_seed;
         }
@@ -64,9 +68,10 @@ impl Seen {
         self.doubles += other.doubles;
         self.crowded_out += other.crowded_out;
         self.handed_again += other.handed_again;
+        self.waits.add(&other.waits);
     }
 
-    pub(super) fn must_cover_everything(self) {
+    pub(super) fn must_cover_everything(&self) {
         let ends = [self.timed_out, self.lost, self.given_up, self.deaths];
         let rest = [self.calm, self.waits_at_the_end, self.counted, self.doubles];
         let odd = [self.crowded_out, self.handed_again];
@@ -75,10 +80,10 @@ impl Seen {
             counts.iter().chain(&self.opened).all(|count| *count > 10),
             "hardly anything happens: {self:?}"
         );
+        self.waits.must_cover_everything();
     }
 }
 
-#[derive(Default)]
 pub(super) struct Judge {
     /// Who each application that has arrived somewhere in its present life is: another one from each visit on that it gave up. The last one is
     /// who it is at its next visit.
@@ -95,6 +100,7 @@ pub(super) struct Judge {
     doubled: BTreeSet<NodeAddress>,
     /// Nobody dies, gives up or is taken for lost.
     is_calm: bool,
+    pub(super) waits: Waits,
     pub(super) violations: Vec<String>,
     pub(super) seen: Seen,
 }
@@ -114,8 +120,28 @@ fn is_met(barrier: usize, names: &[String]) -> bool {
 }
 
 impl Judge {
-    pub(super) fn new(is_calm: bool) -> Self {
-        Self { is_calm, ..Self::default() }
+    pub(super) fn new(is_calm: bool, is_crowded: bool) -> Self {
+        Self {
+            parties: BTreeMap::new(),
+            counts: BTreeMap::new(),
+            names: BTreeMap::new(),
+            visits: BTreeMap::new(),
+            openings: BTreeMap::new(),
+            correlation: 0,
+            doubled: BTreeSet::new(),
+            is_calm,
+            waits: Waits::new(is_crowded),
+            violations: Vec::new(),
+            seen: Seen::default(),
+        }
+    }
+
+    /// What was found to be wrong, and what happened at all.
+    pub(super) fn verdict(self) -> (Vec<String>, Seen) {
+        let Self { waits, mut violations, mut seen, .. } = self;
+        violations.extend(waits.violations);
+        seen.waits = waits.seen;
+        (violations, seen)
     }
 
     fn open_visit(&mut self, app: App, barrier: usize) -> Option<&mut Visit> {
@@ -128,13 +154,15 @@ impl Judge {
         self.visits.get_mut(&(barrier, member))?.last_mut()
     }
 
-    pub(super) fn waits(&mut self, app: App, barrier: usize) -> bool {
+    pub(super) fn is_waiting(&mut self, app: App, barrier: usize) -> bool {
         self.open_visit(app, barrier).is_some()
     }
 
     /// An application arrives; the number of its request is returned.
-    pub(super) fn arrives(&mut self, who: Who, barrier: usize) -> u64 {
+    pub(super) fn arrives(&mut self, who: Who, barrier: usize, asked: Asked) -> u64 {
         self.correlation += 1;
+        let (process, app) = who.app;
+        self.waits.arrives((process, barrier, app), who.name.clone(), asked);
         let member = self.is_somewhere(who);
         let visit = Visit { correlation: self.correlation, passed: None, over: None };
         self.visits.entry((barrier, member)).or_default().push(visit);
@@ -161,6 +189,7 @@ impl Judge {
 
     pub(super) fn gives_up(&mut self, app: App, barrier: usize, generation: u64) {
         self.seen.given_up += 1;
+        self.waits.leaves((app.0, barrier, app.1));
         let Some(visit) = self.open_visit(app, barrier) else { return };
         visit.over = Some(generation);
         // What was said of this visit is not about the next one.
@@ -173,6 +202,7 @@ impl Judge {
     pub(super) fn dies(&mut self, app: App, generations: &[u64]) {
         self.seen.deaths += 1;
         for (barrier, generation) in generations.iter().enumerate() {
+            self.waits.leaves((app.0, barrier, app.1));
             if let Some(visit) = self.open_visit(app, barrier) {
                 visit.over = Some(*generation);
             }
@@ -182,6 +212,7 @@ impl Judge {
 
     pub(super) fn restarts(&mut self, node: usize) {
         self.counts.remove(&node);
+        self.waits.restarts(node);
     }
 
     pub(super) fn answered(
@@ -199,10 +230,8 @@ impl Judge {
         };
         match answer {
             BarrierAnswer::Opened { generation } => self.passes(app, barrier, *generation),
-            BarrierAnswer::TimedOut { missing } | BarrierAnswer::Lost { missing } => {
-                if missing.is_empty() {
-                    self.violations.push(format!("{app:?} is not told who is missing"));
-                }
+            BarrierAnswer::TimedOut { .. } | BarrierAnswer::Lost { .. } => {
+                self.waits.ends((app.0, barrier, app.1), answer);
                 let is_lost = matches!(answer, BarrierAnswer::Lost { .. });
                 *(if is_lost { &mut self.seen.lost } else { &mut self.seen.timed_out }) += 1;
                 self.gives_up(app, barrier, generations[barrier]);
@@ -213,6 +242,7 @@ impl Judge {
 
     fn passes(&mut self, app: App, barrier: usize, generation: u64) {
         self.seen.opened[barrier] += 1;
+        self.waits.passes((app.0, barrier, app.1), generation);
         let of_it = self.parties[&app].iter().filter_map(|member| self.visits.get(&(barrier, *member)));
         let before = of_it.flatten().filter_map(|visit| visit.passed).max();
         if before.is_some_and(|before| before >= generation) {

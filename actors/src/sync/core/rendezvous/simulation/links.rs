@@ -70,7 +70,18 @@ impl World {
                 }
                 Fault::MembersLeftOut => barrier.members.clear(),
                 Fault::EarlierLeftOut => barrier.earlier.clear(),
-                Fault::YoungerBelieved | Fault::VisitsForgotten | Fault::HandledAgain => {}
+                Fault::YoungerBelieved
+                | Fault::VisitsForgotten
+                | Fault::HandledAgain
+                | Fault::DeadlineForgotten
+                | Fault::TimedOutEarly
+                | Fault::FailNotTold
+                | Fault::LossToldUnasked
+                | Fault::LossToldEarly
+                | Fault::WrongReason
+                | Fault::ReasonKept
+                | Fault::ArrivedNamed
+                | Fault::AbsenceOverstated => {}
                 Fault::DeparturesHidden => {
                     let before = self.ever.get(&from).into_iter().flat_map(|said| &said.barriers);
                     let before =
@@ -153,7 +164,13 @@ impl World {
         if !self.chance.once_in(3) || is_double {
             return;
         }
-        self.say(|| format!("node {node} is killed and comes back"));
+        let says_goodbye = self.chance.once_in(2);
+        self.say(|| format!("node {node} ends and comes back, says goodbye: {says_goodbye}"));
+        let (address, life) = (address(node), Incarnation(self.incarnations[node]));
+        let linked: Vec<usize> = self.living().filter(|peer| self.is_up(node, *peer)).collect();
+        for peer in linked.iter().filter(|_| says_goodbye) {
+            self.tell(*peer, Input::LinkChanged(LinkFact::PeerLeft { node: address, incarnation: life }));
+        }
         self.cut_all(node);
         let generations = self.generations(node);
         (0..APPS).for_each(|app| self.judge.dies((node, app), &generations));
@@ -163,6 +180,22 @@ impl World {
         self.incarnations[node] = self.lives[node];
         self.cores[node] = self.new_core(node);
         self.populate(node);
+        linked.into_iter().for_each(|peer| self.hear_of_restart(peer, node, life));
+    }
+
+    /// A process that was linked hears nothing of it before it is linked again, or that the former life is over, or of the new one, too.
+    fn hear_of_restart(&mut self, peer: usize, node: usize, former: Incarnation) {
+        let (address, news) = (address(node), self.chance.below(3));
+        if news > 0 {
+            let why = [LossReason::Crashed, LossReason::Restarted][news - 1];
+            let lost = MembershipFact::NodeLost { node: address, incarnation: former, why };
+            self.tell(peer, Input::MembershipChanged(lost));
+        }
+        if news > 1 {
+            let incarnation = Incarnation(self.incarnations[node]);
+            let found = MembershipFact::NodeFound { node: address, incarnation, gncl: Vec::new() };
+            self.tell(peer, Input::MembershipChanged(found));
+        }
     }
 
     fn cut_all(&mut self, node: usize) {
@@ -194,11 +227,11 @@ impl World {
         let Some(double) = self.double.take() else { return };
         let home = self.homes[double];
         self.say(|| format!("process {double} gives up"));
-        let generations = self.generations(double);
-        (0..APPS).for_each(|app| self.judge.dies((double, app), &generations));
         let took = |peer: &usize| self.is_up(*peer, double) || self.knows_no_better(*peer, double);
         let peers: Vec<usize> = (0..self.nodes()).filter(took).collect();
         self.cut_all(double);
+        let generations = self.generations(double);
+        (0..APPS).for_each(|app| self.judge.dies((double, app), &generations));
         self.ended.insert(double);
         for peer in peers {
             if self.chance.once_in(2) {
