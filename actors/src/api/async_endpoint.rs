@@ -12,7 +12,7 @@ use sinew_runtime::{
     wire::{Kind, Message, Payload},
 };
 use sinew_shm::BellKind;
-use tokio::task::spawn_blocking;
+use tokio::task::{coop, spawn_blocking};
 
 use super::{
     ApiError, Endpoint, LentMessage, Received, Registration, Transport, Untaken, form::Form,
@@ -186,11 +186,14 @@ impl AsyncEndpoint {
     }
 
     /// Waits for a message, in the order of [`Endpoint::receive`]. May be dropped at any time without losing one. When the
-    /// connection has ended it says so once with [`ApiError::Away`]; later calls wait for the node's return, too.
+    /// connection has ended it says so once with [`ApiError::Away`]; later calls wait for the node's return, too. Messages that are there
+    /// already count for tokio's budget: other tasks of the thread have their turn between them.
     ///
     /// # Errors
     /// The connection has ended, and everything that came before was received.
     pub async fn receive(&mut self) -> Result<Received, ApiError> {
+        // What is there already is not waited for. A task that is sent more than it handles would have its thread for itself.
+        coop::consume_budget().await;
         loop {
             // There is always a later time.
             if let Some(received) = self.endpoint.receive_until(Time::MAX, Time::now()).await? {

@@ -10,6 +10,7 @@ use sinew_runtime::{
     wire::{Flags, Header, Kind, Message, Payload},
 };
 use sinew_shm::{Bell, CommonBell};
+use tokio::task::coop;
 
 use super::{
     ApiError, Received, Registration, Transport,
@@ -265,6 +266,10 @@ impl Endpoint {
                 *left = left.saturating_sub(1);
                 now = Time::now();
                 if *left > 0 || now < deadline {
+                    if matches!(self.form, Form::Reactor(_)) {
+                        // Nor other tasks of the thread from their turn.
+                        coop::consume_budget().await;
+                    }
                     continue;
                 }
             }

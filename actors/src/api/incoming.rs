@@ -1,6 +1,6 @@
 //! Messages on their way in: from the node and from direct links, without waiting; and the wait.
 
-use std::time::Duration;
+use std::{future::poll_fn, pin::pin, time::Duration};
 
 use sinew_runtime::{
     outcome::Rejection,
@@ -208,7 +208,7 @@ impl Endpoint {
             Form::Thread => self.block(deadline.since(now)),
             Form::Reactor(reactor) => {
                 let until = Until { deadline, room: None };
-                reactor.wait(&mut self.reader, &self.writer, &mut self.direct, until).await;
+                in_turn(reactor.wait(&mut self.reader, &self.writer, &mut self.direct, until)).await;
             }
         }
     }
@@ -264,6 +264,22 @@ impl Endpoint {
     }
 }
 
+/// Waits, and where that ended at once lets other tasks of the thread have their turn: one to which others send all the time, while it waits
+/// for an answer, would have the thread for itself until that is there.
+async fn in_turn(wait: impl Future<Output = ()>) {
+    let mut wait = pin!(wait);
+    let mut has_waited = false;
+    poll_fn(|cx| {
+        let polled = wait.as_mut().poll(cx);
+        has_waited |= polled.is_pending();
+        polled
+    })
+    .await;
+    if !has_waited {
+        tokio::task::yield_now().await;
+    }
+}
+
 /// The answer that a call waits for.
 #[derive(Clone, Copy)]
 pub(super) struct Wanted {
@@ -277,5 +293,25 @@ impl Wanted {
     /// Nobody answers for others.
     fn from(self, peer: Tid) -> Option<(u64, Awaited)> {
         (peer == self.of).then_some((self.number, self.what))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::future::ready;
+
+    use futures_util::poll;
+    use tokio::task::yield_now;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn a_wait_that_ends_at_once_lets_others_have_their_turn_and_one_that_has_waited_goes_on() {
+        let mut at_once = pin!(in_turn(ready(())));
+        assert!(poll!(at_once.as_mut()).is_pending());
+        assert!(poll!(at_once.as_mut()).is_ready());
+        let mut waits = pin!(in_turn(yield_now()));
+        assert!(poll!(waits.as_mut()).is_pending());
+        assert!(poll!(waits.as_mut()).is_ready());
     }
 }

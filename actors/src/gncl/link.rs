@@ -28,7 +28,7 @@ use super::{
     inbound::Inbound,
     secure::{self, End, Secure, Unproven},
     task::{Move, Place, ReadingTask},
-    transport::Transport,
+    transport::{Got, Transport},
 };
 use crate::{security::Peer, stores::lock};
 
@@ -279,7 +279,7 @@ pub(super) struct Reader {
     greeted: bool,
     /// The shell knows that messages pass.
     carried: bool,
-    /// Bytes that were taken since others had their turn.
+    /// Bytes that were taken since others had their turn; of a sealed connection those that came for them, and each record as some at least.
     turn: usize,
     /// The next pause of one that was refused.
     rest: Duration,
@@ -433,10 +433,10 @@ impl Reader {
             self.give_way().await;
         }
         let room = (self.buffer.capacity() - self.buffer.len()).min(BYTES_PER_TURN);
-        match self.transport.read(&mut self.buffer, room).await? {
-            0 => Err(io::ErrorKind::UnexpectedEof.into()),
-            count => {
-                self.turn += count;
+        match self.transport.take_in(&mut self.buffer, room).await? {
+            Got { count: 0, .. } => Err(io::ErrorKind::UnexpectedEof.into()),
+            Got { count, work } => {
+                self.turn += work;
                 self.asked = if count < room { READ_LEN } else { BYTES_PER_TURN.min(2 * self.asked) };
                 Ok(())
             }
@@ -468,7 +468,40 @@ fn decline(error: &FrameError) -> Decline {
 
 #[cfg(test)]
 mod tests {
+    use std::pin::pin;
+
+    use futures_util::poll;
+
     use super::*;
+    use crate::gncl::transport::tests::sealed_pair;
+
+    fn reading(mode: Mode) -> Reading {
+        Reading {
+            mode: Arc::new(Mutex::new(mode)),
+            heard: Heard::default(),
+            payload_max: HANDSHAKE_PAYLOAD_MAX,
+            give_up: Duration::from_secs(5),
+            secure: None,
+        }
+    }
+
+    #[tokio::test]
+    async fn others_have_their_turn_between_few_records_however_little_is_in_each() {
+        // Given: as many records of a byte as frames in two turns
+        let (transport, mut peer) = sealed_pair(|_| {}).await;
+        peer.seal_each(&[0; 2 * FRAMES_PER_WAKE]);
+        let sending = peer.send();
+        let mut reader = Reader::new(transport, reading(Mode::Handshake));
+        reader.fill().await.unwrap();
+        assert_eq!(reader.buffer.len(), 2 * FRAMES_PER_WAKE);
+        assert!(reader.turn >= BYTES_PER_TURN, "a turn of {}", reader.turn);
+        // When: it goes on
+        let is_pending = poll!(pin!(reader.fill())).is_pending();
+        // Then: others have their turn first
+        assert!(is_pending);
+        assert_eq!(reader.turn, 0);
+        sending.join().unwrap();
+    }
 
     #[tokio::test]
     async fn who_is_refused_and_pours_on_is_read_with_ever_longer_pauses() {
@@ -476,14 +509,7 @@ mod tests {
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let mut stranger = TcpStream::connect(listener.local_addr().unwrap()).await.unwrap();
         let (socket, _) = listener.accept().await.unwrap();
-        let reading = Reading {
-            mode: Arc::new(Mutex::new(Mode::Discard)),
-            heard: Heard::default(),
-            payload_max: HANDSHAKE_PAYLOAD_MAX,
-            give_up: Duration::from_secs(5),
-            secure: None,
-        };
-        let mut reader = Reader::new(Transport::open(socket), reading);
+        let mut reader = Reader::new(Transport::open(socket), reading(Mode::Discard));
         let began = tokio::time::Instant::now();
         let pouring = async {
             tokio::io::AsyncWriteExt::write_all(&mut stranger, &vec![7; POURED]).await.unwrap();

@@ -6,7 +6,8 @@
 //! ```
 //!
 //! Both directions of a sealed connection share rustls' state and so a mutex: whoever writes holds it for as long as a piece of a frame
-//! takes to be sealed, some 30 us for the longest one.
+//! takes to be sealed, some 30 us for the longest one. Who reads holds it until something was opened for him, and never longer than
+//! [`SILENT_MAX`] take to be opened: a peer that sends more in which there is nothing is refused.
 
 use std::{
     io::{self, IoSlice, Read, Write},
@@ -24,6 +25,31 @@ use crate::{outlet::Socket, security::words, stores::lock};
 
 /// Bytes that are sealed before the socket has taken them, at most.
 const SEALED_MAX: usize = 128 << 10;
+/// Bytes that a record counts as in a turn at least: to open it costs as much, however little is in it.
+const RECORD_WORK: usize = 1 << 10;
+/// Bytes of records that come, beyond what was opened of them for the reader, at most. Of an honest peer's these are a record that is not whole
+/// yet, and what was opened last: twice 16 KiB, and little more.
+const SILENT_MAX: usize = 64 << 10;
+/// What a record is longer than what is in it, 22 bytes, and two more. Those two pay for the new keys that an honest peer makes now and then:
+/// after millions of records.
+const RECORD_EXTRA: usize = 24;
+/// Tickets for another connection that a peer may send. A node sends none; other software for TLS sends a few if it is not told otherwise.
+const TICKETS_MAX: u32 = 8;
+
+/// What is said of who sends more tickets.
+const TICKETS_WORDS: &str = "the other end sends tickets of TLS on and on, and a node sends none: it may be no node, or a fault of its software";
+/// What is said of who sends more records for nobody.
+const SILENT_WORDS: &str = "the other end sends records of TLS on and on in which there is nothing for this node, and a node sends none: it may be no node, \
+     or a fault of its software";
+
+/// What one read came to.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Got {
+    /// Bytes for the reader; 0 at the end of the connection.
+    pub(super) count: usize,
+    /// Bytes that this counts as in the reader's turn: what came for it, where records are short or carry nothing.
+    pub(super) work: usize,
+}
 
 /// A connection, which any thread may write to and one task reads.
 #[derive(Clone, Debug)]
@@ -42,7 +68,7 @@ impl Transport {
     /// The same connection, whose handshake is over.
     pub(super) fn sealed(self, mut tls: Connection) -> Self {
         tls.set_buffer_limit(Some(SEALED_MAX));
-        let records = Records { tls, is_one_untold: false };
+        let records = Records { tls, is_one_untold: false, silent: 0, refused: None };
         Self { records: Some(Arc::new(Mutex::new(records))), ..self }
     }
 
@@ -77,18 +103,17 @@ impl Transport {
         Ok(())
     }
 
-    /// Appends to `buffer` what has come, `room` bytes at most; waits until there is something. Returns how much it was, which is 0 at the
-    /// end of the connection.
+    /// Appends to `buffer` what has come, `room` bytes at most; waits until there is something.
     ///
     /// # Errors
-    /// The connection is over. [`io::ErrorKind::InvalidData`]: what came is not what the peer has sealed, or it says that it does not take
-    /// this node; in words.
-    pub(super) async fn read(&self, buffer: &mut BytesMut, room: usize) -> io::Result<usize> {
+    /// The connection is over. [`io::ErrorKind::InvalidData`]: what came is not what the peer has sealed, or is on and on nothing for the
+    /// reader, or it says that it does not take this node; in words.
+    pub(super) async fn take_in(&self, buffer: &mut BytesMut, room: usize) -> io::Result<Got> {
         loop {
             let read = match &self.records {
                 None => {
                     self.socket.readable().await?;
-                    self.read_open(buffer, room)
+                    self.read_open(buffer, room).map(|count| Got { count, work: count })
                 }
                 Some(records) => {
                     // What was opened before is no news of the socket's.
@@ -105,6 +130,12 @@ impl Transport {
                 read => return read,
             }
         }
+    }
+
+    /// The same for who has no turns: how many bytes it were.
+    #[cfg(test)]
+    pub(super) async fn read(&self, buffer: &mut BytesMut, room: usize) -> io::Result<usize> {
+        self.take_in(buffer, room).await.map(|got| got.count)
     }
 
     fn read_open(&self, buffer: &mut BytesMut, room: usize) -> io::Result<usize> {
@@ -149,6 +180,10 @@ struct Records {
     /// The last byte that was taken to be sealed was not told as written, for the socket has not taken all that was sealed: whoever
     /// writes comes again with it, and has the rest go out.
     is_one_untold: bool,
+    /// Bytes that have come, less what was opened of them for the reader, and less what each record was longer.
+    silent: usize,
+    /// Why nothing more of the peer's is opened.
+    refused: Option<&'static str>,
 }
 
 impl Records {
@@ -185,36 +220,74 @@ impl Records {
         Ok(())
     }
 
-    fn read(&mut self, socket: &TcpStream, buffer: &mut BytesMut, room: usize) -> io::Result<usize> {
+    /// Opens what comes until there is something for the reader, or the socket is empty, or the peer is refused.
+    fn read(&mut self, socket: &TcpStream, buffer: &mut BytesMut, room: usize) -> io::Result<Got> {
+        let mut came = 0;
         loop {
             let mut reading = AtOnce::new(socket);
-            let came = self.tls.read_tls(&mut reading)?;
+            let count = self.tls.read_tls(&mut reading)?;
             if reading.is_emptied {
                 expect_more(socket);
             }
-            if came == 0 {
-                return Ok(0);
+            if count == 0 {
+                return Ok(Got::default());
             }
+            came += count;
+            self.silent += count;
             let opened = self.tls.process_new_packets();
             // An answer to what came, or why it is not taken: a socket that is full loses it with the connection, or it goes with what is
             // written next.
             let _ = self.flush(socket);
             opened.map_err(|error| io::Error::new(io::ErrorKind::InvalidData, words(&error)))?;
+            self.refused = self.excess();
             match self.take(buffer, room) {
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-                taken => return taken,
+                taken => return taken.map(|got| Got { work: got.work.max(came), ..got }),
             }
         }
     }
 
-    /// What is open already.
-    fn take(&mut self, buffer: &mut BytesMut, room: usize) -> io::Result<usize> {
+    /// What the peer sends that is for nobody and without end. TLS itself bounds new keys in a row and records without bytes, not tickets.
+    // spec: GNCL-18
+    fn excess(&self) -> Option<&'static str> {
+        match &self.tls {
+            Connection::Client(client) if client.tls13_tickets_received() > TICKETS_MAX => {
+                Some(TICKETS_WORDS)
+            }
+            Connection::Client(_) | Connection::Server(_) => {
+                (self.silent > SILENT_MAX).then_some(SILENT_WORDS)
+            }
+        }
+    }
+
+    /// What is open already, of as many records as there is room for.
+    fn take(&mut self, buffer: &mut BytesMut, room: usize) -> io::Result<Got> {
+        if let Some(why) = self.refused {
+            return Err(io::Error::new(io::ErrorKind::InvalidData, why));
+        }
         let mut reader = self.tls.reader();
-        let opened = io::BufRead::fill_buf(&mut reader)?;
-        let count = opened.len().min(room);
-        buffer.put_slice(&opened[..count]);
-        io::BufRead::consume(&mut reader, count);
-        Ok(count)
+        let mut got = Got::default();
+        while got.count < room {
+            let opened = match io::BufRead::fill_buf(&mut reader) {
+                Ok(opened) => opened,
+                // Said again when it is asked for more.
+                Err(_) if got.count > 0 => break,
+                Err(error) => return Err(error),
+            };
+            // The peer has closed in order.
+            if opened.is_empty() {
+                break;
+            }
+            let part = opened.len().min(room - got.count);
+            let is_whole = part == opened.len();
+            buffer.put_slice(&opened[..part]);
+            io::BufRead::consume(&mut reader, part);
+            got.count += part;
+            got.work += part.max(RECORD_WORK);
+            let paid = if is_whole { part + RECORD_EXTRA } else { part };
+            self.silent = self.silent.saturating_sub(paid);
+        }
+        Ok(got)
     }
 }
 
@@ -250,5 +323,144 @@ impl Write for AtOnce<'_> {
 
     fn flush(&mut self) -> io::Result<()> {
         Ok(())
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use std::{net, thread, time::Duration};
+
+    use rustls::{ServerConfig, ServerConnection, server::ServerSessionMemoryCache};
+    use tokio::time::timeout;
+
+    use super::*;
+    use crate::security::tests::ground::{Authority, Wire, heard, written};
+
+    /// Nothing takes longer, on a busy machine either.
+    const PATIENCE: Duration = Duration::from_secs(60);
+    /// More than comes.
+    const ROOM: usize = 4_096;
+
+    /// Who was dialled over a sealed connection, by hand: what he seals goes out when he is told to send it.
+    pub(in crate::gncl) struct Dialled {
+        tls: ServerConnection,
+        socket: net::TcpStream,
+    }
+
+    impl Dialled {
+        /// Seals each byte in a record of its own.
+        pub(in crate::gncl) fn seal_each(&mut self, bytes: &[u8]) {
+            bytes.iter().for_each(|byte| self.tls.writer().write_all(&[*byte]).unwrap());
+        }
+
+        fn make_new_keys(&mut self, times: usize) {
+            (0..times).for_each(|_| self.tls.refresh_traffic_keys().unwrap());
+        }
+
+        /// Sends all that is sealed, in one piece if there is room for it, and hangs up. Who is refused before that is not heard to the end.
+        pub(in crate::gncl) fn send(mut self) -> thread::JoinHandle<()> {
+            let sealed = written(&mut self.tls);
+            thread::spawn(move || drop(self.socket.write_all(&sealed)))
+        }
+    }
+
+    /// A sealed connection as who has dialled has it, and the other end, which is as `set` makes it.
+    pub(in crate::gncl) async fn sealed_pair(set: impl FnOnce(&mut ServerConfig)) -> (Transport, Dialled) {
+        let walker = Authority::new("walker");
+        let mut config = ServerConfig::clone(&walker.tls("knee", 2).server());
+        set(&mut config);
+        let Wire { mut client, mut server } = Wire::new(walker.tls("hip", 1).client(), Arc::new(config));
+        // What the other end says when it has proven who is there is still to be sent.
+        heard(&mut server, &written(&mut client)).unwrap();
+        heard(&mut client, &written(&mut server)).unwrap();
+        heard(&mut server, &written(&mut client)).unwrap();
+        assert!(!client.is_handshaking() && !server.is_handshaking(), "the handshake is over");
+        server.set_buffer_limit(None);
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let socket = net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+        let (ours, _) = listener.accept().await.unwrap();
+        (Transport::open(ours).sealed(client.into()), Dialled { tls: server, socket })
+    }
+
+    /// Reads until the end, or until so much has come; what that was, and why it ended.
+    async fn read_all(transport: Transport, most: usize) -> (usize, Option<io::Error>) {
+        let mut buffer = BytesMut::new();
+        let reading = async {
+            while buffer.len() < most {
+                match transport.take_in(&mut buffer, ROOM).await {
+                    Ok(Got { count: 0, .. }) => break,
+                    Ok(_) => {}
+                    Err(error) => return Some(error),
+                }
+            }
+            None
+        };
+        let error = timeout(PATIENCE, reading).await.expect("it ends");
+        (buffer.len(), error)
+    }
+
+    #[tokio::test]
+    async fn records_of_one_byte_are_opened_as_many_at_once_as_there_is_room_for_and_each_counts_as_more() {
+        let (transport, mut peer) = sealed_pair(|_| {}).await;
+        peer.seal_each(&[7; 100]);
+        let sending = peer.send();
+        let mut buffer = BytesMut::new();
+        for count in [60, 40] {
+            let read = timeout(PATIENCE, transport.take_in(&mut buffer, 60)).await;
+            let got = read.expect("it has come").expect("an honest peer");
+            assert_eq!(got, Got { count, work: count * RECORD_WORK });
+        }
+        assert_eq!(buffer[..], [7; 100]);
+        sending.join().unwrap();
+    }
+
+    // spec: GNCL-18
+    #[tokio::test]
+    async fn who_sends_tickets_on_and_on_is_refused_in_words() {
+        let (transport, peer) = sealed_pair(|config| {
+            config.session_storage = ServerSessionMemoryCache::new(16);
+            config.send_tls13_tickets = 2_000;
+        })
+        .await;
+        let sending = peer.send();
+        let (_, refused) = read_all(transport, 1).await;
+        let refused = refused.expect("an error");
+        assert_eq!(refused.kind(), io::ErrorKind::InvalidData);
+        assert!(refused.to_string().contains("tickets"), "{refused}");
+        sending.join().unwrap();
+    }
+
+    // spec: GNCL-18
+    #[tokio::test]
+    async fn who_sends_records_on_and_on_with_next_to_nothing_in_them_is_refused_in_words() {
+        // Given: as many new keys in a row as rustls takes, and a byte, again and again
+        const TIMES: usize = 100;
+        let (transport, mut peer) = sealed_pair(|_| {}).await;
+        for _ in 0..TIMES {
+            peer.make_new_keys(30);
+            peer.seal_each(b"x");
+        }
+        // When
+        let sending = peer.send();
+        let (read, refused) = read_all(transport, TIMES).await;
+        // Then
+        let refused = refused.unwrap_or_else(|| panic!("{read} bytes came of {TIMES}"));
+        assert_eq!(refused.kind(), io::ErrorKind::InvalidData);
+        assert!(refused.to_string().contains("nothing for this node"), "{refused}");
+        sending.join().unwrap();
+    }
+
+    #[tokio::test]
+    async fn new_keys_are_taken_more_often_than_an_honest_peer_makes_them() {
+        const TIMES: usize = 1_000;
+        let (transport, mut peer) = sealed_pair(|_| {}).await;
+        for _ in 0..TIMES {
+            peer.make_new_keys(1);
+            peer.seal_each(b"abc");
+        }
+        let sending = peer.send();
+        let (read, refused) = read_all(transport, 3 * TIMES).await;
+        assert_eq!((read, refused.map(|error| error.to_string())), (3 * TIMES, None));
+        sending.join().unwrap();
     }
 }

@@ -29,7 +29,7 @@ use self::{
     outcomes::Outcomes,
 };
 use super::{
-    core::{Address, ClientId, Owner, Request},
+    core::{Address, ClientId, Owner, Request, User},
     introductions::{Leaves, Party},
     link::{self, ClientReader, ClientSocket, Half},
     payload::{self, REGISTER_BYTES_MAX, Register, Registered},
@@ -177,20 +177,20 @@ struct Client {
 impl Client {
     fn register(server: Rc<Server>, peer: Peer, asked: Register) -> Result<Self, super::RegisterError> {
         let Register { name, address, requires, events, kinds, pid: _, direct, ring, former, waits } = asked;
-        let uid = peer.who.uid;
+        let (uid, own) = (peer.who.uid, rustix::process::geteuid().as_raw());
         // Other nodes may still call whoever has it by the name of whoever had it. spec: LNCL-5
         let access = server.stores.access.get();
         let former =
             former.filter(|app| access.is_none_or(|access| access.has_held(*app, uid, name.as_deref())));
         let any = former.map_or(Address::Dynamic, Address::Former);
         if let Some(access) = server.stores.access.get() {
-            let own = rustix::process::geteuid().as_raw();
             let allowed = access.may_register(own, peer.who, name.as_deref(), address);
             allowed.map_err(|why| super::RegisterError::NotAllowed(why.to_string()))?;
             check_share(&server.stores, access, own, uid)?;
         }
         let address = address.map_or(any, Address::Fixed);
-        let request = Request { address, name, requires: requires.clone(), kinds, owner: peer.owner() };
+        let (owner, user) = (peer.owner(), User::of(uid, own));
+        let request = Request { address, name, requires: requires.clone(), kinds, owner, user };
         let called = request.name.clone();
         let app = registrar::register_client(&server.stores, request)?;
         if let Some(access) = server.stores.access.get() {

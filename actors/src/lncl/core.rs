@@ -1,5 +1,6 @@
 //! Who is registered on this node. Pure: no socket, no clock.
 
+mod kinds;
 #[cfg(test)]
 mod tests;
 
@@ -10,6 +11,8 @@ use sinew_runtime::{
     tid::AppAddress,
     wire::Kind,
 };
+
+use self::kinds::Kinds;
 
 /// Longest name in bytes.
 pub(crate) const NAME_MAX: usize = 63;
@@ -49,6 +52,22 @@ impl fmt::Display for Owner {
     }
 }
 
+/// Which user an application runs as.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum User {
+    /// The node's own, or root: the application is one of the robot's own.
+    Own,
+    /// This one, whom the access list lets in.
+    Guest(u32),
+}
+
+impl User {
+    /// That of a process of `uid`, at a node that runs as `own`.
+    pub(crate) const fn of(uid: u32, own: u32) -> Self {
+        if uid == own || uid == 0 { Self::Own } else { Self::Guest(uid) }
+    }
+}
+
 /// Which address is asked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Address {
@@ -73,6 +92,8 @@ pub(crate) struct Request {
     pub(crate) kinds: Vec<String>,
     /// Whom it belongs to.
     pub(crate) owner: Owner,
+    /// Which user it runs as.
+    pub(crate) user: User,
 }
 
 /// Why an application was not registered. Nothing changed.
@@ -180,9 +201,7 @@ struct Entry {
 pub(crate) struct Registry {
     apps: BTreeMap<AppAddress, Entry>,
     names: BTreeMap<String, AppAddress>,
-    /// Kept when an application goes: an id must not change its meaning in a node's life. See [`Registry::claim_kinds`]
-    /// for the bound.
-    kinds: BTreeMap<Kind, String>,
+    kinds: Kinds,
     next_dynamic: u32,
     next_client: u64,
     next_link: u64,
@@ -197,13 +216,13 @@ impl Registry {
         check_lists(&request)?;
         self.check_room(request.owner, limits)?;
         self.check_name(request.name.as_deref())?;
-        let kinds = self.check_kinds(&request.kinds)?;
+        let kinds = self.kinds.check(request.user, &request.kinds)?;
         let app = match request.address {
             Address::Fixed(app) => self.free_fixed(app)?,
             Address::Former(app) if app.is_dynamic() && !self.apps.contains_key(&app) => app,
             Address::Dynamic | Address::Former(_) => self.free_dynamic(),
         };
-        self.claim_kinds(kinds, limits.apps);
+        self.kinds.claim(request.user, app, kinds, limits.apps);
         if let Some(name) = &request.name {
             self.names.insert(name.clone(), app);
         }
@@ -217,6 +236,7 @@ impl Registry {
         if let Some(name) = entry.name {
             self.names.remove(&name);
         }
+        self.kinds.forget(app);
         true
     }
 
@@ -312,35 +332,9 @@ impl Registry {
         Err(RegisterError::NameTaken { name: name.to_owned(), holder: *holder, owner })
     }
 
-    /// The ids of `names`, none of which means anything else. spec: LNCL-8
-    fn check_kinds(&self, names: &[String]) -> Result<BTreeMap<Kind, String>, RegisterError> {
-        let mut claimed = BTreeMap::new();
-        for name in names {
-            let kind = Kind::named(name);
-            let other = self.kinds.get(&kind).or_else(|| claimed.get(&kind));
-            if let Some(other) = other.filter(|other| *other != name) {
-                return Err(RegisterError::KindCollision { name: name.clone(), other: other.clone(), kind });
-            }
-            claimed.insert(kind, name.clone());
-        }
-        Ok(claimed)
-    }
-
-    /// Remembers what these ids mean, up to 16 for each application that the node may have; names past that bound
-    /// are not watched for collisions.
-    fn claim_kinds(&mut self, kinds: BTreeMap<Kind, String>, apps_max: usize) {
-        let bound = apps_max.saturating_mul(16);
-        for (kind, name) in kinds {
-            if self.kinds.len() >= bound {
-                return;
-            }
-            self.kinds.insert(kind, name);
-        }
-    }
-
     /// What the type of this id is called, if an application has said so.
     pub(crate) fn kind_name(&self, kind: Kind) -> Option<&str> {
-        self.kinds.get(&kind).map(String::as_str)
+        self.kinds.name(kind)
     }
 
     fn free_fixed(&self, app: AppAddress) -> Result<AppAddress, RegisterError> {

@@ -303,10 +303,11 @@ impl RingReader {
 
     /// Waits until there may be something in the ring, or the peer is gone.
     async fn wait(&mut self, stream: &UnixStream) -> Result<(), LinkError> {
-        self.looks = 0;
         if self.consumer.get_mut().0.arm().map_err(RingError::from)? == Armed::Ready {
+            // Nobody has waited: who publishes one record at a time, each just now, has no more turns by that.
             return Ok(());
         }
+        self.looks = 0;
         tokio::select! {
             biased;
             rung = self.consumer.readable_mut() => match rung {

@@ -15,7 +15,7 @@
 //! | LNCL-5 | A name has 1 to 63 bytes, no control characters, and one holder on a node. A fixed address is in the fixed range and has one holder. A dynamic address that was given back is not given out again before all others. |
 //! | LNCL-6 | A client that requires names gets `LNCL_REGISTERED` when all of them are ready. Nothing is sent to it before, but what is missing, if it wants to know. |
 //! | LNCL-7 | Each confirmed message to a client ends in what the client says of it; as `Rejected(Closed)` if it was not sent when the connection ended. What was sent and not answered then: where the client has gone as `Failed` if it had taken it, else as `Rejected(Closed)`; where it lives on as `Unknown`, for it may take it yet. |
-//! | LNCL-8 | Two names of payload types with one id are refused where both are told at registration. |
+//! | LNCL-8 | Two names of payload types with one id are refused where both are told at registration. What another user's application tells bars none of the robot's own. |
 //! | LNCL-9 | A client that can, and says so, gets a ring in shared memory for each direction; the socket then carries descriptors and last words only, and tells either side's end. |
 //! | LNCL-13 | Connections that have not said who they are have bounds of their own, for all and for one process. |
 //! | LNCL-14 | What nobody has taken of a client's unconfirmed messages the client is told, with its number and once: the first at once, later ones together. |

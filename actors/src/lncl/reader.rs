@@ -5,7 +5,7 @@ use std::{
     os::fd::AsFd,
 };
 
-use bytes::BytesMut;
+use bytes::{BufMut as _, BytesMut};
 use rustix::{
     io::Errno,
     net::{RecvAncillaryBuffer, RecvFlags, ReturnFlags, recv, recvmsg},
@@ -17,12 +17,30 @@ use tokio_util::codec::Decoder;
 
 /// Bytes that are read at once.
 const READ_CHUNK: usize = 16 * 1024;
+/// Frames that are taken of one peer before other tasks of the thread have their turn.
+const FRAMES_A_TURN: usize = 64;
+/// Bytes that are read of it before that, however long its frames are; of a long frame so many are read at once at most.
+const BYTES_A_TURN: usize = 64 * 1024;
 
 /// The reading half of a connection.
 pub(crate) struct Reader {
     buffer: BytesMut,
     codec: FrameCodec,
     guard: Guard,
+    turn: Turn,
+}
+
+/// What was taken since others had their turn.
+#[derive(Clone, Copy, Debug, Default)]
+struct Turn {
+    frames: usize,
+    bytes: usize,
+}
+
+impl Turn {
+    const fn is_over(self) -> bool {
+        self.frames >= FRAMES_A_TURN || self.bytes >= BYTES_A_TURN
+    }
 }
 
 /// Who sees to it that no descriptor is taken from the socket: the one who reads closes it, for as long as that takes.
@@ -41,7 +59,12 @@ enum Guard {
 impl Reader {
     /// Takes payloads of at most `payload_max` bytes.
     pub(crate) fn new(payload_max: usize) -> Self {
-        Self { buffer: BytesMut::new(), codec: FrameCodec::new(payload_max), guard: Guard::Unknown }
+        Self {
+            buffer: BytesMut::new(),
+            codec: FrameCodec::new(payload_max),
+            guard: Guard::Unknown,
+            turn: Turn::default(),
+        }
     }
 
     /// Takes payloads of at most `payload_max` bytes from now on.
@@ -71,16 +94,26 @@ impl Reader {
     }
 
     /// The next frame; `None` when the peer has closed. May be dropped at any time without losing a byte.
+    ///
+    /// Who writes on and on has a turn of the thread like everybody else. The socket alone would not see to that: as long as something is in
+    /// it nothing here ever waits.
     pub(crate) async fn next(&mut self, stream: &UnixStream) -> Result<Option<Message>, FrameError> {
         loop {
+            // spec: LNCL-16
+            if self.turn.is_over() {
+                // Before a frame is taken: this may be dropped while it waits.
+                tokio::task::yield_now().await;
+                self.turn = Turn::default();
+            }
             if let Some(message) = self.codec.decode(&mut self.buffer)? {
+                self.turn.frames += 1;
                 return Ok(Some(message));
             }
             stream.readable().await?;
             let read = match self.guard(stream) {
                 Guard::System => {
                     self.buffer.reserve(FrameCodec::room(&self.buffer, READ_CHUNK));
-                    stream.try_read_buf(&mut self.buffer)
+                    stream.try_read_buf(&mut (&mut self.buffer).limit(BYTES_A_TURN))
                 }
                 Guard::Unknown | Guard::Soon | Guard::Look => {
                     stream.try_io(Interest::READABLE, || self.read_guarded(stream))
@@ -88,8 +121,10 @@ impl Reader {
             };
             match read {
                 Ok(0) => return Ok(None),
-                Ok(_) => {}
+                Ok(count) => self.turn.bytes += count,
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                    // It waits now, while others have their turn.
+                    self.turn = Turn::default();
                     if self.guard == Guard::Soon {
                         self.guard = Guard::System;
                     }
@@ -158,14 +193,75 @@ fn retried<T>(mut call: impl FnMut() -> Result<T, Errno>) -> io::Result<T> {
 
 #[cfg(test)]
 mod tests {
-    use std::io::Write;
+    use std::{
+        io::Write,
+        sync::{
+            Arc,
+            atomic::{AtomicUsize, Ordering},
+        },
+    };
 
     use sinew_runtime::{
         tid::Tid,
-        wire::{Header, Kind, encode_frame},
+        wire::{HEADER_LEN, Header, Kind, encode_frame},
     };
 
     use super::*;
+
+    /// How many turns another task of the thread has had while so many frames were read that were all there from the beginning.
+    fn turns_of_others(guard: Guard, frames: usize, length: usize) -> usize {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+        runtime.block_on(async {
+            // Given: somebody who has said all at once, and another task.
+            let (ours, mut theirs) = std::os::unix::net::UnixStream::pair().expect("a pair");
+            ours.set_nonblocking(true).expect("it is ours");
+            let ours = UnixStream::from_std(ours).expect("it is a socket");
+            let mut bytes = BytesMut::new();
+            for _ in 0..frames {
+                let header = Header::new(Kind::named("test"), Tid::NONE, Tid::BROADCAST);
+                encode_frame(&header, &vec![7; length], &mut bytes);
+            }
+            theirs.write_all(&bytes).expect("the socket has room for so much");
+            let turns = Arc::new(AtomicUsize::new(0));
+            let counting = turns.clone();
+            tokio::spawn(async move {
+                loop {
+                    counting.fetch_add(1, Ordering::Relaxed);
+                    tokio::task::yield_now().await;
+                }
+            });
+            // When: it is read; the first frame is waited for in any case.
+            let mut reader = Reader { guard, ..Reader::new(length) };
+            reader.next(&ours).await.expect("a frame").expect("it is open");
+            let before = turns.load(Ordering::Relaxed);
+            for _ in 1..frames {
+                reader.next(&ours).await.expect("a frame").expect("it is open");
+            }
+            turns.load(Ordering::Relaxed) - before
+        })
+    }
+
+    // spec: LNCL-16
+    #[test]
+    fn other_tasks_have_a_turn_between_the_frames_of_who_has_written_very_many() {
+        const FRAMES: usize = 16 * FRAMES_A_TURN;
+        for guard in [Guard::Look, Guard::System] {
+            let turns = turns_of_others(guard, FRAMES, 0);
+            assert!(turns >= FRAMES / FRAMES_A_TURN - 1, "{turns} turns for {FRAMES} frames: {guard:?}");
+        }
+    }
+
+    // spec: LNCL-16
+    #[test]
+    fn other_tasks_have_a_turn_between_the_bytes_of_who_has_written_very_much() {
+        const FRAMES: usize = FRAMES_A_TURN / 2;
+        const LENGTH: usize = 4 * 1024;
+        const { assert!(FRAMES * (LENGTH + HEADER_LEN) > 2 * BYTES_A_TURN, "so much is more than two turns") };
+        for guard in [Guard::Look, Guard::System] {
+            let turns = turns_of_others(guard, FRAMES, LENGTH);
+            assert!(turns >= 1, "none for {FRAMES} frames of {LENGTH} bytes: {guard:?}");
+        }
+    }
 
     #[test]
     fn long_frames_right_behind_each_other_keep_their_own_length_each_however_it_is_read() {

@@ -14,7 +14,7 @@ use sinew_runtime::{
 
 use super::{
     AppFact,
-    core::{Address, Limits, Owner, RegisterError, Request},
+    core::{Address, Limits, Owner, RegisterError, Request, User},
 };
 use crate::{
     monitors::{self, Cause},
@@ -48,7 +48,8 @@ pub(crate) struct LocalApp {
 pub(crate) fn register_local(stores: &Stores, app: LocalApp) -> Result<Tid, RegisterError> {
     let LocalApp { name, address, requires, kinds, outlet, events } = app;
     let address = address.map_or(Address::Dynamic, Address::Fixed);
-    let request = Request { address, name: name.clone(), requires, kinds, owner: Owner::Node };
+    let (owner, user) = (Owner::Node, User::Own);
+    let request = Request { address, name: name.clone(), requires, kinds, owner, user };
     let mut registry = lock(&stores.registry);
     let fact_requires = request.requires.clone();
     let app = registry.register(request, limits(stores))?;
@@ -275,6 +276,7 @@ mod tests {
             requires: vec![],
             kinds: vec![],
             owner: Owner::Client { id: lock(&stores.registry).new_client(), pid },
+            user: User::Own,
         };
         // when: processes come and go
         let mut come_and_gone = 0;

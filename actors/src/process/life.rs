@@ -11,6 +11,7 @@ use std::{
     time::Duration,
 };
 
+use rustix::net::Shutdown;
 use sinew_runtime::{
     outcome::{Rejection, Ticket},
     supervision::{self, Life, ReadyGate, Reason},
@@ -300,6 +301,8 @@ impl Child {
 
     /// Returns whether all of it could be read.
     fn hear_the_rest(&mut self) -> bool {
+        // What it has started may hold the socket and write on: nothing more comes of it, so that this ends. It fails where nobody holds it.
+        let _ = rustix::net::shutdown(&self.stream, Shutdown::Read);
         loop {
             match self.reader.next_of_the_dead(&self.stream) {
                 Ok(None) => return true,

@@ -151,6 +151,40 @@ fn a_receive_that_is_dropped_loses_no_message() {
     }
 }
 
+#[test]
+fn other_tasks_run_while_one_receives_messages_that_are_there_already() {
+    // More than tokio's budget of a task's turn, and what a socket has room for.
+    const COUNT: u64 = 200;
+    for transport in BOTH {
+        let node = TestNode::start();
+        let from = node.local(1).tid;
+        runtime().block_on(async {
+            // Given: an endpoint to which messages flow, many that are there, and another task
+            let mut endpoint = endpoint(&node, transport).await;
+            let tid = endpoint.tid();
+            node.stores.router.send(numbered(COUNT, 8, from, tid)).unwrap();
+            drop(endpoint.receive().await.unwrap());
+            for number in 0..COUNT {
+                node.stores.router.send(numbered(number, 8, from, tid)).unwrap();
+            }
+            let turns = Arc::new(AtomicU64::new(0));
+            let counting = turns.clone();
+            tokio::spawn(async move {
+                loop {
+                    counting.fetch_add(1, Ordering::Relaxed);
+                    tokio::task::yield_now().await;
+                }
+            });
+            // When
+            for number in 0..COUNT {
+                assert_eq!(number_of(endpoint.receive().await.unwrap().bytes()), number);
+            }
+            // Then
+            assert!(turns.load(Ordering::Relaxed) > 0, "it had the thread for itself: {transport:?}");
+        });
+    }
+}
+
 /// Keeps LNCL from doing anything, until it is dropped.
 struct Standstill {
     release: Option<SyncSender<()>>,

@@ -8,7 +8,8 @@ const LIMITS: Limits = Limits { apps: 9, clients: 8, per_process: 4 };
 
 fn request(address: Address, name: Option<&str>) -> Request {
     let name = name.map(str::to_owned);
-    Request { address, name, requires: Vec::new(), kinds: Vec::new(), owner: Owner::Node }
+    let (requires, kinds) = (Vec::new(), Vec::new());
+    Request { address, name, requires, kinds, owner: Owner::Node, user: User::Own }
 }
 
 fn client(id: u64, pid: i32) -> Owner {
@@ -101,16 +102,107 @@ fn a_node_and_a_process_have_their_limits() {
     assert!(own.is_ok(), "the node's own applications need no place of a client's");
 }
 
-/// "costarring" and "liquid" share their 32-bit FNV-1a, the best known pair of words that does.
+/// These share their 32-bit FNV-1a, the best known pair of words that does: one is a type of the robot's, the other one a guest's.
+const ITS_OWN: &str = "liquid";
+const A_GUESTS: &str = "costarring";
+/// Two users whom the access list lets in.
+const GUESTS: [User; 2] = [User::Guest(1001), User::Guest(1002)];
+
+/// Registers an application that names this type.
+fn register_naming(
+    registry: &mut Registry,
+    user: User,
+    kind: &str,
+    limits: Limits,
+) -> Result<AppAddress, RegisterError> {
+    let kinds = vec![kind.to_owned()];
+    registry.register(Request { kinds, user, ..request(Address::Dynamic, None) }, limits)
+}
+
+// spec: LNCL-8
 #[test]
 fn two_payload_names_with_one_id_are_refused() {
-    assert_eq!(Kind::named("costarring"), Kind::named("liquid"));
-    let with = |kind: &str| Request { kinds: vec![kind.to_owned()], ..request(Address::Dynamic, None) };
+    assert_eq!(Kind::named(A_GUESTS), Kind::named(ITS_OWN));
     let mut registry = Registry::default();
-    registry.register(with("liquid"), LIMITS).unwrap();
-    registry.register(with("liquid"), LIMITS).unwrap();
-    let refusal = registry.register(with("costarring"), LIMITS);
+    let mut naming = |kind| register_naming(&mut registry, User::Own, kind, LIMITS);
+    let first = naming(ITS_OWN).unwrap();
+    naming(ITS_OWN).unwrap();
+    assert!(matches!(naming(A_GUESTS), Err(RegisterError::KindCollision { .. })));
+    // An id does not change its meaning when who has given it has gone.
+    registry.unregister(first);
+    let refusal = register_naming(&mut registry, User::Own, A_GUESTS, LIMITS);
     assert!(matches!(refusal, Err(RegisterError::KindCollision { .. })));
+}
+
+// spec: LNCL-8
+#[test]
+fn two_names_with_one_id_in_one_registration_are_refused_whoever_it_is() {
+    for user in [User::Own, GUESTS[0]] {
+        let kinds = vec![A_GUESTS.to_owned(), ITS_OWN.to_owned()];
+        let asked = Request { kinds, user, ..request(Address::Dynamic, None) };
+        let refusal = Registry::default().register(asked, LIMITS);
+        assert!(matches!(refusal, Err(RegisterError::KindCollision { .. })), "{user:?}");
+    }
+}
+
+// spec: LNCL-8
+#[test]
+fn a_guest_who_names_types_with_the_ids_of_the_robots_own_bars_none_of_these() {
+    for stays in [true, false] {
+        // Given: a guest was here first
+        let mut registry = Registry::default();
+        let guest = register_naming(&mut registry, GUESTS[0], A_GUESTS, LIMITS).unwrap();
+        assert_eq!(registry.kind_name(Kind::named(A_GUESTS)), Some(A_GUESTS));
+        if !stays {
+            registry.unregister(guest);
+            assert_eq!(registry.kind_name(Kind::named(A_GUESTS)), None, "nothing is kept of him");
+        }
+        // When, then: the robot's own registers, and its word counts
+        register_naming(&mut registry, User::Own, ITS_OWN, LIMITS).unwrap();
+        assert_eq!(registry.kind_name(Kind::named(A_GUESTS)), Some(ITS_OWN));
+        // And: against it no guest is registered, himself neither.
+        for user in GUESTS {
+            let refusal = register_naming(&mut registry, user, A_GUESTS, LIMITS);
+            assert!(matches!(refusal, Err(RegisterError::KindCollision { .. })), "{user:?}");
+            register_naming(&mut registry, user, ITS_OWN, LIMITS).expect("it is called so");
+        }
+    }
+}
+
+// spec: LNCL-8
+#[test]
+fn what_a_guest_names_binds_guests_of_the_same_user_while_it_is_registered() {
+    let mut registry = Registry::default();
+    let first = register_naming(&mut registry, GUESTS[0], A_GUESTS, LIMITS).unwrap();
+    let refusal = register_naming(&mut registry, GUESTS[0], ITS_OWN, LIMITS);
+    assert!(matches!(refusal, Err(RegisterError::KindCollision { .. })));
+    // A guest of another user is not bound by it.
+    register_naming(&mut registry, GUESTS[1], ITS_OWN, LIMITS).unwrap();
+    registry.unregister(first);
+    register_naming(&mut registry, GUESTS[0], ITS_OWN, LIMITS).unwrap();
+}
+
+#[test]
+fn who_comes_again_and_again_with_new_types_has_no_more_of_them_kept_than_there_is_room_for() {
+    let limits = Limits { apps: 2, ..LIMITS };
+    for (user, most) in [(User::Own, (2 * 16, 0)), (GUESTS[0], (0, 1))] {
+        let mut registry = Registry::default();
+        for number in 0..100 {
+            let name = format!("new.{number}");
+            let app = register_naming(&mut registry, user, &name, limits).unwrap();
+            let kept = registry.kinds.counts();
+            assert!(kept.0 <= most.0 && kept.1 <= most.1, "{user:?}: {kept:?}");
+            registry.unregister(app);
+        }
+        assert_eq!(registry.kinds.counts(), (most.0, 0), "{user:?}");
+    }
+}
+
+#[test]
+fn root_and_the_nodes_own_user_are_no_guests() {
+    let of = |uid| User::of(uid, 1000);
+    assert_eq!([of(1000), of(0), of(1001)], [User::Own, User::Own, User::Guest(1001)]);
+    assert_eq!(User::of(1000, 0), User::Guest(1000), "of a node that runs as root");
 }
 
 #[derive(Clone, Debug)]

@@ -20,6 +20,7 @@ use crate::{
         payload::{self, Register, Switch},
         testing::{RawClient, TestNode, WATCHDOG},
     },
+    stores::lock,
 };
 
 #[test]
@@ -185,4 +186,26 @@ fn another_user_has_half_of_the_places_at_most() {
     assert!(why.is_none_or(|why| why.contains("54321") && why.contains("`lncl.clients_max`")));
     // The node's own user is not bound so.
     (0..2).for_each(|_| drop(RawClient::register(&node, &Register::default())));
+}
+
+// spec: LNCL-8
+#[test]
+fn another_user_who_names_types_with_the_ids_of_the_robots_own_bars_none_of_these() {
+    // These two have one id.
+    let (own, theirs) = (Kind::named("liquid"), Kind::named("costarring"));
+    assert_eq!(own, theirs);
+    let node = TestNode::start_guarded(&format!("[[client]]\nuid = {STRANGER}\n"));
+    let naming = |kind: &str| Register { kinds: vec![kind.to_owned()], ..Register::default() };
+    // Given: another user was here first, and one of its applications has gone.
+    let Some((guest, _)) = as_stranger(|| {
+        drop(RawClient::register(&node, &naming("costarring")));
+        RawClient::register(&node, &naming("costarring"))
+    }) else {
+        return;
+    };
+    // When, then: the robot's own is registered, and what it says counts.
+    RawClient::register(&node, &naming("liquid"));
+    assert_eq!(lock(&node.stores.registry).kind_name(theirs), Some("liquid"));
+    drop(guest);
+    RawClient::register(&node, &naming("liquid"));
 }

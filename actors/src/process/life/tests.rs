@@ -2,7 +2,7 @@
 
 use std::{os::unix::process::CommandExt, process::Command};
 
-use bytes::Bytes;
+use bytes::{Bytes, BytesMut};
 use futures_util::FutureExt;
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use sinew_runtime::{
@@ -10,7 +10,7 @@ use sinew_runtime::{
     pending::{AppOutlet, Pending},
     router::Outlet,
     tid::{AppAddress, Incarnation, NodeAddress},
-    wire::Header,
+    wire::{Header, encode_frame},
 };
 
 use super::*;
@@ -114,6 +114,25 @@ async fn kinds_read(child: &mut Child, theirs: UnixStream, last: Kind) -> Vec<Ki
         ended = child.accompany(&stop) => panic!("it lives: {ended:?}"),
         kinds = tokio::time::timeout(WITHIN, hears) => kinds.expect("it comes"),
     }
+}
+
+#[test]
+fn who_holds_the_socket_of_a_dead_process_says_nothing_more_and_what_it_has_said_counts() {
+    run(async {
+        // Given: the last words of a process, whose socket somebody else holds open
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let (mut child, theirs) = begin(&hosted(&stores));
+        let ready = words::bare(Kind::HOST_READY, child.hosted.tid, Tid::NONE);
+        let mut said = BytesMut::new();
+        encode_frame(&ready.header, &ready.payload, &mut said);
+        theirs.writable().await.unwrap();
+        assert_eq!(theirs.try_write(&said).unwrap(), said.len());
+        // When
+        assert!(child.hear_the_rest(), "it can be read");
+        // Then
+        assert!(child.heard.is_some());
+        assert_eq!(theirs.try_write(&said).unwrap_err().kind(), io::ErrorKind::BrokenPipe);
+    });
 }
 
 #[test]

@@ -89,7 +89,7 @@ impl Attacker {
 
     /// Plays one trick. What the node answers to it, or that it closes, is no error.
     pub(super) fn play_one(&mut self) {
-        const TRICKS: [Trick; 27] = [
+        const TRICKS: [Trick; 28] = [
             Attacker::garbage,
             Attacker::mutants,
             Attacker::forged_sources,
@@ -99,6 +99,7 @@ impl Attacker {
             Attacker::half_a_frame,
             Attacker::wishes,
             Attacker::restless,
+            Attacker::torrent,
             Attacker::too_early,
             Attacker::false_outcomes,
             Attacker::lying_ring,
@@ -350,6 +351,20 @@ impl Attacker {
         self.listen(&mut stranger)
     }
 
+    /// Messages for nobody as fast as the node takes them, a thousand with each call; reads nothing.
+    fn torrent(&mut self) -> io::Result<()> {
+        const CALL_BYTES: usize = 64 * 1024;
+        let mut stranger = self.register()?;
+        let nobody = Tid::new(stranger.tid.node, NOBODY);
+        let frame = Frame::new(&self.header(stranger.tid, nobody), Vec::new()).bytes();
+        let frames = frame.repeat(CALL_BYTES / frame.len());
+        let end = Instant::now() + TRICK;
+        while Instant::now() < end {
+            self.write(&mut stranger, &frames)?;
+        }
+        Ok(())
+    }
+
     /// Messages before the barrier has opened; it waits for one who never comes.
     fn too_early(&mut self) -> io::Result<()> {
         let mut stranger = self.connect()?;
@@ -490,3 +505,5 @@ impl Attacker {
 
 /// The correlation of a forged message: what is refused with it was refused because of its source.
 const FORGED: u64 = 0x0F0F_0666;
+/// A fixed address that nobody asks for.
+const NOBODY: AppAddress = AppAddress::new(0x7FFF_FFFF);
