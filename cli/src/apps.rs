@@ -111,9 +111,9 @@ fn meetings(answers: &[Answer<AppsReport>]) -> Vec<(&str, &BarrierReport)> {
 }
 
 fn meeting_cells(node: &str, one: &BarrierReport) -> [String; 5] {
-    let waits: Vec<_> =
-        one.waiting.iter().map(|who| format!("{} {}", who.name, time(who.waits_us))).collect();
-    let missing: Vec<_> = one.missing.iter().map(meeting_lacks).collect();
+    let waits = one.waiting.iter().map(|who| format!("{} {}", who.name, time(who.waits_us)));
+    let waits: Vec<_> = waits.chain(more(one.waiting_left_out)).collect();
+    let missing: Vec<_> = one.missing.iter().map(meeting_lacks).chain(more(one.missing_left_out)).collect();
     let opened = if one.is_phase { "phase".to_owned() } else { one.generation.to_string() };
     [one.name.clone(), node.to_owned(), opened, waits.join(", "), missing.join(", ")]
 }
@@ -128,7 +128,8 @@ fn meeting_json(node: &str, one: &BarrierReport) -> Value {
     let missing = one.missing.iter().map(missing_json);
     json!({
         "name": one.name, "node_name": node, "parties": one.parties, "is_phase": one.is_phase, "generation": one.generation,
-        "waiting": waiting.collect::<Vec<_>>(), "missing": missing.collect::<Vec<_>>(),
+        "waiting": waiting.collect::<Vec<_>>(), "waiting_left_out": one.waiting_left_out,
+        "missing": missing.collect::<Vec<_>>(), "missing_left_out": one.missing_left_out,
     })
 }
 
@@ -175,9 +176,13 @@ fn handles(app: &AppReport) -> Option<String> {
         cut.map_or(name, |cut| cut + "...")
     });
     let mut words: Vec<_> = shown.collect();
-    let more = app.kinds.len().saturating_sub(KINDS_SHOWN) as u64 + app.kinds_left_out;
-    words.extend((more > 0).then(|| format!("{more} more")));
+    words.extend(more(app.kinds.len().saturating_sub(KINDS_SHOWN) as u64 + app.kinds_left_out));
     (!words.is_empty()).then(|| words.join(", "))
+}
+
+/// Of how many there are more than are shown.
+fn more(count: u64) -> Option<String> {
+    (count > 0).then(|| format!("{count} more"))
 }
 
 fn kind_name(of: &KindReport) -> String {
@@ -202,7 +207,7 @@ pub(crate) fn why(app: &AppReport) -> String {
 
 pub(crate) fn lacks(app: &AppReport) -> String {
     let one = |missing: &Missing| format!("{} ({})", missing.name, missing.why);
-    app.missing.iter().map(one).collect::<Vec<_>>().join(", ")
+    app.missing.iter().map(one).chain(more(app.missing_left_out)).collect::<Vec<_>>().join(", ")
 }
 
 fn joined(words: &BTreeSet<&str>) -> String {
@@ -220,6 +225,7 @@ fn app_json(node: &str, app: &AppReport) -> Value {
         "state": state(app),
         "waits_us": app.waits_us,
         "missing": missing.collect::<Vec<_>>(),
+        "missing_left_out": app.missing_left_out,
         "ended": app.ended,
         "kinds": app.kinds.iter().map(|of| json!({ "kind": kind_name(of), "kind_id": of.kind.to_string() })).collect::<Vec<_>>(),
         "kinds_left_out": app.kinds_left_out,
@@ -314,7 +320,9 @@ mod tests {
             is_phase: false,
             generation: 0,
             waiting: vec![WaitReport { name: "knee".to_owned(), waits_us: 1 }],
+            waiting_left_out: 0,
             missing: vec![Missing { name: "hip".to_owned(), why: "not there".to_owned(), since_us: None }],
+            missing_left_out: 0,
         }
     }
 
@@ -333,6 +341,15 @@ mod tests {
         let said = who_waits(&[answer(Vec::new(), [0, 0])]);
         assert_eq!((said.is_fine, said.text.as_str()), (true, "nobody waits\n"));
         assert_eq!(said.json["left_out"], json!([]));
+    }
+
+    #[test]
+    fn those_of_a_barrier_that_had_no_room_are_told_with_their_number() {
+        let one = BarrierReport { waiting_left_out: 3, missing_left_out: 5, ..barrier() };
+        let [.., waits, missing] = meeting_cells("knee", &one);
+        assert!(waits.ends_with(", 3 more") && missing.ends_with(", 5 more"), "{waits}; {missing}");
+        let said = meeting_json("knee", &one);
+        assert_eq!((&said["waiting_left_out"], &said["missing_left_out"]), (&3.into(), &5.into()));
     }
 
     #[test]
@@ -356,6 +373,7 @@ mod tests {
             ready: true,
             waits_us: None,
             missing: Vec::new(),
+            missing_left_out: 0,
             ended: None,
             kinds: names.iter().map(kind).collect(),
             kinds_left_out,

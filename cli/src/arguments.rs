@@ -14,7 +14,7 @@ use crate::{keys, send, watch, why};
 #[command(name = "sinew", version, after_help = AFTER)]
 pub(crate) struct Arguments {
     /// The socket of a node on this machine. Without it: $SINEW_SOCKET, else the first that answers of $XDG_RUNTIME_DIR/sinew/*.sock,
-    /// /run/sinew/*.sock, /tmp/sinew-*.sock
+    /// /run/sinew/*.sock, /tmp/sinew-*.sock; of these only one that belongs to this user or root, as does who listens there
     #[arg(long, global = true, value_name = "PATH")]
     pub(crate) socket: Option<PathBuf>,
     /// Print JSON instead of tables; where the command cannot be carried out, an object whose `fault` says why, beside the words on stderr
@@ -106,8 +106,8 @@ impl Arguments {
 const AFTER: &str = "\
 Exit codes:
   0  all is fine
-  1  something was found: a node does not answer, an application is not ready, a message was not delivered, nobody is called so;
-     a list cannot be used; keys cannot be made, or count for less than another 30 days
+  1  something was found: a node does not answer or refuses, something of it does not get on, an application is not ready, a message
+     was not delivered, nobody is called so; a list cannot be used; keys cannot be made, or count for less than another 30 days
   2  the command line is wrong
   3  no node lets this command in, or that node does not answer
 

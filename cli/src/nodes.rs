@@ -27,7 +27,8 @@ pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
         here.lost.iter().filter(|lost| rows.iter().all(|row| row.answer.node != lost.node)).collect();
     // Who has left in order is missed by nobody.
     let none_is_missed = here.lost.iter().all(|lost| lost.why == "left");
-    let is_fine = rows.iter().all(Row::is_fine) && here.left_out == 0 && none_is_missed;
+    let are_all_told = here.left_out == 0 && here.lost_left_out == 0;
+    let is_fine = rows.iter().all(Row::is_fine) && are_all_told && none_is_missed;
     let json = json!({
         "through": system.path,
         "here": here.node.to_string(),
@@ -35,6 +36,7 @@ pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
         "sources": here.sources.iter().map(source_json).collect::<Vec<_>>(),
         "lost": here.lost.iter().map(lost_json).collect::<Vec<_>>(),
         "left_out": here.left_out,
+        "lost_left_out": here.lost_left_out,
     });
     Ok(Said { text: text(&here, &rows, &lost), json, is_fine })
 }
@@ -71,7 +73,8 @@ impl<'a> Row<'a> {
 
     fn is_fine(&self) -> bool {
         let is_linked = self.seen.is_none_or(|seen| seen.links.iter().all(|link| link.is_up));
-        self.answer.said.as_ref().is_ok_and(|said| !said.stopping) && is_linked
+        let gets_on = self.troubles().is_none_or(|(count, _)| count == 0);
+        self.answer.said.as_ref().is_ok_and(|said| !said.stopping) && is_linked && gets_on
     }
 
     fn links(&self) -> String {
@@ -105,6 +108,13 @@ impl<'a> Row<'a> {
 
     fn found_by(&self) -> String {
         or_dash(self.seen.map(|seen| seen.found_by.join(", ")).filter(|words| !words.is_empty()))
+    }
+
+    /// How many of its layers and applications do not get on, and the first of them: as the node knows through which we came, and of that one
+    /// as it says.
+    fn troubles(&self) -> Option<(u32, &[TroubleReport])> {
+        let seen = self.seen.map(|seen| (seen.troubled, &seen.troubles[..]));
+        seen.or_else(|| self.answer.said.as_ref().ok().map(|said| (said.troubled, &said.troubles[..])))
     }
 
     /// How many of its clients take nothing, and the first of them: as the node knows through which we came, and of that one as it says.
@@ -154,8 +164,8 @@ impl<'a> Row<'a> {
             "missed": seen.map(|seen| seen.missed),
             "asked_every_us": seen.and_then(|seen| seen.asked_every_us),
             "bound_us": seen.and_then(|seen| seen.bound_us),
-            "troubled": seen.map(|seen| seen.troubled),
-            "troubles": seen.map(|seen| seen.troubles.iter().map(trouble_json).collect::<Vec<_>>()),
+            "troubled": self.troubles().map(|(count, _)| count),
+            "troubles": self.troubles().map(|(_, named)| named.iter().map(trouble_json).collect::<Vec<_>>()),
             "idle_clients": self.idle().map(|(count, _)| count),
             "idle": self.idle().map(|(_, named)| named.iter().map(idle_json).collect::<Vec<_>>()),
             "routes": seen.map(|seen| seen.routes.iter().map(route_json).collect::<Vec<_>>()),
@@ -266,21 +276,17 @@ fn stalls_in_words(stalls: Option<StallReport>, node: &dyn Display) -> Option<St
 }
 
 /// What of a node does not get on, a line each.
-fn troubles(of: &PeerReport) -> String {
-    let name = clean(of.name.as_deref().unwrap_or_default());
+fn troubles(row: &Row<'_>) -> String {
+    let Some((count, named)) = row.troubles() else { return String::new() };
+    let (node, name) = (row.answer.node, clean(row.name()));
     let mut lines = String::new();
-    for TroubleReport { app, name: what, trouble, since_us } in &of.troubles {
-        lines += &format!(
-            "{} {name}: {} ({app}) does not get on: {} for {}\n",
-            of.node,
-            clean(what),
-            clean(trouble),
-            time(*since_us)
-        );
+    for TroubleReport { app, name: what, trouble, since_us } in named {
+        let (what, trouble, since) = (clean(what), clean(trouble), time(*since_us));
+        lines += &format!("{node} {name}: {what} ({app}) does not get on: {trouble} for {since}\n");
     }
-    let unnamed = (of.troubled as usize).saturating_sub(of.troubles.len());
+    let unnamed = (count as usize).saturating_sub(named.len());
     if unnamed > 0 {
-        lines += &format!("{} {name}: {unnamed} further ones do not get on\n", of.node);
+        lines += &format!("{node} {name}: {unnamed} further ones do not get on\n");
     }
     lines
 }
@@ -334,13 +340,15 @@ fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport]) -> String {
         }
     }
     for row in rows {
-        text.extend(row.seen.map(troubles));
+        text += &troubles(row);
         text += &idle(row);
     }
     let said = rows.iter().filter_map(|row| row.answer.said.as_ref().ok());
     text.extend(said.filter_map(own_stalls));
-    if here.left_out > 0 {
-        text += &format!("{} further nodes had no room in the answer of {}\n", here.left_out, here.node);
+    for (count, what) in [(here.left_out, "nodes"), (here.lost_left_out, "lost nodes")] {
+        if count > 0 {
+            text += &format!("{count} further {what} had no room in the answer of {}\n", here.node);
+        }
     }
     text
 }
@@ -351,25 +359,41 @@ mod tests {
 
     use super::*;
 
+    fn answer(said: NodeReport) -> Answer<NodeReport> {
+        Answer { node: said.node, name: "as others call it".to_owned(), said: Ok(said) }
+    }
+
     #[test]
-    fn what_of_a_node_does_not_get_on_has_a_line_each_and_the_rest_are_counted() {
-        let node = NodeAddress::from([10, 0, 0, 7]);
+    fn what_of_a_node_does_not_get_on_is_a_finding_with_a_line_each_also_of_the_one_through_which_we_came() {
+        let node = NodeAddress::from([192, 168, 0, 7]);
         let app = Tid::new(node, AppAddress::new(0x1000));
         let (name, trouble) = ("drive".to_owned(), "stalled".to_owned());
-        let seen = PeerReport {
-            name: Some("knee".to_owned()),
-            is_there: true,
-            asked_every_us: Some(500_000),
-            bound_us: Some(2_000_000),
-            troubled: 3,
-            troubles: vec![TroubleReport { app, name, trouble, since_us: 2_500_000 }],
-            ..PeerReport::lost(node, Incarnation(1))
-        };
+        let (troubled, named) = (3, vec![TroubleReport { app, name, trouble, since_us: 2_500_000 }]);
         let lines = [
-            format!("10.0.0.7 knee: drive ({app}) does not get on: stalled for 2.5 s\n"),
-            "10.0.0.7 knee: 2 further ones do not get on\n".to_owned(),
+            format!("192.168.0.7 knee: drive ({app}) does not get on: stalled for 2.5 s\n"),
+            "192.168.0.7 knee: 2 further ones do not get on\n".to_owned(),
         ];
-        assert_eq!(troubles(&seen), lines.concat());
+        // As another node knows it, and as it says itself.
+        let plain = answer(security::tests::said("knee", 7, None));
+        let seen = PeerReport { troubled, troubles: named.clone(), ..PeerReport::lost(node, Incarnation(1)) };
+        let of_peer = Row { answer: &plain, seen: Some(&seen) };
+        let own = answer(NodeReport { troubled, troubles: named, ..security::tests::said("knee", 7, None) });
+        for row in [of_peer, Row { answer: &own, seen: None }] {
+            assert_eq!((troubles(&row), row.is_fine()), (lines.concat(), false));
+            let json = row.json();
+            assert_eq!((&json["troubled"], &json["troubles"][0]["name"]), (&json!(3), &json!("drive")));
+        }
+        let row = Row { answer: &plain, seen: None };
+        assert_eq!((troubles(&row), row.is_fine()), (String::new(), true));
+    }
+
+    #[test]
+    fn nodes_that_had_no_room_in_the_answer_are_told_with_their_number() {
+        let here = NodeReport { left_out: 2, lost_left_out: 3, ..security::tests::said("knee", 7, None) };
+        let said = text(&here, &[], &[]);
+        let lines = "2 further nodes had no room in the answer of 192.168.0.7\n\
+                     3 further lost nodes had no room in the answer of 192.168.0.7\n";
+        assert!(said.ends_with(lines), "{said}");
     }
 
     #[test]
@@ -378,11 +402,6 @@ mod tests {
         let app = Tid::new(node, AppAddress::new(0x1000));
         let (idle_clients, named) =
             (4, vec![IdleReport { app, name: "hand".to_owned(), since_us: 2_900_000 }]);
-        let answer = |said: NodeReport| Answer {
-            node: said.node,
-            name: "as others call it".to_owned(),
-            said: Ok(said),
-        };
         let lines = [
             format!("192.168.0.7 knee: client hand ({app}) takes nothing of what waits for it, for 2.9 s\n"),
             "192.168.0.7 knee: 3 further clients take nothing of what waits for them\n".to_owned(),

@@ -13,7 +13,7 @@ use sinew::{
 
 use crate::{
     FINDING, NOBODY, USAGE,
-    door::{self, NoDoor},
+    door::{self, NoDoor, Others},
     table::clean,
 };
 
@@ -36,6 +36,9 @@ pub(crate) enum Fault {
     /// The node does not answer.
     #[error("the node at {0}: {1}")]
     NoAnswer(String, String),
+    /// The node where the application is that was asked for, another one perhaps, does not answer or refuses.
+    #[error("the application's node {0}: {1}")]
+    ItsNode(String, String),
     /// Nobody is called so.
     #[error("{0}")]
     Whom(String),
@@ -51,7 +54,7 @@ impl Fault {
     /// What the command ends with: see [`Arguments`](crate::arguments::Arguments).
     pub(crate) const fn code(&self) -> u8 {
         match self {
-            Self::Whom(_) | Self::Keys(_) => FINDING,
+            Self::ItsNode(..) | Self::Whom(_) | Self::Keys(_) => FINDING,
             Self::Usage(_) => USAGE,
             Self::NoDoor(_) | Self::NotTaken(..) | Self::NoAnswer(..) => NOBODY,
         }
@@ -86,10 +89,11 @@ impl System {
         Self::through(&path, api, within, REGISTERED_WITHIN)
     }
 
-    /// Enters through each further socket of this host; returns also those that let nobody in, with the reason.
+    /// Enters through each further socket of this host; returns also those that let nobody in, or are not asked, with the reason.
     pub(crate) fn beside(first: &Self, named: &[PathBuf]) -> (Vec<Self>, Vec<String>) {
-        let (mut inside, mut shut) = (Vec::new(), Vec::new());
-        for (path, api) in door::others(Path::new(&first.path), named) {
+        let Others { doors, left_out } = door::others(Path::new(&first.path), named);
+        let (mut inside, mut shut) = (Vec::new(), left_out);
+        for (path, api) in doors {
             // One that is stopped does not keep us for longer than a node that does not answer.
             match Self::through(&path, api, first.within, first.within.min(REGISTERED_WITHIN)) {
                 Ok(system) => inside.push(system),

@@ -11,13 +11,13 @@ use std::{
 use clap::Args;
 use serde_json::{Value, json};
 use sinew::{
-    AppAddress, Tid,
+    ApiError, AppAddress, NodeAddress, Tid,
     inspect::{AppsReport, AskApps, AskWatch, SeenMessage, WatchReport},
 };
 
 use crate::{
     Said, messagepack,
-    system::{Fault, System, in_words},
+    system::{Answer, Fault, System, in_words},
     table::{clean, time},
 };
 use rates::Rates;
@@ -58,7 +58,7 @@ pub(crate) struct Order {
 pub(crate) fn show(system: &mut System, order: &Order, is_json: bool) -> Result<Said, Fault> {
     let app = application(system, &order.whom)?;
     let kinds = order.kind.iter().map(|kind| crate::send::kind(kind)).collect::<Result<Vec<_>, _>>()?;
-    let screen = Screen { names: names(system)?, is_json, rates_only: order.rates };
+    let screen = Screen { names: Names::asked(system)?, is_json, rates_only: order.rates };
     let mut question = AskWatch { app, received: !order.sent, sent: !order.received };
     let began = Instant::now();
     let ends = order.lasts.map(|seconds| began + Duration::from_secs(seconds));
@@ -83,7 +83,10 @@ pub(crate) fn show(system: &mut System, order: &Order, is_json: bool) -> Result<
                     std::thread::sleep(PERIOD);
                 }
             }
-            Err(why) if in_vain + 1 == IN_VAIN_MAX => return Err(Fault::NoAnswer(system.path.clone(), why)),
+            Err(vain) if in_vain + 1 == IN_VAIN_MAX => {
+                let here = (system.endpoint.tid().node, system.path.as_str());
+                return Err(vain.blamed(here, question.app.node, &screen.names));
+            }
             Err(_) => {
                 in_vain += 1;
                 std::thread::sleep(PERIOD);
@@ -129,24 +132,79 @@ fn is_name(whom: &str) -> bool {
     whom.parse::<Tid>().is_err()
 }
 
-fn ask(system: &mut System, question: &AskWatch) -> Result<WatchReport, String> {
+fn ask(system: &mut System, question: &AskWatch) -> Result<WatchReport, Vain> {
     let to = Tid::new(question.app.node, AppAddress::INSPECT);
     let report: WatchReport =
-        system.endpoint.ask(to, question, system.within).map_err(|error| in_words(&error))?;
-    report.refused.clone().map_or(Ok(report), Err)
+        system.endpoint.ask(to, question, system.within).map_err(|error| Vain::of(&error))?;
+    report.refused.clone().map_or(Ok(report), |why| Err(Vain::Refused(why)))
 }
 
-/// What the applications are called that are there now.
-fn names(system: &mut System) -> Result<BTreeMap<Tid, String>, Fault> {
-    let here = system.here()?;
-    let answers = system.ask_all::<AskApps, AppsReport>(&here);
-    let apps = answers.into_iter().filter_map(|answer| answer.said.ok()).flat_map(|said| said.apps);
-    Ok(apps.filter_map(|app| Some((app.tid, app.name?))).collect())
+/// Why a question brought nothing.
+#[derive(Debug)]
+enum Vain {
+    /// It did not get out of this program, or not to the node through which we came.
+    NotAsked(String),
+    /// The application's node did not answer it, or cannot.
+    NotAnswered(String),
+    /// The application's node shows nothing, in its own words.
+    Refused(String),
+}
+
+impl Vain {
+    fn of(error: &ApiError) -> Self {
+        let why = in_words(error);
+        let is_of_the_other =
+            matches!(error, ApiError::Ended(_) | ApiError::NoReply(_) | ApiError::Malformed(_));
+        if is_of_the_other { Self::NotAnswered(why) } else { Self::NotAsked(why) }
+    }
+
+    /// Whose fault it is: that of the node `here`, through whose socket we came, only where it gives no answer itself.
+    fn blamed(self, here: (NodeAddress, &str), there: NodeAddress, names: &Names) -> Fault {
+        let (here, path) = here;
+        match self {
+            Self::NotAsked(why) => Fault::NoAnswer(path.to_owned(), why),
+            Self::NotAnswered(why) if here == there => Fault::NoAnswer(path.to_owned(), why),
+            Self::NotAnswered(why) | Self::Refused(why) => Fault::ItsNode(names.of_node(there), clean(&why)),
+        }
+    }
+}
+
+/// What those are called that are there now.
+#[derive(Default)]
+struct Names {
+    apps: BTreeMap<Tid, String>,
+    nodes: BTreeMap<NodeAddress, String>,
+}
+
+impl Names {
+    fn asked(system: &mut System) -> Result<Self, Fault> {
+        let here = system.here()?;
+        Ok(Self::of(system.ask_all::<AskApps, AppsReport>(&here)))
+    }
+
+    fn of(answers: Vec<Answer<AppsReport>>) -> Self {
+        let mut names = Self::default();
+        for Answer { node, name, said } in answers {
+            // One that is lost has none for the others any more.
+            if !name.is_empty() {
+                names.nodes.insert(node, name);
+            }
+            let apps = said.into_iter().flat_map(|said| said.apps);
+            names.apps.extend(apps.filter_map(|app| Some((app.tid, app.name?))));
+        }
+        names
+    }
+
+    /// The node as it is called in what is said.
+    fn of_node(&self, node: NodeAddress) -> String {
+        let name = self.nodes.get(&node);
+        name.map_or_else(|| node.to_string(), |name| format!("{} at {node}", clean(name)))
+    }
 }
 
 /// Where it is shown. Each method says whether there is still a reader.
 struct Screen {
-    names: BTreeMap<Tid, String>,
+    names: Names,
     is_json: bool,
     rates_only: bool,
 }
@@ -178,7 +236,7 @@ impl Screen {
             seen.as_secs_f64(),
             kind(message),
             format!("{:?}{wants}", message.class),
-            self.names.get(&other).cloned().unwrap_or_else(|| other.to_string()),
+            self.names.apps.get(&other).cloned().unwrap_or_else(|| other.to_string()),
             age(message),
             payload(message),
         );
@@ -189,8 +247,8 @@ impl Screen {
         json!({
             "event": "message", "sent": message.is_sent, "kind": kind(message), "kind_id": message.kind.to_string(),
             "class": format!("{:?}", message.class).to_lowercase(), "wants": message.wants,
-            "source": message.source.to_string(), "source_name": self.names.get(&message.source),
-            "target": message.target.to_string(), "target_name": self.names.get(&message.target),
+            "source": message.source.to_string(), "source_name": self.names.apps.get(&message.source),
+            "target": message.target.to_string(), "target_name": self.names.apps.get(&message.target),
             "sequence": message.sequence, "age_ns": message.age_error_ns.map(|_| message.age_ns), "age_error_ns": message.age_error_ns, "bytes": message.length,
             "refused": message.refused.map(|refused| format!("{refused:?}")),
             "payload": is_whole(message).then(|| messagepack::shown_or_raw(&message.payload)),
@@ -230,4 +288,55 @@ fn clean_lines(text: &str) -> String {
 /// Whether somebody still reads it.
 fn say(line: &str) -> bool {
     writeln!(std::io::stdout(), "{line}").is_ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew::{Outcome, Rejection};
+
+    use super::*;
+    use crate::{FINDING, NOBODY};
+
+    const HIP: NodeAddress = NodeAddress::new(0x0a00_0001);
+    const KNEE: NodeAddress = NodeAddress::new(0x0a00_0002);
+
+    /// What is said, and the exit code, where the command came in at the hip.
+    fn blamed(vain: Vain, there: NodeAddress, names: &Names) -> (String, u8) {
+        let fault = vain.blamed((HIP, "/run/hip.sock"), there, names);
+        (fault.to_string(), fault.code())
+    }
+
+    /// The knee has said nothing of its applications.
+    fn names() -> Names {
+        let said = Err("no answer".to_owned());
+        Names::of(vec![Answer { node: KNEE, name: "knee".to_owned(), said }])
+    }
+
+    #[test]
+    fn the_node_is_blamed_that_has_the_application_and_not_the_one_through_which_we_came() {
+        for error in [
+            ApiError::NoReply(Duration::from_secs(2)),
+            ApiError::Ended(Outcome::Rejected(Rejection::NoSuchNode)),
+        ] {
+            let (said, code) = blamed(Vain::of(&error), KNEE, &names());
+            assert_eq!(said, format!("the application's node knee at 10.0.0.2: {}", in_words(&error)));
+            assert_eq!(code, FINDING);
+        }
+        let refused = || Vain::Refused("this node shows 8 watches at once".to_owned());
+        let words = "the application's node knee at 10.0.0.2: this node shows 8 watches at once";
+        assert_eq!(blamed(refused(), KNEE, &names()), (words.to_owned(), FINDING));
+        // One that answers is no node that does not, wherever it is.
+        let words = "the application's node 10.0.0.1: this node shows 8 watches at once";
+        assert_eq!(blamed(refused(), HIP, &names()), (words.to_owned(), FINDING));
+    }
+
+    #[test]
+    fn the_node_through_which_we_came_is_blamed_where_it_gives_no_answer_itself() {
+        let silent = ApiError::NoReply(Duration::from_secs(2));
+        let ended = ApiError::Closed("it was closed".to_owned());
+        for (error, there) in [(silent, HIP), (ended, KNEE)] {
+            let (said, code) = blamed(Vain::of(&error), there, &names());
+            assert_eq!((said, code), (format!("the node at /run/hip.sock: {}", in_words(&error)), NOBODY));
+        }
+    }
 }

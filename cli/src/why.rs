@@ -27,8 +27,8 @@ pub(crate) struct Order {
     from: String,
     /// Another one
     to: String,
-    /// The socket of a node on this host that is at none of the usual places nor beside the one of --socket: so a node is asked that the
-    /// others do not know. May be given several times
+    /// The socket of a node on this host that is at none of the usual places nor beside the one of --socket, or is another user's: so a node
+    /// is asked that the others do not know. May be given several times
     #[arg(long, value_name = "PATH")]
     other_socket: Vec<PathBuf>,
 }

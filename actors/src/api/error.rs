@@ -9,10 +9,13 @@ use sinew_runtime::{
     wire::{DecodeError, FrameError, Kind},
 };
 
+use super::link::NotBelieved;
+
 /// Why an operation of NodeAPI failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ApiError {
-    /// Nobody listens at the path, or this process may not connect to who does. The environment is at fault; nothing changed.
+    /// Nobody listens at the path, or this process may not connect to who does, or who does is not believed
+    /// ([`NodeApi::connect_found`](super::NodeApi::connect_found)). The environment is at fault; nothing changed.
     #[error("no node can be reached at {path:?}: {cause}; {}", way_to_a_node(cause))]
     NoNode {
         /// The path.
@@ -136,7 +139,9 @@ fn not_handled(outcome: Outcome) -> String {
 
 /// What to do about a node that cannot be reached. spec: LNCL-2
 fn way_to_a_node(cause: &io::Error) -> &'static str {
-    if cause.kind() == io::ErrorKind::PermissionDenied {
+    if cause.get_ref().is_some_and(|cause| cause.is::<NotBelieved>()) {
+        "if that user's node is meant, name its socket: `NodeApi::connect`"
+    } else if cause.kind() == io::ErrorKind::PermissionDenied {
         "this process's user may not open that socket: a node serves the user that it runs as, and root; run the application \
          as that user, and see that it may enter the socket's directories"
     } else {
@@ -153,7 +158,9 @@ mod tests {
     /// One of each, so that a new one is not forgotten here.
     fn all() -> Vec<ApiError> {
         let second = Duration::from_secs(1);
+        let strangers = NotBelieved { theirs: 1001, own: 1000 };
         let mut all = vec![
+            ApiError::NoNode { path: "/tmp/sinew-0.sock".into(), cause: io::Error::other(strangers) },
             ApiError::NoNode { path: "/run/knee.sock".into(), cause: io::ErrorKind::NotFound.into() },
             ApiError::NoNode { path: "/run/knee.sock".into(), cause: io::ErrorKind::PermissionDenied.into() },
             ApiError::NotAPath { path: PathBuf::new(), why: "it is empty" },

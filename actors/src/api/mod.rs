@@ -210,7 +210,7 @@ pub use received::Received;
 pub use untaken::Untaken;
 
 use self::{
-    link::{Greeting, Link, LinkOptions},
+    link::{Believed, Greeting, Link, LinkOptions},
     returning::Returning,
 };
 use crate::lncl::payload::Register;
@@ -219,17 +219,42 @@ use crate::lncl::payload::Register;
 #[derive(Clone, Debug)]
 pub struct NodeApi {
     path: PathBuf,
+    believed: Believed,
 }
 
 impl NodeApi {
     /// Looks whether a node listens at `path`: its configuration's `lncl.socket`.
     ///
+    /// Whoever listens there is believed, of whatever user: the path says whose node is meant. So it is to be in a directory to which nobody
+    /// but the node's user and root can write, as `/run/sinew`; in `/tmp` anybody can listen at it while the node is not there. Where a node
+    /// of this process's own user is meant, [`connect_found`](Self::connect_found) believes no other one.
+    ///
     /// # Errors
     /// Nobody listens there, or this user may not connect.
     pub fn connect(path: impl AsRef<Path>) -> Result<Self, ApiError> {
-        let path = path.as_ref().to_owned();
-        link::connect(&path, Time::now() + link::CONNECT)?;
-        Ok(Self { path })
+        Self::within(path.as_ref(), Believed::Anybody, link::CONNECT)
+    }
+
+    /// The same for a path that nobody has named, as of a socket that was found in `/tmp`: a node of this process's own user, or of root, is
+    /// believed, and nobody else. The kernel says who listens, and is asked for each connection, also of an endpoint that comes back: another
+    /// user who listens there then is not told a word. It takes no longer than `within`, nor than the 2 s that
+    /// [`connect`](Self::connect) takes at most.
+    ///
+    /// # Errors
+    /// Nobody listens there, or a process of another user does, or this user may not connect; or it takes nobody in time.
+    pub fn connect_found(path: impl AsRef<Path>, within: Duration) -> Result<Self, ApiError> {
+        Self::within(path.as_ref(), Believed::OwnUser, within)
+    }
+
+    fn within(path: &Path, believed: Believed, within: Duration) -> Result<Self, ApiError> {
+        link::connect(path, believed, Time::now() + within)?;
+        Ok(Self { path: path.to_owned(), believed })
+    }
+
+    /// What is asked for, of whom this believes.
+    const fn asking(&self, mut registration: Registration) -> Registration {
+        registration.link.believed = self.believed;
+        registration
     }
 
     /// Asks for a transport address, and waits until everything that the application requires is ready
@@ -241,7 +266,7 @@ impl NodeApi {
     /// # Errors
     /// The node refused, in words; or the deadline passed. Nothing stays registered.
     pub fn register_transport_address(&self, registration: Registration) -> Result<Endpoint, ApiError> {
-        Endpoint::register(&self.path, registration)
+        Endpoint::register(&self.path, self.asking(registration))
     }
 
     /// The same for a task of tokio, which is not blocked meanwhile. Dropped, it gives up within a tenth of a second.
@@ -252,7 +277,7 @@ impl NodeApi {
         &self,
         registration: Registration,
     ) -> Result<AsyncEndpoint, ApiError> {
-        AsyncEndpoint::register(&self.path, registration).await
+        AsyncEndpoint::register(&self.path, self.asking(registration)).await
     }
 }
 
@@ -278,6 +303,7 @@ impl Default for Registration {
                 patience: Duration::from_secs(1),
                 bell: BellKind::Futex.into(),
                 direct_ring_bytes: direct::RING_BYTES,
+                believed: Believed::Anybody,
             },
             returning: Returning::Always,
         }

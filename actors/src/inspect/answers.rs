@@ -1,6 +1,7 @@
 //! What a node says about itself: reads its stores, and asks the root for the tree.
 
 use std::{
+    borrow::Cow,
     collections::BTreeMap,
     sync::{Arc, Weak, atomic::Ordering},
     time::Duration,
@@ -70,6 +71,7 @@ impl Answers {
             idle_room -= peer.idle.len();
         }
         let (ndl, groups) = (Discovery::of(stores, now), groups(&stores.config.ndl));
+        let (refusals, refusals_left_out) = refusals(stores, now);
         Ok(NodeReport {
             node: stores.node,
             name: stores.config.name.clone(),
@@ -90,11 +92,16 @@ impl Answers {
             seeds: stores.config.ndl.seeds.iter().take(TOLD_MAX).map(ToString::to_string).collect(),
             sources: ndl.sources,
             lost: ndl.lost,
+            lost_left_out: 0,
             own_stalls: Some(ndl.stalls),
+            troubled: ndl.troubled,
+            troubles: ndl.troubles,
             idle_clients: ndl.idle_clients,
             idle: ndl.idle,
             foreign: ndl.foreign,
-            refusals: refusals(stores, now),
+            foreign_left_out: 0,
+            refusals,
+            refusals_left_out,
             peers,
             left_out,
         })
@@ -164,6 +171,8 @@ struct Discovery {
     lost: Vec<LostReport>,
     foreign: Vec<ForeignReport>,
     stalls: StallReport,
+    troubled: u32,
+    troubles: Vec<TroubleReport>,
     idle_clients: u32,
     idle: Vec<IdleReport>,
 }
@@ -182,7 +191,8 @@ impl Discovery {
         let core = lock(&stores.ndl);
         let (udp, me) = (core.paths().first().copied(), core.announcement().clone());
         let (sources, lost, foreign) = (core.source_counts(), core.lost_nodes(), core.neighbours());
-        let (stalls, (idle_clients, idle_apps)) = (core.own_stalls(), core.own_idle());
+        let (stalls, (troubled, troubled_apps)) = (core.own_stalls(), core.own_troubles());
+        let (idle_clients, idle_apps) = core.own_idle();
         drop(core);
         let stalls = StallReport {
             count: stalls.count,
@@ -213,6 +223,8 @@ impl Discovery {
             lost,
             foreign: foreign.collect(),
             stalls,
+            troubled: u32::try_from(troubled).unwrap_or(u32::MAX),
+            troubles: troubled_apps.iter().map(trouble).collect(),
             idle_clients: u32::try_from(idle_clients).unwrap_or(u32::MAX),
             idle: idle_apps.iter().map(idle).collect(),
         }
@@ -253,18 +265,19 @@ fn lost_report(node: NodeAddress, lost: LostNode, now: Time) -> LostReport {
     }
 }
 
-/// Of NDL, GNCL and the other layers: what came from outside and was refused.
-fn refusals(stores: &Stores, now: Time) -> Vec<RefusalReport> {
+/// Of NDL, GNCL and the other layers: what came from outside and was refused, and how many further causes have no room. spec: INSPECT-3
+fn refusals(stores: &Stores, now: Time) -> (Vec<RefusalReport>, u64) {
     let told = [lock(&stores.ndl).refusals().told(), stores.gncl.refusals.told(), stores.refusals.told()];
     let mut told: Vec<_> = told.into_iter().flatten().collect();
     told.sort_by_key(|told| std::cmp::Reverse(told.at));
+    let left_out = told.len().saturating_sub(TOLD_MAX) as u64;
     let reports = told.into_iter().take(TOLD_MAX).map(|told| RefusalReport {
         cause: told.cause.to_owned(),
         count: told.count,
         detail: told.detail,
         ago_us: micros(now.since(told.at)),
     });
-    reports.collect()
+    (reports.collect(), left_out)
 }
 
 /// Those that answer, and those that GNCL still has something for.
@@ -294,7 +307,7 @@ fn peer_report(known: &KnownNode, now: Time) -> PeerReport {
     PeerReport {
         name: Some(known.name.clone()),
         is_there: true,
-        found_us: known.sources.values().min().map(|found| micros(now.since(*found))),
+        found_us: Some(micros(now.since(known.since))),
         found_by: known.sources.keys().map(|source| source.name().to_owned()).collect(),
         silent_us: Some(micros(now.since(known.heard))),
         missed: known.missed,
@@ -364,19 +377,29 @@ fn stream(stores: &Stores, peer: &Peer) -> Option<StreamReport> {
 fn barrier_report(status: BarrierStatus) -> BarrierReport {
     let BarrierStatus { barrier, parties, kind, generation, waiting, missing } = status;
     let wait = |(name, waits)| WaitReport { name, waits_us: micros(waits) };
+    let waiting_left_out = waiting.len().saturating_sub(MISSING_MAX) as u64;
+    let (missing, missing_left_out) = missing_reports(missing);
     BarrierReport {
         name: barrier,
         parties: parties.into_iter().take(MISSING_MAX).collect(),
         is_phase: kind == BarrierKind::Phase,
         generation,
         waiting: waiting.into_iter().take(MISSING_MAX).map(wait).collect(),
-        missing: missing.into_iter().take(MISSING_MAX).map(missing_report).collect(),
+        waiting_left_out,
+        missing,
+        missing_left_out,
     }
 }
 
-fn missing_report(absence: Absence) -> Missing {
-    let Absence { name, why, since } = absence;
-    Missing { name, why: why.into_owned(), since_us: Some(micros(since)) }
+/// As many as a report has room for, and how many more there are. spec: INSPECT-3
+fn missing_reports(absences: Vec<Absence>) -> (Vec<Missing>, u64) {
+    let left_out = absences.len().saturating_sub(MISSING_MAX) as u64;
+    let report = |Absence { name, why, since }| Missing {
+        name,
+        why: Cow::into_owned(why),
+        since_us: Some(micros(since)),
+    };
+    (absences.into_iter().take(MISSING_MAX).map(report).collect(), left_out)
 }
 
 fn seen_message(now: Time, sight: Sight, name: Option<String>) -> SeenMessage {
@@ -403,13 +426,14 @@ fn seen_message(now: Time, sight: Sight, name: Option<String>) -> SeenMessage {
 
 fn app_report(node: NodeAddress, app: OwnApp, name_of: impl Fn(Kind) -> Option<String>) -> AppReport {
     let kinds = app.kinds.into_iter().map(|kind| KindReport { kind, name: name_of(kind) });
-    let missing = app.missing.into_iter().map(missing_report);
+    let (missing, missing_left_out) = missing_reports(app.missing);
     AppReport {
         tid: Tid::new(node, app.app),
         name: app.name,
         ready: app.ready,
         waits_us: app.waits.map(micros),
-        missing: missing.collect(),
+        missing,
+        missing_left_out,
         ended: app.ended.map(str::to_owned),
         kinds: kinds.collect(),
         kinds_left_out: 0,
@@ -463,7 +487,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_peer_is_told_with_its_pace_its_bound_and_what_of_it_does_not_get_on() {
+    fn a_peer_is_told_with_when_it_was_found_its_pace_its_bound_and_what_of_it_does_not_get_on() {
         let now = Time::ZERO + Duration::from_secs(9);
         let node = NodeAddress::new(7);
         let app = Tid::new(node, AppAddress::new(0x1000));
@@ -476,7 +500,9 @@ mod tests {
             routes: Vec::new(),
             gncl: Vec::new(),
             period: Duration::from_secs(1),
-            sources: BTreeMap::new(),
+            since: now - Duration::from_secs(2),
+            // Its address was known before it was there.
+            sources: BTreeMap::from([(Source::Seed, Time::ZERO)]),
             heard: now,
             missed: 0,
             asked_every: Duration::from_millis(10),
@@ -489,6 +515,7 @@ mod tests {
             offset: None,
         };
         let said = peer_report(&known, now);
+        assert_eq!((said.found_us, said.found_by), (Some(2_000_000), vec!["seed".to_owned()]));
         assert_eq!((said.asked_every_us, said.bound_us, said.troubled), (Some(10_000), Some(40_000), 5));
         let (name, trouble) = ("drive".to_owned(), "given up".to_owned());
         assert_eq!(said.troubles, [TroubleReport { app, name, trouble, since_us: 3_000 }]);

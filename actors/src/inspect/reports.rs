@@ -143,9 +143,18 @@ payload!("sinew.inspect.node_report" =>
         /// Nodes that it knew and that have not come back, as far as it remembers.
         #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
         pub lost: Vec<LostReport>,
+        /// Further ones that had no room.
+        #[serde(default)]
+        pub lost_left_out: u64,
         /// How often its own NDL was starved, so that it counted nobody as silent.
         #[serde(default)]
         pub own_stalls: Option<StallReport>,
+        /// How many of its layers and applications do not get on.
+        #[serde(default)]
+        pub troubled: u32,
+        /// The first of them: four at most.
+        #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
+        pub troubles: Vec<TroubleReport>,
         /// How many of its clients take nothing of what waits for them.
         #[serde(default)]
         pub idle_clients: u32,
@@ -155,9 +164,15 @@ payload!("sinew.inspect.node_report" =>
         /// Nodes of other projects that it hears.
         #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
         pub foreign: Vec<ForeignReport>,
-        /// What its layers refused that came from outside, for each cause.
+        /// Further ones that had no room.
+        #[serde(default)]
+        pub foreign_left_out: u64,
+        /// What its layers refused that came from outside, for each cause, the latest first.
         #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
         pub refusals: Vec<RefusalReport>,
+        /// Further causes that had no room.
+        #[serde(default)]
+        pub refusals_left_out: u64,
         /// The nodes that it knows, in the order of their addresses.
         #[serde(deserialize_with = "at_most::<_, _, PEERS_MAX>")]
         pub peers: Vec<PeerReport>,
@@ -213,6 +228,9 @@ pub struct AppReport {
     /// What it lacks of what it requires: before its start what it waits for, later what it lost.
     #[serde(deserialize_with = "at_most::<_, _, MISSING_MAX>")]
     pub missing: Vec<Missing>,
+    /// Further ones that had no room.
+    #[serde(default)]
+    pub missing_left_out: u64,
     /// How its former life ended, while this one is not ready.
     pub ended: Option<String>,
     /// The payloads that it handles, as far as it tells: of one in a process of its own those that it named when it registered.
@@ -248,9 +266,15 @@ pub struct BarrierReport {
     /// Applications of the node that wait there.
     #[serde(deserialize_with = "at_most::<_, _, MISSING_MAX>")]
     pub waiting: Vec<WaitReport>,
+    /// Further ones that had no room.
+    #[serde(default)]
+    pub waiting_left_out: u64,
     /// Who is missing.
     #[serde(deserialize_with = "at_most::<_, _, MISSING_MAX>")]
     pub missing: Vec<Missing>,
+    /// Further ones that had no room.
+    #[serde(default)]
+    pub missing_left_out: u64,
 }
 
 /// Who waits at a run-time barrier.
@@ -395,9 +419,38 @@ fn halve<T>(list: &mut Vec<T>, left_out: &mut u64) -> bool {
     had_any
 }
 
-impl Report for NodeReport {
+/// A list of a report, and how many further ones had no room in it.
+trait Shortened {
+    /// How long the list is in the answer, in bytes.
+    fn bytes(&self) -> usize;
+    /// Leaves out its second half; whether there was any.
+    fn halve(&mut self) -> bool;
+}
+
+impl<T: Serialize> Shortened for (&mut Vec<T>, &mut u64) {
+    fn bytes(&self) -> usize {
+        encode(&self.0).len()
+    }
+
     fn halve(&mut self) -> bool {
-        halve(&mut self.peers, &mut self.left_out)
+        halve(self.0, self.1)
+    }
+}
+
+impl Report for NodeReport {
+    /// The list that takes most bytes is halved, so that none is lost to the others. spec: INSPECT-3
+    fn halve(&mut self) -> bool {
+        // `troubled` and `idle_clients` count those of these two lists already.
+        let [mut troubles_left_out, mut idle_left_out] = [0_u64; 2];
+        let mut lists: [&mut dyn Shortened; 6] = [
+            &mut (&mut self.peers, &mut self.left_out),
+            &mut (&mut self.lost, &mut self.lost_left_out),
+            &mut (&mut self.foreign, &mut self.foreign_left_out),
+            &mut (&mut self.refusals, &mut self.refusals_left_out),
+            &mut (&mut self.troubles, &mut troubles_left_out),
+            &mut (&mut self.idle, &mut idle_left_out),
+        ];
+        lists.iter_mut().max_by_key(|list| list.bytes()).is_some_and(|list| list.halve())
     }
 }
 

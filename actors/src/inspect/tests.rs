@@ -20,13 +20,15 @@ use sinew_runtime::{
 use super::{
     inspector::{Inbox, WAITING_MAX},
     reports::{
-        AppReport, AppsReport, AskApps, AskNode, AskTree, BarrierReport, KindReport, Missing, NodeReport,
-        Report as _, SecurityReport, WaitReport,
+        AppReport, AppsReport, AskApps, AskNode, AskTree, BarrierReport, ForeignReport, IdleReport,
+        KindReport, LostReport, Missing, NodeReport, PeerReport, RefusalReport, Report as _, SecurityReport,
+        TroubleReport, WaitReport,
     },
 };
 use crate::{
     config::{Interface, NodeConfig},
     lncl::AppFact,
+    ndl::{self, Part, Progress, Told, Trouble},
     secured::Secured,
     security::{
         TimePolicy,
@@ -47,6 +49,7 @@ fn report(count: u32) -> AppsReport {
         ready: true,
         waits_us: None,
         missing: Vec::new(),
+        missing_left_out: 0,
         ended: None,
         kinds: Vec::new(),
         kinds_left_out: 0,
@@ -69,7 +72,9 @@ fn barrier(number: u32) -> BarrierReport {
         is_phase: false,
         generation: 0,
         waiting: vec![WaitReport { name: "hip".to_owned(), waits_us: 1 }],
+        waiting_left_out: 0,
         missing: vec![missing],
+        missing_left_out: 0,
     }
 }
 
@@ -169,6 +174,11 @@ impl Bench {
     fn reply(&self) -> Message {
         self.replies.recv_timeout(DEADLINE).expect("a reply")
     }
+
+    fn node(&self) -> NodeReport {
+        assert_eq!(self.outcome(AskNode::KIND, Flags::ASK), Outcome::Delivered);
+        self.reply().decode().expect("a report")
+    }
 }
 
 #[test]
@@ -241,7 +251,7 @@ fn an_answer_is_no_longer_than_a_payload_may_be() {
     let mut config = NodeConfig::new("knee");
     config.payload_max = 64;
     let bench = Bench::new(config);
-    // Without a peer there is nothing to leave out of it.
+    // Without peers, losses and refusals there is nothing to leave out of it.
     assert_eq!(bench.outcome(AskNode::KIND, Flags::ASK), Outcome::Rejected(Rejection::TooLong));
     assert_eq!(bench.outcome(AskApps::KIND, Flags::ASK), Outcome::Delivered);
     assert!(bench.reply().payload.len() <= 64);
@@ -297,6 +307,31 @@ fn barriers_that_have_no_room_in_an_answer_are_counted() {
 
 // spec: INSPECT-3
 #[test]
+fn what_an_application_lacks_beyond_what_an_answer_names_is_counted() {
+    // Given: one that waits at two phases, each for 40 others
+    let bench = Bench::new(NodeConfig::new("knee"));
+    let name = "knee.drive".to_owned();
+    bench.waits((0, name.clone()), &[], &[]);
+    let app = AppAddress::fixed(0).expect("a low number");
+    for (correlation, barrier) in (1..).zip(["homed", "armed"]) {
+        let others = (0..40).map(|number| format!("drive.{number}"));
+        let asked = ArriveAtBarrier {
+            kind: BarrierKind::Phase,
+            barrier: barrier.to_owned(),
+            parties: std::iter::once(name.clone()).chain(others).collect(),
+            within_ms: 60_000,
+            on_loss: OnPartyLoss::Wait,
+        };
+        lock(&bench.stores.sync).handle(Time::now(), Input::Arrived { app, correlation, asked });
+    }
+    // When, then: who asks can read it
+    let said = bench.apps();
+    assert_eq!((said.apps[0].missing.len(), said.apps[0].missing_left_out), (64, 16));
+    assert!(said.barriers.iter().all(|phase| (phase.missing.len(), phase.missing_left_out) == (40, 0)));
+}
+
+// spec: INSPECT-3
+#[test]
 fn a_barrier_that_is_longer_than_a_payload_may_be_does_not_keep_the_applications_from_being_told() {
     // Given: a barrier of many long names, of which none is there
     let mut config = NodeConfig::new("knee");
@@ -309,6 +344,117 @@ fn a_barrier_that_is_longer_than_a_payload_may_be_does_not_keep_the_applications
     let said = bench.apps();
     assert_eq!((said.barriers.len(), said.barriers_left_out), (0, 1));
     assert_eq!((said.apps.len(), said.left_out), (1, 0));
+}
+
+#[test]
+fn a_node_says_what_of_its_own_does_not_get_on() {
+    // Given
+    let bench = Bench::new(NodeConfig::new("knee"));
+    let part = |app: u32| {
+        let (name, trouble) = (format!("drive.{app:x}"), Told(Trouble::Stalled));
+        Part { app: AppAddress::new(app), name, trouble, since_ms: 300 }
+    };
+    let progress = Progress::of((0x1000..0x1005).map(part).collect());
+    lock(&bench.stores.ndl).handle(Time::now(), ndl::Input::ProgressSeen(progress));
+    // When, then
+    let said = bench.node();
+    assert_eq!((said.troubled, said.troubles.len()), (5, 4));
+    let app = Tid::new(bench.stores.node, AppAddress::new(0x1000));
+    let (name, trouble) = ("drive.1000".to_owned(), "stalled".to_owned());
+    assert_eq!(said.troubles[0], TroubleReport { app, name, trouble, since_us: 300_000 });
+    // And: a version that does not say so has none, as far as it says
+    let mut bytes = encode(&said).to_vec();
+    for key in [&b"troubled"[..], b"troubles"] {
+        let at = bytes.windows(key.len()).position(|window| window == key).expect("a field of the map");
+        bytes[at] = b'x';
+    }
+    let older: NodeReport = decode(&bytes).expect("unknown fields are skipped");
+    assert_eq!((older.troubled, older.troubles), (0, Vec::new()));
+}
+
+/// The same of a node that knows four others, and has lost and refused so many that this takes most room.
+fn with_long_lists(said: NodeReport) -> NodeReport {
+    let (incarnation, udp) = (Incarnation(1), "10.0.0.7:6911".to_owned());
+    let lost = |number: u32| LostReport {
+        node: NodeAddress::new(number),
+        name: format!("knee.{number}"),
+        incarnation,
+        udp: udp.clone(),
+        lost_us: 1_000_000,
+        why: "link down".to_owned(),
+        silent_us: 1_500_000,
+        bound_us: Some(2_000_000),
+        found_by: vec!["multicast".to_owned()],
+    };
+    let foreign = |number: u32| ForeignReport {
+        node: NodeAddress::new(number),
+        name: "arm".to_owned(),
+        project: "arm".to_owned(),
+        udp: udp.clone(),
+        ago_us: 1,
+    };
+    let refusal = |number: u64| RefusalReport {
+        cause: format!("cause {number}"),
+        count: 1,
+        detail: "x".repeat(256),
+        ago_us: number,
+    };
+    let (app, name, since_us) = (Tid::NONE, "drive".to_owned(), 1);
+    let trouble = TroubleReport { app, name: name.clone(), trouble: "away".to_owned(), since_us };
+    NodeReport {
+        lost: (0..64).map(lost).collect(),
+        foreign: (0..16).map(foreign).collect(),
+        refusals: (0..64).map(refusal).collect(),
+        peers: (0..4).map(|number| PeerReport::lost(NodeAddress::new(number), incarnation)).collect(),
+        troubled: 7,
+        troubles: vec![trouble; 4],
+        idle_clients: 3,
+        idle: vec![IdleReport { app, name, since_us }; 2],
+        ..said
+    }
+}
+
+// spec: INSPECT-3
+#[test]
+fn of_what_a_node_says_the_longest_list_yields_first_and_what_has_no_room_is_counted() {
+    // Given
+    let mut said = with_long_lists(Bench::new(NodeConfig::new("knee")).node());
+    let payload_max = 8 * 1024;
+    assert!(encode(&said).len() > payload_max);
+    // When
+    while encode(&said).len() > payload_max {
+        assert!(said.halve(), "the rest has room");
+    }
+    // Then: the few nodes that it knows are all told, and of the others some
+    assert_eq!((said.peers.len(), said.left_out), (4, 0));
+    assert_eq!((said.troubles.len(), said.idle.len()), (4, 2));
+    assert!(!said.lost.is_empty() && !said.refusals.is_empty() && !said.foreign.is_empty());
+    assert!(said.lost_left_out > 0 && said.refusals_left_out > 0);
+    assert_eq!(said.lost.len() as u64 + said.lost_left_out, 64);
+    assert_eq!(said.refusals.len() as u64 + said.refusals_left_out, 64);
+    let left = said.refusals.iter().map(|refusal| refusal.ago_us);
+    assert!(left.eq(0..said.refusals.len() as u64), "the oldest ones go first");
+    // And: where there is room for nothing all of them go
+    while said.halve() {}
+    assert_eq!((said.left_out, said.lost_left_out), (4, 64));
+    assert_eq!((said.foreign_left_out, said.refusals_left_out), (16, 64));
+    assert_eq!((said.troubled, said.troubles.len(), said.idle_clients, said.idle.len()), (7, 0, 3, 0));
+}
+
+// spec: INSPECT-3
+#[test]
+fn a_node_that_has_refused_much_answers_though_little_has_room() {
+    // Given: more causes than an answer names, with details of which so many have no room
+    let mut config = NodeConfig::new("knee");
+    config.payload_max = 16 * 1024;
+    let bench = Bench::new(config);
+    for number in 0..70 {
+        let cause: &'static str = Box::leak(format!("cause {number}").into_boxed_str());
+        bench.stores.refusals.count(Time::now(), cause, &"x".repeat(300));
+    }
+    // When, then
+    let said = bench.node();
+    assert_eq!((said.refusals.len(), said.refusals_left_out), (32, 38));
 }
 
 #[test]

@@ -74,8 +74,8 @@ impl Rated {
                 "   --- {arrow} {name}: {:.1}/s, {:.0} B/s, age mean {} max {}{refused}\n",
                 kind.count as f64 / seconds,
                 kind.bytes as f64 / seconds,
-                time(kind.age_mean_ns() / 1_000),
-                time(kind.age_max_ns / 1_000),
+                age(kind.age_mean_ns()),
+                age(kind.age_max_ns()),
             )
         };
         let mut text: String = self.rates.kinds.iter().map(line).collect();
@@ -97,7 +97,7 @@ impl Rated {
             json!({
                 "kind": name, "sent": is_sent, "count": kind.count, "per_s": kind.count as f64 / seconds,
                 "bytes_per_s": kind.bytes as f64 / seconds, "age_mean_ns": kind.age_mean_ns(),
-                "age_max_ns": kind.age_max_ns, "refused": kind.refused,
+                "age_max_ns": kind.age_max_ns(), "refused": kind.refused,
             })
         });
         let kinds: Vec<_> = kinds.collect();
@@ -105,9 +105,21 @@ impl Rated {
     }
 }
 
+/// As of a single message: nothing is said of what came from nodes whose clocks nobody has measured.
+fn age(ns: Option<u64>) -> String {
+    ns.map_or_else(|| "?".to_owned(), |ns| time(ns / 1_000))
+}
+
 impl Kind {
-    fn age_mean_ns(&self) -> u64 {
-        u64::try_from(self.age_sum_ns / u128::from(self.aged.max(1))).unwrap_or(u64::MAX)
+    /// `None` where no age is known.
+    fn age_mean_ns(&self) -> Option<u64> {
+        let mean = self.age_sum_ns.checked_div(self.aged.into())?;
+        Some(u64::try_from(mean).unwrap_or(u64::MAX))
+    }
+
+    /// `None` where no age is known.
+    fn age_max_ns(&self) -> Option<u64> {
+        (self.aged > 0).then_some(self.age_max_ns)
     }
 }
 
@@ -155,5 +167,23 @@ mod tests {
         );
         assert!(said.text().contains("   --- 7 further ones"));
         assert_eq!(rates.end(Duration::from_secs(1)).text(), "   --- nothing in 1.0 s\n", "it begins anew");
+    }
+
+    #[test]
+    fn an_age_that_is_not_known_is_not_said_to_be_0() {
+        let mut rates = Rates::default();
+        rates.add(&message("a", u64::MAX, None));
+        rates.add(&message("b", 0, None));
+        let said = rates.end(Duration::from_secs(1));
+        assert_eq!(
+            said.text().lines().collect::<Vec<_>>(),
+            [
+                "   --- -> a: 1.0/s, 100 B/s, age mean ? max ?",
+                "   --- -> b: 1.0/s, 100 B/s, age mean 0 us max 0 us"
+            ]
+        );
+        let json = said.json();
+        let ages = ["age_mean_ns", "age_max_ns"].map(|age| [&json["kinds"][0][age], &json["kinds"][1][age]]);
+        assert_eq!(ages, [[&Value::Null, &json!(0)]; 2]);
     }
 }

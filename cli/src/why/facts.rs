@@ -22,6 +22,17 @@ pub(super) struct Facts {
     pub(super) shut: Vec<String>,
     /// Who waits at a start-up barrier, and for whom, on all nodes that were asked.
     pub(super) waits: BTreeMap<String, Vec<String>>,
+    /// The nodes that have not named all their applications: any of them may have one that nobody named.
+    pub(super) unsaid: Vec<(String, Unsaid)>,
+}
+
+/// Why a node has not named all its applications.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Unsaid {
+    /// It did not answer, for this reason.
+    Silent(String),
+    /// So many further ones had no room in its answer.
+    LeftOut(u64),
 }
 
 /// A node, or an application on one.
@@ -56,8 +67,10 @@ pub(super) struct Namesakes {
 /// An application.
 #[derive(Clone, Debug, Default)]
 pub(super) struct App {
-    /// What its node says of it; `None` if it has none such.
+    /// What its node says of it; `None` if it has not named it.
     pub(super) report: Option<AppReport>,
+    /// Why it may be there though its node has not named it.
+    pub(super) unsaid: Option<Unsaid>,
     /// Its line in the supervision tree, if it is supervised there.
     pub(super) line: Option<TreeLine>,
     /// Messages for it that were refused so far.

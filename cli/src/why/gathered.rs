@@ -14,7 +14,7 @@ use sinew::{
 
 use super::{
     called::{Called, by_whom_is_reached},
-    facts::{App, End, Facts, Namesakes},
+    facts::{App, End, Facts, Namesakes, Unsaid},
 };
 use crate::{
     ping,
@@ -33,7 +33,8 @@ struct Asked {
     node: NodeAddress,
     name: String,
     said: Result<NodeReport, String>,
-    apps: Vec<AppReport>,
+    /// Asked for where it has said who it is.
+    apps: Result<AppsReport, String>,
     /// Through which socket.
     through: usize,
     /// Whether that is its own.
@@ -43,11 +44,36 @@ struct Asked {
 impl Asked {
     fn new(through: usize, (node, name): (NodeAddress, String), said: Result<NodeReport, String>) -> Self {
         let name = said.as_ref().map_or(name, |said| said.name.clone());
-        Self { node, name, said, apps: Vec::new(), through, is_own_door: false }
+        let apps = Err("it was not asked".to_owned());
+        Self { node, name, said, apps, through, is_own_door: false }
     }
 
     fn at_its_door(self) -> Self {
         Self { is_own_door: true, ..self }
+    }
+
+    fn label(&self) -> String {
+        if self.name.is_empty() { self.node.to_string() } else { self.name.clone() }
+    }
+
+    /// The applications that it has named.
+    fn named_apps(&self) -> &[AppReport] {
+        self.apps.as_ref().map_or(&[][..], |said| said.apps.as_slice())
+    }
+
+    /// Why it may have others, too.
+    fn unsaid(&self) -> Option<Unsaid> {
+        match self.said.as_ref().and(self.apps.as_ref()) {
+            Ok(said) => (said.left_out > 0).then_some(Unsaid::LeftOut(said.left_out)),
+            Err(why) => Some(Unsaid::Silent(why.clone())),
+        }
+    }
+
+    /// What it says of an application that it is to have; if nothing, why that may be there all the same.
+    fn app(&self, tid: Tid) -> (Option<AppReport>, Option<Unsaid>) {
+        let report = self.named_apps().iter().find(|app| app.tid == tid).cloned();
+        let unsaid = if report.is_none() { self.unsaid() } else { None };
+        (report, unsaid)
     }
 }
 
@@ -83,7 +109,7 @@ impl<'a> Gathered<'a> {
             let (through, whom) = (asked.through, (asked.node, asked.name.clone()));
             let answer = gathered.system(through).ask_these::<AskApps, AppsReport>(vec![whom]).pop();
             gathered.nodes[at].apps =
-                answer.and_then(|answer| answer.said.ok()).map_or_else(Vec::new, |said| said.apps);
+                answer.map_or_else(|| Err("no answer".to_owned()), |answer| answer.said);
         }
         Ok(gathered)
     }
@@ -128,14 +154,15 @@ impl<'a> Gathered<'a> {
         let targets = [found[0].target(), found[1].target()];
         let pings = [self.ping(found[0].at, targets[1]), self.ping(found[1].at, targets[0])];
         let access = [self.access(&found[0], &found[1]), self.access(&found[1], &found[0])];
-        let waits = self.nodes.iter().flat_map(|asked| &asked.apps).filter(|app| !app.ready);
+        let waits = self.nodes.iter().flat_map(Asked::named_apps).filter(|app| !app.ready);
         let waits: BTreeMap<_, _> = waits
             .filter_map(|app| {
                 Some((app.name.clone()?, app.missing.iter().map(|missing| missing.name.clone()).collect()))
             })
             .collect();
+        let unsaid = self.nodes.iter().filter_map(|asked| Some((asked.label(), asked.unsaid()?))).collect();
         let streams = [self.stream(found[0].at, found[1].node), self.stream(found[1].at, found[0].node)];
-        Facts { ends, pings, streams, access, waits, shut: Vec::new() }
+        Facts { ends, pings, streams, access, waits, unsaid, shut: Vec::new() }
     }
 
     /// Whom two words mean. A name that several applications have stands for the one that the other end's messages reach; where that is open, too,
@@ -160,8 +187,11 @@ impl<'a> Gathered<'a> {
 
     /// The applications that have this name.
     fn called(&self, name: &str) -> Vec<Called> {
-        let all =
-            self.nodes.iter().enumerate().flat_map(|(at, asked)| asked.apps.iter().map(move |app| (at, app)));
+        let all = self
+            .nodes
+            .iter()
+            .enumerate()
+            .flat_map(|(at, asked)| asked.named_apps().iter().map(move |app| (at, app)));
         let named = all.filter(|(_, app)| app.name.as_deref() == Some(name));
         named.map(|(at, app)| Called { at, tid: app.tid, is_ready: app.ready }).collect()
     }
@@ -217,13 +247,18 @@ impl<'a> Gathered<'a> {
             .map(|other| format!("node {} (process {})", other.name, other.pid))
             .collect();
         if let Some(tid) = found.app {
-            let report = asked.apps.iter().find(|app| app.tid == tid).cloned();
-            end.app = Some(self.application(at, tid, report));
+            let said = asked.app(tid);
+            end.app = Some(self.application(at, tid, said));
         }
         end
     }
 
-    fn application(&mut self, at: usize, tid: Tid, report: Option<AppReport>) -> App {
+    fn application(
+        &mut self,
+        at: usize,
+        tid: Tid,
+        (report, unsaid): (Option<AppReport>, Option<Unsaid>),
+    ) -> App {
         let asked = &self.nodes[at];
         let (through, whom) = (asked.through, (asked.node, asked.name.clone()));
         let system = self.system(through);
@@ -243,7 +278,7 @@ impl<'a> Gathered<'a> {
         };
         let refused =
             entries.iter().filter(|entry| is_its(&entry.place)).map(|entry| entry.account.refused).sum();
-        App { report, line: lines.into_iter().find(|line| line.tid == Some(tid)), refused }
+        App { report, unsaid, line: lines.into_iter().find(|line| line.tid == Some(tid)), refused }
     }
 
     /// Whether the access list of the target's node lets the source send to it, where both are applications.
@@ -327,5 +362,32 @@ impl Found {
     /// Whom a message goes to that is for it.
     fn target(&self) -> Option<Tid> {
         Some(Tid::new(self.node?, self.app.map_or(AppAddress::INSPECT, |tid| tid.app)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::security;
+
+    #[test]
+    fn an_application_that_is_not_named_is_known_to_be_absent_only_where_its_node_has_named_all() {
+        let report = security::tests::said("knee", 2, None);
+        let whom = || (report.node, report.name.clone());
+        let tid = Tid::new(report.node, AppAddress::new(0x1001));
+        let apps = |left_out| AppsReport {
+            name: "knee".to_owned(),
+            apps: Vec::new(),
+            left_out,
+            barriers: Vec::new(),
+            barriers_left_out: 0,
+        };
+        let of = |apps| Asked { apps, ..Asked::new(0, whom(), Ok(report.clone())) }.app(tid);
+        assert_eq!(of(Ok(apps(0))), (None, None));
+        assert_eq!(of(Ok(apps(3))), (None, Some(Unsaid::LeftOut(3))));
+        let full = || "its queue is full".to_owned();
+        assert_eq!(of(Err(full())), (None, Some(Unsaid::Silent(full()))));
+        let silent = Asked::new(0, whom(), Err("no answer".to_owned()));
+        assert_eq!(silent.app(tid), (None, Some(Unsaid::Silent("no answer".to_owned()))));
     }
 }

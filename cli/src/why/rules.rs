@@ -4,6 +4,7 @@ mod access;
 mod groups;
 mod places;
 mod stream;
+mod unnamed;
 
 use std::collections::BTreeSet;
 
@@ -49,7 +50,7 @@ pub(super) fn judge(facts: &Facts) -> Vec<Step> {
     let mut steps = Steps(Vec::new());
     let [a, b] = &facts.ends;
     for end in [a, b] {
-        steps.there(end, &facts.shut);
+        steps.there(end, facts);
         steps.meant(end);
     }
     steps.address(a, b);
@@ -61,8 +62,9 @@ pub(super) fn judge(facts: &Facts) -> Vec<Step> {
             steps.streamed(from, to, value.as_ref());
         }
     }
-    for end in [a, b] {
-        steps.application(end, facts);
+    let [there, back] = facts.pings.each_ref().map(Option::as_ref);
+    for (end, ping) in [(a, back), (b, there)] {
+        steps.application(end, ping, facts);
     }
     steps.access(a, b, facts);
     for (ping, (from, to)) in facts.pings.iter().zip([(a, b), (b, a)]) {
@@ -89,10 +91,10 @@ impl Steps {
     }
 
     /// Whether its node runs and can be asked.
-    fn there(&mut self, end: &End, shut: &[String]) {
+    fn there(&mut self, end: &End, facts: &Facts) {
         let what = format!("{} is there", end.label());
         // Perhaps its own.
-        let shut: String = shut.iter().map(|door| format!("; {door}")).collect();
+        let shut: String = facts.shut.iter().map(|door| format!("; {door}")).collect();
         match (&end.report, end.node) {
             (Some(report), _) if report.stopping => self.blocked(
                 what,
@@ -109,12 +111,7 @@ impl Steps {
                 "is it running? Start it; if it runs on another host, run `sinew why` there, too; if its socket is elsewhere on this one: \
                  --other-socket PATH",
             ),
-            (None, None) => self.blocked(
-                what,
-                format!("no node and no application called '{}' is known to any node that was asked{shut}", end.wanted),
-                "is it spelled right (`sinew apps`, `sinew nodes`)? Is its node started? If its socket is elsewhere on this host: \
-                 --other-socket PATH",
-            ),
+            (None, None) => self.nowhere(what, &end.wanted, &facts.unsaid, &shut),
         }
     }
 
@@ -225,17 +222,13 @@ impl Steps {
         self.fine(what, seen);
     }
 
-    /// Whether the application that was asked for takes messages.
-    fn application(&mut self, end: &End, facts: &Facts) {
+    /// Whether the application that was asked for takes messages; `ping` is what came of one to it.
+    fn application(&mut self, end: &End, ping: Option<&Result<u64, String>>, facts: &Facts) {
         let Some(app) = &end.app else { return };
         let what = format!("{} takes messages", end.label());
         let Some(report) = &app.report else {
             if end.report.is_some() {
-                self.blocked(
-                    what,
-                    "its node has no such application now",
-                    "is it registered, and spelled right? `sinew apps` shows all that are there",
-                );
+                self.unnamed(what, app.unsaid.as_ref(), ping);
             }
             return;
         };

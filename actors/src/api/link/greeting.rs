@@ -64,7 +64,7 @@ impl Greeting {
         options: LinkOptions,
         deadline: Time,
     ) -> Result<Self, ApiError> {
-        let socket = Arc::new(connect(path, deadline)?);
+        let socket = Arc::new(connect(path, options.believed, deadline)?);
         let lncl = payload::lncl_of(NodeAddress::HERE);
         let asked = asked(register, options.transport);
         let frame = payload::frame(Kind::LNCL_REGISTER, Tid::NONE, lncl, &asked);
@@ -246,7 +246,7 @@ mod tests {
 
     use super::*;
     use crate::{
-        api::{NodeApi, Registration},
+        api::{NodeApi, Registration, link::Believed},
         lncl::testing::{TestDirectory, WATCHDOG},
     };
 
@@ -349,7 +349,8 @@ mod tests {
         listen(&door, 0).unwrap();
         let _waiting = UnixStream::connect(&path).unwrap();
         // When:
-        let registered = NodeApi { path }.register_transport_address(Registration::new().deadline(SHORT));
+        let api = NodeApi { path, believed: Believed::Anybody };
+        let registered = api.register_transport_address(Registration::new().deadline(SHORT));
         // Then:
         let error = registered.unwrap_err();
         assert!(matches!(error, ApiError::NoAnswer(within) if within <= SHORT), "{error}");

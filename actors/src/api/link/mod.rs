@@ -1,6 +1,7 @@
 //! The way to the node: whole frames out, bytes in, each with a bound on the wait. Two ways behind one: a plain socket, or
 //! a ring each way in shared memory with the socket beside it, which then tells the node's end.
 
+mod believed;
 mod greeting;
 pub(super) mod loan;
 pub(super) mod ring;
@@ -28,6 +29,7 @@ use super::{
 };
 use crate::lncl::payload::{Refusal, Register, Registered};
 
+pub(super) use believed::{Believed, NotBelieved};
 pub(super) use greeting::Greeting;
 use loan::InRing;
 use ring::{Begun, Rest};
@@ -58,6 +60,8 @@ pub(super) struct LinkOptions {
     pub(super) bell: Bell,
     /// Bytes of this side's ring of a direct link.
     pub(super) direct_ring_bytes: usize,
+    /// Whom each connection takes for the node.
+    pub(super) believed: Believed,
 }
 
 /// A registered link.
@@ -67,8 +71,8 @@ pub(super) struct Link {
     pub(super) reader: Reader,
 }
 
-/// Connects to the node that listens at `path`, until `deadline` at most.
-pub(super) fn connect(path: &Path, deadline: Time) -> Result<UnixStream, ApiError> {
+/// Connects to the node that listens at `path`, if it is one that is believed, until `deadline` at most.
+pub(super) fn connect(path: &Path, believed: Believed, deadline: Time) -> Result<UnixStream, ApiError> {
     // To the system no time at all is as long as it takes.
     let least = Duration::from_millis(1);
     let within = deadline.since(Time::now()).clamp(least, CONNECT);
@@ -82,7 +86,9 @@ pub(super) fn connect(path: &Path, deadline: Time) -> Result<UnixStream, ApiErro
             socket.connect(&address)
         })?;
         socket.set_nonblocking(true)?;
-        Ok(UnixStream::from(OwnedFd::from(socket)))
+        let stream = UnixStream::from(OwnedFd::from(socket));
+        believed.check(&stream)?;
+        Ok(stream)
     };
     try_to().map_err(|cause| {
         if matches!(cause.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) {

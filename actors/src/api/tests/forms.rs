@@ -21,6 +21,7 @@ use tokio::runtime::{Builder, Runtime};
 use crate::{
     api::{
         ApiError, AsyncEndpoint, Endpoint, LentMessage, NodeApi, Received, Registration, Transport, Untaken,
+        link::Believed,
     },
     lncl::testing::TestNode,
 };
@@ -57,7 +58,8 @@ impl Api {
 
     /// Not looked for: one that serves a single connection may listen there.
     pub(super) fn at(under: Under, path: &Path) -> Self {
-        Self { form: under.form, node: NodeApi { path: path.to_owned() } }
+        let node = NodeApi { path: path.to_owned(), believed: Believed::Anybody };
+        Self { form: under.form, node }
     }
 
     pub(super) fn register(&self, registration: Registration) -> Result<Client, ApiError> {

@@ -123,9 +123,9 @@ pub struct PeerReport {
     pub incarnation: Incarnation,
     /// Whether it answers; else it is lost, and there is still something for it or from it.
     pub is_there: bool,
-    /// Time since it was found.
+    /// Time since this life of it was found.
     pub found_us: Option<u64>,
-    /// How it was found: `seed`, `multicast`, `mdns`, `query`, `remembered`.
+    /// Who says that its addresses are to be asked: `seed`, `multicast`, `mdns`, `query`, `remembered`.
     #[serde(deserialize_with = "at_most::<_, _, LINKS_MAX>")]
     pub found_by: Vec<String>,
     /// Time since its last sign of life.

@@ -1,6 +1,7 @@
 //! A way that is free, and each thing that can stand in it.
 
 mod access;
+mod unnamed;
 
 use sinew::{
     AppAddress, Class, Incarnation, NodeAddress, Tid,
@@ -73,11 +74,16 @@ fn report(number: u8, name: &str, other: u8) -> NodeReport {
         seeds: Vec::new(),
         sources: Vec::new(),
         lost: Vec::new(),
+        lost_left_out: 0,
         own_stalls: None,
+        troubled: 0,
+        troubles: Vec::new(),
         idle_clients: 0,
         idle: Vec::new(),
         foreign: Vec::new(),
+        foreign_left_out: 0,
         refusals: Vec::new(),
+        refusals_left_out: 0,
         peers: vec![peer(other)],
         left_out: 0,
     }
@@ -91,6 +97,7 @@ fn app(name: &str) -> App {
         ready: true,
         waits_us: None,
         missing: Vec::new(),
+        missing_left_out: 0,
         ended: None,
         kinds: Vec::new(),
         kinds_left_out: 0,
@@ -109,7 +116,7 @@ fn app(name: &str) -> App {
         waiting_most: Some(3),
         strategy: None,
     };
-    App { report: Some(report), line: Some(line), refused: 0 }
+    App { report: Some(report), unsaid: None, line: Some(line), refused: 0 }
 }
 
 /// The hip at 10.0.0.1, and knee.drive on the knee at 10.0.0.2.
