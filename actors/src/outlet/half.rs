@@ -333,10 +333,10 @@ impl<S: Socket> Half<S> {
         Ok(())
     }
 
-    /// Urgent frames that the socket has not taken to their last byte.
+    /// Urgent frames that the socket has not taken to their last byte; what is gathered counts as one, as one may be in it.
     pub(super) fn urgent_left(&self) -> usize {
-        self.urgent.len()
-            + usize::from(self.partial.as_ref().is_some_and(|partial| partial.sort == Sort::Frill))
+        let is_frill = self.partial.as_ref().is_some_and(|partial| partial.sort == Sort::Frill);
+        self.urgent.len() + usize::from(is_frill) + usize::from(self.gathered() > 0)
     }
 
     pub(super) fn finish(&mut self, last: Message, after: &mut After) {

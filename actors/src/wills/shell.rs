@@ -113,7 +113,11 @@ fn is_linked(stores: &Stores, node: NodeAddress, life: Incarnation) -> bool {
         return proven == life;
     }
     let now = stores.gncl.peer(node).map(|peer| peer.incarnation);
-    now == Some(life) || lock(&stores.wills).linked(node) == Some(life)
+    match lock(&stores.wills).linked(node) {
+        Some(told) => life == told || now == Some(life),
+        // What came of a life before the present one was read before anybody was told of either; that is told now.
+        None => now.is_some_and(|now| life <= now),
+    }
 }
 
 /// The certificate with which this life of a node was linked is revoked. spec: WILL-5

@@ -19,7 +19,7 @@ use crate::stores::lock;
 /// than goes over its network in this time loses it.
 pub(crate) const LINGER: Duration = Duration::from_secs(3);
 /// Time that a peer that has said goodbye on a connection has to read what is written there, and behind it that all was taken.
-const LAST_WITHIN: Duration = Duration::from_secs(1);
+const LAST_WITHIN: Duration = Duration::from_secs(2);
 /// How often it is looked whether they have.
 const LINGER_LOOK: Duration = Duration::from_millis(1);
 
@@ -76,9 +76,13 @@ impl Gncl {
         }
     }
 
-    /// The peer has said all on a connection: it is left there when it has been sent what of that was taken, for which it has a second to
-    /// read. spec: GNCL-10
+    /// The peer has said all on a connection: it is left there when it has been sent what of that was taken, for which it has
+    /// [`LAST_WITHIN`] to read. spec: GNCL-10
     pub(super) fn goodbye_came(&mut self, connection: ConnectionId, ctx: &mut Context<Self>) {
+        if self.wires.get(&connection).is_some_and(|wire| wire.owes_the_last) {
+            // It says so again and again, and is waited for once.
+            return;
+        }
         self.acknowledge_the_last(connection);
         self.leave_when_said(connection, Time::now() + LAST_WITHIN, ctx);
     }

@@ -112,32 +112,35 @@ fn what_was_written_on_a_connection_that_breaks_behind_the_goodbye_goes_out_agai
 // spec: GNCL-10
 #[test]
 fn who_leaves_hears_that_its_last_message_was_taken_though_much_waits_for_it() {
-    run(async {
-        // Given: a peer that reads nothing until its socket is full
-        let mut node = Node::start_with(1, |config| config.gncl.queue_capacity = 64).await;
-        let mut inbox = node.app(1);
-        let _first = lane_by_hand(&node, Lane::Control, 1).await;
-        node.up().await;
-        let mut lane = bulk_by_hand(&node, 2).await;
-        let to = Tid::new(NINE, node.tid(1).app);
-        let long = vec![0; 256 << 10];
-        while node.stores.router.send(bulk(node.message(to, &long))).is_ok() {}
-        // When
-        let mut last = bulk(node.message(node.tid(1), b"the last word"));
-        last.header.source.node = NINE;
-        lane.say(&last).await;
-        lane.say(&frame(NINE, node.address(), Kind::GNCL_GOODBYE, bytes::Bytes::new())).await;
-        assert_eq!(next("the last word", &mut inbox).await.payload[..], *b"the last word");
-        // Then
-        let mut taken = 0;
-        while let Some(heard) = lane.try_hear_any().await {
-            if heard.header.kind == Kind::GNCL_ACK {
-                let Ack { next, .. } = read(&heard.payload).expect("an ACK has a payload");
-                taken = next;
+    // Those that are written one by one, and those of which many are written at once.
+    for (capacity, length) in [(64, 256 << 10), (8_192, 2 << 10)] {
+        run(async {
+            // Given: a peer that reads nothing until its socket is full
+            let mut node = Node::start_with(1, |config| config.gncl.queue_capacity = capacity).await;
+            let mut inbox = node.app(1);
+            let _first = lane_by_hand(&node, Lane::Control, 1).await;
+            node.up().await;
+            let mut lane = bulk_by_hand(&node, 2).await;
+            let to = Tid::new(NINE, node.tid(1).app);
+            let long = vec![0; length];
+            while node.stores.router.send(bulk(node.message(to, &long))).is_ok() {}
+            // When
+            let mut last = bulk(node.message(node.tid(1), b"the last word"));
+            last.header.source.node = NINE;
+            lane.say(&last).await;
+            lane.say(&frame(NINE, node.address(), Kind::GNCL_GOODBYE, bytes::Bytes::new())).await;
+            // Then
+            let mut taken = 0;
+            while let Some(heard) = lane.try_hear_any().await {
+                if heard.header.kind == Kind::GNCL_ACK {
+                    let Ack { next, .. } = read(&heard.payload).expect("an ACK has a payload");
+                    taken = next;
+                }
             }
-        }
-        assert_eq!(taken, 2, "what it takes next is behind the last word");
-    });
+            assert_eq!(taken, 2, "what it takes next is behind the last word: {length} bytes each");
+            assert_eq!(next("the last word", &mut inbox).await.payload[..], *b"the last word");
+        });
+    }
 }
 
 #[test]

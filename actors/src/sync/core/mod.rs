@@ -229,7 +229,7 @@ impl Core {
                 return self.answer_not_taken(now, app, correlation, answer);
             }
             Input::ArrivalsReceived { from, payload } => self.arrivals_received(now, from, &payload),
-            Input::ListNotTaken { to } => self.peers.not_taken(now, to),
+            Input::ListNotTaken { to } => return self.peers.not_taken(now, to),
             Input::ArrivalsNotTaken { to } => self.rendezvous.not_taken(now, to),
             Input::LinkChanged(fact) => self.link_changed(now, fact),
             Input::ListReceived { from, payload } => self.list_received(from, &payload),

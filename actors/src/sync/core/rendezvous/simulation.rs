@@ -22,7 +22,10 @@ mod links;
 mod told;
 mod waits;
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::{
+    collections::{BTreeMap, BTreeSet, VecDeque},
+    sync::LazyLock,
+};
 
 use super::{super::*, Key, Known};
 use crate::{
@@ -39,7 +42,7 @@ use faults::Fault;
 use judge::Judge;
 
 /// Seeds in an ordinary run.
-const SEEDS: u64 = 250;
+const SEEDS: u64 = if cfg!(debug_assertions) { 120 } else { 250 };
 /// How many instead; `docs/TESTING.md` has the command.
 const SEEDS_VARIABLE: &str = "SINEW_SYNC_SEEDS";
 /// So many nodes, 3 and more, whatever the seed says.
@@ -140,11 +143,15 @@ fn other(number: usize) -> String {
     format!("other {number}")
 }
 
-fn key(barrier: usize) -> Key {
-    let (name, parties) = BARRIERS[barrier];
-    let mut parties: Vec<String> = parties.iter().map(|party| (*party).to_owned()).collect();
-    parties.sort();
-    Key { name: Name::try_from(name.to_owned()).unwrap(), parties }
+fn key(barrier: usize) -> &'static Key {
+    static KEYS: LazyLock<[Key; BARRIERS.len()]> = LazyLock::new(|| {
+        BARRIERS.map(|(name, parties)| {
+            let mut parties: Vec<String> = parties.iter().map(|party| (*party).to_owned()).collect();
+            parties.sort();
+            Key { name: Name::try_from(name.to_owned()).unwrap(), parties }
+        })
+    });
+    &KEYS[barrier]
 }
 
 /// The generation of each barrier that a node is told of.
@@ -223,7 +230,7 @@ impl World {
         self.judge.waits.is_told(node, self.now, &input);
         self.handle(node, input);
         for (barrier, heard) in heard.into_iter().enumerate() {
-            if let Some(known) = self.cores[node].rendezvous.known.get(&key(barrier)) {
+            if let Some(known) = self.cores[node].rendezvous.known.get(key(barrier)) {
                 let (generation, members) = (known.generation, known.members_of_last().collect());
                 self.judge.opened(barrier, generation, &members);
                 if generation > before[barrier].max(heard) {
@@ -294,7 +301,7 @@ impl World {
     }
 
     fn generation(&self, node: usize, barrier: usize) -> u64 {
-        self.cores[node].rendezvous.known.get(&key(barrier)).map_or(0, |known| known.generation)
+        self.cores[node].rendezvous.known.get(key(barrier)).map_or(0, |known| known.generation)
     }
 
     fn step(&mut self) {
@@ -408,7 +415,7 @@ impl World {
         }
         // A node that knows few barriers may have no room for one that only others speak of.
         let knows = |node: &usize, barrier| {
-            !self.is_crowded || self.cores[*node].rendezvous.known.contains_key(&key(barrier))
+            !self.is_crowded || self.cores[*node].rendezvous.known.contains_key(key(barrier))
         };
         let of_barrier = |barrier| (0..self.nodes()).filter(move |node| knows(node, barrier));
         let generations: Vec<Vec<u64>> = (0..BARRIERS.len())

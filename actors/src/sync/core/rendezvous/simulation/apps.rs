@@ -135,7 +135,7 @@ impl World {
         if self.fault == Some(Fault::VisitsForgotten) {
             self.cores[node].rendezvous.known.values_mut().for_each(|known| known.visitors.clear());
         }
-        let correlation = if self.is_full(node, &key(barrier)) {
+        let correlation = if self.is_full(node, key(barrier)) {
             UNJUDGED
         } else {
             let within = Duration::from_millis(within_ms.into());
