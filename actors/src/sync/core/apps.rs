@@ -51,8 +51,8 @@ pub(super) struct App {
 pub(super) enum State {
     /// It waits at the barrier.
     Waiting(Wait),
-    /// It may start.
-    Released,
+    /// It may start: this wait is over.
+    Released(Wait),
     /// It has started and takes messages.
     Ready,
 }
@@ -76,7 +76,7 @@ impl App {
     pub(super) const fn wait(&self) -> Option<&Wait> {
         match &self.state {
             State::Waiting(wait) => Some(wait),
-            State::Released | State::Ready => None,
+            State::Released(_) | State::Ready => None,
         }
     }
 
@@ -87,7 +87,7 @@ impl App {
             return (!has_reached).then(|| self.ended.map_or(Reason::NotReached, Reason::from));
         }
         match self.state {
-            State::Waiting(_) | State::Released => Some(self.ended.map_or(Reason::NotReady, Reason::from)),
+            State::Waiting(_) | State::Released(_) => Some(self.ended.map_or(Reason::NotReady, Reason::from)),
             State::Ready => None,
         }
     }
@@ -101,6 +101,14 @@ impl App {
         // It may be met before it is told: then the life has to hear that all the same.
         self.owed = unmet;
         met.into_iter().collect()
+    }
+
+    /// The root was not told that it may start, and meanwhile it may not: it waits on, and its next release begins its life.
+    pub(super) fn put_back(&mut self) {
+        if let State::Released(wait) = self.state {
+            self.state = State::Waiting(wait);
+            self.lost.append(&mut self.owed);
+        }
     }
 
     /// Keeps since when each requirement is not met.

@@ -43,11 +43,12 @@ impl Core {
                     self.not_taken.remove(&(address, Some(event.name().to_owned())));
                     self.outputs.push_back(Output::Tell { app: address, event, why });
                 }
-            } else if is_free(moment.judged, app, &unready)
+            } else if let Some(wait) = app.wait().copied()
+                && is_free(moment.judged, app, &unready)
                 && !app.name.as_deref().is_some_and(|name| in_cycle.contains(name))
             {
                 // spec: SYNC-5
-                app.state = State::Released;
+                app.state = State::Released(wait);
                 released.push(Output::Release { app: address });
                 let met = app.begin_life(&unready).into_iter().map(|name| RequirementEvent::Met { name });
                 released.extend(met.map(|event| Output::Tell { app: address, event, why: None }));
@@ -158,11 +159,21 @@ impl Core {
         }
         self.retry = None;
         for (address, name) in std::mem::take(&mut self.not_taken) {
-            let Some(app) = self.apps.get(address) else { continue };
+            let may_start = name.is_none() && self.may_start(now, address);
             let output = match name {
-                None if app.state == State::Released => Output::Release { app: address },
-                None => continue,
+                None if may_start => Output::Release { app: address },
+                None => {
+                    self.apps.get_mut(address).into_iter().for_each(App::put_back);
+                    continue;
+                }
                 Some(name) => {
+                    // One that waits again hears the end of it in the life that its next release begins.
+                    let waiting = self.apps.get_mut(address).filter(|app| app.wait().is_some());
+                    if let Some(app) = waiting {
+                        app.lost.insert(name);
+                        continue;
+                    }
+                    let Some(app) = self.apps.get(address) else { continue };
                     let requirement = app.requires.iter().find(|requirement| requirement.as_str() == name);
                     match requirement.filter(|_| app.lost.contains(&name)) {
                         Some(requirement) => {
@@ -178,6 +189,16 @@ impl Core {
             };
             self.outputs.push_back(output);
         }
+    }
+
+    /// Whether a released application lacks nothing, but for what it can do without and has waited for. // spec: SYNC-5
+    fn may_start(&self, now: Time, address: AppAddress) -> bool {
+        let Some(app) = self.apps.get(address) else { return false };
+        let State::Released(wait) = app.state else { return false };
+        app.requires.iter().all(|requirement| {
+            let is_awaited = requirement.wait_max().is_none_or(|most| now < wait.since + most);
+            !is_awaited || self.standing(address, requirement).why_not(requirement).is_none()
+        })
     }
 
     /// The release of an application was not taken: what it would have been told behind it waits, too.

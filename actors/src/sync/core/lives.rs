@@ -72,6 +72,10 @@ impl Core {
         if let Some(app) = self.apps.get_mut(address)
             && app.state != State::Ready
         {
+            if app.wait().is_some() {
+                // The root had been told all the same that it may start. It has been told nothing else.
+                app.owed.append(&mut app.lost);
+            }
             (app.state, app.ended) = (State::Ready, None);
             self.own_list_changed(now);
         }

@@ -290,6 +290,29 @@ fn what_a_full_mailbox_did_not_take_is_offered_again_in_its_last_form() {
 }
 
 // spec: SYNC-9
+// spec: SYNC-5
+#[test]
+fn a_release_that_was_not_taken_is_given_again_only_where_all_is_still_there() {
+    let given = || {
+        let mut bench = Bench::new();
+        bench.registers(0, "sensor", &[]);
+        bench.registers(1, "gait", &["sensor"]);
+        assert!(bench.ready(0).contains(&release(1)));
+        bench.hears(Input::ReleaseNotTaken { app: app(1) });
+        bench.down(0);
+        let again = bench.passes(RETRY);
+        assert!(!again.contains(&release(1)), "{again:?}");
+        bench
+    };
+    let mut bench = given();
+    assert!(bench.ready(0).contains(&release(1)));
+    assert_eq!(bench.ready(1), [], "nothing has changed for it");
+    // It may have been taken all the same, and the application have started: then it hears of the loss.
+    let mut bench = given();
+    assert_eq!(bench.ready(1), [lost(1, "sensor", Reason::Failed)]);
+    assert!(bench.ready(0).contains(&met(1, "sensor")));
+}
+
 #[test]
 fn every_deadline_that_passes_reports_what_is_missing_since_when_and_why() {
     let mut bench = Bench::new();
