@@ -42,7 +42,7 @@ use faults::Fault;
 use judge::Judge;
 
 /// Seeds in an ordinary run.
-const SEEDS: u64 = if cfg!(debug_assertions) { 120 } else { 250 };
+const SEEDS: u64 = if cfg!(debug_assertions) { 160 } else { 250 };
 /// How many instead; `docs/TESTING.md` has the command.
 const SEEDS_VARIABLE: &str = "SINEW_SYNC_SEEDS";
 /// So many nodes, 3 and more, whatever the seed says.

@@ -98,7 +98,7 @@ impl Seen {
     pub(super) fn must_cover_everything(&self) {
         let is_tried = |reason: &&str| self.reasons.get(reason).is_some_and(|times| *times > 10);
         assert!(REASONS.iter().all(is_tried), "hardly anything is told: {self:?}");
-        assert!(self.put_off > 3, "hardly anybody stood still when something was due: {self:?}");
+        assert!(self.put_off > 10, "hardly anybody stood still when something was due: {self:?}");
     }
 }
 
