@@ -137,7 +137,7 @@ mod tests {
 
         #[test]
         fn what_is_written_is_read(
-            all in proptest::collection::vec((any::<u32>(), any::<u32>(), any::<u64>(), 0..=26_u8), 1..OUTCOMES_MAX)
+            all in proptest::collection::vec((any::<u32>(), any::<u32>(), any::<u64>(), 0..=27_u8), 1..OUTCOMES_MAX)
         ) {
             let said = all.into_iter().filter_map(|(destination, source, correlation, code)| {
                 let outcome = Some(Outcome::from_code(code)?);

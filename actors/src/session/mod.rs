@@ -19,7 +19,7 @@
 //! | SESSION-5 | An epoch is one counting. An Ack of a peer that has forgotten what it took ends the epoch: what is kept is reported, not sent again, and nothing of the next one goes out before the Ack that names it. |
 //! | SESSION-6 | What has lost its use while it was kept (expired, superseded) is sent as a void of the same number. |
 //!
-//! Who cannot be sent to at present is in `shelf.rs`, with its rules (CREDIT-1 to CREDIT-4).
+//! Who cannot be sent to at present is in `shelf.rs`, with its rules (CREDIT-1 to CREDIT-5).
 //!
 //! No socket, no clock: the same calls give the same answers. `docs/protocol/gncl.md` has the bytes.
 

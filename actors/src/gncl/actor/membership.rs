@@ -37,7 +37,16 @@ impl Gncl {
         }
         self.disprove_the_denied(ctx);
         for KnownNode { node, incarnation, gncl: addresses, .. } in members {
+            self.takes_back(node, incarnation, ctx);
             self.input(Input::NodeFound { node, incarnation, addresses }, ctx);
+        }
+    }
+
+    /// A life that NDL has found has not left. Was it given up for that, what there is with it ends first: nothing passes there any more.
+    /// spec: GNCL-10
+    fn takes_back(&mut self, node: NodeAddress, incarnation: Incarnation, ctx: &mut Context<Self>) {
+        if self.stores.gncl.stays(node, incarnation) {
+            self.input(Input::NodeDisowned { node, incarnation }, ctx);
         }
     }
 }
@@ -55,10 +64,17 @@ const fn lost_as(why: LossReason, node: NodeAddress, incarnation: Incarnation) -
 impl StreamHandler<Event> for Gncl {
     fn handle(&mut self, event: Event, ctx: &mut Context<Self>) {
         let input = match event {
-            Event::Membership(MembershipFact::NodeFound { node, incarnation, gncl })
+            Event::Membership(MembershipFact::NodeFound { node, incarnation, gncl }) => {
+                self.takes_back(node, incarnation, ctx);
+                Input::NodeFound { node, incarnation, addresses: gncl }
+            }
             // It is dialled there from the next time on; a link that stands is left alone.
-            | Event::Moved { node, incarnation, gncl } => Input::NodeFound { node, incarnation, addresses: gncl },
-            Event::Membership(MembershipFact::NodeLost { node, incarnation, why }) => lost_as(why, node, incarnation),
+            Event::Moved { node, incarnation, gncl } => {
+                Input::NodeFound { node, incarnation, addresses: gncl }
+            }
+            Event::Membership(MembershipFact::NodeLost { node, incarnation, why }) => {
+                lost_as(why, node, incarnation)
+            }
             Event::Forgotten { node, incarnation } => Input::NodeDisowned { node, incarnation },
             Event::DenyListChanged => return self.end_the_denied(ctx),
         };

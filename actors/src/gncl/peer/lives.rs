@@ -24,6 +24,8 @@ const GONE_MAX: usize = 16;
 /// Forgotten lives of peers of which it is known what came by datagram: in an error of NDL they come back, and send again what was not
 /// acknowledged. The one that was forgotten first makes room.
 const HANDED_ON_MAX: usize = 16;
+/// In place of the time at which it left: the life was given up for it.
+const GIVEN_UP: u64 = u64::MAX;
 
 impl Store {
     /// Every life of a peer that is known, or that messages still wait of.
@@ -47,11 +49,16 @@ impl Store {
 
     /// Who left so long ago, and still sends, is over. A later life of the node that leaves just now is not.
     pub(crate) fn fence_who_left(&self, node: NodeAddress, now: Time, ago: Duration) {
-        let has_left = |peer: &&Arc<Peer>| {
-            let left = Some(peer.has_left.load(Ordering::Relaxed)).filter(|left| *left != 0);
-            peer.node == node && left.is_some_and(|left| now.since(Time::from_nanos(left)) >= ago)
-        };
-        self.met().iter().filter(has_left).for_each(|peer| peer.fence());
+        self.met()
+            .iter()
+            .filter(|peer| peer.node == node)
+            .for_each(|peer| peer.is_given_up_if_it_left(now, ago));
+    }
+
+    /// NDL has found this life of `node`, whatever it had said: that it leaves was not its own word. Returns whether nothing is taken of it any more
+    /// all the same, as its time was over.
+    pub(in crate::gncl) fn stays(&self, node: NodeAddress, incarnation: Incarnation) -> bool {
+        self.peer(node).is_some_and(|peer| peer.incarnation == incarnation && peer.stays())
     }
 
     /// To whom a message of a life of `node` that has left or is over may still come.
@@ -167,6 +174,29 @@ impl Store {
 }
 
 impl Peer {
+    fn is_given_up_if_it_left(&self, now: Time, ago: Duration) {
+        // SYNC: Relaxed; a word by itself, which one thread alone takes out: who finds that it stays sees that it is given up, or it is not.
+        let given_up = self.has_left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| {
+            let is_long_gone = left != 0 && left != GIVEN_UP && now.since(Time::from_nanos(left)) >= ago;
+            is_long_gone.then_some(GIVEN_UP)
+        });
+        if given_up.is_ok() {
+            self.fence();
+        }
+    }
+
+    fn stays(&self) -> bool {
+        // SYNC: see above.
+        let stays = self.has_left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| {
+            (left != 0 && left != GIVEN_UP).then_some(0)
+        });
+        if stays.is_ok() {
+            // Who waited for its last message to hear that it is gone waits no longer.
+            self.fewer_owed.notify_one();
+        }
+        self.is_over.load(Ordering::Acquire) || stays == Err(GIVEN_UP)
+    }
+
     /// Whether a message of it that was taken may still come to an application here.
     fn owes(&self) -> bool {
         self.ways.iter().any(Way::owes)

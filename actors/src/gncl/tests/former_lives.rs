@@ -1,6 +1,10 @@
 //! A life of a peer that said goodbye and sends on: how long it is heard, and that no other life pays for it.
 
-use std::time::Duration;
+use std::{
+    net::{IpAddr, Ipv4Addr, SocketAddr},
+    sync::Arc,
+    time::Duration,
+};
 
 use bytes::Bytes;
 use futures_util::{FutureExt as _, Stream, StreamExt as _};
@@ -10,9 +14,12 @@ use sinew_runtime::{
     wire::{Header, Kind, Message},
 };
 
-use super::bench::{ByHand, NINE, Node, run};
+use super::bench::{ByHand, NINE, Node, introduction, run, within};
+use crate::gncl::{core::Introduction, owed::Owed};
 
 const AGO: Duration = Duration::from_secs(5);
+/// An address at which nobody listens.
+const NOWHERE: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 1);
 
 /// Whether the node still takes what the peer says.
 async fn is_heard(peer: &mut ByHand, node: &Node, inbox: &mut (impl Stream<Item = Message> + Unpin)) -> bool {
@@ -65,5 +72,55 @@ fn a_later_life_is_not_cut_for_what_its_former_one_left() {
 
         // Then:
         assert!(is_heard(&mut peer, &node, &mut inbox).await, "it has left just now");
+    });
+}
+
+#[test]
+fn who_is_found_again_has_not_left() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut inbox = node.app(1);
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let (stores, left) = (node.stores.clone(), Time::now());
+        let store = &stores.gncl;
+        let life = store.peer(NINE).expect("it is linked").incarnation;
+        // Given: a word in its name that it leaves, which was not its own.
+        store.leaves(left, NINE, life);
+        assert_eq!(store.owed(NINE), Owed::Anyone);
+        // When: it is found before its time is over.
+        node.find(NINE, NOWHERE);
+        within("the layer to hear of it", async {
+            while store.owed(NINE) != Owed::NOBODY {
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        // Then: that time takes nothing.
+        store.fence_who_left(NINE, left + AGO, AGO);
+        assert!(is_heard(&mut peer, &node, &mut inbox).await);
+    });
+}
+
+#[test]
+fn who_is_found_when_it_was_given_up_has_another_link() {
+    run(async {
+        let mut node = Node::start(1).await;
+        let mut inbox = node.app(1);
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let (stores, left) = (node.stores.clone(), Time::now());
+        let store = &stores.gncl;
+        let given_up = store.peer(NINE).expect("it is linked");
+        store.leaves(left, NINE, given_up.incarnation);
+        store.fence_who_left(NINE, left + AGO, AGO);
+        assert!(!is_heard(&mut peer, &node, &mut inbox).await);
+        // When
+        node.find(NINE, NOWHERE);
+        // Then: a peer that can be heard takes its place.
+        node.broken().await;
+        drop(peer);
+        let again = Introduction { dial: 2, ..introduction(node.address()) };
+        let mut peer = ByHand::greeting(&node, &again).await;
+        assert!(is_heard(&mut peer, &node, &mut inbox).await);
+        assert!(!Arc::ptr_eq(&given_up, &store.peer(NINE).expect("it is linked")));
     });
 }
