@@ -4,18 +4,21 @@
 //! what it is told and says: a barrier never opens early, nobody waits where all are there, whoever counted passes, all nodes say the same after
 //! quiet. No wait outlasts its deadline, who wants to be told of a loss is told in time, and nobody else, and whoever waits is always told for whom, and
 //! the last that its node was told of each. In some seeds a node knows few barriers only, in most a second process comes up with a node's address.
+//! In a third of the seeds applications come up in phases, too. Each life of a process has a clock of its own, which agrees with no other one.
 //! Faults that are planted into what nodes say, remember and are asked must be found.
 //!
 //! | file | what is in it |
 //! | --- | --- |
 //! | `apps` | what applications do |
+//! | `clocks` | what the clock of each process says |
 //! | `links` | links that break and heal, what is on its way over them, processes that come and go |
 //! | `faults` | what is planted |
 //! | `judge` | who may pass and who has to |
-//! | `waits` | when a wait is over, and what is said of it meanwhile |
+//! | `waits` | when a wait is over, and what is said of it meanwhile; `waits::phases` at phases |
 //! | `told` | what each process has been told |
 
 mod apps;
+mod clocks;
 mod faults;
 mod judge;
 mod links;
@@ -38,6 +41,7 @@ use crate::{
     },
 };
 use apps::Stage;
+use clocks::Clocks;
 use faults::Fault;
 use judge::Judge;
 
@@ -69,6 +73,9 @@ const FOR_EVER_MS: u32 = 1_000_000_000;
 const BARRIERS: [(&str, &[&str]); 3] =
     [("named", &["0.0", "1.0", "2.0"]), ("counted", &["3 of *"]), ("chosen", &["2 of *.1", "0.0 | 1.0"])];
 
+/// The phases: by names, and by a count. Each in the order of their texts.
+const PHASES: [(&str, &[&str]); 2] = [("homed", &["0.0", "1.0", "2.0"]), ("armed", &["2 of *.1"])];
+
 /// Chance from a seed.
 struct Chance(fastrand::Rng);
 
@@ -89,7 +96,9 @@ impl Chance {
 /// Nodes are the first processes; a double of one is a process behind them.
 struct World {
     chance: Chance,
+    /// Of the simulation: no process knows it.
     now: Time,
+    clocks: Clocks,
     /// Since when all have had time to read after they stood still.
     rested: Time,
     cores: Vec<Core>,
@@ -124,6 +133,8 @@ struct World {
     is_calm: bool,
     /// In this seed a node knows few barriers.
     is_crowded: bool,
+    /// In this seed applications reach phases.
+    has_phases: bool,
 }
 
 fn address(node: usize) -> NodeAddress {
@@ -173,6 +184,7 @@ impl World {
         let mut world = Self {
             chance,
             now: Time::from_nanos(1),
+            clocks: Clocks::new(seed),
             rested: Time::ZERO,
             cores: Vec::new(),
             incarnations: vec![1; nodes],
@@ -193,6 +205,7 @@ impl World {
             trace,
             is_calm: seed.is_multiple_of(4),
             is_crowded: seed % 4 == 1,
+            has_phases: seed.is_multiple_of(3),
         };
         for node in 0..nodes {
             let core = world.new_core(node);
@@ -209,7 +222,8 @@ impl World {
         self.lives.len()
     }
 
-    fn new_core(&self, process: usize) -> Core {
+    fn new_core(&mut self, process: usize) -> Core {
+        self.clocks.begin(process, self.now);
         let incarnation = Incarnation(self.incarnations[process]);
         let mut core = Core::new(&NodeConfig::new("n"), address(self.homes[process]), incarnation);
         if self.is_crowded {
@@ -250,7 +264,7 @@ impl World {
         self.events += 1;
         let place = (self.events, 1);
         let again = self.chance.once_in(8).then(|| input.clone());
-        let now = self.time_of(&input);
+        let now = self.time_of(node, &input);
         self.cores[node].woken(now, 0);
         self.cores[node].handle_once(now, place, input);
         let Some(again) = again else { return };
@@ -259,11 +273,12 @@ impl World {
         if let Some(output) = self.cores[node].poll().filter(|output| !output.is_said_once()) {
             self.carry_out(node, output);
         }
-        self.cores[node].replaced(self.now);
+        let now = self.clock(node);
+        self.cores[node].replaced(now);
         if self.fault == Some(Fault::HandledAgain) {
-            self.cores[node].handle(self.now, again);
+            self.cores[node].handle(now, again);
         } else {
-            self.cores[node].handle_once(self.now, place, again);
+            self.cores[node].handle_once(now, place, again);
         }
     }
 
@@ -308,6 +323,9 @@ impl World {
         let (node, other) = (self.any_process(None), self.chance.below(APPS));
         let (app, other) = (other, self.any_process(Some(node)));
         let more = if self.nodes() > FEW_NODES { 8 } else { 0 };
+        if self.has_phases && self.chance.once_in(3) {
+            self.come_up();
+        }
         match self.chance.below(48 + more) {
             0..=13 => self.arrive(node, app),
             14 if !self.is_calm => self.leave(node, app),
@@ -345,14 +363,13 @@ impl World {
     fn pass(&mut self, time: Duration) {
         let end = self.now + time;
         let next = |world: &Self| {
-            let wakes =
-                world.living().filter_map(|process| Some((world.cores[process].next_wake()?, process)));
+            let wakes = world.living().filter_map(|process| Some((world.next_wake(process)?, process)));
             wakes.min().filter(|(wake, _)| *wake <= end)
         };
         while let Some((wake, process)) = next(self) {
             self.now = wake.max(self.now);
             self.tell(process, Input::TimePassed);
-            let next = self.cores[process].next_wake();
+            let next = self.next_wake(process);
             assert!(next.is_none_or(|next| next > self.now), "process {process} runs again and again");
         }
         self.now = end;

@@ -156,6 +156,43 @@ impl World {
         self.tell(node, Input::Arrived { app: app_address(app), correlation, asked });
     }
 
+    /// An application reaches a phase, or waits at it no more.
+    pub(super) fn come_up(&mut self) {
+        let (node, app, phase) =
+            (self.any_process(None), self.chance.below(APPS), self.chance.below(PHASES.len()));
+        let home = self.homes[node];
+        let is_party = if phase == 0 { home < 3 && app == 0 } else { app == 1 };
+        if self.judge.waits.is_at_phase((node, phase, app)) {
+            if self.chance.once_in(4) {
+                self.leave_phase(node, app, phase);
+            }
+        } else if is_party && self.can_arrive(node, app) {
+            self.reach(node, app, phase);
+        }
+    }
+
+    fn reach(&mut self, node: usize, app: usize, phase: usize) {
+        let (text, parties) = PHASES[phase];
+        let within_ms = [5, 80, 400, FOR_EVER_MS, FOR_EVER_MS][self.chance.below(5)];
+        let on_loss = if self.chance.once_in(2) { OnPartyLoss::Fail } else { OnPartyLoss::Wait };
+        let (name, within) = (name(self.homes[node], app), Duration::from_millis(within_ms.into()));
+        self.say(|| format!("{name} of process {node} reaches {text}, {within_ms} ms, {on_loss:?}"));
+        let asked = Asked { since: self.now, within, on_loss };
+        let correlation = self.judge.reaches((node, phase, app), name, asked);
+        let (within_ms, on_loss) = self.misheard(within_ms, on_loss);
+        let parties = parties.iter().map(|party| (*party).to_owned()).collect();
+        let kind = BarrierKind::Phase;
+        let asked = ArriveAtBarrier { barrier: text.to_owned(), parties, within_ms, on_loss, kind };
+        self.tell(node, Input::Arrived { app: app_address(app), correlation, asked });
+    }
+
+    fn leave_phase(&mut self, node: usize, app: usize, phase: usize) {
+        let barrier = PHASES[phase].0.to_owned();
+        self.say(|| format!("{} of process {node} waits at {barrier} no more", name(self.homes[node], app)));
+        self.judge.waits.leaves_phase((node, phase, app));
+        self.tell(node, Input::Left { app: app_address(app), barrier, correlation: None });
+    }
+
     pub(super) fn leave(&mut self, node: usize, app: usize) {
         let barrier = self.chance.below(BARRIERS.len());
         if !self.judge.is_waiting((node, app), barrier) {

@@ -1,7 +1,7 @@
 //! Faults that are planted into what nodes say, remember and are asked: each must be found.
 
 use super::*;
-use crate::sync::words::BarrierStatus;
+use crate::sync::{list::List, words::BarrierStatus};
 
 /// A loss is told so much too early: no more than what is nothing to a timer.
 const TOO_EARLY: Duration = Duration::from_millis(10);
@@ -41,10 +41,16 @@ pub(super) enum Fault {
     ArrivedNamed,
     /// Who is missing is said to have been for as long as somebody has waited.
     AbsenceOverstated,
+    /// What another node says is taken to be said when that one's clock says so.
+    ClocksConfused,
+    /// Who has reached a phase is not said.
+    PhasesLeftOut,
+    /// All are said to have reached each phase.
+    PhasesMadeUp,
 }
 
 impl Fault {
-    pub(super) const ALL: [Self; 16] = [
+    pub(super) const ALL: [Self; 19] = [
         Self::GenerationsConfused,
         Self::MembersLeftOut,
         Self::EarlierLeftOut,
@@ -61,6 +67,9 @@ impl Fault {
         Self::ReasonKept,
         Self::ArrivedNamed,
         Self::AbsenceOverstated,
+        Self::ClocksConfused,
+        Self::PhasesLeftOut,
+        Self::PhasesMadeUp,
     ];
 }
 
@@ -76,15 +85,37 @@ impl World {
         }
     }
 
-    /// When a node takes something to be told.
-    pub(super) fn time_of(&self, input: &Input) -> Time {
+    /// When a process takes something to be told.
+    pub(super) fn time_of(&self, process: usize, input: &Input) -> Time {
         let is_loss = matches!(input, Input::MembershipChanged(MembershipFact::NodeLost { .. }));
-        if is_loss && self.fault == Some(Fault::LossToldEarly) { self.now - TOO_EARLY } else { self.now }
+        let is_early = is_loss && self.fault == Some(Fault::LossToldEarly);
+        let at = if is_early { self.now - TOO_EARLY } else { self.now };
+        if self.fault == Some(Fault::ClocksConfused)
+            && let Input::ArrivalsReceived { from, .. } | Input::ListReceived { from, .. } = input
+        {
+            let from = (from.bits() - address(0).bits()) as usize;
+            return self.clocks.read(from, at);
+        }
+        self.clocks.read(process, at)
+    }
+
+    /// A list, as a node says it.
+    pub(super) fn list_said(&self, payload: Bytes) -> Bytes {
+        let phases: Vec<Name> = match self.fault {
+            Some(Fault::PhasesLeftOut) => Vec::new(),
+            Some(Fault::PhasesMadeUp) => {
+                PHASES.iter().map(|(phase, _)| Name::try_from((*phase).to_owned()).unwrap()).collect()
+            }
+            Some(_) | None => return payload,
+        };
+        let mut list = List::parse(&payload).unwrap();
+        list.entries.iter_mut().for_each(|entry| entry.phases.clone_from(&phases));
+        list.encode(NodeConfig::new("n").payload_max).0
     }
 
     /// How a node's barriers stand, as it says.
     pub(super) fn statuses(&mut self, node: usize) -> Vec<BarrierStatus> {
-        let mut statuses = self.cores[node].barriers(self.now);
+        let mut statuses = self.cores[node].barriers(self.clock(node));
         for status in &mut statuses {
             for absence in &mut status.missing {
                 absence.why = self.reason_said(node, &absence.name, &absence.why).into();

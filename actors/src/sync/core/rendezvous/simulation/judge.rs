@@ -169,6 +169,18 @@ impl Judge {
         self.correlation
     }
 
+    /// An application has reached a phase and waits there for others; the number of its request is returned.
+    pub(super) fn reaches(
+        &mut self,
+        (process, phase, app): (usize, usize, usize),
+        name: String,
+        asked: Asked,
+    ) -> u64 {
+        self.correlation += 1;
+        self.waits.reaches((process, phase, app), name, (self.correlation, asked));
+        self.correlation
+    }
+
     /// An application is at some barrier; which of its node's lives that is.
     pub(super) fn is_somewhere(&mut self, Who { app, name, node, incarnation }: Who) -> Member {
         let counts = &mut self.counts;
@@ -201,6 +213,7 @@ impl Judge {
 
     pub(super) fn dies(&mut self, app: App, generations: &[u64]) {
         self.seen.deaths += 1;
+        self.waits.forgets_phases(app);
         for (barrier, generation) in generations.iter().enumerate() {
             self.waits.leaves((app.0, barrier, app.1));
             if let Some(visit) = self.open_visit(app, barrier) {
@@ -222,6 +235,9 @@ impl Judge {
         answer: &BarrierAnswer,
         generations: &[u64],
     ) {
+        if self.waits.answered_at_phase(app, correlation, answer) {
+            return;
+        }
         let asked = (0..BARRIERS.len()).find(|barrier| {
             self.open_visit(app, *barrier).is_some_and(|visit| visit.correlation == correlation)
         });
@@ -318,6 +334,7 @@ impl Judge {
             self.after_quiet(barrier, of_barrier);
         }
         self.nobody_was_left_behind(generations);
+        self.waits.all_is_quiet_at_phases();
     }
 
     fn after_quiet(&mut self, barrier: usize, generations: &[u64]) {

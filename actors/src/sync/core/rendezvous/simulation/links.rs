@@ -42,6 +42,8 @@ impl World {
         let to = (0..self.cores.len()).find(meant).expect("it was sent over a link that is down");
         if is_about_barriers && let Some(fault) = self.fault {
             payload = self.spoil(fault, from, to, &payload);
+        } else if !is_about_barriers {
+            payload = self.list_said(payload);
         }
         if self.is_up(from, to) {
             self.flying.entry((from, to)).or_default().push_back((is_about_barriers, payload));
@@ -81,7 +83,10 @@ impl World {
                 | Fault::WrongReason
                 | Fault::ReasonKept
                 | Fault::ArrivedNamed
-                | Fault::AbsenceOverstated => {}
+                | Fault::AbsenceOverstated
+                | Fault::ClocksConfused
+                | Fault::PhasesLeftOut
+                | Fault::PhasesMadeUp => {}
                 Fault::DeparturesHidden => {
                     let before = self.ever.get(&from).into_iter().flat_map(|said| &said.barriers);
                     let before =
@@ -178,7 +183,8 @@ impl World {
         self.ever.remove(&node);
         self.lives[node] += 1;
         self.incarnations[node] = self.lives[node];
-        self.cores[node] = self.new_core(node);
+        let core = self.new_core(node);
+        self.cores[node] = core;
         self.populate(node);
         linked.into_iter().for_each(|peer| self.hear_of_restart(peer, node, life));
     }

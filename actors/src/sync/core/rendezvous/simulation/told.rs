@@ -4,6 +4,23 @@
 use super::*;
 use crate::sync::list::{Ended, Entry, List};
 
+/// How far an application has come in its present life.
+#[derive(Default)]
+struct Standing {
+    /// Why it is not ready, if it is not.
+    unready: Option<Reason>,
+    phases: BTreeSet<String>,
+}
+
+impl Standing {
+    /// Why it has not reached a phase, or is not ready, if none is asked for. // spec: SYNC-15
+    fn why_not(&self, phase: Option<&str>) -> Option<Reason> {
+        let Some(phase) = phase else { return self.unready };
+        let ended = self.unready.filter(|why| matches!(why, Reason::Failed | Reason::Stopped));
+        (!self.phases.contains(phase)).then(|| ended.unwrap_or(Reason::NotReached))
+    }
+}
+
 /// One node, as a process has been told of it.
 #[derive(Default)]
 struct Sight {
@@ -13,8 +30,8 @@ struct Sight {
     present: Option<Incarnation>,
     /// Why it is not there, if it is not.
     lost: Option<Reason>,
-    /// The list that came last: of which life, and why each application in it is not ready, if it is not.
-    list: Option<(Incarnation, BTreeMap<String, Option<Reason>>)>,
+    /// The list that came last: of which life, and how far each application in it has come.
+    list: Option<(Incarnation, BTreeMap<String, Standing>)>,
     /// Whether a list came since the link did.
     has_list: bool,
     /// What it said last of barriers since the link came.
@@ -55,11 +72,14 @@ impl Sight {
     }
 
     fn lists(&mut self, list: &List) {
-        let standing = |entry: &Entry| match (entry.ready, entry.ended) {
-            (true, _) => None,
-            (false, Some(Ended::Failed)) => Some(Reason::Failed),
-            (false, Some(Ended::Stopped)) => Some(Reason::Stopped),
-            (false, None) => Some(Reason::NotReady),
+        let standing = |entry: &Entry| Standing {
+            unready: match (entry.ready, entry.ended) {
+                (true, _) => None,
+                (false, Some(Ended::Failed)) => Some(Reason::Failed),
+                (false, Some(Ended::Stopped)) => Some(Reason::Stopped),
+                (false, None) => Some(Reason::NotReady),
+            },
+            phases: entry.phases.iter().map(ToString::to_string).collect(),
         };
         let entries = list.entries.iter().map(|entry| (entry.name.to_string(), standing(entry)));
         (self.list, self.has_list) = (Some((list.incarnation, entries.collect())), true);
@@ -69,10 +89,10 @@ impl Sight {
         self.list.as_ref().is_some_and(|(_, entries)| entries.contains_key(name))
     }
 
-    /// Why one that stands in its list is not ready; one of these is right. // spec: SYNC-3
-    fn standing(&self, name: &str) -> Option<Vec<Option<Reason>>> {
+    /// Why one that stands in its list is not ready, or has not reached a phase; one of these is right. // spec: SYNC-3
+    fn standing(&self, name: &str, phase: Option<&str>) -> Option<Vec<Option<Reason>>> {
         let (life, entries) = self.list.as_ref()?;
-        let listed = *entries.get(name)?;
+        let listed = entries.get(name)?.why_not(phase);
         let standing = match self.lost {
             Some(lost) if self.present < Some(*life) => {
                 return Some(vec![Some(lost), Some(Reason::NodeRestarted)]);
@@ -96,8 +116,8 @@ impl Sight {
 /// What one process has been told.
 #[derive(Default)]
 pub(super) struct Told {
-    /// Its own applications by address: how each is called, and why it is not ready, if it is not.
-    own: BTreeMap<AppAddress, (String, Option<Reason>)>,
+    /// Its own applications by address: how each is called, and how far it has come.
+    own: BTreeMap<AppAddress, (String, Standing)>,
     others: BTreeMap<NodeAddress, Sight>,
     /// How often each barrier has opened.
     generations: BTreeMap<String, u64>,
@@ -137,8 +157,8 @@ impl Told {
                 }
                 self.at(from).word = Some(word);
             }
+            Input::Arrived { app, asked, .. } => self.arrives(*app, asked),
             Input::GroupsChanged(_)
-            | Input::Arrived { .. }
             | Input::Left { .. }
             | Input::AnswerNotTaken { .. }
             | Input::ArrivalsNotTaken { .. }
@@ -156,10 +176,11 @@ impl Told {
     }
 
     fn app_changed(&mut self, fact: &AppFact) {
-        let (app, standing) = match fact {
+        let (app, unready) = match fact {
             AppFact::Registered { app, name, .. } => {
                 let name = name.clone().expect("each has one");
-                self.own.insert(*app, (name, Some(Reason::NotReady)));
+                let standing = Standing { unready: Some(Reason::NotReady), ..Standing::default() };
+                self.own.insert(*app, (name, standing));
                 return;
             }
             AppFact::Unregistered { app } => return drop(self.own.remove(app)),
@@ -168,7 +189,19 @@ impl Told {
             AppFact::Stopped { app } => (app, Some(Reason::Stopped)),
             AppFact::Handles { .. } | AppFact::GroupsChanged => return,
         };
-        self.own.get_mut(app).expect("it is registered").1 = standing;
+        let standing = &mut self.own.get_mut(app).expect("it is registered").1;
+        standing.unready = unready;
+        if unready.is_some() {
+            standing.phases.clear();
+        }
+    }
+
+    /// Who arrives at a phase has reached it.
+    fn arrives(&mut self, app: AppAddress, asked: &ArriveAtBarrier) {
+        if asked.kind == BarrierKind::Phase {
+            let standing = &mut self.own.get_mut(&app).expect("it is registered").1;
+            standing.phases.insert(asked.barrier.clone());
+        }
     }
 
     fn link_changed(&mut self, fact: &LinkFact) {
@@ -183,10 +216,11 @@ impl Told {
         }
     }
 
-    /// Why the application of this name is not ready; one of these is right. `None`: it is.
-    pub(super) fn standing(&self, name: &str) -> Vec<Option<Reason>> {
-        let own = self.own.values().find(|(own, _)| own == name).map(|(_, standing)| vec![*standing]);
-        let elsewhere = || self.others.values().find_map(|sight| sight.standing(name));
+    /// Why the application of this name is not ready, or has not reached a phase; one of these is right. `None`: it is, it has.
+    pub(super) fn standing(&self, name: &str, phase: Option<&str>) -> Vec<Option<Reason>> {
+        let own = self.own.values().find(|(own, _)| own == name);
+        let own = own.map(|(_, standing)| vec![standing.why_not(phase)]);
+        let elsewhere = || self.others.values().find_map(|sight| sight.standing(name, phase));
         own.or_else(elsewhere).unwrap_or_else(|| {
             if self.remembered.contains(name) {
                 vec![Some(Reason::Unregistered)]
@@ -196,6 +230,13 @@ impl Told {
                 vec![Some(Reason::NotThere)]
             }
         })
+    }
+
+    /// All names that somebody has, or had when its node was heard last.
+    pub(super) fn names(&self) -> impl Iterator<Item = &str> {
+        let elsewhere = self.others.values().filter_map(|sight| sight.list.as_ref());
+        let elsewhere = elsewhere.flat_map(|(_, entries)| entries.keys());
+        self.own.values().map(|(name, _)| name).chain(elsewhere).map(String::as_str)
     }
 
     fn has(&self, name: &str) -> bool {

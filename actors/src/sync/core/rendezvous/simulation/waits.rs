@@ -1,7 +1,11 @@
 //! What must hold of each wait: when it is over, who is told of a loss, and for whom and why it lasts. By what each process was told and says.
 
+mod mutual;
+mod phases;
+
 use sinew_runtime::app::Requirement;
 
+use self::phases::Phases;
 use super::{told::Told, *};
 use crate::sync::words::BarrierStatus;
 
@@ -18,7 +22,8 @@ const COUNTED: &str = "so many of so many have arrived";
 /// Said of a party that waits elsewhere for one of those who wait for it.
 const MUTUAL: &str = "waits elsewhere for one who waits here";
 /// Each reason that can be told here.
-const REASONS: [&str; 13] = [
+const REASONS: [&str; 14] = [
+    Reason::NotReached.words(),
     Reason::NotReady.words(),
     Reason::Failed.words(),
     Reason::Stopped.words(),
@@ -39,10 +44,6 @@ fn is_end(why: Option<Reason>) -> bool {
     let ends = [Reason::Failed, Reason::Stopped, Reason::Unregistered];
     let of_its_node = [Reason::NodeLeft, Reason::NodeLost, Reason::NodeRestarted];
     why.is_some_and(|why| ends.contains(&why) || of_its_node.contains(&why))
-}
-
-fn mutual(barrier: &str, awaited: &str) -> String {
-    format!("waits at '{barrier}' for {awaited}, which waits here for it")
 }
 
 /// What an application asks for that arrives.
@@ -80,11 +81,13 @@ struct Respite {
     most: Time,
 }
 
-/// How often each reason was found to be right, so that a simulation which tries few is noticed; how many respites there were.
+/// How often each reason was found to be right, so that a simulation which tries few is noticed; how many respites there were, and how many
+/// waits at phases ended in each way: by an opening, by their deadlines, by a loss.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Seen {
     reasons: BTreeMap<&'static str, u64>,
     put_off: u64,
+    at_phases: [u64; 3],
 }
 
 impl Seen {
@@ -93,12 +96,19 @@ impl Seen {
             *self.reasons.entry(reason).or_default() += times;
         }
         self.put_off += other.put_off;
+        for (sum, of_seed) in self.at_phases.iter_mut().zip(other.at_phases) {
+            *sum += of_seed;
+        }
     }
 
     pub(super) fn must_cover_everything(&self) {
         let is_tried = |reason: &&str| self.reasons.get(reason).is_some_and(|times| *times > 10);
         assert!(REASONS.iter().all(is_tried), "hardly anything is told: {self:?}");
         assert!(self.put_off > 10, "hardly anybody stood still when something was due: {self:?}");
+        assert!(
+            self.at_phases.iter().all(|times| *times > 10),
+            "hardly anybody comes up in phases: {self:?}"
+        );
     }
 }
 
@@ -117,6 +127,7 @@ pub(super) struct Waits {
     /// Parties that are missing while somebody waits, by process and barrier: after how many openings, and since when.
     absent: BTreeMap<(usize, usize, String), (u64, Time)>,
     respites: BTreeMap<usize, Respite>,
+    phases: Phases,
     /// Processes may have forgotten a barrier.
     is_crowded: bool,
     pub(super) violations: Vec<String>,
@@ -140,6 +151,7 @@ impl Waits {
             lost: BTreeMap::new(),
             absent: BTreeMap::new(),
             respites: BTreeMap::new(),
+            phases: Phases::new(),
             is_crowded,
             violations: Vec::new(),
             seen: Seen::default(),
@@ -205,21 +217,27 @@ impl Waits {
             BarrierAnswer::Lost { missing } => (missing, self.why_not_lost(place, wait)),
             BarrierAnswer::Opened { .. } | BarrierAnswer::Refused { .. } => return,
         };
-        let respite = self.respites.get(&process);
-        let is_late = respite.map_or(Time::ZERO, |respite| respite.most).max(self.due(place, wait)) < now;
-        let is_hasty = respite.is_some_and(|respite| now < respite.least);
-        self.violations
-            .extend(why_not.map(|why_not| format!("at {now:?} {who} is told {answer:?}, but {why_not}")));
-        if is_late {
-            self.violations.push(format!("at {now:?} {who} is told {answer:?} late"));
-        }
-        if is_hasty {
-            self.violations.push(format!("at {now:?} {who} is told {answer:?} before all was read"));
+        let untimely = self.why_untimely(process, self.due(place, wait));
+        for why_not in why_not.into_iter().chain(untimely) {
+            self.violations.push(format!("at {now:?} {who} is told {answer:?}, but {why_not}"));
         }
         let wait = self.open.remove(&place).expect("it was found");
         self.over.insert(place, wait);
         let right = self.missing(process, barrier);
-        self.check_reasons((process, barrier), right, missing.iter().map(|(name, why)| (&**name, &**why)));
+        let said = missing.iter().map(|(name, why)| (&**name, &**why));
+        self.check_reasons((process, BARRIERS[barrier].0), right, said);
+    }
+
+    /// Why the end of a wait that was to be over at `due` is not told in time.
+    fn why_untimely(&self, process: usize, due: Time) -> Option<String> {
+        let respite = self.respites.get(&process);
+        if respite.map_or(Time::ZERO, |respite| respite.most).max(due) < self.now {
+            Some(format!("late, it was over at {due:?}"))
+        } else if respite.is_some_and(|respite| self.now < respite.least) {
+            Some("has not read all yet".to_owned())
+        } else {
+            None
+        }
     }
 
     /// Why a wait may not be ended because of a loss now.
@@ -255,14 +273,17 @@ impl Waits {
             self.look_who_is_lost(process, barrier);
             self.look_who_is_absent(process, barrier);
         }
+        self.look_at_phases(process);
         self.remember(process);
         self.over.clear();
         self.passed.clear();
+        self.phases.next_moment();
         for barrier in 0..BARRIERS.len() {
             self.check_waiting((process, barrier), of_it(barrier));
             of_it(barrier).into_iter().for_each(|status| self.check_missing((process, barrier), status));
         }
         self.check_deadlines(process);
+        self.check_phases(process, statuses);
     }
 
     /// It knows of as many openings as it was told of.
@@ -304,7 +325,7 @@ impl Waits {
             reasons.extend(mutual.into_iter().map(|why| (why, MUTUAL)));
         }
         let said = status.missing.iter().map(|Absence { name, why, .. }| (&**name, &**why));
-        self.check_reasons((process, barrier), right, said);
+        self.check_reasons((process, BARRIERS[barrier].0), right, said);
         let longest = status.waiting.iter().map(|(_, waited)| *waited).max().unwrap_or_default();
         for Absence { name, since, .. } in &status.missing {
             let absent = self.absent.get(&(process, barrier, name.clone()));
@@ -319,7 +340,7 @@ impl Waits {
     /// Whoever is missing is named with a reason that is right, and nobody else.
     fn check_reasons<'said>(
         &mut self,
-        (process, barrier): (usize, usize),
+        (process, name): (usize, &str),
         right: Vec<(String, Vec<(String, &'static str)>)>,
         said: impl Iterator<Item = (&'said str, &'said str)>,
     ) {
@@ -335,7 +356,6 @@ impl Waits {
                 kinds.into_iter().for_each(|kind| *self.seen.reasons.entry(kind).or_default() += 1)
             }
             None => {
-                let name = BARRIERS[barrier].0;
                 self.violations.push(format!(
                     "at {:?} process {process} says that {name} lacks {said:?}, and it lacks {right:?}",
                     self.now
@@ -381,7 +401,7 @@ impl Waits {
             }
             let reasons = match party.only_name() {
                 Some(name) => {
-                    let standing = self.told[&process].standing(name).into_iter();
+                    let standing = self.told[&process].standing(name, None).into_iter();
                     standing
                         .map(|why| why.map_or(READY, Reason::words))
                         .map(|why| (why.to_owned(), why))
@@ -392,36 +412,6 @@ impl Waits {
             missing.push((party.to_string(), reasons));
         }
         missing
-    }
-
-    /// At which other barriers `name` waits for somebody who waits for it here, in the words that say so.
-    fn waits_for_us(&self, (process, here): (usize, usize), name: &str) -> Vec<String> {
-        let mut words = Vec::new();
-        let waits_here = self.present(process, here);
-        for barrier in (0..BARRIERS.len()).filter(|barrier| *barrier != here) {
-            let there = self.present(process, barrier);
-            if !there.contains(&name) {
-                continue;
-            }
-            let lacks =
-                |party: &&Requirement| there.iter().filter(|name| party.counts(name)).count() < party.count();
-            let lacking: Vec<&Requirement> = self.parties[barrier].iter().filter(lacks).collect();
-            let is_awaited =
-                |who: &&&str| !there.contains(*who) && lacking.iter().any(|party| party.counts(who));
-            let awaited = waits_here.iter().filter(is_awaited);
-            words.extend(awaited.map(|who| mutual(BARRIERS[barrier].0, who)));
-        }
-        words
-    }
-
-    /// The same where it may have been forgotten how often a barrier has opened, and some wait at those that never do.
-    fn may_wait_for_us(&self, (process, here): (usize, usize), name: &str) -> Vec<String> {
-        let others = BARRIERS.iter().map(|(name, _)| (*name).to_owned()).chain((0..OTHERS).map(other));
-        let others: Vec<String> = others.filter(|name| name != BARRIERS[here].0).collect();
-        let is_there = |barrier: &&String| self.told[&process].waiting(barrier).any(|(who, _)| who == name);
-        let waits_here = self.present(process, here);
-        let words = |barrier: &String| waits_here.iter().map(|who| mutual(barrier, who)).collect::<Vec<_>>();
-        others.iter().filter(is_there).flat_map(words).collect()
     }
 
     /// Since when each party is missing for whom somebody waits.
@@ -449,7 +439,7 @@ impl Waits {
         let mut lost: Vec<(String, bool, bool)> = Vec::new();
         for name in self.parties[barrier].iter().filter_map(Requirement::only_name) {
             let is_missing = is_awaited && !present.contains(&name);
-            let ends = self.told[&process].standing(name).into_iter().map(is_end);
+            let ends = self.told[&process].standing(name, None).into_iter().map(is_end);
             let ends: Vec<bool> = ends.map(|is_end| is_end && is_missing).collect();
             lost.push((name.to_owned(), ends.contains(&true), !ends.contains(&false)));
         }
@@ -481,7 +471,10 @@ impl Waits {
         let awaited = barriers(&mut self.open.keys().chain(self.over.keys()));
         let passed = barriers(&mut self.passed.iter());
         let perhaps = awaited.union(&passed).copied().collect();
+        let (mut awaited, mut perhaps) = (names(awaited), names(perhaps));
+        awaited.extend(self.phases.awaited(process));
+        perhaps.extend(self.phases.awaited(process));
         let told = self.told.get_mut(&process).expect("it was told something");
-        told.remember(names(awaited), names(perhaps));
+        told.remember(awaited, perhaps);
     }
 }
