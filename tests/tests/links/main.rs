@@ -4,6 +4,7 @@
 mod faults;
 mod keys;
 mod last_words;
+mod lost_words;
 mod slow_consumer;
 mod storm;
 mod unheard;
