@@ -23,6 +23,7 @@
 //!   (`gncl.datagrams`): how old they are when they are handled. `cpu_ns_each_value` is what both processes needed, `acks_per_s` what this host sent of datagrams beside the
 //!   values that were handled (acknowledgements, repetitions, a few of NDL's). `superseded` are counted values that did not come; `superseded_on_the_way_with_warm_up` and
 //!   `superseded_in_mailboxes_with_warm_up` say where newer ones took their place, of all that were sent. `--bench stream_allocations` counts what memory is asked for.
+//! - `rest_raw_tcp`: the first 1000 bytes after a rest of 100 ms by bare TCP, on a connection that stays open and on one that is dialled and greeted for them.
 //! - `slow_link`: the same as `control_beside_bulk_1000`, and bare TCP, on two hosts with a link of 10 Mbit/s between them
 //!   (network namespaces: needs root, `ip` and `tc`); `slow_link_priorities`: the hosts send by priority what waits.
 
@@ -35,6 +36,7 @@ mod keys;
 mod nodes;
 #[path = "../ping/mod.rs"]
 mod ping;
+mod rest;
 mod rounds;
 mod slow_link;
 mod stream_ends;
@@ -86,6 +88,8 @@ enum Case {
     },
     /// Values of class Stream.
     Stream(Plan),
+    /// First messages after a rest, so many of each sort.
+    Rest(u64),
     SlowLink(Queue),
     /// Between nodes with keys, beside nodes without.
     Secured(Secured),
@@ -141,6 +145,7 @@ impl Case {
         for channels in stream_ways::CHANNELS {
             cases.extend(Way::ALL.map(|by| Self::Stream(Plan { by, channels, values })));
         }
+        cases.push(Self::Rest(200 / part as u64));
         cases.extend([Queue::OneLine, Queue::Priorities].map(Self::SlowLink));
         cases.extend(Secured::all(is_short).into_iter().map(Self::Secured));
         cases
@@ -157,6 +162,7 @@ impl Case {
             Self::Crowd { by: By::Tcp, nodes, .. } => format!("table_2_raw_tcp-{nodes}"),
             Self::Beside { name, .. } => name.to_owned(),
             Self::Stream(Plan { by, channels, .. }) => format!("stream_by_{}-{channels}", by.name()),
+            Self::Rest(_) => "rest_raw_tcp".to_owned(),
             Self::SlowLink(Queue::OneLine) => "slow_link".to_owned(),
             Self::SlowLink(Queue::Priorities) => "slow_link_priorities".to_owned(),
             Self::Secured(Secured::Rounds { thread, rounds, pinning }) => {
@@ -204,6 +210,11 @@ impl Case {
                 }
             }
             Self::Stream(plan) => stream_ways::measure(&self.name(), plan),
+            Self::Rest(count) => {
+                let raw = SocketAddrV4::new(Ipv4Addr::LOCALHOST, At::loopback().port());
+                let _other = process::Process::start(&format!("rest_echo {raw}"));
+                rest::measure(raw, count);
+            }
             Self::SlowLink(queue) => return slow_link::measure(&self.name(), queue),
             Self::Secured(secured) => secured.measure(),
         }
@@ -311,6 +322,7 @@ fn play(role: &str) -> ExitCode {
         }
         ["slow_nodes", case, at] => slow_link::nodes(case, At::read(at)),
         ["beside_raw_echo", address] => beside_raw::echo(address.parse().expect("an address of ours")),
+        ["rest_echo", address] => rest::echo(address.parse().expect("an address of ours")),
         ["slow_raw", case, address] => slow_link::raw(case, address.parse().expect("an address of ours")),
         _ => {
             eprintln!("no such role: {role}");

@@ -1,0 +1,68 @@
+//! The first message after a rest by bare TCP: on a connection that has stayed open, and on one that is dialled for it.
+
+use std::{
+    io::{Read, Write},
+    net::{SocketAddrV4, TcpListener, TcpStream},
+    thread,
+    time::{Duration, Instant},
+};
+
+use sinew_figures::{Alone, Figures, process::say_there};
+
+/// What passes before each message.
+const REST: Duration = Duration::from_millis(100);
+/// Bytes of a message.
+const MESSAGE: usize = 1000;
+/// Bytes of what two nodes say before the first message: HELLO, and WELCOME back.
+const HELLO: usize = 200;
+
+/// Sends back what comes on every connection, until this process is ended.
+pub(crate) fn echo(address: SocketAddrV4) {
+    let listener = TcpListener::bind(address).expect("a free port");
+    say_there();
+    for connection in listener.incoming() {
+        let connection = connection.expect("a descriptor");
+        connection.set_nodelay(true).expect("TCP has no delay");
+        thread::spawn(move || {
+            let (mut reader, mut writer) = (&connection, &connection);
+            // Ends with the connection.
+            let _ = std::io::copy(&mut reader, &mut writer);
+        });
+    }
+}
+
+/// Both in turn, so often each.
+pub(crate) fn measure(address: SocketAddrV4, count: u64) {
+    let mut open = dial(address);
+    round_trip(&mut open, MESSAGE);
+    let [mut stayed, mut dialled] = [Figures::new(), Figures::new()];
+    for _ in 0..count {
+        thread::sleep(REST);
+        let asked = Instant::now();
+        round_trip(&mut open, MESSAGE);
+        stayed.record(asked.elapsed());
+        thread::sleep(REST);
+        let asked = Instant::now();
+        let mut anew = dial(address);
+        round_trip(&mut anew, HELLO);
+        round_trip(&mut anew, MESSAGE);
+        dialled.record(asked.elapsed());
+    }
+    for (figure, seen) in
+        [("first message after a rest", &stayed), ("the same on a new connection", &dialled)]
+    {
+        Alone { bench: "gncl", case: "rest_raw_tcp", figure, seen, counts: &[("messages", count)] }.report();
+    }
+}
+
+fn dial(address: SocketAddrV4) -> TcpStream {
+    let connection = TcpStream::connect(address).expect("the echo listens");
+    connection.set_nodelay(true).expect("TCP has no delay");
+    connection
+}
+
+fn round_trip(connection: &mut TcpStream, bytes: usize) {
+    let mut buffer = vec![7; bytes];
+    connection.write_all(&buffer).expect("the echo reads");
+    connection.read_exact(&mut buffer).expect("the echo answers");
+}
