@@ -31,8 +31,8 @@
 //! | NDL-5 | A node has one life at a time. |
 //! | NDL-5.1 | A higher incarnation replaces a lower one: `NodeRestarted`. |
 //! | NDL-5.2 | A lower one is refused, also after the loss of the higher one, for 15 s. |
-//! | NDL-5.3 | From another address than its own, the newcomer waits up to 100 ms for the former life to show that it lives. |
-//! | NDL-5.4 | If it does, there are two processes with one address: the newcomer is refused, names and addresses of both are logged. |
+//! | NDL-5.3 | From another address than its own, the newcomer waits up to 100 ms for the former life to show that it lives, and shows then that it lives itself. |
+//! | NDL-5.4 | If the former life does, there are two processes with one address: the newcomer is refused, names and addresses of both are logged. |
 //! | NDL-5.5 | A node that finds its own address in use while it settles, `missed_max` plus one periods from its start, gives up: at once if its life is the later one, else at the end of that time if the other is still there, which gets time to give up if it settles, too. |
 //! | NDL-5.6 | Of two that both live, who has settled goes before who has not, and then the elder life: whoever hears both takes that one. |
 //! | NDL-5.7 | Who goes second gives up `missed_max` periods after it hears of the first; who was frozen or alone settles anew. |

@@ -256,6 +256,9 @@ impl Core {
             }
             let why = if yields { LossReason::Duplicate } else { LossReason::Left };
             self.lose(now, announcement.node, why);
+        } else if self.is_contender(from, announcement) {
+            // It makes way for the member, or ends. spec: NDL-5.3
+            self.contests.remove(&announcement.node);
         } else if self.is_former_at(from, announcement) {
             // It was silent, and has been asked since: what it answered before it left is no sign of life any more.
             // Another node may be there by now.

@@ -25,6 +25,8 @@ use crate::{
 
 /// Longest time that a node has to show that it lives, when another process comes with its address.
 const CHALLENGE_MAX: Duration = Duration::from_millis(100);
+/// How often it is asked in that time: a question or its answer may be lost.
+const CHALLENGES: u32 = 3;
 /// Time in which a broken connection may be made again at another address.
 const LINK_GRACE: Duration = Duration::from_secs(1);
 
@@ -45,14 +47,37 @@ impl Proof {
     }
 }
 
-/// A newcomer claims a member's address in a later life. The member has until then to show that it lives.
+/// A newcomer claims a member's address in a later life. The member has a time to show that it lives; if it does not, the newcomer has as long to
+/// show that it does still: who finds that a living process has its address gives that up, and is silent.
 #[derive(Debug)]
 pub(super) struct Contest {
+    /// An answer of the member to a question of then or later says that there are two.
     since: Time,
+    tried: Party,
+    tried_since: Time,
+    /// When the one that is tried is asked again, or its time is over.
     pub(super) until: Time,
-    /// How often it was put off, as our own timer was late.
-    pub(super) put_off: u32,
+    /// How often it is asked again in its time.
+    again: u32,
+    /// How often its time was given anew, as our own timer was late, or the member gave a sign.
+    put_off: u32,
     pub(super) newcomer: Proof,
+}
+
+/// Who is to show that it lives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Party {
+    Member,
+    Newcomer,
+}
+
+impl Contest {
+    /// Whether this says that the newcomer lives still, now that the member has had its time.
+    fn is_won_by(&self, proof: &Proof) -> bool {
+        self.tried == Party::Newcomer
+            && proof.asked >= self.tried_since
+            && self.newcomer.is_of(&proof.announcement)
+    }
 }
 
 /// How a node that becomes a member is announced to applications.
@@ -294,16 +319,37 @@ impl Core {
     /// A newcomer with a member's address: has the member been restarted, or are there two? // spec: NDL-5.3
     fn contest(&mut self, now: Time, newcomer: Proof) {
         let node = newcomer.announcement.node;
-        if self.contests.contains_key(&node) {
+        if let Some(contest) = self.contests.get(&node) {
+            if contest.is_won_by(&newcomer) {
+                self.replace(now, newcomer);
+            }
             return;
         }
-        let until = now + self.challenge();
-        self.contests.insert(node, Contest { since: now, until, put_off: 0, newcomer });
-        self.challenge_member(now, node);
+        let tried = Party::Member;
+        let contest =
+            Contest { since: now, tried, tried_since: now, until: now, again: 0, put_off: 0, newcomer };
+        self.contests.insert(node, contest);
+        self.give_time(now, node, tried);
     }
 
     fn challenge(&self) -> Duration {
         self.rest().period.min(CHALLENGE_MAX)
+    }
+
+    fn give_time(&mut self, now: Time, node: NodeAddress, tried: Party) {
+        let until = now + self.challenge() / CHALLENGES;
+        let Some(contest) = self.contests.get_mut(&node) else { return };
+        (contest.tried, contest.tried_since) = (tried, now);
+        (contest.until, contest.again) = (until, CHALLENGES - 1);
+        self.ask_the_tried(now, node);
+    }
+
+    fn ask_the_tried(&mut self, now: Time, node: NodeAddress) {
+        match self.contests.get(&node).map(|contest| (contest.tried, contest.newcomer.from)) {
+            Some((Party::Member, _)) => self.challenge_member(now, node),
+            Some((Party::Newcomer, from)) => self.ask(now, from),
+            None => {}
+        }
     }
 
     fn challenge_member(&mut self, now: Time, node: NodeAddress) {
@@ -321,22 +367,39 @@ impl Core {
         }
     }
 
+    /// Who is tried has not answered: it is asked again, or its time is over.
     fn decide_contest(&mut self, now: Time, node: NodeAddress) {
         let challenge = self.challenge();
         let Some(contest) = self.contests.get_mut(&node) else { return };
-        // Starved ourselves, we may not have read the answer yet: ask again, but not for ever. spec: NDL-4.2
-        if now.since(contest.until) > challenge / 2 && contest.put_off < IN_A_ROW_MAX {
-            contest.put_off += 1;
-            contest.since = now;
-            contest.until = now + challenge;
-            self.challenge_member(now, node);
+        let is_late = now.since(contest.until) > challenge / 2;
+        if contest.again > 0 && !is_late {
+            contest.again -= 1;
+            contest.until = now + challenge / CHALLENGES;
+            self.ask_the_tried(now, node);
             return;
         }
-        if let Some(contest) = self.contests.remove(&node)
-            && !self.contradicts_a_proof(now, &contest.newcomer)
-        {
-            self.replace(now, contest.newcomer);
+        let (tried, since) = (contest.tried, contest.tried_since);
+        let has_given_a_sign = tried == Party::Member
+            && self.members.get(&node).is_some_and(|member| member.has_given_a_sign_since(since));
+        // Starved ourselves, we may not have read the answer yet; and a sign may have been under way when the member ended. It is asked
+        // again, but not for ever. spec: NDL-4.2
+        if (is_late || has_given_a_sign) && contest.put_off < IN_A_ROW_MAX {
+            contest.put_off += 1;
+            self.give_time(now, node, tried);
+        } else if tried == Party::Member && !has_given_a_sign {
+            self.give_time(now, node, Party::Newcomer);
+        } else {
+            // The member lives, or the newcomer does not: its next answer begins another contest.
+            self.contests.remove(&node);
         }
+    }
+
+    /// Whether this is of a newcomer that is tried, from where it is or says that it is.
+    pub(super) fn is_contender(&self, from: Place, announcement: &Announcement) -> bool {
+        self.contests.get(&announcement.node).is_some_and(|Contest { newcomer, .. }| {
+            let is_from_there = newcomer.from == from || newcomer.announcement.has_ndl_at(from.there);
+            newcomer.is_of(announcement) && is_from_there
+        })
     }
 
     /// What GNCL's connections tell. // spec: NDL-4.3

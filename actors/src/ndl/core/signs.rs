@@ -21,6 +21,11 @@ impl Member {
         self.host != Some(Host::Refuses) && now.since(self.sign) < pace.sign_counts_for()
     }
 
+    /// Whether GNCL heard of it after that, or it asked us: it lives, whatever it answers. // spec: NDL-5.3
+    pub(super) fn has_given_a_sign_since(&self, then: Time) -> bool {
+        self.host != Some(Host::Refuses) && self.sign > then
+    }
+
     /// Whether what it sent at this time of its clock may have been sent so lately that it is a sign, by what is known of that clock. // spec: NDL-4.7
     fn may_have_sent_lately(&self, now: Time, sent: Time, pace: &Pace) -> bool {
         let times = self.clock.offset(now).and_then(|offset| offset.in_our_clock(now, sent));
@@ -29,11 +34,12 @@ impl Member {
 }
 
 impl Core {
-    /// Members that are lost when the next missed answer is counted, unless GNCL has heard of them: that is to be
-    /// [said](super::Input::SignSeen) before it is.
+    /// Members that are lost when the next missed answer is counted, or when a newcomer with their address shows that it lives, unless GNCL has
+    /// heard of them: that is to be [said](super::Input::SignSeen) before it is.
     pub(crate) fn in_doubt(&self) -> Vec<(NodeAddress, Incarnation)> {
         let is_in_doubt = |member: &&Member| {
-            member.missed + u32::from(member.is_awaited) >= self.paces[member.pace].missed_max
+            self.contests.contains_key(&member.announcement.node)
+                || member.missed + u32::from(member.is_awaited) >= self.paces[member.pace].missed_max
         };
         let members = self.members.values().filter(is_in_doubt);
         members.map(|member| (member.announcement.node, member.announcement.incarnation)).collect()

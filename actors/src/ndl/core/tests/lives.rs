@@ -2,10 +2,13 @@
 
 use sinew_runtime::{tid::Incarnation, time::Time};
 
-use super::world::{PERIOD, Spec, World, claimant, ms, node};
+use super::world::{PERIOD, Spec, World, claimant, ms, node, udp};
 use crate::{
     config::WatchGroup,
-    ndl::{LossReason, MembershipFact, NodeEvent, core::Output},
+    ndl::{
+        LossReason, MembershipFact, NodeEvent,
+        core::{Input, Output, Source},
+    },
 };
 
 /// When the first process heard of node 2 last.
@@ -175,6 +178,87 @@ fn a_starved_judge_asks_again_before_a_newcomer_replaces_a_member() {
     world.stall(1, ms(200));
     world.run(PERIOD * 2);
     assert_eq!(world.at(1).facts, []);
+}
+
+/// Node 1 tries a later life of node 2 at another address, and its questions do not reach the member; the two with one address do not hear
+/// each other.
+fn with_a_newcomer_and_a_member_that_is_not_reached() -> World {
+    let mut world = World::of_members(2);
+    [(1, 2), (2, 3), (3, 2)].into_iter().for_each(|(from, to)| world.cut(from, to));
+    world.start(3, &Spec { incarnation: 2, ..Spec::of(2) });
+    world.run_until(ms(10), |world| !world.at(1).core.contests.is_empty());
+    world
+}
+
+// spec: NDL-5.3
+#[test]
+fn a_member_that_is_not_reached_while_a_newcomer_is_tried_stays_when_that_one_gives_up() {
+    for loses_goodbyes in [false, true] {
+        let mut world = with_a_newcomer_and_a_member_that_is_not_reached();
+        world.loses_goodbyes = loses_goodbyes;
+        // when: the newcomer hears of the member
+        world.mend();
+        world.cut(1, 2);
+        world.input(3, Input::AddressNamed { source: Source::Mdns, address: udp(2) });
+        world.run(ms(5));
+        assert_eq!(world.at(3).others, [Output::AddressTaken { holder: claimant(2, 2) }]);
+        // then
+        assert_eq!(world.at(1).core.contests.is_empty(), !loses_goodbyes, "its goodbye ends it");
+        world.run(ms(200));
+        assert!(world.at(1).core.contests.is_empty(), "and so does its silence");
+        world.mend();
+        world.run(PERIOD * 6);
+        assert_eq!(world.at(1).facts, []);
+    }
+}
+
+// spec: NDL-5.3
+#[test]
+fn a_member_that_gives_signs_stays_though_it_is_not_reached_while_a_newcomer_is_tried() {
+    let mut world = with_a_newcomer_and_a_member_that_is_not_reached();
+    assert_eq!(world.at(1).core.in_doubt(), [(node(2), Incarnation(1))]);
+    for _ in 0..100 {
+        let (node, incarnation, at) = (node(2), Incarnation(1), world.now);
+        world.input(1, Input::SignSeen { node, incarnation, at });
+        world.run(ms(20));
+    }
+    assert_eq!(world.at(1).facts, []);
+    // when: it has ended
+    world.kill(2);
+    world.run(PERIOD * 2);
+    // then
+    assert_eq!(world.losses(1), [(2, LossReason::Restarted)]);
+}
+
+// spec: NDL-5.3
+#[test]
+fn a_restart_elsewhere_is_told_when_the_member_has_had_its_time_and_soon_after_where_an_answer_is_lost() {
+    for (lasts, at_most) in [(ms(0), ms(101)), (ms(110), ms(25))] {
+        let mut world = World::of_members(2);
+        world.kill(2);
+        world.start(3, &Spec { incarnation: 2, ..Spec::of(2) });
+        world.run_until(ms(10), |world| !world.at(1).core.contests.is_empty());
+        world.cut(3, 1);
+        world.run(lasts);
+        world.mend();
+        world.run_until(at_most, |world| !world.at(1).facts.is_empty());
+        assert_eq!(world.losses(1), [(2, LossReason::Restarted)]);
+    }
+}
+
+// spec: NDL-5.3
+#[test]
+fn no_restart_of_a_living_node_is_told_where_each_fifth_datagram_is_lost() {
+    for begin in 0..50 {
+        let mut world = World::of_members(3);
+        world.cut(2, 4);
+        world.cut(4, 2);
+        world.loses_each = Some(5);
+        world.run(ms(begin * 11));
+        world.start(4, &Spec { incarnation: 2, ..Spec::of(2) });
+        world.run(PERIOD * 20);
+        assert_eq!((world.losses(1), world.losses(3)), (vec![], vec![]), "after {begin} times 11 ms");
+    }
 }
 
 // spec: NDL-5.5

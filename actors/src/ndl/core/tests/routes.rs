@@ -283,7 +283,8 @@ fn a_later_life_elsewhere_is_no_successor_while_the_member_answers_anywhere() {
     for place in [way(1), elsewhere()] {
         let mut bench = Bench::of_two_ways();
         bench.speak(place, later_life());
-        bench.pass(ms(200));
+        bench.pass(ms(100));
+        bench.answer(place, later_life());
         assert_eq!(bench.life(), Some(Incarnation(6)), "{place:?}");
     }
 }

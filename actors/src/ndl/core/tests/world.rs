@@ -138,6 +138,10 @@ pub(super) struct World {
     flying: BTreeMap<(Time, u64), Flying>,
     sequence: u64,
     cut: BTreeSet<(SocketAddr, SocketAddr)>,
+    /// Datagrams from one to the other so far.
+    sent: BTreeMap<(SocketAddr, SocketAddr), u64>,
+    /// Of those each such one is lost.
+    pub(super) loses_each: Option<u64>,
     /// No goodbye arrives.
     pub(super) loses_goodbyes: bool,
     /// Time that a datagram is under way.
@@ -153,6 +157,8 @@ impl World {
             flying: BTreeMap::new(),
             sequence: 0,
             cut: BTreeSet::new(),
+            sent: BTreeMap::new(),
+            loses_each: None,
             loses_goodbyes: false,
             flight: FLIGHT,
         }
@@ -369,7 +375,10 @@ impl World {
 
     fn fly(&mut self, from: SocketAddr, to: SocketAddr, way: Way, bytes: &[u8]) {
         self.processes.get_mut(&from).unwrap().datagrams_sent += 1;
-        if !self.cut.contains(&(from, to)) {
+        let sent = self.sent.entry((from, to)).or_default();
+        *sent += 1;
+        let is_lost = self.loses_each.is_some_and(|each| sent.is_multiple_of(each));
+        if !is_lost && !self.cut.contains(&(from, to)) {
             self.sequence += 1;
             let flying = Flying { from, to, way, bytes: bytes.to_vec() };
             self.flying.insert((self.now + self.flight, self.sequence), flying);
