@@ -113,19 +113,25 @@ mod tests {
         outlet::Gathering,
     };
 
-    #[test]
-    fn who_is_always_outrun_by_another_thread_leaves_it_to_who_looks_for_what_is_owed() {
-        // Given: each time that one is said, another thread has made a newer one.
-        let [here, node] = [1, 2].map(NodeAddress::new);
+    const HERE: NodeAddress = NodeAddress::new(1);
+    const NODE: NodeAddress = NodeAddress::new(2);
+
+    fn way() -> Way {
         let ends = Ends {
-            here,
-            node,
+            here: HERE,
+            node: NODE,
             takes_outcomes: true,
             answers_there: 100,
             payload_max_there: usize::MAX,
             ways: 1,
         };
-        let way = Way::new(Time::now(), ends, &NodeConfig::new("hip"), &Told::default());
+        Way::new(Time::now(), ends, &NodeConfig::new("hip"), &Told::default())
+    }
+
+    #[test]
+    fn who_is_always_outrun_by_another_thread_leaves_it_to_who_looks_for_what_is_owed() {
+        // Given: each time that one is said, another thread has made a newer one.
+        let way = way();
         let mut rounds = 0;
         let mut outrun = || {
             rounds += 1;
@@ -147,16 +153,7 @@ mod tests {
     async fn one_that_was_made_for_a_connection_that_has_ended_is_not_the_first_word_on_the_next() {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("it is bound");
-        let [here, node] = [1, 2].map(NodeAddress::new);
-        let ends = Ends {
-            here,
-            node,
-            takes_outcomes: true,
-            answers_there: 100,
-            payload_max_there: usize::MAX,
-            ways: 1,
-        };
-        let way = Way::new(Time::now(), ends, &NodeConfig::new("hip"), &Told::default());
+        let way = way();
         // Given: a thread has made one, and is held up before it says it.
         let older = way.next_ack();
         // When: the next connection is there, and the thread goes on before that one has its first word.
@@ -165,7 +162,7 @@ mod tests {
         ours.writable().await.expect("it takes something");
         let link = way.outlet.connect(Gathering::new(Transport::open(ours), Checksum::Crc), 1 << 16, None);
         way.say_ack(older);
-        let mut held = frame(node, here, Kind::named("held"), Bytes::new());
+        let mut held = frame(NODE, HERE, Kind::named("held"), Bytes::new());
         held.header.class = Class::Bulk;
         way.inbox().shelf.put(7, held, 100).expect("there is room");
         way.attach(link);
@@ -194,22 +191,12 @@ mod tests {
         while let Ok(count) = ours.try_write(&[0; 65_536]) {
             filled += count;
         }
-        let [here, node] = [1, 2].map(NodeAddress::new);
-        let ends = Ends {
-            here,
-            node,
-            takes_outcomes: true,
-            answers_there: 100,
-            payload_max_there: usize::MAX,
-            ways: 1,
-        };
-        let config = NodeConfig::new("hip");
-        let way = Way::new(Time::now(), ends, &config, &Told::default());
+        let way = way();
         let link = way.outlet.connect(Gathering::new(Transport::open(ours), Checksum::Crc), 1 << 16, None);
         way.attach(link);
         // When: one thread has made an acknowledgement, another one makes and says a newer one, and the first one goes on.
         let older = way.next_ack();
-        let mut held = frame(node, here, Kind::named("held"), Bytes::new());
+        let mut held = frame(NODE, HERE, Kind::named("held"), Bytes::new());
         held.header.class = Class::Bulk;
         way.inbox().shelf.put(7, held, 100).expect("there is room");
         way.acknowledge();

@@ -144,3 +144,28 @@ async fn what_the_end_of_another_threads_flood_leaves_goes_out_in_a_moment_and_n
     assert_eq!(flood.seen(), (0..40).collect::<Vec<u8>>());
     drainer.abort();
 }
+
+#[test]
+fn what_is_urgent_is_left_until_its_last_byte_is_taken_also_where_it_is_gathered_with_others() {
+    // Given: the wire takes nothing, and an urgent word comes behind a flood.
+    let flood = Flood::new(0);
+    flood.submit(0..8);
+    let mut word = message(Class::Control, 100);
+    word.header.kind = Kind::GNCL_PING;
+    flood.outlet.submit_urgent(word, usize::MAX).expect("it is the first");
+    let has_come = || flood.seen().contains(&100);
+    // When: the wire takes a few bytes at a time.
+    for _ in 0..1_000 {
+        if has_come() {
+            break;
+        }
+        // Then
+        assert_ne!(flood.outlet.urgent_left(), 0);
+        flood.wire.room.store(7, Ordering::Relaxed);
+        flood.drain();
+    }
+    assert!(has_come());
+    flood.wire.room.store(PLENTY, Ordering::Relaxed);
+    flood.drain();
+    assert_eq!(flood.outlet.urgent_left(), 0);
+}
