@@ -1,4 +1,5 @@
-//! Lives that have proven themselves to GNCL, where nodes have keys: what a datagram says ends none of them.
+//! Lives that have proven themselves to GNCL, where nodes have keys: no datagram puts another life in their place. One that says in their name that they leave
+//! is believed, until they answer again (docs/THREAT_MODEL.md).
 //!
 //! Every node of a project can make datagrams that pass for any other node's, so one that was stolen can, too. The connection is what
 //! proves a life: its certificate is shown there and nowhere else. As long as it stands, another life that answers in its node's name, from
