@@ -272,11 +272,6 @@ impl<S: Socket> StreamOutlet<S> {
         self.with(|half, after| half.connect(socket, payload_max, preface, after))
     }
 
-    /// Whether another thread has it in hand just now, as it writes.
-    pub(crate) fn is_in_hand(&self) -> bool {
-        matches!(self.half.try_lock(), Err(TryLockError::WouldBlock))
-    }
-
     /// Whether there is a connection now.
     pub(crate) fn is_connected(&self) -> bool {
         self.lock().is_connected()

@@ -491,9 +491,7 @@ impl Store {
     /// Acknowledges what came so seldom that nothing else did.
     pub(super) async fn acknowledge_late(stores: Arc<Stores>) {
         let (store, mut peers) = (&stores.gncl, Vec::new());
-        // It waits for nobody who writes, and may have lost his CPU: the next look is soon enough.
-        let is_owed = |way: &Way| way.outlet.is_in_hand() || way.acknowledge_if_owed();
-        store.acks.run(ACK_PERIOD, || store.all_ways(&mut peers, is_owed) > 0).await;
+        store.acks.run(ACK_PERIOD, || store.all_ways(&mut peers, Way::acknowledge_if_owed) > 0).await;
     }
 
     /// Of how many sessions `what` is true. Nobody is kept in `peers`, whose memory is used again.
