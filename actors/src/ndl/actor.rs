@@ -253,6 +253,9 @@ impl Shell {
                 // Where too many are silent at once it is not their hosts that are to be doubted.
                 let _ = self.to_probe.try_send(Probe { node, incarnation, to, within });
             }
+            Output::AskForSign { node, incarnation } => {
+                self.stores.gncl.ask_for_a_sign(self.stores.node, node, incarnation);
+            }
             Output::Fact(fact) => self.tell_layers(&fact),
             Output::Moved { node, gncl, .. } => self.tell_of_a_move(node, &gncl),
             Output::Forgotten { node, incarnation } => {

@@ -42,10 +42,10 @@ impl Gncl {
         }
     }
 
-    /// A life that NDL has found has not left. Was it given up for that, what there is with it ends first: nothing passes there any more.
+    /// A life that NDL has found has not left. Was it given up for that, what there is with it ends first, as nothing passes there any more.
     /// spec: GNCL-10
     fn takes_back(&mut self, node: NodeAddress, incarnation: Incarnation, ctx: &mut Context<Self>) {
-        if self.stores.gncl.stays(node, incarnation) {
+        if self.stores.gncl.has_given_up(node, incarnation) {
             self.input(Input::NodeDisowned { node, incarnation }, ctx);
         }
     }

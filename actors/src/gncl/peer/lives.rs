@@ -55,10 +55,17 @@ impl Store {
             .for_each(|peer| peer.is_given_up_if_it_left(now, ago));
     }
 
-    /// NDL has found this life of `node`, whatever it had said: that it leaves was not its own word. Returns whether nothing is taken of it any more
-    /// all the same, as its time was over.
-    pub(in crate::gncl) fn stays(&self, node: NodeAddress, incarnation: Incarnation) -> bool {
-        self.peer(node).is_some_and(|peer| peer.incarnation == incarnation && peer.stays())
+    /// NDL has found this life of `node`: the word that it leaves was not its own. Who waits for its last message to hear that it is gone
+    /// hears that when it is told that it is there, or a second later.
+    pub(crate) fn stays(&self, node: NodeAddress, incarnation: Incarnation) {
+        if let Some(peer) = self.peer(node).filter(|peer| peer.incarnation == incarnation) {
+            peer.stays();
+        }
+    }
+
+    /// Whether nothing is taken any more of this life of `node`, which NDL has found: it was over, or was given up as it said that it leaves.
+    pub(in crate::gncl) fn has_given_up(&self, node: NodeAddress, incarnation: Incarnation) -> bool {
+        self.peer(node).is_some_and(|peer| peer.incarnation == incarnation && peer.was_given_up())
     }
 
     /// To whom a message of a life of `node` that has left or is over may still come.
@@ -185,16 +192,18 @@ impl Peer {
         }
     }
 
-    fn stays(&self) -> bool {
-        // SYNC: see above.
-        let stays = self.has_left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| {
+    fn stays(&self) {
+        // SYNC: see above. An error says that it has said nothing, or that it is too late.
+        let _ = self.has_left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| {
             (left != 0 && left != GIVEN_UP).then_some(0)
         });
-        if stays.is_ok() {
-            // Who waited for its last message to hear that it is gone waits no longer.
-            self.fewer_owed.notify_one();
-        }
-        self.is_over.load(Ordering::Acquire) || stays == Err(GIVEN_UP)
+    }
+
+    /// What is known of its clock by now is of a node that is there: it does not go with what ends.
+    fn was_given_up(&self) -> bool {
+        // SYNC: see above.
+        let is_given_up = self.has_left.compare_exchange(GIVEN_UP, 0, Ordering::Relaxed, Ordering::Relaxed);
+        is_given_up.is_ok() || self.is_over.load(Ordering::Acquire)
     }
 
     /// Whether a message of it that was taken may still come to an application here.

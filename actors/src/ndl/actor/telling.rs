@@ -55,7 +55,13 @@ impl Shell {
     }
 
     fn fence(&self, fact: &MembershipFact) {
-        let MembershipFact::NodeLost { node, incarnation, why } = *fact else { return };
+        let (node, incarnation, why) = match *fact {
+            MembershipFact::NodeLost { node, incarnation, why } => (node, incarnation, why),
+            // By the thread that says that it leaves: a later goodbye is not taken back by this.
+            MembershipFact::NodeFound { node, incarnation, .. } => {
+                return self.stores.gncl.stays(node, incarnation);
+            }
+        };
         match why {
             LossReason::Left => {
                 // What it still sends has its age by its clock, until GNCL forgets it.

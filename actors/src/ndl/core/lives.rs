@@ -320,7 +320,11 @@ impl Core {
     fn contest(&mut self, now: Time, newcomer: Proof) {
         let node = newcomer.announcement.node;
         if let Some(contest) = self.contests.get(&node) {
-            if contest.is_won_by(&newcomer) {
+            let has_given_a_sign = self
+                .members
+                .get(&node)
+                .is_some_and(|member| member.has_given_a_sign_since(contest.tried_since));
+            if contest.is_won_by(&newcomer) && !has_given_a_sign {
                 self.replace(now, newcomer);
             }
             return;
@@ -341,13 +345,22 @@ impl Core {
         let Some(contest) = self.contests.get_mut(&node) else { return };
         (contest.tried, contest.tried_since) = (tried, now);
         (contest.until, contest.again) = (until, CHALLENGES - 1);
+        if let Some(member) = self.members.get(&node) {
+            // Where it is not reached by datagrams, its connections may be at rest.
+            let incarnation = member.announcement.incarnation;
+            self.outputs.push_back(Output::AskForSign { node, incarnation });
+        }
         self.ask_the_tried(now, node);
     }
 
     fn ask_the_tried(&mut self, now: Time, node: NodeAddress) {
         match self.contests.get(&node).map(|contest| (contest.tried, contest.newcomer.from)) {
             Some((Party::Member, _)) => self.challenge_member(now, node),
-            Some((Party::Newcomer, from)) => self.ask(now, from),
+            Some((Party::Newcomer, from)) => {
+                // Others may have taken its place among those that are asked.
+                let _ = self.contact_at(now, from);
+                self.ask(now, from);
+            }
             None => {}
         }
     }
@@ -457,8 +470,10 @@ impl Core {
         let Some(member) = self.members.remove(&node) else { return };
         let contest = self.contests.remove(&node);
         let sources = self.sources(&member).into_keys().collect();
-        // GNCL ends the connection of a life that is over.
-        self.proven.lost(node, member.announcement.incarnation);
+        // GNCL ends the connection of a life that is over; that of one that leaves ends when all is said, and where the word was not its own it stays.
+        if why != LossReason::Left {
+            self.proven.lost(node, member.announcement.incarnation);
+        }
         let silence = self.silence(now, &member);
         self.recall.lost(now, &member, sources, Loss { why, bound: silence.bound });
         self.note_parted(node);

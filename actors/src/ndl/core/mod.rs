@@ -157,6 +157,11 @@ pub(crate) enum Output {
         to: Vec<SocketAddr>,
         within: Duration,
     },
+    /// Have the GNCL of this life of a node give a sign on the connections that stand.
+    AskForSign {
+        node: NodeAddress,
+        incarnation: Incarnation,
+    },
     /// For GNCL and the sync manager.
     Fact(MembershipFact),
     /// For GNCL: a member listens elsewhere now, the address that it prefers first.

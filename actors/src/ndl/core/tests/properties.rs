@@ -109,7 +109,8 @@ proptest! {
                     }
                     Output::SendQuery { .. } | Output::SendMulticastQuery { .. } | Output::SendAnswer { .. }
                     | Output::SendLeave { .. } | Output::Event { .. } | Output::ClockMeasured { .. }
-                    | Output::Moved { .. } | Output::Forgotten { .. } | Output::Collision { .. } | Output::Stalled { .. } | Output::Probe { .. } => {}
+                    | Output::Moved { .. } | Output::Forgotten { .. } | Output::Collision { .. } | Output::Stalled { .. } | Output::Probe { .. }
+                    | Output::AskForSign { .. } => {}
                 }
             }
             prop_assert!(core.members.keys().eq(there.keys()));

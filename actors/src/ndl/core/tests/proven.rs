@@ -133,6 +133,28 @@ fn a_word_in_a_nodes_name_that_it_gives_its_address_up_does_not_end_its_connecti
     assert_eq!(world.at(1).facts, []);
 }
 
+// spec: NDL-5.8
+#[test]
+fn a_word_in_a_nodes_name_that_it_leaves_does_not_take_its_proof_away() {
+    // Given: it is believed, and the node is found again
+    let mut world = linked();
+    let leave = world.at(2).core.announcement().clone();
+    let leave = Datagram { correlation: 0, sent: Time::ZERO, body: Body::Leave(leave) };
+    world.forge(udp(2), 1, &encode(&leave, node(1)));
+    world.run(ms(1));
+    assert_eq!(world.losses(1), [(2, LossReason::Left)]);
+    world.run(PERIOD * 2);
+    assert!(world.knows(1, 2));
+    world.forget_the_past();
+    // When: a thief answers in its name, as a later life
+    world.start(3, &Spec { incarnation: 9, ..with_keys(2) });
+    world.run(PERIOD * 2);
+    // Then
+    assert_eq!(world.losses(1), []);
+    assert_eq!(world.at(1).core.members[&node(2)].announcement.incarnation, FIRST);
+    assert!(world.at(1).core.refusals().of(UNPROVEN) > 0);
+}
+
 // spec: NDL-5.2
 #[test]
 fn a_life_that_never_proved_itself_is_no_bar_to_an_earlier_one() {

@@ -77,6 +77,7 @@ impl Bench {
                 | Output::SendAnswer { .. }
                 | Output::SendLeave { .. }
                 | Output::Probe { .. }
+                | Output::AskForSign { .. }
                 | Output::Event { .. }
                 | Output::ClockMeasured { .. }
                 | Output::AddressTaken { .. }

@@ -353,6 +353,7 @@ impl World {
                 self.send(from, to.there, Datagram { correlation: 0, sent: now, body: Body::Leave(me) });
             }
             Output::Probe { node, incarnation, .. } => process.probes.push((node, incarnation)),
+            Output::AskForSign { .. } => {}
             Output::Fact(fact) => process.facts.push(fact),
             Output::Event { to, .. } if process.is_busy => {
                 process.core.handle(now, Input::EventNotTaken { app: to });

@@ -41,6 +41,7 @@ impl World {
                 let at = self.now + self.chance.between(Duration::ZERO, takes);
                 self.push(at, Event::Tell(from, Box::new(Input::Probed { node, incarnation, host })));
             }
+            Output::AskForSign { node, .. } => self.ask_for_a_sign(from, node, WORD_MAX),
             Output::Fact(fact) => self.told(from, fact),
             Output::ClockMeasured { node, offset, .. } => {
                 let Some(peer) = self.current_of(node) else { return };
