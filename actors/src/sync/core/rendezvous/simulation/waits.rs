@@ -188,7 +188,8 @@ impl Waits {
         self.respites.clear();
         for process in self.told.keys().copied() {
             let of_it = self.open.range((process, 0, 0)..(process + 1, 0, 0));
-            let due = of_it.map(|(place, wait)| self.due(*place, wait)).min();
+            let due =
+                of_it.map(|(place, wait)| self.due(*place, wait)).chain(self.phases.due_of(process)).min();
             let late = due.map_or(Duration::ZERO, |due| now.since(due));
             let is_late = late > LATE;
             self.seen.put_off += u64::from(is_late);

@@ -75,6 +75,11 @@ impl Phases {
         self.open.range((process, phase, 0)..(process, phase + 1, 0)).map(|(_, at)| at)
     }
 
+    /// When each wait of a process has to be over.
+    pub(super) fn due_of(&self, process: usize) -> impl Iterator<Item = Time> {
+        self.open.range((process, 0, 0)..(process + 1, 0, 0)).map(|(_, at)| at.due())
+    }
+
     /// Whether all parties of a phase are among these.
     fn are_all(&self, phase: usize, names: &BTreeSet<&str>) -> bool {
         let is_there =
@@ -290,6 +295,10 @@ impl Waits {
             if said != right {
                 self.violations
                     .push(format!("process {process} says that at {name} wait {said:?}, not {right:?}"));
+            }
+            if !right.is_empty() && self.lacking((process, phase)).is_empty() {
+                self.violations
+                    .push(format!("{right:?} of process {process} wait at {name}, which lacks nobody"));
             }
             status.into_iter().for_each(|status| self.check_lacking((process, phase), status));
         }
