@@ -23,7 +23,7 @@
 //!   (`gncl.datagrams`): how old they are when they are handled. `cpu_ns_each_value` is what both processes needed, `acks_per_s` what this host sent of datagrams beside the
 //!   values that were handled (acknowledgements, repetitions, a few of NDL's). `superseded` are counted values that did not come; `superseded_on_the_way_with_warm_up` and
 //!   `superseded_in_mailboxes_with_warm_up` say where newer ones took their place, of all that were sent. `--bench stream_allocations` counts what memory is asked for.
-//! - `rest_raw_tcp`: the first 1000 bytes after a rest of 100 ms by bare TCP, on a connection that stays open and on one that is dialled and greeted for them.
+//! - `rest_raw_tcp`: the first 1000 bytes after a rest by bare TCP, on a connection that stays open and on one that is dialled and greeted for them.
 //! - `slow_link`: the same as `control_beside_bulk_1000`, and bare TCP, on two hosts with a link of 10 Mbit/s between them
 //!   (network namespaces: needs root, `ip` and `tc`); `slow_link_priorities`: the hosts send by priority what waits.
 

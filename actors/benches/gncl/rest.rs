@@ -9,26 +9,27 @@ use std::{
 
 use sinew_figures::{Alone, Figures, process::say_there};
 
-/// What passes before each message.
+/// What passes before each message; the connection that stays rests twice as long.
 const REST: Duration = Duration::from_millis(100);
 /// Bytes of a message.
 const MESSAGE: usize = 1000;
 /// Bytes of what two nodes say before the first message: HELLO, and WELCOME back.
 const HELLO: usize = 200;
 
-/// Sends back what comes on every connection, until this process is ended.
+/// Sends back what comes, until this process is ended: on the first connection, which stays, by a thread of its own, and on one further one after the other.
 pub(crate) fn echo(address: SocketAddrV4) {
     let listener = TcpListener::bind(address).expect("a free port");
     say_there();
-    for connection in listener.incoming() {
-        let connection = connection.expect("a descriptor");
-        connection.set_nodelay(true).expect("TCP has no delay");
-        thread::spawn(move || {
-            let (mut reader, mut writer) = (&connection, &connection);
-            // Ends with the connection.
-            let _ = std::io::copy(&mut reader, &mut writer);
-        });
-    }
+    let (stays, _) = listener.accept().expect("the measuring end");
+    thread::spawn(move || send_back(&stays));
+    listener.incoming().for_each(|connection| send_back(&connection.expect("a descriptor")));
+}
+
+fn send_back(connection: &TcpStream) {
+    connection.set_nodelay(true).expect("TCP has no delay");
+    let (mut reader, mut writer) = (connection, connection);
+    // Ends with the connection.
+    let _ = std::io::copy(&mut reader, &mut writer);
 }
 
 /// Both in turn, so often each.
