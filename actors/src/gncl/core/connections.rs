@@ -369,6 +369,18 @@ impl Core {
         let deadline = now + self.settings.handshake;
         self.connections.insert(connection, Connection { stage: Stage::Leaving, from, deadline });
         self.outputs.push_back(Output::Refuse(connection, refusal));
+        // Whom we dialled is among them now: a peer whose addresses change without end must not hold more than there are places.
+        if self.strangers().count() > self.settings.strangers_max {
+            self.close_oldest_refused();
+        }
+    }
+
+    fn close_oldest_refused(&mut self) {
+        let oldest = self.connections.iter().find(|(_, known)| known.stage == Stage::Leaving);
+        let Some(connection) = oldest.map(|(connection, _)| *connection) else { return };
+        self.count("too many strangers", "the oldest one that was refused was closed".to_owned());
+        self.connections.remove(&connection);
+        self.outputs.push_back(Output::Close(connection));
     }
 
     pub(super) fn ended(&mut self, now: Time, connection: ConnectionId) {

@@ -239,13 +239,14 @@ impl Play<'_> {
         assert!(orders <= 16 * connections_max, "{orders} orders for one input");
         assert!(self.core.peers.len() <= PEERS_MAX, "{} peers", self.core.peers.len());
         let strange = |stage| matches!(stage, Stage::Stranger | Stage::Leaving);
-        // Their number has no bound of its own, as who is refused may be a peer's that was dialled again and again: their time has.
+        let strangers = self.core.connections.values().filter(|held| strange(held.stage)).count();
+        assert!(strangers <= STRANGERS_MAX, "{strangers} strangers");
         let latest = self.now + settings().handshake;
         for stranger in self.core.connections.values().filter(|held| strange(held.stage)) {
             assert!(stranger.deadline <= latest, "a stranger may stay until {:?}", stranger.deadline);
         }
         assert!(
-            self.core.connections.len() <= 2 * connections_max,
+            self.core.connections.len() <= connections_max,
             "{} connections",
             self.core.connections.len()
         );

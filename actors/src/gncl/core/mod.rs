@@ -304,7 +304,10 @@ impl Core {
         let over = self.connections.iter().filter(|(_, connection)| connection.deadline <= now);
         let over: Vec<_> = over.map(|(id, connection)| (*id, connection.stage)).collect();
         for (connection, stage) in over {
-            self.timed_out(now, connection, stage);
+            // One that makes room for another is gone by then.
+            if self.stage(connection) == Some(stage) {
+                self.timed_out(now, connection, stage);
+            }
         }
         let due =
             self.peers.iter().filter(|(_, peer)| peer.next_wake(&self.settings).is_some_and(|at| at <= now));

@@ -180,6 +180,34 @@ impl Store {
     }
 }
 
+#[cfg(test)]
+impl Store {
+    /// This life of `node`, on connections that stand for themselves.
+    pub(crate) fn meet_in_test(
+        &self,
+        node: NodeAddress,
+        incarnation: Incarnation,
+        stores: &Stores,
+    ) -> Arc<Peer> {
+        use super::super::core::{ConnectionId, Lane};
+        let attach = Attach {
+            connection: ConnectionId(1),
+            node,
+            incarnation,
+            lane: Lane::Control,
+            by_class: false,
+            takes_cancels: true,
+            takes_outcomes: true,
+            takes_datagrams: false,
+            is_guarded: false,
+            payload_max: 1 << 20,
+            answers_max: 8_192,
+            welcome: None,
+        };
+        self.meet(Time::now(), &attach, stores)
+    }
+}
+
 impl Peer {
     fn is_given_up_if_it_left(&self, now: Time, ago: Duration) {
         // SYNC: Relaxed; a word by itself, which one thread alone takes out: who finds that it stays sees that it is given up, or it is not.

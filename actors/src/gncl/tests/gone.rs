@@ -17,7 +17,7 @@ use crate::{
     audit::{self, Account, Place},
     gncl::{
         arrivals::End,
-        core::{Attach, ConnectionId, Lane},
+        core::Lane,
         owed::Owed,
         peer::Peer,
         way::{Taken, Way},
@@ -31,21 +31,7 @@ const GONE_MAX: u64 = 16;
 
 /// A life of node 9, on connections that stand for themselves.
 fn life(node: &Node, number: u64) -> Arc<Peer> {
-    let attach = Attach {
-        connection: ConnectionId(1),
-        node: NINE,
-        incarnation: Incarnation(number),
-        lane: Lane::Control,
-        by_class: false,
-        takes_cancels: true,
-        takes_outcomes: true,
-        takes_datagrams: false,
-        is_guarded: false,
-        payload_max: 1 << 20,
-        answers_max: 8_192,
-        welcome: None,
-    };
-    let peer = node.stores.gncl.meet(Time::now(), &attach, &node.stores);
+    let peer = node.stores.gncl.meet_in_test(NINE, Incarnation(number), &node.stores);
     let way = way(&peer);
     way.attach(LinkNumber::default());
     let ack = Ack { memory: number, epoch: number, of: 0, next: 1, change: 0, held: Vec::new(), room: None };

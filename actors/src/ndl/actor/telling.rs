@@ -136,6 +136,26 @@ mod tests {
     use crate::{config::NodeConfig, stores::Stores};
 
     #[test]
+    fn who_is_found_in_the_life_that_was_said_to_leave_has_not_left() {
+        // Given: a life that GNCL has a connection with
+        let stores = Stores::for_test(NodeConfig::new("hip"), Incarnation(1));
+        stores.gncl_listen.get_or_init(|| ([127, 0, 0, 1], 1).into());
+        let (shell, _readers) = Shell::bind(stores.clone()).expect("any free port");
+        let (node, incarnation, why) = (NodeAddress::new(9), Incarnation(3), LossReason::Left);
+        let _peer = stores.gncl.meet_in_test(node, incarnation, &stores);
+        let stays = stores.gncl.owed(node);
+        // When
+        shell.tell_layers(&MembershipFact::NodeLost { node, incarnation, why });
+        assert_ne!(stores.gncl.owed(node), stays, "its last messages are waited for");
+        let found = |incarnation| MembershipFact::NodeFound { node, incarnation, gncl: Vec::new() };
+        shell.tell_layers(&found(Incarnation(4)));
+        assert_ne!(stores.gncl.owed(node), stays, "another life is found");
+        shell.tell_layers(&found(incarnation));
+        // Then
+        assert_eq!(stores.gncl.owed(node), stays);
+    }
+
+    #[test]
     fn a_node_that_moves_without_end_has_so_many_lines_in_the_log_and_no_more() {
         let stores = Stores::for_test(NodeConfig::new("hip"), Incarnation(1));
         stores.gncl_listen.get_or_init(|| ([127, 0, 0, 1], 1).into());

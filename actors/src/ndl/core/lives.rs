@@ -12,7 +12,6 @@ use super::{
     clock::{Exchange, Measured, PeerClock},
     contact::{Contact, Role},
     contacts::ContactMut,
-    cycle::IN_A_ROW_MAX,
     gone::Silence,
     recall::Loss,
     routes::Routes,
@@ -23,10 +22,6 @@ use crate::{
     ndl::{LossReason, MembershipFact, NodeEvent, Progress, datagram::Announcement},
 };
 
-/// Longest time that a node has to show that it lives, when another process comes with its address.
-const CHALLENGE_MAX: Duration = Duration::from_millis(100);
-/// How often it is asked in that time: a question or its answer may be lost.
-const CHALLENGES: u32 = 3;
 /// Time in which a broken connection may be made again at another address.
 const LINK_GRACE: Duration = Duration::from_secs(1);
 
@@ -42,41 +37,8 @@ pub(super) struct Proof {
 }
 
 impl Proof {
-    fn is_of(&self, other: &Announcement) -> bool {
+    pub(super) fn is_of(&self, other: &Announcement) -> bool {
         self.announcement.node == other.node && self.announcement.is_same_life(other)
-    }
-}
-
-/// A newcomer claims a member's address in a later life. The member has a time to show that it lives; if it does not, the newcomer has as long to
-/// show that it does still: who finds that a living process has its address gives that up, and is silent.
-#[derive(Debug)]
-pub(super) struct Contest {
-    /// An answer of the member to a question of then or later says that there are two.
-    since: Time,
-    tried: Party,
-    tried_since: Time,
-    /// When the one that is tried is asked again, or its time is over.
-    pub(super) until: Time,
-    /// How often it is asked again in its time.
-    again: u32,
-    /// How often its time was given anew, as our own timer was late, or the member gave a sign.
-    put_off: u32,
-    pub(super) newcomer: Proof,
-}
-
-/// Who is to show that it lives.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Party {
-    Member,
-    Newcomer,
-}
-
-impl Contest {
-    /// Whether this says that the newcomer lives still, now that the member has had its time.
-    fn is_won_by(&self, proof: &Proof) -> bool {
-        self.tried == Party::Newcomer
-            && proof.asked >= self.tried_since
-            && self.newcomer.is_of(&proof.announcement)
     }
 }
 
@@ -161,24 +123,6 @@ impl Core {
         self.measure(now, node, proof.exchange);
         self.answers_again(node);
         self.note_progress(node, proof.progress);
-    }
-
-    /// The member lives, and was asked after the newcomer came: there are two. The newcomer, if the address is its own.
-    fn settle_contest(&mut self, now: Time, proof: &Proof) -> Option<Proof> {
-        let node = proof.announcement.node;
-        let is_later =
-            |contest: &Contest| proof.asked >= contest.since && proof.from != contest.newcomer.from;
-        if !self.contests.get(&node).is_some_and(is_later) {
-            return None;
-        }
-        let newcomer = self.contests.remove(&node)?.newcomer;
-        // The member may have proven itself since the newcomer came.
-        if newcomer.announcement.precedes(&proof.announcement) && !self.contradicts_a_proof(now, &newcomer) {
-            self.collide(now, node, (&newcomer).into(), proof.into());
-            return Some(newcomer);
-        }
-        self.collide(now, node, proof.into(), (&newcomer).into());
-        None
     }
 
     fn measure(&mut self, now: Time, node: NodeAddress, exchange: Option<Exchange>) {
@@ -303,7 +247,7 @@ impl Core {
     }
 
     /// A member is there in a new life. // spec: NDL-5.1
-    fn replace(&mut self, now: Time, proof: Proof) {
+    pub(super) fn replace(&mut self, now: Time, proof: Proof) {
         let node = proof.announcement.node;
         let Some(former) = self.members.remove(&node) else { return };
         let silence = self.silence(now, &former);
@@ -314,105 +258,6 @@ impl Core {
         let why = LossReason::Restarted;
         self.outputs.push_back(Output::Fact(MembershipFact::NodeLost { node, incarnation, why }));
         self.join(now, proof, Arrival::Restarted(silence), Some(incarnation));
-    }
-
-    /// A newcomer with a member's address: has the member been restarted, or are there two? // spec: NDL-5.3
-    fn contest(&mut self, now: Time, newcomer: Proof) {
-        let node = newcomer.announcement.node;
-        if let Some(contest) = self.contests.get(&node) {
-            let has_given_a_sign = self
-                .members
-                .get(&node)
-                .is_some_and(|member| member.has_given_a_sign_since(contest.tried_since));
-            if contest.is_won_by(&newcomer) && !has_given_a_sign {
-                self.replace(now, newcomer);
-            }
-            return;
-        }
-        let tried = Party::Member;
-        let contest =
-            Contest { since: now, tried, tried_since: now, until: now, again: 0, put_off: 0, newcomer };
-        self.contests.insert(node, contest);
-        self.give_time(now, node, tried);
-    }
-
-    fn challenge(&self) -> Duration {
-        self.rest().period.min(CHALLENGE_MAX)
-    }
-
-    fn give_time(&mut self, now: Time, node: NodeAddress, tried: Party) {
-        let until = now + self.challenge() / CHALLENGES;
-        let Some(contest) = self.contests.get_mut(&node) else { return };
-        (contest.tried, contest.tried_since) = (tried, now);
-        (contest.until, contest.again) = (until, CHALLENGES - 1);
-        if let Some(member) = self.members.get(&node) {
-            // Where it is not reached by datagrams, its connections may be at rest.
-            let incarnation = member.announcement.incarnation;
-            self.outputs.push_back(Output::AskForSign { node, incarnation });
-        }
-        self.ask_the_tried(now, node);
-    }
-
-    fn ask_the_tried(&mut self, now: Time, node: NodeAddress) {
-        match self.contests.get(&node).map(|contest| (contest.tried, contest.newcomer.from)) {
-            Some((Party::Member, _)) => self.challenge_member(now, node),
-            Some((Party::Newcomer, from)) => {
-                // Others may have taken its place among those that are asked.
-                let _ = self.contact_at(now, from);
-                self.ask(now, from);
-            }
-            None => {}
-        }
-    }
-
-    fn challenge_member(&mut self, now: Time, node: NodeAddress) {
-        // An answer of the member from where the newcomer is proves nothing.
-        let newcomer = self.contests.get(&node).map(|contest| contest.newcomer.from);
-        let routes = self.members.get(&node).into_iter().flat_map(|member| member.routes.places());
-        let asked: Vec<_> = routes.filter(|place| Some(*place) != newcomer).collect();
-        asked.into_iter().for_each(|place| self.ask(now, place));
-    }
-
-    pub(super) fn decide_contests(&mut self, now: Time) {
-        let due = self.contests.iter().filter(|(_, contest)| contest.until <= now).map(|(node, _)| *node);
-        for node in due.collect::<Vec<_>>() {
-            self.decide_contest(now, node);
-        }
-    }
-
-    /// Who is tried has not answered: it is asked again, or its time is over.
-    fn decide_contest(&mut self, now: Time, node: NodeAddress) {
-        let challenge = self.challenge();
-        let Some(contest) = self.contests.get_mut(&node) else { return };
-        let is_late = now.since(contest.until) > challenge / 2;
-        if contest.again > 0 && !is_late {
-            contest.again -= 1;
-            contest.until = now + challenge / CHALLENGES;
-            self.ask_the_tried(now, node);
-            return;
-        }
-        let (tried, since) = (contest.tried, contest.tried_since);
-        let has_given_a_sign = tried == Party::Member
-            && self.members.get(&node).is_some_and(|member| member.has_given_a_sign_since(since));
-        // Starved ourselves, we may not have read the answer yet; and a sign may have been under way when the member ended. It is asked
-        // again, but not for ever. spec: NDL-4.2
-        if (is_late || has_given_a_sign) && contest.put_off < IN_A_ROW_MAX {
-            contest.put_off += 1;
-            self.give_time(now, node, tried);
-        } else if tried == Party::Member && !has_given_a_sign {
-            self.give_time(now, node, Party::Newcomer);
-        } else {
-            // The member lives, or the newcomer does not: its next answer begins another contest.
-            self.contests.remove(&node);
-        }
-    }
-
-    /// Whether this is of a newcomer that is tried, from where it is or says that it is.
-    pub(super) fn is_contender(&self, from: Place, announcement: &Announcement) -> bool {
-        self.contests.get(&announcement.node).is_some_and(|Contest { newcomer, .. }| {
-            let is_from_there = newcomer.from == from || newcomer.announcement.has_ndl_at(from.there);
-            newcomer.is_of(announcement) && is_from_there
-        })
     }
 
     /// What GNCL's connections tell. // spec: NDL-4.3
@@ -432,7 +277,11 @@ impl Core {
             return;
         };
         match fact {
-            LinkFact::LinkUp { .. } => (member.link_broke, member.link_until) = (None, Time::MAX),
+            LinkFact::LinkUp { .. } => {
+                (member.link_broke, member.link_until) = (None, Time::MAX);
+                // It said so just now. spec: NDL-4.7
+                member.sign = now;
+            }
             LinkFact::LinkBroken { .. } => {
                 (member.link_broke, member.link_until) = (Some(now), now + LINK_GRACE);
                 self.challenge_member(now, node);
@@ -507,11 +356,8 @@ impl Core {
             // Perhaps only its GNCL restarts: then it answers this.
             places.into_iter().for_each(|place| self.ask(now, place));
         }
-        // Who proved himself just now, and is why this one is lost, comes by an answer of his own.
-        if let Some(contest) = contest
-            && !self.contradicts_a_proof(now, &contest.newcomer)
-        {
-            self.arrive(now, contest.newcomer);
+        if let Some(contest) = contest {
+            self.succeed(now, &contest.newcomer);
         }
     }
 

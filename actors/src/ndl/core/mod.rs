@@ -14,6 +14,7 @@
 //! | `member` | what is known of a node that answers |
 //! | `own` | which addresses lead to this host |
 //! | `lives` | who comes, goes, comes again |
+//! | `contest` | a newcomer with a member's address: a restart, or a second process |
 //! | `gone` | who has gone, and where he is asked |
 //! | `duplicates` | which of two processes has a node address |
 //! | `proven` | whom no datagram ends, where nodes have keys |
@@ -32,6 +33,7 @@ mod budget;
 mod clock;
 mod contact;
 mod contacts;
+mod contest;
 mod cycle;
 mod duplicates;
 mod gone;
@@ -79,9 +81,9 @@ use self::{
     budget::Strangers,
     contact::{Question, Questions, Role},
     contacts::Contacts,
+    contest::Contest,
     duplicates::{Claimant, Trial},
     gone::Gone,
-    lives::Contest,
     member::Member,
     memory::Memory,
     own::Own,

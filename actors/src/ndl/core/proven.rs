@@ -112,9 +112,15 @@ impl Core {
         });
         let is_another_there = self.proven_member_at(proof.from).is_some_and(|other| other != claimed.node);
         if is_other_life || is_another_there {
-            let Announcement { node, incarnation, .. } = *claimed;
+            let Announcement { node, incarnation, ref name, .. } = *claimed;
+            let at_that_place = || self.members.get(&self.proven_member_at(proof.from)?);
+            let holder = if is_other_life { self.members.get(&node) } else { at_that_place() };
+            let (its_name, at) = holder.map_or(("?", None), |holder| {
+                (holder.announcement.name.as_str(), Some(holder.routes.best().there))
+            });
             let what = format_args!(
-                "{} says that it is {node} in life {incarnation}; the node that proved itself is still connected",
+                "{} says that it is the node {name:?} with address {node} in life {incarnation}; the node {its_name:?} ({at:?}) proved itself, and \
+                 is connected",
                 proof.from.there
             );
             self.refusals.count(now, "NDL answer of a life that is not proven", &what);

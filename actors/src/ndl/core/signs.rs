@@ -26,6 +26,11 @@ impl Member {
         self.host != Some(Host::Refuses) && self.sign > then
     }
 
+    /// Whether its connection stands.
+    pub(super) const fn is_linked(&self) -> bool {
+        matches!(self.link_until, Time::MAX)
+    }
+
     /// Whether what it sent at this time of its clock may have been sent so lately that it is a sign, by what is known of that clock. // spec: NDL-4.7
     fn may_have_sent_lately(&self, now: Time, sent: Time, pace: &Pace) -> bool {
         let times = self.clock.offset(now).and_then(|offset| offset.in_our_clock(now, sent));

@@ -1,5 +1,6 @@
 //! Whole conversations of cores on a simulated network, in virtual time.
 
+mod contests;
 mod duplicates;
 mod lives;
 mod memory;

@@ -26,10 +26,6 @@ const BOTH: u32 = 9;
 /// Seeds in an ordinary run, and those within which each fault must be found.
 const SEEDS: u64 = if cfg!(debug_assertions) { 100 } else { 200 };
 
-fn gave_up(world: &World, index: u16) -> bool {
-    world.at(index).others.iter().any(|output| matches!(output, Output::AddressTaken { .. }))
-}
-
 /// The life of the doubled node that `index` has.
 fn has(world: &World, index: u16) -> Option<Incarnation> {
     world.at(index).core.members.get(&node(BOTH)).map(|member| member.announcement.incarnation)
@@ -70,7 +66,7 @@ fn a_newcomer_that_meets_the_impostor_first_ends_with_the_elder_life_and_names_b
     let (holder, newcomer) = (claimant(BOTH, ELDER), claimant(BOTH, LATER));
     let both = Output::Collision { node: node(BOTH), holder, newcomer };
     assert_eq!(world.at(1).others, [both]);
-    assert!(!gave_up(&world, LATER), "it has not heard of the elder");
+    assert!(!world.gave_up(LATER), "it has not heard of the elder");
 }
 
 // spec: NDL-5.7
@@ -93,9 +89,9 @@ fn of_two_that_settled_apart_the_later_life_gives_up_when_they_meet_and_who_had_
     // when
     world.mend();
     // then
-    world.run_until(PERIOD * 6, |world| gave_up(world, LATER));
+    world.run_until(PERIOD * 6, |world| world.gave_up(LATER));
     world.run(PERIOD * 2);
-    assert!(!gave_up(&world, ELDER));
+    assert!(!world.gave_up(ELDER));
     assert_eq!((has(&world, 1), has(&world, 2)), (Some(Incarnation(1)), Some(Incarnation(1))));
 }
 
@@ -114,7 +110,7 @@ fn who_was_frozen_for_so_long_that_a_later_life_took_over_gives_up_when_it_goes_
     world.run(PERIOD * 15 + ms(1));
     world.forget_the_past();
     world.run(PERIOD * 8);
-    assert!(gave_up(&world, ELDER) && !gave_up(&world, LATER));
+    assert!(world.gave_up(ELDER) && !world.gave_up(LATER));
     assert_eq!((has(&world, 1), has(&world, 2)), (Some(Incarnation(2)), Some(Incarnation(2))));
     assert_eq!((world.losses(1), world.losses(2)), (vec![], vec![]), "nobody doubted the later life");
 }
@@ -136,7 +132,7 @@ fn two_that_meet_in_the_last_period_of_settling() -> World {
 fn of_two_that_meet_when_the_elder_has_almost_settled_the_later_life_gives_up_alone() {
     let mut world = two_that_meet_in_the_last_period_of_settling();
     world.run(PERIOD * 8);
-    assert!(gave_up(&world, LATER) && !gave_up(&world, ELDER));
+    assert!(world.gave_up(LATER) && !world.gave_up(ELDER));
     assert_eq!(world.at(ELDER).core.announcement().claim, Claim::Held);
 }
 
@@ -146,7 +142,7 @@ fn who_settles_gives_up_when_a_later_life_that_does_not_hear_it_has_settled_or_s
     for is_endless in [false, true] {
         let mut world = two_that_meet_in_the_last_period_of_settling();
         let begin = world.now;
-        while !gave_up(&world, ELDER) {
+        while !world.gave_up(ELDER) {
             assert!(world.now.since(begin) <= PERIOD * 6, "it waits for ever");
             assert_eq!(world.at(ELDER).core.announcement().claim, Claim::Settling);
             // No answer finds its question any more: a datagram takes twice as long.
@@ -158,7 +154,7 @@ fn who_settles_gives_up_when_a_later_life_that_does_not_hear_it_has_settled_or_s
                 later.settle(now);
             }
         }
-        assert!(!gave_up(&world, LATER));
+        assert!(!world.gave_up(LATER));
         let claim = if is_endless { Claim::Settling } else { Claim::Held };
         assert_eq!(world.at(LATER).core.announcement().claim, claim);
     }
@@ -183,9 +179,9 @@ fn who_was_alone_and_meets_an_elder_life_that_makes_way_for_it_keeps_the_address
     parted.into_iter().for_each(|(one, other)| part(&mut world, one, other));
     world.run(ms(2));
     // then: the elder has heard that the other had settled
-    assert!(gave_up(&world, ELDER) && !gave_up(&world, LATER));
+    assert!(world.gave_up(ELDER) && !world.gave_up(LATER));
     world.run(PERIOD * 8);
-    assert!(!gave_up(&world, LATER));
+    assert!(!world.gave_up(LATER));
     assert_eq!(world.at(LATER).core.announcement().claim, Claim::Held);
 }
 
@@ -279,7 +275,7 @@ fn meet(seed: u64, fault: Option<Fault>) -> Result<(), String> {
     // A settling, a trial, a loss, and the longest wait before a lost node's address is asked again.
     wait(&mut world, 5 + 5 + 4 + 18);
     let owners: BTreeSet<_> = (1..=others).map(|index| has(&world, index)).collect();
-    let left: Vec<u16> = [ELDER, LATER].into_iter().filter(|index| !gave_up(&world, *index)).collect();
+    let left: Vec<u16> = [ELDER, LATER].into_iter().filter(|index| !world.gave_up(*index)).collect();
     let owner = match left[..] {
         [owner] => Some(owner),
         [ELDER, LATER] if !meet => Some(ELDER),

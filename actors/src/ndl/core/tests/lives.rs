@@ -5,6 +5,7 @@ use sinew_runtime::{tid::Incarnation, time::Time};
 use super::world::{PERIOD, Spec, World, claimant, ms, node, udp};
 use crate::{
     config::WatchGroup,
+    gncl::LinkFact,
     ndl::{
         LossReason, MembershipFact, NodeEvent,
         core::{Input, Output, Source},
@@ -223,6 +224,8 @@ fn a_member_that_gives_signs_stays_though_it_is_not_reached_while_a_newcomer_is_
         world.run(ms(20));
     }
     assert_eq!(world.at(1).facts, []);
+    let both = Output::Collision { node: node(2), holder: claimant(2, 2), newcomer: claimant(2, 3) };
+    assert_eq!(world.at(1).others, [both], "both are named");
     // when: it has ended
     world.kill(2);
     world.run(PERIOD * 2);
@@ -233,7 +236,8 @@ fn a_member_that_gives_signs_stays_though_it_is_not_reached_while_a_newcomer_is_
 // spec: NDL-5.3
 #[test]
 fn a_restart_elsewhere_is_told_when_the_member_has_had_its_time_and_soon_after_where_an_answer_is_lost() {
-    for (lasts, at_most) in [(ms(0), ms(101)), (ms(110), ms(25))] {
+    // A third of its time is given to signs of the member that are under way when the newcomer answers.
+    for (lasts, at_most) in [(ms(0), ms(135)), (ms(110), ms(60))] {
         let mut world = World::of_members(2);
         world.kill(2);
         world.start(3, &Spec { incarnation: 2, ..Spec::of(2) });
@@ -243,7 +247,36 @@ fn a_restart_elsewhere_is_told_when_the_member_has_had_its_time_and_soon_after_w
         world.mend();
         world.run_until(at_most, |world| !world.at(1).facts.is_empty());
         assert_eq!(world.losses(1), [(2, LossReason::Restarted)]);
+        assert_eq!(world.at(1).others, [], "nobody says that there are two");
     }
+}
+
+/// As long as the last question to the newcomer is under way it has answered, and the end of that part of its time is to come.
+fn with_a_newcomer_that_has_answered() -> World {
+    let mut world = with_a_newcomer_and_a_member_that_is_not_reached();
+    world.run_until(ms(110), |world| world.at(1).core.contests.values().any(|contest| contest.has_answered));
+    world
+}
+
+// spec: NDL-5.3
+#[test]
+fn who_stood_still_behind_the_newcomers_answer_asks_again() {
+    let mut world = with_a_newcomer_that_has_answered();
+    // when: the newcomer ends meanwhile
+    world.stall(1, ms(300));
+    world.kill(3);
+    world.run(PERIOD * 6);
+    // then
+    assert_eq!(world.losses(1), []);
+}
+
+// spec: NDL-5.3
+#[test]
+fn a_member_that_connects_behind_the_newcomers_answer_stays() {
+    let mut world = with_a_newcomer_that_has_answered();
+    world.link(1, LinkFact::LinkUp { node: node(2), incarnation: Incarnation(1) });
+    world.run(ms(100));
+    assert_eq!(world.at(1).facts, []);
 }
 
 // spec: NDL-5.3
@@ -283,10 +316,7 @@ fn of_two_that_start_together_with_one_address_the_later_life_gives_up_alone() {
     world.start(2, &Spec::of(2));
     world.start(3, &Spec { incarnation: 2, ..Spec::of(2) });
     world.run(PERIOD * 6);
-    let gave_up = |world: &World, index| {
-        world.at(index).others.iter().any(|output| matches!(output, Output::AddressTaken { .. }))
-    };
-    assert!(gave_up(&world, 3));
-    assert!(!gave_up(&world, 2));
+    assert!(world.gave_up(3));
+    assert!(!world.gave_up(2));
     assert!(world.knows(1, 2));
 }

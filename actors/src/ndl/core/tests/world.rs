@@ -18,7 +18,7 @@ use crate::{
     lncl::AppFact,
     ndl::{
         LossReason, MembershipFact, NodeEvent,
-        core::{Core, Input, Output, Place, Way, duplicates::Claimant},
+        core::{Core, Input, Output, Place, Way, duplicates::Claimant, simulation::Chance},
         datagram::{Answer, Body, Datagram, encode},
     },
 };
@@ -142,6 +142,13 @@ pub(super) struct World {
     sent: BTreeMap<(SocketAddr, SocketAddr), u64>,
     /// Of those each such one is lost.
     pub(super) loses_each: Option<u64>,
+    /// By chance so many of a thousand are lost.
+    pub(super) loses_per_mille: u64,
+    chance: Chance,
+    /// Connections deliver: who is asked for a sign gives it after so long at least, and at most.
+    pub(super) signs_after: Option<(Duration, Duration)>,
+    /// When who is asked for a sign gives it.
+    signs: BTreeMap<(SocketAddr, NodeAddress, Incarnation), Time>,
     /// No goodbye arrives.
     pub(super) loses_goodbyes: bool,
     /// Time that a datagram is under way.
@@ -159,6 +166,10 @@ impl World {
             cut: BTreeSet::new(),
             sent: BTreeMap::new(),
             loses_each: None,
+            loses_per_mille: 0,
+            chance: Chance::new(0),
+            signs_after: None,
+            signs: BTreeMap::new(),
             loses_goodbyes: false,
             flight: FLIGHT,
         }
@@ -215,8 +226,23 @@ impl World {
         });
     }
 
+    /// What is left to chance goes by this seed.
+    pub(super) fn seeded(mut self, seed: u64) -> Self {
+        self.chance = Chance::new(seed);
+        self
+    }
+
     pub(super) fn kill(&mut self, index: u16) {
-        self.process(index).is_alive = false;
+        let process = self.process(index);
+        process.is_alive = false;
+        let me = process.core.announcement();
+        let life = (me.node, me.incarnation);
+        let now = self.now;
+        self.signs.retain(|(_, node, incarnation), at| (*node, *incarnation) != life || *at <= now);
+    }
+
+    pub(super) fn is_alive(&self, index: u16) -> bool {
+        self.at(index).is_alive
     }
 
     pub(super) fn stall(&mut self, index: u16, duration: Duration) {
@@ -256,6 +282,11 @@ impl World {
 
     pub(super) fn knows(&self, index: u16, address: u32) -> bool {
         self.at(index).core.members.contains_key(&node(address))
+    }
+
+    /// Whether `index` found that its node address is another's.
+    pub(super) fn gave_up(&self, index: u16) -> bool {
+        self.at(index).others.iter().any(|output| matches!(output, Output::AddressTaken { .. }))
     }
 
     /// Why `index` lost nodes, in order.
@@ -301,9 +332,37 @@ impl World {
         // A timer goes before a datagram of the same moment: the harder order.
         match wake {
             Some((time, address)) if time <= next => {
+                self.give_signs(address);
                 self.with(address, |core, now| core.handle(now, Input::TimePassed));
             }
             Some(_) | None => self.land(),
+        }
+    }
+
+    /// GNCL asks the other one on their connection.
+    fn ask_for_sign(&mut self, from: SocketAddr, node: NodeAddress, incarnation: Incarnation) {
+        let Some((least, most)) = self.signs_after else { return };
+        let is_it = |process: &&Process| {
+            let me = process.core.announcement();
+            (me.node, me.incarnation) == (node, incarnation) && process.is_alive
+        };
+        if self.processes.values().find(is_it).is_some_and(|process| process.stalled_until <= self.now) {
+            let at = self.now + self.chance.between(least, most);
+            let sign = self.signs.entry((from, node, incarnation)).or_insert(at);
+            // One that is under way comes first.
+            *sign = if *sign <= self.now { at } else { *sign };
+        }
+    }
+
+    /// What GNCL has heard by now of those that are in doubt, as the shell says it before it says that time passed, and not otherwise.
+    fn give_signs(&mut self, address: SocketAddr) {
+        for (node, incarnation) in self.processes[&address].core.in_doubt() {
+            let sign = self.signs.get(&(address, node, incarnation)).copied();
+            if let Some(at) = sign.filter(|at| *at <= self.now) {
+                self.with(address, |core, now| {
+                    core.handle(now, Input::SignSeen { node, incarnation, at });
+                });
+            }
         }
     }
 
@@ -352,8 +411,11 @@ impl World {
             Output::SendLeave { to, .. } => {
                 self.send(from, to.there, Datagram { correlation: 0, sent: now, body: Body::Leave(me) });
             }
-            Output::Probe { node, incarnation, .. } => process.probes.push((node, incarnation)),
-            Output::AskForSign { .. } => {}
+            Output::Probe { node, incarnation, .. } => {
+                process.probes.push((node, incarnation));
+                self.ask_for_sign(from, node, incarnation);
+            }
+            Output::AskForSign { node, incarnation } => self.ask_for_sign(from, node, incarnation),
             Output::Fact(fact) => process.facts.push(fact),
             Output::Event { to, .. } if process.is_busy => {
                 process.core.handle(now, Input::EventNotTaken { app: to });
@@ -378,7 +440,8 @@ impl World {
         self.processes.get_mut(&from).unwrap().datagrams_sent += 1;
         let sent = self.sent.entry((from, to)).or_default();
         *sent += 1;
-        let is_lost = self.loses_each.is_some_and(|each| sent.is_multiple_of(each));
+        let is_lost = self.loses_each.is_some_and(|each| sent.is_multiple_of(each))
+            || self.loses_per_mille > 0 && self.chance.happens(self.loses_per_mille);
         if !is_lost && !self.cut.contains(&(from, to)) {
             self.sequence += 1;
             let flying = Flying { from, to, way, bytes: bytes.to_vec() };
