@@ -32,9 +32,15 @@
  *   own if it may call malloc, that is if the parent had one thread. The node sees the parent's end also while a child
  *   lives that has its connections, too, and tells the peers of its direct links.
  *   Endpoints do not survive exec.
+ * Protected.  Commands that move something: sinew_send_protected seals them, and sinew_guard_output lets only good ones through to an
+ *   output, which is made safe when they are not, or do not come; sinew_arm makes it live, and nothing else does. The same bytes and
+ *   rules as in Rust (docs/protocol/protected.md). The functions that a guard calls may call nothing of a guard but sinew_trip, and
+ *   no sinew_receive_message of an endpoint with protected payloads (SINEW_ERROR_BUSY). A guard knows a payload's length, and not whether you can
+ *   read it: who cannot calls sinew_trip. An output is not called safe while what makes it safe fails (SINEW_ERROR_SAFE_FAILS). Release guards before their outputs, and before the end of main. A child of fork has no guards of its parent's, and
+ *   none of its own where the parent had some, or tried to make one (SINEW_ERROR_FORKED): its outputs are not made safe there.
  * Log.  What no status tells (a link that was not made, no shared memory) is a line on the standard error, warnings and
  *   errors only. The environment variable SINEW_LOG says otherwise: off, error, warn, info, debug; it is read at the first
- *   registration.
+ *   registration or guard.
  * Sizes.  sinew_options carries its size and may grow; all other structs and all numbers stay as they are as long as
  *   SINEW_ABI does.
  */
@@ -98,6 +104,16 @@
  * `SINEW_ERROR_CLOSED`. Without this the endpoint comes back by itself.
  */
 #define SINEW_ONE_CONNECTION 8
+
+/**
+ * Bytes before the payload of a sealed message.
+ */
+#define SINEW_SEALED_HEAD 32
+
+/**
+ * Bytes that sealing adds to a payload: 32 before it and 8 behind it.
+ */
+#define SINEW_SEALED_OVERHEAD 40
 
 /**
  * What a call came to. Negative: an error, and `sinew_last_error` has a sentence about it.
@@ -206,6 +222,22 @@ enum sinew_status
      * A party of the barrier was lost, and was not to be waited for. The sentence says which.
      */
     SINEW_ERROR_PARTY_LOST = -22,
+    /**
+     * This is no guard: it is NULL, or was released, or never made. Nothing was done.
+     */
+    SINEW_ERROR_NO_SUCH_GUARD = -23,
+    /**
+     * Too few good messages in a row have come, or the last one too long ago: the output cannot be armed yet. It stays safe.
+     */
+    SINEW_ERROR_NOT_GOOD = -24,
+    /**
+     * What makes the output safe says that it has failed: whether the output is safe is not known. It is called again each millisecond, until it has not.
+     */
+    SINEW_ERROR_SAFE_FAILS = -25,
+    /**
+     * What makes outputs safe in time cannot be started, or is not more urgent than the calling thread. No guard was made.
+     */
+    SINEW_ERROR_NO_WATCHDOG = -26,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L
@@ -301,6 +333,108 @@ typedef int32_t sinew_outcome;
 #endif // __cplusplus
 
 /**
+ * Whether commands reach an output and, if not, since what.
+ */
+enum sinew_output_state
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : int32_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+    /**
+     * They do.
+     */
+    SINEW_LIVE = 0,
+    /**
+     * It was never armed.
+     */
+    SINEW_SAFE_NOT_ARMED = 1,
+    /**
+     * No good message came in time.
+     */
+    SINEW_SAFE_SILENT = 2,
+    /**
+     * More messages are missing in a row than is borne.
+     */
+    SINEW_SAFE_TOO_MUCH_LOST = 3,
+    /**
+     * More bad messages came than is borne.
+     */
+    SINEW_SAFE_TOO_MANY_BAD = 4,
+    /**
+     * The sender counts anew: it was restarted.
+     */
+    SINEW_SAFE_RESTARTED = 5,
+    /**
+     * The receiver's host has slept: how old commands are that came meanwhile is not known.
+     */
+    SINEW_SAFE_SLEPT = 6,
+    /**
+     * `sinew_trip` was called, or the guard's endpoint was unregistered.
+     */
+    SINEW_SAFE_TRIPPED = 7,
+    /**
+     * The guard is being released.
+     */
+    SINEW_SAFE_RELEASED = 8,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum sinew_output_state sinew_output_state;
+#else
+typedef int32_t sinew_output_state;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+/**
+ * What is wrong with a protected message.
+ */
+enum sinew_sealed_fault
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : int32_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+    /**
+     * Nothing.
+     */
+    SINEW_FAULT_NONE = 0,
+    /**
+     * Its bytes are not those that were sealed for this receiver by this sender: damaged, inserted, or meant for another.
+     */
+    SINEW_FAULT_CORRUPT = 1,
+    /**
+     * It quotes no time of this receiver's, or one that is too long ago.
+     */
+    SINEW_FAULT_TOO_OLD = 2,
+    /**
+     * It has come before.
+     */
+    SINEW_FAULT_REPEATED = 3,
+    /**
+     * One that was sent later has come before it.
+     */
+    SINEW_FAULT_BACKWARDS = 4,
+    /**
+     * Its sender counts anew: another incarnation than that of the last one.
+     */
+    SINEW_FAULT_RESTARTED = 5,
+    /**
+     * Too many before it are missing.
+     */
+    SINEW_FAULT_GAP = 6,
+    /**
+     * It is what was sealed, and its payload is not as long as the type says.
+     */
+    SINEW_FAULT_UNREADABLE = 7,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum sinew_sealed_fault sinew_sealed_fault;
+#else
+typedef int32_t sinew_sealed_fault;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+/**
  * How urgent a message is, and what a newer one does to an older.
  */
 enum sinew_message_class
@@ -333,6 +467,11 @@ typedef int32_t sinew_message_class;
  * An endpoint: a transport address of this process. Only pointers to it are handed out.
  */
 typedef struct sinew_endpoint sinew_endpoint;
+
+/**
+ * The only way to an output. Only pointers to it are handed out.
+ */
+typedef struct sinew_guard sinew_guard;
 
 /**
  * A text: UTF-8, not ended by a zero. `SINEW_TEXT("...")` makes one of a literal, `sinew_text_of` of a C string.
@@ -566,6 +705,144 @@ typedef struct sinew_barrier {
     uint32_t reserved;
 } sinew_barrier;
 
+/**
+ * A type of payloads that are protected: what it is called, and what a receiver bears. Both ends use the same one, best from a header of theirs;
+ * in Rust it is `Payload::NAME` and `Payload::PROTECTION`. `sinew_protected_type_of` fills all of it.
+ */
+typedef struct sinew_protected_type {
+    /**
+     * Its name, at least 1 byte.
+     */
+    struct sinew_text name;
+    /**
+     * Length of each payload in bytes, `sizeof` of a plain struct: one of another length is not sent, and is a bad one where it comes. 0: any. It is all
+     * that a guard looks at of a payload: whoever cannot read one that came through it calls `sinew_trip`, or it keeps the output live for ever.
+     */
+    size_t length;
+    /**
+     * Longest time from one good message to the next, above 0: then the output is made safe.
+     */
+    uint64_t within_ns;
+    /**
+     * Greatest age of a message, at least 4 ns: from an echo that the receiver has sent to the moment at which the message that quotes it arrives.
+     */
+    uint64_t age_max_ns;
+    /**
+     * Messages that may be missing in a row.
+     */
+    uint64_t lost_max;
+    /**
+     * Bad ones that may be among the last 64; none of them is used.
+     */
+    uint32_t bad_max;
+    /**
+     * Good ones in a row before the output may be armed, at least 1.
+     */
+    uint32_t good_min;
+    /**
+     * One of `sinew_message_class`, for the sender. Of `SINEW_STREAM` only the newest one may arrive: those that it replaces are missing ones.
+     */
+    int32_t message_class;
+    /**
+     * Zero.
+     */
+    uint32_t reserved;
+} sinew_protected_type;
+
+/**
+ * What a flow of protected messages is called by both of its ends. It is not sent: whoever is not meant computes another checksum.
+ */
+typedef struct sinew_codename {
+    /**
+     * Who sends: its whole TID, the node's address included.
+     */
+    sinew_tid source;
+    /**
+     * Who receives, as well; one application.
+     */
+    sinew_tid destination;
+    /**
+     * Name of the payload's type.
+     */
+    struct sinew_text name;
+} sinew_codename;
+
+/**
+ * What the sender says of one protected message.
+ */
+typedef struct sinew_stamp {
+    /**
+     * Counts the messages of the flow, from 1.
+     */
+    uint64_t counter;
+    /**
+     * Which life of the sender counts: never the same one twice. `sinew_now_ns` at its beginning will do.
+     */
+    uint64_t incarnation;
+    /**
+     * The newest time that the sender has heard from the receiver (`sinew_guard_echo`); 0 for none.
+     */
+    uint64_t echo_ns;
+} sinew_stamp;
+
+/**
+ * Makes an output safe, and returns 0; anything else says that it could not, and it is called again each millisecond. Any thread calls it, mostly one of
+ * the library's own: it must be short and wait for nobody, as the outputs of all guards wait for it. It must return, by no exception and no `longjmp`, and
+ * may call nothing of a guard but `sinew_trip`, and no `sinew_receive_message` of an endpoint that sends or receives protected payloads: `SINEW_ERROR_BUSY`.
+ */
+typedef int32_t (*sinew_make_safe)(void *output, sinew_output_state why);
+
+/**
+ * Moves an output that is live; what makes it safe waits meanwhile. It must return as `sinew_make_safe`, and soon, and may call as little.
+ */
+typedef void (*sinew_command)(void *output, void *argument);
+
+/**
+ * What a guard has counted.
+ */
+typedef struct sinew_tally {
+    /**
+     * Good messages.
+     */
+    uint64_t good;
+    /**
+     * Those of `SINEW_FAULT_CORRUPT`.
+     */
+    uint64_t corrupt;
+    /**
+     * Those of `SINEW_FAULT_TOO_OLD`.
+     */
+    uint64_t too_old;
+    /**
+     * Those of `SINEW_FAULT_REPEATED`.
+     */
+    uint64_t repeated;
+    /**
+     * Those of `SINEW_FAULT_BACKWARDS`.
+     */
+    uint64_t backwards;
+    /**
+     * Those of `SINEW_FAULT_RESTARTED`.
+     */
+    uint64_t restarted;
+    /**
+     * Those of `SINEW_FAULT_GAP`.
+     */
+    uint64_t gaps;
+    /**
+     * Those of `SINEW_FAULT_UNREADABLE`.
+     */
+    uint64_t unreadable;
+    /**
+     * Messages that are missing, by their numbers.
+     */
+    uint64_t lost;
+    /**
+     * How often the output went from live to safe.
+     */
+    uint64_t trips;
+} sinew_tally;
+
 #ifdef __cplusplus
 extern "C" {
 #endif // __cplusplus
@@ -769,7 +1046,8 @@ sinew_status sinew_reply_within(struct sinew_endpoint *endpoint,
  * Waits for a message, `within_ns` at most; `SINEW_NOTHING` if none came (the paper's ReceiveMessage). Control comes first,
  * then Stream, of which only the newest value of each source and kind, then Bulk. `*received` is set if this returns
  * `SINEW_OK`; settle it when it has been handled. Up to 1024 may be in hand; one more is `SINEW_ERROR_TOO_MANY`, and stays
- * where it waits. With 0 it only looks. The endpoint's thread.
+ * where it waits. With 0 it only looks. `SINEW_ERROR_BUSY` where a guard calls the program, if anything protected was sent or guarded here. The endpoint's
+ * thread.
  *
  * Signals do not end the wait: a loop that is to end at one takes a short `within_ns` and looks each time.
  */
@@ -806,6 +1084,153 @@ sinew_status sinew_settle_message(struct sinew_endpoint *endpoint,
 sinew_status sinew_meet(struct sinew_endpoint *endpoint,
                         const struct sinew_barrier *barrier,
                         uint64_t *generation);
+
+/**
+ * A type of payloads that are protected, for a message each `period_ns`: two may be late or missing, one in 64 bad, and the output may be armed
+ * after eight good ones; a message is too old after eight periods. As `Protection::of_period` in Rust. `length` is that of each payload in bytes,
+ * 0 for any; class Control. `name` is kept as a pointer. Any thread.
+ */
+struct sinew_protected_type sinew_protected_type_of(struct sinew_text name,
+                                                    size_t length,
+                                                    uint64_t period_ns);
+
+/**
+ * Seals a payload and sends it, to one application: what it moves there moves for no other one. Counter, life and the echo are added by the
+ * library; echoes come while this endpoint is in `sinew_receive_message`, so call that at least four times in `age_max_ns`, with 0 if nothing is to be
+ * waited for: without an echo the receiver takes each message for too old. The payload is at most `sinew_payload_max` less `SINEW_SEALED_OVERHEAD` bytes
+ * long. An endpoint goes on with 1,024 flows at most, of one type to one receiver each: one more is `SINEW_ERROR_TOO_MANY`. Blocks as
+ * `sinew_send_message`. The endpoint's thread.
+ */
+sinew_status sinew_send_protected(struct sinew_endpoint *endpoint,
+                                  sinew_tid destination,
+                                  const struct sinew_protected_type *payload_type,
+                                  const void *bytes,
+                                  size_t length);
+
+/**
+ * The same, and blocks as `sinew_send_message_within`. What was not sent counts as missing at the receiver. The endpoint's thread.
+ */
+sinew_status sinew_send_protected_within(struct sinew_endpoint *endpoint,
+                                         sinew_tid destination,
+                                         const struct sinew_protected_type *payload_type,
+                                         const void *bytes,
+                                         size_t length,
+                                         uint64_t within_ns);
+
+/**
+ * Seals a payload for who sends over something else than an endpoint, and keeps the counter itself: writes
+ * `length + SINEW_SEALED_OVERHEAD` bytes to `sealed`, whose `capacity` is at least that. The two must not overlap. Any thread.
+ */
+sinew_status sinew_seal(const struct sinew_codename *codename,
+                        const struct sinew_stamp *stamp,
+                        const void *bytes,
+                        size_t length,
+                        uint8_t *sealed,
+                        size_t capacity);
+
+/**
+ * Looks whether these bytes were sealed under this codename, and what their sender says of them; the payload begins at `SINEW_SEALED_HEAD`
+ * and is `SINEW_SEALED_OVERHEAD` bytes shorter than `length`. `SINEW_ERROR_MALFORMED` if not. This alone protects from nothing but damage and wrong addresses:
+ * to act on a message let a guard take it, `sinew_check_sealed`. Any thread.
+ */
+sinew_status sinew_unseal(const struct sinew_codename *codename,
+                          const void *sealed,
+                          size_t length,
+                          struct sinew_stamp *stamp);
+
+/**
+ * Has `output` moved by what `source` sends to this endpoint of a protected type, and made safe by `safe` when that is not as it has to be: at once, since
+ * it is not armed, and whenever it is not live any more. From now on `sinew_receive_message` hands out of that type only messages of this sender's that are
+ * good, and that come while the output is live, without their envelopes; others are refused and counted. Act on them in `sinew_apply` alone.
+ *
+ * The sender is told what it has to quote while this endpoint is in `sinew_receive_message`: call that at least four times in `age_max_ns`. An endpoint
+ * that came back to another address, or whose sender did, makes its guards anew. `output` may be NULL, and must be there until `sinew_release`
+ * has let go of it; release it before the end of `main`, too. A process has 256 guards at most; its first one starts the thread `safe-output`,
+ * which keeps the watchdogs with a real-time priority of 90, or the highest that is granted (`ulimit -r`). `SINEW_ERROR_SAFE_FAILS`: `safe` has failed at
+ * once and is tried on; the guard is made all the same, and `*guard` set. The endpoint's thread.
+ */
+sinew_status sinew_guard_output(struct sinew_endpoint *endpoint,
+                                sinew_tid source,
+                                const struct sinew_protected_type *payload_type,
+                                void *output,
+                                sinew_make_safe safe,
+                                struct sinew_guard **guard);
+
+/**
+ * The same for messages that come over something else than an endpoint: hand each to `sinew_check_sealed`, and send what `sinew_guard_echo` says to the
+ * sender. The name of the codename is the one that counts, not that of the type. Needs no node. `*guard` is set after `SINEW_ERROR_SAFE_FAILS`, too.
+ * Any thread.
+ */
+sinew_status sinew_guard_alone(const struct sinew_codename *codename,
+                               const struct sinew_protected_type *payload_type,
+                               void *output,
+                               sinew_make_safe safe,
+                               struct sinew_guard **guard);
+
+/**
+ * Has a guard take in a sealed message. `SINEW_OK`: it is good and the output is live; its payload begins at `SINEW_SEALED_HEAD` and is
+ * `SINEW_SEALED_OVERHEAD` bytes shorter. `SINEW_NOTHING`: it is not to be used, since it is bad, or the output is safe. `*fault` is set in both
+ * cases; `fault` may be NULL. Each message is taken once: the second time it is a repeated one. Any thread.
+ */
+sinew_status sinew_check_sealed(struct sinew_guard *guard,
+                                const void *sealed,
+                                size_t length,
+                                sinew_sealed_fault *fault);
+
+/**
+ * The time that the sender is to quote as `echo_ns` of its next messages, on the clock of `sinew_now_ns`. Say it to the sender four times in
+ * `age_max_ns`: the last eight count. For `sinew_guard_alone`; an endpoint does so itself. Any thread.
+ */
+sinew_status sinew_guard_echo(struct sinew_guard *guard,
+                              uint64_t *at_ns);
+
+/**
+ * Makes the output live: from now on commands pass. Somebody has seen that it is safe to; nothing does this by itself, and a live output that has become
+ * safe stays so until this is called again. `SINEW_ERROR_NOT_GOOD` until `good_min` good messages in a row have come, the last one in time;
+ * `SINEW_ERROR_SAFE_FAILS` if it could not be made safe. Any thread.
+ */
+sinew_status sinew_arm(struct sinew_guard *guard);
+
+/**
+ * Calls `command` with the output and `argument` if the output is live, and keeps what makes it safe from doing so meanwhile. `SINEW_NOTHING`: it is safe, and
+ * `command` was not called. `SINEW_ERROR_SAFE_FAILS`: the same, and what makes it safe has failed until now. `*state` says since what in all three cases;
+ * `state` may be NULL. Blocks while another thread has the output in hand. Any thread.
+ */
+sinew_status sinew_apply(struct sinew_guard *guard,
+                         sinew_command command,
+                         void *argument,
+                         sinew_output_state *state);
+
+/**
+ * Makes the output safe: at once or, while another thread has it in hand, as soon as that has not. Does not block, and may be called where a guard
+ * calls the program, too. Any thread.
+ */
+sinew_status sinew_trip(struct sinew_guard *guard);
+
+/**
+ * Whether commands reach the output now and, if not, since what. `SINEW_ERROR_SAFE_FAILS`: they do not, but what makes it safe has failed until now, so
+ * that it may move still; `*state` is set all the same. Any thread.
+ */
+sinew_status sinew_guard_state(struct sinew_guard *guard,
+                               sinew_output_state *state);
+
+/**
+ * What the guard has counted since it was made. Any thread.
+ */
+sinew_status sinew_guard_tally(struct sinew_guard *guard, struct sinew_tally *tally);
+
+/**
+ * Makes the output safe and lets go of it: after `SINEW_OK` the library calls nothing of it any more, and `*guard` is NULL. After
+ * `SINEW_ERROR_SAFE_FAILS` it goes on trying, and lets go as soon as the output is safe: the output must be there until then, which is when
+ * another call says `SINEW_OK` or `SINEW_ERROR_NO_SUCH_GUARD`. What comes of its type to its endpoint goes on being refused. Blocks while another thread
+ * has the output in hand. Any thread.
+ */
+sinew_status sinew_release(struct sinew_guard **guard);
+
+/**
+ * A text for an output's state, one of `sinew_output_state`. Never NULL. Any thread.
+ */
+const char *sinew_output_state_text(int32_t state);
 
 /**
  * A text for a status: what it means in general. Never NULL. Any thread.

@@ -16,6 +16,8 @@
 #include <cstdint>
 #include <cstring>
 #include <exception>
+#include <functional>
+#include <memory>
 #include <optional>
 #include <stdexcept>
 #include <string>
@@ -210,6 +212,92 @@ private:
     int exceptions_ = std::uncaught_exceptions();
 };
 
+/// A type of payloads that are protected: a `T`, one each `period`; its fields may be changed. `name` must stay, as a literal does.
+template <class T> sinew_protected_type protected_type(std::string_view name, duration period)
+{
+    static_assert(std::is_trivially_copyable_v<T>, "only a plain struct can be sent as its bytes");
+    return sinew_protected_type_of(detail::text(name), sizeof(T), detail::nanoseconds(period));
+}
+
+/// The only way to an output: see sinew_guard_output. At its end the output is made safe. Where that fails it is tried on, and the guard's place is free as
+/// soon as it is safe; the output's memory is left to that, and what it refers to must stay. While making safe fails, state and apply throw
+/// SINEW_ERROR_SAFE_FAILS. Any thread may use it.
+template <class Output> class guard {
+public:
+    /// Makes the output safe, on any thread; one that throws is called again each millisecond. An empty one is refused.
+    using make_safe = std::function<void(Output &, sinew_output_state)>;
+
+    guard(guard &&other) noexcept : held_(std::move(other.held_)), raw_(std::exchange(other.raw_, nullptr)) {}
+    /// Makes the output safe that it had before, as the end of a guard does.
+    guard &operator=(guard &&other) noexcept
+    {
+        if (this != &other) {
+            release();
+            held_ = std::move(other.held_);
+            raw_ = std::exchange(other.raw_, nullptr);
+        }
+        return *this;
+    }
+    ~guard() { release(); }
+
+    /// Makes the output live if enough good messages have come; whether it did.
+    [[nodiscard]] bool arm()
+    {
+        const sinew_status status = sinew_arm(raw_);
+        return status != SINEW_ERROR_NOT_GOOD && detail::check(status) == SINEW_OK;
+    }
+    /// Calls `command(output)` if the output is live; whether it was. What the command throws goes on from here.
+    template <class Command> [[nodiscard]] bool apply(Command &&command)
+    {
+        struct call { Command &command; std::exception_ptr thrown; } argument{command, nullptr};
+        const auto run = [](void *held, void *data) {
+            call &called = *static_cast<call *>(data);
+            try {
+                called.command(static_cast<state_of *>(held)->output);
+            } catch (...) { called.thrown = std::current_exception(); }
+        };
+        const bool is_live = detail::check(sinew_apply(raw_, run, &argument, nullptr)) == SINEW_OK;
+        if (argument.thrown)
+            std::rethrow_exception(argument.thrown);
+        return is_live;
+    }
+    /// Makes the output safe, at once or as soon as nobody has it in hand.
+    void trip() { detail::check(sinew_trip(raw_)); }
+    sinew_output_state state() const
+    {
+        sinew_output_state state = SINEW_SAFE_NOT_ARMED;
+        return detail::check(sinew_guard_state(raw_, &state)), state;
+    }
+    sinew_tally tally() const
+    {
+        sinew_tally tally{};
+        return detail::check(sinew_guard_tally(raw_, &tally)), tally;
+    }
+
+private:
+    friend class endpoint;
+    struct state_of { Output output; make_safe safe; };
+    guard(Output output, make_safe safe) : held_(new state_of{std::move(output), std::move(safe)}) {}
+    void release() noexcept
+    {
+        if (raw_ == nullptr || sinew_release(&raw_) == SINEW_OK)
+            return;
+        (void)sinew_trip(raw_); // Where a guard has called the program, it may do no more.
+        (void)held_.release(); // It is tried on until it is safe, and must be there for that.
+        raw_ = nullptr;
+    }
+    static std::int32_t run_safe(void *held, sinew_output_state why)
+    try {
+        static_cast<state_of *>(held)->safe(static_cast<state_of *>(held)->output, why);
+        return 0;
+    } catch (...) {
+        return 1;
+    }
+
+    std::unique_ptr<state_of> held_;
+    sinew_guard *raw_ = nullptr;
+};
+
 /// A transport address of this process. Its end gives the address back.
 class endpoint {
 public:
@@ -323,6 +411,23 @@ public:
     [[nodiscard]] bool reply_within(const received &request, message &&made, duration within)
     {
         return is_sent(sinew_reply_within(raw_, &request.raw_, &made.raw_, detail::nanoseconds(within)));
+    }
+
+    /// Seals a plain struct and sends it to one application; see sinew_send_protected.
+    template <class T> void send_protected(tid destination, const sinew_protected_type &what, const T &value)
+    {
+        static_assert(std::is_trivially_copyable_v<T>, "only a plain struct can be sent as its bytes");
+        detail::check(sinew_send_protected(raw_, destination, &what, &value, sizeof value));
+    }
+    /// Has an output moved by what `source` sends of a protected type, and made safe when that is not as it has to be.
+    template <class Output>
+    [[nodiscard]] sinew::guard<Output> guard(tid source, const sinew_protected_type &what, Output output,
+                                             typename sinew::guard<Output>::make_safe safe)
+    {
+        const sinew_make_safe run = safe ? &sinew::guard<Output>::run_safe : nullptr;
+        sinew::guard<Output> made(std::move(output), std::move(safe));
+        detail::check(sinew_guard_output(raw_, source, &what, made.held_.get(), run, &made.raw_));
+        return made;
     }
 
     /// Waits for a message; nothing if none came in time.

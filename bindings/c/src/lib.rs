@@ -8,7 +8,8 @@
 //! | `session.rs`, `hand.rs` | an endpoint with the messages that the program in C has in hand |
 //! | `fork.rs` | a child of `fork` is told apart |
 //! | `log.rs`, `log/` | what the library says on the standard error, and the thread that writes it |
-//! | `registration.rs`, `sending.rs`, `receiving.rs`, `meeting.rs`, `naming.rs`, `words.rs` | the functions |
+//! | `protection.rs`, `protection/` | protected payloads: their types, and the runtime's guards behind handles |
+//! | `registration.rs`, `sending.rs`, `receiving.rs`, `meeting.rs`, `sealing.rs`, `guarding.rs`, `naming.rs`, `words.rs` | the functions |
 //! | `options.rs`, `text.rs`, `message.rs`, `status.rs` | the types |
 //! | `conformance.rs` | for the suite that holds all forms of NodeAPI to the same claims; with the feature `conformance` alone |
 //!
@@ -26,11 +27,17 @@ mod receiving;
 
 mod meeting;
 
+mod sealing;
+
+mod guarding;
+
 mod words;
 
 mod options;
 
 mod message;
+
+mod protection;
 
 mod text;
 

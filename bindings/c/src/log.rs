@@ -14,6 +14,7 @@ use std::{
 use arc_swap::ArcSwapOption;
 use tracing_subscriber::EnvFilter;
 
+pub(crate) use self::writer::without_signals;
 use self::writer::{Lines, is_taken, look_at_stderr, to_stderr};
 use crate::fork;
 

@@ -13,7 +13,8 @@ use crate::{
 /// Waits for a message, `within_ns` at most; `SINEW_NOTHING` if none came (the paper's ReceiveMessage). Control comes first,
 /// then Stream, of which only the newest value of each source and kind, then Bulk. `*received` is set if this returns
 /// `SINEW_OK`; settle it when it has been handled. Up to 1024 may be in hand; one more is `SINEW_ERROR_TOO_MANY`, and stays
-/// where it waits. With 0 it only looks. The endpoint's thread.
+/// where it waits. With 0 it only looks. `SINEW_ERROR_BUSY` where a guard calls the program, if anything protected was sent or guarded here. The endpoint's
+/// thread.
 ///
 /// Signals do not end the wait: a loop that is to end at one takes a short `within_ns` and looks each time.
 #[unsafe(no_mangle)]

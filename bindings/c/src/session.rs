@@ -1,12 +1,23 @@
 //! An endpoint with the messages that the program has in hand. Safe: all that is known of C is that it has tokens.
 
-use std::{ffi::CString, time::Duration};
+use std::{collections::BTreeMap, ffi::CString, time::Duration};
 
-use sinew::{ApiError, Kind, LentMessage, Outcome, Tid};
+use sinew::{
+    ApiError, Class, Kind, LentMessage, NodeAddress, Outcome, Tid, Time,
+    protection::{
+        SealError,
+        raw::{ECHO, Judged},
+    },
+};
 
 use crate::{
     hand::Hand,
     message::{Message, Received, class_of},
+    protection::{
+        Ends, SINEW_SEALED_HEAD, SINEW_SEALED_OVERHEAD, Typed,
+        guards::{self, Found, Output},
+        names,
+    },
     status::{Fault, Status},
 };
 
@@ -14,6 +25,9 @@ use crate::{
 const MADE_MAX: usize = 1;
 /// Messages that were received and not settled at most.
 const RECEIVED_MAX: usize = 1024;
+/// Messages that are not for the program and that one call takes at most when its time is over: who never waits would be late for ever with
+/// those, and a flood of them is to keep nobody.
+const SETTLED_MAX: usize = 1024;
 
 /// A registered endpoint.
 pub(crate) struct Session {
@@ -21,13 +35,18 @@ pub(crate) struct Session {
     node_name: CString,
     made: Hand<LentMessage>,
     received: Hand<sinew::Received>,
+    /// What it sends and receives of protected payloads.
+    ends: Ends,
+    /// The names of their types: who sends takes no lock of the process for them.
+    names: BTreeMap<Kind, &'static str>,
 }
 
 impl Session {
     pub(crate) fn new(endpoint: sinew::Endpoint) -> Self {
         // A node's name has no control characters.
         let node_name = CString::new(endpoint.node_name()).unwrap_or_default();
-        Self { endpoint, node_name, made: Hand::new(MADE_MAX), received: Hand::new(RECEIVED_MAX) }
+        let (made, received) = (Hand::new(MADE_MAX), Hand::new(RECEIVED_MAX));
+        Self { endpoint, node_name, made, received, ends: Ends::new(Time::now()), names: BTreeMap::new() }
     }
 
     pub(crate) const fn endpoint(&mut self) -> &mut sinew::Endpoint {
@@ -112,12 +131,130 @@ impl Session {
         }?)
     }
 
-    pub(crate) fn receive(&mut self, within: Duration) -> Result<Option<Received>, Fault> {
-        self.check_hand()?;
-        match self.endpoint.receive(within)? {
-            Some(received) => self.hand_out(received).map(Some),
-            None => Ok(None),
+    /// Whether a protected payload of so many bytes can be sent.
+    pub(crate) fn check_length(&self, length: usize) -> Result<(), Fault> {
+        let longest = self.endpoint.payload_max().saturating_sub(SINEW_SEALED_OVERHEAD);
+        if length <= longest {
+            return Ok(());
         }
+        let sentence = format!("`length` is {length}, and the longest protected payload has {longest} bytes");
+        Err(Fault::new(Status::SinewErrorTooLong, sentence))
+    }
+
+    /// `within` `None`: for the endpoint's patience.
+    pub(crate) fn send_protected(
+        &mut self,
+        destination: Tid,
+        typed: &Typed<'_>,
+        payload: &[u8],
+        within: Option<Duration>,
+    ) -> Result<(), Fault> {
+        typed.check_length(payload.len())?;
+        let (source, receiver) = (self.endpoint.tid(), self.absolute(destination));
+        if !receiver.is_single() {
+            let sentence =
+                "a protected message is for one application, not for a group or for all; send it to each";
+            return Err(Fault::argument(sentence));
+        }
+        let protected = typed.protected(self.name_of(typed)?);
+        let length = payload.len().saturating_add(SINEW_SEALED_OVERHEAD);
+        // First, since it says whether so many bytes can be sent at all: then no number is used up.
+        let mut message = self.create(destination, typed.kind, typed.message_class, length)?;
+        match self.ends.seal((source, receiver), &protected, payload, Time::now()) {
+            Ok(sealed) => self.fill(&message, &sealed),
+            Err(error) => {
+                self.discard(&mut message)?;
+                return Err(error.into());
+            }
+        }
+        self.send(&mut message, within)
+    }
+
+    /// The name of a type, which stays.
+    fn name_of(&mut self, typed: &Typed<'_>) -> Result<&'static str, Fault> {
+        let name = match self.names.get(&typed.kind) {
+            Some(name) => *name,
+            None => names::kept(typed.name)?,
+        };
+        if name != typed.name {
+            let sentence =
+                format!("'{}' hashes as another type's name does; call it something else", typed.name);
+            return Err(Fault::argument(sentence));
+        }
+        self.names.insert(typed.kind, name);
+        Ok(name)
+    }
+
+    /// Has what `source` sends of this type go through a guard; its handle, and how its output is found.
+    pub(crate) fn guard(
+        &mut self,
+        source: Tid,
+        typed: &Typed<'_>,
+        output: Output,
+    ) -> Result<(usize, Found), Fault> {
+        let (source, own) = (self.absolute(source), self.endpoint.tid());
+        let protected = typed.protected(self.name_of(typed)?);
+        if self.ends.is_held(source, typed.kind) {
+            let sentence =
+                format!("what {source} sends of '{}' is guarded already: keep that guard", typed.name);
+            return Err(Fault::argument(sentence));
+        }
+        guards::make_held(&mut self.ends, (source, own), protected, output)
+    }
+
+    pub(crate) fn receive(&mut self, within: Duration) -> Result<Option<Received>, Fault> {
+        if !self.ends.are_idle() {
+            // What comes and the echoes are the guards' affair, and who is asking may have one of their outputs in hand.
+            guards::check_callback()?;
+        }
+        self.check_hand()?;
+        if self.ends.are_idle() {
+            return match self.endpoint.receive(within)? {
+                Some(received) => self.hand_out(received).map(Some),
+                None => Ok(None),
+            };
+        }
+        let deadline = Time::now() + within;
+        let mut settled = 0;
+        loop {
+            let now = Time::now();
+            let until = deadline.min(self.tell_echoes(now));
+            match self.endpoint.receive(until.since(now))? {
+                Some(received) => {
+                    let from = (received.source(), received.kind());
+                    match self.ends.judge(from, received.bytes()) {
+                        Judged::Plain => return self.hand_out(received).map(Some),
+                        Judged::Good(_) => return self.hand_out_good(received).map(Some),
+                        Judged::Settled(outcome) => received.settle(outcome),
+                    }
+                    settled += usize::from(Time::now() >= deadline);
+                }
+                None if Time::now() >= deadline => return Ok(None),
+                // An echo is due.
+                None => {}
+            }
+            if settled >= SETTLED_MAX {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// Tells senders of protected payloads what they have to quote, where that is due; when the next one is.
+    fn tell_echoes(&mut self, now: Time) -> Time {
+        // Each that is due is put off by its period.
+        while let Some((to, echo)) = self.ends.echo_payload(now) {
+            // Where a message is lent, or there is no room, it is told the next time; the watchdog knows.
+            if let Ok(mut message) = self.endpoint.create_message(to, ECHO, echo.len()) {
+                message.set_class(Class::Stream);
+                message.copy_from_slice(&echo);
+                let _ = self.endpoint.send_message_within(message, Duration::ZERO);
+            }
+        }
+        self.ends.echo_due().unwrap_or(Time::MAX)
+    }
+
+    fn absolute(&self, tid: Tid) -> Tid {
+        if tid.node == NodeAddress::HERE { Tid::new(self.endpoint.tid().node, tid.app) } else { tid }
     }
 
     pub(crate) fn settle(&mut self, received: &mut Received, outcome: Outcome) -> Result<(), Fault> {
@@ -131,6 +268,8 @@ impl Session {
     pub(crate) fn unregister(mut self) -> Result<(), Fault> {
         // One of these may lie in the ring, through which the rest is said.
         self.made.empty().for_each(drop);
+        // Nothing comes any more; the program has them still. Waits for none of them: it may have one's output in hand just now.
+        self.ends.trip();
         for message in self.received.empty() {
             message.settle(Outcome::Failed);
         }
@@ -159,12 +298,30 @@ impl Session {
         }
     }
 
+    /// One that came through a guard: without its envelope.
+    fn hand_out_good(&mut self, received: sinew::Received) -> Result<Received, Fault> {
+        let payload = received.bytes().get(SINEW_SEALED_HEAD..).unwrap_or_default();
+        let length = payload.len().saturating_sub(SINEW_SEALED_OVERHEAD - SINEW_SEALED_HEAD);
+        let bytes = payload.as_ptr();
+        Ok(Received { bytes, length, ..self.hand_out(received)? })
+    }
+
     fn check_hand(&self) -> Result<(), Fault> {
         if self.received.is_full() {
             let sentence = format!("{RECEIVED_MAX} received messages are in hand; settle them");
             return Err(too_many(sentence));
         }
         Ok(())
+    }
+}
+
+impl From<SealError> for Fault {
+    fn from(error: SealError) -> Self {
+        let status = match error {
+            SealError::ToMany => Status::SinewErrorInvalidArgument,
+            SealError::TooManyFlows => Status::SinewErrorTooMany,
+        };
+        Self::new(status, error.to_string())
     }
 }
 

@@ -66,10 +66,18 @@ pub enum Status {
     SinewErrorNotMet = -21,
     /// A party of the barrier was lost, and was not to be waited for. The sentence says which.
     SinewErrorPartyLost = -22,
+    /// This is no guard: it is NULL, or was released, or never made. Nothing was done.
+    SinewErrorNoSuchGuard = -23,
+    /// Too few good messages in a row have come, or the last one too long ago: the output cannot be armed yet. It stays safe.
+    SinewErrorNotGood = -24,
+    /// What makes the output safe says that it has failed: whether the output is safe is not known. It is called again each millisecond, until it has not.
+    SinewErrorSafeFails = -25,
+    /// What makes outputs safe in time cannot be started, or is not more urgent than the calling thread. No guard was made.
+    SinewErrorNoWatchdog = -26,
 }
 
 impl Status {
-    const ALL: [Self; 24] = [
+    const ALL: [Self; 28] = [
         Self::SinewOk,
         Self::SinewNothing,
         Self::SinewErrorInvalidArgument,
@@ -94,6 +102,10 @@ impl Status {
         Self::SinewErrorAway,
         Self::SinewErrorNotMet,
         Self::SinewErrorPartyLost,
+        Self::SinewErrorNoSuchGuard,
+        Self::SinewErrorNotGood,
+        Self::SinewErrorSafeFails,
+        Self::SinewErrorNoWatchdog,
     ];
 
     /// The text for a number; for one that is no status it says so.
@@ -147,6 +159,16 @@ impl Status {
             }
             Self::SinewErrorNotMet => c"not all were at the barrier in time",
             Self::SinewErrorPartyLost => c"a party of the barrier was lost",
+            Self::SinewErrorNoSuchGuard => c"this is no guard; is it NULL, was it released, or never made?",
+            Self::SinewErrorNotGood => {
+                c"too few good messages in a row have come, or the last one too long ago, to arm the output"
+            }
+            Self::SinewErrorSafeFails => {
+                c"what makes the output safe says that it has failed; it is called again each millisecond"
+            }
+            Self::SinewErrorNoWatchdog => {
+                c"what makes outputs safe in time cannot be started, or is not more urgent than this thread"
+            }
             Self::SinewErrorPanic => {
                 c"a fault of this library; the endpoint can only be unregistered; please report it"
             }
@@ -206,7 +228,7 @@ impl From<ApiError> for Fault {
             ApiError::NotAsked => Status::SinewErrorNotAsked,
             ApiError::OthersRequest(_) => Status::SinewErrorNoSuchMessage,
             ApiError::Lent => Status::SinewErrorLent,
-            // The second one: of protected payloads, which C does not send.
+            // The second one: of payloads whose types Rust knows, which C does not send.
             ApiError::NotYours(_) | ApiError::NotSealed(_) => Status::SinewErrorInvalidArgument,
         };
         Self::new(status, sentence)

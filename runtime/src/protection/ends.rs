@@ -4,12 +4,16 @@ use std::{collections::BTreeSet, io, sync::Arc};
 
 use bytes::Bytes;
 
-use super::{Cause, Echo, Fault, Flows, Guard, Guarded, Verdict};
+use super::{
+    Cause, Echo, Fault, Flows, Guard, Guarded, Verdict,
+    envelope::payload_of,
+    raw::{NotSafe, Protected, Reads, or_panics},
+};
 use crate::{
     outcome::{Outcome, Rejection},
     tid::Tid,
     time::Time,
-    wire::{Kind, Message, Payload, decode, encode},
+    wire::{Header, Kind, Message, Payload, decode, encode},
 };
 
 /// The flows of protected messages that one endpoint sends, and the guards of those that it receives.
@@ -24,17 +28,11 @@ pub struct Ends {
 struct Held {
     guard: Arc<dyn Guarded>,
     kind: Kind,
-    /// Whether these bytes are a value of that type.
-    is_value: fn(&[u8]) -> bool,
+    /// Which payloads are values of that type. They are read here and once more by who receives them: he may not be able to, and then they must
+    /// not count.
+    reads: Reads,
     /// When its sender is to be told the next time to quote.
     echo_at: Time,
-}
-
-impl Held {
-    /// Takes a message in. It is read here and once more by who receives it: he may not, and then it must not count.
-    fn take(&self, bytes: &Bytes) -> Verdict<Bytes> {
-        self.guard.take(bytes, |payload| (self.is_value)(&payload).then_some(payload))
-    }
 }
 
 impl std::fmt::Debug for Held {
@@ -52,6 +50,17 @@ pub enum Came {
     Good(Message),
     /// It is refused, or was not for the receiver; its sender is told.
     Settled,
+}
+
+/// What is to be done with a message that has come, for who has its bytes.
+#[derive(Clone, Copy, Debug)]
+pub enum Judged<'message> {
+    /// It is for the receiver, as it came: nothing here guards its kind.
+    Plain,
+    /// This of it is for the receiver: it is good, and its output is live.
+    Good(&'message [u8]),
+    /// It is not for the receiver; its sender is to be told this.
+    Settled(Outcome),
 }
 
 /// Why a protected payload cannot be sent. The caller is at fault; nothing was sent.
@@ -91,11 +100,26 @@ impl Ends {
         if P::PROTECTION.is_none() {
             return Ok(Message::of_type::<P>(source, destination, encode(value)));
         }
-        if !receiver.is_single() {
-            return Err(SealError::ToMany);
-        }
+        check_single(receiver)?;
         let payload = self.flows.seal(source, receiver, value, now).ok_or(SealError::TooManyFlows)?;
         Ok(Message::of_type::<P>(source, destination, payload))
+    }
+
+    /// The payload of such a message, for who knows its type at run time alone.
+    ///
+    /// # Errors
+    /// Those of [`message`](Self::message).
+    #[doc(hidden)]
+    pub fn seal(
+        &self,
+        (source, receiver): (Tid, Tid),
+        protected: &Protected,
+        payload: &[u8],
+        now: Time,
+    ) -> Result<Bytes, SealError> {
+        check_single(receiver)?;
+        let sealed = self.flows.seal_payload((source, receiver), protected, payload, now);
+        sealed.ok_or(SealError::TooManyFlows)
     }
 
     /// Has `output` moved by what `source` sends to `receiver` of type `P`; see [`Guard::new`]. From `now` on its sender is to be told
@@ -111,61 +135,105 @@ impl Ends {
         output: O,
         safe: impl FnMut(&mut O, Cause) + Send + 'static,
     ) -> io::Result<Guard<O>> {
-        if P::PROTECTION.is_some_and(|protection| protection.echo_period().is_zero()) {
+        self.hold((source, receiver), Protected::of::<P>(), now, (output, or_panics(safe)))
+    }
+
+    /// The same for who knows the type at run time alone; see [`Guard::of`].
+    ///
+    /// # Errors
+    /// Those of [`guard`](Self::guard) and of [`Guard::of`].
+    #[doc(hidden)]
+    pub fn hold<O: Send + 'static>(
+        &mut self,
+        (source, receiver): (Tid, Tid),
+        protected: Protected,
+        now: Time,
+        (output, safe): (O, impl FnMut(&mut O, Cause) -> Result<(), NotSafe> + Send + 'static),
+    ) -> io::Result<Guard<O>> {
+        let Protected { name, kind, protection, reads } = protected;
+        if protection.echo_period().is_zero() {
             let words = format!(
-                "each '{}' is too old: the age_max of its Payload::PROTECTION is below 4 ns; take that of a period above zero",
-                P::NAME
+                "each '{name}' is too old: the age_max of its Payload::PROTECTION is below 4 ns; take that of a period above zero"
             );
             return Err(io::Error::new(io::ErrorKind::InvalidInput, words));
         }
         self.forget_orphans();
-        let is_same = |held: &Held| held.kind == P::KIND && held.guard.codename().source == source;
-        if self.held.iter().any(is_same) {
-            let words = format!(
-                "what {source} sends of '{}' is guarded already: keep that guard, or clone it",
-                P::NAME
-            );
+        if self.is_held(source, kind) {
+            let words =
+                format!("what {source} sends of '{name}' is guarded already: keep that guard, or clone it");
             return Err(io::Error::new(io::ErrorKind::AlreadyExists, words));
         }
-        let guard = Guard::new::<P>(source, receiver, output, safe)?;
-        self.kinds.insert(P::KIND);
-        let is_value = |bytes: &[u8]| decode::<P>(bytes).is_ok();
-        self.held.push(Held { guard: guard.guarded(), kind: P::KIND, is_value, echo_at: now });
+        let guard = Guard::of((source, receiver), protected, output, safe)?;
+        self.kinds.insert(kind);
+        self.held.push(Held { guard: guard.guarded(), kind, reads, echo_at: now });
         Ok(guard)
+    }
+
+    /// Whether what `source` sends of this type is guarded.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn is_held(&self, source: Tid, kind: Kind) -> bool {
+        self.live().any(|held| held.kind == kind && held.guard.codename().source == source)
+    }
+
+    /// Whether nothing protected was ever sent or guarded here.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn are_idle(&self) -> bool {
+        self.kinds.is_empty() && self.flows.are_none()
+    }
+
+    /// Makes all outputs safe, as [`Guard::trip`] does.
+    #[doc(hidden)]
+    pub fn trip(&self) {
+        self.held.iter().for_each(|held| held.guard.trip());
     }
 
     /// Takes a message in that has come.
     pub fn take(&mut self, mut message: Message) -> Came {
-        let (source, kind) = (message.header.source, message.header.kind);
+        let Header { source, kind, .. } = message.header;
+        match self.judge((source, kind), &message.payload) {
+            Judged::Plain => Came::Plain(message),
+            Judged::Good(payload) => {
+                let payload = message.payload.slice_ref(payload);
+                message.payload = payload;
+                Came::Good(message)
+            }
+            Judged::Settled(outcome) => {
+                message.settle(outcome);
+                Came::Settled
+            }
+        }
+    }
+
+    /// The same for who has the bytes of a message, and who sent it.
+    #[doc(hidden)]
+    pub fn judge<'message>(
+        &mut self,
+        (source, kind): (Tid, Kind),
+        payload: &'message [u8],
+    ) -> Judged<'message> {
         if kind == Echo::KIND && self.flows.are_to(source) {
-            let settled = match decode::<Echo>(&message.payload) {
+            return Judged::Settled(match decode::<Echo>(payload) {
                 Ok(echo) => {
                     self.flows.heard(source, echo);
                     Outcome::Delivered
                 }
                 Err(_) => Outcome::Rejected(Rejection::Malformed),
-            };
-            message.settle(settled);
-            return Came::Settled;
+            });
         }
         if !self.kinds.contains(&kind) {
-            return Came::Plain(message);
+            return Judged::Plain;
         }
         self.forget_orphans();
         let is_of_it = |held: &&Held| held.kind == kind && held.guard.codename().source == source;
-        let why = match self.held.iter().find(is_of_it) {
+        let verdict = self.held.iter().find(is_of_it).map(|held| held.guard.check(payload, held.reads));
+        Judged::Settled(Outcome::Rejected(match verdict {
+            Some(Verdict::Apply(())) => return Judged::Good(payload_of(payload)),
+            Some(Verdict::Refused(Fault::Corrupt | Fault::Unreadable)) => Rejection::Malformed,
+            Some(Verdict::Hold | Verdict::Refused(_)) => Rejection::ByHandler,
             None => Rejection::Unsupported,
-            Some(held) => match held.take(&message.payload) {
-                Verdict::Apply(payload) => {
-                    message.payload = payload;
-                    return Came::Good(message);
-                }
-                Verdict::Refused(Fault::Corrupt | Fault::Unreadable) => Rejection::Malformed,
-                Verdict::Hold | Verdict::Refused(_) => Rejection::ByHandler,
-            },
-        };
-        message.reject(why);
-        Came::Settled
+        }))
     }
 
     /// When [`echo`](Self::echo) has something to say next.
@@ -181,6 +249,16 @@ impl Ends {
 
     /// The next echo that is due, from `own`; its sender is told it whenever it can be.
     pub fn echo(&mut self, own: Tid, now: Time) -> Option<Message> {
+        self.next_echo(now).map(|(source, echo)| Message::typed(own, source, &echo))
+    }
+
+    /// Its payload, and whom it is for.
+    #[doc(hidden)]
+    pub fn echo_payload(&mut self, now: Time) -> Option<(Tid, Bytes)> {
+        self.next_echo(now).map(|(source, echo)| (source, encode(&echo)))
+    }
+
+    fn next_echo(&mut self, now: Time) -> Option<(Tid, Echo)> {
         let held = self.held.iter_mut().filter(|held| !held.guard.is_orphan());
         let held = held.min_by_key(|held| held.echo_at).filter(|held| held.echo_at <= now)?;
         // Not on a grid: who looks late says one and not many.
@@ -188,12 +266,16 @@ impl Ends {
         let (source, kind, at) = (held.guard.codename().source, held.kind, held.guard.echo());
         let others = self.live().filter(|held| held.kind != kind && held.guard.codename().source == source);
         let others = others.map(|held| (held.kind, held.guard.last_echo().as_nanos())).collect();
-        Some(Message::typed(own, source, &Echo { others, ..Echo::new(kind, at) }))
+        Some((source, Echo { others, ..Echo::new(kind, at) }))
     }
 
     fn live(&self) -> impl Iterator<Item = &Held> {
         self.held.iter().filter(|held| !held.guard.is_orphan())
     }
+}
+
+const fn check_single(receiver: Tid) -> Result<(), SealError> {
+    if receiver.is_single() { Ok(()) } else { Err(SealError::ToMany) }
 }
 
 #[cfg(test)]

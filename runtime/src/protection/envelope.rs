@@ -78,6 +78,12 @@ pub fn seal(codename: &Codename, stamp: Stamp, payload: &[u8]) -> Bytes {
 /// Takes the payload out of its envelope; `None` if these are not the bytes that were sealed under this codename.
 #[must_use]
 pub fn open(codename: &Codename, bytes: &Bytes) -> Option<(Stamp, Bytes)> {
+    look(codename, bytes).map(|(stamp, payload)| (stamp, bytes.slice_ref(payload)))
+}
+
+/// The same of memory that is not to be kept.
+#[must_use]
+pub fn look<'bytes>(codename: &Codename, bytes: &'bytes [u8]) -> Option<(Stamp, &'bytes [u8])> {
     let (sealed, sum) = bytes.split_last_chunk::<TAIL>()?;
     let mut digest = codename.digest();
     digest.write(sealed);
@@ -91,5 +97,10 @@ pub fn open(codename: &Codename, bytes: &Bytes) -> Option<(Stamp, Bytes)> {
     let is_known = first as u32 == u32::from(VERSION);
     let is_whole = first >> 32 == payload.len() as u64;
     let stamp = Stamp { counter, incarnation, echo: Time::from_nanos(echo) };
-    (is_known && is_whole).then(|| (stamp, bytes.slice(HEAD..bytes.len() - TAIL)))
+    (is_known && is_whole).then_some((stamp, payload))
+}
+
+/// The payload of a message that was looked at, and was good.
+pub(super) fn payload_of(sealed: &[u8]) -> &[u8] {
+    sealed.get(HEAD..sealed.len().saturating_sub(TAIL)).unwrap_or_default()
 }

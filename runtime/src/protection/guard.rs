@@ -10,14 +10,16 @@ use std::{
 use bytes::Bytes;
 
 use super::{
-    ArmError, Cause, Codename, Protection, State, Tally,
+    ArmError, Cause, Codename, State, Tally,
+    envelope::look,
     keeper::{self, Tried, Watch, Watched, rouse},
+    raw::{NotSafe, Protected, Reads, Released, or_panics},
     receiver::{Opened, Receiver, Verdict},
     said::{Said, What},
 };
 use crate::{tid::Tid, time::Time, wire::Payload};
 
-/// Time after which what makes an output safe is called again, where it has panicked.
+/// Time after which what makes an output safe is called again, where it has failed.
 const SAFE_RETRY: Duration = Duration::from_millis(1);
 
 /// The only way to an output of type `O`: commands pass while it is live, and it is made safe as soon as it is not.
@@ -42,11 +44,13 @@ struct Inner<O> {
     output: O,
     safe: MakeSafe<O>,
     owes: Option<Owed>,
+    /// It was released while that was owed: when it is paid, nobody has it any more.
+    is_to_go: bool,
     /// What is to be said when nobody has the output in hand any more.
     said: Option<Said>,
 }
 
-/// The output was to be made safe, and that has panicked.
+/// The output was to be made safe, and that has panicked, or says that it has failed.
 #[derive(Clone, Copy)]
 struct Owed {
     cause: Cause,
@@ -54,7 +58,7 @@ struct Owed {
     retry: Time,
 }
 
-type MakeSafe<O> = Box<dyn FnMut(&mut O, Cause) + Send>;
+type MakeSafe<O> = Box<dyn FnMut(&mut O, Cause) -> Result<(), NotSafe> + Send>;
 
 impl<O> Inner<O> {
     /// Lets the receiver change its mind, and makes the output safe if it did.
@@ -71,7 +75,7 @@ impl<O> Inner<O> {
         let Self { output, safe, owes, said, codename: Codename { source, name, .. }, .. } = self;
         let (source, name) = (*source, *name);
         let is_news = owes.is_none();
-        if catch_unwind(AssertUnwindSafe(|| safe(output, cause))).is_ok() {
+        if matches!(catch_unwind(AssertUnwindSafe(|| safe(output, cause))), Ok(Ok(()))) {
             *owes = None;
             if cause != Cause::NotArmed && cause != Cause::Dropped {
                 *said = Some(Said { source, name, cause, what: What::IsSafe });
@@ -80,14 +84,7 @@ impl<O> Inner<O> {
         }
         *owes = Some(Owed { cause, retry: now + SAFE_RETRY });
         if is_news {
-            *said = Some(Said { source, name, cause, what: What::HasPanicked });
-        }
-    }
-
-    /// Calls again what has panicked.
-    fn pay(&mut self, now: Time) {
-        if let Some(Owed { cause, .. }) = self.owes {
-            self.make_safe(cause, now);
+            *said = Some(Said { source, name, cause, what: What::HasFailed });
         }
     }
 
@@ -112,21 +109,35 @@ impl<O: Send + 'static> Guard<O> {
         output: O,
         safe: impl FnMut(&mut O, Cause) + Send + 'static,
     ) -> io::Result<Self> {
-        const {
-            match P::PROTECTION {
-                Some(protection) => {
-                    assert!(
-                        protection.good_min > 0,
-                        "an output is armed by good messages: `good_min` is at least 1"
-                    );
-                }
-                None => panic!("a guard is for a payload whose PROTECTION says what is borne"),
-            }
+        Self::of((source, receiver), Protected::of::<P>(), output, or_panics(safe))
+    }
+
+    /// The same for who knows the type at run time alone. `safe` says whether it has failed; then it is called again, as one that panics.
+    ///
+    /// # Errors
+    /// Those of [`new`](Self::new), and that no good message would be needed to arm the output.
+    #[doc(hidden)]
+    pub fn of(
+        (source, destination): (Tid, Tid),
+        protected: Protected,
+        output: O,
+        safe: impl FnMut(&mut O, Cause) -> Result<(), NotSafe> + Send + 'static,
+    ) -> io::Result<Self> {
+        if protected.protection.good_min == 0 {
+            let words = "an output is armed by good messages: `good_min` is at least 1";
+            return Err(io::Error::new(io::ErrorKind::InvalidInput, words));
+        }
+        let codename = Codename { source, destination, name: protected.name };
+        let receiver = Receiver::new(protected.protection);
+        let mut inner = Inner {
+            codename,
+            receiver,
+            output,
+            safe: Box::new(safe),
+            owes: None,
+            is_to_go: false,
+            said: None,
         };
-        let protection = P::PROTECTION.unwrap_or(Protection::of_period(Duration::ZERO));
-        let codename = Codename::of::<P>(source, receiver);
-        let receiver = Receiver::new(protection);
-        let mut inner = Inner { codename, receiver, output, safe: Box::new(safe), owes: None, said: None };
         inner.make_safe(Cause::NotArmed, Time::now());
         inner.said.take().into_iter().for_each(Said::log);
         let watch = Watch::new(inner.deadline(), inner.owes.is_some());
@@ -160,11 +171,18 @@ impl<O: Send + 'static> Guard<O> {
     /// Too few good messages have come, or the output could not be made safe.
     pub fn arm(&self) -> Result<(), ArmError> {
         self.shared().with(|inner| {
-            inner.pay(Time::now());
+            self.shared().pay(inner, Time::now());
             if inner.owes.is_some() {
                 return Err(ArmError::SafeFails);
             }
-            self.shared().decide_locked(inner, |receiver, now| receiver.arm(now))
+            let is_released = self.is_released();
+            self.shared().decide_locked(inner, |receiver, now| {
+                if is_released {
+                    // Nothing that has come is good enough: who armed it was on the way when it was released.
+                    receiver.trip(Cause::Dropped);
+                }
+                receiver.arm(now)
+            })
         })?;
         // The thread sleeps, as there was no deadline.
         rouse();
@@ -173,11 +191,7 @@ impl<O: Send + 'static> Guard<O> {
 
     /// Makes the output safe: at once, or, while its application or another thread has it in hand, as soon as it has not.
     pub fn trip(&self) {
-        self.shared().watch.is_tripped.store(true, Ordering::Release);
-        match self.shared().try_expire() {
-            Tried::Held => rouse(),
-            Tried::Done(said) => said.into_iter().for_each(Said::log),
-        }
+        self.shared().trip();
     }
 
     /// Whether commands pass.
@@ -193,6 +207,56 @@ impl<O: Send + 'static> Guard<O> {
     #[must_use]
     pub fn tally(&self) -> Tally {
         self.shared().lock().receiver.tally()
+    }
+
+    /// Takes in a message that has come.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn check(&self, sealed: &[u8], reads: Reads) -> Verdict<()> {
+        let guarded: &dyn Guarded = &**self.shared();
+        guarded.check(sealed, reads)
+    }
+
+    /// The time that the sender is to quote.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn echo(&self) -> Time {
+        self.shared().echo()
+    }
+
+    /// Makes the output safe for good, as the drop of the last clone does, and says whether it is. Where it is not, that is tried on, and the guard is
+    /// released as soon as it is.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn release(&self) -> Released {
+        let shared = self.shared();
+        shared.with(|inner| {
+            if self.is_released() {
+                return Released::Before;
+            }
+            shared.pay(inner, Time::now());
+            shared.decide_locked(inner, |receiver, _| receiver.trip(Cause::Dropped));
+            if inner.owes.is_some() {
+                inner.is_to_go = true;
+                return Released::NotSafe;
+            }
+            shared.watch.is_orphan.store(true, Ordering::Release);
+            Released::Now
+        })
+    }
+
+    /// Whether the output was to be made safe, and that has failed until now.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn is_owed(&self) -> bool {
+        self.shared().watch.owes.load(Ordering::Acquire)
+    }
+
+    /// Whether it is released.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn is_released(&self) -> bool {
+        self.shared().is_orphan()
     }
 
     /// What an application's context knows of it.
@@ -215,6 +279,10 @@ impl<O: Send + 'static> std::fmt::Debug for Guard<O> {
 
 impl<O: Send + 'static> Drop for Owners<O> {
     fn drop(&mut self) {
+        if self.0.is_orphan() {
+            // It was released, and is safe for good. Whoever lets go of it waits for nobody: it may be somebody who trips another one.
+            return;
+        }
         self.0.decide(|receiver, _| receiver.trip(Cause::Dropped));
         self.0.watch.is_orphan.store(true, Ordering::Release);
         if self.0.watch.owes.load(Ordering::Acquire) {
@@ -244,6 +312,15 @@ impl<O> Shared<O> {
         result
     }
 
+    /// Calls again what has failed.
+    fn pay(&self, inner: &mut Inner<O>, now: Time) {
+        let Some(Owed { cause, .. }) = inner.owes else { return };
+        inner.make_safe(cause, now);
+        if inner.owes.is_none() && inner.is_to_go {
+            self.watch.is_orphan.store(true, Ordering::Release);
+        }
+    }
+
     fn decide_locked<R>(&self, inner: &mut Inner<O>, decide: impl FnOnce(&mut Receiver, Time) -> R) -> R {
         let (now, asleep) = Time::now_and_asleep();
         let (is_tripped, owed) = (self.watch.is_tripped.swap(false, Ordering::AcqRel), inner.owes.is_some());
@@ -270,6 +347,8 @@ pub(crate) trait Guarded: Send + Sync {
     fn codename(&self) -> Codename;
     /// Whether nobody has the guard any more.
     fn is_orphan(&self) -> bool;
+    /// Makes the output safe: at once, or as soon as nobody has it in hand.
+    fn trip(&self);
     /// Takes in a message that is out of its envelope.
     fn judge(&self, opened: Opened) -> Verdict<()>;
     /// The time that the sender is to quote.
@@ -286,6 +365,14 @@ impl dyn Guarded {
         let (opened, value) = Opened::of(&self.codename(), bytes, read);
         self.judge(opened).of(value)
     }
+
+    /// The same of memory that is not to be kept.
+    pub(crate) fn check(&self, sealed: &[u8], reads: Reads) -> Verdict<()> {
+        let (opened, _) = Opened::read(look(&self.codename(), sealed), |payload: &[u8]| {
+            reads.is_value(payload).then_some(())
+        });
+        self.judge(opened)
+    }
 }
 
 impl<O: Send + 'static> Guarded for Shared<O> {
@@ -295,6 +382,14 @@ impl<O: Send + 'static> Guarded for Shared<O> {
 
     fn is_orphan(&self) -> bool {
         self.watch.is_orphan.load(Ordering::Acquire)
+    }
+
+    fn trip(&self) {
+        self.watch.is_tripped.store(true, Ordering::Release);
+        match self.try_expire() {
+            Tried::Held => rouse(),
+            Tried::Done(said) => said.into_iter().for_each(Said::log),
+        }
     }
 
     fn judge(&self, opened: Opened) -> Verdict<()> {
@@ -321,7 +416,7 @@ impl<O: Send + 'static> Watched for Shared<O> {
             Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
             Err(TryLockError::WouldBlock) => return Tried::Held,
         };
-        inner.pay(Time::now());
+        self.pay(&mut inner, Time::now());
         self.decide_locked(&mut inner, |receiver, now| receiver.expire(now));
         Tried::Done(inner.said.take())
     }
@@ -342,7 +437,10 @@ mod tests {
     };
 
     use super::*;
-    use crate::tid::{AppAddress, NodeAddress};
+    use crate::{
+        protection::Protection,
+        tid::{AppAddress, NodeAddress},
+    };
 
     /// Time after which a test that waits fails.
     const WATCHDOG: Duration = Duration::from_secs(30);
@@ -361,7 +459,8 @@ mod tests {
         let codename = Codename { source: tid(1), destination: tid(2), name: "test.torque" };
         let receiver = Receiver::new(Protection::of_period(SAFE_RETRY));
         let safe = Box::new(|(): &mut (), _| panic!("a planted panic"));
-        let mut inner = Inner { codename, receiver, output: (), safe, owes: None, said: None };
+        let mut inner =
+            Inner { codename, receiver, output: (), safe, owes: None, is_to_go: false, said: None };
         let begun = Time::from_nanos(1_000_000_000);
         inner.make_safe(Cause::Tripped, begun);
         let due = (begun + SAFE_RETRY).as_nanos();

@@ -41,7 +41,7 @@ pub(super) struct Watch {
     pub(super) is_tripped: AtomicBool,
     /// Nobody has the guard any more.
     pub(super) is_orphan: AtomicBool,
-    /// The output was to be made safe, and that has panicked.
+    /// The output was to be made safe, and that has failed.
     pub(super) owes: AtomicBool,
 }
 
@@ -181,7 +181,7 @@ impl Keeper {
         }
         self.owing.fetch_sub(1, Ordering::Relaxed);
         crate::log::error!(
-            "an output is given up that is not safe: what makes outputs safe panics for {OWING_MAX} others that nobody has any more"
+            "an output is given up that is not safe: what makes outputs safe fails for {OWING_MAX} others that nobody has any more"
         );
     }
 

@@ -30,6 +30,7 @@
 //! | `keeper` | the thread that makes outputs safe |
 //! | `said` | what is said of that in the log |
 //! | `ends` | both ends for an endpoint of NodeAPI |
+//! | `raw` | all of that for types that are known at run time alone |
 
 mod ends;
 mod envelope;
@@ -38,6 +39,8 @@ mod envelope;
 pub mod fuzzing;
 mod guard;
 mod keeper;
+#[doc(hidden)]
+pub mod raw;
 mod receiver;
 mod said;
 mod sender;
@@ -174,8 +177,10 @@ pub enum ArmError {
         /// Time since the last one.
         silent: Duration,
     },
-    /// What makes the output safe has panicked, and goes on to: whether it is safe is not known.
-    #[error("what makes the output safe has panicked, and is tried again; see the log for its words")]
+    /// What makes the output safe has panicked, or says that it has failed, and goes on to: whether it is safe is not known.
+    #[error(
+        "what makes the output safe has panicked, or says that it has failed, and is tried again; see the log"
+    )]
     SafeFails,
 }
 

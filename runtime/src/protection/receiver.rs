@@ -30,7 +30,15 @@ impl Opened {
         bytes: &Bytes,
         read: impl FnOnce(Bytes) -> Option<T>,
     ) -> (Self, Option<T>) {
-        let Some((stamp, payload)) = open(codename, bytes) else { return (Self::Corrupt, None) };
+        Self::read(open(codename, bytes), read)
+    }
+
+    /// Reads what was in an envelope, if that was one.
+    pub(crate) fn read<B, T>(
+        opened: Option<(Stamp, B)>,
+        read: impl FnOnce(B) -> Option<T>,
+    ) -> (Self, Option<T>) {
+        let Some((stamp, payload)) = opened else { return (Self::Corrupt, None) };
         let value = read(payload);
         (if value.is_some() { Self::Value(stamp) } else { Self::Unreadable(stamp) }, value)
     }
@@ -38,7 +46,7 @@ impl Opened {
 
 /// What comes of one message.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Verdict<T> {
+pub enum Verdict<T> {
     /// It is good, and the output is live.
     Apply(T),
     /// It is good, and the output is safe until it is armed again.
@@ -122,6 +130,7 @@ impl Receiver {
         self.protection.echo_period()
     }
 
+    // spec: E2E-9
     /// The host has slept for so long in all. Clocks stand meanwhile: what was under way has an age that nobody knows, so nothing counts that
     /// quotes an echo from before.
     pub(crate) fn has_slept(&mut self, asleep: Duration) {
@@ -132,6 +141,7 @@ impl Receiver {
         self.asleep = self.asleep.max(asleep);
     }
 
+    // spec: E2E-6
     /// The output is safe if the watchdog's time is over.
     pub(crate) fn expire(&mut self, now: Time) {
         if self.deadline().is_some_and(|deadline| now >= deadline) {
@@ -169,6 +179,7 @@ impl Receiver {
                 Verdict::Refused(fault)
             }
         };
+        // spec: E2E-5
         if self.history.count_ones() > self.protection.bad_max {
             // What is remembered has had its effect: the way back begins with a clean sheet.
             self.history = 0;
@@ -179,8 +190,10 @@ impl Receiver {
 
     fn examine(&mut self, now: Time, opened: Opened) -> Result<(), Fault> {
         match opened {
+            // spec: E2E-1
             Opened::Corrupt => Err(Fault::Corrupt),
             Opened::Value(stamp) => self.follow(now, stamp),
+            // spec: E2E-8
             // It has come: none is missing because of it, and it does not come again.
             Opened::Unreadable(stamp) => self.follow(now, stamp).and(Err(Fault::Unreadable)),
         }
@@ -188,10 +201,12 @@ impl Receiver {
 
     /// Whether this is a young message, and the next one.
     fn follow(&mut self, now: Time, stamp: Stamp) -> Result<(), Fault> {
+        // spec: E2E-2
         let is_ours = stamp.echo != Time::ZERO && self.echoes.contains(&stamp.echo);
         if !is_ours || now.since(stamp.echo) > self.protection.age_max {
             return Err(Fault::TooOld);
         }
+        // spec: E2E-3
         let Some((incarnation, counter)) = self.last else {
             self.last = Some((stamp.incarnation, stamp.counter));
             return Ok(());
@@ -201,6 +216,7 @@ impl Receiver {
             self.trip(Cause::Restarted);
             return Err(Fault::Restarted);
         }
+        // spec: E2E-4
         if stamp.counter == counter {
             return Err(Fault::Repeated);
         }
@@ -218,6 +234,7 @@ impl Receiver {
         Ok(())
     }
 
+    // spec: E2E-7
     /// Makes the output live.
     pub(crate) fn arm(&mut self, now: Time) -> Result<(), ArmError> {
         self.expire(now);

@@ -32,7 +32,7 @@ pub(super) struct Said {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum What {
     IsSafe,
-    HasPanicked,
+    HasFailed,
 }
 
 impl Said {
@@ -43,8 +43,8 @@ impl Said {
             What::IsSafe => {
                 crate::log::warn!(%source, of = name, %cause, "a guard is shut; its output, if it has one, is safe");
             }
-            What::HasPanicked => {
-                crate::log::error!(%source, of = name, %cause, "what makes an output safe has panicked; it is tried again each millisecond");
+            What::HasFailed => {
+                crate::log::error!(%source, of = name, %cause, "what makes an output safe has panicked, or says that it has failed; it is tried again each millisecond");
             }
         }
     }

@@ -11,6 +11,7 @@ use bytes::Bytes;
 use super::{
     Echo, Protection,
     envelope::{Codename, Stamp, seal},
+    raw::Protected,
 };
 use crate::{
     tid::Tid,
@@ -92,6 +93,23 @@ impl Flows {
     ) -> Option<Bytes> {
         let stamp = self.stamp((destination, P::KIND), P::PROTECTION?, now)?;
         Some(seal(&Codename::of::<P>(source, destination), stamp, &encode(value)))
+    }
+
+    /// The same for who knows the type at run time alone: `payload` is a value of it.
+    pub(crate) fn seal_payload(
+        &self,
+        (source, destination): (Tid, Tid),
+        protected: &Protected,
+        payload: &[u8],
+        now: Time,
+    ) -> Option<Bytes> {
+        let stamp = self.stamp((destination, protected.kind), protected.protection, now)?;
+        Some(seal(&Codename { source, destination, name: protected.name }, stamp, payload))
+    }
+
+    /// Whether nothing was ever sealed here.
+    pub(crate) fn are_none(&self) -> bool {
+        self.lock().flows.is_empty()
     }
 
     fn stamp(&self, key: (Tid, Kind), protection: Protection, now: Time) -> Option<Stamp> {

@@ -143,7 +143,7 @@ pub(super) fn is_taken() -> bool {
 }
 
 /// Runs `start` while the calling thread takes no signals. A thread that it makes never does.
-fn without_signals<R>(start: impl FnOnce() -> R) -> R {
+pub(crate) fn without_signals<R>(start: impl FnOnce() -> R) -> R {
     let mut all = MaybeUninit::uninit();
     let mut before = MaybeUninit::uninit();
     // SAFETY: it writes the whole set. It does not fail.

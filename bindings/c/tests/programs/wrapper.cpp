@@ -1,6 +1,7 @@
 // What sinew.hpp adds to sinew.h: ends of scopes, exceptions, moves.
 #include <sinew.hpp>
 
+#include <atomic>
 #include <cstdio>
 #include <cstdlib>
 #include <thread>
@@ -128,6 +129,82 @@ static void groups_and_names(const char *socket)
     EXPECT(member.address() == 0);
 }
 
+// Whether it is; what is not known to be safe is an exception.
+static bool is_tripped(const sinew::guard<int> &guard)
+{
+    try {
+        return guard.state() == SINEW_SAFE_TRIPPED;
+    } catch (const sinew::error &error) {
+        EXPECT(error.status() == SINEW_ERROR_SAFE_FAILS);
+        return false;
+    }
+}
+
+// What a guard had is let go of when it gets another one's.
+static void guards_are_assigned(sinew::endpoint &receiver, sinew::tid source)
+{
+    const auto one = sinew::protected_type<pair>("test.wrapper_one", 20s);
+    const auto other = sinew::protected_type<pair>("test.wrapper_other", 20s);
+    const auto safe = [](int &output, sinew_output_state) { output = 0; };
+    auto guard = receiver.guard(source, one, 7, safe);
+    auto second = receiver.guard(source, other, 7, safe);
+    guard = std::move(second);
+    EXPECT(guard.state() == SINEW_SAFE_NOT_ARMED);
+    second = receiver.guard(source, one, 7, safe); // Refused, while that is guarded.
+    EXPECT(second.state() == SINEW_SAFE_NOT_ARMED);
+    try {
+        (void)receiver.guard(source, sinew::protected_type<pair>("test.wrapper_empty", 20s), 7, {});
+        EXPECT(false);
+    } catch (const sinew::error &error) {
+        EXPECT(error.status() == SINEW_ERROR_INVALID_ARGUMENT);
+    }
+}
+
+// An output that is moved by good commands alone, and whose making safe is tried again where it throws.
+static void outputs_are_guarded(const char *socket)
+{
+    const auto type = sinew::protected_type<pair>("test.wrapper_command", 20s);
+    sinew::endpoint sender(socket), receiver(socket);
+    std::atomic<int> fails = 2;
+    auto guard = receiver.guard(sender.address(), type, 7, [&fails](int &output, sinew_output_state why) {
+        if (why == SINEW_SAFE_TRIPPED && fails-- > 0)
+            throw std::runtime_error("it does not move");
+        output = 0;
+    });
+    EXPECT(guard.state() == SINEW_SAFE_NOT_ARMED && !guard.apply([](int &) {}));
+    std::optional<pair> came;
+    for (int look = 0; look < 2000 && !came; look++) {
+        sender.send_protected(receiver.address(), type, pair{1, look});
+        while (sender.receive(0ns)) {
+        }
+        if (guard.state() != SINEW_LIVE)
+            (void)guard.arm();
+        if (auto message = receiver.receive(10ms))
+            came = message->as<pair>();
+    }
+    EXPECT(came && came->a == 1 && guard.tally().good > 8);
+    int moved = -1;
+    EXPECT(guard.apply([&](int &output) { output = came->a, moved = output; }) && moved == 1);
+    try {
+        (void)guard.apply([](int &) { throw std::runtime_error("a command fails"); });
+        EXPECT(false);
+    } catch (const std::runtime_error &error) {
+        EXPECT(std::string(error.what()) == "a command fails");
+    }
+    sinew::guard<int> kept = std::move(guard);
+    kept.trip();
+    while (!is_tripped(kept))
+        std::this_thread::sleep_for(1ms);
+    EXPECT(fails < 0 && !kept.apply([](int &) {}));
+    guards_are_assigned(receiver, sender.address());
+    try {
+        sender.send_protected(sinew::group("test.all"), type, pair{1, 2});
+        EXPECT(false);
+    } catch (const sinew::error &error) {
+        EXPECT(error.status() == SINEW_ERROR_INVALID_ARGUMENT);
+    }
+}
+
 int main(int argc, char **argv)
 {
     const char *socket = argc > 1 ? argv[1] : "";
@@ -138,5 +215,6 @@ int main(int argc, char **argv)
     unsent_messages_are_given_back(endpoint);
     sends_may_have_a_time(endpoint);
     groups_and_names(socket);
+    outputs_are_guarded(socket);
     std::puts("all well");
 }

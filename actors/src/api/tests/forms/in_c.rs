@@ -109,7 +109,11 @@ fn error_of(told: &Told) -> ApiError {
         | Status::SinewErrorForked
         | Status::SinewErrorPanic
         | Status::SinewErrorNotMet
-        | Status::SinewErrorPartyLost => panic!("no claim of the suite ends so: {told:?}"),
+        | Status::SinewErrorPartyLost
+        | Status::SinewErrorNoSuchGuard
+        | Status::SinewErrorNotGood
+        | Status::SinewErrorSafeFails
+        | Status::SinewErrorNoWatchdog => panic!("no claim of the suite ends so: {told:?}"),
     };
     assert_eq!(error.to_string(), sentence, "the same words in both languages");
     error

@@ -1,0 +1,181 @@
+/* Commands that move something, protected from end to end. A control sends torques, and a drive follows them while they are good:
+ *
+ *   commands SOCKET control COUNT     sends one each 20 ms
+ *   commands SOCKET drive             ends when its output has become safe again
+ *
+ * Either may be a program in Rust with  struct Torque { newton_metres: f32 }  of that NAME, and Protection::of_period(500 ms).
+ */
+#define _POSIX_C_SOURCE 200809L
+
+#include <sinew.h>
+
+#include <stdio.h>
+#include <stdlib.h>
+#include <time.h>
+
+#define MS UINT64_C(1000000)
+#define SECOND UINT64_C(1000000000)
+
+/* What Rust writes: a map of one field (0x81), its name (0xa0 + 13), a float32 (0xca), most significant byte first. Between
+ * programs in C a plain struct will do. */
+static const unsigned char torque_head[] = "\x81\xadnewton_metres\xca";
+#define HEAD (sizeof torque_head - 1)
+#define TORQUE_LENGTH (HEAD + 4)
+
+/* Whether something has failed; then it says what. */
+static bool is_error(sinew_status status)
+{
+    if (status >= 0)
+        return false;
+    fprintf(stderr, "commands: %s\n", sinew_last_error());
+    return true;
+}
+
+/* Not while an output may be live: the end of the process makes none safe. */
+static sinew_status check(sinew_status status)
+{
+    if (is_error(status))
+        exit(EXIT_FAILURE);
+    return status;
+}
+
+/* Both ends say the same of the type. It is safe 1.5 s after the last good command; a machine has shorter periods. */
+static sinew_protected_type torque_type(void)
+{
+    return sinew_protected_type_of(SINEW_TEXT("demo.commanded_torque"), TORQUE_LENGTH, 500 * MS);
+}
+
+static sinew_tid await_name(sinew_endpoint *endpoint, sinew_text name)
+{
+    sinew_tid tid = 0;
+    for (int look = 0; look < 600; look++) {
+        const struct timespec pause = { 0, 50000000 };
+        if (check(sinew_resolve(endpoint, name, 10 * SECOND, &tid)) == SINEW_OK)
+            return tid;
+        nanosleep(&pause, NULL);
+    }
+    fprintf(stderr, "commands: the other one did not come within 30 s\n");
+    exit(EXIT_FAILURE);
+}
+
+static int control(sinew_endpoint *endpoint, long count)
+{
+    const sinew_protected_type type = torque_type();
+    const sinew_tid drive = await_name(endpoint, SINEW_TEXT("knee.drive"));
+    const float newton_metres = 2.5f;
+    unsigned char torque[TORQUE_LENGTH];
+    sinew_received received;
+    uint32_t bits;
+    memcpy(torque, torque_head, HEAD);
+    memcpy(&bits, &newton_metres, sizeof bits);
+    for (int byte = 0; byte < 4; byte++)
+        torque[HEAD + (size_t)byte] = (unsigned char)(bits >> (24 - 8 * byte));
+    for (long sent = 0; sent < count; sent++) {
+        check(sinew_send_protected(endpoint, drive, &type, torque, sizeof torque));
+        /* What the drive wants quoted comes here, and is not for us. */
+        if (check(sinew_receive_message(endpoint, 20 * MS, &received)) == SINEW_OK)
+            check(sinew_settle_message(endpoint, &received, SINEW_DELIVERED));
+    }
+    return EXIT_SUCCESS;
+}
+
+/* Whatever is the output of a drive; a number here. */
+struct motor { float newton_metres; };
+
+/* Called by a thread of the library's too: short, and waits for nobody. */
+static int32_t make_safe(void *output, sinew_output_state why)
+{
+    (void)why;
+    ((struct motor *)output)->newton_metres = 0.0f;
+    return 0;
+}
+
+static void move(void *output, void *argument)
+{
+    ((struct motor *)output)->newton_metres = *(const float *)argument;
+}
+
+static float torque_of(const unsigned char *bytes)
+{
+    uint32_t bits = (uint32_t)bytes[0] << 24 | (uint32_t)bytes[1] << 16 | (uint32_t)bytes[2] << 8 | bytes[3];
+    float torque;
+    memcpy(&torque, &bits, sizeof torque);
+    return torque;
+}
+
+static sinew_status follow(sinew_guard *guard, const sinew_received *command)
+{
+    sinew_status status;
+    float torque;
+    /* It is what was sealed, and nothing that we can read: the guard knows its length alone, and takes it for a good one. */
+    if (command->length != TORQUE_LENGTH || memcmp(command->bytes, torque_head, HEAD) != 0)
+        return sinew_trip(guard);
+    torque = torque_of(command->bytes + HEAD);
+    status = sinew_apply(guard, move, &torque, NULL);
+    if (status == SINEW_OK) {
+        printf("moved by %.1f Nm\n", (double)torque);
+        fflush(stdout);
+    }
+    return status;
+}
+
+/* Follows what comes until the output has become safe; false after an error, when it may be live. */
+static bool follow_all(sinew_endpoint *endpoint, sinew_guard *guard, sinew_kind torque)
+{
+    sinew_output_state state = SINEW_SAFE_NOT_ARMED;
+    sinew_received received;
+    bool is_armed = false;
+    while (!is_armed || state == SINEW_LIVE) {
+        sinew_status status;
+        /* Here somebody has seen that it is safe to; refused until enough good commands have come. Never again by itself. */
+        if (!is_armed)
+            is_armed = sinew_arm(guard) == SINEW_OK;
+        status = sinew_receive_message(endpoint, 20 * MS, &received);
+        if (is_error(status))
+            return false;
+        if (status == SINEW_OK) {
+            if (received.kind == torque && is_error(follow(guard, &received)))
+                return false;
+            if (is_error(sinew_settle_message(endpoint, &received, SINEW_DELIVERED)))
+                return false;
+        }
+        if (is_error(sinew_guard_state(guard, &state)))
+            return false;
+    }
+    printf("%s\n", sinew_output_state_text(state));
+    return true;
+}
+
+static int drive(sinew_endpoint *endpoint)
+{
+    static struct motor motor;
+    const struct timespec pause = { 0, 1000000 };
+    const sinew_protected_type type = torque_type();
+    const sinew_tid source = await_name(endpoint, SINEW_TEXT("knee.control"));
+    sinew_guard *guard;
+    bool is_well;
+    check(sinew_guard_output(endpoint, source, &type, &motor, make_safe, &guard));
+    is_well = follow_all(endpoint, guard, sinew_kind_named(type.name));
+    /* Before anything ends, well or not. Where it cannot be made safe the library tries on, while there is this process. */
+    while (sinew_release(&guard) == SINEW_ERROR_SAFE_FAILS)
+        nanosleep(&pause, NULL);
+    return is_well ? EXIT_SUCCESS : EXIT_FAILURE;
+}
+
+int main(int argc, char **argv)
+{
+    const bool is_drive = argc == 3 && strcmp(argv[2], "drive") == 0;
+    const bool is_control = argc == 4 && strcmp(argv[2], "control") == 0;
+    sinew_options options = { .size = sizeof options };
+    sinew_endpoint *endpoint;
+    int result;
+    if (!is_drive && !is_control) {
+        fprintf(stderr, "usage: commands SOCKET control COUNT, or commands SOCKET drive\n");
+        return EXIT_FAILURE;
+    }
+    options.name = sinew_text_of(is_drive ? "knee.drive" : "knee.control");
+    check(sinew_register_transport_address(sinew_text_of(argv[1]), &options, &endpoint));
+    result = is_drive ? drive(endpoint) : control(endpoint, strtol(argv[3], NULL, 10));
+    check(sinew_unregister(&endpoint));
+    return result;
+}
