@@ -2,7 +2,7 @@
 
 use std::{path::PathBuf, time::Duration};
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
 use crate::{keys, send, watch, why};
 
@@ -96,7 +96,30 @@ pub(crate) enum Command {
     },
 }
 
+/// Commands that ask no node: they have no use for what says which node, and how long it has.
+const ASK_NO_NODE: [&str; 2] = ["keys", "completions"];
+
+/// The command, as its help shows it.
+pub(crate) fn command() -> clap::Command {
+    let command = Arguments::command();
+    let hidden: Vec<_> = ["socket", "deadline_ms"]
+        .iter()
+        .filter_map(|id| command.get_arguments().find(|argument| argument.get_id() == *id))
+        .map(|argument| argument.clone().hide(true))
+        .collect();
+    // One of its own of that name goes before one that is handed down to all commands.
+    let without =
+        |command: clap::Command, name: &str| command.mut_subcommand(name, |one| one.args(hidden.clone()));
+    ASK_NO_NODE.into_iter().fold(command, without)
+}
+
 impl Arguments {
+    /// What stands on the command line.
+    pub(crate) fn read() -> Result<Self, clap::Error> {
+        let matches = command().try_get_matches()?;
+        Self::from_arg_matches(&matches).map_err(|error| error.format(&mut command()))
+    }
+
     /// How long each node has for its answer.
     pub(crate) fn within(&self) -> Duration {
         Duration::from_millis(self.deadline_ms.into())

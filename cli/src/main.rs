@@ -24,8 +24,6 @@ mod why;
 
 use std::{ffi::OsString, process::ExitCode};
 
-use clap::{CommandFactory, Parser};
-
 use arguments::{Arguments, Command};
 use system::{Fault, System};
 
@@ -49,7 +47,7 @@ struct Said {
 }
 
 fn main() -> ExitCode {
-    let arguments = match Arguments::try_parse() {
+    let arguments = match Arguments::read() {
         Ok(arguments) => arguments,
         Err(error) => return refused(&error),
     };
@@ -125,7 +123,7 @@ fn run(arguments: &Arguments) -> Result<Said, Fault> {
 /// The shell's file, as it is, whatever else was asked for.
 fn completions(shell: clap_complete::Shell) -> Said {
     let mut bytes = Vec::new();
-    clap_complete::generate(shell, &mut Arguments::command(), "sinew", &mut bytes);
+    clap_complete::generate(shell, &mut arguments::command(), "sinew", &mut bytes);
     let text = String::from_utf8_lossy(&bytes).into_owned();
     Said { json: serde_json::json!({ "shell": shell.to_string(), "text": text }), text, is_fine: true }
 }

@@ -25,7 +25,7 @@ pub(crate) enum Standing {
     EndsSoon,
     /// It does not say: of an older version.
     Unknown,
-    /// Open, and nobody but its own host reaches it.
+    /// Open, and nobody but its own host reaches it: every user of that.
     Alone,
     /// It has a certificate, and looks at nobody's times.
     NotLookedAt,

@@ -25,7 +25,7 @@ use rules::{State, Step};
 pub(crate) struct Order {
     /// A node's name or address, an application's name or TID
     from: String,
-    /// Another one
+    /// Another one, or a group's name or TID (*/f0000007): then each member is looked at
     to: String,
     /// The socket of a node on this host that is at none of the usual places nor beside the one of --socket, or is another user's: so a node
     /// is asked that the others do not know. May be given several times

@@ -1,11 +1,14 @@
 //! Where messages go: the routing table of a node, read by senders without a lock.
 
 mod copies;
+mod groups;
 pub mod guard;
 pub mod tap;
+#[cfg(test)]
+mod tests;
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     sync::{
         Arc, Mutex,
         atomic::{AtomicU64, Ordering},
@@ -15,7 +18,12 @@ use std::{
 
 use arc_swap::ArcSwap;
 
-use self::{copies::Copies, guard::Guard, tap::Tap};
+use self::{
+    copies::Copies,
+    groups::{Groups, Joined},
+    guard::Guard,
+    tap::Tap,
+};
 use crate::{
     outcome::{Rejection, Ticket},
     post::lock,
@@ -83,9 +91,32 @@ struct Table {
     /// Who decides what may reach this node's applications; nobody where everything may.
     guard: Option<Arc<dyn Guard>>,
     local: BTreeMap<AppAddress, LocalRoute>,
-    groups: BTreeMap<AppAddress, Vec<AppAddress>>,
     peers: BTreeMap<NodeAddress, Arc<dyn Outlet>>,
-    remote_groups: BTreeMap<AppAddress, Vec<NodeAddress>>,
+}
+
+/// Who is in which group. Apart from the routes: applications join and leave far more often than they come and go, and a change copies the way
+/// to one group, not the routes.
+#[derive(Clone, Default)]
+struct Members {
+    /// Applications of this node.
+    here: Groups<AppAddress>,
+    /// Nodes that have members.
+    elsewhere: Groups<NodeAddress>,
+}
+
+/// What a sender looks at: both at once, so that no group seems to have nobody where one member hands over to another. A change replaces one
+/// part and shares the other.
+#[derive(Clone, Default)]
+struct Snapshot {
+    table: Arc<Table>,
+    members: Members,
+}
+
+/// The groups that each application and each node is in; who holds it is the one writer.
+#[derive(Default)]
+struct Writing {
+    here: Joined<AppAddress>,
+    elsewhere: Joined<NodeAddress>,
 }
 
 /// Who decides about one message; nobody: it may go anywhere.
@@ -94,9 +125,9 @@ type Judge<'a> = Option<&'a Arc<dyn Guard>>;
 /// The routing table of a node. It is owned by the node, so that it outlives every layer.
 pub struct Router {
     node: NodeAddress,
-    table: ArcSwap<Table>,
+    snapshot: ArcSwap<Snapshot>,
     /// Writers take turns; readers never wait for them.
-    writing: Mutex<()>,
+    writing: Mutex<Writing>,
     /// For each reason in the order of [`Rejection`].
     refused: [AtomicU64; Rejection::ALL.len()],
     /// Where everything goes, in a process that knows no route itself.
@@ -109,8 +140,8 @@ impl Router {
     pub fn new(node: NodeAddress) -> Self {
         Self {
             node,
-            table: ArcSwap::default(),
-            writing: Mutex::new(()),
+            snapshot: ArcSwap::default(),
+            writing: Mutex::default(),
             refused: Default::default(),
             uplink: None,
         }
@@ -149,16 +180,17 @@ impl Router {
         if let Some(uplink) = &self.uplink {
             return self.account(Self::send_up(&**uplink, message));
         }
-        let table = self.table.load();
+        let snapshot = self.snapshot.load();
+        let table = &*snapshot.table;
         guard::note(table.guard.as_ref(), &message.header);
         let result = if destination.is_single() {
-            Self::send_to_one(&table, self.node, message)
+            Self::send_to_one(table, self.node, message)
         } else if destination.app == AppAddress::NONE {
             Err(Refused::new(message, Rejection::NoSuchApplication))
         } else if message.receipt.is_some() || message.header.flags.has(Flags::ASK) {
             Err(Refused::new(message, Rejection::Unsupported))
         } else {
-            self.multicast(&table, message)
+            self.multicast(&snapshot, message)
         };
         self.account(result)
     }
@@ -168,8 +200,8 @@ impl Router {
     /// # Errors
     /// Why nobody took the message.
     pub fn deliver(&self, message: Message) -> Result<(), Rejection> {
-        let table = self.table.load();
-        self.deliver_by(&table, table.guard.as_ref(), message)
+        let snapshot = self.snapshot.load();
+        self.deliver_by(&snapshot, snapshot.table.guard.as_ref(), message)
     }
 
     /// The same, by what another guard than the table's own says of it. It copies no table, however many applications there are.
@@ -177,15 +209,14 @@ impl Router {
     /// # Errors
     /// Why nobody took the message.
     pub fn deliver_judged_by(&self, message: Message, guard: &Arc<dyn Guard>) -> Result<(), Rejection> {
-        self.deliver_by(&self.table.load(), Some(guard), message)
+        self.deliver_by(&self.snapshot.load(), Some(guard), message)
     }
 
-    fn deliver_by(&self, table: &Table, guard: Judge<'_>, message: Message) -> Result<(), Rejection> {
-        let app = message.header.destination.app;
+    fn deliver_by(&self, snapshot: &Snapshot, guard: Judge<'_>, message: Message) -> Result<(), Rejection> {
         let result = if message.header.destination.is_single() {
-            submit_here(table, guard, message)
+            submit_here(&snapshot.table, guard, message)
         } else {
-            let copies = self.fan_out(table, guard, app, &message);
+            let copies = self.fan_out(snapshot, guard, &message);
             self.count(&copies);
             Ok(())
         };
@@ -199,7 +230,7 @@ impl Router {
     /// # Errors
     /// The message, and why it was not taken.
     pub fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
-        let table = self.table.load();
+        let table = &self.snapshot.load().table;
         match table.local.get(&message.header.destination.app) {
             Some(route) => tap::hand_over(table.tap.as_ref(), message, true, |message| {
                 if guard::refuses(table.guard.as_ref(), message.header.destination.app, &message.header) {
@@ -217,7 +248,7 @@ impl Router {
         if let Some(uplink) = &self.uplink {
             return uplink.cancel(ticket);
         }
-        let table = self.table.load();
+        let table = &self.snapshot.load().table;
         let outlet = if node == self.node {
             table.local.get(&app).map(|route| &route.outlet)
         } else {
@@ -235,7 +266,7 @@ impl Router {
     /// Whether the application of this node at `app` subscribed to events of this kind.
     #[must_use]
     pub fn subscribes(&self, app: AppAddress, kind: Kind) -> bool {
-        self.table.load().local.get(&app).is_some_and(|route| route.events.contains(&kind))
+        self.snapshot.load().table.local.get(&app).is_some_and(|route| route.events.contains(&kind))
     }
 
     /// How many messages nobody took.
@@ -281,19 +312,20 @@ impl Router {
     }
 
     /// One copy for each node that has a member, and one for each member here.
-    fn multicast(&self, table: &Table, message: Message) -> Result<(), Refused> {
+    fn multicast(&self, snapshot: &Snapshot, message: Message) -> Result<(), Refused> {
         let Tid { node, app } = message.header.destination;
         let mut copies = Copies::default();
+        let Snapshot { table, members } = snapshot;
         tap::saw_sent_to_many(table.tap.as_ref(), &message);
         if node == self.node || node == NodeAddress::ALL {
-            copies = self.fan_out(table, table.guard.as_ref(), app, &message);
+            copies = self.fan_out(snapshot, table.guard.as_ref(), &message);
         }
         let mut submit = |peer: &Arc<dyn Outlet>| {
             copies.note(peer.submit(copy_of(&message)).err().map(|refused| refused.why));
         };
         if node == NodeAddress::ALL && app.is_group() {
-            let members = table.remote_groups.get(&app).map_or(&[][..], Vec::as_slice);
-            members.iter().filter_map(|member| table.peers.get(member)).for_each(submit);
+            let nodes = members.elsewhere.members(app);
+            nodes.iter().filter_map(|node| table.peers.get(node)).for_each(submit);
         } else if node == NodeAddress::ALL {
             table.peers.values().for_each(submit);
         } else if let Some(peer) = table.peers.get(&node) {
@@ -314,10 +346,10 @@ impl Router {
     }
 
     /// Copies for the members on this node, except the sender itself.
-    fn fan_out(&self, table: &Table, guard: Judge<'_>, app: AppAddress, message: &Message) -> Copies {
+    fn fan_out(&self, snapshot: &Snapshot, guard: Judge<'_>, message: &Message) -> Copies {
         let mut copies = Copies::default();
         let here = self.node;
-        let mut submit = |(member, outlet): (AppAddress, &Arc<dyn Outlet>)| {
+        for_each_here(snapshot, message.header.destination.app, |member, outlet| {
             let is_sender = here == message.header.source.node && member == message.header.source.app;
             if is_sender {
                 return;
@@ -327,28 +359,27 @@ impl Router {
             } else {
                 outlet.submit(copy_of(message)).err().map(|refused| refused.why)
             };
-            tap::saw_one_of_many(table.tap.as_ref(), Tid::new(here, member), message, refused);
+            tap::saw_one_of_many(snapshot.table.tap.as_ref(), Tid::new(here, member), message, refused);
             copies.note(refused);
-        };
-        if app.is_group() {
-            let members = table.groups.get(&app).map_or(&[][..], Vec::as_slice);
-            let routes = members.iter().filter_map(|m| table.local.get(m).map(|route| (*m, &route.outlet)));
-            routes.for_each(submit);
-        } else if app == AppAddress::ALL {
-            let apps = table.local.iter().filter(|(app, _)| !app.is_layer());
-            apps.for_each(|(app, route)| submit((*app, &route.outlet)));
-        } else {
-            // A broadcast to the application that has this address on every node.
-            table.local.get(&app).into_iter().for_each(|route| submit((app, &route.outlet)));
-        }
+        });
         copies
     }
 
     fn change(&self, edit: impl FnOnce(&mut Table)) {
         let _turn = lock(&self.writing);
-        let mut table = Table::clone(&self.table.load());
-        edit(&mut table);
-        self.table.store(Arc::new(table));
+        let mut snapshot = Snapshot::clone(&self.snapshot.load());
+        edit(Arc::make_mut(&mut snapshot.table));
+        self.snapshot.store(Arc::new(snapshot));
+    }
+
+    /// Replaces who is in which group, if `edit` says that anything changed; the caller has the turn.
+    fn regroup(&self, writing: &mut Writing, edit: impl FnOnce(&mut Writing, &mut Members) -> bool) -> bool {
+        let mut snapshot = Snapshot::clone(&self.snapshot.load());
+        let changed = edit(writing, &mut snapshot.members);
+        if changed {
+            self.snapshot.store(Arc::new(snapshot));
+        }
+        changed
     }
 
     /// Adds or replaces the route to an application of this node.
@@ -360,30 +391,44 @@ impl Router {
 
     /// Removes an application and its memberships.
     pub fn remove_local(&self, app: AppAddress) {
-        self.change(|table| {
-            table.local.remove(&app);
-            for members in table.groups.values_mut() {
-                members.retain(|member| *member != app);
-            }
-            table.groups.retain(|_, members| !members.is_empty());
-        });
+        let mut writing = lock(&self.writing);
+        let mut snapshot = Snapshot::clone(&self.snapshot.load());
+        Arc::make_mut(&mut snapshot.table).local.remove(&app);
+        writing.here.set(app, BTreeSet::new(), &mut snapshot.members.here);
+        self.snapshot.store(Arc::new(snapshot));
     }
 
-    /// Makes `app` a member of `group`, or no longer one. Returns whether anything changed.
+    /// Makes `app` a member of `group`, or no longer one. Returns whether anything changed. What it costs does not depend on how many
+    /// applications and groups there are, but on how many members this group has.
     pub fn set_member(&self, group: AppAddress, app: AppAddress, member: bool) -> bool {
-        let mut changed = false;
-        self.change(|table| {
-            let members = table.groups.entry(group).or_default();
-            let was = members.contains(&app);
-            changed = was != member;
-            members.retain(|other| *other != app);
+        self.regroup(&mut lock(&self.writing), |writing, members| {
             if member {
-                members.push(app);
+                writing.here.join(group, app, &mut members.here)
+            } else {
+                writing.here.leave(group, app, &mut members.here)
             }
-            // Whoever joins and leaves groups without end must not fill the table with empty ones.
-            table.groups.retain(|_, members| !members.is_empty());
-        });
-        changed
+        })
+    }
+
+    /// Whether `app` is a member of `group`.
+    #[must_use]
+    pub fn is_member(&self, group: AppAddress, app: AppAddress) -> bool {
+        self.snapshot.load().members.here.members(group).binary_search(&app).is_ok()
+    }
+
+    /// The applications of this node that a message to many reaches, in the order of their addresses: the members of a group, every
+    /// application, or the one that has this address. Its sender may be among them, and gets none.
+    #[must_use]
+    pub fn members(&self, of: AppAddress) -> Vec<AppAddress> {
+        let mut reached = Vec::new();
+        for_each_here(&self.snapshot.load(), of, |app, _| reached.push(app));
+        reached
+    }
+
+    /// Memberships of all applications of this node in all groups.
+    #[must_use]
+    pub fn memberships(&self) -> usize {
+        lock(&self.writing).here.memberships()
     }
 
     /// Shows messages to `tap` from now on; to nobody, if there is none.
@@ -396,11 +441,16 @@ impl Router {
         self.change(|table| table.guard = Some(guard));
     }
 
-    /// Groups that have a member on this node.
+    /// Groups that have a member on this node, in the order of their addresses.
     #[must_use]
     pub fn groups(&self) -> Vec<AppAddress> {
-        let table = self.table.load();
-        table.groups.keys().copied().collect()
+        self.groups_with_members().into_iter().map(|(group, _)| group).collect()
+    }
+
+    /// The same with their members.
+    #[must_use]
+    pub fn groups_with_members(&self) -> Vec<(AppAddress, Arc<[AppAddress]>)> {
+        self.snapshot.load().members.here.all()
     }
 
     /// Adds or replaces the route to another node.
@@ -417,17 +467,26 @@ impl Router {
         });
     }
 
-    /// States which groups have members on another node.
+    /// States which groups have members on another node. Only the ways to the groups that differ from what was said before are copied.
     pub fn set_remote_groups(&self, node: NodeAddress, groups: &[AppAddress]) {
-        self.change(|table| {
-            for nodes in table.remote_groups.values_mut() {
-                nodes.retain(|other| *other != node);
-            }
-            for group in groups {
-                table.remote_groups.entry(*group).or_default().push(node);
-            }
-            table.remote_groups.retain(|_, nodes| !nodes.is_empty());
+        self.regroup(&mut lock(&self.writing), |writing, members| {
+            writing.elsewhere.set(node, groups.iter().copied().collect(), &mut members.elsewhere)
         });
+    }
+}
+
+/// Shows `each` the applications of this node that a message to many is for, in the order of their addresses.
+fn for_each_here(snapshot: &Snapshot, of: AppAddress, mut each: impl FnMut(AppAddress, &Arc<dyn Outlet>)) {
+    let Snapshot { table, members } = snapshot;
+    if of.is_group() {
+        let routes = members.here.members(of).iter().filter_map(|app| Some((*app, table.local.get(app)?)));
+        routes.for_each(|(app, route)| each(app, &route.outlet));
+    } else if of == AppAddress::ALL {
+        let apps = table.local.iter().filter(|(app, _)| !app.is_layer());
+        apps.for_each(|(app, route)| each(*app, &route.outlet));
+    } else if let Some(route) = table.local.get(&of) {
+        // A broadcast to the application that has this address on every node.
+        each(of, &route.outlet);
     }
 }
 

@@ -21,6 +21,15 @@ pub(super) struct ClientRule {
     pub(super) names: Vec<String>,
     /// The fixed addresses that they may have; none: only those that the node chooses.
     pub(super) addresses: Vec<RangeInclusive<u32>>,
+    /// The groups that they may join, if it says so; else nothing is allowed by it, and the robot's own are not narrowed.
+    pub(super) groups: Option<Vec<Joinable>>,
+}
+
+/// A group that somebody may join. What is asked for is a number made of its name, so that no pattern can be compared with it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Joinable {
+    Any,
+    One(AppAddress),
 }
 
 /// A process that comes in, as the kernel says (SO_PEERCRED).
@@ -53,6 +62,10 @@ pub(crate) enum ClientRefusal {
         "{who} may not have the address {address}: [[client]] at {lines} of the access list does not have it; choose another one, or add it to `addresses`"
     )]
     Address { who: Applicant, address: AppAddress, lines: Lines },
+    #[error(
+        "{who} may not join the group {group}: [[client]] at {lines} of the access list does not have it; join another one, or add its name to `groups`"
+    )]
+    Group { who: Applicant, group: AppAddress, lines: Lines },
 }
 
 /// Where the rules are that are about somebody.
@@ -80,6 +93,14 @@ impl List {
     /// Whether a rule is about `who`.
     pub(crate) fn is_about(&self, who: Applicant) -> bool {
         self.about(who).next().is_some()
+    }
+
+    /// Where the rules are that let users beside `own` and root in and name no groups, if there are any.
+    pub(super) fn without_groups(&self, own: u32) -> Option<Lines> {
+        let is_of_others = |rule: &&ClientRule| rule.uid.is_none_or(|uid| uid != own && uid != 0);
+        let without = self.clients.iter().filter(is_of_others).filter(|rule| rule.groups.is_none());
+        let lines: Vec<_> = without.map(|rule| rule.line).collect();
+        (!lines.is_empty()).then_some(Lines(lines))
     }
 
     /// Whether `who` may come in on a node that runs as the user `own`: that user and root may, and whoever a rule is about.
@@ -124,5 +145,28 @@ impl List {
             }
             (_, _) => Ok(()),
         }
+    }
+
+    /// Whether `who` may become a member of `group`. The node's own user and root may, unless a rule about them says which groups; others
+    /// only where a rule says so.
+    ///
+    /// # Errors
+    /// Why not.
+    pub(crate) fn may_join(&self, own: u32, who: Applicant, group: AppAddress) -> Result<(), ClientRefusal> {
+        self.admit(own, who)?;
+        let is_own = who.uid == own || who.uid == 0;
+        let mut said = self.about(who).filter_map(|rule| rule.groups.as_deref()).peekable();
+        if is_own && said.peek().is_none() {
+            return Ok(());
+        }
+        let covers = |joinable: &Joinable| match joinable {
+            Joinable::Any => true,
+            Joinable::One(one) => *one == group,
+        };
+        if said.flatten().any(covers) {
+            return Ok(());
+        }
+        let lines = Lines(self.about(who).map(|rule| rule.line).collect());
+        Err(ClientRefusal::Group { who, group, lines })
     }
 }

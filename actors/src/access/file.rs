@@ -9,7 +9,7 @@ use toml::{
 };
 
 use super::{
-    client::{CLIENTS_MAX, ClientRule},
+    client::{CLIENTS_MAX, ClientRule, Joinable},
     rule::{Action, Classes, List, PATTERNS_MAX, RULES_MAX, Rule, TEXTS_MAX},
     who::{self, Who},
 };
@@ -18,7 +18,7 @@ use crate::security::files::{self, FileFault};
 
 /// Keys of a `[[rule]]` and of a `[[client]]`.
 const RULE_KEYS: [&str; 6] = ["name", "from", "to", "groups", "classes", "action"];
-const CLIENT_KEYS: [&str; 4] = ["uid", "gid", "names", "addresses"];
+const CLIENT_KEYS: [&str; 5] = ["uid", "gid", "names", "addresses", "groups"];
 /// Longest file in bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 /// Longest name of a rule in bytes.
@@ -181,7 +181,8 @@ impl<'t> Reader<'t> {
         let names = self.texts(table, "client.names", legal, who::name_pattern).unwrap_or_default();
         let legal = "addresses as in \"1001\" or \"1000-10ff\", or \"*\"";
         let addresses = self.texts(table, "client.addresses", legal, who::range).unwrap_or_default();
-        Some(ClientRule { line: line_of(self.text, &place.span()), uid, gid, names, addresses })
+        let groups = self.texts(table, "client.groups", JOINABLE_LEGAL, joinable);
+        Some(ClientRule { line: line_of(self.text, &place.span()), uid, gid, names, addresses, groups })
     }
 
     fn know_all(&mut self, table: &Table<'t>, of: &str, keys: &[&str]) {
@@ -245,6 +246,7 @@ impl<'t> Reader<'t> {
 }
 
 const GROUP_LEGAL: &str = "names of groups";
+const JOINABLE_LEGAL: &str = "names of groups, or \"*\" for every one";
 const CLASS_LEGAL: &str = "\"control\", \"stream\" or \"bulk\"";
 
 fn leaf(key: &str) -> &str {
@@ -259,6 +261,10 @@ fn group(text: &str) -> Result<AppAddress, &'static str> {
         );
     }
     Ok(AppAddress::group(text))
+}
+
+fn joinable(text: &str) -> Result<Joinable, &'static str> {
+    if text == "*" { Ok(Joinable::Any) } else { group(text).map(Joinable::One) }
 }
 
 fn class(text: &str) -> Result<Class, &'static str> {

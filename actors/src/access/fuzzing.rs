@@ -102,6 +102,9 @@ fn judge_users(list: &List) {
             let who = Applicant { uid, gid };
             let admitted = list.admit(OWN, who).is_ok();
             assert_eq!(admitted, uid == OWN || uid == 0 || list.is_about(who), "{who}");
+            let joins = list.may_join(OWN, who, AppAddress::group("drives"));
+            assert!(admitted || joins.is_err(), "{who} may not come in, and joins a group");
+            assert!(joins.err().is_none_or(|why| !why.to_string().is_empty()), "a refusal has words");
             for name in [None, Some("guest.1"), Some("gait")] {
                 for address in [None, Some(AppAddress::new(0x2001))] {
                     let may = list.may_register(OWN, who, name, address);

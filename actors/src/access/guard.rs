@@ -1,7 +1,7 @@
 //! The list in force, as every sender reads it; read again on request, and told who has which name.
 
 use std::{
-    collections::VecDeque,
+    collections::{BTreeSet, VecDeque},
     fmt,
     path::PathBuf,
     sync::{Arc, Mutex},
@@ -17,9 +17,10 @@ use sinew_runtime::{
 
 use super::{
     asked::Asked,
-    client::{Applicant, ClientRefusal},
+    client::{Applicant, ClientRefusal, Lines},
     file,
     index::{Index, Names},
+    memberships::{JoinRefusal, Memberships},
     rule::{List, Question, Verdict},
 };
 use crate::{
@@ -42,6 +43,8 @@ pub(crate) struct Access {
     writing: Mutex<()>,
     /// Which user's process had which address last; of more than [`HOLDERS_MAX`] the one that came first and has gone is forgotten.
     holders: Mutex<VecDeque<Holder>>,
+    /// Which applications are guests', and how many memberships of groups they have.
+    memberships: Mutex<Memberships>,
     /// What the applications of this node may be told in reply.
     asked: Asked,
 }
@@ -106,8 +109,8 @@ impl Access {
     pub(crate) fn new(here: NodeAddress, path: PathBuf, list: List, refusals: Arc<Refusals>) -> Self {
         let index = ArcSwap::from_pointee(Index::new(Arc::new(list), here));
         let (reloading, writing, holders) = (Mutex::default(), Mutex::default(), Mutex::default());
-        let asked = Asked::default();
-        Self { here, path, refusals, index, reloading, writing, holders, asked }
+        let (memberships, asked) = (Mutex::default(), Asked::default());
+        Self { here, path, refusals, index, reloading, writing, holders, memberships, asked }
     }
 
     /// Reads the file again and puts its list in force, for every message from now on.
@@ -149,6 +152,7 @@ impl Access {
     /// An application of this node has gone for good.
     pub(crate) fn gone(&self, app: AppAddress) {
         self.asked.forget(app);
+        lock(&self.memberships).gone(app);
         lock(&self.holders)
             .iter_mut()
             .filter(|holder| holder.app == app)
@@ -273,6 +277,38 @@ impl Access {
         self.index.load().list.may_register(own, who, name, address)
     }
 
+    /// A guest, of `uid`, has this address; said before it can join anything.
+    pub(crate) fn guest_came(&self, app: AppAddress, uid: u32) {
+        lock(&self.memberships).came(app, uid);
+    }
+
+    /// One of the robot's own has this address; said before it can join anything.
+    pub(crate) fn own_came(&self, app: AppAddress) {
+        lock(&self.memberships).gone(app);
+    }
+
+    /// The applications of guests: of users beside the node's own and root.
+    pub(crate) fn guests(&self) -> BTreeSet<AppAddress> {
+        lock(&self.memberships).guests()
+    }
+
+    /// Counts that `who`, the application at `app`, becomes a member of `group`, if it may by the list in force now. What it is a member of
+    /// already it stays, whatever list comes.
+    pub(crate) fn join(
+        &self,
+        own: u32,
+        (who, app): (Applicant, AppAddress),
+        group: AppAddress,
+    ) -> Result<(), JoinRefusal> {
+        self.index.load().list.may_join(own, who, group)?;
+        lock(&self.memberships).join(app)
+    }
+
+    /// It is not a member any more of a group that it had joined.
+    pub(crate) fn leave(&self, app: AppAddress) {
+        lock(&self.memberships).leave(app);
+    }
+
     /// Whether the process that has this address now is one of the user `own`, or of root; not, if that is not known any more.
     pub(crate) fn is_of(&self, app: AppAddress, own: u32) -> bool {
         lock(&self.holders).iter().any(|holder| holder.app == app && [own, 0].contains(&holder.uid))
@@ -286,6 +322,16 @@ impl Access {
     /// Whether a rule is about processes of the user `own` in its group, of whom most are meant to do anything.
     pub(crate) fn narrows(&self, own: Applicant) -> bool {
         self.index.load().list.is_about(own)
+    }
+
+    /// Where the rules are that let users beside `own` and root in and name no groups, if there are any.
+    pub(crate) fn without_groups(&self, own: u32) -> Option<Lines> {
+        self.index.load().list.without_groups(own)
+    }
+
+    /// The groups that rules name: of a message to any other one the list says what it says of one to its members alone.
+    pub(crate) fn groups_in_rules(&self) -> BTreeSet<AppAddress> {
+        self.index.load().list.rules.iter().flat_map(|rule| rule.groups.iter().copied()).collect()
     }
 
     /// What becomes of such a message, and why.

@@ -13,7 +13,7 @@ use super::{client::ClientRule, who::Who};
 pub(super) const RULES_MAX: usize = 256;
 /// Texts in `from` and `to` of all rules of one list at most: so much each new name is compared with.
 pub(super) const PATTERNS_MAX: usize = 2_048;
-/// Texts in one `from`, `to`, `groups`, `names` or `addresses` at most.
+/// Texts in one `from`, `to`, `groups`, `names` or `addresses` at most, in a rule or in a `[[client]]`.
 pub(super) const TEXTS_MAX: usize = 64;
 
 /// Everything that a file says.

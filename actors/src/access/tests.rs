@@ -4,6 +4,7 @@ use std::{collections::BTreeMap, sync::Arc};
 
 use proptest::prelude::*;
 use sinew_runtime::{
+    outcome::Rejection,
     router::guard::Guard as _,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     wire::{Class, Header, Kind},
@@ -210,6 +211,78 @@ fn a_user_has_what_its_rule_says_and_nobody_else_comes_in() {
     assert_eq!(may(1002, 9, None, None), Err(ClientRefusal::NotAdmitted(1002, 1000)));
     // The names of one rule and the addresses of another are not for anybody.
     assert!(may(1001, 50, None, Some(0x2001)).is_ok());
+}
+
+#[test]
+fn a_user_joins_the_groups_that_its_rules_name_and_the_robots_own_are_narrowed_by_groups_alone() {
+    let list = parse(
+        "[[client]]\nuid = 1001\ngroups = ['telemetry']\n[[client]]\ngid = 50\ngroups = ['cameras', 'legs']\n\
+         [[client]]\nuid = 1002\n[[client]]\nuid = 1003\ngroups = ['*']\n[[client]]\nuid = 0\nnames = ['*']\n",
+    )
+    .unwrap();
+    let may = |uid, gid, group| list.may_join(1000, Applicant { uid, gid }, AppAddress::group(group));
+    assert_eq!(may(1001, 9, "telemetry"), Ok(()));
+    let why = may(1001, 9, "stop").expect_err("it is not among them");
+    assert!(matches!(why, ClientRefusal::Group { .. }), "{why:?}");
+    for word in ["user 1001", &AppAddress::group("stop").to_string(), "line 1 ", "`groups`"] {
+        assert!(why.to_string().contains(word), "{why}");
+    }
+    assert_eq!(may(1001, 50, "legs"), Ok(()), "several rules add up");
+    assert!(may(1002, 9, "telemetry").is_err(), "none where none is named");
+    assert_eq!(may(1003, 9, "anything"), Ok(()));
+    assert_eq!(may(1004, 9, "telemetry"), Err(ClientRefusal::NotAdmitted(1004, 1000)));
+    assert_eq!(
+        (may(1000, 9, "stop"), may(0, 9, "stop")),
+        (Ok(()), Ok(())),
+        "nothing is said of their groups"
+    );
+    assert!(
+        may(1000, 50, "stop").is_err() && may(0, 50, "legs").is_ok(),
+        "the group's rule is about them, too"
+    );
+}
+
+#[test]
+fn which_rules_for_other_users_name_no_groups_is_known() {
+    let without = |text| parse(text).unwrap().without_groups(1000).map(|lines| lines.to_string());
+    assert_eq!(without("[[client]]\nuid = 1001\n[[client]]\ngid = 50\n").as_deref(), Some("line 1, 3"));
+    assert_eq!(without("[[client]]\nuid = 1001\ngroups = ['*']\n"), None);
+    assert_eq!(without("[[client]]\nuid = 1000\n[[client]]\nuid = 0\n"), None, "these join any all the same");
+}
+
+#[test]
+fn a_pattern_of_groups_is_a_fault_with_what_to_do() {
+    for groups in ["['leg*']", "['']", "[7]", "[]", "'legs'"] {
+        let faults =
+            parse(&format!("[[client]]\nuid = 1\ngroups = {groups}\n")).expect_err(groups).to_string();
+        assert!(faults.starts_with("client.groups (line 3)"), "{faults}");
+    }
+}
+
+#[test]
+fn the_documented_list_is_one() {
+    let text = include_str!("../../../docs/CONFIGURATION.md");
+    let block = text.split("```toml\n").find(|block| block.starts_with("# The first rule")).unwrap();
+    let list = parse(block.split("```").next().unwrap()).unwrap_or_else(|faults| panic!("{faults}"));
+    let may = |group| list.may_join(1000, Applicant { uid: 1001, gid: 9 }, AppAddress::group(group));
+    assert!(may("telemetry").is_ok() && may("stop").is_err());
+}
+
+#[test]
+fn what_is_joined_is_counted_by_the_list_that_is_in_force_then() {
+    let stores = Stores::for_test(NodeConfig::new("knee"), Incarnation(1));
+    let access = Access::in_test(&stores, "[[client]]\nuid = 1001\ngroups = ['telemetry']\n");
+    let (who, guest) = (Applicant { uid: 1_001, gid: 9 }, AppAddress::new(0x8000_0001));
+    let join = |group| access.join(1_000, (who, guest), AppAddress::group(group));
+    access.guest_came(guest, 1_001);
+    assert_eq!(join("telemetry"), Ok(()));
+    assert!(access.guests().contains(&guest));
+    let why = join("stop").expect_err("the list does not have it");
+    assert_eq!(why.why(), Rejection::NotAllowed);
+    access.replace_in_test("[[client]]\nuid = 1001\ngroups = ['stop']\n");
+    assert!(join("stop").is_ok() && join("telemetry").is_err());
+    access.gone(guest);
+    assert!(access.guests().is_empty());
 }
 
 #[test]

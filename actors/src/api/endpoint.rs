@@ -299,7 +299,8 @@ impl Endpoint {
     /// Joins the group called `name`: what is sent to [`Tid::group`] reaches this endpoint from now on.
     ///
     /// # Errors
-    /// It is a member of 256 groups already, or the node did not answer.
+    /// It is a member of 256 groups already, or its user or node has as many memberships as it may ([`ApiError::TooManyGroups`]); the node's access
+    /// list does not let its user join this one ([`ApiError::Ended`], `NotAllowed`); or the node did not answer.
     pub fn join(&mut self, name: &str) -> Result<(), ApiError> {
         at_once(self.set_member(AppAddress::group(name), true))
     }

@@ -90,8 +90,12 @@ pub enum ApiError {
     /// A request was not handled. The outcome says why.
     #[error("{}", not_handled(*.0))]
     Ended(Outcome),
-    /// The endpoint is a member of as many groups as it may. The caller is at fault; nothing was joined.
-    #[error("this endpoint is a member of 256 groups, which is the most; leave one first")]
+    /// The endpoint is a member of as many groups as it may, or its user or node has as many memberships as it may. The caller is at fault, or
+    /// other applications are; nothing was joined.
+    #[error(
+        "this endpoint is a member of 256 groups, which is the most, or its node has no room for a further membership of its user, or of anybody; \
+         leave one first"
+    )]
     TooManyGroups,
     /// A protected payload cannot be sealed. The caller is at fault; nothing was sent.
     #[error("the message was not sent: {0}")]

@@ -505,7 +505,7 @@ impl StreamHandler<News> for Gncl {
                     self.input(Input::Starved, ctx);
                 }
                 if let Some((node, address)) = self.core.dialled(connection) {
-                    self.stores.gncl.notes.dial_failed(Time::now(), node, address, error.to_string());
+                    self.stores.gncl.notes.dial_failed(Time::now(), node, address, &error);
                 }
                 if error.kind() == io::ErrorKind::InvalidData {
                     self.stores.gncl.refusals.count(Time::now(), NOT_PROVEN, &error);

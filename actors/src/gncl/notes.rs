@@ -1,6 +1,6 @@
 //! What is told of the connections to other nodes to whoever asks: since when they stand or do not, and how the last dial failed.
 
-use std::{collections::BTreeMap, net::SocketAddr, sync::Mutex};
+use std::{collections::BTreeMap, io, net::SocketAddr, sync::Mutex};
 
 use sinew_runtime::{tid::NodeAddress, time::Time};
 
@@ -39,8 +39,53 @@ pub(crate) struct FailedDial {
     pub(crate) at: Time,
     pub(crate) address: SocketAddr,
     pub(crate) error: String,
+    pub(crate) fault: DialFault,
     /// How many have failed, with this one, since there was a connection last.
     pub(crate) count: u64,
+}
+
+/// How far a dial came that failed: what mends it is another thing each time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum DialFault {
+    /// The host is there, and nobody listens.
+    Refused,
+    /// Somebody listens, and it is not proven that he is who is meant, or he does not take this node.
+    NotProven,
+    /// Somebody listened, and hung up before that was proven.
+    HungUp,
+    /// The system says something else: mostly that there is no way.
+    System,
+}
+
+impl DialFault {
+    fn of(error: &io::Error) -> Self {
+        const ENDS: [io::ErrorKind; 4] = [
+            io::ErrorKind::ConnectionReset,
+            io::ErrorKind::ConnectionAborted,
+            io::ErrorKind::BrokenPipe,
+            io::ErrorKind::UnexpectedEof,
+        ];
+        let kind = error.kind();
+        if kind == io::ErrorKind::ConnectionRefused {
+            Self::Refused
+        } else if kind == io::ErrorKind::InvalidData {
+            Self::NotProven
+        } else if ENDS.contains(&kind) {
+            Self::HungUp
+        } else {
+            Self::System
+        }
+    }
+
+    /// As reports call it.
+    pub(crate) const fn word(self) -> &'static str {
+        match self {
+            Self::Refused => "refused",
+            Self::NotProven => "not proven",
+            Self::HungUp => "hung up",
+            Self::System => "system",
+        }
+    }
 }
 
 impl Notes {
@@ -49,10 +94,11 @@ impl Notes {
         lock(&self.0).get(&node).map(|entry| entry.note.clone()).unwrap_or_default()
     }
 
-    pub(super) fn dial_failed(&self, now: Time, node: NodeAddress, address: SocketAddr, error: String) {
+    pub(super) fn dial_failed(&self, now: Time, node: NodeAddress, address: SocketAddr, error: &io::Error) {
+        let (error, fault) = (error.to_string(), DialFault::of(error));
         self.write(now, node, |note| {
             let count = note.dial.as_ref().map_or(0, |dial| dial.count) + 1;
-            note.dial = Some(FailedDial { at: now, address, error, count });
+            note.dial = Some(FailedDial { at: now, address, error, fault, count });
         });
     }
 
@@ -97,16 +143,26 @@ mod tests {
         let at = |seconds| Time::ZERO + Duration::from_secs(seconds);
         let address: SocketAddr = ([127, 0, 0, 2], 7).into();
         let incarnation = Incarnation(1);
-        notes.dial_failed(at(1), node, address, "refused".to_owned());
-        notes.dial_failed(at(2), node, address, "timed out".to_owned());
+        notes.dial_failed(at(1), node, address, &io::ErrorKind::ConnectionRefused.into());
+        notes.dial_failed(at(2), node, address, &io::Error::other("timed out"));
         let dial = notes.of(node).dial.expect("two have failed");
         assert_eq!((dial.count, dial.error.as_str(), dial.at), (2, "timed out", at(2)));
+        assert_eq!(dial.fault, DialFault::System);
         notes.fact(at(3), &LinkFact::LinkUp { node, incarnation });
         assert_eq!(notes.of(node), Note { linked: Some(at(3)), broken: None, dial: None });
         notes.fact(at(4), &LinkFact::LinkBroken { node, incarnation });
         assert_eq!(notes.of(node), Note { linked: None, broken: Some(at(4)), dial: None });
         notes.fact(at(5), &LinkFact::PeerLeft { node, incarnation });
         assert_eq!(notes.of(node), Note::default());
+    }
+
+    #[test]
+    fn how_far_a_dial_came_is_known_by_its_error() {
+        let of = |kind: io::ErrorKind| DialFault::of(&kind.into()).word();
+        assert_eq!(of(io::ErrorKind::ConnectionRefused), "refused");
+        assert_eq!(of(io::ErrorKind::InvalidData), "not proven");
+        assert_eq!([io::ErrorKind::ConnectionReset, io::ErrorKind::UnexpectedEof].map(of), ["hung up"; 2]);
+        assert_eq!([io::ErrorKind::TimedOut, io::ErrorKind::HostUnreachable].map(of), ["system"; 2]);
     }
 
     #[test]
@@ -123,7 +179,8 @@ mod tests {
         for number in first..=last {
             notes.fact(at(2), &LinkFact::LinkBroken { node: node(number), incarnation });
         }
-        notes.dial_failed(at(3), dialled, ([127, 0, 0, 2], 7).into(), "refused".to_owned());
+        let refused = io::ErrorKind::ConnectionRefused.into();
+        notes.dial_failed(at(3), dialled, ([127, 0, 0, 2], 7).into(), &refused);
         // When
         notes.fact(at(4), &LinkFact::LinkUp { node: node(last + 1), incarnation });
         // Then

@@ -4,14 +4,14 @@ use std::{sync::Arc, time::Duration};
 
 use sinew_runtime::{
     outcome::Rejection,
-    tid::AppAddress,
+    tid::{AppAddress, Tid},
     time::Time,
     wire::{Class, Message},
 };
 
 use super::reports::{AccessReport, AccessVerdict, AskAccess, ReloadReport};
 use crate::{
-    access::{Explanation, Question},
+    access::{Access, Explanation, Question},
     lncl::Owner,
     node::NodeHandle,
     secured::DenyListError,
@@ -33,11 +33,20 @@ pub(super) fn explained(stores: &Arc<Stores>, question: &Message) -> Result<Acce
     if target.node != stores.node || !target.is_single() || target.app.is_layer() {
         return Err(Rejection::NoSuchApplication);
     }
+    Ok(AccessReport { is_given: true, verdicts: verdicts(access, (source, target), None) })
+}
+
+/// What the list says of messages from the one to the other, or to this group that the other is a member of; for each class.
+pub(super) fn verdicts(
+    access: &Access,
+    (source, target): (Tid, Tid),
+    group: Option<AppAddress>,
+) -> Vec<AccessVerdict> {
     let verdict = |class| {
-        let Explanation { is_allowed, why } = access.explain(Question { source, target, group: None, class });
+        let Explanation { is_allowed, why } = access.explain(Question { source, target, group, class });
         AccessVerdict { class, is_allowed, why }
     };
-    Ok(AccessReport { is_given: true, verdicts: Class::ALL.map(verdict).to_vec() })
+    Class::ALL.map(verdict).to_vec()
 }
 
 /// Whether the application at `app` is one of this process, or of another one of the same user or of root.
@@ -134,7 +143,6 @@ mod tests {
 
     use super::*;
     use crate::{
-        access::Access,
         config::NodeConfig,
         secured::Secured,
         security::{

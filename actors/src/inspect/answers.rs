@@ -296,6 +296,7 @@ fn peers(stores: &Stores, now: Time) -> BTreeMap<NodeAddress, PeerReport> {
         peer.dial = note.dial.map(|dial| DialReport {
             address: dial.address.to_string(),
             error: dial.error,
+            fault: dial.fault.word().to_owned(),
             ago_us: micros(now.since(dial.at)),
             failed: dial.count,
         });

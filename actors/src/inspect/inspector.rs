@@ -21,7 +21,11 @@ use sinew_runtime::{
 use super::{
     access::{self, Readings},
     answers::Answers,
-    reports::{AskAccess, AskApps, AskAudit, AskNode, AskReload, AskTree, AskWatch, Report, WatchReport},
+    reach,
+    reports::{
+        AskAccess, AskApps, AskAudit, AskGroups, AskNode, AskReach, AskReload, AskTree, AskWatch, Report,
+        WatchReport,
+    },
     watches::{NewTap, WATCHES_MAX, Watches, Ways},
 };
 use crate::{log, stores::Stores};
@@ -120,6 +124,8 @@ fn answer(
         AskAccess::KIND => {
             reply(answers, number, &question, |_, stores| access::explained(stores, &question))
         }
+        AskReach::KIND => reply(answers, number, &question, |_, stores| reach::reached(stores, &question)),
+        AskGroups::KIND => reply(answers, number, &question, |_, stores| reach::by_groups(stores, &question)),
         AskReload::KIND => {
             reply(answers, number, &question, |_, stores| access::reloaded(stores, readings, &question))
         }

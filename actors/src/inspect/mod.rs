@@ -12,12 +12,14 @@
 //! | INSPECT-5 | A panic in an answer costs that answer, which ends as `Failed`, and nothing else. |
 //! | INSPECT-6 | A watch sees what the routing table hands over: all that an application of this node sends and gets, but for direct links between processes. At most 8 watches; each keeps 2,048 messages and 1 MiB of payloads until it is asked, further ones are counted as dropped. Nobody who sends waits for it. It is over 3 s after the last question, and without one it costs a sender one look at a pointer. Its answers travel as Bulk. |
 //! | INSPECT-7 | The node's access list does not apply to questions. Its file is read again on the word of a program on the node's own host only; one with faults changes nothing. |
+//! | INSPECT-8 | Whom a message to many reaches is what the routing table says, by the same way as that by which one goes: nothing is sent for it, so that no application gets anything, nothing is counted, and no watch shows it. |
 //!
 //! `docs/protocol/inspect.md` has the fields.
 
 mod access;
 mod answers;
 mod inspector;
+mod reach;
 mod reports;
 #[cfg(test)]
 mod tests;
@@ -25,12 +27,12 @@ mod watches;
 
 pub(crate) use inspector::begin;
 pub use reports::{
-    APPS_MAX, AccessReport, AccessVerdict, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskNode,
-    AskReload, AskTree, AskWatch, AuditReport, BarrierReport, CertificateReport, DialReport, ForeignReport,
-    IdleReport, KindReport, LinkReport, LostReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping,
-    RefusalReport, ReloadReport, RouteReport, SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage,
-    SourceReport, StallReport, StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport,
-    WatchReport,
+    APPS_MAX, AccessReport, AccessVerdict, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskGroups,
+    AskNode, AskReach, AskReload, AskTree, AskWatch, AuditReport, BarrierReport, CertificateReport,
+    DialReport, ForeignReport, IdleReport, KindReport, LinkReport, LostReport, Missing, NodeReport,
+    PEERS_MAX, PeerReport, Ping, REACHED_MAX, ReachReport, Reached, RefusalReport, ReloadReport, RouteReport,
+    SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage, SourceReport, StallReport, StreamReport, TREE_MAX,
+    TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
 };
 
 #[cfg(doc)]

@@ -2,6 +2,7 @@
 
 mod access;
 mod peers;
+mod reach;
 mod security;
 
 pub use access::{AccessReport, AccessVerdict, AskAccess, AskReload, ReloadReport};
@@ -9,6 +10,7 @@ pub use peers::{
     DialReport, ForeignReport, IdleReport, LinkReport, LostReport, PeerReport, RouteReport, SourceReport,
     StallReport, StreamReport, TroubleReport,
 };
+pub use reach::{AskGroups, AskReach, REACHED_MAX, ReachReport, Reached};
 pub use security::{CertificateReport, SecurityReport};
 
 use serde::{Deserialize, Serialize};

@@ -3,6 +3,7 @@
 mod barrier;
 mod end;
 pub(super) mod life;
+mod memberships;
 mod notices;
 mod orders;
 mod outcomes;
@@ -26,6 +27,7 @@ pub(super) use self::notices::Notices;
 use self::{
     end::{End, LAST_WORDS},
     life::Life,
+    memberships::Orders,
     outcomes::Outcomes,
 };
 use super::{
@@ -152,6 +154,8 @@ struct Client {
     outlet: Arc<ClientOutlet>,
     outcomes: Arc<Outcomes>,
     notices: Rc<Notices>,
+    /// What it has asked about its groups.
+    orders: Orders,
     /// Set while messages flow.
     link: Option<LinkNumber>,
     tid: Tid,
@@ -216,6 +220,7 @@ impl Client {
             outlet,
             outcomes,
             notices,
+            orders: Orders::default(),
             link,
             tid,
             name,
@@ -354,10 +359,12 @@ impl Client {
                 Ok(None) => return End::HungUp(None),
                 Err(error) => return End::from(error),
             };
-            if let ControlFlow::Break(end) = self.obey(session.handle(message)) {
+            let order = session.handle(message);
+            if let ControlFlow::Break(end) = self.obey_session(session, order) {
                 return end;
             }
             self.outcomes.may_come().await;
+            self.orders.may_come().await;
         }
     }
 

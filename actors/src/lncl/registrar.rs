@@ -53,7 +53,7 @@ pub(crate) fn register_local(stores: &Stores, app: LocalApp) -> Result<Tid, Regi
     let mut registry = lock(&stores.registry);
     let fact_requires = request.requires.clone();
     let app = registry.register(request, limits(stores))?;
-    named(stores, app, name.as_deref());
+    tell_access(stores, app, name.as_deref(), user);
     let handled = events.to_vec();
     stores.router.set_local(app, LocalRoute { outlet, events });
     monitors::note(stores, monitors::Input::Began { app });
@@ -122,19 +122,31 @@ pub(super) fn register_client(stores: &Stores, request: Request) -> Result<AppAd
     }
     let (name, requires) = (request.name.clone(), request.requires.clone());
     let handled = request.kinds.iter().map(|name| Kind::named(name)).collect();
+    let user = request.user;
     let mut registry = lock(&stores.registry);
     let app = registry.register(request, limits(stores))?;
-    named(stores, app, name.as_deref());
-    monitors::note(stores, monitors::Input::Began { app });
+    tell_access(stores, app, name.as_deref(), user);
+    let began = match user {
+        User::Own => monitors::Input::Began { app },
+        User::Guest(_) => monitors::Input::GuestBegan { app },
+    };
+    monitors::note(stores, began);
     tell_sync(stores, AppFact::Registered { app, name, requires });
+    if let User::Guest(uid) = user {
+        tell_sync(stores, AppFact::Guest { app, uid });
+    }
     tell_handled(stores, app, handled);
     Ok(app)
 }
 
-/// The access list has rules about names: it knows one before whoever has it can send or get anything.
-fn named(stores: &Stores, app: AppAddress, name: Option<&str>) {
-    if let Some(access) = stores.access.get() {
-        access.named(app, name);
+/// The access list has rules about names: it knows one before whoever has it can send or get anything. So it does whose guest it is, and by
+/// the lock that the caller holds it forgets that with the registration.
+fn tell_access(stores: &Stores, app: AppAddress, name: Option<&str>, user: User) {
+    let Some(access) = stores.access.get() else { return };
+    access.named(app, name);
+    match user {
+        User::Own => access.own_came(app),
+        User::Guest(uid) => access.guest_came(app, uid),
     }
 }
 
@@ -222,7 +234,7 @@ mod tests {
     };
 
     use super::*;
-    use crate::{NodeConfig, sync};
+    use crate::{NodeConfig, access::Access, sync};
 
     #[test]
     fn a_name_is_free_when_its_address_is_given_back_whenever_the_sync_manager_hears_of_it() {
@@ -299,6 +311,50 @@ mod tests {
             usize::try_from(3 * come_and_gone).unwrap(),
             "each change was told"
         );
+    }
+
+    #[test]
+    fn that_an_application_is_a_guests_is_told_behind_its_registration() {
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let owner = Owner::Client { id: lock(&stores.registry).new_client(), pid: 1 };
+        let (address, user) = (Address::Dynamic, User::Guest(1_001));
+        let request = Request { address, name: None, requires: vec![], kinds: vec![], owner, user };
+        let app = register_client(&stores, request).expect("nothing is in the way");
+        let mut post = stores.posts.sync.attach();
+        let told: Vec<_> = std::iter::from_fn(|| post.next().now_or_never().flatten()).collect();
+        let facts = told.iter().filter_map(|event| match event {
+            sync::Event::App(fact) => Some(fact.clone()),
+            sync::Event::Membership(_)
+            | sync::Event::Link(_)
+            | sync::Event::Message(_)
+            | sync::Event::Monitors => None,
+        });
+        let registered = AppFact::Registered { app, name: None, requires: vec![] };
+        assert_eq!(facts.collect::<Vec<_>>(), [registered, AppFact::Guest { app, uid: 1_001 }]);
+    }
+
+    #[test]
+    fn the_access_list_knows_a_guest_for_as_long_as_it_is_registered() {
+        // Given: an entry of somebody who had the address
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let access = Access::in_test(&stores, "");
+        let app = AppAddress::new(0x1001);
+        access.guest_came(app, 1_001);
+        let register = |user| {
+            let owner = Owner::Client { id: lock(&stores.registry).new_client(), pid: 1 };
+            let address = Address::Fixed(app);
+            let request = Request { address, name: None, requires: vec![], kinds: vec![], owner, user };
+            register_client(&stores, request).expect("nothing is in the way")
+        };
+        // When, then: one of the robot's own has it
+        register(User::Own);
+        assert!(access.guests().is_empty());
+        // And: a guest has it, until a later life of LNCL takes it back
+        forget_former_clients(&stores);
+        register(User::Guest(1_001));
+        assert!(access.guests().contains(&app));
+        forget_former_clients(&stores);
+        assert!(access.guests().is_empty());
     }
 
     #[test]

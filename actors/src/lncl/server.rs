@@ -23,14 +23,14 @@ use tokio::{
 
 use super::{
     client::{self, ClientOutlet, Notices},
-    core::ClientId,
+    core::{ClientId, User},
+    guests::{Guests, Row},
     introductions::Introductions,
     payload::{self, Refusal},
     rings::{self, Rings},
-    strangers::{Bounds, NoPlace, Place, Strangers},
+    strangers::{Bounds, NoPlace, Place, Stranger, Strangers},
 };
 use crate::{
-    accept_pace::Pace,
     access::Applicant,
     refusals::Refusals,
     stores::{Stores, lock},
@@ -48,6 +48,8 @@ pub(super) struct Server {
     pub(super) refusals: Arc<Refusals>,
     /// Who has not said yet who it is.
     strangers: Strangers,
+    /// How often users have come whom only the access list lets in.
+    guests: RefCell<Guests>,
     /// The bytes that wait for all clients.
     budget: Arc<Budget>,
     /// The part of each process that has clients.
@@ -74,8 +76,19 @@ impl Server {
         let refusals = stores.refusals.clone();
         let (strangers, introductions) = (Strangers::default(), Introductions::default());
         let (budget, shares) = (Budget::new(stores.config.lncl.clients_bytes), RefCell::default());
-        let rings = OnceCell::new();
-        Rc::new(Self { stores, refusals, budget, shares, strangers, introductions, rings, releases, clients })
+        let (rings, guests) = (OnceCell::new(), RefCell::new(Guests::new(Time::now())));
+        Rc::new(Self {
+            stores,
+            refusals,
+            strangers,
+            guests,
+            budget,
+            shares,
+            introductions,
+            rings,
+            releases,
+            clients,
+        })
     }
 
     /// The bytes that may wait for the clients of the process `pid`, together.
@@ -150,12 +163,13 @@ impl Server {
 pub(super) async fn accept(server: Rc<Server>, listener: UnixListener) {
     let mut clients = JoinSet::new();
     let mut backoff = ACCEPT_BACKOFF.0;
-    // Of those who may not come in at all: whoever connects as soon as he is refused has no more of this thread than that.
-    let mut neighbours = Pace::new(Time::now());
+    // Of users other than the node's own: whoever connects as soon as he is refused has no more of this thread than that. Who waits behind him
+    // in the kernel's queue waits for no more than these rests: what comes too often is refused, and not left there.
+    let mut row = Row::new(Time::now());
     loop {
         let accept = async {
             server.may_accept().await;
-            while let Some(rest) = neighbours.rest(Time::now()) {
+            while let Some(rest) = row.rest(Time::now()) {
                 tokio::time::sleep(rest).await;
             }
             listener.accept().await
@@ -165,8 +179,8 @@ pub(super) async fn accept(server: Rc<Server>, listener: UnixListener) {
             accepted = accept => match accepted {
                 Ok((stream, _)) => {
                     backoff = ACCEPT_BACKOFF.0;
-                    if admit(&server, stream, &mut clients) == Admitted::NoClient {
-                        neighbours.took_one(Time::now());
+                    if admit(&server, stream, &mut clients) != Some(User::Own) {
+                        row.took_one(Time::now());
                     }
                     // Who has said already who it is leaves the strangers before the next one comes.
                     tokio::task::yield_now().await;
@@ -192,32 +206,31 @@ fn report(ended: Result<(), JoinError>) {
     }
 }
 
-/// Whether a process may be a client of this node.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Admitted {
-    /// It is served, or refused for what it, or others, do too much.
-    Client,
-    /// Its user may not come in.
-    NoClient,
-}
-
 /// Serves a connection from now on, or refuses it. Those that are served are bounded: as strangers here, as clients by the
-/// registry.
-fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) -> Admitted {
+/// registry, and those of a user whom only the access list lets in by how often he has come. Returns whose it is; `None`: his who may not come in.
+fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) -> Option<User> {
     let connected = Connected::new(server, stream);
     let stream = connected.stream.clone();
     let credentials = match check_credentials(&server.stores, &stream) {
         Ok(credentials) => credentials,
         Err(why) => {
             refuse(server, &stream, "credentials", &why);
-            return Admitted::NoClient;
+            return None;
         }
     };
-    let place = match place_for(server, credentials) {
+    let user = User::of(credentials.uid(), rustix::process::geteuid().as_raw());
+    // spec: LNCL-13
+    if let User::Guest(uid) = user
+        && let Err(why) = server.guests.borrow_mut().admit(uid, Time::now())
+    {
+        refuse(server, &stream, "too many connections of a guest", &why);
+        return Some(user);
+    }
+    let place = match place_for(server, credentials, user) {
         Ok(place) => place,
         Err(why) => {
             refuse(server, &stream, "too many strangers", &why);
-            return Admitted::Client;
+            return Some(user);
         }
     };
     let id = lock(&server.stores.registry).new_client();
@@ -226,7 +239,7 @@ fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) -> 
         client::serve(connected.server.clone(), stream, credentials, id, place).await;
         connected.server.stores.door.dismiss(id);
     });
-    Admitted::Client
+    Some(user)
 }
 
 /// A connection that was taken. Dropping it ends it, and has what the peer left unread in it taken out by a thread that may wait: a
@@ -254,10 +267,10 @@ impl Drop for Connected {
 }
 
 /// spec: LNCL-13
-fn place_for(server: &Server, credentials: UCred) -> Result<Place, NoPlace> {
+fn place_for(server: &Server, credentials: UCred, user: User) -> Result<Place, NoPlace> {
     let lncl = &server.stores.config.lncl;
     let bounds = Bounds { all: lncl.strangers_max, per_process: lncl.strangers_per_process_max };
-    server.strangers.admit(credentials.pid().unwrap_or_default(), bounds)
+    server.strangers.admit(Stranger { pid: credentials.pid().unwrap_or_default(), user }, bounds)
 }
 
 fn check_credentials(stores: &Stores, stream: &UnixStream) -> Result<UCred, String> {

@@ -99,6 +99,11 @@ impl Session {
         self.phase = Phase::Open(tid);
     }
 
+    /// It did not become a member of this group, for a reason that its frames do not show.
+    pub(crate) fn has_not_joined(&mut self, group: AppAddress) {
+        self.groups.remove(&group);
+    }
+
     /// What a frame means.
     pub(crate) fn handle(&mut self, message: Message) -> Order {
         let order = match self.phase {
@@ -295,6 +300,10 @@ mod tests {
         assert!(matches!(one_more, Order::Tell { outcome: Outcome::Rejected(Rejection::QueueFull), .. }));
         session.handle(group(AppAddress::group("0"), false));
         let order = session.handle(group(AppAddress::group("one more"), true));
+        assert!(matches!(order, Order::SetMember { .. }));
+        // One that was refused for another reason takes no place.
+        session.has_not_joined(AppAddress::group("one more"));
+        let order = session.handle(group(AppAddress::group("another one"), true));
         assert!(matches!(order, Order::SetMember { .. }));
     }
 

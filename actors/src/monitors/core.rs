@@ -15,7 +15,11 @@ use sinew_runtime::{
     time::Time,
 };
 
-use self::{pace::Pace, watched::Watched, watching::Watching};
+use self::{
+    pace::Pace,
+    watched::{Watched, Whose},
+    watching::Watching,
+};
 use super::words::{Cause, LifeState, Lives, Watch, watched_max};
 
 /// Time until a `Down` that was not taken is offered again.
@@ -38,6 +42,8 @@ pub(super) const MONITORS_MAX: usize = 4_096;
 pub(crate) enum Input {
     /// An application of this node got its address.
     Began { app: AppAddress },
+    /// The same of a guest: an application of a user whom the access list lets in.
+    GuestBegan { app: AppAddress },
     /// A life of it has ended; another one follows, or it is gone.
     Ended { app: AppAddress, cause: Cause, is_gone: bool },
     /// NDL found a node.
@@ -162,7 +168,8 @@ impl Core {
     /// Takes in what has happened.
     pub(crate) fn handle(&mut self, now: Time, input: Input) {
         match input {
-            Input::Began { app } => self.watched.began(now, app),
+            Input::Began { app } => self.watched.began(now, app, Whose::Own),
+            Input::GuestBegan { app } => self.watched.began(now, app, Whose::Guest),
             Input::Ended { app, cause, is_gone } => self.life_ended(now, app, &cause, is_gone),
             Input::NodeFound { node, incarnation } => {
                 self.node_is(node, incarnation);

@@ -12,8 +12,8 @@
 //! | MON-3 | A cut connection is no end. Its node's loss is (NodeLost), and so is an end that is learned of when the link is back. |
 //! | MON-4 | A life that may have begun after the monitor was set is not taken for the one that was to be watched: its former one's end is told. |
 //! | MON-5 | A watcher's monitors end with its life. |
-//! | MON-6 | 256 monitors of one application, 4,096 of a node, 1,024 applications watched on one other node: the next one is refused. A `Down` that a mailbox does not take is offered again every 10 ms, and counts as a monitor until then. |
-//! | MON-7 | The ends of the 1,024 applications that went last are remembered. |
+//! | MON-6 | 256 monitors of one application, 4,096 of a node, 1,024 applications watched on one other node: the next one is refused. An application in a process of its own, so every guest, has none. A `Down` that a mailbox does not take is offered again every 10 ms, and counts as a monitor until then. |
+//! | MON-7 | The ends of the 1,024 applications that went last are remembered, and of the 256 of guests beside them. |
 //! | MON-8 | That nobody is there, or no such node is known, is told to one watcher 256 times at once and then once every 10 ms; what waits for its time counts as a monitor. |
 
 mod core;

@@ -102,6 +102,26 @@ fn an_address_that_was_used_again_is_remembered_for_its_last_end() {
     assert_eq!(cause, Some(DownClass::Panic));
 }
 
+// spec: MON-7
+#[test]
+fn how_the_robots_own_ended_stays_known_however_many_guests_come_and_go() {
+    // Given
+    let mut bench = Bench::new();
+    bench.hears(Input::Began { app: app(0) });
+    bench.hears(ended(0, true));
+    // When
+    for index in 1..=2_000 {
+        bench.hears(Input::GuestBegan { app: app(index) });
+        bench.hears(ended(index, true));
+    }
+    // Then
+    let watch = Watch { incarnation: LIFE, version: 1, apps: vec![app(0), app(1), app(2_000)] };
+    let told = bench.hears(Input::Watch { from: THERE, watch });
+    let [Output::Lives { lives, .. }] = &told[..] else { panic!("{told:?}") };
+    let are_known: Vec<_> = lives.lives.iter().map(|state| state.ended.is_some()).collect();
+    assert_eq!(are_known, [true, false, true], "of guests those that went last");
+}
+
 // spec: MON-2
 #[test]
 fn who_is_not_there_is_told_at_once() {

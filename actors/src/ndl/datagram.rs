@@ -15,6 +15,7 @@ use super::{
     Progress,
     address::{is_link_local, is_same_host, seen_from, unscoped},
 };
+use crate::secured::SEAL_LEN;
 
 /// Longest datagram in bytes: it passes every network unfragmented. // spec: NDL-1
 pub(crate) const DATAGRAM_MAX: usize = 1_200;
@@ -304,6 +305,11 @@ pub(crate) enum Body {
 pub(crate) enum DatagramError {
     #[error("it is longer than {DATAGRAM_MAX} bytes")]
     TooLong,
+    #[error(
+        "it is sealed, and this node has no keys: give it some of that one's project (`sinew keys issue`, security.keys), or take \
+         security.keys from that one's configuration"
+    )]
+    Sealed,
     #[error(transparent)]
     Header(#[from] HeaderError),
     #[error("its kind {0} is none of NDL's")]
@@ -323,6 +329,7 @@ impl DatagramError {
     pub(crate) const fn cause(&self) -> &'static str {
         match self {
             Self::TooLong => "NDL datagram is too long",
+            Self::Sealed => "sealed NDL datagram at a node without keys",
             Self::Header(HeaderError::Version { .. }) => "NDL datagram of another protocol version",
             Self::Header(_) => "NDL datagram is not a frame",
             Self::Kind(_) => "NDL datagram of a foreign kind",
@@ -342,6 +349,29 @@ pub(crate) fn peek_answer(bytes: &[u8]) -> Option<u64> {
 
 /// Reads a datagram that reached the node at `here`. // spec: NDL-1
 pub(crate) fn parse(here: NodeAddress, bytes: &[u8]) -> Result<Datagram, DatagramError> {
+    match read(here, bytes) {
+        // Of a node with keys that took it the seal is gone here.
+        Err(DatagramError::TooLong | DatagramError::Header(HeaderError::Length { .. }))
+            if is_sealed(bytes) =>
+        {
+            Err(DatagramError::Sealed)
+        }
+        read => read,
+    }
+}
+
+/// Whether these are a whole frame, whatever is in it.
+pub(crate) fn is_frame(bytes: &[u8]) -> bool {
+    let parts = bytes.split_first_chunk::<HEADER_LEN>();
+    parts.is_some_and(|(head, payload)| Header::decode(head, payload).is_ok())
+}
+
+/// Whether these are a whole frame and as many bytes behind it as a seal has.
+fn is_sealed(bytes: &[u8]) -> bool {
+    bytes.split_last_chunk::<SEAL_LEN>().is_some_and(|(frame, _)| is_frame(frame))
+}
+
+fn read(here: NodeAddress, bytes: &[u8]) -> Result<Datagram, DatagramError> {
     if bytes.len() > DATAGRAM_MAX {
         return Err(DatagramError::TooLong);
     }

@@ -1,5 +1,6 @@
 //! Real NDL actors over the loopback interface, each test in a multicast group and on ports of its own.
 
+mod keys;
 mod mdns;
 mod remembered;
 mod root;

@@ -328,10 +328,17 @@ fn guard(stores: &Stores, list: Option<(PathBuf, List)>) {
     let AccessSummary { rules, clients } = access.summary();
     log::info!(?path, rules, clients, "an access list is in force: what no rule allows is refused");
     if stores.secured.get().is_none() {
+        // Loopback is no door: a [[client]] that keeps a user out of the socket does not keep out his own node.
+        let who = if stores.config.is_beyond_host() {
+            "everybody on its network, and every user of this host,"
+        } else {
+            "every user of this host"
+        };
         log::warn!(
             ?path,
-            "the access list keeps out MISTAKES ONLY: without keys anybody who reaches this node can pose as any node and any application \
-             of it. Make keys with `sinew keys init`, and set security.keys on all nodes"
+            "the access list keeps out MISTAKES ONLY: without keys {who} can start a node of his own that joins this one, and pose with it as \
+             any node and any application of it, also whom a [[client]] refuses at the socket. Make keys with `sinew keys init`, and set \
+             security.keys on all nodes"
         );
     }
     let own =
@@ -343,7 +350,18 @@ fn guard(stores: &Stores, list: Option<(PathBuf, List)>) {
              lets them have. If it is meant for others, say their uid"
         );
     }
+    say_without_groups(&access);
     stores.guard(Arc::new(access));
+}
+
+/// Lists from before there was `groups` name none: whoever was in a group by one of these is not, when it comes back.
+pub(super) fn say_without_groups(access: &Access) {
+    if let Some(lines) = access.without_groups(rustix::process::geteuid().as_raw()) {
+        log::warn!(
+            "[[client]] at {lines} names no groups: whom it lets in can join none, unless another one about it names some. Add `groups` where \
+             they are to"
+        );
+    }
 }
 
 /// Refuses a program that no supervisor can help, unless its owner wants it so.
@@ -399,6 +417,46 @@ mod tests {
         let credentials = Authority::new("walker").credentials("knee", 7);
         let own = Secured::new(ground::tls(&credentials), &credentials, 8, Incarnation(1));
         assert_eq!(said(network, Some(own)), "");
+    }
+
+    #[test]
+    fn an_access_list_without_keys_says_once_whom_it_does_not_keep_out_and_with_keys_it_says_nothing_of_it() {
+        let said = |interface: Ipv4Addr, is_secured: bool| {
+            let mut config = NodeConfig::new("knee");
+            config.ndl.interface = interface.into();
+            let stores = Stores::for_test(config, Incarnation(1));
+            if is_secured {
+                let credentials = Authority::new("walker").credentials("knee", 7);
+                let own = Secured::new(ground::tls(&credentials), &credentials, 8, Incarnation(1));
+                assert!(stores.secured.set(own).is_ok(), "it had none");
+            }
+            logged(|| guard(&stores, Some(("/there/access.toml".into(), List::default()))))
+        };
+        let network = Ipv4Addr::new(192, 0, 2, 7);
+        for (interface, who) in [
+            (Ipv4Addr::LOCALHOST, "without keys every user of this host"),
+            (network, "everybody on its network"),
+        ] {
+            let words = said(interface, false);
+            assert_eq!(words.matches("MISTAKES ONLY").count(), 1, "{words:?}");
+            assert!(words.contains(who) && words.contains("sinew keys init"), "{words:?}");
+            assert!(!said(interface, true).contains("MISTAKES"), "{interface}");
+        }
+    }
+
+    #[test]
+    fn a_rule_for_users_that_names_no_groups_is_told_of_once() {
+        let stores = Stores::for_test(NodeConfig::new("knee"), Incarnation(1));
+        let other = rustix::process::geteuid().as_raw() + 7;
+        let access = Access::in_test(&stores, &format!("[[client]]\nuid = {other}\n"));
+        let words = logged(|| say_without_groups(&access));
+        assert_eq!(
+            words.matches("[[client]] at line 1 names no groups: whom it lets in can join none").count(),
+            1,
+            "{words:?}"
+        );
+        access.replace_in_test(&format!("[[client]]\nuid = {other}\ngroups = ['telemetry']\n"));
+        assert_eq!(logged(|| say_without_groups(&access)), "");
     }
 
     /// What this says in the log.

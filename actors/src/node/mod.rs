@@ -308,7 +308,8 @@ impl NodeHandle {
         let read = access.reload();
         match &read {
             Ok(AccessSummary { rules, clients }) => {
-                log::info!(rules, clients, "another access list is in force")
+                log::info!(rules, clients, "another access list is in force");
+                builder::say_without_groups(access);
             }
             Err(why) => {
                 let why: String = why.to_string().chars().take(LOGGED_MAX).collect();

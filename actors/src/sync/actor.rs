@@ -19,6 +19,7 @@ use super::{
     Event,
     core::{Core, Input, Named, Output, Place, Reason},
     facts::DirectoryEvent,
+    list::Published,
     words::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier},
 };
 use crate::{
@@ -149,10 +150,15 @@ impl SyncManager {
     }
 
     fn take_groups(&self) {
-        let groups = self.stores.router.groups();
+        // First who is a guest: of who comes between, and joins, this actor is told again.
+        let guests = self.stores.access.get().map(|access| access.guests()).unwrap_or_default();
+        let published = Published::of(self.stores.router.groups_with_members(), &guests);
+        if let Some(left_out) = published.left_out() {
+            self.refuse("directory full", &left_out);
+        }
         let (mut core, now) = (self.core(), Time::now());
         core.woken(now, self.stores.posts.sync.len());
-        core.handle(now, Input::GroupsChanged(groups));
+        core.handle(now, Input::GroupsChanged(published));
     }
 
     fn handle(&mut self, input: Input, ctx: &mut Context<Self>) {

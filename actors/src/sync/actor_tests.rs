@@ -27,7 +27,10 @@ use super::{
     list::{Entry, List, Name},
     words::{ArriveAtBarrier, BarrierAnswer, BarrierKind, LeaveBarrier, OnPartyLoss},
 };
-use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, monitors, node::RootEvent, stores::Stores};
+use crate::{
+    access::Access, config::NodeConfig, gncl::LinkFact, lncl::AppFact, monitors, node::RootEvent,
+    stores::Stores,
+};
 
 const HERE: NodeAddress = NodeAddress::new(0x7f00_0001);
 const KNEE: NodeAddress = NodeAddress::new(0x7f00_0002);
@@ -144,6 +147,28 @@ fn an_application_is_released_by_a_list_from_another_node_and_hears_of_its_loss(
         bench.knee_says(2, false);
         let event: RequirementEvent = within("an event", inbox.next()).await.unwrap().decode().unwrap();
         assert_eq!(event, RequirementEvent::Lost { name: "knee.drive".to_owned() });
+    });
+}
+
+// spec: SYNC-4
+#[test]
+fn groups_that_only_guests_are_in_are_said_behind_those_of_the_robots_own() {
+    run(async {
+        // Given
+        let bench = Bench::new().await;
+        let access = Access::in_test(&bench.stores, "");
+        let (guest, group) =
+            (AppAddress::new(0x8000_0000), |number: u32| AppAddress::new(0xf000_0000 + number));
+        access.guest_came(guest, 1_001);
+        for (number, app) in [(1, guest), (2, GAIT), (3, guest), (3, GAIT)] {
+            bench.stores.router.set_member(group(number), app, true);
+        }
+        // When
+        bench.tells(Event::App(AppFact::GroupsChanged));
+        let mut sent = bench.links_knee();
+        // Then
+        let list = within("this node's list", sent.next()).await.unwrap();
+        assert_eq!(List::parse(&list.payload).unwrap().groups, [group(2), group(3), group(1)]);
     });
 }
 

@@ -2,7 +2,7 @@
 //!
 //! A list is parsed once, here, and is legal afterwards: `docs/protocol/sync.md` has the fields and the bounds.
 
-use std::{borrow::Borrow, collections::BTreeSet, fmt, marker::PhantomData, ops::Deref};
+use std::{borrow::Borrow, collections::BTreeSet, fmt, marker::PhantomData, ops::Deref, sync::Arc};
 
 use bytes::Bytes;
 use serde::{
@@ -19,6 +19,8 @@ use sinew_runtime::{
 pub(crate) const ENTRIES_MAX: usize = 1_024;
 /// Groups in one list at most.
 pub(crate) const GROUPS_MAX: usize = 1_024;
+/// Of these at most so many that only guests are in, where the robot's own leave room.
+pub(crate) const GUESTS_GROUPS_MAX: usize = 128;
 /// Requirements of one application at most, as far as a list says.
 pub(crate) const REQUIRES_MAX: usize = 64;
 /// Phases that one application has reached at most.
@@ -40,7 +42,7 @@ pub(crate) struct List {
     /// The node's applications that have a name.
     #[serde(deserialize_with = "at_most::<_, _, ENTRIES_MAX>")]
     pub(crate) entries: Vec<Entry>,
-    /// The groups that have members on the node.
+    /// The groups that have members on the node: those of the robot's own first, as what has no room is left out from the end.
     #[serde(default, deserialize_with = "at_most::<_, _, GROUPS_MAX>")]
     pub(crate) groups: Vec<AppAddress>,
 }
@@ -120,6 +122,71 @@ impl fmt::Display for Name {
     }
 }
 
+/// The groups that a node says it has members of, and how many it does not.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Published {
+    /// Those with a member among the robot's own, then those that only guests are in; each in the order of their addresses.
+    pub(crate) groups: Vec<AppAddress>,
+    /// How many of these are the former.
+    pub(crate) own: usize,
+    /// Of the former, those for which there is no room.
+    pub(crate) own_left_out: usize,
+    /// The same of the latter.
+    pub(crate) guests_left_out: usize,
+}
+
+impl Published {
+    /// Of these groups with their members, of whom these are `guests`: who joins without end displaces no group of the robot's own.
+    pub(crate) fn of(groups: Vec<(AppAddress, Arc<[AppAddress]>)>, guests: &BTreeSet<AppAddress>) -> Self {
+        let is_own = |members: &[AppAddress]| members.iter().any(|app| !guests.contains(app));
+        let (own, foreign): (Vec<_>, Vec<_>) = groups.into_iter().partition(|(_, members)| is_own(members));
+        let room = GROUPS_MAX.saturating_sub(own.len()).min(GUESTS_GROUPS_MAX);
+        let (own_left_out, guests_left_out) =
+            (own.len().saturating_sub(GROUPS_MAX), foreign.len().saturating_sub(room));
+        let own_listed = own.len() - own_left_out;
+        let listed = own.into_iter().take(own_listed).chain(foreign.into_iter().take(room));
+        let groups = listed.map(|(group, _)| group).collect();
+        Self { groups, own: own_listed, own_left_out, guests_left_out }
+    }
+
+    /// What has no room, and what to do; `None` where all has.
+    pub(crate) fn left_out(&self) -> Option<LeftOut> {
+        let Self { own_left_out, guests_left_out, .. } = *self;
+        (own_left_out + guests_left_out > 0).then_some(LeftOut { own_left_out, guests_left_out })
+    }
+}
+
+/// Groups that are not in a node's list, in words.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct LeftOut {
+    own_left_out: usize,
+    guests_left_out: usize,
+}
+
+impl fmt::Display for LeftOut {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { own_left_out, guests_left_out } = self;
+        if *own_left_out > 0 {
+            write!(
+                f,
+                "{own_left_out} groups of the robot's own are not in this node's directory, which has at most {GROUPS_MAX}: what other nodes send \
+                 to these does not come here; use fewer groups, or more nodes"
+            )?;
+        }
+        if *own_left_out > 0 && *guests_left_out > 0 {
+            f.write_str("; ")?;
+        }
+        if *guests_left_out > 0 {
+            write!(
+                f,
+                "{guests_left_out} groups that only guests are in are not in this node's directory, which has at most {GUESTS_GROUPS_MAX} of these: \
+                 what other nodes send to these does not come here; have `groups` in [[client]] of the access list allow fewer"
+            )?;
+        }
+        Ok(())
+    }
+}
+
 /// Why bytes are not a list that this node uses. The peer is at fault; nothing changed.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ListError {
@@ -162,9 +229,17 @@ impl List {
         Ok(list)
     }
 
-    /// The bytes of this list, at most `bytes_max` (of an empty one 64): entries that do not fit are left out, last ones first, then
-    /// groups. Returns how many were.
-    pub(crate) fn encode(mut self, bytes_max: usize) -> (Bytes, usize) {
+    /// The bytes of this list, of which all groups are the robot's own.
+    #[cfg(any(test, feature = "fuzzing"))]
+    pub(crate) fn encode(self, bytes_max: usize) -> (Bytes, usize) {
+        let own_groups = self.groups.len();
+        self.encode_within(bytes_max, own_groups)
+    }
+
+    /// The bytes of this list, at most `bytes_max` (of an empty one 64). What does not fit is left out, last ones first: groups behind the
+    /// first `own_groups`, which only guests are in, then entries, of which the robot's own are the first, then its groups. Returns how many
+    /// were.
+    pub(crate) fn encode_within(mut self, bytes_max: usize, own_groups: usize) -> (Bytes, usize) {
         let whole = self.entries.len() + self.groups.len();
         self.groups.truncate(GROUPS_MAX);
         self.entries.truncate(ENTRIES_MAX);
@@ -174,8 +249,11 @@ impl List {
                 return (bytes.into(), whole - self.entries.len() - self.groups.len());
             }
             let excess = bytes.len() - bytes_max;
-            if self.entries.is_empty() {
-                self.groups.truncate(self.groups.len().saturating_sub(excess.div_ceil(GROUP_BYTES)));
+            let has_guests_groups = self.groups.len() > own_groups;
+            if has_guests_groups || self.entries.is_empty() {
+                let kept = if has_guests_groups { own_groups } else { 0 };
+                let fitting = self.groups.len().saturating_sub(excess.div_ceil(GROUP_BYTES));
+                self.groups.truncate(fitting.max(kept));
             } else {
                 self.drop_entries_worth(excess);
             }
@@ -364,11 +442,56 @@ mod tests {
         assert_eq!(list(many(2_000)).encode(usize::MAX).1, 2_000 - ENTRIES_MAX);
     }
 
+    /// So many groups from this one on, each with these members.
+    fn joined(first: u32, count: usize, members: &[AppAddress]) -> Vec<(AppAddress, Arc<[AppAddress]>)> {
+        (first..)
+            .take(count)
+            .map(|number| (AppAddress::new(0xf000_0000 + number), Arc::from(members)))
+            .collect()
+    }
+
+    #[test]
+    fn groups_of_the_robots_own_come_first_and_guests_displace_none_of_them() {
+        let [own, guest] = [0x1000, 0x8000_0000].map(AppAddress::new);
+        let guests = BTreeSet::from([guest]);
+        // Given: guests in more groups than a list has, all of lower addresses than those of the robot's own
+        let low = joined(0, 1_280, &[guest]);
+        for (count, room) in [(1, 128), (900, 124), (GROUPS_MAX, 0), (GROUPS_MAX + 3, 0)] {
+            let its = joined(10_000, count, &[own]);
+            // When
+            let published = Published::of([low.clone(), its.clone()].concat(), &guests);
+            // Then
+            let listed = count.min(GROUPS_MAX);
+            assert_eq!((published.groups.len(), published.own), (listed + room, listed));
+            assert!(
+                its.iter()
+                    .take(listed)
+                    .map(|(group, _)| *group)
+                    .eq(published.groups[..listed].iter().copied())
+            );
+            assert_eq!((published.own_left_out, published.guests_left_out), (count - listed, 1_280 - room));
+            let words = published.left_out().expect("guests have no room").to_string();
+            assert!(words.contains("[[client]]") && !words.contains("payload_max"), "{words}");
+            assert_eq!(words.contains("more nodes"), count > GROUPS_MAX, "{words}");
+        }
+    }
+
+    #[test]
+    fn a_group_that_a_guest_joins_stays_one_of_the_robots_own() {
+        let [own, guest] = [0x1000, 0x8000_0000].map(AppAddress::new);
+        let both = [joined(5, 1, &[own, guest]), joined(9, 1, &[guest])].concat();
+        let published = Published::of([joined(1, 1, &[guest]), both].concat(), &BTreeSet::from([guest]));
+        assert_eq!(published.groups, [5, 1, 9].map(|number| AppAddress::new(0xf000_0000 + number)));
+        assert_eq!(published.left_out(), None);
+        assert_eq!(Published::of(Vec::new(), &BTreeSet::new()), Published::default());
+    }
+
     #[test]
     fn groups_that_do_not_fit_are_left_out_too() {
-        let groups = (0..100).map(|n| AppAddress::group(&n.to_string())).collect();
-        let (bytes, left_out) = List { groups, ..list(many(10)) }.encode(200);
+        let groups: Vec<_> = (0..100).map(|n| AppAddress::group(&n.to_string())).collect();
+        let (bytes, left_out) = List { groups: groups.clone(), ..list(many(10)) }.encode(200);
         let read = List::parse(&bytes).unwrap();
+        assert_eq!(read.groups, groups[..read.groups.len()], "the last ones go");
         assert!(bytes.len() <= 200 && bytes.len() > 190, "{}", bytes.len());
         assert_eq!((read.entries.len(), read.groups.len() + left_out), (0, 110));
         assert!(list(Vec::new()).encode(64).0.len() <= 64);

@@ -1,6 +1,6 @@
 //! Whether the nodes of the system that lets us in are open to others, and when their certificates end.
 
-use sinew::inspect::NodeReport;
+use sinew::{config::Interface, inspect::NodeReport};
 
 use super::Check;
 use crate::{
@@ -10,7 +10,7 @@ use crate::{
 
 const NAME: &str = "security";
 
-/// One check for all nodes that stand alike, the worst first.
+/// One check for all nodes that stand alike, the worst first, and one more for those whose multicast DNS goes past their keys.
 pub(super) fn checks(nodes: &[NodeReport]) -> Vec<Check> {
     let mut standing: Vec<_> = nodes.iter().map(|node| (Standing::of(node), node)).collect();
     standing.sort_by_key(|(standing, node)| (*standing, node.node));
@@ -20,7 +20,30 @@ pub(super) fn checks(nodes: &[NodeReport]) -> Vec<Check> {
             let nodes: Vec<_> = alike.iter().map(|(_, node)| *node).collect();
             check(alike[0].0, &nodes)
         })
+        .chain(unsealed(nodes))
         .collect()
+}
+
+/// Nodes with keys that speak multicast DNS on a network, which has no seals.
+fn unsealed(nodes: &[NodeReport]) -> Option<Check> {
+    let is_on = |node: &NodeReport| {
+        let mut chosen = node.interface.split(", ");
+        certificate(node).is_some()
+            && node.sources.iter().any(|source| source.source == "mdns" && source.is_on)
+            && chosen.any(|choice| choice.parse().is_ok_and(|choice: Interface| !choice.is_loopback()))
+    };
+    let on: Vec<_> = nodes.iter().filter(|node| is_on(node)).map(|node| node.name.as_str()).collect();
+    if on.is_empty() {
+        return None;
+    }
+    let seen = format!(
+        "multicast DNS is on, to which keys are nothing: whoever is on their network can have these nodes ask addresses of his choice, and fill \
+         their memory: {}",
+        on.join(", ")
+    );
+    let mend = "below [ndl] in each one's configuration: mdns_port = false; then start them again. They find each other by `multicast`, or by `seeds`: \
+                set one of these first where mDNS is their only way (`sinew nodes` shows by what they were found)";
+    Some(Check::finding("mdns", seen, mend))
 }
 
 /// What is so of these nodes, of which there is one at least.
@@ -65,7 +88,9 @@ fn check(standing: Standing, nodes: &[&NodeReport]) -> Check {
             "update Sinew there; until then look for security.keys in its configuration",
         ),
         Standing::Alone => {
-            Check::fine(NAME, format!("open, and nobody but their own host reaches them: {who}"))
+            let seen = "open to every user of this host, who can start a node of his own and join, send to their applications, and pose as any \
+                        node (no other host reaches them); `sinew keys init` closes that";
+            Check::fine(NAME, format!("{seen}: {who}"))
         }
         Standing::NotLookedAt => Check::fine(
             NAME,
@@ -94,6 +119,8 @@ fn renewal(nodes: &[&NodeReport]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use sinew::inspect::SourceReport;
+
     use super::*;
     use crate::security::{
         SOON_S,
@@ -110,6 +137,37 @@ mod tests {
         let command = "sinew keys init walker 'my hip'=192.168.0.1 knee=192.168.0.2; ";
         assert!(mend.starts_with(command) && mend.contains("security.keys"), "{mend}");
         assert!(fine.mend.is_none() && fine.seen.ends_with(": desk"), "{}", fine.seen);
+        assert!(fine.seen.starts_with("open to every user of this host"), "{}", fine.seen);
+        assert!(fine.seen.contains("`sinew keys init` closes that"), "{}", fine.seen);
+    }
+
+    #[test]
+    fn multicast_dns_of_a_node_with_keys_on_a_network_is_a_finding_with_the_line_that_ends_it() {
+        let node = |name: &str, interface: &str, is_on: bool, security| {
+            let source = SourceReport { source: "mdns".to_owned(), is_on, places: 0, found: 0 };
+            let interface = interface.to_owned();
+            NodeReport { interface, sources: vec![source], ..said(name, 1, security) }
+        };
+        let keys = || secured(NOW_S, "until-set");
+        let nodes = [
+            node("hip", "lo, eth0", true, keys()),
+            node("knee", "192.168.0.2", false, keys()),
+            node("desk", "127.0.0.1, ::1", true, keys()),
+            node("spy", "eth0", true, open(true)),
+            node("old", "eth0", true, None),
+        ];
+        let checks = checks(&nodes);
+        let [found] = &checks.iter().filter(|check| check.name == "mdns").collect::<Vec<_>>()[..] else {
+            panic!("one finding")
+        };
+        assert!(found.seen.ends_with(": hip"), "{}", found.seen);
+        assert!(
+            found
+                .mend
+                .as_ref()
+                .is_some_and(|mend| mend.contains("[ndl]") && mend.contains("mdns_port = false"))
+        );
+        assert!(super::checks(&nodes[1..3]).iter().all(|check| check.mend.is_none()));
     }
 
     #[test]

@@ -153,12 +153,13 @@ fn sent(directory: &str, (what, files): (&str, &[&str]), issued: &Issued, prepar
     (!is_here(issued)).then(|| format!("  tar -C {from} -c {what} | ssh root@{host} '{unpack}'\n"))
 }
 
-/// What the node's configuration needs. Texts of JSON are texts of TOML.
+/// What the node's configuration needs. Texts of JSON are texts of TOML. On a network multicast DNS is off: keys are nothing to it.
 fn configuration(made: &Made, issued: &Issued) -> String {
     let text = |text: &str| Value::from(text).to_string();
     let identity = &issued.identity;
+    let discovery = if is_here(issued) { "" } else { "[ndl]\nmdns_port = false\n" };
     format!(
-        "[node]\nname = {}\nproject = {}\naddress = \"{}\"\n[security]\nkeys = {}\n",
+        "[node]\nname = {}\nproject = {}\naddress = \"{}\"\n{discovery}[security]\nkeys = {}\n",
         text(&identity.name),
         text(&identity.project),
         identity.address,

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use sinew::{
     NodeAddress, Tid,
-    inspect::{AccessReport, AppReport, NodeReport, PeerReport, StreamReport, TreeLine},
+    inspect::{AccessReport, AccessVerdict, AppReport, NodeReport, PeerReport, StreamReport, TreeLine},
 };
 
 /// All that the rules look at.
@@ -18,6 +18,11 @@ pub(super) struct Facts {
     pub(super) streams: [Option<StreamReport>; 2],
     /// What the node of the second says of messages to it from the first, and back. `None`: not two applications, or it cannot be asked.
     pub(super) access: [Option<AccessReport>; 2],
+    /// The groups by which the first reaches the second otherwise than by itself, as the list of the second's node says, and back; each as it
+    /// is written.
+    pub(super) by_groups: [Vec<Member>; 2],
+    /// If one of the two is many.
+    pub(super) many: Option<Many>,
     /// Sockets of this host that let nobody in, with the reason.
     pub(super) shut: Vec<String>,
     /// Who waits at a start-up barrier, and for whom, on all nodes that were asked.
@@ -51,6 +56,42 @@ pub(super) struct End {
     pub(super) app: Option<App>,
     /// If several have its name.
     pub(super) namesakes: Option<Namesakes>,
+}
+
+/// A group, or everybody: what is sent to it goes to each of many.
+#[derive(Clone, Debug)]
+pub(super) struct Many {
+    /// Which of the two ends it is.
+    pub(super) end: usize,
+    pub(super) tid: Tid,
+    /// Whether the other end is an application: access lists are about those.
+    pub(super) is_judged: bool,
+    /// Whether the other end is many, too.
+    pub(super) is_sender_many: bool,
+    /// The nodes where somebody gets it.
+    pub(super) places: Vec<MembersOn>,
+    /// The nodes that did not say, with the reason.
+    pub(super) unsaid: Vec<(String, String)>,
+}
+
+/// Those on one node that get what is sent to many.
+#[derive(Clone, Debug)]
+pub(super) struct MembersOn {
+    pub(super) node: End,
+    /// Whether the node has an access list.
+    pub(super) is_given: bool,
+    pub(super) members: Vec<Member>,
+    /// Further ones that had no room in its answer.
+    pub(super) left_out: u64,
+}
+
+/// One of many, or a way to one.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Member {
+    /// As it is called in what is said.
+    pub(super) label: String,
+    /// What the access list of its node says of each class, if there is one.
+    pub(super) verdicts: Vec<AccessVerdict>,
 }
 
 /// Several applications with one name.

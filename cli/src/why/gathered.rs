@@ -1,5 +1,7 @@
 //! What all nodes say that can be asked, through every socket of this host that lets us in.
 
+mod many;
+
 use std::{collections::BTreeMap, time::Duration};
 
 use sinew::{
@@ -162,7 +164,12 @@ impl<'a> Gathered<'a> {
             .collect();
         let unsaid = self.nodes.iter().filter_map(|asked| Some((asked.label(), asked.unsaid()?))).collect();
         let streams = [self.stream(found[0].at, found[1].node), self.stream(found[1].at, found[0].node)];
-        Facts { ends, pings, streams, access, waits, unsaid, shut: Vec::new() }
+        let many = self.many(wanted, &found);
+        let by_groups = [
+            self.by_groups(access[0].as_ref(), (&found[0], &found[1])),
+            self.by_groups(access[1].as_ref(), (&found[1], &found[0])),
+        ];
+        Facts { ends, pings, streams, access, by_groups, many, waits, unsaid, shut: Vec::new() }
     }
 
     /// Whom two words mean. A name that several applications have stands for the one that the other end's messages reach; where that is open, too,
@@ -200,6 +207,9 @@ impl<'a> Gathered<'a> {
     fn find(&self, wanted: &str, seen_from: &Asked) -> Found {
         let at_address = |node| self.nodes.iter().position(|asked| asked.node == node);
         if let Ok(tid) = wanted.parse::<Tid>() {
+            if many::is_many(tid) {
+                return Found { many: Some(tid), ..Found::default() };
+            }
             let (at, node) = (at_address(tid.node), Some(tid.node));
             return Found { at, node, app: Some(tid), ..Found::default() };
         }
@@ -215,7 +225,7 @@ impl<'a> Gathered<'a> {
             let others: Vec<_> = others.iter().map(|other| other.tid).filter(|other| *other != tid).collect();
             let namesakes = Namesakes { tid, seen_from: seen_from.name.clone(), others };
             let namesakes = Some(namesakes).filter(|namesakes| !namesakes.others.is_empty());
-            return Found { at: Some(at), node: Some(tid.node), app: Some(tid), namesakes };
+            return Found { at: Some(at), node: Some(tid.node), app: Some(tid), namesakes, many: None };
         }
         if let Some(at) = self.nodes.iter().position(|asked| asked.name == wanted) {
             return Found { at: Some(at), node: Some(self.nodes[at].node), ..Found::default() };
@@ -356,6 +366,8 @@ struct Found {
     node: Option<NodeAddress>,
     app: Option<Tid>,
     namesakes: Option<Namesakes>,
+    /// If a TID was given that stands for many; then it is nothing else.
+    many: Option<Tid>,
 }
 
 impl Found {

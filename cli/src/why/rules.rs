@@ -2,6 +2,8 @@
 
 mod access;
 mod groups;
+mod keys;
+mod many;
 mod places;
 mod stream;
 mod unnamed;
@@ -10,7 +12,7 @@ use std::collections::BTreeSet;
 
 use sinew::{
     Rejection,
-    inspect::{LostReport, NodeReport, PeerReport},
+    inspect::{LostReport, NodeReport, PeerReport, RefusalReport},
 };
 
 use self::places::{is_on_loopback, names};
@@ -48,6 +50,10 @@ const NAMESAKES_SHOWN: usize = 4;
 /// Every step from the one to the other and back, in the order in which a message meets them.
 pub(super) fn judge(facts: &Facts) -> Vec<Step> {
     let mut steps = Steps(Vec::new());
+    if let Some(many) = &facts.many {
+        steps.towards_many(many, facts);
+        return steps.0;
+    }
     let [a, b] = &facts.ends;
     for end in [a, b] {
         steps.there(end, facts);
@@ -56,6 +62,7 @@ pub(super) fn judge(facts: &Facts) -> Vec<Step> {
     steps.address(a, b);
     if a.node.is_some() && a.node != b.node {
         steps.project(a, b);
+        steps.keys(a, b);
         for ((from, to), value) in [(a, b), (b, a)].into_iter().zip(&facts.streams) {
             steps.known(from, to);
             steps.linked(from, to);
@@ -67,6 +74,7 @@ pub(super) fn judge(facts: &Facts) -> Vec<Step> {
         steps.application(end, ping, facts);
     }
     steps.access(a, b, facts);
+    steps.by_groups(a, b, facts);
     for (ping, (from, to)) in facts.pings.iter().zip([(a, b), (b, a)]) {
         steps.ping(ping.as_ref(), from, to);
     }
@@ -209,7 +217,19 @@ impl Steps {
             };
             let since = peer.broken_us.map_or_else(String::new, |us| format!(", broken {} ago", time(us)));
             let (dial, mend) = dial_in_words(peer);
-            self.blocked(what, format!("{which}{since}{dial}{}", refused_because(from, to)), mend);
+            let refused = refused_just_now(from, to);
+            let told: String = refused
+                .iter()
+                .map(|(end, refusal)| {
+                    format!("; {} refused: {} ({})", end.label(), refusal.detail, refusal.cause)
+                })
+                .collect();
+            let proof = keys::remedy_of(refused.iter().map(|(_, refusal)| *refusal));
+            let mend = match &peer.dial {
+                None => proof.unwrap_or(mend),
+                Some(_) => mend,
+            };
+            self.blocked(what, format!("{which}{since}{dial}{told}"), mend);
             return;
         }
         let since = peer.linked_us.map_or_else(String::new, |us| format!(" since {}", time(us)));
@@ -359,11 +379,21 @@ fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
     }
     let Some(theirs) = &to.report else {
         let mend = "is it started, of the same project, and in the same group? Where multicast does not reach: [ndl] seeds = [\"ITS_ADDRESS:PORT\"]";
-        return vec![(format!("never heard of it; it asks {}", ours(from)), mend.to_owned())];
+        let refused = keys::refused_of_anybody(from);
+        return vec![(format!("never heard of it; it asks {}{refused}", ours(from)), mend.to_owned())];
     };
     if from.project != theirs.project {
         // It was said already, and is reason enough.
         return vec![("not found, as it is of another project".to_owned(), "as above".to_owned())];
+    }
+    if keys::are_unlike(from, theirs) {
+        let seen = "not found, as one of them has keys and the other none";
+        return vec![(seen.to_owned(), "as above".to_owned())];
+    }
+    if let Some(refused) =
+        keys::refused_datagrams(from, theirs).or_else(|| keys::refused_datagrams(theirs, from))
+    {
+        return vec![refused];
     }
     let seeded = |of: &NodeReport, other: &NodeReport| {
         other.udp.as_ref().is_some_and(|udp| of.seeds.iter().any(|seed| names(seed, udp)))
@@ -402,33 +432,50 @@ fn dial_in_words(peer: &PeerReport) -> (String, String) {
         time(dial.ago_us),
         dial.error
     );
-    let mend = if dial.error.contains("refused") {
-        format!(
-            "nobody listens at {}: does `gncl.announce` of the other name its real address, does a firewall reject TCP there?",
-            dial.address
-        )
-    } else {
-        format!(
-            "TCP does not reach {}: is there a route (`ip route get {}`), does a firewall drop it?",
-            dial.address,
-            dial.address.rsplit_once(':').map_or(dial.address.as_str(), |(host, _)| host)
-        )
+    let address = &dial.address;
+    let mend = match dial.fault.as_str() {
+        "not proven" => {
+            format!("TCP reaches {address}, and it is not proven who is there: {}", keys::remedy(&dial.error))
+        }
+        "hung up" => format!(
+            "TCP reaches {address}, and whoever is there hung up: is that its node, and what does its log say?"
+        ),
+        "refused" => nobody_listens(address),
+        // Of a version that does not say.
+        "" if dial.error.contains("refused") => nobody_listens(address),
+        _ => format!(
+            "TCP does not reach {address}: is there a route (`ip route get {}`), does a firewall drop it?",
+            address.rsplit_once(':').map_or(address.as_str(), |(host, _)| host)
+        ),
     };
     (said, mend)
 }
 
-/// What either of them has refused of the other just now, in the words of its node.
-fn refused_because(from: &End, to: &End) -> String {
-    let of = |end: &End, other: &End| {
-        let node = other.node.map(|node| node.to_string()).unwrap_or_default();
+fn nobody_listens(address: &str) -> String {
+    format!(
+        "nobody listens at {address}: does `gncl.announce` of the other name its real address, does a firewall reject TCP there?"
+    )
+}
+
+/// What either of them has refused of the other just now.
+fn refused_just_now<'a>(from: &'a End, to: &'a End) -> Vec<(&'a End, &'a RefusalReport)> {
+    let of = |end: &'a End, other: &'a End| {
+        let node = other.node.map(|node| node.to_string());
         let refusals = end.report.iter().flat_map(|report| &report.refusals);
-        let concerns =
-            refusals.filter(|refusal| refusal.ago_us < RECENT_US && refusal.detail.contains(&node));
-        concerns
-            .map(|refusal| format!("; {} refused: {} ({})", end.label(), refusal.detail, refusal.cause))
-            .collect::<String>()
+        let concerns = refusals.filter(move |refusal| {
+            refusal.ago_us < RECENT_US && node.as_ref().is_some_and(|node| speaks_of(&refusal.detail, node))
+        });
+        concerns.map(move |refusal| (end, refusal))
     };
-    of(from, to) + &of(to, from)
+    of(from, to).chain(of(to, from)).collect()
+}
+
+/// Whether a text has this address in it, and not only as a part of a longer one: `10.0.0.1` is not in `10.0.0.10`.
+fn speaks_of(text: &str, address: &str) -> bool {
+    text.match_indices(address).any(|(at, _)| {
+        let (before, behind) = (&text[..at], &text[at + address.len()..]);
+        !before.ends_with(char::is_alphanumeric) && !behind.starts_with(char::is_alphanumeric)
+    })
 }
 
 /// An application that is ready by name, and whose actor does not come to its messages.

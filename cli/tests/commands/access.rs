@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use serde_json::Value;
+use sinew::{Endpoint, NodeApi, Registration, Tid};
 use sinew_tests::Program;
 
 use crate::scenario::{Scenario, named};
@@ -75,4 +76,49 @@ fn a_node_without_a_list_has_none_to_read_and_says_what_to_set() {
     let _knee = scenario.start("knee", 2, &[]);
     let answer = scenario.sinew("knee", &["reload"]);
     assert!(answer.code == Some(1) && answer.out.contains("security.access"), "{}{}", answer.out, answer.err);
+}
+
+/// An application of this name in another process of the knee's, which is in the group.
+fn drive(scenario: &Scenario, name: &str) -> Endpoint {
+    let api = NodeApi::connect(scenario.socket("knee")).expect("its socket");
+    let mut drive = api.register_transport_address(Registration::new().name(name)).expect("it is registered");
+    drive.join("drives").expect("it is in few groups");
+    drive
+}
+
+#[test]
+fn members_of_a_group_are_told_with_the_rule_for_each_of_them_and_between_two_the_group_that_differs() {
+    // Given: a list that lets the hip send to the group, but not to one of its members
+    let scenario = Scenario::new();
+    let list = "[[rule]]\nname = 'spare'\nfrom = ['hip']\nto = ['spare']\naction = 'refuse'\n\
+                [[rule]]\nname = 'setpoints'\nfrom = ['hip']\ngroups = ['drives']\n";
+    let (_hip, _knee, _) = start(&scenario, list);
+    let _members = ["drive", "spare"].map(|name| drive(&scenario, name));
+    // When
+    let (open, shut) = ("hip may send to drives on knee: drive", "hip may send to drives on knee: spare");
+    let said = scenario.until("both names are known", "knee", &["why", "hip", "drives"], |said| {
+        let steps = said["steps"].as_array().expect("a list");
+        [open, shut]
+            .iter()
+            .all(|what| steps.iter().any(|step| step["step"] == *what && says(&step["seen"], "'hip'")))
+    });
+    // Then
+    assert!(says(&step(&said, "drives has members")["seen"], "drive, spare on knee"), "{said}");
+    let passes = step(&said, open);
+    assert!(passes["state"] == "fine" && says(&passes["seen"], "rule 2 'setpoints' (line 6)"), "{said}");
+    let refused = step(&said, shut);
+    assert!(refused["state"] == "note" && says(&refused["seen"], "rule 1 'spare' (line 1)"), "{said}");
+    assert!(says(&refused["mend"], "groups = [\"drives\"]"), "{said}");
+    // And: by its TID, from the other node, and named first
+    let tid = Tid::group("drives").to_string();
+    let what = format!("hip may send to {tid} on knee: drive");
+    scenario.until("the hip knows the knee", "hip", &["why", &tid, "hip"], |said| {
+        let steps = said["steps"].as_array().expect("a list");
+        steps.iter().any(|step| step["step"] == *what && step["state"] == "fine")
+    });
+    // And: what is sent to the one alone is refused, and what is sent to the group is not
+    let said = scenario.sinew("knee", &["why", "hip", "drive", "--json"]).json();
+    assert_eq!(step(&said, "hip may send to drive")["state"], "blocked", "{said}");
+    let by_group = step(&said, &format!("hip may send to drive by group {tid}"));
+    assert!(by_group["state"] == "fine" && says(&by_group["seen"], "'setpoints'"), "{said}");
 }

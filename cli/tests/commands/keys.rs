@@ -213,6 +213,7 @@ fn what_is_said_secures_a_node() {
         "keep it off the robot",
         "tar -C keys/nodes/hip -c . | ssh root@10.0.0.9",
         "keys = \"/etc/sinew/keys\"",
+        "  [ndl]\n  mdns_port = false\n",
     ] {
         assert!(answer.out.contains(part), "{part}: {}", answer.out);
     }
@@ -221,6 +222,11 @@ fn what_is_said_secures_a_node() {
     let lines =
         good(&directory, &["issue", "knee"])["nodes"][0]["configuration"].as_str().expect("lines").to_owned();
     let mut config = sinew::NodeConfig::from_toml(&lines).expect("legal");
+    assert!(config.ndl.mdns_port.is_some(), "nobody else hears it there: {lines}");
+    // On a network multicast DNS, to which keys are nothing, is off.
+    let lines = &good(&directory, &["issue", "hip"])["nodes"][0]["configuration"];
+    let on_a_network = sinew::NodeConfig::from_toml(lines.as_str().expect("lines")).expect("legal");
+    assert_eq!(on_a_network.ndl.mdns_port, None, "{lines}");
     let path = config.security.keys.clone().expect("keys");
     assert!(path.is_absolute() && path.ends_with("keys/nodes/knee"), "{}", path.display());
     let identity = Identity {

@@ -192,6 +192,37 @@ fn a_wrong_command_line_is_2_and_help_names_the_exit_codes() {
 }
 
 #[test]
+fn help_of_commands_that_ask_no_node_offers_neither_a_socket_nor_a_deadline() {
+    for words in [&["keys"][..], &["keys", "init"], &["keys", "show"], &["completions"]] {
+        for help in ["--help", "-h"] {
+            let answer = sinew(&[words, &[help]].concat(), Path::new("/"));
+            assert_eq!(answer.code, Some(0), "{}", answer.err);
+            assert!(
+                !answer.out.contains("--socket") && !answer.out.contains("--deadline-ms"),
+                "{}",
+                answer.out
+            );
+            assert!(answer.out.contains("--json"), "{}", answer.out);
+        }
+    }
+    for words in [&["--help"][..], &["nodes", "--help"]] {
+        let answer = sinew(words, Path::new("/"));
+        assert!(answer.out.contains("--socket") && answer.out.contains("--deadline-ms"), "{}", answer.out);
+    }
+    // And: who says them for all commands, as an alias does, is not refused
+    let directory = OwnDirectory::new();
+    let keys = directory.join("keys");
+    let keys = keys.to_str().expect("a short path");
+    for at_front in [true, false] {
+        let options = ["--socket", "/tmp/none.sock", "--deadline-ms", "50"];
+        let show = ["keys", "show", "--keys", keys];
+        let words = if at_front { [options, show].concat() } else { [show, options].concat() };
+        let answer = sinew(&words, Path::new("/"));
+        assert!(answer.code == Some(1) && answer.err.contains("ca.pem"), "{}", answer.err);
+    }
+}
+
+#[test]
 fn every_application_and_node_is_pinged_by_tid_and_by_name_from_either_node() {
     // Given: two nodes with their applications, and one in another process, which receives
     let scenario = Scenario::new();

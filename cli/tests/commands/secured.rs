@@ -104,7 +104,8 @@ fn the_doctor_and_the_list_of_nodes_say_who_is_open_and_when_a_certificate_ends(
     assert!(knee["fine"] == false && has(&knee, [9, 10]), "{knee}");
     assert!(knee["mend"].as_str().is_some_and(|mend| mend.contains("sinew keys issue knee")), "{knee}");
     assert!(
-        spy["fine"] == true && spy["seen"].as_str().is_some_and(|seen| seen.starts_with("open")),
+        spy["fine"] == true
+            && spy["seen"].as_str().is_some_and(|seen| seen.starts_with("open to every user of this host")),
         "{spy}"
     );
     let (hip, knee, spy) = (listed("hip"), listed("knee"), listed("spy"));
@@ -114,4 +115,45 @@ fn the_doctor_and_the_list_of_nodes_say_who_is_open_and_when_a_certificate_ends(
     assert_eq!((&spy["secured"], &spy["beyond_host"]), (&false.into(), &false.into()), "{spy}");
     let table = scenario.sinew("hip", &["nodes"]).out;
     assert!(table.contains("KEYS") && (table.contains("364 d") || table.contains("365 d")), "{table}");
+}
+
+/// What is in the way from the hip to another node, in words.
+fn in_the_way(said: &Value) -> String {
+    let steps = said["steps"].as_array().expect("a list").iter();
+    let blocked = steps.filter(|step| step["state"] == "blocked");
+    blocked.map(|step| format!("{}: {} - {}\n", step["step"], step["seen"], step["mend"])).collect()
+}
+
+#[test]
+fn why_says_of_a_node_with_keys_and_one_without_that_this_is_it() {
+    let scenario = Scenario::new();
+    make_keys(&scenario, "keys", &["hip=127.0.0.1"]);
+    let _nodes = [secured(&scenario, "keys", "hip", 1, &[]), scenario.start("knee", 2, &[])];
+    for here in ["hip", "knee"] {
+        let answer = scenario.sinew(here, &["why", "hip", "knee", "--json"]);
+        let said = in_the_way(&answer.json());
+        assert!(answer.code == Some(1) && said.contains("hip has keys, and knee has none"), "{said}");
+        assert!(said.contains("sinew keys issue knee=127.0.0.2") && !said.contains("firewall"), "{said}");
+    }
+}
+
+#[test]
+fn why_says_of_a_revoked_certificate_what_its_fault_says_and_blames_no_network() {
+    let scenario = Scenario::new();
+    make_keys(&scenario, "keys", &["hip=127.0.0.1", "knee=127.0.0.2"]);
+    let mut hip = secured(&scenario, "keys", "hip", 1, &["--requires", "knee"]);
+    let _knee = secured(&scenario, "keys", "knee", 2, &[]);
+    hip.wait_for(&["started"]);
+    // When
+    let keys = scenario.directory.join("keys");
+    let keys = keys.to_str().expect("a path of the test's own");
+    let revoked = sinew(&["keys", "revoke", "knee", "--keys", keys], Path::new("/"));
+    assert_eq!(revoked.code, Some(0), "{}{}", revoked.out, revoked.err);
+    scenario.sinew("hip", &["reload"]);
+    // Then
+    let said = scenario.until("a try has failed", "hip", &["why", "hip", "knee"], |said| {
+        in_the_way(said).contains("`sinew keys issue` it anew\"\n")
+    });
+    let said = in_the_way(&said);
+    assert!(said.contains("is revoked") && !said.contains("TCP does not reach"), "{said}");
 }

@@ -51,7 +51,8 @@ pub(crate) struct Arguments {
     /// `SCHED_FIFO` priority of the control loops, 1 to 89; wants `--control-thread own`. Real time only.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=89))]
     pub(crate) realtime_priority: Option<u8>,
-    /// Secure the links between nodes with the keys in this directory, made by `sinew keys init exoskeleton central hip knee ankle`. Real time only.
+    /// Secure the links between nodes with the keys in this directory, made by `sinew keys init exoskeleton central=127.0.0.1 hip=127.0.0.2 knee=127.0.0.3
+    /// ankle=127.0.0.4`. Real time only.
     #[arg(long, value_name = "DIR")]
     pub(crate) keys: Option<PathBuf>,
     /// Folder for the run folders.

@@ -7,7 +7,7 @@ use super::Report;
 use crate::{payload, sync::at_most};
 
 /// Classes that there are.
-const CLASSES: usize = Class::ALL.len();
+pub(super) const CLASSES: usize = Class::ALL.len();
 
 payload!("sinew.inspect.access" =>
     /// May this application send to that one of yours? [`AccessReport`] answers.

@@ -80,8 +80,13 @@ pub struct ForeignReport {
 pub struct DialReport {
     /// Where to.
     pub address: String,
-    /// What the system said.
+    /// What the system said, or why it is not proven who is there and what to do.
     pub error: String,
+    /// How far it came: `refused` (nobody listens there), `not proven` (somebody listens, and it is not proven that he is who is meant, or he does
+    /// not take this node), `hung up` (he did before that was proven), `system` (anything else: mostly there is no way). Empty: of a version that
+    /// does not say.
+    #[serde(default)]
+    pub fault: String,
     /// Time since then.
     pub ago_us: u64,
     /// How many have failed since there was a connection.

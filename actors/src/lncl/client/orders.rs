@@ -28,12 +28,7 @@ impl Client {
         match order {
             Order::Route(message) => self.route(message),
             Order::Settle { source, correlation, outcome } => self.settle(source, correlation, outcome),
-            Order::SetMember { group, member, confirm } => {
-                registrar::set_member(&self.server.stores, self.tid.app, group, member);
-                if let Some(correlation) = confirm {
-                    self.tell(payload::lncl_of(self.tid.node), correlation, Outcome::Delivered);
-                }
-            }
+            Order::SetMember { group, member, confirm } => self.set_member(group, member, confirm),
             Order::Tell { destination, correlation, outcome } => {
                 self.tell(destination, correlation, outcome);
             }
@@ -129,7 +124,7 @@ impl Client {
         }
     }
 
-    fn tell(&self, about: Tid, correlation: u64, outcome: Outcome) {
+    pub(super) fn tell(&self, about: Tid, correlation: u64, outcome: Outcome) {
         let ticket = Ticket { source: self.tid, destination: about, correlation };
         self.outcomes.tell(ticket, outcome);
     }

@@ -12,6 +12,8 @@ use crate::monitors::words::Ended;
 
 /// Ends that are remembered of applications that are gone. spec: MON-7
 const GONE_MAX: usize = 1_024;
+/// The same of guests' applications, beside these: however fast guests come and go, how the robot's own ended stays known.
+const GONE_GUESTS_MAX: usize = 256;
 
 /// The watched side.
 #[derive(Debug)]
@@ -21,13 +23,24 @@ pub(super) struct Watched {
     next_life: u64,
     gone: BTreeMap<AppAddress, (Ended, Time)>,
     gone_order: VecDeque<AppAddress>,
+    gone_guests_order: VecDeque<AppAddress>,
     watchers: BTreeMap<NodeAddress, Watcher>,
     nodes_max: usize,
     version: u64,
 }
 
+/// Which user an application runs as.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Whose {
+    /// The node's own, or root.
+    Own,
+    /// One whom the access list lets in.
+    Guest,
+}
+
 #[derive(Debug)]
 struct Life {
+    whose: Whose,
     number: u64,
     began: Time,
     ended: Option<Ended>,
@@ -47,13 +60,14 @@ impl Watched {
             next_life: 1,
             gone: BTreeMap::new(),
             gone_order: VecDeque::new(),
+            gone_guests_order: VecDeque::new(),
             watchers: BTreeMap::new(),
             nodes_max,
             version: 0,
         }
     }
 
-    pub(super) fn began(&mut self, now: Time, app: AppAddress) {
+    pub(super) fn began(&mut self, now: Time, app: AppAddress, whose: Whose) {
         if self.lives.contains_key(&app) {
             return;
         }
@@ -62,8 +76,9 @@ impl Watched {
         if ended.is_some() {
             // Its next end is remembered for as long as any other.
             self.gone_order.retain(|gone| *gone != app);
+            self.gone_guests_order.retain(|gone| *gone != app);
         }
-        self.lives.insert(app, Life { number, began: now, ended });
+        self.lives.insert(app, Life { whose, number, began: now, ended });
     }
 
     fn new_life(&mut self) -> u64 {
@@ -76,22 +91,26 @@ impl Watched {
         let number = self.new_life();
         let life = self.lives.get_mut(&app)?;
         let ended = Ended { life: life.number, cause: cause.clone() };
-        let former = life.number;
-        *life = Life { number, began: now, ended: Some(ended.clone()) };
+        let (former, whose) = (life.number, life.whose);
+        *life = Life { whose, number, began: now, ended: Some(ended.clone()) };
         if is_gone {
             self.lives.remove(&app);
-            self.remember(app, ended, now);
+            self.remember((app, whose), ended, now);
         }
         Some(former)
     }
 
-    fn remember(&mut self, app: AppAddress, ended: Ended, now: Time) {
-        if self.gone_order.len() >= GONE_MAX
-            && let Some(oldest) = self.gone_order.pop_front()
+    fn remember(&mut self, (app, whose): (AppAddress, Whose), ended: Ended, now: Time) {
+        let (order, most) = match whose {
+            Whose::Own => (&mut self.gone_order, GONE_MAX),
+            Whose::Guest => (&mut self.gone_guests_order, GONE_GUESTS_MAX),
+        };
+        if order.len() >= most
+            && let Some(oldest) = order.pop_front()
         {
             self.gone.remove(&oldest);
         }
-        self.gone_order.push_back(app);
+        order.push_back(app);
         self.gone.insert(app, (ended, now));
     }
 

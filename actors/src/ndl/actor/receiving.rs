@@ -8,7 +8,7 @@ use super::Shell;
 use crate::{
     ndl::{
         core::{Place, Way},
-        datagram::{DATAGRAM_MAX, maker_of},
+        datagram::{DATAGRAM_MAX, is_frame, maker_of},
     },
     secured::SEAL_LEN,
 };
@@ -24,6 +24,10 @@ const ONE_MORE: Duration = Duration::from_nanos(1_000_000 / 64);
 /// to wait for.
 const FOREIGN_IS_WORTH: u32 = 4;
 const REST: Duration = Duration::from_millis(1);
+
+/// What is said of a datagram without a seal to a node that takes none such. Anybody can send one: never that this node is to be without keys.
+const UNSEALED: &str = "it has no seal, and this node has keys; if that node is of this robot, give it keys: `sinew keys issue NAME --keys DIR`, and \
+                        set security.keys there";
 
 /// How fast datagrams are read, whatever socket they come to: one thread reads them all. Whether the next one waits when one has been read is
 /// nothing to it: a flood that is a little slower than this thread would never let it rest.
@@ -98,6 +102,8 @@ impl Shell {
         let Some(secured) = self.stores.secured.get() else { return Some(bytes) };
         let now = Time::now();
         let refused = |why: &&str| {
+            // As a node without keys sends it, or somebody who pretends to be one.
+            let why = if is_frame(bytes) { UNSEALED } else { *why };
             self.refusals.count(
                 now,
                 "NDL datagram not of this project's keys",

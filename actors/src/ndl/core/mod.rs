@@ -427,7 +427,10 @@ impl Core {
             AppFact::Down { app } | AppFact::Stopped { app } | AppFact::Unregistered { app } => {
                 self.audience.remove(app);
             }
-            AppFact::Registered { .. } | AppFact::Handles { .. } | AppFact::GroupsChanged => {}
+            AppFact::Registered { .. }
+            | AppFact::Guest { .. }
+            | AppFact::Handles { .. }
+            | AppFact::GroupsChanged => {}
         }
     }
 

@@ -275,6 +275,27 @@ fn deep_nesting_ends_in_an_error_and_not_in_the_stack() {
 }
 
 #[test]
+fn a_frame_with_a_seal_behind_it_is_told_as_that_and_whatever_else_is_behind_one_is_not() {
+    let datagram = Datagram { correlation: 1, sent: Time::ZERO, body: Body::Query(sound()) };
+    let bytes = encode(&datagram, NodeAddress::ALL);
+    let with_behind = |count: usize| [&bytes[..], &vec![7; count]].concat();
+    let error = parse(HERE, &with_behind(SEAL_LEN)).unwrap_err();
+    assert_eq!(error.cause(), "sealed NDL datagram at a node without keys");
+    assert!(error.to_string().contains("security.keys"), "{error}");
+    for count in [1, SEAL_LEN - 1, SEAL_LEN + 1] {
+        assert_eq!(parse(HERE, &with_behind(count)).unwrap_err().cause(), "NDL datagram is not a frame");
+    }
+    // The longest one is longer than any frame of NDL, and a damaged one is not known for what it was.
+    let longest = frame(Kind::NDL_QUERY, &[0; DATAGRAM_MAX - HEADER_LEN]);
+    let longest = [&longest[..], &[7; SEAL_LEN]].concat();
+    assert!(matches!(parse(HERE, &longest), Err(DatagramError::Sealed)));
+    let mut damaged = with_behind(SEAL_LEN);
+    damaged[HEADER_LEN] ^= 1;
+    assert_eq!(parse(HERE, &damaged).unwrap_err().cause(), "NDL datagram is not a frame");
+    assert!(is_frame(&bytes) && !is_frame(&with_behind(SEAL_LEN)) && !is_frame(&bytes[..7]));
+}
+
+#[test]
 fn another_version_is_refused_in_words() {
     let mut bytes = frame(Kind::NDL_QUERY, &[]);
     bytes[2] = 2;

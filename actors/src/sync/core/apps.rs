@@ -13,7 +13,10 @@ use sinew_runtime::{
 };
 
 use super::reason::Reason;
-use crate::sync::list::{Ended, Entry, Name, REQUIRES_MAX};
+use crate::{
+    lncl::User,
+    sync::list::{Ended, Entry, Name, REQUIRES_MAX},
+};
 
 /// The applications of this node.
 #[derive(Debug, Default)]
@@ -26,6 +29,8 @@ pub(super) struct Apps {
 #[derive(Debug)]
 pub(super) struct App {
     pub(super) name: Option<Name>,
+    /// Whose it is.
+    pub(super) user: User,
     pub(super) requires: Vec<Requirement>,
     /// The phases that it has reached in its present life.
     pub(super) phases: Vec<Name>,
@@ -151,10 +156,11 @@ impl Apps {
         let state = State::Waiting(wait);
         let (phases, kinds, silent) = (Vec::new(), Vec::new(), BTreeMap::new());
         let (lost, owed) = (BTreeSet::new(), BTreeSet::new());
-        let (ended, patience) = (None, None);
+        let (user, ended, patience) = (User::Own, None, None);
         // One that waits already has waited for that, too.
         let absent = former.map(|former| former.absent).unwrap_or_default();
-        let life = App { name, requires, phases, kinds, state, ended, lost, owed, absent, silent, patience };
+        let life =
+            App { name, user, requires, phases, kinds, state, ended, lost, owed, absent, silent, patience };
         self.apps.insert(app, life);
         refused
     }
@@ -216,10 +222,12 @@ impl Apps {
         names.filter_map(|(name, address)| Some((name, *address, self.apps.get(address)?)))
     }
 
-    /// What the node's list says about them.
+    /// What the node's list says about them: guests last, as what has no room in it is left out from the end.
     pub(super) fn entries(&self) -> Vec<Entry> {
         let named = self.names.iter().filter_map(|(name, app)| Some((name, *app, self.apps.get(app)?)));
-        named
+        let (own, guests): (Vec<_>, Vec<_>) = named.partition(|(_, _, app)| app.user == User::Own);
+        own.into_iter()
+            .chain(guests)
             .map(|(name, address, app)| Entry {
                 name: name.clone(),
                 app: address,

@@ -82,7 +82,7 @@ fn the_directory_is_read_only_when_somebody_can_be_told_of_a_change() {
     assert!(!bench.core.watchers.are_due(bench.now), "it knows all");
     let later = bench.now + REPEAT;
     bench.core.take_directory_changed();
-    for input in [Input::TimePassed, Input::GroupsChanged(Vec::new())] {
+    for input in [Input::TimePassed, Input::GroupsChanged(Published::default())] {
         bench.hears(input);
         assert!(!bench.core.take_directory_changed());
     }

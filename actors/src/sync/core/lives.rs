@@ -7,7 +7,7 @@ use super::{
     apps::{State, Wait},
 };
 use crate::{
-    lncl::AppFact,
+    lncl::{AppFact, User},
     sync::list::{Ended, KINDS_MAX},
 };
 
@@ -32,6 +32,7 @@ impl Core {
                 self.note_same_name(name.as_deref().unwrap_or_default());
                 self.own_list_changed(now);
             }
+            AppFact::Guest { app, uid } => self.app_is_of(now, app, User::Guest(uid)),
             AppFact::Handles { app, kinds } => self.app_handles(now, app, kinds),
             AppFact::Ready { app } => self.app_ready(now, app),
             AppFact::Down { app } => self.app_ended(now, app, Ended::Failed),
@@ -56,6 +57,16 @@ impl Core {
             })
         };
         texts.into_iter().map(read).collect()
+    }
+
+    fn app_is_of(&mut self, now: Time, address: AppAddress, user: User) {
+        if let Some(app) = self.apps.get_mut(address)
+            && app.user != user
+        {
+            app.user = user;
+            // Where the list has no room for all, it is left out before others.
+            self.own_list_changed(now);
+        }
     }
 
     fn app_handles(&mut self, now: Time, address: AppAddress, mut kinds: Vec<Kind>) {

@@ -64,8 +64,9 @@ impl Core {
         if let Some(why) = fault_of_parties(&read) {
             return Err(format!("the barrier '{barrier}': {why}"));
         }
-        let (name, within) = (registered.name.clone(), Duration::from_millis(within_ms.into()));
-        Ok(Arrived { app, name, correlation, barrier, parties: read, within, on_loss })
+        let (name, user) = (registered.name.clone(), registered.user);
+        let within = Duration::from_millis(within_ms.into());
+        Ok(Arrived { app, name, user, correlation, barrier, parties: read, within, on_loss })
     }
 
     /// Takes what a node says of barriers. spec: SYNC-11

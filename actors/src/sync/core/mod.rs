@@ -50,6 +50,7 @@ use self::{
 };
 use super::{
     facts::{Absence, DirectoryEntry, DirectoryEvent, OwnApp, Waiting},
+    list::Published,
     words::{ArriveAtBarrier, BarrierAnswer},
 };
 use crate::{config::NodeConfig, gncl::LinkFact, lncl::AppFact, ndl::MembershipFact};
@@ -60,7 +61,7 @@ pub(crate) enum Input {
     /// An application of this node came, became ready, failed, went.
     AppChanged(AppFact),
     /// These groups have members on this node now.
-    GroupsChanged(Vec<AppAddress>),
+    GroupsChanged(Published),
     /// A node is there, or not any more.
     MembershipChanged(MembershipFact),
     /// A node can be reached, or not any more.
@@ -127,6 +128,8 @@ pub(crate) struct Core {
     list_bytes_max: usize,
     apps: Apps,
     groups: Vec<AppAddress>,
+    /// How many of these, the first ones, have a member among the robot's own.
+    own_groups: usize,
     peers: Peers,
     rendezvous: Rendezvous,
     phases: Phases,
@@ -183,6 +186,7 @@ impl Core {
             list_bytes_max: config.payload_max,
             apps: Apps::default(),
             groups: Vec::new(),
+            own_groups: 0,
             peers: Peers::new(config.ndl.nodes_max),
             rendezvous: Rendezvous::new(node, incarnation, config.payload_max),
             phases: Phases::default(),
@@ -218,7 +222,7 @@ impl Core {
     pub(crate) fn handle(&mut self, now: Time, input: Input) {
         match input {
             Input::AppChanged(fact) => self.app_changed(now, fact),
-            Input::GroupsChanged(groups) => self.groups_changed(now, groups),
+            Input::GroupsChanged(published) => self.groups_changed(now, published),
             Input::MembershipChanged(fact) => self.membership_changed(fact),
             Input::Arrived { app, correlation, asked } => self.arrived(now, app, correlation, asked),
             Input::Left { app, barrier, correlation } => {

@@ -118,7 +118,8 @@ impl Core {
     /// # Errors
     /// Why it cannot, in words.
     pub(super) fn reach(&mut self, now: Time, arrived: Arrived) -> Result<(), String> {
-        let Arrived { app, name, correlation, barrier: phase, parties, within, on_loss } = arrived;
+        // What a guest has here is bounded by how many they are: 16 phases of each.
+        let Arrived { app, name, user: _, correlation, barrier: phase, parties, within, on_loss } = arrived;
         if !is_phase(&phase) {
             return Err(format!("the phase '{phase}': it is one word without `*`, `|` and `?`"));
         }

@@ -1,16 +1,18 @@
 //! What this node says about itself, and to whom it goes when.
 
 use bytes::Bytes;
-use sinew_runtime::{tid::AppAddress, time::Time};
+use sinew_runtime::time::Time;
 
 use super::{Core, Output, peers::spacing};
-use crate::sync::list::{ENTRIES_MAX, List};
+use crate::sync::list::{ENTRIES_MAX, List, Published};
 
 impl Core {
-    pub(super) fn groups_changed(&mut self, now: Time, mut groups: Vec<AppAddress>) {
+    pub(super) fn groups_changed(&mut self, now: Time, published: Published) {
+        let Published { mut groups, own, .. } = published;
+        let own = groups.iter().take(own).filter(|group| group.is_group()).count();
         groups.retain(|group| group.is_group());
-        if self.groups != groups {
-            self.groups = groups;
+        if (self.own_groups, &self.groups) != (own, &groups) {
+            (self.own_groups, self.groups) = (own, groups);
             self.own_list_changed(now);
         }
     }
@@ -41,7 +43,7 @@ impl Core {
             entries: self.apps.entries(),
             groups: self.groups.clone(),
         };
-        let (bytes, left_out) = list.encode(self.list_bytes_max);
+        let (bytes, left_out) = list.encode_within(self.list_bytes_max, self.own_groups);
         if left_out > 0 {
             let limit = self.list_bytes_max;
             let detail = format!(

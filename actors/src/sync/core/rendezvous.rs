@@ -13,6 +13,7 @@ mod cost;
 mod evaluate;
 mod known;
 mod room;
+mod shares;
 #[cfg(test)]
 mod simulation;
 mod voices;
@@ -33,14 +34,17 @@ use sinew_runtime::{
 pub(super) use self::{known::Known, who_waits::WhoWaits};
 use self::{known::Wait, voices::Voices};
 use super::{Reason, respite::Moment};
-use crate::sync::{
-    arrivals::{
-        ARRIVALS_MAX, Arrival, Arrivals, BARRIERS_MAX, BarrierSaid, GENERATION_AT_FIRST_MAX,
-        GENERATION_FREE_MAX, GENERATION_MAX, Member, Passed,
+use crate::{
+    lncl::User,
+    sync::{
+        arrivals::{
+            ARRIVALS_MAX, Arrival, Arrivals, BARRIERS_MAX, BarrierSaid, GENERATION_AT_FIRST_MAX,
+            GENERATION_FREE_MAX, GENERATION_MAX, Member, Passed,
+        },
+        facts::Absence,
+        list::Name,
+        words::{BarrierAnswer, OnPartyLoss},
     },
-    facts::Absence,
-    list::Name,
-    words::{BarrierAnswer, OnPartyLoss},
 };
 
 /// Time from a party's loss until who does not want to wait for its return is told: the word that others have passed with it
@@ -82,6 +86,7 @@ pub(super) struct Rendezvous {
 pub(super) struct Arrived {
     pub(super) app: AppAddress,
     pub(super) name: Option<Name>,
+    pub(super) user: User,
     pub(super) correlation: u64,
     pub(super) barrier: Name,
     pub(super) parties: Vec<Requirement>,
@@ -112,7 +117,7 @@ impl Rendezvous {
     /// # Errors
     /// Why it cannot, in words.
     pub(super) fn arrive(&mut self, now: Time, arrived: Arrived) -> Result<(), String> {
-        let Arrived { app, name, correlation, barrier, parties, within, on_loss } = arrived;
+        let Arrived { app, name, user, correlation, barrier, parties, within, on_loss } = arrived;
         let called = name.as_deref().unwrap_or_default();
         if !parties.iter().any(|party| party.counts(called)) {
             return Err(format!(
@@ -125,6 +130,9 @@ impl Rendezvous {
         let waits = elsewhere.clone().filter(|(_, known)| known.waiting.contains_key(&app)).count();
         if waits >= WAITS_PER_APP_MAX {
             return Err(format!("it waits at {WAITS_PER_APP_MAX} barriers already"));
+        }
+        if let User::Guest(uid) = user {
+            self.check_share(&key, &parties, called, (app, uid))?;
         }
         self.has_room(&key, &parties, called)?;
         self.make_room(&key)?;
@@ -141,6 +149,9 @@ impl Rendezvous {
             return Err(format!("{ARRIVALS_MAX} applications of this node wait there already"));
         }
         known.visitors.insert(app);
+        if let User::Guest(uid) = user {
+            known.guests.insert(app, uid);
+        }
         let after = known.generation;
         let wait =
             Wait { party, name, after, since: now, until: now + within, on_loss, lost: None, correlation };
@@ -214,6 +225,7 @@ impl Rendezvous {
         for known in self.known.values_mut() {
             known.waiting.remove(&app);
             known.visitors.remove(&app);
+            known.guests.remove(&app);
         }
         self.changed(now);
     }

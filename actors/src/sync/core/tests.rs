@@ -14,6 +14,8 @@ mod lives;
 mod phases;
 #[path = "publish_tests.rs"]
 mod publish;
+#[path = "shares_tests.rs"]
+mod shares;
 #[path = "stalls_tests.rs"]
 mod stalls;
 
@@ -469,7 +471,8 @@ fn groups_of_a_node_are_routed_until_it_is_lost() {
     assert_eq!(bench.breaks(KNEE), []);
     assert_eq!(bench.lost(KNEE, LossReason::LinkDown), [route(&[])]);
     assert_eq!(bench.hears(Input::MembershipChanged(found)), [route(&groups)]);
-    let mine = bench.hears(Input::GroupsChanged(groups.clone()));
+    let own = Published { groups: groups.clone(), own: 1, ..Published::default() };
+    let mine = bench.hears(Input::GroupsChanged(own));
     assert_eq!(published(&mine), [], "not linked");
     bench.now = bench.now + SPACING;
     assert_eq!(published(&bench.links(KNEE, LIFE))[0].groups, groups);

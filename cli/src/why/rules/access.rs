@@ -1,6 +1,6 @@
 //! Whether an access list stands in the way.
 
-use sinew::inspect::{AccessReport, AccessVerdict};
+use sinew::inspect::AccessVerdict;
 
 use super::{
     super::facts::{End, Facts},
@@ -21,7 +21,7 @@ impl Steps {
                 self.fine(what, format!("node {} has no access list", to.node_label()));
                 continue;
             }
-            let seen = in_words(said);
+            let seen = in_words(&said.verdicts);
             let refused = said.verdicts.iter().filter(|verdict| !verdict.is_allowed).count();
             if refused == 0 {
                 self.fine(what, seen);
@@ -35,16 +35,16 @@ impl Steps {
 }
 
 /// What counts for each class, or for all at once where it is the same.
-fn in_words(said: &AccessReport) -> String {
+pub(super) fn in_words(verdicts: &[AccessVerdict]) -> String {
     let judged = |verdict: &AccessVerdict| {
         format!("{}: {}", if verdict.is_allowed { "allowed" } else { "refused" }, verdict.why)
     };
-    match said.verdicts.split_first() {
+    match verdicts.split_first() {
         Some((first, others)) if others.iter().all(|other| judged(other) == judged(first)) => {
             format!("access list of its node: {}", judged(first))
         }
         _ => {
-            let each = said.verdicts.iter().map(|one| format!("{:?} {}", one.class, judged(one)));
+            let each = verdicts.iter().map(|one| format!("{:?} {}", one.class, judged(one)));
             format!("access list of its node: {}", each.collect::<Vec<_>>().join("; "))
         }
     }

@@ -1,6 +1,8 @@
 //! A way that is free, and each thing that can stand in it.
 
 mod access;
+mod keys;
+mod many;
 mod unnamed;
 
 use sinew::{
@@ -360,7 +362,8 @@ const CASES: &[Case] = &[
             peer.broken_us = Some(2_000_000);
             let (address, error) =
                 ("10.0.0.2:7001".to_owned(), "Connection refused (os error 111)".to_owned());
-            peer.dial = Some(DialReport { address, error, ago_us: 100_000, failed: 5 });
+            let fault = "refused".to_owned();
+            peer.dial = Some(DialReport { address, error, fault, ago_us: 100_000, failed: 5 });
         },
         [
             "hip is connected to knee.drive",
@@ -373,7 +376,8 @@ const CASES: &[Case] = &[
             let peer = &mut hip(facts).peers[0];
             peer.links.clear();
             let (address, error) = ("10.0.0.2:7001".to_owned(), "No route to host".to_owned());
-            peer.dial = Some(DialReport { address, error, ago_us: 100_000, failed: 5 });
+            let fault = "system".to_owned();
+            peer.dial = Some(DialReport { address, error, fault, ago_us: 100_000, failed: 5 });
         },
         ["hip is connected to knee.drive", "never connected", "ip route get 10.0.0.2"],
     ),
@@ -541,6 +545,27 @@ fn an_address_of_a_third_node_that_is_used_twice_does_not_stand_in_the_way() {
         "10.0.0.21 is at 10.0.0.2:7000; the process at 10.0.0.9:7000 claims the same node address".to_owned();
     hip(&mut facts).refusals.push(RefusalReport { cause, count: 4, detail, ago_us: 1_000_000 });
     assert!(judge(&facts).iter().all(|step| step.state == State::Fine));
+}
+
+#[test]
+fn what_was_refused_of_a_third_node_with_a_longer_address_is_not_told_of_this_one() {
+    for (detail, is_of_it) in [
+        ("node 10.0.0.1 says: your clock is odd", true),
+        ("10.0.0.1:7001 proves nothing", true),
+        ("no word of 10.0.0.1.", true),
+        ("node 10.0.0.10 is not it, and 10.0.0.1 is", true),
+        ("node 10.0.0.10 says: your clock is odd", false),
+        ("110.0.0.1:7001 proves nothing", false),
+    ] {
+        let mut facts = free();
+        knee(&mut facts).peers[0].links.clear();
+        let (cause, detail) = ("violation".to_owned(), detail.to_owned());
+        knee(&mut facts).refusals.push(RefusalReport { cause, count: 1, detail, ago_us: 1_000 });
+        let steps = judge(&facts);
+        let step = steps.iter().find(|step| step.what == "knee.drive is connected to hip");
+        let step = step.expect("it is looked at");
+        assert_eq!((step.state, step.seen.contains("refused: ")), (State::Blocked, is_of_it), "{step:?}");
+    }
 }
 
 #[test]

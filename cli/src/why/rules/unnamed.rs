@@ -54,7 +54,7 @@ impl Steps {
                     --other-socket PATH";
         if unsaid.is_empty() {
             let seen = format!(
-                "no node and no application called '{wanted}' is known to any node that was asked{shut}"
+                "no node and no application called '{wanted}' is known to any node that was asked, and no group of that name has members there{shut}"
             );
             return self.blocked(what, seen, look);
         }

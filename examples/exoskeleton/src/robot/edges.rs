@@ -45,8 +45,13 @@ impl Payload for GaitState {
     });
 }
 
-/// Not protected from end to end: whoever is on central's node may send it, and it moves a joint only as far as the drive would by
-/// itself, give or take 10 Nm, and while a word of central's counts that is protected. See README.md, "Safety states".
+/// Not protected from end to end, and on the way to torque for all that: a guard knows one sender, and this comes from whichever application on
+/// central's node sends it. So its bound stands at the drive and not at the sender: [`DriveCore::command`](crate::control::drive::DriveCore::command)
+/// refuses one that is further than 10 Nm (`command_apart_max_nm`) from what the drive feeds forward itself, and each tick keeps the newest one
+/// within that again, as the phase goes on. It counts for 10 ms (`input_age_max_ns`), in WALK alone, which takes the open guard of [`GaitState`], below
+/// the limits of the joint's torque and of its rate. A sender that is not central's node is rejected. So one that is damaged or forged past
+/// the node's checksum, TLS and access list moves a joint by 10 Nm at most from its own moment, and cannot make a drive assist that does not. See README.md,
+/// "Safety states".
 impl Payload for TorqueSet {
     const NAME: &'static str = "exo.torque_set";
     const CLASS: Class = Class::Stream;

@@ -5,6 +5,7 @@ mod collect;
 mod console;
 pub mod faults;
 mod hosts;
+mod keys;
 mod plan;
 mod screen;
 
@@ -32,6 +33,7 @@ use plan::Plan;
 use screen::Screen;
 
 pub use collect::RealTimeFigures;
+pub use keys::KeyFaults;
 
 /// Time between two pictures of the status screen.
 const LOOK_PERIOD: Duration = Duration::from_millis(100);
@@ -128,6 +130,9 @@ pub enum LaunchError {
     /// A process cannot be made ready.
     #[error(transparent)]
     Node(#[from] NodeError),
+    /// The robot is to have keys, and those are not its.
+    #[error(transparent)]
+    Keys(#[from] KeyFaults),
 }
 
 /// Starts all five processes, walks, stops them, and reports.
@@ -139,6 +144,9 @@ pub fn run(options: &LaunchOptions) -> Result<Walk, LaunchError> {
         return Err(LaunchError::KillBeyondRun { kill, strides: options.strides });
     }
     let topology = topology(options)?;
+    if let Some(directory) = &options.keys {
+        keys::check(&topology, directory)?;
+    }
     plant::intention(&topology.plant)?.check_strides(options.strides)?;
     let folder = new_folder(&options.runs, &folder_name(options))?;
     let mut launch = Launch::new(options, &topology, &folder)?;

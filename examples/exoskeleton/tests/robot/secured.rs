@@ -37,7 +37,23 @@ fn robot_with_the_keys_that_the_readme_makes_walks_and_without_them_it_does_not_
         !matches!(refused.status.code(), Some(0 | 3)),
         "it walked without the keys that it was to have: {words}"
     );
-    assert!(words.contains("keys"), "{words}");
+    assert!(words.contains("there is no such directory") && words.contains("sinew keys init "), "{words}");
+
+    // And: keys of another order, in which the nodes have each other's addresses
+    let others = ["keys", "init", "exoskeleton", "hip", "knee", "ankle", "central", "--out", "others"];
+    assert!(sinew(&folder, &others).status.success(), "names alone make keys");
+    let refused = end(start_in(&folder, &["--strides", "8", "--keys", "others"]), "the robot is refused");
+    let words = String::from_utf8_lossy(&refused.stderr);
+    assert_eq!(refused.status.code(), Some(1), "{words}");
+    for part in ["central", "hip", "knee", "ankle"] {
+        assert!(words.contains(&format!("{part} is to be node")), "{words}");
+    }
+    // The remedy is one command that can be carried out, and makes what the README's makes.
+    let command = words.lines().find_map(|line| line.trim().strip_prefix("sinew ")).expect("a command");
+    assert!(command.contains(&init.join(" ")) && command.ends_with("--out others-2"), "{command}");
+    let made = sinew(&folder, &command.split_whitespace().collect::<Vec<_>>());
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    assert!(!folder.join("runs").exists(), "nothing was begun");
 
     // When
     let made = sinew(&folder, &[&["keys", "init"], &init[..]].concat());

@@ -19,6 +19,8 @@ pub(in crate::sync::core) struct Known {
     /// Applications of this node that were there in their present life. It is not forgotten before they end: one that came again
     /// without it would pass with the word of its former visit.
     pub(super) visitors: BTreeSet<AppAddress>,
+    /// Those of them that are guests, and their users.
+    pub(in crate::sync::core) guests: BTreeMap<AppAddress, u32>,
     /// Of each party, since when it is known not to wait there, as long as somebody of this node does.
     pub(super) absent: Vec<Option<Time>>,
     /// Of each party, since when it is known to be lost, as long as somebody of this node does not want to wait for it.
@@ -57,6 +59,7 @@ impl Known {
             members: BTreeMap::new(),
             waiting: BTreeMap::new(),
             visitors: BTreeSet::new(),
+            guests: BTreeMap::new(),
             absent: Vec::new(),
             lost: Vec::new(),
         }

@@ -50,13 +50,7 @@ impl Rendezvous {
     /// # Errors
     /// How it may have, in words.
     pub(super) fn has_room(&self, key: &Key, parties: &[Requirement], name: &str) -> Result<(), String> {
-        let is_own = |(other, known): &(&Key, &Known)| *other == key || !known.visitors.is_empty();
-        let own = self.known.iter().filter(is_own);
-        let mut bytes =
-            WORD + ARRIVAL + text(name) + own.map(|(key, known)| known.bytes_when_open(key)).sum::<usize>();
-        if !self.known.contains_key(key) {
-            bytes += Known::new(parties.to_vec()).bytes_when_open(key);
-        }
+        let bytes = self.bytes_with(key, parties, name, |known| !known.visitors.is_empty());
         if bytes <= self.bytes_max {
             return Ok(());
         }
@@ -65,6 +59,21 @@ impl Rendezvous {
              fewer barriers at once, patterns or counts in place of long lists of names, or raise `node.payload_max`",
             self.bytes_max
         ))
+    }
+
+    /// Bytes of the barriers that are meant and of the one at `key` in our word, at most, with one more who arrives there.
+    pub(super) fn bytes_with(
+        &self,
+        key: &Key,
+        parties: &[Requirement],
+        name: &str,
+        is_meant: impl Fn(&Known) -> bool,
+    ) -> usize {
+        let meant = self.known.iter().filter(|(other, known)| *other == key || is_meant(known));
+        let bytes: usize = meant.map(|(key, known)| known.bytes_when_open(key)).sum();
+        let is_new = !self.known.contains_key(key);
+        let of_new = if is_new { Known::new(parties.to_vec()).bytes_when_open(key) } else { 0 };
+        WORD + ARRIVAL + text(name) + bytes + of_new
     }
 
     /// Our word, and how many barriers have no room in it. spec: SYNC-11
