@@ -14,6 +14,7 @@
 //! | `rounds` | live traffic's times by turns |
 //! | `robot` | the nodes, as the director sees them |
 //! | `stranger` | a peer by hand: TLS, HELLO, a session |
+//! | `together` | what two nodes do together while a guest is at the door of one |
 //! | `tried/` | what is done, one file each |
 //! | `report` | what was seen |
 
@@ -24,6 +25,7 @@ mod report;
 mod robot;
 mod rounds;
 mod stranger;
+mod together;
 mod tried;
 
 use std::{
@@ -100,6 +102,8 @@ struct Attack {
     others_come: bool,
     /// He is a process of the attacked node's host: what that one dials is his doing, too.
     inside: bool,
+    /// The attacked node has an access list that lets everything be said, and a user of its host in with a few names and a group.
+    guests: bool,
     /// In whose name he may speak: his own.
     own: Who,
     /// Does it until the scene is over.
@@ -115,7 +119,7 @@ struct Happened {
     what: String,
     /// What must not have been: for so long a time as the whole of an attack takes.
     broken: Vec<String>,
-    /// Who was let in, which must not have been for however short a time.
+    /// What must not have been for however short a time: who was let in, and what of the robot's own did not get through.
     let_in: Vec<String>,
     /// What the node must have refused meanwhile, by cause, and how often at least: an attack that never reached it shows nothing.
     refused: Vec<(&'static str, u64)>,
@@ -236,7 +240,7 @@ fn allow_descriptors() {
 fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
     let hosts = hosts.all();
     let keys = Keys::make();
-    let mut robot = Robot::start(&plan.program, hosts, &keys, attack.descriptors);
+    let mut robot = Robot::start(&plan.program, hosts, &keys, attack);
     // Nobody stands in for the door.
     let decoys = (!attack.inside).then(|| Decoys::start(&plan.program, hosts, &keys));
     thread::sleep(SETTLING);

@@ -67,6 +67,8 @@ pub fn play() -> Option<ExitCode> {
         "poster" => poster::play(&arguments),
         "attacker" => hostile::play_attacker(&arguments),
         "sleeper" => hostile::play_sleeper(&arguments),
+        "guest" => hostile::play_guest(&arguments),
+        "visitor" => hostile::play_visitor(&arguments),
         "pinger" => steady::play_pinger(&arguments),
         "recorder" => recorder::play(&arguments),
         "host" => host::play(&arguments),

@@ -13,6 +13,7 @@ use std::{
 
 use sinew::{NodeAddress, Sender, prelude::*};
 
+use super::together;
 use crate::{
     DEADLINE,
     load::Times,
@@ -164,7 +165,7 @@ impl Handler<Delivery<NodeEvent>> for Echo {
 
 /// `CONFIGURATION [ASKS]`: says `up` when all runs. `window NAME`: what was measured since the last one, with all that was called so before; `again`: whether questions are answered
 /// from now on; `seen`: who was lost, who was found, and what came unasked; `refused`: what the node refused, for each cause; `tid`: that of
-/// the application that answers.
+/// the application that answers. What it does with another one is told in words of [`together::Part::answer`].
 pub(super) fn play(arguments: &[String]) {
     let config = NodeConfig::from_file(&arguments[0]).expect("the director's configuration");
     let asks = arguments.get(1).is_some_and(|asks| asks == "asks");
@@ -176,8 +177,9 @@ pub(super) fn play(arguments: &[String]) {
         .handles::<NodeEvent>()
         .own_thread();
     let (asker, key) = desk("asker");
-    let node =
-        Node::builder(config.name.clone()).config(config).app(echo).app(asker).start().expect("a node");
+    let (party, mut part) = together::part_of(&config.name);
+    let builder = Node::builder(config.name.clone()).config(config).app(echo).app(asker).app(party);
+    let node = builder.start().expect("a node");
     node.handle().wait_until_running(DEADLINE).expect("it requires nothing");
     let sender = key.sender();
     let echo = until("the echo is there", || sender.resolve(ECHO));
@@ -194,6 +196,10 @@ pub(super) fn play(arguments: &[String]) {
     println!("up");
     let mut windows: BTreeMap<String, Window> = BTreeMap::new();
     for line in std::io::stdin().lock().lines().map_while(Result::ok) {
+        if let Some(answer) = part.answer(&line) {
+            println!("{answer}");
+            continue;
+        }
         match &*line {
             "again" => println!("{}", u8::from(is_answered(&measured))),
             "seen" => {

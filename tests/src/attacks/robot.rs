@@ -2,7 +2,9 @@
 
 use std::{
     collections::BTreeMap,
+    fs::{self, Permissions},
     net::{Ipv4Addr, SocketAddr},
+    os::unix::fs::PermissionsExt as _,
     path::{Path, PathBuf},
     process::Command,
     sync::{
@@ -15,12 +17,15 @@ use std::{
 use sinew::{NodeAddress, Tid};
 
 use super::{
-    decoy,
+    Attack, decoy,
     keys::{self, Keys, PROJECT, Who},
 };
 use crate::{
     DEADLINE, Host,
-    clients::{Held, Performer},
+    clients::{
+        Held, Performer,
+        hostile::{GRANTED, GUEST, VISITORS},
+    },
     own_group,
 };
 
@@ -188,7 +193,7 @@ impl Member {
     /// How often its host has begun a connection since there is one.
     fn dials(&self) -> u64 {
         let path = format!("/proc/{}/net/snmp", self.performer().id());
-        let text = std::fs::read_to_string(path).expect("the kernel counts what hosts do");
+        let text = fs::read_to_string(path).expect("the kernel counts what hosts do");
         let mut lines = text.lines().filter(|line| line.starts_with("Tcp:"));
         let [names, counts] = [lines.next(), lines.next()].map(|line| line.unwrap_or_default().split(' '));
         let (_, count) =
@@ -196,7 +201,8 @@ impl Member {
         count.parse().expect("a number")
     }
 
-    fn ask(&self, question: &str) -> String {
+    /// What it says to this.
+    pub(super) fn ask(&self, question: &str) -> String {
         let mut performer = self.performer();
         performer.tell(question);
         self.answer(question)
@@ -242,18 +248,19 @@ pub(super) struct Robot {
 }
 
 impl Robot {
-    /// Starts both, and returns when they talk. The attacked one may have so many descriptors only.
-    pub(super) fn start(program: &Path, hosts: &[Host], keys: &Keys, descriptors: Option<u32>) -> Self {
+    /// Starts both, and returns when they talk. The attacked one is as this attack has it.
+    pub(super) fn start(program: &Path, hosts: &[Host], keys: &Keys, attack: &Attack) -> Self {
         let (group, directory) = (own_group(), keys.path(""));
-        let config = |who: Who, gncl| configuration(&directory, group, (who, Some(&keys.of(who))), gncl);
+        let config =
+            |who: Who, further| configuration(&directory, group, (who, Some(&keys.of(who))), further);
+        let security = if attack.guests { access_list(&directory) } else { String::new() };
         // With as many strangers as are allowed by default, descriptors would never run out.
-        let knee_gncl = if descriptors.is_some() { "strangers_max = 1024\n" } else { "" };
-        let knee_config = config(keys::KNEE, knee_gncl);
-        let (knee, echo) = start_knee(program, &hosts[super::KNEE], &knee_config, descriptors);
-        let hip = Member::start(
-            hosts[super::HIP].moved(&as_role(program, &config(keys::HIP, ""), &["asks"])),
-            "robot-node",
-        );
+        let gncl = if attack.descriptors.is_some() { "strangers_max = 1024\n" } else { "" };
+        let knee_config = config(keys::KNEE, Further { gncl, security: &security });
+        let (knee, echo) = start_knee(program, &hosts[super::KNEE], &knee_config, attack.descriptors);
+        let hip_config = config(keys::HIP, Further::default());
+        let hip =
+            Member::start(hosts[super::HIP].moved(&as_role(program, &hip_config, &["asks"])), "robot-node");
         hip.answer("up");
         let newcomer_keys = keys.of(keys::ANKLE);
         Self { program: program.to_owned(), directory, group, hip, knee, knee_config, newcomer_keys, echo }
@@ -270,7 +277,8 @@ impl Robot {
 
     /// A node of the robot's that was not there; returns when it has an answer of the attacked one.
     pub(super) fn start_newcomer(&self, host: &Host) -> Member {
-        let config = configuration(&self.directory, self.group, (keys::ANKLE, Some(&self.newcomer_keys)), "");
+        let ankle = (keys::ANKLE, Some(&*self.newcomer_keys));
+        let config = configuration(&self.directory, self.group, ankle, Further::default());
         let asks = as_role(&self.program, &config, &["asks"]);
         let ankle = Member::start(host.moved(&asks), "robot-node");
         ankle.answer("up");
@@ -279,7 +287,7 @@ impl Robot {
 
     /// A command that starts a whole node there, with keys that it should not have, or none.
     pub(super) fn foreign_node(&self, host: &Host, keys: Option<&Path>) -> Command {
-        let config = configuration(&self.directory, self.group, (keys::MALLORY, keys), "");
+        let config = configuration(&self.directory, self.group, (keys::MALLORY, keys), Further::default());
         host.moved(&as_role(&self.program, &config, &["asks"]))
     }
 
@@ -293,6 +301,11 @@ impl Robot {
         let [knee, hip] = [keys::KNEE, keys::HIP].map(|who| SocketAddr::from((who.address(), NDL_PORT)));
         let connections = (keys::KNEE.address(), GNCL_PORT).into();
         Target { is: Is::Node, connections, datagrams: [knee, hip, self.group.into()] }
+    }
+
+    /// Both, for what they do together: `hip`, and `knee`.
+    pub(super) const fn talkers(&self) -> [&Member; 2] {
+        [&self.hip, &self.knee]
     }
 
     /// How often each of both has begun a connection, since there is its host.
@@ -383,12 +396,35 @@ fn limited(command: &Command, descriptors: u32) -> Command {
     limited
 }
 
-/// Writes one, with these further lines of its table `gncl`.
+/// Further lines of tables of a configuration.
+#[derive(Clone, Copy, Default)]
+struct Further<'a> {
+    gncl: &'a str,
+    security: &'a str,
+}
+
+/// Writes an access list that lets everything be said, a guest in with names and one group of its own, and visitors with names and any group,
+/// where they can get at the door beside it. Returns the line that names it.
+fn access_list(directory: &Path) -> String {
+    let path = directory.join("access.toml");
+    let visitor = |uid: u32| format!("[[client]]\nuid = {uid}\nnames = ['visitor.*']\ngroups = ['*']\n");
+    let visitors = VISITORS.map(visitor).concat();
+    let text = format!(
+        "[[rule]]\nfrom = ['*']\nto = ['*']\n[[client]]\nuid = {GUEST}\nnames = ['guest.*']\ngroups = ['{GRANTED}']\n{visitors}"
+    );
+    let written = fs::write(&path, text);
+    // Whatever umask there is: nobody else writes there, and everybody comes to what is there for him.
+    let opened = fs::set_permissions(directory, Permissions::from_mode(0o755));
+    written.and(opened).expect("the scene's own directory");
+    format!("access = {path:?}\n")
+}
+
+/// Writes one.
 fn configuration(
     directory: &Path,
     group: std::net::SocketAddrV4,
     (who, keys): (Who, Option<&Path>),
-    gncl: &str,
+    Further { gncl, security }: Further<'_>,
 ) -> PathBuf {
     let path = directory.join(format!("{}.toml", who.name));
     let (name, address, socket) = (who.name, who.address(), directory.join(format!("{}.sock", who.name)));
@@ -397,8 +433,8 @@ fn configuration(
     let text = format!(
         "[node]\nname = \"{name}\"\naddress = \"{address}\"\nproject = \"{PROJECT}\"\n[lncl]\nsocket = {socket:?}\n\
          [gncl]\nport = {GNCL_PORT}\n{gncl}[ndl]\ninterface = \"{address}\"\nport = {NDL_PORT}\nmulticast = \"{group}\"\n\
-         mdns_port = false\nperiod_ms = {period}\n[security]\nkeys = {keys}\n"
+         mdns_port = false\nperiod_ms = {period}\n[security]\nkeys = {keys}\n{security}"
     );
-    std::fs::write(&path, text).expect("the scene's own directory");
+    fs::write(&path, text).expect("the scene's own directory");
     path
 }

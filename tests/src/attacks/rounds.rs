@@ -59,7 +59,7 @@ pub struct Rounds {
     pub(super) own_sent: u64,
     /// The same on links that broke.
     pub(super) own_perhaps: u64,
-    /// Who was let in by the node, and must not have been.
+    /// What must not have been for however short a time: who was let in by the node, say.
     pub(super) let_in: Vec<String>,
 }
 

@@ -5,6 +5,7 @@ mod connections;
 mod credentials;
 mod datagrams;
 mod garbage;
+mod guest;
 mod handshakes;
 mod slow_loris;
 mod sources;
@@ -29,10 +30,14 @@ const COMMON: Attack = Attack {
     records: false,
     others_come: false,
     inside: false,
+    guests: false,
     own: SPARE,
     run: |_| Happened::new(String::new(), Vec::new()),
     goes_on: None,
 };
+
+/// What those of guests have in common.
+const OF_GUEST: Attack = Attack { inside: true, guests: true, own: KNEE, ..COMMON };
 
 /// So much of it was done.
 fn done(what: &'static str, count: u64) -> BTreeMap<&'static str, u64> {
@@ -112,6 +117,31 @@ pub(super) const ATTACKS: &[Attack] = &[
         own: KNEE,
         run: client::at_the_door,
         ..COMMON
+    },
+    Attack {
+        name: "guest-groups",
+        tried: "up to 64 clients of another user, whom the access list grants names and one group, join and leave that and others as fast as they can",
+        run: guest::groups,
+        ..OF_GUEST
+    },
+    Attack {
+        name: "guest-memberships",
+        tried: "the same user's clients ask to be in 256 groups each, at the lowest addresses, and those of two further users, whom the list grants all groups, \
+                are in as many as they may, 512 each, while hip sends to a group of knee's at a high one",
+        run: guest::memberships,
+        ..OF_GUEST
+    },
+    Attack {
+        name: "guest-barriers",
+        tried: "the same user's clients arrive at barriers, each of another name, and wait a millisecond, while hip and knee meet at new ones of their own",
+        run: guest::barriers,
+        ..OF_GUEST
+    },
+    Attack {
+        name: "guest-connections",
+        tried: "the same user connects and closes, and registers and leaves, as often as it can",
+        run: guest::connections,
+        ..OF_GUEST
     },
     Attack {
         name: "descriptors",

@@ -4,10 +4,12 @@
 //! | file | what it is |
 //! | --- | --- |
 //! | `stranger` | a connection by hand |
+//! | `guest` | the roles of those whom only the access list lets in |
 //! | `lingering` | what takes for ever to close, and who keeps it from closing |
 //! | `ring` | the hostile end of rings |
 //! | `tricks` | what a hostile client does |
 
+mod guest;
 mod lingering;
 mod ring;
 mod stranger;
@@ -28,7 +30,11 @@ use std::{
 use rustix::process::{Signal, getpid, kill_process};
 use sinew::{Kind, NodeApi, Registration};
 
-pub(crate) use self::lingering::Keeper;
+pub(super) use self::guest::{play as play_guest, play_visitor};
+pub(crate) use self::{
+    guest::{GRANTED, GUEST, VISITORS},
+    lingering::Keeper,
+};
 use self::{
     stranger::{Frame, Stranger},
     tricks::{Attacker, Tally},

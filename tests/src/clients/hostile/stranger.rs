@@ -62,6 +62,26 @@ pub(super) struct Said {
     pub(super) payload: Vec<u8>,
 }
 
+impl Said {
+    /// The first that is in these bytes, and how many of them it has; `None` while it is not whole.
+    pub(super) fn first_of(bytes: &[u8]) -> Option<(Self, usize)> {
+        let (said, length) = Self::of_head(bytes.first_chunk()?);
+        let whole = HEADER_BYTES + length;
+        let payload = bytes.get(HEADER_BYTES..whole)?.to_vec();
+        Some((Self { payload, ..said }, whole))
+    }
+
+    /// What a header says, and how long the payload is that follows.
+    fn of_head(header: &[u8; HEADER_BYTES]) -> (Self, usize) {
+        let number = |at: usize, bytes: usize| {
+            header[at..at + bytes].iter().rev().fold(0, |number: u64, byte| number << 8 | u64::from(*byte))
+        };
+        let kind = Kind::from_bits(number(8, 4) as u32);
+        let source = if kind == Kind::LNCL_REGISTERED { number(24, 8) } else { number(16, 8) };
+        (Self { kind, source, correlation: number(40, 8), payload: Vec::new() }, number(4, 4) as usize)
+    }
+}
+
 /// A connection.
 #[derive(Debug)]
 pub(super) struct Stranger {
@@ -106,14 +126,10 @@ impl Stranger {
             Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => return Ok(None),
             result => result?,
         }
-        let number = |at: usize, bytes: usize| {
-            header[at..at + bytes].iter().rev().fold(0, |number: u64, byte| number << 8 | u64::from(*byte))
-        };
-        let mut payload = vec![0; number(4, 4) as usize];
+        let (said, length) = Said::of_head(&header);
+        let mut payload = vec![0; length];
         self.stream.read_exact(&mut payload)?;
-        let kind = Kind::from_bits(number(8, 4) as u32);
-        let source = if kind == Kind::LNCL_REGISTERED { number(24, 8) } else { number(16, 8) };
-        Ok(Some(Said { kind, source, correlation: number(40, 8), payload }))
+        Ok(Some(Said { payload, ..said }))
     }
 }
 
