@@ -175,9 +175,8 @@ impl Core {
         let (Some(member), Some(contest)) = (self.members.get(&node), self.contests.remove(&node)) else {
             return;
         };
-        // Just before it ended it may have given one, too.
-        let has_ended = member.link_broke.is_some_and(|broke| broke >= contest.since);
-        if has_ended || !member.has_given_a_sign_since(contest.tried_since) {
+        // Where no connection stands it may have ended: what it sent before comes late as well.
+        if !member.is_linked() || !member.has_given_a_sign_since(contest.tried_since) {
             return;
         }
         self.collide(now, node, member.into(), (&contest.newcomer).into());

@@ -218,6 +218,7 @@ fn a_member_that_is_not_reached_while_a_newcomer_is_tried_stays_when_that_one_gi
 fn a_member_that_gives_signs_stays_though_it_is_not_reached_while_a_newcomer_is_tried() {
     let mut world = with_a_newcomer_and_a_member_that_is_not_reached();
     assert_eq!(world.at(1).core.in_doubt(), [(node(2), Incarnation(1))]);
+    world.link(1, LinkFact::LinkUp { node: node(2), incarnation: Incarnation(1) });
     for _ in 0..100 {
         let (node, incarnation, at) = (node(2), Incarnation(1), world.now);
         world.input(1, Input::SignSeen { node, incarnation, at });
@@ -228,6 +229,7 @@ fn a_member_that_gives_signs_stays_though_it_is_not_reached_while_a_newcomer_is_
     assert_eq!(world.at(1).others, [both], "both are named");
     // when: it has ended
     world.kill(2);
+    world.link(1, LinkFact::LinkBroken { node: node(2), incarnation: Incarnation(1) });
     world.run(PERIOD * 2);
     // then
     assert_eq!(world.losses(1), [(2, LossReason::Restarted)]);

@@ -147,8 +147,8 @@ pub(super) struct World {
     chance: Chance,
     /// Connections deliver: who is asked for a sign gives it after so long at least, and at most.
     pub(super) signs_after: Option<(Duration, Duration)>,
-    /// When who is asked for a sign gives it.
-    signs: BTreeMap<(SocketAddr, NodeAddress, Incarnation), Time>,
+    /// When who is asked for a sign gives it, and when he gave the last one.
+    signs: BTreeMap<(SocketAddr, NodeAddress, Incarnation), (Time, Option<Time>)>,
     /// No goodbye arrives.
     pub(super) loses_goodbyes: bool,
     /// Time that a datagram is under way.
@@ -238,7 +238,12 @@ impl World {
         let me = process.core.announcement();
         let life = (me.node, me.incarnation);
         let now = self.now;
-        self.signs.retain(|(_, node, incarnation), at| (*node, *incarnation) != life || *at <= now);
+        for ((_, node, incarnation), (next, last)) in &mut self.signs {
+            if (*node, *incarnation) == life && *next > now {
+                // What is under way never comes.
+                *next = last.unwrap_or(Time::MAX);
+            }
+        }
     }
 
     pub(super) fn is_alive(&self, index: u16) -> bool {
@@ -348,9 +353,11 @@ impl World {
         };
         if self.processes.values().find(is_it).is_some_and(|process| process.stalled_until <= self.now) {
             let at = self.now + self.chance.between(least, most);
-            let sign = self.signs.entry((from, node, incarnation)).or_insert(at);
+            let (next, last) = self.signs.entry((from, node, incarnation)).or_insert((at, None));
             // One that is under way comes first.
-            *sign = if *sign <= self.now { at } else { *sign };
+            if *next <= self.now {
+                (*next, *last) = (at, Some(*next));
+            }
         }
     }
 
@@ -358,7 +365,8 @@ impl World {
     fn give_signs(&mut self, address: SocketAddr) {
         for (node, incarnation) in self.processes[&address].core.in_doubt() {
             let sign = self.signs.get(&(address, node, incarnation)).copied();
-            if let Some(at) = sign.filter(|at| *at <= self.now) {
+            let read = sign.and_then(|(next, last)| if next <= self.now { Some(next) } else { last });
+            if let Some(at) = read {
                 self.with(address, |core, now| {
                     core.handle(now, Input::SignSeen { node, incarnation, at });
                 });
