@@ -72,6 +72,8 @@ pub(crate) struct Stores {
     pub(crate) door: lncl::Door,
     /// Who is registered on this node.
     pub(crate) registry: Mutex<lncl::Registry>,
+    /// What guests have waiting at layers.
+    pub(crate) shares_of_guests: lncl::Shares,
     /// Counts the changes of who has which name, on this node or any.
     pub(crate) directory_changes: watch::Sender<u64>,
     /// Who is known on other nodes, and what waits for whom.
@@ -129,6 +131,7 @@ impl Stores {
             untold_of_apps: lncl::Untold::new(),
             door: lncl::Door::default(),
             registry: Mutex::new(lncl::Registry::counting_links_from(RandomState::new().hash_one(()))),
+            shares_of_guests: lncl::Shares::default(),
             directory_changes: watch::Sender::default(),
             sync: Mutex::new(sync::Core::new(&config, node, incarnation)),
             groups_told: AtomicBool::new(false),

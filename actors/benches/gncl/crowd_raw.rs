@@ -1,9 +1,10 @@
 //! The same as [`crowd`](crate::crowd) by bare sockets: what the machine itself makes of so many processes.
 //!
-//! Each has one thread, a connection to every other one, and a task that reads it.
+//! Each has one thread while it measures, a connection to every other one, and a task that reads it.
 
 use std::{
     cell::RefCell,
+    io::ErrorKind,
     net::{Ipv4Addr, SocketAddrV4},
     rc::Rc,
     time::{Duration, Instant},
@@ -34,8 +35,7 @@ type Shared = Rc<RefCell<Member>>;
 /// One of them, in a process of its own: hands over what it has seen.
 pub(crate) fn member(share: Share, port: u16) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a reactor");
-    let seen = LocalSet::new().block_on(&runtime, run(share, port));
-    hand_over(seen);
+    LocalSet::new().block_on(&runtime, run(share, port));
 }
 
 /// Where the n-th one listens.
@@ -43,7 +43,7 @@ const fn address(index: usize, port: u16) -> SocketAddrV4 {
     SocketAddrV4::new(Ipv4Addr::new(127, 0, 1, index as u8 + 1), port)
 }
 
-async fn run(share: Share, port: u16) -> Seen {
+async fn run(share: Share, port: u16) {
     let Share { index, count, seconds, .. } = share;
     let listener = TcpListener::bind(address(index, port)).await.expect("a free port");
     let mut others = Vec::new();
@@ -69,8 +69,9 @@ async fn run(share: Share, port: u16) -> Seen {
     sleep(WARM_UP).await;
     member.borrow_mut().seen = Some(Seen::begin());
     sleep(Duration::from_secs(seconds)).await;
-    let seen = member.borrow_mut().seen.take().expect("it was begun");
-    seen.end()
+    let seen = member.borrow_mut().seen.take().expect("it was begun").end();
+    // The others may not be through: they are answered until they are.
+    tokio::task::spawn_blocking(move || hand_over(seen)).await.expect("what was seen is handed over");
 }
 
 async fn ask(member: Shared, first: usize, period: Duration) {
@@ -87,12 +88,29 @@ fn now_ns(member: &Member) -> u64 {
     u64::try_from(member.clock.elapsed().as_nanos()).expect("a bench does not last for centuries")
 }
 
+/// Writes a packet. One that has no room, or whose receiver has ended, is missing among the times.
 fn write(to: &TcpStream, kind: u8, sent_ns: u64) {
     let mut frame = [7; FRAME];
     frame[0] = kind;
     frame[1..9].copy_from_slice(&sent_ns.to_le_bytes());
-    let written = to.try_write(&frame).expect("the other one reads");
-    assert_eq!(written, FRAME, "so little always has room");
+    match to.try_write(&frame) {
+        Ok(FRAME) => {}
+        // The next one would be taken for the rest of it, and what is measured would be of nothing.
+        Ok(written) => fail(&format!("only {written} of {FRAME} bytes had room: a member is too slow")),
+        Err(error) if is_missing(error.kind()) => {}
+        Err(error) => fail(&format!("a packet cannot be written: {error}")),
+    }
+}
+
+/// Whether nobody gets the packet, and all goes on.
+const fn is_missing(error: ErrorKind) -> bool {
+    matches!(error, ErrorKind::WouldBlock | ErrorKind::BrokenPipe | ErrorKind::ConnectionReset)
+}
+
+/// Ends this process, not the task alone: whoever started it misses what was seen, and takes it for failed.
+fn fail(words: &str) -> ! {
+    eprintln!("raw_member: {words}");
+    std::process::exit(1)
 }
 
 async fn read(member: Shared, from: Rc<TcpStream>) {
@@ -103,7 +121,7 @@ async fn read(member: Shared, from: Rc<TcpStream>) {
             // It has ended.
             Ok(0) => return,
             Ok(_) => {}
-            Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => continue,
+            Err(error) if error.kind() == ErrorKind::WouldBlock => continue,
             Err(_) => return,
         }
         let whole = buffer.len() / FRAME * FRAME;

@@ -248,7 +248,7 @@ impl Access {
         let mut holders = lock(&self.holders);
         holders.retain(|holder| holder.app != app);
         if holders.len() >= HOLDERS_MAX {
-            // Who is here stays: of these there are `lncl.clients_max`, which is no more than this, and by them a user's places are counted.
+            // Who is here stays: of these there are `lncl.clients_max`, which is no more than this, and by them it is known who is one of the robot's own.
             let first = holders.iter().position(|holder| !holder.is_here).unwrap_or(0);
             holders.remove(first);
         }
@@ -277,13 +277,15 @@ impl Access {
         self.index.load().list.may_register(own, who, name, address)
     }
 
-    /// A guest, of `uid`, has this address; said before it can join anything.
+    /// A guest, of `uid`, has this address; said before it can join or ask anything.
     pub(crate) fn guest_came(&self, app: AppAddress, uid: u32) {
+        self.asked.guest_came(app, uid);
         lock(&self.memberships).came(app, uid);
     }
 
-    /// One of the robot's own has this address; said before it can join anything.
+    /// One of the robot's own has this address; said before it can join or ask anything.
     pub(crate) fn own_came(&self, app: AppAddress) {
+        self.asked.forget(app);
         lock(&self.memberships).gone(app);
     }
 
@@ -312,11 +314,6 @@ impl Access {
     /// Whether the process that has this address now is one of the user `own`, or of root; not, if that is not known any more.
     pub(crate) fn is_of(&self, app: AppAddress, own: u32) -> bool {
         lock(&self.holders).iter().any(|holder| holder.app == app && [own, 0].contains(&holder.uid))
-    }
-
-    /// How many of these addresses processes of `uid` have, that was let in by a rule.
-    pub(crate) fn held_by(&self, uid: u32, is_held: impl Fn(AppAddress) -> bool) -> usize {
-        lock(&self.holders).iter().filter(|holder| holder.uid == uid && is_held(holder.app)).count()
     }
 
     /// Whether a rule is about processes of the user `own` in its group, of whom most are meant to do anything.

@@ -66,7 +66,7 @@ struct Guest {
 }
 
 impl Memberships {
-    /// A guest has this address. Bounded by who may be registered: half of `lncl.clients_max` for each user.
+    /// A guest has this address. Bounded by who may be registered: half of `lncl.clients_max` for all of them.
     pub(super) fn came(&mut self, app: AppAddress, uid: u32) {
         self.gone(app);
         self.guests.insert(app, Guest { uid, memberships: 0 });

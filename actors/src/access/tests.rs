@@ -7,7 +7,7 @@ use sinew_runtime::{
     outcome::Rejection,
     router::guard::Guard as _,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
-    wire::{Class, Header, Kind},
+    wire::{Class, Flags, Header, Kind},
 };
 
 use super::{
@@ -329,21 +329,62 @@ fn a_list_is_read_again_at_the_word_of_the_nodes_user_and_of_root() {
 }
 
 #[test]
-fn a_user_who_comes_and_goes_without_end_hides_none_of_the_places_that_he_has() {
+fn a_user_who_comes_and_goes_without_end_hides_nobody_who_is_here() {
     let stores = Stores::for_test(NodeConfig::new("knee"), Incarnation(1));
     let access = Access::in_test(&stores, "");
     let held = AppAddress::new(0x1001);
-    access.holds(held, 1_001, None);
+    access.holds(held, 1_000, None);
     for number in 0..5_000 {
         let app = AppAddress::new(0x8000_0000 + number);
         access.holds(app, 1_001, None);
         access.gone(app);
     }
-    assert_eq!(access.held_by(1_001, |app| app == held), 1);
+    assert!(access.is_of(held, 1_000));
 }
 
 fn header(source: Tid, target: Tid) -> Header {
     Header::new(Kind::named("test"), source, target)
+}
+
+#[test]
+fn guests_who_ask_all_they_may_and_the_robots_own_are_all_answered_past_the_list() {
+    // Given: a list that lets nobody send anything, one of the robot's own, and five guest users, all in one part of the notes
+    let stores = Stores::for_test(NodeConfig::new("knee"), Incarnation(1));
+    let access = Access::in_test(&stores, "");
+    let (here, there) = (stores.node, app(THERE, 0x1001));
+    let own = app(here, 0x2000);
+    let guests = [1, 2, 3, 4, 5].map(|uid| (app(here, 0x2000 + 16 * uid), uid));
+    access.own_came(own.app);
+    guests.iter().for_each(|(guest, uid)| access.guest_came(guest.app, *uid));
+    let asks = |source: Tid, number| {
+        let mut question = header(source, there);
+        (question.correlation, question.flags) = (number, Flags::ASK);
+        access.asks(&question);
+    };
+    let is_answered = |target: Tid, number| {
+        let mut reply = header(there, target);
+        (reply.correlation, reply.flags) = (number, Flags::REPLY);
+        access.allows(&reply, target.app)
+    };
+    // When: a question of the robot's own is followed by all that guests can ask
+    asks(own, 1);
+    guests.iter().for_each(|(guest, _)| (1..=2_000).for_each(|number| asks(*guest, number)));
+    asks(own, 2);
+    // Then
+    assert!(is_answered(own, 1) && is_answered(own, 2) && !is_answered(own, 2), "each once");
+    // When: the same the other way
+    let (first, _) = guests[0];
+    asks(first, 3_000);
+    (1..=5).for_each(|robots| {
+        (1..=2_000).for_each(|number| asks(app(here, 0x3000 + 16 * robots), number));
+    });
+    // Then
+    assert!(is_answered(first, 3_000));
+    // And: of a guest that has gone nothing is answered, whoever has its address next
+    asks(first, 3_001);
+    access.gone(first.app);
+    access.own_came(first.app);
+    assert!(!is_answered(first, 3_001));
 }
 
 #[test]

@@ -153,7 +153,7 @@ impl Endpoint {
         wanted.and_then(|wanted| wanted.from(self.absolute(message.header.source)))
     }
 
-    /// Hands back what is not about direct links.
+    /// Hands back what is neither about direct links nor about groups that it asked for when it came back.
     fn heed(&mut self, message: Message, wanted: Option<Wanted>) -> Option<Message> {
         let Header { kind, correlation, .. } = message.header;
         // The number alone says nothing: a mark and an introduction carry numbers that others have given.
@@ -161,6 +161,9 @@ impl Endpoint {
             && wanted.is_some_and(|wanted| wanted.number == correlation);
         if kind.is_user() || is_answer {
             return Some(message);
+        }
+        if self.heed_rejoined(&message) {
+            return None;
         }
         let mut node = ToNode { writer: &self.writer, correlation: &mut self.correlation };
         self.direct.heed(message, Time::now(), &mut node)

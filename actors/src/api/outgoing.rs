@@ -209,6 +209,10 @@ impl Endpoint {
         if self.reader.has_ended(now) {
             return Err(self.explain(ApiError::Closed("the node has gone".to_owned())));
         }
+        if !self.home.rejoining.is_empty() {
+            // The node reads on when its answers about groups are taken, which who only sends does here.
+            let _ = self.take_in_from_node(None, WhenFull::Leave, now);
+        }
         self.write(draft, limit).await.map(|()| None).map_err(|error| self.explain(error))
     }
 

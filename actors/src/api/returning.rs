@@ -4,12 +4,18 @@
 //! tries once, and waits for a node that is there and has just been asked, for 20 ms at most: who calls seldom would else
 //! come too late for each step of it. Between two tries there is a pause, from 10 ms doubling to 1 s.
 
-use std::{collections::BTreeSet, path::PathBuf, thread, time::Duration};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    path::PathBuf,
+    thread,
+    time::Duration,
+};
 
 use sinew_runtime::{
+    outcome::{Outcome, Rejection},
     tid::{AppAddress, Tid},
     time::Time,
-    wire::{Kind, Message},
+    wire::{Flags, Header, Kind, Message},
 };
 
 use super::{
@@ -30,6 +36,10 @@ pub(super) const ANSWERED_WITHIN: Duration = Duration::from_millis(20);
 /// How often who registers on another thread looks whether that is still wanted.
 pub(super) const LOOK: Duration = Duration::from_millis(100);
 
+/// Memberships of which who comes back asks what becomes of them, at most. A node reads nothing more of who does not take its answers, and who
+/// comes back takes none before all is asked: so many, asked last, fit the shortest ring, whether the node reads them or not. spec: LNCL-16
+const CONFIRMED_MAX: usize = 32;
+
 /// Whether an endpoint registers again when its connection has ended through no fault of its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Returning {
@@ -45,6 +55,8 @@ pub(super) struct Home {
     pub(super) returning: Returning,
     /// The groups that it is a member of.
     pub(super) groups: BTreeSet<AppAddress>,
+    /// Those that it has asked for when it came back, by the numbers of the questions, and of which the node has said nothing yet.
+    pub(super) rejoining: BTreeMap<u64, AppAddress>,
     /// How often it has registered.
     pub(super) registrations: u64,
     way: Option<Way>,
@@ -68,7 +80,16 @@ impl Home {
         options: LinkOptions,
         returning: Returning,
     ) -> Self {
-        Self { path, register, options, returning, groups: BTreeSet::new(), registrations: 1, way: None }
+        Self {
+            path,
+            register,
+            options,
+            returning,
+            groups: BTreeSet::new(),
+            rejoining: BTreeMap::new(),
+            registrations: 1,
+            way: None,
+        }
     }
 
     /// The way back, which begins with the first question for it.
@@ -229,13 +250,49 @@ impl Endpoint {
         {
             return self.turn_back(why.to_string());
         }
-        for group in &self.home.groups {
-            let membership = Group { group: *group, member: true };
-            let message: Message = payload::frame(Kind::LNCL_GROUP, self.tid, LNCL, &membership);
-            if let Err(why) = self.writer.write(&message) {
-                return self.turn_back(why.to_string());
-            }
+        if let Err(why) = self.join_again() {
+            self.turn_back(why.to_string());
         }
+    }
+
+    /// Asks for its groups again: for the last [`CONFIRMED_MAX`] of them so that the node says what becomes of that.
+    fn join_again(&mut self) -> Result<(), ApiError> {
+        self.home.rejoining.clear();
+        let unconfirmed = self.home.groups.len().saturating_sub(CONFIRMED_MAX);
+        for (index, group) in self.home.groups.iter().enumerate() {
+            let membership = Group { group: *group, member: true };
+            let mut message: Message = payload::frame(Kind::LNCL_GROUP, self.tid, LNCL, &membership);
+            if index >= unconfirmed {
+                self.correlation += 1;
+                (message.header.flags, message.header.correlation) = (Flags::CONFIRM, self.correlation);
+                self.home.rejoining.insert(self.correlation, *group);
+            }
+            self.writer.write(&message)?;
+        }
+        Ok(())
+    }
+
+    /// Hears what became of a group that it asked for when it came back; whether `message` says that. Nobody waits for the answer: the log says
+    /// where it may not join one. That may pass, so it asks for it again when it comes back the next time.
+    pub(super) fn heed_rejoined(&mut self, message: &Message) -> bool {
+        let Header { kind, source, correlation, .. } = message.header;
+        if kind != Kind::OUTCOME || self.absolute(source) != self.absolute(LNCL) {
+            return false;
+        }
+        let Some(group) = self.home.rejoining.remove(&correlation) else { return false };
+        let outcome = message.payload.first().and_then(|code| Outcome::from_code(*code));
+        // Whose address is not its own any more has no connection for long: it comes back once more, and asks again.
+        if let Some(Outcome::Rejected(why)) = outcome
+            && why != Rejection::NoSuchApplication
+        {
+            let remedy = if why == Rejection::QueueFull {
+                "its user, or the node, has as many memberships as it may: leave groups, then join this one again"
+            } else {
+                "the node's access list does not let it: name the group in its `[[client]]`, `sinew reload`, then join it again"
+            };
+            tracing::warn!(endpoint = %self.tid, %group, remedy, "it came back to its node, and is not in this group any more");
+        }
+        true
     }
 
     /// Half a return is none. What has come meanwhile is not taken: to the node who hangs up has not handled it.

@@ -74,7 +74,8 @@ pub struct NodeConfig {
 pub struct LnclConfig {
     /// Path of the unix socket for applications in other processes; 1 to 100 bytes. Default: none, no such door.
     pub socket: Option<PathBuf>,
-    /// Connections of other processes at most, one for each registered address. 1 to 4,096; default 256.
+    /// Connections of other processes at most, one for each registered address. 1 to 4,096; default 256. Users whom only the access list
+    /// lets in have half of them at most, one such user a quarter, one at least.
     pub clients_max: usize,
     /// Those of one process at most. 1 to 4,096; default 64: one process leaves room for others.
     pub clients_per_process_max: usize,

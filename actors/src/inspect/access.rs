@@ -61,6 +61,12 @@ fn is_of_the_nodes_user(stores: &Stores, app: AppAddress) -> bool {
     }
 }
 
+/// Whether the application at `watcher` is one of this node's that a guest has: a process of a user whom only the list lets in. Of those on
+/// other nodes that is not known here.
+pub(super) fn is_of_a_guest(stores: &Stores, watcher: Tid) -> bool {
+    watcher.node == stores.node && stores.access.get().is_some() && !is_of_the_nodes_user(stores, watcher.app)
+}
+
 /// How often files were read again of late on the word of tools.
 #[derive(Debug, Default)]
 pub(super) struct Readings {
@@ -139,11 +145,14 @@ fn report(stores: &Stores, faults: &str) -> ReloadReport {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::mpsc::sync_channel;
+
     use sinew_runtime::tid::{Incarnation, NodeAddress};
 
-    use super::*;
+    use super::{super::inspector::Inbox, *};
     use crate::{
         config::NodeConfig,
+        lncl::{LocalApp, register_local},
         secured::Secured,
         security::{
             Identity, files,
@@ -230,5 +239,28 @@ mod tests {
         assert_eq!(may(begin), 4);
         assert_eq!(may(begin + Duration::from_secs(1)), 1);
         assert_eq!(may(begin + Duration::from_secs(60)), 4);
+    }
+
+    // spec: INSPECT-6
+    #[test]
+    fn who_is_not_of_the_nodes_own_user_is_a_guest_where_there_is_a_list() {
+        let (stores, _directory) = node();
+        let (put, _inbox) = sync_channel(1);
+        let own = LocalApp {
+            name: None,
+            address: None,
+            requires: Vec::new(),
+            kinds: Vec::new(),
+            outlet: Arc::new(Inbox(put)),
+            events: Arc::new([]),
+        };
+        let own = register_local(&stores, own).expect("nobody else is there");
+        assert!(!is_of_a_guest(&stores, own));
+        // Whoever has gone meanwhile is nobody's: it is not taken for the robot's own.
+        let other = AppAddress::new(0x8000_1234);
+        assert!(is_of_a_guest(&stores, Tid::new(stores.node, other)));
+        assert!(!is_of_a_guest(&stores, Tid::new(NodeAddress::new(3), other)), "another node's");
+        let open = Stores::for_test(NodeConfig::new("hip"), Incarnation(1));
+        assert!(!is_of_a_guest(&open, Tid::new(open.node, other)), "no list, no guests");
     }
 }

@@ -26,7 +26,7 @@ use super::{
         AskAccess, AskApps, AskAudit, AskGroups, AskNode, AskReach, AskReload, AskTree, AskWatch, Report,
         WatchReport,
     },
-    watches::{NewTap, WATCHES_MAX, Watches, Ways},
+    watches::{GUESTS_WATCHES_MAX, NewTap, WATCHES_MAX, Watches, Ways},
 };
 use crate::{log, stores::Stores};
 
@@ -149,14 +149,26 @@ fn watch(
     let watched = Tid::new(stores.node, app.app);
     let bytes_max = WATCH_BYTES.min(stores.config.payload_max / 2);
     let ways = Ways { received, sent };
-    let (fetched, tap) = watches.fetch(now, (question.header.source, watched), ways, bytes_max);
+    let key = (question.header.source, watched);
+    if !watches.leaves_room(key, |watcher| access::is_of_a_guest(stores, watcher)) {
+        return Ok(refused(format!(
+            "applications of other users have {GUESTS_WATCHES_MAX} watches at once on this node, which keeps the rest for its own \
+             user's, and so many are there; end another one"
+        )));
+    }
+    let (fetched, tap) = watches.fetch(now, key, ways, bytes_max);
     put_up(stores, tap);
     let Some(fetched) = fetched else {
-        let refused =
-            format!("this node shows {WATCHES_MAX} watches at once, and so many are there; end another one");
-        return Ok(WatchReport { seen: Vec::new(), dropped: 0, more: false, refused: Some(refused) });
+        return Ok(refused(format!(
+            "this node shows {WATCHES_MAX} watches at once, and so many are there; end another one"
+        )));
     };
     Ok(answers.seen(stores, fetched))
+}
+
+/// Nothing is watched, for this reason.
+const fn refused(why: String) -> WatchReport {
+    WatchReport { seen: Vec::new(), dropped: 0, more: false, refused: Some(why) }
 }
 
 fn reply<R: Report + Payload>(

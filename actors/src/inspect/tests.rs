@@ -263,7 +263,7 @@ impl Bench {
         let app = AppAddress::fixed(number).expect("a low number");
         let mut sync = lock(&self.stores.sync);
         let mut hears = |input| sync.handle(Time::now(), input);
-        let registered = AppFact::Registered { app, name: Some(name.clone()), requires: Vec::new() };
+        let registered = AppFact::own_registered(app, Some(name.clone()), Vec::new());
         hears(Input::AppChanged(registered));
         hears(Input::AppChanged(AppFact::Ready { app }));
         for (correlation, barrier) in (1..).zip(barriers) {

@@ -26,6 +26,8 @@ use super::reports::{SEEN_BYTES_MAX, SEEN_MAX};
 
 /// Watches at once at most, of all watchers together.
 pub(super) const WATCHES_MAX: usize = 8;
+/// Of these guests have so many at most, together: the rest is there for the robot's own, and for watchers on other nodes.
+pub(super) const GUESTS_WATCHES_MAX: usize = WATCHES_MAX / 2;
 /// After so long without a question a watch is over.
 pub(super) const LEASE: Duration = Duration::from_secs(3);
 /// Messages that one watch keeps until they are fetched, at most; further ones are counted.
@@ -188,6 +190,12 @@ impl Watches {
         (Some(Fetched { sights: Vec::new(), dropped: 0, more: false }), Some(self.tap()))
     }
 
+    /// Whether guests leave enough to others if this watcher watches this application. Who does already goes on.
+    pub(super) fn leaves_room(&self, key: (Tid, Tid), is_guest: impl Fn(Tid) -> bool) -> bool {
+        let of_guests = || self.0.keys().filter(|(watcher, _)| is_guest(*watcher)).count();
+        self.0.contains_key(&key) || !is_guest(key.0) || of_guests() < GUESTS_WATCHES_MAX
+    }
+
     /// Ends those that nobody has asked for.
     pub(super) fn expire(&mut self, now: Time) -> NewTap {
         let before = self.0.len();
@@ -333,5 +341,32 @@ mod tests {
         assert!(watches.expire(Time::ZERO + LEASE).is_none(), "nothing changes");
         assert!(matches!(watches.expire(later + LEASE), Some(None)));
         assert_eq!(watches.next_end(), None);
+    }
+
+    // spec: INSPECT-6
+    #[test]
+    fn guests_leave_half_of_the_watches_to_others_and_go_on_with_those_that_they_have() {
+        // Given
+        let (own, first, second) = (0x1ffd, 0x1ffe, 0x1fff);
+        let is_guest = |watcher: Tid| watcher != tid(own);
+        let begin = |watches: &mut Watches, watcher: u32, app: u32| {
+            let key = (tid(watcher), tid(app));
+            watches.leaves_room(key, is_guest) && watches.fetch(Time::ZERO, key, BOTH, 1).0.is_some()
+        };
+        let begin_all = |watches: &mut Watches, watcher| {
+            let apps = 0x1000..0x1000 + WATCHES_MAX as u32;
+            apps.filter(|app| begin(watches, watcher, *app)).count()
+        };
+        let mut watches = Watches::default();
+        // When, then: one leaves what guests have to the other, and both the rest to the robot's own
+        assert!(begin(&mut watches, first, 0x1000));
+        assert_eq!(begin_all(&mut watches, second), GUESTS_WATCHES_MAX - 1);
+        assert!(!begin(&mut watches, first, 0x1001));
+        assert_eq!(begin_all(&mut watches, own), WATCHES_MAX - GUESTS_WATCHES_MAX);
+        // And: who watches goes on
+        assert!(begin(&mut watches, first, 0x1000) && begin(&mut watches, second, 0x1000));
+        // And: what is over is there for others
+        watches.expire(Time::ZERO + LEASE);
+        assert_eq!(begin_all(&mut watches, first), GUESTS_WATCHES_MAX);
     }
 }

@@ -42,7 +42,7 @@ use super::{
     strangers::Place,
 };
 use crate::{
-    access::{Access, Applicant},
+    access::Applicant,
     monitors::Cause,
     outlet::{Left, LinkNumber, OutletLimits, StreamOutlet},
     stores::{Stores, lock},
@@ -159,6 +159,8 @@ struct Client {
     /// Set while messages flow.
     link: Option<LinkNumber>,
     tid: Tid,
+    /// Whose it is.
+    user: User,
     name: String,
     requires: Vec<String>,
     /// Whether the peer wants to be told what it waits for.
@@ -190,7 +192,6 @@ impl Client {
         if let Some(access) = server.stores.access.get() {
             let allowed = access.may_register(own, peer.who, name.as_deref(), address);
             allowed.map_err(|why| super::RegisterError::NotAllowed(why.to_string()))?;
-            check_share(&server.stores, access, own, uid)?;
         }
         let address = address.map_or(any, Address::Fixed);
         let (owner, user) = (peer.owner(), User::of(uid, own));
@@ -223,6 +224,7 @@ impl Client {
             orders: Orders::default(),
             link,
             tid,
+            user,
             name,
             requires,
             waits,
@@ -382,19 +384,6 @@ impl Client {
         let registered = Registered { node, app, node_name: config.name.clone(), payload_max, ring };
         payload::frame(Kind::LNCL_REGISTERED, payload::lncl_of(node), self.tid, &registered)
     }
-}
-
-/// Users whom the access list lets in leave room for the robot's own: each has half of the places at most.
-fn check_share(stores: &Stores, access: &Access, own: u32, uid: u32) -> Result<(), super::RegisterError> {
-    let limit = (stores.config.lncl.clients_max / 2).max(1);
-    let registry = lock(&stores.registry);
-    let is_held = |app| matches!(registry.owner_of(app), Some(Owner::Client { .. }));
-    if uid == own || uid == 0 || access.held_by(uid, is_held) < limit {
-        return Ok(());
-    }
-    Err(super::RegisterError::NotAllowed(format!(
-        "user {uid} has {limit} applications here, half of `lncl.clients_max`, and may not have more: end one, or raise it"
-    )))
 }
 
 fn encoded(message: &Message) -> BytesMut {

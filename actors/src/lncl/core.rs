@@ -30,6 +30,18 @@ pub(crate) struct Limits {
     pub(crate) per_process: usize,
 }
 
+impl Limits {
+    /// Those of all guests, of whom there may be any number: half of the places are the robot's own whatever they do, where there are two or more.
+    fn guests(self) -> usize {
+        (self.clients / 2).max(1)
+    }
+
+    /// Those of one guest user: half of what guests have, so that it keeps no other one out by itself.
+    fn per_guest(self) -> usize {
+        (self.clients / 4).max(1)
+    }
+}
+
 /// One connection of another process; never used again in a node's life.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct ClientId(pub(crate) u64);
@@ -146,6 +158,26 @@ pub enum RegisterError {
         /// The limit in force.
         limit: usize,
     },
+    /// The user, whom the access list lets in, has as many applications as one such user may have.
+    #[error(
+        "user {uid} has {limit} applications here, a quarter of `lncl.clients_max`, which is the limit for a user whom only the access list \
+         lets in; end one, or raise it"
+    )]
+    GuestFull {
+        /// The user.
+        uid: u32,
+        /// The limit.
+        limit: usize,
+    },
+    /// Users whom the access list lets in have as many applications as all of them may have together.
+    #[error(
+        "users whom only the access list lets in have {limit} applications here, half of `lncl.clients_max`, which is the limit for all of \
+         them together; end one, or raise it"
+    )]
+    GuestsFull {
+        /// The limit.
+        limit: usize,
+    },
     /// The node has not looked yet at what was registered and given back before.
     #[error(
         "the node has {waiting} changes of applications to look at, and takes no further one before; register again in a moment"
@@ -194,6 +226,7 @@ pub enum RegisterError {
 struct Entry {
     name: Option<String>,
     owner: Owner,
+    user: User,
 }
 
 /// Who is registered on this node. It outlives LNCL's actor.
@@ -215,6 +248,7 @@ impl Registry {
     pub(crate) fn register(&mut self, request: Request, limits: Limits) -> Result<AppAddress, RegisterError> {
         check_lists(&request)?;
         self.check_room(request.owner, limits)?;
+        self.check_share(request.user, limits)?;
         self.check_name(request.name.as_deref())?;
         let kinds = self.kinds.check(request.user, &request.kinds)?;
         let app = match request.address {
@@ -226,7 +260,7 @@ impl Registry {
         if let Some(name) = &request.name {
             self.names.insert(name.clone(), app);
         }
-        self.apps.insert(app, Entry { name: request.name, owner: request.owner });
+        self.apps.insert(app, Entry { name: request.name, owner: request.owner, user: request.user });
         Ok(app)
     }
 
@@ -319,6 +353,25 @@ impl Registry {
         }
         if all >= limits.clients {
             return Err(RegisterError::ClientsFull { limit: limits.clients });
+        }
+        Ok(())
+    }
+
+    /// Guests leave room for the robot's own, and one user of theirs for others. spec: LNCL-13
+    fn check_share(&self, user: User, limits: Limits) -> Result<(), RegisterError> {
+        let User::Guest(uid) = user else { return Ok(()) };
+        let (mut all, mut own) = (0, 0);
+        for entry in self.apps.values() {
+            if let User::Guest(theirs) = entry.user {
+                all += 1;
+                own += usize::from(theirs == uid);
+            }
+        }
+        if own >= limits.per_guest() {
+            return Err(RegisterError::GuestFull { uid, limit: limits.per_guest() });
+        }
+        if all >= limits.guests() {
+            return Err(RegisterError::GuestsFull { limit: limits.guests() });
         }
         Ok(())
     }

@@ -41,6 +41,7 @@ mod registrar;
 mod rings;
 mod server;
 pub(crate) mod session;
+mod shares;
 mod strangers;
 #[cfg(test)]
 pub(crate) mod testing;
@@ -60,6 +61,9 @@ pub(crate) use reader::Reader;
 pub(crate) use registrar::{
     LocalApp, app_down, app_ready, app_stopped, register_local, resolve, set_member, unregister_local,
 };
+#[cfg(test)]
+pub(crate) use shares::OF_USER_AT_SYNC;
+pub(crate) use shares::Shares;
 pub(crate) use untaken::is_fault;
 pub(crate) use untold::Untold;
 

@@ -14,7 +14,7 @@ use sinew_runtime::{
 
 use super::{
     AppFact,
-    core::{Address, Limits, Owner, RegisterError, Request, User},
+    core::{Address, Limits, Owner, RegisterError, Registry, Request, User},
 };
 use crate::{
     monitors::{self, Cause},
@@ -57,7 +57,7 @@ pub(crate) fn register_local(stores: &Stores, app: LocalApp) -> Result<Tid, Regi
     let handled = events.to_vec();
     stores.router.set_local(app, LocalRoute { outlet, events });
     monitors::note(stores, monitors::Input::Began { app });
-    tell_sync(stores, AppFact::Registered { app, name, requires: fact_requires });
+    tell_sync(stores, AppFact::Registered { app, name, requires: fact_requires, user });
     tell_handled(stores, app, handled);
     Ok(Tid::new(stores.node, app))
 }
@@ -103,8 +103,24 @@ pub(crate) fn resolve(stores: &Stores, name: &str) -> Option<Tid> {
     here.or_else(|| lock(&stores.sync).called(name).into_iter().find(is_elsewhere))
 }
 
-/// Makes `app` a member of `group`, or no longer one.
+/// Makes `app`, one of the node's own, in it or in a process that it started, a member of `group`, or no longer one. Nothing where none of
+/// these has the address: such a word comes after its application's end, and would be whoever's who gets the address next.
 pub(crate) fn set_member(stores: &Stores, app: AppAddress, group: AppAddress, member: bool) {
+    let registry = lock(&stores.registry);
+    if registry.owner_of(app) == Some(Owner::Node) {
+        set_registered_member(stores, &registry, app, group, member);
+    }
+}
+
+/// The same of any application, for who holds the registry's lock and has seen in it that the application is there.
+pub(super) fn set_registered_member(
+    stores: &Stores,
+    registry: &Registry,
+    app: AppAddress,
+    group: AppAddress,
+    member: bool,
+) {
+    debug_assert!(registry.owner_of(app).is_some(), "nobody would end the membership");
     if stores.router.set_member(group, app, member) && stores.groups_are_to_be_told() {
         tell_sync(stores, AppFact::GroupsChanged);
     }
@@ -131,10 +147,7 @@ pub(super) fn register_client(stores: &Stores, request: Request) -> Result<AppAd
         User::Guest(_) => monitors::Input::GuestBegan { app },
     };
     monitors::note(stores, began);
-    tell_sync(stores, AppFact::Registered { app, name, requires });
-    if let User::Guest(uid) = user {
-        tell_sync(stores, AppFact::Guest { app, uid });
-    }
+    tell_sync(stores, AppFact::Registered { app, name, requires, user });
     tell_handled(stores, app, handled);
     Ok(app)
 }
@@ -236,22 +249,27 @@ mod tests {
     use super::*;
     use crate::{NodeConfig, access::Access, sync};
 
+    /// One of the node's own registers.
+    fn registers(stores: &Stores, name: Option<&str>, address: Option<AppAddress>) -> AppAddress {
+        let outlet = Arc::new(AppOutlet { pending: Pending::new(1), inbox: Mailbox::new(1) });
+        let (name, events) = (name.map(str::to_owned), Arc::new([]));
+        let app = LocalApp { name, address, requires: vec![], kinds: vec![], outlet, events };
+        register_local(stores, app).expect("nothing is in the way").app
+    }
+
+    /// A process of this user registers.
+    fn client_registers(stores: &Stores, address: Address, user: User) -> AppAddress {
+        let owner = Owner::Client { id: lock(&stores.registry).new_client(), pid: 1 };
+        let request = Request { address, name: None, requires: vec![], kinds: vec![], owner, user };
+        register_client(stores, request).expect("nothing is in the way")
+    }
+
     #[test]
     fn a_name_is_free_when_its_address_is_given_back_whenever_the_sync_manager_hears_of_it() {
         // given: an application, of which the sync manager knows
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
-        let outlet = Arc::new(AppOutlet { pending: Pending::new(1), inbox: Mailbox::new(1) });
-        let (name, address) = (Some("drive".to_owned()), None);
-        let app = LocalApp {
-            name: name.clone(),
-            address,
-            requires: vec![],
-            kinds: vec![],
-            outlet,
-            events: Arc::new([]),
-        };
-        let tid = register_local(&stores, app).expect("nothing is in the way");
-        let fact = AppFact::Registered { app: tid.app, name, requires: vec![] };
+        let tid = Tid::new(stores.node, registers(&stores, Some("drive"), None));
+        let fact = AppFact::own_registered(tid.app, Some("drive".to_owned()), vec![]);
         lock(&stores.sync).handle(Time::ZERO, sync::Input::AppChanged(fact));
         assert_eq!(resolve(&stores, "drive"), Some(tid));
         // when
@@ -265,17 +283,50 @@ mod tests {
     fn whoever_joins_and_leaves_without_end_takes_one_place_in_the_sync_managers_post() {
         // given: a sync manager that reads nothing for now
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
-        let (app, group) = (AppAddress::new(0x1000), AppAddress::group("drives"));
+        let (app, group) = (registers(&stores, None, None), AppAddress::group("drives"));
+        let before = stores.posts.sync.len();
         // when: more changes than its post has room for
         for turn in 0..=POST_CAPACITY {
             set_member(&stores, app, group, turn % 2 == 0);
         }
         // then
-        assert_eq!(stores.posts.sync.len(), 1);
+        assert_eq!(stores.posts.sync.len(), before + 1);
         // and when it has looked, the next change is told
         stores.groups_are_looked_at();
         set_member(&stores, app, group, false);
-        assert_eq!(stores.posts.sync.len(), 2);
+        assert_eq!(stores.posts.sync.len(), before + 2);
+    }
+
+    #[test]
+    fn a_join_that_comes_after_its_applications_end_leaves_no_membership() {
+        // given: one of the node's own that was a member, and has ended
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let (app, group) = (registers(&stores, None, None), AppAddress::group("drives"));
+        set_member(&stores, app, group, true);
+        assert!(stores.router.is_member(group, app));
+        unregister_local(&stores, app);
+        stores.groups_are_looked_at();
+        let before = stores.posts.sync.len();
+        // when
+        set_member(&stores, app, group, true);
+        // then: and the sync manager has nothing to look at
+        assert_eq!((stores.router.memberships(), stores.posts.sync.len()), (0, before));
+    }
+
+    #[test]
+    fn a_late_word_about_groups_changes_nothing_of_the_guest_that_has_the_address_now() {
+        // given: a guest at the address of one of the node's own that has ended, and a member of one group
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let app = registers(&stores, None, Some(AppAddress::new(0x1001)));
+        unregister_local(&stores, app);
+        client_registers(&stores, Address::Fixed(app), User::Guest(1_001));
+        let [drives, legs] = ["drives", "legs"].map(AppAddress::group);
+        set_registered_member(&stores, &lock(&stores.registry), app, legs, true);
+        // when
+        set_member(&stores, app, drives, true);
+        set_member(&stores, app, legs, false);
+        // then
+        assert_eq!([drives, legs].map(|group| stores.router.is_member(group, app)), [false, true]);
     }
 
     #[test]
@@ -314,12 +365,12 @@ mod tests {
     }
 
     #[test]
-    fn that_an_application_is_a_guests_is_told_behind_its_registration() {
+    fn whose_an_application_is_is_told_with_its_registration() {
+        // given, when: one of the robot's own and a guest come
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
-        let owner = Owner::Client { id: lock(&stores.registry).new_client(), pid: 1 };
-        let (address, user) = (Address::Dynamic, User::Guest(1_001));
-        let request = Request { address, name: None, requires: vec![], kinds: vec![], owner, user };
-        let app = register_client(&stores, request).expect("nothing is in the way");
+        let users = [User::Own, User::Guest(1_001)];
+        let apps = users.map(|user| client_registers(&stores, Address::Dynamic, user));
+        // then
         let mut post = stores.posts.sync.attach();
         let told: Vec<_> = std::iter::from_fn(|| post.next().now_or_never().flatten()).collect();
         let facts = told.iter().filter_map(|event| match event {
@@ -329,8 +380,11 @@ mod tests {
             | sync::Event::Message(_)
             | sync::Event::Monitors => None,
         });
-        let registered = AppFact::Registered { app, name: None, requires: vec![] };
-        assert_eq!(facts.collect::<Vec<_>>(), [registered, AppFact::Guest { app, uid: 1_001 }]);
+        let registered = |of: usize| {
+            let (app, user) = (apps[of], users[of]);
+            AppFact::Registered { app, name: None, requires: vec![], user }
+        };
+        assert_eq!(facts.collect::<Vec<_>>(), [registered(0), registered(1)]);
     }
 
     #[test]
@@ -340,12 +394,7 @@ mod tests {
         let access = Access::in_test(&stores, "");
         let app = AppAddress::new(0x1001);
         access.guest_came(app, 1_001);
-        let register = |user| {
-            let owner = Owner::Client { id: lock(&stores.registry).new_client(), pid: 1 };
-            let address = Address::Fixed(app);
-            let request = Request { address, name: None, requires: vec![], kinds: vec![], owner, user };
-            register_client(&stores, request).expect("nothing is in the way")
-        };
+        let register = |user| client_registers(&stores, Address::Fixed(app), user);
         // When, then: one of the robot's own has it
         register(User::Own);
         assert!(access.guests().is_empty());
@@ -361,13 +410,13 @@ mod tests {
     fn a_change_of_groups_that_found_no_room_is_told_when_there_is_some() {
         // given: a post that is full
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
-        let (app, group) = (AppAddress::new(0x1000), AppAddress::group("drives"));
+        let (app, group) = (registers(&stores, None, None), AppAddress::group("drives"));
         while stores.posts.sync.post(sync::Event::Monitors).is_ok() {}
         set_member(&stores, app, group, true);
         // when
         let mut post = stores.posts.sync.attach();
         let mut next = || post.next().now_or_never().flatten();
-        assert!(matches!(next(), Some(sync::Event::Monitors)));
+        assert!(matches!(next(), Some(sync::Event::App(AppFact::Registered { .. }))));
         assert!(stores.untold_of_apps.offer_to_sync(&stores.posts));
         // then
         let told = std::iter::from_fn(next).filter(|event| !matches!(event, sync::Event::Monitors));

@@ -42,8 +42,9 @@ pub(crate) enum Order {
     Settle { source: Tid, correlation: u64, outcome: Outcome },
     /// Change a membership, then tell the client so if `confirm` is its correlation.
     SetMember { group: AppAddress, member: bool, confirm: Option<u64> },
-    /// Tell the client what became of its message `correlation`, to `destination`.
-    Tell { destination: Tid, correlation: u64, outcome: Outcome },
+    /// Count that a membership stays as it is for this reason, and tell the client what became of its message `correlation`, to
+    /// `destination`.
+    Tell { destination: Tid, correlation: u64, outcome: Outcome, why: NoMembership },
     /// Tell the client the TID of `name`.
     Resolve { name: String, correlation: u64 },
     /// Introduce the client to `to`, or tell it why not.
@@ -81,6 +82,31 @@ pub(crate) enum Violation {
         /// What is wrong with it.
         cause: String,
     },
+}
+
+/// Why a client does not become a member of a group, or leave it, as its frames show. The client is at fault; nothing changed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum NoMembership {
+    /// It is in as many groups as it may.
+    #[error(
+        "it is in {GROUPS_MAX} groups, which is the most for one application; leave one before group {0}"
+    )]
+    Full(AppAddress),
+    /// What it names is none.
+    #[error(
+        "{0} is not the address of a group, which are f0000000 to fffffffe, hexadecimal; make it of a name"
+    )]
+    NoGroup(AppAddress),
+}
+
+impl NoMembership {
+    /// What the client is told, which is a byte.
+    const fn outcome(self) -> Outcome {
+        Outcome::Rejected(match self {
+            Self::Full(_) => Rejection::QueueFull,
+            Self::NoGroup(_) => Rejection::Unsupported,
+        })
+    }
 }
 
 impl Session {
@@ -140,18 +166,19 @@ impl Session {
     fn read_group(&mut self, message: &Message) -> Result<Order, Violation> {
         let Group { group, member } = read_payload(message)?;
         let confirm = message.header.flags.has(Flags::CONFIRM).then_some(message.header.correlation);
-        let refuse = |why| Order::Tell {
+        let refuse = |why: NoMembership| Order::Tell {
             destination: message.header.destination,
             correlation: message.header.correlation,
-            outcome: Outcome::Rejected(why),
+            outcome: why.outcome(),
+            why,
         };
         if !group.is_group() {
-            return Ok(refuse(Rejection::Unsupported));
+            return Ok(refuse(NoMembership::NoGroup(group)));
         }
         if !member {
             self.groups.remove(&group);
         } else if self.groups.len() >= GROUPS_MAX && !self.groups.contains(&group) {
-            return Ok(refuse(Rejection::QueueFull));
+            return Ok(refuse(NoMembership::Full(group)));
         } else {
             self.groups.insert(group);
         }
@@ -297,7 +324,10 @@ mod tests {
             assert!(matches!(order, Order::SetMember { .. }));
         }
         let one_more = session.handle(group(AppAddress::group("one more"), true));
-        assert!(matches!(one_more, Order::Tell { outcome: Outcome::Rejected(Rejection::QueueFull), .. }));
+        let Order::Tell { outcome, why, .. } = one_more else { panic!("{one_more:?}") };
+        let refused = Outcome::Rejected(Rejection::QueueFull);
+        assert_eq!((outcome, why), (refused, NoMembership::Full(AppAddress::group("one more"))));
+        assert!(why.to_string().contains("256 groups"), "{why}");
         session.handle(group(AppAddress::group("0"), false));
         let order = session.handle(group(AppAddress::group("one more"), true));
         assert!(matches!(order, Order::SetMember { .. }));
@@ -310,7 +340,9 @@ mod tests {
     #[test]
     fn what_is_no_group_cannot_be_joined() {
         let order = open().handle(group(AppAddress::LNCL, true));
-        assert!(matches!(order, Order::Tell { outcome: Outcome::Rejected(Rejection::Unsupported), .. }));
+        let Order::Tell { outcome, why, .. } = order else { panic!("{order:?}") };
+        let refused = Outcome::Rejected(Rejection::Unsupported);
+        assert_eq!((outcome, why), (refused, NoMembership::NoGroup(AppAddress::LNCL)));
     }
 
     proptest! {

@@ -63,7 +63,7 @@ impl Reader {
             (_, AppFact::Unregistered { .. })
             | (Self::Ndl, AppFact::Down { .. } | AppFact::Stopped { .. }) => Role::Ends,
             (Self::Sync, AppFact::Ready { .. } | AppFact::Down { .. } | AppFact::Stopped { .. })
-            | (_, AppFact::Guest { .. } | AppFact::Handles { .. } | AppFact::GroupsChanged)
+            | (_, AppFact::Handles { .. } | AppFact::GroupsChanged)
             | (Self::Ndl, AppFact::Registered { .. }) => Role::Changes,
         }
     }
@@ -72,7 +72,6 @@ impl Reader {
 const fn about(fact: &AppFact) -> Option<AppAddress> {
     match fact {
         AppFact::Registered { app, .. }
-        | AppFact::Guest { app, .. }
         | AppFact::Handles { app, .. }
         | AppFact::Ready { app }
         | AppFact::Down { app }
@@ -89,7 +88,6 @@ const fn is_out_of_date(former: &AppFact, later: &AppFact) -> bool {
             matches!(former, AppFact::Ready { .. } | AppFact::Down { .. } | AppFact::Stopped { .. })
         }
         AppFact::Ready { .. } => matches!(former, AppFact::Ready { .. }),
-        AppFact::Guest { .. } => matches!(former, AppFact::Guest { .. }),
         AppFact::Handles { .. } => matches!(former, AppFact::Handles { .. }),
         AppFact::GroupsChanged => matches!(former, AppFact::GroupsChanged),
         AppFact::Registered { .. } | AppFact::Unregistered { .. } => false,

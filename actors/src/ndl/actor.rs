@@ -248,10 +248,10 @@ impl Shell {
                 self.send(to, node, correlation, Body::Answer(answer));
             }
             Output::SendLeave { to, node } => self.send(to, node, 0, Body::Leave(self.me())),
-            Output::Probe { node, incarnation, to, within } => {
+            Output::Probe { node, incarnation, to, within, asked } => {
                 self.stores.gncl.ask_for_a_sign(self.stores.node, node, incarnation);
                 // Where too many are silent at once it is not their hosts that are to be doubted.
-                let _ = self.to_probe.try_send(Probe { node, incarnation, to, within });
+                let _ = self.to_probe.try_send(Probe { node, incarnation, to, within, asked });
             }
             Output::AskForSign { node, incarnation } => {
                 self.stores.gncl.ask_for_a_sign(self.stores.node, node, incarnation);
@@ -404,8 +404,8 @@ async fn try_hosts(shell: Rc<Shell>, mut asked: mpsc::Receiver<Probe>) {
     loop {
         tokio::select! {
             Some(probe) = asked.recv(), if under_way.len() < PROBES_MAX => under_way.push(probe.carry_out()),
-            Some((node, incarnation, host)) = under_way.next() => {
-                if !shell.feed(|core, now| core.handle(now, Input::Probed { node, incarnation, host })) {
+            Some(probed) = under_way.next() => {
+                if !shell.feed(|core, now| core.handle(now, probed)) {
                     return;
                 }
             }

@@ -10,10 +10,13 @@ use std::{
 };
 
 use futures_util::{StreamExt as _, stream};
-use sinew_runtime::tid::{Incarnation, NodeAddress};
+use sinew_runtime::{
+    tid::{Incarnation, NodeAddress},
+    time::Time,
+};
 use tokio::{net::TcpStream, time::timeout};
 
-use super::core::Host;
+use super::core::{Host, Input};
 
 /// Hosts that are tried at once, at most, so that a cut network costs few descriptors. Whose host is not tried counts as out of reach with
 /// it, as all the others are then.
@@ -28,16 +31,20 @@ pub(super) struct Probe {
     pub(super) incarnation: Incarnation,
     pub(super) to: Vec<SocketAddr>,
     pub(super) within: Duration,
+    /// When that was to be known.
+    pub(super) asked: Time,
 }
 
 impl Probe {
     /// Tries the addresses, the first ones at once; what the host said is known in time, whatever it is. It refuses only if it does so at
     /// each of them.
-    pub(super) async fn carry_out(self) -> (NodeAddress, Incarnation, Host) {
-        self.carry_out_with(TcpStream::connect).await
+    pub(super) async fn carry_out(self) -> Input {
+        let host = self.said_by(TcpStream::connect).await;
+        let Self { node, incarnation, asked, .. } = self;
+        Input::Probed { node, incarnation, host, asked }
     }
 
-    async fn carry_out_with<T>(self, connect: impl Fn(SocketAddr) -> T) -> (NodeAddress, Incarnation, Host)
+    async fn said_by<T>(&self, connect: impl Fn(SocketAddr) -> T) -> Host
     where
         T: Future<Output = io::Result<TcpStream>>,
     {
@@ -58,8 +65,7 @@ impl Probe {
             }
         };
         let has_ended = timeout(self.within, all).await;
-        let host = Host::by(said.into_iter().chain(has_ended.err().map(|_| Host::IsSilent)));
-        (self.node, self.incarnation, host)
+        Host::by(said.into_iter().chain(has_ended.err().map(|_| Host::IsSilent)))
     }
 }
 
@@ -73,12 +79,12 @@ mod tests {
     use super::*;
 
     fn of(to: Vec<SocketAddr>, within: Duration) -> Probe {
-        Probe { node: NodeAddress::new(1), incarnation: Incarnation(1), to, within }
+        Probe { node: NodeAddress::new(1), incarnation: Incarnation(1), to, within, asked: Time::ZERO }
     }
 
     fn probe(to: Vec<SocketAddr>) -> Host {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-        runtime.block_on(of(to, Duration::from_secs(5)).carry_out()).2
+        runtime.block_on(of(to, Duration::from_secs(5)).said_by(TcpStream::connect))
     }
 
     #[tokio::test]
@@ -94,7 +100,7 @@ mod tests {
                 std::future::pending().await
             }
         };
-        let host = of(to, Duration::ZERO).carry_out_with(connect).await.2;
+        let host = of(to, Duration::ZERO).said_by(connect).await;
         assert_eq!(host, Host::IsSilent);
         assert!(tried.into_inner().into_iter().eq(1..=9));
     }
@@ -109,7 +115,7 @@ mod tests {
             let (is_first, second) = (at == to[0], second());
             async move { if is_first { Err(ErrorKind::ConnectionRefused.into()) } else { second.await } }
         };
-        of(to.clone(), Duration::ZERO).carry_out_with(connect).await.2
+        of(to.clone(), Duration::ZERO).said_by(connect).await
     }
 
     // spec: NDL-4.6

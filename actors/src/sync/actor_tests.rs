@@ -28,8 +28,13 @@ use super::{
     words::{ArriveAtBarrier, BarrierAnswer, BarrierKind, LeaveBarrier, OnPartyLoss},
 };
 use crate::{
-    access::Access, config::NodeConfig, gncl::LinkFact, lncl::AppFact, monitors, node::RootEvent,
-    stores::Stores,
+    access::Access,
+    config::NodeConfig,
+    gncl::LinkFact,
+    lncl::{AppFact, OF_USER_AT_SYNC},
+    monitors,
+    node::RootEvent,
+    stores::{POST_CAPACITY, Stores},
 };
 
 const HERE: NodeAddress = NodeAddress::new(0x7f00_0001);
@@ -75,7 +80,7 @@ impl Bench {
 
     fn registers_gait(&self) {
         let requires = vec!["knee.drive".to_owned()];
-        self.tells(Event::App(AppFact::Registered { app: GAIT, name: Some("gait".to_owned()), requires }));
+        self.tells(Event::App(AppFact::own_registered(GAIT, Some("gait".to_owned()), requires)));
     }
 
     /// The knee is linked; what is sent to it can be read.
@@ -192,7 +197,7 @@ fn a_manager_that_stood_still_reads_that_a_link_is_back_before_it_tells_of_a_los
         // given: the link is broken, and the manager gets no processor for longer than it would wait for that
         bench.tells(Event::Link(LinkFact::LinkBroken { node: KNEE, incarnation: LIFE }));
         let second = AppAddress::new(0x1001);
-        bench.tells(Event::App(AppFact::Registered { app: second, name: None, requires: Vec::new() }));
+        bench.tells(Event::App(AppFact::own_registered(second, None, Vec::new())));
         assert_eq!(bench.released().await, second);
         std::thread::sleep(Duration::from_millis(100));
         // when: groups have changed, and behind that the link is back
@@ -201,7 +206,7 @@ fn a_manager_that_stood_still_reads_that_a_link_is_back_before_it_tells_of_a_los
         bench.knee_says(1, true);
         // then: all that is read, and the next that is told is a true loss
         let third = AppAddress::new(0x1002);
-        bench.tells(Event::App(AppFact::Registered { app: third, name: None, requires: Vec::new() }));
+        bench.tells(Event::App(AppFact::own_registered(third, None, Vec::new())));
         assert_eq!(bench.released().await, third);
         assert!(futures_util::poll!(inbox.next()).is_pending(), "nobody was lost");
     });
@@ -224,7 +229,7 @@ fn an_event_that_a_full_mailbox_did_not_take_comes_when_there_is_room() {
         bench.knee_says(2, false);
         // The second application is released after the refused event was dealt with: events are handled in order.
         let second = AppAddress::new(0x1001);
-        bench.tells(Event::App(AppFact::Registered { app: second, name: None, requires: Vec::new() }));
+        bench.tells(Event::App(AppFact::own_registered(second, None, Vec::new())));
         assert_eq!(bench.released().await, second);
         assert_eq!(mailbox.refused(), 1);
 
@@ -257,7 +262,7 @@ fn an_answer_about_a_barrier_that_a_full_mailbox_did_not_take_comes_when_there_i
         bench.stores.router.deliver(arrival).unwrap();
         // The second application is released after the refused answer was dealt with: events are handled in order.
         let second = AppAddress::new(0x1001);
-        bench.tells(Event::App(AppFact::Registered { app: second, name: None, requires: Vec::new() }));
+        bench.tells(Event::App(AppFact::own_registered(second, None, Vec::new())));
         assert_eq!(bench.released().await, second);
         assert!(mailbox.refused() > 0);
 
@@ -352,7 +357,7 @@ fn an_arrival_that_the_successor_of_a_failed_manager_is_handed_again_counts_once
         bench.stores.router.set_local(drive, LocalRoute { outlet: Arc::new(Mine), events: no_events() });
         for (app, name) in [(GAIT, "gait"), (drive, "drive")] {
             let name = Some(name.to_owned());
-            bench.tells(Event::App(AppFact::Registered { app, name, requires: Vec::new() }));
+            bench.tells(Event::App(AppFact::own_registered(app, name, Vec::new())));
             bench.released().await;
         }
         bench.stores.router.deliver(arrival(GAIT, 7)).unwrap();
@@ -369,7 +374,7 @@ fn an_arrival_that_the_successor_of_a_failed_manager_is_handed_again_counts_once
         assert_eq!(answer.header.correlation, 9);
         assert!(matches!(answer.decode().unwrap(), BarrierAnswer::Opened { generation: 1 }));
         let third = AppAddress::new(0x1002);
-        bench.tells(Event::App(AppFact::Registered { app: third, name: None, requires: Vec::new() }));
+        bench.tells(Event::App(AppFact::own_registered(third, None, Vec::new())));
         assert_eq!(bench.released().await, third, "all events before it were handled");
         let core = bench.stores.sync.lock().unwrap_or_else(PoisonError::into_inner);
         assert_eq!(core.barriers(Time::now()), [], "nobody waits for the next round");
@@ -410,7 +415,7 @@ fn what_is_no_directory_of_another_sync_manager_is_refused() {
             bench.stores.router.deliver(message).unwrap();
         }
         // Released after all of them were handled.
-        bench.tells(Event::App(AppFact::Registered { app: GAIT, name: None, requires: Vec::new() }));
+        bench.tells(Event::App(AppFact::own_registered(GAIT, None, Vec::new())));
         assert_eq!(bench.released().await, GAIT);
         let forged = Outcome::Rejected(Rejection::ForgedSource);
         let expected = [Outcome::Rejected(Rejection::UnknownKind), forged, forged, Outcome::Delivered];
@@ -426,7 +431,7 @@ fn a_cycle_is_told_to_the_root() {
         for (index, own, required) in [(0x1000, "a", "b"), (0x1001, "b", "a")] {
             let app = AppAddress::new(index);
             let requires = vec![required.to_owned()];
-            bench.tells(Event::App(AppFact::Registered { app, name: name(own), requires }));
+            bench.tells(Event::App(AppFact::own_registered(app, name(own), requires)));
         }
         match within("the cycle", bench.root.next()).await {
             Some(RootEvent::RequirementCycle { names }) => assert_eq!(names, ["a", "b", "a"]),
@@ -514,5 +519,104 @@ fn what_says_nothing_new_of_the_directory_wakes_nobody_who_has_a_copy_of_it() {
             tokio::task::yield_now().await;
         }
         assert!(*changes.borrow() > before);
+    });
+}
+
+/// An application of a guest, and two users who are guests.
+const GUEST: AppAddress = AppAddress::new(0x8000_0000);
+const USERS: [u32; 2] = [1_001, 1_002];
+
+impl Bench {
+    /// An application of this user arrives, by way of LNCL, as often as that is taken; and how often it was.
+    fn guest_fills(&self, uid: u32) -> usize {
+        let sends = |correlation| {
+            let admitted = self.stores.shares_of_guests.admit(HERE, uid, arrival(GUEST, correlation));
+            admitted.is_ok_and(|message| self.stores.router.send(message).is_ok())
+        };
+        (1..=POST_CAPACITY as u64).take_while(|correlation| sends(*correlation)).count()
+    }
+
+    /// The manager has read all that waits.
+    async fn reads_all(&self) {
+        let read = async {
+            while !self.stores.posts.sync.is_empty() {
+                tokio::task::yield_now().await;
+            }
+        };
+        within("all is read", read).await;
+    }
+}
+
+#[test]
+fn the_robots_own_arrivals_are_taken_where_guests_have_sent_all_that_they_may() {
+    run(async {
+        // Given: it comes to none of them, as this has its thread
+        let bench = Bench::new().await;
+        // When
+        assert_eq!(USERS.map(|uid| bench.guest_fills(uid)), [OF_USER_AT_SYNC; 2]);
+        assert_eq!(bench.guest_fills(1_003), 0, "two have all that guests may have");
+        // Then: of the robot's own as many as ever, and as many of other nodes
+        assert_eq!(bench.stores.posts.sync.len(), 2 * OF_USER_AT_SYNC);
+        let knee = || directory(Tid::new(KNEE, AppAddress::SYNC), Bytes::new());
+        for correlation in (2 * OF_USER_AT_SYNC..POST_CAPACITY / 2).step_by(2) {
+            bench.stores.router.send(arrival(GAIT, correlation as u64)).unwrap();
+            bench.stores.router.deliver(knee()).unwrap();
+        }
+    });
+}
+
+#[test]
+fn what_a_guest_sends_has_room_again_when_the_manager_has_read_what_it_sent_before() {
+    run(async {
+        let bench = Bench::new().await;
+        for _ in 0..2 {
+            assert_eq!(bench.guest_fills(USERS[0]), OF_USER_AT_SYNC);
+            bench.reads_all().await;
+        }
+    });
+}
+
+#[test]
+fn a_manager_that_fails_with_a_guests_message_in_hand_costs_that_guest_no_room_nor_does_its_successor() {
+    run(async {
+        // Given: a manager that fails when it answers the guest's first message
+        let bench = Bench::new().await;
+        let route = LocalRoute { outlet: Arc::new(Mine), events: Arc::new([]) };
+        bench.stores.router.set_local(GUEST, route);
+        assert_eq!(bench.guest_fills(USERS[0]), OF_USER_AT_SYNC);
+        let fails = async {
+            while bench.stores.posts.sync.len() == OF_USER_AT_SYNC {
+                tokio::task::yield_now().await;
+            }
+        };
+        within("the first message is read", fails).await;
+        assert_eq!(
+            bench.stores.posts.sync.len(),
+            OF_USER_AT_SYNC - 1,
+            "the others wait for the next manager"
+        );
+        assert_eq!(bench.guest_fills(USERS[0]), 1, "the one that was in its hand waits no more");
+        // When
+        bench.stores.router.remove_local(GUEST);
+        bench.start_manager().await;
+        bench.reads_all().await;
+        // Then
+        assert_eq!(bench.guest_fills(USERS[0]), OF_USER_AT_SYNC);
+    });
+}
+
+#[test]
+fn what_is_not_taken_of_a_guest_or_waits_where_nobody_reads_any_more_leaves_it_its_room() {
+    run(async {
+        // Given
+        let bench = Bench::new().await;
+        assert_eq!(bench.guest_fills(USERS[0]), OF_USER_AT_SYNC);
+        // When
+        drop(bench.stores.posts.sync.close());
+        // Then: all that waited there has gone, and what is refused there takes no room
+        assert_eq!([(); 2].map(|()| bench.guest_fills(USERS[0])), [0; 2]);
+        let admit = |number| bench.stores.shares_of_guests.admit(HERE, USERS[0], arrival(GUEST, number)).ok();
+        let held: Vec<_> = (1..=1_000).map_while(admit).collect();
+        assert_eq!(held.len(), OF_USER_AT_SYNC);
     });
 }

@@ -34,8 +34,8 @@
  *   Endpoints do not survive exec.
  * Protected.  Commands that move something: sinew_send_protected seals them, and sinew_guard_output lets only good ones through to an
  *   output, which is made safe when they are not, or do not come; sinew_arm makes it live, and nothing else does. The same bytes and
- *   rules as in Rust (docs/protocol/protected.md). The functions that a guard calls may call nothing of a guard but sinew_trip, and
- *   no sinew_receive_message of an endpoint with protected payloads (SINEW_ERROR_BUSY). A guard knows a payload's length, and not whether you can
+ *   rules as in Rust (docs/protocol/protected.md). The functions that a guard calls may call nothing of a guard but sinew_trip and
+ *   sinew_release_later, and no sinew_receive_message of an endpoint with protected payloads (SINEW_ERROR_BUSY). A guard knows a payload's length, and not whether you can
  *   read it: who cannot calls sinew_trip. An output is not called safe while what makes it safe fails (SINEW_ERROR_SAFE_FAILS). Release guards before their outputs, and before the end of main. A child of fork has no guards of its parent's, and
  *   none of its own where the parent had some, or tried to make one (SINEW_ERROR_FORKED): its outputs are not made safe there.
  * Log.  What no status tells (a link that was not made, no shared memory) is a line on the standard error, warnings and
@@ -788,7 +788,8 @@ typedef struct sinew_stamp {
 /**
  * Makes an output safe, and returns 0; anything else says that it could not, and it is called again each millisecond. Any thread calls it, mostly one of
  * the library's own: it must be short and wait for nobody, as the outputs of all guards wait for it. It must return, by no exception and no `longjmp`, and
- * may call nothing of a guard but `sinew_trip`, and no `sinew_receive_message` of an endpoint that sends or receives protected payloads: `SINEW_ERROR_BUSY`.
+ * may call nothing of a guard but `sinew_trip` and `sinew_release_later`, and no `sinew_receive_message` of an endpoint that sends or receives protected
+ * payloads: `SINEW_ERROR_BUSY`.
  */
 typedef int32_t (*sinew_make_safe)(void *output, sinew_output_state why);
 
@@ -1226,6 +1227,13 @@ sinew_status sinew_guard_tally(struct sinew_guard *guard, struct sinew_tally *ta
  * has the output in hand. Any thread.
  */
 sinew_status sinew_release(struct sinew_guard **guard);
+
+/**
+ * The same for where a guard calls the program, which may not wait: makes the output safe as `sinew_trip`, and lets go of it when nobody has it in hand
+ * any more, at the latest with the next guard that is made, which waits for that. `*guard` is NULL then, and no call knows it any more. Nobody says when
+ * the library calls nothing of it any more: `output` and what makes it safe must be there until the end of the process. Does not block. Any thread.
+ */
+sinew_status sinew_release_later(struct sinew_guard **guard);
 
 /**
  * A text for an output's state, one of `sinew_output_state`. Never NULL. Any thread.

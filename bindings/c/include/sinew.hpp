@@ -220,7 +220,8 @@ template <class T> sinew_protected_type protected_type(std::string_view name, du
 }
 
 /// The only way to an output: see sinew_guard_output. At its end the output is made safe. Where that fails it is tried on, and the guard's place is free as
-/// soon as it is safe; the output's memory is left to that, and what it refers to must stay. While making safe fails, state and apply throw
+/// soon as it is safe; the output's memory is left to that, and what it refers to must stay. The same holds where a guard ends in a function that a guard
+/// calls, be it its own: it is let go of as soon as nobody has its output in hand. While making safe fails, state and apply throw
 /// SINEW_ERROR_SAFE_FAILS. Any thread may use it.
 template <class Output> class guard {
 public:
@@ -282,8 +283,9 @@ private:
     {
         if (raw_ == nullptr || sinew_release(&raw_) == SINEW_OK)
             return;
-        (void)sinew_trip(raw_); // Where a guard has called the program, it may do no more.
-        (void)held_.release(); // It is tried on until it is safe, and must be there for that.
+        // Where a guard has called the program, maybe this one, or where it is not safe: the library does the rest, and what it calls must be there for that.
+        (void)sinew_release_later(&raw_);
+        (void)held_.release();
         raw_ = nullptr;
     }
     static std::int32_t run_safe(void *held, sinew_output_state why)

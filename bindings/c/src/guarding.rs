@@ -175,17 +175,15 @@ pub extern "C" fn sinew_guard_tally(
 /// has the output in hand. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_release(guard: *mut *mut OutputGuard) -> Status {
-    call(|| {
-        if guard.is_null() {
-            return Err(Fault::plain(Status::SinewErrorNoSuchGuard));
-        }
-        // SAFETY: not NULL; the header asks of the caller that there is one. It is not borrowed: what makes the output safe may look at it.
-        let held = unsafe { guard.read() };
-        guards::release(held.addr())?;
-        // SAFETY: as above.
-        unsafe { guard.write(std::ptr::null_mut()) };
-        Ok(Status::SinewOk)
-    })
+    call(|| let_go(guard, guards::release))
+}
+
+/// The same for where a guard calls the program, which may not wait: makes the output safe as `sinew_trip`, and lets go of it as soon as nobody has it in
+/// hand any more and it is safe. `*guard` is NULL then, and no call knows it any more. Nobody says when the library calls nothing of it any more: `output`
+/// and what makes it safe must be there until the end of the process. Does not block. Any thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_release_later(guard: *mut *mut OutputGuard) -> Status {
+    call(|| let_go(guard, guards::release_later))
 }
 
 /// A text for an output's state, one of `sinew_output_state`. Never NULL. Any thread.
@@ -214,4 +212,20 @@ fn hand_out(
     let status = write(guard, std::ptr::without_provenance_mut(handle));
     found.check()?;
     Ok(status)
+}
+
+/// Takes a guard out of a program's pointer to it, if that is how it ends.
+fn let_go(
+    guard: *mut *mut OutputGuard,
+    release: impl FnOnce(usize) -> Result<(), Fault>,
+) -> Result<Status, Fault> {
+    if guard.is_null() {
+        return Err(Fault::plain(Status::SinewErrorNoSuchGuard));
+    }
+    // SAFETY: not NULL; the header asks of the caller that there is one. It is not borrowed: what makes the output safe may look at it.
+    let held = unsafe { guard.read() };
+    release(held.addr())?;
+    // SAFETY: as above.
+    unsafe { guard.write(std::ptr::null_mut()) };
+    Ok(Status::SinewOk)
 }

@@ -164,7 +164,8 @@ pub struct OutputGuard {
 
 /// Makes an output safe, and returns 0; anything else says that it could not, and it is called again each millisecond. Any thread calls it, mostly one of
 /// the library's own: it must be short and wait for nobody, as the outputs of all guards wait for it. It must return, by no exception and no `longjmp`, and
-/// may call nothing of a guard but `sinew_trip`, and no `sinew_receive_message` of an endpoint that sends or receives protected payloads: `SINEW_ERROR_BUSY`.
+/// may call nothing of a guard but `sinew_trip` and `sinew_release_later`, and no `sinew_receive_message` of an endpoint that sends or receives protected
+/// payloads: `SINEW_ERROR_BUSY`.
 pub type MakeSafe = Option<unsafe extern "C" fn(output: *mut c_void, why: OutputState) -> i32>;
 
 /// Moves an output that is live; what makes it safe waits meanwhile. It must return as `sinew_make_safe`, and soon, and may call as little.

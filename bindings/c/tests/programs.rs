@@ -8,7 +8,7 @@ use std::{
     time::Duration,
 };
 
-use ground::{C, CPP, CPP20, Ground, WATCHDOG, is_there};
+use ground::{C, CPP, CPP20, Ground, WATCHDOG, endpoint, is_there};
 use rustix::{io::ioctl_fionbio, process::Signal};
 use serde::{Deserialize, Serialize};
 use sinew::{Barrier, Endpoint, Kind, NodeApi, Outcome, Payload, Registration, RequirementEvent, Tid};
@@ -31,11 +31,6 @@ const VALGRIND: [&str; 5] = [
     "--errors-for-leak-kinds=definite,indirect",
     "--error-exitcode=99",
 ];
-
-fn endpoint(ground: &Ground, registration: Registration) -> Endpoint {
-    let node = NodeApi::connect(ground.socket()).expect("the node is up");
-    node.register_transport_address(registration.deadline(WATCHDOG)).expect("nothing is in the way")
-}
 
 fn resolve(endpoint: &mut Endpoint, name: &str) -> Tid {
     endpoint.resolve(name, WATCHDOG).expect("the node answers").expect("it is registered")
@@ -285,9 +280,7 @@ fn what_c_does_wrong_is_refused_in_words() {
         return;
     }
     let ground = Ground::new();
-    let mut misuse = ground.start(&C.shared("tests/programs/misuse.c", &ground), &[]);
-    misuse.wait_for(&["all refused"]);
-    assert_eq!(misuse.wait_for_end(), Some(0));
+    ground.run(&C.shared("tests/programs/misuse.c", &ground), "all refused");
 }
 
 #[test]
@@ -296,9 +289,7 @@ fn the_wrapper_in_cpp_settles_at_the_end_of_a_scope_and_throws_errors() {
         return;
     }
     let ground = Ground::new();
-    let mut wrapper = ground.start(&CPP.shared("tests/programs/wrapper.cpp", &ground), &[]);
-    wrapper.wait_for(&["all well"]);
-    assert_eq!(wrapper.wait_for_end(), Some(0));
+    ground.run(&CPP.shared("tests/programs/wrapper.cpp", &ground), "all well");
 }
 
 #[test]

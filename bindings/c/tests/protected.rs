@@ -9,9 +9,9 @@ use std::{
     time::{Duration, Instant},
 };
 
-use ground::{C, Ground, WATCHDOG, is_there};
+use ground::{C, Ground, WATCHDOG, endpoint, is_there};
 use serde::{Deserialize, Serialize};
-use sinew::{Endpoint, Kind, NodeApi, Payload, Registration, Tid, protection::Protection};
+use sinew::{Endpoint, Kind, Payload, Registration, Tid, protection::Protection};
 
 /// As in `examples/commands.c`: its map, written by hand there.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
@@ -25,12 +25,6 @@ impl Payload for Torque {
 }
 
 const SOON: Duration = Duration::from_millis(20);
-
-fn endpoint(ground: &Ground, name: &str) -> Endpoint {
-    let node = NodeApi::connect(ground.socket()).expect("the node is up");
-    let registration = Registration::new().name(name).deadline(WATCHDOG);
-    node.register_transport_address(registration).expect("nothing is in the way")
-}
 
 /// The TID of a program that comes soon.
 fn await_name(endpoint: &mut Endpoint, name: &str) -> Tid {
@@ -50,9 +44,7 @@ fn each_error_makes_an_output_safe_until_it_is_armed_again() {
         return;
     }
     let ground = Ground::new();
-    let mut program = ground.start(&C.shared("tests/programs/protected.c", &ground), &[]);
-    program.wait_for(&["all well"]);
-    assert_eq!(program.wait_for_end(), Some(0));
+    ground.run(&C.shared("tests/programs/protected.c", &ground), "all well");
 }
 
 #[test]
@@ -76,7 +68,7 @@ fn a_guard_in_rust_lets_through_what_c_has_sealed() {
         return;
     }
     let ground = Ground::new();
-    let mut drive = endpoint(&ground, "knee.drive");
+    let mut drive = endpoint(&ground, Registration::new().name("knee.drive"));
     let _control = ground.start(&C.shared("examples/commands.c", &ground), &["control", "100000"]);
     let source = await_name(&mut drive, "knee.control");
     let guard = drive.guard::<Torque, _>(source, 0.0_f32, |torque, _| *torque = 0.0).expect("a thread");
@@ -102,7 +94,7 @@ fn a_guard_in_c_lets_through_what_rust_has_sealed_and_not_what_it_has_not() {
         return;
     }
     let ground = Ground::new();
-    let mut control = endpoint(&ground, "knee.control");
+    let mut control = endpoint(&ground, Registration::new().name("knee.control"));
     let mut drive = ground.start(&C.shared("examples/commands.c", &ground), &["drive"]);
     let to = await_name(&mut control, "knee.drive");
     let (has_moved, is_over) = (AtomicBool::new(false), AtomicBool::new(false));
@@ -145,7 +137,7 @@ fn a_drive_in_c_that_cannot_read_a_good_command_makes_its_output_safe() {
         return;
     }
     let ground = Ground::new();
-    let mut control = endpoint(&ground, "knee.control");
+    let mut control = endpoint(&ground, Registration::new().name("knee.control"));
     let mut drive = ground.start(&C.shared("examples/commands.c", &ground), &["drive"]);
     let to = await_name(&mut control, "knee.drive");
     let is_over = AtomicBool::new(false);

@@ -44,8 +44,6 @@ struct Inner<O> {
     output: O,
     safe: MakeSafe<O>,
     owes: Option<Owed>,
-    /// It was released while that was owed: when it is paid, nobody has it any more.
-    is_to_go: bool,
     /// What is to be said when nobody has the output in hand any more.
     said: Option<Said>,
 }
@@ -129,15 +127,7 @@ impl<O: Send + 'static> Guard<O> {
         }
         let codename = Codename { source, destination, name: protected.name };
         let receiver = Receiver::new(protected.protection);
-        let mut inner = Inner {
-            codename,
-            receiver,
-            output,
-            safe: Box::new(safe),
-            owes: None,
-            is_to_go: false,
-            said: None,
-        };
+        let mut inner = Inner { codename, receiver, output, safe: Box::new(safe), owes: None, said: None };
         inner.make_safe(Cause::NotArmed, Time::now());
         inner.said.take().into_iter().for_each(Said::log);
         let watch = Watch::new(inner.deadline(), inner.owes.is_some());
@@ -234,15 +224,21 @@ impl<O: Send + 'static> Guard<O> {
             if self.is_released() {
                 return Released::Before;
             }
+            shared.watch.is_to_go.store(true, Ordering::Release);
             shared.pay(inner, Time::now());
             shared.decide_locked(inner, |receiver, _| receiver.trip(Cause::Dropped));
-            if inner.owes.is_some() {
-                inner.is_to_go = true;
-                return Released::NotSafe;
-            }
-            shared.watch.is_orphan.store(true, Ordering::Release);
-            Released::Now
+            if self.is_released() { Released::Now } else { Released::NotSafe }
         })
+    }
+
+    /// The same for who may not wait, as he has an output in hand: trips the guard, which is released at once or, while somebody has its output in
+    /// hand, as soon as nobody has, and the output is safe.
+    #[doc(hidden)]
+    pub fn release_later(&self) {
+        let shared = self.shared();
+        // SYNC: before the trip. Who makes the output live between the two finds it tripped, and who does so behind it that it is released.
+        shared.watch.is_to_go.store(true, Ordering::Release);
+        shared.trip();
     }
 
     /// Whether the output was to be made safe, and that has failed until now.
@@ -316,7 +312,13 @@ impl<O> Shared<O> {
     fn pay(&self, inner: &mut Inner<O>, now: Time) {
         let Some(Owed { cause, .. }) = inner.owes else { return };
         inner.make_safe(cause, now);
-        if inner.owes.is_none() && inner.is_to_go {
+        self.let_go(inner);
+    }
+
+    /// Whoever is to go goes when it is safe.
+    fn let_go(&self, inner: &Inner<O>) {
+        let is_safe = inner.owes.is_none() && inner.receiver.state() != State::Live;
+        if is_safe && self.watch.is_to_go.load(Ordering::Acquire) {
             self.watch.is_orphan.store(true, Ordering::Release);
         }
     }
@@ -337,6 +339,7 @@ impl<O> Shared<O> {
             // The thread sleeps until the deadline that was, if there was any.
             rouse();
         }
+        self.let_go(inner);
         decided
     }
 }
@@ -459,8 +462,7 @@ mod tests {
         let codename = Codename { source: tid(1), destination: tid(2), name: "test.torque" };
         let receiver = Receiver::new(Protection::of_period(SAFE_RETRY));
         let safe = Box::new(|(): &mut (), _| panic!("a planted panic"));
-        let mut inner =
-            Inner { codename, receiver, output: (), safe, owes: None, is_to_go: false, said: None };
+        let mut inner = Inner { codename, receiver, output: (), safe, owes: None, said: None };
         let begun = Time::from_nanos(1_000_000_000);
         inner.make_safe(Cause::Tripped, begun);
         let due = (begun + SAFE_RETRY).as_nanos();

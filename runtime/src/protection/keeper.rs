@@ -39,6 +39,8 @@ pub(super) struct Watch {
     pub(super) deadline: AtomicU64,
     /// Somebody trips the output who could not wait for it.
     pub(super) is_tripped: AtomicBool,
+    /// Somebody has let go of the output: it is an orphan as soon as it is safe.
+    pub(super) is_to_go: AtomicBool,
     /// Nobody has the guard any more.
     pub(super) is_orphan: AtomicBool,
     /// The output was to be made safe, and that has failed.
@@ -50,6 +52,7 @@ impl Watch {
         Self {
             deadline: AtomicU64::new(deadline),
             is_tripped: AtomicBool::new(false),
+            is_to_go: AtomicBool::new(false),
             is_orphan: AtomicBool::new(false),
             owes: AtomicBool::new(owes),
         }

@@ -3,10 +3,12 @@
 use std::{thread, time::Duration};
 
 use super::{
-    ApiError, AppAddress, Kind, Outcome, TORQUE, TestNode, Tid, Time, Torque, Transport, WATCHDOG,
+    ApiError, AppAddress, Kind, NodeApi, Outcome, Registration, Rejection, TORQUE, TestNode, Tid, Time,
+    Torque, Transport, WATCHDOG,
     forms::{self, Client, Form, Under},
     on, register,
 };
+use crate::api::link::Ended;
 
 on_every_transport! {
     an_endpoint_comes_back_to_its_name_its_address_and_its_groups
@@ -64,6 +66,78 @@ fn an_endpoint_comes_back_to_its_name_its_address_and_its_groups(under: Under) {
         let received = client.receive(WATCHDOG).unwrap().expect("what was sent to the group");
         assert_eq!(received.destination(), Tid::group("drives"));
     }
+}
+
+/// A node with a list by which its own user joins these groups alone.
+fn list_of_groups(groups: &str) -> String {
+    let uid = rustix::process::geteuid().as_raw();
+    format!("[[client]]\nuid = {uid}\ngroups = [{groups}]\n[[rule]]\nfrom = ['*']\nto = ['*']\n")
+}
+
+#[test]
+fn who_comes_back_and_may_not_join_a_group_any_more_hears_it_and_is_in_the_others() {
+    // Given: an endpoint in two groups, and a list that does not name one of them any more
+    let node = TestNode::start_guarded(&list_of_groups("'drives', 'lamps'"));
+    let api = NodeApi::connect(node.path()).unwrap();
+    let mut endpoint = api.register_transport_address(Registration::new().deadline(WATCHDOG)).unwrap();
+    ["drives", "lamps"].into_iter().for_each(|name| endpoint.join(name).unwrap());
+    node.stores.access.get().expect("it has a list").replace_in_test(&list_of_groups("'drives'"));
+    // When: it comes back
+    endpoint.writer.close();
+    endpoint.end(Ended { why: "a test ends it".to_owned(), again: true });
+    let deadline = Time::now() + WATCHDOG;
+    while endpoint.registrations() == 1 || !endpoint.home.rejoining.is_empty() {
+        assert!(Time::now() < deadline, "waited for what becomes of its groups");
+        // It is told once that it is away.
+        let _ = endpoint.receive(Duration::from_millis(10));
+    }
+    // Then
+    assert_eq!(node.refused("membership"), 1);
+    assert_eq!(endpoint.home.groups.len(), 2, "it asks again when it comes back the next time");
+    assert!(node.stores.router.is_member(AppAddress::group("drives"), endpoint.tid().app));
+    let refused = endpoint.join("lamps");
+    assert!(matches!(refused, Err(ApiError::Ended(Outcome::Rejected(Rejection::NotAllowed)))), "{refused:?}");
+}
+
+#[test]
+fn who_comes_back_to_more_groups_than_it_asks_about_is_in_all_of_them() {
+    // Given: rings and a mailbox that hold few answers
+    let mut node = TestNode::start_with(|config| {
+        config.lncl.ring_bytes = 4_096;
+        config.mailbox_capacity = 1;
+    });
+    let api = NodeApi::connect(node.path()).unwrap();
+    let mut endpoint = api.register_transport_address(Registration::new().deadline(WATCHDOG)).unwrap();
+    (0..256).for_each(|number| endpoint.join(&number.to_string()).unwrap());
+    // When
+    node.restart();
+    let deadline = Time::now() + WATCHDOG;
+    while endpoint.registrations() == 1 || !endpoint.home.rejoining.is_empty() {
+        assert!(Time::now() < deadline, "waited for what becomes of its groups");
+        // It is told once that it is away.
+        let _ = endpoint.receive(Duration::from_millis(10));
+    }
+    // Then
+    assert_eq!((endpoint.registrations(), node.stores.router.memberships()), (2, 256));
+}
+
+#[test]
+fn who_comes_back_and_only_sends_takes_what_becomes_of_its_groups_so_that_the_node_reads_on() {
+    // Given: a node that reads nothing more of who leaves one answer lying
+    let mut node = TestNode::start_with(|config| config.mailbox_capacity = 1);
+    let api = NodeApi::connect(node.path()).unwrap();
+    let mut endpoint = api.register_transport_address(Registration::new().deadline(WATCHDOG)).unwrap();
+    (0..20).for_each(|number| endpoint.join(&number.to_string()).unwrap());
+    // When
+    node.restart();
+    let deadline = Time::now() + WATCHDOG;
+    while endpoint.registrations() == 1 || !endpoint.home.rejoining.is_empty() {
+        assert!(Time::now() < deadline, "waited for what becomes of its groups");
+        // It fails while the node is away.
+        let _ = endpoint.send(Tid::group("drives"), &TORQUE);
+    }
+    // Then
+    assert_eq!((endpoint.registrations(), node.stores.router.memberships()), (2, 20));
 }
 
 fn meanwhile_it_says_once_that_it_is_away_and_each_send_says_it_was_not_sent(under: Under) {

@@ -371,14 +371,21 @@ impl Core {
         self.outputs.push_back(Output::Refuse(connection, refusal));
         // Whom we dialled is among them now: a peer whose addresses change without end must not hold more than there are places.
         if self.strangers().count() > self.settings.strangers_max {
-            self.close_oldest_refused();
+            self.make_room_for_refused(now, connection);
         }
     }
 
-    fn close_oldest_refused(&mut self) {
-        let oldest = self.connections.iter().find(|(_, known)| known.stage == Stage::Leaving);
-        let Some(connection) = oldest.map(|(connection, _)| *connection) else { return };
-        self.count("too many strangers", "the oldest one that was refused was closed".to_owned());
+    /// Of the others that were refused the one goes that began first. Where there is none, a stranger does that has said nothing.
+    fn make_room_for_refused(&mut self, now: Time, refused: ConnectionId) {
+        let mut others = self.connections.iter().filter(|(connection, _)| **connection != refused);
+        let oldest =
+            others.find(|(_, known)| known.stage == Stage::Leaving).map(|(connection, _)| *connection);
+        let goes = match oldest {
+            Some(oldest) => Some(oldest),
+            None => self.least_wanted(now).into_iter().find(|connection| *connection != refused),
+        };
+        let Some(connection) = goes else { return };
+        self.count("too many strangers", "one was closed for one that was refused".to_owned());
         self.connections.remove(&connection);
         self.outputs.push_back(Output::Close(connection));
     }

@@ -356,6 +356,26 @@ fn who_is_refused_counts_where_it_came_from() {
 }
 
 #[test]
+fn whom_we_dialled_and_refuse_is_told_why_though_all_places_are_taken_by_who_says_nothing() {
+    // Given: a dial, and as many strangers as there are places
+    let mut core = core();
+    core.handle(millis(0), found(1));
+    let Some(Output::Dial { connection: dialled, .. }) = core.poll() else {
+        panic!("a found node is dialled at once")
+    };
+    core.handle(millis(0), Input::Connected(dialled));
+    let strangers = [(); 3].map(|()| accept_from(&mut core, [10, 0, 0, 7]).0);
+    // When: it answers what it may not
+    let strange = Introduction { project: "another".to_owned(), ..hello_from(HIGH, 1, 1) };
+    core.handle(millis(1), Input::WelcomeReceived(dialled, strange));
+    // Then
+    let outputs = outputs(&mut core);
+    assert!(refusal(&outputs).is_some(), "{outputs:?}");
+    let closed = outputs.iter().filter(|output| matches!(output, Output::Close(_))).collect::<Vec<_>>();
+    assert_eq!(closed, [&Output::Close(strangers[0])], "the oldest of those who say nothing");
+}
+
+#[test]
 fn a_full_table_refuses_newcomers_unless_somebody_in_it_is_gone() {
     let mut core = core();
     greet(&mut core, millis(0), hello_from(HIGH, 1, 1));

@@ -10,6 +10,7 @@ use sinew_runtime::{
 
 use super::{
     super::{
+        core::Registry,
         payload, registrar,
         session::{Order, Session},
     },
@@ -32,7 +33,7 @@ const MEMBERSHIPS_MAX: usize = 16_384;
 pub(super) struct Orders(Cell<usize>);
 
 impl Orders {
-    fn count(&self) {
+    pub(super) fn count(&self) {
         self.0.set(self.0.get() + 1);
     }
 
@@ -65,9 +66,9 @@ impl Client {
     pub(super) fn set_member(&self, group: AppAddress, member: bool, confirm: Option<u64>) {
         self.orders.count();
         let app = self.tid.app;
-        let set = |stores: &Stores| {
+        let set = |stores: &Stores, registry: &Registry| {
             let leaves = !member && stores.router.is_member(group, app);
-            registrar::set_member(stores, app, group, member);
+            registrar::set_registered_member(stores, registry, app, group, member);
             if leaves && let Some(access) = stores.access.get() {
                 access.leave(app);
             }
@@ -81,16 +82,16 @@ impl Client {
     }
 
     /// Does this while it has its address, if it still has: a later life of LNCL takes it back from this one, which hung, and nobody would
-    /// take back what comes of it afterwards.
-    fn while_registered<T>(&self, act: impl FnOnce(&Stores) -> T) -> Option<T> {
+    /// take back what comes of it afterwards. The registry's lock is held meanwhile.
+    fn while_registered<T>(&self, act: impl FnOnce(&Stores, &Registry) -> T) -> Option<T> {
         let stores = &self.server.stores;
         let registry = lock(&stores.registry);
-        (registry.owner_of(self.tid.app) == Some(self.peer.owner())).then(|| act(stores))
+        (registry.owner_of(self.tid.app) == Some(self.peer.owner())).then(|| act(stores, &registry))
     }
 
     /// Whether it may be a member from now on, which is counted. What it is a member of already it stays.
     fn may_join(&self, group: AppAddress) -> Result<(), JoinRefusal> {
-        self.while_registered(|stores| self.may_join_by(stores, group)).unwrap_or(Err(JoinRefusal::Gone))
+        self.while_registered(|stores, _| self.may_join_by(stores, group)).unwrap_or(Err(JoinRefusal::Gone))
     }
 
     fn may_join_by(&self, stores: &Stores, group: AppAddress) -> Result<(), JoinRefusal> {

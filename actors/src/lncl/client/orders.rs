@@ -11,10 +11,11 @@ use sinew_runtime::{
 
 use super::{
     super::{
+        core::User,
         introductions::Question,
         payload::{self, Resolved},
         registrar,
-        session::Order,
+        session::{NoMembership, Order},
         untaken,
     },
     Client,
@@ -29,7 +30,8 @@ impl Client {
             Order::Route(message) => self.route(message),
             Order::Settle { source, correlation, outcome } => self.settle(source, correlation, outcome),
             Order::SetMember { group, member, confirm } => self.set_member(group, member, confirm),
-            Order::Tell { destination, correlation, outcome } => {
+            Order::Tell { destination, correlation, outcome, why } => {
+                self.count_no_membership(why);
                 self.tell(destination, correlation, outcome);
             }
             Order::Resolve { name, correlation } => self.resolve(&name, correlation),
@@ -55,7 +57,8 @@ impl Client {
             let Some(receipt) = self.outcomes.receipt(ticket) else { return };
             message.receipt = Some(receipt);
         }
-        if let Err(why) = router.send(message)
+        let sent = self.within_share(message).and_then(|message| router.send(message));
+        if let Err(why) = sent
             && !is_confirmed
             && untaken::is_fault(destination, why)
         {
@@ -64,6 +67,18 @@ impl Client {
             self.server.refusals.count(now, "unconfirmed message not taken", &detail);
             self.notices.count(destination, why, now);
         }
+    }
+
+    /// The message, if it is one of the robot's own, or guests leave enough to these with it.
+    fn within_share(&self, message: Message) -> Result<Message, Rejection> {
+        let User::Guest(uid) = self.user else { return Ok(message) };
+        let stores = &self.server.stores;
+        stores.shares_of_guests.admit(stores.node, uid, message).map_err(|refused| {
+            let why = refused.why;
+            // Counted, and told to whom its receipt belongs, as what a full queue does not take.
+            stores.router.refuse(refused);
+            why
+        })
     }
 
     fn settle(&self, source: Tid, correlation: u64, outcome: Outcome) {
@@ -122,6 +137,13 @@ impl Client {
         } else {
             self.notices.count(self.server.stores.router.absolute(destination), why, now);
         }
+    }
+
+    /// In words in the log, as a membership that the access list refuses.
+    fn count_no_membership(&self, why: NoMembership) {
+        self.orders.count();
+        let detail = format!("of {} ({}): {why}", self.name, self.tid);
+        self.server.refusals.count(Time::now(), "membership", &detail);
     }
 
     pub(super) fn tell(&self, about: Tid, correlation: u64, outcome: Outcome) {

@@ -102,6 +102,54 @@ fn a_node_and_a_process_have_their_limits() {
     assert!(own.is_ok(), "the node's own applications need no place of a client's");
 }
 
+/// Registers one more application of this user in another process, on a node that takes so many of such.
+fn register_of(registry: &mut Registry, user: User, clients: usize) -> Result<AppAddress, RegisterError> {
+    let ClientId(id) = registry.new_client();
+    let limits = Limits { apps: 2 * clients, clients, per_process: clients };
+    let owner = client(id, i32::try_from(id).unwrap());
+    registry.register(Request { owner, user, ..request(Address::Dynamic, None) }, limits)
+}
+
+// spec: LNCL-13
+#[test]
+fn two_guest_users_have_half_of_the_places_together_and_say_which_bound_it_was() {
+    let (mut registry, [first, second], third) = (Registry::default(), GUESTS, User::Guest(1003));
+    // Given: one user has as many as one may have
+    let of_first = [(); 2].map(|()| register_of(&mut registry, first, 8).unwrap());
+    let full = register_of(&mut registry, first, 8).unwrap_err();
+    assert_eq!(full, RegisterError::GuestFull { uid: 1001, limit: 2 });
+    for word in ["user 1001", " 2 ", "a quarter of `lncl.clients_max`", "end one, or raise it"] {
+        assert!(full.to_string().contains(word), "{full}");
+    }
+    // When: another one has, too
+    for _ in 0..2 {
+        register_of(&mut registry, second, 8).unwrap();
+    }
+    // Then: a third one finds no place, and the robot's own find the other half
+    let full = register_of(&mut registry, third, 8).unwrap_err();
+    assert_eq!(full, RegisterError::GuestsFull { limit: 4 });
+    for word in [" 4 ", "half of `lncl.clients_max`", "end one, or raise it"] {
+        assert!(full.to_string().contains(word), "{full}");
+    }
+    for _ in 0..4 {
+        register_of(&mut registry, User::Own, 8).unwrap();
+    }
+    // And: the place of one that has gone is anybody's; where all are taken, it is by all
+    registry.unregister(of_first[0]);
+    register_of(&mut registry, third, 8).unwrap();
+    let full = register_of(&mut registry, User::Own, 8);
+    assert_eq!(full, Err(RegisterError::ClientsFull { limit: 8 }));
+}
+
+#[test]
+fn a_guest_finds_a_place_on_a_node_that_has_but_few() {
+    for clients in 1..4 {
+        let mut registry = Registry::default();
+        register_of(&mut registry, GUESTS[0], clients).expect("one at least");
+        assert!(register_of(&mut registry, GUESTS[0], clients).is_err(), "of {clients}");
+    }
+}
+
 /// These share their 32-bit FNV-1a, the best known pair of words that does: one is a type of the robot's, the other one a guest's.
 const ITS_OWN: &str = "liquid";
 const A_GUESTS: &str = "costarring";
@@ -255,6 +303,43 @@ proptest! {
             for (name, app) in &registry.names {
                 prop_assert_eq!(registry.apps[app].name.as_ref(), Some(name));
             }
+        }
+    }
+}
+
+proptest! {
+    // spec: LNCL-13
+    #[test]
+    fn the_robots_own_find_half_of_the_places_and_each_guest_user_a_quarter_at_most(
+        clients in 2_usize..40,
+        // Which user comes, or else which of those that are there goes.
+        steps in proptest::collection::vec(
+            (proptest::option::of(0_u32..5), any::<proptest::sample::Index>()),
+            0..120,
+        ),
+    ) {
+        let (mut registry, mut here) = (Registry::default(), Vec::new());
+        for (comes, which) in steps {
+            if let Some(number) = comes {
+                let user = if number == 0 { User::Own } else { User::Guest(1_000 + number) };
+                here.extend(register_of(&mut registry, user, clients).ok().map(|app| (app, user)));
+            } else if !here.is_empty() {
+                let (app, _) = here.swap_remove(which.index(here.len()));
+                prop_assert!(registry.unregister(app));
+            }
+            let guests = here.iter().filter(|(_, user)| *user != User::Own).count();
+            prop_assert!(guests <= clients / 2, "{guests} of {clients}");
+            for number in 1..5 {
+                let is_this = |user: User| user == User::Guest(1_000 + number);
+                let of_user = here.iter().filter(|(_, user)| is_this(*user)).count();
+                prop_assert!(of_user <= (clients / 4).max(1), "{of_user} of {clients}");
+            }
+        }
+        // Whoever is here, the robot's own have, or get, all places but the half.
+        let mut own = here.iter().filter(|(_, user)| *user == User::Own).count();
+        while own < clients - clients / 2 {
+            prop_assert!(register_of(&mut registry, User::Own, clients).is_ok(), "{own} of {clients}");
+            own += 1;
         }
     }
 }

@@ -1,15 +1,20 @@
 //! Who of this host may register what, and what its processes may send.
 
 use std::{
+    collections::VecDeque,
     io::Write as _,
-    sync::atomic::{AtomicBool, Ordering},
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicBool, Ordering},
+    },
     time::{Duration, Instant},
 };
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
+    router::{LocalRoute, Outlet, Refused},
     tid::{AppAddress, Tid},
-    wire::{Flags, Kind},
+    wire::{Flags, Kind, Message},
 };
 
 use super::{Angle, confirmed, named, outcome_of};
@@ -17,7 +22,7 @@ use crate::{
     accept_pace::{IN_A_ROW_MAX, REST},
     api::{NodeApi, Registration},
     lncl::{
-        AppFact,
+        AppFact, OF_USER_AT_SYNC,
         guests::{EACH, SAVED_MAX},
         payload::{self, Group, Register, Switch},
         registrar,
@@ -203,19 +208,23 @@ fn another_user_who_registers_and_leaves_without_end_comes_in_at_the_pace_and_ke
     (0..4).for_each(|_| drop(RawClient::register(&node, &Register::default())));
 }
 
+// spec: LNCL-13
 #[test]
-fn another_user_has_half_of_the_places_at_most() {
+fn another_user_has_a_quarter_of_the_places_at_most() {
     let list = format!("[[client]]\nuid = {STRANGER}\n");
-    let node = TestNode::start_guarded_with(&list, |config| config.lncl.clients_max = 4);
+    let node = TestNode::start_guarded_with(&list, |config| config.lncl.clients_max = 8);
     let why = as_stranger(|| {
         let _two = [(); 2].map(|()| RawClient::register(&node, &Register::default()));
         let mut third = RawClient::connect(&node);
         third.ask_for_address(&Register::default());
         third.expect_refusal()
     });
-    assert!(why.is_none_or(|why| why.contains("54321") && why.contains("`lncl.clients_max`")));
+    if let Some(why) = why {
+        assert!(why.contains("54321") && why.contains("a quarter of `lncl.clients_max`"), "{why}");
+        assert_eq!(node.refused("registration"), 1);
+    }
     // The node's own user is not bound so.
-    (0..2).for_each(|_| drop(RawClient::register(&node, &Register::default())));
+    let _own = [(); 4].map(|()| RawClient::register(&node, &Register::default()));
 }
 
 // spec: LNCL-8
@@ -248,6 +257,28 @@ fn asks(client: &mut RawClient, tid: Tid, group: AppAddress, member: bool) -> Ou
     asked.header.correlation = 5;
     client.send(&asked);
     outcome_of(&client.next().unwrap()).1
+}
+
+#[test]
+fn a_group_beyond_a_clients_bound_and_what_is_no_group_are_refused_counted_and_told_in_words() {
+    // Given: a client in as many groups as one may be in
+    let node = TestNode::start();
+    let (mut client, tid) = RawClient::register(&node, &named("gait"));
+    let group = |number: u32| AppAddress::new(0xf000_0000 + number);
+    (0..256).for_each(|number| {
+        assert_eq!(asks(&mut client, tid, group(number), true), Outcome::Delivered);
+    });
+    assert_eq!(node.refused("membership"), 0);
+    // When, then
+    assert_eq!(asks(&mut client, tid, group(256), true), Outcome::Rejected(Rejection::QueueFull));
+    assert_eq!(node.refused("membership"), 1);
+    let told = node.stores.refusals.told();
+    let words = &told.iter().find(|told| told.cause == "membership").expect("it is counted").detail;
+    for word in ["gait", "256 groups", &group(256).to_string(), "leave one"] {
+        assert!(words.contains(word), "{words}");
+    }
+    assert_eq!(asks(&mut client, tid, AppAddress::LNCL, true), Outcome::Rejected(Rejection::Unsupported));
+    assert_eq!((node.refused("membership"), node.stores.router.memberships()), (2, 256));
 }
 
 #[test]
@@ -315,4 +346,47 @@ fn another_user_has_a_share_of_memberships_with_all_its_connections() {
     // The node's own user has no such share.
     let (mut own, tid) = RawClient::register(&node, &Register::default());
     assert_eq!(asks(&mut own, tid, group(0), true), Outcome::Delivered);
+}
+
+/// A sync manager that reads when the test does.
+#[derive(Default)]
+struct Slow(Mutex<VecDeque<Message>>);
+
+impl Outlet for Slow {
+    fn submit(&self, message: Message) -> Result<(), Refused> {
+        lock(&self.0).push_back(message);
+        Ok(())
+    }
+}
+
+#[test]
+fn another_user_has_a_share_of_what_waits_for_the_sync_manager_and_the_nodes_own_has_all_of_it() {
+    const SHARE: u64 = OF_USER_AT_SYNC as u64;
+    let node = TestNode::start_guarded(&format!("[[client]]\nuid = {STRANGER}\n"));
+    let slow = Arc::new(Slow::default());
+    let route = LocalRoute { outlet: slow.clone(), events: Arc::new([]) };
+    node.stores.router.set_local(AppAddress::SYNC, route);
+    let sync = Tid::new(node.address(), AppAddress::SYNC);
+    let Some((mut guest, tid)) = as_stranger(|| RawClient::register(&node, &Register::default())) else {
+        return;
+    };
+    // When, then: one too many is refused, and what becomes of the others it hears when they are read
+    (1..=SHARE + 1).for_each(|correlation| guest.send(&confirmed(tid, sync, correlation)));
+    let full = Outcome::Rejected(Rejection::QueueFull);
+    assert_eq!(outcome_of(&guest.next().unwrap()), (SHARE + 1, full));
+    let first = lock(&slow.0).pop_front();
+    first.expect("it waits").settle(Outcome::Delivered);
+    assert_eq!(outcome_of(&guest.next().unwrap()), (1, Outcome::Delivered));
+    // And: there is room for one again
+    (SHARE + 2..=SHARE + 3).for_each(|correlation| guest.send(&confirmed(tid, sync, correlation)));
+    assert_eq!(outcome_of(&guest.next().unwrap()), (SHARE + 3, full));
+    assert_eq!(lock(&slow.0).len() as u64, SHARE);
+    // And: the node's own user has no such share. Of its messages the last one is the first that ends.
+    let (mut own, tid) = RawClient::register(&node, &Register::default());
+    (1..=2 * SHARE).for_each(|correlation| own.send(&confirmed(tid, sync, correlation)));
+    let nobody = Tid::new(node.address(), AppAddress::fixed(9).unwrap());
+    own.send(&confirmed(tid, nobody, 0));
+    let none = Outcome::Rejected(Rejection::NoSuchApplication);
+    assert_eq!(outcome_of(&own.next().unwrap()), (0, none));
+    assert_eq!(lock(&slow.0).len() as u64, 3 * SHARE);
 }

@@ -4,7 +4,7 @@ const APP: AppAddress = AppAddress::new(0x1000);
 const OTHER: AppAddress = AppAddress::new(0x1001);
 
 fn registered(app: AppAddress, name: &str) -> AppFact {
-    AppFact::Registered { app, name: Some(name.to_owned()), requires: Vec::new() }
+    AppFact::own_registered(app, Some(name.to_owned()), Vec::new())
 }
 
 const fn ready(app: AppAddress) -> AppFact {

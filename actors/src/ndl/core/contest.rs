@@ -28,6 +28,8 @@ pub(super) struct Contest {
     pub(super) put_off: u32,
     /// The newcomer has answered in its time. What the member said meanwhile on its connection is known when that part of the time is over.
     pub(super) has_answered: bool,
+    /// The member lives, too, and has not settled, as the newcomer has: if that lives still, the address is its own.
+    gives_way: bool,
     pub(super) newcomer: Proof,
 }
 
@@ -52,8 +54,11 @@ impl Core {
     pub(super) fn contest(&mut self, now: Time, newcomer: Proof) {
         let node = newcomer.announcement.node;
         if let Some(contest) = self.contests.get_mut(&node) {
-            if contest.is_won_by(&newcomer) {
-                (contest.has_answered, contest.newcomer) = (true, newcomer);
+            contest.has_answered |= contest.is_won_by(&newcomer);
+            let is_its =
+                contest.newcomer.is_of(&newcomer.announcement) && contest.newcomer.from == newcomer.from;
+            if is_its && newcomer.asked >= contest.newcomer.asked {
+                contest.newcomer = newcomer;
             }
             return;
         }
@@ -66,6 +71,7 @@ impl Core {
             again: 0,
             put_off: 0,
             has_answered: false,
+            gives_way: false,
             newcomer,
         };
         self.contests.insert(node, contest);
@@ -154,7 +160,7 @@ impl Core {
             contest.put_off += 1;
             let tried = contest.tried;
             self.give_time(now, node, tried);
-        } else if has_given_a_sign {
+        } else if has_given_a_sign && !contest.gives_way {
             self.both_live(now, node);
         } else if contest.tried == Party::Member {
             contest.put_off = 0;
@@ -162,11 +168,14 @@ impl Core {
         } else {
             // One that does not live: its next answer would begin another contest.
             let contest = self.contests.remove(&node).filter(|contest| contest.has_answered);
-            if let Some(Contest { newcomer, .. }) = contest
-                && !self.contradicts_a_proof(now, &newcomer)
-            {
-                self.replace(now, newcomer);
+            let Some(Contest { newcomer, gives_way, .. }) = contest else { return };
+            if self.contradicts_a_proof(now, &newcomer) {
+                return;
             }
+            if let Some(member) = self.members.get(&node).filter(|_| gives_way) {
+                self.collide(now, node, (&newcomer).into(), member.into());
+            }
+            self.replace(now, newcomer);
         }
     }
 
@@ -193,18 +202,34 @@ impl Core {
     /// The member lives, and was asked after the newcomer came: there are two. The newcomer, if the address is its own.
     pub(super) fn settle_contest(&mut self, now: Time, proof: &Proof) -> Option<Proof> {
         let node = proof.announcement.node;
+        let fresh = self.challenge() / CHALLENGES;
         let is_later =
             |contest: &Contest| proof.asked >= contest.since && proof.from != contest.newcomer.from;
         if !self.contests.get(&node).is_some_and(is_later) {
             return None;
         }
-        let newcomer = self.contests.remove(&node)?.newcomer;
+        let mut contest = self.contests.remove(&node)?;
         // The member may have proven itself since the newcomer came.
-        if newcomer.announcement.precedes(&proof.announcement) && !self.contradicts_a_proof(now, &newcomer) {
-            self.collide(now, node, (&newcomer).into(), proof.into());
-            return Some(newcomer);
+        if !contest.newcomer.announcement.precedes(&proof.announcement)
+            || self.contradicts_a_proof(now, &contest.newcomer)
+        {
+            self.collide(now, node, proof.into(), (&contest.newcomer).into());
+            return None;
         }
-        self.collide(now, node, proof.into(), (&newcomer).into());
+        if now.since(contest.newcomer.asked) <= fresh {
+            self.collide(now, node, (&contest.newcomer).into(), proof.into());
+            return Some(contest.newcomer);
+        }
+        // It may be gone since, and the member would be lost to nobody.
+        let is_tried = contest.gives_way;
+        contest.gives_way = true;
+        if !is_tried {
+            contest.put_off = 0;
+        }
+        self.contests.insert(node, contest);
+        if !is_tried {
+            self.give_time(now, node, Party::Newcomer);
+        }
         None
     }
 }

@@ -84,7 +84,7 @@ impl Core {
             self.tell_who_does_not_answer(at);
         }
         // In any cycle: what their hosts and GNCL say is to be new when the next one counts.
-        self.probe_the_suspected(at);
+        self.probe_the_suspected(now, at);
         if at == REST {
             self.ask_everybody(now);
         } else {
@@ -131,7 +131,7 @@ impl Core {
     }
 
     /// Whoever missed an answer: why that is so is to be known by the time that it is lost. // spec: NDL-4.6
-    fn probe_the_suspected(&mut self, at: usize) {
+    fn probe_the_suspected(&mut self, now: Time, at: usize) {
         // What is said later than the next look at the timer may be too late.
         let within = self.paces[at].period * 3 / 4;
         let suspected = self.members.iter().filter(|(_, member)| member.pace == at && member.missed > 0);
@@ -140,14 +140,17 @@ impl Core {
             incarnation: member.announcement.incarnation,
             to: member.probed_addresses(&self.own),
             within,
+            asked: now,
         });
         self.outputs.extend(probes);
     }
 
-    pub(super) fn probed(&mut self, node: NodeAddress, incarnation: Incarnation, host: Host) {
+    /// What a host said when it was asked then; before its last connection was made it says nothing of what has happened since.
+    pub(super) fn probed(&mut self, node: NodeAddress, incarnation: Incarnation, host: Host, asked: Time) {
         if let Some(member) = self.members.get_mut(&node)
             && member.announcement.incarnation == incarnation
             && member.missed > 0
+            && asked >= member.linked
         {
             member.host = Some(host);
         }

@@ -219,6 +219,7 @@ impl Core {
             answered: Time::ZERO,
             link_broke: None,
             link_until,
+            linked: Time::ZERO,
             since: now,
             fence,
         };
@@ -279,8 +280,8 @@ impl Core {
         match fact {
             LinkFact::LinkUp { .. } => {
                 (member.link_broke, member.link_until) = (None, Time::MAX);
-                // It said so just now. spec: NDL-4.7
-                member.sign = now;
+                // It said so just now, so that its host does not refuse what it is sent any more. spec: NDL-4.7
+                (member.sign, member.heard, member.host, member.linked) = (now, now, None, now);
             }
             LinkFact::LinkBroken { .. } => {
                 (member.link_broke, member.link_until) = (Some(now), now + LINK_GRACE);

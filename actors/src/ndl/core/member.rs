@@ -47,6 +47,8 @@ pub(super) struct Member {
     pub(super) link_broke: Option<Time>,
     /// Until then its connection stands, or is being made again.
     pub(super) link_until: Time,
+    /// When its connection was made last, if ever.
+    pub(super) linked: Time,
     /// Since when it has been a member.
     pub(super) since: Time,
     /// The life before this one whose end is known: neither that one nor one before it comes back.

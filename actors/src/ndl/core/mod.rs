@@ -113,7 +113,7 @@ pub(crate) enum Input {
     /// A connection of GNCL changed.
     Link(LinkFact),
     /// The host of a node that missed answers was tried, as [`Output::Probe`] asked.
-    Probed { node: NodeAddress, incarnation: Incarnation, host: Host },
+    Probed { node: NodeAddress, incarnation: Incarnation, host: Host, asked: Time },
     /// GNCL read something of this life of a node at that time; of those [in doubt](Core::in_doubt).
     SignSeen { node: NodeAddress, incarnation: Incarnation, at: Time },
     /// It is time for [`Core::next_wake`].
@@ -158,6 +158,7 @@ pub(crate) enum Output {
         incarnation: Incarnation,
         to: Vec<SocketAddr>,
         within: Duration,
+        asked: Time,
     },
     /// Have the GNCL of this life of a node give a sign on the connections that stand.
     AskForSign {
@@ -400,7 +401,7 @@ impl Core {
             Input::AddressNamed { source, address } => self.named(now, source, address),
             Input::PeersRemembered(peers) => self.recalled(now, peers),
             Input::Link(fact) => self.linked(now, fact),
-            Input::Probed { node, incarnation, host } => self.probed(node, incarnation, host),
+            Input::Probed { node, incarnation, host, asked } => self.probed(node, incarnation, host, asked),
             Input::SignSeen { node, incarnation, at } => self.sign_seen(now, node, incarnation, at),
             Input::TimePassed => self.time_passed(now),
             Input::Stopping => self.leave(),
@@ -427,10 +428,7 @@ impl Core {
             AppFact::Down { app } | AppFact::Stopped { app } | AppFact::Unregistered { app } => {
                 self.audience.remove(app);
             }
-            AppFact::Registered { .. }
-            | AppFact::Guest { .. }
-            | AppFact::Handles { .. }
-            | AppFact::GroupsChanged => {}
+            AppFact::Registered { .. } | AppFact::Handles { .. } | AppFact::GroupsChanged => {}
         }
     }
 

@@ -117,6 +117,31 @@ async fn kinds_read(child: &mut Child, theirs: UnixStream, last: Kind) -> Vec<Ki
 }
 
 #[test]
+fn a_process_joins_groups_only_while_its_application_is_registered() {
+    run(async {
+        // Given: a process whose application has its address
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let hosted = hosted(&stores);
+        let (tid, group) = (hosted.tid, AppAddress::group("legs"));
+        let outlet = Arc::new(AppOutlet { pending: Pending::new(1), inbox: Mailbox::new(1) });
+        let (address, events) = (Some(tid.app), Arc::new([]));
+        let app = LocalApp { name: None, address, requires: vec![], kinds: vec![], outlet, events };
+        register_local(&stores, app).unwrap();
+        let (mut child, _theirs) = begin(&hosted);
+        let membership = payload::Group { group, member: true };
+        let joins = || payload::frame(Kind::LNCL_GROUP, tid, Tid::NONE, &membership);
+        // When
+        child.obey(joins()).unwrap();
+        // Then
+        assert!(stores.router.is_member(group, tid.app));
+        // And: what it says behind its application's end leaves nothing to whoever gets the address next
+        unregister_local(&stores, tid.app);
+        child.obey(joins()).unwrap();
+        assert!(!stores.router.is_member(group, tid.app));
+    });
+}
+
+#[test]
 fn who_holds_the_socket_of_a_dead_process_says_nothing_more_and_what_it_has_said_counts() {
     run(async {
         // Given: the last words of a process, whose socket somebody else holds open

@@ -51,6 +51,15 @@ pub(super) struct App {
     pub(super) patience: Option<Time>,
 }
 
+/// What a node is told of an application that registers.
+#[derive(Debug)]
+pub(super) struct Newcomer {
+    pub(super) name: Option<String>,
+    /// Whose it is.
+    pub(super) user: User,
+    pub(super) requires: Vec<Requirement>,
+}
+
 /// How far an application has come in its present life.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum State {
@@ -134,20 +143,22 @@ impl App {
 
 impl Apps {
     /// Whether `app` is registered just so already.
-    pub(super) fn knows(&self, app: AppAddress, name: Option<&str>, requires: &[String]) -> bool {
+    pub(super) fn knows(
+        &self,
+        app: AppAddress,
+        name: Option<&str>,
+        requires: &[String],
+        whose: User,
+    ) -> bool {
         self.apps.get(&app).is_some_and(|app| {
-            app.name.as_deref() == name && app.requires.iter().map(Requirement::as_str).eq(requires)
+            let is_called_so = app.name.as_deref() == name;
+            is_called_so && app.user == whose && app.requires.iter().map(Requirement::as_str).eq(requires)
         })
     }
 
     /// A life of `app` begins; one that waits already goes on waiting. Returns the name, if it cannot be had.
-    pub(super) fn register(
-        &mut self,
-        app: AppAddress,
-        name: Option<String>,
-        mut requires: Vec<Requirement>,
-        wait: Wait,
-    ) -> Option<String> {
+    pub(super) fn register(&mut self, app: AppAddress, newcomer: Newcomer, wait: Wait) -> Option<String> {
+        let Newcomer { name, user, mut requires } = newcomer;
         let mut seen = BTreeSet::new();
         requires.retain(|requirement| seen.insert(requirement.to_string()));
         let former = self.remove(app);
@@ -156,7 +167,7 @@ impl Apps {
         let state = State::Waiting(wait);
         let (phases, kinds, silent) = (Vec::new(), Vec::new(), BTreeMap::new());
         let (lost, owed) = (BTreeSet::new(), BTreeSet::new());
-        let (user, ended, patience) = (User::Own, None, None);
+        let (ended, patience) = (None, None);
         // One that waits already has waited for that, too.
         let absent = former.map(|former| former.absent).unwrap_or_default();
         let life =

@@ -4,10 +4,10 @@ use sinew_runtime::{app::Requirement, tid::AppAddress, time::Time, wire::Kind};
 
 use super::{
     Core,
-    apps::{State, Wait},
+    apps::{Newcomer, State, Wait},
 };
 use crate::{
-    lncl::{AppFact, User},
+    lncl::AppFact,
     sync::list::{Ended, KINDS_MAX},
 };
 
@@ -15,12 +15,13 @@ impl Core {
     pub(super) fn app_changed(&mut self, now: Time, fact: AppFact) {
         match fact {
             // Told again, as after a restart of LNCL: nothing has changed.
-            AppFact::Registered { app, name, requires }
-                if self.apps.knows(app, name.as_deref(), &requires) => {}
-            AppFact::Registered { app, name, requires } => {
+            AppFact::Registered { app, name, requires, user }
+                if self.apps.knows(app, name.as_deref(), &requires, user) => {}
+            AppFact::Registered { app, name, requires, user } => {
                 let wait = Wait::begun(now, self.requirement_deadline);
                 let requires = self.read_requirements(app, requires);
-                let refused = self.apps.register(app, name.clone(), requires, wait);
+                let newcomer = Newcomer { name: name.clone(), user, requires };
+                let refused = self.apps.register(app, newcomer, wait);
                 if let Some(name) = refused {
                     self.refuse(
                         "name",
@@ -32,7 +33,6 @@ impl Core {
                 self.note_same_name(name.as_deref().unwrap_or_default());
                 self.own_list_changed(now);
             }
-            AppFact::Guest { app, uid } => self.app_is_of(now, app, User::Guest(uid)),
             AppFact::Handles { app, kinds } => self.app_handles(now, app, kinds),
             AppFact::Ready { app } => self.app_ready(now, app),
             AppFact::Down { app } => self.app_ended(now, app, Ended::Failed),
@@ -57,16 +57,6 @@ impl Core {
             })
         };
         texts.into_iter().map(read).collect()
-    }
-
-    fn app_is_of(&mut self, now: Time, address: AppAddress, user: User) {
-        if let Some(app) = self.apps.get_mut(address)
-            && app.user != user
-        {
-            app.user = user;
-            // Where the list has no room for all, it is left out before others.
-            self.own_list_changed(now);
-        }
     }
 
     fn app_handles(&mut self, now: Time, address: AppAddress, mut kinds: Vec<Kind>) {

@@ -3,9 +3,13 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::sync::{
-    arrivals::BARRIERS_MAX,
-    words::{BarrierKind, OnPartyLoss},
+use crate::{
+    lncl::User,
+    sync::{
+        arrivals::BARRIERS_MAX,
+        list::ENTRIES_MAX,
+        words::{BarrierKind, OnPartyLoss},
+    },
 };
 
 /// Users whom the access list lets in.
@@ -19,10 +23,10 @@ const OF_ALL: usize = 64;
 
 impl Bench {
     /// An application of another user registers. Application 0 is "hip", and the robot's own.
-    fn guest(&mut self, index: u32, uid: u32) {
-        self.registers(index, &format!("guest.{index}"), &[]);
-        self.hears(Input::AppChanged(AppFact::Guest { app: app(index), uid }));
-        self.ready(index);
+    fn guest(&mut self, index: u32, uid: u32) -> Vec<Output> {
+        let (name, user) = (Some(format!("guest.{index}")), User::Guest(uid));
+        let fact = AppFact::Registered { app: app(index), name, requires: Vec::new(), user };
+        [self.hears(Input::AppChanged(fact)), self.ready(index)].concat()
     }
 
     fn ends(&mut self, index: u32) {
@@ -159,7 +163,7 @@ fn where_the_list_has_no_room_for_all_guests_are_left_out_first() {
     config.payload_max = 4_096;
     let core = Core::new(&config, HERE, Incarnation(1));
     let mut bench = Bench { core, now: Time::from_nanos(1_000_000_000) };
-    (1..=200).for_each(|index| bench.guest(index, USER));
+    (1..=200).for_each(|index| drop(bench.guest(index, USER)));
     bench.registers(0, "toe", &[]);
     // And: as many of the robot's own as there is room for, but not beside the groups that only guests are in
     for index in 201..=280 {
@@ -176,6 +180,39 @@ fn where_the_list_has_no_room_for_all_guests_are_left_out_first() {
     assert!(names.contains(&"toe") && names.len() < 281, "{names:?}");
     assert_eq!(names.iter().filter(|name| name.starts_with("own.")).count(), 80, "{names:?}");
     assert_eq!(list.groups, groups[..1], "the robot's own");
+}
+
+// spec: SYNC-4
+#[test]
+fn no_list_that_is_said_lacks_a_name_of_the_robots_own_because_a_guest_has_come() {
+    // Given: a list with as many of the robot's own as there may be in one, which a peer has, so that each change is said at once
+    let mut bench = Bench::new();
+    let names: Vec<String> = (0..ENTRIES_MAX).map(|number| format!("own.{number:04}")).collect();
+    for (index, name) in (0..).zip(&names) {
+        bench.registers(index, name, &[]);
+    }
+    bench.links(KNEE, LIFE);
+    bench.passes(REPEAT);
+    bench.now = bench.now + REPEAT / 2;
+    // When: a guest comes whose name stands before all of theirs
+    let comes = bench.guest(2_000, USER);
+    let lists = published(&[comes, bench.passes(REPEAT)].concat());
+    // Then: in the first one that is said of it, too
+    assert!(lists.len() > 1, "{} lists", lists.len());
+    for list in lists {
+        assert!(list.entries.iter().map(|entry| &*entry.name).eq(names.iter()), "version {}", list.version);
+    }
+}
+
+// spec: SYNC-4
+#[test]
+fn whose_an_application_is_counts_also_where_nothing_else_of_it_is_new() {
+    // Given: a guest that was one of the robot's own before, by the same name
+    let mut bench = Bench::new();
+    bench.registers(1, "guest.1", &[]);
+    bench.guest(1, USER);
+    // Then
+    assert_eq!(bench.core.apps.get(app(1)).map(|app| app.user), Some(User::Guest(USER)));
 }
 
 /// What happens to one of some applications.
@@ -204,7 +241,7 @@ proptest! {
         let mut bench = Bench::of_the_hip();
         for act in acts {
             match act {
-                Act::Comes(index) => bench.guest(index, USER + index % 3),
+                Act::Comes(index) => drop(bench.guest(index, USER + index % 3)),
                 Act::Ends(index) => bench.ends(index),
                 // The robot's own is at as many as are left to it, some of them with guests.
                 Act::Visits(0, barrier) => {

@@ -66,7 +66,7 @@ impl Bench {
     fn registers(&mut self, index: u32, name: &str, requires: &[&str]) -> Vec<Output> {
         let requires = requires.iter().map(|name| (*name).to_owned()).collect();
         let name = (!name.is_empty()).then(|| name.to_owned());
-        self.hears(Input::AppChanged(AppFact::Registered { app: app(index), name, requires }))
+        self.hears(Input::AppChanged(AppFact::own_registered(app(index), name, requires)))
     }
 
     fn ready(&mut self, index: u32) -> Vec<Output> {

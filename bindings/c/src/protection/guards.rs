@@ -9,7 +9,7 @@ use std::{
     io,
     sync::{
         Arc, Mutex, PoisonError,
-        atomic::{AtomicPtr, AtomicUsize, Ordering},
+        atomic::{AtomicBool, AtomicPtr, AtomicUsize, Ordering},
     },
 };
 
@@ -54,6 +54,8 @@ struct Held {
     handle: usize,
     guard: Guard<Pointer>,
     reads: Reads,
+    /// Somebody has let go of it who had an output in hand: no call knows it any more.
+    is_to_go: AtomicBool,
 }
 
 static PLACES: [ArcSwapOption<Held>; GUARDS_MAX] = [const { ArcSwapOption::const_empty() }; GUARDS_MAX];
@@ -100,7 +102,7 @@ fn make(reads: Reads, guard: impl FnOnce() -> io::Result<Guard<Pointer>>) -> Res
     let found = Found::of(&guard, State::Safe(Cause::NotArmed));
     let handle = next_serial() * GUARDS_MAX + at;
     // The lock keeps others from the place; what was there before is released.
-    PLACES[at].store(Some(Arc::new(Held { handle, guard, reads })));
+    PLACES[at].store(Some(Arc::new(Held { handle, guard, reads, is_to_go: AtomicBool::new(false) })));
     Ok((handle, found))
 }
 
@@ -155,6 +157,29 @@ pub(crate) fn release(handle: usize) -> Result<(), Fault> {
     })
 }
 
+/// Trips it and lets go of it, for who has an output in hand: no call knows it any more, and it is released as soon as nobody has its output in hand.
+/// Never waits.
+pub(crate) fn release_later(handle: usize) -> Result<(), Fault> {
+    let held = held(handle)?;
+    held.is_to_go.store(true, Ordering::Release);
+    held.guard.release_later();
+    Ok(())
+}
+
+impl Held {
+    fn is_to_go(&self) -> bool {
+        self.is_to_go.load(Ordering::Acquire)
+    }
+
+    /// For a thread that has no output in hand: where it was let go of in the function that returns here, it is released when that has returned.
+    fn finish_release(&self) {
+        if self.is_to_go() && !self.guard.is_released() {
+            // Where that fails it is tried on, and released as soon as the output is safe.
+            let _ = self.guard.release();
+        }
+    }
+}
+
 impl Found {
     /// What was live when it was looked at is not owed, whatever has become of it since.
     fn of(guard: &Guard<Pointer>, state: State) -> Self {
@@ -183,12 +208,15 @@ impl Output {
 fn with<R>(handle: usize, body: impl FnOnce(&Held) -> Result<R, Fault>) -> Result<R, Fault> {
     let held = held(handle)?;
     check_callback()?;
-    body(&held)
+    let result = body(&held);
+    held.finish_release();
+    result
 }
 
 fn held(handle: usize) -> Result<Arc<Held>, Fault> {
     let held = PLACES[handle % GUARDS_MAX].load_full();
-    let held = held.filter(|held| held.handle == handle && !held.guard.is_released()).ok_or_else(no_such)?;
+    let is_there = |held: &Arc<Held>| held.handle == handle && !held.is_to_go() && !held.guard.is_released();
+    let held = held.filter(is_there).ok_or_else(no_such)?;
     watchdog::check_fork()?;
     Ok(held)
 }
@@ -199,8 +227,8 @@ fn next_serial() -> usize {
     SERIALS.fetch_add(1, Ordering::Relaxed) % SERIALS_MAX + 1
 }
 
-/// Runs a function of the program's, in which it may only trip guards: two that wait for each other's outputs would wait for ever, and so would
-/// one that waits for its own.
+/// Runs a function of the program's, in which it may only trip guards, and let go of them for later: two that wait for each other's outputs would
+/// wait for ever, and so would one that waits for its own.
 fn in_callback<R>(callback: impl FnOnce() -> R) -> R {
     let before = IS_IN_CALLBACK.replace(true);
     let result = callback();
@@ -213,7 +241,8 @@ pub(crate) fn check_callback() -> Result<(), Fault> {
     if !IS_IN_CALLBACK.get() {
         return Ok(());
     }
-    let sentence = "a function that has an output in hand may only call sinew_trip; do the rest behind it";
+    let sentence =
+        "with an output in hand only sinew_trip and sinew_release_later may be called; do the rest behind it";
     Err(Fault::new(Status::SinewErrorBusy, sentence))
 }
 
@@ -242,7 +271,7 @@ impl From<ArmError> for Fault {
 mod tests {
     use std::{
         sync::{
-            atomic::{AtomicBool, AtomicI32},
+            atomic::AtomicI32,
             mpsc::{Receiver, SyncSender, sync_channel},
         },
         thread,
@@ -364,6 +393,59 @@ mod tests {
         assert_eq!(NOTED.load(Ordering::Acquire), busy as i32, "nor may what makes it safe");
         assert_eq!(status(check_callback()), None, "nobody has it in hand any more");
         assert_eq!(status(release(handle)), None);
+    }
+
+    /// Whether the place of a guard is another one's, or may be.
+    fn is_gone(handle: usize) -> bool {
+        let held = PLACES[handle % GUARDS_MAX].load_full();
+        held.is_none_or(|held| held.handle != handle || held.guard.is_released())
+    }
+
+    #[test]
+    fn a_guard_that_is_let_go_of_in_its_own_command_is_released_when_that_returns() {
+        // given
+        static NOTED: AtomicI32 = AtomicI32::new(0);
+        let handle = made(&NOTED);
+        come_alive(handle);
+        // when
+        let mut inside = None;
+        let moved = apply(handle, |_| {
+            let [let_go, again] = [(); 2].map(|()| status(release_later(handle)));
+            inside = Some((let_go, again, status(trip(handle)), is_gone(handle)));
+        });
+        // then: from then on nobody finds it, and it is there until nobody has it in hand
+        assert_eq!(moved.ok(), Some(Found { state: State::Live, is_owed: false }));
+        let no_such = Some(Status::SinewErrorNoSuchGuard);
+        assert_eq!(inside, Some((None, no_such, no_such, false)));
+        assert!(is_gone(handle), "its place is free");
+        assert_eq!(NOTED.load(Ordering::Acquire), Status::SinewErrorBusy as i32, "it was made safe");
+        assert_eq!((status(arm(handle)), status(release(handle))), (no_such, no_such));
+    }
+
+    /// Lets go of its own guard, whose handle is there, when that is tripped.
+    unsafe extern "C" fn let_go(output: *mut c_void, why: OutputState) -> i32 {
+        // SAFETY: the test below makes a guard with this of a number that stays.
+        let handle = unsafe { &*output.cast::<AtomicUsize>() };
+        let is_its_turn = why == OutputState::SinewSafeTripped;
+        i32::from(is_its_turn && release_later(handle.load(Ordering::Acquire)).is_err())
+    }
+
+    #[test]
+    fn a_guard_that_is_let_go_of_where_it_is_made_safe_is_released_as_soon_as_it_is_safe() {
+        // given
+        static HANDLE: AtomicUsize = AtomicUsize::new(0);
+        let (handle, _) = made_of(&HANDLE, let_go);
+        HANDLE.store(handle, Ordering::Release);
+        come_alive(handle);
+        // when
+        assert_eq!(status(trip(handle)), None);
+        // then: whoever makes it safe, here or the thread that does so, has it go
+        let begun = Time::now();
+        while !is_gone(handle) {
+            assert!(Time::now().since(begun) < WATCHDOG, "its place is not free");
+            thread::yield_now();
+        }
+        assert_eq!(status(release(handle)), Some(Status::SinewErrorNoSuchGuard));
     }
 
     /// An output that becomes safe when it is allowed to.

@@ -1,10 +1,11 @@
-//! What the programs in C and C++ stand on: a compiler, a node in a process of its own, and a directory.
+//! What the programs in C and C++ stand on: a compiler, a node in a process of its own, a directory, and endpoints in Rust beside them.
 
 use std::{
     path::{Path, PathBuf},
     process::{Command, Stdio},
 };
 
+use sinew::{Endpoint, NodeApi, Registration};
 use sinew_tests::{OwnDirectory, Program, own_group};
 
 /// Time for what has to happen anyway, as on a loaded machine.
@@ -76,6 +77,12 @@ fn start_node(config: &Path) -> Program {
     node
 }
 
+/// An endpoint in Rust at the node of the programs.
+pub(crate) fn endpoint(ground: &Ground, registration: Registration) -> Endpoint {
+    let node = NodeApi::connect(ground.socket()).expect("the node is up");
+    node.register_transport_address(registration.deadline(WATCHDOG)).expect("nothing is in the way")
+}
+
 /// A node in a process of its own, and a directory for its socket and for the programs.
 pub(crate) struct Ground {
     pub(crate) node: Program,
@@ -111,7 +118,14 @@ impl Ground {
         self.start_under(&[], program, arguments)
     }
 
-    /// The same under another program. What they say on their standard errors is kept, too.
+    /// Runs a program that checks all by itself: it says so, and ends well.
+    pub(crate) fn run(&self, program: &Path, says: &str) {
+        let mut running = self.start(program, &[]);
+        running.wait_for(&[says]);
+        assert_eq!(running.wait_for_end(), Some(0));
+    }
+
+    /// Starts one under another program. What they say on their standard errors is kept, too.
     pub(crate) fn start_under(&self, over: &[&str], program: &Path, arguments: &[&str]) -> Program {
         let mut command = Command::new("sh");
         command.args(["-c", r#"exec "$@" 2>&1"#, "sh"]).args(over).arg(program);

@@ -241,6 +241,28 @@ static void callbacks(void)
     EXPECT(sinew_trip(gone) == SINEW_ERROR_NO_SUCH_GUARD);
 }
 
+/* In its own command, where it cannot be released at once. */
+static void let_go(void *output, void *argument)
+{
+    sinew_guard **guard = argument, *gone = *guard;
+    (void)output;
+    EXPECT(sinew_release(guard) == SINEW_ERROR_BUSY && *guard == gone);
+    EXPECT(sinew_release_later(guard) == SINEW_OK && *guard == NULL);
+    EXPECT(sinew_trip(gone) == SINEW_ERROR_NO_SUCH_GUARD);
+    EXPECT(sinew_release_later(&gone) == SINEW_ERROR_NO_SUCH_GUARD && gone != NULL);
+}
+
+/* More of them than there are places. */
+static void ends_in_hand(void)
+{
+    static struct bench bench;
+    for (int ended = 0; ended < 300; ended++) {
+        begin_patient(&bench);
+        EXPECT(sinew_apply(bench.guard, let_go, &bench.guard, NULL) == SINEW_OK && bench.guard == NULL);
+        EXPECT(bench.motor.safe_count == 2 && bench.motor.why == SINEW_SAFE_TRIPPED);
+    }
+}
+
 /* What is not known to be safe is not called so, and its release is finished by the library. */
 static void failures(void)
 {
@@ -348,6 +370,8 @@ static void misuse(void)
     EXPECT(found.counter == 1 && found.incarnation == 2 && found.echo_ns == 3);
     EXPECT(sinew_unseal(&codename, sealed, sizeof sealed - 1, &found) == SINEW_ERROR_MALFORMED);
     EXPECT(sinew_arm(NULL) == SINEW_ERROR_NO_SUCH_GUARD && sinew_trip(NULL) == SINEW_ERROR_NO_SUCH_GUARD);
+    EXPECT(sinew_release_later(NULL) == SINEW_ERROR_NO_SUCH_GUARD);
+    EXPECT(sinew_release_later(&guard) == SINEW_ERROR_NO_SUCH_GUARD);
     EXPECT(sinew_guard_state(NULL, NULL) == SINEW_ERROR_INVALID_ARGUMENT);
     EXPECT(strcmp(sinew_output_state_text(99), "no state of an output") == 0);
 }
@@ -397,6 +421,7 @@ int main(int argc, char **argv)
     lengths();
     silence();
     callbacks();
+    ends_in_hand();
     failures();
     if (argc > 1)
         endpoints(argv[1]);

@@ -129,6 +129,23 @@ static void groups_and_names(const char *socket)
     EXPECT(member.address() == 0);
 }
 
+// Good ones come until the first of them has passed a guard that is live.
+static std::optional<pair> come_alive(sinew::endpoint &sender, sinew::endpoint &receiver, const sinew_protected_type &type,
+                                      sinew::guard<int> &guard)
+{
+    std::optional<pair> came;
+    for (int look = 0; look < 2000 && !came; look++) {
+        sender.send_protected(receiver.address(), type, pair{1, look});
+        while (sender.receive(0ns)) {
+        }
+        if (guard.state() != SINEW_LIVE)
+            (void)guard.arm();
+        if (auto message = receiver.receive(10ms))
+            came = message->as<pair>();
+    }
+    return came;
+}
+
 // Whether it is; what is not known to be safe is an exception.
 static bool is_tripped(const sinew::guard<int> &guard)
 {
@@ -172,16 +189,7 @@ static void outputs_are_guarded(const char *socket)
         output = 0;
     });
     EXPECT(guard.state() == SINEW_SAFE_NOT_ARMED && !guard.apply([](int &) {}));
-    std::optional<pair> came;
-    for (int look = 0; look < 2000 && !came; look++) {
-        sender.send_protected(receiver.address(), type, pair{1, look});
-        while (sender.receive(0ns)) {
-        }
-        if (guard.state() != SINEW_LIVE)
-            (void)guard.arm();
-        if (auto message = receiver.receive(10ms))
-            came = message->as<pair>();
-    }
+    const auto came = come_alive(sender, receiver, type, guard);
     EXPECT(came && came->a == 1 && guard.tally().good > 8);
     int moved = -1;
     EXPECT(guard.apply([&](int &output) { output = came->a, moved = output; }) && moved == 1);
@@ -205,6 +213,38 @@ static void outputs_are_guarded(const char *socket)
     }
 }
 
+// One that ends while it calls the program is let go of then: another one may have its place.
+static void guards_end_in_their_own_functions(const char *socket)
+{
+    const auto moved = sinew::protected_type<pair>("test.wrapper_ends_moved", 20s);
+    const auto tripped = sinew::protected_type<pair>("test.wrapper_ends_tripped", 20s);
+    sinew::endpoint sender(socket), receiver(socket);
+    std::atomic<int> safe_count = 0;
+    std::optional<sinew::guard<int>> guard;
+    guard.emplace(receiver.guard(sender.address(), moved, 7, [&safe_count](int &output, sinew_output_state) {
+        output = 0;
+        safe_count++;
+    }));
+    EXPECT(come_alive(sender, receiver, moved, *guard) && safe_count == 1);
+    EXPECT(guard->apply([&guard](int &output) { guard.reset(), output = 1; }) && !guard);
+    EXPECT(safe_count == 2);
+    EXPECT(receiver.guard(sender.address(), moved, 7, [](int &, sinew_output_state) {}).state() == SINEW_SAFE_NOT_ARMED);
+
+    std::atomic<bool> has_ended = false;
+    guard.emplace(receiver.guard(sender.address(), tripped, 7, [&](int &output, sinew_output_state why) {
+        output = 0;
+        if (why != SINEW_SAFE_TRIPPED)
+            return;
+        guard.reset();
+        has_ended = true;
+    }));
+    EXPECT(come_alive(sender, receiver, tripped, *guard));
+    guard->trip();
+    while (!has_ended)
+        std::this_thread::sleep_for(1ms);
+    EXPECT(receiver.guard(sender.address(), tripped, 7, [](int &, sinew_output_state) {}).state() == SINEW_SAFE_NOT_ARMED);
+}
+
 int main(int argc, char **argv)
 {
     const char *socket = argc > 1 ? argv[1] : "";
@@ -216,5 +256,6 @@ int main(int argc, char **argv)
     sends_may_have_a_time(endpoint);
     groups_and_names(socket);
     outputs_are_guarded(socket);
+    guards_end_in_their_own_functions(socket);
     std::puts("all well");
 }

@@ -6,6 +6,7 @@ use sinew_runtime::{tid::Incarnation, time::Time};
 
 use super::world::{PERIOD, Spec, World, claimant, ms, node, udp};
 use crate::{
+    gncl::LinkFact,
     ndl::{
         LossReason,
         core::{
@@ -93,6 +94,63 @@ fn of_two_that_settled_apart_the_later_life_gives_up_when_they_meet_and_who_had_
     world.run(PERIOD * 2);
     assert!(!world.gave_up(ELDER));
     assert_eq!((has(&world, 1), has(&world, 2)), (Some(Incarnation(1)), Some(Incarnation(1))));
+}
+
+// spec: NDL-5.3
+#[test]
+fn a_member_that_settles_and_lives_is_not_replaced_by_one_that_had_settled_and_is_gone_since() {
+    // Given: the later life has settled, and nobody hears it; the elder, which settles, is a member whose connection stands
+    let mut world = World::new();
+    world.signs_after = Some((ms(0), ms(1)));
+    [1, ELDER].into_iter().for_each(|other| part(&mut world, LATER, other));
+    world.start(LATER, &Spec { incarnation: 2, ..Spec::of(BOTH) });
+    world.run(PERIOD * 8);
+    world.start(1, &Spec::of(1));
+    world.start(ELDER, &Spec { incarnation: 1, ..Spec::of(BOTH) });
+    world.run(ms(100));
+    assert_eq!(has(&world, 1), Some(Incarnation(1)));
+    world.link(1, LinkFact::LinkUp { node: node(BOTH), incarnation: Incarnation(1) });
+    // When: node 1 meets the later life while its questions to the elder are lost
+    world.mend();
+    part(&mut world, ELDER, LATER);
+    world.cut(1, ELDER);
+    world.run_until(PERIOD * 2, |world| world.at(1).core.contests.contains_key(&node(BOTH)));
+    world.kill(LATER);
+    world.run(ms(60));
+    assert_eq!(world.at(ELDER).core.announcement().claim, Claim::Settling);
+    world.mend();
+    // Then: the elder answers, and stays
+    world.run(PERIOD * 2);
+    assert_eq!((has(&world, 1), world.losses(1)), (Some(Incarnation(1)), vec![]));
+    assert!(world.at(1).core.contests.is_empty());
+}
+
+// spec: NDL-5.3
+#[test]
+fn a_member_that_settles_gives_way_to_one_that_has_settled_and_shows_again_that_it_lives() {
+    // Given: as above
+    let mut world = World::new();
+    world.signs_after = Some((ms(0), ms(1)));
+    [1, ELDER].into_iter().for_each(|other| part(&mut world, LATER, other));
+    world.start(LATER, &Spec { incarnation: 2, ..Spec::of(BOTH) });
+    world.run(PERIOD * 8);
+    world.start(1, &Spec::of(1));
+    world.start(ELDER, &Spec { incarnation: 1, ..Spec::of(BOTH) });
+    world.run(ms(100));
+    world.link(1, LinkFact::LinkUp { node: node(BOTH), incarnation: Incarnation(1) });
+    world.mend();
+    part(&mut world, ELDER, LATER);
+    world.cut(1, ELDER);
+    // When: the later life lives on
+    world.run_until(PERIOD * 2, |world| world.at(1).core.contests.contains_key(&node(BOTH)));
+    world.run(ms(60));
+    world.mend();
+    part(&mut world, ELDER, LATER);
+    // Then: both are named, and it follows within the third of a challenge that it has
+    world.run_until(ms(150), |world| has(world, 1) == Some(Incarnation(2)));
+    assert_eq!(world.losses(1), [(BOTH, LossReason::Restarted)]);
+    let (holder, newcomer) = (claimant(BOTH, LATER), claimant(BOTH, ELDER));
+    assert_eq!(world.at(1).others, [Output::Collision { node: node(BOTH), holder, newcomer }]);
 }
 
 // spec: NDL-5.7

@@ -169,9 +169,11 @@ fn a_silent_node_is_lost_as_what_its_host_said_of_it_and_no_later_for_that() {
         assert!(world.knows(1, 2), "it is tried while it is suspected");
         let (node, incarnation) = world.at(1).probes[0];
         for host in said {
-            world.input(1, Input::Probed { node, incarnation, host: *host });
+            let asked = world.now;
+            world.input(1, Input::Probed { node, incarnation, host: *host, asked });
         }
-        world.input(1, Input::Probed { node, incarnation: Incarnation(9), host: Host::Refuses });
+        let asked = world.now;
+        world.input(1, Input::Probed { node, incarnation: Incarnation(9), host: Host::Refuses, asked });
         let took = world.run_until(PERIOD * 4, |world| !world.knows(1, 2));
         // then
         assert_eq!(world.losses(1), [(2, why)]);
@@ -186,10 +188,12 @@ fn what_a_host_said_of_an_earlier_silence_does_not_count() {
     world.cut(2, 1);
     world.run_until(PERIOD * 3, |world| !world.at(1).probes.is_empty());
     let (node, incarnation) = world.at(1).probes[0];
-    world.input(1, Input::Probed { node, incarnation, host: Host::Accepts });
+    let asked = world.now;
+    world.input(1, Input::Probed { node, incarnation, host: Host::Accepts, asked });
     world.mend();
     world.run(PERIOD * 2);
-    world.input(1, Input::Probed { node, incarnation, host: Host::Accepts });
+    let asked = world.now;
+    world.input(1, Input::Probed { node, incarnation, host: Host::Accepts, asked });
     world.kill(2);
     world.run(PERIOD * 5);
     assert_eq!(world.losses(1), [(2, LossReason::LinkDown)]);

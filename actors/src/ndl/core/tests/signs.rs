@@ -5,9 +5,12 @@ use std::time::Duration;
 use sinew_runtime::tid::{AppAddress, Incarnation, Tid};
 
 use super::world::{PERIOD, World, ms, node};
-use crate::ndl::{
-    LossReason, NodeEvent, Trouble,
-    core::{Host, Input},
+use crate::{
+    gncl::LinkFact,
+    ndl::{
+        LossReason, NodeEvent, Trouble,
+        core::{Host, Input},
+    },
 };
 
 /// Two nodes, and no datagram between them any more.
@@ -67,9 +70,35 @@ fn what_is_read_of_a_process_that_has_ended_keeps_nobody() {
     let mut world = two_that_are_cut();
     world.run_until(PERIOD * 2, |world| !world.at(1).probes.is_empty());
     let (node, incarnation) = world.at(1).probes[0];
-    world.input(1, Input::Probed { node, incarnation, host: Host::Refuses });
+    let asked = world.now;
+    world.input(1, Input::Probed { node, incarnation, host: Host::Refuses, asked });
     reads(&mut world, 1, PERIOD * 3);
     assert_eq!(world.losses(1), [(2, LossReason::Crashed)]);
+}
+
+#[test]
+fn a_connection_that_is_made_is_a_sign_whatever_its_host_has_said_before() {
+    // Given: a member whose host has refused what it was sent, as while GNCL is restarted there
+    let mut world = two_that_are_cut();
+    world.run_until(PERIOD * 2, |world| !world.at(1).probes.is_empty());
+    let ((of, incarnation), asked) = (world.at(1).probes[0], world.now);
+    let refused = || Input::Probed { node: of, incarnation, host: Host::Refuses, asked };
+    world.input(1, refused());
+    // When: it connects, and what it was asked before is heard once more
+    world.run(ms(1));
+    world.link(1, LinkFact::LinkUp { node: of, incarnation });
+    world.input(1, refused());
+    // Then: what is read of it counts
+    reads(&mut world, 1, PERIOD * 5);
+    assert_eq!(world.losses(1), []);
+    // And: where nothing is, its silence is counted from there
+    let mut world = two_that_are_cut();
+    world.run(PERIOD * 2);
+    world.link(1, LinkFact::LinkUp { node: of, incarnation });
+    let linked = world.now;
+    world.run_until(PERIOD * 10, |world| !world.losses(1).is_empty());
+    let Some(NodeEvent::NodeLost { silent_us, .. }) = world.at(1).events.last() else { panic!("a loss") };
+    assert_eq!(u128::from(*silent_us), world.now.since(linked).as_micros());
 }
 
 #[test]

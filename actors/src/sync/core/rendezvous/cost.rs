@@ -36,7 +36,7 @@ fn round(nodes: u32, parties: &[String]) -> (f64, f64) {
     let drain = |core: &mut Core| std::iter::from_fn(|| core.poll()).collect::<Vec<_>>();
     for app in 0..each {
         let (address, name) = (AppAddress::fixed(app).unwrap(), Some(name(0, app).to_string()));
-        core.handle(now, Input::AppChanged(AppFact::Registered { app: address, name, requires: Vec::new() }));
+        core.handle(now, Input::AppChanged(AppFact::own_registered(address, name, Vec::new())));
         core.handle(now, Input::AppChanged(AppFact::Ready { app: address }));
     }
     for node in 1..nodes {

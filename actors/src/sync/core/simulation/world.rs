@@ -209,7 +209,7 @@ impl World {
             return;
         }
         let app = app_address(WATCHER);
-        self.tell(node, Input::AppChanged(AppFact::Registered { app, name: None, requires: Vec::new() }));
+        self.tell(node, Input::AppChanged(AppFact::own_registered(app, None, Vec::new())));
         self.tell(node, Input::AppChanged(AppFact::Ready { app }));
         self.tell(node, Input::DirectoryWanted { app });
     }
@@ -458,7 +458,7 @@ impl World {
         }
         let requires = requires.iter().map(|wanted| self.spelled(wanted)).collect();
         let address = app_address(slot);
-        let fact = AppFact::Registered { app: address, name: Some(name(index)), requires };
+        let fact = AppFact::own_registered(address, Some(name(index)), requires);
         self.tell(node, Input::AppChanged(fact));
         if self.fault == Some(Fault::ReadyTooEarly) {
             self.tell(node, Input::AppChanged(AppFact::Ready { app: address }));

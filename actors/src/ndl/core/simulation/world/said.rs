@@ -34,12 +34,12 @@ impl World {
                 self.processes[from].goodbyes.insert(to.there);
                 self.send(from, to, What::Leave, &datagram);
             }
-            Output::Probe { node, incarnation, to, within } => {
+            Output::Probe { node, incarnation, to, within, asked } => {
                 let host = self.said_of(from, node_at(node), &to);
                 let takes = if host == Host::IsSilent { within } else { WORD_MAX.min(within / 2) };
                 self.ask_for_a_sign(from, node, WORD_MAX.min(within / 2));
                 let at = self.now + self.chance.between(Duration::ZERO, takes);
-                self.push(at, Event::Tell(from, Box::new(Input::Probed { node, incarnation, host })));
+                self.push(at, Event::Tell(from, Box::new(Input::Probed { node, incarnation, host, asked })));
             }
             Output::AskForSign { node, .. } => self.ask_for_a_sign(from, node, WORD_MAX),
             Output::Fact(fact) => self.told(from, fact),

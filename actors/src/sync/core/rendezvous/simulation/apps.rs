@@ -23,7 +23,7 @@ impl World {
     fn register(&mut self, node: usize, app: usize) {
         self.stages.insert((node, app), Stage::Unready);
         let (app, name) = (app_address(app), Some(name(self.homes[node], app)));
-        self.tell(node, Input::AppChanged(AppFact::Registered { app, name, requires: Vec::new() }));
+        self.tell(node, Input::AppChanged(AppFact::own_registered(app, name, Vec::new())));
     }
 
     fn becomes_ready(&mut self, node: usize, app: usize) {

@@ -187,7 +187,7 @@ impl Told {
             AppFact::Ready { app } => (app, None),
             AppFact::Down { app } => (app, Some(Reason::Failed)),
             AppFact::Stopped { app } => (app, Some(Reason::Stopped)),
-            AppFact::Guest { .. } | AppFact::Handles { .. } | AppFact::GroupsChanged => return,
+            AppFact::Handles { .. } | AppFact::GroupsChanged => return,
         };
         let standing = &mut self.own.get_mut(app).expect("it is registered").1;
         standing.unready = unready;
