@@ -3,6 +3,7 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet, VecDeque},
+    hash::{DefaultHasher, Hasher},
     num::NonZeroUsize,
     time::Duration,
 };
@@ -49,6 +50,7 @@ struct Play {
     receiver: Seals,
     nodes: [Seals; 2],
     forger: Seals,
+    key: u64,
     lives: [Incarnation; 2],
     sent: VecDeque<Sent>,
     proven: BTreeMap<NodeAddress, Proven>,
@@ -58,10 +60,12 @@ struct Play {
 /// Plays a script. Returns whether any datagram was taken.
 pub(crate) fn seals(script: &[u8]) -> bool {
     let lives = [Incarnation(100), Incarnation(200)];
+    let key = key_for(script);
     let mut play = Play {
-        receiver: seals_of(b'0', NodeAddress::new(1), Incarnation(1)),
-        nodes: [0, 1].map(|index| seals_of(b'0', NODES[index], lives[index])),
-        forger: seals_of(b'1', NODES[0], lives[0]),
+        receiver: seals_of(key, NodeAddress::new(1), Incarnation(1)),
+        nodes: [0, 1].map(|index| seals_of(key, NODES[index], lives[index])),
+        forger: seals_of(!key, NODES[0], lives[0]),
+        key,
         lives,
         sent: VecDeque::new(),
         proven: BTreeMap::new(),
@@ -74,8 +78,17 @@ pub(crate) fn seals(script: &[u8]) -> bool {
     play.taken > 0
 }
 
-fn seals_of(digit: u8, node: NodeAddress, life: Incarnation) -> Seals {
-    let key = DiscoveryKey::read(&[digit; 2 * DiscoveryKey::BYTES]).expect("these are digits");
+/// The key of all honest nodes of this script, and of no other one: whoever writes scripts reads what is compared, so he knows the tags of all
+/// that was sealed in others, and with one key for all could write a datagram that an honest node is yet to make.
+fn key_for(script: &[u8]) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    hasher.write(script);
+    hasher.finish()
+}
+
+fn seals_of(key: u64, node: NodeAddress, life: Incarnation) -> Seals {
+    let digits = format!("{key:016x}").repeat(2 * DiscoveryKey::BYTES / 16);
+    let key = DiscoveryKey::read(digits.as_bytes()).expect("these are digits");
     Seals::new(&key, PROJECT, node, life, NonZeroUsize::new(4).expect("it is not 0"))
 }
 
@@ -108,7 +121,7 @@ impl Play {
                 // Whether the clock has gone on, or begun anew: a life is never used twice.
                 let Incarnation(life) = self.lives[index];
                 self.lives[index] = Incarnation(if index == 0 { life + 1 } else { life.saturating_sub(1) });
-                self.nodes[index] = seals_of(b'0', NODES[index], self.lives[index]);
+                self.nodes[index] = seals_of(self.key, NODES[index], self.lives[index]);
             }
             7 => {
                 let mut forged = BytesMut::from(&NODES[0].bits().to_le_bytes()[..]);
