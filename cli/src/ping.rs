@@ -5,7 +5,7 @@ use std::time::Duration;
 use serde_json::json;
 use sinew::{
     Outcome, Rejection, Tid, Time,
-    inspect::{AppsReport, AskApps, Ping},
+    inspect::{AppReport, AppsReport, AskApps, Ping},
 };
 
 use crate::{
@@ -75,11 +75,20 @@ pub(crate) fn judged(outcome: Outcome, within: Duration) -> Result<(), String> {
 }
 
 /// Why the application at `to` is not ready, if it is not: better known than that it does not answer.
-fn not_ready(system: &mut System, to: Tid) -> Option<String> {
+pub(crate) fn not_ready(system: &mut System, to: Tid) -> Option<String> {
     let answers = system.ask_these::<AskApps, AppsReport>(vec![(to.node, String::new())]);
     let said = answers.into_iter().find_map(|answer| answer.said.ok())?;
-    let app = said.apps.iter().find(|app| app.tid == to && !app.ready)?;
-    Some(format!("it is not ready: {}", apps::why(app)))
+    said.apps.iter().find(|app| app.tid == to).and_then(unready)
+}
+
+/// Why this application is not ready, if it is not.
+pub(crate) fn unready(app: &AppReport) -> Option<String> {
+    let why = apps::why(app);
+    match (app.ready, why.is_empty()) {
+        (true, _) => None,
+        (false, true) => Some("it is not ready".to_owned()),
+        (false, false) => Some(format!("it is not ready: {why}")),
+    }
 }
 
 impl Tally {
@@ -117,7 +126,34 @@ fn nanos(time: Duration) -> u64 {
 
 #[cfg(test)]
 mod tests {
+    use sinew::{AppAddress, NodeAddress, inspect::Missing};
+
     use super::*;
+
+    #[test]
+    fn an_application_is_not_ready_for_a_reason_that_is_said_and_one_that_is_ready_has_none() {
+        let missing = Missing { name: "ankle".to_owned(), why: "not there".to_owned(), since_us: None };
+        let mut app = AppReport {
+            tid: Tid::new(NodeAddress::from([10, 0, 0, 2]), AppAddress::new(0x1001)),
+            name: Some("knee".to_owned()),
+            ready: false,
+            waits_us: Some(2_000_000),
+            missing: vec![missing],
+            missing_left_out: 0,
+            ended: None,
+            kinds: Vec::new(),
+            kinds_left_out: 0,
+        };
+        let why = "it is not ready: has waited 2.0 s for ankle (not there)";
+        assert_eq!(unready(&app).as_deref(), Some(why));
+        // It lost what it needs, and goes on.
+        (app.ready, app.waits_us) = (true, None);
+        assert_eq!(unready(&app), None);
+        // Its last life ended, and said nothing.
+        (app.ready, app.ended) = (false, Some(String::new()));
+        app.missing.clear();
+        assert_eq!(unready(&app).as_deref(), Some("it is not ready"));
+    }
 
     #[test]
     fn a_quantile_is_the_round_trip_that_so_many_did_not_exceed() {

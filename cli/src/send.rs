@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use sinew::{ApiError, Class, Kind, LentMessage, Outcome, Tid, Time};
 
 use crate::{
-    Said, messagepack,
+    Said, messagepack, ping,
     system::{Fault, System},
     table::{clean, time},
 };
@@ -65,6 +65,22 @@ struct Ended {
     outcome: Option<Outcome>,
     reply: Option<Value>,
     fault: Option<String>,
+    /// Nobody has come to it in its time, or said so: the outcome does not tell why.
+    is_unheard: bool,
+}
+
+impl Ended {
+    /// A receiver that is known not to be ready is the reason why nobody has come to it.
+    fn explained_by(&mut self, not_ready: impl FnOnce() -> Option<String>) {
+        if self.is_unheard
+            && let Some(why) = not_ready()
+        {
+            self.fault = Some(match self.outcome {
+                Some(outcome) => format!("{outcome:?}: {why}"),
+                None => why,
+            });
+        }
+    }
 }
 
 /// Sends it, and says what became of it.
@@ -73,8 +89,9 @@ pub(crate) fn show(system: &mut System, order: &Order) -> Result<Said, Fault> {
     let kind = kind(&order.kind)?;
     let payload = payload(&order.payload)?;
     let began = Time::now();
-    let ended = send(system, to, (kind, &payload), order);
+    let mut ended = send(system, to, (kind, &payload), order);
     let took = Time::now().since(began);
+    ended.explained_by(|| ping::not_ready(system, to));
     let micros = u64::try_from(took.as_micros()).unwrap_or(u64::MAX);
     let said = match (&ended.fault, &ended.reply, ended.outcome) {
         (Some(why), ..) => clean(why),
@@ -114,14 +131,23 @@ fn send(system: &mut System, to: Tid, (kind, payload): (Kind, &[u8]), order: &Or
         }
         endpoint.send_message_confirmed(lent, within).map(|outcome| (Some(outcome), None))
     });
+    ended_of(ended, order)
+}
+
+fn ended_of(ended: Result<(Option<Outcome>, Option<Value>), ApiError>, order: &Order) -> Ended {
+    let is_open = |outcome: Outcome| matches!(outcome, Outcome::Unknown | Outcome::Expired);
     match ended {
-        Ok((outcome, reply)) => {
-            Ended { outcome, reply, fault: outcome.and_then(|outcome| fault(outcome, order)) }
+        Ok((outcome, reply)) => Ended {
+            outcome,
+            reply,
+            fault: outcome.and_then(|outcome| fault(outcome, order)),
+            is_unheard: outcome.is_some_and(is_open),
+        },
+        Err(error) => {
+            let outcome = if let ApiError::Ended(outcome) = error { Some(outcome) } else { None };
+            let is_unheard = matches!(error, ApiError::NoReply(_)) || outcome.is_some_and(is_open);
+            Ended { outcome, reply: None, fault: Some(error.to_string()), is_unheard }
         }
-        Err(ApiError::Ended(outcome)) => {
-            Ended { outcome: Some(outcome), reply: None, fault: Some(ApiError::Ended(outcome).to_string()) }
-        }
-        Err(error) => Ended { outcome: None, reply: None, fault: Some(error.to_string()) },
     }
 }
 
@@ -168,4 +194,59 @@ fn payload(json: &str) -> Result<Vec<u8>, Fault> {
         Fault::Usage(format!("the payload is no JSON: {error}. A text needs its quotes: '\"on\"'"))
     })?;
     messagepack::written(&value).map_err(Fault::Usage)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use sinew::Rejection;
+
+    use super::*;
+
+    fn order() -> Order {
+        Order {
+            whom: "knee".to_owned(),
+            kind: "demo.angle".to_owned(),
+            payload: "{}".to_owned(),
+            ask: false,
+            class: ClassName::Control,
+            unconfirmed: false,
+            within: 2_000,
+        }
+    }
+
+    /// What is said of it where the receiver is known not to be ready.
+    fn said_of_a_waiting(ended: Result<Outcome, ApiError>) -> String {
+        let mut ended = ended_of(ended.map(|outcome| (Some(outcome), None)), &order());
+        ended.explained_by(|| Some("it is not ready: has waited 2.0 s for ankle (not there)".to_owned()));
+        ended.fault.unwrap_or_default()
+    }
+
+    #[test]
+    fn a_message_that_nobody_came_to_is_explained_by_a_receiver_that_is_not_ready() {
+        let why = "it is not ready: has waited 2.0 s for ankle (not there)";
+        assert_eq!(said_of_a_waiting(Ok(Outcome::Unknown)), format!("Unknown: {why}"));
+        assert_eq!(said_of_a_waiting(Ok(Outcome::Expired)), format!("Expired: {why}"));
+        assert_eq!(said_of_a_waiting(Err(ApiError::Ended(Outcome::Unknown))), format!("Unknown: {why}"));
+        assert_eq!(said_of_a_waiting(Err(ApiError::NoReply(Duration::from_secs(2)))), why);
+    }
+
+    #[test]
+    fn what_has_a_reason_of_its_own_keeps_it_and_nobody_is_asked_for_another() {
+        assert_eq!(said_of_a_waiting(Ok(Outcome::Delivered)), "");
+        let full = Outcome::Rejected(Rejection::QueueFull);
+        for ended in [Ok(full), Ok(Outcome::PeerLost), Err(ApiError::Ended(full)), Err(ApiError::Lent)] {
+            let said = said_of_a_waiting(ended);
+            assert!(!said.is_empty() && !said.contains("not ready"), "{said}");
+        }
+    }
+
+    #[test]
+    fn a_message_to_one_that_is_ready_is_unknown_as_nobody_has_said() {
+        let mut ended = ended_of(Ok((Some(Outcome::Unknown), None)), &order());
+        ended.explained_by(|| None);
+        let said = ended.fault.expect("it is no success");
+        assert!(said.starts_with("Unknown: nobody has said within 2000 ms"), "{said}");
+    }
 }

@@ -1,5 +1,6 @@
 //! `sinew watch`: what an application gets and sends, as it goes by.
 
+mod envelope;
 mod rates;
 
 use std::{
@@ -244,6 +245,7 @@ impl Screen {
     }
 
     fn message_json(&self, message: &SeenMessage) -> Value {
+        let (counter, payload) = if is_whole(message) { value(&message.payload) } else { Default::default() };
         json!({
             "event": "message", "sent": message.is_sent, "kind": kind(message), "kind_id": message.kind.to_string(),
             "class": format!("{:?}", message.class).to_lowercase(), "wants": message.wants,
@@ -251,7 +253,8 @@ impl Screen {
             "target": message.target.to_string(), "target_name": self.names.apps.get(&message.target),
             "sequence": message.sequence, "age_ns": message.age_error_ns.map(|_| message.age_ns), "age_error_ns": message.age_error_ns, "bytes": message.length,
             "refused": message.refused.map(|refused| format!("{refused:?}")),
-            "payload": is_whole(message).then(|| messagepack::shown_or_raw(&message.payload)),
+            "protected": counter.map(|counter| json!({ "counter": counter })),
+            "payload": payload,
         })
     }
 
@@ -274,11 +277,20 @@ const fn is_whole(message: &SeenMessage) -> bool {
 }
 
 fn payload(message: &SeenMessage) -> String {
-    if is_whole(message) {
-        messagepack::shown_or_raw(&message.payload).to_string()
-    } else {
-        format!("({} bytes, too long to be shown)", message.length)
+    if !is_whole(message) {
+        return format!("({} bytes, too long to be shown)", message.length);
     }
+    match value(&message.payload) {
+        (Some(counter), value) => format!("protected #{counter} {value}"),
+        (None, value) => value.to_string(),
+    }
+}
+
+/// What a payload says, and the counter of one that is protected.
+fn value(payload: &[u8]) -> (Option<u64>, Value) {
+    let unsealed = envelope::unsealed(payload);
+    let inner = unsealed.map_or(payload, |unsealed| unsealed.payload);
+    (unsealed.map(|unsealed| unsealed.counter), messagepack::shown_or_raw(inner))
 }
 
 fn clean_lines(text: &str) -> String {
@@ -292,7 +304,10 @@ fn say(line: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use sinew::{Outcome, Rejection};
+    use sinew::{
+        Class, Kind, Outcome, Rejection, Time,
+        protection::{Codename, Stamp, seal},
+    };
 
     use super::*;
     use crate::{FINDING, NOBODY};
@@ -338,5 +353,69 @@ mod tests {
             let (said, code) = blamed(Vain::of(&error), there, &names());
             assert_eq!((said, code), (format!("the node at /run/hip.sock: {}", in_words(&error)), NOBODY));
         }
+    }
+
+    /// A message of the hip to the knee with this payload.
+    fn seen(payload: Vec<u8>) -> SeenMessage {
+        let tid = |node| Tid::new(node, AppAddress::new(0x1001));
+        SeenMessage {
+            seen_us: 0,
+            age_ns: 1_000,
+            age_error_ns: Some(0),
+            is_sent: true,
+            source: tid(HIP),
+            target: tid(KNEE),
+            kind: Kind::named("demo.angle"),
+            name: Some("demo.angle".to_owned()),
+            class: Class::Stream,
+            sequence: 9,
+            wants: None,
+            length: payload.len() as u64,
+            payload,
+            refused: None,
+        }
+    }
+
+    /// In an envelope, as the hip's message 103 of this type.
+    fn sealed(payload: &[u8]) -> Vec<u8> {
+        let SeenMessage { source, target, .. } = seen(Vec::new());
+        let codename = Codename { source, destination: target, name: "demo.angle" };
+        let stamp = Stamp { counter: 103, incarnation: 7, echo: Time::ZERO };
+        seal(&codename, stamp, payload).to_vec()
+    }
+
+    fn screen() -> Screen {
+        Screen { names: Names::default(), is_json: true, rates_only: false }
+    }
+
+    #[test]
+    fn a_protected_payload_is_decoded_and_shown_as_such_with_its_counter() {
+        let angle = json!({ "degrees": 1.5 });
+        let message = seen(sealed(&messagepack::written(&angle).unwrap()));
+        // For people
+        assert_eq!(payload(&message), r#"protected #103 {"degrees":1.5}"#);
+        // For programs: its counter is not the number that its source gave the message
+        let said = screen().message_json(&message);
+        assert_eq!((&said["protected"], &said["payload"]), (&json!({ "counter": 103 }), &angle));
+        assert_eq!(said["sequence"], 9);
+        // And: of what is in it and no MessagePack, as between programs in C, its bytes
+        assert_eq!(payload(&seen(sealed(&[1, 2]))), r#"protected #103 {"bytes":"0102"}"#);
+    }
+
+    #[test]
+    fn a_payload_without_an_envelope_is_shown_as_it_is_and_is_not_called_protected() {
+        let angle = json!({ "degrees": 1.5 });
+        let message = seen(messagepack::written(&angle).unwrap());
+        assert_eq!(payload(&message), r#"{"degrees":1.5}"#);
+        let said = screen().message_json(&message);
+        assert_eq!((&said["protected"], &said["payload"]), (&Value::Null, &angle));
+        // One byte is missing of this one.
+        let mut cut = sealed(&[0x80]);
+        cut.pop();
+        assert!(payload(&seen(cut)).starts_with(r#"{"bytes":"0100000001"#));
+        // And of one that was too long to be brought nothing is said.
+        let long = SeenMessage { length: 1 << 20, ..seen(Vec::new()) };
+        assert_eq!(screen().message_json(&long)["payload"], Value::Null);
+        assert_eq!(payload(&long), "(1048576 bytes, too long to be shown)");
     }
 }

@@ -193,6 +193,10 @@ impl Endpoint {
         let now = Time::now();
         draft.header.sent = now;
         let destination = self.absolute(draft.header.destination);
+        if !self.home.rejoining.is_empty() {
+            // The node reads on when its answers about groups are taken, which who only sends does here: before it is settled which way this goes.
+            let _ = self.take_in_from_node(None, WhenFull::Leave, now);
+        }
         if let Some(link) = self.way(destination, now) {
             draft.header.destination = destination;
             let is_awaited = draft.header.flags.has(Flags::CONFIRM);
@@ -208,10 +212,6 @@ impl Endpoint {
         self.be_there()?;
         if self.reader.has_ended(now) {
             return Err(self.explain(ApiError::Closed("the node has gone".to_owned())));
-        }
-        if !self.home.rejoining.is_empty() {
-            // The node reads on when its answers about groups are taken, which who only sends does here.
-            let _ = self.take_in_from_node(None, WhenFull::Leave, now);
         }
         self.write(draft, limit).await.map(|()| None).map_err(|error| self.explain(error))
     }

@@ -24,9 +24,10 @@ const AT_SYNC_MAX: usize = 48;
 const AT_INSPECTION_MAX: usize = 8;
 /// Of these two shares one user has this part at most: none keeps all others out alone. Two of them leave nothing for a third.
 const USERS: usize = 2;
-/// Leaves of one user that wait for the sync manager, at most: as many as one is at barriers. Nobody says a leave again, so nobody else's are in its
-/// way, nor is anything else: all together are bounded by how many guests there may be.
-const LEAVES_OF_USER: usize = 32;
+/// Leaves of all guests that wait for the sync manager, at most, and those of one user. Nobody says a leave again, so nothing else is in its way, and
+/// there is room for all that the applications of a user give up at once, if these are not hundreds.
+const LEAVES_MAX: usize = 1_024;
+const LEAVES_OF_USER: usize = LEAVES_MAX / 4;
 
 /// What one user may have waiting for the sync manager but for leaves.
 #[cfg(test)]
@@ -64,7 +65,7 @@ impl Shares {
         let (share, of_all, of_user) = match app {
             AppAddress::SYNC if !is_here => return Err(Refused::new(message, Rejection::ForgedSource)),
             AppAddress::SYNC if message.header.kind == LeaveBarrier::KIND => {
-                (&self.leaves, usize::MAX, LEAVES_OF_USER)
+                (&self.leaves, LEAVES_MAX, LEAVES_OF_USER)
             }
             AppAddress::SYNC => (&self.sync, AT_SYNC_MAX, AT_SYNC_MAX / USERS),
             AppAddress::INSPECT if is_here => {
@@ -241,8 +242,8 @@ mod tests {
         };
         let others = [USER, USER + 1].map(|uid| fill(&shares, uid, AppAddress::SYNC));
         // When, then
-        let held = [USER, USER + 1, USER + 2].map(leaves);
-        assert_eq!(held.each_ref().map(Vec::len), [LEAVES_OF_USER; 3]);
+        let held = [0, 1, 2, 3, 4].map(|number| leaves(USER + number));
+        assert_eq!(held.each_ref().map(Vec::len), [256, 256, 256, 256, 0]);
         // And: leaves are in the way of nothing else
         drop(others);
         assert_eq!(fill(&shares, USER, AppAddress::SYNC).len(), OF_USER_AT_SYNC);

@@ -270,15 +270,27 @@ impl Shell {
                 "node address {node} is used twice: by {holder}, and by {newcomer}, which is not let in; give one of \
                  them another `address`"
             ),
-            Output::AddressTaken { holder } => give_up(&format!(
-                "node address {} is used already, by {holder}; set `address` of this node to \
-                 a free one",
-                self.stores.node
+            Output::AddressTaken { holder } => self.end_node(format!(
+                "node address {} is used already by '{}' at {}; give this node another `node.address`, or \
+                 end the other one",
+                self.stores.node, holder.name, holder.at
             )),
             Output::Stalled { late } => crate::log::warn!(
                 late_ms = late.as_millis(),
                 "NDL was starved: its own timer came late, so of such cycles only one in four counts whoever is silent"
             ),
+        }
+    }
+
+    /// A later instance would find the same: the root ends the node, and nothing is tried again.
+    // spec: NDL-5.5
+    fn end_node(&self, words: String) {
+        let root = &self.stores.posts.root;
+        // A root whose post is full hears it from the supervisor, after restarts.
+        if let Err(node::RootEvent::AddressTaken(words)) = root.post(node::RootEvent::AddressTaken(words))
+            && !root.is_closed()
+        {
+            give_up(&words);
         }
     }
 

@@ -1,6 +1,7 @@
 //! Declares a node and starts it.
 
 use std::{
+    net::Ipv4Addr,
     path::PathBuf,
     process::ExitCode,
     sync::{Arc, mpsc::sync_channel},
@@ -78,6 +79,9 @@ pub enum StartError {
     /// A layer did not become ready.
     #[error("the layers did not start: {0}")]
     Layers(String),
+    /// Another living process has the node's address: the words say which one. Nothing is tried again.
+    #[error("{0}")]
+    AddressTaken(String),
     /// Applications require each other in a circle: none of them can be the first.
     #[error("these applications require each other in a circle: {}; take one requirement out", .0.join(" -> "))]
     Cycle(Vec<String>),
@@ -233,8 +237,8 @@ impl NodeBuilder {
     /// keep it short there, and do not read the standard input.
     ///
     /// # Errors
-    /// The configuration has faults, or turns security on and the keys cannot be used; `lncl.socket` cannot be had, an application cannot be registered, or a layer did not
-    /// become ready.
+    /// The configuration has faults, or turns security on and the keys cannot be used; `lncl.socket` cannot be had, an application cannot be registered, a layer did not
+    /// become ready, or another process was found by then that has the node's address. One that is found later ends the node in the same words.
     pub fn start(mut self) -> Result<Node, StartError> {
         // Here, on a thread like any other.
         log::begin();
@@ -253,6 +257,7 @@ impl NodeBuilder {
         let stores = Stores::new(self.config, incarnation);
         if !is_bystander {
             secure(&stores, secured);
+            say_deaf(&stores.config);
             guard(&stores, list);
         }
         #[cfg(feature = "fault-points")]
@@ -310,6 +315,19 @@ fn secure(stores: &Stores, secured: Option<Secured>) {
             "this node is OPEN: whoever is on its network can send to its applications, and pose as any node. Make keys with \
              `sinew keys init`, and set security.keys on all nodes"
         ),
+    }
+}
+
+/// Says of a node with an address of a network that no other host hears it, as nobody has chosen an interface. Who writes loopback means it.
+fn say_deaf(config: &NodeConfig) {
+    let address = config.node_address();
+    if config.ndl.interface.are_default() && !Ipv4Addr::from(address.bits()).is_loopback() {
+        log::warn!(
+            %address,
+            interface = %config.ndl.interface,
+            "this node is on loopback alone, the default, though its address is one of a network: no other host sees it, and it sees none. Set \
+             ndl.interface to an address of this host there, or to \"lo\" if loopback is meant"
+        );
     }
 }
 
@@ -378,7 +396,7 @@ fn check_panics(unwinds: bool, accepted: bool) -> Result<(), StartError> {
 
 #[cfg(test)]
 mod tests {
-    use std::{net::Ipv4Addr, sync::Mutex, time::Duration};
+    use std::sync::Mutex;
 
     use super::*;
     use crate::security::tests::ground::{self, Authority};
@@ -417,6 +435,31 @@ mod tests {
         let credentials = Authority::new("walker").credentials("knee", 7);
         let own = Secured::new(ground::tls(&credentials), &credentials, 8, Incarnation(1));
         assert_eq!(said(network, Some(own)), "");
+    }
+
+    #[test]
+    fn a_node_with_an_address_of_a_network_that_is_left_on_loopback_says_that_no_other_host_sees_it() {
+        let said = |address: [u8; 4], interface: Option<Ipv4Addr>| {
+            let mut config = NodeConfig::new("knee");
+            config.address = Some(NodeAddress::from(address));
+            if let Some(interface) = interface {
+                config.ndl.interface = interface.into();
+            }
+            logged(|| say_deaf(&config))
+        };
+        // Given: nobody chose an interface
+        let words = said([192, 0, 2, 7], None);
+        // Then: cause and remedy are said
+        assert!(
+            ["WARN", "192.0.2.7", "127.0.0.1", "no other host sees it", "ndl.interface"]
+                .iter()
+                .all(|word| words.contains(word)),
+            "{words:?}"
+        );
+        // And: nothing where it is heard, where loopback is meant, or where its address is one of loopback
+        assert_eq!(said([192, 0, 2, 7], Some(Ipv4Addr::new(192, 0, 2, 7))), "");
+        assert_eq!(said([192, 0, 2, 7], Some(Ipv4Addr::LOCALHOST)), "");
+        assert_eq!(said([127, 0, 0, 7], None), "");
     }
 
     #[test]

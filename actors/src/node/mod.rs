@@ -392,8 +392,36 @@ impl NodeHandle {
 
 #[cfg(test)]
 mod tests {
+    use actix::Actor;
+    use sinew_runtime::app::{AppContext, AppSpec};
+
     use super::*;
     use crate::config::NodeConfig;
+
+    struct Idle;
+
+    impl Actor for Idle {
+        type Context = AppContext<Self>;
+    }
+
+    #[test]
+    fn a_node_whose_address_is_taken_ends_in_these_words_and_so_hears_who_waits_for_its_applications() {
+        // Given: a node with an application that waits for another one
+        let alone = |config: &mut NodeConfig| (config.ndl.multicast, config.ndl.mdns_port) = (None, None);
+        let waits = AppSpec::new("waits", || Idle).requires(["nobody"]);
+        let node = Node::builder("knee").address([127, 0, 0, 77]).configure(alone).app(waits);
+        let node = node.start().expect("its layers start");
+        let (asker, question) = Asker::new();
+        let asked = node.handle.tell(RootEvent::TellWhenRunning(asker));
+        assert_eq!(asked, Told::Taken);
+        // When
+        let words = "it is used already by 'hip'".to_owned();
+        assert_eq!(node.handle.tell(RootEvent::AddressTaken(words.clone())), Told::Taken);
+        // Then
+        let heard = question.heard.recv_timeout(Duration::from_secs(60)).expect("it is answered");
+        assert!(matches!(heard, Err(StartError::AddressTaken(said)) if said == words));
+        assert_eq!(node.wait_for_end(), NodeEnd::GaveUp(words));
+    }
 
     #[test]
     fn who_asks_a_root_that_takes_no_more_orders_is_told_so_and_not_that_nobody_waits() {

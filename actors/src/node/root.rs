@@ -87,6 +87,8 @@ pub(super) struct Root {
     pub(super) layer_supervisor: Option<Roster>,
     pub(super) app_supervisor: Option<Roster>,
     last_layer_fault: Option<String>,
+    /// Who has the node's address; the node ends of it.
+    address_taken: Option<String>,
     cycle: Option<Cycle>,
     started: Option<SyncSender<Result<(), StartError>>>,
     ended: SyncSender<NodeEnd>,
@@ -125,6 +127,7 @@ pub(super) fn run(
         layer_supervisor: None,
         app_supervisor: None,
         last_layer_fault: None,
+        address_taken: None,
         cycle: None,
         started: Some(started),
         ended,
@@ -192,6 +195,7 @@ impl StreamHandler<RootEvent> for Root {
             RootEvent::Ordered(ordered) => self.ordered(ordered),
             // Who asked may have stopped waiting.
             RootEvent::TellTree(answer) => _ = answer.try_send(self.tree()),
+            RootEvent::AddressTaken(words) => self.address_taken(words),
             RootEvent::TellProgress(answer) => _ = answer.send(self.progress()),
             RootEvent::HeedSignals => self.heed_signals(context),
             RootEvent::StopOrdered => self.stop_apps(),
@@ -256,6 +260,24 @@ impl Root {
             Phase::StoppingApps => {}
             Phase::StartingLayers | Phase::StoppingLayers => self.finish(context),
         }
+    }
+
+    /// No restart of a layer mends it: the node ends, its applications first. // spec: NDL-5.5
+    fn address_taken(&mut self, words: String) {
+        match self.phase {
+            Phase::StartingLayers | Phase::Running => {}
+            // It gives the address up in any case.
+            Phase::StoppingApps | Phase::StoppingLayers => return,
+        }
+        self.end = NodeEnd::GaveUp(words.clone());
+        self.address_taken = Some(words.clone());
+        // No error: the owner says that, who is given these words. But he may read them late, or never.
+        crate::log::warn!(node = self.stores.config.name, "{words}");
+        if let Some(started) = self.started.take() {
+            // The owner may have lost its patience already.
+            let _ = started.send(Err(StartError::AddressTaken(words)));
+        }
+        self.stop_apps();
     }
 
     fn start_apps(&mut self) {
@@ -409,8 +431,16 @@ impl Root {
     fn tell_if_running(&mut self) {
         match self.phase {
             Phase::StartingLayers | Phase::Running => {}
-            // Applications that have ended for good are no applications that run. Dropped, this says that the node ends.
-            Phase::StoppingApps | Phase::StoppingLayers => return self.tell_when_running.clear(),
+            // Applications that have ended for good are no applications that run.
+            Phase::StoppingApps | Phase::StoppingLayers => {
+                for asker in self.tell_when_running.drain(..) {
+                    // Dropped, it says that the node ends.
+                    if let Some(words) = &self.address_taken {
+                        asker.answer(Err(StartError::AddressTaken(words.clone())));
+                    }
+                }
+                return;
+            }
         }
         let is_running = self.app_supervisor.is_some() && self.apps.all_run();
         // Once one of them is removed, here or elsewhere, or requires less, the circle is open.

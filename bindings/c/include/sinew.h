@@ -1229,9 +1229,9 @@ sinew_status sinew_guard_tally(struct sinew_guard *guard, struct sinew_tally *ta
 sinew_status sinew_release(struct sinew_guard **guard);
 
 /**
- * The same for where a guard calls the program, which may not wait: makes the output safe as `sinew_trip`, and lets go of it when nobody has it in hand
- * any more, at the latest with the next guard that is made, which waits for that. `*guard` is NULL then, and no call knows it any more. Nobody says when
- * the library calls nothing of it any more: `output` and what makes it safe must be there until the end of the process. Does not block. Any thread.
+ * The same for where a guard calls the program, which may not wait: makes the output safe as `sinew_trip`, and lets go of it as soon as nobody has it in
+ * hand any more and it is safe. `*guard` is NULL then, and no call knows it any more. Nobody says when the library calls nothing of it any more: `output`
+ * and what makes it safe must be there until the end of the process. Does not block. Any thread.
  */
 sinew_status sinew_release_later(struct sinew_guard **guard);
 

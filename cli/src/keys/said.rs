@@ -153,11 +153,17 @@ fn sent(directory: &str, (what, files): (&str, &[&str]), issued: &Issued, prepar
     (!is_here(issued)).then(|| format!("  tar -C {from} -c {what} | ssh root@{host} '{unpack}'\n"))
 }
 
-/// What the node's configuration needs. Texts of JSON are texts of TOML. On a network multicast DNS is off: keys are nothing to it.
+/// What the node's configuration needs. Texts of JSON are texts of TOML. On a network it says the interface, as the default is loopback, where no
+/// other host hears the node, and multicast DNS is off: keys are nothing to it.
 fn configuration(made: &Made, issued: &Issued) -> String {
     let text = |text: &str| Value::from(text).to_string();
     let identity = &issued.identity;
-    let discovery = if is_here(issued) { "" } else { "[ndl]\nmdns_port = false\n" };
+    let discovery = if is_here(issued) {
+        String::new()
+    } else {
+        let own = identity.address;
+        format!("[ndl]\ninterface = \"{own}\"  # an address of the node's own host\nmdns_port = false\n")
+    };
     format!(
         "[node]\nname = {}\nproject = {}\naddress = \"{}\"\n{discovery}[security]\nkeys = {}\n",
         text(&identity.name),

@@ -7,11 +7,14 @@ use sinew::{
     inspect::{AccessReport, AccessVerdict, AppReport, NodeReport, PeerReport, StreamReport, TreeLine},
 };
 
+use crate::ping;
+
 /// All that the rules look at.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Facts {
     pub(super) ends: [End; 2],
-    /// From the node of the first to the second, and back: microseconds until it was confirmed, or why not. `None`: not tried.
+    /// From the node of the first to the second, and back: microseconds until it was confirmed, or why not. `None`: not tried, as
+    /// where the second is known not to be ready.
     pub(super) pings: [Option<Result<u64, String>>; 2],
     /// What the node of the first has counted for that of the second when a value of class Stream had been sent to it, and back. `None`: none
     /// was sent.
@@ -127,6 +130,11 @@ impl End {
     /// The node, as it is called.
     pub(super) fn node_label(&self) -> &str {
         self.report.as_ref().map_or(&self.wanted, |report| &report.name)
+    }
+
+    /// Why its application takes no messages yet, if its node says so.
+    pub(super) fn not_ready(&self) -> Option<String> {
+        ping::unready(self.app.as_ref()?.report.as_ref()?)
     }
 
     /// What its node says of another one.

@@ -153,7 +153,8 @@ impl<'a> Gathered<'a> {
     pub(super) fn facts(&mut self, wanted: [&str; 2]) -> Facts {
         let found = self.find_both(wanted);
         let ends = [self.end(wanted[0], &found[0]), self.end(wanted[1], &found[1])];
-        let targets = [found[0].target(), found[1].target()];
+        // What waits for its start answers no ping, and that is known.
+        let targets = [0, 1].map(|at: usize| found[at].target().filter(|_| ends[at].not_ready().is_none()));
         let pings = [self.ping(found[0].at, targets[1]), self.ping(found[1].at, targets[0])];
         let access = [self.access(&found[0], &found[1]), self.access(&found[1], &found[0])];
         let waits = self.nodes.iter().flat_map(Asked::named_apps).filter(|app| !app.ready);

@@ -1,6 +1,7 @@
 //! From what two ends say to what stands in the way between them: facts in, steps out, nothing asked and nothing waited for.
 
 mod access;
+mod address;
 mod groups;
 mod keys;
 mod many;
@@ -59,7 +60,7 @@ pub(super) fn judge(facts: &Facts) -> Vec<Step> {
         steps.there(end, facts);
         steps.meant(end);
     }
-    steps.address(a, b);
+    steps.address(facts);
     if a.node.is_some() && a.node != b.node {
         steps.project(a, b);
         steps.keys(a, b);
@@ -134,36 +135,6 @@ impl Steps {
             format!("from node {seen_from} the name stands for {tid}, not for {}{more}", named.join(", ")),
             "`sinew why` with the TID of another one looks at that",
         );
-    }
-
-    /// No two processes have the address of one of them.
-    fn address(&mut self, a: &End, b: &End) {
-        let nodes: Vec<String> =
-            [a, b].iter().filter_map(|end| end.node).map(|node| node.to_string()).collect();
-        // The node that is used twice is the first word.
-        let is_ours =
-            |detail: &str| detail.split(' ').next().is_some_and(|word| nodes.iter().any(|node| node == word));
-        for end in [a, b] {
-            if let (Some(node), Some(double)) = (end.node, end.doubles.first()) {
-                self.blocked(
-                    format!("{} has its address alone", end.label()),
-                    format!("node address {node} is used by {double}, too"),
-                    "give one of them another `address` under [node]",
-                );
-                continue;
-            }
-            let refusals = end.report.iter().flat_map(|report| &report.refusals);
-            let mut twice = refusals.filter(|refusal| refusal.cause == "NDL node address used twice");
-            if let Some(refusal) =
-                twice.find(|refusal| refusal.ago_us < RECENT_US && is_ours(&refusal.detail))
-            {
-                self.blocked(
-                    format!("{} sees both addresses once", end.label()),
-                    format!("{} ago: {}", time(refusal.ago_us), refusal.detail),
-                    "give one of the two another `address` under [node]",
-                );
-            }
-        }
     }
 
     fn project(&mut self, a: &End, b: &End) {
@@ -293,6 +264,14 @@ impl Steps {
 
     fn ping(&mut self, ping: Option<&Result<u64, String>>, from: &End, to: &End) {
         let what = format!("a message goes from {} to {}", from.node_label(), to.label());
+        // None was sent, as it would only wait there; what mends that was told.
+        if from.report.is_some()
+            && !matches!(ping, Some(Ok(_)))
+            && let Some(why) = to.not_ready()
+        {
+            let seen = format!("not tried: {why}");
+            return self.0.push(Step { what, state: State::Note, seen, mend: None });
+        }
         match ping {
             Some(Ok(micros)) => self.fine(what, format!("confirmed after {}", time(*micros))),
             // The list was looked at for the two applications; this command is a third one.

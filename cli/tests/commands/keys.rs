@@ -213,7 +213,7 @@ fn what_is_said_secures_a_node() {
         "keep it off the robot",
         "tar -C keys/nodes/hip -c . | ssh root@10.0.0.9",
         "keys = \"/etc/sinew/keys\"",
-        "  [ndl]\n  mdns_port = false\n",
+        "  [ndl]\n  interface = \"10.0.0.9\"  # an address of the node's own host\n  mdns_port = false\n",
     ] {
         assert!(answer.out.contains(part), "{part}: {}", answer.out);
     }
@@ -223,9 +223,11 @@ fn what_is_said_secures_a_node() {
         good(&directory, &["issue", "knee"])["nodes"][0]["configuration"].as_str().expect("lines").to_owned();
     let mut config = sinew::NodeConfig::from_toml(&lines).expect("legal");
     assert!(config.ndl.mdns_port.is_some(), "nobody else hears it there: {lines}");
-    // On a network multicast DNS, to which keys are nothing, is off.
+    assert!(config.ndl.interface.are_default(), "loopback is the default: {lines}");
+    // On a network it is heard, and multicast DNS, to which keys are nothing, is off.
     let lines = &good(&directory, &["issue", "hip"])["nodes"][0]["configuration"];
     let on_a_network = sinew::NodeConfig::from_toml(lines.as_str().expect("lines")).expect("legal");
+    assert_eq!(on_a_network.ndl.interface.to_string(), "10.0.0.9", "{lines}");
     assert_eq!(on_a_network.ndl.mdns_port, None, "{lines}");
     let path = config.security.keys.clone().expect("keys");
     assert!(path.is_absolute() && path.ends_with("keys/nodes/knee"), "{}", path.display());

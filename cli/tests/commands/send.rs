@@ -87,3 +87,20 @@ fn a_reply_is_printed_decoded() {
     assert!(answer.code == Some(1) && answer.out.contains("50ms"), "{}{}", answer.out, answer.err);
     drop(client);
 }
+
+#[test]
+fn what_is_sent_to_an_application_that_waits_to_be_started_is_a_finding_that_says_for_whom_it_waits() {
+    // Given
+    let scenario = Scenario::new();
+    let _knee = scenario.start("knee", 2, &["--requires", "ankle"]);
+    scenario.until("the knee waits", "knee", &["apps"], |said| {
+        named(&said["apps"], "knee").is_some_and(|app| app["state"] == "waits")
+    });
+    // When
+    let words = ["send", "knee", "scenario.count", r#"{"number":1}"#, "--within", "50"];
+    let answer = scenario.sinew("knee", &words);
+    // Then
+    let said = answer.out + &answer.err;
+    assert!(answer.code == Some(1) && said.contains(": it is not ready: has waited "), "{said}");
+    assert!(said.contains("ankle (not there)"), "{said}");
+}

@@ -182,3 +182,26 @@ fn which_way_values_of_class_stream_go_is_said_from_both_ends() {
             && back.contains("`datagrams = true` under [gncl] of ankle")
     });
 }
+
+#[test]
+fn a_message_to_an_application_that_waits_to_be_started_is_not_tried_and_why_says_for_whom_it_waits() {
+    // Given
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &[]);
+    hip.wait_for(&["started"]);
+    let _knee = scenario.start("knee", 2, &["--requires", "ankle"]);
+    scenario.until("the knee waits", "hip", &["apps"], |said| {
+        named(&said["apps"], "knee").is_some_and(|app| app["state"] == "waits")
+    });
+    // When
+    let said = scenario.until("all links are up", "hip", &["why", "hip", "knee"], |said| {
+        said["steps"].is_array() && blocked(said).lines().count() == 1
+    });
+    // Then
+    let why = blocked(&said);
+    assert!(why.starts_with("\"knee takes messages\"") && why.contains("ankle (not there)"), "{why}");
+    let steps = said["steps"].as_array().expect("a list");
+    let there = steps.iter().find(|step| step["step"] == "a message goes from hip to knee");
+    let seen = there.expect("it is told")["seen"].as_str().expect("a text");
+    assert!(seen.starts_with("not tried: it is not ready: has waited "), "{seen}");
+}

@@ -1,5 +1,7 @@
 //! Topology files: what is read, what is refused, in which words.
 
+use std::collections::BTreeSet;
+use std::ffi::OsStr;
 use std::path::Path;
 
 use exoskeleton::joint::Joint;
@@ -26,14 +28,32 @@ fn example_file_is_a_topology_and_says_what_its_comments_say() {
     assert_eq!(topology.joint_at([10, 0, 0, 3].into()), Some(Joint::Knee));
     let config = topology.node_config(Part::Central);
     assert_eq!((config.project.as_str(), config.ndl.period.as_millis()), ("my-leg", 500));
-    assert_eq!(config.lncl.socket.as_deref(), Some(Path::new("/tmp/exoskeleton.socket")));
-    assert_eq!(topology.node_config(Part::Joint(Joint::Hip)).lncl.socket, None);
+    assert_eq!(config.lncl.socket.as_deref(), Some(Path::new("/tmp/sinew-central.sock")));
+    let socket = |joint| topology.node_config(Part::Joint(joint)).lncl.socket;
+    assert_eq!(socket(Joint::Hip).as_deref(), Some(Path::new("/tmp/sinew-hip.sock")));
+    assert_eq!(socket(Joint::Knee), None);
 }
 
 #[test]
 fn topology_of_a_run_on_this_host_reads_back_from_its_file() {
     let topology = for_this_host(7).unwrap();
     assert_eq!(Topology::parse(&topology.to_toml()), Ok(topology));
+}
+
+#[test]
+fn every_node_of_a_run_on_this_host_has_a_socket_of_its_own_that_sinew_finds_by_its_name() {
+    let topology = for_this_host(7).unwrap();
+    let id = std::process::id().to_string();
+    let mut seen = BTreeSet::new();
+    for part in Part::ALL {
+        let socket = topology.node_config(part).lncl.socket.expect("a door");
+        let name = socket.file_name().and_then(OsStr::to_str).expect("a name");
+        // What `sinew` looks for in /tmp; runs beside each other differ by their process.
+        assert!(name.starts_with("sinew-") && name.ends_with(".sock"), "{name}");
+        assert!(name.contains(&id) && name.contains(part.name()), "{name}");
+        assert_eq!(socket.parent(), Some(std::env::temp_dir().as_path()));
+        assert!(seen.insert(socket), "{part} has another's");
+    }
 }
 
 #[test]
@@ -92,10 +112,14 @@ fn key_that_does_not_exist_is_named() {
 }
 
 #[test]
-fn seed_without_a_port_and_console_at_a_joint_are_refused() {
+fn seed_without_a_port_and_socket_with_a_path_too_long_are_refused() {
     assert!(faults(&with("10.0.0.1:6911", "10.0.0.1:0"))[0].contains("port 0"));
-    let console = with("address = \"10.0.0.2\"", "address = \"10.0.0.2\"\nconsole = \"/tmp/x\"");
-    assert!(faults(&console)[0].contains("central only"));
+    for (length, is_legal) in [(0, false), (1, true), (100, true), (101, false)] {
+        let text = with("/tmp/sinew-hip.sock", &"x".repeat(length));
+        let told = Topology::parse(&text).map_or_else(|faults| faults.0, |_| Vec::new()).join("\n");
+        assert_eq!(told.is_empty(), is_legal, "{length}: {told}");
+        assert!(is_legal || told.contains(&format!("hip.socket has {length} bytes")), "{told}");
+    }
 }
 
 proptest! {

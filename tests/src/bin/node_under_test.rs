@@ -1,13 +1,16 @@
 //! A node for the scenarios: one application that sends, and says what it sees, one line each.
 //!
-//! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--floods NAME]... [--will NAME]... [--incarnation NUMBER] [--logs | --logs-info]`
+//! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--floods NAME]... [--will NAME]... [--meets NAME]... [--incarnation NUMBER]
+//! [--says-directory] [--logs | --logs-info]`
 //!
 //! Whom it floods it sends as many counts as are taken, to each the same. A will is a count of 1,000,000. The
 //! incarnation is the clock's of its host, if none is given. What it logs goes to its standard error, with `--logs` warnings and with `--logs-info` more go to its output.
+//! With those whom it meets, itself among them, it waits at a barrier when it starts, once. When it has started is said in nanoseconds of the
+//! monotonic clock, which all hosts of one machine share. If it says the directory, it does so whenever its standard input has the line `directory`.
 
 use std::process::ExitCode;
 
-use sinew::prelude::*;
+use sinew::{Barrier, Meet, NodeHandle, prelude::*};
 
 payload!("scenario.count", Bulk => struct Count { number: u64 });
 
@@ -17,6 +20,7 @@ const AT_ONCE: u32 = 100;
 struct Probe {
     sends_to: Option<String>,
     floods: Vec<String>,
+    meets: Option<Barrier>,
     sent: u64,
     last: u64,
 }
@@ -25,7 +29,14 @@ impl Actor for Probe {
     type Context = AppContext<Self>;
 
     fn started(&mut self, context: &mut Self::Context) {
-        println!("started {}", context.tid());
+        println!("started {} at {}", context.tid(), Time::now().as_nanos());
+        if let Some(barrier) = &self.meets {
+            let meeting = context.meet(barrier).into_actor(self);
+            context.spawn(meeting.map(|passed, _, _| match passed {
+                Ok(generation) => println!("met {generation}"),
+                Err(error) => println!("not met: {error}"),
+            }));
+        }
         for to in self.floods.clone() {
             let mut sent = 0;
             context.every(Duration::from_millis(1), move |_, _, context| {
@@ -74,6 +85,18 @@ impl Handler<Delivery<RequirementEvent>> for Probe {
     }
 }
 
+/// Says which applications are there, and whether each is ready, whenever it is asked, until nobody can ask any more.
+fn say_the_directory(node: &NodeHandle) {
+    for line in std::io::stdin().lines().map_while(Result::ok) {
+        if line == "directory" {
+            let directory = node.directory();
+            let entries: Vec<String> =
+                directory.iter().map(|entry| format!("{}={}", entry.name, entry.ready)).collect();
+            println!("directory {}", entries.join(" "));
+        }
+    }
+}
+
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let has = |flag: &str| arguments.iter().any(|argument| argument == flag);
@@ -100,7 +123,12 @@ fn main() -> ExitCode {
     let sends_to = after("--sends-to").into_iter().next();
     let floods = after("--floods");
     let name = config.name.clone();
-    let make = move || Probe { sends_to: sends_to.clone(), floods: floods.clone(), sent: 0, last: 0 };
+    let parties = after("--meets");
+    let meets = (!parties.is_empty()).then(|| Barrier::new("step", parties));
+    let make = move || {
+        let (sends_to, floods, meets) = (sends_to.clone(), floods.clone(), meets.clone());
+        Probe { sends_to, floods, meets, sent: 0, last: 0 }
+    };
     let mut probe = AppSpec::new(name.as_str(), make)
         .handles::<Count>()
         .handles::<NodeEvent>()
@@ -121,6 +149,10 @@ fn main() -> ExitCode {
     match builder.start() {
         Ok(node) => {
             println!("up");
+            if has("--says-directory") {
+                let handle = node.handle();
+                std::thread::spawn(move || say_the_directory(&handle));
+            }
             node.run()
         }
         Err(error) => {

@@ -7,8 +7,8 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::{NodeApi, Registration, StartError};
-use sinew_tests::{Ground, OwnDirectory, Program, node_under_test, own_group, process_under_test};
+use sinew::{Incarnation, NodeApi, NodeEnd, Registration, StartError};
+use sinew_tests::{Ground, OwnDirectory, Program, all_run, node_under_test, own_group, process_under_test};
 
 /// How often a node that is told to sends.
 const SENT_EVERY: Duration = Duration::from_millis(20);
@@ -117,7 +117,6 @@ fn a_second_node_with_the_same_address_is_not_let_in() {
     knee.wait_for(&["count 1 ", "from 127.0.0.1"]);
     // When: another one claims the address of the second, and then a newcomer meets all of them
     let mut impostor = scenario.start("impostor", 2, &[]);
-    impostor.wait_for(&["up"]);
     let mut ankle = scenario.start("ankle", 3, &["--requires", "hip", "--sends-to", "hip"]);
     ankle.wait_for(&["started"]);
     hip.wait_for(&["count", "from 127.0.0.3"]);
@@ -125,6 +124,49 @@ fn a_second_node_with_the_same_address_is_not_let_in() {
     let not_sent_yet = began.elapsed().as_millis() / SENT_EVERY.as_millis() + 1;
     knee.wait_for(&[&format!("count {not_sent_yet} "), "from 127.0.0.1"]);
     assert!(hip.said().iter().all(|line| !line.contains("impostor")));
+    // Whether it was up by then, or did not start.
+    assert_eq!(impostor.wait_for_end(), Some(1));
+}
+
+#[test]
+fn a_node_whose_address_another_one_has_ends_with_one_error_and_none_of_its_layers_is_started_again() {
+    // Given: a node
+    let ground = Ground::new();
+    let hip = ground.node("hip").incarnation(Incarnation(1)).start().expect("a node");
+    // When: a later life with another name is to have the same address
+    let knee = ground.node("knee").address(hip.address()).incarnation(Incarnation(2)).start();
+    // Then: whether its layers were ready by then or not, it ends, and says who has it
+    let why = match knee {
+        Ok(knee) => {
+            let handle = knee.handle();
+            let NodeEnd::GaveUp(why) = knee.wait_for_end() else { panic!("nobody told it to stop") };
+            for layer in ["LNCL", "sync", "GNCL", "NDL"] {
+                assert_eq!(handle.lives(layer).map(|lives| lives.starts), Some(1), "{layer}");
+            }
+            why
+        }
+        Err(StartError::AddressTaken(why)) => why,
+        Err(error) => panic!("{error}"),
+    };
+    let [begin, end] = ["node address 127.0.0.1 is used already by 'hip' at ", ", or end the other one"];
+    assert!(why.starts_with(begin) && why.ends_with(end), "{why}");
+    all_run(&[&hip]);
+}
+
+#[test]
+fn a_program_whose_nodes_address_another_one_has_says_so_and_not_how_it_looks_inside() {
+    // Given
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &[]);
+    hip.wait_for(&["up"]);
+    // When
+    let mut knee = process_under_test(&scenario.configuration("knee", 1), &["--place", "thread"]);
+    // Then
+    assert_eq!(knee.wait_for_end(), Some(1));
+    let said = knee.said();
+    let whose = "node address 127.0.0.1 is used already by 'hip' at ";
+    assert!(said.iter().any(|line| line.contains(whose)), "{said:#?}");
+    assert!(said.iter().all(|line| !line.contains("panicked") && !line.contains("restarts")), "{said:#?}");
 }
 
 #[test]

@@ -54,10 +54,12 @@ impl Core {
     pub(super) fn contest(&mut self, now: Time, newcomer: Proof) {
         let node = newcomer.announcement.node;
         if let Some(contest) = self.contests.get_mut(&node) {
-            contest.has_answered |= contest.is_won_by(&newcomer);
-            let is_its =
-                contest.newcomer.is_of(&newcomer.announcement) && contest.newcomer.from == newcomer.from;
-            if is_its && newcomer.asked >= contest.newcomer.asked {
+            let wins = contest.is_won_by(&newcomer);
+            let is_newer = contest.newcomer.is_of(&newcomer.announcement)
+                && contest.newcomer.from == newcomer.from
+                && newcomer.asked >= contest.newcomer.asked;
+            contest.has_answered |= wins;
+            if wins || is_newer {
                 contest.newcomer = newcomer;
             }
             return;
@@ -172,10 +174,14 @@ impl Core {
             if self.contradicts_a_proof(now, &newcomer) {
                 return;
             }
-            if let Some(member) = self.members.get(&node).filter(|_| gives_way) {
-                self.collide(now, node, (&newcomer).into(), member.into());
+            match self.members.get(&node).filter(|_| gives_way) {
+                None => self.replace(now, newcomer),
+                // It may have settled since.
+                Some(member) if !newcomer.announcement.precedes(&member.announcement) => {
+                    self.collide(now, node, member.into(), (&newcomer).into());
+                }
+                Some(_) => self.give_way_to(now, newcomer),
             }
-            self.replace(now, newcomer);
         }
     }
 
@@ -217,7 +223,6 @@ impl Core {
             return None;
         }
         if now.since(contest.newcomer.asked) <= fresh {
-            self.collide(now, node, (&contest.newcomer).into(), proof.into());
             return Some(contest.newcomer);
         }
         // It may be gone since, and the member would be lost to nobody.

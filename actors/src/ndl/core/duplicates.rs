@@ -88,8 +88,14 @@ impl Core {
         if proof.asked < member.since {
             return;
         }
-        let newcomer = member.into();
-        self.collide(now, node, (&proof).into(), newcomer);
+        self.give_way_to(now, proof);
+    }
+
+    /// A member lives, and so does who goes before it in its address.
+    pub(super) fn give_way_to(&mut self, now: Time, proof: Proof) {
+        let node = proof.announcement.node;
+        let Some(member) = self.members.get(&node) else { return };
+        self.collide(now, node, (&proof).into(), member.into());
         self.contests.remove(&node);
         self.lose(now, node, LossReason::Duplicate);
         self.arrive(now, proof);
@@ -152,7 +158,6 @@ impl Core {
     }
 
     fn give_address_up(&mut self, holder: Claimant) {
-        // The next start begins anew: the other may be gone by then.
         (self.settles, self.trial) = (None, None);
         self.me.claim = Claim::Yielded;
         for _ in 0..YIELDS {

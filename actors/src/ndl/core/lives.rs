@@ -109,7 +109,7 @@ impl Core {
             member.announcement.claim = proof.announcement.claim;
         }
         if let Some(newcomer) = self.settle_contest(now, &proof) {
-            self.replace(now, newcomer);
+            self.give_way_to(now, newcomer);
             return;
         }
         let Some(member) = self.members.get_mut(&node) else { return };
@@ -219,7 +219,7 @@ impl Core {
             answered: Time::ZERO,
             link_broke: None,
             link_until,
-            linked: Time::ZERO,
+            linked: now,
             since: now,
             fence,
         };

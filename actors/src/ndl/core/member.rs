@@ -47,7 +47,7 @@ pub(super) struct Member {
     pub(super) link_broke: Option<Time>,
     /// Until then its connection stands, or is being made again.
     pub(super) link_until: Time,
-    /// When its connection was made last, if ever.
+    /// When its connection was made last, or since when it has been a member.
     pub(super) linked: Time,
     /// Since when it has been a member.
     pub(super) since: Time,

@@ -30,6 +30,8 @@ pub(crate) enum RootEvent {
     Ordered(Ordered),
     /// By the owner: say who is supervised.
     TellTree(SyncSender<SupervisionTree>),
+    /// By NDL: another living process has the node's address, in words for who started the node. The node ends.
+    AddressTaken(String),
     /// By NDL: say what does not get on.
     TellProgress(oneshot::Sender<ndl::Progress>),
     /// By a test: panic.

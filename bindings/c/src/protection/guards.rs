@@ -161,7 +161,10 @@ pub(crate) fn release(handle: usize) -> Result<(), Fault> {
 /// Never waits.
 pub(crate) fn release_later(handle: usize) -> Result<(), Fault> {
     let held = held(handle)?;
-    held.is_to_go.store(true, Ordering::Release);
+    if held.is_to_go.swap(true, Ordering::AcqRel) {
+        // By another thread, just now.
+        return Err(no_such());
+    }
     held.guard.release_later();
     Ok(())
 }

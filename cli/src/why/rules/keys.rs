@@ -41,7 +41,7 @@ impl Steps {
 }
 
 /// `None`: it is of a version that does not say.
-fn has_keys(report: &NodeReport) -> Option<bool> {
+pub(super) fn has_keys(report: &NodeReport) -> Option<bool> {
     report.security.as_ref().map(|SecurityReport { certificate, .. }| certificate.is_some())
 }
 

@@ -32,7 +32,7 @@ impl Steps {
         } else {
             self.there(from, facts);
             self.meant(from);
-            self.address(from, to);
+            self.address(facts);
             self.application(from, None, facts);
         }
         self.members(many, to);

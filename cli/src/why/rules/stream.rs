@@ -2,7 +2,7 @@
 
 use sinew::inspect::StreamReport;
 
-use super::{End, Steps};
+use super::{End, Steps, keys::has_keys};
 
 impl Steps {
     /// Which way they go from `from` to `to`. `after` is what was counted when one had just been sent.
@@ -16,6 +16,10 @@ impl Steps {
         };
         let what = format!("class Stream from {} to {}", from.label(), to.label());
         let Some(before) = &peer.stream else { return };
+        // Before the others: between these no setting lets datagrams through, so none is named.
+        if !before.is_agreed && both_have_keys(from, to) {
+            return self.fine(what, "by the connection (TCP), as nodes with keys do");
+        }
         if !before.is_on {
             let mend =
                 format!("`datagrams = true` under [gncl] of {}, where UDP gets through", from.node_label());
@@ -37,6 +41,16 @@ impl Steps {
             return self.fine(what, "by datagram (UDP)");
         }
         self.note(what, "by the connection (TCP): no datagram is answered", blocked(from, to));
+    }
+}
+
+/// Whether both have keys. One that does not say has them if the other one has: they are connected, and those with and without refuse each other.
+fn both_have_keys(from: &End, to: &End) -> bool {
+    let said = |end: &End| end.report.as_ref().and_then(has_keys);
+    match (said(from), said(to)) {
+        (Some(one), Some(other)) => one && other,
+        (Some(either), None) | (None, Some(either)) => either,
+        (None, None) => false,
     }
 }
 

@@ -1,6 +1,7 @@
 //! A way that is free, and each thing that can stand in it.
 
 mod access;
+mod address;
 mod keys;
 mod many;
 mod unnamed;
@@ -494,6 +495,28 @@ fn a_way_back_that_was_not_tried_is_told_with_where_to_try_it() {
     // What cannot be asked at all stands in the way, and that is told once.
     facts.ends[1].report = None;
     assert!(judge(&facts).iter().all(|step| step.what != "a message goes from knee.drive to hip"));
+}
+
+#[test]
+fn a_message_to_an_application_that_waits_to_be_started_is_not_tried_and_its_wait_is_the_reason() {
+    // Given: no ping was sent to it, or one had no answer before its node said that it waits
+    for ping in [None, Some(Err("no answer within 2s: its thread is busy or hangs".to_owned()))] {
+        let mut facts = free();
+        waits(&mut facts, "ankle");
+        facts.pings[0] = ping;
+        // When
+        let steps = judge(&facts);
+        // Then: it stands in the way once, where it takes no messages
+        let blocked: Vec<_> = steps.iter().filter(|step| step.state == State::Blocked).collect();
+        assert!(blocked.len() == 1 && blocked[0].what == "knee.drive takes messages", "{blocked:#?}");
+        let there = steps.iter().find(|step| step.what == "a message goes from hip to knee.drive");
+        let there = there.expect("it is told");
+        let seen = "not tried: it is not ready: has waited 2.0 s for ankle (not there)";
+        assert_eq!((there.state, there.seen.as_str(), &there.mend), (State::Note, seen, &None));
+        // And: the way back is another one
+        let back = steps.iter().find(|step| step.what == "a message goes from knee to hip");
+        assert_eq!(back.map(|step| step.state), Some(State::Fine));
+    }
 }
 
 fn of_stream(facts: &mut Facts) -> &mut StreamReport {

@@ -240,7 +240,7 @@ impl<'a> Launch<'a> {
         Ok(Self {
             options,
             plan: Plan::shuffled(options.seed, now),
-            children: Children::new(file, folder.to_owned(), None)?,
+            children: Children::new(topology, file, folder.to_owned(), None)?,
             lines,
             say_line,
             console: Console::start(topology)?,

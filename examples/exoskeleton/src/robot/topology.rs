@@ -35,8 +35,6 @@ pub struct Topology {
     pub joints: PerJoint<NodePlace>,
     /// Directory of the robot's keys, as `sinew keys init` makes it; `None`: links between nodes are open.
     pub keys: Option<PathBuf>,
-    /// Path of central's socket for the status screen; `None`: no such door.
-    pub console: Option<PathBuf>,
     /// The plant.
     pub plant: PlantPlace,
 }
@@ -95,6 +93,9 @@ pub struct NodePlace {
     pub port: u16,
     /// UDP addresses of nodes to ask in any case.
     pub seeds: Vec<Seed>,
+    /// Path of the unix socket for processes of its host: the status screen (at central) and the `sinew` tool. 1 to 100
+    /// bytes; `None`: no such door.
+    pub socket: Option<PathBuf>,
     /// Where the drive of a joint runs; of no meaning at central.
     pub drive: DrivePlace,
 }
@@ -188,9 +189,7 @@ impl Topology {
         config.ndl.period = self.discovery.period;
         config.ndl.missed_max = self.discovery.missed_max;
         config.security.keys = self.keys.as_ref().map(|keys| keys.join("nodes").join(part.name()));
-        if part == Part::Central {
-            config.lncl.socket.clone_from(&self.console);
-        }
+        config.lncl.socket.clone_from(&place.socket);
         config
     }
 }

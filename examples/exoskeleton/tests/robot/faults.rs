@@ -10,7 +10,7 @@ fn report_of(name: &str, steps: &str) -> serde_json::Value {
     let (runs_text, report_text) = (runs.display().to_string(), report.display().to_string());
     let arguments = ["faults", "--short", "--only", steps, "--runs", &runs_text, "--report", &report_text];
 
-    let output = end(start(&arguments), steps);
+    let output = end(start(&folder, &arguments), steps);
 
     let told = String::from_utf8_lossy(&output.stdout);
     let failed = String::from_utf8_lossy(&output.stderr);

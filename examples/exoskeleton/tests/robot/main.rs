@@ -3,6 +3,7 @@
 mod faults;
 mod real_time;
 mod secured;
+mod sockets;
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -19,24 +20,23 @@ use thread_priority::{
 const PROGRAM: &str = env!("CARGO_BIN_EXE_exoskeleton");
 const DEADLINE: Duration = Duration::from_secs(600);
 
-/// A folder of this test's own.
+/// Where in a test's folder its nodes' sockets are: `sinew` looks there when the folder is its `XDG_RUNTIME_DIR`.
+const SOCKETS: &str = "sinew";
+
+/// A folder of this test's own. Its name is short: paths of sockets in it have 100 bytes at most.
 fn folder(name: &str) -> PathBuf {
-    let folder = std::env::temp_dir().join(format!("exoskeleton-test-{name}-{}", std::process::id()));
+    let folder = std::env::temp_dir().join(format!("exo-{name}-{}", std::process::id()));
     let _ = std::fs::remove_dir_all(&folder);
-    std::fs::create_dir_all(&folder).expect("a folder for this test");
+    std::fs::create_dir_all(folder.join(SOCKETS)).expect("a folder for this test");
     folder
 }
 
-/// Starts the program. A leg at 1 kHz does not walk where compilers come first, so it comes before them, as on a robot:
-/// by the priority of the thread that starts it, where that is granted.
-fn start(arguments: &[&str]) -> Child {
-    start_in(Path::new("."), arguments)
-}
-
-/// The same in this directory.
-fn start_in(directory: &Path, arguments: &[&str]) -> Child {
+/// Starts the program in the folder of a test. Its sockets are there too: in `/tmp` a test of `sinew` that runs
+/// beside this one would find them. A leg at 1 kHz does not walk where compilers come first, so it comes before them,
+/// as on a robot: by the priority of the thread that starts it, where that is granted.
+fn start(folder: &Path, arguments: &[&str]) -> Child {
     let mut command = Command::new(PROGRAM);
-    command.args(arguments).current_dir(directory);
+    command.args(arguments).current_dir(folder).env("TMPDIR", folder.join(SOCKETS));
     command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
     let started = std::thread::spawn(move || {
         let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::RoundRobin);
@@ -46,6 +46,17 @@ fn start_in(directory: &Path, arguments: &[&str]) -> Child {
         command.spawn().expect("the program that was just built starts")
     });
     started.join().expect("the program that was just built starts")
+}
+
+/// Runs `sinew`, which another package builds into the same directory, in the folder of a test.
+fn sinew(folder: &Path, words: &[&str]) -> Output {
+    let test = std::env::current_exe().expect("a test has a path");
+    let program =
+        test.parent().and_then(Path::parent).expect("it lies in deps/ of the profile's").join("sinew");
+    assert!(program.exists(), "there is no {}; build it: cargo build -p sinew-cli", program.display());
+    let mut command = Command::new(program);
+    command.args(words).current_dir(folder).env("XDG_RUNTIME_DIR", folder).env_remove("SINEW_SOCKET");
+    command.output().expect("the command starts")
 }
 
 /// Closes its standard input and waits for its end.

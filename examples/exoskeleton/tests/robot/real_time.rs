@@ -14,7 +14,8 @@ fn topology_file(folder: &Path, text: &str) -> String {
 
 fn topology_of_this_test() -> Topology {
     let mut topology = for_this_host(1).expect("free ports");
-    topology.console = None;
+    topology.central.socket = None;
+    topology.joints.iter_mut().for_each(|place| place.socket = None);
     topology
 }
 
@@ -26,7 +27,7 @@ fn five_processes_wait_for_the_late_one_without_torque_and_then_walk() {
     let arguments =
         ["--strides", "8", "--runs", runs.to_str().unwrap(), "--report", report.to_str().unwrap()];
 
-    let output = end(start(&arguments), "the walk ends");
+    let output = end(start(&folder, &arguments), "the walk ends");
 
     let told = String::from_utf8_lossy(&output.stdout);
     let failed = String::from_utf8_lossy(&output.stderr);
@@ -47,7 +48,7 @@ fn node_with_a_bad_topology_is_refused_in_words_with_exit_code_1() {
     let text = topology_of_this_test().to_toml().replacen("127.0.0.3", "127.0.0.2", 1);
     let file = topology_file(&folder, &text);
 
-    let output = end(start(&["node", "hip", "--topology", &file]), "the node is refused");
+    let output = end(start(&folder, &["node", "hip", "--topology", &file]), "the node is refused");
 
     let words = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{words}");
@@ -60,7 +61,7 @@ fn node_and_plant_alone_end_in_order_when_their_starter_does() {
     let folder = folder("alone");
     let file = topology_file(&folder, &topology_of_this_test().to_toml());
     for role in ["plant", "hip", "central"] {
-        let child = start(&["node", role, "--stop-with-stdin", "--topology", &file]);
+        let child = start(&folder, &["node", role, "--stop-with-stdin", "--topology", &file]);
         let output = end(child, role);
         let words = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(0), "{role}: {words}");
@@ -76,7 +77,7 @@ fn second_plant_at_the_same_address_says_what_is_wrong() {
     topology.plant.address = taken.local_addr().unwrap();
     let file = topology_file(&folder, &topology.to_toml());
 
-    let output = end(start(&["node", "plant", "--topology", &file]), "the plant is refused");
+    let output = end(start(&folder, &["node", "plant", "--topology", &file]), "the plant is refused");
 
     let words = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{words}");

@@ -1,8 +1,6 @@
 //! The secured robot, by the README's own words: keys for all nodes, and the robot that takes nobody without them.
 
-use std::{path::Path, process::Command};
-
-use crate::{alone, end, folder, start_in};
+use crate::{alone, end, folder, sinew, start};
 
 const README: &str = include_str!("../../../../README.md");
 
@@ -11,15 +9,6 @@ fn words_behind(command: &str) -> Vec<&'static str> {
     let mut found = README.lines().filter_map(|line| line.trim().strip_prefix(command));
     let words = found.next().unwrap_or_else(|| panic!("the README has no line with `{command}`"));
     words.split_whitespace().take_while(|word| *word != "#").collect()
-}
-
-/// `sinew`, which another package builds into the same directory.
-fn sinew(directory: &Path, words: &[&str]) -> std::process::Output {
-    let test = std::env::current_exe().expect("a test has a path");
-    let program =
-        test.parent().and_then(Path::parent).expect("it lies in deps/ of the profile's").join("sinew");
-    assert!(program.exists(), "there is no {}; build it: cargo build -p sinew-cli", program.display());
-    Command::new(program).args(words).current_dir(directory).output().expect("the command starts")
 }
 
 #[test]
@@ -31,7 +20,7 @@ fn robot_with_the_keys_that_the_readme_makes_walks_and_without_them_it_does_not_
     let robot = [&["--strides", "8", "--keys"], &robot[..]].concat();
 
     // Given: no keys yet
-    let refused = end(start_in(&folder, &robot), "the robot is refused");
+    let refused = end(start(&folder, &robot), "the robot is refused");
     let words = String::from_utf8_lossy(&refused.stderr);
     assert!(
         !matches!(refused.status.code(), Some(0 | 3)),
@@ -42,7 +31,7 @@ fn robot_with_the_keys_that_the_readme_makes_walks_and_without_them_it_does_not_
     // And: keys of another order, in which the nodes have each other's addresses
     let others = ["keys", "init", "exoskeleton", "hip", "knee", "ankle", "central", "--out", "others"];
     assert!(sinew(&folder, &others).status.success(), "names alone make keys");
-    let refused = end(start_in(&folder, &["--strides", "8", "--keys", "others"]), "the robot is refused");
+    let refused = end(start(&folder, &["--strides", "8", "--keys", "others"]), "the robot is refused");
     let words = String::from_utf8_lossy(&refused.stderr);
     assert_eq!(refused.status.code(), Some(1), "{words}");
     for part in ["central", "hip", "knee", "ankle"] {
@@ -58,7 +47,7 @@ fn robot_with_the_keys_that_the_readme_makes_walks_and_without_them_it_does_not_
     // When
     let made = sinew(&folder, &[&["keys", "init"], &init[..]].concat());
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-    let output = end(start_in(&folder, &robot), "the walk ends");
+    let output = end(start(&folder, &robot), "the walk ends");
 
     // Then
     let told = String::from_utf8_lossy(&output.stdout);

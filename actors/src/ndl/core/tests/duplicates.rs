@@ -148,7 +148,7 @@ fn a_member_that_settles_gives_way_to_one_that_has_settled_and_shows_again_that_
     part(&mut world, ELDER, LATER);
     // Then: both are named, and it follows within the third of a challenge that it has
     world.run_until(ms(150), |world| has(world, 1) == Some(Incarnation(2)));
-    assert_eq!(world.losses(1), [(BOTH, LossReason::Restarted)]);
+    assert_eq!(world.losses(1), [(BOTH, LossReason::Duplicate)]);
     let (holder, newcomer) = (claimant(BOTH, LATER), claimant(BOTH, ELDER));
     assert_eq!(world.at(1).others, [Output::Collision { node: node(BOTH), holder, newcomer }]);
 }

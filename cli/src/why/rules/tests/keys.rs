@@ -67,6 +67,39 @@ fn nodes_that_both_have_keys_or_neither_are_fine_and_of_an_older_version_nothing
 }
 
 #[test]
+fn between_nodes_with_keys_stream_goes_by_the_connection_and_no_setting_is_blamed() {
+    // Both say that they have keys, or one alone, as the other one cannot be asked.
+    for who_says in [[true, true], [true, false], [false, true]] {
+        for is_on in [true, false] {
+            // Given
+            let mut facts = free();
+            facts.streams = [None, None];
+            if who_says[0] {
+                secure(hip(&mut facts));
+            }
+            if who_says[1] {
+                secure(knee(&mut facts));
+            }
+            hip(&mut facts).peers[0].stream = Some(StreamReport { is_on, is_agreed: false, ..values(0) });
+            // When
+            let steps = judge(&facts);
+            // Then
+            let what = "class Stream from hip to knee.drive";
+            let step = steps.iter().find(|step| step.what == what).expect("it is looked at");
+            assert_eq!((step.state, step.mend.as_deref()), (State::Fine, None), "{who_says:?}: {step:?}");
+            assert_eq!(step.seen, "by the connection (TCP), as nodes with keys do");
+        }
+    }
+    // And: where neither has keys the setting is what is to be looked at
+    let mut facts = free();
+    open(hip(&mut facts));
+    open(knee(&mut facts));
+    hip(&mut facts).peers[0].stream = Some(StreamReport { is_agreed: false, ..values(0) });
+    let is_setting = |step: &Step| step.mend.as_ref().is_some_and(|mend| mend.contains("`datagrams = true`"));
+    assert!(judge(&facts).iter().any(is_setting));
+}
+
+#[test]
 fn datagrams_that_are_refused_for_their_keys_are_the_reason_and_not_a_firewall() {
     let words = "it was not made with this project's keys: somebody pretends";
     for is_refused_by_hip in [true, false] {

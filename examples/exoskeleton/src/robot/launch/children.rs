@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, BufRead, BufReader};
-use std::path::PathBuf;
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::SyncSender;
 use std::time::Duration;
@@ -15,7 +16,9 @@ use super::LaunchError;
 use sinew_hosts::{Carried, Weather};
 
 use super::hosts::{Hosts, Link};
+use crate::part::Part;
 use crate::robot::role::Role;
+use crate::robot::topology::Topology;
 
 /// Time that a process has for its orderly end.
 const STOP_PATIENCE: Duration = Duration::from_secs(5);
@@ -33,14 +36,24 @@ pub(super) struct Children {
     program: PathBuf,
     topology: PathBuf,
     folder: PathBuf,
+    /// Those of the nodes, which are to go when they have ended.
+    sockets: Vec<PathBuf>,
     /// None: all of them on this host.
     hosts: Option<Hosts>,
     running: BTreeMap<Role, Child>,
 }
 
 impl Children {
-    pub(super) fn new(topology: PathBuf, folder: PathBuf, hosts: Option<Hosts>) -> io::Result<Self> {
-        Ok(Self { program: std::env::current_exe()?, topology, folder, hosts, running: BTreeMap::new() })
+    /// None of them runs yet. `file` is where `topology` is written, for them to read.
+    pub(super) fn new(
+        topology: &Topology,
+        file: PathBuf,
+        folder: PathBuf,
+        hosts: Option<Hosts>,
+    ) -> io::Result<Self> {
+        let program = std::env::current_exe()?;
+        let sockets = Part::ALL.into_iter().filter_map(|part| topology.place(part).socket.clone()).collect();
+        Ok(Self { program, topology: file, folder, sockets, hosts, running: BTreeMap::new() })
     }
 
     /// Starts a process. It stops when its standard input ends, which is when this process ends, however it does.
@@ -136,12 +149,13 @@ impl Children {
         (Time::now(), all.filter_map(|(name, id)| Some((name, cpu_seconds(id)?))).collect())
     }
 
-    /// Stops the nodes, then the plant. What does not end in time is killed.
+    /// Stops the nodes, then the plant. What does not end in time is killed. Their sockets go too.
     pub(super) fn stop(&mut self) {
         let plant = self.running.remove(&Role::Plant);
         let mut nodes: Vec<Child> = std::mem::take(&mut self.running).into_values().collect();
         stop_all(&mut nodes);
         stop_all(&mut plant.into_iter().collect::<Vec<_>>());
+        self.sockets.iter().for_each(|socket| remove_if_dead(socket));
     }
 
     fn log(&self, role: Role) -> PathBuf {
@@ -173,6 +187,15 @@ fn stop_all(children: &mut Vec<Child>) {
     children.clear();
 }
 
+/// Who ends in order takes its socket away; one that was killed leaves it, and no later run has its name.
+fn remove_if_dead(socket: &Path) {
+    // Where somebody listens it is another's, as of a run in another container with the same process id.
+    if UnixStream::connect(socket).is_err_and(|error| error.kind() == io::ErrorKind::ConnectionRefused) {
+        // Somebody may have tidied up meanwhile.
+        let _ = fs::remove_file(socket);
+    }
+}
+
 /// From `/proc/PID/stat`: the fourth field.
 fn parent_of(id: i32) -> Option<u32> {
     let text = fs::read_to_string(format!("/proc/{id}/stat")).ok()?;
@@ -190,11 +213,32 @@ fn cpu_seconds(id: u32) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::net::UnixListener;
+
     use super::*;
 
     #[test]
     fn cpu_time_of_a_process_is_read() {
         assert!(cpu_seconds(std::process::id()).is_some_and(|seconds| seconds < 10_000.0));
         assert_eq!(cpu_seconds(u32::MAX), None);
+    }
+
+    #[test]
+    fn socket_of_a_killed_node_goes_and_one_where_somebody_listens_stays() {
+        // Given: a socket that somebody listens at, and one whose listener ended without a word
+        let id = std::process::id();
+        let [dead, living] =
+            ["dead", "living"].map(|name| std::env::temp_dir().join(format!("exo-{name}-{id}.s")));
+        drop(UnixListener::bind(&dead).unwrap());
+        let listener = UnixListener::bind(&living).unwrap();
+        assert!(dead.exists() && living.exists());
+        // When
+        remove_if_dead(&dead);
+        remove_if_dead(&living);
+        // Then
+        assert!(!dead.exists() && living.exists());
+        drop(listener);
+        remove_if_dead(&living);
+        assert!(!living.exists());
     }
 }

@@ -65,7 +65,7 @@ impl Console {
     pub(super) fn start(topology: &Topology) -> io::Result<Self> {
         let view = Arc::new(Mutex::new(View::default()));
         let stop = Arc::new(AtomicBool::new(false));
-        let thread = match topology.console.clone() {
+        let thread = match topology.central.socket.clone() {
             None => None,
             Some(socket) => {
                 let listener = Listener {

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::fmt::Display;
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::Duration;
 
@@ -71,8 +71,8 @@ struct NodeTable {
     port: u16,
     #[serde(default)]
     seeds: Vec<String>,
-    /// The door for the status screen; at central only.
-    console: Option<PathBuf>,
+    /// The door for processes of the same host.
+    socket: Option<PathBuf>,
     /// Where the drive runs; at a joint only.
     drive: Option<String>,
 }
@@ -125,8 +125,8 @@ pub(super) fn parse(text: &str) -> Result<Topology, TopologyFaults> {
     let places: Option<[NodePlace; 4]> = places.and_then(|places| places.try_into().ok());
     match (places, discovery, plant) {
         (Some([central, hip, knee, ankle]), Some(discovery), Some(plant)) if faults.0.is_empty() => {
-            let (joints, console) = ([hip, knee, ankle], file.central.console);
-            Ok(Topology { project, keys: file.keys, discovery, control, central, joints, console, plant })
+            let joints = [hip, knee, ankle];
+            Ok(Topology { project, keys: file.keys, discovery, control, central, joints, plant })
         }
         (Some(_) | None, Some(_) | None, Some(_) | None) => Err(TopologyFaults(faults.0)),
     }
@@ -149,10 +149,11 @@ fn node(faults: &mut Faults, part: Part, table: &NodeTable) -> Option<NodePlace>
         faults.note(single, || format!("{part}.address = \"{address}\" names no single node"));
     }
     let seeds = seeds(faults, &format!("{part}.seeds"), &table.seeds);
-    check_console(faults, part, table.console.as_ref());
+    let socket = table.socket.clone();
+    check_socket(faults, part, socket.as_deref());
     let drive = drive_place(faults, part, table.drive.as_deref());
     let (address, port) = (NodeAddress::from(address?), table.port);
-    Some(NodePlace { address, interface: interface?, port, seeds, drive })
+    Some(NodePlace { address, interface: interface?, port, seeds, socket, drive })
 }
 
 fn drive_place(faults: &mut Faults, part: Part, text: Option<&str>) -> DrivePlace {
@@ -179,14 +180,11 @@ fn seeds(faults: &mut Faults, place: &str, texts: &[String]) -> Vec<Seed> {
     seeds
 }
 
-fn check_console(faults: &mut Faults, part: Part, console: Option<&PathBuf>) {
-    let Some(path) = console else { return };
-    faults.note(part == Part::Central, || {
-        format!("{part}.console: the status screen is at central only; take it out here")
-    });
+fn check_socket(faults: &mut Faults, part: Part, socket: Option<&Path>) {
+    let Some(path) = socket else { return };
     let length = path.as_os_str().len();
     faults.note((1..=SOCKET_PATH_MAX).contains(&length), || {
-        format!("{part}.console has {length} bytes; a socket's path has 1 to {SOCKET_PATH_MAX}")
+        format!("{part}.socket has {length} bytes; a socket's path has 1 to {SOCKET_PATH_MAX}")
     });
 }
 
@@ -286,7 +284,7 @@ pub(super) fn write(topology: &Topology) -> String {
             interface: Some(place.interface.to_string()),
             port: place.port,
             seeds: place.seeds.iter().map(ToString::to_string).collect(),
-            console: topology.console.clone().filter(|_| part == Part::Central),
+            socket: place.socket.clone(),
             drive: match place.drive {
                 DrivePlace::Process if part != Part::Central => Some("process".to_owned()),
                 DrivePlace::Process | DrivePlace::Node => None,

@@ -8,8 +8,10 @@ use std::time::Duration;
 use sinew::NodeAddress;
 
 use super::{Control, ControlThread, Discovery, DrivePlace, NodePlace, PlantPlace, ReleaseBy, Topology};
+use crate::joint::Joint;
+use crate::part::Part;
 
-/// A topology on loopback with a project name, a multicast port and a plant port of its own.
+/// A topology on loopback with a project name, a multicast port, a plant port and sockets of its own.
 ///
 /// # Errors
 /// The system has no free UDP port.
@@ -19,11 +21,12 @@ pub fn for_this_host(seed: u64) -> io::Result<Topology> {
     // an error in words at their start.
     let (query, plant) = (free_port()?, free_port()?);
     let group = Ipv4Addr::new(239, 255, (id >> 8) as u8, id as u8);
-    let node = |last| NodePlace {
+    let node = |part, last| NodePlace {
         address: NodeAddress::from([127, 0, 0, last]),
         interface: Ipv4Addr::LOCALHOST.into(),
         port: 0,
         seeds: Vec::new(),
+        socket: Some(socket_path(id, part)),
         drive: DrivePlace::Node,
     };
     Ok(Topology {
@@ -36,9 +39,9 @@ pub fn for_this_host(seed: u64) -> io::Result<Topology> {
             missed_max: 3,
         },
         control: Control { thread: ControlThread::Io, realtime_priority: None, release: ReleaseBy::Itself },
-        central: node(1),
-        joints: [node(2), node(3), node(4)],
-        console: Some(console_path(id)),
+        central: node(Part::Central, 1),
+        joints: [(Joint::Hip, 2), (Joint::Knee, 3), (Joint::Ankle, 4)]
+            .map(|(joint, last)| node(Part::Joint(joint), last)),
         plant: PlantPlace { address: plant.local_addr()?, device_watchdog: None, seed, trial: None },
     })
 }
@@ -47,7 +50,8 @@ fn free_port() -> io::Result<UdpSocket> {
     UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))
 }
 
-/// Not in the run folder: the path of a socket has at most 107 bytes.
-fn console_path(id: u32) -> PathBuf {
-    std::env::temp_dir().join(format!("exoskeleton-{id}.socket"))
+/// `sinew` finds `/tmp/sinew-*.sock` by itself. Not in the run folder: the path of a socket has at most 107 bytes,
+/// of which Sinew takes 100.
+fn socket_path(id: u32, part: Part) -> PathBuf {
+    std::env::temp_dir().join(format!("sinew-exoskeleton-{id}-{part}.sock"))
 }

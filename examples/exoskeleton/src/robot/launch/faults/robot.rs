@@ -63,9 +63,9 @@ impl Robot {
         let file = folder.join("topology.toml");
         std::fs::write(&file, topology.to_toml())?;
         let (say_line, lines) = sync_channel(LINES_MAX);
-        let socket = topology.console.clone().expect("a topology for this host has a console");
+        let socket = topology.central.socket.clone().expect("a topology for this host has sockets");
         let mut robot = Self {
-            children: Children::new(file, folder.to_owned(), hosts)?,
+            children: Children::new(topology, file, folder.to_owned(), hosts)?,
             say_line,
             lines,
             console: Console::start(topology)?,
