@@ -29,7 +29,8 @@ impl Actor for Probe {
     type Context = AppContext<Self>;
 
     fn started(&mut self, context: &mut Self::Context) {
-        println!("started {} at {}", context.tid(), Time::now().as_nanos());
+        println!("started {}", context.tid());
+        println!("clock_ns {}", Time::now().as_nanos());
         if let Some(barrier) = &self.meets {
             let meeting = context.meet(barrier).into_actor(self);
             context.spawn(meeting.map(|passed, _, _| match passed {

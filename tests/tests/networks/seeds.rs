@@ -88,8 +88,8 @@ fn others(nodes: &mut [Program]) -> impl Iterator<Item = (&'static str, &mut Pro
 fn order_of_start(nodes: &mut [Program]) -> Vec<&'static str> {
     let mut started: Vec<(u64, &str)> = named(nodes)
         .map(|(name, node)| {
-            let line = node.wait_for(&["started "]);
-            let at = line.rsplit_once(" at ").and_then(|(_, nanos)| nanos.parse().ok());
+            let line = node.wait_for(&["clock_ns "]);
+            let at = line.strip_prefix("clock_ns ").and_then(|nanos| nanos.parse().ok());
             (at.unwrap_or_else(|| panic!("it says when it started: {line}")), name)
         })
         .collect();
