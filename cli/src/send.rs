@@ -70,13 +70,15 @@ struct Ended {
 }
 
 impl Ended {
-    /// A receiver that is known not to be ready is the reason why nobody has come to it.
+    /// A receiver that is known not to be ready is the reason why nobody has come to it, or at least not yet: where that is not known it may have
+    /// been ready when the message came.
     fn explained_by(&mut self, not_ready: impl FnOnce() -> Option<String>) {
         if self.is_unheard
             && let Some(why) = not_ready()
         {
             self.fault = Some(match self.outcome {
-                Some(outcome) => format!("{outcome:?}: {why}"),
+                Some(Outcome::Expired) => format!("Expired: {why}"),
+                Some(outcome) => format!("{outcome:?}: it may have been handled, but {why}"),
                 None => why,
             });
         }
@@ -226,9 +228,10 @@ mod tests {
     #[test]
     fn a_message_that_nobody_came_to_is_explained_by_a_receiver_that_is_not_ready() {
         let why = "it is not ready: has waited 2.0 s for ankle (not there)";
-        assert_eq!(said_of_a_waiting(Ok(Outcome::Unknown)), format!("Unknown: {why}"));
+        let unknown = format!("Unknown: it may have been handled, but {why}");
+        assert_eq!(said_of_a_waiting(Ok(Outcome::Unknown)), unknown);
         assert_eq!(said_of_a_waiting(Ok(Outcome::Expired)), format!("Expired: {why}"));
-        assert_eq!(said_of_a_waiting(Err(ApiError::Ended(Outcome::Unknown))), format!("Unknown: {why}"));
+        assert_eq!(said_of_a_waiting(Err(ApiError::Ended(Outcome::Unknown))), unknown);
         assert_eq!(said_of_a_waiting(Err(ApiError::NoReply(Duration::from_secs(2)))), why);
     }
 

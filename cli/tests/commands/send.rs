@@ -101,6 +101,6 @@ fn what_is_sent_to_an_application_that_waits_to_be_started_is_a_finding_that_say
     let answer = scenario.sinew("knee", &words);
     // Then
     let said = answer.out + &answer.err;
-    assert!(answer.code == Some(1) && said.contains(": it is not ready: has waited "), "{said}");
+    assert!(answer.code == Some(1) && said.contains("it is not ready: has waited "), "{said}");
     assert!(said.contains("ankle (not there)"), "{said}");
 }
