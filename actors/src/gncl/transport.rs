@@ -36,6 +36,12 @@ const RECORD_EXTRA: usize = 24;
 /// Tickets for another connection that a peer may send. A node sends none; other software for TLS sends a few if it is not told otherwise.
 const TICKETS_MAX: u32 = 8;
 
+/// Bytes that one read takes from the socket at first. rustls itself asks for as many at a time.
+const READ_FIRST: usize = 4 << 10;
+/// Bytes that one read takes from a socket that had more than that: two records, so that a long message does not cost a system call for each
+/// quarter of one. Only connections that carry such have the memory.
+const READ_LONG: usize = 32 << 10;
+
 /// What is said of who sends more tickets.
 const TICKETS_WORDS: &str = "the other end sends tickets of TLS on and on, and a node sends none: it may be no node, or a fault of its software";
 /// What is said of who sends more records for nobody.
@@ -68,7 +74,8 @@ impl Transport {
     /// The same connection, whose handshake is over.
     pub(super) fn sealed(self, mut tls: Connection) -> Self {
         tls.set_buffer_limit(Some(SEALED_MAX));
-        let records = Records { tls, is_one_untold: false, silent: 0, refused: None };
+        let records =
+            Records { tls, sealed: Unopened::default(), is_one_untold: false, silent: 0, refused: None };
         Self { records: Some(Arc::new(Mutex::new(records))), ..self }
     }
 
@@ -116,13 +123,13 @@ impl Transport {
                     self.read_open(buffer, room).map(|count| Got { count, work: count })
                 }
                 Some(records) => {
-                    // What was opened before is no news of the socket's.
-                    let opened = lock(records).take(buffer, room);
+                    // What came before is no news of the socket's.
+                    let opened = lock(records).open(&self.socket, false, buffer, room);
                     if !matches!(&opened, Err(error) if error.kind() == io::ErrorKind::WouldBlock) {
                         return opened;
                     }
                     self.socket.readable().await?;
-                    lock(records).read(&self.socket, buffer, room)
+                    lock(records).open(&self.socket, true, buffer, room)
                 }
             };
             match read {
@@ -177,6 +184,8 @@ fn expect_more(socket: &TcpStream) {
 #[derive(Debug)]
 struct Records {
     tls: Connection,
+    /// What has come of the peer's and rustls has not been given.
+    sealed: Unopened,
     /// The last byte that was taken to be sealed was not told as written, for the socket has not taken all that was sealed: whoever
     /// writes comes again with it, and has the rest go out.
     is_one_untold: bool,
@@ -213,22 +222,38 @@ impl Records {
     /// Has the socket take all that is sealed.
     fn flush(&mut self, socket: &TcpStream) -> io::Result<()> {
         while self.tls.wants_write() {
-            if self.tls.write_tls(&mut AtOnce::new(socket))? == 0 {
+            if self.tls.write_tls(&mut AtOnce(socket))? == 0 {
                 return Err(io::ErrorKind::WriteZero.into());
             }
         }
         Ok(())
     }
 
-    /// Opens what comes until there is something for the reader, or the socket is empty, or the peer is refused.
-    fn read(&mut self, socket: &TcpStream, buffer: &mut BytesMut, room: usize) -> io::Result<Got> {
+    /// Opens what has been read of the socket, and, where it is `is_readable`, what is in it still, until there is something for the reader, or
+    /// nothing is left, or the peer is refused.
+    fn open(
+        &mut self,
+        socket: &TcpStream,
+        is_readable: bool,
+        buffer: &mut BytesMut,
+        room: usize,
+    ) -> io::Result<Got> {
         let mut came = 0;
         loop {
-            let mut reading = AtOnce::new(socket);
-            let count = self.tls.read_tls(&mut reading)?;
-            if reading.is_emptied {
-                expect_more(socket);
+            match self.take(buffer, room) {
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+                taken => return taken.map(|got| Got { work: got.work.max(came), ..got }),
             }
+            if self.sealed.is_empty() {
+                if !is_readable {
+                    return Err(io::ErrorKind::WouldBlock.into());
+                }
+                if self.sealed.fill(socket)? == 0 {
+                    return Ok(Got::default());
+                }
+            }
+            let count = self.tls.read_tls(&mut self.sealed)?;
+            // The peer has closed in order before that.
             if count == 0 {
                 return Ok(Got::default());
             }
@@ -240,10 +265,6 @@ impl Records {
             let _ = self.flush(socket);
             opened.map_err(|error| io::Error::new(io::ErrorKind::InvalidData, words(&error)))?;
             self.refused = self.excess();
-            match self.take(buffer, room) {
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-                taken => return taken.map(|got| Got { work: got.work.max(came), ..got }),
-            }
         }
     }
 
@@ -291,34 +312,56 @@ impl Records {
     }
 }
 
-/// A socket that is read and written at once or not at all.
-struct AtOnce<'a> {
-    socket: &'a TcpStream,
-    /// The last read has left nothing.
-    is_emptied: bool,
+/// Bytes that one read took from a socket, in the order in which they came; it is filled again when all were taken out.
+#[derive(Debug, Default)]
+struct Unopened {
+    /// As long as a read may be.
+    room: Vec<u8>,
+    taken: usize,
+    filled: usize,
 }
 
-impl<'a> AtOnce<'a> {
-    const fn new(socket: &'a TcpStream) -> Self {
-        Self { socket, is_emptied: false }
+impl Unopened {
+    const fn is_empty(&self) -> bool {
+        self.taken == self.filled
+    }
+
+    /// Reads once from the socket; what was there of before has been taken out. Returns how many bytes came; 0 at the end of the connection.
+    fn fill(&mut self, socket: &TcpStream) -> io::Result<usize> {
+        // The last read had left something.
+        let wanted = if self.filled == READ_FIRST { READ_LONG } else { READ_FIRST };
+        if self.room.len() < wanted {
+            self.room.resize(wanted, 0);
+        }
+        (self.taken, self.filled) = (0, 0);
+        self.filled = socket.try_read(&mut self.room)?;
+        if self.filled > 0 && self.filled < self.room.len() {
+            expect_more(socket);
+        }
+        Ok(self.filled)
     }
 }
 
-impl Read for AtOnce<'_> {
+impl Read for Unopened {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let count = self.socket.try_read(buffer)?;
-        self.is_emptied = count > 0 && count < buffer.len();
+        let rest = &self.room[self.taken..self.filled];
+        let count = rest.len().min(buffer.len());
+        buffer[..count].copy_from_slice(&rest[..count]);
+        self.taken += count;
         Ok(count)
     }
 }
 
+/// A socket that is written at once or not at all.
+struct AtOnce<'a>(&'a TcpStream);
+
 impl Write for AtOnce<'_> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.socket.try_write(bytes)
+        self.0.try_write(bytes)
     }
 
     fn write_vectored(&mut self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
-        self.socket.try_write_vectored(parts)
+        self.0.try_write_vectored(parts)
     }
 
     fn flush(&mut self) -> io::Result<()> {
@@ -411,6 +454,25 @@ pub(super) mod tests {
             assert_eq!(got, Got { count, work: count * RECORD_WORK });
         }
         assert_eq!(buffer[..], [7; 100]);
+        sending.join().unwrap();
+    }
+
+    #[tokio::test]
+    async fn a_long_message_comes_whole_in_whatever_pieces_it_is_read() {
+        let (transport, mut peer) = sealed_pair(|_| {}).await;
+        let message: Vec<u8> = (0..1_000_000_u32).map(|at| (at % 251) as u8).collect();
+        peer.tls.writer().write_all(&message).unwrap();
+        let sending = peer.send();
+        let mut buffer = BytesMut::new();
+        for room in [1, 100, 5_000, 20_000, 70_000].into_iter().cycle() {
+            let got = timeout(PATIENCE, transport.take_in(&mut buffer, room)).await;
+            let got = got.expect("it has come").expect("an honest peer");
+            assert!(got.count <= room, "{got:?} of {room}");
+            if got.count == 0 {
+                break;
+            }
+        }
+        assert!(buffer[..] == message, "{} bytes came", buffer.len());
         sending.join().unwrap();
     }
 
