@@ -62,6 +62,8 @@ pub const SLOWER_MAX: f64 = 2.0;
 /// Of the answers in each second before an attack, so many are still given while it lasts: fewer is no service, on any machine, however many
 /// others share it (6 % were seen while garbage was poured and compilers ran). How much live traffic feels is said by the 99th percentile, which counts on a machine at rest.
 pub const ANSWERED_MIN: f64 = 0.02;
+/// The same on a machine at rest, where nothing else takes them away.
+pub const ANSWERED_AT_REST: f64 = 0.5;
 /// Share of the questions that may be late before an attack, on a machine at rest: with more of them the ratio of times says nothing.
 pub const LATE_AT_REST: f64 = 0.01;
 /// Connections that a node begins to one that comes: a dial, one that crosses the other's (GNCL-4), and two side connections (GNCL-14).

@@ -267,12 +267,7 @@ fn every_application_and_node_is_pinged_by_tid_and_by_name_from_either_node() {
 #[test]
 fn who_does_not_answer_a_ping_is_a_finding_with_a_reason() {
     let scenario = Scenario::new();
-    let mut hip = scenario.start("hip", 1, &[]);
-    hip.wait_for(&["started"]);
-    let _knee = scenario.start("knee", 2, &["--requires", "ankle"]);
-    scenario.until("the knee waits", "hip", &["apps"], |said| {
-        named(&said["apps"], "knee").is_some_and(|app| app["state"] == "waits")
-    });
+    let _robot = scenario.start_a_knee_that_waits_for_an_ankle();
     let answer = scenario.sinew("hip", &["ping", "knee", "--deadline-ms", "50"]);
     assert!(
         answer.code == Some(1) && answer.out.contains("ankle (not there)"),

@@ -51,6 +51,17 @@ impl Scenario {
         (hip, knee)
     }
 
+    /// The hip, which runs, and the knee, which waits for an ankle that is not there.
+    pub(crate) fn start_a_knee_that_waits_for_an_ankle(&self) -> (Program, Program) {
+        let mut hip = self.start("hip", 1, &[]);
+        hip.wait_for(&["started"]);
+        let knee = self.start("knee", 2, &["--requires", "ankle"]);
+        self.until("the knee waits", "hip", &["apps"], |said| {
+            named(&said["apps"], "knee").is_some_and(|app| app["state"] == "waits")
+        });
+        (hip, knee)
+    }
+
     /// As `start`, with these texts of its configuration replaced by others.
     pub(crate) fn start_changed(
         &self,

@@ -187,12 +187,7 @@ fn which_way_values_of_class_stream_go_is_said_from_both_ends() {
 fn a_message_to_an_application_that_waits_to_be_started_is_not_tried_and_why_says_for_whom_it_waits() {
     // Given
     let scenario = Scenario::new();
-    let mut hip = scenario.start("hip", 1, &[]);
-    hip.wait_for(&["started"]);
-    let _knee = scenario.start("knee", 2, &["--requires", "ankle"]);
-    scenario.until("the knee waits", "hip", &["apps"], |said| {
-        named(&said["apps"], "knee").is_some_and(|app| app["state"] == "waits")
-    });
+    let _robot = scenario.start_a_knee_that_waits_for_an_ankle();
     // When
     let said = scenario.until("all links are up", "hip", &["why", "hip", "knee"], |said| {
         said["steps"].is_array() && blocked(said).lines().count() == 1

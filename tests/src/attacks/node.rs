@@ -11,7 +11,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew::{NodeAddress, Sender, prelude::*};
+use sinew::{NodeAddress, Reply, Sender, prelude::*};
 
 use super::together;
 use crate::{
@@ -23,6 +23,9 @@ use crate::{
 
 /// The name of the application that answers.
 pub(super) const ECHO: &str = "echo";
+/// Questions that may wait for their answers at once: one that takes long holds up none, as in a control loop, and a stall of the machine is
+/// no queue that lasts for many times as long.
+const OPEN_MAX: usize = 64;
 /// Time between the moments at which two questions are due.
 const PACE: Duration = Duration::from_millis(1);
 
@@ -69,7 +72,7 @@ struct Window {
     times: Times,
     count: u64,
     failed: u64,
-    /// Questions that were asked more than a pace after they were due, because the one before had no answer.
+    /// Questions that were asked more than a pace after they were due, because who asks had no CPU, or [`OPEN_MAX`] had no answer.
     late: u64,
     /// Questions that were due and had no answer at the end.
     waiting: u64,
@@ -103,21 +106,21 @@ impl Measured {
         Self { since: now, window: Window::default(), due: now, answers: 0 }
     }
 
-    /// The question that was due has been asked.
-    fn asked(&mut self, now: Instant) {
-        self.window.late += u64::from(now.saturating_duration_since(self.due) > PACE);
+    /// The question that was `due` then has been asked.
+    fn asked(&mut self, due: Instant, now: Instant) {
+        self.window.late += u64::from(now.saturating_duration_since(due) > PACE);
     }
 
-    /// It has its answer, or will never have one. Of those that were due before this window began none is asked any more: they were counted there.
-    fn ended(&mut self, now: Instant, is_answered: bool) {
-        if is_answered {
-            self.window.times.note(now.saturating_duration_since(self.due));
+    /// The oldest one, which was `due` then, has its answer, or will never have one. An answer to one of before this window counted there, as
+    /// one that waits.
+    fn ended(&mut self, due: Instant, now: Instant, is_answered: bool) {
+        self.answers += u64::from(is_answered);
+        self.window.failed += u64::from(!is_answered);
+        if is_answered && due >= self.since {
+            self.window.times.note(now.saturating_duration_since(due));
             self.window.count += 1;
-            self.answers += 1;
-        } else {
-            self.window.failed += 1;
         }
-        self.due = (self.due + PACE).max(self.since);
+        self.due = (due + PACE).max(self.since);
     }
 
     /// Ends the window, and begins the next one. Questions that were due and have no answer count with the time that they have waited: else
@@ -248,25 +251,36 @@ fn is_answered(measured: &Mutex<Measured>) -> bool {
     true
 }
 
+/// Asks when a question is due, whether those before have their answers or not; another thread takes these, which come in the order of the
+/// questions.
 fn question(sender: &Sender, over: &AtomicBool, measured: &Mutex<Measured>) {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build();
-    let runtime = runtime.expect("a reactor with nothing but a timer");
-    for number in 0.. {
-        if over.load(Ordering::Relaxed) {
-            return;
-        }
-        let due = lock(measured).due;
-        std::thread::sleep(due.saturating_duration_since(Instant::now()));
-        lock(measured).asked(Instant::now());
-        let answer = runtime.block_on(async {
-            sender.ask::<Order, Order>(ECHO, &Order { number }, DEADLINE).ok()?.await.ok()
+    let (put, taken) = std::sync::mpsc::sync_channel::<(u64, Instant, Option<Reply<Order>>)>(OPEN_MAX);
+    std::thread::scope(|threads| {
+        threads.spawn(|| {
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build();
+            let runtime = runtime.expect("a reactor with nothing but a timer");
+            for (number, due, asked) in taken {
+                let answer = asked.and_then(|asked| runtime.block_on(asked).ok());
+                assert!(
+                    answer.as_ref().is_none_or(|answer| answer.number == number),
+                    "the answer to another question"
+                );
+                lock(measured).ended(due, Instant::now(), answer.is_some());
+            }
         });
-        assert!(
-            answer.as_ref().is_none_or(|answer| answer.number == number),
-            "the answer to another question"
-        );
-        lock(measured).ended(Instant::now(), answer.is_some());
-    }
+        let mut due = lock(measured).due;
+        for number in 0.. {
+            if over.load(Ordering::Relaxed) {
+                break;
+            }
+            std::thread::sleep(due.saturating_duration_since(Instant::now()));
+            lock(measured).asked(due, Instant::now());
+            let asked = sender.ask::<Order, Order>(ECHO, &Order { number }, DEADLINE).ok();
+            put.send((number, due, asked)).expect("it takes until nothing more comes");
+            due += PACE;
+        }
+        drop(put);
+    });
 }
 
 #[cfg(test)]
@@ -284,10 +298,11 @@ mod tests {
         let mut measured = Measured::new(begin);
         let mut now = begin;
         for number in 0..100 {
-            now = now.max(measured.due);
-            measured.asked(now);
+            let due = measured.due;
+            now = now.max(due);
+            measured.asked(due, now);
             now += if number == 9 { Duration::from_millis(50) } else { quick };
-            measured.ended(now, true);
+            measured.ended(due, now, true);
         }
         // Then: half of those that it held up waited for 25 ms and more, not one of a hundred
         let seen = window(&mut measured, now);
@@ -302,19 +317,19 @@ mod tests {
     fn a_silence_that_does_not_end_is_all_that_is_due_in_it_and_the_next_window_begins_anew() {
         let begin = Instant::now();
         let mut measured = Measured::new(begin);
-        measured.asked(begin);
+        measured.asked(begin, begin);
         // When: nothing comes for 20 ms, and the answer 5 ms later
         let seen = window(&mut measured, begin + PACE * 20);
-        measured.ended(begin + PACE * 25, true);
+        measured.ended(begin, begin + PACE * 25, true);
         // Then
         assert_eq!(seen[..4], [0, 0, 0, 20]);
         assert_eq!((seen[5], seen[6]), (20_000_000, 20_000_000));
         assert_eq!(measured.due, begin + PACE * 20, "those before were counted");
-        measured.asked(begin + PACE * 25);
-        measured.ended(begin + PACE * 25, false);
+        measured.asked(begin + PACE * 20, begin + PACE * 25);
+        measured.ended(begin + PACE * 20, begin + PACE * 25, false);
         let seen = window(&mut measured, begin + PACE * 26);
-        // The one that came late, one that failed, and of six that are due one and four that have no answer.
-        assert_eq!(seen[..4], [1, 1, 1, 5]);
+        // One that was asked late and failed, and five that have no answer.
+        assert_eq!(seen[..4], [0, 1, 1, 5]);
     }
 
     #[test]
@@ -325,7 +340,8 @@ mod tests {
             let mut measured = Measured::new(begin + PACE * at);
             for number in 0..100 {
                 let time = if number < slow { PACE / 2 } else { PACE / 10 };
-                measured.ended(measured.due + time, true);
+                let due = measured.due;
+                measured.ended(due, due + time, true);
             }
             let window = measured.window(measured.due);
             all.add(window);

@@ -5,7 +5,8 @@ use std::{collections::BTreeMap, fmt, time::Duration};
 use serde_json::{Value, json};
 
 use super::{
-    ANSWERED_MIN, Attack, DIALS_OF_A_NEWCOMER, GROWTH_MAX, Happened, Knocked, LATE_AT_REST, SLOWER_MAX,
+    ANSWERED_AT_REST, ANSWERED_MIN, Attack, DIALS_OF_A_NEWCOMER, GROWTH_MAX, Happened, Knocked, LATE_AT_REST,
+    SLOWER_MAX,
     keys::{self, ANKLE},
     robot::{NDL_PERIOD, Refused, Seen, Window},
     rounds::{Attacked, Rounds},
@@ -100,8 +101,7 @@ impl Row {
     /// The machine was at rest where nobody was attacked: else times say nothing.
     #[must_use]
     pub fn was_at_rest(&self) -> bool {
-        let before = &self.rounds.before;
-        before.missed() as f64 <= LATE_AT_REST * before.asked() as f64
+        self.rounds.was_at_rest()
     }
 
     /// The attacker came to do something in the rounds, to each: else times say nothing.
@@ -222,7 +222,8 @@ impl Outcome {
         if before.count == 0 || failed > 0 {
             broken.push(format!("{failed} questions without an answer, and {} answers before", before.count));
         }
-        if lived.rate() < ANSWERED_MIN * before.rate() {
+        let least = if self.rounds.was_at_rest() { ANSWERED_AT_REST } else { ANSWERED_MIN };
+        if lived.rate() < least * before.rate() {
             let [before, during] = [before.rate(), lived.rate()];
             broken.push(format!("{during:.1} answers in a second, and {before:.1} before"));
         }

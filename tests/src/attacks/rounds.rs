@@ -9,7 +9,7 @@ use std::{
 };
 
 use super::{
-    Attack, EndsIt, Happened, Plan, Scene,
+    Attack, EndsIt, Happened, LATE_AT_REST, Plan, Scene,
     robot::{Decoys, Target, Window},
 };
 
@@ -61,6 +61,13 @@ pub struct Rounds {
     pub(super) own_perhaps: u64,
     /// What must not have been for however short a time: who was let in by the node, say.
     pub(super) let_in: Vec<String>,
+}
+
+impl Rounds {
+    /// The machine was at rest where nobody was attacked: else times say nothing.
+    pub(super) fn was_at_rest(&self) -> bool {
+        self.before.missed() as f64 <= LATE_AT_REST * self.before.asked() as f64
+    }
 }
 
 /// Measures them with this attack.

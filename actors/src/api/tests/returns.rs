@@ -8,7 +8,7 @@ use super::{
     forms::{self, Client, Form, Under},
     on, register,
 };
-use crate::api::link::Ended;
+use crate::api::{Endpoint, link::Ended};
 
 on_every_transport! {
     an_endpoint_comes_back_to_its_name_its_address_and_its_groups
@@ -85,18 +85,25 @@ fn who_comes_back_and_may_not_join_a_group_any_more_hears_it_and_is_in_the_other
     // When: it comes back
     endpoint.writer.close();
     endpoint.end(Ended { why: "a test ends it".to_owned(), again: true });
-    let deadline = Time::now() + WATCHDOG;
-    while endpoint.registrations() == 1 || !endpoint.home.rejoining.is_empty() {
-        assert!(Time::now() < deadline, "waited for what becomes of its groups");
-        // It is told once that it is away.
-        let _ = endpoint.receive(Duration::from_millis(10));
-    }
+    // It is told once that it is away.
+    until_it_is_back_in_its_groups(&mut endpoint, |endpoint| {
+        drop(endpoint.receive(Duration::from_millis(10)))
+    });
     // Then
     assert_eq!(node.refused("membership"), 1);
     assert_eq!(endpoint.home.groups.len(), 2, "it asks again when it comes back the next time");
     assert!(node.stores.router.is_member(AppAddress::group("drives"), endpoint.tid().app));
     let refused = endpoint.join("lamps");
     assert!(matches!(refused, Err(ApiError::Ended(Outcome::Rejected(Rejection::NotAllowed)))), "{refused:?}");
+}
+
+/// It does this again and again, until it has come back and has heard of all its groups.
+fn until_it_is_back_in_its_groups(endpoint: &mut Endpoint, does: impl Fn(&mut Endpoint)) {
+    let deadline = Time::now() + WATCHDOG;
+    while endpoint.registrations() == 1 || !endpoint.home.rejoining.is_empty() {
+        assert!(Time::now() < deadline, "waited for what becomes of its groups");
+        does(endpoint);
+    }
 }
 
 #[test]
@@ -111,12 +118,10 @@ fn who_comes_back_to_more_groups_than_it_asks_about_is_in_all_of_them() {
     (0..256).for_each(|number| endpoint.join(&number.to_string()).unwrap());
     // When
     node.restart();
-    let deadline = Time::now() + WATCHDOG;
-    while endpoint.registrations() == 1 || !endpoint.home.rejoining.is_empty() {
-        assert!(Time::now() < deadline, "waited for what becomes of its groups");
-        // It is told once that it is away.
-        let _ = endpoint.receive(Duration::from_millis(10));
-    }
+    // It is told once that it is away.
+    until_it_is_back_in_its_groups(&mut endpoint, |endpoint| {
+        drop(endpoint.receive(Duration::from_millis(10)))
+    });
     // Then
     assert_eq!((endpoint.registrations(), node.stores.router.memberships()), (2, 256));
 }
@@ -130,12 +135,10 @@ fn who_comes_back_and_only_sends_takes_what_becomes_of_its_groups_so_that_the_no
     (0..20).for_each(|number| endpoint.join(&number.to_string()).unwrap());
     // When
     node.restart();
-    let deadline = Time::now() + WATCHDOG;
-    while endpoint.registrations() == 1 || !endpoint.home.rejoining.is_empty() {
-        assert!(Time::now() < deadline, "waited for what becomes of its groups");
-        // It fails while the node is away.
-        let _ = endpoint.send(Tid::group("drives"), &TORQUE);
-    }
+    // It fails while the node is away.
+    until_it_is_back_in_its_groups(&mut endpoint, |endpoint| {
+        drop(endpoint.send(Tid::group("drives"), &TORQUE))
+    });
     // Then
     assert_eq!((endpoint.registrations(), node.stores.router.memberships()), (2, 20));
 }

@@ -2,6 +2,7 @@
 
 mod contests;
 mod duplicates;
+mod endings;
 mod lives;
 mod memory;
 mod paces;

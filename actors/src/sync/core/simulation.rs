@@ -7,10 +7,12 @@
 //! | file | what is in it |
 //! | --- | --- |
 //! | `plan` | what a seed says |
-//! | `world` | the cores, their applications, and what becomes of what cores order |
+//! | `world` | the cores, and what becomes of what they order |
+//! | `apps` | applications: what they require and were told, how they start and go |
 //! | `links` | links that break, one end after the other, nodes that are lost, paused, restarted and leave |
 //! | `judge` | what must hold after quiet, apart from all that happened |
 
+mod apps;
 mod judge;
 mod links;
 mod plan;

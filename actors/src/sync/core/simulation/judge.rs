@@ -1,6 +1,6 @@
 //! What must hold after quiet, by what each application's own node knows of it: nothing of the cores but what they say.
 
-use super::{super::reason::Reason, world::Life, *};
+use super::{super::reason::Reason, apps::Life, *};
 use crate::sync::facts::Absence;
 
 impl World {

@@ -1,0 +1,130 @@
+//! How a broken connection and a goodbye end a member, and what brings it back.
+
+use sinew_runtime::tid::Incarnation;
+
+use super::{
+    scenarios::bytes,
+    world::{PERIOD, Spec, World, ms, node, place, udp},
+};
+use crate::{
+    gncl::LinkFact,
+    ndl::{
+        LossReason, MembershipFact,
+        core::Input,
+        datagram::{Answer, Body},
+    },
+};
+
+// spec: NDL-4.3
+#[test]
+fn a_broken_and_refused_connection_is_a_loss_at_once() {
+    let mut world = World::of_members(2);
+    let (node, incarnation) = (node(2), Incarnation(1));
+    world.kill(2);
+    world.link(1, LinkFact::DialRefused { node, incarnation });
+    world.link(1, LinkFact::LinkBroken { node, incarnation });
+    assert_eq!(world.losses(1), [], "refused before it was up, or only broken");
+    world.link(1, LinkFact::DialRefused { node, incarnation: Incarnation(0) });
+    assert_eq!(world.losses(1), [], "a former life");
+    world.link(1, LinkFact::DialRefused { node, incarnation });
+    assert_eq!(world.losses(1), [(2, LossReason::Crashed)]);
+}
+
+// spec: NDL-4.3
+#[test]
+fn who_answers_a_question_of_after_its_link_broke_is_not_lost_because_somebody_refuses_for_it() {
+    let mut world = World::of_members(2);
+    let (node, incarnation) = (node(2), Incarnation(1));
+    let refused = || LinkFact::DialRefused { node, incarnation };
+    world.link(1, LinkFact::LinkBroken { node, incarnation });
+    // Between two dials
+    for _ in 0..5 {
+        world.run(ms(10));
+        world.link(1, refused());
+    }
+    assert_eq!(world.losses(1), []);
+    // But when it has ended the next refusal says so.
+    world.kill(2);
+    world.run(ms(10));
+    world.link(1, refused());
+    assert_eq!(world.losses(1), [(2, LossReason::Crashed)]);
+}
+
+// spec: NDL-2.2
+#[test]
+fn who_is_started_again_at_the_same_address_is_found_at_once_though_its_former_life_was_asked_just_before() {
+    let mut world = World::of_members(2);
+    let (node, incarnation) = (node(2), Incarnation(1));
+    world.kill(2);
+    world.link(1, LinkFact::LinkBroken { node, incarnation });
+    world.run(ms(3));
+    world.start(2, &Spec { incarnation: 2, ..Spec::of(2) });
+    world.run(ms(5));
+    let is_back =
+        |fact: &MembershipFact| matches!(fact, MembershipFact::NodeFound { incarnation: Incarnation(2), .. });
+    assert!(world.at(1).facts.iter().any(is_back), "{:?}", world.at(1).facts);
+}
+
+#[test]
+fn a_refused_node_that_answers_a_later_question_is_found_again() {
+    // given: an answer to an earlier question is on its way
+    let mut world = World::of_members(2);
+    let (node, incarnation) = (node(2), Incarnation(1));
+    world.link(1, LinkFact::LinkBroken { node, incarnation });
+    world.cut(1, 2);
+    world.link(1, LinkFact::DialRefused { node, incarnation });
+    world.run(ms(1));
+    assert!(!world.knows(1, 2));
+    // when
+    world.mend();
+    // then
+    world.run_until(PERIOD + ms(2), |world| world.knows(1, 2));
+}
+
+// spec: NDL-4.4
+#[test]
+fn a_node_that_says_goodbye_has_left_and_is_found_when_it_comes_again() {
+    let mut world = World::of_members(2);
+    world.input(2, Input::Stopping);
+    world.run(ms(1));
+    assert_eq!(world.losses(1), [(2, LossReason::Left)]);
+    world.restart_shell(2);
+    world.run_until(ms(1), |world| world.knows(1, 2));
+}
+
+#[test]
+fn a_goodbye_with_a_forged_source_or_of_another_life_changes_nothing() {
+    let mut world = World::of_members(2);
+    let mut me = world.at(2).core.announcement().clone();
+    world.forge(udp(3), 1, &bytes(0, Body::Leave(me.clone())));
+    me.boot_nonce += 1;
+    world.forge(udp(2), 1, &bytes(0, Body::Leave(me)));
+    assert_eq!(world.losses(1), []);
+    assert_eq!(world.at(1).core.refusals().of("NDL leave of a stranger"), 2);
+}
+
+/// Found by the simulation.
+#[test]
+fn what_a_node_answered_before_its_goodbye_does_not_bring_it_back_though_it_was_lost_as_silent() {
+    // given: lost as silent, it is asked again; its answer is overtaken by its goodbye
+    let mut world = World::of_members(2);
+    world.cut(2, 1);
+    world.run_until(PERIOD * 5, |world| !world.knows(1, 2));
+    let contact = &world.at(1).core.contacts[&place(1, udp(2))];
+    let correlation = contact.questions.newest().expect("it is asked again at once").correlation;
+    let announcement = world.at(2).core.announcement().clone();
+    // when
+    world.forge(udp(2), 1, &bytes(0, Body::Leave(announcement.clone())));
+    let answer =
+        Answer { announcement, query_sent_ns: 0, query_received_ns: 0, progress: Default::default() };
+    world.forge(udp(2), 1, &bytes(correlation, Body::Answer(answer)));
+    // then
+    assert!(!world.knows(1, 2));
+}
+
+#[test]
+fn goodbye_on_the_connection_counts_as_well() {
+    let mut world = World::of_members(2);
+    world.link(1, LinkFact::PeerLeft { node: node(2), incarnation: Incarnation(1) });
+    assert_eq!(world.losses(1), [(2, LossReason::Left)]);
+}

@@ -1,0 +1,251 @@
+//! Each thing that can stand in a way, what is said of it, and what mends it.
+
+use super::*;
+
+/// What stands in the way of facts that were changed so: the step, what is seen, what mends it.
+struct Case(fn(&mut Facts), [&'static str; 3]);
+
+const CASES: &[Case] = &[
+    Case(
+        |facts| facts.ends[1] = End { wanted: "ankle".to_owned(), ..End::default() },
+        ["ankle is there", "'ankle'", "sinew apps"],
+    ),
+    Case(|facts| facts.ends[1].report = None, ["knee.drive is there", "cannot be asked", "--other-socket"]),
+    Case(|facts| knee(facts).stopping = true, ["knee.drive is there", "about to end", "start it"]),
+    Case(
+        |facts| facts.ends[1].doubles.push("node shank (process 9)".to_owned()),
+        ["its address alone", "10.0.0.2 is used by node shank", "another `address`"],
+    ),
+    Case(
+        |facts| {
+            let cause = "NDL node address used twice".to_owned();
+            let detail = "10.0.0.2 is at 10.0.0.2:7000; the process at 10.0.0.9:7000 claims it".to_owned();
+            hip(facts).refusals.push(RefusalReport { cause, count: 4, detail, ago_us: 1_000_000 });
+        },
+        ["hip sees both addresses once", "10.0.0.9", "another `address`"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            knee(facts).project = "arm".to_owned();
+        },
+        ["one project", "'leg', knee.drive of 'arm'", "same `project`"],
+    ),
+    Case(
+        |facts| {
+            hip(facts).peers.clear();
+            hip(facts).lost.push(lost("link down"));
+        },
+        ["hip knows knee.drive", "had not answered for 1.5 s, nor", "cable"],
+    ),
+    Case(
+        |facts| {
+            hip(facts).peers.clear();
+            hip(facts).lost.push(lost("hung"));
+        },
+        ["hip knows knee.drive", "while its host did", "kill -CONT"],
+    ),
+    Case(
+        |facts| {
+            hip(facts).peers.clear();
+            hip(facts).lost.push(lost("crashed"));
+        },
+        ["hip knows knee.drive", "its process has ended", "start it again"],
+    ),
+    Case(
+        |facts| {
+            hip(facts).peers.clear();
+            hip(facts).lost.push(lost("left"));
+        },
+        ["hip knows knee.drive", "stopped in order", "start it again"],
+    ),
+    Case(
+        |facts| {
+            never_answered(facts);
+            let project = "arm".to_owned();
+            let foreign = ForeignReport {
+                node: node(2),
+                name: "knee".to_owned(),
+                project,
+                udp: String::new(),
+                ago_us: 1,
+            };
+            hip(facts).foreign.push(foreign);
+        },
+        ["hip knows 10.0.0.2", "project 'arm', not 'leg'", "same `project`"],
+    ),
+    Case(never_answered, ["hip knows 10.0.0.2", "never heard of it; it asks 239.0.0.1:7000", "seeds"]),
+    Case(
+        |facts| {
+            strangers(facts);
+            asks(knee(facts), &["239.0.0.2:7000"]);
+        },
+        ["hip knows knee.drive", "the other in 239.0.0.2:7000", "same `multicast`"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            asks(knee(facts), &["239.0.0.2:7000"]);
+            // It is of a version that says one group alone.
+            hip(facts).groups.clear();
+        },
+        ["hip knows knee.drive", "in the group 239.0.0.1:7000, the other in 239.0.0.2", "same `multicast`"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            asks(knee(facts), &[]);
+        },
+        ["hip knows knee.drive", "knee takes no part in multicast", "seeds = [\"10.0.0.2:7000\"]"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            asks(hip(facts), &["239.0.0.1:7000", "[ff12::1]:7000"]);
+            asks(knee(facts), &["[ff12::1]:7000"]);
+        },
+        [
+            "hip knows knee.drive",
+            "both ask in the group [ff12::1]:7000, and it has not",
+            "firewalls, IGMP and MLD",
+        ],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            asks(hip(facts), &["239.0.0.1:7000", "[ff12::1]:7000"]);
+            asks(knee(facts), &["[ff12::2]:7000"]);
+        },
+        [
+            "hip knows knee.drive",
+            "239.0.0.1:7000 and [ff12::1]:7000, the other in [ff12::2]",
+            "same `multicast6`",
+        ],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            asks(knee(facts), &["[ff12::1]:7000"]);
+        },
+        ["hip knows knee.drive", "the other in [ff12::1]:7000", "both of IPv6"],
+    ),
+    // Its groups are of no use to whom nothing of it reaches.
+    Case(
+        |facts| {
+            strangers(facts);
+            asks(knee(facts), &[]);
+            knee(facts).interface = "::1".to_owned();
+        },
+        ["hip knows knee.drive", "its own host only", "`interface`"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            knee(facts).interface = "127.0.0.1".to_owned();
+        },
+        ["hip knows knee.drive", "its own host only", "`interface`"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            knee(facts).interface = "lo, ::1".to_owned();
+        },
+        ["hip knows knee.drive", "its own host only", "`interface`"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            knee(facts).interface = "lo, eth0".to_owned();
+        },
+        ["hip knows knee.drive", "has not heard the other", "IGMP"],
+    ),
+    Case(
+        |facts| {
+            strangers(facts);
+            hip(facts).seeds.push("10.0.0.2:7000".to_owned());
+        },
+        ["hip knows knee.drive", "a seed names it", "firewalls"],
+    ),
+    Case(strangers, ["hip knows knee.drive", "has not heard the other", "IGMP"]),
+    Case(
+        |facts| {
+            let peer = &mut hip(facts).peers[0];
+            peer.links[0].is_up = false;
+            peer.broken_us = Some(2_000_000);
+            let (address, error) =
+                ("10.0.0.2:7001".to_owned(), "Connection refused (os error 111)".to_owned());
+            let fault = "refused".to_owned();
+            peer.dial = Some(DialReport { address, error, fault, ago_us: 100_000, failed: 5 });
+        },
+        [
+            "hip is connected to knee.drive",
+            "control down, broken 2.0 s ago; 5 dials in vain",
+            "nobody listens at 10.0.0.2:7001",
+        ],
+    ),
+    Case(
+        |facts| {
+            let peer = &mut hip(facts).peers[0];
+            peer.links.clear();
+            let (address, error) = ("10.0.0.2:7001".to_owned(), "No route to host".to_owned());
+            let fault = "system".to_owned();
+            peer.dial = Some(DialReport { address, error, fault, ago_us: 100_000, failed: 5 });
+        },
+        ["hip is connected to knee.drive", "never connected", "ip route get 10.0.0.2"],
+    ),
+    Case(
+        |facts| {
+            knee(facts).peers[0].links.clear();
+            let detail = "node 10.0.0.1 says: your clock is odd".to_owned();
+            let cause = "violation".to_owned();
+            knee(facts).refusals.push(RefusalReport { cause, count: 1, detail, ago_us: 1_000 });
+        },
+        ["knee.drive is connected to hip", "your clock is odd", "log"],
+    ),
+    Case(
+        |facts| drive(facts).report = None,
+        ["knee.drive takes messages", "no such application", "sinew apps"],
+    ),
+    Case(
+        |facts| waits(facts, "ankle"),
+        ["knee.drive takes messages", "ankle (not there)", "start what it waits for: ankle"],
+    ),
+    Case(
+        |facts| {
+            waits(facts, "gait");
+            facts.waits.insert("gait".to_owned(), vec!["clock".to_owned(), "knee.drive".to_owned()]);
+        },
+        ["knee.drive takes messages", "knee.drive -> gait -> knee.drive", "`requires`"],
+    ),
+    Case(
+        |facts| drive(facts).line.as_mut().expect("supervised").state = "hung".to_owned(),
+        ["knee.drive takes messages", "hung for", "sinew tree"],
+    ),
+    Case(
+        |facts| {
+            facts.ends[1].report = None;
+            facts.shut.push("the socket /run/knee.sock lets nobody in".to_owned());
+        },
+        ["knee.drive is there", "/run/knee.sock lets nobody in", "is it running"],
+    ),
+    Case(
+        |facts| facts.pings[0] = Some(Err("no answer within 2s".to_owned())),
+        ["a message goes from hip to knee.drive", "no answer", "tree"],
+    ),
+];
+
+#[test]
+fn whatever_stands_in_the_way_is_named_with_what_mends_it() {
+    for (number, Case(change, [what, seen, mend])) in CASES.iter().enumerate() {
+        let mut facts = free();
+        change(&mut facts);
+        let steps = judge(&facts);
+        let blocked: Vec<_> = steps.iter().filter(|step| step.state == State::Blocked).collect();
+        let is_it = |step: &&&Step| {
+            step.what.contains(what)
+                && step.seen.contains(seen)
+                && step.mend.as_ref().is_some_and(|said| said.contains(mend))
+        };
+        assert!(blocked.iter().any(|step| is_it(&step)), "case {number}, {what}: {blocked:#?}");
+    }
+}
