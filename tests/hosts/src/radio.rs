@@ -163,9 +163,8 @@ impl Carrier {
         while !self.shared.ends.load(Ordering::Relaxed) {
             self.deliver(Instant::now());
             self.wait();
-            let weather = *self.shared.weather.lock().unwrap_or_else(PoisonError::into_inner);
             for from in 0..self.taps.len() {
-                self.read(from, weather);
+                self.read(from);
             }
         }
     }
@@ -182,9 +181,11 @@ impl Carrier {
     }
 
     /// Takes what a host has sent.
-    fn read(&mut self, from: usize, weather: Weather) {
+    fn read(&mut self, from: usize) {
         let mut frame = [0; FRAME_MAX];
         while let Ok(length) = self.taps[from].recv(&mut frame) {
+            // Looked at only now: what is sent after `set` meets what was set.
+            let weather = *self.shared.weather.lock().unwrap_or_else(PoisonError::into_inner);
             let Some((to, rest)) = frame[..length].split_first_chunk::<MAC>() else { continue };
             let Some(source) = rest.first_chunk::<MAC>() else { continue };
             self.homes.insert(*source, from);
