@@ -9,6 +9,7 @@
 //! | file | what it is |
 //! | --- | --- |
 //! | `decoy` | the role of the one that is attacked instead of the node |
+//! | `intruder` | a whole node that does not belong there |
 //! | `keys` | the robot's authority, and another one |
 //! | `node` | the role of each node |
 //! | `rounds` | live traffic's times by turns |
@@ -19,6 +20,7 @@
 //! | `report` | what was seen |
 
 mod decoy;
+mod intruder;
 mod keys;
 mod node;
 mod report;
@@ -39,6 +41,7 @@ use std::{
 use rustix::process::{Resource, Rlimit, getrlimit, setpriority_process, setrlimit};
 
 use self::{
+    intruder::Intruder,
     keys::{Keys, Who},
     robot::{Decoys, Robot, Target},
     stranger::Stranger,
@@ -106,6 +109,8 @@ struct Attack {
     inside: bool,
     /// The attacked node has an access list that lets everything be said, and a user of its host in with a few names and a group.
     guests: bool,
+    /// A whole node that tries to get in meanwhile.
+    intruder: Option<Intruder>,
     /// In whose name he may speak: his own.
     own: Who,
     /// Does it until the scene is over.
@@ -136,6 +141,26 @@ struct Happened {
 impl Happened {
     fn new(what: String, broken: Vec<String>) -> Self {
         Self { what, broken, ..Self::default() }
+    }
+
+    /// Both this and that.
+    fn and(mut self, that: Self) -> Self {
+        let Self { what, broken, let_in, refused, own_sent, own_perhaps, done } = that;
+        self.what = format!("{}; {what}", self.what);
+        self.broken.extend(broken);
+        self.let_in.extend(let_in);
+        for (cause, count) in refused {
+            match self.refused.iter_mut().find(|(known, _)| *known == cause) {
+                Some((_, known)) => *known += count,
+                None => self.refused.push((cause, count)),
+            }
+        }
+        self.own_sent += own_sent;
+        self.own_perhaps += own_perhaps;
+        for (what, count) in done {
+            *self.done.entry(what).or_default() += count;
+        }
+        self
     }
 }
 
@@ -308,6 +333,7 @@ struct Meanwhile {
 /// The whole of an attack, with those who want to come in meanwhile.
 fn go_through(attack: &Attack, scene: &Scene<'_>) -> Meanwhile {
     let Scene { robot, hosts, lasts, over, .. } = *scene;
+    let intruding = attack.intruder.map(|intruder| intruder.start(scene));
     let (mut held_most, mut came) = (robot.held_bytes(), None);
     thread::scope(|scope| {
         let _ends = EndsIt(over);
@@ -330,7 +356,10 @@ fn go_through(attack: &Attack, scene: &Scene<'_>) -> Meanwhile {
         let (dials, dialled_by) = (robot.dials(), Instant::now());
         drop(ankle);
         over.store(true, Ordering::Relaxed);
-        let happened = attacking.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        let mut happened = attacking.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        if let Some(intruding) = intruding {
+            happened = happened.and(intruding.end());
+        }
         let by_hand =
             knocking.map(|knocking| knocking.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
         Meanwhile { happened, by_hand, came, dials, dialled_by, held_most }

@@ -63,7 +63,7 @@ impl Hosts {
     /// Makes `count` hosts, 10.77.0.1 and up; or says why that is not possible here.
     ///
     /// # Errors
-    /// A sentence: no root, no `ip`, or a kernel without namespaces.
+    /// A sentence: no root, no `ip` or `nsenter`, or a kernel without namespaces.
     pub fn new(count: u8) -> Result<Self, String> {
         Self::in_networks(count, 1)
     }
@@ -81,6 +81,7 @@ impl Hosts {
     /// # Errors
     /// As `new`; and a kernel without IPv6.
     pub fn with_addresses(count: u8, networks: u8, addresses: Addresses) -> Result<Self, String> {
+        run("nsenter", &["--version"])?;
         let number = format!("{}-{}-", std::process::id(), NETWORKS.fetch_add(1, Ordering::Relaxed));
         let bridge = Namespace::new(format!("sw{number}br"))?;
         for network in 0..networks {
@@ -277,10 +278,13 @@ impl Host {
     }
 
     /// A command that runs `program` on this host.
+    ///
+    /// Not by `ip netns exec`: that also mounts a `/sys` of the namespace, and waits inside the kernel until that is seen on each CPU. Where
+    /// a thread spins on one, that can take seconds. So in `/sys` a program sees the machine's own interfaces.
     #[must_use]
     pub fn command(&self, program: &Path) -> Command {
-        let mut command = Command::new("ip");
-        command.args(["netns", "exec", &self.namespace.0]).arg(program);
+        let mut command = Command::new("nsenter");
+        command.arg(format!("--net={}", self.namespace.path())).arg(program);
         command
     }
 
@@ -308,10 +312,13 @@ impl Namespace {
         Ok(Self(name))
     }
 
+    fn path(&self) -> String {
+        format!("/run/netns/{}", self.0)
+    }
+
     /// Itself, to be entered.
     fn open(&self) -> Result<File, String> {
-        File::open(format!("/run/netns/{}", self.0))
-            .map_err(|error| format!("the namespace {}: {error}", self.0))
+        File::open(self.path()).map_err(|error| format!("the namespace {}: {error}", self.0))
     }
 
     /// `ip` inside this namespace.

@@ -166,12 +166,13 @@ impl Handler<Delivery<NodeEvent>> for Echo {
     }
 }
 
-/// `CONFIGURATION [ASKS]`: says `up` when all runs. `window NAME`: what was measured since the last one, with all that was called so before; `again`: whether questions are answered
-/// from now on; `seen`: who was lost, who was found, and what came unasked; `refused`: what the node refused, for each cause; `tid`: that of
+/// `CONFIGURATION [asks | tries]`: says `up` when all runs; one that tries to get in says `runs` then, and `up` if it has got in. `window
+/// NAME`: what was measured since the last one, with all that was called so before; `again`: whether questions are answered from now on; `seen`: who was lost, who was found, and what came unasked; `refused`: what the node refused, for each cause; `tid`: that of
 /// the application that answers. What it does with another one is told in words of [`together::Part::answer`].
 pub(super) fn play(arguments: &[String]) {
     let config = NodeConfig::from_file(&arguments[0]).expect("the director's configuration");
-    let asks = arguments.get(1).is_some_and(|asks| asks == "asks");
+    let tries = arguments.get(1).is_some_and(|what| what == "tries");
+    let asks = tries || arguments.get(1).is_some_and(|what| what == "asks");
     let counts: Arc<Mutex<Counts>> = Arc::default();
     let counted = counts.clone();
     let name = if asks { "idle" } else { ECHO };
@@ -184,6 +185,9 @@ pub(super) fn play(arguments: &[String]) {
     let builder = Node::builder(config.name.clone()).config(config).app(echo).app(asker).app(party);
     let node = builder.start().expect("a node");
     node.handle().wait_until_running(DEADLINE).expect("it requires nothing");
+    if tries {
+        println!("runs");
+    }
     let sender = key.sender();
     let echo = until("the echo is there", || sender.resolve(ECHO));
     let over = Arc::new(AtomicBool::new(false));

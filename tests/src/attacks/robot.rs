@@ -288,7 +288,7 @@ impl Robot {
     /// A command that starts a whole node there, with keys that it should not have, or none.
     pub(super) fn foreign_node(&self, host: &Host, keys: Option<&Path>) -> Command {
         let config = configuration(&self.directory, self.group, (keys::MALLORY, keys), Further::default());
-        host.moved(&as_role(&self.program, &config, &["asks"]))
+        host.moved(&as_role(&self.program, &config, &["tries"]))
     }
 
     #[expect(clippy::unused_self, reason = "it is the robot's, whichever is attacked")]

@@ -10,12 +10,13 @@ mod handshakes;
 mod slow_loris;
 mod sources;
 
-pub(super) use datagrams::{Recording, listen};
+pub(super) use datagrams::{NOT_OURS, Recording, listen};
 
 use std::collections::BTreeMap;
 
 use super::{
     Attack, Happened, Scene,
+    intruder::Intruder,
     keys::{KNEE, SPARE},
 };
 
@@ -31,6 +32,7 @@ const COMMON: Attack = Attack {
     others_come: false,
     inside: false,
     guests: false,
+    intruder: None,
     own: SPARE,
     run: |_| Happened::new(String::new(), Vec::new()),
     goes_on: None,
@@ -49,15 +51,15 @@ pub(super) const ATTACKS: &[Attack] = &[
     Attack {
         name: "wrong-authority",
         tried: "a whole node, and handshakes by hand, with certificates of another authority of the same project name",
+        intruder: Some(Intruder::OfOthers),
         run: credentials::wrong_authority,
-        goes_on: Some(credentials::wrong_authority_by_hand),
         ..COMMON
     },
     Attack {
         name: "no-certificate",
         tried: "a whole node without keys, handshakes of TLS without a certificate, and HELLO without TLS",
+        intruder: Some(Intruder::WithoutKeys),
         run: credentials::none,
-        goes_on: Some(credentials::none_by_hand),
         ..COMMON
     },
     Attack {

@@ -1,10 +1,8 @@
 //! Who shows what is not his, or nothing.
 
 use std::{
-    collections::BTreeMap,
     io,
-    path::Path,
-    sync::{Arc, mpsc::sync_channel},
+    sync::Arc,
     time::{Duration, Instant},
 };
 
@@ -12,16 +10,12 @@ use sinew::security::rustls::{AlertDescription, Error};
 
 use super::{
     super::{
-        ATTACKER,
         keys::{self, Who},
         robot::Is,
         stranger::{Answer, Client, Stranger, client},
     },
-    Happened, Scene,
-    datagrams::NOT_OURS,
-    done,
+    Happened, Scene, done,
 };
-use crate::clients::Performer;
 
 /// Time between two handshakes.
 const PACE: Duration = Duration::from_millis(20);
@@ -151,53 +145,13 @@ fn shake(scene: &Scene<'_>, lasts: Duration, attempt: &Attempt<'_>) -> Happened 
     tallies.pop().unwrap_or_default().happened(who, expected)
 }
 
-fn together(parts: Vec<Happened>) -> Happened {
-    let mut all = Happened::default();
-    let mut refused: BTreeMap<&'static str, u64> = BTreeMap::new();
-    let mut what = Vec::new();
-    for part in parts {
-        what.push(part.what);
-        all.broken.extend(part.broken);
-        all.let_in.extend(part.let_in);
-        for (cause, count) in part.refused {
-            *refused.entry(cause).or_default() += count;
-        }
-        for (what, count) in part.done {
-            *all.done.entry(what).or_default() += count;
-        }
-    }
-    Happened { what: what.join("; "), refused: refused.into_iter().collect(), ..all }
-}
-
-/// Starts a whole node with these keys, or none, does this meanwhile, and looks whether the node has got in. It says `up` when it has an
-/// answer.
-fn beside_a_node(scene: &Scene<'_>, keys: Option<&Path>, tries: impl FnOnce() -> Vec<Happened>) -> Happened {
-    let command = scene.robot.foreign_node(&scene.hosts[ATTACKER], keys);
-    let (say, said) = sync_channel(16);
-    let node = Performer::start_command(command, "robot-node", move |line| {
-        // What it says beyond that is not needed: one word is enough.
-        let _ = say.try_send(line.to_owned());
-    });
-    let mut parts = tries();
-    drop(node);
-    let broken = said.iter().map(|line| format!("a foreign node has got in, and says {line:?}")).collect();
-    // Only a whole node speaks discovery: it has truly tried if that was refused.
-    let whole = Happened::new("a whole node was started".to_owned(), broken);
-    parts.push(Happened { refused: vec![(NOT_OURS, 1)], ..whole });
-    together(parts)
+/// Tries one after the other, each for as long.
+fn shake_in_turn(scene: &Scene<'_>, attempts: &[Attempt<'_>]) -> Happened {
+    let lasts = scene.lasts / attempts.len().max(1) as u32;
+    attempts.iter().map(|attempt| shake(scene, lasts, attempt)).reduce(Happened::and).unwrap_or_default()
 }
 
 pub(super) fn wrong_authority(scene: &Scene<'_>) -> Happened {
-    let theirs = scene.keys.of_others(keys::MALLORY);
-    beside_a_node(scene, Some(&theirs), || shake_as_others(scene))
-}
-
-/// By hand alone.
-pub(super) fn wrong_authority_by_hand(scene: &Scene<'_>) -> Happened {
-    together(shake_as_others(scene))
-}
-
-fn shake_as_others(scene: &Scene<'_>) -> Vec<Happened> {
     let [own, hip] = [keys::MALLORY, keys::HIP].map(|who| scene.keys.tls_of_others(who));
     let expected = Expected::Alert(NOT_TAKEN);
     let attempts = [
@@ -209,19 +163,10 @@ fn shake_as_others(scene: &Scene<'_>) -> Vec<Happened> {
             expected,
         },
     ];
-    attempts.iter().map(|attempt| shake(scene, scene.lasts / 2, attempt)).collect()
+    shake_in_turn(scene, &attempts)
 }
 
 pub(super) fn none(scene: &Scene<'_>) -> Happened {
-    beside_a_node(scene, None, || shake_without_keys(scene))
-}
-
-/// By hand alone.
-pub(super) fn none_by_hand(scene: &Scene<'_>) -> Happened {
-    together(shake_without_keys(scene))
-}
-
-fn shake_without_keys(scene: &Scene<'_>) -> Vec<Happened> {
     let nothing = client(None);
     let attempts = [
         Attempt {
@@ -237,7 +182,7 @@ fn shake_without_keys(scene: &Scene<'_>) -> Vec<Happened> {
             expected: Expected::Refusal("you do not speak TLS"),
         },
     ];
-    attempts.iter().map(|attempt| shake(scene, scene.lasts / 2, attempt)).collect()
+    shake_in_turn(scene, &attempts)
 }
 
 pub(super) fn stolen(scene: &Scene<'_>) -> Happened {
@@ -253,5 +198,5 @@ pub(super) fn stolen(scene: &Scene<'_>) -> Happened {
             expected: Expected::Alert(NOT_TAKEN),
         },
     ];
-    together(attempts.iter().map(|attempt| shake(scene, scene.lasts / 3, attempt)).collect())
+    shake_in_turn(scene, &attempts)
 }

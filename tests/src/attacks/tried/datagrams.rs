@@ -25,7 +25,7 @@ const KINDS: [&str; 3] = ["sent again", "changed", "made up"];
 /// Where to.
 const DESTINATIONS: [&str; 3] = ["knee", "hip", "the group"];
 /// The node's word for a datagram that nobody of its project has made, or that it has taken before.
-pub(super) const NOT_OURS: &str = "NDL datagram not of this project's keys";
+pub(in super::super) const NOT_OURS: &str = "NDL datagram not of this project's keys";
 
 /// What was heard of the robot.
 #[derive(Default)]
