@@ -50,6 +50,7 @@ pub(super) const CLIENTS_PER_PROCESS_MAX: Range =
 pub(super) const LNCL_STRANGERS_MAX: Range = range("lncl.strangers_max", 1, 1_024, "connections");
 pub(super) const STRANGERS_PER_PROCESS_MAX: Range =
     range("lncl.strangers_per_process_max", 1, 1_024, "connections");
+pub(super) const GUEST_FRAMES: Range = range("lncl.guest_frames_per_s", 100, 1_000_000, "frames in a second");
 pub(super) const CLIENTS_BYTES: Range = range("lncl.clients_bytes", 64 << 10, 64 << 30, "bytes");
 pub(super) const APPS_MAX: Range = range("lncl.apps_max", 1, 65_536, "applications");
 pub(super) const RING_BYTES: Range = range("lncl.ring_bytes", 4 << 10, 16 << 20, "bytes");
@@ -171,6 +172,7 @@ impl NodeConfig {
         CLIENTS_PER_PROCESS_MAX.count(faults, self.lncl.clients_per_process_max);
         LNCL_STRANGERS_MAX.count(faults, self.lncl.strangers_max);
         STRANGERS_PER_PROCESS_MAX.count(faults, self.lncl.strangers_per_process_max);
+        GUEST_FRAMES.count(faults, self.lncl.guest_frames_per_s);
         CLIENTS_BYTES.count(faults, self.lncl.clients_bytes);
         APPS_MAX.count(faults, self.lncl.apps_max);
         RING_BYTES.count(faults, self.lncl.ring_bytes);

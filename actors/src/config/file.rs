@@ -29,7 +29,7 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 const SECTIONS: [&str; 7] = ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 47] = [
+pub(super) const KEYS: [&str; 48] = [
     "node.name",
     "node.project",
     "node.address",
@@ -42,6 +42,7 @@ pub(super) const KEYS: [&str; 47] = [
     "lncl.clients_per_process_max",
     "lncl.strangers_max",
     "lncl.strangers_per_process_max",
+    "lncl.guest_frames_per_s",
     "lncl.clients_bytes",
     "lncl.apps_max",
     "lncl.ring_bytes",
@@ -346,6 +347,7 @@ impl Reader<'_> {
         self.number(&check::CLIENTS_PER_PROCESS_MAX, &mut lncl.clients_per_process_max);
         self.number(&check::LNCL_STRANGERS_MAX, &mut lncl.strangers_max);
         self.number(&check::STRANGERS_PER_PROCESS_MAX, &mut lncl.strangers_per_process_max);
+        self.number(&check::GUEST_FRAMES, &mut lncl.guest_frames_per_s);
         self.number(&check::CLIENTS_BYTES, &mut lncl.clients_bytes);
         self.number(&check::APPS_MAX, &mut lncl.apps_max);
         self.number(&check::RING_BYTES, &mut lncl.ring_bytes);

@@ -361,12 +361,16 @@ impl Client {
                 Ok(None) => return End::HungUp(None),
                 Err(error) => return End::from(error),
             };
+            let bytes = message.payload.len();
             let order = session.handle(message);
             if let ControlFlow::Break(end) = self.obey_session(session, order) {
                 return end;
             }
             self.outcomes.may_come().await;
             self.orders.may_come().await;
+            if let User::Guest(uid) = self.user {
+                self.server.keep_pace(uid, self.tid, bytes).await;
+            }
         }
     }
 

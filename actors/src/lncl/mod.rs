@@ -17,7 +17,7 @@
 //! | LNCL-7 | Each confirmed message to a client ends in what the client says of it; as `Rejected(Closed)` if it was not sent when the connection ended. What was sent and not answered then: where the client has gone as `Failed` if it had taken it, else as `Rejected(Closed)`; where it lives on as `Unknown`, for it may take it yet. |
 //! | LNCL-8 | Two names of payload types with one id are refused where both are told at registration. What another user's application tells bars none of the robot's own. |
 //! | LNCL-9 | A client that can, and says so, gets a ring in shared memory for each direction; the socket then carries descriptors and last words only, and tells either side's end. |
-//! | LNCL-13 | Connections that have not said who they are have bounds of their own, for all, for one process, and for users whom only the access list lets in; each of these connects at a pace. |
+//! | LNCL-13 | Connections that have not said who they are have bounds of their own, for all, for one process, and for users whom only the access list lets in; each of these connects at a pace, and what these send is read at one. |
 //! | LNCL-14 | What nobody has taken of a client's unconfirmed messages the client is told, with its number and once: the first at once, later ones together. |
 //! | LNCL-15 | A connection ends with the process that connected, also while a child that it forked holds the socket open. |
 //! | LNCL-16 | Each confirmed message of a client's has an outcome, also where its queue is full. Who takes none is not read. |
@@ -31,6 +31,7 @@ mod door;
 mod facts;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;
+mod guest_pace;
 mod guests;
 mod introductions;
 mod link;

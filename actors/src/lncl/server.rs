@@ -24,6 +24,7 @@ use tokio::{
 use super::{
     client::{self, ClientOutlet, Notices},
     core::{ClientId, User},
+    guest_pace::GuestPace,
     guests::{Guests, Row},
     introductions::Introductions,
     payload::{self, Refusal},
@@ -50,6 +51,8 @@ pub(super) struct Server {
     strangers: Strangers,
     /// How often users have come whom only the access list lets in.
     guests: RefCell<Guests>,
+    /// How much these have sent.
+    pace: RefCell<GuestPace>,
     /// The bytes that wait for all clients.
     budget: Arc<Budget>,
     /// The part of each process that has clients.
@@ -77,11 +80,13 @@ impl Server {
         let (strangers, introductions) = (Strangers::default(), Introductions::default());
         let (budget, shares) = (Budget::new(stores.config.lncl.clients_bytes), RefCell::default());
         let (rings, guests) = (OnceCell::new(), RefCell::new(Guests::new(Time::now())));
+        let pace = RefCell::new(GuestPace::new(stores.config.lncl.guest_frames_per_s));
         Rc::new(Self {
             stores,
             refusals,
             strangers,
             guests,
+            pace,
             budget,
             shares,
             introductions,
@@ -102,6 +107,19 @@ impl Server {
         let share = Budget::part_of(&self.budget, self.stores.config.lncl.clients_bytes / PROCESSES_MIN);
         shares.insert(pid, Arc::downgrade(&share));
         share
+    }
+
+    /// A frame of this application of the guest `uid` with so many bytes was read. Resolves when the next one may be. spec: LNCL-13
+    pub(super) async fn keep_pace(&self, uid: u32, tid: Tid, bytes: usize) {
+        let rest = self.pace.borrow_mut().read(uid, bytes, Time::now());
+        let Some(rest) = rest else { return };
+        let per_s = self.stores.config.lncl.guest_frames_per_s;
+        let detail = format_args!(
+            "nothing, but {tid} of user {uid} has to wait: {per_s} frames of guests are read in a second, of one user half of that; send fewer, \
+             or raise `lncl.guest_frames_per_s`"
+        );
+        self.refusals.count(Time::now(), "guest too fast", &detail);
+        tokio::time::sleep(rest).await;
     }
 
     /// What makes the rings of clients.

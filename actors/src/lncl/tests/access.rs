@@ -210,6 +210,37 @@ fn another_user_who_registers_and_leaves_without_end_comes_in_at_the_pace_and_ke
 
 // spec: LNCL-13
 #[test]
+fn what_another_user_sends_is_read_at_a_pace_so_that_none_of_the_robots_own_waits_behind_it() {
+    const SENT: u64 = 200;
+    let list = format!("[[client]]\nuid = {STRANGER}\n[[rule]]\nfrom = ['*']\nto = ['*']\n");
+    let node = TestNode::start_guarded_with(&list, |config| config.lncl.guest_frames_per_s = 200);
+    let (app, (mut own, own_tid)) = (node.local(1), RawClient::register(&node, &Register::default()));
+    // Given: a guest that has sent what takes two seconds at that pace
+    let guest = as_stranger(|| {
+        let (mut guest, tid) = RawClient::register(&node, &Register::default());
+        (0..SENT).for_each(|number| guest.send(&confirmed(tid, app.tid, number)));
+        guest
+    });
+    let Some(_guest) = guest else { return };
+    // When
+    own.send(&confirmed(own_tid, app.tid, 0));
+    // Then: it comes before most of these, and they all come in their order
+    let (mut before, mut of_guest) = (None, 0);
+    while of_guest < SENT {
+        let message = app.next();
+        if message.header.source == own_tid {
+            before = Some(of_guest);
+        } else {
+            assert_eq!(message.header.correlation, of_guest);
+            of_guest += 1;
+        }
+    }
+    assert!(before.is_some_and(|before| before < 60), "{before:?} of {SENT}");
+    assert!(node.refused("guest too fast") > 0);
+}
+
+// spec: LNCL-13
+#[test]
 fn another_user_has_a_quarter_of_the_places_at_most() {
     let list = format!("[[client]]\nuid = {STRANGER}\n");
     let node = TestNode::start_guarded_with(&list, |config| config.lncl.clients_max = 8);
