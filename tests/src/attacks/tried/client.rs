@@ -20,8 +20,13 @@ pub(super) fn at_the_door(scene: &Scene<'_>) -> Happened {
         scope.spawn(|| keeper.keep(scene.over));
         let attackers: Vec<_> = (0..ATTACKERS)
             .map(|number| {
-                let mut command = Command::new(scene.program);
-                command.args(["--role", "attacker"]).arg(scene.robot.door());
+                // As all attackers it has the CPU that is left: any program of this user could take that, without a node.
+                let mut command = Command::new("nice");
+                command
+                    .args(["-n", "19"])
+                    .arg(scene.program)
+                    .args(["--role", "attacker"])
+                    .arg(scene.robot.door());
                 command.args([(number + 1).to_string(), scene.lasts.as_millis().to_string()]);
                 command.arg(keeper.port().to_string());
                 let said = said.clone();
