@@ -15,6 +15,7 @@ mod apps;
 mod asker;
 mod audits;
 mod builder;
+mod closed;
 mod commands;
 mod directory;
 #[cfg(feature = "fault-points")]
@@ -309,7 +310,7 @@ impl NodeHandle {
         match &read {
             Ok(AccessSummary { rules, clients }) => {
                 log::info!(rules, clients, "another access list is in force");
-                builder::say_without_groups(access);
+                closed::say_without_groups(access);
             }
             Err(why) => {
                 let why: String = why.to_string().chars().take(LOGGED_MAX).collect();
