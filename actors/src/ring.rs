@@ -19,6 +19,8 @@ use tokio_util::codec::Decoder;
 
 /// Records that one look takes at most: a peer may cut its frames as small as it likes.
 const RECORDS_A_LOOK: usize = 64;
+/// Bytes that a record counts as, beside those of its frame: to take one costs some 50 ns, however short it is.
+const RECORD_WORK: usize = 256;
 /// What a ring has before each record, in bytes.
 const MARK_BYTES: usize = 8;
 /// Bytes that one look takes at least, if they are there: or half a ring, in the pieces in which long frames come, if that is less.
@@ -194,12 +196,22 @@ pub(crate) struct RingFrames {
     buffer: BytesMut,
     /// Bytes of `buffer` that are known to be whole frames: where a record without bytes came, it was looked for their end.
     whole: usize,
+    /// Bytes that the last look copied.
+    copied: usize,
+    /// Bytes' worth of work beside the frames that came: of each record, and what was taken back.
+    idle: usize,
 }
 
 impl RingFrames {
     /// Takes payloads of at most `payload_max` bytes.
     pub(crate) fn new(payload_max: usize) -> Self {
-        Self { codec: FrameCodec::in_memory(payload_max), buffer: BytesMut::new(), whole: 0 }
+        Self {
+            codec: FrameCodec::in_memory(payload_max),
+            buffer: BytesMut::new(),
+            whole: 0,
+            copied: 0,
+            idle: 0,
+        }
     }
 
     /// The next frame of what was taken.
@@ -220,8 +232,9 @@ impl RingFrames {
     /// Each byte is read once. The peer gets their room back together: one that waits for it is woken once, and not for each.
     pub(crate) fn take(&mut self, consumer: &mut Consumer, enough: usize) -> Result<Taken, Corrupt> {
         let half = consumer.payload_max() - MARK_BYTES;
-        let (enough, before) = (enough.max(half.min(ENOUGH_MIN)), self.buffer.len());
+        let enough = enough.max(half.min(ENOUGH_MIN));
         let mut taken = Taken::Nothing;
+        self.copied = 0;
         for _ in 0..RECORDS_A_LOOK {
             let Some(lent) = consumer.receive()? else { break };
             if lent.is_empty() {
@@ -230,14 +243,27 @@ impl RingFrames {
             let start = self.buffer.len();
             self.buffer.resize(start + lent.len(), 0);
             lent.copy_to(&mut self.buffer[start..]);
+            // What was copied counts, not what is left of it: a part may be taken back again and again.
+            self.copied += lent.len();
+            self.idle += RECORD_WORK;
             lent.keep();
             taken = Taken::Some;
-            if self.buffer.len().saturating_sub(before) >= enough || self.has_filled() {
+            if self.copied >= enough || self.has_filled() {
                 break;
             }
         }
         consumer.give_back();
         Ok(taken)
+    }
+
+    /// Bytes that the last look copied.
+    pub(crate) const fn copied(&self) -> usize {
+        self.copied
+    }
+
+    /// Bytes' worth of work since the last call that no frame came of.
+    pub(crate) fn take_idle(&mut self) -> usize {
+        std::mem::take(&mut self.idle)
     }
 
     /// Whether a frame is whole that has a buffer of its own: with what comes behind it that would grow, and each payload in it keep
@@ -257,6 +283,7 @@ impl RingFrames {
             }
             self.whole = end;
         }
+        self.idle += self.buffer.len().saturating_sub(self.whole);
         self.buffer.truncate(self.whole);
     }
 }
@@ -298,6 +325,51 @@ mod tests {
         assert_eq!(frames.take(&mut consumer, 1).expect("an honest peer"), Taken::Some);
         let taken = Capacity::MIN.bytes() - producer.untaken().expect("an honest peer");
         assert_eq!(taken, Capacity::MIN.bytes() / 2);
+    }
+
+    #[test]
+    fn a_frame_that_is_begun_and_taken_back_again_and_again_is_work_and_a_look_at_it_ends() {
+        // Given: a ring full of beginnings of a long frame, each with the record that takes it back
+        let ((mut producer, mut consumer), mut frames) = (ring(), RingFrames::new(1 << 20));
+        let (begins, mut written) = (&frame(1 << 20)[..64], 0);
+        while write(&mut producer, &[IoSlice::new(begins)]).is_ok() && withdraw(&mut producer).is_ok() {
+            written += 1;
+        }
+        assert!(written > 20, "{written} beginnings");
+        // When: it is read, for as little as may be
+        let (mut looks, mut copied, mut idle) = (0, 0, 0);
+        while frames.take(&mut consumer, 1).expect("an honest peer") == Taken::Some {
+            assert!(frames.next().expect("no frame is wrong").is_none());
+            (looks, copied) = (looks + 1, copied + frames.copied());
+            assert!(frames.copied() <= RECORDS_A_LOOK * begins.len());
+            idle += frames.take_idle();
+        }
+        // Then: each byte that was copied, and each record, is in what it came to
+        assert!(looks * RECORDS_A_LOOK >= 2 * written, "{looks} looks at {written} beginnings");
+        assert!(copied >= written * begins.len());
+        assert!(idle >= 2 * written * RECORD_WORK + written * begins.len(), "{idle}");
+        assert_eq!(frames.take_idle(), 0);
+    }
+
+    #[test]
+    fn a_look_takes_no_more_than_is_enough_though_parts_are_taken_back() {
+        // Given: two beginnings of half a look each, both taken back, and what is long enough for a further look
+        let terms = Terms { capacity_max: Capacity::MAX, ..Terms::default() };
+        let make = || Region::create(capacity(2 << 20), BellKind::Futex).expect("a region");
+        let ((left, left_offer), (right, right_offer)) = (make(), make());
+        let (mut producer, _) = left.connect(right_offer, &terms).expect("an honest offer");
+        let (_, mut consumer) = right.connect(left_offer, &terms).expect("an honest offer");
+        let begins = &frame(1 << 20)[..ENOUGH_MIN / 2];
+        for _ in 0..8 {
+            write(&mut producer, &[IoSlice::new(begins)]).expect("there is room");
+            withdraw(&mut producer).expect("there is room");
+        }
+        // When, then
+        let mut frames = RingFrames::new(1 << 20);
+        for look in 0..4 {
+            assert_eq!(frames.take(&mut consumer, 1).expect("an honest peer"), Taken::Some);
+            assert_eq!(frames.copied(), ENOUGH_MIN, "look {look}");
+        }
     }
 
     #[test]

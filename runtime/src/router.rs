@@ -119,6 +119,15 @@ struct Writing {
     elsewhere: Joined<NodeAddress>,
 }
 
+/// How many a message is for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Reach {
+    /// Applications of this node.
+    pub here: usize,
+    /// Other nodes.
+    pub elsewhere: usize,
+}
+
 /// Who decides about one message; nobody: it may go anywhere.
 type Judge<'a> = Option<&'a Arc<dyn Guard>>;
 
@@ -193,6 +202,29 @@ impl Router {
             self.multicast(&snapshot, message)
         };
         self.account(result)
+    }
+
+    /// How many applications of this node a message from here is handed to, each where it may have it, and to how many other nodes.
+    #[must_use]
+    pub fn reach(&self, destination: Tid) -> Reach {
+        let Tid { node, app } = self.absolute(destination);
+        if destination.is_single() {
+            let is_here = node == self.node;
+            return Reach { here: usize::from(is_here), elsewhere: usize::from(!is_here) };
+        }
+        let Snapshot { table, members } = &**self.snapshot.load();
+        let here = match (node == self.node || node == NodeAddress::ALL, app) {
+            (false, _) => 0,
+            (true, group) if group.is_group() => members.here.members(group).len(),
+            (true, AppAddress::ALL) => table.local.len(),
+            (true, _) => 1,
+        };
+        let elsewhere = match (node, app) {
+            (NodeAddress::ALL, group) if group.is_group() => members.elsewhere.members(group).len(),
+            (NodeAddress::ALL, _) => table.peers.len(),
+            (node, _) => usize::from(node != self.node),
+        };
+        Reach { here, elsewhere }
     }
 
     /// Hands a message that came from another node to this node's applications: it never leaves the node again.

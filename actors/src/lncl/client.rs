@@ -14,7 +14,7 @@ use bytes::{Buf, BytesMut};
 use rustix::net::Shutdown;
 use sinew_runtime::{
     monitor::DownClass,
-    router::{LocalRoute, Outlet},
+    router::{LocalRoute, Outlet, Reach},
     tid::Tid,
     time::Time,
     wire::{Kind, Message, encode_frame},
@@ -32,10 +32,11 @@ use self::{
 };
 use super::{
     core::{Address, ClientId, Owner, Request, User},
+    guest_pace::Sent,
     introductions::{Leaves, Party},
     link::{self, ClientReader, ClientSocket, Half},
     payload::{self, REGISTER_BYTES_MAX, Register, Registered},
-    reader::Reader,
+    reader::{Heard, Reader},
     registrar,
     server::{Server, refuse, say_why},
     session::{Order, Session},
@@ -355,23 +356,41 @@ impl Client {
     }
 
     async fn receive(&self, reader: &mut ClientReader, session: &mut Session) -> End {
+        if let User::Guest(uid) = self.user {
+            self.server.join_pace(uid, self.tid).await;
+        }
         loop {
-            let message = match reader.next(&self.peer.stream).await {
-                Ok(Some(message)) => message,
-                Ok(None) => return End::HungUp(None),
+            let mut sent = Sent::default();
+            match reader.hear(&self.peer.stream).await {
+                Ok(Heard::Frame(message)) => {
+                    sent = self.sent(&message);
+                    let order = session.handle(message);
+                    if let ControlFlow::Break(end) = self.obey_session(session, order) {
+                        return end;
+                    }
+                    self.outcomes.may_come().await;
+                    self.orders.may_come().await;
+                }
+                Ok(Heard::Turn) => {
+                    // What no frame came of is work all the same.
+                    sent.frames = 1;
+                    tokio::task::yield_now().await;
+                }
+                Ok(Heard::End) => return End::HungUp(None),
                 Err(error) => return End::from(error),
-            };
-            let bytes = message.payload.len();
-            let order = session.handle(message);
-            if let ControlFlow::Break(end) = self.obey_session(session, order) {
-                return end;
             }
-            self.outcomes.may_come().await;
-            self.orders.may_come().await;
             if let User::Guest(uid) = self.user {
-                self.server.keep_pace(uid, self.tid, bytes).await;
+                sent.idle = reader.take_idle();
+                self.server.keep_pace(uid, self.tid, sent).await;
             }
         }
+    }
+
+    /// What a frame of a guest costs; of the robot's own nobody reckons that.
+    fn sent(&self, message: &Message) -> Sent {
+        let User::Guest(_) = self.user else { return Sent::default() };
+        let Reach { here, elsewhere } = self.server.stores.router.reach(message.header.destination);
+        Sent { frames: 1, bytes: message.payload.len(), idle: 0, here: here.saturating_sub(1), elsewhere }
     }
 
     fn say(&self, message: Message) {

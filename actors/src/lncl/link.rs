@@ -7,7 +7,7 @@ use std::{
     task::{Context, Poll},
 };
 
-use sinew_runtime::wire::{Checksum, FrameError, Message};
+use sinew_runtime::wire::{Checksum, FrameError};
 use sinew_shm::{Armed, BellKind, Capacity, Consumer, Descriptors, LoanError, Offer, PassError, Producer};
 use tokio::{
     io::{Interest, unix::AsyncFd},
@@ -15,7 +15,7 @@ use tokio::{
 };
 
 use super::{
-    reader::{self, Reader, Seen},
+    reader::{self, Heard, READ_WORK, Reader, Seen},
     rings::{Kept, Rings},
 };
 use crate::{
@@ -25,6 +25,10 @@ use crate::{
 
 /// Looks at one client's ring before others have their turn.
 const LOOKS_A_TURN: usize = 64;
+/// Bytes that are taken of it before that: a look takes more if they are there, twice as many or a record, and then the turn is over.
+const BYTES_A_TURN: usize = 64 * 1024;
+/// Waits without a frame before others are told to have their turn.
+const WAITS_A_TURN: usize = 64;
 /// Bytes that are taken from a ring at once.
 const ENOUGH: usize = 16 * 1024;
 
@@ -107,7 +111,8 @@ pub(super) async fn exchange(
     let (producer, consumer) = rings.run(map).await.ok_or(ExchangeError::Fault)??;
     let socket = RingSocket { producer: watch(Out(producer))?, wanted: 0, written: 0 };
     let consumer = watch(In(consumer))?;
-    let reader = RingReader { consumer, frames: RingFrames::new(payload_max), looks: 0, has_hung_up: false };
+    let frames = RingFrames::new(payload_max);
+    let reader = RingReader { consumer, frames, looks: 0, bytes: 0, waits: 0, idle: 0, has_hung_up: false };
     Ok((ClientSocket::Ring(socket), ClientReader::Ring(reader)))
 }
 
@@ -261,11 +266,19 @@ pub(super) enum ClientReader {
 }
 
 impl ClientReader {
-    /// The next frame; `None` when the peer has closed. May be dropped at any time without losing a byte.
-    pub(super) async fn next(&mut self, stream: &UnixStream) -> Result<Option<Message>, LinkError> {
+    /// What comes next. May be dropped at any time without losing a byte.
+    pub(super) async fn hear(&mut self, stream: &UnixStream) -> Result<Heard, LinkError> {
         match self {
-            Self::Plain(reader) => Ok(reader.next(stream).await?),
-            Self::Ring(reader) => reader.next(stream).await,
+            Self::Plain(reader) => Ok(reader.hear(stream).await?),
+            Self::Ring(reader) => reader.hear(stream).await,
+        }
+    }
+
+    /// Bytes' worth of work since the last call that no frame came of.
+    pub(super) fn take_idle(&mut self) -> usize {
+        match self {
+            Self::Plain(reader) => reader.take_idle(),
+            Self::Ring(reader) => reader.frames.take_idle() + std::mem::take(&mut reader.idle),
         }
     }
 }
@@ -276,26 +289,35 @@ pub(super) struct RingReader {
     frames: RingFrames,
     /// Frames and looks since others had their turn.
     looks: usize,
+    /// Bytes that these looks took.
+    bytes: usize,
+    /// Waits since the last frame, or the last turn: a bell can be rung for nothing.
+    waits: usize,
+    /// Bytes' worth of work that these were.
+    idle: usize,
     /// Its process is gone; what it said before still counts.
     has_hung_up: bool,
 }
 
 impl RingReader {
-    async fn next(&mut self, stream: &UnixStream) -> Result<Option<Message>, LinkError> {
+    async fn hear(&mut self, stream: &UnixStream) -> Result<Heard, LinkError> {
         loop {
+            // Before a frame is taken. spec: LNCL-16
             self.looks += 1;
-            if self.looks > LOOKS_A_TURN {
-                // Before the frame is taken: this may be dropped while it waits.
-                tokio::task::yield_now().await;
-                self.looks = 0;
+            if self.looks > LOOKS_A_TURN || self.bytes >= BYTES_A_TURN || self.waits > WAITS_A_TURN {
+                (self.looks, self.bytes, self.waits) = (0, 0, 0);
+                return Ok(Heard::Turn);
             }
             if let Some(message) = self.frames.next()? {
-                return Ok(Some(message));
+                self.waits = 0;
+                return Ok(Heard::Frame(message));
             }
             let consumer = &mut self.consumer.get_mut().0;
-            match self.frames.take(consumer, ENOUGH).map_err(RingError::from)? {
+            let taken = self.frames.take(consumer, ENOUGH).map_err(RingError::from)?;
+            self.bytes += self.frames.copied();
+            match taken {
                 Taken::Some => {}
-                Taken::Nothing if self.has_hung_up => return Ok(None),
+                Taken::Nothing if self.has_hung_up => return Ok(Heard::End),
                 Taken::Nothing => self.wait(stream).await?,
             }
         }
@@ -307,7 +329,8 @@ impl RingReader {
             // Nobody has waited: who publishes one record at a time, each just now, has no more turns by that.
             return Ok(());
         }
-        self.looks = 0;
+        (self.looks, self.bytes) = (0, 0);
+        (self.waits, self.idle) = (self.waits + 1, self.idle + READ_WORK);
         tokio::select! {
             biased;
             rung = self.consumer.readable_mut() => match rung {

@@ -22,12 +22,32 @@ const FRAMES_A_TURN: usize = 64;
 /// Bytes that are read of it before that, however long its frames are; of a long frame so many are read at once at most.
 const BYTES_A_TURN: usize = 64 * 1024;
 
+/// Reads without a frame before others are told to have their turn: who sends byte by byte costs a wake for each.
+const READS_A_TURN: usize = 64;
+/// Bytes that a read counts as, beside those of its frame.
+pub(super) const READ_WORK: usize = 4 * 1024;
+
+/// What comes of a connection.
+#[derive(Debug)]
+pub(crate) enum Heard {
+    /// A frame.
+    Frame(Message),
+    /// Nothing that is whole, and others are to have their turn now.
+    Turn,
+    /// The peer has closed.
+    End,
+}
+
 /// The reading half of a connection.
 pub(crate) struct Reader {
     buffer: BytesMut,
     codec: FrameCodec,
     guard: Guard,
     turn: Turn,
+    /// Since the last frame, or the last turn.
+    reads: usize,
+    /// Bytes' worth of work beside the frames that came.
+    idle: usize,
 }
 
 /// What was taken since others had their turn.
@@ -64,7 +84,14 @@ impl Reader {
             codec: FrameCodec::new(payload_max),
             guard: Guard::Unknown,
             turn: Turn::default(),
+            reads: 0,
+            idle: 0,
         }
+    }
+
+    /// Bytes' worth of work since the last call that no frame came of.
+    pub(super) fn take_idle(&mut self) -> usize {
+        std::mem::take(&mut self.idle)
     }
 
     /// Takes payloads of at most `payload_max` bytes from now on.
@@ -99,17 +126,29 @@ impl Reader {
     /// it nothing here ever waits.
     pub(crate) async fn next(&mut self, stream: &UnixStream) -> Result<Option<Message>, FrameError> {
         loop {
-            // spec: LNCL-16
-            if self.turn.is_over() {
-                // Before a frame is taken: this may be dropped while it waits.
-                tokio::task::yield_now().await;
-                self.turn = Turn::default();
+            match self.hear(stream).await? {
+                Heard::Frame(message) => return Ok(Some(message)),
+                Heard::Turn => tokio::task::yield_now().await,
+                Heard::End => return Ok(None),
+            }
+        }
+    }
+
+    /// The same for who has more to do in the turns of others than to let them have these.
+    pub(super) async fn hear(&mut self, stream: &UnixStream) -> Result<Heard, FrameError> {
+        loop {
+            // Before a frame is taken. spec: LNCL-16
+            if self.turn.is_over() || self.reads >= READS_A_TURN {
+                (self.turn, self.reads) = (Turn::default(), 0);
+                return Ok(Heard::Turn);
             }
             if let Some(message) = self.codec.decode(&mut self.buffer)? {
                 self.turn.frames += 1;
-                return Ok(Some(message));
+                self.reads = 0;
+                return Ok(Heard::Frame(message));
             }
             stream.readable().await?;
+            (self.reads, self.idle) = (self.reads + 1, self.idle + READ_WORK);
             let read = match self.guard(stream) {
                 Guard::System => {
                     self.buffer.reserve(FrameCodec::room(&self.buffer, READ_CHUNK));
@@ -120,7 +159,7 @@ impl Reader {
                 }
             };
             match read {
-                Ok(0) => return Ok(None),
+                Ok(0) => return Ok(Heard::End),
                 Ok(count) => self.turn.bytes += count,
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
                     // It waits now, while others have their turn.
@@ -249,6 +288,41 @@ mod tests {
             let turns = turns_of_others(guard, FRAMES, 0);
             assert!(turns >= FRAMES / FRAMES_A_TURN - 1, "{turns} turns for {FRAMES} frames: {guard:?}");
         }
+    }
+
+    // spec: LNCL-16
+    #[test]
+    fn who_sends_byte_by_byte_has_a_turn_for_some_of_them_and_each_is_work() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+        runtime.block_on(async {
+            let (ours, mut theirs) = std::os::unix::net::UnixStream::pair().expect("a pair");
+            ours.set_nonblocking(true).expect("it is ours");
+            let ours = UnixStream::from_std(ours).expect("it is a socket");
+            let (mut reader, mut bytes) = (Reader::new(4_096), BytesMut::new());
+            let header = Header::new(Kind::named("test"), Tid::NONE, Tid::BROADCAST);
+            encode_frame(&header, &[7; 4_000], &mut bytes);
+            // When: each byte is sent when the one before was read
+            let (mut turns, mut sent) = (0, 0);
+            let heard = loop {
+                tokio::select! {
+                    biased;
+                    heard = reader.hear(&ours) => match heard.expect("bytes of a frame") {
+                        Heard::Turn => turns += 1,
+                        heard => break heard,
+                    },
+                    () = std::future::ready(()) => {
+                        theirs.write_all(&bytes[sent..=sent]).expect("there is room");
+                        sent += 1;
+                        // Whoever is polled next finds it.
+                        tokio::task::yield_now().await;
+                    }
+                }
+            };
+            // Then
+            assert!(matches!(heard, Heard::Frame(_)) && sent == bytes.len());
+            assert!(turns >= sent / READS_A_TURN / 2, "{turns} turns for {sent} bytes");
+            assert!(reader.take_idle() >= READ_WORK * sent / 2);
+        });
     }
 
     // spec: LNCL-16

@@ -24,7 +24,7 @@ use tokio::{
 use super::{
     client::{self, ClientOutlet, Notices},
     core::{ClientId, User},
-    guest_pace::GuestPace,
+    guest_pace::{GuestPace, Sent},
     guests::{Guests, Row},
     introductions::Introductions,
     payload::{self, Refusal},
@@ -109,14 +109,24 @@ impl Server {
         share
     }
 
-    /// A frame of this application of the guest `uid` with so many bytes was read. Resolves when the next one may be. spec: LNCL-13
-    pub(super) async fn keep_pace(&self, uid: u32, tid: Tid, bytes: usize) {
-        let rest = self.pace.borrow_mut().read(uid, bytes, Time::now());
+    /// Resolves when a connection of the guest `uid` may be read that was not before, that of `tid`. spec: LNCL-13
+    pub(super) async fn join_pace(&self, uid: u32, tid: Tid) {
+        let rest = self.pace.borrow_mut().rest(uid, Time::now());
+        self.rest(uid, tid, rest).await;
+    }
+
+    /// This was read of the application `tid` of the guest `uid`. Resolves when it may be read again. spec: LNCL-13
+    pub(super) async fn keep_pace(&self, uid: u32, tid: Tid, sent: Sent) {
+        let rest = self.pace.borrow_mut().read(uid, sent, Time::now());
+        self.rest(uid, tid, rest).await;
+    }
+
+    async fn rest(&self, uid: u32, tid: Tid, rest: Option<Duration>) {
         let Some(rest) = rest else { return };
         let per_s = self.stores.config.lncl.guest_frames_per_s;
         let detail = format_args!(
-            "nothing, but {tid} of user {uid} has to wait: {per_s} frames of guests are read in a second, of one user half of that; send fewer, \
-             or raise `lncl.guest_frames_per_s`"
+            "nothing, but {tid} of user {uid} has to wait: as much as {per_s} short frames of guests are read in a second, of one user half of \
+             that; send less, or raise `lncl.guest_frames_per_s`"
         );
         self.refusals.count(Time::now(), "guest too fast", &detail);
         tokio::time::sleep(rest).await;

@@ -92,6 +92,29 @@ fn a_group_reaches_its_members_here_and_elsewhere_as_they_come_and_go() {
 }
 
 #[test]
+fn what_a_message_reaches_is_known_before_it_is_sent() {
+    let (router, _) = router(3);
+    for peer in [PEER, OTHER] {
+        router.set_peer(peer, Arc::new(Sink::default()));
+    }
+    (0..2).for_each(|number| _ = router.set_member(LEGS, app(number), true));
+    router.set_remote_groups(PEER, &[LEGS]);
+    for (node, to, here, elsewhere) in [
+        (NODE, app(0), 1, 0),
+        (NodeAddress::HERE, app(0), 1, 0),
+        (PEER, app(0), 0, 1),
+        (NodeAddress::ALL, LEGS, 2, 1),
+        (NODE, LEGS, 2, 0),
+        (PEER, LEGS, 0, 1),
+        (NodeAddress::ALL, AppAddress::ALL, 3, 2),
+        (NodeAddress::ALL, app(0), 1, 2),
+        (NodeAddress::ALL, DRIVES, 0, 0),
+    ] {
+        assert_eq!(router.reach(Tid::new(node, to)), Reach { here, elsewhere }, "{node}/{to}");
+    }
+}
+
+#[test]
 fn who_has_an_address_next_is_in_no_group_of_the_one_before() {
     let (router, sinks) = router(1);
     [DRIVES, LEGS].into_iter().for_each(|group| assert!(router.set_member(group, app(0), true)));

@@ -97,7 +97,7 @@ impl Hosts {
     /// comes from `seed`.
     ///
     /// # Errors
-    /// A sentence: no root, no `ip`, or a kernel without namespaces or TAP devices.
+    /// A sentence: no root, no `ip` or `nsenter`, or a kernel without namespaces or TAP devices.
     pub fn on_radio(count: u8, seed: u64) -> Result<Self, String> {
         let mut hosts = Self::in_networks(count, 0)?;
         let namespaces =
@@ -110,7 +110,8 @@ impl Hosts {
         Ok(hosts)
     }
 
-    /// From now on this happens to each frame. What became of those before is returned.
+    /// From now on this happens to each frame. What became of those that were carried before is returned; what is sent, and not taken yet,
+    /// meets this one.
     ///
     /// # Panics
     /// If these hosts are not on a radio.
@@ -280,7 +281,7 @@ impl Host {
     /// A command that runs `program` on this host.
     ///
     /// Not by `ip netns exec`: that also mounts a `/sys` of the namespace, and waits inside the kernel until that is seen on each CPU. Where
-    /// a thread spins on one, that can take seconds. So in `/sys` a program sees the machine's own interfaces.
+    /// a thread spins on one, that can take seconds. So in `/sys` a program sees the machine's own interfaces, as `sinew doctor` would.
     #[must_use]
     pub fn command(&self, program: &Path) -> Command {
         let mut command = Command::new("nsenter");

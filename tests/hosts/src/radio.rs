@@ -26,6 +26,8 @@ use tun_rs::{DeviceBuilder, Layer, SyncDevice};
 
 /// Longest frame: an Ethernet header and 1,500 bytes.
 const FRAME_MAX: usize = 1_514;
+/// Frames that are taken of a host before the others have their turn.
+const FRAMES_A_TURN: usize = 64;
 /// Frames that are on their way at most; what comes then is lost, as in a full queue.
 const UNDER_WAY_MAX: usize = 16_384;
 /// Longest sleep of the thread: it looks whether it is to end.
@@ -183,7 +185,9 @@ impl Carrier {
     /// Takes what a host has sent.
     fn read(&mut self, from: usize) {
         let mut frame = [0; FRAME_MAX];
-        while let Ok(length) = self.taps[from].recv(&mut frame) {
+        // Others have their turn after some: one that sends on and on holds up none.
+        for _ in 0..FRAMES_A_TURN {
+            let Ok(length) = self.taps[from].recv(&mut frame) else { return };
             // Looked at only now: what is sent after `set` meets what was set.
             let weather = *self.shared.weather.lock().unwrap_or_else(PoisonError::into_inner);
             let Some((to, rest)) = frame[..length].split_first_chunk::<MAC>() else { continue };
