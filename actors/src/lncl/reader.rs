@@ -308,7 +308,7 @@ mod tests {
                     biased;
                     heard = reader.hear(&ours) => match heard.expect("bytes of a frame") {
                         Heard::Turn => turns += 1,
-                        heard => break heard,
+                        heard @ (Heard::Frame(_) | Heard::End) => break heard,
                     },
                     () = std::future::ready(()) => {
                         theirs.write_all(&bytes[sent..=sent]).expect("there is room");

@@ -140,6 +140,12 @@ pub(super) const ATTACKS: &[Attack] = &[
         ..OF_GUEST
     },
     Attack {
+        name: "guest-messages",
+        tried: "the same user's clients send 1000 bytes to every application of every node, as fast as they can",
+        run: guest::messages,
+        ..OF_GUEST
+    },
+    Attack {
         name: "guest-connections",
         tried: "the same user connects and closes, and registers and leaves, as often as it can",
         run: guest::connections,

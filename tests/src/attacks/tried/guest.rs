@@ -25,6 +25,8 @@ use crate::{
 
 /// What the node counts when it refuses a connection of a guest that comes too often.
 const TOO_OFTEN: &str = "too many connections of a guest";
+/// When what it sends has to wait.
+const TOO_FAST: &str = "guest too fast";
 /// And when it does not let one into a group.
 const NOT_GRANTED: &str = "membership";
 
@@ -73,6 +75,12 @@ pub(super) fn memberships(scene: &Scene<'_>) -> Happened {
 pub(super) fn barriers(scene: &Scene<'_>) -> Happened {
     let (did, happened) = play(scene, "barriers", "arrivals");
     judge_arrivals(&did, happened)
+}
+
+/// Clients that send to everybody.
+pub(super) fn messages(scene: &Scene<'_>) -> Happened {
+    let (_, happened) = play(scene, "messages", "messages to all");
+    Happened { refused: vec![(TOO_FAST, 1)], ..happened }
 }
 
 /// Connections that are closed at once, and clients that leave at once.

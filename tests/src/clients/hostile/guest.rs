@@ -47,6 +47,8 @@ const VISITING: u32 = 3;
 const LOWEST_GROUP: u32 = 0xF000_0000;
 /// Frames that a client writes in one go. An even number: whoever joined has left at the end of them.
 const BATCH: u32 = 32;
+/// Bytes of what it says to all.
+const WORD_BYTES: usize = 1_000;
 /// Barriers at which one application may wait at once.
 const WAITS_MAX: u32 = 16;
 /// Until it tries to have one client more, when it was refused.
@@ -86,6 +88,7 @@ pub(in crate::clients) fn play(arguments: &[String]) {
         "groups" => guest.toggle_groups(),
         "memberships" => guest.fill_groups(),
         "barriers" => guest.arrive_everywhere(),
+        "messages" => guest.say_to_all(),
         "connections" => guest.come_and_go(),
         _ => panic!("{what:?} is nothing that a guest does"),
     }
@@ -275,6 +278,15 @@ impl Guest {
                 Frame::new(&header, encode(&arrive).to_vec()).bytes()
             };
             ((0..WAITS_MAX).flat_map(frame).collect(), WAITS_MAX)
+        });
+    }
+
+    /// Sends what nobody knows to each application of each node.
+    fn say_to_all(&mut self) {
+        self.crowd(|_, _| (0, Ok(0)), &mut |tid, _| {
+            let header = Header::new(Kind::named("guest.word"), tid, Tid::BROADCAST);
+            let frame = |_| Frame::new(&header, vec![7; WORD_BYTES]).bytes();
+            ((0..BATCH).flat_map(frame).collect(), BATCH)
         });
     }
 
