@@ -161,7 +161,8 @@ impl Secured {
         if readmitted > 0 {
             crate::log::warn!(
                 readmitted,
-                "certificates that were on the deny list are not any more, and count again; if nobody took them out the file was read before                  all of it was there: copy it under another name, rename it, and have it read again"
+                "certificates that were on the deny list are not any more, and count again; if nobody took them out the file was read before all of it was \
+                 there: copy it under another name, rename it, and have it read again"
             );
         }
         Ok(Denied { summary: DenyListSummary { denied, readmitted }, own })

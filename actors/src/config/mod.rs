@@ -83,8 +83,8 @@ pub struct LnclConfig {
     pub strangers_max: usize,
     /// Those of one process at most. 1 to 1,024; default 32.
     pub strangers_per_process_max: usize,
-    /// Frames in a second that are read of all users together whom only the access list lets in; of one such user half of it. A frame with
-    /// more than 16 KiB counts as so many as that begins in it. 100 to 1,000,000; default 20,000.
+    /// Short frames in a second that are read of all users together whom only the access list lets in; of one such user half of it. Each 16 KiB
+    /// of a frame count as one more, a frame to another node counts four times. 100 to 1,000,000; default 20,000.
     pub guest_frames_per_s: usize,
     /// Bytes of payloads that wait for all clients together at most; a quarter of it for those of one process. 64 KiB to
     /// 64 GiB; default 256 MiB. Beside [`NodeConfig::mailbox_bytes`], which each of them has.

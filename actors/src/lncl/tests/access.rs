@@ -213,9 +213,9 @@ fn another_user_who_registers_and_leaves_without_end_comes_in_at_the_pace_and_ke
 fn what_another_user_sends_is_read_at_a_pace_so_that_none_of_the_robots_own_waits_behind_it() {
     const SENT: u64 = 200;
     let list = format!("[[client]]\nuid = {STRANGER}\n[[rule]]\nfrom = ['*']\nto = ['*']\n");
-    let node = TestNode::start_guarded_with(&list, |config| config.lncl.guest_frames_per_s = 200);
+    let node = TestNode::start_guarded_with(&list, |config| config.lncl.guest_frames_per_s = 100);
     let (app, (mut own, own_tid)) = (node.local(1), RawClient::register(&node, &Register::default()));
-    // Given: a guest that has sent what takes two seconds at that pace
+    // Given: a guest that has sent what takes four seconds at that pace
     let guest = as_stranger(|| {
         let (mut guest, tid) = RawClient::register(&node, &Register::default());
         (0..SENT).for_each(|number| guest.send(&confirmed(tid, app.tid, number)));
