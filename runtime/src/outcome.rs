@@ -93,7 +93,7 @@ impl fmt::Display for Rejection {
             Self::Unsupported => "this cannot be asked of this destination",
             Self::Away => "the destination's application is away: it ended and is not ready again",
             Self::NotAllowed => {
-                "the access list of the destination's node does not allow it; `sinew why` names the rule"
+                "the access list of the destination's node does not allow it; `sinew why SENDER DESTINATION` names the rule"
             }
         })
     }

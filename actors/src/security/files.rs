@@ -95,7 +95,8 @@ pub enum FileFault {
     /// Others can read a secret.
     #[error(
         "{path} is a secret, and others can get at it (mode {mode:04o}): `chmod 600 {path}`; if others use this machine, \
-         take it for stolen: `sinew keys revoke` and `issue`"
+         take it for stolen: {}",
+        after_theft(path)
     )]
     Exposed {
         /// Which.
@@ -123,6 +124,16 @@ pub enum FileFault {
         /// Longest in bytes.
         bytes_max: u64,
     },
+}
+
+/// What to do when a secret may be known to others.
+fn after_theft(path: &Path) -> &'static str {
+    if path.ends_with(NODE_KEY) {
+        "`sinew keys revoke NODE`, and `issue` it anew"
+    } else {
+        // The authority's key makes nodes, the discovery key is the same in all: to revoke some helps against neither.
+        "make the keys of all nodes anew, `sinew keys init` with --out for another directory"
+    }
 }
 
 /// Who may do what with a file.

@@ -55,7 +55,7 @@ pub enum PeerFault {
     /// Its certificate is of another authority.
     #[error(
         "the other end's certificate is not from this project's authority: {0}. It has keys of another project, or of this \
-         one from before they were made anew: `sinew keys issue` there"
+         one from before they were made anew: `sinew keys issue NODE --keys DIR`, where this project's ca.key is, makes it some"
     )]
     OtherAuthority(String),
     /// Its certificate is of another project, of the same authority.
@@ -68,7 +68,7 @@ pub enum PeerFault {
     },
     /// Its certificate is revoked.
     #[error(
-        "the certificate of {identity}, number {serial}, is revoked; if this is the real one, `sinew keys issue` it anew"
+        "the certificate of {identity}, number {serial}, is revoked; if this is the real one, `sinew keys issue NODE --keys DIR`, where ca.key is, makes it another"
     )]
     Denied {
         /// Who shows it.

@@ -13,13 +13,17 @@ pub(super) fn directory() -> Check {
     if let Some(place) = places.iter().find(|place| is_writable(place)) {
         return Check::fine(NAME, format!("{} is there and can be written to", place.display()));
     }
-    let shown = places.iter().map(|place| place.display().to_string()).collect::<Vec<_>>().join(" nor ");
+    let places: Vec<_> = places.iter().map(|place| place.display().to_string()).collect();
+    let shown = match &places[..] {
+        [place] => format!("{place} cannot be written to"),
+        places => format!("neither {} can be written to", places.join(" nor ")),
+    };
     let mend = if own.as_ref().and_then(|own| own.parent()).is_some_and(is_writable) {
         "mkdir -p \"$XDG_RUNTIME_DIR/sinew\""
     } else {
-        "sudo install -d -o \"$USER\" /run/sinew"
+        "sudo install -d -o \"$(id -un)\" /run/sinew"
     };
-    Check::finding(NAME, format!("neither {shown} can be written to"), mend)
+    Check::finding(NAME, shown, mend)
 }
 
 fn is_writable(directory: &Path) -> bool {

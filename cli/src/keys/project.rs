@@ -141,8 +141,13 @@ impl Project {
     pub(super) fn open(directory: &Path) -> Result<Self, Fault> {
         let key = directory.join(AUTHORITY_KEY);
         if !key.exists() {
-            let remedy = "name the directory that `sinew keys init` made with --keys DIR";
-            return Err(fault(directory, "there is no key of an authority (ca.key) here", remedy));
+            let why = "there is no key of an authority (ca.key) here";
+            let remedy = if directory.join(AUTHORITY).exists() && directory.join(ISSUED).exists() {
+                "the rest of the project is: put ca.key back from where you keep it, for as long as this takes"
+            } else {
+                "name the directory that `sinew keys init` made with --keys DIR"
+            };
+            return Err(fault(directory, why, remedy));
         }
         files::directory(directory).map_err(|why| Fault::Keys(why.to_string()))?;
         let lock = lock(directory)?;

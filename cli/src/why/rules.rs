@@ -274,12 +274,22 @@ impl Steps {
         }
         match ping {
             Some(Ok(micros)) => self.fine(what, format!("confirmed after {}", time(*micros))),
-            // The list was looked at for the two applications; this command is a third one.
-            Some(Err(why)) if *why == Rejection::NotAllowed.to_string() => self.note(
-                what,
-                "not tried: the access list there does not let this command send",
-                "a [[rule]] for this command, if it is to; what the list says of the two is told above",
-            ),
+            Some(Err(why)) if *why == Rejection::NotAllowed.to_string() => {
+                let may = access::may_send(from, to);
+                let seen = "the access list there does not let this command send";
+                if self.0.iter().any(|step| step.what == may) {
+                    // The list was looked at for the two applications; this command is a third one.
+                    let mend = "a [[rule]] for this command, if it is to; what the list says of the two is told above";
+                    self.note(what, seen, mend);
+                } else {
+                    // Of no sender it was said what the list makes of it.
+                    let to = to.label();
+                    let mend = format!(
+                        "`sinew why SENDER {to}`, with an application for SENDER, names the rule; or have a [[rule]] let this command send"
+                    );
+                    self.blocked(what, seen, mend);
+                }
+            }
             Some(Err(why)) => {
                 // What was found before explains it.
                 let is_explained = self.0.iter().any(|step| step.state == State::Blocked);

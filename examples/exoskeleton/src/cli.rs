@@ -46,14 +46,14 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "MS")]
     pub(crate) device_watchdog: Option<u64>,
     /// Thread of the control loops: `io`, which reads the sockets too, or `own`. Real time only.
-    #[arg(long, value_name = "THREAD", default_value = "io")]
+    #[arg(long, value_name = "THREAD", default_value = "io", conflicts_with = "lock_step")]
     pub(crate) control_thread: real_time::ThreadArgument,
     /// `SCHED_FIFO` priority of the control loops, 1 to 89; wants `--control-thread own`. Real time only.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=89))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=89), conflicts_with = "lock_step")]
     pub(crate) realtime_priority: Option<u8>,
     /// Secure the links between nodes with the keys in this directory, made by `sinew keys init exoskeleton central=127.0.0.1 hip=127.0.0.2 knee=127.0.0.3
     /// ankle=127.0.0.4`. Real time only.
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", conflicts_with = "lock_step")]
     pub(crate) keys: Option<PathBuf>,
     /// Folder for the run folders.
     #[arg(long, value_name = "DIR", default_value = "runs")]

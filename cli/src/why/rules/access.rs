@@ -16,7 +16,7 @@ impl Steps {
         let [there, back] = &facts.access;
         for (said, from, to, is_asked_for) in [(there, a, b, true), (back, b, a, false)] {
             let Some(said) = said else { continue };
-            let what = format!("{} may send to {}", from.label(), to.label());
+            let what = may_send(from, to);
             if !said.is_given {
                 self.fine(what, format!("node {} has no access list", to.node_label()));
                 continue;
@@ -32,6 +32,11 @@ impl Steps {
             }
         }
     }
+}
+
+/// What is asked of the list of the second.
+pub(super) fn may_send(from: &End, to: &End) -> String {
+    format!("{} may send to {}", from.label(), to.label())
 }
 
 /// What counts for each class, or for all at once where it is the same.

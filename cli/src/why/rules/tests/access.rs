@@ -33,3 +33,16 @@ fn a_list_is_in_the_way_where_it_lets_nothing_through_and_is_told_of_where_it_le
     facts.pings[0] = Some(Err(Rejection::NotAllowed.to_string()));
     assert!(judge(&facts).iter().all(|step| step.state != State::Blocked));
 }
+
+#[test]
+fn where_nobody_asked_what_the_list_says_of_the_two_a_refusal_is_in_the_way_and_says_how_to_ask() {
+    // Given: one end is a node, so that the list was not asked about a sender
+    let mut facts = free();
+    facts.access = [None, None];
+    facts.pings[0] = Some(Err(Rejection::NotAllowed.to_string()));
+    // When, then
+    let told: Vec<_> = judge(&facts).into_iter().filter(|step| step.state == State::Blocked).collect();
+    let [step] = &told[..] else { panic!("{told:#?}") };
+    let mend = step.mend.as_deref().unwrap_or_default();
+    assert!(step.seen.contains("access list") && mend.contains("`sinew why SENDER knee.drive`"), "{step:?}");
+}

@@ -147,12 +147,12 @@ fn dialled(facts: &mut Facts, fault: &str, error: &str) {
 #[test]
 fn what_mends_a_dial_depends_on_how_far_it_came_and_of_a_revoked_certificate_the_fault_says_it_itself() {
     const REVOKED: &str = "the certificate of node \"knee\" (10.0.0.2) of project \"leg\", number 7, is revoked; if this is the real one, \
-                           `sinew keys issue` it anew";
+                           `sinew keys issue NODE --keys DIR`, where ca.key is, makes it another";
     for (fault, error, mend) in [
         (
             "not proven",
             REVOKED,
-            "TCP reaches 10.0.0.2:7001, and it is not proven who is there: if this is the real one, `sinew keys issue`",
+            "TCP reaches 10.0.0.2:7001, and it is not proven who is there: if this is the real one, `sinew keys issue NODE --keys DIR`",
         ),
         (
             "not proven",
@@ -182,7 +182,7 @@ fn what_mends_a_dial_depends_on_how_far_it_came_and_of_a_revoked_certificate_the
     refuse(knee(&mut facts), "peer not proven", &REVOKED.replace("knee\" (10.0.0.2)", "hip\" (10.0.0.1)"));
     let told = blocked(&facts);
     assert!(
-        told.iter().any(|(.., mend)| mend == "if this is the real one, `sinew keys issue` it anew"),
+        told.iter().any(|(.., mend)| mend == "if this is the real one, `sinew keys issue NODE --keys DIR`, where ca.key is, makes it another"),
         "{told:#?}"
     );
 }
