@@ -17,6 +17,8 @@ pub(crate) const SOON_S: u64 = 30 * DAY_S;
 pub(crate) enum Standing {
     /// Open, and other hosts reach it.
     Open,
+    /// Its certificate is on the deny list that it has itself.
+    Revoked,
     /// Its certificate has ended, by its own clock.
     Ended,
     /// Its clock says an earlier time than its certificate was made: nobody there knows when one ends.
@@ -39,6 +41,7 @@ impl Standing {
         match &security.certificate {
             None if security.is_beyond_host => Self::Open,
             None => Self::Alone,
+            Some(CertificateReport { is_revoked: true, .. }) => Self::Revoked,
             Some(certificate) if certificate.times == TimePolicy::Ignored.word() => Self::NotLookedAt,
             Some(CertificateReport { from_s, clock_s, .. }) if clock_s < from_s => Self::ClockNotSet,
             Some(CertificateReport { until_s, clock_s, .. }) if until_s < clock_s => Self::Ended,
@@ -50,6 +53,7 @@ impl Standing {
     const fn word(self) -> &'static str {
         match self {
             Self::Open => "open",
+            Self::Revoked => "revoked",
             Self::Ended => "ended",
             Self::ClockNotSet => "clock not set",
             Self::EndsSoon => "ends soon",
@@ -67,6 +71,7 @@ pub(crate) fn cell(said: &NodeReport) -> String {
     let days = certificate(said).and_then(days_left);
     match (standing, days) {
         (Standing::Open, _) => "OPEN".to_owned(),
+        (Standing::Revoked, _) => "REVOKED".to_owned(),
         (Standing::Ended, _) => "ENDED".to_owned(),
         (Standing::Secured | Standing::EndsSoon, Some(days)) => format!("{days} d"),
         _ => standing.word().to_owned(),
@@ -81,6 +86,7 @@ pub(crate) fn json(said: &NodeReport) -> Value {
             "clock": at(certificate.clock_s),
             "days_left": days_left(certificate),
             "times": certificate.times,
+            "revoked": certificate.is_revoked,
         })
     });
     let security = said.security.as_ref();
@@ -159,7 +165,15 @@ pub(crate) mod tests {
     /// With a certificate of a year that was made at [`NOW_S`].
     pub(crate) fn secured(clock_s: u64, times: &str) -> Option<SecurityReport> {
         let (from_s, until_s) = (NOW_S, NOW_S + 365 * DAY_S);
-        let certificate = CertificateReport { from_s, until_s, clock_s, times: times.to_owned() };
+        let times = times.to_owned();
+        let certificate = CertificateReport { from_s, until_s, clock_s, times, is_revoked: false };
+        Some(SecurityReport { is_beyond_host: true, certificate: Some(certificate) })
+    }
+
+    /// The same, and it is on the list that its node has.
+    pub(crate) fn revoked(clock_s: u64) -> Option<SecurityReport> {
+        let certificate = secured(clock_s, "strict")?.certificate?;
+        let certificate = CertificateReport { is_revoked: true, ..certificate };
         Some(SecurityReport { is_beyond_host: true, certificate: Some(certificate) })
     }
 
@@ -170,6 +184,9 @@ pub(crate) mod tests {
             (None, Standing::Unknown, "unknown"),
             (open(true), Standing::Open, "OPEN"),
             (open(false), Standing::Alone, "open, own host only"),
+            (revoked(NOW_S), Standing::Revoked, "REVOKED"),
+            // Worse than that it has ended, too: to set the clock does not mend it.
+            (revoked(until_s + 1), Standing::Revoked, "REVOKED"),
             (secured(NOW_S, "until-set"), Standing::Secured, "365 d"),
             (secured(until_s - 30 * DAY_S, "until-set"), Standing::Secured, "30 d"),
             (secured(until_s - 30 * DAY_S + 1, "strict"), Standing::EndsSoon, "29 d"),

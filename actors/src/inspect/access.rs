@@ -149,13 +149,16 @@ mod tests {
 
     use sinew_runtime::tid::{Incarnation, NodeAddress};
 
-    use super::{super::inspector::Inbox, *};
+    use super::{
+        super::{answers, inspector::Inbox},
+        *,
+    };
     use crate::{
         config::NodeConfig,
         lncl::{LocalApp, register_local},
         secured::Secured,
         security::{
-            Identity, files,
+            Identity, UnixTime, files,
             tests::ground::{self, Authority, Directory, Wish},
         },
     };
@@ -207,10 +210,16 @@ mod tests {
         assert!(said.refused.is_some());
         assert_eq!((said.rules, said.denied), (2, Some(2)));
         // The node's own certificate is on it
+        let is_revoked = || {
+            let security = answers::security(&stores, UnixTime::now());
+            security.certificate.is_some_and(|certificate| certificate.is_revoked)
+        };
+        assert!(!is_revoked());
         let own = stores.secured.get().expect("it has keys").serial.to_string();
         directory.put(files::DENIED, 0o644, &format!("{own}\n2d6f\n2d70\n"));
         let said = read_again(&stores);
         assert!(said.refused.is_some_and(|why| why.contains("own certificate")));
+        assert!(is_revoked());
         assert_eq!((said.denied, said.readmitted), (Some(3), 0));
     }
 

@@ -153,12 +153,13 @@ impl Answers {
     }
 }
 
-fn security(stores: &Stores, clock: UnixTime) -> SecurityReport {
+pub(super) fn security(stores: &Stores, clock: UnixTime) -> SecurityReport {
     let certificate = stores.secured.get().map(|secured| CertificateReport {
         from_s: secured.validity.from.as_secs(),
         until_s: secured.validity.until.as_secs(),
         clock_s: clock.as_secs(),
         times: stores.config.security.times.word().to_owned(),
+        is_revoked: secured.tls.denied().has(&secured.serial),
     });
     SecurityReport { is_beyond_host: stores.config.is_beyond_host(), certificate }
 }

@@ -67,6 +67,13 @@ fn check(standing: Standing, nodes: &[&NodeReport]) -> Check {
                     .join(" ")
             ),
         ),
+        Standing::Revoked => Check::finding(
+            NAME,
+            format!(
+                "certificates are revoked, by the deny list that these nodes have themselves; no node with that list takes them: {who}"
+            ),
+            renewal(nodes),
+        ),
         Standing::Ended => Check::finding(
             NAME,
             format!("certificates have ended, no other node takes them: {ends}"),

@@ -23,4 +23,7 @@ pub struct CertificateReport {
     pub clock_s: u64,
     /// What the times of certificates are good for there (`security.times`): `strict`, `until-set` or `ignored`.
     pub times: String,
+    /// Whether it is on the deny list that the node itself has in force. Nodes that have read the same list do not take it.
+    #[serde(default)]
+    pub is_revoked: bool,
 }

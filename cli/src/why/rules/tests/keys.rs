@@ -5,7 +5,13 @@ use sinew::inspect::{CertificateReport, SecurityReport};
 use super::*;
 
 fn secure(report: &mut NodeReport) {
-    let certificate = CertificateReport { from_s: 1, until_s: 3, clock_s: 2, times: "strict".to_owned() };
+    let certificate = CertificateReport {
+        from_s: 1,
+        until_s: 3,
+        clock_s: 2,
+        times: "strict".to_owned(),
+        is_revoked: false,
+    };
     report.security = Some(SecurityReport { is_beyond_host: true, certificate: Some(certificate) });
 }
 
