@@ -152,7 +152,7 @@ fn why_says_of_a_revoked_certificate_what_its_fault_says_and_blames_no_network()
     scenario.sinew("hip", &["reload"]);
     // Then
     let said = scenario.until("a try has failed", "hip", &["why", "hip", "knee"], |said| {
-        in_the_way(said).contains("`sinew keys issue` it anew\"\n")
+        in_the_way(said).contains("`sinew keys issue NODE --keys DIR`, where ca.key is, makes it another\"\n")
     });
     let said = in_the_way(&said);
     assert!(said.contains("is revoked") && !said.contains("TCP does not reach"), "{said}");
