@@ -245,7 +245,8 @@ impl RingFrames {
             lent.copy_to(&mut self.buffer[start..]);
             // What was copied counts, not what is left of it: a part may be taken back again and again.
             self.copied += lent.len();
-            self.idle += RECORD_WORK;
+            // Only a node asks for it, and of its guests alone.
+            self.idle = self.idle.saturating_add(RECORD_WORK);
             lent.keep();
             taken = Taken::Some;
             if self.copied >= enough || self.has_filled() {
@@ -283,7 +284,7 @@ impl RingFrames {
             }
             self.whole = end;
         }
-        self.idle += self.buffer.len().saturating_sub(self.whole);
+        self.idle = self.idle.saturating_add(self.buffer.len().saturating_sub(self.whole));
         self.buffer.truncate(self.whole);
     }
 }
@@ -353,7 +354,7 @@ mod tests {
 
     #[test]
     fn a_look_takes_no_more_than_is_enough_though_parts_are_taken_back() {
-        // Given: two beginnings of half a look each, both taken back, and what is long enough for a further look
+        // Given: beginnings of half a look each, all of them taken back
         let terms = Terms { capacity_max: Capacity::MAX, ..Terms::default() };
         let make = || Region::create(capacity(2 << 20), BellKind::Futex).expect("a region");
         let ((left, left_offer), (right, right_offer)) = (make(), make());

@@ -278,7 +278,7 @@ impl ClientReader {
     pub(super) fn take_idle(&mut self) -> usize {
         match self {
             Self::Plain(reader) => reader.take_idle(),
-            Self::Ring(reader) => reader.frames.take_idle() + std::mem::take(&mut reader.idle),
+            Self::Ring(reader) => reader.frames.take_idle().saturating_add(std::mem::take(&mut reader.idle)),
         }
     }
 }
@@ -330,7 +330,7 @@ impl RingReader {
             return Ok(());
         }
         (self.looks, self.bytes) = (0, 0);
-        (self.waits, self.idle) = (self.waits + 1, self.idle + READ_WORK);
+        (self.waits, self.idle) = (self.waits + 1, self.idle.saturating_add(READ_WORK));
         tokio::select! {
             biased;
             rung = self.consumer.readable_mut() => match rung {

@@ -148,7 +148,8 @@ impl Reader {
                 return Ok(Heard::Frame(message));
             }
             stream.readable().await?;
-            (self.reads, self.idle) = (self.reads + 1, self.idle + READ_WORK);
+            // Of whom nobody asks for it, it stays.
+            (self.reads, self.idle) = (self.reads + 1, self.idle.saturating_add(READ_WORK));
             let read = match self.guard(stream) {
                 Guard::System => {
                     self.buffer.reserve(FrameCodec::room(&self.buffer, READ_CHUNK));
