@@ -75,8 +75,8 @@ pub use sinew_runtime::supervision::fault;
 
 pub use access::{AccessError, AccessSummary};
 pub use api::{
-    ApiError, AsyncEndpoint, Barrier, BarrierError, Endpoint, LentMessage, Meet, Meeting, NodeApi, Received,
-    Registration, Transport, Untaken,
+    ApiError, AsyncEndpoint, Barrier, BarrierError, Endpoint, LoanedMessage, Meet, Meeting, NodeApi,
+    Received, Registration, Transport, Undelivered,
 };
 pub use audit::{Audit, NodeAudit};
 pub use clocks::{ClockDrift, ClockOffset};
@@ -94,8 +94,8 @@ pub use secured::{DenyListError, DenyListSummary};
 pub use serde;
 pub use sinew_runtime::{
     app::{
-        AppContext, AppSpec, Away, Delivery, LastWill, Raw, Requirement, RequirementEvent, RequirementPolicy,
-        Silence, Told,
+        AppContext, AppSpec, Delivery, DownPolicy, InputTimeout, LastWill, Raw, Requirement,
+        RequirementEvent, RequirementPolicy, SendOutcome,
     },
     monitor::{Down, DownClass, MonitorError, MonitorId},
     outcome::{Outcome, Rejection},
@@ -120,10 +120,10 @@ pub mod prelude {
     pub use actix::{Actor, ActorContext, ActorFutureExt, AsyncContext, Handler, Running, fut::WrapFuture};
 
     pub use crate::{
-        AppAddress, AppContext, AppSpec, AutoShutdown, Away, Class, Delivery, Down, LastWill, Node,
-        NodeAddress, NodeBuilder, NodeConfig, NodeEvent, Outcome, Payload, Place, RequirementEvent,
-        RequirementPolicy, Restart, Silence, StartError, Strategy, SupervisorSpec, Tick, Tid, Time, Told,
-        payload,
+        AppAddress, AppContext, AppSpec, AutoShutdown, Class, Delivery, Down, DownPolicy, InputTimeout,
+        LastWill, Node, NodeAddress, NodeBuilder, NodeConfig, NodeEvent, Outcome, Payload, Place,
+        RequirementEvent, RequirementPolicy, Restart, SendOutcome, StartError, Strategy, SupervisorSpec,
+        Tick, Tid, Time, payload,
     };
 }
 

@@ -209,7 +209,7 @@ impl LinkNumber {
 /// Who is left at the other end of a connection that is over.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Left {
-    /// Nobody takes anything any more: what was taken is [`Outcome::Failed`], and what lay in memory untaken was not handled.
+    /// Nobody takes anything any more: what was taken is [`Outcome::Failed`], and what lay in memory undelivered was not handled.
     Nobody,
     /// A program that may take what lies in its memory yet, and handle it: all that was sent is [`Outcome::Unknown`].
     Somebody,

@@ -158,9 +158,9 @@ fn comes_back_to_a_killed_node(transport: Transport) {
     node.wait().unwrap();
     // Then: it is said once by `receive`, and by each send
     let told = until("word of the node's end", || endpoint.receive(Duration::from_millis(5)).err());
-    assert!(matches!(told, ApiError::Away(_)), "{told}");
+    assert!(matches!(told, ApiError::Disconnected(_)), "{told}");
     let told = endpoint.send(tid, &Angle { degrees: 1.0 }).unwrap_err();
-    assert!(matches!(told, ApiError::Away(_)), "{told}");
+    assert!(matches!(told, ApiError::Disconnected(_)), "{told}");
     assert!(endpoint.receive(Duration::from_millis(5)).unwrap().is_none(), "it waits for the node's return");
     assert_eq!(endpoint.registrations(), 1);
     // When
@@ -217,13 +217,13 @@ async fn a_task_comes_back(transport: Transport) {
     // Then: who waits is told at once, and each send
     let told =
         tokio::time::timeout(WATCHDOG, endpoint.receive()).await.expect("word of the end").unwrap_err();
-    assert!(matches!(told, ApiError::Away(_)), "{told}");
+    assert!(matches!(told, ApiError::Disconnected(_)), "{told}");
     let told = endpoint.send(tid, &Angle { degrees: 1.0 }).await.unwrap_err();
-    assert!(matches!(told, ApiError::Away(_)), "{told}");
+    assert!(matches!(told, ApiError::Disconnected(_)), "{told}");
     // When: the node comes back while it waits
     let mut node = start_process("lone_node", &socket);
     // Its address is of another range: who comes first has the former dynamic one.
-    let fixed = Registration::new().fixed(AppAddress::fixed(9).unwrap());
+    let fixed = Registration::new().fixed_address(AppAddress::fixed(9).unwrap());
     let other = tokio::task::spawn_blocking(move || {
         let mut other = until("the door", || api.register_transport_address(fixed.clone()).ok());
         until("the name", || other.resolve("drive", WATCHDOG).unwrap());

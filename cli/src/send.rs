@@ -4,7 +4,7 @@ use std::io::Read;
 
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
-use sinew::{ApiError, Class, Kind, LentMessage, Outcome, Tid, Time};
+use sinew::{ApiError, Class, Kind, LoanedMessage, Outcome, Tid, Time};
 
 use crate::{
     Said, messagepack, ping,
@@ -117,7 +117,7 @@ pub(crate) fn show(system: &mut System, order: &Order) -> Result<Said, Fault> {
 fn send(system: &mut System, to: Tid, (kind, payload): (Kind, &[u8]), order: &Order) -> Ended {
     let within = std::time::Duration::from_millis(order.within.into());
     let endpoint = &mut system.endpoint;
-    let lent = endpoint.create_message(to, kind, payload.len()).map(|mut lent: LentMessage| {
+    let lent = endpoint.create_message(to, kind, payload.len()).map(|mut lent: LoanedMessage| {
         lent.copy_from_slice(payload);
         lent.set_class(order.class.into());
         lent
@@ -239,7 +239,8 @@ mod tests {
     fn what_has_a_reason_of_its_own_keeps_it_and_nobody_is_asked_for_another() {
         assert_eq!(said_of_a_waiting(Ok(Outcome::Delivered)), "");
         let full = Outcome::Rejected(Rejection::QueueFull);
-        for ended in [Ok(full), Ok(Outcome::PeerLost), Err(ApiError::Ended(full)), Err(ApiError::Lent)] {
+        for ended in [Ok(full), Ok(Outcome::PeerLost), Err(ApiError::Ended(full)), Err(ApiError::LoanActive)]
+        {
             let said = said_of_a_waiting(ended);
             assert!(!said.is_empty() && !said.contains("not ready"), "{said}");
         }

@@ -306,7 +306,7 @@ fn say(line: &str) -> bool {
 mod tests {
     use sinew::{
         Class, Kind, Outcome, Rejection, Time,
-        protection::{Codename, Stamp, seal},
+        protection::{DataId, Stamp, seal},
     };
 
     use super::*;
@@ -379,9 +379,9 @@ mod tests {
     /// In an envelope, as the hip's message 103 of this type.
     fn sealed(payload: &[u8]) -> Vec<u8> {
         let SeenMessage { source, target, .. } = seen(Vec::new());
-        let codename = Codename { source, destination: target, name: "demo.angle" };
+        let data_id = DataId { source, destination: target, name: "demo.angle" };
         let stamp = Stamp { counter: 103, incarnation: 7, echo: Time::ZERO };
-        seal(&codename, stamp, payload).to_vec()
+        seal(&data_id, stamp, payload).to_vec()
     }
 
     fn screen() -> Screen {

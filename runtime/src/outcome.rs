@@ -51,7 +51,7 @@ pub enum Rejection {
     /// The request does not make sense: a confirmation of a multicast, for instance.
     Unsupported,
     /// The destination's application has ended, is not ready again, and wants no message kept for it meanwhile.
-    Away,
+    Down,
     /// The access list of the destination's node does not let this source send this to it.
     NotAllowed,
 }
@@ -69,7 +69,7 @@ impl Rejection {
         Self::ForgedSource,
         Self::ByHandler,
         Self::Unsupported,
-        Self::Away,
+        Self::Down,
         Self::NotAllowed,
     ];
 }
@@ -91,7 +91,7 @@ impl fmt::Display for Rejection {
             Self::ForgedSource => "the source TID does not belong to the sender",
             Self::ByHandler => "the destination's handler refused it",
             Self::Unsupported => "this cannot be asked of this destination",
-            Self::Away => "the destination's application is away: it ended and is not ready again",
+            Self::Down => "the destination's application is away: it ended and is not ready again",
             Self::NotAllowed => {
                 "the access list of the destination's node does not allow it; `sinew why SENDER DESTINATION` names the rule"
             }

@@ -365,7 +365,7 @@ impl Sender {
         }
         let receiver = self.shared.router.absolute(destination);
         if !receiver.is_single() {
-            // Each receiver has its own echo, and its own codename.
+            // Each receiver has its own echo, and its own data_id.
             return Err(Rejection::Unsupported.into());
         }
         let payload = self.flows.seal(self.shared.tid, receiver, value, Time::now());

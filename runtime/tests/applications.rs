@@ -15,7 +15,7 @@ use std::{
 use actix::{Actor, ActorContext, AsyncContext, Handler, Running, fut::WrapFuture};
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{
-    app::{AppContext, AppSpec, AppWiring, Delivery, DynApp, Told},
+    app::{AppContext, AppSpec, AppWiring, Delivery, DynApp, SendOutcome},
     mailbox::Mailbox,
     outcome::{Outcome, Rejection},
     pending::{AppOutlet, Pending},
@@ -224,17 +224,17 @@ impl Actor for Clerk {
 
     fn started(&mut self, context: &mut Self::Context) {
         for (tag, number) in [7, 13, 99].into_iter().enumerate() {
-            context.send_told(self.to[0], &Number(number), DEADLINE, tag as u64).unwrap();
+            context.send_with_tag(self.to[0], &Number(number), DEADLINE, tag as u64).unwrap();
         }
-        let nobody = context.send_told(self.to[1], &Number(1), DEADLINE, 3);
+        let nobody = context.send_with_tag(self.to[1], &Number(1), DEADLINE, 3);
         assert!(nobody.is_err(), "nobody takes it, and nobody tells of it");
     }
 }
 
-impl Handler<Told> for Clerk {
+impl Handler<SendOutcome> for Clerk {
     type Result = ();
 
-    fn handle(&mut self, told: Told, _: &mut Self::Context) {
+    fn handle(&mut self, told: SendOutcome, _: &mut Self::Context) {
         self.written.send((told.tag, told.outcome)).unwrap();
     }
 }
@@ -269,7 +269,7 @@ impl Actor for Watcher {
                 this.0.send("five ticks").unwrap();
             }
         });
-        context.expect::<Number>(None, SILENCE, |this, silence, _| {
+        context.watch_input::<Number>(None, SILENCE, |this, silence, _| {
             assert!(silence.silent >= SILENCE);
             this.0.send("silence").unwrap();
         });

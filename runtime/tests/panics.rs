@@ -128,7 +128,7 @@ impl Handler<Delivery<Number>> for Fragile {
                 context.after(now, |_, _, _| panic!("in a timer"));
             }
             Where::Silence => {
-                context.expect::<Number>(None, now, |_, _, _| panic!("in a silence"));
+                context.watch_input::<Number>(None, now, |_, _, _| panic!("in a silence"));
             }
             Where::ActixTimer => {
                 context.run_later(now, |_, _| panic!("in a timer of actix's"));

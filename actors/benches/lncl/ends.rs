@@ -2,7 +2,7 @@
 
 use std::{os::unix::process::CommandExt, path::PathBuf, process::Command, time::Duration};
 
-use sinew::{Endpoint, LentMessage, NodeApi, Registration, Spin, Transport, prelude::*};
+use sinew::{Endpoint, LoanedMessage, NodeApi, Registration, Spin, Transport, prelude::*};
 use sinew_figures::{
     Figures, Pinning, Rounds,
     process::{Process, await_end, say_there},
@@ -111,7 +111,7 @@ impl Memory {
 struct Maker(Option<Endpoint>);
 
 impl Maker {
-    fn create(&mut self, endpoint: &mut Endpoint, to: Tid, kind: Kind, length: usize) -> LentMessage {
+    fn create(&mut self, endpoint: &mut Endpoint, to: Tid, kind: Kind, length: usize) -> LoanedMessage {
         self.0.as_mut().unwrap_or(endpoint).create_message(to, kind, length).expect("not too long")
     }
 }

@@ -1,6 +1,6 @@
 //! Sinew's ends as tasks of tokio, each on a runtime of one thread: the same round trips by `AsyncEndpoint`.
 
-use sinew::{AsyncEndpoint, LentMessage, NodeApi, Registration, Tid};
+use sinew::{AsyncEndpoint, LoanedMessage, NodeApi, Registration, Tid};
 use sinew_figures::{
     Figures, Pinning, Rounds,
     process::{Process, say_there},
@@ -23,7 +23,7 @@ async fn register(way: Way, socket: &str, name: &str) -> AsyncEndpoint {
     api.register_transport_address_async(registration).await.expect("an address")
 }
 
-fn filled(endpoint: &mut AsyncEndpoint, to: Tid, kind: Kind, bytes: &[u8]) -> LentMessage {
+fn filled(endpoint: &mut AsyncEndpoint, to: Tid, kind: Kind, bytes: &[u8]) -> LoanedMessage {
     let mut message = endpoint.create_message(to, kind, bytes.len()).expect("not too long");
     message.copy_from_slice(bytes);
     message

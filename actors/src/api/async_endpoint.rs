@@ -15,7 +15,7 @@ use sinew_shm::BellKind;
 use tokio::task::{coop, spawn_blocking};
 
 use super::{
-    ApiError, Endpoint, LentMessage, Received, Registration, Transport, Untaken, form::Form,
+    ApiError, Endpoint, LoanedMessage, Received, Registration, Transport, Undelivered, form::Form,
     outgoing::Request, reactor::Reactor, returning::LOOK,
 };
 
@@ -92,7 +92,7 @@ impl AsyncEndpoint {
         destination: Tid,
         kind: Kind,
         length: usize,
-    ) -> Result<LentMessage, ApiError> {
+    ) -> Result<LoanedMessage, ApiError> {
         self.endpoint.create_message(destination, kind, length)
     }
 
@@ -100,8 +100,8 @@ impl AsyncEndpoint {
     ///
     /// # Errors
     /// It was not sent.
-    pub async fn send_message(&mut self, message: LentMessage) -> Result<(), ApiError> {
-        self.endpoint.dispatch(message.into(), self.endpoint.patience()).await.map(drop)
+    pub async fn send_message(&mut self, message: LoanedMessage) -> Result<(), ApiError> {
+        self.endpoint.dispatch(message.into(), self.endpoint.stall_timeout()).await.map(drop)
     }
 
     /// The same, and waits for what becomes of it, as [`send_confirmed`](Self::send_confirmed).
@@ -110,7 +110,7 @@ impl AsyncEndpoint {
     /// It was not sent.
     pub async fn send_message_confirmed(
         &mut self,
-        message: LentMessage,
+        message: LoanedMessage,
         within: Duration,
     ) -> Result<Outcome, ApiError> {
         self.endpoint.confirm(message.into(), within).await
@@ -122,7 +122,7 @@ impl AsyncEndpoint {
     /// It was not sent or not handled, or no reply came `within` this time.
     pub async fn ask_message(
         &mut self,
-        message: LentMessage,
+        message: LoanedMessage,
         within: Duration,
     ) -> Result<Received, ApiError> {
         self.endpoint.await_reply(message.into(), within).await.map(Received::new)
@@ -132,9 +132,13 @@ impl AsyncEndpoint {
     ///
     /// # Errors
     /// The message asks for no reply, or the reply was not sent.
-    pub async fn reply_message(&mut self, request: &Received, message: LentMessage) -> Result<(), ApiError> {
+    pub async fn reply_message(
+        &mut self,
+        request: &Received,
+        message: LoanedMessage,
+    ) -> Result<(), ApiError> {
         let request = Request::of(request, self.tid())?;
-        self.endpoint.answer(request, message.into(), self.endpoint.patience()).await
+        self.endpoint.answer(request, message.into(), self.endpoint.stall_timeout()).await
     }
 
     /// Sends a value, as [`Endpoint::send`].
@@ -142,8 +146,8 @@ impl AsyncEndpoint {
     /// # Errors
     /// It was not sent.
     pub async fn send<P: Payload>(&mut self, destination: Tid, value: &P) -> Result<(), ApiError> {
-        let message = self.endpoint.typed(destination, value, self.endpoint.patience())?;
-        self.endpoint.dispatch(message.into(), self.endpoint.patience()).await.map(drop)
+        let message = self.endpoint.typed(destination, value, self.endpoint.stall_timeout())?;
+        self.endpoint.dispatch(message.into(), self.endpoint.stall_timeout()).await.map(drop)
     }
 
     /// Sends a value and waits for what becomes of it, as [`Endpoint::send_confirmed`].
@@ -156,7 +160,7 @@ impl AsyncEndpoint {
         value: &P,
         within: Duration,
     ) -> Result<Outcome, ApiError> {
-        let message = self.endpoint.typed(destination, value, self.endpoint.patience())?;
+        let message = self.endpoint.typed(destination, value, self.endpoint.stall_timeout())?;
         self.endpoint.confirm(message.into(), within).await
     }
 
@@ -182,11 +186,11 @@ impl AsyncEndpoint {
     pub async fn reply<R: Payload>(&mut self, request: &Received, value: &R) -> Result<(), ApiError> {
         let request = Request::of(request, self.tid())?;
         let message = Message::typed(self.tid(), request.source, value);
-        self.endpoint.answer(request, message.into(), self.endpoint.patience()).await
+        self.endpoint.answer(request, message.into(), self.endpoint.stall_timeout()).await
     }
 
     /// Waits for a message, in the order of [`Endpoint::receive`]. May be dropped at any time without losing one. When the
-    /// connection has ended it says so once with [`ApiError::Away`]; later calls wait for the node's return, too. Messages that are there
+    /// connection has ended it says so once with [`ApiError::Disconnected`]; later calls wait for the node's return, too. Messages that are there
     /// already count for tokio's budget: other tasks of the thread have their turn between them.
     ///
     /// # Errors
@@ -202,9 +206,9 @@ impl AsyncEndpoint {
         }
     }
 
-    /// What the node has said about messages that nobody has taken, as [`Endpoint::untaken`]. Never waits.
-    pub fn untaken(&mut self) -> Option<Untaken> {
-        self.endpoint.untaken()
+    /// What the node has said about messages that nobody has taken, as [`Endpoint::take_undelivered`]. Never waits.
+    pub fn take_undelivered(&mut self) -> Option<Undelivered> {
+        self.endpoint.take_undelivered()
     }
 
     /// Joins the group called `name`, as [`Endpoint::join`].

@@ -118,7 +118,7 @@ impl Barrier {
     }
 
     /// How long the request itself may take.
-    fn patience(&self) -> Duration {
+    fn stall_timeout(&self) -> Duration {
         self.within.saturating_add(SAYING)
     }
 
@@ -185,7 +185,7 @@ pub trait Meet {
 impl Meet for Sender {
     fn meet(&self, barrier: &Barrier) -> Meeting {
         let to = Tid::new(self.tid().node, AppAddress::SYNC);
-        let reply = self.ask(to, &barrier.request(), barrier.patience());
+        let reply = self.ask(to, &barrier.request(), barrier.stall_timeout());
         Meeting { barrier: barrier.clone(), sender: self.clone(), wait: Wait::from(reply) }
     }
 }
@@ -307,7 +307,7 @@ impl Endpoint {
         let to = Tid::new(self.tid().node, AppAddress::SYNC);
         let request = Message::typed(self.tid(), to, &barrier.request());
         let mut arrival = Arrival { endpoint: self, barrier: barrier.name(), is_answered: false };
-        let reply = arrival.endpoint.await_reply(request.into(), barrier.patience()).await?;
+        let reply = arrival.endpoint.await_reply(request.into(), barrier.stall_timeout()).await?;
         arrival.is_answered = true;
         Ok(reply.decode()?)
     }
@@ -327,7 +327,7 @@ impl Endpoint {
             if let Some(message) = self.writer.send_in_place(message.into()) {
                 match self.writer.begin(message) {
                     // What is being sent just now has the ring in hand: the next call tells it.
-                    Ok(Progress::Full(_)) | Err(ApiError::Lent) => return,
+                    Ok(Progress::Full(_)) | Err(ApiError::LoanActive) => return,
                     Ok(Progress::Part(rest)) => self.rest = rest,
                     // An error shows itself again when the ring is read.
                     Ok(Progress::Whole) | Err(_) => {}

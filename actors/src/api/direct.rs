@@ -31,13 +31,13 @@ use sinew_shm::{Any, AnyError, Spin, Waiter};
 
 use super::{
     ApiError,
-    lent::Draft,
     link::{
         LinkOptions, Writer,
         loan::InRing,
         ring::{self, NAP},
         socket,
     },
+    loan::Draft,
     routes::{Answered, Directness, Farewell, LINKS_MAX, Left, LinkNumber, Marked, Passed, Routes, Way},
 };
 use crate::{
@@ -238,7 +238,7 @@ impl Direct {
     /// Sends on a link, as far as there is room.
     ///
     /// # Errors
-    /// [`ApiError::Lent`], or it is too long for its rings.
+    /// [`ApiError::LoanActive`], or it is too long for its rings.
     pub(super) fn send(&mut self, number: LinkNumber, draft: Draft, now: Time) -> Result<Sent, ApiError> {
         let Some(link) = self.standing(number) else { return Ok(Sent::Gone(draft)) };
         match link.send_draft(draft) {

@@ -19,11 +19,11 @@ use super::{
     form::{Form, at_once},
     inbox::{Answer, Awaited, Inbox},
     incoming::WhenFull,
-    lent::{Lender, LentMessage},
     link::{Ended, Link, Reader, Writer, ring::Rest},
+    loan::{Lender, LoanedMessage},
     outgoing::Request,
     returning::Home,
-    untaken::Refusals,
+    undelivered::Refusals,
 };
 use crate::lncl::payload::{self, Group, Registered, Resolve};
 
@@ -58,7 +58,7 @@ pub struct Endpoint {
     pub(super) ends: Ends,
     /// What is left of a frame of which a part is in the ring to the node.
     pub(super) rest: Option<Rest>,
-    /// What the node had taken when a sender's patience with it was over.
+    /// What the node had taken when a sender's stall timeout with it was over.
     pub(super) stalled: Option<u32>,
     /// The number of its last request.
     pub(super) asked: u64,
@@ -141,17 +141,17 @@ impl Endpoint {
 
     /// Writable memory of `length` bytes, all zeros, for a raw payload of `kind` (the paper's CreateMessage): in the ring
     /// itself where that is possible. Never waits. One message is lent at a time, and nothing else goes out until it is sent or
-    /// dropped: see [`LentMessage`].
+    /// dropped: see [`LoanedMessage`].
     ///
     /// # Errors
     /// It would be longer than the node takes, `kind` is one of the layers' own, or another message is lent
-    /// ([`ApiError::Lent`]).
+    /// ([`ApiError::LoanActive`]).
     pub fn create_message(
         &mut self,
         destination: Tid,
         kind: Kind,
         length: usize,
-    ) -> Result<LentMessage, ApiError> {
+    ) -> Result<LoanedMessage, ApiError> {
         self.check_length(length)?;
         if !kind.is_user() {
             return Err(ApiError::NotYours(kind));
@@ -160,14 +160,14 @@ impl Endpoint {
     }
 
     /// Sends memory that [`create_message`](Self::create_message) lent (the paper's SendMessage), without a copy if it lies
-    /// in the ring. Returns when the ring, or the socket to the node, has it; [`untaken`](Self::untaken) says if nobody takes
+    /// in the ring. Returns when the ring, or the socket to the node, has it; [`undelivered`](Self::undelivered) says if nobody takes
     /// it then.
     ///
     /// # Errors
-    /// It was not sent, and its memory is given back. It may have been another endpoint's: [`ApiError::Lent`] if this one has
+    /// It was not sent, and its memory is given back. It may have been another endpoint's: [`ApiError::LoanActive`] if this one has
     /// lent one too.
-    pub fn send_message(&mut self, message: LentMessage) -> Result<(), ApiError> {
-        at_once(self.dispatch(message.into(), self.patience())).map(drop)
+    pub fn send_message(&mut self, message: LoanedMessage) -> Result<(), ApiError> {
+        at_once(self.dispatch(message.into(), self.stall_timeout())).map(drop)
     }
 
     /// Sends a value, in the class of its type; in an envelope if its type is [protected](crate::protection), see [`guard`](Self::guard).
@@ -177,15 +177,15 @@ impl Endpoint {
     /// # Errors
     /// It was not sent.
     pub fn send<P: Payload>(&mut self, destination: Tid, value: &P) -> Result<(), ApiError> {
-        let message = self.typed(destination, value, self.patience())?;
-        at_once(self.dispatch(message.into(), self.patience())).map(drop)
+        let message = self.typed(destination, value, self.stall_timeout())?;
+        at_once(self.dispatch(message.into(), self.stall_timeout())).map(drop)
     }
 
     /// Sends a value and waits for what becomes of it: [`Outcome::Unknown`] when nobody has said so `within` this
     /// time. The message expires where it waits when it is older. A longer `within` than
     /// [`TIME_TO_LIVE_MAX`](sinew_runtime::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s, counts as that. Messages that come meanwhile wait to be
     /// [received](Self::receive), beyond the inbox's capacity too: 16,384 of each class, 4 MiB of payloads and one message. What
-    /// comes then is refused: who sent it confirmed is told, the others are [counted](Self::untaken). The same holds for
+    /// comes then is refused: who sent it confirmed is told, the others are [counted](Self::undelivered). The same holds for
     /// whatever else waits for an answer: [`ask`](Self::ask), [`resolve`](Self::resolve), [`join`](Self::join),
     /// [`leave`](Self::leave).
     ///
@@ -199,7 +199,7 @@ impl Endpoint {
         value: &P,
         within: Duration,
     ) -> Result<Outcome, ApiError> {
-        let message = self.typed(destination, value, self.patience())?;
+        let message = self.typed(destination, value, self.stall_timeout())?;
         at_once(self.confirm(message.into(), within))
     }
 
@@ -225,14 +225,14 @@ impl Endpoint {
     /// The message asks for no reply, or the reply was not sent.
     pub fn reply<R: Payload>(&mut self, request: &Received, value: &R) -> Result<(), ApiError> {
         let message = Message::typed(self.tid, request.source(), value);
-        at_once(self.answer(Request::of(request, self.tid())?, message.into(), self.patience()))
+        at_once(self.answer(Request::of(request, self.tid())?, message.into(), self.stall_timeout()))
     }
 
     /// Waits for a message, at most `within` this time; `None` if none came (the paper's ReceiveMessage). Control
     /// comes first, then Stream, of which only the newest value of each source and kind, then Bulk.
     ///
     /// When the connection has ended, through no fault of this endpoint, it registers again: the first call says so with
-    /// [`ApiError::Away`], each later one waits for the node's return as for a message.
+    /// [`ApiError::Disconnected`], each later one waits for the node's return as for a message.
     ///
     /// # Errors
     /// The connection has ended, and everything that came before was received.
@@ -333,7 +333,7 @@ impl Endpoint {
     /// Gives the address back and waits until the node has taken it, 2 s at most: the name is free when this returns.
     ///
     /// # Errors
-    /// The node did not answer, or a message is lent ([`ApiError::Lent`]). The address is given back in any case.
+    /// The node did not answer, or a message is lent ([`ApiError::LoanActive`]). The address is given back in any case.
     pub fn unregister(mut self) -> Result<(), ApiError> {
         at_once(self.take_leave())
     }
@@ -341,7 +341,7 @@ impl Endpoint {
     pub(super) async fn take_leave(&mut self) -> Result<(), ApiError> {
         self.inbox.close();
         let deadline = Time::now() + PROMPT;
-        self.part(self.home.options.patience.min(PROMPT)).await;
+        self.part(self.home.options.stall_timeout.min(PROMPT)).await;
         if self.ended.is_some() {
             // The connection has taken the address with it.
             return Ok(());
@@ -350,7 +350,7 @@ impl Endpoint {
         // It may go on just now.
         self.stalled = None;
         let goodbye = Message::new(Header::new(Kind::LNCL_UNREGISTER, self.tid, LNCL), bytes::Bytes::new());
-        let limit = self.patience().and_in_all(deadline.since(Time::now()));
+        let limit = self.stall_timeout().and_in_all(deadline.since(Time::now()));
         self.write(goodbye.into(), limit).await?;
         while self.ended.is_none() {
             self.take_in(None, WhenFull::Refuse, Time::now())?;

@@ -60,18 +60,18 @@ pub enum ApiError {
     #[error(
         "the connection to the node has ended: {0}; the endpoint registers again by itself, go on receiving"
     )]
-    Away(String),
-    /// There was no room for so long: the patience of the endpoint, or the time that the call was given. Or another send's
-    /// patience was over before, and nothing was taken since. Nothing of this message is received; it may be sent again.
+    Disconnected(String),
+    /// There was no room for so long: the stall timeout of the endpoint, or the time that the call was given. Or another send's
+    /// stall timeout was over before, and nothing was taken since. Nothing of this message is received; it may be sent again.
     #[error(
         "no room for the message for {0:?}, it was not sent: the node, or the receiver on a direct link, is stopped or slower than \
          messages come; send less often, or as a Stream, of which only the newest value waits"
     )]
     Stalled(Duration),
     /// A message that was lent was neither sent nor dropped, before which nothing else goes out of its endpoint: see
-    /// [`LentMessage`](super::LentMessage). The caller is at fault; nothing was sent.
+    /// [`LoanedMessage`](super::LoanedMessage). The caller is at fault; nothing was sent.
     #[error("this endpoint has lent memory for a message; send that message or drop it first")]
-    Lent,
+    LoanActive,
     /// The payload is above the node's limit. The caller is at fault; nothing was sent.
     #[error(
         "a payload of {length} bytes is above the node's limit of {limit}; raise `node.payload_max` on all nodes, or send it in parts"
@@ -171,9 +171,9 @@ mod tests {
             ApiError::Waiting { missing: vec!["hip".to_owned()], waited: second },
             ApiError::NoAnswer(second),
             ApiError::Closed("why".to_owned()),
-            ApiError::Away("why".to_owned()),
+            ApiError::Disconnected("why".to_owned()),
             ApiError::Stalled(second),
-            ApiError::Lent,
+            ApiError::LoanActive,
             ApiError::TooLong { length: 2, limit: 1 },
             ApiError::NotYours(Kind::OUTCOME),
             ApiError::NoReply(second),

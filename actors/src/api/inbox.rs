@@ -41,7 +41,7 @@ pub(super) enum Sorted {
     /// The node ends the connection, for this reason.
     Refusal(Refusal),
     /// Messages of this endpoint's that nobody has taken.
-    Untaken(payload::Untaken),
+    Undelivered(payload::Undelivered),
     /// Nobody waits for it any more, or this version does not know it.
     Nothing,
 }
@@ -122,7 +122,9 @@ impl Inbox {
                 payload::read(&message.payload)
                     .unwrap_or_else(|error| Refusal { sentence: error.to_string(), again: false }),
             ),
-            Kind::LNCL_UNTAKEN => payload::read(&message.payload).map_or(Sorted::Nothing, Sorted::Untaken),
+            Kind::LNCL_UNDELIVERED => {
+                payload::read(&message.payload).map_or(Sorted::Nothing, Sorted::Undelivered)
+            }
             // A node of a later version may say more than we know.
             _ => Sorted::Nothing,
         }

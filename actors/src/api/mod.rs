@@ -22,13 +22,13 @@
 //! | be told what became of it (confirm) | [`send_confirmed`](Endpoint::send_confirmed): one [`Outcome`](crate::Outcome) | `sinew_send_message_confirmed` |
 //! | ask, and wait for the reply | [`ask`](Endpoint::ask), [`reply`](Endpoint::reply) | `sinew_ask`, `sinew_reply` |
 //! | wait for room 200 us at most, or not at all | [`send_within`](Endpoint::send_within), [`reply_within`](Endpoint::reply_within) | `sinew_send_message_within` |
-//! | write a payload where it travels from, so that sending it copies nothing (loan: CreateMessage, SendMessage) | [`create_message`](Endpoint::create_message), [`LentMessage`], [`send_message`](Endpoint::send_message) | `sinew_create_message`, `sinew_send_message` |
+//! | write a payload where it travels from, so that sending it copies nothing (loan: CreateMessage, SendMessage) | [`create_message`](Endpoint::create_message), [`LoanedMessage`], [`send_message`](Endpoint::send_message) | `sinew_create_message`, `sinew_send_message` |
 //! | receive, with a deadline (ReceiveMessage) | [`receive`](Endpoint::receive), [`Received`] | `sinew_receive_message`, `sinew_settle_message` |
 //! | speak to many at once (groups) | [`join`](Endpoint::join), [`leave`](Endpoint::leave), [`Tid::group`](crate::Tid::group) | `sinew_join_group`, `sinew_group` |
 //! | take only the newest value of a sensor | [`Class::Stream`](crate::Class), at the type | `SINEW_STREAM` |
 //! | protect commands from end to end, and make an output safe without them ([`protection`](crate::protection)) | [`Endpoint::guard`] | not there: `bindings/c/README.md` |
 //! | hear of nodes that come and go | [`Registration::subscribe`] | `events` of `sinew_options` |
-//! | go on when the node was restarted | nothing to do; [`ApiError::Away`] says so once | `SINEW_ERROR_AWAY` |
+//! | go on when the node was restarted | nothing to do; [`ApiError::Disconnected`] says so once | `SINEW_ERROR_DISCONNECTED` |
 //! | the shortest way to another process | [`Registration::direct`], [`Registration::spin`] | `SINEW_DIRECT`, `spin_ns` |
 //! | know what went wrong | [`ApiError`]: cause, place, remedy | `sinew_last_error` |
 //!
@@ -172,20 +172,20 @@ mod error;
 mod form;
 mod inbox;
 mod incoming;
-mod lent;
 mod link;
+mod loan;
 mod outgoing;
-mod patience;
 mod protected;
 mod raw;
 mod reactor;
 mod received;
 mod returning;
 mod routes;
+mod stall_timeout;
 #[cfg(test)]
 mod tests;
 mod to_node;
-mod untaken;
+mod undelivered;
 mod within;
 
 use std::{
@@ -204,14 +204,14 @@ pub use async_endpoint::AsyncEndpoint;
 pub use barrier::{Barrier, BarrierError, Meet, Meeting};
 pub use endpoint::Endpoint;
 pub use error::ApiError;
-pub use lent::LentMessage;
 pub use link::Transport;
+pub use loan::LoanedMessage;
 pub use received::Received;
-pub use untaken::Untaken;
+pub use undelivered::Undelivered;
 
 use self::{
     link::{Believed, Greeting, Link, LinkOptions},
-    returning::Returning,
+    returning::ReconnectPolicy,
 };
 use crate::lncl::payload::Register;
 
@@ -288,7 +288,7 @@ pub struct Registration {
     deadline: Duration,
     inbox_capacity: usize,
     link: LinkOptions,
-    returning: Returning,
+    returning: ReconnectPolicy,
 }
 
 impl Default for Registration {
@@ -300,12 +300,12 @@ impl Default for Registration {
             link: LinkOptions {
                 transport: Transport::Ring,
                 spin: Spin::Off,
-                patience: Duration::from_secs(1),
+                stall_timeout: Duration::from_secs(1),
                 bell: BellKind::Futex.into(),
                 direct_ring_bytes: direct::RING_BYTES,
                 believed: Believed::Anybody,
             },
-            returning: Returning::Always,
+            returning: ReconnectPolicy::Always,
         }
     }
 }
@@ -326,7 +326,7 @@ impl Registration {
 
     /// Asks for this address of the fixed range (`0x1000..=0x7fff_ffff`) instead of a dynamic one.
     #[must_use]
-    pub const fn fixed(mut self, address: AppAddress) -> Self {
+    pub const fn fixed_address(mut self, address: AppAddress) -> Self {
         self.register.address = Some(address);
         self
     }
@@ -378,8 +378,8 @@ impl Registration {
     /// How long a send waits while the node or, on a direct link, the peer takes nothing; whatever it takes begins that time
     /// anew. Default 1 s. For one send alone, and in all: [`Endpoint::send_within`].
     #[must_use]
-    pub const fn patience(mut self, patience: Duration) -> Self {
-        self.link.patience = patience;
+    pub const fn stall_timeout(mut self, stall_timeout: Duration) -> Self {
+        self.link.stall_timeout = stall_timeout;
         self
     }
 
@@ -406,8 +406,8 @@ impl Registration {
     /// Does not register again when the connection has ended: then every call says [`ApiError::Closed`]. Without this the
     /// endpoint comes back by itself, under the same name, to the same address if it is free, and to its groups.
     #[must_use]
-    pub const fn for_one_connection(mut self) -> Self {
-        self.returning = Returning::Never;
+    pub const fn without_reconnect(mut self) -> Self {
+        self.returning = ReconnectPolicy::Never;
         self
     }
 

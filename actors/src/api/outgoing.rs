@@ -15,11 +15,11 @@ use super::{
     form::Form,
     inbox::{Answer, Awaited},
     incoming::{Wanted, WhenFull},
-    lent::{Draft, LentMessage},
     link::ring::NAP,
-    patience::{Limit, Waiting},
+    loan::{Draft, LoanedMessage},
     returning::ANSWERED_WITHIN,
     routes::LinkNumber,
+    stall_timeout::{Limit, Waiting},
 };
 
 /// Looks for the last words of a node that has gone.
@@ -99,7 +99,7 @@ impl Endpoint {
         let now = Time::now();
         let deadline = now + within;
         // Who waits so long for the answer waits no longer for room.
-        let way = self.dispatch(message, self.patience().and_in_all(within)).await?;
+        let way = self.dispatch(message, self.stall_timeout().and_in_all(within)).await?;
         let wanted = Wanted { number, what: awaited, of: self.absolute(asked) };
         let asking = Asking(self);
         asking.0.await_answer(wanted, way, deadline, now).await
@@ -144,7 +144,7 @@ impl Endpoint {
     }
 
     /// Lends memory for a payload of `length` bytes: in the ring that a message to `destination` goes into now, if it can.
-    pub(super) fn lend(&mut self, header: Header, length: usize) -> Result<LentMessage, ApiError> {
+    pub(super) fn lend(&mut self, header: Header, length: usize) -> Result<LoanedMessage, ApiError> {
         if self.leaves.are_to_be_told() {
             self.tell_leaves();
         }
@@ -156,7 +156,7 @@ impl Endpoint {
             Some(link) => self.direct.lend(link, length),
             None => self.writer.lend(length),
         };
-        Ok(LentMessage::new(loan, header, room, length))
+        Ok(LoanedMessage::new(loan, header, room, length))
     }
 
     /// Comes back first, where `limit` leaves the time for it.
@@ -241,7 +241,7 @@ impl Endpoint {
         mut now: Time,
     ) -> Result<Option<Draft>, ApiError> {
         let room = Room { link, length: HEADER_LEN + draft.payload.len(), class: draft.header.class };
-        // Who takes nothing costs a patience once, and not with each message.
+        // Who takes nothing costs a stall timeout once, and not with each message.
         let has_stalled = self.direct.is_stalled(link);
         let mut waiting = if has_stalled { Waiting::after_a_stall(limit) } else { Waiting::new(limit) };
         // `None`: it is begun.

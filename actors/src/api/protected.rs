@@ -9,7 +9,7 @@ use sinew_runtime::{
     wire::{Kind, Message, Payload},
 };
 
-use super::{ApiError, AsyncEndpoint, Endpoint, Received, patience::Limit};
+use super::{ApiError, AsyncEndpoint, Endpoint, Received, stall_timeout::Limit};
 
 impl Endpoint {
     /// Has `output` moved by what `source` sends of type `P`, which is protected, and made safe by `safe` when that is not as it has

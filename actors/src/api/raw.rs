@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use sinew_runtime::outcome::Outcome;
 
-use super::{ApiError, Endpoint, LentMessage, Received, form::at_once, outgoing::Request};
+use super::{ApiError, Endpoint, LoanedMessage, Received, form::at_once, outgoing::Request};
 
 impl Endpoint {
     /// As [`send_confirmed`](Self::send_confirmed), for memory that [`create_message`](Self::create_message) lent.
@@ -13,7 +13,7 @@ impl Endpoint {
     /// It was not sent, or the connection ended before the outcome was known.
     pub fn send_message_confirmed(
         &mut self,
-        message: LentMessage,
+        message: LoanedMessage,
         within: Duration,
     ) -> Result<Outcome, ApiError> {
         at_once(self.confirm(message.into(), within))
@@ -23,7 +23,7 @@ impl Endpoint {
     ///
     /// # Errors
     /// It was not sent or not handled, or no reply came `within` this time.
-    pub fn ask_message(&mut self, message: LentMessage, within: Duration) -> Result<Received, ApiError> {
+    pub fn ask_message(&mut self, message: LoanedMessage, within: Duration) -> Result<Received, ApiError> {
         at_once(self.await_reply(message.into(), within)).map(Received::new)
     }
 
@@ -32,7 +32,7 @@ impl Endpoint {
     ///
     /// # Errors
     /// The message asks for no reply, or the reply was not sent.
-    pub fn reply_message(&mut self, request: &Received, message: LentMessage) -> Result<(), ApiError> {
-        at_once(self.answer(Request::of(request, self.tid())?, message.into(), self.patience()))
+    pub fn reply_message(&mut self, request: &Received, message: LoanedMessage) -> Result<(), ApiError> {
+        at_once(self.answer(Request::of(request, self.tid())?, message.into(), self.stall_timeout()))
     }
 }

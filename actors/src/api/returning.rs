@@ -42,7 +42,7 @@ const CONFIRMED_MAX: usize = 32;
 
 /// Whether an endpoint registers again when its connection has ended through no fault of its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Returning {
+pub(super) enum ReconnectPolicy {
     Always,
     Never,
 }
@@ -52,7 +52,7 @@ pub(super) struct Home {
     pub(super) path: PathBuf,
     pub(super) register: Register,
     pub(super) options: LinkOptions,
-    pub(super) returning: Returning,
+    pub(super) returning: ReconnectPolicy,
     /// The groups that it is a member of.
     pub(super) groups: BTreeSet<AppAddress>,
     /// Those that it has asked for when it came back, by the numbers of the questions, and of which the node has said nothing yet.
@@ -78,7 +78,7 @@ impl Home {
         path: PathBuf,
         register: Register,
         options: LinkOptions,
-        returning: Returning,
+        returning: ReconnectPolicy,
     ) -> Self {
         Self {
             path,
@@ -154,14 +154,14 @@ impl Endpoint {
     /// The error of a call that finds the connection ended.
     pub(super) fn gone(&self, ended: &Ended) -> ApiError {
         if self.returns(ended) {
-            ApiError::Away(ended.why.clone())
+            ApiError::Disconnected(ended.why.clone())
         } else {
             ApiError::Closed(ended.why.clone())
         }
     }
 
     const fn returns(&self, ended: &Ended) -> bool {
-        ended.again && matches!(self.home.returning, Returning::Always)
+        ended.again && matches!(self.home.returning, ReconnectPolicy::Always)
     }
 
     /// The connection to the node has ended. What is told is the first reason.

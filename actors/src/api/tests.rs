@@ -378,7 +378,7 @@ fn what_nobody_takes_is_said_with_its_number_and_once(under: Under) {
     let app = node.local(1);
     let nobody = Tid::new(node.address(), AppAddress::fixed(9).unwrap());
     let mut endpoint = register(under, &node, on(under));
-    assert_eq!(endpoint.untaken(), None);
+    assert_eq!(endpoint.take_undelivered(), None);
     for _ in 0..ROOM + MORE {
         endpoint.send(app.tid, &Torque { newton_metres: 1.0 }).unwrap();
     }
@@ -387,15 +387,15 @@ fn what_nobody_takes_is_said_with_its_number_and_once(under: Under) {
     let deadline = Time::now() + WATCHDOG;
     while full < MORE || gone < 1 {
         assert!(Time::now() < deadline, "waited for {MORE} and 1, was told of {full} and {gone}");
-        let Some(untaken) = endpoint.untaken() else {
+        let Some(undelivered) = endpoint.take_undelivered() else {
             assert!(endpoint.receive(Duration::from_millis(10)).unwrap().is_none(), "nobody sends to it");
             continue;
         };
-        match (untaken.destination, untaken.why) {
-            (to, Rejection::QueueFull) if to == app.tid => full += untaken.count,
-            (to, Rejection::NoSuchApplication) if to == nobody => gone += untaken.count,
+        match (undelivered.destination, undelivered.why) {
+            (to, Rejection::QueueFull) if to == app.tid => full += undelivered.count,
+            (to, Rejection::NoSuchApplication) if to == nobody => gone += undelivered.count,
             other => panic!("{other:?}"),
         }
     }
-    assert_eq!((full, gone, endpoint.untaken()), (MORE, 1, None));
+    assert_eq!((full, gone, endpoint.take_undelivered()), (MORE, 1, None));
 }

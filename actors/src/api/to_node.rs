@@ -9,15 +9,15 @@ use sinew_runtime::time::Time;
 use super::{
     ApiError, Endpoint,
     form::Form,
-    lent::Draft,
     link::{Progress, ring::Rest},
-    patience::{Limit, Waiting},
+    loan::Draft,
+    stall_timeout::{Limit, Waiting},
 };
 
 impl Endpoint {
     /// How long a send waits if its caller says nothing.
-    pub(super) const fn patience(&self) -> Limit {
-        Limit::patience(self.home.options.patience)
+    pub(super) const fn stall_timeout(&self) -> Limit {
+        Limit::stall_timeout(self.home.options.stall_timeout)
     }
 
     /// Writes a message to the node; waits for room as long as `limit` allows.
@@ -25,7 +25,7 @@ impl Endpoint {
     /// # Errors
     /// Nothing of it is received. [`ApiError::Closed`]: or the connection ended before it was whole.
     pub(super) async fn write(&mut self, draft: Draft, limit: Limit) -> Result<(), ApiError> {
-        // Who takes nothing costs a patience once, and not with each message.
+        // Who takes nothing costs a stall timeout once, and not with each message.
         let has_stalled = self.stalled.is_some_and(|taken| taken == self.taken());
         let mut waiting = if has_stalled { Waiting::after_a_stall(limit) } else { Waiting::new(limit) };
         let written = self.write_within(draft, &mut waiting).await;

@@ -6,7 +6,7 @@
 //! time sends nothing that is longer than the ring. Only from a plain socket nothing can be taken back: there a message is sent
 //! when its first byte is, and the rest follows with later calls, ahead of all that is sent then.
 //!
-//! These do not look for a node that has gone, since to register takes time: they say [`ApiError::Away`], and
+//! These do not look for a node that has gone, since to register takes time: they say [`ApiError::Disconnected`], and
 //! [`Endpoint::receive`], or a send without a time, brings the endpoint back.
 
 use std::time::Duration;
@@ -17,12 +17,12 @@ use sinew_runtime::{
 };
 
 use super::{
-    ApiError, AsyncEndpoint, Endpoint, LentMessage, Received, form::at_once, outgoing::Request,
-    patience::Limit,
+    ApiError, AsyncEndpoint, Endpoint, LoanedMessage, Received, form::at_once, outgoing::Request,
+    stall_timeout::Limit,
 };
 
 impl Endpoint {
-    /// As [`send`](Self::send), and waits for room for `within` at most instead of its patience; zero: not at all.
+    /// As [`send`](Self::send), and waits for room for `within` at most instead of its stall timeout; zero: not at all.
     /// For a loop with a period: a message that finds no room is skipped, not waited for.
     ///
     /// ```no_run
@@ -41,7 +41,7 @@ impl Endpoint {
     ///
     /// # Errors
     /// It was not sent. [`ApiError::Stalled`]: there was no room in time. A node that has gone is not looked for here
-    /// ([`ApiError::Away`]): [`receive`](Self::receive), or a send without a time, does.
+    /// ([`ApiError::Disconnected`]): [`receive`](Self::receive), or a send without a time, does.
     pub fn send_within<P: Payload>(
         &mut self,
         destination: Tid,
@@ -54,11 +54,11 @@ impl Endpoint {
     }
 
     /// As [`send_message`](Self::send_message), for `within` at most: see [`send_within`](Self::send_within). Memory that
-    /// [is in place](LentMessage::is_in_place) has its room already.
+    /// [is in place](LoanedMessage::is_in_place) has its room already.
     ///
     /// # Errors
     /// It was not sent, and its memory is given back.
-    pub fn send_message_within(&mut self, message: LentMessage, within: Duration) -> Result<(), ApiError> {
+    pub fn send_message_within(&mut self, message: LoanedMessage, within: Duration) -> Result<(), ApiError> {
         at_once(self.dispatch(message.into(), Limit::in_all(within))).map(drop)
     }
 
@@ -83,7 +83,7 @@ impl Endpoint {
     pub fn reply_message_within(
         &mut self,
         request: &Received,
-        message: LentMessage,
+        message: LoanedMessage,
         within: Duration,
     ) -> Result<(), ApiError> {
         at_once(self.answer(Request::of(request, self.tid())?, message.into(), Limit::in_all(within)))
@@ -112,7 +112,7 @@ impl AsyncEndpoint {
     /// It was not sent, and its memory is given back.
     pub async fn send_message_within(
         &mut self,
-        message: LentMessage,
+        message: LoanedMessage,
         within: Duration,
     ) -> Result<(), ApiError> {
         self.endpoint.dispatch(message.into(), Limit::in_all(within)).await.map(drop)
@@ -140,7 +140,7 @@ impl AsyncEndpoint {
     pub async fn reply_message_within(
         &mut self,
         request: &Received,
-        message: LentMessage,
+        message: LoanedMessage,
         within: Duration,
     ) -> Result<(), ApiError> {
         let request = Request::of(request, self.tid())?;

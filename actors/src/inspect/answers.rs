@@ -342,7 +342,7 @@ fn route(of: &KnownRoute) -> RouteReport {
 fn trouble(part: &TroubledApp) -> TroubleReport {
     let word = match part.trouble {
         Trouble::Stalled => "stalled",
-        Trouble::Away => "away",
+        Trouble::Down => "away",
         Trouble::GivenUp => "given up",
         Trouble::Unheard => "not heard",
     };

@@ -123,7 +123,7 @@ fn payloads(bytes: &[u8]) {
     is_read_as_written::<payload::Registered>(bytes);
     is_read_as_written::<payload::Refusal>(bytes);
     is_read_as_written::<payload::Waiting>(bytes);
-    is_read_as_written::<payload::Untaken>(bytes);
+    is_read_as_written::<payload::Undelivered>(bytes);
     is_read_as_written::<payload::Gone>(bytes);
     is_read_as_written::<Introduction>(bytes);
 }

@@ -226,8 +226,8 @@ impl RingSocket {
     fn account(&mut self) -> Account {
         let written = self.written;
         // Nothing is known of what a peer that writes nonsense has read.
-        let untaken = self.producer.get_mut().0.untaken().unwrap_or(0);
-        Account { written, taken: written - u64::from(untaken) }
+        let undelivered = self.producer.get_mut().0.untaken().unwrap_or(0);
+        Account { written, taken: written - u64::from(undelivered) }
     }
 
     fn poll_writable(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {

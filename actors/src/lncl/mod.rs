@@ -48,7 +48,7 @@ mod strangers;
 pub(crate) mod testing;
 #[cfg(test)]
 mod tests;
-mod untaken;
+mod undelivered;
 mod untold;
 mod worker;
 
@@ -65,7 +65,7 @@ pub(crate) use registrar::{
 #[cfg(test)]
 pub(crate) use shares::OF_USER_AT_SYNC;
 pub(crate) use shares::Shares;
-pub(crate) use untaken::is_fault;
+pub(crate) use undelivered::is_fault;
 pub(crate) use untold::Untold;
 
 use sinew_runtime::tid::AppAddress;

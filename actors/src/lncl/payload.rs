@@ -148,14 +148,14 @@ pub(crate) struct Gone {
 
 /// Unconfirmed messages of the client that nobody has taken, since it was told so last.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct Untaken {
+pub(crate) struct Undelivered {
     /// One for each destination and reason; a few at most.
-    pub(crate) entries: Vec<UntakenEntry>,
+    pub(crate) entries: Vec<UndeliveredEntry>,
 }
 
 /// Those to one destination, for one reason.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct UntakenEntry {
+pub(crate) struct UndeliveredEntry {
     /// 64 bits of the destination's TID; 0: several that are not told apart any more.
     pub(crate) to: u64,
     /// Code of the outcome that each of them would have had.

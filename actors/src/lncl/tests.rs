@@ -23,7 +23,7 @@ use sinew_runtime::{
 
 use super::{
     AppFact,
-    payload::{self, Group, Register, Resolve, Resolved, Untaken},
+    payload::{self, Group, Register, Resolve, Resolved, Undelivered},
     registrar,
     testing::{RawClient, TestNode, WATCHDOG},
 };
@@ -163,7 +163,7 @@ fn who_sends_to_nobody_at_all_is_told() {
     let (mut client, tid) = RawClient::register(&node, &Register::default());
     client.send(&Message::typed(tid, Tid::NONE, &Angle { degrees: 1.0 }));
     let said = client.next().expect("what nobody has taken");
-    let Untaken { entries } = payload::read(&said.payload).unwrap();
+    let Undelivered { entries } = payload::read(&said.payload).unwrap();
     let [entry] = &entries[..] else { panic!("{entries:?} of one destination") };
     assert_eq!((entry.to, entry.count), (Tid::NONE.bits(), 1));
     assert_eq!(Outcome::from_code(entry.why), Some(Outcome::Rejected(Rejection::NoSuchApplication)));
@@ -186,8 +186,8 @@ fn who_sends_more_than_its_destination_takes_is_told_how_much_of_it_and_not_of_e
     let (mut told, mut frames) = (0, 0);
     while told < MORE {
         let said = client.next().expect("what nobody has taken");
-        assert_eq!((said.header.kind, said.header.class), (Kind::LNCL_UNTAKEN, Class::Control));
-        let Untaken { entries } = payload::read(&said.payload).unwrap();
+        assert_eq!((said.header.kind, said.header.class), (Kind::LNCL_UNDELIVERED, Class::Control));
+        let Undelivered { entries } = payload::read(&said.payload).unwrap();
         let [entry] = &entries[..] else { panic!("{entries:?} of one destination") };
         assert_eq!(entry.to, app.tid.bits());
         assert_eq!(Outcome::from_code(entry.why), Some(Outcome::Rejected(Rejection::QueueFull)));
@@ -214,7 +214,7 @@ fn who_sends_to_a_group_whose_one_member_has_no_room_is_told() {
         client.send(&message);
     }
     let said = client.next().expect("what nobody has taken");
-    let Untaken { entries } = payload::read(&said.payload).unwrap();
+    let Undelivered { entries } = payload::read(&said.payload).unwrap();
     let [entry] = &entries[..] else { panic!("{entries:?} of one destination") };
     assert_eq!((entry.to, entry.count), (group.bits(), 1));
     assert_eq!(Outcome::from_code(entry.why), Some(Outcome::Rejected(Rejection::QueueFull)));
@@ -230,7 +230,7 @@ fn who_sends_to_a_group_without_members_is_told_nothing() {
         client.send(&message);
     }
     let said = client.next().expect("what nobody has taken");
-    let Untaken { entries } = payload::read(&said.payload).unwrap();
+    let Undelivered { entries } = payload::read(&said.payload).unwrap();
     let told: Vec<u64> = entries.iter().map(|entry| entry.to).collect();
     assert_eq!(told, [Tid::NONE.bits()]);
 }
@@ -246,7 +246,7 @@ fn who_may_take_short_payloads_only_is_told_of_each_destination_all_the_same() {
     }
     while !nobodies.is_empty() {
         let said = client.next().expect("what nobody has taken");
-        let Untaken { entries } = payload::read(&said.payload).unwrap();
+        let Undelivered { entries } = payload::read(&said.payload).unwrap();
         let [entry] = &entries[..] else { panic!("{entries:?} have no room in 64 bytes") };
         let at = nobodies.iter().position(|nobody| nobody.bits() == entry.to).expect("told once");
         nobodies.remove(at);

@@ -106,7 +106,7 @@ pub enum Trouble {
     /// One turn of it (a handler, a timer, a future) has lasted for 250 ms and more.
     Stalled,
     /// It has failed and is started again, or waits for that.
-    Away,
+    Down,
     /// It has failed, and is not started again.
     GivenUp,
     /// Only of NDL: it does not answer, while other connections of the node deliver. It hangs, or datagrams do not get through.

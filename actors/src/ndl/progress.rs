@@ -132,7 +132,7 @@ pub(crate) struct Told(pub(crate) Trouble);
 impl From<u8> for Told {
     fn from(number: u8) -> Self {
         Self(match number {
-            1 => Trouble::Away,
+            1 => Trouble::Down,
             2 => Trouble::GivenUp,
             3 => Trouble::Unheard,
             _ => Trouble::Stalled,
@@ -144,7 +144,7 @@ impl From<Told> for u8 {
     fn from(told: Told) -> Self {
         match told.0 {
             Trouble::Stalled => 0,
-            Trouble::Away => 1,
+            Trouble::Down => 1,
             Trouble::GivenUp => 2,
             // Said by nobody of himself.
             Trouble::Unheard => 3,

@@ -104,9 +104,9 @@ fn trouble(child: &ChildView, stalled: Option<Time>) -> Option<(Trouble, Time)> 
     let was_there = child.restarts > 0;
     match child.state {
         ChildState::Ready | ChildState::Stopping(_) => stalled.map(|since| (Trouble::Stalled, since)),
-        ChildState::BackingOff(_) => Some((Trouble::Away, child.since)),
-        ChildState::Starting(_) => was_there.then_some((Trouble::Away, child.since)),
-        ChildState::Down if child.wanted => was_there.then_some((Trouble::Away, child.since)),
+        ChildState::BackingOff(_) => Some((Trouble::Down, child.since)),
+        ChildState::Starting(_) => was_there.then_some((Trouble::Down, child.since)),
+        ChildState::Down if child.wanted => was_there.then_some((Trouble::Down, child.since)),
         ChildState::Down => {
             let has_failed = child.last_reason.as_ref().is_some_and(|reason| reason.is_failure());
             has_failed.then_some((Trouble::GivenUp, child.since))

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use sinew::{AsyncEndpoint, Endpoint, LentMessage, NodeApi, Registration, Spin, Tid, prelude::*};
+use sinew::{AsyncEndpoint, Endpoint, LoanedMessage, NodeApi, Registration, Spin, Tid, prelude::*};
 use sinew_figures::{
     Figures, Pinning, Rounds,
     process::{Process, await_end, say_there},
@@ -150,7 +150,7 @@ async fn register_task(way: Way, socket: &str, name: &str) -> AsyncEndpoint {
     api.register_transport_address_async(way.registration(name)).await.expect("an address")
 }
 
-fn filled(endpoint: &mut AsyncEndpoint, to: Tid, bytes: &[u8]) -> LentMessage {
+fn filled(endpoint: &mut AsyncEndpoint, to: Tid, bytes: &[u8]) -> LoanedMessage {
     let mut message = endpoint.create_message(to, BLOCK, bytes.len()).expect("not too long");
     message.copy_from_slice(bytes);
     message

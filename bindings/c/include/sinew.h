@@ -103,7 +103,7 @@
  * For `links` of `sinew_options`: does not register again when the connection to the node has ended. Then every call says
  * `SINEW_ERROR_CLOSED`. Without this the endpoint comes back by itself.
  */
-#define SINEW_ONE_CONNECTION 8
+#define SINEW_WITHOUT_RECONNECT 8
 
 /**
  * Bytes before the payload of a sealed message.
@@ -207,13 +207,13 @@ enum sinew_status
     /**
      * A message is lent and was neither sent nor discarded: nothing else goes out of the endpoint before. Nothing was sent.
      */
-    SINEW_ERROR_LENT = -19,
+    SINEW_ERROR_LOAN_ACTIVE = -19,
     /**
      * The connection to the node has ended, through no fault of this endpoint, which registers again by itself while it is
      * used: go on. Each send without a time tries, and `sinew_receive_message`, which says this once, waits for it. The message
      * was not sent.
      */
-    SINEW_ERROR_AWAY = -20,
+    SINEW_ERROR_DISCONNECTED = -20,
     /**
      * Not all parties were at the barrier in time. The sentence says who is missing; the others go on waiting.
      */
@@ -318,7 +318,7 @@ enum sinew_outcome
     /**
      * Not handled: the application has ended and is not ready again.
      */
-    SINEW_REJECTED_AWAY = 26,
+    SINEW_REJECTED_DOWN = 26,
     /**
      * Not handled: the access list of the destination's node does not allow it.
      */
@@ -534,7 +534,7 @@ typedef struct sinew_options {
      * How long a send waits while the node or, on a direct link, the receiver takes nothing; whatever it takes begins that time
      * anew. Default: 1 s. For one send alone, and in all: `sinew_send_message_within`.
      */
-    uint64_t patience_ns;
+    uint64_t stall_timeout_ns;
     /**
      * How many received messages wait in this process until no more are taken out of the socket or the rings; more while an
      * answer is waited for. Default: 256.
@@ -547,7 +547,7 @@ typedef struct sinew_options {
      */
     uint64_t spin_ns;
     /**
-     * What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`, `SINEW_ONE_CONNECTION`. Default:
+     * What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`, `SINEW_WITHOUT_RECONNECT`. Default:
      * shared memory where the system has it, all through the node, and again when the connection has ended.
      */
     uint32_t links;
@@ -650,7 +650,7 @@ typedef struct sinew_received {
 /**
  * Messages to one destination that were sent without asking for their outcome, and that nobody has taken.
  */
-typedef struct sinew_untaken {
+typedef struct sinew_undelivered {
     /**
      * Whom they were for; 0: several that are not told apart any more.
      */
@@ -671,7 +671,7 @@ typedef struct sinew_untaken {
      * Zero.
      */
     uint32_t reserved;
-} sinew_untaken;
+} sinew_undelivered;
 
 /**
  * A barrier: where several applications, on any nodes, wait for each other. It need not be made, and can be used again and
@@ -752,7 +752,7 @@ typedef struct sinew_protected_type {
 /**
  * What a flow of protected messages is called by both of its ends. It is not sent: whoever is not meant computes another checksum.
  */
-typedef struct sinew_codename {
+typedef struct sinew_data_id {
     /**
      * Who sends: its whole TID, the node's address included.
      */
@@ -765,7 +765,7 @@ typedef struct sinew_codename {
      * Name of the payload's type.
      */
     struct sinew_text name;
-} sinew_codename;
+} sinew_data_id;
 
 /**
  * What the sender says of one protected message.
@@ -942,7 +942,7 @@ uint64_t sinew_now_ns(void);
  * `message_class` is one of `sinew_message_class`. Does not block. The endpoint's thread; the bytes, any.
  *
  * An endpoint lends one message at a time, and until that is sent or discarded nothing else goes out of it: to create
- * another, to send, ask, reply, resolve, join and leave return `SINEW_ERROR_LENT`, whatever carries the messages; what
+ * another, to send, ask, reply, resolve, join and leave return `SINEW_ERROR_LOAN_ACTIVE`, whatever carries the messages; what
  * `sinew_settle_message` says may wait. So write it at once. The bytes lie in the shared memory from which they are read, if there
  * is room: then sending copies nothing. Else they are ordinary memory. If the process is killed meanwhile, nobody notices more
  * than its end.
@@ -962,7 +962,7 @@ sinew_status sinew_discard_message(struct sinew_endpoint *endpoint,
 
 /**
  * Sends a message (the paper's SendMessage). What becomes of it then is not told. The message is gone when this returns, sent
- * or not: see Messages at the top. Blocks while there is no room and nothing is taken, for the `patience_ns` of the options.
+ * or not: see Messages at the top. Blocks while there is no room and nothing is taken, for the `stall_timeout_ns` of the options.
  * The endpoint's thread.
  */
 sinew_status sinew_send_message(struct sinew_endpoint *endpoint,
@@ -972,7 +972,7 @@ sinew_status sinew_send_message(struct sinew_endpoint *endpoint,
  * The same, and blocks for `within_ns` at most while there is no room; with 0 it does not block at all. For a control loop:
  * `SINEW_ERROR_STALLED` says that there was no room in time and that nothing of the message is received. One that is longer than
  * the ring needs a time in which its receiver takes some of it (with `SINEW_SOCKET_ONLY` it is sent with its first byte, and the
- * rest follows with later calls). A node that has gone is not looked for here (`SINEW_ERROR_AWAY`): `sinew_receive_message`,
+ * rest follows with later calls). A node that has gone is not looked for here (`SINEW_ERROR_DISCONNECTED`): `sinew_receive_message`,
  * or a send without a time, does. The endpoint's thread.
  */
 sinew_status sinew_send_message_within(struct sinew_endpoint *endpoint,
@@ -1006,7 +1006,7 @@ sinew_status sinew_send_bytes_within(struct sinew_endpoint *endpoint,
  * expires where it waits when it is older. `*outcome` is set if this returns `SINEW_OK`. The message is gone as with
  * `sinew_send_message`. What comes meanwhile waits to be received. Blocks for `within_ns` at most, room included; a longer one
  * counts as the longest time to live of a message, 71 minutes and 35 s. With less than 20 ms a node that has gone is not looked
- * for here (`SINEW_ERROR_AWAY`): `sinew_receive_message` does. The endpoint's thread.
+ * for here (`SINEW_ERROR_DISCONNECTED`): `sinew_receive_message` does. The endpoint's thread.
  */
 sinew_status sinew_send_message_confirmed(struct sinew_endpoint *endpoint,
                                           struct sinew_message *message,
@@ -1059,12 +1059,12 @@ sinew_status sinew_receive_message(struct sinew_endpoint *endpoint,
 /**
  * The next thing that the node has said about messages that were sent without asking for their outcome, and that nobody has
  * taken: once for each destination and reason, with how many; `SINEW_NOTHING` if there is nothing new. Does not block. The
- * first refusal is told at once, those after it every 100 ms together. `*untaken` is set if this returns `SINEW_OK`. What
+ * first refusal is told at once, those after it every 100 ms together. `*undelivered` is set if this returns `SINEW_OK`. What
  * this endpoint itself has refused, since it came while an answer was waited for and was more than is kept then (16,384 messages
  * of each class, 4 MiB and one message), is counted with its own TID as the destination. The endpoint's thread.
  */
-sinew_status sinew_next_untaken(struct sinew_endpoint *endpoint,
-                                struct sinew_untaken *untaken);
+sinew_status sinew_next_undelivered(struct sinew_endpoint *endpoint,
+                                struct sinew_undelivered *undelivered);
 
 /**
  * Says what became of a message in hand, which its sender is told if it asked, and gives its memory back. `outcome` is
@@ -1122,7 +1122,7 @@ sinew_status sinew_send_protected_within(struct sinew_endpoint *endpoint,
  * Seals a payload for who sends over something else than an endpoint, and keeps the counter itself: writes
  * `length + SINEW_SEALED_OVERHEAD` bytes to `sealed`, whose `capacity` is at least that. The two must not overlap. Any thread.
  */
-sinew_status sinew_seal(const struct sinew_codename *codename,
+sinew_status sinew_seal(const struct sinew_data_id *data_id,
                         const struct sinew_stamp *stamp,
                         const void *bytes,
                         size_t length,
@@ -1130,11 +1130,11 @@ sinew_status sinew_seal(const struct sinew_codename *codename,
                         size_t capacity);
 
 /**
- * Looks whether these bytes were sealed under this codename, and what their sender says of them; the payload begins at `SINEW_SEALED_HEAD`
+ * Looks whether these bytes were sealed under this data ID, and what their sender says of them; the payload begins at `SINEW_SEALED_HEAD`
  * and is `SINEW_SEALED_OVERHEAD` bytes shorter than `length`. `SINEW_ERROR_MALFORMED` if not. This alone protects from nothing but damage and wrong addresses:
  * to act on a message let a guard take it, `sinew_check_sealed`. Any thread.
  */
-sinew_status sinew_unseal(const struct sinew_codename *codename,
+sinew_status sinew_unseal(const struct sinew_data_id *data_id,
                           const void *sealed,
                           size_t length,
                           struct sinew_stamp *stamp);
@@ -1159,10 +1159,10 @@ sinew_status sinew_guard_output(struct sinew_endpoint *endpoint,
 
 /**
  * The same for messages that come over something else than an endpoint: hand each to `sinew_check_sealed`, and send what `sinew_guard_echo` says to the
- * sender. The name of the codename is the one that counts, not that of the type. Needs no node. `*guard` is set after `SINEW_ERROR_SAFE_FAILS`, too.
+ * sender. The name of the data ID is the one that counts, not that of the type. Needs no node. `*guard` is set after `SINEW_ERROR_SAFE_FAILS`, too.
  * Any thread.
  */
-sinew_status sinew_guard_alone(const struct sinew_codename *codename,
+sinew_status sinew_guard_alone(const struct sinew_data_id *data_id,
                                const struct sinew_protected_type *payload_type,
                                void *output,
                                sinew_make_safe safe,

@@ -92,7 +92,7 @@ struct options {
     std::uint32_t fixed_address = 0;
     std::uint32_t events = 0;
     duration deadline{};
-    duration patience{};
+    duration stall_timeout{};
     std::size_t inbox_capacity = 0;
     duration spin{};
     std::uint32_t links = 0;
@@ -317,7 +317,7 @@ public:
         raw.fixed_address = wanted.fixed_address;
         raw.events = wanted.events;
         raw.deadline_ns = detail::nanoseconds(wanted.deadline);
-        raw.patience_ns = detail::nanoseconds(wanted.patience);
+        raw.stall_timeout_ns = detail::nanoseconds(wanted.stall_timeout);
         raw.inbox_capacity = wanted.inbox_capacity;
         raw.spin_ns = detail::nanoseconds(wanted.spin);
         raw.links = wanted.links;
@@ -444,10 +444,10 @@ public:
 
     /// What the node has said about messages that were sent without asking for their outcome, and that nobody has taken:
     /// the next of them; nothing if there is nothing new.
-    [[nodiscard]] std::optional<sinew_untaken> untaken()
+    [[nodiscard]] std::optional<sinew_undelivered> take_undelivered()
     {
-        sinew_untaken next;
-        if (detail::check(sinew_next_untaken(raw_, &next)) == SINEW_NOTHING)
+        sinew_undelivered next;
+        if (detail::check(sinew_next_undelivered(raw_, &next)) == SINEW_NOTHING)
             return std::nullopt;
         return next;
     }

@@ -16,8 +16,8 @@ use std::{
 };
 
 pub use crate::{
-    message::Untaken,
-    options::{SINEW_DIRECT, SINEW_ONE_CONNECTION, SINEW_SOCKET_ONLY},
+    message::Undelivered,
+    options::{SINEW_DIRECT, SINEW_SOCKET_ONLY, SINEW_WITHOUT_RECONNECT},
     status::Status,
     words::Outcome,
 };
@@ -25,7 +25,7 @@ use crate::{
     message::{self, Message},
     naming::{sinew_join_group, sinew_leave_group, sinew_resolve},
     options::Options,
-    receiving::{sinew_next_untaken, sinew_receive_message, sinew_settle_message},
+    receiving::{sinew_next_undelivered, sinew_receive_message, sinew_settle_message},
     registration::{
         sinew_endpoint_tid, sinew_node_name, sinew_payload_max, sinew_register_transport_address,
         sinew_unregister,
@@ -59,7 +59,7 @@ pub struct Asked {
     pub handled: Vec<String>,
     pub fixed_address: u32,
     pub deadline_ns: u64,
-    pub patience_ns: u64,
+    pub stall_timeout_ns: u64,
     pub inbox_capacity: usize,
     pub links: u32,
 }
@@ -135,7 +135,7 @@ impl Endpoint {
             fixed_address: asked.fixed_address,
             events: 0,
             deadline_ns: asked.deadline_ns,
-            patience_ns: asked.patience_ns,
+            stall_timeout_ns: asked.stall_timeout_ns,
             inbox_capacity: asked.inbox_capacity,
             spin_ns: 0,
             links: asked.links,
@@ -312,19 +312,19 @@ impl Endpoint {
         InHand { owner: self.handle, message: Given(received), payload }
     }
 
-    /// `sinew_next_untaken`.
+    /// `sinew_next_undelivered`.
     ///
     /// # Errors
     /// What it says.
-    pub fn next_untaken(&mut self) -> Result<Option<Untaken>, Told> {
-        let nothing = Untaken { destination: 0, count: 0, since_ns: 0, outcome: 0, reserved: 0 };
-        let mut untaken = MaybeUninit::new(nothing);
-        let status = sinew_next_untaken(self.pointer(), Some(&mut untaken));
+    pub fn next_undelivered(&mut self) -> Result<Option<Undelivered>, Told> {
+        let nothing = Undelivered { destination: 0, count: 0, since_ns: 0, outcome: 0, reserved: 0 };
+        let mut undelivered = MaybeUninit::new(nothing);
+        let status = sinew_next_undelivered(self.pointer(), Some(&mut undelivered));
         if status == Status::SinewNothing {
             return Ok(None);
         }
         // SAFETY: it was made with a value.
-        done(status).map(|()| Some(unsafe { untaken.assume_init() }))
+        done(status).map(|()| Some(unsafe { undelivered.assume_init() }))
     }
 
     /// `sinew_resolve`.

@@ -14,7 +14,7 @@ use crate::{
     border::{call, present, write},
     message::{Endpoint, TidBits},
     protection::{
-        Codename, Command, MakeSafe, OutputGuard, OutputState, ProtectedType, SealedFault, Tally, code_of,
+        Command, DataId, MakeSafe, OutputGuard, OutputState, ProtectedType, SealedFault, Tally, code_of,
         guards::{self, Found, Output},
     },
     registration::with,
@@ -50,11 +50,11 @@ pub extern "C" fn sinew_guard_output(
 }
 
 /// The same for messages that come over something else than an endpoint: hand each to `sinew_check_sealed`, and send what `sinew_guard_echo` says to the
-/// sender. The name of the codename is the one that counts, not that of the type. Needs no node. `*guard` is set after `SINEW_ERROR_SAFE_FAILS`, too.
+/// sender. The name of the data ID is the one that counts, not that of the type. Needs no node. `*guard` is set after `SINEW_ERROR_SAFE_FAILS`, too.
 /// Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_guard_alone(
-    codename: Option<&Codename>,
+    data_id: Option<&DataId>,
     payload_type: Option<&ProtectedType>,
     output: *mut c_void,
     safe: MakeSafe,
@@ -62,11 +62,11 @@ pub extern "C" fn sinew_guard_alone(
 ) -> Status {
     call(|| {
         let guard = present(guard, "guard")?;
-        let codename = present(codename, "codename")?.read()?;
+        let data_id = present(data_id, "data_id")?.read()?;
         let typed = present(payload_type, "payload_type")?.read()?;
         let output = Output { pointer: output, safe: present(safe, "safe")? };
-        let ends = (codename.source, codename.destination);
-        hand_out(guard, guards::make_alone(ends, typed.protected(codename.name), output)?)
+        let ends = (data_id.source, data_id.destination);
+        hand_out(guard, guards::make_alone(ends, typed.protected(data_id.name), output)?)
     })
 }
 

@@ -82,7 +82,7 @@ pub struct Received {
 /// Messages to one destination that were sent without asking for their outcome, and that nobody has taken.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
-pub struct Untaken {
+pub struct Undelivered {
     /// Whom they were for; 0: several that are not told apart any more.
     pub destination: TidBits,
     /// How many, since the last time that this endpoint said so. Never 0.
@@ -140,13 +140,13 @@ impl Received {
     }
 }
 
-impl Untaken {
-    pub(crate) fn of(untaken: &sinew::Untaken) -> Self {
+impl Undelivered {
+    pub(crate) fn of(undelivered: &sinew::Undelivered) -> Self {
         Self {
-            destination: untaken.destination.bits(),
-            count: untaken.count,
-            since_ns: untaken.since.as_nanos(),
-            outcome: outcome_code(sinew::Outcome::Rejected(untaken.why)) as i32,
+            destination: undelivered.destination.bits(),
+            count: undelivered.count,
+            since_ns: undelivered.since.as_nanos(),
+            outcome: outcome_code(sinew::Outcome::Rejected(undelivered.why)) as i32,
             reserved: 0,
         }
     }

@@ -22,7 +22,7 @@ pub const SINEW_DIRECT: u32 = 2;
 pub const SINEW_SPIN_ADAPTIVE: u32 = 4;
 /// For `links` of `sinew_options`: does not register again when the connection to the node has ended. Then every call says
 /// `SINEW_ERROR_CLOSED`. Without this the endpoint comes back by itself.
-pub const SINEW_ONE_CONNECTION: u32 = 8;
+pub const SINEW_WITHOUT_RECONNECT: u32 = 8;
 
 /// What an application asks for when it registers. Set all of it to zero, then `size`, then what is wanted; zero means the
 /// default everywhere. It grows at its end only: a program that was compiled with a shorter one is served as before.
@@ -51,7 +51,7 @@ pub struct Options {
     pub deadline_ns: u64,
     /// How long a send waits while the node or, on a direct link, the receiver takes nothing; whatever it takes begins that time
     /// anew. Default: 1 s. For one send alone, and in all: `sinew_send_message_within`.
-    pub patience_ns: u64,
+    pub stall_timeout_ns: u64,
     /// How many received messages wait in this process until no more are taken out of the socket or the rings; more while an
     /// answer is waited for. Default: 256.
     pub inbox_capacity: usize,
@@ -59,7 +59,7 @@ pub struct Options {
     /// Looking keeps a CPU busy and saves the wake, which is most of a short message's way: for a thread with a CPU of its
     /// own. Default: it sleeps at once.
     pub spin_ns: u64,
-    /// What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`, `SINEW_ONE_CONNECTION`. Default:
+    /// What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`, `SINEW_WITHOUT_RECONNECT`. Default:
     /// shared memory where the system has it, all through the node, and again when the connection has ended.
     pub links: u32,
     /// Zero.
@@ -70,7 +70,7 @@ pub struct Options {
     pub direct_ring_bytes: usize,
 }
 
-const KNOWN_LINKS: u32 = SINEW_SOCKET_ONLY | SINEW_DIRECT | SINEW_SPIN_ADAPTIVE | SINEW_ONE_CONNECTION;
+const KNOWN_LINKS: u32 = SINEW_SOCKET_ONLY | SINEW_DIRECT | SINEW_SPIN_ADAPTIVE | SINEW_WITHOUT_RECONNECT;
 
 /// What says how long the rest is.
 const SHORTEST: usize = size_of::<usize>();
@@ -113,7 +113,7 @@ impl Options {
             registration = registration.name(name);
         }
         if self.fixed_address != 0 {
-            registration = registration.fixed(AppAddress::new(self.fixed_address));
+            registration = registration.fixed_address(AppAddress::new(self.fixed_address));
         }
         registration =
             registration.requires(text::read_all(self.required, self.required_count, "options.required")?);
@@ -152,8 +152,8 @@ impl Options {
         if self.direct_ring_bytes != 0 {
             registration = registration.direct_ring_bytes(self.direct_ring_bytes);
         }
-        if self.links & SINEW_ONE_CONNECTION != 0 {
-            registration = registration.for_one_connection();
+        if self.links & SINEW_WITHOUT_RECONNECT != 0 {
+            registration = registration.without_reconnect();
         }
         let longest = Duration::from_nanos(self.spin_ns);
         Ok(match (self.spin_ns, self.links & SINEW_SPIN_ADAPTIVE) {
@@ -167,8 +167,8 @@ impl Options {
         if self.deadline_ns != 0 {
             registration = registration.deadline(Duration::from_nanos(self.deadline_ns));
         }
-        if self.patience_ns != 0 {
-            registration = registration.patience(Duration::from_nanos(self.patience_ns));
+        if self.stall_timeout_ns != 0 {
+            registration = registration.stall_timeout(Duration::from_nanos(self.stall_timeout_ns));
         }
         if self.inbox_capacity > INBOX_MAX {
             return Err(Fault::argument(format!(
@@ -213,11 +213,11 @@ mod tests {
 
     #[test]
     fn of_a_shorter_struct_the_rest_is_the_default() {
-        let mut options = zeroed(std::mem::offset_of!(Options, patience_ns));
+        let mut options = zeroed(std::mem::offset_of!(Options, stall_timeout_ns));
         options.deadline_ns = 1;
-        options.patience_ns = 2;
+        options.stall_timeout_ns = 2;
         let read = Options::read(&options).unwrap();
-        assert_eq!((read.deadline_ns, read.patience_ns), (1, 0));
+        assert_eq!((read.deadline_ns, read.stall_timeout_ns), (1, 0));
     }
 
     #[test]
@@ -250,9 +250,9 @@ mod tests {
     #[test]
     fn the_rings_of_direct_links_and_the_return_are_chosen() {
         let mut options = zeroed(size_of::<Options>());
-        (options.links, options.direct_ring_bytes) = (SINEW_DIRECT | SINEW_ONE_CONNECTION, 1 << 18);
+        (options.links, options.direct_ring_bytes) = (SINEW_DIRECT | SINEW_WITHOUT_RECONNECT, 1 << 18);
         let asked = format!("{:?}", options.registration().unwrap());
-        let wanted = Registration::new().direct(true).direct_ring_bytes(1 << 18).for_one_connection();
+        let wanted = Registration::new().direct(true).direct_ring_bytes(1 << 18).without_reconnect();
         assert_eq!(asked, format!("{wanted:?}"));
     }
 

@@ -61,7 +61,7 @@ pub struct ProtectedType {
 /// What a flow of protected messages is called by both of its ends. It is not sent: whoever is not meant computes another checksum.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
-pub struct Codename {
+pub struct DataId {
     /// Who sends: its whole TID, the node's address included.
     pub source: TidBits,
     /// Who receives, as well; one application.
@@ -222,7 +222,7 @@ impl ProtectedType {
 }
 
 impl Typed<'_> {
-    /// As the runtime has it; `name` stays, and is this one's or that of the codename that counts.
+    /// As the runtime has it; `name` stays, and is this one's or that of the data ID that counts.
     pub(crate) const fn protected(&self, name: &'static str) -> Protected {
         let reads = match self.length {
             0 => Reads::Any,

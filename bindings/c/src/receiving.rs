@@ -4,7 +4,7 @@ use std::{mem::MaybeUninit, time::Duration};
 
 use crate::{
     border::{call, present, write},
-    message::{Endpoint, Received, Untaken},
+    message::{Endpoint, Received, Undelivered},
     registration::with,
     status::{Fault, Status},
     words::outcome_of,
@@ -34,18 +34,18 @@ pub extern "C" fn sinew_receive_message(
 
 /// The next thing that the node has said about messages that were sent without asking for their outcome, and that nobody has
 /// taken: once for each destination and reason, with how many; `SINEW_NOTHING` if there is nothing new. Does not block. The
-/// first refusal is told at once, those after it every 100 ms together. `*untaken` is set if this returns `SINEW_OK`. What
+/// first refusal is told at once, those after it every 100 ms together. `*undelivered` is set if this returns `SINEW_OK`. What
 /// this endpoint itself has refused, since it came while an answer was waited for and was more than is kept then (16,384 messages
 /// of each class, 4 MiB and one message), is counted with its own TID as the destination. The endpoint's thread.
 #[unsafe(no_mangle)]
-pub extern "C" fn sinew_next_untaken(
+pub extern "C" fn sinew_next_undelivered(
     endpoint: *mut Endpoint,
-    untaken: Option<&mut MaybeUninit<Untaken>>,
+    undelivered: Option<&mut MaybeUninit<Undelivered>>,
 ) -> Status {
     call(|| {
-        let untaken = present(untaken, "untaken")?;
-        match with(endpoint, |session| Ok(session.endpoint().untaken()))? {
-            Some(next) => Ok(write(untaken, Untaken::of(&next))),
+        let undelivered = present(undelivered, "undelivered")?;
+        match with(endpoint, |session| Ok(session.endpoint().take_undelivered()))? {
+            Some(next) => Ok(write(undelivered, Undelivered::of(&next))),
             None => Ok(Status::SinewNothing),
         }
     })

@@ -10,7 +10,7 @@ use sinew::{
 use crate::{
     border::{call, present, write},
     message::{Endpoint, TidBits},
-    protection::{Codename, ProtectedType, Stamp, names},
+    protection::{DataId, ProtectedType, Stamp, names},
     registration::with,
     status::{Fault, Status},
     text::{self, Text},
@@ -68,7 +68,7 @@ pub extern "C" fn sinew_send_protected_within(
 /// `length + SINEW_SEALED_OVERHEAD` bytes to `sealed`, whose `capacity` is at least that. The two must not overlap. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_seal(
-    codename: Option<&Codename>,
+    data_id: Option<&DataId>,
     stamp: Option<&Stamp>,
     bytes: *const c_void,
     length: usize,
@@ -76,7 +76,7 @@ pub extern "C" fn sinew_seal(
     capacity: usize,
 ) -> Status {
     call(|| {
-        let codename = present(codename, "codename")?.read()?;
+        let data_id = present(data_id, "data_id")?.read()?;
         let &Stamp { counter, incarnation, echo_ns } = present(stamp, "stamp")?;
         let stamp = protection::Stamp { counter, incarnation, echo: Time::from_nanos(echo_ns) };
         if sealed.is_null() {
@@ -89,27 +89,27 @@ pub extern "C" fn sinew_seal(
         if capacity < needed {
             return Err(Fault::argument(format!("`capacity` is {capacity}: {needed} bytes are needed")));
         }
-        let written = protection::seal(&codename, stamp, payload((bytes, length))?);
+        let written = protection::seal(&data_id, stamp, payload((bytes, length))?);
         // SAFETY: not NULL; the header asks of the caller that so many bytes are there, and this is not longer.
         unsafe { std::ptr::copy_nonoverlapping(written.as_ptr(), sealed, written.len()) };
         Ok(Status::SinewOk)
     })
 }
 
-/// Looks whether these bytes were sealed under this codename, and what their sender says of them; the payload begins at `SINEW_SEALED_HEAD`
+/// Looks whether these bytes were sealed under this data ID, and what their sender says of them; the payload begins at `SINEW_SEALED_HEAD`
 /// and is `SINEW_SEALED_OVERHEAD` bytes shorter than `length`. `SINEW_ERROR_MALFORMED` if not. This alone protects from nothing but damage and wrong addresses:
 /// to act on a message let a guard take it, `sinew_check_sealed`. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_unseal(
-    codename: Option<&Codename>,
+    data_id: Option<&DataId>,
     sealed: *const c_void,
     length: usize,
     stamp: Option<&mut MaybeUninit<Stamp>>,
 ) -> Status {
     call(|| {
-        let codename = present(codename, "codename")?.read()?;
+        let data_id = present(data_id, "data_id")?.read()?;
         let stamp = present(stamp, "stamp")?;
-        let Some((found, _)) = raw::look(&codename, payload((sealed, length))?) else {
+        let Some((found, _)) = raw::look(&data_id, payload((sealed, length))?) else {
             let sentence = "it is damaged, or was sealed by or for somebody else";
             return Err(Fault::new(Status::SinewErrorMalformed, sentence));
         };
@@ -144,16 +144,16 @@ pub(crate) fn payload<'call>((bytes, length): (*const c_void, usize)) -> Result<
         .ok_or_else(|| Fault::argument("`bytes` is NULL, but has a length"))
 }
 
-impl Codename {
+impl DataId {
     /// As Rust says it: its name stays.
-    pub(crate) fn read(&self) -> Result<protection::Codename, Fault> {
-        let name = names::kept(self.name.read("codename.name")?)?;
+    pub(crate) fn read(&self) -> Result<protection::DataId, Fault> {
+        let name = names::kept(self.name.read("data_id.name")?)?;
         let (source, destination) = (Tid::from_bits(self.source), Tid::from_bits(self.destination));
         if !destination.is_single() {
             return Err(Fault::argument(format!(
-                "`codename.destination` is {destination}: it is one application's"
+                "`data_id.destination` is {destination}: it is one application's"
             )));
         }
-        Ok(protection::Codename { source, destination, name })
+        Ok(protection::DataId { source, destination, name })
     }
 }

@@ -18,7 +18,7 @@ use crate::{
 /// `message_class` is one of `sinew_message_class`. Does not block. The endpoint's thread; the bytes, any.
 ///
 /// An endpoint lends one message at a time, and until that is sent or discarded nothing else goes out of it: to create
-/// another, to send, ask, reply, resolve, join and leave return `SINEW_ERROR_LENT`, whatever carries the messages; what
+/// another, to send, ask, reply, resolve, join and leave return `SINEW_ERROR_LOAN_ACTIVE`, whatever carries the messages; what
 /// `sinew_settle_message` says may wait. So write it at once. The bytes lie in the shared memory from which they are read, if there
 /// is room: then sending copies nothing. Else they are ordinary memory. If the process is killed meanwhile, nobody notices more
 /// than its end.
@@ -50,7 +50,7 @@ pub extern "C" fn sinew_discard_message(endpoint: *mut Endpoint, message: Option
 }
 
 /// Sends a message (the paper's SendMessage). What becomes of it then is not told. The message is gone when this returns, sent
-/// or not: see Messages at the top. Blocks while there is no room and nothing is taken, for the `patience_ns` of the options.
+/// or not: see Messages at the top. Blocks while there is no room and nothing is taken, for the `stall_timeout_ns` of the options.
 /// The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_send_message(endpoint: *mut Endpoint, message: Option<&mut Message>) -> Status {
@@ -63,7 +63,7 @@ pub extern "C" fn sinew_send_message(endpoint: *mut Endpoint, message: Option<&m
 /// The same, and blocks for `within_ns` at most while there is no room; with 0 it does not block at all. For a control loop:
 /// `SINEW_ERROR_STALLED` says that there was no room in time and that nothing of the message is received. One that is longer than
 /// the ring needs a time in which its receiver takes some of it (with `SINEW_SOCKET_ONLY` it is sent with its first byte, and the
-/// rest follows with later calls). A node that has gone is not looked for here (`SINEW_ERROR_AWAY`): `sinew_receive_message`,
+/// rest follows with later calls). A node that has gone is not looked for here (`SINEW_ERROR_DISCONNECTED`): `sinew_receive_message`,
 /// or a send without a time, does. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_send_message_within(
@@ -122,7 +122,7 @@ pub extern "C" fn sinew_send_bytes_within(
 /// expires where it waits when it is older. `*outcome` is set if this returns `SINEW_OK`. The message is gone as with
 /// `sinew_send_message`. What comes meanwhile waits to be received. Blocks for `within_ns` at most, room included; a longer one
 /// counts as the longest time to live of a message, 71 minutes and 35 s. With less than 20 ms a node that has gone is not looked
-/// for here (`SINEW_ERROR_AWAY`): `sinew_receive_message` does. The endpoint's thread.
+/// for here (`SINEW_ERROR_DISCONNECTED`): `sinew_receive_message` does. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_send_message_confirmed(
     endpoint: *mut Endpoint,

@@ -3,7 +3,7 @@
 use std::{collections::BTreeMap, ffi::CString, time::Duration};
 
 use sinew::{
-    ApiError, Class, Kind, LentMessage, NodeAddress, Outcome, Tid, Time,
+    ApiError, Class, Kind, LoanedMessage, NodeAddress, Outcome, Tid, Time,
     protection::{
         SealError,
         raw::{ECHO, Judged},
@@ -33,7 +33,7 @@ const SETTLED_MAX: usize = 1024;
 pub(crate) struct Session {
     endpoint: sinew::Endpoint,
     node_name: CString,
-    made: Hand<LentMessage>,
+    made: Hand<LoanedMessage>,
     received: Hand<sinew::Received>,
     /// What it sends and receives of protected payloads.
     ends: Ends,
@@ -74,7 +74,7 @@ impl Session {
         match self.made.take(buffer) {
             Ok(token) => Ok(Message { bytes, length, token }),
             // Dropped; there is none in the hand that is not lent.
-            Err(_) => Err(Fault::plain(Status::SinewErrorLent)),
+            Err(_) => Err(Fault::plain(Status::SinewErrorLoanActive)),
         }
     }
 
@@ -89,7 +89,7 @@ impl Session {
         self.take(message).map(drop)
     }
 
-    /// `within` `None`: for the endpoint's patience.
+    /// `within` `None`: for the stall timeout of the endpoint.
     pub(crate) fn send(&mut self, message: &mut Message, within: Option<Duration>) -> Result<(), Fault> {
         let buffer = self.take(message)?;
         Ok(match within {
@@ -98,14 +98,18 @@ impl Session {
         }?)
     }
 
-    pub(crate) fn send_confirmed(&mut self, buffer: LentMessage, within: Duration) -> Result<Outcome, Fault> {
+    pub(crate) fn send_confirmed(
+        &mut self,
+        buffer: LoanedMessage,
+        within: Duration,
+    ) -> Result<Outcome, Fault> {
         Ok(self.endpoint.send_message_confirmed(buffer, within)?)
     }
 
     /// Asks; what became of the request, too, if it was not handled.
     pub(crate) fn ask(
         &mut self,
-        buffer: LentMessage,
+        buffer: LoanedMessage,
         within: Duration,
     ) -> Result<Result<Received, (Outcome, Fault)>, Fault> {
         self.check_hand()?;
@@ -119,7 +123,7 @@ impl Session {
     pub(crate) fn reply(
         &mut self,
         request: &Received,
-        buffer: LentMessage,
+        buffer: LoanedMessage,
         within: Option<Duration>,
     ) -> Result<(), Fault> {
         let Some(request) = self.received.get_mut(request.token) else {
@@ -141,7 +145,7 @@ impl Session {
         Err(Fault::new(Status::SinewErrorTooLong, sentence))
     }
 
-    /// `within` `None`: for the endpoint's patience.
+    /// `within` `None`: for the stall timeout of the endpoint.
     pub(crate) fn send_protected(
         &mut self,
         destination: Tid,
@@ -277,7 +281,7 @@ impl Session {
     }
 
     /// Takes a message out of the program's hand: whatever comes now, it is gone.
-    pub(crate) fn take(&mut self, message: &mut Message) -> Result<LentMessage, Fault> {
+    pub(crate) fn take(&mut self, message: &mut Message) -> Result<LoanedMessage, Fault> {
         let Some(buffer) = self.made.give(message.token) else { return Err(no_such("the message")) };
         *message = Message::GONE;
         Ok(buffer)

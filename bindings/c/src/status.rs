@@ -57,11 +57,11 @@ pub enum Status {
     /// A fault of this library. The endpoint can only be unregistered; all others go on.
     SinewErrorPanic = -18,
     /// A message is lent and was neither sent nor discarded: nothing else goes out of the endpoint before. Nothing was sent.
-    SinewErrorLent = -19,
+    SinewErrorLoanActive = -19,
     /// The connection to the node has ended, through no fault of this endpoint, which registers again by itself while it is
     /// used: go on. Each send without a time tries, and `sinew_receive_message`, which says this once, waits for it. The message
     /// was not sent.
-    SinewErrorAway = -20,
+    SinewErrorDisconnected = -20,
     /// Not all parties were at the barrier in time. The sentence says who is missing; the others go on waiting.
     SinewErrorNotMet = -21,
     /// A party of the barrier was lost, and was not to be waited for. The sentence says which.
@@ -98,8 +98,8 @@ impl Status {
         Self::SinewErrorTooMany,
         Self::SinewErrorForked,
         Self::SinewErrorPanic,
-        Self::SinewErrorLent,
-        Self::SinewErrorAway,
+        Self::SinewErrorLoanActive,
+        Self::SinewErrorDisconnected,
         Self::SinewErrorNotMet,
         Self::SinewErrorPartyLost,
         Self::SinewErrorNoSuchGuard,
@@ -151,10 +151,10 @@ impl Status {
             Self::SinewErrorForked => {
                 c"this endpoint belongs to the process that this one was forked from; register an own one"
             }
-            Self::SinewErrorLent => {
+            Self::SinewErrorLoanActive => {
                 c"a message of this endpoint is lent; hand it to sinew_send_message or sinew_discard_message first"
             }
-            Self::SinewErrorAway => {
+            Self::SinewErrorDisconnected => {
                 c"the connection to the node has ended; the endpoint registers again by itself while it is used"
             }
             Self::SinewErrorNotMet => c"not all were at the barrier in time",
@@ -218,7 +218,7 @@ impl From<ApiError> for Fault {
             ApiError::Refused(_) => Status::SinewErrorRefused,
             ApiError::Waiting { .. } => Status::SinewErrorWaiting,
             ApiError::NoAnswer(_) => Status::SinewErrorNoAnswer,
-            ApiError::Away(_) => Status::SinewErrorAway,
+            ApiError::Disconnected(_) => Status::SinewErrorDisconnected,
             ApiError::Closed(_) | ApiError::Frame(_) => Status::SinewErrorClosed,
             ApiError::Stalled(_) => Status::SinewErrorStalled,
             ApiError::TooLong { .. } => Status::SinewErrorTooLong,
@@ -227,7 +227,7 @@ impl From<ApiError> for Fault {
             ApiError::Malformed(_) => Status::SinewErrorMalformed,
             ApiError::NotAsked => Status::SinewErrorNotAsked,
             ApiError::OthersRequest(_) => Status::SinewErrorNoSuchMessage,
-            ApiError::Lent => Status::SinewErrorLent,
+            ApiError::LoanActive => Status::SinewErrorLoanActive,
             // The second one: of payloads whose types Rust knows, which C does not send.
             ApiError::NotYours(_) | ApiError::NotSealed(_) => Status::SinewErrorInvalidArgument,
         };
@@ -246,13 +246,13 @@ fn in_c(error: &ApiError) -> String {
         ApiError::NotYours(kind) => {
             format!("the kind {kind} belongs to Sinew's layers; take one from sinew_kind_named")
         }
-        ApiError::Lent => {
+        ApiError::LoanActive => {
             "a message of this endpoint is lent, before which nothing else goes out; hand it to \
                            sinew_send_message or sinew_discard_message first"
                 .to_owned()
         }
         ApiError::Ended(outcome) => text_of(*outcome).to_string_lossy().into_owned(),
-        ApiError::Away(why) => format!(
+        ApiError::Disconnected(why) => format!(
             "the connection to the node has ended: {why}; the endpoint registers again by itself, go on with \
              sinew_receive_message"
         ),
@@ -300,8 +300,12 @@ mod tests {
     fn what_an_error_says_names_nothing_of_rusts() {
         let kind = sinew::Kind::from_bits(1);
         let outcomes = (0..=u8::MAX).filter_map(sinew::Outcome::from_code).map(ApiError::Ended);
-        let spoken =
-            [ApiError::NotAsked, ApiError::NotYours(kind), ApiError::Away("why".to_owned()), ApiError::Lent];
+        let spoken = [
+            ApiError::NotAsked,
+            ApiError::NotYours(kind),
+            ApiError::Disconnected("why".to_owned()),
+            ApiError::LoanActive,
+        ];
         for error in spoken.into_iter().chain(outcomes) {
             let Fault { sentence, .. } = error.into();
             for rusts in ["::", "`ask`", "Rejected(", "PeerLost"] {

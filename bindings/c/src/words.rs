@@ -42,7 +42,7 @@ pub enum Outcome {
     /// Not handled: this cannot be asked of this destination.
     SinewRejectedUnsupported = 25,
     /// Not handled: the application has ended and is not ready again.
-    SinewRejectedAway = 26,
+    SinewRejectedDown = 26,
     /// Not handled: the access list of the destination's node does not allow it.
     SinewRejectedNotAllowed = 27,
 }
@@ -88,7 +88,7 @@ pub(crate) const fn code_of(outcome: sinew::Outcome) -> Outcome {
             Rejection::ForgedSource => Outcome::SinewRejectedForgedSource,
             Rejection::ByHandler => Outcome::SinewRejectedByHandler,
             Rejection::Unsupported => Outcome::SinewRejectedUnsupported,
-            Rejection::Away => Outcome::SinewRejectedAway,
+            Rejection::Down => Outcome::SinewRejectedDown,
             Rejection::NotAllowed => Outcome::SinewRejectedNotAllowed,
         },
     }
@@ -117,7 +117,7 @@ pub(crate) const fn text_of(outcome: sinew::Outcome) -> &'static CStr {
         Outcome::SinewRejectedForgedSource => c"not handled: the source TID is not the sender's",
         Outcome::SinewRejectedByHandler => c"not handled: the destination's handler refused it",
         Outcome::SinewRejectedUnsupported => c"not handled: this cannot be asked of this destination",
-        Outcome::SinewRejectedAway => {
+        Outcome::SinewRejectedDown => {
             c"not handled: the destination's application has ended and is not ready again"
         }
         Outcome::SinewRejectedNotAllowed => {

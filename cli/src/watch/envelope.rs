@@ -1,6 +1,6 @@
 //! What is in the envelope of a protected payload, for eyes alone (`docs/protocol/protected.md`).
 //!
-//! The checksum is not looked at: it takes the flow's codename, which is not sent. Whether the bytes are those that the source has sealed, and
+//! The checksum is not looked at: it takes the flow's data ID, which is not sent. Whether the bytes are those that the source has sealed, and
 //! not too old, is the receiver's to say.
 
 use sinew::protection::OVERHEAD;
@@ -35,7 +35,7 @@ pub(super) fn unsealed(bytes: &[u8]) -> Option<Unsealed<'_>> {
 mod tests {
     use sinew::{
         AppAddress, NodeAddress, Tid, Time,
-        protection::{Codename, Stamp, seal},
+        protection::{DataId, Stamp, seal},
     };
 
     use super::*;
@@ -43,9 +43,9 @@ mod tests {
     /// As the library seals it, so that the layout here cannot be another one.
     fn sealed(payload: &[u8]) -> Vec<u8> {
         let tid = |app| Tid::new(NodeAddress::from([10, 0, 0, 1]), AppAddress::new(app));
-        let codename = Codename { source: tid(0x1001), destination: tid(0x1002), name: "demo.angle" };
+        let data_id = DataId { source: tid(0x1001), destination: tid(0x1002), name: "demo.angle" };
         let stamp = Stamp { counter: 103, incarnation: 7, echo: Time::from_nanos(5) };
-        seal(&codename, stamp, payload).to_vec()
+        seal(&data_id, stamp, payload).to_vec()
     }
 
     #[test]

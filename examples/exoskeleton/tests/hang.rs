@@ -14,7 +14,7 @@ use exoskeleton::robot::drive::{self, DriveParts};
 use exoskeleton::robot::edges::{Arm, GAIT, Shut, drive_name, sensor_name};
 use exoskeleton::robot::trace::{DriveRow, EventRow, Recording};
 use sinew::prelude::*;
-use sinew::protection::{Codename, Stamp, seal};
+use sinew::protection::{DataId, Stamp, seal};
 
 /// How long one thing may take on a machine that is busy with other tests.
 const DEADLINE: Duration = Duration::from_secs(60);
@@ -147,10 +147,10 @@ impl Payload for Unsealed {
 /// the time that it quotes, as one that was kept from another day.
 fn forge(drive: Tid, context: &AppContext<Gait>) {
     let _ = context.send(drive, &Unsealed { suspect: true });
-    let codename = Codename::of::<Arm>(context.tid(), drive);
+    let data_id = DataId::of::<Arm>(context.tid(), drive);
     let counter = Time::now().as_nanos();
     let stamp = Stamp { counter, incarnation: 1, echo: Time::from_nanos(1) };
-    let sealed = seal(&codename, stamp, b"\x81\xa7suspect\xc3");
+    let sealed = seal(&data_id, stamp, b"\x81\xa7suspect\xc3");
     let sender = context.sender();
     let mut message = sender.create_message(drive, Arm::KIND, sealed.len()).expect("it is short");
     message.copy_from_slice(&sealed);

@@ -11,7 +11,7 @@ use crate::{
     app::Delivery,
     monitor::{MonitorError, MonitorId},
     outcome::{Outcome, Rejection},
-    protection::{Cause, Codename, Echo, Guard, Guarded},
+    protection::{Cause, DataId, Echo, Guard, Guarded},
     schedule::{Schedule, Tick, TimerId},
     sender::{Confirmation, Destination, Reply, SendError, Sender},
     supervision::{ReadyGate, vitals::Vitals},
@@ -47,7 +47,7 @@ struct HeldGuard {
 
 pub(super) type Timer<A> = Box<dyn FnMut(&mut A, Tick, &mut <A as Actor>::Context)>;
 
-type Alert<A> = Box<dyn FnMut(&mut A, Silence, &mut <A as Actor>::Context)>;
+type Alert<A> = Box<dyn FnMut(&mut A, InputTimeout, &mut <A as Actor>::Context)>;
 
 /// What a deadline is for.
 pub(super) enum Action<A: Actor> {
@@ -61,7 +61,7 @@ pub struct WatchId(pub(super) usize);
 
 /// An input that has gone silent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Silence {
+pub struct InputTimeout {
     /// Who was expected to send; `None` where anybody may.
     pub source: Option<Tid>,
     /// What was expected.
@@ -230,11 +230,11 @@ impl<A: Actor<Context = Self>> AppContext<A> {
 
     /// Calls `action` when no `P` has come from `source` (from anybody, if `None`) for `within`, counted from now. It is
     /// called once for each silence; the next `P` that comes begins a new count.
-    pub fn expect<P: Payload>(
+    pub fn watch_input<P: Payload>(
         &mut self,
         source: Option<Tid>,
         within: Duration,
-        action: impl FnMut(&mut A, Silence, &mut Self) + 'static,
+        action: impl FnMut(&mut A, InputTimeout, &mut Self) + 'static,
     ) -> WatchId {
         let id = WatchId(self.watches.len());
         let now = Time::now();
@@ -296,14 +296,14 @@ impl<A: Actor<Context = Self>> AppContext<A> {
 
     /// The guard of what `source` sends of type `P`.
     pub(super) fn guard_of<P: Payload>(&self, source: Tid) -> Option<&Arc<dyn Guarded>> {
-        let codename = Codename::of::<P>(source, self.tid());
-        self.guards.iter().map(|held| &held.guard).find(|guard| guard.codename() == codename)
+        let data_id = DataId::of::<P>(source, self.tid());
+        self.guards.iter().map(|held| &held.guard).find(|guard| guard.data_id() == data_id)
     }
 
     /// What was sent last to `source` for each type but `kind`. All echoes are one Stream, of which only the newest message may arrive.
     fn last_echoes(&self, source: Tid, kind: Kind) -> Vec<(Kind, u64)> {
         let others =
-            self.guards.iter().filter(|held| held.kind != kind && held.guard.codename().source == source);
+            self.guards.iter().filter(|held| held.kind != kind && held.guard.data_id().source == source);
         others.map(|held| (held.kind, held.guard.last_echo().as_nanos())).collect()
     }
 

@@ -17,7 +17,7 @@ use bytes::Bytes;
 use crate::{
     alarm::Alarm,
     app::{
-        AppContext, Delivery, Raw, Silence, WatchId,
+        AppContext, Delivery, InputTimeout, Raw, WatchId,
         context::Action,
         requirement::{Requirements, event_in},
     },
@@ -347,7 +347,7 @@ where
         return;
     }
     watch.silent = true;
-    let silence = Silence {
+    let silence = InputTimeout {
         source: watch.source,
         kind: watch.kind,
         silent: now.since(watch.last),

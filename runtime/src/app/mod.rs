@@ -4,21 +4,21 @@
 //! has a `Handler<Delivery<P>>` for each. Everything that actix gives an actor (spawned futures, `run_later`, an
 //! `Addr`) works as usual.
 
-mod away;
 mod context;
 mod delivery;
+mod down_policy;
 mod drive;
 mod required;
 mod requirement;
+mod send_outcome;
 mod spec;
-mod told;
 
-pub use away::{Absence, Away, Heir, LastWill, WILLS_MAX, Will};
-pub use context::{AppContext, Silence, WatchId};
+pub use context::{AppContext, InputTimeout, WatchId};
 pub use delivery::{Delivery, Raw};
+pub use down_policy::{Absence, DownPolicy, Heir, LastWill, WILLS_MAX, Will};
 pub use required::{
     ALTERNATIVES_MAX, REQUIREMENT_BYTES_MAX, Requirement, RequirementError, is_pattern, is_phase, matches,
 };
 pub use requirement::{RequirementEvent, RequirementPolicy};
+pub use send_outcome::SendOutcome;
 pub use spec::{AppSpec, AppWiring, DynApp};
-pub use told::Told;

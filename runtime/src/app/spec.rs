@@ -6,7 +6,7 @@ use actix::{Actor, AsyncContext, Handler};
 
 use crate::{
     app::{
-        Absence, AppContext, Away, Delivery, Raw, RequirementEvent, RequirementPolicy, WILLS_MAX, Will,
+        Absence, AppContext, Delivery, DownPolicy, Raw, RequirementEvent, RequirementPolicy, WILLS_MAX, Will,
         drive::{Dispatch, Drive, dispatch_raw, dispatch_typed},
         requirement::{Parting, PartingLife, Requirements, SafeState},
     },
@@ -40,8 +40,8 @@ use crate::{
 /// let spec = AppSpec::new("knee", || Knee).handles::<Angle>().requires(["hip"]).own_thread();
 ///
 /// // A setpoint that waited for a restart would be stale; and who follows this one is told that it died.
-/// use sinew_runtime::{app::Away, tid::Tid};
-/// let spec = spec.while_away(Away::Drop).last_will(Tid::group("followers"), &Angle { degrees: 0.0 });
+/// use sinew_runtime::{app::DownPolicy, tid::Tid};
+/// let spec = spec.while_down(DownPolicy::Drop).last_will(Tid::group("followers"), &Angle { degrees: 0.0 });
 /// ```
 pub struct AppSpec<A: Actor<Context = AppContext<A>>> {
     factory: Arc<dyn Fn() -> A + Send + Sync>,
@@ -58,7 +58,7 @@ pub(super) struct Common {
     kinds: Vec<(Kind, &'static str)>,
     policy: Policy,
     place: Place,
-    pub(super) away: Away,
+    pub(super) away: DownPolicy,
     pub(super) wills: Vec<Will>,
     pub(super) on_lost: RequirementPolicy,
     has_safe_state: bool,
@@ -77,7 +77,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
             kinds: Vec::new(),
             policy: Policy { held: true, ..Policy::default() },
             place: Place::thread("apps"),
-            away: Away::default(),
+            away: DownPolicy::default(),
             wills: Vec::new(),
             on_lost: RequirementPolicy::default(),
             has_safe_state: false,

@@ -98,13 +98,13 @@ impl Lender {
             let mut shared = lock(&self.mailbox.shared);
             let refuses = match (shared.closed, shared.refuses) {
                 (true, _) => Some(Rejection::Closed),
-                (false, true) => Some(Rejection::Away),
+                (false, true) => Some(Rejection::Down),
                 (false, false) => None,
             };
             for message in lent.into_iter().rev() {
                 let class = message.header.class as usize;
                 shared.lent_no_more(message.header.class);
-                if let Some(why) = refuses.or_else(|| is_event(&message.header).then_some(Rejection::Away)) {
+                if let Some(why) = refuses.or_else(|| is_event(&message.header).then_some(Rejection::Down)) {
                     shared.tallies[class].rejected += 1;
                     refused.push((message, why));
                 } else if shared.queue.put_back(message).is_some() {

@@ -270,7 +270,7 @@ impl Mailbox {
             (shared.empty(), shared.queue.awaited_no_more())
         };
         for message in waiting {
-            message.reject(Rejection::Away);
+            message.reject(Rejection::Down);
         }
         waker.into_iter().for_each(Waker::wake);
     }
@@ -279,7 +279,7 @@ impl Mailbox {
     pub fn forget_events(&self) {
         let events = lock(&self.shared).take_events();
         for event in events {
-            event.reject(Rejection::Away);
+            event.reject(Rejection::Down);
         }
     }
 
@@ -339,7 +339,7 @@ impl Outlet for Mailbox {
             }
             if shared.refuses {
                 shared.tallies[class].refused += 1;
-                return Err(Refused::new(message, Rejection::Away));
+                return Err(Refused::new(message, Rejection::Down));
             }
             if message.receipt.is_some() && message.header.class == Class::Stream {
                 shared.tallies[class].refused += 1;

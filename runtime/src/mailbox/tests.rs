@@ -107,7 +107,7 @@ fn a_mailbox_whose_application_is_away_and_keeps_nothing_refuses_until_it_is_bac
     let mailbox = Mailbox::new(8);
     mailbox.submit(message()).unwrap();
     mailbox.refuse_while_away();
-    assert_eq!(mailbox.submit(message()).unwrap_err().why, Rejection::Away);
+    assert_eq!(mailbox.submit(message()).unwrap_err().why, Rejection::Down);
     mailbox.is_back();
     mailbox.submit(message()).unwrap();
     let tally = mailbox.tally(Class::Control);

@@ -37,7 +37,7 @@ struct Held {
 
 impl std::fmt::Debug for Held {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "Held({:?})", self.guard.codename())
+        write!(f, "Held({:?})", self.guard.data_id())
     }
 }
 
@@ -66,7 +66,7 @@ pub enum Judged<'message> {
 /// Why a protected payload cannot be sent. The caller is at fault; nothing was sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SealError {
-    /// It is for many: each receiver has an echo and a codename of its own.
+    /// It is for many: each receiver has an echo and a data ID of its own.
     #[error(
         "it is protected, and so for one application, not for a group or for all; send it to each by itself"
     )]
@@ -173,7 +173,7 @@ impl Ends {
     #[doc(hidden)]
     #[must_use]
     pub fn is_held(&self, source: Tid, kind: Kind) -> bool {
-        self.live().any(|held| held.kind == kind && held.guard.codename().source == source)
+        self.live().any(|held| held.kind == kind && held.guard.data_id().source == source)
     }
 
     /// Whether nothing protected was ever sent or guarded here.
@@ -226,7 +226,7 @@ impl Ends {
             return Judged::Plain;
         }
         self.forget_orphans();
-        let is_of_it = |held: &&Held| held.kind == kind && held.guard.codename().source == source;
+        let is_of_it = |held: &&Held| held.kind == kind && held.guard.data_id().source == source;
         let verdict = self.held.iter().find(is_of_it).map(|held| held.guard.check(payload, held.reads));
         Judged::Settled(Outcome::Rejected(match verdict {
             Some(Verdict::Apply(())) => return Judged::Good(payload_of(payload)),
@@ -263,8 +263,8 @@ impl Ends {
         let held = held.min_by_key(|held| held.echo_at).filter(|held| held.echo_at <= now)?;
         // Not on a grid: who looks late says one and not many.
         held.echo_at = now + held.guard.echo_period();
-        let (source, kind, at) = (held.guard.codename().source, held.kind, held.guard.echo());
-        let others = self.live().filter(|held| held.kind != kind && held.guard.codename().source == source);
+        let (source, kind, at) = (held.guard.data_id().source, held.kind, held.guard.echo());
+        let others = self.live().filter(|held| held.kind != kind && held.guard.data_id().source == source);
         let others = others.map(|held| (held.kind, held.guard.last_echo().as_nanos())).collect();
         Some((source, Echo { others, ..Echo::new(kind, at) }))
     }

@@ -2,7 +2,7 @@
 //!
 //! Little-endian: version (1 byte), flags (1, all zero), zero (2), length of the payload (4), counter (8), incarnation (8),
 //! echo (8), payload, CRC-64 (8). The CRC is CRC-64/XZ (ECMA-182, reflected), as in AUTOSAR's E2E profile 7; it is taken over the
-//! codename, then all that stands before it. The codename itself is not sent: whoever is not meant computes another one.
+//! data ID, then all that stands before it. The data ID itself is not sent: whoever is not meant computes another one.
 
 use bytes::{BufMut, Bytes, BytesMut};
 use crc64fast::Digest;
@@ -20,16 +20,16 @@ const VERSION: u8 = 1;
 
 /// What a flow of protected messages is called by both of its ends: who sends, who receives, what it is. Not sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Codename {
+pub struct DataId {
     /// Who sends.
     pub source: Tid,
-    /// Who receives. One application: a group has no codename.
+    /// Who receives. One application: a group has no data_id.
     pub destination: Tid,
     /// [`Payload::NAME`].
     pub name: &'static str,
 }
 
-impl Codename {
+impl DataId {
     /// That of the values of type `P` from `source` to `destination`.
     #[must_use]
     pub const fn of<P: Payload>(source: Tid, destination: Tid) -> Self {
@@ -59,7 +59,7 @@ pub struct Stamp {
 
 /// Puts `payload` into an envelope.
 #[must_use]
-pub fn seal(codename: &Codename, stamp: Stamp, payload: &[u8]) -> Bytes {
+pub fn seal(data_id: &DataId, stamp: Stamp, payload: &[u8]) -> Bytes {
     let mut bytes = BytesMut::with_capacity(OVERHEAD + payload.len());
     bytes.put_u8(VERSION);
     bytes.put_bytes(0, 3);
@@ -69,23 +69,23 @@ pub fn seal(codename: &Codename, stamp: Stamp, payload: &[u8]) -> Bytes {
     bytes.put_u64_le(stamp.incarnation);
     bytes.put_u64_le(stamp.echo.as_nanos());
     bytes.extend_from_slice(payload);
-    let mut digest = codename.digest();
+    let mut digest = data_id.digest();
     digest.write(&bytes);
     bytes.put_u64_le(digest.sum64());
     bytes.freeze()
 }
 
-/// Takes the payload out of its envelope; `None` if these are not the bytes that were sealed under this codename.
+/// Takes the payload out of its envelope; `None` if these are not the bytes that were sealed under this data_id.
 #[must_use]
-pub fn open(codename: &Codename, bytes: &Bytes) -> Option<(Stamp, Bytes)> {
-    look(codename, bytes).map(|(stamp, payload)| (stamp, bytes.slice_ref(payload)))
+pub fn open(data_id: &DataId, bytes: &Bytes) -> Option<(Stamp, Bytes)> {
+    look(data_id, bytes).map(|(stamp, payload)| (stamp, bytes.slice_ref(payload)))
 }
 
 /// The same of memory that is not to be kept.
 #[must_use]
-pub fn look<'bytes>(codename: &Codename, bytes: &'bytes [u8]) -> Option<(Stamp, &'bytes [u8])> {
+pub fn look<'bytes>(data_id: &DataId, bytes: &'bytes [u8]) -> Option<(Stamp, &'bytes [u8])> {
     let (sealed, sum) = bytes.split_last_chunk::<TAIL>()?;
-    let mut digest = codename.digest();
+    let mut digest = data_id.digest();
     digest.write(sealed);
     if digest.sum64() != u64::from_le_bytes(*sum) {
         return None;

@@ -7,7 +7,7 @@ use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Cause, Codename, Echo, Fault, Protection, Stamp, State,
+    Cause, DataId, Echo, Fault, Protection, Stamp, State,
     envelope::seal,
     receiver::{Opened, Receiver, Verdict},
     sender::Flows,
@@ -43,7 +43,7 @@ impl Payload for Torque {
     const PROTECTION: Option<Protection> = Some(PROTECTION);
 }
 
-/// A message under the right codename, whoever has sealed it.
+/// A message under the right data ID, whoever has sealed it.
 struct Sealed {
     bytes: Bytes,
     stamp: Stamp,
@@ -90,8 +90,8 @@ fn tid(app: u32) -> Tid {
     Tid::new(NodeAddress::new(7), AppAddress::new(0x1000 + app))
 }
 
-fn codename() -> Codename {
-    Codename::of::<Torque>(tid(1), tid(2))
+fn data_id() -> DataId {
+    DataId::of::<Torque>(tid(1), tid(2))
 }
 
 fn byte(script: &mut &[u8]) -> u8 {
@@ -177,7 +177,7 @@ impl Play {
             }
             11 => {
                 let bit = byte(script) % 64;
-                let other = Codename { source: Tid::from_bits(tid(1).bits() ^ 1 << bit), ..codename() };
+                let other = DataId { source: Tid::from_bits(tid(1).bits() ^ 1 << bit), ..data_id() };
                 let stamp = Stamp { counter: self.next.counter + 1, ..self.next };
                 self.comes(&seal(&other, stamp, b"forged"));
             }
@@ -243,7 +243,7 @@ impl Play {
     }
 
     fn keep(&mut self, stamp: Stamp, payload: Bytes) {
-        let bytes = seal(&codename(), stamp, &payload);
+        let bytes = seal(&data_id(), stamp, &payload);
         self.kept.push_front(Sealed { bytes, stamp, payload });
         self.kept.truncate(KEPT);
     }
@@ -264,7 +264,7 @@ impl Play {
         let sealed = self.kept.iter().find(|sealed| sealed.bytes == *bytes);
         let expected = self.model.take(self.now, sealed);
         let read = |payload: Bytes| decode::<Torque>(&payload).is_ok().then_some(payload);
-        let (opened, payload) = Opened::of(&codename(), bytes, read);
+        let (opened, payload) = Opened::of(&data_id(), bytes, read);
         let verdict = self.receiver.take(self.now, opened).of(payload);
         assert_eq!(verdict, expected, "{:?}", sealed.map(|sealed| sealed.stamp));
         self.applied += usize::from(matches!(verdict, Verdict::Apply(_)));

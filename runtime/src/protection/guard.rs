@@ -10,7 +10,7 @@ use std::{
 use bytes::Bytes;
 
 use super::{
-    ArmError, Cause, Codename, State, Tally,
+    ArmError, Cause, DataId, State, Tally,
     envelope::look,
     keeper::{self, Tried, Watch, Watched, rouse},
     raw::{NotSafe, Protected, Reads, Released, or_panics},
@@ -33,13 +33,13 @@ pub struct Guard<O: Send + 'static> {
 struct Owners<O: Send + 'static>(Arc<Shared<O>>);
 
 struct Shared<O> {
-    codename: Codename,
+    data_id: DataId,
     inner: Mutex<Inner<O>>,
     watch: Arc<Watch>,
 }
 
 struct Inner<O> {
-    codename: Codename,
+    data_id: DataId,
     receiver: Receiver,
     output: O,
     safe: MakeSafe<O>,
@@ -70,7 +70,7 @@ impl<O> Inner<O> {
     }
 
     fn make_safe(&mut self, cause: Cause, now: Time) {
-        let Self { output, safe, owes, said, codename: Codename { source, name, .. }, .. } = self;
+        let Self { output, safe, owes, said, data_id: DataId { source, name, .. }, .. } = self;
         let (source, name) = (*source, *name);
         let is_news = owes.is_none();
         if matches!(catch_unwind(AssertUnwindSafe(|| safe(output, cause))), Ok(Ok(()))) {
@@ -125,13 +125,13 @@ impl<O: Send + 'static> Guard<O> {
             let words = "an output is armed by good messages: `good_min` is at least 1";
             return Err(io::Error::new(io::ErrorKind::InvalidInput, words));
         }
-        let codename = Codename { source, destination, name: protected.name };
+        let data_id = DataId { source, destination, name: protected.name };
         let receiver = Receiver::new(protected.protection);
-        let mut inner = Inner { codename, receiver, output, safe: Box::new(safe), owes: None, said: None };
+        let mut inner = Inner { data_id, receiver, output, safe: Box::new(safe), owes: None, said: None };
         inner.make_safe(Cause::NotArmed, Time::now());
         inner.said.take().into_iter().for_each(Said::log);
         let watch = Watch::new(inner.deadline(), inner.owes.is_some());
-        let shared = Arc::new(Shared { codename, inner: Mutex::new(inner), watch: Arc::new(watch) });
+        let shared = Arc::new(Shared { data_id, inner: Mutex::new(inner), watch: Arc::new(watch) });
         let output: Arc<dyn Watched> = shared.clone();
         keeper::begun()?.keep(shared.watch.clone(), Arc::downgrade(&output));
         Ok(Self { owners: Arc::new(Owners(shared)) })
@@ -269,7 +269,7 @@ impl<O: Send + 'static> Clone for Guard<O> {
 
 impl<O: Send + 'static> std::fmt::Debug for Guard<O> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "Guard({:?})", self.shared().codename)
+        write!(f, "Guard({:?})", self.shared().data_id)
     }
 }
 
@@ -347,7 +347,7 @@ impl<O> Shared<O> {
 /// A guard, whatever its output is, as its application's context sees it.
 pub(crate) trait Guarded: Send + Sync {
     /// Who sends what to whom.
-    fn codename(&self) -> Codename;
+    fn data_id(&self) -> DataId;
     /// Whether nobody has the guard any more.
     fn is_orphan(&self) -> bool;
     /// Makes the output safe: at once, or as soon as nobody has it in hand.
@@ -365,13 +365,13 @@ pub(crate) trait Guarded: Send + Sync {
 impl dyn Guarded {
     /// Takes a message in. One that `read` makes no value of is a bad one. That is the user's code: the output's lock is not held meanwhile.
     pub(crate) fn take<T>(&self, bytes: &Bytes, read: impl FnOnce(Bytes) -> Option<T>) -> Verdict<T> {
-        let (opened, value) = Opened::of(&self.codename(), bytes, read);
+        let (opened, value) = Opened::of(&self.data_id(), bytes, read);
         self.judge(opened).of(value)
     }
 
     /// The same of memory that is not to be kept.
     pub(crate) fn check(&self, sealed: &[u8], reads: Reads) -> Verdict<()> {
-        let (opened, _) = Opened::read(look(&self.codename(), sealed), |payload: &[u8]| {
+        let (opened, _) = Opened::read(look(&self.data_id(), sealed), |payload: &[u8]| {
             reads.is_value(payload).then_some(())
         });
         self.judge(opened)
@@ -379,8 +379,8 @@ impl dyn Guarded {
 }
 
 impl<O: Send + 'static> Guarded for Shared<O> {
-    fn codename(&self) -> Codename {
-        self.codename
+    fn data_id(&self) -> DataId {
+        self.data_id
     }
 
     fn is_orphan(&self) -> bool {
@@ -459,10 +459,10 @@ mod tests {
     #[test]
     fn messages_do_not_put_off_the_next_try_of_what_has_panicked() {
         let tid = |app| Tid::new(NodeAddress::new(7), AppAddress::new(app));
-        let codename = Codename { source: tid(1), destination: tid(2), name: "test.torque" };
+        let data_id = DataId { source: tid(1), destination: tid(2), name: "test.torque" };
         let receiver = Receiver::new(Protection::of_period(SAFE_RETRY));
         let safe = Box::new(|(): &mut (), _| panic!("a planted panic"));
-        let mut inner = Inner { codename, receiver, output: (), safe, owes: None, said: None };
+        let mut inner = Inner { data_id, receiver, output: (), safe, owes: None, said: None };
         let begun = Time::from_nanos(1_000_000_000);
         inner.make_safe(Cause::Tripped, begun);
         let due = (begun + SAFE_RETRY).as_nanos();

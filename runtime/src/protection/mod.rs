@@ -4,7 +4,7 @@
 //! into an envelope, the receiver's lets nothing else through. Queues, rings, sockets, layers and networks between them
 //! are a black channel, of which nothing is believed.
 //!
-//! | error | counter | watchdog | age by echo | codename | CRC-64 |
+//! | error | counter | watchdog | age by echo | data ID | CRC-64 |
 //! | --- | --- | --- | --- | --- | --- |
 //! | corruption | | | | | x |
 //! | unintended repetition | x | | | | |
@@ -53,7 +53,7 @@ use serde::{Deserialize, Serialize};
 
 pub use self::{
     ends::{Came, Ends, SealError},
-    envelope::{Codename, OVERHEAD, Stamp, open, seal},
+    envelope::{DataId, OVERHEAD, Stamp, open, seal},
     guard::Guard,
 };
 pub(crate) use self::{guard::Guarded, receiver::Verdict, sender::Flows};

@@ -18,7 +18,7 @@ pub const ECHO: Kind = Echo::KIND;
 /// A type of protected payloads.
 #[derive(Clone, Copy, Debug)]
 pub struct Protected {
-    /// What codenames call it.
+    /// What data IDs call it.
     pub name: &'static str,
     /// What messages call it.
     pub kind: Kind,

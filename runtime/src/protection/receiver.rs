@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 
-use super::{ArmError, Cause, Codename, Fault, Protection, Stamp, State, Tally, envelope::open};
+use super::{ArmError, Cause, DataId, Fault, Protection, Stamp, State, Tally, envelope::open};
 use crate::time::Time;
 
 /// Echoes that a sender may answer with. One is sent each quarter of the longest age, so that the oldest is twice too old.
@@ -15,7 +15,7 @@ const SLEEP_MIN: Duration = Duration::from_millis(5);
 /// What is in a message, as far as that can be said without its receiver.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Opened {
-    /// Not what was sealed under this codename.
+    /// Not what was sealed under this data_id.
     Corrupt,
     /// What was sealed, and no value of the type that the receiver has.
     Unreadable(Stamp),
@@ -26,11 +26,11 @@ pub(crate) enum Opened {
 impl Opened {
     /// Takes a message out of its envelope, and reads it. How it is read is the user's code: nobody else waits for it.
     pub(crate) fn of<T>(
-        codename: &Codename,
+        data_id: &DataId,
         bytes: &Bytes,
         read: impl FnOnce(Bytes) -> Option<T>,
     ) -> (Self, Option<T>) {
-        Self::read(open(codename, bytes), read)
+        Self::read(open(data_id, bytes), read)
     }
 
     /// Reads what was in an envelope, if that was one.

@@ -10,7 +10,7 @@ use bytes::Bytes;
 
 use super::{
     Echo, Protection,
-    envelope::{Codename, Stamp, seal},
+    envelope::{DataId, Stamp, seal},
     raw::Protected,
 };
 use crate::{
@@ -92,7 +92,7 @@ impl Flows {
         now: Time,
     ) -> Option<Bytes> {
         let stamp = self.stamp((destination, P::KIND), P::PROTECTION?, now)?;
-        Some(seal(&Codename::of::<P>(source, destination), stamp, &encode(value)))
+        Some(seal(&DataId::of::<P>(source, destination), stamp, &encode(value)))
     }
 
     /// The same for who knows the type at run time alone: `payload` is a value of it.
@@ -104,7 +104,7 @@ impl Flows {
         now: Time,
     ) -> Option<Bytes> {
         let stamp = self.stamp((destination, protected.kind), protected.protection, now)?;
-        Some(seal(&Codename { source, destination, name: protected.name }, stamp, payload))
+        Some(seal(&DataId { source, destination, name: protected.name }, stamp, payload))
     }
 
     /// Whether nothing was ever sealed here.

@@ -44,8 +44,8 @@ const DRIVE: u32 = 2;
 /// Which life of the sender counts.
 const LIFE: Time = Time::from_nanos(5);
 
-fn codename() -> Codename {
-    Codename::of::<Torque>(tid(CENTRAL), tid(DRIVE))
+fn data_id() -> DataId {
+    DataId::of::<Torque>(tid(CENTRAL), tid(DRIVE))
 }
 
 /// A sender and a receiver, a message and an echo each millisecond.
@@ -106,7 +106,7 @@ impl Bench {
 
     /// The only way to the output, for good messages and bad ones.
     fn take(&mut self, bytes: &Bytes) -> Verdict<Bytes> {
-        let (opened, payload) = Opened::of(&codename(), bytes, Some);
+        let (opened, payload) = Opened::of(&data_id(), bytes, Some);
         let verdict = self.receiver.take(self.now, opened).of(payload);
         if let Verdict::Apply(payload) = &verdict {
             self.applied.push(crate::wire::decode::<Torque>(payload).map_or(u64::MAX, |torque| torque.nm));
@@ -173,7 +173,7 @@ fn what_cannot_be_read_keeps_no_output_live_and_arms_none() {
     let mut bench = Bench::live_of(Protection { bad_max: 64, ..PROTECTION });
     let of_later_version = |bench: &mut Bench| {
         let message = bench.next();
-        let (opened, value) = Opened::of(&codename(), &message, |_| None::<Bytes>);
+        let (opened, value) = Opened::of(&data_id(), &message, |_| None::<Bytes>);
         bench.receiver.take(bench.now, opened).of(value)
     };
     let deadline = bench.receiver.deadline();
@@ -262,7 +262,7 @@ fn one_bad_message_is_borne_and_the_second_of_64_is_not() {
 #[test]
 fn the_bytes_are_those_of_the_page() {
     let stamp = Stamp { counter: 3, incarnation: 5, echo: Time::from_nanos(7) };
-    let sealed = seal(&Codename { source: tid(1), destination: tid(2), name: "a.b" }, stamp, b"xyz");
+    let sealed = seal(&DataId { source: tid(1), destination: tid(2), name: "a.b" }, stamp, b"xyz");
     let mut head = vec![1, 0, 0, 0, 3, 0, 0, 0];
     for word in [3_u64, 5, 7] {
         head.extend(word.to_le_bytes());
@@ -297,7 +297,7 @@ fn a_flow_that_is_over_gives_its_place_up_and_comes_back_above_all_that_it_has_s
     // When: the first one comes back.
     let echo = bench.receiver.echo(bench.now);
     let message = bench.seal();
-    let (stamp, _) = open(&codename(), &message).expect("it is its own");
+    let (stamp, _) = open(&data_id(), &message).expect("it is its own");
     assert!(stamp.counter > said && stamp.incarnation == LIFE.as_nanos());
     assert_eq!(stamp.echo, Time::ZERO, "what it had heard is forgotten");
     assert_eq!(bench.take(&message), Verdict::Refused(Fault::TooOld));

@@ -87,7 +87,7 @@ mod tests {
 
     #[test]
     fn whoever_is_not_there_or_may_not_have_it_is_no_loss() {
-        for why in [Rejection::Closed, Rejection::Away, Rejection::NotAllowed] {
+        for why in [Rejection::Closed, Rejection::Down, Rejection::NotAllowed] {
             let router = router(Some(why), None);
             assert_eq!(router.send(to_group()), Ok(()));
             assert_eq!(router.refused_because(), []);

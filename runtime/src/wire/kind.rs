@@ -92,7 +92,7 @@ impl Kind {
     /// From here on a process sends to another one on their link only.
     pub const LNCL_SWITCH: Self = Self(0x4b);
     /// A process is told which of its unconfirmed messages nobody has taken.
-    pub const LNCL_UNTAKEN: Self = Self(0x4c);
+    pub const LNCL_UNDELIVERED: Self = Self(0x4c);
     /// A process is told that the one at the other end of a direct link has ended.
     pub const LNCL_GONE: Self = Self(0x4d);
     /// LNCL tells a client that waits what it waits for.

@@ -35,7 +35,7 @@ impl Actor for Clerk {
     fn started(&mut self, context: &mut Self::Context) {
         // A timer of the kernel's, a group, a watchdog, a future: all that an application can leave behind.
         context.every(Duration::from_millis(50), |_, _, _| {});
-        context.expect::<Job>(None, Duration::from_secs(1), |_, _, _| {});
+        context.watch_input::<Job>(None, Duration::from_secs(1), |_, _, _| {});
         context.join("clerks");
         context.spawn(async { actix::clock::sleep(Duration::from_secs(3_600)).await }.into_actor(self));
     }

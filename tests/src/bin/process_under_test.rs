@@ -85,7 +85,7 @@ impl Actor for Drive {
     fn started(&mut self, context: &mut Self::Context) {
         say(&format!("started {}", context.tid()));
         self.hangs.iter().for_each(|token| token.hang_in("started"));
-        context.expect::<Level>(None, Duration::from_millis(50), |_, _, _| say("silence"));
+        context.watch_input::<Level>(None, Duration::from_millis(50), |_, _, _| say("silence"));
         if self.talks {
             context.every(Duration::from_millis(2), |_, _, context| {
                 // What the node does not take is not heard.

@@ -117,7 +117,7 @@ mod tests {
             Entry::Sends(way, 3, 16, at),
             Entry::Asks(way, 4, at),
             Entry::NotSent(way, 5),
-            Entry::Outcome(way, 6, Outcome::Rejected(Rejection::Away)),
+            Entry::Outcome(way, 6, Outcome::Rejected(Rejection::Down)),
             Entry::Got(1, 2, Class::Bulk, 7),
             Entry::Quiet,
             Entry::Broken("for a reason".to_owned()),

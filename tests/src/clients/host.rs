@@ -27,7 +27,7 @@ pub(super) fn play(arguments: &[String]) {
     let [socket, name] = arguments else { panic!("{arguments:?} are not a socket and a name") };
     let is_task = HOSTS.iter().any(|(one, is_task)| one == name && *is_task);
     let api = NodeApi::connect(socket).expect("the door is open");
-    let registration = Registration::new().direct(true).name(name.as_str()).patience(PATIENCE);
+    let registration = Registration::new().direct(true).name(name.as_str()).stall_timeout(PATIENCE);
     let over = Arc::new(AtomicBool::new(false));
     let ends = over.clone();
     let host = thread::spawn(move || {

@@ -112,7 +112,7 @@ struct Letters {
 
 impl Letters {
     fn register(api: &NodeApi, me: Poster, all: Poster, life: u32, dice: Dice) -> Self {
-        let registration = wishes().fixed(address(me)).inbox_capacity(CAPACITY);
+        let registration = wishes().fixed_address(address(me)).inbox_capacity(CAPACITY);
         let endpoint = register(api, &registration);
         let this = Self { endpoint, me, all, life, dice, numbers: BTreeMap::new() };
         this.tell(&Entry::Up(Time::now()));
@@ -201,7 +201,7 @@ impl Letters {
         let entry = match error {
             ApiError::Stalled(_) => Entry::NotSent(way, number),
             ApiError::Closed(_)
-            | ApiError::Away(_)
+            | ApiError::Disconnected(_)
             | ApiError::NoNode { .. }
             | ApiError::NotAPath { .. }
             | ApiError::Refused(_)
@@ -212,7 +212,7 @@ impl Letters {
             | ApiError::TooManyGroups
             | ApiError::NotSealed(_)
             | ApiError::NoReply(_)
-            | ApiError::Lent
+            | ApiError::LoanActive
             | ApiError::NotYours(_)
             | ApiError::NotAsked
             | ApiError::OthersRequest(_)

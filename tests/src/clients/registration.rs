@@ -17,10 +17,10 @@ pub(super) fn address(index: u16) -> AppAddress {
     AppAddress::fixed(u32::from(index)).expect("the range is wide")
 }
 
-/// What every process of the cast asks for, if it asks for nothing else. Its patience is long: where there are more threads
+/// What every process of the cast asks for, if it asks for nothing else. Its stall timeout is long: where there are more threads
 /// than processors, a node that is not run for a second hangs as little as its clients do.
 pub(super) fn wishes() -> Registration {
-    let registration = Registration::new().patience(DEADLINE);
+    let registration = Registration::new().stall_timeout(DEADLINE);
     match std::env::var(TRANSPORT).as_deref() {
         Ok("socket") => registration.transport(Transport::Socket),
         Ok("ring") => registration.transport(Transport::Ring),

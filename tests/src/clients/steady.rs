@@ -189,7 +189,7 @@ fn take(mut endpoint: Endpoint, over: &AtomicBool) {
         let received = match endpoint.receive(Duration::from_millis(100)) {
             Ok(Some(received)) => received,
             // It comes back by itself when its node was replaced.
-            Ok(None) | Err(ApiError::Away(_)) => continue,
+            Ok(None) | Err(ApiError::Disconnected(_)) => continue,
             Err(error) => panic!("{error}"),
         };
         if received.kind() == Order::KIND && received.wants_reply() {

@@ -56,7 +56,7 @@ struct Victim {
 
 impl Victim {
     fn register(api: &NodeApi, me: u16, all: u16, dice: Dice) -> Self {
-        let mut endpoint = register(api, &wishes().fixed(address(me)));
+        let mut endpoint = register(api, &wishes().fixed_address(address(me)));
         let node = endpoint.tid().node;
         let mut others: Vec<Tid> =
             (0..all).filter(|other| *other != me).map(|other| Tid::new(node, address(other))).collect();

@@ -274,7 +274,7 @@ fn notes_that_cannot_be_are_caught() {
 #[test]
 fn every_note_is_read_as_it_was_written() {
     let mut notes = clean();
-    notes.extend([lost([1, 2, 3]), ended(9, Outcome::Rejected(Rejection::Away))]);
+    notes.extend([lost([1, 2, 3]), ended(9, Outcome::Rejected(Rejection::Down))]);
     notes.push((TWO, Note::Damaged { from: ONE, class: Class::Stream, number: 4 }));
     for (_, note) in notes {
         assert_eq!(note.to_string().parse(), Ok(note));

@@ -76,15 +76,15 @@ impl Scene {
 #[test]
 fn an_application_that_drops_while_away_refuses_what_waits_and_what_comes_until_it_is_ready_again() {
     let (spec, scene) = scene();
-    let (_node, key) = start(spec.while_away(Away::Drop));
+    let (_node, key) = start(spec.while_down(DownPolicy::Drop));
     let sender = key.sender();
     // When it ends with one message in its hand and two behind it
     let outcomes = scene.die(&sender).map(wait);
-    let away = Outcome::Rejected(Rejection::Away);
+    let away = Outcome::Rejected(Rejection::Down);
     assert_eq!(outcomes, [Outcome::Failed, away, away]);
     // Then, while the new life is not ready, nobody takes a message, and its sender is told at once
     let refused = sender.send("puppet", &Job { number: 4 }).expect_err("it is away");
-    assert_eq!(refused, sinew::SendError::Rejected(Rejection::Away));
+    assert_eq!(refused, sinew::SendError::Rejected(Rejection::Down));
     // And when it is ready, it is as before.
     scene.become_ready();
     let sent = until("it takes messages again", || {
@@ -121,7 +121,7 @@ fn an_application_that_holds_for_a_time_refuses_from_then_on() {
         .got(|_, _| panic!("its end"))
         .app("anchor");
     let (puppet, log) = Stage::new().got(|puppet, _| assert!(puppet.number != 13, "its end")).app("puppet");
-    let puppet = puppet.requires(["anchor"]).while_away(Away::HoldFor(Duration::from_millis(50)));
+    let puppet = puppet.requires(["anchor"]).while_down(DownPolicy::HoldFor(Duration::from_millis(50)));
     let (desk, key) = desk("desk");
     let node = Ground::new().node("node").app(puppet).app(anchor).app(desk).start().expect("a node");
     all_run(&[&node]);
@@ -132,7 +132,7 @@ fn an_application_that_holds_for_a_time_refuses_from_then_on() {
     assert_eq!(outcome_of_job(&sender, "puppet", 13), Outcome::Failed);
     let kept = confirmed(&sender, 1);
     // Then: it is kept for a while and refused when that is over
-    assert_eq!(wait(kept), Outcome::Rejected(Rejection::Away));
+    assert_eq!(wait(kept), Outcome::Rejected(Rejection::Down));
     assert!(sender.send("puppet", &Job { number: 2 }).is_err());
     gate.lock().expect("nobody panics with it").take().expect("it holds").reached();
     log.wait_for(Seen::Started(2));

@@ -71,7 +71,7 @@ fn an_application_that_pauses_handles_no_message_and_no_period_until_all_is_met_
             context.every(PERIOD, |puppet, tick, _| {
                 puppet.say(if tick.missed < MADE_UP_FOR { "tick" } else { "made up for" });
             });
-            context.expect::<Job>(None, LIMIT, |puppet, _, _| puppet.say("accused"));
+            context.watch_input::<Job>(None, LIMIT, |puppet, _, _| puppet.say("accused"));
         })
         .app("walker");
     let scene = start(walker.on_requirement_lost(RequirementPolicy::Pause), None);

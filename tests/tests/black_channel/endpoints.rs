@@ -11,7 +11,7 @@ use std::{
 use sinew::{
     Endpoint, Kind, Received,
     prelude::*,
-    protection::{Cause, Codename, Guard, Protection, State, Tally, open},
+    protection::{Cause, DataId, Guard, Protection, State, Tally, open},
 };
 use sinew_tests::{DEADLINE, Ground, OwnDirectory};
 
@@ -197,8 +197,8 @@ const ERRORS: [Error; 6] = [
     (
         "masquerade as a command without protection",
         |line| {
-            let codename = Codename::of::<Level>(central(), drive());
-            open(&codename, &line.next().into()).expect("it is central's").1.to_vec()
+            let data_id = DataId::of::<Level>(central(), drive());
+            open(&data_id, &line.next().into()).expect("it is central's").1.to_vec()
         },
         |tally| tally.corrupt,
         Cause::TooManyBad,

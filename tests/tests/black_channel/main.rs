@@ -24,7 +24,7 @@ use std::{
 use sinew::{
     Endpoint, Kind, NodeApi, Outcome, Registration, Rejection,
     prelude::*,
-    protection::{Cause, Codename, Guard, Protection, State, Tally, open, seal},
+    protection::{Cause, DataId, Guard, Protection, State, Tally, open, seal},
 };
 use sinew_tests::{DEADLINE, Ground, OwnDirectory};
 
@@ -159,7 +159,7 @@ fn node(ground: &Ground, host: u8, name: &str, directory: &OwnDirectory) -> Node
 
 fn relay(name: &str, own: Tid, directory: &OwnDirectory) -> Endpoint {
     let api = NodeApi::connect(directory.join(&format!("{name}.sock"))).expect("its door");
-    let registration = Registration::new().fixed(own.app).deadline(DEADLINE);
+    let registration = Registration::new().fixed_address(own.app).deadline(DEADLINE);
     api.register_transport_address(registration).expect("the address is free")
 }
 
@@ -381,16 +381,16 @@ const ERRORS: [Error<PATIENT_MS>; 8] = [
         class: "masquerade as the command of another type",
         make: |scene| {
             let bytes = scene.next();
-            let own = Codename::of::<Torque<PATIENT_MS>>(central(), drive());
+            let own = DataId::of::<Torque<PATIENT_MS>>(central(), drive());
             let (stamp, payload) = open(&own, &bytes.into()).expect("it is central's");
-            Some(seal(&Codename { name: "black_channel.speed", ..own }, stamp, &payload).to_vec())
+            Some(seal(&DataId { name: "black_channel.speed", ..own }, stamp, &payload).to_vec())
         },
         ..CORRUPT
     },
     Error {
         class: "masquerade as a command without protection",
         make: |scene| {
-            let own = Codename::of::<Torque<PATIENT_MS>>(central(), drive());
+            let own = DataId::of::<Torque<PATIENT_MS>>(central(), drive());
             Some(open(&own, &scene.next().into()).expect("it is central's").1.to_vec())
         },
         ..CORRUPT

@@ -160,7 +160,7 @@ fn ask_all_along(asking: &mut Endpoint, to: Tid, is_over: &AtomicBool) -> u64 {
 fn is_whole_again(scene: &mut Scene, registrations: u64) {
     until("the asking endpoint is back", || {
         match scene.asking.receive(Duration::from_millis(20)) {
-            Ok(None) | Err(ApiError::Away(_)) => {}
+            Ok(None) | Err(ApiError::Disconnected(_)) => {}
             other => panic!("{other:?}"),
         }
         (scene.asking.registrations() >= registrations).then_some(())

@@ -57,7 +57,7 @@ impl Scene {
         let api = NodeApi::connect(stage.socket()).expect("the door is open");
         // The node takes whatever is sent, and refuses it itself. A sender that gave up at its own full ring would leave gaps in
         // the numbers, and perhaps the newest value unsent, whenever the node is late for it.
-        let registration = Registration::new().patience(DEADLINE);
+        let registration = Registration::new().stall_timeout(DEADLINE);
         let mut sender = api.register_transport_address(registration).expect("an address");
         let to = sender.resolve("stopped", DEADLINE).expect("the node answers").expect("it is registered");
         Self { stage, others: [echo, pinger], stopped, windows, got, sender, to }

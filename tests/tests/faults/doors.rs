@@ -69,7 +69,7 @@ fn hangs_for_ever(layer: &'static str) {
     if layer == "LNCL" || layer == "GNCL" {
         // They share a thread. Who was connected to what hangs there is told.
         let told = former.receive(DEADLINE);
-        assert!(matches!(told, Err(ApiError::Away(_))), "{layer}: {told:?}");
+        assert!(matches!(told, Err(ApiError::Disconnected(_))), "{layer}: {told:?}");
     }
     assert_eq!(lives(&log), 1, "{layer}: the application was not restarted");
     // The next node finds the doors free, though the thread still hangs.

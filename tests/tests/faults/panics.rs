@@ -125,7 +125,7 @@ fn a_panic_in_a_spawned_future_ends_that_life_only() {
 #[test]
 fn a_panic_in_a_watchdogs_alert_ends_that_life_and_the_next_one_watches_again() {
     let stage = Stage::new().started(|_, context| {
-        context.expect::<Job>(None, Duration::from_millis(1), |puppet, _, _| {
+        context.watch_input::<Job>(None, Duration::from_millis(1), |puppet, _, _| {
             assert!(puppet.life > 1, "in an alert");
             puppet.say("silence");
         });

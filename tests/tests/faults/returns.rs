@@ -22,7 +22,7 @@ fn come_back(endpoint: &mut Endpoint, times: u64) {
     until("the endpoint is back", || {
         match endpoint.receive(Duration::from_millis(20)) {
             // It says once that its connection has ended.
-            Ok(None) | Err(ApiError::Away(_)) => {}
+            Ok(None) | Err(ApiError::Disconnected(_)) => {}
             other => panic!("{other:?}"),
         }
         (endpoint.registrations() == times).then_some(())

@@ -70,14 +70,14 @@ impl Handler<Delivery<Go>> for Clerk {
             clerk.0.write((round, AWAITED, outcome));
         });
         context.spawn(awaited);
-        context.send_told(to, &held(round, TOLD), WITHIN, round).expect("it has room");
+        context.send_with_tag(to, &held(round, TOLD), WITHIN, round).expect("it has room");
     }
 }
 
-impl Handler<Told> for Clerk {
+impl Handler<SendOutcome> for Clerk {
     type Result = ();
 
-    fn handle(&mut self, told: Told, _: &mut Self::Context) {
+    fn handle(&mut self, told: SendOutcome, _: &mut Self::Context) {
         self.0.write((told.tag, TOLD, told.outcome));
     }
 }

@@ -47,7 +47,7 @@ fn runtime() -> Runtime {
 }
 
 async fn endpoint(node: &TestNode, transport: Transport) -> AsyncEndpoint {
-    let registration = Registration::new().transport(transport).patience(WATCHDOG);
+    let registration = Registration::new().transport(transport).stall_timeout(WATCHDOG);
     let api = NodeApi::connect(node.path()).unwrap();
     api.register_transport_address_async(registration).await.unwrap()
 }
@@ -257,7 +257,8 @@ fn a_send_gives_up_when_its_patience_is_over_and_what_was_not_sent_does_not_come
         let node = TestNode::start();
         let app = node.local(1);
         runtime().block_on(async {
-            let registration = Registration::new().transport(transport).patience(Duration::from_millis(30));
+            let registration =
+                Registration::new().transport(transport).stall_timeout(Duration::from_millis(30));
             let api = NodeApi::connect(node.path()).unwrap();
             let mut endpoint = api.register_transport_address_async(registration).await.unwrap();
             let standstill = Standstill::begin(&node, &mut endpoint).await;

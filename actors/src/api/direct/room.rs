@@ -19,14 +19,14 @@ pub(in crate::api) struct Room {
 }
 
 impl Direct {
-    /// A sender has lost its patience there. Until the peer takes something no other one waits.
+    /// A sender has lost its stall timeout there. Until the peer takes something no other one waits.
     pub(in crate::api) fn has_stalled(&mut self, number: LinkNumber) {
         if let Some(link) = self.standing(number) {
             link.is_stalled = true;
         }
     }
 
-    /// Whether a sender has lost its patience there, and the peer has taken nothing since.
+    /// Whether a sender has lost its stall timeout there, and the peer has taken nothing since.
     pub(in crate::api) fn is_stalled(&mut self, number: LinkNumber) -> bool {
         self.standing(number).is_some_and(|link| link.is_stalled)
     }

@@ -24,8 +24,8 @@ use super::{
 use crate::{
     api::{
         ApiError,
-        lent::{Content, Draft},
         link::ring::{self, Begun, ENOUGH, End, Rest},
+        loan::{Content, Draft},
         routes::LinkNumber,
     },
     ring::{RingError, RingFrames, Taken},

@@ -25,7 +25,7 @@ use socket2::{Domain, SockAddr, Socket, Type};
 
 use super::{
     ApiError,
-    lent::{Content, Draft},
+    loan::{Content, Draft},
 };
 use crate::lncl::payload::{Refusal, Register, Registered};
 
@@ -55,7 +55,7 @@ pub(super) struct LinkOptions {
     pub(super) transport: Transport,
     pub(super) spin: Spin,
     /// How long a send waits for room.
-    pub(super) patience: Duration,
+    pub(super) stall_timeout: Duration,
     /// How this side is woken: by a futex where threads wait, one for all links of the endpoint; by a socket each where tasks do.
     pub(super) bell: Bell,
     /// Bytes of this side's ring of a direct link.
@@ -142,7 +142,7 @@ impl Writer {
         }
     }
 
-    /// Writes one of the layers' own frames, none of which is long; waits for room as long as the link's patience lasts.
+    /// Writes one of the layers' own frames, none of which is long; waits for room as long as the link's stall timeout lasts.
     pub(super) fn write(&self, message: &Message) -> Result<(), ApiError> {
         match self {
             Self::Socket(writer) => writer.write(message),

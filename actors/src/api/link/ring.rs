@@ -74,7 +74,7 @@ pub(in crate::api) struct Writer {
     is_owing: AtomicBool,
     /// Told when some thread has left something owed: a task that waits looks again.
     pub(super) owing: Notify,
-    patience: Duration,
+    stall_timeout: Duration,
 }
 
 impl Writer {
@@ -86,17 +86,17 @@ impl Writer {
         producer.set_spin(options.spin);
         let (producer, owed) = (Mutex::new(Some(Box::new(producer))), Mutex::default());
         let is_owing = AtomicBool::new(false);
-        Self { socket, producer, owed, is_owing, owing: Notify::new(), patience: options.patience }
+        Self { socket, producer, owed, is_owing, owing: Notify::new(), stall_timeout: options.stall_timeout }
     }
 
-    /// Writes one frame that fits into half the ring; waits for room as long as the link's patience lasts.
+    /// Writes one frame that fits into half the ring; waits for room as long as the link's stall timeout lasts.
     pub(in crate::api) fn write(&self, message: &Message) -> Result<(), ApiError> {
         let head = message.header.encode_in_memory(message.payload.len());
         let parts = [IoSlice::new(&head), IoSlice::new(&message.payload)];
         let mut producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
         let written = match producer.as_deref_mut() {
             Some(producer) => self.write_to(producer, &parts, message.size()),
-            None => Err(ApiError::Lent),
+            None => Err(ApiError::LoanActive),
         };
         drop(producer);
         self.pay();
@@ -180,14 +180,14 @@ impl Writer {
         parts: &[IoSlice<'_>],
         length: usize,
     ) -> Result<(), ApiError> {
-        let wait = Wait::within(self.patience).or_hang_up(HangUp::Socket(self.socket.as_fd()));
+        let wait = Wait::within(self.stall_timeout).or_hang_up(HangUp::Socket(self.socket.as_fd()));
         match producer.loan_before(length, &wait) {
             Ok(mut loan) => {
                 ring::gather(parts, &mut loan);
                 loan.publish();
                 Ok(())
             }
-            Err(RoomError::TimedOut) => Err(ApiError::Stalled(self.patience)),
+            Err(RoomError::TimedOut) => Err(ApiError::Stalled(self.stall_timeout)),
             Err(RoomError::HungUp) => Err(ApiError::Closed(Ended::silently().why)),
             Err(error @ (RoomError::TooLong { .. } | RoomError::Corrupt(_) | RoomError::System(_))) => {
                 self.close();

@@ -27,7 +27,7 @@ use tokio_util::codec::Decoder;
 use super::{Ended, LinkOptions, Progress, Read, ring::OWED_MAX};
 use crate::api::{
     ApiError,
-    patience::{Limit, Waiting},
+    stall_timeout::{Limit, Waiting},
 };
 
 /// Bytes that are read at once.
@@ -43,7 +43,7 @@ pub(in crate::api) struct Writer {
     turn: Mutex<Turn>,
     /// Told when some thread has left an outcome there: a task that waits looks again.
     pub(super) owing: Notify,
-    patience: Duration,
+    stall_timeout: Duration,
 }
 
 /// What is on its way out. Kept for a moment only: nobody waits for room with it in hand.
@@ -66,7 +66,7 @@ enum Pushed {
 
 impl Writer {
     pub(in crate::api) fn new(socket: Arc<UnixStream>, options: &LinkOptions) -> Self {
-        Self { socket, turn: Mutex::default(), owing: Notify::new(), patience: options.patience }
+        Self { socket, turn: Mutex::default(), owing: Notify::new(), stall_timeout: options.stall_timeout }
     }
 
     fn turn(&self) -> MutexGuard<'_, Turn> {
@@ -152,9 +152,9 @@ impl Writer {
         }
     }
 
-    /// Writes one frame, and waits for room for as long as the patience lasts.
+    /// Writes one frame, and waits for room for as long as the stall timeout lasts.
     pub(in crate::api) fn write(&self, message: &Message) -> Result<(), ApiError> {
-        let mut waiting = Waiting::new(Limit::patience(self.patience));
+        let mut waiting = Waiting::new(Limit::stall_timeout(self.stall_timeout));
         let mut pushed = Pushed::Nothing;
         loop {
             let taken = {
@@ -319,9 +319,9 @@ mod tests {
 
     #[test]
     fn an_outcome_that_finds_no_room_is_said_later_and_nobody_waits_for_that() {
-        // given: a socket that takes no more, and a patience without an end
+        // given: a socket that takes no more, and a stall timeout without an end
         let (ours, theirs) = UnixStream::pair().unwrap();
-        let options = Registration::new().patience(Duration::MAX).link;
+        let options = Registration::new().stall_timeout(Duration::MAX).link;
         let writer = Arc::new(Writer::new(Arc::new(ours), &options));
         let filling =
             || Message::new(Header::new(Kind::named("x"), Tid::NONE, Tid::NONE), vec![0; 4_096].into());

@@ -119,9 +119,9 @@ fn receive_all(endpoint: &mut Client, count: usize) -> u64 {
     while came + refused < count as u64 {
         assert!(Time::now() < deadline, "waited for {count}; {came} came, {refused} were refused");
         came += u64::from(endpoint.receive(Duration::from_millis(1)).unwrap().is_some());
-        while let Some(untaken) = endpoint.untaken() {
-            assert_eq!((untaken.destination, untaken.why), (endpoint.tid(), Rejection::QueueFull));
-            refused += untaken.count;
+        while let Some(undelivered) = endpoint.take_undelivered() {
+            assert_eq!((undelivered.destination, undelivered.why), (endpoint.tid(), Rejection::QueueFull));
+            refused += undelivered.count;
         }
     }
     assert_eq!(came + refused, count as u64);

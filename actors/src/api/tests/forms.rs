@@ -20,8 +20,8 @@ use tokio::runtime::{Builder, Runtime};
 
 use crate::{
     api::{
-        ApiError, AsyncEndpoint, Endpoint, LentMessage, NodeApi, Received, Registration, Transport, Untaken,
-        link::Believed,
+        ApiError, AsyncEndpoint, Endpoint, LoanedMessage, NodeApi, Received, Registration, Transport,
+        Undelivered, link::Believed,
     },
     lncl::testing::TestNode,
 };
@@ -86,7 +86,7 @@ pub(super) enum Client {
 /// Memory for a message that was lent.
 #[derive(Debug)]
 pub(super) enum Lent {
-    Rust(LentMessage),
+    Rust(LoanedMessage),
     C(Made),
 }
 
@@ -123,7 +123,7 @@ macro_rules! look {
 const OF_ANOTHER_FORM: &str = "all of one test is of one form";
 
 impl Lent {
-    fn of_rust(self) -> LentMessage {
+    fn of_rust(self) -> LoanedMessage {
         let Self::Rust(message) = self else { panic!("{OF_ANOTHER_FORM}") };
         message
     }
@@ -345,8 +345,8 @@ impl Client {
         Ok(received?.map(Got::Rust))
     }
 
-    pub(super) fn untaken(&mut self) -> Option<Untaken> {
-        look!(self, endpoint => endpoint.untaken(), endpoint.untaken())
+    pub(super) fn take_undelivered(&mut self) -> Option<Undelivered> {
+        look!(self, endpoint => endpoint.take_undelivered(), endpoint.take_undelivered())
     }
 
     pub(super) fn join(&mut self, name: &str) -> Result<(), ApiError> {

@@ -24,7 +24,7 @@ on_every_transport! {
 
 fn lent<T>(refused: Result<T, ApiError>) {
     match refused {
-        Err(error @ ApiError::Lent) => {
+        Err(error @ ApiError::LoanActive) => {
             assert!(error.to_string().contains("send that message or drop it first"), "{error}");
         }
         Err(other) => panic!("{other}"),
@@ -134,7 +134,7 @@ fn what_was_lent_before_the_node_was_restarted_goes_to_its_next_life(under: Unde
         while client.registrations() == 1 {
             assert!(super::Time::now() < deadline, "waited for the endpoint to come back");
             if let Err(error) = client.receive(Duration::from_millis(10)) {
-                assert!(matches!(error, ApiError::Away(_)), "{error}");
+                assert!(matches!(error, ApiError::Disconnected(_)), "{error}");
             }
         }
         // when: other things are to go out, they are still refused

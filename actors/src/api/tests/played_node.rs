@@ -208,8 +208,8 @@ impl Played {
     fn obey(mut self, orders: &Receiver<Order>) {
         let mut takes_all = false;
         loop {
-            let patience = if takes_all { Duration::from_millis(1) } else { WATCHDOG };
-            match orders.recv_timeout(patience) {
+            let stall_timeout = if takes_all { Duration::from_millis(1) } else { WATCHDOG };
+            match orders.recv_timeout(stall_timeout) {
                 Ok(Order::Take(bytes)) => self.take(bytes),
                 Ok(Order::TakeAll(all)) => takes_all = all,
                 Err(RecvTimeoutError::Timeout) => {}

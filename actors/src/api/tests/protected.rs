@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use sinew_runtime::{protection::Protection, time::Time};
 
 use super::{Payload, Registration, TestNode, WATCHDOG};
-use crate::api::{Endpoint, NodeApi, incoming::WhenFull, patience::Limit};
+use crate::api::{Endpoint, NodeApi, incoming::WhenFull, stall_timeout::Limit};
 
 /// What came while the receiver did not look: more than is needed to arm its guard.
 const BACKLOG: usize = 64;
@@ -76,6 +76,6 @@ fn who_comes_back_does_so_before_it_seals() {
     assert_eq!(control.registrations(), 1);
     while control.registrations() == 1 {
         assert!(Time::now() < deadline, "waited for the endpoint to come back");
-        control.typed(own, &Speed(0), control.patience()).unwrap();
+        control.typed(own, &Speed(0), control.stall_timeout()).unwrap();
     }
 }

@@ -26,7 +26,7 @@ fn refusal(under: Under, node: &TestNode, registration: Registration) -> String 
 fn addresses_are_fixed_or_dynamic_and_names_have_one_holder(under: Under) {
     let node = TestNode::start();
     let fixed = AppAddress::fixed(7).unwrap();
-    let first = register(under, &node, on(under).name("knee").fixed(fixed));
+    let first = register(under, &node, on(under).name("knee").fixed_address(fixed));
     assert!(first.transport().is_none_or(|transport| transport == under.transport));
     assert_eq!(first.tid(), Tid::new(node.address(), fixed));
     assert_eq!((first.node_name(), first.payload_max()), ("test", 1 << 20));
@@ -35,14 +35,14 @@ fn addresses_are_fixed_or_dynamic_and_names_have_one_holder(under: Under) {
     let pid = std::process::id();
     let why = refusal(under, &node, on(under).name("knee"));
     assert!(why.contains(&format!("'knee' is taken by application {fixed} of process {pid}")), "{why}");
-    let why = refusal(under, &node, on(under).fixed(fixed));
+    let why = refusal(under, &node, on(under).fixed_address(fixed));
     assert!(why.contains("is taken by 'knee'"), "{why}");
-    let why = refusal(under, &node, on(under).fixed(AppAddress::NDL));
+    let why = refusal(under, &node, on(under).fixed_address(AppAddress::NDL));
     assert!(why.contains("fixed addresses are"), "{why}");
     // The life after the one that had it has it again.
     first.unregister().unwrap();
     assert_eq!(
-        register(under, &node, on(under).name("knee").fixed(fixed)).tid(),
+        register(under, &node, on(under).name("knee").fixed_address(fixed)).tid(),
         Tid::new(node.address(), fixed)
     );
 }

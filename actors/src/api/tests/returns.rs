@@ -30,7 +30,7 @@ fn await_return(client: &mut Client) -> u32 {
         match client.receive(Duration::from_millis(10)) {
             Ok(None) => {}
             Ok(Some(received)) => panic!("{received:?}"),
-            Err(ApiError::Away(_)) => told += 1,
+            Err(ApiError::Disconnected(_)) => told += 1,
             Err(error) => panic!("{error}"),
         }
     }
@@ -53,7 +53,7 @@ fn await_end(client: &mut Client) -> ApiError {
 fn an_endpoint_comes_back_to_its_name_its_address_and_its_groups(under: Under) {
     let mut node = TestNode::start();
     let fixed = AppAddress::fixed(77).unwrap();
-    let mut client = register(under, &node, on(under).name("knee").fixed(fixed));
+    let mut client = register(under, &node, on(under).name("knee").fixed_address(fixed));
     let tid = client.tid();
     client.join("drives").unwrap();
     for life in 2..4 {
@@ -148,7 +148,7 @@ fn meanwhile_it_says_once_that_it_is_away_and_each_send_says_it_was_not_sent(und
     let mut client = register(under, &node, on(under));
     node.stop();
     let told = await_end(&mut client);
-    assert!(matches!(told, ApiError::Away(_)), "{told}");
+    assert!(matches!(told, ApiError::Disconnected(_)), "{told}");
     assert!(told.to_string().contains("registers again by itself"), "{told}");
     assert!(client.receive(Duration::from_millis(1)).unwrap().is_none(), "it was said once");
     let to = Tid::new(client.tid().node, AppAddress::fixed(1).unwrap());
@@ -160,7 +160,7 @@ fn meanwhile_it_says_once_that_it_is_away_and_each_send_says_it_was_not_sent(und
         client.resolve("anybody", WATCHDOG).map(drop),
         client.join("drives"),
     ] {
-        assert!(matches!(refused, Err(ApiError::Away(_))), "{refused:?}");
+        assert!(matches!(refused, Err(ApiError::Disconnected(_))), "{refused:?}");
     }
     node.restart();
     assert_eq!(await_return(&mut client), 0, "it was said before");
@@ -207,7 +207,7 @@ fn what_an_endpoint_had_and_takes_after_its_node_has_gone_is_unknown_to_its_send
 
 fn who_is_there_for_one_connection_does_not_come_back(under: Under) {
     let mut node = TestNode::start();
-    let mut client = register(under, &node, on(under).for_one_connection());
+    let mut client = register(under, &node, on(under).without_reconnect());
     node.restart();
     for _ in 0..3 {
         let told = await_end(&mut client);
@@ -223,15 +223,15 @@ fn a_send_with_a_time_of_its_own_does_not_look_for_the_node(under: Under) {
     let mut node = TestNode::start();
     let mut client = register(under, &node, on(under));
     node.restart();
-    assert!(matches!(await_end(&mut client), ApiError::Away(_)));
+    assert!(matches!(await_end(&mut client), ApiError::Disconnected(_)));
     let before = client.registrations();
     for _ in 0..100 {
         let refused = client.send_within(Tid::NONE, &TORQUE, Duration::from_millis(1));
-        assert!(matches!(refused, Err(ApiError::Away(_))), "{refused:?}");
+        assert!(matches!(refused, Err(ApiError::Disconnected(_))), "{refused:?}");
         // Of a task a thread of its runtime's pool looks meanwhile.
         if !matches!(under.form, Form::Task) {
             let refused = client.send_confirmed(Tid::NONE, &TORQUE, Duration::from_millis(1));
-            assert!(matches!(refused, Err(ApiError::Away(_))), "{refused:?}");
+            assert!(matches!(refused, Err(ApiError::Disconnected(_))), "{refused:?}");
         }
     }
     assert_eq!(client.registrations(), before);
@@ -239,9 +239,9 @@ fn a_send_with_a_time_of_its_own_does_not_look_for_the_node(under: Under) {
 }
 
 fn a_send_of_whatever_patience_does_and_comes_back(under: Under) {
-    for patience in [Duration::ZERO, Duration::MAX] {
+    for stall_timeout in [Duration::ZERO, Duration::MAX] {
         let mut node = TestNode::start();
-        let mut client = register(under, &node, on(under).patience(patience));
+        let mut client = register(under, &node, on(under).stall_timeout(stall_timeout));
         let to = Tid::new(client.tid().node, AppAddress::fixed(1).unwrap());
         node.restart();
         let app = node.local(1);
@@ -260,7 +260,7 @@ fn what_is_left_of_a_long_message_ends_with_the_connection_and_the_next_one_is_w
     let mut node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
     let raw = Kind::named("test.raw");
     let to = node.local(1).tid;
-    let mut client = register(under, &node, on(under).patience(Duration::from_millis(1)));
+    let mut client = register(under, &node, on(under).stall_timeout(Duration::from_millis(1)));
     for _ in 0..3 {
         let mut half = client.create_message(to, raw, LONG).unwrap();
         half.fill(1);

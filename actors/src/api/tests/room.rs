@@ -28,8 +28,8 @@ on_every_transport! {
     who_unregisters_waits_until_what_was_sent_is_out
 }
 
-fn register(under: Under, node: &PlayedNode, patience: Duration) -> Client {
-    let registration = super::on(under).patience(patience);
+fn register(under: Under, node: &PlayedNode, stall_timeout: Duration) -> Client {
+    let registration = super::on(under).stall_timeout(stall_timeout);
     forms::Api::at(under, &node.path()).register(registration).unwrap()
 }
 
@@ -65,7 +65,7 @@ fn patience_is_for_a_node_that_takes_nothing_and_not_for_a_long_message(under: U
     const PATIENCE: Duration = Duration::from_secs(2);
     let node = PlayedNode::start();
     let mut client = register(under, &node, PATIENCE);
-    // given: a node that takes a little of a message again and again, for longer than the patience lasts
+    // given: a node that takes a little of a message again and again, for longer than the stall timeout lasts
     let long = message(&mut client, 1, LONG);
     let sending = thread::spawn(move || {
         client.send_message(long).unwrap();
@@ -128,7 +128,7 @@ fn who_has_no_time_is_told_at_once_and_nothing_that_was_refused_comes(under: Und
         assert!(matches!(client.send_message_within(refused, NO_TIME), Err(ApiError::Stalled(_))));
     }
     node.take_all();
-    // Its patience is whole: those who have no time have lost none of it.
+    // Its stall timeout is whole: those who have no time have lost none of it.
     let last = message(&mut client, taken, SHORT);
     client.send_message(last).unwrap();
     for number in 0..=taken {
@@ -169,7 +169,7 @@ fn who_has_time_waits_for_room_and_no_longer_than_it_has(under: Under) {
     let (began, error) = (std::time::Instant::now(), client.send_message_within(late, time).unwrap_err());
     assert!(matches!(error, ApiError::Stalled(waited) if waited == time), "{error}");
     assert!(began.elapsed() >= time);
-    // A time of its own is longer than the patience.
+    // A time of its own is longer than the stall timeout.
     let waits = message(&mut client, taken, SHORT);
     node.take_all_in(Duration::from_millis(20));
     client.send_message_within(waits, WATCHDOG).unwrap();
@@ -192,19 +192,19 @@ fn who_waits_so_long_for_an_answer_waits_no_longer_for_room(under: Under) {
 }
 
 fn patience_that_was_lost_once_is_not_lost_again_until_the_node_takes_something(under: Under) {
-    let patience = Duration::from_millis(500);
+    let stall_timeout = Duration::from_millis(500);
     let node = PlayedNode::start();
-    let mut client = register(under, &node, patience);
+    let mut client = register(under, &node, stall_timeout);
     let taken = fill(&mut client, SHORT);
     let began = std::time::Instant::now();
     let refused = message(&mut client, 0, SHORT);
     assert!(matches!(client.send_message(refused), Err(ApiError::Stalled(_))));
-    assert!(began.elapsed() >= patience);
-    // Each with a patience of its own, these would take eight minutes.
+    assert!(began.elapsed() >= stall_timeout);
+    // Each with a stall timeout of its own, these would take eight minutes.
     for _ in 0..1_000 {
         let refused = message(&mut client, 0, SHORT);
         let error = client.send_message(refused).unwrap_err();
-        assert!(matches!(error, ApiError::Stalled(waited) if waited == patience), "{error}");
+        assert!(matches!(error, ApiError::Stalled(waited) if waited == stall_timeout), "{error}");
     }
     node.take_all();
     while client.send(PlayedNode::somebody(), &super::TORQUE).is_err() {}
@@ -214,14 +214,14 @@ fn patience_that_was_lost_once_is_not_lost_again_until_the_node_takes_something(
 }
 
 fn who_has_a_time_of_its_own_gives_nobody_a_patience_back_that_was_lost(under: Under) {
-    let patience = Duration::from_millis(500);
+    let stall_timeout = Duration::from_millis(500);
     let node = PlayedNode::start();
-    let mut client = register(under, &node, patience);
+    let mut client = register(under, &node, stall_timeout);
     fill(&mut client, SHORT);
     let refused = message(&mut client, 0, SHORT);
     assert!(matches!(client.send_message(refused), Err(ApiError::Stalled(_))));
-    // Each with a patience of its own, these would take eight minutes.
-    let deadline = std::time::Instant::now() + 100 * patience;
+    // Each with a stall timeout of its own, these would take eight minutes.
+    let deadline = std::time::Instant::now() + 100 * stall_timeout;
     for _ in 0..1_000 {
         let refused = message(&mut client, 0, SHORT);
         assert!(matches!(client.send_message_within(refused, NO_TIME), Err(ApiError::Stalled(_))));
@@ -232,7 +232,7 @@ fn who_has_a_time_of_its_own_gives_nobody_a_patience_back_that_was_lost(under: U
 }
 
 fn who_unregisters_waits_no_longer_than_is_said(under: Under) {
-    // given: a node that takes nothing, and a patience without an end
+    // given: a node that takes nothing, and a stall timeout without an end
     let node = PlayedNode::start();
     let mut client = register(under, &node, Duration::MAX);
     fill(&mut client, SHORT);

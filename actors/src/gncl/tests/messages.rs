@@ -281,7 +281,7 @@ fn what_only_a_nodes_own_layers_say_no_peer_says_to_an_application() {
         let mut node = Node::start(1).await;
         let mut peer = ByHand::linked_to(&mut node).await;
         let mut inbox = node.app(1);
-        for kind in [Kind::LNCL_REFUSAL, Kind::LNCL_GONE, Kind::LNCL_UNTAKEN] {
+        for kind in [Kind::LNCL_REFUSAL, Kind::LNCL_GONE, Kind::LNCL_UNDELIVERED] {
             let mut forged = from_nine(&node, b"I am your LNCL");
             forged.header.kind = kind;
             peer.say(&forged).await;

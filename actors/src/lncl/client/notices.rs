@@ -5,7 +5,7 @@ use std::{cell::RefCell, sync::Arc};
 use sinew_runtime::{outcome::Rejection, router::Outlet, tid::Tid, time::Time, wire::Kind};
 
 use super::{
-    super::{payload, untaken::Ledger},
+    super::{payload, undelivered::Ledger},
     ClientOutlet,
 };
 
@@ -31,10 +31,11 @@ impl Notices {
     /// Tells what is to be told at `now`. A client that takes nothing is told later.
     pub(in crate::lncl) fn tell(&self, now: Time) {
         // spec: LNCL-14
-        let Some(untaken) = self.ledger.borrow_mut().take(now) else { return };
-        let frame = payload::frame(Kind::LNCL_UNTAKEN, payload::lncl_of(self.tid.node), self.tid, &untaken);
+        let Some(undelivered) = self.ledger.borrow_mut().take(now) else { return };
+        let frame =
+            payload::frame(Kind::LNCL_UNDELIVERED, payload::lncl_of(self.tid.node), self.tid, &undelivered);
         if self.outlet.submit(frame).is_err() {
-            self.ledger.borrow_mut().put_back(untaken);
+            self.ledger.borrow_mut().put_back(undelivered);
         }
     }
 }

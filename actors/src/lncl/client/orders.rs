@@ -16,7 +16,7 @@ use super::{
         payload::{self, Resolved},
         registrar,
         session::{NoMembership, Order},
-        untaken,
+        undelivered,
     },
     Client,
     end::End,
@@ -60,7 +60,7 @@ impl Client {
         let sent = self.within_share(message).and_then(|message| router.send(message));
         if let Err(why) = sent
             && !is_confirmed
-            && untaken::is_fault(destination, why)
+            && undelivered::is_fault(destination, why)
         {
             // The source of a confirmed message knows.
             let (detail, now) = (format!("from {} to {destination}: {why}", self.tid), Time::now());

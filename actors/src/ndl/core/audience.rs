@@ -273,7 +273,7 @@ mod tests {
             name: String::new(),
             app: Tid::new(node, AppAddress::new(app)),
             app_name: String::new(),
-            trouble: Trouble::Away,
+            trouble: Trouble::Down,
             since_us: 1,
         }
     }

@@ -55,7 +55,7 @@ impl Memory {
 }
 
 #[test]
-fn what_lies_in_memory_untaken_waits_for_the_peer_and_what_finds_no_room_there_does_too() {
+fn what_lies_in_memory_undelivered_waits_for_the_peer_and_what_finds_no_room_there_does_too() {
     assert_eq!(StreamOutlet::<Arc<Memory>>::new(LIMITS).taking(), None, "nobody is there");
     // When: one message has room, and the next one has not.
     let (outlet, memory, link) = to_memory(message(Class::Bulk, 1).size());

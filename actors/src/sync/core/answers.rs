@@ -10,12 +10,12 @@ const ANSWERS_PER_APP_MAX: usize = 16;
 
 /// The answers that were not taken, with their applications and the correlations of the requests.
 #[derive(Debug, Default)]
-pub(super) struct Untaken {
+pub(super) struct Undelivered {
     answers: Vec<(AppAddress, u64, BarrierAnswer)>,
     retry: Option<Time>,
 }
 
-impl Untaken {
+impl Undelivered {
     /// The life of `app` that asked is over.
     pub(super) fn forget(&mut self, app: AppAddress) {
         self.answers.retain(|(other, ..)| *other != app);
@@ -35,23 +35,23 @@ impl Core {
         correlation: u64,
         answer: BarrierAnswer,
     ) {
-        let kept = self.untaken.answers.iter().filter(|(other, ..)| *other == app).count();
+        let kept = self.undelivered.answers.iter().filter(|(other, ..)| *other == app).count();
         if kept >= ANSWERS_PER_APP_MAX {
             let detail =
                 format!("{app} has not taken {kept} answers about barriers; it does not get another one");
             return self.refuse("barriers", detail);
         }
-        self.untaken.answers.push((app, correlation, answer));
-        self.untaken.retry.get_or_insert(now + RETRY);
+        self.undelivered.answers.push((app, correlation, answer));
+        self.undelivered.retry.get_or_insert(now + RETRY);
     }
 
     /// Offers again what was not taken. spec: SYNC-10
     pub(super) fn answer_again(&mut self, now: Time) {
-        if self.untaken.retry.is_none_or(|retry| now < retry) {
+        if self.undelivered.retry.is_none_or(|retry| now < retry) {
             return;
         }
-        self.untaken.retry = None;
-        for (app, correlation, answer) in std::mem::take(&mut self.untaken.answers) {
+        self.undelivered.retry = None;
+        for (app, correlation, answer) in std::mem::take(&mut self.undelivered.answers) {
             self.outputs.push_back(Output::AnswerBarrier { app, correlation, answer });
         }
     }

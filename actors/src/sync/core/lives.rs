@@ -107,7 +107,7 @@ impl Core {
     fn life_ended(&mut self, now: Time, app: AppAddress) {
         self.rendezvous.ended(now, app);
         self.phases.ended(app);
-        self.untaken.forget(app);
+        self.undelivered.forget(app);
         self.watchers.remove(app);
     }
 }

@@ -40,7 +40,7 @@ use sinew_runtime::{
 pub(in crate::sync) use self::directory::Named;
 pub(crate) use self::reason::Reason;
 use self::{
-    answers::Untaken,
+    answers::Undelivered,
     apps::{Apps, State},
     directory::Watchers,
     peers::Peers,
@@ -133,7 +133,7 @@ pub(crate) struct Core {
     peers: Peers,
     rendezvous: Rendezvous,
     phases: Phases,
-    untaken: Untaken,
+    undelivered: Undelivered,
     watchers: Watchers,
     /// Of the names and patterns that are required here, those that somebody had at some time.
     seen: BTreeSet<String>,
@@ -190,7 +190,7 @@ impl Core {
             peers: Peers::new(config.ndl.nodes_max),
             rendezvous: Rendezvous::new(node, incarnation, config.payload_max),
             phases: Phases::default(),
-            untaken: Untaken::default(),
+            undelivered: Undelivered::default(),
             watchers: Watchers::default(),
             seen: BTreeSet::new(),
             cycles: BTreeSet::new(),
@@ -291,7 +291,7 @@ impl Core {
             self.peers.next_due(),
             self.retry,
             self.rendezvous.next_due(),
-            self.untaken.next_wake(),
+            self.undelivered.next_wake(),
             self.watchers.next_wake(),
         ]
         .into_iter()

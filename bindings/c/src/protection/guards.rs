@@ -281,7 +281,7 @@ mod tests {
         time::Duration,
     };
 
-    use sinew::protection::{Codename, Protection, Stamp, seal};
+    use sinew::protection::{DataId, Protection, Stamp, seal};
 
     use super::*;
 
@@ -331,9 +331,9 @@ mod tests {
 
     fn next(handle: usize, counter: u64) -> Verdict<()> {
         let (source, destination) = ENDS;
-        let codename = Codename { source, destination, name: protected().name };
+        let data_id = DataId { source, destination, name: protected().name };
         let stamp = Stamp { counter, incarnation: 5, echo: echo(handle).expect("it is there") };
-        take(handle, &seal(&codename, stamp, &[7; 2])).expect("it is there")
+        take(handle, &seal(&data_id, stamp, &[7; 2])).expect("it is there")
     }
 
     fn status<T>(result: Result<T, Fault>) -> Option<Status> {

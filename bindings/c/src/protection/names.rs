@@ -1,4 +1,4 @@
-//! Names of protected types, kept for the life of the process: a codename is compared for ever.
+//! Names of protected types, kept for the life of the process: a data ID is compared for ever.
 //!
 //! Who seals a message each millisecond looks its name up each time, and must not wait for a thread that brings a new one. So no lock is here: a
 //! place is filled once and never emptied, and a name lies in the first place from its hash on that was free when it came. All places before that one are

@@ -59,7 +59,7 @@ int main(int argc, char **argv)
     fflush(stdout);
     while (count < MAX_HELD) {
         status = sinew_receive_message(holder, UINT64_MAX, &held[count]);
-        if (status == SINEW_ERROR_AWAY) {
+        if (status == SINEW_ERROR_DISCONNECTED) {
             printf("away: %s\n", sinew_last_error());
             fflush(stdout);
             continue;

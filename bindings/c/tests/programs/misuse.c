@@ -65,7 +65,7 @@ static void null_arguments(sinew_endpoint *endpoint)
     EXPECT_WORDS(sinew_send_bytes(endpoint, 1, kind, 0, NULL, 5), SINEW_ERROR_INVALID_ARGUMENT, "`bytes` is NULL");
     EXPECT_WORDS(sinew_receive_message(endpoint, 0, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`received` is NULL");
     EXPECT_WORDS(sinew_receive_message(NULL, 0, &received), SINEW_ERROR_NO_SUCH_ENDPOINT, "is it NULL");
-    EXPECT_WORDS(sinew_next_untaken(endpoint, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`untaken` is NULL");
+    EXPECT_WORDS(sinew_next_undelivered(endpoint, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`undelivered` is NULL");
     EXPECT_WORDS(sinew_settle_message(endpoint, NULL, 0), SINEW_ERROR_INVALID_ARGUMENT, "`received` is NULL");
     EXPECT_WORDS(sinew_resolve(endpoint, no_text, 1, &tid), SINEW_ERROR_INVALID_ARGUMENT, "`name` is NULL");
     EXPECT_WORDS(sinew_resolve(endpoint, node, 1, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`tid` is NULL");
@@ -262,12 +262,12 @@ static void one_at_a_time(const char *way, uint32_t links)
     for (size_t length = 5; length <= 50000; length += 49995) {
         first = new_message(endpoint, to, length);
         memcpy(first.bytes, "first", 5);
-        EXPECT_WORDS(sinew_create_message(endpoint, to, kind, 0, 1, &second), SINEW_ERROR_LENT, "hand it to sinew_send_message or sinew_discard_message first");
-        EXPECT_WORDS(sinew_send_bytes(endpoint, to, kind, SINEW_CONTROL, NULL, 0), SINEW_ERROR_LENT, "lent");
-        EXPECT_WORDS(sinew_send_bytes_within(endpoint, to, kind, SINEW_CONTROL, NULL, 0, 0), SINEW_ERROR_LENT, "lent");
-        EXPECT(sinew_resolve(endpoint, SINEW_TEXT("nobody"), SECOND, &tid), SINEW_ERROR_LENT);
-        EXPECT(sinew_join_group(endpoint, SINEW_TEXT("drives")), SINEW_ERROR_LENT);
-        EXPECT(sinew_leave_group(endpoint, SINEW_TEXT("drives")), SINEW_ERROR_LENT);
+        EXPECT_WORDS(sinew_create_message(endpoint, to, kind, 0, 1, &second), SINEW_ERROR_LOAN_ACTIVE, "hand it to sinew_send_message or sinew_discard_message first");
+        EXPECT_WORDS(sinew_send_bytes(endpoint, to, kind, SINEW_CONTROL, NULL, 0), SINEW_ERROR_LOAN_ACTIVE, "lent");
+        EXPECT_WORDS(sinew_send_bytes_within(endpoint, to, kind, SINEW_CONTROL, NULL, 0, 0), SINEW_ERROR_LOAN_ACTIVE, "lent");
+        EXPECT(sinew_resolve(endpoint, SINEW_TEXT("nobody"), SECOND, &tid), SINEW_ERROR_LOAN_ACTIVE);
+        EXPECT(sinew_join_group(endpoint, SINEW_TEXT("drives")), SINEW_ERROR_LOAN_ACTIVE);
+        EXPECT(sinew_leave_group(endpoint, SINEW_TEXT("drives")), SINEW_ERROR_LOAN_ACTIVE);
         EXPECT(sinew_receive_message(endpoint, 0, &received), SINEW_NOTHING);
         EXPECT(sinew_send_message(endpoint, &first), SINEW_OK);
         EXPECT(sinew_receive_message(endpoint, 10 * SECOND, &received), SINEW_OK);

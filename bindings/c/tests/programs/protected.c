@@ -50,7 +50,7 @@ static sinew_protected_type torque_type(uint64_t period_ns)
     return sinew_protected_type_of(SINEW_TEXT("test.torque"), sizeof(struct torque), period_ns);
 }
 
-static const sinew_codename codename = { UINT64_C(0x700001001), UINT64_C(0x700001002), { "test.torque", 11 } };
+static const sinew_data_id data_id = { UINT64_C(0x700001001), UINT64_C(0x700001002), { "test.torque", 11 } };
 
 /* A sender that keeps its own numbers, and what it has sent last. */
 struct bench {
@@ -60,7 +60,7 @@ struct bench {
     uint8_t sealed[sizeof(struct torque) + SINEW_SEALED_OVERHEAD];
 };
 
-static void seal_as(struct bench *bench, const sinew_codename *name)
+static void seal_as(struct bench *bench, const sinew_data_id *name)
 {
     struct torque torque = { 2.5f, (uint32_t)bench->stamp.counter };
     EXPECT(sinew_seal(name, &bench->stamp, &torque, sizeof torque, bench->sealed, sizeof bench->sealed) == SINEW_OK);
@@ -77,7 +77,7 @@ static sinew_sealed_fault next(struct bench *bench, sinew_status wanted)
 {
     EXPECT(sinew_guard_echo(bench->guard, &bench->stamp.echo_ns) == SINEW_OK);
     bench->stamp.counter++;
-    seal_as(bench, &codename);
+    seal_as(bench, &data_id);
     return take(bench, wanted);
 }
 
@@ -102,7 +102,7 @@ static void begin(struct bench *bench, uint64_t period_ns)
     sinew_protected_type type = torque_type(period_ns);
     memset(bench, 0, sizeof *bench);
     bench->stamp.incarnation = 5;
-    EXPECT(sinew_guard_alone(&codename, &type, &bench->motor, make_safe, &bench->guard) == SINEW_OK);
+    EXPECT(sinew_guard_alone(&data_id, &type, &bench->motor, make_safe, &bench->guard) == SINEW_OK);
     EXPECT(bench->motor.safe_count == 1 && bench->motor.why == SINEW_SAFE_NOT_ARMED);
     come_alive(bench);
 }
@@ -131,7 +131,7 @@ static void begin_patient(struct bench *bench)
 static void errors(void)
 {
     static struct bench bench;
-    sinew_codename wrong = codename;
+    sinew_data_id wrong = data_id;
     sinew_tally tally;
 
     begin_patient(&bench);
@@ -144,7 +144,7 @@ static void errors(void)
     begin_patient(&bench);
     EXPECT(take(&bench, SINEW_NOTHING) == SINEW_FAULT_REPEATED);
     bench.stamp.counter--;
-    seal_as(&bench, &codename);
+    seal_as(&bench, &data_id);
     EXPECT(take(&bench, SINEW_NOTHING) == SINEW_FAULT_BACKWARDS);
     bench.stamp.counter++;
     is_safe(&bench, SINEW_SAFE_TOO_MANY_BAD);
@@ -179,7 +179,7 @@ static void errors(void)
     begin_patient(&bench);
     bench.stamp.echo_ns = 0;
     bench.stamp.counter++;
-    seal_as(&bench, &codename);
+    seal_as(&bench, &data_id);
     EXPECT(take(&bench, SINEW_NOTHING) == SINEW_FAULT_TOO_OLD && state(&bench) == SINEW_LIVE);
     EXPECT(sinew_trip(bench.guard) == SINEW_OK && state(&bench) == SINEW_SAFE_TRIPPED);
     is_safe(&bench, SINEW_SAFE_TRIPPED);
@@ -192,7 +192,7 @@ static void lengths(void)
     sinew_sealed_fault fault;
     begin_patient(&bench);
     bench.stamp.counter++;
-    EXPECT(sinew_seal(&codename, &bench.stamp, "abc", 3, sealed, sizeof sealed) == SINEW_OK);
+    EXPECT(sinew_seal(&data_id, &bench.stamp, "abc", 3, sealed, sizeof sealed) == SINEW_OK);
     EXPECT(sinew_check_sealed(bench.guard, sealed, sizeof sealed, &fault) == SINEW_NOTHING);
     EXPECT(fault == SINEW_FAULT_UNREADABLE);
     EXPECT(next(&bench, SINEW_OK) == SINEW_FAULT_NONE);
@@ -233,7 +233,7 @@ static void callbacks(void)
     static struct bench bench;
     sinew_protected_type type = torque_type(60 * SECOND);
     sinew_guard *gone;
-    EXPECT(sinew_guard_alone(&codename, &type, &bench.guard, call_back, &bench.guard) == SINEW_OK);
+    EXPECT(sinew_guard_alone(&data_id, &type, &bench.guard, call_back, &bench.guard) == SINEW_OK);
     come_alive(&bench);
     gone = bench.guard;
     EXPECT(sinew_release(&bench.guard) == SINEW_OK && bench.guard == NULL);
@@ -273,7 +273,7 @@ static void failures(void)
     sinew_guard *guard = NULL;
     sinew_status status = SINEW_ERROR_SAFE_FAILS;
     int torque = 7;
-    EXPECT(sinew_guard_alone(&codename, &type, &fails, unless, &guard) == SINEW_ERROR_SAFE_FAILS && guard != NULL);
+    EXPECT(sinew_guard_alone(&data_id, &type, &fails, unless, &guard) == SINEW_ERROR_SAFE_FAILS && guard != NULL);
     EXPECT(sinew_guard_state(guard, &state) == SINEW_ERROR_SAFE_FAILS && state == SINEW_SAFE_NOT_ARMED);
     state = SINEW_LIVE;
     EXPECT(sinew_apply(guard, move, &torque, &state) == SINEW_ERROR_SAFE_FAILS && state == SINEW_SAFE_NOT_ARMED);
@@ -355,20 +355,20 @@ static void misuse(void)
     sinew_stamp stamp = { 1, 2, 3 }, found;
     uint8_t sealed[SINEW_SEALED_OVERHEAD];
     EXPECT(sinew_guard_alone(NULL, &type, NULL, make_safe, &guard) == SINEW_ERROR_INVALID_ARGUMENT);
-    EXPECT(sinew_guard_alone(&codename, NULL, NULL, make_safe, &guard) == SINEW_ERROR_INVALID_ARGUMENT);
-    EXPECT(sinew_guard_alone(&codename, &type, NULL, NULL, &guard) == SINEW_ERROR_INVALID_ARGUMENT);
+    EXPECT(sinew_guard_alone(&data_id, NULL, NULL, make_safe, &guard) == SINEW_ERROR_INVALID_ARGUMENT);
+    EXPECT(sinew_guard_alone(&data_id, &type, NULL, NULL, &guard) == SINEW_ERROR_INVALID_ARGUMENT);
     bad.within_ns = 0;
-    EXPECT(sinew_guard_alone(&codename, &bad, NULL, make_safe, &guard) == SINEW_ERROR_INVALID_ARGUMENT);
+    EXPECT(sinew_guard_alone(&data_id, &bad, NULL, make_safe, &guard) == SINEW_ERROR_INVALID_ARGUMENT);
     bad = type;
     bad.good_min = 0;
-    EXPECT(sinew_guard_alone(&codename, &bad, NULL, make_safe, &guard) == SINEW_ERROR_INVALID_ARGUMENT);
+    EXPECT(sinew_guard_alone(&data_id, &bad, NULL, make_safe, &guard) == SINEW_ERROR_INVALID_ARGUMENT);
     EXPECT(sinew_guard_output(NULL, 1, &type, NULL, make_safe, &guard) == SINEW_ERROR_NO_SUCH_ENDPOINT);
     EXPECT(sinew_send_protected(NULL, 1, &type, NULL, 0) == SINEW_ERROR_NO_SUCH_ENDPOINT);
-    EXPECT(sinew_seal(&codename, &stamp, NULL, 0, sealed, sizeof sealed - 1) == SINEW_ERROR_INVALID_ARGUMENT);
-    EXPECT(sinew_seal(&codename, &stamp, NULL, 0, sealed, sizeof sealed) == SINEW_OK);
-    EXPECT(sinew_unseal(&codename, sealed, sizeof sealed, &found) == SINEW_OK);
+    EXPECT(sinew_seal(&data_id, &stamp, NULL, 0, sealed, sizeof sealed - 1) == SINEW_ERROR_INVALID_ARGUMENT);
+    EXPECT(sinew_seal(&data_id, &stamp, NULL, 0, sealed, sizeof sealed) == SINEW_OK);
+    EXPECT(sinew_unseal(&data_id, sealed, sizeof sealed, &found) == SINEW_OK);
     EXPECT(found.counter == 1 && found.incarnation == 2 && found.echo_ns == 3);
-    EXPECT(sinew_unseal(&codename, sealed, sizeof sealed - 1, &found) == SINEW_ERROR_MALFORMED);
+    EXPECT(sinew_unseal(&data_id, sealed, sizeof sealed - 1, &found) == SINEW_ERROR_MALFORMED);
     EXPECT(sinew_arm(NULL) == SINEW_ERROR_NO_SUCH_GUARD && sinew_trip(NULL) == SINEW_ERROR_NO_SUCH_GUARD);
     EXPECT(sinew_release_later(NULL) == SINEW_ERROR_NO_SUCH_GUARD);
     EXPECT(sinew_release_later(&guard) == SINEW_ERROR_NO_SUCH_GUARD);
@@ -384,11 +384,11 @@ static void many(void)
     sinew_protected_type type = torque_type(60 * SECOND);
     sinew_guard *more, *gone;
     for (size_t at = 0; at < 256; at++)
-        EXPECT(sinew_guard_alone(&codename, &type, &motor, make_safe, &guards[at]) == SINEW_OK);
-    EXPECT(sinew_guard_alone(&codename, &type, &motor, make_safe, &more) == SINEW_ERROR_TOO_MANY);
+        EXPECT(sinew_guard_alone(&data_id, &type, &motor, make_safe, &guards[at]) == SINEW_OK);
+    EXPECT(sinew_guard_alone(&data_id, &type, &motor, make_safe, &more) == SINEW_ERROR_TOO_MANY);
     gone = guards[100];
     EXPECT(sinew_release(&guards[100]) == SINEW_OK);
-    EXPECT(sinew_guard_alone(&codename, &type, &motor, make_safe, &guards[100]) == SINEW_OK);
+    EXPECT(sinew_guard_alone(&data_id, &type, &motor, make_safe, &guards[100]) == SINEW_OK);
     EXPECT(guards[100] != gone && sinew_arm(gone) == SINEW_ERROR_NO_SUCH_GUARD);
     for (size_t at = 0; at < 256; at++)
         EXPECT(sinew_release(&guards[at]) == SINEW_OK);
@@ -408,7 +408,7 @@ static void in_a_child(void)
     if (child == 0) {
         bool is_refused = sinew_trip(bench.guard) == SINEW_ERROR_FORKED
             && sinew_arm(bench.guard) == SINEW_ERROR_FORKED
-            && sinew_guard_alone(&codename, &type, &bench.motor, make_safe, &own) == SINEW_ERROR_FORKED;
+            && sinew_guard_alone(&data_id, &type, &bench.motor, make_safe, &own) == SINEW_ERROR_FORKED;
         _exit(is_refused ? EXIT_SUCCESS : EXIT_FAILURE);
     }
     EXPECT(waitpid(child, &status, 0) == child && WIFEXITED(status) && WEXITSTATUS(status) == EXIT_SUCCESS);

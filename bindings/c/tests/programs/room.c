@@ -46,7 +46,7 @@ int main(int argc, char **argv)
     sinew_received received;
     EXPECT(argc > 2);
     options.links = strcmp(argv[2], "socket") == 0 ? SINEW_SOCKET_ONLY : 0;
-    options.patience_ns = 60 * SECOND;
+    options.stall_timeout_ns = 60 * SECOND;
     EXPECT(sinew_register_transport_address(sinew_text_of(argv[1]), &options, &endpoint) == SINEW_OK);
     await_word("stop it");
     while ((status = send_number(endpoint, kind, sent, 0)) == SINEW_OK)

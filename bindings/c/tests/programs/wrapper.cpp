@@ -41,17 +41,17 @@ static void errors_are_exceptions(sinew::endpoint &endpoint)
 }
 
 // What was sent without asking and reached nobody is said with its number.
-static void untaken_messages_are_counted(sinew::endpoint &endpoint)
+static void undelivered_messages_are_counted(sinew::endpoint &endpoint)
 {
-    EXPECT(!endpoint.untaken());
+    EXPECT(!endpoint.take_undelivered());
     for (int number = 0; number < 3; number++)
         endpoint.send(0x7777, what, pair{1, 2});
     std::uint64_t count = 0;
     for (int look = 0; look < 1000 && count < 3; look++) {
-        while (const auto untaken = endpoint.untaken()) {
-            EXPECT((untaken->destination & 0xffffffff) == 0x7777 && untaken->since_ns <= sinew_now_ns());
-            EXPECT(untaken->outcome == SINEW_REJECTED_NO_SUCH_APPLICATION);
-            count += untaken->count;
+        while (const auto undelivered = endpoint.take_undelivered()) {
+            EXPECT((undelivered->destination & 0xffffffff) == 0x7777 && undelivered->since_ns <= sinew_now_ns());
+            EXPECT(undelivered->outcome == SINEW_REJECTED_NO_SUCH_APPLICATION);
+            count += undelivered->count;
         }
         EXPECT(!endpoint.receive(10ms));
     }
@@ -97,7 +97,7 @@ static void unsent_messages_are_given_back(sinew::endpoint &endpoint)
             auto another = endpoint.create(endpoint.address(), what, 8);
             EXPECT(false);
         } catch (const sinew::error &error) {
-            EXPECT(error.status() == SINEW_ERROR_LENT);
+            EXPECT(error.status() == SINEW_ERROR_LOAN_ACTIVE);
         }
     }
 }
@@ -264,7 +264,7 @@ int main(int argc, char **argv)
     const char *socket = argc > 1 ? argv[1] : "";
     sinew::endpoint endpoint(socket);
     errors_are_exceptions(endpoint);
-    untaken_messages_are_counted(endpoint);
+    undelivered_messages_are_counted(endpoint);
     scopes_settle(endpoint, sinew::endpoint(socket));
     unsent_messages_are_given_back(endpoint);
     sends_may_have_a_time(endpoint);

@@ -296,7 +296,7 @@ impl Drive {
         self.parts.events.note(EventRow { t_ns: Time::now().as_nanos(), what, whom, how });
     }
 
-    fn note_silence(&self, input: &str, silence: Silence) {
+    fn note_silence(&self, input: &str, silence: InputTimeout) {
         let (joint, silent) = (self.parts.joint, silence.silent);
         tracing::warn!(%joint, input, ?silent, lateness = ?silence.lateness, "an input is silent");
         self.note_event("input_silent", input, format!("nothing for {silent:?}"));
@@ -368,7 +368,7 @@ impl Handler<Delivery<JointSample>> for Drive {
         }
         if self.sample.is_none() {
             // From the first one on: before it there is nothing that could fall silent.
-            context.expect::<JointSample>(None, SILENCE_MAX, |this, silence, _| {
+            context.watch_input::<JointSample>(None, SILENCE_MAX, |this, silence, _| {
                 this.note_silence("joint sample", silence);
             });
         }
@@ -393,7 +393,7 @@ impl Handler<Delivery<GaitState>> for Drive {
             return;
         }
         if !std::mem::replace(&mut self.central_heard, true) {
-            context.expect::<GaitState>(None, SILENCE_MAX, |this, silence, _| {
+            context.watch_input::<GaitState>(None, SILENCE_MAX, |this, silence, _| {
                 this.note_silence("gait state", silence);
             });
         }

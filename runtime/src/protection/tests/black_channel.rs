@@ -97,11 +97,11 @@ fn inject(
 }
 
 /// `message` as somebody else would have sealed it: right in all but what `change` changes.
-fn forged(message: &Bytes, change: impl FnOnce(&mut Codename, &mut Stamp)) -> Bytes {
-    let (mut stamp, payload) = open(&codename(), message).expect("it is the sender's own");
-    let mut codename = codename();
-    change(&mut codename, &mut stamp);
-    seal(&codename, stamp, &payload)
+fn forged(message: &Bytes, change: impl FnOnce(&mut DataId, &mut Stamp)) -> Bytes {
+    let (mut stamp, payload) = open(&data_id(), message).expect("it is the sender's own");
+    let mut data_id = data_id();
+    change(&mut data_id, &mut stamp);
+    seal(&data_id, stamp, &payload)
 }
 
 fn any_tid(rng: &mut TestRng) -> Tid {
@@ -264,7 +264,7 @@ fn an_age_that_nobody_measured_is_detected_however_young_it_looks() {
 fn insertion_of_what_another_has_sealed_is_detected() {
     inject("insertion", PROTECTION, Aftermath::Live, |trial, rng| {
         let message = trial.bench.next();
-        let forged = forged(&message, |codename, _| codename.source = another(codename.source, rng));
+        let forged = forged(&message, |data_id, _| data_id.source = another(data_id.source, rng));
         trial.inject(&forged, Fault::Corrupt);
     });
 }
@@ -273,15 +273,15 @@ fn insertion_of_what_another_has_sealed_is_detected() {
 fn masquerade_of_what_is_no_protected_command_is_detected() {
     inject("masquerade", PROTECTION, Aftermath::Live, |trial, rng| {
         let message = trial.bench.next();
-        let (_, payload) = open(&codename(), &message).expect("it is the sender's own");
+        let (_, payload) = open(&data_id(), &message).expect("it is the sender's own");
         let forged = match rng.random_range(0..3) {
             // By the right one to the right one, of another type.
-            0 => forged(&message, |codename, _| {
-                codename.name = ["test.torquo", "test.torqu", ""][rng.random_range(0..3)]
+            0 => forged(&message, |data_id, _| {
+                data_id.name = ["test.torquo", "test.torqu", ""][rng.random_range(0..3)]
             }),
             // The value without protection.
             1 => payload,
-            // All but the codename, by somebody who knows the format.
+            // All but the data ID, by somebody who knows the format.
             _ => {
                 let mut digest = crc64fast::Digest::new();
                 let sealed = &message[..message.len() - 8];
@@ -297,12 +297,12 @@ fn masquerade_of_what_is_no_protected_command_is_detected() {
 fn wrong_addressing_is_detected() {
     inject("addressing", PROTECTION, Aftermath::Live, |trial, rng| {
         let message = trial.bench.next();
-        let forged = forged(&message, |codename, _| {
+        let forged = forged(&message, |data_id, _| {
             if rng.random_range(0..8) == 0 {
                 // What the receiver itself has sent comes back to it.
-                std::mem::swap(&mut codename.source, &mut codename.destination);
+                std::mem::swap(&mut data_id.source, &mut data_id.destination);
             } else {
-                codename.destination = another(codename.destination, rng);
+                data_id.destination = another(data_id.destination, rng);
             }
         });
         trial.inject(&forged, Fault::Corrupt);

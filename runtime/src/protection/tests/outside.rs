@@ -6,7 +6,7 @@ use super::*;
 
 /// Bytes with the sum that belongs to them.
 fn summed(bytes: &[u8]) -> Bytes {
-    let Codename { source, destination, name } = codename();
+    let DataId { source, destination, name } = data_id();
     let mut digest = crc64fast::Digest::new();
     for word in [source.bits(), destination.bits(), name.len() as u64] {
         digest.write(&word.to_le_bytes());

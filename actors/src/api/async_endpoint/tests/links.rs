@@ -25,7 +25,7 @@ use crate::{
 };
 
 fn wish() -> Registration {
-    Registration::new().direct(true).patience(WATCHDOG)
+    Registration::new().direct(true).stall_timeout(WATCHDOG)
 }
 
 async fn task(node: &TestNode) -> AsyncEndpoint {

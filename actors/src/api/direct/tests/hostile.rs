@@ -164,7 +164,7 @@ fn an_introduction_that_is_refused_leaves_nothing_in_the_socket() {
 fn who_only_sends_hears_of_the_end_of_a_peer_that_takes_nothing_and_whose_link_does_not_hang_up() {
     // Given: a link that is full, whose peer takes nothing.
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let mut one = register(&node, Registration::new().direct(true).patience(Duration::from_millis(1)));
+    let mut one = register(&node, Registration::new().direct(true).stall_timeout(Duration::from_millis(1)));
     let mut other = endpoint(&node);
     link(&mut one, &mut other);
     while one.send(other.tid(), &Counted(1)).is_ok() {}

@@ -35,7 +35,7 @@ fn what_a_peer_said_before_it_went_is_received_and_then_it_has_gone() {
 fn what_one_life_of_an_address_wrote_into_its_ring_comes_before_what_the_next_one_sends_through_the_node() {
     // given
     let node = TestNode::start();
-    let wanted = || Registration::new().direct(true).fixed(AppAddress::fixed(7).unwrap());
+    let wanted = || Registration::new().direct(true).fixed_address(AppAddress::fixed(7).unwrap());
     let (mut one, mut other) = (register(&node, wanted()), endpoint(&node));
     link(&mut one, &mut other);
     for number in 1..=3 {
@@ -140,7 +140,7 @@ fn of_a_peer_whose_process_has_ended_what_it_had_taken_has_failed_and_what_it_ha
 fn the_outcome_of_a_former_lifes_message_is_not_taken_for_one_of_this_life() {
     // given: a message of the former life waits to be received
     let node = TestNode::start();
-    let wanted = || Registration::new().fixed(AppAddress::fixed(7).unwrap());
+    let wanted = || Registration::new().fixed_address(AppAddress::fixed(7).unwrap());
     let (former, mut other) = (register(&node, wanted()), register(&node, Registration::new()));
     let mut left = Message::typed(former.tid(), other.tid(), &Counted(1));
     (left.header.class, left.header.flags) = (Class::Bulk, Flags::CONFIRM);
@@ -169,7 +169,7 @@ fn links_outlive_the_node_and_none_of_its_next_life_has_the_number_of_one_of_the
     // given: a link with messages that were not received
     let mut node = TestNode::start();
     let path = node.path();
-    let fixed = |index| Registration::new().direct(true).fixed(AppAddress::fixed(index).unwrap());
+    let fixed = |index| Registration::new().direct(true).fixed_address(AppAddress::fixed(index).unwrap());
     let (mut one, mut other) = (register(&node, fixed(1)), register(&node, fixed(2)));
     link(&mut one, &mut other);
     let former = one.direct.open[0].number;
@@ -188,7 +188,7 @@ fn links_outlive_the_node_and_none_of_its_next_life_has_the_number_of_one_of_the
                 Ok(received) => {
                     numbers.extend(received.map(|received| received.decode::<Counted>().unwrap().0))
                 }
-                Err(error) => assert!(matches!(error, ApiError::Away(_)), "{error}"),
+                Err(error) => assert!(matches!(error, ApiError::Disconnected(_)), "{error}"),
             }
         }
     }

@@ -90,7 +90,7 @@ fn who_waits_for_room_for_a_short_command_does_not_wait_for_that_of_a_long_value
 }
 
 #[test]
-fn a_value_that_waits_when_its_link_ends_is_counted_as_untaken() {
+fn a_value_that_waits_when_its_link_ends_is_counted_as_undelivered() {
     // given
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
     let (mut one, mut other) = (endpoint(&node), endpoint(&node));
@@ -107,14 +107,14 @@ fn a_value_that_waits_when_its_link_ends_is_counted_as_untaken() {
         drop(one.receive(Duration::from_millis(1)).unwrap());
     }
     // then
-    let untaken = one.untaken().expect("something was lost");
-    assert_eq!((untaken.destination, untaken.why, untaken.count), (to, Rejection::Closed, 1));
+    let undelivered = one.take_undelivered().expect("something was lost");
+    assert_eq!((undelivered.destination, undelivered.why, undelivered.count), (to, Rejection::Closed, 1));
 }
 
 #[test]
 fn a_peer_that_takes_nothing_costs_a_sender_its_patience_and_not_the_link() {
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let mut one = register(&node, Registration::new().direct(true).patience(Duration::from_millis(10)));
+    let mut one = register(&node, Registration::new().direct(true).stall_timeout(Duration::from_millis(10)));
     let mut other = endpoint(&node);
     link(&mut one, &mut other);
     let mut taken = 0;
@@ -156,7 +156,7 @@ fn a_long_message_goes_in_pieces_through_a_short_ring() {
 fn two_that_wait_for_room_in_each_others_rings_take_in_what_is_there_meanwhile() {
     // given: rings that hold a fraction of what each sends before it receives anything
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let wanted = || Registration::new().direct(true).patience(WATCHDOG / 2);
+    let wanted = || Registration::new().direct(true).stall_timeout(WATCHDOG / 2);
     let (mut one, mut other) = (register(&node, wanted()), register(&node, wanted()));
     link(&mut one, &mut other);
     let (one_tid, other_tid, number) = (one.tid(), other.tid(), one.direct.open[0].number);
@@ -175,7 +175,7 @@ fn two_that_wait_for_room_in_each_others_rings_take_in_what_is_there_meanwhile()
         exchange(&mut other, one_tid);
     });
     // then
-    assert_eq!(one.direct.open[0].number, number, "nobody lost patience within a frame");
+    assert_eq!(one.direct.open[0].number, number, "nobody lost stall_timeout within a frame");
 }
 
 fn send_long(from: &mut Endpoint, to: Tid, length: usize) -> Result<(), ApiError> {
@@ -187,7 +187,7 @@ fn send_long(from: &mut Endpoint, to: Tid, length: usize) -> Result<(), ApiError
 #[test]
 fn a_long_message_that_a_peer_does_not_take_in_time_is_not_sent_and_nothing_of_it_comes() {
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let mut one = register(&node, Registration::new().direct(true).patience(Duration::from_millis(1)));
+    let mut one = register(&node, Registration::new().direct(true).stall_timeout(Duration::from_millis(1)));
     let mut other = endpoint(&node);
     link(&mut one, &mut other);
     let to = other.tid();
@@ -215,7 +215,7 @@ fn a_long_message_that_a_peer_does_not_take_in_time_is_not_sent_and_nothing_of_i
 #[test]
 fn who_goes_after_a_long_message_was_not_taken_in_time_has_lost_nothing_of_which_it_was_told_ok() {
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let mut one = register(&node, Registration::new().direct(true).patience(Duration::from_millis(10)));
+    let mut one = register(&node, Registration::new().direct(true).stall_timeout(Duration::from_millis(10)));
     let mut other = endpoint(&node);
     link(&mut one, &mut other);
     let mut sent = 0;
@@ -242,7 +242,7 @@ fn who_goes_after_a_long_message_was_not_taken_in_time_has_lost_nothing_of_which
 fn a_long_message_that_the_links_end_cuts_goes_through_the_node_once() {
     // given
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let mut one = register(&node, Registration::new().direct(true).patience(WATCHDOG / 2));
+    let mut one = register(&node, Registration::new().direct(true).stall_timeout(WATCHDOG / 2));
     let mut other = endpoint(&node);
     link(&mut one, &mut other);
     let (to, peer) = (other.tid(), one.tid());
@@ -271,7 +271,7 @@ fn a_long_message_that_the_links_end_cuts_goes_through_the_node_once() {
 #[test]
 fn the_newest_value_of_a_stream_reaches_a_peer_that_takes_something_although_its_sender_goes() {
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let mut one = register(&node, Registration::new().direct(true).patience(WATCHDOG));
+    let mut one = register(&node, Registration::new().direct(true).stall_timeout(WATCHDOG));
     let mut other = endpoint(&node);
     link(&mut one, &mut other);
     for number in 1..=1_000 {
@@ -376,8 +376,8 @@ fn an_application_that_can_close_no_more_of_what_peers_pass_wrongly_has_no_furth
 #[test]
 fn a_peer_that_takes_nothing_costs_a_sender_its_patience_once_and_not_with_each_message() {
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let patience = WATCHDOG / 30;
-    let mut one = register(&node, Registration::new().direct(true).patience(patience));
+    let stall_timeout = WATCHDOG / 30;
+    let mut one = register(&node, Registration::new().direct(true).stall_timeout(stall_timeout));
     let (mut other, mut third) = (endpoint(&node), endpoint(&node));
     link(&mut one, &mut other);
     while one.send(other.tid(), &Counted(1)).is_ok() {}
@@ -386,7 +386,7 @@ fn a_peer_that_takes_nothing_costs_a_sender_its_patience_once_and_not_with_each_
     for number in 0..100 {
         assert!(
             Time::now() < deadline,
-            "{number} messages were refused, and each after the sender's patience"
+            "{number} messages were refused, and each after the sender's stall_timeout"
         );
         let refused = one.send(other.tid(), &Counted(2)).unwrap_err();
         assert!(matches!(refused, ApiError::Stalled(_)), "{refused}");

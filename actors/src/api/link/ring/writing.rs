@@ -38,12 +38,12 @@ impl Writer {
     /// Writes a frame as far as there is room now.
     ///
     /// # Errors
-    /// [`ApiError::Lent`], or [`ApiError::Closed`] if the ring cannot be used any more; nothing was written.
+    /// [`ApiError::LoanActive`], or [`ApiError::Closed`] if the ring cannot be used any more; nothing was written.
     pub(in crate::api) fn begin(self: &Arc<Self>, message: Message) -> Result<Begun, (ApiError, Message)> {
         self.pay();
         let head = message.header.encode_in_memory(message.payload.len());
         let mut place = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
-        let Some(producer) = place.as_deref_mut() else { return Err((ApiError::Lent, message)) };
+        let Some(producer) = place.as_deref_mut() else { return Err((ApiError::LoanActive, message)) };
         let written = match ring::write(producer, &[IoSlice::new(&head), IoSlice::new(&message.payload)]) {
             Ok(count) => count,
             Err(LoanError::Full { .. }) => return Ok(Begun::Full(message)),

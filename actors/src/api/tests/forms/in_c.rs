@@ -20,7 +20,7 @@
 use std::{path::Path, time::Duration};
 
 use sinew_c::conformance::{
-    Asked, Endpoint, InHand, Made, Outcome as Code, SINEW_DIRECT, SINEW_ONE_CONNECTION, SINEW_SOCKET_ONLY,
+    Asked, Endpoint, InHand, Made, Outcome as Code, SINEW_DIRECT, SINEW_SOCKET_ONLY, SINEW_WITHOUT_RECONNECT,
     Status, Told,
 };
 use sinew_runtime::{
@@ -30,7 +30,7 @@ use sinew_runtime::{
     wire::{Class, Header, Kind, Message, Payload},
 };
 
-use crate::api::{ApiError, Registration, Transport, Untaken, returning::Returning};
+use crate::api::{ApiError, Registration, Transport, Undelivered, returning::ReconnectPolicy};
 
 const RAW: Kind = Kind::named("test.raw");
 
@@ -79,16 +79,16 @@ fn error_of(told: &Told) -> ApiError {
             }
         }
         // What to do about these is said with the names that C has for it.
-        Status::SinewErrorAway => {
-            return ApiError::Away(between(
+        Status::SinewErrorDisconnected => {
+            return ApiError::Disconnected(between(
                 "the connection to the node has ended: ",
                 sentence,
                 "; the endpoint registers again by itself, go on with sinew_receive_message",
             ));
         }
-        Status::SinewErrorLent => {
+        Status::SinewErrorLoanActive => {
             assert!(sentence.contains("sinew_send_message or sinew_discard_message first"), "{sentence}");
-            return ApiError::Lent;
+            return ApiError::LoanActive;
         }
         Status::SinewErrorNotAsked => {
             assert!(sentence.contains("only what was sent with sinew_ask does"), "{sentence}");
@@ -149,13 +149,13 @@ const fn code_of(class: Class) -> i32 {
     }
 }
 
-/// As it would be asked for in C, where zero is the default: no patience is the least.
+/// As it would be asked for in C, where zero is the default: no stall timeout is the least.
 fn asked(registration: &Registration) -> Asked {
     let (register, link) = (&registration.register, &registration.link);
     let chosen = [
         (link.transport == Transport::Socket, SINEW_SOCKET_ONLY),
         (register.direct, SINEW_DIRECT),
-        (matches!(registration.returning, Returning::Never), SINEW_ONE_CONNECTION),
+        (matches!(registration.returning, ReconnectPolicy::Never), SINEW_WITHOUT_RECONNECT),
     ];
     Asked {
         name: register.name.clone().unwrap_or_default(),
@@ -163,7 +163,7 @@ fn asked(registration: &Registration) -> Asked {
         handled: register.kinds.clone(),
         fixed_address: register.address.map_or(0, AppAddress::bits),
         deadline_ns: nanos(registration.deadline),
-        patience_ns: nanos(link.patience).max(1),
+        stall_timeout_ns: nanos(link.stall_timeout).max(1),
         inbox_capacity: registration.inbox_capacity,
         links: chosen.into_iter().filter(|(is, _)| *is).fold(0, |links, (_, link)| links | link),
     }
@@ -178,7 +178,7 @@ impl Client {
     /// What a call said; that the endpoint is away is remembered.
     fn heard<T>(&mut self, result: Result<T, Told>) -> Result<T, ApiError> {
         let result = said(result);
-        self.is_away |= matches!(result, Err(ApiError::Away(_)));
+        self.is_away |= matches!(result, Err(ApiError::Disconnected(_)));
         result
     }
 
@@ -190,7 +190,7 @@ impl Client {
                     self.registrations += 1;
                     self.is_away = false;
                 }
-                Err(ApiError::Away(_)) => {}
+                Err(ApiError::Disconnected(_)) => {}
                 Err(other) => panic!("{other}"),
             }
         }
@@ -310,17 +310,18 @@ impl Client {
         self.heard(received)
     }
 
-    pub(super) fn untaken(&mut self) -> Option<Untaken> {
-        let untaken = said(self.endpoint.next_untaken()).expect("it only looks")?;
-        let code = u8::try_from(untaken.outcome).expect("an outcome has the number that it has on the wire");
-        Some(Untaken {
-            destination: Tid::from_bits(untaken.destination),
+    pub(super) fn take_undelivered(&mut self) -> Option<Undelivered> {
+        let undelivered = said(self.endpoint.next_undelivered()).expect("it only looks")?;
+        let code =
+            u8::try_from(undelivered.outcome).expect("an outcome has the number that it has on the wire");
+        Some(Undelivered {
+            destination: Tid::from_bits(undelivered.destination),
             why: match Outcome::from_code(code) {
                 Some(Outcome::Rejected(why)) => why,
                 other => panic!("{other:?} is no reason"),
             },
-            count: untaken.count,
-            since: Time::from_nanos(untaken.since_ns),
+            count: undelivered.count,
+            since: Time::from_nanos(undelivered.since_ns),
         })
     }
 

@@ -270,7 +270,7 @@ impl Plan {
         for _ in 0..chance.below(4) {
             let node = chance.index(self.nodes);
             let mut at = chance.between(self.period, heals);
-            for trouble in [Trouble::Stalled, Trouble::Away] {
+            for trouble in [Trouble::Stalled, Trouble::Down] {
                 self.happenings.push((at, Happening::Trouble { node, trouble: Some(trouble) }));
                 at = chance.between(at, heals);
             }

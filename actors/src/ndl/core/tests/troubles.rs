@@ -32,7 +32,7 @@ fn says(world: &mut World, parts: Vec<Part>) {
 #[test]
 fn what_stalls_on_a_living_node_is_told_once_and_again_when_it_gets_on() {
     let mut world = World::of_members(2);
-    let (stalled, away) = (Trouble::Stalled, Trouble::Away);
+    let (stalled, away) = (Trouble::Stalled, Trouble::Down);
     says(&mut world, vec![part(0x2000, stalled), part(3, stalled)]);
     assert_eq!(told(&mut world), [(3, Some(stalled)), (0x2000, Some(stalled))], "layers first");
     world.run(PERIOD * 5);
@@ -80,15 +80,15 @@ fn of_more_than_are_kept_those_without_room_are_told_when_there_is_some() {
     let mut world = World::of_members(2);
     for first in (0..80).step_by(4) {
         // The first four of many, each time others.
-        let mut parts: Vec<_> = (first..first + 5).map(|app| part(0x2000 + app, Trouble::Away)).collect();
-        parts.push(part(0x3000, Trouble::Away));
+        let mut parts: Vec<_> = (first..first + 5).map(|app| part(0x2000 + app, Trouble::Down)).collect();
+        parts.push(part(0x3000, Trouble::Down));
         says(&mut world, parts);
     }
     assert_eq!(told(&mut world).len(), 64);
-    says(&mut world, vec![part(0x3000, Trouble::Away)]);
+    says(&mut world, vec![part(0x3000, Trouble::Down)]);
     let events = told(&mut world);
     assert_eq!(events.len(), 65);
-    assert_eq!(events.last(), Some(&(0x3000, Some(Trouble::Away))));
+    assert_eq!(events.last(), Some(&(0x3000, Some(Trouble::Down))));
 }
 
 #[test]

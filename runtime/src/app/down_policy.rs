@@ -28,11 +28,11 @@ pub const WILLS_MAX: usize = 8;
 
 /// What becomes of messages for an application between its end and its next Ready.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Away {
+pub enum DownPolicy {
     /// They are kept, up to the mailbox's bound, and handed to its next life in order.
     #[default]
     Hold,
-    /// They are refused at once as [`Rejection::Away`](crate::outcome::Rejection::Away), those too that waited when it
+    /// They are refused at once as [`Rejection::Down`](crate::outcome::Rejection::Down), those too that waited when it
     /// ended: for setpoints and whatever else would be stale.
     Drop,
     /// They are kept for this long; from then on, and with those that wait by then, as [`Drop`](Self::Drop).
@@ -109,7 +109,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     /// What becomes of messages for it between its end and its next Ready. Default: they are kept. Before its first
     /// start they are kept whatever is said here.
     #[must_use]
-    pub const fn while_away(mut self, away: Away) -> Self {
+    pub const fn while_down(mut self, away: DownPolicy) -> Self {
         self.common.away = away;
         self
     }
@@ -141,14 +141,14 @@ pub struct Absence {
     /// The node's own sending side of the application's TID: a life that hangs may have lost its own.
     sender: Sender,
     mailbox: Arc<Mailbox>,
-    away: Away,
+    away: DownPolicy,
     wills: Arc<[Will]>,
     /// Counts ends and returns, so that a late timer does not speak for a later absence.
     turn: Arc<AtomicU64>,
 }
 
 impl Absence {
-    pub(super) fn new(AppWiring { sender, mailbox }: AppWiring, away: Away, wills: Vec<Will>) -> Self {
+    pub(super) fn new(AppWiring { sender, mailbox }: AppWiring, away: DownPolicy, wills: Vec<Will>) -> Self {
         Self { sender, mailbox, away, wills: wills.into(), turn: Arc::default() }
     }
 
@@ -167,15 +167,15 @@ impl Absence {
     /// Its life has ended: its mailbox does as declared, and its last wills are sent, each once. They come after all that
     /// this life has sent in the same class. A will that nobody takes is logged, and counted by the router.
     ///
-    /// Called on a thread of actix's where [`Away::HoldFor`] is used.
+    /// Called on a thread of actix's where [`DownPolicy::HoldFor`] is used.
     pub fn begins(&self, reason: &Reason) {
         // SYNC: Relaxed; begins, ends and the timer between them run on one thread.
         let turn = self.turn.fetch_add(1, Ordering::Relaxed) + 1;
         self.mailbox.forget_events();
         match self.away {
-            Away::Hold => {}
-            Away::Drop => self.mailbox.refuse_while_away(),
-            Away::HoldFor(time) => self.refuse_after(time, turn),
+            DownPolicy::Hold => {}
+            DownPolicy::Drop => self.mailbox.refuse_while_away(),
+            DownPolicy::HoldFor(time) => self.refuse_after(time, turn),
         }
         for will in self.wills.iter().filter(|will| will.applies_to(reason)) {
             if let Err(error) = self.execute(will) {

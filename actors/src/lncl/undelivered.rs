@@ -11,7 +11,7 @@ use sinew_runtime::{
     time::Time,
 };
 
-use super::payload::{Untaken, UntakenEntry};
+use super::payload::{Undelivered, UndeliveredEntry};
 
 /// Destinations and reasons that are told apart between two frames; what comes beyond them is told of no destination.
 pub(super) const ENTRIES_MAX: usize = 16;
@@ -32,7 +32,7 @@ pub(crate) fn is_fault(destination: Tid, why: Rejection) -> bool {
 /// What one client is to be told.
 #[derive(Debug)]
 pub(super) struct Ledger {
-    entries: Vec<UntakenEntry>,
+    entries: Vec<UndeliveredEntry>,
     /// As many as one frame has.
     told_at_once: usize,
     /// Nothing is told before this.
@@ -59,17 +59,17 @@ impl Ledger {
     }
 
     /// What is to be told at `now`, if anything is; it counts as told.
-    pub(super) fn take(&mut self, now: Time) -> Option<Untaken> {
+    pub(super) fn take(&mut self, now: Time) -> Option<Undelivered> {
         if self.entries.is_empty() || self.not_before.is_some_and(|then| now < then) {
             return None;
         }
         self.not_before = Some(now + PAUSE);
         let rest = self.entries.split_off(self.told_at_once.min(self.entries.len()));
-        Some(Untaken { entries: std::mem::replace(&mut self.entries, rest) })
+        Some(Undelivered { entries: std::mem::replace(&mut self.entries, rest) })
     }
 
     /// It could not be told: it is told later, with what comes until then.
-    pub(super) fn put_back(&mut self, untold: Untaken) {
+    pub(super) fn put_back(&mut self, untold: Undelivered) {
         for entry in untold.entries {
             match self.find(Tid::from_bits(entry.to), entry.why) {
                 Some(at) => self.entries[at].count += entry.count,
@@ -83,7 +83,7 @@ impl Ledger {
     }
 
     fn begin(&mut self, destination: Tid, why: u8, now: Time) -> usize {
-        self.entries.push(UntakenEntry { to: destination.bits(), why, count: 0, since: now.as_nanos() });
+        self.entries.push(UndeliveredEntry { to: destination.bits(), why, count: 0, since: now.as_nanos() });
         self.entries.len() - 1
     }
 }
@@ -105,7 +105,7 @@ mod tests {
     }
 
     fn told(ledger: &mut Ledger, now: Time) -> Vec<(u64, u64)> {
-        let told = ledger.take(now).map(|untaken| untaken.entries).unwrap_or_default();
+        let told = ledger.take(now).map(|undelivered| undelivered.entries).unwrap_or_default();
         told.into_iter().map(|entry| (entry.to, entry.count)).collect()
     }
 
@@ -119,9 +119,9 @@ mod tests {
             ledger.count(tid(2), FULL, at(millis));
             assert!(ledger.take(at(millis)).is_none(), "{millis} ms after the first");
         }
-        let untaken = ledger.take(at(100)).expect("its time has come");
-        assert_eq!(untaken.entries[0].since, at(1).as_nanos(), "since the first of these");
-        assert_eq!(untaken.entries.iter().map(|entry| entry.count).collect::<Vec<_>>(), [99, 99]);
+        let undelivered = ledger.take(at(100)).expect("its time has come");
+        assert_eq!(undelivered.entries[0].since, at(1).as_nanos(), "since the first of these");
+        assert_eq!(undelivered.entries.iter().map(|entry| entry.count).collect::<Vec<_>>(), [99, 99]);
         assert!(ledger.take(at(10_000)).is_none(), "nothing was refused since");
     }
 
@@ -175,10 +175,10 @@ mod tests {
 
     #[test]
     fn no_frame_is_longer_than_it_is_counted() {
-        let longest = || UntakenEntry { to: u64::MAX, why: u8::MAX, count: u64::MAX, since: u64::MAX };
+        let longest = || UndeliveredEntry { to: u64::MAX, why: u8::MAX, count: u64::MAX, since: u64::MAX };
         for entries in [0, 1, 15, 16, ENTRIES_MAX + 11] {
-            let untaken = Untaken { entries: (0..entries).map(|_| longest()).collect() };
-            let bytes = rmp_serde::to_vec_named(&untaken).unwrap().len();
+            let undelivered = Undelivered { entries: (0..entries).map(|_| longest()).collect() };
+            let bytes = rmp_serde::to_vec_named(&undelivered).unwrap().len();
             assert!(bytes <= FRAME_BYTES + entries * ENTRY_BYTES, "{entries} entries have {bytes} bytes");
         }
     }

@@ -17,7 +17,7 @@ use super::{ApiError, link::loan::InRing};
 /// dropped, it was never there, and so it is when the process is killed.
 ///
 /// **An endpoint lends one message at a time, and until that is sent or dropped nothing else goes out of it**: to create
-/// another, to send, ask, reply, resolve, join and leave are refused with [`ApiError::Lent`], whatever carries the messages, and
+/// another, to send, ask, reply, resolve, join and leave are refused with [`ApiError::LoanActive`], whatever carries the messages, and
 /// so is to unregister, which gives the address back all the same. To receive goes on. What is said of received messages
 /// may wait. So keep it no longer than it takes to write it.
 ///
@@ -26,7 +26,7 @@ use super::{ApiError, link::loan::InRing};
 /// [`is_in_place`](Self::is_in_place) says which. After a restart of the node it is copied to the node's next life.
 #[derive(Debug)]
 #[must_use = "memory that is dropped is not sent"]
-pub struct LentMessage {
+pub struct LoanedMessage {
     header: Header,
     memory: Memory,
     /// Over when the memory has been given back.
@@ -52,7 +52,7 @@ impl Lender {
 
     /// Whether nothing is lent.
     pub(super) fn be_free(&self) -> Result<(), ApiError> {
-        if Arc::strong_count(&self.0) > 1 { Err(ApiError::Lent) } else { Ok(()) }
+        if Arc::strong_count(&self.0) > 1 { Err(ApiError::LoanActive) } else { Ok(()) }
     }
 }
 
@@ -62,7 +62,7 @@ enum Memory {
     InRing(InRing),
 }
 
-impl LentMessage {
+impl LoanedMessage {
     /// In a ring if there is room, else in memory of its own.
     pub(super) fn new(loan: Loan, header: Header, room: Option<InRing>, length: usize) -> Self {
         let own = || Memory::Own(MessageBuffer::new(header, length));
@@ -84,7 +84,7 @@ impl LentMessage {
     }
 }
 
-impl Deref for LentMessage {
+impl Deref for LoanedMessage {
     type Target = [u8];
 
     fn deref(&self) -> &[u8] {
@@ -95,7 +95,7 @@ impl Deref for LentMessage {
     }
 }
 
-impl DerefMut for LentMessage {
+impl DerefMut for LoanedMessage {
     fn deref_mut(&mut self) -> &mut [u8] {
         match &mut self.memory {
             Memory::Own(buffer) => buffer,
@@ -148,10 +148,10 @@ impl From<Message> for Draft {
     }
 }
 
-impl From<LentMessage> for Draft {
-    fn from(lent: LentMessage) -> Self {
+impl From<LoanedMessage> for Draft {
+    fn from(lent: LoanedMessage) -> Self {
         // What its own sending does not wait for.
-        let LentMessage { header, memory, _loan: _ } = lent;
+        let LoanedMessage { header, memory, _loan: _ } = lent;
         let payload = match memory {
             Memory::Own(buffer) => Content::Bytes(buffer.freeze().payload),
             Memory::InRing(room) => Content::InRing(room),

@@ -18,7 +18,7 @@ const LOG_AGAIN: Duration = Duration::from_secs(10);
 
 /// Messages of one endpoint to one destination that were sent without asking for their outcome, and that nobody has taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Untaken {
+pub struct Undelivered {
     /// Whom they were for; [`Tid::NONE`]: several that are not told apart any more. This endpoint itself, too: what others
     /// have sent to it, or to a group of its, and it had no room for while it waited for an answer.
     pub destination: Tid,
@@ -33,7 +33,7 @@ pub struct Untaken {
 /// What the node has said, until the application looks.
 #[derive(Debug, Default)]
 pub(super) struct Refusals {
-    entries: Vec<Untaken>,
+    entries: Vec<Undelivered>,
     /// Messages that this endpoint has refused and that no line in the log tells of yet.
     unlogged: u64,
     logged: Option<Time>,
@@ -41,7 +41,7 @@ pub(super) struct Refusals {
 
 impl Refusals {
     /// The node says this.
-    pub(super) fn hear(&mut self, said: &payload::Untaken) {
+    pub(super) fn hear(&mut self, said: &payload::Undelivered) {
         for entry in &said.entries {
             // What a later node gives as a reason that this version does not know is a refusal all the same.
             let why = match Outcome::from_code(entry.why) {
@@ -50,14 +50,14 @@ impl Refusals {
             };
             let since = Time::from_nanos(entry.since);
             let destination = Tid::from_bits(entry.to);
-            self.add(Untaken { destination, why, count: entry.count, since });
+            self.add(Undelivered { destination, why, count: entry.count, since });
         }
     }
 
     /// This endpoint, `own`, has refused so many, and nobody was told.
     pub(super) fn count_own(&mut self, own: Tid, count: u64, now: Time) {
         if count > 0 {
-            self.add(Untaken { destination: own, why: Rejection::QueueFull, count, since: now });
+            self.add(Undelivered { destination: own, why: Rejection::QueueFull, count, since: now });
         }
         self.unlogged = self.unlogged.saturating_add(count);
         if self.unlogged > 0 && self.logged.is_none_or(|logged| now >= logged + LOG_AGAIN) {
@@ -72,13 +72,13 @@ impl Refusals {
     }
 
     /// So many more.
-    pub(super) fn add(&mut self, untaken: Untaken) {
-        let known = self.find(untaken.destination, untaken.why);
+    pub(super) fn add(&mut self, undelivered: Undelivered) {
+        let known = self.find(undelivered.destination, undelivered.why);
         let is_full = self.entries.len() >= ENTRIES_MAX;
-        let destination = if known.is_none() && is_full { Tid::NONE } else { untaken.destination };
-        match known.or_else(|| self.find(destination, untaken.why)) {
-            Some(at) => self.entries[at].count = self.entries[at].count.saturating_add(untaken.count),
-            None => self.entries.push(Untaken { destination, ..untaken }),
+        let destination = if known.is_none() && is_full { Tid::NONE } else { undelivered.destination };
+        match known.or_else(|| self.find(destination, undelivered.why)) {
+            Some(at) => self.entries[at].count = self.entries[at].count.saturating_add(undelivered.count),
+            None => self.entries.push(Undelivered { destination, ..undelivered }),
         }
     }
 
@@ -87,7 +87,7 @@ impl Refusals {
     }
 
     /// The oldest.
-    fn take(&mut self) -> Option<Untaken> {
+    fn take(&mut self) -> Option<Undelivered> {
         (!self.entries.is_empty()).then(|| self.entries.remove(0))
     }
 }
@@ -104,7 +104,7 @@ impl Endpoint {
     /// What this endpoint itself has refused without anybody's being told is counted here too, with itself as the destination.
     ///
     /// Whoever needs to know it of one message sends that one [confirmed](Self::send_confirmed).
-    pub fn untaken(&mut self) -> Option<Untaken> {
+    pub fn take_undelivered(&mut self) -> Option<Undelivered> {
         // An error shows itself again when messages are received.
         let _ = self.take_in(None, WhenFull::Leave, Time::now());
         self.refusals.take()
@@ -121,8 +121,10 @@ mod tests {
         Tid::new(NodeAddress::new(1), AppAddress::new(app))
     }
 
-    fn said(to: Tid, why: u8, count: u64) -> payload::Untaken {
-        payload::Untaken { entries: vec![payload::UntakenEntry { to: to.bits(), why, count, since: count }] }
+    fn said(to: Tid, why: u8, count: u64) -> payload::Undelivered {
+        payload::Undelivered {
+            entries: vec![payload::UndeliveredEntry { to: to.bits(), why, count, since: count }],
+        }
     }
 
     #[test]
@@ -132,10 +134,14 @@ mod tests {
         refusals.hear(&said(tid(1), full, 3));
         refusals.hear(&said(tid(2), full, 1));
         refusals.hear(&said(tid(1), full, 4));
-        let expected =
-            Untaken { destination: tid(1), why: Rejection::QueueFull, count: 7, since: Time::from_nanos(3) };
+        let expected = Undelivered {
+            destination: tid(1),
+            why: Rejection::QueueFull,
+            count: 7,
+            since: Time::from_nanos(3),
+        };
         assert_eq!(refusals.take(), Some(expected), "since the first");
-        assert_eq!(refusals.take().map(|untaken| untaken.destination), Some(tid(2)));
+        assert_eq!(refusals.take().map(|undelivered| undelivered.destination), Some(tid(2)));
         assert_eq!(refusals.take(), None);
     }
 
@@ -150,7 +156,7 @@ mod tests {
         assert_eq!((refusals.unlogged, refusals.logged), (2, Some(at(2))), "the log says it of the first 5");
         refusals.count_own(tid(1), 0, at(12));
         assert_eq!((refusals.unlogged, refusals.logged), (0, Some(at(12))));
-        let expected = Untaken { destination: tid(1), why: Rejection::QueueFull, count: 7, since: at(2) };
+        let expected = Undelivered { destination: tid(1), why: Rejection::QueueFull, count: 7, since: at(2) };
         assert_eq!((refusals.take(), refusals.take()), (Some(expected), None));
     }
 
@@ -161,6 +167,9 @@ mod tests {
             refusals.hear(&said(tid(app), (app % 256) as u8, 1));
         }
         assert!(refusals.entries.len() <= ENTRIES_MAX + 12, "{} entries", refusals.entries.len());
-        assert_eq!(std::iter::from_fn(|| refusals.take()).map(|untaken| untaken.count).sum::<u64>(), 1_000);
+        assert_eq!(
+            std::iter::from_fn(|| refusals.take()).map(|undelivered| undelivered.count).sum::<u64>(),
+            1_000
+        );
     }
 }

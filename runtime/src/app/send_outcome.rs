@@ -11,26 +11,26 @@ use crate::{
     wire::Payload,
 };
 
-/// What became of a message that was sent with [`AppContext::send_told`].
+/// What became of a message that was sent with [`AppContext::send_with_tag`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Told {
+pub struct SendOutcome {
     /// The number that its sender gave it.
     pub tag: u64,
     /// Its fate.
     pub outcome: Outcome,
 }
 
-impl Message for Told {
+impl Message for SendOutcome {
     type Result = ();
 }
 
 impl<A: Actor<Context = Self>> AppContext<A> {
-    /// Sends a value; what becomes of it comes to this actor as a [`Told`] with `tag`, once, in a turn of its own. Else as
+    /// Sends a value; what becomes of it comes to this actor as a [`SendOutcome`] with `tag`, once, in a turn of its own. Else as
     /// [`send_confirmed`](Self::send_confirmed), its longest `within` included. The next life of the application is not told.
     ///
     /// # Errors
-    /// Nobody took it; no `Told` comes.
-    pub fn send_told<'a, P: Payload>(
+    /// Nobody took it; no `SendOutcome` comes.
+    pub fn send_with_tag<'a, P: Payload>(
         &mut self,
         to: impl Into<Destination<'a>>,
         value: &P,
@@ -38,11 +38,11 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         tag: u64,
     ) -> Result<(), SendError>
     where
-        A: Handler<Told, Result = ()>,
+        A: Handler<SendOutcome, Result = ()>,
     {
         let confirmation = self.send_confirmed(to, value, within)?;
         let told = fut::wrap_future::<_, A>(confirmation)
-            .map(move |outcome, actor, context| actor.handle(Told { tag, outcome }, context));
+            .map(move |outcome, actor, context| actor.handle(SendOutcome { tag, outcome }, context));
         self.spawn(told);
         Ok(())
     }

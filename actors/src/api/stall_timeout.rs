@@ -10,39 +10,39 @@ use super::ApiError;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Limit {
     /// Time in which the peer takes nothing; `None` if it does not matter what it takes.
-    patience: Option<Duration>,
+    stall_timeout: Option<Duration>,
     /// Time in all.
     in_all: Duration,
 }
 
 impl Limit {
     /// As long as the peer goes on taking, and then so much longer.
-    pub(super) const fn patience(patience: Duration) -> Self {
-        Self { patience: Some(patience), in_all: Duration::MAX }
+    pub(super) const fn stall_timeout(stall_timeout: Duration) -> Self {
+        Self { stall_timeout: Some(stall_timeout), in_all: Duration::MAX }
     }
 
     /// So long at most, whatever the peer takes. Zero: not at all.
     pub(super) const fn in_all(within: Duration) -> Self {
-        Self { patience: None, in_all: within }
+        Self { stall_timeout: None, in_all: within }
     }
 
     /// The same, and so long at most.
     pub(super) const fn and_in_all(self, within: Duration) -> Self {
-        Self { patience: self.patience, in_all: within }
+        Self { stall_timeout: self.stall_timeout, in_all: within }
     }
 
     /// Whether the caller has said how long it takes in all, whatever the peer takes.
     pub(super) const fn is_in_all(&self) -> bool {
-        self.patience.is_none()
+        self.stall_timeout.is_none()
     }
 
     /// Whether it leaves `time` for something else than room: what is only to be tried at once does not, nor what ends before.
     pub(super) fn leaves(&self, time: Duration) -> bool {
-        self.patience.is_some() && self.in_all >= time
+        self.stall_timeout.is_some() && self.in_all >= time
     }
 
     fn patience_from(&self, now: Time) -> Time {
-        self.patience.map_or(Time::MAX, |patience| now + patience)
+        self.stall_timeout.map_or(Time::MAX, |stall_timeout| now + stall_timeout)
     }
 }
 
@@ -59,14 +59,19 @@ pub(super) struct Waiting {
 
 impl Waiting {
     pub(super) fn new(limit: Limit) -> Self {
-        Self { limit, told: limit.patience.unwrap_or(limit.in_all).min(limit.in_all), end: None, turn: None }
+        Self {
+            limit,
+            told: limit.stall_timeout.unwrap_or(limit.in_all).min(limit.in_all),
+            end: None,
+            turn: None,
+        }
     }
 
-    /// The same where the peer, as far as is known, has taken nothing since another one's patience was over: that was the
+    /// The same where the peer, as far as is known, has taken nothing since another one's stall timeout was over: that was the
     /// time for all. Who has said a time in all has it.
     pub(super) fn after_a_stall(limit: Limit) -> Self {
-        let patience = limit.patience.map(|_| Duration::ZERO);
-        Self { limit: Limit { patience, in_all: limit.in_all }, ..Self::new(limit) }
+        let stall_timeout = limit.stall_timeout.map(|_| Duration::ZERO);
+        Self { limit: Limit { stall_timeout, in_all: limit.in_all }, ..Self::new(limit) }
     }
 
     /// Until when to wait; `None` if it has lasted long enough. `taken`: a count of what the peer takes, which starts its
@@ -87,7 +92,7 @@ impl Waiting {
         self.turn.is_some()
     }
 
-    /// Whether the peer has taken nothing for as long as the patience lasts.
+    /// Whether the peer has taken nothing for as long as the stall timeout lasts.
     pub(super) fn is_out_of_patience(&self, now: Time) -> bool {
         !self.limit.is_in_all() && self.turn.is_some_and(|(_, until)| now >= until)
     }
@@ -110,7 +115,7 @@ mod tests {
 
     #[test]
     fn patience_lasts_for_the_time_in_which_the_peer_takes_nothing() {
-        let mut waiting = Waiting::new(Limit::patience(SECOND));
+        let mut waiting = Waiting::new(Limit::stall_timeout(SECOND));
         assert_eq!(waiting.until(7, at(0)), Some(at(1_000)));
         assert_eq!(waiting.until(7, at(999)), Some(at(1_000)));
         // It takes a little each time.
@@ -125,7 +130,7 @@ mod tests {
 
     #[test]
     fn what_was_taken_just_before_the_end_begins_the_time_anew() {
-        let mut waiting = Waiting::new(Limit::patience(SECOND));
+        let mut waiting = Waiting::new(Limit::stall_timeout(SECOND));
         assert_eq!(waiting.until(0, at(0)), Some(at(1_000)));
         assert_eq!(waiting.until(1, at(1_000)), Some(at(2_000)));
         assert_eq!(waiting.until(1, at(2_000)), None);
@@ -137,7 +142,7 @@ mod tests {
         assert_eq!(waiting.until(0, at(0)), Some(at(1_000)));
         assert_eq!(waiting.until(1, at(999)), Some(at(1_000)));
         assert_eq!(waiting.until(2, at(1_000)), None);
-        let mut both = Waiting::new(Limit::patience(SECOND).and_in_all(SECOND / 2));
+        let mut both = Waiting::new(Limit::stall_timeout(SECOND).and_in_all(SECOND / 2));
         assert_eq!(both.until(0, at(0)), Some(at(500)));
         assert_eq!(both.until(1, at(500)), None);
     }
@@ -145,7 +150,7 @@ mod tests {
     #[test]
     fn no_time_is_no_wait_at_all() {
         assert_eq!(Waiting::new(Limit::in_all(Duration::ZERO)).until(0, at(5)), None);
-        assert_eq!(Waiting::after_a_stall(Limit::patience(SECOND)).until(0, at(5)), None);
+        assert_eq!(Waiting::after_a_stall(Limit::stall_timeout(SECOND)).until(0, at(5)), None);
     }
 
     #[test]
@@ -154,7 +159,7 @@ mod tests {
         assert_eq!(waiting.until(0, at(0)), Some(at(1_000)));
         assert_eq!(waiting.until(0, at(1_000)), None);
         assert!(!waiting.is_out_of_patience(at(1_000)), "others may have more");
-        let mut waiting = Waiting::new(Limit::patience(SECOND).and_in_all(SECOND / 2));
+        let mut waiting = Waiting::new(Limit::stall_timeout(SECOND).and_in_all(SECOND / 2));
         assert_eq!((waiting.until(0, at(0)), waiting.until(0, at(500))), (Some(at(500)), None));
         assert!(!waiting.is_out_of_patience(at(500)) && waiting.is_out_of_patience(at(1_000)));
     }
@@ -164,7 +169,7 @@ mod tests {
         let mut waiting = Waiting::new(Limit::in_all(Duration::MAX));
         assert_eq!(waiting.until(0, at(5)), Some(Time::MAX));
         assert_eq!(waiting.until(0, at(1 << 40)), Some(Time::MAX));
-        let endless = Limit::patience(Duration::MAX);
+        let endless = Limit::stall_timeout(Duration::MAX);
         assert!(!endless.is_in_all(), "it may take the time to come back to a node");
         assert_eq!(Waiting::new(endless).until(0, at(5)), Some(Time::MAX));
     }
