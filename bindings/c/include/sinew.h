@@ -1064,7 +1064,7 @@ sinew_status sinew_receive_message(struct sinew_endpoint *endpoint,
  * of each class, 4 MiB and one message), is counted with its own TID as the destination. The endpoint's thread.
  */
 sinew_status sinew_next_undelivered(struct sinew_endpoint *endpoint,
-                                struct sinew_undelivered *undelivered);
+                                    struct sinew_undelivered *undelivered);
 
 /**
  * Says what became of a message in hand, which its sender is told if it asked, and gives its memory back. `outcome` is
