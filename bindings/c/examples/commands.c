@@ -16,11 +16,11 @@
 #define MS UINT64_C(1000000)
 #define SECOND UINT64_C(1000000000)
 
-/* What Rust writes: a map of one field (0x81), its name (0xa0 + 13), a float32 (0xca), most significant byte first. Between
- * programs in C a plain struct will do. */
-static const unsigned char torque_head[] = "\x81\xadnewton_metres\xca";
-#define HEAD (sizeof torque_head - 1)
-#define TORQUE_LENGTH (HEAD + 4)
+/* The command: a map of one field, five bytes and the field's name long. */
+struct torque { float newton_metres; };
+static const sinew_field torque_fields[] = { SINEW_FIELD(struct torque, newton_metres) };
+static const sinew_payload_type torque_payload = SINEW_PAYLOAD("demo.commanded_torque", SINEW_STREAM, struct torque, torque_fields);
+#define TORQUE_LENGTH (1 + 1 + sizeof "newton_metres" - 1 + 5)
 
 /* Whether something has failed; then it says what. */
 static bool is_error(sinew_status status)
@@ -62,16 +62,13 @@ static int control(sinew_endpoint *endpoint, long count)
 {
     const sinew_protected_type type = torque_type();
     const sinew_tid drive = await_name(endpoint, SINEW_TEXT("knee.drive"));
-    const float newton_metres = 2.5f;
-    unsigned char torque[TORQUE_LENGTH];
+    const struct torque torque = { 2.5f };
+    unsigned char bytes[TORQUE_LENGTH];
     sinew_received received;
-    uint32_t bits;
-    memcpy(torque, torque_head, HEAD);
-    memcpy(&bits, &newton_metres, sizeof bits);
-    for (int byte = 0; byte < 4; byte++)
-        torque[HEAD + (size_t)byte] = (unsigned char)(bits >> (24 - 8 * byte));
+    size_t length;
+    check(sinew_encode_value(&torque_payload, &torque, bytes, sizeof bytes, &length));
     for (long sent = 0; sent < count; sent++) {
-        check(sinew_send_protected(endpoint, drive, &type, torque, sizeof torque));
+        check(sinew_send_protected(endpoint, drive, &type, bytes, length));
         /* What the drive wants quoted comes here, and is not for us. */
         if (check(sinew_receive_message(endpoint, 20 * MS, &received)) == SINEW_OK)
             check(sinew_settle_message(endpoint, &received, SINEW_DELIVERED));
@@ -95,25 +92,16 @@ static void move(void *output, void *argument)
     ((struct motor *)output)->newton_metres = *(const float *)argument;
 }
 
-static float torque_of(const unsigned char *bytes)
-{
-    uint32_t bits = (uint32_t)bytes[0] << 24 | (uint32_t)bytes[1] << 16 | (uint32_t)bytes[2] << 8 | bytes[3];
-    float torque;
-    memcpy(&torque, &bits, sizeof torque);
-    return torque;
-}
-
 static sinew_status follow(sinew_guard *guard, const sinew_received *command)
 {
     sinew_status status;
-    float torque;
+    struct torque torque;
     /* It is what was sealed, and nothing that we can read: the guard knows its length alone, and takes it for a good one. */
-    if (command->length != TORQUE_LENGTH || memcmp(command->bytes, torque_head, HEAD) != 0)
+    if (is_error(sinew_decode_value(&torque_payload, command->bytes, command->length, &torque)))
         return sinew_trip(guard);
-    torque = torque_of(command->bytes + HEAD);
-    status = sinew_apply(guard, move, &torque, NULL);
+    status = sinew_apply(guard, move, &torque.newton_metres, NULL);
     if (status == SINEW_OK) {
-        printf("moved by %.1f Nm\n", (double)torque);
+        printf("moved by %.1f Nm\n", (double)torque.newton_metres);
         fflush(stdout);
     }
     return status;

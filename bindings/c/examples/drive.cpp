@@ -4,11 +4,12 @@
 #include <cstdio>
 
 struct joint_angle { float degrees; std::uint32_t number; };
+SINEW_PAYLOAD(joint_angle, "demo.joint_angle", SINEW_STREAM, degrees, number)
 struct drive_report { float degrees; std::uint32_t number; };
+SINEW_PAYLOAD(drive_report, "demo.drive_report", SINEW_CONTROL, degrees, number)
 
 int main(int argc, char **argv) try {
     using namespace std::chrono_literals;
-    const auto angle_kind = sinew::kind_named("demo.joint_angle"), report_kind = sinew::kind_named("demo.drive_report");
     sinew::options options;
     options.name = "knee.drive";
     sinew::endpoint drive(argc > 1 ? argv[1] : "", options);
@@ -16,11 +17,10 @@ int main(int argc, char **argv) try {
     std::fflush(stdout);
     drive_report report{};
     for (auto patience = 30s; auto message = drive.receive(patience); patience = 2s) {
-        auto angle = message->as<joint_angle>();
-        if (message->kind() == angle_kind && angle && angle->number > report.number) // Control overtakes Stream
+        if (auto angle = message->as<joint_angle>(); angle && angle->number > report.number) // Control overtakes Stream
             report = {angle->degrees, angle->number};
-        if (message->kind() == report_kind && message->wants_reply())
-            drive.reply(*message, report_kind, report);
+        if (message->wants_reply())
+            drive.reply(*message, drive.create(message->source(), report));
     }
     std::printf("last angle was number %u\n", static_cast<unsigned>(report.number));
 } catch (const sinew::error &error) {

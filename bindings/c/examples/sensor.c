@@ -14,9 +14,14 @@
 
 #define SECOND UINT64_C(1000000000)
 
-/* What goes over: the same numbers, in the same order, without gaps, in every program. */
+/* The types of payloads: a struct, the table of its fields, and the name and class that go with them. */
 struct joint_angle { float degrees; uint32_t number; };
+static const sinew_field angle_fields[] = { SINEW_FIELD(struct joint_angle, degrees), SINEW_FIELD(struct joint_angle, number) };
+static const sinew_payload_type angle_type = SINEW_PAYLOAD("demo.joint_angle", SINEW_STREAM, struct joint_angle, angle_fields);
+
 struct drive_report { float degrees; uint32_t number; };
+static const sinew_field report_fields[] = { SINEW_FIELD(struct drive_report, degrees), SINEW_FIELD(struct drive_report, number) };
+static const sinew_payload_type report_type = SINEW_PAYLOAD("demo.drive_report", SINEW_CONTROL, struct drive_report, report_fields);
 
 /* A program that controls something does not go on after an error. */
 static void check(sinew_status status, const char *what)
@@ -31,10 +36,8 @@ static void send_angle(sinew_endpoint *sensor, sinew_tid drive, uint32_t number)
 {
     struct joint_angle angle = { 30.0f * sinf((float)number / 100.0f), number };
     sinew_message message;
-    sinew_kind kind = sinew_kind_named(SINEW_TEXT("demo.joint_angle"));
-    check(sinew_create_message(sensor, drive, kind, SINEW_STREAM, sizeof angle, &message), "create");
-    /* Into the memory that the drive's side reads: sending copies nothing. */
-    memcpy(message.bytes, &angle, sizeof angle);
+    /* Written into the memory that the drive's side reads: sending copies nothing. */
+    check(sinew_create_value(sensor, drive, &angle_type, &angle, &message), "create");
     check(sinew_send_message(sensor, &message), "send");
 }
 
@@ -46,24 +49,20 @@ static struct drive_report ask_report(sinew_endpoint *sensor, sinew_tid drive)
     sinew_kind kind = sinew_kind_named(SINEW_TEXT("demo.drive_report"));
     check(sinew_create_message(sensor, drive, kind, SINEW_CONTROL, 0, &request), "create");
     check(sinew_ask(sensor, &request, 10 * SECOND, &reply, NULL), "ask");
-    if (reply.length != sizeof report) {
-        fprintf(stderr, "the drive's report has %zu bytes\n", reply.length);
-        exit(EXIT_FAILURE);
-    }
-    memcpy(&report, reply.bytes, sizeof report);
+    check(sinew_read_value(&reply, &report_type, &report), "read the report");
     check(sinew_settle_message(sensor, &reply, SINEW_DELIVERED), "settle");
     return report;
 }
 
-/* Of a stream only the newest value counts, so the last one is sent again as one that is confirmed. */
+/* Of a stream only the newest value counts, so the last one is sent again in class Control, which can be confirmed. */
 static void send_last(sinew_endpoint *sensor, sinew_tid drive, uint32_t number)
 {
     struct joint_angle angle = { 0.0f, number };
     sinew_message message;
     sinew_outcome outcome;
-    sinew_kind kind = sinew_kind_named(SINEW_TEXT("demo.joint_angle"));
-    check(sinew_create_message(sensor, drive, kind, SINEW_CONTROL, sizeof angle, &message), "create");
-    memcpy(message.bytes, &angle, sizeof angle);
+    sinew_payload_type confirmed = angle_type;
+    confirmed.message_class = SINEW_CONTROL;
+    check(sinew_create_value(sensor, drive, &confirmed, &angle, &message), "create");
     check(sinew_send_message_confirmed(sensor, &message, 10 * SECOND, &outcome), "send confirmed");
     printf("last angle: %s\n", sinew_outcome_text(outcome));
 }

@@ -62,6 +62,23 @@
 #define SINEW_TID_TEXT 32
 
 /**
+ * For `flags` of `sinew_field`: the field is an array; without `SINEW_FIELD_COUNTED` all of its elements are written and wanted.
+ */
+#define SINEW_FIELD_ARRAY 1
+
+/**
+ * For `flags` of `sinew_field`: a `size_t` at `extra_offset` says how many elements of the array are in use. Without it an array
+ * has as many elements as fit.
+ */
+#define SINEW_FIELD_COUNTED 2
+
+/**
+ * For `flags` of `sinew_field`: a `bool` at `extra_offset` says whether the field has a value. It is `null` without one, and may be
+ * missing in what is read. Rust's `Option`.
+ */
+#define SINEW_FIELD_OPTIONAL 4
+
+/**
  * For `flags` of `sinew_barrier`: does not wait for the return of a party that is asked for by its name and has failed, was
  * stopped, or whose node is lost. Then `sinew_meet` returns `SINEW_ERROR_PARTY_LOST`.
  */
@@ -464,6 +481,79 @@ typedef int32_t sinew_message_class;
 #endif // __cplusplus
 
 /**
+ * The type of a field, and of the elements of one that is an array. C has `SINEW_FIELD`, which finds it by itself.
+ */
+enum sinew_field_type
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : uint32_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+    /**
+     * `bool`.
+     */
+    SINEW_TYPE_BOOL = 1,
+    /**
+     * `int8_t`.
+     */
+    SINEW_TYPE_I8 = 2,
+    /**
+     * `int16_t`.
+     */
+    SINEW_TYPE_I16 = 3,
+    /**
+     * `int32_t`.
+     */
+    SINEW_TYPE_I32 = 4,
+    /**
+     * `int64_t`.
+     */
+    SINEW_TYPE_I64 = 5,
+    /**
+     * `uint8_t`.
+     */
+    SINEW_TYPE_U8 = 6,
+    /**
+     * `uint16_t`.
+     */
+    SINEW_TYPE_U16 = 7,
+    /**
+     * `uint32_t`.
+     */
+    SINEW_TYPE_U32 = 8,
+    /**
+     * `uint64_t`.
+     */
+    SINEW_TYPE_U64 = 9,
+    /**
+     * `float`.
+     */
+    SINEW_TYPE_F32 = 10,
+    /**
+     * `double`.
+     */
+    SINEW_TYPE_F64 = 11,
+    /**
+     * An array of `char`: UTF-8 that ends with a zero.
+     */
+    SINEW_TYPE_TEXT = 12,
+    /**
+     * An array of `uint8_t` that is written as bytes, not as a list of numbers.
+     */
+    SINEW_TYPE_BYTES = 13,
+    /**
+     * A struct that has a table of its own.
+     */
+    SINEW_TYPE_STRUCT = 14,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum sinew_field_type sinew_field_type;
+#else
+typedef uint32_t sinew_field_type;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+/**
  * An endpoint: a transport address of this process. Only pointers to it are handed out.
  */
 typedef struct sinew_endpoint sinew_endpoint;
@@ -672,6 +762,77 @@ typedef struct sinew_undelivered {
      */
     uint32_t reserved;
 } sinew_undelivered;
+
+/**
+ * A field of a struct. C: one of the macros `SINEW_FIELD`, `SINEW_FIELD_LIST`, `SINEW_FIELD_MAYBE`, `SINEW_FIELD_STRUCT`,
+ * `SINEW_FIELD_STRUCTS`, `SINEW_FIELD_BYTES`. C++: `SINEW_PAYLOAD` and `SINEW_STRUCT` of sinew.hpp write the whole table.
+ */
+typedef struct sinew_field {
+    /**
+     * Its name in the payload, a C string.
+     */
+    const char *name;
+    /**
+     * Where it is in the struct, in bytes.
+     */
+    size_t offset;
+    /**
+     * Its length in bytes, with all elements of an array.
+     */
+    size_t size;
+    /**
+     * Where its count or its `bool` is: see `flags`.
+     */
+    size_t extra_offset;
+    /**
+     * The table of its struct, for `SINEW_TYPE_STRUCT`; else NULL.
+     */
+    const struct sinew_layout *layout;
+    /**
+     * One of `sinew_field_type`.
+     */
+    uint32_t field_type;
+    /**
+     * `SINEW_FIELD_ARRAY`, `SINEW_FIELD_COUNTED`, `SINEW_FIELD_OPTIONAL`.
+     */
+    uint32_t flags;
+} sinew_field;
+
+/**
+ * The table of a struct's fields. C: `SINEW_LAYOUT`.
+ */
+typedef struct sinew_layout {
+    /**
+     * Its fields, 64 at most.
+     */
+    const struct sinew_field *fields;
+    /**
+     * How many there are.
+     */
+    size_t fields_count;
+    /**
+     * Length of the struct in bytes.
+     */
+    size_t size;
+} sinew_layout;
+
+/**
+ * A type of payloads: its name, the class in which it is sent, and its fields. C: `SINEW_PAYLOAD`.
+ */
+typedef struct sinew_payload_type {
+    /**
+     * Its name, the same in every program and language.
+     */
+    struct sinew_text name;
+    /**
+     * One of `sinew_message_class`.
+     */
+    int32_t message_class;
+    /**
+     * Its fields.
+     */
+    struct sinew_layout layout;
+} sinew_payload_type;
 
 /**
  * A barrier: where several applications, on any nodes, wait for each other. It need not be made, and can be used again and
@@ -1076,6 +1237,47 @@ sinew_status sinew_settle_message(struct sinew_endpoint *endpoint,
                                   int32_t outcome);
 
 /**
+ * Creates a message with a typed value: `*value` is a struct of this type. Its class is the type's, its bytes are MessagePack with the
+ * names of the fields, which Rust reads as the `payload!` of the same name. Hand it to any function that sends, as one of
+ * `sinew_create_message`. `SINEW_ERROR_INVALID_ARGUMENT` with the field's name where the value cannot be written: a text that is
+ * not UTF-8, a count above the array. Does not block. The endpoint's thread.
+ */
+sinew_status sinew_create_value(struct sinew_endpoint *endpoint,
+                                sinew_tid destination,
+                                const struct sinew_payload_type *payload_type,
+                                const void *value,
+                                struct sinew_message *message);
+
+/**
+ * Reads a received message as a typed value: `*value` is a struct of this type, which is written if this returns `SINEW_OK`.
+ * `SINEW_NOTHING` if the message is of another kind. `SINEW_ERROR_MALFORMED` with the field's name if it cannot be read: a field
+ * that is missing, of another type, or whose value does not fit. Settle the message then as `SINEW_REJECTED_MALFORMED`. Fields
+ * that the type does not have are skipped. Any thread.
+ */
+sinew_status sinew_read_value(const struct sinew_received *received,
+                              const struct sinew_payload_type *payload_type,
+                              void *value);
+
+/**
+ * Writes a typed value as MessagePack to `bytes`, which has room for `room` bytes, for a protected payload, a file, or a bus of
+ * your own. `*length` is the length that the value has, also where this returns `SINEW_ERROR_TOO_LONG`, since there is less
+ * room. `bytes` may be NULL if `room` is 0. Any thread.
+ */
+sinew_status sinew_encode_value(const struct sinew_payload_type *payload_type,
+                                const void *value,
+                                uint8_t *bytes,
+                                size_t room,
+                                size_t *length);
+
+/**
+ * Reads a typed value from MessagePack, as `sinew_read_value` does from a message. Any thread.
+ */
+sinew_status sinew_decode_value(const struct sinew_payload_type *payload_type,
+                                const uint8_t *bytes,
+                                size_t length,
+                                void *value);
+
+/**
  * Arrives at a barrier and waits until all parties have, `within_ns` of the barrier at most. `*generation` is how often the barrier
  * has opened then, the same number for all that went on together (of a phase 1); `generation` may be NULL. What comes meanwhile waits
  * to be received. `SINEW_ERROR_NOT_MET`: not all came in time; `SINEW_ERROR_PARTY_LOST`: one was lost and was not to be waited for;
@@ -1271,5 +1473,41 @@ static inline sinew_text sinew_text_of(const char *string)
     text.length = string ? strlen(string) : 0;
     return text;
 }
+
+/* Tables of fields, for sinew_create_value and sinew_read_value. In C++ take SINEW_PAYLOAD and SINEW_STRUCT of sinew.hpp.
+ *
+ *   struct torque { double newton_metres; uint32_t number; float gains[3]; char mode[16]; };
+ *   static const sinew_field torque_fields[] = {
+ *       SINEW_FIELD(struct torque, newton_metres), SINEW_FIELD(struct torque, number),
+ *       SINEW_FIELD(struct torque, gains), SINEW_FIELD(struct torque, mode) };
+ *   static const sinew_payload_type torque_type = SINEW_PAYLOAD("knee.torque", SINEW_STREAM, struct torque, torque_fields);
+ */
+#ifndef __cplusplus
+
+#define SINEW_MEMBER(type, member) (((type *)0)->member)
+#define SINEW_INT_TYPE(is_signed, size) ((size) == 1 ? ((is_signed) ? SINEW_TYPE_I8 : SINEW_TYPE_U8) : (size) == 2 ? ((is_signed) ? SINEW_TYPE_I16 : SINEW_TYPE_U16) : (size) == 4 ? ((is_signed) ? SINEW_TYPE_I32 : SINEW_TYPE_U32) : ((is_signed) ? SINEW_TYPE_I64 : SINEW_TYPE_U64))
+/* A type that is not in this list, a lone `char` or a pointer for one, is an error of the compiler. */
+#define SINEW_TYPE_OF(value) _Generic((value), bool: SINEW_TYPE_BOOL, bool *: SINEW_TYPE_BOOL, float: SINEW_TYPE_F32, float *: SINEW_TYPE_F32, double: SINEW_TYPE_F64, double *: SINEW_TYPE_F64, char *: SINEW_TYPE_TEXT, signed char: SINEW_TYPE_I8, signed char *: SINEW_TYPE_I8, unsigned char: SINEW_TYPE_U8, unsigned char *: SINEW_TYPE_U8, short: SINEW_INT_TYPE(1, sizeof(short)), short *: SINEW_INT_TYPE(1, sizeof(short)), unsigned short: SINEW_INT_TYPE(0, sizeof(short)), unsigned short *: SINEW_INT_TYPE(0, sizeof(short)), int: SINEW_INT_TYPE(1, sizeof(int)), int *: SINEW_INT_TYPE(1, sizeof(int)), unsigned: SINEW_INT_TYPE(0, sizeof(int)), unsigned *: SINEW_INT_TYPE(0, sizeof(int)), long: SINEW_INT_TYPE(1, sizeof(long)), long *: SINEW_INT_TYPE(1, sizeof(long)), unsigned long: SINEW_INT_TYPE(0, sizeof(long)), unsigned long *: SINEW_INT_TYPE(0, sizeof(long)), long long: SINEW_TYPE_I64, long long *: SINEW_TYPE_I64, unsigned long long: SINEW_TYPE_U64, unsigned long long *: SINEW_TYPE_U64)
+#define SINEW_ARRAY_OF(value) _Generic((value), bool *: SINEW_FIELD_ARRAY, float *: SINEW_FIELD_ARRAY, double *: SINEW_FIELD_ARRAY, signed char *: SINEW_FIELD_ARRAY, unsigned char *: SINEW_FIELD_ARRAY, short *: SINEW_FIELD_ARRAY, unsigned short *: SINEW_FIELD_ARRAY, int *: SINEW_FIELD_ARRAY, unsigned *: SINEW_FIELD_ARRAY, long *: SINEW_FIELD_ARRAY, unsigned long *: SINEW_FIELD_ARRAY, long long *: SINEW_FIELD_ARRAY, unsigned long long *: SINEW_FIELD_ARRAY, default: 0)
+#define SINEW_FIELD_RAW(type, member, extra, layout, field_type, flags) { #member, offsetof(type, member), sizeof SINEW_MEMBER(type, member), extra, layout, field_type, flags }
+
+/** A field that is a bool, a number, an array of these, or a text (an array of char that ends with a zero). */
+#define SINEW_FIELD(type, member) SINEW_FIELD_RAW(type, member, 0, NULL, SINEW_TYPE_OF(SINEW_MEMBER(type, member)), SINEW_ARRAY_OF(SINEW_MEMBER(type, member)))
+/** An array of which the `size_t` member `count` says how many elements are in use. */
+#define SINEW_FIELD_LIST(type, member, count) SINEW_FIELD_RAW(type, member, offsetof(type, count), NULL, SINEW_TYPE_OF(SINEW_MEMBER(type, member)), SINEW_FIELD_ARRAY | SINEW_FIELD_COUNTED)
+/** A field that has a value if the `bool` member `is_there` is true. */
+#define SINEW_FIELD_MAYBE(type, member, is_there) SINEW_FIELD_RAW(type, member, offsetof(type, is_there), NULL, SINEW_TYPE_OF(SINEW_MEMBER(type, member)), SINEW_FIELD_OPTIONAL | SINEW_ARRAY_OF(SINEW_MEMBER(type, member)))
+/** An array of `uint8_t` that is written as bytes; the `size_t` member `count` says how many are in use. */
+#define SINEW_FIELD_BYTES(type, member, count) SINEW_FIELD_RAW(type, member, offsetof(type, count), NULL, SINEW_TYPE_BYTES, SINEW_FIELD_COUNTED)
+/** A field that is a struct with this `sinew_layout`. */
+#define SINEW_FIELD_STRUCT(type, member, layout) SINEW_FIELD_RAW(type, member, 0, &(layout), SINEW_TYPE_STRUCT, 0)
+/** An array of structs with this `sinew_layout`. */
+#define SINEW_FIELD_STRUCTS(type, member, layout) SINEW_FIELD_RAW(type, member, 0, &(layout), SINEW_TYPE_STRUCT, SINEW_FIELD_ARRAY)
+/** The table of a struct. */
+#define SINEW_LAYOUT(type, fields) { fields, sizeof(fields) / sizeof(fields)[0], sizeof(type) }
+/** A type of payloads: its name as a literal, its class, its struct, and the array of its fields. */
+#define SINEW_PAYLOAD(name, message_class, type, fields) { { "" name, sizeof(name) - 1 }, message_class, SINEW_LAYOUT(type, fields) }
+
+#endif
 
 #endif /* SINEW_H */

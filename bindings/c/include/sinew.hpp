@@ -11,6 +11,7 @@
 
 #include "sinew.h"
 
+#include <array>
 #include <chrono>
 #include <cstddef>
 #include <cstdint>
@@ -83,6 +84,54 @@ inline std::string to_string(tid address)
     detail::check(sinew_tid_text(address, text, sizeof text));
     return text;
 }
+
+/// The table of a struct's fields: written by SINEW_STRUCT and SINEW_PAYLOAD.
+template <class T> struct layout_of;
+/// A type of payloads, with its name and class: written by SINEW_PAYLOAD.
+template <class T> struct payload_of;
+
+namespace detail {
+
+template <class T, class = void> struct is_described : std::false_type {};
+template <class T> struct is_described<T, std::void_t<decltype(payload_of<T>::get())>> : std::true_type {};
+
+template <class M> struct element { using type = M; static constexpr std::uint32_t flags = 0; };
+template <class M, std::size_t N> struct element<M[N]> { using type = M; static constexpr std::uint32_t flags = SINEW_FIELD_ARRAY; };
+template <class M, std::size_t N> struct element<std::array<M, N>> : element<M[N]> {};
+template <std::size_t N> struct element<char[N]> { using type = char[N]; static constexpr std::uint32_t flags = 0; };
+template <std::size_t N> struct element<std::array<char, N>> : element<char[N]> {};
+
+template <class E> constexpr std::uint32_t field_type()
+{
+    if constexpr (std::is_same_v<E, bool>)
+        return SINEW_TYPE_BOOL;
+    else if constexpr (std::is_same_v<E, float>)
+        return SINEW_TYPE_F32;
+    else if constexpr (std::is_same_v<E, double>)
+        return SINEW_TYPE_F64;
+    else if constexpr (std::is_array_v<E>)
+        return SINEW_TYPE_TEXT;
+    else if constexpr (std::is_integral_v<E> || std::is_enum_v<E>) {
+        static_assert(!std::is_same_v<E, char>, "a lone char is no number and no text: take std::uint8_t, or an array of char");
+        using number = typename std::conditional_t<std::is_enum_v<E>, std::underlying_type<E>, std::common_type<E>>::type;
+        constexpr bool is_signed = std::is_signed_v<number>;
+        constexpr std::uint32_t types[] = {is_signed ? SINEW_TYPE_I8 : SINEW_TYPE_U8, is_signed ? SINEW_TYPE_I16 : SINEW_TYPE_U16,
+                                           is_signed ? SINEW_TYPE_I32 : SINEW_TYPE_U32, is_signed ? SINEW_TYPE_I64 : SINEW_TYPE_U64};
+        return types[sizeof(E) == 1 ? 0 : sizeof(E) == 2 ? 1 : sizeof(E) == 4 ? 2 : 3];
+    } else
+        return SINEW_TYPE_STRUCT;
+}
+
+template <class M> sinew_field field(const char *name, std::size_t offset)
+{
+    using E = typename element<M>::type;
+    sinew_field made{name, offset, sizeof(M), 0, nullptr, field_type<E>(), element<M>::flags};
+    if constexpr (field_type<E>() == SINEW_TYPE_STRUCT)
+        made.layout = &layout_of<E>::get();
+    return made;
+}
+
+} // namespace detail
 
 /// What an application asks for when it registers; what is left as it is has the default of sinew_options.
 struct options {
@@ -189,9 +238,16 @@ public:
         return error < duration::max() - known ? known + error : duration::max();
     }
 
-    /// The payload as a plain struct; nothing if it has another size.
+    /// The payload as a value of a type that SINEW_PAYLOAD describes; nothing if the message is of another kind. One that cannot be read throws
+    /// SINEW_ERROR_MALFORMED with the field's name. Of any other struct: its bytes; nothing if it has another size.
     template <class T> std::optional<T> as() const
     {
+        if constexpr (detail::is_described<T>::value) {
+            T value{};
+            if (detail::check(sinew_read_value(&raw_, &payload_of<T>::get(), &value)) == SINEW_NOTHING)
+                return std::nullopt;
+            return value;
+        }
         static_assert(std::is_trivially_copyable_v<T>, "only a plain struct can be copied out of bytes");
         if (size() != sizeof(T))
             return std::nullopt;
@@ -354,6 +410,17 @@ public:
         return created;
     }
 
+    /// A message with a value of a type that SINEW_PAYLOAD describes, in the class of that type, for any function that sends.
+    template <class T> message create(tid destination, const T &value)
+    {
+        static_assert(detail::is_described<T>::value, "describe the type by SINEW_PAYLOAD(type, \"name\", class, fields...)");
+        message created(raw_);
+        detail::check(sinew_create_value(raw_, destination, &payload_of<T>::get(), &value, &created.raw_));
+        return created;
+    }
+    /// Sends a value of a type that SINEW_PAYLOAD describes, in the class of that type.
+    template <class T> void send(tid destination, const T &value) { send(create(destination, value)); }
+
     /// Sends a message; what becomes of it is not told.
     void send(message &&made) { detail::check(sinew_send_message(raw_, &made.raw_)); }
     /// Sends a plain struct.
@@ -509,5 +576,65 @@ private:
 };
 
 } // namespace sinew
+
+/// Describes a struct as a type of payloads: SINEW_PAYLOAD(torque, "knee.torque", SINEW_STREAM, newton_metres, number). At file scope, outside of
+/// all namespaces. It is sent as MessagePack with the names of its fields, which Rust reads as the `payload!` of the same name. Fields, 32 at most:
+/// bool, numbers, enums, text (an array of char that ends with a zero), structs with SINEW_STRUCT, and arrays of these but text.
+#define SINEW_PAYLOAD(T, NAME, CLASS, ...) \
+    SINEW_STRUCT(T, __VA_ARGS__) \
+    template <> struct sinew::payload_of<T> { \
+        static const sinew_payload_type &get() \
+        { \
+            static const sinew_payload_type type = {sinew::detail::text(NAME), CLASS, sinew::layout_of<T>::get()}; \
+            return type; \
+        } \
+    };
+/// Describes a struct that is a field of another.
+#define SINEW_STRUCT(T, ...) \
+    template <> struct sinew::layout_of<T> { \
+        static_assert(std::is_standard_layout_v<T> && std::is_trivially_copyable_v<T>, "only a plain struct has fields at fixed places"); \
+        static const sinew_layout &get() \
+        { \
+            static const sinew_field fields[] = {SINEW_EACH(T, __VA_ARGS__)}; \
+            static const sinew_layout layout = {fields, sizeof fields / sizeof fields[0], sizeof(T)}; \
+            return layout; \
+        } \
+    };
+
+#define SINEW_FIELD_OF(T, M) sinew::detail::field<decltype(T::M)>(#M, offsetof(T, M))
+#define SINEW_EACH_1(T, M) SINEW_FIELD_OF(T, M)
+#define SINEW_EACH_2(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_1(T, __VA_ARGS__)
+#define SINEW_EACH_3(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_2(T, __VA_ARGS__)
+#define SINEW_EACH_4(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_3(T, __VA_ARGS__)
+#define SINEW_EACH_5(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_4(T, __VA_ARGS__)
+#define SINEW_EACH_6(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_5(T, __VA_ARGS__)
+#define SINEW_EACH_7(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_6(T, __VA_ARGS__)
+#define SINEW_EACH_8(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_7(T, __VA_ARGS__)
+#define SINEW_EACH_9(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_8(T, __VA_ARGS__)
+#define SINEW_EACH_10(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_9(T, __VA_ARGS__)
+#define SINEW_EACH_11(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_10(T, __VA_ARGS__)
+#define SINEW_EACH_12(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_11(T, __VA_ARGS__)
+#define SINEW_EACH_13(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_12(T, __VA_ARGS__)
+#define SINEW_EACH_14(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_13(T, __VA_ARGS__)
+#define SINEW_EACH_15(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_14(T, __VA_ARGS__)
+#define SINEW_EACH_16(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_15(T, __VA_ARGS__)
+#define SINEW_EACH_17(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_16(T, __VA_ARGS__)
+#define SINEW_EACH_18(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_17(T, __VA_ARGS__)
+#define SINEW_EACH_19(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_18(T, __VA_ARGS__)
+#define SINEW_EACH_20(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_19(T, __VA_ARGS__)
+#define SINEW_EACH_21(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_20(T, __VA_ARGS__)
+#define SINEW_EACH_22(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_21(T, __VA_ARGS__)
+#define SINEW_EACH_23(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_22(T, __VA_ARGS__)
+#define SINEW_EACH_24(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_23(T, __VA_ARGS__)
+#define SINEW_EACH_25(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_24(T, __VA_ARGS__)
+#define SINEW_EACH_26(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_25(T, __VA_ARGS__)
+#define SINEW_EACH_27(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_26(T, __VA_ARGS__)
+#define SINEW_EACH_28(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_27(T, __VA_ARGS__)
+#define SINEW_EACH_29(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_28(T, __VA_ARGS__)
+#define SINEW_EACH_30(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_29(T, __VA_ARGS__)
+#define SINEW_EACH_31(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_30(T, __VA_ARGS__)
+#define SINEW_EACH_32(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_31(T, __VA_ARGS__)
+#define SINEW_PICK(_1, _2, _3, _4, _5, _6, _7, _8, _9, _10, _11, _12, _13, _14, _15, _16, _17, _18, _19, _20, _21, _22, _23, _24, _25, _26, _27, _28, _29, _30, _31, _32, NAME, ...) NAME
+#define SINEW_EACH(T, ...) SINEW_PICK(__VA_ARGS__, SINEW_EACH_32, SINEW_EACH_31, SINEW_EACH_30, SINEW_EACH_29, SINEW_EACH_28, SINEW_EACH_27, SINEW_EACH_26, SINEW_EACH_25, SINEW_EACH_24, SINEW_EACH_23, SINEW_EACH_22, SINEW_EACH_21, SINEW_EACH_20, SINEW_EACH_19, SINEW_EACH_18, SINEW_EACH_17, SINEW_EACH_16, SINEW_EACH_15, SINEW_EACH_14, SINEW_EACH_13, SINEW_EACH_12, SINEW_EACH_11, SINEW_EACH_10, SINEW_EACH_9, SINEW_EACH_8, SINEW_EACH_7, SINEW_EACH_6, SINEW_EACH_5, SINEW_EACH_4, SINEW_EACH_3, SINEW_EACH_2, SINEW_EACH_1, )(T, __VA_ARGS__)
 
 #endif // SINEW_HPP

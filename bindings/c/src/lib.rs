@@ -10,6 +10,7 @@
 //! | `log.rs`, `log/` | what the library says on the standard error, and the thread that writes it |
 //! | `protection.rs`, `protection/` | protected payloads: their types, and the runtime's guards behind handles |
 //! | `registration.rs`, `sending.rs`, `receiving.rs`, `meeting.rs`, `sealing.rs`, `guarding.rs`, `naming.rs`, `words.rs` | the functions |
+//! | `payload.rs`, `payload/` | typed payloads: a C struct as MessagePack, by a table of its fields |
 //! | `options.rs`, `text.rs`, `message.rs`, `status.rs` | the types |
 //! | `conformance.rs` | for the suite that holds all forms of NodeAPI to the same claims; with the feature `conformance` alone |
 //!
@@ -24,6 +25,8 @@ mod naming;
 mod sending;
 
 mod receiving;
+
+mod payload;
 
 mod meeting;
 

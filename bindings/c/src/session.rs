@@ -65,11 +65,24 @@ impl Session {
         class: i32,
         length: usize,
     ) -> Result<Message, Fault> {
+        self.create_with(destination, kind, class, length, |_| Ok(()))
+    }
+
+    /// Creates a message and has its bytes written; after an error there is no message.
+    pub(crate) fn create_with(
+        &mut self,
+        destination: Tid,
+        kind: Kind,
+        class: i32,
+        length: usize,
+        write: impl FnOnce(&mut [u8]) -> Result<(), Fault>,
+    ) -> Result<Message, Fault> {
         let class = class_of(class).ok_or_else(|| {
             Fault::argument(format!("`message_class` is {class}: take one of sinew_message_class"))
         })?;
         let mut buffer = self.endpoint.create_message(destination, kind, length)?;
         buffer.set_class(class);
+        write(&mut buffer)?;
         let bytes = buffer.as_mut_ptr();
         match self.made.take(buffer) {
             Ok(token) => Ok(Message { bytes, length, token }),

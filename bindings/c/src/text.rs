@@ -74,6 +74,20 @@ pub(crate) unsafe fn memory<'call, T>(first: *const T, count: usize) -> Option<&
     }
 }
 
+/// Memory of the caller that is written. `None` if it begins at NULL and is not empty.
+///
+/// # Safety
+/// `count` values of `T` are there, for the user of the result alone, unless `first` is NULL; together they have at most
+/// `isize::MAX` bytes, and any bytes are a `T`.
+pub(crate) unsafe fn memory_mut<'call, T>(first: *mut T, count: usize) -> Option<&'call mut [T]> {
+    match (first.is_null(), count) {
+        (_, 0) => Some(&mut []),
+        (true, _) => None,
+        // SAFETY: not NULL, and the caller of this function vouches for the rest.
+        (false, _) => Some(unsafe { slice::from_raw_parts_mut(first, count) }),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use std::ptr;

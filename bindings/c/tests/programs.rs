@@ -11,9 +11,9 @@ use std::{
 use ground::{C, CPP, CPP20, Ground, WATCHDOG, endpoint, is_there};
 use rustix::{io::ioctl_fionbio, process::Signal};
 use serde::{Deserialize, Serialize};
-use sinew::{Barrier, Endpoint, Kind, NodeApi, Outcome, Payload, Registration, RequirementEvent, Tid};
+use sinew::{Barrier, Class, Endpoint, Kind, NodeApi, Outcome, Payload, Registration, RequirementEvent, Tid};
 
-/// As in `programs/holder.c`: its map, written by hand there.
+/// As in `programs/holder.c`.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Torque {
     newton_metres: f32,
@@ -21,6 +21,29 @@ struct Torque {
 
 impl Payload for Torque {
     const NAME: &'static str = "test.torque";
+}
+
+/// As in `examples/sensor.c` and `examples/drive.cpp`.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct JointAngle {
+    degrees: f32,
+    number: u32,
+}
+
+impl Payload for JointAngle {
+    const NAME: &'static str = "demo.joint_angle";
+    const CLASS: Class = Class::Stream;
+}
+
+/// As in `examples/sensor.c` and `examples/drive.cpp`.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct DriveReport {
+    degrees: f32,
+    number: u32,
+}
+
+impl Payload for DriveReport {
+    const NAME: &'static str = "demo.drive_report";
 }
 
 /// What an endpoint that lives has is no leak, as in a child of `fork`; a buffer that is read from has no pointer to its start.
@@ -162,18 +185,14 @@ fn drive_in_rust(drive: &mut Endpoint) -> (f32, u32) {
             drive.receive(WATCHDOG).expect("the node lives").expect("an angle, or the question at the end");
         if message.wants_reply() {
             assert_eq!(message.kind(), Kind::named("demo.drive_report"));
-            let mut report = drive.create_message(message.source(), message.kind(), 8).expect("it is short");
-            report[..4].copy_from_slice(&f32::to_ne_bytes(last.0));
-            report[4..].copy_from_slice(&u32::to_ne_bytes(last.1));
-            drive.reply_message(&message, report).expect("the node takes it");
+            let report = DriveReport { degrees: last.0, number: last.1 };
+            drive.reply(&message, &report).expect("the node takes it");
             return last;
         }
-        assert_eq!(message.kind(), Kind::named("demo.joint_angle"));
-        let half = |at: usize| *message.bytes()[at..].first_chunk().expect("an angle has eight bytes");
-        let number = u32::from_ne_bytes(half(4));
+        let angle: JointAngle = message.decode().expect("an angle");
         // The last one is Control, which overtakes what waits of the Stream.
-        if number > last.1 {
-            last = (f32::from_ne_bytes(half(0)), number);
+        if angle.number > last.1 {
+            last = (angle.degrees, angle.number);
         }
     }
 }
@@ -323,7 +342,8 @@ fn the_examples_are_clean_under_valgrind() {
     let mut sensor = endpoint(&ground, Registration::new());
     let to = resolve(&mut sensor, "knee.drive");
     let question = sensor.create_message(to, Kind::named("demo.drive_report"), 0).unwrap();
-    assert_eq!(sensor.ask_message(question, WATCHDOG).unwrap().bytes().len(), 8);
+    let answer = sensor.ask_message(question, WATCHDOG).unwrap();
+    assert_eq!(answer.decode::<DriveReport>().unwrap(), DriveReport { degrees: 0.0, number: 0 });
     assert_eq!(drive.wait_for_end(), Some(0), "{}", drive.said().join("\n"));
 }
 

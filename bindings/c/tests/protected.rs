@@ -13,7 +13,7 @@ use ground::{C, Ground, WATCHDOG, endpoint, is_there};
 use serde::{Deserialize, Serialize};
 use sinew::{Endpoint, Kind, Payload, Registration, Tid, protection::Protection};
 
-/// As in `examples/commands.c`: its map, written by hand there.
+/// As in `examples/commands.c`.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Torque {
     newton_metres: f32,

@@ -18,6 +18,16 @@ using namespace std::chrono_literals;
 
 struct pair { std::int32_t a, b; };
 
+enum class mode : std::uint8_t { idle = 1, walking = 2 };
+struct gain { double p, d; };
+SINEW_STRUCT(gain, p, d)
+struct setpoint { float torque; std::int64_t number; bool is_armed; mode state; char label[8]; std::array<std::uint16_t, 3> steps; gain gains[2]; };
+SINEW_PAYLOAD(setpoint, "test.setpoint", SINEW_STREAM, torque, number, is_armed, state, label, steps, gains)
+struct narrow { std::uint8_t number; };
+SINEW_PAYLOAD(narrow, "test.setpoint", SINEW_STREAM, number)
+struct other { float torque; };
+SINEW_PAYLOAD(other, "test.other", SINEW_CONTROL, torque)
+
 static const auto what = sinew::kind_named("test.wrapper");
 
 static void errors_are_exceptions(sinew::endpoint &endpoint)
@@ -56,6 +66,26 @@ static void undelivered_messages_are_counted(sinew::endpoint &endpoint)
         EXPECT(!endpoint.receive(10ms));
     }
     EXPECT(count == 3);
+}
+
+// A described struct comes as it was sent, one of another kind is none, and one that does not fit is an error that names the field.
+static void values_are_typed(sinew::endpoint &endpoint)
+{
+    const setpoint sent{2.5f, -7, true, mode::walking, "knee", {1, 2, 3}, {{1.0, 0.5}, {2.0, 0.25}}};
+    endpoint.send(endpoint.address(), sent);
+    auto message = endpoint.receive(20s);
+    EXPECT(message && !message->as<other>());
+    const auto got = message->as<setpoint>();
+    EXPECT(got && got->torque == 2.5f && got->number == -7 && got->is_armed && got->state == mode::walking);
+    EXPECT(std::string(got->label) == "knee" && got->steps[2] == 3 && got->gains[1].d == 0.25);
+    try {
+        (void)message->as<narrow>();
+        EXPECT(false);
+    } catch (const sinew::error &error) {
+        EXPECT(error.status() == SINEW_ERROR_MALFORMED);
+        EXPECT(std::string(error.what()).find("field `number`: expected uint8_t, found the integer -7") != std::string::npos);
+    }
+    EXPECT(endpoint.confirm(endpoint.create(0x7777, other{1.0f}), 10s) == SINEW_REJECTED_NO_SUCH_APPLICATION);
 }
 
 // How the receiver ends with the message in hand decides what its sender is told.
@@ -264,6 +294,7 @@ int main(int argc, char **argv)
     const char *socket = argc > 1 ? argv[1] : "";
     sinew::endpoint endpoint(socket);
     errors_are_exceptions(endpoint);
+    values_are_typed(endpoint);
     undelivered_messages_are_counted(endpoint);
     scopes_settle(endpoint, sinew::endpoint(socket));
     unsent_messages_are_given_back(endpoint);
