@@ -9,7 +9,7 @@ use crate::{
     outcome::{Outcome, Receipt, Rejection, Ticket},
     protection::Protection,
     tid::Tid,
-    wire::{Class, Flags, Header, Kind, memory},
+    wire::{Class, Flags, Header, Kind, memory, read::decode_payload},
 };
 
 /// A type that travels as MessagePack (a map with field names, so that any language can read it).
@@ -49,7 +49,7 @@ impl DecodeError {
     #[must_use]
     pub fn unguarded<P: Payload>() -> Self {
         let words = "it is protected, and did not come through a guard; make one for its sender".to_owned();
-        Self { name: P::NAME, cause: rmp_serde::decode::Error::Uncategorized(words) }
+        Self { name: P::NAME, cause: rmp_serde::decode::Error::Syntax(words) }
     }
 }
 
@@ -172,24 +172,8 @@ pub fn encode<T: Serialize>(value: &T) -> Bytes {
 
 /// Reads a value from the bytes of a payload that is a `P`.
 pub(crate) fn decode_as<P: Payload>(bytes: &[u8]) -> Result<P, DecodeError> {
-    decode(bytes).map_err(|cause| DecodeError { name: P::NAME, cause })
+    decode_payload(bytes).map_err(|cause| DecodeError { name: P::NAME, cause })
 }
-
-/// Reads a value from its MessagePack form.
-///
-/// Values nested deeper than 64 are refused: rmp-serde's own limit of 1,024 lets a payload of 1,100 bytes, each the
-/// start of a list, overflow the stack of a thread and so end the process.
-///
-/// # Errors
-/// The bytes are not a `T`.
-pub fn decode<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, rmp_serde::decode::Error> {
-    let mut deserializer = rmp_serde::Deserializer::from_read_ref(bytes);
-    deserializer.set_max_depth(DEPTH_MAX);
-    T::deserialize(&mut deserializer)
-}
-
-/// Lists in lists, and so on, in a payload.
-const DEPTH_MAX: usize = 64;
 
 /// Writable memory for a raw payload: what `create_message` lends and `send_message` takes back.
 #[derive(Debug)]

@@ -10,9 +10,12 @@ mod kind;
 mod long;
 mod memory;
 mod message;
+mod read;
+mod strict;
 
 pub use codec::{Checksum, FrameCodec, FrameError, decode_datagram, encode_frame};
 pub use header::{Class, Flags, HEADER_LEN, Header, HeaderError, MAGIC, TIME_TO_LIVE_MAX, VERSION};
 pub use kind::{Kind, fnv1a};
 pub(crate) use message::decode_as;
-pub use message::{DecodeError, Message, MessageBuffer, Payload, decode, encode};
+pub use message::{DecodeError, Message, MessageBuffer, Payload, encode};
+pub use read::decode;
