@@ -326,7 +326,7 @@ impl Direct {
     /// Ends the open link at `index`, whose ring holds what it cannot.
     pub(super) fn fail<T>(&mut self, index: usize, why: &RingError) -> Option<T> {
         let (peer, number) = (self.open[index].peer, self.open[index].number);
-        tracing::warn!(%peer, %why, "a direct link is closed; what goes there goes through the node");
+        crate::log::here!(warn: %peer, %why, "a direct link is closed; what goes there goes through the node");
         self.end(peer, number, Time::now());
         None
     }

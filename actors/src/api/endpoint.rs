@@ -90,7 +90,7 @@ impl Endpoint {
         let control = reader.control().filter(|_| register.direct);
         let inbox = Inbox::new(inbox_capacity, payload_max as usize, writer.clone());
         register.former = Some(app);
-        tracing::debug!(tid = %Tid::new(node, app), node = node_name, "registered");
+        crate::log::here!(debug: tid = %Tid::new(node, app), node = node_name, "registered");
         Self {
             tid: Tid::new(node, app),
             node_name,

@@ -120,7 +120,7 @@ impl Home {
             link => Ok(link),
         });
         answer.unwrap_or_else(|why| {
-            tracing::debug!(%why, "not registered again yet");
+            crate::log::here!(debug: %why, "not registered again yet");
             way.next = Time::now() + way.pause;
             way.pause = (way.pause * 2).min(PAUSE.1);
             None
@@ -290,7 +290,7 @@ impl Endpoint {
             } else {
                 "the node's access list does not let it: name the group in its `[[client]]`, `sinew reload`, then join it again"
             };
-            tracing::warn!(endpoint = %self.tid, %group, remedy, "it came back to its node, and is not in this group any more");
+            crate::log::here!(warn: endpoint = %self.tid, %group, remedy, "it came back to its node, and is not in this group any more");
         }
         true
     }

@@ -63,7 +63,7 @@ impl Refusals {
         if self.unlogged > 0 && self.logged.is_none_or(|logged| now >= logged + LOG_AGAIN) {
             let messages = std::mem::take(&mut self.unlogged);
             self.logged = Some(now);
-            tracing::warn!(
+            crate::log::here!(warn:
                 endpoint = %own,
                 messages,
                 "messages for it were refused: while it waited for an answer more came than it keeps; it is to receive more often"

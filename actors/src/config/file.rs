@@ -18,7 +18,7 @@ use toml::{
 };
 
 use super::{
-    ConfigFault, ConfigFaults, Interface, Interfaces, NodeConfig, WatchGroup,
+    ConfigFault, ConfigFaults, Interface, Interfaces, LogLevel, NodeConfig, WatchGroup,
     check::{self, Range, fault},
     faults::quoted,
 };
@@ -26,10 +26,10 @@ use super::{
 /// Longest configuration file in bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-const SECTIONS: [&str; 7] = ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security"];
+const SECTIONS: [&str; 8] = ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security", "log"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 48] = [
+pub(super) const KEYS: [&str; 49] = [
     "node.name",
     "node.project",
     "node.address",
@@ -78,6 +78,7 @@ pub(super) const KEYS: [&str; 48] = [
     "security.keys",
     "security.times",
     "security.access",
+    "log.level",
 ];
 
 impl NodeConfig {
@@ -109,6 +110,7 @@ impl NodeConfig {
         reader.time(&check::REQUIREMENT_DEADLINE, &mut config.sync.requirement_deadline);
         reader.read_supervision(&mut config);
         reader.read_security(&mut config);
+        reader.text("log.level", "\"off\", \"error\", \"warn\", \"info\", \"debug\" or \"trace\"", &mut config.log.level);
         reader.finish(&config)?;
         Ok(config)
     }
@@ -312,6 +314,22 @@ impl<'t> Reader<'t> {
                 *target = Some(found);
             }
         }
+    }
+}
+
+impl FromStr for LogLevel {
+    type Err = ();
+
+    fn from_str(text: &str) -> Result<Self, ()> {
+        Ok(match text {
+            "off" => Self::Off,
+            "error" => Self::Error,
+            "warn" => Self::Warn,
+            "info" => Self::Info,
+            "debug" => Self::Debug,
+            "trace" => Self::Trace,
+            _ => return Err(()),
+        })
     }
 }
 

@@ -67,6 +67,34 @@ pub struct NodeConfig {
     pub supervision: SupervisionConfig,
     /// Who other nodes are, proven.
     pub security: SecurityConfig,
+    /// What the node logs.
+    pub log: LogConfig,
+}
+
+/// The node's log: lines on the standard error, in a program that has installed no subscriber of `tracing`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct LogConfig {
+    /// The most detailed level that is written; the environment variables `SINEW_LOG` and `RUST_LOG` override it. The nodes of one process
+    /// share a log: the one that starts last sets its level. Default [`LogLevel::Info`].
+    pub level: LogLevel,
+}
+
+/// How much is written to the log.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum LogLevel {
+    /// Nothing, except panics of actors.
+    Off,
+    /// Failures.
+    Error,
+    /// Also conditions that need attention.
+    Warn,
+    /// Also starts, stops, and changes of members.
+    #[default]
+    Info,
+    /// Also details for the search of a fault.
+    Debug,
+    /// Everything.
+    Trace,
 }
 
 /// Local Node Communication Layer: the applications of this host.
@@ -323,6 +351,7 @@ impl NodeConfig {
                 app_window: Duration::from_secs(10),
             },
             security: SecurityConfig { keys: None, times: TimePolicy::UntilSet, access: None },
+            log: LogConfig::default(),
         }
     }
 

@@ -255,6 +255,10 @@ fn state_and_security_are_directories_or_off_and_times_a_policy_that_exists() {
         ("security.access", path(0), false),
         ("security.access", path(4_096), true),
         ("security.access", path(4_097), false),
+        ("log.level", "'off'".to_owned(), true),
+        ("log.level", "'trace'".to_owned(), true),
+        ("log.level", "'verbose'".to_owned(), false),
+        ("log.level", "false".to_owned(), false),
     ];
     are_legal_or_not(cases);
     let config = NodeConfig::from_toml(&with("security.keys", "'/etc/keys'", "times = 'strict'")).unwrap();

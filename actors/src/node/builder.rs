@@ -9,6 +9,7 @@ use std::{
 
 use sinew_runtime::{
     app::DynApp,
+    log::tracing::level_filters::LevelFilter,
     supervision::{AutoShutdown, Flags, UNWINDS},
     tid::{Incarnation, NodeAddress},
 };
@@ -19,7 +20,7 @@ use super::{
     supervisor_spec::SupervisorSpec,
 };
 use crate::{
-    config::{ConfigFaults, NodeConfig},
+    config::{ConfigFaults, LogLevel, NodeConfig},
     inspect, log, process,
     secured::{KeyFault, Secured},
     stores::Stores,
@@ -240,6 +241,7 @@ impl NodeBuilder {
     pub fn start(mut self) -> Result<Node, StartError> {
         // Here, on a thread like any other.
         log::begin();
+        log::set_level(level(self.config.log.level));
         self.config.validate()?;
         check_panics(UNWINDS, self.accept_abort_on_panic)?;
         #[cfg(feature = "fault-points")]
@@ -287,6 +289,17 @@ impl NodeBuilder {
             Ok(Err(error)) => Err(error),
             Err(_) => Err(StartError::Layers(format!("no word from the root in {patience:?}"))),
         }
+    }
+}
+
+const fn level(level: LogLevel) -> LevelFilter {
+    match level {
+        LogLevel::Off => LevelFilter::OFF,
+        LogLevel::Error => LevelFilter::ERROR,
+        LogLevel::Warn => LevelFilter::WARN,
+        LogLevel::Info => LevelFilter::INFO,
+        LogLevel::Debug => LevelFilter::DEBUG,
+        LogLevel::Trace => LevelFilter::TRACE,
     }
 }
 

@@ -61,12 +61,14 @@ pub(super) fn host(config: &NodeConfig, apps: Vec<DynApp>, hosting: Hosting) -> 
     let code = match hosted.map(std::thread::JoinHandle::join) {
         Ok(Ok(Ok(()))) => 0,
         Ok(Ok(Err(error))) => {
+            log::error!(name, %error, "the process that hosts this application has no connection to its node");
             log::print(format!("the process that hosts '{name}' has no connection to its node: {error}"));
             1
         }
         // The panic has been told by the panic hook.
         Ok(Err(_)) => 1,
         Err(error) => {
+            log::error!(name, %error, "no thread for this application; raise `ulimit -u`");
             log::print(format!("no thread for '{name}': {error}; raise `ulimit -u`"));
             1
         }
@@ -248,6 +250,7 @@ fn watched(watcher: Watcher, app: &DynApp, wire: &Arc<Wire>, tid: Tid) -> Alone 
     Alone {
         watcher,
         name: app.name().to_owned(),
+        tid: Some(tid),
         place: place(app),
         progress_within: app.policy().progress_within,
         on_hung: Box::new(on_hung),

@@ -1,6 +1,11 @@
 //! An event of the log: taken down where it happens, told to its reader elsewhere.
 
-use std::{cell::RefCell, fmt, sync::OnceLock};
+use std::{
+    cell::RefCell,
+    fmt,
+    sync::{Once, OnceLock},
+    time::SystemTime,
+};
 
 use tracing::{
     Dispatch, Event, Level, Metadata, Subscriber,
@@ -11,7 +16,10 @@ use tracing::{
     subscriber::{Interest, NoSubscriber},
 };
 
-use super::writer::enter;
+use super::{
+    stderr::{self, Line},
+    writer::enter,
+};
 
 /// Fields of one event at most; more are left out.
 const FIELDS_MAX: usize = 16;
@@ -21,19 +29,49 @@ const TEXT_BYTES_MAX: usize = 4_096;
 /// Whether anybody reads events of this level.
 #[must_use]
 pub fn is_on(level: Level) -> bool {
+    begin_default();
     level <= LevelFilter::current()
 }
 
-/// Has the event that `say` says told to this thread's subscriber, on the log's thread. Waits for nobody.
+/// Has the default log count among those that may read events. It is nobody's default subscriber.
+fn begin_default() {
+    static BEGUN: Once = Once::new();
+    // What `tracing` asks a new subscriber leads to no event.
+    BEGUN.call_once(|| _ = notebook(Reader::Default));
+}
+
+/// Has the event that `say` says told to this thread's subscriber, or written by the default log, on the log's thread. Waits for nobody.
 pub fn apart(say: impl FnOnce()) {
     let reader = get_default(Dispatch::clone);
-    if reader.is::<NoSubscriber>() {
-        return;
-    }
-    with_default(notebook(), say);
+    let is_default = reader.is::<NoSubscriber>();
+    with_default(notebook(if is_default { Reader::Default } else { Reader::Subscriber }), say);
     // A thread that is about to end has no notebook any more.
-    if let Some(noted) = NOTED.try_with(RefCell::take).ok().flatten() {
+    let Some(noted) = NOTED.try_with(RefCell::take).ok().flatten() else { return };
+    if is_default {
+        enter(Box::new(move || noted.write()));
+    } else {
         enter(Box::new(move || noted.tell(&reader)));
+    }
+}
+
+/// Has the event that `say` says told to this thread's subscriber here and now. Where there is none, it goes to the default log as with
+/// [`apart`]: for programs that have no node, and may have been forked.
+pub fn here(say: impl FnOnce()) {
+    if get_default(|reader| reader.is::<NoSubscriber>()) {
+        apart(say);
+    } else {
+        say();
+    }
+}
+
+/// On the log's thread: has the event that `say` says told or written now.
+pub(super) fn at_once(say: impl FnOnce()) {
+    if stderr::is_replaced() {
+        return say();
+    }
+    with_default(notebook(Reader::Default), say);
+    if let Some(noted) = NOTED.take() {
+        noted.write();
     }
 }
 
@@ -42,30 +80,46 @@ thread_local! {
     static NOTED: RefCell<Option<Noted>> = const { RefCell::new(None) };
 }
 
-/// The subscriber that takes down what is said.
-fn notebook() -> &'static Dispatch {
-    static NOTEBOOK: OnceLock<Dispatch> = OnceLock::new();
-    NOTEBOOK.get_or_init(|| Dispatch::new(Notebook))
+/// For which reader an event is taken down.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Reader {
+    /// The program's own.
+    Subscriber,
+    /// The default log.
+    Default,
 }
 
-struct Notebook;
+/// The subscriber that takes down what is said for this reader.
+fn notebook(reader: Reader) -> &'static Dispatch {
+    static NOTEBOOKS: [OnceLock<Dispatch>; 2] = [const { OnceLock::new() }; 2];
+    NOTEBOOKS[usize::from(reader == Reader::Default)].get_or_init(|| Dispatch::new(Notebook(reader)))
+}
+
+struct Notebook(Reader);
 
 impl Subscriber for Notebook {
-    fn enabled(&self, _: &Metadata<'_>) -> bool {
-        true
+    fn enabled(&self, metadata: &Metadata<'_>) -> bool {
+        self.0 == Reader::Subscriber || stderr::wants(metadata)
     }
 
-    // It wants nothing for itself: which events there are is the other subscribers' business.
-    fn register_callsite(&self, _: &'static Metadata<'static>) -> Interest {
-        Interest::never()
+    // For a subscriber's events it wants nothing itself: which ones there are is that one's business.
+    fn register_callsite(&self, metadata: &'static Metadata<'static>) -> Interest {
+        match self.0 {
+            Reader::Default if stderr::wants(metadata) => Interest::sometimes(),
+            Reader::Default | Reader::Subscriber => Interest::never(),
+        }
     }
 
     fn max_level_hint(&self) -> Option<LevelFilter> {
-        Some(LevelFilter::OFF)
+        Some(match self.0 {
+            Reader::Default => stderr::most(),
+            Reader::Subscriber => LevelFilter::OFF,
+        })
     }
 
     fn event(&self, event: &Event<'_>) {
-        let mut noted = Noted { metadata: event.metadata(), fields: Vec::with_capacity(FIELDS_MAX) };
+        let time = (self.0 == Reader::Default).then(now);
+        let mut noted = Noted { metadata: event.metadata(), fields: Vec::with_capacity(FIELDS_MAX), time };
         event.record(&mut noted);
         let _ = NOTED.try_with(|last| last.replace(Some(noted)));
     }
@@ -87,6 +141,14 @@ impl Subscriber for Notebook {
 struct Noted {
     metadata: &'static Metadata<'static>,
     fields: Vec<(Field, Said)>,
+    /// When it happened, where that is to be written.
+    time: Option<SystemTime>,
+}
+
+/// The time that a line of the log shows.
+#[expect(clippy::disallowed_methods, reason = "people compare the time of a line with a clock on the wall")]
+pub(crate) fn now() -> SystemTime {
+    SystemTime::now()
 }
 
 /// What a field says.
@@ -103,6 +165,8 @@ enum Said {
 impl Noted {
     /// Tells it to `reader`, if that wants it.
     fn tell(&self, reader: &Dispatch) {
+        // Said on this thread, which has no subscriber of its own: it retires the default log where that has become idle.
+        let _ = stderr::is_replaced();
         let words: Vec<_> = self.fields.iter().map(|(_, said)| said.words()).collect();
         let values: Vec<&dyn Value> =
             self.fields.iter().zip(&words).map(|((_, said), words)| said.value(words)).collect();
@@ -118,6 +182,24 @@ impl Noted {
         }
     }
 
+    /// Writes it as a line of the default log; tells the program's subscriber, if there is one by now.
+    fn write(self) {
+        if stderr::is_replaced() {
+            return self.tell(&get_default(Dispatch::clone));
+        }
+        let time = self.time.unwrap_or_else(now);
+        let mut line = Line::new(time, *self.metadata.level(), self.metadata.target());
+        let (message, fields): (Vec<_>, Vec<_>) =
+            self.fields.iter().partition(|(field, _)| field.name() == "message");
+        for (_, said) in message {
+            line.message(&said.shown());
+        }
+        for (field, said) in fields {
+            line.field(field.name(), &said.shown());
+        }
+        line.write();
+    }
+
     fn note(&mut self, field: &Field, said: Said) {
         if self.fields.len() < FIELDS_MAX {
             self.fields.push((field.clone(), said));
@@ -126,6 +208,18 @@ impl Noted {
 }
 
 impl Said {
+    /// What a line shows of it.
+    fn shown(&self) -> String {
+        match self {
+            Self::Bool(value) => value.to_string(),
+            Self::Signed(value) => value.to_string(),
+            Self::Unsigned(value) => value.to_string(),
+            Self::Real(value) => value.to_string(),
+            Self::Text(text) => format!("{text:?}"),
+            Self::Words(words) => words.clone(),
+        }
+    }
+
     fn words(&self) -> tracing::field::DisplayValue<&str> {
         match self {
             Self::Words(words) => display(words.as_str()),

@@ -3,12 +3,19 @@
 //!
 //! The macros here are those of `tracing`. An event is taken down where it happens, and given to the subscriber that was
 //! the thread's own there, later and on the log's thread: its time is when it is written, and it stands in no span.
+//!
+//! Where the program has installed no subscriber, lines on the standard error are the default: see [`stderr`].
 
 mod event;
+mod filter;
+mod stderr;
 mod writer;
 
 #[doc(hidden)]
-pub use event::{apart, is_on};
+pub use event::{apart, here, is_on};
+pub use stderr::set_level;
+pub(crate) use event::now;
+pub(crate) use stderr::{Line, is_replaced, write_text};
 pub(crate) use writer::enter;
 pub use writer::{begin, flush, lost, print};
 
@@ -61,6 +68,20 @@ macro_rules! log_apart {
     };
 }
 
+/// The same of an event that the program's subscriber is told on the calling thread: `log::here!(warn: %peer, "...")`.
+#[macro_export]
+#[doc(hidden)]
+macro_rules! log_here {
+    (error: $($said:tt)*) => { $crate::log_here!(ERROR, $crate::log::tracing::error!($($said)*)) };
+    (warn: $($said:tt)*) => { $crate::log_here!(WARN, $crate::log::tracing::warn!($($said)*)) };
+    (debug: $($said:tt)*) => { $crate::log_here!(DEBUG, $crate::log::tracing::debug!($($said)*)) };
+    ($level:ident, $event:expr) => {
+        if $crate::log::is_on($crate::log::tracing::Level::$level) {
+            $crate::log::here(|| $event);
+        }
+    };
+}
+
 pub use crate::{
-    log_debug as debug, log_error as error, log_info as info, log_trace as trace, log_warn as warn,
+    log_debug as debug, log_error as error, log_here as here, log_info as info, log_trace as trace, log_warn as warn,
 };

@@ -12,6 +12,8 @@ use std::{
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
+use super::{event::at_once, stderr};
+
 /// What waits to be written, at most. What comes then is dropped and counted.
 const QUEUE_MAX: usize = 1_024;
 
@@ -45,9 +47,14 @@ pub(crate) fn enter(entry: Entry) {
     }
 }
 
-/// Writes a line to the standard error, behind what is logged already.
+/// Writes a line to the standard error, behind what is logged already: the words of an error that the log has too. Where the log is written
+/// there anyway, nothing is added.
 pub fn print(line: String) {
-    enter(Box::new(move || eprintln!("{line}")));
+    enter(Box::new(move || {
+        if !stderr::writes_errors() {
+            stderr::write_text(&format!("{line}\n"));
+        }
+    }));
 }
 
 /// Waits until what was logged so far is written, and no longer than this: before the process ends, say. Where the standard
@@ -99,7 +106,9 @@ fn write(entries: &Receiver<Entry>) {
             let lost = lost();
             let new = lost - std::mem::replace(&mut said, lost);
             if new > 0 {
-                tracing::warn!(lost = new, "the log took nothing for a while: events are missing here");
+                at_once(|| {
+                    tracing::warn!(lost = new, "the log took nothing for a while: events are missing here");
+                });
             }
             entry();
         }));

@@ -19,7 +19,7 @@ use super::{
     vitals::Vitals,
     watchdog::Watchdog,
 };
-use crate::post::lock;
+use crate::{post::lock, tid::Tid};
 
 /// Who sees whether an actor that has no supervisor hangs: a thread, which is there from the beginning.
 #[derive(Debug)]
@@ -44,6 +44,8 @@ pub struct Alone {
     pub watcher: Watcher,
     /// Its name, for people.
     pub name: String,
+    /// Its address, if it is an application.
+    pub tid: Option<Tid>,
     /// The calling thread's place.
     pub place: Place,
     /// Longest time that one turn may take; `None`: as long as it likes.
@@ -91,9 +93,9 @@ pub fn alone(
     ready: ReadyGate,
     alone: Alone,
 ) -> (AloneHandle, impl Future<Output = Reason> + use<>) {
-    let Alone { watcher: Watcher(watchdog), name, place, progress_within, on_hung } = alone;
+    let Alone { watcher: Watcher(watchdog), name, tid, place, progress_within, on_hung } = alone;
     let (report, ended) = report(on_hung);
-    let vitals = Vitals::new(name);
+    let vitals = Vitals::of(name, tid);
     let seat = Seat::of_this_thread(&place);
     let tenant = Tenant::new(vitals.clone(), Some(seat), progress_within, report);
     watchdog.watch(&tenant);

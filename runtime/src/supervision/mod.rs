@@ -18,6 +18,7 @@
 //! | `vitals` | its signs of life, and its fence |
 //! | `watchdog` | who does not come back |
 //! | `panics` | where a panic was, and who is told of it |
+//! | `frames` | the frames of a panic that are the program's own |
 //! | `linux`, `elsewhere` | what the system does for a thread |
 //! | `fault` | faults on purpose, with the feature `fault-points` only |
 
@@ -29,6 +30,7 @@ pub mod core;
 mod elsewhere;
 #[cfg(feature = "fault-points")]
 pub mod fault;
+mod frames;
 mod guard;
 #[cfg(target_os = "linux")]
 mod linux;

@@ -3,25 +3,25 @@
 
 use std::{
     any::Any,
-    backtrace::{Backtrace, BacktraceStatus},
+    backtrace::Backtrace,
     cell::{Cell, RefCell},
     panic::{AssertUnwindSafe, PanicHookInfo, catch_unwind},
     sync::{Arc, Once, RwLock},
-    time::Duration,
+    time::{Duration, SystemTime},
 };
 
 use tracing::{
-    Dispatch,
+    Dispatch, Level,
     dispatcher::{get_default, with_default},
-    level_filters::LevelFilter,
     subscriber::NoSubscriber,
 };
 
 use super::{
+    frames::{Frames, frames},
     system,
     vitals::{Doing, Vitals},
 };
-use crate::log;
+use crate::{log, tid::Tid};
 
 /// Whether this program unwinds from a panic. One that is built with `panic = "abort"` ends with its first panic, whatever
 /// supervisors it has. Cargo builds every crate of a program with the same strategy, so this crate's is the program's.
@@ -116,8 +116,11 @@ fn hook(info: &PanicHookInfo<'_>, former: &Arc<Former>) {
             }
         }
         (Station::Runtime | Station::Foreign, _) => {
-            let thread = system::thread_id();
-            log::error!(thread, "outside of any supervised actor's turn: {}", sentence(info));
+            // The former hook says it. A subscriber may be all that anybody reads.
+            if !get_default(|reader| reader.is::<NoSubscriber>()) {
+                let thread = system::thread_id();
+                log::error!(thread, "outside of any supervised actor's turn: {}", sentence(info));
+            }
             let _prints = PRINTS.read();
             (former.hook)(info);
         }
@@ -131,58 +134,97 @@ fn is_the_last(info: &PanicHookInfo<'_>) -> bool {
 
 /// A panic that is to be told on the log's thread.
 struct Panicked {
-    actor: Option<String>,
+    /// The actor and its address.
+    actor: Option<(String, Option<Tid>)>,
     thread: i32,
     said: String,
     backtrace: Option<Backtrace>,
     reader: Dispatch,
+    time: SystemTime,
 }
 
 impl Panicked {
     /// Waits for nobody: where a backtrace is printed now, this panic has none.
     fn new(info: &PanicHookInfo<'_>, vitals: Option<&Vitals>) -> Self {
-        let backtrace = PRINTS.try_write().ok().map(|_held| Backtrace::capture());
+        let is_wanted = Frames::wanted() != Frames::None;
+        let backtrace = PRINTS.try_write().ok().filter(|_| is_wanted).map(|_held| Backtrace::force_capture());
         Self {
-            actor: vitals.map(|vitals| vitals.name().to_owned()),
+            actor: vitals.map(|vitals| (vitals.name().to_owned(), vitals.tid())),
             thread: system::thread_id(),
             said: sentence(info),
-            backtrace: backtrace.filter(|backtrace| backtrace.status() == BacktraceStatus::Captured),
+            backtrace,
             reader: get_default(Dispatch::clone),
+            time: log::now(),
         }
     }
 
-    /// Tells the reader of the log, then the hook that was there before.
+    /// Says it once: to the subscriber that reads the log, and where there is none to the standard error. A hook of the program's own
+    /// is called in any case; where there is no subscriber it alone says the panic, as it would for any other.
     fn tell(&self, former: &Former) {
         let _prints = PRINTS.read();
-        let in_words = |backtrace| format!("\nstack backtrace:\n{backtrace}");
-        let backtrace = self.backtrace.as_ref().map(in_words).unwrap_or_default();
-        if self.reader.is::<NoSubscriber>() {
-            self.log(&backtrace);
-        } else {
-            with_default(&self.reader, || self.log(&backtrace));
-        }
-        let is_read = LevelFilter::current() >= LevelFilter::ERROR;
-        let backtrace = if is_read { "" } else { &*backtrace };
-        let who = match &self.actor {
-            Some(actor) => format!("the actor '{actor}'"),
-            None => "a task that is no actor's".to_owned(),
-        };
-        let Self { thread, said, .. } = self;
-        let words = format!("{who} on thread {thread} {said}{backtrace}");
-        let is_standard = former.is_standard;
-        let _ = catch_unwind(|| match is_standard {
-            true => eprintln!("\n{words}"),
+        // A subscriber that came after the panic has the events of this thread.
+        let has_reader = !self.reader.is::<NoSubscriber>() || log::is_replaced();
+        let is_said = has_reader && self.is_logged();
+        if !former.is_standard {
+            let mut words = self.words();
+            if !is_said {
+                words.extend(self.frames().iter().map(|frame| format!("\n{frame}")));
+            }
             // A hook takes what only a panic can make.
-            false => std::panic::panic_any(words),
-        });
+            let _ = catch_unwind(|| std::panic::panic_any(words));
+        } else if !is_said {
+            self.write();
+        }
     }
 
-    fn log(&self, backtrace: &str) {
+    /// Tells the subscriber, if it takes errors.
+    fn is_logged(&self) -> bool {
+        if self.reader.is::<NoSubscriber>() {
+            return self.log();
+        }
+        with_default(&self.reader, || self.log())
+    }
+
+    /// Who panicked, where, and what it said.
+    fn words(&self) -> String {
         let Self { actor, thread, said, .. } = self;
         match actor {
-            Some(actor) => tracing::error!(actor, thread, "{said}{backtrace}"),
-            None => tracing::error!(thread, "outside of any supervised actor's turn: {said}{backtrace}"),
+            Some((name, Some(tid))) => format!("the actor '{name}' ({tid}) on thread {thread} {said}"),
+            Some((name, None)) => format!("the actor '{name}' on thread {thread} {said}"),
+            None => format!("a task that is no actor's on thread {thread} {said}"),
         }
+    }
+
+    fn frames(&self) -> Vec<String> {
+        self.backtrace.as_ref().map(|backtrace| frames(backtrace, Frames::wanted())).unwrap_or_default()
+    }
+
+    /// Writes it to the standard error, as the standard hook would, whatever the log is set to. The frames come last: their names may
+    /// take a while to look up.
+    fn write(&self) {
+        let mut line = log::Line::new(self.time, Level::ERROR, module_path!());
+        line.message(&self.words());
+        line.write();
+        let frames = self.frames();
+        if !frames.is_empty() {
+            log::write_text(&format!("{}\n", frames.join("\n")));
+        }
+    }
+
+    fn log(&self) -> bool {
+        if !tracing::enabled!(Level::ERROR) {
+            return false;
+        }
+        let Self { actor, thread, said, .. } = self;
+        let frames: String = self.frames().iter().map(|frame| format!("\n{frame}")).collect();
+        match actor {
+            Some((actor, tid)) => {
+                let tid = tid.map(tracing::field::display);
+                tracing::error!(actor, tid, thread, "{said}{frames}");
+            }
+            None => tracing::error!(thread, "outside of any supervised actor's turn: {said}{frames}"),
+        }
+        true
     }
 }
 

@@ -326,11 +326,16 @@ impl Supervisor {
     fn note_end(&self, id: ChildId, reason: &Reason) {
         let Standing { supervisor, generation, restarts } = self.roster.standing(id);
         let (child, tid, waiting) = (self.roster.name(id), self.tid_of(id), self.waiting(id));
-        if reason.is_failure() {
-            crate::log::error!(supervisor, child, tid, generation, restarts, waiting, %reason, "a child failed");
-        } else {
-            crate::log::info!(supervisor, child, tid, generation, restarts, waiting, %reason, "a child ended");
+        if *reason == Reason::Shutdown {
+            return crate::log::debug!(supervisor, child, tid, generation, restarts, waiting, %reason, "a child ended");
         }
+        if !reason.is_failure() {
+            return crate::log::info!(supervisor, child, tid, generation, restarts, waiting, %reason, "a child ended");
+        }
+        // What a panic said, the panic hook has written.
+        let place = if let Reason::Panic(words) = reason { words.rsplit_once(" at ") } else { None };
+        let reason = place.map_or_else(|| reason.to_string(), |(_, place)| format!("a panic at {place}"));
+        crate::log::error!(supervisor, child, tid, generation, restarts, waiting, reason, "a child failed");
     }
 
     /// Messages that wait for it; `None` where that is not known here, or somebody is in its mailbox.
@@ -358,7 +363,7 @@ impl Supervisor {
             Fate::Hung(reason) => say(&post, Input::Hung(id, generation, reason)),
             Fate::Ended(reason) => say(&post, Input::Ended(id, generation, reason)),
         });
-        let vitals = Vitals::new(&*spec.name);
+        let vitals = Vitals::of(&*spec.name, spec.tid);
         let tenant = Tenant::new(vitals, Some(seat), spec.policy.progress_within, report);
         threads.settle(&tenant);
         *reprieve = Some(threads.reprieve(&tenant, spec.policy.start_within));

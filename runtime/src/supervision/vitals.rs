@@ -16,6 +16,7 @@ use crate::{
     mailbox::Mailbox,
     outcome::{Outcome, Receipt},
     post::lock,
+    tid::Tid,
     time::Time,
     wire::Kind,
 };
@@ -102,6 +103,8 @@ struct Inbox {
 /// The signs of life of one incarnation of an actor.
 pub(crate) struct Vitals {
     name: String,
+    /// Its address, if it is an application.
+    tid: Option<Tid>,
     /// Written by the actor's thread only.
     turn: AtomicU64,
     doing: AtomicU64,
@@ -137,8 +140,15 @@ impl Vitals {
     /// Signs of life of the actor called `name`, before it is made.
     #[must_use]
     pub(crate) fn new(name: impl Into<String>) -> Arc<Self> {
+        Self::of(name, None)
+    }
+
+    /// The same of an actor that has this address.
+    #[must_use]
+    pub(crate) fn of(name: impl Into<String>, tid: Option<Tid>) -> Arc<Self> {
         Arc::new(Self {
             name: name.into(),
+            tid,
             turn: AtomicU64::new(0),
             doing: AtomicU64::new(Doing::Start.code()),
             begun: AtomicU64::new(0),
@@ -163,6 +173,12 @@ impl Vitals {
     pub(crate) fn is_present_over() -> bool {
         PRESENT.try_with(|present| present.borrow().as_ref().is_some_and(|vitals| vitals.is_over()))
             == Ok(true)
+    }
+
+    /// The address of the application that this is, if it is one.
+    #[must_use]
+    pub(crate) const fn tid(&self) -> Option<Tid> {
+        self.tid
     }
 
     /// The actor's name.

@@ -628,9 +628,7 @@ struct KeyVisitor<'k, 'de, V> {
 macro_rules! visit_number {
     ($($method:ident($value:ty))*) => {$(
         fn $method<E: Error>(self, value: $value) -> Result<V::Value, E> {
-            if let Ok(number) = u64::try_from(value) {
-                *self.key = Key::Number(number);
-            }
+            *self.key = Key::Number(value.into());
             self.visitor.$method(value)
         }
     )*};
@@ -643,12 +641,10 @@ impl<'de, V: Visitor<'de>> Visitor<'de> for KeyVisitor<'_, 'de, V> {
         self.visitor.expecting(formatter)
     }
 
-    visit_number! {
-        visit_i8(i8) visit_i16(i16) visit_i32(i32) visit_i64(i64) visit_i128(i128)
-        visit_u8(u8) visit_u16(u16) visit_u32(u32) visit_u64(u64) visit_u128(u128)
-    }
+    visit_number! { visit_u8(u8) visit_u16(u16) visit_u32(u32) visit_u64(u64) }
 
     visit_as_ever! {
+        visit_i8(i8) visit_i16(i16) visit_i32(i32) visit_i64(i64) visit_i128(i128) visit_u128(u128)
         visit_bool(bool) visit_f32(f32) visit_f64(f64) visit_char(char) visit_str(&str) visit_string(String)
         visit_bytes(&[u8]) visit_borrowed_bytes(&'de [u8]) visit_byte_buf(Vec<u8>)
     }

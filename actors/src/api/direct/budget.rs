@@ -36,7 +36,7 @@ impl Budget {
         let has_room = self.held.load(Ordering::Relaxed) + ring_bytes + BESIDE <= self.max;
         if !has_room && !self.has_said_so.swap(true, Ordering::Relaxed) {
             let max = self.max;
-            tracing::warn!(
+            crate::log::here!(warn:
                 max,
                 "the rings of this process's direct links have their most in bytes; what else there is goes through the node"
             );

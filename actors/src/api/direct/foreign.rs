@@ -179,7 +179,7 @@ impl Closing {
         });
         if !matches!(closing, Some(Ok(_))) {
             self.done();
-            tracing::error!(
+            crate::log::here!(error:
                 "a peer has passed descriptors that were not asked for; they stay open until this process ends"
             );
             std::mem::forget(held);

@@ -71,7 +71,7 @@ impl Direct {
             return Err(Rejection::Unsupported);
         }
         let (half, share) = self.prepare(&socket).map_err(|why| {
-            tracing::warn!(%peer, %why, "a direct link was not made");
+            crate::log::here!(warn: %peer, %why, "a direct link was not made");
             Rejection::QueueFull
         })?;
         self.routes.offered(peer, number);
@@ -112,7 +112,7 @@ impl Direct {
                 self.routes.connected(peer, number, said, now);
             }
             Err(why) => {
-                tracing::warn!(%peer, %why, "a direct link was not made");
+                crate::log::here!(warn: %peer, %why, "a direct link was not made");
                 self.routes.ended(peer, now);
             }
         }
@@ -176,7 +176,7 @@ impl Direct {
                 true
             }
             Err(why) => {
-                tracing::warn!(%peer, %why, "a direct link was not made");
+                crate::log::here!(warn: %peer, %why, "a direct link was not made");
                 self.routes.ended(peer, now);
                 false
             }

@@ -300,7 +300,7 @@ impl Standing {
         let (peer, values) = (self.peer, self.parked.len() + usize::from(self.cut().is_some()));
         if values > 0 || self.writer.owes() {
             let owes_outcomes = self.writer.owes();
-            tracing::warn!(%peer, values, owes_outcomes, "a direct link ends whose peer takes nothing; the newest values of so many kinds of Stream do not reach it");
+            crate::log::here!(warn: %peer, values, owes_outcomes, "a direct link ends whose peer takes nothing; the newest values of so many kinds of Stream do not reach it");
         }
     }
 
@@ -339,7 +339,7 @@ impl Standing {
         let is_forged = header.source != self.peer;
         if !std::mem::replace(&mut self.has_forged, true) {
             let (source, destination, kind) = (header.source, header.destination, header.kind);
-            tracing::warn!(peer = %self.peer, %source, %destination, %kind, "it sent on its direct link what is not its own to send there; this is said once");
+            crate::log::here!(warn: peer = %self.peer, %source, %destination, %kind, "it sent on its direct link what is not its own to send there; this is said once");
         }
         if header.flags.has(Flags::CONFIRM) {
             let why = if is_forged { Rejection::ForgedSource } else { Rejection::Unsupported };

@@ -56,7 +56,7 @@ pub(super) fn is_available() -> bool {
     *AVAILABLE.get_or_init(|| match Region::create(Capacity::MIN, BellKind::Futex) {
         Ok(_) => true,
         Err(why) => {
-            tracing::warn!(%why, "messages to the node go through its socket");
+            crate::log::here!(warn: %why, "messages to the node go through its socket");
             false
         }
     })

@@ -1,0 +1,174 @@
+//! The frames of a panic that its reader can do something about: those of the program's own code.
+
+use std::{backtrace::Backtrace, sync::OnceLock};
+
+/// Frames of the program's own code that are shown, from the panic outwards.
+const SHOWN_MAX: usize = 10;
+
+/// The crates between an application's code and its thread.
+const LIBRARIES: [&str; 16] = [
+    "std",
+    "core",
+    "alloc",
+    "__rustc",
+    "test",
+    "tokio",
+    "tokio_util",
+    "actix",
+    "actix_rt",
+    "actix_utils",
+    "futures_core",
+    "futures_util",
+    "sinew",
+    "sinew_runtime",
+    "sinew_shm",
+    "sinew_c",
+];
+
+/// Parts of the paths of files that are not the program's own: the standard library's, and those of crates from a registry.
+const FOREIGN_PATHS: [&str; 4] = ["/rustc/", "/registry/src/", "/library/std/src/", "/library/core/src/"];
+
+/// Which frames of a panic are shown.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Frames {
+    None,
+    /// Those of the program's own code.
+    Own,
+    All,
+}
+
+impl Frames {
+    /// What the environment asks for: `RUST_BACKTRACE=0` for none, `full` for all.
+    pub(super) fn wanted() -> Self {
+        static WANTED: OnceLock<Frames> = OnceLock::new();
+        *WANTED.get_or_init(|| match std::env::var("RUST_BACKTRACE").as_deref() {
+            Ok("0") => Self::None,
+            Ok("full") => Self::All,
+            Ok(_) | Err(_) => Self::Own,
+        })
+    }
+}
+
+/// One line for each frame. Looks up names, which may take long at the first time in a process.
+pub(super) fn frames(backtrace: &Backtrace, wanted: Frames) -> Vec<String> {
+    match wanted {
+        Frames::None => Vec::new(),
+        Frames::All => vec![format!("{backtrace:#}")],
+        Frames::Own => own(&backtrace.to_string(), &Homes::of_sinew()),
+    }
+}
+
+/// Where the sources of Sinew are, which may be a folder of the program's own.
+struct Homes {
+    folders: Vec<String>,
+    /// The working folder, which the standard library leaves out of paths.
+    here: String,
+}
+
+impl Homes {
+    fn of_sinew() -> Self {
+        let runtime = env!("CARGO_MANIFEST_DIR");
+        let root = runtime.strip_suffix("/runtime").unwrap_or(runtime);
+        let folders = [format!("{runtime}/src/"), format!("{runtime}/shm/src/"), format!("{root}/actors/src/")];
+        let here = std::env::current_dir().unwrap_or_default();
+        Self { folders: folders.into(), here: here.to_string_lossy().into_owned() }
+    }
+
+    fn are_of(&self, file: &str) -> bool {
+        let whole = file.strip_prefix("./").map(|rest| format!("{}/{rest}", self.here));
+        let file = whole.as_deref().unwrap_or(file);
+        self.folders.iter().any(|folder| file.starts_with(folder))
+    }
+}
+
+/// The frames of the program's own code, of what the standard library writes of a backtrace: for each frame a line
+/// `  4: name`, and one `at file:line:column` where that is known.
+fn own(written: &str, sinew: &Homes) -> Vec<String> {
+    let mut shown: Vec<String> = Vec::new();
+    let mut lines = written.lines().peekable();
+    while let Some(line) = lines.next() {
+        let Some((_, name)) = line.split_once(": ") else { continue };
+        let at = lines.next_if(|next| next.trim_start().starts_with("at "));
+        let file = at.map(|at| at.trim_start().trim_start_matches("at "));
+        if shown.len() < SHOWN_MAX && is_own(name, file, sinew) {
+            let file = file.map(|file| format!(" ({})", file.trim_start_matches("./")));
+            shown.push(format!("      at {name}{}", file.unwrap_or_default()));
+        }
+    }
+    shown
+}
+
+fn is_own(name: &str, file: Option<&str>, sinew: &Homes) -> bool {
+    let is_foreign = |file: &str| FOREIGN_PATHS.iter().any(|part| file.contains(part)) || sinew.are_of(file);
+    match (crate_of(name), file) {
+        (Some(library), _) if LIBRARIES.contains(&library) => false,
+        (_, Some(file)) => !is_foreign(file),
+        // A name of the C library's: `start_thread`.
+        (found, None) => found.is_some(),
+    }
+}
+
+/// The crate that a function's name begins with: `hip` of `<hip::Hip as actix::Handler<Torque>>::handle`.
+fn crate_of(name: &str) -> Option<&str> {
+    let start = name.trim_start_matches(['<', '&', '(', '*', '[']);
+    let start = ["mut ", "dyn ", "const "].into_iter().fold(start, |start, word| start.trim_start_matches(word));
+    let (found, _) = start.split_once("::")?;
+    found.chars().all(|part| part.is_alphanumeric() || part == '_').then_some(found)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WRITTEN: &str = "   0: std::backtrace_rs::backtrace::trace
+             at /rustc/59807/library/std/src/../../backtrace/src/backtrace/mod.rs:66:14
+   1: sinew_runtime::supervision::panics::hook
+             at ./runtime/src/supervision/panics.rs:130:5
+   2: core::panicking::panic_fmt
+             at /rustc/59807/library/core/src/panicking.rs:80:14
+   3: hip::gait::phase
+             at ./src/gait.rs:12:9
+   4: <hip::Hip as actix::handler::Handler<sinew_runtime::app::Delivery<hip::Torque>>>::handle
+             at /robot/src/main.rs:42:5
+   5: {closure#0}
+             at /home/me/robot/vendor/sinew/runtime/src/app/drive.rs:57:11
+   6: {closure#1}
+             at ./src/main.rs:50:11
+   7: <core::panic::unwind_safe::AssertUnwindSafe<hip::main::{closure#0}> as core::ops::function::FnOnce<()>>::call_once
+   8: call_once<hip::main::{closure_env#0}, ()>
+             at /rustc/59807/library/core/src/ops/function.rs:250:5
+   9: nalgebra::base::solve
+             at /home/me/.cargo/registry/src/index.crates.io-1949/nalgebra-0.33.0/src/base.rs:7:1
+  10: start_thread
+  11: <unknown>
+";
+
+    fn homes() -> Homes {
+        Homes { folders: vec!["/home/me/robot/vendor/sinew/runtime/src/".to_owned()], here: "/robot".to_owned() }
+    }
+
+    #[test]
+    fn only_the_programs_own_code_is_shown() {
+        let handle =
+            "<hip::Hip as actix::handler::Handler<sinew_runtime::app::Delivery<hip::Torque>>>::handle";
+        let wanted = [
+            "      at hip::gait::phase (src/gait.rs:12:9)".to_owned(),
+            format!("      at {handle} (/robot/src/main.rs:42:5)"),
+            "      at {closure#1} (src/main.rs:50:11)".to_owned(),
+        ];
+        assert_eq!(own(WRITTEN, &homes()), wanted);
+    }
+
+    #[test]
+    fn sinew_in_a_folder_of_the_program_is_not_its_own_code() {
+        let homes = Homes { folders: vec!["/robot/sinew/runtime/src/".to_owned()], here: "/robot".to_owned() };
+        assert!(homes.are_of("./sinew/runtime/src/app/drive.rs") && !homes.are_of("./src/main.rs"));
+    }
+
+    #[test]
+    fn no_more_frames_are_shown_than_a_screen_has_room_for() {
+        let frame = |number: usize| format!("  {number}: hip::deep\n             at ./src/deep.rs:1:1\n");
+        let written: String = (0..100).map(frame).collect();
+        assert_eq!(own(&written, &homes()).len(), SHOWN_MAX);
+    }
+}
