@@ -1,9 +1,13 @@
 //! A message as an application of another process gets it.
 
-use std::{thread, time::Duration};
+use std::{
+    sync::atomic::{AtomicBool, Ordering},
+    thread,
+    time::Duration,
+};
 
 use sinew_runtime::{
-    outcome::Outcome,
+    outcome::{Outcome, Rejection},
     tid::Tid,
     time::Time,
     wire::{Class, DecodeError, Flags, Kind, Message, Payload},
@@ -12,7 +16,7 @@ use sinew_runtime::{
 /// A message in hand.
 ///
 /// If its sender wants to know the outcome it is told when this value is dropped: `Delivered`, or `Failed` if the
-/// thread is panicking then. So a message counts as handled at the end of the scope that handled it, and one that was
+/// thread is panicking then; `Rejected(Malformed)` if the last [`decode`](Self::decode) of it failed. So a message counts as handled at the end of the scope that handled it, and one that was
 /// in hand at a panic counts as failed. [`settle`](Self::settle) says something else, or says it sooner. The process's
 /// end says `Failed`.
 #[derive(Debug)]
@@ -21,15 +25,17 @@ pub struct Received {
     message: Message,
     /// It came through a guard, and is without its envelope.
     is_guarded: bool,
+    /// The last try to decode it failed.
+    is_malformed: AtomicBool,
 }
 
 impl Received {
     pub(super) const fn new(message: Message) -> Self {
-        Self { message, is_guarded: false }
+        Self { message, is_guarded: false, is_malformed: AtomicBool::new(false) }
     }
 
     pub(super) const fn guarded(message: Message) -> Self {
-        Self { message, is_guarded: true }
+        Self { message, is_guarded: true, is_malformed: AtomicBool::new(false) }
     }
 
     /// Who sent it; the sender's node answers for it.
@@ -100,15 +106,18 @@ impl Received {
         &self.message.payload
     }
 
-    /// Reads the payload as a `P`. Compare [`kind`](Self::kind) with `P::KIND` first.
+    /// Reads the payload as a `P`. Compare [`kind`](Self::kind) with `P::KIND` first. A number that does not fit its field is an error, which
+    /// names the field.
     ///
     /// # Errors
-    /// The bytes are not a `P`, or it is [protected](crate::protection) and did not come through a [`guard`](super::Endpoint::guard).
+    /// The bytes are not a `P`: a sender that asked for the outcome gets `Rejected(Malformed)`. Or it is [protected](crate::protection) and did not come through a [`guard`](super::Endpoint::guard).
     pub fn decode<P: Payload>(&self) -> Result<P, DecodeError> {
         if P::PROTECTION.is_some() && !self.is_guarded {
             return Err(DecodeError::unguarded::<P>());
         }
-        self.message.decode()
+        let decoded = self.message.decode();
+        self.is_malformed.store(decoded.is_err(), Ordering::Relaxed);
+        decoded
     }
 
     /// Says what became of the message, if the sender wants to know.
@@ -123,7 +132,11 @@ impl Received {
 
 impl Drop for Received {
     fn drop(&mut self) {
-        let outcome = if thread::panicking() { Outcome::Failed } else { Outcome::Delivered };
+        let outcome = match *self.is_malformed.get_mut() {
+            _ if thread::panicking() => Outcome::Failed,
+            true => Outcome::Rejected(Rejection::Malformed),
+            false => Outcome::Delivered,
+        };
         self.message.settle(outcome);
     }
 }

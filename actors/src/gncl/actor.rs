@@ -314,7 +314,7 @@ impl Gncl {
         | LinkFact::DialRefused { node, .. }
         | LinkFact::PeerLeft { node, .. }) = &fact;
         if let Some(suppressed) = self.stores.log_quotas.links.take(node, Time::now()) {
-            crate::log::info!(?fact, suppressed, "link");
+            crate::log::debug!(?fact, suppressed, "link");
         }
         self.stores.gncl.notes.fact(Time::now(), &fact);
         if let LinkFact::PeerLeft { node, incarnation } = fact {

@@ -45,7 +45,7 @@ impl Lncl {
         let opened = opened.and_then(|listener| UnixListener::from_std(listener).map_err(in_words));
         let listener = opened.unwrap_or_else(|error| panic!("LNCL cannot start: {error}"));
         ctx.spawn(accept(self.server.clone(), listener).into_actor(self));
-        crate::log::info!(?path, "applications of other processes can connect");
+        crate::log::debug!(?path, "applications of other processes can connect");
     }
 }
 

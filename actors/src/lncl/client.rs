@@ -210,6 +210,7 @@ impl Client {
         server.add_client(peer.id, outlet.clone(), notices.clone());
         server.stores.book.add_client(peer.id, app, &name, outlet.clone());
         if let Some(suppressed) = server.stores.log_quotas.clients.take(&name, Time::now()) {
+            let suppressed = (suppressed > 0).then_some(suppressed);
             crate::log::info!(%tid, name, pid = peer.pid, suppressed, "an application of another process has registered");
         }
         let (link, events, has_been_told) = (None, events.into(), false);

@@ -27,6 +27,9 @@ use crate::{
     sync::Waiting,
 };
 
+/// Applications of which the log says at the start that they wait.
+const WAITING_SHOWN_MAX: usize = 8;
+
 /// Declares a node: its configuration and its applications.
 pub struct NodeBuilder {
     config: NodeConfig,
@@ -284,11 +287,28 @@ impl NodeBuilder {
             .spawn(move || root::run(stores, tree, say_started, say_ended))?;
         let node = Node { handle, ended, thread: Some(thread) };
         match started.recv_timeout(patience) {
-            Ok(Ok(())) => Ok(node),
+            Ok(Ok(())) => {
+                log_start(&node.handle);
+                Ok(node)
+            }
             // Dropping the node stops what has started.
             Ok(Err(error)) => Err(error),
             Err(_) => Err(StartError::Layers(format!("no word from the root in {patience:?}"))),
         }
+    }
+}
+
+/// Says which node this is, and which of its applications wait.
+fn log_start(handle: &NodeHandle) {
+    let config = &handle.stores.config;
+    let (interface, socket) = (&config.ndl.interface, config.lncl.socket.as_ref());
+    let socket = socket.map(|path| path.display().to_string());
+    log::info!(
+        node = config.name, address = %handle.address(), project = config.project, %interface, socket, "the node has started"
+    );
+    for waiting in handle.waiting().into_iter().take(WAITING_SHOWN_MAX) {
+        let missing: Vec<_> = waiting.missing.iter().map(|absence| &*absence.name).collect();
+        log::info!(application = waiting.application, "waits for {}", missing.join(", "));
     }
 }
 

@@ -21,6 +21,8 @@ mod directory;
 #[cfg(feature = "fault-points")]
 mod faults;
 mod layers;
+#[cfg(test)]
+mod log_tests;
 mod places;
 mod progress;
 mod root;

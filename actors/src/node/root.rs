@@ -463,7 +463,7 @@ impl Root {
             Phase::StartingLayers | Phase::Running => {}
             Phase::StoppingApps | Phase::StoppingLayers => return,
         }
-        crate::log::info!(node = self.stores.config.name, "stops");
+        crate::log::info!(node = self.stores.config.name, "the node stops");
         self.phase = Phase::StoppingApps;
         self.tell_if_running();
         match &self.app_supervisor {
@@ -505,7 +505,7 @@ impl Root {
                 _ = interrupt.recv() => "SIGINT",
                 _ = terminate.recv() => "SIGTERM",
             };
-            crate::log::info!(which, "a signal asks for a stop");
+            crate::log::info!(signal = which, "a signal asks for a stop");
             tell(&post, RootEvent::StopOrdered);
         };
         context.spawn(heed.into_actor(self));

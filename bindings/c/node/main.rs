@@ -1,12 +1,11 @@
 //! `sinew-node CONFIGURATION`: a node with no application of its own, for programs that come in through its socket.
 //!
-//! It says `up` when they may come, and ends in order at SIGINT and SIGTERM. Warnings and errors are on its standard error; RUST_LOG
-//! says what else is (`RUST_LOG=info`).
+//! It prints `up` when they can connect, and stops in order at SIGINT and SIGTERM. Its log is on the standard error; `SINEW_LOG` sets the
+//! level (`SINEW_LOG=warn`).
 
 use std::process::ExitCode;
 
 use sinew::{Node, NodeConfig};
-use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
     let mut arguments = std::env::args().skip(1);
@@ -14,8 +13,6 @@ fn main() -> ExitCode {
         eprintln!("sinew-node: give it one file, the node's configuration (docs/CONFIGURATION.md)");
         return ExitCode::FAILURE;
     };
-    let wanted = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn"));
-    tracing_subscriber::fmt().with_env_filter(wanted).with_writer(std::io::stderr).init();
     match start(&path) {
         Ok(node) => {
             println!("up");

@@ -30,6 +30,8 @@ pub struct AppContext<A: Actor<Context = Self>> {
     pub(super) ready: Option<ReadyGate>,
     /// When a payload that cannot be read was last logged.
     warned: Option<Time>,
+    /// Those since then.
+    unlogged: u64,
     /// What the handler says of the message in hand, if it does not take it.
     pub(super) verdict: Option<Outcome>,
     /// The outputs that protected messages move.
@@ -94,6 +96,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
             watches: Vec::new(),
             ready: Some(ready),
             warned: None,
+            unlogged: 0,
             verdict: None,
             guards: Vec::new(),
         };
@@ -188,10 +191,18 @@ impl<A: Actor<Context = Self>> AppContext<A> {
 
     /// Logs a payload that cannot be read, once a second at most: the mailbox counts them all.
     pub(super) fn warn_of_payload(&mut self, source: Tid, error: &dyn fmt::Display, now: Time) {
-        if self.warned.is_none_or(|last| now.since(last) >= Duration::from_secs(1)) {
-            self.warned = Some(now);
-            crate::log::warn!(tid = %self.tid(), %source, %error, "payloads are refused");
+        if self.warned.is_some_and(|last| now.since(last) < Duration::from_secs(1)) {
+            self.unlogged += 1;
+            return;
         }
+        self.warned = Some(now);
+        let suppressed = Some(std::mem::take(&mut self.unlogged)).filter(|count| *count > 0);
+        let vitals = Vitals::present();
+        let application = vitals.as_ref().map(|vitals| vitals.name());
+        crate::log::warn!(
+            application, tid = %self.tid(), %source, suppressed,
+            "a message was refused: {error}; build sender and receiver with the same type"
+        );
     }
 
     /// Becomes a member of the group called `name`.

@@ -6,7 +6,7 @@ use std::{backtrace::Backtrace, sync::OnceLock};
 const SHOWN_MAX: usize = 10;
 
 /// The crates between an application's code and its thread.
-const LIBRARIES: [&str; 16] = [
+const LIBRARIES: [&str; 15] = [
     "std",
     "core",
     "alloc",
@@ -16,7 +16,6 @@ const LIBRARIES: [&str; 16] = [
     "tokio_util",
     "actix",
     "actix_rt",
-    "actix_utils",
     "futures_core",
     "futures_util",
     "sinew",
@@ -27,6 +26,9 @@ const LIBRARIES: [&str; 16] = [
 
 /// Parts of the paths of files that are not the program's own: the standard library's, and those of crates from a registry.
 const FOREIGN_PATHS: [&str; 4] = ["/rustc/", "/registry/src/", "/library/std/src/", "/library/core/src/"];
+
+/// Functions of the C library's below every thread, whose file is known where its debug information is there.
+const C_STARTS: [&str; 4] = ["start_thread", "clone", "__libc_start", "_start"];
 
 /// Which frames of a panic are shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -102,6 +104,7 @@ fn is_own(name: &str, file: Option<&str>, sinew: &Homes) -> bool {
     let is_foreign = |file: &str| FOREIGN_PATHS.iter().any(|part| file.contains(part)) || sinew.are_of(file);
     match (crate_of(name), file) {
         (Some(library), _) if LIBRARIES.contains(&library) => false,
+        (None, _) if C_STARTS.iter().any(|start| name.starts_with(start)) => false,
         (_, Some(file)) => !is_foreign(file),
         // A name of the C library's: `start_thread`.
         (found, None) => found.is_some(),
@@ -140,6 +143,7 @@ mod tests {
    9: nalgebra::base::solve
              at /home/me/.cargo/registry/src/index.crates.io-1949/nalgebra-0.33.0/src/base.rs:7:1
   10: start_thread
+             at nptl/pthread_create.c:442:8
   11: <unknown>
 ";
 

@@ -194,7 +194,7 @@ pub(crate) fn make_foremost(thread: &str, wanted: u8) -> u8 {
     }
     let (_, has) = schedule();
     if has >= wanted {
-        crate::log::info!(thread, priority = has, "has its real-time priority, and may run on any CPU");
+        crate::log::debug!(thread, priority = has, "has its real-time priority, and may run on any CPU");
     } else {
         crate::log::warn!(
             thread,

@@ -185,6 +185,7 @@ impl Client {
     fn log(&self, what: &str) {
         if let Some(suppressed) = self.server.stores.log_quotas.clients.take(&self.name, Time::now()) {
             let (tid, name, pid) = (self.tid, &self.name, self.peer.pid);
+            let suppressed = (suppressed > 0).then_some(suppressed);
             crate::log::info!(%tid, name, pid, suppressed, "an application of another process {what}");
         }
     }

@@ -243,7 +243,7 @@ fn open(stores: &Stores, local: LocalAddress) -> io::Result<Path> {
     let (ndl, marks) = (&stores.config.ndl, stores.config.gncl.marks);
     let socket = stores::lock(&stores.ndl_sockets).open(local, ndl.port, marks)?;
     let here = socket.local_addr()?;
-    crate::log::info!(udp = %here, "NDL asks and answers");
+    crate::log::debug!(udp = %here, "NDL sends and receives here");
     Ok(Path { local, here, socket, group: None, readers: Vec::new() })
 }
 
@@ -255,7 +255,7 @@ fn say_in_doubt(local: LocalAddress, flags: Flags) {
              (`sudo ip -6 address del`), and give it another one"
         );
     } else {
-        crate::log::info!(%local, "NDL uses this address as soon as the kernel knows that no other host on the link has it");
+        crate::log::debug!(%local, "NDL uses this address as soon as the kernel knows that no other host on the link has it");
     }
 }
 

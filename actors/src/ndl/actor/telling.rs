@@ -41,7 +41,15 @@ impl Shell {
         }
         let (MembershipFact::NodeFound { node, .. } | MembershipFact::NodeLost { node, .. }) = fact;
         if let Some(suppressed) = self.stores.log_quotas.members.take(node, Time::now()) {
-            crate::log::info!(?fact, suppressed, "membership");
+            let suppressed = (suppressed > 0).then_some(suppressed);
+            match fact {
+                MembershipFact::NodeFound { incarnation, gncl, .. } => {
+                    crate::log::info!(%node, life = %incarnation, ?gncl, suppressed, "a node was found");
+                }
+                MembershipFact::NodeLost { incarnation, why, .. } => {
+                    crate::log::info!(%node, life = %incarnation, ?why, suppressed, "a node was lost");
+                }
+            }
         }
         self.tell();
     }

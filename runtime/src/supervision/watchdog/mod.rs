@@ -147,7 +147,8 @@ fn run(shared: &Weak<Shared>, prepared: Option<SyncSender<()>>) {
     if let Err(error) = make_realtime(PRIORITY) {
         static SAID: Once = Once::new();
         SAID.call_once(|| {
-            crate::log::warn!(
+            // Usual on a computer for development; who asks for a priority for an actor is warned.
+            crate::log::info!(
                 ?error,
                 "the watchdog has no real-time priority: on a busy CPU it notices a hang late; allow it with `ulimit -r 99`"
             );
