@@ -110,7 +110,11 @@ impl NodeConfig {
         reader.time(&check::REQUIREMENT_DEADLINE, &mut config.sync.requirement_deadline);
         reader.read_supervision(&mut config);
         reader.read_security(&mut config);
-        reader.text("log.level", "\"off\", \"error\", \"warn\", \"info\", \"debug\" or \"trace\"", &mut config.log.level);
+        reader.text(
+            "log.level",
+            "\"off\", \"error\", \"warn\", \"info\", \"debug\" or \"trace\"",
+            &mut config.log.level,
+        );
         reader.finish(&config)?;
         Ok(config)
     }

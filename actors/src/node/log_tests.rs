@@ -144,6 +144,12 @@ fn a_panic_is_logged_with_name_and_address_and_the_place_alone_is_said_again() {
     let said: Vec<_> = lines.iter().filter(|line| line.contains("kp is 2.5")).collect();
     assert_eq!(said.len(), 1, "{lines:#?}");
     assert!(said[0].contains("ERROR sinew_runtime::supervision: the actor 'hip' (127.0.0.124/"), "{said:?}");
-    assert!(lines.iter().any(|line| line.contains("a child failed") && line.contains("a panic at ")), "{lines:#?}");
-    assert!(!lines.iter().any(|line| line.starts_with("thread '")), "not the standard hook as well: {lines:#?}");
+    assert!(
+        lines.iter().any(|line| line.contains("a child failed") && line.contains("a panic at ")),
+        "{lines:#?}"
+    );
+    assert!(
+        !lines.iter().any(|line| line.starts_with("thread '")),
+        "not the standard hook as well: {lines:#?}"
+    );
 }

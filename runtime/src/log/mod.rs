@@ -11,10 +11,10 @@ mod filter;
 mod stderr;
 mod writer;
 
+pub(crate) use event::now;
 #[doc(hidden)]
 pub use event::{apart, here, is_on};
 pub use stderr::set_level;
-pub(crate) use event::now;
 pub(crate) use stderr::{Line, is_replaced, write_text};
 pub(crate) use writer::enter;
 pub use writer::{begin, flush, lost, print};
@@ -83,5 +83,6 @@ macro_rules! log_here {
 }
 
 pub use crate::{
-    log_debug as debug, log_error as error, log_here as here, log_info as info, log_trace as trace, log_warn as warn,
+    log_debug as debug, log_error as error, log_here as here, log_info as info, log_trace as trace,
+    log_warn as warn,
 };

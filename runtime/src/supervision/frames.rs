@@ -71,7 +71,8 @@ impl Homes {
     fn of_sinew() -> Self {
         let runtime = env!("CARGO_MANIFEST_DIR");
         let root = runtime.strip_suffix("/runtime").unwrap_or(runtime);
-        let folders = [format!("{runtime}/src/"), format!("{runtime}/shm/src/"), format!("{root}/actors/src/")];
+        let folders =
+            [format!("{runtime}/src/"), format!("{runtime}/shm/src/"), format!("{root}/actors/src/")];
         let here = std::env::current_dir().unwrap_or_default();
         Self { folders: folders.into(), here: here.to_string_lossy().into_owned() }
     }
@@ -114,7 +115,8 @@ fn is_own(name: &str, file: Option<&str>, sinew: &Homes) -> bool {
 /// The crate that a function's name begins with: `hip` of `<hip::Hip as actix::Handler<Torque>>::handle`.
 fn crate_of(name: &str) -> Option<&str> {
     let start = name.trim_start_matches(['<', '&', '(', '*', '[']);
-    let start = ["mut ", "dyn ", "const "].into_iter().fold(start, |start, word| start.trim_start_matches(word));
+    let start =
+        ["mut ", "dyn ", "const "].into_iter().fold(start, |start, word| start.trim_start_matches(word));
     let (found, _) = start.split_once("::")?;
     found.chars().all(|part| part.is_alphanumeric() || part == '_').then_some(found)
 }
@@ -148,7 +150,10 @@ mod tests {
 ";
 
     fn homes() -> Homes {
-        Homes { folders: vec!["/home/me/robot/vendor/sinew/runtime/src/".to_owned()], here: "/robot".to_owned() }
+        Homes {
+            folders: vec!["/home/me/robot/vendor/sinew/runtime/src/".to_owned()],
+            here: "/robot".to_owned(),
+        }
     }
 
     #[test]
@@ -165,7 +170,8 @@ mod tests {
 
     #[test]
     fn sinew_in_a_folder_of_the_program_is_not_its_own_code() {
-        let homes = Homes { folders: vec!["/robot/sinew/runtime/src/".to_owned()], here: "/robot".to_owned() };
+        let homes =
+            Homes { folders: vec!["/robot/sinew/runtime/src/".to_owned()], here: "/robot".to_owned() };
         assert!(homes.are_of("./sinew/runtime/src/app/drive.rs") && !homes.are_of("./src/main.rs"));
     }
 

@@ -38,7 +38,8 @@ pub(super) fn decode_payload<T: DeserializeOwned + Serialize>(bytes: &[u8]) -> R
     let trail = Trail::default();
     let value = read(bytes, &trail).map_err(|error| in_words(error, &trail))?;
     if trail.is_doubtful() && infinities(&encode(&value)) > infinities(bytes) {
-        let words = "a number is beyond the largest f32, and its field is one, in a flattened or untagged part";
+        let words =
+            "a number is beyond the largest f32, and its field is one, in a flattened or untagged part";
         return Err(Error::Syntax(words.to_owned()));
     }
     Ok(value)
@@ -64,11 +65,14 @@ fn in_words(error: Error, trail: &Trail) -> Error {
 fn words_of(error: Error, wanted: &str) -> String {
     match error {
         Error::Syntax(words) | Error::Uncategorized(words) => turned(words),
-        Error::InvalidMarkerRead(_) | Error::InvalidDataRead(_) => "the payload ends before its value does".to_owned(),
+        Error::InvalidMarkerRead(_) | Error::InvalidDataRead(_) => {
+            "the payload ends before its value does".to_owned()
+        }
         Error::TypeMismatch(marker) => {
             let found = format!("{marker:?}");
             // `FixStr(5)`, `Str8`, `Array16`, `Map32`, `Bin8`, `FixExt4`, `Reserved`.
-            let found = KINDS.iter().find(|(mark, _)| found.contains(mark)).map_or(&*found, |(_, found)| found);
+            let found =
+                KINDS.iter().find(|(mark, _)| found.contains(mark)).map_or(&*found, |(_, found)| found);
             format!("expected {wanted}, found {found}")
         }
         Error::OutOfRange => "the number is out of range".to_owned(),
@@ -261,7 +265,8 @@ mod tests {
         ] {
             assert_eq!(of_robot(value), words);
         }
-        let fits = json!({"load": 33_554_432, "mass": 9_007_199_254_740_992_i64, "pair": [255, -32768], "count": 0});
+        let fits =
+            json!({"load": 33_554_432, "mass": 9_007_199_254_740_992_i64, "pair": [255, -32768], "count": 0});
         assert_eq!(decode_payload::<Robot>(&bytes(fits)).unwrap().load, Some(Newtons(33_554_432.0)));
     }
 
@@ -275,12 +280,18 @@ mod tests {
             ("field `gains`: missing field `kp`", json!({"gains": {"kd": 1}})),
             ("field `gains`: expected struct Gains, found integer `1`", json!({"gains": 1})),
             ("field `offsets`: invalid length 1, expected an array of length 2", json!({"offsets": [1]})),
-            ("field `mode`: unknown variant `Run`, expected one of `Off`, `Hold`, `Walk`, `Track`", json!({"mode": "Run"})),
+            (
+                "field `mode`: unknown variant `Run`, expected one of `Off`, `Hold`, `Walk`, `Track`",
+                json!({"mode": "Run"}),
+            ),
             ("field `mode.Hold`: expected newtype variant, found unit variant", json!({"mode": "Hold"})),
         ] {
             assert_eq!(of_robot(value), words);
         }
-        assert_eq!(refusal::<Gains>(&[0x81, 0xa2, b'k', b'p', 0xcb, 1]), "field `kp`: the payload ends before its value does");
+        assert_eq!(
+            refusal::<Gains>(&[0x81, 0xa2, b'k', b'p', 0xcb, 1]),
+            "field `kp`: the payload ends before its value does"
+        );
         assert_eq!(refusal::<Gains>(&[0x01]), "expected struct Gains, found integer `1`");
         let long = refusal::<Joint>(&bytes(json!("x".repeat(100_000))));
         assert!(long.len() < 500, "{} bytes", long.len());
