@@ -239,7 +239,7 @@ pub extern "C" fn sinew_create_value(
         let (kind, length) = (payload_type.kind()?, encode::length(&payload_type.layout, value)?);
         let destination = Tid::from_bits(destination);
         let created = with(endpoint, |session| {
-            session.create_with(destination, kind, payload_type.message_class, length, |bytes| {
+            session.create_with((destination, kind, payload_type.message_class), length, |bytes| {
                 encode::write(&payload_type.layout, value, bytes).map(|_| ())
             })
         })?;

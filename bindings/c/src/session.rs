@@ -65,25 +65,34 @@ impl Session {
         class: i32,
         length: usize,
     ) -> Result<Message, Fault> {
-        self.create_with(destination, kind, class, length, |_| Ok(()))
+        let buffer = self.loan((destination, kind, class), length)?;
+        self.hand_out_loan(buffer)
     }
 
-    /// Creates a message and has its bytes written; after an error there is no message.
+    /// Creates a message of so many bytes and has them written; after an error there is no message.
     pub(crate) fn create_with(
         &mut self,
-        destination: Tid,
-        kind: Kind,
-        class: i32,
+        to: (Tid, Kind, i32),
         length: usize,
         write: impl FnOnce(&mut [u8]) -> Result<(), Fault>,
     ) -> Result<Message, Fault> {
+        let mut buffer = self.loan(to, length)?;
+        write(&mut buffer)?;
+        self.hand_out_loan(buffer)
+    }
+
+    fn loan(&mut self, to: (Tid, Kind, i32), length: usize) -> Result<LoanedMessage, Fault> {
+        let (destination, kind, class) = to;
         let class = class_of(class).ok_or_else(|| {
             Fault::argument(format!("`message_class` is {class}: take one of sinew_message_class"))
         })?;
         let mut buffer = self.endpoint.create_message(destination, kind, length)?;
         buffer.set_class(class);
-        write(&mut buffer)?;
-        let bytes = buffer.as_mut_ptr();
+        Ok(buffer)
+    }
+
+    fn hand_out_loan(&mut self, mut buffer: LoanedMessage) -> Result<Message, Fault> {
+        let (bytes, length) = (buffer.as_mut_ptr(), buffer.len());
         match self.made.take(buffer) {
             Ok(token) => Ok(Message { bytes, length, token }),
             // Dropped; there is none in the hand that is not lent.

@@ -345,6 +345,10 @@ impl<'call> Reader<'call> {
         read(&mut self.bytes).map_err(|_| cut())
     }
 
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "MessagePack has 38 markers, fixed by its specification; the others have no length"
+    )]
     fn length(&mut self, marker: Marker) -> Result<Option<usize>, ReadError> {
         Ok(Some(match marker {
             Marker::FixStr(length) | Marker::FixArray(length) | Marker::FixMap(length) => usize::from(length),
@@ -362,33 +366,34 @@ impl<'call> Reader<'call> {
     /// The start of a struct: how many fields come, and whether each has its name before it.
     fn fields(&mut self) -> Result<(usize, bool), ReadError> {
         let marker = self.marker()?;
-        let has_names = match family(marker) {
-            Family::Map => true,
-            Family::List => false,
-            // What Rust writes for a struct without fields.
-            Family::Nil => return Ok((0, true)),
-            other => return Err(ReadError::payload(format!("expected a struct, found {}", other.words()))),
-        };
-        Ok((self.length(marker)?.unwrap_or_default(), has_names))
+        let found = family(marker);
+        // What Rust writes for a struct without fields.
+        if found == Family::Nil {
+            return Ok((0, true));
+        }
+        if found != Family::Map && found != Family::List {
+            return Err(ReadError::payload(format!("expected a struct, found {}", found.words())));
+        }
+        Ok((self.length(marker)?.unwrap_or_default(), found == Family::Map))
     }
 
     fn list(&mut self) -> Result<usize, ReadError> {
         let marker = self.marker()?;
-        match family(marker) {
-            Family::List => Ok(self.length(marker)?.unwrap_or_default()),
-            other => Err(ReadError::payload(format!("expected a list, found {}", other.words()))),
+        let found = family(marker);
+        if found != Family::List {
+            return Err(ReadError::payload(format!("expected a list, found {}", found.words())));
         }
+        Ok(self.length(marker)?.unwrap_or_default())
     }
 
     fn text(&mut self) -> Result<&'call [u8], ReadError> {
         let marker = self.marker()?;
-        match family(marker) {
-            Family::Text => {
-                let length = self.length(marker)?.unwrap_or_default();
-                self.take(length)
-            }
-            other => Err(ReadError::payload(format!("expected a text, found {}", other.words()))),
+        let found = family(marker);
+        if found != Family::Text {
+            return Err(ReadError::payload(format!("expected a text, found {}", found.words())));
         }
+        let length = self.length(marker)?.unwrap_or_default();
+        self.take(length)
     }
 
     fn name(&mut self) -> Result<&'call [u8], ReadError> {
@@ -416,13 +421,17 @@ impl<'call> Reader<'call> {
     }
 
     fn boolean(&mut self) -> Result<bool, ReadError> {
-        match self.marker()? {
-            Marker::True => Ok(true),
-            Marker::False => Ok(false),
-            other => Err(ReadError::payload(format!("expected bool, found {}", family(other).words()))),
+        let marker = self.marker()?;
+        if family(marker) != Family::Boolean {
+            return Err(ReadError::payload(format!("expected bool, found {}", family(marker).words())));
         }
+        Ok(marker == Marker::True)
     }
 
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "MessagePack has 38 markers, fixed by its specification; the others are no numbers"
+    )]
     fn number(&mut self) -> Result<Number, ReadError> {
         Ok(match self.marker()? {
             Marker::FixPos(value) => Number::Unsigned(u64::from(value)),
@@ -471,6 +480,10 @@ impl<'call> Reader<'call> {
         Ok(())
     }
 
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "MessagePack has 38 markers, fixed by its specification; the others have no data"
+    )]
     fn skip_data(&mut self, marker: Marker) -> Result<(), ReadError> {
         let length = match marker {
             Marker::U8 | Marker::I8 => 1,
