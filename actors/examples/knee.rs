@@ -34,7 +34,7 @@ fn sensor(node: &NodeApi) -> Result<(), ApiError> {
     let drive = sensor.resolve("knee.drive", SECOND)?.expect("it is ready: it was required");
     for number in 0..10_u8 {
         let angle = JointAngle { degrees: f32::from(number) };
-        let outcome = sensor.send_confirmed(drive, &angle, SECOND)?;
+        let outcome = sensor.message(drive, &angle).confirmed(SECOND)?;
         println!("{} degrees: {outcome:?}", angle.degrees);
     }
     Ok(())

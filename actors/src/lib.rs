@@ -12,7 +12,7 @@
 //! | an application in the node's process | [`AppSpec`], [`AppContext`], [`Delivery`], [`payload!`] |
 //! | the same in a process of its own, started and restarted by the node | [`AppSpec::own_process`], [`Place::process`] |
 //! | an application in a process that the node did not start | [`NodeApi`], [`Endpoint`] for a thread, [`AsyncEndpoint`] for a task |
-//! | sending | [`Sender`]: `send`, `send_confirmed`, `ask`; [`Outcome`] |
+//! | sending | `send`, `reply` and `message` of [`AppContext`], [`Sender`], [`Endpoint`] and [`AsyncEndpoint`]; [`Outcome`] |
 //! | who another node is, proven | [`security`] |
 //! | events | [`NodeEvent`] (who is there), [`DirectoryEvent`] (which applications are, and what they handle), [`RequirementEvent`] (what is ready), [`Down`] (who ended, and why) |
 //!

@@ -165,13 +165,13 @@ impl<P: Filled> Here<P> {
     /// Sends `count`, of which each is followed by a word when it is handled.
     fn send_confirmed(&mut self, there: Tid, count: usize, sender: &Sender) {
         self.words = 0;
-        let sent = (0..count).map(|_| sender.send_confirmed(there, &P::filled(), DEADLINE).unwrap());
+        let sent = (0..count).map(|_| sender.message(there, &P::filled()).confirmed(DEADLINE).unwrap());
         self.under_way.extend(sent);
     }
 
     /// Sends, and awaits the outcome of the oldest one, with `count` under way.
     async fn send_and_await(sender: Sender, there: Tid, count: usize, mut windows: Windows) {
-        let send = || sender.send_confirmed(there, &P::filled(), DEADLINE).unwrap();
+        let send = || sender.message(there, &P::filled()).confirmed(DEADLINE).unwrap();
         let mut under_way: VecDeque<_> = (0..count).map(|_| send()).collect();
         while let Some(first) = under_way.pop_front() {
             assert_eq!(first.await, Outcome::Delivered);

@@ -279,7 +279,7 @@ fn sensor() {
     let api = NodeApi::connect(socket).unwrap();
     let mut sensor = api.register_transport_address(Registration::new().name("sensor")).unwrap();
     let drive = sensor.resolve("drive", WATCHDOG).unwrap().expect("the drive is registered");
-    let twice: Twice = sensor.ask(drive, &Angle { degrees: 12.5 }, WATCHDOG).unwrap();
+    let twice: Twice = sensor.message(drive, &Angle { degrees: 12.5 }).ask(WATCHDOG).unwrap();
     assert_eq!(twice.degrees, 25.0);
     // Until it is killed; the end of the node ends it, too.
     while sensor.receive(WATCHDOG).is_ok() {}

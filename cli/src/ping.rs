@@ -36,7 +36,7 @@ pub(crate) fn show(system: &mut System, whom: &str, count: u32) -> Result<Said, 
     let mut in_vain = 0;
     while tally.sent < count && in_vain < IN_VAIN_MAX {
         let began = Time::now();
-        let outcome = system.endpoint.send_confirmed(to, &Ping {}, system.within);
+        let outcome = system.endpoint.message(to, &Ping {}).confirmed(system.within);
         tally.sent += 1;
         tally.outcome = outcome.as_ref().ok().copied();
         match outcome.map_err(|error| error.to_string()).and_then(|outcome| judged(outcome, system.within)) {

@@ -124,14 +124,14 @@ fn send(system: &mut System, to: Tid, (kind, payload): (Kind, &[u8]), order: &Or
     });
     let ended = lent.and_then(|lent| {
         if order.ask {
-            let reply = endpoint.ask_message(lent, within)?;
+            let reply = endpoint.loaned(lent).ask_raw(within)?;
             return Ok((Some(Outcome::Delivered), Some(messagepack::shown_or_raw(reply.bytes()))));
         }
         // spec: FRAME-5
         if order.unconfirmed || order.class == ClassName::Stream {
-            return endpoint.send_message(lent).map(|()| (None, None));
+            return endpoint.loaned(lent).send().map(|()| (None, None));
         }
-        endpoint.send_message_confirmed(lent, within).map(|outcome| (Some(outcome), None))
+        endpoint.loaned(lent).confirmed(within).map(|outcome| (Some(outcome), None))
     });
     ended_of(ended, order)
 }

@@ -251,7 +251,7 @@ where
     R: Payload,
 {
     let to = Tid::new(node, AppAddress::INSPECT);
-    endpoint.ask::<Q, R>(to, &Q::default(), within).map_err(|error| in_words(&error))
+    endpoint.message(to, &Q::default()).ask::<R>(within).map_err(|error| in_words(&error))
 }
 
 /// What a question to a node ended with, and what to do.

@@ -136,7 +136,7 @@ fn is_name(whom: &str) -> bool {
 fn ask(system: &mut System, question: &AskWatch) -> Result<WatchReport, Vain> {
     let to = Tid::new(question.app.node, AppAddress::INSPECT);
     let report: WatchReport =
-        system.endpoint.ask(to, question, system.within).map_err(|error| Vain::of(&error))?;
+        system.endpoint.message(to, question).ask(system.within).map_err(|error| Vain::of(&error))?;
     report.refused.clone().map_or(Ok(report), |why| Err(Vain::Refused(why)))
 }
 

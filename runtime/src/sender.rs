@@ -1,6 +1,7 @@
 //! How an application sends: fire and forget, confirmed, or asking.
 
 mod awaiting;
+mod builder;
 mod clock;
 
 use std::{
@@ -13,8 +14,11 @@ use std::{
 
 use bytes::Bytes;
 
-pub use self::awaiting::{Confirmation, Reply};
-use self::awaiting::{Deadline, Request};
+pub(crate) use self::builder::{Content, Via};
+pub use self::{
+    awaiting::{Confirmation, Reply},
+    builder::{MessageBuilder, Value},
+};
 use crate::{
     monitor::{MonitorError, MonitorId},
     outcome::{Outcome, Receipt, Rejection, Ticket},
@@ -247,50 +251,18 @@ impl Sender {
         self.dispatch(message).map(drop)
     }
 
-    /// Sends a value and wants to know what becomes of it: the returned future ends in exactly one [`Outcome`]. The
-    /// message expires where it waits once it is older than `within`; the future ends as [`Outcome::Unknown`] when
-    /// nobody has said anything by then, whenever it is polled first. No message lives longer than [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX), 71 minutes and
-    /// 35 s: a longer `within` counts as that.
-    ///
-    /// # Errors
-    /// Nobody took it.
-    pub fn send_confirmed<'a, P: Payload>(
-        &self,
-        destination: impl Into<Destination<'a>>,
-        value: &P,
-        within: Duration,
-    ) -> Result<Confirmation, SendError> {
-        let mut message = self.typed(destination.into(), value)?;
-        if message.header.class == Class::Stream {
-            // Newest wins, so an older one has no fate of its own.
-            return Err(Rejection::Unsupported.into());
-        }
-        let (wait, within) = self.expect_answer(&mut message, Awaited::Outcome, within)?;
-        let sent = self.dispatch(message)?;
-        Ok(Confirmation::new(Deadline::new(wait, sent + within)))
+    /// A value to be sent otherwise than as its type says, confirmed, or as a request: see [`MessageBuilder`].
+    pub fn message<'a, P: Payload>(
+        &'a self,
+        to: impl Into<Destination<'a>>,
+        value: &'a P,
+    ) -> MessageBuilder<&'a Self, Value<'a, P>> {
+        MessageBuilder::new(self, Value { destination: to.into(), value })
     }
 
-    /// Sends a request; the returned future ends with the reply, an error, or at the deadline. A longer `within` than
-    /// [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s, counts as that.
-    ///
-    /// # Errors
-    /// Nobody took it.
-    pub fn ask<'a, P: Payload, R: Payload>(
-        &self,
-        destination: impl Into<Destination<'a>>,
-        request: &P,
-        within: Duration,
-    ) -> Result<Reply<R>, SendError> {
-        const { assert!(R::PROTECTION.is_none(), "a protected payload is sent, not asked for") };
-        let mut message = Message::typed(self.shared.tid, self.find(destination.into())?, request);
-        message.header.class = Class::Control;
-        message.header.flags = Flags::ASK;
-        let (wait, within) = self.expect_answer(&mut message, Awaited::Reply, within)?;
-        let destination = self.shared.router.absolute(message.header.destination);
-        let ticket = Ticket { source: self.shared.tid, destination, correlation: wait.correlation() };
-        let sent = self.dispatch(message)?;
-        let request = Request { router: self.shared.router.clone(), ticket };
-        Ok(Reply::new(Deadline::new(wait, sent + within), within, request))
+    /// The same for memory that [`create_message`](Self::create_message) lent (the paper's SendMessage).
+    pub const fn loaned(&self, buffer: MessageBuffer) -> MessageBuilder<&Self, MessageBuffer> {
+        MessageBuilder::new(self, buffer)
     }
 
     /// Whether whoever asked still waits for the reply, as far as is known here: its deadline is not over, and it has not given
@@ -334,14 +306,6 @@ impl Sender {
         }
         let header = Header::new(kind, self.shared.tid, self.find(destination.into())?);
         Ok(MessageBuffer::new(header, length))
-    }
-
-    /// Sends memory that [`create_message`](Self::create_message) lent (the paper's SendMessage).
-    ///
-    /// # Errors
-    /// Nobody took it, or its kind is one of the layers' own.
-    pub fn send_message(&self, buffer: MessageBuffer) -> Result<(), SendError> {
-        self.dispatch(buffer.freeze()).map(drop)
     }
 
     /// Sends a payload that was encoded before.
@@ -403,7 +367,7 @@ impl Sender {
         let wait = self.shared.pending.open(awaited, destination).ok_or(SendError::TooManyWaits)?;
         message.header.flags = message.header.flags.with(Flags::CONFIRM);
         message.header.correlation = wait.correlation();
-        let within = message.header.set_time_to_live(within);
+        let within = message.header.limit_time_to_live(within);
         let ticket = Ticket { source: self.shared.tid, destination, correlation: wait.correlation() };
         message.receipt = Some(Receipt::new(self.shared.pending.clone(), ticket));
         Ok((wait, within))

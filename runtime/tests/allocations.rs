@@ -122,7 +122,7 @@ fn send(from: &Sender, to: Tid, what: What) {
         What::Raw => {
             let mut buffer = from.create_message(to, RAW, 4096).unwrap();
             buffer.fill(7);
-            from.send_message(buffer)
+            from.loaned(buffer).send()
         }
     }
     .unwrap();
@@ -246,7 +246,7 @@ fn a_confirmed_message_and_its_outcome_cost_no_memory() {
         let before = allocated();
         // When it is sent a message whose outcome somebody waits for.
         let angles = Angles { joints: [0.5; 6], at };
-        let mut confirmation = pin!(sender.send_confirmed(sender.tid(), &angles, DEADLINE).unwrap());
+        let mut confirmation = pin!(sender.message(sender.tid(), &angles).confirmed(DEADLINE).unwrap());
         let Poll::Ready(Some(mut message)) = reader.poll_take(task) else { panic!("the message") };
         message.settle(Outcome::Delivered);
         reader.finish(Outcome::Delivered);

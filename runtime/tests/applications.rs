@@ -189,12 +189,12 @@ impl Actor for Asker {
         let (sender, to, written) = (context.sender(), self.to, self.written.clone());
         let story = async move {
             for number in [7, 13, 99] {
-                let outcome = sender.send_confirmed(to, &Number(number), DEADLINE).unwrap().await;
+                let outcome = sender.message(to, &Number(number)).confirmed(DEADLINE).unwrap().await;
                 written.send(format!("{outcome:?}")).unwrap();
             }
-            let unheard = sender.send_confirmed(to, &Unheard, DEADLINE).unwrap().await;
+            let unheard = sender.message(to, &Unheard).confirmed(DEADLINE).unwrap().await;
             assert_eq!(unheard, Outcome::Rejected(Rejection::UnknownKind));
-            let reply = sender.ask::<_, Number>(to, &Number(21), DEADLINE).unwrap().await;
+            let reply = sender.message(to, &Number(21)).ask::<Number>(DEADLINE).unwrap().await;
             written.send(format!("{}", reply.unwrap().0)).unwrap();
         };
         context.spawn(story.into_actor(self));
@@ -224,9 +224,9 @@ impl Actor for Clerk {
 
     fn started(&mut self, context: &mut Self::Context) {
         for (tag, number) in [7, 13, 99].into_iter().enumerate() {
-            context.send_with_tag(self.to[0], &Number(number), DEADLINE, tag as u64).unwrap();
+            context.message(self.to[0], &Number(number)).with_tag(tag as u64).confirmed(DEADLINE).unwrap();
         }
-        let nobody = context.send_with_tag(self.to[1], &Number(1), DEADLINE, 3);
+        let nobody = context.message(self.to[1], &Number(1)).with_tag(3).confirmed(DEADLINE);
         assert!(nobody.is_err(), "nobody takes it, and nobody tells of it");
     }
 }
@@ -423,7 +423,7 @@ fn an_application_does_not_speak_as_a_layer() {
     bench.wait_for(&SupervisorFact::Ready(ChildId(0)));
     let sender = &bench.senders[0];
     let forged = sender.create_message(sender.tid(), Kind::NDL_LEAVE, 3).unwrap();
-    assert!(matches!(sender.send_message(forged), Err(SendError::NotYours(Kind::NDL_LEAVE))));
+    assert!(matches!(sender.loaned(forged).send(), Err(SendError::NotYours(Kind::NDL_LEAVE))));
     // And: what is its own still goes
     sender.send(sender.tid(), &Number(1)).unwrap();
     assert_eq!(heard.recv_timeout(DEADLINE), Ok(1));
@@ -444,7 +444,7 @@ fn bytes_that_are_no_payload_do_not_feed_the_input_watchdog() {
                 let mut garbage = sender.create_message(sender.tid(), Number::KIND, 3).unwrap();
                 garbage.fill(0xc1); // the one byte that MessagePack never uses
                 // An actor that gets no CPU for a while has no room for it.
-                let _ = sender.send_message(garbage);
+                let _ = sender.loaned(garbage).send();
                 std::thread::sleep(Duration::from_millis(1)); // the pace of the rubbish
             }
         })

@@ -168,7 +168,7 @@ fn a_neighbour_that_computes_is_not_lost_because_others_take_the_cpu() {
     let burners = Burners::new();
     taken.store(true, Ordering::Relaxed);
     let sender = &stage.senders[0];
-    let after = sender.send_confirmed(sender.tid(), &Number(14), DEADLINE).unwrap();
+    let after = sender.message(sender.tid(), &Number(14)).confirmed(DEADLINE).unwrap();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     assert_eq!(runtime.block_on(after), sinew_runtime::outcome::Outcome::Delivered);
     drop(burners);

@@ -116,7 +116,7 @@ fn next(read: &Receiver<String>) -> String {
 
 /// The outcome of a confirmed number, waited for on a thread of its own.
 fn confirmed(sender: &Sender, number: u64) -> Receiver<Outcome> {
-    let confirmation = sender.send_confirmed(sender.tid(), &Number(number), DEADLINE).unwrap();
+    let confirmation = sender.message(sender.tid(), &Number(number)).confirmed(DEADLINE).unwrap();
     let (say, heard) = sync_channel(1);
     std::thread::spawn(move || {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();

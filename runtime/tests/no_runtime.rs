@@ -66,7 +66,7 @@ fn outcomes_and_replies_that_are_polled_without_tokio_come_and_have_their_deadli
     let stage = Stage::start(vec![spec.own_thread().into()]);
     stage.wait_ready(0);
     let sender = &stage.senders[0];
-    let confirmed = |number, within| sender.send_confirmed(sender.tid(), &Number(number), within).unwrap();
+    let confirmed = |number, within| sender.message(sender.tid(), &Number(number)).confirmed(within).unwrap();
     // When a message is handled, then that is heard of.
     assert_eq!(block_on(confirmed(1, DEADLINE)), Outcome::Delivered);
     assert_eq!(block_on(confirmed(13, DEADLINE)), Outcome::Delivered);
@@ -77,12 +77,12 @@ fn outcomes_and_replies_that_are_polled_without_tokio_come_and_have_their_deadli
         assert_eq!(block_on(confirmed(2, within)), Outcome::Unknown);
         assert!(sent.elapsed() >= within);
     }
-    let reply = sender.ask::<_, Number>(sender.tid(), &Number(3), within).unwrap();
+    let reply = sender.message(sender.tid(), &Number(3)).ask::<Number>(within).unwrap();
     let answer = block_on(reply);
     assert!(matches!(answer, Err(AskError::Deadline(after)) if after == within), "{answer:?}");
     // When it is over before anybody polls, then it is: it counts from the send.
     let (confirmation, sent) = (confirmed(4, within), Instant::now());
-    let reply = sender.ask::<_, Number>(sender.tid(), &Number(5), within).unwrap();
+    let reply = sender.message(sender.tid(), &Number(5)).ask::<Number>(within).unwrap();
     while sent.elapsed() <= within * 2 {
         std::thread::park_timeout(within);
     }

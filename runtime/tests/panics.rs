@@ -272,7 +272,7 @@ fn a_panic_settles_the_confirmed_message_in_hand_and_no_other() {
     stage.wait_ready(0);
     let sender = &stage.senders[0];
     let [fatal, next] =
-        [13, 2].map(|number| sender.send_confirmed(sender.tid(), &Number(number), DEADLINE).unwrap());
+        [13, 2].map(|number| sender.message(sender.tid(), &Number(number)).confirmed(DEADLINE).unwrap());
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     assert_eq!(runtime.block_on(fatal), Outcome::Failed);
     assert_eq!(runtime.block_on(next), Outcome::Delivered);

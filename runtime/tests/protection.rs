@@ -431,7 +431,7 @@ fn what_is_not_sealed_moves_nothing() {
     for _ in 0..10 {
         let mut message = central.create_message(stage::tid(1), Torque::KIND, plain.len()).unwrap();
         message.copy_from_slice(&plain);
-        central.send_message(message).unwrap();
+        central.loaned(message).send().unwrap();
     }
     assert!(scene.seen.recv_timeout(PERIOD * 20).is_err(), "nothing moves it");
 }

@@ -342,5 +342,5 @@ pub fn send_jobs(sender: &Sender, to: &str, numbers: impl IntoIterator<Item = u6
 /// If nobody takes it.
 #[track_caller]
 pub fn outcome_of_job(sender: &Sender, to: &str, number: u64) -> Outcome {
-    wait(sender.send_confirmed(to, &Job { number }, DEADLINE).expect("somebody takes it"))
+    wait(sender.message(to, &Job { number }).confirmed(DEADLINE).expect("somebody takes it"))
 }

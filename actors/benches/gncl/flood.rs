@@ -179,7 +179,7 @@ async fn confirmed(sender: &Sender, to: Tid, packets: usize) {
         if under_way.len() == UNDER_WAY {
             arrived(under_way.pop_front()).await;
         }
-        let sent = sender.send_confirmed(to, &packet, DEADLINE);
+        let sent = sender.message(to, &packet).confirmed(DEADLINE);
         under_way.push_back(sent.expect("there is room for what is under way"));
     }
     while !under_way.is_empty() {

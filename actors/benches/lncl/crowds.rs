@@ -79,7 +79,7 @@ pub(crate) fn fan_in(way: Way, packets: u64, pinning: Pinning) -> (Figures, u64)
     }
     for sender in waiting {
         let begin = endpoint.create_message(sender, BEGIN, 1).expect("short");
-        endpoint.send_message(begin).expect("the node takes it");
+        endpoint.loaned(begin).send().expect("the node takes it");
     }
     let mut figures = Figures::new();
     while figures.rounds() < expected {
@@ -97,12 +97,12 @@ pub(crate) fn send(way: Way, socket: &str, packets: u64) {
     say_there();
     let sink = endpoint.resolve("sink", DEADLINE).expect("the node lives").expect("it is registered");
     let asks = endpoint.create_message(sink, BEGIN, 1).expect("short");
-    endpoint.send_message(asks).expect("the node takes it");
+    endpoint.loaned(asks).send().expect("the node takes it");
     let _begin = endpoint.receive(DEADLINE).expect("the node lives").expect("the word to begin");
     paced(packets, || {
         let mut packet = endpoint.create_message(sink, BLOCK, PACKET).expect("not too long");
         packet.fill(7);
-        endpoint.send_message(packet).expect("the node takes it");
+        endpoint.loaned(packet).send().expect("the node takes it");
     });
     // The address would go with this process before all is received.
     let _none = endpoint.receive(DEADLINE);
@@ -124,7 +124,7 @@ pub(crate) fn flood(way: Way, packets: u64, pinning: Pinning) -> (Figures, f64) 
             }
             let mut packet = endpoint.create_message(sink, BLOCK, PACKET).expect("not too long");
             packet.fill(7);
-            endpoint.send_message(packet).expect("the node takes it");
+            endpoint.loaned(packet).send().expect("the node takes it");
             sent += 1;
         } else {
             let _answer = endpoint.receive(DEADLINE).expect("the node lives").expect("the sink answers");
@@ -145,7 +145,7 @@ pub(crate) fn sink(way: Way, socket: &str) {
         drop(packet);
         if taken.is_multiple_of(ANSWERED_EACH) {
             let answer = endpoint.create_message(source, ANSWER, 8).expect("short");
-            endpoint.send_message(answer).expect("the node takes it");
+            endpoint.loaned(answer).send().expect("the node takes it");
         }
     }
 }

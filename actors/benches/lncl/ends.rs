@@ -128,7 +128,7 @@ pub(crate) fn echo(way: Way, memory: Memory, socket: &str) {
             let age = received.age(Time::now());
             back[..8].copy_from_slice(&(age.as_nanos() as u64).to_le_bytes());
         }
-        endpoint.send_message(back).expect("the node takes it");
+        endpoint.loaned(back).send().expect("the node takes it");
     }
 }
 
@@ -166,7 +166,7 @@ impl Pair {
     fn round_trip(&mut self, kind: Kind, buffer: &mut [u8]) {
         let mut block = self.maker.create(&mut self.endpoint, self.to, kind, buffer.len());
         block.copy_from_slice(buffer);
-        self.endpoint.send_message(block).expect("the node takes it");
+        self.endpoint.loaned(block).send().expect("the node takes it");
         let back = self.endpoint.receive(DEADLINE).expect("the node lives").expect("the echo answers");
         buffer.copy_from_slice(back.bytes());
     }

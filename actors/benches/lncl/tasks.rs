@@ -37,7 +37,7 @@ pub(crate) fn echo(way: Way, socket: &str) {
         loop {
             let received = endpoint.receive().await.expect("the node lives");
             let back = filled(&mut endpoint, received.source(), received.kind(), received.bytes());
-            endpoint.send_message(back).await.expect("the node takes it");
+            endpoint.loaned(back).send().await.expect("the node takes it");
         }
     });
 }
@@ -53,7 +53,7 @@ pub(crate) fn round_trips(way: Way, bytes: usize, rounds: Rounds, pinning: Pinni
     rounds.time(|| {
         runtime.block_on(async {
             let block = filled(&mut endpoint, to, BLOCK, &buffer);
-            endpoint.send_message(block).await.expect("the node takes it");
+            endpoint.loaned(block).send().await.expect("the node takes it");
             let back = endpoint.receive().await.expect("the echo answers");
             buffer.copy_from_slice(back.bytes());
         });

@@ -6,17 +6,20 @@ mod tests;
 use std::{path::Path, sync::Arc, time::Duration};
 
 use sinew_runtime::{
-    outcome::Outcome,
+    sender::Destination,
     tid::{AppAddress, Tid},
     time::Time,
-    wire::{Kind, Message, Payload},
+    wire::{Kind, Payload},
 };
 use sinew_shm::BellKind;
 use tokio::task::{coop, spawn_blocking};
 
 use super::{
-    ApiError, Endpoint, LoanedMessage, Received, Registration, Transport, Undelivered, form::Form,
-    outgoing::Request, reactor::Reactor, returning::LOOK,
+    ApiError, Endpoint, LoanedMessage, MessageBuilder, Received, Registration, Transport, Undelivered,
+    builder::{SendTerms, Value},
+    form::Form,
+    reactor::Reactor,
+    returning::LOOK,
 };
 
 /// A registered transport address for a task: an [`Endpoint`] whose calls await instead of blocking. The same semantics, word
@@ -96,87 +99,30 @@ impl AsyncEndpoint {
         self.endpoint.create_message(destination, kind, length)
     }
 
-    /// Sends memory that [`create_message`](Self::create_message) lent, as [`Endpoint::send_message`].
+    /// Sends a value as its type says, as [`Endpoint::send`].
     ///
     /// # Errors
     /// It was not sent.
-    pub async fn send_message(&mut self, message: LoanedMessage) -> Result<(), ApiError> {
-        self.endpoint.dispatch(message.into(), self.endpoint.stall_timeout()).await.map(drop)
-    }
-
-    /// The same, and waits for what becomes of it, as [`send_confirmed`](Self::send_confirmed).
-    ///
-    /// # Errors
-    /// It was not sent.
-    pub async fn send_message_confirmed(
+    pub async fn send<'a, P: Payload>(
         &mut self,
-        message: LoanedMessage,
-        within: Duration,
-    ) -> Result<Outcome, ApiError> {
-        self.endpoint.confirm(message.into(), within).await
-    }
-
-    /// Sends it as a request and waits for the reply, as [`Endpoint::ask_message`].
-    ///
-    /// # Errors
-    /// It was not sent or not handled, or no reply came `within` this time.
-    pub async fn ask_message(
-        &mut self,
-        message: LoanedMessage,
-        within: Duration,
-    ) -> Result<Received, ApiError> {
-        self.endpoint.await_reply(message.into(), within).await.map(Received::new)
-    }
-
-    /// Sends it as the reply to `request`, as [`Endpoint::reply_message`].
-    ///
-    /// # Errors
-    /// The message asks for no reply, or the reply was not sent.
-    pub async fn reply_message(
-        &mut self,
-        request: &Received,
-        message: LoanedMessage,
+        to: impl Into<Destination<'a>>,
+        value: &'a P,
     ) -> Result<(), ApiError> {
-        let request = Request::of(request, self.tid())?;
-        self.endpoint.answer(request, message.into(), self.endpoint.stall_timeout()).await
+        self.endpoint.send_as(Value::new(to, value), SendTerms::PLAIN).await
     }
 
-    /// Sends a value, as [`Endpoint::send`].
-    ///
-    /// # Errors
-    /// It was not sent.
-    pub async fn send<P: Payload>(&mut self, destination: Tid, value: &P) -> Result<(), ApiError> {
-        let message = self.endpoint.typed(destination, value, self.endpoint.stall_timeout())?;
-        self.endpoint.dispatch(message.into(), self.endpoint.stall_timeout()).await.map(drop)
+    /// A value to be sent otherwise than as its type says, as [`Endpoint::message`]: see [`MessageBuilder`].
+    pub fn message<'a, P: Payload>(
+        &'a mut self,
+        to: impl Into<Destination<'a>>,
+        value: &'a P,
+    ) -> MessageBuilder<'a, Self, Value<'a, P>> {
+        MessageBuilder::new(self, Value::new(to, value))
     }
 
-    /// Sends a value and waits for what becomes of it, as [`Endpoint::send_confirmed`].
-    ///
-    /// # Errors
-    /// It was not sent. If the connection ends before the outcome is known that is [`Outcome::Unknown`].
-    pub async fn send_confirmed<P: Payload>(
-        &mut self,
-        destination: Tid,
-        value: &P,
-        within: Duration,
-    ) -> Result<Outcome, ApiError> {
-        let message = self.endpoint.typed(destination, value, self.endpoint.stall_timeout())?;
-        self.endpoint.confirm(message.into(), within).await
-    }
-
-    /// Sends a request and waits for the reply, as [`Endpoint::ask`].
-    ///
-    /// # Errors
-    /// It was not sent or not handled, no reply came `within` this time, or the reply is not an `R`.
-    pub async fn ask<P: Payload, R: Payload>(
-        &mut self,
-        destination: Tid,
-        request: &P,
-        within: Duration,
-    ) -> Result<R, ApiError> {
-        const { assert!(R::PROTECTION.is_none(), "a protected payload is sent, not asked for") };
-        let message = Message::typed(self.tid(), destination, request);
-        Ok(self.endpoint.await_reply(message.into(), within).await?.decode()?)
+    /// The same for memory that [`create_message`](Self::create_message) lent, as [`Endpoint::loaned`].
+    pub const fn loaned(&mut self, message: LoanedMessage) -> MessageBuilder<'_, Self, LoanedMessage> {
+        MessageBuilder::new(self, message)
     }
 
     /// Answers a request, as [`Endpoint::reply`].
@@ -184,9 +130,7 @@ impl AsyncEndpoint {
     /// # Errors
     /// The message asks for no reply, or the reply was not sent.
     pub async fn reply<R: Payload>(&mut self, request: &Received, value: &R) -> Result<(), ApiError> {
-        let request = Request::of(request, self.tid())?;
-        let message = Message::typed(self.tid(), request.source, value);
-        self.endpoint.answer(request, message.into(), self.endpoint.stall_timeout()).await
+        self.endpoint.reply_as(request, Value::new(request.source(), value), SendTerms::PLAIN).await
     }
 
     /// Waits for a message, in the order of [`Endpoint::receive`]. May be dropped at any time without losing one. When the

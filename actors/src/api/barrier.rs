@@ -185,7 +185,7 @@ pub trait Meet {
 impl Meet for Sender {
     fn meet(&self, barrier: &Barrier) -> Meeting {
         let to = Tid::new(self.tid().node, AppAddress::SYNC);
-        let reply = self.ask(to, &barrier.request(), barrier.stall_timeout());
+        let reply = self.message(to, &barrier.request()).ask(barrier.stall_timeout());
         Meeting { barrier: barrier.clone(), sender: self.clone(), wait: Wait::from(reply) }
     }
 }
@@ -307,7 +307,8 @@ impl Endpoint {
         let to = Tid::new(self.tid().node, AppAddress::SYNC);
         let request = Message::typed(self.tid(), to, &barrier.request());
         let mut arrival = Arrival { endpoint: self, barrier: barrier.name(), is_answered: false };
-        let reply = arrival.endpoint.await_reply(request.into(), barrier.stall_timeout()).await?;
+        let room = arrival.endpoint.stall_timeout();
+        let reply = arrival.endpoint.await_reply(request.into(), room, barrier.stall_timeout()).await?;
         arrival.is_answered = true;
         Ok(reply.decode()?)
     }

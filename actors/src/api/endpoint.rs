@@ -5,6 +5,7 @@ use std::{path::Path, sync::Arc, time::Duration};
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
     protection::Ends,
+    sender::Destination,
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wire::{Flags, Header, Kind, Message, Payload},
@@ -13,15 +14,15 @@ use sinew_shm::{Bell, CommonBell};
 use tokio::task::coop;
 
 use super::{
-    ApiError, Received, Registration, Transport,
+    ApiError, MessageBuilder, Received, Registration, Transport,
     barrier::Leaves,
+    builder::{SendTerms, Value},
     direct::{Direct, Terms},
     form::{Form, at_once},
     inbox::{Answer, Awaited, Inbox},
     incoming::WhenFull,
     link::{Ended, Link, Reader, Writer, ring::Rest},
     loan::{Lender, LoanedMessage},
-    outgoing::Request,
     returning::Home,
     undelivered::Refusals,
 };
@@ -159,73 +160,44 @@ impl Endpoint {
         self.lend(Header::new(kind, self.tid, destination), length)
     }
 
-    /// Sends memory that [`create_message`](Self::create_message) lent (the paper's SendMessage), without a copy if it lies
-    /// in the ring. Returns when the ring, or the socket to the node, has it; [`undelivered`](Self::undelivered) says if nobody takes
-    /// it then.
-    ///
-    /// # Errors
-    /// It was not sent, and its memory is given back. It may have been another endpoint's: [`ApiError::LoanActive`] if this one has
-    /// lent one too.
-    pub fn send_message(&mut self, message: LoanedMessage) -> Result<(), ApiError> {
-        at_once(self.dispatch(message.into(), self.stall_timeout())).map(drop)
-    }
-
-    /// Sends a value, in the class of its type; in an envelope if its type is [protected](crate::protection), see [`guard`](Self::guard).
+    /// Sends a value as its type says; in an envelope if its type is [protected](crate::protection), see [`guard`](Self::guard).
     /// Whoever guards that may have sent an echo before: a message of kind `sinew.echo`, which who has sent nothing protected to it yet receives, and leaves alone.
-    /// Returns when the way to the node, or the ring of a direct link, has taken it.
+    /// Returns when the way to the node, or the ring of a direct link, has taken it. For anything else see [`message`](Self::message).
+    ///
+    /// A name is looked up by the node with each call, which costs a round trip to it: a loop resolves it once, and sends to the TID.
     ///
     /// # Errors
-    /// It was not sent.
-    pub fn send<P: Payload>(&mut self, destination: Tid, value: &P) -> Result<(), ApiError> {
-        let message = self.typed(destination, value, self.stall_timeout())?;
-        at_once(self.dispatch(message.into(), self.stall_timeout())).map(drop)
-    }
-
-    /// Sends a value and waits for what becomes of it: [`Outcome::Unknown`] when nobody has said so `within` this
-    /// time. The message expires where it waits when it is older. A longer `within` than
-    /// [`TIME_TO_LIVE_MAX`](sinew_runtime::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s, counts as that. Messages that come meanwhile wait to be
-    /// [received](Self::receive), beyond the inbox's capacity too: 16,384 of each class, 4 MiB of payloads and one message. What
-    /// comes then is refused: who sent it confirmed is told, the others are [counted](Self::undelivered). The same holds for
-    /// whatever else waits for an answer: [`ask`](Self::ask), [`resolve`](Self::resolve), [`join`](Self::join),
-    /// [`leave`](Self::leave).
-    ///
-    /// With less than 20 ms a node that has gone is not looked for: [`receive`](Self::receive) does.
-    ///
-    /// # Errors
-    /// It was not sent. If the connection ends before the outcome is known that is [`Outcome::Unknown`].
-    pub fn send_confirmed<P: Payload>(
+    /// It was not sent. [`ApiError::UnknownName`]: no application has the name now.
+    pub fn send<'a, P: Payload>(
         &mut self,
-        destination: Tid,
-        value: &P,
-        within: Duration,
-    ) -> Result<Outcome, ApiError> {
-        let message = self.typed(destination, value, self.stall_timeout())?;
-        at_once(self.confirm(message.into(), within))
+        to: impl Into<Destination<'a>>,
+        value: &'a P,
+    ) -> Result<(), ApiError> {
+        at_once(self.send_as(Value::new(to, value), SendTerms::PLAIN))
     }
 
-    /// Sends a request and waits for the reply. A longer `within` than [`TIME_TO_LIVE_MAX`](sinew_runtime::wire::TIME_TO_LIVE_MAX),
-    /// 71 minutes and 35 s, counts as that. With less than 20 ms a node that has gone is not looked for: [`receive`](Self::receive) does.
-    ///
-    /// # Errors
-    /// It was not sent or not handled, no reply came `within` this time, or the reply is not an `R`.
-    pub fn ask<P: Payload, R: Payload>(
-        &mut self,
-        destination: Tid,
-        request: &P,
-        within: Duration,
-    ) -> Result<R, ApiError> {
-        const { assert!(R::PROTECTION.is_none(), "a protected payload is sent, not asked for") };
-        Ok(at_once(self.await_reply(Message::typed(self.tid, destination, request).into(), within))?
-            .decode()?)
+    /// A value to be sent otherwise than as its type says, confirmed, as a request, or with a limit to the wait for room: see
+    /// [`MessageBuilder`].
+    pub fn message<'a, P: Payload>(
+        &'a mut self,
+        to: impl Into<Destination<'a>>,
+        value: &'a P,
+    ) -> MessageBuilder<'a, Self, Value<'a, P>> {
+        MessageBuilder::new(self, Value::new(to, value))
     }
 
-    /// Answers a request.
+    /// The same for memory that [`create_message`](Self::create_message) lent (the paper's SendMessage): without a copy if it lies in the ring.
+    /// It may have been another endpoint's: then [`ApiError::LoanActive`] if this one has lent one too.
+    pub const fn loaned(&mut self, message: LoanedMessage) -> MessageBuilder<'_, Self, LoanedMessage> {
+        MessageBuilder::new(self, message)
+    }
+
+    /// Answers a request. With a limit to the wait for room: [`MessageBuilder::reply_to`].
     ///
     /// # Errors
     /// The message asks for no reply, or the reply was not sent.
     pub fn reply<R: Payload>(&mut self, request: &Received, value: &R) -> Result<(), ApiError> {
-        let message = Message::typed(self.tid, request.source(), value);
-        at_once(self.answer(Request::of(request, self.tid())?, message.into(), self.stall_timeout()))
+        at_once(self.reply_as(request, Value::new(request.source(), value), SendTerms::PLAIN))
     }
 
     /// Waits for a message, at most `within` this time; `None` if none came (the paper's ReceiveMessage). Control

@@ -87,6 +87,12 @@ pub enum ApiError {
         "the kind {0} belongs to Sinew's layers, which would end the connection; take one from `Kind::named`"
     )]
     NotYours(Kind),
+    /// No application has the name now. Nothing was sent.
+    #[error(
+        "no application is called '{0}' now; require it at registration, so that this one starts when it is there, or see `sinew apps` for \
+         the names that there are"
+    )]
+    UnknownName(String),
     /// A request was not handled. The outcome says why.
     #[error("{}", not_handled(*.0))]
     Ended(Outcome),
@@ -176,6 +182,7 @@ mod tests {
             ApiError::LoanActive,
             ApiError::TooLong { length: 2, limit: 1 },
             ApiError::NotYours(Kind::OUTCOME),
+            ApiError::UnknownName("knee".to_owned()),
             ApiError::NoReply(second),
             ApiError::NotAsked,
             ApiError::OthersRequest(Tid::NONE),

@@ -19,10 +19,10 @@
 //! | get an address, with a name, and give it back (RegisterTransportAddress) | [`Registration`], [`unregister`](Endpoint::unregister) or drop | `sinew_register_transport_address`, `sinew_unregister` |
 //! | find somebody by name, on any node | [`resolve`](Endpoint::resolve), [`Registration::requires`] | `sinew_resolve` |
 //! | send, and not ask what becomes of it | [`send`](Endpoint::send) | `sinew_send_bytes` |
-//! | be told what became of it (confirm) | [`send_confirmed`](Endpoint::send_confirmed): one [`Outcome`](crate::Outcome) | `sinew_send_message_confirmed` |
-//! | ask, and wait for the reply | [`ask`](Endpoint::ask), [`reply`](Endpoint::reply) | `sinew_ask`, `sinew_reply` |
-//! | wait for room 200 us at most, or not at all | [`send_within`](Endpoint::send_within), [`reply_within`](Endpoint::reply_within) | `sinew_send_message_within` |
-//! | write a payload where it travels from, so that sending it copies nothing (loan: CreateMessage, SendMessage) | [`create_message`](Endpoint::create_message), [`LoanedMessage`], [`send_message`](Endpoint::send_message) | `sinew_create_message`, `sinew_send_message` |
+//! | be told what became of it (confirm) | [`message`](Endpoint::message)`(to, &value)`[`.confirmed(within)`](MessageBuilder::confirmed): one [`Outcome`](crate::Outcome) | `sinew_send_message_confirmed` |
+//! | ask, and wait for the reply | [`ask`](MessageBuilder::ask) of a message, [`reply`](Endpoint::reply) | `sinew_ask`, `sinew_reply` |
+//! | wait for room 200 us at most, or not at all | [`room_within`](MessageBuilder::room_within) of a message | `sinew_send_message_within` |
+//! | write a payload where it travels from, so that sending it copies nothing (loan: CreateMessage, SendMessage) | [`create_message`](Endpoint::create_message), [`LoanedMessage`], [`loaned`](Endpoint::loaned) | `sinew_create_message`, `sinew_send_message` |
 //! | receive, with a deadline (ReceiveMessage) | [`receive`](Endpoint::receive), [`Received`] | `sinew_receive_message`, `sinew_settle_message` |
 //! | speak to many at once (groups) | [`join`](Endpoint::join), [`leave`](Endpoint::leave), [`Tid::group`](crate::Tid::group) | `sinew_join_group`, `sinew_group` |
 //! | take only the newest value of a sensor | [`Class::Stream`](crate::Class), at the type | `SINEW_STREAM` |
@@ -56,7 +56,7 @@
 //!
 //! // The sensor finds the drive, and sends it an angle; if there is no room now, it is skipped.
 //! let to = sensor.resolve("knee.drive", second)?.expect("it is registered");
-//! match sensor.send_within(to, &JointAngle { degrees: 12.5 }, Duration::ZERO) {
+//! match sensor.message(to, &JointAngle { degrees: 12.5 }).room_within(Duration::ZERO).send() {
 //!     Ok(()) | Err(ApiError::Stalled(_)) => {}
 //!     Err(other) => return Err(other),
 //! }
@@ -68,7 +68,7 @@
 //! // The drive tells its limit to who has spoken, in bytes that lie where they are read.
 //! let mut limit = drive.create_message(received.source(), sinew::Kind::named("demo.raw"), 4)?;
 //! limit.copy_from_slice(&90_f32.to_le_bytes());
-//! drive.send_message(limit)?;
+//! drive.loaned(limit).send()?;
 //! assert_eq!(sensor.receive(second)?.expect("the limit").bytes(), 90_f32.to_le_bytes());
 //! # Ok::<(), ApiError>(())
 //! ```
@@ -104,9 +104,9 @@
 //!     drive.reply(&request, &Torque { newton_metres: newton_metres / 2.0 }).await
 //! };
 //! let controlling = async {
-//!     let outcome = control.send_confirmed(to, &Torque { newton_metres: 3.0 }, second).await?;
+//!     let outcome = control.message(to, &Torque { newton_metres: 3.0 }).confirmed(second).await?;
 //!     assert_eq!(outcome, Outcome::Delivered);
-//!     control.ask::<_, Torque>(to, &Torque { newton_metres: 3.0 }, second).await
+//!     control.message(to, &Torque { newton_metres: 3.0 }).ask::<Torque>(second).await
 //! };
 //! let (driven, given) = tokio::join!(driving, controlling);
 //! driven?;
@@ -166,6 +166,7 @@
 
 mod async_endpoint;
 mod barrier;
+mod builder;
 mod direct;
 mod endpoint;
 mod error;
@@ -176,7 +177,6 @@ mod link;
 mod loan;
 mod outgoing;
 mod protected;
-mod raw;
 mod reactor;
 mod received;
 mod returning;
@@ -186,7 +186,6 @@ mod stall_timeout;
 mod tests;
 mod to_node;
 mod undelivered;
-mod within;
 
 use std::{
     path::{Path, PathBuf},
@@ -202,6 +201,7 @@ use sinew_shm::{BellKind, Spin};
 
 pub use async_endpoint::AsyncEndpoint;
 pub use barrier::{Barrier, BarrierError, Meet, Meeting};
+pub use builder::{MessageBuilder, Value};
 pub use endpoint::Endpoint;
 pub use error::ApiError;
 pub use link::Transport;
@@ -368,7 +368,7 @@ impl Registration {
     }
 
     /// How many received messages wait in this process until no more are taken out of the socket or the rings. Default 256.
-    /// While an answer is waited for it is more, see [`Endpoint::send_confirmed`].
+    /// While an answer is waited for it is more, see [`MessageBuilder::confirmed`].
     #[must_use]
     pub const fn inbox_capacity(mut self, messages: usize) -> Self {
         self.inbox_capacity = messages;
@@ -376,7 +376,7 @@ impl Registration {
     }
 
     /// How long a send waits while the node or, on a direct link, the peer takes nothing; whatever it takes begins that time
-    /// anew. Default 1 s. For one send alone, and in all: [`Endpoint::send_within`].
+    /// anew. Default 1 s. For one send alone, and in all: [`MessageBuilder::room_within`].
     #[must_use]
     pub const fn stall_timeout(mut self, stall_timeout: Duration) -> Self {
         self.link.stall_timeout = stall_timeout;

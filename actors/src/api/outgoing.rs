@@ -41,14 +41,16 @@ impl Endpoint {
     pub(super) async fn confirm(
         &mut self,
         mut message: Draft,
+        limit: Limit,
         within: Duration,
     ) -> Result<Outcome, ApiError> {
         if message.header.class == Class::Stream {
             // Of a Stream the newest wins, so an older one has no outcome of its own.
             return Ok(Outcome::Rejected(Rejection::Unsupported));
         }
-        let within = message.header.set_time_to_live(within);
-        match self.request(message, Awaited::Outcome, Flags::CONFIRM, within).await? {
+        let within = message.header.limit_time_to_live(within);
+        let wait = (Awaited::Outcome, within);
+        match self.request_within(message, wait, Flags::CONFIRM, limit).await? {
             Some(Answer::Outcome(outcome)) => Ok(outcome),
             Some(Answer::Reply(_) | Answer::Resolved(_)) | None => Ok(Outcome::Unknown),
         }
@@ -58,11 +60,13 @@ impl Endpoint {
     pub(super) async fn await_reply(
         &mut self,
         mut message: Draft,
+        limit: Limit,
         within: Duration,
     ) -> Result<Message, ApiError> {
         message.header.class = Class::Control;
-        let within = message.header.set_time_to_live(within);
-        match self.request(message, Awaited::Reply, Flags::CONFIRM.with(Flags::ASK), within).await? {
+        let within = message.header.limit_time_to_live(within);
+        let wait = (Awaited::Reply, within);
+        match self.request_within(message, wait, Flags::CONFIRM.with(Flags::ASK), limit).await? {
             Some(Answer::Reply(reply)) => Ok(reply),
             Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
             Some(Answer::Resolved(_)) | None => Err(ApiError::NoReply(within)),
@@ -86,10 +90,21 @@ impl Endpoint {
     /// Sends `message` and waits for its answer; `None` at the deadline.
     pub(super) async fn request(
         &mut self,
-        mut message: Draft,
+        message: Draft,
         awaited: Awaited,
         flags: Flags,
         within: Duration,
+    ) -> Result<Option<Answer>, ApiError> {
+        self.request_within(message, (awaited, within), flags, self.stall_timeout()).await
+    }
+
+    /// The same, and waits for room as long as `limit` and the wait for the answer allow.
+    async fn request_within(
+        &mut self,
+        mut message: Draft,
+        (awaited, within): (Awaited, Duration),
+        flags: Flags,
+        limit: Limit,
     ) -> Result<Option<Answer>, ApiError> {
         self.correlation += 1;
         self.asked = self.correlation;
@@ -99,7 +114,7 @@ impl Endpoint {
         let now = Time::now();
         let deadline = now + within;
         // Who waits so long for the answer waits no longer for room.
-        let way = self.dispatch(message, self.stall_timeout().and_in_all(within)).await?;
+        let way = self.dispatch(message, limit.and_in_all(within)).await?;
         let wanted = Wanted { number, what: awaited, of: self.absolute(asked) };
         let asking = Asking(self);
         asking.0.await_answer(wanted, way, deadline, now).await

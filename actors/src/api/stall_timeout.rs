@@ -27,8 +27,13 @@ impl Limit {
     }
 
     /// The same, and so long at most.
-    pub(super) const fn and_in_all(self, within: Duration) -> Self {
-        Self { stall_timeout: self.stall_timeout, in_all: within }
+    pub(super) fn and_in_all(self, within: Duration) -> Self {
+        Self { stall_timeout: self.stall_timeout, in_all: self.in_all.min(within) }
+    }
+
+    /// How long it leaves at most for an answer that comes before the send.
+    pub(super) fn time(&self) -> Duration {
+        self.stall_timeout.map_or(self.in_all, |stall_timeout| stall_timeout.min(self.in_all))
     }
 
     /// Whether the caller has said how long it takes in all, whatever the peer takes.

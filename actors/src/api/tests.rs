@@ -135,7 +135,7 @@ fn raw_memory_is_lent_filled_and_sent(under: Under) {
     let kind = Kind::named("test.raw");
     let mut buffer = endpoint.create_message(app.tid, kind, 100_000).unwrap();
     buffer[99_999] = 7;
-    endpoint.send_message(buffer).unwrap();
+    endpoint.loaned(buffer).send().unwrap();
     let message = app.next();
     assert_eq!((message.header.kind, message.payload.len(), message.payload[99_999]), (kind, 100_000, 7));
     let too_long = endpoint.create_message(app.tid, kind, endpoint.payload_max() + 1);
@@ -184,15 +184,15 @@ fn raw_memory_is_confirmed_asked_with_and_replied_with(under: Under) {
         let request = replying.receive(WATCHDOG).unwrap().expect("a request");
         let mut reply = replying.create_message(Tid::NONE, kind, 1).unwrap();
         reply[0] = request.bytes()[0] + 1;
-        replying.reply_message(&request, reply).unwrap();
+        replying.loaned(reply).reply_to(&request).unwrap();
     });
     let mut buffer = asking.create_message(to, kind, 1).unwrap();
     buffer[0] = 6;
-    let outcome = asking.send_message_confirmed(buffer, WATCHDOG).unwrap();
+    let outcome = asking.loaned(buffer).confirmed(WATCHDOG).unwrap();
     assert_eq!(outcome, Outcome::Rejected(Rejection::ByHandler));
     let mut buffer = asking.create_message(to, kind, 1).unwrap();
     buffer[0] = 7;
-    assert_eq!(asking.ask_message(buffer, WATCHDOG).unwrap().bytes(), [8]);
+    assert_eq!(asking.loaned(buffer).ask_raw(WATCHDOG).unwrap().bytes(), [8]);
     thread.join().unwrap();
 }
 
@@ -203,14 +203,14 @@ fn a_confirmed_message_ends_in_what_its_receiver_says(under: Under) {
     for said in [Outcome::Delivered, Outcome::Rejected(Rejection::ByHandler), Outcome::Failed] {
         let told = thread::scope(|scope| {
             scope.spawn(|| app.next().settle(said));
-            endpoint.send_confirmed(app.tid, &TORQUE, WATCHDOG).unwrap()
+            endpoint.message(app.tid, &TORQUE).confirmed(WATCHDOG).unwrap()
         });
         assert_eq!(told, said);
     }
     let nobody = Tid::new(node.address(), AppAddress::new(0x7777));
-    let told = endpoint.send_confirmed(nobody, &TORQUE, WATCHDOG).unwrap();
+    let told = endpoint.message(nobody, &TORQUE).confirmed(WATCHDOG).unwrap();
     assert_eq!(told, Outcome::Rejected(Rejection::NoSuchApplication));
-    let told = endpoint.send_confirmed(app.tid, &Setpoint(1), WATCHDOG).unwrap();
+    let told = endpoint.message(app.tid, &Setpoint(1)).confirmed(WATCHDOG).unwrap();
     assert_eq!(told, Outcome::Rejected(Rejection::Unsupported), "of a Stream the newest wins");
 }
 
@@ -218,13 +218,13 @@ fn an_outcome_that_nobody_says_is_unknown_at_the_deadline(under: Under) {
     let node = TestNode::start();
     let app = node.local(1);
     let mut endpoint = register(under, &node, on(under));
-    let told = endpoint.send_confirmed(app.tid, &TORQUE, Duration::from_millis(1)).unwrap();
+    let told = endpoint.message(app.tid, &TORQUE).confirmed(Duration::from_millis(1)).unwrap();
     assert_eq!(told, Outcome::Unknown);
     // The late outcome of the first is not taken for the second's.
     app.next().settle(Outcome::Delivered);
     let told = thread::scope(|scope| {
         scope.spawn(|| app.next().settle(Outcome::Failed));
-        endpoint.send_confirmed(app.tid, &TORQUE, WATCHDOG).unwrap()
+        endpoint.message(app.tid, &TORQUE).confirmed(WATCHDOG).unwrap()
     });
     assert_eq!(told, Outcome::Failed);
 }
@@ -240,7 +240,7 @@ fn messages_that_come_while_an_outcome_is_awaited_are_received_afterwards(under:
             node.stores.router.send(Message::typed(app.tid, tid, &TORQUE)).unwrap();
             message.settle(Outcome::Delivered);
         });
-        assert_eq!(endpoint.send_confirmed(app.tid, &TORQUE, WATCHDOG).unwrap(), Outcome::Delivered);
+        assert_eq!(endpoint.message(app.tid, &TORQUE).confirmed(WATCHDOG).unwrap(), Outcome::Delivered);
     });
     assert!(endpoint.receive(Duration::ZERO).unwrap().is_some());
 }
@@ -256,7 +256,7 @@ fn two_endpoints_of_one_process_ask_and_reply(under: Under) {
         let Torque { newton_metres } = request.decode().unwrap();
         replying.reply(&request, &Doubled { newton_metres: 2.0 * newton_metres }).unwrap();
     });
-    let reply: Doubled = asking.ask(to, &TORQUE, WATCHDOG).unwrap();
+    let reply: Doubled = asking.message(to, &TORQUE).ask(WATCHDOG).unwrap();
     assert_eq!(reply, Doubled { newton_metres: 5.0 });
     thread.join().unwrap();
 }
@@ -265,7 +265,7 @@ fn a_request_that_cannot_be_handled_ends_at_once(under: Under) {
     let node = TestNode::start();
     let mut endpoint = register(under, &node, on(under));
     let nobody = Tid::new(node.address(), AppAddress::new(0x7777));
-    let error = endpoint.ask::<_, Doubled>(nobody, &TORQUE, WATCHDOG).unwrap_err();
+    let error = endpoint.message(nobody, &TORQUE).ask::<Doubled>(WATCHDOG).unwrap_err();
     assert!(matches!(error, ApiError::Ended(Outcome::Rejected(Rejection::NoSuchApplication))), "{error}");
 }
 
@@ -283,7 +283,7 @@ fn another_endpoint_cannot_reply_to_what_this_one_was_asked(under: Under) {
     let node = TestNode::start();
     let (mut asked, mut other) = (register(under, &node, on(under)), register(under, &node, on(under)));
     let (to, mut asking) = (asked.tid(), register(under, &node, on(under)));
-    let asks = thread::spawn(move || asking.ask::<_, Doubled>(to, &TORQUE, WATCHDOG));
+    let asks = thread::spawn(move || asking.message(to, &TORQUE).ask::<Doubled>(WATCHDOG));
     let request = asked.receive(WATCHDOG).unwrap().expect("a request");
     // When the other one replies, by mistake:
     let refused = other.reply(&request, &Doubled { newton_metres: 3.0 });

@@ -103,7 +103,7 @@ impl Endpoint {
     ///
     /// What this endpoint itself has refused without anybody's being told is counted here too, with itself as the destination.
     ///
-    /// Whoever needs to know it of one message sends that one [confirmed](Self::send_confirmed).
+    /// Whoever needs to know it of one message sends that one [confirmed](super::MessageBuilder::confirmed).
     pub fn take_undelivered(&mut self) -> Option<Undelivered> {
         // An error shows itself again when messages are received.
         let _ = self.take_in(None, WhenFull::Leave, Time::now());

@@ -115,7 +115,7 @@ pub(crate) fn measure(way: Way, rounds: Rounds, pinning: Pinning) -> Figures {
     rounds.time(|| {
         let mut block = endpoint.create_message(to, BLOCK, buffer.len()).expect("not too long");
         block.copy_from_slice(&buffer);
-        endpoint.send_message(block).expect("it is taken");
+        endpoint.loaned(block).send().expect("it is taken");
         let back = endpoint.receive(DEADLINE).expect("the node lives").expect("the echo answers");
         buffer.copy_from_slice(back.bytes());
     })
@@ -132,7 +132,7 @@ pub(crate) fn echo(way: Way, socket: &str) {
         let (to, bytes) = (received.source(), received.bytes());
         let mut back = endpoint.create_message(to, BLOCK, bytes.len()).expect("not too long");
         back.copy_from_slice(bytes);
-        endpoint.send_message(back).expect("it is taken");
+        endpoint.loaned(back).send().expect("it is taken");
     }
 }
 
@@ -158,7 +158,7 @@ fn filled(endpoint: &mut AsyncEndpoint, to: Tid, bytes: &[u8]) -> LoanedMessage 
 
 async fn task_round_trip(endpoint: &mut AsyncEndpoint, to: Tid, buffer: &mut [u8]) {
     let block = filled(endpoint, to, buffer);
-    endpoint.send_message(block).await.expect("it is taken");
+    endpoint.loaned(block).send().await.expect("it is taken");
     let back = endpoint.receive().await.expect("the echo answers");
     buffer.copy_from_slice(back.bytes());
 }
@@ -169,6 +169,6 @@ async fn echo_task(way: Way, socket: &str) {
     loop {
         let received = endpoint.receive().await.expect("the node lives");
         let back = filled(&mut endpoint, received.source(), received.bytes());
-        endpoint.send_message(back).await.expect("it is taken");
+        endpoint.loaned(back).send().await.expect("it is taken");
     }
 }

@@ -115,8 +115,8 @@ impl Session {
     pub(crate) fn send(&mut self, message: &mut Message, within: Option<Duration>) -> Result<(), Fault> {
         let buffer = self.take(message)?;
         Ok(match within {
-            None => self.endpoint.send_message(buffer),
-            Some(within) => self.endpoint.send_message_within(buffer, within),
+            None => self.endpoint.loaned(buffer).send(),
+            Some(within) => self.endpoint.loaned(buffer).room_within(within).send(),
         }?)
     }
 
@@ -125,7 +125,7 @@ impl Session {
         buffer: LoanedMessage,
         within: Duration,
     ) -> Result<Outcome, Fault> {
-        Ok(self.endpoint.send_message_confirmed(buffer, within)?)
+        Ok(self.endpoint.loaned(buffer).confirmed(within)?)
     }
 
     /// Asks; what became of the request, too, if it was not handled.
@@ -135,7 +135,7 @@ impl Session {
         within: Duration,
     ) -> Result<Result<Received, (Outcome, Fault)>, Fault> {
         self.check_hand()?;
-        match self.endpoint.ask_message(buffer, within) {
+        match self.endpoint.loaned(buffer).ask_raw(within) {
             Ok(reply) => self.hand_out(reply).map(Ok),
             Err(ApiError::Ended(outcome)) => Ok(Err((outcome, ApiError::Ended(outcome).into()))),
             Err(error) => Err(error.into()),
@@ -152,8 +152,8 @@ impl Session {
             return Err(no_such("the request"));
         };
         Ok(match within {
-            None => self.endpoint.reply_message(request, buffer),
-            Some(within) => self.endpoint.reply_message_within(request, buffer, within),
+            None => self.endpoint.loaned(buffer).reply_to(request),
+            Some(within) => self.endpoint.loaned(buffer).room_within(within).reply_to(request),
         }?)
     }
 
@@ -273,7 +273,7 @@ impl Session {
             if let Ok(mut message) = self.endpoint.create_message(to, ECHO, echo.len()) {
                 message.set_class(Class::Stream);
                 message.copy_from_slice(&echo);
-                let _ = self.endpoint.send_message_within(message, Duration::ZERO);
+                let _ = self.endpoint.loaned(message).room_within(Duration::ZERO).send();
             }
         }
         self.ends.echo_due().unwrap_or(Time::MAX)

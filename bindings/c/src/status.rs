@@ -228,8 +228,10 @@ impl From<ApiError> for Fault {
             ApiError::NotAsked => Status::SinewErrorNotAsked,
             ApiError::OthersRequest(_) => Status::SinewErrorNoSuchMessage,
             ApiError::LoanActive => Status::SinewErrorLoanActive,
-            // The second one: of payloads whose types Rust knows, which C does not send.
-            ApiError::NotYours(_) | ApiError::NotSealed(_) => Status::SinewErrorInvalidArgument,
+            // C sends to TIDs, and no payloads whose types Rust knows: the last two do not come here.
+            ApiError::NotYours(_) | ApiError::NotSealed(_) | ApiError::UnknownName(_) => {
+                Status::SinewErrorInvalidArgument
+            }
         };
         Self::new(status, sentence)
     }
@@ -266,6 +268,7 @@ fn in_c(error: &ApiError) -> String {
         | ApiError::TooLong { .. }
         | ApiError::TooManyGroups
         | ApiError::NotSealed(_)
+        | ApiError::UnknownName(_)
         | ApiError::NoReply(_)
         | ApiError::OthersRequest(_)
         | ApiError::Malformed(_)

@@ -89,7 +89,7 @@ fn the_first_program_in_c_asks_and_prints_the_reply() {
     assert_eq!((request.kind(), request.bytes()), (Kind::named("demo.name"), &b"Ankle"[..]));
     let mut reply = greeter.create_message(request.source(), request.kind(), 6).unwrap();
     reply.copy_from_slice(b"Hello!");
-    greeter.reply_message(&request, reply).unwrap();
+    greeter.loaned(reply).reply_to(&request).unwrap();
     hello.wait_for(&["Hello!"]);
     assert_eq!(hello.wait_for_end(), Some(0));
 }
@@ -132,7 +132,7 @@ fn ask_for_a_greeting(asking: &mut Endpoint) -> Vec<u8> {
     let to = resolve(asking, "greeter");
     let mut name = asking.create_message(to, Kind::named("demo.name"), 5).expect("it is short");
     name.copy_from_slice(b"Ankle");
-    asking.ask_message(name, WATCHDOG).expect("the greeter answers").bytes().to_vec()
+    asking.loaned(name).ask_raw(WATCHDOG).expect("the greeter answers").bytes().to_vec()
 }
 
 #[test]
@@ -213,7 +213,7 @@ fn c_is_driven_by_rust() {
 fn echoed(asking: &mut Endpoint, to: Tid, kind: Kind) -> Vec<u8> {
     let mut packet = asking.create_message(to, kind, 16).expect("it is short");
     packet.fill(0xa5);
-    asking.send_message(packet).expect("the node takes it");
+    asking.loaned(packet).send().expect("the node takes it");
     let back = asking.receive(WATCHDOG).expect("the node lives").expect("what was sent");
     assert_eq!(back.kind(), kind);
     back.bytes().to_vec()
@@ -246,7 +246,7 @@ fn a_type_of_rust_is_read_and_written_by_c() {
     holder.wait_for(&["ready"]);
     let mut asking = endpoint(&ground, Registration::new());
     let to = resolve(&mut asking, "holder");
-    let doubled: Torque = asking.ask(to, &Torque { newton_metres: 2.5 }, WATCHDOG).unwrap();
+    let doubled: Torque = asking.message(to, &Torque { newton_metres: 2.5 }).ask(WATCHDOG).unwrap();
     assert_eq!(doubled, Torque { newton_metres: 5.0 });
 }
 
@@ -266,7 +266,7 @@ fn the_death_of_a_process_in_c_is_noticed_and_what_it_had_in_hand_has_failed() {
         let node = NodeApi::connect(socket).unwrap();
         let mut sender = node.register_transport_address(Registration::new()).unwrap();
         let message = sender.create_message(to, Kind::named("test.held"), 3).unwrap();
-        sender.send_message_confirmed(message, WATCHDOG).unwrap()
+        sender.loaned(message).confirmed(WATCHDOG).unwrap()
     });
     holder.wait_for(&["held 3 bytes"]);
     holder.signal(Signal::KILL);
@@ -289,7 +289,7 @@ fn a_program_in_c_is_told_of_its_nodes_death_and_comes_back_with_it() {
     ground.start_node_again();
     let mut asking = endpoint(&ground, Registration::new().requires(["holder"]));
     let to = resolve(&mut asking, "holder");
-    let doubled: Torque = asking.ask(to, &Torque { newton_metres: 2.5 }, WATCHDOG).unwrap();
+    let doubled: Torque = asking.message(to, &Torque { newton_metres: 2.5 }).ask(WATCHDOG).unwrap();
     assert_eq!(doubled, Torque { newton_metres: 5.0 });
 }
 
@@ -342,7 +342,7 @@ fn the_examples_are_clean_under_valgrind() {
     let mut sensor = endpoint(&ground, Registration::new());
     let to = resolve(&mut sensor, "knee.drive");
     let question = sensor.create_message(to, Kind::named("demo.drive_report"), 0).unwrap();
-    let answer = sensor.ask_message(question, WATCHDOG).unwrap();
+    let answer = sensor.loaned(question).ask_raw(WATCHDOG).unwrap();
     assert_eq!(answer.decode::<DriveReport>().unwrap(), DriveReport { degrees: 0.0, number: 0 });
     assert_eq!(drive.wait_for_end(), Some(0), "{}", drive.said().join("\n"));
 }

@@ -159,7 +159,7 @@ fn send_bare(control: &mut Endpoint, to: Tid) {
     let mut bare = control.create_message(to, Torque::KIND, 20).expect("it is short");
     bare[..15].copy_from_slice(b"\x81\xadnewton_metres");
     bare[15..].copy_from_slice(&[0xca, 0x42, 0, 0, 0]);
-    control.send_message(bare).expect("the node takes it");
+    control.loaned(bare).send().expect("the node takes it");
 }
 
 /// Sends, each 20 ms or so, and hears what it has to quote.

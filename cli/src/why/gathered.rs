@@ -303,7 +303,7 @@ impl<'a> Gathered<'a> {
         let system = self.system(through);
         let inspection = Tid::new(asked.target.node, AppAddress::INSPECT);
         // A node of an older version does not know the question, and has no list.
-        system.endpoint.ask(inspection, &asked, system.within).ok()
+        system.endpoint.message(inspection, &asked).ask(system.within).ok()
     }
 
     /// A ping from the very node, if it has a door here.
@@ -315,7 +315,7 @@ impl<'a> Gathered<'a> {
         let through = asked.through;
         let system = self.system(through);
         let began = Time::now();
-        let outcome = system.endpoint.send_confirmed(to, &Ping {}, system.within);
+        let outcome = system.endpoint.message(to, &Ping {}).confirmed(system.within);
         let took = u64::try_from(Time::now().since(began).as_micros()).unwrap_or(u64::MAX);
         let judged = outcome
             .map_err(|error| error.to_string())

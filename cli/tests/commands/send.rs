@@ -68,7 +68,7 @@ fn a_reply_is_printed_decoded() {
             .create_message(request.source(), request.kind(), request.bytes().len())
             .expect("there is room");
         reply.copy_from_slice(request.bytes());
-        client.reply_message(&request, reply).expect("it is sent");
+        client.loaned(reply).reply_to(&request).expect("it is sent");
         request.settle(Outcome::Delivered);
         client
     });

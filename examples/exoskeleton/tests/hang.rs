@@ -154,7 +154,7 @@ fn forge(drive: Tid, context: &AppContext<Gait>) {
     let sender = context.sender();
     let mut message = sender.create_message(drive, Arm::KIND, sealed.len()).expect("it is short");
     message.copy_from_slice(&sealed);
-    let _ = sender.send_message(message);
+    let _ = sender.loaned(message).send();
 }
 
 #[derive(Default)]

@@ -13,7 +13,7 @@ use crate::{
     outcome::{Outcome, Rejection},
     protection::{Cause, DataId, Echo, Guard, Guarded},
     schedule::{Schedule, Tick, TimerId},
-    sender::{Confirmation, Destination, Reply, SendError, Sender},
+    sender::{Destination, MessageBuilder, SendError, Sender, Value, Via},
     supervision::{ReadyGate, vitals::Vitals},
     tid::Tid,
     time::Time,
@@ -143,30 +143,13 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         self.sender.send(to, value)
     }
 
-    /// Sends a value and wants to know what becomes of it; see [`Sender::send_confirmed`].
-    ///
-    /// # Errors
-    /// Nobody took it.
-    pub fn send_confirmed<'a, P: Payload>(
-        &self,
+    /// A value to be sent otherwise than as its type says, confirmed, or as a request: see [`MessageBuilder`].
+    pub fn message<'a, P: Payload>(
+        &'a mut self,
         to: impl Into<Destination<'a>>,
-        value: &P,
-        within: Duration,
-    ) -> Result<Confirmation, SendError> {
-        self.sender.send_confirmed(to, value, within)
-    }
-
-    /// Sends a request; see [`Sender::ask`].
-    ///
-    /// # Errors
-    /// Nobody took it.
-    pub fn ask<'a, P: Payload, R: Payload>(
-        &self,
-        to: impl Into<Destination<'a>>,
-        request: &P,
-        within: Duration,
-    ) -> Result<Reply<R>, SendError> {
-        self.sender.ask(to, request, within)
+        value: &'a P,
+    ) -> MessageBuilder<&'a mut Self, Value<'a, P>> {
+        MessageBuilder::new(self, Value { destination: to.into(), value })
     }
 
     /// Answers a request.
@@ -336,6 +319,15 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     /// calibrate first. `None` if it is ready already; call it in `started`.
     pub fn hold_ready(&mut self) -> Option<ReadyGate> {
         self.ready.take()
+    }
+}
+
+impl<A> Via for &mut AppContext<A>
+where
+    A: Actor<Context = AppContext<A>>,
+{
+    fn sender(&self) -> &Sender {
+        &self.sender
     }
 }
 

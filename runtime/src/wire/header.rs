@@ -163,6 +163,17 @@ impl Header {
         within
     }
 
+    /// The same for a message whose own time to live may be shorter: that stays.
+    #[must_use = "who waits longer waits for what nobody says any more"]
+    pub fn limit_time_to_live(&mut self, within: Duration) -> Duration {
+        let own = self.time_to_live_us;
+        let within = self.set_time_to_live(within);
+        if own != 0 {
+            self.time_to_live_us = self.time_to_live_us.min(own);
+        }
+        within
+    }
+
     /// Whether the time to live has run out at `now`.
     #[must_use]
     pub fn is_expired(&self, now: Time) -> bool {

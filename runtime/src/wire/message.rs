@@ -1,6 +1,9 @@
 //! A message in memory: header, payload bytes, and the duty to say what became of it.
 
-use std::ops::{Deref, DerefMut};
+use std::{
+    ops::{Deref, DerefMut},
+    time::Duration,
+};
 
 use bytes::{Bytes, BytesMut};
 use serde::{Serialize, de::DeserializeOwned};
@@ -32,6 +35,9 @@ pub trait Payload: Serialize + DeserializeOwned + Send + 'static {
     const KIND: Kind = Kind::named(Self::NAME);
     /// Class that this type travels in unless the sender says otherwise.
     const CLASS: Class = Class::Control;
+    /// How long after it was sent a message of this type is still worth handling: it expires where it waits when it is older. `None`: for
+    /// ever. What one message says of itself comes first: [`MessageBuilder::expires_after`](crate::sender::MessageBuilder::expires_after).
+    const TIME_TO_LIVE: Option<Duration> = None;
     /// What a receiver bears, for a type that is protected from end to end: see [`protection`](crate::protection).
     const PROTECTION: Option<Protection> = None;
 }
@@ -100,9 +106,13 @@ impl Message {
     }
 
     /// The same, of bytes that stand for a `P`.
-    pub(crate) const fn of_type<P: Payload>(source: Tid, destination: Tid, payload: Bytes) -> Self {
+    pub(crate) fn of_type<P: Payload>(source: Tid, destination: Tid, payload: Bytes) -> Self {
         let mut header = Header::new(P::KIND, source, destination);
         header.class = P::CLASS;
+        if let Some(time) = P::TIME_TO_LIVE {
+            // Nothing is waited for here.
+            let _ = header.set_time_to_live(time);
+        }
         Self::new(header, payload)
     }
 
@@ -175,7 +185,7 @@ pub(crate) fn decode_as<P: Payload>(bytes: &[u8]) -> Result<P, DecodeError> {
     decode_payload(bytes).map_err(|cause| DecodeError { name: P::NAME, cause })
 }
 
-/// Writable memory for a raw payload: what `create_message` lends and `send_message` takes back.
+/// Writable memory for a raw payload: what `create_message` lends.
 #[derive(Debug)]
 pub struct MessageBuffer {
     header: Header,

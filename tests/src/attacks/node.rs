@@ -279,7 +279,7 @@ fn question(sender: &Sender, over: &AtomicBool, measured: &Mutex<Measured>) {
             }
             std::thread::sleep(due.saturating_duration_since(Instant::now()));
             lock(measured).asked(due, Instant::now());
-            let asked = sender.ask::<Order, Order>(ECHO, &Order { number }, DEADLINE).ok();
+            let asked = sender.message(ECHO, &Order { number }).ask::<Order>(DEADLINE).ok();
             put.send((number, due, asked)).expect("it takes until nothing more comes");
             due += PACE;
         }

@@ -234,7 +234,7 @@ fn overflow(frame: &[u8; 1024]) -> u8 {
 }
 
 fn send(context: &mut AppContext<Drive>, to: &str, number: u64) {
-    match context.send_confirmed(to, &Count { number }, Duration::from_secs(10)) {
+    match context.message(to, &Count { number }).confirmed(Duration::from_secs(10)) {
         Ok(confirmation) => {
             let wait =
                 confirmation.into_actor(&Drive::default()).map(move |outcome, _: &mut Drive, _: &mut _| {
@@ -247,7 +247,7 @@ fn send(context: &mut AppContext<Drive>, to: &str, number: u64) {
 }
 
 fn ask(context: &mut AppContext<Drive>, whom: &str) {
-    match context.ask::<_, Me>(whom, &Who {}, Duration::from_secs(10)) {
+    match context.message(whom, &Who {}).ask::<Me>(Duration::from_secs(10)) {
         Ok(reply) => {
             let wait = reply.into_actor(&Drive::default()).map(|me, _: &mut Drive, _: &mut _| match me {
                 Ok(me) => say(&format!("answer {:?}", me.counts)),

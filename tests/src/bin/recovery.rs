@@ -138,7 +138,7 @@ fn row(what: &str, limit_ms: u64, trials: impl Iterator<Item = Duration>) -> Row
 fn panic_to_delivery(node: &NodeHandle, sender: &Sender) -> Duration {
     node.inject("puppet", Fault::panic().at_event(1)).expect("it is there");
     sender.send("puppet", &Job { number: 1 }).expect("it has room");
-    let sent = sender.send_confirmed("puppet", &Job { number: 2 }, DEADLINE).expect("it has room");
+    let sent = sender.message("puppet", &Job { number: 2 }).confirmed(DEADLINE).expect("it has room");
     assert_eq!(wait(sent), Outcome::Delivered);
     Time::now().since(node.lives("puppet").and_then(|lives| lives.struck).expect("it was struck"))
 }
@@ -194,7 +194,7 @@ fn killed_process(trials: usize) -> Row {
     let times = (0..trials).map(|_| {
         // An answer takes less than the window: without this the wait before the next start doubled, up to 16 ms.
         live();
-        let asked = sender.ask::<_, Me>("drive", &Who {}, DEADLINE).expect("it is sent");
+        let asked = sender.message("drive", &Who {}).ask::<Me>(DEADLINE).expect("it is sent");
         let me = wait(asked).expect("it answers");
         let before = handle.lives("drive").expect("it is there").readies;
         let pid = i32::try_from(me.pid).ok().and_then(Pid::from_raw).expect("a process id");

@@ -77,7 +77,7 @@ fn be_a_thread(mut endpoint: Endpoint, over: &AtomicBool) {
         let _: Result<(), ApiError> = match answer(&received) {
             Answer::Reply(question) => endpoint.reply(&received, &question),
             Answer::Send => endpoint.send(to, &order),
-            Answer::SendConfirmed => endpoint.send_confirmed(to, &order, PATIENCE).map(drop),
+            Answer::SendConfirmed => endpoint.message(to, &order).confirmed(PATIENCE).map(drop),
         };
     }
 }
@@ -94,7 +94,7 @@ async fn be_a_task(mut endpoint: AsyncEndpoint, over: &AtomicBool) {
         let _: Result<(), ApiError> = match answer(&received) {
             Answer::Reply(question) => endpoint.reply(&received, &question).await,
             Answer::Send => endpoint.send(to, &order).await,
-            Answer::SendConfirmed => endpoint.send_confirmed(to, &order, PATIENCE).await.map(drop),
+            Answer::SendConfirmed => endpoint.message(to, &order).confirmed(PATIENCE).await.map(drop),
         };
     }
 }

@@ -186,9 +186,9 @@ impl Letters {
         let within = within(&mut self.dice);
         self.tell(&Entry::Asks(way, number, Time::now()));
         let outcome = if class == Class::Control {
-            self.endpoint.send_confirmed(tid, &Wire { life, number, body }, within)
+            self.endpoint.message(tid, &Wire { life, number, body }).confirmed(within)
         } else {
-            self.endpoint.send_confirmed(tid, &Parcel { life, number, body }, within)
+            self.endpoint.message(tid, &Parcel { life, number, body }).confirmed(within)
         };
         match outcome {
             Ok(outcome) => self.tell(&Entry::Outcome(way, number, outcome)),
@@ -214,6 +214,7 @@ impl Letters {
             | ApiError::NoReply(_)
             | ApiError::LoanActive
             | ApiError::NotYours(_)
+            | ApiError::UnknownName(_)
             | ApiError::NotAsked
             | ApiError::OthersRequest(_)
             | ApiError::Malformed(_)

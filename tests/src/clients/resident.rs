@@ -105,9 +105,9 @@ impl Resident {
         let (life, body, within) = (1, body(&mut self.dice, number), within(&mut self.dice));
         self.tell(&Entry::Asks(way, number, Time::now()));
         let asked = if class == Class::Control {
-            context.send_confirmed(tid, &Wire { life, number, body }, within)
+            context.message(tid, &Wire { life, number, body }).confirmed(within)
         } else {
-            context.send_confirmed(tid, &Parcel { life, number, body }, within)
+            context.message(tid, &Parcel { life, number, body }).confirmed(within)
         };
         let Ok(confirmation) = asked else { return self.tell(&Entry::NotSent(way, number)) };
         self.waits += 1;

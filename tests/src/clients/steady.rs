@@ -121,7 +121,7 @@ pub(super) fn play_pinger(arguments: &[String]) {
     thread::spawn(move || {
         for number in 0.. {
             let (asked, part) = (Instant::now(), present.load(Ordering::Relaxed));
-            let answer = endpoint.ask::<Order, Order>(echo, &Order { number }, DEADLINE);
+            let answer = endpoint.message(echo, &Order { number }).ask::<Order>(DEADLINE);
             let took = asked.elapsed();
             let mut measured = lock(&measuring);
             match answer {

@@ -85,7 +85,7 @@ impl Victim {
         self.number += 1;
         let number = self.number;
         let sent = match self.dice.below(8) {
-            0 => self.endpoint.send_confirmed(to, &Order { number }, Duration::from_millis(2)).map(drop),
+            0 => self.endpoint.message(to, &Order { number }).confirmed(Duration::from_millis(2)).map(drop),
             1..3 => self.endpoint.send(to, &Order { number }),
             3..5 => self.endpoint.send(to, &Value { number }),
             _ => self.endpoint.send(to, &Job { number }),

@@ -178,7 +178,7 @@ impl Work {
                     return Err(SendError::TooManyWaits);
                 }
                 let control = Control { life, number, asked, filling };
-                let confirmation = sender.send_confirmed(name, &control, OUTCOME_WITHIN)?;
+                let confirmation = sender.message(name, &control).confirmed(OUTCOME_WITHIN)?;
                 self.waiting.push_back((number, confirmation));
                 Ok(())
             }

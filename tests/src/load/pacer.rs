@@ -118,7 +118,7 @@ impl Work {
         if self.waiting.len() >= WAITS_MAX {
             return Err(SendError::TooManyWaits);
         }
-        let confirmation = self.sender.send_confirmed("sink", &Order { number }, PATIENCE)?;
+        let confirmation = self.sender.message("sink", &Order { number }).confirmed(PATIENCE)?;
         self.waiting.push_back((number, confirmation));
         Ok(())
     }

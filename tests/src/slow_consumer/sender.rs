@@ -113,7 +113,7 @@ fn question(sender: &Sender, shared: &Shared) {
         }
         let asked = Instant::now();
         let answer = runtime.block_on(async {
-            sender.ask::<Order, Order>(ECHO, &Order { number }, DEADLINE).ok()?.await.ok()
+            sender.message(ECHO, &Order { number }).ask::<Order>(DEADLINE).ok()?.await.ok()
         });
         let took = asked.elapsed();
         let mut measured = shared.measured.lock().unwrap_or_else(PoisonError::into_inner);

@@ -53,7 +53,7 @@ fn start(spec: AppSpec<Puppet>) -> (Node, DeskKey) {
 }
 
 fn confirmed(sender: &Sender, number: u64) -> Confirmation {
-    sender.send_confirmed("puppet", &Job { number }, DEADLINE).expect("it has room")
+    sender.message("puppet", &Job { number }).confirmed(DEADLINE).expect("it has room")
 }
 
 impl Scene {
@@ -88,7 +88,7 @@ fn an_application_that_drops_while_away_refuses_what_waits_and_what_comes_until_
     // And when it is ready, it is as before.
     scene.become_ready();
     let sent = until("it takes messages again", || {
-        sender.send_confirmed("puppet", &Job { number: 5 }, DEADLINE).ok().map(wait)
+        sender.message("puppet", &Job { number: 5 }).confirmed(DEADLINE).ok().map(wait)
     });
     assert_eq!(sent, Outcome::Delivered);
     assert_eq!(numbers(&scene.log.all()), [1, 5]);
@@ -137,7 +137,7 @@ fn an_application_that_holds_for_a_time_refuses_from_then_on() {
     gate.lock().expect("nobody panics with it").take().expect("it holds").reached();
     log.wait_for(Seen::Started(2));
     let sent = until("it takes messages again", || {
-        sender.send_confirmed("puppet", &Job { number: 3 }, DEADLINE).ok().map(wait)
+        sender.message("puppet", &Job { number: 3 }).confirmed(DEADLINE).ok().map(wait)
     });
     assert_eq!(sent, Outcome::Delivered);
     assert_eq!(numbers(&log.all()), [13, 3]);

@@ -133,7 +133,7 @@ impl Line {
 fn put(by: &mut Endpoint, to: Tid, kind: Kind, bytes: &[u8]) {
     let mut message = by.create_message(to, kind, bytes.len()).expect("there is room");
     message.copy_from_slice(bytes);
-    by.send_message(message).expect("it is sent");
+    by.loaned(message).send().expect("it is sent");
 }
 
 /// Everything that has come.

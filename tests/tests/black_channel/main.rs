@@ -274,12 +274,12 @@ impl<const AGE_MAX_MS: u64> Scene<AGE_MAX_MS> {
 fn pass(by: &mut Endpoint, to: Tid, kind: Kind, bytes: &[u8]) -> Outcome {
     let mut message = by.create_message(to, kind, bytes.len()).expect("there is room");
     message.copy_from_slice(bytes);
-    by.send_message_confirmed(message, DEADLINE).expect("it is sent")
+    by.loaned(message).confirmed(DEADLINE).expect("it is sent")
 }
 
 /// The bytes of the next torque of `source` for who asks.
 fn next_of<const AGE_MAX_MS: u64>(asks: &mut Endpoint, source: Tid) -> Vec<u8> {
-    assert_eq!(asks.send_confirmed(source, &Go, DEADLINE).expect("it is sent"), Outcome::Delivered);
+    assert_eq!(asks.message(source, &Go).confirmed(DEADLINE).expect("it is sent"), Outcome::Delivered);
     let torque = asks.receive(DEADLINE).expect("it is connected").expect("it sends one");
     assert_eq!((torque.source(), torque.kind()), (source, Torque::<AGE_MAX_MS>::KIND));
     torque.bytes().to_vec()

@@ -64,7 +64,7 @@ impl Scene {
     }
 
     fn ask(&mut self, number: u64, within: Duration) -> Result<Order, ApiError> {
-        self.asking.ask(self.to, &Order { number }, within)
+        self.asking.message(self.to, &Order { number }).ask(within)
     }
 
     /// Asks until there is an answer while the node is stopped; it stays so.
@@ -122,7 +122,7 @@ fn the_death_of_a_peer_is_an_outcome_also_while_the_node_is_stopped() {
     let (say, begun) = sync_channel(1);
     let waiting = thread::spawn(move || {
         say.send(gettid().as_raw_nonzero().get()).expect("the test waits for it");
-        let answer = asking.ask::<Order, Order>(to, &Order { number: 7 }, DEADLINE * 3);
+        let answer = asking.message(to, &Order { number: 7 }).ask::<Order>(DEADLINE * 3);
         (asking, answer)
     });
     // It sleeps when the question is in the ring, and not before.
@@ -148,9 +148,9 @@ fn ask_all_along(asking: &mut Endpoint, to: Tid, is_over: &AtomicBool) -> u64 {
     let mut number = 0;
     while !is_over.load(Ordering::Relaxed) {
         number += 1;
-        let answer = asking.ask::<Order, Order>(to, &Order { number }, DEADLINE);
+        let answer = asking.message(to, &Order { number }).ask::<Order>(DEADLINE);
         assert_eq!(answer.expect("the link stands").number, number);
-        let told = asking.send_confirmed(to, &Order { number }, DEADLINE);
+        let told = asking.message(to, &Order { number }).confirmed(DEADLINE);
         assert!(matches!(told, Ok(Outcome::Delivered)), "{number}: {told:?}");
     }
     number
@@ -171,7 +171,7 @@ fn is_whole_again(scene: &mut Scene, registrations: u64) {
     let api = NodeApi::connect(scene.stage.socket()).expect("the door is open");
     let mut third = api.register_transport_address(Registration::new()).expect("an address");
     assert_eq!(echo, scene.to, "it has its address again");
-    let answer = third.ask::<Order, Order>(echo, &Order { number: 3 }, DEADLINE).expect("an answer");
+    let answer = third.message(echo, &Order { number: 3 }).ask::<Order>(DEADLINE).expect("an answer");
     assert_eq!(answer.number, 3);
 }
 
@@ -226,7 +226,7 @@ fn the_death_of_a_peer_is_an_outcome_also_where_a_child_of_its_holds_the_link() 
     let (say, begun) = sync_channel(1);
     let waiting = thread::spawn(move || {
         say.send(gettid().as_raw_nonzero().get()).expect("the test waits for it");
-        let answer = asking.ask::<Order, Order>(to, &Order { number: 7 }, DEADLINE);
+        let answer = asking.message(to, &Order { number: 7 }).ask::<Order>(DEADLINE);
         (asking, answer)
     });
     wait_until_asleep(begun.recv_timeout(DEADLINE).expect("the thread begins"));

@@ -70,7 +70,7 @@ impl Scene {
     /// The same, as their own node says.
     fn idle_of_itself(&self) -> Vec<(Tid, String)> {
         let inspection = Tid::new(self.there.address(), AppAddress::INSPECT);
-        let asked = self.sender.ask::<_, NodeReport>(inspection, &AskNode {}, DEADLINE);
+        let asked = self.sender.message(inspection, &AskNode {}).ask::<NodeReport>(DEADLINE);
         let said = wait(asked.expect("it has a place")).expect("an answer");
         assert_eq!(said.idle_clients as usize, said.idle.len(), "there are fewer than can be named");
         said.idle.into_iter().map(|client| (client.app, client.name)).collect()
@@ -126,7 +126,7 @@ fn stopped_clients_are_well_for_which_nothing_waits_or_nothing_but_pings() {
     // Whom a slow machine had leave that for a while is not named any more.
     scene.wait_for_none();
     // When: a message waits for one of them, later than a ping for another.
-    let answer = scene.sender.send_confirmed("pinged", &Ping {}, DEADLINE).expect("it has a place");
+    let answer = scene.sender.message("pinged", &Ping {}).confirmed(DEADLINE).expect("it has a place");
     send_jobs(&scene.sender, "hand", [2]);
     // Then: what waits for the other one is seen in the same looks.
     assert_eq!(scene.wait_for_idle(), [(tid, "hand".to_owned())]);

@@ -92,13 +92,13 @@ impl Scene {
 
     /// Refused at once, and the sender told so.
     fn assert_full<P: Payload>(&mut self, value: &P) {
-        let outcome = self.sender.send_confirmed(self.to, value, DEADLINE).expect("the node answers");
+        let outcome = self.sender.message(self.to, value).confirmed(DEADLINE).expect("the node answers");
         assert_eq!(outcome, Outcome::Rejected(sinew::Rejection::QueueFull), "{} to a full queue", P::NAME);
     }
 
     /// Sends until it is handled: there is room again.
     fn send_until_delivered<P: Payload>(&mut self, value: &P) {
-        until("it is delivered", || match self.sender.send_confirmed(self.to, value, DEADLINE) {
+        until("it is delivered", || match self.sender.message(self.to, value).confirmed(DEADLINE) {
             Ok(Outcome::Delivered) => Some(()),
             Ok(Outcome::Rejected(sinew::Rejection::QueueFull)) => None,
             other => panic!("it ends as {other:?}"),
@@ -199,7 +199,7 @@ fn a_stopped_client_costs_its_node_bytes_within_their_bound_and_they_go_back_whe
             let mut message = sender.create_message(to, kind, LONG).expect("the longest there may be");
             message.set_class(class);
             message[..8].copy_from_slice(&number.to_le_bytes());
-            sender.send_message(message).expect("the node takes it, and passes it on or refuses it");
+            sender.loaned(message).send().expect("the node takes it, and passes it on or refuses it");
         }
         most = most.max(Held::of(stage.node_id()).own_kib.saturating_sub(before.own_kib));
     }
@@ -208,7 +208,7 @@ fn a_stopped_client_costs_its_node_bytes_within_their_bound_and_they_go_back_whe
     assert!(most <= LONG_BOUND_KIB, "the node has grown by {most} KiB of {LONG_BOUND_KIB}");
     assert!(most >= LONG_WAIT * 1_024, "it did hold what it may: {most} KiB");
     let refused = sender.create_message(to, Kind::named("scenario.load"), LONG).expect("as above");
-    let outcome = sender.send_message_confirmed(refused, DEADLINE).expect("it is sent");
+    let outcome = sender.loaned(refused).confirmed(DEADLINE).expect("it is sent");
     assert_eq!(outcome, Outcome::Rejected(sinew::Rejection::QueueFull));
 
     // And when it goes on, it gets what waited, and the memory is free again.

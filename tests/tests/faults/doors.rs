@@ -39,7 +39,7 @@ impl Doors {
 /// Jobs of the other node reach the puppet.
 fn is_linked(sender: &Sender) {
     until("a job gets through", || {
-        let sent = sender.send_confirmed("puppet", &Job { number: 1 }, DEADLINE).ok()?;
+        let sent = sender.message("puppet", &Job { number: 1 }).confirmed(DEADLINE).ok()?;
         (wait(sent) == Outcome::Delivered).then_some(())
     });
 }

@@ -104,7 +104,7 @@ fn a_hung_application_is_replaced_its_message_failed_and_those_behind_are_handle
         }
     });
     let (_node, sender, log) = perform(stage, |app| app);
-    let hung = sender.send_confirmed("puppet", &Job { number: 13 }, DEADLINE).expect("it has room");
+    let hung = sender.message("puppet", &Job { number: 13 }).confirmed(DEADLINE).expect("it has room");
     send_jobs(&sender, "puppet", [14, 15]);
     assert_eq!(wait(hung), Outcome::Failed);
     assert_eq!(wait_for_numbers(&log, 3), [13, 14, 15]);
@@ -290,7 +290,7 @@ fn pair() -> (Node, Node, Sender, Log<Seen>) {
     let sender = key.sender();
     until("the puppet is known", || sender.resolve("puppet"));
     until("it is reached", || {
-        let sent = sender.send_confirmed("puppet", &Job { number: 0 }, DEADLINE).ok()?;
+        let sent = sender.message("puppet", &Job { number: 0 }).confirmed(DEADLINE).ok()?;
         (wait(sent) == Outcome::Delivered).then_some(())
     });
     (here, there, sender, log)
@@ -309,13 +309,13 @@ fn a_hung_layer_is_replaced_and_the_nodes_find_together_again() {
                 ready_for(&there.handle(), LAYERS[index], before[index] + 1);
             }
             until("a job gets through", || {
-                let sent = sender.send_confirmed("puppet", &Job { number: 1 }, DEADLINE).ok()?;
+                let sent = sender.message("puppet", &Job { number: 1 }).confirmed(DEADLINE).ok()?;
                 (wait(sent) == Outcome::Delivered).then_some(())
             });
             assert_eq!(lives(&log), 1, "{layer}: the application was not restarted");
             // When the hung one comes back, nothing is disturbed.
             until("it has come back", || {
-                let sent = sender.send_confirmed("puppet", &Job { number: 2 }, DEADLINE).ok()?;
+                let sent = sender.message("puppet", &Job { number: 2 }).confirmed(DEADLINE).ok()?;
                 let struck =
                     there.handle().lives(layer).and_then(|lives| lives.struck).expect("it was struck");
                 (wait(sent) == Outcome::Delivered && Time::now().since(struck) > HANG + BUDGET).then_some(())

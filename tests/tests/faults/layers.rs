@@ -59,7 +59,7 @@ impl Pair {
     #[track_caller]
     fn gets_through(&self, number: u64) {
         until("a job gets through", || {
-            let sent = self.sender.send_confirmed("puppet", &Job { number }, DEADLINE).ok()?;
+            let sent = self.sender.message("puppet", &Job { number }).confirmed(DEADLINE).ok()?;
             (wait(sent) == Outcome::Delivered).then_some(())
         });
     }
@@ -270,7 +270,7 @@ fn confirmed_messages_between_nodes_have_exactly_one_outcome_while_gncl_dies() {
         let sent: Vec<_> = (1..=50)
             .map(|number| round * 100 + number)
             .filter_map(|number| {
-                Some((number, pair.sender.send_confirmed("puppet", &Job { number }, DEADLINE).ok()?))
+                Some((number, pair.sender.message("puppet", &Job { number }).confirmed(DEADLINE).ok()?))
             })
             .collect();
         kill(&pair.here.handle(), "GNCL");

@@ -94,7 +94,7 @@ fn of_a_stream_only_the_newest_value_waits_for_one_that_is_away() {
 #[test]
 fn what_expires_while_its_application_is_away_is_told_and_never_handled() {
     let away = Away::new(64);
-    let sent = away.sender.send_confirmed(away.tid, &Job { number: 1 }, Duration::from_micros(1));
+    let sent = away.sender.message(away.tid, &Job { number: 1 }).confirmed(Duration::from_micros(1));
     let confirmation = sent.expect("it has room");
     let _other = away.let_it_come_back();
     assert_eq!(outcome_of_job(&away.sender, "puppet", 2), Outcome::Delivered);
@@ -106,7 +106,7 @@ fn what_expires_while_its_application_is_away_is_told_and_never_handled() {
 fn a_confirmed_message_to_one_that_is_away_is_delivered_when_it_is_back() {
     let away = Away::new(64);
     let confirmation =
-        away.sender.send_confirmed(away.tid, &Job { number: 1 }, DEADLINE).expect("it has room");
+        away.sender.message(away.tid, &Job { number: 1 }).confirmed(DEADLINE).expect("it has room");
     let _other = away.let_it_come_back();
     assert_eq!(wait(confirmation), Outcome::Delivered);
     away.log.wait_for(Seen::Got(2, 1));
@@ -115,7 +115,7 @@ fn a_confirmed_message_to_one_that_is_away_is_delivered_when_it_is_back() {
 #[test]
 fn what_waits_for_one_that_never_comes_back_is_refused_when_its_node_stops() {
     let Away { node, sender, tid, log, .. } = Away::new(64);
-    let confirmation = sender.send_confirmed(tid, &Job { number: 1 }, DEADLINE).expect("it has room");
+    let confirmation = sender.message(tid, &Job { number: 1 }).confirmed(DEADLINE).expect("it has room");
     drop(node);
     assert_eq!(wait(confirmation), Outcome::Rejected(Rejection::Closed));
     assert!(numbers(&log.all()).is_empty(), "nobody was started for it");
@@ -129,7 +129,7 @@ fn each_confirmed_message_through_many_panics_has_exactly_one_outcome_and_is_han
     all_run(&[&node]);
     let sender = key.sender();
     let sent: Vec<_> = (0..200)
-        .map(|number| sender.send_confirmed("puppet", &Job { number }, DEADLINE).expect("room"))
+        .map(|number| sender.message("puppet", &Job { number }).confirmed(DEADLINE).expect("room"))
         .collect();
     let outcomes = wait(async {
         let mut outcomes = Vec::new();
@@ -153,7 +153,7 @@ fn an_answer_to_a_life_that_is_over_disturbs_the_next_one_in_nothing() {
     let stage = Stage::new().started(|puppet, context| {
         if puppet.life == 1 {
             let asked =
-                context.ask::<_, Order>("oracle", &Order { number: 7 }, DEADLINE).expect("it is sent");
+                context.message("oracle", &Order { number: 7 }).ask::<Order>(DEADLINE).expect("it is sent");
             drop(asked);
             panic!("before the answer");
         }

@@ -40,8 +40,9 @@ fn a_poison_message_fails_once_and_is_not_handed_over_again() {
 fn a_request_whose_handler_panics_ends_as_failed_and_the_next_one_is_answered() {
     let stage = Stage::new().got(|puppet, _| assert!(puppet.number != 13, "thirteen"));
     let (_node, sender, _log) = perform(stage, |app| app);
-    let ask =
-        |number| wait(sender.ask::<_, Order>("puppet", &Order { number }, DEADLINE).expect("it is sent"));
+    let ask = |number| {
+        wait(sender.message("puppet", &Order { number }).ask::<Order>(DEADLINE).expect("it is sent"))
+    };
     let words = ask(13).expect_err("it failed").to_string();
     assert!(words.contains("panicked") || words.contains("Failed"), "{words}");
     assert_eq!(ask(14).expect("a reply").number, 14);

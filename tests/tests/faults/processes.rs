@@ -106,7 +106,7 @@ fn a_process_killed_under_confirmed_traffic_leaves_no_message_without_an_outcome
     // Frozen: what is sent now cannot be answered any more.
     knee.freeze();
     let sent: Vec<_> =
-        (0..100).filter_map(|_| sender.send_confirmed(tid, &payload(), DEADLINE).ok()).collect();
+        (0..100).filter_map(|_| sender.message(tid, &payload()).confirmed(DEADLINE).ok()).collect();
     assert!(!sent.is_empty());
     knee.signal(Signal::KILL);
     let outcomes = sinew_tests::puppet::wait(async {
@@ -205,13 +205,13 @@ fn an_application_in_a_process_of_its_own_takes_its_faults_along() {
     let wanted = Registration::new().name("test").requires(["drive"]).deadline(DEADLINE);
     let mut endpoint = api.register_transport_address(wanted).expect("the drive becomes ready");
     let drive = endpoint.resolve("drive", DEADLINE).expect("the node answers").expect("it is ready");
-    let mut who = || -> Me { endpoint.ask(drive, &Who {}, DEADLINE).expect("the drive answers") };
+    let mut who = || -> Me { endpoint.message(drive, &Who {}).ask(DEADLINE).expect("the drive answers") };
     let first = who();
     assert_ne!(first.pid, robot.id());
     assert_eq!(who().pid, first.pid);
-    let failed = endpoint.send_confirmed(drive, &Count { number: 3 }, DEADLINE).expect("the node answers");
+    let failed = endpoint.message(drive, &Count { number: 3 }).confirmed(DEADLINE).expect("the node answers");
     assert_eq!(failed, Outcome::Failed, "the third message of this process");
-    let next: Me = endpoint.ask(drive, &Who {}, DEADLINE).expect("the drive answers");
+    let next: Me = endpoint.message(drive, &Who {}).ask(DEADLINE).expect("the drive answers");
     assert!(next.pid != first.pid && next.pid != robot.id(), "a new process: {next:?}");
 }
 

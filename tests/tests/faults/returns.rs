@@ -40,7 +40,7 @@ fn comes_back(transport: Transport) {
     let (drive_tid, hip_tid) = (drive.tid(), hip.tid());
     drive.join("drives").expect("there is room in it");
     let asking = thread::spawn(move || {
-        let outcome = hip.send_confirmed(drive_tid, &Job { number: 1 }, DEADLINE);
+        let outcome = hip.message(drive_tid, &Job { number: 1 }).confirmed(DEADLINE);
         (hip, outcome)
     });
     let in_hand = drive.receive(DEADLINE).expect("the node is there").expect("a message in time");

@@ -126,7 +126,7 @@ fn a_node_whose_clock_began_anew_is_there_again_15_s_after_its_loss() {
 }
 
 fn send(gait: &mut Endpoint, to: Tid, within: Duration) -> Outcome {
-    gait.send_confirmed(to, &Torque { newton_metres: 1.0 }, within).expect("it is sent")
+    gait.message(to, &Torque { newton_metres: 1.0 }).confirmed(within).expect("it is sent")
 }
 
 // spec: GNCL-18

@@ -65,12 +65,12 @@ impl Handler<Delivery<Go>> for Clerk {
 
     fn handle(&mut self, go: Delivery<Go>, context: &mut Self::Context) {
         let (round, to) = (go.round, Tid::from_bits(go.to));
-        let sent = context.send_confirmed(to, &held(round, AWAITED), WITHIN).expect("it has room");
+        let sent = context.message(to, &held(round, AWAITED)).confirmed(WITHIN).expect("it has room");
         let awaited = sent.into_actor(self).map(move |outcome, clerk: &mut Self, _: &mut _| {
             clerk.0.write((round, AWAITED, outcome));
         });
         context.spawn(awaited);
-        context.send_with_tag(to, &held(round, TOLD), WITHIN, round).expect("it has room");
+        context.message(to, &held(round, TOLD)).with_tag(round).confirmed(WITHIN).expect("it has room");
     }
 }
 
@@ -85,7 +85,7 @@ impl Handler<SendOutcome> for Clerk {
 fn by_endpoint(socket: &Path, to: Tid, held: &Held) -> Outcome {
     let api = NodeApi::connect(socket).expect("the node is up");
     let mut endpoint = api.register_transport_address(Registration::new()).expect("there is room for it");
-    endpoint.send_confirmed(to, held, WITHIN).expect("the node takes it")
+    endpoint.message(to, held).confirmed(WITHIN).expect("the node takes it")
 }
 
 fn by_task(socket: &Path, to: Tid, held: &Held) -> Outcome {
@@ -94,7 +94,7 @@ fn by_task(socket: &Path, to: Tid, held: &Held) -> Outcome {
         let api = NodeApi::connect(socket).expect("the node is up");
         let registered = api.register_transport_address_async(Registration::new()).await;
         let mut endpoint = registered.expect("there is room for it");
-        endpoint.send_confirmed(to, held, WITHIN).await.expect("the node takes it")
+        endpoint.message(to, held).confirmed(WITHIN).await.expect("the node takes it")
     })
 }
 

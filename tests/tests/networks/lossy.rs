@@ -97,7 +97,7 @@ impl Pair {
     /// Sends a round of values, and an order with the first of them; returns when the last one has come.
     fn round(&self, round: u64) {
         let confirmation =
-            self.sender.send_confirmed("sink", &Order { number: round }, DEADLINE).expect("it has room");
+            self.sender.message("sink", &Order { number: round }).confirmed(DEADLINE).expect("it has room");
         let first = ABOVE + round * VALUES;
         for number in first..first + VALUES {
             self.sender.send("sink", &Value { number }).expect("the newest one has room");

@@ -29,7 +29,7 @@ fn write(path: &Path, list: &str) {
 
 fn send(gait: &mut Endpoint, to: Tid) -> Outcome {
     let torque = Torque { newton_metres: 1.0 };
-    gait.send_confirmed(to, &torque, DEADLINE).expect("it is sent")
+    gait.message(to, &torque).confirmed(DEADLINE).expect("it is sent")
 }
 
 #[test]

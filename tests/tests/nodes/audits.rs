@@ -43,7 +43,7 @@ fn send_every_sort(sender: &Sender, to: &str) -> u64 {
         sender.send(to, &Value { number }).expect("it replaces the one before");
     }
     let late =
-        sender.send_confirmed(to, &Order { number: 5 }, Duration::from_millis(1)).expect("it is taken");
+        sender.message(to, &Order { number: 5 }).confirmed(Duration::from_millis(1)).expect("it is taken");
     assert_eq!(wait(late), Outcome::Unknown, "nobody has said anything in its time");
     for number in [REFUSED, FATAL, 6] {
         sender.send(to, &Order { number }).expect("there is room");
@@ -125,7 +125,7 @@ fn what_a_client_is_given_is_counted_while_it_is_there_and_when_it_has_gone() {
     }
     let sink = handle.resolve("sink").expect("it is registered");
     assert_eq!(
-        far.send_confirmed(sink, &Job { number: 7 }, DEADLINE).expect("an outcome"),
+        far.message(sink, &Job { number: 7 }).confirmed(DEADLINE).expect("an outcome"),
         Outcome::Delivered
     );
     // Then: beside the 7 messages it was sent an outcome

@@ -66,7 +66,7 @@ impl Victim {
         let api = NodeApi::connect(&self.socket).expect("the door is open");
         let mut endpoint = api.register_transport_address(Registration::new()).expect("an address");
         let outcome =
-            endpoint.send_confirmed(self.witness(), &Count { number }, DEADLINE).expect("an outcome");
+            endpoint.message(self.witness(), &Count { number }).confirmed(DEADLINE).expect("an outcome");
         assert_eq!(outcome, Outcome::Delivered);
         assert_eq!(self.seen.recv_timeout(DEADLINE), Ok(number));
     }

@@ -104,21 +104,23 @@ fn requests_to_another_node_are_answered_and_every_confirmed_send_has_its_outcom
         |node| node.app(spec),
         &["oracle"],
         async |sender: sinew::Sender| {
-            let ask =
-                sender.ask::<_, Answer>("oracle", &Question { number: 21 }, DEADLINE).expect("it is sent");
+            let ask = sender
+                .message("oracle", &Question { number: 21 })
+                .ask::<Answer>(DEADLINE)
+                .expect("it is sent");
             assert_eq!(ask.await.expect("a reply").number, 42);
             let outcome = async |number| {
-                let sent = sender.send_confirmed("oracle", &Question { number }, DEADLINE);
+                let sent = sender.message("oracle", &Question { number }).confirmed(DEADLINE);
                 sent.expect("it is sent").await
             };
             assert_eq!(outcome(1).await, Outcome::Delivered);
             assert_eq!(outcome(99).await, Outcome::Rejected(Rejection::ByHandler));
             assert_eq!(outcome(13).await, Outcome::Failed);
             assert_eq!(outcome(2).await, Outcome::Delivered, "by the new instance behind the same TID");
-            let unheard = sender.send_confirmed("oracle", &Unheard, DEADLINE).expect("it is sent").await;
+            let unheard = sender.message("oracle", &Unheard).confirmed(DEADLINE).expect("it is sent").await;
             assert_eq!(unheard, Outcome::Rejected(Rejection::UnknownKind));
             let nobody = Tid::new([127, 0, 0, 2].into(), AppAddress::fixed(7).expect("a fixed address"));
-            let lost = sender.send_confirmed(nobody, &Unheard, DEADLINE).expect("it is sent").await;
+            let lost = sender.message(nobody, &Unheard).confirmed(DEADLINE).expect("it is sent").await;
             assert_eq!(lost, Outcome::Rejected(Rejection::NoSuchApplication));
         },
     );
@@ -135,7 +137,7 @@ fn requests_that_nobody_waits_for_any_more_take_no_places_and_their_late_replies
         async |sender: sinew::Sender| {
             let mut asked = 0;
             while asked < DROPPED {
-                match sender.ask::<_, Answer>("oracle", &Question { number: 21 }, DEADLINE) {
+                match sender.message("oracle", &Question { number: 21 }).ask::<Answer>(DEADLINE) {
                     Ok(reply) => {
                         drop(reply);
                         asked += 1;
@@ -149,7 +151,7 @@ fn requests_that_nobody_waits_for_any_more_take_no_places_and_their_late_replies
             }
             // Behind all of them; what comes now is its own.
             let last = loop {
-                match sender.ask::<_, Answer>("oracle", &Question { number: 21 }, DEADLINE) {
+                match sender.message("oracle", &Question { number: 21 }).ask::<Answer>(DEADLINE) {
                     Ok(reply) => break reply,
                     Err(_) => actix::clock::sleep(Duration::from_millis(1)).await,
                 }
@@ -193,19 +195,19 @@ fn a_handler_sees_that_nobody_waits_for_its_reply_any_more_and_a_late_reply_is_c
         |node| node.app(AppSpec::new("ponderer", || Ponderer).handles::<Question>()),
         &["ponderer"],
         async |sender: sinew::Sender| {
-            let ask = |within| sender.ask::<_, Answer>("ponderer", &Question { number: 1 }, within);
+            let ask = |within| sender.message("ponderer", &Question { number: 1 }).ask::<Answer>(within);
             // Given up by whoever asked: the deadline is beyond the test's.
             let reply = ask(DEADLINE * 2).expect("it is sent");
-            let behind = sender.send_confirmed("ponderer", &Question { number: 2 }, DEADLINE);
+            let behind = sender.message("ponderer", &Question { number: 2 }).confirmed(DEADLINE);
             assert_eq!(behind.expect("it is sent").await, Outcome::Delivered, "so the request is handled");
             drop(reply);
             // Its time is over: one that waited for its handler so long is not handled, and has no reply.
             while sender.late_replies() < 2 {
                 let hasty = Question { number: HASTY };
-                let over = sender.ask::<_, Answer>("ponderer", &hasty, Duration::from_millis(100));
+                let over = sender.message("ponderer", &hasty).ask::<Answer>(Duration::from_millis(100));
                 assert!(over.expect("it is sent").await.is_err(), "nobody replied in time");
                 // The reply is on its way, if there is one.
-                let behind = sender.send_confirmed("ponderer", &Question { number: 2 }, DEADLINE);
+                let behind = sender.message("ponderer", &Question { number: 2 }).confirmed(DEADLINE);
                 assert_eq!(behind.expect("it is sent").await, Outcome::Delivered);
             }
         },

@@ -46,7 +46,7 @@ fn a_node_in_python_is_found_sends_takes_confirms_and_leaves() {
 
     let sender = key.sender();
     for number in 1..=COUNT {
-        let sent = sender.send_confirmed("python.arm", &Order { number }, DEADLINE).expect("it has room");
+        let sent = sender.message("python.arm", &Order { number }).confirmed(DEADLINE).expect("it has room");
         assert_eq!(wait(sent), Outcome::Delivered, "of {number}");
         python.wait_for(&[&format!("got {number}")]);
     }
@@ -80,7 +80,7 @@ fn a_node_in_python_has_a_connection_for_each_class_and_sends_and_takes_values_b
         python.wait_for(&["linked with rust for", lane]);
     }
     for number in 1..=COUNT {
-        let sent = sender.send_confirmed("python.arm", &Order { number }, DEADLINE).expect("it has room");
+        let sent = sender.message("python.arm", &Order { number }).confirmed(DEADLINE).expect("it has room");
         assert_eq!(wait(sent), Outcome::Delivered, "of {number}");
     }
     // The first ones may go by the connection: datagrams are used once one was answered.

@@ -71,7 +71,7 @@ impl Actor for Sending {
                     assert!(matches!(error, SendError::Rejected(Rejection::QueueFull)), "{error}");
                     seen.refused += 1;
                     // It is full now and here: the quick one is asked until it is not.
-                    let ask = sender.ask::<_, Answer>("quick", &Question { number }, DEADLINE);
+                    let ask = sender.message("quick", &Question { number }).ask::<Answer>(DEADLINE);
                     let answer = ask.expect("what is for others is taken").await.expect("and answered");
                     assert_eq!(answer.number, number);
                     seen.answered += 1;

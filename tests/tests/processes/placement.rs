@@ -59,7 +59,7 @@ fn outcomes_are_what_the_handler_made_of_the_message(place: &str) {
     assert_eq!(scenario.count_confirmed(1), Outcome::Delivered);
     assert_eq!(scenario.order_confirmed(Order::Refuse), Outcome::Rejected(Rejection::ByHandler));
     let (endpoint, drive) = (&mut scenario.endpoint, scenario.drive);
-    let told = endpoint.send_confirmed(drive, &Unknown {}, DEADLINE).expect("the node takes it");
+    let told = endpoint.message(drive, &Unknown {}).confirmed(DEADLINE).expect("the node takes it");
     assert_eq!(told, Outcome::Rejected(Rejection::UnknownKind));
     assert_eq!(scenario.order_confirmed(Order::Panic), Outcome::Failed);
     assert_eq!(scenario.count_confirmed(2), Outcome::Delivered);
@@ -69,7 +69,8 @@ fn a_message_that_waits_too_long_expires(place: &str) {
     let mut scenario = sent_while_it_holds(place, |_| {});
     let (endpoint, drive) = (&mut scenario.endpoint, scenario.drive);
     let told = endpoint
-        .send_confirmed(drive, &Count { number: 1 }, Duration::from_millis(1))
+        .message(drive, &Count { number: 1 })
+        .confirmed(Duration::from_millis(1))
         .expect("the node takes it");
     assert!(matches!(told, Outcome::Unknown | Outcome::Expired), "{told:?}");
     assert_eq!(scenario.who().counts, [0; 0], "it was not handled");
@@ -219,7 +220,8 @@ fn it_pauses_until_what_it_requires_is_back_whatever_waits(place: &str) {
     scenario.helper.take().expect("it was required").unregister().expect("the node answers");
     scenario.node.wait_for(&["requirement Lost"]);
     (1..=100).for_each(|number| scenario.count(number));
-    let paused = scenario.endpoint.send_confirmed(scenario.drive, &Order::Refuse, Duration::from_millis(100));
+    let paused =
+        scenario.endpoint.message(scenario.drive, &Order::Refuse).confirmed(Duration::from_millis(100));
     assert!(matches!(paused, Ok(Outcome::Unknown | Outcome::Expired)), "{paused:?}");
     let helper = scenario.api.register_transport_address(Registration::new().name("helper"));
     scenario.node.wait_for(&["requirement Met"]);
@@ -261,7 +263,7 @@ fn large_messages_go_both_ways(place: &str) {
         }
     }
     assert_eq!(
-        scenario.endpoint.ask::<_, Me>(drive, &Who {}, DEADLINE).expect("the node takes it").counts,
+        scenario.endpoint.message(drive, &Who {}).ask::<Me>(DEADLINE).expect("the node takes it").counts,
         [0; 0]
     );
 }

@@ -57,7 +57,7 @@ impl Scenario {
 
     /// Asks the application who it is. All counts before it, too: they are asked for in the same class.
     pub(crate) fn who(&mut self) -> Me {
-        self.endpoint.ask(self.drive, &Who {}, DEADLINE).expect("the drive answers")
+        self.endpoint.message(self.drive, &Who {}).ask(DEADLINE).expect("the drive answers")
     }
 
     pub(crate) fn order(&mut self, order: Order) {
@@ -66,12 +66,12 @@ impl Scenario {
 
     /// Gives an order whose handler does not return as it should; returns what is told of it.
     pub(crate) fn order_confirmed(&mut self, order: Order) -> Outcome {
-        self.endpoint.send_confirmed(self.drive, &order, DEADLINE).expect("the node answers")
+        self.endpoint.message(self.drive, &order).confirmed(DEADLINE).expect("the node answers")
     }
 
     /// What was sent before it in its class has been handled then.
     pub(crate) fn count_confirmed(&mut self, number: u64) -> Outcome {
-        let told = self.endpoint.send_confirmed(self.drive, &Count { number }, DEADLINE);
+        let told = self.endpoint.message(self.drive, &Count { number }).confirmed(DEADLINE);
         told.expect("the node answers")
     }
 

@@ -56,7 +56,7 @@ fn a_process_that_starts_while_its_node_or_all_of_the_host_stands_still_is_not_k
         let wanted = Registration::new().requires(["drive"]).deadline(DEADLINE);
         let mut endpoint = api.register_transport_address(wanted).expect("the drive becomes ready");
         let drive = endpoint.resolve("drive", DEADLINE).expect("the node answers").expect("it is ready");
-        let me: Me = endpoint.ask(drive, &Who {}, DEADLINE).expect("it answers");
+        let me: Me = endpoint.message(drive, &Who {}).ask(DEADLINE).expect("it answers");
         assert_eq!(me.pid, pid, "with the process: {with_process}");
     }
 }

@@ -23,12 +23,12 @@ impl Leg {
     }
 
     fn leader_panics(&mut self) {
-        let told = self.scenario.endpoint.send_confirmed(self.leader, &Order::Panic, DEADLINE);
+        let told = self.scenario.endpoint.message(self.leader, &Order::Panic).confirmed(DEADLINE);
         assert_eq!(told.expect("the node answers"), Outcome::Failed);
     }
 
     fn leader_is_back(&mut self) {
-        let me: Me = self.scenario.endpoint.ask(self.leader, &Who {}, DEADLINE).expect("it answers");
+        let me: Me = self.scenario.endpoint.message(self.leader, &Who {}).ask(DEADLINE).expect("it answers");
         assert_eq!(me.pid, self.scenario.node.id());
     }
 

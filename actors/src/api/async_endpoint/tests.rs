@@ -76,9 +76,9 @@ fn its_futures_may_go_from_thread_to_thread() {
         let (to, tid) = (app.tid, endpoint.tid());
         let task = tokio::spawn(async move {
             moves(endpoint.send(to, &TORQUE)).await.unwrap();
-            moves(endpoint.send_confirmed(Tid::NONE, &TORQUE, WATCHDOG)).await.unwrap();
+            moves(endpoint.message(Tid::NONE, &TORQUE).confirmed(WATCHDOG)).await.unwrap();
             let message = endpoint.create_message(to, RAW, 3).unwrap();
-            moves(endpoint.send_message(message)).await.unwrap();
+            moves(endpoint.loaned(message).send()).await.unwrap();
             moves(endpoint.receive()).await.unwrap().source()
         });
         node.stores.router.send(Message::typed(to, tid, &TORQUE)).unwrap();
@@ -99,14 +99,14 @@ fn many_endpoints_share_one_thread_and_each_waits_for_itself() {
                     let request = replying.receive().await.unwrap();
                     let mut reply = replying.create_message(request.source(), RAW, 8).unwrap();
                     reply.copy_from_slice(request.bytes());
-                    replying.reply_message(&request, reply).await.unwrap();
+                    replying.loaned(reply).reply_to(&request).await.unwrap();
                 }
             };
             let ask = async {
                 for number in 0..100_u64 {
                     let mut request = asking.create_message(to, RAW, 8).unwrap();
                     request.copy_from_slice(&number.to_le_bytes());
-                    let reply = asking.ask_message(request, WATCHDOG).await.unwrap();
+                    let reply = asking.loaned(request).ask_raw(WATCHDOG).await.unwrap();
                     assert_eq!(number_of(reply.bytes()), number);
                 }
             };
@@ -229,7 +229,7 @@ fn a_send_without_room_lets_other_tasks_run_and_goes_on_when_there_is_room() {
                 for number in 0..COUNT {
                     let mut message = endpoint.create_message(app.tid, RAW, 100_000).unwrap();
                     message[..8].copy_from_slice(&number.to_le_bytes());
-                    endpoint.send_message(message).await.unwrap();
+                    endpoint.loaned(message).send().await.unwrap();
                     sent.set(number + 1);
                 }
             };
@@ -266,7 +266,7 @@ fn a_send_gives_up_when_its_patience_is_over_and_what_was_not_sent_does_not_come
             let error = loop {
                 let mut message = endpoint.create_message(app.tid, RAW, 1_000).unwrap();
                 message[..8].copy_from_slice(&sent.to_le_bytes());
-                match endpoint.send_message(message).await {
+                match endpoint.loaned(message).send().await {
                     Ok(()) => sent += 1,
                     Err(error) => break error,
                 }
@@ -294,7 +294,7 @@ fn a_long_message_whose_send_is_dropped_half_way_comes_whole_or_not_at_all() {
                 let standstill = Standstill::begin(&node, &mut endpoint).await;
                 let mut long = endpoint.create_message(app.tid, RAW, 900_000).unwrap();
                 long[..8].copy_from_slice(&number.to_le_bytes());
-                assert!(poll!(pin!(endpoint.send_message(long))).is_pending(), "so much does not fit");
+                assert!(poll!(pin!(endpoint.loaned(long).send())).is_pending(), "so much does not fit");
                 drop(standstill);
                 endpoint.send(app.tid, &TORQUE).await.unwrap();
                 let first = app.next();
@@ -386,7 +386,7 @@ fn a_task_that_looks_before_it_sleeps_keeps_its_deadlines() {
         let wish = Registration::new().spin(Spin::For(10 * WATCHDOG));
         let mut endpoint = api.register_transport_address_async(wish).await.unwrap();
         // Nobody takes it out of the mailbox, where it is long before it expires.
-        let confirmed = endpoint.send_confirmed(app.tid, &TORQUE, Duration::from_secs(1));
+        let confirmed = endpoint.message(app.tid, &TORQUE).confirmed(Duration::from_secs(1));
         let outcome = timeout(WATCHDOG, confirmed)
             .await
             .expect("it ends at its deadline, not when it has looked enough");

@@ -91,7 +91,7 @@ fn two_that_send_to_each_other_do_it_directly_after_a_while() {
     assert_eq!((received.source(), received.decode::<Counted>().unwrap()), (one.tid(), Counted(7)));
     let told = thread::scope(|scope| {
         let (from, to) = (&mut one, other.tid());
-        let sending = scope.spawn(move || from.send_confirmed(to, &Counted(8), WATCHDOG).unwrap());
+        let sending = scope.spawn(move || from.message(to, &Counted(8)).confirmed(WATCHDOG).unwrap());
         other.receive(WATCHDOG).unwrap().expect("a message").settle(Outcome::Failed);
         sending.join().unwrap()
     });
@@ -109,7 +109,7 @@ fn messages_flow_on_a_link_while_the_node_does_nothing() {
     }
     let to = other.tid();
     let asking = thread::spawn(move || {
-        let reply: Counted = one.ask(to, &Counted(2), WATCHDOG).unwrap();
+        let reply: Counted = one.message(to, &Counted(2)).ask(WATCHDOG).unwrap();
         reply
     });
     let request = other.receive(WATCHDOG).unwrap().expect("a request");
@@ -180,7 +180,7 @@ fn a_link_is_made_while_one_side_waits_for_an_answer_by_the_same_number_as_the_l
         other.correlation = 40 + 1 - what_the_peer_says_next;
         let (to, asked) = (one.tid(), app.tid);
         thread::scope(|scope| {
-            let waiting = scope.spawn(|| one.send_confirmed(asked, &Counted(1), WATCHDOG).unwrap());
+            let waiting = scope.spawn(|| one.message(asked, &Counted(1)).confirmed(WATCHDOG).unwrap());
             let mut message = app.next();
             // when
             let deadline = Time::now() + WATCHDOG / 2;

@@ -27,7 +27,7 @@ fn endpoint(node: &TestNode) -> Endpoint {
 fn send(from: &mut Endpoint, to: Tid, bytes: &[u8]) {
     let mut message = from.create_message(to, RAW, bytes.len()).unwrap();
     message.copy_from_slice(bytes);
-    from.send_message(message).unwrap();
+    from.loaned(message).send().unwrap();
 }
 
 #[test]
@@ -84,7 +84,7 @@ fn an_outcome_that_is_said_while_memory_is_lent_goes_out_when_it_is_given_back()
         // By another thread, as it may be.
         thread::spawn(move || drop(received)).join().unwrap();
         if is_sent {
-            endpoint.send_message(message).unwrap();
+            endpoint.loaned(message).send().unwrap();
         } else {
             drop(message);
         }
@@ -100,7 +100,7 @@ fn what_lies_in_another_ring_is_copied_and_that_ring_is_free_again() {
     let mut message = one.create_message(app.tid, RAW, 3).unwrap();
     message.copy_from_slice(b"one");
     assert!(message.is_in_place());
-    other.send_message(message).unwrap();
+    other.loaned(message).send().unwrap();
     let came = app.next();
     assert_eq!((came.header.source, &came.payload[..]), (other.tid(), &b"one"[..]));
     send(&mut one, app.tid, b"two");
@@ -131,10 +131,10 @@ fn a_full_ring_lends_nothing_and_the_message_waits_for_room_when_it_is_sent() {
         if !message.is_in_place() {
             break message;
         }
-        endpoint.send_message(message).unwrap();
+        endpoint.loaned(message).send().unwrap();
         sent += 1;
     };
-    endpoint.send_message(full).unwrap();
+    endpoint.loaned(full).send().unwrap();
     for number in 0..=sent {
         assert_eq!(app.next().payload[..8], number.to_le_bytes());
     }
@@ -169,7 +169,7 @@ fn on_a_direct_link_memory_lies_in_the_ring_of_that_link() {
     let mut message = one.create_message(other.tid(), RAW, 7).unwrap();
     message.copy_from_slice(b"in ring");
     assert!(message.is_in_place());
-    one.send_message(message).unwrap();
+    one.loaned(message).send().unwrap();
     assert_eq!(other.receive(WATCHDOG).unwrap().expect("a message").bytes(), b"in ring");
 }
 
@@ -182,7 +182,7 @@ fn memory_in_the_ring_of_a_peer_that_has_gone_ends_as_a_message_to_nobody() {
     other.unregister().unwrap();
     let deadline = Time::now() + WATCHDOG;
     loop {
-        let outcome = one.send_message_confirmed(message, WATCHDOG).unwrap();
+        let outcome = one.loaned(message).confirmed(WATCHDOG).unwrap();
         if outcome == Outcome::Rejected(Rejection::NoSuchApplication) {
             break;
         }
@@ -203,7 +203,7 @@ fn of_a_stream_what_was_lent_is_newer_than_what_waits_for_room() {
         message.set_class(Class::Stream);
         message[..8].copy_from_slice(&value.to_le_bytes());
         let is_in_place = message.is_in_place();
-        one.send_message(message).unwrap();
+        one.loaned(message).send().unwrap();
         is_in_place
     };
     // given: the ring is full, and a value waits for room

@@ -38,7 +38,7 @@ fn nobody_answers_for_another_by_guessing_the_number(under: Under) {
             hostile.send(&Message::outcome(ticket, Outcome::Failed));
             correlation
         });
-        let told = endpoint.send_confirmed(its_tid, &TORQUE, WATCHDOG).unwrap();
+        let told = endpoint.message(its_tid, &TORQUE).confirmed(WATCHDOG).unwrap();
         assert_eq!(told, Outcome::Failed);
         asked.join().unwrap()
     });
@@ -60,7 +60,7 @@ fn nobody_answers_for_another_by_guessing_the_number(under: Under) {
             reply.header.correlation = request.header.correlation;
             node.stores.router.send(reply).unwrap();
         });
-        endpoint.ask::<_, Doubled>(app.tid, &TORQUE, WATCHDOG).unwrap()
+        endpoint.message(app.tid, &TORQUE).ask::<Doubled>(WATCHDOG).unwrap()
     });
     assert_eq!(asked, Doubled { newton_metres: 5.0 });
 }
@@ -84,8 +84,8 @@ fn a_time_that_is_longer_than_any_message_lives_counts_as_that(under: Under) {
                 reply.header.correlation = request.header.correlation;
                 node.stores.router.send(reply).unwrap();
             });
-            assert_eq!(endpoint.send_confirmed(app.tid, &TORQUE, within).unwrap(), Outcome::Delivered);
-            endpoint.ask::<_, Doubled>(app.tid, &TORQUE, within).unwrap()
+            assert_eq!(endpoint.message(app.tid, &TORQUE).confirmed(within).unwrap(), Outcome::Delivered);
+            endpoint.message(app.tid, &TORQUE).ask::<Doubled>(within).unwrap()
         });
     }
 }
@@ -107,7 +107,7 @@ fn flood(node: &TestNode, endpoint: &mut Client, app: &PlayedApp, count: usize, 
             }
             asked.settle(Outcome::Delivered);
         });
-        let told = endpoint.send_confirmed(app.tid, &TORQUE, WATCHDOG * 3).unwrap();
+        let told = endpoint.message(app.tid, &TORQUE).confirmed(WATCHDOG * 3).unwrap();
         assert_eq!(told, Outcome::Delivered);
     });
 }

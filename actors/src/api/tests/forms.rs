@@ -223,6 +223,82 @@ impl Got {
     }
 }
 
+/// A message to be sent, by the builder of the form.
+#[derive(Debug)]
+pub(super) struct Sending<'a, C> {
+    client: &'a mut Client,
+    to: Tid,
+    content: C,
+    room: Option<Duration>,
+}
+
+/// The builder with the limit to the wait for room, if there is one.
+macro_rules! limited {
+    ($builder:expr, $room:expr) => {
+        match $room {
+            Some(room) => $builder.room_within(room),
+            None => $builder,
+        }
+    };
+}
+
+impl<C> Sending<'_, C> {
+    pub(super) fn room_within(mut self, room: Duration) -> Self {
+        self.room = Some(room);
+        self
+    }
+}
+
+impl Sending<'_, Lent> {
+    pub(super) fn send(self) -> Result<(), ApiError> {
+        let (message, room) = (self.content, self.room);
+        either!(self.client, endpoint => limited!(endpoint.loaned(message.of_rust()), room).send(), endpoint.send_message(message.of_c(), room))
+    }
+
+    pub(super) fn confirmed(self, within: Duration) -> Result<Outcome, ApiError> {
+        let message = self.content;
+        either!(self.client, endpoint => endpoint.loaned(message.of_rust()).confirmed(within), endpoint.confirm_message(message.of_c(), within))
+    }
+
+    pub(super) fn ask_raw(self, within: Duration) -> Result<Got, ApiError> {
+        let message = self.content;
+        match self.client {
+            Client::Thread(endpoint) => endpoint.loaned(message.of_rust()).ask_raw(within).map(Got::Rust),
+            Client::Task(endpoint, runtime) => {
+                runtime.block_on(endpoint.loaned(message.of_rust()).ask_raw(within)).map(Got::Rust)
+            }
+            Client::C(endpoint) => endpoint.ask_message(message.of_c(), within).map(Got::C),
+        }
+    }
+
+    pub(super) fn reply_to(self, request: &Got) -> Result<(), ApiError> {
+        let message = self.content;
+        either!(self.client, endpoint => endpoint.loaned(message.of_rust()).reply_to(request.of_rust()), endpoint.reply_message(request.of_c(), message.of_c(), None))
+    }
+}
+
+impl<P: Payload> Sending<'_, &P> {
+    pub(super) fn send(self) -> Result<(), ApiError> {
+        let (to, value, room) = (self.to, self.content, self.room);
+        either!(self.client, endpoint => limited!(endpoint.message(to, value), room).send(), endpoint.send(to, value, room))
+    }
+
+    pub(super) fn confirmed(self, within: Duration) -> Result<Outcome, ApiError> {
+        let (to, value) = (self.to, self.content);
+        either!(self.client, endpoint => endpoint.message(to, value).confirmed(within), endpoint.confirm(to, value, within))
+    }
+
+    pub(super) fn ask<R: Payload>(self, within: Duration) -> Result<R, ApiError> {
+        let (to, request) = (self.to, self.content);
+        either!(self.client, endpoint => endpoint.message(to, request).ask(within), endpoint.ask(to, request, within))
+    }
+
+    pub(super) fn reply_to(self, request: &Got) -> Result<(), ApiError> {
+        let (value, room) = (self.content, self.room);
+        either!(self.client, endpoint => limited!(endpoint.message(Tid::NONE, value), room).reply_to(request.of_rust()), endpoint.reply(request.of_c(), value, room))
+    }
+}
+
 impl Client {
     pub(super) fn tid(&self) -> Tid {
         look!(self, endpoint => endpoint.tid(), endpoint.tid())
@@ -262,78 +338,20 @@ impl Client {
         )
     }
 
-    pub(super) fn send_message(&mut self, message: Lent) -> Result<(), ApiError> {
-        either!(self, endpoint => endpoint.send_message(message.of_rust()), endpoint.send_message(message.of_c(), None))
+    pub(super) fn loaned(&mut self, message: Lent) -> Sending<'_, Lent> {
+        Sending { client: self, to: Tid::NONE, content: message, room: None }
     }
 
-    pub(super) fn send_message_within(&mut self, message: Lent, within: Duration) -> Result<(), ApiError> {
-        either!(self, endpoint => endpoint.send_message_within(message.of_rust(), within), endpoint.send_message(message.of_c(), Some(within)))
+    pub(super) fn message<'a, P: Payload>(&'a mut self, to: Tid, value: &'a P) -> Sending<'a, &'a P> {
+        Sending { client: self, to, content: value, room: None }
     }
 
-    pub(super) fn send_message_confirmed(
-        &mut self,
-        message: Lent,
-        within: Duration,
-    ) -> Result<Outcome, ApiError> {
-        either!(self, endpoint => endpoint.send_message_confirmed(message.of_rust(), within), endpoint.confirm_message(message.of_c(), within))
-    }
-
-    pub(super) fn ask_message(&mut self, message: Lent, within: Duration) -> Result<Got, ApiError> {
-        match self {
-            Self::Thread(endpoint) => endpoint.ask_message(message.of_rust(), within).map(Got::Rust),
-            Self::Task(endpoint, runtime) => {
-                runtime.block_on(endpoint.ask_message(message.of_rust(), within)).map(Got::Rust)
-            }
-            Self::C(endpoint) => endpoint.ask_message(message.of_c(), within).map(Got::C),
-        }
-    }
-
-    pub(super) fn reply_message(&mut self, request: &Got, message: Lent) -> Result<(), ApiError> {
-        either!(self, endpoint => endpoint.reply_message(request.of_rust(), message.of_rust()), endpoint.reply_message(request.of_c(), message.of_c(), None))
-    }
-
-    pub(super) fn send<P: Payload>(&mut self, destination: Tid, value: &P) -> Result<(), ApiError> {
-        either!(self, endpoint => endpoint.send(destination, value), endpoint.send(destination, value, None))
-    }
-
-    pub(super) fn send_within<P: Payload>(
-        &mut self,
-        destination: Tid,
-        value: &P,
-        within: Duration,
-    ) -> Result<(), ApiError> {
-        either!(self, endpoint => endpoint.send_within(destination, value, within), endpoint.send(destination, value, Some(within)))
-    }
-
-    pub(super) fn send_confirmed<P: Payload>(
-        &mut self,
-        destination: Tid,
-        value: &P,
-        within: Duration,
-    ) -> Result<Outcome, ApiError> {
-        either!(self, endpoint => endpoint.send_confirmed(destination, value, within), endpoint.confirm(destination, value, within))
-    }
-
-    pub(super) fn ask<P: Payload, R: Payload>(
-        &mut self,
-        destination: Tid,
-        request: &P,
-        within: Duration,
-    ) -> Result<R, ApiError> {
-        either!(self, endpoint => endpoint.ask(destination, request, within), endpoint.ask(destination, request, within))
+    pub(super) fn send<P: Payload>(&mut self, to: Tid, value: &P) -> Result<(), ApiError> {
+        either!(self, endpoint => endpoint.send(to, value), endpoint.send(to, value, None))
     }
 
     pub(super) fn reply<R: Payload>(&mut self, request: &Got, value: &R) -> Result<(), ApiError> {
         either!(self, endpoint => endpoint.reply(request.of_rust(), value), endpoint.reply(request.of_c(), value, None))
-    }
-
-    pub(super) fn reply_within<R: Payload>(
-        &mut self,
-        request: &Got,
-        value: &R,
-        within: Duration,
-    ) -> Result<(), ApiError> {
-        either!(self, endpoint => endpoint.reply_within(request.of_rust(), value, within), endpoint.reply(request.of_c(), value, Some(within)))
     }
 
     pub(super) fn receive(&mut self, within: Duration) -> Result<Option<Got>, ApiError> {

@@ -45,14 +45,14 @@ fn while_a_message_is_lent_nothing_else_goes_out_and_the_refusal_says_what_to_do
             message.fill(7);
             lent(client.create_message(to, RAW, 1));
             lent(client.send(to, &TORQUE));
-            lent(client.send_within(to, &TORQUE, Duration::ZERO));
-            lent(client.send_confirmed(to, &TORQUE, WATCHDOG));
-            lent(client.ask::<_, Torque>(to, &TORQUE, WATCHDOG));
+            lent(client.message(to, &TORQUE).room_within(Duration::ZERO).send());
+            lent(client.message(to, &TORQUE).confirmed(WATCHDOG));
+            lent(client.message(to, &TORQUE).ask::<Torque>(WATCHDOG));
             lent(client.resolve("anybody", WATCHDOG));
             lent(client.join("drives"));
             lent(client.leave("drives"));
             assert!(client.receive(Duration::ZERO).unwrap().is_none(), "it is looked, and nothing is there");
-            client.send_message(message).unwrap();
+            client.loaned(message).send().unwrap();
             assert_eq!(app.next().payload[..], vec![7; length]);
             drop(received);
             assert_eq!(outcome.recv_timeout(WATCHDOG), Ok(Outcome::Delivered));
@@ -81,11 +81,11 @@ fn another_endpoint_may_send_what_this_one_has_lent_if_it_has_lent_nothing_itsel
     for length in LENGTHS {
         let message = one.create_message(app.tid, RAW, length).unwrap();
         let its_own = other.create_message(app.tid, RAW, length).unwrap();
-        lent(other.send_message(message));
+        lent(other.loaned(message).send());
         // That one is gone, and its memory given back.
         one.send(app.tid, &TORQUE).unwrap();
         assert_eq!(app.next().header.source, one.tid());
-        one.send_message(its_own).unwrap();
+        one.loaned(its_own).send().unwrap();
         let came = app.next();
         assert_eq!((came.header.source, came.payload.len()), (one.tid(), length));
         other.send(app.tid, &TORQUE).unwrap();
@@ -141,7 +141,7 @@ fn what_was_lent_before_the_node_was_restarted_goes_to_its_next_life(under: Unde
         lent(client.send(to, &TORQUE));
         lent(client.join("drives"));
         // then: it goes to the node's next life
-        client.send_message(message).unwrap();
+        client.loaned(message).send().unwrap();
         let came = app.next();
         assert_eq!((came.header.source, &came.payload[..]), (client.tid(), &vec![7; length][..]));
         client.join("drives").unwrap();
@@ -164,7 +164,7 @@ fn what_was_lent_before_a_link_was_made_goes_out_on_it(under: Under) {
             drop(received);
             other
         });
-        one.send_message(message).unwrap();
+        one.loaned(message).send().unwrap();
         other = other_receives.join().unwrap();
     }
 }

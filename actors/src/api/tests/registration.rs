@@ -92,7 +92,7 @@ fn every_thread_may_have_an_address_of_its_own(under: Under) {
                 for number in 0..100_u64 {
                     let mut buffer = endpoint.create_message(app.tid, kind, 8).unwrap();
                     buffer.copy_from_slice(&number.to_le_bytes());
-                    endpoint.send_message(buffer).unwrap();
+                    endpoint.loaned(buffer).send().unwrap();
                 }
             });
         }

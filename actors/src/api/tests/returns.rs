@@ -154,9 +154,9 @@ fn meanwhile_it_says_once_that_it_is_away_and_each_send_says_it_was_not_sent(und
     let to = Tid::new(client.tid().node, AppAddress::fixed(1).unwrap());
     for refused in [
         client.send(to, &TORQUE),
-        client.send_within(to, &TORQUE, Duration::ZERO),
-        client.send_confirmed(to, &TORQUE, WATCHDOG).map(drop),
-        client.ask::<_, Torque>(to, &TORQUE, WATCHDOG).map(drop),
+        client.message(to, &TORQUE).room_within(Duration::ZERO).send(),
+        client.message(to, &TORQUE).confirmed(WATCHDOG).map(drop),
+        client.message(to, &TORQUE).ask::<Torque>(WATCHDOG).map(drop),
         client.resolve("anybody", WATCHDOG).map(drop),
         client.join("drives"),
     ] {
@@ -174,7 +174,7 @@ fn a_confirmed_message_that_its_node_took_along_is_unknown(under: Under) {
     let app = node.local(1);
     let mut client = register(under, &node, on(under));
     let to = app.tid;
-    let sending = thread::spawn(move || client.send_confirmed(to, &TORQUE, WATCHDOG * 3));
+    let sending = thread::spawn(move || client.message(to, &TORQUE).confirmed(WATCHDOG * 3));
     // Its receiver has it in hand, and says nothing before the node's end.
     let in_hand = app.next();
     node.stop();
@@ -226,11 +226,11 @@ fn a_send_with_a_time_of_its_own_does_not_look_for_the_node(under: Under) {
     assert!(matches!(await_end(&mut client), ApiError::Disconnected(_)));
     let before = client.registrations();
     for _ in 0..100 {
-        let refused = client.send_within(Tid::NONE, &TORQUE, Duration::from_millis(1));
+        let refused = client.message(Tid::NONE, &TORQUE).room_within(Duration::from_millis(1)).send();
         assert!(matches!(refused, Err(ApiError::Disconnected(_))), "{refused:?}");
         // Of a task a thread of its runtime's pool looks meanwhile.
         if !matches!(under.form, Form::Task) {
-            let refused = client.send_confirmed(Tid::NONE, &TORQUE, Duration::from_millis(1));
+            let refused = client.message(Tid::NONE, &TORQUE).confirmed(Duration::from_millis(1));
             assert!(matches!(refused, Err(ApiError::Disconnected(_))), "{refused:?}");
         }
     }
@@ -265,14 +265,14 @@ fn what_is_left_of_a_long_message_ends_with_the_connection_and_the_next_one_is_w
         let mut half = client.create_message(to, raw, LONG).unwrap();
         half.fill(1);
         // From a socket it is sent with its first byte; from a ring it is taken back, for which there may be no room yet.
-        let begun = client.send_message_within(half, Duration::ZERO);
+        let begun = client.loaned(half).room_within(Duration::ZERO).send();
         assert!(matches!(begun, Ok(()) | Err(ApiError::Stalled(_))), "{begun:?}");
         node.restart();
         await_return(&mut client);
         let app = node.local(1);
         let mut whole = client.create_message(to, raw, LONG).unwrap();
         whole.fill(2);
-        client.send_message_within(whole, WATCHDOG).unwrap();
+        client.loaned(whole).room_within(WATCHDOG).send().unwrap();
         assert_eq!(app.next().payload[..], vec![2; LONG]);
     }
 }

@@ -49,7 +49,7 @@ fn number_of(node: &PlayedNode, length: usize) -> u64 {
 fn fill(from: &mut Client, length: usize) -> u64 {
     for number in 0.. {
         let message = message(from, number, length);
-        match from.send_message_within(message, NO_TIME) {
+        match from.loaned(message).room_within(NO_TIME).send() {
             Ok(()) => {}
             Err(ApiError::Stalled(waited)) => {
                 assert_eq!(waited, NO_TIME);
@@ -68,7 +68,7 @@ fn patience_is_for_a_node_that_takes_nothing_and_not_for_a_long_message(under: U
     // given: a node that takes a little of a message again and again, for longer than the stall timeout lasts
     let long = message(&mut client, 1, LONG);
     let sending = thread::spawn(move || {
-        client.send_message(long).unwrap();
+        client.loaned(long).send().unwrap();
         client
     });
     let began = std::time::Instant::now();
@@ -82,7 +82,7 @@ fn patience_is_for_a_node_that_takes_nothing_and_not_for_a_long_message(under: U
     let mut client = sending.join().unwrap();
     assert_eq!(number_of(&node, LONG), 1);
     let next = message(&mut client, 2, SHORT);
-    client.send_message(next).unwrap();
+    client.loaned(next).send().unwrap();
     assert_eq!(number_of(&node, SHORT), 2);
 }
 
@@ -91,14 +91,14 @@ fn a_long_message_that_is_not_taken_comes_whole_or_not_at_all_and_costs_no_conne
     let mut client = register(under, &node, Duration::from_millis(50));
     // given: a node that takes nothing
     let long = message(&mut client, 1, LONG);
-    let is_sent = match client.send_message(long) {
+    let is_sent = match client.loaned(long).send() {
         Ok(()) => true,
         Err(ApiError::Stalled(_)) => false,
         Err(other) => panic!("{other}"),
     };
     assert_eq!(is_sent, under.transport == Transport::Socket, "from a ring it is taken back");
     let refused = message(&mut client, 2, SHORT);
-    let error = client.send_message(refused).unwrap_err();
+    let error = client.loaned(refused).send().unwrap_err();
     assert!(matches!(error, ApiError::Stalled(_)), "{error}");
     assert!(node.next_now().is_none());
     // when: it takes again, and the client does nothing but receive
@@ -114,7 +114,7 @@ fn a_long_message_that_is_not_taken_comes_whole_or_not_at_all_and_costs_no_conne
     }
     // then
     let third = message(&mut client, 3, SHORT);
-    client.send_message_within(third, WATCHDOG).unwrap();
+    client.loaned(third).room_within(WATCHDOG).send().unwrap();
     assert_eq!(number_of(&node, SHORT), 3, "the refused one does not come");
 }
 
@@ -125,12 +125,12 @@ fn who_has_no_time_is_told_at_once_and_nothing_that_was_refused_comes(under: Und
     assert!(taken > 0);
     for _ in 0..100 {
         let refused = message(&mut client, 1_000_000, SHORT);
-        assert!(matches!(client.send_message_within(refused, NO_TIME), Err(ApiError::Stalled(_))));
+        assert!(matches!(client.loaned(refused).room_within(NO_TIME).send(), Err(ApiError::Stalled(_))));
     }
     node.take_all();
     // Its stall timeout is whole: those who have no time have lost none of it.
     let last = message(&mut client, taken, SHORT);
-    client.send_message(last).unwrap();
+    client.loaned(last).send().unwrap();
     for number in 0..=taken {
         assert_eq!(number_of(&node, SHORT), number);
     }
@@ -141,15 +141,15 @@ fn a_long_message_of_who_has_no_time_comes_whole_or_not_at_all_and_in_order(unde
     let mut client = register(under, &node, WATCHDOG);
     for round in 0..3 {
         let first = message(&mut client, 3 * round, LONG);
-        let is_sent = client.send_message_within(first, NO_TIME).is_ok();
+        let is_sent = client.loaned(first).room_within(NO_TIME).send().is_ok();
         assert_eq!(is_sent, under.transport == Transport::Socket, "from a ring it is taken back");
         // Behind what is half written nothing is.
         let refused = message(&mut client, 1_000_000, SHORT);
-        assert!(matches!(client.send_message_within(refused, NO_TIME), Err(ApiError::Stalled(_))));
+        assert!(matches!(client.loaned(refused).room_within(NO_TIME).send(), Err(ApiError::Stalled(_))));
         node.take_all();
         for (number, length) in [(1, SHORT), (2, LONG)] {
             let next = message(&mut client, 3 * round + number, length);
-            client.send_message(next).unwrap();
+            client.loaned(next).send().unwrap();
         }
         if is_sent {
             assert_eq!(number_of(&node, LONG), 3 * round);
@@ -166,13 +166,14 @@ fn who_has_time_waits_for_room_and_no_longer_than_it_has(under: Under) {
     let taken = fill(&mut client, SHORT);
     let time = Duration::from_millis(30);
     let late = message(&mut client, taken, SHORT);
-    let (began, error) = (std::time::Instant::now(), client.send_message_within(late, time).unwrap_err());
+    let (began, error) =
+        (std::time::Instant::now(), client.loaned(late).room_within(time).send().unwrap_err());
     assert!(matches!(error, ApiError::Stalled(waited) if waited == time), "{error}");
     assert!(began.elapsed() >= time);
     // A time of its own is longer than the stall timeout.
     let waits = message(&mut client, taken, SHORT);
     node.take_all_in(Duration::from_millis(20));
-    client.send_message_within(waits, WATCHDOG).unwrap();
+    client.loaned(waits).room_within(WATCHDOG).send().unwrap();
     for number in 0..=taken {
         assert_eq!(number_of(&node, SHORT), number);
     }
@@ -185,9 +186,9 @@ fn who_waits_so_long_for_an_answer_waits_no_longer_for_room(under: Under) {
     fill(&mut client, 8);
     let time = Duration::from_millis(5);
     let lent = message(&mut client, 0, SHORT);
-    assert!(matches!(client.send_message_confirmed(lent, time), Err(ApiError::Stalled(_))));
+    assert!(matches!(client.loaned(lent).confirmed(time), Err(ApiError::Stalled(_))));
     let lent = message(&mut client, 0, SHORT);
-    assert!(matches!(client.ask_message(lent, time), Err(ApiError::Stalled(_))));
+    assert!(matches!(client.loaned(lent).ask_raw(time), Err(ApiError::Stalled(_))));
     assert!(matches!(client.resolve("anybody", time), Err(ApiError::Stalled(_))));
 }
 
@@ -198,12 +199,12 @@ fn patience_that_was_lost_once_is_not_lost_again_until_the_node_takes_something(
     let taken = fill(&mut client, SHORT);
     let began = std::time::Instant::now();
     let refused = message(&mut client, 0, SHORT);
-    assert!(matches!(client.send_message(refused), Err(ApiError::Stalled(_))));
+    assert!(matches!(client.loaned(refused).send(), Err(ApiError::Stalled(_))));
     assert!(began.elapsed() >= stall_timeout);
     // Each with a stall timeout of its own, these would take eight minutes.
     for _ in 0..1_000 {
         let refused = message(&mut client, 0, SHORT);
-        let error = client.send_message(refused).unwrap_err();
+        let error = client.loaned(refused).send().unwrap_err();
         assert!(matches!(error, ApiError::Stalled(waited) if waited == stall_timeout), "{error}");
     }
     node.take_all();
@@ -219,14 +220,14 @@ fn who_has_a_time_of_its_own_gives_nobody_a_patience_back_that_was_lost(under: U
     let mut client = register(under, &node, stall_timeout);
     fill(&mut client, SHORT);
     let refused = message(&mut client, 0, SHORT);
-    assert!(matches!(client.send_message(refused), Err(ApiError::Stalled(_))));
+    assert!(matches!(client.loaned(refused).send(), Err(ApiError::Stalled(_))));
     // Each with a stall timeout of its own, these would take eight minutes.
     let deadline = std::time::Instant::now() + 100 * stall_timeout;
     for _ in 0..1_000 {
         let refused = message(&mut client, 0, SHORT);
-        assert!(matches!(client.send_message_within(refused, NO_TIME), Err(ApiError::Stalled(_))));
+        assert!(matches!(client.loaned(refused).room_within(NO_TIME).send(), Err(ApiError::Stalled(_))));
         let refused = message(&mut client, 0, SHORT);
-        assert!(matches!(client.send_message(refused), Err(ApiError::Stalled(_))));
+        assert!(matches!(client.loaned(refused).send(), Err(ApiError::Stalled(_))));
         assert!(std::time::Instant::now() < deadline, "each waits anew");
     }
 }
@@ -250,14 +251,15 @@ fn values_and_replies_may_have_a_time_too(under: Under) {
     let register = || super::register(under, &node, super::on(under));
     let (mut asking, mut replying) = (register(), register());
     let to = replying.tid();
-    asking.send_within(to, &super::TORQUE, NO_TIME).unwrap();
+    asking.message(to, &super::TORQUE).room_within(NO_TIME).send().unwrap();
     assert_eq!(
         replying.receive(WATCHDOG).unwrap().expect("a value").decode::<super::Torque>().unwrap(),
         super::TORQUE
     );
-    let asked = thread::spawn(move || asking.ask::<_, super::Torque>(to, &super::TORQUE, WATCHDOG).unwrap());
+    let asked =
+        thread::spawn(move || asking.message(to, &super::TORQUE).ask::<super::Torque>(WATCHDOG).unwrap());
     let request = replying.receive(WATCHDOG).unwrap().expect("a request");
-    replying.reply_within(&request, &super::TORQUE, NO_TIME).unwrap();
+    replying.message(request.source(), &super::TORQUE).room_within(NO_TIME).reply_to(&request).unwrap();
     assert_eq!(asked.join().unwrap(), super::TORQUE);
 }
 
@@ -265,9 +267,9 @@ fn who_unregisters_waits_until_what_was_sent_is_out(under: Under) {
     let node = PlayedNode::start();
     let mut client = register(under, &node, WATCHDOG);
     let first = message(&mut client, 0, SHORT);
-    client.send_message(first).unwrap();
+    client.loaned(first).send().unwrap();
     let long = message(&mut client, 1, LONG);
-    let is_sent = client.send_message_within(long, NO_TIME).is_ok();
+    let is_sent = client.loaned(long).room_within(NO_TIME).send().is_ok();
     assert_eq!(is_sent, under.transport == Transport::Socket, "from a ring it is taken back");
     node.take_all_in(Duration::from_millis(20));
     client.unregister().unwrap();

@@ -62,7 +62,7 @@ impl App {
     }
 
     fn ask(&self, to: Tid, number: u64, within: Duration) -> Reply<Number> {
-        self.sender.ask(to, &Number(number), within).expect("somebody takes it")
+        self.sender.message(to, &Number(number)).ask(within).expect("somebody takes it")
     }
 
     /// The number in the next message, which ends as delivered.

@@ -65,7 +65,7 @@ fn what_two_processes_say_to_each_other_stays_where_the_list_sees_it() {
                 }
             }
         });
-        let mut send = || asker.send_confirmed(to, &Angle { degrees: 1.0 }, WATCHDOG).unwrap();
+        let mut send = || asker.message(to, &Angle { degrees: 1.0 }).confirmed(WATCHDOG).unwrap();
         // When: they have said enough for an introduction
         let said: Vec<_> = (0..ENOUGH).map(|_| send()).collect();
         // Then: another list counts for the next thing that they say

@@ -80,7 +80,7 @@ impl Gathered<'_> {
         let (node, through) = (self.nodes[at].node, self.nodes[at].through);
         let system = self.system(through);
         let within = system.within;
-        let answer = system.endpoint.ask(Tid::new(node, AppAddress::INSPECT), question, within);
+        let answer = system.endpoint.message(Tid::new(node, AppAddress::INSPECT), question).ask(within);
         answer.map_err(|error| {
             if let ApiError::Ended(Outcome::Rejected(Rejection::UnknownKind)) = error {
                 return "it runs a version of Sinew that cannot be asked this; update it".to_owned();

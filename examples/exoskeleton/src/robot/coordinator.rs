@@ -24,7 +24,7 @@ pub fn spec() -> AppSpec<Coordinator> {
 
 impl Coordinator {
     fn release(&mut self, context: &mut AppContext<Self>) {
-        let sent = match context.send_confirmed(GAIT, &Release {}, PATIENCE) {
+        let sent = match context.message(GAIT, &Release {}).confirmed(PATIENCE) {
             Ok(confirmation) => confirmation,
             Err(error) => {
                 tracing::warn!(%error, "walking cannot be released now");

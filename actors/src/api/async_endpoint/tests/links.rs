@@ -45,7 +45,7 @@ async fn send(from: &mut AsyncEndpoint, to: Tid, number: u64, length: usize) {
     let mut message = from.create_message(to, RAW, length).unwrap();
     message.set_class(Class::Bulk);
     message[..8].copy_from_slice(&number.to_le_bytes());
-    from.send_message(message).await.unwrap();
+    from.loaned(message).send().await.unwrap();
 }
 
 /// Two tasks, each with an open link with the other.
@@ -81,14 +81,14 @@ fn two_tasks_speak_directly_while_the_node_does_nothing() {
             for _ in 0..100 {
                 let request = timeout(WATCHDOG, other.receive()).await.expect("a request").unwrap();
                 let reply = other.create_message(request.source(), RAW, 8).unwrap();
-                other.reply_message(&request, reply).await.unwrap();
+                other.loaned(reply).reply_to(&request).await.unwrap();
             }
         };
         let ask = async {
             for _ in 0..100 {
                 let request = one.create_message(to, RAW, 8).unwrap();
                 assert!(request.is_in_place());
-                drop(one.ask_message(request, WATCHDOG).await.unwrap());
+                drop(one.loaned(request).ask_raw(WATCHDOG).await.unwrap());
             }
         };
         tokio::join!(echo, ask);
@@ -108,7 +108,7 @@ fn a_task_and_a_thread_have_a_link_with_each_other() {
                 return is_direct;
             }
             let reply = blocking.create_message(request.source(), RAW, 8).unwrap();
-            blocking.reply_message(&request, reply).unwrap();
+            blocking.loaned(reply).reply_to(&request).unwrap();
         }
         panic!("the last word did not come");
     });
@@ -117,7 +117,7 @@ fn a_task_and_a_thread_have_a_link_with_each_other() {
         let mut is_direct = false;
         for _ in 0..200 {
             let request = endpoint.create_message(thread_tid, RAW, 8).unwrap();
-            drop(endpoint.ask_message(request, WATCHDOG).await.unwrap());
+            drop(endpoint.loaned(request).ask_raw(WATCHDOG).await.unwrap());
             is_direct |= has_link(&endpoint.endpoint, thread_tid);
         }
         send(&mut endpoint, thread_tid, 0, 8).await;
@@ -241,9 +241,9 @@ fn the_end_of_a_peer_on_a_link_ends_what_was_asked_of_it_and_the_rest_goes_throu
         let to = other.tid();
         let asking = async {
             let message = one.create_message(to, RAW, 8).unwrap();
-            let first = one.send_message_confirmed(message, WATCHDOG).await.unwrap();
+            let first = one.loaned(message).confirmed(WATCHDOG).await.unwrap();
             let message = one.create_message(to, RAW, 8).unwrap();
-            (first, one.send_message_confirmed(message, WATCHDOG).await.unwrap())
+            (first, one.loaned(message).confirmed(WATCHDOG).await.unwrap())
         };
         let dying = async {
             // In its hand for ever, and its endpoint gone.

@@ -59,7 +59,7 @@ fn a_peer_answers_for_itself_alone() {
     let forged = Message::new(header, bytes::Bytes::from_static(&[0]));
     other.direct.open[0].writer.write(&forged).unwrap();
     let told = thread::scope(|scope| {
-        let asking = scope.spawn(|| one.send_confirmed(to, &Counted(1), WATCHDOG).unwrap());
+        let asking = scope.spawn(|| one.message(to, &Counted(1)).confirmed(WATCHDOG).unwrap());
         app.next().settle(Outcome::Failed);
         asking.join().unwrap()
     });

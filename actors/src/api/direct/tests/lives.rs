@@ -27,7 +27,7 @@ fn what_a_peer_said_before_it_went_is_received_and_then_it_has_gone() {
         assert!(Time::now() < deadline, "waited for the end of the link to be seen");
         assert!(other.receive(Duration::from_millis(1)).unwrap().is_none());
     }
-    let told = other.send_confirmed(gone, &Counted(4), WATCHDOG).unwrap();
+    let told = other.message(gone, &Counted(4)).confirmed(WATCHDOG).unwrap();
     assert!(matches!(told, Outcome::Rejected(_)), "through the node again: {told:?}");
 }
 
@@ -92,7 +92,7 @@ fn a_message_in_the_hand_of_a_peer_that_goes_is_unknown_while_its_process_lives(
     let (mut one, mut other) = (endpoint(&node), endpoint(&node));
     link(&mut one, &mut other);
     let to = other.tid();
-    let sending = thread::spawn(move || one.send_confirmed(to, &Counted(1), WATCHDOG).unwrap());
+    let sending = thread::spawn(move || one.message(to, &Counted(1)).confirmed(WATCHDOG).unwrap());
     let in_hand = other.receive(WATCHDOG).unwrap().expect("a message");
     drop(other);
     assert_eq!(sending.join().unwrap(), Outcome::Unknown, "who has it may handle it yet");
@@ -116,7 +116,7 @@ fn of_a_peer_whose_process_has_ended_what_it_had_taken_has_failed_and_what_it_ha
         let gone = Gone { peer: to.bits(), number: one.direct.open[0].number.0 };
         let taken = one.direct.open[0].taken();
         let sending = thread::spawn(move || {
-            let told = one.send_confirmed(to, &Counted(1), WATCHDOG).unwrap();
+            let told = one.message(to, &Counted(1)).confirmed(WATCHDOG).unwrap();
             (told, one)
         });
         let in_hand = is_taken.then(|| other.receive(WATCHDOG).unwrap().expect("a message"));
@@ -149,7 +149,7 @@ fn the_outcome_of_a_former_lifes_message_is_not_taken_for_one_of_this_life() {
     former.unregister().unwrap();
     // when
     let (mut next, to) = (register(&node, wanted()), other.tid());
-    let asking = thread::spawn(move || next.send_confirmed(to, &Hurried(2), WATCHDOG).unwrap());
+    let asking = thread::spawn(move || next.message(to, &Hurried(2)).confirmed(WATCHDOG).unwrap());
     let deadline = Time::now() + WATCHDOG;
     let mut held = Vec::new();
     while held.len() < 2 {

@@ -144,7 +144,7 @@ fn a_long_message_goes_in_pieces_through_a_short_ring() {
     let sending = thread::spawn(move || {
         let mut buffer = one.create_message(to, kind, 100_000).unwrap();
         buffer.fill(7);
-        one.send_message(buffer).unwrap();
+        one.loaned(buffer).send().unwrap();
         one
     });
     let received = other.receive(WATCHDOG).unwrap().expect("a message");
@@ -164,7 +164,7 @@ fn two_that_wait_for_room_in_each_others_rings_take_in_what_is_there_meanwhile()
     let exchange = |endpoint: &mut Endpoint, to| {
         for _ in 0..20 {
             let long = endpoint.create_message(to, Kind::named("test.long"), 20_000).unwrap();
-            endpoint.send_message(long).unwrap();
+            endpoint.loaned(long).send().unwrap();
         }
         for _ in 0..20 {
             assert_eq!(endpoint.receive(WATCHDOG).unwrap().expect("a message").bytes().len(), 20_000);
@@ -181,7 +181,7 @@ fn two_that_wait_for_room_in_each_others_rings_take_in_what_is_there_meanwhile()
 fn send_long(from: &mut Endpoint, to: Tid, length: usize) -> Result<(), ApiError> {
     let mut long = from.create_message(to, Kind::named("test.long"), length).unwrap();
     long.fill(7);
-    from.send_message(long)
+    from.loaned(long).send()
 }
 
 #[test]

@@ -140,7 +140,7 @@ impl Operator {
 
     fn press<P: Payload>(&mut self, name: &str, word: &P) -> Result<Outcome, OperatorError> {
         let tid = self.whoever_is(name)?;
-        self.endpoint.send_confirmed(tid, word, PATIENCE).map_err(lost)
+        self.endpoint.message(tid, word).confirmed(PATIENCE).map_err(lost)
     }
 
     fn whoever_is(&mut self, name: &str) -> Result<Tid, OperatorError> {

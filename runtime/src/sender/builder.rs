@@ -1,0 +1,177 @@
+//! One builder for all messages that an application of a node's process sends.
+
+use std::{fmt, time::Duration};
+
+use super::{
+    Confirmation, Destination, Reply, SendError, Sender,
+    awaiting::{Deadline, Request},
+};
+use crate::{
+    outcome::{Rejection, Ticket},
+    pending::Awaited,
+    wire::{Class, Flags, Message, MessageBuffer, Payload},
+};
+
+/// A message to be sent: made by [`Sender::message`], [`AppContext::message`](crate::app::AppContext::message) or [`Sender::loaned`].
+///
+/// What it does not say is as its type says. It is sent by [`send`](Self::send), [`confirmed`](Self::confirmed) or [`ask`](Self::ask), and not before.
+///
+/// ```
+/// # use std::time::Duration;
+/// # use sinew_runtime::{sender::{SendError, Sender}, tid::Tid, wire::Payload};
+/// # fn steer<P: Payload>(sender: &Sender, drive: Tid, setpoint: &P) -> Result<(), SendError> {
+/// sender.message(drive, setpoint).expires_after(Duration::from_millis(20)).send()
+/// # }
+/// ```
+#[must_use = "a message is sent by `send`, `confirmed` or `ask`"]
+pub struct MessageBuilder<V, C> {
+    pub(crate) via: V,
+    pub(crate) content: C,
+    pub(crate) terms: Terms,
+}
+
+/// What one call says of its message, beside what its type says.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Terms {
+    class: Option<Class>,
+    expires_after: Option<Duration>,
+}
+
+/// A value and its destination.
+#[derive(Debug)]
+pub struct Value<'a, P> {
+    pub(crate) destination: Destination<'a>,
+    pub(crate) value: &'a P,
+}
+
+/// What sends: a [`Sender`], or the context of an application.
+pub trait Via {
+    /// The sending side.
+    fn sender(&self) -> &Sender;
+}
+
+impl Via for &Sender {
+    fn sender(&self) -> &Sender {
+        self
+    }
+}
+
+/// What is sent: a [`Value`], or a [`MessageBuffer`].
+pub trait Content {
+    /// The message from `sender`.
+    ///
+    /// # Errors
+    /// The destination is not known, or the payload cannot be sealed.
+    fn into_message(self, sender: &Sender) -> Result<Message, SendError>;
+}
+
+impl<P: Payload> Content for Value<'_, P> {
+    fn into_message(self, sender: &Sender) -> Result<Message, SendError> {
+        sender.typed(self.destination, self.value)
+    }
+}
+
+impl Content for MessageBuffer {
+    fn into_message(self, _: &Sender) -> Result<Message, SendError> {
+        Ok(self.freeze())
+    }
+}
+
+impl<V, C> fmt::Debug for MessageBuilder<V, C> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "MessageBuilder({:?})", self.terms)
+    }
+}
+
+impl<V, C> MessageBuilder<V, C> {
+    pub(crate) const fn new(via: V, content: C) -> Self {
+        Self { via, content, terms: Terms { class: None, expires_after: None } }
+    }
+
+    /// The class in which it travels, instead of its type's.
+    pub const fn class(mut self, class: Class) -> Self {
+        self.terms.class = Some(class);
+        self
+    }
+
+    /// Has it expire where it waits when it is older than this, instead of its type's [`TIME_TO_LIVE`](Payload::TIME_TO_LIVE). At most
+    /// [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s: a longer time counts as that.
+    pub const fn expires_after(mut self, time: Duration) -> Self {
+        self.terms.expires_after = Some(time);
+        self
+    }
+}
+
+impl Terms {
+    fn apply(self, message: &mut Message) {
+        if let Some(class) = self.class {
+            message.header.class = class;
+        }
+        if let Some(time) = self.expires_after {
+            // An unconfirmed message is not waited for.
+            let _ = message.header.set_time_to_live(time);
+        }
+    }
+}
+
+impl<V: Via, C: Content> MessageBuilder<V, C> {
+    fn message(self) -> Result<(V, Message), SendError> {
+        let Self { via, content, terms } = self;
+        let mut message = content.into_message(via.sender())?;
+        terms.apply(&mut message);
+        Ok((via, message))
+    }
+
+    /// Sends it, and does not ask what becomes of it. Returns when a queue or a socket has taken it.
+    ///
+    /// # Errors
+    /// No queue and no socket took it.
+    pub fn send(self) -> Result<(), SendError> {
+        let (via, message) = self.message()?;
+        via.sender().dispatch(message).map(drop)
+    }
+
+    pub(crate) fn confirm(self, within: Duration) -> Result<(V, Confirmation), SendError> {
+        let (via, mut message) = self.message()?;
+        if message.header.class == Class::Stream {
+            // Newest wins, so an older one has no fate of its own.
+            return Err(Rejection::Unsupported.into());
+        }
+        let sender = via.sender();
+        let (wait, within) = sender.expect_answer(&mut message, Awaited::Outcome, within)?;
+        let sent = sender.dispatch(message)?;
+        Ok((via, Confirmation::new(Deadline::new(wait, sent + within))))
+    }
+
+    /// Sends it as a request, in class Control; the returned future ends with the reply, an error, or at the deadline. A longer `within` than
+    /// [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s, counts as that.
+    ///
+    /// # Errors
+    /// No queue and no socket took it. The future's own errors are [`AskError`](super::AskError)s.
+    pub fn ask<R: Payload>(self, within: Duration) -> Result<Reply<R>, SendError> {
+        const { assert!(R::PROTECTION.is_none(), "a protected payload is sent, not asked for") };
+        let (via, mut message) = self.message()?;
+        let sender = via.sender();
+        message.header.class = Class::Control;
+        message.header.flags = Flags::ASK;
+        let (wait, within) = sender.expect_answer(&mut message, Awaited::Reply, within)?;
+        let destination = sender.absolute(message.header.destination);
+        let ticket = Ticket { source: sender.tid(), destination, correlation: wait.correlation() };
+        let sent = sender.dispatch(message)?;
+        let request = Request { router: sender.shared.router.clone(), ticket };
+        Ok(Reply::new(Deadline::new(wait, sent + within), within, request))
+    }
+}
+
+impl<C: Content> MessageBuilder<&Sender, C> {
+    /// Sends it, and asks what becomes of it: the returned future ends in exactly one [`Outcome`](crate::outcome::Outcome). The message
+    /// expires where it waits once it is older than `within`. The future ends as [`Outcome::Unknown`](crate::outcome::Outcome::Unknown) when
+    /// no outcome has come by then, whenever it is polled first. No message lives longer than
+    /// [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s: a longer `within` counts as that.
+    ///
+    /// # Errors
+    /// No queue and no socket took it, or it is of class Stream.
+    pub fn confirmed(self, within: Duration) -> Result<Confirmation, SendError> {
+        self.confirm(within).map(|(_, confirmation)| confirmation)
+    }
+}
