@@ -50,7 +50,7 @@ pub(super) fn host(config: &NodeConfig, apps: Vec<DynApp>, hosting: Hosting) -> 
     let Some(app) = apps.into_iter().find(|app| app.name() == name) else {
         // Where nobody reads it the exit code is all there is.
         let _ = writeln!(
-            std::io::stderr(),
+            io::stderr(),
             "this program, started again to host '{name}', declared no such application of node {}",
             config.name
         );

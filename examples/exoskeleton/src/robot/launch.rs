@@ -263,7 +263,9 @@ struct Launch<'a> {
 impl<'a> Launch<'a> {
     fn new(options: &'a LaunchOptions, topology: &Topology, folder: &Path) -> Result<Self, LaunchError> {
         let file = folder.join("topology.toml");
-        std::fs::write(&file, topology.to_toml())?;
+        std::fs::write(&file, topology.to_toml()).map_err(|error| {
+            io::Error::new(error.kind(), format!("cannot write {}: {error}", file.display()))
+        })?;
         let (say_line, lines) = sync_channel(LINES_MAX);
         let now = Time::now();
         Ok(Self {
