@@ -3,7 +3,11 @@
 //! The sensor waits until the drive is there, sends it ten angles, and is told of each what became of it. The node is
 //! `sinew-node`, or any node whose `lncl.socket` is the path that is given as the second word.
 
-use std::time::Duration;
+use std::{
+    io::{self, Write as _},
+    process::ExitCode,
+    time::Duration,
+};
 
 use sinew::{ApiError, NodeApi, Registration, payload};
 
@@ -11,7 +15,27 @@ payload!("demo.joint_angle" => struct JointAngle { degrees: f32 });
 
 const SECOND: Duration = Duration::from_secs(1);
 
-fn main() -> Result<(), ApiError> {
+fn main() -> ExitCode {
+    let Err(error) = run() else { return ExitCode::SUCCESS };
+    // A reader that closes its pipe, as `head` does, is no error.
+    if matches!(&error, Error::Output(error) if error.kind() == io::ErrorKind::BrokenPipe) {
+        return ExitCode::SUCCESS;
+    }
+    // Nothing can be done where standard error takes nothing either.
+    let _ = writeln!(io::stderr(), "knee: {error}");
+    ExitCode::FAILURE
+}
+
+/// Why the program ends early.
+#[derive(Debug, thiserror::Error)]
+enum Error {
+    #[error(transparent)]
+    Api(#[from] ApiError),
+    #[error("standard output takes nothing: {0}")]
+    Output(#[from] io::Error),
+}
+
+fn run() -> Result<(), Error> {
     let words: Vec<String> = std::env::args().collect();
     let role = words.get(1).map_or("sensor", String::as_str);
     let path = words.get(2).map_or("/tmp/sinew-knee.sock", String::as_str);
@@ -19,23 +43,23 @@ fn main() -> Result<(), ApiError> {
     if role == "drive" { drive(&node) } else { sensor(&node) }
 }
 
-fn drive(node: &NodeApi) -> Result<(), ApiError> {
+fn drive(node: &NodeApi) -> Result<(), Error> {
     let mut drive = node.register_transport_address(Registration::new().name("knee.drive"))?;
     while let Some(message) = drive.receive(10 * SECOND)? {
         let angle: JointAngle = message.decode()?;
-        println!("{} is at {} degrees", message.source(), angle.degrees);
+        writeln!(io::stdout(), "{} is at {} degrees", message.source(), angle.degrees)?;
     }
     Ok(())
 }
 
-fn sensor(node: &NodeApi) -> Result<(), ApiError> {
+fn sensor(node: &NodeApi) -> Result<(), Error> {
     let registration = Registration::new().requires(["knee.drive"]);
     let mut sensor = node.register_transport_address(registration)?;
     let drive = sensor.resolve("knee.drive", SECOND)?.expect("it is ready: it was required");
     for number in 0..10_u8 {
         let angle = JointAngle { degrees: f32::from(number) };
         let outcome = sensor.message(drive, &angle).confirmed(SECOND)?;
-        println!("{} degrees: {outcome:?}", angle.degrees);
+        writeln!(io::stdout(), "{} degrees: {outcome:?}", angle.degrees)?;
     }
     Ok(())
 }

@@ -133,6 +133,7 @@ Exit codes:
      was not delivered, nobody is called so; a list cannot be used; keys cannot be made, or count for less than another 30 days
   2  the command line is wrong
   3  no node lets this command in, or that node does not answer
+  4  all is fine, but standard output did not take all of it (a full disk); a reader that closes its pipe, as `head`, is no error
 
 Examples:
   sinew nodes

@@ -4,6 +4,8 @@
 //! messages. It changes nothing, but for what `send` sends and the access
 //! list that `reload` has a node read again. `keys` asks no node: it makes the files by which nodes know each other.
 
+#![warn(clippy::print_stdout, clippy::print_stderr)] // `output` prints: the macros panic where a pipe is closed or a disk is full.
+
 mod apps;
 mod arguments;
 mod audit;
@@ -12,6 +14,7 @@ mod door;
 mod keys;
 mod messagepack;
 mod nodes;
+mod output;
 mod ping;
 mod reload;
 mod security;
@@ -35,6 +38,8 @@ const FINDING: u8 = 1;
 const USAGE: u8 = 2;
 /// Exit code where no node lets us in, or the one that does gives no answer.
 const NOBODY: u8 = 3;
+/// Exit code where all is fine, but standard output did not take all of it.
+const NOT_WRITTEN: u8 = 4;
 
 /// What a command has to say.
 struct Said {
@@ -55,38 +60,37 @@ fn main() -> ExitCode {
         Ok(said) => {
             let json = || if said.json.is_null() { String::new() } else { format!("{:#}\n", said.json) };
             let text = if arguments.json { json() } else { said.text };
-            // A reader that has seen enough, as `head`, is no fault.
-            let _ = std::io::Write::write_all(&mut std::io::stdout(), text.as_bytes());
-            ExitCode::from(if said.is_fine { FINE } else { FINDING })
+            output::print(&text);
+            output::exit_code(if said.is_fine { FINE } else { FINDING })
         }
         Err(error) => {
-            eprintln!("sinew: {error}");
+            output::note(format_args!("sinew: {error}"));
             if arguments.json {
                 print_fault(&error.to_string());
             }
-            ExitCode::from(error.code())
+            output::exit_code(error.code())
         }
     }
 }
 
 /// For programs, beside the words for people.
 fn print_fault(why: &str) {
-    let text = format!("{:#}\n", serde_json::json!({ "fault": why }));
-    // Nobody may read any more.
-    let _ = std::io::Write::write_all(&mut std::io::stdout(), text.as_bytes());
+    output::line(&format!("{:#}", serde_json::json!({ "fault": why })));
 }
 
 /// A wrong command line, or one that asks for help or the version.
 fn refused(error: &clap::Error) -> ExitCode {
-    let _ = error.print();
+    let printed = error.print();
     if !error.use_stderr() {
-        return ExitCode::from(FINE);
+        // Help and version go to standard output.
+        output::keep(printed);
+        return output::exit_code(FINE);
     }
     if ask_for_json(std::env::args_os().skip(1)) {
         let why = error.render().to_string();
         print_fault(why.strip_prefix("error: ").unwrap_or(&why).trim_end());
     }
-    ExitCode::from(USAGE)
+    output::exit_code(USAGE)
 }
 
 /// Whether a command line that cannot be read asks for JSON. What stands behind `--` is no option.

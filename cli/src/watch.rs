@@ -5,7 +5,6 @@ mod rates;
 
 use std::{
     collections::BTreeMap,
-    io::Write as _,
     time::{Duration, Instant},
 };
 
@@ -17,7 +16,7 @@ use sinew::{
 };
 
 use crate::{
-    Said, messagepack,
+    Said, messagepack, output,
     system::{Answer, Fault, System, in_words},
     table::{clean, time},
 };
@@ -124,7 +123,7 @@ fn follow(system: &mut System, whom: &str, question: &mut AskWatch) {
         && tid != question.app
     {
         question.app = tid;
-        eprintln!("{} is {tid} now", clean(whom));
+        output::note(format_args!("{} is {tid} now", clean(whom)));
     }
 }
 
@@ -214,9 +213,9 @@ impl Screen {
     fn heading(&self, whom: &str, app: Tid) {
         if !self.is_json {
             let whom = clean(whom);
-            eprintln!(
+            output::note(format_args!(
                 "{whom} ({app}): what it gets (->) and sends (<-); Ctrl-C ends it. Not seen: direct links between processes"
-            );
+            ));
         }
     }
 
@@ -225,7 +224,7 @@ impl Screen {
             return true;
         }
         if self.is_json {
-            return say(&self.message_json(message).to_string());
+            return output::line(&self.message_json(message).to_string());
         }
         let seen = began.elapsed().saturating_sub(Duration::from_micros(message.seen_us));
         let (arrow, other) = if message.is_sent { ("<-", message.target) } else { ("->", message.source) };
@@ -241,7 +240,7 @@ impl Screen {
             age(message),
             payload(message),
         );
-        say(&clean(&line))
+        output::line(&clean(&line))
     }
 
     fn message_json(&self, message: &SeenMessage) -> Value {
@@ -259,7 +258,11 @@ impl Screen {
     }
 
     fn rates(&self, rates: &rates::Rated) -> bool {
-        if self.is_json { say(&rates.json().to_string()) } else { say(&clean_lines(&rates.text())) }
+        if self.is_json {
+            output::line(&rates.json().to_string())
+        } else {
+            output::line(&clean_lines(&rates.text()))
+        }
     }
 }
 
@@ -295,11 +298,6 @@ fn value(payload: &[u8]) -> (Option<u64>, Value) {
 
 fn clean_lines(text: &str) -> String {
     text.lines().map(clean).collect::<Vec<_>>().join("\n")
-}
-
-/// Whether somebody still reads it.
-fn say(line: &str) -> bool {
-    writeln!(std::io::stdout(), "{line}").is_ok()
 }
 
 #[cfg(test)]

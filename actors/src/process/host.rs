@@ -2,7 +2,7 @@
 
 use std::{
     future::poll_fn,
-    io::{self, Read},
+    io::{self, Read, Write as _},
     os::unix::net::UnixStream as StdStream,
     sync::{
         Arc, OnceLock,
@@ -48,7 +48,9 @@ const STALLS_LOOKED_FOR: Duration = Duration::from_millis(125);
 pub(super) fn host(config: &NodeConfig, apps: Vec<DynApp>, hosting: Hosting) -> ! {
     let Hosting { app: name, socket } = hosting;
     let Some(app) = apps.into_iter().find(|app| app.name() == name) else {
-        eprintln!(
+        // Where nobody reads it the exit code is all there is.
+        let _ = writeln!(
+            io::stderr(),
             "this program, started again to host '{name}', declared no such application of node {}",
             config.name
         );

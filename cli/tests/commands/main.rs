@@ -2,6 +2,7 @@
 
 mod access;
 mod keys;
+mod output;
 mod scenario;
 mod secured;
 mod send;

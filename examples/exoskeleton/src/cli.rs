@@ -12,6 +12,7 @@ use clap::{Parser, Subcommand};
 use exoskeleton::gait::trial::TrialError;
 use exoskeleton::lockstep::LockStepError;
 use exoskeleton::part::Kill;
+use exoskeleton::report;
 use exoskeleton::robot::launch::LaunchError;
 use exoskeleton::robot::launch::faults::FaultError;
 use exoskeleton::robot::node::NodeError;
@@ -19,7 +20,7 @@ use thiserror::Error;
 
 /// A powered leg of four nodes and a simulated person.
 #[derive(Debug, Parser)]
-#[command(version, args_conflicts_with_subcommands = true)]
+#[command(version, args_conflicts_with_subcommands = true, after_help = EXIT_CODES)]
 pub(crate) struct Arguments {
     /// One part alone, or the robot under faults, instead of a walk of the whole robot on this host.
     #[command(subcommand)]
@@ -67,15 +68,34 @@ enum SubCommand {
     Faults(faults::FaultArguments),
 }
 
+const EXIT_CODES: &str = "\
+Exit codes:
+  0  all limits held
+  1  it did not walk, or a result could not be written; the error says why
+  2  the command line is wrong
+  3  it walked, and a limit did not hold (FAILED); the table says which
+  4  it walked, but other load on this host disturbed too many strides to judge them (INCONCLUSIVE); use an idle host, more strides,
+     or --lock-step, which needs no real time";
+
 /// How a run ended.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Verdict {
-    /// All limits held.
-    LimitsHeld,
-    /// At least one limit did not hold.
-    LimitBroken,
+    /// A robot walked.
+    Walked(report::Verdict),
     /// One part ran alone and has ended.
     NodeEnded(ExitCode),
+}
+
+impl Verdict {
+    /// The exit code; [`EXIT_CODES`] describes them.
+    pub(crate) fn code(self) -> ExitCode {
+        match self {
+            Self::Walked(report::Verdict::Passed) => ExitCode::SUCCESS,
+            Self::Walked(report::Verdict::Failed) => ExitCode::from(3),
+            Self::Walked(report::Verdict::Inconclusive) => ExitCode::from(4),
+            Self::NodeEnded(code) => code,
+        }
+    }
 }
 
 /// Why there was no run.
@@ -108,6 +128,9 @@ pub(crate) enum RunError {
     /// A result could not be written.
     #[error("{0}")]
     Write(#[from] std::io::Error),
+    /// The robot walked, and its record could not be written.
+    #[error("the record of this walk is incomplete: {0}")]
+    Record(String),
     /// The robot did not walk in real time.
     #[error(transparent)]
     Launch(#[from] LaunchError),

@@ -102,6 +102,15 @@ impl Intention {
         Self { onset_s: 0.0, ..self }
     }
 
+    /// What was left out or bridged in the recorded trial, a sentence each.
+    #[must_use]
+    pub fn notes(&self) -> &[String] {
+        match &self.source {
+            Source::Curves(_) => &[],
+            Source::Trial { trial, .. } => trial.notes(),
+        }
+    }
+
     /// Checks that `wanted` strides can be walked.
     ///
     /// # Errors

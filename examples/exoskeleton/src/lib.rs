@@ -6,6 +6,8 @@
 //!
 //! It is a simulation and claims nothing clinical; the software e-stop is not a safety function.
 
+#![warn(clippy::print_stdout, clippy::print_stderr)] // `output` prints: the macros panic where a pipe is closed or a disk is full.
+
 pub mod central;
 pub mod chance;
 pub mod control;
@@ -16,6 +18,7 @@ pub mod leg;
 pub mod lockstep;
 pub mod message;
 pub mod metrics;
+pub mod output;
 pub mod part;
 pub mod phase;
 pub mod plant;

@@ -2,7 +2,9 @@
 //!
 //! Strides 1 to 6 are for the estimator to settle; figures count from stride 7 on. In a run with a fault they pause
 //! from the fault until two whole strides after assistance has come back. Strides in which the host of a real-time run
-//! stood still count like all others; what the figures were without them is asked for by [`Metrics::without_stalls`].
+//! stalled are in [`Metrics::of`] and not in [`Metrics::without_stalls`].
+
+use std::collections::BTreeSet;
 
 use crate::gait::curves;
 use crate::joint::{Joint, PerJoint};
@@ -73,7 +75,7 @@ impl Metrics {
         Self::leaving_out(record, &[])
     }
 
-    /// What the figures were without the strides around stalls of the host: for an explanation, not for a judgement.
+    /// Computes all figures without the strides around stalls of the host.
     #[must_use]
     pub fn without_stalls(record: &Record) -> Self {
         Self::leaving_out(record, &record.stalls)
@@ -150,6 +152,17 @@ impl Counting {
         let paused =
             self.pauses.iter().any(|(from_s, stride)| row.t_s >= *from_s && row.strides_true < *stride);
         row.walking && row.strides_true >= FIRST_STRIDE_COUNTED && !paused
+    }
+
+    /// The strides that a stall of the host keeps from counting, the first stride being 1.
+    #[must_use]
+    pub fn disturbed(record: &Record) -> Vec<u32> {
+        let fault = record.outage.map(|outage| fault_figures(record, outage));
+        let [all, undisturbed] =
+            [&[][..], &record.stalls].map(|stalls| Self::with(record, fault.as_ref(), stalls));
+        let is_disturbed = |row: &&Row| all.counts(row) && !undisturbed.counts(row);
+        let strides = record.rows.iter().filter(is_disturbed).map(|row| row.strides_true as u32 + 1);
+        strides.filter(|stride| *stride <= record.strides).collect::<BTreeSet<u32>>().into_iter().collect()
     }
 
     fn with(record: &Record, fault: Option<&FaultFigures>, stalls: &[Stall]) -> Self {

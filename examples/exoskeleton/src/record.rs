@@ -59,7 +59,7 @@ pub struct Outage {
     pub to_s: Option<f64>,
 }
 
-/// A time in which the host stood still and the leg did not; only in real time.
+/// A time in which the host did not run a thread that only sleeps, by no fault of the robot; only in real time.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct Stall {
     /// From when, seconds of the run.
@@ -81,7 +81,7 @@ pub struct Record {
     pub released_s: Option<f64>,
     /// A node that was killed on purpose.
     pub outage: Option<Outage>,
-    /// Times in which the host stood still.
+    /// Stalls of the host.
     pub stalls: Vec<Stall>,
     /// Rows at 1 kHz, rising in time.
     pub rows: Vec<Row>,

@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use crate::joint::PerJoint;
 use crate::metrics::Metrics;
+use crate::record::{Record, Stall};
 pub use limits::LimitCheck;
 pub use table::table;
 
@@ -19,6 +20,65 @@ pub enum RunMode {
     /// Wall-clock time over processes.
     RealTime,
 }
+
+/// How a run ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Verdict {
+    /// All limits held.
+    Passed,
+    /// A limit did not hold.
+    Failed,
+    /// The host disturbed the run where a limit did not hold: it cannot be judged.
+    Inconclusive,
+}
+
+/// What other load on the host did to a run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Disturbance<'a> {
+    /// Figures of the strides that the host did not disturb.
+    undisturbed: &'a Metrics,
+    /// Stalls of the host.
+    stalls: &'a [Stall],
+    /// Whether too few strides are left to be judged.
+    too_few: bool,
+    /// Whether it stalled while the drives became ready.
+    at_start: bool,
+    /// Whether it stalled between the death of a node and the return of assistance.
+    at_fault: bool,
+}
+
+impl<'a> Disturbance<'a> {
+    /// Of a run with these figures, with and without the strides that the host disturbed.
+    #[must_use]
+    pub fn of(record: &'a Record, all: &Metrics, undisturbed: &'a Metrics) -> Self {
+        let hits = |from_s: f64, to_s: f64| {
+            record.stalls.iter().any(|stall| stall.from_s <= to_s && stall.to_s >= from_s)
+        };
+        let ready = record.ready_s.iter().flatten().copied();
+        let (first_s, last_s) = (ready.clone().fold(f64::INFINITY, f64::min), ready.fold(0.0, f64::max));
+        let needed = (UNDISTURBED_SHARE_MIN * all.strides_counted).max(UNDISTURBED_MIN);
+        let is_less = undisturbed.strides_counted + ROUNDING < all.strides_counted;
+        Self {
+            undisturbed,
+            stalls: &record.stalls,
+            too_few: is_less && undisturbed.strides_counted < needed,
+            at_start: hits(first_s, last_s),
+            at_fault: all.fault.as_ref().is_some_and(|fault| {
+                let back_s =
+                    fault.outage.to_s.zip(fault.resumed_after_s).map(|(to_s, after_s)| to_s + after_s);
+                hits(fault.outage.from_s, back_s.unwrap_or(f64::INFINITY))
+            }),
+        }
+    }
+}
+
+/// Share of the strides that has to be left for a judgement.
+const UNDISTURBED_SHARE_MIN: f64 = 1.0 / 3.0;
+/// Strides that have to be left for a judgement. A stride lacks its last millisecond.
+const UNDISTURBED_MIN: f64 = 0.99;
+/// Differences of sums of floating-point numbers, strides.
+const ROUNDING: f64 = 1e-6;
 
 /// What was run.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -57,6 +117,12 @@ pub struct MeasuredTiming {
     pub age_us: PercentilesUs,
     /// Ticks that came more than two milliseconds late.
     pub deadline_misses: u64,
+    /// Ticks.
+    pub ticks: u64,
+    /// Wakes of the witness that came more than two milliseconds late.
+    pub witness_misses: u64,
+    /// Wakes of the witness.
+    pub witness_wakes: u64,
 }
 
 /// A value per joint by name.
@@ -139,14 +205,26 @@ pub struct Report {
     pub period_us: Option<PercentilesUs>,
     /// Age of the gait state at its use; `null` when not measured.
     pub age_us: Option<PercentilesUs>,
-    /// Late ticks; `null` when not measured.
+    /// Ticks of the drives more than 2 ms late; `null` when not measured.
     pub deadline_misses: Option<u64>,
+    /// Ticks of the drives; `null` when not measured.
+    pub ticks: Option<u64>,
+    /// Wakes of the witness, which only sleeps, more than 2 ms late; `null` when not measured.
+    pub witness_misses: Option<u64>,
+    /// Wakes of the witness; `null` when not measured.
+    pub witness_wakes: Option<u64>,
+    /// Strides that the limits were judged on: those that the host did not disturb, or all where too few are left.
+    pub strides_judged: f64,
+    /// Stalls of the host, seconds of the run.
+    pub stalls: Vec<Stall>,
     /// The barrier.
     pub barrier: Barrier,
     /// The fault, if one was injected.
     pub fault: Option<FaultReport>,
     /// Each limit with what was expected and what was seen.
     pub limits: Vec<LimitCheck>,
+    /// How the run ended.
+    pub verdict: Verdict,
     /// Whether every limit held.
     pub passed: bool,
 }
@@ -161,7 +239,28 @@ impl Report {
     /// The report on a run; `timing` only from a real-time run.
     #[must_use]
     pub fn of(run: &RunDescription, metrics: &Metrics, timing: Option<&MeasuredTiming>) -> Self {
-        let limits = limits::check(metrics, run);
+        let undisturbed = Disturbance {
+            undisturbed: metrics,
+            stalls: &[],
+            too_few: false,
+            at_start: false,
+            at_fault: false,
+        };
+        Self::of_disturbed(run, metrics, timing, &undisturbed)
+    }
+
+    /// The report on a run whose host may have disturbed it. Figures are those of all strides; limits on strides are judged on
+    /// undisturbed ones.
+    #[must_use]
+    pub fn of_disturbed(
+        run: &RunDescription,
+        metrics: &Metrics,
+        timing: Option<&MeasuredTiming>,
+        disturbance: &Disturbance<'_>,
+    ) -> Self {
+        let judged = if disturbance.too_few { metrics } else { disturbance.undisturbed };
+        let limits = limits::check(metrics, judged, disturbance, run);
+        let verdict = limits::verdict(&limits);
         Self {
             mode: run.mode,
             strides: run.strides,
@@ -183,13 +282,19 @@ impl Report {
             period_us: timing.map(|t| t.period_us),
             age_us: timing.map(|t| t.age_us),
             deadline_misses: timing.map(|t| t.deadline_misses),
+            ticks: timing.map(|t| t.ticks),
+            witness_misses: timing.map(|t| t.witness_misses),
+            witness_wakes: timing.map(|t| t.witness_wakes),
+            strides_judged: judged.strides_counted,
+            stalls: disturbance.stalls.to_vec(),
             barrier: Barrier {
                 held_s: metrics.barrier_held_s,
                 ready_skew_ms: metrics.ready_skew_ms,
                 torque_before_release_nm: metrics.torque_before_release_nm,
             },
             fault: metrics.fault.as_ref().map(FaultReport::of),
-            passed: limits.iter().all(|limit| limit.held),
+            verdict,
+            passed: verdict == Verdict::Passed,
             limits,
         }
     }

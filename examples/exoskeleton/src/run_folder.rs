@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use crate::plot::{Figure, Lateness, figure};
 use crate::record::Record;
-use crate::report::{Report, RunMode};
+use crate::report::{Report, RunMode, Verdict};
 
 /// Writes the three files into `folder`, which is made if needed; returns the folder.
 ///
@@ -19,14 +19,19 @@ pub fn write(
     lateness: Option<&Lateness>,
 ) -> io::Result<PathBuf> {
     fs::create_dir_all(folder).map_err(|e| at(folder, &e))?;
-    write_report(&folder.join("report.json"), report)?;
     let csv = folder.join("run.csv");
-    let file = fs::File::create(&csv).map_err(|e| at(&csv, &e))?;
-    record.write_csv(BufWriter::new(file)).map_err(|e| at(&csv, &e))?;
     let svg = folder.join("gait.svg");
     let (title, caption) = (title(report), caption(report));
     let text = figure(&Figure { record, title: &title, caption: &caption, lateness });
-    fs::write(&svg, text).map_err(|e| at(&svg, &e))?;
+    let written = [
+        write_report(&folder.join("report.json"), report),
+        fs::File::create(&csv)
+            .and_then(|file| record.write_csv(BufWriter::new(file)))
+            .map_err(|e| at(&csv, &e)),
+        fs::write(&svg, text).map_err(|e| at(&svg, &e)),
+    ];
+    // Each is tried: one that is too large for what is left of a disk takes no other away.
+    written.into_iter().collect::<io::Result<()>>()?;
     Ok(folder.to_owned())
 }
 
@@ -72,7 +77,11 @@ fn caption(report: &Report) -> String {
         rms.ankle,
         report.phase_rms_percent,
         work.hip + work.knee + work.ankle,
-        if report.passed { "held" } else { "NOT held" }
+        match report.verdict {
+            Verdict::Passed => "held",
+            Verdict::Failed => "NOT held",
+            Verdict::Inconclusive => "not judged: the host stalled",
+        }
     )
 }
 

@@ -218,6 +218,7 @@ fn joint_node(host: u8, device: &Device, will: &Arc<Will>) -> (NodeBuilder, Reco
         trace: rows.trace(),
         events: events.trace(),
         figures: None,
+        burden: None,
     };
     let gait = AppSpec::new(GAIT, move || Gait { will: of_will.clone(), seq: 0 }).handles::<Shut>();
     let node = Node::builder("ankle")

@@ -342,7 +342,11 @@ impl Namespace {
 impl Drop for Namespace {
     fn drop(&mut self) {
         if let Err(error) = run("ip", &["netns", "del", &self.0]) {
-            eprintln!("the namespace {} stays: {error}", self.0);
+            // Nothing can be done where nobody reads it.
+            let _ = std::io::Write::write_fmt(
+                &mut std::io::stderr(),
+                format_args!("the namespace {} stays: {error}\n", self.0),
+            );
         }
     }
 }

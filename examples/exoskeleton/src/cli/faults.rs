@@ -4,6 +4,8 @@ use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
 
+use exoskeleton::output;
+use exoskeleton::report;
 use exoskeleton::robot::launch::faults::{self, ContrastRun, FaultOptions, FaultReport, Step};
 
 use super::{RunError, Verdict};
@@ -79,15 +81,24 @@ impl FromStr for Item {
 /// Runs, prints the table, writes the report.
 pub(super) fn run(arguments: &FaultArguments) -> Result<Verdict, RunError> {
     let report = faults::run(&options(arguments)?)?;
-    print!("{}", faults::table(&report.claims));
+    output::print(&faults::table(&report.claims));
     let json = serde_json::to_string_pretty(&serde_json::json!({ "faults": report }))
-        .map_err(std::io::Error::other)?;
-    for path in arguments.report.iter().chain([&report.folder.join("report.json")]) {
-        std::fs::write(path, json.clone() + "\n").map_err(|e| super::at(path, &e))?;
+        .map_err(std::io::Error::other)?
+        + "\n";
+    output::print(&words(&report));
+    let in_folder = report.folder.join("report.json");
+    let mut unwritten = None;
+    // One that cannot be written takes no other away.
+    for path in [Some(&in_folder), arguments.report.as_ref()].into_iter().flatten() {
+        if let Err(error) = std::fs::write(path, &json) {
+            unwritten.get_or_insert(super::at(path, &error));
+        }
     }
-    print!("{}", words(&report));
+    if let Some(error) = unwritten {
+        return Err(error.into());
+    }
     let held = if arguments.short { report.functional_held } else { report.passed };
-    Ok(if held { Verdict::LimitsHeld } else { Verdict::LimitBroken })
+    Ok(Verdict::Walked(if held { report::Verdict::Passed } else { report::Verdict::Failed }))
 }
 
 fn options(arguments: &FaultArguments) -> Result<FaultOptions, RunError> {

@@ -7,24 +7,29 @@ use exoskeleton::gait::trial::Trial;
 use exoskeleton::intention::Intention;
 use exoskeleton::lockstep::{self, LockStepConfig};
 use exoskeleton::metrics::Metrics;
+use exoskeleton::output;
 use exoskeleton::report::{self, Report, RunDescription, RunMode};
 use exoskeleton::run_folder;
 
 /// Runs, prints the table, writes the folder.
 pub(super) fn run(arguments: &Arguments) -> Result<Verdict, RunError> {
-    let mut config = LockStepConfig::standard(arguments.strides, arguments.seed, intention(arguments)?);
+    let intention = intention(arguments)?;
+    intention.notes().iter().for_each(|note| output::print(&format!("--trial: {note}\n")));
+    let mut config = LockStepConfig::standard(arguments.strides, arguments.seed, intention);
     config.kill = arguments.kill;
     config.plant.watchdog_ns = arguments.device_watchdog.map(|ms| ms * 1_000_000);
     let record = lockstep::run(&config)?;
     let report = Report::of(&description(arguments), &Metrics::of(&record), None);
-    print!("{}", report::table(&report));
+    output::print(&report::table(&report));
     let folder = arguments.runs.join(run_folder::name(&report));
-    run_folder::write(&folder, &report, &record, None)?;
-    if let Some(path) = &arguments.report {
-        run_folder::write_report(path, &report)?;
-    }
-    println!("written: {}/ gait.svg, run.csv, report.json", folder.display());
-    Ok(if report.passed { Verdict::LimitsHeld } else { Verdict::LimitBroken })
+    let folder_written = run_folder::write(&folder, &report, &record, None);
+    let report_written =
+        arguments.report.as_ref().map_or(Ok(()), |path| run_folder::write_report(path, &report));
+    // A folder that cannot be written takes no report away.
+    folder_written?;
+    report_written?;
+    output::print(&format!("written: {}/ gait.svg, run.csv, report.json\n", folder.display()));
+    Ok(Verdict::Walked(report.verdict))
 }
 
 fn intention(arguments: &Arguments) -> Result<Intention, RunError> {

@@ -37,5 +37,7 @@ pub(super) fn run(arguments: &NodeArguments) -> Result<Verdict, RunError> {
 fn log_to_stderr() {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(false).init();
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(false);
+    // It would report a standard error that takes nothing on standard error, and panic.
+    log.log_internal_errors(false).init();
 }

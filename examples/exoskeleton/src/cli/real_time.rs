@@ -2,6 +2,7 @@
 
 use std::{path::Path, time::Duration};
 
+use exoskeleton::output;
 use exoskeleton::report;
 use exoskeleton::robot::launch::{self, LaunchOptions, RealTimeFigures, Walk};
 use exoskeleton::robot::topology::{Control, ControlThread, ReleaseBy};
@@ -20,19 +21,26 @@ pub(crate) enum ThreadArgument {
 /// Starts the five processes, walks, prints the table, writes the folder.
 pub(super) fn run(arguments: &Arguments) -> Result<Verdict, RunError> {
     let walk = launch::run(&options(arguments)?)?;
-    print!("{}", report::table(&walk.report));
-    print!("{}", words(&walk.real_time));
-    println!("{}", links(arguments.keys.as_deref()));
+    output::print(&report::table(&walk.report));
+    output::print(&words(&walk.real_time));
+    output::print(&format!("{}\n", links(arguments.keys.as_deref())));
     let json = json(&walk)?;
-    std::fs::write(walk.folder.join("report.json"), &json)?;
-    if let Some(path) = &arguments.report {
-        std::fs::write(path, &json).map_err(|e| super::at(path, &e))?;
+    let mut unwritten = walk.unwritten.clone();
+    let in_folder = walk.folder.join("report.json");
+    // One that cannot be written takes no other away.
+    for path in [Some(&in_folder), arguments.report.as_ref()].into_iter().flatten() {
+        if let Err(error) = std::fs::write(path, &json) {
+            unwritten.get_or_insert(super::at(path, &error).to_string());
+        }
     }
-    println!(
-        "written: {}/ gait.svg, run.csv, report.json, and each process's trace and log",
+    if let Some(why) = unwritten {
+        return Err(RunError::Record(why));
+    }
+    output::print(&format!(
+        "written: {}/ gait.svg, run.csv, report.json, and each process's trace and log\n",
         walk.folder.display()
-    );
-    Ok(if walk.report.passed { Verdict::LimitsHeld } else { Verdict::LimitBroken })
+    ));
+    Ok(Verdict::Walked(walk.report.verdict))
 }
 
 fn options(arguments: &Arguments) -> Result<LaunchOptions, RunError> {
@@ -93,22 +101,45 @@ fn words(figures: &RealTimeFigures) -> String {
     let each: Vec<String> =
         figures.cpu_percent.iter().map(|(name, share)| format!("{name} {share:.0}")).collect();
     text += &format!("CPU: {:.0} % of one ({})\n", figures.cpu_percent_total, each.join(", "));
-    if let Some(without) = figures.without_stalls {
-        let each: Vec<String> = figures
-            .stalls
-            .iter()
-            .map(|stall| format!("{:.0} ms at {:.1} s", 1000.0 * (stall.to_s - stall.from_s), stall.from_s))
-            .collect();
-        let ([hip, knee, ankle], phase) = (without.rms_deg, without.phase_rms_percent);
-        text += &format!("the host stood still: {}\n", each.join(", "));
-        text += &format!(
-            "  without the strides around that: RMS {hip:.2} / {knee:.2} / {ankle:.2} deg, phase {phase:.2} %\n"
-        );
-    }
+    text += &host_words(figures);
     if let Some(kill) = &figures.kill {
         for (what, times) in [("SAFE", &kill.safe_after_ms), ("NodeLost", &kill.node_lost_after_ms)] {
             let each: Vec<String> = times.iter().map(|(name, ms)| format!("{name} {}", after(*ms))).collect();
             text += &format!("from kill to {what}: {}\n", each.join(", "));
+        }
+    }
+    text
+}
+
+/// What the witness saw, and what became of it.
+fn host_words(figures: &RealTimeFigures) -> String {
+    /// Stalls that are listed one by one.
+    const LISTED_MAX: usize = 8;
+    let host = &figures.host;
+    let percent = |share: Option<f64>| share.map_or_else(|| "?".to_owned(), |share| format!("{share:.0} %"));
+    let mut text = format!(
+        "host: other programs {} of all CPUs, taken by a hypervisor {}\n",
+        percent(host.others_cpu_percent),
+        percent(host.stolen_cpu_percent)
+    );
+    for (whose, stalls) in [("the host's", &host.stalls), ("the robot's own", &host.own_stalls)] {
+        if stalls.is_empty() {
+            continue;
+        }
+        let each: Vec<String> = stalls
+            .iter()
+            .take(LISTED_MAX)
+            .map(|stall| format!("{:.0} ms at {:.1} s", 1000.0 * (stall.to_s - stall.from_s), stall.from_s))
+            .collect();
+        let more = if stalls.len() > LISTED_MAX { ", ..." } else { "" };
+        text += &format!("stalls, {whose}: {} ({}{more})\n", stalls.len(), each.join(", "));
+    }
+    if let Some(without) = figures.without_stalls.filter(|_| !host.strides_disturbed.is_empty()) {
+        let strides: Vec<String> = host.strides_disturbed.iter().map(u32::to_string).collect();
+        let ([hip, knee, ankle], phase) = (without.rms_deg, without.phase_rms_percent);
+        text += &format!("  strides disturbed by the host: {}\n", strides.join(" "));
+        if !phase.is_nan() {
+            text += &format!("  the others: RMS {hip:.2} / {knee:.2} / {ankle:.2} deg, phase {phase:.2} %\n");
         }
     }
     text

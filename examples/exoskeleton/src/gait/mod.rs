@@ -3,6 +3,7 @@
 pub mod band;
 pub mod curves;
 pub mod filter;
+pub mod motion;
 pub mod spline;
 pub mod table;
 pub mod trial;

@@ -2,6 +2,10 @@
 
 use thiserror::Error;
 
+/// Most bytes that are read.
+pub const BYTES_MAX: u64 = 512 << 20;
+/// The optional column that is 1 where the recording has a gap.
+const GAP: &str = "gap";
 /// Most rows that are read; a longer file is refused rather than filling the memory (2 h 46 min at 100 Hz).
 pub const ROWS_MAX: usize = 1_000_000;
 
@@ -22,6 +26,28 @@ pub enum TableError {
         /// The name looked for.
         column: String,
     },
+    /// A header line holds this column twice.
+    #[error("column `{column}` is in the header {times} times; keep one of them")]
+    ColumnRepeated {
+        /// The column's name.
+        column: String,
+        /// How often it is there.
+        times: usize,
+    },
+    /// The columns are not separated by commas.
+    #[error("line {line}: columns are separated by {found}; write commas, and decimal points in the numbers")]
+    Separator {
+        /// Line of the header, from 1.
+        line: u64,
+        /// The separator found.
+        found: &'static str,
+    },
+    /// The file is longer than any trial.
+    #[error("{path}: longer than {} MB; cut the file into shorter trials", BYTES_MAX >> 20)]
+    TooLarge {
+        /// The path as given.
+        path: String,
+    },
     /// The text is not a CSV record, or not UTF-8.
     #[error("line {line}: not a CSV record of the header's length ({reason}); repair or remove the line")]
     RecordGarbled {
@@ -31,7 +57,9 @@ pub enum TableError {
         reason: String,
     },
     /// A field is not a finite number.
-    #[error("line {line}, column `{column}`: `{found}` is not a finite number; repair or remove the line")]
+    #[error(
+        "line {line}, column `{column}`: `{found}` is not a finite number{hint}; repair the line, or mark it with `gap` 1"
+    )]
     NotANumber {
         /// Line in the file, from 1.
         line: u64,
@@ -39,6 +67,8 @@ pub enum TableError {
         column: String,
         /// What stands there, cut to 40 characters.
         found: String,
+        /// What may be wrong with it; empty if nothing is known.
+        hint: &'static str,
     },
     /// More than [`ROWS_MAX`] rows.
     #[error("line {line}: more than {ROWS_MAX} rows; cut the file into shorter trials")]
@@ -53,34 +83,32 @@ pub enum TableError {
 pub struct TableRow {
     /// Line in the file, from 1.
     pub line: u64,
-    /// The numbers, all finite.
+    /// The numbers, all finite outside of gaps; a gap has NaN where there is none.
     pub values: Vec<f64>,
+    /// Whether the file marks this row as a gap of the recording.
+    pub is_gap: bool,
 }
 
-/// The wanted columns of a CSV text, all numbers finite.
+/// The wanted columns of a CSV text.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Table {
     rows: Vec<TableRow>,
 }
 
 impl Table {
-    /// Reads `columns` from `text`; other columns are ignored.
+    /// Reads `columns` from `text`, and `gap` if it is there; other columns are ignored.
     ///
     /// # Errors
-    /// [`TableError`] for a missing column, a garbled record, a field that is no finite number, or too many rows.
+    /// [`TableError`] for another separator, a missing column, a garbled record, a field that is no finite number, or too many rows.
     pub fn parse(text: &str, columns: &[&str]) -> Result<Self, TableError> {
+        // Spreadsheets begin a file with a byte order mark.
+        let text = text.strip_prefix('\u{feff}').unwrap_or(text);
         let mut reader =
             csv::ReaderBuilder::new().comment(Some(b'#')).trim(csv::Trim::All).from_reader(text.as_bytes());
         let header = reader.headers().map_err(|e| garbled(&e))?.clone();
-        let places = columns
-            .iter()
-            .map(|name| {
-                header
-                    .iter()
-                    .position(|h| h == *name)
-                    .ok_or_else(|| TableError::ColumnMissing { column: (*name).to_owned() })
-            })
-            .collect::<Result<Vec<_>, _>>()?;
+        check_separator(&header)?;
+        let places = columns.iter().map(|name| place(&header, name)).collect::<Result<Vec<_>, _>>()?;
+        let gap = header.iter().any(|h| h == GAP).then(|| place(&header, GAP)).transpose()?;
         let mut rows = Vec::new();
         for record in reader.records() {
             let record = record.map_err(|e| garbled(&e))?;
@@ -88,12 +116,17 @@ impl Table {
             if rows.len() == ROWS_MAX {
                 return Err(TableError::TooLong { line });
             }
-            let values = columns
-                .iter()
-                .zip(&places)
-                .map(|(name, place)| number(record.get(*place).unwrap_or(""), line, name))
-                .collect::<Result<Vec<_>, _>>()?;
-            rows.push(TableRow { line, values });
+            let field = |place: usize| record.get(place).unwrap_or("");
+            let is_gap = match gap {
+                Some(place) => number(field(place), line, GAP)? != 0.0,
+                None => false,
+            };
+            let value = |(name, place): (&&str, &usize)| match number(field(*place), line, name) {
+                Err(_) if is_gap => Ok(f64::NAN),
+                read => read,
+            };
+            let values = columns.iter().zip(&places).map(value).collect::<Result<Vec<_>, _>>()?;
+            rows.push(TableRow { line, values, is_gap });
         }
         Ok(Self { rows })
     }
@@ -103,12 +136,31 @@ impl Table {
     pub fn rows(&self) -> &[TableRow] {
         &self.rows
     }
+}
 
-    /// All values of the wanted column with this place.
-    #[must_use]
-    pub fn column(&self, place: usize) -> Vec<f64> {
-        self.rows.iter().map(|row| row.values[place]).collect()
+fn place(header: &csv::StringRecord, name: &str) -> Result<usize, TableError> {
+    let column = || name.to_owned();
+    let mut places = header.iter().enumerate().filter(|(_, h)| *h == name).map(|(place, _)| place);
+    let first = places.next().ok_or_else(|| TableError::ColumnMissing { column: column() })?;
+    match places.count() {
+        0 => Ok(first),
+        more => Err(TableError::ColumnRepeated { column: column(), times: 1 + more }),
     }
+}
+
+/// A header with another separator is one long name.
+fn check_separator(header: &csv::StringRecord) -> Result<(), TableError> {
+    let line = header.position().map_or(0, csv::Position::line);
+    let text = header.iter().collect::<Vec<_>>().join(",");
+    for (separator, found) in [('\t', "tabs"), (';', "semicolons"), ('|', "`|`")] {
+        if text.contains(separator) && header.len() < text.matches(separator).count() + 1 {
+            return Err(TableError::Separator { line, found });
+        }
+    }
+    if header.len() == 1 && text.split_ascii_whitespace().count() > 1 {
+        return Err(TableError::Separator { line, found: "spaces" });
+    }
+    Ok(())
 }
 
 fn number(field: &str, line: u64, column: &str) -> Result<f64, TableError> {
@@ -118,6 +170,7 @@ fn number(field: &str, line: u64, column: &str) -> Result<f64, TableError> {
             line,
             column: column.to_owned(),
             found: field.chars().take(40).collect(),
+            hint: if field.contains(',') { " (a decimal comma? write a point)" } else { "" },
         }),
     }
 }

@@ -3,7 +3,7 @@
 
 use serde::Serialize;
 
-use super::RunDescription;
+use super::{Disturbance, RunDescription, Verdict};
 use crate::joint::Joint;
 use crate::metrics::Metrics;
 
@@ -32,19 +32,47 @@ pub struct LimitCheck {
     pub seen: Option<f64>,
     /// Whether the limit held.
     pub held: bool,
+    /// Whether the host disturbed the run where this was measured: a limit that did not hold is not judged then.
+    pub disturbed: bool,
 }
 
-/// Checks all limits that apply.
-pub(super) fn check(metrics: &Metrics, run: &RunDescription) -> Vec<LimitCheck> {
-    let killed = run.kill.is_some();
+/// A broken limit decides where the host did not disturb it.
+pub(super) fn verdict(limits: &[LimitCheck]) -> Verdict {
+    let mut broken = limits.iter().filter(|limit| !limit.held).peekable();
+    if broken.peek().is_none() {
+        Verdict::Passed
+    } else if broken.all(|limit| limit.disturbed) {
+        Verdict::Inconclusive
+    } else {
+        Verdict::Failed
+    }
+}
+
+/// Checks all limits that apply: those on strides with `judged`, the rest with the figures of the whole run.
+pub(super) fn check(
+    whole: &Metrics,
+    judged: &Metrics,
+    disturbance: &Disturbance<'_>,
+    run: &RunDescription,
+) -> Vec<LimitCheck> {
+    let disturbed = |disturbed: bool, checks: Vec<LimitCheck>| {
+        checks.into_iter().map(move |check| LimitCheck { disturbed, ..check })
+    };
+    let start = vec![at_most("spread of READY, ms", READY_SKEW_MAX_MS, whole.ready_skew_ms)];
+    let mut checks = vec![at_most("torque before release, Nm", 0.0, Some(whole.torque_before_release_nm))];
+    checks.extend(disturbed(disturbance.at_start, start));
+    checks.extend(disturbed(disturbance.too_few, of_strides(judged)));
+    checks.push(at_most("torque rate, Nm/s", TORQUE_RATE_MAX_NM_S, Some(whole.torque_rate_max_nm_s)));
+    if run.kill.is_some() {
+        checks.extend(disturbed(disturbance.at_fault, of_fault(whole)));
+    }
+    checks
+}
+
+fn of_strides(metrics: &Metrics) -> Vec<LimitCheck> {
+    let strides = (metrics.strides_counted * 100.0).round() / 100.0;
     let mut checks = vec![
-        at_most("torque before release, Nm", 0.0, Some(metrics.torque_before_release_nm)),
-        at_most("spread of READY, ms", READY_SKEW_MAX_MS, metrics.ready_skew_ms),
-        at_least(
-            "strides that count",
-            STRIDES_COUNTED_MIN,
-            Some((metrics.strides_counted * 100.0).round() / 100.0),
-        ),
+        at_least("strides that count", STRIDES_COUNTED_MIN, Some(strides)),
         at_most("phase RMS, %", PHASE_RMS_MAX_PERCENT, Some(metrics.phase_rms_percent)),
     ];
     for joint in Joint::ALL {
@@ -63,17 +91,18 @@ pub(super) fn check(metrics: &Metrics, run: &RunDescription) -> Vec<LimitCheck> 
             expected: format!("< {SATURATION_MAX_PERCENT}"),
             seen: Some(seen),
             held: seen < SATURATION_MAX_PERCENT,
+            disturbed: false,
         });
     }
-    checks.push(at_most("torque rate, Nm/s", TORQUE_RATE_MAX_NM_S, Some(metrics.torque_rate_max_nm_s)));
-    if killed {
-        let fault = metrics.fault.as_ref();
-        let safe_ms = fault.and_then(|f| f.all_safe_after_ms);
-        checks.push(at_most("loss to all others SAFE, ms", ALL_SAFE_MAX_MS, safe_ms));
-        let resumed = fault.and_then(|f| f.resumed_after_s);
-        checks.push(at_least("assistance came back after, s", 0.0, resumed));
-    }
     checks
+}
+
+fn of_fault(metrics: &Metrics) -> Vec<LimitCheck> {
+    let fault = metrics.fault.as_ref();
+    vec![
+        at_most("loss to all others SAFE, ms", ALL_SAFE_MAX_MS, fault.and_then(|f| f.all_safe_after_ms)),
+        at_least("assistance came back after, s", 0.0, fault.and_then(|f| f.resumed_after_s)),
+    ]
 }
 
 fn at_most(name: &str, limit: f64, seen: Option<f64>) -> LimitCheck {
@@ -82,6 +111,7 @@ fn at_most(name: &str, limit: f64, seen: Option<f64>) -> LimitCheck {
         expected: if limit == 0.0 { "exactly 0".to_owned() } else { format!("<= {limit}") },
         seen,
         held: seen.is_some_and(|seen| seen <= limit * (1.0 + ROUNDING)),
+        disturbed: false,
     }
 }
 
@@ -91,6 +121,7 @@ fn at_least(name: &str, limit: f64, seen: Option<f64>) -> LimitCheck {
         expected: format!(">= {limit}"),
         seen,
         held: seen.is_some_and(|seen| seen >= limit),
+        disturbed: false,
     }
 }
 
@@ -100,5 +131,6 @@ fn within(name: &str, (low, high): (f64, f64), seen: f64) -> LimitCheck {
         expected: format!("{low}..{high}"),
         seen: Some(seen),
         held: (low..=high).contains(&seen),
+        disturbed: false,
     }
 }

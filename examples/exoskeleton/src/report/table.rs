@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::{PercentilesUs, Report, RunMode};
+use super::{PercentilesUs, Report, RunMode, Verdict};
 
 /// The result table of a run, lines of at most 78 characters.
 #[must_use]
@@ -24,7 +24,11 @@ fn write_table(out: &mut String, report: &Report) -> std::fmt::Result {
     writeln!(out, "{:32} {:>16} {:>14}  held", "limit", "expected", "seen")?;
     for limit in &report.limits {
         let seen = limit.seen.map_or_else(|| "never".to_owned(), |seen| format!("{seen:.3}"));
-        let held = if limit.held { "yes" } else { "NO" };
+        let held = match (limit.held, limit.disturbed) {
+            (true, _) => "yes",
+            (false, false) => "NO",
+            (false, true) => "not judged",
+        };
         writeln!(out, "{:32} {:>16} {seen:>14}  {held}", limit.name, limit.expected)?;
     }
     writeln!(out, "{:-<72}", "")?;
@@ -43,7 +47,26 @@ fn write_table(out: &mut String, report: &Report) -> std::fmt::Result {
     }
     write_fault(out, report)?;
     write_timing(out, report)?;
-    writeln!(out, "{}", if report.passed { "PASSED: all limits held" } else { "FAILED: see `NO` above" })
+    write_verdict(out, report)
+}
+
+fn write_verdict(out: &mut String, report: &Report) -> std::fmt::Result {
+    let longest_ms =
+        report.stalls.iter().map(|stall| 1000.0 * (stall.to_s - stall.from_s)).fold(0.0, f64::max);
+    let stalled = format!("the host stalled {} times (up to {longest_ms:.0} ms)", report.stalls.len());
+    let apart = report.strides_counted - report.strides_judged;
+    match report.verdict {
+        Verdict::Failed => writeln!(out, "FAILED: see `NO` above"),
+        Verdict::Passed if apart > 0.01 => {
+            writeln!(out, "PASSED: all limits held; {stalled}, so {apart:.1} strides were not judged")
+        }
+        Verdict::Passed => writeln!(out, "PASSED: all limits held"),
+        Verdict::Inconclusive => writeln!(
+            out,
+            "INCONCLUSIVE: {stalled}; see `not judged` above.\nStop other load on this host, ask for more \
+             strides, or use --lock-step, which needs no real time."
+        ),
+    }
 }
 
 fn write_fault(out: &mut String, report: &Report) -> std::fmt::Result {
@@ -64,5 +87,12 @@ fn write_timing(out: &mut String, report: &Report) -> std::fmt::Result {
     writeln!(out, "{:24} {:>10} {:>10} {:>10} {:>10}", "us", "p50", "p99", "p99.9", "max")?;
     writeln!(out, "{:24} {}", "period", row(period))?;
     writeln!(out, "{:24} {}", "age at use", row(age))?;
-    writeln!(out, "deadline misses: {}", report.deadline_misses.unwrap_or(0))
+    let of =
+        |misses: Option<u64>, all: Option<u64>| format!("{} of {}", misses.unwrap_or(0), all.unwrap_or(0));
+    writeln!(
+        out,
+        "deadline misses (more than 2 ms late): drives {} ticks, witness {} wakes",
+        of(report.deadline_misses, report.ticks),
+        of(report.witness_misses, report.witness_wakes)
+    )
 }

@@ -13,6 +13,7 @@
 //! so until central's gait asks for it ([`Arm`]), in a state in which no torque comes of central's word. When the drive is told
 //! to stop, the torque ramps to zero first.
 
+mod burden;
 mod lookout;
 mod order;
 mod suspicion;
@@ -25,6 +26,7 @@ use sinew::ReadyGate;
 use sinew::prelude::*;
 use sinew::protection::Guard;
 
+pub use self::burden::Burden;
 use self::lookout::{Lookout, Watch};
 use self::order::Order;
 use self::word::{Armed, Output, Word};
@@ -59,6 +61,8 @@ pub struct DriveParts {
     pub events: Trace<EventRow>,
     /// Where it leaves its figures at its end, as JSON.
     pub figures: Option<PathBuf>,
+    /// CPU time that it wastes in each tick once the person walks: a planted fault, see [`Burden`].
+    pub burden: Option<Burden>,
 }
 
 /// The drive of one joint.
@@ -81,6 +85,8 @@ pub struct Drive {
     ticked_at: Option<Time>,
     figures: LoopFigures,
     stopping: bool,
+    /// Ticks since central asked for walking, for its burden.
+    ticks_walking: u32,
     /// Whom the inputs are believed from.
     sensor: Addressee,
     central: Addressee,
@@ -124,6 +130,7 @@ impl Drive {
             ticked_at: None,
             figures: LoopFigures::default(),
             stopping: false,
+            ticks_walking: 0,
         }
     }
 
@@ -139,6 +146,7 @@ impl Drive {
         }
         let mut output = self.core.tick(now.as_nanos(), self.sample.as_ref(), gait.as_ref());
         output.command_nm = self.command(now, &output, gait.as_ref());
+        self.carry_burden(gait.as_ref());
         if output.state != DriveState::Init
             && let Some(gate) = self.ready.take()
         {
@@ -161,6 +169,15 @@ impl Drive {
                 self.damper.damp(now, output.state);
             }
             context.stop();
+        }
+    }
+
+    fn carry_burden(&mut self, gait: Option<&GaitState>) {
+        let Some(burden) = self.parts.burden else { return };
+        let walks = gait.is_some_and(|gait| matches!(gait.mode, GaitMode::Sync | GaitMode::Walk));
+        self.ticks_walking = self.ticks_walking.saturating_add(u32::from(walks));
+        if self.ticks_walking > burden::FREE_TICKS {
+            burden.carry();
         }
     }
 

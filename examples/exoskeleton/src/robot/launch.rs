@@ -1,5 +1,6 @@
 //! The whole robot on this host: five processes in shuffled order, one of them late; then the walk, and its report.
 
+mod blame;
 mod children;
 mod collect;
 mod console;
@@ -8,6 +9,7 @@ mod hosts;
 mod keys;
 mod plan;
 mod screen;
+mod witness;
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -23,18 +25,22 @@ use super::role::Role;
 use super::topology::{self, Control, Topology};
 use crate::intention::IntentionError;
 use crate::metrics::Metrics;
+use crate::output;
 use crate::part::Kill;
-use crate::report::{Report, RunDescription, RunMode};
+use crate::report::{Disturbance, Report, RunDescription, RunMode};
 use crate::run_folder;
-use children::Children;
+use children::{Children, HostCpu};
 use collect::{Collected, RunTimes};
 use console::Console;
 use plan::Plan;
 use screen::Screen;
+use witness::Witness;
 
 pub use collect::RealTimeFigures;
 pub use keys::KeyFaults;
 
+/// Time between two looks at the CPU times of all processes.
+const SAMPLE_PERIOD: Duration = Duration::from_millis(200);
 /// Time between two pictures of the status screen.
 const LOOK_PERIOD: Duration = Duration::from_millis(100);
 /// Time for all to meet and to be released.
@@ -78,6 +84,8 @@ pub struct Walk {
     pub real_time: RealTimeFigures,
     /// Where it is all written.
     pub folder: PathBuf,
+    /// The reason why a part of its record could not be written.
+    pub unwritten: Option<String>,
 }
 
 /// Why there was no walk.
@@ -127,6 +135,18 @@ pub enum LaunchError {
         /// Time that they had.
         within: Duration,
     },
+    /// A trace ends before the walk does.
+    #[error(
+        "the trace of {role} in {folder} ends {missing_s:.1} s before the walk does, so the walk cannot be judged; is the disk full?"
+    )]
+    TraceCut {
+        /// The process.
+        role: Role,
+        /// The run folder.
+        folder: String,
+        /// Missing time, s.
+        missing_s: f64,
+    },
     /// A process cannot be made ready.
     #[error(transparent)]
     Node(#[from] NodeError),
@@ -147,19 +167,27 @@ pub fn run(options: &LaunchOptions) -> Result<Walk, LaunchError> {
     if let Some(directory) = &options.keys {
         keys::check(&topology, directory)?;
     }
-    plant::intention(&topology.plant)?.check_strides(options.strides)?;
+    let intention = plant::intention(&topology.plant)?;
+    intention.notes().iter().for_each(|note| output::print(&format!("--trial: {note}\n")));
+    intention.check_strides(options.strides)?;
     let folder = new_folder(&options.runs, &folder_name(options))?;
     let mut launch = Launch::new(options, &topology, &folder)?;
     let walked = launch.walk();
     let times = launch.end();
     walked?;
     let collected = Collected::read(&folder, &times)?;
-    let mut metrics = Metrics::of(&collected.record);
+    let [mut all, mut undisturbed] =
+        [Metrics::of(&collected.record), Metrics::without_stalls(&collected.record)];
     // The rows are the plant's milliseconds; the limiter's rate shows in the drive's own time only.
-    metrics.torque_rate_max_nm_s = collected.torque_rate_max_nm_s;
-    let report = Report::of(&description(options), &metrics, Some(&collected.timing));
-    run_folder::write(&folder, &report, &collected.record, Some(&collected.lateness))?;
-    Ok(Walk { report, real_time: collected.figures, folder })
+    for metrics in [&mut all, &mut undisturbed] {
+        metrics.torque_rate_max_nm_s = collected.torque_rate_max_nm_s;
+    }
+    let disturbance = Disturbance::of(&collected.record, &all, &undisturbed);
+    let timing = Some(&collected.timing);
+    let report = Report::of_disturbed(&description(options), &all, timing, &disturbance);
+    let written = run_folder::write(&folder, &report, &collected.record, Some(&collected.lateness));
+    let unwritten = written.err().map(|error| error.to_string());
+    Ok(Walk { report, real_time: collected.figures, folder, unwritten })
 }
 
 /// The project of a robot with keys: they say whose they are. Its multicast group keeps each run apart.
@@ -229,12 +257,15 @@ struct Launch<'a> {
     screen: Screen,
     times: RunTimes,
     strides: Option<u32>,
+    witness: Witness,
 }
 
 impl<'a> Launch<'a> {
     fn new(options: &'a LaunchOptions, topology: &Topology, folder: &Path) -> Result<Self, LaunchError> {
         let file = folder.join("topology.toml");
-        std::fs::write(&file, topology.to_toml())?;
+        std::fs::write(&file, topology.to_toml()).map_err(|error| {
+            io::Error::new(error.kind(), format!("cannot write {}: {error}", file.display()))
+        })?;
         let (say_line, lines) = sync_channel(LINES_MAX);
         let now = Time::now();
         Ok(Self {
@@ -247,6 +278,7 @@ impl<'a> Launch<'a> {
             screen: Screen::new(options.strides, now),
             times: RunTimes { strides: options.strides, ..RunTimes::default() },
             strides: None,
+            witness: Witness::start(options.control.realtime_priority)?,
         })
     }
 
@@ -257,6 +289,7 @@ impl<'a> Launch<'a> {
         loop {
             let now = Time::now();
             self.start_due(now)?;
+            self.sample(now);
             self.children.check()?;
             let pause = self.plan.next_due().map_or(LOOK_PERIOD, |due| due.since(now).min(LOOK_PERIOD));
             match self.lines.recv_timeout(pause) {
@@ -278,6 +311,14 @@ impl<'a> Launch<'a> {
             if Time::now() > deadline {
                 return Err(self.too_late());
             }
+        }
+    }
+
+    /// Notes the CPU times of all processes, if it is time.
+    fn sample(&mut self, now: Time) {
+        let samples = &mut self.times.samples;
+        if samples.last().is_none_or(|(at, _)| now.since(*at) >= SAMPLE_PERIOD) {
+            samples.push(self.children.cpu_times());
         }
     }
 
@@ -304,6 +345,7 @@ impl<'a> Launch<'a> {
         };
         if self.strides.is_none() {
             self.times.cpu_from = Some(self.children.cpu_times());
+            self.times.host_from = HostCpu::now();
         }
         self.strides = Some(stride);
         let Some(kill) = self.options.kill.filter(|_| self.times.outage.is_none()) else { return };
@@ -331,6 +373,9 @@ impl<'a> Launch<'a> {
     fn end(mut self) -> RunTimes {
         self.times.stop = Time::now();
         self.times.cpu_to = Some(self.children.cpu_times());
+        self.times.samples.extend(self.times.cpu_to.clone());
+        self.times.host_to = HostCpu::now();
+        self.times.testimonies = self.witness.end();
         self.screen.close();
         self.console.stop();
         self.children.stop();

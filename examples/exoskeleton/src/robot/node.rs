@@ -12,7 +12,7 @@ use sinew::prelude::*;
 use thiserror::Error;
 
 use super::device::{JointDevice, UdpDevice};
-use super::drive::DriveParts;
+use super::drive::{Burden, DriveParts};
 use super::gait::GaitParts;
 use super::plant::{self, PlantError};
 use super::role::Role;
@@ -123,6 +123,7 @@ fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<Ex
                 trace: trace.trace(),
                 events: events.trace(),
                 figures: options.run_dir.as_ref().map(|folder| folder.join(format!("{joint}-figures.json"))),
+                burden: Burden::planted(joint),
             };
             let builder = builder
                 .app(sensor::spec(joint, device, events.trace(), place(topology)))

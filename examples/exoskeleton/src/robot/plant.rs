@@ -4,7 +4,7 @@
 //! device holds the last torque of a drive that falls silent. The person begins to walk when all three drives say that
 //! walking is released. A line on standard output tells each stride.
 
-use std::io::{self, Write};
+use std::io;
 use std::net::{SocketAddr, UdpSocket};
 use std::path::Path;
 use std::sync::Arc;
@@ -21,6 +21,7 @@ use super::trace::{PlantRow, Recording, Trace};
 use crate::gait::trial::{Trial, TrialError};
 use crate::intention::Intention;
 use crate::joint::{Joint, PerJoint};
+use crate::output;
 use crate::plant::{PlantConfig, PlantCore, PlantReadings};
 
 const PERIOD_NS: u64 = PERIOD.as_nanos() as u64;
@@ -189,14 +190,13 @@ impl Plant {
     }
 }
 
-/// A line for whoever started the plant. Once a stride, so that it may take the microseconds of a write.
+/// Prints a line for the program that started the plant. Once a stride, so that it may take the microseconds of a write.
 fn tell(line: &str) {
-    let mut out = io::stdout().lock();
-    // Nobody may listen.
-    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
+    output::print(&format!("{line}\n"));
 }
 
-fn sleep_until(due: Time) -> Result<(), PlantError> {
+/// Sleeps until a moment of the host's clock.
+pub(super) fn sleep_until(due: Time) -> Result<(), PlantError> {
     let nanos = due.as_nanos();
     let request = rustix::thread::Timespec {
         tv_sec: (nanos / 1_000_000_000).cast_signed(),

@@ -1,6 +1,8 @@
 //! The built program as its users run it: real processes, real time. No time is asserted of them.
 
 mod faults;
+mod output;
+mod overload;
 mod real_time;
 mod secured;
 mod sockets;
@@ -35,8 +37,14 @@ fn folder(name: &str) -> PathBuf {
 /// beside this one would find them. A leg at 1 kHz does not walk where compilers come first, so it comes before them,
 /// as on a robot: by the priority of the thread that starts it, where that is granted.
 fn start(folder: &Path, arguments: &[&str]) -> Child {
+    start_in(folder, arguments, &[])
+}
+
+/// As [`start`], with these variables in its environment.
+fn start_in(folder: &Path, arguments: &[&str], variables: &[(&str, &str)]) -> Child {
     let mut command = Command::new(PROGRAM);
     command.args(arguments).current_dir(folder).env("TMPDIR", folder.join(SOCKETS));
+    command.envs(variables.iter().copied());
     command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
     let started = std::thread::spawn(move || {
         let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::RoundRobin);

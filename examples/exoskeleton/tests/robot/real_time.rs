@@ -34,7 +34,7 @@ fn five_processes_wait_for_the_late_one_without_torque_and_then_walk() {
     assert!(told.contains("waits for hip.sensor"), "the late hip is waited for:\n{told}\n{failed}");
     assert!(told.contains("stride 8 of 8"), "{told}\n{failed}");
     // Whether limits hold depends on the machine; that it walked does not.
-    assert!(matches!(output.status.code(), Some(0 | 3)), "{:?}\n{told}\n{failed}", output.status);
+    assert!(matches!(output.status.code(), Some(0 | 3 | 4)), "{:?}\n{told}\n{failed}", output.status);
     let report: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(report).unwrap()).unwrap();
     assert_eq!(report["barrier"]["torque_before_release_nm"], 0.0);
     assert!(report["barrier"]["held_s"].as_f64().unwrap() > 1.0, "{report}");

@@ -16,6 +16,7 @@ use super::LaunchError;
 use sinew_hosts::{Carried, Weather};
 
 use super::hosts::{Hosts, Link};
+use crate::output;
 use crate::part::Part;
 use crate::robot::role::Role;
 use crate::robot::topology::Topology;
@@ -180,7 +181,8 @@ fn stop_all(children: &mut Vec<Child>) {
         std::thread::sleep(STOP_LOOK_PERIOD);
     }
     for child in children.iter_mut() {
-        eprintln!("process {} did not end within {STOP_PATIENCE:?}; it is killed", child.id());
+        let id = child.id();
+        output::note(format_args!("process {id} did not end within {STOP_PATIENCE:?}; it is killed"));
         let _ = child.kill();
         let _ = child.wait();
     }
@@ -211,6 +213,33 @@ fn cpu_seconds(id: u32) -> Option<f64> {
     Some((ticks(fields.next())? + ticks(fields.next())?) / CLOCK_TICKS_PER_S)
 }
 
+/// CPU time of the whole machine since its start, hundredths of a second of all its CPUs.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct HostCpu {
+    /// All of it, idle or not.
+    pub(super) total: f64,
+    /// Used by programs and the kernel.
+    pub(super) busy: f64,
+    /// Taken by the hypervisor, where it says so.
+    pub(super) stolen: f64,
+}
+
+impl HostCpu {
+    /// As `/proc/stat` has it now.
+    pub(super) fn now() -> Option<Self> {
+        Self::parse(&fs::read_to_string("/proc/stat").ok()?)
+    }
+
+    /// user, nice, system, idle, iowait, irq, softirq, steal.
+    fn parse(text: &str) -> Option<Self> {
+        let fields = text.lines().next()?.strip_prefix("cpu ")?.split_ascii_whitespace();
+        let ticks: Vec<f64> = fields.take(8).map_while(|field| field.parse().ok()).collect();
+        let [user, nice, system, idle, iowait, irq, softirq, stolen] = ticks.try_into().ok()?;
+        let busy = user + nice + system + irq + softirq;
+        Some(Self { total: busy + idle + iowait + stolen, busy, stolen })
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use std::os::unix::net::UnixListener;
@@ -221,6 +250,14 @@ mod tests {
     fn cpu_time_of_a_process_is_read() {
         assert!(cpu_seconds(std::process::id()).is_some_and(|seconds| seconds < 10_000.0));
         assert_eq!(cpu_seconds(u32::MAX), None);
+    }
+
+    #[test]
+    fn cpu_time_of_the_machine_is_read() {
+        let text = "cpu  1 2 3 40 5 6 7 8 9 10\ncpu0 1 2 3\n";
+        assert_eq!(HostCpu::parse(text), Some(HostCpu { total: 72.0, busy: 19.0, stolen: 8.0 }));
+        assert_eq!(HostCpu::parse("intr 1"), None);
+        assert!(HostCpu::now().is_some_and(|cpu| cpu.total > 0.0));
     }
 
     #[test]

@@ -7,22 +7,26 @@ use std::path::Path;
 use serde::Serialize;
 use sinew::Time;
 
-use super::children::CpuTimes;
+use super::LaunchError;
+use super::blame::{self, Evidence, HostStall};
+use super::children::{CpuTimes, HostCpu};
+use super::witness::Testimony;
 use crate::joint::{Joint, PerJoint};
 use crate::message::DriveState;
-use crate::metrics::Metrics;
+use crate::metrics::{Counting, Metrics};
 use crate::part::Part;
 use crate::plot::Lateness;
 use crate::record::{JointRow, Outage, Record, Row, Stall};
 use crate::report::{MeasuredTiming, PercentilesUs};
 use crate::robot::figures::{LoopFigures, LoopSummary, percentiles_of};
+use crate::robot::role::Role;
 use crate::robot::trace::{DriveRow, EventRow, GaitRow, PlantRow, read_lives};
 
 /// A word of central that is older than this says nothing about now, ns.
 const NEWS_NS: u64 = 5_000_000;
 
-/// The plant shares nothing with the nodes but the host. When it is this late the host stood still, us.
-const STALL_US: u32 = 20_000;
+/// A trace that ends so much before the walk was cut off, ns: its rows come a tenth of a second late at most, and after a stall.
+const TRACE_CUT_NS: u64 = 2_000_000_000;
 
 /// A kill, in the host's clock.
 #[derive(Debug, Clone, Copy)]
@@ -41,6 +45,11 @@ pub(super) struct RunTimes {
     pub(super) outage: Option<KillTimes>,
     pub(super) cpu_from: Option<CpuTimes>,
     pub(super) cpu_to: Option<CpuTimes>,
+    /// CPU times of all processes, five times a second.
+    pub(super) samples: Vec<CpuTimes>,
+    pub(super) host_from: Option<HostCpu>,
+    pub(super) host_to: Option<HostCpu>,
+    pub(super) testimonies: Vec<Testimony>,
 }
 
 /// What only a real-time run can say.
@@ -56,12 +65,33 @@ pub struct RealTimeFigures {
     pub cpu_percent: BTreeMap<String, f64>,
     /// All of them, per cent of one CPU.
     pub cpu_percent_total: f64,
-    /// Times in which the host stood still for more than 20 ms, seconds of the run. They count.
-    pub stalls: Vec<Stall>,
-    /// The figures if those strides did not count, to explain a broken limit; `null` without stalls.
+    /// What the witness saw of the host.
+    pub host: HostFigures,
+    /// The figures of undisturbed strides alone; `null` where the host did not stall.
     pub without_stalls: Option<UnstalledFigures>,
     /// How the death of a node was noticed, if one was killed.
     pub kill: Option<KillFigures>,
+}
+
+/// What the witness saw of the host: threads of the launcher that only sleep, one on each CPU.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct HostFigures {
+    /// CPUs with a witness.
+    pub witnesses: usize,
+    /// Times at which the witnesses were woken.
+    pub wakes: u64,
+    /// Of these, more than 2 ms late: the deadline of a drive's tick.
+    pub deadline_misses: u64,
+    /// Stalls of the host, in which a witness was at least 5 ms late: seconds of the run. The strides around them count apart.
+    pub stalls: Vec<Stall>,
+    /// Stalls that the robot has caused itself, by its use of CPU time. Their strides count.
+    pub own_stalls: Vec<Stall>,
+    /// Strides that count apart, the first stride being 1.
+    pub strides_disturbed: Vec<u32>,
+    /// CPU time of all other programs while walking, per cent of all CPUs.
+    pub others_cpu_percent: Option<f64>,
+    /// CPU time that a hypervisor says it took while walking, per cent of all CPUs.
+    pub stolen_cpu_percent: Option<f64>,
 }
 
 /// How the death of a node was noticed: times since the kill, ms; `null` where it was not.
@@ -126,21 +156,28 @@ fn up_to<R>(lives: Vec<Vec<R>>, holds: impl Fn(&R) -> bool) -> Vec<R> {
 }
 
 impl Collected {
-    pub(super) fn read(folder: &Path, times: &RunTimes) -> io::Result<Self> {
+    /// # Errors
+    /// A trace cannot be opened, or ends before the walk does.
+    pub(super) fn read(folder: &Path, times: &RunTimes) -> Result<Self, LaunchError> {
         let traces = Traces::read(folder, times.stop)?;
+        check_whole(&traces, folder, times.stop)?;
         let mut loops = LoopFigures::default();
         for life in traces.drives.iter().flatten() {
             life.iter().filter(|row| row.state != DriveState::Init).for_each(|row| loops.note(row));
         }
         let summary = loops.summary();
-        let record = record(&traces, times);
+        let (stalls, own_stalls) = stalls(&traces, times);
+        let record = record(&traces, times, stalls);
         Ok(Self {
-            figures: figures(&traces, times, summary, &record),
+            figures: figures(&traces, times, summary, &record, own_stalls),
             record,
             timing: MeasuredTiming {
                 period_us: summary.period_us,
                 age_us: summary.gait_age_us,
                 deadline_misses: summary.deadline_misses,
+                ticks: summary.ticks,
+                witness_misses: times.testimonies.iter().map(|seen| seen.misses).sum(),
+                witness_wakes: times.testimonies.iter().map(|seen| seen.wakes).sum(),
             },
             lateness: loops.lateness(),
             torque_rate_max_nm_s: torque_rate_max(&traces.drives),
@@ -148,7 +185,7 @@ impl Collected {
     }
 }
 
-fn record(traces: &Traces, times: &RunTimes) -> Record {
+fn record(traces: &Traces, times: &RunTimes, stalls: Vec<Stall>) -> Record {
     let start_ns = times.first_start.unwrap_or(Time::ZERO).as_nanos();
     let seconds = |t_ns: u64| (i128::from(t_ns) - i128::from(start_ns)) as f64 * 1e-9;
     let is_ready = |row: &&DriveRow| row.state == DriveState::Ready;
@@ -179,22 +216,75 @@ fn record(traces: &Traces, times: &RunTimes) -> Record {
         ready_s,
         released_s: rows.iter().find(|row| row.walking).map(|row| row.t_s),
         outage,
-        stalls: stalls(&traces.plant, seconds),
+        stalls,
         rows,
     }
 }
 
-/// The steps that a late plant makes up at once were all due while the host stood still.
-fn stalls(plant: &[PlantRow], seconds: impl Fn(u64) -> f64) -> Vec<Stall> {
-    let mut stalls: Vec<Stall> = Vec::new();
-    for row in plant.iter().filter(|row| row.late_us > STALL_US) {
-        let (from_s, to_s) = (seconds(row.t_ns), seconds(row.t_ns + u64::from(row.late_us) * 1000));
-        match stalls.last_mut() {
-            Some(last) if from_s <= last.to_s => last.to_s = last.to_s.max(to_s),
-            Some(_) | None => stalls.push(Stall { from_s, to_s }),
+/// A walk that is not recorded to its end cannot be judged. A drive that was killed has an end of its own.
+fn check_whole(traces: &Traces, folder: &Path, stop: Time) -> Result<(), LaunchError> {
+    let central = Role::Node(Part::Central);
+    let ends = [
+        (Role::Plant, traces.plant.last().map(|row| row.t_ns)),
+        (central, traces.gait.last().map(|row| row.t_ns)),
+    ];
+    for (role, end_ns) in ends {
+        let missing_ns = stop.as_nanos().saturating_sub(end_ns.unwrap_or(0));
+        if missing_ns > TRACE_CUT_NS {
+            let (folder, missing_s) = (folder.display().to_string(), missing_ns as f64 * 1e-9);
+            return Err(LaunchError::TraceCut { role, folder, missing_s });
         }
     }
-    stalls
+    Ok(())
+}
+
+/// The stalls that were the host's, and those that the robot has caused itself.
+fn stalls(traces: &Traces, times: &RunTimes) -> (Vec<Stall>, Vec<Stall>) {
+    let start_ns = times.first_start.unwrap_or(Time::ZERO).as_nanos();
+    let seconds = |t_ns: u64| (i128::from(t_ns) - i128::from(start_ns)) as f64 * 1e-9;
+    let drive = |joint: Joint| traces.drives[joint.index()].iter().flatten().map(|row| row.t_ns).collect();
+    let mut ticks: Vec<(&str, Vec<u64>)> =
+        Joint::ALL.into_iter().map(|joint| (joint.name(), drive(joint))).collect();
+    ticks.push((Role::Plant.name(), traces.plant.iter().map(|row| row.t_ns).collect()));
+    ticks.push((Part::Central.name(), traces.gait.iter().map(|row| row.t_ns).collect()));
+    let evidence = Evidence {
+        samples: &times.samples,
+        ticks,
+        cpus: times.testimonies.len(),
+        walks_from_ns: traces.plant.iter().find(|row| row.walking).map_or(u64::MAX, |row| row.t_ns),
+    };
+    let until = times.stop.as_nanos();
+    let all = blame::merged(&times.testimonies);
+    let (own, hosts): (Vec<HostStall>, Vec<HostStall>) =
+        all.iter().filter(|stall| stall.at.from_ns < until).partition(|stall| evidence.is_own(stall));
+    let of_the_run = |stalls: Vec<HostStall>| {
+        let at =
+            |stall: HostStall| Stall { from_s: seconds(stall.at.from_ns), to_s: seconds(stall.at.to_ns) };
+        stalls.into_iter().map(at).collect()
+    };
+    (of_the_run(hosts), of_the_run(own))
+}
+
+fn host_figures(times: &RunTimes, record: &Record, own_stalls: Vec<Stall>) -> HostFigures {
+    let sum = |of: fn(&Testimony) -> u64| times.testimonies.iter().map(of).sum();
+    let spent = times.host_from.zip(times.host_to).map(|(from, to)| HostCpu {
+        total: (to.total - from.total).max(1.0),
+        busy: to.busy - from.busy,
+        stolen: to.stolen - from.stolen,
+    });
+    let seconds = times.cpu_from.as_ref().zip(times.cpu_to.as_ref()).map(|(from, to)| to.0.since(from.0));
+    // Per cent of one CPU, over the seconds of the walk, in hundredths of a second.
+    let robot = cpu_percent(times).values().sum::<f64>() * seconds.unwrap_or_default().as_secs_f64();
+    HostFigures {
+        witnesses: times.testimonies.len(),
+        wakes: sum(|seen| seen.wakes),
+        deadline_misses: sum(|seen| seen.misses),
+        stalls: record.stalls.clone(),
+        own_stalls,
+        strides_disturbed: Counting::disturbed(record),
+        others_cpu_percent: spent.map(|cpu| (100.0 * (cpu.busy - robot) / cpu.total).max(0.0)),
+        stolen_cpu_percent: spent.map(|cpu| 100.0 * cpu.stolen / cpu.total),
+    }
 }
 
 fn row(t_s: f64, plant: &PlantRow, gait: Option<&GaitRow>) -> Row {
@@ -229,15 +319,21 @@ fn torque_rate_max(drives: &PerJoint<Vec<Vec<DriveRow>>>) -> f64 {
     drives.iter().flatten().flat_map(|life| life.windows(2).filter_map(rate)).fold(0.0, f64::max)
 }
 
-fn figures(traces: &Traces, times: &RunTimes, drives: LoopSummary, record: &Record) -> RealTimeFigures {
+fn figures(
+    traces: &Traces,
+    times: &RunTimes,
+    drives: LoopSummary,
+    record: &Record,
+    own_stalls: Vec<Stall>,
+) -> RealTimeFigures {
     let cpu_percent = cpu_percent(times);
     RealTimeFigures {
         drives,
         central_late_us: percentiles_of(traces.gait.iter().map(|row| row.late_us)),
         plant_late_us: percentiles_of(traces.plant.iter().map(|row| row.late_us)),
+        host: host_figures(times, record, own_stalls),
         cpu_percent_total: cpu_percent.values().sum(),
         cpu_percent,
-        stalls: record.stalls.clone(),
         without_stalls: (!record.stalls.is_empty()).then(|| {
             let rest = Metrics::without_stalls(record);
             UnstalledFigures { rms_deg: rest.rms_deg, phase_rms_percent: rest.phase_rms_percent }

@@ -25,6 +25,7 @@ use super::hosts::{Hosts, Network};
 use super::{LaunchError, new_folder};
 use crate::joint::Joint;
 use crate::lockstep::LockStepError;
+use crate::output;
 use crate::part::Part;
 use crate::plot;
 use crate::robot::role::Role;
@@ -263,5 +264,5 @@ fn topology_on_hosts(options: &FaultOptions) -> io::Result<Topology> {
 
 /// A line for whoever looks on.
 fn say(line: &str) {
-    println!("{line}");
+    output::print(&format!("{line}\n"));
 }

@@ -13,6 +13,7 @@ use std::process::{Child, Command, Stdio};
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 use sinew_hosts::{Carried, Radio, Weather};
 
+use crate::output;
 use crate::robot::role::Role;
 
 /// The network of the nodes, and that of the devices.
@@ -202,7 +203,7 @@ impl Named {
 impl Drop for Named {
     fn drop(&mut self) {
         if let Err(error) = run(&["netns", "del", &self.0]) {
-            eprintln!("the namespace {} keeps its name: {error}", self.0);
+            output::note(format_args!("the namespace {} keeps its name: {error}", self.0));
         }
     }
 }

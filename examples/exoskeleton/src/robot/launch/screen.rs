@@ -1,11 +1,12 @@
 //! The status screen: a picture ten times a second on a terminal, a line for each change elsewhere.
 
-use std::io::{self, IsTerminal, Write};
+use std::io::{self, IsTerminal};
 
 use sinew::Time;
 
 use super::console::View;
 use crate::joint::Joint;
+use crate::output;
 
 const BAR: usize = 30;
 const UP_AND_CLEAR: &str = "\x1b[1A\x1b[2K";
@@ -40,7 +41,7 @@ impl Screen {
     pub(super) fn say(&mut self, line: &str) {
         let time = self.time();
         let clear = self.clear();
-        write(&format!("{clear}{time} {line}\n"));
+        output::print(&format!("{clear}{time} {line}\n"));
     }
 
     /// How things stand.
@@ -49,7 +50,7 @@ impl Screen {
             let lines = self.picture(view, strides);
             let clear = self.clear();
             self.drawn = lines.len();
-            write(&format!("{clear}{CLIP}{}\n{WRAP}", lines.join("\n")));
+            output::print(&format!("{clear}{CLIP}{}\n{WRAP}", lines.join("\n")));
         } else {
             self.tell_changes(view, strides);
         }
@@ -58,7 +59,7 @@ impl Screen {
     /// Takes the picture away.
     pub(super) fn close(&mut self) {
         let clear = self.clear();
-        write(&clear);
+        output::print(&clear);
     }
 
     fn clear(&mut self) -> String {
@@ -148,12 +149,6 @@ fn untimed(words: &str) -> String {
 fn bar(phase: f32) -> String {
     let full = ((phase.clamp(0.0, 1.0) * BAR as f32) as usize).min(BAR);
     format!("{}{}", "#".repeat(full), ".".repeat(BAR - full))
-}
-
-/// Nobody may look.
-fn write(text: &str) {
-    let mut out = io::stdout().lock();
-    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
 }
 
 #[cfg(test)]

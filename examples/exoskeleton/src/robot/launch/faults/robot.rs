@@ -61,7 +61,10 @@ impl Robot {
         folder: &Path,
     ) -> Result<Self, FaultError> {
         let file = folder.join("topology.toml");
-        std::fs::write(&file, topology.to_toml())?;
+        let at = |error: std::io::Error| {
+            std::io::Error::new(error.kind(), format!("cannot write {}: {error}", file.display()))
+        };
+        std::fs::write(&file, topology.to_toml()).map_err(at)?;
         let (say_line, lines) = sync_channel(LINES_MAX);
         let socket = topology.central.socket.clone().expect("a topology for this host has sockets");
         let mut robot = Self {

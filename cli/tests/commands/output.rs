@@ -1,0 +1,96 @@
+//! Every command where its output goes to a full disk, or to a pipe that nobody reads.
+
+use std::{
+    fs::File,
+    process::{Command, Stdio},
+};
+
+use crate::scenario::{Answer, Scenario};
+
+/// One of each command that answers by itself, for a node called `hip`.
+const COMMANDS: [&[&str]; 17] = [
+    &["--help"],
+    &["--version"],
+    &["watch", "--help"],
+    &["completions", "bash"],
+    &["keys", "show"],
+    &["keys", "init", "walker", "hip=127.0.0.1"],
+    &["nodes"],
+    &["nodes", "--json"],
+    &["apps"],
+    &["tree"],
+    &["ping", "hip", "--count", "1"],
+    &["send", "hip", "demo.nothing", "{}"],
+    &["watch", "hip", "--json"],
+    &["why", "hip"],
+    &["barriers"],
+    &["audit"],
+    &["doctor"],
+];
+
+/// What a command did that had this standard output and standard error.
+fn run(scenario: &Scenario, words: &[&str], out: Stdio, err: Stdio) -> Answer {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
+    let asks_no_node = matches!(words[0], "keys" | "completions") || words.contains(&"--help");
+    if !asks_no_node {
+        command.arg("--socket").arg(scenario.socket("hip"));
+    }
+    let answer = command
+        .args(words)
+        .current_dir(scenario.directory.join("."))
+        .stdin(Stdio::null())
+        .stdout(out)
+        .stderr(err)
+        .output()
+        .expect("the command starts");
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    Answer { code: answer.status.code(), out: text(&answer.stdout), err: text(&answer.stderr) }
+}
+
+fn full_disk() -> Stdio {
+    File::options().write(true).open("/dev/full").expect("Linux has it").into()
+}
+
+/// The end of a pipe whose reader has gone.
+fn closed_pipe() -> Stdio {
+    let (reader, writer) = std::io::pipe().expect("a pipe");
+    drop(reader);
+    writer.into()
+}
+
+#[test]
+fn every_command_fails_in_words_where_the_disk_is_full() {
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &[]);
+    hip.wait_for(&["started"]);
+    for words in COMMANDS {
+        let answer = run(&scenario, words, full_disk(), Stdio::piped());
+        assert!(!matches!(answer.code, None | Some(0 | 101)), "{words:?}: {:?} {}", answer.code, answer.err);
+        assert!(
+            answer.err.contains("standard output is incomplete: No space left"),
+            "{words:?}: {}",
+            answer.err
+        );
+    }
+    let fine = run(&scenario, &["nodes", "--json"], full_disk(), Stdio::piped());
+    assert_eq!(fine.code, Some(4), "{}", fine.err);
+}
+
+#[test]
+fn every_command_ends_quietly_where_nobody_reads_it() {
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &[]);
+    hip.wait_for(&["started"]);
+    for words in COMMANDS {
+        let answer = run(&scenario, words, closed_pipe(), Stdio::piped());
+        assert!(!matches!(answer.code, None | Some(4 | 101)), "{words:?}: {:?} {}", answer.code, answer.err);
+        assert!(!answer.err.contains("standard output"), "{words:?}: {}", answer.err);
+        // And where nobody reads its errors either.
+        let mute = run(&scenario, words, closed_pipe(), closed_pipe());
+        assert!(!matches!(mute.code, None | Some(4 | 101)), "{words:?}: {:?}", mute.code);
+    }
+    let wrong = run(&scenario, &["nodes", "--wrong"], Stdio::piped(), full_disk());
+    assert_eq!(wrong.code, Some(2), "{}", wrong.out);
+    let nobody = run(&scenario, &["--socket", "/nowhere.sock", "nodes"], full_disk(), full_disk());
+    assert!(matches!(nobody.code, Some(2 | 3)), "{:?}", nobody.code);
+}

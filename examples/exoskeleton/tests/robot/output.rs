@@ -1,0 +1,99 @@
+//! Runs whose output goes to a full disk, or to a pipe that nobody reads.
+
+use std::fs::File;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+
+use exoskeleton::robot::topology::for_this_host;
+
+use crate::{PROGRAM, folder};
+
+const WALK: [&str; 7] = ["--lock-step", "--strides", "8", "--runs", "runs", "--report", "report.json"];
+
+fn run(folder: &Path, arguments: &[&str], out: Stdio, err: Stdio) -> Output {
+    let mut command = Command::new(PROGRAM);
+    command.args(arguments).current_dir(folder).stdin(Stdio::null()).stdout(out).stderr(err);
+    command.output().expect("the program that was just built starts")
+}
+
+fn full_disk() -> Stdio {
+    File::options().write(true).open("/dev/full").expect("Linux has it").into()
+}
+
+/// The end of a pipe whose reader has gone.
+fn closed_pipe() -> Stdio {
+    let (reader, writer) = std::io::pipe().expect("a pipe");
+    drop(reader);
+    writer.into()
+}
+
+fn assert_recorded(folder: &Path) {
+    let run = folder.join("runs/lock-step-curves-seed1-8strides");
+    for file in
+        [run.join("gait.svg"), run.join("run.csv"), run.join("report.json"), folder.join("report.json")]
+    {
+        assert!(std::fs::metadata(&file).is_ok_and(|file| file.len() > 0), "{}", file.display());
+        std::fs::remove_file(file).unwrap();
+    }
+}
+
+#[test]
+fn walk_that_nobody_reads_ends_quietly_with_all_its_records() {
+    let folder = folder("pipe");
+    for err in [Stdio::piped(), closed_pipe()] {
+        let output = run(&folder, &WALK, closed_pipe(), err);
+        assert_eq!((output.status.code(), output.stderr.as_slice()), (Some(0), &b""[..]));
+        assert_recorded(&folder);
+    }
+    std::fs::remove_dir_all(&folder).unwrap();
+}
+
+#[test]
+fn walk_whose_output_finds_a_full_disk_is_recorded_and_fails_in_words() {
+    let folder = folder("full");
+    let output = run(&folder, &WALK, full_disk(), Stdio::piped());
+    let words = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{words}");
+    assert!(words.contains("standard output is incomplete: No space left"), "{words}");
+    assert_recorded(&folder);
+    std::fs::remove_dir_all(&folder).unwrap();
+}
+
+#[test]
+fn report_that_finds_a_full_disk_is_named_and_takes_no_other_record_away() {
+    let folder = folder("report");
+    let mut walk = WALK;
+    walk[6] = "/dev/full";
+    let output = run(&folder, &walk, Stdio::piped(), Stdio::piped());
+    let words = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{words}");
+    assert!(words.contains("cannot write /dev/full: No space left"), "{words}");
+    assert!(folder.join("runs/lock-step-curves-seed1-8strides/gait.svg").exists());
+    std::fs::remove_dir_all(&folder).unwrap();
+}
+
+#[test]
+fn every_other_command_has_an_exit_code_of_its_own_for_a_full_disk_and_none_panics() {
+    let folder = folder("others");
+    let topology = folder.join("topology.toml");
+    std::fs::write(&topology, for_this_host(1).expect("free ports").to_toml()).unwrap();
+    let file = topology.to_str().unwrap();
+    let plant = ["node", "plant", "--stop-with-stdin", "--topology", file];
+    for arguments in [&["--help"][..], &["--version"], &["faults", "--help"], &["node", "--help"], &plant] {
+        let output = run(&folder, arguments, full_disk(), Stdio::piped());
+        let words = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{arguments:?}: {words}");
+        assert!(words.contains("standard output is incomplete"), "{arguments:?}: {words}");
+        let output = run(&folder, arguments, closed_pipe(), full_disk());
+        assert_eq!(output.status.code(), Some(0), "{arguments:?}");
+    }
+    // A node logs to standard error alone.
+    let output =
+        run(&folder, &["node", "hip", "--stop-with-stdin", "--topology", file], closed_pipe(), closed_pipe());
+    assert_eq!(output.status.code(), Some(0));
+    for arguments in [&["--wrong"][..], &["--lock-step", "--trial", "nowhere.csv"]] {
+        let output = run(&folder, arguments, closed_pipe(), full_disk());
+        assert!(matches!(output.status.code(), Some(1 | 2)), "{arguments:?}: {:?}", output.status);
+    }
+    std::fs::remove_dir_all(&folder).unwrap();
+}
