@@ -46,7 +46,7 @@ fn run() -> Result<(), Error> {
 fn drive(node: &NodeApi) -> Result<(), Error> {
     let mut drive = node.register_transport_address(Registration::new().name("knee.drive"))?;
     while let Some(message) = drive.receive(10 * SECOND)? {
-        let angle: JointAngle = message.decode()?;
+        let angle: JointAngle = message.decode().map_err(ApiError::from)?;
         writeln!(io::stdout(), "{} is at {} degrees", message.source(), angle.degrees)?;
     }
     Ok(())
