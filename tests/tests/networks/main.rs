@@ -4,5 +4,6 @@
 mod addresses;
 mod hosts;
 mod ipv6;
+mod lengths;
 mod lossy;
 mod seeds;
