@@ -35,6 +35,7 @@ mod access;
 mod aftermath;
 pub mod api;
 pub mod audit;
+mod bind_error;
 mod clocks;
 pub mod config;
 

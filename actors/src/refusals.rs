@@ -18,6 +18,20 @@ const LOG_PERIOD: Duration = Duration::from_secs(1);
 const DETAIL_MAX: usize = 256;
 /// What of a detail is in the log at most, in characters: the longest sentence of this program, and a peer's in it.
 const LOGGED_MAX: usize = 1_024;
+/// Causes that belong to ordinary starts, stops and restarts of nodes. They are counted as all are, and nobody is warned.
+const ORDINARY: [&str; 8] = [
+    // Two nodes have dialled each other at once: one of the two connections stays.
+    "duplicate",
+    "duplicate at the peer",
+    // A node that is being stopped takes no further connection.
+    "leaving",
+    "the peer leaves",
+    // The last datagrams of a life that has just ended, or to one.
+    "datagram of a stranger",
+    "datagram with another key",
+    "datagram of a life that is over",
+    PEER_GONE,
+];
 /// What ends a line or turns it round and is no control character: separators of lines and paragraphs, overrides of direction.
 const LINE_BREAKERS: [char; 9] = [
     '\u{2028}', '\u{2029}', '\u{202a}', '\u{202b}', '\u{202c}', '\u{202d}', '\u{202e}', '\u{2066}',
@@ -36,6 +50,9 @@ pub(crate) struct Refusals {
 
 /// The cause under which messages are counted that the access list refuses.
 pub(crate) const BY_LIST: &str = "access list";
+
+/// The cause under which frames of a layer are counted that a peer was not sent as it is being stopped, or is lost.
+pub(crate) const PEER_GONE: &str = "peer gone";
 
 #[derive(Debug, Default)]
 struct Cause {
@@ -73,7 +90,11 @@ impl Refusals {
         entry.detail = detail.chars().take(DETAIL_MAX).collect();
         // Whoever reads the log may be slow: nobody waits for it with the lock in hand.
         drop(causes);
-        crate::log::warn!(cause, suppressed, "refused: {detail}");
+        if ORDINARY.contains(&cause) {
+            crate::log::debug!(cause, suppressed, "refused: {detail}");
+        } else {
+            crate::log::warn!(cause, suppressed, "refused: {detail}");
+        }
     }
 
     /// Counts a message that the access list refuses, without a lock.

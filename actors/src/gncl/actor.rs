@@ -4,6 +4,7 @@ mod accepting;
 mod by_datagram;
 mod leaving;
 #[cfg(target_os = "linux")]
+mod long_segments;
 mod lost_addresses;
 mod membership;
 mod proven;
@@ -160,8 +161,10 @@ impl Gncl {
                     self.stores.clocks.forget(node, left.incarnation);
                 }
                 self.stores.gncl.forget(node);
+                self.stores.gncl.segments.forget(node);
             }
             Output::Fact(fact) => self.tell(fact, ctx),
+            Output::Silent(node) => self.is_silent(node),
             Output::Count { cause, detail } => self.stores.gncl.refusals.count(Time::now(), cause, &detail),
         }
     }
@@ -170,6 +173,9 @@ impl Gncl {
         let mode = Arc::new(Mutex::new(Mode::Handshake));
         let reading = self.reading(&mode);
         let ends = Ends::of(address, lock(&self.stores.ndl).paths());
+        let node = self.core.node_dialled(connection);
+        let segment_max = node.and_then(|node| self.stores.gncl.segments.limit(node));
+        let ends = Ends { segment_max, ..ends };
         let shared = (mode, reading.heard.clone());
         let reader = self.crowd.join(link::dial(connection, ends, reading));
         self.wires.insert(connection, Wire::new(None, shared, reader, self.secure.is_none()));
@@ -451,6 +457,7 @@ impl Actor for Gncl {
         }
         #[cfg(target_os = "linux")]
         self.watch_interfaces(ctx);
+        self.watch_limits(ctx);
         ctx.add_stream(self.stores.posts.gncl.attach_keeping(Clone::clone));
         ctx.spawn(fut::wrap_future(Store::serve_those_held_up(self.stores.clone())));
         let spin = self.spin.clone();

@@ -18,7 +18,6 @@ use sinew_runtime::{
     time::Time,
     wire::{Checksum, FrameCodec, FrameError, HeaderError, Kind, Message},
 };
-#[cfg(target_os = "linux")]
 use socket2::SockRef;
 use tokio::net::{TcpSocket, TcpStream};
 use tokio_util::codec::Decoder;
@@ -112,6 +111,8 @@ impl Heard {
 pub(super) struct Ends {
     pub(super) to: SocketAddr,
     pub(super) from: Option<IpAddr>,
+    /// How long its segments may be, where that is known.
+    pub(super) segment_max: Option<u32>,
 }
 
 impl Ends {
@@ -138,7 +139,7 @@ impl Ends {
             }
             SocketAddr::V6(_) | SocketAddr::V4(_) => None,
         };
-        Self { to, from }
+        Self { to, from, segment_max: None }
     }
 }
 
@@ -239,6 +240,10 @@ pub(super) async fn connect(ends: Ends, give_up: Duration) -> io::Result<TcpStre
     if let Some(from) = ends.from {
         // An address that was taken away since leaves the choice to the system.
         let _ = socket.bind((from, 0).into());
+    }
+    if let Some(longest) = ends.segment_max {
+        // What the system does not take leaves the connection as it is.
+        let _ = SockRef::from(&socket).set_tcp_mss(longest);
     }
     let socket = socket.connect(ends.to).await?;
     tune(&socket, give_up)?;

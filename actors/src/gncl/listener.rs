@@ -17,7 +17,7 @@ use socket2::{Domain, SockRef, Socket, Type};
 use tokio::net::TcpStream;
 
 use super::lent::Lent;
-use crate::{accept_pace::Pace, config::NodeConfig, refusals::Refusals};
+use crate::{accept_pace::Pace, bind_error, config::NodeConfig, refusals::Refusals};
 
 /// Connections that wait to be accepted at most, at all listeners together; the kernel refuses further ones. Those that 300 nodes make who all
 /// meet this one at once wait here, and are not made again a second later.
@@ -25,24 +25,14 @@ const BACKLOG: i32 = 1_024;
 const BACK_OFF_MIN: Duration = Duration::from_millis(10);
 const BACK_OFF_MAX: Duration = Duration::from_millis(100);
 
-/// Listens at `address`; connections of a former process may still be closing there.
-///
-/// # Errors
-/// What the system says.
-pub(super) fn listen(address: SocketAddr) -> io::Result<TcpListener> {
-    begin_to_listen(&new_socket(address)?, address)
-}
-
 /// Listens at the first interface; where one is chosen by its name, at all addresses that this host has or will have: of IPv4, and of IPv6
-/// only where no interface can have one of IPv4. Where all are of loopback, nowhere else. Where NDL waits for its addresses, as they come and
-/// go, this host need not have the one to listen at yet.
+/// only where no interface can have one of IPv4. Where all are of loopback, nowhere else. This host need not have the address yet: NDL waits for
+/// it, and announces it when it is there.
 ///
 /// # Errors
 /// What the system says.
 pub(super) fn listen_first(config: &NodeConfig) -> io::Result<TcpListener> {
-    let (address, chosen) = (first_of(config), &config.ndl.interface);
-    let may_come = !chosen.are_ipv4_addresses() || chosen.iter().count() > 1;
-    if may_come { listen_also_without(address) } else { listen(address) }
+    listen(first_of(config))
 }
 
 fn first_of(config: &NodeConfig) -> SocketAddr {
@@ -66,8 +56,9 @@ pub(super) fn why_not(config: &NodeConfig, error: &io::Error) -> String {
         "another node or program of this host has this port. Where `ndl.interface` chooses by name, or an IPv6 address, GNCL listens at all \
          addresses of the host, so that each node of one host needs a port of its own, though their addresses differ: set `gncl.port` to a free \
          one (0 takes any), or choose by IPv4 addresses alone"
+            .to_owned()
     } else {
-        "is another node using this port? Set `gncl.port` to a free one (0 takes any), and `ndl.interface` to an address of this host"
+        bind_error::remedy(error, "gncl.port")
     };
     format!("GNCL cannot listen at {address}: {error}; {remedy}")
 }
@@ -78,8 +69,11 @@ fn all_of_ipv6(config: &NodeConfig) -> Ipv6Addr {
     if config.ndl.interface.are_loopback() { Ipv6Addr::LOCALHOST } else { Ipv6Addr::UNSPECIFIED }
 }
 
-/// Listens at an address that this host may not have yet.
-fn listen_also_without(address: SocketAddr) -> io::Result<TcpListener> {
+/// Listens at an address that this host may not have yet; connections of a former process may still be closing there.
+///
+/// # Errors
+/// What the system says.
+pub(super) fn listen(address: SocketAddr) -> io::Result<TcpListener> {
     let socket = new_socket(address)?;
     #[cfg(target_os = "linux")]
     if address.is_ipv4() {
@@ -96,7 +90,7 @@ pub(super) fn listen_at_further(config: &NodeConfig, refusals: &Refusals) -> Vec
     if !config.ndl.interface.are_ipv4_addresses() {
         return Vec::new();
     }
-    let listen = |ip: Ipv4Addr| {
+    let listen_at = |ip: Ipv4Addr| {
         let address = (ip, config.gncl.port).into();
         let noted = |error: &io::Error| {
             refusals.count(
@@ -105,9 +99,9 @@ pub(super) fn listen_at_further(config: &NodeConfig, refusals: &Refusals) -> Vec
                 &format_args!("{address}: {error}"),
             );
         };
-        listen_also_without(address).inspect_err(noted).ok()
+        listen(address).inspect_err(noted).ok()
     };
-    config.gncl_further().into_iter().filter_map(listen).collect()
+    config.gncl_further().into_iter().filter_map(listen_at).collect()
 }
 
 /// Listens at all IPv6 addresses, too, where interfaces may have some beside those of IPv4: at the same port, if that is free or was asked for.
@@ -117,7 +111,7 @@ pub(super) fn listen_at_ipv6(config: &NodeConfig, first: SocketAddr) -> Option<T
         return None;
     }
     // Loopback may have no address of IPv6 yet, or never.
-    let listen_at = |port| listen_also_without((all_of_ipv6(config), port).into());
+    let listen_at = |port| listen((all_of_ipv6(config), port).into());
     let listened = match listen_at(first.port()) {
         Err(error) if config.gncl.port == 0 && error.kind() == io::ErrorKind::AddrInUse => listen_at(0),
         listened => listened,
@@ -318,20 +312,25 @@ mod tests {
 
     #[test]
     fn who_cannot_listen_is_told_where_and_that_nodes_at_all_addresses_need_a_port_each() {
-        let words = |interface: &str, error: io::ErrorKind| {
+        let words = |interface: &str, error: io::Error| {
             let mut config = NodeConfig::new("test");
             config.ndl.interface = vec![interface.parse().unwrap()].into();
             config.gncl.port = 7_000;
-            why_not(&config, &error.into())
+            why_not(&config, &error)
         };
         for (interface, at) in [("eth0", "0.0.0.0:7000"), ("fd00::7", "[::]:7000")] {
-            let said = words(interface, io::ErrorKind::AddrInUse);
+            let said = words(interface, Errno::ADDRINUSE.into());
             assert!(said.contains(&format!("listen at {at}: ")), "{said}");
             assert!(said.contains("needs a port of its own") && said.contains("`gncl.port`"), "{said}");
         }
-        let said = words("10.0.0.7", io::ErrorKind::AddrInUse);
+        let said = words("10.0.0.7", Errno::ADDRINUSE.into());
         assert!(said.contains("listen at 10.0.0.7:7000") && !said.contains("of its own"), "{said}");
-        assert!(words("::1", io::ErrorKind::AddrNotAvailable).contains("listen at [::1]:7000"));
+        let said = words("::1", Errno::ADDRNOTAVAIL.into());
+        assert!(
+            said.contains("listen at [::1]:7000") && said.contains("does not have this address"),
+            "{said}"
+        );
+        assert!(!words("10.0.0.7", Errno::MFILE.into()).contains("another node"));
     }
 
     #[test]

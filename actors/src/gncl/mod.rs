@@ -22,6 +22,7 @@
 //! | GNCL-15 | Who waits no more for a reply says CANCEL, to a peer that knows it: a request that still waits is taken out as `Expired`. |
 //! | GNCL-16 | All addresses that a peer announces are dialled, 20 ms apart; the first that is reached stays, the others are closed. |
 //! | GNCL-17 | Outcomes that wait go several in one frame, to a peer that knows `outcomes`. |
+//! | GNCL-19 | Where long packets do not arrive at a peer, connections to it have segments that do. |
 //! | GNCL-13 | When a connection ends, nothing is lost (`session/`); when the node is, what was sent is `Unknown`, what waited `PeerLost`. |
 //!
 //! | file | what it is |
@@ -71,6 +72,7 @@ mod owed;
 mod peer;
 mod proofs;
 mod secure;
+mod segments;
 mod spin;
 mod stream_way;
 mod task;

@@ -35,6 +35,7 @@ use super::{
     owed::Owed,
     proofs::Proofs,
     secure::Secure,
+    segments::Segments,
     task::{Move, Place},
     ticks::Ticks,
     transport::Transport,
@@ -122,7 +123,7 @@ impl Peer {
             let key = RandomState::new().hash_one(());
             let ends = (stores.node, attach.node);
             let former = stores.gncl.handed_on(attach.node, attach.incarnation);
-            Channel::new(now, ends, key, former, (&stores.gncl.alarm, refusals))
+            Channel::new(now, ends, key, former, &stores.gncl)
         });
         let (buried, expiring) = (stores.gncl.buried.clone(), stores.gncl.expiring.clone());
         let fewer_owed = fewer_owed.clone();
@@ -380,6 +381,8 @@ pub(crate) struct Store {
     /// Where datagrams are read, and who looks at the time for them.
     pub(super) datagrams: Sockets,
     pub(super) alarm: Arc<Alarm>,
+    /// How long segments of connections may be.
+    pub(super) segments: Arc<Segments>,
     /// What is told of connections to whoever asks.
     pub(crate) notes: Notes,
     /// What GNCL refused, and why.

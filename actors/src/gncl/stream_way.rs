@@ -9,10 +9,13 @@ pub(crate) struct ByDatagram {
     pub(crate) sent: u64,
     /// Those of them that the peer has acknowledged.
     pub(crate) arrived: u64,
+    /// The longest payload that goes so, where longer datagrams do not arrive.
+    pub(crate) payload_max: Option<usize>,
 }
 
 /// What went by datagram; `None` where the two nodes have not agreed on datagrams, so that all goes by the connection.
 pub(crate) fn by_datagram(peer: &Peer) -> Option<ByDatagram> {
-    let position = peer.channel()?.position();
-    Some(ByDatagram { sent: position.counts.sent, arrived: position.arrived })
+    let channel = peer.channel()?;
+    let (position, payload_max) = (channel.position(), channel.payload_max());
+    Some(ByDatagram { sent: position.counts.sent, arrived: position.arrived, payload_max })
 }

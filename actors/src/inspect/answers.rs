@@ -370,9 +370,10 @@ fn stream(stores: &Stores, peer: &Peer) -> Option<StreamReport> {
     let has_a_connection = peer.ways().len() > 1;
     has_a_connection.then(|| {
         let by_datagram = gncl::by_datagram(peer);
-        let ByDatagram { sent, arrived } = by_datagram.unwrap_or_default();
+        let ByDatagram { sent, arrived, payload_max } = by_datagram.unwrap_or_default();
         let is_on = stores.config.gncl.datagrams;
-        StreamReport { is_on, is_agreed: by_datagram.is_some(), sent, arrived }
+        let payload_max = payload_max.map(|bytes| bytes as u64);
+        StreamReport { is_on, is_agreed: by_datagram.is_some(), sent, arrived, payload_max }
     })
 }
 

@@ -12,6 +12,7 @@ use std::{
     collections::BTreeSet,
     future::poll_fn,
     hash::{BuildHasher, RandomState},
+    io,
     net::{SocketAddr, SocketAddrV6},
     rc::Rc,
     sync::{Arc, MutexGuard, PoisonError, atomic::Ordering},
@@ -45,7 +46,7 @@ use super::{
     progress::{Progress, RootWatch},
 };
 use crate::{
-    aftermath,
+    aftermath, bind_error,
     config::NodeConfig,
     gncl, node,
     refusals::Refusals,
@@ -90,11 +91,14 @@ impl Actor for NdlActor {
         // The first queries leave here.
         shell.carry_out();
         let chosen = &self.stores.config.ndl.interface;
-        if chosen.are_ipv4_addresses() && chosen.iter().count() == 1 {
-            // Nothing comes and goes.
-            if let Some(here) = shell.paths.here().first() {
-                ctx.spawn(speaking::speak_mdns(shell.clone(), *here).into_actor(self));
-            }
+        let only = if chosen.are_ipv4_addresses() && chosen.iter().count() == 1 {
+            shell.paths.here().first().copied()
+        } else {
+            None
+        };
+        if let Some(here) = only {
+            // It is open, and nothing comes and goes.
+            ctx.spawn(speaking::speak_mdns(shell.clone(), here).into_actor(self));
         } else {
             let news = (!chosen.are_ipv4_addresses()).then(|| interfaces::watch(chosen.clone()));
             let news = news.transpose().unwrap_or_else(|error| {
@@ -178,12 +182,11 @@ impl Shell {
         let (chosen, port, paths) = (&stores.config.ndl.interface, stores.config.ndl.port, Paths::default());
         let addresses: Vec<_> = chosen.addresses().map(LocalAddress::from).collect();
         let (readers, unopened) = paths.open(&stores, &addresses);
-        // Of several each may come later.
-        if let Some((_, error)) = unopened.first().filter(|_| chosen.iter().count() == 1) {
-            return Err(format!(
-                "NDL cannot use UDP {chosen}:{port}: {error}; set `ndl.interface` to an IPv4 address of this host \
-                 and `ndl.port` to a free port, or to 0 for any"
-            ));
+        // An address that this host does not have may come later; of several each may be opened later, whatever the error.
+        let is_final = |error: &io::Error| chosen.iter().count() == 1 && !bind_error::may_come_later(error);
+        if let Some((_, error)) = unopened.first().filter(|(_, error)| is_final(error)) {
+            let remedy = bind_error::remedy(error, "ndl.port");
+            return Err(format!("NDL cannot use UDP {chosen}:{port}: {error}; {remedy}"));
         }
         // Before the core is looked at: what GNCL changes from now on is in NDL's post.
         let links = links(&stores);

@@ -28,7 +28,7 @@ use crate::{
     monitors,
     ndl::MembershipFact,
     node::RootEvent,
-    refusals::Refusals,
+    refusals::{PEER_GONE, Refusals},
     stores::{POST_CAPACITY, Stores},
     wills,
 };
@@ -42,6 +42,12 @@ pub(crate) struct SyncManager {
     in_hand: Option<Place>,
     /// The timer that is set, and for when.
     alarm: Option<(Time, SpawnHandle)>,
+}
+
+/// The cause under which a frame is counted that a peer was not sent.
+const fn cause_of(why: Rejection) -> &'static str {
+    // It is being stopped, or has been lost: this life of it needs to know nothing more.
+    if matches!(why, Rejection::Closed | Rejection::NoSuchNode) { PEER_GONE } else { "peer" }
 }
 
 impl SyncManager {
@@ -388,7 +394,10 @@ impl SyncManager {
         let mut header = Header::new(Kind::SYNC_DIRECTORY, self.tid(), Tid::new(to, AppAddress::SYNC));
         self.stamp(&mut header);
         if let Err(why) = self.stores.router.send(Message::new(header, list)) {
-            self.refuse("peer", &format_args!("{to} was not sent this node's directory, tried again: {why}"));
+            self.refuse(
+                cause_of(why),
+                &format_args!("{to} was not sent this node's directory, tried again: {why}"),
+            );
             // One that takes shorter words than this node writes is not helped by haste.
             if why != Rejection::TooLong {
                 self.core().handle(Time::now(), Input::ListNotTaken { to });
@@ -401,7 +410,10 @@ impl SyncManager {
         let mut header = Header::new(Kind::SYNC_ARRIVALS, self.tid(), Tid::new(to, AppAddress::SYNC));
         self.stamp(&mut header);
         if let Err(why) = self.stores.router.send(Message::new(header, said)) {
-            self.refuse("peer", &format_args!("{to} was not told who waits at barriers, tried again: {why}"));
+            self.refuse(
+                cause_of(why),
+                &format_args!("{to} was not told who waits at barriers, tried again: {why}"),
+            );
             // One that takes shorter words than this node writes is not helped by haste.
             if why != Rejection::TooLong {
                 self.core().handle(Time::now(), Input::ArrivalsNotTaken { to });

@@ -177,6 +177,15 @@ impl Hosts {
         self.set_port(host, 0, "master bridge0");
     }
 
+    /// From now on the first network carries no packet longer than `mtu` bytes from a host nor to it; nobody's kernel knows, and no ICMP
+    /// says so.
+    ///
+    /// # Panics
+    /// If the kernel refuses.
+    pub fn limit_packets(&self, host: usize, mtu: u32) {
+        self.set_port(host, 0, &format!("mtu {mtu}"));
+    }
+
     /// Takes a host's own interface in a network down.
     ///
     /// # Panics

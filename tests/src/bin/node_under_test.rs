@@ -1,8 +1,9 @@
 //! A node for the scenarios: one application that sends, and says what it sees, one line each.
 //!
 //! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--floods NAME]... [--will NAME]... [--meets NAME]... [--incarnation NUMBER]
-//! [--says-directory] [--logs | --logs-info]`
+//! [--says-directory] [--streams-to NAME [--stream BYTES]...] [--logs | --logs-info]`
 //!
+//! For each length that it streams it has an application more, which sends a value of class Stream of so many bytes every 20 ms.
 //! Whom it floods it sends as many counts as are taken, to each the same. A will is a count of 1,000,000. The
 //! incarnation is the clock's of its host, if none is given. What it logs goes to its standard error, with `--logs` warnings and with `--logs-info` more go to its output.
 //! With those whom it meets, itself among them, it waits at a barrier when it starts, once. When it has started is said in nanoseconds of the
@@ -13,6 +14,29 @@ use std::process::ExitCode;
 use sinew::{Barrier, Meet, NodeHandle, prelude::*};
 
 payload!("scenario.count", Bulk => struct Count { number: u64 });
+
+payload!("scenario.sized", Stream => struct Sized { number: u64, filler: Vec<u8> });
+
+/// Bytes of a value beside those of its filler, at most.
+const FRAME_OF_FILLER: usize = 12;
+
+/// Sends values of one length.
+struct Streamer {
+    to: String,
+    length: usize,
+    sent: u64,
+}
+
+impl Actor for Streamer {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        context.every(Duration::from_millis(20), |this, _, context| {
+            let filler = vec![7; this.length.saturating_sub(FRAME_OF_FILLER)];
+            this.sent += u64::from(context.send(&*this.to, &Sized { number: this.sent + 1, filler }).is_ok());
+        });
+    }
+}
 
 /// Counts in each millisecond to whom it floods.
 const AT_ONCE: u32 = 100;
@@ -70,6 +94,14 @@ impl Handler<Delivery<Count>> for Probe {
     }
 }
 
+impl Handler<Delivery<Sized>> for Probe {
+    type Result = ();
+
+    fn handle(&mut self, value: Delivery<Sized>, _: &mut Self::Context) {
+        println!("sized {} number {}", value.filler.len() + FRAME_OF_FILLER, value.number);
+    }
+}
+
 impl Handler<Delivery<NodeEvent>> for Probe {
     type Result = ();
 
@@ -96,6 +128,20 @@ fn say_the_directory(node: &NodeHandle) {
             println!("directory {}", entries.join(" "));
         }
     }
+}
+
+/// An application for each length that is streamed.
+fn streamers(name: &str, receivers: &[String], lengths: &[String]) -> Vec<AppSpec<Streamer>> {
+    let of_one = |to: &String| {
+        let lengths = lengths.iter().filter_map(|length| length.parse().ok());
+        let of_length = |length: usize| {
+            let receiver = to.clone();
+            let make = move || Streamer { to: receiver.clone(), length, sent: 0 };
+            AppSpec::new(format!("{name}.{length}"), make).requires([to.clone()])
+        };
+        lengths.map(of_length).collect::<Vec<_>>()
+    };
+    receivers.iter().flat_map(of_one).collect()
 }
 
 fn main() -> ExitCode {
@@ -132,6 +178,7 @@ fn main() -> ExitCode {
     };
     let mut probe = AppSpec::new(name.as_str(), make)
         .handles::<Count>()
+        .handles::<Sized>()
         .handles::<NodeEvent>()
         .handles::<RequirementEvent>()
         .requires(after("--requires"))
@@ -139,7 +186,10 @@ fn main() -> ExitCode {
     for heir in after("--will") {
         probe = probe.last_will(heir.as_str(), &Count { number: 1_000_000 });
     }
-    let mut builder = Node::builder(name).config(config).app(probe).heed_signals();
+    let mut builder = Node::builder(name.clone()).config(config).app(probe).heed_signals();
+    for streamer in streamers(&name, &after("--streams-to"), &after("--stream")) {
+        builder = builder.app(streamer);
+    }
     for life in after("--incarnation") {
         let Ok(life) = life.parse() else {
             println!("refused --incarnation {life}: it is no number");

@@ -5,6 +5,7 @@ mod audits;
 mod bad_input;
 mod barriers;
 mod directory;
+mod healthy;
 mod lives;
 mod messages;
 mod other_language;

@@ -3,7 +3,7 @@
 use std::sync::{Arc, Weak};
 
 use actix::SpawnHandle;
-use sinew_runtime::time::Time;
+use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::super::{
     core::Lane,
@@ -35,6 +35,11 @@ impl Linked {
         let peer = self.peer.upgrade();
         let Some(way) = peer.as_ref().and_then(|peer| peer.way(self.lane)) else { return true };
         way.outlet.disconnect(self.number)
+    }
+
+    /// At the other end.
+    pub(super) fn node(&self) -> Option<NodeAddress> {
+        self.peer.upgrade().map(|peer| peer.node)
     }
 
     /// Whether words for the peer still wait there.

@@ -341,11 +341,11 @@ impl Core {
         let Some(stage) = self.stage(connection) else { return };
         match stage {
             Stage::HelloSent(node, _) | Stage::Linked(node, _) => {
-                // Two nodes that dial each other at once refuse one of the two: that is how it should be.
-                let cause = if refusal.cause == "duplicate" {
-                    "duplicate at the peer"
-                } else {
-                    "refused by the peer"
+                let cause = match &*refusal.cause {
+                    // Two nodes that dial each other at once refuse one of the two: that is how it should be.
+                    "duplicate" => "duplicate at the peer",
+                    "leaving" => "the peer leaves",
+                    _ => "refused by the peer",
                 };
                 self.count(cause, format!("node {node} says: {}", printable(&refusal.sentence)));
             }

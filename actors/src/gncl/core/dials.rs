@@ -111,6 +111,14 @@ impl Core {
         dials.into_iter().find_map(|(node, dial)| Some((node, dial.address_of(connection)?)))
     }
 
+    /// Whose connection is dialled there.
+    pub(in crate::gncl) fn node_dialled(&self, connection: ConnectionId) -> Option<NodeAddress> {
+        match self.connections.get(&connection)?.stage {
+            Stage::Dialling(node, _) => Some(node),
+            Stage::HelloSent(..) | Stage::Linked(..) | Stage::Stranger | Stage::Leaving => None,
+        }
+    }
+
     fn dial_over(&mut self, now: Time, node: NodeAddress) {
         let chance = self.chance();
         if let Some(peer) = self.peers.get_mut(&node) {

@@ -31,7 +31,7 @@ pub(crate) const CANCEL: &str = "cancel";
 pub(crate) const OUTCOMES: &str = "outcomes";
 
 /// The ability to have values of class Stream by datagram.
-pub(crate) const DATAGRAMS: &str = "datagrams";
+pub(crate) const DATAGRAMS: &str = "datagrams-2";
 
 /// Whose messages a connection carries: those of one class, where both nodes know [`CLASSES`]. Where one does not, the first
 /// carries all.

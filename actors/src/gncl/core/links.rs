@@ -308,6 +308,7 @@ impl Core {
             "silent link",
             format!("node {node} answers no ping; its GNCL hangs or the way to it is cut"),
         );
+        self.outputs.push_back(Output::Silent(node));
         self.ended(now, connection);
         self.outputs.push_back(Output::Close(connection));
     }

@@ -148,6 +148,8 @@ pub(super) enum Output {
     Forget(NodeAddress),
     /// Tell the other layers.
     Fact(LinkFact),
+    /// A connection to the node answers no ping, and is closed: whether the node itself is silent is not known here.
+    Silent(NodeAddress),
     /// Count a refusal, ours or the peer's.
     Count { cause: &'static str, detail: String },
 }

@@ -19,12 +19,16 @@ use sinew_runtime::{
 use super::{
     core::{Core, Order, stamp},
     incoming::Incoming,
+    lengths::Report,
     outgoing::{Offered, Position},
     packet::{ACK_LEN, Content, DATAGRAM_MAX, PREFIX_LEN, Packet, Prefix, RANGE_LEN, RANGES_MAX},
     reader::Alarm,
     sockets::{Announcement, Door},
 };
-use crate::{gncl::way::Way, refusals::Refusals};
+use crate::{
+    gncl::{peer::Store, segments::Segments, way::Way},
+    refusals::Refusals,
+};
 
 /// Bytes of a payload at most that goes by datagram.
 pub(super) const PAYLOAD_MAX: usize = DATAGRAM_MAX - PREFIX_LEN - HEADER_LEN;
@@ -64,6 +68,8 @@ struct State {
     payload_max: usize,
     /// No value goes by datagram any more.
     is_retired: bool,
+    /// The longest datagram that arrives, as connections to the peer know it.
+    narrow: Option<usize>,
 }
 
 impl State {
@@ -96,6 +102,7 @@ pub(in crate::gncl) struct Channel {
     /// When the peer spoke on a connection last.
     heard: AtomicU64,
     alarm: Arc<Alarm>,
+    segments: Arc<Segments>,
     refusals: Arc<Refusals>,
 }
 
@@ -107,15 +114,18 @@ impl Channel {
         (here, node): (NodeAddress, NodeAddress),
         key: u64,
         former: Option<HandedOn>,
-        (alarm, refusals): (&Arc<Alarm>, &Arc<Refusals>),
+        store: &Store,
     ) -> Self {
         let mut core = Core::new(now.as_nanos());
         if let Some(HandedOn(incoming)) = former {
             core.incoming = incoming;
         }
-        let state = State { core, connection: None, target: None, payload_max: 0, is_retired: false };
-        let (alarm, refusals) = (alarm.clone(), refusals.clone());
-        Self { here, node, key, state: Mutex::new(state), heard: AtomicU64::new(0), alarm, refusals }
+        let state =
+            State { core, connection: None, target: None, payload_max: 0, is_retired: false, narrow: None };
+        let (state, heard) = (Mutex::new(state), AtomicU64::new(0));
+        let Store { alarm, segments, refusals, .. } = store;
+        let (alarm, segments, refusals) = (alarm.clone(), segments.clone(), refusals.clone());
+        Self { here, node, key, state, heard, alarm, segments, refusals }
     }
 
     /// There is a connection for Stream, between these two addresses, and `door` is beside it; the peer takes payloads of `payload_max`
@@ -258,8 +268,8 @@ impl Channel {
         {
             crate::log::debug!(node = %self.node, "values of class Stream go by datagram");
         }
-        if content.is_probe {
-            state.core.asked(now, prefix.stamp);
+        if let Some(number) = content.probe {
+            state.core.asked(now, prefix.stamp, number);
         }
         let mut message = value?;
         let number = std::mem::take(&mut message.header.correlation);
@@ -294,15 +304,27 @@ impl Channel {
 
     /// Time has passed. Returns when it is to be told again.
     pub(in crate::gncl) fn tick(&self, now: Time, way: &Way) -> Option<Time> {
-        let (wake, blocked) = {
+        let (wake, blocked, report, narrow) = {
             let state = &mut *self.lock();
             let heard = Time::from_nanos(self.heard.load(Ordering::Relaxed));
             let is_blocked = state.core.tick(now, heard);
             self.hand_over(now, state, way);
             self.write(state, now);
             let target = state.target.as_ref().map(|target| target.address);
-            (state.next_wake(), target.filter(|_| is_blocked))
+            let report = state.core.report().zip(target);
+            let measured = state.core.lengths.narrow();
+            let is_news =
+                if measured.is_some() { measured != state.narrow } else { state.core.lengths.is_full() };
+            let narrow = (is_news && measured != state.narrow).then_some(measured);
+            state.narrow = narrow.unwrap_or(state.narrow);
+            (state.next_wake(), target.filter(|_| is_blocked), report, narrow)
         };
+        if let Some(narrow) = narrow {
+            self.segments.measured(self.node, narrow);
+        }
+        if let Some((report, to)) = report {
+            self.log(report, to);
+        }
         if let Some(to) = blocked {
             crate::log::warn!(
                 node = %self.node, %to,
@@ -312,6 +334,26 @@ impl Channel {
             );
         }
         wake
+    }
+
+    fn log(&self, report: Report, to: SocketAddr) {
+        match report {
+            Report::Narrow(longest) => crate::log::warn!(
+                node = %self.node, %to, longest,
+                "datagrams (UDP) of more than {longest} bytes do not arrive at this node, shorter ones do: longer values of class Stream go by the connection \
+                 (TCP), where one lost packet can hold them up for 200 ms. Compare the MTU of the interfaces at both ends and on the way (`ip link`), and let \
+                 ICMP \"packet too big\" through every firewall"
+            ),
+            Report::Full => {
+                crate::log::info!(node = %self.node, %to, "datagrams (UDP) of every length arrive at this node again")
+            }
+        }
+    }
+
+    /// The longest payload that goes by datagram, where longer datagrams do not arrive.
+    pub(in crate::gncl) fn payload_max(&self) -> Option<usize> {
+        let longest = self.lock().core.lengths.narrow()?;
+        Some(longest.saturating_sub(PREFIX_LEN + HEADER_LEN))
     }
 
     /// No value goes by datagram any more; what is under way goes by the connection.
@@ -364,7 +406,7 @@ impl Channel {
             let mut packet = Packet::new(self.here, target.key, stamp(now));
             match core.poll(now) {
                 None => return,
-                Some(Order::Probe) => packet.probe(),
+                Some(Order::Probe(number, length)) => packet.probe(number, length),
                 Some(Order::Acknowledgement) => acknowledge(&mut packet, core, now, 0),
                 Some(Order::Value(number, message)) => {
                     let mut header = message.header;
@@ -374,6 +416,7 @@ impl Channel {
                     let head = Checksum::Crc.encode(&header, &payload);
                     acknowledge(&mut packet, core, now, HEADER_LEN + payload.len());
                     packet.value(&head, &payload);
+                    core.outgoing.went(number, packet.len());
                 }
             }
             // What the system does not take is a datagram that is lost, and sent again: the network does the same.
@@ -388,7 +431,8 @@ impl Channel {
 
 /// Says with a datagram what has come, as far as there is room before `length` bytes.
 fn acknowledge(packet: &mut Packet, core: &mut Core<Flow, Message>, now: Time, length: usize) {
-    let Some(room) = packet.room().checked_sub(length + ACK_LEN + RANGE_LEN) else { return };
+    let before = packet.len() + length + ACK_LEN + RANGE_LEN;
+    let Some(room) = core.lengths.room().checked_sub(before) else { return };
     let ranges_max = (room / RANGE_LEN + 1).min(RANGES_MAX);
     if let Some(said) = core.incoming.take(now, ranges_max) {
         packet.acknowledge(&said);

@@ -6,6 +6,7 @@ use sinew_runtime::time::Time;
 
 use super::{
     incoming::{self, Incoming},
+    lengths::{Lengths, Report},
     outgoing::{LIMITS, Outgoing, Position},
     packet::Acknowledgement,
     path::{Path, Step},
@@ -14,8 +15,8 @@ use super::{
 /// What is to be sent.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Order<'a, V> {
-    /// A datagram that is to be answered.
-    Probe,
+    /// A probe with this number, which makes a datagram of this length.
+    Probe(u64, usize),
     /// This value, with its number.
     Value(u64, &'a V),
     /// What has come.
@@ -28,9 +29,9 @@ pub(super) struct Core<K, V> {
     pub(super) outgoing: Outgoing<K, V>,
     pub(super) incoming: Incoming<K>,
     path: Path,
+    pub(super) lengths: Lengths,
     /// Since when datagrams go where they do: what answers an earlier one says nothing of the way there.
     there_since: Time,
-    is_to_probe: bool,
 }
 
 impl<K: Ord + Copy, V> Core<K, V> {
@@ -40,8 +41,8 @@ impl<K: Ord + Copy, V> Core<K, V> {
             outgoing: Outgoing::new(first, LIMITS),
             incoming: Incoming::new(incoming::FLOWS_MAX),
             path: Path::new(),
+            lengths: Lengths::new(),
             there_since: Time::ZERO,
-            is_to_probe: false,
         }
     }
 
@@ -49,6 +50,7 @@ impl<K: Ord + Copy, V> Core<K, V> {
     /// [`hand_over`](Outgoing::hand_over) follows.
     pub(super) fn announced(&mut self, now: Time) {
         self.path.announced(now);
+        self.lengths.reset();
         self.there_since = now;
         self.outgoing.turn_to_connection();
     }
@@ -56,6 +58,7 @@ impl<K: Ord + Copy, V> Core<K, V> {
     /// There is a new connection, and the peer reads datagrams where it did.
     pub(super) const fn reconnected(&mut self, now: Time) {
         self.path.reconnected(now);
+        self.lengths.reconnected(now);
     }
 
     /// The peer has forgotten what came from here. [`announced`](Self::announced) follows.
@@ -67,14 +70,14 @@ impl<K: Ord + Copy, V> Core<K, V> {
     /// No datagrams are sent any more. What is under way goes by the connection: [`hand_over`](Outgoing::hand_over) follows.
     pub(super) fn retire(&mut self) {
         self.path.over();
-        self.is_to_probe = false;
+        self.lengths.reset();
         self.outgoing.turn_to_connection();
     }
 
     /// The peer is gone, with all that was for it.
     pub(super) fn end(&mut self) {
         self.path.over();
-        self.is_to_probe = false;
+        self.lengths.reset();
         self.outgoing.end();
     }
 
@@ -89,21 +92,28 @@ impl<K: Ord + Copy, V> Core<K, V> {
     /// # Errors
     /// The value: it goes by the connection.
     pub(super) fn submit(&mut self, key: K, value: V, bytes: usize, expiry: Time) -> Result<(), V> {
-        if self.path.is_open() { self.outgoing.submit(key, value, bytes, expiry) } else { Err(value) }
+        // spec: DATAGRAM-7
+        let may = self.path.is_open() && bytes <= self.lengths.limit();
+        if may { self.outgoing.submit(key, value, bytes, expiry) } else { Err(value) }
     }
 
-    /// A datagram has come that is to be answered.
-    pub(super) const fn asked(&mut self, now: Time, stamp: u32) {
-        self.incoming.asked(now, stamp);
+    /// A probe has come.
+    pub(super) fn asked(&mut self, now: Time, stamp: u32, number: u64) {
+        self.incoming.asked(now, stamp, number);
     }
 
     /// The peer says what has come. Returns whether values go by datagram from now on, and did not before.
     pub(super) fn acknowledged(&mut self, now: Time, said: &Acknowledgement) -> bool {
-        self.outgoing.acknowledged(said, stamp(now));
+        let value = self.outgoing.acknowledged(said, stamp(now));
+        let longest = value.max(self.lengths.answered(said.ranges()));
         let age_us = stamp(now).wrapping_sub(said.echo);
         // spec: DATAGRAM-5
         let is_from_there = u128::from(age_us) <= now.since(self.there_since).as_micros();
-        is_from_there && self.path.answered()
+        let is_news = is_from_there && self.path.answered();
+        if longest > 0 && self.path.is_open() {
+            self.judge_lengths(|lengths| lengths.arrived(now, longest));
+        }
+        is_news
     }
 
     /// Time has passed; [`hand_over`](Outgoing::hand_over) follows. `heard` is when the peer spoke on a connection last. Returns whether
@@ -112,32 +122,63 @@ impl<K: Ord + Copy, V> Core<K, V> {
         let is_blocked = self.path.is_to_warn(now, heard);
         match self.path.tick(now) {
             Step::Nothing => {}
-            Step::Probe => self.is_to_probe = true,
+            Step::Probe => self.lengths.probe_both(),
             Step::GoBack => {
-                self.is_to_probe = self.path.tick(now) == Step::Probe;
+                self.lengths.reset();
+                if self.path.tick(now) == Step::Probe {
+                    self.lengths.probe_both();
+                }
                 self.outgoing.turn_to_connection();
             }
+        }
+        if self.path.is_open() {
+            self.lengths.tick(now, self.outgoing.time_out());
         }
         is_blocked
     }
 
+    /// What is longer than what arrives from now on goes by the connection: [`hand_over`](Outgoing::hand_over) follows.
+    fn judge_lengths(&mut self, happens: impl FnOnce(&mut Lengths)) {
+        let before = self.lengths.limit();
+        happens(&mut self.lengths);
+        if self.lengths.limit() < before {
+            self.outgoing.turn_long_to_connection(self.lengths.limit());
+        }
+    }
+
+    /// What of the lengths that arrive is to be logged, once.
+    pub(super) const fn report(&mut self) -> Option<Report> {
+        self.lengths.report()
+    }
+
     /// The next thing to send.
     pub(super) fn poll(&mut self, now: Time) -> Option<Order<'_, V>> {
-        if std::mem::take(&mut self.is_to_probe) {
-            return Some(Order::Probe);
-        }
-        if self.path.is_open()
-            && let Some((key, number)) = self.outgoing.transmit(now)
-        {
+        if let Some(length) = self.lengths.order() {
+            let number = self.outgoing.number();
+            self.lengths.probed(number, length);
             self.path.sent(now);
-            return self.outgoing.value(&key).map(|value| Order::Value(number, value));
+            return Some(Order::Probe(number, length));
+        }
+        if self.path.is_open() {
+            let sent = self.outgoing.transmit(now);
+            while let Some(length) = self.outgoing.next_lost() {
+                self.judge_lengths(|lengths| lengths.lost(now, length));
+            }
+            if let Some((key, number)) = sent {
+                self.path.sent(now);
+                return self.outgoing.value(&key).map(|value| Order::Value(number, value));
+            }
         }
         self.incoming.is_due(now).then_some(Order::Acknowledgement)
     }
 
     /// When to call [`tick`](Self::tick) and [`poll`](Self::poll), if nothing else happens before.
     pub(super) fn next_wake(&self) -> Option<Time> {
-        [self.path.next_wake(), self.outgoing.next_wake(), self.incoming.due()].into_iter().flatten().min()
+        let lengths = self.lengths.next_wake();
+        [self.path.next_wake(), self.outgoing.next_wake(), self.incoming.due(), lengths]
+            .into_iter()
+            .flatten()
+            .min()
     }
 
     /// Where each value is that was taken.

@@ -4,6 +4,7 @@ use sinew_runtime::{tid::NodeAddress, time::Time, wire::decode_datagram};
 
 use super::{
     core::Core,
+    lengths::SHORTEST,
     packet::{Packet, Prefix, RANGES_MAX},
 };
 
@@ -13,7 +14,7 @@ const CRC_AT: usize = 20;
 pub(crate) fn some_datagrams() -> Vec<Vec<u8>> {
     let packet = || Packet::new(NodeAddress::new(2), 7, 9);
     let mut probe = packet();
-    probe.probe();
+    probe.probe(7, SHORTEST);
     let mut value = packet();
     value.value(b"a frame's header", b"and its payload");
     let mut core = Core::<u64, u64>::new(1);
@@ -61,8 +62,8 @@ fn come(core: &mut Core<u64, u64>, now: Time, datagram: &mut [u8]) -> bool {
                 assert!(said.ranges().len() <= RANGES_MAX);
                 core.acknowledged(now, said);
             }
-            if content.is_probe {
-                core.asked(now, prefix.stamp);
+            if let Some(number) = content.probe {
+                core.asked(now, prefix.stamp, number);
             }
             if let Some(frame) = content.value {
                 let number =

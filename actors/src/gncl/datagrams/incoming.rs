@@ -69,9 +69,10 @@ impl<K: Ord + Copy> Incoming<K> {
         self.is_new(key, number)
     }
 
-    /// A datagram has come that is to be answered at once.
-    pub(super) const fn asked(&mut self, now: Time, stamp: u32) {
+    /// A probe has come, which is to be acknowledged at once.
+    pub(super) fn asked(&mut self, now: Time, stamp: u32, number: u64) {
         self.echo = Some((stamp, now));
+        self.owe(number);
         self.owed_values = ACK_AT;
     }
 

@@ -14,6 +14,7 @@
 //! | DATAGRAM-4 | The newest value of a flow is repeated until it is acknowledged, superseded, too old, or the connection has taken it. |
 //! | DATAGRAM-5 | No value goes by datagram before a datagram was answered; after 500 ms without any answer none does, and it is tried now and then. |
 //! | DATAGRAM-6 | 256 datagrams and 32 KiB are on the way to a peer at most. |
+//! | DATAGRAM-7 | No value goes in a datagram that is longer than one that was acknowledged; where lengths are acknowledged no more, such values go by the connection, and the lengths are probed again. |
 //!
 //! | file | what it is |
 //! | --- | --- |
@@ -21,6 +22,7 @@
 //! | `outgoing.rs` | what is sent, repeated, and waits |
 //! | `incoming.rs` | what is handed on and acknowledged |
 //! | `path.rs` | whether datagrams get through |
+//! | `lengths.rs` | which lengths of them do |
 //! | `round_trip.rs` | when a datagram counts as lost |
 //! | `packet.rs` | the bytes |
 //! | `channel.rs` | the core of one peer, its lock, and what is written |
@@ -32,6 +34,7 @@ mod core;
 #[cfg(feature = "fuzzing")]
 pub(super) mod fuzzing;
 mod incoming;
+mod lengths;
 mod outgoing;
 mod packet;
 mod path;

@@ -55,6 +55,8 @@ pub(super) enum Offered<V> {
 
 /// Flows that are looked at for one that may be forgotten, of each that is new. Where none of these may, that one goes by the connection.
 const LOOKS_MAX: usize = 32;
+/// Lengths of lost datagrams that are kept between two looks, at most: more say nothing more.
+const LOST_MAX: usize = 16;
 /// How often the connection is offered what it had no room for.
 const OFFER_PERIOD: Duration = Duration::from_millis(10);
 
@@ -77,7 +79,10 @@ struct Flow<V> {
 struct Flight<K> {
     number: u64,
     key: K,
+    /// Without an acknowledgement that goes with it.
     bytes: usize,
+    /// Of the datagram that was sent last.
+    length: usize,
     repeats: u32,
     /// When it counts as lost.
     due: Time,
@@ -134,6 +139,8 @@ pub(super) struct Outgoing<K, V> {
     taken_before: u64,
     /// The flow that was looked at last for one that may be forgotten.
     looked_at: Option<K>,
+    /// Lengths of datagrams that count as lost, until [`next_lost`](Self::next_lost) has said so.
+    lost: Vec<usize>,
     #[cfg(test)]
     pub(super) planted: super::simulation::Planted,
 }
@@ -155,6 +162,7 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
             taken: 0,
             taken_before: 0,
             looked_at: None,
+            lost: Vec::with_capacity(LOST_MAX),
             #[cfg(test)]
             planted: super::simulation::Planted::Nothing,
         }
@@ -207,7 +215,8 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
         }
     }
 
-    const fn number(&mut self) -> u64 {
+    /// The number of a value, or of a probe.
+    pub(super) const fn number(&mut self) -> u64 {
         let number = self.next;
         self.next += 1;
         number
@@ -252,8 +261,10 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
         if self.planted == super::simulation::Planted::NotRepeated {
             return None;
         }
+        let lost = &mut self.lost;
         let again = self.flight.iter_mut().find(|flight| flight.due <= now);
         let sent = again.map(|flight| {
+            note_lost(lost, flight.length);
             flight.repeats += 1;
             flight.due = now + self.round_trip.time_out(flight.repeats);
             (flight.key, flight.number)
@@ -264,7 +275,7 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
 
     /// What counts as lost and has been superseded, or has expired, is on its way no more.
     fn give_up(&mut self, now: Time) {
-        let Self { flight, flows, counts, flight_bytes, .. } = self;
+        let Self { flight, flows, counts, flight_bytes, lost, .. } = self;
         flight.retain(|flight| {
             if flight.due > now {
                 return true;
@@ -279,7 +290,10 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
                 }
                 Some(_) | None => false,
             };
-            *flight_bytes -= if keeps { 0 } else { flight.bytes };
+            if !keeps {
+                *flight_bytes -= flight.bytes;
+                note_lost(lost, flight.length);
+            }
             keeps
         });
     }
@@ -308,21 +322,41 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
             self.waiting.pop_front();
             self.counts.sent += 1;
             let due = now + self.round_trip.time_out(0);
-            self.flight.push(Flight { number, key, bytes, repeats: 0, due });
+            self.flight.push(Flight { number, key, bytes, length: bytes, repeats: 0, due });
             self.flight_bytes += bytes;
             self.next_due = self.next_due.min(due);
             return Some((key, number));
         }
     }
 
-    /// The peer says what has come. `now_stamp` is the stamp of a datagram that would be sent now.
-    pub(super) fn acknowledged(&mut self, said: &Acknowledgement, now_stamp: u32) {
+    /// The value with this number has just gone in a datagram of this length.
+    pub(super) fn went(&mut self, number: u64, length: usize) {
+        // Most are the last one.
+        if let Some(flight) = self.flight.iter_mut().rev().find(|flight| flight.number == number) {
+            flight.length = length;
+        }
+    }
+
+    /// The length of a datagram that counts as lost, each once.
+    pub(super) fn next_lost(&mut self) -> Option<usize> {
+        self.lost.pop()
+    }
+
+    /// How long to wait for the acknowledgement of what is sent now.
+    pub(super) fn time_out(&self) -> Duration {
+        self.round_trip.time_out(0)
+    }
+
+    /// The peer says what has come. `now_stamp` is the stamp of a datagram that would be sent now. Returns the longest datagram that it took
+    /// a value in, as far as that is certain; 0: none.
+    pub(super) fn acknowledged(&mut self, said: &Acknowledgement, now_stamp: u32) -> usize {
         self.taken = self.taken.max(said.taken);
         let took_us = now_stamp.wrapping_sub(said.echo).saturating_sub(said.held_us);
         // A stamp that was never sent would look as old as the clock's turn.
         if took_us < u32::MAX / 2 {
             self.round_trip.measured(Duration::from_micros(took_us.into()));
         }
+        let mut longest = 0;
         let Self { flight, flows, flight_bytes, .. } = self;
         flight.retain(|flight| {
             if !said.ranges().iter().any(|range| range.has(flight.number)) {
@@ -332,21 +366,36 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
                 (flow.value, flow.state) = (None, State::Idle);
             }
             *flight_bytes -= flight.bytes;
+            // It may have gone several times, with an acknowledgement or without.
+            longest = longest.max(flight.bytes);
             false
         });
         if flight.is_empty() {
             self.next_due = Time::MAX;
         }
+        longest
+    }
+
+    /// What is not known to have arrived, and makes a longer datagram than this, goes by the connection: [`hand_over`](Self::hand_over)
+    /// follows. spec: DATAGRAM-7
+    pub(super) fn turn_long_to_connection(&mut self, longest: usize) {
+        for flow in self.flows.values_mut().filter(|flow| flow.bytes > longest) {
+            flow.state = flow.state.for_connection();
+        }
+        let Self { flight, flows, flight_bytes, .. } = self;
+        self.waiting.retain(|key| flows.get(key).is_some_and(|flow| flow.state == State::Waiting));
+        flight.retain(|flight| {
+            let stays = flight.bytes <= longest;
+            *flight_bytes -= if stays { 0 } else { flight.bytes };
+            stays
+        });
+        self.offer_at = Time::ZERO;
     }
 
     /// What is not known to have arrived goes by the connection: [`hand_over`](Self::hand_over) follows.
     pub(super) fn turn_to_connection(&mut self) {
         for flow in self.flows.values_mut() {
-            flow.state = match flow.state {
-                State::Waiting => State::ForConnection { was_sent: false },
-                State::OnTheWay => State::ForConnection { was_sent: true },
-                stays @ (State::Idle | State::ForConnection { .. }) => stays,
-            };
+            flow.state = flow.state.for_connection();
         }
         self.clear();
         self.offer_at = Time::ZERO;
@@ -465,7 +514,23 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
     }
 }
 
+/// What finds no room says nothing new.
+fn note_lost(lost: &mut Vec<usize>, length: usize) {
+    if lost.len() < LOST_MAX {
+        lost.push(length);
+    }
+}
+
 impl State {
+    /// The same where the value goes by the connection.
+    const fn for_connection(self) -> Self {
+        match self {
+            Self::Waiting => Self::ForConnection { was_sent: false },
+            Self::OnTheWay => Self::ForConnection { was_sent: true },
+            stays @ (Self::Idle | Self::ForConnection { .. }) => stays,
+        }
+    }
+
     /// Whether there is a value that has gone out neither way.
     const fn was_never_sent(self) -> bool {
         matches!(self, Self::Waiting | Self::ForConnection { was_sent: false })

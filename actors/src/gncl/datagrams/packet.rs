@@ -3,12 +3,12 @@
 //! ```text
 //! offset size field
 //!      0    1 version: 1
-//!      1    1 what is in it: 1 an acknowledgement, 2 a value, 4 it is to be answered
+//!      1    1 what is in it: 1 an acknowledgement, 2 a value, 4 a probe
 //!      2    2 length of the authentication tag at its end: 0 in this version
 //!      4    4 node of the sender
 //!      8    8 key, as the receiver has given it to the sender
 //!     16    4 stamp: the sender's clock in microseconds, lower 32 bits
-//!     20    4 CRC-32 (as in a frame) of what is before this, and of the acknowledgement
+//!     20    4 CRC-32 (as in a frame) of what is before this, of the acknowledgement, and of a probe's number
 //! an acknowledgement, 20 bytes and 12 for each range:
 //!      0    4 stamp of the last datagram that came
 //!      4    4 microseconds since it came
@@ -17,6 +17,7 @@
 //!     17    3 0
 //!   then 12 first number that has come (8), and how many follow it without a gap (4)
 //! a value: one frame, to the end of the datagram
+//! a probe, which is acknowledged at once: its number (8), then anything to the end of the datagram
 //! ```
 
 use sinew_runtime::tid::NodeAddress;
@@ -103,8 +104,8 @@ pub(super) struct Prefix {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Content<'a> {
     pub(super) acknowledgement: Option<Acknowledgement>,
-    /// Whether it is to be answered at once.
-    pub(super) is_probe: bool,
+    /// The number of a probe, which is to be acknowledged at once.
+    pub(super) probe: Option<u64>,
     pub(super) value: Option<&'a [u8]>,
 }
 
@@ -128,18 +129,25 @@ impl Packet {
         packet
     }
 
-    /// Bytes that still have room.
-    pub(super) const fn room(&self) -> usize {
-        DATAGRAM_MAX - self.length
+    /// Its bytes so far.
+    pub(super) const fn len(&self) -> usize {
+        self.length
     }
 
-    pub(super) fn probe(&mut self) {
+    /// A probe that makes the datagram so long, last of all. spec: DATAGRAM-7
+    pub(super) fn probe(&mut self, number: u64, length: usize) {
         self.bytes[1] |= PROBE;
+        self.put(&number.to_le_bytes());
+        self.head = self.length;
+        self.length = length.clamp(self.length, DATAGRAM_MAX);
     }
 
     /// Before a value.
     pub(super) fn acknowledge(&mut self, acknowledgement: &Acknowledgement) {
-        debug_assert!(acknowledgement.len() <= self.room(), "it was made for the room that there is");
+        debug_assert!(
+            acknowledgement.len() <= DATAGRAM_MAX - self.length,
+            "it was made for the room that there is"
+        );
         self.bytes[1] |= ACK;
         self.put(&acknowledgement.echo.to_le_bytes());
         self.put(&acknowledgement.held_us.to_le_bytes());
@@ -201,17 +209,17 @@ impl Prefix {
     pub(super) fn content(self, bytes: &[u8]) -> Option<Content<'_>> {
         let rest = bytes.get(PREFIX_LEN..)?;
         let (acknowledgement, rest) = if self.what & ACK == 0 { (None, rest) } else { read_ack(rest)? };
+        let (probe, rest) =
+            if self.what & PROBE == 0 { (None, rest) } else { (Some(u64_at(rest, 0)?), &rest[8..]) };
         let head = bytes.get(..bytes.len() - rest.len())?;
         if u32_at(bytes, CRC_AT)? != checksum(head) {
             return None;
         }
         let is_known = self.what & !(ACK | VALUE | PROBE) == 0;
         let has_value = self.what & VALUE != 0;
-        (is_known && (has_value || rest.is_empty())).then_some(Content {
-            acknowledgement,
-            is_probe: self.what & PROBE != 0,
-            value: has_value.then_some(rest),
-        })
+        // Behind a probe is what makes it long.
+        let is_whole = if probe.is_some() { !has_value } else { has_value || rest.is_empty() };
+        (is_known && is_whole).then_some(Content { acknowledgement, probe, value: has_value.then_some(rest) })
     }
 }
 
@@ -264,19 +272,20 @@ mod tests {
         fn what_is_written_is_read(
             ranges in proptest::option::of(proptest::collection::vec((any::<u64>(), any::<u32>()), 0..=RANGES_MAX)),
             value in proptest::option::of(proptest::collection::vec(any::<u8>(), 0..500)),
-            is_probe: bool,
+            probe in proptest::option::of((any::<u64>(), 0..=DATAGRAM_MAX)),
         ) {
+            let value = value.filter(|_| probe.is_none());
             let mut packet = Packet::new(NodeAddress::new(3), 7, 9);
             let acknowledgement = ranges.map(|ranges| acknowledgement(&ranges));
             acknowledgement.iter().for_each(|acknowledgement| packet.acknowledge(acknowledgement));
-            if is_probe {
-                packet.probe();
-            }
+            probe.iter().for_each(|(number, length)| packet.probe(*number, *length));
             value.iter().for_each(|value| packet.value(&value[..value.len() / 2], &value[value.len() / 2..]));
             let bytes = packet.bytes();
             let prefix = Prefix::read(bytes).unwrap();
             prop_assert_eq!((prefix.node, prefix.key, prefix.stamp), (NodeAddress::new(3), 7, 9));
-            let content = Content { acknowledgement, is_probe, value: value.as_deref() };
+            prop_assert!(probe.is_none_or(|(_, length)| bytes.len() >= length));
+            let probe = probe.map(|(number, _)| number);
+            let content = Content { acknowledgement, probe, value: value.as_deref() };
             prop_assert_eq!(prefix.content(bytes), Some(content));
         }
 

@@ -13,8 +13,9 @@ use crate::seeded::{Seed, number};
 use super::{
     core::{Core, Order, stamp},
     incoming::{FLOWS_MAX, Incoming},
+    lengths::{Report, SHORTEST},
     outgoing::{LIMITS, Offered, Outgoing},
-    packet::Acknowledgement,
+    packet::{Acknowledgement, DATAGRAM_MAX},
 };
 
 /// The one seed that is to be replayed.
@@ -43,6 +44,8 @@ pub(super) enum Planted {
     GivenUpFirst,
     /// What is under way when the peer says another key is dropped.
     AnewDrops,
+    /// A probe that is answered is believed for every length.
+    LengthsBelieved,
 }
 
 /// Of a flow, which of its values.
@@ -50,7 +53,7 @@ type Value = (u8, u64);
 
 #[derive(Clone, Debug)]
 enum Datagram {
-    Probe(u32),
+    Probe(u32, u64),
     Value(u32, u64, Value),
     Acknowledgement(Box<Acknowledgement>),
 }
@@ -88,6 +91,10 @@ struct World {
     network: Network,
     /// No datagram gets through, as long as this is so.
     is_blocked: bool,
+    /// The longest datagram that gets through to the receiver.
+    longest: usize,
+    /// What a flow's values make of a datagram.
+    lengths: fn(u8) -> usize,
     /// The connection has no room for one more, as long as this is so.
     is_full: bool,
     /// When the sender hears that the receiver has forgotten it; what it sends before has the former key.
@@ -118,6 +125,7 @@ impl World {
         sender.announced(now);
         receiver.announced(now);
         sender.outgoing.planted = planted;
+        sender.lengths.planted = planted;
         receiver.incoming.planted = planted;
         Self {
             dice: Dice::new(seed),
@@ -125,6 +133,8 @@ impl World {
             planted,
             network,
             is_blocked: false,
+            longest: DATAGRAM_MAX,
+            lengths: |_| 200,
             is_full: false,
             another_key: None,
             sender,
@@ -149,7 +159,7 @@ impl World {
         *count += 1;
         let value = (key, *count);
         self.sent_at.insert(value, self.now);
-        match self.sender.submit(key, value, 200, Time::MAX) {
+        match self.sender.submit(key, value, (self.lengths)(key), Time::MAX) {
             Ok(()) => {
                 self.by_datagram += 1;
                 self.flush_sender();
@@ -196,14 +206,18 @@ impl World {
     fn flush_sender(&mut self) {
         let (now, stamp) = (self.now, stamp(self.now));
         while let Some(order) = self.sender.poll(now) {
-            let datagram = match order {
-                Order::Probe => Datagram::Probe(stamp),
-                Order::Value(number, value) => Datagram::Value(stamp, number, *value),
-                Order::Acknowledgement => Datagram::Acknowledgement(Box::new(
-                    self.sender.incoming.take(now, 32).expect("it is due"),
-                )),
+            let (datagram, length) = match order {
+                Order::Probe(number, length) => (Datagram::Probe(stamp, number), length),
+                Order::Value(number, value) => {
+                    (Datagram::Value(stamp, number, *value), (self.lengths)(value.0))
+                }
+                Order::Acknowledgement => {
+                    let said = self.sender.incoming.take(now, 32).expect("it is due");
+                    (Datagram::Acknowledgement(Box::new(said)), SHORTEST)
+                }
             };
-            let arrivals = if self.another_key.is_some() { Vec::new() } else { self.arrivals() };
+            let is_lost = self.another_key.is_some() || length > self.longest;
+            let arrivals = if is_lost { Vec::new() } else { self.arrivals() };
             self.there.extend(arrivals.into_iter().map(|at| (at, datagram.clone())));
         }
     }
@@ -212,7 +226,7 @@ impl World {
         let (now, stamp) = (self.now, stamp(self.now));
         while let Some(order) = self.receiver.poll(now) {
             let datagram = match order {
-                Order::Probe => Datagram::Probe(stamp),
+                Order::Probe(number, _) => Datagram::Probe(stamp, number),
                 Order::Value(..) => unreachable!("it sends none"),
                 Order::Acknowledgement => {
                     // As one that has room for few ranges only.
@@ -249,7 +263,7 @@ impl World {
     fn read_there(&mut self) {
         for datagram in due(&mut self.there, self.now) {
             match datagram {
-                Datagram::Probe(stamp) => self.receiver.asked(self.now, stamp),
+                Datagram::Probe(stamp, number) => self.receiver.asked(self.now, stamp, number),
                 Datagram::Value(stamp, number, value) => {
                     if self.receiver.incoming.came(self.now, stamp, value.0, number) {
                         self.hand_on(value);
@@ -269,7 +283,7 @@ impl World {
     fn read_back(&mut self) {
         for datagram in due(&mut self.back, self.now) {
             match datagram {
-                Datagram::Probe(stamp) => self.sender.asked(self.now, stamp),
+                Datagram::Probe(stamp, number) => self.sender.asked(self.now, stamp, number),
                 Datagram::Value(..) => unreachable!("nobody sends one"),
                 Datagram::Acknowledgement(said) => drop(self.sender.acknowledged(self.now, &said)),
             }
@@ -370,6 +384,8 @@ fn play(seed: u64, planted: Planted) -> Result<World, String> {
         jitter_us: [0, 500, 30_000][dice.below(3) as usize],
     };
     let mut world = World::new(seed, network, planted);
+    // From 100 to 1,175 bytes.
+    world.lengths = |key| 100 + 215 * usize::from(key);
     let flows = 1 + dice.below(6);
     let (ends_cut_off, ends_forgotten) = (dice.below(3) == 0, dice.below(3) == 0);
     for millis in 0..2_000 {
@@ -388,6 +404,8 @@ fn play(seed: u64, planted: Planted) -> Result<World, String> {
             11..=12 => world.is_full = true,
             13..=17 => world.is_full = false,
             18..=19 => world.forget_sender(),
+            20 => world.longest = SHORTEST + dice.below(1_061) as usize,
+            21 => world.longest = DATAGRAM_MAX,
             _ => {}
         }
         if ends_cut_off && millis > 1_200 {
@@ -484,5 +502,64 @@ fn a_blocked_way_is_found_out_and_nothing_is_lost_by_it_and_it_is_tried_again() 
     world.steps(100);
     assert!(world.sender.is_open());
     assert_eq!((world.came[&0].len(), world.by_datagram), (4, 3));
+    world.verdict().unwrap();
+}
+
+/// The lengths of row after row, from 120 bytes to a whole datagram.
+const LENGTHS: [usize; 6] = [120, 488, 788, 988, 1_188, DATAGRAM_MAX];
+
+/// Values of each length 50 times a second, for so long. Returns how many of each came.
+fn send_each_length(world: &mut World, millis: u64) -> Vec<usize> {
+    let before: Vec<_> = (0..6).map(|key| world.came.get(&key).map_or(0, Vec::len)).collect();
+    for _ in 0..millis / 20 {
+        (0..6).for_each(|key| world.send(key));
+        world.steps(20);
+    }
+    world.steps(250);
+    (0..6).map(|key| world.came.get(&key).map_or(0, Vec::len) - before[usize::from(key)]).collect()
+}
+
+/// How many values of each length come in 5 s, of 250, where longer datagrams than `longest` vanish from the start.
+fn behind_a_hole(longest: usize, planted: Planted) -> (Vec<usize>, World) {
+    let network = Network { lost: 0.0, doubled: 0.0, delay_us: 300, jitter_us: 100 };
+    let mut world = World::new(3, network, planted);
+    (world.longest, world.lengths) = (longest, |key| LENGTHS[usize::from(key)]);
+    world.steps(1_000);
+    (send_each_length(&mut world, 5_000), world)
+}
+
+// spec: DATAGRAM-7
+#[test]
+fn where_long_datagrams_vanish_every_length_comes_at_the_full_rate() {
+    for longest in [300, 600, 972, 1_199] {
+        let (came, mut world) = behind_a_hole(longest, Planted::Nothing);
+        assert_eq!(came, [250; 6], "longer than {longest} vanish");
+        let report = world.sender.report();
+        assert!(matches!(report, Some(Report::Narrow(passes)) if passes <= longest), "{report:?}");
+        world.verdict().unwrap();
+        let (came, _) = behind_a_hole(longest, Planted::LengthsBelieved);
+        assert!(came[5] < 10, "a probe that is believed for every length is found: {came:?}");
+    }
+}
+
+// spec: DATAGRAM-7
+#[test]
+fn a_way_that_shrinks_while_it_is_used_costs_a_few_values_and_is_used_wholly_again_when_it_grows() {
+    let network = Network { lost: 0.01, doubled: 0.0, delay_us: 300, jitter_us: 100 };
+    let mut world = World::new(5, network, Planted::Nothing);
+    world.lengths = |key| LENGTHS[usize::from(key)];
+    world.steps(100);
+    assert_eq!(send_each_length(&mut world, 1_000), [50; 6]);
+    world.longest = 700;
+    let came = send_each_length(&mut world, 2_000);
+    assert!(came.iter().all(|count| (95..=100).contains(count)), "{came:?}");
+    let by_connection = world.by_connection;
+    assert_eq!(send_each_length(&mut world, 2_000), [100; 6]);
+    assert!(world.by_connection > by_connection);
+    world.longest = DATAGRAM_MAX;
+    world.steps(11_000);
+    let by_connection = world.by_connection;
+    assert_eq!(send_each_length(&mut world, 1_000), [50; 6]);
+    assert_eq!(world.by_connection, by_connection, "all go by datagram again");
     world.verdict().unwrap();
 }

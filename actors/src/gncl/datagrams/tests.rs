@@ -8,8 +8,9 @@ use sinew_runtime::time::Time;
 use super::{
     core::{Core, Order, stamp},
     incoming::Incoming,
+    lengths::SHORTEST,
     outgoing::{LIMITS, Limits, Offered, Outgoing},
-    packet::{Acknowledgement, RANGES_MAX, Range},
+    packet::{Acknowledgement, DATAGRAM_MAX, RANGES_MAX, Range},
 };
 
 const NOW: Time = Time::from_nanos(1_000_000_000);
@@ -237,7 +238,8 @@ fn what_answers_a_datagram_to_a_former_address_says_nothing_of_the_present_one()
     let mut core = Core::<u32, u32>::new(100);
     let probe = |core: &mut Core<u32, u32>, now| {
         core.tick(now, now);
-        assert_eq!(core.poll(now), Some(Order::Probe));
+        assert!(matches!(core.poll(now), Some(Order::Probe(_, DATAGRAM_MAX))));
+        assert!(matches!(core.poll(now), Some(Order::Probe(_, SHORTEST))));
     };
     let answered = |core: &mut Core<u32, u32>, now, echo| {
         let said = Acknowledgement { echo: stamp(echo), ..said(&[], 0) };

@@ -152,7 +152,7 @@ fn a_value_that_is_longer_than_a_datagram_goes_by_the_connection_and_so_does_all
         assert!(first > 0);
         let probe = mate.hear().await;
         assert_eq!(probe.what, PROBE);
-        mate.acknowledge(probe.stamp, &[]).await;
+        mate.acknowledge_probe(&probe).await;
         // One that fills a datagram, and one of a byte more.
         let sized = |length: usize| of_class(Class::Stream, node.message(nines_app(), &vec![7; length]));
         let (second, payload) = loop {
@@ -266,14 +266,14 @@ fn a_value_in_somebody_elses_name_is_neither_acknowledged_nor_a_flow_of_the_peer
         let forged = mate.value_bytes(node.tid(1), 2, node.tid(7));
         mate.say(VALUE, &forged).await;
         node.counted("forged source").await;
-        mate.say(PROBE, &[]).await;
+        mate.say(PROBE, &77_u64.to_le_bytes()).await;
         let answer = loop {
             let heard = mate.hear().await;
             if heard.what & ACK != 0 {
                 break heard;
             }
         };
-        assert_eq!(answer.numbers, []);
+        assert_eq!(answer.numbers, [(77, 0)], "the probe alone");
         let arrived = peer.accounts()[Class::Stream as usize].arrived;
         assert_eq!((arrived.taken, arrived.refused), (0, 0), "{arrived:?}");
     });
@@ -378,14 +378,14 @@ fn a_value_of_a_life_that_is_over_is_neither_acknowledged_nor_counted_as_taken()
         node.stores.gncl.fence(NINE, peer.incarnation);
         mate.send_value(node.tid(1), 5).await;
         node.counted("datagram of a life that is over").await;
-        mate.say(PROBE, &[]).await;
+        mate.say(PROBE, &77_u64.to_le_bytes()).await;
         let answer = loop {
             let heard = mate.hear().await;
             if heard.what & ACK != 0 {
                 break heard;
             }
         };
-        assert_eq!(answer.numbers, []);
+        assert_eq!(answer.numbers, [(77, 0)], "the probe alone");
         let arrived = peer.accounts()[Class::Stream as usize].arrived;
         assert_eq!((arrived.taken, arrived.waiting), (0, 0), "{arrived:?}");
     });

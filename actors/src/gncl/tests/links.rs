@@ -344,8 +344,9 @@ fn both_ends_of_a_connection_give_it_up_when_nothing_is_taken_any_more() {
         let listener = Lent::of(&Arc::new(listener)).expect("it does not block");
         let pace = Rc::new(RefCell::new(Pace::new(Time::now())));
         let mut accepted = Box::pin(listener::accepted(listener, give_up, pace));
-        let dialled =
-            link::connect(link::Ends { to: address, from: None }, give_up).await.expect("it listens");
+        let dialled = link::connect(link::Ends { to: address, from: None, segment_max: None }, give_up)
+            .await
+            .expect("it listens");
         let accepted = next("a connection", &mut accepted).await.expect("it is accepted");
         for end in [&dialled, &accepted] {
             assert_eq!(SockRef::from(end).tcp_user_timeout().expect("the system says it"), Some(give_up));

@@ -211,6 +211,9 @@ pub struct StreamReport {
     pub sent: u64,
     /// Those of them that the other node has acknowledged.
     pub arrived: u64,
+    /// The longest payload that goes by datagram, in bytes, where longer datagrams do not arrive; longer values go by the connection.
+    #[serde(default)]
+    pub payload_max: Option<u64>,
 }
 
 impl PeerReport {

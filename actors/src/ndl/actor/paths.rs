@@ -18,10 +18,12 @@ use futures_util::{
     future::{AbortHandle, LocalBoxFuture, abortable},
     stream::FuturesUnordered,
 };
+use sinew_runtime::time::Time;
 use tokio::sync::watch;
 
 use super::{Shell, lock, receiving::receive, speaking::speak_mdns};
 use crate::{
+    bind_error,
     config::Interfaces,
     ndl::{
         PATHS_MAX,
@@ -35,6 +37,8 @@ use crate::{
 
 /// Time after which what cannot be opened is tried again, and what is open is made sure to send and hear by its interface.
 const RETRY: Duration = Duration::from_secs(1);
+/// Time between two warnings of the same address that is not there.
+const REMINDER: Duration = Duration::from_secs(60);
 
 /// A task of this layer that ends with it, or before.
 type Task = LocalBoxFuture<'static, ()>;
@@ -55,8 +59,11 @@ struct Path {
 pub(super) struct Paths {
     open: RefCell<Vec<Path>>,
     said: RefCell<BTreeSet<(LocalAddress, &'static str)>>,
+    /// When it is said next that an address cannot be opened, as long as that is so.
+    unopened: RefCell<BTreeMap<LocalAddress, Time>>,
     has_said_no_ipv6: Cell<bool>,
-    has_said_none: Cell<bool>,
+    /// When it is said next that there is no address at all.
+    none_next: Cell<Time>,
 }
 
 /// A socket that is to be read.
@@ -107,7 +114,7 @@ impl Paths {
                             }
                         }
                         self.open.borrow_mut().push(path);
-                        self.said.borrow_mut().remove(&(local, UNOPENED));
+                        self.unopened.borrow_mut().remove(&local);
                     }
                     Err(error) => unopened.push((local, error)),
                 }
@@ -132,6 +139,7 @@ impl Paths {
         // What is said of those that are not used each clears itself.
         let is_of_unused = |what: &str| [IN_DOUBT, TAKEN, LEFT_OUT].contains(&what);
         self.said.borrow_mut().retain(|(local, what)| is_of_unused(what) || wanted.contains(local));
+        self.unopened.borrow_mut().retain(|local, _| wanted.contains(local));
     }
 
     /// Joins the group on a path that has not joined it yet.
@@ -155,16 +163,19 @@ impl Paths {
         }
     }
 
-    /// What is not open, and why, once.
-    fn say_unopened(&self, port: u16, unopened: &[(LocalAddress, io::Error)]) {
+    /// Warns of each address that is not open, with the reason: at once, and each minute as long as that is so.
+    fn say_unopened(&self, now: Time, port: u16, unopened: &[(LocalAddress, io::Error)]) {
         for (local, error) in unopened {
-            if self.said.borrow_mut().insert((*local, UNOPENED)) {
-                let at = local.at(port);
-                crate::log::warn!(
-                    "NDL cannot use UDP {at} yet: {error}; it tries again each second. Give this host the address \
-                     (`ip address`), leave it out of `ndl.interface`, or set `ndl.port` to a port that is free there"
-                );
+            let next = self.unopened.borrow().get(local).copied();
+            if next.is_some_and(|next| now < next) {
+                continue;
             }
+            self.unopened.borrow_mut().insert(*local, now + REMINDER);
+            let (at, remedy) = (local.at(port), bind_error::remedy(error, "ndl.port"));
+            crate::log::warn!(
+                "NDL cannot use UDP {at} yet: {error}; it tries again each second, and warns each minute until then: {remedy}, or leave it \
+                 out of `ndl.interface`"
+            );
         }
     }
 
@@ -198,7 +209,7 @@ impl Paths {
     }
 
     /// Why an IPv6 address that was chosen is not used, and that there are none at all; each once.
-    fn say_what_is_missing(&self, stores: &Stores, usable: &Usable) {
+    fn say_what_is_missing(&self, now: Time, stores: &Stores, usable: &Usable) {
         for (local, flags) in &usable.in_doubt {
             let is_open = self.locals().contains(local);
             // Whoever was told that an address is asked for is told again if another host has it.
@@ -211,11 +222,13 @@ impl Paths {
             ![IN_DOUBT, TAKEN].contains(what) || usable.in_doubt.iter().any(|(known, _)| known == local)
         });
         let interfaces = &stores.config.ndl.interface;
-        if usable.is_known && wanted_later(interfaces, usable) && !self.has_said_none.replace(true) {
+        let has_none = usable.is_known && wanted_later(interfaces, usable) && self.here().is_empty();
+        if has_none && self.none_next.get() <= now {
+            self.none_next.set(now + REMINDER);
             crate::log::warn!(
                 %interfaces,
-                "NDL has no address yet: no interface of this host that is up has what `ndl.interface` chooses. It begins when there is one: give \
-                 the host the address (`ip address`), or choose another interface"
+                "NDL has no address yet: no interface of this host that is up has what `ndl.interface` chooses. It begins when there is one, and warns each minute \
+                 until then: give the host the address (`ip address`), or choose another interface"
             );
         }
         if usable.is_known
@@ -233,7 +246,6 @@ impl Paths {
     }
 }
 
-const UNOPENED: &str = "it cannot be opened";
 const IN_DOUBT: &str = "another host may have it";
 const TAKEN: &str = "another host has it";
 const LEFT_OUT: &str = "there are too many";
@@ -318,7 +330,7 @@ impl Shell {
         let left_out = leave_out(&mut wanted, &kept);
         self.paths.say_left_out(&left_out);
         let (readers, unopened) = self.paths.open(stores, &wanted);
-        self.paths.say_unopened(stores.config.ndl.port, &unopened);
+        self.paths.say_unopened(Time::now(), stores.config.ndl.port, &unopened);
         let mut watched = self.paths.locals();
         for reader in readers {
             let local = reader.local;
@@ -333,7 +345,7 @@ impl Shell {
         // What nobody reads would be asked from, and every answer lost.
         self.paths.close_all_but(stores, &watched);
         self.paths.renew(stores);
-        self.paths.say_what_is_missing(stores, usable);
+        self.paths.say_what_is_missing(Time::now(), stores, usable);
         let here = self.paths.here();
         let seeds = super::seeds(stores, Some(usable));
         let is_known = {

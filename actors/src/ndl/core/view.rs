@@ -118,6 +118,11 @@ fn troubled(node: NodeAddress, part: &Part) -> TroubledApp {
 }
 
 impl Core {
+    /// Whether a node is there.
+    pub(crate) fn has_member(&self, node: NodeAddress) -> bool {
+        self.members.contains_key(&node)
+    }
+
     /// Who is there, in the order of their addresses.
     pub(crate) fn members(&self, now: Time) -> Vec<KnownNode> {
         let views = self.members.iter().map(|(node, member)| KnownNode {

@@ -32,6 +32,12 @@ impl Steps {
             );
             return self.note(what, "by the connection (TCP): the other end takes no datagrams", mend);
         }
+        if let Some(payload_max) = after.unwrap_or(before).payload_max {
+            let seen = format!(
+                "values of up to {payload_max} bytes by datagram (UDP), longer ones by the connection (TCP): longer datagrams do not arrive"
+            );
+            return self.note(what, seen, long_packets(from, to));
+        }
         let Some(after) = after else {
             let StreamReport { sent, arrived, .. } = before;
             return self
@@ -52,6 +58,16 @@ fn both_have_keys(from: &End, to: &End) -> bool {
         (Some(either), None) | (None, Some(either)) => either,
         (None, None) => false,
     }
+}
+
+/// What lets long packets through.
+fn long_packets(from: &End, to: &End) -> String {
+    format!(
+        "give the interfaces of {}, of {} and of all between them one MTU (`ip link` shows it, `sudo ip link set eth0 mtu 1500` sets it), and let ICMP \
+         \"packet too big\" through every firewall",
+        from.node_label(),
+        to.node_label()
+    )
 }
 
 /// What lets datagrams through.

@@ -55,7 +55,7 @@ fn peer(number: u8) -> PeerReport {
 
 /// Datagrams are agreed on, and so many values have arrived by one.
 fn values(arrived: u64) -> StreamReport {
-    StreamReport { is_on: true, is_agreed: true, sent: arrived, arrived }
+    StreamReport { is_on: true, is_agreed: true, sent: arrived, arrived, payload_max: None }
 }
 
 fn report(number: u8, name: &str, other: u8) -> NodeReport {

@@ -308,7 +308,11 @@ impl World {
             Output::SendPing(_, lane) => self.send_on_link(node, lane, Parcel::Ping),
             Output::SendPong(_, lane) => self.send_on_link(node, lane, Parcel::Pong),
             Output::Fact(fact) => self.nodes[node].facts.push(fact),
-            Output::Detach { .. } | Output::SendGoodbye(_) | Output::Forget(_) | Output::Count { .. } => {}
+            Output::Detach { .. }
+            | Output::SendGoodbye(_)
+            | Output::Forget(_)
+            | Output::Silent(_)
+            | Output::Count { .. } => {}
         }
     }
 

@@ -38,6 +38,9 @@ pub(super) async fn opened(node: &Node, peer: NodeAddress) {
 pub(super) struct Heard {
     pub(super) what: u8,
     pub(super) stamp: u32,
+    /// The number of a probe.
+    pub(super) probe: Option<u64>,
+    pub(super) length: usize,
     pub(super) value: Option<Message>,
     pub(super) numbers: Vec<(u64, u32)>,
 }
@@ -89,8 +92,8 @@ impl Mate {
 
     pub(super) async fn open(self, node: &Node) -> Self {
         let probe = self.hear().await;
-        assert_eq!(probe.what, PROBE);
-        self.acknowledge(probe.stamp, &[]).await;
+        assert_eq!((probe.what, probe.length), (PROBE, 1_200));
+        self.acknowledge_probe(&probe).await;
         opened(node, NINE).await;
         self
     }
@@ -100,7 +103,7 @@ impl Mate {
         bytes.extend(NINE.bits().to_le_bytes());
         bytes.extend(key.to_le_bytes());
         bytes.extend(1_000_u32.to_le_bytes());
-        let head = if what & ACK == 0 { &[][..] } else { rest };
+        let head = if what & (ACK | PROBE) == 0 { &[][..] } else { rest };
         bytes.extend(crc32fast::hash(&[&bytes, head].concat()).to_le_bytes());
         bytes.extend(rest);
         bytes
@@ -114,10 +117,19 @@ impl Mate {
         self.socket.send_to(bytes, self.to).await.expect("loopback takes it");
     }
 
+    /// A probe is no value that was taken.
+    pub(super) async fn acknowledge_probe(&self, probe: &Heard) {
+        self.acknowledge_taken(probe.stamp, 0, &[probe.probe.expect("it has a number")]).await;
+    }
+
     pub(super) async fn acknowledge(&self, echo: u32, numbers: &[u64]) {
+        self.acknowledge_taken(echo, numbers.len() as u64, numbers).await;
+    }
+
+    async fn acknowledge_taken(&self, echo: u32, taken: u64, numbers: &[u64]) {
         let mut rest = Vec::from(echo.to_le_bytes());
         rest.extend(0_u32.to_le_bytes());
-        rest.extend((numbers.len() as u64).to_le_bytes());
+        rest.extend(taken.to_le_bytes());
         rest.extend((numbers.len() as u32).to_le_bytes());
         for number in numbers {
             rest.extend(number.to_le_bytes());
@@ -152,9 +164,11 @@ impl Mate {
             numbers = (0..count).map(|n| (u64_at(44 + 12 * n), u32_at(52 + 12 * n))).collect();
             at = 44 + 12 * count;
         }
+        let probe = (what & PROBE != 0).then(|| u64_at(at));
+        at += if probe.is_some() { 8 } else { 0 };
         assert_eq!(u32_at(20), crc32fast::hash(&[&bytes[..20], &bytes[24..at]].concat()));
         let value = (what & VALUE != 0).then(|| decode_datagram(&bytes[at..]).expect("it is a frame"));
-        Heard { what, stamp: u32_at(16), value, numbers }
+        Heard { what, stamp: u32_at(16), probe, length, value, numbers }
     }
 
     /// The next value, with its number.

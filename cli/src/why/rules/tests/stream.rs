@@ -14,7 +14,7 @@ fn which_way_stream_goes_is_said_at_both_ends_with_what_lets_datagrams_through()
     assert_eq!(said("class Stream from hip to knee.drive"), "by datagram (UDP)");
     // Nobody could send one from there.
     assert!(said("class Stream from knee.drive to hip").starts_with("7 values by datagram (UDP) so far"));
-    let notes: [(fn(&mut Facts), _, _); 3] = [
+    let notes: [(fn(&mut Facts), _, _); 4] = [
         (
             |facts| facts.streams[0] = Some(values(7)),
             "no datagram is answered",
@@ -29,6 +29,11 @@ fn which_way_stream_goes_is_said_at_both_ends_with_what_lets_datagrams_through()
             |facts| of_stream(facts).is_agreed = false,
             "takes no datagrams",
             "`datagrams = true` under [gncl] of knee",
+        ),
+        (
+            |facts| facts.streams[0] = Some(StreamReport { payload_max: Some(872), ..values(8) }),
+            "values of up to 872 bytes by datagram (UDP), longer ones by the connection (TCP)",
+            "one MTU (`ip link` shows it",
         ),
     ];
     for (change, seen, mend) in notes {
