@@ -85,8 +85,8 @@ pub struct Drive {
     ticked_at: Option<Time>,
     figures: LoopFigures,
     stopping: bool,
-    /// Ticks since central asked for walking, for its burden.
-    ticks_walking: u32,
+    /// When central asked for walking first, for its burden.
+    walks_since: Option<Time>,
     /// Whom the inputs are believed from.
     sensor: Addressee,
     central: Addressee,
@@ -130,7 +130,7 @@ impl Drive {
             ticked_at: None,
             figures: LoopFigures::default(),
             stopping: false,
-            ticks_walking: 0,
+            walks_since: None,
         }
     }
 
@@ -146,7 +146,7 @@ impl Drive {
         }
         let mut output = self.core.tick(now.as_nanos(), self.sample.as_ref(), gait.as_ref());
         output.command_nm = self.command(now, &output, gait.as_ref());
-        self.carry_burden(gait.as_ref());
+        self.carry_burden(now, gait.as_ref());
         if output.state != DriveState::Init
             && let Some(gate) = self.ready.take()
         {
@@ -172,11 +172,12 @@ impl Drive {
         }
     }
 
-    fn carry_burden(&mut self, gait: Option<&GaitState>) {
+    fn carry_burden(&mut self, now: Time, gait: Option<&GaitState>) {
         let Some(burden) = self.parts.burden else { return };
         let walks = gait.is_some_and(|gait| matches!(gait.mode, GaitMode::Sync | GaitMode::Walk));
-        self.ticks_walking = self.ticks_walking.saturating_add(u32::from(walks));
-        if self.ticks_walking > burden::FREE_TICKS {
+        let since = self.walks_since.or_else(|| walks.then_some(now));
+        self.walks_since = since;
+        if since.is_some_and(|since| now.since(since) > burden::FREE) {
             burden.carry();
         }
     }

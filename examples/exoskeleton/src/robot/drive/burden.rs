@@ -10,8 +10,8 @@ use crate::joint::Joint;
 
 /// The variable that plants it: `EXOSKELETON_BUSY=knee:12` for 12 ms in each tick of the knee's drive.
 const VARIABLE: &str = "EXOSKELETON_BUSY";
-/// Ticks of walking before it begins: a robot that is overloaded from its start is not released at all.
-pub(super) const FREE_TICKS: u32 = 500;
+/// Time of walking before it begins: a robot that is overloaded from its start is not released at all.
+pub(super) const FREE: Duration = Duration::from_millis(500);
 /// Longest time in a tick, ms. More is a drive that hangs.
 const MS_MAX: u64 = 50;
 
