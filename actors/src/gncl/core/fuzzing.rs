@@ -230,6 +230,7 @@ impl Play<'_> {
                 | Output::SendPong(..)
                 | Output::SendGoodbye(_)
                 | Output::Forget(_)
+                | Output::Silent(_)
                 | Output::Fact(_)
                 | Output::Count { .. } => {}
             }
