@@ -13,3 +13,4 @@ mod root;
 mod slow;
 mod start_up;
 mod trees;
+mod undelivered;
