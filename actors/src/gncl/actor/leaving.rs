@@ -68,7 +68,11 @@ impl Gncl {
         self.stores.gncl.close();
         for peer in self.stores.gncl.peers() {
             let messages = peer.left();
-            if messages > 0 {
+            // One that has left, or is lost, takes nothing more: that was told, and it is no fault of this stop.
+            let is_there = !peer.has_left() && lock(&self.stores.ndl).has_member(peer.node);
+            if messages > 0 && !is_there {
+                crate::log::debug!(node = %peer.node, messages, "the node stops, and these were for one that is gone");
+            } else if messages > 0 {
                 self.stores.gncl.refusals.count(Time::now(), "not delivered", &peer.node);
                 crate::log::warn!(node = %peer.node, messages, "the node stops, and these have not arrived, as far as it knows");
             }
