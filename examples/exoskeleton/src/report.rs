@@ -63,7 +63,7 @@ impl<'a> Disturbance<'a> {
             undisturbed,
             stalls: &record.stalls,
             too_few: is_less && undisturbed.strides_counted < needed,
-            at_start: hits(first_s, last_s),
+            at_start: hits(first_s - BEFORE_READY_S, last_s),
             at_fault: all.fault.as_ref().is_some_and(|fault| {
                 let back_s =
                     fault.outage.to_s.zip(fault.resumed_after_s).map(|(to_s, after_s)| to_s + after_s);
@@ -73,6 +73,8 @@ impl<'a> Disturbance<'a> {
     }
 }
 
+/// What a stall holds up shows so much later at most: a drive is ready when several processes have answered each other.
+const BEFORE_READY_S: f64 = 0.1;
 /// Share of the strides that has to be left for a judgement.
 const UNDISTURBED_SHARE_MIN: f64 = 1.0 / 3.0;
 /// Strides that have to be left for a judgement. A stride lacks its last millisecond.

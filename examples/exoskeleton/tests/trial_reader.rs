@@ -89,12 +89,12 @@ const COLUMNS: [&str; 6] = ["time_s", "hip_r_deg", "knee_r_deg", "ankle_r_deg", 
 /// The recording's text, and what a person may have done to a row (time in seconds) of it: values in the order of [`COLUMNS`].
 fn changed(gap: impl Fn(f64) -> bool, change: impl Fn(f64, &mut [f64; 6])) -> String {
     let mut reader = csv::ReaderBuilder::new().comment(Some(b'#')).from_reader(FILE.as_bytes());
-    let header = reader.headers().unwrap().clone();
-    let places = COLUMNS.map(|column| header.iter().position(|name| name == column).unwrap());
+    let header = reader.headers().expect("a header").clone();
+    let places = COLUMNS.map(|column| header.iter().position(|name| name == column).expect("its column"));
     let mut text = format!("{},gap\n", COLUMNS.join(","));
     for record in reader.records() {
-        let record = record.unwrap();
-        let mut values = places.map(|place| record[place].parse::<f64>().unwrap());
+        let record = record.expect("a row");
+        let mut values = places.map(|place| record[place].parse::<f64>().expect("a number"));
         let time_s = values[0];
         change(time_s, &mut values);
         let fields: Vec<String> = values.iter().map(f64::to_string).collect();

@@ -30,7 +30,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Verdict, RunError> {
     // One that cannot be written takes no other away.
     for path in [Some(&in_folder), arguments.report.as_ref()].into_iter().flatten() {
         if let Err(error) = std::fs::write(path, &json) {
-            unwritten.get_or_insert(super::at(path, &error).to_string());
+            unwritten.get_or_insert_with(|| super::at(path, &error).to_string());
         }
     }
     if let Some(why) = unwritten {

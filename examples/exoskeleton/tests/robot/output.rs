@@ -33,7 +33,7 @@ fn assert_recorded(folder: &Path) {
         [run.join("gait.svg"), run.join("run.csv"), run.join("report.json"), folder.join("report.json")]
     {
         assert!(std::fs::metadata(&file).is_ok_and(|file| file.len() > 0), "{}", file.display());
-        std::fs::remove_file(file).unwrap();
+        std::fs::remove_file(file).expect("it is there");
     }
 }
 
