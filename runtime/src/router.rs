@@ -186,7 +186,7 @@ impl Router {
     /// Sends a message from an application of this node. A confirmed message that is refused is also settled so.
     ///
     /// # Errors
-    /// Why nobody took the message. For a multicast: why no destination at all took it.
+    /// Why nobody took the message. For a multicast: why no member took it, where that can be mended. A group without members is no error.
     pub fn send(&self, mut message: Message) -> Result<(), Rejection> {
         message.header.destination = self.absolute(message.header.destination);
         let destination = message.header.destination;
@@ -400,12 +400,16 @@ impl Router {
             table.peers.values().for_each(submit);
         } else if let Some(peer) = table.peers.get(&node) {
             submit(peer);
+        } else if node != self.node {
+            return Err(Refused::new(message, Rejection::NoSuchNode));
         }
-        if copies.is_taken() {
-            self.count(&copies, &message.header);
-            return Ok(());
+        match copies.why_none() {
+            Some(why) if !copies.is_taken() => Err(Refused::new(message, why)),
+            Some(_) | None => {
+                self.count(&copies, &message.header);
+                Ok(())
+            }
         }
-        Err(Refused::new(message, copies.why_none()))
     }
 
     /// Of a message to many that others took, so that its sender hears nothing: the copies for which there was no room.

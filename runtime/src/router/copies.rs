@@ -28,11 +28,10 @@ impl Copies {
         [Rejection::QueueFull, Rejection::TooLong].into_iter().map(|why| (why, self.refused[why as usize]))
     }
 
-    /// Why none was taken: what a sender can mend, and where there is nothing of that, nobody is there.
-    pub(super) fn why_none(&self) -> Rejection {
+    /// Why none was taken, where a sender can mend it. `None`: there is no member that could take one, which is no fault.
+    pub(super) fn why_none(&self) -> Option<Rejection> {
         let mendable = [Rejection::TooLong, Rejection::QueueFull, Rejection::NotAllowed];
-        let found = mendable.into_iter().find(|why| self.refused[*why as usize] > 0);
-        found.unwrap_or(Rejection::NoSuchApplication)
+        mendable.into_iter().find(|why| self.refused[*why as usize] > 0)
     }
 }
 
@@ -103,12 +102,28 @@ mod tests {
             (Some(Rejection::TooLong), full, Rejection::TooLong),
             (Some(Rejection::NotAllowed), full, Rejection::QueueFull),
             (Some(Rejection::NotAllowed), Some(Rejection::Closed), Rejection::NotAllowed),
-            (Some(Rejection::Closed), Some(Rejection::Closed), Rejection::NoSuchApplication),
         ] {
             let router = router(here, there);
             assert_eq!(router.send(to_group()), Err(said));
             assert_eq!(router.refused_because(), [(said, 1)], "the message is refused once");
         }
+    }
+
+    #[test]
+    fn a_group_without_a_member_that_is_there_is_no_error_and_no_refusal() {
+        let router = router(Some(Rejection::Closed), Some(Rejection::Closed));
+        assert_eq!(router.send(to_group()), Ok(()));
+        router.remove_local(MEMBER);
+        router.set_remote_groups(PEER, &[]);
+        assert_eq!((router.send(to_group()), router.refused()), (Ok(()), 0));
+    }
+
+    #[test]
+    fn a_group_of_a_node_that_is_not_known_is_refused() {
+        let (router, unknown) = (router(None, None), NodeAddress::new(0x7f00_0003));
+        let mut message = to_group();
+        message.header.destination.node = unknown;
+        assert_eq!(router.send(message), Err(Rejection::NoSuchNode));
     }
 
     #[test]
