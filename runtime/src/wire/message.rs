@@ -182,7 +182,18 @@ pub fn encode<T: Serialize>(value: &T) -> Bytes {
 
 /// Reads a value from the bytes of a payload that is a `P`.
 pub(crate) fn decode_as<P: Payload>(bytes: &[u8]) -> Result<P, DecodeError> {
-    decode_payload(bytes).map_err(|cause| DecodeError { name: P::NAME, cause })
+    let read = decode_payload(bytes).or_else(|cause| without_fields(bytes).ok_or(cause));
+    read.map_err(|cause| DecodeError { name: P::NAME, cause })
+}
+
+/// MessagePack forms of a value without fields: an empty map, an empty array, nil.
+const NO_FIELDS: [&[u8]; 3] = [&[0x80], &[0x90], &[0xc0]];
+
+/// Reads a type without fields (`struct Stop;`, `struct Stop {}`), whichever form of none its sender has chosen, also no bytes at all.
+fn without_fields<T: DeserializeOwned>(bytes: &[u8]) -> Option<T> {
+    // A type of no size has no fields with values in them: nothing is read that the sender has not written.
+    let is_one = size_of::<T>() == 0 && (bytes.is_empty() || NO_FIELDS.contains(&bytes));
+    NO_FIELDS.into_iter().filter(|_| is_one).find_map(|form| decode_payload(form).ok())
 }
 
 /// Writable memory for a raw payload: what `create_message` lends.
@@ -247,5 +258,41 @@ mod tests {
             let message = Message::new(Header::new(Point::KIND, Tid::NONE, Tid::NONE), payload.into());
             assert!(message.decode::<Point>().is_err());
         }
+    }
+
+    #[test]
+    fn a_type_without_fields_is_read_from_each_form_of_none_and_no_other_type_is() {
+        #[derive(Debug, Serialize, serde::Deserialize)]
+        struct Unit;
+        #[derive(Debug, Serialize, serde::Deserialize)]
+        struct Braces {}
+        #[derive(Debug, Serialize, serde::Deserialize)]
+        #[serde(default)]
+        struct Angle {
+            degrees: f64,
+        }
+        impl Default for Angle {
+            fn default() -> Self {
+                Self { degrees: 90.0 }
+            }
+        }
+        impl Payload for Unit {
+            const NAME: &'static str = "test.unit";
+        }
+        impl Payload for Braces {
+            const NAME: &'static str = "test.braces";
+        }
+        impl Payload for Angle {
+            const NAME: &'static str = "test.angle";
+        }
+        // As docs/protocol/frame.md says.
+        assert_eq!((&encode(&Unit)[..], &encode(&Braces {})[..]), (&[0x90][..], &[0x80][..]));
+        for bytes in [&[][..], &[0x80], &[0x90], &[0xc0]] {
+            assert!(decode_as::<Unit>(bytes).is_ok() && decode_as::<Braces>(bytes).is_ok(), "{bytes:?}");
+        }
+        for bytes in [&[0x01][..], &[0xc2], &[0xa1, b'x']] {
+            assert!(decode_as::<Unit>(bytes).is_err(), "{bytes:?}");
+        }
+        assert!(decode_as::<Angle>(&[]).is_err() && decode_as::<Angle>(&[0xc0]).is_err());
     }
 }
