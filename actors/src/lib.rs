@@ -72,7 +72,7 @@ mod takeover;
 mod wills;
 
 #[cfg(feature = "fault-points")]
-pub use sinew_runtime::supervision::fault;
+pub use sinew_runtime::{name, supervision::fault};
 
 pub use access::{AccessError, AccessSummary};
 pub use api::{

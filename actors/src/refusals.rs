@@ -10,7 +10,7 @@ use std::{
     time::Duration,
 };
 
-use sinew_runtime::time::Time;
+use sinew_runtime::{name::is_invisible, time::Time};
 
 /// A peer that sends rubbish at line rate costs one log line a second, not a full disk.
 const LOG_PERIOD: Duration = Duration::from_secs(1);
@@ -31,11 +31,6 @@ const ORDINARY: [&str; 8] = [
     "datagram with another key",
     "datagram of a life that is over",
     PEER_GONE,
-];
-/// What ends a line or turns it round and is no control character: separators of lines and paragraphs, overrides of direction.
-const LINE_BREAKERS: [char; 9] = [
-    '\u{2028}', '\u{2029}', '\u{202a}', '\u{202b}', '\u{202c}', '\u{202d}', '\u{202e}', '\u{2066}',
-    '\u{2067}',
 ];
 
 /// Counters of refusals. The causes are literals of this program, so their number is bounded.
@@ -155,7 +150,7 @@ impl Refusals {
 /// A detail as it is logged: nobody who has words of his in it ends its line or does things to a terminal, nor makes it longer than that.
 fn in_one_line(detail: &dyn Display) -> String {
     let words = detail.to_string();
-    let is_plain = |character: char| !character.is_control() && !LINE_BREAKERS.contains(&character);
+    let is_plain = |character: char| !is_invisible(character);
     let escaped = words.chars().flat_map(|character| {
         let (plain, escaped) =
             if is_plain(character) { (Some(character), None) } else { (None, Some(character)) };

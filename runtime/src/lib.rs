@@ -27,6 +27,7 @@ pub mod app;
 pub mod log;
 pub mod mailbox;
 pub mod monitor;
+pub mod name;
 pub mod outcome;
 pub mod pending;
 pub mod post;

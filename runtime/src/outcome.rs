@@ -86,7 +86,7 @@ impl fmt::Display for Rejection {
             Self::QueueFull => {
                 "the destination's queue is full; it handles messages more slowly than they come"
             }
-            Self::TooLong => "the payload is longer than the configured limit",
+            Self::TooLong => "the payload is longer than `node.payload_max` of a node on its way; raise that on all nodes, or send it in parts",
             Self::Closed => "the destination's application has ended",
             Self::ForgedSource => "the source TID does not belong to the sender",
             Self::ByHandler => "the destination's handler refused it",

@@ -204,8 +204,14 @@ impl Sender {
         self.shared.directory.resolve(name)
     }
 
-    /// Makes this application a member of the group called `name`: what is sent to [`Tid::group`] reaches it.
+    /// Makes this application a member of the group called `name`: what is sent to [`Tid::group`] reaches it. A name that breaks the
+    /// grammar of [names](crate::name) is refused with an error in the log.
     pub fn join(&self, name: &str) {
+        if let Err(why) = crate::name::check_name(name) {
+            let group: String = name.escape_debug().take(crate::name::NAME_BYTES_MAX).collect();
+            crate::log::error!(%group, %why, "the group is not joined: its name cannot be used");
+            return;
+        }
         self.set_member(name, true);
     }
 

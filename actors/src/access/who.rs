@@ -4,6 +4,7 @@ use std::ops::RangeInclusive;
 
 use sinew_runtime::{
     app::matches,
+    name::is_invisible,
     tid::{AppAddress, NodeAddress, Tid},
 };
 
@@ -98,7 +99,7 @@ impl Who {
 /// # Errors
 /// Why nothing can be called so.
 pub(super) fn name_pattern(text: &str) -> Result<String, &'static str> {
-    if text.is_empty() || text.len() > NAME_MAX || text.chars().any(char::is_control) {
+    if text.is_empty() || text.len() > NAME_MAX || text.chars().any(is_invisible) {
         return Err("a name has 1 to 63 bytes without control characters");
     }
     if text.trim() != text {

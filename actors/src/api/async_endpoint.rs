@@ -161,7 +161,7 @@ impl AsyncEndpoint {
     /// It is a member of 256 groups already, or its user or node has as many memberships as it may ([`ApiError::TooManyGroups`]); the node's access
     /// list does not let its user join this one ([`ApiError::Ended`], `NotAllowed`); or the node did not answer.
     pub async fn join(&mut self, name: &str) -> Result<(), ApiError> {
-        self.endpoint.set_member(AppAddress::group(name), true).await
+        self.endpoint.set_member(super::endpoint::group_named(name)?, true).await
     }
 
     /// Leaves the group called `name`.

@@ -3,6 +3,7 @@
 use std::{path::Path, sync::Arc, time::Duration};
 
 use sinew_runtime::{
+    name::{NAME_BYTES_MAX, check_name},
     outcome::{Outcome, Rejection},
     protection::Ends,
     sender::Destination,
@@ -274,7 +275,7 @@ impl Endpoint {
     /// It is a member of 256 groups already, or its user or node has as many memberships as it may ([`ApiError::TooManyGroups`]); the node's access
     /// list does not let its user join this one ([`ApiError::Ended`], `NotAllowed`); or the node did not answer.
     pub fn join(&mut self, name: &str) -> Result<(), ApiError> {
-        at_once(self.set_member(AppAddress::group(name), true))
+        at_once(self.set_member(group_named(name)?, true))
     }
 
     /// Leaves the group called `name`.
@@ -369,4 +370,13 @@ impl Drop for Endpoint {
         // A message that is still in some thread's hand ends as `Failed`.
         self.writer.close();
     }
+}
+/// The address of the group of this name.
+///
+/// # Errors
+/// The name breaks the grammar of names.
+pub(super) fn group_named(name: &str) -> Result<AppAddress, ApiError> {
+    let beginning = || name.chars().take(NAME_BYTES_MAX).collect();
+    check_name(name).map_err(|why| ApiError::BadName { name: beginning(), why })?;
+    Ok(AppAddress::group(name))
 }

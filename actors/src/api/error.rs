@@ -3,6 +3,7 @@
 use std::{io, path::PathBuf, time::Duration};
 
 use sinew_runtime::{
+    name::NameError,
     outcome::Outcome,
     protection::SealError,
     tid::Tid,
@@ -32,6 +33,14 @@ pub enum ApiError {
         path: PathBuf,
         /// What is wrong with it.
         why: &'static str,
+    },
+    /// No group can have this name. The caller is at fault; nothing changed.
+    #[error("the name {name:?} cannot be used: {why}")]
+    BadName {
+        /// The name, or its beginning.
+        name: String,
+        /// Which rule of [names](sinew_runtime::name) it breaks.
+        why: NameError,
     },
     /// The node refused, in its words. The connection is closed and nothing is registered.
     #[error("the node refused: {0}")]
@@ -173,6 +182,7 @@ mod tests {
             ApiError::NoNode { path: "/tmp/sinew-0.sock".into(), cause: io::Error::other(strangers) },
             ApiError::NoNode { path: "/run/knee.sock".into(), cause: io::ErrorKind::NotFound.into() },
             ApiError::NoNode { path: "/run/knee.sock".into(), cause: io::ErrorKind::PermissionDenied.into() },
+            ApiError::BadName { name: "a|b".to_owned(), why: NameError::Reserved('|') },
             ApiError::NotAPath { path: PathBuf::new(), why: "it is empty" },
             ApiError::Waiting { missing: vec!["hip".to_owned()], waited: second },
             ApiError::NoAnswer(second),

@@ -290,9 +290,9 @@ impl NodeConfig {
 }
 
 fn check_name(faults: &mut Vec<ConfigFault>, key: &str, name: &str) {
-    if name.is_empty() || name.len() > NAME_BYTES_MAX || name.chars().any(char::is_control) {
+    if let Err(why) = sinew_runtime::name::check_name(name) {
         let found = if name.is_empty() { "nothing".to_owned() } else { quoted(name) };
-        let legal = format!("a text of 1 to {NAME_BYTES_MAX} bytes without control characters");
+        let legal = format!("a name of 1 to {NAME_BYTES_MAX} bytes ({why})");
         faults.push(fault(key, found, legal, format!("set {key} to a short name, as in \"knee\"")));
     }
 }

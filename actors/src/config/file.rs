@@ -122,7 +122,7 @@ impl NodeConfig {
     /// Reads and checks the configuration in the TOML file at `path`; at most 1 MiB.
     ///
     /// # Errors
-    /// All faults, as in [`from_toml`](Self::from_toml). A file that cannot be read is one fault.
+    /// All faults, as in [`from_toml`](Self::from_toml), each with the file's name. A file that cannot be read is one fault.
     pub fn from_file(path: impl AsRef<Path>) -> Result<Self, ConfigFaults> {
         let path = path.as_ref();
         let text = read_bounded(path).map_err(|found| {
@@ -130,7 +130,7 @@ impl NodeConfig {
             let remedy = "check its path and its permissions";
             ConfigFaults::one(fault(&path.display().to_string(), found, legal, remedy))
         })?;
-        Self::from_toml(&text)
+        Self::from_toml(&text).map_err(|faults| faults.in_file(path))
     }
 }
 

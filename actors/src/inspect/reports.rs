@@ -355,7 +355,7 @@ payload!("sinew.inspect.audit_report" =>
 
 payload!("sinew.inspect.watch_report" =>
     /// What an application got and sent.
-    #[derive(Clone, Debug, PartialEq, Eq)]
+    #[derive(Clone, Debug, Default, PartialEq, Eq)]
     pub struct WatchReport {
         /// In the order in which it was seen.
         #[serde(deserialize_with = "at_most::<_, _, SEEN_MAX>")]

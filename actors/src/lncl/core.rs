@@ -8,14 +8,13 @@ use std::{collections::BTreeMap, fmt};
 
 use sinew_runtime::{
     app::{Requirement, RequirementError},
+    name::{NAME_BYTES_MAX, NameError, check_name},
     tid::AppAddress,
     wire::Kind,
 };
 
 use self::kinds::Kinds;
 
-/// Longest name in bytes.
-pub(crate) const NAME_MAX: usize = 63;
 /// Requirements of one application, and payload types that it may name, at most.
 pub(crate) const NAMES_MAX: usize = 64;
 
@@ -111,9 +110,14 @@ pub(crate) struct Request {
 /// Why an application was not registered. Nothing changed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum RegisterError {
-    /// The caller's name is empty, too long or has control characters in it.
-    #[error("the name {0:?} cannot be used: 1 to 63 bytes without control characters are allowed")]
-    BadName(String),
+    /// The caller's name, or that of a payload type, breaks the grammar of [names](sinew_runtime::name).
+    #[error("the name {name:?} cannot be used: {why}")]
+    BadName {
+        /// The name, or its beginning.
+        name: String,
+        /// Which rule it breaks.
+        why: NameError,
+    },
     /// Another application of the node has this name.
     #[error(
         "the name '{name}' is taken by application {holder} of {owner}; choose another name or end that one first"
@@ -425,11 +429,9 @@ impl Registry {
 }
 
 fn check_spelling(name: &str) -> Result<(), RegisterError> {
-    if name.is_empty() || name.len() > NAME_MAX || name.chars().any(char::is_control) {
-        // The name itself may be long; what is told of it is not.
-        return Err(RegisterError::BadName(name.chars().take(NAME_MAX).collect()));
-    }
-    Ok(())
+    // The name itself may be long; the error is not.
+    let beginning = || name.chars().take(NAME_BYTES_MAX).collect();
+    check_name(name).map_err(|why| RegisterError::BadName { name: beginning(), why })
 }
 
 fn check_lists(request: &Request) -> Result<(), RegisterError> {

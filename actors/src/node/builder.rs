@@ -10,6 +10,7 @@ use std::{
 use sinew_runtime::{
     app::DynApp,
     log::tracing::level_filters::LevelFilter,
+    name::NameError,
     supervision::{AutoShutdown, Flags, UNWINDS},
     tid::{Incarnation, NodeAddress},
 };
@@ -56,6 +57,14 @@ pub enum StartError {
     /// Two children of the node have the same name.
     #[error("two applications or supervisors of this node are called '{0}'; names are unique on a node")]
     SameName(String),
+    /// The name of a child of the node breaks the grammar of [names](sinew_runtime::name).
+    #[error("the application or supervisor '{name}' cannot have this name: {why}")]
+    BadName {
+        /// The name, its odd characters escaped.
+        name: String,
+        /// Which rule it breaks.
+        why: NameError,
+    },
     /// An application could not be registered.
     #[error("application '{name}' cannot be registered: {why}")]
     Application {

@@ -7,6 +7,7 @@ use std::{
 
 use sinew_runtime::{
     app::{DynApp, Requirement},
+    name::check_name,
     supervision::{AutoShutdown, Flags, Intensity, Policy, Restart, Strategy},
 };
 
@@ -181,6 +182,9 @@ impl SupervisorSpec {
 
     fn check_names<'a>(&'a self, names: &mut BTreeSet<&'a str>) -> Result<(), StartError> {
         for member in &self.members {
+            if let Err(why) = check_name(member.name()) {
+                return Err(StartError::BadName { name: member.name().escape_default().to_string(), why });
+            }
             if !names.insert(member.name()) {
                 return Err(StartError::SameName(member.name().to_owned()));
             }

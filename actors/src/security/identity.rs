@@ -15,8 +15,6 @@ use std::{
 
 use sinew_runtime::tid::NodeAddress;
 
-use crate::sync::NAME_BYTES_MAX;
-
 const SCHEME: &str = "sinew://";
 
 /// Which node of which project.
@@ -81,7 +79,7 @@ pub fn project_of(uri: &str) -> Option<String> {
 
 /// The rule of `node.name` and `node.project`.
 fn is_name(text: &str) -> bool {
-    (1..=NAME_BYTES_MAX).contains(&text.len()) && !text.chars().any(char::is_control)
+    sinew_runtime::name::check_name(text).is_ok()
 }
 
 const fn is_plain(byte: u8) -> bool {

@@ -11,6 +11,7 @@ use serde::{
 };
 use sinew_runtime::{
     app::Requirement,
+    name::is_invisible,
     tid::{AppAddress, Incarnation},
     wire::Kind,
 };
@@ -95,8 +96,8 @@ impl TryFrom<String> for Name {
         if text.is_empty() || text.len() > NAME_BYTES_MAX {
             return Err("a name has 1 to 63 bytes");
         }
-        if text.chars().any(char::is_control) {
-            return Err("a name has no control characters");
+        if text.chars().any(is_invisible) {
+            return Err("a name has no control characters and no invisible ones");
         }
         Ok(Self(text))
     }

@@ -214,7 +214,7 @@ impl From<ApiError> for Fault {
         let sentence = in_c(&error);
         let status = match error {
             ApiError::NoNode { .. } => Status::SinewErrorNoNode,
-            ApiError::NotAPath { .. } => Status::SinewErrorInvalidArgument,
+            ApiError::NotAPath { .. } | ApiError::BadName { .. } => Status::SinewErrorInvalidArgument,
             ApiError::Refused(_) => Status::SinewErrorRefused,
             ApiError::Waiting { .. } => Status::SinewErrorWaiting,
             ApiError::NoAnswer(_) => Status::SinewErrorNoAnswer,
@@ -261,6 +261,7 @@ fn in_c(error: &ApiError) -> String {
         ApiError::Waiting { .. }
         | ApiError::NoNode { .. }
         | ApiError::NotAPath { .. }
+        | ApiError::BadName { .. }
         | ApiError::Refused(_)
         | ApiError::NoAnswer(_)
         | ApiError::Closed(_)

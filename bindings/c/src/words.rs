@@ -112,7 +112,7 @@ pub(crate) const fn text_of(outcome: sinew::Outcome) -> &'static CStr {
         Outcome::SinewRejectedQueueFull => {
             c"not handled: a queue was full; the destination is slower than messages come"
         }
-        Outcome::SinewRejectedTooLong => c"not handled: the payload is longer than the configured limit",
+        Outcome::SinewRejectedTooLong => c"not handled: the payload is longer than `node.payload_max` of a node on its way; raise that on all nodes, or send it in parts",
         Outcome::SinewRejectedClosed => c"not handled: the destination's application has ended",
         Outcome::SinewRejectedForgedSource => c"not handled: the source TID is not the sender's",
         Outcome::SinewRejectedByHandler => c"not handled: the destination's handler refused it",

@@ -16,12 +16,12 @@ use std::{fmt, str::FromStr, time::Duration};
 
 use serde::{Deserialize, Serialize};
 
+use crate::name::{NAME_BYTES_MAX, is_invisible};
+
 /// Longest requirement in bytes.
 pub const REQUIREMENT_BYTES_MAX: usize = 255;
 /// Names or patterns between which one requirement chooses, at most.
 pub const ALTERNATIVES_MAX: usize = 16;
-/// Longest name in bytes.
-const NAME_BYTES_MAX: usize = 63;
 /// What ends the count of a requirement.
 const OF: &str = " of ";
 /// What begins the phase of a requirement.
@@ -228,8 +228,8 @@ fn parse(text: &str) -> Result<Requirement, &'static str> {
         if name.is_empty() || name.len() > NAME_BYTES_MAX {
             return Err("each name in it has 1 to 63 bytes");
         }
-        if name.chars().any(char::is_control) {
-            return Err("a name has no control characters");
+        if name.chars().any(is_invisible) {
+            return Err("a name has no control characters and no invisible ones");
         }
         let name = plain(name);
         if !of.contains(&name) {

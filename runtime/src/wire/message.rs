@@ -190,7 +190,7 @@ pub(crate) fn decode_as<P: Payload>(bytes: &[u8]) -> Result<P, DecodeError> {
 const NO_FIELDS: [&[u8]; 3] = [&[0x80], &[0x90], &[0xc0]];
 
 /// Reads a type without fields (`struct Stop;`, `struct Stop {}`), whichever form of none its sender has chosen, also no bytes at all.
-fn without_fields<T: DeserializeOwned>(bytes: &[u8]) -> Option<T> {
+fn without_fields<T: DeserializeOwned + Serialize>(bytes: &[u8]) -> Option<T> {
     // A type of no size has no fields with values in them: nothing is read that the sender has not written.
     let is_one = size_of::<T>() == 0 && (bytes.is_empty() || NO_FIELDS.contains(&bytes));
     NO_FIELDS.into_iter().filter(|_| is_one).find_map(|form| decode_payload(form).ok())

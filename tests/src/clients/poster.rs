@@ -204,6 +204,7 @@ impl Letters {
             | ApiError::Disconnected(_)
             | ApiError::NoNode { .. }
             | ApiError::NotAPath { .. }
+            | ApiError::BadName { .. }
             | ApiError::Refused(_)
             | ApiError::Waiting { .. }
             | ApiError::NoAnswer(_)

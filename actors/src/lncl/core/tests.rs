@@ -46,9 +46,18 @@ fn a_fixed_address_must_be_in_its_range_and_free() {
 
 #[test]
 fn names_that_nobody_could_read_are_refused() {
-    for name in ["", "line\nbreak", &"x".repeat(64)] {
+    for name in [
+        "",
+        "line\nbreak",
+        &"x".repeat(64),
+        "a|b",
+        "2 of drives",
+        "leg.*",
+        "left\u{202e}right",
+        "10.0.0.2/1001",
+    ] {
         let refusal = Registry::default().register(request(Address::Dynamic, Some(name)), LIMITS);
-        assert!(matches!(refusal, Err(RegisterError::BadName(_))), "{name:?}");
+        assert!(matches!(refusal, Err(RegisterError::BadName { .. })), "{name:?}");
     }
 }
 

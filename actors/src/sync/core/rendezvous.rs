@@ -27,6 +27,7 @@ use std::{
 use bytes::Bytes;
 use sinew_runtime::{
     app::Requirement,
+    name::{check_name, shown},
     tid::{AppAddress, Incarnation, NodeAddress},
     time::Time,
 };
@@ -119,6 +120,8 @@ impl Rendezvous {
     pub(super) fn arrive(&mut self, now: Time, arrived: Arrived) -> Result<(), String> {
         let Arrived { app, name, user, correlation, barrier, parties, within, on_loss } = arrived;
         let called = name.as_deref().unwrap_or_default();
+        check_name(&barrier)
+            .map_err(|why| format!("a barrier cannot be called '{}': {why}", shown(&barrier)))?;
         if !parties.iter().any(|party| party.counts(called)) {
             return Err(format!(
                 "an application called {called:?} is none of the parties of the barrier '{barrier}'"

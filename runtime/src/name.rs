@@ -1,0 +1,168 @@
+//! Names: the one grammar of applications, supervisors, groups, barriers, payload types, nodes and projects.
+//!
+//! A name is 1 to 63 bytes of UTF-8. It has
+//!
+//! - no control characters, line separators, and no characters without a width or with a direction of their own (`U+200B`, `U+202E`);
+//! - no white space at its beginning or end;
+//! - no `*` and no `|`: these belong to the language of requirements;
+//! - no form that the language of requirements reads as more than a name: `2 of drives`, `drive at homed`, `camera ?2s`;
+//! - no form of an address: `10.0.0.2`, `10.0.0.2/80000001`.
+
+use crate::{
+    app::Requirement,
+    tid::{NodeAddress, Tid},
+};
+
+/// Longest name in bytes.
+pub const NAME_BYTES_MAX: usize = 63;
+
+/// Why a text is no name. The caller is at fault.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum NameError {
+    /// It has no characters.
+    #[error("it is empty; a name has 1 to {NAME_BYTES_MAX} bytes")]
+    Empty,
+    /// It has more than [`NAME_BYTES_MAX`] bytes.
+    #[error("it has {0} bytes, and a name has at most {NAME_BYTES_MAX}")]
+    TooLong(usize),
+    /// It has a character that a reader would not see.
+    #[error("it contains the invisible character U+{:04X}; remove it", u32::from(*.0))]
+    Invisible(char),
+    /// White space comes first or last.
+    #[error("it begins or ends with white space; remove that")]
+    WhiteSpace,
+    /// It has a character of the language of requirements.
+    #[error(
+        "'{0}' belongs to the language of requirements (`a | b`, `drive.*`); use letters, digits, '.', '_' or '-' instead"
+    )]
+    Reserved(char),
+    /// A requirement with this text asks for something else.
+    #[error(
+        "as a requirement it asks for something else (`2 of drives`, `drive at homed`, `camera ?2s`); choose another name"
+    )]
+    Expression,
+    /// It reads as an address.
+    #[error("it reads as the address of a node or an application; choose another name")]
+    Address,
+}
+
+/// Checks a name against the grammar of this module.
+///
+/// # Errors
+/// The first rule that the text breaks.
+pub fn check_name(name: &str) -> Result<(), NameError> {
+    if name.is_empty() {
+        return Err(NameError::Empty);
+    }
+    if name.len() > NAME_BYTES_MAX {
+        return Err(NameError::TooLong(name.len()));
+    }
+    if let Some(invisible) = name.chars().find(|character| is_invisible(*character)) {
+        return Err(NameError::Invisible(invisible));
+    }
+    if name.trim() != name {
+        return Err(NameError::WhiteSpace);
+    }
+    if let Some(reserved) = name.chars().find(|character| "*|".contains(*character)) {
+        return Err(NameError::Reserved(reserved));
+    }
+    let requirement = name.parse::<Requirement>();
+    if !requirement.is_ok_and(|requirement| requirement.only_name() == Some(name)) {
+        return Err(NameError::Expression);
+    }
+    if name.parse::<NodeAddress>().is_ok() || name.parse::<Tid>().is_ok() {
+        return Err(NameError::Address);
+    }
+    Ok(())
+}
+
+/// Whether a character changes how the text around it is shown without being seen itself: controls, line and paragraph separators,
+/// characters that set the direction of text, characters of no width, and tags.
+#[must_use]
+pub fn is_invisible(character: char) -> bool {
+    character.is_control()
+        || matches!(
+            character,
+            '\u{ad}' | '\u{34f}' | '\u{61c}' | '\u{115f}' | '\u{1160}' | '\u{17b4}' | '\u{17b5}' | '\u{180b}'..='\u{180f}'
+                | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2060}'..='\u{206f}' | '\u{3164}' | '\u{fe00}'..='\u{fe0f}'
+                | '\u{feff}' | '\u{ffa0}' | '\u{fff0}'..='\u{fffb}' | '\u{1bca0}'..='\u{1bca3}' | '\u{1d173}'..='\u{1d17a}'
+                | '\u{e0000}'..='\u{e0fff}'
+        )
+}
+
+/// A text from outside as it is shown: each invisible character as its escape, `\u{202e}`.
+#[must_use]
+pub fn shown(text: &str) -> String {
+    let mut shown = String::with_capacity(text.len());
+    for character in text.chars() {
+        if is_invisible(character) {
+            shown.extend(character.escape_unicode());
+        } else {
+            shown.push(character);
+        }
+    }
+    shown
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn names_of_every_kind_in_use_are_legal() {
+        for name in [
+            "knee",
+            "knee.drive",
+            "sync manager",
+            "Knie-Antrieb_2",
+            "膝.駆動",
+            "a/b",
+            "a@b",
+            "2 of",
+            "of",
+            "cam?",
+        ] {
+            assert_eq!(check_name(name), Ok(()), "{name:?}");
+        }
+    }
+
+    #[test]
+    fn a_name_that_requirements_cannot_say_is_refused_with_its_reason() {
+        for (name, why) in [
+            ("", NameError::Empty),
+            ("a|b", NameError::Reserved('|')),
+            ("leg.*", NameError::Reserved('*')),
+            ("2 of drives", NameError::Expression),
+            ("drive at homed", NameError::Expression),
+            ("camera ?2s", NameError::Expression),
+            ("camera ?soon", NameError::Expression),
+            (" knee", NameError::WhiteSpace),
+            ("knee\u{a0}", NameError::WhiteSpace),
+            ("a\nb", NameError::Invisible('\n')),
+            ("a\u{202e}b", NameError::Invisible('\u{202e}')),
+            ("kn\u{200b}ee", NameError::Invisible('\u{200b}')),
+            ("10.0.0.2", NameError::Address),
+            ("10.0.0.2/80000001", NameError::Address),
+        ] {
+            assert_eq!(check_name(name), Err(why), "{name:?}");
+        }
+        assert_eq!(check_name(&"x".repeat(64)), Err(NameError::TooLong(64)));
+    }
+
+    #[test]
+    fn a_text_is_shown_with_its_invisible_characters_escaped() {
+        assert_eq!(shown("knee\u{202e}x\n\u{200b}é"), "knee\\u{202e}x\\u{a}\\u{200b}é");
+    }
+
+    proptest! {
+        #[test]
+        fn each_legal_name_is_a_requirement_of_itself(name in "\\PC{0,40}") {
+            if check_name(&name).is_ok() {
+                let requirement: Requirement = name.parse().unwrap();
+                prop_assert_eq!(requirement.only_name(), Some(name.as_str()));
+            }
+        }
+    }
+}
