@@ -9,7 +9,7 @@ use sinew::{
 };
 
 use crate::{
-    Said,
+    Report,
     system::{Answer, Fault, System},
     table::{Table, clean, or_dash, time},
 };
@@ -20,9 +20,9 @@ const KINDS_SHOWN: usize = 2;
 const KIND_WIDTH: usize = 32;
 
 /// Asks every node for its applications.
-pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
+pub(crate) fn show(system: &mut System, is_wide: bool) -> Result<Report, Fault> {
     let answers = ask(system)?;
-    let mut table = Table::new(["TID", "NAME", "NODE", "STATE", "HANDLES", "WHY"]);
+    let mut table = Table::new(["TID", "NAME", "NODE", "STATE", "HANDLES", "DETAIL"]).wide(is_wide);
     let mut rows = Vec::new();
     for (node, app) in all(&answers) {
         table.row([
@@ -40,15 +40,15 @@ pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
     let is_fine = is_ready && shown.is_complete(&answers);
     let text = table.text() + &shown.silent(&answers);
     let (left_out, silent) = (shown.left_out_json(&answers), silent_json(&answers));
-    Ok(Said { text, json: json!({ "apps": rows, "left_out": left_out, "silent": silent }), is_fine })
+    Ok(Report { text, json: json!({ "apps": rows, "left_out": left_out, "silent": silent }), is_fine })
 }
 
 /// Asks every node who waits there, and says who is waited for.
-pub(crate) fn barriers(system: &mut System) -> Result<Said, Fault> {
+pub(crate) fn barriers(system: &mut System) -> Result<Report, Fault> {
     Ok(who_waits(&ask(system)?))
 }
 
-fn who_waits(answers: &[Answer<AppsReport>]) -> Said {
+fn who_waits(answers: &[Answer<AppsReport>]) -> Report {
     let shown = Shown::Barriers;
     let waiting: Vec<_> = all(answers).filter(|(_, app)| !app.missing.is_empty()).collect();
     let mut blocked: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
@@ -101,7 +101,7 @@ fn who_waits(answers: &[Answer<AppsReport>]) -> Said {
         meetings.iter().for_each(|(node, one)| table.row(meeting_cells(node, one)));
         text += &(if text.is_empty() { table.text() } else { format!("\n{}", table.text()) });
     }
-    Said { text: text + &shown.silent(answers), json, is_fine }
+    Report { text: text + &shown.silent(answers), json, is_fine }
 }
 
 /// The run-time barriers at which somebody waits, each as every node sees it that has somebody there.

@@ -20,6 +20,9 @@ pub(crate) struct Arguments {
     /// Print JSON instead of tables; where the command cannot be carried out, an object whose `fault` says why, beside the words on stderr
     #[arg(long, global = true)]
     pub(crate) json: bool,
+    /// Show all columns, and do not wrap lines at 120 columns
+    #[arg(long, global = true)]
+    pub(crate) wide: bool,
     /// How long each node has for its answer
     #[arg(long, global = true, value_name = "MS", default_value_t = 2_000, value_parser = clap::value_parser!(u32).range(1..=60_000))]
     deadline_ms: u32,
@@ -31,65 +34,109 @@ pub(crate) struct Arguments {
 /// What to show.
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Every node: address, name, life, since when, for how many days its keys still count (or OPEN), what connects it, round trip and clock
+    /// Shows every node: address, name, up time, state, validity of its keys (or OPEN), links and round-trip time
+    #[command(after_help = r#"Examples:
+  sinew nodes
+  sinew nodes --wide            all columns: incarnation, routes, bounds, clock, drift
+  sinew nodes --json | jq -r '.nodes[].name'"#)]
     Nodes,
-    /// Every application: address, name, node, ready or why not
+    /// Shows every application: TID, name, node, and whether it is ready or why not
+    #[command(after_help = r#"Examples:
+  sinew apps
+  sinew apps --json | jq '.apps[] | select(.ready | not)'"#)]
     Apps,
-    /// Who supervises whom, with lives, restarts, and how the last life ended
+    /// Shows the supervision tree of each node, with restarts and the reason of the last one
+    #[command(after_help = r#"Examples:
+  sinew tree
+  sinew tree knee"#)]
     Tree {
         /// A node's address or name; without it: every node
         node: Option<String>,
     },
-    /// How long a message and its confirmation take
+    /// Measures the round-trip time of a confirmed message
     ///
     /// The ping goes to the application's own thread, or to the node's inspection, and is answered there without the application's code.
     /// An application in a process of its own that came in through a socket answers it when it receives.
+    #[command(after_help = r#"Examples:
+  sinew ping knee.drive
+  sinew ping 192.168.0.12 --count 1000"#)]
     Ping {
         /// An application's TID (127.0.0.2/80000001) or name, a node's address or name: the first that it is, in this order
-        whom: String,
+        target: String,
         /// How many, each when the one before was answered; after three in a row without an answer no more
         #[arg(long, short, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
         count: u32,
     },
-    /// Sends a message, and says what became of it
+    /// Sends a message to an application or a group, and shows its outcome
     ///
     /// The payload is written as MessagePack, as every typed payload is: what its type calls its fields are the keys of the JSON object.
+    #[command(after_help = r#"Examples:
+  sinew send knee.drive demo.angle '{"degrees": 5}'
+  sinew send drives demo.stop                 to a group: each member, without confirmation
+  sinew send knee.drive demo.status --ask     prints the reply"#)]
     Send(send::Order),
     /// Shows what an application gets and sends: decoded payloads, type, class, source, age, and each type's rate once a second
     ///
     /// The copies come from the application's node, as far as it has room for them: what has none is counted, the application does not
     /// wait. Not seen is what goes over direct links between processes (`Registration::direct`). With --json each line is an object.
+    #[command(after_help = r#"Examples:
+  sinew watch knee.drive --received
+  sinew watch drives --kind demo.stop         what the members of a group get by it
+  sinew watch knee.drive --rates --for 10
+  sinew watch knee.drive --json | jq .payload"#)]
     Watch(watch::Order),
-    /// What stands in the way between two nodes or applications: each step, seen from both ends, with what mends it
+    /// Finds out why two nodes or applications cannot communicate: each step, from both ends, with a suggested fix
     ///
     /// All nodes are asked that can be reached through any socket of this host, so that two nodes that do not know each other are asked
     /// both. Exit code 0 if the way is free.
+    #[command(after_help = r#"Examples:
+  sinew why hip knee
+  sinew why gait knee.drive
+  sinew why gait drives                       each member of a group"#)]
     Why(why::Order),
-    /// Who waits for whom, at start-up barriers and at run-time ones, and who blocks them
+    /// Shows which applications wait at barriers, and which ones they wait for
+    #[command(after_help = r#"Examples:
+  sinew barriers
+  sinew barriers --json | jq .missing"#)]
     Barriers,
-    /// Where every message is that was ever sent: what each mailbox, client and link took, and how each of these ended
+    /// Accounts for every message ever sent: the counters of each mailbox, client and link
     ///
     /// Each node is read twice, and both ends of each link are compared. What nobody can explain is named, with its place or link.
+    #[command(after_help = r#"Examples:
+  sinew audit"#)]
     Audit,
-    /// Has the node that lets this command in read its access list and its deny list again, without a restart
+    /// Reloads the access list and the deny list of the local node, without a restart
     ///
     /// A list with faults changes nothing: each is named with its line, and the list in force stays. Connections with nodes whose
     /// certificates are on the deny list end.
+    #[command(after_help = r#"Examples:
+  sinew --socket /run/sinew/knee.sock reload"#)]
     Reload,
-    /// Whether this machine gives a node what it needs: interfaces, multicast, limits, real-time rights, CPU governor, clock, shared memory,
-    /// sockets; whether nodes are open to others, and when their certificates end; each finding with the command that mends it
+    /// Checks whether this machine has what a node needs: interfaces, multicast, limits, real-time rights, CPU governor, clock, shared memory,
+    /// sockets, open nodes, expiry of certificates. Each finding has a suggested fix
+    #[command(after_help = r#"Examples:
+  sinew doctor
+  sinew doctor --interface eth0"#)]
     Doctor {
         /// Interfaces that multicast is tried on, by address or by name, or `all`, with commas between them. Without it: the
         /// `ndl.interface` of the node that lets us in, else 127.0.0.1. What is sent does not leave this machine
         #[arg(long, value_name = "INTERFACE", value_delimiter = ',')]
         interface: Vec<sinew::config::Interface>,
     },
-    /// Makes the keys of a whole robot, and shows who has which: its authority, and a key and a certificate for each node
+    /// Makes and shows the keys of a robot: its certificate authority, and a key and a certificate for each node
     ///
     /// It asks no node. A node whose configuration names its keys takes only nodes with keys of the same project.
-    #[command(subcommand)]
+    #[command(
+        subcommand,
+        after_help = r#"Examples:
+  sinew keys init walker hip=192.168.0.11 knee=192.168.0.12
+  sinew keys show
+  sinew keys revoke knee"#
+    )]
     Keys(keys::Order),
-    /// Prints what makes the shell complete this command's words
+    /// Prints a completion script for a shell
+    #[command(after_help = r#"Examples:
+  sinew completions bash > ~/.local/share/bash-completion/completions/sinew"#)]
     Completions {
         /// Which shell
         shell: clap_complete::Shell,
@@ -128,11 +175,11 @@ impl Arguments {
 
 const AFTER: &str = "\
 Exit codes:
-  0  all is fine
-  1  something was found: a node does not answer or refuses, something of it does not get on, an application is not ready, a message
-     was not delivered, nobody is called so; a list cannot be used; keys cannot be made, or count for less than another 30 days
+  0  no problem was found
+  1  a problem was found: a node or an application does not answer, is not ready or refuses, a message was not delivered, a name is
+     unknown, a list cannot be used, keys cannot be made or are valid for less than 30 days
   2  the command line is wrong
-  3  no node lets this command in, or that node does not answer
+  3  no node on this machine accepts this command, or that node does not answer
   4  all is fine, but standard output did not take all of it (a full disk); a reader that closes its pipe, as `head`, is no error
 
 Examples:

@@ -8,13 +8,13 @@ use sinew::{
 };
 
 use crate::{
-    Said,
+    Report,
     system::{Answer, Fault, System},
     table::clean,
 };
 
 /// Reads every node twice, and puts that side by side.
-pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
+pub(crate) fn show(system: &mut System) -> Result<Report, Fault> {
     let here = system.here()?;
     let before = system.ask_all::<AskAudit, AuditReport>(&here);
     let after = system.ask_all::<AskAudit, AuditReport>(&here);
@@ -23,7 +23,7 @@ pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
     let audit = Audit::of_readings(here.node, &asked, &readings(before), readings(after));
     let json = serde_json::to_value(&audit).expect("every key of an audit is a text");
     let is_fine = audit.missing() == 0 && audit.silent.is_empty();
-    Ok(Said { text: format!("{audit}\n{faults}"), json, is_fine })
+    Ok(Report { text: format!("{audit}\n{faults}"), json, is_fine })
 }
 
 fn readings(answers: Vec<Answer<AuditReport>>) -> Vec<NodeAudit> {

@@ -21,7 +21,8 @@ use sinew::{
 };
 
 use crate::{
-    Said,
+    Report,
+    arguments::Arguments,
     system::{Answer, Fault, System},
     table::{Table, clean},
 };
@@ -46,7 +47,8 @@ impl Check {
 }
 
 /// Tries everything; multicast at these interfaces, without any where the node looks that lets us in.
-pub(crate) fn show(chosen: Vec<Interface>, socket: Option<&Path>, within: Duration) -> Said {
+pub(crate) fn show(chosen: Vec<Interface>, arguments: &Arguments) -> Report {
+    let (socket, within) = (arguments.socket.as_deref(), arguments.within());
     let interfaces = network::found();
     let chosen = Some(chosen).filter(|chosen| !chosen.is_empty()).map(Interfaces::from);
     let Nodes { said: nodes, silent } = Nodes::asked(socket, within);
@@ -70,15 +72,15 @@ pub(crate) fn show(chosen: Vec<Interface>, socket: Option<&Path>, within: Durati
     checks.extend(together::checks(&nodes));
     let is_fine = checks.iter().all(|check| check.mend.is_none());
     let json = json!({ "checks": checks.iter().map(check_json).collect::<Vec<_>>() });
-    let mut table = Table::new(["CHECK", "", "WHAT IS SO"]);
+    let mut table = Table::new(["CHECK", "STATUS", "DETAIL"]).wide(arguments.wide);
     for check in &checks {
         let state = if check.mend.is_none() { "fine" } else { "FINDING" };
         table.row([check.name.to_owned(), state.to_owned(), check.seen.clone()]);
     }
     let mends = checks.iter().filter_map(|check| Some((check.name, check.mend.as_ref()?)));
     let mends: String = mends.map(|(name, mend)| format!("{name}: {}\n", clean(mend))).collect();
-    let text = if is_fine { table.text() } else { format!("{}\nWhat mends it\n{mends}", table.text()) };
-    Said { text, json, is_fine }
+    let text = if is_fine { table.text() } else { format!("{}\nSuggested fix\n{mends}", table.text()) };
+    Report { text, json, is_fine }
 }
 
 /// What the nodes of a system say of themselves.

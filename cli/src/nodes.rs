@@ -9,7 +9,7 @@ use sinew::inspect::{
 };
 
 use crate::{
-    Said, security,
+    Report, security,
     system::{Answer, Fault, System},
     table::{Table, clean, or_dash, time},
     why::lost_in_words,
@@ -17,9 +17,11 @@ use crate::{
 
 /// Columns of the table.
 const COLUMNS: usize = 14;
+/// Those that are shown unless all are asked for: node, name, up, state, keys, found by, links, round trip.
+const SHORT: [usize; 8] = [0, 1, 3, 4, 5, 6, 7, 11];
 
 /// Asks every node.
-pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
+pub(crate) fn show(system: &mut System, is_wide: bool) -> Result<Report, Fault> {
     let here = system.here()?;
     let answers = system.ask_all::<AskNode, NodeReport>(&here);
     let rows: Vec<_> = answers.iter().map(|answer| Row::of(&here, answer)).collect();
@@ -38,7 +40,7 @@ pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
         "left_out": here.left_out,
         "lost_left_out": here.lost_left_out,
     });
-    Ok(Said { text: text(&here, &rows, &lost), json, is_fine })
+    Ok(Report { text: text(&here, &rows, &lost, is_wide), json, is_fine })
 }
 
 /// A node: what it says, and what the node says through which we came.
@@ -308,11 +310,11 @@ fn idle(row: &Row<'_>) -> String {
     lines
 }
 
-fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport]) -> String {
+fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport], is_wide: bool) -> String {
     let heading: [_; COLUMNS] = [
         "NODE",
         "NAME",
-        "LIFE",
+        "INCARNATION",
         "UP",
         "STATE",
         "KEYS",
@@ -325,10 +327,16 @@ fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport]) -> String {
         "CLOCK",
         "DRIFT",
     ];
-    let mut table = Table::new(heading);
-    rows.iter().for_each(|row| table.row(row.cells()));
-    lost.iter().for_each(|lost| table.row(lost_cells(lost)));
-    let mut text = table.text();
+    let cells = rows.iter().map(Row::cells).chain(lost.iter().map(|lost| lost_cells(lost)));
+    let mut text = if is_wide {
+        let mut table = Table::new(heading).wide(true);
+        cells.for_each(|cells| table.row(cells));
+        table.text()
+    } else {
+        let mut table = Table::new(SHORT.map(|column| heading[column]));
+        cells.for_each(|cells| table.row(SHORT.map(|column| cells[column].clone())));
+        table.text()
+    };
     text.extend(sources(here));
     for lost in &here.lost {
         let (seen, mend) = lost_in_words(lost);
@@ -390,7 +398,7 @@ mod tests {
     #[test]
     fn nodes_that_had_no_room_in_the_answer_are_told_with_their_number() {
         let here = NodeReport { left_out: 2, lost_left_out: 3, ..security::tests::said("knee", 7, None) };
-        let said = text(&here, &[], &[]);
+        let said = text(&here, &[], &[], false);
         let lines = "2 further nodes had no room in the answer of 192.168.0.7\n\
                      3 further lost nodes had no room in the answer of 192.168.0.7\n";
         assert!(said.ends_with(lines), "{said}");

@@ -37,12 +37,12 @@ pub(crate) fn note(text: impl Display) {
     let _ = writeln!(io::stderr(), "{text}");
 }
 
-/// The exit code of the program: `code`, or [`NOT_WRITTEN`](crate::NOT_WRITTEN) where all was fine but standard output has failed.
+/// The exit code of the program: `code`, or [`EXIT_NOT_WRITTEN`](crate::EXIT_NOT_WRITTEN) where all was fine but standard output has failed.
 pub(crate) fn exit_code(code: u8) -> ExitCode {
     let failed = FIRST_ERROR.get().filter(|error| error.kind() != io::ErrorKind::BrokenPipe);
     let Some(error) = failed else { return ExitCode::from(code) };
     note(format_args!(
         "sinew: standard output is incomplete: {error}; free space where it goes, or send it elsewhere"
     ));
-    ExitCode::from(if code == crate::FINE { crate::NOT_WRITTEN } else { code })
+    ExitCode::from(if code == crate::EXIT_OK { crate::EXIT_NOT_WRITTEN } else { code })
 }

@@ -9,7 +9,7 @@ use sinew::{
 };
 
 use crate::{
-    Said, apps,
+    Report, apps,
     system::{Fault, System},
     table::clean,
 };
@@ -30,7 +30,7 @@ struct Tally {
 }
 
 /// Sends `count` pings to a TID, a name or a node, each when the one before was answered.
-pub(crate) fn show(system: &mut System, whom: &str, count: u32) -> Result<Said, Fault> {
+pub(crate) fn show(system: &mut System, whom: &str, count: u32) -> Result<Report, Fault> {
     let to = system.find(whom)?;
     let mut tally = Tally::default();
     let mut in_vain = 0;
@@ -98,7 +98,7 @@ impl Tally {
         self.round_trips.get(rank.saturating_sub(1)).copied()
     }
 
-    fn said(&self, whom: &str, to: Tid) -> Said {
+    fn said(&self, whom: &str, to: Tid) -> Report {
         let answered = self.round_trips.len();
         let quantiles = [self.quantile(0.0), self.quantile(0.5), self.quantile(0.99), self.quantile(1.0)];
         let [min, p50, p99, max] = quantiles;
@@ -116,7 +116,7 @@ impl Tally {
             "outcome": self.outcome.map(|outcome| format!("{outcome:?}")),
             "min_ns": min, "p50_ns": p50, "p99_ns": p99, "max_ns": max,
         });
-        Said { text, json, is_fine: self.fault.is_none() }
+        Report { text, json, is_fine: self.fault.is_none() }
     }
 }
 

@@ -7,13 +7,13 @@ use sinew::{
 };
 
 use crate::{
-    Said,
+    Report,
     system::{Fault, System},
     table::clean,
 };
 
 /// Asks the node that lets us in.
-pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
+pub(crate) fn show(system: &mut System) -> Result<Report, Fault> {
     let node = system.endpoint.tid().node;
     let answer = system.ask_these::<AskReload, ReloadReport>(vec![(node, String::new())]).pop();
     let said = answer.map_or_else(|| Err("no answer".to_owned()), |answer| answer.said);
@@ -23,7 +23,7 @@ pub(crate) fn show(system: &mut System) -> Result<Said, Fault> {
         "rules": rules, "clients": clients, "has_list": has_list, "denied": denied, "readmitted": readmitted,
         "refused": refused
     });
-    Ok(Said { text: text(node, &said), json, is_fine: refused.is_none() })
+    Ok(Report { text: text(node, &said), json, is_fine: refused.is_none() })
 }
 
 /// What is wrong, one fault a line, and what is in force whether anything is or not.

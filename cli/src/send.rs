@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use sinew::{ApiError, Class, Kind, LoanedMessage, Outcome, Tid, Time};
 
 use crate::{
-    Said, messagepack, ping,
+    Report, messagepack, ping,
     system::{Fault, System},
     table::{clean, time},
 };
@@ -18,11 +18,11 @@ const INPUT_MAX: u64 = 64 << 20;
 /// What to send, and how.
 #[derive(Debug, Args)]
 pub(crate) struct Order {
-    /// An application's TID (127.0.0.2/80000001) or name
-    pub(crate) whom: String,
+    /// An application's TID (127.0.0.2/80000001) or name, or a group's name
+    pub(crate) target: String,
     /// The payload's type as its program calls it (demo.angle), or its number (0x9c1b6bda)
     kind: String,
-    /// The payload, as JSON; `-` reads it from the standard input
+    /// The payload, as JSON; `-` reads it from the standard input. A type without fields takes `{}`, `null` and `''` (no bytes)
     #[arg(default_value = "{}")]
     payload: String,
     /// Wait for a reply, and print it
@@ -86,10 +86,13 @@ impl Ended {
 }
 
 /// Sends it, and says what became of it.
-pub(crate) fn show(system: &mut System, order: &Order) -> Result<Said, Fault> {
-    let to = system.find(&order.whom)?;
+pub(crate) fn show(system: &mut System, order: &Order) -> Result<Report, Fault> {
+    let to = system.find_or_group(&order.target)?;
     let kind = kind(&order.kind)?;
     let payload = payload(&order.payload)?;
+    if !to.is_single() {
+        return to_many(system, to, (kind, &payload), order);
+    }
     let began = Time::now();
     let mut ended = send(system, to, (kind, &payload), order);
     let took = Time::now().since(began);
@@ -105,13 +108,59 @@ pub(crate) fn show(system: &mut System, order: &Order) -> Result<Said, Fault> {
         // Alone, for a pipe.
         said + "\n"
     } else {
-        format!("{} ({to}): {said}, after {}\n", clean(&order.whom), time(micros))
+        format!("{} ({to}): {said}, after {}\n", clean(&order.target), time(micros))
     };
     let json = json!({
         "tid": to.to_string(), "kind": kind.to_string(), "bytes": payload.len(), "took_us": micros, "fault": ended.fault,
         "outcome": ended.outcome.map(|outcome| format!("{outcome:?}")), "reply": ended.reply,
     });
-    Ok(Said { text, json, is_fine: ended.fault.is_none() })
+    Ok(Report { text, json, is_fine: ended.fault.is_none() })
+}
+
+/// Sends it to each member of a group, or to all applications: without confirmation, as each of them would have one of its own.
+fn to_many(
+    system: &mut System,
+    to: Tid,
+    (kind, payload): (Kind, &[u8]),
+    order: &Order,
+) -> Result<Report, Fault> {
+    if order.ask {
+        let target = clean(&order.target);
+        return Err(Fault::Usage(format!(
+            "'{target}' is a group, and --ask asks one application; name a member of it"
+        )));
+    }
+    let (members, silent) = system.members(to)?;
+    // With nobody there to send to, nothing is sent and nothing can fail.
+    let fault = if members.is_empty() {
+        None
+    } else {
+        let endpoint = &mut system.endpoint;
+        let sent = endpoint.create_message(to, kind, payload.len()).and_then(|mut loan: LoanedMessage| {
+            loan.copy_from_slice(payload);
+            loan.set_class(order.class.into());
+            endpoint.send_message(loan)
+        });
+        sent.err().map(|error| clean(&error.to_string()))
+    };
+    let target = clean(&order.target);
+    let result = match (&fault, members.len()) {
+        (Some(why), _) => why.clone(),
+        (None, 0) => {
+            "no application is a member; the message reached nobody. `sinew apps` shows the applications"
+                .to_owned()
+        }
+        (None, 1) => "sent to 1 member, without confirmation".to_owned(),
+        (None, count) => format!("sent to {count} members, without confirmation"),
+    };
+    let silent_lines: String =
+        silent.iter().map(|line| format!("its members are unknown: {line}\n")).collect();
+    let json = json!({
+        "tid": to.to_string(), "kind": kind.to_string(), "bytes": payload.len(), "fault": fault,
+        "members": members.iter().map(ToString::to_string).collect::<Vec<_>>(), "silent": silent,
+    });
+    let text = format!("{target} ({to}): {result}\n{silent_lines}");
+    Ok(Report { text, json, is_fine: fault.is_none() && silent.is_empty() })
 }
 
 fn send(system: &mut System, to: Tid, (kind, payload): (Kind, &[u8]), order: &Order) -> Ended {
@@ -192,6 +241,9 @@ fn payload(json: &str) -> Result<Vec<u8>, Fault> {
     } else {
         json
     };
+    if text.trim().is_empty() {
+        return Ok(Vec::new());
+    }
     let value: Value = serde_json::from_str(text).map_err(|error| {
         Fault::Usage(format!("the payload is no JSON: {error}. A text needs its quotes: '\"on\"'"))
     })?;
@@ -208,7 +260,7 @@ mod tests {
 
     fn order() -> Order {
         Order {
-            whom: "knee".to_owned(),
+            target: "knee".to_owned(),
             kind: "demo.angle".to_owned(),
             payload: "{}".to_owned(),
             ask: false,

@@ -8,11 +8,12 @@ use std::{
 
 use sinew::{
     ApiError, AppAddress, Endpoint, NodeAddress, NodeApi, Outcome, Payload, Registration, Rejection, Tid,
-    inspect::{AskNode, NodeReport},
+    inspect::{AskNode, AskReach, NodeReport, ReachReport},
+    name::check_name,
 };
 
 use crate::{
-    FINDING, NOBODY, USAGE,
+    EXIT_FINDING, EXIT_NO_NODE, EXIT_USAGE,
     door::{self, NoDoor, Others},
     table::clean,
 };
@@ -54,9 +55,9 @@ impl Fault {
     /// What the command ends with: see [`Arguments`](crate::arguments::Arguments).
     pub(crate) const fn code(&self) -> u8 {
         match self {
-            Self::ItsNode(..) | Self::Whom(_) | Self::Keys(_) => FINDING,
-            Self::Usage(_) => USAGE,
-            Self::NoDoor(_) | Self::NotTaken(..) | Self::NoAnswer(..) => NOBODY,
+            Self::ItsNode(..) | Self::Whom(_) | Self::Keys(_) => EXIT_FINDING,
+            Self::Usage(_) => EXIT_USAGE,
+            Self::NoDoor(_) | Self::NotTaken(..) | Self::NoAnswer(..) => EXIT_NO_NODE,
         }
     }
 }
@@ -155,6 +156,34 @@ impl System {
         };
         let nodes = chosen(&here, Some(whom)).map_err(|_| nobody())?;
         nodes.first().map(|(node, _)| inspection(*node)).ok_or_else(nobody)
+    }
+
+    /// As [`find`](Self::find), and last of all a group of this name: one that has members, or the only thing that the name can mean.
+    pub(crate) fn find_or_group(&mut self, target: &str) -> Result<Tid, Fault> {
+        match self.find(target) {
+            Err(Fault::Whom(_)) if check_name(target).is_ok() => Ok(Tid::group(target)),
+            found => found,
+        }
+    }
+
+    /// The members of a group, of every application or of an address on all nodes; and the nodes that have not said theirs, with the reason.
+    pub(crate) fn members(&mut self, to: Tid) -> Result<(Vec<Tid>, Vec<String>), Fault> {
+        let here = self.here()?;
+        let question = AskReach { source: self.endpoint.tid(), to: to.app };
+        let own = if to.node == NodeAddress::HERE { here.node } else { to.node };
+        let (mut members, mut silent) = (Vec::new(), Vec::new());
+        for (node, name) in all(&here) {
+            if own != NodeAddress::ALL && own != node {
+                continue;
+            }
+            let inspection = Tid::new(node, AppAddress::INSPECT);
+            match self.endpoint.ask::<AskReach, ReachReport>(inspection, &question, self.within) {
+                Ok(said) => members.extend(said.reached.iter().map(|one| one.app)),
+                Err(why) => silent.push(format!("{node} {}: {}", clean(&name), in_words(&why))),
+            }
+        }
+        members.retain(|member| !self.own.contains(member));
+        Ok((members, silent))
     }
 
     /// Asks this node and all that it knows, in the order of their addresses.

@@ -4,19 +4,19 @@ use serde_json::{Value, json};
 use sinew::inspect::{AskTree, TreeLine, TreeReport};
 
 use crate::{
-    Said,
+    Report,
     system::{Answer, Fault, System, chosen},
     table::{clean, time},
 };
 
 /// Asks every node, or the one called so.
-pub(crate) fn show(system: &mut System, wanted: Option<&str>) -> Result<Said, Fault> {
+pub(crate) fn show(system: &mut System, wanted: Option<&str>) -> Result<Report, Fault> {
     let here = system.here()?;
     let nodes = chosen(&here, wanted)?;
     let answers = system.ask_these::<AskTree, TreeReport>(nodes);
     let is_fine = answers.iter().all(|answer| answer.said.as_ref().is_ok_and(|said| said.left_out == 0));
     let text = answers.iter().map(text).collect::<Vec<_>>().join("\n");
-    Ok(Said { text, json: json!({ "nodes": answers.iter().map(node_json).collect::<Vec<_>>() }), is_fine })
+    Ok(Report { text, json: json!({ "nodes": answers.iter().map(node_json).collect::<Vec<_>>() }), is_fine })
 }
 
 fn text(answer: &Answer<TreeReport>) -> String {

@@ -5,7 +5,7 @@ mod rates;
 
 use std::{
     collections::BTreeMap,
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
 };
 
 use clap::Args;
@@ -16,7 +16,7 @@ use sinew::{
 };
 
 use crate::{
-    Said, messagepack, output,
+    Report, messagepack, output,
     system::{Answer, Fault, System, in_words},
     table::{clean, time},
 };
@@ -32,8 +32,8 @@ const IN_VAIN_MAX: u32 = 3;
 /// What to watch.
 #[derive(Debug, Args)]
 pub(crate) struct Order {
-    /// An application's TID (127.0.0.2/80000001) or name
-    whom: String,
+    /// An application's TID (127.0.0.2/80000001) or name, or a group's name: then what its members get by it
+    target: String,
     /// Only what it gets
     #[arg(long, conflicts_with = "sent")]
     received: bool,
@@ -55,57 +55,157 @@ pub(crate) struct Order {
 }
 
 /// Shows it until the end that was asked for, or the user's.
-pub(crate) fn show(system: &mut System, order: &Order, is_json: bool) -> Result<Said, Fault> {
-    let app = application(system, &order.whom)?;
+pub(crate) fn show(system: &mut System, order: &Order, is_json: bool) -> Result<Report, Fault> {
+    let app = application(system, &order.target)?;
     let kinds = order.kind.iter().map(|kind| crate::send::kind(kind)).collect::<Result<Vec<_>, _>>()?;
     let screen = Screen { names: Names::asked(system)?, is_json, rates_only: order.rates };
-    let mut question = AskWatch { app, received: !order.sent, sent: !order.received };
+    let mut watched = Watched::new(system, order, app)?;
     let began = Instant::now();
     let ends = order.lasts.map(|seconds| began + Duration::from_secs(seconds));
-    let (mut rates, mut rates_due) = (Rates::default(), began + RATES_PERIOD);
-    let (mut shown, mut in_vain) = (0, 0);
-    let mut is_over = false;
-    screen.heading(&order.whom, app);
+    let mut rates = Rates::default();
+    // The first answers begin the watch: what was there before is no part of a rate.
+    let (mut rates_began, mut rates_due, mut fetched) = (None, began + RATES_PERIOD, began);
+    let (mut shown, mut is_over) = (0, false);
+    screen.heading(&order.target, app);
     while !is_over {
-        match ask(system, &question) {
-            Ok(report) => {
-                in_vain = 0;
-                rates.drop(report.dropped);
-                let chosen = report.seen.iter().filter(|m| kinds.is_empty() || kinds.contains(&m.kind));
-                let left = order.count.map_or(u64::MAX, |count| count - shown);
-                for message in chosen.take(usize::try_from(left).unwrap_or(usize::MAX)) {
-                    shown += 1;
-                    rates.add(message);
-                    is_over |= !screen.message(began, message);
-                }
-                is_over |= order.count == Some(shown);
-                if !report.more && !is_over {
-                    std::thread::sleep(PERIOD);
-                }
-            }
-            Err(vain) if in_vain + 1 == IN_VAIN_MAX => {
-                let here = (system.endpoint.tid().node, system.path.as_str());
-                return Err(vain.blamed(here, question.app.node, &screen.names));
-            }
-            Err(_) => {
-                in_vain += 1;
-                std::thread::sleep(PERIOD);
-            }
+        let report = watched.ask(system, &screen)?;
+        fetched = report.as_ref().map_or(fetched, |_| Instant::now());
+        let report = report.unwrap_or_default();
+        if rates_began.is_none() && fetched > began {
+            (rates_began, rates_due) = (Some(fetched), fetched + RATES_PERIOD);
+        }
+        rates.drop(report.dropped);
+        let is_chosen = |m: &&SeenMessage| watched.shows(m) && (kinds.is_empty() || kinds.contains(&m.kind));
+        let left = order.count.map_or(u64::MAX, |count| count - shown);
+        for message in report.seen.iter().filter(is_chosen).take(usize::try_from(left).unwrap_or(usize::MAX))
+        {
+            shown += 1;
+            rates.add(message);
+            is_over |= !screen.message(began, message);
+        }
+        is_over |= order.count == Some(shown);
+        if !report.more && !is_over {
+            std::thread::sleep(PERIOD);
         }
         let now = Instant::now();
         is_over |= ends.is_some_and(|ends| now >= ends);
         if now >= rates_due || is_over {
-            is_over |= !screen.rates(&rates.end(now.duration_since(rates_due - RATES_PERIOD)));
-            rates_due = now + RATES_PERIOD;
-            follow(system, &order.whom, &mut question);
+            // Up to the last answer: what came since then is in the next one.
+            let over = fetched.saturating_duration_since(rates_began.unwrap_or(began));
+            is_over |= !screen.rates(&rates.end(over));
+            (rates_began, rates_due) = (rates_began.map(|_| fetched), now + RATES_PERIOD);
+            watched.follow(system);
         }
     }
     // All was said as it came.
-    Ok(Said { text: String::new(), json: Value::Null, is_fine: true })
+    Ok(Report { text: String::new(), json: Value::Null, is_fine: true })
+}
+
+/// Members of a group that are watched at most: a node shows 8 watches at once.
+const MEMBERS_MAX: usize = 8;
+
+/// One application, or the members of a group.
+struct Watched {
+    target: String,
+    /// The group, if it is one.
+    group: Option<Tid>,
+    questions: Vec<AskWatch>,
+    received: bool,
+    sent: bool,
+    /// Rounds without any answer, one after the other.
+    in_vain: u32,
+}
+
+impl Watched {
+    fn new(system: &mut System, order: &Order, app: Tid) -> Result<Self, Fault> {
+        let mut watched = Self {
+            target: order.target.clone(),
+            group: Some(app).filter(|app| !app.is_single()),
+            questions: Vec::new(),
+            received: !order.sent,
+            // Nothing is sent by a group.
+            sent: !order.received && app.is_single(),
+            in_vain: 0,
+        };
+        match watched.group {
+            None => watched.questions.push(watched.question(app)),
+            Some(group) => {
+                watched.take_members(system.members(group)?.0);
+                if watched.questions.is_empty() {
+                    let target = clean(&order.target);
+                    output::note(format_args!(
+                        "'{target}' has no members yet; no application and no node has this name either"
+                    ));
+                }
+            }
+        }
+        Ok(watched)
+    }
+
+    const fn question(&self, app: Tid) -> AskWatch {
+        AskWatch { app, received: self.received, sent: self.sent }
+    }
+
+    fn take_members(&mut self, members: Vec<Tid>) {
+        let left_out = members.len().saturating_sub(MEMBERS_MAX);
+        if left_out > 0 && self.questions.is_empty() {
+            output::note(format_args!("{left_out} further members are not watched: at most {MEMBERS_MAX} are"));
+        }
+        self.questions = members.into_iter().take(MEMBERS_MAX).map(|member| self.question(member)).collect();
+    }
+
+    /// Whether a message of one of them is shown: of members of a group those that were sent to the group.
+    fn shows(&self, message: &SeenMessage) -> bool {
+        self.group.is_none_or(|group| message.target.app == group.app)
+    }
+
+    /// What was seen since the last question; `None` where nobody has answered.
+    ///
+    /// # Errors
+    /// Nobody has answered several times in a row.
+    fn ask(&mut self, system: &mut System, screen: &Screen) -> Result<Option<WatchReport>, Fault> {
+        let mut all: Option<WatchReport> = self.questions.is_empty().then(WatchReport::default);
+        let mut failed = None;
+        for question in &self.questions {
+            match ask(system, question) {
+                Ok(report) => {
+                    let all = all.get_or_insert_with(WatchReport::default);
+                    all.seen.extend(report.seen);
+                    (all.dropped, all.more) = (all.dropped + report.dropped, all.more | report.more);
+                }
+                Err(vain) => failed = Some((question.app.node, vain)),
+            }
+        }
+        self.in_vain = if all.is_some() { 0 } else { self.in_vain + 1 };
+        if let Some((node, vain)) = failed.filter(|_| self.in_vain == IN_VAIN_MAX) {
+            let here = (system.endpoint.tid().node, system.path.as_str());
+            return Err(vain.blamed(here, node, &screen.names));
+        }
+        Ok(all)
+    }
+
+    /// A name is followed to where it is now: its application may have been started again elsewhere. One that is gone keeps its address until
+    /// the name has another. A group has the members that it has now.
+    fn follow(&mut self, system: &mut System) {
+        if let Some(group) = self.group {
+            if let Ok((members, _)) = system.members(group) {
+                self.take_members(members);
+            }
+            return;
+        }
+        if is_name(&self.target)
+            && let Ok(Some(tid)) = system.endpoint.resolve(&self.target, system.within)
+            && let Some(question) = self.questions.first_mut()
+            && tid != question.app
+        {
+            question.app = tid;
+            output::note(format_args!("{} is {tid} now", clean(&self.target)));
+        }
+    }
 }
 
 fn application(system: &mut System, whom: &str) -> Result<Tid, Fault> {
-    let app = system.find(whom)?;
+    let app = system.find_or_group(whom)?;
     if app.app == AppAddress::INSPECT && is_name(whom) {
         let whom = clean(whom);
         return Err(Fault::Whom(format!(
@@ -113,18 +213,6 @@ fn application(system: &mut System, whom: &str) -> Result<Tid, Fault> {
         )));
     }
     Ok(app)
-}
-
-/// A name is followed to where it is now: its application may have been started again elsewhere. One that is gone keeps its address until
-/// the name has another.
-fn follow(system: &mut System, whom: &str, question: &mut AskWatch) {
-    if is_name(whom)
-        && let Ok(Some(tid)) = system.endpoint.resolve(whom, system.within)
-        && tid != question.app
-    {
-        question.app = tid;
-        output::note(format_args!("{} is {tid} now", clean(whom)));
-    }
 }
 
 /// A name may have a slash in it, as a TID has.
@@ -246,7 +334,7 @@ impl Screen {
     fn message_json(&self, message: &SeenMessage) -> Value {
         let (counter, payload) = if is_whole(message) { value(&message.payload) } else { Default::default() };
         json!({
-            "event": "message", "sent": message.is_sent, "kind": kind(message), "kind_id": message.kind.to_string(),
+            "event": "message", "time_s": since_1970(Duration::from_micros(message.seen_us)), "sent": message.is_sent, "kind": kind(message), "kind_id": message.kind.to_string(),
             "class": format!("{:?}", message.class).to_lowercase(), "wants": message.wants,
             "source": message.source.to_string(), "source_name": self.names.apps.get(&message.source),
             "target": message.target.to_string(), "target_name": self.names.apps.get(&message.target),
@@ -259,11 +347,17 @@ impl Screen {
 
     fn rates(&self, rates: &rates::Rated) -> bool {
         if self.is_json {
-            output::line(&rates.json().to_string())
+            output::line(&rates.json(since_1970(Duration::ZERO)).to_string())
         } else {
             output::line(&clean_lines(&rates.text()))
         }
     }
+}
+
+/// Seconds since 1970, by the clock of this host, of what was seen so long ago.
+fn since_1970(ago: Duration) -> f64 {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    now.saturating_sub(ago).as_secs_f64()
 }
 
 fn kind(message: &SeenMessage) -> String {
@@ -308,7 +402,7 @@ mod tests {
     };
 
     use super::*;
-    use crate::{FINDING, NOBODY};
+    use crate::{EXIT_FINDING, EXIT_NO_NODE};
 
     const HIP: NodeAddress = NodeAddress::new(0x0a00_0001);
     const KNEE: NodeAddress = NodeAddress::new(0x0a00_0002);
@@ -333,14 +427,14 @@ mod tests {
         ] {
             let (said, code) = blamed(Vain::of(&error), KNEE, &names());
             assert_eq!(said, format!("the application's node knee at 10.0.0.2: {}", in_words(&error)));
-            assert_eq!(code, FINDING);
+            assert_eq!(code, EXIT_FINDING);
         }
         let refused = || Vain::Refused("this node shows 8 watches at once".to_owned());
         let words = "the application's node knee at 10.0.0.2: this node shows 8 watches at once";
-        assert_eq!(blamed(refused(), KNEE, &names()), (words.to_owned(), FINDING));
+        assert_eq!(blamed(refused(), KNEE, &names()), (words.to_owned(), EXIT_FINDING));
         // One that answers is no node that does not, wherever it is.
         let words = "the application's node 10.0.0.1: this node shows 8 watches at once";
-        assert_eq!(blamed(refused(), HIP, &names()), (words.to_owned(), FINDING));
+        assert_eq!(blamed(refused(), HIP, &names()), (words.to_owned(), EXIT_FINDING));
     }
 
     #[test]
@@ -349,7 +443,10 @@ mod tests {
         let ended = ApiError::Closed("it was closed".to_owned());
         for (error, there) in [(silent, HIP), (ended, KNEE)] {
             let (said, code) = blamed(Vain::of(&error), there, &names());
-            assert_eq!((said, code), (format!("the node at /run/hip.sock: {}", in_words(&error)), NOBODY));
+            assert_eq!(
+                (said, code),
+                (format!("the node at /run/hip.sock: {}", in_words(&error)), EXIT_NO_NODE)
+            );
         }
     }
 

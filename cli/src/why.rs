@@ -11,7 +11,7 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use crate::{
-    Said,
+    Report,
     system::{Fault, System},
     table::{Table, clean},
 };
@@ -34,7 +34,7 @@ pub(crate) struct Order {
 }
 
 /// Asks every node that can be reached, and judges.
-pub(crate) fn show(system: &mut System, order: &Order) -> Result<Said, Fault> {
+pub(crate) fn show(system: &mut System, order: &Order, is_wide: bool) -> Result<Report, Fault> {
     let (others, shut) = System::beside(system, &order.other_socket);
     let mut gathered = Gathered::from(system, others)?;
     let facts = Facts { shut, ..gathered.facts([&order.from, &order.to]) };
@@ -44,11 +44,11 @@ pub(crate) fn show(system: &mut System, order: &Order) -> Result<Said, Fault> {
     let json = json!({
         "from": order.from, "to": order.to, "free": is_free, "steps": steps.iter().map(step_json).collect::<Vec<_>>(),
     });
-    Ok(Said { text: text(&steps, is_free), json, is_fine: is_free })
+    Ok(Report { text: text(&steps, is_free, is_wide), json, is_fine: is_free })
 }
 
-fn text(steps: &[Step], is_free: bool) -> String {
-    let mut table = Table::new(["STEP", "", "WHAT IS SO"]);
+fn text(steps: &[Step], is_free: bool, is_wide: bool) -> String {
+    let mut table = Table::new(["STEP", "STATUS", "DETAIL"]).wide(is_wide);
     for step in steps {
         table.row([step.what.clone(), word(step.state).to_owned(), step.seen.clone()]);
     }
@@ -60,8 +60,8 @@ fn text(steps: &[Step], is_free: bool) -> String {
     let verdict = if is_free { "The way is free." } else { "The way is blocked." };
     match (is_free, mends.is_empty()) {
         (_, true) => format!("{}\n{verdict}\n", table.text()),
-        (true, false) => format!("{}\n{verdict} To look at\n{mends}", table.text()),
-        (false, false) => format!("{}\n{verdict} What mends it\n{mends}", table.text()),
+        (true, false) => format!("{}\n{verdict} Suggested fix\n{mends}", table.text()),
+        (false, false) => format!("{}\n{verdict} Suggested fix\n{mends}", table.text()),
     }
 }
 

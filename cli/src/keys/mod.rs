@@ -11,7 +11,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 use sinew::security::UnixTime;
 
-use crate::{Said, system::Fault};
+use crate::{Report, system::Fault};
 use project::Project;
 
 /// What to do with keys.
@@ -86,7 +86,7 @@ pub(crate) struct Time {
 }
 
 /// Carries out `order`.
-pub(crate) fn show(order: &Order) -> Result<Said, Fault> {
+pub(crate) fn show(order: &Order) -> Result<Report, Fault> {
     let now = UnixTime::now();
     match order {
         Order::Init { project, nodes, out, time } => {

@@ -24,13 +24,13 @@ const INSTALLED: &str = "/etc/sinew/keys";
 const FILES: [&str; 5] = [NODE_KEY, NODE_CERTIFICATE, AUTHORITY, DISCOVERY_KEY, DENIED];
 
 /// Of `init` and `issue`.
-pub(super) fn made(made: &Made, wanted: &[Wanted]) -> Said {
+pub(super) fn made(made: &Made, wanted: &[Wanted]) -> Report {
     let shown = made.directory.display();
     let mut text = String::new();
     if let Some(until) = made.authority_until {
         let _ = write!(
             text,
-            "The authority of project {} is made; it counts until {}. Whoever has {shown}/ca.key can make nodes of this robot:\n\
+            "The authority of project {} is made; it is valid until {}. Anyone with {shown}/ca.key can make nodes of this robot:\n\
              keep it off the robot, and a copy of {shown} in a safe place.\n\n",
             clean(&made.project),
             date(&until)
@@ -66,14 +66,14 @@ pub(super) fn made(made: &Made, wanted: &[Wanted]) -> Said {
         let Issued { identity, .. } = older;
         let _ = write!(
             text,
-            "\n{} ({}) has an older certificate that counts until {}: if its key was lost, `sinew keys revoke {} --keys {shown}`\n",
+            "\n{} ({}) has an older certificate that is valid until {}: if its key was lost, `sinew keys revoke {} --keys {shown}`\n",
             clean(&identity.name),
             identity.address,
             date(&older.validity().until),
             older.serial()
         );
     }
-    Said { text, json: made_json(made, wanted), is_fine: true }
+    Report { text, json: made_json(made, wanted), is_fine: true }
 }
 
 fn made_json(made: &Made, wanted: &[Wanted]) -> Value {
@@ -174,7 +174,7 @@ fn configuration(made: &Made, issued: &Issued) -> String {
 }
 
 /// Of `revoke`.
-pub(super) fn revoked(revoked: &Revoked, directory: &Path) -> Said {
+pub(super) fn revoked(revoked: &Revoked, directory: &Path) -> Report {
     let mut text = String::new();
     let line = |issued: &Issued, word: &str| {
         let identity = &issued.identity;
@@ -204,7 +204,7 @@ pub(super) fn revoked(revoked: &Revoked, directory: &Path) -> Said {
         "to": format!("{INSTALLED}/denied.txt"),
         "nodes": revoked.left.iter().map(issued_json).collect::<Vec<_>>(),
     });
-    Said { text, json, is_fine: true }
+    Report { text, json, is_fine: true }
 }
 
 fn issued_json(issued: &Issued) -> Value {
@@ -259,7 +259,7 @@ impl State {
 }
 
 /// Of `show`.
-pub(super) fn shown(look: &Look, now: UnixTime) -> Said {
+pub(super) fn shown(look: &Look, now: UnixTime) -> Report {
     let states: Vec<_> = look.issued.iter().map(|issued| (issued, State::of(issued, look, now))).collect();
     let has_good = |name: &str| {
         states.iter().any(|(issued, state)| issued.identity.name == name && *state == State::Good)
@@ -296,5 +296,5 @@ pub(super) fn shown(look: &Look, now: UnixTime) -> Said {
         "denied": look.denied.len(),
         "certificates": certificates.collect::<Vec<_>>(),
     });
-    Said { text: heading + &table.text(), json, is_fine }
+    Report { text: heading + &table.text(), json, is_fine }
 }

@@ -82,9 +82,8 @@ fn beside(project: &str, name: &str) -> Result<Option<(NodeAddress, AddressFrom)
 }
 
 fn configured(project: &str, file: &Path) -> Result<(String, (NodeAddress, AddressFrom)), Fault> {
-    let config = NodeConfig::from_file(file).map_err(|faults| {
-        Fault::Usage(format!("{} is no configuration of a node:\n{faults}", file.display()))
-    })?;
+    let config = NodeConfig::from_file(file)
+        .map_err(|faults| Fault::Usage(format!("this is no configuration of a node:\n{faults}")))?;
     if config.project != project {
         return Err(Fault::Usage(format!(
             "{} is of project '{}', and these keys are of '{project}'; correct node.project there",

@@ -91,7 +91,7 @@ impl Rated {
         text
     }
 
-    pub(super) fn json(&self) -> Value {
+    pub(super) fn json(&self, time_s: f64) -> Value {
         let seconds = self.over.as_secs_f64().max(1e-3);
         let kinds = self.rates.kinds.iter().map(|((name, is_sent), kind)| {
             json!({
@@ -101,7 +101,7 @@ impl Rated {
             })
         });
         let kinds: Vec<_> = kinds.collect();
-        json!({ "event": "rates", "over_s": seconds, "dropped": self.rates.dropped, "kinds": kinds })
+        json!({ "event": "rates", "time_s": time_s, "over_s": seconds, "dropped": self.rates.dropped, "kinds": kinds })
     }
 }
 
@@ -182,7 +182,7 @@ mod tests {
                 "   --- -> b: 1.0/s, 100 B/s, age mean 0 us max 0 us"
             ]
         );
-        let json = said.json();
+        let json = said.json(0.0);
         let ages = ["age_mean_ns", "age_max_ns"].map(|age| [&json["kinds"][0][age], &json["kinds"][1][age]]);
         assert_eq!(ages, [[&Value::Null, &json!(0)]; 2]);
     }

@@ -4,7 +4,9 @@ use std::collections::BTreeMap;
 
 use sinew::{
     NodeAddress, Tid,
-    inspect::{AccessReport, AccessVerdict, AppReport, NodeReport, PeerReport, StreamReport, TreeLine},
+    inspect::{
+        AccessReport, AccessVerdict, AppReport, Missing, NodeReport, PeerReport, StreamReport, TreeLine,
+    },
 };
 
 use crate::ping;
@@ -30,6 +32,8 @@ pub(super) struct Facts {
     pub(super) shut: Vec<String>,
     /// Who waits at a start-up barrier, and for whom, on all nodes that were asked.
     pub(super) waits: BTreeMap<String, Vec<String>>,
+    /// What applications that require one of the two, which no node has named, say of it: the name, the reason, and how long ago.
+    pub(super) lacked: Vec<Missing>,
     /// The nodes that have not named all their applications: any of them may have one that nobody named.
     pub(super) unsaid: Vec<(String, Unsaid)>,
 }

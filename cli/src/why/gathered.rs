@@ -163,6 +163,8 @@ impl<'a> Gathered<'a> {
                 Some((app.name.clone()?, app.missing.iter().map(|missing| missing.name.clone()).collect()))
             })
             .collect();
+        let lacked = self.nodes.iter().flat_map(Asked::named_apps).flat_map(|app| &app.missing);
+        let lacked = lacked.filter(|missing| wanted.contains(&missing.name.as_str())).cloned().collect();
         let unsaid = self.nodes.iter().filter_map(|asked| Some((asked.label(), asked.unsaid()?))).collect();
         let streams = [self.stream(found[0].at, found[1].node), self.stream(found[1].at, found[0].node)];
         let many = self.many(wanted, &found);
@@ -170,7 +172,7 @@ impl<'a> Gathered<'a> {
             self.by_groups(access[0].as_ref(), (&found[0], &found[1])),
             self.by_groups(access[1].as_ref(), (&found[1], &found[0])),
         ];
-        Facts { ends, pings, streams, access, by_groups, many, waits, unsaid, shut: Vec::new() }
+        Facts { ends, pings, streams, access, by_groups, many, waits, lacked, unsaid, shut: Vec::new() }
     }
 
     /// Whom two words mean. A name that several applications have stands for the one that the other end's messages reach; where that is open, too,

@@ -8,6 +8,7 @@ mod many;
 mod places;
 mod stream;
 mod unnamed;
+mod version;
 
 use std::collections::BTreeSet;
 
@@ -120,7 +121,7 @@ impl Steps {
                 "is it running? Start it; if it runs on another host, run `sinew why` there, too; if its socket is elsewhere on this one: \
                  --other-socket PATH",
             ),
-            (None, None) => self.nowhere(what, &end.wanted, &facts.unsaid, &shut),
+            (None, None) => self.nowhere(what, &end.wanted, facts, &shut),
         }
     }
 
@@ -367,9 +368,17 @@ fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
         return vec![(seen, "set the same `project` under [node] in both configurations".to_owned())];
     }
     let Some(theirs) = &to.report else {
-        let mend = "is it started, of the same project, and in the same group? Where multicast does not reach: [ndl] seeds = [\"ITS_ADDRESS:PORT\"]";
+        let mend = "is it started, with the same `project` and the same multicast group? Where multicast does not pass (WiFi, VPN, containers, most clouds): \
+                    [ndl] seeds = [\"ITS_ADDRESS:PORT\"], with a fixed `ndl.port` there";
         let refused = keys::refused_of_anybody(from);
-        return vec![(format!("never heard of it; it asks {}{refused}", ours(from)), mend.to_owned())];
+        return vec![(
+            format!(
+                "no datagram from it has arrived, by multicast or from a seed; {} asks {}{refused}",
+                from.name,
+                ours(from)
+            ),
+            mend.to_owned(),
+        )];
     };
     if from.project != theirs.project {
         // It was said already, and is reason enough.
@@ -384,12 +393,18 @@ fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
     {
         return vec![refused];
     }
+    if let Some(differ) = version::differs(from, theirs) {
+        return vec![differ];
+    }
     let seeded = |of: &NodeReport, other: &NodeReport| {
         other.udp.as_ref().is_some_and(|udp| of.seeds.iter().any(|seed| names(seed, udp)))
     };
     if seeded(from, theirs) || seeded(theirs, from) {
         let mend = "is UDP let through by the firewalls of both hosts (`sudo nft list ruleset`), and is `ndl.port` the one that the seed names?";
         return vec![("a seed names it, and no answer has come".to_owned(), mend.to_owned())];
+    }
+    if let Some(useless) = places::useless_seed(from, theirs).or_else(|| places::useless_seed(theirs, from)) {
+        return vec![useless];
     }
     if is_on_loopback(&from.interface) != is_on_loopback(&theirs.interface) {
         let seen = format!(

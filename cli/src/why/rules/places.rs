@@ -1,6 +1,9 @@
 //! Where nodes say that they are, and where others look for them.
 
-use sinew::config::{Interface, Seed};
+use sinew::{
+    config::{Interface, Seed},
+    inspect::NodeReport,
+};
 
 /// Whether a node looks for others on its own host only: none of its interfaces leads out of it.
 pub(super) fn is_on_loopback(interfaces: &str) -> bool {
@@ -12,6 +15,27 @@ pub(super) fn is_on_loopback(interfaces: &str) -> bool {
 pub(super) fn names(seed: &str, udp: &str) -> bool {
     let at = |text: &str| text.parse::<Seed>().ok().map(|seed| seed.address);
     seed == udp || at(seed).is_some_and(|seed| at(udp) == Some(seed))
+}
+
+/// A seed of `of` that names the host of the other and not its port: the other takes another one at each start, or the seed is mistyped.
+pub(super) fn useless_seed(of: &NodeReport, other: &NodeReport) -> Option<(String, String)> {
+    let udp = other.udp.as_ref()?;
+    let address = udp.parse::<Seed>().ok()?.address;
+    let is_useless = |seed: &&String| {
+        let named = seed.parse::<Seed>().ok().map(|seed| seed.address);
+        named.is_some_and(|named| named.ip() == address.ip() && named.port() != address.port())
+    };
+    let seed = of.seeds.iter().find(is_useless)?;
+    let seen = format!(
+        "the seed {seed} of {} names the host of {} but not its port: it listens at {udp}",
+        of.name, other.name
+    );
+    let port = address.port();
+    let mend = format!(
+        "with `port = 0` (an ephemeral port) a node takes another one at each start: set [ndl] port in {}, and the same one in the seed; now it is {port}",
+        other.name
+    );
+    Some((seen, mend))
 }
 
 #[cfg(test)]

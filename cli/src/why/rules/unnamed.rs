@@ -1,6 +1,12 @@
 //! Applications that no node has named: there is none such only where all have named all that they have.
 
-use super::{super::facts::Unsaid, Steps};
+use sinew::inspect::Missing;
+
+use super::{
+    super::facts::{Facts, Unsaid},
+    Steps,
+};
+use crate::table::time;
 
 /// Nodes that are told of at most.
 const NODES_SHOWN: usize = 4;
@@ -49,7 +55,17 @@ impl Steps {
     }
 
     /// A word that means nobody whom a node has named.
-    pub(super) fn nowhere(&mut self, what: String, wanted: &str, unsaid: &[(String, Unsaid)], shut: &str) {
+    pub(super) fn nowhere(&mut self, what: String, wanted: &str, facts: &Facts, shut: &str) {
+        if let Some(Missing { why, since_us, .. }) =
+            facts.lacked.iter().find(|missing| missing.name == wanted)
+        {
+            let ago = since_us.map_or_else(String::new, |since| format!(", {} ago", time(since)));
+            let seen = format!("the applications that require '{wanted}' report: {why}{ago}{shut}");
+            let mend = "`sinew nodes` shows lost nodes and the reason; start its node again, or register the application. `sinew barriers` \
+                        shows which applications wait for it";
+            return self.blocked(what, seen, mend);
+        }
+        let unsaid = &facts.unsaid;
         let look = "is it spelled right (`sinew apps`, `sinew nodes`)? Is its node started? If its socket is elsewhere on this host: \
                     --other-socket PATH";
         if unsaid.is_empty() {

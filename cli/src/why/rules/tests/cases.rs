@@ -74,7 +74,14 @@ const CASES: &[Case] = &[
         },
         ["hip knows 10.0.0.2", "project 'arm', not 'leg'", "same `project`"],
     ),
-    Case(never_answered, ["hip knows 10.0.0.2", "never heard of it; it asks 239.0.0.1:7000", "seeds"]),
+    Case(
+        never_answered,
+        [
+            "hip knows 10.0.0.2",
+            "no datagram from it has arrived, by multicast or from a seed; hip asks 239.0.0.1:7000",
+            "seeds",
+        ],
+    ),
     Case(
         |facts| {
             strangers(facts);
