@@ -1,8 +1,8 @@
 //! `sinew why`: what stands in the way between two nodes or applications, looked at from both ends.
 
-mod called;
+mod collect;
 mod facts;
-mod gathered;
+mod resolve;
 mod rules;
 
 use std::{collections::BTreeSet, path::PathBuf};
@@ -15,8 +15,8 @@ use crate::{
     system::{Fault, System},
     table::{Table, clean},
 };
+use collect::Gathered;
 use facts::Facts;
-use gathered::Gathered;
 pub(crate) use rules::lost_in_words;
 use rules::{State, Step};
 

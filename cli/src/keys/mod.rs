@@ -2,8 +2,8 @@
 
 mod authority;
 mod project;
-mod said;
-mod whom;
+mod report;
+mod targets;
 mod write;
 
 use std::path::PathBuf;
@@ -91,24 +91,24 @@ pub(crate) fn show(order: &Order) -> Result<Report, Fault> {
     match order {
         Order::Init { project, nodes, out, time } => {
             let clock = authority::Clock::new(now, time.days)?;
-            let wanted = whom::wanted(project, nodes)?;
-            let wanted = whom::placed(wanted, &[], &[])?;
+            let wanted = targets::wanted(project, nodes)?;
+            let wanted = targets::placed(wanted, &[], &[])?;
             let made = Project::init(project, out, &wanted, clock)?;
-            Ok(said::made(&made, &wanted))
+            Ok(report::made(&made, &wanted))
         }
         Order::Issue { nodes, place, time } => {
             let clock = authority::Clock::new(now, time.days)?;
             let project = Project::open(&place.keys)?;
-            let wanted = whom::wanted(project.name(), nodes)?;
-            let wanted = whom::placed(wanted, &project.counting(now)?, &project.issued()?)?;
+            let wanted = targets::wanted(project.name(), nodes)?;
+            let wanted = targets::placed(wanted, &project.counting(now)?, &project.issued()?)?;
             let made = project.issue(&wanted, clock)?;
-            Ok(said::made(&made, &wanted))
+            Ok(report::made(&made, &wanted))
         }
         Order::Revoke { whom, place } => {
             let project = Project::open(&place.keys)?;
-            Ok(said::revoked(&project.revoke(whom, now)?, &place.keys))
+            Ok(report::revoked(&project.revoke(whom, now)?, &place.keys))
         }
-        Order::Show { place } => Ok(said::shown(&Project::look(&place.keys)?, now)),
+        Order::Show { place } => Ok(report::shown(&Project::look(&place.keys)?, now)),
     }
 }
 

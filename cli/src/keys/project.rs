@@ -24,7 +24,7 @@ use sinew::security::{
 use super::{
     authority::{Authority, Clock, Pair},
     fault,
-    whom::Wanted,
+    targets::Wanted,
     write::{self, Readers, Staged},
 };
 use crate::system::Fault;

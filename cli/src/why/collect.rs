@@ -15,8 +15,8 @@ use sinew::{
 };
 
 use super::{
-    called::{Called, by_whom_is_reached},
     facts::{App, End, Facts, Namesakes, Unsaid},
+    resolve::{Called, by_whom_is_reached},
 };
 use crate::{
     ping,

@@ -10,10 +10,10 @@ use sinew::security::{
 
 use super::{
     project::{Issued, Look, Made, Revoked},
-    whom::{AddressFrom, Wanted},
+    targets::{AddressFrom, Wanted},
 };
 use crate::{
-    Said,
+    Report,
     security::SOON_S,
     table::{Table, clean, quoted},
 };
