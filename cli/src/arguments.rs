@@ -180,7 +180,7 @@ Exit codes:
      unknown, a list cannot be used, keys cannot be made or are valid for less than 30 days
   2  the command line is wrong
   3  no node on this machine accepts this command, or that node does not answer
-  4  no problem was found, but standard output did not take everything (a full disk); a reader that closes its pipe, such as `head`, is no error
+  4  all is fine, but standard output did not take all of it (a full disk); a reader that closes its pipe, as `head`, is no error
 
 Examples:
   sinew nodes

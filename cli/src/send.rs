@@ -139,7 +139,7 @@ fn to_many(
         let sent = endpoint.create_message(to, kind, payload.len()).and_then(|mut loan: LoanedMessage| {
             loan.copy_from_slice(payload);
             loan.set_class(order.class.into());
-            endpoint.send_message(loan)
+            endpoint.loaned(loan).send()
         });
         sent.err().map(|error| clean(&error.to_string()))
     };
