@@ -177,7 +177,7 @@ impl NodeBuilder {
         self
     }
 
-    /// SIGINT and SIGTERM stop the node in order, from before its first application starts. For a process that is this
+    /// SIGINT, SIGTERM and SIGHUP stop the node in order ([`signals`](crate::signals)), from before its first application starts. For a process that is this
     /// node; what `run` does too, but only from when it is called.
     #[must_use]
     pub const fn heed_signals(mut self) -> Self {

@@ -19,11 +19,7 @@ use sinew_runtime::{
     time::Time,
     wire::{FrameCodec, HEADER_LEN, Header, Kind},
 };
-use tokio::{
-    net::UnixStream,
-    signal::unix::{SignalKind, signal},
-    time::MissedTickBehavior,
-};
+use tokio::{net::UnixStream, time::MissedTickBehavior};
 use tokio_util::codec::Decoder;
 
 use super::{
@@ -31,7 +27,7 @@ use super::{
     wire::Wire,
     words::{self, Beat, Ending, WORDS_BYTES_MAX, Welcome},
 };
-use crate::{config::NodeConfig, lncl::payload, log, node::Stalls};
+use crate::{config::NodeConfig, lncl::payload, log, node::Stalls, signals::StopSignals};
 
 /// Time that the node has for its first words.
 const WELCOME: Duration = Duration::from_secs(10);
@@ -261,12 +257,12 @@ fn place(app: &DynApp) -> Place {
     Place { thread: app.name().to_owned(), ..app.place().clone() }
 }
 
-/// Resolves when the node, or whoever sends this process a SIGTERM, asks for an orderly stop.
+/// Resolves when the node or a signal asks for an orderly stop.
 async fn stop_asked(wire: &Wire) {
-    let Ok(mut terminate) = signal(SignalKind::terminate()) else { return wire.stop_asked().await };
+    let Ok(mut signals) = StopSignals::listen() else { return wire.stop_asked().await };
     tokio::select! {
         () = wire.stop_asked() => {}
-        _ = terminate.recv() => log::info!("SIGTERM asks for a stop"),
+        which = signals.recv() => log::info!(which, "a signal asks for a stop"),
     }
 }
 
