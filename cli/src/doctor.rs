@@ -60,6 +60,7 @@ pub(crate) fn show(chosen: Vec<Interface>, socket: Option<&Path>, within: Durati
         rights::governor(),
         clock::clock(),
         rights::shared_memory(),
+        rights::own_processes(),
         sockets::directory(),
         sockets::leftover(),
         sockets::node(socket),

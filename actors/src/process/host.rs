@@ -14,6 +14,7 @@ use std::{
 use sinew_runtime::{
     app::{AppWiring, DynApp},
     mailbox::Mailbox,
+    remedy::{Wanted, remedy},
     supervision::{Alone, AloneHandle, Place, ReadyGate, Reason, Watcher, alone, tell_of_a_stop},
     tid::Tid,
     time::Time,
@@ -64,8 +65,9 @@ pub(super) fn host(config: &NodeConfig, apps: Vec<DynApp>, hosting: Hosting) -> 
         // The panic has been told by the panic hook.
         Ok(Err(_)) => 1,
         Err(error) => {
-            log::error!(name, %error, "no thread for this application; raise `ulimit -u`");
-            log::print(format!("no thread for '{name}': {error}; raise `ulimit -u`"));
+            let remedy = remedy(Wanted::Thread, &error);
+            log::error!(name, %error, remedy, "no thread for this application");
+            log::print(format!("no thread for '{name}': {error}; {remedy}"));
             1
         }
     };
@@ -196,10 +198,11 @@ impl Beats {
         match thread.spawn(beats) {
             Ok(_) => {}
             Err(error) if beat.is_none() => {
-                log::warn!(%error, "no thread says whether this application stalls; raise `ulimit -u`");
+                log::warn!(%error, remedy = remedy(Wanted::Thread, &error), "no thread says whether this application stalls");
             }
             Err(error) => {
-                let why = format!("no thread gives its signs of life: {error}; raise `ulimit -u`");
+                let why =
+                    format!("no thread gives its signs of life: {error}; {}", remedy(Wanted::Thread, &error));
                 return Err(io::Error::new(error.kind(), why));
             }
         }
