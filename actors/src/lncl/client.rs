@@ -271,7 +271,7 @@ impl Client {
 
     /// The life of its process.
     fn life(&self) -> Life {
-        Life::of(self.peer.pid).unwrap_or_else(|cause| {
+        Life::behind(&*self.peer.stream, self.peer.pid).unwrap_or_else(|cause| {
             let detail = format!("{}, process {}: {cause}", self.tid, self.peer.pid);
             self.server.refusals.count(Time::now(), "process cannot be watched", &detail);
             Life::Unknown

@@ -96,15 +96,20 @@ impl Server {
         })
     }
 
-    /// The bytes that may wait for the clients of the process `pid`, together.
+    /// The bytes that may wait for the clients of the process `pid`, together; for one client where the kernel does not say its process (0).
     pub(super) fn budget_of(&self, pid: i32) -> Arc<Budget> {
         let mut shares = self.shares.borrow_mut();
+        let share_max = self.stores.config.lncl.clients_bytes / PROCESSES_MIN;
+        // Not one process, but any number of them: each connection has a share.
+        if pid == 0 {
+            return Budget::part_of(&self.budget, share_max);
+        }
         if let Some(share) = shares.get(&pid).and_then(Weak::upgrade) {
             return share;
         }
         // Those of processes that have none any more.
         shares.retain(|_, share| share.strong_count() > 0);
-        let share = Budget::part_of(&self.budget, self.stores.config.lncl.clients_bytes / PROCESSES_MIN);
+        let share = Budget::part_of(&self.budget, share_max);
         shares.insert(pid, Arc::downgrade(&share));
         share
     }
