@@ -35,6 +35,7 @@ pub mod post;
 pub mod protection;
 pub mod remedy;
 pub mod router;
+pub mod safe_wake;
 pub mod schedule;
 #[cfg(test)]
 mod seeded;
