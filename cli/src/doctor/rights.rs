@@ -170,7 +170,7 @@ pub(super) fn own_processes() -> Check {
             format!(
                 "pidfd_open fails: {error}; a node with an application that has `own_process` does not start"
             ),
-            "take Linux 5.4 or newer, and allow pidfd_open in the container's seccomp profile",
+            "Linux 5.4 or newer, and a seccomp profile of the container that allows pidfd_open and waitid",
         ),
     }
 }
