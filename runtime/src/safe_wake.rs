@@ -33,6 +33,8 @@ impl SafeWaker {
         let known = self.known.take().filter(|(known, _)| known.will_wake(task));
         let make = || {
             start();
+            // On the task's own thread, where its thread-local variables are there: a wake at the end of this thread finds them used in order.
+            let _ = are_thread_locals_alive();
             (task.clone(), Waker::from(Arc::new(Forward(task.clone()))))
         };
         &self.known.insert(known.unwrap_or_else(make)).1

@@ -15,6 +15,7 @@ use sinew_runtime::{
     app::{AppWiring, DynApp},
     mailbox::Mailbox,
     remedy::{Wanted, remedy},
+    safe_wake::SafelyWoken,
     supervision::{Alone, AloneHandle, Place, ReadyGate, Reason, Watcher, alone, tell_of_a_stop},
     tid::Tid,
     time::Time,
@@ -155,12 +156,13 @@ async fn live(
 /// Keeps the connection going beside the application, on its thread.
 fn serve(wire: &Arc<Wire>) {
     let (draining, reading, telling, expiring) = (wire.clone(), wire.clone(), wire.clone(), wire.clone());
-    actix_rt::spawn(async move {
+    // Senders on any thread wake the first and the third.
+    actix_rt::spawn(SafelyWoken::new(async move {
         draining.drain().await;
         die();
-    });
+    }));
     actix_rt::spawn(async move { reading.read().await });
-    actix_rt::spawn(async move { poll_fn(|cx| telling.poll_tell(cx)).await });
+    actix_rt::spawn(SafelyWoken::new(async move { poll_fn(|cx| telling.poll_tell(cx)).await }));
     actix_rt::spawn(async move {
         let mut interval = tokio::time::interval(EXPIRING);
         interval.set_missed_tick_behavior(MissedTickBehavior::Delay);
