@@ -66,6 +66,7 @@ pub mod security;
 #[path = "../../runtime/src/seeded.rs"]
 mod seeded;
 mod session;
+pub mod signals;
 mod stores;
 mod sync;
 mod takeover;

@@ -62,6 +62,7 @@ pub(crate) fn show(chosen: Vec<Interface>, arguments: &Arguments) -> Report {
         rights::governor(),
         clock::clock(),
         rights::shared_memory(),
+        rights::own_processes(),
         sockets::directory(),
         sockets::leftover(),
         sockets::node(socket),

@@ -14,6 +14,8 @@
 //! | [`mailbox`] | messages into an application that outlive it |
 //! | [`monitor`] | who is told of an end |
 //! | [`wakes`] | one wake for a batch of messages |
+//! | [`remedy`] | what mends a system call that has failed |
+//! | [`safe_wake`] | wakes from threads whose thread-local variables are gone |
 //! | [`pending`], [`sender`] | sending, and waiting for what comes of it |
 //! | [`protection`] | end-to-end protection of commands, and outputs that are safe without them |
 //! | [`schedule`] | what an actor does when |
@@ -33,7 +35,9 @@ pub mod outcome;
 pub mod pending;
 pub mod post;
 pub mod protection;
+pub mod remedy;
 pub mod router;
+pub mod safe_wake;
 pub mod schedule;
 #[cfg(test)]
 mod seeded;

@@ -18,6 +18,7 @@ mod program;
 pub mod orders;
 pub mod proxy;
 pub mod puppet;
+pub mod sandbox;
 pub mod slow_consumer;
 
 pub use ground::{Ground, all_run, ready_for, sees};

@@ -8,7 +8,11 @@
 
 use std::{collections::VecDeque, sync::Arc, thread};
 
-use sinew_runtime::{tid::NodeAddress, time::Time};
+use sinew_runtime::{
+    remedy::{Wanted, remedy},
+    tid::NodeAddress,
+    time::Time,
+};
 
 use super::asking::answer;
 use crate::{
@@ -45,9 +49,9 @@ pub(super) fn have_answered(stores: &Arc<Stores>, to: NodeAddress, number: u64) 
     }
     let taker = Taker { stores: stores.clone(), takes: true };
     let begun = thread::Builder::new().name("audit".to_owned()).spawn(move || taker.run());
-    begun
-        .map(drop)
-        .map_err(|cause| format!("from {to}, and no thread answers it: {cause}; raise `ulimit -u`"))
+    begun.map(drop).map_err(|cause| {
+        format!("from {to}, and no thread answers it: {cause}; {}", remedy(Wanted::Thread, &cause))
+    })
 }
 
 /// Who takes the questions. Whatever ends it, the next question begins another one, and what it left waits for that.

@@ -3,7 +3,7 @@
 
 use std::{panic, sync::Arc, thread};
 
-use sinew_runtime::time::Time;
+use sinew_runtime::{safe_wake::SafelyWoken, time::Time};
 use tokio::{runtime::Handle, sync::mpsc, task};
 use tokio_util::task::AbortOnDropHandle;
 
@@ -53,7 +53,7 @@ impl Place {
         task: impl Future<Output = T> + Send + 'static,
     ) -> AbortOnDropHandle<T> {
         AbortOnDropHandle::new(match self {
-            Self::Here => task::spawn_local(task),
+            Self::Here => task::spawn_local(SafelyWoken::new(task)),
             Self::There(runtime, _) => runtime.spawn(task),
         })
     }

@@ -80,11 +80,12 @@ pub(super) async fn serve(
     let pid = credentials.pid().unwrap_or_default();
     let who = Applicant { uid: credentials.uid(), gid: credentials.gid() };
     let peer = Peer { stream: stream.clone(), id, pid, who };
+    let owner = peer.owner();
     let mut client = match Client::register(server.clone(), peer, register) {
         Ok(client) => client,
         Err(why) => {
             // Who is refused knows who it is; whoever reads the log does not.
-            let both = format!("of process {pid}: {why}");
+            let both = format!("of {owner}: {why}");
             server.refusals.count(Time::now(), "registration", &both);
             return say_why(&server, &stream, &why);
         }
@@ -265,8 +266,8 @@ impl Client {
 
     /// The life of its process.
     fn life(&self) -> Life {
-        Life::of(self.peer.pid).unwrap_or_else(|cause| {
-            let detail = format!("{}, process {}: {cause}", self.tid, self.peer.pid);
+        Life::behind(&*self.peer.stream, self.peer.pid).unwrap_or_else(|cause| {
+            let detail = format!("{}, {}: {cause}", self.tid, self.peer.owner());
             self.server.refusals.count(Time::now(), "process cannot be watched", &detail);
             Life::Unknown
         })

@@ -50,7 +50,7 @@ pub(crate) struct ClientId(pub(crate) u64);
 pub(crate) enum Owner {
     /// The node's own process.
     Node,
-    /// A connection of the process `pid`.
+    /// A connection of the process `pid`; 0 where the kernel does not say it, as for a process of another PID namespace.
     Client { id: ClientId, pid: i32 },
 }
 
@@ -58,6 +58,7 @@ impl fmt::Display for Owner {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Node => f.write_str("the node's own process"),
+            Self::Client { pid: 0, .. } => f.write_str("a process of another PID namespace"),
             Self::Client { pid, .. } => write!(f, "process {pid}"),
         }
     }
@@ -354,7 +355,8 @@ impl Registry {
         for entry in self.apps.values() {
             if let Owner::Client { pid: theirs, .. } = entry.owner {
                 all += 1;
-                own += usize::from(theirs == pid);
+                // 0 is any process of another PID namespace.
+                own += usize::from(theirs == pid && pid != 0);
             }
         }
         if own >= limits.per_process {

@@ -11,6 +11,7 @@ use std::{
 
 use sinew_runtime::{
     mailbox::Budget,
+    safe_wake::SafelyWoken,
     tid::{AppAddress, Tid},
     time::Time,
     wire::{Kind, encode_frame},
@@ -91,15 +92,20 @@ impl Server {
         })
     }
 
-    /// The bytes that may wait for the clients of the process `pid`, together.
+    /// The bytes that may wait for the clients of the process `pid`, together; for one client where the kernel does not say its process (0).
     pub(super) fn budget_of(&self, pid: i32) -> Arc<Budget> {
+        let share_max = self.stores.config.lncl.clients_bytes / PROCESSES_MIN;
+        // Not one process, but any number of them: each connection has a share.
+        if pid == 0 {
+            return Budget::part_of(&self.budget, share_max);
+        }
         let mut shares = self.shares.borrow_mut();
         if let Some(share) = shares.get(&pid).and_then(Weak::upgrade) {
             return share;
         }
         // Those of processes that have none any more.
         shares.retain(|_, share| share.strong_count() > 0);
-        let share = Budget::part_of(&self.budget, self.stores.config.lncl.clients_bytes / PROCESSES_MIN);
+        let share = Budget::part_of(&self.budget, share_max);
         shares.insert(pid, Arc::downgrade(&share));
         share
     }
@@ -258,10 +264,11 @@ fn admit(server: &Rc<Server>, stream: UnixStream, clients: &mut JoinSet<()>) -> 
     };
     let id = lock(&server.stores.registry).new_client();
     server.stores.door.admit(id, &stream);
-    clients.spawn_local(async move {
+    // Senders on any thread wake it.
+    clients.spawn_local(SafelyWoken::new(async move {
         client::serve(connected.server.clone(), stream, credentials, id, place).await;
         connected.server.stores.door.dismiss(id);
-    });
+    }));
     Some(user)
 }
 

@@ -32,7 +32,7 @@ impl Bounds {
 /// Who connects.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Stranger {
-    /// Its process.
+    /// Its process; 0 where the kernel does not say it: such connections are counted with all, and not as one process.
     pub(super) pid: i32,
     /// Its user.
     pub(super) user: User,
@@ -81,7 +81,7 @@ impl Strangers {
     pub(super) fn admit(&self, who: Stranger, bounds: Bounds) -> Result<Place, NoPlace> {
         let Silent { processes, guests } = &mut *self.0.borrow_mut();
         let of_process = processes.get(&who.pid).copied().unwrap_or_default();
-        if of_process >= bounds.per_process {
+        if who.pid != 0 && of_process >= bounds.per_process {
             return Err(NoPlace::Process { pid: who.pid, limit: bounds.per_process });
         }
         if let User::Guest(uid) = who.user {
@@ -147,6 +147,13 @@ mod tests {
         let _theirs = strangers.admit(own(2), BOUNDS).unwrap();
         drop(ours);
         assert!(strangers.admit(own(1), BOUNDS).is_ok());
+    }
+
+    #[test]
+    fn processes_whose_pids_are_unknown_are_not_one_process() {
+        let strangers = Strangers::default();
+        let _places: Vec<_> = (0..5).map(|_| strangers.admit(own(0), BOUNDS).unwrap()).collect();
+        assert_eq!(strangers.admit(own(0), BOUNDS).unwrap_err(), NoPlace::All { limit: 5 });
     }
 
     #[test]

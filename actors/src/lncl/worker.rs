@@ -58,7 +58,8 @@ impl Worker {
         let its_queue = queue.clone();
         let tasks = thread::Builder::new().name(name.to_owned()).spawn(move || work(tasks, &its_queue));
         let tasks = tasks.inspect_err(|cause| {
-            crate::log::warn!(%cause, "there is no thread `{name}`: {without}; raise `ulimit -u`");
+            let remedy = sinew_runtime::remedy::remedy(sinew_runtime::remedy::Wanted::Thread, cause);
+            crate::log::warn!(%cause, remedy, "there is no thread `{name}`: {without}");
         });
         Self { tasks: tasks.is_ok().then_some(sender), queue }
     }

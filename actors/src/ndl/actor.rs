@@ -24,6 +24,7 @@ use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, WrapFutur
 use futures_util::{StreamExt as _, stream::FuturesUnordered};
 use sinew_runtime::{
     alarm::Alarm,
+    remedy::{Wanted, remedy},
     supervision::ReadyGate,
     tid::{Incarnation, NodeAddress},
     time::Time,
@@ -102,7 +103,8 @@ impl Actor for NdlActor {
         } else {
             let news = (!chosen.are_ipv4_addresses()).then(|| interfaces::watch(chosen.clone()));
             let news = news.transpose().unwrap_or_else(|error| {
-                give_up(&format!("NDL has no thread to see interfaces with: {error}; raise `ulimit -u`"))
+                let remedy = remedy(Wanted::Thread, &error);
+                give_up(&format!("NDL has no thread to see interfaces with: {error}; {remedy}"))
             });
             ctx.spawn(paths::keep_paths(shell.clone(), news).into_actor(self));
         }
@@ -433,7 +435,8 @@ async fn try_hosts(shell: Rc<Shell>, mut asked: mpsc::Receiver<Probe>) {
 async fn keep_time(shell: Rc<Shell>) {
     // Not the reactor's own sleep, whose ticks of a millisecond made each look late by one to two, and each loss twice as much.
     let mut alarm = Alarm::new().unwrap_or_else(|error| {
-        give_up(&format!("NDL gets no timer of the kernel's: {error}; raise `ulimit -n`"))
+        let remedy = remedy(Wanted::Descriptor, &error);
+        give_up(&format!("NDL gets no timer of the kernel's (timerfd): {error}; {remedy}"))
     });
     loop {
         let wake = lock(&shell.stores).next_wake();

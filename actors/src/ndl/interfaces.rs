@@ -13,6 +13,7 @@ use std::{
     time::Duration,
 };
 
+use sinew_runtime::remedy::{Wanted, remedy};
 use tokio::sync::watch;
 
 pub(super) use self::flags::Flags;
@@ -187,8 +188,9 @@ fn follow(chosen: &Interfaces, tell: &watch::Sender<Usable>) {
                 has_failed = true;
                 crate::log::warn!(
                     %error,
+                    remedy = remedy(Wanted::Descriptor, &error),
                     "NDL cannot see this host's interfaces; what was known of them holds, and it looks again each second. \
-                     Where that goes on, raise `ulimit -n`, or choose interfaces by their addresses in `ndl.interface`"
+                     Where that goes on, choose interfaces by their addresses in `ndl.interface`"
                 );
             }
             Err(_) => {}

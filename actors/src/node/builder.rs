@@ -11,6 +11,7 @@ use sinew_runtime::{
     app::DynApp,
     log::tracing::level_filters::LevelFilter,
     name::NameError,
+    remedy::{Wanted, remedy},
     supervision::{AutoShutdown, Flags, UNWINDS},
     tid::{Incarnation, NodeAddress},
 };
@@ -136,8 +137,11 @@ pub enum StartError {
          profile, or say `accept_abort_on_panic()` where that is what you want"
     )]
     AbortsOnPanic,
+    /// An application is to have a process of its own, and the system lacks what watches one: the words say what is missing. Nothing was started.
+    #[error("{0}")]
+    OwnProcess(String),
     /// The operating system gives no thread.
-    #[error("no thread for the node's root: {0}; raise `ulimit -u`")]
+    #[error("no thread for the node's root: {0}; {remedy}", remedy = remedy(Wanted::Thread, .0))]
     Thread(#[from] std::io::Error),
 }
 
@@ -186,7 +190,7 @@ impl NodeBuilder {
         self
     }
 
-    /// SIGINT and SIGTERM stop the node in order, from before its first application starts. For a process that is this
+    /// SIGINT, SIGTERM and SIGHUP stop the node in order ([`signals`](crate::signals)), from before its first application starts. For a process that is this
     /// node; what `run` does too, but only from when it is called.
     #[must_use]
     pub const fn heed_signals(mut self) -> Self {
@@ -285,6 +289,9 @@ impl NodeBuilder {
             return Ok(Node { handle, ended, thread: None });
         }
         // Before any layer: one that cannot have it would fail again and again, with the same words.
+        if self.tree.apps().iter().any(|app| app.place().own_process) {
+            process::check_kernel().map_err(StartError::OwnProcess)?;
+        }
         open_door(&stores)?;
         inspect::begin(&stores)?;
         let (tree, heed_signals) = (self.tree, self.heed_signals);

@@ -163,7 +163,7 @@ impl Node {
         self.wait()
     }
 
-    /// Runs until SIGINT or SIGTERM, or until the node gives up; then stops in order. Returns the exit code for `main`:
+    /// Runs until SIGINT, SIGTERM or SIGHUP ([`signals`](crate::signals)), or until the node gives up; then stops in order. Returns the exit code for `main`:
     /// 0 after an orderly stop, 1 after giving up.
     pub fn run(mut self) -> ExitCode {
         if self.handle.is_bystander {

@@ -25,7 +25,6 @@ use sinew_runtime::{
     tid::AppAddress,
     time::Time,
 };
-use tokio::signal::unix::{SignalKind, signal};
 
 pub(crate) use self::events::RootEvent;
 use super::{
@@ -42,6 +41,7 @@ use super::{
 };
 use crate::{
     lncl, process,
+    signals::StopSignals,
     stores::{Stores, lock},
 };
 
@@ -495,17 +495,16 @@ impl Root {
             return;
         }
         let post = self.stores.posts.root.clone();
-        let (Ok(mut interrupt), Ok(mut terminate)) =
-            (signal(SignalKind::interrupt()), signal(SignalKind::terminate()))
-        else {
-            crate::log::error!("signals cannot be heeded; stop this node by its handle");
-            return;
+        let mut signals = match StopSignals::listen() {
+            Ok(signals) => signals,
+            Err(error) => {
+                let remedy = "stop this node by its handle";
+                crate::log::error!(%error, remedy, "SIGINT, SIGTERM and SIGHUP cannot be handled and end this process at once");
+                return;
+            }
         };
         let heed = async move {
-            let which = tokio::select! {
-                _ = interrupt.recv() => "SIGINT",
-                _ = terminate.recv() => "SIGTERM",
-            };
+            let which = signals.recv().await;
             crate::log::info!(signal = which, "a signal asks for a stop");
             tell(&post, RootEvent::StopOrdered);
         };

@@ -14,16 +14,14 @@ use std::{
 use sinew_runtime::{
     app::{AppWiring, DynApp},
     mailbox::Mailbox,
+    remedy::{Wanted, remedy},
+    safe_wake::SafelyWoken,
     supervision::{Alone, AloneHandle, Place, ReadyGate, Reason, Watcher, alone, tell_of_a_stop},
     tid::Tid,
     time::Time,
     wire::{FrameCodec, HEADER_LEN, Header, Kind},
 };
-use tokio::{
-    net::UnixStream,
-    signal::unix::{SignalKind, signal},
-    time::MissedTickBehavior,
-};
+use tokio::{net::UnixStream, time::MissedTickBehavior};
 use tokio_util::codec::Decoder;
 
 use super::{
@@ -31,7 +29,7 @@ use super::{
     wire::Wire,
     words::{self, Beat, Ending, WORDS_BYTES_MAX, Welcome},
 };
-use crate::{config::NodeConfig, lncl::payload, log, node::Stalls};
+use crate::{config::NodeConfig, lncl::payload, log, node::Stalls, signals::StopSignals};
 
 /// Time that the node has for its first words.
 const WELCOME: Duration = Duration::from_secs(10);
@@ -70,8 +68,9 @@ pub(super) fn host(config: &NodeConfig, apps: Vec<DynApp>, hosting: Hosting) -> 
         // The panic has been told by the panic hook.
         Ok(Err(_)) => 1,
         Err(error) => {
-            log::error!(name, %error, "no thread for this application; raise `ulimit -u`");
-            log::print(format!("no thread for '{name}': {error}; raise `ulimit -u`"));
+            let remedy = remedy(Wanted::Thread, &error);
+            log::error!(name, %error, remedy, "no thread for this application");
+            log::print(format!("no thread for '{name}': {error}; {remedy}"));
             1
         }
     };
@@ -159,12 +158,13 @@ async fn live(
 /// Keeps the connection going beside the application, on its thread.
 fn serve(wire: &Arc<Wire>) {
     let (draining, reading, telling, expiring) = (wire.clone(), wire.clone(), wire.clone(), wire.clone());
-    actix_rt::spawn(async move {
+    // Senders on any thread wake the first and the third.
+    actix_rt::spawn(SafelyWoken::new(async move {
         draining.drain().await;
         die();
-    });
+    }));
     actix_rt::spawn(async move { reading.read().await });
-    actix_rt::spawn(async move { poll_fn(|cx| telling.poll_tell(cx)).await });
+    actix_rt::spawn(SafelyWoken::new(async move { poll_fn(|cx| telling.poll_tell(cx)).await }));
     actix_rt::spawn(async move {
         let mut interval = tokio::time::interval(EXPIRING);
         interval.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -202,10 +202,11 @@ impl Beats {
         match thread.spawn(beats) {
             Ok(_) => {}
             Err(error) if beat.is_none() => {
-                log::warn!(%error, "no thread says whether this application stalls; raise `ulimit -u`");
+                log::warn!(%error, remedy = remedy(Wanted::Thread, &error), "no thread says whether this application stalls");
             }
             Err(error) => {
-                let why = format!("no thread gives its signs of life: {error}; raise `ulimit -u`");
+                let why =
+                    format!("no thread gives its signs of life: {error}; {}", remedy(Wanted::Thread, &error));
                 return Err(io::Error::new(error.kind(), why));
             }
         }
@@ -263,12 +264,12 @@ fn place(app: &DynApp) -> Place {
     Place { thread: app.name().to_owned(), ..app.place().clone() }
 }
 
-/// Resolves when the node, or whoever sends this process a SIGTERM, asks for an orderly stop.
+/// Resolves when the node or a signal asks for an orderly stop.
 async fn stop_asked(wire: &Wire) {
-    let Ok(mut terminate) = signal(SignalKind::terminate()) else { return wire.stop_asked().await };
+    let Ok(mut signals) = StopSignals::listen() else { return wire.stop_asked().await };
     tokio::select! {
         () = wire.stop_asked() => {}
-        _ = terminate.recv() => log::info!("SIGTERM asks for a stop"),
+        which = signals.recv() => log::info!(which, "a signal asks for a stop"),
     }
 }
 

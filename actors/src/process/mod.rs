@@ -46,6 +46,7 @@ mod words;
 pub(crate) use link::Link;
 
 use role::{Role, role};
+pub(crate) use spawn::check_kernel;
 
 use crate::{config::NodeConfig, node::SupervisorSpec};
 

@@ -6,8 +6,9 @@
 
 use std::{
     ffi::OsString,
+    io,
     os::{
-        fd::OwnedFd,
+        fd::{AsFd, OwnedFd},
         unix::{net::UnixStream, process::CommandExt},
     },
     process::{Command, Stdio},
@@ -18,7 +19,13 @@ use std::{
     time::Duration,
 };
 
-use rustix::process::{Pid, PidfdFlags, Signal, kill_process_group, pidfd_open};
+use rustix::{
+    io::Errno,
+    process::{
+        Pid, PidfdFlags, Signal, WaitId, WaitIdOptions, getpid, kill_process_group, pidfd_open, waitid,
+    },
+};
+use sinew_runtime::remedy::{Wanted, is_permanent, remedy};
 use tokio::sync::oneshot;
 
 use super::{group::Group, predecessor::Predecessor, words::VARIABLE};
@@ -78,6 +85,30 @@ pub(super) fn begin_spawning() {
     let _ = thread();
 }
 
+/// Tries on this process the calls that watch another one. What is short now may be there later, and is no error.
+///
+/// # Errors
+/// In words: a call is missing, with the version of Linux that has it, and stays missing.
+pub(crate) fn check_kernel() -> Result<(), String> {
+    let missing = |call: &str, since: &str, cause: io::Error| {
+        let cannot = "an application cannot have a process of its own here (`own_process`)";
+        format!(
+            "{cannot}: {call} fails: {cause}; it needs Linux {since} or newer, and a seccomp profile that allows this call"
+        )
+    };
+    let pidfd = match pidfd_open(getpid(), PidfdFlags::empty()).map_err(io::Error::from) {
+        Ok(pidfd) => pidfd,
+        Err(cause) if is_permanent(&cause) => return Err(missing("pidfd_open", "5.3", cause)),
+        Err(_) => return Ok(()),
+    };
+    match waitid(WaitId::PidFd(pidfd.as_fd()), WaitIdOptions::EXITED | WaitIdOptions::NOHANG) {
+        // This process is no child of its own.
+        Ok(_) | Err(Errno::CHILD) => Ok(()),
+        Err(cause) if is_permanent(&cause.into()) => Err(missing("waitid with P_PIDFD", "5.4", cause.into())),
+        Err(_) => Ok(()),
+    }
+}
+
 /// Starts this program again, as a host. It is the `predecessor` of the next one from then on, also where nobody hears of it.
 pub(super) async fn start(variable: String, predecessor: Arc<Predecessor>) -> Result<Started, String> {
     let (answer, started) = oneshot::channel();
@@ -98,12 +129,12 @@ fn order(order: Order) -> Result<(), String> {
         Ok(Ok(())) => Ok(()),
         Ok(Err(TrySendError::Full(_))) => Err("too many processes are to be started at once".to_owned()),
         Ok(Err(TrySendError::Disconnected(_))) => Err("the thread for it has ended".to_owned()),
-        Err(why) => Err(format!("there is no thread for it: {why}; raise `ulimit -u`")),
+        Err(why) => Err(format!("there is no thread for it: {why}; {}", remedy(Wanted::Thread, why))),
     }
 }
 
-fn thread() -> &'static std::io::Result<SyncSender<Order>> {
-    static THREAD: OnceLock<std::io::Result<SyncSender<Order>>> = OnceLock::new();
+fn thread() -> &'static io::Result<SyncSender<Order>> {
+    static THREAD: OnceLock<io::Result<SyncSender<Order>>> = OnceLock::new();
     THREAD.get_or_init(|| {
         let (orders, inbox) = sync_channel(ORDERS_MAX);
         let thread = std::thread::Builder::new().name("processes".to_owned());
@@ -141,8 +172,10 @@ fn run(inbox: &Receiver<Order>) {
 }
 
 fn start_now(variable: &str) -> Result<Started, String> {
-    let fault = |doing: &'static str| move |cause: std::io::Error| format!("{doing}: {cause}");
-    let (socket, theirs) = UnixStream::pair().map_err(fault("no pair of sockets; raise `ulimit -n`"))?;
+    let fault = |wanted, doing: &'static str| {
+        move |cause: io::Error| format!("{doing}: {cause}; {}", remedy(wanted, &cause))
+    };
+    let (socket, theirs) = UnixStream::pair().map_err(fault(Wanted::Descriptor, "no pair of sockets"))?;
     let mut arguments = std::env::args_os();
     // Not by its path: the file there may be another one by now.
     let mut command = Command::new("/proc/self/exe");
@@ -154,7 +187,7 @@ fn start_now(variable: &str) -> Result<Started, String> {
         // Ctrl-C is for the node, which then stops its applications in order. And what the process starts ends with it.
         .process_group(0)
         .spawn()
-        .map_err(fault("this program cannot be started again"))?;
+        .map_err(fault(Wanted::Process, "this program cannot be started again"))?;
     let pid = Pid::from_child(&child);
     // It is our child and has not been waited for, so nobody else has its id.
     match pidfd_open(pid, PidfdFlags::empty()) {
@@ -163,7 +196,7 @@ fn start_now(variable: &str) -> Result<Started, String> {
             let mut child = child;
             let _ = kill_process_group(pid, Signal::KILL);
             let _ = child.wait();
-            Err(format!("no descriptor for the process: {cause}; raise `ulimit -n`"))
+            Err(fault(Wanted::Descriptor, "no descriptor for the process (pidfd_open)")(cause.into()))
         }
     }
 }

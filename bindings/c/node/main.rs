@@ -1,6 +1,6 @@
 //! `sinew-node CONFIGURATION`: a node with no application of its own, for programs that come in through its socket.
 //!
-//! It prints `up` when they can connect, and stops in order at SIGINT and SIGTERM. Its log is on the standard error; `SINEW_LOG` sets the
+//! It prints `up` when they can connect, and stops in order at SIGINT, SIGTERM and SIGHUP. Its log is on the standard error; `SINEW_LOG` sets the
 //! level (`SINEW_LOG=warn`). A node that cannot print `up`, as on a full disk, runs all the same, and has exit code 1 in the end. A
 //! reader that has closed its pipe is no error.
 

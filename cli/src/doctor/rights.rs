@@ -4,7 +4,7 @@ use std::{collections::BTreeSet, fs};
 
 use rustix::{
     fs::{MemfdFlags, SealFlags, fcntl_add_seals, ftruncate, memfd_create},
-    process::{Resource, getrlimit},
+    process::{PidfdFlags, Resource, getpid, getrlimit, pidfd_open},
     thread::{CapabilitySet, capabilities},
 };
 use sinew::protection::SAFE_OUTPUT_PRIORITY;
@@ -154,6 +154,23 @@ pub(super) fn shared_memory() -> Check {
                 "no sealed memory: {error}; other processes are reached through sockets, which is slower"
             ),
             "allow memfd_create in the container's seccomp profile, as podman run --security-opt seccomp=unconfined ..",
+        ),
+    }
+}
+
+/// The node watches the process of an application with `own_process` through a descriptor.
+pub(super) fn own_processes() -> Check {
+    const NAME: &str = "own processes";
+    match pidfd_open(getpid(), PidfdFlags::empty()) {
+        Ok(_) => {
+            Check::fine(NAME, "pidfd_open works: applications may have processes of their own".to_owned())
+        }
+        Err(error) => Check::finding(
+            NAME,
+            format!(
+                "pidfd_open fails: {error}; a node with an application that has `own_process` does not start"
+            ),
+            "Linux 5.4 or newer, and a seccomp profile of the container that allows pidfd_open and waitid",
         ),
     }
 }

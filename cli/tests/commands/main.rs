@@ -1,6 +1,7 @@
 //! The command itself, against real node processes: what it says of two nodes from one of them, and how it fails.
 
 mod access;
+mod doctor;
 mod keys;
 mod output;
 mod scenario;

@@ -63,7 +63,7 @@ pub(crate) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum SubCommand {
-    /// Runs one part of the robot until SIGINT or SIGTERM, so that it can be spread over several hosts.
+    /// Runs one part of the robot until SIGINT, SIGTERM or SIGHUP, so that it can be spread over several hosts.
     Node(node::NodeArguments),
     Faults(faults::FaultArguments),
 }

@@ -30,6 +30,10 @@ pub(crate) fn keep_urgent_in_line(_: BorrowedFd<'_>) -> io::Result<()> {
     Ok(())
 }
 
+pub(crate) fn peer_pidfd(_: BorrowedFd<'_>) -> io::Result<OwnedFd> {
+    Err(io::ErrorKind::Unsupported.into())
+}
+
 pub(crate) fn set_descriptors(_: BorrowedFd<'_>, _: Descriptors) -> io::Result<()> {
     Err(io::ErrorKind::Unsupported.into())
 }

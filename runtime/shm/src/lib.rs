@@ -68,7 +68,9 @@ pub use error::{
     AnyError, Corrupt, CreateError, LoanError, PassError, ReceiveError, RefusedOffer, RoomError,
 };
 pub use layout::{Capacity, CapacityError};
-pub use offer::{Descriptors, OFFER_BYTES, Offer, Received, keep_urgent_in_line, set_descriptors};
+pub use offer::{
+    Descriptors, OFFER_BYTES, Offer, Received, keep_urgent_in_line, peer_pidfd, set_descriptors,
+};
 pub use producer::{Loan, Producer};
 pub use region::{Accepted, Region, Terms};
 pub use spin::Spin;

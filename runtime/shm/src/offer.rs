@@ -164,6 +164,15 @@ pub fn keep_urgent_in_line(socket: impl AsFd) -> io::Result<()> {
     platform::keep_urgent_in_line(socket.as_fd())
 }
 
+/// Returns a descriptor of the process that has connected at the other end of a unix socket, or that listens there. It is readable when
+/// that process has ended, also where its number is unknown because it lives in another PID namespace.
+///
+/// # Errors
+/// The system does not have it: Linux before 6.5. Or the process has ended and was reaped (ESRCH or EINVAL).
+pub fn peer_pidfd(socket: impl AsFd) -> io::Result<OwnedFd> {
+    platform::peer_pidfd(socket.as_fd())
+}
+
 fn take<const N: usize>(bytes: &[u8; OFFER_BYTES], from: usize) -> [u8; N] {
     std::array::from_fn(|index| bytes[from + index])
 }

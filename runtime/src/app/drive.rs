@@ -24,6 +24,7 @@ use crate::{
     mailbox::MailboxReader,
     outcome::{Outcome, Rejection},
     protection::{Echo, Fault, Verdict},
+    remedy::{Wanted, remedy},
     schedule::Due,
     supervision::vitals::{Doing, Vitals},
     time::Time,
@@ -274,7 +275,13 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
     fn sleep(&mut self, context: &AppContext<A>, task: &mut Context<'_>) {
         let next = context.schedule.next_due();
         if self.alarm.is_none() && next.is_some() {
-            self.alarm = Some(Alarm::new().expect("a descriptor for a timer; raise `ulimit -n`"));
+            let no_timer = |error: std::io::Error| -> Alarm {
+                panic!(
+                    "no timer for its deadlines (timerfd): {error}; {}",
+                    remedy(Wanted::Descriptor, &error)
+                )
+            };
+            self.alarm = Some(Alarm::new().unwrap_or_else(no_timer));
         }
         if let Some(alarm) = &mut self.alarm {
             alarm.wake_at(next, task).expect("a timerfd that was made takes a time");

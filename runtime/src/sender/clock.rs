@@ -8,6 +8,7 @@ use std::{
     time::Duration,
 };
 
+use crate::remedy::{Wanted, remedy};
 use tokio::{
     runtime::{Builder, Handle},
     time::Sleep,
@@ -32,7 +33,8 @@ fn kept() -> Option<Handle> {
         match begin() {
             Ok(handle) => *kept = Some(handle),
             Err(error) => {
-                crate::log::error!(%error, "no timer, so that a wait without a runtime ends at once; raise `ulimit -u` and `ulimit -n`");
+                let remedy = remedy(Wanted::Reactor, &error);
+                crate::log::error!(%error, remedy, "no timer, so that a wait without a runtime ends at once");
             }
         }
     }

@@ -101,7 +101,8 @@ impl Burials {
         });
         if let Err(error) = &begun {
             // What waits is dropped after the next one.
-            log::error!(%error, name, "there is no thread to drop what is over; raise `ulimit -u`");
+            let remedy = crate::remedy::remedy(crate::remedy::Wanted::Thread, error);
+            log::error!(%error, name, remedy, "there is no thread to drop what is over");
         }
         begun.is_ok()
     }

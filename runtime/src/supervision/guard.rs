@@ -19,7 +19,7 @@ use super::{
     tenant::{Fate, Tenant},
     vitals::{Doing, Over, Vitals},
 };
-use crate::{outcome::Outcome, time::Time};
+use crate::{outcome::Outcome, safe_wake::SafeWaker, time::Time};
 
 /// A running actor of any type, as its guard sees it.
 pub trait Life {
@@ -76,6 +76,7 @@ pub(super) struct Guard {
     ends_before_its_drop: bool,
     /// Where what its panics carry is dropped.
     burials: Burials,
+    waker: SafeWaker,
 }
 
 impl Guard {
@@ -83,7 +84,8 @@ impl Guard {
     pub(super) fn around(life: Option<Box<dyn Life>>, tenant: Tenant, burials: Burials) -> Self {
         let vitals = Some(tenant.vitals().clone());
         let (was_polled, has_reported, ends_before_its_drop) = (false, false, false);
-        Self { life, tenant, vitals, was_polled, has_reported, ends_before_its_drop, burials }
+        let waker = SafeWaker::default();
+        Self { life, tenant, vitals, was_polled, has_reported, ends_before_its_drop, burials, waker }
     }
 
     /// Guards one that has done all that it is for when it has ended: what it drops then is not its own.
@@ -178,6 +180,9 @@ impl Future for Guard {
 
     fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<()> {
         let this = &mut *self;
+        // All that the actor waits for wakes it by this one.
+        let mut safe = std::mem::take(&mut this.waker);
+        let mut cx = Context::from_waker(safe.of(cx.waker()));
         let told = this.tenant.told(cx.waker());
         if told.kill {
             this.end(Reason::Killed);
@@ -191,11 +196,14 @@ impl Future for Guard {
                 if told.stop {
                     life.stop();
                 }
-                life.poll(cx)
+                life.poll(&mut cx)
             }))
         });
         let reason = match polled {
-            Ok(Poll::Pending) if !this.tenant.vitals().is_over() => return Poll::Pending,
+            Ok(Poll::Pending) if !this.tenant.vitals().is_over() => {
+                this.waker = safe;
+                return Poll::Pending;
+            }
             Ok(Poll::Pending) => Reason::Killed,
             Err(panic) if panic.is::<Over>() => Reason::Killed,
             Ok(Poll::Ready(reason)) => reason,

@@ -186,7 +186,10 @@ impl Threads {
             };
         }
         let made = self.make(place);
-        made.map_err(|error| format!("there is no thread for it: {error}; raise `ulimit -u` and `ulimit -n`"))
+        made.map_err(|error| {
+            let remedy = crate::remedy::remedy(crate::remedy::Wanted::Reactor, &error);
+            format!("there is no thread for it: {error}; {remedy}")
+        })
     }
 
     fn make(&mut self, place: &Place) -> std::io::Result<(ArbiterHandle, Arc<Seat>)> {

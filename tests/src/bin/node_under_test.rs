@@ -1,7 +1,9 @@
 //! A node for the scenarios: one application that sends, and says what it sees, one line each.
 //!
 //! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--floods NAME]... [--will NAME]... [--meets NAME]... [--incarnation NUMBER]
-//! [--says-directory] [--streams-to NAME [--stream BYTES]...] [--logs | --logs-info]`
+//! [--says-directory] [--streams-to NAME [--stream BYTES]...] [--logs | --logs-info] [--held]`
+//!
+//! With `--held` a thread-local variable of the main thread holds the node, and `main` returns 3 once the node runs: a destructor stops it.
 //!
 //! For each length that it streams it has an application more, which sends a value of class Stream of so many bytes every 20 ms.
 //! Whom it floods it sends as many counts as are taken, to each the same. A will is a count of 1,000,000. The
@@ -9,7 +11,7 @@
 //! With those whom it meets, itself among them, it waits at a barrier when it starts, once. When it has started is said in nanoseconds of the
 //! monotonic clock, which all hosts of one machine share. If it says the directory, it does so whenever its standard input has the line `directory`.
 
-use std::process::ExitCode;
+use std::{cell::RefCell, process::ExitCode};
 
 use sinew::{Barrier, Meet, NodeHandle, prelude::*};
 
@@ -40,6 +42,10 @@ impl Actor for Streamer {
 
 /// Counts in each millisecond to whom it floods.
 const AT_ONCE: u32 = 100;
+
+thread_local! {
+    static HELD: RefCell<Option<Node>> = const { RefCell::new(None) };
+}
 
 struct Probe {
     sends_to: Option<String>,
@@ -197,7 +203,14 @@ fn main() -> ExitCode {
         };
         builder = builder.incarnation(sinew::Incarnation(life));
     }
+    // Used before all others, so that its destructor runs after theirs.
+    HELD.with(|held| drop(held.borrow()));
     match builder.start() {
+        Ok(node) if has("--held") => {
+            let running = node.handle().wait_until_running(Duration::from_secs(60));
+            HELD.set(Some(node));
+            ExitCode::from(if running.is_ok() { 3 } else { 4 })
+        }
         Ok(node) => {
             println!("up");
             if has("--says-directory") {

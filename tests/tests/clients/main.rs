@@ -6,4 +6,5 @@ mod direct;
 mod hostile;
 mod idle;
 mod kills;
+mod namespaces;
 mod stopped;

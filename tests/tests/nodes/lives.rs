@@ -3,15 +3,21 @@
 use std::{
     net::SocketAddrV4,
     path::PathBuf,
+    process::Command,
     time::{Duration, Instant},
 };
 
 use rustix::process::Signal;
 use sinew::{Incarnation, NodeApi, NodeEnd, Registration, StartError};
-use sinew_tests::{Ground, OwnDirectory, Program, all_run, node_under_test, own_group, process_under_test};
+use sinew_tests::{
+    Ground, OwnDirectory, Program, all_run, node_under_test, own_group, process_under_test, program,
+};
 
 /// How often a node that is told to sends.
 const SENT_EVERY: Duration = Duration::from_millis(20);
+
+/// Lives of the node that a destructor stops: a lost wake is a race, which one life may win.
+const ENDS_OF_PROCESSES: u32 = 30;
 
 /// A node of a scenario: its own address on loopback, the scenario's own multicast group.
 struct Scenario {
@@ -68,7 +74,7 @@ fn a_killed_node_is_lost_at_once_and_its_next_life_is_a_restart() {
 
 #[test]
 fn a_node_that_is_told_to_stop_tells_its_application_and_says_goodbye() {
-    for signal in [Signal::TERM, Signal::INT] {
+    for signal in [Signal::TERM, Signal::INT, Signal::HUP] {
         let scenario = Scenario::new();
         let mut hip = scenario.start("hip", 1, &[]);
         let mut knee = scenario.start("knee", 2, &[]);
@@ -78,6 +84,34 @@ fn a_node_that_is_told_to_stop_tells_its_application_and_says_goodbye() {
         knee.wait_for(&["stopping"]);
         assert_eq!(knee.wait_for_end(), Some(0));
         hip.wait_for(&["NodeLost", "knee", "Left"]);
+    }
+}
+
+#[test]
+fn a_node_whose_hangups_are_ignored_at_its_start_goes_on() {
+    let scenario = Scenario::new();
+    let mut command = Command::new("sh");
+    command.args(["-c", r#"trap "" HUP; exec "$0" "$@""#]).arg(program("node_under_test"));
+    command.arg(scenario.configuration("knee", 2)).args(["--says-directory", "--requires", "hip"]);
+    let mut knee = Program::start("knee", command);
+    knee.wait_for(&["up"]);
+    knee.signal(Signal::HUP);
+    // It finds and starts what comes later.
+    let _hip = scenario.start("hip", 1, &[]);
+    knee.wait_for(&["started"]);
+    knee.signal(Signal::TERM);
+    assert_eq!(knee.wait_for_end(), Some(0));
+}
+
+/// The destructor that stops the node runs after those of the thread-local variables that tokio and the log use.
+#[test]
+fn a_node_that_a_destructor_stops_at_the_end_of_the_process_stops_in_order() {
+    let scenario = Scenario::new();
+    for life in 0..ENDS_OF_PROCESSES {
+        let mut knee = scenario.start("knee", 2, &["--held"]);
+        let code = knee.wait_for_end();
+        assert_eq!(code, Some(3), "life {life}: {:?}", knee.said());
+        assert!(knee.said().iter().any(|line| line.contains("stopping")), "life {life}: {:?}", knee.said());
     }
 }
 

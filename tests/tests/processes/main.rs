@@ -3,6 +3,7 @@
 mod death;
 mod fence;
 mod groups;
+mod missing_calls;
 mod placement;
 mod scenario;
 mod stalls;

@@ -4,7 +4,10 @@ use std::{sync::Arc, time::Duration};
 
 use actix::{AsyncContext, Context};
 use rustls::pki_types::UnixTime;
-use sinew_runtime::time::Time;
+use sinew_runtime::{
+    remedy::{Wanted, remedy},
+    time::Time,
+};
 
 use super::{
     super::{
@@ -37,7 +40,7 @@ impl Gncl {
         let mut kept = lock(&self.stores.gncl.secure);
         let secure = kept.get_or_insert_with(|| {
             let secure = Secure::begin(secured.tls.clone()).unwrap_or_else(|error| {
-                panic!("GNCL gets no thread for handshakes: {error}; raise `ulimit -n` or `ulimit -u`")
+                panic!("GNCL gets no thread for handshakes: {error}; {}", remedy(Wanted::Reactor, &error))
             });
             Arc::new(secure)
         });

@@ -90,6 +90,15 @@ fn dynamic_addresses_go_round_their_range() {
 }
 
 #[test]
+fn processes_whose_pids_are_unknown_are_not_counted_as_one() {
+    let mut registry = Registry::default();
+    for _ in 0..=LIMITS.per_process {
+        let owner = Owner::Client { id: registry.new_client(), pid: 0 };
+        assert!(registry.register(Request { owner, ..request(Address::Dynamic, None) }, LIMITS).is_ok());
+    }
+}
+
+#[test]
 fn a_node_and_a_process_have_their_limits() {
     let mut registry = Registry::default();
     let mut register = |pid: i32, limits| {

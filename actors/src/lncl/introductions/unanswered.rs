@@ -37,14 +37,14 @@ impl<T> Default for Unanswered<T> {
 }
 
 impl<T> Unanswered<T> {
-    /// Whether one more may wait.
+    /// Whether one more may wait. A process whose pid is unknown (0) has no share of its own.
     pub(super) fn has_room_for(&self, of: Processes) -> bool {
         let count = |is_theirs: fn(Processes, Processes) -> bool| {
             self.0.values().filter(|waiting| is_theirs(waiting.of, of)).count()
         };
         self.0.len() < ALL_MAX
-            && count(|one, other| one.asker == other.asker) < PROCESS_MAX
-            && count(|one, other| one.peer == other.peer) < PROCESS_MAX
+            && count(|one, other| one.asker != 0 && one.asker == other.asker) < PROCESS_MAX
+            && count(|one, other| one.peer != 0 && one.peer == other.peer) < PROCESS_MAX
     }
 
     /// `what` waits from `now` on as the introduction `number`, which no other has.

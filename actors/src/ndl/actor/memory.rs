@@ -3,6 +3,7 @@
 
 use std::{rc::Rc, sync::Arc, thread, time::Duration};
 
+use sinew_runtime::remedy::{Wanted, remedy};
 use tokio::sync::oneshot;
 
 use super::{Shell, lock};
@@ -127,7 +128,8 @@ async fn elsewhere<T: Send + 'static>(
         // Nobody waits any more where this layer has ended.
         let _ = say.send(act());
     });
-    begun.map_err(|error| format!("there is no thread for it: {error}; raise `ulimit -u`"))?;
+    begun
+        .map_err(|error| format!("there is no thread for it: {error}; {}", remedy(Wanted::Thread, &error)))?;
     let ended = || "its thread has panicked".to_owned();
     if let Ok(done) = tokio::time::timeout(SLOW, &mut said).await {
         return done.unwrap_or_else(|_| Err(ended()));

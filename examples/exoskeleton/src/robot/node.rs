@@ -9,6 +9,7 @@ use std::time::SystemTime;
 
 use sinew::Incarnation;
 use sinew::prelude::*;
+use sinew::signals::StopSignals;
 use thiserror::Error;
 
 use super::device::{JointDevice, UdpDevice};
@@ -63,7 +64,7 @@ pub enum NodeError {
     Thread(io::Error),
 }
 
-/// Runs a process of the robot until SIGINT or SIGTERM.
+/// Runs a process of the robot until SIGINT, SIGTERM or SIGHUP.
 ///
 /// # Errors
 /// It did not start, or the plant ended early.
@@ -215,20 +216,16 @@ fn when_stdin_ends(act: impl FnOnce() + Send + 'static) -> Result<(), NodeError>
 
 /// For the plant, which is no node and has no runtime that heeds signals.
 fn stop_on_signals(stop: Arc<AtomicBool>) -> Result<(), NodeError> {
-    use tokio::signal::unix::{SignalKind, signal};
     let runtime =
         tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(NodeError::Thread)?;
     let wait = move || {
         runtime.block_on(async {
-            let (Ok(mut interrupt), Ok(mut terminate)) =
-                (signal(SignalKind::interrupt()), signal(SignalKind::terminate()))
-            else {
-                tracing::error!("signals cannot be heeded: they will end the plant at once");
-                return;
-            };
-            tokio::select! {
-                _ = interrupt.recv() => {}
-                _ = terminate.recv() => {}
+            match StopSignals::listen() {
+                Ok(mut signals) => drop(signals.recv().await),
+                Err(error) => {
+                    tracing::error!(%error, "signals cannot be handled: they will end the plant at once");
+                    return;
+                }
             }
             // SYNC: Relaxed, the flag carries nothing but itself.
             stop.store(true, Ordering::Relaxed);

@@ -14,4 +14,4 @@ pub(crate) use ears::{Ears, sleep_at};
 pub(crate) use mapping::{OwnHeaderMemory, OwnMemory, OwnRingMemory, PeerMemory};
 pub(crate) use memfd::{adopt, create};
 pub(crate) use passing::{receive, send};
-pub(crate) use rights::{keep_urgent_in_line, set_descriptors};
+pub(crate) use rights::{keep_urgent_in_line, peer_pidfd, set_descriptors};

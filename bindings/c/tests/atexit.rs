@@ -1,0 +1,105 @@
+//! A node that lives until its process ends, as a plug-in or a Python module holds it: a function registered with `atexit` stops it.
+//!
+//! The thread-local variables of the thread that ends the process are gone by then. Whether that disturbs the stop is a race, so there are many
+//! lives. This program starts itself again for each.
+
+use std::{
+    io::{Write, stdout},
+    process::{Command, ExitCode},
+    sync::Mutex,
+    thread,
+};
+
+use sinew::{NodeConfig, prelude::*};
+use sinew_tests::{DEADLINE, OwnDirectory, Program, own_group};
+
+/// Lives of the node in each mode.
+const LIVES: u32 = 20;
+/// The exit code of each life.
+const CODE: u8 = 3;
+/// What ends a life: `main` returns, `main` calls `exit`, or another thread does.
+const MODES: [&str; 3] = ["return", "exit", "exit-of-a-thread"];
+
+static NODE: Mutex<Option<Node>> = Mutex::new(None);
+
+struct Idle(&'static str);
+
+impl Actor for Idle {
+    type Context = AppContext<Self>;
+
+    fn stopped(&mut self, _: &mut Self::Context) {
+        say(&format!("{} has stopped", self.0));
+    }
+}
+
+fn say(line: &str) {
+    // Nobody reads it where the test has failed already.
+    let _ = writeln!(stdout(), "{line}");
+}
+
+extern "C" fn at_exit() {
+    let node = NODE.lock().ok().and_then(|mut node| node.take());
+    if let Some(node) = node {
+        say(&format!("the node has ended: {:?}", node.stop()));
+    }
+}
+
+fn live(mode: &str, config: &str) -> ExitCode {
+    let config = NodeConfig::from_file(config).expect("the test's own file");
+    let node = Node::builder("held")
+        .config(config)
+        .app(AppSpec::new("shared", || Idle("shared")))
+        .app(AppSpec::new("alone", || Idle("alone")).own_thread())
+        .start()
+        .expect("it starts");
+    node.handle().wait_until_running(DEADLINE).expect("it runs");
+    *NODE.lock().expect("no thread has panicked") = Some(node);
+    // SAFETY: the function takes nothing, returns nothing, and lives as long as the program; a panic in it ends the process at once.
+    let registered = unsafe { libc::atexit(at_exit) };
+    assert_eq!(registered, 0, "there is room for a handler");
+    match mode {
+        "exit" => std::process::exit(CODE.into()),
+        "exit-of-a-thread" => {
+            let ends = thread::spawn(|| std::process::exit(CODE.into()));
+            let _ = ends.join();
+        }
+        _ => {}
+    }
+    ExitCode::from(CODE)
+}
+
+fn prove(mode: &str) {
+    let directory = OwnDirectory::new();
+    let (config, socket) = (directory.join("held.toml"), directory.join("held.sock"));
+    let text = format!(
+        "[node]\nname = \"held\"\naddress = \"127.0.0.1\"\nproject = \"atexit\"\n[lncl]\nsocket = {socket:?}\n\
+         [ndl]\nmulticast = \"{}\"\nmdns_port = false\n",
+        own_group()
+    );
+    std::fs::write(&config, text).expect("the test's own directory");
+    let this = std::env::current_exe().expect("a test has a path");
+    for life in 1..=LIVES {
+        let mut command = Command::new(&this);
+        command.args(["--life", mode]).arg(&config);
+        let mut program = Program::start(mode, command);
+        let code = program.wait_for_end();
+        let said = program.said();
+        let has_said = |words: &str| said.iter().any(|line| line.contains(words));
+        let words = ["shared has stopped", "alone has stopped", "the node has ended: Stopped"];
+        let is_ordered = words.into_iter().all(has_said);
+        assert_eq!((code, is_ordered), (Some(CODE.into()), true), "{mode}, life {life}: {said:#?}");
+        assert!(!socket.exists(), "{mode}, life {life}: the socket file stays");
+    }
+    println!("{mode}: {LIVES} lives stopped in order");
+}
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
+        ["--life", mode, config] => live(mode, config),
+        _ => {
+            MODES.into_iter().for_each(prove);
+            ExitCode::SUCCESS
+        }
+    }
+}
