@@ -69,6 +69,7 @@ mod session;
 mod stores;
 mod sync;
 mod takeover;
+mod undelivered;
 mod wills;
 
 #[cfg(feature = "fault-points")]
@@ -77,7 +78,7 @@ pub use sinew_runtime::supervision::fault;
 pub use access::{AccessError, AccessSummary};
 pub use api::{
     ApiError, AsyncEndpoint, Barrier, BarrierError, Endpoint, LoanedMessage, Meet, Meeting, NodeApi,
-    Received, Registration, Transport, Undelivered,
+    Received, Registration, Transport,
 };
 pub use audit::{Audit, NodeAudit};
 pub use clocks::{ClockDrift, ClockOffset};
@@ -106,6 +107,7 @@ pub use sinew_runtime::{
     supervision::{AutoShutdown, Place, ReadyGate, Reason, Refusal, Restart, Strategy},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
+    undelivered::Undelivered,
     wire::{Class, Kind, MessageBuffer, Payload, TIME_TO_LIVE_MAX},
 };
 pub use sinew_shm::Spin;
@@ -124,7 +126,7 @@ pub mod prelude {
         AppAddress, AppContext, AppSpec, AutoShutdown, Class, Delivery, Down, DownPolicy, InputTimeout,
         LastWill, Node, NodeAddress, NodeBuilder, NodeConfig, NodeEvent, Outcome, Payload, Place,
         RequirementEvent, RequirementPolicy, Restart, SendOutcome, StartError, Strategy, SupervisorSpec,
-        Tick, Tid, Time, payload,
+        Tick, Tid, Time, Undelivered, payload,
     };
 }
 

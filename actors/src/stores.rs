@@ -20,7 +20,8 @@ use tokio::sync::watch;
 
 use crate::{
     access::Access, aftermath::Aftermath, audit, clocks::ClockOffsets, config::NodeConfig, gncl, lncl,
-    log_quotas::LogQuotas, monitors, ndl, node, refusals::Refusals, secured::Secured, sync, wills,
+    log_quotas::LogQuotas, monitors, ndl, node, refusals::Refusals, secured::Secured, sync,
+    undelivered::Undelivered, wills,
 };
 
 /// What the layers of one node share.
@@ -52,6 +53,8 @@ pub(crate) struct Stores {
     pub(crate) gncl_port6: OnceLock<u16>,
     /// What LNCL, the sync manager and NDL's sockets refused.
     pub(crate) refusals: Arc<Refusals>,
+    /// Unconfirmed messages that were refused, and of which their senders were not told.
+    pub(crate) undelivered: Arc<Undelivered>,
     /// GNCL's peers with the messages that wait for them, and what GNCL refused.
     pub(crate) gncl: gncl::Store,
     /// NDL's sockets for queries and answers. They stay open while this layer is restarted.
@@ -102,18 +105,16 @@ impl Stores {
     /// The stores of a node that has not started yet.
     pub(crate) fn new(config: NodeConfig, incarnation: Incarnation) -> Arc<Self> {
         let node = config.node_address();
+        let (router, posts) = (Arc::new(Router::new(node)), Posts::new());
+        let undelivered = Undelivered::new(node, posts.lncl.clone());
+        router.set_refusal_sink(undelivered.clone());
         Arc::new(Self {
             node,
             incarnation,
             stopping: AtomicBool::new(false),
-            router: Arc::new(Router::new(node)),
-            posts: Posts {
-                root: Post::new(POST_CAPACITY),
-                lncl: Post::new(POST_CAPACITY),
-                sync: Post::new(POST_CAPACITY),
-                gncl: Post::new(POST_CAPACITY),
-                ndl: Post::new(POST_CAPACITY),
-            },
+            router,
+            posts,
+            undelivered,
             clocks: ClockOffsets::default(),
             secured: OnceLock::new(),
             access: OnceLock::new(),
@@ -213,4 +214,16 @@ pub(crate) struct Posts {
     pub(crate) sync: Post<sync::Event>,
     pub(crate) gncl: Post<gncl::Event>,
     pub(crate) ndl: Post<ndl::Event>,
+}
+
+impl Posts {
+    fn new() -> Self {
+        Self {
+            root: Post::new(POST_CAPACITY),
+            lncl: Post::new(POST_CAPACITY),
+            sync: Post::new(POST_CAPACITY),
+            gncl: Post::new(POST_CAPACITY),
+            ndl: Post::new(POST_CAPACITY),
+        }
+    }
 }

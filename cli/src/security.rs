@@ -147,6 +147,7 @@ pub(crate) mod tests {
             foreign: Vec::new(),
             foreign_left_out: 0,
             refusals: Vec::new(),
+            unhandled: Vec::new(),
             refusals_left_out: 0,
             peers: Vec::new(),
             own_stalls: None,

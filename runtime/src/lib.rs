@@ -8,6 +8,7 @@
 //! | [`time`] | when: nanoseconds of the monotonic clock |
 //! | [`wire`] | what: header, payload, frames |
 //! | [`outcome`] | and then: what became of a message |
+//! | [`undelivered`] | unconfirmed messages that were refused |
 //! | [`router`] | where to: the table that senders read without a lock |
 //! | [`post`] | events into an actor that outlive it |
 //! | [`mailbox`] | messages into an application that outlive it |
@@ -42,5 +43,6 @@ pub mod time;
 // A timerfd; `alarm` stands in for it elsewhere.
 #[cfg(target_os = "linux")]
 pub mod timer;
+pub mod undelivered;
 pub mod wakes;
 pub mod wire;

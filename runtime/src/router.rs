@@ -10,7 +10,7 @@ mod tests;
 use std::{
     collections::{BTreeMap, BTreeSet},
     sync::{
-        Arc, Mutex,
+        Arc, Mutex, OnceLock,
         atomic::{AtomicU64, Ordering},
     },
     task::Waker,
@@ -28,7 +28,8 @@ use crate::{
     outcome::{Rejection, Ticket},
     post::lock,
     tid::{AppAddress, NodeAddress, Tid},
-    wire::{Flags, Kind, Message},
+    undelivered::{RefusalSink, is_reported},
+    wire::{Flags, Header, Kind, Message},
 };
 
 /// A place that takes messages: a mailbox, a client's socket, the connection to a node.
@@ -139,6 +140,8 @@ pub struct Router {
     writing: Mutex<Writing>,
     /// For each reason in the order of [`Rejection`].
     refused: [AtomicU64; Rejection::ALL.len()],
+    /// Who reports refusals of unconfirmed messages to their senders.
+    refusals: OnceLock<Arc<dyn RefusalSink>>,
     /// Where everything goes, in a process that knows no route itself.
     uplink: Option<Arc<dyn Outlet>>,
 }
@@ -152,6 +155,7 @@ impl Router {
             snapshot: ArcSwap::default(),
             writing: Mutex::default(),
             refused: Default::default(),
+            refusals: OnceLock::new(),
             uplink: None,
         }
     }
@@ -249,10 +253,10 @@ impl Router {
             submit_here(&snapshot.table, guard, message)
         } else {
             let copies = self.fan_out(snapshot, guard, &message);
-            self.count(&copies);
+            self.count(&copies, &message.header);
             Ok(())
         };
-        self.account(result)
+        result.map_err(|refused| self.refuse_arrived(refused))
     }
 
     /// Offers a message that came from another node to the one application of this node that it is for. One who is refused because of a
@@ -293,6 +297,40 @@ impl Router {
     pub fn refuse(&self, refused: Refused) {
         // The reason is told to whom the receipt belongs.
         let _ = self.account(Err(refused));
+    }
+
+    /// The same of a message that came from another node: its sender is told, whether it asked or not.
+    pub fn refuse_arrived(&self, refused: Refused) -> Rejection {
+        let Refused { message, why } = refused;
+        self.report(message.header.destination, &message.header, why, 1);
+        self.refuse(Refused::new(message, why));
+        why
+    }
+
+    /// Has refusals of unconfirmed messages told to `sink` from now on. Set once.
+    pub fn set_refusal_sink(&self, sink: Arc<dyn RefusalSink>) {
+        // Whoever sets a second one keeps it for itself.
+        let _ = self.refusals.set(sink);
+    }
+
+    /// `receiver` refused `count` messages with this header, whose sender had gone on.
+    pub fn report(&self, receiver: Tid, header: &Header, why: Rejection, count: u64) {
+        if let Some(sink) = self.refusals.get()
+            && is_reported(header, why)
+        {
+            sink.refused(receiver, header, why, count);
+        }
+    }
+
+    /// Hands a layer's message to an application of this node, past the access list and whoever watches.
+    ///
+    /// # Errors
+    /// The message, and why it was not taken.
+    pub fn tell(&self, app: AppAddress, message: Message) -> Result<(), Refused> {
+        match self.snapshot.load().table.local.get(&app) {
+            Some(route) => route.outlet.submit(message),
+            None => Err(Refused::new(message, Rejection::NoSuchApplication)),
+        }
     }
 
     /// Whether the application of this node at `app` subscribed to events of this kind.
@@ -364,16 +402,17 @@ impl Router {
             submit(peer);
         }
         if copies.is_taken() {
-            self.count(&copies);
+            self.count(&copies, &message.header);
             return Ok(());
         }
         Err(Refused::new(message, copies.why_none()))
     }
 
     /// Of a message to many that others took, so that its sender hears nothing: the copies for which there was no room.
-    fn count(&self, copies: &Copies) {
-        for (why, count) in copies.without_room() {
+    fn count(&self, copies: &Copies, header: &Header) {
+        for (why, count) in copies.without_room().filter(|(_, count)| *count > 0) {
             self.refused[why as usize].fetch_add(count, Ordering::Relaxed);
+            self.report(header.destination, header, why, count);
         }
     }
 

@@ -342,6 +342,11 @@ impl Sender {
         self.shared.router.absolute(tid)
     }
 
+    /// The application refused a message that it had taken out of its mailbox: an unconfirmed one is reported to its sender.
+    pub fn refused(&self, header: &Header, why: Rejection) {
+        self.shared.router.report(self.shared.tid, header, why, 1);
+    }
+
     /// A receiver of protected messages wants this time quoted.
     pub(crate) fn echoed(&self, from: Tid, echo: Echo) {
         self.flows.heard(from, echo);

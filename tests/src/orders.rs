@@ -67,6 +67,8 @@ payload!("process.order" =>
         Leave(String),
         /// Send a number to the application of this name, confirmed, and write down what becomes of it.
         Send(String, u64),
+        /// Send a number to the application that has this TID, unconfirmed.
+        SendTo(u64),
         /// Ask the application of this name who it is, and write down the answer.
         Ask(String),
         /// Send these bytes, in this very order, to the application of this name.

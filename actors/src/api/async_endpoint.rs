@@ -9,13 +9,14 @@ use sinew_runtime::{
     sender::Destination,
     tid::{AppAddress, Tid},
     time::Time,
+    undelivered::Undelivered,
     wire::{Kind, Payload},
 };
 use sinew_shm::BellKind;
 use tokio::task::{coop, spawn_blocking};
 
 use super::{
-    ApiError, Endpoint, LoanedMessage, MessageBuilder, Received, Registration, Transport, Undelivered,
+    ApiError, Endpoint, LoanedMessage, MessageBuilder, Received, Registration, Transport,
     builder::{SendTerms, Value},
     form::Form,
     reactor::Reactor,
@@ -150,7 +151,7 @@ impl AsyncEndpoint {
         }
     }
 
-    /// What the node has said about messages that nobody has taken, as [`Endpoint::take_undelivered`]. Never waits.
+    /// Returns the next report of messages that were not delivered, as [`Endpoint::take_undelivered`]. Never waits.
     pub fn take_undelivered(&mut self) -> Option<Undelivered> {
         self.endpoint.take_undelivered()
     }

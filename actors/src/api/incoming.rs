@@ -17,7 +17,7 @@ use super::{
     link::{Read, Reader, ring::NAP},
     reactor::Until,
     routes::LinkNumber,
-    undelivered::Undelivered,
+    undelivered::unsent,
 };
 use crate::ring::Taken;
 
@@ -56,7 +56,7 @@ impl Endpoint {
     /// Counts what was lost with direct links.
     pub(super) fn count_unsent(&mut self, now: Time) {
         for (destination, count) in self.direct.take_unsent() {
-            self.refusals.add(Undelivered { destination, why: Rejection::Closed, count, since: now });
+            self.refusals.add(unsent(destination, Rejection::Closed, count, now));
         }
     }
 
@@ -139,7 +139,7 @@ impl Endpoint {
             match self.inbox.sort(message, awaited) {
                 Sorted::Answer(answer) => return Ok(Some(answer)),
                 Sorted::Refusal(refusal) => self.end(refusal.into()),
-                Sorted::Undelivered(undelivered) => self.refusals.hear(&undelivered),
+                Sorted::Undelivered(undelivered) => self.refusals.hear(self.tid, undelivered, Time::now()),
                 Sorted::Message | Sorted::Nothing => {}
             }
         }

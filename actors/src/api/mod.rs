@@ -207,7 +207,6 @@ pub use error::ApiError;
 pub use link::Transport;
 pub use loan::LoanedMessage;
 pub use received::Received;
-pub use undelivered::Undelivered;
 
 use self::{
     link::{Believed, Greeting, Link, LinkOptions},

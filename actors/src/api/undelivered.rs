@@ -1,34 +1,16 @@
-//! Messages that were sent without asking for their outcome, and that nobody has taken: what the node says of them, and this endpoint.
+//! Unconfirmed messages that were not delivered: what the node reports of them, and this endpoint.
 
 use std::time::Duration;
 
-use sinew_runtime::{
-    outcome::{Outcome, Rejection},
-    tid::Tid,
-    time::Time,
-};
+use sinew_runtime::{outcome::Rejection, tid::Tid, time::Time, undelivered::Undelivered};
 
 use super::{Endpoint, incoming::WhenFull};
-use crate::lncl::payload;
+use crate::{lncl::payload, undelivered::reason_of};
 
 /// Destinations and reasons that are told apart at most, until the application looks. Beyond them only the reasons are.
 const ENTRIES_MAX: usize = 64;
 /// Time between two lines in the log about messages that this endpoint has refused.
 const LOG_AGAIN: Duration = Duration::from_secs(10);
-
-/// Messages of one endpoint to one destination that were sent without asking for their outcome, and that nobody has taken.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Undelivered {
-    /// Whom they were for; [`Tid::NONE`]: several that are not told apart any more. This endpoint itself, too: what others
-    /// have sent to it, or to a group of its, and it had no room for while it waited for an answer.
-    pub destination: Tid,
-    /// Why: mostly [`Rejection::QueueFull`], that is more came than the destination takes.
-    pub why: Rejection,
-    /// How many, since the last time that this endpoint said so. Never 0.
-    pub count: u64,
-    /// When the first of these was refused, on this host's monotonic clock.
-    pub since: Time,
-}
 
 /// What the node has said, until the application looks.
 #[derive(Debug, Default)]
@@ -37,27 +19,47 @@ pub(super) struct Refusals {
     /// Messages that this endpoint has refused and that no line in the log tells of yet.
     unlogged: u64,
     logged: Option<Time>,
+    /// The program takes what is reported, so that no line in the log does.
+    is_taken: bool,
+    /// Messages that were reported and that no line in the log shows yet, with the time of the last such line.
+    unshown: u64,
+    shown: Option<Time>,
 }
 
 impl Refusals {
-    /// The node says this.
-    pub(super) fn hear(&mut self, said: &payload::Undelivered) {
-        for entry in &said.entries {
-            // What a later node gives as a reason that this version does not know is a refusal all the same.
-            let why = match Outcome::from_code(entry.why) {
-                Some(Outcome::Rejected(why)) => why,
-                Some(_) | None => Rejection::Unsupported,
+    /// The node of endpoint `own` reports this.
+    pub(super) fn hear(&mut self, own: Tid, said: payload::Undelivered, now: Time) {
+        for entry in said.entries {
+            let undelivered = Undelivered {
+                destination: Tid::from_bits(entry.to),
+                name: entry.name,
+                kind: entry.kind,
+                class: entry.class,
+                why: reason_of(entry.why),
+                count: entry.count,
+                since: Time::from_nanos(entry.since),
+                first_sequence: entry.first,
+                last_sequence: entry.last,
             };
-            let since = Time::from_nanos(entry.since);
-            let destination = Tid::from_bits(entry.to);
-            self.add(Undelivered { destination, why, count: entry.count, since });
+            self.show(own, &undelivered, now);
+            self.add(undelivered);
+        }
+    }
+
+    /// Logs the first report, and then one in a while, as long as the program takes none itself.
+    fn show(&mut self, own: Tid, undelivered: &Undelivered, now: Time) {
+        self.unshown = self.unshown.saturating_add(undelivered.count);
+        if !self.is_taken && self.shown.is_none_or(|shown| now >= shown + LOG_AGAIN) {
+            let messages = std::mem::take(&mut self.unshown);
+            self.shown = Some(now);
+            tracing::warn!(endpoint = %own, messages, "{undelivered}; `take_undelivered` has each of them");
         }
     }
 
     /// This endpoint, `own`, has refused so many, and nobody was told.
     pub(super) fn count_own(&mut self, own: Tid, count: u64, now: Time) {
         if count > 0 {
-            self.add(Undelivered { destination: own, why: Rejection::QueueFull, count, since: now });
+            self.add(unsent(own, Rejection::QueueFull, count, now));
         }
         self.unlogged = self.unlogged.saturating_add(count);
         if self.unlogged > 0 && self.logged.is_none_or(|logged| now >= logged + LOG_AGAIN) {
@@ -73,30 +75,56 @@ impl Refusals {
 
     /// So many more.
     pub(super) fn add(&mut self, undelivered: Undelivered) {
-        let known = self.find(undelivered.destination, undelivered.why);
+        let known = self.find(&undelivered);
         let is_full = self.entries.len() >= ENTRIES_MAX;
-        let destination = if known.is_none() && is_full { Tid::NONE } else { undelivered.destination };
-        match known.or_else(|| self.find(destination, undelivered.why)) {
-            Some(at) => self.entries[at].count = self.entries[at].count.saturating_add(undelivered.count),
-            None => self.entries.push(Undelivered { destination, ..undelivered }),
+        let undelivered = if known.is_none() && is_full {
+            unsent(Tid::NONE, undelivered.why, undelivered.count, undelivered.since)
+        } else {
+            undelivered
+        };
+        match known.or_else(|| self.find(&undelivered)) {
+            Some(at) => {
+                let known = &mut self.entries[at];
+                known.count = known.count.saturating_add(undelivered.count);
+                known.last_sequence = known.last_sequence.max(undelivered.last_sequence);
+            }
+            None => self.entries.push(undelivered),
         }
     }
 
-    fn find(&self, destination: Tid, why: Rejection) -> Option<usize> {
-        self.entries.iter().position(|known| known.destination == destination && known.why == why)
+    fn find(&self, like: &Undelivered) -> Option<usize> {
+        let key = |of: &Undelivered| (of.destination, of.kind, of.why);
+        self.entries.iter().position(|known| key(known) == key(like))
     }
 
     /// The oldest.
     fn take(&mut self) -> Option<Undelivered> {
+        self.is_taken = true;
         (!self.entries.is_empty()).then(|| self.entries.remove(0))
     }
 }
 
+/// Messages of which no more is known than their destination.
+pub(super) const fn unsent(destination: Tid, why: Rejection, count: u64, since: Time) -> Undelivered {
+    Undelivered {
+        destination,
+        name: None,
+        kind: None,
+        class: None,
+        why,
+        count,
+        since,
+        first_sequence: 0,
+        last_sequence: 0,
+    }
+}
+
 impl Endpoint {
-    /// The next thing that the node has said about messages that were sent without asking for their outcome, through the
-    /// node, and that nobody has taken: once for each destination and reason, with how many; `None` if there is nothing new.
-    /// Looks, and does not wait. The first refusal is told at once, those after it every 100 ms together, so that a flood
-    /// of refusals wakes nobody for each. What is not told when the connection ends is not told.
+    /// Returns the next report of unconfirmed messages that were not delivered, here or by another node: one for each destination, type
+    /// and reason, with the number of messages; `None` if there is nothing new. Never waits. The first refusal is reported at once, later
+    /// ones every 100 ms together. A report that has not arrived when the connection ends is lost.
+    ///
+    /// Until the first call of this the endpoint logs a warning of reports itself, at most one every 10 s.
     ///
     /// Values of class Stream that waited for room in a direct link when that ended are counted here too, with their destination, as
     /// [`Closed`](Rejection::Closed). What lay in its ring by then, and was sent without asking for its outcome, is not: nobody knows of it.
@@ -113,7 +141,10 @@ impl Endpoint {
 
 #[cfg(test)]
 mod tests {
-    use sinew_runtime::tid::{AppAddress, NodeAddress};
+    use sinew_runtime::{
+        outcome::Outcome,
+        tid::{AppAddress, NodeAddress},
+    };
 
     use super::*;
 
@@ -123,7 +154,17 @@ mod tests {
 
     fn said(to: Tid, why: u8, count: u64) -> payload::Undelivered {
         payload::Undelivered {
-            entries: vec![payload::UndeliveredEntry { to: to.bits(), why, count, since: count }],
+            entries: vec![payload::UndeliveredEntry {
+                to: to.bits(),
+                why,
+                count,
+                since: count,
+                kind: None,
+                class: None,
+                first: 0,
+                last: 0,
+                name: None,
+            }],
         }
     }
 
@@ -131,15 +172,10 @@ mod tests {
     fn what_is_said_of_one_destination_is_added_up_until_somebody_looks() {
         let mut refusals = Refusals::default();
         let full = Outcome::Rejected(Rejection::QueueFull).code();
-        refusals.hear(&said(tid(1), full, 3));
-        refusals.hear(&said(tid(2), full, 1));
-        refusals.hear(&said(tid(1), full, 4));
-        let expected = Undelivered {
-            destination: tid(1),
-            why: Rejection::QueueFull,
-            count: 7,
-            since: Time::from_nanos(3),
-        };
+        refusals.hear(tid(9), said(tid(1), full, 3), Time::ZERO);
+        refusals.hear(tid(9), said(tid(2), full, 1), Time::ZERO);
+        refusals.hear(tid(9), said(tid(1), full, 4), Time::ZERO);
+        let expected = unsent(tid(1), Rejection::QueueFull, 7, Time::from_nanos(3));
         assert_eq!(refusals.take(), Some(expected), "since the first");
         assert_eq!(refusals.take().map(|undelivered| undelivered.destination), Some(tid(2)));
         assert_eq!(refusals.take(), None);
@@ -156,7 +192,7 @@ mod tests {
         assert_eq!((refusals.unlogged, refusals.logged), (2, Some(at(2))), "the log says it of the first 5");
         refusals.count_own(tid(1), 0, at(12));
         assert_eq!((refusals.unlogged, refusals.logged), (0, Some(at(12))));
-        let expected = Undelivered { destination: tid(1), why: Rejection::QueueFull, count: 7, since: at(2) };
+        let expected = unsent(tid(1), Rejection::QueueFull, 7, at(2));
         assert_eq!((refusals.take(), refusals.take()), (Some(expected), None));
     }
 
@@ -164,7 +200,7 @@ mod tests {
     fn nothing_that_a_node_says_makes_it_longer_than_it_may_be_and_nothing_is_uncounted() {
         let mut refusals = Refusals::default();
         for app in 0..1_000 {
-            refusals.hear(&said(tid(app), (app % 256) as u8, 1));
+            refusals.hear(tid(9), said(tid(app), (app % 256) as u8, 1), Time::ZERO);
         }
         assert!(refusals.entries.len() <= ENTRIES_MAX + 12, "{} entries", refusals.entries.len());
         assert_eq!(

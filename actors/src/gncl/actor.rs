@@ -33,7 +33,7 @@ use super::{
     LinkFact,
     core::{
         Attach, CANCEL, CLASSES, ConnectionId, Core, DATAGRAMS, Decline, GUARD, Input, Introduction, Lane,
-        OUTCOMES, Output, Refusal, Settings, read, write,
+        OUTCOMES, Output, Refusal, Settings, UNDELIVERED, read, write,
     },
     crowd::Crowd,
     datagrams,
@@ -408,7 +408,7 @@ fn settings(stores: &Stores) -> Settings {
     let NodeConfig { name, project, payload_max, gncl, ndl, .. } = stores.config.clone();
     // What is sealed is a connection: a datagram would go as it is.
     let datagrams = (gncl.datagrams && stores.secured.get().is_none()).then_some(DATAGRAMS);
-    let features = [CLASSES, CANCEL, GUARD, OUTCOMES].into_iter().chain(datagrams);
+    let features = [CLASSES, CANCEL, GUARD, OUTCOMES, UNDELIVERED].into_iter().chain(datagrams);
     Settings {
         ours: Introduction {
             project,

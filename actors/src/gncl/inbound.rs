@@ -23,6 +23,7 @@ use crate::{
     outlet::{LinkNumber, OUTCOMES_MAX, line_of, read_outcomes},
     session::Ack,
     stores::Stores,
+    undelivered::Report,
 };
 
 /// Outcomes that are told together at most, but for those of one frame.
@@ -85,6 +86,12 @@ impl Inbound {
         }
         if is_for_the_link(&message, Kind::GNCL_DATAGRAMS) {
             return self.datagrams_announced(now, &message, way);
+        }
+        if is_for_the_link(&message, Kind::GNCL_UNDELIVERED) {
+            // spec: GNCL-20
+            let report: Report = read(&message.payload)?;
+            report.note(&self.stores, self.peer.node, now);
+            return Ok(());
         }
         // Counted first: what panics from here on must not come again.
         let taken = way.arrive(self.link, &message)?;
@@ -212,7 +219,7 @@ impl Inbound {
             Ok(()) => Some(End::HandedOn),
             Err(Refused { message, why: Rejection::QueueFull }) => self.put_in_line(way, line, message),
             Err(refused) => {
-                self.stores.router.refuse(refused);
+                self.stores.router.refuse_arrived(refused);
                 Some(End::Refused)
             }
         }
@@ -228,7 +235,7 @@ impl Inbound {
                 None
             }
             Err(message) => {
-                self.stores.router.refuse(Refused::new(message, Rejection::QueueFull));
+                self.stores.router.refuse_arrived(Refused::new(message, Rejection::QueueFull));
                 Some(End::Refused)
             }
         }

@@ -387,7 +387,8 @@ impl Reader {
                 }
                 (Ok(Some(message)), Mode::Linked(inbound)) if !is_for_the_shell(&message) => {
                     self.reading.heard.at(now);
-                    let is_a_word = message.header.kind == Kind::GNCL_DATAGRAMS;
+                    let is_a_word =
+                        matches!(message.header.kind, Kind::GNCL_DATAGRAMS | Kind::GNCL_UNDELIVERED);
                     if let Err(decline) = inbound.receive(now, message) {
                         return Look::Tell(What::Violated(decline));
                     }

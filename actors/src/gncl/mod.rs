@@ -23,6 +23,7 @@
 //! | GNCL-16 | All addresses that a peer announces are dialled, 20 ms apart; the first that is reached stays, the others are closed. |
 //! | GNCL-17 | Outcomes that wait go several in one frame, to a peer that knows `outcomes`. |
 //! | GNCL-19 | Where long packets do not arrive at a peer, connections to it have segments that do. |
+//! | GNCL-20 | Unconfirmed messages that were refused are reported to their sender's node, to a peer that knows `undelivered`: one frame in 100 ms at most. |
 //! | GNCL-13 | When a connection ends, nothing is lost (`session/`); when the node is, what was sent is `Unknown`, what waited `PeerLost`. |
 //!
 //! | file | what it is |

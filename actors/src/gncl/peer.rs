@@ -28,7 +28,7 @@ use tokio::sync::Notify;
 
 use super::{
     bulk::BulkThread,
-    core::{Attach, Lane},
+    core::{Attach, Lane, write},
     courtesy::Courtesy,
     datagrams::{Alarm, Channel, HandedOn, Position, Sockets},
     notes::Notes,
@@ -47,6 +47,7 @@ use crate::{
     refusals::Refusals,
     stores::{Stores, lock},
     takeover::take_over,
+    undelivered::Report,
 };
 
 /// How often what waits for an application that is full is offered to it, if it does not say itself that it takes more; so late at most
@@ -65,6 +66,8 @@ pub(crate) struct Peer {
     ways: Vec<Way>,
     /// Whether it knows [`CANCEL`](Kind::CANCEL).
     takes_cancels: bool,
+    /// Whether it takes [reports](Kind::GNCL_UNDELIVERED).
+    takes_reports: bool,
     /// When something of it was read last, in nanoseconds of our clock; 0: never.
     sign: AtomicU64,
     /// When it said that it leaves, in nanoseconds of our clock, 0: it has not; what it still sends is taken.
@@ -127,12 +130,13 @@ impl Peer {
         });
         let (buried, expiring) = (stores.gncl.buried.clone(), stores.gncl.expiring.clone());
         let fewer_owed = fewer_owed.clone();
-        let Attach { node, incarnation, takes_cancels, .. } = *attach;
+        let Attach { node, incarnation, takes_cancels, takes_reports, .. } = *attach;
         Self {
             node,
             incarnation,
             ways,
             takes_cancels,
+            takes_reports,
             channel,
             sign: AtomicU64::new(0),
             has_left: AtomicU64::new(0),
@@ -214,6 +218,14 @@ impl Peer {
     /// Something waits here again that had gone out.
     pub(super) fn holds_what_may_expire(&self) {
         self.expiring.want();
+    }
+
+    /// Reports messages of its applications that were refused here. Without a connection it is told nothing. spec: GNCL-20
+    pub(crate) fn report_undelivered(&self, here: NodeAddress, report: &Report) {
+        if self.takes_reports {
+            let report = frame(here, self.node, Kind::GNCL_UNDELIVERED, write(report));
+            self.way_of(Class::Control).say(report);
+        }
     }
 
     /// Cuts every connection.

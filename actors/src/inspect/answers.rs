@@ -8,7 +8,7 @@ use std::{
 };
 
 use sinew_runtime::{
-    outcome::Rejection,
+    outcome::{Outcome, Rejection},
     router::tap::Way,
     supervision::Strategy,
     tid::{NodeAddress, Tid},
@@ -20,8 +20,8 @@ use super::reports::{
     APPS_MAX, AppReport, AppsReport, AuditReport, BarrierReport, CertificateReport, DialReport,
     ForeignReport, IdleReport, KindReport, LinkReport, LostReport, MISSING_MAX, Missing, NodeReport,
     PEERS_MAX, PeerReport, RefusalReport, RouteReport, SecurityReport, SeenMessage, SourceReport,
-    StallReport, StreamReport, TOLD_MAX, TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport,
-    WatchReport,
+    StallReport, StreamReport, TOLD_MAX, TREE_MAX, TreeLine, TreeReport, TroubleReport, UnhandledReport,
+    WaitReport, WatchReport,
 };
 use super::watches::{Fetched, Sight};
 use crate::{
@@ -33,6 +33,7 @@ use crate::{
     security::UnixTime,
     stores::{Stores, lock},
     sync::{Absence, BarrierKind, BarrierStatus, OwnApp},
+    undelivered,
 };
 
 /// Time for the root's answer: one that hangs does not keep the other questions waiting for long.
@@ -102,6 +103,7 @@ impl Answers {
             foreign_left_out: 0,
             refusals,
             refusals_left_out,
+            unhandled: unhandled(stores, now),
             peers,
             left_out,
         })
@@ -279,6 +281,30 @@ fn refusals(stores: &Stores, now: Time) -> (Vec<RefusalReport>, u64) {
         ago_us: micros(now.since(told.at)),
     });
     (reports.collect(), left_out)
+}
+
+/// Types that applications of this node did not handle or could not read.
+fn unhandled(stores: &Stores, now: Time) -> Vec<UnhandledReport> {
+    let latest = stores.undelivered.unhandled();
+    let reports = latest.into_iter().take(TOLD_MAX).map(|((app, kind, why), line)| {
+        let is_malformed = why == Outcome::Rejected(Rejection::Malformed).code();
+        let remedy = if is_malformed {
+            "use the same type at both ends".to_owned()
+        } else {
+            undelivered::remedy(app, kind)
+        };
+        UnhandledReport {
+            receiver: Tid::new(stores.node, app),
+            sender: line.about,
+            kind,
+            kind_name: undelivered::kind_name(stores, kind),
+            is_malformed,
+            count: line.count,
+            ago_us: micros(now.since(line.last)),
+            remedy,
+        }
+    });
+    reports.collect()
 }
 
 /// Those that answer, and those that GNCL still has something for.

@@ -32,7 +32,7 @@ pub use reports::{
     DialReport, ForeignReport, IdleReport, KindReport, LinkReport, LostReport, Missing, NodeReport,
     PEERS_MAX, PeerReport, Ping, REACHED_MAX, ReachReport, Reached, RefusalReport, ReloadReport, RouteReport,
     SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage, SourceReport, StallReport, StreamReport, TREE_MAX,
-    TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
+    TreeLine, TreeReport, TroubleReport, UnhandledReport, WaitReport, WatchReport,
 };
 
 #[cfg(doc)]

@@ -175,6 +175,9 @@ payload!("sinew.inspect.node_report" =>
         /// Further causes that had no room.
         #[serde(default)]
         pub refusals_left_out: u64,
+        /// Types that its applications did not handle or could not read, the latest first.
+        #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
+        pub unhandled: Vec<UnhandledReport>,
         /// The nodes that it knows, in the order of their addresses.
         #[serde(deserialize_with = "at_most::<_, _, PEERS_MAX>")]
         pub peers: Vec<PeerReport>,
@@ -194,6 +197,30 @@ pub struct RefusalReport {
     pub detail: String,
     /// Time since then.
     pub ago_us: u64,
+}
+
+/// Messages of one type that an application did not handle, or could not read.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct UnhandledReport {
+    /// The application.
+    pub receiver: Tid,
+    /// Sender of the latest of them.
+    pub sender: Tid,
+    /// Their type.
+    pub kind: Kind,
+    /// Its name, where the node knows it.
+    #[serde(default)]
+    pub kind_name: Option<String>,
+    /// Whether it cannot read them; else it does not handle the type.
+    #[serde(default)]
+    pub is_malformed: bool,
+    /// Number of messages.
+    pub count: u64,
+    /// Time since the latest.
+    pub ago_us: u64,
+    /// What mends it.
+    #[serde(default)]
+    pub remedy: String,
 }
 
 payload!("sinew.inspect.apps_report" =>
@@ -443,12 +470,13 @@ impl Report for NodeReport {
     /// The list that takes most bytes is halved, so that none is lost to the others. spec: INSPECT-3
     fn halve(&mut self) -> bool {
         // `troubled` and `idle_clients` count those of these two lists already.
-        let [mut troubles_left_out, mut idle_left_out] = [0_u64; 2];
-        let mut lists: [&mut dyn Shortened; 6] = [
+        let [mut troubles_left_out, mut idle_left_out, mut unhandled_left_out] = [0_u64; 3];
+        let mut lists: [&mut dyn Shortened; 7] = [
             &mut (&mut self.peers, &mut self.left_out),
             &mut (&mut self.lost, &mut self.lost_left_out),
             &mut (&mut self.foreign, &mut self.foreign_left_out),
             &mut (&mut self.refusals, &mut self.refusals_left_out),
+            &mut (&mut self.unhandled, &mut unhandled_left_out),
             &mut (&mut self.troubles, &mut troubles_left_out),
             &mut (&mut self.idle, &mut idle_left_out),
         ];

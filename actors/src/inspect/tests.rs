@@ -405,6 +405,7 @@ fn with_long_lists(said: NodeReport) -> NodeReport {
         lost: (0..64).map(lost).collect(),
         foreign: (0..16).map(foreign).collect(),
         refusals: (0..64).map(refusal).collect(),
+        unhandled: Vec::new(),
         peers: (0..4).map(|number| PeerReport::lost(NodeAddress::new(number), incarnation)).collect(),
         troubled: 7,
         troubles: vec![trouble; 4],

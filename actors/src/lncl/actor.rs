@@ -16,9 +16,9 @@ use super::{
     registrar,
     server::{Server, accept},
 };
-use crate::stores::Stores;
+use crate::{stores::Stores, undelivered};
 
-/// Time between two looks at messages that wait for clients that do not read, and at what clients are still to be told.
+/// Time between two looks at messages that wait for clients that do not read, and at refusals that are to be reported.
 const TICK: Duration = Duration::from_millis(100);
 
 /// The LNCL of a node: a new one after each fault, on the same registry. Connections end with it.
@@ -76,6 +76,7 @@ impl StreamHandler<Event> for Lncl {
     fn handle(&mut self, event: Event, _: &mut Self::Context) {
         match event {
             Event::Released { app } => self.server.release(app),
+            Event::Undelivered => undelivered::report(&self.server.stores, Time::now()),
         }
     }
 }

@@ -4,7 +4,6 @@ mod barrier;
 mod end;
 pub(super) mod life;
 mod memberships;
-mod notices;
 mod orders;
 mod outcomes;
 
@@ -21,8 +20,6 @@ use sinew_runtime::{
 };
 use sinew_shm::Capacity;
 use tokio::net::{UnixStream, unix::UCred};
-
-pub(super) use self::notices::Notices;
 
 use self::{
     end::{End, LAST_WORDS},
@@ -154,7 +151,6 @@ struct Client {
     peer: Peer,
     outlet: Arc<ClientOutlet>,
     outcomes: Arc<Outcomes>,
-    notices: Rc<Notices>,
     /// What it has asked about its groups.
     orders: Orders,
     /// Set while messages flow.
@@ -206,8 +202,7 @@ impl Client {
         let name = lock(&server.stores.registry).name_of(app);
         let outlet = Arc::new(StreamOutlet::sharing(limits(&server.stores), server.budget_of(peer.pid)));
         let outcomes = Outcomes::new(outlet.clone(), server.stores.config.mailbox_capacity);
-        let notices = Rc::new(Notices::new(tid, outlet.clone(), server.stores.config.payload_max));
-        server.add_client(peer.id, outlet.clone(), notices.clone());
+        server.add_client(peer.id, outlet.clone());
         server.stores.book.add_client(peer.id, app, &name, outlet.clone());
         if let Some(suppressed) = server.stores.log_quotas.clients.take(&name, Time::now()) {
             let suppressed = (suppressed > 0).then_some(suppressed);
@@ -222,7 +217,6 @@ impl Client {
             peer,
             outlet,
             outcomes,
-            notices,
             orders: Orders::default(),
             link,
             tid,

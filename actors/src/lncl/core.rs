@@ -326,6 +326,11 @@ impl Registry {
         name.unwrap_or_else(|| app.to_string())
     }
 
+    /// The name of `app`, if it has one.
+    pub(crate) fn own_name_of(&self, app: AppAddress) -> Option<String> {
+        self.apps.get(&app).and_then(|entry| entry.name.clone())
+    }
+
     /// How many applications there are.
     #[cfg(test)]
     pub(crate) fn len(&self) -> usize {

@@ -18,7 +18,7 @@
 //! | LNCL-8 | Two names of payload types with one id are refused where both are told at registration. What another user's application tells bars none of the robot's own. |
 //! | LNCL-9 | A client that can, and says so, gets a ring in shared memory for each direction; the socket then carries descriptors and last words only, and tells either side's end. |
 //! | LNCL-13 | Connections that have not said who they are have bounds of their own, for all, for one process, and for users whom only the access list lets in; each of these connects at a pace, and what these send is read at one. |
-//! | LNCL-14 | What nobody has taken of a client's unconfirmed messages the client is told, with its number and once: the first at once, later ones together. |
+//! | LNCL-14 | Unconfirmed messages of a client's that were refused are reported to it: the first at once, later ones together. |
 //! | LNCL-15 | A connection ends with the process that connected, also while a child that it forked holds the socket open. |
 //! | LNCL-16 | Each confirmed message of a client's has an outcome, also where its queue is full. Who takes none is not read. |
 //! | LNCL-17 | Who has a direct link with a process that has ended is told so, also while a child of that process holds the link's end. |
@@ -48,7 +48,6 @@ mod strangers;
 pub(crate) mod testing;
 #[cfg(test)]
 mod tests;
-mod undelivered;
 mod untold;
 mod worker;
 
@@ -65,7 +64,6 @@ pub(crate) use registrar::{
 #[cfg(test)]
 pub(crate) use shares::OF_USER_AT_SYNC;
 pub(crate) use shares::Shares;
-pub(crate) use undelivered::is_fault;
 pub(crate) use untold::Untold;
 
 use sinew_runtime::tid::AppAddress;
@@ -75,4 +73,6 @@ use sinew_runtime::tid::AppAddress;
 pub(crate) enum Event {
     /// By the root: all that this application of another process requires is ready.
     Released { app: AppAddress },
+    /// By any thread: refused messages are to be reported to their senders.
+    Undelivered,
 }

@@ -4,7 +4,7 @@ use bytes::Bytes;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use sinew_runtime::{
     tid::{AppAddress, NodeAddress, Tid},
-    wire::{Header, Kind, Message, decode},
+    wire::{Class, Header, Kind, Message, decode},
 };
 
 /// Longest payload of a connection's first frame, in bytes: enough for the longest lists that are allowed.
@@ -164,6 +164,26 @@ pub(crate) struct UndeliveredEntry {
     pub(crate) count: u64,
     /// When the first of them was refused: nanoseconds of the system's monotonic clock.
     pub(crate) since: u64,
+    /// Type of the payload; none: several, or not known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) kind: Option<Kind>,
+    /// Class of the first of them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) class: Option<Class>,
+    /// Lowest sequence of them; 0: not known.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub(crate) first: u64,
+    /// Highest sequence of them; 0: not known.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub(crate) last: u64,
+    /// Name of the destination.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) name: Option<String>,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it with a reference")]
+const fn is_zero(number: &u64) -> bool {
+    *number == 0
 }
 
 /// The TID of the LNCL of `node`.

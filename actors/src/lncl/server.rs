@@ -22,7 +22,7 @@ use tokio::{
 };
 
 use super::{
-    client::{self, ClientOutlet, Notices},
+    client::{self, ClientOutlet},
     core::{ClientId, User},
     guest_pace::{GuestPace, Sent},
     guests::{Guests, Row},
@@ -35,6 +35,7 @@ use crate::{
     access::Applicant,
     refusals::Refusals,
     stores::{Stores, lock},
+    undelivered,
 };
 
 /// First and longest wait after `accept` failed: usually the process has no descriptor left, and needs time to get one.
@@ -64,13 +65,7 @@ pub(super) struct Server {
     /// Who waits at the barrier.
     releases: RefCell<BTreeMap<AppAddress, oneshot::Sender<()>>>,
     /// The connections, for what is to be done now and then.
-    clients: RefCell<BTreeMap<ClientId, Served>>,
-}
-
-/// One connection that is served.
-struct Served {
-    outlet: Arc<ClientOutlet>,
-    notices: Rc<Notices>,
+    clients: RefCell<BTreeMap<ClientId, Arc<ClientOutlet>>>,
 }
 
 impl Server {
@@ -166,24 +161,24 @@ impl Server {
         }
     }
 
-    pub(super) fn add_client(&self, id: ClientId, outlet: Arc<ClientOutlet>, notices: Rc<Notices>) {
+    pub(super) fn add_client(&self, id: ClientId, outlet: Arc<ClientOutlet>) {
         self.stores.door.add_outlet(id, &outlet);
-        self.clients.borrow_mut().insert(id, Served { outlet, notices });
+        self.clients.borrow_mut().insert(id, outlet);
     }
 
     pub(super) fn remove_client(&self, id: ClientId) {
         self.clients.borrow_mut().remove(&id);
     }
 
-    /// Settles messages that expired while their client did not read, gives up introductions that nobody answers, and tells clients
-    /// what nobody has taken of theirs.
+    /// Settles messages that expired while their client did not read, gives up introductions that nobody answers, and reports
+    /// refused messages to their senders.
     pub(super) fn tick(&self, now: Time) {
         self.introductions.give_up(now);
         self.stores.log_quotas.tick(now);
-        for Served { outlet, notices } in self.clients.borrow().values() {
+        for outlet in self.clients.borrow().values() {
             outlet.expire(now);
-            notices.tell(now);
         }
+        undelivered::report(&self.stores, now);
     }
 }
 

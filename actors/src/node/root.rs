@@ -381,6 +381,7 @@ impl Root {
         let directory = Arc::new(NodeDirectory(self.stores.clone()));
         let sender = Sender::new(tid, self.stores.router.clone(), directory, pending, config.payload_max);
         let id = self.child_ids.next();
+        mailbox.report_refusals(tid, self.stores.undelivered.clone());
         self.stores.book.add_mailbox(tid.app, app.name(), &mailbox);
         self.apps.add(id, app, tid, mailbox.clone());
         let wiring = AppWiring { sender, mailbox };

@@ -17,7 +17,7 @@ use sinew_runtime::{
     supervision::{self, Life, ReadyGate, Reason},
     tid::Tid,
     time::Time,
-    wire::{Flags, FrameError, Kind, Message},
+    wire::{Flags, FrameError, Header, Kind, Message},
 };
 use tokio::{
     net::UnixStream,
@@ -40,6 +40,7 @@ use crate::{
     },
     outlet::LinkNumber,
     stores::Stores,
+    undelivered::{Entry, is_fault},
 };
 
 /// Time that a process has to end once it has said that it does, or was killed.
@@ -399,13 +400,15 @@ impl Child {
             let correlation = message.header.correlation;
             message.receipt = Some(link.receipt(Ticket { source: *tid, destination, correlation }));
         }
+        let header = Header { source: *tid, destination, ..message.header };
         if let Err(why) = stores.router.send(message)
             && !is_confirmed
-            && lncl::is_fault(destination, why)
+            && is_fault(destination, why)
         {
             // The source of a confirmed message knows.
-            let detail = format!("from {tid} to {destination}: {why}");
-            stores.refusals.count(Time::now(), "unconfirmed message not taken", &detail);
+            let (detail, now) = (format!("from {tid} to {destination}: {why}"), Time::now());
+            stores.refusals.count(now, "unconfirmed message not taken", &detail);
+            stores.undelivered.count(now, Entry::of(&header, why, 1, now));
         }
     }
 

@@ -282,10 +282,18 @@ impl Link {
         };
         // Told without the lock, because whoever is told may send to this very TID.
         if let Some((mut message, Fate::Ended(outcome))) = ended {
+            self.report(&message, outcome);
             message.settle(outcome);
         }
         self.pump();
         Ok(())
+    }
+
+    /// The child refused a message: its sender is told, if it did not ask.
+    fn report(&self, message: &Message, outcome: Outcome) {
+        if let (Outcome::Rejected(why), Some(sender)) = (outcome, self.sender.get()) {
+            sender.refused(&message.header, why);
+        }
     }
 
     /// Says something to this child, and to none after it, ahead of all messages: its supervisor's thread may have hung, and come back when

@@ -509,8 +509,7 @@ public:
         return came;
     }
 
-    /// What the node has said about messages that were sent without asking for their outcome, and that nobody has taken:
-    /// the next of them; nothing if there is nothing new.
+    /// Returns the next report of unconfirmed messages that were not delivered; nothing if there is nothing new.
     [[nodiscard]] std::optional<sinew_undelivered> take_undelivered()
     {
         sinew_undelivered next;

@@ -317,13 +317,12 @@ impl Endpoint {
     /// # Errors
     /// What it says.
     pub fn next_undelivered(&mut self) -> Result<Option<Undelivered>, Told> {
-        let nothing = Undelivered { destination: 0, count: 0, since_ns: 0, outcome: 0, reserved: 0 };
-        let mut undelivered = MaybeUninit::new(nothing);
+        let mut undelivered = MaybeUninit::<Undelivered>::zeroed();
         let status = sinew_next_undelivered(self.pointer(), Some(&mut undelivered));
         if status == Status::SinewNothing {
             return Ok(None);
         }
-        // SAFETY: it was made with a value.
+        // SAFETY: all zeros are a value of it.
         done(status).map(|()| Some(unsafe { undelivered.assume_init() }))
     }
 

@@ -1,6 +1,6 @@
 //! Messages as C sees them: where the bytes are, and a number by which the library knows them again.
 
-use std::time::Duration;
+use std::{ffi::c_char, time::Duration};
 
 use sinew::{Class, Tid};
 
@@ -79,20 +79,28 @@ pub struct Received {
     pub reserved: [u8; 2],
 }
 
-/// Messages to one destination that were sent without asking for their outcome, and that nobody has taken.
+/// Unconfirmed messages to one destination, of one type, that were not delivered for one reason.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct Undelivered {
-    /// Whom they were for; 0: several that are not told apart any more.
+    /// Destination; 0: several that are not told apart any more.
     pub destination: TidBits,
-    /// How many, since the last time that this endpoint said so. Never 0.
+    /// Number of messages since the last report. Never 0.
     pub count: u64,
     /// When the first of these was refused, on the clock of `sinew_now_ns`.
     pub since_ns: u64,
-    /// Why: one of `sinew_outcome`, mostly `SINEW_REJECTED_QUEUE_FULL`, that is more came than the destination takes.
+    /// Lowest sequence of these messages; 0 where it is not known.
+    pub first_sequence: u64,
+    /// Highest sequence of these messages; 0 where it is not known.
+    pub last_sequence: u64,
+    /// Reason: one of `sinew_outcome`. `SINEW_REJECTED_UNKNOWN_KIND`: the destination does not handle this type.
     pub outcome: i32,
-    /// Zero.
-    pub reserved: u32,
+    /// Type of the payload; 0: several, or not known.
+    pub kind: KindBits,
+    /// One of `sinew_message_class`, of the first message; -1 where it is not known.
+    pub message_class: i32,
+    /// Name of the destination, of at most 63 bytes, with a zero behind it; empty where it is not known.
+    pub name: [c_char; 64],
 }
 
 impl Message {
@@ -146,10 +154,23 @@ impl Undelivered {
             destination: undelivered.destination.bits(),
             count: undelivered.count,
             since_ns: undelivered.since.as_nanos(),
+            first_sequence: undelivered.first_sequence,
+            last_sequence: undelivered.last_sequence,
             outcome: outcome_code(sinew::Outcome::Rejected(undelivered.why)) as i32,
-            reserved: 0,
+            kind: undelivered.kind.map_or(0, sinew::Kind::bits),
+            message_class: undelivered.class.map_or(-1, |class| i32::from(code_of(class))),
+            name: name_in_c(undelivered.name.as_deref().unwrap_or_default()),
         }
     }
+}
+
+/// A name with a zero behind it; what has no room is cut off.
+fn name_in_c(name: &str) -> [c_char; 64] {
+    let mut bytes = [0; 64];
+    for (place, byte) in bytes.iter_mut().zip(name.bytes()).take(63) {
+        *place = c_char::from_ne_bytes([byte]);
+    }
+    bytes
 }
 
 /// The class with this number.

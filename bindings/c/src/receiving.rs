@@ -32,9 +32,9 @@ pub extern "C" fn sinew_receive_message(
     })
 }
 
-/// The next thing that the node has said about messages that were sent without asking for their outcome, and that nobody has
-/// taken: once for each destination and reason, with how many; `SINEW_NOTHING` if there is nothing new. Does not block. The
-/// first refusal is told at once, those after it every 100 ms together. `*undelivered` is set if this returns `SINEW_OK`. What
+/// Gives the next report of unconfirmed messages that were not delivered, by this node or another: one for each destination, type and
+/// reason, with the number of messages; `SINEW_NOTHING` if there is nothing new. Does not block. The first refusal is reported at once,
+/// later ones every 100 ms together. `*undelivered` is set if this returns `SINEW_OK`. What
 /// this endpoint itself has refused, since it came while an answer was waited for and was more than is kept then (16,384 messages
 /// of each class, 4 MiB and one message), is counted with its own TID as the destination. The endpoint's thread.
 #[unsafe(no_mangle)]

@@ -7,6 +7,7 @@ mod keys;
 mod many;
 mod places;
 mod stream;
+mod types;
 mod unnamed;
 
 use std::collections::BTreeSet;
@@ -73,6 +74,9 @@ pub(super) fn judge(facts: &Facts) -> Vec<Step> {
     let [there, back] = facts.pings.each_ref().map(Option::as_ref);
     for (end, ping) in [(a, back), (b, there)] {
         steps.application(end, ping, facts);
+    }
+    for (from, to) in [(a, b), (b, a)] {
+        steps.handled(from, to);
     }
     steps.access(a, b, facts);
     steps.by_groups(a, b, facts);

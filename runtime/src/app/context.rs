@@ -17,7 +17,7 @@ use crate::{
     supervision::{ReadyGate, vitals::Vitals},
     tid::Tid,
     time::Time,
-    wire::{Kind, Payload},
+    wire::{Header, Kind, Payload},
 };
 
 /// The context of an application's actor: actix's, and what Sinew adds to it.
@@ -299,6 +299,11 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         let others =
             self.guards.iter().filter(|held| held.kind != kind && held.guard.data_id().source == source);
         others.map(|held| (held.kind, held.guard.last_echo().as_nanos())).collect()
+    }
+
+    /// An unconfirmed message was refused.
+    pub(super) fn refused(&self, header: &Header, why: Rejection) {
+        self.sender.refused(header, why);
     }
 
     /// The sender's side hears an echo.

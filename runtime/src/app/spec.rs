@@ -14,7 +14,7 @@ use crate::{
     sender::Sender,
     supervision::{Launch, Place, Policy, Restart, life, vitals::Vitals},
     tid::AppAddress,
-    wire::{Kind, Payload},
+    wire::{Kind, Payload, remember},
 };
 
 /// Declares an application: how to make its actor, its name, what it handles, what it requires, where it runs.
@@ -93,6 +93,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     where
         A: Handler<Delivery<P>, Result = ()>,
     {
+        remember::<P>();
         self.handlers.push((P::KIND, dispatch_typed::<A, P>));
         self.common.kinds.push((P::KIND, P::NAME));
         self

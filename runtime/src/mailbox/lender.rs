@@ -116,7 +116,7 @@ impl Lender {
         };
         // Told outside the lock, so that nobody who is told runs into it.
         for (message, why) in refused {
-            message.reject(why);
+            self.mailbox.reject(message, why);
         }
         waker.into_iter().for_each(Waker::wake);
     }

@@ -19,7 +19,7 @@ mod tests;
 
 use std::{
     collections::VecDeque,
-    sync::{Arc, Mutex, TryLockError},
+    sync::{Arc, Mutex, OnceLock, TryLockError},
     task::Waker,
 };
 
@@ -35,7 +35,9 @@ use crate::{
     outcome::{Outcome, Rejection, Ticket},
     post::lock,
     router::{Outlet, Refused},
+    tid::Tid,
     time::Time,
+    undelivered::{RefusalSink, is_reported},
     wakes,
     wire::{Class, Header, Message},
 };
@@ -46,6 +48,8 @@ pub struct Mailbox {
     shared: Mutex<Shared>,
     /// Where its messages wait, if not here.
     source: Option<Arc<dyn Source>>,
+    /// Who reports refusals of what had been taken, and whose mailbox this is.
+    refusals: OnceLock<(Tid, Arc<dyn RefusalSink>)>,
 }
 
 #[derive(Debug)]
@@ -206,7 +210,23 @@ impl Mailbox {
             tallies: [Tally::default(); 3],
             high_water: 0,
         };
-        Self { shared: Mutex::new(shared), source }
+        Self { shared: Mutex::new(shared), source, refusals: OnceLock::new() }
+    }
+
+    /// Has refusals of unconfirmed messages that had been taken here told to `sink`, as by `owner`. Set once.
+    pub fn report_refusals(&self, owner: Tid, sink: Arc<dyn RefusalSink>) {
+        // Whoever sets a second one keeps it for itself.
+        let _ = self.refusals.set((owner, sink));
+    }
+
+    /// Refuses a message that had been taken. To be called without a lock.
+    pub(super) fn reject(&self, message: Message, why: Rejection) {
+        if let Some((owner, sink)) = self.refusals.get()
+            && is_reported(&message.header, why)
+        {
+            sink.refused(*owner, &message.header, why, 1);
+        }
+        message.reject(why);
     }
 
     /// Takes over the reading end for a new incarnation; the former reader is fenced off.
@@ -257,7 +277,7 @@ impl Mailbox {
             (waiting, [shared.waker.take(), shared.queue.awaited_no_more()])
         };
         for message in waiting {
-            message.reject(Rejection::Closed);
+            self.reject(message, Rejection::Closed);
         }
         wakers.into_iter().flatten().for_each(Waker::wake);
     }
@@ -270,7 +290,7 @@ impl Mailbox {
             (shared.empty(), shared.queue.awaited_no_more())
         };
         for message in waiting {
-            message.reject(Rejection::Down);
+            self.reject(message, Rejection::Down);
         }
         waker.into_iter().for_each(Waker::wake);
     }

@@ -49,6 +49,8 @@ impl Kind {
     pub const GNCL_OUTCOMES: Self = Self(0x18);
     /// Where its sender reads datagrams.
     pub const GNCL_DATAGRAMS: Self = Self(0x19);
+    /// Unconfirmed messages of the receiver's applications that its sender refused.
+    pub const GNCL_UNDELIVERED: Self = Self(0x1a);
     /// A node asks who is there, or whether a known node lives.
     pub const NDL_QUERY: Self = Self(0x20);
     /// The matched answer.

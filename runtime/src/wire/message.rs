@@ -12,7 +12,7 @@ use crate::{
     outcome::{Outcome, Receipt, Rejection, Ticket},
     protection::Protection,
     tid::Tid,
-    wire::{Class, Flags, Header, Kind, memory, read::decode_payload},
+    wire::{Class, Flags, Header, Kind, memory, read::decode_payload, remember},
 };
 
 /// A type that travels as MessagePack (a map with field names, so that any language can read it).
@@ -107,6 +107,7 @@ impl Message {
 
     /// The same, of bytes that stand for a `P`.
     pub(crate) fn of_type<P: Payload>(source: Tid, destination: Tid, payload: Bytes) -> Self {
+        remember::<P>();
         let mut header = Header::new(P::KIND, source, destination);
         header.class = P::CLASS;
         if let Some(time) = P::TIME_TO_LIVE {

@@ -12,6 +12,7 @@ mod memory;
 mod message;
 mod read;
 mod strict;
+mod type_names;
 
 pub use codec::{Checksum, FrameCodec, FrameError, decode_datagram, encode_frame};
 pub use header::{Class, Flags, HEADER_LEN, Header, HeaderError, MAGIC, TIME_TO_LIVE_MAX, VERSION};
@@ -19,3 +20,4 @@ pub use kind::{Kind, fnv1a};
 pub(crate) use message::decode_as;
 pub use message::{DecodeError, Message, MessageBuffer, Payload, encode};
 pub use read::decode;
+pub(crate) use type_names::remember;

@@ -160,6 +160,14 @@ impl Handler<Delivery<RequirementEvent>> for Drive {
     }
 }
 
+impl Handler<Delivery<Undelivered>> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, undelivered: Delivery<Undelivered>, _: &mut Self::Context) {
+        say(&format!("undelivered: {}", undelivered.payload));
+    }
+}
+
 impl Handler<Delivery<Order>> for Drive {
     type Result = ();
 
@@ -183,6 +191,10 @@ impl Handler<Delivery<Order>> for Drive {
             Order::Join(group) => context.join(&group),
             Order::Leave(group) => context.leave(&group),
             Order::Send(to, number) => send(context, &to, number),
+            Order::SendTo(tid) => {
+                let sent = context.send(Tid::from_bits(tid), &Count { number: 1 });
+                say(&format!("sent: {sent:?}"));
+            }
             Order::Ask(whom) => ask(context, &whom),
             Order::Echo(ref to, _) => {
                 if let Err(error) = context.send(&**to, &order.payload) {
@@ -396,6 +408,7 @@ fn main() -> ExitCode {
         .handles::<Order>()
         .handles::<NodeEvent>()
         .handles::<RequirementEvent>()
+        .handles::<Undelivered>()
         .requires(after("--requires"));
     if swells.is_some() || starts_in.is_some() {
         drive = drive.start_within(time("--starts-within").unwrap_or(Duration::from_secs(1)));

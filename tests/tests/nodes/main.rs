@@ -14,3 +14,4 @@ mod root;
 mod slow;
 mod start_up;
 mod trees;
+mod undelivered;

@@ -7,3 +7,4 @@ mod placement;
 mod scenario;
 mod stalls;
 mod trees;
+mod undelivered;

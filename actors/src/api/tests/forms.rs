@@ -14,6 +14,7 @@ use sinew_runtime::{
     outcome::Outcome,
     tid::Tid,
     time::Time,
+    undelivered::Undelivered,
     wire::{DecodeError, Kind, Payload},
 };
 use tokio::runtime::{Builder, Runtime};
@@ -21,7 +22,7 @@ use tokio::runtime::{Builder, Runtime};
 use crate::{
     api::{
         ApiError, AsyncEndpoint, Endpoint, LoanedMessage, NodeApi, Received, Registration, Transport,
-        Undelivered, link::Believed,
+        link::Believed,
     },
     lncl::testing::TestNode,
 };

@@ -14,7 +14,7 @@ use sinew_runtime::{
 
 use super::{
     Attach, CANCEL, Connection, ConnectionId, Core, DATAGRAMS, Decline, GUARD, Introduction, Lane, LinkFact,
-    OUTCOMES, Output, Refusal, Stage,
+    OUTCOMES, Output, Refusal, Stage, UNDELIVERED,
     acquaintance::{Acquaintance, Link, Pulse},
     dials::Dial,
     handshake::{check, printable},
@@ -327,6 +327,7 @@ impl Core {
             by_class,
             takes_cancels: theirs.knows(CANCEL),
             takes_outcomes: theirs.knows(OUTCOMES),
+            takes_reports: theirs.knows(UNDELIVERED),
             takes_datagrams: by_class && theirs.knows(DATAGRAMS) && self.settings.ours.knows(DATAGRAMS),
             is_guarded: theirs.knows(GUARD) && self.settings.ours.knows(GUARD),
             payload_max: theirs.payload_max,

@@ -33,6 +33,9 @@ pub(crate) const OUTCOMES: &str = "outcomes";
 /// The ability to have values of class Stream by datagram.
 pub(crate) const DATAGRAMS: &str = "datagrams-2";
 
+/// The ability to take reports of messages that were not delivered.
+pub(crate) const UNDELIVERED: &str = "undelivered";
+
 /// Whose messages a connection carries: those of one class, where both nodes know [`CLASSES`]. Where one does not, the first
 /// carries all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -77,7 +80,7 @@ pub(crate) struct Introduction {
     #[serde(default = "unsaid", skip_serializing_if = "is_unsaid")]
     pub(crate) answers_max: u64,
     /// Optional abilities of the sender; what both have may be used: [`CLASSES`], [`CANCEL`], [`GUARD`], [`OUTCOMES`],
-    /// [`DATAGRAMS`].
+    /// [`DATAGRAMS`], [`UNDELIVERED`].
     #[serde(default)]
     pub(crate) features: Vec<String>,
     /// What travels on this connection.

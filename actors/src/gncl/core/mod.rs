@@ -37,7 +37,7 @@ use acquaintance::Acquaintance;
 use connections::{Clearing, FoundAt};
 pub(super) use handshake::{
     CANCEL, CLASSES, DATAGRAMS, Decline, GUARD, HANDSHAKE_PAYLOAD_MAX, Introduction, Lane, OUTCOMES, Refusal,
-    read, write,
+    UNDELIVERED, read, write,
 };
 
 /// What the core is set to.
@@ -167,6 +167,8 @@ pub(super) struct Attach {
     pub(super) takes_cancels: bool,
     /// Whether the peer takes several outcomes in one frame.
     pub(super) takes_outcomes: bool,
+    /// Whether the peer takes reports of messages that were not delivered.
+    pub(super) takes_reports: bool,
     /// Whether values of class Stream may go by datagram.
     pub(super) takes_datagrams: bool,
     /// Whether the peer's frames have guards, and ours.

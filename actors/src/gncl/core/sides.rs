@@ -11,7 +11,7 @@ use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
     Attach, CANCEL, Connection, ConnectionId, Core, DATAGRAMS, Decline, GUARD, Introduction, Lane, OUTCOMES,
-    Output, Settings, Stage,
+    Output, Settings, Stage, UNDELIVERED,
     acquaintance::{Link, Pulse},
     handshake::check,
 };
@@ -202,6 +202,7 @@ impl Core {
             by_class: true,
             takes_cancels: theirs.knows(CANCEL),
             takes_outcomes: theirs.knows(OUTCOMES),
+            takes_reports: theirs.knows(UNDELIVERED),
             takes_datagrams: theirs.knows(DATAGRAMS) && self.settings.ours.knows(DATAGRAMS),
             is_guarded: theirs.knows(GUARD) && self.settings.ours.knows(GUARD),
             payload_max: theirs.payload_max,

@@ -198,6 +198,7 @@ impl Store {
             by_class: false,
             takes_cancels: true,
             takes_outcomes: true,
+            takes_reports: true,
             takes_datagrams: false,
             is_guarded: false,
             payload_max: 1 << 20,

@@ -165,12 +165,12 @@ impl Way {
                             hand.empty();
                             return Offered::Full;
                         };
-                        router.refuse(Refused::new(message, Rejection::QueueFull));
+                        router.refuse_arrived(Refused::new(message, Rejection::QueueFull));
                         hand.ends(End::Refused);
                         return Offered::All;
                     }
                     Err(refused) => {
-                        router.refuse(refused);
+                        router.refuse_arrived(refused);
                         hand.ends(End::Refused);
                     }
                 }

@@ -16,12 +16,14 @@ use super::{
         payload::{self, Resolved},
         registrar,
         session::{NoMembership, Order},
-        undelivered,
     },
     Client,
     end::End,
 };
-use crate::stores::lock;
+use crate::{
+    stores::lock,
+    undelivered::{self, Entry},
+};
 
 impl Client {
     /// Carries an order out; the end of the connection, if that is what it asks for.
@@ -57,6 +59,7 @@ impl Client {
             let Some(receipt) = self.outcomes.receipt(ticket) else { return };
             message.receipt = Some(receipt);
         }
+        let header = Header { destination, ..message.header };
         let sent = self.within_share(message).and_then(|message| router.send(message));
         if let Err(why) = sent
             && !is_confirmed
@@ -65,7 +68,7 @@ impl Client {
             // The source of a confirmed message knows.
             let (detail, now) = (format!("from {} to {destination}: {why}", self.tid), Time::now());
             self.server.refusals.count(now, "unconfirmed message not taken", &detail);
-            self.notices.count(destination, why, now);
+            self.server.stores.undelivered.count(now, Entry::of(&header, why, 1, now));
         }
     }
 
@@ -135,7 +138,10 @@ impl Client {
         if flags.has(Flags::CONFIRM) {
             self.tell(destination, correlation, Outcome::Rejected(why));
         } else {
-            self.notices.count(self.server.stores.router.absolute(destination), why, now);
+            // Whatever source it names: this client has sent it.
+            let destination = self.server.stores.router.absolute(destination);
+            let header = Header { source: self.tid, destination, ..message.header };
+            self.server.stores.undelivered.count(now, Entry::of(&header, why, 1, now));
         }
     }
 

@@ -61,6 +61,7 @@ static void undelivered_messages_are_counted(sinew::endpoint &endpoint)
         while (const auto undelivered = endpoint.take_undelivered()) {
             EXPECT((undelivered->destination & 0xffffffff) == 0x7777 && undelivered->since_ns <= sinew_now_ns());
             EXPECT(undelivered->outcome == SINEW_REJECTED_NO_SUCH_APPLICATION);
+            EXPECT(undelivered->kind == what && undelivered->message_class == SINEW_CONTROL);
             count += undelivered->count;
         }
         EXPECT(!endpoint.receive(10ms));

@@ -12,7 +12,7 @@ use sinew::{
     AppAddress, Class, Incarnation, NodeAddress, Tid,
     inspect::{
         AccessReport, AccessVerdict, AppReport, DialReport, ForeignReport, LinkReport, Missing,
-        RefusalReport, StreamReport, TreeLine,
+        RefusalReport, StreamReport, TreeLine, UnhandledReport,
     },
 };
 
@@ -88,6 +88,7 @@ fn report(number: u8, name: &str, other: u8) -> NodeReport {
         foreign: Vec::new(),
         foreign_left_out: 0,
         refusals: Vec::new(),
+        unhandled: Vec::new(),
         refusals_left_out: 0,
         peers: vec![peer(other)],
         left_out: 0,

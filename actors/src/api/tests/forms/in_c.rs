@@ -27,10 +27,11 @@ use sinew_runtime::{
     outcome::Outcome,
     tid::{AppAddress, Tid},
     time::Time,
+    undelivered::Undelivered,
     wire::{Class, Header, Kind, Message, Payload},
 };
 
-use crate::api::{ApiError, Registration, Transport, Undelivered, returning::ReconnectPolicy};
+use crate::api::{ApiError, Registration, Transport, returning::ReconnectPolicy};
 
 const RAW: Kind = Kind::named("test.raw");
 
@@ -320,8 +321,17 @@ impl Client {
                 Some(Outcome::Rejected(why)) => why,
                 other => panic!("{other:?} is no reason"),
             },
+            name: {
+                let bytes = undelivered.name.iter().map(|byte| byte.to_ne_bytes()[0]);
+                let name: Vec<u8> = bytes.take_while(|byte| *byte != 0).collect();
+                (!name.is_empty()).then(|| String::from_utf8(name).expect("names are UTF-8"))
+            },
+            kind: (undelivered.kind != 0).then(|| Kind::from_bits(undelivered.kind)),
+            class: Class::ALL.into_iter().find(|class| *class as i32 == undelivered.message_class),
             count: undelivered.count,
             since: Time::from_nanos(undelivered.since_ns),
+            first_sequence: undelivered.first_sequence,
+            last_sequence: undelivered.last_sequence,
         })
     }
 

@@ -11,6 +11,28 @@ const CASES: &[Case] = &[
         ["ankle is there", "'ankle'", "sinew apps"],
     ),
     Case(|facts| facts.ends[1].report = None, ["knee.drive is there", "cannot be asked", "--other-socket"]),
+    Case(
+        |facts| {
+            facts.ends[0].app = Some(app("hip"));
+            let tid = drive(facts).report.as_ref().expect("it is named").tid;
+            let (sender, receiver) = (tid, tid);
+            knee(facts).unhandled.push(UnhandledReport {
+                receiver,
+                sender,
+                kind: sinew::Kind::named("demo.angle"),
+                kind_name: Some("demo.angle".to_owned()),
+                is_malformed: false,
+                count: 7,
+                ago_us: 1_000,
+                remedy: "add `.handles::<Angle>()`".to_owned(),
+            });
+        },
+        [
+            "knee.drive handles what it is sent",
+            "demo.angle is not handled: 7 messages, the last one 1 ms ago from hip",
+            "handles::<Angle>",
+        ],
+    ),
     Case(|facts| knee(facts).stopping = true, ["knee.drive is there", "about to end", "start it"]),
     Case(
         |facts| facts.ends[1].doubles.push("node shank (process 9)".to_owned()),

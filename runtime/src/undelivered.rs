@@ -1,0 +1,126 @@
+//! Unconfirmed messages that were refused: what their sender is told, and the trait by which a node learns of each refusal.
+//!
+//! A confirmed message has its [`Outcome`](crate::outcome::Outcome). An unconfirmed one has none; a node counts its refusals, puts
+//! them together, and reports them to the sender as [`Undelivered`]. Nothing here runs where no message is refused.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    outcome::Rejection,
+    tid::{AppAddress, Tid},
+    time::Time,
+    wire::{Class, Flags, Header, Kind, Payload},
+};
+
+/// Unconfirmed messages of one sender to one destination that were refused for one reason, since the last report of them.
+///
+/// An application gets it as an event: `AppSpec::handles::<Undelivered>()` and `Handler<Delivery<Undelivered>>`, in the node's process
+/// and in a process of its own alike. An endpoint takes it with `take_undelivered`. The first refusal is reported at once, later ones
+/// every 100 ms together. Where an application does not handle it, its node logs a warning.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Undelivered {
+    /// Destination of the messages; [`Tid::NONE`]: several that are not told apart any more. For an endpoint also its own TID: messages to
+    /// it, or to a group of its, for which it had no room while it waited for an answer.
+    pub destination: Tid,
+    /// Name of the destination, where the node knows one.
+    #[serde(default)]
+    pub name: Option<String>,
+    /// Type of the payload; `None`: several, or not known.
+    #[serde(default)]
+    pub kind: Option<Kind>,
+    /// Class of the first message; `None` where it is not known.
+    #[serde(default)]
+    pub class: Option<Class>,
+    /// Reason.
+    pub why: Rejection,
+    /// Number of messages since the last report. Never 0.
+    pub count: u64,
+    /// When the first of these was refused, on this host's monotonic clock. Of a refusal by another node: when its report arrived.
+    pub since: Time,
+    /// Lowest sequence of these messages; 0 where it is not known.
+    #[serde(default)]
+    pub first_sequence: u64,
+    /// Highest sequence of these messages; 0 where it is not known.
+    #[serde(default)]
+    pub last_sequence: u64,
+}
+
+impl Payload for Undelivered {
+    const NAME: &'static str = "sinew.undelivered";
+    const CLASS: Class = Class::Control;
+}
+
+impl fmt::Display for Undelivered {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} messages", self.count)?;
+        if let Some(kind) = self.kind {
+            match kind.type_name() {
+                Some(name) => write!(f, " of type {name}")?,
+                None => write!(f, " of kind {kind}")?,
+            }
+        }
+        match &self.name {
+            Some(name) => write!(f, " to {name} ({})", self.destination)?,
+            None if self.destination == Tid::NONE => write!(f, " to several destinations")?,
+            None => write!(f, " to {}", self.destination)?,
+        }
+        write!(f, " were not delivered: {}", self.why)
+    }
+}
+
+/// Takes note of unconfirmed messages that were refused after their sender's call had returned. Must not block.
+pub trait RefusalSink: Send + Sync + fmt::Debug {
+    /// `receiver` refused `count` messages with this header.
+    fn refused(&self, receiver: Tid, header: &Header, why: Rejection, count: u64);
+}
+
+/// Whether the refusal of a message with this header is reported to its sender.
+///
+/// Not reported: confirmed messages and requests, which have an outcome; replies; frames and events of layers; a refusal by the handler
+/// itself; that an application does not handle the type of a broadcast, which is for all that do.
+#[must_use]
+pub fn is_reported(header: &Header, why: Rejection) -> bool {
+    let Header { flags, kind, source, destination, .. } = *header;
+    let has_an_end_of_its_own = [Flags::CONFIRM, Flags::ASK, Flags::REPLY, Flags::OUTCOME];
+    let is_broadcast = !destination.is_single() && !destination.app.is_group();
+    !has_an_end_of_its_own.into_iter().any(|flag| flags.has(flag))
+        && kind.is_user()
+        && kind != Kind::PING
+        && !source.app.is_layer()
+        && source.app != AppAddress::NONE
+        && why != Rejection::ByHandler
+        && !(is_broadcast && why == Rejection::UnknownKind)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tid::NodeAddress;
+
+    fn header(flags: Flags, destination: Tid) -> Header {
+        let source = Tid::new(NodeAddress::new(1), AppAddress::fixed(1).unwrap());
+        let mut header = Header::new(Kind::named("demo.angle"), source, destination);
+        header.flags = flags;
+        header
+    }
+
+    #[test]
+    fn refusals_without_an_outcome_of_their_own_are_reported() {
+        let knee = Tid::new(NodeAddress::new(2), AppAddress::fixed(2).unwrap());
+        assert!(is_reported(&header(Flags::NONE, knee), Rejection::UnknownKind));
+        assert!(is_reported(&header(Flags::NONE, Tid::group("legs")), Rejection::UnknownKind));
+        for flags in [Flags::CONFIRM, Flags::ASK, Flags::REPLY, Flags::OUTCOME] {
+            assert!(!is_reported(&header(flags, knee), Rejection::UnknownKind), "{flags:?}");
+        }
+        assert!(!is_reported(&header(Flags::NONE, knee), Rejection::ByHandler));
+    }
+
+    #[test]
+    fn an_unhandled_broadcast_is_no_fault() {
+        let all = Tid::new(NodeAddress::ALL, AppAddress::ALL);
+        assert!(!is_reported(&header(Flags::NONE, all), Rejection::UnknownKind));
+        assert!(is_reported(&header(Flags::NONE, all), Rejection::Malformed));
+    }
+}
