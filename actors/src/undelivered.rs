@@ -24,7 +24,7 @@ use sinew_runtime::{
 
 pub(crate) use self::{
     ledger::Entry,
-    report::{Report, kind_name, reason_of, remedy, report},
+    report::{Report, is_of_an_end, kind_name, reason_of, remedy, report},
 };
 use self::{
     ledger::Ledger,

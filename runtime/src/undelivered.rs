@@ -54,7 +54,8 @@ impl Payload for Undelivered {
 
 impl fmt::Display for Undelivered {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} messages", self.count)?;
+        let (messages, were) = if self.count == 1 { ("message", "was") } else { ("messages", "were") };
+        write!(f, "{} {messages}", self.count)?;
         if let Some(kind) = self.kind {
             match kind.type_name() {
                 Some(name) => write!(f, " of type {name}")?,
@@ -66,7 +67,7 @@ impl fmt::Display for Undelivered {
             None if self.destination == Tid::NONE => write!(f, " to several destinations")?,
             None => write!(f, " to {}", self.destination)?,
         }
-        write!(f, " were not delivered: {}", self.why)
+        write!(f, " {were} not delivered: {}", self.why)
     }
 }
 

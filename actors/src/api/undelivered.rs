@@ -5,7 +5,10 @@ use std::time::Duration;
 use sinew_runtime::{outcome::Rejection, tid::Tid, time::Time, undelivered::Undelivered};
 
 use super::{Endpoint, incoming::WhenFull};
-use crate::{lncl::payload, undelivered::reason_of};
+use crate::{
+    lncl::payload,
+    undelivered::{is_of_an_end, reason_of},
+};
 
 /// Destinations and reasons that are told apart at most, until the application looks. Beyond them only the reasons are.
 const ENTRIES_MAX: usize = 64;
@@ -52,7 +55,11 @@ impl Refusals {
         if !self.is_taken && self.shown.is_none_or(|shown| now >= shown + LOG_AGAIN) {
             let messages = std::mem::take(&mut self.unshown);
             self.shown = Some(now);
-            tracing::warn!(endpoint = %own, messages, "{undelivered}; `take_undelivered` has each of them");
+            if is_of_an_end(undelivered.why) {
+                tracing::info!(endpoint = %own, messages, "{undelivered}");
+            } else {
+                tracing::warn!(endpoint = %own, messages, "{undelivered}; `take_undelivered` has each of them");
+            }
         }
     }
 

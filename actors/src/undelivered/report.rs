@@ -279,14 +279,78 @@ fn warn_sender(stores: &Stores, key: &Warned, line: &Line<Entry>) {
     } else {
         in_words(stores, destination)
     };
-    crate::log::warn!(messages, "{kind} that {sender} sent to {to} was not delivered: {why}");
+    if is_of_an_end(why) {
+        crate::log::info!(messages, "{kind} that {sender} sent to {to} was not delivered: {why}");
+    } else {
+        crate::log::warn!(messages, "{kind} that {sender} sent to {to} was not delivered: {why}");
+    }
+}
+
+/// Whether the reason is that an application has ended or restarts: an ordinary stop has such refusals too, and warns of nothing.
+pub(crate) const fn is_of_an_end(why: Rejection) -> bool {
+    matches!(why, Rejection::Closed | Rejection::Down)
 }
 
 #[cfg(test)]
 mod tests {
-    use sinew_runtime::wire::{Header, encode};
+    use std::sync::Arc;
+
+    use sinew_runtime::{
+        mailbox::Mailbox,
+        tid::Incarnation,
+        wire::{Header, decode, encode},
+    };
 
     use super::*;
+    use crate::{
+        NodeConfig,
+        lncl::{LocalApp, register_local},
+    };
+
+    fn said(from: AppAddress, to: Tid, count: u64) -> Reported {
+        let why = Outcome::Rejected(Rejection::UnknownKind).code();
+        Reported { from, to: to.bits(), why, count, kind: None, class: None, first: 0, last: 0 }
+    }
+
+    // spec: GNCL-19
+    #[test]
+    fn a_peer_reports_its_own_refusals_to_applications_that_are_there_and_no_others() {
+        let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
+        let app = LocalApp {
+            name: Some("hip".to_owned()),
+            address: None,
+            requires: vec![],
+            kinds: vec![],
+            outlet: Mailbox::new(1),
+            events: Arc::new([]),
+        };
+        let hip = register_local(&stores, app).expect("nothing is in the way").app;
+        let [peer, other] = [9, 10].map(NodeAddress::new);
+        let knee = |node| Tid::new(node, AppAddress::new(0x1001));
+        let absent = AppAddress::fixed(7).expect("in the range");
+        let entries = vec![
+            said(hip, knee(peer), 3),
+            said(hip, knee(other), 1),
+            said(hip, knee(stores.node), 1),
+            said(hip, knee(peer), 0),
+            said(absent, knee(peer), 1),
+        ];
+        Report { entries }.note(&stores, peer, Time::ZERO);
+        assert_eq!(stores.gncl.refusals.of("report of another node's messages"), 3);
+        let due = lock(&stores.undelivered.core).take(Time::ZERO, usize::MAX);
+        let [(Reader::App(reader), kept)] = &due[..] else { panic!("{due:?}") };
+        assert_eq!((*reader, kept.len(), kept[0].count), (hip, 1, 3));
+    }
+
+    // spec: GNCL-19
+    #[test]
+    fn a_longer_report_than_there_may_be_is_refused() {
+        let app = AppAddress::new(0x1001);
+        let report = |entries| Report { entries: vec![said(app, Tid::NONE, 1); entries] };
+        for (entries, is_read) in [(REPORTED_MAX, true), (REPORTED_MAX + 1, false)] {
+            assert_eq!(decode::<Report>(&encode(&report(entries))).is_ok(), is_read, "{entries}");
+        }
+    }
 
     #[test]
     fn no_report_is_longer_than_it_is_counted() {

@@ -738,15 +738,15 @@ typedef struct sinew_received {
 } sinew_received;
 
 /**
- * Messages to one destination that were sent without asking for their outcome, and that nobody has taken.
+ * Unconfirmed messages to one destination, of one type, that were not delivered for one reason.
  */
 typedef struct sinew_undelivered {
     /**
-     * Whom they were for; 0: several that are not told apart any more.
+     * Destination; 0: several that are not told apart any more.
      */
     sinew_tid destination;
     /**
-     * How many, since the last time that this endpoint said so. Never 0.
+     * Number of messages since the last report. Never 0.
      */
     uint64_t count;
     /**
@@ -754,13 +754,29 @@ typedef struct sinew_undelivered {
      */
     uint64_t since_ns;
     /**
-     * Why: one of `sinew_outcome`, mostly `SINEW_REJECTED_QUEUE_FULL`, that is more came than the destination takes.
+     * Lowest sequence of these messages; 0 where it is not known.
+     */
+    uint64_t first_sequence;
+    /**
+     * Highest sequence of these messages; 0 where it is not known.
+     */
+    uint64_t last_sequence;
+    /**
+     * Reason: one of `sinew_outcome`. `SINEW_REJECTED_UNKNOWN_KIND`: the destination does not handle this type.
      */
     int32_t outcome;
     /**
-     * Zero.
+     * Type of the payload; 0: several, or not known.
      */
-    uint32_t reserved;
+    sinew_kind kind;
+    /**
+     * One of `sinew_message_class`, of the first message; -1 where it is not known.
+     */
+    int32_t message_class;
+    /**
+     * Name of the destination, of at most 63 bytes, with a zero behind it; empty where it is not known.
+     */
+    char name[64];
 } sinew_undelivered;
 
 /**
@@ -1218,9 +1234,9 @@ sinew_status sinew_receive_message(struct sinew_endpoint *endpoint,
                                    struct sinew_received *received);
 
 /**
- * The next thing that the node has said about messages that were sent without asking for their outcome, and that nobody has
- * taken: once for each destination and reason, with how many; `SINEW_NOTHING` if there is nothing new. Does not block. The
- * first refusal is told at once, those after it every 100 ms together. `*undelivered` is set if this returns `SINEW_OK`. What
+ * Gives the next report of unconfirmed messages that were not delivered, by this node or another: one for each destination, type and
+ * reason, with the number of messages; `SINEW_NOTHING` if there is nothing new. Does not block. The first refusal is reported at once,
+ * later ones every 100 ms together. `*undelivered` is set if this returns `SINEW_OK`. What
  * this endpoint itself has refused, since it came while an answer was waited for and was more than is kept then (16,384 messages
  * of each class, 4 MiB and one message), is counted with its own TID as the destination. The endpoint's thread.
  */

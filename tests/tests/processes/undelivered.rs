@@ -17,7 +17,7 @@ fn an_application_in_a_process_of_its_own_is_told_what_nobody_took() {
     scenario.order(Order::SendTo(nobody.bits()));
     scenario.node.wait_for(&["sent: Ok(())"]);
     scenario.node.wait_for(&[
-        "undelivered: 1 messages of type process.count",
+        "undelivered: 1 message of type process.count",
         &nobody.to_string(),
         "no application has this TID",
     ]);
