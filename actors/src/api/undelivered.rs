@@ -56,9 +56,9 @@ impl Refusals {
             let messages = std::mem::take(&mut self.unshown);
             self.shown = Some(now);
             if is_of_an_end(undelivered.why) {
-                tracing::info!(endpoint = %own, messages, "{undelivered}");
+                crate::log::here!(info: endpoint = %own, messages, "{undelivered}");
             } else {
-                tracing::warn!(endpoint = %own, messages, "{undelivered}; `take_undelivered` has each of them");
+                crate::log::here!(warn: endpoint = %own, messages, "{undelivered}; `take_undelivered` has each of them");
             }
         }
     }

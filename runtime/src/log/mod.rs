@@ -74,6 +74,7 @@ macro_rules! log_apart {
 macro_rules! log_here {
     (error: $($said:tt)*) => { $crate::log_here!(ERROR, $crate::log::tracing::error!($($said)*)) };
     (warn: $($said:tt)*) => { $crate::log_here!(WARN, $crate::log::tracing::warn!($($said)*)) };
+    (info: $($said:tt)*) => { $crate::log_here!(INFO, $crate::log::tracing::info!($($said)*)) };
     (debug: $($said:tt)*) => { $crate::log_here!(DEBUG, $crate::log::tracing::debug!($($said)*)) };
     ($level:ident, $event:expr) => {
         if $crate::log::is_on($crate::log::tracing::Level::$level) {
