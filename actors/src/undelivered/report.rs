@@ -312,7 +312,7 @@ mod tests {
         Reported { from, to: to.bits(), why, count, kind: None, class: None, first: 0, last: 0 }
     }
 
-    // spec: GNCL-19
+    // spec: GNCL-20
     #[test]
     fn a_peer_reports_its_own_refusals_to_applications_that_are_there_and_no_others() {
         let stores = Stores::for_test(NodeConfig::new("test"), Incarnation(1));
@@ -342,7 +342,7 @@ mod tests {
         assert_eq!((*reader, kept.len(), kept[0].count), (hip, 1, 3));
     }
 
-    // spec: GNCL-19
+    // spec: GNCL-20
     #[test]
     fn a_longer_report_than_there_may_be_is_refused() {
         let app = AppAddress::new(0x1001);
