@@ -46,6 +46,7 @@ mod documentation;
 pub mod fuzzing;
 mod gncl;
 pub mod inspect;
+mod last_words;
 #[cfg(all(test, target_os = "linux"))]
 mod lingering;
 mod lncl;

@@ -84,7 +84,7 @@ pub enum NodeEnd {
     GaveUp(String),
 }
 
-/// A running node. Dropping it stops it.
+/// A running node. Dropping it stops it; dropped by a panic, it gives up.
 #[derive(Debug)]
 pub struct Node {
     handle: NodeHandle,
@@ -207,7 +207,12 @@ fn wait_for_ever() -> ! {
 impl Drop for Node {
     fn drop(&mut self) {
         if self.thread.is_some() {
-            self.handle.stop();
+            if std::thread::panicking() {
+                // Peers must not take this for an orderly stop.
+                let _ = self.handle.tell(RootEvent::OwnerPanicked);
+            } else {
+                self.handle.stop();
+            }
             self.wait();
         }
     }

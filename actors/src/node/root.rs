@@ -41,7 +41,8 @@ use super::{
     wind_up::{self, Branch, Heirs},
 };
 use crate::{
-    lncl, process,
+    last_words::LastWords,
+    lncl, ndl, process,
     stores::{Stores, lock},
 };
 
@@ -199,6 +200,10 @@ impl StreamHandler<RootEvent> for Root {
             RootEvent::TellProgress(answer) => _ = answer.send(self.progress()),
             RootEvent::HeedSignals => self.heed_signals(context),
             RootEvent::StopOrdered => self.stop_apps(),
+            RootEvent::OwnerPanicked => {
+                self.gives_up("the thread that owns the node panicked".to_owned());
+                self.stop_apps();
+            }
             #[cfg(feature = "fault-points")]
             RootEvent::Fail => panic!("a fault was planned for the root"),
             #[cfg(feature = "fault-points")]
@@ -246,7 +251,12 @@ impl Root {
 
     fn layers_ended(&mut self, reason: &Reason, context: &mut Context<Self>) {
         if let Reason::GaveUp(why) = reason {
-            self.end = NodeEnd::GaveUp(format!("layers: {why}"));
+            self.gives_up(format!("layers: {why}"));
+            if matches!(self.phase, Phase::StartingLayers | Phase::Running) {
+                // Its own NDL is gone, and the applications have yet to stop.
+                let _ = self.stores.gave_up.set(LastWords::of(why));
+                ndl::say_goodbye(&self.stores);
+            }
         }
         self.layer_supervisor = None;
         if let Some(started) = self.started.take() {
@@ -420,7 +430,7 @@ impl Root {
 
     fn apps_ended(&mut self, reason: &Reason) {
         if let Reason::GaveUp(why) = reason {
-            self.end = NodeEnd::GaveUp(format!("applications: {why}"));
+            self.gives_up(format!("applications: {why}"));
         }
         self.app_supervisor = None;
         self.answer_all_that_wait();
@@ -474,6 +484,10 @@ impl Root {
 
     fn stop_layers(&mut self) {
         self.phase = Phase::StoppingLayers;
+        if let NodeEnd::GaveUp(why) = &self.end {
+            // Before its layers say goodbye. spec: NDL-4.8
+            let _ = self.stores.gave_up.set(LastWords::of(why));
+        }
         self.stores.stopping.store(true, Ordering::Relaxed);
         match &self.layer_supervisor {
             Some(supervisor) => order(supervisor, Input::StopOrdered),

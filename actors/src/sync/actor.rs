@@ -126,10 +126,10 @@ impl SyncManager {
                 self.handle(Input::MembershipChanged(fact), ctx);
             }
             Event::Link(fact) => {
-                if let Some(input) = monitors::Input::of_link(fact) {
+                if let Some(input) = monitors::Input::of_link(&fact) {
                     monitors::feed(&self.stores, input);
                 }
-                if let Some(input) = wills::Input::of_link(fact) {
+                if let Some(input) = wills::Input::of_link(&fact) {
                     wills::feed(&self.stores, input);
                 }
                 self.handle(Input::LinkChanged(fact), ctx);

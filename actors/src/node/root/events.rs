@@ -26,6 +26,8 @@ pub(crate) enum RootEvent {
     HeedSignals,
     /// By the owner or a signal.
     StopOrdered,
+    /// By the node's drop in a thread that panics.
+    OwnerPanicked,
     /// By the owner: add, stop, start again or remove a child.
     Ordered(Ordered),
     /// By the owner: say who is supervised.

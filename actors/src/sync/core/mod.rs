@@ -38,7 +38,6 @@ use sinew_runtime::{
 };
 
 pub(in crate::sync) use self::directory::Named;
-pub(crate) use self::reason::Reason;
 use self::{
     answers::Undelivered,
     apps::{Apps, State},

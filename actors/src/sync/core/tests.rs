@@ -355,7 +355,7 @@ fn the_last_known_reason_is_told_for_each_way_to_be_missing() {
     bench.lost(KNEE, LossReason::LinkDown);
     assert_eq!(reason(&bench), "its node was lost");
     bench.links(KNEE, LIFE);
-    bench.hears(Input::LinkChanged(LinkFact::PeerLeft { node: KNEE, incarnation: LIFE }));
+    bench.hears(Input::LinkChanged(LinkFact::PeerLeft { node: KNEE, incarnation: LIFE, gave_up: None }));
     bench.lost(KNEE, LossReason::LinkDown);
     assert_eq!(reason(&bench), "its node left");
     bench.registers(1, "drive", &[]);
