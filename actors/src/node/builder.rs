@@ -85,7 +85,9 @@ pub enum StartError {
     #[error("{0}")]
     AddressTaken(String),
     /// Applications require each other in a circle: none of them can be the first.
-    #[error("these applications require each other in a circle: {}; take one requirement out", .0.join(" -> "))]
+    ///
+    /// The first one again at the end; of an application of another node with its node's name.
+    #[error("these applications require each other in a circle, so that none of them can start: {}; take one of these requirements out", .0.join(" requires "))]
     Cycle(Vec<String>),
     /// Applications wait for each other, some because their supervisor starts them in order.
     #[error("these applications wait for each other in a circle, by the order of their start and by what they require: {}; change the order, or take a requirement out", .0.join(" -> "))]

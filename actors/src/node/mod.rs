@@ -170,6 +170,7 @@ impl Node {
             wait_for_ever();
         }
         let _ = self.handle.tell(RootEvent::HeedSignals);
+        let _ = self.handle.tell(RootEvent::RunsAlone);
         match self.wait() {
             NodeEnd::Stopped => ExitCode::SUCCESS,
             NodeEnd::GaveUp(why) => {

@@ -61,6 +61,8 @@ pub(super) enum Phase {
 /// Names that require each other in a circle, the first one again at the end.
 struct Cycle {
     names: Vec<String>,
+    /// The same with the names of other nodes.
+    labels: Vec<String>,
     /// Those of them that are applications of this node.
     ours: Vec<ChildId>,
 }
@@ -95,6 +97,8 @@ pub(super) struct Root {
     ended: SyncSender<NodeEnd>,
     tell_when_running: Vec<Asker>,
     heeds_signals: bool,
+    /// Nobody but the node itself handles an end.
+    runs_alone: bool,
 }
 
 /// The root thread's whole life.
@@ -134,6 +138,7 @@ pub(super) fn run(
         ended,
         tell_when_running: Vec::new(),
         heeds_signals: false,
+        runs_alone: false,
         stores,
     };
     part_from_threads();
@@ -186,10 +191,16 @@ impl StreamHandler<RootEvent> for Root {
     fn handle(&mut self, event: RootEvent, context: &mut Context<Self>) {
         match event {
             RootEvent::Release { app } => self.release(app),
-            RootEvent::RequirementCycle { names } => {
+            RootEvent::RequirementCycle { names, labels } => {
                 let ours = names.iter().filter_map(|name| self.apps.named(name)).collect();
-                self.cycle = Some(Cycle { names, ours });
+                self.cycle = Some(Cycle { names, labels, ours });
                 self.tell_if_running();
+                self.end_on_circle();
+            }
+            RootEvent::RunsAlone => {
+                self.runs_alone = true;
+                self.tell_if_running();
+                self.end_on_circle();
             }
             RootEvent::Layers(fact) => self.layers_said(fact, context),
             RootEvent::Apps(fact) => self.apps_said(fact),
@@ -428,6 +439,26 @@ impl Root {
         }
     }
 
+    /// Applications of this node can never start: it ends, but only while none of its applications has run. spec: SYNC-7
+    fn end_on_circle(&mut self) {
+        let is_new = matches!(self.phase, Phase::StartingLayers | Phase::Running) && !self.apps.any_ran();
+        let Some(cycle) =
+            self.cycle.as_ref().filter(|cycle| self.runs_alone && is_new && !cycle.ours.is_empty())
+        else {
+            return;
+        };
+        let why = StartError::Cycle(cycle.labels.clone()).to_string();
+        self.gives_up(why);
+        self.stop_apps();
+    }
+
+    /// The first reason counts: what fails while the node stops follows from it.
+    fn gives_up(&mut self, why: String) {
+        if self.end == NodeEnd::Stopped {
+            self.end = NodeEnd::GaveUp(why);
+        }
+    }
+
     fn apps_ended(&mut self, reason: &Reason) {
         if let Reason::GaveUp(why) = reason {
             self.gives_up(format!("applications: {why}"));
@@ -461,7 +492,7 @@ impl Root {
         if is_running || self.cycle.is_some() {
             for asker in self.tell_when_running.drain(..) {
                 asker.answer(match &self.cycle {
-                    Some(cycle) if !is_running => Err(StartError::Cycle(cycle.names.clone())),
+                    Some(cycle) if !is_running => Err(StartError::Cycle(cycle.labels.clone())),
                     Some(_) | None => Ok(()),
                 });
             }

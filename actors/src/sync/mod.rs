@@ -35,7 +35,7 @@ mod list;
 mod words;
 
 pub(crate) use actor::SyncManager;
-pub(crate) use core::Core;
+pub(crate) use core::{Core, circle_of};
 #[cfg(test)]
 pub(crate) use core::{Input, Output};
 pub(crate) use facts::OwnApp;

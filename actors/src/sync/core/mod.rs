@@ -47,6 +47,7 @@ use self::{
     rendezvous::Rendezvous,
     respite::Respite,
 };
+pub(crate) use self::{cycles::circle_of, reason::Reason};
 use super::{
     facts::{Absence, DirectoryEntry, DirectoryEvent, OwnApp, Waiting},
     list::Published,
