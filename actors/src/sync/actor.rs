@@ -329,6 +329,17 @@ impl SyncManager {
                 application = waiting.application,
                 "{waiting}; it goes on waiting. Are these applications started, and spelled right?"
             ),
+            Output::Misspelt { application, name, nearest } => {
+                let nearest = if nearest.is_empty() {
+                    "none is similar".to_owned()
+                } else {
+                    format!("nearest: {}", nearest.join(", "))
+                };
+                crate::log::warn!(
+                    application,
+                    "{application} waits for `{name}`, which no application is called; {nearest}. Is it spelled right, and its node started?"
+                );
+            }
             Output::SameName { name, tids } => crate::log::warn!(
                 name,
                 ?tids,
