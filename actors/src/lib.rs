@@ -104,7 +104,7 @@ pub use sinew_runtime::{
     protection,
     schedule::{Tick, TimerId},
     sender::{AskError, Confirmation, Destination, Reply, SendError, Sender},
-    supervision::{AutoShutdown, Place, ReadyGate, Reason, Refusal, Restart, Strategy},
+    supervision::{AutoShutdown, Place, ReadyGate, Reason, Refusal, Restart, StartRetry, Strategy},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
     wire::{Class, Kind, MessageBuffer, Payload, TIME_TO_LIVE_MAX},
