@@ -1,6 +1,9 @@
 //! What is wrong with a configuration: all of it at once, each with its remedy.
 
-use std::fmt;
+use std::{
+    fmt,
+    path::{Path, PathBuf},
+};
 
 /// All that is wrong with a configuration. The user is at fault; nothing was started.
 ///
@@ -13,6 +16,8 @@ pub struct ConfigFaults(Vec<ConfigFault>);
 pub struct ConfigFault {
     /// Which setting: `ndl.period_ms`.
     pub key: String,
+    /// The file; `None` where the setting comes from code or from a text.
+    pub file: Option<PathBuf>,
     /// Line of the file, from 1; `None` where the setting comes from code or is missing.
     pub line: Option<usize>,
     /// What is there.
@@ -40,7 +45,13 @@ impl ConfigFaults {
         Self(vec![fault])
     }
 
-    pub(super) fn into_vec(self) -> Vec<ConfigFault> {
+    /// The same of the file at `path`.
+    pub(super) fn of_file(mut self, path: &Path) -> Self {
+        self.0.iter_mut().for_each(|fault| fault.file = Some(path.to_owned()));
+        self
+    }
+
+    pub(crate) fn into_vec(self) -> Vec<ConfigFault> {
         self.0
     }
 }
@@ -59,10 +70,13 @@ impl fmt::Display for ConfigFaults {
 
 impl fmt::Display for ConfigFault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { key, line, found, legal, remedy } = self;
+        let Self { key, file, line, found, legal, remedy } = self;
         write!(f, "{key}")?;
-        if let Some(line) = line {
-            write!(f, " (line {line})")?;
+        match (file, line) {
+            (Some(file), Some(line)) => write!(f, " ({}, line {line})", file.display())?,
+            (Some(file), None) => write!(f, " ({})", file.display())?,
+            (None, Some(line)) => write!(f, " (line {line})")?,
+            (None, None) => {}
         }
         write!(f, ": found {found}; legal is {legal}; {remedy}")
     }

@@ -43,6 +43,7 @@ pub use tree::{LifeState, MailboxState, Supervised, Supervises, SupervisionTree}
 
 use std::{
     net::SocketAddr,
+    path::Path,
     process::ExitCode,
     sync::{
         Arc,
@@ -137,6 +138,13 @@ impl Node {
     #[must_use]
     pub fn builder(name: impl Into<String>) -> NodeBuilder {
         NodeBuilder::new(name.into())
+    }
+
+    /// Begins the declaration of a node whose configuration is in the TOML file at `path`. What is wrong with the file is found by
+    /// [`NodeBuilder::start`], together with all else that is wrong.
+    #[must_use]
+    pub fn from_file(path: impl AsRef<Path>) -> NodeBuilder {
+        NodeBuilder::from_file(path.as_ref())
     }
 
     /// Asks and stops, from any thread.
