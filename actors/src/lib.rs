@@ -46,6 +46,7 @@ mod documentation;
 pub mod fuzzing;
 mod gncl;
 pub mod inspect;
+mod last_words;
 #[cfg(all(test, target_os = "linux"))]
 mod lingering;
 mod lncl;
@@ -105,7 +106,7 @@ pub use sinew_runtime::{
     protection,
     schedule::{Tick, TimerId},
     sender::{AskError, Confirmation, Destination, Reply, SendError, Sender},
-    supervision::{AutoShutdown, Place, ReadyGate, Reason, Refusal, Restart, Strategy},
+    supervision::{AutoShutdown, Place, ReadyGate, Reason, Refusal, Restart, StartRetry, Strategy},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
     undelivered::Undelivered,

@@ -19,9 +19,9 @@ use sinew_runtime::{
 use tokio::sync::watch;
 
 use crate::{
-    access::Access, aftermath::Aftermath, audit, clocks::ClockOffsets, config::NodeConfig, gncl, lncl,
-    log_quotas::LogQuotas, monitors, ndl, node, refusals::Refusals, secured::Secured, sync,
-    undelivered::Undelivered, wills,
+    access::Access, aftermath::Aftermath, audit, clocks::ClockOffsets, config::NodeConfig, gncl,
+    last_words::LastWords, lncl, log_quotas::LogQuotas, monitors, ndl, node, refusals::Refusals,
+    secured::Secured, sync, undelivered::Undelivered, wills,
 };
 
 /// What the layers of one node share.
@@ -35,6 +35,8 @@ pub(crate) struct Stores {
     /// Set by the root before it stops the layers: those that say goodbye to others do so only then, not when one of them
     /// is restarted.
     pub(crate) stopping: AtomicBool,
+    /// Why the node gave up; peers are sent it instead of an orderly goodbye. Set before `stopping`.
+    pub(crate) gave_up: OnceLock<LastWords>,
     /// Where messages go.
     pub(crate) router: Arc<Router>,
     /// Events into each layer.
@@ -112,6 +114,7 @@ impl Stores {
             node,
             incarnation,
             stopping: AtomicBool::new(false),
+            gave_up: OnceLock::new(),
             router,
             posts,
             undelivered,

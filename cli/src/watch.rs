@@ -149,7 +149,9 @@ impl Watched {
     fn take_members(&mut self, members: Vec<Tid>) {
         let left_out = members.len().saturating_sub(MEMBERS_MAX);
         if left_out > 0 && self.questions.is_empty() {
-            output::note(format_args!("{left_out} further members are not watched: at most {MEMBERS_MAX} are"));
+            output::note(format_args!(
+                "{left_out} further members are not watched: at most {MEMBERS_MAX} are"
+            ));
         }
         self.questions = members.into_iter().take(MEMBERS_MAX).map(|member| self.question(member)).collect();
     }

@@ -45,7 +45,9 @@ impl DownClass {
             Reason::Shutdown | Reason::RequirementLost(_) | Reason::GaveUp(_) => Self::Shutdown,
             Reason::Panic(_) => Self::Panic,
             Reason::Hung(_) => Self::Hung,
-            Reason::Killed | Reason::StartTimeout | Reason::ThreadEnded => Self::Killed,
+            Reason::Killed | Reason::StartTimeout | Reason::StartFailed(_) | Reason::ThreadEnded => {
+                Self::Killed
+            }
             Reason::ProcessEnded(_) => Self::ProcessEnded,
         }
     }

@@ -44,7 +44,7 @@ pub(crate) fn read(path: &Path) -> Result<List, ConfigFaults> {
         let remedy = "check security.access, the path and its permissions, and those of its directory";
         ConfigFaults::one(fault(&path.display().to_string(), found, legal, remedy))
     })?;
-    parse(&text).map_err(|faults| faults.in_file(path))
+    parse(&text).map_err(|faults| faults.of_file(path))
 }
 
 /// The list that `text` is.

@@ -103,7 +103,14 @@ pub(crate) fn fault(
     legal: impl Into<String>,
     remedy: impl Into<String>,
 ) -> ConfigFault {
-    ConfigFault { key: key.to_owned(), line: None, found, legal: legal.into(), remedy: remedy.into() }
+    ConfigFault {
+        key: key.to_owned(),
+        file: None,
+        line: None,
+        found,
+        legal: legal.into(),
+        remedy: remedy.into(),
+    }
 }
 
 impl NodeConfig {

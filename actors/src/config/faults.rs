@@ -9,17 +9,15 @@ use std::{
 ///
 /// It is written with one fault a line.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ConfigFaults {
-    faults: Vec<ConfigFault>,
-    /// The file that was read, if one was.
-    file: Option<PathBuf>,
-}
+pub struct ConfigFaults(Vec<ConfigFault>);
 
 /// One thing that is wrong with a configuration.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ConfigFault {
     /// Which setting: `ndl.period_ms`.
     pub key: String,
+    /// The file; `None` where the setting comes from code or from a text.
+    pub file: Option<PathBuf>,
     /// Line of the file, from 1; `None` where the setting comes from code or is missing.
     pub line: Option<usize>,
     /// What is there.
@@ -34,33 +32,27 @@ impl ConfigFaults {
     /// All of them, at least one: those of a file by line, those of code in the order of the settings.
     #[must_use]
     pub fn faults(&self) -> &[ConfigFault] {
-        &self.faults
-    }
-
-    /// The file that they are in; `None` of those of code.
-    #[must_use]
-    pub fn file(&self) -> Option<&Path> {
-        self.file.as_deref()
-    }
-
-    /// The same, of the file at `path`: each line of the text names it.
-    #[must_use]
-    pub(crate) fn in_file(self, path: &Path) -> Self {
-        Self { file: Some(path.to_owned()), ..self }
+        &self.0
     }
 
     /// Good if there are no `faults`.
     pub(crate) fn check(faults: Vec<ConfigFault>) -> Result<(), Self> {
-        if faults.is_empty() { Ok(()) } else { Err(Self { faults, file: None }) }
+        if faults.is_empty() { Ok(()) } else { Err(Self(faults)) }
     }
 
     /// A single fault.
     pub(crate) fn one(fault: ConfigFault) -> Self {
-        Self { faults: vec![fault], file: None }
+        Self(vec![fault])
     }
 
-    pub(super) fn into_vec(self) -> Vec<ConfigFault> {
-        self.faults
+    /// The same of the file at `path`.
+    pub(crate) fn of_file(mut self, path: &Path) -> Self {
+        self.0.iter_mut().for_each(|fault| fault.file = Some(path.to_owned()));
+        self
+    }
+
+    pub(crate) fn into_vec(self) -> Vec<ConfigFault> {
+        self.0
     }
 }
 
@@ -68,12 +60,9 @@ impl std::error::Error for ConfigFaults {}
 
 impl fmt::Display for ConfigFaults {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for (place, fault) in self.faults.iter().enumerate() {
+        for (place, fault) in self.0.iter().enumerate() {
             let end = if place == 0 { "" } else { "\n" };
-            match &self.file {
-                Some(file) => write!(f, "{end}{}: {fault}", file.display())?,
-                None => write!(f, "{end}{fault}")?,
-            }
+            write!(f, "{end}{fault}")?;
         }
         Ok(())
     }
@@ -81,10 +70,13 @@ impl fmt::Display for ConfigFaults {
 
 impl fmt::Display for ConfigFault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { key, line, found, legal, remedy } = self;
+        let Self { key, file, line, found, legal, remedy } = self;
         write!(f, "{key}")?;
-        if let Some(line) = line {
-            write!(f, " (line {line})")?;
+        match (file, line) {
+            (Some(file), Some(line)) => write!(f, " ({}, line {line})", file.display())?,
+            (Some(file), None) => write!(f, " ({})", file.display())?,
+            (None, Some(line)) => write!(f, " (line {line})")?,
+            (None, None) => {}
         }
         write!(f, ": found {found}; legal is {legal}; {remedy}")
     }

@@ -18,7 +18,7 @@ use toml::{
 };
 
 use super::{
-    ConfigFault, ConfigFaults, Interface, Interfaces, LogLevel, NodeConfig, WatchGroup,
+    AppSettings, ConfigFault, ConfigFaults, Interface, Interfaces, LogLevel, NodeConfig, WatchGroup,
     check::{self, Range, fault},
     faults::quoted,
 };
@@ -26,7 +26,7 @@ use super::{
 /// Longest configuration file in bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-const SECTIONS: [&str; 8] = ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security", "log"];
+const SECTIONS: [&str; 9] = ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security", "log", "app"];
 
 /// Every key of every section.
 pub(super) const KEYS: [&str; 49] = [
@@ -98,6 +98,13 @@ impl NodeConfig {
     /// # Ok::<(), sinew::config::ConfigFaults>(())
     /// ```
     pub fn from_toml(text: &str) -> Result<Self, ConfigFaults> {
+        let (config, faults) = Self::read(text)?;
+        ConfigFaults::check(faults)?;
+        Ok(config)
+    }
+
+    /// As much of it as can be used, with all that is wrong: for who has more to check.
+    fn read(text: &str) -> Result<(Self, Vec<ConfigFault>), ConfigFaults> {
         let table = DeTable::parse(text).map_err(|error| ConfigFaults::one(syntax_fault(text, &error)))?;
         let mut reader = Reader::new(text, table.get_ref());
         // A name that is not set is a fault, and the check finds it.
@@ -115,22 +122,45 @@ impl NodeConfig {
             "\"off\", \"error\", \"warn\", \"info\", \"debug\" or \"trace\"",
             &mut config.log.level,
         );
-        reader.finish(&config)?;
-        Ok(config)
+        config.app_settings = reader.app_settings.take().unwrap_or_default();
+        let faults = reader.finish(&config).err().map(ConfigFaults::into_vec).unwrap_or_default();
+        Ok((config, faults))
     }
 
     /// Reads and checks the configuration in the TOML file at `path`; at most 1 MiB.
     ///
     /// # Errors
-    /// All faults, as in [`from_toml`](Self::from_toml), each with the file's name. A file that cannot be read is one fault.
+    /// All faults, as in [`from_toml`](Self::from_toml). A file that cannot be read is one fault.
     pub fn from_file(path: impl AsRef<Path>) -> Result<Self, ConfigFaults> {
-        let path = path.as_ref();
-        let text = read_bounded(path).map_err(|found| {
+        let (config, faults) = Self::read_file(path.as_ref());
+        ConfigFaults::check(faults)?;
+        Ok(config)
+    }
+
+    /// As much of the file as can be used, with all that is wrong.
+    pub(crate) fn read_file(path: &Path) -> (Self, Vec<ConfigFault>) {
+        let read =
+            Self::text_of(path).and_then(|text| Self::read(&text).map_err(|faults| faults.of_file(path)));
+        match read {
+            Ok((mut config, faults)) => {
+                config.app_settings.name_file(path.to_owned());
+                (
+                    config,
+                    ConfigFaults::check(faults)
+                        .err()
+                        .map_or_else(Vec::new, |all| all.of_file(path).into_vec()),
+                )
+            }
+            Err(faults) => (Self::new(""), faults.into_vec()),
+        }
+    }
+
+    fn text_of(path: &Path) -> Result<String, ConfigFaults> {
+        read_bounded(path).map_err(|found| {
             let legal = "a text file of at most 1 MiB that this user may read";
             let remedy = "check its path and its permissions";
             ConfigFaults::one(fault(&path.display().to_string(), found, legal, remedy))
-        })?;
-        Self::from_toml(&text).map_err(|faults| faults.in_file(path))
+        })
     }
 }
 
@@ -168,16 +198,20 @@ pub(crate) fn shown(text: &str, span: Span<usize>) -> String {
 struct Reader<'t> {
     text: &'t str,
     values: BTreeMap<&'static str, &'t Spanned<DeValue<'t>>>,
+    app_settings: Option<AppSettings>,
     faults: Vec<ConfigFault>,
 }
 
 /// Sorting the file's keys.
 impl<'t> Reader<'t> {
     fn new(text: &'t str, table: &'t DeTable<'t>) -> Self {
-        let mut reader = Self { text, values: BTreeMap::new(), faults: Vec::new() };
+        let mut reader = Self { text, values: BTreeMap::new(), app_settings: None, faults: Vec::new() };
         for (name, value) in table {
             let section = SECTIONS.into_iter().find(|section| *section == name.get_ref());
             match (section, value.get_ref()) {
+                (Some("app"), DeValue::Table(table)) => {
+                    reader.app_settings = Some(AppSettings::read(text, table));
+                }
                 (Some(section), DeValue::Table(table)) => reader.add_section(section, table),
                 (Some(section), _) => {
                     let legal = format!("a section [{section}]");

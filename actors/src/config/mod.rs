@@ -3,6 +3,7 @@
 //! It comes from code ([`NodeConfig::new`]) or from TOML ([`NodeConfig::from_toml`], [`NodeConfig::from_file`]);
 //! `docs/CONFIGURATION.md` has a complete file. Whichever way it came, the same check decides whether it is legal.
 
+mod app_settings;
 mod check;
 mod faults;
 mod file;
@@ -30,6 +31,7 @@ use sinew_runtime::{
     tid::NodeAddress,
 };
 
+pub use self::app_settings::AppSettings;
 use crate::security::TimePolicy;
 
 /// Everything that can be set about a node.
@@ -69,6 +71,8 @@ pub struct NodeConfig {
     pub security: SecurityConfig,
     /// What the node logs.
     pub log: LogConfig,
+    /// Settings of the user's own: the tables `[app.NAME]` of its file, which [`NodeConfig::app`] reads. Default: none.
+    pub app_settings: AppSettings,
 }
 
 /// The node's log: lines on the standard error, in a program that has installed no subscriber of `tracing`.
@@ -352,6 +356,7 @@ impl NodeConfig {
             },
             security: SecurityConfig { keys: None, times: TimePolicy::UntilSet, access: None },
             log: LogConfig::default(),
+            app_settings: AppSettings::default(),
         }
     }
 

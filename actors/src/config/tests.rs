@@ -425,3 +425,56 @@ fn value() -> impl Strategy<Value = String> {
         any::<([u8; 4], u16)>().prop_map(|([a, b, c, d], port)| format!("['{a}.{b}.{c}.{d}:{port}']")),
     ]
 }
+
+#[derive(Debug, PartialEq, serde::Deserialize)]
+struct Drive {
+    kp: f64,
+    #[serde(default)]
+    gains: Vec<Gain>,
+}
+
+#[derive(Debug, PartialEq, serde::Deserialize)]
+struct Gain {
+    at: u32,
+}
+
+fn with_apps(tables: &str) -> NodeConfig {
+    NodeConfig::from_toml(&format!("[node]\nname = 'knee'\n{tables}")).unwrap()
+}
+
+#[test]
+fn settings_of_an_application_are_read_however_its_name_is_written() {
+    let drive = Drive { kp: 2.5, gains: vec![Gain { at: 3 }] };
+    let config = with_apps("[app.knee.drive]\nkp = 2.5\ngains = [{ at = 3 }]\n");
+    assert_eq!(config.app::<Drive>("knee.drive").as_ref(), Ok(&drive));
+    let config = with_apps("[app.'knee.drive']\nkp = 2.5\n[[app.'knee.drive'.gains]]\nat = 3\n");
+    assert_eq!(config.app::<Drive>("knee.drive"), Ok(drive));
+    assert_eq!(config.unclaimed_settings(), []);
+}
+
+#[test]
+fn each_fault_of_such_settings_has_its_key_its_line_and_a_remedy() {
+    let config = with_apps("[app.drive]\nkp = 'two'\nki = 1\n[app.driev]\nkp = 1\n");
+    let faults = config.app::<Drive>("drive").unwrap_err();
+    let places: Vec<_> = faults.faults().iter().map(|fault| (&*fault.key, fault.line)).collect();
+    assert!(places.contains(&("app.drive.kp", Some(4))), "{faults}");
+    let missing = config.app::<Drive>("drivee").unwrap_err().to_string();
+    assert!(
+        missing.contains("app.drivee: found no such table") && missing.contains("[app.drive]"),
+        "{missing}"
+    );
+    let config = with_apps("[app.drive]\nkp = 2\nki = 1\n");
+    let unknown = config.app::<Drive>("drive").unwrap_err().to_string();
+    assert!(unknown.starts_with("app.drive.ki (line 5): found a key that does not exist"), "{unknown}");
+}
+
+#[test]
+fn settings_that_nothing_reads_are_a_fault_with_the_nearest_name() {
+    let config = with_apps("[app.knee.drive]\nkp = 1\n[app.knee.driev]\nkp = 1\n[app.camera]\nid = 1\n");
+    config.app::<Drive>("knee.drive").unwrap();
+    config.app_is_elsewhere("camera");
+    let unread = config.unclaimed_settings();
+    let [fault] = &*unread else { panic!("{unread:?}") };
+    assert_eq!((&*fault.key, fault.line), ("app.knee.driev", Some(5)));
+    assert!(fault.remedy.contains("[app.knee.drive]"), "{fault}");
+}

@@ -49,6 +49,7 @@ use super::{
 use crate::{
     accept_pace::Pace,
     config::NodeConfig,
+    last_words::LastWords,
     outlet::Gathering,
     stores::{Stores, lock},
 };
@@ -75,6 +76,8 @@ pub(crate) struct Gncl {
     tells_again: bool,
     /// When it goes, whoever has not hung up; set once the node is being stopped.
     goes_at: Option<Time>,
+    /// Why linked peers gave up that have said goodbye and are not told to have left yet; one for each peer at most.
+    last_words: BTreeMap<NodeAddress, LastWords>,
 }
 
 impl Gncl {
@@ -94,6 +97,7 @@ impl Gncl {
             alarm: None,
             tells_again: false,
             goes_at: None,
+            last_words: BTreeMap::new(),
         }
     }
 
@@ -314,7 +318,12 @@ impl Gncl {
         }
     }
 
-    fn tell(&mut self, fact: LinkFact, ctx: &mut Context<Self>) {
+    fn tell(&mut self, mut fact: LinkFact, ctx: &mut Context<Self>) {
+        match &mut fact {
+            LinkFact::PeerLeft { node, gave_up, .. } => *gave_up = self.last_words.remove(node),
+            LinkFact::LinkBroken { node, .. } => _ = self.last_words.remove(node),
+            LinkFact::LinkUp { .. } | LinkFact::DialRefused { .. } => {}
+        }
         let (LinkFact::LinkUp { node, .. }
         | LinkFact::LinkBroken { node, .. }
         | LinkFact::DialRefused { node, .. }
@@ -323,7 +332,7 @@ impl Gncl {
             crate::log::debug!(?fact, suppressed, "link");
         }
         self.stores.gncl.notes.fact(Time::now(), &fact);
-        if let LinkFact::PeerLeft { node, incarnation } = fact {
+        if let LinkFact::PeerLeft { node, incarnation, .. } = fact {
             self.stores.gncl.leaves(Time::now(), node, incarnation);
         }
         self.stores.untold_of_links.note(fact);
@@ -373,7 +382,10 @@ impl Gncl {
             Kind::GNCL_REFUSAL => Ok(Input::RefusalReceived(connection, read(&message.payload)?)),
             Kind::GNCL_PING => Ok(Input::PingReceived(connection)),
             Kind::GNCL_PONG => Ok(Input::PongReceived(connection)),
-            Kind::GNCL_GOODBYE => Ok(Input::GoodbyeReceived(connection)),
+            Kind::GNCL_GOODBYE => {
+                self.note_last_words(message.header.source.node, &message.payload)?;
+                Ok(Input::GoodbyeReceived(connection))
+            }
             kind => {
                 Err(Decline::Violation(format!("a frame of kind {kind} came before the handshake was over")))
             }

@@ -2,8 +2,10 @@
 
 use sinew_runtime::tid::{Incarnation, NodeAddress};
 
+use crate::last_words::LastWords;
+
 /// A change of the connection to a node, told to NDL and to the sync manager.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum LinkFact {
     /// Messages can flow.
     LinkUp { node: NodeAddress, incarnation: Incarnation },
@@ -11,6 +13,6 @@ pub(crate) enum LinkFact {
     LinkBroken { node: NodeAddress, incarnation: Incarnation },
     /// A dial was refused by the peer's host: nobody listens there any more.
     DialRefused { node: NodeAddress, incarnation: Incarnation },
-    /// The peer said goodbye: its node stops in order.
-    PeerLeft { node: NodeAddress, incarnation: Incarnation },
+    /// The peer said goodbye: its node stops in order, or gave up for this reason.
+    PeerLeft { node: NodeAddress, incarnation: Incarnation, gave_up: Option<LastWords> },
 }

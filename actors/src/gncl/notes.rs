@@ -152,7 +152,7 @@ mod tests {
         assert_eq!(notes.of(node), Note { linked: Some(at(3)), broken: None, dial: None });
         notes.fact(at(4), &LinkFact::LinkBroken { node, incarnation });
         assert_eq!(notes.of(node), Note { linked: None, broken: Some(at(4)), dial: None });
-        notes.fact(at(5), &LinkFact::PeerLeft { node, incarnation });
+        notes.fact(at(5), &LinkFact::PeerLeft { node, incarnation, gave_up: None });
         assert_eq!(notes.of(node), Note::default());
     }
 

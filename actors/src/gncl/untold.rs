@@ -39,7 +39,7 @@ impl Untold {
 
     /// Keeps a fact for both.
     pub(super) fn note(&self, fact: LinkFact) {
-        lock(&self.ndl).note(fact);
+        lock(&self.ndl).note(fact.clone());
         lock(&self.sync).note(fact);
     }
 
@@ -76,7 +76,7 @@ impl Facts {
     /// Offers one after the other, until one is not taken. Returns whether all were.
     fn offer(&mut self, mut takes: impl FnMut(LinkFact) -> bool) -> bool {
         while let Some(fact) = self.facts.front() {
-            if !takes(*fact) {
+            if !takes(fact.clone()) {
                 return false;
             }
             self.facts.pop_front();
@@ -140,11 +140,12 @@ mod tests {
     #[test]
     fn of_links_that_are_cut_the_sync_manager_hears_and_ndl_looks_for_itself() {
         let untold = Untold::new(8);
-        let left = LinkFact::PeerLeft { node: NodeAddress::new(1), incarnation: Incarnation(1) };
-        untold.note(left);
+        let left =
+            LinkFact::PeerLeft { node: NodeAddress::new(1), incarnation: Incarnation(1), gave_up: None };
+        untold.note(left.clone());
         untold.note(up(2));
         untold.links_are_cut([broken(2)].into_iter());
-        assert_eq!(told(&untold.ndl), [left]);
+        assert_eq!(told(&untold.ndl), [left.clone()]);
         assert_eq!(told(&untold.sync), [left, up(2), broken(2)]);
     }
 }

@@ -248,6 +248,7 @@ fn is_on(stores: &Stores, source: Source) -> bool {
 
 fn lost_report(node: NodeAddress, lost: LostNode, now: Time) -> LostReport {
     let why = match lost.why {
+        LossReason::GaveUp(words) => &format!("gave up: {words}"),
         LossReason::Left => "left",
         LossReason::Crashed => "crashed",
         LossReason::Hung => "hung",

@@ -7,7 +7,7 @@ mod pace;
 mod watched;
 mod watching;
 
-use std::{collections::VecDeque, time::Duration};
+use std::{borrow::Cow, collections::VecDeque, time::Duration};
 
 use sinew_runtime::{
     monitor::{Down, DownClass, MonitorError, MonitorId},
@@ -49,7 +49,7 @@ pub(crate) enum Input {
     /// NDL found a node.
     NodeFound { node: NodeAddress, incarnation: Incarnation },
     /// A node is lost, or left: why.
-    NodeLost { node: NodeAddress, incarnation: Incarnation, why: &'static str },
+    NodeLost { node: NodeAddress, incarnation: Incarnation, why: Cow<'static, str> },
     /// Messages can flow to a node.
     LinkUp { node: NodeAddress, incarnation: Incarnation },
     /// They cannot any more.
@@ -176,7 +176,7 @@ impl Core {
                 self.watching.found(node, incarnation);
             }
             Input::NodeLost { node, incarnation, why } => {
-                self.end_all_on(node, Some(incarnation), why);
+                self.end_all_on(node, Some(incarnation), &why);
                 self.watched.forget_node(node, incarnation);
                 self.watching.lost(node, incarnation);
             }

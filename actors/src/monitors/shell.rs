@@ -4,7 +4,7 @@ use sinew_runtime::{
     mailbox::About,
     monitor::{Down, DownClass},
     outcome::Rejection,
-    tid::{AppAddress, NodeAddress, Tid},
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
     wire::{Header, Kind, Message, Payload, decode},
 };
@@ -23,10 +23,14 @@ use crate::{
 
 impl From<&MembershipFact> for Input {
     fn from(fact: &MembershipFact) -> Self {
-        match *fact {
-            MembershipFact::NodeFound { node, incarnation, .. } => Self::NodeFound { node, incarnation },
+        match fact {
+            MembershipFact::NodeFound { node, incarnation, .. } => {
+                Self::NodeFound { node: *node, incarnation: *incarnation }
+            }
             MembershipFact::NodeLost { node, incarnation, why } => {
+                let (node, incarnation) = (*node, *incarnation);
                 let why = match why {
+                    LossReason::GaveUp(words) => return Self::gave_up(node, incarnation, words),
                     LossReason::Left => "its node left",
                     LossReason::Crashed => "its node was lost: its process ended",
                     LossReason::Hung => "its node was lost: it hangs, while its host answers",
@@ -34,20 +38,27 @@ impl From<&MembershipFact> for Input {
                     LossReason::Restarted => "its node was restarted",
                     LossReason::Duplicate => "its node is none: another process holds that node address",
                 };
-                Self::NodeLost { node, incarnation, why }
+                Self::NodeLost { node, incarnation, why: why.into() }
             }
         }
     }
 }
 
 impl Input {
+    fn gave_up(node: NodeAddress, incarnation: Incarnation, words: &str) -> Self {
+        Self::NodeLost { node, incarnation, why: format!("its node gave up: {words}").into() }
+    }
+
     /// What a link's change is to monitors; `None`: nothing.
-    pub(crate) const fn of_link(fact: LinkFact) -> Option<Self> {
-        match fact {
+    pub(crate) fn of_link(fact: &LinkFact) -> Option<Self> {
+        match *fact {
             LinkFact::LinkUp { node, incarnation } => Some(Self::LinkUp { node, incarnation }),
             LinkFact::LinkBroken { node, incarnation } => Some(Self::LinkBroken { node, incarnation }),
-            LinkFact::PeerLeft { node, incarnation } => {
-                Some(Self::NodeLost { node, incarnation, why: "its node left" })
+            LinkFact::PeerLeft { node, incarnation, gave_up: Some(ref words) } => {
+                Some(Self::gave_up(node, incarnation, words.as_str()))
+            }
+            LinkFact::PeerLeft { node, incarnation, gave_up: None } => {
+                Some(Self::NodeLost { node, incarnation, why: "its node left".into() })
             }
             LinkFact::DialRefused { .. } => None,
         }

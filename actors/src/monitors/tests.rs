@@ -143,9 +143,9 @@ fn a_node_that_is_lost_ends_all_its_lives_and_one_that_is_only_cut_off_none() {
     bench.hears(Input::LinkUp { node: THERE, incarnation: LIFE });
     bench.monitors(1, Tid::new(THERE, app(0))).0.unwrap();
     assert_eq!(downs(&bench.hears(Input::LinkBroken { node: THERE, incarnation: LIFE })), []);
-    let former = Input::NodeLost { node: THERE, incarnation: Incarnation(4), why: "an earlier life" };
+    let former = Input::NodeLost { node: THERE, incarnation: Incarnation(4), why: "an earlier life".into() };
     assert_eq!(downs(&bench.hears(former)), []);
-    let lost = Input::NodeLost { node: THERE, incarnation: LIFE, why: "its node left" };
+    let lost = Input::NodeLost { node: THERE, incarnation: LIFE, why: "its node left".into() };
     assert_eq!(classes(&bench.hears(lost.clone())), [DownClass::NodeLost]);
     assert_eq!(downs(&bench.hears(lost)), []);
 }
@@ -157,11 +157,11 @@ fn the_elder_life_of_a_node_is_watched_after_a_later_one_was_another_process() {
     let elder = Incarnation(LIFE.0 - 1);
     bench.hears(Input::NodeFound { node: THERE, incarnation: LIFE });
     bench.hears(Input::LinkUp { node: THERE, incarnation: LIFE });
-    bench.hears(Input::NodeLost { node: THERE, incarnation: LIFE, why: "it was another process" });
+    bench.hears(Input::NodeLost { node: THERE, incarnation: LIFE, why: "it was another process".into() });
     bench.hears(Input::NodeFound { node: THERE, incarnation: elder });
     bench.hears(Input::LinkUp { node: THERE, incarnation: elder });
     bench.monitors(1, Tid::new(THERE, app(0))).0.unwrap();
-    let lost = bench.hears(Input::NodeLost { node: THERE, incarnation: elder, why: "it is silent" });
+    let lost = bench.hears(Input::NodeLost { node: THERE, incarnation: elder, why: "it is silent".into() });
     assert_eq!(classes(&lost), [DownClass::NodeLost]);
 }
 
@@ -174,7 +174,7 @@ fn a_node_in_a_new_life_has_lost_the_old_one_whoever_says_so_first() {
     let again = bench.hears(Input::LinkUp { node: THERE, incarnation: Incarnation(6) });
     assert_eq!(classes(&again), [DownClass::NodeLost]);
     bench.monitors(1, Tid::new(THERE, app(0))).0.unwrap();
-    let late = Input::NodeLost { node: THERE, incarnation: LIFE, why: "its node was restarted" };
+    let late = Input::NodeLost { node: THERE, incarnation: LIFE, why: "its node was restarted".into() };
     assert_eq!(downs(&bench.hears(late)), [], "it is about the life before");
 }
 

@@ -1,6 +1,7 @@
 //! The thin shell around the membership core: sockets, timer, mDNS, and the ways to other layers.
 
 mod announcing;
+mod goodbye;
 mod memory;
 mod paths;
 mod receiving;
@@ -31,6 +32,7 @@ use sinew_runtime::{
 };
 use tokio::sync::{Notify, mpsc, oneshot};
 
+pub(crate) use self::goodbye::say_goodbye;
 use self::{
     announcing::announced,
     paths::{Paths, Reader},
@@ -40,7 +42,7 @@ use super::{
     Event,
     address::LocalAddress,
     core::{Core, Epoch, Input, Output, Place},
-    datagram::{Answer, Body, Datagram, encode},
+    datagram::{Answer, Body, Datagram, Leave, encode},
     interfaces::{self, Usable},
     look_period,
     probe::{PROBES_MAX, Probe},
@@ -252,7 +254,10 @@ impl Shell {
                 let answer = Answer { announcement, query_sent_ns, query_received_ns, progress };
                 self.send(to, node, correlation, Body::Answer(answer));
             }
-            Output::SendLeave { to, node } => self.send(to, node, 0, Body::Leave(self.me())),
+            Output::SendLeave { to, node } => {
+                let gave_up = self.stores.gave_up.get().cloned();
+                self.send(to, node, 0, Body::Leave(Leave { announcement: self.me(), gave_up }));
+            }
             Output::Probe { node, incarnation, to, within, asked } => {
                 self.stores.gncl.ask_for_a_sign(self.stores.node, node, incarnation);
                 // Where too many are silent at once it is not their hosts that are to be doubted.

@@ -15,7 +15,7 @@ use super::{
     Progress,
     address::{is_link_local, is_same_host, seen_from, unscoped},
 };
-use crate::secured::SEAL_LEN;
+use crate::{last_words::LastWords, secured::SEAL_LEN};
 
 /// Longest datagram in bytes: it passes every network unfragmented. // spec: NDL-1
 pub(crate) const DATAGRAM_MAX: usize = 1_200;
@@ -279,6 +279,31 @@ pub(crate) struct Answer {
     pub(crate) progress: Progress,
 }
 
+/// The payload of a leave: an announcement, and one field more where the node gave up. // spec: NDL-4.8
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub(crate) struct Leave {
+    /// The node that stops.
+    #[serde(flatten)]
+    pub(crate) announcement: Announcement,
+    /// Why it gave up; `None`: it stops in order.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) gave_up: Option<LastWords>,
+}
+
+impl From<Announcement> for Leave {
+    /// Of a node that stops in order.
+    fn from(announcement: Announcement) -> Self {
+        Self { announcement, gave_up: None }
+    }
+}
+
+/// The further field of a leave, which is read by itself: the announcement is read as in any other datagram.
+#[derive(Deserialize)]
+struct LeaveWords {
+    #[serde(default)]
+    gave_up: Option<LastWords>,
+}
+
 /// A datagram that keeps the rules of its form.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Datagram {
@@ -296,8 +321,8 @@ pub(crate) enum Body {
     Query(Announcement),
     /// I am.
     Answer(Answer),
-    /// I stop, in order.
-    Leave(Announcement),
+    /// I stop.
+    Leave(Leave),
 }
 
 /// Why bytes are no datagram of NDL. The sender is at fault, or the network; nothing changed.
@@ -393,7 +418,10 @@ fn read(here: NodeAddress, bytes: &[u8]) -> Result<Datagram, DatagramError> {
             }
             Body::Answer(Answer { announcement: answer.announcement.check()?, ..answer })
         }
-        Kind::NDL_LEAVE => Body::Leave(announcement(payload)?),
+        Kind::NDL_LEAVE => {
+            let LeaveWords { gave_up } = decode(payload)?;
+            Body::Leave(Leave { announcement: announcement(payload)?, gave_up })
+        }
         other => return Err(DatagramError::Kind(other)),
     };
     let announced = body.announcement().node;
@@ -411,8 +439,9 @@ impl Body {
     /// Who speaks.
     pub(crate) const fn announcement(&self) -> &Announcement {
         match self {
-            Self::Query(announcement) | Self::Leave(announcement) => announcement,
+            Self::Query(announcement) => announcement,
             Self::Answer(answer) => &answer.announcement,
+            Self::Leave(leave) => &leave.announcement,
         }
     }
 }
@@ -425,7 +454,7 @@ pub(crate) fn encode(datagram: &Datagram, to: NodeAddress) -> BytesMut {
     let (kind, flags, written) = match &datagram.body {
         Body::Query(announcement) => (Kind::NDL_QUERY, Flags::ASK, write_named(&mut payload, announcement)),
         Body::Answer(answer) => (Kind::NDL_ANSWER, Flags::REPLY, write_named(&mut payload, answer)),
-        Body::Leave(announcement) => (Kind::NDL_LEAVE, Flags::NONE, write_named(&mut payload, announcement)),
+        Body::Leave(leave) => (Kind::NDL_LEAVE, Flags::NONE, write_named(&mut payload, leave)),
     };
     written.expect("strings and numbers can be written as MessagePack");
     let mut header = Header::new(kind, source, Tid::new(to, AppAddress::NDL));

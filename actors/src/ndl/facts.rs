@@ -8,6 +8,8 @@ use sinew_runtime::{
     wire::{Class, Payload},
 };
 
+use crate::last_words::LastWords;
+
 /// A change in who is there, told to GNCL and to the sync manager.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum MembershipFact {
@@ -114,10 +116,12 @@ pub enum Trouble {
 }
 
 /// How a loss was noticed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum LossReason {
-    /// It said goodbye.
+    /// It stopped in order.
     Left,
+    /// It gave up: its own reason, 200 bytes at most, without control characters. Its process may have to be started again.
+    GaveUp(String),
     /// Its process has ended: its host refuses connections to it.
     Crashed,
     /// It missed as many answers in a row as the configuration allows, and its host takes connections for it: its process does not run.
@@ -128,6 +132,21 @@ pub enum LossReason {
     Restarted,
     /// Another process holds its node address, and held it before: nodes listen to that one.
     Duplicate,
+}
+
+impl LossReason {
+    /// Whether the node itself announced its end: what it still sends is taken, and it is not asked any more.
+    pub(crate) const fn is_announced(&self) -> bool {
+        match self {
+            Self::Left | Self::GaveUp(_) => true,
+            Self::Crashed | Self::Hung | Self::LinkDown | Self::Restarted | Self::Duplicate => false,
+        }
+    }
+
+    /// The reason of a node that has announced its end. // spec: NDL-4.8
+    pub(crate) fn announced(gave_up: Option<LastWords>) -> Self {
+        gave_up.map_or(Self::Left, |words| Self::GaveUp(words.into()))
+    }
 }
 
 #[cfg(test)]

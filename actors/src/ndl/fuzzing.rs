@@ -12,11 +12,12 @@ use super::{
     Progress,
     core::{Core, Input, REMEMBERED_MAX, RememberedPeer, UNANSWERED_MAX},
     datagram::{
-        Announcement, Answer, Body, Claim, DATAGRAM_MAX, Datagram, encode, maker_of, parse, peek_answer,
+        Announcement, Answer, Body, Claim, DATAGRAM_MAX, Datagram, Leave, encode, maker_of, parse,
+        peek_answer,
     },
     peers_file,
 };
-use crate::config::NodeConfig;
+use crate::{config::NodeConfig, last_words::LastWords};
 
 const HERE: NodeAddress = NodeAddress::new(5);
 
@@ -51,7 +52,8 @@ pub(crate) fn some_datagrams() -> Vec<Vec<u8>> {
     let bodies = [
         Body::Query(announcement.clone()),
         Body::Answer(answer),
-        Body::Leave(announcement),
+        Body::Leave(announcement.clone().into()),
+        Body::Leave(Leave { announcement, gave_up: Some(LastWords::of("applications: knee.drive")) }),
         Body::Answer(answer_of_both),
         Body::Query(alone),
     ];

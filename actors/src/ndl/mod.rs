@@ -26,6 +26,7 @@
 //! | NDL-4.2 | but nobody is accused in a cycle to which our own timer came late by more than half a period; where it came late by less, as long again is given to read what was answered; of four such cycles in a row the fourth counts, and three respites are given; |
 //! | NDL-4.3 | when its connection broke and is refused, and it answers no question of after that: `Crashed`, until it answers a later query; |
 //! | NDL-4.4 | when it says so, from its own address, in its own life: `Left`. |
+//! | NDL-4.8 | or when it says so because it gave up: `GaveUp`, with its reason. |
 //! | NDL-4.6 | whose host is tried from its first missed answer on: `Hung` if it accepts, `Crashed` if it refuses, else `LinkDown`. |
 //! | NDL-4.7 | But not while GNCL reads of it: it lives, and is told to have an NDL that is not heard. |
 //! | NDL-5 | A node has one life at a time. |
@@ -64,7 +65,7 @@ mod socket;
 mod tests;
 mod untold;
 
-pub(crate) use actor::{NdlActor, new_core};
+pub(crate) use actor::{NdlActor, new_core, say_goodbye};
 pub(crate) use address::is_same_host;
 pub(crate) use core::Core;
 #[cfg(test)]

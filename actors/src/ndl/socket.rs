@@ -93,7 +93,16 @@ impl Sockets {
         self.0.clear();
     }
 
-    #[cfg(test)]
+    /// Sends from the open socket at `from`.
+    ///
+    /// # Errors
+    /// What the system says; that no socket is open there.
+    pub(super) fn send(&self, from: SocketAddr, bytes: &[u8], to: SocketAddr) -> io::Result<()> {
+        let is_it = |socket: &&UdpSocket| socket.local_addr().is_ok_and(|here| here == from);
+        let socket = self.all().find(is_it).ok_or(io::ErrorKind::AddrNotAvailable)?;
+        send(socket, bytes, to)
+    }
+
     pub(super) fn all(&self) -> impl Iterator<Item = &UdpSocket> {
         self.0.values().filter_map(|kept| kept.socket.as_ref())
     }

@@ -276,8 +276,9 @@ mod tests {
 
     #[test]
     fn the_reason_of_a_loss_is_the_last_one() {
-        let (node, incarnation, why) = (NODE, Incarnation(5), LossReason::Duplicate);
-        let as_duplicate = || Event::Membership(MembershipFact::NodeLost { node, incarnation, why });
+        let (node, incarnation) = (NODE, Incarnation(5));
+        let why = || LossReason::Duplicate;
+        let as_duplicate = || Event::Membership(MembershipFact::NodeLost { node, incarnation, why: why() });
         let told = kept(4, [lost(NODE, 5), found(NODE, 5), as_duplicate(), found(NODE, 3)]);
         assert_eq!(told, written([as_duplicate(), found(NODE, 3)]));
     }

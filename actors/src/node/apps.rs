@@ -25,6 +25,8 @@ struct Table {
     by_address: BTreeMap<AppAddress, ChildId>,
     /// Names of applications and of supervisors.
     names: BTreeMap<String, ChildId>,
+    /// Whether any of them has ever been ready.
+    any_ran: bool,
 }
 
 struct App {
@@ -109,6 +111,11 @@ impl Apps {
         self.0.borrow().apps.values().all(|app| app.progress != Progress::Coming)
     }
 
+    /// Whether any of them has ever been ready in this life of the node.
+    pub(super) fn any_ran(&self) -> bool {
+        self.0.borrow().any_ran
+    }
+
     /// Nobody takes messages any more.
     pub(super) fn close(&self) {
         self.0.borrow().apps.values().for_each(|app| app.mailbox.close());
@@ -123,10 +130,13 @@ impl Apps {
                 }
                 app.progress = Progress::Coming;
             }),
-            SupervisorFact::Ready(id) => self.change(*id, |app| {
-                app.progress = Progress::Running;
-                lncl::app_ready(stores, app.tid.app);
-            }),
+            SupervisorFact::Ready(id) => {
+                self.0.borrow_mut().any_ran = true;
+                self.change(*id, |app| {
+                    app.progress = Progress::Running;
+                    lncl::app_ready(stores, app.tid.app);
+                });
+            }
             SupervisorFact::Failed(id, reason) => self.change(*id, |app| {
                 app.progress = Progress::Coming;
                 app.tell_end(stores, reason);

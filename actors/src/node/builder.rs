@@ -1,12 +1,13 @@
 //! Declares a node and starts it.
 
 use std::{
-    path::PathBuf,
+    path::{Path, PathBuf},
     process::ExitCode,
     sync::mpsc::sync_channel,
     time::{Duration, SystemTime},
 };
 
+use serde::de::DeserializeOwned;
 use sinew_runtime::{
     app::DynApp,
     log::tracing::level_filters::LevelFilter,
@@ -22,7 +23,7 @@ use super::{
     supervisor_spec::SupervisorSpec,
 };
 use crate::{
-    config::{ConfigFaults, LogLevel, NodeConfig},
+    config::{ConfigFault, ConfigFaults, LogLevel, NodeConfig},
     inspect, log, process,
     secured::{KeyFault, Secured},
     stores::Stores,
@@ -32,6 +33,9 @@ use crate::{
 /// Applications of which the log says at the start that they wait.
 const WAITING_SHOWN_MAX: usize = 8;
 
+/// Makes an application of its settings.
+type Configured = Box<dyn FnOnce(&NodeConfig) -> Result<DynApp, ConfigFaults> + Send>;
+
 /// Declares a node: its configuration and its applications.
 pub struct NodeBuilder {
     config: NodeConfig,
@@ -39,6 +43,10 @@ pub struct NodeBuilder {
     incarnation: Option<Incarnation>,
     heed_signals: bool,
     accept_abort_on_panic: bool,
+    /// Applications that are made of settings, when the node starts.
+    configured: Vec<Configured>,
+    /// What is wrong with the file that it is made from.
+    file_faults: Vec<ConfigFault>,
     #[cfg(feature = "fault-points")]
     pub(super) faults: Vec<String>,
 }
@@ -95,7 +103,9 @@ pub enum StartError {
     #[error("{0}")]
     AddressTaken(String),
     /// Applications require each other in a circle: none of them can be the first.
-    #[error("these applications require each other in a circle: {}; take one requirement out", .0.join(" -> "))]
+    ///
+    /// The first one again at the end; of an application of another node with its node's name.
+    #[error("these applications require each other in a circle, so that none of them can start: {}; take one of these requirements out", .0.join(" requires "))]
     Cycle(Vec<String>),
     /// Applications wait for each other, some because their supervisor starts them in order.
     #[error("these applications wait for each other in a circle, by the order of their start and by what they require: {}; change the order, or take a requirement out", .0.join(" -> "))]
@@ -157,9 +167,67 @@ impl NodeBuilder {
             incarnation: None,
             heed_signals: false,
             accept_abort_on_panic: false,
+            configured: Vec::new(),
+            file_faults: Vec::new(),
             #[cfg(feature = "fault-points")]
             faults: Vec::new(),
         }
+    }
+
+    pub(super) fn from_file(path: &Path) -> Self {
+        let mut builder = Self::new(String::new());
+        (builder.config, builder.file_faults) = NodeConfig::read_file(path);
+        builder
+    }
+
+    /// Adds an application that is made of its settings: the table `[app.NAME]` of the node's file, read by serde. What is wrong with them is
+    /// found by [`start`](Self::start), together with all else that is wrong with the configuration.
+    ///
+    /// ```no_run
+    /// use sinew::prelude::*;
+    ///
+    /// #[derive(Clone, serde::Deserialize)]
+    /// struct DriveSettings { kp: f64 }
+    /// struct Drive(DriveSettings);
+    /// impl Actor for Drive { type Context = AppContext<Self>; }
+    ///
+    /// fn main() -> std::process::ExitCode {
+    ///     Node::from_file("knee.toml")
+    ///         .configured_app("knee.drive", |settings: DriveSettings| {
+    ///             AppSpec::new("knee.drive", move || Drive(settings.clone()))
+    ///         })
+    ///         .run()
+    /// }
+    /// ```
+    #[must_use]
+    pub fn configured_app<T: DeserializeOwned, A: Into<DynApp>>(
+        mut self,
+        name: impl Into<String>,
+        make: impl FnOnce(T) -> A + Send + 'static,
+    ) -> Self {
+        let name = name.into();
+        self.configured.push(Box::new(move |config| config.app(&name).map(|settings| make(settings).into())));
+        self
+    }
+
+    /// Reads the settings of applications, and checks all of the configuration.
+    fn check_config(&mut self) -> Result<(), ConfigFaults> {
+        let mut faults = std::mem::take(&mut self.file_faults);
+        let is_new =
+            |faults: &[ConfigFault], fault: &ConfigFault| faults.iter().all(|other| other.key != fault.key);
+        for found in self.config.validate().err().map(ConfigFaults::into_vec).unwrap_or_default() {
+            if is_new(&faults, &found) {
+                faults.push(found);
+            }
+        }
+        for make in std::mem::take(&mut self.configured) {
+            match make(&self.config) {
+                Ok(app) => self.tree = std::mem::replace(&mut self.tree, SupervisorSpec::new("")).app(app),
+                Err(found) => faults.extend(found.into_vec()),
+            }
+        }
+        faults.extend(self.config.unclaimed_settings());
+        ConfigFaults::check(faults)
     }
 
     /// Replaces the whole configuration: one read from a file, for instance.
@@ -258,7 +326,7 @@ impl NodeBuilder {
         // Here, on a thread like any other.
         log::begin();
         log::set_level(level(self.config.log.level));
-        self.config.validate()?;
+        self.check_config()?;
         check_panics(UNWINDS, self.accept_abort_on_panic)?;
         #[cfg(feature = "fault-points")]
         let planned = super::faults::read(&self.faults, &mut self.tree)?;

@@ -43,6 +43,7 @@ pub use tree::{LifeState, MailboxState, Supervised, Supervises, SupervisionTree}
 
 use std::{
     net::SocketAddr,
+    path::Path,
     process::ExitCode,
     sync::{
         Arc,
@@ -84,7 +85,7 @@ pub enum NodeEnd {
     GaveUp(String),
 }
 
-/// A running node. Dropping it stops it.
+/// A running node. Dropping it stops it; dropped by a panic, it gives up.
 #[derive(Debug)]
 pub struct Node {
     handle: NodeHandle,
@@ -139,6 +140,13 @@ impl Node {
         NodeBuilder::new(name.into())
     }
 
+    /// Begins the declaration of a node whose configuration is in the TOML file at `path`. What is wrong with the file is found by
+    /// [`NodeBuilder::start`], together with all else that is wrong.
+    #[must_use]
+    pub fn from_file(path: impl AsRef<Path>) -> NodeBuilder {
+        NodeBuilder::from_file(path.as_ref())
+    }
+
     /// Asks and stops, from any thread.
     #[must_use]
     pub fn handle(&self) -> NodeHandle {
@@ -170,6 +178,7 @@ impl Node {
             wait_for_ever();
         }
         let _ = self.handle.tell(RootEvent::HeedSignals);
+        let _ = self.handle.tell(RootEvent::RunsAlone);
         match self.wait() {
             NodeEnd::Stopped => ExitCode::SUCCESS,
             NodeEnd::GaveUp(why) => {
@@ -207,7 +216,12 @@ fn wait_for_ever() -> ! {
 impl Drop for Node {
     fn drop(&mut self) {
         if self.thread.is_some() {
-            self.handle.stop();
+            if std::thread::panicking() {
+                // Peers must not take this for an orderly stop.
+                let _ = self.handle.tell(RootEvent::OwnerPanicked);
+            } else {
+                self.handle.stop();
+            }
             self.wait();
         }
     }

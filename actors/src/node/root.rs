@@ -40,7 +40,8 @@ use super::{
     wind_up::{self, Branch, Heirs},
 };
 use crate::{
-    lncl, process,
+    last_words::LastWords,
+    lncl, ndl, process,
     signals::StopSignals,
     stores::{Stores, lock},
 };
@@ -60,6 +61,8 @@ pub(super) enum Phase {
 /// Names that require each other in a circle, the first one again at the end.
 struct Cycle {
     names: Vec<String>,
+    /// The same with the names of other nodes.
+    labels: Vec<String>,
     /// Those of them that are applications of this node.
     ours: Vec<ChildId>,
 }
@@ -94,6 +97,8 @@ pub(super) struct Root {
     ended: SyncSender<NodeEnd>,
     tell_when_running: Vec<Asker>,
     heeds_signals: bool,
+    /// Nobody but the node itself handles an end.
+    runs_alone: bool,
 }
 
 /// The root thread's whole life.
@@ -133,6 +138,7 @@ pub(super) fn run(
         ended,
         tell_when_running: Vec::new(),
         heeds_signals: false,
+        runs_alone: false,
         stores,
     };
     part_from_threads();
@@ -185,10 +191,16 @@ impl StreamHandler<RootEvent> for Root {
     fn handle(&mut self, event: RootEvent, context: &mut Context<Self>) {
         match event {
             RootEvent::Release { app } => self.release(app),
-            RootEvent::RequirementCycle { names } => {
+            RootEvent::RequirementCycle { names, labels } => {
                 let ours = names.iter().filter_map(|name| self.apps.named(name)).collect();
-                self.cycle = Some(Cycle { names, ours });
+                self.cycle = Some(Cycle { names, labels, ours });
                 self.tell_if_running();
+                self.end_on_circle();
+            }
+            RootEvent::RunsAlone => {
+                self.runs_alone = true;
+                self.tell_if_running();
+                self.end_on_circle();
             }
             RootEvent::Layers(fact) => self.layers_said(fact, context),
             RootEvent::Apps(fact) => self.apps_said(fact),
@@ -199,6 +211,10 @@ impl StreamHandler<RootEvent> for Root {
             RootEvent::TellProgress(answer) => _ = answer.send(self.progress()),
             RootEvent::HeedSignals => self.heed_signals(context),
             RootEvent::StopOrdered => self.stop_apps(),
+            RootEvent::OwnerPanicked => {
+                self.gives_up("the thread that owns the node panicked".to_owned());
+                self.stop_apps();
+            }
             #[cfg(feature = "fault-points")]
             RootEvent::Fail => panic!("a fault was planned for the root"),
             #[cfg(feature = "fault-points")]
@@ -246,7 +262,12 @@ impl Root {
 
     fn layers_ended(&mut self, reason: &Reason, context: &mut Context<Self>) {
         if let Reason::GaveUp(why) = reason {
-            self.end = NodeEnd::GaveUp(format!("layers: {why}"));
+            self.gives_up(format!("layers: {why}"));
+            if matches!(self.phase, Phase::StartingLayers | Phase::Running) {
+                // Its own NDL is gone, and the applications have yet to stop.
+                let _ = self.stores.gave_up.set(LastWords::of(why));
+                ndl::say_goodbye(&self.stores);
+            }
         }
         self.layer_supervisor = None;
         if let Some(started) = self.started.take() {
@@ -419,9 +440,29 @@ impl Root {
         }
     }
 
+    /// Applications of this node can never start: it ends, but only while none of its applications has run. spec: SYNC-7
+    fn end_on_circle(&mut self) {
+        let is_new = matches!(self.phase, Phase::StartingLayers | Phase::Running) && !self.apps.any_ran();
+        let Some(cycle) =
+            self.cycle.as_ref().filter(|cycle| self.runs_alone && is_new && !cycle.ours.is_empty())
+        else {
+            return;
+        };
+        let why = StartError::Cycle(cycle.labels.clone()).to_string();
+        self.gives_up(why);
+        self.stop_apps();
+    }
+
+    /// The first reason counts: what fails while the node stops follows from it.
+    fn gives_up(&mut self, why: String) {
+        if self.end == NodeEnd::Stopped {
+            self.end = NodeEnd::GaveUp(why);
+        }
+    }
+
     fn apps_ended(&mut self, reason: &Reason) {
         if let Reason::GaveUp(why) = reason {
-            self.end = NodeEnd::GaveUp(format!("applications: {why}"));
+            self.gives_up(format!("applications: {why}"));
         }
         self.app_supervisor = None;
         self.answer_all_that_wait();
@@ -452,7 +493,7 @@ impl Root {
         if is_running || self.cycle.is_some() {
             for asker in self.tell_when_running.drain(..) {
                 asker.answer(match &self.cycle {
-                    Some(cycle) if !is_running => Err(StartError::Cycle(cycle.names.clone())),
+                    Some(cycle) if !is_running => Err(StartError::Cycle(cycle.labels.clone())),
                     Some(_) | None => Ok(()),
                 });
             }
@@ -475,6 +516,10 @@ impl Root {
 
     fn stop_layers(&mut self) {
         self.phase = Phase::StoppingLayers;
+        if let NodeEnd::GaveUp(why) = &self.end {
+            // Before its layers say goodbye. spec: NDL-4.8
+            let _ = self.stores.gave_up.set(LastWords::of(why));
+        }
         self.stores.stopping.store(true, Ordering::Relaxed);
         match &self.layer_supervisor {
             Some(supervisor) => order(supervisor, Input::StopOrdered),

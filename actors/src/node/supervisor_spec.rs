@@ -12,6 +12,7 @@ use sinew_runtime::{
 };
 
 use super::{StartError, places};
+use crate::sync;
 
 /// Declares a supervisor: who is restarted when one of its children fails, how often, and who its children are. Children are
 /// applications and supervisors, in the order of their start; they are stopped in the reverse order.
@@ -177,7 +178,17 @@ impl SupervisorSpec {
         self.check_places()?;
         let mut edges = Edges::default();
         self.enter(&mut edges);
-        edges.check()
+        edges.check()?;
+        self.check_requirements()
+    }
+
+    /// Applications of this node that require each other in a circle. A name that this node does not have is a way out: another node may
+    /// have it. spec: SYNC-7
+    fn check_requirements(&self) -> Result<(), StartError> {
+        let read = |app: &DynApp| app.requires().iter().filter_map(|text| text.parse().ok()).collect();
+        let apps: BTreeMap<&str, Vec<Requirement>> =
+            self.apps().into_iter().map(|app| (app.name(), read(app))).collect();
+        sync::circle_of(&apps).map_or(Ok(()), |names| Err(StartError::Cycle(names)))
     }
 
     fn check_names<'a>(&'a self, names: &mut BTreeSet<&'a str>) -> Result<(), StartError> {

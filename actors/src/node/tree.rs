@@ -198,7 +198,8 @@ impl Root {
             name: who.map_or_else(|| id.to_string(), |who| who.name),
             state: state(&view, is_paused),
             // One that was never started has waited since the node's start.
-            since: now.since(view.since.max(self.began)),
+            // One that cannot start is tried again and again: since its first failure.
+            since: now.since(view.cannot_start_since.unwrap_or(view.since).max(self.began)),
             generation: view.generation,
             restarts: view.restarts,
             last_reason: view.last_reason.map(|reason| roster.name_children(reason)),

@@ -17,7 +17,7 @@ use super::{
     NodeEnd,
     root::{Root, RootEvent},
 };
-use crate::stores::Stores;
+use crate::{last_words::LastWords, stores::Stores};
 
 /// Time that the applications, and then the layers, have to end when the root has failed, beyond what each was declared with.
 const WIND_UP_WITHIN: Duration = Duration::from_secs(5);
@@ -83,12 +83,14 @@ pub(super) async fn oversee(root: Root, heirs: Heirs, stores: Arc<Stores>, ended
     let mut events = stores.posts.root.attach();
     heirs.stop(Branch::Apps);
     wait(&mut events, Branch::Apps, &heirs).await;
+    let why = format!("the root {reason}");
+    let _ = stores.gave_up.set(LastWords::of(&why));
     stores.stopping.store(true, Ordering::Relaxed);
     heirs.stop(Branch::Layers);
     wait(&mut events, Branch::Layers, &heirs).await;
     stores.close();
     // The owner may be gone: then nobody wants to know.
-    let _ = ended.try_send(NodeEnd::GaveUp(format!("the root {reason}")));
+    let _ = ended.try_send(NodeEnd::GaveUp(why));
 }
 
 /// Waits until this branch has ended, if there is one, and not for ever: its supervisor keeps the time of each child.

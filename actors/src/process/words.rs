@@ -86,6 +86,8 @@ pub(super) enum Ending {
     RequirementLost(String),
     /// It does not come back; in what.
     Hung(String),
+    /// It cannot start now; why.
+    StartFailed(String),
     /// Something else, in words.
     Other(String),
 }
@@ -97,6 +99,7 @@ impl From<&Reason> for Ending {
             Reason::RequirementLost(name) => Self::RequirementLost(name.clone()),
             Reason::Panic(said) => Self::Panic(cut(said)),
             Reason::Hung(what) => Self::Hung(cut(what)),
+            Reason::StartFailed(why) => Self::StartFailed(cut(why)),
             other @ (Reason::StartTimeout
             | Reason::Killed
             | Reason::ThreadEnded
@@ -117,6 +120,7 @@ impl From<Ending> for Reason {
             Ending::Panic(said) => Self::Panic(said),
             Ending::RequirementLost(name) => Self::RequirementLost(name),
             Ending::Hung(what) => Self::Hung(what),
+            Ending::StartFailed(why) => Self::StartFailed(why),
             Ending::Other(what) => Self::ProcessEnded(what),
         }
     }

@@ -29,7 +29,7 @@ use crate::{
     ndl::MembershipFact,
     node::RootEvent,
     refusals::{PEER_GONE, Refusals},
-    stores::{POST_CAPACITY, Stores},
+    stores::{self, POST_CAPACITY, Stores},
     wills,
 };
 
@@ -126,10 +126,10 @@ impl SyncManager {
                 self.handle(Input::MembershipChanged(fact), ctx);
             }
             Event::Link(fact) => {
-                if let Some(input) = monitors::Input::of_link(fact) {
+                if let Some(input) = monitors::Input::of_link(&fact) {
                     monitors::feed(&self.stores, input);
                 }
-                if let Some(input) = wills::Input::of_link(fact) {
+                if let Some(input) = wills::Input::of_link(&fact) {
                     wills::feed(&self.stores, input);
                 }
                 self.handle(Input::LinkChanged(fact), ctx);
@@ -329,6 +329,17 @@ impl SyncManager {
                 application = waiting.application,
                 "{waiting}; it goes on waiting. Are these applications started, and spelled right?"
             ),
+            Output::Misspelt { application, name, nearest } => {
+                let nearest = if nearest.is_empty() {
+                    "none is similar".to_owned()
+                } else {
+                    format!("nearest: {}", nearest.join(", "))
+                };
+                crate::log::warn!(
+                    application,
+                    "{application} waits for `{name}`, which no application is called; {nearest}. Is it spelled right, and its node started?"
+                );
+            }
             Output::SameName { name, tids } => crate::log::warn!(
                 name,
                 ?tids,
@@ -435,14 +446,27 @@ impl SyncManager {
     }
 
     fn refuse_cycle(&self, names: Vec<String>) {
-        let spelled = names.join(" -> ");
+        let labels: Vec<String> = names.iter().map(|name| self.with_node(name)).collect();
+        let spelled = labels.join(" requires ");
         crate::log::error!(
             "these applications require each other in a circle, so that none of them can ever start: {spelled}; \
              remove one of these requirements"
         );
-        if self.stores.posts.root.post(RootEvent::RequirementCycle { names }).is_err() {
+        if self.stores.posts.root.post(RootEvent::RequirementCycle { names, labels }).is_err() {
             self.refuse("root", &"the node's root is too busy to hear of a cycle of requirements");
         }
+    }
+
+    /// The name, with that of its node where that is another one.
+    fn with_node(&self, name: &str) -> String {
+        let tid = self.core().called(name).first().copied();
+        let Some(node) = tid.map(|tid| tid.node).filter(|node| *node != self.stores.node) else {
+            return name.to_owned();
+        };
+        // NDL's lock and this core's are never held together.
+        let members = stores::lock(&self.stores.ndl).members(Time::now());
+        let called = members.into_iter().find(|member| member.node == node).map(|member| member.name);
+        format!("{name} (node {})", called.unwrap_or_else(|| node.to_string()))
     }
 
     fn tid(&self) -> Tid {

@@ -35,7 +35,7 @@ mod list;
 mod words;
 
 pub(crate) use actor::SyncManager;
-pub(crate) use core::Core;
+pub(crate) use core::{Core, circle_of};
 #[cfg(test)]
 pub(crate) use core::{Input, Output};
 pub(crate) use facts::OwnApp;
@@ -68,7 +68,7 @@ impl Event {
         match self {
             Self::App(fact) => Self::App(fact.clone()),
             Self::Membership(fact) => Self::Membership(fact.clone()),
-            Self::Link(fact) => Self::Link(*fact),
+            Self::Link(fact) => Self::Link(fact.clone()),
             Self::Monitors => Self::Monitors,
             Self::Message(message) => Self::Message(Message::new(message.header, message.payload.clone())),
         }

@@ -29,7 +29,12 @@ impl Input {
             MembershipFact::NodeLost {
                 node,
                 incarnation,
-                why: LossReason::Crashed | LossReason::Hung | LossReason::LinkDown | LossReason::Restarted,
+                why:
+                    LossReason::GaveUp(_)
+                    | LossReason::Crashed
+                    | LossReason::Hung
+                    | LossReason::LinkDown
+                    | LossReason::Restarted,
             } => Some(Self::NodeLost { node, incarnation }),
             MembershipFact::NodeLost { node, incarnation, why: LossReason::Duplicate } => {
                 Some(Self::WasNobody { node, incarnation })
@@ -38,11 +43,16 @@ impl Input {
     }
 
     /// What a link's change is to wills; `None`: nothing.
-    pub(crate) const fn of_link(fact: LinkFact) -> Option<Self> {
-        match fact {
+    pub(crate) fn of_link(fact: &LinkFact) -> Option<Self> {
+        match *fact {
             LinkFact::LinkUp { node, incarnation } => Some(Self::LinkUp { node, incarnation }),
             LinkFact::LinkBroken { node, incarnation } => Some(Self::LinkBroken { node, incarnation }),
-            LinkFact::PeerLeft { node, incarnation } => Some(Self::NodeLeft { node, incarnation }),
+            LinkFact::PeerLeft { node, incarnation, gave_up: None } => {
+                Some(Self::NodeLeft { node, incarnation })
+            }
+            LinkFact::PeerLeft { node, incarnation, gave_up: Some(_) } => {
+                Some(Self::NodeLost { node, incarnation })
+            }
             LinkFact::DialRefused { .. } => None,
         }
     }

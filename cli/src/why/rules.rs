@@ -347,6 +347,9 @@ pub(crate) fn lost_in_words(lost: &LostReport) -> (String, &'static str) {
             format!("lost {ago} ago: it had not answered for {}, nor had its host", time(lost.silent_us)),
             "is the cable in, the interface up (`ip link`), the way free (`ping` its host), its host on?",
         ),
+        why if why.starts_with("gave up") => {
+            (format!("lost {ago} ago: it {why}"), "mend that, and start it again; its log says more")
+        }
         why => (format!("lost {ago} ago: {why}"), "its log says more"),
     }
 }

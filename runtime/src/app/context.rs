@@ -8,13 +8,13 @@ use actix::{
 };
 
 use crate::{
-    app::Delivery,
+    app::{Delivery, requirement::Parting},
     monitor::{MonitorError, MonitorId},
     outcome::{Outcome, Rejection},
     protection::{Cause, DataId, Echo, Guard, Guarded},
     schedule::{Schedule, Tick, TimerId},
     sender::{Destination, MessageBuilder, SendError, Sender, Value, Via},
-    supervision::{ReadyGate, vitals::Vitals},
+    supervision::{ReadyGate, Reason, vitals::Vitals},
     tid::Tid,
     time::Time,
     wire::{Header, Kind, Payload},
@@ -28,6 +28,8 @@ pub struct AppContext<A: Actor<Context = Self>> {
     pub(super) schedule: Schedule<Action<A>>,
     pub(super) watches: Vec<Watch<A>>,
     pub(super) ready: Option<ReadyGate>,
+    /// How it ends, where it says so itself.
+    parting: Parting,
     /// When a payload that cannot be read was last logged.
     warned: Option<Time>,
     /// Those since then.
@@ -86,7 +88,12 @@ pub(super) struct Watch<A: Actor> {
 }
 
 impl<A: Actor<Context = Self>> AppContext<A> {
-    pub(super) fn into_life(sender: Sender, ready: ReadyGate, actor: A) -> ContextFut<A, Self> {
+    pub(super) fn into_life(
+        sender: Sender,
+        ready: ReadyGate,
+        actor: A,
+        parting: Parting,
+    ) -> ContextFut<A, Self> {
         let mailbox = actix::dev::Mailbox::default();
         let mut context = Self {
             parts: ContextParts::new(mailbox.sender_producer()),
@@ -95,6 +102,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
             schedule: Schedule::default(),
             watches: Vec::new(),
             ready: Some(ready),
+            parting,
             warned: None,
             unlogged: 0,
             verdict: None,
@@ -324,6 +332,19 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     /// calibrate first. `None` if it is ready already; call it in `started`.
     pub fn hold_ready(&mut self) -> Option<ReadyGate> {
         self.ready.take()
+    }
+
+    /// Fails the start of this application, which cannot run now: a device is not plugged in, for example. Call it in `started`, or later
+    /// as long as the application [holds its readiness](Self::hold_ready), and return.
+    ///
+    /// It is started again after a wait that grows ([`AppSpec::start_retry`](super::AppSpec::start_retry)), and is not ready until then:
+    /// applications that require it wait, and messages wait in its mailbox. The reason is logged once for as long as it stays the same. Such a
+    /// failure does not count towards restart intensity, as a panic does. Of an application that is ready already it is a failure that counts.
+    pub fn fail_start(&mut self, why: impl Into<String>) {
+        // Not ready by the end of `started`.
+        self.ready = None;
+        *self.parting.borrow_mut() = Some(Reason::StartFailed(why.into()));
+        self.stop();
     }
 }
 

@@ -200,6 +200,19 @@ pub(super) fn event_in<A: Actor<Context = AppContext<A>>>(
     if message.header.kind == RequirementEvent::KIND && is_ours { message.decode().ok() } else { None }
 }
 
+/// An application whose factory could not make its actor.
+pub(super) struct Unmade(pub(super) String);
+
+impl Life for Unmade {
+    fn poll(&mut self, _: &mut std::task::Context<'_>) -> std::task::Poll<Reason> {
+        std::task::Poll::Ready(Reason::StartFailed(std::mem::take(&mut self.0)))
+    }
+
+    fn stop(&mut self) {}
+
+    fn terminate(&mut self) {}
+}
+
 /// A life that may say itself how it ended.
 pub(super) struct PartingLife {
     pub(super) life: Box<dyn Life>,

@@ -8,11 +8,11 @@ use crate::{
     app::{
         Absence, AppContext, Delivery, DownPolicy, Raw, RequirementEvent, RequirementPolicy, WILLS_MAX, Will,
         drive::{Dispatch, Drive, dispatch_raw, dispatch_typed},
-        requirement::{Parting, PartingLife, Requirements, SafeState},
+        requirement::{Parting, PartingLife, Requirements, SafeState, Unmade},
     },
     mailbox::Mailbox,
     sender::Sender,
-    supervision::{Launch, Place, Policy, Restart, life, vitals::Vitals},
+    supervision::{Launch, Life, Place, Policy, Restart, StartRetry, life, vitals::Vitals},
     tid::AppAddress,
     wire::{Kind, Payload, remember},
 };
@@ -44,7 +44,7 @@ use crate::{
 /// let spec = spec.while_down(DownPolicy::Drop).last_will(Tid::group("followers"), &Angle { degrees: 0.0 });
 /// ```
 pub struct AppSpec<A: Actor<Context = AppContext<A>>> {
-    factory: Arc<dyn Fn() -> A + Send + Sync>,
+    factory: Arc<dyn Fn() -> Result<A, String> + Send + Sync>,
     handlers: Vec<(Kind, Dispatch<A>)>,
     pub(super) common: Common,
     pub(super) safe_state: Option<SafeState<A>>,
@@ -70,8 +70,29 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     /// An application called `name` (1 to 63 bytes, unique on its node). `factory` makes a new actor for its start and
     /// for each restart. It runs on the thread that the node's applications share, until a place is set.
     pub fn new(name: impl Into<String>, factory: impl Fn() -> A + Send + Sync + 'static) -> Self {
+        Self::made_by(name.into(), Arc::new(move || Ok(factory())))
+    }
+
+    /// The same with a factory that may fail, as it opens a device for example. Its error fails the start, as
+    /// [`AppContext::fail_start`] does.
+    ///
+    /// ```
+    /// # use sinew_runtime::app::{AppContext, AppSpec};
+    /// struct Imu(std::fs::File);
+    /// # impl actix::Actor for Imu { type Context = AppContext<Self>; }
+    /// let open = || std::fs::File::open("/dev/ttyUSB0").map(Imu);
+    /// let imu = AppSpec::try_new("imu", move || open().map_err(|error| format!("/dev/ttyUSB0: {error}; plug it in")));
+    /// ```
+    pub fn try_new<E: std::fmt::Display>(
+        name: impl Into<String>,
+        factory: impl Fn() -> Result<A, E> + Send + Sync + 'static,
+    ) -> Self {
+        Self::made_by(name.into(), Arc::new(move || factory().map_err(|error| error.to_string())))
+    }
+
+    fn made_by(name: String, factory: Arc<dyn Fn() -> Result<A, String> + Send + Sync>) -> Self {
         let common = Common {
-            name: name.into(),
+            name,
             address: None,
             requires: Vec::new(),
             kinds: Vec::new(),
@@ -84,7 +105,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
             #[cfg(feature = "fault-points")]
             faults: Vec::new(),
         };
-        Self { factory: Arc::new(factory), handlers: Vec::new(), common, safe_state: None }
+        Self { factory, handlers: Vec::new(), common, safe_state: None }
     }
 
     /// It handles payloads of type `P`. Layers' events are payloads too: to handle `NodeEvent` is to subscribe to it.
@@ -192,6 +213,14 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
+    /// How a start is tried again that failed by [`AppContext::fail_start`] or by the error of [`try_new`](Self::try_new). Default: after 100 ms
+    /// at first, doubled each time up to 5 s, without an end.
+    #[must_use]
+    pub const fn start_retry(mut self, retry: StartRetry) -> Self {
+        self.common.policy.start_retry = retry;
+        self
+    }
+
     /// Time that it has to become ready once it is started. Default 10 s; after it the start has failed and is tried again.
     /// One that holds its readiness (`hold_ready`) for a device that may be off sets what it is willing to wait.
     #[must_use]
@@ -257,16 +286,20 @@ impl<A: Actor<Context = AppContext<A>>> From<AppSpec<A>> for DynApp {
                 // Before the factory: if that comes back after another life has taken this one's place, the reader is the
                 // other's, and stays so.
                 let reader = wiring.mailbox.attach();
-                let actor = factory();
+                let made = factory();
                 if vitals.is_over() {
                     vitals.leave();
                 }
+                let actor = match made {
+                    Ok(actor) => actor,
+                    Err(why) => return Box::new(Unmade(why)) as Box<dyn Life>,
+                };
                 vitals.reads(wiring.mailbox.clone(), reader.epoch(), kinds.clone());
                 let sender = wiring.sender.in_life(vitals.clone());
                 let parting = Parting::default();
                 let requirements = Requirements::new(on_lost, safe_state.clone(), parting.clone());
                 let drive = Drive::new(reader, handlers.clone(), requirements, vitals);
-                let mut running = AppContext::into_life(sender, ready, actor);
+                let mut running = AppContext::into_life(sender, ready, actor, parting.clone());
                 running.ctx().spawn(drive);
                 Box::new(PartingLife { life: life(running), parting })
             });

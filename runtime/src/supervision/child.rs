@@ -11,11 +11,13 @@ pub(super) struct Child {
     pub(super) reprieve: Option<Reprieve>,
     /// Nobody was told yet that this life has ended.
     pub(super) is_owed: bool,
+    /// Why it could not start, as was logged; it has not started since.
+    pub(super) cannot_start: Option<String>,
 }
 
 impl Child {
     pub(super) const fn new(spec: ChildSpec) -> Self {
-        Self { spec, tenant: None, reprieve: None, is_owed: false }
+        Self { spec, tenant: None, reprieve: None, is_owed: false, cannot_start: None }
     }
 
     /// Nobody makes it again: what makes it is the user's, and is not dropped here. Returns what is left of its life.

@@ -55,7 +55,7 @@ pub use self::{
     burial::Burials,
     core::{
         AutoShutdown, BranchView, ChildId, ChildIds, ChildState, ChildView, Command, Flags, Generation,
-        Input, Intensity, Policy, Reason, Refusal, Restart, Strategy,
+        Input, Intensity, Policy, Reason, Refusal, Restart, StartRetry, Strategy,
     },
     guard::{Life, life},
     own_system::{part_from_threads, tell_of_a_stop},

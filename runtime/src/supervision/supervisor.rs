@@ -269,6 +269,7 @@ impl Supervisor {
                 self.note(id, "ready");
                 if let Some(child) = self.children.get_mut(&id) {
                     child.reprieve = None;
+                    child.cannot_start = None;
                 }
                 (self.listener)(SupervisorFact::Ready(id));
             }
@@ -323,9 +324,26 @@ impl Supervisor {
         crate::log::debug!(supervisor, child, tid, generation, restarts, waiting, "{what}");
     }
 
-    fn note_end(&self, id: ChildId, reason: &Reason) {
+    fn note_end(&mut self, id: ChildId, reason: &Reason) {
+        if let Reason::StartFailed(why) = reason
+            && let Some(child) = self.children.get_mut(&id)
+            && child.cannot_start.replace(why.clone()).as_ref() == Some(why)
+        {
+            // That was logged when it failed so first.
+            return self.note(id, "cannot start yet");
+        }
         let Standing { supervisor, generation, restarts } = self.roster.standing(id);
         let (child, tid, waiting) = (self.roster.name(id), self.tid_of(id), self.waiting(id));
+        if let Reason::StartFailed(why) = reason {
+            return crate::log::warn!(
+                supervisor,
+                child,
+                tid,
+                generation,
+                waiting,
+                "{child} cannot start: {why}. It is tried again, and this is logged again when the reason changes"
+            );
+        }
         if *reason == Reason::Shutdown {
             return crate::log::debug!(supervisor, child, tid, generation, restarts, waiting, %reason, "a child ended");
         }
@@ -350,7 +368,7 @@ impl Supervisor {
 
     fn spawn(&mut self, id: ChildId, generation: Generation) {
         install_hook();
-        let Some(Child { spec, tenant: held, reprieve, is_owed }) = self.children.get_mut(&id) else {
+        let Some(Child { spec, tenant: held, reprieve, is_owed, .. }) = self.children.get_mut(&id) else {
             return;
         };
         let mut threads = self.threads.borrow_mut();

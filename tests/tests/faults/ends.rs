@@ -1,5 +1,10 @@
 //! How nodes end: restarts that are too many, faults while a node stops, groups of faults at once.
 
+use std::sync::{
+    Arc,
+    atomic::{AtomicU64, Ordering},
+};
+
 use sinew::{NodeEnd, fault::Fault, prelude::*};
 use sinew_tests::{
     DEADLINE, Ground, all_run,
@@ -35,6 +40,40 @@ fn as_many_restarts_as_are_allowed_are_survived_and_one_more_is_the_end() {
     let why = gave_up(node);
     assert!(why.starts_with("applications: more than 2 restarts"), "{why}");
     assert_eq!(lives(&log), 3);
+}
+
+#[test]
+fn an_application_whose_device_is_absent_is_tried_again_uncounted_and_those_that_require_it_wait() {
+    // Given: a drive that finds its device at the third start, and a reader whose factory finds its own at the second
+    let drive = Stage::new().started(|puppet, context| {
+        if puppet.life < 3 {
+            context.fail_start("device /dev/ttyUSB0 is absent: plug it in");
+        }
+    });
+    let (drive, log) = drive.app("drive");
+    let tries = Arc::new(AtomicU64::new(0));
+    let reader = AppSpec::try_new("reader", move || match tries.fetch_add(1, Ordering::Relaxed) {
+        0 => Err("device /dev/ttyUSB1 is absent"),
+        _ => Ok(Reader),
+    });
+    let (gait, seen) = Stage::new().app("gait");
+    // When: no restart is allowed
+    let node = Ground::new().node("node").configure(|config| config.supervision.app_restarts_max = 0);
+    let gait = gait.requires(["drive", "reader"]);
+    let node = node.app(drive).app(reader).app(gait).start().expect("a node");
+    // Then
+    all_run(&[&node]);
+    assert_eq!(lives(&log), 3);
+    assert!(seen.all().contains(&Seen::Started(1)));
+    // A panic counts all the same.
+    node.handle().inject("drive", Fault::panic()).expect("it is there");
+    assert!(gave_up(node).starts_with("applications: more than 0 restarts"));
+}
+
+struct Reader;
+
+impl Actor for Reader {
+    type Context = AppContext<Self>;
 }
 
 #[test]

@@ -5,7 +5,7 @@ use std::{
     sync::{Arc, Mutex},
 };
 
-use sinew::{Rejection, SendError, Sender, prelude::*};
+use sinew::{Rejection, SendError, Sender, fault::Fault, prelude::*};
 use sinew_runtime::{app::DynApp, post::Post};
 use sinew_tests::{
     DEADLINE, Ground, Log, all_run,
@@ -333,10 +333,50 @@ fn one_panic_too_many_ends_the_node_in_order_and_the_other_nodes_are_told() {
     assert_eq!(lives(&log), 6);
     assert!(other.all().ends_with(&[Seen::Stopping(1), Seen::Dropped(1)]), "{:?}", other.all());
     seen.wait_for(Seen::Requirement(RequirementEvent::Lost { name: "wild".to_owned() }));
-    let left =
-        |seen: &Seen| matches!(seen, Seen::Node(NodeEvent::NodeLost { why: sinew::LossReason::Left, .. }));
-    seen.wait("the goodbye of the failing node", |all| all.iter().any(left).then_some(()));
+    let is_told = |seen: &Seen| {
+        matches!(seen, Seen::Node(NodeEvent::NodeLost { why: sinew::LossReason::GaveUp(words), .. })
+            if words.contains("more than 5 restarts"))
+    };
+    seen.wait("the reason of the failing node", |all| all.iter().any(is_told).then_some(()));
     assert_eq!(lives(&seen), 1, "a lost requirement is told, not obeyed by a restart");
+}
+
+#[test]
+fn a_node_that_a_panic_of_its_owner_drops_gives_up_and_is_not_taken_for_stopped() {
+    let ground = Ground::new();
+    let node = ground.node("failing").app(Stage::new().app("calm").0).start().expect("a node");
+    let (witness, seen) = Stage::new().app("witness");
+    let witness = witness.handles::<NodeEvent>().requires(["calm"]);
+    let there = ground.node("there").app(witness).start().expect("a node");
+    all_run(&[&node, &there]);
+    let owner = std::thread::spawn(move || {
+        let _node = node;
+        panic!("on the owner's thread");
+    });
+    assert!(owner.join().is_err());
+    let why = seen.wait("its loss", |all| all.iter().find_map(loss));
+    assert!(matches!(&why, sinew::LossReason::GaveUp(words) if words.contains("panicked")), "{why:?}");
+}
+
+#[test]
+fn a_node_whose_layers_give_up_is_lost_for_that_reason() {
+    let ground = Ground::new();
+    let failing = ground.node("failing").configure(|config| config.supervision.layer_restarts_max = 0);
+    let node = failing.app(Stage::new().app("calm").0).start().expect("a node");
+    let (witness, seen) = Stage::new().app("witness");
+    let witness = witness.handles::<NodeEvent>().requires(["calm"]);
+    let there = ground.node("there").app(witness).start().expect("a node");
+    all_run(&[&node, &there]);
+    node.handle().inject("NDL", Fault::panic()).expect("every node has it");
+    let why = seen.wait("its loss", |all| all.iter().find_map(loss));
+    assert!(matches!(&why, sinew::LossReason::GaveUp(words) if words.contains("restarts")), "{why:?}");
+}
+
+fn loss(seen: &Seen) -> Option<sinew::LossReason> {
+    match seen {
+        Seen::Node(NodeEvent::NodeLost { why, .. }) => Some(why.clone()),
+        _ => None,
+    }
 }
 
 /// All applications of a node at once.

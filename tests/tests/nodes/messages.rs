@@ -283,13 +283,45 @@ fn requirements_in_a_circle_are_refused_with_the_circle_spelled_out() {
     let (first, _a) = oracle("first");
     let (second, _b) = oracle("second");
     let node = node("circle", 1, own_group()).app(first.requires(["second"])).app(second.requires(["first"]));
-    let node = node.start().expect("the layers start");
-    let error = node.handle().wait_until_running(DEADLINE).expect_err("nobody can be the first");
-    let words = error.to_string();
-    assert!(
-        words.contains("first -> second -> first") || words.contains("second -> first -> second"),
-        "{words}"
-    );
+    let error = node.start().expect_err("nobody can be the first");
+    assert!(error.to_string().contains("first requires second requires first"), "{error}");
+}
+
+#[test]
+fn a_requirement_that_anything_else_can_meet_closes_no_circle_at_the_start() {
+    let app = |name: &str, requires: &str| oracle(name).0.requires([requires]);
+    let either =
+        node("either", 1, own_group()).app(app("first", "second | other")).app(app("second", "first"));
+    either.start().expect("another node may have `other`");
+    let many = node("many", 1, own_group()).app(app("first", "2 of second.*")).app(app("second.a", "first"));
+    many.start().expect("other nodes may have more of them");
+    let limited =
+        node("limited", 1, own_group()).app(app("first", "second")).app(app("second", "first ?50ms"));
+    let limited = limited.start().expect("one of them goes on without the other");
+    limited.handle().wait_until_running(DEADLINE).expect("both run");
+}
+
+#[test]
+fn a_run_ends_with_a_circle_through_another_node_and_a_node_that_runs_others_goes_on() {
+    // Given: a node that runs another application beside the one in the circle
+    let group = own_group();
+    let app = |name: &str| oracle(name).0;
+    let there = node("there", 2, group).app(app("other")).app(app("knee").requires(["hip"]));
+    let there = there.start().expect("the layers start");
+    until("the other one runs", || there.handle().directory().iter().any(|entry| entry.ready).then_some(()));
+    let handle = there.handle();
+    let runs_on = std::thread::spawn(move || there.run());
+    // When: a node starts that closes the circle, and runs nothing else
+    let here = node("here", 1, group).app(app("hip").requires(["knee"])).start().expect("the layers start");
+    let asked = here.handle();
+    let error = asked.wait_until_running(DEADLINE).expect_err("nobody can be the first");
+    assert!(error.to_string().contains("hip requires knee (node there) requires hip"), "{error}");
+    // Then
+    assert_eq!(format!("{:?}", here.run()), format!("{:?}", std::process::ExitCode::FAILURE));
+    assert!(!runs_on.is_finished(), "the circle ends no node that runs");
+    assert!(handle.directory().iter().any(|entry| entry.name == "other" && entry.ready));
+    handle.stop();
+    runs_on.join().expect("it was stopped");
 }
 
 #[test]

@@ -3,17 +3,26 @@
 use std::time::Duration;
 
 use actix::{ActorContext, AsyncContext, Context};
+use serde::{Deserialize, Serialize};
 use sinew_runtime::{tid::NodeAddress, time::Time, wire::Kind};
 
 use super::{
     super::{
-        core::{ConnectionId, Input},
+        core::{ConnectionId, Decline, Input, read, write},
         link::Mode,
         peer::frame,
     },
     Gncl, Linked,
 };
-use crate::stores::lock;
+use crate::{last_words::LastWords, stores::lock};
+
+/// The payload of a GOODBYE; of a node that stops in order there is none.
+#[derive(Serialize, Deserialize)]
+struct Goodbye {
+    /// Why the node gave up.
+    #[serde(default)]
+    gave_up: Option<LastWords>,
+}
 
 /// Time that peers have, when the node is stopped, to take what waits for them and hang up. Whoever has more to send
 /// than goes over its network in this time loses it.
@@ -29,8 +38,11 @@ impl Gncl {
         let peer = self.stores.gncl.peer(node);
         // Behind the last values, too.
         peer.iter().for_each(|peer| peer.retire_datagrams());
+        // spec: GNCL-10
+        let words = self.stores.gave_up.get().map(|words| write(&Goodbye { gave_up: Some(words.clone()) }));
         for way in peer.iter().flat_map(|peer| peer.ways()) {
-            way.outlet.finish(frame(self.stores.node, node, Kind::GNCL_GOODBYE, bytes::Bytes::new()));
+            let words = words.clone().unwrap_or_default();
+            way.outlet.finish(frame(self.stores.node, node, Kind::GNCL_GOODBYE, words));
         }
     }
 
@@ -78,6 +90,18 @@ impl Gncl {
             }
             peer.close();
         }
+    }
+
+    /// Keeps why a linked peer gave up, until it is told that it has left.
+    pub(super) fn note_last_words(&mut self, node: NodeAddress, payload: &[u8]) -> Result<(), Decline> {
+        if payload.is_empty() {
+            return Ok(());
+        }
+        let Goodbye { gave_up } = read(payload)?;
+        if let Some(words) = gave_up.filter(|_| self.core.knows(node)) {
+            self.last_words.insert(node, words);
+        }
+        Ok(())
     }
 
     /// The peer has said all on a connection: it is left there when it has been sent what of that was taken, for which it has

@@ -29,9 +29,9 @@ impl Gncl {
         for (node, LostNode { incarnation, why, .. }) in lost {
             match why {
                 // One that leaves may still have something to say, and of a process that was none nothing is known.
-                LossReason::Left | LossReason::Duplicate => {}
+                LossReason::Left | LossReason::GaveUp(_) | LossReason::Duplicate => {}
                 LossReason::Crashed | LossReason::Hung | LossReason::LinkDown | LossReason::Restarted => {
-                    self.input(lost_as(why, node, incarnation), ctx);
+                    self.input(lost_as(&why, node, incarnation), ctx);
                 }
             }
         }
@@ -51,9 +51,9 @@ impl Gncl {
     }
 }
 
-const fn lost_as(why: LossReason, node: NodeAddress, incarnation: Incarnation) -> Input {
+const fn lost_as(why: &LossReason, node: NodeAddress, incarnation: Incarnation) -> Input {
     match why {
-        LossReason::Left => Input::NodeLeaves { node, incarnation },
+        LossReason::Left | LossReason::GaveUp(_) => Input::NodeLeaves { node, incarnation },
         LossReason::Duplicate => Input::NodeDisowned { node, incarnation },
         LossReason::Crashed | LossReason::Hung | LossReason::LinkDown | LossReason::Restarted => {
             Input::NodeLost { node, incarnation }
@@ -73,7 +73,7 @@ impl StreamHandler<Event> for Gncl {
                 Input::NodeFound { node, incarnation, addresses: gncl }
             }
             Event::Membership(MembershipFact::NodeLost { node, incarnation, why }) => {
-                lost_as(why, node, incarnation)
+                lost_as(&why, node, incarnation)
             }
             Event::Forgotten { node, incarnation } => Input::NodeDisowned { node, incarnation },
             Event::DenyListChanged => return self.end_the_denied(ctx),

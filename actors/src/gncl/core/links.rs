@@ -219,7 +219,7 @@ impl Core {
         let Some(peer) = self.peers.get(&node) else { return };
         if peer.link.is_some_and(|link| link.has_left && !link.expects_more()) {
             let incarnation = peer.incarnation;
-            self.fact(LinkFact::PeerLeft { node, incarnation });
+            self.fact(LinkFact::PeerLeft { node, incarnation, gave_up: None });
             self.forget(now, node);
         }
     }

@@ -412,7 +412,7 @@ fn who_says_goodbye_has_left_and_is_not_dialled() {
     let one_for_all = Introduction { features: Vec::new(), ..hello_from(HIGH, 1, 1) };
     let (link, _) = greet(&mut core, millis(0), one_for_all);
     core.handle(millis(1), Input::GoodbyeReceived(link));
-    let left = Output::Fact(LinkFact::PeerLeft { node: HIGH, incarnation: Incarnation(1) });
+    let left = Output::Fact(LinkFact::PeerLeft { node: HIGH, incarnation: Incarnation(1), gave_up: None });
     assert!(outputs(&mut core).contains(&left));
     assert_eq!(core.next_wake(), None);
 }

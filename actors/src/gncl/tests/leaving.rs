@@ -1,5 +1,7 @@
 //! A node that stops: what waits goes out first, and what does not says so.
 
+use std::collections::BTreeMap;
+
 use sinew_runtime::{
     outcome::Outcome,
     tid::{Incarnation, Tid},
@@ -18,6 +20,7 @@ use crate::{
         core::{CLASSES, Introduction, Lane, read, write},
         peer::frame,
     },
+    last_words::LastWords,
     session::Ack,
 };
 
@@ -141,6 +144,39 @@ fn who_leaves_hears_that_its_last_message_was_taken_though_much_waits_for_it() {
             assert_eq!(next("the last word", &mut inbox).await.payload[..], *b"the last word");
         });
     }
+}
+
+#[test]
+fn the_goodbye_of_a_node_that_gives_up_has_its_reason_and_is_told_with_it() {
+    run(async {
+        let words = LastWords::of("layers: more than 5 restarts");
+        // Given: a peer that gives up
+        let mut node = Node::start(1).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        let goodbye =
+            |fields: &BTreeMap<&str, &str>| frame(NINE, node.address(), Kind::GNCL_GOODBYE, write(fields));
+        let bytes = goodbye(&[("gave_up", words.as_str())].into());
+        peer.say(&bytes).await;
+        // Then
+        let left = node.fact_that(|fact| matches!(fact, LinkFact::PeerLeft { .. })).await;
+        let gave_up = Some(words.clone());
+        assert_eq!(left, LinkFact::PeerLeft { node: NINE, incarnation: Incarnation(1), gave_up });
+        // Given: a node that gives up
+        let mut node = Node::start(1).await;
+        let mut peer = ByHand::linked_to(&mut node).await;
+        node.stores.gave_up.get_or_init(|| words.clone());
+        // When
+        node.leave();
+        // Then
+        loop {
+            let heard = peer.hear().await;
+            if heard.header.kind == Kind::GNCL_GOODBYE {
+                let fields: BTreeMap<String, String> = read(&heard.payload).expect("its reason");
+                assert_eq!(fields["gave_up"], words.as_str());
+                break;
+            }
+        }
+    });
 }
 
 #[test]

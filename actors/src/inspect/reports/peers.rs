@@ -23,7 +23,7 @@ pub struct LostReport {
     pub udp: String,
     /// Time since it was lost.
     pub lost_us: u64,
-    /// How that was noticed: `left`, `crashed`, `hung`, `link down`, `restarted`, `duplicate`.
+    /// How that was noticed: `left`, `gave up: ` with its reason, `crashed`, `hung`, `link down`, `restarted`, `duplicate`.
     pub why: String,
     /// How long it had been silent then.
     pub silent_us: u64,

@@ -111,7 +111,7 @@ impl Standstill {
     fn fill_posts(&self) {
         let fact = LinkFact::LinkUp { node: self.stores.node, incarnation: Incarnation(1) };
         while self.stores.posts.sync.post(sync::Event::Monitors).is_ok() {}
-        while self.stores.posts.ndl.post(ndl::Event::Link(fact)).is_ok() {}
+        while self.stores.posts.ndl.post(ndl::Event::Link(fact.clone())).is_ok() {}
     }
 }
 

@@ -63,15 +63,15 @@ impl Shell {
     }
 
     fn fence(&self, fact: &MembershipFact) {
-        let (node, incarnation, why) = match *fact {
-            MembershipFact::NodeLost { node, incarnation, why } => (node, incarnation, why),
+        let (node, incarnation, why) = match fact {
+            MembershipFact::NodeLost { node, incarnation, why } => (*node, *incarnation, why),
             // By the thread that says that it leaves: a later goodbye is not taken back by this.
             MembershipFact::NodeFound { node, incarnation, .. } => {
-                return self.stores.gncl.stays(node, incarnation);
+                return self.stores.gncl.stays(*node, *incarnation);
             }
         };
         match why {
-            LossReason::Left => {
+            LossReason::Left | LossReason::GaveUp(_) => {
                 // What it still sends has its age by its clock, until GNCL forgets it.
                 if self.stores.gncl.peer(node).is_none_or(|peer| peer.incarnation != incarnation) {
                     self.stores.clocks.forget(node, incarnation);

@@ -64,7 +64,7 @@ impl Core {
     }
 
     /// Keeps the last life of a lost node, so that a former one never comes back. // spec: NDL-7.1
-    pub(super) fn remember(&mut self, now: Time, member: &Member, why: LossReason) {
+    pub(super) fn remember(&mut self, now: Time, member: &Member, why: &LossReason) {
         if self.gone.len() >= self.nodes_max
             && let Some(node) = self.gone.iter().min_by_key(|(_, gone)| gone.since).map(|(node, _)| *node)
             && let Some(oldest) = self.gone.remove(&node)
@@ -76,7 +76,7 @@ impl Core {
         if places.is_empty() {
             places.push(member.routes.best());
         }
-        let has_left = why == LossReason::Left;
+        let has_left = why.is_announced();
         let (heard, bound) = (member.heard, self.paces[member.pace].bound());
         self.gone.insert(node, Gone { since: now, heard, bound, has_left, places, incarnation, boot_nonce });
     }

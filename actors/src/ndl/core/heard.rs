@@ -15,7 +15,7 @@ use super::{
 };
 use crate::ndl::{
     LossReason,
-    datagram::{Announcement, Answer, Body, Claim, parse, peek_answer},
+    datagram::{Announcement, Answer, Body, Claim, Leave, parse, peek_answer},
 };
 
 /// Whose word a datagram is, if it is not forged.
@@ -72,7 +72,7 @@ impl Core {
                 Input::QueryReceived(Query { from, way, correlation, sent, announcement })
             }
             Body::Answer(answer) => Input::AnswerReceived { from, correlation, sent, answer },
-            Body::Leave(announcement) => Input::LeaveReceived { from, announcement },
+            Body::Leave(leave) => Input::LeaveReceived { from, leave },
         };
         self.handle(now, input);
     }
@@ -243,8 +243,10 @@ impl Core {
         }
     }
 
-    // spec: NDL-4.4
-    pub(super) fn taken_leave_of(&mut self, now: Time, from: Place, announcement: &Announcement) {
+    // spec: NDL-4.4, NDL-4.8
+    pub(super) fn taken_leave_of(&mut self, now: Time, from: Place, leave: Leave) {
+        let Leave { announcement, gave_up } = leave;
+        let announcement = &announcement;
         let yields = announcement.claim == Claim::Yielded;
         if yields && self.is_proven(announcement.node) {
             // Who gives its address up ends, and its connections with it. spec: NDL-5.8
@@ -254,7 +256,7 @@ impl Core {
             if !yields {
                 self.note_goodbye(announcement.node, announcement.incarnation);
             }
-            let why = if yields { LossReason::Duplicate } else { LossReason::Left };
+            let why = if yields { LossReason::Duplicate } else { LossReason::announced(gave_up) };
             self.lose(now, announcement.node, why);
         } else if self.is_contender(from, announcement) {
             // It makes way for the member, or ends. spec: NDL-5.3

@@ -266,12 +266,12 @@ impl Core {
         let (LinkFact::LinkUp { node, incarnation }
         | LinkFact::LinkBroken { node, incarnation }
         | LinkFact::DialRefused { node, incarnation }
-        | LinkFact::PeerLeft { node, incarnation }) = fact;
+        | LinkFact::PeerLeft { node, incarnation, .. }) = fact;
         if let LinkFact::PeerLeft { .. } = fact {
             // Before the connection is over that proves who says so.
             self.note_goodbye(node, incarnation);
         }
-        self.note_proof(now, fact);
+        self.note_proof(now, &fact);
         let Some(member) = self.members.get_mut(&node).filter(|m| m.announcement.incarnation == incarnation)
         else {
             // About a life that is over for NDL already.
@@ -297,7 +297,7 @@ impl Core {
                 // Never connected: its GNCL may not listen yet.
                 None => {}
             },
-            LinkFact::PeerLeft { .. } => self.lose(now, node, LossReason::Left),
+            LinkFact::PeerLeft { gave_up, .. } => self.lose(now, node, LossReason::announced(gave_up)),
         }
     }
 
@@ -321,22 +321,22 @@ impl Core {
         let contest = self.contests.remove(&node);
         let sources = self.sources(&member).into_keys().collect();
         // GNCL ends the connection of a life that is over; that of one that leaves ends when all is said, and where the word was not its own it stays.
-        if why != LossReason::Left {
+        if !why.is_announced() {
             self.proven.lost(node, member.announcement.incarnation);
         }
         let silence = self.silence(now, &member);
-        self.recall.lost(now, &member, sources, Loss { why, bound: silence.bound });
+        self.recall.lost(now, &member, sources, Loss { why: why.clone(), bound: silence.bound });
         self.note_parted(node);
         self.is_lonely |= self.members.is_empty() && matches!(why, LossReason::Hung | LossReason::LinkDown);
         // An elder life has the address of a duplicate, which is no bar to that; one that nobody proves may never have been there.
         let is_remembered = why != LossReason::Duplicate && self.bars_earlier(&member);
         if is_remembered {
-            self.remember(now, &member, why);
+            self.remember(now, &member, &why);
         }
         self.void_questions(now, &member.announcement);
         let places: Vec<_> = member.routes.places().collect();
         for place in places.iter().copied() {
-            if why == LossReason::Left {
+            if why.is_announced() {
                 self.drop_contact(now, place);
                 continue;
             }
@@ -351,9 +351,11 @@ impl Core {
         }
         let Announcement { incarnation, name, .. } = member.announcement;
         let (silent_us, bound_us) = silence.micros();
-        self.outputs.push_back(Output::Fact(MembershipFact::NodeLost { node, incarnation, why }));
+        let is_crash = why == LossReason::Crashed;
+        let fact = MembershipFact::NodeLost { node, incarnation, why: why.clone() };
+        self.outputs.push_back(Output::Fact(fact));
         self.publish(&NodeEvent::NodeLost { node, name, incarnation, why, silent_us, bound_us });
-        if why == LossReason::Crashed {
+        if is_crash {
             // Perhaps only its GNCL restarts: then it answers this.
             places.into_iter().for_each(|place| self.ask(now, place));
         }

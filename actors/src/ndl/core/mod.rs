@@ -93,7 +93,7 @@ use self::{
 };
 use super::{
     MembershipFact, NodeEvent, Progress,
-    datagram::{Announcement, Answer, Claim, FURTHER_MAX},
+    datagram::{Announcement, Answer, Claim, FURTHER_MAX, Leave},
 };
 use crate::{clocks::ClockOffset, config::NodeConfig, gncl::LinkFact, lncl::AppFact, refusals::Refusals};
 
@@ -105,7 +105,7 @@ pub(crate) enum Input {
     /// Somebody answered; `sent` is in its clock.
     AnswerReceived { from: Place, correlation: u64, sent: Time, answer: Answer },
     /// Somebody said goodbye.
-    LeaveReceived { from: Place, announcement: Announcement },
+    LeaveReceived { from: Place, leave: Leave },
     /// A source outside of the core says that a node of this project is at this address.
     AddressNamed { source: Source, address: SocketAddr },
     /// Where members of earlier lives of this node answered, as far as that was kept; said once, also if there are none.
@@ -393,9 +393,9 @@ impl Core {
                     self.answered(now, from, (correlation, sent), answer);
                 }
             }
-            Input::LeaveReceived { from, announcement } => {
-                if self.concerns_us(now, from, &announcement) {
-                    self.taken_leave_of(now, from, &announcement);
+            Input::LeaveReceived { from, leave } => {
+                if self.concerns_us(now, from, &leave.announcement) {
+                    self.taken_leave_of(now, from, leave);
                 }
             }
             Input::AddressNamed { source, address } => self.named(now, source, address),

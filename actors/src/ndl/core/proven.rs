@@ -43,15 +43,15 @@ impl Proven {
         self.proves
     }
 
-    fn note(&mut self, fact: LinkFact) {
-        match fact {
+    fn note(&mut self, fact: &LinkFact) {
+        match *fact {
             LinkFact::LinkUp { node, incarnation } => {
                 // GNCL has no more peers than that.
                 if self.lives.len() < self.nodes_max || self.lives.contains_key(&node) {
                     self.lives.insert(node, incarnation);
                 }
             }
-            LinkFact::LinkBroken { node, incarnation } | LinkFact::PeerLeft { node, incarnation } => {
+            LinkFact::LinkBroken { node, incarnation } | LinkFact::PeerLeft { node, incarnation, .. } => {
                 self.lost(node, incarnation);
             }
             LinkFact::DialRefused { .. } => {}
@@ -88,9 +88,9 @@ impl Proven {
 
 impl Core {
     /// A connection was made or ended. Who proves to be another life than the one that answered in its name takes that one's place.
-    pub(super) fn note_proof(&mut self, now: Time, fact: LinkFact) {
+    pub(super) fn note_proof(&mut self, now: Time, fact: &LinkFact) {
         self.proven.note(fact);
-        let LinkFact::LinkUp { node, incarnation } = fact else { return };
+        let LinkFact::LinkUp { node, incarnation } = *fact else { return };
         let is_other = |member: &Member| member.announcement.incarnation != incarnation;
         if self.proven.is_asked() && self.members.get(&node).is_some_and(is_other) {
             self.lose(now, node, LossReason::Duplicate);

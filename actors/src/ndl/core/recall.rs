@@ -31,7 +31,7 @@ pub(crate) struct LostNode {
 }
 
 /// What is told of a loss.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Loss {
     pub(super) why: LossReason,
     /// As in [`LostNode`].

@@ -72,7 +72,11 @@ fn any_datagram() -> impl Strategy<Value = Datagram> {
         |(announcement, kind, [correlation, sent, a, b])| {
             let body = match kind {
                 0 => Body::Query(announcement),
-                1 => Body::Leave(announcement),
+                1 => {
+                    let gave_up =
+                        a.is_multiple_of(2).then(|| LastWords::of(&"ö\n".repeat((b % 120) as usize)));
+                    Body::Leave(Leave { announcement, gave_up })
+                }
                 _ => Body::Answer(Answer {
                     announcement,
                     query_sent_ns: a,

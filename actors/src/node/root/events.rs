@@ -17,15 +17,23 @@ pub(crate) enum RootEvent {
     Release { app: AppAddress },
     /// By the sync manager: these names require each other in a circle, the first one again at the end. None of these
     /// applications is released.
-    RequirementCycle { names: Vec<String> },
+    RequirementCycle {
+        names: Vec<String>,
+        /// The same with the names of other nodes.
+        labels: Vec<String>,
+    },
     /// By the layers' supervisor.
     Layers(SupervisorFact),
     /// By the applications' supervisor.
     Apps(SupervisorFact),
     /// By the owner: stop on SIGINT and SIGTERM.
     HeedSignals,
+    /// By [`Node::run`](crate::Node::run): nobody but the node itself handles an end.
+    RunsAlone,
     /// By the owner or a signal.
     StopOrdered,
+    /// By the node's drop in a thread that panics.
+    OwnerPanicked,
     /// By the owner: add, stop, start again or remove a child.
     Ordered(Ordered),
     /// By the owner: say who is supervised.

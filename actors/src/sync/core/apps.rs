@@ -45,6 +45,8 @@ pub(super) struct App {
     pub(super) owed: BTreeSet<String>,
     /// Of what it requires, what is not met, and since when.
     pub(super) absent: BTreeMap<String, Time>,
+    /// Of what it requires and is absent while it waits, when it is next reported that nobody has such a name.
+    pub(super) misspelt: BTreeMap<String, Time>,
     /// Of what it requires, what nobody can hear of, and until when that is not told.
     pub(super) silent: BTreeMap<String, Time>,
     /// When the next time ends for which it waits for what it can do without.
@@ -165,13 +167,26 @@ impl Apps {
         let wait = former.as_ref().and_then(App::wait).copied().unwrap_or(wait);
         let (name, refused) = self.claim(app, name);
         let state = State::Waiting(wait);
-        let (phases, kinds, silent) = (Vec::new(), Vec::new(), BTreeMap::new());
+        let (phases, kinds, silent, misspelt) = (Vec::new(), Vec::new(), BTreeMap::new(), BTreeMap::new());
         let (lost, owed) = (BTreeSet::new(), BTreeSet::new());
         let (ended, patience) = (None, None);
         // One that waits already has waited for that, too.
         let absent = former.map(|former| former.absent).unwrap_or_default();
-        let life =
-            App { name, user, requires, phases, kinds, state, ended, lost, owed, absent, silent, patience };
+        let life = App {
+            name,
+            user,
+            requires,
+            phases,
+            kinds,
+            state,
+            ended,
+            lost,
+            owed,
+            absent,
+            misspelt,
+            silent,
+            patience,
+        };
         self.apps.insert(app, life);
         refused
     }

@@ -30,6 +30,14 @@ struct Impossible {
     lacks: Vec<Vec<usize>>,
 }
 
+/// A circle among these applications, the first name again at the end, if there is one. spec: SYNC-7
+pub(crate) fn circle_of(applications: &BTreeMap<&str, Vec<Requirement>>) -> Option<Vec<String>> {
+    let starts = applications.values().flatten().cloned().collect();
+    let providers = |name: &str| applications.get(name).cloned().into_iter().collect();
+    let circle = Graph::reach(starts, providers).cycles().pop_first()?;
+    Some(circle.iter().chain(circle.first()).cloned().collect())
+}
+
 impl Graph {
     /// The part of the requirements that can be reached from `starts`. `providers` gives the requirements of each
     /// application of a name.

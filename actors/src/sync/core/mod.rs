@@ -12,6 +12,7 @@ mod cycles;
 mod directory;
 mod lives;
 mod meet;
+mod misspelt;
 mod nodes;
 mod peers;
 mod phases;
@@ -38,7 +39,6 @@ use sinew_runtime::{
 };
 
 pub(in crate::sync) use self::directory::Named;
-pub(crate) use self::reason::Reason;
 use self::{
     answers::Undelivered,
     apps::{Apps, State},
@@ -48,6 +48,7 @@ use self::{
     rendezvous::Rendezvous,
     respite::Respite,
 };
+pub(crate) use self::{cycles::circle_of, reason::Reason};
 use super::{
     facts::{Absence, DirectoryEntry, DirectoryEvent, OwnApp, Waiting},
     list::Published,
@@ -113,6 +114,8 @@ pub(crate) enum Output {
     Cycle { names: Vec<String> },
     /// An application has waited for its deadline, once more.
     Overdue(Waiting),
+    /// An application waits for a name that nobody has; up to three similar names, with their states.
+    Misspelt { application: String, name: String, nearest: Vec<String> },
     /// Several nodes have an application of this name; said once. Whoever asks for the name gets the first.
     SameName { name: String, tids: Vec<Tid> },
     /// Something was not used.
@@ -250,6 +253,7 @@ impl Core {
         let moment = self.respite.moment(now);
         self.evaluate(moment);
         self.report_overdue(moment);
+        self.report_misspelt(moment);
         self.meet(moment);
         self.tell_watchers(now);
     }
@@ -284,7 +288,8 @@ impl Core {
         let overdue = self.apps.waiting().map(|(_, _, wait)| wait.overdue).min();
         let silent =
             self.apps.iter().flat_map(|(_, app)| app.silent.values().chain(&app.patience).copied()).min();
-        let judged = [overdue, silent, self.rendezvous.next_over(), self.phases.next_wake()];
+        let judged =
+            [overdue, self.next_misspelt(), silent, self.rendezvous.next_over(), self.phases.next_wake()];
         let judged = judged.into_iter().flatten().min().map(|over| self.respite.judges(over));
         [
             judged,

@@ -29,7 +29,8 @@ impl Core {
             MembershipFact::NodeLost { node, incarnation, why } => {
                 let reason = match why {
                     LossReason::Left => Reason::NodeLeft,
-                    LossReason::Crashed
+                    LossReason::GaveUp(_)
+                    | LossReason::Crashed
                     | LossReason::Hung
                     | LossReason::LinkDown
                     | LossReason::Restarted
@@ -61,8 +62,9 @@ impl Core {
             }
             // A link that was refused was down before. Whether its node is lost, NDL says.
             LinkFact::DialRefused { .. } => {}
-            LinkFact::PeerLeft { node, incarnation } => {
-                self.peers.lost(node, incarnation, Reason::NodeLeft);
+            LinkFact::PeerLeft { node, incarnation, gave_up } => {
+                let reason = if gave_up.is_some() { Reason::NodeLost } else { Reason::NodeLeft };
+                self.peers.lost(node, incarnation, reason);
                 self.peers.link_broken(node, incarnation);
                 self.hear_no_more(node);
                 self.route_groups(node);

@@ -8,7 +8,7 @@ use sinew_runtime::{
     time::Time,
 };
 
-use super::{Core, Reason};
+use super::{Core, Reason, misspelt::FIRST_AFTER};
 use crate::sync::facts::Absence;
 
 /// Of those that a requirement with a pattern or a choice lacks, so many are named at most.
@@ -120,7 +120,23 @@ impl Core {
         let absent = self.apps.get(of).and_then(|app| app.absent.get(requirement.as_str()));
         let since = absent.map_or(Duration::ZERO, |absent| now.since(*absent));
         let parts = self.missing_parts(of, requirement).into_iter();
-        parts.map(|(name, why)| Absence { name, why: why.into(), since }).collect()
+        let own = self.apps.get(of).and_then(|app| app.name.as_deref());
+        let is_one = requirement.one_name().is_some() && requirement.phase().is_none();
+        let similar = |name: &str, why: &'static str| {
+            let is_unknown = is_one && why == Reason::NotThere.words() && since >= FIRST_AFTER;
+            if is_unknown { self.nearest(name, own) } else { Vec::new() }
+        };
+        parts
+            .map(|(name, why)| {
+                let nearest = similar(&name, why);
+                let why = if nearest.is_empty() {
+                    why.into()
+                } else {
+                    format!("{why}; nearest: {}", nearest.join(", ")).into()
+                };
+                Absence { name, why, since }
+            })
+            .collect()
     }
 
     /// The parts of a requirement that is not met. That a name is part of a circle is seen within the first

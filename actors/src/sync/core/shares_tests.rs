@@ -162,7 +162,7 @@ fn where_the_list_has_no_room_for_all_guests_are_left_out_first() {
     let mut config = NodeConfig::new("hip");
     config.payload_max = 4_096;
     let core = Core::new(&config, HERE, Incarnation(1));
-    let mut bench = Bench { core, now: Time::from_nanos(1_000_000_000) };
+    let mut bench = Bench { core, now: Time::from_nanos(1_000_000_000), misspelt: Vec::new() };
     (1..=200).for_each(|index| drop(bench.guest(index, USER)));
     bench.registers(0, "toe", &[]);
     // And: as many of the robot's own as there is room for, but not beside the groups that only guests are in

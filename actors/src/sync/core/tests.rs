@@ -40,12 +40,14 @@ const NEXT_LIFE: Incarnation = Incarnation(6);
 struct Bench {
     core: Core,
     now: Time,
+    /// Reports of names that nobody has: who waits, for which, and similar ones.
+    misspelt: Vec<(String, String, Vec<String>)>,
 }
 
 impl Bench {
     fn new() -> Self {
         let core = Core::new(&NodeConfig::new("hip"), HERE, Incarnation(1));
-        Self { core, now: Time::from_nanos(1_000_000_000) }
+        Self { core, now: Time::from_nanos(1_000_000_000), misspelt: Vec::new() }
     }
 
     /// Application 0 is "gait" and requires "sensor", which is application 1; both are ready.
@@ -60,7 +62,16 @@ impl Bench {
 
     fn hears(&mut self, input: Input) -> Vec<Output> {
         self.core.handle(self.now, input);
-        std::iter::from_fn(|| self.core.poll()).collect()
+        let mut outputs = Vec::new();
+        while let Some(output) = self.core.poll() {
+            match output {
+                Output::Misspelt { application, name, nearest } => {
+                    self.misspelt.push((application, name, nearest));
+                }
+                output => outputs.push(output),
+            }
+        }
+        outputs
     }
 
     fn registers(&mut self, index: u32, name: &str, requires: &[&str]) -> Vec<Output> {
@@ -321,7 +332,7 @@ fn every_deadline_that_passes_reports_what_is_missing_since_when_and_why() {
     bench.registers(0, "gait", &["sensor", "knee.drive"]);
     bench.registers(1, "sensor", &[]);
     let deadline = bench.core.next_wake().unwrap();
-    assert_eq!(deadline, bench.now + Duration::from_secs(60));
+    assert_eq!(deadline, bench.now + Duration::from_secs(2), "first it is looked whether a name is misspelt");
     let waited = |seconds| {
         let since = Duration::from_secs(seconds);
         let absent =
@@ -355,13 +366,41 @@ fn the_last_known_reason_is_told_for_each_way_to_be_missing() {
     bench.lost(KNEE, LossReason::LinkDown);
     assert_eq!(reason(&bench), "its node was lost");
     bench.links(KNEE, LIFE);
-    bench.hears(Input::LinkChanged(LinkFact::PeerLeft { node: KNEE, incarnation: LIFE }));
+    bench.hears(Input::LinkChanged(LinkFact::PeerLeft { node: KNEE, incarnation: LIFE, gave_up: None }));
     bench.lost(KNEE, LossReason::LinkDown);
     assert_eq!(reason(&bench), "its node left");
     bench.registers(1, "drive", &[]);
     assert_eq!(reason(&bench), "registered, not ready", "what this node knows comes first");
     bench.down(1);
     assert_eq!(reason(&bench), "failed, not ready again");
+}
+
+#[test]
+fn a_name_that_nobody_has_is_reported_after_two_seconds_with_those_that_are_similar() {
+    let mut bench = Bench::new();
+    bench.links(KNEE, LIFE);
+    bench.list(KNEE, list(1, &[("knee.sensor", true, &[]), ("hip.drive", true, &[])]));
+    bench.registers(1, "knee.drive", &["knee.sensor"]);
+    bench.registers(0, "hip", &["knee.senser", "camera | lidar", "arm.*", "knee.drive"]);
+    bench.passes(Duration::from_millis(1_999));
+    assert_eq!(bench.misspelt, []);
+    assert!(bench.missing().contains(&("knee.senser".to_owned(), "not there")));
+    assert!(bench.core.next_wake() <= Some(bench.now + Duration::from_millis(1)));
+    bench.passes(Duration::from_millis(1));
+    let nearest = ["knee.sensor (ready)", "knee.drive (starting)"].map(str::to_owned).to_vec();
+    let report = |name: &str, nearest| ("hip".to_owned(), name.to_owned(), nearest);
+    let none = Vec::new;
+    let all = [report("camera", none()), report("lidar", none()), report("knee.senser", nearest)];
+    assert_eq!(bench.misspelt, all);
+    let why = "not there; nearest: knee.sensor (ready), knee.drive (starting)";
+    let missing = bench.core.waiting(bench.now).remove(0).missing;
+    assert!(missing.iter().any(|absence| absence.name == "knee.senser" && absence.why == why), "{missing:?}");
+    // Again, but seldom; and no more once somebody has it.
+    bench.passes(Duration::from_secs(299));
+    assert_eq!(bench.misspelt.len(), 3);
+    bench.list(KNEE, list(2, &[("knee.sensor", true, &[]), ("knee.senser", false, &[])]));
+    bench.passes(Duration::from_secs(1));
+    assert_eq!(bench.misspelt.len(), 5, "the other two");
 }
 
 // spec: SYNC-7
@@ -500,7 +539,8 @@ fn what_is_not_a_list_is_refused_and_changes_nothing() {
 fn more_nodes_than_allowed_are_refused_until_one_is_lost() {
     let mut config = NodeConfig::new("hip");
     config.ndl.nodes_max = 1;
-    let mut bench = Bench { core: Core::new(&config, HERE, Incarnation(1)), now: Time::ZERO };
+    let core = Core::new(&config, HERE, Incarnation(1));
+    let mut bench = Bench { core, now: Time::ZERO, misspelt: Vec::new() };
     bench.links(KNEE, LIFE);
     bench.list(KNEE, list(1, &[("drive", true, &[])]));
     assert!(matches!(bench.links(ANKLE, LIFE)[..], [Output::Refused { cause: "nodes", .. }]));

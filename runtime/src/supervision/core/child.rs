@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::{ChildId, Generation, Policy, Reason, Restart};
+use super::{ChildId, Generation, Policy, Reason, Restart, StartRetry};
 use crate::time::Time;
 
 /// Where a child is in its life.
@@ -46,6 +46,8 @@ pub struct ChildView {
     pub restarts: u64,
     /// How its last life ended.
     pub last_reason: Option<Reason>,
+    /// Since when it says at each start that it cannot start now.
+    pub cannot_start_since: Option<Time>,
     /// Whether it should live. One that is down and should not was terminated or has ended by itself.
     pub wanted: bool,
     /// Whether its release is what it waits for.
@@ -71,6 +73,10 @@ pub(super) struct Child {
     /// Commands to terminate it that were not answered yet.
     pub(super) terminations: u32,
     pub(super) failures_in_a_row: u32,
+    /// When it said first that it cannot start, if it has not been ready since.
+    pub(super) cannot_start_since: Option<Time>,
+    /// How often in a row it has said so.
+    pub(super) failed_starts: u32,
     /// How often it was started.
     pub(super) starts: u64,
     pub(super) ready_since: Time,
@@ -91,6 +97,8 @@ impl Child {
             stale: false,
             terminations: 0,
             failures_in_a_row: 0,
+            cannot_start_since: None,
+            failed_starts: 0,
             starts: 0,
             ready_since: Time::ZERO,
             last_reason: None,
@@ -129,6 +137,30 @@ impl Child {
         self.policy.backoff_min.saturating_mul(1 << doublings).min(self.policy.backoff_max)
     }
 
+    /// A life has ended: whether it could not start and said so, since when.
+    pub(super) fn note_start(&mut self, now: Time, reason: &Reason) {
+        if matches!((self.state, reason), (ChildState::Starting(_), Reason::StartFailed(_))) {
+            self.cannot_start_since.get_or_insert(now);
+            self.failed_starts = self.failed_starts.saturating_add(1);
+        } else {
+            self.can_start();
+        }
+    }
+
+    /// It has started, or failed in another way.
+    pub(super) const fn can_start(&mut self) {
+        (self.cannot_start_since, self.failed_starts) = (None, 0);
+    }
+
+    /// The wait before it is tried again to start it, if that is no restart that counts.
+    pub(super) fn start_retry(&self, now: Time) -> Option<Duration> {
+        let since = self.cannot_start_since?;
+        let StartRetry { wait_min, wait_max, give_up_after } = self.policy.start_retry;
+        let doublings = self.failed_starts.saturating_sub(1).min(20);
+        let is_tried = give_up_after.is_none_or(|time| now.since(since) < time);
+        is_tried.then(|| wait_min.saturating_mul(1 << doublings).min(wait_max))
+    }
+
     pub(super) fn view(&self, abandoned: usize) -> ChildView {
         ChildView {
             state: self.state,
@@ -136,6 +168,7 @@ impl Child {
             generation: self.generation,
             restarts: self.starts.saturating_sub(1),
             last_reason: self.last_reason.clone(),
+            cannot_start_since: self.cannot_start_since,
             wanted: self.wanted,
             waits_for_release: self.wanted && self.waits_for_release(),
             abandoned,

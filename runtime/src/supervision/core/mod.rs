@@ -47,7 +47,7 @@ use child::Child;
 pub use child::{ChildState, ChildView};
 pub use event::{Command, Input, Order, Refusal};
 pub use id::{ChildId, ChildIds, Generation};
-pub use policy::{AutoShutdown, Flags, Intensity, Policy, Restart, Strategy};
+pub use policy::{AutoShutdown, Flags, Intensity, Policy, Restart, StartRetry, Strategy};
 pub use reason::Reason;
 pub use tree::{BranchView, Plan, Planned, Tree};
 use window::{Chance, Window};
@@ -229,6 +229,7 @@ impl Core {
         {
             self.children[index].enter(ChildState::Ready, now);
             self.children[index].ready_since = now;
+            self.children[index].can_start();
             self.orders.push_back(Order::Ready(id));
         }
     }

@@ -45,6 +45,7 @@ fn is_restarted(restart: Restart, reason: &Reason) -> bool {
             Restart::Transient,
             Reason::Panic(_)
             | Reason::StartTimeout
+            | Reason::StartFailed(_)
             | Reason::Hung(_)
             | Reason::Killed
             | Reason::ThreadEnded
@@ -287,6 +288,7 @@ impl Model {
             | Reason::Shutdown
             | Reason::Panic(_)
             | Reason::StartTimeout
+            | Reason::StartFailed(_)
             | Reason::Hung(_)
             | Reason::Killed
             | Reason::ProcessEnded(_)

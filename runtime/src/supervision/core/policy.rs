@@ -70,6 +70,26 @@ pub struct Policy {
     pub progress_within: Option<Duration>,
     /// Whether it waits for its release before its first start and after each failure. Default no.
     pub held: bool,
+    /// How a start that [failed by an explicit call](super::Reason::StartFailed) is tried again.
+    pub start_retry: StartRetry,
+}
+
+/// How a start that failed by an explicit call is tried again. Such failures do not count towards restart intensity.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct StartRetry {
+    /// First wait; doubles with each such failure in a row, and is then shortened by chance by up to a quarter. Default 100 ms.
+    pub wait_min: Duration,
+    /// Longest wait. Default 5 s.
+    pub wait_max: Duration,
+    /// Time after the first such failure in a row from which they count as restarts do. Default `None`: never.
+    pub give_up_after: Option<Duration>,
+}
+
+impl Default for StartRetry {
+    fn default() -> Self {
+        let (wait_min, wait_max) = (Duration::from_millis(100), Duration::from_secs(5));
+        Self { wait_min, wait_max, give_up_after: None }
+    }
 }
 
 impl Default for Policy {
@@ -83,6 +103,7 @@ impl Default for Policy {
             backoff_max: Duration::from_secs(2),
             progress_within: Some(Duration::from_secs(1)),
             held: false,
+            start_retry: StartRetry::default(),
         }
     }
 }

@@ -11,6 +11,8 @@ pub enum Reason {
     Panic(String),
     /// It did not become ready in its time.
     StartTimeout,
+    /// It cannot start now and said why: a device that is not plugged in, for example.
+    StartFailed(String),
     /// It did not come back in its progress budget; who says so, since when, and in what.
     Hung(String),
     /// It did not stop in its time.
@@ -40,6 +42,7 @@ impl std::fmt::Display for Reason {
             Self::Shutdown => f.write_str("was told to stop"),
             Self::Panic(said) => write!(f, "panicked: {said}"),
             Self::StartTimeout => f.write_str("did not become ready in its time"),
+            Self::StartFailed(why) => write!(f, "cannot start: {why}"),
             Self::Hung(what) => write!(f, "hung: {what}"),
             Self::Killed => f.write_str("did not stop in its time"),
             Self::ThreadEnded => f.write_str("lost its thread"),

@@ -20,6 +20,7 @@ impl Core {
     pub(super) fn child_ended(&mut self, now: Time, index: usize, reason: Reason) {
         let child = &mut self.children[index];
         let was_to_end = child.stale || !child.wanted || matches!(child.state, ChildState::Stopping(_));
+        child.note_start(now, &reason);
         child.enter(ChildState::Down, now);
         child.released = false;
         child.stale = false;
@@ -95,6 +96,12 @@ impl Core {
     }
 
     fn restart(&mut self, now: Time, index: usize, reason: &Reason) {
+        if let Some(wait) = self.children[index].start_retry(now) {
+            // It failed alone, before anything depended on it: neither the intensity nor its group is concerned.
+            let wait = self.chance.jitter(wait);
+            self.children[index].enter(ChildState::BackingOff(now + wait), now);
+            return;
+        }
         let Intensity { restarts_max, losses_max, window } = self.flags.intensity;
         let lost_its_thread = *reason == Reason::ThreadEnded;
         let (counted, max, what) = match lost_its_thread {

@@ -285,3 +285,69 @@ fn the_same_seed_gives_the_same_waits_and_others_give_others() {
     assert!(waits.len() > 50);
     assert!(waits.iter().all(|wait| (75..=100).contains(&wait.as_millis())), "{waits:?}");
 }
+
+fn cannot_start(generation: u64) -> Input {
+    Input::Ended(child(0), generation, Reason::StartFailed("no device".to_owned()))
+}
+
+/// Lets the first child be started again; returns how long that took.
+fn started_again(core: &mut Core, now: &mut Time) -> Duration {
+    let due = core.next_wake().expect("it is tried again");
+    let waited = due.since(*now);
+    *now = due;
+    core.handle(*now, Input::TimePassed);
+    assert!(orders(core).iter().any(|order| matches!(order, Order::Spawn(..))));
+    waited
+}
+
+#[test]
+fn a_start_that_fails_by_a_call_is_tried_without_end_at_growing_intervals() {
+    let mut core = supervisor(Strategy::OneForOne, 1);
+    orders(&mut core);
+    let (mut now, mut waits) = (at(0), Vec::new());
+    for generation in 1..=20 {
+        core.handle(now, cannot_start(generation));
+        assert_eq!(core.child(child(0)).expect("it is there").cannot_start_since, Some(at(0)));
+        waits.push(started_again(&mut core, &mut now));
+    }
+    let StartRetry { wait_min, wait_max, .. } = StartRetry::default();
+    assert!(waits[0] <= wait_min && waits[0] >= wait_min * 3 / 4, "{waits:?}");
+    assert!(waits[19] <= wait_max && waits[19] >= wait_max * 3 / 4, "{waits:?}");
+    assert_eq!(core.restarts_in_window(now), 0);
+    core.handle(now, Input::BecameReady(child(0), 21));
+    assert_eq!(core.child(child(0)).expect("it is there").cannot_start_since, None);
+}
+
+#[test]
+fn panics_between_failed_starts_count_and_so_does_a_failed_start_of_one_that_was_ready() {
+    let mut core = supervisor(Strategy::OneForOne, 1);
+    orders(&mut core);
+    let mut now = at(0);
+    core.handle(now, cannot_start(1));
+    started_again(&mut core, &mut now);
+    core.handle(now, panicked(0, 2));
+    assert_eq!(core.restarts_in_window(now), 1);
+    started_again(&mut core, &mut now);
+    core.handle(now, Input::BecameReady(child(0), 3));
+    core.handle(now, cannot_start(3));
+    assert_eq!(core.restarts_in_window(now), 2);
+}
+
+#[test]
+fn failed_starts_count_when_their_time_is_over() {
+    let start_retry = StartRetry { give_up_after: Some(Duration::from_secs(1)), ..StartRetry::default() };
+    let policy = Policy { start_retry, ..Policy::default() };
+    let mut core = Core::new(Strategy::OneForOne.into(), 0, vec![(child(0), policy)]);
+    core.handle(at(0), Input::Started);
+    orders(&mut core);
+    let mut now = at(0);
+    for generation in 1..1_000 {
+        core.handle(now, cannot_start(generation));
+        if core.is_ending() {
+            assert!(now.since(at(0)) >= Duration::from_secs(1));
+            return;
+        }
+        started_again(&mut core, &mut now);
+    }
+    panic!("it never gives up");
+}

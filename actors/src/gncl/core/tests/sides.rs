@@ -83,7 +83,7 @@ fn a_node_that_says_goodbye_has_left_when_each_of_its_connections_is_through() {
     let (link, _) = greet(&mut core, millis(0), hello_from(HIGH, 1, 10));
     let (stream, _) = greet(&mut core, millis(1), side_of(10, Lane::Stream, 11));
     let (bulk, _) = greet(&mut core, millis(1), side_of(10, Lane::Bulk, 12));
-    let left = Output::Fact(LinkFact::PeerLeft { node: HIGH, incarnation: Incarnation(1) });
+    let left = Output::Fact(LinkFact::PeerLeft { node: HIGH, incarnation: Incarnation(1), gave_up: None });
     for connection in [bulk, link] {
         core.handle(millis(2), Input::GoodbyeReceived(connection));
         let out = outputs(&mut core);
@@ -101,7 +101,7 @@ fn a_node_that_said_goodbye_and_hangs_up_has_left_whatever_its_other_connections
     greet(&mut core, millis(1), side_of(10, Lane::Bulk, 12));
     core.handle(millis(2), Input::GoodbyeReceived(link));
     core.handle(millis(3), Input::Ended(link));
-    let left = Output::Fact(LinkFact::PeerLeft { node: HIGH, incarnation: Incarnation(1) });
+    let left = Output::Fact(LinkFact::PeerLeft { node: HIGH, incarnation: Incarnation(1), gave_up: None });
     assert!(outputs(&mut core).contains(&left));
     assert_eq!(core.next_wake(), None);
 }
@@ -119,7 +119,7 @@ fn a_side_that_breaks_when_the_peer_leaves_is_dialled_again_until_it_is_through(
     for side in &sides {
         welcomed(&mut core, 3, *side);
     }
-    let left = Output::Fact(LinkFact::PeerLeft { node: HIGH, incarnation: Incarnation(1) });
+    let left = Output::Fact(LinkFact::PeerLeft { node: HIGH, incarnation: Incarnation(1), gave_up: None });
     for connection in [link, sides[0]] {
         core.handle(millis(4), Input::GoodbyeReceived(connection));
     }

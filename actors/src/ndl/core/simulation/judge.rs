@@ -338,10 +338,16 @@ impl Judge {
     fn check_reason(&mut self, now: Time, process: usize, other: usize, why: LossReason) {
         let lives = self.lives[other].ended.is_none();
         match why {
-            LossReason::Left | LossReason::Crashed | LossReason::Restarted if lives => {
+            LossReason::Left | LossReason::GaveUp(_) | LossReason::Crashed | LossReason::Restarted
+                if lives =>
+            {
                 self.violate(now, process, other, &format!("lives, and is lost as {why:?}"));
             }
-            LossReason::Left | LossReason::Crashed | LossReason::Restarted | LossReason::Duplicate => {}
+            LossReason::Left
+            | LossReason::GaveUp(_)
+            | LossReason::Crashed
+            | LossReason::Restarted
+            | LossReason::Duplicate => {}
             LossReason::Hung | LossReason::LinkDown => {
                 let (most, least) = self.unanswered(now, process, other);
                 let missed_max = self.pace(other).1 as usize;
@@ -378,7 +384,7 @@ impl Judge {
     ) {
         let (Some(other), Some(host)) = (self.life(node, incarnation), host) else { return };
         let is_right = match why {
-            LossReason::Left | LossReason::Restarted | LossReason::Duplicate => true,
+            LossReason::Left | LossReason::GaveUp(_) | LossReason::Restarted | LossReason::Duplicate => true,
             LossReason::Crashed => host == Host::Refuses,
             LossReason::Hung => host == Host::Accepts,
             LossReason::LinkDown => host == Host::IsSilent,

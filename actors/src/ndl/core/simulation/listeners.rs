@@ -13,7 +13,7 @@ use sinew_runtime::tid::{AppAddress, Incarnation, NodeAddress};
 use crate::ndl::{LossReason, MembershipFact, NodeEvent, Trouble};
 
 /// What is to be told.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 enum Owed {
     Found(NodeAddress, Incarnation),
     Restarted(NodeAddress, Incarnation),
@@ -67,10 +67,10 @@ impl Listeners {
                     Owed::Found(node, incarnation)
                 });
             }
-            MembershipFact::NodeLost { node, incarnation, why } => {
+            MembershipFact::NodeLost { node, incarnation, ref why } => {
                 former.insert(node, incarnation);
-                if why != LossReason::Restarted {
-                    owed.push_back(Owed::Lost(node, incarnation, why));
+                if *why != LossReason::Restarted {
+                    owed.push_back(Owed::Lost(node, incarnation, why.clone()));
                 }
             }
         }
@@ -93,8 +93,8 @@ impl Listeners {
                 listener.pays(Owed::Restarted(node, incarnation))?;
                 listener.there.insert(node, There { incarnation, troubles: BTreeMap::new() });
             }
-            NodeEvent::NodeLost { node, incarnation, why, .. } => {
-                listener.pays(Owed::Lost(node, incarnation, why))?;
+            NodeEvent::NodeLost { node, incarnation, ref why, .. } => {
+                listener.pays(Owed::Lost(node, incarnation, why.clone()))?;
                 let was_there = listener.there.remove(&node);
                 if was_there.is_none_or(|there| there.incarnation != incarnation) {
                     return Err("nothing of this life was told before".to_owned());

@@ -232,7 +232,7 @@ impl Patient {
     }
 
     /// What becomes of an event for applications.
-    const fn tell(&self, event: &mut NodeEvent) -> Telling {
+    fn tell(&self, event: &mut NodeEvent) -> Telling {
         match (self.fault, event) {
             (Some(Fault::KeepsALossFromApplications), NodeEvent::NodeLost { .. })
             | (Some(Fault::KeepsATroubleToItself), NodeEvent::AppStalled { .. })

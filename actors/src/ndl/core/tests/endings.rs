@@ -8,10 +8,11 @@ use super::{
 };
 use crate::{
     gncl::LinkFact,
+    last_words::LastWords,
     ndl::{
         LossReason, MembershipFact,
         core::Input,
-        datagram::{Answer, Body},
+        datagram::{Answer, Body, Leave},
     },
 };
 
@@ -96,9 +97,9 @@ fn a_node_that_says_goodbye_has_left_and_is_found_when_it_comes_again() {
 fn a_goodbye_with_a_forged_source_or_of_another_life_changes_nothing() {
     let mut world = World::of_members(2);
     let mut me = world.at(2).core.announcement().clone();
-    world.forge(udp(3), 1, &bytes(0, Body::Leave(me.clone())));
+    world.forge(udp(3), 1, &bytes(0, Body::Leave(me.clone().into())));
     me.boot_nonce += 1;
-    world.forge(udp(2), 1, &bytes(0, Body::Leave(me)));
+    world.forge(udp(2), 1, &bytes(0, Body::Leave(me.into())));
     assert_eq!(world.losses(1), []);
     assert_eq!(world.at(1).core.refusals().of("NDL leave of a stranger"), 2);
 }
@@ -114,7 +115,7 @@ fn what_a_node_answered_before_its_goodbye_does_not_bring_it_back_though_it_was_
     let correlation = contact.questions.newest().expect("it is asked again at once").correlation;
     let announcement = world.at(2).core.announcement().clone();
     // when
-    world.forge(udp(2), 1, &bytes(0, Body::Leave(announcement.clone())));
+    world.forge(udp(2), 1, &bytes(0, Body::Leave(announcement.clone().into())));
     let answer =
         Answer { announcement, query_sent_ns: 0, query_received_ns: 0, progress: Default::default() };
     world.forge(udp(2), 1, &bytes(correlation, Body::Answer(answer)));
@@ -123,8 +124,22 @@ fn what_a_node_answered_before_its_goodbye_does_not_bring_it_back_though_it_was_
 }
 
 #[test]
+fn a_node_that_gives_up_is_lost_for_its_own_reason_by_datagram_and_by_connection() {
+    let words = LastWords::of("applications: more than 5 restarts");
+    let lost = [(2, LossReason::GaveUp("applications: more than 5 restarts".to_owned()))];
+    let mut world = World::of_members(2);
+    let leave = Leave { announcement: world.at(2).core.announcement().clone(), gave_up: Some(words.clone()) };
+    world.forge(udp(2), 1, &bytes(0, Body::Leave(leave)));
+    assert_eq!(world.losses(1), lost);
+    let mut world = World::of_members(2);
+    let (node, incarnation) = (node(2), Incarnation(1));
+    world.link(1, LinkFact::PeerLeft { node, incarnation, gave_up: Some(words) });
+    assert_eq!(world.losses(1), lost);
+}
+
+#[test]
 fn goodbye_on_the_connection_counts_as_well() {
     let mut world = World::of_members(2);
-    world.link(1, LinkFact::PeerLeft { node: node(2), incarnation: Incarnation(1) });
+    world.link(1, LinkFact::PeerLeft { node: node(2), incarnation: Incarnation(1), gave_up: None });
     assert_eq!(world.losses(1), [(2, LossReason::Left)]);
 }

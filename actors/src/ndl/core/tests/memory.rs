@@ -117,7 +117,7 @@ fn who_leaves_is_asked_no_more_at_any_address_that_it_announced() {
     let says_so_on_its_connection = |world: &mut World| {
         world.kill(2);
         world.run(ms(1));
-        world.link(1, LinkFact::PeerLeft { node, incarnation });
+        world.link(1, LinkFact::PeerLeft { node, incarnation, gave_up: None });
     };
     for has_keys in [false, true] {
         for leave in [&says_so as &dyn Fn(&mut World), &says_so_on_its_connection] {

@@ -58,7 +58,7 @@ fn any_input() -> impl Strategy<Value = (u64, Input)> {
                 };
                 Input::AnswerReceived { from, correlation: 0, sent: Time::ZERO, answer }
             }
-            3 => Input::LeaveReceived { from, announcement },
+            3 => Input::LeaveReceived { from, leave: announcement.into() },
             4 => Input::AddressNamed { source: Source::Mdns, address: from.there },
             5 if flag => Input::Link(LinkFact::LinkBroken { node, incarnation }),
             5 => Input::Link(LinkFact::DialRefused { node, incarnation }),

@@ -127,7 +127,7 @@ fn a_word_in_a_nodes_name_that_it_gives_its_address_up_does_not_end_its_connecti
     let mut world = linked();
     let mut announcement = world.at(2).core.announcement().clone();
     announcement.claim = Claim::Yielded;
-    let leave = Datagram { correlation: 0, sent: Time::ZERO, body: Body::Leave(announcement) };
+    let leave = Datagram { correlation: 0, sent: Time::ZERO, body: Body::Leave(announcement.into()) };
     world.forge(udp(2), 1, &encode(&leave, node(1)));
     world.run(ms(1));
     assert_eq!(world.at(1).facts, []);
@@ -139,7 +139,7 @@ fn a_word_in_a_nodes_name_that_it_leaves_does_not_take_its_proof_away() {
     // Given: it is believed, and the node is found again
     let mut world = linked();
     let leave = world.at(2).core.announcement().clone();
-    let leave = Datagram { correlation: 0, sent: Time::ZERO, body: Body::Leave(leave) };
+    let leave = Datagram { correlation: 0, sent: Time::ZERO, body: Body::Leave(leave.into()) };
     world.forge(udp(2), 1, &encode(&leave, node(1)));
     world.run(ms(1));
     assert_eq!(world.losses(1), [(2, LossReason::Left)]);

@@ -297,7 +297,7 @@ impl World {
     /// Why `index` lost nodes, in order.
     pub(super) fn losses(&self, index: u16) -> Vec<(u32, LossReason)> {
         let facts = self.at(index).facts.iter().filter_map(|fact| match fact {
-            MembershipFact::NodeLost { node, why, .. } => Some((node.bits(), *why)),
+            MembershipFact::NodeLost { node, why, .. } => Some((node.bits(), why.clone())),
             MembershipFact::NodeFound { .. } => None,
         });
         facts.collect()
@@ -417,7 +417,11 @@ impl World {
             }
             Output::SendLeave { .. } if self.loses_goodbyes => {}
             Output::SendLeave { to, .. } => {
-                self.send(from, to.there, Datagram { correlation: 0, sent: now, body: Body::Leave(me) });
+                self.send(
+                    from,
+                    to.there,
+                    Datagram { correlation: 0, sent: now, body: Body::Leave(me.into()) },
+                );
             }
             Output::Probe { node, incarnation, .. } => {
                 process.probes.push((node, incarnation));

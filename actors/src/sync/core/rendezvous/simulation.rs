@@ -307,6 +307,7 @@ impl World {
             | Output::RouteGroups { .. }
             | Output::Cycle { .. }
             | Output::Overdue(_)
+            | Output::Misspelt { .. }
             | Output::SameName { .. } => {}
         }
     }

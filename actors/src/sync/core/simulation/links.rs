@@ -221,7 +221,7 @@ impl World {
                 Some(ends.1)
             }
             Input::MembershipChanged(MembershipFact::NodeLost { node: peer, incarnation, .. })
-            | Input::LinkChanged(LinkFact::PeerLeft { node: peer, incarnation }) => {
+            | Input::LinkChanged(LinkFact::PeerLeft { node: peer, incarnation, .. }) => {
                 let ends = (node, number(peer));
                 let present = self.present.entry(ends).or_default();
                 present.take_if(|life| *life == incarnation.0);
@@ -317,7 +317,7 @@ impl World {
         for peer in (0..self.nodes).filter(|peer| *peer != node) {
             let is_told = self.up.contains(&sorted((node, peer))) && !self.paused.contains(&peer);
             if is_told {
-                let left = LinkFact::PeerLeft { node: address(node), incarnation };
+                let left = LinkFact::PeerLeft { node: address(node), incarnation, gave_up: None };
                 self.tell(peer, Input::LinkChanged(left));
             }
             self.cut((node, peer), Loss::Nobody);

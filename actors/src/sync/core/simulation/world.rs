@@ -305,6 +305,7 @@ impl World {
             | Output::RouteGroups { .. }
             | Output::Cycle { .. }
             | Output::Overdue(_)
+            | Output::Misspelt { .. }
             | Output::SameName { .. } => {}
         }
     }

@@ -30,7 +30,7 @@ impl World {
                 self.send(from, to, What::Answer(correlation), &datagram);
             }
             Output::SendLeave { to, .. } => {
-                let datagram = Datagram { correlation: 0, sent: now, body: Body::Leave(me()) };
+                let datagram = Datagram { correlation: 0, sent: now, body: Body::Leave(me().into()) };
                 self.processes[from].goodbyes.insert(to.there);
                 self.send(from, to, What::Leave, &datagram);
             }
@@ -107,10 +107,10 @@ impl World {
                 }
                 self.judge.found(self.now, process, node, incarnation);
             }
-            MembershipFact::NodeLost { node, incarnation, why } => {
-                use crate::ndl::LossReason::{Crashed, Duplicate, Hung, Left, LinkDown, Restarted};
+            MembershipFact::NodeLost { node, incarnation, ref why } => {
+                use crate::ndl::LossReason::{Crashed, Duplicate, GaveUp, Hung, Left, LinkDown, Restarted};
                 match why {
-                    Left => self.seen.left += 1,
+                    Left | GaveUp(_) => self.seen.left += 1,
                     Crashed => self.seen.crashed += 1,
                     Hung => self.seen.hung += 1,
                     LinkDown => self.seen.link_down += 1,
@@ -120,7 +120,7 @@ impl World {
                         return;
                     }
                 }
-                self.judge.lost(self.now, process, (node, incarnation), why);
+                self.judge.lost(self.now, process, (node, incarnation), why.clone());
                 if matches!(why, Hung | LinkDown) && self.has_delivered(process, (node, incarnation)) {
                     self.judge.violations.push(format!(
                         "{:?}: {process} says {fact:?}, and the connection with it delivers",
@@ -128,7 +128,7 @@ impl World {
                     ));
                 }
                 let host = self.settled_host_of(process, node_at(node));
-                self.judge.check_class(self.now, process, (node, incarnation), (why, host));
+                self.judge.check_class(self.now, process, (node, incarnation), (why.clone(), host));
             }
         }
     }

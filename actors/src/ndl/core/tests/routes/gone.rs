@@ -71,7 +71,7 @@ fn who_is_back_is_asked_from_an_address_that_came_meanwhile_where_it_says_that_i
 fn who_has_left_is_asked_from_no_address_that_comes_later() {
     let mut bench = alone();
     bench.speak(way(0), single());
-    bench.core.handle(bench.now, Input::LeaveReceived { from: way(0), announcement: single() });
+    bench.core.handle(bench.now, Input::LeaveReceived { from: way(0), leave: single().into() });
     assert!(bench.life().is_none(), "it said goodbye");
     bench.joins_the_second_network();
     assert!(bench.asked.is_empty() && bench.core.contacts.is_empty(), "{:?}", bench.asked);
@@ -83,7 +83,7 @@ fn who_says_goodbye_when_it_is_lost_already_is_asked_from_no_address_that_comes_
     let mut bench = alone();
     bench.speak(way(0), single());
     bench.pass(PERIOD * 5);
-    bench.core.handle(bench.now, Input::LeaveReceived { from: way(0), announcement: single() });
+    bench.core.handle(bench.now, Input::LeaveReceived { from: way(0), leave: single().into() });
     bench.joins_the_second_network();
     assert!(!bench.asked.contains(&across()), "{:?}", bench.asked);
 }
@@ -93,7 +93,7 @@ fn who_says_goodbye_when_it_is_lost_already_is_asked_from_no_address_that_comes_
 fn who_has_left_is_asked_again_when_it_can_know_none_of_our_addresses_any_more() {
     let mut bench = alone();
     bench.speak(way(0), single());
-    bench.core.handle(bench.now, Input::LeaveReceived { from: way(0), announcement: single() });
+    bench.core.handle(bench.now, Input::LeaveReceived { from: way(0), leave: single().into() });
     bench.pass(PERIOD * 5);
     bench.asked.clear();
     bench.core.use_paths(bench.now, &[]);
@@ -109,7 +109,7 @@ fn whose_life_nothing_is_kept_of_is_forgotten_where_it_was() {
     let mut bench = alone();
     bench.speak(way(0), single());
     let announcement = Announcement { claim: Claim::Yielded, ..single() };
-    bench.core.handle(bench.now, Input::LeaveReceived { from: way(0), announcement });
+    bench.core.handle(bench.now, Input::LeaveReceived { from: way(0), leave: announcement.into() });
     assert!(bench.life().is_none() && bench.core.gone.is_empty(), "it gave its address up");
     bench.pass(PERIOD * 6);
     assert!(bench.core.contacts.is_empty(), "{:?}", bench.core.contacts);

@@ -174,7 +174,10 @@ impl World {
         let (address, life) = (address(node), Incarnation(self.incarnations[node]));
         let linked: Vec<usize> = self.living().filter(|peer| self.is_up(node, *peer)).collect();
         for peer in linked.iter().filter(|_| says_goodbye) {
-            self.tell(*peer, Input::LinkChanged(LinkFact::PeerLeft { node: address, incarnation: life }));
+            self.tell(
+                *peer,
+                Input::LinkChanged(LinkFact::PeerLeft { node: address, incarnation: life, gave_up: None }),
+            );
         }
         self.cut_all(node);
         let generations = self.generations(node);
@@ -193,7 +196,7 @@ impl World {
     fn hear_of_restart(&mut self, peer: usize, node: usize, former: Incarnation) {
         let (address, news) = (address(node), self.chance.below(3));
         if news > 0 {
-            let why = [LossReason::Crashed, LossReason::Restarted][news - 1];
+            let why = if news == 1 { LossReason::Crashed } else { LossReason::Restarted };
             let lost = MembershipFact::NodeLost { node: address, incarnation: former, why };
             self.tell(peer, Input::MembershipChanged(lost));
         }

@@ -142,7 +142,8 @@ impl Told {
                 match why {
                     LossReason::Duplicate if is_another => {}
                     LossReason::Left => sight.is_lost(Reason::NodeLeft),
-                    LossReason::Crashed
+                    LossReason::GaveUp(_)
+                    | LossReason::Crashed
                     | LossReason::Hung
                     | LossReason::LinkDown
                     | LossReason::Restarted
@@ -208,8 +209,9 @@ impl Told {
         match fact {
             LinkFact::LinkUp { node, incarnation } => self.at(node).link_up(*incarnation),
             LinkFact::LinkBroken { node, incarnation } => self.at(node).link_broken(*incarnation),
-            LinkFact::PeerLeft { node, incarnation } => {
-                self.at(node).is_lost(Reason::NodeLeft);
+            LinkFact::PeerLeft { node, incarnation, gave_up } => {
+                let reason = if gave_up.is_some() { Reason::NodeLost } else { Reason::NodeLeft };
+                self.at(node).is_lost(reason);
                 self.at(node).link_broken(*incarnation);
             }
             LinkFact::DialRefused { .. } => {}

@@ -1,0 +1,210 @@
+//! Settings of the user's own: the tables `[app.NAME]` of a node's file.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fmt,
+    path::PathBuf,
+    sync::{Arc, Mutex},
+};
+
+use serde::de::DeserializeOwned;
+use toml::{
+    Spanned, Table, Value,
+    de::{DeTable, DeValue},
+};
+
+use super::{ConfigFault, ConfigFaults, NodeConfig, check::fault, faults::quoted, file::line_of};
+use crate::stores::lock;
+
+/// The key below which all of them are.
+const APP: &str = "app";
+
+/// The tables of a file, and which of them were read. Clones of a configuration share the latter.
+#[derive(Clone, Default)]
+pub struct AppSettings {
+    tables: Table,
+    /// The file, and the lines of its tables and keys by their full keys.
+    file: Option<PathBuf>,
+    lines: BTreeMap<String, usize>,
+    claimed: Arc<Mutex<BTreeSet<String>>>,
+}
+
+impl fmt::Debug for AppSettings {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        // Settings may be secrets.
+        f.debug_list().entries(self.tables.keys()).finish()
+    }
+}
+
+impl PartialEq for AppSettings {
+    fn eq(&self, other: &Self) -> bool {
+        self.tables == other.tables
+    }
+}
+
+impl AppSettings {
+    /// The tables below `table`, which is that of `[app]`.
+    pub(super) fn read(text: &str, table: &DeTable<'_>) -> Self {
+        let tables: Option<Table> = toml::from_str(text).ok();
+        let tables = tables.and_then(|mut all| match all.remove(APP) {
+            Some(Value::Table(tables)) => Some(tables),
+            Some(_) | None => None,
+        });
+        let mut lines = BTreeMap::new();
+        note_lines(text, APP, table, &mut lines);
+        Self { tables: tables.unwrap_or_default(), lines, ..Self::default() }
+    }
+
+    pub(super) fn name_file(&mut self, file: PathBuf) {
+        self.file = Some(file);
+    }
+
+    /// The table of `name`, written `[app."knee.drive"]` or `[app.knee.drive]`.
+    fn table(&self, name: &str) -> Option<(&Value, String)> {
+        if let Some(found) = self.tables.get(name) {
+            return Some((found, format!("{APP}.{name}")));
+        }
+        let mut parts = name.split('.');
+        let mut found = self.tables.get(parts.next()?)?;
+        for part in parts {
+            found = found.get(part)?;
+        }
+        Some((found, format!("{APP}.{name}")))
+    }
+
+    fn fault(&self, key: &str, found: &str, legal: String, remedy: String) -> ConfigFault {
+        let line = self.lines.get(key).copied();
+        let file = self.file.clone();
+        ConfigFault { line, file, ..fault(quoted(key).trim_matches('"'), found.to_owned(), legal, remedy) }
+    }
+
+    fn missing(&self, name: &str) -> ConfigFault {
+        let place = self
+            .file
+            .as_ref()
+            .map_or_else(|| "the node's file".to_owned(), |file| file.display().to_string());
+        let similar = nearest(name, self.tables.keys().map(String::as_str));
+        let similar =
+            similar.map_or_else(String::new, |other| format!("; [{APP}.{other}] is there, is it misspelt?"));
+        let key = format!("{APP}.{name}");
+        let legal = format!("a table with the settings of '{name}'");
+        self.fault(&key, "no such table", legal, format!("add [{key}] to {place}{similar}"))
+    }
+
+    fn settings<T: DeserializeOwned>(&self, name: &str) -> Result<T, Vec<ConfigFault>> {
+        lock(&self.claimed).insert(name.to_owned());
+        let Some((value, key)) = self.table(name) else { return Err(vec![self.missing(name)]) };
+        let (mut unknown, mut track) = (Vec::new(), serde_path_to_error::Track::new());
+        let mut note = |path: serde_ignored::Path<'_>| unknown.push(path.to_string());
+        let tracked = serde_path_to_error::Deserializer::new(value.clone(), &mut track);
+        let read = T::deserialize(serde_ignored::Deserializer::new(tracked, &mut note));
+        let mut faults: Vec<_> = unknown
+            .iter()
+            .map(|path| {
+                let legal = format!("a key of the settings of '{name}'");
+                let remedy = "correct its spelling, or remove it".to_owned();
+                self.fault(&format!("{key}.{path}"), "a key that does not exist", legal, remedy)
+            })
+            .collect();
+        match read {
+            Ok(settings) if faults.is_empty() => return Ok(settings),
+            Ok(_) => {}
+            Err(error) => {
+                let path = track.path().to_string();
+                let at = if path == "." { key } else { format!("{key}.{path}") };
+                let remedy = format!("correct it in the table of '{name}'");
+                let what = error.to_string();
+                let what = what.lines().next().unwrap_or("a value that cannot be used");
+                faults.push(self.fault(
+                    &at,
+                    what,
+                    format!("what the settings of '{name}' have there"),
+                    remedy,
+                ));
+            }
+        }
+        Err(faults)
+    }
+
+    /// The tables that nothing has read.
+    fn unclaimed(&self) -> Vec<ConfigFault> {
+        let claimed = lock(&self.claimed);
+        let mut unread = Vec::new();
+        note_unread(&self.tables, "", &claimed, &mut unread);
+        let fault = |name: String| {
+            let remedy = nearest(&name, claimed.iter().map(String::as_str)).map_or_else(
+                || "remove it".to_owned(),
+                |nearest| format!("write [{APP}.{nearest}], the nearest, or remove it"),
+            );
+            let legal = "a table that an application of this program reads".to_owned();
+            self.fault(&format!("{APP}.{name}"), "settings that no application reads", legal, remedy)
+        };
+        unread.into_iter().map(fault).collect()
+    }
+}
+
+fn note_unread(table: &Table, above: &str, claimed: &BTreeSet<String>, unread: &mut Vec<String>) {
+    for (key, value) in table {
+        let name = if above.is_empty() { key.clone() } else { format!("{above}.{key}") };
+        if claimed.contains(&name) {
+            continue;
+        }
+        let is_above_one = claimed.iter().any(|other| other.starts_with(&format!("{name}.")));
+        match value {
+            Value::Table(below) if is_above_one => note_unread(below, &name, claimed, unread),
+            _ => unread.push(name),
+        }
+    }
+}
+
+fn note_lines(text: &str, above: &str, table: &DeTable<'_>, lines: &mut BTreeMap<String, usize>) {
+    for (name, value) in table {
+        let key = format!("{above}.{}", name.get_ref());
+        lines.insert(key.clone(), line_of(text, &Spanned::span(name)));
+        if let DeValue::Table(below) = value.get_ref() {
+            note_lines(text, &key, below, lines);
+        }
+    }
+}
+
+/// The most similar of these names, if one is.
+fn nearest<'a>(name: &str, others: impl Iterator<Item = &'a str>) -> Option<String> {
+    let similar = others.map(|other| (strsim::jaro_winkler(name, other), other));
+    let similar = similar.filter(|(similarity, _)| *similarity >= 0.75);
+    similar.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, other)| other.to_owned())
+}
+
+impl NodeConfig {
+    /// The settings of the application `name`: its table `[app.NAME]` in the node's file, read by serde.
+    ///
+    /// ```
+    /// use sinew::config::NodeConfig;
+    ///
+    /// #[derive(serde::Deserialize)]
+    /// struct DriveSettings { kp: f64, limit_nm: f64 }
+    ///
+    /// let file = "[node]\nname = 'knee'\n[app.knee.drive]\nkp = 12.5\nlimit_nm = 40\n";
+    /// let settings: DriveSettings = NodeConfig::from_toml(file)?.app("knee.drive")?;
+    /// assert_eq!(settings.kp, 12.5);
+    /// # Ok::<(), sinew::config::ConfigFaults>(())
+    /// ```
+    ///
+    /// # Errors
+    /// There is no such table, or it has keys that `T` does not have, or a value of another type.
+    pub fn app<T: DeserializeOwned>(&self, name: &str) -> Result<T, ConfigFaults> {
+        self.app_settings.settings(name).map_err(|faults| match ConfigFaults::check(faults) {
+            Err(faults) => faults,
+            Ok(()) => ConfigFaults::one(self.app_settings.missing(name)),
+        })
+    }
+
+    /// The tables `[app.NAME]` that no application of this program reads.
+    pub(crate) fn unclaimed_settings(&self) -> Vec<ConfigFault> {
+        self.app_settings.unclaimed()
+    }
+
+    /// Notes that another program reads the table `[app.NAME]` of the same file, so that it is no fault that this one does not.
+    pub fn app_is_elsewhere(&self, name: &str) {
+        lock(&self.app_settings.claimed).insert(name.to_owned());
+    }
+}
