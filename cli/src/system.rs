@@ -177,7 +177,7 @@ impl System {
                 continue;
             }
             let inspection = Tid::new(node, AppAddress::INSPECT);
-            match self.endpoint.ask::<AskReach, ReachReport>(inspection, &question, self.within) {
+            match self.endpoint.message(inspection, &question).ask::<ReachReport>(self.within) {
                 Ok(said) => members.extend(said.reached.iter().map(|one| one.app)),
                 Err(why) => silent.push(format!("{node} {}: {}", clean(&name), in_words(&why))),
             }

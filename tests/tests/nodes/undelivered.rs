@@ -170,7 +170,7 @@ fn an_endpoint_is_told_what_an_actor_of_another_node_does_not_handle() {
     // The node of the receiver shows it to `sinew why`.
     let inspect = Tid::new(to.node, AppAddress::INSPECT);
     let report: inspect::NodeReport =
-        gait.ask(inspect, &inspect::AskNode {}, DEADLINE).expect("the node answers");
+        gait.message(inspect, &inspect::AskNode {}).ask(DEADLINE).expect("the node answers");
     let [unhandled] = &report.unhandled[..] else { panic!("{:?}", report.unhandled) };
     assert_eq!((unhandled.receiver, unhandled.sender, unhandled.count), (to, gait.tid(), 1));
     assert_eq!((unhandled.kind, unhandled.is_malformed), (Kind::named("undelivered.angle"), false));
