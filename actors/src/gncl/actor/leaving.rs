@@ -67,7 +67,8 @@ impl Gncl {
     pub(super) fn give_up(&self) {
         self.stores.gncl.close();
         for peer in self.stores.gncl.peers() {
-            let messages = peer.left();
+            // What layers tell each other is of no use to a node that stops, too, or of this one.
+            let messages = peer.left_of_applications();
             if messages > 0 {
                 self.stores.gncl.refusals.count(Time::now(), "not delivered", &peer.node);
                 crate::log::warn!(node = %peer.node, messages, "the node stops, and these have not arrived, as far as it knows");
