@@ -456,6 +456,11 @@ impl<S: Socket> StreamOutlet<S> {
         self.lock().left()
     }
 
+    /// Those of applications among these.
+    pub(crate) fn left_of_applications(&self) -> usize {
+        self.lock().left_of_applications()
+    }
+
     /// Messages that wait because their destinations take nothing.
     #[cfg(test)]
     pub(crate) fn in_lines(&self) -> usize {

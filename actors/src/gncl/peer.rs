@@ -239,6 +239,12 @@ impl Peer {
         by_datagram + self.ways.iter().map(|way| way.outlet.left()).sum::<usize>()
     }
 
+    /// Those of applications among these.
+    pub(super) fn left_of_applications(&self) -> usize {
+        let by_datagram = self.channel.as_ref().map_or(0, Channel::left);
+        by_datagram + self.ways.iter().map(|way| way.outlet.left_of_applications()).sum::<usize>()
+    }
+
     /// Nothing reaches it any more, because this node stops.
     pub(super) fn close(&self) {
         self.end(Rejection::Closed);

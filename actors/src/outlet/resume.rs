@@ -69,6 +69,15 @@ impl<S: Socket> Half<S> {
         self.waits_for_its_number() + kept
     }
 
+    /// The messages of applications among these: not what layers tell each other.
+    pub(super) fn left_of_applications(&self) -> usize {
+        let is_one = |message: &Message| !message.header.source.app.is_layer();
+        let waiting = self.queue.iter().chain(&self.interrupted).filter(|message| is_one(message)).count();
+        let kept = self.session.as_ref().map_or(0, |session| session.sending.kept_that(is_one));
+        // What waits in lines is for mailboxes.
+        waiting + kept + self.in_lines()
+    }
+
     /// What waits and has no number yet.
     pub(super) fn waits_for_its_number(&self) -> usize {
         self.queue.len() + usize::from(self.interrupted.is_some()) + self.in_lines()

@@ -109,6 +109,11 @@ impl<M> Sending<M> {
         self.kept.len() - self.voids
     }
 
+    /// Of the messages that have not become voids, those of which this is true.
+    pub(crate) fn kept_that(&self, is_one: impl Fn(&M) -> bool) -> usize {
+        self.kept.iter().filter_map(|kept| kept.message.as_ref()).filter(|message| is_one(message)).count()
+    }
+
     /// How far the peer is, as far as is known here, for an audit.
     pub(crate) fn position(&self) -> Sent {
         let Self { epoch, peer, base, .. } = *self;

@@ -79,7 +79,8 @@ impl Gncl {
     pub(super) fn give_up(&self) {
         self.stores.gncl.close();
         for peer in self.stores.gncl.peers() {
-            let messages = peer.left();
+            // What layers tell each other is of no use to a node that stops, too, or of this one.
+            let messages = peer.left_of_applications();
             // One that has left, or is lost, takes nothing more: that was told, and it is no fault of this stop.
             let is_there = !peer.has_left() && lock(&self.stores.ndl).has_member(peer.node);
             if messages > 0 && !is_there {
