@@ -81,7 +81,13 @@ impl Core {
     }
 
     /// `receiver`, an application of this node or a group of it, refused messages that were sent to it.
-    fn refused(&mut self, now: Time, here: NodeAddress, receiver: Tid, entry: Entry, source: Tid) -> bool {
+    fn refused(
+        &mut self,
+        now: Time,
+        here: NodeAddress,
+        (source, receiver): (Tid, Tid),
+        entry: Entry,
+    ) -> bool {
         let is_of_type = matches!(entry.why, Rejection::UnknownKind | Rejection::Malformed);
         if let Some(kind) = entry.kind.filter(|_| is_of_type && receiver.is_single()) {
             let key = (receiver.app, kind, Outcome::Rejected(entry.why).code());
@@ -148,7 +154,7 @@ impl RefusalSink for Undelivered {
     fn refused(&self, receiver: Tid, header: &Header, why: Rejection, count: u64) {
         let now = Time::now();
         let entry = Entry::of(header, why, count, now);
-        let is_due = lock(&self.core).refused(now, self.node, receiver, entry, header.source);
+        let is_due = lock(&self.core).refused(now, self.node, (header.source, receiver), entry);
         self.tell(is_due);
     }
 }
@@ -167,7 +173,7 @@ mod tests {
     fn refuse(core: &mut Core, source: Tid, now: Time) -> bool {
         let knee = tid(HERE, 0x1001);
         let header = Header::new(Kind::named("demo.angle"), source, knee);
-        core.refused(now, HERE, knee, Entry::of(&header, Rejection::UnknownKind, 1, now), source)
+        core.refused(now, HERE, (source, knee), Entry::of(&header, Rejection::UnknownKind, 1, now))
     }
 
     #[test]

@@ -150,9 +150,9 @@ fn note_unread(table: &Table, above: &str, claimed: &BTreeSet<String>, unread: &
             continue;
         }
         let is_above_one = claimed.iter().any(|other| other.starts_with(&format!("{name}.")));
-        match value {
-            Value::Table(below) if is_above_one => note_unread(below, &name, claimed, unread),
-            _ => unread.push(name),
+        match value.as_table().filter(|_| is_above_one) {
+            Some(below) => note_unread(below, &name, claimed, unread),
+            None => unread.push(name),
         }
     }
 }
