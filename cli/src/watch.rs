@@ -357,6 +357,7 @@ impl Screen {
 }
 
 /// Seconds since 1970, by the clock of this host, of what was seen so long ago.
+#[expect(clippy::disallowed_methods, reason = "people compare the time of a line with a clock on the wall")]
 fn since_1970(ago: Duration) -> f64 {
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     now.saturating_sub(ago).as_secs_f64()

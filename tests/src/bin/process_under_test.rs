@@ -374,11 +374,15 @@ fn run(node: Node, stays: bool, audits: bool) -> ExitCode {
     code
 }
 
-fn main() -> ExitCode {
+fn log_to_standard_error() {
     tracing_subscriber::fmt()
         .with_env_filter(tracing_subscriber::EnvFilter::from_default_env())
         .with_writer(std::io::stderr)
         .init();
+}
+
+fn main() -> ExitCode {
+    log_to_standard_error();
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let after = |flag: &str| {
         let mut pairs = arguments.windows(2).filter(|pair| pair[0] == flag);
