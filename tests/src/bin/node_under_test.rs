@@ -150,11 +150,10 @@ fn streamers(name: &str, receivers: &[String], lengths: &[String]) -> Vec<AppSpe
     receivers.iter().flat_map(of_one).collect()
 }
 
-fn main() -> ExitCode {
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let has = |flag: &str| arguments.iter().any(|argument| argument == flag);
-    if has("--logs") || has("--logs-info") {
-        let level = if has("--logs-info") { tracing::Level::INFO } else { tracing::Level::WARN };
+/// To the output with `warnings` or `info`, else to the standard error.
+fn log(warnings: bool, info: bool) {
+    if warnings || info {
+        let level = if info { tracing::Level::INFO } else { tracing::Level::WARN };
         tracing_subscriber::fmt().with_max_level(level).init();
     } else {
         tracing_subscriber::fmt()
@@ -162,6 +161,12 @@ fn main() -> ExitCode {
             .with_writer(std::io::stderr)
             .init();
     }
+}
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let has = |flag: &str| arguments.iter().any(|argument| argument == flag);
+    log(has("--logs"), has("--logs-info"));
     let after = |flag: &str| {
         let pairs = arguments.windows(2).filter(|pair| pair[0] == flag);
         pairs.map(|pair| pair[1].clone()).collect::<Vec<_>>()

@@ -373,10 +373,8 @@ fn a_node_whose_layers_give_up_is_lost_for_that_reason() {
 }
 
 fn loss(seen: &Seen) -> Option<sinew::LossReason> {
-    match seen {
-        Seen::Node(NodeEvent::NodeLost { why, .. }) => Some(why.clone()),
-        _ => None,
-    }
+    let Seen::Node(NodeEvent::NodeLost { why, .. }) = seen else { return None };
+    Some(why.clone())
 }
 
 /// All applications of a node at once.
