@@ -150,6 +150,7 @@ mod tests {
     proptest! {
         #[test]
         fn what_is_written_is_read(project in "\\PC{1,15}", name in "\\PC{1,15}", bits in 1..u32::MAX) {
+            prop_assume!([&project, &name].iter().all(|one| sinew_runtime::name::check_name(one).is_ok()));
             let identity = Identity { project, address: NodeAddress::new(bits), name };
             prop_assert!(identity.uri().is_ascii());
             prop_assert_eq!(Identity::from_uri(&identity.uri()), Some(identity.clone()));

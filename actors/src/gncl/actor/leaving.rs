@@ -82,8 +82,9 @@ impl Gncl {
             // What layers tell each other is of no use to a node that stops, too, or of this one.
             let messages = peer.left_of_applications();
             // One that has left, or is lost, takes nothing more: that was told, and it is no fault of this stop.
-            let is_there = !peer.has_left() && lock(&self.stores.ndl).has_member(peer.node);
-            if messages > 0 && !is_there {
+            let is_gone = peer.has_left()
+                || lock(&self.stores.ndl).lost_nodes().iter().any(|(lost, _)| *lost == peer.node);
+            if messages > 0 && is_gone {
                 crate::log::debug!(node = %peer.node, messages, "the node stops, and these were for one that is gone");
             } else if messages > 0 {
                 self.stores.gncl.refusals.count(Time::now(), "not delivered", &peer.node);
