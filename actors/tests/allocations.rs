@@ -281,10 +281,10 @@ fn parts<P: Filled>(how: How) -> Vec<usize> {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let (done, parts) = sync_channel(1);
     let there = AppSpec::new("there", move || There { how }).handles::<P>().handles::<Word>().own_thread();
-    let here = AppSpec::new("here", move || Here::<P>::new(how, done.clone()));
+    let here = AppSpec::new("home", move || Here::<P>::new(how, done.clone()));
     let here = here.handles::<P>().handles::<Word>().requires(["there"]).own_thread();
     let there = node("there", 2).app(there).start().unwrap();
-    let here = node("here", 1).app(here).start().unwrap();
+    let here = node("home", 1).app(here).start().unwrap();
     let parts = parts.recv_timeout(DEADLINE).expect("all windows are counted");
     assert_goes_by_datagram::<P>(&here);
     here.stop();

@@ -125,7 +125,7 @@ mod tests {
         let mut table = Table::new(["name", "state", "what"]);
         table.row(["膝".to_owned(), "a\nb".to_owned(), "x\u{202e}y".to_owned()]);
         table.row(["knee".to_owned(), "c".to_owned(), "z".to_owned()]);
-        let lines = "name  state   what\n膝    a\\u{a}b  x\\u{202e}y\nknee  c       z\n";
+        let lines = "name  state    what\n膝    a\\u{a}b  x\\u{202e}y\nknee  c        z\n";
         assert_eq!(table.text(), lines);
     }
 

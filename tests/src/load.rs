@@ -67,7 +67,7 @@ pub fn run(plan: Plan) -> Report {
         .handles::<crate::puppet::Order>()
         .own_thread();
     let ((near, near_key), (far, far_key)) = (desk("near"), desk("far"));
-    let here = node("here").app(sink).app(near).start().expect("a node");
+    let here = node("home").app(sink).app(near).start().expect("a node");
     let there = node("there").app(far).start().expect("a node");
     all_run(&[&here, &there]);
     sees(&here.handle(), there.address());

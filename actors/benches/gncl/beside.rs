@@ -230,7 +230,7 @@ pub(crate) fn measure(case: &str, at: At, bulk_bytes: usize, rounds: u64) {
         began: Instant::now(),
     };
     let asker = AppSpec::new("asker", asker).handles::<Answer>().requires(["echo", "sink"]).own_thread();
-    let node = node("here", at).app(asker).start().expect("a node");
+    let node = node("home", at).app(asker).start().expect("a node");
     let seen = seen.recv_timeout(DEADLINE).expect("the rounds end");
     node.stop();
     seen.report(case);

@@ -45,7 +45,7 @@ fn main() {
         for channels in [1, 16] {
             let plan = Plan { by, channels, values };
             let (there, taken) = taker(plan, node("there", 2), nothing);
-            let (here, given) = giver(plan, node("here", 1), meter);
+            let (here, given) = giver(plan, node("home", 1), meter);
             let [allocations, bytes, _] = given.recv_timeout(DEADLINE).expect("all are given").counted;
             let came = taken.recv_timeout(DEADLINE).expect("the last ones come").ages.rounds();
             here.stop();

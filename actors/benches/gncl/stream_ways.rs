@@ -69,7 +69,7 @@ pub(crate) fn measure(case: &str, plan: Plan) {
     let at = At::loopback();
     let role = format!("stream_take {} {} {} {}", plan.by.name(), plan.channels, plan.values, at.host(2));
     let other = Process::start(&role);
-    let (node, given) = giver(plan, at.node("here"), meter);
+    let (node, given) = giver(plan, at.node("home"), meter);
     let [cpu_ns, sleeps, datagrams] = given.recv_timeout(DEADLINE).expect("all are given").counted;
     let said = other.wait();
     let [on_the_way, _] = superseded(&node);

@@ -42,7 +42,7 @@ fn the_first_socket_of_ones_own_that_takes_us_is_entered_and_each_that_does_not_
     fs::write(directory.join("sinew-a\u{1b}[2J.sock"), "").expect("the test's own directory");
     let find = || find_at(vec![place(&directory)], own_uid());
     let seen = find().expect_err("nobody listens");
-    assert!(seen.contains("sinew-a?[2J.sock: "), "{seen}");
+    assert!(seen.contains("sinew-a\\u{1b}[2J.sock: "), "{seen}");
     assert!(!seen.contains('\u{1b}'), "what terminals obey is not shown");
     let listener = listens(&directory.join("sinew-b.sock"));
     let (path, _) = find().expect("it is ours");

@@ -87,7 +87,7 @@ impl Field {
         };
         let names: Vec<_> = (0..APPS).map(|number| format!("clerk {number}")).collect();
         let (desk, key) = desk("desk");
-        let mut here = node("here").app(desk);
+        let mut here = node("home").app(desk);
         for (number, name) in names.iter().enumerate() {
             let app = AppSpec::new(name.as_str(), || Clerk).handles::<Job>();
             here = here.app(app.place(Place::thread(format!("thread {}", number % 4))));

@@ -99,7 +99,7 @@ impl Across {
         let ground = Ground::new();
         let ((target, log), (watcher, eye), (desk, key)) = (target(), watcher(), desk("desk"));
         let there = ground.node("there").app(target).app(desk).start().expect("a node");
-        let here = ground.node("here").app(watcher.requires(["target"])).start().expect("a node");
+        let here = ground.node("home").app(watcher.requires(["target"])).start().expect("a node");
         all_run(&[&there, &here]);
         let tid = there.handle().resolve("target").expect("it is registered");
         Self { there, here, eye, sender: key.sender(), tid, log }

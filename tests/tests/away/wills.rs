@@ -121,7 +121,7 @@ fn a_will_reaches_another_node_behind_all_that_the_dead_one_sent() {
     let ((mortal, log), (heir, seen), (desk, key)) = (mortal(100), heir(), desk("desk"));
     let mortal = mortal.requires(["heir"]).last_will("heir", &WILL);
     let there = ground.node("there").app(heir).start().expect("a node");
-    let here = ground.node("here").app(mortal).app(desk).start().expect("a node");
+    let here = ground.node("home").app(mortal).app(desk).start().expect("a node");
     all_run(&[&there, &here]);
     kill(&key.sender(), &log);
     seen.wait_for(Seen::Got(1, WILL.number));
@@ -140,7 +140,7 @@ fn wills_are_sent_when_the_supervisor_of_the_applications_fails_itself() {
     let ((mortal, log), (heir, seen)) = (mortal(0), heir());
     let mortal = mortal.requires(["heir"]).last_will("heir", &WILL);
     let there = ground.node("there").app(heir).start().expect("a node");
-    let here = ground.node("here").app(mortal).app(hung).start().expect("a node");
+    let here = ground.node("home").app(mortal).app(hung).start().expect("a node");
     all_run(&[&there, &here]);
     here.handle().fail_supervisor();
     seen.wait_for(Seen::Got(1, WILL.number));
@@ -160,7 +160,7 @@ fn wills_of_a_node_whose_layers_have_given_up_are_executed_by_the_others() {
     let ((mortal, log), (heir, seen)) = (mortal(0), heir());
     let mortal = mortal.last_will("heir", &WILL);
     let there = ground.node("there").app(heir.requires(["mortal"])).start().expect("a node");
-    let here = ground.node("here").configure(|config| config.supervision.layer_restarts_max = 0);
+    let here = ground.node("home").configure(|config| config.supervision.layer_restarts_max = 0);
     let here = here.app(mortal).start().expect("a node");
     all_run(&[&here, &there]);
     here.handle().inject("NDL", Fault::panic()).expect("every node has it");

@@ -35,7 +35,7 @@ impl Scene {
             })
         };
         let (watcher, heard) = Stage::new().app("watcher");
-        let here = watched(ground.node("here")).app(watcher.handles::<NodeEvent>()).start().expect("a node");
+        let here = watched(ground.node("home")).app(watcher.handles::<NodeEvent>()).start().expect("a node");
         let (desk, key) = desk("desk");
         let socket = directory.join("node.sock");
         let opened = watched(ground.node("there")).configure(|config| config.lncl.socket = Some(socket));

@@ -49,7 +49,7 @@ fn hangs_for_ever(layer: &'static str) {
     let (ground, doors) = (Ground::new(), Doors::new());
     let ((puppet, log), (desk, key)) = (Stage::new().app("puppet"), desk("desk"));
     let there = doors.node(&ground).app(puppet).start().expect("a node");
-    let here = ground.node("here").app(desk).start().expect("a node");
+    let here = ground.node("home").app(desk).start().expect("a node");
     all_run(&[&there, &here]);
     let sender = key.sender();
     is_linked(&sender);
@@ -105,7 +105,7 @@ fn an_application_that_hangs_on_the_thread_of_the_sockets_keeps_no_door_from_the
     let (neighbour, _) = Stage::new().app("neighbour");
     let neighbour = neighbour.on_io_thread().progress_within(Duration::from_millis(100));
     let there = doors.node(&ground).app(puppet).app(neighbour).start().expect("a node");
-    let here = ground.node("here").app(desk).start().expect("a node");
+    let here = ground.node("home").app(desk).start().expect("a node");
     all_run(&[&there, &here]);
     let sender = key.sender();
     is_linked(&sender);

@@ -66,7 +66,7 @@ fn an_application_that_stalls_its_nodes_io_thread_is_named_to_other_nodes_and_it
         builder.configure(|config| (config.ndl.period, config.ndl.missed_max) = (LOSS / 4, 4))
     };
     let (watcher, log) = Stage::new().app("watcher");
-    let here = quick(ground.node("here")).app(watcher.handles::<NodeEvent>()).start().expect("a node");
+    let here = quick(ground.node("home")).app(watcher.handles::<NodeEvent>()).start().expect("a node");
     let (slow, _) = Stage::new().got(move |_, _| blocks.wait()).app("slow");
     let slow = slow.place(Place::io()).progress_within(Duration::from_secs(60));
     let (desk, key) = desk("desk");
@@ -284,7 +284,7 @@ fn pair() -> (Node, Node, Sender, Log<Seen>) {
     let ground = Ground::new();
     let ((puppet, log), (desk, key)) = (Stage::new().app("puppet"), desk("desk"));
     let there = ground.node("there").app(puppet).start().expect("a node");
-    let here = ground.node("here").app(desk).start().expect("a node");
+    let here = ground.node("home").app(desk).start().expect("a node");
     all_run(&[&there, &here]);
     sees(&here.handle(), there.address());
     let sender = key.sender();

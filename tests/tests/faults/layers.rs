@@ -43,7 +43,7 @@ impl Pair {
         };
         let ((first, at_first), (second, at_second)) = (witness("first"), witness("second"));
         let there = ground.node("there").app(puppet).app(second).start().expect("a node");
-        let here = ground.node("here").app(desk).app(first).start().expect("a node");
+        let here = ground.node("home").app(desk).app(first).start().expect("a node");
         all_run(&[&there, &here]);
         sees(&here.handle(), there.address());
         sees(&there.handle(), here.address());
@@ -204,7 +204,7 @@ fn membership_is_kept_while_ndl_dies_on_either_node() {
 #[test]
 fn a_new_node_is_found_by_an_ndl_that_was_just_restarted() {
     let ground = Ground::new();
-    let here = ground.node("here").start().expect("a node");
+    let here = ground.node("home").start().expect("a node");
     kill(&here.handle(), "NDL");
     let there = ground.node("there").start().expect("a node");
     sees(&here.handle(), there.address());
@@ -215,7 +215,7 @@ fn a_new_node_is_found_by_an_ndl_that_was_just_restarted() {
 fn a_barrier_keeps_its_state_while_the_sync_manager_dies() {
     let ground = Ground::new();
     let (puppet, log) = Stage::new().app("puppet");
-    let here = ground.node("here").app(puppet.requires(["gate"])).start().expect("a node");
+    let here = ground.node("home").app(puppet.requires(["gate"])).start().expect("a node");
     for layer in ["sync", "LNCL", "GNCL"] {
         kill(&here.handle(), layer);
         let waiting = here.handle().waiting();
@@ -317,7 +317,7 @@ fn groups_reach_their_members_on_other_nodes_after_each_layer_died() {
     let stage = Stage::new().started(|_, context| context.join("listeners"));
     let ((puppet, log), (desk, key)) = (stage.app("puppet"), desk("desk"));
     let there = ground.node("there").app(puppet).start().expect("a node");
-    let here = ground.node("here").app(desk).start().expect("a node");
+    let here = ground.node("home").app(desk).start().expect("a node");
     all_run(&[&there, &here]);
     let sender = key.sender();
     let reaches = |number| {
@@ -389,7 +389,7 @@ fn an_application_and_a_layer_that_die_at_once_both_come_back() {
 fn all_run_with(fault: &str) {
     let ground = Ground::new();
     let app = |name: &str, requires: &[&str]| Stage::new().app(name).0.requires(requires.iter().copied());
-    let here = ground.node("here").app(app("a", &["b"])).app(app("b", &[])).app(app("c", &["d"]));
+    let here = ground.node("home").app(app("a", &["b"])).app(app("b", &[])).app(app("c", &["d"]));
     let there = ground.node("there").app(app("d", &["a"])).app(app("e", &["c"]));
     let here = here.fault(fault).start().expect("a node");
     let there = there.start().expect("a node");

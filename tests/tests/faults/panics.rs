@@ -149,10 +149,10 @@ fn a_panic_in_the_drop_of_one_that_panicked_does_not_abort_the_process() {
 #[test]
 fn a_panic_in_the_factory_is_a_failed_start_and_is_tried_again() {
     let stage =
-        Stage::new().made(|life| assert!(life > 2, "no such device")).got(|puppet, _| puppet.say("here"));
+        Stage::new().made(|life| assert!(life > 2, "no such device")).got(|puppet, _| puppet.say("home"));
     let (node, sender, log) = perform(stage, |app| app);
     send_jobs(&sender, "puppet", [1]);
-    log.wait_for(Seen::Said(3, "here"));
+    log.wait_for(Seen::Said(3, "home"));
     assert_eq!(lives(&log), 1, "the first two never came to be");
     all_run(&[&node]);
 }
@@ -234,7 +234,7 @@ fn a_panic_on_the_thread_of_the_sockets_does_not_cut_the_node_off() {
     let stage = Stage::new().got(|puppet, _| assert!(puppet.number != 13, "on the io thread"));
     let ((puppet, log), (desk, key)) = (stage.app("puppet"), desk("desk"));
     let there = ground.node("there").app(puppet.on_io_thread()).start().expect("a node");
-    let here = ground.node("here").app(desk).start().expect("a node");
+    let here = ground.node("home").app(desk).start().expect("a node");
     let sender = key.sender();
     until("the puppet's name is known here", || sender.resolve("puppet"));
     until("it is reached", || (outcome_of_job(&sender, "puppet", 1) == Outcome::Delivered).then_some(()));

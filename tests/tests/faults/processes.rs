@@ -98,7 +98,7 @@ fn a_process_killed_under_confirmed_traffic_leaves_no_message_without_an_outcome
     let scenario = Scenario::new();
     let knee = scenario.start("knee", 101, &[]);
     let (desk, key) = desk("desk");
-    let here = scenario.ground.node("here").app(desk).start().expect("a node");
+    let here = scenario.ground.node("home").app(desk).start().expect("a node");
     let sender = key.sender();
     let tid = until("the knee is known", || sender.resolve("knee"));
     let payload = || sinew_tests::puppet::Order { number: 1 };
@@ -144,7 +144,7 @@ fn a_process_that_freezes_for_a_moment_is_not_lost_and_gets_every_message_in_ord
 fn a_node_killed_while_others_wait_for_it_at_the_barrier_is_waited_for_in_its_next_life() {
     let scenario = Scenario::new();
     let (puppet, log) = Stage::new().app("puppet");
-    let here = scenario.ground.node("here").app(puppet.requires(["knee", "hip"])).start().expect("a node");
+    let here = scenario.ground.node("home").app(puppet.requires(["knee", "hip"])).start().expect("a node");
     let mut knee = scenario.start("knee", 101, &[]);
     knee.wait_for(&["started"]);
     until("half of the barrier is met", || here.handle().resolve("knee"));
@@ -219,12 +219,12 @@ fn an_application_in_a_process_of_its_own_takes_its_faults_along() {
 fn both_ends_of_a_conversation_may_be_killed_in_turn() {
     let scenario = Scenario::new();
     let (puppet, log) = Stage::new().app("puppet");
-    let here = scenario.ground.node("here").app(puppet.handles::<NodeEvent>()).start().expect("a node");
+    let here = scenario.ground.node("home").app(puppet.handles::<NodeEvent>()).start().expect("a node");
     all_run(&[&here]);
     for (round, address) in [(1, 101), (2, 102), (3, 101)] {
         let name = format!("peer{address}");
         let mut peer = scenario.start(&name, address, &[]);
-        peer.wait_for(&["NodeFound", "here"]);
+        peer.wait_for(&["NodeFound", "home"]);
         let there = NodeAddress::from([127, 0, 0, address]);
         log.wait("the peer is seen", |seen| {
             let found = |seen: &&Seen| matches!(seen, Seen::Node(NodeEvent::NodeFound { node, .. } | NodeEvent::NodeRestarted { node, .. }) if *node == there);

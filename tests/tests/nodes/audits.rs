@@ -172,7 +172,7 @@ fn an_audit_of_two_nodes_explains_every_message_while_they_flow_and_when_all_is_
     let (sink, _log) = Stage::new().app("sink");
     let (desk, key) = desk("desk");
     let there = ground.node("there").app(sink).start().expect("a node");
-    let here = ground.node("here").app(desk).start().expect("a node");
+    let here = ground.node("home").app(desk).start().expect("a node");
     all_run(&[&there, &here]);
     let (handle, sender) = (here.handle(), key.sender());
     sees(&handle, there.address());

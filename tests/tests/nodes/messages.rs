@@ -90,7 +90,7 @@ where
     let (told, is_told) = sync_channel(1);
     let teller = AppSpec::new("teller", move || Teller { story: story.clone(), told: told.clone() });
     let there = second(node("there", 2, group)).start().expect("a node");
-    let here = node("here", 1, group).app(teller.requires(requires.iter().copied())).start().expect("a node");
+    let here = node("home", 1, group).app(teller.requires(requires.iter().copied())).start().expect("a node");
     if is_told.recv_timeout(DEADLINE).is_err() {
         panic!("the story was not told; who waits: {:?}", here.handle().waiting());
     }
@@ -312,7 +312,7 @@ fn a_run_ends_with_a_circle_through_another_node_and_a_node_that_runs_others_goe
     let handle = there.handle();
     let runs_on = std::thread::spawn(move || there.run());
     // When: a node starts that closes the circle, and runs nothing else
-    let here = node("here", 1, group).app(app("hip").requires(["knee"])).start().expect("the layers start");
+    let here = node("home", 1, group).app(app("hip").requires(["knee"])).start().expect("the layers start");
     let asked = here.handle();
     let error = asked.wait_until_running(DEADLINE).expect_err("nobody can be the first");
     assert!(error.to_string().contains("hip requires knee (node there) requires hip"), "{error}");
@@ -330,7 +330,7 @@ fn a_circle_that_was_opened_on_another_node_is_told_of_no_more() {
     let group = own_group();
     let oracle = |name: &str| oracle(name).0;
     let here =
-        node("here", 1, group).app(oracle("hip").requires(["knee"])).start().expect("the layers start");
+        node("home", 1, group).app(oracle("hip").requires(["knee"])).start().expect("the layers start");
     let there =
         node("there", 2, group).app(oracle("knee").requires(["hip"])).start().expect("the layers start");
     let error = here.handle().wait_until_running(DEADLINE).expect_err("nobody can be the first");

@@ -26,7 +26,7 @@ fn an_application_has_its_time_to_stop_after_a_panic_of_the_root_and_then_its_la
     let slow = slow.requires(["heir"]).stop_within(time).last_will("heir", &Order { number: 7 });
     let (heir, seen) = Stage::new().app("heir");
     let there = ground.node("there").app(heir).start().expect("a node");
-    let here = ground.node("here").app(slow).start().expect("a node");
+    let here = ground.node("home").app(slow).start().expect("a node");
     all_run(&[&there, &here]);
     here.handle().fail_root();
     seen.wait_for(Seen::Got(1, 7));

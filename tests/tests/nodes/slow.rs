@@ -107,7 +107,7 @@ fn a_slow_application_gets_everything_in_order_and_those_beside_it_are_answered_
     let quick = AppSpec::new("quick", || Quick).handles::<Question>().own_thread();
     let _there = node("there", 2, group).app(slow).app(quick).start().expect("a node");
     let sending = AppSpec::new("sending", move || Sending(done.clone())).requires(["slow", "quick"]);
-    let here = node("here", 1, group).app(sending).start().expect("a node");
+    let here = node("home", 1, group).app(sending).start().expect("a node");
     in_order(&did);
     let seen = seen.recv_timeout(DEADLINE).expect("all were sent");
     assert!(seen.refused > 0 && seen.answered == seen.refused, "{seen:?}");

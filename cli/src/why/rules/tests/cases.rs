@@ -29,7 +29,7 @@ const CASES: &[Case] = &[
         },
         [
             "knee.drive handles what it is sent",
-            "demo.angle is not handled: 7 messages, the last one 1 ms ago from hip",
+            "demo.angle is not handled: 7 messages, the last one 1.0 ms ago from hip",
             "handles::<Angle>",
         ],
     ),
