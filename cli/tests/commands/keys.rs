@@ -171,7 +171,7 @@ fn names_and_addresses_that_cannot_be_are_refused_before_anything_is_made() {
         (&[".hip"], &["cannot be the name of a directory"]),
         (&["a/b=10.0.0.2"], &["cannot be the name of a directory"]),
         (&[""], &["node.name"]),
-        (&["nowhere.toml"], &["nowhere.toml is no configuration"]),
+        (&["nowhere.toml"], &["nowhere.toml", "this is no configuration of a node"]),
     ] {
         refused(&directory, &[&["init", "walker"], nodes].concat(), 2, parts);
     }

@@ -382,6 +382,7 @@ fn the_doctor_tries_each_thing_and_every_finding_has_what_mends_it() {
             "CPU governor",
             "clock",
             "shared memory",
+            "own processes",
             "socket directory",
             "leftover sockets",
             "node",

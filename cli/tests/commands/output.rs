@@ -22,7 +22,7 @@ const COMMANDS: [&[&str]; 17] = [
     &["ping", "hip", "--count", "1"],
     &["send", "hip", "demo.nothing", "{}"],
     &["watch", "hip", "--json"],
-    &["why", "hip"],
+    &["why", "hip", "hip"],
     &["barriers"],
     &["audit"],
     &["doctor"],
