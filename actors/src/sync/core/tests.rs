@@ -64,11 +64,10 @@ impl Bench {
         self.core.handle(self.now, input);
         let mut outputs = Vec::new();
         while let Some(output) = self.core.poll() {
-            match output {
-                Output::Misspelt { application, name, nearest } => {
-                    self.misspelt.push((application, name, nearest));
-                }
-                output => outputs.push(output),
+            if let Output::Misspelt { application, name, nearest } = output {
+                self.misspelt.push((application, name, nearest));
+            } else {
+                outputs.push(output);
             }
         }
         outputs
