@@ -144,12 +144,16 @@ fn to_many(
         sent.err().map(|error| clean(&error.to_string()))
     };
     let target = clean(&order.target);
+    // A group that is named by its TID is known to be one. A bare name may be misspelt.
+    let is_name = order.target.parse::<Tid>().is_err();
     let result = match (&fault, members.len()) {
         (Some(why), _) => why.clone(),
-        (None, 0) => {
-            "no application is a member; the message reached nobody. `sinew apps` shows the applications"
+        (None, 0) if is_name => {
+            "no application has this name, and no group of this name has a member; the message reached nobody. \
+             `sinew apps` shows the applications"
                 .to_owned()
         }
+        (None, 0) => "no application is a member; the message reached nobody".to_owned(),
         (None, 1) => "sent to 1 member, without confirmation".to_owned(),
         (None, count) => format!("sent to {count} members, without confirmation"),
     };
@@ -160,7 +164,8 @@ fn to_many(
         "members": members.iter().map(ToString::to_string).collect::<Vec<_>>(), "silent": silent,
     });
     let text = format!("{target} ({to}): {result}\n{silent_lines}");
-    Ok(Report { text, json, is_fine: fault.is_none() && silent.is_empty() })
+    let is_fine = fault.is_none() && silent.is_empty() && !(is_name && members.is_empty());
+    Ok(Report { text, json, is_fine })
 }
 
 fn send(system: &mut System, to: Tid, (kind, payload): (Kind, &[u8]), order: &Order) -> Ended {

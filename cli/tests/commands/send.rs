@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use sinew::{Kind, NodeApi, Outcome, Registration};
+use sinew::{Kind, NodeApi, Outcome, Registration, Tid};
 
 use crate::scenario::{Scenario, named};
 
@@ -41,7 +41,9 @@ fn what_is_not_delivered_is_a_finding_with_the_reason() {
         (&[&*tid, "scenario.count", r#"{"nummer":1}"#], 1, "Malformed"),
         (&["127.0.0.2/1fff", "scenario.count"], 1, "NoSuchApplication"),
         (&["127.0.0.9/1fff", "scenario.count"], 1, "NoSuchNode"),
-        (&["ankle", "scenario.count"], 0, "reached nobody"),
+        (&["ankle", "scenario.count"], 1, "no application has this name"),
+        // A group without members is no finding where the target can be nothing else.
+        (&[&Tid::group("legs").to_string(), "scenario.count"], 0, "reached nobody"),
         (&[&*tid, "scenario.count", "{number:1}"], 2, "JSON"),
         (&[&*tid, "0x13"], 2, "0x13"),
     ] {
@@ -50,6 +52,8 @@ fn what_is_not_delivered_is_a_finding_with_the_reason() {
         assert!(answer.code == Some(code) && said.contains(part), "{words:?}: {said}");
     }
     // Where JSON is asked for, a failure is JSON, too.
+    let answer = scenario.sinew("knee", &["send", "ankle", "scenario.count", "--json"]);
+    assert!(answer.code == Some(1) && answer.json()["members"] == json!([]), "{}", answer.out);
     let answer = scenario.sinew("knee", &["send", "a|b", "scenario.count", "--json"]);
     assert!(answer.json()["fault"].as_str().is_some_and(|why| why.contains("a|b")), "{}", answer.out);
 }
