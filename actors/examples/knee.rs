@@ -9,7 +9,7 @@ use std::{
     time::Duration,
 };
 
-use sinew::{ApiError, NodeApi, Registration, payload};
+use sinew::{NodeApi, Registration, client::ApiError, payload};
 
 payload!("demo.joint_angle" => struct JointAngle { degrees: f32 });
 

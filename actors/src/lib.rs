@@ -6,15 +6,26 @@
 //!
 //! # The map
 //!
+//! The root has what nearly every program names. All else is in a module by topic.
+//!
 //! | for | look at |
 //! | --- | --- |
-//! | a node and its life | [`Node`], [`NodeBuilder`], [`config`] |
-//! | an application in the node's process | [`AppSpec`], [`AppContext`], [`Delivery`], [`payload!`] |
-//! | the same in a process of its own, started and restarted by the node | [`AppSpec::own_process`], [`Place::process`] |
-//! | an application in a process that the node did not start | [`NodeApi`], [`Endpoint`] for a thread, [`AsyncEndpoint`] for a task |
-//! | sending | `send`, `reply` and `message` of [`AppContext`], [`Sender`], [`Endpoint`] and [`AsyncEndpoint`]; [`Outcome`] |
-//! | who another node is, proven | [`security`] |
-//! | events | [`NodeEvent`] (who is there), [`DirectoryEvent`] (which applications are, and what they handle), [`RequirementEvent`] (what is ready), [`Down`] (who ended, and why) |
+//! | a node: start, stop, status | [`Node`], [`NodeBuilder`], [`node`], [`config`] |
+//! | an application in the node's process | [`AppSpec`], [`AppContext`], [`Delivery`], [`payload!`], [`app`] |
+//! | the same in a process of its own, started and restarted by the node | [`AppSpec::own_process`], [`supervision::Place`] |
+//! | an application in a process that the node did not start | [`client`]: [`NodeApi`], [`Endpoint`] for a thread, [`AsyncEndpoint`] for a task |
+//! | sending, and what became of it | [`message`], [`Outcome`] |
+//! | restarts, supervisors | [`supervision`] |
+//! | notifications of nodes, applications, requirements, ended actors, late inputs | [`events`] |
+//! | starting in step with others | [`barrier`] |
+//! | which nodes are known, and by which routes | [`discovery`] |
+//! | addresses | [`Tid`], [`address`] |
+//! | identities and keys | [`security`] |
+//! | protected commands and safe outputs | [`protection`] |
+//! | counts of every message | [`audit`] |
+//! | reports for tools | [`inspect`] |
+//! | signals | [`signals`] |
+//! | clocks, timers | [`Time`], [`time`] |
 //!
 //! `docs/SEMANTICS.md` says on one page what is promised and what is not.
 //!
@@ -33,9 +44,9 @@ use sinew_runtime::log;
 mod accept_pace;
 mod access;
 mod aftermath;
-pub mod api;
 pub mod audit;
 mod bind_error;
+pub mod client;
 mod clocks;
 pub mod config;
 
@@ -54,7 +65,7 @@ mod log_quotas;
 mod monitors;
 mod ndl;
 mod nicer;
-mod node;
+pub mod node;
 mod outlet;
 mod payload;
 mod process;
@@ -77,46 +88,93 @@ mod wills;
 #[cfg(feature = "fault-points")]
 pub use sinew_runtime::{name, supervision::fault};
 
-pub use access::{AccessError, AccessSummary};
-pub use api::{
-    ApiError, AsyncEndpoint, Barrier, BarrierError, Endpoint, LoanedMessage, Meet, Meeting, NodeApi,
-    Received, Registration, Transport,
-};
-pub use audit::{Audit, NodeAudit};
-pub use clocks::{ClockDrift, ClockOffset};
-pub use config::{ConfigFaults, NodeConfig};
-pub use lncl::RegisterError;
-pub use ndl::{
-    IdleApp, KnownNode, KnownRoute, LossReason, NodeEvent, OwnStalls, Source, Trouble, TroubledApp,
-};
-pub use node::{
-    AuditError, CommandError, LifeState, MailboxState, Node, NodeBuilder, NodeEnd, NodeHandle, StartError,
-    Supervised, Supervises, SupervisionTree, SupervisorSpec, Traffic,
-};
-pub use outlet::OutletCounts;
-pub use secured::{DenyListError, DenyListSummary};
+#[doc(no_inline)]
+pub use address::{AppAddress, NodeAddress, Tid};
+#[doc(no_inline)]
+pub use app::{AppContext, AppSpec, Delivery};
+#[doc(no_inline)]
+pub use client::{AsyncEndpoint, Endpoint, NodeApi, Registration};
+#[doc(no_inline)]
+pub use config::NodeConfig;
+#[doc(no_inline)]
+pub use message::{Class, Outcome, Payload};
+#[doc(no_inline)]
+pub use node::{Node, NodeBuilder, NodeHandle, StartError};
 pub use serde;
-pub use sinew_runtime::{
-    app::{
-        AppContext, AppSpec, Delivery, DownPolicy, InputTimeout, LastWill, Raw, Requirement,
-        RequirementEvent, RequirementPolicy, SendOutcome,
-    },
-    monitor::{Down, DownClass, MonitorError, MonitorId},
-    outcome::{Outcome, Rejection},
-    protection,
-    schedule::{Tick, TimerId},
-    sender::{AskError, Confirmation, Destination, Reply, SendError, Sender},
-    supervision::{AutoShutdown, Place, ReadyGate, Reason, Refusal, Restart, StartRetry, Strategy},
-    tid::{AppAddress, Incarnation, NodeAddress, Tid},
-    time::Time,
-    undelivered::Undelivered,
-    wire::{Class, Kind, MessageBuffer, Payload, TIME_TO_LIVE_MAX},
-};
-pub use sinew_shm::Spin;
-pub use sync::{
-    Absence, ArriveAtBarrier, BarrierAnswer, BarrierKind, BarrierStatus, DirectoryEntry, DirectoryEvent,
-    LeaveBarrier, OnPartyLoss, Waiting,
-};
+pub use sinew_runtime::protection;
+#[doc(no_inline)]
+pub use time::Time;
+
+/// Addresses of nodes and applications.
+pub mod address {
+    pub use sinew_runtime::tid::{AppAddress, Incarnation, NodeAddress, Tid};
+}
+
+/// Applications: how one is declared, what it gets with each message, and what it may do.
+pub mod app {
+    pub use sinew_runtime::app::{
+        AppContext, AppSpec, Delivery, DownPolicy, LastWill, Raw, Requirement, RequirementPolicy, SendOutcome,
+    };
+}
+
+/// Barriers: several applications go on at the same moment.
+pub mod barrier {
+    pub use crate::{
+        client::{Barrier, BarrierError, Meet, Meeting},
+        sync::{
+            Absence, ArriveAtBarrier, BarrierAnswer, BarrierKind, BarrierStatus, LeaveBarrier, OnPartyLoss,
+            Waiting,
+        },
+    };
+}
+
+/// Which nodes are known, from where, and by which routes.
+pub mod discovery {
+    pub use crate::ndl::{KnownNode, KnownRoute, OwnStalls, Source};
+}
+
+/// Notifications that an application can subscribe to or ask for: of nodes, of applications and what they require, of actors that ended, of
+/// inputs that are late, of messages that were not delivered.
+pub mod events {
+    pub use sinew_runtime::{
+        app::{InputTimeout, RequirementEvent},
+        monitor::{Down, DownClass, MonitorError, MonitorId},
+        undelivered::Undelivered,
+    };
+
+    pub use crate::{
+        ndl::{IdleApp, LossReason, NodeEvent, Trouble, TroubledApp},
+        sync::{DirectoryEntry, DirectoryEvent},
+    };
+}
+
+/// Messages: their types and classes, how they are sent, and what becomes of them.
+pub mod message {
+    pub use sinew_runtime::{
+        outcome::{Outcome, Rejection},
+        sender::{AskError, Confirmation, Destination, Reply, SendError, Sender},
+        wire::{Class, Kind, MessageBuffer, Payload, TIME_TO_LIVE_MAX},
+    };
+}
+
+/// Supervision: where an actor runs, when it is restarted, and what happens when that does not help.
+pub mod supervision {
+    pub use sinew_runtime::supervision::{
+        AutoShutdown, Place, ReadyGate, Reason, Refusal, Restart, StartRetry, Strategy,
+    };
+
+    pub use crate::node::SupervisorSpec;
+}
+
+/// Time, timers, and the clocks of other nodes.
+pub mod time {
+    pub use sinew_runtime::{
+        schedule::{Tick, TimerId},
+        time::Time,
+    };
+
+    pub use crate::clocks::{ClockDrift, ClockOffset};
+}
 
 /// Everything that an ordinary program needs, in one line: `use sinew::prelude::*;`
 pub mod prelude {
@@ -125,10 +183,13 @@ pub mod prelude {
     pub use actix::{Actor, ActorContext, ActorFutureExt, AsyncContext, Handler, Running, fut::WrapFuture};
 
     pub use crate::{
-        AppAddress, AppContext, AppSpec, AutoShutdown, Class, Delivery, Down, DownPolicy, InputTimeout,
-        LastWill, Node, NodeAddress, NodeBuilder, NodeConfig, NodeEvent, Outcome, Payload, Place,
-        RequirementEvent, RequirementPolicy, Restart, SendOutcome, StartError, Strategy, SupervisorSpec,
-        Tick, Tid, Time, Undelivered, payload,
+        AppAddress, AppContext, AppSpec, Class, Delivery, Node, NodeAddress, NodeBuilder, NodeConfig,
+        Outcome, Payload, StartError, Tid, Time,
+        app::{DownPolicy, LastWill, RequirementPolicy, SendOutcome},
+        events::{Down, InputTimeout, NodeEvent, RequirementEvent, Undelivered},
+        payload,
+        supervision::{AutoShutdown, Place, Restart, Strategy, SupervisorSpec},
+        time::Tick,
     };
 }
 

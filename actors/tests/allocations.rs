@@ -19,7 +19,10 @@ use std::{
 use actix::fut::wrap_future;
 use serde::{Deserialize, Serialize};
 use serde_bytes::ByteArray;
-use sinew::{Confirmation, Sender, prelude::*};
+use sinew::{
+    message::{Confirmation, Sender},
+    prelude::*,
+};
 use stats_alloc::{INSTRUMENTED_SYSTEM, StatsAlloc};
 
 /// Counts what all threads allocate, so that both ends are counted.

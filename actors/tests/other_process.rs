@@ -9,7 +9,11 @@ use std::{
     time::Duration,
 };
 
-use sinew::{ApiError, AppAddress, NodeApi, Registration, Transport, prelude::*};
+use sinew::{
+    AppAddress, NodeApi, Registration,
+    client::{ApiError, Transport},
+    prelude::*,
+};
 
 const WATCHDOG: Duration = Duration::from_secs(60);
 const SOCKET: &str = "SINEW_TEST_SOCKET";

@@ -302,7 +302,7 @@ fn silent_json(answers: &[Answer<AppsReport>]) -> Value {
 
 #[cfg(test)]
 mod tests {
-    use sinew::{AppAddress, Kind, Tid, inspect::WaitReport};
+    use sinew::{AppAddress, Tid, inspect::WaitReport, message::Kind};
 
     use super::*;
 

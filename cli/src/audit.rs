@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use sinew::{
-    Audit, NodeAudit,
+    audit::{Audit, NodeAudit},
     inspect::{AskAudit, AuditReport},
 };
 

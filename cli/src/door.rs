@@ -15,7 +15,7 @@ use std::{
     time::Duration,
 };
 
-use sinew::{ApiError, NodeApi, Time};
+use sinew::{NodeApi, Time, client::ApiError};
 
 use crate::table::clean;
 

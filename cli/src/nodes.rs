@@ -363,7 +363,7 @@ fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport], is_wide: bool
 
 #[cfg(test)]
 mod tests {
-    use sinew::{AppAddress, Incarnation, NodeAddress, Tid};
+    use sinew::{AppAddress, NodeAddress, Tid, address::Incarnation};
 
     use super::*;
 

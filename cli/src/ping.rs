@@ -4,8 +4,9 @@ use std::time::Duration;
 
 use serde_json::json;
 use sinew::{
-    Outcome, Rejection, Tid, Time,
+    Outcome, Tid, Time,
     inspect::{AppReport, AppsReport, AskApps, Ping},
+    message::Rejection,
 };
 
 use crate::{

@@ -115,7 +115,7 @@ pub(crate) fn at(seconds: u64) -> String {
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use sinew::{Incarnation, NodeAddress, inspect::SecurityReport};
+    use sinew::{NodeAddress, address::Incarnation, inspect::SecurityReport};
 
     use super::*;
 

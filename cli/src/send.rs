@@ -4,7 +4,11 @@ use std::io::Read;
 
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
-use sinew::{ApiError, Class, Kind, LoanedMessage, Outcome, Tid, Time};
+use sinew::{
+    Class, Outcome, Tid, Time,
+    client::{ApiError, LoanedMessage},
+    message::Kind,
+};
 
 use crate::{
     Report, messagepack, ping,
@@ -259,7 +263,7 @@ fn payload(json: &str) -> Result<Vec<u8>, Fault> {
 mod tests {
     use std::time::Duration;
 
-    use sinew::Rejection;
+    use sinew::message::Rejection;
 
     use super::*;
 

@@ -7,8 +7,10 @@ use std::{
 };
 
 use sinew::{
-    ApiError, AppAddress, Endpoint, NodeAddress, NodeApi, Outcome, Payload, Registration, Rejection, Tid,
+    AppAddress, Endpoint, NodeAddress, NodeApi, Outcome, Payload, Registration, Tid,
+    client::ApiError,
     inspect::{AskNode, AskReach, NodeReport, ReachReport},
+    message::Rejection,
     name::check_name,
 };
 

@@ -11,7 +11,8 @@ use std::{
 use clap::Args;
 use serde_json::{Value, json};
 use sinew::{
-    ApiError, AppAddress, NodeAddress, Tid,
+    AppAddress, NodeAddress, Tid,
+    client::ApiError,
     inspect::{AppsReport, AskApps, AskWatch, SeenMessage, WatchReport},
 };
 
@@ -400,7 +401,8 @@ fn clean_lines(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use sinew::{
-        Class, Kind, Outcome, Rejection, Time,
+        Class, Outcome, Time,
+        message::{Kind, Rejection},
         protection::{DataId, Stamp, seal},
     };
 

@@ -7,7 +7,7 @@ use std::sync::{
 };
 
 use actix::StreamHandler;
-use sinew::{Sender, prelude::*};
+use sinew::{message::Sender, prelude::*};
 
 use crate::{DEADLINE, Log};
 

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use sinew::{CommandError, prelude::*};
+use sinew::{node::CommandError, prelude::*};
 use sinew_tests::{
     Ground, Log, all_run,
     puppet::{Puppet, Stage},

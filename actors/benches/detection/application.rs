@@ -8,7 +8,10 @@ use std::{
 
 use fastrand::Rng;
 use rustix::process::{Pid, Signal, kill_process};
-use sinew::{Down, DownClass, prelude::*};
+use sinew::{
+    events::{Down, DownClass},
+    prelude::*,
+};
 use sinew_figures::{Alone, Figures};
 
 use crate::{nodes::At, observer::DEADLINE, trials::SETTLED};

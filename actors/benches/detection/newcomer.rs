@@ -9,7 +9,10 @@ use std::{
 
 use fastrand::Rng;
 use rustix::process::Signal;
-use sinew::{LossReason, NodeEvent, Time};
+use sinew::{
+    Time,
+    events::{LossReason, NodeEvent},
+};
 use sinew_figures::{
     Alone, Figures,
     process::{self, Process},

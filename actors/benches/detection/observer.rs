@@ -5,7 +5,7 @@ use std::{
     time::Duration,
 };
 
-use sinew::{NodeHandle, Sender, prelude::*};
+use sinew::{NodeHandle, message::Sender, prelude::*};
 
 use crate::{
     nodes::At,

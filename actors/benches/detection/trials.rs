@@ -4,7 +4,7 @@ use std::{thread, time::Duration};
 
 use fastrand::Rng;
 use rustix::process::Signal;
-use sinew::{NodeEvent, Time};
+use sinew::{Time, events::NodeEvent};
 use sinew_figures::{
     Alone, Figures,
     process::{self, Process},

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use sinew::{LossReason, NodeEvent, Trouble};
+use sinew::events::{LossReason, NodeEvent, Trouble};
 
 use crate::{setting::Setting, subject::SUBJECT};
 

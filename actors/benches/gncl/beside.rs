@@ -11,7 +11,7 @@ use std::{
 };
 
 use serde::{Deserialize, Serialize};
-use sinew::{Sender, prelude::*};
+use sinew::{message::Sender, prelude::*};
 use sinew_figures::{
     Alone, Figures,
     process::{await_end, say_there},

@@ -9,7 +9,10 @@ use std::{
 };
 
 use serde::{Deserialize, Serialize};
-use sinew::{Confirmation, Sender, prelude::*};
+use sinew::{
+    message::{Confirmation, Sender},
+    prelude::*,
+};
 use sinew_figures::{
     Alone, Figures, Pinning,
     process::{Process, await_end, say_there},

@@ -2,7 +2,11 @@
 
 use std::{os::unix::process::CommandExt, path::PathBuf, process::Command, time::Duration};
 
-use sinew::{Endpoint, LoanedMessage, NodeApi, Registration, Spin, Transport, prelude::*};
+use sinew::{
+    Endpoint, NodeApi, Registration,
+    client::{LoanedMessage, Spin, Transport},
+    prelude::*,
+};
 use sinew_figures::{
     Figures, Pinning, Rounds,
     process::{Process, await_end, say_there},

@@ -1,6 +1,6 @@
 //! Sinew's ends as tasks of tokio, each on a runtime of one thread: the same round trips by `AsyncEndpoint`.
 
-use sinew::{AsyncEndpoint, LoanedMessage, NodeApi, Registration, Tid};
+use sinew::{AsyncEndpoint, NodeApi, Registration, Tid, client::LoanedMessage};
 use sinew_figures::{
     Figures, Pinning, Rounds,
     process::{Process, say_there},

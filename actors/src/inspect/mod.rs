@@ -1,7 +1,7 @@
 //! Inspection: every node answers questions about itself, for tools like `sinew`.
 //!
 //! Whoever can send a message can ask, from any node: the questions go to `node/inspect` ([`AppAddress::INSPECT`]) by
-//! [`ask`](crate::Endpoint::ask), as to any application. It only reads, but for the access list, which it has read again.
+//! [`ask`](crate::client::MessageBuilder::ask), as to any application. It only reads, but for the access list, which it has read again.
 //!
 //! | rule | |
 //! | --- | --- |

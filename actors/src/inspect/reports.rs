@@ -372,7 +372,7 @@ pub struct TreeLine {
 
 payload!("sinew.inspect.audit_report" =>
     /// What became of the messages of a node, as it was at one moment.
-    /// [`Audit::of_readings`](crate::Audit::of_readings) puts those of all nodes side by side.
+    /// [`Audit::of_readings`](crate::audit::Audit::of_readings) puts those of all nodes side by side.
     #[derive(Clone, Debug, PartialEq, Eq)]
     pub struct AuditReport {
         /// What it says of itself. Applications that have no room are counted together.

@@ -30,6 +30,12 @@ mod supervisor_spec;
 mod tree;
 mod wind_up;
 
+pub use crate::{
+    access::{AccessError, AccessSummary},
+    lncl::RegisterError,
+    outlet::OutletCounts,
+    secured::{DenyListError, DenyListSummary},
+};
 use asker::Asker;
 pub use audits::AuditError;
 pub use builder::{NodeBuilder, StartError};
@@ -61,12 +67,10 @@ use sinew_runtime::{
 };
 
 use crate::{
-    access::{AccessError, AccessSummary},
     gncl::{self, Peer},
     log,
     ndl::{KnownNode, OwnStalls},
-    outlet::OutletCounts,
-    secured::{Denied, DenyListError, DenyListSummary},
+    secured::Denied,
     stores::{Stores, lock},
     sync::{BarrierStatus, DirectoryEntry, Waiting},
 };

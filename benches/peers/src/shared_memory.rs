@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use sinew::{AsyncEndpoint, Endpoint, LoanedMessage, NodeApi, Registration, Spin, Tid, prelude::*};
+use sinew::{AsyncEndpoint, Endpoint, NodeApi, Registration, Tid, prelude::*, client::{LoanedMessage, Spin}};
 use sinew_figures::{
     Figures, Pinning, Rounds,
     process::{Process, await_end, say_there},

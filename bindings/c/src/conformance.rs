@@ -1,4 +1,4 @@
-//! The functions of C behind a face that safe Rust may call, so that NodeAPI's suite of claims (`actors/src/api/tests/`)
+//! The functions of C behind a face that safe Rust may call, so that NodeAPI's suite of claims (`actors/src/client/tests/`)
 //! holds C to them, too. There with the feature `conformance` alone.
 //!
 //! Each call here is one call of C's, with the structs that C hands over; what it returns is handed on as it is, with its

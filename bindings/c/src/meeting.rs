@@ -2,7 +2,7 @@
 
 use std::{mem::MaybeUninit, time::Duration};
 
-use sinew::{BarrierError, OnPartyLoss};
+use sinew::barrier::{BarrierError, OnPartyLoss};
 
 use crate::{
     border::{call, present, write},
@@ -61,7 +61,7 @@ pub extern "C" fn sinew_meet(
 
 impl Barrier {
     /// As Rust says it.
-    fn read(&self) -> Result<sinew::Barrier, Fault> {
+    fn read(&self) -> Result<sinew::barrier::Barrier, Fault> {
         if self.flags & !KNOWN_FLAGS != 0 {
             return Err(Fault::argument(format!("`barrier.flags` is {:#x}: no such flags", self.flags)));
         }
@@ -71,9 +71,9 @@ impl Barrier {
         let name = self.name.read("barrier.name")?;
         let parties = text::read_all(self.parties, self.parties_count, "barrier.parties")?;
         let mut barrier = if self.flags & SINEW_PHASE == 0 {
-            sinew::Barrier::new(name, parties)
+            sinew::barrier::Barrier::new(name, parties)
         } else {
-            sinew::Barrier::phase(name, parties)
+            sinew::barrier::Barrier::phase(name, parties)
         };
         if self.within_ns != 0 {
             barrier = barrier.within(Duration::from_millis(self.within_ns.div_ceil(1_000_000)));

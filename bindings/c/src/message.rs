@@ -130,7 +130,7 @@ impl Received {
         reserved: [0; 2],
     };
 
-    pub(crate) fn of(received: &sinew::Received, token: u64) -> Self {
+    pub(crate) fn of(received: &sinew::client::Received, token: u64) -> Self {
         Self {
             bytes: received.bytes().as_ptr(),
             length: received.bytes().len(),
@@ -149,7 +149,7 @@ impl Received {
 }
 
 impl Undelivered {
-    pub(crate) fn of(undelivered: &sinew::Undelivered) -> Self {
+    pub(crate) fn of(undelivered: &sinew::events::Undelivered) -> Self {
         Self {
             destination: undelivered.destination.bits(),
             count: undelivered.count,
@@ -157,7 +157,7 @@ impl Undelivered {
             first_sequence: undelivered.first_sequence,
             last_sequence: undelivered.last_sequence,
             outcome: outcome_code(sinew::Outcome::Rejected(undelivered.why)) as i32,
-            kind: undelivered.kind.map_or(0, sinew::Kind::bits),
+            kind: undelivered.kind.map_or(0, sinew::message::Kind::bits),
             message_class: undelivered.class.map_or(-1, |class| i32::from(code_of(class))),
             name: name_in_c(undelivered.name.as_deref().unwrap_or_default()),
         }

@@ -2,7 +2,7 @@
 
 use std::{ffi::c_char, mem::MaybeUninit, time::Duration};
 
-use sinew::{Kind, Tid, Time};
+use sinew::{Tid, Time, message::Kind};
 
 use crate::{
     border::{call, present, value, write},

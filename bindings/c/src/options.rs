@@ -2,7 +2,11 @@
 
 use std::{mem::MaybeUninit, ptr, time::Duration};
 
-use sinew::{AppAddress, NodeEvent, Registration, RequirementEvent, Spin, Transport};
+use sinew::{
+    AppAddress, Registration,
+    client::{Spin, Transport},
+    events::{NodeEvent, RequirementEvent},
+};
 
 use crate::{
     status::Fault,

@@ -8,7 +8,7 @@ use std::{
     mem::MaybeUninit,
 };
 
-use sinew::{Kind, Tid};
+use sinew::{Tid, message::Kind};
 
 use crate::{
     border::{call, present, write},

@@ -14,7 +14,7 @@ mod watchdog;
 use std::{ffi::c_void, time::Duration};
 
 use sinew::{
-    Kind,
+    message::Kind,
     protection::{
         Cause, Fault as Wrong, OVERHEAD, Protection, State,
         raw::{Protected, Reads},

@@ -2,7 +2,7 @@
 
 use std::{ffi::c_void, mem::MaybeUninit, time::Duration};
 
-use sinew::{Kind, Tid};
+use sinew::{Tid, message::Kind};
 
 use crate::{
     border::{call, present, write},

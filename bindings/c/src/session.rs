@@ -3,7 +3,9 @@
 use std::{collections::BTreeMap, ffi::CString, time::Duration};
 
 use sinew::{
-    ApiError, Class, Kind, LoanedMessage, NodeAddress, Outcome, Tid, Time,
+    Class, NodeAddress, Outcome, Tid, Time,
+    client::{ApiError, LoanedMessage},
+    message::Kind,
     protection::{
         SealError,
         raw::{ECHO, Judged},
@@ -34,7 +36,7 @@ pub(crate) struct Session {
     endpoint: sinew::Endpoint,
     node_name: CString,
     made: Hand<LoanedMessage>,
-    received: Hand<sinew::Received>,
+    received: Hand<sinew::client::Received>,
     /// What it sends and receives of protected payloads.
     ends: Ends,
     /// The names of their types: who sends takes no lock of the process for them.
@@ -309,7 +311,7 @@ impl Session {
         Ok(buffer)
     }
 
-    fn hand_out(&mut self, received: sinew::Received) -> Result<Received, Fault> {
+    fn hand_out(&mut self, received: sinew::client::Received) -> Result<Received, Fault> {
         let mut out = Received::of(&received, 0);
         match self.received.take(received) {
             Ok(token) => {
@@ -325,7 +327,7 @@ impl Session {
     }
 
     /// One that came through a guard: without its envelope.
-    fn hand_out_good(&mut self, received: sinew::Received) -> Result<Received, Fault> {
+    fn hand_out_good(&mut self, received: sinew::client::Received) -> Result<Received, Fault> {
         let payload = received.bytes().get(SINEW_SEALED_HEAD..).unwrap_or_default();
         let length = payload.len().saturating_sub(SINEW_SEALED_OVERHEAD - SINEW_SEALED_HEAD);
         let bytes = payload.as_ptr();

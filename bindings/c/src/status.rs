@@ -2,7 +2,7 @@
 
 use std::{cell::RefCell, ffi::CStr, ffi::CString};
 
-use sinew::ApiError;
+use sinew::client::ApiError;
 
 use crate::words::text_of;
 
@@ -302,7 +302,7 @@ mod tests {
 
     #[test]
     fn what_an_error_says_names_nothing_of_rusts() {
-        let kind = sinew::Kind::from_bits(1);
+        let kind = sinew::message::Kind::from_bits(1);
         let outcomes = (0..=u8::MAX).filter_map(sinew::Outcome::from_code).map(ApiError::Ended);
         let spoken = [
             ApiError::NotAsked,

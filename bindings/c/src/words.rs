@@ -2,7 +2,7 @@
 
 use std::ffi::{CStr, c_char};
 
-use sinew::Rejection;
+use sinew::message::Rejection;
 
 use crate::status::{Status, last_sentence};
 

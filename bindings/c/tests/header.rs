@@ -37,12 +37,12 @@ fn the_readme_shows_the_example_as_it_is() {
 #[test]
 fn the_first_page_of_the_api_shows_the_example_as_it_is() {
     let package = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let page = std::fs::read_to_string(package.join("../../actors/src/api/mod.rs")).unwrap();
+    let page = std::fs::read_to_string(package.join("../../actors/src/client/mod.rs")).unwrap();
     let example = std::fs::read_to_string(package.join("examples/hello.c")).unwrap();
     let shown = example.lines().map(|line| format!("//! {line}").trim_end().to_owned() + "\n");
     assert!(
         page.contains(&shown.collect::<String>()),
-        "actors/src/api/mod.rs shows another examples/hello.c"
+        "actors/src/client/mod.rs shows another examples/hello.c"
     );
 }
 

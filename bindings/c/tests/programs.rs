@@ -11,7 +11,10 @@ use std::{
 use ground::{C, CPP, CPP20, Ground, WATCHDOG, endpoint, is_there};
 use rustix::{io::ioctl_fionbio, process::Signal};
 use serde::{Deserialize, Serialize};
-use sinew::{Barrier, Class, Endpoint, Kind, NodeApi, Outcome, Payload, Registration, RequirementEvent, Tid};
+use sinew::{
+    Class, Endpoint, NodeApi, Outcome, Payload, Registration, Tid, barrier::Barrier,
+    events::RequirementEvent, message::Kind,
+};
 
 /// As in `programs/holder.c`.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]

@@ -11,7 +11,7 @@ use std::{
 
 use ground::{C, Ground, WATCHDOG, endpoint, is_there};
 use serde::{Deserialize, Serialize};
-use sinew::{Endpoint, Kind, Payload, Registration, Tid, protection::Protection};
+use sinew::{Endpoint, Payload, Registration, Tid, message::Kind, protection::Protection};
 
 /// As in `examples/commands.c`.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]

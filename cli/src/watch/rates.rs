@@ -125,7 +125,7 @@ impl Kind {
 
 #[cfg(test)]
 mod tests {
-    use sinew::{AppAddress, Class, NodeAddress, Rejection, Tid};
+    use sinew::{AppAddress, Class, NodeAddress, Tid, message::Rejection};
 
     use super::*;
 
@@ -138,7 +138,7 @@ mod tests {
             is_sent: false,
             source: tid,
             target: tid,
-            kind: sinew::Kind::named(name),
+            kind: sinew::message::Kind::named(name),
             name: Some(name.to_owned()),
             class: Class::Control,
             sequence: 1,

@@ -27,7 +27,7 @@ pub(super) fn by_whom_is_reached(called: &mut [Called], from: &NodeReport) {
 
 #[cfg(test)]
 mod tests {
-    use sinew::{AppAddress, Incarnation, NodeAddress, inspect::PeerReport};
+    use sinew::{AppAddress, NodeAddress, address::Incarnation, inspect::PeerReport};
 
     use super::*;
     use crate::security;

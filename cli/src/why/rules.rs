@@ -14,8 +14,8 @@ mod version;
 use std::collections::BTreeSet;
 
 use sinew::{
-    Rejection,
     inspect::{LostReport, NodeReport, PeerReport, RefusalReport},
+    message::Rejection,
 };
 
 use self::places::{is_on_loopback, names};

@@ -242,7 +242,7 @@ fn what_is_said_secures_a_node() {
     config.ndl.multicast = None;
     config.ndl.mdns_port = None;
     let node = sinew::Node::builder("knee").configure(|own| *own = config).start();
-    assert_eq!(node.expect("its keys are its own").stop(), sinew::NodeEnd::Stopped);
+    assert_eq!(node.expect("its keys are its own").stop(), sinew::node::NodeEnd::Stopped);
 }
 
 #[test]

@@ -14,7 +14,7 @@ use std::{path::Path, time::Duration};
 
 use rustix::process::Signal;
 use serde_json::Value;
-use sinew::{Barrier, NodeApi, Registration};
+use sinew::{NodeApi, Registration, barrier::Barrier};
 use sinew_tests::{OwnDirectory, Program};
 
 use scenario::{Scenario, named, sinew};

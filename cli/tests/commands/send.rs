@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use sinew::{Kind, NodeApi, Outcome, Registration, Tid};
+use sinew::{NodeApi, Outcome, Registration, Tid, message::Kind};
 
 use crate::scenario::{Scenario, named};
 

@@ -6,7 +6,7 @@ use std::{
 };
 
 use serde_json::Value;
-use sinew::{Kind, NodeApi, Registration};
+use sinew::{NodeApi, Registration, message::Kind};
 
 use crate::scenario::{Answer, Scenario};
 

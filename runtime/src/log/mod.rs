@@ -4,7 +4,7 @@
 //! The macros here are those of `tracing`. An event is taken down where it happens, and given to the subscriber that was
 //! the thread's own there, later and on the log's thread: its time is when it is written, and it stands in no span.
 //!
-//! Where the program has installed no subscriber, lines on the standard error are the default: see [`stderr`].
+//! Where the program has installed no subscriber, lines on the standard error are the default: see `stderr`.
 
 mod event;
 mod filter;

@@ -9,7 +9,8 @@ use exoskeleton::{
     },
 };
 use sinew::{
-    AppAddress, NodeAddress, NodeConfig, Requirement, Tid,
+    AppAddress, NodeAddress, NodeConfig, Tid,
+    app::Requirement,
     fault::Fault,
     security::{Certificate, DenyList, DiscoveryKey, Serial, rustls::pki_types::CertificateDer},
 };

@@ -11,7 +11,11 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew::{NodeAddress, Reply, Sender, prelude::*};
+use sinew::{
+    NodeAddress,
+    message::{Reply, Sender},
+    prelude::*,
+};
 
 use super::together;
 use crate::{

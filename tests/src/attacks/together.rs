@@ -15,7 +15,11 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew::{Barrier, Meet as _, Sender, prelude::*};
+use sinew::{
+    barrier::{Barrier, Meet as _},
+    message::Sender,
+    prelude::*,
+};
 use sinew_runtime::app::DynApp;
 
 use super::{

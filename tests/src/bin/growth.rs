@@ -71,7 +71,7 @@ impl Held {
 struct Field {
     nodes: [Node; 2],
     names: Vec<String>,
-    sender: sinew::Sender,
+    sender: sinew::message::Sender,
 }
 
 impl Field {

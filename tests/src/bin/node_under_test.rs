@@ -13,7 +13,11 @@
 
 use std::{cell::RefCell, process::ExitCode};
 
-use sinew::{Barrier, Meet, NodeHandle, prelude::*};
+use sinew::{
+    NodeHandle,
+    barrier::{Barrier, Meet},
+    prelude::*,
+};
 
 payload!("scenario.count", Bulk => struct Count { number: u64 });
 
@@ -206,7 +210,7 @@ fn main() -> ExitCode {
             println!("refused --incarnation {life}: it is no number");
             return ExitCode::FAILURE;
         };
-        builder = builder.incarnation(sinew::Incarnation(life));
+        builder = builder.incarnation(sinew::address::Incarnation(life));
     }
     // Used before all others, so that its destructor runs after theirs.
     HELD.with(|held| drop(held.borrow()));

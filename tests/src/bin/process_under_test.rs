@@ -20,9 +20,10 @@ use std::{
 
 use rustix::process::{Signal, getpid, kill_process};
 use sinew::{
-    NodeHandle, ReadyGate,
+    NodeHandle,
     audit::{Account, Place},
     prelude::*,
+    supervision::ReadyGate,
 };
 use sinew_tests::orders::{Count, Level, Me, Order, Who};
 

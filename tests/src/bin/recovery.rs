@@ -9,7 +9,7 @@ use std::{process::ExitCode, time::Duration};
 use clap::Parser;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::json;
-use sinew::{NodeHandle, Sender, fault::Fault, prelude::*};
+use sinew::{NodeHandle, fault::Fault, message::Sender, prelude::*};
 use sinew_tests::{
     DEADLINE, Ground, Log, all_run,
     load::{LAYERS, Times},

@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew::Audit;
+use sinew::audit::Audit;
 
 use super::{
     Performer, Stage, StageLimits,

@@ -2,7 +2,7 @@
 
 use std::os::unix::net::UnixStream;
 
-use sinew::{ApiError, NodeApi, Registration};
+use sinew::{NodeApi, Registration, client::ApiError};
 
 use super::{say, told};
 

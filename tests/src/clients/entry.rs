@@ -105,7 +105,7 @@ fn read(verb: &str, numbers: &[u64]) -> Option<Entry> {
 
 #[cfg(test)]
 mod tests {
-    use sinew::Rejection;
+    use sinew::message::Rejection;
 
     use super::*;
 

@@ -9,7 +9,10 @@ use std::{
     time::Duration,
 };
 
-use sinew::{ApiError, AsyncEndpoint, Endpoint, NodeApi, Payload as _, Received, Registration};
+use sinew::{
+    AsyncEndpoint, Endpoint, NodeApi, Payload as _, Registration,
+    client::{ApiError, Received},
+};
 
 use super::{registration::register, say, told};
 use crate::puppet::Order;

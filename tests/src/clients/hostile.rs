@@ -28,7 +28,7 @@ use std::{
 };
 
 use rustix::process::{Signal, getpid, kill_process};
-use sinew::{Kind, NodeApi, Registration};
+use sinew::{NodeApi, Registration, message::Kind};
 
 pub(super) use self::guest::{play as play_guest, play_visitor};
 pub(crate) use self::{

@@ -5,7 +5,7 @@ use std::{
     fmt,
 };
 
-use sinew::{Class, Outcome, Rejection, Time};
+use sinew::{Class, Outcome, Time, message::Rejection};
 
 use super::entry::{Entry, Poster, Way};
 use crate::numbers::Numbers;

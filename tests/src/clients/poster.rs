@@ -9,7 +9,12 @@ use std::{
     time::Duration,
 };
 
-use sinew::{ApiError, Class, Endpoint, NodeApi, Outcome, Received, Rejection, Tid, Time, payload};
+use sinew::{
+    Class, Endpoint, NodeApi, Outcome, Tid, Time,
+    client::{ApiError, Received},
+    message::Rejection,
+    payload,
+};
 
 use super::{
     entry::{Entry, Poster, Way},

@@ -5,7 +5,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew::{ApiError, AppAddress, Endpoint, NodeApi, Registration, Transport};
+use sinew::{
+    AppAddress, Endpoint, NodeApi, Registration,
+    client::{ApiError, Transport},
+};
 
 use crate::DEADLINE;
 

@@ -6,7 +6,7 @@ use std::{
     sync::mpsc::{Receiver, sync_channel},
 };
 
-use sinew::Audit;
+use sinew::audit::Audit;
 
 use super::Performer;
 use crate::{DEADLINE, OwnDirectory, preload::Preload};

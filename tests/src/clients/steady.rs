@@ -11,7 +11,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew::{ApiError, Endpoint, NodeApi, Payload as _};
+use sinew::{Endpoint, NodeApi, Payload as _, client::ApiError};
 
 use super::{
     heir,

@@ -7,7 +7,7 @@ use std::{
     time::Duration,
 };
 
-use sinew::{Endpoint, Kind, NodeApi, Received, Tid};
+use sinew::{Endpoint, NodeApi, Tid, client::Received, message::Kind};
 
 use super::{
     registration::{address, register, wishes},

@@ -1,7 +1,7 @@
 //! What the checker promises: a true history holds, and no planted violation passes.
 
 use proptest::prelude::*;
-use sinew::{Class, Outcome, Rejection};
+use sinew::{Class, Outcome, message::Rejection};
 
 use super::{
     verdict::Fault::{self, *},

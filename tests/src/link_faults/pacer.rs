@@ -11,7 +11,11 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew::{Class, Confirmation, SendError, Sender, prelude::*};
+use sinew::{
+    Class,
+    message::{Confirmation, SendError, Sender},
+    prelude::*,
+};
 
 use super::clerk::Clerk;
 use crate::{

@@ -11,7 +11,10 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::{Audit, Class, audit::Place};
+use sinew::{
+    Class,
+    audit::{Audit, Place},
+};
 
 use super::{
     CLASSES, Plan,

@@ -3,7 +3,7 @@
 use std::{collections::BTreeMap, fmt, time::Duration};
 
 use serde_json::{Value, json};
-use sinew::{Audit, Class};
+use sinew::{Class, audit::Audit};
 
 use super::{CLASSES, Plan, trouble::Trouble};
 use crate::{history::Verdict, load::Times, proxy::Counts};

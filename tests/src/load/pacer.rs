@@ -12,7 +12,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew::{Confirmation, Outcome, SendError, Sender};
+use sinew::{
+    Outcome,
+    message::{Confirmation, SendError, Sender},
+};
 
 use super::PATIENCE;
 use crate::puppet::{Job, Order};

@@ -8,7 +8,7 @@ use std::{
     sync::{Arc, Mutex, PoisonError},
 };
 
-use sinew::{Requirement, Time};
+use sinew::{Time, app::Requirement};
 
 use super::{
     node::{COME, DIRECTORY, KEPT_BACK, STAY_AWAY, UP},

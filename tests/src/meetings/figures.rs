@@ -5,7 +5,11 @@ use std::{
     time::Duration,
 };
 
-use sinew::{Barrier, Meet, ReadyGate, prelude::*};
+use sinew::{
+    barrier::{Barrier, Meet},
+    prelude::*,
+    supervision::ReadyGate,
+};
 
 use crate::{DEADLINE, Ground, all_run, load::Times, sees, until};
 

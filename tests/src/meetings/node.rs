@@ -8,7 +8,11 @@ use std::{
     },
 };
 
-use sinew::{Barrier, Meet, NodeBuilder, prelude::*};
+use sinew::{
+    NodeBuilder,
+    barrier::{Barrier, Meet},
+    prelude::*,
+};
 
 use super::{Event, PARTIES};
 

@@ -135,7 +135,7 @@ impl Verdict {
                     parties[other].iter().any(|life| life.started().is_some_and(|then| life.counts(then, at)))
                 };
                 for text in PARTIES[index].1 {
-                    let requirement: sinew::Requirement = text.parse().expect("they are written by us");
+                    let requirement: sinew::app::Requirement = text.parse().expect("they are written by us");
                     let there = (0..PARTIES.len())
                         .filter(|other| requirement.counts(PARTIES[*other].0) && is_there(*other));
                     if there.count() < requirement.count() {

@@ -9,7 +9,7 @@ use std::{
     time::Instant,
 };
 
-use sinew::{Sender, prelude::*};
+use sinew::{message::Sender, prelude::*};
 
 use super::receiver::{CONSUMER, ECHO, Load};
 use crate::{

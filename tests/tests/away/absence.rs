@@ -5,7 +5,11 @@ use std::{
     time::Duration,
 };
 
-use sinew::{Confirmation, ReadyGate, Rejection, Sender, prelude::*};
+use sinew::{
+    message::{Confirmation, Rejection, Sender},
+    prelude::*,
+    supervision::ReadyGate,
+};
 use sinew_tests::{
     DEADLINE, Ground, Log, all_run,
     puppet::{DeskKey, Job, Puppet, Seen, Stage, desk, numbers, outcome_of_job, wait},
@@ -84,7 +88,7 @@ fn an_application_that_drops_while_away_refuses_what_waits_and_what_comes_until_
     assert_eq!(outcomes, [Outcome::Failed, away, away]);
     // Then, while the new life is not ready, nobody takes a message, and its sender is told at once
     let refused = sender.send("puppet", &Job { number: 4 }).expect_err("it is away");
-    assert_eq!(refused, sinew::SendError::Rejected(Rejection::Down));
+    assert_eq!(refused, sinew::message::SendError::Rejected(Rejection::Down));
     // And when it is ready, it is as before.
     scene.become_ready();
     let sent = until("it takes messages again", || {

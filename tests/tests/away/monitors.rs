@@ -1,6 +1,12 @@
 //! Monitors on real nodes: who watches a life is told once that it ended, and why.
 
-use sinew::{DownClass, MonitorId, NodeApi, Registration, Sender, fault::Fault, prelude::*};
+use sinew::{
+    NodeApi, Registration,
+    events::{DownClass, MonitorId},
+    fault::Fault,
+    message::Sender,
+    prelude::*,
+};
 use sinew_tests::{
     Ground, Log, OwnDirectory, all_run,
     puppet::{Job, Puppet, Seen, Stage, desk, outcome_of_job},

@@ -9,7 +9,7 @@ use std::{
     time::Duration,
 };
 
-use sinew::{Endpoint, LifeState, NodeApi, Registration, Sender, StartError, prelude::*};
+use sinew::{Endpoint, NodeApi, Registration, StartError, message::Sender, node::LifeState, prelude::*};
 use sinew_tests::{
     DEADLINE, Ground, Log, OwnDirectory, all_run,
     puppet::{Job, Order, Puppet, Seen, Stage, desk, numbers},
@@ -107,7 +107,7 @@ fn the_tree_shows_who_is_paused_and_why_and_who_was_stopped_is_not_said_to_have_
     log.wait_for(Seen::Started(1));
     let walker = || node.handle().tree().ok()?.find("walker").cloned();
     let is = |state, missing: &[(&str, &str)]| {
-        let lacks = |walker: &sinew::Supervised| {
+        let lacks = |walker: &sinew::node::Supervised| {
             let lacks = walker.missing.iter().map(|absence| (&*absence.name, &*absence.why));
             lacks.eq(missing.iter().copied())
         };
@@ -189,7 +189,7 @@ fn an_application_that_restarts_goes_through_the_barrier_again_as_often_as_it_mu
         drop(anchor);
         log.wait_for(Seen::Stopping(life));
     }
-    assert_eq!(scene.node.stop(), sinew::NodeEnd::Stopped);
+    assert_eq!(scene.node.stop(), sinew::node::NodeEnd::Stopped);
 }
 
 #[test]

@@ -6,7 +6,7 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::{NodeEnd, Reason, Sender, StartError, fault::Fault, prelude::*};
+use sinew::{StartError, fault::Fault, message::Sender, node::NodeEnd, prelude::*, supervision::Reason};
 use sinew_tests::{
     Ground, Log, OwnDirectory, Program, all_run, node_under_test, own_group,
     puppet::{Job, Order, Puppet, Seen, Stage, desk, lives, numbers, outcome_of_job},

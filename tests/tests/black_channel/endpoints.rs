@@ -9,7 +9,9 @@ use std::{
 };
 
 use sinew::{
-    Endpoint, Kind, Received,
+    Endpoint,
+    client::Received,
+    message::Kind,
     prelude::*,
     protection::{Cause, DataId, Guard, Protection, State, Tally, open},
 };

@@ -22,7 +22,8 @@ use std::{
 };
 
 use sinew::{
-    Endpoint, Kind, NodeApi, Outcome, Registration, Rejection,
+    Endpoint, NodeApi, Outcome, Registration,
+    message::{Kind, Rejection},
     prelude::*,
     protection::{Cause, DataId, Guard, Protection, State, Tally, open, seal},
 };

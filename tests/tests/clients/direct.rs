@@ -13,7 +13,7 @@ use rustix::{
     process::{Pid, Signal, kill_process},
     thread::gettid,
 };
-use sinew::{ApiError, Endpoint, NodeApi, Registration, Rejection, prelude::*};
+use sinew::{Endpoint, NodeApi, Registration, client::ApiError, message::Rejection, prelude::*};
 use sinew_tests::{
     DEADLINE, Log,
     clients::{Performer, Stage, StageLimits},

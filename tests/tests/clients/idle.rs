@@ -4,8 +4,9 @@ use std::process::Command;
 
 use rustix::process::Signal;
 use sinew::{
-    Outcome, Sender, Tid,
+    Outcome, Tid,
     inspect::{AskNode, NodeReport, Ping},
+    message::Sender,
     prelude::*,
 };
 use sinew_tests::{

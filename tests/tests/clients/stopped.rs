@@ -1,7 +1,7 @@
 //! A client that is stopped only fills what is its own.
 
 use rustix::process::Signal;
-use sinew::{Class, Endpoint, Kind, NodeApi, Payload, Registration, prelude::*};
+use sinew::{Class, Endpoint, NodeApi, Payload, Registration, message::Kind, prelude::*};
 use sinew_tests::{
     DEADLINE, Log,
     clients::{Held, Performer, Stage, StageLimits, Window},
@@ -93,14 +93,19 @@ impl Scene {
     /// Refused at once, and the sender told so.
     fn assert_full<P: Payload>(&mut self, value: &P) {
         let outcome = self.sender.message(self.to, value).confirmed(DEADLINE).expect("the node answers");
-        assert_eq!(outcome, Outcome::Rejected(sinew::Rejection::QueueFull), "{} to a full queue", P::NAME);
+        assert_eq!(
+            outcome,
+            Outcome::Rejected(sinew::message::Rejection::QueueFull),
+            "{} to a full queue",
+            P::NAME
+        );
     }
 
     /// Sends until it is handled: there is room again.
     fn send_until_delivered<P: Payload>(&mut self, value: &P) {
         until("it is delivered", || match self.sender.message(self.to, value).confirmed(DEADLINE) {
             Ok(Outcome::Delivered) => Some(()),
-            Ok(Outcome::Rejected(sinew::Rejection::QueueFull)) => None,
+            Ok(Outcome::Rejected(sinew::message::Rejection::QueueFull)) => None,
             other => panic!("it ends as {other:?}"),
         });
     }
@@ -209,7 +214,7 @@ fn a_stopped_client_costs_its_node_bytes_within_their_bound_and_they_go_back_whe
     assert!(most >= LONG_WAIT * 1_024, "it did hold what it may: {most} KiB");
     let refused = sender.create_message(to, Kind::named("scenario.load"), LONG).expect("as above");
     let outcome = sender.loaned(refused).confirmed(DEADLINE).expect("it is sent");
-    assert_eq!(outcome, Outcome::Rejected(sinew::Rejection::QueueFull));
+    assert_eq!(outcome, Outcome::Rejected(sinew::message::Rejection::QueueFull));
 
     // And when it goes on, it gets what waited, and the memory is free again.
     stopped.signal(Signal::CONT);

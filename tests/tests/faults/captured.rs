@@ -5,7 +5,11 @@ use std::sync::{
     mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel},
 };
 
-use sinew::{CommandError, NodeEnd, StartError, prelude::*};
+use sinew::{
+    StartError,
+    node::{CommandError, NodeEnd},
+    prelude::*,
+};
 use sinew_tests::{
     DEADLINE, Ground, Log, all_run,
     puppet::{DeskKey, Seen, Stage, desk, outcome_of_job},

@@ -1,6 +1,9 @@
 //! What a hung thread still holds of the node's doors: its socket file, its TCP port, its UDP port.
 
-use sinew::{ApiError, Endpoint, NodeApi, NodeEnd, Registration, Sender, fault::Fault, prelude::*};
+use sinew::{
+    Endpoint, NodeApi, Registration, client::ApiError, fault::Fault, message::Sender, node::NodeEnd,
+    prelude::*,
+};
 use sinew_tests::{
     DEADLINE, Ground, OwnDirectory, all_run,
     load::LAYERS,

@@ -5,7 +5,7 @@ use std::sync::{
     atomic::{AtomicU64, Ordering},
 };
 
-use sinew::{NodeEnd, fault::Fault, prelude::*};
+use sinew::{fault::Fault, node::NodeEnd, prelude::*};
 use sinew_tests::{
     DEADLINE, Ground, all_run,
     puppet::{Job, Seen, Stage, desk, lives, outcome_of_job, send_jobs, wait_for_numbers},

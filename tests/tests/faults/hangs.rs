@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
-use sinew::{NodeEnd, Sender, Trouble, fault::Fault, prelude::*};
+use sinew::{events::Trouble, fault::Fault, message::Sender, node::NodeEnd, prelude::*};
 use sinew_tests::{
     DEADLINE, Ground, Log, all_run,
     load::LAYERS,

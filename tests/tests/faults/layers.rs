@@ -1,6 +1,6 @@
 //! Layers that fail while applications run: who is restarted, who is not, and what nobody notices.
 
-use sinew::{NodeHandle, Sender, fault::Fault, prelude::*};
+use sinew::{NodeHandle, fault::Fault, message::Sender, prelude::*};
 use sinew_tests::{
     DEADLINE, Ground, Log, all_run,
     puppet::{Job, Seen, Stage, desk, lives, numbers, outcome_of_job, send_jobs, wait, wait_for_numbers},
@@ -353,7 +353,7 @@ fn a_layer_that_never_comes_back_ends_the_node_and_its_applications_are_told() {
     let node = node.start().expect("the first start succeeds");
     all_run(&[&node]);
     node.handle().inject("sync", Fault::panic()).expect("every node has it");
-    let sinew::NodeEnd::GaveUp(why) = node.wait_for_end() else { panic!("it did not give up") };
+    let sinew::node::NodeEnd::GaveUp(why) = node.wait_for_end() else { panic!("it did not give up") };
     assert!(why.starts_with("layers: more than 5 restarts"), "{why}");
     assert_eq!(log.all(), [Seen::Made(1), Seen::Started(1), Seen::Stopping(1), Seen::Dropped(1)]);
 }

@@ -1,6 +1,9 @@
 //! What becomes of messages while their application is away: kept, bounded, replaced, expired, and told.
 
-use sinew::{Rejection, SendError, Sender, prelude::*};
+use sinew::{
+    message::{Rejection, SendError, Sender},
+    prelude::*,
+};
 use sinew_tests::{
     DEADLINE, Ground, Log, all_run,
     puppet::{

@@ -14,7 +14,7 @@ mod points;
 mod processes;
 mod returns;
 
-use sinew::{Sender, fault::Fault, prelude::*};
+use sinew::{fault::Fault, message::Sender, prelude::*};
 use sinew_tests::{
     Ground, Log, all_run,
     puppet::{Seen, Stage, desk},

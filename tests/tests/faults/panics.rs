@@ -5,7 +5,11 @@ use std::{
     sync::{Arc, Mutex},
 };
 
-use sinew::{Rejection, SendError, Sender, fault::Fault, prelude::*};
+use sinew::{
+    fault::Fault,
+    message::{Rejection, SendError, Sender},
+    prelude::*,
+};
 use sinew_runtime::{app::DynApp, post::Post};
 use sinew_tests::{
     DEADLINE, Ground, Log, all_run,
@@ -163,7 +167,7 @@ fn a_panic_in_stopping_does_not_keep_the_node_from_its_orderly_end() {
     let (wild, log) = Stage::new().stopping(|_, _| panic!("not now")).app("wild");
     let node = Ground::new().node("node").app(calm).app(wild).start().expect("a node");
     all_run(&[&node]);
-    assert_eq!(node.stop(), sinew::NodeEnd::Stopped);
+    assert_eq!(node.stop(), sinew::node::NodeEnd::Stopped);
     assert!(log.all().contains(&Seen::Stopping(1)));
     assert!(log.all().contains(&Seen::Dropped(1)));
     assert!(!log.all().contains(&Seen::Made(2)), "nothing is started in a node that stops");
@@ -328,13 +332,13 @@ fn one_panic_too_many_ends_the_node_in_order_and_the_other_nodes_are_told() {
         sender.send("wild", &Job { number: 13 }).expect("it has room");
     }
     let end = node.wait_for_end();
-    let sinew::NodeEnd::GaveUp(why) = end else { panic!("{end:?}") };
+    let sinew::node::NodeEnd::GaveUp(why) = end else { panic!("{end:?}") };
     assert!(why.contains("more than 5 restarts") && why.contains("thirteen"), "{why}");
     assert_eq!(lives(&log), 6);
     assert!(other.all().ends_with(&[Seen::Stopping(1), Seen::Dropped(1)]), "{:?}", other.all());
     seen.wait_for(Seen::Requirement(RequirementEvent::Lost { name: "wild".to_owned() }));
     let is_told = |seen: &Seen| {
-        matches!(seen, Seen::Node(NodeEvent::NodeLost { why: sinew::LossReason::GaveUp(words), .. })
+        matches!(seen, Seen::Node(NodeEvent::NodeLost { why: sinew::events::LossReason::GaveUp(words), .. })
             if words.contains("more than 5 restarts"))
     };
     seen.wait("the reason of the failing node", |all| all.iter().any(is_told).then_some(()));
@@ -355,7 +359,10 @@ fn a_node_that_a_panic_of_its_owner_drops_gives_up_and_is_not_taken_for_stopped(
     });
     assert!(owner.join().is_err());
     let why = seen.wait("its loss", |all| all.iter().find_map(loss));
-    assert!(matches!(&why, sinew::LossReason::GaveUp(words) if words.contains("panicked")), "{why:?}");
+    assert!(
+        matches!(&why, sinew::events::LossReason::GaveUp(words) if words.contains("panicked")),
+        "{why:?}"
+    );
 }
 
 #[test]
@@ -369,10 +376,13 @@ fn a_node_whose_layers_give_up_is_lost_for_that_reason() {
     all_run(&[&node, &there]);
     node.handle().inject("NDL", Fault::panic()).expect("every node has it");
     let why = seen.wait("its loss", |all| all.iter().find_map(loss));
-    assert!(matches!(&why, sinew::LossReason::GaveUp(words) if words.contains("restarts")), "{why:?}");
+    assert!(
+        matches!(&why, sinew::events::LossReason::GaveUp(words) if words.contains("restarts")),
+        "{why:?}"
+    );
 }
 
-fn loss(seen: &Seen) -> Option<sinew::LossReason> {
+fn loss(seen: &Seen) -> Option<sinew::events::LossReason> {
     let Seen::Node(NodeEvent::NodeLost { why, .. }) = seen else { return None };
     Some(why.clone())
 }

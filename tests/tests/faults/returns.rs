@@ -2,7 +2,12 @@
 
 use std::thread;
 
-use sinew::{ApiError, Endpoint, NodeApi, Registration, Transport, fault::Fault, prelude::*};
+use sinew::{
+    Endpoint, NodeApi, Registration,
+    client::{ApiError, Transport},
+    fault::Fault,
+    prelude::*,
+};
 use sinew_tests::{DEADLINE, Ground, OwnDirectory, all_run, puppet::Job, ready_for, until};
 
 /// A node, the way to it, and the directory where its socket lies.

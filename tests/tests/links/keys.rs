@@ -8,7 +8,8 @@ use std::{
 
 use rustix::process::Signal;
 use sinew::{
-    DenyListError, Endpoint, NodeApi, NodeBuilder, Registration,
+    Endpoint, NodeApi, NodeBuilder, Registration,
+    node::DenyListError,
     prelude::*,
     security::{Certificate, Identity, files},
 };

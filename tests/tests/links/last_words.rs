@@ -7,7 +7,7 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::{DownClass, Endpoint, Kind, NodeApi, Registration, prelude::*};
+use sinew::{Endpoint, NodeApi, Registration, events::DownClass, message::Kind, prelude::*};
 use sinew_tests::{Ground, Log, OwnDirectory, Program, node_under_test};
 
 /// Lives of the sender, each of which ends by a kill.

@@ -10,7 +10,7 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::{Endpoint, NodeApi, Received, Registration, Sender, audit::Place, prelude::*};
+use sinew::{Endpoint, NodeApi, Registration, audit::Place, client::Received, message::Sender, prelude::*};
 use sinew_c::conformance::{self, Asked};
 use sinew_runtime::wire::Message;
 use sinew_tests::{

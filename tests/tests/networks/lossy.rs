@@ -6,7 +6,7 @@ use std::{
     num::NonZeroU32,
 };
 
-use sinew::Sender;
+use sinew::message::Sender;
 use sinew::prelude::*;
 use sinew_tests::{
     DEADLINE, Log, all_run,

@@ -2,7 +2,12 @@
 
 use std::{os::unix::fs::PermissionsExt, path::Path};
 
-use sinew::{AccessError, AccessSummary, Endpoint, NodeApi, Registration, Rejection, prelude::*};
+use sinew::{
+    Endpoint, NodeApi, Registration,
+    message::Rejection,
+    node::{AccessError, AccessSummary},
+    prelude::*,
+};
 use sinew_tests::{DEADLINE, Ground, OwnDirectory, until};
 
 payload!("access.torque", Control => struct Torque { newton_metres: f64 });

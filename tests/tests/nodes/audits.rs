@@ -3,8 +3,9 @@
 use std::sync::{Mutex, mpsc::sync_channel};
 
 use sinew::{
-    NodeApi, NodeHandle, Registration, Sender,
+    NodeApi, NodeHandle, Registration,
     audit::{Account, Audit, NodeAudit, Place},
+    message::Sender,
     prelude::*,
 };
 use sinew_tests::{

@@ -8,7 +8,7 @@ use std::{
     sync::mpsc::{Receiver, sync_channel},
 };
 
-use sinew::{Class, Kind, NodeApi, Registration, prelude::*};
+use sinew::{Class, NodeApi, Registration, message::Kind, prelude::*};
 use sinew_runtime::wire::{Header, encode_frame};
 use sinew_tests::{DEADLINE, OwnDirectory, own_group};
 

@@ -8,7 +8,8 @@ use std::{
 };
 
 use sinew::{
-    AsyncEndpoint, Barrier, BarrierError, BarrierStatus, Endpoint, Meet, NodeApi, OnPartyLoss, Registration,
+    AsyncEndpoint, Endpoint, NodeApi, Registration,
+    barrier::{Barrier, BarrierError, BarrierStatus, Meet, OnPartyLoss},
     prelude::*,
 };
 use sinew_tests::{DEADLINE, Ground, OwnDirectory, all_run, sees, until};

@@ -2,7 +2,7 @@
 
 use std::sync::mpsc::{SyncSender, sync_channel};
 
-use sinew::{DirectoryEvent, prelude::*};
+use sinew::{events::DirectoryEvent, prelude::*};
 use sinew_tests::{DEADLINE, Ground};
 
 payload!("scenario.angle" => struct Angle { degrees: f32 });

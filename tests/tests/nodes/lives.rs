@@ -8,7 +8,7 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::{Incarnation, NodeApi, NodeEnd, Registration, StartError};
+use sinew::{NodeApi, Registration, StartError, address::Incarnation, node::NodeEnd};
 use sinew_tests::{
     Ground, OwnDirectory, Program, all_run, node_under_test, own_group, process_under_test, program,
 };

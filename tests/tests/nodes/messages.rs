@@ -5,7 +5,11 @@ use std::{
     sync::mpsc::{Receiver, SyncSender, sync_channel},
 };
 
-use sinew::{Rejection, SendError, StartError, prelude::*};
+use sinew::{
+    StartError,
+    message::{Rejection, SendError},
+    prelude::*,
+};
 use sinew_tests::{DEADLINE, own_group, until};
 
 payload!("messages.question", Control => struct Question { number: u64 });
@@ -67,7 +71,7 @@ struct Teller<F> {
     told: SyncSender<()>,
 }
 
-impl<F: AsyncFn(sinew::Sender) + Clone + Unpin + 'static> Actor for Teller<F> {
+impl<F: AsyncFn(sinew::message::Sender) + Clone + Unpin + 'static> Actor for Teller<F> {
     type Context = AppContext<Self>;
 
     fn started(&mut self, context: &mut Self::Context) {
@@ -84,7 +88,7 @@ impl<F: AsyncFn(sinew::Sender) + Clone + Unpin + 'static> Actor for Teller<F> {
 #[must_use]
 fn tell<F>(second: impl FnOnce(NodeBuilder) -> NodeBuilder, requires: &[&str], story: F) -> (Node, Node)
 where
-    F: AsyncFn(sinew::Sender) + Clone + Send + Sync + Unpin + 'static,
+    F: AsyncFn(sinew::message::Sender) + Clone + Send + Sync + Unpin + 'static,
 {
     let group = own_group();
     let (told, is_told) = sync_channel(1);
@@ -103,7 +107,7 @@ fn requests_to_another_node_are_answered_and_every_confirmed_send_has_its_outcom
     let _nodes = tell(
         |node| node.app(spec),
         &["oracle"],
-        async |sender: sinew::Sender| {
+        async |sender: sinew::message::Sender| {
             let ask = sender
                 .message("oracle", &Question { number: 21 })
                 .ask::<Answer>(DEADLINE)
@@ -134,7 +138,7 @@ fn requests_that_nobody_waits_for_any_more_take_no_places_and_their_late_replies
     let _nodes = tell(
         |node| node.app(spec),
         &["oracle"],
-        async |sender: sinew::Sender| {
+        async |sender: sinew::message::Sender| {
             let mut asked = 0;
             while asked < DROPPED {
                 match sender.message("oracle", &Question { number: 21 }).ask::<Answer>(DEADLINE) {
@@ -194,7 +198,7 @@ fn a_handler_sees_that_nobody_waits_for_its_reply_any_more_and_a_late_reply_is_c
     let _nodes = tell(
         |node| node.app(AppSpec::new("ponderer", || Ponderer).handles::<Question>()),
         &["ponderer"],
-        async |sender: sinew::Sender| {
+        async |sender: sinew::message::Sender| {
             let ask = |within| sender.message("ponderer", &Question { number: 1 }).ask::<Answer>(within);
             // Given up by whoever asked: the deadline is beyond the test's.
             let reply = ask(DEADLINE * 2).expect("it is sent");
@@ -221,7 +225,7 @@ fn all_that_was_sent_arrives_before_the_node_that_sent_it_is_gone() {
     let (here, _there) = tell(
         |node| node.app(spec),
         &["oracle"],
-        async |sender: sinew::Sender| {
+        async |sender: sinew::message::Sender| {
             // More than sockets and the session's window hold: most of it waits when the node is told to stop.
             for number in 0..WORDS {
                 let text = format!("{number:>16384}");
@@ -242,7 +246,7 @@ fn a_group_and_a_broadcast_reach_each_member_on_every_node_once() {
     let (here, there) = tell(
         |node| node.app(first).app(second),
         &["first", "second"],
-        async |sender: sinew::Sender| {
+        async |sender: sinew::message::Sender| {
             let word = |text: &str| Word { text: text.to_owned() };
             // The membership follows the readiness by one list; until then nobody takes the message.
             while sender.send(Tid::group("listeners"), &word("group")).is_err() {
@@ -267,7 +271,7 @@ fn a_thousand_messages_arrive_once_and_in_order() {
     let _nodes = tell(
         |node| node.configure(|config| config.mailbox_capacity = 2_000).app(spec),
         &["oracle"],
-        async |sender: sinew::Sender| {
+        async |sender: sinew::message::Sender| {
             for number in 0..1_000 {
                 sender.send("oracle", &Word { text: number.to_string() }).expect("it is sent");
             }

@@ -60,7 +60,7 @@ fn a_node_in_python_is_found_sends_takes_confirms_and_leaves() {
     assert!(got.eq((1..=COUNT).map(|number| Seen::Got(1, number))), "once and in order");
     events.wait("the node in Python to have left", |seen| {
         let left = |seen: &Seen| {
-            matches!(seen, Seen::Node(NodeEvent::NodeLost { why: sinew::LossReason::Left, .. }))
+            matches!(seen, Seen::Node(NodeEvent::NodeLost { why: sinew::events::LossReason::Left, .. }))
         };
         seen.iter().any(left).then_some(())
     });

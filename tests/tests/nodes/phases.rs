@@ -2,7 +2,11 @@
 
 use std::sync::mpsc::{SyncSender, sync_channel};
 
-use sinew::{Barrier, BarrierKind, Meet, ReadyGate, prelude::*};
+use sinew::{
+    barrier::{Barrier, BarrierKind, Meet},
+    prelude::*,
+    supervision::ReadyGate,
+};
 use sinew_tests::{DEADLINE, Ground, until};
 
 const DRIVES: [&str; 2] = ["hip.drive", "knee.drive"];

@@ -1,6 +1,6 @@
 //! A node whose root fails: the one fault that ends it, in order.
 
-use sinew::{NodeEnd, prelude::*};
+use sinew::{node::NodeEnd, prelude::*};
 use sinew_tests::{
     Ground, all_run,
     puppet::{Order, Seen, Stage},

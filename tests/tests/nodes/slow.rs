@@ -5,7 +5,10 @@ use std::{
     time::Duration,
 };
 
-use sinew::{Rejection, SendError, prelude::*};
+use sinew::{
+    message::{Rejection, SendError},
+    prelude::*,
+};
 use sinew_tests::{DEADLINE, own_group};
 
 payload!("slow.job", Bulk => struct Job { number: u64 });

@@ -2,7 +2,13 @@
 
 use std::sync::Mutex;
 
-use sinew::{CommandError, LifeState, NodeEnd, Refusal, Rejection, StartError, Supervised, prelude::*};
+use sinew::{
+    StartError,
+    message::Rejection,
+    node::{CommandError, LifeState, NodeEnd, Supervised},
+    prelude::*,
+    supervision::Refusal,
+};
 use sinew_tests::{
     DEADLINE, Ground, Log, all_run,
     puppet::{Job, Puppet, Seen, Stage, desk, lives, outcome_of_job},

@@ -2,7 +2,11 @@
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
-use sinew::{Kind, NodeApi, Registration, Rejection, Sender, inspect, prelude::*};
+use sinew::{
+    NodeApi, Registration, inspect,
+    message::{Kind, Rejection, Sender},
+    prelude::*,
+};
 use sinew_tests::{DEADLINE, Ground, OwnDirectory, all_run, until};
 
 payload!("undelivered.angle", Control => #[derive(Debug)] struct Angle { degrees: f32 });

@@ -3,7 +3,11 @@
 use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
-use sinew::{Kind, Outcome, Registration, Rejection, Tid, payload};
+use sinew::{
+    Outcome, Registration, Tid,
+    message::{Kind, Rejection},
+    payload,
+};
 use sinew_tests::{
     DEADLINE,
     orders::{Count, Level, Me, Order, Who},

@@ -1,6 +1,6 @@
 //! Unconfirmed messages that are not delivered: from an application in a process of its own, and to one.
 
-use sinew::{AppAddress, Rejection, Tid, prelude::*};
+use sinew::{AppAddress, Tid, message::Rejection, prelude::*};
 use sinew_tests::{orders::Order, until};
 
 use crate::scenario::Scenario;

@@ -20,7 +20,7 @@ use sinew_runtime::{
 use super::{Angle, confirmed, named, outcome_of};
 use crate::{
     accept_pace::{IN_A_ROW_MAX, REST},
-    api::{NodeApi, Registration},
+    client::{NodeApi, Registration},
     lncl::{
         AppFact, OF_USER_AT_SYNC,
         guests::{EACH, SAVED_MAX},

@@ -48,7 +48,7 @@ pub struct KnownNode {
     /// The first of them: its NDL where that is not heard; then, as it says, layers, then applications by their addresses, four at most.
     pub troubles: Vec<TroubledApp>,
     /// How many of its clients (applications with [`NodeApi`](crate::NodeApi), in any language) take nothing of what waits for them, as it
-    /// says. No [`NodeEvent`](crate::NodeEvent) tells of it.
+    /// says. No [`NodeEvent`](crate::events::NodeEvent) tells of it.
     pub idle_clients: usize,
     /// The first of them by their addresses, two at most.
     pub idle: Vec<IdleApp>,

@@ -293,7 +293,7 @@ mod tests {
     fn protected() -> Protected {
         let protection = Protection::of_period(Duration::from_secs(60));
         let (name, reads) = ("test.guards", Reads::OfLength(2));
-        Protected { name, kind: sinew::Kind::named(name), protection, reads }
+        Protected { name, kind: sinew::message::Kind::named(name), protection, reads }
     }
 
     /// A guard of an output that stays.

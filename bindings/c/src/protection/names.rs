@@ -6,7 +6,7 @@
 
 use std::sync::OnceLock;
 
-use sinew::Kind;
+use sinew::message::Kind;
 
 use crate::status::{Fault, Status};
 

@@ -1,8 +1,10 @@
 //! Whom a message to many reaches, the members of a group or everybody, as the nodes say at which they are.
 
 use sinew::{
-    ApiError, AppAddress, NodeAddress, Outcome, Payload, Rejection, Tid,
+    AppAddress, NodeAddress, Outcome, Payload, Tid,
+    client::ApiError,
     inspect::{AccessReport, AskGroups, AskReach, NodeReport, ReachReport, Reached},
+    message::Rejection,
 };
 
 use super::{

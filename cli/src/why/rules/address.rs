@@ -1,8 +1,8 @@
 //! Whether two processes have one node address, or had it until just now.
 
 use sinew::{
-    Rejection,
     inspect::{NodeReport, RefusalReport},
+    message::Rejection,
 };
 
 use super::{

@@ -9,7 +9,8 @@ mod stream;
 mod unnamed;
 
 use sinew::{
-    AppAddress, Class, Incarnation, NodeAddress, Tid,
+    AppAddress, Class, NodeAddress, Tid,
+    address::Incarnation,
     inspect::{
         AccessReport, AccessVerdict, AppReport, DialReport, ForeignReport, LinkReport, Missing,
         RefusalReport, StreamReport, TreeLine, UnhandledReport,

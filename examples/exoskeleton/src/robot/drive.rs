@@ -22,9 +22,9 @@ mod word;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use sinew::ReadyGate;
 use sinew::prelude::*;
 use sinew::protection::Guard;
+use sinew::supervision::ReadyGate;
 
 pub use self::burden::Burden;
 use self::lookout::{Lookout, Watch};

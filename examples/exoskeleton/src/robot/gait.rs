@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use sinew::prelude::*;
-use sinew::{Down, NodeAddress, ReadyGate};
+use sinew::{NodeAddress, events::Down, supervision::ReadyGate};
 
 use super::PERIOD;
 use super::drive::micros;

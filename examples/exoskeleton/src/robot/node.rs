@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::SystemTime;
 
-use sinew::Incarnation;
+use sinew::address::Incarnation;
 use sinew::prelude::*;
 use sinew::signals::StopSignals;
 use thiserror::Error;

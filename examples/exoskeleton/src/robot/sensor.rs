@@ -5,8 +5,8 @@
 
 use std::sync::Arc;
 
-use sinew::ReadyGate;
 use sinew::prelude::*;
+use sinew::supervision::ReadyGate;
 
 use super::PERIOD;
 use super::device::JointDevice;

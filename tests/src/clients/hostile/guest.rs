@@ -16,8 +16,10 @@ use rustix::{
     thread::{set_thread_gid, set_thread_uid},
 };
 use sinew::{
-    AppAddress, ArriveAtBarrier, BarrierAnswer, BarrierKind, Kind, NodeAddress, OnPartyLoss, Payload as _,
-    Tid, payload,
+    AppAddress, NodeAddress, Payload as _, Tid,
+    barrier::{ArriveAtBarrier, BarrierAnswer, BarrierKind, OnPartyLoss},
+    message::Kind,
+    payload,
 };
 use sinew_runtime::wire::{Flags, Header, decode, encode};
 

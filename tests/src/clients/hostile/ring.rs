@@ -16,7 +16,7 @@ use rustix::{
     io::{pread, pwrite},
     net::{SendFlags, send},
 };
-use sinew::{Kind, Tid, payload};
+use sinew::{Tid, message::Kind, payload};
 use sinew_runtime::wire::decode;
 use sinew_shm::{BellKind, Capacity, Offer, Producer, Region, Terms};
 

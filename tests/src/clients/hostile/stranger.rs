@@ -12,7 +12,7 @@ use std::{
 };
 
 use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
-use sinew::{AppAddress, Kind, NodeAddress, Tid};
+use sinew::{AppAddress, NodeAddress, Tid, message::Kind};
 use sinew_runtime::wire::{Header, encode};
 
 /// Nothing is waited for longer than this: whoever is hostile has more to do.

@@ -15,7 +15,11 @@ use std::{
 };
 
 use rustix::fs::{MemfdFlags, memfd_create};
-use sinew::{AppAddress, Class, Kind, NodeAddress, Outcome, Payload as _, Rejection, Tid, payload};
+use sinew::{
+    AppAddress, Class, NodeAddress, Outcome, Payload as _, Tid,
+    message::{Kind, Rejection},
+    payload,
+};
 use sinew_runtime::wire::{Flags, Header, encode};
 
 use super::{

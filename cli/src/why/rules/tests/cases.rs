@@ -19,7 +19,7 @@ const CASES: &[Case] = &[
             knee(facts).unhandled.push(UnhandledReport {
                 receiver,
                 sender,
-                kind: sinew::Kind::named("demo.angle"),
+                kind: sinew::message::Kind::named("demo.angle"),
                 kind_name: Some("demo.angle".to_owned()),
                 is_malformed: false,
                 count: 7,

@@ -8,7 +8,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use sinew::{ApiError, NodeAddress, NodeApi, Payload, Received, Registration, Time};
+use sinew::{
+    NodeAddress, NodeApi, Payload, Registration, Time,
+    client::{ApiError, Received},
+};
 
 use crate::joint::{Joint, PerJoint};
 use crate::message::DriveStatus;

@@ -10,7 +10,7 @@ use std::{
 };
 
 use rustix::net::{RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, recvmsg};
-use sinew::{AppAddress, Kind, Outcome, Tid, payload};
+use sinew::{AppAddress, Outcome, Tid, message::Kind, payload};
 use sinew_runtime::wire::{Flags, Header, encode};
 use sinew_shm::{BellKind, Capacity, Offer, PassError, Region};
 

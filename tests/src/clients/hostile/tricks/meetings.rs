@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew::{AppAddress, Kind, NodeAddress, Outcome, Tid, payload};
+use sinew::{AppAddress, NodeAddress, Outcome, Tid, message::Kind, payload};
 use sinew_runtime::wire::{Flags, Header, encode};
 
 use super::{Attacker, TRICK};

@@ -1,6 +1,6 @@
 //! What was injected against what was seen: the claims of each step.
 
-use sinew::{LossReason, Time};
+use sinew::{Time, events::LossReason};
 
 use super::claim::{Claim, Claims, REPORTED};
 use super::evidence::{Evidence, Loss, SAFE_AT_LATEST_NS, Span, ms_after, span};

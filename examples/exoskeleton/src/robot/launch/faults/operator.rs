@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use sinew::{ApiError, Class, Endpoint, NodeApi, Outcome, Payload, Registration, Tid, Time};
+use sinew::{Class, Endpoint, NodeApi, Outcome, Payload, Registration, Tid, Time, client::ApiError};
 use thiserror::Error;
 
 use crate::joint::Joint;
