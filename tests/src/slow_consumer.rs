@@ -115,7 +115,7 @@ pub fn run(plan: &Plan) -> Report {
     let takes = plan.takes.as_micros().to_string();
     let mut receiver = Member::start(&plan.program, "receiver", &[path("there", 2), takes]);
     let flood = [plan.rate.to_string(), plan.length.to_string()];
-    let arguments = [vec![path("here", 1)], flood.to_vec()].concat();
+    let arguments = [vec![path("home", 1)], flood.to_vec()].concat();
     let mut sender = Member::start(&plan.program, "sender", &arguments);
 
     let quiet = window(&mut [&mut sender, &mut receiver], plan.reference);

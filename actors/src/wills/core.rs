@@ -34,6 +34,8 @@ pub(crate) enum Input {
     LinkBroken { node: NodeAddress, incarnation: Incarnation },
     /// A node is lost.
     NodeLost { node: NodeAddress, incarnation: Incarnation },
+    /// A node has said that it gives up. Its goodbye on its link, if it has one, says that it has executed its wills itself.
+    GaveUp { node: NodeAddress, incarnation: Incarnation },
     /// This life was another process than the one that has the node's address.
     WasNobody { node: NodeAddress, incarnation: Incarnation },
     /// A node has left in order.
@@ -70,6 +72,8 @@ pub(crate) struct Core {
 #[derive(Debug, Default)]
 struct Peer {
     linked: Option<Incarnation>,
+    /// The linked life gives up: a link that breaks now, without a goodbye, is its loss.
+    gives_up: bool,
     sent: Option<Time>,
     /// When it is told our wills.
     due: Option<Time>,
@@ -112,8 +116,16 @@ impl Core {
                     && peer.linked.is_some_and(|life| life <= incarnation)
                 {
                     (peer.linked, peer.due) = (None, None);
+                    if std::mem::take(&mut peer.gives_up) {
+                        self.execute(node, |life| life <= incarnation);
+                    }
                 }
             }
+            // spec: WILL-2
+            Input::GaveUp { node, incarnation } => match self.peers.get_mut(&node) {
+                Some(peer) if peer.linked.is_some_and(|life| life <= incarnation) => peer.gives_up = true,
+                Some(_) | None => self.execute(node, |life| life <= incarnation),
+            },
             Input::NodeLost { node, incarnation } => self.execute(node, |life| life <= incarnation),
             // The node itself, in whatever life, may be alive. spec: WILL-2
             Input::WasNobody { node, incarnation } => self.execute(node, |life| life == incarnation),
@@ -162,7 +174,7 @@ impl Core {
         self.execute(node, |life| life < incarnation);
         let has_wills = !self.own.is_empty();
         if let Some(peer) = self.at(node) {
-            peer.linked = Some(incarnation);
+            (peer.linked, peer.gives_up) = (Some(incarnation), false);
             peer.due = has_wills.then_some(now);
         }
     }

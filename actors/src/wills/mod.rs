@@ -8,7 +8,7 @@
 //! | rule | |
 //! | --- | --- |
 //! | WILL-1 | The whole list goes to a node when the link comes up, at each change (not sooner than 5 ms after the one before), and every 2 s as long as it is not empty. |
-//! | WILL-2 | A lost node's wills are executed once for each loss; not those of a node that left: it stops its applications itself. |
+//! | WILL-2 | A lost node's wills are executed once for each loss; not those of a node that left: it stops its applications itself. A node that gives up has executed its wills if it says goodbye on its link, and has not if that link breaks. |
 //! | WILL-3 | That a node is there in a new life is the loss of the old one, whoever says so first. |
 //! | WILL-4 | A will of more than 1,024 bytes, and what is more than 256 wills of a node or than `payload_max` has room for, stays at home. One list is held of each of `ndl.nodes_max` nodes. |
 //! | WILL-5 | The wills of a node whose certificate is revoked are not executed, whatever becomes of it. |

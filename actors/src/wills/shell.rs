@@ -29,13 +29,11 @@ impl Input {
             MembershipFact::NodeLost {
                 node,
                 incarnation,
-                why:
-                    LossReason::GaveUp(_)
-                    | LossReason::Crashed
-                    | LossReason::Hung
-                    | LossReason::LinkDown
-                    | LossReason::Restarted,
+                why: LossReason::Crashed | LossReason::Hung | LossReason::LinkDown | LossReason::Restarted,
             } => Some(Self::NodeLost { node, incarnation }),
+            MembershipFact::NodeLost { node, incarnation, why: LossReason::GaveUp(_) } => {
+                Some(Self::GaveUp { node, incarnation })
+            }
             MembershipFact::NodeLost { node, incarnation, why: LossReason::Duplicate } => {
                 Some(Self::WasNobody { node, incarnation })
             }
@@ -47,11 +45,9 @@ impl Input {
         match *fact {
             LinkFact::LinkUp { node, incarnation } => Some(Self::LinkUp { node, incarnation }),
             LinkFact::LinkBroken { node, incarnation } => Some(Self::LinkBroken { node, incarnation }),
-            LinkFact::PeerLeft { node, incarnation, gave_up: None } => {
+            // A node says goodbye on a link behind the wills that it has executed, also when it gives up.
+            LinkFact::PeerLeft { node, incarnation, gave_up: _ } => {
                 Some(Self::NodeLeft { node, incarnation })
-            }
-            LinkFact::PeerLeft { node, incarnation, gave_up: Some(_) } => {
-                Some(Self::NodeLost { node, incarnation })
             }
             LinkFact::DialRefused { .. } => None,
         }

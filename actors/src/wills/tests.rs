@@ -95,6 +95,27 @@ fn a_lost_nodes_wills_are_executed_once_for_each_loss_and_those_of_one_that_left
     assert_eq!(executed(&bench.hears(LOST)), 0);
 }
 
+// spec: WILL-2
+#[test]
+fn wills_of_a_node_that_gives_up_are_executed_when_its_link_breaks_and_not_when_it_says_goodbye() {
+    let gives_up = Input::GaveUp { node: THERE, incarnation: LIFE };
+    let left = Input::NodeLeft { node: THERE, incarnation: LIFE };
+    let broken = Input::LinkBroken { node: THERE, incarnation: LIFE };
+    for (then, count) in [(vec![left, broken.clone()], 0), (vec![broken.clone()], 1)] {
+        let mut bench = Bench::new();
+        bench.hears(UP);
+        bench.hears(told(LIFE, 1));
+        assert_eq!(executed(&bench.hears(gives_up.clone())), 0);
+        assert_eq!(then.into_iter().map(|input| executed(&bench.hears(input))).sum::<usize>(), count);
+    }
+    // And: of a node whose link broke before, nothing else tells what became of its wills
+    let mut bench = Bench::new();
+    bench.hears(UP);
+    bench.hears(told(LIFE, 1));
+    bench.hears(broken);
+    assert_eq!(executed(&bench.hears(gives_up)), 1);
+}
+
 // spec: WILL-5
 #[test]
 fn the_wills_of_a_node_whose_certificate_is_revoked_are_not_executed() {

@@ -90,7 +90,7 @@ fn an_application_that_fails_too_often_ends_its_process_with_code_1_and_the_othe
     hip.wait_for(&["started"]);
     let mut knee = scenario.start_with("knee:panic@every(1)", "knee", 101, &[]);
     assert_eq!(knee.wait_for_end(), Some(1));
-    hip.wait_for(&["NodeLost", "knee", "Left"]);
+    hip.wait_for(&["NodeLost", "knee", "GaveUp"]);
 }
 
 #[test]
