@@ -377,7 +377,11 @@ fn run(node: Node, stays: bool, audits: bool) -> ExitCode {
 
 fn log_to_standard_error() {
     tracing_subscriber::fmt()
-        .with_env_filter(tracing_subscriber::EnvFilter::from_default_env())
+        .with_env_filter(
+            tracing_subscriber::EnvFilter::builder()
+                .with_default_directive(tracing::Level::WARN.into())
+                .from_env_lossy(),
+        )
         .with_writer(std::io::stderr)
         .init();
 }

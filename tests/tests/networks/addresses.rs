@@ -40,7 +40,7 @@ fn a_node_waits_for_its_address_however_that_is_written_and_goes_on_when_it_is_t
         let no_question = if address.contains(':') { " nodad" } else { "" };
         host.ip(&format!("address add {address} dev eth0{no_question}"))
             .unwrap_or_else(|error| panic!("{error}"));
-        node.wait_for(&["NDL asks and answers", logged]);
+        node.wait_for(&["NDL sends and receives here now", logged]);
     }
 }
 

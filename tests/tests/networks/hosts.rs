@@ -191,7 +191,7 @@ fn an_interface_that_is_chosen_by_its_name_is_used_from_when_it_is_there() {
     hip.wait_for(&["count 50 from 10.77.0.1"]);
     // The second one comes up: the other node learns where this one listens besides.
     hosts.bring_up(0, 1);
-    central.wait_for(&["NDL asks and answers", "10.78.0.1"]);
+    central.wait_for(&["NDL sends and receives here now", "10.78.0.1"]);
     hip.wait_for(&["listens there now", "10.78.0.1"]);
     // Now the first one may go.
     hosts.take_down(0, 0);

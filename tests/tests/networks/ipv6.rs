@@ -212,10 +212,10 @@ fn an_address_that_comes_later_is_used_when_no_other_host_has_it() {
         node.wait_for(&["NDL has no address yet", "fd77"]);
     }
     scenario.ip(0, "address add fd77::1/64 dev eth0 nodad");
-    central.wait_for(&["NDL asks and answers", "fd77::1"]);
+    central.wait_for(&["NDL sends and receives here now", "fd77::1"]);
     // The kernel asks first; nothing of the node fails for that.
     scenario.ip(1, "address add fd77::2/64 dev eth0");
-    hip.wait_for(&["NDL asks and answers", "fd77::2"]);
+    hip.wait_for(&["NDL sends and receives here now", "fd77::2"]);
     central.wait_for(&["started"]);
     all_came(&central, &mut hip, 50);
     assert!(hip.said().iter().all(|line| !line.contains("cannot use UDP")), "{:?}", hip.said());
@@ -228,7 +228,7 @@ fn an_address_that_another_host_has_is_not_used_and_that_is_said() {
     scenario.ip(1, "address add fd77::9/64 dev eth0");
     let mut hip = scenario.start(1, "interface = \"fd77::9\"\nmulticast = false");
     hip.wait_for(&["another host on the link has it", "fd77::9"]);
-    assert!(hip.said().iter().all(|line| !line.contains("asks and answers")), "{:?}", hip.said());
+    assert!(hip.said().iter().all(|line| !line.contains("sends and receives here now")), "{:?}", hip.said());
 }
 
 #[test]

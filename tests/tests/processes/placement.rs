@@ -123,7 +123,7 @@ fn a_panic_fails_the_message_in_hand_and_keeps_those_behind(place: &str) {
     (2..=200).for_each(|number| scenario.count(number));
     assert_eq!(scenario.count_confirmed(201), Outcome::Delivered);
     assert_eq!(scenario.who().counts, (2..=201).collect::<Vec<_>>(), "of the new instance");
-    scenario.node.wait_for(&["a child failed", "panicked: this is the panic that the scenario asks for"]);
+    scenario.node.wait_for(&["a child failed", "a panic at", "process_under_test.rs"]);
 }
 
 fn an_application_that_stops_ramps_down_and_is_started_again(place: &str) {

@@ -62,6 +62,8 @@ pub(super) struct Paths {
     /// When it is said next that an address cannot be opened, as long as that is so.
     unopened: RefCell<BTreeMap<LocalAddress, Time>>,
     has_said_no_ipv6: Cell<bool>,
+    /// Whether addresses were looked for before: what is opened later came later.
+    has_begun: Cell<bool>,
     /// When it is said next that there is no address at all.
     none_next: Cell<Time>,
 }
@@ -113,6 +115,9 @@ impl Paths {
                                 continue;
                             }
                         }
+                        if self.has_begun.get() {
+                            crate::log::info!(udp = %path.here, "NDL sends and receives here now");
+                        }
                         self.open.borrow_mut().push(path);
                         self.unopened.borrow_mut().remove(&local);
                     }
@@ -121,6 +126,7 @@ impl Paths {
             }
             readers.extend(self.join(stores, local));
         }
+        self.has_begun.set(true);
         let place = |path: &Path| wanted.iter().position(|local| *local == path.local);
         self.open.borrow_mut().sort_by_key(place);
         (readers, unopened)
@@ -132,7 +138,7 @@ impl Paths {
             if !is_wanted {
                 path.readers.iter().for_each(AbortHandle::abort);
                 stores::lock(&stores.ndl_sockets).close(path.local);
-                crate::log::info!(udp = %path.here, "NDL does not ask there any more: the address is gone, or its socket of no use");
+                crate::log::info!(udp = %path.here, "NDL no longer sends and receives here: the address is gone, or its socket of no use");
             }
             is_wanted
         });

@@ -218,14 +218,16 @@ class Link:
 class Datagrams:
     """One socket beside the connection for Stream; PREFIX and the acknowledgement as the page has them."""
     PREFIX, ACKNOWLEDGEMENT, RANGE = struct.Struct("<BBHIQII"), struct.Struct("<IIQB3x"), struct.Struct("<QI")
-    IS_ACK, IS_VALUE, IS_TO_BE_ANSWERED = 1, 2, 4
+    IS_ACK, IS_VALUE, IS_PROBE = 1, 2, 4
+    PROBED = 1200  # bytes of a probe: our value is shorter (DATAGRAM-7)
 
     def __init__(self):
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind((own_address, 0))
         self.key, self.their_address, self.their_key = secrets.randbits(64), None, None
         self.newest, self.got = {}, 0  # by flow; and how many were newer than all before them
-        self.number, self.is_open, self.is_acknowledged, self.due, self.wait = time.monotonic_ns(), False, False, 0.0, 0.02
+        self.probe = time.monotonic_ns()  # the number of a probe, and behind it of our value (DATAGRAM-3)
+        self.number, self.is_open, self.is_acknowledged, self.due, self.wait = self.probe + 1, False, False, 0.0, 0.02
 
     def announce(self, link):
         """Where we read, to be said behind the first ACK (DATAGRAM-2)."""
@@ -235,11 +237,11 @@ class Datagrams:
         address = socket.inet_ntoa(struct.pack(">I", said["address"])) if said.get("address", 0) else link.connection.getpeername()[0]
         self.their_address, self.their_key = (address, said["port"]), said["key"]
 
-    def say(self, what, acknowledgement=b"", value=b""):
+    def say(self, what, acknowledgement=b"", probe=b"", value=b""):
         stamp = time.monotonic_ns() // 1000 & 0xffffffff
         start = self.PREFIX.pack(1, what, 0, here, self.their_key, stamp, 0)[:20]
-        checksum = zlib.crc32(acknowledgement, zlib.crc32(start))
-        self.socket.sendto(start + struct.pack("<I", checksum) + acknowledgement + value, self.their_address)
+        checksum = zlib.crc32(acknowledgement + probe, zlib.crc32(start))
+        self.socket.sendto(start + struct.pack("<I", checksum) + acknowledgement + probe + value, self.their_address)
 
     def is_new(self, message):
         """Whether this is newer than all before it of its flow, whichever way it came (DATAGRAM-3)."""
@@ -261,13 +263,15 @@ class Datagrams:
             count = self.ACKNOWLEDGEMENT.unpack(data[end:ranges_at])[3]
             end = ranges_at + count * self.RANGE.size
             ranges = list(self.RANGE.iter_unpack(data[ranges_at:end]))
-        assert checksum == zlib.crc32(data[24:end], zlib.crc32(data[:20]))
+        of_probe = data[end:end + 8] if what & self.IS_PROBE else b""
+        assert checksum == zlib.crc32(data[24:end] + of_probe, zlib.crc32(data[:20]))
         if what & self.IS_ACK:
-            self.is_open = True
-            if any(first <= self.number <= first + behind for first, behind in ranges) and not self.is_acknowledged:
+            has = lambda number: any(first <= number <= first + behind for first, behind in ranges)
+            self.is_open = self.is_open or has(self.probe)
+            if has(self.number) and not self.is_acknowledged:
                 self.is_acknowledged = True
                 say("value acknowledged")
-        came = []
+        came = list(struct.unpack("<Q", of_probe)) if of_probe else []
         if what & self.IS_VALUE:
             message = Frame(data[end:])
             assert (message.cls, message.flags) == (1, 0) and message.source >> 32 == peer
@@ -275,12 +279,12 @@ class Datagrams:
             if self.is_new(message):
                 self.got += 1
                 say("value", unpack(message.payload)[0]["number"], "by datagram")
-        if what & (self.IS_VALUE | self.IS_TO_BE_ANSWERED):
+        if what & (self.IS_VALUE | self.IS_PROBE):
             ranges = b"".join(self.RANGE.pack(number, 0) for number in came)
             self.say(self.IS_ACK, self.ACKNOWLEDGEMENT.pack(stamp, 0, self.got, len(came)) + ranges)
 
     def tick(self, now):
-        """Asks until a datagram is answered, then sends our value until it is acknowledged (DATAGRAM-4, DATAGRAM-5)."""
+        """Probes until one is acknowledged, then sends our value until it is acknowledged (DATAGRAM-4, DATAGRAM-5)."""
         if self.their_key is None or destination is None or self.is_acknowledged or now < self.due:
             return
         self.due, self.wait = now + self.wait, min(2 * self.wait, 0.25)
@@ -288,7 +292,7 @@ class Datagrams:
             payload = pack({"number": int(value)})
             self.say(self.IS_VALUE, value=frame(kind_of(value_kind), us, destination, payload, correlation=self.number, cls=1))
         else:
-            self.say(self.IS_TO_BE_ANSWERED)
+            self.say(self.IS_PROBE, probe=struct.pack("<Q", self.probe), value=bytes(self.PROBED - 32))
 
 
 by_class = value_kind is not None
@@ -307,7 +311,7 @@ def introduced(link, hello):
     them, _ = unpack(hello.payload)
     assert hello.kind == HELLO and them["project"] == project and them["peer"] == here
     peer, lane = them["node"], them.get("lane", "control")
-    features = ["guard", "outcomes"] + (["classes", "datagrams"] if by_class else [])
+    features = ["guard", "outcomes"] + (["classes", "datagrams-2"] if by_class else [])
     ours = {"project": project, "node": here, "name": "python", "incarnation": incarnation, "peer": peer, "dial": 0,
             "payload_max": 65536, "features": features, "lane": lane, "link": them.get("link", 0)}
     link.own(WELCOME, ours)
