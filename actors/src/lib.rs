@@ -113,7 +113,8 @@ pub mod address {
 /// Applications: how one is declared, what it gets with each message, and what it may do.
 pub mod app {
     pub use sinew_runtime::app::{
-        AppContext, AppSpec, Delivery, DownPolicy, LastWill, Raw, Requirement, RequirementPolicy, SendOutcome,
+        AppContext, AppSpec, Delivery, DownPolicy, GroupOutcome, LastWill, Raw, Requirement,
+        RequirementPolicy, SendOutcome,
     };
 }
 
@@ -151,8 +152,8 @@ pub mod events {
 /// Messages: their types and classes, how they are sent, and what becomes of them.
 pub mod message {
     pub use sinew_runtime::{
-        outcome::{Outcome, Rejection},
-        sender::{AskError, Confirmation, Destination, Reply, SendError, Sender},
+        outcome::{MemberOutcome, Outcome, Rejection},
+        sender::{AskError, Confirmation, Destination, GroupConfirmation, Reply, SendError, Sender},
         wire::{Class, Kind, MessageBuffer, Payload, TIME_TO_LIVE_MAX},
     };
 }

@@ -72,7 +72,7 @@ pub(crate) enum Command {
     /// The payload is written as MessagePack, as every typed payload is: what its type calls its fields are the keys of the JSON object.
     #[command(after_help = r#"Examples:
   sinew send knee.drive demo.angle '{"degrees": 5}'
-  sinew send drives demo.stop                 to a group: each member, without confirmation
+  sinew send drives demo.stop                 to a group: the outcome of each member; exit code 1 if one did not take it
   sinew send knee.drive demo.status --ask     prints the reply"#)]
     Send(send::Order),
     /// Shows what an application gets and sends: decoded payloads, type, class, source, age, and each type's rate once a second

@@ -1,5 +1,7 @@
 //! `sinew send`: one message, and what became of it.
 
+mod many;
+
 use std::io::Read;
 
 use clap::{Args, ValueEnum};
@@ -95,7 +97,7 @@ pub(crate) fn show(system: &mut System, order: &Order) -> Result<Report, Fault> 
     let kind = kind(&order.kind)?;
     let payload = payload(&order.payload)?;
     if !to.is_single() {
-        return to_many(system, to, (kind, &payload), order);
+        return many::to_many(system, to, (kind, &payload), order);
     }
     let began = Time::now();
     let mut ended = send(system, to, (kind, &payload), order);
@@ -119,57 +121,6 @@ pub(crate) fn show(system: &mut System, order: &Order) -> Result<Report, Fault> 
         "outcome": ended.outcome.map(|outcome| format!("{outcome:?}")), "reply": ended.reply,
     });
     Ok(Report { text, json, is_fine: ended.fault.is_none() })
-}
-
-/// Sends it to each member of a group, or to all applications: without confirmation, as each of them would have one of its own.
-fn to_many(
-    system: &mut System,
-    to: Tid,
-    (kind, payload): (Kind, &[u8]),
-    order: &Order,
-) -> Result<Report, Fault> {
-    if order.ask {
-        let target = clean(&order.target);
-        return Err(Fault::Usage(format!(
-            "'{target}' is a group, and --ask asks one application; name a member of it"
-        )));
-    }
-    let (members, silent) = system.members(to)?;
-    // With nobody there to send to, nothing is sent and nothing can fail.
-    let fault = if members.is_empty() {
-        None
-    } else {
-        let endpoint = &mut system.endpoint;
-        let sent = endpoint.create_message(to, kind, payload.len()).and_then(|mut loan: LoanedMessage| {
-            loan.copy_from_slice(payload);
-            loan.set_class(order.class.into());
-            endpoint.loaned(loan).send()
-        });
-        sent.err().map(|error| clean(&error.to_string()))
-    };
-    let target = clean(&order.target);
-    // A group that is named by its TID is known to be one. A bare name may be misspelt.
-    let is_name = order.target.parse::<Tid>().is_err();
-    let result = match (&fault, members.len()) {
-        (Some(why), _) => why.clone(),
-        (None, 0) if is_name => {
-            "no application has this name, and no group of this name has a member; the message reached nobody. \
-             `sinew apps` shows the applications"
-                .to_owned()
-        }
-        (None, 0) => "no application is a member; the message reached nobody".to_owned(),
-        (None, 1) => "sent to 1 member, without confirmation".to_owned(),
-        (None, count) => format!("sent to {count} members, without confirmation"),
-    };
-    let silent_lines: String =
-        silent.iter().map(|line| format!("its members are unknown: {line}\n")).collect();
-    let json = json!({
-        "tid": to.to_string(), "kind": kind.to_string(), "bytes": payload.len(), "fault": fault,
-        "members": members.iter().map(ToString::to_string).collect::<Vec<_>>(), "silent": silent,
-    });
-    let text = format!("{target} ({to}): {result}\n{silent_lines}");
-    let is_fine = fault.is_none() && silent.is_empty() && !(is_name && members.is_empty());
-    Ok(Report { text, json, is_fine })
 }
 
 fn send(system: &mut System, to: Tid, (kind, payload): (Kind, &[u8]), order: &Order) -> Ended {

@@ -4,10 +4,13 @@
 //! dropped unsettled says [`Outcome::Failed`]: an actor that panics drops the message in its hand, so its sender
 //! learns of it without any further code.
 
+mod members;
+
 use std::{fmt, sync::Arc};
 
 use serde::{Deserialize, Serialize};
 
+pub use self::members::{MEMBERS_MAX, MemberOutcome, MemberReport, MemberState, MemberTable, REPORTS_MAX};
 use crate::tid::Tid;
 
 /// The fate of a confirmed message.
@@ -48,17 +51,19 @@ pub enum Rejection {
     ForgedSource,
     /// The handler refused it.
     ByHandler,
-    /// The request does not make sense: a confirmation of a multicast, for instance.
+    /// The request does not make sense: a question to a group, for instance.
     Unsupported,
     /// The destination's application has ended, is not ready again, and wants no message kept for it meanwhile.
     Down,
     /// The access list of the destination's node does not let this source send this to it.
     NotAllowed,
+    /// A confirmed message to many has more members on a node, or more nodes, than one may have, or its source has too many of them under way.
+    TooManyMembers,
 }
 
 impl Rejection {
     /// All of them, in the order in which they are declared.
-    pub(crate) const ALL: [Self; 12] = [
+    pub(crate) const ALL: [Self; 13] = [
         Self::NoSuchApplication,
         Self::NoSuchNode,
         Self::UnknownKind,
@@ -71,6 +76,7 @@ impl Rejection {
         Self::Unsupported,
         Self::Down,
         Self::NotAllowed,
+        Self::TooManyMembers,
     ];
 }
 
@@ -94,6 +100,10 @@ impl fmt::Display for Rejection {
             Self::Down => "the destination's application is away: it ended and is not ready again",
             Self::NotAllowed => {
                 "the access list of the destination's node does not allow it; `sinew why SENDER DESTINATION` names the rule"
+            }
+            Self::TooManyMembers => {
+                "a confirmed message reaches at most 256 members of a group on one node, and 256 other nodes, and an application has 64 of them \
+                 under way; send it to smaller groups, wait for some to end, or send it unconfirmed"
             }
         })
     }
@@ -143,6 +153,11 @@ pub struct Ticket {
 pub trait ReceiptSink: Send + Sync {
     /// Takes the one outcome of the message that `ticket` names. Called once for each receipt.
     fn settle(&self, ticket: Ticket, outcome: Outcome);
+
+    /// Takes reports about the members of the message to many that `ticket` names, before it is settled. spec: FRAME-7
+    fn members(&self, ticket: Ticket, reports: &[MemberReport]) {
+        let _ = (ticket, reports);
+    }
 }
 
 /// The right and the duty to say what became of one confirmed message.
@@ -162,6 +177,15 @@ impl Receipt {
     pub fn settle(mut self, outcome: Outcome) {
         if let Some(sink) = self.sink.take() {
             sink.settle(self.ticket, outcome);
+        }
+    }
+
+    /// Reports members of the message, which is one to many.
+    pub fn report(&self, reports: &[MemberReport]) {
+        if let Some(sink) = &self.sink
+            && !reports.is_empty()
+        {
+            sink.members(self.ticket, reports);
         }
     }
 

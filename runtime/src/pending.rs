@@ -8,10 +8,10 @@ use std::{
 };
 
 use crate::{
-    outcome::{Outcome, ReceiptSink, Ticket},
+    outcome::{MemberOutcome, MemberReport, MemberTable, Outcome, ReceiptSink, Ticket},
     post::lock,
     router::{Outlet, Refused},
-    tid::Tid,
+    tid::{NodeAddress, Tid},
     time::Time,
     wakes,
     wire::{Flags, Header, Kind, Message},
@@ -66,6 +66,8 @@ struct Slot {
     from: Tid,
     waker: Option<Waker>,
     settled: Option<Settlement>,
+    /// Of a message to many: what became of it at each member so far.
+    members: Option<Box<MemberTable>>,
 }
 
 /// What is waited for.
@@ -103,13 +105,25 @@ impl Pending {
 
     /// Opens a wait for what `from` says; its number is the message's correlation. `None` if too many are open.
     pub fn open(self: &Arc<Self>, awaited: Awaited, from: Tid) -> Option<Wait> {
+        self.open_slot(Slot { awaited, from, waker: None, settled: None, members: None })
+    }
+
+    /// Opens a wait for the outcomes of all members of a message to `destination`, from an application of the node at `here`. It ends when the
+    /// message does; then, or at any time before, [`Wait::members`] has them. `None` if too many are open.
+    pub fn open_each(self: &Arc<Self>, destination: Tid, here: NodeAddress) -> Option<Wait> {
+        let members = Some(Box::new(MemberTable::new(destination, here)));
+        let awaited = Awaited::Outcome;
+        self.open_slot(Slot { awaited, from: destination, waker: None, settled: None, members })
+    }
+
+    fn open_slot(self: &Arc<Self>, slot: Slot) -> Option<Wait> {
         let mut inner = lock(&self.inner);
         if inner.slots.len() >= self.capacity {
             return None;
         }
         let id = inner.next;
         inner.next += 1;
-        inner.slots.insert(id, Slot { awaited, from, waker: None, settled: None });
+        inner.slots.insert(id, slot);
         Some(Wait { pending: self.clone(), id })
     }
 
@@ -183,6 +197,16 @@ impl ReceiptSink for Pending {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
         self.settle_with(ticket.correlation, ticket.destination, Settlement::Outcome(outcome));
     }
+
+    fn members(&self, ticket: Ticket, reports: &[MemberReport]) {
+        let mut inner = lock(&self.inner);
+        if let Some(slot) = inner.slots.get_mut(&ticket.correlation)
+            && slot.from == ticket.destination
+            && let Some(members) = &mut slot.members
+        {
+            members.note(reports);
+        }
+    }
 }
 
 /// One open wait. Dropping it closes it.
@@ -211,6 +235,16 @@ impl Wait {
         }
         slot.waker = Some(cx.waker().clone());
         Poll::Pending
+    }
+
+    /// The outcome of each member, where it is waited for these; `last` is the outcome of the message as a whole, `None` at the deadline. See
+    /// [`MemberTable::finish`].
+    #[must_use]
+    pub fn members(&self, last: Option<Outcome>) -> Vec<MemberOutcome> {
+        let mut inner = lock(&self.pending.inner);
+        let table = inner.slots.get_mut(&self.id).and_then(|slot| slot.members.take());
+        drop(inner);
+        table.map_or_else(Vec::new, |table| table.finish(last))
     }
 
     /// Whether nothing has come yet.

@@ -1,6 +1,7 @@
 //! Where messages go: the routing table of a node, read by senders without a lock.
 
 mod copies;
+mod each;
 mod groups;
 pub mod guard;
 pub mod tap;
@@ -20,6 +21,7 @@ use arc_swap::ArcSwap;
 
 use self::{
     copies::Copies,
+    each::OpenSends,
     groups::{Groups, Joined},
     guard::Guard,
     tap::Tap,
@@ -142,6 +144,8 @@ pub struct Router {
     refused: [AtomicU64; Rejection::ALL.len()],
     /// Who reports refusals of unconfirmed messages to their senders.
     refusals: OnceLock<Arc<dyn RefusalSink>>,
+    /// Confirmed messages to many that other nodes have copies of.
+    group_sends: Arc<OpenSends>,
     /// Where everything goes, in a process that knows no route itself.
     uplink: Option<Arc<dyn Outlet>>,
 }
@@ -156,6 +160,7 @@ impl Router {
             writing: Mutex::default(),
             refused: Default::default(),
             refusals: OnceLock::new(),
+            group_sends: Arc::default(),
             uplink: None,
         }
     }
@@ -200,8 +205,10 @@ impl Router {
             Self::send_to_one(table, self.node, message)
         } else if destination.app == AppAddress::NONE {
             Err(Refused::new(message, Rejection::NoSuchApplication))
-        } else if message.receipt.is_some() || message.header.flags.has(Flags::ASK) {
+        } else if message.header.flags.has(Flags::ASK) {
             Err(Refused::new(message, Rejection::Unsupported))
+        } else if message.receipt.is_some() {
+            self.send_to_each(&snapshot, message)
         } else {
             self.multicast(&snapshot, message)
         };
@@ -251,6 +258,8 @@ impl Router {
     fn deliver_by(&self, snapshot: &Snapshot, guard: Judge<'_>, message: Message) -> Result<(), Rejection> {
         let result = if message.header.destination.is_single() {
             submit_here(&snapshot.table, guard, message)
+        } else if message.receipt.is_some() {
+            self.deliver_to_each(snapshot, guard, message)
         } else {
             let copies = self.fan_out(snapshot, guard, &message);
             self.count(&copies, &message.header);
@@ -361,9 +370,7 @@ impl Router {
     }
 
     fn send_up(uplink: &dyn Outlet, message: Message) -> Result<(), Refused> {
-        if !message.header.destination.is_single()
-            && (message.receipt.is_some() || message.header.flags.has(Flags::ASK))
-        {
+        if !message.header.destination.is_single() && message.header.flags.has(Flags::ASK) {
             return Err(Refused::new(message, Rejection::Unsupported));
         }
         uplink.submit(message)

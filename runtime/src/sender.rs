@@ -16,7 +16,7 @@ use bytes::Bytes;
 
 pub(crate) use self::builder::{Content, Via};
 pub use self::{
-    awaiting::{Confirmation, Reply},
+    awaiting::{Confirmation, GroupConfirmation, Reply},
     builder::{MessageBuilder, Value},
 };
 use crate::{
@@ -96,6 +96,11 @@ pub enum SendError {
     /// Too many confirmed messages and requests wait for their end.
     #[error("too many confirmed messages and requests are under way; wait for some to end")]
     TooManyWaits,
+    /// A group or a broadcast has no outcome of its own: each member has one.
+    #[error(
+        "{0} is more than one application, so that the message has an outcome for each; send it with `confirmed_by_each`"
+    )]
+    ToMany(Tid),
     /// Kinds below `0x8000_0000` are the layers' own; see [`Kind`].
     #[error(
         "the kind {0} belongs to Sinew's layers, which would end a connection; take one from `Kind::named`"
@@ -376,12 +381,27 @@ impl Sender {
     ) -> Result<(Wait, Duration), SendError> {
         let destination = self.shared.router.absolute(message.header.destination);
         let wait = self.shared.pending.open(awaited, destination).ok_or(SendError::TooManyWaits)?;
+        let within = self.confirm_to(message, destination, &wait, within);
+        Ok((wait, within))
+    }
+
+    /// The same for the outcomes of all members of a message to many.
+    fn expect_each(&self, message: &mut Message, within: Duration) -> Result<(Wait, Duration), SendError> {
+        let destination = self.shared.router.absolute(message.header.destination);
+        let wait = self.shared.pending.open_each(destination, self.shared.router.node());
+        let wait = wait.ok_or(SendError::TooManyWaits)?;
+        let within = self.confirm_to(message, destination, &wait, within);
+        Ok((wait, within))
+    }
+
+    /// Has the message confirmed to a wait.
+    fn confirm_to(&self, message: &mut Message, destination: Tid, wait: &Wait, within: Duration) -> Duration {
         message.header.flags = message.header.flags.with(Flags::CONFIRM);
         message.header.correlation = wait.correlation();
         let within = message.header.limit_time_to_live(within);
         let ticket = Ticket { source: self.shared.tid, destination, correlation: wait.correlation() };
         message.receipt = Some(Receipt::new(self.shared.pending.clone(), ticket));
-        Ok((wait, within))
+        within
     }
 
     /// Returns when it was sent.

@@ -69,6 +69,8 @@ payload!("process.order" =>
         Send(String, u64),
         /// Send a number to the application that has this TID, unconfirmed.
         SendTo(u64),
+        /// Send a number to the group of this name, confirmed by each member, and write down what becomes of it.
+        SendToGroup(String),
         /// Ask the application of this name who it is, and write down the answer.
         Ask(String),
         /// Send these bytes, in this very order, to the application of this name.

@@ -3,7 +3,7 @@
 use std::{fmt, time::Duration};
 
 use sinew_runtime::{
-    outcome::Outcome,
+    outcome::{MemberOutcome, Outcome},
     sender::Destination,
     tid::Tid,
     wire::{Class, Header, Message, Payload},
@@ -17,7 +17,7 @@ use super::{
 /// A message to be sent: made by `message` or `loaned` of an [`Endpoint`] or an [`AsyncEndpoint`].
 ///
 /// What it does not say is as its type and its endpoint say. It is sent by [`send`](Self::send), [`confirmed`](Self::confirmed),
-/// [`ask`](Self::ask) or [`reply_to`](Self::reply_to), and not before.
+/// [`confirmed_by_each`](Self::confirmed_by_each), [`ask`](Self::ask) or [`reply_to`](Self::reply_to), and not before.
 ///
 /// ```no_run
 /// # use std::time::Duration;
@@ -32,7 +32,7 @@ use super::{
 /// # Ok(())
 /// # }
 /// ```
-#[must_use = "a message is sent by `send`, `confirmed`, `ask` or `reply_to`"]
+#[must_use = "a message is sent by `send`, `confirmed`, `confirmed_by_each`, `ask` or `reply_to`"]
 pub struct MessageBuilder<'a, E, C> {
     endpoint: &'a mut E,
     content: C,
@@ -160,6 +160,18 @@ impl Endpoint {
         self.confirm(draft, limit, within).await
     }
 
+    async fn confirm_by_each_as(
+        &mut self,
+        content: impl Content,
+        terms: SendTerms,
+        within: Duration,
+    ) -> Result<Vec<MemberOutcome>, ApiError> {
+        let limit = terms.limit(self);
+        let mut draft = content.into_draft(self, limit).await?;
+        terms.apply(&mut draft.header);
+        self.confirm_by_each(draft, limit, within).await
+    }
+
     async fn ask_as(
         &mut self,
         content: impl Content,
@@ -245,9 +257,40 @@ impl<C: Content> MessageBuilder<'_, Endpoint, C> {
     /// With less than 20 ms a node that has gone is not looked for: [`receive`](Endpoint::receive) does.
     ///
     /// # Errors
-    /// It was not sent. If the connection ends before the outcome is known that is [`Outcome::Unknown`].
+    /// It was not sent; a group or a broadcast has no outcome of its own ([`ApiError::ToMany`]). If the connection ends before the outcome is
+    /// known that is [`Outcome::Unknown`].
     pub fn confirmed(self, within: Duration) -> Result<Outcome, ApiError> {
         at_once(self.endpoint.confirm_as(self.content, self.terms, within))
+    }
+
+    /// Sends it to a group, to every application ([`Tid::BROADCAST`]) or to an address on all nodes, and waits for what becomes of it at each
+    /// member: one [`MemberOutcome`] for each that is known when the message arrives at its node, without this endpoint. Returns as soon as the
+    /// last one is settled, and at the latest `within` this time. A member that has no outcome by then has [`Outcome::Unknown`], as have all
+    /// members of a node that is lost, or of all nodes where the connection ends. A node that has not named its members has one entry for them.
+    /// A group without members gives an empty list.
+    ///
+    /// At most 256 members of one node and 256 other nodes are reached. The message expires where it waits, and what comes meanwhile waits, as
+    /// with [`confirmed`](Self::confirmed).
+    ///
+    /// ```no_run
+    /// use std::time::Duration;
+    ///
+    /// use sinew::{Endpoint, Outcome, Tid, client::ApiError};
+    ///
+    /// sinew::payload!("doc.stop" => struct Stop);
+    ///
+    /// /// Stops all drives; returns those that may still move.
+    /// fn stop(endpoint: &mut Endpoint) -> Result<Vec<Tid>, ApiError> {
+    ///     let drives = endpoint.message(Tid::group("drives"), &Stop).confirmed_by_each(Duration::from_millis(50))?;
+    ///     let failed = drives.into_iter().filter(|drive| drive.outcome != Outcome::Delivered);
+    ///     Ok(failed.map(|drive| drive.tid).collect())
+    /// }
+    /// ```
+    ///
+    /// # Errors
+    /// No member has a copy: it was not sent, it is of class Stream, its node is not known, or it has too many members.
+    pub fn confirmed_by_each(self, within: Duration) -> Result<Vec<MemberOutcome>, ApiError> {
+        at_once(self.endpoint.confirm_by_each_as(self.content, self.terms, within))
     }
 
     /// Sends it as a request, in class Control, and waits for the reply. A longer `within` than
@@ -290,9 +333,34 @@ impl<C: Content> MessageBuilder<'_, AsyncEndpoint, C> {
     /// Sends it and waits for its outcome, as of an [`Endpoint`].
     ///
     /// # Errors
-    /// It was not sent. If the connection ends before the outcome is known that is [`Outcome::Unknown`].
+    /// It was not sent; a group or a broadcast has no outcome of its own ([`ApiError::ToMany`]). If the connection ends before the outcome is
+    /// known that is [`Outcome::Unknown`].
     pub async fn confirmed(self, within: Duration) -> Result<Outcome, ApiError> {
         self.endpoint.endpoint.confirm_as(self.content, self.terms, within).await
+    }
+
+    /// Sends it to many and waits for what becomes of it at each member, as of an [`Endpoint`].
+    ///
+    /// ```no_run
+    /// use std::time::Duration;
+    ///
+    /// use sinew::{AsyncEndpoint, Outcome, Tid, client::ApiError};
+    ///
+    /// sinew::payload!("doc.stop" => struct Stop);
+    ///
+    /// /// Stops all drives; returns those that may still move.
+    /// async fn stop(endpoint: &mut AsyncEndpoint) -> Result<Vec<Tid>, ApiError> {
+    ///     let within = Duration::from_millis(50);
+    ///     let drives = endpoint.message(Tid::group("drives"), &Stop).confirmed_by_each(within).await?;
+    ///     let failed = drives.into_iter().filter(|drive| drive.outcome != Outcome::Delivered);
+    ///     Ok(failed.map(|drive| drive.tid).collect())
+    /// }
+    /// ```
+    ///
+    /// # Errors
+    /// No member has a copy: it was not sent, it is of class Stream, its node is not known, or it has too many members.
+    pub async fn confirmed_by_each(self, within: Duration) -> Result<Vec<MemberOutcome>, ApiError> {
+        self.endpoint.endpoint.confirm_by_each_as(self.content, self.terms, within).await
     }
 
     /// Sends it as a request and waits for the reply, as of an [`Endpoint`].

@@ -90,7 +90,7 @@ impl Endpoint {
         let terms = Terms::of(&registered, &options);
         let Registered { node, app, node_name, payload_max, ring: _ } = registered;
         let control = reader.control().filter(|_| register.direct);
-        let inbox = Inbox::new(inbox_capacity, payload_max as usize, writer.clone());
+        let inbox = Inbox::new(Tid::new(node, app), inbox_capacity, payload_max as usize, writer.clone());
         register.former = Some(app);
         crate::log::here!(debug: tid = %Tid::new(node, app), node = node_name, "registered");
         Self {
@@ -299,7 +299,9 @@ impl Endpoint {
         let message = payload::frame(Kind::LNCL_RESOLVE, self.tid, LNCL, &asked);
         match self.request(message.into(), Awaited::Resolved, Flags::NONE, within).await? {
             Some(Answer::Resolved(tid)) => Ok(tid),
-            Some(Answer::Outcome(_) | Answer::Reply(_)) | None => Err(ApiError::NoAnswer(within)),
+            Some(Answer::Outcome(_) | Answer::Members(_) | Answer::Reply(_)) | None => {
+                Err(ApiError::NoAnswer(within))
+            }
         }
     }
 
@@ -352,7 +354,9 @@ impl Endpoint {
             }
             Some(Answer::Outcome(Outcome::Rejected(Rejection::QueueFull))) => Err(ApiError::TooManyGroups),
             Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
-            Some(Answer::Reply(_) | Answer::Resolved(_)) | None => Err(ApiError::NoAnswer(PROMPT)),
+            Some(Answer::Members(_) | Answer::Reply(_) | Answer::Resolved(_)) | None => {
+                Err(ApiError::NoAnswer(PROMPT))
+            }
         }
     }
 }

@@ -96,6 +96,11 @@ pub enum ApiError {
         "the kind {0} belongs to Sinew's layers, which would end the connection; take one from `Kind::named`"
     )]
     NotYours(Kind),
+    /// A group or a broadcast has no outcome of its own: each member has one. The caller is at fault; nothing was sent.
+    #[error(
+        "{0} is more than one application, so that the message has an outcome for each; send it with `confirmed_by_each`"
+    )]
+    ToMany(Tid),
     /// No application has the name now. Nothing was sent.
     #[error(
         "no application is called '{0}' now; require it at registration, so that this one starts when it is there, or see `sinew apps` for \
@@ -192,6 +197,7 @@ mod tests {
             ApiError::LoanActive,
             ApiError::TooLong { length: 2, limit: 1 },
             ApiError::NotYours(Kind::OUTCOME),
+            ApiError::ToMany(Tid::BROADCAST),
             ApiError::UnknownName("knee".to_owned()),
             ApiError::NoReply(second),
             ApiError::NotAsked,

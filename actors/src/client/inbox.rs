@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use sinew_runtime::{
     mailbox::{Bounds, ClassQueue},
-    outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
+    outcome::{MemberReport, Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     tid::Tid,
     time::Time,
     wire::{Flags, Kind, Message},
@@ -19,6 +19,8 @@ pub(super) enum Awaited {
     Outcome,
     /// The reply to a request, or an outcome which says that there will be none.
     Reply,
+    /// The outcomes of a message to many, one for each member.
+    Members,
     /// The TID of a name.
     Resolved,
 }
@@ -27,6 +29,8 @@ pub(super) enum Awaited {
 #[derive(Debug)]
 pub(super) enum Answer {
     Outcome(Outcome),
+    /// A part of what is awaited: further reports follow, or the outcome of the message as a whole.
+    Members(Vec<MemberReport>),
     Reply(Message),
     Resolved(Option<Tid>),
 }
@@ -57,6 +61,8 @@ const AWAITING_MAX: usize = 16_384;
 pub(super) struct Inbox {
     queue: ClassQueue,
     capacity: usize,
+    /// The address that it receives at.
+    own: Tid,
     /// Confirmations of what was received go out here.
     sink: Arc<dyn ReceiptSink>,
     /// Messages that were refused and whose senders were told nothing.
@@ -64,12 +70,12 @@ pub(super) struct Inbox {
 }
 
 impl Inbox {
-    /// For messages with payloads of so many bytes at most.
-    pub(super) fn new(capacity: usize, payload_max: usize, sink: Arc<dyn ReceiptSink>) -> Self {
+    /// For messages to `own` with payloads of so many bytes at most.
+    pub(super) fn new(own: Tid, capacity: usize, payload_max: usize, sink: Arc<dyn ReceiptSink>) -> Self {
         // Whoever leaves messages in the socket while there is no room is refused none.
         let bounds =
             Bounds { messages: capacity.max(AWAITING_MAX), bytes: BYTES_ENOUGH.saturating_add(payload_max) };
-        Self { queue: ClassQueue::new(bounds), capacity, sink, untold: 0 }
+        Self { queue: ClassQueue::new(bounds), capacity, own, sink, untold: 0 }
     }
 
     /// How many unconfirmed messages it has refused since the last time that somebody asked.
@@ -77,9 +83,9 @@ impl Inbox {
         std::mem::take(&mut self.untold)
     }
 
-    /// Confirms what comes from now on over another connection.
-    pub(super) fn set_sink(&mut self, sink: Arc<dyn ReceiptSink>) {
-        self.sink = sink;
+    /// Confirms what comes from now on, to `own`, over another connection.
+    pub(super) fn set_sink(&mut self, own: Tid, sink: Arc<dyn ReceiptSink>) {
+        (self.own, self.sink) = (own, sink);
     }
 
     /// Whether every class has room for one more.
@@ -109,14 +115,15 @@ impl Inbox {
         let awaited = awaited.filter(|(number, _)| *number == header.correlation).map(|(_, what)| what);
         if header.kind.is_user() {
             return if header.flags.has(Flags::REPLY) {
-                sort_reply(with_receipt(sink, message), awaited)
+                sort_reply(self.with_receipt(sink, message), awaited)
             } else {
-                self.push(with_receipt(sink, message));
+                self.push(self.with_receipt(sink, message));
                 Sorted::Message
             };
         }
         match header.kind {
             Kind::OUTCOME => sort_outcome(&message, awaited),
+            Kind::MEMBERS => sort_members(&message, awaited),
             Kind::LNCL_RESOLVED => sort_resolved(&message, awaited),
             Kind::LNCL_REFUSAL => Sorted::Refusal(
                 payload::read(&message.payload)
@@ -132,7 +139,7 @@ impl Inbox {
 
     /// Refuses a message of the node for which there is no room elsewhere.
     pub(super) fn refuse(&mut self, message: Message) {
-        let message = with_receipt(&self.sink, message);
+        let message = self.with_receipt(&self.sink, message);
         self.reject(message, Rejection::QueueFull);
     }
 
@@ -154,6 +161,16 @@ impl Inbox {
         }
     }
 
+    /// What becomes of it is said as from this endpoint, also where it was sent to many.
+    fn with_receipt(&self, sink: &Arc<dyn ReceiptSink>, mut message: Message) -> Message {
+        if message.header.flags.has(Flags::CONFIRM) {
+            let Ticket { source, destination, correlation } = message.ticket();
+            let destination = if destination.is_single() { destination } else { self.own };
+            message.receipt = Some(Receipt::new(sink.clone(), Ticket { source, destination, correlation }));
+        }
+        message
+    }
+
     fn push(&mut self, message: Message) {
         match self.queue.push(message) {
             // Of a Stream the newest value wins; Stream messages have no receipts.
@@ -170,15 +187,6 @@ impl Inbox {
     }
 }
 
-fn with_receipt(sink: &Arc<dyn ReceiptSink>, mut message: Message) -> Message {
-    if message.header.flags.has(Flags::CONFIRM) {
-        let (source, destination) = (message.header.source, message.header.destination);
-        let ticket = Ticket { source, destination, correlation: message.header.correlation };
-        message.receipt = Some(Receipt::new(sink.clone(), ticket));
-    }
-    message
-}
-
 fn sort_reply(mut message: Message, awaited: Option<Awaited>) -> Sorted {
     let is_awaited = awaited == Some(Awaited::Reply);
     message.settle(if is_awaited { Outcome::Delivered } else { Outcome::Expired });
@@ -190,8 +198,18 @@ fn sort_outcome(message: &Message, awaited: Option<Awaited>) -> Sorted {
     match (awaited, outcome) {
         // The reply follows.
         (Some(Awaited::Reply), Some(Outcome::Delivered)) => Sorted::Nothing,
-        (Some(Awaited::Outcome | Awaited::Reply), Some(outcome)) => Sorted::Answer(Answer::Outcome(outcome)),
+        (Some(Awaited::Outcome | Awaited::Members | Awaited::Reply), Some(outcome)) => {
+            Sorted::Answer(Answer::Outcome(outcome))
+        }
         (None | Some(Awaited::Resolved), _) | (_, None) => Sorted::Nothing,
+    }
+}
+
+fn sort_members(message: &Message, awaited: Option<Awaited>) -> Sorted {
+    match MemberReport::decode(&message.payload) {
+        Some(reports) if awaited == Some(Awaited::Members) => Sorted::Answer(Answer::Members(reports)),
+        // What they would say is unknown at the deadline.
+        Some(_) | None => Sorted::Nothing,
     }
 }
 
@@ -214,6 +232,8 @@ mod tests {
     use sinew_runtime::wire::{Class, Header};
 
     use super::*;
+
+    const OWN: Tid = Tid::from_bits(2);
 
     #[derive(Default)]
     struct Ledger(Mutex<Vec<(u64, Outcome)>>);
@@ -241,7 +261,7 @@ mod tests {
     #[test]
     fn a_message_that_finds_no_room_is_refused_and_its_sender_told() {
         let ledger = Arc::new(Ledger::default());
-        let mut inbox = Inbox::new(1, 1 << 20, ledger.clone());
+        let mut inbox = Inbox::new(OWN, 1, 1 << 20, ledger.clone());
         inbox.sort(confirmed(1), None);
         assert!(!inbox.has_room());
         for number in 2..=AWAITING_MAX as u64 + 1 {
@@ -256,7 +276,7 @@ mod tests {
     fn each_class_is_bounded_in_bytes_and_what_is_refused_untold_is_counted() {
         const LENGTH: usize = 64 << 10;
         for class in [Class::Control, Class::Stream, Class::Bulk] {
-            let mut inbox = Inbox::new(4, LENGTH, Arc::new(Ledger::default()));
+            let mut inbox = Inbox::new(OWN, 4, LENGTH, Arc::new(Ledger::default()));
             let payload = Bytes::from(vec![0; LENGTH]);
             let kept = BYTES_ENOUGH / LENGTH + 1;
             for number in 0..kept + 3 {
@@ -274,7 +294,7 @@ mod tests {
     #[test]
     fn whoever_leaves_messages_where_they_are_while_there_is_no_room_is_refused_none() {
         const LONG: usize = 3 << 20;
-        let mut inbox = Inbox::new(100, LONG, Arc::new(Ledger::default()));
+        let mut inbox = Inbox::new(OWN, 100, LONG, Arc::new(Ledger::default()));
         let mut taken = 0;
         while inbox.has_room() {
             let header = Header::new(Kind::named("x"), Tid::from_bits(1), Tid::from_bits(2));
@@ -287,7 +307,7 @@ mod tests {
     #[test]
     fn a_message_that_became_too_old_is_not_handed_out() {
         let ledger = Arc::new(Ledger::default());
-        let mut inbox = Inbox::new(4, 1 << 20, ledger.clone());
+        let mut inbox = Inbox::new(OWN, 4, 1 << 20, ledger.clone());
         let mut message = confirmed(1);
         message.header.time_to_live_us = 10;
         inbox.sort(message, None);
@@ -297,7 +317,7 @@ mod tests {
 
     #[test]
     fn the_newest_value_of_a_stream_is_the_one_that_is_received() {
-        let mut inbox = Inbox::new(4, 1 << 20, Arc::new(Ledger::default()));
+        let mut inbox = Inbox::new(OWN, 4, 1 << 20, Arc::new(Ledger::default()));
         for value in [1, 2, 3] {
             let mut header = Header::new(Kind::named("angle"), Tid::from_bits(1), Tid::from_bits(2));
             header.class = Class::Stream;
@@ -309,7 +329,7 @@ mod tests {
 
     #[test]
     fn an_outcome_reaches_the_one_who_waits_for_it_and_nobody_else() {
-        let mut inbox = Inbox::new(4, 1 << 20, Arc::new(Ledger::default()));
+        let mut inbox = Inbox::new(OWN, 4, 1 << 20, Arc::new(Ledger::default()));
         let awaited = Some((7, Awaited::Outcome));
         assert!(matches!(inbox.sort(outcome(6, Outcome::Failed), awaited), Sorted::Nothing));
         let sorted = inbox.sort(outcome(7, Outcome::Failed), awaited);
@@ -318,7 +338,7 @@ mod tests {
 
     #[test]
     fn a_request_that_was_delivered_still_waits_for_its_reply() {
-        let mut inbox = Inbox::new(4, 1 << 20, Arc::new(Ledger::default()));
+        let mut inbox = Inbox::new(OWN, 4, 1 << 20, Arc::new(Ledger::default()));
         let awaited = Some((7, Awaited::Reply));
         assert!(matches!(inbox.sort(outcome(7, Outcome::Delivered), awaited), Sorted::Nothing));
         let mut reply = confirmed(7);
@@ -329,10 +349,10 @@ mod tests {
     proptest! {
         #[test]
         fn anything_that_a_node_may_say_is_sorted(kind: u32, layer in 0u32..0x50, payload: Vec<u8>) {
-            let mut inbox = Inbox::new(4, 1 << 20, Arc::new(Ledger::default()));
+            let mut inbox = Inbox::new(OWN, 4, 1 << 20, Arc::new(Ledger::default()));
             for kind in [kind, layer] {
                 let header = Header::new(Kind::from_bits(kind), Tid::from_bits(1), Tid::from_bits(2));
-                for awaited in [Awaited::Outcome, Awaited::Reply, Awaited::Resolved] {
+                for awaited in [Awaited::Outcome, Awaited::Members, Awaited::Reply, Awaited::Resolved] {
                     let message = Message::new(header, Bytes::copy_from_slice(&payload));
                     inbox.sort(message, Some((0, awaited)));
                 }

@@ -157,7 +157,7 @@ impl Endpoint {
     fn heed(&mut self, message: Message, wanted: Option<Wanted>) -> Option<Message> {
         let Header { kind, correlation, .. } = message.header;
         // The number alone says nothing: a mark and an introduction carry numbers that others have given.
-        let is_answer = matches!(kind, Kind::OUTCOME | Kind::LNCL_RESOLVED)
+        let is_answer = matches!(kind, Kind::OUTCOME | Kind::MEMBERS | Kind::LNCL_RESOLVED)
             && wanted.is_some_and(|wanted| wanted.number == correlation);
         if kind.is_user() || is_answer {
             return Some(message);

@@ -24,6 +24,7 @@
 //! | wait for room 200 us at most, or not at all | [`room_within`](MessageBuilder::room_within) of a message | `sinew_send_message_within` |
 //! | write a payload where it travels from, so that sending it copies nothing (loan: CreateMessage, SendMessage) | [`create_message`](Endpoint::create_message), [`LoanedMessage`], [`loaned`](Endpoint::loaned) | `sinew_create_message`, `sinew_send_message` |
 //! | receive, with a deadline (ReceiveMessage) | [`receive`](Endpoint::receive), [`Received`] | `sinew_receive_message`, `sinew_settle_message` |
+//! | be told what became of it at each member of a group | [`.confirmed_by_each(within)`](MessageBuilder::confirmed_by_each): a [`MemberOutcome`](crate::message::MemberOutcome) for each | `sinew_send_message_confirmed_by_each` |
 //! | speak to many at once (groups) | [`join`](Endpoint::join), [`leave`](Endpoint::leave), [`Tid::group`](crate::Tid::group) | `sinew_join_group`, `sinew_group` |
 //! | take only the newest value of a sensor | [`Class::Stream`](crate::Class), at the type | `SINEW_STREAM` |
 //! | protect commands from end to end, and make an output safe without them ([`protection`](crate::protection)) | [`Endpoint::guard`] | not there: `bindings/c/README.md` |

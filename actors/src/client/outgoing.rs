@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use sinew_runtime::{
-    outcome::{Outcome, Rejection},
-    tid::{NodeAddress, Tid},
+    outcome::{MemberOutcome, MemberTable, Outcome, Rejection},
+    tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wire::{Class, Flags, HEADER_LEN, Header, Message},
 };
@@ -48,11 +48,58 @@ impl Endpoint {
             // Of a Stream the newest wins, so an older one has no outcome of its own.
             return Ok(Outcome::Rejected(Rejection::Unsupported));
         }
+        if is_many(message.header.destination) {
+            return Err(ApiError::ToMany(message.header.destination));
+        }
         let within = message.header.limit_time_to_live(within);
         let wait = (Awaited::Outcome, within);
         match self.request_within(message, wait, Flags::CONFIRM, limit).await? {
             Some(Answer::Outcome(outcome)) => Ok(outcome),
-            Some(Answer::Reply(_) | Answer::Resolved(_)) | None => Ok(Outcome::Unknown),
+            Some(Answer::Members(_) | Answer::Reply(_) | Answer::Resolved(_)) | None => Ok(Outcome::Unknown),
+        }
+    }
+
+    /// Sends `message` to many and waits for the outcome of each, no longer than a message can live.
+    pub(super) async fn confirm_by_each(
+        &mut self,
+        mut message: Draft,
+        limit: Limit,
+        within: Duration,
+    ) -> Result<Vec<MemberOutcome>, ApiError> {
+        let tid = self.absolute(message.header.destination);
+        if !is_many(tid) {
+            let outcome = self.confirm(message, limit, within).await?;
+            return Ok(vec![MemberOutcome { tid, outcome }]);
+        }
+        if message.header.class == Class::Stream {
+            return Err(ApiError::Ended(Outcome::Rejected(Rejection::Unsupported)));
+        }
+        let within = message.header.limit_time_to_live(within);
+        let asked = self.put(message, (Awaited::Members, within), Flags::CONFIRM, limit).await?;
+        let table = MemberTable::new(tid, self.tid.node);
+        Asking(self).0.await_members(table, asked).await
+    }
+
+    /// Collects reports until no outcome is missing; what is missing when the message has ended, or at the deadline, ends as that says.
+    async fn await_members(
+        &mut self,
+        mut table: MemberTable,
+        mut asked: Asked,
+    ) -> Result<Vec<MemberOutcome>, ApiError> {
+        loop {
+            match self.await_answer(asked).await? {
+                Some(Answer::Members(reports)) => table.note(&reports),
+                // Reports may be behind it, where the queue of this endpoint was full.
+                Some(Answer::Outcome(Outcome::Delivered)) => {}
+                // No member has a copy.
+                Some(Answer::Outcome(why @ Outcome::Rejected(_))) => return Err(ApiError::Ended(why)),
+                Some(Answer::Outcome(last)) => return Ok(table.finish(Some(last))),
+                Some(Answer::Reply(_) | Answer::Resolved(_)) | None => return Ok(table.finish(None)),
+            }
+            asked.now = Time::now();
+            if table.is_complete() || asked.now >= asked.deadline {
+                return Ok(table.finish(None));
+            }
         }
     }
 
@@ -69,7 +116,7 @@ impl Endpoint {
         match self.request_within(message, wait, Flags::CONFIRM.with(Flags::ASK), limit).await? {
             Some(Answer::Reply(reply)) => Ok(reply),
             Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
-            Some(Answer::Resolved(_)) | None => Err(ApiError::NoReply(within)),
+            Some(Answer::Members(_) | Answer::Resolved(_)) | None => Err(ApiError::NoReply(within)),
         }
     }
 
@@ -101,11 +148,23 @@ impl Endpoint {
     /// The same, and waits for room as long as `limit` and the wait for the answer allow.
     async fn request_within(
         &mut self,
+        message: Draft,
+        wait: (Awaited, Duration),
+        flags: Flags,
+        limit: Limit,
+    ) -> Result<Option<Answer>, ApiError> {
+        let asked = self.put(message, wait, flags, limit).await?;
+        Asking(self).0.await_answer(asked).await
+    }
+
+    /// Sends `message`, whose answer is awaited then.
+    async fn put(
+        &mut self,
         mut message: Draft,
         (awaited, within): (Awaited, Duration),
         flags: Flags,
         limit: Limit,
-    ) -> Result<Option<Answer>, ApiError> {
+    ) -> Result<Asked, ApiError> {
         self.correlation += 1;
         self.asked = self.correlation;
         message.header.correlation = self.correlation;
@@ -116,17 +175,13 @@ impl Endpoint {
         // Who waits so long for the answer waits no longer for room.
         let way = self.dispatch(message, limit.and_in_all(within)).await?;
         let wanted = Wanted { number, what: awaited, of: self.absolute(asked) };
-        let asking = Asking(self);
-        asking.0.await_answer(wanted, way, deadline, now).await
+        Ok(Asked { wanted, way, deadline, now })
     }
 
     /// Waits for the answer to what went this `way`; `None` at the deadline.
     async fn await_answer(
         &mut self,
-        wanted: Wanted,
-        way: Option<LinkNumber>,
-        mut deadline: Time,
-        mut now: Time,
+        Asked { wanted, way, mut deadline, mut now }: Asked,
     ) -> Result<Option<Answer>, ApiError> {
         // The link has ended, and what is not said by the deadline nobody knows.
         let mut has_ended = false;
@@ -353,6 +408,21 @@ impl Endpoint {
         }
         Ok(())
     }
+}
+
+/// What was sent and is to be answered.
+#[derive(Clone, Copy)]
+struct Asked {
+    wanted: Wanted,
+    /// The direct link that it went by.
+    way: Option<LinkNumber>,
+    deadline: Time,
+    now: Time,
+}
+
+/// Whether a message to `destination` has an outcome for each of several.
+fn is_many(destination: Tid) -> bool {
+    !destination.is_single() && destination.app != AppAddress::NONE
 }
 
 /// Who has asked, and for what.

@@ -240,7 +240,7 @@ impl Endpoint {
         self.home.register.former = Some(registered.app);
         self.payload_max = registered.payload_max as usize;
         self.node_name = registered.node_name;
-        self.inbox.set_sink(writer.clone());
+        self.inbox.set_sink(own, writer.clone());
         (self.writer, self.reader) = (writer, reader);
         (self.ended, self.home.way) = (None, None);
         (self.rest, self.stalled) = (None, None);

@@ -7,7 +7,7 @@ use std::{thread, time::Duration};
 
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{
-    outcome::{Outcome, Rejection},
+    outcome::{MemberOutcome, Outcome, Rejection},
     tid::{AppAddress, Tid},
     time::Time,
     wire::{Class, Flags, Kind, Message, Payload},
@@ -16,7 +16,7 @@ use sinew_runtime::{
 use super::{ApiError, NodeApi, Registration, Transport};
 use crate::lncl::{
     AppFact,
-    testing::{RawClient, TestDirectory, TestNode, WATCHDOG},
+    testing::{PlayedApp, RawClient, TestDirectory, TestNode, WATCHDOG},
 };
 
 use forms::{Api, Client, Under};
@@ -98,6 +98,8 @@ on_every_transport! {
     a_message_that_is_in_hand_at_a_panic_has_failed
     of_a_stream_only_the_newest_value_is_received
     a_member_gets_what_is_sent_to_its_group_until_it_leaves
+    each_member_of_a_group_says_what_became_of_it
+    a_member_that_says_nothing_is_unknown_at_the_deadline_and_others_have_their_outcomes
     the_end_of_the_node_is_an_error_with_its_reason
     what_nobody_takes_is_said_with_its_number_and_once
     ; in_rust:
@@ -358,6 +360,59 @@ fn a_member_gets_what_is_sent_to_its_group_until_it_leaves(under: Under) {
     // What the sender says directly comes after what it said to the group.
     sender.send(member.tid(), &TORQUE).unwrap();
     assert_eq!(member.receive(WATCHDOG).unwrap().expect("a message").destination(), member.tid());
+}
+
+fn each_member_of_a_group_says_what_became_of_it(under: Under) {
+    let node = TestNode::start();
+    let (app, mut member) = (node.local(1), register(under, &node, on(under)));
+    let mut sender = register(under, &node, on(under));
+    let group = Tid::group("drives");
+    // A group has no outcome of its own, and what to do is said.
+    let error = sender.message(group, &TORQUE).confirmed(WATCHDOG).unwrap_err();
+    assert!(error.to_string().contains("confirmed_by_each"), "{error}");
+    // An empty one has no outcomes.
+    assert_eq!(sender.message(group, &TORQUE).confirmed_by_each(WATCHDOG).unwrap(), []);
+    // The sender itself has none.
+    sender.join("drives").unwrap();
+    member.join("drives").unwrap();
+    node.stores.router.set_member(group.app, app.tid.app, true);
+    let of_member = member.tid();
+    let told = thread::scope(|scope| {
+        scope.spawn(|| app.next().settle(Outcome::Rejected(Rejection::UnknownKind)));
+        scope.spawn(move || {
+            let received = member.receive(WATCHDOG).unwrap().expect("its copy");
+            assert_eq!(received.destination(), group);
+        });
+        sender.message(group, &TORQUE).confirmed_by_each(WATCHDOG).unwrap()
+    });
+    let mut expected = [
+        MemberOutcome { tid: app.tid, outcome: Outcome::Rejected(Rejection::UnknownKind) },
+        MemberOutcome { tid: of_member, outcome: Outcome::Delivered },
+    ];
+    expected.sort_unstable_by_key(|member| member.tid);
+    assert_eq!(told, expected);
+    // One application has one.
+    let told = thread::scope(|scope| {
+        scope.spawn(|| app.next().settle(Outcome::Delivered));
+        sender.message(app.tid, &TORQUE).confirmed_by_each(WATCHDOG).unwrap()
+    });
+    assert_eq!(told, [MemberOutcome { tid: app.tid, outcome: Outcome::Delivered }]);
+}
+
+fn a_member_that_says_nothing_is_unknown_at_the_deadline_and_others_have_their_outcomes(under: Under) {
+    let node = TestNode::start();
+    let [takes, hangs] = [1, 2].map(|index| node.local(index));
+    let mut sender = register(under, &node, on(under));
+    let group = Tid::group("drives");
+    for app in [&takes, &hangs] {
+        node.stores.router.set_member(group.app, app.tid.app, true);
+    }
+    let told = thread::scope(|scope| {
+        scope.spawn(|| takes.next().settle(Outcome::Delivered));
+        sender.message(group, &TORQUE).confirmed_by_each(Duration::from_secs(1)).unwrap()
+    });
+    let entry = |app: &PlayedApp, outcome| MemberOutcome { tid: app.tid, outcome };
+    assert_eq!(told, [entry(&takes, Outcome::Delivered), entry(&hangs, Outcome::Unknown)]);
 }
 
 fn the_end_of_the_node_is_an_error_with_its_reason(under: Under) {

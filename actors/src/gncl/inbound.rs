@@ -3,9 +3,9 @@
 use std::{cell::RefCell, sync::Arc};
 
 use sinew_runtime::{
-    outcome::{Outcome, Receipt, Rejection, Ticket},
+    outcome::{MemberReport, Outcome, Receipt, Rejection, Ticket},
     router::Refused,
-    tid::{AppAddress, NodeAddress},
+    tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wakes,
     wire::{Checksum, Class, Flags, Header, Kind, Message},
@@ -159,6 +159,10 @@ impl Inbound {
         {
             return Some(End::Superseded);
         }
+        if header.flags.has(Flags::OUTCOME) && header.kind == Kind::MEMBERS {
+            self.members(now, &message);
+            return Some(End::Told);
+        }
         if header.flags.has(Flags::OUTCOME) {
             self.outcome(now, &message);
             return Some(End::Told);
@@ -179,8 +183,7 @@ impl Inbound {
             message.reject(Rejection::NoSuchNode);
             return Some(End::Refused);
         }
-        let is_one_of_many = header.class == Class::Stream || !header.destination.is_single();
-        if message.receipt.is_some() && is_one_of_many {
+        if message.receipt.is_some() && header.class == Class::Stream {
             self.count(now, "unconfirmable", &message);
             message.reject(Rejection::Unsupported);
             return Some(End::Refused);
@@ -253,10 +256,14 @@ impl Inbound {
         header.set_sent_error(times.map(|(_, error)| error));
     }
 
-    /// spec: GNCL-12
+    /// What becomes of a message to all nodes is said as from this one. spec: GNCL-12
     fn attach_receipt(&self, message: &mut Message) {
         if message.header.flags.has(Flags::CONFIRM) {
-            message.receipt = Some(Receipt::new(self.peer.clone(), message.ticket()));
+            let mut ticket = message.ticket();
+            if ticket.destination.node == NodeAddress::ALL {
+                ticket.destination = Tid::new(self.stores.node, ticket.destination.app);
+            }
+            message.receipt = Some(Receipt::new(self.peer.clone(), ticket));
         }
     }
 
@@ -270,20 +277,24 @@ impl Inbound {
         }
     }
 
+    /// What the peer reports of its members that have copies of a message from here. spec: FRAME-7.3
+    fn members(&self, now: Time, message: &Message) {
+        match MemberReport::decode(&message.payload) {
+            Some(reports) => {
+                self.stores.router.members_reported(self.peer.node, about(&message.header), &reports);
+            }
+            None => self.count(now, "no reports about members", message),
+        }
+    }
+
     fn outcome(&self, now: Time, message: &Message) {
-        let Message { header, payload, .. } = message;
-        let outcome = match payload[..] {
+        let outcome = match message.payload[..] {
             [code] => Outcome::from_code(code),
             _ => None,
         };
-        let ticket = Ticket {
-            source: header.destination,
-            destination: header.source,
-            correlation: header.correlation,
-        };
         match outcome {
             // One that nobody waits for any more was settled as Unknown when an earlier connection ended.
-            Some(outcome) => self.outcomes.borrow_mut().push((ticket, outcome)),
+            Some(outcome) => self.outcomes.borrow_mut().push((about(&message.header), outcome)),
             None => self.count(now, "no such outcome", message),
         }
     }
@@ -324,6 +335,11 @@ impl Inbound {
         let detail = format!("node {peer} sent a frame from {} to {}", header.source, header.destination);
         self.stores.gncl.refusals.count(now, cause, &detail);
     }
+}
+
+/// The message from here that an answer is about.
+const fn about(answer: &Header) -> Ticket {
+    Ticket { source: answer.destination, destination: answer.source, correlation: answer.correlation }
 }
 
 /// Whether this is about the connection itself, and of that kind.

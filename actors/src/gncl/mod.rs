@@ -17,7 +17,7 @@
 //! | GNCL-9 | A link on which nothing comes is pinged every second; after 3 unanswered pings it is broken. One whose own address is lost is so at once. |
 //! | GNCL-10 | GOODBYE is the last frame of a node that leaves, behind all that waits; it is not dialled again until it is found again. |
 //! | GNCL-11 | A frame's source must be on the peer's node and its destination on this one; times are turned into our clock. |
-//! | GNCL-12 | CONFIRM is answered by OUTCOME on the peer's present connection. |
+//! | GNCL-12 | CONFIRM is answered by OUTCOME on the peer's present connection; to many by MEMBERS before it (FRAME-7). |
 //! | GNCL-14 | Where both know `classes`, whoever dialled a link dials a connection each for Stream and for Bulk as well. At rest they are pinged every 10 s. |
 //! | GNCL-15 | Who waits no more for a reply says CANCEL, to a peer that knows it: a request that still waits is taken out as `Expired`. |
 //! | GNCL-16 | All addresses that a peer announces are dialled, 20 ms apart; the first that is reached stays, the others are closed. |

@@ -17,7 +17,7 @@ use std::{
 
 use bytes::Bytes;
 use sinew_runtime::{
-    outcome::{Outcome, ReceiptSink, Rejection, Ticket},
+    outcome::{MemberReport, Outcome, ReceiptSink, Rejection, Ticket},
     router::{Outlet, Refused},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
@@ -331,6 +331,15 @@ impl ReceiptSink for Peer {
         let mut said = Message::outcome(ticket, outcome);
         said.header.sent = Time::now();
         self.way_of(said.header.class).send_outcome(said);
+    }
+
+    /// So do reports about members of this node. spec: FRAME-7
+    fn members(&self, ticket: Ticket, reports: &[MemberReport]) {
+        let way = self.way_of(Class::Control);
+        for mut frame in Message::members(ticket, reports, way.payload_max()) {
+            frame.header.sent = Time::now();
+            way.send_outcome(frame);
+        }
     }
 }
 

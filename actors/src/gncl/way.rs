@@ -380,7 +380,12 @@ impl Way {
         }
     }
 
-    /// Sends an outcome: more of them than other messages may wait, for one that is lost leaves its sender waiting. The peer has no more
+    /// Longest payload that both sides take.
+    pub(super) fn payload_max(&self) -> usize {
+        self.ends.payload_max_there.min(self.longest - HEADER_LEN)
+    }
+
+    /// Sends an outcome, or reports about members: more of them than other messages may wait, for one that is lost leaves its sender waiting. The peer has no more
     /// messages open than it was told that there is room for; of one that has, the rest is counted and dropped.
     pub(super) fn send_outcome(&self, message: Message) {
         if let Err(refused) = self.outlet.submit_outcome(message, self.outcomes_max) {

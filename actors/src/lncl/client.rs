@@ -202,7 +202,10 @@ impl Client {
         let tid = Tid::new(server.stores.node, app);
         let name = lock(&server.stores.registry).name_of(app);
         let outlet = Arc::new(StreamOutlet::sharing(limits(&server.stores), server.budget_of(peer.pid)));
-        let outcomes = Outcomes::new(outlet.clone(), server.stores.config.mailbox_capacity);
+        let outcomes = {
+            let config = &server.stores.config;
+            Outcomes::new(outlet.clone(), config.mailbox_capacity, config.payload_max)
+        };
         server.add_client(peer.id, outlet.clone());
         server.stores.book.add_client(peer.id, app, &name, outlet.clone());
         if let Some(suppressed) = server.stores.log_quotas.clients.take(&name, Time::now()) {

@@ -368,7 +368,9 @@ impl<S: Socket> Half<S> {
         } else if confirmed && message.header.class == Class::Stream {
             // It may be superseded, and then there is no outcome that tells the truth.
             Err(Rejection::Unsupported)
-        } else if confirmed && bound == Bound::Kept && self.receipts.has_too_many(message.header.destination)
+        } else if let Some(destination) = owed_by(message)
+            && bound == Bound::Kept
+            && self.receipts.has_too_many(destination)
         {
             Err(Rejection::QueueFull)
         } else {
@@ -400,8 +402,7 @@ impl<S: Socket> Half<S> {
     /// What found no room is not refused: its sender keeps it.
     pub(super) fn is_offered_again(&mut self, message: &Message, room: Option<&Waker>, after: &mut After) {
         self.counts.refused -= 1;
-        let destination = message.header.destination;
-        if message.receipt.is_none() || !self.receipts.await_fewer(destination, room) {
+        if !owed_by(message).is_some_and(|destination| self.receipts.await_fewer(destination, room)) {
             after.room.extend(room.and_then(|room| self.queue.offered(message, room)));
         }
     }

@@ -128,6 +128,6 @@ fn share_of(message: &Message) -> Share {
     let window = Window { messages: 1, bytes: message.payload.len() };
     Share {
         for_lines: line_of(&message.header).map_or(NONE, |_| window),
-        outcomes: usize::from(message.header.kind == Kind::OUTCOME),
+        outcomes: usize::from(matches!(message.header.kind, Kind::OUTCOME | Kind::MEMBERS)),
     }
 }

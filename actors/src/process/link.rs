@@ -14,7 +14,7 @@ use std::{
 use sinew_runtime::{
     app::DynApp,
     mailbox::{Lender, Mailbox},
-    outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
+    outcome::{MemberReport, Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     router::{Outlet, Refused},
     sender::Sender,
     supervision::Launch,
@@ -383,7 +383,7 @@ impl Link {
                 said => said,
             };
         }
-        if kind.is_host() || kind == Kind::OUTCOME {
+        if kind.is_host() || matches!(kind, Kind::OUTCOME | Kind::MEMBERS) {
             // The child takes these for the node's own words.
             return Err(Refused::new(message, Rejection::UnknownKind));
         }
@@ -401,6 +401,14 @@ impl ReceiptSink for OutcomeSink {
         // Not taken: the child is gone, or does not read; its own deadline says `Unknown`. A later process of this TID
         // has other correlations.
         let _ = self.0.say(Message::outcome(ticket, outcome));
+    }
+
+    // spec: FRAME-7
+    fn members(&self, ticket: Ticket, reports: &[MemberReport]) {
+        for frame in Message::members(ticket, reports, self.0.payload_max) {
+            // Not taken: as above, of these members.
+            let _ = self.0.say(frame);
+        }
     }
 }
 

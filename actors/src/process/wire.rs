@@ -20,7 +20,7 @@ use rustix::{
 };
 use sinew_runtime::{
     mailbox::Source,
-    outcome::{Outcome, Ticket},
+    outcome::{MemberReport, Outcome, ReceiptSink as _, Ticket},
     pending::Pending,
     router::Router,
     sender::{Directory, Sender},
@@ -260,7 +260,10 @@ impl Wire {
         if header.flags.has(Flags::OUTCOME) {
             let ticket =
                 Ticket { source: self.tid, destination: header.source, correlation: header.correlation };
-            if let Some(outcome) = message.payload.first().and_then(|code| Outcome::from_code(*code)) {
+            if header.kind == Kind::MEMBERS {
+                let reports = MemberReport::decode(&message.payload).unwrap_or_default();
+                self.pending.members(ticket, &reports);
+            } else if let Some(outcome) = message.payload.first().and_then(|code| Outcome::from_code(*code)) {
                 self.outlet.confirm(ticket, outcome);
             }
         } else if header.flags.has(Flags::REPLY) {

@@ -62,6 +62,11 @@
 #define SINEW_TID_TEXT 32
 
 /**
+ * Members of one message to many, at most, that are told what became of it.
+ */
+#define SINEW_MEMBERS_MAX 4096
+
+/**
  * For `flags` of `sinew_field`: the field is an array; without `SINEW_FIELD_COUNTED` all of its elements are written and wanted.
  */
 #define SINEW_FIELD_ARRAY 1
@@ -340,6 +345,10 @@ enum sinew_outcome
      * Not handled: the access list of the destination's node does not allow it.
      */
     SINEW_REJECTED_NOT_ALLOWED = 27,
+    /**
+     * Not handled: a confirmed message to many has too many members or nodes, or too many of them are under way.
+     */
+    SINEW_REJECTED_TOO_MANY_MEMBERS = 28,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L
@@ -680,6 +689,24 @@ typedef struct sinew_message {
      */
     uint64_t token;
 } sinew_message;
+
+/**
+ * What became of a message to many at one of its members.
+ */
+typedef struct sinew_member_outcome {
+    /**
+     * The member. Where a node has not named its members: its node, and the application address that the message was sent to.
+     */
+    sinew_tid tid;
+    /**
+     * One of `sinew_outcome`.
+     */
+    int32_t outcome;
+    /**
+     * Zero.
+     */
+    uint32_t reserved;
+} sinew_member_outcome;
 
 /**
  * A message that was received. `bytes` is readable until it is settled; do not change the fields.
@@ -1189,6 +1216,21 @@ sinew_status sinew_send_message_confirmed(struct sinew_endpoint *endpoint,
                                           struct sinew_message *message,
                                           uint64_t within_ns,
                                           sinew_outcome *outcome);
+
+/**
+ * Sends a message to a group, to every application or to an address on all nodes, and waits for what becomes of it at each member that is
+ * known when the message arrives at its node, without this endpoint. Returns as soon as the last one is settled, and after `within_ns` at
+ * the latest: `SINEW_UNKNOWN` of a member without an outcome by then. The first `capacity` of them, in the order of their TIDs, are written
+ * to `members`, which may be NULL where that is 0; `*count` is the number of all, `SINEW_MEMBERS_MAX` at most, and 0 for a group without
+ * members. Both are set if this returns `SINEW_OK`. `SINEW_ERROR_NOT_HANDLED`: no member has a copy. All else is as with
+ * `sinew_send_message_confirmed`. The endpoint's thread.
+ */
+sinew_status sinew_send_message_confirmed_by_each(struct sinew_endpoint *endpoint,
+                                                  struct sinew_message *message,
+                                                  uint64_t within_ns,
+                                                  struct sinew_member_outcome *members,
+                                                  size_t capacity,
+                                                  size_t *count);
 
 /**
  * Sends a message as a request, in class Control, and waits for the reply, `within_ns` at most, room included. `*reply` is

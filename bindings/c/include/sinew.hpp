@@ -455,6 +455,25 @@ public:
         return confirm(filled(destination, what, value, SINEW_CONTROL), within);
     }
 
+    /// Sends a message to a group, to every application or to an address on all nodes, and waits for what becomes of it at each member;
+    /// SINEW_UNKNOWN of those that have no outcome in time. Empty for a group without members.
+    [[nodiscard]] std::vector<sinew_member_outcome> confirm_by_each(message &&made, duration within)
+    {
+        std::vector<sinew_member_outcome> members(SINEW_MEMBERS_MAX);
+        std::size_t count = 0;
+        detail::check(sinew_send_message_confirmed_by_each(raw_, &made.raw_, detail::nanoseconds(within), members.data(),
+                                                           members.size(), &count));
+        members.resize(count);
+        return members;
+    }
+    /// Sends a plain struct to many and waits for what becomes of it at each member.
+    template <class T>
+    [[nodiscard]] std::vector<sinew_member_outcome> confirm_by_each(tid destination, kind what, const T &value,
+                                                                    duration within)
+    {
+        return confirm_by_each(filled(destination, what, value, SINEW_CONTROL), within);
+    }
+
     /// Sends a request and waits for the reply.
     received ask(message &&made, duration within)
     {

@@ -33,7 +33,7 @@ use crate::{
     sending::{
         sinew_ask, sinew_create_message, sinew_discard_message, sinew_reply, sinew_reply_within,
         sinew_send_bytes, sinew_send_bytes_within, sinew_send_message, sinew_send_message_confirmed,
-        sinew_send_message_within,
+        sinew_send_message_confirmed_by_each, sinew_send_message_within,
     },
     text::Text,
     words::sinew_last_error,
@@ -257,6 +257,35 @@ impl Endpoint {
         done(sinew_send_message_confirmed(self.pointer(), message, within_ns, Some(&mut outcome)))?;
         // SAFETY: it was made with a value.
         Ok(unsafe { outcome.assume_init() })
+    }
+
+    /// `sinew_send_message_confirmed_by_each`: the TID and the outcome of each member.
+    ///
+    /// # Errors
+    /// What it says.
+    pub fn send_confirmed_by_each(
+        &mut self,
+        mut made: Made,
+        within_ns: u64,
+    ) -> Result<Vec<(u64, i32)>, Told> {
+        self.fill(&mut made);
+        const NONE: message::MemberOutcome = message::MemberOutcome { tid: 0, outcome: -1, reserved: 0 };
+        let mut members = [NONE; 8];
+        let mut count = MaybeUninit::new(0);
+        let (message, room) = (Some(&mut made.message.0), members.as_mut_ptr());
+        let (endpoint, capacity) = (self.pointer(), members.len());
+        let status = sinew_send_message_confirmed_by_each(
+            endpoint,
+            message,
+            within_ns,
+            room,
+            capacity,
+            Some(&mut count),
+        );
+        done(status)?;
+        // SAFETY: it was made with a value.
+        let count = unsafe { count.assume_init() };
+        Ok(members[..count].iter().map(|member| (member.tid, member.outcome)).collect())
     }
 
     /// `sinew_ask`.

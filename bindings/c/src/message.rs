@@ -103,6 +103,24 @@ pub struct Undelivered {
     pub name: [c_char; 64],
 }
 
+/// What became of a message to many at one of its members.
+#[derive(Clone, Copy, Debug)]
+#[repr(C)]
+pub struct MemberOutcome {
+    /// The member. Where a node has not named its members: its node, and the application address that the message was sent to.
+    pub tid: TidBits,
+    /// One of `sinew_outcome`.
+    pub outcome: i32,
+    /// Zero.
+    pub reserved: u32,
+}
+
+impl MemberOutcome {
+    pub(crate) fn of(member: &sinew::message::MemberOutcome) -> Self {
+        Self { tid: member.tid.bits(), outcome: i32::from(member.outcome.code()), reserved: 0 }
+    }
+}
+
 impl Message {
     /// What is left in the caller's memory when the library has taken the message.
     pub(crate) const GONE: Self = Self { bytes: std::ptr::null_mut(), length: 0, token: 0 };

@@ -6,7 +6,7 @@ use sinew::{Tid, message::Kind};
 
 use crate::{
     border::{call, present, write},
-    message::{Endpoint, KindBits, Message, Received, TidBits},
+    message::{Endpoint, KindBits, MemberOutcome, Message, Received, TidBits},
     registration::with,
     session::Session,
     status::{Fault, Status},
@@ -138,6 +138,45 @@ pub extern "C" fn sinew_send_message_confirmed(
             let taken = session.take(message)?;
             let outcome = present(outcome, "outcome")?;
             Ok(write(outcome, code_of(session.send_confirmed(taken, within)?)))
+        })
+    })
+}
+
+/// Members of one message to many, at most, that are told what became of it.
+pub const SINEW_MEMBERS_MAX: usize = 4_096;
+
+/// Sends a message to a group, to every application or to an address on all nodes, and waits for what becomes of it at each member that is
+/// known when the message arrives at its node, without this endpoint. Returns as soon as the last one is settled, and after `within_ns` at
+/// the latest: `SINEW_UNKNOWN` of a member without an outcome by then. The first `capacity` of them, in the order of their TIDs, are written
+/// to `members`, which may be NULL where that is 0; `*count` is the number of all, `SINEW_MEMBERS_MAX` at most, and 0 for a group without
+/// members. Both are set if this returns `SINEW_OK`. `SINEW_ERROR_NOT_HANDLED`: no member has a copy. All else is as with
+/// `sinew_send_message_confirmed`. The endpoint's thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_send_message_confirmed_by_each(
+    endpoint: *mut Endpoint,
+    message: Option<&mut Message>,
+    within_ns: u64,
+    members: *mut MemberOutcome,
+    capacity: usize,
+    count: Option<&mut MaybeUninit<usize>>,
+) -> Status {
+    call(|| {
+        let message = present(message, "message")?;
+        let within = Duration::from_nanos(within_ns);
+        with(endpoint, |session| {
+            // First: after any error behind this it is gone.
+            let taken = session.take(message)?;
+            let count = present(count, "count")?;
+            let capacity = capacity.min(SINEW_MEMBERS_MAX);
+            // SAFETY: the header asks of the caller that `capacity` members are there, for this call alone; any bytes are a `MaybeUninit`.
+            let room = unsafe { text::memory_mut(members.cast::<MaybeUninit<MemberOutcome>>(), capacity) };
+            let room =
+                room.ok_or_else(|| Fault::argument("`members` is NULL, but has a capacity".to_owned()))?;
+            let outcomes = session.send_confirmed_by_each(taken, within)?;
+            for (place, member) in room.iter_mut().zip(&outcomes) {
+                place.write(MemberOutcome::of(member));
+            }
+            Ok(write(count, outcomes.len()))
         })
     })
 }

@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, ffi::CString, time::Duration};
 use sinew::{
     Class, NodeAddress, Outcome, Tid, Time,
     client::{ApiError, LoanedMessage},
-    message::Kind,
+    message::{Kind, MemberOutcome},
     protection::{
         SealError,
         raw::{ECHO, Judged},
@@ -128,6 +128,14 @@ impl Session {
         within: Duration,
     ) -> Result<Outcome, Fault> {
         Ok(self.endpoint.loaned(buffer).confirmed(within)?)
+    }
+
+    pub(crate) fn send_confirmed_by_each(
+        &mut self,
+        buffer: LoanedMessage,
+        within: Duration,
+    ) -> Result<Vec<MemberOutcome>, Fault> {
+        Ok(self.endpoint.loaned(buffer).confirmed_by_each(within)?)
     }
 
     /// Asks; what became of the request, too, if it was not handled.

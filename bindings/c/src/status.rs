@@ -229,9 +229,10 @@ impl From<ApiError> for Fault {
             ApiError::OthersRequest(_) => Status::SinewErrorNoSuchMessage,
             ApiError::LoanActive => Status::SinewErrorLoanActive,
             // C sends to TIDs, and no payloads whose types Rust knows: the last two do not come here.
-            ApiError::NotYours(_) | ApiError::NotSealed(_) | ApiError::UnknownName(_) => {
-                Status::SinewErrorInvalidArgument
-            }
+            ApiError::NotYours(_)
+            | ApiError::ToMany(_)
+            | ApiError::NotSealed(_)
+            | ApiError::UnknownName(_) => Status::SinewErrorInvalidArgument,
         };
         Self::new(status, sentence)
     }
@@ -253,6 +254,10 @@ fn in_c(error: &ApiError) -> String {
                            sinew_send_message or sinew_discard_message first"
                 .to_owned()
         }
+        ApiError::ToMany(tid) => format!(
+            "{tid} is more than one application, so that the message has an outcome for each; send it with \
+             sinew_send_message_confirmed_by_each"
+        ),
         ApiError::Ended(outcome) => text_of(*outcome).to_string_lossy().into_owned(),
         ApiError::Disconnected(why) => format!(
             "the connection to the node has ended: {why}; the endpoint registers again by itself, go on with \

@@ -45,6 +45,8 @@ pub enum Outcome {
     SinewRejectedDown = 26,
     /// Not handled: the access list of the destination's node does not allow it.
     SinewRejectedNotAllowed = 27,
+    /// Not handled: a confirmed message to many has too many members or nodes, or too many of them are under way.
+    SinewRejectedTooManyMembers = 28,
 }
 
 /// A text for a status: what it means in general. Never NULL. Any thread.
@@ -90,6 +92,7 @@ pub(crate) const fn code_of(outcome: sinew::Outcome) -> Outcome {
             Rejection::Unsupported => Outcome::SinewRejectedUnsupported,
             Rejection::Down => Outcome::SinewRejectedDown,
             Rejection::NotAllowed => Outcome::SinewRejectedNotAllowed,
+            Rejection::TooManyMembers => Outcome::SinewRejectedTooManyMembers,
         },
     }
 }
@@ -123,6 +126,7 @@ pub(crate) const fn text_of(outcome: sinew::Outcome) -> &'static CStr {
         Outcome::SinewRejectedNotAllowed => {
             c"not handled: the access list of the destination's node does not allow it"
         }
+        Outcome::SinewRejectedTooManyMembers => c"not handled: a confirmed message reaches at most 256 members of a group on one node, and 256 other nodes, and an application has 64 of them under way; send it to smaller groups, or unconfirmed",
     }
 }
 
@@ -133,7 +137,7 @@ mod tests {
     #[test]
     fn every_outcome_has_the_number_that_it_has_on_the_wire() {
         let outcomes: Vec<_> = (0..=i32::from(u8::MAX)).filter_map(outcome_of).collect();
-        assert_eq!(outcomes.len(), 17);
+        assert_eq!(outcomes.len(), 18);
         for outcome in outcomes {
             assert_eq!(code_of(outcome) as i32, i32::from(outcome.code()), "{outcome:?}");
         }

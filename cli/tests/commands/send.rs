@@ -2,8 +2,14 @@
 
 use std::time::Duration;
 
+use rustix::process::Signal;
 use serde_json::{Value, json};
-use sinew::{NodeApi, Outcome, Registration, Tid, message::Kind};
+use sinew::{
+    Endpoint, NodeApi, Outcome, Registration, Tid,
+    client::Received,
+    message::{Kind, Rejection},
+};
+use sinew_tests::until;
 
 use crate::scenario::{Scenario, named};
 
@@ -107,4 +113,64 @@ fn what_is_sent_to_an_application_that_waits_to_be_started_is_a_finding_that_say
     let said = answer.out + &answer.err;
     assert!(answer.code == Some(1) && said.contains("it is not ready: has waited "), "{said}");
     assert!(said.contains("ankle (not there)"), "{said}");
+}
+
+#[test]
+fn of_a_group_each_member_has_a_line_who_took_it_who_does_not_handle_it_and_who_was_on_a_node_that_was_killed()
+ {
+    // Given: three nodes, each with a member in a process of its own
+    let scenario = Scenario::new();
+    let _nodes = [scenario.start("hip", 1, &[]), scenario.start("knee", 2, &[])];
+    let mut shank = scenario.start("shank", 3, &[]);
+    let join = |node: &str| {
+        let api = NodeApi::connect(scenario.socket(node)).expect("its socket");
+        let name = format!("{node}.drive");
+        let mut drive =
+            api.register_transport_address(Registration::new().name(&name)).expect("it is registered");
+        drive.join("drives").expect("it is in few groups");
+        drive
+    };
+    let (mut takes, mut refuses, mut hangs) = (join("hip"), join("knee"), join("shank"));
+    let tids = [&takes, &refuses, &hangs].map(|drive| drive.tid().to_string());
+    let api = NodeApi::connect(scenario.socket("hip")).expect("its socket");
+    let mut asker = api.register_transport_address(Registration::new()).expect("it is registered");
+    until("the hip knows that all three nodes have members", || {
+        let look =
+            asker.create_message(Tid::group("drives"), Kind::named("test.look"), 0).expect("there is room");
+        let members = asker.loaned(look).confirmed_by_each(Duration::from_millis(1));
+        (members.expect("it is sent").len() == 3).then_some(())
+    });
+    // When: each takes its copy, and the node of the third is killed while that has it in hand
+    let handling = std::thread::spawn(move || {
+        copy_for(&mut takes).settle(Outcome::Delivered);
+        copy_for(&mut refuses).settle(Outcome::Rejected(Rejection::UnknownKind));
+        let in_hand = copy_for(&mut hangs);
+        shank.signal(Signal::KILL);
+        shank.wait_for_end();
+        drop(in_hand);
+        (takes, refuses)
+    });
+    let words = ["send", "drives", "test.stop", "--within", "30000"];
+    let answer = scenario.sinew("hip", &words);
+    let _members = handling.join().expect("all have a copy");
+    // Then
+    let said = format!("{}{}", answer.out, answer.err);
+    let lines: Vec<_> = answer.out.lines().collect();
+    assert!(answer.code == Some(1) && lines.len() == 4, "{said}");
+    assert!(lines[0].contains("delivered to 1 of 3 members"), "{said}");
+    assert_eq!(lines[1], format!("hip.drive ({}): Delivered", tids[0]));
+    let refused = format!("knee.drive ({}): Rejected(UnknownKind): ", tids[1]);
+    assert!(lines[2].starts_with(&refused), "{said}");
+    assert!(lines[3].starts_with(&format!("{}: Unknown: ", tids[2])), "{said}");
+}
+
+/// What comes for `drive` but for looks.
+fn copy_for(drive: &mut Endpoint) -> Received {
+    let stop = Kind::named("test.stop");
+    loop {
+        let received = drive.receive(Duration::from_secs(60)).expect("its node lives").expect("its copy");
+        if received.kind() == stop {
+            return received;
+        }
+    }
 }

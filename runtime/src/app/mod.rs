@@ -20,5 +20,5 @@ pub use required::{
     ALTERNATIVES_MAX, REQUIREMENT_BYTES_MAX, Requirement, RequirementError, is_pattern, is_phase, matches,
 };
 pub use requirement::{RequirementEvent, RequirementPolicy};
-pub use send_outcome::{SendOutcome, Tagged};
+pub use send_outcome::{GroupOutcome, SendOutcome, Tagged};
 pub use spec::{AppSpec, AppWiring, DynApp};

@@ -6,8 +6,8 @@ use actix::{Actor, ActorFutureExt, AsyncContext, Handler, Message, fut};
 
 use super::AppContext;
 use crate::{
-    outcome::Outcome,
-    sender::{Confirmation, Content, MessageBuilder, SendError, Sender, Via},
+    outcome::{MemberOutcome, Outcome},
+    sender::{Confirmation, Content, GroupConfirmation, MessageBuilder, SendError, Sender, Via},
 };
 
 /// What became of a message that was sent with [`MessageBuilder::with_tag`].
@@ -20,6 +20,19 @@ pub struct SendOutcome {
 }
 
 impl Message for SendOutcome {
+    type Result = ();
+}
+
+/// What became of a message to many that was sent with [`MessageBuilder::with_tag`], at each of its members.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct GroupOutcome {
+    /// The number that its sender gave it.
+    pub tag: u64,
+    /// One for each member, in the order of their TIDs.
+    pub members: Vec<MemberOutcome>,
+}
+
+impl Message for GroupOutcome {
     type Result = ();
 }
 
@@ -39,12 +52,21 @@ impl<'a, A: Actor<Context = AppContext<A>>, C: Content> MessageBuilder<&'a mut A
     /// Sends it, and asks what becomes of it: see [`Confirmation`] and [`Sender::message`].
     ///
     /// # Errors
-    /// No queue and no socket took it, or it is of class Stream.
+    /// No queue and no socket took it, it is of class Stream, or it is for more than one application ([`SendError::ToMany`]).
     pub fn confirmed(self, within: Duration) -> Result<Confirmation, SendError> {
         self.confirm(within).map(|(_, confirmation)| confirmation)
     }
 
-    /// Has its outcome come to this actor as a [`SendOutcome`] with `tag`, instead of as a future.
+    /// Sends it to many, and asks what becomes of it at each member: see [`MessageBuilder::confirmed_by_each`] of a [`Sender`], which this is
+    /// for an actor.
+    ///
+    /// # Errors
+    /// It is of class Stream, its node is not known, or it has too many members.
+    pub fn confirmed_by_each(self, within: Duration) -> Result<GroupConfirmation, SendError> {
+        self.confirm_by_each(within).map(|(_, confirmation)| confirmation)
+    }
+
+    /// Has its outcome come to this actor as a [`SendOutcome`] with `tag`, or as a [`GroupOutcome`], instead of as a future.
     pub fn with_tag(self, tag: u64) -> MessageBuilder<Tagged<'a, A>, C> {
         let Self { via, content, terms } = self;
         MessageBuilder { via: Tagged { context: via, tag }, content, terms }
@@ -59,11 +81,58 @@ where
     /// application does not get it.
     ///
     /// # Errors
-    /// No queue and no socket took it, or it is of class Stream; no `SendOutcome` comes.
+    /// No queue and no socket took it, it is of class Stream, or it is for more than one application; no `SendOutcome` comes.
     pub fn confirmed(self, within: Duration) -> Result<(), SendError> {
         let (Tagged { context, tag }, confirmation) = self.confirm(within)?;
         let handled = fut::wrap_future::<_, A>(confirmation)
             .map(move |outcome, actor, context| actor.handle(SendOutcome { tag, outcome }, context));
+        context.spawn(handled);
+        Ok(())
+    }
+}
+
+impl<A, C: Content> MessageBuilder<Tagged<'_, A>, C>
+where
+    A: Actor<Context = AppContext<A>> + Handler<GroupOutcome, Result = ()>,
+{
+    /// Sends it to many; what becomes of it at each member comes to this actor as a [`GroupOutcome`], once, in a turn of its own: when the last
+    /// member is settled, and at the latest `within` this time. The next life of the application does not get it.
+    ///
+    /// ```
+    /// use std::time::Duration;
+    /// use actix::{Actor, Handler};
+    /// use sinew_runtime::{
+    ///     app::{AppContext, GroupOutcome}, outcome::Outcome, sender::SendError, tid::Tid, wire::Payload,
+    /// };
+    ///
+    /// struct Brain;
+    ///
+    /// impl Actor for Brain {
+    ///     type Context = AppContext<Self>;
+    /// }
+    ///
+    /// impl Handler<GroupOutcome> for Brain {
+    ///     type Result = ();
+    ///
+    ///     fn handle(&mut self, told: GroupOutcome, _: &mut AppContext<Self>) {
+    ///         for member in told.members.iter().filter(|member| member.outcome != Outcome::Delivered) {
+    ///             println!("{} did not stop: {:?}", member.tid, member.outcome);
+    ///         }
+    ///     }
+    /// }
+    ///
+    /// fn stop<P: Payload>(stop: &P, context: &mut AppContext<Brain>) -> Result<(), SendError> {
+    ///     let drives = Tid::group("drives");
+    ///     context.message(drives, stop).with_tag(1).confirmed_by_each(Duration::from_millis(50))
+    /// }
+    /// ```
+    ///
+    /// # Errors
+    /// It is of class Stream, its node is not known, or it has too many members; no `GroupOutcome` comes.
+    pub fn confirmed_by_each(self, within: Duration) -> Result<(), SendError> {
+        let (Tagged { context, tag }, confirmation) = self.confirm_by_each(within)?;
+        let handled = fut::wrap_future::<_, A>(confirmation)
+            .map(move |members, actor, context| actor.handle(GroupOutcome { tag, members }, context));
         context.spawn(handled);
         Ok(())
     }

@@ -10,7 +10,7 @@ use std::{
 
 use super::{AskError, clock};
 use crate::{
-    outcome::{Outcome, Ticket},
+    outcome::{MemberOutcome, Outcome, Ticket},
     pending::{Settlement, Wait},
     router::Router,
     time::Time,
@@ -83,6 +83,30 @@ impl Future for Confirmation {
             Some(Settlement::Outcome(outcome)) => outcome,
             Some(Settlement::Reply(_)) | None => Outcome::Unknown,
         })
+    }
+}
+
+/// The future outcomes of a confirmed message to many, one for each member, in the order of their TIDs. Any thread may poll it, with any
+/// executor; in a runtime of tokio's, one whose time is enabled.
+#[derive(Debug)]
+#[must_use = "outcomes that nobody reads are no better than an unconfirmed send"]
+pub struct GroupConfirmation(Deadline);
+
+impl GroupConfirmation {
+    pub(super) const fn new(deadline: Deadline) -> Self {
+        Self(deadline)
+    }
+}
+
+impl Future for GroupConfirmation {
+    type Output = Vec<MemberOutcome>;
+
+    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Vec<MemberOutcome>> {
+        let last = match ready!(self.0.poll(cx)) {
+            Some(Settlement::Outcome(outcome)) => Some(outcome),
+            Some(Settlement::Reply(_)) | None => None,
+        };
+        Poll::Ready(self.0.wait.members(last))
     }
 }
 

@@ -3,18 +3,20 @@
 use std::{fmt, time::Duration};
 
 use super::{
-    Confirmation, Destination, Reply, SendError, Sender,
+    Confirmation, Destination, GroupConfirmation, Reply, SendError, Sender,
     awaiting::{Deadline, Request},
 };
 use crate::{
     outcome::{Rejection, Ticket},
     pending::Awaited,
+    tid::{AppAddress, Tid},
     wire::{Class, Flags, Message, MessageBuffer, Payload},
 };
 
 /// A message to be sent: made by [`Sender::message`], [`AppContext::message`](crate::app::AppContext::message) or [`Sender::loaned`].
 ///
-/// What it does not say is as its type says. It is sent by [`send`](Self::send), [`confirmed`](Self::confirmed) or [`ask`](Self::ask), and not before.
+/// What it does not say is as its type says. It is sent by [`send`](Self::send), [`confirmed`](Self::confirmed),
+/// [`confirmed_by_each`](Self::confirmed_by_each) or [`ask`](Self::ask), and not before.
 ///
 /// ```
 /// # use std::time::Duration;
@@ -23,7 +25,7 @@ use crate::{
 /// sender.message(drive, setpoint).expires_after(Duration::from_millis(20)).send()
 /// # }
 /// ```
-#[must_use = "a message is sent by `send`, `confirmed` or `ask`"]
+#[must_use = "a message is sent by `send`, `confirmed`, `confirmed_by_each` or `ask`"]
 pub struct MessageBuilder<V, C> {
     pub(crate) via: V,
     pub(crate) content: C,
@@ -132,15 +134,32 @@ impl<V: Via, C: Content> MessageBuilder<V, C> {
     }
 
     pub(crate) fn confirm(self, within: Duration) -> Result<(V, Confirmation), SendError> {
-        let (via, mut message) = self.message()?;
+        let (via, mut message) = self.confirmable()?;
+        let sender = via.sender();
+        let destination = sender.absolute(message.header.destination);
+        if is_many(destination) {
+            return Err(SendError::ToMany(destination));
+        }
+        let (wait, within) = sender.expect_answer(&mut message, Awaited::Outcome, within)?;
+        let sent = sender.dispatch(message)?;
+        Ok((via, Confirmation::new(Deadline::new(wait, sent + within))))
+    }
+
+    pub(crate) fn confirm_by_each(self, within: Duration) -> Result<(V, GroupConfirmation), SendError> {
+        let (via, mut message) = self.confirmable()?;
+        let sender = via.sender();
+        let (wait, within) = sender.expect_each(&mut message, within)?;
+        let sent = sender.dispatch(message)?;
+        Ok((via, GroupConfirmation::new(Deadline::new(wait, sent + within))))
+    }
+
+    fn confirmable(self) -> Result<(V, Message), SendError> {
+        let (via, message) = self.message()?;
         if message.header.class == Class::Stream {
             // Newest wins, so an older one has no fate of its own.
             return Err(Rejection::Unsupported.into());
         }
-        let sender = via.sender();
-        let (wait, within) = sender.expect_answer(&mut message, Awaited::Outcome, within)?;
-        let sent = sender.dispatch(message)?;
-        Ok((via, Confirmation::new(Deadline::new(wait, sent + within))))
+        Ok((via, message))
     }
 
     /// Sends it as a request, in class Control; the returned future ends with the reply, an error, or at the deadline. A longer `within` than
@@ -170,8 +189,40 @@ impl<C: Content> MessageBuilder<&Sender, C> {
     /// [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s: a longer `within` counts as that.
     ///
     /// # Errors
-    /// No queue and no socket took it, or it is of class Stream.
+    /// No queue and no socket took it, it is of class Stream, or it is for more than one application ([`SendError::ToMany`]).
     pub fn confirmed(self, within: Duration) -> Result<Confirmation, SendError> {
         self.confirm(within).map(|(_, confirmation)| confirmation)
     }
+
+    /// Sends it to a group, to every application ([`Tid::BROADCAST`]) or to an address on all nodes, and asks what becomes of it at each member.
+    /// The returned future ends with one [`MemberOutcome`](crate::outcome::MemberOutcome) for each member that is known when the message
+    /// arrives at its node, without the sender: as soon as the last one is settled, and at the latest `within` this time. A member that has
+    /// no outcome by then has [`Outcome::Unknown`](crate::outcome::Outcome::Unknown), as have all members of a node that is lost. A node that
+    /// has not named its members has one entry for them. A group without members gives an empty list.
+    ///
+    /// At most 256 members of one node and 256 other nodes are reached, and an application has 64 such messages to other nodes under way.
+    ///
+    /// ```
+    /// use std::time::Duration;
+    /// use sinew_runtime::{outcome::Outcome, sender::{SendError, Sender}, tid::{NodeAddress, Tid}, wire::Payload};
+    ///
+    /// /// Stops all drives; returns those that may still move.
+    /// async fn stop<P: Payload>(sender: &Sender, stop: &P) -> Result<Vec<Tid>, SendError> {
+    ///     let within = Duration::from_millis(50);
+    ///     let drives = sender.message(Tid::group("drives"), stop).confirmed_by_each(within)?.await;
+    ///     let failed = drives.into_iter().filter(|drive| drive.outcome != Outcome::Delivered);
+    ///     Ok(failed.map(|drive| drive.tid).collect())
+    /// }
+    /// ```
+    ///
+    /// # Errors
+    /// It is of class Stream, its node is not known, or it has too many members.
+    pub fn confirmed_by_each(self, within: Duration) -> Result<GroupConfirmation, SendError> {
+        self.confirm_by_each(within).map(|(_, confirmation)| confirmation)
+    }
+}
+
+/// Whether a message to `destination` has an outcome for each of several.
+fn is_many(destination: Tid) -> bool {
+    !destination.is_single() && destination.app != AppAddress::NONE
 }

@@ -29,6 +29,8 @@ impl Kind {
     pub const OUTCOME: Self = Self(1);
     /// Nobody waits any more for the reply to the request that its correlation names.
     pub const CANCEL: Self = Self(2);
+    /// Reports about the members of a confirmed message to many: see [`MemberReport`](crate::outcome::MemberReport).
+    pub const MEMBERS: Self = Self(3);
     /// First frame of a connection between nodes.
     pub const GNCL_HELLO: Self = Self(0x10);
     /// Answer to a hello that is accepted.

@@ -9,7 +9,7 @@ use bytes::{Bytes, BytesMut};
 use serde::{Serialize, de::DeserializeOwned};
 
 use crate::{
-    outcome::{Outcome, Receipt, Rejection, Ticket},
+    outcome::{MemberReport, Outcome, Receipt, Rejection, Ticket},
     protection::Protection,
     tid::Tid,
     wire::{Class, Flags, Header, Kind, memory, read::decode_payload, remember},
@@ -84,6 +84,21 @@ impl Message {
         header.flags = Flags::OUTCOME;
         header.correlation = ticket.correlation;
         Self::new(header, code_of(outcome))
+    }
+
+    /// Reports about the members of the message to many that `ticket` names, in frames with payloads of at most `payload_max` bytes, or one
+    /// report. spec: FRAME-7
+    pub fn members(
+        ticket: Ticket,
+        reports: &[MemberReport],
+        payload_max: usize,
+    ) -> impl Iterator<Item = Self> {
+        reports.chunks(MemberReport::in_payload(payload_max)).map(move |reports| {
+            let mut header = Header::new(Kind::MEMBERS, ticket.destination, ticket.source);
+            header.flags = Flags::OUTCOME;
+            header.correlation = ticket.correlation;
+            Self::new(header, MemberReport::encode(reports).into())
+        })
     }
 
     /// Says to whoever was asked that nobody waits any more for the reply to the request that `ticket` names.

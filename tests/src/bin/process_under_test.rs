@@ -21,6 +21,7 @@ use std::{
 use rustix::process::{Signal, getpid, kill_process};
 use sinew::{
     NodeHandle,
+    app::GroupOutcome,
     audit::{Account, Place},
     prelude::*,
     supervision::ReadyGate,
@@ -196,6 +197,7 @@ impl Handler<Delivery<Order>> for Drive {
                 let sent = context.send(Tid::from_bits(tid), &Count { number: 1 });
                 say(&format!("sent: {sent:?}"));
             }
+            Order::SendToGroup(group) => send_to_group(context, &group),
             Order::Ask(whom) => ask(context, &whom),
             Order::Echo(ref to, _) => {
                 if let Err(error) = context.send(&**to, &order.payload) {
@@ -256,6 +258,23 @@ fn send(context: &mut AppContext<Drive>, to: &str, number: u64) {
             context.spawn(wait);
         }
         Err(error) => say(&format!("not sent {number}: {error}")),
+    }
+}
+
+fn send_to_group(context: &mut AppContext<Drive>, group: &str) {
+    let within = Duration::from_secs(10);
+    let message = context.message(Tid::group(group), &Count { number: 1 });
+    if let Err(error) = message.with_tag(1).confirmed_by_each(within) {
+        say(&format!("not sent to {group}: {error}"));
+    }
+}
+
+impl Handler<GroupOutcome> for Drive {
+    type Result = ();
+
+    fn handle(&mut self, told: GroupOutcome, _: &mut AppContext<Self>) {
+        let members = told.members.iter().map(|member| format!("{}: {:?}", member.tid, member.outcome));
+        say(&format!("group {}: {}", told.tag, members.collect::<Vec<_>>().join(", ")));
     }
 }
 

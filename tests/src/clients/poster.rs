@@ -220,6 +220,7 @@ impl Letters {
             | ApiError::NoReply(_)
             | ApiError::LoanActive
             | ApiError::NotYours(_)
+            | ApiError::ToMany(_)
             | ApiError::UnknownName(_)
             | ApiError::NotAsked
             | ApiError::OthersRequest(_)

@@ -11,6 +11,7 @@ use sinew::{
 use sinew_tests::{
     DEADLINE,
     orders::{Count, Level, Me, Order, Who},
+    until,
 };
 
 use crate::scenario::Scenario;
@@ -33,6 +34,7 @@ in_every_place! {
     an_application_that_stops_ramps_down_and_is_started_again
     it_sends_with_known_outcomes_and_asks
     it_is_a_member_of_a_group_until_it_leaves_and_across_restarts
+    it_hears_the_outcome_of_each_member_of_a_group_and_is_one_itself
     an_input_that_goes_silent_is_noticed
     a_lost_requirement_is_told_and_its_name_resolves_anew
     it_pauses_until_what_it_requires_is_back_whatever_waits
@@ -195,6 +197,37 @@ fn it_is_a_member_of_a_group_until_it_leaves_and_across_restarts(place: &str) {
     scenario.endpoint.send(scenario.drive, &Level { value: 4 }).expect("the node takes it");
     scenario.node.wait_for(&["level 4"]);
     assert!(scenario.node.said().iter().all(|line| !line.contains("level 3")));
+}
+
+fn it_hears_the_outcome_of_each_member_of_a_group_and_is_one_itself(place: &str) {
+    let mut scenario = start(place);
+    // Nobody is in it.
+    scenario.order(Order::SendToGroup("drives".to_owned()));
+    scenario.node.wait_for(&["group 1: "]);
+    // Two in other processes: the one takes it, and the other does not handle it.
+    let register = || {
+        let member = scenario.api.register_transport_address(Registration::new());
+        let mut member = member.expect("the node takes it");
+        member.join("drives").expect("it is in few groups");
+        member
+    };
+    let (mut takes, mut refuses) = (register(), register());
+    scenario.order(Order::SendToGroup("drives".to_owned()));
+    takes.receive(DEADLINE).expect("the node is there").expect("a number").settle(Outcome::Delivered);
+    let refused = Outcome::Rejected(Rejection::UnknownKind);
+    refuses.receive(DEADLINE).expect("the node is there").expect("a number").settle(refused);
+    let told = format!("group 1: {}: Delivered, {}: Rejected(UnknownKind)", takes.tid(), refuses.tid());
+    scenario.node.wait_for(&[&told]);
+    // And: what is sent to its group has its outcome, too
+    takes.leave("drives").expect("it was in it");
+    assert_eq!(scenario.order_confirmed(Order::Join("drives".to_owned())), Outcome::Delivered);
+    let (drive, count) = (scenario.drive, Count { number: 2 });
+    let list = until("both are members", || {
+        let sent = takes.message(Tid::group("drives"), &count).confirmed_by_each(Duration::from_millis(500));
+        Some(sent.expect("it is sent")).filter(|list| list.len() == 2)
+    });
+    let entry = list.iter().find(|member| member.tid == drive).expect("it is a member");
+    assert_eq!(entry.outcome, Outcome::Delivered);
 }
 
 fn an_input_that_goes_silent_is_noticed(place: &str) {

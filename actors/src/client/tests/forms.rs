@@ -11,7 +11,7 @@ use std::{
 
 use sinew_c::conformance::{InHand, Made};
 use sinew_runtime::{
-    outcome::Outcome,
+    outcome::{MemberOutcome, Outcome},
     tid::Tid,
     time::Time,
     undelivered::Undelivered,
@@ -287,6 +287,11 @@ impl<P: Payload> Sending<'_, &P> {
     pub(super) fn confirmed(self, within: Duration) -> Result<Outcome, ApiError> {
         let (to, value) = (self.to, self.content);
         either!(self.client, endpoint => endpoint.message(to, value).confirmed(within), endpoint.confirm(to, value, within))
+    }
+
+    pub(super) fn confirmed_by_each(self, within: Duration) -> Result<Vec<MemberOutcome>, ApiError> {
+        let (to, value) = (self.to, self.content);
+        either!(self.client, endpoint => endpoint.message(to, value).confirmed_by_each(within), endpoint.confirm_by_each(to, value, within))
     }
 
     pub(super) fn ask<R: Payload>(self, within: Duration) -> Result<R, ApiError> {

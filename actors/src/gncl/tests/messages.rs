@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use sinew_runtime::{
-    outcome::{Outcome, Rejection},
+    outcome::{MemberReport, MemberState, Outcome, Rejection},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
     wire::{Class, Flags, Kind, Message},
@@ -75,7 +75,7 @@ fn a_message_for_another_node_is_not_carried_on() {
 }
 
 #[test]
-fn a_broadcast_reaches_every_application_and_cannot_be_confirmed() {
+fn a_broadcast_reaches_every_application_and_is_confirmed_by_each() {
     run(async {
         let mut node = Node::start(1).await;
         let mut peer = ByHand::linked_to(&mut node).await;
@@ -87,8 +87,32 @@ fn a_broadcast_reaches_every_application_and_cannot_be_confirmed() {
             assert_eq!(&next("the broadcast", inbox).await.payload[..], b"all");
         }
         broadcast.header.flags = Flags::CONFIRM;
+        broadcast.header.correlation = 7;
         peer.say(&broadcast).await;
-        assert_eq!(peer.hear().await.payload[..], [Outcome::Rejected(Rejection::Unsupported).code()]);
+        // spec: GNCL-12: who has a copy, each one's outcome, and that these are all
+        let here = node.stores.node;
+        let members = [1, 2].map(|number| Tid::new(here, AppAddress::new(0x1000 + number)));
+        let mut said = vec![peer.hear().await];
+        for inbox in &mut inboxes {
+            let mut message = next("the confirmed one", inbox).await;
+            assert_eq!(message.header.destination, Tid::BROADCAST);
+            message.settle(Outcome::Delivered);
+        }
+        for _ in 0..3 {
+            said.push(peer.hear().await);
+        }
+        assert!(said.iter().all(|frame| frame.header.source == Tid::new(here, AppAddress::ALL)));
+        assert!(
+            said.iter().all(|frame| frame.header.correlation == 7 && frame.header.flags.has(Flags::OUTCOME))
+        );
+        let last = said.pop().expect("there are four");
+        assert_eq!((last.header.kind, &last.payload[..]), (Kind::OUTCOME, &[Outcome::Delivered.code()][..]));
+        let reports: Vec<_> =
+            said.iter().flat_map(|frame| MemberReport::decode(&frame.payload).expect("reports")).collect();
+        let of = |state| members.map(|tid| MemberReport::of_member(tid, state));
+        let listed = MemberReport::of_node(here, MemberState::Listed);
+        let settled = of(MemberState::Settled(Outcome::Delivered));
+        assert_eq!(reports, [&of(MemberState::Pending)[..], &[listed], &settled].concat());
     });
 }
 

@@ -13,7 +13,7 @@ use std::{
 };
 
 use sinew_runtime::{
-    outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
+    outcome::{MemberReport, Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     router::Outlet,
     wire::Message,
 };
@@ -33,16 +33,18 @@ pub(super) struct Outcomes {
     pending_max: usize,
     /// Outcomes that wait ahead of its queue while it is read.
     waiting_max: usize,
+    payload_max: usize,
     /// Whether some may: to count them takes a lock, which others hold while they write to the client.
     may_wait: AtomicBool,
 }
 
 impl Outcomes {
-    /// Of a client whose queue holds so many messages of a class.
-    pub(super) fn new(outlet: Arc<ClientOutlet>, queue_capacity: usize) -> Arc<Self> {
+    /// Of a client whose queue holds so many messages of a class, with payloads of so many bytes at most.
+    pub(super) fn new(outlet: Arc<ClientOutlet>, queue_capacity: usize, payload_max: usize) -> Arc<Self> {
         let pending_max = PENDING_QUEUES * queue_capacity;
         let (pending, may_wait) = (AtomicUsize::new(0), AtomicBool::new(false));
-        Arc::new(Self { outlet, pending, pending_max, waiting_max: queue_capacity, may_wait })
+        let waiting_max = queue_capacity;
+        Arc::new(Self { outlet, pending, pending_max, waiting_max, payload_max, may_wait })
     }
 
     /// The receipt of a message of the client's; `None` if too many are without an outcome, which is told to it.
@@ -100,5 +102,10 @@ impl ReceiptSink for Outcomes {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
         self.pending.fetch_sub(1, Ordering::Relaxed);
         self.tell(ticket, outcome);
+    }
+
+    // spec: FRAME-7
+    fn members(&self, ticket: Ticket, reports: &[MemberReport]) {
+        Message::members(ticket, reports, self.payload_max).for_each(|frame| self.answer(frame));
     }
 }

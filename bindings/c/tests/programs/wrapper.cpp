@@ -154,7 +154,19 @@ static void groups_and_names(const char *socket)
     member.join("drives");
     sender.send(sinew::group("drives"), what, pair{3, 4});
     EXPECT(member.receive(20s)->destination() == sinew::group("drives"));
+    try {
+        (void)sender.confirm(sinew::group("drives"), what, pair{3, 4}, 20s);
+        EXPECT(false);
+    } catch (const sinew::error &error) {
+        EXPECT(error.status() == SINEW_ERROR_INVALID_ARGUMENT);
+        EXPECT(std::string(error.what()).find("sinew_send_message_confirmed_by_each") != std::string::npos);
+    }
+    std::thread taking([&] { EXPECT(member.receive(20s)); });
+    const auto told = sender.confirm_by_each(sinew::group("drives"), what, pair{3, 4}, 20s);
+    taking.join();
+    EXPECT(told.size() == 1 && told[0].tid == member.address() && told[0].outcome == SINEW_DELIVERED);
     member.leave("drives");
+    EXPECT(sender.confirm_by_each(sinew::group("drives"), what, pair{3, 4}, 20s).empty());
     member.unregister();
     EXPECT(!sender.resolve("member", 10s));
     EXPECT(member.address() == 0);

@@ -24,7 +24,7 @@ use sinew_c::conformance::{
     Status, Told,
 };
 use sinew_runtime::{
-    outcome::Outcome,
+    outcome::{MemberOutcome, Outcome},
     tid::{AppAddress, Tid},
     time::Time,
     undelivered::Undelivered,
@@ -262,7 +262,28 @@ impl Client {
         within: Duration,
     ) -> Result<Outcome, ApiError> {
         let made = self.made(to, value)?;
-        self.confirm_message(made, within)
+        match self.endpoint.send_confirmed(made, nanos(within)) {
+            Err(told) if told.status == Status::SinewErrorInvalidArgument && !to.is_single() => {
+                assert!(told.sentence.contains("sinew_send_message_confirmed_by_each"), "{told:?}");
+                Err(ApiError::ToMany(to))
+            }
+            sent => self.heard(sent).map(outcome_of),
+        }
+    }
+
+    pub(super) fn confirm_by_each<P: Payload>(
+        &mut self,
+        to: Tid,
+        value: &P,
+        within: Duration,
+    ) -> Result<Vec<MemberOutcome>, ApiError> {
+        let made = self.made(to, value)?;
+        let sent = self.endpoint.send_confirmed_by_each(made, nanos(within));
+        let of = |(tid, code): (u64, i32)| MemberOutcome {
+            tid: Tid::from_bits(tid),
+            outcome: u8::try_from(code).ok().and_then(Outcome::from_code).expect("an outcome"),
+        };
+        self.heard(sent).map(|members| members.into_iter().map(of).collect())
     }
 
     pub(super) fn ask_message(&mut self, made: Made, within: Duration) -> Result<InHand, ApiError> {
