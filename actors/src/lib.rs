@@ -45,7 +45,6 @@ mod accept_pace;
 mod access;
 mod aftermath;
 pub mod audit;
-mod bind_error;
 pub mod client;
 mod clocks;
 pub mod config;
