@@ -170,20 +170,15 @@ pub(crate) struct UndeliveredEntry {
     /// Class of the first of them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) class: Option<Class>,
-    /// Lowest sequence of them; 0: not known.
-    #[serde(default, skip_serializing_if = "is_zero")]
-    pub(crate) first: u64,
-    /// Highest sequence of them; 0: not known.
-    #[serde(default, skip_serializing_if = "is_zero")]
-    pub(crate) last: u64,
+    /// Lowest sequence of them, where it is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) first: Option<u64>,
+    /// Highest sequence of them, where it is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) last: Option<u64>,
     /// Name of the destination.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) name: Option<String>,
-}
-
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it with a reference")]
-const fn is_zero(number: &u64) -> bool {
-    *number == 0
 }
 
 /// The TID of the LNCL of `node`.
