@@ -63,6 +63,7 @@ mod lncl;
 mod log_quotas;
 mod monitors;
 mod ndl;
+mod nearest;
 mod nicer;
 pub mod node;
 mod outlet;
@@ -136,7 +137,7 @@ pub mod discovery {
 /// inputs that are late, of messages that were not delivered.
 pub mod events {
     pub use sinew_runtime::{
-        app::{InputTimeout, RequirementEvent},
+        app::{InputCriterion, InputTimeout, RequirementEvent},
         monitor::{Down, DownClass, MonitorError, MonitorId},
         undelivered::Undelivered,
     };
@@ -151,7 +152,7 @@ pub mod events {
 pub mod message {
     pub use sinew_runtime::{
         outcome::{Outcome, Rejection},
-        sender::{AskError, Confirmation, Destination, Reply, SendError, Sender},
+        sender::{AskError, Confirmation, Destination, Reply, SendError, Sender, UnknownNameError},
         wire::{Class, Kind, MessageBuffer, Payload, TIME_TO_LIVE_MAX},
     };
 }

@@ -176,10 +176,7 @@ impl Endpoint {
     async fn find(&mut self, destination: Destination<'_>, limit: Limit) -> Result<Tid, ApiError> {
         match destination {
             Destination::Tid(tid) => Ok(tid),
-            Destination::Name(name) => {
-                let found = self.look_up(name.to_owned(), limit.time()).await?;
-                found.ok_or_else(|| ApiError::UnknownName(name.to_owned()))
-            }
+            Destination::Name(name) => self.find_named(name, limit.time()).await,
         }
     }
 }

@@ -52,7 +52,7 @@ impl Endpoint {
         let wait = (Awaited::Outcome, within);
         match self.request_within(message, wait, Flags::CONFIRM, limit).await? {
             Some(Answer::Outcome(outcome)) => Ok(outcome),
-            Some(Answer::Reply(_) | Answer::Resolved(_)) | None => Ok(Outcome::Unknown),
+            Some(Answer::Reply(_) | Answer::Resolved(..)) | None => Ok(Outcome::Unknown),
         }
     }
 
@@ -69,7 +69,7 @@ impl Endpoint {
         match self.request_within(message, wait, Flags::CONFIRM.with(Flags::ASK), limit).await? {
             Some(Answer::Reply(reply)) => Ok(reply),
             Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
-            Some(Answer::Resolved(_)) | None => Err(ApiError::NoReply(within)),
+            Some(Answer::Resolved(..)) | None => Err(ApiError::NoReply(within)),
         }
     }
 

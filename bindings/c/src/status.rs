@@ -229,7 +229,7 @@ impl From<ApiError> for Fault {
             ApiError::OthersRequest(_) => Status::SinewErrorNoSuchMessage,
             ApiError::LoanActive => Status::SinewErrorLoanActive,
             // C sends to TIDs, and no payloads whose types Rust knows: the last two do not come here.
-            ApiError::NotYours(_) | ApiError::NotSealed(_) | ApiError::UnknownName(_) => {
+            ApiError::NotYours(_) | ApiError::NotSealed(_) | ApiError::UnknownName { .. } => {
                 Status::SinewErrorInvalidArgument
             }
         };
@@ -269,7 +269,7 @@ fn in_c(error: &ApiError) -> String {
         | ApiError::TooLong { .. }
         | ApiError::TooManyGroups
         | ApiError::NotSealed(_)
-        | ApiError::UnknownName(_)
+        | ApiError::UnknownName { .. }
         | ApiError::NoReply(_)
         | ApiError::OthersRequest(_)
         | ApiError::Malformed(_)

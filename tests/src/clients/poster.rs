@@ -220,7 +220,7 @@ impl Letters {
             | ApiError::NoReply(_)
             | ApiError::LoanActive
             | ApiError::NotYours(_)
-            | ApiError::UnknownName(_)
+            | ApiError::UnknownName { .. }
             | ApiError::NotAsked
             | ApiError::OthersRequest(_)
             | ApiError::Malformed(_)
