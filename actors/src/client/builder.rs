@@ -22,7 +22,7 @@ use super::{
 /// ```no_run
 /// # use std::time::Duration;
 /// # use sinew::{Endpoint, Tid, client::ApiError};
-/// # sinew::payload!("doc.setpoint" => struct Setpoint { degrees: f32 });
+/// # sinew::payload!("doc.setpoint", Stream => struct Setpoint { degrees: f32 });
 /// # fn step(endpoint: &mut Endpoint, drive: Tid, setpoint: &Setpoint, skipped: &mut u32) -> Result<(), ApiError> {
 /// match endpoint.message(drive, setpoint).room_within(Duration::from_micros(200)).send() {
 ///     Ok(()) => {}

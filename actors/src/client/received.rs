@@ -97,7 +97,7 @@ impl Received {
     ///
     /// ```no_run
     /// # use std::time::Duration;
-    /// # use sinew::{ApiError, Endpoint, Time};
+    /// # use sinew::{Endpoint, Time, client::ApiError};
     /// # sinew::payload!("doc.setpoint", Stream => struct Setpoint { degrees: f32 });
     /// # fn step(endpoint: &mut Endpoint, setpoint: &mut Option<Setpoint>) -> Result<(), ApiError> {
     /// while let Some(received) = endpoint.receive(Duration::ZERO)? {
