@@ -1,17 +1,20 @@
 //! Two programs on one node, each in a process of its own: `knee drive` in one terminal, `knee sensor` in another.
 //!
-//! The sensor waits until the drive is there, sends it ten angles, and is told of each what became of it. The node is
-//! `sinew-node`, or any node whose `lncl.socket` is the path that is given as the second word.
+//! The sensor waits until the drive is there, and has it calibrate: a command, of class Control, whose outcome it waits for. Then it streams ten
+//! angles: of class Stream, of which only the newest waits. The node is `sinew-node`, or any node whose `lncl.socket` is the path that is given as
+//! the second word.
 
 use std::{
     io::{self, Write as _},
     process::ExitCode,
+    thread,
     time::Duration,
 };
 
-use sinew::{NodeApi, Registration, client::ApiError, payload};
+use sinew::{NodeApi, Outcome, Payload, Registration, Time, client::ApiError, message::Rejection, payload};
 
-payload!("demo.joint_angle" => struct JointAngle { degrees: f32 });
+payload!("demo.calibrate" => struct Calibrate { zero_degrees: f32 });
+payload!("demo.joint_angle", Stream, expires_after = 20 ms => struct JointAngle { degrees: f32 });
 
 const SECOND: Duration = Duration::from_secs(1);
 
@@ -46,8 +49,16 @@ fn run() -> Result<(), Error> {
 fn drive(node: &NodeApi) -> Result<(), Error> {
     let mut drive = node.register_transport_address(Registration::new().name("knee.drive"))?;
     while let Some(message) = drive.receive(10 * SECOND)? {
-        let angle: JointAngle = message.decode().map_err(ApiError::from)?;
-        writeln!(io::stdout(), "{} is at {} degrees", message.source(), angle.degrees)?;
+        if message.kind() == Calibrate::KIND {
+            let Calibrate { zero_degrees } = message.decode().map_err(ApiError::from)?;
+            writeln!(io::stdout(), "calibrated: zero is at {zero_degrees} degrees")?;
+        } else if message.kind() == JointAngle::KIND {
+            let angle: JointAngle = message.decode().map_err(ApiError::from)?;
+            let age = message.age(Time::now());
+            writeln!(io::stdout(), "{} is at {} degrees, {age:?} ago", message.source(), angle.degrees)?;
+        } else {
+            message.settle(Outcome::Rejected(Rejection::UnknownKind));
+        }
     }
     Ok(())
 }
@@ -56,10 +67,11 @@ fn sensor(node: &NodeApi) -> Result<(), Error> {
     let registration = Registration::new().requires(["knee.drive"]);
     let mut sensor = node.register_transport_address(registration)?;
     let drive = sensor.resolve("knee.drive", SECOND)?.expect("it is ready: it was required");
+    let outcome = sensor.message(drive, &Calibrate { zero_degrees: 0.5 }).confirmed(SECOND)?;
+    writeln!(io::stdout(), "calibrate: {outcome:?}")?;
     for number in 0..10_u8 {
-        let angle = JointAngle { degrees: f32::from(number) };
-        let outcome = sensor.message(drive, &angle).confirmed(SECOND)?;
-        writeln!(io::stdout(), "{} degrees: {outcome:?}", angle.degrees)?;
+        sensor.send(drive, &JointAngle { degrees: f32::from(number) })?;
+        thread::sleep(Duration::from_millis(10));
     }
     Ok(())
 }

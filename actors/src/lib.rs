@@ -45,7 +45,6 @@ mod accept_pace;
 mod access;
 mod aftermath;
 pub mod audit;
-mod bind_error;
 pub mod client;
 mod clocks;
 pub mod config;
@@ -64,6 +63,7 @@ mod lncl;
 mod log_quotas;
 mod monitors;
 mod ndl;
+mod nearest;
 mod nicer;
 pub mod node;
 mod outlet;
@@ -138,7 +138,7 @@ pub mod discovery {
 /// inputs that are late, of messages that were not delivered.
 pub mod events {
     pub use sinew_runtime::{
-        app::{InputTimeout, RequirementEvent},
+        app::{InputCriterion, InputTimeout, RequirementEvent},
         monitor::{Down, DownClass, MonitorError, MonitorId},
         undelivered::Undelivered,
     };
@@ -153,7 +153,10 @@ pub mod events {
 pub mod message {
     pub use sinew_runtime::{
         outcome::{MemberOutcome, Outcome, Rejection},
-        sender::{AskError, Confirmation, Destination, GroupConfirmation, Reply, SendError, Sender},
+        sender::{
+            AskError, Confirmation, Destination, GroupConfirmation, Reply, SendError, Sender,
+            UnknownNameError,
+        },
         wire::{Class, Kind, MessageBuffer, Payload, TIME_TO_LIVE_MAX},
     };
 }

@@ -3,12 +3,18 @@
 /// Declares a type that travels between applications: `payload!("project.name" => struct ...)`.
 ///
 /// The type can be written and read by serde, and is a [`Payload`](crate::Payload) of that name and of class Control.
-/// A class after the name, as in `payload!("exo.angle", Stream => struct ...)`, makes it another.
+/// Two things may follow the name:
+///
+/// - A class, as in `payload!("exo.angle", Stream => struct ...)`. Periodic values (measurements, setpoints) are of class Stream: of these only the
+///   newest waits, and a late one is replaced. Commands that must arrive are Control; Bulk gives way to both.
+/// - A time to live, as in `payload!("exo.angle", Stream, expires_after = 20 ms => struct ...)`: a message of the type that is older expires
+///   where it waits, and does not reach its handler. It is a number and a unit, `us`, `ms` or `s`, from 1 us to 4294 s, and becomes
+///   [`Payload::TIME_TO_LIVE`](crate::Payload::TIME_TO_LIVE). A send may say another one (`expires_after` of its builder).
 ///
 /// ```
 /// use sinew::prelude::*;
 ///
-/// payload!("demo.angle", Stream =>
+/// payload!("demo.angle", Stream, expires_after = 20 ms =>
 ///     /// How far a joint is bent.
 ///     #[derive(Debug)]
 ///     pub struct Angle {
@@ -17,29 +23,70 @@
 ///     }
 /// );
 /// assert_eq!(Angle::NAME, "demo.angle");
+/// assert_eq!((Angle::CLASS, Angle::TIME_TO_LIVE), (Class::Stream, Some(Duration::from_millis(20))));
+/// ```
+///
+/// A unit that is none does not compile:
+///
+/// ```compile_fail
+/// sinew::payload!("demo.angle", Stream, expires_after = 20 millis => struct Angle { degrees: f32 });
+/// ```
+///
+/// Nor does a time to live of zero:
+///
+/// ```compile_fail
+/// sinew::payload!("demo.angle", Stream, expires_after = 0 ms => struct Angle { degrees: f32 });
 /// ```
 #[macro_export]
 macro_rules! payload {
     ($name:literal => $($item:tt)+) => {
-        $crate::payload!($name, Control => $($item)+);
+        $crate::payload!(@declare [$name Control] $($item)+);
     };
-    ($name:literal, $class:ident => $(#[$meta:meta])* $visible:vis struct $type:ident $($rest:tt)*) => {
+    ($name:literal, expires_after = $amount:literal $unit:ident => $($item:tt)+) => {
+        $crate::payload!(@declare [$name Control $amount $unit] $($item)+);
+    };
+    ($name:literal, $class:ident => $($item:tt)+) => {
+        $crate::payload!(@declare [$name $class] $($item)+);
+    };
+    ($name:literal, $class:ident, expires_after = $amount:literal $unit:ident => $($item:tt)+) => {
+        $crate::payload!(@declare [$name $class $amount $unit] $($item)+);
+    };
+    ($name:literal, $($class:ident,)? expires_after = $($wrong:tt)*) => {
+        ::core::compile_error!("expires_after is a number, a space and a unit, and `=>` after it: `expires_after = 20 ms => struct ...`");
+    };
+    (@declare $head:tt $(#[$meta:meta])* $visible:vis struct $type:ident $($rest:tt)*) => {
         $crate::payload!(@item $(#[$meta])* $visible struct $type $($rest)*);
-        $crate::payload!(@impl $name, $class, $type);
+        $crate::payload!(@impl $head $type);
     };
-    ($name:literal, $class:ident => $(#[$meta:meta])* $visible:vis enum $type:ident $($rest:tt)*) => {
+    (@declare $head:tt $(#[$meta:meta])* $visible:vis enum $type:ident $($rest:tt)*) => {
         $crate::payload!(@item $(#[$meta])* $visible enum $type $($rest)*);
-        $crate::payload!(@impl $name, $class, $type);
+        $crate::payload!(@impl $head $type);
     };
     (@item $($item:tt)+) => {
         #[derive($crate::serde::Serialize, $crate::serde::Deserialize)]
         #[serde(crate = "::sinew::serde")]
         $($item)+
     };
-    (@impl $name:literal, $class:ident, $type:ident) => {
+    (@impl [$name:literal $class:ident $($amount:literal $unit:ident)?] $type:ident) => {
         impl $crate::Payload for $type {
             const NAME: &'static str = $name;
             const CLASS: $crate::Class = $crate::Class::$class;
+            $(const TIME_TO_LIVE: ::core::option::Option<::core::time::Duration> = {
+                const TIME: ::core::time::Duration = $crate::payload!(@time $amount $unit);
+                ::core::assert!(
+                    TIME.as_micros() > 0 && TIME.as_micros() <= u32::MAX as u128,
+                    "expires_after is from 1 us to 4294 s"
+                );
+                ::core::option::Option::Some(TIME)
+            };)?
         }
+    };
+    (@time $amount:literal us) => { ::core::time::Duration::from_micros($amount) };
+    (@time $amount:literal ms) => { ::core::time::Duration::from_millis($amount) };
+    (@time $amount:literal s) => { ::core::time::Duration::from_secs($amount) };
+    (@time $amount:literal $unit:ident) => {
+        ::core::compile_error!(::core::concat!(
+            "`", ::core::stringify!($unit), "` is no unit of expires_after; take us, ms or s, as in `expires_after = 20 ms`"
+        ))
     };
 }

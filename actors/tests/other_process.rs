@@ -67,6 +67,50 @@ fn start_node(socket: &Path) -> (Node, Receiver<String>) {
     (node, seen)
 }
 
+/// Sends to a name that nobody has, and says what the error shows.
+struct Misspelt(SyncSender<String>);
+
+impl Actor for Misspelt {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        let error = context.send("sensro", &Angle { degrees: 1.0 }).unwrap_err();
+        self.0.send(error.to_string()).unwrap();
+    }
+}
+
+// spec: LNCL-19
+#[test]
+fn a_send_to_a_misspelt_name_shows_the_nearest_ones() {
+    let directory = Directory(std::env::temp_dir().join(format!("sinew-nearest-{}", std::process::id())));
+    let socket = directory.0.join("knee.sock");
+    let (say, seen) = sync_channel(64);
+    let node = Node::builder("knee")
+        .configure(|config| {
+            config.lncl.socket = Some(socket.clone());
+            config.ndl.multicast = None;
+            config.ndl.mdns_port = None;
+        })
+        .app(AppSpec::new("misspelt", move || Misspelt(say.clone())).requires(["sensor"]))
+        .start()
+        .unwrap();
+    let api = NodeApi::connect(socket.to_str().unwrap()).unwrap();
+    let _sensor = api.register_transport_address(Registration::new().name("sensor")).unwrap();
+    let found = seen.recv_timeout(WATCHDOG).unwrap();
+    assert!(found.starts_with("no application is called 'sensro' now; nearest: sensor; "), "{found}");
+
+    let mut endpoint = api.register_transport_address(Registration::new().requires(["sensor"])).unwrap();
+    let error = endpoint.send("sensro", &Angle { degrees: 1.0 }).unwrap_err();
+    let text = error.to_string();
+    let ApiError::UnknownName { name, nearest } = error else { panic!("{text}") };
+    assert_eq!((&*name, nearest), ("sensro", vec!["sensor".to_owned()]));
+    assert!(text.starts_with("no application is called 'sensro' now; nearest: sensor; "), "{text}");
+    // A loop that goes on sending there has the node compare names once a second.
+    let again = endpoint.send("sensro", &Angle { degrees: 1.0 });
+    assert!(matches!(again, Err(ApiError::UnknownName { nearest, .. }) if nearest.is_empty()));
+    node.stop();
+}
+
 /// Runs `role` below in a process of its own.
 fn start_process(role: &str, socket: &Path) -> Child {
     Command::new(std::env::current_exe().unwrap())

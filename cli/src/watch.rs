@@ -341,7 +341,7 @@ impl Screen {
             "class": format!("{:?}", message.class).to_lowercase(), "wants": message.wants,
             "source": message.source.to_string(), "source_name": self.names.apps.get(&message.source),
             "target": message.target.to_string(), "target_name": self.names.apps.get(&message.target),
-            "sequence": message.sequence, "age_ns": message.age_error_ns.map(|_| message.age_ns), "age_error_ns": message.age_error_ns, "bytes": message.length,
+            "sequence": message.sequence, "age_ns": message.age_ns, "age_error_ns": message.age_error_ns, "bytes": message.length,
             "refused": message.refused.map(|refused| format!("{refused:?}")),
             "protected": counter.map(|counter| json!({ "counter": counter })),
             "payload": payload,
@@ -370,7 +370,7 @@ fn kind(message: &SeenMessage) -> String {
 
 /// How old a message was; nothing is said of what came from a node whose clock nobody has measured.
 fn age(message: &SeenMessage) -> String {
-    message.age_error_ns.map_or_else(|| "?".to_owned(), |_| time(message.age_ns / 1_000))
+    message.age_ns.map_or_else(|| "?".to_owned(), |age_ns| time(age_ns / 1_000))
 }
 
 const fn is_whole(message: &SeenMessage) -> bool {
@@ -460,7 +460,7 @@ mod tests {
         let tid = |node| Tid::new(node, AppAddress::new(0x1001));
         SeenMessage {
             seen_us: 0,
-            age_ns: 1_000,
+            age_ns: Some(1_000),
             age_error_ns: Some(0),
             is_sent: true,
             source: tid(HIP),

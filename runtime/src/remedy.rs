@@ -1,12 +1,12 @@
 //! What mends a system call that has failed: each error has a remedy of its own.
 
-use std::io;
+use std::{borrow::Cow, io};
 
 use rustix::io::Errno;
 
 /// What was asked of the system.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Wanted {
+pub enum Wanted<'a> {
     /// A descriptor: a socket, a pipe, a timer, an epoll instance.
     Descriptor,
     /// A thread.
@@ -15,16 +15,28 @@ pub enum Wanted {
     Reactor,
     /// A process.
     Process,
+    /// A socket that is bound to an address of `ndl.interface`, with the port of this key of the configuration.
+    Port(&'a str),
 }
 
 /// The remedy for `error`.
 #[must_use]
-pub fn remedy(wanted: Wanted, error: &io::Error) -> &'static str {
-    let Some(errno) = Errno::from_io_error(error) else { return "see the error" };
-    match errno {
-        Errno::MFILE => "raise `ulimit -n`",
-        Errno::NFILE => "the host has no descriptor left: raise the sysctl `fs.file-max`",
-        Errno::NOMEM => "memory is short: see the limits of the container or cgroup, and `ulimit -v`",
+pub fn remedy(wanted: Wanted<'_>, error: &io::Error) -> Cow<'static, str> {
+    let errno = Errno::from_io_error(error);
+    if let Wanted::Port(key) = wanted
+        && let Some(remedy) = remedy_of_port(key, errno)
+    {
+        return remedy;
+    }
+    let Some(errno) = errno else { return "see the error".into() };
+    let remedy = match errno {
+        Errno::MFILE => {
+            "this process has no file descriptor left: raise its limit (`ulimit -n`, `LimitNOFILE=` of systemd)"
+        }
+        Errno::NFILE => "this host has no file descriptor left: raise `sysctl fs.file-max`",
+        Errno::NOMEM | Errno::NOBUFS => {
+            "memory is short: see the limits of the container or cgroup (`MemoryMax=` of systemd), and `ulimit -v`"
+        }
         Errno::AGAIN if wanted != Wanted::Descriptor => {
             "raise `ulimit -u`, or `pids.max` of the container or cgroup"
         }
@@ -37,7 +49,43 @@ pub fn remedy(wanted: Wanted, error: &io::Error) -> &'static str {
         }
         Errno::NOENT => "something that it needs is not there: is /proc mounted?",
         _ => "see the error",
-    }
+    };
+    remedy.into()
+}
+
+/// The remedy for an error that only a bound socket has; `None` where any descriptor may have it.
+fn remedy_of_port(key: &str, errno: Option<Errno>) -> Option<Cow<'static, str>> {
+    Some(match errno {
+        Some(Errno::ADDRINUSE) => format!(
+            "is another node using this port? Set `{key}` to a free one (0 takes any); `ss -tulpn` lists the programs and their ports"
+        )
+        .into(),
+        Some(Errno::ADDRNOTAVAIL) => {
+            "this host does not have this address: give it to an interface (`ip address add`), or set `ndl.interface` to an address or an \
+             interface of this host"
+                .into()
+        }
+        Some(Errno::ACCESS | Errno::PERM) => format!(
+            "this process may not use this port: set `{key}` to 1024 or above (0 takes any free one), or grant CAP_NET_BIND_SERVICE"
+        )
+        .into(),
+        Some(Errno::AFNOSUPPORT | Errno::PROTONOSUPPORT) => {
+            "this kernel does not have the address family: choose addresses of the other one in `ndl.interface` (/ipv4 or /ipv6 behind a name)"
+                .into()
+        }
+        Some(Errno::NODEV | Errno::NXIO) => {
+            "the interface is not there: `ip link` lists those of this host; set `ndl.interface` to one of them".into()
+        }
+        Some(Errno::MFILE | Errno::NFILE | Errno::NOMEM | Errno::NOBUFS | Errno::AGAIN | Errno::NOSYS) => return None,
+        // Of any other error no more is known than where the address and the port come from.
+        Some(_) | None => format!("the address comes from `ndl.interface`, and the port from `{key}`").into(),
+    })
+}
+
+/// Whether this host does not have the address of a socket: it may have it later.
+#[must_use]
+pub fn may_come_later(error: &io::Error) -> bool {
+    error.kind() == io::ErrorKind::AddrNotAvailable
 }
 
 /// Whether the same call fails again until this program is started elsewhere: a retry is of no use.
@@ -53,13 +101,14 @@ pub fn is_permanent(error: &io::Error) -> bool {
 mod tests {
     use super::*;
 
-    fn of(wanted: Wanted, errno: Errno) -> &'static str {
+    fn of(wanted: Wanted<'_>, errno: Errno) -> Cow<'static, str> {
         remedy(wanted, &errno.into())
     }
 
     #[test]
     fn only_a_lack_of_descriptors_is_mended_by_the_limit_of_open_files() {
-        for wanted in [Wanted::Descriptor, Wanted::Thread, Wanted::Reactor, Wanted::Process] {
+        let port = Wanted::Port("ndl.port");
+        for wanted in [Wanted::Descriptor, Wanted::Thread, Wanted::Reactor, Wanted::Process, port] {
             assert!(of(wanted, Errno::MFILE).contains("ulimit -n"));
             for errno in [
                 Errno::NFILE,
@@ -75,6 +124,25 @@ mod tests {
         }
         assert!(of(Wanted::Thread, Errno::AGAIN).contains("ulimit -u"));
         assert!(of(Wanted::Process, Errno::NOSYS).contains("Linux 5.4"));
+    }
+
+    #[test]
+    fn each_error_of_a_bound_socket_has_a_remedy_of_its_own() {
+        for (errno, word) in [
+            (Errno::ADDRINUSE, "another node using this port? Set `ndl.port`"),
+            (Errno::ADDRNOTAVAIL, "does not have this address"),
+            (Errno::MFILE, "`ulimit -n`"),
+            (Errno::NFILE, "`sysctl fs.file-max`"),
+            (Errno::ACCESS, "`ndl.port` to 1024"),
+            (Errno::AFNOSUPPORT, "address family"),
+            (Errno::NODEV, "`ip link`"),
+            (Errno::NOBUFS, "memory"),
+            (Errno::INVAL, "`ndl.interface`"),
+        ] {
+            let remedy = of(Wanted::Port("ndl.port"), errno);
+            assert!(remedy.contains(word), "{errno}: {remedy}");
+            assert_eq!(remedy.contains("another node"), errno == Errno::ADDRINUSE, "{errno}: {remedy}");
+        }
     }
 
     #[test]

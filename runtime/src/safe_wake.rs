@@ -121,7 +121,7 @@ fn start() {
             Ok(_) => Some(late),
             Err(error) => {
                 let remedy = remedy(Wanted::Thread, &error);
-                crate::log::warn!(%error, remedy, "no thread for wakes at the end of the process: stop the node before the end of `main`");
+                crate::log::warn!(%error, %remedy, "no thread for wakes at the end of the process: stop the node before the end of `main`");
                 None
             }
         }

@@ -3,6 +3,7 @@
 mod awaiting;
 mod builder;
 mod clock;
+mod unknown_name;
 
 use std::{
     sync::{
@@ -18,6 +19,7 @@ pub(crate) use self::builder::{Content, Via};
 pub use self::{
     awaiting::{Confirmation, GroupConfirmation, Reply},
     builder::{MessageBuilder, Value},
+    unknown_name::UnknownNameError,
 };
 use crate::{
     monitor::{MonitorError, MonitorId},
@@ -38,6 +40,13 @@ const SEQUENCES_PER_LIFE: u64 = 1 << 40;
 pub trait Directory: Send + Sync {
     /// The TID that has `name` now, or `None` if nobody has it.
     fn resolve(&self, name: &str) -> Option<Tid>;
+
+    /// Names of applications that are similar to `name`, three at most, the most similar first; none where no names are at hand. It compares
+    /// names, so it is for what is shown to people.
+    fn nearest(&self, name: &str) -> Vec<String> {
+        let _ = name;
+        Vec::new()
+    }
 
     /// Makes the application at `app` of this node a member of `group`, or no longer one.
     fn set_member(&self, app: AppAddress, group: AppAddress, member: bool);
@@ -83,10 +92,8 @@ impl<'a> From<&'a str> for Destination<'a> {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SendError {
     /// The directory does not know the name.
-    #[error(
-        "no application is called '{0}' now; require it, so that this application starts when it is there"
-    )]
-    UnknownName(String),
+    #[error(transparent)]
+    UnknownName(#[from] UnknownNameError),
     /// Nobody took the message.
     #[error("{0}")]
     Rejected(#[from] Rejection),
@@ -367,7 +374,9 @@ impl Sender {
         match destination {
             Destination::Tid(tid) => Ok(tid),
             Destination::Name(name) => {
-                self.resolve(name).ok_or_else(|| SendError::UnknownName(name.to_owned()))
+                let directory = &self.shared.directory;
+                let tid = directory.resolve(name);
+                tid.ok_or_else(|| UnknownNameError::new(name, directory).into())
             }
         }
     }

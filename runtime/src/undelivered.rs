@@ -39,12 +39,12 @@ pub struct Undelivered {
     pub count: u64,
     /// When the first of these was refused, on this host's monotonic clock. Of a refusal by another node: when its report arrived.
     pub since: Time,
-    /// Lowest sequence of these messages; 0 where it is not known.
+    /// Lowest sequence of these messages; `None` where it is not known.
     #[serde(default)]
-    pub first_sequence: u64,
-    /// Highest sequence of these messages; 0 where it is not known.
+    pub first_sequence: Option<u64>,
+    /// Highest sequence of these messages; `None` where it is not known.
     #[serde(default)]
-    pub last_sequence: u64,
+    pub last_sequence: Option<u64>,
 }
 
 impl Payload for Undelivered {

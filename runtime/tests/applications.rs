@@ -15,7 +15,7 @@ use std::{
 use actix::{Actor, ActorContext, AsyncContext, Handler, Running, fut::WrapFuture};
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{
-    app::{AppContext, AppSpec, AppWiring, Delivery, DynApp, SendOutcome},
+    app::{AppContext, AppSpec, AppWiring, Delivery, DynApp, InputCriterion, InputTimeout, SendOutcome},
     mailbox::Mailbox,
     outcome::{Outcome, Rejection},
     pending::{AppOutlet, Pending},
@@ -24,7 +24,8 @@ use sinew_runtime::{
     sender::{Directory, SendError, Sender},
     supervision::{ChildId, ChildSpec, Input, Policy, Strategy, Supervisor, SupervisorFact, Threads},
     tid::{AppAddress, NodeAddress, Tid},
-    wire::{Class, Kind, Payload},
+    time::Time,
+    wire::{Class, Kind, Message, Payload},
 };
 
 const NODE: NodeAddress = NodeAddress::new(0x7f00_0001);
@@ -300,6 +301,47 @@ fn periods_tick_and_each_silence_is_told_once() {
     assert_eq!([next(), next()], ["number", "silence"], "the next silence is a new one");
     bench.stop();
     assert_eq!(next(), "stopping");
+}
+
+/// Says when a watchdog by age, or the one by arrival, reports an input.
+struct Judge(SyncSender<InputTimeout>);
+
+impl Actor for Judge {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        context.watch_input::<Number>(None, SILENCE, |this, timeout, _| this.0.send(timeout).unwrap());
+        context.watch_input_age::<Number>(None, SILENCE, |this, timeout, _| this.0.send(timeout).unwrap());
+    }
+}
+
+impl Handler<Delivery<Number>> for Judge {
+    type Result = ();
+
+    fn handle(&mut self, number: Delivery<Number>, _: &mut Self::Context) {
+        assert!(number.is_older_than(SILENCE) && !number.is_older_than(DEADLINE), "{:?}", number.age);
+    }
+}
+
+#[test]
+fn late_values_that_keep_arriving_trip_a_watchdog_by_age() {
+    let (say, heard) = sync_channel(100);
+    let bench =
+        Bench::start(vec![AppSpec::new("judge", move || Judge(say.clone())).handles::<Number>().into()]);
+    let to = bench.senders[0].tid();
+    // A machine that stands still for so long that nothing arrives trips the other one, too.
+    let timeout = loop {
+        let mut late = Message::typed(to, to, &Number(1));
+        late.header.sent = Time::now() - 2 * SILENCE;
+        bench.router.send(late).unwrap();
+        match heard.recv_timeout(Duration::from_millis(1)) {
+            Ok(timeout) if timeout.criterion == InputCriterion::Age => break timeout,
+            Ok(_) | Err(_) => {}
+        }
+    };
+    assert_eq!((timeout.kind, timeout.limit), (Number::KIND, SILENCE));
+    assert!(timeout.is_silent() || timeout.age > Some(2 * SILENCE), "{timeout:?}");
+    bench.stop();
 }
 
 /// Needs three more periods after it was told to stop, as a drive does that ramps its torque down.

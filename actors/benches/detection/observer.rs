@@ -52,7 +52,7 @@ impl Handler<Delivery<NodeEvent>> for Watch {
     type Result = ();
 
     fn handle(&mut self, event: Delivery<NodeEvent>, _: &mut Self::Context) {
-        let told = Told { at: Time::now(), sent: event.sent, event: event.payload };
+        let told = Told { at: Time::now(), sent: event.sent.expect("of this host"), event: event.payload };
         self.heard.try_send(Heard::Event(told)).expect("fewer events than that in a trial");
     }
 }

@@ -84,7 +84,7 @@ pub(crate) fn fan_in(way: Way, packets: u64, pinning: Pinning) -> (Figures, u64)
     let mut figures = Figures::new();
     while figures.rounds() < expected {
         let Some(packet) = endpoint.receive(DEADLINE).expect("the node lives") else { break };
-        figures.record(packet.age(Time::now()));
+        figures.record(packet.age(Time::now()).expect("of this host"));
     }
     drop(senders);
     let lost = expected - figures.rounds();

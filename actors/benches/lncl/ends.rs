@@ -129,7 +129,7 @@ pub(crate) fn echo(way: Way, memory: Memory, socket: &str) {
         let mut back = maker.create(&mut endpoint, to, received.kind(), bytes.len());
         back.copy_from_slice(bytes);
         if received.kind() == AGED {
-            let age = received.age(Time::now());
+            let age = received.age(Time::now()).expect("of this host");
             back[..8].copy_from_slice(&(age.as_nanos() as u64).to_le_bytes());
         }
         endpoint.loaned(back).send().expect("the node takes it");

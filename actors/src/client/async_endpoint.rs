@@ -178,7 +178,7 @@ impl AsyncEndpoint {
     /// # Errors
     /// The node did not answer `within` this time.
     pub async fn resolve(&mut self, name: &str, within: Duration) -> Result<Option<Tid>, ApiError> {
-        self.endpoint.look_up(name.to_owned(), within).await
+        self.endpoint.look_up(name, within).await
     }
 
     /// Gives the address back and waits until the node has taken it: the name is free when this returns.

@@ -22,7 +22,7 @@ use super::{
 /// ```no_run
 /// # use std::time::Duration;
 /// # use sinew::{Endpoint, Tid, client::ApiError};
-/// # sinew::payload!("doc.setpoint" => struct Setpoint { degrees: f32 });
+/// # sinew::payload!("doc.setpoint", Stream => struct Setpoint { degrees: f32 });
 /// # fn step(endpoint: &mut Endpoint, drive: Tid, setpoint: &Setpoint, skipped: &mut u32) -> Result<(), ApiError> {
 /// match endpoint.message(drive, setpoint).room_within(Duration::from_micros(200)).send() {
 ///     Ok(()) => {}
@@ -188,10 +188,7 @@ impl Endpoint {
     async fn find(&mut self, destination: Destination<'_>, limit: Limit) -> Result<Tid, ApiError> {
         match destination {
             Destination::Tid(tid) => Ok(tid),
-            Destination::Name(name) => {
-                let found = self.look_up(name.to_owned(), limit.time()).await?;
-                found.ok_or_else(|| ApiError::UnknownName(name.to_owned()))
-            }
+            Destination::Name(name) => self.find_named(name, limit.time()).await,
         }
     }
 }

@@ -33,6 +33,8 @@ use crate::lncl::payload::{self, Group, Registered, Resolve};
 const PROMPT: Duration = Duration::from_secs(2);
 /// Time that what waits for room on direct links has to find it when an endpoint is dropped by a thread.
 const PARTING: Duration = Duration::from_millis(20);
+/// Time between two questions for names that are similar to one that nobody has.
+const NEAREST_AGAIN: Duration = Duration::from_secs(1);
 pub(super) const LNCL: Tid = payload::lncl_of(NodeAddress::HERE);
 
 /// A registered transport address: sends and receives, from one thread at a time.
@@ -64,6 +66,8 @@ pub struct Endpoint {
     pub(super) stalled: Option<u32>,
     /// The number of its last request.
     pub(super) asked: u64,
+    /// When it last asked for names that are similar to one that nobody has.
+    pub(super) nearest_asked: Option<Time>,
     pub(super) leaves: Leaves,
 }
 
@@ -113,6 +117,7 @@ impl Endpoint {
             rest: None,
             stalled: None,
             asked: 0,
+            nearest_asked: None,
             leaves: Leaves::default(),
         }
     }
@@ -291,14 +296,35 @@ impl Endpoint {
     /// # Errors
     /// The node did not answer `within` this time.
     pub fn resolve(&mut self, name: &str, within: Duration) -> Result<Option<Tid>, ApiError> {
-        at_once(self.look_up(name.to_owned(), within))
+        at_once(self.look_up(name, within))
     }
 
-    pub(super) async fn look_up(&mut self, name: String, within: Duration) -> Result<Option<Tid>, ApiError> {
-        let asked = Resolve { name };
-        let message = payload::frame(Kind::LNCL_RESOLVE, self.tid, LNCL, &asked);
+    pub(super) async fn look_up(&mut self, name: &str, within: Duration) -> Result<Option<Tid>, ApiError> {
+        let asked = Resolve { name: name.to_owned(), nearest: false };
+        self.ask_for_name(&asked, within).await.map(|(tid, _)| tid)
+    }
+
+    /// The TID of a name for a send. Where nobody has it the error has names that are similar, once in [`NEAREST_AGAIN`]: to find them takes the
+    /// node's time, and a loop may send to a name that is away.
+    pub(super) async fn find_named(&mut self, name: &str, within: Duration) -> Result<Tid, ApiError> {
+        let now = Time::now();
+        let nearest = self.nearest_asked.is_none_or(|asked| now.since(asked) >= NEAREST_AGAIN);
+        let asked = Resolve { name: name.to_owned(), nearest };
+        let (tid, nearest) = self.ask_for_name(&asked, within).await?;
+        if tid.is_none() && asked.nearest {
+            self.nearest_asked = Some(now);
+        }
+        tid.ok_or(ApiError::UnknownName { name: asked.name, nearest })
+    }
+
+    async fn ask_for_name(
+        &mut self,
+        asked: &Resolve,
+        within: Duration,
+    ) -> Result<(Option<Tid>, Vec<String>), ApiError> {
+        let message = payload::frame(Kind::LNCL_RESOLVE, self.tid, LNCL, asked);
         match self.request(message.into(), Awaited::Resolved, Flags::NONE, within).await? {
-            Some(Answer::Resolved(tid)) => Ok(tid),
+            Some(Answer::Resolved(tid, nearest)) => Ok((tid, nearest)),
             Some(Answer::Outcome(_) | Answer::Members(_) | Answer::Reply(_)) | None => {
                 Err(ApiError::NoAnswer(within))
             }
@@ -354,7 +380,7 @@ impl Endpoint {
             }
             Some(Answer::Outcome(Outcome::Rejected(Rejection::QueueFull))) => Err(ApiError::TooManyGroups),
             Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
-            Some(Answer::Members(_) | Answer::Reply(_) | Answer::Resolved(_)) | None => {
+            Some(Answer::Members(_) | Answer::Reply(_) | Answer::Resolved(..)) | None => {
                 Err(ApiError::NoAnswer(PROMPT))
             }
         }

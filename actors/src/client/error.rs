@@ -103,10 +103,17 @@ pub enum ApiError {
     ToMany(Tid),
     /// No application has the name now. Nothing was sent.
     #[error(
-        "no application is called '{0}' now; require it at registration, so that this one starts when it is there, or see `sinew apps` for \
-         the names that there are"
+        "no application is called '{name}' now; {}require it at registration, so that this one starts when it is there, or see `sinew apps` \
+         for the names that there are",
+        nearest_of(nearest)
     )]
-    UnknownName(String),
+    UnknownName {
+        /// The name.
+        name: String,
+        /// Names of applications that are similar and there now, three at most, the most similar first. An endpoint is told them once a
+        /// second at most, and one of another user than the node's never.
+        nearest: Vec<String>,
+    },
     /// A request was not handled. The outcome says why.
     #[error("{}", not_handled(*.0))]
     Ended(Outcome),
@@ -173,6 +180,10 @@ fn way_to_a_node(cause: &io::Error) -> &'static str {
     }
 }
 
+fn nearest_of(nearest: &[String]) -> String {
+    if nearest.is_empty() { String::new() } else { format!("nearest: {}; ", nearest.join(", ")) }
+}
+
 #[cfg(test)]
 mod tests {
     use sinew_runtime::outcome::Rejection;
@@ -198,7 +209,8 @@ mod tests {
             ApiError::TooLong { length: 2, limit: 1 },
             ApiError::NotYours(Kind::OUTCOME),
             ApiError::ToMany(Tid::BROADCAST),
-            ApiError::UnknownName("knee".to_owned()),
+            ApiError::UnknownName { name: "knee".to_owned(), nearest: Vec::new() },
+            ApiError::UnknownName { name: "knee".to_owned(), nearest: vec!["knee.drive".to_owned()] },
             ApiError::NoReply(second),
             ApiError::NotAsked,
             ApiError::OthersRequest(Tid::NONE),

@@ -32,7 +32,8 @@ pub(super) enum Answer {
     /// A part of what is awaited: further reports follow, or the outcome of the message as a whole.
     Members(Vec<MemberReport>),
     Reply(Message),
-    Resolved(Option<Tid>),
+    /// The TID of the name, and names that are similar to one that nobody has.
+    Resolved(Option<Tid>, Vec<String>),
 }
 
 /// What a frame was.
@@ -216,7 +217,7 @@ fn sort_members(message: &Message, awaited: Option<Awaited>) -> Sorted {
 fn sort_resolved(message: &Message, awaited: Option<Awaited>) -> Sorted {
     match payload::read::<Resolved>(&message.payload) {
         Ok(resolved) if awaited == Some(Awaited::Resolved) => {
-            Sorted::Answer(Answer::Resolved(resolved.tid.map(Tid::from_bits)))
+            Sorted::Answer(Answer::Resolved(resolved.tid.map(Tid::from_bits), resolved.nearest))
         }
         // The wait ends at its deadline.
         Ok(_) | Err(_) => Sorted::Nothing,

@@ -6,6 +6,7 @@ mod tests;
 use std::{
     ops::{Deref, DerefMut},
     sync::Arc,
+    time::Duration,
 };
 
 use bytes::Bytes;
@@ -72,6 +73,13 @@ impl LoanedMessage {
     /// The class in which it will travel. Control at first.
     pub const fn set_class(&mut self, class: Class) {
         self.header.class = class;
+    }
+
+    /// Has it expire where it waits when it is older than this. At most [`TIME_TO_LIVE_MAX`](sinew_runtime::wire::TIME_TO_LIVE_MAX), 71 minutes
+    /// and 35 s: a longer time counts as that. It never expires at first.
+    pub fn set_expires_after(&mut self, time: Duration) {
+        // It is the send that waits for an outcome.
+        let _ = self.header.set_time_to_live(time);
     }
 
     /// Whether it lies in a ring: sending it copies nothing.

@@ -55,7 +55,7 @@ impl Endpoint {
         let wait = (Awaited::Outcome, within);
         match self.request_within(message, wait, Flags::CONFIRM, limit).await? {
             Some(Answer::Outcome(outcome)) => Ok(outcome),
-            Some(Answer::Members(_) | Answer::Reply(_) | Answer::Resolved(_)) | None => Ok(Outcome::Unknown),
+            Some(Answer::Members(_) | Answer::Reply(_) | Answer::Resolved(..)) | None => Ok(Outcome::Unknown),
         }
     }
 
@@ -94,7 +94,7 @@ impl Endpoint {
                 // No member has a copy.
                 Some(Answer::Outcome(why @ Outcome::Rejected(_))) => return Err(ApiError::Ended(why)),
                 Some(Answer::Outcome(last)) => return Ok(table.finish(Some(last))),
-                Some(Answer::Reply(_) | Answer::Resolved(_)) | None => return Ok(table.finish(None)),
+                Some(Answer::Reply(_) | Answer::Resolved(..)) | None => return Ok(table.finish(None)),
             }
             asked.now = Time::now();
             if table.is_complete() || asked.now >= asked.deadline {
@@ -116,7 +116,7 @@ impl Endpoint {
         match self.request_within(message, wait, Flags::CONFIRM.with(Flags::ASK), limit).await? {
             Some(Answer::Reply(reply)) => Ok(reply),
             Some(Answer::Outcome(outcome)) => Err(ApiError::Ended(outcome)),
-            Some(Answer::Members(_) | Answer::Resolved(_)) | None => Err(ApiError::NoReply(within)),
+            Some(Answer::Members(_) | Answer::Resolved(..)) | None => Err(ApiError::NoReply(within)),
         }
     }
 

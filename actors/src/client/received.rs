@@ -10,7 +10,7 @@ use sinew_runtime::{
     outcome::{Outcome, Rejection},
     tid::Tid,
     time::Time,
-    wire::{Class, DecodeError, Flags, Kind, Message, Payload},
+    wire::{Class, DecodeError, Flags, Kind, Message, Payload, may_be_older},
 };
 
 /// A message in hand.
@@ -68,30 +68,49 @@ impl Received {
         self.message.header.sequence
     }
 
-    /// When it was sent, in this host's clock; [`Time::ZERO`] where that is not known ([`age_error`](Self::age_error)).
+    /// When it was sent, in this host's clock; `None` where that is not known ([`age_error`](Self::age_error)).
     #[must_use]
-    pub const fn sent(&self) -> Time {
+    pub const fn sent(&self) -> Option<Time> {
         self.message.header.known_sent()
     }
 
-    /// Time from sending to `now`, as wrong as [`age_error`](Self::age_error) says. Where it is not known it is 584 years, so that no limit
-    /// takes what may be old for fresh.
+    /// Time from sending to `now`, as wrong as [`age_error`](Self::age_error) says; `None` where it is not known.
     #[must_use]
-    pub const fn age(&self, now: Time) -> Duration {
-        self.message.header.known_age(now)
+    pub const fn age(&self, now: Time) -> Option<Duration> {
+        self.message.header.age(now)
     }
 
-    /// The error of the age at most: zero for what was sent on this host; `None` where the age is not known, because the clock of the
-    /// sender's host was not measured yet, or not for so long that it may be wrong by more than 32 s.
+    /// The error of the age at most: zero for a message of this host. `None` where the age is not known: the clock of the sender's host was
+    /// not measured yet, or not for so long that it may be wrong by more than 32 s.
     #[must_use]
     pub const fn age_error(&self) -> Option<Duration> {
         self.message.header.sent_error()
     }
 
-    /// The greatest age that it can have: `age` and its error; [`Duration::MAX`] where it is not known. For whoever uses only what is young.
+    /// The greatest age that the message can have: `age` and its error; `None` where it is not known.
     #[must_use]
-    pub fn age_at_most(&self, now: Time) -> Duration {
-        self.age_error().map_or(Duration::MAX, |error| self.age(now).saturating_add(error))
+    pub fn age_at_most(&self, now: Time) -> Option<Duration> {
+        self.message.header.age_at_most(now)
+    }
+
+    /// Whether the message may be older than `limit`. An unknown age counts as too old, as a program that may use fresh values only needs it.
+    ///
+    /// ```no_run
+    /// # use std::time::Duration;
+    /// # use sinew::{Endpoint, Time, client::ApiError};
+    /// # sinew::payload!("doc.setpoint", Stream => struct Setpoint { degrees: f32 });
+    /// # fn step(endpoint: &mut Endpoint, setpoint: &mut Option<Setpoint>) -> Result<(), ApiError> {
+    /// while let Some(received) = endpoint.receive(Duration::ZERO)? {
+    ///     if !received.is_older_than(Duration::from_millis(5), Time::now()) {
+    ///         *setpoint = Some(received.decode()?);
+    ///     }
+    /// }
+    /// # Ok(())
+    /// # }
+    /// ```
+    #[must_use]
+    pub fn is_older_than(&self, limit: Duration, now: Time) -> bool {
+        may_be_older(self.age_at_most(now), limit)
     }
 
     /// Whether the sender waits for a [`reply`](super::Endpoint::reply).

@@ -93,6 +93,8 @@ impl Refusals {
             Some(at) => {
                 let known = &mut self.entries[at];
                 known.count = known.count.saturating_add(undelivered.count);
+                let firsts = [known.first_sequence, undelivered.first_sequence];
+                known.first_sequence = firsts.into_iter().flatten().min();
                 known.last_sequence = known.last_sequence.max(undelivered.last_sequence);
             }
             None => self.entries.push(undelivered),
@@ -121,8 +123,8 @@ pub(super) const fn unsent(destination: Tid, why: Rejection, count: u64, since: 
         why,
         count,
         since,
-        first_sequence: 0,
-        last_sequence: 0,
+        first_sequence: None,
+        last_sequence: None,
     }
 }
 
@@ -168,8 +170,8 @@ mod tests {
                 since: count,
                 kind: None,
                 class: None,
-                first: 0,
-                last: 0,
+                first: None,
+                last: None,
                 name: None,
             }],
         }

@@ -14,7 +14,7 @@ use toml::{
 };
 
 use super::{ConfigFault, ConfigFaults, NodeConfig, check::fault, faults::quoted, file::line_of};
-use crate::stores::lock;
+use crate::{nearest::nearest, stores::lock};
 
 /// The key below which all of them are.
 const APP: &str = "app";
@@ -83,7 +83,7 @@ impl AppSettings {
             .file
             .as_ref()
             .map_or_else(|| "the node's file".to_owned(), |file| file.display().to_string());
-        let similar = nearest(name, self.tables.keys().map(String::as_str));
+        let similar = nearest_name(name, self.tables.keys().map(String::as_str));
         let similar =
             similar.map_or_else(String::new, |other| format!("; [{APP}.{other}] is there, is it misspelt?"));
         let key = format!("{APP}.{name}");
@@ -132,7 +132,7 @@ impl AppSettings {
         let mut unread = Vec::new();
         note_unread(&self.tables, "", &claimed, &mut unread);
         let fault = |name: String| {
-            let remedy = nearest(&name, claimed.iter().map(String::as_str)).map_or_else(
+            let remedy = nearest_name(&name, claimed.iter().map(String::as_str)).map_or_else(
                 || "remove it".to_owned(),
                 |nearest| format!("write [{APP}.{nearest}], the nearest, or remove it"),
             );
@@ -168,10 +168,8 @@ fn note_lines(text: &str, above: &str, table: &DeTable<'_>, lines: &mut BTreeMap
 }
 
 /// The most similar of these names, if one is.
-fn nearest<'a>(name: &str, others: impl Iterator<Item = &'a str>) -> Option<String> {
-    let similar = others.map(|other| (strsim::jaro_winkler(name, other), other));
-    let similar = similar.filter(|(similarity, _)| *similarity >= 0.75);
-    similar.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, other)| other.to_owned())
+fn nearest_name<'a>(name: &str, others: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+    nearest(name, others, |other| other).into_iter().next()
 }
 
 impl NodeConfig {

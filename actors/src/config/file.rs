@@ -22,6 +22,7 @@ use super::{
     check::{self, Range, fault},
     faults::quoted,
 };
+use crate::nearest::nearest;
 
 /// Longest configuration file in bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
@@ -238,11 +239,13 @@ impl<'t> Reader<'t> {
     }
 
     fn unknown<S>(&mut self, place: &Spanned<S>, name: &str, known: &[&'static str]) {
-        let nearest = nearest(name, known);
-        let (kind, remedy) = if known == SECTIONS {
-            ("section", format!("write [{nearest}], the nearest section, or remove it"))
-        } else {
-            ("key", format!("write {nearest}, the nearest key, or remove it"))
+        let (kind, remedy) = match (known == SECTIONS, nearest_key(name, known)) {
+            (true, Some(nearest)) => {
+                ("section", format!("write [{nearest}], the nearest section, or remove it"))
+            }
+            (false, Some(nearest)) => ("key", format!("write {nearest}, the nearest key, or remove it")),
+            (true, None) => ("section", "remove it".to_owned()),
+            (false, None) => ("key", "remove it".to_owned()),
         };
         let line = Some(line_of(self.text, &place.span()));
         let key = quoted(name).trim_matches('"').to_owned();
@@ -531,27 +534,12 @@ fn watch_group(table: &DeTable<'_>) -> Option<WatchGroup> {
     is_all.then(|| WatchGroup { nodes, period: Duration::from_millis(period), missed_max })
 }
 
-/// The known name that differs least from `name`. A name without a section is compared with keys without theirs.
-fn nearest(name: &str, known: &[&'static str]) -> &'static str {
-    let distance = |key: &&&'static str| match key.split_once('.') {
-        Some((_, leaf)) if !name.contains('.') => edits(name, leaf),
-        Some(_) | None => edits(name, key),
+/// The known name that is most similar to `name`. A name without a section is compared with keys without theirs.
+fn nearest_key(name: &str, known: &[&'static str]) -> Option<&'static str> {
+    let compared = |key: &&'static str| match key.split_once('.') {
+        Some((_, leaf)) if !name.contains('.') => leaf,
+        Some(_) | None => *key,
     };
-    known.iter().min_by_key(distance).copied().unwrap_or_default()
-}
-
-/// How many letters must be added, removed or replaced to turn `a` into `b` (Levenshtein); of a long `a` its start.
-fn edits(a: &str, b: &str) -> usize {
-    const COMPARED_MAX: usize = 64;
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, from) in a.chars().take(COMPARED_MAX).enumerate() {
-        let mut diagonal = std::mem::replace(&mut row[0], i + 1);
-        for (j, to) in b.iter().enumerate() {
-            let replaced = diagonal + usize::from(from != *to);
-            diagonal = row[j + 1];
-            row[j + 1] = replaced.min(diagonal + 1).min(row[j] + 1);
-        }
-    }
-    row[b.len()]
+    let known = known.iter().map(|key| (compared(key), *key));
+    nearest(name, known, |(compared, _)| compared).first().map(|(_, key)| *key)
 }

@@ -12,12 +12,15 @@ use std::{
 
 use futures_util::{Stream, stream};
 use rustix::io::Errno;
-use sinew_runtime::time::Time;
+use sinew_runtime::{
+    remedy::{Wanted, remedy},
+    time::Time,
+};
 use socket2::{Domain, SockRef, Socket, Type};
 use tokio::net::TcpStream;
 
 use super::lent::Lent;
-use crate::{accept_pace::Pace, bind_error, config::NodeConfig, refusals::Refusals};
+use crate::{accept_pace::Pace, config::NodeConfig, refusals::Refusals};
 
 /// Connections that wait to be accepted at most, at all listeners together; the kernel refuses further ones. Those that 300 nodes make who all
 /// meet this one at once wait here, and are not made again a second later.
@@ -56,9 +59,9 @@ pub(super) fn why_not(config: &NodeConfig, error: &io::Error) -> String {
         "another node or program of this host has this port. Where `ndl.interface` chooses by name, or an IPv6 address, GNCL listens at all \
          addresses of the host, so that each node of one host needs a port of its own, though their addresses differ: set `gncl.port` to a free \
          one (0 takes any), or choose by IPv4 addresses alone"
-            .to_owned()
+            .into()
     } else {
-        bind_error::remedy(error, "gncl.port")
+        remedy(Wanted::Port("gncl.port"), error)
     };
     format!("GNCL cannot listen at {address}: {error}; {remedy}")
 }

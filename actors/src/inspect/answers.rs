@@ -438,7 +438,7 @@ fn seen_message(now: Time, sight: Sight, name: Option<String>) -> SeenMessage {
     let wants = wants.into_iter().find(|(flag, _)| header.flags.has(*flag));
     SeenMessage {
         seen_us: micros(now.since(at)),
-        age_ns: nanos(header.known_age(at)),
+        age_ns: header.age(at).map(nanos),
         age_error_ns: header.sent_error().map(nanos),
         is_sent: way == Way::Out,
         source: header.source,

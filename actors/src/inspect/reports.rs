@@ -401,9 +401,10 @@ payload!("sinew.inspect.watch_report" =>
 pub struct SeenMessage {
     /// Time since then.
     pub seen_us: u64,
-    /// How old it was then, in nanoseconds; 2^64 - 1 where that is not known.
-    pub age_ns: u64,
-    /// The error of that at most: 0 for what was sent on the node's host, `None` where the age is not known.
+    /// How old it was then, in nanoseconds; `None` where that is not known.
+    #[serde(default)]
+    pub age_ns: Option<u64>,
+    /// The error of that at most: 0 for a message of the node's host, `None` where the age is not known.
     #[serde(default)]
     pub age_error_ns: Option<u64>,
     /// Whether the application has sent it; else it was for it.

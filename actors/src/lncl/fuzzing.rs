@@ -28,7 +28,12 @@ pub(crate) fn some_frames() -> Vec<Vec<u8>> {
             &Register { name: Some("hip".to_owned()), ..Register::default() },
         ),
         payload::frame(Kind::LNCL_GROUP, CLIENT, CLIENT, &group),
-        payload::frame(Kind::LNCL_RESOLVE, CLIENT, CLIENT, &Resolve { name: "knee".to_owned() }),
+        payload::frame(
+            Kind::LNCL_RESOLVE,
+            CLIENT,
+            CLIENT,
+            &Resolve { name: "knee".to_owned(), nearest: true },
+        ),
         payload::frame(Kind::LNCL_INTRODUCE, CLIENT, CLIENT, &Introduce { to: CLIENT.bits() }),
         payload::frame(Kind::LNCL_SWITCH, CLIENT, CLIENT, &Switch { peer: CLIENT.bits(), number: 1 }),
         Message::new(Header::new(Kind::OUTCOME, CLIENT, CLIENT), vec![Outcome::Delivered.code()].into()),

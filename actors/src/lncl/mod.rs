@@ -59,7 +59,8 @@ pub(crate) use facts::AppFact;
 pub(crate) use listener::{ListenError, Openers};
 pub(crate) use reader::Reader;
 pub(crate) use registrar::{
-    LocalApp, app_down, app_ready, app_stopped, register_local, resolve, set_member, unregister_local,
+    LocalApp, app_down, app_ready, app_stopped, nearest, register_local, resolve, set_member,
+    unregister_local,
 };
 #[cfg(test)]
 pub(crate) use shares::OF_USER_AT_SYNC;

@@ -7,6 +7,8 @@ use sinew_runtime::{
     wire::{Class, Header, Kind, Message, decode},
 };
 
+use crate::{nearest::NEAREST_MAX, sync::at_most};
+
 /// Longest payload of a connection's first frame, in bytes: enough for the longest lists that are allowed.
 pub(crate) const REGISTER_BYTES_MAX: usize = 24 * 1024;
 
@@ -101,6 +103,9 @@ pub(crate) struct Group {
 pub(crate) struct Resolve {
     /// The name.
     pub(crate) name: String,
+    /// Whether similar names are wanted, where nobody has it.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub(crate) nearest: bool,
 }
 
 /// The TID of a name.
@@ -108,6 +113,13 @@ pub(crate) struct Resolve {
 pub(crate) struct Resolved {
     /// Its 64 bits; none = nobody has the name.
     pub(crate) tid: Option<u64>,
+    /// Similar names, where they were wanted and nobody has it.
+    #[serde(
+        default,
+        skip_serializing_if = "Vec::is_empty",
+        deserialize_with = "at_most::<_, _, NEAREST_MAX>"
+    )]
+    pub(crate) nearest: Vec<String>,
 }
 
 /// Asks for a direct link.
@@ -170,20 +182,15 @@ pub(crate) struct UndeliveredEntry {
     /// Class of the first of them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) class: Option<Class>,
-    /// Lowest sequence of them; 0: not known.
-    #[serde(default, skip_serializing_if = "is_zero")]
-    pub(crate) first: u64,
-    /// Highest sequence of them; 0: not known.
-    #[serde(default, skip_serializing_if = "is_zero")]
-    pub(crate) last: u64,
+    /// Lowest sequence of them, where it is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) first: Option<u64>,
+    /// Highest sequence of them, where it is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) last: Option<u64>,
     /// Name of the destination.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) name: Option<String>,
-}
-
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde calls it with a reference")]
-const fn is_zero(number: &u64) -> bool {
-    *number == 0
 }
 
 /// The TID of the LNCL of `node`.

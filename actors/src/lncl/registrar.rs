@@ -103,6 +103,12 @@ pub(crate) fn resolve(stores: &Stores, name: &str) -> Option<Tid> {
     here.or_else(|| lock(&stores.sync).called(name).into_iter().find(is_elsewhere))
 }
 
+/// Names of applications, on this node or any, that are similar to `name`. They are compared without a lock.
+pub(crate) fn nearest(stores: &Stores, name: &str) -> Vec<String> {
+    let names = lock(&stores.sync).names();
+    crate::nearest::nearest(name, &names, |name| name).into_iter().map(ToString::to_string).collect()
+}
+
 /// Makes `app`, one of the node's own, in it or in a process that it started, a member of `group`, or no longer one. Nothing where none of
 /// these has the address: such a word comes after its application's end, and would be whoever's who gets the address next.
 pub(crate) fn set_member(stores: &Stores, app: AppAddress, group: AppAddress, member: bool) {

@@ -46,7 +46,7 @@ pub(crate) enum Order {
     /// `destination`.
     Tell { destination: Tid, correlation: u64, outcome: Outcome, why: NoMembership },
     /// Tell the client the TID of `name`.
-    Resolve { name: String, correlation: u64 },
+    Resolve { name: String, nearest: bool, correlation: u64 },
     /// Introduce the client to `to`, or tell it why not.
     Introduce { to: Tid, correlation: u64 },
     /// Tell `to`, behind all that the client has sent to it, that the client goes on on their link `number`.
@@ -225,8 +225,8 @@ fn read_outcome(message: &Message) -> Result<Order, Violation> {
 }
 
 fn read_resolve(message: &Message) -> Result<Order, Violation> {
-    let Resolve { name } = read_payload(message)?;
-    Ok(Order::Resolve { name, correlation: message.header.correlation })
+    let Resolve { name, nearest } = read_payload(message)?;
+    Ok(Order::Resolve { name, nearest, correlation: message.header.correlation })
 }
 
 fn read_introduce(message: &Message) -> Result<Order, Violation> {

@@ -388,7 +388,7 @@ fn names_resolve_to_tids() {
     let node = TestNode::start();
     let (mut client, tid) = RawClient::register(&node, &named("hip"));
     for (name, expected) in [("hip", Some(tid.bits())), ("nobody", None)] {
-        let asked = Resolve { name: name.to_owned() };
+        let asked = Resolve { name: name.to_owned(), nearest: false };
         let mut asked = payload::frame(Kind::LNCL_RESOLVE, tid, Tid::NONE, &asked);
         asked.header.correlation = 3;
         client.send(&asked);

@@ -59,7 +59,7 @@ impl Worker {
         let tasks = thread::Builder::new().name(name.to_owned()).spawn(move || work(tasks, &its_queue));
         let tasks = tasks.inspect_err(|cause| {
             let remedy = sinew_runtime::remedy::remedy(sinew_runtime::remedy::Wanted::Thread, cause);
-            crate::log::warn!(%cause, remedy, "there is no thread `{name}`: {without}");
+            crate::log::warn!(%cause, %remedy, "there is no thread `{name}`: {without}");
         });
         Self { tasks: tasks.is_ok().then_some(sender), queue }
     }

@@ -25,7 +25,7 @@ use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, WrapFutur
 use futures_util::{StreamExt as _, stream::FuturesUnordered};
 use sinew_runtime::{
     alarm::Alarm,
-    remedy::{Wanted, remedy},
+    remedy::{Wanted, may_come_later, remedy},
     supervision::ReadyGate,
     tid::{Incarnation, NodeAddress},
     time::Time,
@@ -49,7 +49,7 @@ use super::{
     progress::{Progress, RootWatch},
 };
 use crate::{
-    aftermath, bind_error,
+    aftermath,
     config::NodeConfig,
     gncl, node,
     refusals::Refusals,
@@ -187,9 +187,9 @@ impl Shell {
         let addresses: Vec<_> = chosen.addresses().map(LocalAddress::from).collect();
         let (readers, unopened) = paths.open(&stores, &addresses);
         // An address that this host does not have may come later; of several each may be opened later, whatever the error.
-        let is_final = |error: &io::Error| chosen.iter().count() == 1 && !bind_error::may_come_later(error);
+        let is_final = |error: &io::Error| chosen.iter().count() == 1 && !may_come_later(error);
         if let Some((_, error)) = unopened.first().filter(|(_, error)| is_final(error)) {
-            let remedy = bind_error::remedy(error, "ndl.port");
+            let remedy = remedy(Wanted::Port("ndl.port"), error);
             return Err(format!("NDL cannot use UDP {chosen}:{port}: {error}; {remedy}"));
         }
         // Before the core is looked at: what GNCL changes from now on is in NDL's post.

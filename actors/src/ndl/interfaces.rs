@@ -188,7 +188,7 @@ fn follow(chosen: &Interfaces, tell: &watch::Sender<Usable>) {
                 has_failed = true;
                 crate::log::warn!(
                     %error,
-                    remedy = remedy(Wanted::Descriptor, &error),
+                    remedy = %remedy(Wanted::Descriptor, &error),
                     "NDL cannot see this host's interfaces; what was known of them holds, and it looks again each second. \
                      Where that goes on, choose interfaces by their addresses in `ndl.interface`"
                 );

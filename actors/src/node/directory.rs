@@ -18,6 +18,10 @@ impl Directory for NodeDirectory {
         lncl::resolve(&self.0, name)
     }
 
+    fn nearest(&self, name: &str) -> Vec<String> {
+        lncl::nearest(&self.0, name)
+    }
+
     fn monitor(&self, watcher: AppAddress, target: Tid) -> Result<MonitorId, MonitorError> {
         monitors::change(&self.0, |core| core.monitor(Time::now(), watcher, target))
     }

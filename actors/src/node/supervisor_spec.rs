@@ -23,7 +23,7 @@ use crate::sync;
 /// ```
 /// use sinew::prelude::*;
 ///
-/// payload!("demo.angle" => struct Angle { degrees: f32 });
+/// payload!("demo.angle", Stream => struct Angle { degrees: f32 });
 ///
 /// struct Motor;
 /// struct Controller;

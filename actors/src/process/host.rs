@@ -69,7 +69,7 @@ pub(super) fn host(config: &NodeConfig, apps: Vec<DynApp>, hosting: Hosting) -> 
         Ok(Err(_)) => 1,
         Err(error) => {
             let remedy = remedy(Wanted::Thread, &error);
-            log::error!(name, %error, remedy, "no thread for this application");
+            log::error!(name, %error, %remedy, "no thread for this application");
             log::print(format!("no thread for '{name}': {error}; {remedy}"));
             1
         }
@@ -202,7 +202,7 @@ impl Beats {
         match thread.spawn(beats) {
             Ok(_) => {}
             Err(error) if beat.is_none() => {
-                log::warn!(%error, remedy = remedy(Wanted::Thread, &error), "no thread says whether this application stalls");
+                log::warn!(%error, remedy = %remedy(Wanted::Thread, &error), "no thread says whether this application stalls");
             }
             Err(error) => {
                 let why =

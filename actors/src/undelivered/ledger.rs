@@ -29,15 +29,16 @@ pub(crate) struct Entry {
     pub(crate) why: Rejection,
     pub(crate) count: u64,
     pub(crate) since: Time,
-    /// Lowest and highest sequence; 0 where it is not known.
-    pub(crate) first: u64,
-    pub(crate) last: u64,
+    /// Lowest and highest sequence, where they are known.
+    pub(crate) first: Option<u64>,
+    pub(crate) last: Option<u64>,
 }
 
 impl Entry {
     /// `count` messages with this header, refused at `now`.
     pub(crate) const fn of(header: &Header, why: Rejection, count: u64, now: Time) -> Self {
         let Header { source, destination, kind, class, sequence, .. } = *header;
+        let sequence = if sequence == 0 { None } else { Some(sequence) };
         Self {
             source: source.app,
             destination,
@@ -57,14 +58,13 @@ impl Entry {
     }
 
     fn without_destination(self) -> Self {
-        Self { destination: Tid::NONE, kind: None, class: None, first: 0, last: 0, ..self }
+        Self { destination: Tid::NONE, kind: None, class: None, first: None, last: None, ..self }
     }
 
     fn add(&mut self, other: &Self) {
         self.count = self.count.saturating_add(other.count);
         self.since = self.since.min(other.since);
-        let sequences = [self.first, other.first].into_iter().filter(|sequence| *sequence > 0);
-        self.first = sequences.min().unwrap_or(0);
+        self.first = [self.first, other.first].into_iter().flatten().min();
         self.last = self.last.max(other.last);
     }
 }
@@ -171,13 +171,13 @@ mod tests {
             first,
             Entry { why: Rejection::NoSuchApplication, ..first },
             Entry { kind: Some(Kind::named("demo.torque")), ..first },
-            Entry { first: 5, last: 9, ..first },
+            Entry { first: Some(5), last: Some(9), ..first },
         ] {
             ledger.add(entry);
         }
         let taken = ledger.take(at(0), usize::MAX);
         assert_eq!(taken.iter().map(|entry| entry.count).collect::<Vec<_>>(), [2, 1, 1]);
-        assert_eq!((taken[0].first, taken[0].last), (5, 9));
+        assert_eq!((taken[0].first, taken[0].last), (Some(5), Some(9)));
     }
 
     #[test]

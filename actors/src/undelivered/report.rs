@@ -46,9 +46,9 @@ pub(crate) struct Reported {
     #[serde(default)]
     class: Option<Class>,
     #[serde(default)]
-    first: u64,
+    first: Option<u64>,
     #[serde(default)]
-    last: u64,
+    last: Option<u64>,
 }
 
 impl Report {
@@ -174,8 +174,8 @@ fn tell_client(stores: &Stores, now: Time, app: AppAddress, entries: Vec<Entry>,
             since: event.since.as_nanos(),
             kind: None,
             class: None,
-            first: 0,
-            last: 0,
+            first: None,
+            last: None,
             name: None,
         };
         if form == Form::Whole {
@@ -309,7 +309,7 @@ mod tests {
 
     fn said(from: AppAddress, to: Tid, count: u64) -> Reported {
         let why = Outcome::Rejected(Rejection::UnknownKind).code();
-        Reported { from, to: to.bits(), why, count, kind: None, class: None, first: 0, last: 0 }
+        Reported { from, to: to.bits(), why, count, kind: None, class: None, first: None, last: None }
     }
 
     // spec: GNCL-20
@@ -361,12 +361,18 @@ mod tests {
             since: u64::MAX,
             kind: Some(Kind::named("a")),
             class: Some(Class::Control),
-            first: u64::MAX,
-            last: u64::MAX,
+            first: Some(u64::MAX),
+            last: Some(u64::MAX),
             name: Some("x".repeat(63)),
         };
-        let short =
-            || payload::UndeliveredEntry { kind: None, class: None, first: 0, last: 0, name: None, ..long() };
+        let short = || payload::UndeliveredEntry {
+            kind: None,
+            class: None,
+            first: None,
+            last: None,
+            name: None,
+            ..long()
+        };
         for entries in [0, 1, 15, 16, 27] {
             let bytes = |entry: &dyn Fn() -> payload::UndeliveredEntry| {
                 encode(&payload::Undelivered { entries: (0..entries).map(|_| entry()).collect() }).len()

@@ -733,13 +733,13 @@ typedef struct sinew_received {
      */
     uint64_t sequence;
     /**
-     * When it was sent, on the clock of `sinew_now_ns`, as wrong as `sent_error_ns` says; 0: nobody has measured the clock of the sender's host
-     * yet, or not well enough (32 s).
+     * When it was sent, on the clock of `sinew_now_ns`, as wrong as `sent_error_ns` says. It has a meaning if `is_sent_known` alone. For an age
+     * take `sinew_age`, `sinew_age_at_most` or `sinew_is_older_than`.
      */
     uint64_t sent_ns;
     /**
-     * The error of `sent_ns` at most: 0 for what was sent on this host, `UINT64_MAX` where `sent_ns` is 0. It grows while nothing is heard of the
-     * clock of the sender's host. Whoever uses only what is young adds it to the age.
+     * The error of `sent_ns` at most, if `is_sent_known`: 0 for a message of this host. It grows while the clock of the sender's host is not
+     * measured.
      */
     uint64_t sent_error_ns;
     /**
@@ -759,9 +759,13 @@ typedef struct sinew_received {
      */
     bool wants_reply;
     /**
+     * Whether `sent_ns` is known. Not, while the clock of the sender's host is not measured, or may be wrong by more than 32 s.
+     */
+    bool is_sent_known;
+    /**
      * Zero.
      */
-    uint8_t reserved[2];
+    uint8_t reserved;
 } sinew_received;
 
 /**
@@ -781,11 +785,11 @@ typedef struct sinew_undelivered {
      */
     uint64_t since_ns;
     /**
-     * Lowest sequence of these messages; 0 where it is not known.
+     * Lowest sequence of these messages, if `are_sequences_known`.
      */
     uint64_t first_sequence;
     /**
-     * Highest sequence of these messages; 0 where it is not known.
+     * Highest sequence of these messages, if `are_sequences_known`.
      */
     uint64_t last_sequence;
     /**
@@ -804,6 +808,14 @@ typedef struct sinew_undelivered {
      * Name of the destination, of at most 63 bytes, with a zero behind it; empty where it is not known.
      */
     char name[64];
+    /**
+     * Whether `first_sequence` and `last_sequence` are known.
+     */
+    bool are_sequences_known;
+    /**
+     * Zero.
+     */
+    uint8_t reserved[7];
 } sinew_undelivered;
 
 /**
@@ -860,7 +872,8 @@ typedef struct sinew_layout {
 } sinew_layout;
 
 /**
- * A type of payloads: its name, the class in which it is sent, and its fields. C: `SINEW_PAYLOAD`.
+ * A type of payloads: its name, the class in which it is sent, its fields, and its time to live. C: `SINEW_PAYLOAD`,
+ * `SINEW_PAYLOAD_EXPIRING`.
  */
 typedef struct sinew_payload_type {
     /**
@@ -875,6 +888,11 @@ typedef struct sinew_payload_type {
      * Its fields.
      */
     struct sinew_layout layout;
+    /**
+     * Time to live: a message that is older expires where it waits, and is not received. 0: it has none. At most 71 minutes and 35 s: more
+     * counts as that.
+     */
+    uint64_t expires_after_ns;
 } sinew_payload_type;
 
 /**
@@ -1165,6 +1183,15 @@ sinew_status sinew_discard_message(struct sinew_endpoint *endpoint,
                                    struct sinew_message *message);
 
 /**
+ * Has a message that is being made expire where it waits when it is older than `time_ns`, instead of its type's time to live. An unconfirmed message
+ * without one waits for ever; a confirmed one and a request live no longer than they are waited for. At most 71 minutes and 35 s: more counts
+ * as that. 0 is `SINEW_ERROR_INVALID_ARGUMENT`. Does not block. The endpoint's thread.
+ */
+sinew_status sinew_expires_after(struct sinew_endpoint *endpoint,
+                                 const struct sinew_message *message,
+                                 uint64_t time_ns);
+
+/**
  * Sends a message (the paper's SendMessage). What becomes of it then is not told. The message is gone when this returns, sent
  * or not: see Messages at the top. Blocks while there is no room and nothing is taken, for the `stall_timeout_ns` of the options.
  * The endpoint's thread.
@@ -1286,6 +1313,27 @@ sinew_status sinew_next_undelivered(struct sinew_endpoint *endpoint,
                                     struct sinew_undelivered *undelivered);
 
 /**
+ * Gives the time since a message was sent, as wrong as its `sent_error_ns` says. Returns whether that is known, and leaves `*age_ns` as it is where
+ * it is not: the clock of the sender's host is not measured yet, or may be wrong by more than 32 s. Any thread.
+ */
+bool sinew_age(const struct sinew_received *received,
+               uint64_t *age_ns);
+
+/**
+ * Gives the greatest age that a message can have: its age and the error of that. Returns whether that is known, and leaves `*age_ns` as it is
+ * where it is not. Any thread.
+ */
+bool sinew_age_at_most(const struct sinew_received *received,
+                       uint64_t *age_ns);
+
+/**
+ * Whether a message may be older than `limit_ns`: for a program that may use fresh values only. An unknown age counts as too old, and so does
+ * NULL. Any thread.
+ */
+bool sinew_is_older_than(const struct sinew_received *received,
+                         uint64_t limit_ns);
+
+/**
  * Says what became of a message in hand, which its sender is told if it asked, and gives its memory back. `outcome` is
  * `SINEW_DELIVERED` if it was handled, `SINEW_FAILED`, or one of the rejections. `*received` is all zeros then; after
  * an error it is still in hand. The endpoint's thread. Does not block.
@@ -1295,7 +1343,7 @@ sinew_status sinew_settle_message(struct sinew_endpoint *endpoint,
                                   int32_t outcome);
 
 /**
- * Creates a message with a typed value: `*value` is a struct of this type. Its class is the type's, its bytes are MessagePack with the
+ * Creates a message with a typed value: `*value` is a struct of this type. Its class and its time to live are the type's, its bytes are MessagePack with the
  * names of the fields, which Rust reads as the `payload!` of the same name. Hand it to any function that sends, as one of
  * `sinew_create_message`. `SINEW_ERROR_INVALID_ARGUMENT` with the field's name where the value cannot be written: a text that is
  * not UTF-8, a count above the array. Does not block. The endpoint's thread.
@@ -1564,7 +1612,9 @@ static inline sinew_text sinew_text_of(const char *string)
 /** The table of a struct. */
 #define SINEW_LAYOUT(type, fields) { fields, sizeof(fields) / sizeof(fields)[0], sizeof(type) }
 /** A type of payloads: its name as a literal, its class, its struct, and the array of its fields. */
-#define SINEW_PAYLOAD(name, message_class, type, fields) { { "" name, sizeof(name) - 1 }, message_class, SINEW_LAYOUT(type, fields) }
+#define SINEW_PAYLOAD(name, message_class, type, fields) SINEW_PAYLOAD_EXPIRING(name, message_class, 0, type, fields)
+/** The same with a time to live in nanoseconds: a message that is older expires where it waits. */
+#define SINEW_PAYLOAD_EXPIRING(name, message_class, expires_after_ns, type, fields) { { "" name, sizeof(name) - 1 }, message_class, SINEW_LAYOUT(type, fields), expires_after_ns }
 
 #endif
 

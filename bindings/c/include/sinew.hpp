@@ -69,6 +69,12 @@ inline std::uint64_t nanoseconds(duration within) noexcept
     return within.count() < 0 ? 0 : static_cast<std::uint64_t>(within.count());
 }
 
+inline duration time(std::uint64_t nanoseconds) noexcept
+{
+    constexpr auto most = static_cast<std::uint64_t>(duration::max().count());
+    return duration(static_cast<std::int64_t>(nanoseconds < most ? nanoseconds : most));
+}
+
 } // namespace detail
 
 /// The kind of the payload type called `name`.
@@ -175,6 +181,12 @@ public:
 
     std::uint8_t *data() noexcept { return raw_.bytes; }
     std::size_t size() const noexcept { return raw_.length; }
+    /// Has it expire where it waits when it is older than this, instead of its type's time to live: `drive.send(drive.create(to, value).expires_after(20ms))`.
+    message &&expires_after(duration time) &&
+    {
+        detail::check(sinew_expires_after(endpoint_, &raw_, detail::nanoseconds(time)));
+        return std::move(*this);
+    }
     std::uint8_t *begin() noexcept { return data(); }
     std::uint8_t *end() noexcept { return data() + size(); }
 
@@ -217,26 +229,17 @@ public:
     sinew::kind kind() const noexcept { return raw_.kind; }
     std::uint64_t sequence() const noexcept { return raw_.sequence; }
     bool wants_reply() const noexcept { return raw_.wants_reply; }
-    /// Time since it was sent, as wrong as age_error() says; `duration::max()` while nobody has measured the clock of the sender's host, or it is known too badly.
-    duration age() const noexcept
+    /// Time since it was sent, as wrong as age_error() says; nothing while the clock of the sender's host is not measured, or is known too badly.
+    std::optional<duration> age() const noexcept { return age_of(sinew_age); }
+    /// The error of the age at most: none for a message of this host, nothing where the age is not known.
+    std::optional<duration> age_error() const noexcept
     {
-        if (raw_.sent_ns == 0)
-            return duration::max();
-        const std::uint64_t now = sinew_now_ns();
-        return duration(now > raw_.sent_ns ? static_cast<std::int64_t>(now - raw_.sent_ns) : 0);
+        return raw_.is_sent_known ? std::optional(detail::time(raw_.sent_error_ns)) : std::nullopt;
     }
-    /// The error of the age at most: none for what was sent on this host, `duration::max()` where the age is not known.
-    duration age_error() const noexcept
-    {
-        constexpr auto most = static_cast<std::uint64_t>(duration::max().count());
-        return raw_.sent_error_ns < most ? duration(static_cast<std::int64_t>(raw_.sent_error_ns)) : duration::max();
-    }
-    /// The greatest age that it can have, for a loop that uses only what is young; `duration::max()` where that is not known.
-    duration age_at_most() const noexcept
-    {
-        const duration known = age(), error = age_error();
-        return error < duration::max() - known ? known + error : duration::max();
-    }
+    /// The greatest age that it can have; nothing where that is not known.
+    std::optional<duration> age_at_most() const noexcept { return age_of(sinew_age_at_most); }
+    /// Whether it may be older than this: for a loop that may use fresh values only. An unknown age counts as too old.
+    bool is_older_than(duration limit) const noexcept { return sinew_is_older_than(&raw_, detail::nanoseconds(limit)); }
 
     /// The payload as a value of a type that SINEW_PAYLOAD describes; nothing if the message is of another kind. One that cannot be read throws
     /// SINEW_ERROR_MALFORMED with the field's name. Of any other struct: its bytes; nothing if it has another size.
@@ -261,6 +264,11 @@ public:
 
 private:
     friend class endpoint;
+    std::optional<duration> age_of(bool (*how)(const sinew_received *, std::uint64_t *)) const noexcept
+    {
+        std::uint64_t age_ns = 0;
+        return how(&raw_, &age_ns) ? std::optional(detail::time(age_ns)) : std::nullopt;
+    }
     explicit received(sinew_endpoint *endpoint) noexcept : endpoint_(endpoint), raw_{} {}
 
     sinew_endpoint *endpoint_;
@@ -598,12 +606,15 @@ private:
 /// Describes a struct as a type of payloads: SINEW_PAYLOAD(torque, "knee.torque", SINEW_STREAM, newton_metres, number). At file scope, outside of
 /// all namespaces. It is sent as MessagePack with the names of its fields, which Rust reads as the `payload!` of the same name. Fields, 32 at most:
 /// bool, numbers, enums, text (an array of char that ends with a zero), structs with SINEW_STRUCT, and arrays of these but text.
-#define SINEW_PAYLOAD(T, NAME, CLASS, ...) \
+#define SINEW_PAYLOAD(T, NAME, CLASS, ...) SINEW_PAYLOAD_EXPIRING(T, NAME, CLASS, sinew::duration{}, __VA_ARGS__)
+/// The same with a time to live: SINEW_PAYLOAD_EXPIRING(torque, "knee.torque", SINEW_STREAM, std::chrono::milliseconds(20), newton_metres). A message that is
+/// older expires where it waits.
+#define SINEW_PAYLOAD_EXPIRING(T, NAME, CLASS, EXPIRES_AFTER, ...) \
     SINEW_STRUCT(T, __VA_ARGS__) \
     template <> struct sinew::payload_of<T> { \
         static const sinew_payload_type &get() \
         { \
-            static const sinew_payload_type type = {sinew::detail::text(NAME), CLASS, sinew::layout_of<T>::get()}; \
+            static const sinew_payload_type type = {sinew::detail::text(NAME), CLASS, sinew::layout_of<T>::get(), sinew::detail::nanoseconds(EXPIRES_AFTER)}; \
             return type; \
         } \
     };

@@ -2,7 +2,7 @@
 
 use std::{ffi::c_char, time::Duration};
 
-use sinew::{Class, Tid};
+use sinew::{Class, Tid, Time};
 
 use crate::words::code_of as outcome_code;
 
@@ -61,11 +61,11 @@ pub struct Received {
     pub destination: TidBits,
     /// The source's n-th message, from 1.
     pub sequence: u64,
-    /// When it was sent, on the clock of `sinew_now_ns`, as wrong as `sent_error_ns` says; 0: nobody has measured the clock of the sender's host
-    /// yet, or not well enough (32 s).
+    /// When it was sent, on the clock of `sinew_now_ns`, as wrong as `sent_error_ns` says. It has a meaning if `is_sent_known` alone. For an age
+    /// take `sinew_age`, `sinew_age_at_most` or `sinew_is_older_than`.
     pub sent_ns: u64,
-    /// The error of `sent_ns` at most: 0 for what was sent on this host, `UINT64_MAX` where `sent_ns` is 0. It grows while nothing is heard of the
-    /// clock of the sender's host. Whoever uses only what is young adds it to the age.
+    /// The error of `sent_ns` at most, if `is_sent_known`: 0 for a message of this host. It grows while the clock of the sender's host is not
+    /// measured.
     pub sent_error_ns: u64,
     /// For the library: by this it knows the message again.
     pub token: u64,
@@ -75,8 +75,10 @@ pub struct Received {
     pub message_class: u8,
     /// Whether the sender waits for `sinew_reply`.
     pub wants_reply: bool,
+    /// Whether `sent_ns` is known. Not, while the clock of the sender's host is not measured, or may be wrong by more than 32 s.
+    pub is_sent_known: bool,
     /// Zero.
-    pub reserved: [u8; 2],
+    pub reserved: u8,
 }
 
 /// Unconfirmed messages to one destination, of one type, that were not delivered for one reason.
@@ -89,9 +91,9 @@ pub struct Undelivered {
     pub count: u64,
     /// When the first of these was refused, on the clock of `sinew_now_ns`.
     pub since_ns: u64,
-    /// Lowest sequence of these messages; 0 where it is not known.
+    /// Lowest sequence of these messages, if `are_sequences_known`.
     pub first_sequence: u64,
-    /// Highest sequence of these messages; 0 where it is not known.
+    /// Highest sequence of these messages, if `are_sequences_known`.
     pub last_sequence: u64,
     /// Reason: one of `sinew_outcome`. `SINEW_REJECTED_UNKNOWN_KIND`: the destination does not handle this type.
     pub outcome: i32,
@@ -101,6 +103,10 @@ pub struct Undelivered {
     pub message_class: i32,
     /// Name of the destination, of at most 63 bytes, with a zero behind it; empty where it is not known.
     pub name: [c_char; 64],
+    /// Whether `first_sequence` and `last_sequence` are known.
+    pub are_sequences_known: bool,
+    /// Zero.
+    pub reserved: [u8; 7],
 }
 
 /// What became of a message to many at one of its members.
@@ -127,7 +133,7 @@ impl Message {
 }
 
 /// Whole nanoseconds; more than 584 years count as that.
-fn nanos(time: Duration) -> u64 {
+pub(crate) fn nanos(time: Duration) -> u64 {
     u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
 }
 
@@ -145,24 +151,39 @@ impl Received {
         kind: 0,
         message_class: 0,
         wants_reply: false,
-        reserved: [0; 2],
+        is_sent_known: false,
+        reserved: 0,
     };
 
     pub(crate) fn of(received: &sinew::client::Received, token: u64) -> Self {
+        let sent = received.sent().zip(received.age_error());
+        // Where it is not known these are as old as can be, to whoever does not ask.
+        let (sent_ns, sent_error_ns) = sent.map_or((0, 0), |(sent, error)| (sent.as_nanos(), nanos(error)));
         Self {
             bytes: received.bytes().as_ptr(),
             length: received.bytes().len(),
             source: received.source().bits(),
             destination: received.destination().bits(),
             sequence: received.sequence(),
-            sent_ns: received.sent().as_nanos(),
-            sent_error_ns: received.age_error().map_or(u64::MAX, nanos),
+            sent_ns,
+            sent_error_ns,
             token,
             kind: received.kind().bits(),
             message_class: code_of(received.class()),
             wants_reply: received.wants_reply(),
-            reserved: [0; 2],
+            is_sent_known: sent.is_some(),
+            reserved: 0,
         }
+    }
+
+    /// Time from sending to `now`; `None` where it is not known.
+    pub(crate) fn age(&self, now: Time) -> Option<Duration> {
+        self.is_sent_known.then(|| now.since(Time::from_nanos(self.sent_ns)))
+    }
+
+    /// The greatest age that it can have; `None` where it is not known.
+    pub(crate) fn age_at_most(&self, now: Time) -> Option<Duration> {
+        Some(self.age(now)?.saturating_add(Duration::from_nanos(self.sent_error_ns)))
     }
 }
 
@@ -172,12 +193,14 @@ impl Undelivered {
             destination: undelivered.destination.bits(),
             count: undelivered.count,
             since_ns: undelivered.since.as_nanos(),
-            first_sequence: undelivered.first_sequence,
-            last_sequence: undelivered.last_sequence,
+            first_sequence: undelivered.first_sequence.unwrap_or(0),
+            last_sequence: undelivered.last_sequence.unwrap_or(0),
             outcome: outcome_code(sinew::Outcome::Rejected(undelivered.why)) as i32,
             kind: undelivered.kind.map_or(0, sinew::message::Kind::bits),
             message_class: undelivered.class.map_or(-1, |class| i32::from(code_of(class))),
             name: name_in_c(undelivered.name.as_deref().unwrap_or_default()),
+            are_sequences_known: undelivered.first_sequence.is_some(),
+            reserved: [0; 7],
         }
     }
 }

@@ -112,7 +112,8 @@ pub struct Layout {
     pub size: usize,
 }
 
-/// A type of payloads: its name, the class in which it is sent, and its fields. C: `SINEW_PAYLOAD`.
+/// A type of payloads: its name, the class in which it is sent, its fields, and its time to live. C: `SINEW_PAYLOAD`,
+/// `SINEW_PAYLOAD_EXPIRING`.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct PayloadType {
@@ -122,6 +123,9 @@ pub struct PayloadType {
     pub message_class: i32,
     /// Its fields.
     pub layout: Layout,
+    /// Time to live: a message that is older expires where it waits, and is not received. 0: it has none. At most 71 minutes and 35 s: more
+    /// counts as that.
+    pub expires_after_ns: u64,
 }
 
 impl Layout {
@@ -220,7 +224,7 @@ fn check_depth(depth: usize) -> Result<(), Fault> {
     Err(Fault::argument(format!("structs are nested deeper than {DEPTH_MAX}")))
 }
 
-/// Creates a message with a typed value: `*value` is a struct of this type. Its class is the type's, its bytes are MessagePack with the
+/// Creates a message with a typed value: `*value` is a struct of this type. Its class and its time to live are the type's, its bytes are MessagePack with the
 /// names of the fields, which Rust reads as the `payload!` of the same name. Hand it to any function that sends, as one of
 /// `sinew_create_message`. `SINEW_ERROR_INVALID_ARGUMENT` with the field's name where the value cannot be written: a text that is
 /// not UTF-8, a count above the array. Does not block. The endpoint's thread.
@@ -239,9 +243,15 @@ pub extern "C" fn sinew_create_value(
         let (kind, length) = (payload_type.kind()?, encode::length(&payload_type.layout, value)?);
         let destination = Tid::from_bits(destination);
         let created = with(endpoint, |session| {
-            session.create_with((destination, kind, payload_type.message_class), length, |bytes| {
-                encode::write(&payload_type.layout, value, bytes).map(|_| ())
-            })
+            let created =
+                session.create_with((destination, kind, payload_type.message_class), length, |bytes| {
+                    encode::write(&payload_type.layout, value, bytes).map(|_| ())
+                })?;
+            match payload_type.expires_after_ns {
+                0 => {}
+                time => session.set_expires_after(&created, time)?,
+            }
+            Ok(created)
         })?;
         Ok(write(message, created))
     })

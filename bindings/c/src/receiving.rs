@@ -2,9 +2,11 @@
 
 use std::{mem::MaybeUninit, time::Duration};
 
+use sinew::Time;
+
 use crate::{
-    border::{call, present, write},
-    message::{Endpoint, Received, Undelivered},
+    border::{call, present, value, write},
+    message::{Endpoint, Received, Undelivered, nanos},
     registration::with,
     status::{Fault, Status},
     words::outcome_of,
@@ -51,6 +53,40 @@ pub extern "C" fn sinew_next_undelivered(
     })
 }
 
+/// Gives the time since a message was sent, as wrong as its `sent_error_ns` says. Returns whether that is known, and leaves `*age_ns` as it is where
+/// it is not: the clock of the sender's host is not measured yet, or may be wrong by more than 32 s. Any thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_age(received: Option<&Received>, age_ns: Option<&mut MaybeUninit<u64>>) -> bool {
+    value(false, || Ok(give_age(present(received, "received")?.age(Time::now()), present(age_ns, "age_ns")?)))
+}
+
+/// Gives the greatest age that a message can have: its age and the error of that. Returns whether that is known, and leaves `*age_ns` as it is
+/// where it is not. Any thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_age_at_most(
+    received: Option<&Received>,
+    age_ns: Option<&mut MaybeUninit<u64>>,
+) -> bool {
+    value(false, || {
+        let age = present(received, "received")?.age_at_most(Time::now());
+        Ok(give_age(age, present(age_ns, "age_ns")?))
+    })
+}
+
+/// Whether a message may be older than `limit_ns`: for a program that may use fresh values only. An unknown age counts as too old, and so does
+/// NULL. Any thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_is_older_than(received: Option<&Received>, limit_ns: u64) -> bool {
+    value(true, || {
+        let age = present(received, "received")?.age_at_most(Time::now());
+        Ok(age.is_none_or(|age| age > Duration::from_nanos(limit_ns)))
+    })
+}
+
+fn give_age(age: Option<Duration>, age_ns: &mut MaybeUninit<u64>) -> bool {
+    age.map(|age| age_ns.write(nanos(age))).is_some()
+}
+
 /// Says what became of a message in hand, which its sender is told if it asked, and gives its memory back. `outcome` is
 /// `SINEW_DELIVERED` if it was handled, `SINEW_FAILED`, or one of the rejections. `*received` is all zeros then; after
 /// an error it is still in hand. The endpoint's thread. Does not block.
@@ -66,4 +102,40 @@ pub extern "C" fn sinew_settle_message(
             .ok_or_else(|| Fault::argument(format!("`outcome` is {outcome}: take one of sinew_outcome")))?;
         with(endpoint, |session| session.settle(received, outcome)).map(|()| Status::SinewOk)
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ages(received: &Received) -> (Option<u64>, Option<u64>) {
+        let of = |how: extern "C" fn(Option<&Received>, Option<&mut MaybeUninit<u64>>) -> bool| {
+            let mut age_ns = MaybeUninit::new(7);
+            let is_known = how(Some(received), Some(&mut age_ns));
+            // SAFETY: it was made with a value.
+            let age_ns = unsafe { age_ns.assume_init() };
+            assert!(is_known || age_ns == 7, "it is left as it was");
+            is_known.then_some(age_ns)
+        };
+        (of(sinew_age), of(sinew_age_at_most))
+    }
+
+    #[test]
+    fn an_age_that_is_not_known_is_no_number_and_counts_as_too_old() {
+        assert_eq!(ages(&Received::GONE), (None, None));
+        assert!(sinew_is_older_than(Some(&Received::GONE), u64::MAX));
+        assert!(sinew_is_older_than(None, u64::MAX));
+        assert!(!sinew_age(None, None) && !sinew_age_at_most(Some(&Received::GONE), None));
+    }
+
+    #[test]
+    fn an_age_is_known_with_its_error() {
+        let sent_ns = Time::now().as_nanos();
+        let received =
+            Received { sent_ns, sent_error_ns: 1_000_000_000, is_sent_known: true, ..Received::GONE };
+        let (age, at_most) = ages(&received);
+        assert!(age.is_some() && at_most >= Some(1_000_000_000));
+        assert!(sinew_is_older_than(Some(&received), 999_999_999));
+        assert!(!sinew_is_older_than(Some(&received), u64::MAX));
+    }
 }

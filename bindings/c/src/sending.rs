@@ -49,6 +49,21 @@ pub extern "C" fn sinew_discard_message(endpoint: *mut Endpoint, message: Option
     })
 }
 
+/// Has a message that is being made expire where it waits when it is older than `time_ns`, instead of its type's time to live. An unconfirmed message
+/// without one waits for ever; a confirmed one and a request live no longer than they are waited for. At most 71 minutes and 35 s: more counts
+/// as that. 0 is `SINEW_ERROR_INVALID_ARGUMENT`. Does not block. The endpoint's thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_expires_after(
+    endpoint: *mut Endpoint,
+    message: Option<&Message>,
+    time_ns: u64,
+) -> Status {
+    call(|| {
+        let message = present(message, "message")?;
+        with(endpoint, |session| session.set_expires_after(message, time_ns)).map(|()| Status::SinewOk)
+    })
+}
+
 /// Sends a message (the paper's SendMessage). What becomes of it then is not told. The message is gone when this returns, sent
 /// or not: see Messages at the top. Blocks while there is no room and nothing is taken, for the `stall_timeout_ns` of the options.
 /// The endpoint's thread.

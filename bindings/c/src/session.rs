@@ -102,6 +102,17 @@ impl Session {
         }
     }
 
+    /// Has a message that is being made expire where it waits when it is older than this.
+    pub(crate) fn set_expires_after(&mut self, message: &Message, time_ns: u64) -> Result<(), Fault> {
+        if time_ns == 0 {
+            let sentence = "the time to live is 0, so that no message would arrive; for a message that does not expire do not set one";
+            return Err(Fault::argument(sentence));
+        }
+        let buffer = self.made.get_mut(message.token).ok_or_else(|| no_such("the message"))?;
+        buffer.set_expires_after(Duration::from_nanos(time_ns));
+        Ok(())
+    }
+
     /// Copies a payload into a message of the same length.
     pub(crate) fn fill(&mut self, message: &Message, payload: &[u8]) {
         if let Some(buffer) = self.made.get_mut(message.token) {

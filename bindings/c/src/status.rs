@@ -232,7 +232,7 @@ impl From<ApiError> for Fault {
             ApiError::NotYours(_)
             | ApiError::ToMany(_)
             | ApiError::NotSealed(_)
-            | ApiError::UnknownName(_) => Status::SinewErrorInvalidArgument,
+            | ApiError::UnknownName { .. } => Status::SinewErrorInvalidArgument,
         };
         Self::new(status, sentence)
     }
@@ -274,7 +274,7 @@ fn in_c(error: &ApiError) -> String {
         | ApiError::TooLong { .. }
         | ApiError::TooManyGroups
         | ApiError::NotSealed(_)
-        | ApiError::UnknownName(_)
+        | ApiError::UnknownName { .. }
         | ApiError::NoReply(_)
         | ApiError::OthersRequest(_)
         | ApiError::Malformed(_)

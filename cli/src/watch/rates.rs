@@ -24,7 +24,7 @@ struct Kind {
     /// Those of them whose age is known.
     aged: u64,
     age_sum_ns: u128,
-    age_max_ns: u64,
+    age_max_ns: Option<u64>,
     refused: u64,
 }
 
@@ -44,10 +44,10 @@ impl Rates {
         let kind = self.kinds.entry(key).or_default();
         kind.count += 1;
         kind.bytes += message.length;
-        if message.age_error_ns.is_some() {
+        if let Some(age_ns) = message.age_ns {
             kind.aged += 1;
-            kind.age_sum_ns += u128::from(message.age_ns);
-            kind.age_max_ns = kind.age_max_ns.max(message.age_ns);
+            kind.age_sum_ns += u128::from(age_ns);
+            kind.age_max_ns = kind.age_max_ns.max(Some(age_ns));
         }
         kind.refused += u64::from(message.refused.is_some());
     }
@@ -75,7 +75,7 @@ impl Rated {
                 kind.count as f64 / seconds,
                 kind.bytes as f64 / seconds,
                 age(kind.age_mean_ns()),
-                age(kind.age_max_ns()),
+                age(kind.age_max_ns),
             )
         };
         let mut text: String = self.rates.kinds.iter().map(line).collect();
@@ -97,7 +97,7 @@ impl Rated {
             json!({
                 "kind": name, "sent": is_sent, "count": kind.count, "per_s": kind.count as f64 / seconds,
                 "bytes_per_s": kind.bytes as f64 / seconds, "age_mean_ns": kind.age_mean_ns(),
-                "age_max_ns": kind.age_max_ns(), "refused": kind.refused,
+                "age_max_ns": kind.age_max_ns, "refused": kind.refused,
             })
         });
         let kinds: Vec<_> = kinds.collect();
@@ -116,11 +116,6 @@ impl Kind {
         let mean = self.age_sum_ns.checked_div(self.aged.into())?;
         Some(u64::try_from(mean).unwrap_or(u64::MAX))
     }
-
-    /// `None` where no age is known.
-    fn age_max_ns(&self) -> Option<u64> {
-        (self.aged > 0).then_some(self.age_max_ns)
-    }
 }
 
 #[cfg(test)]
@@ -129,12 +124,12 @@ mod tests {
 
     use super::*;
 
-    fn message(name: &str, age_ns: u64, refused: Option<Rejection>) -> SeenMessage {
+    fn message(name: &str, age_ns: Option<u64>, refused: Option<Rejection>) -> SeenMessage {
         let tid = Tid::new(NodeAddress::from([127, 0, 0, 1]), AppAddress::new(0x1000));
         SeenMessage {
             seen_us: 0,
             age_ns,
-            age_error_ns: (age_ns < u64::MAX).then_some(0),
+            age_error_ns: age_ns.map(|_| 0),
             is_sent: false,
             source: tid,
             target: tid,
@@ -152,10 +147,10 @@ mod tests {
     #[test]
     fn each_type_has_a_line_and_what_was_dropped_has_one() {
         let mut rates = Rates::default();
-        (0..10).for_each(|number| rates.add(&message("a", number * 2_000, None)));
+        (0..10).for_each(|number| rates.add(&message("a", Some(number * 2_000), None)));
         // Of unknown age: it makes no mean.
-        rates.add(&message("a", u64::MAX, None));
-        rates.add(&message("b", 0, Some(Rejection::QueueFull)));
+        rates.add(&message("a", None, None));
+        rates.add(&message("b", Some(0), Some(Rejection::QueueFull)));
         rates.drop(7);
         let said = rates.end(Duration::from_secs(2));
         assert_eq!(
@@ -172,8 +167,8 @@ mod tests {
     #[test]
     fn an_age_that_is_not_known_is_not_said_to_be_0() {
         let mut rates = Rates::default();
-        rates.add(&message("a", u64::MAX, None));
-        rates.add(&message("b", 0, None));
+        rates.add(&message("a", None, None));
+        rates.add(&message("b", Some(0), None));
         let said = rates.end(Duration::from_secs(1));
         assert_eq!(
             said.text().lines().collect::<Vec<_>>(),

@@ -413,7 +413,7 @@ impl CentralCore {
         GaitState {
             seq,
             t_ns: now_ns,
-            t_error_ns: 0,
+            t_error_ns: Some(0),
             phase: self.estimate.phase as f32,
             phase_rate_hz: self.estimate.rate_hz as f32,
             stance: if loaded { Stance::Stance } else { Stance::Swing },

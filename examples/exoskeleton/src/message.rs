@@ -4,11 +4,6 @@
 
 use serde::{Deserialize, Serialize};
 
-/// The error of a time that nobody has vouched for: beyond every limit.
-const fn unknown_ns() -> u64 {
-    u64::MAX
-}
-
 /// From a joint's sensor to its own drive and to central, each millisecond.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct JointSample {
@@ -16,10 +11,10 @@ pub struct JointSample {
     pub seq: u32,
     /// When the device was read, ns.
     pub t_ns: u64,
-    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. Not sent; whoever receives it
-    /// says it, as before that nobody knows.
-    #[serde(skip, default = "unknown_ns")]
-    pub t_error_ns: u64,
+    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. `None`: not known, and
+    /// `t_ns` is a time of the sender's clock. It is not sent; the receiver sets both.
+    #[serde(skip)]
+    pub t_error_ns: Option<u64>,
     /// Joint angle, rad.
     pub angle_rad: f32,
     /// Joint velocity, rad/s.
@@ -39,10 +34,10 @@ pub struct FootLoad {
     pub seq: u32,
     /// When the sole was read, ns.
     pub t_ns: u64,
-    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. Not sent; whoever receives it
-    /// says it, as before that nobody knows.
-    #[serde(skip, default = "unknown_ns")]
-    pub t_error_ns: u64,
+    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. `None`: not known, and
+    /// `t_ns` is a time of the sender's clock. It is not sent; the receiver sets both.
+    #[serde(skip)]
+    pub t_error_ns: Option<u64>,
     /// Vertical load under the heel, N.
     pub heel_n: f32,
     /// Vertical load under the forefoot, N.
@@ -82,10 +77,10 @@ pub struct GaitState {
     pub seq: u32,
     /// When the state was computed, ns.
     pub t_ns: u64,
-    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. Not sent; whoever receives it
-    /// says it, as before that nobody knows.
-    #[serde(skip, default = "unknown_ns")]
-    pub t_error_ns: u64,
+    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. `None`: not known, and
+    /// `t_ns` is a time of the sender's clock. It is not sent; the receiver sets both.
+    #[serde(skip)]
+    pub t_error_ns: Option<u64>,
     /// Estimated phase, cycles 0..1; 0 is heel strike.
     pub phase: f32,
     /// Estimated phase rate, cycles per second.
@@ -111,10 +106,10 @@ pub struct TorqueSet {
     pub seq: u32,
     /// When it was computed, ns.
     pub t_ns: u64,
-    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. Not sent; whoever receives it
-    /// says it, as before that nobody knows.
-    #[serde(skip, default = "unknown_ns")]
-    pub t_error_ns: u64,
+    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. `None`: not known, and
+    /// `t_ns` is a time of the sender's clock. It is not sent; the receiver sets both.
+    #[serde(skip)]
+    pub t_error_ns: Option<u64>,
     /// Moment to feed forward, Nm.
     pub torque_nm: f32,
     /// Grows with each new start of its sender; older ones are refused.
@@ -144,18 +139,18 @@ pub struct DriveStatus {
     pub seq: u32,
     /// When the status was taken, ns.
     pub t_ns: u64,
-    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. Not sent; whoever receives it
-    /// says it, as before that nobody knows.
-    #[serde(skip, default = "unknown_ns")]
-    pub t_error_ns: u64,
+    /// How much earlier it may have been, at most, ns: the error of the clocks between where it was made and here. `None`: not known, and
+    /// `t_ns` is a time of the sender's clock. It is not sent; the receiver sets both.
+    #[serde(skip)]
+    pub t_error_ns: Option<u64>,
     /// State of the drive.
     pub state: DriveState,
     /// Bits of [`crate::control::faults::FaultBits`].
     pub faults: u16,
     /// Commanded torque, Nm.
     pub torque_nm: f32,
-    /// Greatest age of an input at its use since the last status, us.
-    pub age_max_us: u32,
+    /// Greatest age of an input at its use since the last status, us; `None`: none was used.
+    pub age_max_us: Option<u32>,
     /// Ticks without fresh inputs since the start.
     pub misses: u32,
     /// Torques from outside that were taken since the start.

@@ -41,7 +41,7 @@ impl SensorCore {
         JointSample {
             seq,
             t_ns,
-            t_error_ns: 0,
+            t_error_ns: Some(0),
             angle_rad: angle_rad as f32,
             velocity_rad_s: reading.velocity_rad_s as f32,
             torque_nm: reading.torque_nm as f32,
@@ -54,7 +54,13 @@ impl SensorCore {
     pub fn foot_load(&mut self, t_ns: u64, reading: &FootReading) -> FootLoad {
         let seq = self.load_seq;
         self.load_seq = seq.wrapping_add(1);
-        FootLoad { seq, t_ns, t_error_ns: 0, heel_n: reading.heel_n as f32, toe_n: reading.toe_n as f32 }
+        FootLoad {
+            seq,
+            t_ns,
+            t_error_ns: Some(0),
+            heel_n: reading.heel_n as f32,
+            toe_n: reading.toe_n as f32,
+        }
     }
 }
 

@@ -13,7 +13,7 @@ fn sample(ms: u64) -> JointSample {
     JointSample {
         seq: ms as u32,
         t_ns: ms * MS,
-        t_error_ns: 0,
+        t_error_ns: Some(0),
         angle_rad: 0.2,
         velocity_rad_s: 1.5,
         torque_nm: 0.0,
@@ -26,7 +26,7 @@ fn gait(ms: u64, mode: GaitMode) -> GaitState {
     GaitState {
         seq: ms as u32,
         t_ns: ms * MS,
-        t_error_ns: 0,
+        t_error_ns: Some(0),
         phase: 0.5,
         phase_rate_hz: 0.75,
         stance: Stance::Stance,
@@ -224,9 +224,9 @@ fn status_tells_the_state_and_starts_a_new_maximum_of_the_age() {
     let mut drive = walking();
     drive.tick(1005 * MS, None, None);
     let status = drive.status(1005 * MS);
-    assert_eq!((status.state, status.age_max_us), (DriveState::Walk, 6000));
+    assert_eq!((status.state, status.age_max_us), (DriveState::Walk, Some(6000)));
     feed(&mut drive, 1006..1008, GaitMode::Walk);
-    assert_eq!(drive.status(1008 * MS).age_max_us, 0);
+    assert_eq!(drive.status(1008 * MS).age_max_us, None);
 }
 
 /// The drive's own feed-forward at the phase of [`gait`], where the ankle pushes off: about -47 Nm.
@@ -235,7 +235,7 @@ fn own_nm() -> f32 {
 }
 
 fn torque_set(ms: u64, torque_nm: f32) -> TorqueSet {
-    TorqueSet { seq: ms as u32, t_ns: ms * MS, t_error_ns: 0, torque_nm, epoch: 1 }
+    TorqueSet { seq: ms as u32, t_ns: ms * MS, t_error_ns: Some(0), torque_nm, epoch: 1 }
 }
 
 #[test]
@@ -432,13 +432,13 @@ proptest! {
 fn input_that_may_be_over_the_age_limit_is_not_used_however_young_it_is_taken_to_be() {
     // Given: a drive that walks, and clocks that are known to 6 ms
     let mut drive = walking();
-    let gait = |ms| GaitState { t_error_ns: 6 * MS, ..gait(ms, GaitMode::Walk) };
+    let gait = |ms| GaitState { t_error_ns: Some(6 * MS), ..gait(ms, GaitMode::Walk) };
     assert_eq!(drive.tick(1000 * MS, Some(&sample(1000)), Some(&gait(1000))).state, DriveState::Walk);
     // Then: it may be 10 ms old after 4
     assert_eq!(drive.tick(1004 * MS, Some(&sample(1004)), None).state, DriveState::Walk);
     assert_eq!(drive.tick(1005 * MS, Some(&sample(1005)), None).state, DriveState::Safe);
     // And: where nobody knows, all are refused
-    for t_error_ns in [11 * MS, u64::MAX] {
+    for t_error_ns in [Some(11 * MS), None] {
         let unknown = GaitState { t_error_ns, ..gait(1006) };
         assert_eq!(drive.tick(1006 * MS, Some(&sample(1006)), Some(&unknown)).state, DriveState::Safe);
     }
@@ -446,11 +446,11 @@ fn input_that_may_be_over_the_age_limit_is_not_used_however_young_it_is_taken_to
     // And: so is the device's word after a pause, until it was surely said after that
     let mut drive = walking();
     drive.tick(1100 * MS, Some(&sample(1100)), None);
-    let perhaps = JointSample { t_error_ns: 2 * MS, ..sample(1101) };
+    let perhaps = JointSample { t_error_ns: Some(2 * MS), ..sample(1101) };
     assert_eq!(drive.tick(1101 * MS, Some(&perhaps), None).command_nm, None);
     assert!(
         drive
-            .tick(1103 * MS, Some(&JointSample { t_error_ns: 2 * MS, ..sample(1103) }), None)
+            .tick(1103 * MS, Some(&JointSample { t_error_ns: Some(2 * MS), ..sample(1103) }), None)
             .command_nm
             .is_some()
     );

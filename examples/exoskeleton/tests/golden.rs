@@ -122,7 +122,7 @@ impl Robot {
         let gait = GaitState {
             seq: u32::try_from(ms).expect("27 seconds fit"),
             t_ns: now_ns,
-            t_error_ns: 0,
+            t_error_ns: Some(0),
             phase: strides.rem_euclid(1.0) as f32,
             phase_rate_hz: rate_hz as f32,
             stance: Stance::Stance,

@@ -104,7 +104,7 @@ impl Actor for Gait {
             let state = GaitState {
                 seq: gait.seq,
                 t_ns: Time::now().as_nanos(),
-                t_error_ns: 0,
+                t_error_ns: Some(0),
                 phase: 0.5,
                 phase_rate_hz: 0.75,
                 stance: Stance::Stance,
@@ -172,7 +172,7 @@ impl Actor for Sensor {
             let sample = JointSample {
                 seq: sensor.seq,
                 t_ns: Time::now().as_nanos(),
-                t_error_ns: 0,
+                t_error_ns: Some(0),
                 angle_rad: 0.2,
                 velocity_rad_s: 1.5,
                 torque_nm: 0.0,

@@ -8,7 +8,7 @@ use actix::{
 };
 
 use crate::{
-    app::{Delivery, requirement::Parting},
+    app::{Delivery, InputCriterion, InputTimeout, input_watch::InputWatch, requirement::Parting},
     monitor::{MonitorError, MonitorId},
     outcome::{Outcome, Rejection},
     protection::{Cause, DataId, Echo, Guard, Guarded},
@@ -63,26 +63,9 @@ pub(super) enum Action<A: Actor> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct WatchId(pub(super) usize);
 
-/// An input that has gone silent.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct InputTimeout {
-    /// Who was expected to send; `None` where anybody may.
-    pub source: Option<Tid>,
-    /// What was expected.
-    pub kind: Kind,
-    /// Time since it came last, or since the watchdog was set.
-    pub silent: Duration,
-    /// How much later than its limit this was noticed.
-    pub lateness: Duration,
-}
-
+/// An input watchdog and what it calls.
 pub(super) struct Watch<A: Actor> {
-    pub(super) source: Option<Tid>,
-    pub(super) kind: Kind,
-    pub(super) within: Duration,
-    pub(super) last: Time,
-    /// Has been reported and not heard since.
-    pub(super) silent: bool,
+    pub(super) input: InputWatch,
     /// Out while it runs.
     pub(super) action: Option<Alert<A>>,
 }
@@ -230,20 +213,84 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         self.schedule.cancel(timer)
     }
 
-    /// Calls `action` when no `P` has come from `source` (from anybody, if `None`) for `within`, counted from now. It is
-    /// called once for each silence; the next `P` that comes begins a new count.
+    /// Sets an input watchdog that judges by **arrival**: calls `action` when no `P` from `source` (from any sender, if `None`) was handled
+    /// for `within`, counted from now. It is called once for each silence; the next `P` begins a new count.
+    ///
+    /// It finds a sender, a node or a network that is silent. It does not find one that is late: a value feeds it however old the value is,
+    /// and of whatever age that is not known. Where a late value is a hazard take [`watch_input_age`](Self::watch_input_age), or both.
     pub fn watch_input<P: Payload>(
         &mut self,
         source: Option<Tid>,
         within: Duration,
         action: impl FnMut(&mut A, InputTimeout, &mut Self) + 'static,
     ) -> WatchId {
-        let id = WatchId(self.watches.len());
-        let now = Time::now();
-        let action: Alert<A> = Box::new(action);
-        let watch = Watch { source, kind: P::KIND, within, last: now, silent: false, action: Some(action) };
-        self.watches.push(watch);
-        self.schedule.once(now + within, Action::CheckWatch(id));
+        self.set_watch((source, P::KIND), (InputCriterion::Arrival, within), Box::new(action))
+    }
+
+    /// Sets an input watchdog that judges by **age**: calls `action` when the youngest `P` from `source` (from any sender, if `None`) that was
+    /// handled may be older than `limit`. A value feeds it from its handling until it is as old as the limit; the error of an age counts as
+    /// age. A value that is older when it arrives does not feed it. **One of unknown age does not either**, as it may be old: so it is called,
+    /// too, while the clock of the sender's host is not measured. It is called once, and again after a fresh value and a further timeout.
+    /// Until the first value the limit counts from now.
+    ///
+    /// Take it for setpoints and measurements by which something moves. The limit is to be longer than the sender's period, the way and the
+    /// error of the clocks together. [`watch_input`](Self::watch_input) judges by arrival: it needs no measured clock, and tells of a sender
+    /// that is there at all. [`InputTimeout`] has what a watchdog judged by, the silence and the age.
+    ///
+    /// ```
+    /// # use std::time::Duration;
+    /// # use actix::{Actor, Handler};
+    /// # use serde::{Deserialize, Serialize};
+    /// # use sinew_runtime::{app::{AppContext, Delivery}, wire::{Class, Payload}};
+    /// # #[derive(Serialize, Deserialize)]
+    /// # struct Setpoint { newton_metres: f32 }
+    /// # impl Payload for Setpoint {
+    /// #     const NAME: &'static str = "demo.setpoint";
+    /// #     const CLASS: Class = Class::Stream;
+    /// # }
+    /// struct Drive {
+    ///     newton_metres: f32,
+    /// }
+    ///
+    /// impl Actor for Drive {
+    ///     type Context = AppContext<Self>;
+    ///
+    ///     fn started(&mut self, context: &mut Self::Context) {
+    ///         // Setpoints come each 5 ms: three periods without one that is fresh, and the torque is let go.
+    ///         context.watch_input_age::<Setpoint>(None, Duration::from_millis(15), |drive, timeout, _| {
+    ///             drive.newton_metres = 0.0;
+    ///             eprintln!("{timeout}");
+    ///         });
+    ///     }
+    /// }
+    /// # impl Handler<Delivery<Setpoint>> for Drive {
+    /// #     type Result = ();
+    /// #     fn handle(&mut self, setpoint: Delivery<Setpoint>, _: &mut Self::Context) {
+    /// #         self.newton_metres = setpoint.newton_metres;
+    /// #     }
+    /// # }
+    /// ```
+    ///
+    /// A late value still reaches its handler: [`Delivery::is_older_than`] refuses it there.
+    pub fn watch_input_age<P: Payload>(
+        &mut self,
+        source: Option<Tid>,
+        limit: Duration,
+        action: impl FnMut(&mut A, InputTimeout, &mut Self) + 'static,
+    ) -> WatchId {
+        self.set_watch((source, P::KIND), (InputCriterion::Age, limit), Box::new(action))
+    }
+
+    fn set_watch(
+        &mut self,
+        (source, kind): (Option<Tid>, Kind),
+        (criterion, limit): (InputCriterion, Duration),
+        action: Alert<A>,
+    ) -> WatchId {
+        let (id, now) = (WatchId(self.watches.len()), Time::now());
+        let input = InputWatch::new(source, kind, (criterion, limit), now);
+        self.watches.push(Watch { input, action: Some(action) });
+        self.schedule.once(now + limit, Action::CheckWatch(id));
         id
     }
 
@@ -324,7 +371,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     pub(super) fn resume(&mut self, since: Time, now: Time) {
         self.schedule.skip_to(now);
         for watch in &mut self.watches {
-            watch.last = watch.last + now.since(since);
+            watch.input.resume(now.since(since));
         }
     }
 

@@ -8,7 +8,7 @@ use crate::{
     sender::ReplyTo,
     tid::Tid,
     time::Time,
-    wire::{Flags, Header, Kind},
+    wire::{Flags, Header, Kind, may_be_older},
 };
 
 /// A payload with where it came from and how old it is.
@@ -22,11 +22,12 @@ pub struct Delivery<P> {
     pub destination: Tid,
     /// The source's n-th message.
     pub sequence: u64,
-    /// When it was sent, in this host's clock; [`Time::ZERO`] where that is not known ([`age_error`](Self::age_error)).
-    pub sent: Time,
-    /// Time from sending to handling, as wrong as [`age_error`](Self::age_error) says. Where it is not known it is 584 years, so that no limit
-    /// takes what may be old for fresh.
-    pub age: Duration,
+    /// When it was sent, in this host's clock; `None` where that is not known ([`age_error`](Self::age_error)).
+    pub sent: Option<Time>,
+    /// Time from sending to handling, as wrong as [`age_error`](Self::age_error) says; `None` where it is not known.
+    ///
+    /// A handler that may use fresh values only asks [`is_older_than`](Self::is_older_than).
+    pub age: Option<Duration>,
     /// Type of the payload.
     pub kind: Kind,
     age_error: Option<Duration>,
@@ -43,15 +44,15 @@ impl<P> Delivery<P> {
             destination: header.destination,
             sequence: header.sequence,
             sent: header.known_sent(),
-            age: header.known_age(now),
+            age: header.age(now),
             kind: header.kind,
             age_error: header.sent_error(),
             reply_to: header.flags.has(Flags::ASK).then_some(reply_to),
         }
     }
 
-    /// The error of `age`, and of `sent`, at most: zero for what was sent on this host; `None` where the age is not known, because the clock
-    /// of the sender's host was not measured yet, or not for so long that it may be wrong by more than 32 s.
+    /// The error of `age`, and of `sent`, at most: zero for a message of this host. `None` where the age is not known: the clock of the
+    /// sender's host was not measured yet, or not for so long that it may be wrong by more than 32 s.
     ///
     /// It holds as long as the hosts' clocks drift apart as clocks do (`docs/protocol/ndl.md`, NDL-6.1).
     #[must_use]
@@ -59,10 +60,26 @@ impl<P> Delivery<P> {
         self.age_error
     }
 
-    /// The greatest age that it can have had: `age` and its error; [`Duration::MAX`] where it is not known. For whoever uses only what is young.
+    /// The greatest age that the message can have had: `age` and its error; `None` where it is not known.
     #[must_use]
-    pub fn age_at_most(&self) -> Duration {
-        self.age_error.map_or(Duration::MAX, |error| self.age.saturating_add(error))
+    pub fn age_at_most(&self) -> Option<Duration> {
+        Some(self.age?.saturating_add(self.age_error?))
+    }
+
+    /// Whether the message may have been older than `limit` when its handler was called. An unknown age counts as too old, as a handler
+    /// that may use fresh values only needs it.
+    ///
+    /// ```
+    /// # use std::time::Duration;
+    /// # use sinew_runtime::app::Delivery;
+    /// # struct Setpoint { degrees: f32 }
+    /// fn follow(setpoint: &Delivery<Setpoint>) -> Option<f32> {
+    ///     (!setpoint.is_older_than(Duration::from_millis(5))).then_some(setpoint.degrees)
+    /// }
+    /// ```
+    #[must_use]
+    pub fn is_older_than(&self, limit: Duration) -> bool {
+        may_be_older(self.age_at_most(), limit)
     }
 
     /// Where the sender waits for a reply; `None` if it does not.

@@ -17,8 +17,9 @@ use bytes::Bytes;
 use crate::{
     alarm::Alarm,
     app::{
-        AppContext, Delivery, InputTimeout, Raw, WatchId,
+        AppContext, Delivery, Raw, WatchId,
         context::Action,
+        input_watch::Looked,
         requirement::{Requirements, event_in},
     },
     mailbox::MailboxReader,
@@ -332,14 +333,9 @@ where
     A: Actor<Context = AppContext<A>>,
 {
     for (index, watch) in context.watches.iter_mut().enumerate() {
-        let is_it = watch.kind == message.header.kind
-            && watch.source.is_none_or(|source| source == message.header.source);
-        if is_it {
-            watch.last = now;
-            if std::mem::take(&mut watch.silent) {
-                // Only now: while it was silent there was no deadline to keep.
-                context.schedule.once(now + watch.within, Action::CheckWatch(WatchId(index)));
-            }
+        // Only after a timeout: until then one timer is set for each limit, not one for each message.
+        if let Some(at) = watch.input.note(&message.header, now) {
+            context.schedule.once(at, Action::CheckWatch(WatchId(index)));
         }
     }
 }
@@ -349,21 +345,15 @@ where
     A: Actor<Context = AppContext<A>>,
 {
     let watch = &mut context.watches[id.0];
-    let deadline = watch.last + watch.within;
-    if now < deadline {
-        // Heard since the deadline was set: one timer a silence, not one a message.
-        context.schedule.once(deadline, Action::CheckWatch(id));
-        return;
-    }
-    watch.silent = true;
-    let silence = InputTimeout {
-        source: watch.source,
-        kind: watch.kind,
-        silent: now.since(watch.last),
-        lateness: now.since(deadline),
+    let timeout = match watch.input.look(now) {
+        Looked::DueAt(at) => {
+            context.schedule.once(at, Action::CheckWatch(id));
+            return;
+        }
+        Looked::Over(timeout) => timeout,
     };
     if let Some(mut action) = watch.action.take() {
-        action(actor, silence, context);
+        action(actor, timeout, context);
         context.watches[id.0].action = Some(action);
     }
 }

@@ -8,14 +8,16 @@ mod context;
 mod delivery;
 mod down_policy;
 mod drive;
+mod input_watch;
 mod required;
 mod requirement;
 mod send_outcome;
 mod spec;
 
-pub use context::{AppContext, InputTimeout, WatchId};
+pub use context::{AppContext, WatchId};
 pub use delivery::{Delivery, Raw};
 pub use down_policy::{Absence, DownPolicy, Heir, LastWill, WILLS_MAX, Will};
+pub use input_watch::{InputCriterion, InputTimeout};
 pub use required::{
     ALTERNATIVES_MAX, REQUIREMENT_BYTES_MAX, Requirement, RequirementError, is_pattern, is_phase, matches,
 };

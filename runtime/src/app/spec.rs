@@ -22,18 +22,21 @@ use crate::{
 /// ```
 /// use actix::{Actor, Handler};
 /// use serde::{Deserialize, Serialize};
-/// use sinew_runtime::{app::{AppContext, AppSpec, Delivery}, wire::Payload};
+/// use sinew_runtime::{app::{AppContext, AppSpec, Delivery}, wire::{Class, Payload}};
 ///
 /// #[derive(Serialize, Deserialize)]
 /// struct Angle { degrees: f32 }
-/// impl Payload for Angle { const NAME: &'static str = "demo.angle"; }
+/// impl Payload for Angle {
+///     const NAME: &'static str = "demo.angle";
+///     const CLASS: Class = Class::Stream;
+/// }
 ///
 /// struct Knee;
 /// impl Actor for Knee { type Context = AppContext<Self>; }
 /// impl Handler<Delivery<Angle>> for Knee {
 ///     type Result = ();
 ///     fn handle(&mut self, angle: Delivery<Angle>, _: &mut Self::Context) {
-///         println!("{} degrees, {:?} old", angle.degrees, angle.age);
+///         println!("{} degrees, {:?} old", angle.degrees, angle.age); // `None`: not known
 ///     }
 /// }
 ///

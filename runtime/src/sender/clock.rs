@@ -34,7 +34,7 @@ fn kept() -> Option<Handle> {
             Ok(handle) => *kept = Some(handle),
             Err(error) => {
                 let remedy = remedy(Wanted::Reactor, &error);
-                crate::log::error!(%error, remedy, "no timer, so that a wait without a runtime ends at once");
+                crate::log::error!(%error, %remedy, "no timer, so that a wait without a runtime ends at once");
             }
         }
     }

@@ -102,7 +102,7 @@ impl Burials {
         if let Err(error) = &begun {
             // What waits is dropped after the next one.
             let remedy = crate::remedy::remedy(crate::remedy::Wanted::Thread, error);
-            log::error!(%error, name, remedy, "there is no thread to drop what is over");
+            log::error!(%error, name, %remedy, "there is no thread to drop what is over");
         }
         begun.is_ok()
     }

@@ -6,10 +6,7 @@ use std::time::Duration;
 use super::Header;
 use crate::time::Time;
 
-/// The age of what nobody knows the age of.
-const UNKNOWN_AGE: Duration = Duration::from_nanos(u64::MAX);
-
-/// In these bits: nobody knows.
+/// In these bits: it is not known.
 const UNKNOWN: u16 = u16::MAX;
 /// From here on milliseconds, below it microseconds.
 const MILLIS: u16 = 1 << 15;
@@ -41,18 +38,29 @@ impl Header {
         });
     }
 
-    /// When it was sent, in this host's clock, for whoever handles it: what is not known is as early as can be, so that nobody takes it
-    /// for fresh.
+    /// When it was sent, in this host's clock; `None` where that is not known.
     #[must_use]
-    pub const fn known_sent(&self) -> Time {
-        if self.number == UNKNOWN { Time::ZERO } else { self.sent }
+    pub const fn known_sent(&self) -> Option<Time> {
+        if self.number == UNKNOWN { None } else { Some(self.sent) }
     }
 
-    /// Time from sending to `now`, for whoever handles it: what is not known is longer than any limit.
+    /// Time from sending to `now`, as wrong as [`sent_error`](Self::sent_error) says; `None` where it is not known.
     #[must_use]
-    pub const fn known_age(&self, now: Time) -> Duration {
-        if self.number == UNKNOWN { UNKNOWN_AGE } else { now.since(self.sent) }
+    pub const fn age(&self, now: Time) -> Option<Duration> {
+        if self.number == UNKNOWN { None } else { Some(now.since(self.sent)) }
     }
+
+    /// The greatest age that it can have at `now`: its age and the error of that; `None` where it is not known.
+    #[must_use]
+    pub fn age_at_most(&self, now: Time) -> Option<Duration> {
+        Some(self.age(now)?.saturating_add(self.sent_error()?))
+    }
+}
+
+/// Whether something of this greatest age may be older than `limit`. What has an unknown age may be.
+#[must_use]
+pub fn may_be_older(age_at_most: Option<Duration>, limit: Duration) -> bool {
+    age_at_most.is_none_or(|age| age > limit)
 }
 
 #[cfg(test)]
@@ -89,15 +97,26 @@ mod tests {
             Header { sent: Time::from_nanos(1_000), ..Header::new(Kind::PING, Tid::NONE, Tid::NONE) };
         let now = Time::from_nanos(5_000);
         assert_eq!(header.sent_error(), Some(Duration::ZERO));
-        assert_eq!((header.known_sent(), header.known_age(now)), (header.sent, Duration::from_nanos(4_000)));
+        let age = Some(Duration::from_nanos(4_000));
+        assert_eq!(
+            (header.known_sent(), header.age(now), header.age_at_most(now)),
+            (Some(header.sent), age, age)
+        );
     }
 
     #[test]
-    fn an_unknown_age_is_fresh_to_nobody() {
+    fn an_unknown_age_is_none_and_older_than_every_limit() {
         let (header, now) = (header(None), Time::from_nanos(5_000));
-        assert_eq!((header.sent_error(), header.known_sent()), (None, Time::ZERO));
-        assert!(header.known_age(now) > Duration::from_secs(1_000_000_000));
-        // Whoever adds to it does not panic.
-        assert!(header.known_age(now) + header.known_age(now) > header.known_age(now));
+        assert_eq!((header.sent_error(), header.known_sent()), (None, None));
+        assert_eq!((header.age(now), header.age_at_most(now)), (None, None));
+        assert!(may_be_older(header.age_at_most(now), Duration::MAX));
+    }
+
+    #[test]
+    fn a_message_is_older_than_a_limit_if_it_may_be() {
+        let (header, now) = (header(Some(Duration::from_micros(2))), Time::from_nanos(5_000));
+        assert_eq!(header.age(now), Some(Duration::from_micros(4)));
+        let may_be_older = |micros| may_be_older(header.age_at_most(now), Duration::from_micros(micros));
+        assert!(may_be_older(5) && !may_be_older(6));
     }
 }

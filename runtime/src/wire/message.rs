@@ -19,13 +19,14 @@ use crate::{
 ///
 /// ```
 /// use serde::{Deserialize, Serialize};
-/// use sinew_runtime::wire::Payload;
+/// use sinew_runtime::wire::{Class, Payload};
 ///
 /// #[derive(Serialize, Deserialize)]
 /// struct JointAngle { degrees: f32 }
 ///
 /// impl Payload for JointAngle {
 ///     const NAME: &'static str = "demo.joint_angle";
+///     const CLASS: Class = Class::Stream; // a value that a newer one replaces
 /// }
 /// ```
 pub trait Payload: Serialize + DeserializeOwned + Send + 'static {

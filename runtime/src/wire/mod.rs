@@ -14,6 +14,7 @@ mod read;
 mod strict;
 mod type_names;
 
+pub use age::may_be_older;
 pub use codec::{Checksum, FrameCodec, FrameError, decode_datagram, encode_frame};
 pub use header::{Class, Flags, HEADER_LEN, Header, HeaderError, MAGIC, TIME_TO_LIVE_MAX, VERSION};
 pub use kind::{Kind, fnv1a};

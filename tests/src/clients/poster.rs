@@ -221,7 +221,7 @@ impl Letters {
             | ApiError::LoanActive
             | ApiError::NotYours(_)
             | ApiError::ToMany(_)
-            | ApiError::UnknownName(_)
+            | ApiError::UnknownName { .. }
             | ApiError::NotAsked
             | ApiError::OthersRequest(_)
             | ApiError::Malformed(_)

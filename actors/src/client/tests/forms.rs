@@ -195,10 +195,10 @@ impl Got {
     }
 
     /// C says when it was sent, and leaves it to the program to subtract.
-    pub(super) fn age(&self, now: Time) -> Duration {
+    pub(super) fn age(&self, now: Time) -> Option<Duration> {
         match self {
             Self::Rust(message) => message.age(now),
-            Self::C(message) => now.since(in_c::message_of(message).header.sent),
+            Self::C(message) => in_c::message_of(message).header.age(now),
         }
     }
 

@@ -115,7 +115,7 @@ fn gives_pidfds_of_peers() -> bool {
 
 fn unwatched(cause: &io::Error) -> io::Error {
     let remedy = match Errno::from_io_error(cause) {
-        Some(Errno::NOPROTOOPT | Errno::INVAL | Errno::OPNOTSUPP) => "Linux 6.5 or newer has it",
+        Some(Errno::NOPROTOOPT | Errno::INVAL | Errno::OPNOTSUPP) => "Linux 6.5 or newer has it".into(),
         Some(_) | None => remedy(Wanted::Descriptor, cause),
     };
     let words = format!(

@@ -36,7 +36,7 @@ impl Client {
                 self.count_no_membership(why);
                 self.tell(destination, correlation, outcome);
             }
-            Order::Resolve { name, correlation } => self.resolve(&name, correlation),
+            Order::Resolve { name, nearest, correlation } => self.resolve(&name, nearest, correlation),
             Order::Introduce { to, correlation } => self.introduce(to, correlation),
             Order::Switch { to, number, correlation } => self.switch(to, number, correlation),
             Order::RefuseMessage { message, why } => self.refuse_message(&message, why),
@@ -92,10 +92,14 @@ impl Client {
         }
     }
 
-    fn resolve(&self, name: &str, correlation: u64) {
+    // spec: LNCL-19
+    fn resolve(&self, name: &str, nearest: bool, correlation: u64) {
         let tid = registrar::resolve(&self.server.stores, name).map(Tid::bits);
+        // To compare names takes the node's time, which guests do not get.
+        let is_told = nearest && tid.is_none() && self.user == User::Own;
+        let nearest = if is_told { registrar::nearest(&self.server.stores, name) } else { Vec::new() };
         let lncl = payload::lncl_of(self.tid.node);
-        let mut answer = payload::frame(Kind::LNCL_RESOLVED, lncl, self.tid, &Resolved { tid });
+        let mut answer = payload::frame(Kind::LNCL_RESOLVED, lncl, self.tid, &Resolved { tid, nearest });
         answer.header.correlation = correlation;
         self.outcomes.answer(answer);
     }

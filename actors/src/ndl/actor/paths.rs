@@ -18,12 +18,14 @@ use futures_util::{
     future::{AbortHandle, LocalBoxFuture, abortable},
     stream::FuturesUnordered,
 };
-use sinew_runtime::time::Time;
+use sinew_runtime::{
+    remedy::{Wanted, remedy},
+    time::Time,
+};
 use tokio::sync::watch;
 
 use super::{Shell, lock, receiving::receive, speaking::speak_mdns};
 use crate::{
-    bind_error,
     config::Interfaces,
     ndl::{
         PATHS_MAX,
@@ -177,7 +179,7 @@ impl Paths {
                 continue;
             }
             self.unopened.borrow_mut().insert(*local, now + REMINDER);
-            let (at, remedy) = (local.at(port), bind_error::remedy(error, "ndl.port"));
+            let (at, remedy) = (local.at(port), remedy(Wanted::Port("ndl.port"), error));
             crate::log::warn!(
                 "NDL cannot use UDP {at} yet: {error}; it tries again each second, and warns each minute until then: {remedy}, or leave it \
                  out of `ndl.interface`"

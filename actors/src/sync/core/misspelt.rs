@@ -8,17 +8,15 @@ use sinew_runtime::{
 };
 
 use super::{Core, Output, Reason, apps::State, respite::Moment};
+use crate::{
+    nearest::{COMPARED_MAX, nearest},
+    sync::list::Name,
+};
 
 /// Time for which nobody may have a required name before that is logged: at a normal start of a robot its nodes have found each other by then.
 pub(super) const FIRST_AFTER: Duration = Duration::from_secs(2);
 /// Time until the same requirement is logged again.
 const AGAIN_AFTER: Duration = Duration::from_secs(300);
-/// Similar names that are listed at most.
-const LISTED_MAX: usize = 3;
-/// Names that are compared at most: one comparison takes about a microsecond, on a thread that has other work.
-const COMPARED_MAX: usize = 1_024;
-/// Similarity (Jaro-Winkler, 0 to 1) from which a name is listed. `knee.senser` and `knee.drive` have 0.77, `knee.senser` and `hip.drive` 0.53.
-const SIMILAR: f64 = 0.75;
 
 impl Core {
     /// Reports requirements whose names nobody has, while their applications wait.
@@ -65,21 +63,21 @@ impl Core {
         if names.iter().all(is_unknown) { names } else { Vec::new() }
     }
 
+    /// Names of applications, on this node and on all that are known and not lost, as many as are compared.
+    pub(crate) fn names(&self) -> Vec<Name> {
+        let here = self.apps.iter().filter_map(|(_, app)| app.name.as_ref());
+        here.chain(self.peers.directory().map(|(name, ..)| name)).take(COMPARED_MAX).cloned().collect()
+    }
+
     /// The names of other applications that are similar to `name`, with their states, the most similar first.
     pub(super) fn nearest(&self, name: &str, own: Option<&str>) -> Vec<String> {
         let here =
             self.apps.iter().filter_map(|(_, app)| Some((app.name.as_ref()?, app.state == State::Ready)));
         let there = self.peers.directory().map(|(name, _, is_ready, _)| (name, is_ready));
-        let others = here.chain(there).filter(|(other, _)| Some(&***other) != own).take(COMPARED_MAX);
-        let mut similar: Vec<_> = others
-            .map(|(other, is_ready)| (strsim::jaro_winkler(name, other), other, is_ready))
-            .filter(|(similarity, ..)| *similarity >= SIMILAR)
-            .collect();
-        similar.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| a.1.cmp(b.1)));
-        similar.dedup_by(|a, b| a.1 == b.1);
-        let listed = similar.into_iter().take(LISTED_MAX);
-        listed
-            .map(|(_, other, is_ready)| format!("{other} ({})", if is_ready { "ready" } else { "starting" }))
+        let others = here.chain(there).filter(|(other, _)| Some(&***other) != own);
+        nearest(name, others, |(other, _)| other)
+            .into_iter()
+            .map(|(other, is_ready)| format!("{other} ({})", if is_ready { "ready" } else { "starting" }))
             .collect()
     }
 }

@@ -110,6 +110,7 @@ fn with_outer<R>(use_it: impl FnOnce(&PayloadType) -> R) -> R {
         name: Text { bytes: name.as_ptr().cast(), length: name.len() },
         message_class: 0,
         layout: Layout { fields: fields.as_ptr(), fields_count: fields.len(), size: size_of::<Outer>() },
+        expires_after_ns: 0,
     })
 }
 

@@ -27,6 +27,8 @@ struct narrow { std::uint8_t number; };
 SINEW_PAYLOAD(narrow, "test.setpoint", SINEW_STREAM, number)
 struct other { float torque; };
 SINEW_PAYLOAD(other, "test.other", SINEW_CONTROL, torque)
+struct brief { float torque; };
+SINEW_PAYLOAD_EXPIRING(brief, "test.brief", SINEW_CONTROL, 1us, torque)
 
 static const auto what = sinew::kind_named("test.wrapper");
 
@@ -89,6 +91,26 @@ static void values_are_typed(sinew::endpoint &endpoint)
     EXPECT(endpoint.confirm(endpoint.create(0x7777, other{1.0f}), 10s) == SINEW_REJECTED_NO_SUCH_APPLICATION);
 }
 
+// What is older than its type, or its send, lets it live is not received.
+static void old_messages_expire(sinew::endpoint &endpoint)
+{
+    const sinew::tid own = endpoint.address();
+    endpoint.send(own, brief{1.0f});
+    endpoint.send(endpoint.create(own, other{2.0f}).expires_after(1us));
+    std::this_thread::sleep_for(1ms);
+    EXPECT(!endpoint.receive(0ns));
+    endpoint.send(endpoint.create(own, brief{3.0f}).expires_after(1h));
+    endpoint.send(own, other{4.0f});
+    EXPECT(endpoint.receive(20s)->as<brief>()->torque == 3.0f);
+    EXPECT(endpoint.receive(20s)->as<other>()->torque == 4.0f);
+    try {
+        endpoint.send(endpoint.create(own, other{5.0f}).expires_after(0ns));
+        EXPECT(false);
+    } catch (const sinew::error &error) {
+        EXPECT(error.status() == SINEW_ERROR_INVALID_ARGUMENT);
+    }
+}
+
 // How the receiver ends with the message in hand decides what its sender is told.
 static void scopes_settle(sinew::endpoint &sender, sinew::endpoint receiver)
 {
@@ -97,8 +119,8 @@ static void scopes_settle(sinew::endpoint &sender, sinew::endpoint receiver)
         {
             auto message = receiver.receive(20s);
             EXPECT(message && message->as<pair>() && message->as<pair>()->b == 2 && !message->as<char>());
-            EXPECT(message->age_error() == 0ns && message->age_at_most() < sinew::duration::max());
-            EXPECT(message->age() >= 0ns && message->end() - message->begin() == sizeof(pair));
+            EXPECT(message->age_error() == 0ns && message->age_at_most() >= message->age_error());
+            EXPECT(message->age() >= 0ns && !message->is_older_than(1h) && message->end() - message->begin() == sizeof(pair));
         }
         try {
             auto message = receiver.receive(20s);
@@ -308,6 +330,7 @@ int main(int argc, char **argv)
     sinew::endpoint endpoint(socket);
     errors_are_exceptions(endpoint);
     values_are_typed(endpoint);
+    old_messages_expire(endpoint);
     undelivered_messages_are_counted(endpoint);
     scopes_settle(endpoint, sinew::endpoint(socket));
     unsent_messages_are_given_back(endpoint);

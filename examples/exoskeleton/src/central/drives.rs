@@ -40,7 +40,8 @@ impl Drives {
             self.stopped_ns[index] = Some(now_ns);
             return;
         }
-        let earliest_ns = status.t_ns.saturating_sub(status.t_error_ns);
+        let Some(error_ns) = status.t_error_ns else { return };
+        let earliest_ns = status.t_ns.saturating_sub(error_ns);
         if earliest_ns <= self.ended_ns[index].max(self.stopped_ns[index].unwrap_or(0)) {
             return;
         }

@@ -17,8 +17,8 @@ const PHASE_RATE_LARGEST_HZ: f32 = 5.0;
 pub struct Stamp {
     /// When it was made, ns.
     pub t_ns: u64,
-    /// How much earlier that may have been, at most, ns; `u64::MAX` where nobody knows.
-    pub t_error_ns: u64,
+    /// How much earlier that may have been, at most, ns; `None` where that is not known.
+    pub t_error_ns: Option<u64>,
     /// Its number; wraps.
     pub seq: u32,
     /// Life of its sender; newer lives beat older ones whatever the sequence. 0 where the sender does not tell.
@@ -26,16 +26,22 @@ pub struct Stamp {
 }
 
 impl Stamp {
-    /// The earliest time at which it can have been made, ns; 0 where nobody knows.
+    /// The earliest time at which it can have been made, ns; `None` where that is not known.
     #[must_use]
-    pub const fn earliest_ns(&self) -> u64 {
-        self.t_ns.saturating_sub(self.t_error_ns)
+    pub fn earliest_ns(&self) -> Option<u64> {
+        self.t_error_ns.map(|error_ns| self.t_ns.saturating_sub(error_ns))
     }
 
-    /// The greatest age that it can have, ns: beyond every limit where nobody knows.
+    /// The greatest age that it can have, ns; `None` where that is not known.
     #[must_use]
-    pub const fn age_at_most_ns(&self, now_ns: u64) -> u64 {
-        now_ns.saturating_sub(self.t_ns).saturating_add(self.t_error_ns)
+    pub fn age_at_most_ns(&self, now_ns: u64) -> Option<u64> {
+        self.t_error_ns.map(|error_ns| now_ns.saturating_sub(self.t_ns).saturating_add(error_ns))
+    }
+
+    /// Whether it may be older than this. What has an unknown age may be.
+    #[must_use]
+    pub fn is_older_than(&self, limit_ns: u64, now_ns: u64) -> bool {
+        self.age_at_most_ns(now_ns).is_none_or(|age_ns| age_ns > limit_ns)
     }
 }
 
@@ -116,7 +122,7 @@ impl<T: Stamped> Admission<T> {
     #[must_use]
     pub fn fresh(&self, now_ns: u64) -> Option<&T> {
         let newest = self.newest.as_ref().filter(|_| self.is_believed);
-        newest.filter(|input| input.stamp().age_at_most_ns(now_ns) <= self.age_max_ns)
+        newest.filter(|input| !input.stamp().is_older_than(self.age_max_ns, now_ns))
     }
 
     /// The newest admitted input, however old.
@@ -149,10 +155,11 @@ impl<T: Stamped> Admission<T> {
             return Err(Refusal::OutOfRange);
         }
         let stamp = input.stamp();
-        if stamp.t_ns > now_ns.saturating_add(self.age_max_ns) {
+        let is_known = stamp.t_error_ns.is_some();
+        if is_known && stamp.t_ns > now_ns.saturating_add(self.age_max_ns) {
             return Err(Refusal::FromFuture);
         }
-        if stamp.age_at_most_ns(now_ns) > self.age_max_ns {
+        if stamp.is_older_than(self.age_max_ns, now_ns) {
             return Err(Refusal::TooOld);
         }
         if self.follows(now_ns, input) { Ok(()) } else { Err(Refusal::OldSequence) }

@@ -121,7 +121,7 @@ pub struct DriveCore {
     interrupted: bool,
     counters: DriveCounters,
     faults: FaultBits,
-    age_max_ns: u64,
+    age_max_ns: Option<u64>,
     status_seq: u32,
 }
 
@@ -154,7 +154,7 @@ impl DriveCore {
                 pauses: 0,
             },
             faults: FaultBits(0),
-            age_max_ns: 0,
+            age_max_ns: None,
             status_seq: 0,
         }
     }
@@ -280,17 +280,17 @@ impl DriveCore {
         let status = DriveStatus {
             seq: self.status_seq,
             t_ns: now_ns,
-            t_error_ns: 0,
+            t_error_ns: Some(0),
             state: self.state,
             faults: self.faults.0,
             torque_nm: self.limiter.torque_nm() as f32,
-            age_max_us: u32::try_from(self.age_max_ns / 1000).unwrap_or(u32::MAX),
+            age_max_us: self.age_max_ns.map(|age_ns| u32::try_from(age_ns / 1000).unwrap_or(u32::MAX)),
             misses: self.counters.misses,
             commands_taken: self.counters.commands_admitted,
             commands_refused: self.counters.commands_refused.total(),
         };
         self.status_seq = self.status_seq.wrapping_add(1);
-        self.age_max_ns = 0;
+        self.age_max_ns = None;
         status
     }
 
@@ -317,7 +317,7 @@ impl DriveCore {
         if let Some(sample) = sample {
             let admitted = self.samples.offer(now_ns, sample);
             let of_now =
-                self.paused_until_ns.is_none_or(|ns| now_ns > ns && sample.stamp().earliest_ns() > ns);
+                self.paused_until_ns.is_none_or(|ns| now_ns > ns && sample.stamp().earliest_ns() > Some(ns));
             if admitted && of_now && !self.device_heard {
                 (self.device_heard, self.damps) = (true, false);
                 self.go_on_from(f64::from(sample.torque_nm));
@@ -426,7 +426,7 @@ impl DriveCore {
             self.counters.misses = self.counters.misses.saturating_add(1);
         }
         let age_ns = self.samples.age_ns(now_ns).max(self.gait.age_ns(now_ns));
-        self.age_max_ns = self.age_max_ns.max(age_ns.unwrap_or(0));
+        self.age_max_ns = self.age_max_ns.max(age_ns);
     }
 }
 

@@ -316,7 +316,7 @@ impl Drive {
 
     fn note_silence(&self, input: &str, silence: InputTimeout) {
         let (joint, silent) = (self.parts.joint, silence.silent);
-        tracing::warn!(%joint, input, ?silent, lateness = ?silence.lateness, "an input is silent");
+        tracing::warn!(%joint, input, ?silent, age = ?silence.age, lateness = ?silence.lateness, "an input is silent");
         self.note_event("input_silent", input, format!("nothing for {silent:?}"));
     }
 
@@ -390,7 +390,7 @@ impl Handler<Delivery<JointSample>> for Drive {
                 this.note_silence("joint sample", silence);
             });
         }
-        let (t_ns, t_error_ns) = sent(&sample);
+        let (t_ns, t_error_ns) = sent(&sample, sample.t_ns);
         self.sample = Some(JointSample { t_ns, t_error_ns, ..sample.payload });
     }
 }
@@ -404,7 +404,7 @@ impl Handler<Delivery<GaitState>> for Drive {
             context.reject();
             return;
         };
-        let (t_ns, t_error_ns) = sent(&gait);
+        let (t_ns, t_error_ns) = sent(&gait, gait.t_ns);
         let gait = GaitState { t_ns, t_error_ns, ..gait.payload };
         if word.guard.apply(|output| output.word = Some(gait)).is_err() {
             context.reject();
@@ -428,7 +428,7 @@ impl Handler<Delivery<TorqueSet>> for Drive {
             context.reject();
             return;
         }
-        let (t_ns, t_error_ns) = sent(&command);
+        let (t_ns, t_error_ns) = sent(&command, command.t_ns);
         let set = TorqueSet { t_ns, t_error_ns, ..command.payload };
         if !self.core.command(now.as_nanos(), &set) {
             context.reject();

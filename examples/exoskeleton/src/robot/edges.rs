@@ -138,10 +138,11 @@ payload!("exo.barrier_status", Stream =>
     }
 );
 
-/// When a message was sent, ns of this host's clock, and how much earlier that may have been: `u64::MAX` where nobody knows.
-pub(super) fn sent<P>(message: &Delivery<P>) -> (u64, u64) {
+/// When a message was sent, ns of this host's clock, and how much earlier that may have been. Where that is not known it is `t_ns`, by
+/// the clock of its sender, and `None`.
+pub(super) fn sent<P>(message: &Delivery<P>, t_ns: u64) -> (u64, Option<u64>) {
     let error_ns = message.age_error().map(|error| u64::try_from(error.as_nanos()).unwrap_or(u64::MAX));
-    (message.sent.as_nanos(), error_ns.unwrap_or(u64::MAX))
+    (message.sent.map_or(t_ns, Time::as_nanos), error_ns)
 }
 
 /// Name of a joint's sensor.

@@ -200,7 +200,7 @@ impl Handler<Delivery<JointSample>> for Gait {
     fn handle(&mut self, sample: Delivery<JointSample>, context: &mut Self::Context) {
         match self.joint_at(sample.source.node) {
             Some(joint) => {
-                let (t_ns, t_error_ns) = sent(&sample);
+                let (t_ns, t_error_ns) = sent(&sample, sample.t_ns);
                 let sample = JointSample { t_ns, t_error_ns, ..sample.payload };
                 self.samples[joint.index()] = Some(sample);
             }
@@ -214,7 +214,7 @@ impl Handler<Delivery<FootLoad>> for Gait {
 
     fn handle(&mut self, load: Delivery<FootLoad>, context: &mut Self::Context) {
         if self.joint_at(load.source.node) == Some(Joint::Ankle) {
-            let (t_ns, t_error_ns) = sent(&load);
+            let (t_ns, t_error_ns) = sent(&load, load.t_ns);
             self.load = Some(FootLoad { t_ns, t_error_ns, ..load.payload });
         } else {
             context.reject();
@@ -276,7 +276,7 @@ impl Handler<Delivery<DriveStatus>> for Gait {
                 let monitored = &mut self.monitored[joint.index()];
                 // Without a monitor its silence is noticed all the same, 25 ms later.
                 *monitored = *monitored || context.monitor(status.source).is_ok();
-                let (t_ns, t_error_ns) = sent(&status);
+                let (t_ns, t_error_ns) = sent(&status, status.t_ns);
                 let status = DriveStatus { t_ns, t_error_ns, ..status.payload };
                 self.core.drive_heard(Time::now().as_nanos(), joint, &status);
             }

@@ -66,7 +66,7 @@ fn gain_after(silent_ms: u64) -> f64 {
     let sample = |ms: u64| JointSample {
         seq: ms as u32,
         t_ns: ms * MS,
-        t_error_ns: 0,
+        t_error_ns: Some(0),
         angle_rad: 0.2,
         velocity_rad_s: 0.0,
         torque_nm: 0.0,
@@ -76,7 +76,7 @@ fn gain_after(silent_ms: u64) -> f64 {
     let gait = |ms: u64| GaitState {
         seq: ms as u32,
         t_ns: ms * MS,
-        t_error_ns: 0,
+        t_error_ns: Some(0),
         phase: 0.2,
         phase_rate_hz: 0.8,
         stance: Stance::Stance,

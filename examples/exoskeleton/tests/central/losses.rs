@@ -137,12 +137,12 @@ fn standing_still_of_central_itself_degrades_nobody() {
 fn stop_is_heeded_whatever_is_known_of_its_age_and_of_whichever_life_it_is() {
     // Of a clock that was not measured yet
     let mut walk = Walk::begun(Resume::ByItself);
-    walk.hears_late(Joint::Hip, (DriveState::EStop, FaultBits::STOPPED), (0, u64::MAX));
+    walk.hears_late(Joint::Hip, (DriveState::EStop, FaultBits::STOPPED), (0, None));
     assert_eq!(walk.hear(1).mode, GaitMode::Stop);
     // Of a life that is over
     let mut walk = Walk::begun(Resume::ByItself);
     walk.central.drive_ended(Joint::Hip, walk.ms * MS);
-    walk.hears_late(Joint::Hip, (DriveState::EStop, FaultBits::STOPPED), ((walk.ms - 1_000) * MS, 0));
+    walk.hears_late(Joint::Hip, (DriveState::EStop, FaultBits::STOPPED), ((walk.ms - 1_000) * MS, Some(0)));
     assert_eq!(walk.hear(1).mode, GaitMode::Stop);
 }
 
@@ -154,17 +154,17 @@ fn word_that_may_have_been_said_before_the_stop_takes_nothing_back() {
     let ready = (DriveState::Ready, FaultBits(0));
     walk.says[Joint::Hip.index()] = None;
     let (t_ns, stopped) = (walk.ms * MS, (DriveState::EStop, FaultBits::STOPPED));
-    walk.hears_late(Joint::Hip, stopped, (t_ns, 0));
+    walk.hears_late(Joint::Hip, stopped, (t_ns, Some(0)));
     walk.hear(10);
     // When: older words of it come, and such of which nobody knows
     for (of_ns, error_ns) in
-        [(t_ns - MS, 0), (t_ns + 3 * MS, 3 * MS), (t_ns + 3 * MS, u64::MAX), (0, u64::MAX)]
+        [(t_ns - MS, Some(0)), (t_ns + 3 * MS, Some(3 * MS)), (t_ns + 3 * MS, None), (0, None)]
     {
         walk.hears_late(Joint::Hip, ready, (of_ns, error_ns));
-        assert_eq!(walk.central.release(), Err(StillStopped), "{of_ns} {error_ns}");
+        assert_eq!(walk.central.release(), Err(StillStopped), "{of_ns} {error_ns:?}");
     }
     // Then: one does that was surely said later
-    walk.hears_late(Joint::Hip, ready, (t_ns + 4 * MS, 3 * MS));
+    walk.hears_late(Joint::Hip, ready, (t_ns + 4 * MS, Some(3 * MS)));
     walk.central.release().expect("the drive was reset");
 }
 
@@ -174,7 +174,7 @@ fn drive_whose_words_are_of_unknown_age_is_degraded() {
     walk.says[Joint::Knee.index()] = None;
     for _ in 0..40 {
         walk.hear(1);
-        walk.hears_late(Joint::Knee, (DriveState::Walk, FaultBits(0)), (walk.ms * MS, u64::MAX));
+        walk.hears_late(Joint::Knee, (DriveState::Walk, FaultBits(0)), (walk.ms * MS, None));
     }
     assert_eq!(walk.hear(1).degraded, bit(Joint::Knee));
 }

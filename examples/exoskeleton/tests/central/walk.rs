@@ -64,7 +64,7 @@ impl Walk {
         let samples = Joint::ALL.map(|joint| JointSample {
             seq,
             t_ns,
-            t_error_ns: 0,
+            t_error_ns: Some(0),
             angle_rad: intended.angle_rad[joint.index()] as f32,
             velocity_rad_s: 0.0,
             torque_nm: 0.0,
@@ -72,7 +72,7 @@ impl Walk {
             flags: 0,
         });
         let load_n = intended.vertical_load_bw * 80.0 * 9.81;
-        let load = FootLoad { seq, t_ns, t_error_ns: 0, heel_n: load_n as f32, toe_n: 0.0 };
+        let load = FootLoad { seq, t_ns, t_error_ns: Some(0), heel_n: load_n as f32, toe_n: 0.0 };
         let input = CentralInput { samples: samples.each_ref().map(Some), load: Some(&load) };
         self.central.tick(t_ns, &input)
     }
@@ -82,17 +82,26 @@ impl Walk {
         let (t_ns, seq) = (self.ms * MS, self.ms as u32);
         for (joint, says) in Joint::ALL.into_iter().zip(self.says) {
             let Some((state, faults)) = says.filter(|_| seq.is_multiple_of(5)) else { continue };
-            self.central.drive_heard(t_ns, joint, &status(seq, (t_ns, 0), (state, faults)));
+            self.central.drive_heard(t_ns, joint, &status(seq, (t_ns, Some(0)), (state, faults)));
         }
     }
 
     /// Central hears a drive now, from then: ns, and how much earlier that may have been.
-    pub(crate) fn hears_late(&mut self, joint: Joint, says: (DriveState, FaultBits), when: (u64, u64)) {
+    pub(crate) fn hears_late(
+        &mut self,
+        joint: Joint,
+        says: (DriveState, FaultBits),
+        when: (u64, Option<u64>),
+    ) {
         self.central.drive_heard(self.ms * MS, joint, &status(self.ms as u32, when, says));
     }
 }
 
-fn status(seq: u32, (t_ns, t_error_ns): (u64, u64), (state, faults): (DriveState, FaultBits)) -> DriveStatus {
+fn status(
+    seq: u32,
+    (t_ns, t_error_ns): (u64, Option<u64>),
+    (state, faults): (DriveState, FaultBits),
+) -> DriveStatus {
     DriveStatus {
         seq,
         t_ns,
@@ -100,7 +109,7 @@ fn status(seq: u32, (t_ns, t_error_ns): (u64, u64), (state, faults): (DriveState
         state,
         faults: faults.0,
         torque_nm: 0.0,
-        age_max_us: 0,
+        age_max_us: None,
         misses: 0,
         commands_taken: 0,
         commands_refused: 0,

@@ -351,8 +351,8 @@ impl Client {
             class: Class::ALL.into_iter().find(|class| *class as i32 == undelivered.message_class),
             count: undelivered.count,
             since: Time::from_nanos(undelivered.since_ns),
-            first_sequence: undelivered.first_sequence,
-            last_sequence: undelivered.last_sequence,
+            first_sequence: undelivered.are_sequences_known.then_some(undelivered.first_sequence),
+            last_sequence: undelivered.are_sequences_known.then_some(undelivered.last_sequence),
         })
     }
 
@@ -384,6 +384,7 @@ pub(super) fn message_of(received: &InHand) -> Message {
     let mut header = Header::new(Kind::from_bits(fields.kind), source, destination);
     header.sequence = fields.sequence;
     header.sent = Time::from_nanos(fields.sent_ns);
+    header.set_sent_error(fields.is_sent_known.then(|| Duration::from_nanos(fields.sent_error_ns)));
     Message::new(header, received.payload().to_vec().into())
 }
 

@@ -99,8 +99,8 @@ impl Word {
         // So is one that was sent before central knew that somebody meddles.
         self.suspicion.note(&self.guard.tally(), false);
         let is_known = arm.suspect || !self.suspicion.is_there();
-        let is_young = arm.age_at_most() <= SILENCE_MAX;
-        if state == DriveState::Walk || !is_young || !is_known || self.guard.arm().is_err() {
+        let is_old = arm.is_older_than(SILENCE_MAX);
+        if state == DriveState::Walk || is_old || !is_known || self.guard.arm().is_err() {
             return Armed::Refused;
         }
         self.suspicion.forget();

@@ -112,13 +112,15 @@ impl Screen {
         lines.extend(Joint::ALL.map(|joint| match view.drive(joint) {
             None => format!("  {:7}  -", joint.name()),
             Some(drive) => format!(
-                "  {:7}  {:5}  {:+6.1} Nm  inputs {:.1} ms old at most  {} ticks without them",
-                joint.name(),
-                format!("{:?}", drive.state),
-                drive.torque_nm,
-                f64::from(drive.age_max_us) / 1000.0,
-                drive.misses
-            ),
+                    "  {:7}  {:5}  {:+6.1} Nm  inputs {} old at most  {} ticks without them",
+                    joint.name(),
+                    format!("{:?}", drive.state),
+                    drive.torque_nm,
+                    drive
+                        .age_max_us
+                        .map_or_else(|| "?".to_owned(), |us| format!("{:.1} ms", f64::from(us) / 1000.0)),
+                    drive.misses
+                ),
         }));
         lines.push(match strides {
             None => "  standing".to_owned(),

@@ -112,7 +112,7 @@ impl Operator {
         };
         let drive = self.whoever_is(&drive_name(joint))?;
         // The drive takes the time of sending for its age.
-        let set = TorqueSet { seq, t_ns: Time::now().as_nanos(), t_error_ns: 0, torque_nm, epoch: 1 };
+        let set = TorqueSet { seq, t_ns: Time::now().as_nanos(), t_error_ns: Some(0), torque_nm, epoch: 1 };
         self.endpoint.send(drive, &set).map_err(lost)
     }
 
@@ -122,7 +122,7 @@ impl Operator {
         let state = GaitState {
             seq: self.seq,
             t_ns: Time::now().as_nanos(),
-            t_error_ns: 0,
+            t_error_ns: Some(0),
             phase: f32::NAN,
             phase_rate_hz: 0.0,
             stance: Stance::Swing,

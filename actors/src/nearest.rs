@@ -1,0 +1,58 @@
+//! Names that are similar to one that does not exist: for the remedies of errors. Pure.
+
+/// Names that are suggested at most.
+pub(crate) const NEAREST_MAX: usize = 3;
+/// Names that are compared at most: one comparison takes about a microsecond.
+pub(crate) const COMPARED_MAX: usize = 1_024;
+/// Characters of a name that are compared at most.
+const CHARACTERS_MAX: usize = 64;
+/// Similarity (Jaro-Winkler, 0 to 1) from which a name is suggested. `knee.senser` and `knee.drive` have 0.77, `knee.senser` and `hip.drive` 0.53.
+const SIMILAR: f64 = 0.75;
+
+/// Those of `known` whose names are similar to `name`, [`NEAREST_MAX`] at most, the most similar first. Each name once.
+pub(crate) fn nearest<T>(
+    name: &str,
+    known: impl IntoIterator<Item = T>,
+    name_of: impl Fn(&T) -> &str,
+) -> Vec<T> {
+    let name: String = name.chars().take(CHARACTERS_MAX).collect();
+    let known = known.into_iter().take(COMPARED_MAX);
+    let mut similar: Vec<_> = known
+        .map(|known| (strsim::jaro_winkler(&name, name_of(&known)), known))
+        .filter(|(similarity, _)| *similarity >= SIMILAR)
+        .collect();
+    similar.sort_by(|a, b| b.0.total_cmp(&a.0).then_with(|| name_of(&a.1).cmp(name_of(&b.1))));
+    similar.dedup_by(|a, b| name_of(&a.1) == name_of(&b.1));
+    similar.into_iter().take(NEAREST_MAX).map(|(_, known)| known).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn of<'a>(name: &str, known: &[&'a str]) -> Vec<&'a str> {
+        nearest(name, known.iter().copied(), |known| known)
+    }
+
+    #[test]
+    fn similar_names_are_suggested_the_most_similar_first_and_each_once() {
+        let known = ["hip.drive", "knee.drive", "knee.sensor", "knee.sensor"];
+        assert_eq!(of("knee.senser", &known), ["knee.sensor", "knee.drive"]);
+        assert_eq!(of("camera", &known), [""; 0]);
+    }
+
+    #[test]
+    fn however_many_names_are_similar_three_are_suggested() {
+        assert_eq!(
+            of("drive", &["drive.1", "drive.2", "drive.3", "drive.4"]),
+            ["drive.1", "drive.2", "drive.3"]
+        );
+    }
+
+    #[test]
+    fn names_beyond_the_bounds_are_not_compared() {
+        let many = vec!["other"; COMPARED_MAX];
+        assert_eq!(of("knee", &[&many[..], &["knee"]].concat()), [""; 0]);
+        assert_eq!(of(&"k".repeat(100_000), &["kkkk"]), ["kkkk"]);
+    }
+}
