@@ -336,13 +336,11 @@ fn a_send_whose_time_is_over_takes_no_room_from_later_ones() {
     let (now, until) = (Time::from_nanos(1), Time::from_nanos(2));
     let nodes = || (node(1), vec![node(2)]);
     let hung: Vec<_> = (0..OPEN_OF_ONE_MAX as u64)
-        .map(|correlation| {
-            open.open(nodes(), receipt(correlation), (now, until)).ok().expect("there is room")
-        })
+        .map(|correlation| open.open(nodes(), receipt(correlation), (now, until)).expect("there is room"))
         .collect();
     assert!(open.open(nodes(), receipt(100), (now, until)).is_err());
     let later = Time::from_nanos(3);
-    let next = open.open(nodes(), receipt(100), (later, later)).ok().expect("theirs is over");
+    let next = open.open(nodes(), receipt(100), (later, later)).expect("theirs is over");
     drop(hung);
     assert_eq!(open.len(), 1, "those that end late leave the later one");
     drop(next);
