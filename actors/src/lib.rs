@@ -85,8 +85,9 @@ mod takeover;
 mod undelivered;
 mod wills;
 
+pub use sinew_runtime::name;
 #[cfg(feature = "fault-points")]
-pub use sinew_runtime::{name, supervision::fault};
+pub use sinew_runtime::supervision::fault;
 
 #[doc(no_inline)]
 pub use address::{AppAddress, NodeAddress, Tid};

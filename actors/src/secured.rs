@@ -224,7 +224,8 @@ impl Seals {
         sealed: &'a [u8],
         maker: impl FnOnce(&[u8]) -> Option<NodeAddress>,
     ) -> Result<&'a [u8], &'static str> {
-        const FORGED: &str = "it was not made with this project's keys: somebody pretends, or a node there has no keys, or older ones";
+        const FORGED: &str = "it was not made with this project's keys: a node there has those of another project, or older ones, or somebody pretends to be one; \
+             compare `sinew keys show --keys DIR` of both nodes";
         let (datagram, seal) = sealed.split_last_chunk::<SEAL_LEN>().ok_or(FORGED)?;
         let (incarnation, seal) = seal.split_first_chunk::<8>().ok_or(FORGED)?;
         let (number, tag) = seal.split_first_chunk::<8>().ok_or(FORGED)?;

@@ -148,6 +148,19 @@ impl Undelivered {
     pub(crate) fn unhandled(&self) -> Vec<(Unhandled, Line<Tid>)> {
         lock(&self.core).unhandled.latest()
     }
+
+    /// Types that applications of other nodes did not handle or could not read when applications of this one sent them, the latest first:
+    /// sender, receiver, type, and code of the reason.
+    pub(crate) fn unhandled_elsewhere(&self) -> Vec<((AppAddress, Tid, Kind, u8), Line<Entry>)> {
+        let latest = lock(&self.core).warned.latest().into_iter();
+        let of_types =
+            [Rejection::UnknownKind, Rejection::Malformed].map(|why| Outcome::Rejected(why).code());
+        let elsewhere = latest.filter_map(|((app, to, kind, why), line)| {
+            let is_it = of_types.contains(&why) && to.is_single() && to.node != self.node;
+            Some(((app, to, kind.filter(|_| is_it)?, why), line))
+        });
+        elsewhere.collect()
+    }
 }
 
 impl RefusalSink for Undelivered {

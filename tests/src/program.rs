@@ -107,6 +107,15 @@ impl Program {
         }
     }
 
+    /// Looks at all that it has said so far.
+    pub fn look(&mut self) -> &[String] {
+        for line in self.lines.try_iter() {
+            self.seen.push(line.clone());
+            self.unclaimed.push(line);
+        }
+        &self.seen
+    }
+
     /// What it has said so far, as far as it was looked at.
     #[must_use]
     pub fn said(&self) -> &[String] {

@@ -216,6 +216,18 @@ pub struct WatchGroup {
     pub missed_max: u32,
 }
 
+impl NdlConfig {
+    /// The groups that are asked: none of either family where multicast is off, and none from loopback of IPv6.
+    pub(crate) fn asked_groups(&self) -> Vec<String> {
+        let Some(ipv4) = self.multicast else { return Vec::new() };
+        let beyond: Vec<_> =
+            self.interface.iter().filter(|interface| !interface.is_loopback()).cloned().collect();
+        let ipv4 = self.interface.have_ipv4().then(|| ipv4.to_string());
+        let ipv6 = self.multicast6.filter(|_| Interfaces::from(beyond).have_ipv6());
+        ipv4.into_iter().chain(ipv6.map(|group| group.to_string())).collect()
+    }
+}
+
 impl WatchGroup {
     /// Whether the node called `name` is in this group.
     ///

@@ -26,7 +26,6 @@ use super::reports::{
 use super::watches::{Fetched, Sight};
 use crate::{
     audit,
-    config::{Interfaces, NdlConfig},
     gncl::{self, ByDatagram, Peer},
     ndl::{IdleApp, KnownNode, KnownRoute, LossReason, LostNode, Source, SourceCounts, Trouble, TroubledApp},
     node::{CommandError, NodeHandle, Supervised},
@@ -71,7 +70,7 @@ impl Answers {
             peer.idle.truncate(idle_room);
             idle_room -= peer.idle.len();
         }
-        let (ndl, groups) = (Discovery::of(stores, now), groups(&stores.config.ndl));
+        let (ndl, groups) = (Discovery::of(stores, now), stores.config.ndl.asked_groups());
         let (refusals, refusals_left_out) = refusals(stores, now);
         Ok(NodeReport {
             node: stores.node,
@@ -180,15 +179,6 @@ struct Discovery {
     idle: Vec<IdleReport>,
 }
 
-/// The groups that are asked: none of either family where multicast is off, and none from loopback of IPv6.
-fn groups(ndl: &NdlConfig) -> Vec<String> {
-    let Some(ipv4) = ndl.multicast else { return Vec::new() };
-    let beyond: Vec<_> = ndl.interface.iter().filter(|interface| !interface.is_loopback()).cloned().collect();
-    let ipv4 = ndl.interface.have_ipv4().then(|| ipv4.to_string());
-    let ipv6 = ndl.multicast6.filter(|_| Interfaces::from(beyond).have_ipv6());
-    ipv4.into_iter().chain(ipv6.map(|group| group.to_string())).collect()
-}
-
 impl Discovery {
     fn of(stores: &Stores, now: Time) -> Self {
         let core = lock(&stores.ndl);
@@ -284,24 +274,32 @@ fn refusals(stores: &Stores, now: Time) -> (Vec<RefusalReport>, u64) {
     (reports.collect(), left_out)
 }
 
-/// Types that applications of this node did not handle or could not read.
+/// Types that applications of this node did not handle or could not read, and those of this node's that others did not.
 fn unhandled(stores: &Stores, now: Time) -> Vec<UnhandledReport> {
-    let latest = stores.undelivered.unhandled();
-    let reports = latest.into_iter().take(TOLD_MAX).map(|((app, kind, why), line)| {
+    let here = stores.undelivered.unhandled().into_iter();
+    let here = here.map(|((app, kind, why), line)| {
+        (Tid::new(stores.node, app), line.about, kind, why, line.count, line.last)
+    });
+    // What other nodes refused of this one's: the name of the type is known here alone.
+    let there = stores.undelivered.unhandled_elsewhere().into_iter();
+    let there = there.map(|((app, to, kind, why), line)| {
+        (to, Tid::new(stores.node, app), kind, why, line.count, line.last)
+    });
+    let reports = here.chain(there).take(TOLD_MAX).map(|(receiver, sender, kind, why, count, last)| {
         let is_malformed = why == Outcome::Rejected(Rejection::Malformed).code();
         let remedy = if is_malformed {
-            "use the same type at both ends".to_owned()
+            "use the same type at both ends; the log of the receiver names the field".to_owned()
         } else {
-            undelivered::remedy(app, kind)
+            undelivered::remedy(receiver.app, kind)
         };
         UnhandledReport {
-            receiver: Tid::new(stores.node, app),
-            sender: line.about,
+            receiver,
+            sender,
             kind,
             kind_name: undelivered::kind_name(stores, kind),
             is_malformed,
-            count: line.count,
-            ago_us: micros(now.since(line.last)),
+            count,
+            ago_us: micros(now.since(last)),
             remedy,
         }
     });

@@ -175,7 +175,8 @@ payload!("sinew.inspect.node_report" =>
         /// Further causes that had no room.
         #[serde(default)]
         pub refusals_left_out: u64,
-        /// Types that its applications did not handle or could not read, the latest first.
+        /// Types that its applications did not handle or could not read, the latest first; then those that its applications sent, and
+        /// receivers at other nodes did not handle or could not read.
         #[serde(default, deserialize_with = "at_most::<_, _, TOLD_MAX>")]
         pub unhandled: Vec<UnhandledReport>,
         /// The nodes that it knows, in the order of their addresses.

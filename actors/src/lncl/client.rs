@@ -160,6 +160,8 @@ struct Client {
     /// Whose it is.
     user: User,
     name: String,
+    /// Whether it chose the name; else that is its address.
+    is_named: bool,
     requires: Vec<String>,
     /// Whether the peer wants to be told what it waits for.
     waits: bool,
@@ -209,8 +211,13 @@ impl Client {
         server.add_client(peer.id, outlet.clone());
         server.stores.book.add_client(peer.id, app, &name, outlet.clone());
         if let Some(suppressed) = server.stores.log_quotas.clients.take(&name, Time::now()) {
-            let suppressed = (suppressed > 0).then_some(suppressed);
-            crate::log::info!(%tid, name, pid = peer.pid, suppressed, "an application of another process has registered");
+            let (suppressed, pid) = ((suppressed > 0).then_some(suppressed), peer.pid);
+            // Each command of `sinew` registers some without a name.
+            if called.is_some() {
+                crate::log::info!(%tid, name, pid, suppressed, "an application of another process has registered");
+            } else {
+                crate::log::debug!(%tid, pid, suppressed, "an application of another process has registered");
+            }
         }
         let (link, events, has_been_told) = (None, events.into(), false);
         let cause = Cause::new(DownClass::Killed, registrar::LNCL_ENDED);
@@ -226,6 +233,7 @@ impl Client {
             tid,
             user,
             name,
+            is_named: called.is_some(),
             requires,
             waits,
             events,

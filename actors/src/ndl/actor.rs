@@ -287,7 +287,8 @@ impl Shell {
             )),
             Output::Stalled { late } => crate::log::warn!(
                 late_ms = late.as_millis(),
-                "NDL was starved: its own timer came late, so of such cycles only one in four counts whoever is silent"
+                "this node did not run for {} ms: its process was stopped, or had no CPU; of such cycles only one in four counts missed answers of others",
+                late.as_millis()
             ),
         }
     }

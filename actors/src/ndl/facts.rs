@@ -1,6 +1,6 @@
 //! What NDL says to the other layers and to applications.
 
-use std::net::SocketAddr;
+use std::{fmt, net::SocketAddr};
 
 use serde::{Deserialize, Serialize};
 use sinew_runtime::{
@@ -115,7 +115,7 @@ pub enum Trouble {
     Unheard,
 }
 
-/// How a loss was noticed.
+/// How a loss was noticed. Its text says what is to be done, too.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum LossReason {
     /// It stopped in order.
@@ -132,6 +132,28 @@ pub enum LossReason {
     Restarted,
     /// Another process holds its node address, and held it before: nodes listen to that one.
     Duplicate,
+}
+
+impl fmt::Display for LossReason {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Left => "it stopped in order",
+            Self::GaveUp(words) => return write!(f, "it gave up: {words}"),
+            Self::Crashed => {
+                "its process has ended, nothing listens at its address; start it again, its log says why it ended"
+            }
+            Self::Hung => {
+                "it does not answer, and its host does; is its process stopped (SIGSTOP), in a debugger, or without a CPU?"
+            }
+            Self::LinkDown => {
+                "neither it nor its host answers; is the cable in, the interface up (`ip link`), its host on?"
+            }
+            Self::Restarted => "its process ended without a stop, and was started again",
+            Self::Duplicate => {
+                "another process holds its node address; give one of the two another `address` under [node]"
+            }
+        })
+    }
 }
 
 impl LossReason {

@@ -387,8 +387,10 @@ fn log_start(handle: &NodeHandle) {
     let config = &handle.stores.config;
     let (interface, socket) = (&config.ndl.interface, config.lncl.socket.as_ref());
     let socket = socket.map(|path| path.display().to_string());
+    let is_chosen = !interface.are_default();
+    let place = if is_chosen { "" } else { ", on its own host alone: no `interface` under [ndl] is set" };
     log::info!(
-        node = config.name, address = %handle.address(), project = config.project, %interface, socket, "the node has started"
+        node = config.name, address = %handle.address(), project = config.project, %interface, socket, "the node has started{place}"
     );
     for waiting in handle.waiting().into_iter().take(WAITING_SHOWN_MAX) {
         let missing: Vec<_> = waiting.missing.iter().map(|absence| &*absence.name).collect();

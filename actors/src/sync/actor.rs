@@ -18,6 +18,7 @@ use sinew_runtime::{
 use super::{
     Event,
     core::{Core, Input, Named, Output, Place, Reason},
+    discovery,
     facts::DirectoryEvent,
     list::Published,
     words::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier},
@@ -30,7 +31,7 @@ use crate::{
     node::RootEvent,
     refusals::{PEER_GONE, Refusals},
     stores::{self, POST_CAPACITY, Stores},
-    wills,
+    undelivered, wills,
 };
 
 /// The sync manager of a node: a new one after each fault, on the same core.
@@ -331,7 +332,7 @@ impl SyncManager {
             ),
             Output::Misspelt { application, name, nearest } => {
                 let nearest = if nearest.is_empty() {
-                    "none is similar".to_owned()
+                    format!("none is similar{}", discovery::in_words(&self.stores))
                 } else {
                     format!("nearest: {}", nearest.join(", "))
                 };
@@ -351,21 +352,20 @@ impl SyncManager {
 
     /// Tells an application that subscribed to it what became of a requirement.
     fn tell(&self, app: AppAddress, event: RequirementEvent, why: Option<Reason>) {
+        let title = stores::lock(&self.stores.registry).name_of(app);
+        let words = why.map_or("it is ready again by now", Reason::words);
         match &event {
             RequirementEvent::Lost { name } if why.is_some_and(Reason::is_orderly) => {
-                let why = why.map(Reason::words);
-                crate::log::info!(%app, name, why, "what an application requires was stopped in order");
+                crate::log::info!(%app, "{title} lost {name}, which it requires: {words}");
             }
             RequirementEvent::Lost { name } => {
-                let why = why.map_or("it is ready again by now", Reason::words);
-                crate::log::warn!(%app, name, why, "an application lost what it requires");
+                crate::log::warn!(%app, "{title} lost {name}, which it requires: {words}");
             }
             RequirementEvent::Without { name } => {
-                let why = why.map_or("it is ready again by now", Reason::words);
-                crate::log::warn!(%app, name, why, "an application goes on without what it can do without");
+                crate::log::warn!(%app, "{title} goes on without {name}, which it can do without: {words}");
             }
             RequirementEvent::Met { name } => {
-                crate::log::info!(%app, name, "an application's requirement is met again")
+                crate::log::info!(%app, "{name}, which {title} requires, is ready again");
             }
         }
         if !self.stores.router.subscribes(app, RequirementEvent::KIND) {
@@ -384,6 +384,8 @@ impl SyncManager {
                 let name = event.name().to_owned();
                 self.core().handle(Time::now(), Input::EventNotTaken { app, name });
             }
+            // It has ended itself: an ordinary stop of a whole robot has such.
+            Err(why) if undelivered::is_of_an_end(why) => {}
             Err(why) => {
                 self.refuse("application", &format_args!("{app} was not told of a requirement: {why}"))
             }

@@ -28,6 +28,7 @@ mod actor;
 mod actor_tests;
 mod arrivals;
 mod core;
+mod discovery;
 mod facts;
 #[cfg(feature = "fuzzing")]
 pub(crate) mod fuzzing;

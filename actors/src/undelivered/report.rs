@@ -265,7 +265,9 @@ fn warn_receiver(stores: &Stores, key: &Unhandled, line: &Line<Tid>) {
         return;
     }
     let receiver = in_words(stores, Tid::new(stores.node, app));
-    let (sender, kind_name) = (in_words(stores, line.about), type_in_words(stores, Some(kind)));
+    let sender = in_words(stores, line.about);
+    let named = kind_name(stores, kind);
+    let kind_name = named.unwrap_or_else(|| format!("kind {kind} (the log of its sender names it)"));
     let (messages, remedy) = (line.unlogged, remedy(app, kind));
     crate::log::warn!(messages, "{receiver} does not handle {kind_name}, sent by {sender}: {remedy}");
 }

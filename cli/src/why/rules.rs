@@ -14,7 +14,7 @@ mod version;
 use std::collections::BTreeSet;
 
 use sinew::{
-    inspect::{LostReport, NodeReport, PeerReport, RefusalReport},
+    inspect::{LostReport, Missing, NodeReport, PeerReport, RefusalReport},
     message::Rejection,
 };
 
@@ -73,8 +73,8 @@ pub(super) fn judge(facts: &Facts) -> Vec<Step> {
         }
     }
     let [there, back] = facts.pings.each_ref().map(Option::as_ref);
-    for (end, ping) in [(a, back), (b, there)] {
-        steps.application(end, ping, facts);
+    for ((end, other), ping) in [(a, b), (b, a)].into_iter().zip([back, there]) {
+        steps.application((end, other), ping, facts);
     }
     for (from, to) in [(a, b), (b, a)] {
         steps.handled(from, to);
@@ -97,6 +97,15 @@ impl Steps {
     fn note(&mut self, what: impl Into<String>, seen: impl Into<String>, mend: impl Into<String>) {
         let (what, seen) = (what.into(), seen.into());
         self.0.push(Step { what, state: State::Note, seen, mend: Some(mend.into()) });
+    }
+
+    /// It stands in the way, and what mends it was told with another step.
+    fn explained(&mut self, what: impl Into<String>, seen: impl Into<String>) {
+        self.0.push(Step { what: what.into(), state: State::Blocked, seen: seen.into(), mend: None });
+    }
+
+    fn is_blocked(&self) -> bool {
+        self.0.iter().any(|step| step.state == State::Blocked)
     }
 
     fn blocked(&mut self, what: impl Into<String>, seen: impl Into<String>, mend: impl Into<String>) {
@@ -173,8 +182,9 @@ impl Steps {
             let (seen, mend) = lost_in_words(lost);
             return self.blocked(what, seen, mend);
         }
-        for (seen, mend) in why_unknown(report, to) {
-            self.blocked(what.clone(), seen, mend);
+        match why_unknown(report, to) {
+            (seen, Some(mend)) => self.blocked(what, seen, mend),
+            (seen, None) => self.explained(what, seen),
         }
     }
 
@@ -219,7 +229,7 @@ impl Steps {
     }
 
     /// Whether the application that was asked for takes messages; `ping` is what came of one to it.
-    fn application(&mut self, end: &End, ping: Option<&Result<u64, String>>, facts: &Facts) {
+    fn application(&mut self, (end, other): (&End, &End), ping: Option<&Result<u64, String>>, facts: &Facts) {
         let Some(app) = &end.app else { return };
         let what = format!("{} takes messages", end.label());
         let Some(report) = &app.report else {
@@ -236,18 +246,13 @@ impl Steps {
             );
         }
         if !report.ready {
-            let mend = if report.missing.is_empty() {
-                "`sinew tree` shows how its last life ended, its log says more".to_owned()
-            } else {
-                let names: Vec<_> = report.missing.iter().map(|missing| missing.name.as_str()).collect();
-                format!(
-                    "start what it waits for: {}; `sinew why` from it to each says what stands there",
-                    names.join(", ")
-                )
-            };
             let why = crate::apps::why(report);
             let why = if why.is_empty() { "not ready".to_owned() } else { why };
-            return self.blocked(what, why, mend);
+            let is_other = |missing: &Missing| missing.name == other.wanted;
+            if self.is_blocked() && !report.missing.is_empty() && report.missing.iter().all(is_other) {
+                return self.explained(what, why);
+            }
+            return self.blocked(what, why, unnamed::mend_of_wait(&report.missing));
         }
         if let Some((seen, mend)) = troubled(app) {
             return self.blocked(what, seen, mend);
@@ -297,7 +302,7 @@ impl Steps {
             }
             Some(Err(why)) => {
                 // What was found before explains it.
-                let is_explained = self.0.iter().any(|step| step.state == State::Blocked);
+                let is_explained = self.is_blocked();
                 let mend = "`sinew tree` of its node shows what it does; is it busy, or does it hang?";
                 let mend = (!is_explained).then(|| mend.to_owned());
                 self.0.push(Step { what, state: State::Blocked, seen: why.clone(), mend });
@@ -354,16 +359,9 @@ pub(crate) fn lost_in_words(lost: &LostReport) -> (String, &'static str) {
     }
 }
 
-/// Why `from` has never found `to`: in what their configurations do not meet.
-fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
-    let ours = |report: &NodeReport| {
-        let seeds = if report.seeds.is_empty() {
-            "no seeds".to_owned()
-        } else {
-            format!("seeds {}", report.seeds.join(", "))
-        };
-        format!("{} at {}, {seeds}", groups::in_words(report), report.interface)
-    };
+/// Why `from` has never found `to`: in what their configurations do not meet; and what mends it, unless another step has told that.
+fn why_unknown(from: &NodeReport, to: &End) -> (String, Option<String>) {
+    let told = |(seen, mend)| (seen, Some(mend));
     if let Some(foreign) = from.foreign.iter().find(|foreign| Some(foreign.node) == to.node) {
         let seen = format!(
             "{} at that address speaks for project '{}', not '{}', {} ago",
@@ -372,61 +370,66 @@ fn why_unknown(from: &NodeReport, to: &End) -> Vec<(String, String)> {
             from.project,
             time(foreign.ago_us)
         );
-        return vec![(seen, "set the same `project` under [node] in both configurations".to_owned())];
+        return (seen, Some("set the same `project` under [node] in both configurations".to_owned()));
     }
     let Some(theirs) = &to.report else {
         let mend = "is it started, with the same `project` and the same multicast group? Where multicast does not pass (WiFi, VPN, containers, most clouds): \
                     [ndl] seeds = [\"ITS_ADDRESS:PORT\"], with a fixed `ndl.port` there";
         let refused = keys::refused_of_anybody(from);
-        return vec![(
-            format!(
-                "no datagram from it has arrived, by multicast or from a seed; {} asks {}{refused}",
-                from.name,
-                ours(from)
-            ),
-            mend.to_owned(),
-        )];
+        let asked = asked(from);
+        let seen = format!(
+            "no datagram from it has arrived, by multicast or from a seed; {} asks {asked}{refused}",
+            from.name
+        );
+        return (seen, Some(mend.to_owned()));
     };
     if from.project != theirs.project {
         // It was said already, and is reason enough.
-        return vec![("not found, as it is of another project".to_owned(), "as above".to_owned())];
+        return ("not found, as it is of another project".to_owned(), None);
     }
     if keys::are_unlike(from, theirs) {
         let seen = "not found, as one of them has keys and the other none";
-        return vec![(seen.to_owned(), "as above".to_owned())];
+        return (seen.to_owned(), None);
     }
     if let Some(refused) =
         keys::refused_datagrams(from, theirs).or_else(|| keys::refused_datagrams(theirs, from))
     {
-        return vec![refused];
+        return told(refused);
     }
     if let Some(differ) = version::differs(from, theirs) {
-        return vec![differ];
+        return told(differ);
     }
     let seeded = |of: &NodeReport, other: &NodeReport| {
         other.udp.as_ref().is_some_and(|udp| of.seeds.iter().any(|seed| names(seed, udp)))
     };
     if seeded(from, theirs) || seeded(theirs, from) {
         let mend = "is UDP let through by the firewalls of both hosts (`sudo nft list ruleset`), and is `ndl.port` the one that the seed names?";
-        return vec![("a seed names it, and no answer has come".to_owned(), mend.to_owned())];
+        return ("a seed names it, and no answer has come".to_owned(), Some(mend.to_owned()));
     }
     if let Some(useless) = places::useless_seed(from, theirs).or_else(|| places::useless_seed(theirs, from)) {
-        return vec![useless];
+        return told(useless);
     }
     if is_on_loopback(&from.interface) != is_on_loopback(&theirs.interface) {
         let seen = format!(
             "it asks at {}, the other at {}: one of them on its own host only",
             from.interface, theirs.interface
         );
-        return vec![(
-            seen,
-            "set `interface` under [ndl] to the address of the interface between the hosts, in both"
-                .to_owned(),
-        )];
+        let mend = "set `interface` under [ndl] to the address of the interface between the hosts, in both";
+        return (seen, Some(mend.to_owned()));
     }
     let udp = theirs.udp.as_deref().unwrap_or("ITS_ADDRESS:PORT");
     let seed = format!("[ndl] seeds = [\"{udp}\"] in the configuration of {}", from.name);
-    vec![groups::why_unheard(from, theirs, &seed)]
+    told(groups::why_unheard(from, theirs, &seed))
+}
+
+/// Where a node looks for others.
+fn asked(report: &NodeReport) -> String {
+    let seeds = if report.seeds.is_empty() {
+        "no seeds".to_owned()
+    } else {
+        format!("seeds {}", report.seeds.join(", "))
+    };
+    format!("{} at {}, {seeds}", groups::in_words(report), report.interface)
 }
 
 fn dial_in_words(peer: &PeerReport) -> (String, String) {

@@ -3,6 +3,7 @@
 mod access;
 mod doctor;
 mod keys;
+mod mistakes;
 mod output;
 mod scenario;
 mod secured;

@@ -23,6 +23,13 @@ pub(crate) struct Answer {
 }
 
 impl Answer {
+    /// Runs it.
+    pub(crate) fn of(command: &mut Command) -> Self {
+        let Output { status, stdout, stderr } = command.output().expect("the command starts");
+        let text = |bytes| String::from_utf8(bytes).expect("it writes text");
+        Self { code: status.code(), out: text(stdout), err: text(stderr) }
+    }
+
     pub(crate) fn json(&self) -> Value {
         serde_json::from_str(&self.out).unwrap_or_else(|error| panic!("{error}: {}{}", self.out, self.err))
     }
@@ -70,6 +77,16 @@ impl Scenario {
         changes: &[(&str, &str)],
         more: &[&str],
     ) -> Program {
+        let path = self.configure(name, address, changes);
+        let mut command = Command::new(node_program());
+        command.arg(&path).args(more);
+        let mut node = Program::start(name, command);
+        node.wait_for(&["up"]);
+        node
+    }
+
+    /// Writes the configuration of a node, with these texts of it replaced by others.
+    pub(crate) fn configure(&self, name: &str, address: u8, changes: &[(&str, &str)]) -> PathBuf {
         let path = self.directory.join(&format!("{name}.toml"));
         let text = format!(
             "[node]\nname = \"{name}\"\naddress = \"127.0.0.{address}\"\nproject = \"cli\"\n\
@@ -79,13 +96,7 @@ impl Scenario {
         );
         let text = changes.iter().fold(text, |text, (from, to)| text.replace(from, to));
         std::fs::write(&path, text).expect("the test's own directory");
-        let node = program("node_under_test");
-        assert!(node.exists(), "there is no {}; build it: cargo build -p sinew-tests", node.display());
-        let mut command = Command::new(node);
-        command.arg(&path).args(more);
-        let mut node = Program::start(name, command);
-        node.wait_for(&["up"]);
-        node
+        path
     }
 
     /// Runs `sinew` through the socket of the node called `name`. A node of a machine that is slow has more time for its answer than the
@@ -111,12 +122,16 @@ impl Scenario {
     }
 }
 
+/// The program of the nodes.
+pub(crate) fn node_program() -> PathBuf {
+    let node = program("node_under_test");
+    assert!(node.exists(), "there is no {}; build it: cargo build -p sinew-tests", node.display());
+    node
+}
+
 pub(crate) fn sinew(words: &[&str], runtime_directory: &Path) -> Answer {
     let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
-    command.args(words).env("XDG_RUNTIME_DIR", runtime_directory).env_remove("SINEW_SOCKET");
-    let Output { status, stdout, stderr } = command.output().expect("the command starts");
-    let text = |bytes| String::from_utf8(bytes).expect("it writes text");
-    Answer { code: status.code(), out: text(stdout), err: text(stderr) }
+    Answer::of(command.args(words).env("XDG_RUNTIME_DIR", runtime_directory).env_remove("SINEW_SOCKET"))
 }
 
 /// The element of `list` whose `name` is this one.

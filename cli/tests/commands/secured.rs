@@ -8,7 +8,7 @@ use sinew_tests::Program;
 use crate::scenario::{Scenario, named, sinew};
 
 /// Keys of a project of their own, in this directory of the test's.
-fn make_keys(scenario: &Scenario, directory: &str, nodes: &[&str]) {
+pub(crate) fn make_keys(scenario: &Scenario, directory: &str, nodes: &[&str]) {
     make_keys_for(scenario, directory, "365", nodes);
 }
 

@@ -1,13 +1,19 @@
 //! A node for the scenarios: one application that sends, and says what it sees, one line each.
 //!
 //! `node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--floods NAME]... [--will NAME]... [--meets NAME]... [--incarnation NUMBER]
-//! [--says-directory] [--streams-to NAME [--stream BYTES]...] [--logs | --logs-info] [--held]`
+//! [--says-directory] [--streams-to NAME [--stream BYTES]...] [--logs | --logs-info | --default-log] [--held]
+//! [--forgets-a-handler] [--sends-text-to NAME] [--panics]`
 //!
 //! With `--held` a thread-local variable of the main thread holds the node, and `main` returns 3 once the node runs: a destructor stops it.
 //!
 //! For each length that it streams it has an application more, which sends a value of class Stream of so many bytes every 20 ms.
 //! Whom it floods it sends as many counts as are taken, to each the same. A will is a count of 1,000,000. The
 //! incarnation is the clock's of its host, if none is given. What it logs goes to its standard error, with `--logs` warnings and with `--logs-info` more go to its output.
+//! With `--default-log` it installs no subscriber, as a first program does: Sinew's own lines go to its standard error.
+//!
+//! It makes mistakes when asked to. With `--forgets-a-handler` counts are not declared as handled. With `--sends-text-to` it sends a type that has the name of a
+//! count and a text in its field, every 20 ms. With `--panics` its application panics at the first count that it receives.
+//!
 //! With those whom it meets, itself among them, it waits at a barrier when it starts, once. When it has started is said in nanoseconds of the
 //! monotonic clock, which all hosts of one machine share. If it says the directory, it does so whenever its standard input has the line `directory`.
 
@@ -20,6 +26,9 @@ use sinew::{
 };
 
 payload!("scenario.count", Bulk => struct Count { number: u64 });
+
+// What another version of the program could have under the same name.
+payload!("scenario.count", Bulk => struct TextCount { number: String });
 
 payload!("scenario.sized", Stream => struct Sized { number: u64, filler: Vec<u8> });
 
@@ -55,6 +64,8 @@ struct Probe {
     sends_to: Option<String>,
     floods: Vec<String>,
     meets: Option<Barrier>,
+    sends_text_to: Option<String>,
+    panics: bool,
     sent: u64,
     last: u64,
 }
@@ -80,6 +91,11 @@ impl Actor for Probe {
                 }
             });
         }
+        if let Some(to) = self.sends_text_to.clone() {
+            context.every(Duration::from_millis(20), move |_, tick, context| {
+                let _ = context.send(&*to, &TextCount { number: format!("{}th", tick.number) });
+            });
+        }
         let Some(to) = self.sends_to.clone() else { return };
         context.every(Duration::from_millis(20), move |this, _, context| {
             // What nobody takes while the network is cut is not counted as sent.
@@ -99,6 +115,7 @@ impl Handler<Delivery<Count>> for Probe {
     type Result = ();
 
     fn handle(&mut self, count: Delivery<Count>, _: &mut Self::Context) {
+        assert!(!self.panics, "no encoder at /dev/ttyUSB0");
         println!("count {} from {} after {}", count.number, count.source, self.last);
         self.last = count.number;
     }
@@ -154,10 +171,9 @@ fn streamers(name: &str, receivers: &[String], lengths: &[String]) -> Vec<AppSpe
     receivers.iter().flat_map(of_one).collect()
 }
 
-/// To the output with `warnings` or `info`, else to the standard error.
-fn log(warnings: bool, info: bool) {
-    if warnings || info {
-        let level = if info { tracing::Level::INFO } else { tracing::Level::WARN };
+/// To the output at this level, else to the standard error.
+fn log(level: Option<tracing::Level>) {
+    if let Some(level) = level {
         tracing_subscriber::fmt().with_max_level(level).init();
     } else {
         tracing_subscriber::fmt()
@@ -170,7 +186,10 @@ fn log(warnings: bool, info: bool) {
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let has = |flag: &str| arguments.iter().any(|argument| argument == flag);
-    log(has("--logs"), has("--logs-info"));
+    if !has("--default-log") {
+        let info = has("--logs-info").then_some(tracing::Level::INFO);
+        log(info.or(has("--logs").then_some(tracing::Level::WARN)));
+    }
     let after = |flag: &str| {
         let pairs = arguments.windows(2).filter(|pair| pair[0] == flag);
         pairs.map(|pair| pair[1].clone()).collect::<Vec<_>>()
@@ -187,12 +206,16 @@ fn main() -> ExitCode {
     let name = config.name.clone();
     let parties = after("--meets");
     let meets = (!parties.is_empty()).then(|| Barrier::new("step", parties));
+    let (sends_text_to, panics) = (after("--sends-text-to").into_iter().next(), has("--panics"));
     let make = move || {
         let (sends_to, floods, meets) = (sends_to.clone(), floods.clone(), meets.clone());
-        Probe { sends_to, floods, meets, sent: 0, last: 0 }
+        Probe { sends_to, floods, meets, sends_text_to: sends_text_to.clone(), panics, sent: 0, last: 0 }
     };
-    let mut probe = AppSpec::new(name.as_str(), make)
-        .handles::<Count>()
+    let mut probe = AppSpec::new(name.as_str(), make);
+    if !has("--forgets-a-handler") {
+        probe = probe.handles::<Count>();
+    }
+    probe = probe
         .handles::<Sized>()
         .handles::<NodeEvent>()
         .handles::<RequirementEvent>()

@@ -186,7 +186,11 @@ impl Client {
         if let Some(suppressed) = self.server.stores.log_quotas.clients.take(&self.name, Time::now()) {
             let (tid, name, pid) = (self.tid, &self.name, self.peer.pid);
             let suppressed = (suppressed > 0).then_some(suppressed);
-            crate::log::info!(%tid, name, pid, suppressed, "an application of another process {what}");
+            if self.is_named {
+                crate::log::info!(%tid, name, pid, suppressed, "an application of another process {what}");
+            } else {
+                crate::log::debug!(%tid, pid, suppressed, "an application of another process {what}");
+            }
         }
     }
 }

@@ -41,17 +41,26 @@ impl Shell {
         }
         let (MembershipFact::NodeFound { node, .. } | MembershipFact::NodeLost { node, .. }) = fact;
         if let Some(suppressed) = self.stores.log_quotas.members.take(node, Time::now()) {
-            let suppressed = (suppressed > 0).then_some(suppressed);
-            match fact {
-                MembershipFact::NodeFound { incarnation, gncl, .. } => {
-                    crate::log::info!(%node, life = %incarnation, ?gncl, suppressed, "a node was found");
-                }
-                MembershipFact::NodeLost { incarnation, why, .. } => {
-                    crate::log::info!(%node, life = %incarnation, ?why, suppressed, "a node was lost");
+            self.log(fact, (suppressed > 0).then_some(suppressed));
+        }
+        self.tell();
+    }
+
+    fn log(&self, fact: &MembershipFact, suppressed: Option<u64>) {
+        match fact {
+            MembershipFact::NodeFound { node, incarnation: life, gncl } => {
+                let name = lock(&self.stores).name_of(*node);
+                crate::log::info!(%node, %life, ?gncl, suppressed, "node {name} was found");
+            }
+            MembershipFact::NodeLost { node, incarnation: life, why } => {
+                let name = lock(&self.stores).name_of(*node);
+                if matches!(why, LossReason::Left) {
+                    crate::log::info!(%node, %life, suppressed, "node {name} was lost: {why}");
+                } else {
+                    crate::log::warn!(%node, %life, suppressed, "node {name} was lost: {why}");
                 }
             }
         }
-        self.tell();
     }
 
     /// A member listens elsewhere now. It may say so each second, for ever.

@@ -107,6 +107,10 @@ impl Recall {
         self.lost.iter().map(|(node, lost)| (*node, lost.clone())).collect()
     }
 
+    pub(super) fn name_of(&self, node: NodeAddress) -> Option<String> {
+        self.lost.get(&node).map(|lost| lost.name.clone())
+    }
+
     pub(super) fn neighbours(&self) -> Vec<(SocketAddr, Neighbour)> {
         self.neighbours.iter().map(|(from, neighbour)| (*from, neighbour.clone())).collect()
     }

@@ -179,6 +179,17 @@ impl Core {
         self.recall.lost_nodes()
     }
 
+    /// The name of a node that is there, or was lost; its address where neither is so.
+    pub(crate) fn name_of(&self, node: NodeAddress) -> String {
+        let member = self.members.get(&node).map(|member| member.announcement.name.clone());
+        member.or_else(|| self.recall.name_of(node)).unwrap_or_else(|| node.to_string())
+    }
+
+    /// Whether a node is there beside this one.
+    pub(crate) fn knows_others(&self) -> bool {
+        !self.members.is_empty()
+    }
+
     /// How often this node's own timer came so late that nobody was counted as silent.
     pub(crate) const fn own_stalls(&self) -> OwnStalls {
         self.recall.stalls()

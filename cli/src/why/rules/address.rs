@@ -52,6 +52,18 @@ impl Steps {
     }
 }
 
+/// That the node of this name was not let in, as it claims an address that another one has; and what mends it.
+pub(super) fn not_let_in(name: &str, facts: &Facts) -> Option<(String, String)> {
+    let refusals =
+        facts.ends.iter().filter_map(|end| end.report.as_ref()).flat_map(|report| &report.refusals);
+    let is_its = |refusal: &&RefusalReport| {
+        refusal.cause == TWICE && refusal.detail.contains(&format!("the node '{name}' at "))
+    };
+    let RefusalReport { detail, ago_us, .. } = refusals.into_iter().find(is_its)?;
+    let mend = format!("give node {name} another `address` under [node], and start it again");
+    Some((format!("its node was not let in {} ago: {detail}", time(*ago_us)), mend))
+}
+
 /// Whether this says, of now or of just before, that the address of one of the two is used twice.
 fn is_of_one(refusal: &RefusalReport, facts: &Facts) -> bool {
     // The node that is used twice is the first word.

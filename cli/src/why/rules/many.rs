@@ -33,7 +33,7 @@ impl Steps {
             self.there(from, facts);
             self.meant(from);
             self.address(facts);
-            self.application(from, None, facts);
+            self.application((from, to), None, facts);
         }
         self.members(many, to);
         self.ways(many, from);

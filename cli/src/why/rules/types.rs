@@ -16,7 +16,8 @@ impl Steps {
         for said in unhandled.filter(|said| said.receiver == receiver) {
             let what = format!("{} handles what it is sent", to.label());
             let is_of_it = sender == Some(said.sender);
-            let seen = seen(said, if is_of_it { Some(from.label()) } else { None });
+            let kind = said.kind_name.clone().or_else(|| name_at(from, said));
+            let seen = seen(said, kind, if is_of_it { Some(from.label()) } else { None });
             if is_of_it && said.ago_us < RECENT_US {
                 self.blocked(what, seen, said.remedy.clone());
             } else {
@@ -26,9 +27,15 @@ impl Steps {
     }
 }
 
-fn seen(said: &UnhandledReport, sender: Option<&str>) -> String {
-    let UnhandledReport { sender: tid, kind, kind_name, count, ago_us, is_malformed, .. } = said;
-    let kind = kind_name.clone().unwrap_or_else(|| format!("kind {kind}"));
+/// The name of the type at its sender: a receiver that does not handle it does not know its name.
+fn name_at(sender: &End, said: &UnhandledReport) -> Option<String> {
+    let mut known = sender.report.iter().flat_map(|report| &report.unhandled);
+    known.find(|known| known.kind == said.kind)?.kind_name.clone()
+}
+
+fn seen(said: &UnhandledReport, name: Option<String>, sender: Option<&str>) -> String {
+    let UnhandledReport { sender: tid, kind, count, ago_us, is_malformed, .. } = said;
+    let kind = name.unwrap_or_else(|| format!("kind {kind}"));
     let sender = sender.map_or_else(|| tid.to_string(), str::to_owned);
     let ago = time(*ago_us);
     if *is_malformed {

@@ -10,6 +10,50 @@ const CASES: &[Case] = &[
         |facts| facts.ends[1] = End { wanted: "ankle".to_owned(), ..End::default() },
         ["ankle is there", "'ankle'", "sinew apps"],
     ),
+    Case(
+        |facts| {
+            facts.ends[1] = End { wanted: "ankle".to_owned(), ..End::default() };
+            let cause = "NDL node address used twice".to_owned();
+            let detail = "10.0.0.9 is that of the node 'arm' at 10.0.0.9:7000; the node 'ankle' at 10.0.0.8:7000 claims it".to_owned();
+            hip(facts).refusals.push(RefusalReport { cause, count: 1, detail, ago_us: 90_000_000 });
+        },
+        [
+            "ankle is there",
+            "its node was not let in 1 min 30 s ago: 10.0.0.9 is that of",
+            "give node ankle another `address`",
+        ],
+    ),
+    Case(
+        |facts| {
+            facts.ends[1] = End { wanted: "ankle".to_owned(), ..End::default() };
+            hip(facts).peers.clear();
+        },
+        [
+            "ankle is there",
+            "hip finds no other node; it looks in 239.0.0.1:7000",
+            "Does multicast pass: `sinew doctor",
+        ],
+    ),
+    Case(
+        |facts| {
+            facts.ends[1] = End { wanted: "ankle".to_owned(), ..End::default() };
+            hip(facts).peers.clear();
+            hip(facts).interface = "127.0.0.1".to_owned();
+        },
+        ["ankle is there", "hip finds no other node", "hip looks on its own host alone; set `interface`"],
+    ),
+    Case(
+        |facts| {
+            waits(facts, "ankel");
+            drive(facts).report.as_mut().expect("it is there").missing[0].why =
+                "not there; nearest: ankle (ready)".to_owned();
+        },
+        [
+            "knee.drive takes messages",
+            "nearest: ankle (ready)",
+            "is 'ankel' misspelt in `requires`? There is ankle (ready)",
+        ],
+    ),
     Case(|facts| facts.ends[1].report = None, ["knee.drive is there", "cannot be asked", "--other-socket"]),
     Case(
         |facts| {
