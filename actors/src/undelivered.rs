@@ -53,6 +53,8 @@ enum Reader {
 
 /// Receiver of a message that it does not handle or cannot read, type of the message, and [`Outcome::code`] of the reason.
 type Unhandled = (AppAddress, Kind, u8);
+/// Sender, receiver on another node, type of the message, and [`Outcome::code`] of the reason.
+type UnhandledElsewhere = (AppAddress, Tid, Kind, u8);
 /// Sender, destination, type and reason of messages that were not delivered.
 type Warned = (AppAddress, Tid, Option<Kind>, u8);
 
@@ -151,7 +153,7 @@ impl Undelivered {
 
     /// Types that applications of other nodes did not handle or could not read when applications of this one sent them, the latest first:
     /// sender, receiver, type, and code of the reason.
-    pub(crate) fn unhandled_elsewhere(&self) -> Vec<((AppAddress, Tid, Kind, u8), Line<Entry>)> {
+    pub(crate) fn unhandled_elsewhere(&self) -> Vec<(UnhandledElsewhere, Line<Entry>)> {
         let latest = lock(&self.core).warned.latest().into_iter();
         let of_types =
             [Rejection::UnknownKind, Rejection::Malformed].map(|why| Outcome::Rejected(why).code());

@@ -188,7 +188,7 @@ fn main() -> ExitCode {
     let has = |flag: &str| arguments.iter().any(|argument| argument == flag);
     if !has("--default-log") {
         let info = has("--logs-info").then_some(tracing::Level::INFO);
-        log(info.or(has("--logs").then_some(tracing::Level::WARN)));
+        log(info.or_else(|| has("--logs").then_some(tracing::Level::WARN)));
     }
     let after = |flag: &str| {
         let pairs = arguments.windows(2).filter(|pair| pair[0] == flag);
@@ -237,15 +237,19 @@ fn main() -> ExitCode {
     }
     // Used before all others, so that its destructor runs after theirs.
     HELD.with(|held| drop(held.borrow()));
+    run(builder, has("--held"), has("--says-directory"))
+}
+
+fn run(builder: NodeBuilder, is_held: bool, says_directory: bool) -> ExitCode {
     match builder.start() {
-        Ok(node) if has("--held") => {
+        Ok(node) if is_held => {
             let running = node.handle().wait_until_running(Duration::from_secs(60));
             HELD.set(Some(node));
             ExitCode::from(if running.is_ok() { 3 } else { 4 })
         }
         Ok(node) => {
             println!("up");
-            if has("--says-directory") {
+            if says_directory {
                 let handle = node.handle();
                 std::thread::spawn(move || say_the_directory(&handle));
             }
