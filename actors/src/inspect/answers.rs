@@ -280,7 +280,7 @@ fn unhandled(stores: &Stores, now: Time) -> Vec<UnhandledReport> {
     let here = here.map(|((app, kind, why), line)| {
         (Tid::new(stores.node, app), line.about, kind, why, line.count, line.last)
     });
-    // What other nodes refused of this one's: the name of the type is known here alone.
+    // Refused by other nodes: the sender's node alone knows the name of the type.
     let there = stores.undelivered.unhandled_elsewhere().into_iter();
     let there = there.map(|((app, to, kind, why), line)| {
         (to, Tid::new(stores.node, app), kind, why, line.count, line.last)

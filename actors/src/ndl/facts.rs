@@ -115,7 +115,7 @@ pub enum Trouble {
     Unheard,
 }
 
-/// How a loss was noticed. Its text says what is to be done, too.
+/// How a loss was noticed. Its `Display` adds the remedy.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum LossReason {
     /// It stopped in order.

@@ -1,11 +1,11 @@
-//! What discovery has to do with a name that no application has: no other node is found, or nodes of another project alone.
+//! Why a required name may be missing: discovery finds no other node, or only nodes of another project.
 
 use crate::stores::{Stores, lock};
 
 /// Nodes of other projects that are named at most.
 const NAMED_MAX: usize = 3;
 
-/// What stands in the way, to follow what is missing; empty where other nodes of the project are known.
+/// Returns this reason as the end of a sentence; an empty text where other nodes of the project are known.
 pub(super) fn in_words(stores: &Stores) -> String {
     let core = lock(&stores.ndl);
     if core.knows_others() {

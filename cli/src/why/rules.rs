@@ -99,7 +99,7 @@ impl Steps {
         self.0.push(Step { what, state: State::Note, seen, mend: Some(mend.into()) });
     }
 
-    /// It stands in the way, and what mends it was told with another step.
+    /// It stands in the way, and another step has the remedy.
     fn explained(&mut self, what: impl Into<String>, seen: impl Into<String>) {
         self.0.push(Step { what: what.into(), state: State::Blocked, seen: seen.into(), mend: None });
     }
@@ -359,7 +359,7 @@ pub(crate) fn lost_in_words(lost: &LostReport) -> (String, &'static str) {
     }
 }
 
-/// Why `from` has never found `to`: in what their configurations do not meet; and what mends it, unless another step has told that.
+/// Why `from` has never found `to`: in what their configurations do not meet; and the remedy, unless another step has it.
 fn why_unknown(from: &NodeReport, to: &End) -> (String, Option<String>) {
     let told = |(seen, mend)| (seen, Some(mend));
     if let Some(foreign) = from.foreign.iter().find(|foreign| Some(foreign.node) == to.node) {

@@ -15,7 +15,7 @@ const MISTAKES: usize = 12;
 /// On the page, any text.
 const ANY: &str = "...";
 
-/// What the page quotes of one mistake: a command, and lines that it shows. `./knee` is the terminal of the program of that name.
+/// The quotes of one mistake: a command, and lines that it shows. `./knee` is the terminal of the program of that name.
 type Quotes = Vec<(&'static str, Vec<&'static str>)>;
 
 fn sections() -> impl Iterator<Item = &'static str> {

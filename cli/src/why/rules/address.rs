@@ -52,7 +52,7 @@ impl Steps {
     }
 }
 
-/// That the node of this name was not let in, as it claims an address that another one has; and what mends it.
+/// That the node of this name was refused because another one has its address; and the remedy.
 pub(super) fn not_let_in(name: &str, facts: &Facts) -> Option<(String, String)> {
     let refusals =
         facts.ends.iter().filter_map(|end| end.report.as_ref()).flat_map(|report| &report.refusals);

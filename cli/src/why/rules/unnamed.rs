@@ -22,7 +22,7 @@ fn respell(name: &str, nearest: &str) -> String {
     format!("is '{name}' misspelt in `requires`? There is {nearest}. Else start '{name}'")
 }
 
-/// What is to be done for an application that waits for these.
+/// The remedy for an application that waits for these.
 pub(super) fn mend_of_wait(missing: &[Missing]) -> String {
     if missing.is_empty() {
         return "`sinew tree` shows how its last life ended, its log says more".to_owned();
