@@ -130,6 +130,10 @@ fn a_value_that_does_not_fit_is_refused_with_names_and_field_once_for_many() {
     let words = "a message was refused: this is not a test.gains: field `kp`: expected f32, found 1e300";
     let warned: Vec<_> = lines.iter().filter(|line| line.contains(words)).collect();
     assert_eq!(warned.len(), 1, "{lines:#?}");
+    // And the one that the sender's report is.
+    let of_sender = "test.gains that pilot (";
+    let warnings: Vec<_> = lines.iter().filter(|line| line.contains(" WARN ")).collect();
+    assert!(warnings.len() == 2 && warnings.iter().any(|line| line.contains(of_sender)), "{lines:#?}");
     for said in [words, "application=\"hip\"", "tid=127.0.0.123/", "source=127.0.0.123/"] {
         assert!(warned[0].contains(said), "{said}: {warned:?}");
     }
