@@ -21,7 +21,7 @@
 //! | send, and not ask what becomes of it | [`send`](Endpoint::send) | `sinew_send_bytes` |
 //! | be told what became of it (confirm) | [`message`](Endpoint::message)`(to, &value)`[`.confirmed(within)`](MessageBuilder::confirmed): one [`Outcome`](crate::Outcome) | `sinew_send_message_confirmed` |
 //! | ask, and wait for the reply | [`ask`](MessageBuilder::ask) of a message, [`reply`](Endpoint::reply) | `sinew_ask`, `sinew_reply` |
-//! | wait for room 200 us at most, or not at all | [`room_within`](MessageBuilder::room_within) of a message | `sinew_send_message_within` |
+//! | wait for room 200 us at most, or not at all | [`room_within`](MessageBuilder::room_within) of a message | `sinew_room_within` of a message |
 //! | write a payload where it travels from, so that sending it copies nothing (loan: CreateMessage, SendMessage) | [`create_message`](Endpoint::create_message), [`LoanedMessage`], [`loaned`](Endpoint::loaned) | `sinew_create_message`, `sinew_send_message` |
 //! | receive, with a deadline (ReceiveMessage) | [`receive`](Endpoint::receive), [`Received`] | `sinew_receive_message`, `sinew_settle_message` |
 //! | be told what became of it at each member of a group | [`.confirmed_by_each(within)`](MessageBuilder::confirmed_by_each): a [`MemberOutcome`](crate::message::MemberOutcome) for each | `sinew_send_message_confirmed_by_each` |

@@ -187,6 +187,12 @@ public:
         detail::check(sinew_expires_after(endpoint_, &raw_, detail::nanoseconds(time)));
         return std::move(*this);
     }
+    /// Has its sending wait for room no longer than this, zero: not at all: `drive.send(drive.create(to, value).room_within(200us))` throws `SINEW_ERROR_STALLED` then, and `send_within` returns false.
+    message &&room_within(duration time) &&
+    {
+        detail::check(sinew_room_within(endpoint_, &raw_, detail::nanoseconds(time)));
+        return std::move(*this);
+    }
     std::uint8_t *begin() noexcept { return data(); }
     std::uint8_t *end() noexcept { return data() + size(); }
 
@@ -440,7 +446,8 @@ public:
     /// Sends a message if there is room in time, zero: now; says whether there was. What is not sent is gone.
     [[nodiscard]] bool send_within(message &&made, duration within)
     {
-        return is_sent(sinew_send_message_within(raw_, &made.raw_, detail::nanoseconds(within)));
+        auto timed = std::move(made).room_within(within);
+        return is_sent(sinew_send_message(raw_, &timed.raw_));
     }
     /// Sends a plain struct if there is room in time.
     template <class T>
@@ -506,7 +513,8 @@ public:
     /// Replies to a request if there is room in time; says whether there was.
     [[nodiscard]] bool reply_within(const received &request, message &&made, duration within)
     {
-        return is_sent(sinew_reply_within(raw_, &request.raw_, &made.raw_, detail::nanoseconds(within)));
+        auto timed = std::move(made).room_within(within);
+        return is_sent(sinew_reply(raw_, &request.raw_, &timed.raw_));
     }
 
     /// Seals a plain struct and sends it to one application; see sinew_send_protected.

@@ -31,9 +31,9 @@ use crate::{
         sinew_unregister,
     },
     sending::{
-        sinew_ask, sinew_create_message, sinew_discard_message, sinew_reply, sinew_reply_within,
-        sinew_send_bytes, sinew_send_bytes_within, sinew_send_message, sinew_send_message_confirmed,
-        sinew_send_message_confirmed_by_each, sinew_send_message_within,
+        sinew_ask, sinew_create_message, sinew_discard_message, sinew_reply, sinew_room_within,
+        sinew_send_bytes, sinew_send_message, sinew_send_message_confirmed,
+        sinew_send_message_confirmed_by_each,
     },
     text::Text,
     words::sinew_last_error,
@@ -213,20 +213,21 @@ impl Endpoint {
         }
     }
 
-    /// `sinew_send_message`, or with a time `sinew_send_message_within`.
+    /// `sinew_send_message`, with a time behind `sinew_room_within`.
     ///
     /// # Errors
     /// What it says.
     pub fn send(&mut self, mut made: Made, within_ns: Option<u64>) -> Result<(), Told> {
         self.fill(&mut made);
-        let message = Some(&mut made.message.0);
-        done(match within_ns {
-            None => sinew_send_message(self.pointer(), message),
-            Some(within_ns) => sinew_send_message_within(self.pointer(), message, within_ns),
-        })
+        self.set_room_within(&made, within_ns)?;
+        done(sinew_send_message(self.pointer(), Some(&mut made.message.0)))
     }
 
-    /// `sinew_send_bytes`, or with a time `sinew_send_bytes_within`.
+    fn set_room_within(&self, made: &Made, within_ns: Option<u64>) -> Result<(), Told> {
+        within_ns.map_or(Ok(()), |time| done(sinew_room_within(self.pointer(), Some(&made.message.0), time)))
+    }
+
+    /// `sinew_send_bytes`.
     ///
     /// # Errors
     /// What it says.
@@ -235,15 +236,9 @@ impl Endpoint {
         destination: u64,
         (kind, message_class): (u32, i32),
         bytes: &[u8],
-        within_ns: Option<u64>,
     ) -> Result<(), Told> {
         let (endpoint, first, length) = (self.pointer(), bytes.as_ptr().cast(), bytes.len());
-        done(match within_ns {
-            None => sinew_send_bytes(endpoint, destination, kind, message_class, first, length),
-            Some(time) => {
-                sinew_send_bytes_within(endpoint, destination, kind, message_class, first, length, time)
-            }
-        })
+        done(sinew_send_bytes(endpoint, destination, kind, message_class, first, length))
     }
 
     /// `sinew_send_message_confirmed`.
@@ -307,17 +302,15 @@ impl Endpoint {
         Ok(self.in_hand(reply))
     }
 
-    /// `sinew_reply`, or with a time `sinew_reply_within`.
+    /// `sinew_reply`, with a time behind `sinew_room_within`.
     ///
     /// # Errors
     /// What it says.
     pub fn reply(&mut self, request: &InHand, mut made: Made, within_ns: Option<u64>) -> Result<(), Told> {
         self.fill(&mut made);
+        self.set_room_within(&made, within_ns)?;
         let (request, message) = (Some(&request.message.0), Some(&mut made.message.0));
-        done(match within_ns {
-            None => sinew_reply(self.pointer(), request, message),
-            Some(within_ns) => sinew_reply_within(self.pointer(), request, message, within_ns),
-        })
+        done(sinew_reply(self.pointer(), request, message))
     }
 
     /// `sinew_receive_message`.

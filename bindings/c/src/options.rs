@@ -54,7 +54,7 @@ pub struct Options {
     /// How long the registration may take, waiting for what is required included. Default: 60 s.
     pub deadline_ns: u64,
     /// How long a send waits while the node or, on a direct link, the receiver takes nothing; whatever it takes begins that time
-    /// anew. Default: 1 s. For one send alone, and in all: `sinew_send_message_within`.
+    /// anew. Default: 1 s. For one send alone, and in all: `sinew_room_within`.
     pub stall_timeout_ns: u64,
     /// How many received messages wait in this process until no more are taken out of the socket or the rings; more while an
     /// answer is waited for. Default: 256.

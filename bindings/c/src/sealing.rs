@@ -50,7 +50,7 @@ pub extern "C" fn sinew_send_protected(
     call(|| send(endpoint, destination, payload_type, (bytes, length), None))
 }
 
-/// The same, and blocks as `sinew_send_message_within`. What was not sent counts as missing at the receiver. The endpoint's thread.
+/// The same, and waits for room as `sinew_room_within` says. What was not sent counts as missing at the receiver. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_send_protected_within(
     endpoint: *mut Endpoint,

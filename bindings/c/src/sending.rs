@@ -64,32 +64,32 @@ pub extern "C" fn sinew_expires_after(
     })
 }
 
-/// Sends a message (the paper's SendMessage). What becomes of it then is not told. The message is gone when this returns, sent
-/// or not: see Messages at the top. Blocks while there is no room and nothing is taken, for the `stall_timeout_ns` of the options.
-/// The endpoint's thread.
+/// Has the sending of a message that is being made wait for room no longer than `within_ns`, in place of the `stall_timeout_ns` of the options; with 0 it
+/// does not wait at all. For a control loop: `SINEW_ERROR_STALLED` says that there was no room in time and that nothing of the message is received.
+/// One that is longer than the ring needs a time in which its receiver takes some of it (with `SINEW_SOCKET_ONLY` it is sent with its first byte,
+/// and the rest follows with later calls). A node that has gone is not looked for while the message is sent (`SINEW_ERROR_DISCONNECTED`):
+/// `sinew_receive_message`, or a send without such a time, does. Does not block. The endpoint's thread.
 #[unsafe(no_mangle)]
-pub extern "C" fn sinew_send_message(endpoint: *mut Endpoint, message: Option<&mut Message>) -> Status {
-    call(|| {
-        let message = present(message, "message")?;
-        with(endpoint, |session| session.send(message, None)).map(|()| Status::SinewOk)
-    })
-}
-
-/// The same, and blocks for `within_ns` at most while there is no room; with 0 it does not block at all. For a control loop:
-/// `SINEW_ERROR_STALLED` says that there was no room in time and that nothing of the message is received. One that is longer than
-/// the ring needs a time in which its receiver takes some of it (with `SINEW_SOCKET_ONLY` it is sent with its first byte, and the
-/// rest follows with later calls). A node that has gone is not looked for here (`SINEW_ERROR_DISCONNECTED`): `sinew_receive_message`,
-/// or a send without a time, does. The endpoint's thread.
-#[unsafe(no_mangle)]
-pub extern "C" fn sinew_send_message_within(
+pub extern "C" fn sinew_room_within(
     endpoint: *mut Endpoint,
-    message: Option<&mut Message>,
+    message: Option<&Message>,
     within_ns: u64,
 ) -> Status {
     call(|| {
         let message = present(message, "message")?;
         let within = Duration::from_nanos(within_ns);
-        with(endpoint, |session| session.send(message, Some(within))).map(|()| Status::SinewOk)
+        with(endpoint, |session| session.set_room_within(message, within)).map(|()| Status::SinewOk)
+    })
+}
+
+/// Sends a message (the paper's SendMessage). What becomes of it then is not told. The message is gone when this returns, sent
+/// or not: see Messages at the top. Blocks while there is no room and nothing is taken, for the `stall_timeout_ns` of the
+/// options, or as `sinew_room_within` says. The endpoint's thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_send_message(endpoint: *mut Endpoint, message: Option<&mut Message>) -> Status {
+    call(|| {
+        let message = present(message, "message")?;
+        with(endpoint, |session| session.send(message)).map(|()| Status::SinewOk)
     })
 }
 
@@ -107,27 +107,7 @@ pub extern "C" fn sinew_send_bytes(
     call(|| {
         with(endpoint, |session| {
             let mut message = filled(session, destination, kind, message_class, (bytes, length))?;
-            session.send(&mut message, None)
-        })
-        .map(|()| Status::SinewOk)
-    })
-}
-
-/// The same, and blocks as `sinew_send_message_within`. The endpoint's thread.
-#[unsafe(no_mangle)]
-pub extern "C" fn sinew_send_bytes_within(
-    endpoint: *mut Endpoint,
-    destination: TidBits,
-    kind: KindBits,
-    message_class: i32,
-    bytes: *const c_void,
-    length: usize,
-    within_ns: u64,
-) -> Status {
-    call(|| {
-        with(endpoint, |session| {
-            let mut message = filled(session, destination, kind, message_class, (bytes, length))?;
-            session.send(&mut message, Some(Duration::from_nanos(within_ns)))
+            session.send(&mut message)
         })
         .map(|()| Status::SinewOk)
     })
@@ -237,32 +217,14 @@ pub extern "C" fn sinew_reply(
     request: Option<&Received>,
     message: Option<&mut Message>,
 ) -> Status {
-    call(|| reply(endpoint, request, message, None))
-}
-
-/// The same, and blocks as `sinew_send_message_within`. The endpoint's thread.
-#[unsafe(no_mangle)]
-pub extern "C" fn sinew_reply_within(
-    endpoint: *mut Endpoint,
-    request: Option<&Received>,
-    message: Option<&mut Message>,
-    within_ns: u64,
-) -> Status {
-    call(|| reply(endpoint, request, message, Some(Duration::from_nanos(within_ns))))
-}
-
-fn reply(
-    endpoint: *mut Endpoint,
-    request: Option<&Received>,
-    message: Option<&mut Message>,
-    within: Option<Duration>,
-) -> Result<Status, Fault> {
-    let message = present(message, "message")?;
-    with(endpoint, |session| {
-        let taken = session.take(message)?;
-        session.reply(present(request, "request")?, taken, within)
+    call(|| {
+        let message = present(message, "message")?;
+        with(endpoint, |session| {
+            let taken = session.take(message)?;
+            session.reply(present(request, "request")?, taken)
+        })
+        .map(|()| Status::SinewOk)
     })
-    .map(|()| Status::SinewOk)
 }
 
 /// A message with these bytes of the caller's.

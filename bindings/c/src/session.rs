@@ -4,7 +4,7 @@ use std::{collections::BTreeMap, ffi::CString, time::Duration};
 
 use sinew::{
     Class, NodeAddress, Outcome, Tid, Time,
-    client::{ApiError, LoanedMessage},
+    client::{ApiError, LoanedMessage, MessageBuilder},
     message::{Kind, MemberOutcome},
     protection::{
         SealError,
@@ -31,11 +31,18 @@ const RECEIVED_MAX: usize = 1024;
 /// those, and a flood of them is to keep nobody.
 const SETTLED_MAX: usize = 1024;
 
+/// A message that is being made, and what is said about how it is sent.
+pub(crate) struct Made {
+    buffer: LoanedMessage,
+    /// Time that its sending waits for room; `None`: the stall timeout of the endpoint.
+    room_within: Option<Duration>,
+}
+
 /// A registered endpoint.
 pub(crate) struct Session {
     endpoint: sinew::Endpoint,
     node_name: CString,
-    made: Hand<LoanedMessage>,
+    made: Hand<Made>,
     received: Hand<sinew::client::Received>,
     /// What it sends and receives of protected payloads.
     ends: Ends,
@@ -95,7 +102,7 @@ impl Session {
 
     fn hand_out_loan(&mut self, mut buffer: LoanedMessage) -> Result<Message, Fault> {
         let (bytes, length) = (buffer.as_mut_ptr(), buffer.len());
-        match self.made.take(buffer) {
+        match self.made.take(Made { buffer, room_within: None }) {
             Ok(token) => Ok(Message { bytes, length, token }),
             // Dropped; there is none in the hand that is not lent.
             Err(_) => Err(Fault::plain(Status::SinewErrorLoanActive)),
@@ -108,15 +115,24 @@ impl Session {
             let sentence = "the time to live is 0, so that no message would arrive; for a message that does not expire do not set one";
             return Err(Fault::argument(sentence));
         }
-        let buffer = self.made.get_mut(message.token).ok_or_else(|| no_such("the message"))?;
-        buffer.set_expires_after(Duration::from_nanos(time_ns));
+        self.made(message)?.buffer.set_expires_after(Duration::from_nanos(time_ns));
         Ok(())
+    }
+
+    /// Has the sending of a message that is being made wait for room no longer than this.
+    pub(crate) fn set_room_within(&mut self, message: &Message, within: Duration) -> Result<(), Fault> {
+        self.made(message)?.room_within = Some(within);
+        Ok(())
+    }
+
+    fn made(&mut self, message: &Message) -> Result<&mut Made, Fault> {
+        self.made.get_mut(message.token).ok_or_else(|| no_such("the message"))
     }
 
     /// Copies a payload into a message of the same length.
     pub(crate) fn fill(&mut self, message: &Message, payload: &[u8]) {
-        if let Some(buffer) = self.made.get_mut(message.token) {
-            buffer.copy_from_slice(payload);
+        if let Some(made) = self.made.get_mut(message.token) {
+            made.buffer.copy_from_slice(payload);
         }
     }
 
@@ -124,57 +140,53 @@ impl Session {
         self.take(message).map(drop)
     }
 
-    /// `within` `None`: for the stall timeout of the endpoint.
-    pub(crate) fn send(&mut self, message: &mut Message, within: Option<Duration>) -> Result<(), Fault> {
-        let buffer = self.take(message)?;
-        Ok(match within {
-            None => self.endpoint.loaned(buffer).send(),
-            Some(within) => self.endpoint.loaned(buffer).room_within(within).send(),
-        }?)
+    pub(crate) fn send(&mut self, message: &mut Message) -> Result<(), Fault> {
+        let made = self.take(message)?;
+        Ok(self.builder(made).send()?)
     }
 
-    pub(crate) fn send_confirmed(
-        &mut self,
-        buffer: LoanedMessage,
-        within: Duration,
-    ) -> Result<Outcome, Fault> {
-        Ok(self.endpoint.loaned(buffer).confirmed(within)?)
+    /// The message as it is sent.
+    fn builder(&mut self, made: Made) -> MessageBuilder<'_, sinew::Endpoint, LoanedMessage> {
+        let builder = self.endpoint.loaned(made.buffer);
+        match made.room_within {
+            None => builder,
+            Some(within) => builder.room_within(within),
+        }
+    }
+
+    pub(crate) fn send_confirmed(&mut self, made: Made, within: Duration) -> Result<Outcome, Fault> {
+        Ok(self.builder(made).confirmed(within)?)
     }
 
     pub(crate) fn send_confirmed_by_each(
         &mut self,
-        buffer: LoanedMessage,
+        made: Made,
         within: Duration,
     ) -> Result<Vec<MemberOutcome>, Fault> {
-        Ok(self.endpoint.loaned(buffer).confirmed_by_each(within)?)
+        Ok(self.builder(made).confirmed_by_each(within)?)
     }
 
     /// Asks; what became of the request, too, if it was not handled.
     pub(crate) fn ask(
         &mut self,
-        buffer: LoanedMessage,
+        made: Made,
         within: Duration,
     ) -> Result<Result<Received, (Outcome, Fault)>, Fault> {
         self.check_hand()?;
-        match self.endpoint.loaned(buffer).ask_raw(within) {
+        match self.builder(made).ask_raw(within) {
             Ok(reply) => self.hand_out(reply).map(Ok),
             Err(ApiError::Ended(outcome)) => Ok(Err((outcome, ApiError::Ended(outcome).into()))),
             Err(error) => Err(error.into()),
         }
     }
 
-    pub(crate) fn reply(
-        &mut self,
-        request: &Received,
-        buffer: LoanedMessage,
-        within: Option<Duration>,
-    ) -> Result<(), Fault> {
-        let Some(request) = self.received.get_mut(request.token) else {
-            return Err(no_such("the request"));
-        };
-        Ok(match within {
-            None => self.endpoint.loaned(buffer).reply_to(request),
-            Some(within) => self.endpoint.loaned(buffer).room_within(within).reply_to(request),
+    pub(crate) fn reply(&mut self, request: &Received, made: Made) -> Result<(), Fault> {
+        let Self { endpoint, received, .. } = self;
+        let Some(request) = received.get_mut(request.token) else { return Err(no_such("the request")) };
+        let builder = endpoint.loaned(made.buffer);
+        Ok(match made.room_within {
+            None => builder.reply_to(request),
+            Some(within) => builder.room_within(within).reply_to(request),
         }?)
     }
 
@@ -214,7 +226,10 @@ impl Session {
                 return Err(error.into());
             }
         }
-        self.send(&mut message, within)
+        if let Some(within) = within {
+            self.set_room_within(&message, within)?;
+        }
+        self.send(&mut message)
     }
 
     /// The name of a type, which stays.
@@ -324,10 +339,10 @@ impl Session {
     }
 
     /// Takes a message out of the program's hand: whatever comes now, it is gone.
-    pub(crate) fn take(&mut self, message: &mut Message) -> Result<LoanedMessage, Fault> {
-        let Some(buffer) = self.made.give(message.token) else { return Err(no_such("the message")) };
+    pub(crate) fn take(&mut self, message: &mut Message) -> Result<Made, Fault> {
+        let Some(made) = self.made.give(message.token) else { return Err(no_such("the message")) };
         *message = Message::GONE;
-        Ok(buffer)
+        Ok(made)
     }
 
     fn hand_out(&mut self, received: sinew::client::Received) -> Result<Received, Fault> {

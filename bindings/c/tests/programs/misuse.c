@@ -59,9 +59,8 @@ static void null_arguments(sinew_endpoint *endpoint)
     EXPECT_WORDS(sinew_create_message(endpoint, 1, kind, 0, 1, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`message` is NULL");
     EXPECT_WORDS(sinew_create_message(NULL, 1, kind, 0, 1, &message), SINEW_ERROR_NO_SUCH_ENDPOINT, "is it NULL");
     EXPECT_WORDS(sinew_send_message(endpoint, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`message` is NULL");
-    EXPECT_WORDS(sinew_send_message_within(endpoint, NULL, 0), SINEW_ERROR_INVALID_ARGUMENT, "`message` is NULL");
+    EXPECT_WORDS(sinew_room_within(endpoint, NULL, 0), SINEW_ERROR_INVALID_ARGUMENT, "`message` is NULL");
     EXPECT(sinew_discard_message(endpoint, &message), SINEW_OK);
-    EXPECT_WORDS(sinew_send_bytes_within(endpoint, 1, kind, 0, NULL, 5, 0), SINEW_ERROR_INVALID_ARGUMENT, "`bytes` is NULL");
     EXPECT_WORDS(sinew_send_bytes(endpoint, 1, kind, 0, NULL, 5), SINEW_ERROR_INVALID_ARGUMENT, "`bytes` is NULL");
     EXPECT_WORDS(sinew_receive_message(endpoint, 0, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`received` is NULL");
     EXPECT_WORDS(sinew_receive_message(NULL, 0, &received), SINEW_ERROR_NO_SUCH_ENDPOINT, "is it NULL");
@@ -83,11 +82,9 @@ static sinew_status send_anyhow(int how, sinew_endpoint *endpoint, const sinew_r
     sinew_outcome outcome;
     switch (how) {
     case 0: return sinew_send_message(endpoint, message);
-    case 1: return sinew_send_message_within(endpoint, message, 0);
-    case 2: return sinew_send_message_confirmed(endpoint, message, SECOND, &outcome);
-    case 3: return sinew_ask(endpoint, message, SECOND, &reply, &outcome);
-    case 4: return sinew_reply(endpoint, request, message);
-    default: return sinew_reply_within(endpoint, request, message, 0);
+    case 1: return sinew_send_message_confirmed(endpoint, message, SECOND, &outcome);
+    case 2: return sinew_ask(endpoint, message, SECOND, &reply, &outcome);
+    default: return sinew_reply(endpoint, request, message);
     }
 }
 
@@ -114,22 +111,20 @@ static void whose_it_is_after_an_error(sinew_endpoint *endpoint)
     message = new_message(endpoint, own, 100);
     EXPECT_WORDS(sinew_ask(endpoint, &message, 1, NULL, NULL), SINEW_ERROR_INVALID_ARGUMENT, "`reply` is NULL");
     gone(endpoint, &message);
-    for (int how = 4; how < 6; how++) {
-        message = new_message(endpoint, own, 100);
-        EXPECT_WORDS(send_anyhow(how, endpoint, NULL, &message), SINEW_ERROR_INVALID_ARGUMENT, "`request` is NULL");
-        gone(endpoint, &message);
-        message = new_message(endpoint, own, 100);
-        EXPECT_WORDS(send_anyhow(how, endpoint, &none, &message), SINEW_ERROR_NO_SUCH_MESSAGE, "the request");
-        gone(endpoint, &message);
-    }
+    message = new_message(endpoint, own, 100);
+    EXPECT_WORDS(sinew_reply(endpoint, NULL, &message), SINEW_ERROR_INVALID_ARGUMENT, "`request` is NULL");
+    gone(endpoint, &message);
+    message = new_message(endpoint, own, 100);
+    EXPECT_WORDS(sinew_reply(endpoint, &none, &message), SINEW_ERROR_NO_SUCH_MESSAGE, "the request");
+    gone(endpoint, &message);
     /* It is gone already. */
-    for (int how = 0; how < 6; how++) {
+    for (int how = 0; how < 4; how++) {
         memset(&other, 0, sizeof other);
         EXPECT_WORDS(send_anyhow(how, endpoint, &none, &other), SINEW_ERROR_NO_SUCH_MESSAGE, "the message");
     }
     /* It is not looked at. */
     message = other = new_message(endpoint, own, 100);
-    for (int how = 0; how < 6; how++) {
+    for (int how = 0; how < 4; how++) {
         EXPECT(send_anyhow(how, NULL, &none, &message), SINEW_ERROR_NO_SUCH_ENDPOINT);
         EXPECT(memcmp(&message, &other, sizeof message), 0);
     }
@@ -264,7 +259,6 @@ static void one_at_a_time(const char *way, uint32_t links)
         memcpy(first.bytes, "first", 5);
         EXPECT_WORDS(sinew_create_message(endpoint, to, kind, 0, 1, &second), SINEW_ERROR_LOAN_ACTIVE, "hand it to sinew_send_message or sinew_discard_message first");
         EXPECT_WORDS(sinew_send_bytes(endpoint, to, kind, SINEW_CONTROL, NULL, 0), SINEW_ERROR_LOAN_ACTIVE, "lent");
-        EXPECT_WORDS(sinew_send_bytes_within(endpoint, to, kind, SINEW_CONTROL, NULL, 0, 0), SINEW_ERROR_LOAN_ACTIVE, "lent");
         EXPECT(sinew_resolve(endpoint, SINEW_TEXT("nobody"), SECOND, &tid), SINEW_ERROR_LOAN_ACTIVE);
         EXPECT(sinew_join_group(endpoint, SINEW_TEXT("drives")), SINEW_ERROR_LOAN_ACTIVE);
         EXPECT(sinew_leave_group(endpoint, SINEW_TEXT("drives")), SINEW_ERROR_LOAN_ACTIVE);
@@ -275,7 +269,7 @@ static void one_at_a_time(const char *way, uint32_t links)
         EXPECT(sinew_settle_message(endpoint, &received, SINEW_DELIVERED), SINEW_OK);
         first = new_message(endpoint, to, length);
         EXPECT(sinew_discard_message(endpoint, &first), SINEW_OK);
-        EXPECT(sinew_send_bytes_within(endpoint, to, kind, SINEW_CONTROL, "second", 6, SECOND), SINEW_OK);
+        EXPECT(sinew_send_bytes(endpoint, to, kind, SINEW_CONTROL, "second", 6), SINEW_OK);
         EXPECT(sinew_receive_message(endpoint, 10 * SECOND, &received), SINEW_OK);
         EXPECT(received.length == 6 && memcmp(received.bytes, "second", 6) == 0, 1);
         EXPECT(sinew_settle_message(endpoint, &received, SINEW_DELIVERED), SINEW_OK);

@@ -30,7 +30,8 @@ static sinew_status send_number(sinew_endpoint *endpoint, sinew_kind kind, uint3
     sinew_status status;
     EXPECT(sinew_create_message(endpoint, sinew_endpoint_tid(endpoint), kind, SINEW_BULK, 1000, &message) == SINEW_OK);
     memcpy(message.bytes, &number, sizeof number);
-    status = sinew_send_message_within(endpoint, &message, within_ns);
+    EXPECT(sinew_room_within(endpoint, &message, within_ns) == SINEW_OK);
+    status = sinew_send_message(endpoint, &message);
     EXPECT(message.token == 0);
     return status;
 }

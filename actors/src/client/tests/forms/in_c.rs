@@ -185,8 +185,8 @@ impl Client {
 
     pub(super) fn registrations(&mut self) -> u64 {
         if self.is_away {
-            let sent = self.endpoint.send_bytes(0, (RAW.bits(), code_of(Class::Control)), &[], Some(0));
-            match said(sent) {
+            let made = self.endpoint.create(0, RAW.bits(), code_of(Class::Control), 0);
+            match said(made.and_then(|made| self.endpoint.send(made, Some(0)))) {
                 Ok(()) => {
                     self.registrations += 1;
                     self.is_away = false;
@@ -244,9 +244,13 @@ impl Client {
         value: &P,
         within: Option<Duration>,
     ) -> Result<(), ApiError> {
+        if within.is_some() {
+            let made = self.made(to, value)?;
+            return self.send_message(made, within);
+        }
         let message = Message::typed(self.tid(), to, value);
         let as_what = (P::KIND.bits(), code_of(P::CLASS));
-        let sent = self.endpoint.send_bytes(to.bits(), as_what, &message.payload, within.map(nanos));
+        let sent = self.endpoint.send_bytes(to.bits(), as_what, &message.payload);
         self.heard(sent)
     }
 
