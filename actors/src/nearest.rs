@@ -6,8 +6,8 @@ pub(crate) const NEAREST_MAX: usize = 3;
 pub(crate) const COMPARED_MAX: usize = 1_024;
 /// Characters of a name that are compared at most.
 const CHARACTERS_MAX: usize = 64;
-/// Similarity (Jaro-Winkler, 0 to 1) from which a name is suggested. `knee.senser` and `knee.drive` have 0.77, `knee.senser` and `hip.drive` 0.53.
-const SIMILAR: f64 = 0.75;
+/// Similarity (Jaro-Winkler, 0 to 1) from which a name is suggested. `knee.senser` and `knee.drive` have 0.77, `knee.senser` and `hip.drive` 0.53, `sink` and `sync` 0.67.
+const SIMILAR: f64 = 0.66;
 
 /// Those of `known` whose names are similar to `name`, [`NEAREST_MAX`] at most, the most similar first. Each name once.
 pub(crate) fn nearest<T>(

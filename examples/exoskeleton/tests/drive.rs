@@ -226,7 +226,7 @@ fn status_tells_the_state_and_starts_a_new_maximum_of_the_age() {
     let status = drive.status(1005 * MS);
     assert_eq!((status.state, status.age_max_us), (DriveState::Walk, Some(6000)));
     feed(&mut drive, 1006..1008, GaitMode::Walk);
-    assert_eq!(drive.status(1008 * MS).age_max_us, None);
+    assert_eq!(drive.status(1008 * MS).age_max_us, Some(0));
 }
 
 /// The drive's own feed-forward at the phase of [`gait`], where the ankle pushes off: about -47 Nm.
