@@ -11,6 +11,8 @@
 ///   where it waits, and does not reach its handler. It is a number and a unit, `us`, `ms` or `s`, from 1 us to 4294 s, and becomes
 ///   [`Payload::TIME_TO_LIVE`](crate::Payload::TIME_TO_LIVE). A send may say another one (`expires_after` of its builder).
 ///
+/// # Examples
+///
 /// ```
 /// use sinew::prelude::*;
 ///

@@ -28,6 +28,8 @@ pub struct StopSignals {
 impl StopSignals {
     /// Takes over SIGINT, SIGTERM and SIGHUP from now on, for the rest of the process. On a thread of a tokio runtime.
     ///
+    /// # Examples
+    ///
     /// ```no_run
     /// # async fn example() -> std::io::Result<()> {
     /// let mut stop = sinew::signals::StopSignals::listen()?;

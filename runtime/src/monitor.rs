@@ -11,11 +11,41 @@ use crate::{
 };
 
 /// Names one monitor; never used twice in a node's life.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{events::{MonitorError, MonitorId}, prelude::*};
+///
+/// struct Arm { gripper: Option<MonitorId> }
+/// # impl Actor for Arm { type Context = AppContext<Self>; }
+///
+/// fn take_hold(arm: &mut Arm, gripper: Tid, ctx: &mut AppContext<Arm>) -> Result<(), MonitorError> {
+///     arm.gripper = Some(ctx.monitor(gripper)?);
+///     Ok(())
+/// }
+///
+/// fn let_go(arm: &mut Arm, ctx: &mut AppContext<Arm>) {
+///     arm.gripper.take().map(|monitor| ctx.demonitor(monitor));
+/// }
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct MonitorId(pub u64);
 
 /// Which kind of end it was.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::events::DownClass;
+///
+/// /// Whether the end of a drive is a reason to stop the leg.
+/// fn is_failure(class: DownClass) -> bool {
+///     !matches!(class, DownClass::Normal | DownClass::Shutdown)
+/// }
+/// assert!(is_failure(DownClass::Panic) && is_failure(DownClass::NodeLost));
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum DownClass {
     /// It ended by itself, in order.
@@ -57,6 +87,26 @@ impl DownClass {
 /// goes ahead of every message that waits. A restart behind the same TID is an end, too; who wants to watch the next
 /// life monitors again. That there is nobody ([`DownClass::NoSuchAddress`], [`DownClass::NodeLost`]) is told at once, 256 times;
 /// who goes on to ask is told once every 10 ms.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// struct Hip;
+/// # impl Actor for Hip { type Context = AppContext<Self>; }
+///
+/// impl Handler<Delivery<Down>> for Hip {
+///     type Result = ();
+///     fn handle(&mut self, down: Delivery<Down>, ctx: &mut Self::Context) {
+///         println!("{} ended: {}", down.tid, down.why);
+///         // The next life has the same TID, and needs a monitor of its own.
+///         let _ = ctx.monitor(down.tid);
+///     }
+/// }
+///
+/// let hip = AppSpec::new("hip", || Hip).handles::<Down>();
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Down {
     /// Which monitor.
@@ -81,6 +131,15 @@ impl fmt::Display for Down {
 }
 
 /// Why a monitor was not set. Nothing changed.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{Tid, events::MonitorError};
+///
+/// let error = MonitorError::NotOne(Tid::group("drives"));
+/// assert!(error.to_string().ends_with("is not the TID of one application"));
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum MonitorError {
     /// This is not the TID of one application: a layer, a group, everybody.

@@ -17,6 +17,15 @@ use crate::{
 pub const NAME_BYTES_MAX: usize = 63;
 
 /// Why a text is no name. The caller is at fault.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::name::{NameError, check_name};
+///
+/// assert_eq!(check_name("leg.*"), Err(NameError::Reserved('*')));
+/// assert_eq!(check_name("10.0.0.2"), Err(NameError::Address));
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum NameError {
     /// It has no characters.
@@ -50,6 +59,16 @@ pub enum NameError {
 ///
 /// # Errors
 /// The first rule that the text breaks.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::name::check_name;
+///
+/// assert!(check_name("knee.drive").is_ok());
+/// let why = check_name("2 of drives").unwrap_err();
+/// assert!(why.to_string().ends_with("choose another name"));
+/// ```
 pub fn check_name(name: &str) -> Result<(), NameError> {
     if name.is_empty() {
         return Err(NameError::Empty);

@@ -14,6 +14,21 @@ pub use self::members::{MEMBERS_MAX, MemberOutcome, MemberReport, MemberState, M
 use crate::tid::Tid;
 
 /// The fate of a confirmed message.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::Outcome;
+///
+/// /// Whether a command may be sent again without the risk that it is carried out twice.
+/// fn is_safe_to_repeat(outcome: Outcome) -> bool {
+///     match outcome {
+///         Outcome::Rejected(_) | Outcome::Expired | Outcome::PeerLost => true,
+///         Outcome::Delivered | Outcome::Failed | Outcome::Unknown => false,
+///     }
+/// }
+/// assert!(!is_safe_to_repeat(Outcome::Unknown));
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Outcome {
     /// The destination's handler took it and returned.
@@ -31,6 +46,17 @@ pub enum Outcome {
 }
 
 /// Why a message was refused.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{Outcome, message::Rejection};
+///
+/// let outcome = Outcome::Rejected(Rejection::QueueFull);
+/// if let Outcome::Rejected(why) = outcome {
+///     assert!(why.to_string().contains("more slowly than they come"));
+/// }
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Rejection {
     /// No application has this TID.

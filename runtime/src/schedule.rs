@@ -5,10 +5,47 @@ use std::{collections::BTreeMap, time::Duration};
 use crate::time::Time;
 
 /// Names one entry of a [`Schedule`].
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{prelude::*, time::TimerId};
+///
+/// struct Brake { release: Option<TimerId> }
+/// # impl Actor for Brake { type Context = AppContext<Self>; }
+///
+/// impl Brake {
+///     /// Releases the brake in 200 ms, whatever was planned before.
+///     fn release_soon(&mut self, ctx: &mut AppContext<Self>) {
+///         if let Some(timer) = self.release.take() {
+///             ctx.cancel(timer);
+///         }
+///         self.release = Some(ctx.after(Duration::from_millis(200), |_, _, _| println!("released")));
+///     }
+/// }
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TimerId(u64);
 
 /// One firing of a timer.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// struct Gait { missed: u64 }
+/// # impl Actor for Gait { type Context = AppContext<Self>; }
+///
+/// fn begin(ctx: &mut AppContext<Gait>) {
+///     ctx.every(Duration::from_millis(1), |gait, tick, _| {
+///         gait.missed += tick.missed;
+///         if tick.lateness > Duration::from_micros(500) {
+///             eprintln!("turn {} is {:?} late", tick.number, tick.lateness);
+///         }
+///     });
+/// }
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Tick {
     /// When it was due.

@@ -68,6 +68,16 @@ pub trait Directory: Send + Sync {
 }
 
 /// Whom a message is for: a TID (an application, a group, everybody) or a name.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{Tid, message::Destination};
+///
+/// let by_name: Destination<'_> = "knee.drive".into();
+/// let by_address: Destination<'_> = Tid::group("drives").into();
+/// assert_ne!(by_name, by_address);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Destination<'a> {
     /// By address.
@@ -89,6 +99,20 @@ impl<'a> From<&'a str> for Destination<'a> {
 }
 
 /// Why a message was not sent. Nothing changed.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::message::SendError;
+///
+/// fn skip_or_fail(sent: Result<(), SendError>) -> Result<(), SendError> {
+///     match sent {
+///         // The knee is away: the next value comes in a millisecond.
+///         Err(SendError::UnknownName(_) | SendError::Rejected(_)) => Ok(()),
+///         other => other,
+///     }
+/// }
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SendError {
     /// The directory does not know the name.
@@ -121,6 +145,17 @@ pub enum SendError {
 }
 
 /// Why a request has no reply.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{Outcome, message::AskError};
+///
+/// /// Whether the request was certainly not handled, so that it may be sent again.
+/// fn was_not_handled(error: &AskError) -> bool {
+///     matches!(error, AskError::Send(_) | AskError::Ended(Outcome::Rejected(_) | Outcome::Expired))
+/// }
+/// ```
 #[derive(Debug, thiserror::Error)]
 pub enum AskError {
     /// It was not sent.
@@ -138,6 +173,20 @@ pub enum AskError {
 }
 
 /// The sending side of one TID. Clones share it; any thread may use it.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{message::{SendError, Sender}, payload};
+///
+/// payload!("demo.force", Stream => struct Force { newtons: f32 });
+///
+/// /// Runs on the thread of a device whose driver blocks; `AppContext::sender` gives the sender.
+/// fn read_device(sender: &Sender) -> Result<(), SendError> {
+///     let newtons = 0.0;
+///     sender.send("gait", &Force { newtons })
+/// }
+/// ```
 #[derive(Clone)]
 pub struct Sender {
     shared: Arc<Shared>,
@@ -211,6 +260,17 @@ impl Sender {
     }
 
     /// The TID that has `name` now, on any node.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{Tid, message::Sender};
+    ///
+    /// /// The left knee, or the right one where there is no left one.
+    /// fn a_knee(sender: &Sender) -> Option<Tid> {
+    ///     sender.resolve("knee.left").or_else(|| sender.resolve("knee.right"))
+    /// }
+    /// ```
     #[must_use]
     pub fn resolve(&self, name: &str) -> Option<Tid> {
         self.shared.directory.resolve(name)
@@ -243,6 +303,16 @@ impl Sender {
     ///
     /// # Errors
     /// The TID is not that of an application, or the bounds of [`MonitorError`] are reached.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{Tid, events::{MonitorError, MonitorId}, message::Sender};
+    ///
+    /// fn watch(sender: &Sender, drives: &[Tid]) -> Result<Vec<MonitorId>, MonitorError> {
+    ///     drives.iter().map(|drive| sender.monitor(*drive)).collect()
+    /// }
+    /// ```
     pub fn monitor(&self, tid: Tid) -> Result<MonitorId, MonitorError> {
         if self.is_over() {
             return Err(MonitorError::LifeOver);
@@ -260,6 +330,18 @@ impl Sender {
     ///
     /// # Errors
     /// Nobody took it.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{Tid, message::{SendError, Sender}, payload};
+    ///
+    /// payload!("demo.stop" => struct Stop);
+    ///
+    /// fn stop(sender: &Sender) -> Result<(), SendError> {
+    ///     sender.send(Tid::group("drives"), &Stop)
+    /// }
+    /// ```
     pub fn send<'a, P: Payload>(
         &self,
         destination: impl Into<Destination<'a>>,
@@ -270,6 +352,19 @@ impl Sender {
     }
 
     /// A value to be sent otherwise than as its type says, confirmed, or as a request: see [`MessageBuilder`].
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{Class, Tid, message::{SendError, Sender}, payload};
+    ///
+    /// payload!("demo.sample", Stream => struct Sample { newtons: f32 });
+    ///
+    /// /// Sends each sample of a record: as Bulk none takes the place of another, and none delays commands.
+    /// fn send_record(sender: &Sender, to: Tid, record: &[Sample]) -> Result<(), SendError> {
+    ///     record.iter().try_for_each(|sample| sender.message(to, sample).class(Class::Bulk).send())
+    /// }
+    /// ```
     pub fn message<'a, P: Payload>(
         &'a self,
         to: impl Into<Destination<'a>>,
@@ -285,6 +380,17 @@ impl Sender {
 
     /// Whether whoever asked still waits for the reply, as far as is known here: its deadline is not over, and it has not given
     /// up. For a handler that works long, or replies later: what nobody wants need not be done.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{app::Delivery, message::Sender};
+    ///
+    /// # struct Plan;
+    /// fn is_to_go_on(sender: &Sender, request: &Delivery<Plan>) -> bool {
+    ///     request.reply_to().is_some_and(|reply_to| sender.is_wanted(&reply_to))
+    /// }
+    /// ```
     #[must_use]
     pub fn is_wanted(&self, request: &ReplyTo) -> bool {
         let ReplyTo { source, correlation, sent, until } = *request;
@@ -301,6 +407,21 @@ impl Sender {
     ///
     /// # Errors
     /// Nobody took the reply, or the message asked for none.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{app::Delivery, message::Sender, payload};
+    ///
+    /// payload!("demo.plan" => struct Plan);
+    /// payload!("demo.planned" => struct Planned { steps: u32 });
+    ///
+    /// /// Replies from a thread that has the time to plan.
+    /// fn plan(sender: Sender, request: Delivery<Plan>) {
+    ///     let Some(reply_to) = request.reply_to() else { return };
+    ///     std::thread::spawn(move || sender.reply(reply_to, &Planned { steps: 12 }));
+    /// }
+    /// ```
     pub fn reply<R: Payload>(&self, to: ReplyTo, value: &R) -> Result<(), SendError> {
         let mut message = Message::typed(self.shared.tid, to.source, value);
         message.header.class = Class::Control;
@@ -313,6 +434,18 @@ impl Sender {
     ///
     /// # Errors
     /// The name is unknown, or the payload would be too long.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::message::{Kind, SendError, Sender};
+    ///
+    /// fn send_image(sender: &Sender, pixels: &[u8]) -> Result<(), SendError> {
+    ///     let mut memory = sender.create_message("vision", Kind::named("camera.image"), pixels.len())?;
+    ///     memory.copy_from_slice(pixels);
+    ///     sender.loaned(memory).send()
+    /// }
+    /// ```
     pub fn create_message<'a>(
         &self,
         destination: impl Into<Destination<'a>>,

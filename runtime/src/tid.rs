@@ -24,6 +24,16 @@ use std::{fmt, net::Ipv4Addr, str::FromStr};
 use serde::{Deserialize, Serialize};
 
 /// Address of a node: 32 bits, unique in a project; written as an IPv4 address, which it is by default.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::NodeAddress;
+///
+/// let knee = NodeAddress::from([10, 0, 0, 3]);
+/// assert_eq!(knee.to_string(), "10.0.0.3");
+/// assert_eq!("10.0.0.3".parse(), Ok(knee));
+/// ```
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct NodeAddress(u32);
@@ -47,6 +57,15 @@ impl NodeAddress {
     }
 
     /// Whether this names one single node (neither [`HERE`](Self::HERE) nor [`ALL`](Self::ALL)).
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::NodeAddress;
+    ///
+    /// assert!(NodeAddress::from([10, 0, 0, 3]).is_single());
+    /// assert!(!NodeAddress::ALL.is_single()); // a broadcast
+    /// ```
     #[must_use]
     pub const fn is_single(self) -> bool {
         self.0 != 0 && self.0 != u32::MAX
@@ -94,6 +113,18 @@ impl FromStr for NodeAddress {
 }
 
 /// Address of an application inside its node: 32 bits; see the table of the [module](self).
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{AppAddress, Tid};
+///
+/// /// The address of the knee's drive on its node, which other programs know beforehand.
+/// const DRIVE: AppAddress = AppAddress::new(0x1001);
+///
+/// assert!(DRIVE.is_fixed());
+/// assert_eq!(Tid::new([10, 0, 0, 3].into(), DRIVE).to_string(), "10.0.0.3/1001");
+/// ```
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct AppAddress(u32);
@@ -131,6 +162,15 @@ impl AppAddress {
     }
 
     /// The `index`-th address that users may choose; `None` past the end of the range.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::AppAddress;
+    ///
+    /// assert_eq!(AppAddress::fixed(1), Some(AppAddress::new(0x1001)));
+    /// assert_eq!(AppAddress::fixed(0x8000_0000), None);
+    /// ```
     #[must_use]
     pub const fn fixed(index: u32) -> Option<Self> {
         if index < Self::DYNAMIC_FIRST - Self::FIXED_FIRST {
@@ -151,6 +191,15 @@ impl AppAddress {
     }
 
     /// The address of the group called `name`: FNV-1a of the name, folded into the group range.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{AppAddress, Tid};
+    ///
+    /// assert!(AppAddress::group("drives").is_group());
+    /// assert_eq!(Tid::group("drives").app, AppAddress::group("drives"));
+    /// ```
     #[must_use]
     pub const fn group(name: &str) -> Self {
         let span = Self::ALL.0 - Self::GROUP_FIRST;
@@ -225,13 +274,16 @@ impl FromStr for AppAddress {
 ///
 /// Its text form is `node/application`, the application in hexadecimal or by its layer's name; it parses back.
 ///
+/// # Examples
+///
 /// ```
-/// use sinew_runtime::tid::Tid;
+/// use sinew::Tid;
+///
 /// let tid: Tid = "10.0.0.7/1001".parse()?;
 /// assert_eq!(tid.bits(), 0x0a00_0007_0000_1001);
 /// assert_eq!(tid.to_string(), "10.0.0.7/1001");
 /// assert_eq!("*/ndl".parse::<Tid>()?.to_string(), "*/ndl");
-/// # Ok::<(), sinew_runtime::tid::ParseTidError>(())
+/// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Tid {
@@ -248,18 +300,48 @@ impl Tid {
     pub const BROADCAST: Self = Self::new(NodeAddress::ALL, AppAddress::ALL);
 
     /// The TID of `app` on `node`.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{AppAddress, NodeAddress, Tid};
+    ///
+    /// let drive = Tid::new(NodeAddress::from([10, 0, 0, 3]), AppAddress::new(0x1001));
+    /// let own_drive = Tid::new(NodeAddress::HERE, AppAddress::new(0x1001)); // on the node of the sender
+    /// assert_ne!(drive, own_drive);
+    /// ```
     #[must_use]
     pub const fn new(node: NodeAddress, app: AppAddress) -> Self {
         Self { node, app }
     }
 
     /// The members of the group called `name`, on every node.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::Tid;
+    ///
+    /// const DRIVES: Tid = Tid::group("drives");
+    ///
+    /// assert!(!DRIVES.is_single()); // so a confirmed message to it has one outcome for each member
+    /// ```
     #[must_use]
     pub const fn group(name: &str) -> Self {
         Self::new(NodeAddress::ALL, AppAddress::group(name))
     }
 
     /// The TID with these 64 bits, node address in the upper half.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::Tid;
+    ///
+    /// // For example from the header of a frame that a logger has recorded.
+    /// let tid = Tid::from_bits(0x0a00_0003_0000_1001);
+    /// assert_eq!(tid.to_string(), "10.0.0.3/1001");
+    /// ```
     #[must_use]
     pub const fn from_bits(bits: u64) -> Self {
         Self::new(NodeAddress((bits >> 32) as u32), AppAddress(bits as u32))
@@ -272,6 +354,16 @@ impl Tid {
     }
 
     /// Whether this names exactly one application or layer.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::Tid;
+    ///
+    /// let drive: Tid = "10.0.0.3/1001".parse().expect("a TID");
+    /// assert!(drive.is_single());
+    /// assert!(!Tid::BROADCAST.is_single() && !Tid::NONE.is_single());
+    /// ```
     #[must_use]
     pub const fn is_single(self) -> bool {
         !matches!(self.node, NodeAddress::ALL)
@@ -320,6 +412,15 @@ pub enum ParseTidError {
 }
 
 /// Which life of a node or of an application something belongs to; larger is later.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::address::Incarnation;
+///
+/// let (known, found) = (Incarnation(7), Incarnation(8));
+/// assert!(found > known, "the node was restarted");
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Incarnation(pub u64);

@@ -13,6 +13,16 @@ use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 
 /// A point in time, in nanoseconds of `CLOCK_MONOTONIC`.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// let sent = Time::from_nanos(1_000_000);
+/// let handled = sent + Duration::from_micros(250);
+/// assert_eq!(handled.since(sent), Duration::from_micros(250));
+/// ```
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Time(u64);
@@ -24,6 +34,16 @@ impl Time {
     pub const MAX: Self = Self(u64::MAX);
 
     /// The present moment. For shells only.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::Time;
+    ///
+    /// let begin = Time::now();
+    /// // One turn of a control loop.
+    /// println!("the turn took {:?}", Time::now().since(begin));
+    /// ```
     #[must_use]
     pub fn now() -> Self {
         Self::of(ClockId::Monotonic)
@@ -63,6 +83,16 @@ impl Time {
     }
 
     /// How long after `earlier` this is; zero if it is not after it.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// let (earlier, later) = (Time::from_nanos(5_000), Time::from_nanos(7_000));
+    /// assert_eq!(later.since(earlier), Duration::from_micros(2));
+    /// assert_eq!(earlier.since(later), Duration::ZERO);
+    /// ```
     #[must_use]
     pub const fn since(self, earlier: Self) -> Duration {
         Duration::from_nanos(self.0.saturating_sub(earlier.0))

@@ -19,6 +19,25 @@ use crate::{
 /// An application gets it as an event: `AppSpec::handles::<Undelivered>()` and `Handler<Delivery<Undelivered>>`, in the node's process
 /// and in a process of its own alike. An endpoint takes it with `take_undelivered`. The first refusal is reported at once, later ones
 /// every 100 ms together. Where an application does not handle it, its node logs a warning.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// struct Hip { lost: u64 }
+/// # impl Actor for Hip { type Context = AppContext<Self>; }
+///
+/// impl Handler<Delivery<Undelivered>> for Hip {
+///     type Result = ();
+///     fn handle(&mut self, report: Delivery<Undelivered>, _: &mut Self::Context) {
+///         self.lost += report.count;
+///         eprintln!("{}", *report);
+///     }
+/// }
+///
+/// let hip = AppSpec::new("hip", || Hip { lost: 0 }).handles::<Undelivered>();
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Undelivered {
     /// Destination of the messages; [`Tid::NONE`]: several that are not told apart any more. For an endpoint also its own TID: messages to

@@ -31,6 +31,8 @@ const WITHIN: Duration = Duration::from_secs(60);
 /// can be used again: the next round is its next generation. What is promised when a node dies meanwhile stands in
 /// `docs/SEMANTICS.md`, "Barriers".
 ///
+/// # Examples
+///
 /// ```no_run
 /// use sinew::{NodeApi, Registration, prelude::*, barrier::Barrier};
 ///
@@ -64,6 +66,8 @@ impl Barrier {
     /// The phase of this name, one word, that these parties come up in: to `meet` there says that one has reached it, and waits until all
     /// parties have. Who has reached it counts until its life ends. So who is started again goes on at once if the others are there, and
     /// nobody else is brought back. Whoever is no party can require it: `2 of *.drive at homed`.
+    ///
+    /// # Examples
     ///
     /// ```no_run
     /// # use sinew::{barrier::{Barrier, Meet}, message::Sender};

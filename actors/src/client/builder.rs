@@ -19,6 +19,8 @@ use super::{
 /// What it does not say is as its type and its endpoint say. It is sent by [`send`](Self::send), [`confirmed`](Self::confirmed),
 /// [`confirmed_by_each`](Self::confirmed_by_each), [`ask`](Self::ask) or [`reply_to`](Self::reply_to), and not before.
 ///
+/// # Examples
+///
 /// ```no_run
 /// # use std::time::Duration;
 /// # use sinew::{Endpoint, Tid, client::ApiError};
@@ -269,6 +271,8 @@ impl<C: Content> MessageBuilder<'_, Endpoint, C> {
     /// At most 256 members of one node and 256 other nodes are reached. The message expires where it waits, and what comes meanwhile waits, as
     /// with [`confirmed`](Self::confirmed).
     ///
+    /// # Examples
+    ///
     /// ```no_run
     /// use std::time::Duration;
     ///
@@ -337,6 +341,8 @@ impl<C: Content> MessageBuilder<'_, AsyncEndpoint, C> {
     }
 
     /// Sends it to many and waits for what becomes of it at each member, as of an [`Endpoint`].
+    ///
+    /// # Examples
     ///
     /// ```no_run
     /// use std::time::Duration;

@@ -20,6 +20,8 @@ impl Endpoint {
     /// whoever sends protected payloads hears echoes there, too (one that comes before it has sent the first is received: a message of kind `sinew.echo`, to be left alone). Without them each message is too old. An endpoint that came back
     /// to another address than it had makes its guards anew: what is sealed for the former one is refused.
     ///
+    /// # Examples
+    ///
     /// ```
     /// use std::time::Duration;
     ///

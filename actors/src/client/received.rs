@@ -95,6 +95,8 @@ impl Received {
 
     /// Whether the message may be older than `limit`. An unknown age counts as too old, as a program that may use fresh values only needs it.
     ///
+    /// # Examples
+    ///
     /// ```no_run
     /// # use std::time::Duration;
     /// # use sinew::{Endpoint, Time, client::ApiError};

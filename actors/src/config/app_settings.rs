@@ -175,6 +175,8 @@ fn nearest_name<'a>(name: &str, others: impl Iterator<Item = &'a str>) -> Option
 impl NodeConfig {
     /// The settings of the application `name`: its table `[app.NAME]` in the node's file, read by serde.
     ///
+    /// # Examples
+    ///
     /// ```
     /// use sinew::config::NodeConfig;
     ///

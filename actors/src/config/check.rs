@@ -119,6 +119,8 @@ impl NodeConfig {
     /// # Errors
     /// All faults, not just the first one.
     ///
+    /// # Examples
+    ///
     /// ```
     /// use sinew::config::NodeConfig;
     /// let mut config = NodeConfig::new("knee");

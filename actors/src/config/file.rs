@@ -89,6 +89,8 @@ impl NodeConfig {
     /// All faults, not just the first one: keys that do not exist, values of another type, values out of range. Text
     /// that is not TOML is one fault.
     ///
+    /// # Examples
+    ///
     /// ```
     /// use sinew::config::NodeConfig;
     /// let config = NodeConfig::from_toml("[node]\nname = 'knee'\n[ndl]\nperiod_ms = 100\n")?;

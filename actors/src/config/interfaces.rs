@@ -164,6 +164,8 @@ impl fmt::Display for Interface {
 
 /// All interfaces that a node uses, the one that it prefers first.
 ///
+/// # Examples
+///
 /// ```
 /// # use sinew::config::{Interface, Interfaces};
 /// let cable: Interfaces = [192, 168, 1, 7].into();

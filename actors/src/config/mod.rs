@@ -231,6 +231,8 @@ impl NdlConfig {
 impl WatchGroup {
     /// Whether the node called `name` is in this group.
     ///
+    /// # Examples
+    ///
     /// ```
     /// # use sinew::config::WatchGroup;
     /// let legs = WatchGroup { nodes: vec!["leg.*".into(), "hip".into()], period: std::time::Duration::from_millis(10), missed_max: 3 };

@@ -13,6 +13,8 @@ use super::interfaces::{Zone, zoned};
 /// A link-local IPv6 address is another host's on each link: it is asked over the interface of the name `zone`, or over each one, if there is
 /// none.
 ///
+/// # Examples
+///
 /// ```
 /// # use sinew::config::Seed;
 /// let seed: Seed = "[fe80::1%eth0]:6911".parse().unwrap();

@@ -183,6 +183,8 @@ impl NodeBuilder {
     /// Adds an application that is made of its settings: the table `[app.NAME]` of the node's file, read by serde. What is wrong with them is
     /// found by [`start`](Self::start), together with all else that is wrong with the configuration.
     ///
+    /// # Examples
+    ///
     /// ```no_run
     /// use sinew::prelude::*;
     ///

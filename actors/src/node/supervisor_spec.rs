@@ -20,6 +20,8 @@ use crate::sync;
 /// Three actors of a leg that make sense together only, so that one that fails takes the others with it. The leg may fail twice
 /// in ten seconds; at the third time it gives up, its own supervisor makes it anew, and that one's limit counts:
 ///
+/// # Examples
+///
 /// ```
 /// use sinew::prelude::*;
 ///

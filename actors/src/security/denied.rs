@@ -46,6 +46,8 @@ impl DenyList {
     /// # Errors
     /// The first line that is none.
     ///
+    /// # Examples
+    ///
     /// ```
     /// use sinew::security::DenyList;
     /// let denied = DenyList::read("# none yet\n\n2d6f  # hip\n").unwrap();

@@ -31,6 +31,8 @@ pub struct Identity {
 impl Identity {
     /// As it stands in a certificate.
     ///
+    /// # Examples
+    ///
     /// ```
     /// use sinew::security::Identity;
     /// let hip = Identity { project: "walker".into(), address: [192, 168, 0, 11].into(), name: "hip".into() };

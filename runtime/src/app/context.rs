@@ -21,6 +21,26 @@ use crate::{
 };
 
 /// The context of an application's actor: actix's, and what Sinew adds to it.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// payload!("demo.angle", Stream => struct Angle { degrees: f32 });
+///
+/// struct Hip { degrees: f32 }
+///
+/// impl Actor for Hip {
+///     type Context = AppContext<Self>;
+///     fn started(&mut self, ctx: &mut Self::Context) {
+///         ctx.every(Duration::from_millis(1), |hip, _, ctx| {
+///             // The knee may not be there yet, and the next value comes in a millisecond.
+///             let _ = ctx.send("knee", &Angle { degrees: hip.degrees });
+///         });
+///     }
+/// }
+/// ```
 pub struct AppContext<A: Actor<Context = Self>> {
     parts: ContextParts<A>,
     mailbox: Option<actix::dev::Mailbox<A>>,
@@ -102,12 +122,46 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     }
 
     /// The sending side of this application, for futures and other threads.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// payload!("demo.force", Stream => struct Force { newtons: f32 });
+    ///
+    /// struct Plate;
+    /// # fn read_device() -> f32 { 0.0 }
+    ///
+    /// impl Actor for Plate {
+    ///     type Context = AppContext<Self>;
+    ///     fn started(&mut self, ctx: &mut Self::Context) {
+    ///         let sender = ctx.sender();
+    ///         // A device whose driver blocks has a thread of its own.
+    ///         std::thread::spawn(move || while sender.send("gait", &Force { newtons: read_device() }).is_ok() {});
+    ///     }
+    /// }
+    /// ```
     #[must_use]
     pub fn sender(&self) -> Sender {
         self.sender.clone()
     }
 
     /// The TID that has `name` now, on any node.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// struct Hip { knee: Option<Tid> }
+    /// # impl Actor for Hip { type Context = AppContext<Self>; }
+    ///
+    /// /// Looks the name up once, so that each turn of the loop sends to a TID.
+    /// fn find(hip: &mut Hip, ctx: &AppContext<Hip>) {
+    ///     hip.knee = ctx.resolve("knee.drive");
+    /// }
+    /// ```
     #[must_use]
     pub fn resolve(&self, name: &str) -> Option<Tid> {
         self.sender.resolve(name)
@@ -117,6 +171,28 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     ///
     /// # Errors
     /// The TID is not that of an application, or there are too many monitors.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{events::MonitorError, prelude::*};
+    ///
+    /// struct Gait;
+    /// # impl Actor for Gait { type Context = AppContext<Self>; }
+    /// impl Handler<Delivery<Down>> for Gait {
+    ///     type Result = ();
+    ///     fn handle(&mut self, down: Delivery<Down>, _: &mut Self::Context) {
+    ///         println!("stop walking: {}", *down);
+    ///     }
+    /// }
+    ///
+    /// fn watch_the_knee(ctx: &mut AppContext<Gait>) -> Result<(), MonitorError> {
+    ///     if let Some(knee) = ctx.resolve("knee.drive") {
+    ///         ctx.monitor(knee)?;
+    ///     }
+    ///     Ok(())
+    /// }
+    /// ```
     pub fn monitor(&self, tid: Tid) -> Result<MonitorId, MonitorError> {
         self.sender.monitor(tid)
     }
@@ -130,11 +206,44 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     ///
     /// # Errors
     /// Nobody took it.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{message::SendError, prelude::*};
+    ///
+    /// payload!("demo.stop" => struct Stop);
+    /// # struct Gait;
+    /// # impl Actor for Gait { type Context = AppContext<Self>; }
+    ///
+    /// fn stop_all(ctx: &AppContext<Gait>) -> Result<(), SendError> {
+    ///     ctx.send("knee.drive", &Stop)?; // by name
+    ///     ctx.send(Tid::group("drives"), &Stop) // to each member of a group
+    /// }
+    /// ```
     pub fn send<'a, P: Payload>(&self, to: impl Into<Destination<'a>>, value: &P) -> Result<(), SendError> {
         self.sender.send(to, value)
     }
 
     /// A value to be sent otherwise than as its type says, confirmed, or as a request: see [`MessageBuilder`].
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{message::SendError, prelude::*};
+    ///
+    /// payload!("demo.calibrate" => struct Calibrate { zero_degrees: f32 });
+    ///
+    /// struct Gait;
+    /// # impl Actor for Gait { type Context = AppContext<Self>; }
+    ///
+    /// fn calibrate(ctx: &mut AppContext<Gait>) -> Result<(), SendError> {
+    ///     let command = Calibrate { zero_degrees: 0.5 };
+    ///     let outcome = ctx.message("knee.drive", &command).confirmed(Duration::from_millis(100))?;
+    ///     ctx.spawn(outcome.into_actor(&Gait).map(|outcome, _, _| println!("calibrate: {outcome:?}")));
+    ///     Ok(())
+    /// }
+    /// ```
     pub fn message<'a, P: Payload>(
         &'a mut self,
         to: impl Into<Destination<'a>>,
@@ -147,18 +256,82 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     ///
     /// # Errors
     /// The sender of `request` waits for no reply, or nobody took the reply.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// payload!("demo.ask_angle" => struct AskAngle);
+    /// payload!("demo.angle" => struct Angle { degrees: f32 });
+    ///
+    /// struct Knee { degrees: f32 }
+    /// # impl Actor for Knee { type Context = AppContext<Self>; }
+    ///
+    /// impl Handler<Delivery<AskAngle>> for Knee {
+    ///     type Result = ();
+    ///     fn handle(&mut self, request: Delivery<AskAngle>, ctx: &mut Self::Context) {
+    ///         let _ = ctx.reply(&request, &Angle { degrees: self.degrees });
+    ///     }
+    /// }
+    /// ```
     pub fn reply<P, R: Payload>(&self, request: &Delivery<P>, value: &R) -> Result<(), SendError> {
         let to = request.reply_to().ok_or(SendError::Rejected(Rejection::Unsupported))?;
         self.sender.reply(to, value)
     }
 
     /// Whether the sender of `request` still waits for a reply; see [`Sender::is_wanted`].
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// payload!("demo.plan" => struct Plan { steps: u32 });
+    /// payload!("demo.planned" => struct Planned);
+    /// # struct Planner;
+    /// # impl Actor for Planner { type Context = AppContext<Self>; }
+    ///
+    /// impl Handler<Delivery<Plan>> for Planner {
+    ///     type Result = ();
+    ///     fn handle(&mut self, request: Delivery<Plan>, ctx: &mut Self::Context) {
+    ///         for _step in 0..request.steps {
+    ///             if !ctx.is_wanted(&request) {
+    ///                 return; // its sender waits no more
+    ///             }
+    ///             // Long work.
+    ///         }
+    ///         let _ = ctx.reply(&request, &Planned);
+    ///     }
+    /// }
+    /// ```
     #[must_use]
     pub fn is_wanted<P>(&self, request: &Delivery<P>) -> bool {
         request.reply_to().is_some_and(|to| self.sender.is_wanted(&to))
     }
 
     /// Refuses the message in hand: its sender gets `Rejected(ByHandler)` instead of `Delivered`.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// payload!("demo.move" => struct Move { degrees: f32 });
+    ///
+    /// struct Knee { target: f32 }
+    /// # impl Actor for Knee { type Context = AppContext<Self>; }
+    ///
+    /// impl Handler<Delivery<Move>> for Knee {
+    ///     type Result = ();
+    ///     fn handle(&mut self, command: Delivery<Move>, ctx: &mut Self::Context) {
+    ///         if !(0.0..=120.0).contains(&command.degrees) {
+    ///             return ctx.reject(); // beyond the mechanical stops
+    ///         }
+    ///         self.target = command.degrees;
+    ///     }
+    /// }
+    /// ```
     pub fn reject(&mut self) {
         self.verdict = Some(Outcome::Rejected(Rejection::ByHandler));
     }
@@ -180,6 +353,21 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     }
 
     /// Becomes a member of the group called `name`.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// struct Drive;
+    ///
+    /// impl Actor for Drive {
+    ///     type Context = AppContext<Self>;
+    ///     fn started(&mut self, ctx: &mut Self::Context) {
+    ///         ctx.join("drives"); // what is sent to Tid::group("drives") comes here, too
+    ///     }
+    /// }
+    /// ```
     pub fn join(&self, name: &str) {
         self.sender.join(name);
     }
@@ -191,6 +379,26 @@ impl<A: Actor<Context = Self>> AppContext<A> {
 
     /// Calls `action` once a period, on a grid that begins one period from now. The first argument's
     /// [`Tick`] says how late it is and how many turns were missed; missed turns are not made up for.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// struct Hip { position: f32, velocity: f32 }
+    ///
+    /// impl Actor for Hip {
+    ///     type Context = AppContext<Self>;
+    ///     fn started(&mut self, ctx: &mut Self::Context) {
+    ///         let period = Duration::from_millis(1);
+    ///         ctx.every(period, move |hip, tick, _| {
+    ///             // Missed turns are not made up for: integrate over the time that has passed.
+    ///             let turns = (tick.missed + 1) as f32;
+    ///             hip.position += hip.velocity * period.as_secs_f32() * turns;
+    ///         });
+    ///     }
+    /// }
+    /// ```
     pub fn every(
         &mut self,
         period: Duration,
@@ -200,6 +408,20 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     }
 
     /// Calls `action` once, after `delay`.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// struct Brake { engaged: bool }
+    /// # impl Actor for Brake { type Context = AppContext<Self>; }
+    ///
+    /// fn release(ctx: &mut AppContext<Brake>) {
+    ///     // The drive holds its position before the brake lets go.
+    ///     ctx.after(Duration::from_millis(200), |brake, _, _| brake.engaged = false);
+    /// }
+    /// ```
     pub fn after(
         &mut self,
         delay: Duration,
@@ -218,6 +440,26 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     ///
     /// It finds a sender, a node or a network that is silent. It does not find one that is late: a value feeds it however old the value is,
     /// and of whatever age that is not known. Where a late value is a hazard take [`watch_input_age`](Self::watch_input_age), or both.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// payload!("demo.setpoint", Stream => struct Setpoint { newton_metres: f32 });
+    ///
+    /// struct Drive { newton_metres: f32 }
+    ///
+    /// impl Actor for Drive {
+    ///     type Context = AppContext<Self>;
+    ///     fn started(&mut self, ctx: &mut Self::Context) {
+    ///         ctx.watch_input::<Setpoint>(None, Duration::from_millis(15), |drive, timeout, _| {
+    ///             drive.newton_metres = 0.0;
+    ///             eprintln!("{timeout}");
+    ///         });
+    ///     }
+    /// }
+    /// ```
     pub fn watch_input<P: Payload>(
         &mut self,
         source: Option<Tid>,
@@ -237,17 +479,15 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     /// error of the clocks together. [`watch_input`](Self::watch_input) judges by arrival: it needs no measured clock, and tells of a sender
     /// that is there at all. [`InputTimeout`] has what a watchdog judged by, the silence and the age.
     ///
+    /// A late value still reaches its handler: [`Delivery::is_older_than`] refuses it there.
+    ///
+    /// # Examples
+    ///
     /// ```
-    /// # use std::time::Duration;
-    /// # use actix::{Actor, Handler};
-    /// # use serde::{Deserialize, Serialize};
-    /// # use sinew_runtime::{app::{AppContext, Delivery}, wire::{Class, Payload}};
-    /// # #[derive(Serialize, Deserialize)]
-    /// # struct Setpoint { newton_metres: f32 }
-    /// # impl Payload for Setpoint {
-    /// #     const NAME: &'static str = "demo.setpoint";
-    /// #     const CLASS: Class = Class::Stream;
-    /// # }
+    /// use sinew::prelude::*;
+    ///
+    /// payload!("demo.setpoint", Stream => struct Setpoint { newton_metres: f32 });
+    ///
     /// struct Drive {
     ///     newton_metres: f32,
     /// }
@@ -270,8 +510,6 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     /// #     }
     /// # }
     /// ```
-    ///
-    /// A late value still reaches its handler: [`Delivery::is_older_than`] refuses it there.
     pub fn watch_input_age<P: Payload>(
         &mut self,
         source: Option<Tid>,
@@ -300,6 +538,34 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     ///
     /// # Errors
     /// The thread that keeps the watchdogs cannot be started or is not more urgent than this one, or this is guarded already.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{prelude::*, protection::{Guard, Protection}, serde::{Deserialize, Serialize}};
+    ///
+    /// #[derive(Serialize, Deserialize)]
+    /// #[serde(crate = "sinew::serde")]
+    /// struct Torque { newton_metres: f32 }
+    /// impl Payload for Torque {
+    ///     const NAME: &'static str = "demo.torque";
+    ///     const PROTECTION: Option<Protection> = Some(Protection::of_period(Duration::from_millis(5)));
+    /// }
+    ///
+    /// struct Motor { newton_metres: f32 }
+    /// struct Drive { guard: Option<Guard<Motor>> }
+    /// # impl Actor for Drive { type Context = AppContext<Self>; }
+    ///
+    /// fn begin(drive: &mut Drive, control: Tid, ctx: &mut AppContext<Drive>) -> std::io::Result<()> {
+    ///     let motor = Motor { newton_metres: 0.0 };
+    ///     let guard = ctx.guard::<Torque, _>(control, motor, |motor, cause| {
+    ///         motor.newton_metres = 0.0;
+    ///         eprintln!("the motor is without torque: {cause}");
+    ///     })?;
+    ///     drive.guard = Some(guard);
+    ///     Ok(())
+    /// }
+    /// ```
     pub fn guard<P: Payload, O: Send + 'static>(
         &mut self,
         source: Tid,
@@ -377,6 +643,26 @@ impl<A: Actor<Context = Self>> AppContext<A> {
 
     /// Keeps this application from being ready until the gate that is returned is reached: for one that has to
     /// calibrate first. `None` if it is ready already; call it in `started`.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// struct Imu { calibrated: bool }
+    ///
+    /// impl Actor for Imu {
+    ///     type Context = AppContext<Self>;
+    ///     fn started(&mut self, ctx: &mut Self::Context) {
+    ///         let mut gate = ctx.hold_ready();
+    ///         // Applications that require this one wait until the bias of the gyroscope is known.
+    ///         ctx.after(Duration::from_secs(2), move |imu, _, _| {
+    ///             imu.calibrated = true;
+    ///             gate.take().into_iter().for_each(|gate| gate.reached());
+    ///         });
+    ///     }
+    /// }
+    /// ```
     pub fn hold_ready(&mut self) -> Option<ReadyGate> {
         self.ready.take()
     }
@@ -387,6 +673,23 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     /// It is started again after a wait that grows ([`AppSpec::start_retry`](super::AppSpec::start_retry)), and is not ready until then:
     /// applications that require it wait, and messages wait in its mailbox. The reason is logged once for as long as it stays the same. Such a
     /// failure does not count towards restart intensity, as a panic does. Of an application that is ready already it is a failure that counts.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// struct Imu;
+    ///
+    /// impl Actor for Imu {
+    ///     type Context = AppContext<Self>;
+    ///     fn started(&mut self, ctx: &mut Self::Context) {
+    ///         if let Err(error) = std::fs::File::open("/dev/ttyUSB0") {
+    ///             ctx.fail_start(format!("/dev/ttyUSB0: {error}; plug the sensor in"));
+    ///         }
+    ///     }
+    /// }
+    /// ```
     pub fn fail_start(&mut self, why: impl Into<String>) {
         // Not ready by the end of `started`.
         self.ready = None;

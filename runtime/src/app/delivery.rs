@@ -12,6 +12,27 @@ use crate::{
 };
 
 /// A payload with where it came from and how old it is.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// payload!("demo.angle", Stream => struct Angle { degrees: f32 });
+///
+/// struct Knee { hip_degrees: f32 }
+/// # impl Actor for Knee { type Context = AppContext<Self>; }
+///
+/// impl Handler<Delivery<Angle>> for Knee {
+///     type Result = ();
+///     fn handle(&mut self, angle: Delivery<Angle>, _: &mut Self::Context) {
+///         if !angle.is_older_than(Duration::from_millis(5)) {
+///             self.hip_degrees = angle.degrees; // a field of the payload
+///         }
+///         println!("message {} of {}, {:?} old", angle.sequence, angle.source, angle.age);
+///     }
+/// }
+/// ```
 #[derive(Clone, Debug)]
 pub struct Delivery<P> {
     /// What was sent.
@@ -69,9 +90,11 @@ impl<P> Delivery<P> {
     /// Whether the message may have been older than `limit` when its handler was called. An unknown age counts as too old, as a handler
     /// that may use fresh values only needs it.
     ///
+    /// # Examples
+    ///
     /// ```
-    /// # use std::time::Duration;
-    /// # use sinew_runtime::app::Delivery;
+    /// use sinew::prelude::*;
+    ///
     /// # struct Setpoint { degrees: f32 }
     /// fn follow(setpoint: &Delivery<Setpoint>) -> Option<f32> {
     ///     (!setpoint.is_older_than(Duration::from_millis(5))).then_some(setpoint.degrees)
@@ -102,6 +125,24 @@ impl<P: 'static> actix::Message for Delivery<P> {
 }
 
 /// The bytes of a payload as they came, without a copy.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{app::Raw, message::Kind, prelude::*};
+///
+/// struct Recorder { bytes: usize }
+/// # impl Actor for Recorder { type Context = AppContext<Self>; }
+///
+/// impl Handler<Delivery<Raw>> for Recorder {
+///     type Result = ();
+///     fn handle(&mut self, samples: Delivery<Raw>, _: &mut Self::Context) {
+///         self.bytes += samples.payload.len();
+///     }
+/// }
+///
+/// let recorder = AppSpec::new("recorder", || Recorder { bytes: 0 }).handles_raw(Kind::named("plate.samples"));
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Raw(pub Bytes);
 

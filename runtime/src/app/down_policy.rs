@@ -27,6 +27,22 @@ use crate::{
 pub const WILLS_MAX: usize = 8;
 
 /// What becomes of messages for an application between its end and its next Ready.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// struct Drive;
+/// # impl Actor for Drive { type Context = AppContext<Self>; }
+///
+/// // A setpoint that waited for a restart is stale.
+/// let drive = AppSpec::new("knee.drive", || Drive).while_down(DownPolicy::Drop);
+/// // A recorder may take up to 2 s to come back.
+/// # struct Recorder;
+/// # impl Actor for Recorder { type Context = AppContext<Self>; }
+/// let recorder = AppSpec::new("recorder", || Recorder).while_down(DownPolicy::HoldFor(Duration::from_secs(2)));
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum DownPolicy {
     /// They are kept, up to the mailbox's bound, and handed to its next life in order.
@@ -40,6 +56,19 @@ pub enum DownPolicy {
 }
 
 /// When a last will is sent.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// payload!("demo.offline" => struct Offline);
+/// struct Knee;
+/// # impl Actor for Knee { type Context = AppContext<Self>; }
+///
+/// // Sent also where the knee stops in order.
+/// let knee = AppSpec::new("knee", || Knee).last_will_when(LastWill::Always, "gait", &Offline);
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LastWill {
     /// When it died: by a panic, a hang, its process's end, a missed deadline. Not when it ended in order.
@@ -117,6 +146,19 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     /// A message that is sent from its TID the moment that it is known dead, before a new life is started; at most 8.
     /// Where it dies again, it is sent again. Its heir is a name, which is looked up then, or a TID: an application, a
     /// group, everybody.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// payload!("demo.stop" => struct Stop);
+    /// struct Gait;
+    /// # impl Actor for Gait { type Context = AppContext<Self>; }
+    ///
+    /// // Where the gait dies, its node stops the drives on its behalf.
+    /// let gait = AppSpec::new("gait", || Gait).last_will(Tid::group("drives"), &Stop);
+    /// ```
     #[must_use]
     pub fn last_will<'a, P: Payload>(self, to: impl Into<Destination<'a>>, value: &P) -> Self {
         self.last_will_when(LastWill::OnDeath, to, value)

@@ -9,6 +9,20 @@ use crate::{
 };
 
 /// What an input watchdog judges by.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::events::{InputCriterion, InputTimeout};
+///
+/// fn cause(timeout: &InputTimeout) -> &'static str {
+///     match timeout.criterion {
+///         InputCriterion::Arrival => "the sender, its node or the network is silent",
+///         InputCriterion::Age if timeout.is_silent() => "no value arrives",
+///         InputCriterion::Age => "values arrive too late",
+///     }
+/// }
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum InputCriterion {
     /// Arrival: each value that is handled feeds the watchdog, however old it is.
@@ -18,6 +32,26 @@ pub enum InputCriterion {
 }
 
 /// An input that is silent, or whose values are too old: what an input watchdog reports.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// payload!("demo.setpoint", Stream => struct Setpoint { newton_metres: f32 });
+///
+/// struct Drive { newton_metres: f32 }
+/// # impl Actor for Drive { type Context = AppContext<Self>; }
+///
+/// fn to_safe_state(drive: &mut Drive, timeout: InputTimeout, _: &mut AppContext<Drive>) {
+///     drive.newton_metres = 0.0;
+///     eprintln!("{timeout}; noticed {:?} late", timeout.lateness);
+/// }
+///
+/// fn begin(ctx: &mut AppContext<Drive>) {
+///     ctx.watch_input::<Setpoint>(None, Duration::from_millis(15), to_safe_state);
+/// }
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct InputTimeout {
     /// Sender that the watchdog expects; `None`: any sender.

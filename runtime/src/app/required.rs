@@ -29,12 +29,12 @@ const AT: &str = " at ";
 
 /// One requirement of an application: its text, and what it says.
 ///
+/// # Examples
+///
 /// ```
-/// use std::time::Duration;
-/// use sinew_runtime::app::{AppSpec, Requirement};
-/// # use actix::Actor;
+/// use sinew::{app::Requirement, prelude::*};
 /// # struct Gait;
-/// # impl Actor for Gait { type Context = sinew_runtime::app::AppContext<Self>; }
+/// # impl Actor for Gait { type Context = AppContext<Self>; }
 ///
 /// let spec = AppSpec::new("gait", || Gait).requires(["knee.drive", "hip.imu | knee.imu", "2 of *.drive", "camera ?2s"]);
 /// let same = AppSpec::new("gait", || Gait).requires([
@@ -79,6 +79,19 @@ impl Requirement {
 
     /// At least `count` applications whose names are among these or match them are ready. Each application counts once, and
     /// where several nodes have one of a name, each of them does; the one that requires it counts too: it does not wait for itself.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{app::Requirement, prelude::*};
+    ///
+    /// struct Gait;
+    /// # impl Actor for Gait { type Context = AppContext<Self>; }
+    ///
+    /// let drives = Requirement::at_least(2, ["*.drive"]);
+    /// assert_eq!(drives.as_str(), "2 of *.drive");
+    /// let gait = AppSpec::new("gait", || Gait).requires([drives]);
+    /// ```
     #[must_use]
     pub fn at_least<N: Into<String>>(count: usize, names: impl IntoIterator<Item = N>) -> Self {
         let of: Vec<String> = names.into_iter().map(|name| plain(&name.into())).collect();
@@ -87,6 +100,15 @@ impl Requirement {
 
     /// It is enough, and needed, that they have reached this phase in their present lives, be they ready or not. A phase is one word
     /// ([`is_phase`]).
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::app::Requirement;
+    ///
+    /// let homed = Requirement::at_least(2, ["*.drive"]).at("homed");
+    /// assert_eq!(homed.as_str(), "2 of *.drive at homed");
+    /// ```
     #[must_use]
     pub fn at(mut self, phase: impl Into<String>) -> Self {
         self.phase = Some(phase.into());
@@ -95,6 +117,16 @@ impl Requirement {
 
     /// After this time at the barrier the application starts without it, and is told so
     /// ([`RequirementEvent::Without`](crate::app::RequirementEvent::Without)). Whole milliseconds.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{app::Requirement, prelude::*};
+    ///
+    /// let camera = Requirement::name("camera").or_after(Duration::from_secs(2));
+    /// assert_eq!(camera.wait_max(), Some(Duration::from_secs(2)));
+    /// assert_eq!("camera ?2s".parse::<Requirement>().map(|same| same.wait_max()), Ok(camera.wait_max()));
+    /// ```
     #[must_use]
     pub fn or_after(mut self, wait: Duration) -> Self {
         self.or_after = Some(wait);

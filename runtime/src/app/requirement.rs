@@ -15,6 +15,32 @@ use crate::{
 
 /// A requirement changed. Applications that require something and handle this payload get it from their node's sync
 /// manager, ahead of every message that waits for them.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// struct Gait { cautious: bool }
+/// # impl Actor for Gait { type Context = AppContext<Self>; }
+///
+/// impl Handler<Delivery<RequirementEvent>> for Gait {
+///     type Result = ();
+///     fn handle(&mut self, event: Delivery<RequirementEvent>, _: &mut Self::Context) {
+///         match &event.payload {
+///             RequirementEvent::Met { .. } => self.cautious = false,
+///             RequirementEvent::Lost { name } | RequirementEvent::Without { name } => {
+///                 println!("{name} is not there");
+///                 self.cautious = true;
+///             }
+///         }
+///     }
+/// }
+///
+/// let gait = AppSpec::new("gait", || Gait { cautious: false })
+///     .requires(["knee.drive", "camera ?2s"])
+///     .handles::<RequirementEvent>();
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum RequirementEvent {
     /// What this application requires is not ready any more.
@@ -52,6 +78,18 @@ impl Payload for RequirementEvent {
 
 /// What an application does when it loses what it requires. Whatever it is, its `Handler<Delivery<RequirementEvent>>`
 /// is called as well, if it declares one, after what stands here.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// struct Gait;
+/// # impl Actor for Gait { type Context = AppContext<Self>; }
+///
+/// // Without its sensor the gait handles nothing, and its timers rest.
+/// let gait = AppSpec::new("gait", || Gait).requires(["imu"]).on_requirement_lost(RequirementPolicy::Pause);
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum RequirementPolicy {
     /// It goes on as before.
@@ -92,6 +130,23 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
 
     /// When it loses what it requires, `enter` is called, once for each name, ahead of every message that waits; when all
     /// is met again, `leave`. Between them it handles messages as ever.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// struct Drive { limit: f32 }
+    /// # impl Actor for Drive { type Context = AppContext<Self>; }
+    ///
+    /// let drive = AppSpec::new("knee.drive", || Drive { limit: 40.0 }).requires(["gait"]).safe_state(
+    ///     |drive, lost, _| {
+    ///         println!("{} is lost", lost.name());
+    ///         drive.limit = 0.0;
+    ///     },
+    ///     |drive, _, _| drive.limit = 40.0,
+    /// );
+    /// ```
     #[must_use]
     pub fn safe_state(
         mut self,

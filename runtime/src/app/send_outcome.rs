@@ -11,6 +11,29 @@ use crate::{
 };
 
 /// What became of a message that was sent with [`MessageBuilder::with_tag`].
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{message::SendError, prelude::*};
+///
+/// payload!("demo.calibrate" => struct Calibrate { zero_degrees: f32 });
+///
+/// struct Gait;
+/// # impl Actor for Gait { type Context = AppContext<Self>; }
+///
+/// impl Handler<SendOutcome> for Gait {
+///     type Result = ();
+///     fn handle(&mut self, sent: SendOutcome, _: &mut Self::Context) {
+///         println!("command {} ended as {:?}", sent.tag, sent.outcome);
+///     }
+/// }
+///
+/// fn calibrate(ctx: &mut AppContext<Gait>) -> Result<(), SendError> {
+///     let command = Calibrate { zero_degrees: 0.5 };
+///     ctx.message("knee.drive", &command).with_tag(17).confirmed(Duration::from_millis(100))
+/// }
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SendOutcome {
     /// The number that its sender gave it.
@@ -24,6 +47,23 @@ impl Message for SendOutcome {
 }
 
 /// What became of a message to many that was sent with [`MessageBuilder::with_tag`], at each of its members.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{app::GroupOutcome, prelude::*};
+///
+/// struct Gait { stopped: usize }
+/// # impl Actor for Gait { type Context = AppContext<Self>; }
+///
+/// impl Handler<GroupOutcome> for Gait {
+///     type Result = ();
+///     fn handle(&mut self, sent: GroupOutcome, _: &mut Self::Context) {
+///         let delivered = sent.members.iter().filter(|member| member.outcome == Outcome::Delivered);
+///         self.stopped = delivered.count();
+///     }
+/// }
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct GroupOutcome {
     /// The number that its sender gave it.
@@ -67,6 +107,29 @@ impl<'a, A: Actor<Context = AppContext<A>>, C: Content> MessageBuilder<&'a mut A
     }
 
     /// Has its outcome come to this actor as a [`SendOutcome`] with `tag`, or as a [`GroupOutcome`], instead of as a future.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{message::SendError, prelude::*};
+    ///
+    /// payload!("demo.home" => struct Home);
+    /// struct Gait;
+    /// # impl Actor for Gait { type Context = AppContext<Self>; }
+    /// impl Handler<SendOutcome> for Gait {
+    ///     type Result = ();
+    ///     fn handle(&mut self, sent: SendOutcome, _: &mut Self::Context) {
+    ///         println!("drive {}: {:?}", sent.tag, sent.outcome);
+    ///     }
+    /// }
+    ///
+    /// fn home(drives: &[Tid], ctx: &mut AppContext<Gait>) -> Result<(), SendError> {
+    ///     for (number, drive) in (0..).zip(drives) {
+    ///         ctx.message(*drive, &Home).with_tag(number).confirmed(Duration::from_secs(1))?;
+    ///     }
+    ///     Ok(())
+    /// }
+    /// ```
     pub fn with_tag(self, tag: u64) -> MessageBuilder<Tagged<'a, A>, C> {
         let Self { via, content, terms } = self;
         MessageBuilder { via: Tagged { context: via, tag }, content, terms }
@@ -98,12 +161,10 @@ where
     /// Sends it to many; what becomes of it at each member comes to this actor as a [`GroupOutcome`], once, in a turn of its own: when the last
     /// member is settled, and at the latest `within` this time. The next life of the application does not get it.
     ///
+    /// # Examples
+    ///
     /// ```
-    /// use std::time::Duration;
-    /// use actix::{Actor, Handler};
-    /// use sinew_runtime::{
-    ///     app::{AppContext, GroupOutcome}, outcome::Outcome, sender::SendError, tid::Tid, wire::Payload,
-    /// };
+    /// use sinew::{app::GroupOutcome, message::SendError, prelude::*};
     ///
     /// struct Brain;
     ///

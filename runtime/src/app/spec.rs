@@ -19,17 +19,12 @@ use crate::{
 
 /// Declares an application: how to make its actor, its name, what it handles, what it requires, where it runs.
 ///
-/// ```
-/// use actix::{Actor, Handler};
-/// use serde::{Deserialize, Serialize};
-/// use sinew_runtime::{app::{AppContext, AppSpec, Delivery}, wire::{Class, Payload}};
+/// # Examples
 ///
-/// #[derive(Serialize, Deserialize)]
-/// struct Angle { degrees: f32 }
-/// impl Payload for Angle {
-///     const NAME: &'static str = "demo.angle";
-///     const CLASS: Class = Class::Stream;
-/// }
+/// ```
+/// use sinew::prelude::*;
+///
+/// payload!("demo.angle", Stream => struct Angle { degrees: f32 });
 ///
 /// struct Knee;
 /// impl Actor for Knee { type Context = AppContext<Self>; }
@@ -42,8 +37,7 @@ use crate::{
 ///
 /// let spec = AppSpec::new("knee", || Knee).handles::<Angle>().requires(["hip"]).own_thread();
 ///
-/// // A setpoint that waited for a restart would be stale; and who follows this one is told that it died.
-/// use sinew_runtime::{app::DownPolicy, tid::Tid};
+/// // A setpoint that waits for a restart is stale. Where this application dies, its followers get its last will.
 /// let spec = spec.while_down(DownPolicy::Drop).last_will(Tid::group("followers"), &Angle { degrees: 0.0 });
 /// ```
 pub struct AppSpec<A: Actor<Context = AppContext<A>>> {
@@ -79,10 +73,13 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     /// The same with a factory that may fail, as it opens a device for example. Its error fails the start, as
     /// [`AppContext::fail_start`] does.
     ///
+    /// # Examples
+    ///
     /// ```
-    /// # use sinew_runtime::app::{AppContext, AppSpec};
+    /// use sinew::prelude::*;
+    ///
     /// struct Imu(std::fs::File);
-    /// # impl actix::Actor for Imu { type Context = AppContext<Self>; }
+    /// # impl Actor for Imu { type Context = AppContext<Self>; }
     /// let open = || std::fs::File::open("/dev/ttyUSB0").map(Imu);
     /// let imu = AppSpec::try_new("imu", move || open().map_err(|error| format!("/dev/ttyUSB0: {error}; plug it in")));
     /// ```
@@ -112,6 +109,25 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     }
 
     /// It handles payloads of type `P`. Layers' events are payloads too: to handle `NodeEvent` is to subscribe to it.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// payload!("demo.angle", Stream => struct Angle { degrees: f32 });
+    ///
+    /// struct Knee;
+    /// # impl Actor for Knee { type Context = AppContext<Self>; }
+    /// impl Handler<Delivery<Angle>> for Knee {
+    ///     type Result = ();
+    ///     fn handle(&mut self, angle: Delivery<Angle>, _: &mut Self::Context) {
+    ///         println!("{} degrees", angle.degrees);
+    ///     }
+    /// }
+    ///
+    /// let knee = AppSpec::new("knee", || Knee).handles::<Angle>();
+    /// ```
     #[must_use]
     pub fn handles<P: Payload>(mut self) -> Self
     where
@@ -137,6 +153,17 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     /// It starts when all of these are met, on this node or on any other: names (`knee.drive`), patterns (`*.drive`), any of
     /// several (`hip.imu | knee.imu`), so many of them (`2 of *.drive`), or what it waits for no longer than a time
     /// (`camera ?2s`). See [`Requirement`](crate::app::Requirement), which can be given instead of its text.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// struct Gait;
+    /// # impl Actor for Gait { type Context = AppContext<Self>; }
+    ///
+    /// let gait = AppSpec::new("gait", || Gait).requires(["knee.drive", "hip.imu | knee.imu", "camera ?2s"]);
+    /// ```
     #[must_use]
     pub fn requires<N: Into<String>>(mut self, names: impl IntoIterator<Item = N>) -> Self {
         self.common.requires.extend(names.into_iter().map(Into::into));
@@ -163,6 +190,18 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     /// up to the line that starts the node, which does not return there. Whatever comes before that line happens in each such
     /// process as well, so keep it short, and leave to the application itself what only one process can have (a port, a
     /// device, a file that is written). It can do all that it can in a thread, but `monitor` others.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// struct Camera;
+    /// # impl Actor for Camera { type Context = AppContext<Self>; }
+    ///
+    /// // A driver that may crash takes nothing else with it.
+    /// let camera = AppSpec::new("camera", || Camera).own_process();
+    /// ```
     #[must_use]
     pub fn own_process(self) -> Self {
         self.place(Place::process())
@@ -176,6 +215,18 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
 
     /// It runs in this place: a thread with a name, and perhaps a real-time priority and a CPU. A node in which two ask
     /// for different priorities or CPUs of one thread does not start.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// struct Gait;
+    /// # impl Actor for Gait { type Context = AppContext<Self>; }
+    ///
+    /// // A real-time thread on a CPU that the kernel keeps free (`isolcpus=3`).
+    /// let gait = AppSpec::new("gait", || Gait).place(Place::own_thread().realtime(60).on_cpu(3));
+    /// ```
     #[must_use]
     pub fn place(mut self, place: Place) -> Self {
         self.common.place = place.of_application(&self.common.name);
@@ -218,6 +269,18 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
 
     /// How a start is tried again that failed by [`AppContext::fail_start`] or by the error of [`try_new`](Self::try_new). Default: after 100 ms
     /// at first, doubled each time up to 5 s, without an end.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{prelude::*, supervision::StartRetry};
+    ///
+    /// struct Imu;
+    /// # impl Actor for Imu { type Context = AppContext<Self>; }
+    ///
+    /// let retry = StartRetry { max: Duration::from_secs(1), ..StartRetry::default() };
+    /// let imu = AppSpec::new("imu", || Imu).start_retry(retry);
+    /// ```
     #[must_use]
     pub const fn start_retry(mut self, retry: StartRetry) -> Self {
         self.common.policy.start_retry = retry;
@@ -234,6 +297,18 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
 
     /// Longest time that one turn (a handler, a timer, `started`) may take, and that it may leave its messages waiting while
     /// it waits for something else. After it the application counts as hung and is replaced. Default 1 s.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// struct Drive;
+    /// # impl Actor for Drive { type Context = AppContext<Self>; }
+    ///
+    /// // A turn takes 200 us. One that takes 20 ms hangs, and the drive is started again.
+    /// let drive = AppSpec::new("knee.drive", || Drive).own_thread().progress_within(Duration::from_millis(20));
+    /// ```
     #[must_use]
     pub const fn progress_within(mut self, time: Duration) -> Self {
         self.common.policy.progress_within = Some(time);

@@ -32,6 +32,18 @@ const PENDING: u8 = 0xff;
 ///
 /// Where a node did not name its members, the entry has the node's address and the application address that the message was sent to: it
 /// stands for all members of that node.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{Outcome, Tid, message::MemberOutcome};
+///
+/// /// The drives that may still move.
+/// fn not_stopped(members: &[MemberOutcome]) -> Vec<Tid> {
+///     let failed = members.iter().filter(|member| member.outcome != Outcome::Delivered);
+///     failed.map(|member| member.tid).collect()
+/// }
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct MemberOutcome {
     /// The member.

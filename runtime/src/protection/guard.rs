@@ -25,6 +25,28 @@ const SAFE_RETRY: Duration = Duration::from_millis(1);
 /// The only way to an output of type `O`: commands pass while it is live, and it is made safe as soon as it is not.
 ///
 /// Clones have the same output. When the last one is dropped (its application has ended) the output is made safe.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{Tid, prelude::*, protection::{Cause, Guard, Protection, State}};
+/// use sinew::serde::{Deserialize, Serialize};
+///
+/// #[derive(Serialize, Deserialize)]
+/// #[serde(crate = "sinew::serde")]
+/// struct Torque { newton_metres: f32 }
+/// impl Payload for Torque {
+///     const NAME: &'static str = "demo.torque";
+///     const PROTECTION: Option<Protection> = Some(Protection::of_period(Duration::from_millis(5)));
+/// }
+///
+/// // In an application it is made by `ctx.guard`, in a program apart by `Endpoint::guard`.
+/// let (control, drive): (Tid, Tid) = ("10.0.0.2/1001".parse()?, "10.0.0.3/1001".parse()?);
+/// let guard = Guard::new::<Torque>(control, drive, 0.0_f32, |motor, _| *motor = 0.0)?;
+/// assert_eq!(guard.state(), State::Safe(Cause::NotArmed));
+/// assert!(guard.apply(|motor| *motor = 3.0).is_err()); // nothing moves
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct Guard<O: Send + 'static> {
     /// Counts the clones, without the hold that a context has.
     owners: Arc<Owners<O>>,
@@ -145,6 +167,20 @@ impl<O: Send + 'static> Guard<O> {
     ///
     /// # Errors
     /// It is not, since this; it was not moved.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::protection::Guard;
+    ///
+    /// struct Motor { newton_metres: f32 }
+    ///
+    /// fn drive(guard: &Guard<Motor>, newton_metres: f32) {
+    ///     if let Err(cause) = guard.apply(|motor| motor.newton_metres = newton_metres) {
+    ///         eprintln!("not moved: {cause}");
+    ///     }
+    /// }
+    /// ```
     pub fn apply<R>(&self, command: impl FnOnce(&mut O) -> R) -> Result<R, Cause> {
         self.shared().with(|inner| {
             self.shared().decide_locked(inner, |receiver, now| receiver.expire(now));
@@ -180,6 +216,19 @@ impl<O: Send + 'static> Guard<O> {
     }
 
     /// Makes the output safe: at once, or, while its application or another thread has it in hand, as soon as it has not.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::protection::Guard;
+    ///
+    /// /// The drive's own limit: a torque that the joint does not bear trips the output.
+    /// fn check<O: Send>(guard: &Guard<O>, newton_metres: f32) {
+    ///     if newton_metres.abs() > 40.0 {
+    ///         guard.trip();
+    ///     }
+    /// }
+    /// ```
     pub fn trip(&self) {
         self.shared().trip();
     }

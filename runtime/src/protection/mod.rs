@@ -67,6 +67,24 @@ use crate::{
 pub const SAFE_OUTPUT_PRIORITY: u8 = 90;
 
 /// What a receiver of protected messages bears.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{prelude::*, protection::Protection, serde::{Deserialize, Serialize}};
+///
+/// #[derive(Serialize, Deserialize)]
+/// #[serde(crate = "sinew::serde")]
+/// struct Torque { newton_metres: f32 }
+///
+/// impl Payload for Torque {
+///     const NAME: &'static str = "demo.torque";
+///     const CLASS: Class = Class::Stream;
+///     /// One each 5 ms, of which no more than one in a row may be missing.
+///     const PROTECTION: Option<Protection> =
+///         Some(Protection { lost_max: 1, ..Protection::of_period(Duration::from_millis(5)) });
+/// }
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Protection {
     /// Longest time from one good message to the next.
@@ -84,6 +102,16 @@ pub struct Protection {
 
 impl Protection {
     /// For a message each `period`: two may be late or missing, one in 64 bad, and the output may be armed after eight good ones.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{prelude::*, protection::Protection};
+    ///
+    /// let bears = Protection::of_period(Duration::from_millis(5));
+    /// assert_eq!(bears.within, Duration::from_millis(15));
+    /// assert_eq!(bears.age_max, Duration::from_millis(40));
+    /// ```
     #[must_use]
     pub const fn of_period(period: Duration) -> Self {
         let within = period.saturating_mul(3);
@@ -99,6 +127,21 @@ impl Protection {
 }
 
 /// Whether commands reach the output.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::protection::{Cause, State};
+///
+/// fn lamp(state: State) -> &'static str {
+///     match state {
+///         State::Live => "green",
+///         State::Safe(Cause::NotArmed) => "yellow",
+///         State::Safe(_) => "red",
+///     }
+/// }
+/// assert_eq!(lamp(State::Safe(Cause::Silent)), "red");
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
     /// They do.
@@ -108,6 +151,14 @@ pub enum State {
 }
 
 /// Why an output is safe.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::protection::Cause;
+///
+/// assert_eq!(Cause::Silent.to_string(), "no good message came in time");
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Cause {
     /// It was never armed.
@@ -163,6 +214,21 @@ pub enum Fault {
 }
 
 /// Why an output cannot be armed.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::protection::{ArmError, Guard};
+///
+/// /// Arms the output as soon as enough good commands have come.
+/// fn arm<O: Send>(guard: &Guard<O>) -> Result<bool, ArmError> {
+///     match guard.arm() {
+///         Ok(()) => Ok(true),
+///         Err(ArmError::NotGood { .. }) => Ok(false), // try again with the next command
+///         Err(other) => Err(other),
+///     }
+/// }
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ArmError {
     /// Too few good messages have come, or the last one too long ago.
@@ -185,6 +251,17 @@ pub enum ArmError {
 }
 
 /// What a receiver has counted.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::protection::Guard;
+///
+/// fn report<O: Send>(guard: &Guard<O>) {
+///     let tally = guard.tally();
+///     println!("{} good, {} lost, {} trips", tally.good, tally.lost, tally.trips);
+/// }
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Tally {
     /// Good messages.

@@ -65,6 +65,20 @@ impl Deadline {
 
 /// The future outcome of a confirmed message. Any thread may poll it, with any executor; in a runtime of tokio's, one whose
 /// time is enabled.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{message::{SendError, Sender}, prelude::*};
+///
+/// payload!("demo.home" => struct Home);
+///
+/// /// Whether the knee has handled the command.
+/// async fn home(sender: &Sender) -> Result<bool, SendError> {
+///     let confirmation = sender.message("knee.drive", &Home).confirmed(Duration::from_secs(1))?;
+///     Ok(confirmation.await == Outcome::Delivered)
+/// }
+/// ```
 #[derive(Debug)]
 #[must_use = "an outcome that nobody reads is no better than an unconfirmed send"]
 pub struct Confirmation(Deadline);
@@ -88,6 +102,21 @@ impl Future for Confirmation {
 
 /// The future outcomes of a confirmed message to many, one for each member, in the order of their TIDs. Any thread may poll it, with any
 /// executor; in a runtime of tokio's, one whose time is enabled.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{message::{SendError, Sender}, prelude::*};
+///
+/// payload!("demo.home" => struct Home);
+///
+/// /// How many drives have handled the command.
+/// async fn home(sender: &Sender) -> Result<usize, SendError> {
+///     let drives = Tid::group("drives");
+///     let members = sender.message(drives, &Home).confirmed_by_each(Duration::from_secs(1))?.await;
+///     Ok(members.iter().filter(|member| member.outcome == Outcome::Delivered).count())
+/// }
+/// ```
 #[derive(Debug)]
 #[must_use = "outcomes that nobody reads are no better than an unconfirmed send"]
 pub struct GroupConfirmation(Deadline);
@@ -115,6 +144,20 @@ impl Future for GroupConfirmation {
 ///
 /// Dropping it before it has ended gives the request up: where it still waits for its handler it is taken back, on any node, and
 /// a handler that has begun can [see](super::Sender::is_wanted) it.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{message::{AskError, Sender}, prelude::*};
+///
+/// payload!("demo.ask_angle" => struct AskAngle);
+/// payload!("demo.angle" => struct Angle { degrees: f32 });
+///
+/// async fn knee_degrees(sender: &Sender) -> Result<f32, AskError> {
+///     let reply = sender.message("knee", &AskAngle).ask::<Angle>(Duration::from_millis(50))?;
+///     Ok(reply.await?.degrees)
+/// }
+/// ```
 #[derive(Debug)]
 #[must_use = "a reply that nobody reads need not be asked for"]
 pub struct Reply<R> {

@@ -18,9 +18,11 @@ use crate::{
 /// What it does not say is as its type says. It is sent by [`send`](Self::send), [`confirmed`](Self::confirmed),
 /// [`confirmed_by_each`](Self::confirmed_by_each) or [`ask`](Self::ask), and not before.
 ///
+/// # Examples
+///
 /// ```
 /// # use std::time::Duration;
-/// # use sinew_runtime::{sender::{SendError, Sender}, tid::Tid, wire::Payload};
+/// # use sinew::{Payload, Tid, message::{SendError, Sender}};
 /// # fn steer<P: Payload>(sender: &Sender, drive: Tid, setpoint: &P) -> Result<(), SendError> {
 /// sender.message(drive, setpoint).expires_after(Duration::from_millis(20)).send()
 /// # }
@@ -91,6 +93,19 @@ impl<V, C> MessageBuilder<V, C> {
     }
 
     /// The class in which it travels, instead of its type's.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{message::{SendError, Sender}, prelude::*};
+    ///
+    /// payload!("demo.setpoint", Stream => struct Setpoint { degrees: f32 });
+    ///
+    /// /// Sends the last setpoint of a motion as a command, which no later value replaces.
+    /// fn finish(sender: &Sender, drive: Tid, setpoint: &Setpoint) -> Result<(), SendError> {
+    ///     sender.message(drive, setpoint).class(Class::Control).send()
+    /// }
+    /// ```
     pub const fn class(mut self, class: Class) -> Self {
         self.terms.class = Some(class);
         self
@@ -98,6 +113,19 @@ impl<V, C> MessageBuilder<V, C> {
 
     /// Has it expire where it waits when it is older than this, instead of its type's [`TIME_TO_LIVE`](Payload::TIME_TO_LIVE). At most
     /// [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s: a longer time counts as that.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{message::{SendError, Sender}, prelude::*};
+    ///
+    /// payload!("demo.step" => struct Step { metres: f32 });
+    ///
+    /// /// A step that waits for longer than 50 ms comes too late to be taken.
+    /// fn step(sender: &Sender, gait: Tid) -> Result<(), SendError> {
+    ///     sender.message(gait, &Step { metres: 0.3 }).expires_after(Duration::from_millis(50)).send()
+    /// }
+    /// ```
     pub const fn expires_after(mut self, time: Duration) -> Self {
         self.terms.expires_after = Some(time);
         self
@@ -167,6 +195,27 @@ impl<V: Via, C: Content> MessageBuilder<V, C> {
     ///
     /// # Errors
     /// No queue and no socket took it. The future's own errors are [`AskError`](super::AskError)s.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{message::SendError, prelude::*};
+    ///
+    /// payload!("demo.ask_angle" => struct AskAngle);
+    /// payload!("demo.angle" => struct Angle { degrees: f32 });
+    ///
+    /// struct Hip { knee_degrees: f32 }
+    /// # impl Actor for Hip { type Context = AppContext<Self>; }
+    ///
+    /// fn ask(hip: &Hip, ctx: &mut AppContext<Hip>) -> Result<(), SendError> {
+    ///     let reply = ctx.message("knee", &AskAngle).ask::<Angle>(Duration::from_millis(50))?;
+    ///     ctx.spawn(reply.into_actor(hip).map(|reply, hip, _| match reply {
+    ///         Ok(angle) => hip.knee_degrees = angle.degrees,
+    ///         Err(error) => eprintln!("{error}"),
+    ///     }));
+    ///     Ok(())
+    /// }
+    /// ```
     pub fn ask<R: Payload>(self, within: Duration) -> Result<Reply<R>, SendError> {
         const { assert!(R::PROTECTION.is_none(), "a protected payload is sent, not asked for") };
         let (via, mut message) = self.message()?;
@@ -190,6 +239,19 @@ impl<C: Content> MessageBuilder<&Sender, C> {
     ///
     /// # Errors
     /// No queue and no socket took it, it is of class Stream, or it is for more than one application ([`SendError::ToMany`]).
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{message::{SendError, Sender}, prelude::*};
+    ///
+    /// payload!("demo.calibrate" => struct Calibrate { zero_degrees: f32 });
+    ///
+    /// async fn calibrate(sender: &Sender, drive: Tid) -> Result<Outcome, SendError> {
+    ///     let command = Calibrate { zero_degrees: 0.5 };
+    ///     Ok(sender.message(drive, &command).confirmed(Duration::from_millis(100))?.await)
+    /// }
+    /// ```
     pub fn confirmed(self, within: Duration) -> Result<Confirmation, SendError> {
         self.confirm(within).map(|(_, confirmation)| confirmation)
     }
@@ -202,9 +264,11 @@ impl<C: Content> MessageBuilder<&Sender, C> {
     ///
     /// At most 256 members of one node and 256 other nodes are reached, and an application has 64 such messages to other nodes under way.
     ///
+    /// # Examples
+    ///
     /// ```
     /// use std::time::Duration;
-    /// use sinew_runtime::{outcome::Outcome, sender::{SendError, Sender}, tid::{NodeAddress, Tid}, wire::Payload};
+    /// use sinew::{Outcome, Payload, Tid, message::{SendError, Sender}};
     ///
     /// /// Stops all drives; returns those that may still move.
     /// async fn stop<P: Payload>(sender: &Sender, stop: &P) -> Result<Vec<Tid>, SendError> {

@@ -12,6 +12,18 @@ use super::Directory;
 ///
 /// It can say which names are similar. They are looked for when it is shown, not when the message is refused: so a loop that sends to a name
 /// which is away pays nothing for them.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::message::SendError;
+///
+/// fn explain(error: &SendError) {
+///     if let SendError::UnknownName(unknown) = error {
+///         eprintln!("'{}' is not there; did you mean {:?}?", unknown.name(), unknown.nearest());
+///     }
+/// }
+/// ```
 #[derive(Clone)]
 pub struct UnknownNameError {
     name: String,

@@ -11,6 +11,22 @@ use super::system;
 
 /// Where an actor runs: a thread with a name. Actors that name the same one share it; what they ask of it besides must be the
 /// same, too.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// struct Hip;
+/// struct Knee;
+/// # impl Actor for Hip { type Context = AppContext<Self>; }
+/// # impl Actor for Knee { type Context = AppContext<Self>; }
+///
+/// // Both controllers share one real-time thread: no wake between them.
+/// let leg = || Place::thread("leg").realtime(60);
+/// let hip = AppSpec::new("hip", || Hip).place(leg());
+/// let knee = AppSpec::new("knee", || Knee).place(leg());
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Place {
     /// Name of the thread; the kernel shows its first 15 bytes.
@@ -80,6 +96,17 @@ impl Place {
     }
 
     /// A process of its own, a child of the node's: its thread is called like the application.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// struct Camera;
+    /// # impl Actor for Camera { type Context = AppContext<Self>; }
+    ///
+    /// let camera = AppSpec::new("camera", || Camera).place(Place::process().on_cpu(1));
+    /// ```
     #[must_use]
     pub const fn process() -> Self {
         let mut place = Self::own_thread();
@@ -89,6 +116,15 @@ impl Place {
 
     /// The same thread under SCHED_FIFO with this priority, 1 to 99; an application with 90 or more is refused by its node, as
     /// [what makes outputs safe](crate::protection::SAFE_OUTPUT_PRIORITY) has to come before what it guards.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// let place = Place::own_thread().realtime(60);
+    /// assert_eq!(place.realtime_priority, Some(60));
+    /// ```
     #[must_use]
     pub const fn realtime(mut self, priority: u8) -> Self {
         self.realtime_priority = Some(priority);

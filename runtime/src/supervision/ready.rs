@@ -9,6 +9,25 @@ use std::sync::{
 ///
 /// The paper's section 6: a layer may not mark itself as started before all of its threads have reached the intended
 /// point of execution. Each sub-task owns one [`ReadyPart`]; the last one that is reached speaks for all.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// struct Drive;
+///
+/// impl Actor for Drive {
+///     type Context = AppContext<Self>;
+///     fn started(&mut self, ctx: &mut Self::Context) {
+///         let Some(gate) = ctx.hold_ready() else { return };
+///         // Ready when both the encoder and the brake have answered.
+///         let [encoder, brake] = gate.parts();
+///         std::thread::spawn(move || encoder.reached());
+///         std::thread::spawn(move || brake.reached());
+///     }
+/// }
+/// ```
 pub struct ReadyGate {
     say: Box<dyn FnOnce() + Send>,
 }

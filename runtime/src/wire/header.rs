@@ -43,6 +43,18 @@ const GUARD_AT: usize = 38;
 const SEQUENCE_MAX: u64 = (1 << 48) - 1;
 
 /// How urgent a message is, and what a newer one does to an older.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{Class, Payload, payload};
+///
+/// payload!("demo.calibrate" => struct Calibrate); // a command: Control
+/// payload!("demo.angle", Stream => struct Angle { degrees: f32 }); // a measurement: only the newest waits
+/// payload!("demo.record", Bulk => struct Record { samples: Vec<f32> }); // gives way to both
+///
+/// assert_eq!([Calibrate::CLASS, Angle::CLASS, Record::CLASS], Class::ALL);
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub enum Class {
     /// Ordered and ahead of all else.

@@ -20,6 +20,17 @@ pub const fn fnv1a(bytes: &[u8]) -> u32 {
 ///
 /// Ids below `0x8000_0000` belong to Sinew's own layers; a user's kind is the hash of its name with the top bit set.
 /// Two names of one node that hash alike are refused when the second is registered.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{Payload, message::Kind, payload};
+///
+/// payload!("demo.angle", Stream => struct Angle { degrees: f32 });
+///
+/// // The kind depends on the name alone, so that each language has the same.
+/// assert_eq!(Angle::KIND, Kind::named("demo.angle"));
+/// ```
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Kind(u32);
@@ -131,6 +142,16 @@ impl Kind {
     }
 
     /// The id of the user's payload type called `name`.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::message::Kind;
+    ///
+    /// /// Raw samples of a force plate: bytes that no Rust type describes.
+    /// const SAMPLES: Kind = Kind::named("plate.samples");
+    /// assert!(SAMPLES.is_user());
+    /// ```
     #[must_use]
     pub const fn named(name: &str) -> Self {
         Self(fnv1a(name.as_bytes()) | 0x8000_0000)

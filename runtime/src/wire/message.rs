@@ -17,11 +17,13 @@ use crate::{
 
 /// A type that travels as MessagePack (a map with field names, so that any language can read it).
 ///
+/// # Examples
+///
 /// ```
-/// use serde::{Deserialize, Serialize};
-/// use sinew_runtime::wire::{Class, Payload};
+/// use sinew::{Class, Payload, serde::{Deserialize, Serialize}};
 ///
 /// #[derive(Serialize, Deserialize)]
+/// #[serde(crate = "sinew::serde")]
 /// struct JointAngle { degrees: f32 }
 ///
 /// impl Payload for JointAngle {
@@ -214,6 +216,21 @@ fn without_fields<T: DeserializeOwned + Serialize>(bytes: &[u8]) -> Option<T> {
 }
 
 /// Writable memory for a raw payload: what `create_message` lends.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{Tid, message::{Kind, SendError, Sender}};
+///
+/// /// Sends raw samples that are written where they travel from.
+/// fn record(sender: &Sender, recorder: Tid, samples: &[f32]) -> Result<(), SendError> {
+///     let mut memory = sender.create_message(recorder, Kind::named("plate.samples"), 4 * samples.len())?;
+///     for (bytes, sample) in memory.chunks_exact_mut(4).zip(samples) {
+///         bytes.copy_from_slice(&sample.to_le_bytes());
+///     }
+///     sender.loaned(memory).send()
+/// }
+/// ```
 #[derive(Debug)]
 pub struct MessageBuffer {
     header: Header,

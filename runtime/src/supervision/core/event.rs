@@ -68,6 +68,14 @@ pub enum Command {
 }
 
 /// Why a command is not carried out. Nothing has changed.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::supervision::Refusal;
+///
+/// assert_eq!(Refusal::Running.to_string(), "it runs; stop it first, with `stop_app`");
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Refusal {
     /// The supervisor has no such child.

@@ -3,6 +3,15 @@
 use std::time::Duration;
 
 /// Who is restarted when one child fails.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// // Encoder, controller and drive of a joint make sense together only.
+/// let joint = SupervisorSpec::new("knee").strategy(Strategy::OneForAll);
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Strategy {
     /// That child alone.
@@ -25,6 +34,18 @@ impl Strategy {
 }
 
 /// When a child that ended is started again.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// struct Homing;
+/// # impl Actor for Homing { type Context = AppContext<Self>; }
+///
+/// // Started again only where it failed: once the joint is homed, it ends for good.
+/// let homing = AppSpec::new("homing", || Homing).restart(Restart::Transient);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Restart {
     /// Always.
@@ -37,6 +58,19 @@ pub enum Restart {
 
 /// Whether a supervisor ends by itself when its [significant](Policy::significant) children have done their work: when one
 /// that is transient ends without a failure, or one that is temporary ends in whatever way.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// struct Trial;
+/// # impl Actor for Trial { type Context = AppContext<Self>; }
+///
+/// // The node stops in order when the trial is over.
+/// let trial = AppSpec::new("trial", || Trial).restart(Restart::Transient).significant();
+/// let node = Node::builder("bench").app(trial).auto_shutdown(AutoShutdown::AnySignificant);
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum AutoShutdown {
     /// It does not.
@@ -75,6 +109,16 @@ pub struct Policy {
 }
 
 /// How a start that failed by an explicit call is tried again. Such failures do not count towards restart intensity.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{prelude::*, supervision::StartRetry};
+///
+/// // A sensor that is plugged in by hand: look for it twice a second.
+/// let retry = StartRetry { max: Duration::from_millis(500), ..StartRetry::default() };
+/// assert_eq!(retry.min, Duration::from_millis(100));
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct StartRetry {
     /// First wait; doubles with each such failure in a row, and is then shortened by chance by up to a quarter. Default 100 ms.

@@ -1,6 +1,15 @@
 //! How a child ended.
 
 /// How a child ended.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::supervision::Reason;
+///
+/// assert!(Reason::Hung("in a handler".to_owned()).is_failure());
+/// assert!(!Reason::RequirementLost("imu".to_owned()).is_failure());
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Reason {
     /// By itself, in order.
