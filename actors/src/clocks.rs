@@ -20,6 +20,19 @@ pub(crate) const DRIFT_PPB_MAX: u64 = 200_000;
 pub(crate) const WANDER_PPB_PER_S: u64 = 100;
 
 /// How far a peer's monotonic clock is from ours.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{prelude::*, time::{ClockDrift, ClockOffset}};
+///
+/// let drift = ClockDrift { ppb: 0, bound_ppb: 20_000 };
+/// let at = Time::from_nanos(1_000_000_000);
+/// let measured = ClockOffset { theirs_minus_ours_ns: -350_000, bound: Duration::from_micros(40), at, drift };
+/// // A second later the clocks may have drifted apart by 20 us.
+/// let later = measured.at(at + Duration::from_secs(1));
+/// assert!(later.bound >= Duration::from_micros(60));
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ClockOffset {
     /// Their clock minus ours, in nanoseconds.
@@ -33,6 +46,15 @@ pub struct ClockOffset {
 }
 
 /// How much faster a peer's clock runs than ours.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::time::ClockDrift;
+///
+/// let drift = ClockDrift { ppb: 1_500, bound_ppb: 200 };
+/// println!("their clock gains {} us an hour", drift.ppb * 3_600 / 1_000);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ClockDrift {
     /// Nanoseconds in a second by which theirs goes ahead of ours; 1000 are 1 ppm.

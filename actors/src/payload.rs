@@ -34,10 +34,11 @@
 /// sinew::payload!("demo.angle", Stream, expires_after = 20 millis => struct Angle { degrees: f32 });
 /// ```
 ///
-/// Nor does a time to live of zero:
+/// Nor does a program that sends or handles a type with a time to live of zero:
 ///
 /// ```compile_fail
 /// sinew::payload!("demo.angle", Stream, expires_after = 0 ms => struct Angle { degrees: f32 });
+/// # const _: Option<std::time::Duration> = <Angle as sinew::Payload>::TIME_TO_LIVE;
 /// ```
 #[macro_export]
 macro_rules! payload {

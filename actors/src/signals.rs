@@ -17,6 +17,20 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 const SIGHUP: u32 = 1;
 
 /// Waits for the first signal that asks for an orderly stop.
+///
+/// # Examples
+///
+/// ```no_run
+/// use sinew::{Node, signals::StopSignals};
+///
+/// async fn run() -> Result<(), Box<dyn std::error::Error>> {
+///     let mut signals = StopSignals::listen()?;
+///     let node = Node::from_file("/etc/sinew/knee.toml").start()?;
+///     println!("{}: the node stops", signals.recv().await);
+///     node.stop();
+///     Ok(())
+/// }
+/// ```
 #[derive(Debug)]
 pub struct StopSignals {
     interrupt: Signal,

@@ -336,7 +336,7 @@ impl Sender {
     /// ```
     /// use sinew::{Tid, message::{SendError, Sender}, payload};
     ///
-    /// payload!("demo.stop" => struct Stop);
+    /// payload!("demo.stop" => struct Stop;);
     ///
     /// fn stop(sender: &Sender) -> Result<(), SendError> {
     ///     sender.send(Tid::group("drives"), &Stop)
@@ -413,7 +413,7 @@ impl Sender {
     /// ```
     /// use sinew::{app::Delivery, message::Sender, payload};
     ///
-    /// payload!("demo.plan" => struct Plan);
+    /// payload!("demo.plan" => struct Plan;);
     /// payload!("demo.planned" => struct Planned { steps: u32 });
     ///
     /// /// Replies from a thread that has the time to plan.

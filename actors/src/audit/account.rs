@@ -57,6 +57,15 @@ pub enum Place {
 /// What became of the messages that a place took, in messages since the node's start.
 ///
 /// `taken = delivered + superseded + rejected + expired + failed + lost + unknown + waiting + unacknowledged`.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::audit::Account;
+///
+/// let mailbox = Account { taken: 10, delivered: 7, superseded: 2, waiting: 1, ..Account::default() };
+/// assert_eq!(mailbox.unexplained(), 0);
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Account {

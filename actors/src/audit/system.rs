@@ -13,6 +13,20 @@ use super::{
 
 /// Where every message is that was ever sent, as far as the nodes say. Shown with `{}` it is a table to read; every field can be written by
 /// serde, as JSON for instance.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::audit::Audit;
+///
+/// fn report(audit: &Audit) {
+///     let total = audit.total();
+///     println!("{} taken, {} delivered, {} expired", total.taken, total.delivered, total.expired);
+///     for unexplained in &audit.unexplained {
+///         eprintln!("{:?} lacks {} messages", unexplained.at, unexplained.messages);
+///     }
+/// }
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Audit {
     /// The node that has asked.
@@ -28,6 +42,17 @@ pub struct Audit {
 }
 
 /// One direction of a link between two nodes: what one says that it has sent, and the other that it has taken.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::audit::Audit;
+///
+/// /// Messages that were sent and are not acknowledged yet.
+/// fn under_way(audit: &Audit) -> u64 {
+///     audit.links.iter().map(|link| link.sent - link.acknowledged).sum()
+/// }
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Link {
     /// Who sends.

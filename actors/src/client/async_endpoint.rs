@@ -34,6 +34,25 @@ use super::{
 /// thread, of which none is this endpoint's own: only registering, and coming back to a node, take a thread of the runtime's
 /// pool for blocking work meanwhile. With a direct link it looks every 20 ms, as a thread does that waits; for room in one that
 /// is full it is woken by what the peer takes.
+///
+/// # Examples
+///
+/// ```no_run
+/// use sinew::{AsyncEndpoint, Payload, client::ApiError, payload};
+///
+/// payload!("demo.ask_angle" => struct AskAngle;);
+/// payload!("demo.angle" => struct Angle { degrees: f32 });
+///
+/// /// A task that answers requests.
+/// async fn serve(mut endpoint: AsyncEndpoint, degrees: f32) -> Result<(), ApiError> {
+///     loop {
+///         let request = endpoint.receive().await?;
+///         if request.kind() == AskAngle::KIND {
+///             endpoint.reply(&request, &Angle { degrees }).await?;
+///         }
+///     }
+/// }
+/// ```
 #[derive(Debug)]
 pub struct AsyncEndpoint {
     pub(super) endpoint: Endpoint,
@@ -140,6 +159,22 @@ impl AsyncEndpoint {
     ///
     /// # Errors
     /// The connection has ended, and everything that came before was received.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use std::time::Duration;
+    ///
+    /// use sinew::{AsyncEndpoint, client::ApiError};
+    ///
+    /// /// Waits 100 ms at most. Nothing is lost when the time is over first.
+    /// async fn receive_soon(endpoint: &mut AsyncEndpoint) -> Result<bool, ApiError> {
+    ///     match tokio::time::timeout(Duration::from_millis(100), endpoint.receive()).await {
+    ///         Ok(received) => received.map(|message| println!("from {}", message.source())).map(|()| true),
+    ///         Err(_elapsed) => Ok(false),
+    ///     }
+    /// }
+    /// ```
     pub async fn receive(&mut self) -> Result<Received, ApiError> {
         // What is there already is not waited for. A task that is sent more than it handles would have its thread for itself.
         coop::consume_budget().await;

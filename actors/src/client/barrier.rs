@@ -92,6 +92,16 @@ impl Barrier {
     }
 
     /// How long one waits; whole milliseconds. Default: 60 s.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{barrier::{Barrier, OnPartyLoss}, prelude::*};
+    ///
+    /// let calibrated = Barrier::new("calibrated", ["hip", "knee"])
+    ///     .within(Duration::from_secs(5))
+    ///     .on_loss(OnPartyLoss::Fail);
+    /// ```
     #[must_use]
     pub const fn within(mut self, within: Duration) -> Self {
         self.within = within;
@@ -140,6 +150,23 @@ impl Barrier {
 }
 
 /// Why one does not wait at a barrier any more.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{Endpoint, barrier::{Barrier, BarrierError}};
+///
+/// fn calibrate_together(endpoint: &mut Endpoint, barrier: &Barrier) -> Result<bool, BarrierError> {
+///     match endpoint.meet(barrier) {
+///         Ok(_generation) => Ok(true),
+///         Err(BarrierError::TimedOut { missing, .. }) => {
+///             missing.iter().for_each(|(name, why)| eprintln!("{name} is missing: {why}"));
+///             Ok(false)
+///         }
+///         Err(other) => Err(other),
+///     }
+/// }
+/// ```
 #[derive(Debug, thiserror::Error)]
 pub enum BarrierError {
     /// Not all were there in time. The others go on waiting.
@@ -180,6 +207,22 @@ fn in_words(missing: &[(String, String)]) -> String {
 }
 
 /// Whoever has a [`Sender`] can wait at a barrier.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{barrier::{Barrier, Meet}, prelude::*};
+///
+/// struct Hip { ready: bool }
+///
+/// impl Actor for Hip {
+///     type Context = AppContext<Self>;
+///     fn started(&mut self, ctx: &mut Self::Context) {
+///         let meeting = ctx.meet(&Barrier::new("calibrated", ["hip", "knee"]));
+///         ctx.spawn(meeting.into_actor(self).map(|met, hip, _| hip.ready = met.is_ok()));
+///     }
+/// }
+/// ```
 pub trait Meet {
     /// Arrives at the barrier and waits there; the future ends with the generation that opened. Dropped before, it leaves the
     /// barrier. In an actor: `context.spawn` or `context.wait` it.
@@ -201,6 +244,18 @@ impl<A: Actor<Context = Self>> Meet for AppContext<A> {
 }
 
 /// A wait at a barrier; see [`Meet::meet`].
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{barrier::{Barrier, BarrierError, Meet}, message::Sender};
+///
+/// async fn go_on_together(sender: &Sender) -> Result<(), BarrierError> {
+///     let generation = sender.meet(&Barrier::of(4, "step")).await?;
+///     println!("step {generation}");
+///     Ok(())
+/// }
+/// ```
 #[must_use = "who does not wait for it leaves the barrier"]
 #[derive(Debug)]
 pub struct Meeting {

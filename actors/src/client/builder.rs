@@ -216,6 +216,25 @@ impl<'a, E, C> MessageBuilder<'a, E, C> {
     ///
     /// Such a send does not look for a node that has gone, since to register takes time: it says [`ApiError::Disconnected`], and
     /// [`Endpoint::receive`], or a send without a time, brings the endpoint back.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use std::time::Duration;
+    ///
+    /// use sinew::{Endpoint, Tid, client::ApiError, payload};
+    ///
+    /// payload!("demo.setpoint", Stream => struct Setpoint { degrees: f32 });
+    ///
+    /// /// Sends without a wait; returns whether there was room.
+    /// fn try_send(endpoint: &mut Endpoint, drive: Tid, setpoint: &Setpoint) -> Result<bool, ApiError> {
+    ///     match endpoint.message(drive, setpoint).room_within(Duration::ZERO).send() {
+    ///         Ok(()) => Ok(true),
+    ///         Err(ApiError::Stalled(_)) => Ok(false),
+    ///         Err(other) => Err(other),
+    ///     }
+    /// }
+    /// ```
     pub const fn room_within(mut self, time: Duration) -> Self {
         self.terms.room_within = Some(time);
         self
@@ -223,12 +242,39 @@ impl<'a, E, C> MessageBuilder<'a, E, C> {
 
     /// Has it expire where it waits when it is older than this, instead of its type's [`TIME_TO_LIVE`](Payload::TIME_TO_LIVE). At most
     /// [`TIME_TO_LIVE_MAX`](sinew_runtime::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s: a longer time counts as that.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use std::time::Duration;
+    ///
+    /// use sinew::{Endpoint, Tid, client::ApiError, payload};
+    ///
+    /// payload!("demo.step" => struct Step { metres: f32 });
+    ///
+    /// fn step(endpoint: &mut Endpoint, gait: Tid) -> Result<(), ApiError> {
+    ///     endpoint.message(gait, &Step { metres: 0.3 }).expires_after(Duration::from_millis(50)).send()
+    /// }
+    /// ```
     pub const fn expires_after(mut self, time: Duration) -> Self {
         self.terms.expires_after = Some(time);
         self
     }
 
     /// The class in which it travels, instead of its type's; a request and a reply are Control.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{Class, Endpoint, Tid, client::ApiError, payload};
+    ///
+    /// payload!("demo.sample", Stream => struct Sample { newtons: f32 });
+    ///
+    /// /// Sends each sample of a record: as Bulk none takes the place of another, and none delays commands.
+    /// fn send_record(endpoint: &mut Endpoint, to: Tid, record: &[Sample]) -> Result<(), ApiError> {
+    ///     record.iter().try_for_each(|sample| endpoint.message(to, sample).class(Class::Bulk).send())
+    /// }
+    /// ```
     pub const fn class(mut self, class: Class) -> Self {
         self.terms.class = Some(class);
         self
@@ -258,6 +304,24 @@ impl<C: Content> MessageBuilder<'_, Endpoint, C> {
     /// # Errors
     /// It was not sent; a group or a broadcast has no outcome of its own ([`ApiError::ToMany`]). If the connection ends before the outcome is
     /// known that is [`Outcome::Unknown`].
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use std::time::Duration;
+    ///
+    /// use sinew::{Endpoint, Outcome, Tid, client::ApiError, payload};
+    ///
+    /// payload!("demo.home" => struct Home;);
+    ///
+    /// fn home(endpoint: &mut Endpoint, drive: Tid) -> Result<(), ApiError> {
+    ///     match endpoint.message(drive, &Home).confirmed(Duration::from_secs(5))? {
+    ///         Outcome::Delivered => println!("homed"),
+    ///         outcome => println!("not homed: {outcome:?}"),
+    ///     }
+    ///     Ok(())
+    /// }
+    /// ```
     pub fn confirmed(self, within: Duration) -> Result<Outcome, ApiError> {
         at_once(self.endpoint.confirm_as(self.content, self.terms, within))
     }
@@ -278,7 +342,7 @@ impl<C: Content> MessageBuilder<'_, Endpoint, C> {
     ///
     /// use sinew::{Endpoint, Outcome, Tid, client::ApiError};
     ///
-    /// sinew::payload!("doc.stop" => struct Stop);
+    /// sinew::payload!("doc.stop" => struct Stop;);
     ///
     /// /// Stops all drives; returns those that may still move.
     /// fn stop(endpoint: &mut Endpoint) -> Result<Vec<Tid>, ApiError> {
@@ -300,6 +364,21 @@ impl<C: Content> MessageBuilder<'_, Endpoint, C> {
     ///
     /// # Errors
     /// It was not sent or not handled, no reply came `within` this time, or the reply is not an `R`.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use std::time::Duration;
+    ///
+    /// use sinew::{Endpoint, Tid, client::ApiError, payload};
+    ///
+    /// payload!("demo.ask_angle" => struct AskAngle;);
+    /// payload!("demo.angle" => struct Angle { degrees: f32 });
+    ///
+    /// fn knee_degrees(endpoint: &mut Endpoint, knee: Tid) -> Result<f32, ApiError> {
+    ///     Ok(endpoint.message(knee, &AskAngle).ask::<Angle>(Duration::from_millis(50))?.degrees)
+    /// }
+    /// ```
     pub fn ask<R: Payload>(self, within: Duration) -> Result<R, ApiError> {
         const { assert!(R::PROTECTION.is_none(), "a protected payload is sent, not asked for") };
         Ok(self.ask_raw(within)?.decode()?)
@@ -349,7 +428,7 @@ impl<C: Content> MessageBuilder<'_, AsyncEndpoint, C> {
     ///
     /// use sinew::{AsyncEndpoint, Outcome, Tid, client::ApiError};
     ///
-    /// sinew::payload!("doc.stop" => struct Stop);
+    /// sinew::payload!("doc.stop" => struct Stop;);
     ///
     /// /// Stops all drives; returns those that may still move.
     /// async fn stop(endpoint: &mut AsyncEndpoint) -> Result<Vec<Tid>, ApiError> {

@@ -40,6 +40,25 @@ pub(super) const LNCL: Tid = payload::lncl_of(NodeAddress::HERE);
 /// A registered transport address: sends and receives, from one thread at a time.
 ///
 /// Dropping it gives the address back at once; [`unregister`](Self::unregister) waits until the node has taken it.
+///
+/// # Examples
+///
+/// ```no_run
+/// use std::time::Duration;
+///
+/// use sinew::{NodeApi, Registration, payload};
+///
+/// payload!("demo.angle", Stream, expires_after = 20 ms => struct Angle { degrees: f32 });
+///
+/// let node = NodeApi::connect("/run/sinew/knee.sock")?;
+/// let mut sensor = node.register_transport_address(Registration::new().requires(["knee.drive"]))?;
+/// let drive = sensor.resolve("knee.drive", Duration::from_secs(1))?.expect("it was required");
+/// for number in 0..10_u8 {
+///     sensor.send(drive, &Angle { degrees: f32::from(number) })?;
+///     std::thread::sleep(Duration::from_millis(10));
+/// }
+/// # Ok::<(), sinew::client::ApiError>(())
+/// ```
 pub struct Endpoint {
     pub(super) tid: Tid,
     pub(super) node_name: String,
@@ -153,6 +172,19 @@ impl Endpoint {
     /// # Errors
     /// It would be longer than the node takes, `kind` is one of the layers' own, or another message is lent
     /// ([`ApiError::LoanActive`]).
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{Endpoint, Tid, client::ApiError, message::Kind};
+    ///
+    /// /// Sends an image without a copy, where there is room for it in the ring.
+    /// fn send_image(endpoint: &mut Endpoint, to: Tid, pixels: &[u8]) -> Result<(), ApiError> {
+    ///     let mut image = endpoint.create_message(to, Kind::named("camera.image"), pixels.len())?;
+    ///     image.copy_from_slice(pixels);
+    ///     endpoint.loaned(image).send()
+    /// }
+    /// ```
     pub fn create_message(
         &mut self,
         destination: Tid,
@@ -174,6 +206,18 @@ impl Endpoint {
     ///
     /// # Errors
     /// It was not sent. [`ApiError::UnknownName`]: no application has the name now.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{Endpoint, Tid, client::ApiError, payload};
+    ///
+    /// payload!("demo.stop" => struct Stop;);
+    ///
+    /// fn stop(endpoint: &mut Endpoint) -> Result<(), ApiError> {
+    ///     endpoint.send(Tid::group("drives"), &Stop)
+    /// }
+    /// ```
     pub fn send<'a, P: Payload>(
         &mut self,
         to: impl Into<Destination<'a>>,
@@ -184,6 +228,22 @@ impl Endpoint {
 
     /// A value to be sent otherwise than as its type says, confirmed, as a request, or with a limit to the wait for room: see
     /// [`MessageBuilder`].
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use std::time::Duration;
+    ///
+    /// use sinew::{Endpoint, Outcome, Tid, client::ApiError, payload};
+    ///
+    /// payload!("demo.calibrate" => struct Calibrate { zero_degrees: f32 });
+    ///
+    /// fn calibrate(endpoint: &mut Endpoint, drive: Tid) -> Result<bool, ApiError> {
+    ///     let command = Calibrate { zero_degrees: 0.5 };
+    ///     let outcome = endpoint.message(drive, &command).confirmed(Duration::from_secs(1))?;
+    ///     Ok(outcome == Outcome::Delivered)
+    /// }
+    /// ```
     pub fn message<'a, P: Payload>(
         &'a mut self,
         to: impl Into<Destination<'a>>,
@@ -202,6 +262,22 @@ impl Endpoint {
     ///
     /// # Errors
     /// The message asks for no reply, or the reply was not sent.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{Endpoint, Payload, client::{ApiError, Received}, payload};
+    ///
+    /// payload!("demo.ask_angle" => struct AskAngle;);
+    /// payload!("demo.angle" => struct Angle { degrees: f32 });
+    ///
+    /// fn answer(endpoint: &mut Endpoint, request: &Received, degrees: f32) -> Result<(), ApiError> {
+    ///     if request.kind() == AskAngle::KIND && request.wants_reply() {
+    ///         endpoint.reply(request, &Angle { degrees })?;
+    ///     }
+    ///     Ok(())
+    /// }
+    /// ```
     pub fn reply<R: Payload>(&mut self, request: &Received, value: &R) -> Result<(), ApiError> {
         at_once(self.reply_as(request, Value::new(request.source(), value), SendTerms::PLAIN))
     }
@@ -214,6 +290,26 @@ impl Endpoint {
     ///
     /// # Errors
     /// The connection has ended, and everything that came before was received.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use std::time::Duration;
+    ///
+    /// use sinew::{Endpoint, Payload, client::ApiError, payload};
+    ///
+    /// payload!("demo.setpoint", Stream => struct Setpoint { degrees: f32 });
+    ///
+    /// /// One turn of a control loop: takes what has come, and does not wait.
+    /// fn take_setpoint(endpoint: &mut Endpoint, setpoint: &mut f32) -> Result<(), ApiError> {
+    ///     while let Some(received) = endpoint.receive(Duration::ZERO)? {
+    ///         if received.kind() == Setpoint::KIND {
+    ///             *setpoint = received.decode::<Setpoint>()?.degrees;
+    ///         }
+    ///     }
+    ///     Ok(())
+    /// }
+    /// ```
     pub fn receive(&mut self, within: Duration) -> Result<Option<Received>, ApiError> {
         let now = Time::now();
         at_once(self.receive_until(now + within, now))
@@ -279,6 +375,17 @@ impl Endpoint {
     /// # Errors
     /// It is a member of 256 groups already, or its user or node has as many memberships as it may ([`ApiError::TooManyGroups`]); the node's access
     /// list does not let its user join this one ([`ApiError::Ended`], `NotAllowed`); or the node did not answer.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{Endpoint, client::ApiError};
+    ///
+    /// /// From now on messages to `Tid::group("drives")` come here, too.
+    /// fn join_drives(endpoint: &mut Endpoint) -> Result<(), ApiError> {
+    ///     endpoint.join("drives")
+    /// }
+    /// ```
     pub fn join(&mut self, name: &str) -> Result<(), ApiError> {
         at_once(self.set_member(group_named(name)?, true))
     }
@@ -295,6 +402,18 @@ impl Endpoint {
     ///
     /// # Errors
     /// The node did not answer `within` this time.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use std::time::Duration;
+    ///
+    /// use sinew::{Endpoint, Tid, client::ApiError};
+    ///
+    /// fn find_knee(endpoint: &mut Endpoint) -> Result<Option<Tid>, ApiError> {
+    ///     endpoint.resolve("knee.drive", Duration::from_millis(100))
+    /// }
+    /// ```
     pub fn resolve(&mut self, name: &str, within: Duration) -> Result<Option<Tid>, ApiError> {
         at_once(self.look_up(name, within))
     }

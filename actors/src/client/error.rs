@@ -13,6 +13,25 @@ use sinew_runtime::{
 use super::link::NotBelieved;
 
 /// Why an operation of NodeAPI failed.
+///
+/// # Examples
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use sinew::{Endpoint, client::{ApiError, Received}};
+///
+/// /// Goes on when the node was restarted: the endpoint registers again by itself.
+/// fn receive(endpoint: &mut Endpoint) -> Result<Option<Received>, ApiError> {
+///     match endpoint.receive(Duration::from_millis(10)) {
+///         Err(ApiError::Disconnected(why)) => {
+///             eprintln!("without a node: {why}");
+///             Ok(None)
+///         }
+///         other => other,
+///     }
+/// }
+/// ```
 #[derive(Debug, thiserror::Error)]
 pub enum ApiError {
     /// Nobody listens at the path, or this process may not connect to who does, or who does is not believed

@@ -25,6 +25,20 @@ use super::{ApiError, link::loan::InRing};
 /// Where there is room for it in the ring to its receiver, or to the node, it lies there, and sending it copies nothing. Else
 /// (no rings, more than half a ring, no room now) it is ordinary memory, copied when it is sent.
 /// [`is_in_place`](Self::is_in_place) says which. After a restart of the node it is copied to the node's next life.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{Class, Endpoint, Tid, client::ApiError, message::Kind};
+///
+/// fn send_samples(endpoint: &mut Endpoint, to: Tid, samples: &[f32]) -> Result<(), ApiError> {
+///     let mut memory = endpoint.create_message(to, Kind::named("plate.samples"), 4 * samples.len())?;
+///     for (bytes, sample) in memory.chunks_exact_mut(4).zip(samples) {
+///         bytes.copy_from_slice(&sample.to_le_bytes());
+///     }
+///     endpoint.loaned(memory).class(Class::Bulk).send()
+/// }
+/// ```
 #[derive(Debug)]
 #[must_use = "memory that is dropped is not sent"]
 pub struct LoanedMessage {

@@ -217,6 +217,17 @@ use self::{
 use crate::lncl::payload::Register;
 
 /// The way to the node of this host, at the path of its socket.
+///
+/// # Examples
+///
+/// ```no_run
+/// use sinew::{NodeApi, Registration};
+///
+/// let node = NodeApi::connect("/run/sinew/knee.sock")?;
+/// let mut sensor = node.register_transport_address(Registration::new().name("knee.sensor"))?;
+/// println!("{} on node {}", sensor.tid(), sensor.node_name());
+/// # Ok::<(), sinew::client::ApiError>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct NodeApi {
     path: PathBuf,
@@ -232,6 +243,19 @@ impl NodeApi {
     ///
     /// # Errors
     /// Nobody listens there, or this user may not connect.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use sinew::{NodeApi, client::ApiError};
+    ///
+    /// match NodeApi::connect("/run/sinew/knee.sock") {
+    ///     Ok(_node) => println!("the node is there"),
+    ///     Err(error @ ApiError::NoNode { .. }) => eprintln!("{error}"), // with what to do
+    ///     Err(other) => return Err(other),
+    /// }
+    /// # Ok::<(), ApiError>(())
+    /// ```
     pub fn connect(path: impl AsRef<Path>) -> Result<Self, ApiError> {
         Self::within(path.as_ref(), Believed::Anybody, link::CONNECT)
     }
@@ -266,6 +290,20 @@ impl NodeApi {
     ///
     /// # Errors
     /// The node refused, in words; or the deadline passed. Nothing stays registered.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use std::time::Duration;
+    ///
+    /// use sinew::{NodeApi, Registration};
+    ///
+    /// let node = NodeApi::connect("/run/sinew/knee.sock")?;
+    /// // Returns when the drive is ready.
+    /// let registration = Registration::new().requires(["knee.drive"]).deadline(Duration::from_secs(30));
+    /// let mut sensor = node.register_transport_address(registration)?;
+    /// # Ok::<(), sinew::client::ApiError>(())
+    /// ```
     pub fn register_transport_address(&self, registration: Registration) -> Result<Endpoint, ApiError> {
         Endpoint::register(&self.path, self.asking(registration))
     }
@@ -274,6 +312,22 @@ impl NodeApi {
     ///
     /// # Errors
     /// As [`register_transport_address`](Self::register_transport_address).
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use sinew::{NodeApi, Registration, client::ApiError};
+    ///
+    /// async fn log_all() -> Result<(), ApiError> {
+    ///     let node = NodeApi::connect("/run/sinew/knee.sock")?;
+    ///     let mut logger = node.register_transport_address_async(Registration::new()).await?;
+    ///     logger.join("log").await?;
+    ///     loop {
+    ///         let received = logger.receive().await?;
+    ///         println!("{} bytes from {}", received.bytes().len(), received.source());
+    ///     }
+    /// }
+    /// ```
     pub async fn register_transport_address_async(
         &self,
         registration: Registration,
@@ -283,6 +337,21 @@ impl NodeApi {
 }
 
 /// What an application asks for when it registers.
+///
+/// # Examples
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use sinew::{AppAddress, Registration, events::NodeEvent};
+///
+/// let registration = Registration::new()
+///     .name("knee.sensor")
+///     .fixed_address(AppAddress::new(0x1001))
+///     .requires(["knee.drive", "camera ?2s"])
+///     .subscribe::<NodeEvent>()
+///     .deadline(Duration::from_secs(30));
+/// ```
 #[derive(Clone, Debug)]
 pub struct Registration {
     register: Register,
@@ -334,6 +403,14 @@ impl Registration {
 
     /// Adds what must be met, on this node or any, before this application is ready; at most 64. Names, patterns, any of several,
     /// so many of them, with a limit to the wait or without: see [`Requirement`](crate::app::Requirement).
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{Registration, app::Requirement};
+    ///
+    /// let registration = Registration::new().requires(["hip.imu | knee.imu"]).requires([Requirement::at_least(2, ["*.drive"])]);
+    /// ```
     #[must_use]
     pub fn requires<N: Into<String>>(mut self, names: impl IntoIterator<Item = N>) -> Self {
         self.register.requires.extend(names.into_iter().map(Into::into));
@@ -341,6 +418,23 @@ impl Registration {
     }
 
     /// Subscribes to a layer's events: [`NodeEvent`](crate::events::NodeEvent), [`RequirementEvent`](crate::events::RequirementEvent).
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use std::time::Duration;
+    ///
+    /// use sinew::{NodeApi, Payload, Registration, events::NodeEvent};
+    ///
+    /// let node = NodeApi::connect("/run/sinew/knee.sock")?;
+    /// let mut monitor = node.register_transport_address(Registration::new().subscribe::<NodeEvent>())?;
+    /// while let Some(received) = monitor.receive(Duration::from_secs(60))? {
+    ///     if received.kind() == NodeEvent::KIND {
+    ///         println!("{:?}", received.decode::<NodeEvent>()?);
+    ///     }
+    /// }
+    /// # Ok::<(), sinew::client::ApiError>(())
+    /// ```
     #[must_use]
     pub fn subscribe<P: Payload>(self) -> Self {
         self.subscribe_kind(P::KIND)
@@ -378,6 +472,16 @@ impl Registration {
 
     /// How long a send waits while the node or, on a direct link, the peer takes nothing; whatever it takes begins that time
     /// anew. Default 1 s. For one send alone, and in all: [`MessageBuilder::room_within`].
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use std::time::Duration;
+    ///
+    /// use sinew::Registration;
+    ///
+    /// let registration = Registration::new().stall_timeout(Duration::from_millis(50));
+    /// ```
     #[must_use]
     pub const fn stall_timeout(mut self, stall_timeout: Duration) -> Self {
         self.link.stall_timeout = stall_timeout;
@@ -389,6 +493,15 @@ impl Registration {
     /// another process. It costs a ring of each side ([`direct_ring_bytes`](Self::direct_ring_bytes)), allocated at once, and some
     /// time in the call in which it is made.
     /// Default false; only with [`Transport::Ring`].
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::Registration;
+    ///
+    /// // The shortest way to another process of the node, where that one registers with `direct`, too.
+    /// let registration = Registration::new().name("knee.sensor").direct(true);
+    /// ```
     #[must_use]
     pub const fn direct(mut self, direct: bool) -> Self {
         self.register.direct = direct;

@@ -19,6 +19,24 @@ use sinew_runtime::{
 /// thread is panicking then; `Rejected(Malformed)` if the last [`decode`](Self::decode) of it failed. So a message counts as handled at the end of the scope that handled it, and one that was
 /// in hand at a panic counts as failed. [`settle`](Self::settle) says something else, or says it sooner. The process's
 /// end says `Failed`.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{Outcome, Payload, Time, client::{ApiError, Received}, message::Rejection, payload};
+///
+/// payload!("demo.angle", Stream => struct Angle { degrees: f32 });
+///
+/// fn handle(received: Received) -> Result<(), ApiError> {
+///     if received.kind() != Angle::KIND {
+///         received.settle(Outcome::Rejected(Rejection::UnknownKind));
+///         return Ok(());
+///     }
+///     let angle: Angle = received.decode()?;
+///     println!("{} degrees, {:?} old", angle.degrees, received.age(Time::now()));
+///     Ok(())
+/// }
+/// ```
 #[derive(Debug)]
 #[must_use = "a received message that is dropped counts as handled"]
 pub struct Received {

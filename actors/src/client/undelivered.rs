@@ -141,6 +141,19 @@ impl Endpoint {
     /// What this endpoint itself has refused without anybody's being told is counted here too, with itself as the destination.
     ///
     /// Whoever needs to know it of one message sends that one [confirmed](super::MessageBuilder::confirmed).
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::Endpoint;
+    ///
+    /// /// Once a second: says which messages nobody has taken.
+    /// fn report(endpoint: &mut Endpoint) {
+    ///     while let Some(report) = endpoint.take_undelivered() {
+    ///         eprintln!("{report}");
+    ///     }
+    /// }
+    /// ```
     pub fn take_undelivered(&mut self) -> Option<Undelivered> {
         // An error shows itself again when messages are received.
         let _ = self.take_in(None, WhenFull::Leave, Time::now());

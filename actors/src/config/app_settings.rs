@@ -20,6 +20,20 @@ use crate::{nearest::nearest, stores::lock};
 const APP: &str = "app";
 
 /// The tables of a file, and which of them were read. Clones of a configuration share the latter.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::config::NodeConfig;
+///
+/// #[derive(serde::Deserialize)]
+/// struct DriveSettings { kp: f64 }
+///
+/// let config = NodeConfig::from_toml("[node]\nname = 'knee'\n[app.drive]\nkp = 12.5\n")?;
+/// let drive: DriveSettings = config.app("drive")?; // out of `config.app_settings`
+/// assert_eq!(drive.kp, 12.5);
+/// # Ok::<(), sinew::config::ConfigFaults>(())
+/// ```
 #[derive(Clone, Default)]
 pub struct AppSettings {
     tables: Table,

@@ -8,10 +8,30 @@ use std::{
 /// All that is wrong with a configuration. The user is at fault; nothing was started.
 ///
 /// It is written with one fault a line.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::config::NodeConfig;
+///
+/// let faults = NodeConfig::from_toml("[node]\nname = 'knee'\n[ndl]\nperiod_ms = 5\nmissed_max = 0\n").unwrap_err();
+/// assert_eq!(faults.faults().len(), 2);
+/// println!("{faults}"); // one a line
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ConfigFaults(Vec<ConfigFault>);
 
 /// One thing that is wrong with a configuration.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::config::NodeConfig;
+///
+/// let faults = NodeConfig::from_toml("[node]\nname = 'knee'\n[ndl]\nmissed_max = 0\n").unwrap_err();
+/// let fault = &faults.faults()[0];
+/// assert_eq!((fault.key.as_str(), fault.line), ("ndl.missed_max", Some(4)));
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ConfigFault {
     /// Which setting: `ndl.period_ms`.

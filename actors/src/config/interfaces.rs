@@ -17,6 +17,15 @@ const IPV6_ONLY: &str = "/ipv6";
 const LOOPBACK: &str = if cfg!(any(target_os = "linux", target_os = "android")) { "lo" } else { "lo0" };
 
 /// A choice of network interfaces.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::config::{Families, Interface};
+///
+/// assert_eq!("wlan0/ipv4".parse(), Ok(Interface::Name("wlan0".into(), Families::Ipv4)));
+/// assert_eq!("10.0.0.7".parse(), Ok(Interface::Address([10, 0, 0, 7].into())));
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Interface {
     /// The one that has this IPv4 address. It is used for as long as the node runs, from when the host has the address.

@@ -35,6 +35,19 @@ pub use self::app_settings::AppSettings;
 use crate::security::TimePolicy;
 
 /// Everything that can be set about a node.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// let mut config = NodeConfig::new("knee");
+/// config.project = "left-leg".to_owned();
+/// config.ndl.interface = [10, 0, 0, 3].into();
+/// config.validate()?;
+/// assert_eq!(config.node_address(), [10, 0, 0, 3].into());
+/// # Ok::<(), sinew::config::ConfigFaults>(())
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct NodeConfig {
     /// Name of the node, for people: `knee`. 1 to 63 bytes, no control characters. No default.
@@ -84,6 +97,16 @@ pub struct LogConfig {
 }
 
 /// How much is written to the log.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::config::{LogLevel, NodeConfig};
+///
+/// let config = NodeConfig::from_toml("[node]\nname = 'knee'\n[log]\nlevel = 'warn'\n")?;
+/// assert_eq!(config.log.level, LogLevel::Warn);
+/// # Ok::<(), sinew::config::ConfigFaults>(())
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LogLevel {
     /// Nothing, except panics of actors.
@@ -102,6 +125,17 @@ pub enum LogLevel {
 }
 
 /// Local Node Communication Layer: the applications of this host.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::NodeConfig;
+///
+/// let mut config = NodeConfig::new("knee");
+/// config.lncl.socket = Some("/run/sinew/knee.sock".into()); // for programs apart
+/// config.lncl.clients_max = 16;
+/// # config.validate().expect("it is legal");
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct LnclConfig {
     /// Path of the unix socket for applications in other processes; 1 to 100 bytes. Default: none, no such door.
@@ -130,6 +164,17 @@ pub struct LnclConfig {
 }
 
 /// Global Node Communication Layer: connections between nodes.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// let mut config = NodeConfig::new("knee");
+/// config.gncl.port = 6912; // a fixed one, for the firewall
+/// config.gncl.give_up = Duration::from_millis(500);
+/// # config.validate().expect("it is legal");
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct GnclConfig {
     /// TCP port to listen on, at [`NdlConfig::interface`], where that is several at each. Default 0: any free one; NDL tells the others which.
@@ -173,6 +218,18 @@ pub struct GnclConfig {
 }
 
 /// Node Discovery Layer: who is there, who is gone.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// let mut config = NodeConfig::new("knee");
+/// config.ndl.interface = [10, 0, 0, 3].into();
+/// config.ndl.seeds = vec![([10, 0, 0, 2], 6911).into()]; // for a network without multicast
+/// (config.ndl.period, config.ndl.missed_max) = (Duration::from_millis(20), 3); // lost within 80 ms
+/// # config.validate().expect("it is legal");
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct NdlConfig {
     /// Network interfaces that the node uses, at most 8, the one that it prefers first: by addresses of this host (not 0.0.0.0 nor ::), by
@@ -206,6 +263,18 @@ pub struct NdlConfig {
 
 /// Nodes whose loss is to be known sooner, or may be known later, than that of others. Each node decides for itself how it watches others;
 /// those answer whoever asks.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{config::WatchGroup, prelude::*};
+///
+/// let mut config = NodeConfig::new("central");
+/// // The loss of a leg is known within 40 ms, that of others in the default's 2 s.
+/// let legs = WatchGroup { nodes: vec!["leg.*".into()], period: Duration::from_millis(10), missed_max: 3 };
+/// config.ndl.watch.push(legs);
+/// # config.validate().expect("it is legal");
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WatchGroup {
     /// Names of nodes; `*` stands for any text: `leg.*`. 1 to 64 names of 1 to 63 bytes.
@@ -255,6 +324,17 @@ pub struct SyncConfig {
 }
 
 /// Restart intensity: how many restarts are too many, for the layers and for the applications that the node supervises.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// let mut config = NodeConfig::new("knee");
+/// // More than 3 restarts of applications in a minute: the node ends in order.
+/// (config.supervision.app_restarts_max, config.supervision.app_window) = (3, Duration::from_secs(60));
+/// # config.validate().expect("it is legal");
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct SupervisionConfig {
     /// Restarts of layers that failed, all together, in one window; at one more the node ends in order. 0 to 1,000,000;
@@ -270,6 +350,16 @@ pub struct SupervisionConfig {
 }
 
 /// Security: who other nodes are ([`security`](crate::security)), and who may send what to whom.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::NodeConfig;
+///
+/// let mut config = NodeConfig::new("knee");
+/// config.security.keys = Some("/etc/sinew/keys".into()); // as `sinew keys` makes them
+/// config.security.access = Some("/etc/sinew/access.toml".into());
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct SecurityConfig {
     /// Directory of the node's keys, as `sinew keys` makes it ([`security::files`](crate::security::files)); 1 to 4,096 bytes. Default:
@@ -375,6 +465,18 @@ impl NodeConfig {
     }
 
     /// The node's address: as set, or that of its first interface. One that is chosen by its name has none to give: 0.0.0.0.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::NodeConfig;
+    ///
+    /// let mut config = NodeConfig::new("knee");
+    /// config.ndl.interface = [10, 0, 0, 3].into();
+    /// assert_eq!(config.node_address().to_string(), "10.0.0.3");
+    /// config.address = Some([10, 0, 0, 33].into());
+    /// assert_eq!(config.node_address().to_string(), "10.0.0.33");
+    /// ```
     #[must_use]
     pub fn node_address(&self) -> NodeAddress {
         let interface = || self.ndl.interface.first_address().unwrap_or(Ipv4Addr::UNSPECIFIED);

@@ -49,6 +49,17 @@ pub const SEEN_BYTES_MAX: usize = 16 * 1024;
 
 payload!("sinew.ping" =>
     /// Asks for a sign of life, confirmed: whoever it is for need not know it.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{Endpoint, Outcome, Tid, client::ApiError, inspect::Ping, prelude::*};
+    ///
+    /// fn lives(endpoint: &mut Endpoint, app: Tid) -> Result<bool, ApiError> {
+    ///     let outcome = endpoint.message(app, &Ping {}).confirmed(Duration::from_millis(100))?;
+    ///     Ok(outcome == Outcome::Delivered)
+    /// }
+    /// ```
     #[derive(Clone, Copy, Debug, Default)]
     pub struct Ping {}
 );
@@ -81,6 +92,19 @@ payload!("sinew.inspect.watch" =>
     /// Which messages has this application of yours got and sent, since I asked last? [`WatchReport`] answers.
     ///
     /// The first question begins the watch, and is answered with nothing. It is over 3 s after the last one.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{AppAddress, Endpoint, Tid, client::ApiError, inspect::{AskWatch, WatchReport}, prelude::*};
+    ///
+    /// /// What the application has got since the last call; the first one begins the watch.
+    /// fn watch(endpoint: &mut Endpoint, app: Tid) -> Result<WatchReport, ApiError> {
+    ///     let inspect = Tid::new(app.node, AppAddress::INSPECT);
+    ///     let question = AskWatch { app, received: true, sent: false };
+    ///     endpoint.message(inspect, &question).ask(Duration::from_secs(1))
+    /// }
+    /// ```
     #[derive(Clone, Copy, Debug)]
     pub struct AskWatch {
         /// The application.
@@ -94,6 +118,17 @@ payload!("sinew.inspect.watch" =>
 
 payload!("sinew.inspect.node_report" =>
     /// A node, and the nodes that it knows.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{AppAddress, Endpoint, Tid, client::ApiError, inspect::{AskNode, NodeReport}, prelude::*};
+    ///
+    /// fn ask(endpoint: &mut Endpoint) -> Result<NodeReport, ApiError> {
+    ///     let node = Tid::new(endpoint.tid().node, AppAddress::INSPECT);
+    ///     endpoint.message(node, &AskNode {}).ask(Duration::from_secs(1))
+    /// }
+    /// ```
     #[derive(Clone, Debug, PartialEq, Eq)]
     pub struct NodeReport {
         /// Its address.
@@ -226,6 +261,19 @@ pub struct UnhandledReport {
 
 payload!("sinew.inspect.apps_report" =>
     /// The applications of a node.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{AppAddress, Endpoint, Tid, client::ApiError, inspect::{AppsReport, AskApps}, prelude::*};
+    ///
+    /// /// The applications of a node that are not ready.
+    /// fn not_ready(endpoint: &mut Endpoint, node: NodeAddress) -> Result<Vec<Tid>, ApiError> {
+    ///     let inspect = Tid::new(node, AppAddress::INSPECT);
+    ///     let report: AppsReport = endpoint.message(inspect, &AskApps {}).ask(Duration::from_secs(1))?;
+    ///     Ok(report.apps.iter().filter(|app| !app.ready).map(|app| app.tid).collect())
+    /// }
+    /// ```
     #[derive(Clone, Debug, PartialEq, Eq)]
     pub struct AppsReport {
         /// The node's name.

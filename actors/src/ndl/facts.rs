@@ -25,6 +25,26 @@ pub(crate) enum MembershipFact {
 }
 
 /// A change in who is there. Applications that handle this payload get it from their node's NDL.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// struct Gait;
+/// # impl Actor for Gait { type Context = AppContext<Self>; }
+///
+/// impl Handler<Delivery<NodeEvent>> for Gait {
+///     type Result = ();
+///     fn handle(&mut self, event: Delivery<NodeEvent>, _: &mut Self::Context) {
+///         if let NodeEvent::NodeLost { name, why, silent_us, .. } = &event.payload {
+///             println!("node {name} is lost after {silent_us} us of silence: {why}");
+///         }
+///     }
+/// }
+///
+/// let gait = AppSpec::new("gait", || Gait).handles::<NodeEvent>();
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum NodeEvent {
     /// A node is there that was not.
@@ -103,6 +123,16 @@ impl Payload for NodeEvent {
 }
 
 /// Why a layer or an application does not get on.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::events::{NodeEvent, Trouble};
+///
+/// fn needs_service(event: &NodeEvent) -> bool {
+///     matches!(event, NodeEvent::AppStalled { trouble: Trouble::GivenUp, .. })
+/// }
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum Trouble {
     /// One turn of it (a handler, a timer, a future) has lasted for 250 ms and more.
@@ -116,6 +146,18 @@ pub enum Trouble {
 }
 
 /// How a loss was noticed. Its `Display` adds the remedy.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::events::LossReason;
+///
+/// /// Whether a cable or a radio is to be looked at.
+/// fn is_the_network(why: &LossReason) -> bool {
+///     matches!(why, LossReason::LinkDown)
+/// }
+/// assert_eq!(LossReason::Left.to_string(), "it stopped in order");
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum LossReason {
     /// It stopped in order.

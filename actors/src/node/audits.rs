@@ -35,6 +35,19 @@ impl NodeHandle {
     ///
     /// # Errors
     /// The node does not run, too many threads are at it already, or it is no one's turn within this time.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{node::AuditError, prelude::*};
+    ///
+    /// /// At the end of a trial: whether each message can be explained.
+    /// fn check(handle: &sinew::NodeHandle) -> Result<bool, AuditError> {
+    ///     let audit = handle.audit(Duration::from_secs(2))?;
+    ///     println!("{audit}");
+    ///     Ok(audit.missing() == 0)
+    /// }
+    /// ```
     pub fn audit(&self, within: Duration) -> Result<Audit, AuditError> {
         if self.is_bystander || self.stores.stopping.load(Ordering::Relaxed) {
             return Err(AuditError::NotRunning);

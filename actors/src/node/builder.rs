@@ -37,6 +37,22 @@ const WAITING_SHOWN_MAX: usize = 8;
 type Configured = Box<dyn FnOnce(&NodeConfig) -> Result<DynApp, ConfigFaults> + Send>;
 
 /// Declares a node: its configuration and its applications.
+///
+/// # Examples
+///
+/// ```no_run
+/// use sinew::prelude::*;
+///
+/// struct Knee;
+/// # impl Actor for Knee { type Context = AppContext<Self>; }
+///
+/// fn main() -> std::process::ExitCode {
+///     Node::builder("knee")
+///         .configure(|config| config.ndl.interface = [10, 0, 0, 3].into()) // the default is loopback
+///         .app(AppSpec::new("knee.drive", || Knee).requires(["hip"]))
+///         .run() // until SIGINT or SIGTERM
+/// }
+/// ```
 pub struct NodeBuilder {
     config: NodeConfig,
     tree: SupervisorSpec,
@@ -58,6 +74,22 @@ impl std::fmt::Debug for NodeBuilder {
 }
 
 /// Why a node does not run.
+///
+/// # Examples
+///
+/// ```no_run
+/// use sinew::prelude::*;
+///
+/// match Node::from_file("/etc/sinew/knee.toml").start() {
+///     Ok(node) => println!("the node has the address {}", node.address()),
+///     Err(StartError::Config(faults)) => {
+///         // All of them at once: an editor can jump to each line.
+///         faults.faults().iter().for_each(|fault| eprintln!("{:?}: {fault}", fault.line));
+///     }
+///     Err(StartError::AddressTaken(words)) => eprintln!("is this node started twice? {words}"),
+///     Err(other) => eprintln!("{other}"),
+/// }
+/// ```
 #[derive(Debug, thiserror::Error)]
 pub enum StartError {
     /// The configuration has faults; all of them are listed.
@@ -233,6 +265,17 @@ impl NodeBuilder {
     }
 
     /// Replaces the whole configuration: one read from a file, for instance.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use sinew::prelude::*;
+    ///
+    /// let mut config = NodeConfig::from_file("/etc/sinew/knee.toml")?;
+    /// config.project = "left-leg".to_owned();
+    /// let node = Node::builder("").config(config).start()?;
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     #[must_use]
     pub fn config(mut self, config: NodeConfig) -> Self {
         self.config = config;
@@ -240,6 +283,18 @@ impl NodeBuilder {
     }
 
     /// Changes the configuration in place.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use sinew::prelude::*;
+    ///
+    /// let knee = Node::builder("knee").configure(|config| {
+    ///     config.ndl.interface = [10, 0, 0, 3].into();
+    ///     config.ndl.period = Duration::from_millis(100); // a loss is known after 400 ms
+    ///     config.lncl.socket = Some("/run/sinew/knee.sock".into());
+    /// });
+    /// ```
     #[must_use]
     pub fn configure(mut self, change: impl FnOnce(&mut NodeConfig)) -> Self {
         change(&mut self.config);
@@ -247,6 +302,17 @@ impl NodeBuilder {
     }
 
     /// Sets the node's address. Needed where several nodes share a host.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use sinew::prelude::*;
+    ///
+    /// // Two nodes of one host, for a test of both.
+    /// let thigh = Node::builder("thigh").address([127, 0, 0, 1]).start()?;
+    /// let shank = Node::builder("shank").address([127, 0, 0, 2]).start()?;
+    /// # Ok::<(), StartError>(())
+    /// ```
     #[must_use]
     pub fn address(mut self, address: impl Into<NodeAddress>) -> Self {
         self.config.address = Some(address.into());
@@ -279,6 +345,16 @@ impl NodeBuilder {
     /// Starts the node and runs it until it ends: all that the `main` of a node's program has to do. Returns the exit
     /// code: 0 after an orderly stop, 1 if it did not start or gave up; the reason is logged and written to the standard
     /// error.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use sinew::Node;
+    ///
+    /// fn main() -> std::process::ExitCode {
+    ///     Node::from_file("/etc/sinew/knee.toml").run()
+    /// }
+    /// ```
     pub fn run(self) -> ExitCode {
         match self.heed_signals().start() {
             Ok(node) => node.run(),
@@ -324,6 +400,21 @@ impl NodeBuilder {
     /// # Errors
     /// The configuration has faults, or turns security on and the keys cannot be used; `lncl.socket` cannot be had, an application cannot be registered, a layer did not
     /// become ready, or another process was found by then that has the node's address. One that is found later ends the node in the same words.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use sinew::prelude::*;
+    ///
+    /// struct Knee;
+    /// # impl Actor for Knee { type Context = AppContext<Self>; }
+    ///
+    /// let node = Node::builder("knee").app(AppSpec::new("knee.drive", || Knee)).start()?;
+    /// node.handle().wait_until_running(Duration::from_secs(10))?;
+    /// // The node lives as long as `node`.
+    /// node.stop();
+    /// # Ok::<(), StartError>(())
+    /// ```
     pub fn start(mut self) -> Result<Node, StartError> {
         // Here, on a thread like any other.
         log::begin();

@@ -24,6 +24,19 @@ use super::{
 const WITHIN: Duration = Duration::from_secs(10);
 
 /// Why a change of the supervision tree was not made, or is not known to be.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{NodeHandle, node::CommandError};
+///
+/// fn stop_camera(handle: &NodeHandle) -> Result<(), CommandError> {
+///     match handle.stop_app("camera") {
+///         Err(CommandError::Unknown(_)) => Ok(()), // this robot has none
+///         other => other,
+///     }
+/// }
+/// ```
 #[derive(Debug, thiserror::Error)]
 pub enum CommandError {
     /// Nobody has this name. Nothing has changed.
@@ -107,6 +120,20 @@ impl NodeHandle {
     ///
     /// # Errors
     /// Why it was not added. All variants but [`CommandError::NoAnswer`] say that nothing has changed.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{node::CommandError, prelude::*};
+    ///
+    /// struct Recorder;
+    /// # impl Actor for Recorder { type Context = AppContext<Self>; }
+    ///
+    /// /// Begins to record while the robot walks.
+    /// fn record(handle: &sinew::NodeHandle) -> Result<(), CommandError> {
+    ///     handle.add_app(AppSpec::new("recorder", || Recorder), None)
+    /// }
+    /// ```
     pub fn add_app(&self, app: impl Into<DynApp>, under: Option<&str>) -> Result<(), CommandError> {
         let app = app.into();
         let name = app.name().to_owned();
@@ -128,6 +155,18 @@ impl NodeHandle {
     ///
     /// # Errors
     /// Why not: it runs, for instance.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{NodeHandle, node::CommandError};
+    ///
+    /// /// Has the camera read its calibration again.
+    /// fn restart_camera(handle: &NodeHandle) -> Result<(), CommandError> {
+    ///     handle.stop_app("camera")?;
+    ///     handle.restart_app("camera")
+    /// }
+    /// ```
     pub fn restart_app(&self, name: &str) -> Result<(), CommandError> {
         self.order(What::Tell(Command::Restart, name.to_owned()), name.to_owned())
     }

@@ -81,6 +81,19 @@ const LOGGED_MAX: usize = 1_024;
 const LAST_WORDS: Duration = Duration::from_millis(500);
 
 /// How a node ended.
+///
+/// # Examples
+///
+/// ```no_run
+/// use sinew::{node::NodeEnd, prelude::*};
+///
+/// let node = Node::builder("knee").start()?;
+/// match node.wait_for_end() {
+///     NodeEnd::Stopped => println!("stopped in order"),
+///     NodeEnd::GaveUp(why) => eprintln!("the node gave up: {why}"),
+/// }
+/// # Ok::<(), StartError>(())
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum NodeEnd {
     /// It was told to stop, by its owner or by a signal.
@@ -90,6 +103,24 @@ pub enum NodeEnd {
 }
 
 /// A running node. Dropping it stops it; dropped by a panic, it gives up.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::prelude::*;
+///
+/// struct Hip;
+/// # impl Actor for Hip { type Context = AppContext<Self>; }
+///
+/// # let alone = |config: &mut NodeConfig| (config.ndl.multicast, config.ndl.mdns_port) = (None, None);
+/// let node = Node::builder("thigh").app(AppSpec::new("hip", || Hip))
+/// #   .configure(|config| { alone(config); })
+///     .start()?;
+/// node.handle().wait_until_running(Duration::from_secs(10))?;
+/// assert!(node.handle().resolve("hip").is_some());
+/// node.stop();
+/// # Ok::<(), StartError>(())
+/// ```
 #[derive(Debug)]
 pub struct Node {
     handle: NodeHandle,
@@ -99,6 +130,17 @@ pub struct Node {
 
 /// What became of the messages to another node, from the link with its present life on. Nothing leaks: submitted =
 /// sent + superseded + expired + lost + refused + waiting.
+///
+/// # Examples
+///
+/// ```no_run
+/// use sinew::{NodeHandle, node::Traffic};
+///
+/// /// The nodes to which messages were lost.
+/// fn with_losses(handle: &NodeHandle) -> Vec<Traffic> {
+///     handle.traffic().into_iter().filter(|traffic| traffic.counts.lost > 0).collect()
+/// }
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Traffic {
     /// The other node.
@@ -123,6 +165,20 @@ enum Told {
 }
 
 /// Asks about a running node and stops it, from any thread.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::NodeHandle;
+///
+/// /// A line for the operator's display.
+/// fn status(handle: &NodeHandle) -> String {
+///     match handle.waiting().first() {
+///         Some(waiting) => waiting.to_string(), // as "hip has waited 3.1 s for knee (not there; ...)"
+///         None => format!("{} nodes are there", handle.members().len()),
+///     }
+/// }
+/// ```
 #[derive(Clone)]
 pub struct NodeHandle {
     stores: Arc<Stores>,
@@ -139,6 +195,16 @@ impl std::fmt::Debug for NodeHandle {
 
 impl Node {
     /// Begins the declaration of a node called `name`.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use sinew::Node;
+    ///
+    /// let node = Node::builder("knee").start()?;
+    /// println!("{}", node.address());
+    /// # Ok::<(), sinew::StartError>(())
+    /// ```
     #[must_use]
     pub fn builder(name: impl Into<String>) -> NodeBuilder {
         NodeBuilder::new(name.into())
@@ -146,6 +212,15 @@ impl Node {
 
     /// Begins the declaration of a node whose configuration is in the TOML file at `path`. What is wrong with the file is found by
     /// [`NodeBuilder::start`], together with all else that is wrong.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use sinew::Node;
+    ///
+    /// let node = Node::from_file("/etc/sinew/knee.toml").start()?;
+    /// # Ok::<(), sinew::StartError>(())
+    /// ```
     #[must_use]
     pub fn from_file(path: impl AsRef<Path>) -> NodeBuilder {
         NodeBuilder::from_file(path.as_ref())
@@ -165,6 +240,16 @@ impl Node {
 
     /// Stops the node: applications are told, layers go down in reverse order. Returns when all have ended or were
     /// abandoned, each after its own deadline.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use sinew::{Node, node::NodeEnd};
+    ///
+    /// let node = Node::builder("knee").start()?;
+    /// assert_eq!(node.stop(), NodeEnd::Stopped);
+    /// # Ok::<(), sinew::StartError>(())
+    /// ```
     pub fn stop(mut self) -> NodeEnd {
         self.handle.stop();
         self.wait()
@@ -256,6 +341,17 @@ impl NodeHandle {
     }
 
     /// Who waits at the start-up barrier on this node, for whom, and since when.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::NodeHandle;
+    ///
+    /// /// Says what holds up the start of the robot.
+    /// fn explain(handle: &NodeHandle) {
+    ///     handle.waiting().iter().for_each(|waiting| println!("{waiting}"));
+    /// }
+    /// ```
     #[must_use]
     pub fn waiting(&self) -> Vec<Waiting> {
         lock(&self.stores.sync).waiting(Time::now())
@@ -268,6 +364,19 @@ impl NodeHandle {
     }
 
     /// The nodes that are there, as this node's NDL sees them, in the order of their addresses.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::NodeHandle;
+    ///
+    /// fn show_clocks(handle: &NodeHandle) {
+    ///     for node in handle.members() {
+    ///         let clock = node.offset.map(|offset| (offset.theirs_minus_ours_ns, offset.bound));
+    ///         println!("{} at {}: clock {clock:?}", node.name, node.node);
+    ///     }
+    /// }
+    /// ```
     #[must_use]
     pub fn members(&self) -> Vec<KnownNode> {
         lock(&self.stores.ndl).members(Time::now())
@@ -280,6 +389,18 @@ impl NodeHandle {
     }
 
     /// Every application that has a name, on any node that is known.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::NodeHandle;
+    ///
+    /// /// The drives of the robot that are ready.
+    /// fn drives(handle: &NodeHandle) -> Vec<String> {
+    ///     let ready = handle.directory().into_iter().filter(|entry| entry.ready);
+    ///     ready.map(|entry| entry.name).filter(|name| name.ends_with(".drive")).collect()
+    /// }
+    /// ```
     #[must_use]
     pub fn directory(&self) -> Vec<DirectoryEntry> {
         lock(&self.stores.sync).directory()
@@ -324,6 +445,19 @@ impl NodeHandle {
     ///
     /// # Errors
     /// The node was started without a list, or the file cannot be used: the list in force stays, which is logged too.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::NodeHandle;
+    ///
+    /// fn reload(handle: &NodeHandle) {
+    ///     match handle.reload_access() {
+    ///         Ok(list) => println!("{} rules are in force", list.rules),
+    ///         Err(why) => eprintln!("the former list stays in force: {why}"),
+    ///     }
+    /// }
+    /// ```
     pub fn reload_access(&self) -> Result<AccessSummary, AccessError> {
         let access = self.stores.access.get().ok_or(AccessError::None)?;
         let read = access.reload();
@@ -379,6 +513,18 @@ impl NodeHandle {
     ///
     /// # Errors
     /// Who still waits after `within`, and for whom; or that the node ends, or takes no order.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use sinew::prelude::*;
+    ///
+    /// let node = Node::from_file("/etc/sinew/knee.toml").start()?;
+    /// if let Err(StartError::Waiting { waiting, .. }) = node.handle().wait_until_running(Duration::from_secs(10)) {
+    ///     waiting.iter().for_each(|waiting| eprintln!("{waiting}"));
+    /// }
+    /// # Ok::<(), StartError>(())
+    /// ```
     pub fn wait_until_running(&self, within: Duration) -> Result<(), StartError> {
         if self.is_bystander {
             return Ok(());

@@ -18,6 +18,18 @@ use crate::{stores::lock, sync::Absence};
 const WITHIN: Duration = Duration::from_secs(10);
 
 /// Who is supervised on a node, as it was when asked. Shown with `{}` it is a tree to read.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{NodeHandle, node::CommandError};
+///
+/// fn restarts_of_the_drive(handle: &NodeHandle) -> Result<Option<u64>, CommandError> {
+///     let tree = handle.tree()?;
+///     println!("{tree}");
+///     Ok(tree.find("knee.drive").map(|drive| drive.restarts))
+/// }
+/// ```
 #[derive(Clone, Debug)]
 pub struct SupervisionTree {
     /// The node's name.
@@ -27,6 +39,20 @@ pub struct SupervisionTree {
 }
 
 /// One actor or supervisor.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::node::{LifeState, Supervised};
+///
+/// fn describe(app: &Supervised) -> String {
+///     match (&app.state, &app.last_reason) {
+///         (LifeState::Ready, _) => format!("{} is up for {:?}", app.name, app.since),
+///         (state, Some(reason)) => format!("{} is {state}, after {reason:?}", app.name),
+///         (state, None) => format!("{} is {state}", app.name),
+///     }
+/// }
+/// ```
 #[derive(Clone, Debug)]
 pub struct Supervised {
     /// Its name.

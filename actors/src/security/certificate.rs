@@ -11,6 +11,18 @@ use webpki::{EndEntityCert, Error, KeyUsage};
 use super::{CredentialFault, Identity, Validity, credentials, project_of};
 
 /// A certificate that could be read. Nothing is proven by that.
+///
+/// # Examples
+///
+/// ```no_run
+/// use std::path::Path;
+///
+/// use sinew::security::{Certificate, date};
+///
+/// let certificate = Certificate::from_file(Path::new("/etc/sinew/keys/node.pem"))?;
+/// println!("{:?} until {}", certificate.identity(), date(&certificate.validity().until));
+/// # Ok::<(), sinew::security::CredentialFault>(())
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Certificate {
     der: CertificateDer<'static>,
@@ -25,6 +37,15 @@ pub struct Certificate {
 pub struct Malformed;
 
 /// The number of a certificate, which its authority gives out once. Written as hexadecimal digits.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::security::Serial;
+///
+/// let serial: Serial = "2D6F".parse().expect("hexadecimal digits");
+/// assert_eq!(serial.to_string(), "2d6f");
+/// ```
 #[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Serial(Vec<u8>);
 

@@ -13,6 +13,17 @@ use std::collections::BTreeSet;
 use super::Serial;
 
 /// Numbers of certificates that are revoked.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::security::DenyList;
+///
+/// // The knee's controller was stolen: the number of its certificate is on the list.
+/// let denied = DenyList::read("2d6f  # knee, stolen in May\n")?;
+/// assert_eq!(denied.len(), 1);
+/// # Ok::<(), sinew::security::DenyListFault>(())
+/// ```
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct DenyList(BTreeSet<Serial>);
 

@@ -62,6 +62,17 @@ const WRITABLE_BY_OTHERS: u32 = 0o022;
 const OPEN_TO_OTHERS: u32 = 0o077;
 
 /// Why a file is not taken. The environment is at fault; nothing was changed.
+///
+/// # Examples
+///
+/// ```
+/// use std::path::Path;
+///
+/// use sinew::security::files::{self, FileFault};
+///
+/// let fault = files::directory(Path::new("/no/such/directory")).unwrap_err();
+/// assert!(matches!(fault, FileFault::Unreadable { .. }));
+/// ```
 #[derive(Debug, thiserror::Error)]
 pub enum FileFault {
     /// It cannot be read.
@@ -149,6 +160,19 @@ enum Guarded {
 ///
 /// # Errors
 /// It cannot be had, or somebody else can have it, too.
+///
+/// # Examples
+///
+/// ```no_run
+/// use std::path::Path;
+///
+/// use sinew::security::files;
+///
+/// // Refused if others than its owner may read it.
+/// let key = files::secret(&Path::new("/etc/sinew/keys").join(files::NODE_KEY))?;
+/// println!("{} bytes", key.len());
+/// # Ok::<(), files::FileFault>(())
+/// ```
 pub fn secret(path: &Path) -> Result<Zeroizing<Vec<u8>>, FileFault> {
     read(path, Guarded::Secret, KEY_BYTES_MAX)
 }
@@ -218,6 +242,18 @@ pub(crate) fn own(path: &Path, bytes_max: u64) -> Result<Option<Zeroizing<Vec<u8
 ///
 /// # Errors
 /// It is none, or somebody else can.
+///
+/// # Examples
+///
+/// ```no_run
+/// use std::path::Path;
+///
+/// use sinew::security::files;
+///
+/// if let Err(fault) = files::directory(Path::new("/etc/sinew/keys")) {
+///     eprintln!("{fault}"); // with what to do
+/// }
+/// ```
 pub fn directory(path: &Path) -> Result<(), FileFault> {
     let unreadable = |cause| FileFault::Unreadable { path: path.to_owned(), cause };
     let about = std::fs::metadata(path).map_err(unreadable)?;

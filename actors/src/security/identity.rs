@@ -18,6 +18,15 @@ use sinew_runtime::tid::NodeAddress;
 const SCHEME: &str = "sinew://";
 
 /// Which node of which project.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::security::Identity;
+///
+/// let hip = Identity::from_uri("sinew://walker/node/192.168.0.11/hip").expect("it names a node");
+/// assert_eq!((hip.project.as_str(), hip.name.as_str()), ("walker", "hip"));
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Identity {
     /// The project, as in `node.project`.

@@ -21,6 +21,16 @@ pub struct Validity {
 }
 
 /// What the times of certificates are good for on a machine whose clock may be wrong.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{NodeConfig, security::TimePolicy};
+///
+/// let mut config = NodeConfig::new("knee");
+/// // A host whose clock is set by GPS before Sinew starts.
+/// config.security.times = TimePolicy::Strict;
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum TimePolicy {
     /// A certificate counts from its first to its last second. While the clock is known not to be set none counts: no link is made.

@@ -9,6 +9,17 @@ use sinew_runtime::{
 };
 
 /// An application that waits at the start-up barrier.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{NodeHandle, barrier::Waiting};
+///
+/// /// The application that has waited longest at the start-up barrier.
+/// fn slowest(handle: &NodeHandle) -> Option<Waiting> {
+///     handle.waiting().into_iter().max_by_key(|waiting| waiting.since)
+/// }
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Waiting {
     /// The application's name, or its address where it has none.
@@ -49,6 +60,19 @@ impl fmt::Display for Absence {
 }
 
 /// An application that has a name, on this node or on another.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{Payload, events::DirectoryEntry, payload};
+///
+/// payload!("demo.home" => struct Home;);
+///
+/// /// Whether this application can be homed now.
+/// fn can_be_homed(entry: &DirectoryEntry) -> bool {
+///     entry.ready && entry.kinds.contains(&Home::KIND)
+/// }
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DirectoryEntry {
     /// Its name.
@@ -64,6 +88,27 @@ pub struct DirectoryEntry {
 
 /// The directory of names changed. An application that handles this payload hears, when it is ready, of every entry, then of each
 /// change; what its mailbox does not take comes later, in the form that is true then.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{events::DirectoryEvent, prelude::*};
+///
+/// struct Display { drives: usize }
+/// # impl Actor for Display { type Context = AppContext<Self>; }
+///
+/// impl Handler<Delivery<DirectoryEvent>> for Display {
+///     type Result = ();
+///     fn handle(&mut self, event: Delivery<DirectoryEvent>, _: &mut Self::Context) {
+///         match &event.payload {
+///             DirectoryEvent::Is(entry) => println!("{} has {}, ready: {}", entry.tid, entry.name, entry.ready),
+///             DirectoryEvent::Gone { name, .. } => println!("{name} is not there any more"),
+///         }
+///     }
+/// }
+///
+/// let display = AppSpec::new("display", || Display { drives: 0 }).handles::<DirectoryEvent>();
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum DirectoryEvent {
     /// An application is there, or something of what is said of it is new.

@@ -76,6 +76,15 @@ payload!("sinew.barrier.answer" =>
 );
 
 /// What whoever waits at a barrier does when a party that it asks for by its name has failed, was stopped, or its node is lost.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::barrier::{Barrier, OnPartyLoss};
+///
+/// // A knee that fails does not come back in time for this step.
+/// let step = Barrier::new("step", ["hip", "knee"]).on_loss(OnPartyLoss::Fail);
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum OnPartyLoss {
     /// It goes on waiting: the party may come back and arrive.
@@ -86,6 +95,18 @@ pub enum OnPartyLoss {
 }
 
 /// A run-time barrier at which somebody waits, as this node sees it.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{NodeHandle, barrier::BarrierStatus};
+///
+/// fn show(handle: &NodeHandle) {
+///     for BarrierStatus { barrier, missing, .. } in handle.barriers() {
+///         missing.iter().for_each(|absence| println!("{barrier} waits for {absence}"));
+///     }
+/// }
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BarrierStatus {
     /// The barrier's name.

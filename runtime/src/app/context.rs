@@ -212,7 +212,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     /// ```
     /// use sinew::{message::SendError, prelude::*};
     ///
-    /// payload!("demo.stop" => struct Stop);
+    /// payload!("demo.stop" => struct Stop;);
     /// # struct Gait;
     /// # impl Actor for Gait { type Context = AppContext<Self>; }
     ///
@@ -262,7 +262,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     /// ```
     /// use sinew::prelude::*;
     ///
-    /// payload!("demo.ask_angle" => struct AskAngle);
+    /// payload!("demo.ask_angle" => struct AskAngle;);
     /// payload!("demo.angle" => struct Angle { degrees: f32 });
     ///
     /// struct Knee { degrees: f32 }
@@ -288,7 +288,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     /// use sinew::prelude::*;
     ///
     /// payload!("demo.plan" => struct Plan { steps: u32 });
-    /// payload!("demo.planned" => struct Planned);
+    /// payload!("demo.planned" => struct Planned;);
     /// # struct Planner;
     /// # impl Actor for Planner { type Context = AppContext<Self>; }
     ///

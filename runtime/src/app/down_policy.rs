@@ -62,7 +62,7 @@ pub enum DownPolicy {
 /// ```
 /// use sinew::prelude::*;
 ///
-/// payload!("demo.offline" => struct Offline);
+/// payload!("demo.offline" => struct Offline;);
 /// struct Knee;
 /// # impl Actor for Knee { type Context = AppContext<Self>; }
 ///
@@ -152,7 +152,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     /// ```
     /// use sinew::prelude::*;
     ///
-    /// payload!("demo.stop" => struct Stop);
+    /// payload!("demo.stop" => struct Stop;);
     /// struct Gait;
     /// # impl Actor for Gait { type Context = AppContext<Self>; }
     ///

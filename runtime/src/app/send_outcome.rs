@@ -113,7 +113,7 @@ impl<'a, A: Actor<Context = AppContext<A>>, C: Content> MessageBuilder<&'a mut A
     /// ```
     /// use sinew::{message::SendError, prelude::*};
     ///
-    /// payload!("demo.home" => struct Home);
+    /// payload!("demo.home" => struct Home;);
     /// struct Gait;
     /// # impl Actor for Gait { type Context = AppContext<Self>; }
     /// impl Handler<SendOutcome> for Gait {

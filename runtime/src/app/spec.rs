@@ -278,7 +278,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     /// struct Imu;
     /// # impl Actor for Imu { type Context = AppContext<Self>; }
     ///
-    /// let retry = StartRetry { max: Duration::from_secs(1), ..StartRetry::default() };
+    /// let retry = StartRetry { wait_max: Duration::from_secs(1), ..StartRetry::default() };
     /// let imu = AppSpec::new("imu", || Imu).start_retry(retry);
     /// ```
     #[must_use]

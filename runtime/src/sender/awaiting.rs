@@ -71,7 +71,7 @@ impl Deadline {
 /// ```
 /// use sinew::{message::{SendError, Sender}, prelude::*};
 ///
-/// payload!("demo.home" => struct Home);
+/// payload!("demo.home" => struct Home;);
 ///
 /// /// Whether the knee has handled the command.
 /// async fn home(sender: &Sender) -> Result<bool, SendError> {
@@ -108,7 +108,7 @@ impl Future for Confirmation {
 /// ```
 /// use sinew::{message::{SendError, Sender}, prelude::*};
 ///
-/// payload!("demo.home" => struct Home);
+/// payload!("demo.home" => struct Home;);
 ///
 /// /// How many drives have handled the command.
 /// async fn home(sender: &Sender) -> Result<usize, SendError> {
@@ -150,7 +150,7 @@ impl Future for GroupConfirmation {
 /// ```
 /// use sinew::{message::{AskError, Sender}, prelude::*};
 ///
-/// payload!("demo.ask_angle" => struct AskAngle);
+/// payload!("demo.ask_angle" => struct AskAngle;);
 /// payload!("demo.angle" => struct Angle { degrees: f32 });
 ///
 /// async fn knee_degrees(sender: &Sender) -> Result<f32, AskError> {

@@ -201,7 +201,7 @@ impl<V: Via, C: Content> MessageBuilder<V, C> {
     /// ```
     /// use sinew::{message::SendError, prelude::*};
     ///
-    /// payload!("demo.ask_angle" => struct AskAngle);
+    /// payload!("demo.ask_angle" => struct AskAngle;);
     /// payload!("demo.angle" => struct Angle { degrees: f32 });
     ///
     /// struct Hip { knee_degrees: f32 }

@@ -49,7 +49,7 @@ const SEQUENCE_MAX: u64 = (1 << 48) - 1;
 /// ```
 /// use sinew::{Class, Payload, payload};
 ///
-/// payload!("demo.calibrate" => struct Calibrate); // a command: Control
+/// payload!("demo.calibrate" => struct Calibrate;); // a command: Control
 /// payload!("demo.angle", Stream => struct Angle { degrees: f32 }); // a measurement: only the newest waits
 /// payload!("demo.record", Bulk => struct Record { samples: Vec<f32> }); // gives way to both
 ///

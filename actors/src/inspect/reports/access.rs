@@ -22,6 +22,20 @@ payload!("sinew.inspect.access" =>
 
 payload!("sinew.inspect.access_report" =>
     /// What the access list of a node says of messages from one application to another.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{AppAddress, Endpoint, Tid, client::ApiError, inspect::{AccessReport, AskAccess}, prelude::*};
+    ///
+    /// fn explain(endpoint: &mut Endpoint, source: Tid, target: Tid) -> Result<(), ApiError> {
+    ///     let inspect = Tid::new(target.node, AppAddress::INSPECT);
+    ///     let question = AskAccess { source, target };
+    ///     let report: AccessReport = endpoint.message(inspect, &question).ask(Duration::from_secs(1))?;
+    ///     report.verdicts.iter().for_each(|verdict| println!("{:?}: {}", verdict.class, verdict.why));
+    ///     Ok(())
+    /// }
+    /// ```
     #[derive(Clone, Debug, PartialEq, Eq)]
     pub struct AccessReport {
         /// Whether the node has a list; without one everything is allowed.

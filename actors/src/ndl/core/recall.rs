@@ -40,6 +40,19 @@ pub(super) struct Loss {
 
 /// How often this node's own timer came so late that nobody was counted as silent: it got no processor, or its host slept. Each of these puts
 /// the losses of that moment off by as much and one period.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{NodeHandle, discovery::OwnStalls};
+///
+/// /// Whether this host was ever too busy to watch others.
+/// fn was_starved(handle: &NodeHandle) -> bool {
+///     let OwnStalls { count, longest, .. } = handle.own_stalls();
+///     println!("{count} stalls, the longest {longest:?}");
+///     count > 0
+/// }
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct OwnStalls {
     /// How often since the node started.

@@ -21,6 +21,15 @@ use std::collections::BTreeMap;
 use super::Core;
 
 /// How a node was found.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::discovery::Source;
+///
+/// let names: Vec<_> = Source::ALL.iter().map(|source| source.name()).collect();
+/// assert_eq!(names.join(" "), "seed multicast mdns query remembered");
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Source {
     /// It is listed in this node's configuration.

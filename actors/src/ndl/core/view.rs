@@ -14,6 +14,17 @@ use crate::{
 };
 
 /// A node that is there.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::discovery::KnownNode;
+///
+/// /// How much longer this node's loss may stay unnoticed than the robot can bear, 200 ms.
+/// fn is_watched_too_slowly(node: &KnownNode) -> bool {
+///     node.bound > std::time::Duration::from_millis(200)
+/// }
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct KnownNode {
     /// Its address.
@@ -59,6 +70,18 @@ pub struct KnownNode {
 }
 
 /// A way to a node: an address of this node, and one of the other where it answers.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{NodeHandle, discovery::KnownRoute};
+///
+/// fn show_routes(handle: &NodeHandle) {
+///     for KnownRoute { here, there, round_trip, .. } in handle.members().iter().flat_map(|node| &node.routes) {
+///         println!("{here} -> {there}: {round_trip:?}");
+///     }
+/// }
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct KnownRoute {
     /// This node's.

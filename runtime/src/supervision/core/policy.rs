@@ -116,8 +116,8 @@ pub struct Policy {
 /// use sinew::{prelude::*, supervision::StartRetry};
 ///
 /// // A sensor that is plugged in by hand: look for it twice a second.
-/// let retry = StartRetry { max: Duration::from_millis(500), ..StartRetry::default() };
-/// assert_eq!(retry.min, Duration::from_millis(100));
+/// let retry = StartRetry { wait_max: Duration::from_millis(500), ..StartRetry::default() };
+/// assert_eq!(retry.wait_min, Duration::from_millis(100));
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct StartRetry {
