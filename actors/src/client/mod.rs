@@ -409,7 +409,9 @@ impl Registration {
     /// ```
     /// use sinew::{Registration, app::Requirement};
     ///
-    /// let registration = Registration::new().requires(["hip.imu | knee.imu"]).requires([Requirement::at_least(2, ["*.drive"])]);
+    /// let registration = Registration::new()
+    ///     .requires(["hip.imu | knee.imu"])
+    ///     .requires([Requirement::at_least(2, ["*.drive"])]);
     /// ```
     #[must_use]
     pub fn requires<N: Into<String>>(mut self, names: impl IntoIterator<Item = N>) -> Self {
