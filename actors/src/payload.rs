@@ -3,6 +3,7 @@
 /// Declares a type that travels between applications: `payload!("project.name" => struct ...)`.
 ///
 /// The type can be written and read by serde, and is a [`Payload`](crate::Payload) of that name and of class Control.
+/// A type without fields keeps its semicolon: `payload!("project.stop" => struct Stop;)`.
 /// Two things may follow the name:
 ///
 /// - A class, as in `payload!("exo.angle", Stream => struct ...)`. Periodic values (measurements, setpoints) are of class Stream: of these only the
