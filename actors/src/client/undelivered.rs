@@ -147,7 +147,7 @@ impl Endpoint {
     /// ```
     /// use sinew::Endpoint;
     ///
-    /// /// Once a second: says which messages nobody has taken.
+    /// /// Prints the messages that were not delivered; called once a second.
     /// fn report(endpoint: &mut Endpoint) {
     ///     while let Some(report) = endpoint.take_undelivered() {
     ///         eprintln!("{report}");

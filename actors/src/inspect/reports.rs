@@ -98,7 +98,7 @@ payload!("sinew.inspect.watch" =>
     /// ```
     /// use sinew::{AppAddress, Endpoint, Tid, client::ApiError, inspect::{AskWatch, WatchReport}, prelude::*};
     ///
-    /// /// What the application has got since the last call; the first one begins the watch.
+    /// /// Returns the messages to the application since the last call. The first call begins the watch.
     /// fn watch(endpoint: &mut Endpoint, app: Tid) -> Result<WatchReport, ApiError> {
     ///     let inspect = Tid::new(app.node, AppAddress::INSPECT);
     ///     let question = AskWatch { app, received: true, sent: false };

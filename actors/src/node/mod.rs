@@ -347,7 +347,7 @@ impl NodeHandle {
     /// ```
     /// use sinew::NodeHandle;
     ///
-    /// /// Says what holds up the start of the robot.
+    /// /// Shows which applications wait, and for which others.
     /// fn explain(handle: &NodeHandle) {
     ///     handle.waiting().iter().for_each(|waiting| println!("{waiting}"));
     /// }
