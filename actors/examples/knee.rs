@@ -50,12 +50,20 @@ fn drive(node: &NodeApi) -> Result<(), Error> {
     let mut drive = node.register_transport_address(Registration::new().name("knee.drive"))?;
     while let Some(message) = drive.receive(10 * SECOND)? {
         if message.kind() == Calibrate::KIND {
-            let Calibrate { zero_degrees } = message.decode().map_err(ApiError::from)?;
-            writeln!(io::stdout(), "calibrated: zero is at {zero_degrees} degrees")?;
+            match message.decode() {
+                Ok(Calibrate { zero_degrees }) => {
+                    writeln!(io::stdout(), "calibrated: zero is at {zero_degrees} degrees")?;
+                }
+                Err(error) => writeln!(io::stderr(), "from {}: {error}", message.source())?,
+            }
         } else if message.kind() == JointAngle::KIND {
-            let angle: JointAngle = message.decode().map_err(ApiError::from)?;
             let age = message.age(Time::now());
-            writeln!(io::stdout(), "{} is at {} degrees, {age:?} ago", message.source(), angle.degrees)?;
+            match message.decode() {
+                Ok(JointAngle { degrees }) => {
+                    writeln!(io::stdout(), "{} is at {degrees} degrees, {age:?} ago", message.source())?;
+                }
+                Err(error) => writeln!(io::stderr(), "from {}: {error}", message.source())?,
+            }
         } else {
             message.settle(Outcome::Rejected(Rejection::UnknownKind));
         }

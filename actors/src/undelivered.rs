@@ -88,12 +88,19 @@ impl Core {
         now: Time,
         here: NodeAddress,
         (source, receiver): (Tid, Tid),
-        entry: Entry,
+        (entry, is_reported): (Entry, bool),
     ) -> bool {
         let is_of_type = matches!(entry.why, Rejection::UnknownKind | Rejection::Malformed);
         if let Some(kind) = entry.kind.filter(|_| is_of_type && receiver.is_single()) {
             let key = (receiver.app, kind, Outcome::Rejected(entry.why).code());
-            self.unhandled.note(now, key, entry.count, source);
+            let is_due = self.unhandled.note(now, key, entry.count, source);
+            if !is_reported {
+                // Its sender has the outcome.
+                return is_due && !std::mem::replace(&mut self.is_posted, true);
+            }
+        }
+        if !is_reported {
+            return false;
         }
         let reader = if source.node == here { Reader::App(source.app) } else { Reader::Node(source.node) };
         self.add(now, reader, entry)
@@ -169,7 +176,8 @@ impl RefusalSink for Undelivered {
     fn refused(&self, receiver: Tid, header: &Header, why: Rejection, count: u64) {
         let now = Time::now();
         let entry = Entry::of(header, why, count, now);
-        let is_due = lock(&self.core).refused(now, self.node, (header.source, receiver), entry);
+        let noted = (entry, is_reported(header, why));
+        let is_due = lock(&self.core).refused(now, self.node, (header.source, receiver), noted);
         self.tell(is_due);
     }
 }
@@ -188,7 +196,7 @@ mod tests {
     fn refuse(core: &mut Core, source: Tid, now: Time) -> bool {
         let knee = tid(HERE, 0x1001);
         let header = Header::new(Kind::named("demo.angle"), source, knee);
-        core.refused(now, HERE, (source, knee), Entry::of(&header, Rejection::UnknownKind, 1, now))
+        core.refused(now, HERE, (source, knee), (Entry::of(&header, Rejection::UnknownKind, 1, now), true))
     }
 
     #[test]

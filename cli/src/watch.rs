@@ -78,10 +78,11 @@ pub(crate) fn show(system: &mut System, order: &Order, is_json: bool) -> Result<
         rates.drop(report.dropped);
         let is_chosen = |m: &&SeenMessage| watched.shows(m) && (kinds.is_empty() || kinds.contains(&m.kind));
         let left = order.count.map_or(u64::MAX, |count| count - shown);
+        // The rate is of all messages up to the last answer, also of those beyond the count.
+        report.seen.iter().filter(is_chosen).for_each(|message| rates.add(message));
         for message in report.seen.iter().filter(is_chosen).take(usize::try_from(left).unwrap_or(usize::MAX))
         {
             shown += 1;
-            rates.add(message);
             is_over |= !screen.message(began, message);
         }
         is_over |= order.count == Some(shown);

@@ -30,7 +30,7 @@ use crate::{
     outcome::{Rejection, Ticket},
     post::lock,
     tid::{AppAddress, NodeAddress, Tid},
-    undelivered::{RefusalSink, is_reported},
+    undelivered::{RefusalSink, is_noted},
     wire::{Flags, Header, Kind, Message},
 };
 
@@ -325,7 +325,7 @@ impl Router {
     /// `receiver` refused `count` messages with this header, whose sender had gone on.
     pub fn report(&self, receiver: Tid, header: &Header, why: Rejection, count: u64) {
         if let Some(sink) = self.refusals.get()
-            && is_reported(header, why)
+            && is_noted(header, why)
         {
             sink.refused(receiver, header, why, count);
         }

@@ -114,6 +114,20 @@ pub fn is_reported(header: &Header, why: Rejection) -> bool {
         && !(is_broadcast && why == Rejection::UnknownKind)
 }
 
+/// Whether the receiver's node notes the refusal of a message with this header: each that is reported, and confirmed messages and requests whose type
+/// the receiver does not handle or cannot read.
+#[must_use]
+pub fn is_noted(header: &Header, why: Rejection) -> bool {
+    let Header { flags, .. } = *header;
+    let is_of_type = matches!(why, Rejection::UnknownKind | Rejection::Malformed);
+    let has_outcome = flags.has(Flags::CONFIRM) || flags.has(Flags::ASK);
+    let mut unconfirmed = *header;
+    if is_of_type && has_outcome && !flags.has(Flags::REPLY) && !flags.has(Flags::OUTCOME) {
+        unconfirmed.flags = Flags::NONE;
+    }
+    is_reported(&unconfirmed, why)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -135,6 +149,17 @@ mod tests {
             assert!(!is_reported(&header(flags, knee), Rejection::UnknownKind), "{flags:?}");
         }
         assert!(!is_reported(&header(Flags::NONE, knee), Rejection::ByHandler));
+    }
+
+    #[test]
+    fn types_that_are_not_handled_are_noted_of_confirmed_messages_and_requests_too() {
+        let knee = Tid::new(NodeAddress::new(2), AppAddress::fixed(2).unwrap());
+        for flags in [Flags::NONE, Flags::CONFIRM, Flags::ASK, Flags::CONFIRM.with(Flags::ASK)] {
+            assert!(is_noted(&header(flags, knee), Rejection::UnknownKind), "{flags:?}");
+        }
+        assert!(!is_noted(&header(Flags::CONFIRM, knee), Rejection::QueueFull));
+        assert!(!is_noted(&header(Flags::OUTCOME, knee), Rejection::UnknownKind));
+        assert!(!is_noted(&header(Flags::REPLY, knee), Rejection::UnknownKind));
     }
 
     #[test]

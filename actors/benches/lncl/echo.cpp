@@ -14,7 +14,7 @@ int main(int argc, char **argv) try {
     std::puts("there");
     std::fflush(stdout);
     while (auto packet = echo.receive(20s)) {
-        const std::int64_t age = packet->age().count();
+        const std::int64_t age = packet->age().value_or(0ns).count(); // of this host's own clock: always known
         auto back = echo.create(packet->source(), packet->kind(), packet->size());
         std::memcpy(back.data(), packet->data(), packet->size());
         if (packet->kind() == aged && back.size() >= sizeof age)

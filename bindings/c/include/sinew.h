@@ -631,7 +631,7 @@ typedef struct sinew_options {
     uint64_t deadline_ns;
     /**
      * How long a send waits while the node or, on a direct link, the receiver takes nothing; whatever it takes begins that time
-     * anew. Default: 1 s. For one send alone, and in all: `sinew_send_message_within`.
+     * anew. Default: 1 s. For one send alone, and in all: `sinew_room_within`.
      */
     uint64_t stall_timeout_ns;
     /**
@@ -1192,23 +1192,23 @@ sinew_status sinew_expires_after(struct sinew_endpoint *endpoint,
                                  uint64_t time_ns);
 
 /**
+ * Has the sending of a message that is being made wait for room no longer than `within_ns`, in place of the `stall_timeout_ns` of the options; with 0 it
+ * does not wait at all. For a control loop: `SINEW_ERROR_STALLED` says that there was no room in time and that nothing of the message is received.
+ * One that is longer than the ring needs a time in which its receiver takes some of it (with `SINEW_SOCKET_ONLY` it is sent with its first byte,
+ * and the rest follows with later calls). A node that has gone is not looked for while the message is sent (`SINEW_ERROR_DISCONNECTED`):
+ * `sinew_receive_message`, or a send without such a time, does. Does not block. The endpoint's thread.
+ */
+sinew_status sinew_room_within(struct sinew_endpoint *endpoint,
+                               const struct sinew_message *message,
+                               uint64_t within_ns);
+
+/**
  * Sends a message (the paper's SendMessage). What becomes of it then is not told. The message is gone when this returns, sent
- * or not: see Messages at the top. Blocks while there is no room and nothing is taken, for the `stall_timeout_ns` of the options.
- * The endpoint's thread.
+ * or not: see Messages at the top. Blocks while there is no room and nothing is taken, for the `stall_timeout_ns` of the
+ * options, or as `sinew_room_within` says. The endpoint's thread.
  */
 sinew_status sinew_send_message(struct sinew_endpoint *endpoint,
                                 struct sinew_message *message);
-
-/**
- * The same, and blocks for `within_ns` at most while there is no room; with 0 it does not block at all. For a control loop:
- * `SINEW_ERROR_STALLED` says that there was no room in time and that nothing of the message is received. One that is longer than
- * the ring needs a time in which its receiver takes some of it (with `SINEW_SOCKET_ONLY` it is sent with its first byte, and the
- * rest follows with later calls). A node that has gone is not looked for here (`SINEW_ERROR_DISCONNECTED`): `sinew_receive_message`,
- * or a send without a time, does. The endpoint's thread.
- */
-sinew_status sinew_send_message_within(struct sinew_endpoint *endpoint,
-                                       struct sinew_message *message,
-                                       uint64_t within_ns);
 
 /**
  * Lends, copies and sends in one call. `bytes` may be NULL if `length` is 0. Blocks as `sinew_send_message`. The endpoint's
@@ -1220,17 +1220,6 @@ sinew_status sinew_send_bytes(struct sinew_endpoint *endpoint,
                               int32_t message_class,
                               const void *bytes,
                               size_t length);
-
-/**
- * The same, and blocks as `sinew_send_message_within`. The endpoint's thread.
- */
-sinew_status sinew_send_bytes_within(struct sinew_endpoint *endpoint,
-                                     sinew_tid destination,
-                                     sinew_kind kind,
-                                     int32_t message_class,
-                                     const void *bytes,
-                                     size_t length,
-                                     uint64_t within_ns);
 
 /**
  * Sends a message and waits for what becomes of it; `SINEW_UNKNOWN` when nobody has said so after `within_ns`. The message
@@ -1280,14 +1269,6 @@ sinew_status sinew_ask(struct sinew_endpoint *endpoint,
 sinew_status sinew_reply(struct sinew_endpoint *endpoint,
                          const struct sinew_received *request,
                          struct sinew_message *message);
-
-/**
- * The same, and blocks as `sinew_send_message_within`. The endpoint's thread.
- */
-sinew_status sinew_reply_within(struct sinew_endpoint *endpoint,
-                                const struct sinew_received *request,
-                                struct sinew_message *message,
-                                uint64_t within_ns);
 
 /**
  * Waits for a message, `within_ns` at most; `SINEW_NOTHING` if none came (the paper's ReceiveMessage). Control comes first,
@@ -1417,7 +1398,7 @@ sinew_status sinew_send_protected(struct sinew_endpoint *endpoint,
                                   size_t length);
 
 /**
- * The same, and blocks as `sinew_send_message_within`. What was not sent counts as missing at the receiver. The endpoint's thread.
+ * The same, and waits for room as `sinew_room_within` says. What was not sent counts as missing at the receiver. The endpoint's thread.
  */
 sinew_status sinew_send_protected_within(struct sinew_endpoint *endpoint,
                                          sinew_tid destination,

@@ -228,7 +228,12 @@ fn heard_at(address: IpAddr, interface: &Interface) -> Check {
         )
     };
     match hears_itself(address, interface.number) {
-        Ok(true) => Check::fine(NAME, format!("a datagram to a group came back at {address} ({device})")),
+        Ok(true) => Check::fine(
+            NAME,
+            format!(
+                "a datagram to a group came back at {address} ({device}); the way to other hosts was not tried"
+            ),
+        ),
         Ok(false) => {
             let seen = format!(
                 "a datagram to a group at {address} ({device}) did not come back within {HEARD_WITHIN:?}"

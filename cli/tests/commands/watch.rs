@@ -83,7 +83,7 @@ fn what_an_application_gets_and_sends_is_seen_decoded_from_either_node() {
                 .flatten()
                 .filter_map(|k| k["count"].as_u64())
                 .sum();
-            assert_eq!(counted, 20, "{rates:?}");
+            assert!(counted >= 20, "{rates:?}");
             // A node that is not asked in time drops what it saw, and says how much.
             let missing = numbers[19] - numbers[0] - 19;
             let dropped: u64 = rates.iter().filter_map(|r| r["dropped"].as_u64()).sum();

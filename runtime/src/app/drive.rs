@@ -220,7 +220,8 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         self.reader.finish(outcome);
         if is_confirmed {
             self.vitals.settle(outcome);
-        } else if let Outcome::Rejected(why) = outcome {
+        }
+        if let Outcome::Rejected(why) = outcome {
             context.refused(&message.header, why);
         }
     }

@@ -69,4 +69,8 @@ fn two_nodes_whose_addresses_come_after_their_start_find_each_other_and_talk() {
             .unwrap_or_else(|error| panic!("{error}"));
     }
     second.wait_for(&["count 20 from 10.9.0.1"]);
+    for node in [&first, &second] {
+        let warnings = node.said().iter().filter(|line| line.contains("warns each minute")).count();
+        assert_eq!(warnings, 1, "{:?}", node.said());
+    }
 }

@@ -105,6 +105,7 @@ impl Paths {
     ) -> (Vec<Reader>, Vec<(LocalAddress, io::Error)>) {
         let (mut readers, mut unopened) = (Vec::new(), Vec::new());
         self.close_all_but(stores, wanted);
+        self.unopened.borrow_mut().retain(|local, _| wanted.contains(local));
         for local in wanted.iter().copied() {
             if !self.locals().contains(&local) {
                 match open(stores, local) {
@@ -147,7 +148,6 @@ impl Paths {
         // What is said of those that are not used each clears itself.
         let is_of_unused = |what: &str| [IN_DOUBT, TAKEN, LEFT_OUT].contains(&what);
         self.said.borrow_mut().retain(|(local, what)| is_of_unused(what) || wanted.contains(local));
-        self.unopened.borrow_mut().retain(|local, _| wanted.contains(local));
     }
 
     /// Joins the group on a path that has not joined it yet.

@@ -38,9 +38,10 @@ fn seen(said: &UnhandledReport, name: Option<String>, sender: Option<&str>) -> S
     let kind = name.unwrap_or_else(|| format!("kind {kind}"));
     let sender = sender.map_or_else(|| tid.to_string(), str::to_owned);
     let ago = time(*ago_us);
+    let messages = if *count == 1 { "1 message".to_owned() } else { format!("{count} messages") };
     if *is_malformed {
-        format!("{count} messages of {kind} could not be read, the last one {ago} ago from {sender}")
+        format!("{messages} of {kind} could not be read, the last one {ago} ago from {sender}")
     } else {
-        format!("{kind} is not handled: {count} messages, the last one {ago} ago from {sender}")
+        format!("{kind} is not handled: {messages}, the last one {ago} ago from {sender}")
     }
 }

@@ -65,8 +65,8 @@ fn alone(wanted: &str, facts: &Facts) -> Option<(String, String)> {
     } else {
         format!(
             "{foreign}Is its node started, with the same project and multicast group, and with its `interface` under [ndl] between the hosts (by itself \
-             that is loopback)? Does multicast pass: `sinew doctor --interface {}`; where it does not (WiFi, VPN, containers, most clouds): [ndl] \
-             seeds = [\"ITS_ADDRESS:PORT\"], with a fixed `ndl.port` there",
+             that is loopback)? Does multicast pass between the hosts? `sinew doctor --interface {}` tries it within one host alone; where it \
+             does not pass (WiFi, VPN, containers, most clouds): [ndl] seeds = [\"ITS_ADDRESS:PORT\"], with a fixed `ndl.port` there",
             report.interface
         )
     };

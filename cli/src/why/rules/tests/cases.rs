@@ -31,7 +31,7 @@ const CASES: &[Case] = &[
         [
             "ankle is there",
             "hip finds no other node; it looks in 239.0.0.1:7000",
-            "Does multicast pass: `sinew doctor",
+            "Does multicast pass between the hosts? `sinew doctor",
         ],
     ),
     Case(
