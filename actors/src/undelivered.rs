@@ -18,7 +18,7 @@ use sinew_runtime::{
     post::Post,
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
-    undelivered::RefusalSink,
+    undelivered::{RefusalSink, is_reported},
     wire::{Header, Kind},
 };
 
