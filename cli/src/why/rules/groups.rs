@@ -28,8 +28,8 @@ pub(super) fn why_unheard(from: &NodeReport, theirs: &NodeReport, seed: &str) ->
         return (seen, one_group(&ours, &others, seed));
     }
     let mend = format!(
-        "does multicast pass between the two interfaces ({} and {})? `sinew doctor --interface ADDRESS` tries each host by itself; look at firewalls and at IGMP \
-         and MLD snooping of the switch; or {seed}",
+        "does multicast pass between the two interfaces ({} and {})? `sinew doctor --interface ADDRESS` tries each host by itself; look at firewalls, IGMP and \
+         MLD snooping of the switch; or {seed}",
         from.interface, theirs.interface
     );
     (format!("both ask in the group {}, and it has not heard the other", shared.join(" and ")), mend)
