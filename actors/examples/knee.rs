@@ -1,8 +1,8 @@
 //! Two programs on one node, each in a process of its own: `knee drive` in one terminal, `knee sensor` in another.
 //!
-//! The sensor waits until the drive is there, and has it calibrate: a command, of class Control, whose outcome it waits for. Then it streams ten
-//! angles: of class Stream, of which only the newest waits. The node is `sinew-node`, or any node whose `lncl.socket` is the path that is given as
-//! the second word.
+//! The sensor requires the drive. It sends a calibration command in class Control and waits for its outcome. Then it sends ten angles in class
+//! Stream, in which a newer value replaces one that still waits. The node is `sinew-node`, or any other node. The second argument is the
+//! `lncl.socket` of that node.
 
 use std::{
     io::{self, Write as _},
@@ -79,7 +79,7 @@ fn sensor(node: &NodeApi) -> Result<(), Error> {
     writeln!(io::stdout(), "calibrate: {outcome:?}")?;
     for number in 0..10_u8 {
         sensor.send(drive, &JointAngle { degrees: f32::from(number) })?;
-        thread::sleep(Duration::from_millis(10));
+        thread::sleep(Duration::from_millis(10)); // the period of the stream
     }
     Ok(())
 }

@@ -9,7 +9,7 @@ const CHARACTERS_MAX: usize = 64;
 /// Similarity (Jaro-Winkler, 0 to 1) from which a name is suggested. `knee.senser` and `knee.drive` have 0.77, `knee.senser` and `hip.drive` 0.53, `sink` and `sync` 0.67.
 const SIMILAR: f64 = 0.66;
 
-/// Those of `known` whose names are similar to `name`, [`NEAREST_MAX`] at most, the most similar first. Each name once.
+/// Returns up to [`NEAREST_MAX`] entries of `known` with names similar to `name`, most similar first. Each name appears once.
 pub(crate) fn nearest<T>(
     name: &str,
     known: impl IntoIterator<Item = T>,

@@ -157,7 +157,7 @@ impl Endpoint {
         Asking(self).0.await_answer(asked).await
     }
 
-    /// Sends `message`, whose answer is awaited then.
+    /// Sends `message` and registers the wait for its answer.
     async fn put(
         &mut self,
         mut message: Draft,

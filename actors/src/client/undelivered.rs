@@ -140,7 +140,7 @@ impl Endpoint {
     ///
     /// What this endpoint itself has refused without anybody's being told is counted here too, with itself as the destination.
     ///
-    /// Whoever needs to know it of one message sends that one [confirmed](super::MessageBuilder::confirmed).
+    /// Where the outcome of one message matters, send it [confirmed](super::MessageBuilder::confirmed).
     ///
     /// # Examples
     ///

@@ -106,7 +106,7 @@ impl NodeConfig {
         Ok(config)
     }
 
-    /// As much of it as can be used, with all that is wrong: for who has more to check.
+    /// Reads the settings that are valid, and lists all faults of the others. The caller adds the faults of its own checks.
     fn read(text: &str) -> Result<(Self, Vec<ConfigFault>), ConfigFaults> {
         let table = DeTable::parse(text).map_err(|error| ConfigFaults::one(syntax_fault(text, &error)))?;
         let mut reader = Reader::new(text, table.get_ref());

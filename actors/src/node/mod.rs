@@ -210,8 +210,8 @@ impl Node {
         NodeBuilder::new(name.into())
     }
 
-    /// Begins the declaration of a node whose configuration is in the TOML file at `path`. What is wrong with the file is found by
-    /// [`NodeBuilder::start`], together with all else that is wrong.
+    /// Returns a builder with the configuration of the TOML file at `path`. [`NodeBuilder::start`] reports the faults of the file, together
+    /// with all other faults.
     ///
     /// # Examples
     ///

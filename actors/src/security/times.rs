@@ -28,7 +28,7 @@ pub struct Validity {
 /// use sinew::{NodeConfig, security::TimePolicy};
 ///
 /// let mut config = NodeConfig::new("knee");
-/// // A host whose clock is set by GPS before Sinew starts.
+/// // GPS sets the clock of this host before Sinew starts.
 /// config.security.times = TimePolicy::Strict;
 /// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

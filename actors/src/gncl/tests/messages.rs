@@ -89,7 +89,7 @@ fn a_broadcast_reaches_every_application_and_is_confirmed_by_each() {
         broadcast.header.flags = Flags::CONFIRM;
         broadcast.header.correlation = 7;
         peer.say(&broadcast).await;
-        // spec: GNCL-12: who has a copy, each one's outcome, and that these are all
+        // spec: GNCL-12: the members with a copy, the end of that list, and the outcome of each member
         let here = node.stores.node;
         let members = [1, 2].map(|number| Tid::new(here, AppAddress::new(0x1000 + number)));
         let mut said = vec![peer.hear().await];

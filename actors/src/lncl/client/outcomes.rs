@@ -39,7 +39,7 @@ pub(super) struct Outcomes {
 }
 
 impl Outcomes {
-    /// Of a client whose queue holds so many messages of a class, with payloads of so many bytes at most.
+    /// The outcomes for a client. Its queue holds `queue_capacity` messages of each class, with payloads of at most `payload_max` bytes.
     pub(super) fn new(outlet: Arc<ClientOutlet>, queue_capacity: usize, payload_max: usize) -> Arc<Self> {
         let pending_max = PENDING_QUEUES * queue_capacity;
         let (pending, may_wait) = (AtomicUsize::new(0), AtomicBool::new(false));

@@ -37,7 +37,7 @@ impl<T> Default for Unanswered<T> {
 }
 
 impl<T> Unanswered<T> {
-    /// Whether one more may wait. A process whose pid is unknown (0) has no share of its own.
+    /// Whether there is room for one more. The limit of one process is not applied to a process with an unknown pid (0).
     pub(super) fn has_room_for(&self, of: Processes) -> bool {
         let count = |is_theirs: fn(Processes, Processes) -> bool| {
             self.0.values().filter(|waiting| is_theirs(waiting.of, of)).count()

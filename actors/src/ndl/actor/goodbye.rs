@@ -1,4 +1,4 @@
-//! The goodbye of a node whose layers have given up: no instance of NDL is left to send it.
+//! Sends `NDL_LEAVE` for a node whose layers have given up, since its NDL actor no longer runs.
 
 use sinew_runtime::time::Time;
 
