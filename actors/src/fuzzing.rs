@@ -1,163 +1,115 @@
-//! Doors for fuzzers to parsers and cores that nobody else may call: there with the feature `fuzzing` alone, never in a robot.
+//! Entry points for fuzzers to internal parsers and cores. They exist only with the feature `fuzzing`, never
+//! in a robot.
 //!
-//! Each takes any bytes, panics where a promise about them is broken, and says whether anything in them was understood: a
-//! target whose seeds are not understood tries nothing. What is checked stands beside what it checks, in each layer's `fuzzing`.
+//! Each accepts any bytes, panics if a promised property is violated, and returns whether any part of the
+//! bytes was valid: a target with only invalid seeds tests nothing. The checks are next to the checked code,
+//! in each layer's `fuzzing`.
 
-/// HELLO, WELCOME and REFUSAL: payloads of the handshake between nodes.
+/// Tests HELLO, WELCOME and REFUSAL: payloads of the handshake between nodes.
 #[must_use]
 pub fn handshake(bytes: &[u8]) -> bool {
-    crate::gncl::fuzzing::handshake(bytes)
+    sinew_gncl::fuzzing::handshake(bytes)
 }
 
-/// A script of what happens to connections and peers, played to a live core of GNCL.
+/// Runs a script of events on connections and peers with a live core of GNCL.
 #[must_use]
 pub fn links(script: &[u8]) -> bool {
-    crate::gncl::fuzzing::links(script)
+    sinew_gncl::fuzzing::links(script)
 }
 
-/// A script of frames between two nodes, damaged and lost ones too, played to both halves of a live session.
+/// Runs a script of frames between two nodes, including damaged and lost ones, with both halves of a live session.
 #[must_use]
 pub fn session(script: &[u8]) -> bool {
-    crate::session::fuzzing::session(script)
+    sinew_session::fuzzing::session(script)
 }
 
-/// Datagrams for values of class Stream.
+/// Tests datagrams for values of class Stream.
 #[must_use]
 pub fn datagrams(bytes: &[u8]) -> bool {
-    crate::gncl::fuzzing::datagrams(bytes)
+    sinew_gncl::fuzzing::datagrams(bytes)
 }
 
-/// Datagrams of discovery, sealed and not.
+/// Tests datagrams of discovery, sealed and unsealed.
 #[must_use]
 pub fn discovery(bytes: &[u8]) -> bool {
-    crate::ndl::fuzzing::discovery(bytes)
+    sinew_ndl::fuzzing::discovery(bytes)
 }
 
-/// The file in which a node keeps where its peers answered.
+/// Tests the file in which a node stores the addresses at which its peers answered.
 #[must_use]
 pub fn peers(bytes: &[u8]) -> bool {
-    crate::ndl::fuzzing::peers(bytes)
+    sinew_ndl::fuzzing::peers(bytes)
 }
 
-/// A script of sealed datagrams of discovery, honest, forged, damaged and sent again, played to a live checker of seals.
+/// Runs a script of sealed datagrams of discovery (valid, forged, damaged, replayed) with a live checker of seals.
 #[must_use]
 pub fn seals(script: &[u8]) -> bool {
-    crate::secured::fuzzing::seals(script)
+    sinew_security::node_security::fuzzing::seals(script)
 }
 
-/// A script of protected messages and echoes, honest, lost, held up, damaged and forged, played to a live receiver.
+/// Runs a script of protected messages and echoes (valid, lost, delayed, damaged, forged) with a live receiver.
 #[must_use]
 pub fn protected(script: &[u8]) -> bool {
     sinew_runtime::protection::fuzzing::protected(script)
 }
 
-/// The file of an access list.
+/// Tests the file of an access list.
 #[must_use]
 pub fn access(bytes: &[u8]) -> bool {
-    crate::access::fuzzing::access(bytes)
+    sinew_security::access::fuzzing::access(bytes)
 }
 
-/// Frames of a client at the node's door, in any state of its connection.
+/// Tests frames of a client at the node's socket, in any state of its connection.
 #[must_use]
 pub fn control(bytes: &[u8]) -> bool {
-    crate::lncl::fuzzing::control(bytes)
+    sinew_lncl::fuzzing::control(bytes)
 }
 
-/// What layers of different nodes, and a node and its child processes, say to each other.
+/// Tests the frames between layers of different nodes, and between a node and its child processes.
 #[must_use]
 pub fn words(bytes: &[u8]) -> bool {
     let Some((which, bytes)) = bytes.split_first() else { return false };
     let readers: [fn(&[u8]) -> bool; 6] = [
-        crate::sync::fuzzing::words,
-        crate::monitors::fuzzing::words,
-        crate::wills::fuzzing::words,
-        crate::audit::fuzzing::words,
-        crate::process::fuzzing::words,
-        crate::outlet::fuzzing::words,
+        sinew_sync::fuzzing::frames,
+        sinew_sync::monitors::fuzzing::frames,
+        sinew_sync::wills::fuzzing::frames,
+        sinew_node::fuzzing::audit::frames,
+        sinew_node::fuzzing::process::frames,
+        sinew_session::outlet::fuzzing::words,
     ];
     readers[usize::from(*which) % readers.len()](bytes)
 }
 
-/// Bytes that all of these understand, as they are written by their own side: what a fuzzer begins with.
+/// Returns bytes that all of these accept, as written by their own side: the start corpus of a fuzzer.
 #[must_use]
 pub fn seeds(format: &str) -> Vec<Vec<u8>> {
     match format {
-        "handshake" => crate::gncl::fuzzing::handshakes(),
-        "links" => vec![crate::gncl::fuzzing::A_LINK.to_vec()],
-        "session" => vec![crate::session::fuzzing::A_SESSION.to_vec()],
-        "datagrams" => crate::gncl::fuzzing::some_datagrams(),
-        "discovery" => crate::ndl::fuzzing::some_datagrams(),
-        "peers" => crate::ndl::fuzzing::some_peers(),
-        "seals" => vec![crate::secured::fuzzing::SOME_SEALS.to_vec()],
+        "handshake" => sinew_gncl::fuzzing::handshakes(),
+        "links" => vec![sinew_gncl::fuzzing::A_LINK.to_vec()],
+        "session" => vec![sinew_session::fuzzing::A_SESSION.to_vec()],
+        "datagrams" => sinew_gncl::fuzzing::some_datagrams(),
+        "discovery" => sinew_ndl::fuzzing::some_datagrams(),
+        "peers" => sinew_ndl::fuzzing::some_peers(),
+        "seals" => vec![sinew_security::node_security::fuzzing::SOME_SEALS.to_vec()],
         "protected" => vec![sinew_runtime::protection::fuzzing::SOME_MESSAGES.to_vec()],
-        "access" => crate::access::fuzzing::some_lists(),
-        "control" => crate::lncl::fuzzing::some_frames(),
+        "access" => sinew_security::access::fuzzing::some_lists(),
+        "control" => sinew_lncl::fuzzing::some_frames(),
         "words" => {
-            let said = [
-                crate::sync::fuzzing::said(),
-                crate::monitors::fuzzing::said(),
-                crate::wills::fuzzing::said(),
-                crate::audit::fuzzing::said(),
-                crate::process::fuzzing::said(),
-                crate::outlet::fuzzing::said(),
+            let samples = [
+                sinew_sync::fuzzing::sent_frames(),
+                sinew_sync::monitors::fuzzing::sent_frames(),
+                sinew_sync::wills::fuzzing::sent_frames(),
+                sinew_node::fuzzing::audit::sent_frames(),
+                sinew_node::fuzzing::process::sent_frames(),
+                sinew_session::outlet::fuzzing::said(),
             ];
-            let numbered = said.into_iter().zip(0_u8..);
+            let numbered = samples.into_iter().zip(0_u8..);
             numbered
-                .flat_map(|(said, which)| said.into_iter().map(move |bytes| [&[which][..], &bytes].concat()))
+                .flat_map(|(frames, which)| {
+                    frames.into_iter().map(move |bytes| [&[which][..], &bytes].concat())
+                })
                 .collect()
         }
         _ => Vec::new(),
     }
-}
-
-/// Bytes that decide what happens next, one after the other; behind their end all are 0.
-pub(crate) struct Script<'a>(&'a [u8]);
-
-impl<'a> Script<'a> {
-    pub(crate) const fn new(bytes: &'a [u8]) -> Self {
-        Self(bytes)
-    }
-
-    pub(crate) const fn is_over(&self) -> bool {
-        self.0.is_empty()
-    }
-
-    pub(crate) fn byte(&mut self) -> u8 {
-        let [byte] = self.take();
-        byte
-    }
-
-    /// A number that is small, or one of the largest: those between are like each other.
-    pub(crate) fn number(&mut self) -> u64 {
-        match self.byte() {
-            near @ 0..=0xef => u64::from(near),
-            far => u64::MAX - u64::from(0xff - far),
-        }
-    }
-
-    /// So many bytes at most.
-    pub(crate) fn bytes(&mut self, count: usize) -> &'a [u8] {
-        let (taken, rest) = self.0.split_at(count.min(self.0.len()));
-        self.0 = rest;
-        taken
-    }
-
-    fn take<const N: usize>(&mut self) -> [u8; N] {
-        let mut bytes = [0; N];
-        let taken = self.bytes(N);
-        bytes[..taken.len()].copy_from_slice(taken);
-        bytes
-    }
-}
-
-/// What this reads of any bytes it writes so that it reads the same again. Returns whether it reads anything.
-pub(crate) fn is_read_as_written<T>(bytes: &[u8]) -> bool
-where
-    T: serde::Serialize + serde::de::DeserializeOwned + PartialEq + std::fmt::Debug,
-{
-    let Ok(read) = sinew_runtime::wire::decode::<T>(bytes) else { return false };
-    let written = rmp_serde::to_vec_named(&read).expect("what was read can be written");
-    let again = sinew_runtime::wire::decode::<T>(&written);
-    assert_eq!(again.expect("what was written can be read"), read);
-    true
 }

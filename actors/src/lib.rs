@@ -1,12 +1,12 @@
 //! Sinew: an actor runtime for distributed control.
 //!
-//! Write control logic as actors. Sinew gives each a 64-bit address, starts it when everything that it needs is ready,
-//! carries its messages to any thread, process or machine with a known outcome, restarts it when it fails, and tells it
-//! when the structure of the system changes.
+//! Write control logic as actors. Sinew assigns each a 64-bit address, starts it when all its requirements are ready,
+//! and carries its messages to any thread, process or machine with a known outcome. It restarts an actor that fails,
+//! and notifies it when the structure of the system changes.
 //!
 //! # The map
 //!
-//! The root has what nearly every program names. All else is in a module by topic.
+//! The root contains the items that nearly every program uses. Everything else is in a module by topic.
 //!
 //! | for | look at |
 //! | --- | --- |
@@ -14,7 +14,7 @@
 //! | an application in the node's process | [`AppSpec`], [`AppContext`], [`Delivery`], [`payload!`], [`app`] |
 //! | the same in a process of its own, started and restarted by the node | [`AppSpec::own_process`], [`supervision::Place`] |
 //! | an application in a process that the node did not start | [`client`]: [`NodeApi`], [`Endpoint`] for a thread, [`AsyncEndpoint`] for a task |
-//! | sending, and what became of it | [`message`], [`Outcome`] |
+//! | sending, and outcomes | [`message`], [`Outcome`] |
 //! | restarts, supervisors | [`supervision`] |
 //! | notifications of nodes, applications, requirements, ended actors, late inputs | [`events`] |
 //! | starting in step with others | [`barrier`] |
@@ -27,64 +27,39 @@
 //! | signals | [`signals`] |
 //! | clocks, timers | [`Time`], [`time`] |
 //!
-//! `docs/SEMANTICS.md` says on one page what is promised and what is not.
+//! `docs/book/src/reference/guarantees.md` lists the guarantees, and the explicit non-guarantees.
 //!
 //! # The layers
 //!
-//! `lncl/`, `sync/`, `gncl/`, `ndl/` are the paper's layers. Each is a pure core (bytes and events in, bytes and events
-//! out, time and chance as arguments) and a thin actor around it. `node/` is the root that starts, supervises and stops
-//! them; `stores.rs` is the state that outlives them.
+//! This package re-exports the packages below it, by topic. `sinew-lncl`, `sinew-sync`, `sinew-gncl` and
+//! `sinew-ndl` are the paper's layers. Each is a pure core (bytes and events in, bytes and events out, time and
+//! chance as arguments) and a thin actor around it. No layer names another one. `sinew-node` is the root that starts,
+//! connects, supervises and stops them; `sinew-model` has the types that they share.
 
-// The macro `payload!` names this crate as its users do.
+// The macro `payload!` uses the crate name as its users do.
 extern crate self as sinew;
 
-// What the layers log stops nobody.
-use sinew_runtime::log;
+#[doc(hidden)] // The command `sinew` uses it to suggest names.
+pub use sinew_model::nearest;
+// Logging in the layers never blocks.
+use sinew_runtime::{log, log::tracing::level_filters::LevelFilter};
 
-mod accept_pace;
-mod access;
-mod aftermath;
-pub mod audit;
-pub mod client;
-mod clocks;
-pub mod config;
+/// Switches the default log off, unless `SINEW_LOG` or `RUST_LOG` is set. The command `sinew` calls it: its standard
+/// error is for its own errors.
+#[doc(hidden)]
+pub fn silence_default_log() {
+    log::set_level(LevelFilter::OFF);
+}
 
 #[cfg(test)]
 mod documentation;
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
 pub mod fuzzing;
-mod gncl;
-pub mod inspect;
-mod last_words;
-#[cfg(all(test, target_os = "linux"))]
-mod lingering;
-mod lncl;
-mod log_quotas;
-mod monitors;
-mod ndl;
-mod nearest;
-mod nicer;
-pub mod node;
-mod outlet;
 mod payload;
-mod process;
-mod refusals;
-mod ring;
-mod secured;
-// One file for both packages, which share nothing else in tests.
-pub mod security;
-#[cfg(test)]
-#[path = "../../runtime/src/seeded.rs"]
-mod seeded;
-mod session;
-pub mod signals;
-mod stores;
-mod sync;
-mod takeover;
-mod undelivered;
-mod wills;
 
+#[doc(inline)]
+pub use sinew_node::{audit, inspect, signals};
 pub use sinew_runtime::name;
 #[cfg(feature = "fault-points")]
 pub use sinew_runtime::supervision::fault;
@@ -94,14 +69,14 @@ pub use address::{AppAddress, NodeAddress, Tid};
 #[doc(no_inline)]
 pub use app::{AppContext, AppSpec, Delivery};
 #[doc(no_inline)]
-pub use client::{AsyncEndpoint, Endpoint, NodeApi, Registration};
-#[doc(no_inline)]
 pub use config::NodeConfig;
 #[doc(no_inline)]
 pub use message::{Class, Outcome, Payload};
 #[doc(no_inline)]
 pub use node::{Node, NodeBuilder, NodeHandle, StartError};
 pub use serde;
+#[doc(no_inline)]
+pub use sinew_client::{self as client, AsyncEndpoint, Endpoint, NodeApi, Registration};
 pub use sinew_runtime::protection;
 #[doc(no_inline)]
 pub use time::Time;
@@ -111,7 +86,7 @@ pub mod address {
     pub use sinew_runtime::tid::{AppAddress, Incarnation, NodeAddress, Tid};
 }
 
-/// Applications: how one is declared, what it gets with each message, and what it may do.
+/// Applications: how to declare one, the context of each message, and the calls available in it.
 pub mod app {
     pub use sinew_runtime::app::{
         AppContext, AppSpec, Delivery, DownPolicy, GroupOutcome, LastWill, Raw, Requirement,
@@ -119,24 +94,35 @@ pub mod app {
     };
 }
 
-/// Barriers: several applications go on at the same moment.
+/// Barriers: several applications continue at the same moment.
 pub mod barrier {
-    pub use crate::{
-        client::{Barrier, BarrierError, Meet, Meeting},
-        sync::{
-            Absence, ArriveAtBarrier, BarrierAnswer, BarrierKind, BarrierStatus, LeaveBarrier, OnPartyLoss,
-            Waiting,
-        },
+    pub use sinew_client::{Barrier, BarrierError, Meet, Meeting};
+    pub use sinew_model::barrier::{
+        ArriveAtBarrier, BarrierAnswer, BarrierKind, BarrierStatus, LeaveBarrier, OnPartyLoss,
+    };
+    pub use sinew_model::directory::{Absence, Waiting};
+}
+
+/// Configuration of a node: one struct per layer, safe defaults, all faults reported together.
+///
+/// It comes from code ([`NodeConfig::new`]) or from TOML ([`NodeConfig::from_toml`](config::NodeConfig::from_toml),
+/// [`NodeConfig::from_file`](config::NodeConfig::from_file)). The same check validates both.
+pub mod config {
+    #[doc(inline)]
+    pub use sinew_model::config::{
+        AppSettings, ConfigError, ConfigFault, Families, GnclConfig, Interface, InterfaceError, Interfaces,
+        LnclConfig, LogConfig, LogLevel, NdlConfig, NodeConfig, SecurityConfig, Seed, SeedError,
+        SupervisionConfig, SyncConfig, TimePolicy, WatchGroup,
     };
 }
 
 /// Which nodes are known, from where, and by which routes.
 pub mod discovery {
-    pub use crate::ndl::{KnownNode, KnownRoute, OwnStalls, Source};
+    pub use sinew_ndl::{KnownNode, KnownRoute, OwnStalls, Source};
 }
 
-/// Notifications that an application can subscribe to or ask for: of nodes, of applications and what they require, of actors that ended, of
-/// inputs that are late, of messages that were not delivered.
+/// Notifications that an application can subscribe to or request: of nodes, of applications and their requirements, of
+/// actors that ended, of inputs that are late, of messages that were not delivered.
 pub mod events {
     pub use sinew_runtime::{
         app::{InputCriterion, InputTimeout, RequirementEvent},
@@ -144,13 +130,22 @@ pub mod events {
         undelivered::Undelivered,
     };
 
-    pub use crate::{
-        ndl::{IdleApp, LossReason, NodeEvent, Trouble, TroubledApp},
-        sync::{DirectoryEntry, DirectoryEvent},
+    pub use sinew_model::directory::{DirectoryEntry, DirectoryEvent};
+    pub use sinew_model::facts::{LossReason, NodeEvent, Trouble};
+    pub use sinew_ndl::{IdleApp, TroubledApp};
+}
+
+/// A node: start, stop, status.
+pub mod node {
+    #[doc(inline)]
+    pub use sinew_node::{
+        AccessError, AccessSummary, AuditError, CommandError, DenyListError, DenyListSummary, LifeState,
+        MailboxState, Node, NodeBuilder, NodeEnd, NodeHandle, OutletCounts, RegisterError, StartError,
+        Supervised, Supervises, SupervisionTree, Traffic,
     };
 }
 
-/// Messages: their types and classes, how they are sent, and what becomes of them.
+/// Messages: their types and classes, how they are sent, and their outcomes.
 pub mod message {
     pub use sinew_runtime::{
         outcome::{MemberOutcome, Outcome, Rejection},
@@ -162,13 +157,24 @@ pub mod message {
     };
 }
 
-/// Supervision: where an actor runs, when it is restarted, and what happens when that does not help.
+/// Security between nodes: identities, certificates and keys. `sinew keys` makes all of the files.
+pub mod security {
+    #[doc(inline)]
+    pub use sinew_security::{
+        Certificate, Checker, CredentialError, CredentialFaults, Credentials, DenyList, DenyListEntryError,
+        DiscoveryKey, Identity, Judged, MalformedCertificateError, PROTOCOL, Peer, PeerError, Sealer, Serial,
+        Stamp, Tag, TimePolicy, Tls, UnixTime, Validity, ValidityError, Verdict, date, files, project_of,
+        project_uri, rustls, words,
+    };
+}
+
+/// Supervision: where an actor runs, when it is restarted, and how failures escalate if restarts do not help.
 pub mod supervision {
     pub use sinew_runtime::supervision::{
-        AutoShutdown, Place, ReadyGate, Reason, Refusal, Restart, StartRetry, Strategy,
+        AutoShutdown, ChildCommandError, Place, ReadyGate, Reason, Restart, StartRetry, Strategy,
     };
 
-    pub use crate::node::SupervisorSpec;
+    pub use sinew_node::SupervisorSpec;
 }
 
 /// Time, timers, and the clocks of other nodes.
@@ -178,7 +184,7 @@ pub mod time {
         time::Time,
     };
 
-    pub use crate::clocks::{ClockDrift, ClockOffset};
+    pub use sinew_model::clocks::{ClockDrift, ClockOffset};
 }
 
 /// Everything that an ordinary program needs, in one line: `use sinew::prelude::*;`

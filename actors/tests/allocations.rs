@@ -1,4 +1,5 @@
-//! Messages between nodes cost no memory: once their number under way no longer grows, nothing is allocated for one, at either end.
+//! Messages between nodes need no allocation, at either end, once the number of messages in flight no longer
+//! grows.
 
 #![expect(clippy::unwrap_used, reason = "a test says what failed by failing")]
 
@@ -25,24 +26,24 @@ use sinew::{
 };
 use stats_alloc::{INSTRUMENTED_SYSTEM, StatsAlloc};
 
-/// Counts what all threads allocate, so that both ends are counted.
+/// Counts allocations of all threads, so that both ends are counted.
 #[global_allocator]
 static MEMORY: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
 
-/// The count is the process's: one test at a time.
+/// The count covers the whole process: one test at a time.
 static TURN: Mutex<()> = Mutex::new(());
 
 /// No wait is longer.
 const DEADLINE: Duration = Duration::from_secs(120);
 /// Windows after which queues and buffers have grown as far as they will.
 const WARM_UP: usize = 20;
-/// Messages that are looked at together: more than are acknowledged at once. The count is the whole process's, whose layers have their
-/// own work now and then: in most of the windows they have none.
+/// Messages per measured window: more than are acknowledged at once. The count covers the whole process, and
+/// its layers have occasional work of their own. Most windows contain none of it.
 const WINDOW: usize = 200;
 /// Windows that are counted.
 const WINDOWS: usize = 30;
-/// Messages of a part of a window. Where others take the CPUs a window lasts so long that the layers, whose work goes by time and comes at once,
-/// do some in most of them; in most parts they do none.
+/// Messages per part of a window. On a busy machine a window lasts so long that most windows contain periodic
+/// work of the layers. Most parts contain none.
 const PART: usize = 20;
 const PARTS: usize = WINDOW / PART;
 
@@ -63,7 +64,7 @@ impl<const N: usize> Payload for Load<N> {
     const CLASS: Class = Class::Bulk;
 }
 
-/// A payload of `N` bytes in class Stream, which goes by datagram where it fits into one.
+/// A payload of `N` bytes in class Stream, sent by datagram if it fits into one.
 #[derive(Serialize, Deserialize)]
 struct Setpoint<const N: usize>(ByteArray<N>);
 
@@ -95,7 +96,8 @@ impl<const N: usize> Filled for Setpoint<N> {
     }
 }
 
-/// Says that something was handled; sent back, that whatever went before it the same way has come.
+/// Reports that a message was handled. Its echo shows that everything sent before on the same path has
+/// arrived.
 #[derive(Serialize, Deserialize)]
 struct Word;
 
@@ -106,11 +108,11 @@ impl Payload for Word {
 /// How messages go.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum How {
-    /// As many as this are under way, each sent back by whoever gets it.
+    /// This number of messages is in flight; the receiver sends each one back.
     ThereAndBack(usize),
-    /// As many as this are sent, and their outcomes looked at when they are all there.
+    /// This number of messages is sent, and their outcomes are read when all of them are there.
     ConfirmedAndLookedAt(usize),
-    /// As many as this are under way, and the outcome of each is awaited in turn.
+    /// This number of messages is in flight, and the outcome of each is awaited in turn.
     ConfirmedAndAwaited(usize),
 }
 
@@ -119,7 +121,7 @@ fn allocated() -> usize {
     stats.allocations + stats.reallocations
 }
 
-/// What was allocated in each part of a window, but for those of the warm-up.
+/// Allocations in each part of a window, without the warm-up.
 struct Windows {
     messages: usize,
     before: usize,
@@ -149,13 +151,13 @@ impl Windows {
     }
 }
 
-/// Sends from one node, and counts.
+/// The sending application, which counts.
 struct Here<P> {
     how: How,
     windows: Windows,
-    /// What was sent and not looked at.
+    /// Sent messages with unread outcomes.
     under_way: Vec<Confirmation>,
-    /// Words that have come since.
+    /// Words received since then.
     words: usize,
     payload: PhantomData<fn() -> P>,
 }
@@ -165,14 +167,14 @@ impl<P: Filled> Here<P> {
         Self { how, windows: Windows::new(done), under_way: Vec::new(), words: 0, payload: PhantomData }
     }
 
-    /// Sends `count`, of which each is followed by a word when it is handled.
+    /// Sends `count` messages; the receiver answers each with a word when it is handled.
     fn send_confirmed(&mut self, there: Tid, count: usize, sender: &Sender) {
         self.words = 0;
         let sent = (0..count).map(|_| sender.message(there, &P::filled()).confirmed(DEADLINE).unwrap());
         self.under_way.extend(sent);
     }
 
-    /// Sends, and awaits the outcome of the oldest one, with `count` under way.
+    /// Sends messages with `count` in flight, and awaits the oldest outcome each time.
     async fn send_and_await(sender: Sender, there: Tid, count: usize, mut windows: Windows) {
         let send = || sender.message(there, &P::filled()).confirmed(DEADLINE).unwrap();
         let mut under_way: VecDeque<_> = (0..count).map(|_| send()).collect();
@@ -224,7 +226,8 @@ impl<P: Filled> Handler<Delivery<Word>> for Here<P> {
         if self.words < count {
             return;
         }
-        // An outcome is told at the end of all that was read with it: what is asked for after that comes behind it.
+        // Outcomes are delivered after all messages of the same read. A word requested now arrives behind
+        // them.
         if self.words < count + 2 {
             return context.send(word.source, &Word).unwrap();
         }
@@ -232,14 +235,14 @@ impl<P: Filled> Handler<Delivery<Word>> for Here<P> {
         for confirmation in self.under_way.drain(..) {
             assert_eq!(pin!(confirmation).poll(task), Poll::Ready(Outcome::Delivered));
         }
-        // What was confirmed is counted, too.
+        // Allocations for confirmations are counted, too.
         if (0..count).all(|_| self.windows.count()) {
             self.send_confirmed(word.source, count, &context.sender());
         }
     }
 }
 
-/// Takes what comes at the other node, and says what is to be said to it.
+/// The receiving application at the other node, which also answers.
 struct There {
     how: How,
 }
@@ -252,7 +255,7 @@ impl<P: Filled> Handler<Delivery<P>> for There {
     type Result = ();
 
     fn handle(&mut self, message: Delivery<P>, context: &mut Self::Context) {
-        // Once all is counted the other node stops, and takes nothing more.
+        // After the last count the other node stops, and receives nothing more.
         let _ = match self.how {
             How::ThereAndBack(_) => context.send(message.source, &P::filled()),
             How::ConfirmedAndLookedAt(_) => context.send(message.source, &Word),
@@ -279,7 +282,7 @@ fn node(name: &str, host: u8) -> NodeBuilder {
     })
 }
 
-/// What was allocated in each part of the windows of messages between two nodes.
+/// Allocations in each part of the windows of messages between two nodes.
 fn parts<P: Filled>(how: How) -> Vec<usize> {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let (done, parts) = sync_channel(1);
@@ -295,8 +298,9 @@ fn parts<P: Filled>(how: How) -> Vec<usize> {
     parts
 }
 
-/// Values of class Stream went by datagram, but for those before the way of datagrams was known: else the connection was measured, of which
-/// the session counts what goes.
+/// Asserts that values of class Stream went by datagram, except those before the datagram path was
+/// established. Otherwise the test would have measured the connection, where the session counts sent
+/// messages.
 fn assert_goes_by_datagram<P: Payload>(here: &Node) {
     if P::CLASS == Class::Stream {
         let sessions = here.handle().audit_here().sessions;
@@ -310,8 +314,9 @@ fn assert_goes_by_datagram<P: Payload>(here: &Node) {
     }
 }
 
-/// The least that is allocated in a window, at most `bound`, and in a quarter of their parts not much more: most messages find memory that is
-/// used again, not one now and then. With `--nocapture` the rest is shown, layers' own work in it.
+/// Asserts that the best window allocates at most `bound`, and that a quarter of the parts allocate little
+/// more. So most messages reuse memory, not just some. `--nocapture` displays the other windows, including
+/// the layers' own work.
 fn assert_at_most<P: Filled>(bound: usize, length: usize, how: How) {
     let mut parts = parts::<P>(how);
     let mut windows: Vec<usize> = parts.chunks(PARTS).map(|window| window.iter().sum()).collect();
@@ -337,27 +342,27 @@ fn assert_all_at_most(bound: usize, how: How) {
 }
 
 #[test]
-fn an_unconfirmed_message_between_nodes_costs_no_memory() {
+fn unconfirmed_message_between_nodes_allocates_nothing() {
     assert_all_at_most(0, How::ThereAndBack(1));
     assert_all_at_most(0, How::ThereAndBack(16));
 }
 
 #[test]
-fn a_value_by_datagram_costs_no_memory() {
-    // Two values of a flow under way are one: the newer takes the place of the older.
+fn stream_value_by_datagram_allocates_nothing() {
+    // Two values of a flow in flight are one: the newer value replaces the older.
     assert_at_most::<Setpoint<64>>(0, 64, How::ThereAndBack(1));
     assert_at_most::<Setpoint<1000>>(0, 1000, How::ThereAndBack(1));
 }
 
 #[test]
-fn a_confirmed_message_between_nodes_and_its_outcome_cost_no_memory() {
+fn confirmed_message_and_outcome_allocate_nothing() {
     assert_all_at_most(0, How::ConfirmedAndLookedAt(1));
     assert_all_at_most(0, How::ConfirmedAndLookedAt(16));
 }
 
 #[test]
-fn an_outcome_that_is_awaited_costs_the_timer_of_its_deadline_and_nothing_else() {
-    // A window's first message may find the timer of the one before it not given back yet.
+fn awaited_outcome_allocates_only_its_timer() {
+    // The first message of a window may find the previous timer still in use.
     let of_the_edge = 2;
     assert_all_at_most(WINDOW + of_the_edge, How::ConfirmedAndAwaited(1));
 }

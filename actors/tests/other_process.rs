@@ -21,7 +21,7 @@ const SOCKET: &str = "SINEW_TEST_SOCKET";
 payload!("test.angle" => struct Angle { degrees: f32 });
 payload!("test.twice" => struct Twice { degrees: f32 });
 
-/// In the node's process: requires the sensor, and tells the test what it sees.
+/// The application in the node's process: requires the sensor, and reports its observations to the test.
 struct Drive(SyncSender<String>);
 
 impl Actor for Drive {
@@ -67,7 +67,7 @@ fn start_node(socket: &Path) -> (Node, Receiver<String>) {
     (node, seen)
 }
 
-/// Sends to a name that nobody has, and says what the error shows.
+/// Sends to an unregistered name, and reports the text of the error.
 struct Misspelt(SyncSender<String>);
 
 impl Actor for Misspelt {
@@ -81,7 +81,7 @@ impl Actor for Misspelt {
 
 // spec: LNCL-19
 #[test]
-fn a_send_to_a_misspelt_name_shows_the_nearest_ones() {
+fn misspelt_name_suggests_nearest_ones() {
     let directory = Directory(std::env::temp_dir().join(format!("sinew-nearest-{}", std::process::id())));
     let socket = directory.0.join("knee.sock");
     let (say, seen) = sync_channel(64);
@@ -105,7 +105,7 @@ fn a_send_to_a_misspelt_name_shows_the_nearest_ones() {
     let ApiError::UnknownName { name, nearest } = error else { panic!("{text}") };
     assert_eq!((&*name, nearest), ("sensro", vec!["sensor".to_owned()]));
     assert!(text.starts_with("no application is called 'sensro' now; nearest: sensor; "), "{text}");
-    // A loop that goes on sending there has the node compare names once a second.
+    // A loop that keeps sending to this name makes the node compare names only once a second.
     let again = endpoint.send("sensro", &Angle { degrees: 1.0 });
     assert!(matches!(again, Err(ApiError::UnknownName { nearest, .. }) if nearest.is_empty()));
     node.stop();
@@ -134,7 +134,7 @@ impl Drop for Directory {
 }
 
 #[test]
-fn an_application_in_another_process_is_waited_for_heard_and_missed_when_it_is_killed() {
+fn requirement_is_awaited_lost_and_met_again() {
     let directory = Directory(std::env::temp_dir().join(format!("sinew-process-{}", std::process::id())));
     let socket = directory.0.join("knee.sock");
     let (node, seen) = start_node(&socket);
@@ -144,13 +144,13 @@ fn an_application_in_another_process_is_waited_for_heard_and_missed_when_it_is_k
     expect(&seen, "started");
     expect(&seen, "angle 12.5");
 
-    // `kill` is SIGKILL: the process says nothing more.
+    // `kill` is SIGKILL: the process sends nothing more.
     sensor.kill().unwrap();
     sensor.wait().unwrap();
     expect(&seen, "Lost { name: \"sensor\" }");
 
     let mut sensor = start_process("sensor", &socket);
-    // The sync manager says the one and the sensor the other, in any order.
+    // One report comes from the sync manager and the other from the sensor, in any order.
     let mut both = [seen.recv_timeout(WATCHDOG).unwrap(), seen.recv_timeout(WATCHDOG).unwrap()];
     both.sort();
     assert_eq!(both, ["Met { name: \"sensor\" }", "angle 12.5"]);
@@ -161,17 +161,17 @@ fn an_application_in_another_process_is_waited_for_heard_and_missed_when_it_is_k
 }
 
 #[test]
-fn an_application_in_another_process_waits_for_one_in_the_nodes() {
+fn process_application_waits_for_its_requirement() {
     let directory = Directory(std::env::temp_dir().join(format!("sinew-waits-{}", std::process::id())));
     let socket = directory.0.join("knee.sock");
     let (node, seen) = start_node(&socket);
     let api = NodeApi::connect(&socket).unwrap();
-    // Given: what it requires waits itself, for a sensor that is not there.
+    // Given: the required application waits itself, for a sensor that does not exist.
     let hip = Registration::new().name("hip").requires(["drive"]);
-    // Long enough for the node to say what is waited for.
+    // Long enough for the node to report the missing requirement.
     let early = api.register_transport_address(hip.clone().deadline(Duration::from_secs(1)));
     assert!(early.unwrap_err().to_string().contains("drive"));
-    // When: the sensor comes.
+    // When: the sensor registers.
     let _sensor = api.register_transport_address(Registration::new().name("sensor")).unwrap();
     expect(&seen, "started");
     // Then
@@ -179,7 +179,7 @@ fn an_application_in_another_process_waits_for_one_in_the_nodes() {
     node.stop();
 }
 
-/// Asks `look` again until it finds something.
+/// Repeats `look` until it returns a value.
 fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     let deadline = std::time::Instant::now() + WATCHDOG;
     loop {
@@ -204,7 +204,7 @@ fn comes_back_to_a_killed_node(transport: Transport) {
     // When
     node.kill().unwrap();
     node.wait().unwrap();
-    // Then: it is said once by `receive`, and by each send
+    // Then: `receive` reports it once, and so does each send
     let told = until("word of the node's end", || endpoint.receive(Duration::from_millis(5)).err());
     assert!(matches!(told, ApiError::Disconnected(_)), "{told}");
     let told = endpoint.send(tid, &Angle { degrees: 1.0 }).unwrap_err();
@@ -213,7 +213,7 @@ fn comes_back_to_a_killed_node(transport: Transport) {
     assert_eq!(endpoint.registrations(), 1);
     // When
     let mut node = start_process("lone_node", &socket);
-    // Then: it is back behind its name and address, for whoever sends to it
+    // Then: it has reconnected with its name and address, and any sender reaches it
     until("the endpoint's return", || {
         endpoint.receive(Duration::from_millis(50)).unwrap();
         (endpoint.registrations() == 2).then_some(())
@@ -231,17 +231,17 @@ fn comes_back_to_a_killed_node(transport: Transport) {
 }
 
 #[test]
-fn an_endpoint_at_rings_comes_back_to_a_node_that_was_killed_and_started_again() {
+fn ring_endpoint_reconnects_to_restarted_node() {
     comes_back_to_a_killed_node(Transport::Ring);
 }
 
 #[test]
-fn an_endpoint_at_a_socket_comes_back_to_a_node_that_was_killed_and_started_again() {
+fn socket_endpoint_reconnects_to_restarted_node() {
     comes_back_to_a_killed_node(Transport::Socket);
 }
 
 #[test]
-fn an_endpoint_of_a_task_comes_back_to_a_node_that_was_killed_and_started_again() {
+fn task_endpoint_reconnects_to_restarted_node() {
     for transport in [Transport::Ring, Transport::Socket] {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(a_task_comes_back(transport));
@@ -262,20 +262,21 @@ async fn a_task_comes_back(transport: Transport) {
     // When
     node.kill().unwrap();
     node.wait().unwrap();
-    // Then: who waits is told at once, and each send
+    // Then: the pending receive fails at once, and so does each send
     let told =
         tokio::time::timeout(WATCHDOG, endpoint.receive()).await.expect("word of the end").unwrap_err();
     assert!(matches!(told, ApiError::Disconnected(_)), "{told}");
     let told = endpoint.send(tid, &Angle { degrees: 1.0 }).await.unwrap_err();
     assert!(matches!(told, ApiError::Disconnected(_)), "{told}");
-    // When: the node comes back while it waits
+    // When: the node returns while the endpoint waits
     let mut node = start_process("lone_node", &socket);
-    // Its address is of another range: who comes first has the former dynamic one.
+    // A fixed address is of another range: the first dynamic registration gets the former dynamic one.
     let fixed = Registration::new().fixed_address(AppAddress::fixed(9).unwrap());
     let other = tokio::task::spawn_blocking(move || {
         let mut other = until("the door", || api.register_transport_address(fixed.clone()).ok());
         until("the name", || other.resolve("drive", WATCHDOG).unwrap());
-        // A group's members say so after they have registered: until one hears it.
+        // Group membership is announced after the registration: the sender repeats until a member receives
+        // it.
         move || other.send(Tid::group("drives"), &Angle { degrees: 2.0 }).unwrap()
     });
     let mut send = tokio::time::timeout(WATCHDOG, async {
@@ -286,7 +287,7 @@ async fn a_task_comes_back(transport: Transport) {
     })
     .await
     .expect("it comes back while it waits");
-    // Then: it is who it was, and where it was
+    // Then: it has its former name and address
     let received = tokio::time::timeout(WATCHDOG, async {
         loop {
             send();
@@ -316,7 +317,7 @@ fn lone_node() {
         })
         .start()
         .unwrap();
-    // Until it is killed; not for ever if the test is.
+    // Until it is killed; not forever if the test is.
     std::thread::sleep(2 * WATCHDOG);
 }
 

@@ -1,4 +1,4 @@
-//! `sinew apps` and `sinew barriers`: every application, and who waits for whom, at the start and at run time.
+//! `sinew apps` and `sinew barriers`: every application, and which ones wait for which, at the start and at run time.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,21 +10,25 @@ use sinew::{
 
 use crate::{
     Report,
-    system::{Answer, Fault, System},
+    system::{Answer, System, SystemError},
     table::{Table, clean, or_dash, time},
 };
 
-/// Payloads of one application that stand in the table.
+/// Maximum number of payload types of one application in the table.
 const KINDS_SHOWN: usize = 2;
-/// Characters of the name of each.
+/// Maximum characters of the name of each.
 const KIND_WIDTH: usize = 32;
 
 /// Asks every node for its applications.
-pub(crate) fn show(system: &mut System, is_wide: bool) -> Result<Report, Fault> {
-    let answers = ask(system)?;
-    let mut table = Table::new(["TID", "NAME", "NODE", "STATE", "HANDLES", "DETAIL"]).wide(is_wide);
+pub(crate) fn show(system: &mut System, is_wide: bool) -> Result<Report, SystemError> {
+    Ok(listed(&ask(system)?, is_wide))
+}
+
+fn listed(answers: &[Answer<AppsReport>], is_wide: bool) -> Report {
+    let heading = ["TID", "NAME", "NODE", "STATE", "HANDLES", "DETAIL"];
+    let mut table = Table::new(heading).whole(&["TID", "STATE"]).wide(is_wide);
     let mut rows = Vec::new();
-    for (node, app) in all(&answers) {
+    for (node, app) in all(answers) {
         table.row([
             app.tid.to_string(),
             or_dash(app.name.clone()),
@@ -36,19 +40,19 @@ pub(crate) fn show(system: &mut System, is_wide: bool) -> Result<Report, Fault> 
         rows.push(app_json(node, app));
     }
     let shown = Shown::Apps;
-    let is_ready = all(&answers).all(|(_, app)| app.ready && app.missing.is_empty());
-    let is_fine = is_ready && shown.is_complete(&answers);
-    let text = table.text() + &shown.silent(&answers);
-    let (left_out, silent) = (shown.left_out_json(&answers), silent_json(&answers));
-    Ok(Report { text, json: json!({ "apps": rows, "left_out": left_out, "silent": silent }), is_fine })
+    let is_ready = all(answers).all(|(_, app)| app.ready && app.missing.is_empty());
+    let is_fine = is_ready && shown.is_complete(answers);
+    let text = table.text() + &shown.silent(answers);
+    let (left_out, silent) = (shown.left_out_json(answers), silent_json(answers));
+    Report { text, json: json!({ "apps": rows, "left_out": left_out, "silent": silent }), is_fine }
 }
 
-/// Asks every node who waits there, and says who is waited for.
-pub(crate) fn barriers(system: &mut System) -> Result<Report, Fault> {
-    Ok(who_waits(&ask(system)?))
+/// Asks every node for its waiting applications and their missing requirements.
+pub(crate) fn barriers(system: &mut System, is_wide: bool) -> Result<Report, SystemError> {
+    Ok(waiting(&ask(system)?, is_wide))
 }
 
-fn who_waits(answers: &[Answer<AppsReport>]) -> Report {
+fn waiting(answers: &[Answer<AppsReport>], is_wide: bool) -> Report {
     let shown = Shown::Barriers;
     let waiting: Vec<_> = all(answers).filter(|(_, app)| !app.missing.is_empty()).collect();
     let mut blocked: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
@@ -64,67 +68,69 @@ fn who_waits(answers: &[Answer<AppsReport>]) -> Report {
         }
     }
     let meetings = meetings(answers);
-    let is_anybody_told = !waiting.is_empty() || !meetings.is_empty();
-    let is_fine = !is_anybody_told && shown.is_complete(answers);
+    let is_any_shown = !waiting.is_empty() || !meetings.is_empty();
+    let is_fine = !is_any_shown && shown.is_complete(answers);
     let waiters = waiting.iter().map(|(node, app)| app_json(node, app)).collect::<Vec<_>>();
     let blockers = blocked
         .iter()
-        .map(|(name, who)| json!({ "name": name, "since_us": since[name], "why": reasons[name], "blocks": who }))
+        .map(|(name, apps)| json!({ "name": name, "since_us": since[name], "why": reasons[name], "blocks": apps }))
         .collect::<Vec<_>>();
     let json = json!({
         "waiting": waiters, "missing": blockers, "barriers": meetings.iter().map(|(node, one)| meeting_json(node, one)).collect::<Vec<_>>(),
         "left_out": shown.left_out_json(answers), "silent": silent_json(answers),
     });
     let mut text = if waiting.is_empty() {
-        // Where somebody had no room, nobody knows.
-        let is_known = !is_anybody_told && shown.left_out(answers).is_empty();
-        if is_known { "nobody waits\n".to_owned() } else { String::new() }
+        // If an answer was cut, an application may wait nevertheless.
+        let is_known = !is_any_shown && shown.left_out(answers).is_empty();
+        if is_known { "no application waits\n".to_owned() } else { String::new() }
     } else {
-        let mut table = Table::new(["WAITS", "NODE", "SINCE", "FOR"]);
+        let mut table = Table::new(["WAITS", "NODE", "SINCE", "FOR"]).whole(&["SINCE"]).wide(is_wide);
         for (node, app) in &waiting {
             let since = app.waits_us.map_or_else(|| "lost it".to_owned(), time);
             table.row([or_dash(app.name.clone()), (*node).to_owned(), since, lacks(app)]);
         }
-        let mut missing = Table::new(["MISSING", "SINCE", "WHY", "BLOCKS"]);
-        for (name, who) in &blocked {
+        let mut missing = Table::new(["MISSING", "SINCE", "WHY", "BLOCKS"]).whole(&["SINCE"]).wide(is_wide);
+        for (name, apps) in &blocked {
             missing.row([
                 (*name).to_owned(),
                 or_dash(since[name].map(time)),
                 joined(&reasons[name]),
-                joined(who),
+                joined(apps),
             ]);
         }
         format!("{}\n{}", table.text(), missing.text())
     };
     if !meetings.is_empty() {
-        let mut table = Table::new(["BARRIER", "NODE", "OPENED", "WAITS", "MISSING"]);
+        let heading = ["BARRIER", "NODE", "OPENED", "WAITS", "MISSING"];
+        let mut table = Table::new(heading).whole(&["OPENED"]).wide(is_wide);
         meetings.iter().for_each(|(node, one)| table.row(meeting_cells(node, one)));
         text += &(if text.is_empty() { table.text() } else { format!("\n{}", table.text()) });
     }
     Report { text: text + &shown.silent(answers), json, is_fine }
 }
 
-/// The run-time barriers at which somebody waits, each as every node sees it that has somebody there.
+/// Returns the run-time barriers with waiting applications, each as reported by every node with one.
 fn meetings(answers: &[Answer<AppsReport>]) -> Vec<(&str, &BarrierReport)> {
-    let said = answers.iter().filter_map(|answer| answer.said.as_ref().ok());
-    said.flat_map(|said| said.barriers.iter().map(|one| (said.name.as_str(), one))).collect()
+    let reports = answers.iter().filter_map(|answer| answer.result.as_ref().ok());
+    reports.flat_map(|report| report.barriers.iter().map(|one| (report.name.as_str(), one))).collect()
 }
 
 fn meeting_cells(node: &str, one: &BarrierReport) -> [String; 5] {
-    let waits = one.waiting.iter().map(|who| format!("{} {}", who.name, time(who.waits_us)));
+    let waits = one.waiting.iter().map(|one| format!("{} {}", one.name, time(one.waits_us)));
     let waits: Vec<_> = waits.chain(more(one.waiting_left_out)).collect();
     let missing: Vec<_> = one.missing.iter().map(meeting_lacks).chain(more(one.missing_left_out)).collect();
     let opened = if one.is_phase { "phase".to_owned() } else { one.generation.to_string() };
     [one.name.clone(), node.to_owned(), opened, waits.join(", "), missing.join(", ")]
 }
 
-fn meeting_lacks(who: &Missing) -> String {
-    let since = who.since_us.map_or_else(String::new, |since| format!("; {}", time(since)));
-    format!("{} ({}{since})", who.name, who.why)
+fn meeting_lacks(missing: &Missing) -> String {
+    let since = missing.since_us.map_or_else(String::new, |since| format!("; {}", time(since)));
+    format!("{} ({}{since})", missing.name, missing.why)
 }
 
 fn meeting_json(node: &str, one: &BarrierReport) -> Value {
-    let waiting = one.waiting.iter().map(|who| json!({ "name": who.name, "waits_us": who.waits_us }));
+    let waiting =
+        one.waiting.iter().map(|waiter| json!({ "name": waiter.name, "waits_us": waiter.waits_us }));
     let missing = one.missing.iter().map(missing_json);
     json!({
         "name": one.name, "node_name": node, "parties": one.parties, "is_phase": one.is_phase, "generation": one.generation,
@@ -138,22 +144,22 @@ fn missing_json(of: &Missing) -> Value {
     json!({ "name": name, "why": why, "since_us": since_us })
 }
 
-fn ask(system: &mut System) -> Result<Vec<Answer<AppsReport>>, Fault> {
+fn ask(system: &mut System) -> Result<Vec<Answer<AppsReport>>, SystemError> {
     let here = system.here()?;
     let mut answers = system.ask_all::<AskApps, AppsReport>(&here);
-    // Those that only ask are no part of the system that is shown.
+    // Applications that only ask are not part of the shown system.
     for answer in &mut answers {
-        if let Ok(said) = &mut answer.said {
-            said.apps.retain(|app| !system.own.contains(&app.tid));
+        if let Ok(report) = &mut answer.result {
+            report.apps.retain(|app| !system.own.contains(&app.tid));
         }
     }
     Ok(answers)
 }
 
-/// Each with the name of its node.
+/// Returns each application with the name of its node.
 fn all(answers: &[Answer<AppsReport>]) -> impl Iterator<Item = (&str, &AppReport)> {
-    let said = answers.iter().filter_map(|answer| answer.said.as_ref().ok());
-    said.flat_map(|said| said.apps.iter().map(|app| (said.name.as_str(), app)))
+    let reports = answers.iter().filter_map(|answer| answer.result.as_ref().ok());
+    reports.flat_map(|report| report.apps.iter().map(|app| (report.name.as_str(), app)))
 }
 
 const fn state(app: &AppReport) -> &'static str {
@@ -165,7 +171,7 @@ const fn state(app: &AppReport) -> &'static str {
     }
 }
 
-/// What it handles, as much of it as a table has room for.
+/// Returns the types that it handles, as many as fit into a table.
 fn handles(app: &AppReport) -> Option<String> {
     let shown = app.kinds.iter().take(KINDS_SHOWN).map(|kind| {
         let name = kind_name(kind);
@@ -180,7 +186,7 @@ fn handles(app: &AppReport) -> Option<String> {
     (!words.is_empty()).then(|| words.join(", "))
 }
 
-/// Of how many there are more than are shown.
+/// Returns the number of further ones, if any.
 fn more(count: u64) -> Option<String> {
     (count > 0).then(|| format!("{count} more"))
 }
@@ -189,7 +195,7 @@ fn kind_name(of: &KindReport) -> String {
     of.name.clone().unwrap_or_else(|| of.kind.to_string())
 }
 
-/// Why it is not ready, in words.
+/// Returns why it is not ready, as text.
 pub(crate) fn why(app: &AppReport) -> String {
     let mut parts = Vec::new();
     match app.waits_us {
@@ -232,7 +238,7 @@ fn app_json(node: &str, app: &AppReport) -> Value {
     })
 }
 
-/// What a command shows of the answers.
+/// The part of the answers that a command shows.
 #[derive(Clone, Copy)]
 enum Shown {
     /// Applications alone.
@@ -241,7 +247,7 @@ enum Shown {
     Barriers,
 }
 
-/// What had no room in the answer of a node.
+/// Number of entries that did not fit into the answer of a node.
 struct LeftOut {
     node: NodeAddress,
     apps: u64,
@@ -249,25 +255,25 @@ struct LeftOut {
 }
 
 impl Shown {
-    /// Of what is shown, for each node that has left anything of it out.
+    /// Returns the numbers of left-out entries of the shown kind, for each node with any.
     fn left_out(self, answers: &[Answer<AppsReport>]) -> Vec<LeftOut> {
         let of = |answer: &Answer<AppsReport>| {
-            let said = answer.said.as_ref().ok()?;
+            let report = answer.result.as_ref().ok()?;
             let barriers = match self {
                 Self::Apps => 0,
-                Self::Barriers => said.barriers_left_out,
+                Self::Barriers => report.barriers_left_out,
             };
-            let left_out = LeftOut { node: answer.node, apps: said.left_out, barriers };
+            let left_out = LeftOut { node: answer.node, apps: report.left_out, barriers };
             (left_out.apps > 0 || left_out.barriers > 0).then_some(left_out)
         };
         answers.iter().filter_map(of).collect()
     }
 
     fn is_complete(self, answers: &[Answer<AppsReport>]) -> bool {
-        answers.iter().all(|answer| answer.said.is_ok()) && self.left_out(answers).is_empty()
+        answers.iter().all(|answer| answer.result.is_ok()) && self.left_out(answers).is_empty()
     }
 
-    /// The nodes that have not answered, or not all.
+    /// Returns the nodes that have not answered, or not completely.
     fn silent(self, answers: &[Answer<AppsReport>]) -> String {
         let mut lines = String::new();
         for LeftOut { node, apps, barriers } in self.left_out(answers) {
@@ -277,7 +283,7 @@ impl Shown {
                 }
             }
         }
-        let silent = answers.iter().filter_map(|answer| Some((answer, answer.said.as_ref().err()?)));
+        let silent = answers.iter().filter_map(|answer| Some((answer, answer.result.as_ref().err()?)));
         lines.extend(
             silent.map(|(answer, why)| format!("{} {}: {}\n", answer.node, clean(&answer.name), clean(why))),
         );
@@ -295,7 +301,7 @@ impl Shown {
 
 fn silent_json(answers: &[Answer<AppsReport>]) -> Value {
     let line = |answer: &Answer<AppsReport>| {
-        Some(json!({ "node": answer.node.to_string(), "why": answer.said.as_ref().err()? }))
+        Some(json!({ "node": answer.node.to_string(), "why": answer.result.as_ref().err()? }))
     };
     answers.iter().filter_map(line).collect()
 }
@@ -305,12 +311,24 @@ mod tests {
     use sinew::{AppAddress, Tid, inspect::WaitReport, message::Kind};
 
     use super::*;
+    use crate::table::{
+        WIDTH,
+        tests::{long_name, widest},
+    };
 
-    /// A node that says this of its barriers, and has no application.
+    /// The answer of a node with these barriers and no application.
     fn answer(barriers: Vec<BarrierReport>, [left_out, barriers_left_out]: [u64; 2]) -> Answer<AppsReport> {
         let name = "knee".to_owned();
-        let said = AppsReport { name: name.clone(), apps: Vec::new(), left_out, barriers, barriers_left_out };
-        Answer { node: NodeAddress::new(2), name, said: Ok(said) }
+        let report = AppsReport {
+            name: name.clone(),
+            apps: Vec::new(),
+            left_out,
+            barriers,
+            barriers_left_out,
+            groups: Vec::new(),
+            groups_left_out: 0,
+        };
+        Answer { node: NodeAddress::new(2), name, result: Ok(report) }
     }
 
     fn barrier() -> BarrierReport {
@@ -326,34 +344,76 @@ mod tests {
         }
     }
 
-    #[test]
-    fn barriers_that_had_no_room_in_an_answer_are_told_with_their_number() {
-        let line = "0.0.0.2: 6 further barriers had no room in its answer\n";
-        let said = who_waits(&[answer(vec![barrier()], [0, 6])]);
-        assert!(!said.is_fine && said.text.ends_with(line), "{}", said.text);
-        assert_eq!(said.json["left_out"], json!([{ "node": "0.0.0.2", "apps": 0, "barriers": 6 }]));
-        // Who waits at one that is not shown is not nobody.
-        let said = who_waits(&[answer(Vec::new(), [0, 6])]);
-        assert_eq!((said.is_fine, said.text.as_str()), (false, line));
-        let said = who_waits(&[answer(Vec::new(), [2, 0])]);
-        let line = "0.0.0.2: 2 further applications had no room in its answer\n";
-        assert_eq!((said.is_fine, said.text.as_str()), (false, line));
-        let said = who_waits(&[answer(Vec::new(), [0, 0])]);
-        assert_eq!((said.is_fine, said.text.as_str()), (true, "nobody waits\n"));
-        assert_eq!(said.json["left_out"], json!([]));
+    fn waited(answers: &[Answer<AppsReport>]) -> Report {
+        waiting(answers, false)
     }
 
     #[test]
-    fn those_of_a_barrier_that_had_no_room_are_told_with_their_number() {
+    fn tables_fit_a_terminal_for_any_names() {
+        let name = long_name();
+        let missing = Missing {
+            name: name.clone(),
+            why: format!("not there; nearest: {name}"),
+            since_us: Some(90_000_000_000),
+        };
+        let kinds = [&*name, &name, &name];
+        let app = AppReport {
+            tid: Tid::new(NodeAddress::from([192, 168, 100, 200]), AppAddress::new(0x8000_0001)),
+            name: Some(name.clone()),
+            ready: false,
+            waits_us: Some(90_000_000_000),
+            missing: vec![missing.clone(), missing.clone()],
+            ended: Some("it panicked: no encoder at /dev/ttyUSB0".to_owned()),
+            ..app(&kinds, 7)
+        };
+        let waits = WaitReport { name: name.clone(), waits_us: 90_000_000_000 };
+        let barrier =
+            BarrierReport { name: name.clone(), waiting: vec![waits], missing: vec![missing], ..barrier() };
+        let report = AppsReport {
+            name: name.clone(),
+            apps: vec![app],
+            left_out: 0,
+            barriers: vec![barrier],
+            barriers_left_out: 0,
+            groups: Vec::new(),
+            groups_left_out: 0,
+        };
+        let answers = [Answer { node: NodeAddress::new(2), name, result: Ok(report) }];
+        for show in [listed, waiting] {
+            let text = show(&answers, false).text;
+            assert!(widest(&text) <= WIDTH, "{text}");
+            assert!(widest(&show(&answers, true).text) > WIDTH);
+        }
+        assert!(listed(&answers, false).text.contains("192.168.100.200/80000001  "));
+    }
+
+    #[test]
+    fn left_out_barriers_are_counted() {
+        let line = "0.0.0.2: 6 further barriers had no room in its answer\n";
+        let report = waited(&[answer(vec![barrier()], [0, 6])]);
+        assert!(!report.is_fine && report.text.ends_with(line), "{}", report.text);
+        assert_eq!(report.json["left_out"], json!([{ "node": "0.0.0.2", "apps": 0, "barriers": 6 }]));
+        let report = waited(&[answer(Vec::new(), [0, 6])]);
+        assert_eq!((report.is_fine, report.text.as_str()), (false, line));
+        let report = waited(&[answer(Vec::new(), [2, 0])]);
+        let line = "0.0.0.2: 2 further applications had no room in its answer\n";
+        assert_eq!((report.is_fine, report.text.as_str()), (false, line));
+        let report = waited(&[answer(Vec::new(), [0, 0])]);
+        assert_eq!((report.is_fine, report.text.as_str()), (true, "no application waits\n"));
+        assert_eq!(report.json["left_out"], json!([]));
+    }
+
+    #[test]
+    fn left_out_parties_of_a_barrier_are_counted() {
         let one = BarrierReport { waiting_left_out: 3, missing_left_out: 5, ..barrier() };
         let [.., waits, missing] = meeting_cells("knee", &one);
         assert!(waits.ends_with(", 3 more") && missing.ends_with(", 5 more"), "{waits}; {missing}");
-        let said = meeting_json("knee", &one);
-        assert_eq!((&said["waiting_left_out"], &said["missing_left_out"]), (&3.into(), &5.into()));
+        let json = meeting_json("knee", &one);
+        assert_eq!((&json["waiting_left_out"], &json["missing_left_out"]), (&3.into(), &5.into()));
     }
 
     #[test]
-    fn applications_are_all_told_though_barriers_had_no_room_beside_them() {
+    fn complete_applications_are_shown_despite_left_out_barriers() {
         let answers = [answer(Vec::new(), [0, 6])];
         assert!(Shown::Apps.is_complete(&answers) && Shown::Apps.silent(&answers).is_empty());
         assert_eq!(Shown::Apps.left_out_json(&answers), json!([]));
@@ -381,7 +441,7 @@ mod tests {
     }
 
     #[test]
-    fn what_an_application_handles_has_a_bounded_place_in_the_table_and_all_of_it_in_json() {
+    fn handled_types_are_bounded_in_the_table_only() {
         assert_eq!(handles(&app(&[], 0)), None);
         assert_eq!(handles(&app(&[], 7)).as_deref(), Some("7 more"));
         assert_eq!(handles(&app(&["gait.step"], 0)).as_deref(), Some("gait.step"));
@@ -390,8 +450,8 @@ mod tests {
         let many = app(&["gait.step", "gait.a_name_that_is_longer_than_a_cell", "c", "d"], 1);
         let expected = "gait.step, gait.a_name_that_is_longer_th..., 3 more";
         assert_eq!(handles(&many).as_deref(), Some(expected));
-        let said = app_json("knee", &many);
-        assert_eq!(said["kinds"].as_array().map(Vec::len), Some(4));
-        assert_eq!((&said["kinds"][3]["kind"], &said["kinds_left_out"]), (&"d".into(), &1.into()));
+        let json = app_json("knee", &many);
+        assert_eq!(json["kinds"].as_array().map(Vec::len), Some(4));
+        assert_eq!((&json["kinds"][3]["kind"], &json["kinds_left_out"]), (&"d".into(), &1.into()));
     }
 }

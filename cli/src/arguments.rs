@@ -1,4 +1,4 @@
-//! What can be said on the command line.
+//! The command line.
 
 use std::{path::PathBuf, time::Duration};
 
@@ -6,18 +6,21 @@ use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
 use crate::{keys, send, watch, why};
 
-/// Shows a running Sinew system, from any one node of it. It changes nothing, but for what `send` sends, and the files of `keys`.
+/// Shows a running Sinew system, from any one node of it. It changes nothing, except that `send` sends
+/// messages and `keys` writes files.
 ///
-/// It comes in through the socket of a node on this machine (`lncl.socket` in the node's configuration) and asks that node, and through
-/// it all others.
+/// It connects to the socket of a node on this machine (`lncl.socket` in the node's configuration) and asks
+/// that node, and through it all others.
 #[derive(Debug, Parser)]
 #[command(name = "sinew", version, after_help = AFTER)]
 pub(crate) struct Arguments {
-    /// The socket of a node on this machine. Without it: $SINEW_SOCKET, else the first that answers of $XDG_RUNTIME_DIR/sinew/*.sock,
-    /// /run/sinew/*.sock, /tmp/sinew-*.sock; of these only one that belongs to this user or root, as does who listens there
+    /// The socket of a node on this machine. Without it: $SINEW_SOCKET, else the first that answers of
+    /// $XDG_RUNTIME_DIR/sinew/*.sock, /run/sinew/*.sock, /tmp/sinew-*.sock; of these only one of this user or
+    /// root, with a listening process of this user or root
     #[arg(long, global = true, value_name = "PATH")]
     pub(crate) socket: Option<PathBuf>,
-    /// Print JSON instead of tables; where the command cannot be carried out, an object whose `fault` says why, beside the words on stderr
+    /// Print JSON instead of tables; where the command cannot be carried out, an object with the reason as
+    /// `fault`, beside the text on stderr
     #[arg(long, global = true)]
     pub(crate) json: bool,
     /// Show all columns, and do not wrap lines at 120 columns
@@ -26,12 +29,12 @@ pub(crate) struct Arguments {
     /// How long each node has for its answer
     #[arg(long, global = true, value_name = "MS", default_value_t = 2_000, value_parser = clap::value_parser!(u32).range(1..=60_000))]
     deadline_ms: u32,
-    /// What to show
+    /// The command to run
     #[command(subcommand)]
     pub(crate) command: Command,
 }
 
-/// What to show.
+/// The commands.
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
     /// Shows every node: address, name, up time, state, validity of its keys (or OPEN), links and round-trip time
@@ -55,13 +58,15 @@ pub(crate) enum Command {
     },
     /// Measures the round-trip time of a confirmed message
     ///
-    /// The ping goes to the application's own thread, or to the node's inspection, and is answered there without the application's code.
-    /// An application in a process of its own that came in through a socket answers it when it receives.
+    /// The ping goes to the application's own thread, or to the node's inspection, and is answered there
+    /// without the application's code. An application in a process of its own that is connected by a socket
+    /// answers it when it receives.
     #[command(after_help = r#"Examples:
   sinew ping knee.drive
   sinew ping 192.168.0.12 --count 1000"#)]
     Ping {
-        /// An application's TID (127.0.0.2/80000001) or name, a node's address or name: the first that it is, in this order
+        /// An application's TID (127.0.0.2/80000001) or name, a node's address or name: the first that it is,
+        /// in this order
         target: String,
         /// How many, each when the one before was answered; after three in a row without an answer no more
         #[arg(long, short, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
@@ -69,26 +74,30 @@ pub(crate) enum Command {
     },
     /// Sends a message to an application or a group, and shows its outcome
     ///
-    /// The payload is written as MessagePack, as every typed payload is: what its type calls its fields are the keys of the JSON object.
+    /// The payload is written as MessagePack, as every typed payload is: the keys of the JSON object are the
+    /// names of the type's fields.
     #[command(after_help = r#"Examples:
   sinew send knee.drive demo.angle '{"degrees": 5}'
   sinew send drives demo.stop                 to a group: the outcome of each member; exit code 1 if one did not take it
   sinew send knee.drive demo.status --ask     prints the reply"#)]
     Send(send::Order),
-    /// Shows what an application gets and sends: decoded payloads, type, class, source, age, and each type's rate once a second
+    /// Shows the messages that an application receives and sends: decoded payloads, type, class, source, age,
+    /// and each type's rate once a second
     ///
-    /// The copies come from the application's node, as far as it has room for them: what has none is counted, the application does not
-    /// wait. Not seen is what goes over direct links between processes (`Registration::direct`). With --json each line is an object.
+    /// The copies come from the application's node, as far as it has room for them: others are counted, and
+    /// the application does not wait. Messages over direct links between processes (`Registration::direct`)
+    /// are not shown. With --json each line is an object.
     #[command(after_help = r#"Examples:
   sinew watch knee.drive --received
-  sinew watch drives --kind demo.stop         what the members of a group get by it
+  sinew watch drives --kind demo.stop         messages to a group, at each member
   sinew watch knee.drive --rates --for 10
+  sinew watch knee.drive --wait               also where nothing has this name yet
   sinew watch knee.drive --json | jq .payload"#)]
     Watch(watch::Order),
     /// Finds out why two nodes or applications cannot communicate: each step, from both ends, with a suggested fix
     ///
-    /// All nodes are asked that can be reached through any socket of this host, so that two nodes that do not know each other are asked
-    /// both. Exit code 0 if the way is free.
+    /// All nodes are asked that can be reached through any socket of this host, so that two nodes that do not
+    /// know each other are both asked. Exit code 0 if the way is free.
     #[command(after_help = r#"Examples:
   sinew why hip knee
   sinew why gait knee.drive
@@ -101,31 +110,36 @@ pub(crate) enum Command {
     Barriers,
     /// Accounts for every message ever sent: the counters of each mailbox, client and link
     ///
-    /// Each node is read twice, and both ends of each link are compared. What nobody can explain is named, with its place or link.
+    /// Each node is read twice, and both ends of each link are compared. Each unexplained difference is
+    /// named, with its place or link.
     #[command(after_help = r#"Examples:
-  sinew audit"#)]
+  sinew audit
+  sinew audit --wide            a column for each counter"#)]
     Audit,
     /// Reloads the access list and the deny list of the local node, without a restart
     ///
-    /// A list with faults changes nothing: each is named with its line, and the list in force stays. Connections with nodes whose
-    /// certificates are on the deny list end.
+    /// A list with faults changes nothing: each is named with its line, and the list in force stays.
+    /// Connections to nodes with certificates on the deny list end.
     #[command(after_help = r#"Examples:
   sinew --socket /run/sinew/knee.sock reload"#)]
     Reload,
-    /// Checks whether this machine has what a node needs: interfaces, multicast, limits, real-time rights, CPU governor, clock, shared memory,
-    /// sockets, open nodes, expiry of certificates. Each finding has a suggested fix
+    /// Checks the requirements of a node on this machine: interfaces, multicast, limits, real-time rights,
+    /// CPU governor, clock, shared memory, sockets, open nodes, expiry of certificates. Each finding has a
+    /// suggested fix
     #[command(after_help = r#"Examples:
   sinew doctor
   sinew doctor --interface eth0"#)]
     Doctor {
-        /// Interfaces that multicast is tried on, by address or by name, or `all`, with commas between them. Without it: the
-        /// `ndl.interface` of the node that lets us in, else 127.0.0.1. What is sent does not leave this machine
+        /// Interfaces that multicast is tried on, by address or by name, or `all`, with commas between them.
+        /// Without it: the `ndl.interface` of the node that accepts this command, else 127.0.0.1. The test
+        /// messages do not leave this machine
         #[arg(long, value_name = "INTERFACE", value_delimiter = ',')]
         interface: Vec<sinew::config::Interface>,
     },
     /// Makes and shows the keys of a robot: its certificate authority, and a key and a certificate for each node
     ///
-    /// It asks no node. A node whose configuration names its keys takes only nodes with keys of the same project.
+    /// It asks no node. A node with keys in its configuration accepts only nodes with keys of the same
+    /// project.
     #[command(
         subcommand,
         after_help = r#"Examples:
@@ -143,7 +157,7 @@ pub(crate) enum Command {
     },
 }
 
-/// Commands that ask no node: they have no use for what says which node, and how long it has.
+/// Commands that send no request to a node: the options that select a node and its time limit do not apply to them.
 const ASK_NO_NODE: [&str; 2] = ["keys", "completions"];
 
 /// The command, as its help shows it.
@@ -161,7 +175,7 @@ pub(crate) fn command() -> clap::Command {
 }
 
 impl Arguments {
-    /// What stands on the command line.
+    /// Parses the command line.
     pub(crate) fn read() -> Result<Self, clap::Error> {
         let matches = command().try_get_matches()?;
         Self::from_arg_matches(&matches).map_err(|error| error.format(&mut command()))

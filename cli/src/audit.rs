@@ -9,12 +9,12 @@ use sinew::{
 
 use crate::{
     Report,
-    system::{Answer, Fault, System},
+    system::{Answer, System, SystemError},
     table::clean,
 };
 
-/// Reads every node twice, and puts that side by side.
-pub(crate) fn show(system: &mut System) -> Result<Report, Fault> {
+/// Reads every node twice, and compares the readings.
+pub(crate) fn show(system: &mut System, is_wide: bool) -> Result<Report, SystemError> {
     let here = system.here()?;
     let before = system.ask_all::<AskAudit, AuditReport>(&here);
     let after = system.ask_all::<AskAudit, AuditReport>(&here);
@@ -23,14 +23,15 @@ pub(crate) fn show(system: &mut System) -> Result<Report, Fault> {
     let audit = Audit::of_readings(here.node, &asked, &readings(before), readings(after));
     let json = serde_json::to_value(&audit).expect("every key of an audit is a text");
     let is_fine = audit.missing() == 0 && audit.silent.is_empty();
-    Ok(Report { text: format!("{audit}\n{faults}"), json, is_fine })
+    let table = if is_wide { format!("{audit:#}") } else { audit.to_string() };
+    Ok(Report { text: format!("{table}\n{faults}"), json, is_fine })
 }
 
 fn readings(answers: Vec<Answer<AuditReport>>) -> Vec<NodeAudit> {
-    answers.into_iter().filter_map(|answer| Some(answer.said.ok()?.audit)).collect()
+    answers.into_iter().filter_map(|answer| Some(answer.result.ok()?.audit)).collect()
 }
 
 fn fault(answer: &Answer<AuditReport>) -> Option<String> {
-    let why = answer.said.as_ref().err()?;
+    let why = answer.result.as_ref().err()?;
     Some(format!("{} {}: {}\n", answer.node, clean(&answer.name), clean(why)))
 }

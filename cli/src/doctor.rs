@@ -1,7 +1,8 @@
-//! `sinew doctor`: whether this machine gives a node what it needs, whether its nodes are closed to others, whether other hosts see
-//! them, and whether those of one host keep each other without a network; each finding with the command that mends it.
+//! `sinew doctor`: checks whether this machine meets the needs of a node, and whether its nodes are closed to others.
+//! It also checks whether other hosts can reach them, and whether those of one host stay connected without a network.
+//! Each finding has the command that fixes it.
 //!
-//! Every check tries the thing itself where it can, and undoes it.
+//! Every check tests the real operation if possible, and undoes it.
 
 mod clock;
 mod network;
@@ -23,35 +24,40 @@ use sinew::{
 use crate::{
     Report,
     arguments::Arguments,
-    system::{Answer, Fault, System},
-    table::{Table, clean},
+    system::{Answer, System, SystemError},
+    table::{Table, clean_lines},
 };
 
-/// What was tried.
+/// The result of a check.
 struct Check {
     name: &'static str,
-    /// What is so, in words.
-    seen: String,
-    /// What mends it; `None` where nothing is wrong.
-    mend: Option<String>,
+    /// The finding, as text.
+    detail: String,
+    /// The suggested fix; `None` if nothing is wrong.
+    fix: Option<String>,
 }
 
 impl Check {
-    const fn fine(name: &'static str, seen: String) -> Self {
-        Self { name, seen, mend: None }
+    const fn fine(name: &'static str, detail: String) -> Self {
+        Self { name, detail, fix: None }
     }
 
-    fn finding(name: &'static str, seen: String, mend: impl Into<String>) -> Self {
-        Self { name, seen, mend: Some(mend.into()) }
+    const fn status(&self) -> &'static str {
+        if self.fix.is_none() { "fine" } else { "FINDING" }
+    }
+
+    fn finding(name: &'static str, detail: String, fix: impl Into<String>) -> Self {
+        Self { name, detail, fix: Some(fix.into()) }
     }
 }
 
-/// Tries everything; multicast at these interfaces, without any where the node looks that lets us in.
+/// Runs all checks; the multicast check uses these interfaces, or by default those of the node that accepts this
+/// command.
 pub(crate) fn show(chosen: Vec<Interface>, arguments: &Arguments) -> Report {
     let (socket, within) = (arguments.socket.as_deref(), arguments.within());
     let interfaces = network::found();
     let chosen = Some(chosen).filter(|chosen| !chosen.is_empty()).map(Interfaces::from);
-    let Nodes { said: nodes, silent } = Nodes::asked(socket, within);
+    let Nodes { reports: nodes, silent } = Nodes::asked(socket, within);
     let chosen = chosen.or_else(|| of_node(nodes.first()?)).unwrap_or_else(|| Ipv4Addr::LOCALHOST.into());
     let mut checks = vec![network::interfaces(&interfaces)];
     checks.extend(network::multicast(&chosen, &interfaces));
@@ -63,7 +69,7 @@ pub(crate) fn show(chosen: Vec<Interface>, arguments: &Arguments) -> Report {
         clock::clock(),
         rights::shared_memory(),
         rights::own_processes(),
-        sockets::directory(),
+        sockets::directory(!nodes.is_empty() || !silent.is_empty()),
         sockets::leftover(),
         sockets::node(socket),
     ]);
@@ -71,35 +77,39 @@ pub(crate) fn show(chosen: Vec<Interface>, arguments: &Arguments) -> Report {
     checks.extend(security::checks(&nodes));
     checks.extend(reach::checks(&nodes, &interfaces));
     checks.extend(together::checks(&nodes));
-    let is_fine = checks.iter().all(|check| check.mend.is_none());
+    let is_fine = checks.iter().all(|check| check.fix.is_none());
     let json = json!({ "checks": checks.iter().map(check_json).collect::<Vec<_>>() });
-    let mut table = Table::new(["CHECK", "STATUS", "DETAIL"]).wide(arguments.wide);
-    for check in &checks {
-        let state = if check.mend.is_none() { "fine" } else { "FINDING" };
-        table.row([check.name.to_owned(), state.to_owned(), check.seen.clone()]);
-    }
-    let mends = checks.iter().filter_map(|check| Some((check.name, check.mend.as_ref()?)));
-    let mends: String = mends.map(|(name, mend)| format!("{name}: {}\n", clean(mend))).collect();
-    let text = if is_fine { table.text() } else { format!("{}\nSuggested fix\n{mends}", table.text()) };
+    let table = table(&checks, arguments.wide);
+    let fixes = checks.iter().filter_map(|check| Some((check.name, check.fix.as_ref()?)));
+    let fixes: String = fixes.map(|(name, fix)| format!("{name}: {}\n", clean_lines(fix))).collect();
+    let text = if is_fine { table } else { format!("{table}\nSuggested fix\n{fixes}") };
     Report { text, json, is_fine }
 }
 
-/// What the nodes of a system say of themselves.
+fn table(checks: &[Check], is_wide: bool) -> String {
+    let mut table = Table::new(["CHECK", "STATUS", "DETAIL"]).whole(&["CHECK", "STATUS"]).wide(is_wide);
+    for check in checks {
+        table.row([check.name.to_owned(), check.status().to_owned(), check.detail.clone()]);
+    }
+    table.text()
+}
+
+/// The reports of the nodes of a system.
 #[derive(Default)]
 struct Nodes {
-    /// First of all the one that lets us in; nothing where none does.
-    said: Vec<NodeReport>,
-    /// One for each that has not answered: the checks of the others say nothing of it.
+    /// The node that accepts this command is first; empty if there is none.
+    reports: Vec<NodeReport>,
+    /// One check for each node without an answer: the other checks do not cover it.
     silent: Vec<Check>,
 }
 
 impl Nodes {
-    /// Asks the node that lets us in, and every other one of its system.
+    /// Asks the node that accepts this command, and every other node of its system.
     fn asked(socket: Option<&Path>, within: Duration) -> Self {
         let mut system = match System::enter(socket, within) {
             Ok(system) => system,
-            // A check of its own says that.
-            Err(Fault::NoDoor(_)) => return Self::default(),
+            // A separate check reports that.
+            Err(SystemError::NoSocket(_)) => return Self::default(),
             Err(why) => return Self::none(&why),
         };
         let nodes = match system.here() {
@@ -113,83 +123,94 @@ impl Nodes {
         nodes
     }
 
-    /// Where the one that is to let us in does not answer.
-    fn none(why: &Fault) -> Self {
-        let mend = "is it stopped, or its host overloaded? `sinew ping` it, its log says more; or take another one: --socket PATH";
-        Self { said: Vec::new(), silent: vec![Check::finding(SILENT, why.to_string(), mend)] }
+    /// Returns the result if the node at the socket does not answer.
+    fn none(why: &SystemError) -> Self {
+        let fix = "is it stopped, or its host overloaded? `sinew ping` it, its log says more; or take another one: --socket PATH";
+        Self { reports: Vec::new(), silent: vec![Check::finding(SILENT, why.to_string(), fix)] }
     }
 
     fn of(here: NodeReport, answers: Vec<Answer<NodeReport>>) -> Self {
         let here_node = here.node;
-        let (mut said, mut silent) = (vec![here], Vec::new());
+        let (mut reports, mut silent) = (vec![here], Vec::new());
         let others = answers.into_iter().filter(|answer| answer.node != here_node);
-        for Answer { node, name, said: answer } in others {
+        for Answer { node, name, result: answer } in others {
             match answer {
-                Ok(other) => said.push(other),
+                Ok(other) => reports.push(other),
                 Err(why) => silent.push(silence(here_node, node, &name, &why)),
             }
         }
-        Self { said, silent }
+        Self { reports, silent }
     }
 }
 
 const SILENT: &str = "silent node";
 
-/// That a node has not answered.
+/// Returns the check of a node that has not answered.
 fn silence(here: NodeAddress, node: NodeAddress, name: &str, why: &str) -> Check {
-    let who = if name.is_empty() { node.to_string() } else { format!("{name} at {node}") };
-    let seen = format!("nothing is known of the keys and the network of {who}: {why}");
+    let node_label = if name.is_empty() { node.to_string() } else { format!("{name} at {node}") };
+    let detail = format!("the keys and the network are not known of {node_label}: {why}");
     Check::finding(
         SILENT,
-        seen,
-        format!("`sinew why {here} {node}` says what stands there; then `sinew doctor` again"),
+        detail,
+        format!("`sinew why {here} {node}` looks for the reason; then `sinew doctor` again"),
     )
 }
 
-/// The interfaces at which this node of this machine looks for others.
+/// Returns the interfaces on which this node of this machine discovers others.
 fn of_node(node: &NodeReport) -> Option<Interfaces> {
     let chosen: Vec<_> = node.interface.split(", ").filter_map(|one| one.parse().ok()).collect();
     (!chosen.is_empty()).then(|| chosen.into())
 }
 
 fn check_json(check: &Check) -> Value {
-    json!({ "check": check.name, "fine": check.mend.is_none(), "seen": check.seen, "mend": check.mend })
+    let Check { name, detail, fix } = check;
+    let status = check.status().to_lowercase();
+    json!({ "check": name, "status": status, "fine": fix.is_none(), "detail": detail, "suggested_fix": fix })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::security::tests::said;
+    use crate::{
+        security::tests::node_report,
+        table::{WIDTH, tests::widest},
+    };
 
     fn answer(name: &str, last: u8, fault: Option<&str>) -> Answer<NodeReport> {
-        let report = said(name, last, None);
+        let report = node_report(name, last, None);
         let (node, name) = (report.node, name.to_owned());
-        Answer { node, name, said: fault.map_or(Ok(report), |why| Err(why.to_owned())) }
+        Answer { node, name, result: fault.map_or(Ok(report), |why| Err(why.to_owned())) }
     }
 
     #[test]
-    fn a_node_that_has_not_answered_is_a_finding_with_its_name_and_why() {
+    fn table_fits_a_terminal_for_any_finding() {
+        let checks = [Check::finding("real-time rights", "nodes ".repeat(100) + &"k".repeat(300), "no fix")];
+        assert!(widest(&table(&checks, false)) <= WIDTH, "{}", table(&checks, false));
+    }
+
+    #[test]
+    fn silent_node_is_a_finding_with_name_and_reason() {
         let answers = vec![
             answer("hip", 1, None),
             answer("knee", 2, Some("no answer within 2s")),
             answer("ankle", 3, None),
         ];
-        let nodes = Nodes::of(said("hip", 1, None), answers);
-        let names: Vec<_> = nodes.said.iter().map(|said| said.name.as_str()).collect();
-        assert_eq!(names, ["hip", "ankle"], "the one that lets us in is first, and once");
+        let nodes = Nodes::of(node_report("hip", 1, None), answers);
+        let names: Vec<_> = nodes.reports.iter().map(|report| report.name.as_str()).collect();
+        assert_eq!(names, ["hip", "ankle"], "the one that was asked first comes first, and once");
         let [silent] = &nodes.silent[..] else { panic!("one has not answered") };
         let end = "of knee at 192.168.0.2: no answer within 2s";
-        assert!(silent.seen.ends_with(end), "{}", silent.seen);
-        let mend = silent.mend.as_ref().expect("a finding");
-        assert!(mend.starts_with("`sinew why 192.168.0.1 192.168.0.2`"), "{mend}");
+        assert!(silent.detail.ends_with(end), "{}", silent.detail);
+        let fix = silent.fix.as_ref().expect("a finding");
+        assert!(fix.starts_with("`sinew why 192.168.0.1 192.168.0.2`"), "{fix}");
     }
 
     #[test]
-    fn the_node_that_lets_us_in_and_does_not_answer_is_a_finding() {
-        let why = Fault::NoAnswer("/run/hip.sock".to_owned(), "no answer within 2s".to_owned());
+    fn silent_node_at_the_socket_is_a_finding() {
+        let why = SystemError::NoAnswer("/run/hip.sock".to_owned(), "no answer within 2s".to_owned());
         let nodes = Nodes::none(&why);
         let [silent] = &nodes.silent[..] else { panic!("it has not answered") };
-        assert!(nodes.said.is_empty() && silent.mend.is_some());
-        assert_eq!(silent.seen, "the node at /run/hip.sock: no answer within 2s");
+        assert!(nodes.reports.is_empty() && silent.fix.is_some());
+        assert_eq!(silent.detail, "the node at /run/hip.sock: no answer within 2s");
     }
 }

@@ -1,8 +1,8 @@
 //! `sinew`: shows a running system, from any one node of it.
 //!
-//! It comes in through a node's socket like any other program, and asks each node's inspection (`sinew::inspect`) through ordinary
-//! messages. It changes nothing, but for what `send` sends and the access
-//! list that `reload` has a node read again. `keys` asks no node: it makes the files by which nodes know each other.
+//! It connects through a node's socket like any other program, and asks each node's inspection (`sinew::inspect`)
+//! through ordinary messages. It changes nothing, except that `send` sends messages and `reload` makes a node read its
+//! access list again. `keys` asks no node: it creates the files by which nodes authenticate each other.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)] // `output` prints: the macros panic where a pipe is closed or a disk is full.
 
@@ -10,7 +10,6 @@ mod apps;
 mod arguments;
 mod audit;
 mod doctor;
-mod door;
 mod keys;
 mod messagepack;
 mod nodes;
@@ -19,31 +18,33 @@ mod ping;
 mod reload;
 mod security;
 mod send;
+mod sockets;
 mod system;
 mod table;
 mod tree;
+mod unknown;
 mod watch;
 mod why;
 
 use std::{ffi::OsString, process::ExitCode};
 
 use arguments::{Arguments, Command};
-use system::{Fault, System};
+use system::{System, SystemError};
 
-/// Exit code where all is fine.
+/// Exit code if all is fine.
 const EXIT_OK: u8 = 0;
-/// Exit code where something was found.
+/// Exit code if there is a finding.
 const EXIT_FINDING: u8 = 1;
-/// Exit code of a wrong command line; clap has the same.
+/// Exit code of an invalid command line, the same as that of clap.
 const EXIT_USAGE: u8 = 2;
-/// Exit code where no node lets us in, or the one that does gives no answer.
+/// Exit code if no node accepts this command, or the one that does gives no answer.
 const EXIT_NO_NODE: u8 = 3;
-/// Exit code where all is fine, but standard output did not take all of it.
+/// Exit code if all is fine, but standard output did not accept all of the text.
 const EXIT_NOT_WRITTEN: u8 = 4;
 
-/// What a command has to say.
+/// The result of a command.
 struct Report {
-    /// For people.
+    /// For users.
     text: String,
     /// For programs.
     json: serde_json::Value,
@@ -52,16 +53,18 @@ struct Report {
 }
 
 fn main() -> ExitCode {
+    // The library's warnings are about this command's own questions, which its user has not sent.
+    sinew::silence_default_log();
     let arguments = match Arguments::read() {
         Ok(arguments) => arguments,
         Err(error) => return refused(&error),
     };
     match run(&arguments) {
-        Ok(said) => {
-            let json = || if said.json.is_null() { String::new() } else { format!("{:#}\n", said.json) };
-            let text = if arguments.json { json() } else { said.text };
+        Ok(report) => {
+            let json = || if report.json.is_null() { String::new() } else { format!("{:#}\n", report.json) };
+            let text = if arguments.json { json() } else { report.text };
             output::print(&text);
-            output::exit_code(if said.is_fine { EXIT_OK } else { EXIT_FINDING })
+            output::exit_code(if report.is_fine { EXIT_OK } else { EXIT_FINDING })
         }
         Err(error) => {
             output::note(format_args!("sinew: {error}"));
@@ -73,12 +76,12 @@ fn main() -> ExitCode {
     }
 }
 
-/// For programs, beside the words for people.
+/// Prints a fault for programs, in addition to the text for users.
 fn print_fault(why: &str) {
     output::line(&format!("{:#}", serde_json::json!({ "fault": why })));
 }
 
-/// A wrong command line, or one that asks for help or the version.
+/// Handles an invalid command line, or a request for help or the version.
 fn refused(error: &clap::Error) -> ExitCode {
     let printed = error.print();
     if !error.use_stderr() {
@@ -93,36 +96,41 @@ fn refused(error: &clap::Error) -> ExitCode {
     output::exit_code(EXIT_USAGE)
 }
 
-/// Whether a command line that cannot be read asks for JSON. What stands behind `--` is no option.
+/// Returns whether an invalid command line asks for JSON. Words after `--` are no options.
 fn ask_for_json(words: impl IntoIterator<Item = OsString>) -> bool {
     words.into_iter().take_while(|word| word != "--").any(|word| word == "--json")
 }
 
-fn run(arguments: &Arguments) -> Result<Report, Fault> {
-    let inside = |show: &dyn Fn(&mut System) -> Result<Report, Fault>| {
+fn run(arguments: &Arguments) -> Result<Report, SystemError> {
+    let inside = |show: &dyn Fn(&mut System) -> Result<Report, SystemError>| {
         let mut system = System::enter(arguments.socket.as_deref(), arguments.within())?;
-        let said = show(&mut system);
+        let report = show(&mut system);
         system.leave();
-        said
+        report
     };
     match &arguments.command {
-        Command::Nodes => inside(&|system| nodes::show(system, arguments.wide)),
+        Command::Nodes => {
+            let is_searched = sockets::is_searched(arguments.socket.as_deref());
+            inside(&|system| nodes::show(system, arguments.wide, is_searched))
+        }
         Command::Apps => inside(&|system| apps::show(system, arguments.wide)),
-        Command::Tree { node } => inside(&|system| tree::show(system, node.as_deref())),
+        Command::Tree { node } => inside(&|system| tree::show(system, node.as_deref(), arguments.wide)),
         Command::Ping { target, count } => inside(&|system| ping::show(system, target, *count)),
         Command::Send(order) => inside(&|system| send::show(system, order)),
-        Command::Watch(order) => inside(&|system| watch::show(system, order, arguments.json)),
+        Command::Watch(order) => {
+            inside(&|system| watch::show(system, order, (arguments.json, arguments.wide)))
+        }
         Command::Why(order) => inside(&|system| why::show(system, order, arguments.wide)),
-        Command::Barriers => inside(&apps::barriers),
-        Command::Audit => inside(&audit::show),
+        Command::Barriers => inside(&|system| apps::barriers(system, arguments.wide)),
+        Command::Audit => inside(&|system| audit::show(system, arguments.wide)),
         Command::Reload => inside(&reload::show),
         Command::Doctor { interface } => Ok(doctor::show(interface.clone(), arguments)),
-        Command::Keys(order) => keys::show(order),
+        Command::Keys(order) => keys::show(order, arguments.wide),
         Command::Completions { shell } => Ok(completions(*shell)),
     }
 }
 
-/// The shell's file, as it is, whatever else was asked for.
+/// Returns the completion file of the shell, regardless of other options.
 fn completions(shell: clap_complete::Shell) -> Report {
     let mut bytes = Vec::new();
     clap_complete::generate(shell, &mut arguments::command(), "sinew", &mut bytes);

@@ -1,4 +1,4 @@
-//! Payloads for people: MessagePack as JSON, and JSON as MessagePack.
+//! Payloads for users: MessagePack as JSON, and JSON as MessagePack.
 
 use std::{fmt, io::Cursor};
 
@@ -8,14 +8,14 @@ use serde::{
 };
 use serde_json::{Map, Number, Value};
 
-/// Lists in lists, and so on, in a payload that is read: as many as a node takes.
+/// Maximum nesting depth of a payload: as in a node.
 const DEPTH_MAX: usize = 64;
 
-/// What a typed payload is, as JSON. MessagePack has more than JSON: bytes become `{"bytes": "0a0b.."}`, a key that is no text becomes
-/// one, a number that is none (NaN, infinity) its name.
+/// Returns a typed payload as JSON. MessagePack has more types than JSON: bytes become `{"bytes": "0a0b.."}`, a key
+/// that is no text becomes one, and a number without a JSON form (NaN, infinity) becomes its name.
 ///
 /// # Errors
-/// It is no one MessagePack value: a raw payload.
+/// The bytes are not exactly one MessagePack value: a raw payload.
 pub(crate) fn shown(bytes: &[u8]) -> Result<Value, String> {
     let mut deserializer = rmp_serde::Deserializer::new(Cursor::new(bytes));
     deserializer.set_max_depth(DEPTH_MAX);
@@ -24,15 +24,15 @@ pub(crate) fn shown(bytes: &[u8]) -> Result<Value, String> {
     if rest > 0 { Err(format!("{rest} bytes follow the value")) } else { Ok(value) }
 }
 
-/// What to show of a payload: the value, or of a raw one its bytes.
+/// Returns the displayed form of a payload: the value, or the bytes of a raw one.
 pub(crate) fn shown_or_raw(bytes: &[u8]) -> Value {
     shown(bytes).unwrap_or_else(|_| raw(bytes))
 }
 
-/// The payload for a value, as a typed one is written.
+/// Returns the payload for a value, encoded as a typed one.
 ///
 /// # Errors
-/// A number that has no form in MessagePack.
+/// A number has no form in MessagePack.
 pub(crate) fn written(value: &Value) -> Result<Vec<u8>, String> {
     rmp_serde::to_vec_named(value).map_err(|error| error.to_string())
 }
@@ -79,7 +79,7 @@ impl<'de> Visitor<'de> for AnyValue {
         Ok(value.into())
     }
 
-    /// As its source has written it: 0.1, not 0.10000000149.
+    /// As written by its source: 0.1, not 0.10000000149.
     fn visit_f32<E: de::Error>(self, value: f32) -> Result<Value, E> {
         self.visit_f64(value.to_string().parse().unwrap_or_else(|_| value.into()))
     }
@@ -126,13 +126,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_written_is_shown_again() {
+    fn written_value_is_shown_again() {
         let value = json!({ "degrees": 1.5, "joint": "knee", "n": -3, "big": u64::MAX, "list": [null, true, { "a": 0 }] });
         assert_eq!(shown(&written(&value).unwrap()), Ok(value));
     }
 
     #[test]
-    fn what_json_has_not_is_shown_in_words() {
+    fn values_without_json_form_are_shown_as_text() {
         // A map of 1 to bytes, and a float of 32 bits.
         assert_eq!(shown(&[0x81, 0x01, 0xc4, 2, 0x0a, 0xff]), Ok(json!({ "1": { "bytes": "0aff" } })));
         let mut float = vec![0xca];
@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn foreign_bytes_neither_end_this_program_nor_take_its_memory() {
+    fn foreign_bytes_cause_no_panic_and_no_large_allocation() {
         for bytes in [vec![0x91; 100_000], vec![0xdd, 0xff, 0xff, 0xff, 0xff], vec![0xc1], vec![]] {
             assert!(shown(&bytes).is_err());
         }

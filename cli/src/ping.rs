@@ -11,42 +11,42 @@ use sinew::{
 
 use crate::{
     Report, apps,
-    system::{Fault, System},
+    system::{System, SystemError},
     table::clean,
 };
 
-/// So many without an answer, one after the other, are enough.
-const IN_VAIN_MAX: u32 = 3;
+/// Maximum number of consecutive pings without an answer.
+const UNANSWERED_MAX: u32 = 3;
 
-/// What came of the pings.
+/// The results of the pings.
 #[derive(Default)]
 struct Tally {
-    /// In nanoseconds, sorted in the end.
+    /// In nanoseconds, sorted at the end.
     round_trips: Vec<u64>,
     sent: u32,
-    /// What became of the last one.
+    /// The outcome of the last one.
     outcome: Option<Outcome>,
-    /// Why the last one that failed did.
+    /// Why the last failed one failed.
     fault: Option<String>,
 }
 
-/// Sends `count` pings to a TID, a name or a node, each when the one before was answered.
-pub(crate) fn show(system: &mut System, whom: &str, count: u32) -> Result<Report, Fault> {
-    let to = system.find(whom)?;
+/// Sends `count` pings to a TID, a name or a node, each after the answer to the previous one.
+pub(crate) fn show(system: &mut System, target: &str, count: u32) -> Result<Report, SystemError> {
+    let to = system.find(target)?;
     let mut tally = Tally::default();
-    let mut in_vain = 0;
-    while tally.sent < count && in_vain < IN_VAIN_MAX {
+    let mut unanswered = 0;
+    while tally.sent < count && unanswered < UNANSWERED_MAX {
         let began = Time::now();
         let outcome = system.endpoint.message(to, &Ping {}).confirmed(system.within);
         tally.sent += 1;
         tally.outcome = outcome.as_ref().ok().copied();
         match outcome.map_err(|error| error.to_string()).and_then(|outcome| judged(outcome, system.within)) {
             Ok(()) => {
-                in_vain = 0;
+                unanswered = 0;
                 tally.round_trips.push(nanos(Time::now().since(began)));
             }
             Err(why) => {
-                in_vain += 1;
+                unanswered += 1;
                 tally.fault = Some(why);
             }
         }
@@ -55,13 +55,13 @@ pub(crate) fn show(system: &mut System, whom: &str, count: u32) -> Result<Report
         *fault = why;
     }
     tally.round_trips.sort_unstable();
-    Ok(tally.said(whom, to))
+    Ok(tally.report(target, to))
 }
 
-/// Whether whoever it was for has come to it.
+/// Returns whether the receiver has handled the ping.
 pub(crate) fn judged(outcome: Outcome, within: Duration) -> Result<(), String> {
     match outcome {
-        // Who does not know the kind has come to it all the same.
+        // A receiver that does not know the kind has handled it nevertheless.
         Outcome::Delivered | Outcome::Rejected(Rejection::UnknownKind | Rejection::ByHandler) => Ok(()),
         Outcome::Rejected(why) => Err(why.to_string()),
         Outcome::Unknown => Err(format!(
@@ -75,14 +75,14 @@ pub(crate) fn judged(outcome: Outcome, within: Duration) -> Result<(), String> {
     }
 }
 
-/// Why the application at `to` is not ready, if it is not: better known than that it does not answer.
+/// Returns why the application at `to` is not ready, if it is not: more specific than a missing answer.
 pub(crate) fn not_ready(system: &mut System, to: Tid) -> Option<String> {
     let answers = system.ask_these::<AskApps, AppsReport>(vec![(to.node, String::new())]);
-    let said = answers.into_iter().find_map(|answer| answer.said.ok())?;
-    said.apps.iter().find(|app| app.tid == to).and_then(unready)
+    let report = answers.into_iter().find_map(|answer| answer.result.ok())?;
+    report.apps.iter().find(|app| app.tid == to).and_then(unready)
 }
 
-/// Why this application is not ready, if it is not.
+/// Returns why this application is not ready, if it is not.
 pub(crate) fn unready(app: &AppReport) -> Option<String> {
     let why = apps::why(app);
     match (app.ready, why.is_empty()) {
@@ -93,17 +93,17 @@ pub(crate) fn unready(app: &AppReport) -> Option<String> {
 }
 
 impl Tally {
-    /// The round trip that this share of all did not exceed, in nanoseconds.
+    /// Returns the round trip that this share of all did not exceed, in nanoseconds.
     fn quantile(&self, share: f64) -> Option<u64> {
         let rank = (share * self.round_trips.len() as f64).ceil() as usize;
         self.round_trips.get(rank.saturating_sub(1)).copied()
     }
 
-    fn said(&self, whom: &str, to: Tid) -> Report {
+    fn report(&self, target: &str, to: Tid) -> Report {
         let answered = self.round_trips.len();
         let quantiles = [self.quantile(0.0), self.quantile(0.5), self.quantile(0.99), self.quantile(1.0)];
         let [min, p50, p99, max] = quantiles;
-        let mut text = format!("{} ({to}): {answered} of {} answered\n", clean(whom), self.sent);
+        let mut text = format!("{} ({to}): {answered} of {} answered\n", clean(target), self.sent);
         if let (Some(min), Some(p50), Some(p99), Some(max)) = (min, p50, p99, max) {
             let us = |ns: u64| format!("{:.1} us", ns as f64 / 1e3);
             text +=
@@ -132,7 +132,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_application_is_not_ready_for_a_reason_that_is_said_and_one_that_is_ready_has_none() {
+    fn only_an_unready_application_has_a_reason() {
         let missing = Missing { name: "ankle".to_owned(), why: "not there".to_owned(), since_us: None };
         let mut app = AppReport {
             tid: Tid::new(NodeAddress::from([10, 0, 0, 2]), AppAddress::new(0x1001)),
@@ -147,17 +147,17 @@ mod tests {
         };
         let why = "it is not ready: has waited 2.0 s for ankle (not there)";
         assert_eq!(unready(&app).as_deref(), Some(why));
-        // It lost what it needs, and goes on.
+        // It lost a requirement, and continues.
         (app.ready, app.waits_us) = (true, None);
         assert_eq!(unready(&app), None);
-        // Its last life ended, and said nothing.
+        // Its last incarnation ended without a reason.
         (app.ready, app.ended) = (false, Some(String::new()));
         app.missing.clear();
         assert_eq!(unready(&app).as_deref(), Some("it is not ready"));
     }
 
     #[test]
-    fn a_quantile_is_the_round_trip_that_so_many_did_not_exceed() {
+    fn quantile_is_the_round_trip_of_its_rank() {
         let tally = Tally { round_trips: (1..=200).collect(), ..Tally::default() };
         let [min, p50, p99, max] = [0.0, 0.5, 0.99, 1.0].map(|share| tally.quantile(share));
         assert_eq!([min, p50, p99, max], [Some(1), Some(100), Some(198), Some(200)]);

@@ -1,4 +1,4 @@
-//! `sinew reload`: has the node on this host read its access list and its deny list again.
+//! `sinew reload`: makes the node on this host read its access list and its deny list again.
 
 use serde_json::json;
 use sinew::{
@@ -8,40 +8,40 @@ use sinew::{
 
 use crate::{
     Report,
-    system::{Fault, System},
+    system::{System, SystemError},
     table::clean,
 };
 
-/// Asks the node that lets us in.
-pub(crate) fn show(system: &mut System) -> Result<Report, Fault> {
+/// Asks the node at the socket.
+pub(crate) fn show(system: &mut System) -> Result<Report, SystemError> {
     let node = system.endpoint.tid().node;
     let answer = system.ask_these::<AskReload, ReloadReport>(vec![(node, String::new())]).pop();
-    let said = answer.map_or_else(|| Err("no answer".to_owned()), |answer| answer.said);
-    let said = said.map_err(|why| Fault::NoAnswer(system.path.clone(), why))?;
-    let ReloadReport { rules, clients, has_list, denied, readmitted, ref refused } = said;
+    let report = answer.map_or_else(|| Err("no answer".to_owned()), |answer| answer.result);
+    let report = report.map_err(|why| SystemError::NoAnswer(system.path.clone(), why))?;
+    let ReloadReport { rules, clients, has_list, denied, readmitted, ref refused } = report;
     let json = json!({
         "rules": rules, "clients": clients, "has_list": has_list, "denied": denied, "readmitted": readmitted,
         "refused": refused
     });
-    Ok(Report { text: text(node, &said), json, is_fine: refused.is_none() })
+    Ok(Report { text: text(node, &report), json, is_fine: refused.is_none() })
 }
 
-/// What is wrong, one fault a line, and what is in force whether anything is or not.
-fn text(node: NodeAddress, said: &ReloadReport) -> String {
+/// Returns the faults, one per line, and the lists that are in force in either case.
+fn text(node: NodeAddress, report: &ReloadReport) -> String {
     let faults: String =
-        said.refused.iter().flat_map(|why| why.lines()).map(|line| clean(line) + "\n").collect();
-    let readmitted = match said.readmitted {
+        report.refused.iter().flat_map(|why| why.lines()).map(|line| clean(line) + "\n").collect();
+    let readmitted = match report.readmitted {
         0 => String::new(),
         count => format!(
-            "Certificates that were revoked and are not on the deny list any more: {count}. They count again. If nobody took them out, the \
+            "Certificates that were revoked and are not on the deny list any more: {count}. They are valid again. If they were not taken out on purpose, the \
              file was read before all of it was there: copy it under another name, rename it, and reload.\n"
         ),
     };
-    format!("{faults}In force at {node}: {}.\n{readmitted}", in_force(said))
+    format!("{faults}In force at {node}: {}.\n{readmitted}", in_force(report))
 }
 
-fn in_force(said: &ReloadReport) -> String {
-    let ReloadReport { rules, clients, has_list, denied, .. } = said;
+fn in_force(report: &ReloadReport) -> String {
+    let ReloadReport { rules, clients, has_list, denied, .. } = report;
     let access = format!("{rules} rules for messages, {clients} for users of this host");
     let access = if *has_list { access } else { "no access list".to_owned() };
     match denied {
@@ -61,7 +61,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_in_force_is_said_also_where_something_is_wrong() {
+    fn active_lists_are_shown_despite_faults() {
         let node = NodeAddress::new(0x0a00_0002);
         let good = text(node, &report(1, 0, None));
         assert_eq!(
@@ -72,9 +72,9 @@ mod tests {
     }
 
     #[test]
-    fn who_is_let_in_again_is_said() {
-        let said = text(NodeAddress::new(1), &report(0, 3, None));
-        assert!(said.contains("0 certificates are revoked") && said.contains("any more: 3."), "{said}");
-        assert!(said.contains("count again") && said.contains("rename"), "{said}");
+    fn reinstated_certificates_are_reported() {
+        let shown = text(NodeAddress::new(1), &report(0, 3, None));
+        assert!(shown.contains("0 certificates are revoked") && shown.contains("any more: 3."), "{shown}");
+        assert!(shown.contains("valid again") && shown.contains("rename"), "{shown}");
     }
 }

@@ -1,4 +1,4 @@
-//! How a node proves itself to others, as it says: open, or secured and for how long.
+//! How a node authenticates, by its own report: open, or secured and for how long.
 
 use std::time::Duration;
 
@@ -9,35 +9,35 @@ use sinew::{
 };
 
 const DAY_S: u64 = 24 * 3_600;
-/// A certificate that counts for less than this is a finding: 30 days, in seconds.
+/// A certificate with less remaining validity than this is a finding: 30 days, in seconds.
 pub(crate) const SOON_S: u64 = 30 * DAY_S;
 
-/// Where a node stands, the worst first.
+/// The state of a node, the worst first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Standing {
-    /// Open, and other hosts reach it.
+pub(crate) enum CertificateState {
+    /// Open, and reachable from other hosts.
     Open,
     /// Its certificate is on the deny list that it has itself.
     Revoked,
     /// Its certificate has ended, by its own clock.
     Ended,
-    /// Its clock says an earlier time than its certificate was made: nobody there knows when one ends.
+    /// Its clock shows a time before its certificate's creation: it cannot determine when one ends.
     ClockNotSet,
     /// Its certificate ends within 30 days.
     EndsSoon,
-    /// It does not say: of an older version.
+    /// Not reported: an older version.
     Unknown,
-    /// Open, and nobody but its own host reaches it: every user of that.
+    /// Open, and reachable only from its own host, by every user there.
     Alone,
-    /// It has a certificate, and looks at nobody's times.
+    /// It has a certificate, and ignores validity times.
     NotLookedAt,
     /// Secured.
     Secured,
 }
 
-impl Standing {
-    pub(crate) fn of(said: &NodeReport) -> Self {
-        let Some(security) = &said.security else { return Self::Unknown };
+impl CertificateState {
+    pub(crate) fn of(report: &NodeReport) -> Self {
+        let Some(security) = &report.security else { return Self::Unknown };
         match &security.certificate {
             None if security.is_beyond_host => Self::Open,
             None => Self::Alone,
@@ -65,21 +65,21 @@ impl Standing {
     }
 }
 
-/// A cell of a table.
-pub(crate) fn cell(said: &NodeReport) -> String {
-    let standing = Standing::of(said);
-    let days = certificate(said).and_then(days_left);
-    match (standing, days) {
-        (Standing::Open, _) => "OPEN".to_owned(),
-        (Standing::Revoked, _) => "REVOKED".to_owned(),
-        (Standing::Ended, _) => "ENDED".to_owned(),
-        (Standing::Secured | Standing::EndsSoon, Some(days)) => format!("{days} d"),
-        _ => standing.word().to_owned(),
+/// Returns a cell of a table.
+pub(crate) fn cell(report: &NodeReport) -> String {
+    let state = CertificateState::of(report);
+    let days = certificate(report).and_then(days_left);
+    match (state, days) {
+        (CertificateState::Open, _) => "OPEN".to_owned(),
+        (CertificateState::Revoked, _) => "REVOKED".to_owned(),
+        (CertificateState::Ended, _) => "ENDED".to_owned(),
+        (CertificateState::Secured | CertificateState::EndsSoon, Some(days)) => format!("{days} d"),
+        _ => state.word().to_owned(),
     }
 }
 
-pub(crate) fn json(said: &NodeReport) -> Value {
-    let certificate = certificate(said).map(|certificate| {
+pub(crate) fn json(report: &NodeReport) -> Value {
+    let certificate = certificate(report).map(|certificate| {
         json!({
             "from": at(certificate.from_s),
             "until": at(certificate.until_s),
@@ -89,26 +89,26 @@ pub(crate) fn json(said: &NodeReport) -> Value {
             "revoked": certificate.is_revoked,
         })
     });
-    let security = said.security.as_ref();
+    let security = report.security.as_ref();
     json!({
-        "state": Standing::of(said).word(),
+        "state": CertificateState::of(report).word(),
         "secured": security.map(|security| security.certificate.is_some()),
         "beyond_host": security.map(|security| security.is_beyond_host),
         "certificate": certificate,
     })
 }
 
-pub(crate) fn certificate(said: &NodeReport) -> Option<&CertificateReport> {
-    said.security.as_ref()?.certificate.as_ref()
+pub(crate) fn certificate(report: &NodeReport) -> Option<&CertificateReport> {
+    report.security.as_ref()?.certificate.as_ref()
 }
 
-/// Whole days that its certificate still counts by its own clock; `None` while that is not set.
+/// Returns the remaining full days of its certificate by its own clock; `None` while that is not set.
 pub(crate) fn days_left(certificate: &CertificateReport) -> Option<u64> {
     let CertificateReport { from_s, until_s, clock_s, .. } = certificate;
     (clock_s >= from_s).then(|| until_s.saturating_sub(*clock_s) / DAY_S)
 }
 
-/// Seconds since 1970 as text, in UTC.
+/// Returns seconds since 1970 as text, in UTC.
 pub(crate) fn at(seconds: u64) -> String {
     date(&UnixTime::since_unix_epoch(Duration::from_secs(seconds)))
 }
@@ -121,8 +121,8 @@ pub(crate) mod tests {
 
     pub(crate) const NOW_S: u64 = 1_795_360_380;
 
-    /// What a node of this name says.
-    pub(crate) fn said(name: &str, last: u8, security: Option<SecurityReport>) -> NodeReport {
+    /// The report of a node with this name.
+    pub(crate) fn node_report(name: &str, last: u8, security: Option<SecurityReport>) -> NodeReport {
         NodeReport {
             node: NodeAddress::from([192, 168, 0, last]),
             name: name.to_owned(),
@@ -148,6 +148,8 @@ pub(crate) mod tests {
             foreign_left_out: 0,
             refusals: Vec::new(),
             unhandled: Vec::new(),
+            unguarded: Vec::new(),
+            lost_echoes: Vec::new(),
             refusals_left_out: 0,
             peers: Vec::new(),
             own_stalls: None,
@@ -163,7 +165,7 @@ pub(crate) mod tests {
         Some(SecurityReport { is_beyond_host, certificate: None })
     }
 
-    /// With a certificate of a year that was made at [`NOW_S`].
+    /// With a certificate that is valid for a year from [`NOW_S`].
     pub(crate) fn secured(clock_s: u64, times: &str) -> Option<SecurityReport> {
         let (from_s, until_s) = (NOW_S, NOW_S + 365 * DAY_S);
         let times = times.to_owned();
@@ -171,7 +173,7 @@ pub(crate) mod tests {
         Some(SecurityReport { is_beyond_host: true, certificate: Some(certificate) })
     }
 
-    /// The same, and it is on the list that its node has.
+    /// The same, with the certificate on the node's deny list.
     pub(crate) fn revoked(clock_s: u64) -> Option<SecurityReport> {
         let certificate = secured(clock_s, "strict")?.certificate?;
         let certificate = CertificateReport { is_revoked: true, ..certificate };
@@ -179,35 +181,35 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_node_stands_where_its_own_clock_says() {
+    fn state_follows_the_clock_of_the_node() {
         let until_s = NOW_S + 365 * DAY_S;
-        for (security, standing, shown) in [
-            (None, Standing::Unknown, "unknown"),
-            (open(true), Standing::Open, "OPEN"),
-            (open(false), Standing::Alone, "open, own host only"),
-            (revoked(NOW_S), Standing::Revoked, "REVOKED"),
-            // Worse than that it has ended, too: to set the clock does not mend it.
-            (revoked(until_s + 1), Standing::Revoked, "REVOKED"),
-            (secured(NOW_S, "until-set"), Standing::Secured, "365 d"),
-            (secured(until_s - 30 * DAY_S, "until-set"), Standing::Secured, "30 d"),
-            (secured(until_s - 30 * DAY_S + 1, "strict"), Standing::EndsSoon, "29 d"),
-            (secured(until_s, "until-set"), Standing::EndsSoon, "0 d"),
-            (secured(until_s + 1, "until-set"), Standing::Ended, "ENDED"),
-            // In 1970 nobody knows whether it has ended.
-            (secured(7, "until-set"), Standing::ClockNotSet, "clock not set"),
-            (secured(7, "ignored"), Standing::NotLookedAt, "times ignored"),
-            (secured(until_s + 1, "ignored"), Standing::NotLookedAt, "times ignored"),
+        for (security, state, shown) in [
+            (None, CertificateState::Unknown, "unknown"),
+            (open(true), CertificateState::Open, "OPEN"),
+            (open(false), CertificateState::Alone, "open, own host only"),
+            (revoked(NOW_S), CertificateState::Revoked, "REVOKED"),
+            // Revocation ranks above expiry: setting the clock does not fix it.
+            (revoked(until_s + 1), CertificateState::Revoked, "REVOKED"),
+            (secured(NOW_S, "until-set"), CertificateState::Secured, "365 d"),
+            (secured(until_s - 30 * DAY_S, "until-set"), CertificateState::Secured, "30 d"),
+            (secured(until_s - 30 * DAY_S + 1, "strict"), CertificateState::EndsSoon, "29 d"),
+            (secured(until_s, "until-set"), CertificateState::EndsSoon, "0 d"),
+            (secured(until_s + 1, "until-set"), CertificateState::Ended, "ENDED"),
+            // With a clock in 1970, expiry cannot be judged.
+            (secured(7, "until-set"), CertificateState::ClockNotSet, "clock not set"),
+            (secured(7, "ignored"), CertificateState::NotLookedAt, "times ignored"),
+            (secured(until_s + 1, "ignored"), CertificateState::NotLookedAt, "times ignored"),
         ] {
-            let said = said("hip", 1, security);
-            assert_eq!((Standing::of(&said), cell(&said).as_str()), (standing, shown), "{said:?}");
+            let report = node_report("hip", 1, security);
+            assert_eq!((CertificateState::of(&report), cell(&report).as_str()), (state, shown), "{report:?}");
         }
     }
 
     #[test]
-    fn what_is_not_known_is_null_and_not_false() {
-        let shown = json(&said("hip", 1, None));
+    fn unknown_value_is_null_instead_of_false() {
+        let shown = json(&node_report("hip", 1, None));
         assert!(shown["secured"].is_null() && shown["certificate"].is_null(), "{shown}");
-        let shown = json(&said("hip", 1, secured(7, "strict")));
+        let shown = json(&node_report("hip", 1, secured(7, "strict")));
         assert_eq!((&shown["secured"], &shown["certificate"]["days_left"]), (&true.into(), &Value::Null));
         assert_eq!(shown["certificate"]["clock"], "1970-01-01T00:00:07Z");
     }

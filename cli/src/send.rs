@@ -1,5 +1,6 @@
-//! `sinew send`: one message, and what became of it.
+//! `sinew send`: sends one message, and shows its outcome.
 
+mod explained;
 mod many;
 
 use std::io::Read;
@@ -14,21 +15,23 @@ use sinew::{
 
 use crate::{
     Report, messagepack, ping,
-    system::{Fault, System},
+    system::{System, SystemError},
     table::{clean, time},
 };
+use explained::Receiver;
 
-/// Longest payload that is read from the standard input, in bytes: no node takes more.
+/// Maximum bytes of a payload read from the standard input: no node accepts more.
 const INPUT_MAX: u64 = 64 << 20;
 
-/// What to send, and how.
+/// The arguments of `sinew send`.
 #[derive(Debug, Args)]
 pub(crate) struct Order {
     /// An application's TID (127.0.0.2/80000001) or name, or a group's name
     pub(crate) target: String,
     /// The payload's type as its program calls it (demo.angle), or its number (0x9c1b6bda)
     kind: String,
-    /// The payload, as JSON; `-` reads it from the standard input. A type without fields takes `{}`, `null` and `''` (no bytes)
+    /// The payload, as JSON; `-` reads it from the standard input. A type without fields takes `{}`, `null`
+    /// and `''` (no bytes)
     #[arg(default_value = "{}")]
     payload: String,
     /// Wait for a reply, and print it
@@ -37,7 +40,7 @@ pub(crate) struct Order {
     /// How it travels. A Stream cannot be confirmed
     #[arg(long, value_enum, default_value = "control")]
     class: ClassName,
-    /// Do not wait for what becomes of it
+    /// Do not wait for its outcome
     #[arg(long)]
     unconfirmed: bool,
     /// How long it may take. It expires where it waits when it is older
@@ -66,22 +69,28 @@ impl From<ClassName> for Class {
     }
 }
 
-/// What came of it.
+/// The result of a message.
 struct Ended {
     outcome: Option<Outcome>,
     reply: Option<Value>,
     fault: Option<String>,
-    /// Nobody has come to it in its time, or said so: the outcome does not tell why.
-    is_unheard: bool,
+    /// Whether the receiver has not handled the message in time, or not reported it: the outcome does not state why.
+    is_open: bool,
 }
 
 impl Ended {
-    /// A receiver that is known not to be ready is the reason why nobody has come to it, or at least not yet: where that is not known it may have
-    /// been ready when the message came.
-    fn explained_by(&mut self, not_ready: impl FnOnce() -> Option<String>) {
-        if self.is_unheard
-            && let Some(why) = not_ready()
-        {
+    /// Adds an explanation. If the receiver is known not to be ready, that explains why it has not handled
+    /// the message, at least not yet; otherwise it may have been ready when the message arrived. If the
+    /// receiver has refused the type, the explanation lists the types that it handles.
+    fn explained_by(&mut self, order: &Order, receiver: impl FnOnce() -> Option<Receiver>) {
+        if !self.is_open && !self.outcome.is_some_and(explained::is_about_types) {
+            return;
+        }
+        let Some(receiver) = receiver() else { return };
+        if !self.is_open {
+            let about = self.outcome.and_then(|outcome| explained::by_types(outcome, &receiver, order));
+            self.fault = self.fault.take().map(|fault| fault + &about.unwrap_or_default());
+        } else if let Some(why) = ping::unready(&receiver.app) {
             self.fault = Some(match self.outcome {
                 Some(Outcome::Expired) => format!("Expired: {why}"),
                 Some(outcome) => format!("{outcome:?}: it may have been handled, but {why}"),
@@ -91,8 +100,8 @@ impl Ended {
     }
 }
 
-/// Sends it, and says what became of it.
-pub(crate) fn show(system: &mut System, order: &Order) -> Result<Report, Fault> {
+/// Sends the message, and reports its outcome.
+pub(crate) fn show(system: &mut System, order: &Order) -> Result<Report, SystemError> {
     let to = system.find_or_group(&order.target)?;
     let kind = kind(&order.kind)?;
     let payload = payload(&order.payload)?;
@@ -102,19 +111,19 @@ pub(crate) fn show(system: &mut System, order: &Order) -> Result<Report, Fault> 
     let began = Time::now();
     let mut ended = send(system, to, (kind, &payload), order);
     let took = Time::now().since(began);
-    ended.explained_by(|| ping::not_ready(system, to));
+    ended.explained_by(order, || explained::receivers(system, vec![to.node]).remove(&to));
     let micros = u64::try_from(took.as_micros()).unwrap_or(u64::MAX);
-    let said = match (&ended.fault, &ended.reply, ended.outcome) {
+    let result = match (&ended.fault, &ended.reply, ended.outcome) {
         (Some(why), ..) => clean(why),
         (None, Some(reply), _) => format!("{reply:#}"),
         (None, None, Some(outcome)) => format!("{outcome:?}"),
-        (None, None, None) => "sent; nobody was asked what becomes of it".to_owned(),
+        (None, None, None) => "sent without confirmation".to_owned(),
     };
     let text = if ended.reply.is_some() && ended.fault.is_none() {
-        // Alone, for a pipe.
-        said + "\n"
+        // Printed alone, for a pipe.
+        result + "\n"
     } else {
-        format!("{} ({to}): {said}, after {}\n", clean(&order.target), time(micros))
+        format!("{} ({to}): {result}, after {}\n", clean(&order.target), time(micros))
     };
     let json = json!({
         "tid": to.to_string(), "kind": kind.to_string(), "bytes": payload.len(), "took_us": micros, "fault": ended.fault,
@@ -152,51 +161,53 @@ fn ended_of(ended: Result<(Option<Outcome>, Option<Value>), ApiError>, order: &O
             outcome,
             reply,
             fault: outcome.and_then(|outcome| fault(outcome, order)),
-            is_unheard: outcome.is_some_and(is_open),
+            is_open: outcome.is_some_and(is_open),
         },
         Err(error) => {
             let outcome = if let ApiError::Ended(outcome) = error { Some(outcome) } else { None };
-            let is_unheard = matches!(error, ApiError::NoReply(_)) || outcome.is_some_and(is_open);
-            Ended { outcome, reply: None, fault: Some(error.to_string()), is_unheard }
+            let is_open = matches!(error, ApiError::NoReply(_)) || outcome.is_some_and(is_open);
+            Ended { outcome, reply: None, fault: Some(error.to_string()), is_open }
         }
     }
 }
 
-/// In words, unless it was delivered.
+/// Returns the fault as text, unless the message was delivered.
 fn fault(outcome: Outcome, order: &Order) -> Option<String> {
     let within = order.within;
     let why = match outcome {
         Outcome::Delivered => return None,
         Outcome::Rejected(why) => why.to_string(),
         Outcome::Expired => {
-            format!("it was not come to within {within} ms; is the receiver busy? Give it more: --within")
+            format!("the receiver did not come to it within {within} ms; is it busy? Give it more: --within")
         }
-        Outcome::Failed => "its receiver failed, or ended with it in hand; look at `sinew tree`".to_owned(),
+        Outcome::Failed => {
+            "its receiver failed, or ended before it had handled it; look at `sinew tree`".to_owned()
+        }
         Outcome::PeerLost => "its node was lost before it was sent; look at `sinew nodes`".to_owned(),
-        Outcome::Unknown => format!("nobody has said within {within} ms; it may have been handled"),
+        Outcome::Unknown => format!("no outcome within {within} ms; it may have been handled"),
     };
     Some(format!("{outcome:?}: {why}"))
 }
 
-/// The type of a payload, by name or by number.
-pub(crate) fn kind(text: &str) -> Result<Kind, Fault> {
+/// Returns the type of a payload, by name or by number.
+pub(crate) fn kind(text: &str) -> Result<Kind, SystemError> {
     let kind = match text.strip_prefix("0x") {
         Some(digits) => u32::from_str_radix(digits, 16).ok().map(Kind::from_bits),
         None => Some(Kind::named(text)).filter(|_| !text.is_empty()),
     };
     kind.filter(|kind| kind.is_user()).ok_or_else(|| {
         let text = clean(text);
-        Fault::Usage(format!(
+        SystemError::Usage(format!(
             "'{text}' is no type of an application's payload: a name, or 0x80000000 to 0xffffffff"
         ))
     })
 }
 
-fn payload(json: &str) -> Result<Vec<u8>, Fault> {
+fn payload(json: &str) -> Result<Vec<u8>, SystemError> {
     let mut read = String::new();
     let text = if json == "-" {
         let input = std::io::stdin().take(INPUT_MAX).read_to_string(&mut read);
-        input.map_err(|error| Fault::Usage(format!("the standard input cannot be read: {error}")))?;
+        input.map_err(|error| SystemError::Usage(format!("the standard input cannot be read: {error}")))?;
         &read
     } else {
         json
@@ -205,16 +216,19 @@ fn payload(json: &str) -> Result<Vec<u8>, Fault> {
         return Ok(Vec::new());
     }
     let value: Value = serde_json::from_str(text).map_err(|error| {
-        Fault::Usage(format!("the payload is no JSON: {error}. A text needs its quotes: '\"on\"'"))
+        SystemError::Usage(format!("the payload is no JSON: {error}. A text needs its quotes: '\"on\"'"))
     })?;
-    messagepack::written(&value).map_err(Fault::Usage)
+    messagepack::written(&value).map_err(SystemError::Usage)
 }
 
 #[cfg(test)]
 mod tests {
     use std::time::Duration;
 
-    use sinew::message::Rejection;
+    use sinew::{
+        inspect::{AppReport, Missing},
+        message::Rejection,
+    };
 
     use super::*;
 
@@ -230,39 +244,48 @@ mod tests {
         }
     }
 
-    /// What is said of it where the receiver is known not to be ready.
-    fn said_of_a_waiting(ended: Result<Outcome, ApiError>) -> String {
+    /// The knee, which waits for an ankle, and handles these types.
+    fn waiting() -> Receiver {
+        let missing = Missing { name: "ankle".to_owned(), why: "not there".to_owned(), since_us: None };
+        Receiver {
+            node: "leg".to_owned(),
+            app: AppReport { missing: vec![missing], ..explained::tests::app(&["demo.angle"]) },
+        }
+    }
+
+    /// Returns the reported text if the receiver is known not to be ready.
+    fn text_of_a_waiting(ended: Result<Outcome, ApiError>) -> String {
         let mut ended = ended_of(ended.map(|outcome| (Some(outcome), None)), &order());
-        ended.explained_by(|| Some("it is not ready: has waited 2.0 s for ankle (not there)".to_owned()));
+        ended.explained_by(&order(), || Some(waiting()));
         ended.fault.unwrap_or_default()
     }
 
     #[test]
-    fn a_message_that_nobody_came_to_is_explained_by_a_receiver_that_is_not_ready() {
+    fn unconfirmed_message_is_explained_by_an_unready_receiver() {
         let why = "it is not ready: has waited 2.0 s for ankle (not there)";
         let unknown = format!("Unknown: it may have been handled, but {why}");
-        assert_eq!(said_of_a_waiting(Ok(Outcome::Unknown)), unknown);
-        assert_eq!(said_of_a_waiting(Ok(Outcome::Expired)), format!("Expired: {why}"));
-        assert_eq!(said_of_a_waiting(Err(ApiError::Ended(Outcome::Unknown))), unknown);
-        assert_eq!(said_of_a_waiting(Err(ApiError::NoReply(Duration::from_secs(2)))), why);
+        assert_eq!(text_of_a_waiting(Ok(Outcome::Unknown)), unknown);
+        assert_eq!(text_of_a_waiting(Ok(Outcome::Expired)), format!("Expired: {why}"));
+        assert_eq!(text_of_a_waiting(Err(ApiError::Ended(Outcome::Unknown))), unknown);
+        assert_eq!(text_of_a_waiting(Err(ApiError::NoReply(Duration::from_secs(2)))), why);
     }
 
     #[test]
-    fn what_has_a_reason_of_its_own_keeps_it_and_nobody_is_asked_for_another() {
-        assert_eq!(said_of_a_waiting(Ok(Outcome::Delivered)), "");
+    fn known_reason_is_kept_without_another_query() {
+        assert_eq!(text_of_a_waiting(Ok(Outcome::Delivered)), "");
         let full = Outcome::Rejected(Rejection::QueueFull);
         for ended in [Ok(full), Ok(Outcome::PeerLost), Err(ApiError::Ended(full)), Err(ApiError::LoanActive)]
         {
-            let said = said_of_a_waiting(ended);
-            assert!(!said.is_empty() && !said.contains("not ready"), "{said}");
+            let text = text_of_a_waiting(ended);
+            assert!(!text.is_empty() && !text.contains("not ready"), "{text}");
         }
     }
 
     #[test]
-    fn a_message_to_one_that_is_ready_is_unknown_as_nobody_has_said() {
+    fn missing_outcome_of_a_ready_receiver_is_unknown() {
         let mut ended = ended_of(Ok((Some(Outcome::Unknown), None)), &order());
-        ended.explained_by(|| None);
-        let said = ended.fault.expect("it is no success");
-        assert!(said.starts_with("Unknown: nobody has said within 2000 ms"), "{said}");
+        ended.explained_by(&order(), || None);
+        let fault = ended.fault.expect("it is no success");
+        assert!(fault.starts_with("Unknown: no outcome within 2000 ms"), "{fault}");
     }
 }

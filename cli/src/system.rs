@@ -1,4 +1,4 @@
-//! The way into the system: an endpoint at one node, from which all nodes are asked.
+//! The connection to the system: an endpoint at one node, from which all nodes are asked.
 
 use std::{
     collections::BTreeSet,
@@ -7,59 +7,69 @@ use std::{
 };
 
 use sinew::{
-    AppAddress, Endpoint, NodeAddress, NodeApi, Outcome, Payload, Registration, Tid,
+    AppAddress, Endpoint, NodeAddress, NodeApi, Outcome, Payload, Registration, Tid, Time,
     client::ApiError,
-    inspect::{AskNode, AskReach, NodeReport, ReachReport},
+    inspect::{AppsReport, AskApps, AskNode, AskReach, NodeReport, ReachReport},
     message::Rejection,
-    name::check_name,
 };
 
 use crate::{
     EXIT_FINDING, EXIT_NO_NODE, EXIT_USAGE,
-    door::{self, NoDoor, Others},
+    sockets::{self, NoSocketError, OtherSockets},
     table::clean,
+    unknown::{Known, Target, not_a_name},
 };
 
-/// Endpoints that ask at the same time at most: a node that does not answer holds up a part of the others only.
-const ASKERS_MAX: usize = 8;
-/// Time for the registration.
+/// Maximum number of endpoints that ask at the same time: a node that does not answer delays only a part of the others.
+const REQUESTERS_MAX: usize = 8;
+/// Time limit to ask the further nodes of this host for their projects. One answers within a few milliseconds.
+const PROJECTS_WITHIN: Duration = Duration::from_millis(300);
+/// Time limit for the registration.
 const REGISTERED_WITHIN: Duration = Duration::from_secs(5);
 
-/// Why a command cannot be carried out.
+/// Why a command failed.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum Fault {
-    /// No way in.
+pub(crate) enum SystemError {
+    /// No socket of a node was found.
     #[error(transparent)]
-    NoDoor(#[from] NoDoor),
-    /// The node lets nobody in.
+    NoSocket(#[from] NoSocketError),
+    /// The node does not register this client.
     #[error(
-        "the node at {0} lets nobody in now: {1}. It may be stopping: try again, or another one with --socket PATH"
+        "the node at {0} does not register this command now: {1}. It may be stopping: try again, or another one with --socket PATH"
     )]
-    NotTaken(String, ApiError),
+    NotRegistered(String, ApiError),
     /// The node does not answer.
     #[error("the node at {0}: {1}")]
     NoAnswer(String, String),
-    /// The node where the application is that was asked for, another one perhaps, does not answer or refuses.
+    /// The node of the requested application does not answer or refuses.
     #[error("the application's node {0}: {1}")]
     ItsNode(String, String),
-    /// Nobody is called so.
+    /// No application or node has this name.
     #[error("{0}")]
-    Whom(String),
-    /// Keys cannot be made or read.
+    Unknown(String),
+    /// Keys cannot be created or read.
     #[error("{0}")]
     Keys(String),
-    /// What was said on the command line cannot be meant.
+    /// The command line is invalid.
     #[error("{0}")]
     Usage(String),
 }
 
-impl Fault {
-    /// What the command ends with: see [`Arguments`](crate::arguments::Arguments).
+impl SystemError {
+    /// Adds a remedy, if the error is an unknown name.
+    pub(crate) fn with_remedy(self, remedy: &str) -> Self {
+        if let Self::Unknown(why) = &self {
+            return Self::Unknown(format!("{why}; {remedy}"));
+        }
+        self
+    }
+
+    /// Returns the exit code: see [`Arguments`](crate::arguments::Arguments).
     pub(crate) const fn code(&self) -> u8 {
         match self {
-            Self::ItsNode(..) | Self::Whom(_) | Self::Keys(_) => EXIT_FINDING,
+            Self::ItsNode(..) | Self::Unknown(_) | Self::Keys(_) => EXIT_FINDING,
             Self::Usage(_) => EXIT_USAGE,
-            Self::NoDoor(_) | Self::NotTaken(..) | Self::NoAnswer(..) => EXIT_NO_NODE,
+            Self::NoSocket(_) | Self::NotRegistered(..) | Self::NoAnswer(..) => EXIT_NO_NODE,
         }
     }
 }
@@ -67,43 +77,65 @@ impl Fault {
 /// A running system, seen from one node.
 pub(crate) struct System {
     api: NodeApi,
-    /// At the node through which we came.
+    /// The endpoint at the entry node.
     pub(crate) endpoint: Endpoint,
     /// Its socket.
     pub(crate) path: String,
-    /// How long each node has for its answer.
+    /// Time limit for the answer of each node.
     pub(crate) within: Duration,
-    /// Addresses that this program has or had: no part of the system that it shows.
+    /// Current and former addresses of this program, which are not shown as part of the system.
     pub(crate) own: BTreeSet<Tid>,
 }
 
-/// What a node has answered, or why it has not.
+/// The answer of a node, or why there is none.
 pub(crate) struct Answer<R> {
     pub(crate) node: NodeAddress,
-    /// As the others call it.
+    /// Its name, as other nodes report it.
     pub(crate) name: String,
-    pub(crate) said: Result<R, String>,
+    pub(crate) result: Result<R, String>,
 }
 
 impl System {
-    /// Enters through the socket that was named, else through the first that lets us in.
-    pub(crate) fn enter(socket: Option<&Path>, within: Duration) -> Result<Self, Fault> {
-        let (path, api) = door::find(socket)?;
+    /// Registers through the named socket, else through the first that accepts this command.
+    pub(crate) fn enter(socket: Option<&Path>, within: Duration) -> Result<Self, SystemError> {
+        let (path, api) = sockets::find(socket)?;
         Self::through(&path, api, within, REGISTERED_WITHIN)
     }
 
-    /// Enters through each further socket of this host; returns also those that let nobody in, or are not asked, with the reason.
+    /// Registers through each further socket of this host. Also returns those that refuse, or are not asked, with the
+    /// reason.
     pub(crate) fn beside(first: &Self, named: &[PathBuf]) -> (Vec<Self>, Vec<String>) {
-        let Others { doors, left_out } = door::others(Path::new(&first.path), named);
+        let OtherSockets { nodes, left_out } = sockets::others(Path::new(&first.path), named);
         let (mut inside, mut shut) = (Vec::new(), left_out);
-        for (path, api) in doors {
-            // One that is stopped does not keep us for longer than a node that does not answer.
+        for (path, api) in nodes {
+            // A stopped one delays the command no longer than a node that does not answer.
             match Self::through(&path, api, first.within, first.within.min(REGISTERED_WITHIN)) {
                 Ok(system) => inside.push(system),
-                Err(why) => shut.push(format!("the socket {} lets nobody in: {why}", path.display())),
+                Err(why) => {
+                    shut.push(format!("the socket {} does not accept this command: {why}", path.display()))
+                }
             }
         }
         (inside, shut)
+    }
+
+    /// Returns the projects of further nodes of this host, except `project`. A node that does not answer at once is
+    /// left out, and the command does not wait for it.
+    pub(crate) fn other_projects(&self, project: &str) -> BTreeSet<String> {
+        let until = Time::now() + PROJECTS_WITHIN;
+        let OtherSockets { nodes, .. } = sockets::others_within(Path::new(&self.path), &[], PROJECTS_WITHIN);
+        let mut projects = BTreeSet::new();
+        for (path, api) in nodes {
+            let left = until.since(Time::now());
+            if left.is_zero() {
+                break;
+            }
+            let Ok(mut system) = Self::through(&path, api, left, left) else { continue };
+            projects.extend(system.here().ok().map(|here| here.project));
+            system.leave();
+        }
+        projects.remove(project);
+        projects
     }
 
     fn through(
@@ -111,65 +143,80 @@ impl System {
         api: NodeApi,
         within: Duration,
         registered_within: Duration,
-    ) -> Result<Self, Fault> {
+    ) -> Result<Self, SystemError> {
         let path = path.display().to_string();
-        let endpoint = register(&api, registered_within).map_err(|why| Fault::NotTaken(path.clone(), why))?;
+        let endpoint =
+            register(&api, registered_within).map_err(|why| SystemError::NotRegistered(path.clone(), why))?;
         let own = BTreeSet::from([endpoint.tid()]);
         Ok(Self { api, endpoint, path, within, own })
     }
 
-    /// Leaves the system as if we had not been there.
+    /// Disconnects from the system.
     pub(crate) fn leave(self) {
         leave(self.endpoint);
     }
 
-    /// What the node through which we came says of itself and of those that it knows.
-    pub(crate) fn here(&mut self) -> Result<NodeReport, Fault> {
+    /// Returns the report of the entry node about itself and the nodes that it knows.
+    pub(crate) fn here(&mut self) -> Result<NodeReport, SystemError> {
         let node = self.endpoint.tid().node;
         let within = self.within;
         ask::<AskNode, NodeReport>(&mut self.endpoint, node, within)
-            .map_err(|why| Fault::NoAnswer(self.path.clone(), why))
+            .map_err(|why| SystemError::NoAnswer(self.path.clone(), why))
     }
 
-    /// An application's TID, a node's address, an application's name, a node's name: the first that it is. A node is its inspection.
-    pub(crate) fn find(&mut self, whom: &str) -> Result<Tid, Fault> {
-        let tid = whom.parse::<Tid>();
-        if let Ok(tid) = tid {
-            return Ok(tid);
+    /// Resolves an application's TID, a node's address, an application's name, or a node's name: the first match. A
+    /// node resolves to its inspection.
+    ///
+    /// # Errors
+    /// No application or node has this name; the error lists similar names.
+    pub(crate) fn find(&mut self, target: &str) -> Result<Tid, SystemError> {
+        match self.resolve(target)? {
+            Some(tid) => Ok(tid),
+            None => Err(self.unknown(target, Target::One)),
+        }
+    }
+
+    /// Like [`find`](Self::find), and finally a group of this name, whether it has members or not.
+    pub(crate) fn find_or_group(&mut self, target: &str) -> Result<Tid, SystemError> {
+        Ok(self.resolve(target)?.unwrap_or_else(|| Tid::group(target)))
+    }
+
+    fn resolve(&mut self, target: &str) -> Result<Option<Tid>, SystemError> {
+        if let Ok(tid) = target.parse::<Tid>() {
+            return Ok(Some(tid));
         }
         let inspection = |node: NodeAddress| Tid::new(node, AppAddress::INSPECT);
-        if let Ok(node) = whom.parse::<NodeAddress>() {
-            return Ok(inspection(node));
+        if let Ok(node) = target.parse::<NodeAddress>() {
+            return Ok(Some(inspection(node)));
         }
-        let resolved = self.endpoint.resolve(whom, self.within);
-        if let Some(tid) = resolved.map_err(|why| Fault::NoAnswer(self.path.clone(), why.to_string()))? {
-            return Ok(tid);
+        if let Some(why) = not_a_name(target) {
+            return Err(SystemError::Unknown(why));
+        }
+        let resolved = self.endpoint.resolve(target, self.within);
+        if let Some(tid) =
+            resolved.map_err(|why| SystemError::NoAnswer(self.path.clone(), why.to_string()))?
+        {
+            return Ok(Some(tid));
         }
         let here = self.here()?;
-        let nobody = || {
-            // Who writes a slash means a TID, where nobody is called so.
-            let no_tid = tid.as_ref().err().filter(|_| whom.contains('/'));
-            let unknown = || {
-                format!(
-                    "no application and no node is called '{whom}'; `sinew apps` and `sinew nodes` show those that are there"
-                )
-            };
-            Fault::Whom(clean(&no_tid.map_or_else(unknown, ToString::to_string)))
-        };
-        let nodes = chosen(&here, Some(whom)).map_err(|_| nobody())?;
-        nodes.first().map(|(node, _)| inspection(*node)).ok_or_else(nobody)
+        let node = chosen(&here, Some(target)).and_then(|nodes| nodes.first().map(|(node, _)| *node));
+        Ok(node.map(inspection))
     }
 
-    /// As [`find`](Self::find), and last of all a group of this name: one that has members, or the only thing that the name can mean.
-    pub(crate) fn find_or_group(&mut self, target: &str) -> Result<Tid, Fault> {
-        match self.find(target) {
-            Err(Fault::Whom(_)) if check_name(target).is_ok() => Ok(Tid::group(target)),
-            found => found,
+    /// Returns the error for an unknown name, with similar ones.
+    pub(crate) fn unknown(&mut self, name: &str, sought: Target) -> SystemError {
+        match self.here() {
+            Ok(here) => {
+                let known = Known::of(&here, self.ask_all::<AskApps, AppsReport>(&here));
+                SystemError::Unknown(known.report(name, sought))
+            }
+            Err(why) => why,
         }
     }
 
-    /// The members of a group, of every application or of an address on all nodes; and the nodes that have not said theirs, with the reason.
-    pub(crate) fn members(&mut self, to: Tid) -> Result<(Vec<Tid>, Vec<String>), Fault> {
+    /// Returns the members of a group, of all applications or of an address on all nodes; and the nodes that did not
+    /// report theirs, with the reason.
+    pub(crate) fn members(&mut self, to: Tid) -> Result<(Vec<Tid>, Vec<String>), SystemError> {
         let here = self.here()?;
         let question = AskReach { source: self.endpoint.tid(), to: to.app };
         let own = if to.node == NodeAddress::HERE { here.node } else { to.node };
@@ -180,7 +227,7 @@ impl System {
             }
             let inspection = Tid::new(node, AppAddress::INSPECT);
             match self.endpoint.message(inspection, &question).ask::<ReachReport>(self.within) {
-                Ok(said) => members.extend(said.reached.iter().map(|one| one.app)),
+                Ok(report) => members.extend(report.reached.iter().map(|one| one.app)),
                 Err(why) => silent.push(format!("{node} {}: {}", clean(&name), in_words(&why))),
             }
         }
@@ -188,7 +235,7 @@ impl System {
         Ok((members, silent))
     }
 
-    /// Asks this node and all that it knows, in the order of their addresses.
+    /// Asks this node and all nodes that it knows, in the order of their addresses.
     pub(crate) fn ask_all<Q, R>(&mut self, here: &NodeReport) -> Vec<Answer<R>>
     where
         Q: Payload + Default,
@@ -197,24 +244,29 @@ impl System {
         self.ask_these::<Q, R>(all(here))
     }
 
-    /// Asks these nodes; the answers come in the order of their addresses.
+    /// Asks these nodes; the answers are in the order of their addresses.
     pub(crate) fn ask_these<Q, R>(&mut self, nodes: Vec<(NodeAddress, String)>) -> Vec<Answer<R>>
     where
         Q: Payload + Default,
         R: Payload,
     {
-        let askers = nodes.len().min(ASKERS_MAX);
+        let requesters = nodes.len().min(REQUESTERS_MAX);
         let (api, within) = (&self.api, self.within);
         let parts: Vec<_> = std::thread::scope(|scope| {
-            let askers: Vec<_> = (0..askers)
-                .map(|asker| nodes.iter().skip(asker).step_by(askers).cloned().collect::<Vec<_>>())
+            let requesters: Vec<_> = (0..requesters)
+                .map(|requester| {
+                    nodes.iter().skip(requester).step_by(requesters).cloned().collect::<Vec<_>>()
+                })
                 .map(|part| scope.spawn(move || ask_each::<Q, R>(api, part, within)))
                 .collect();
-            askers.into_iter().map(|asker| asker.join().expect("an asker does not panic")).collect()
+            requesters
+                .into_iter()
+                .map(|requester| requester.join().expect("a requester does not panic"))
+                .collect()
         });
         let mut answers = Vec::new();
-        for (asker, part) in parts {
-            self.own.extend(asker);
+        for (requester, part) in parts {
+            self.own.extend(requester);
             answers.extend(part);
         }
         answers.sort_by_key(|answer| answer.node);
@@ -222,7 +274,7 @@ impl System {
     }
 }
 
-/// This node and all that it knows.
+/// Returns this node and all nodes that it knows.
 fn all(here: &NodeReport) -> Vec<(NodeAddress, String)> {
     let mut nodes = vec![(here.node, here.name.clone())];
     nodes.extend(here.peers.iter().map(|peer| (peer.node, peer.name.clone().unwrap_or_default())));
@@ -230,26 +282,20 @@ fn all(here: &NodeReport) -> Vec<(NodeAddress, String)> {
     nodes
 }
 
-/// Of all nodes those that have this address or name, at least one; all of them where none is wanted.
-pub(crate) fn chosen(here: &NodeReport, wanted: Option<&str>) -> Result<Vec<(NodeAddress, String)>, Fault> {
+/// Returns the nodes with this address or name; all of them if none is wanted; `None` if no node has it.
+pub(crate) fn chosen(here: &NodeReport, wanted: Option<&str>) -> Option<Vec<(NodeAddress, String)>> {
     let mut nodes = all(here);
     if let Some(wanted) = wanted {
         nodes.retain(|(node, name)| node.to_string() == wanted || name == wanted);
-        if nodes.is_empty() {
-            let wanted = clean(wanted);
-            return Err(Fault::Whom(format!(
-                "no node has the address or name '{wanted}'; `sinew nodes` shows those that are there"
-            )));
-        }
     }
-    Ok(nodes)
+    (!nodes.is_empty()).then_some(nodes)
 }
 
 fn register(api: &NodeApi, within: Duration) -> Result<Endpoint, ApiError> {
     api.register_transport_address(Registration::new().deadline(within))
 }
 
-/// Asks these one after the other; returns from which address.
+/// Asks these nodes one after the other. Returns the address that was used.
 fn ask_each<Q, R>(
     api: &NodeApi,
     nodes: Vec<(NodeAddress, String)>,
@@ -260,19 +306,20 @@ where
     R: Payload,
 {
     let mut endpoint = register(api, REGISTERED_WITHIN);
-    let asker = endpoint.as_ref().ok().map(Endpoint::tid);
+    let requester = endpoint.as_ref().ok().map(Endpoint::tid);
     let mut ask_one = |node| match &mut endpoint {
         Ok(endpoint) => ask::<Q, R>(endpoint, node, within),
         Err(why) => Err(why.to_string()),
     };
-    let answers = nodes.into_iter().map(|(node, name)| Answer { node, name, said: ask_one(node) }).collect();
+    let answers =
+        nodes.into_iter().map(|(node, name)| Answer { node, name, result: ask_one(node) }).collect();
     endpoint.into_iter().for_each(leave);
-    (asker, answers)
+    (requester, answers)
 }
 
-/// Gives the address back and waits for that, so that the next command does not see it.
+/// Releases the address and waits for that, so that the next command does not see it.
 fn leave(endpoint: Endpoint) {
-    // It is given back in any case when the connection ends.
+    // It is released in any case when the connection ends.
     let _ = endpoint.unregister();
 }
 
@@ -285,7 +332,7 @@ where
     endpoint.message(to, &Q::default()).ask::<R>(within).map_err(|error| in_words(&error))
 }
 
-/// What a question to a node ended with, and what to do.
+/// Returns the result of a failed question to a node, and the remedy.
 pub(crate) fn in_words(error: &ApiError) -> String {
     if let ApiError::Ended(Outcome::Rejected(Rejection::NoSuchApplication)) = error {
         return "it runs a version of Sinew that cannot be asked; update it".to_owned();

@@ -1,30 +1,39 @@
-//! Tables and texts for people.
+//! Tables and texts for users.
 
-use unicode_width::UnicodeWidthStr as _;
+use unicode_width::{UnicodeWidthChar as _, UnicodeWidthStr};
 
-/// Columns of a terminal that a table takes unless all of it is asked for.
+/// Maximum terminal columns of a table, unless it is wide.
 pub(crate) const WIDTH: usize = 120;
 /// Columns between two cells.
 const GAP: usize = 2;
-/// The last column is wrapped at no less than this.
-const LAST_MIN: usize = 40;
+/// Minimum width of a column.
+const COLUMN_MIN: usize = 4;
 
-/// A table with a heading; every column as wide as its longest cell, the text of the last one wrapped.
+/// A table with a heading. Each column is as wide as its longest cell; if the table is too wide for a terminal, the
+/// widest columns are wrapped.
 pub(crate) struct Table {
     rows: Vec<Vec<String>>,
     /// `None`: as wide as its cells are.
     width: Option<usize>,
+    /// Columns that are wrapped last, by their headings, because users copy their cells.
+    whole: &'static [&'static str],
 }
 
 impl Table {
     /// A table that has only its heading.
     pub(crate) fn new<const N: usize>(heading: [&str; N]) -> Self {
-        Self { rows: vec![heading.map(str::to_owned).to_vec()], width: Some(WIDTH) }
+        Self { rows: vec![heading.map(str::to_owned).to_vec()], width: Some(WIDTH), whole: &[] }
     }
 
-    /// The same table, its lines as long as its cells make them if `is_wide`.
+    /// Returns the same table with unlimited line length if `is_wide`.
     pub(crate) fn wide(mut self, is_wide: bool) -> Self {
         self.width = self.width.filter(|_| !is_wide);
+        self
+    }
+
+    /// Returns the same table, in which the columns with these headings are wrapped last.
+    pub(crate) fn whole(mut self, headings: &'static [&'static str]) -> Self {
+        self.whole = headings;
         self
     }
 
@@ -35,44 +44,80 @@ impl Table {
 
     /// The lines of the table.
     pub(crate) fn text(&self) -> String {
-        let columns = self.rows[0].len();
         let rows: Vec<Vec<String>> = self.rows.iter().map(|row| cleaned(row)).collect();
-        let width = |column: usize| rows.iter().map(|row| row[column].width()).max().unwrap_or(0);
-        let widths: Vec<_> = (0..columns - 1).map(width).collect();
-        let before: usize = widths.iter().map(|width| width + GAP).sum();
-        let room = self.width.map_or(usize::MAX, |all| all.saturating_sub(before).max(LAST_MIN));
-        rows.iter().map(|row| lines(row, &widths, room)).collect()
+        let widest = |cell: &String| cell.lines().map(UnicodeWidthStr::width).max().unwrap_or(0);
+        let columns = self.rows[0].len();
+        let width = |column: usize| rows.iter().map(|row| widest(&row[column])).max().unwrap_or(0);
+        let mut widths: Vec<_> = (0..columns).map(width).collect();
+        if let Some(all) = self.width {
+            let room = all.saturating_sub(GAP * (columns - 1));
+            let is_whole = |column: usize| self.whole.contains(&self.rows[0][column].as_str());
+            let narrowed: Vec<_> = (0..columns).filter(|column| !is_whole(*column)).collect();
+            narrow(&mut widths, &narrowed, room);
+            narrow(&mut widths, &(0..columns).collect::<Vec<_>>(), room);
+        }
+        rows.iter().map(|row| lines(row, &widths)).collect()
     }
 }
 
-/// The cells of a row as they are shown; of the last one each line by itself.
+/// Narrows the widest of these columns until all columns fit or none is wider than the others.
+fn narrow(widths: &mut [usize], columns: &[usize], room: usize) {
+    let all: usize = widths.iter().sum();
+    let own: usize = columns.iter().map(|column| widths[*column]).sum();
+    let own_room = room.saturating_sub(all - own);
+    let capped = |cap: usize| columns.iter().map(|column| widths[*column].min(cap)).sum::<usize>();
+    let widest = columns.iter().map(|column| widths[*column]).max().unwrap_or(0);
+    let cap =
+        (COLUMN_MIN..=widest.min(own_room)).rev().find(|cap| capped(*cap) <= own_room).unwrap_or(COLUMN_MIN);
+    let mut left = own_room.saturating_sub(capped(cap));
+    for column in columns {
+        let width = &mut widths[*column];
+        // The remainder of the division goes to the first ones.
+        let more = usize::from(*width > cap && left > 0);
+        left -= more;
+        *width = (*width).min(cap + more);
+    }
+}
+
+/// Returns the cells of a row as displayed; the last one is split into its lines.
 fn cleaned(row: &[String]) -> Vec<String> {
     let last = row.len() - 1;
     let cell = |(at, cell): (usize, &String)| {
-        if at < last { clean(cell) } else { cell.lines().map(clean).collect::<Vec<_>>().join("\n") }
+        if at < last { clean(cell) } else { clean_lines(cell) }
     };
     row.iter().enumerate().map(cell).collect()
 }
 
-/// The lines of one row: its last cell is wrapped at `room`, and continues below itself.
-fn lines(row: &[String], widths: &[usize], room: usize) -> String {
-    let Some((last, cells)) = row.split_last() else { return String::new() };
-    let padded = |(cell, width): (&String, &usize)| {
-        let fill = width.saturating_sub(cell.width()) + GAP;
-        format!("{cell}{}", " ".repeat(fill))
+/// Returns the lines of one row: each cell is wrapped at the width of its column, and continues below itself.
+pub(crate) fn lines(row: &[String], widths: &[usize]) -> String {
+    let wrap = |(cell, width): (&String, &usize)| {
+        cell.lines().flat_map(|line| wrapped(line, *width)).collect::<Vec<_>>()
     };
-    let mut head: String = cells.iter().zip(widths).map(padded).collect();
+    let cells: Vec<_> = row.iter().zip(widths).map(wrap).collect();
+    let height = cells.iter().map(Vec::len).max().unwrap_or(0).max(1);
     let mut text = String::new();
-    let wrapped: Vec<_> = last.lines().flat_map(|line| wrapped(line, room)).collect();
-    for line in wrapped.iter().map(String::as_str).chain(wrapped.is_empty().then_some("")) {
-        text += format!("{head}{line}").trim_end();
+    for at in 0..height {
+        let mut line = String::new();
+        for (cell, width) in cells.iter().zip(widths) {
+            let part = cell.get(at).map_or("", String::as_str);
+            line += part;
+            line += &" ".repeat(width.saturating_sub(part.width()) + GAP);
+        }
+        text += line.trim_end();
         text.push('\n');
-        head = " ".repeat(head.width());
     }
     text
 }
 
-/// A line in parts of at most `room` columns, parted between words.
+/// Returns a line of text, wrapped at [`WIDTH`] unless `is_wide`; continuation lines are indented slightly more than
+/// the first.
+pub(crate) fn paragraph(indent: usize, line: &str, is_wide: bool) -> String {
+    let room = if is_wide { usize::MAX } else { WIDTH.saturating_sub(indent + GAP) };
+    let parts = wrapped(line, room).into_iter().enumerate();
+    parts.map(|(at, part)| format!("{}{part}\n", " ".repeat(indent + if at > 0 { GAP } else { 0 }))).collect()
+}
+
+/// Splits a line into parts of at most `room` columns, between words if these fit.
 fn wrapped(line: &str, room: usize) -> Vec<String> {
     let mut parts: Vec<String> = Vec::new();
     for word in line.split(' ') {
@@ -81,24 +126,58 @@ fn wrapped(line: &str, room: usize) -> Vec<String> {
                 part.push(' ');
                 part.push_str(word);
             }
-            Some(_) | None => parts.push(word.to_owned()),
+            Some(_) | None => parts.extend(cut(word, room)),
         }
     }
     parts
 }
 
-/// A text of another program, each character that would move the cursor, forge a line or hide as its escape.
+/// Splits a word into pieces of at most `room` columns.
+fn cut(word: &str, room: usize) -> Vec<String> {
+    let mut pieces = vec![String::new()];
+    let mut width = 0;
+    for character in word.chars() {
+        let wide = character.width().unwrap_or(0);
+        if width + wide > room && width > 0 {
+            pieces.push(String::new());
+            width = 0;
+        }
+        width += wide;
+        if let Some(piece) = pieces.last_mut() {
+            piece.push(character);
+        }
+    }
+    pieces
+}
+
+/// Returns the start of a text from another program, for a quotation in a message.
+pub(crate) fn short(text: &str) -> String {
+    const QUOTED_MAX: usize = 80;
+    let text = clean(text);
+    match text.char_indices().nth(QUOTED_MAX) {
+        Some((end, _)) => format!("{}...", &text[..end]),
+        None => text,
+    }
+}
+
+/// Returns a text from another program, with escapes for each character that would move the cursor, forge a line or be
+/// invisible.
 pub(crate) fn clean(text: &str) -> String {
     sinew::name::shown(text)
 }
 
-/// One word for the shell.
+/// Same as [`clean`], but keeps the lines of the text.
+pub(crate) fn clean_lines(text: &str) -> String {
+    text.lines().map(clean).collect::<Vec<_>>().join("\n")
+}
+
+/// Quotes one word for the shell.
 pub(crate) fn quoted(word: &str) -> String {
     let is_plain = |sign: char| sign.is_ascii_alphanumeric() || "/._-".contains(sign);
     if word.chars().all(is_plain) { word.to_owned() } else { format!("'{}'", word.replace('\'', r"'\''")) }
 }
 
-/// A time in the unit that suits it, from microseconds.
+/// Returns a time given in microseconds, in a suitable unit.
 pub(crate) fn time(micros: u64) -> String {
     let seconds = micros / 1_000_000;
     match seconds {
@@ -111,17 +190,27 @@ pub(crate) fn time(micros: u64) -> String {
     }
 }
 
-/// What is known, or a dash.
+/// Returns the text, or a dash for an unknown one.
 pub(crate) fn or_dash(text: Option<String>) -> String {
     text.unwrap_or_else(|| "-".to_owned())
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
 
+    /// Returns the columns of the longest line.
+    pub(crate) fn widest(text: &str) -> usize {
+        text.lines().map(UnicodeWidthStr::width).max().unwrap_or(0)
+    }
+
+    /// A name of the maximum length.
+    pub(crate) fn long_name() -> String {
+        "left-knee.".repeat(7).chars().take(63).collect()
+    }
+
     #[test]
-    fn a_column_is_as_wide_as_its_longest_cell_on_the_screen_and_a_foreign_text_forges_no_line() {
+    fn columns_fit_cells_and_control_characters_are_escaped() {
         let mut table = Table::new(["name", "state", "what"]);
         table.row(["膝".to_owned(), "a\nb".to_owned(), "x\u{202e}y".to_owned()]);
         table.row(["knee".to_owned(), "c".to_owned(), "z".to_owned()]);
@@ -130,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn the_last_column_is_wrapped_between_words_below_itself_unless_all_is_asked_for() {
+    fn last_column_wraps_between_words_unless_wide() {
         let words = ["word"; 40].join(" ");
         let mut table = Table::new(["step", "detail"]);
         table.row(["knee".to_owned(), format!("{words}\nits second line")]);
@@ -142,8 +231,32 @@ mod tests {
     }
 
     #[test]
-    fn times_are_told_in_the_unit_that_suits_them() {
-        let told = [7, 1_500, 2_500_000, 61_000_000, 3_660_000_000, 90_000_000_000].map(time);
-        assert_eq!(told, ["7 us", "1.5 ms", "2.5 s", "1 min 1 s", "1 h 1 min", "1 d 1 h"]);
+    fn table_fits_a_terminal_and_keeps_all_text() {
+        for lengths in [[63, 63, 63, 63], [1, 63, 63, 400], [400, 400, 400, 400], [120, 0, 3, 0]] {
+            let mut table = Table::new(["TID", "NAME", "NODE", "DETAIL"]).whole(&["TID"]);
+            table.row(lengths.map(|length| "k".repeat(length)));
+            let text = table.text();
+            assert!(widest(&text) <= WIDTH, "{text}");
+            assert_eq!(text.matches('k').count(), lengths.iter().sum::<usize>(), "{text}");
+        }
+        let mut table = Table::new(["NUMBER", "NAME", "DETAIL"]).whole(&["NUMBER"]);
+        table.row(["1".repeat(40), "膝".repeat(60), "words ".repeat(30)]);
+        let text = table.text();
+        assert!(widest(&text) <= WIDTH && text.contains(&"1".repeat(40)), "{text}");
+        assert_eq!(text.matches('膝').count(), 60);
+    }
+
+    #[test]
+    fn paragraph_continues_with_an_indent() {
+        let text = paragraph(3, &"word ".repeat(60), false);
+        assert!(widest(&text) <= WIDTH && text.lines().count() > 2, "{text}");
+        assert!(text.lines().skip(1).all(|line| line.starts_with("     ")), "{text}");
+        assert_eq!(paragraph(3, &"word ".repeat(60), true).lines().count(), 1);
+    }
+
+    #[test]
+    fn times_are_shown_in_a_suitable_unit() {
+        let texts = [7, 1_500, 2_500_000, 61_000_000, 3_660_000_000, 90_000_000_000].map(time);
+        assert_eq!(texts, ["7 us", "1.5 ms", "2.5 s", "1 min 1 s", "1 h 1 min", "1 d 1 h"]);
     }
 }

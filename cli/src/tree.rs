@@ -1,36 +1,41 @@
-//! `sinew tree`: who supervises whom, with restarts.
+//! `sinew tree`: the supervision tree of each node, with restarts.
 
 use serde_json::{Value, json};
 use sinew::inspect::{AskTree, TreeLine, TreeReport};
 
 use crate::{
     Report,
-    system::{Answer, Fault, System, chosen},
-    table::{clean, time},
+    system::{Answer, System, SystemError, chosen},
+    table::{clean, paragraph, time},
+    unknown::Target,
 };
 
-/// Asks every node, or the one called so.
-pub(crate) fn show(system: &mut System, wanted: Option<&str>) -> Result<Report, Fault> {
+/// Asks every node, or the node with this name.
+pub(crate) fn show(system: &mut System, wanted: Option<&str>, is_wide: bool) -> Result<Report, SystemError> {
     let here = system.here()?;
-    let nodes = chosen(&here, wanted)?;
+    let Some(nodes) = chosen(&here, wanted) else {
+        return Err(system.unknown(wanted.unwrap_or_default(), Target::Node));
+    };
     let answers = system.ask_these::<AskTree, TreeReport>(nodes);
-    let is_fine = answers.iter().all(|answer| answer.said.as_ref().is_ok_and(|said| said.left_out == 0));
-    let text = answers.iter().map(text).collect::<Vec<_>>().join("\n");
+    let is_fine =
+        answers.iter().all(|answer| answer.result.as_ref().is_ok_and(|report| report.left_out == 0));
+    let text = answers.iter().map(|answer| text(answer, is_wide)).collect::<Vec<_>>().join("\n");
     Ok(Report { text, json: json!({ "nodes": answers.iter().map(node_json).collect::<Vec<_>>() }), is_fine })
 }
 
-fn text(answer: &Answer<TreeReport>) -> String {
-    let said = match &answer.said {
-        Ok(said) => said,
+fn text(answer: &Answer<TreeReport>, is_wide: bool) -> String {
+    let report = match &answer.result {
+        Ok(report) => report,
         Err(why) => return format!("{} {}: {}\n", answer.node, clean(&answer.name), clean(why)),
     };
-    let mut text = format!("{} {}\n", answer.node, clean(&said.name));
-    for line in &said.lines {
-        // As many as came; a depth that another node made up moves nothing out of the window.
-        text += &format!("{}{}\n", "   ".repeat(line.depth.min(16) as usize + 1), clean(&in_words(line)));
+    let mut text = format!("{} {}\n", answer.node, clean(&report.name));
+    for line in &report.lines {
+        // Bounded: an invented depth of another node cannot move the text out of the window.
+        let indent = 3 * (line.depth.min(16) as usize + 1);
+        text += &paragraph(indent, &clean(&in_words(line)), is_wide);
     }
-    if said.left_out > 0 {
-        text += &format!("   {} further ones had no room in its answer\n", said.left_out);
+    if report.left_out > 0 {
+        text += &format!("   {} further ones had no room in its answer\n", report.left_out);
     }
     text
 }
@@ -54,13 +59,13 @@ fn in_words(line: &TreeLine) -> String {
 }
 
 fn node_json(answer: &Answer<TreeReport>) -> Value {
-    let said = answer.said.as_ref();
+    let result = answer.result.as_ref();
     json!({
         "node": answer.node.to_string(),
-        "name": said.map_or(&answer.name, |said| &said.name),
-        "fault": said.err(),
-        "left_out": said.map_or(0, |said| said.left_out),
-        "tree": said.map_or_else(|_| Vec::new(), |said| said.lines.iter().map(line_json).collect()),
+        "name": result.map_or(&answer.name, |report| &report.name),
+        "fault": result.err(),
+        "left_out": result.map_or(0, |report| report.left_out),
+        "tree": result.map_or_else(|_| Vec::new(), |report| report.lines.iter().map(line_json).collect()),
     })
 }
 
@@ -79,4 +84,40 @@ fn line_json(line: &TreeLine) -> Value {
         "waiting_most": line.waiting_most,
         "strategy": line.strategy,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew::{AppAddress, NodeAddress, Tid};
+
+    use super::*;
+    use crate::table::{
+        WIDTH,
+        tests::{long_name, widest},
+    };
+
+    #[test]
+    fn tree_fits_a_terminal_and_keeps_its_branches() {
+        let name = long_name();
+        let line = |depth| TreeLine {
+            depth,
+            name: name.clone(),
+            tid: Some(Tid::new(NodeAddress::from([192, 168, 100, 200]), AppAddress::new(0x8000_0001))),
+            state: "ready".to_owned(),
+            since_us: 90_000_000_000,
+            life: 7,
+            restarts: 6,
+            last_reason: Some(format!("panicked: {name}")),
+            place: Some(format!("thread {name}, SCHED_FIFO 40, CPU 3")),
+            waiting: Some(12),
+            waiting_most: Some(512),
+            strategy: Some("one for one".to_owned()),
+        };
+        let report = TreeReport { name: name.clone(), lines: [0, 1, 9].map(line).to_vec(), left_out: 0 };
+        let answer = Answer { node: NodeAddress::new(2), name: name.clone(), result: Ok(report) };
+        let shown = text(&answer, false);
+        assert!(widest(&shown) <= WIDTH, "{shown}");
+        assert!(shown.contains(&format!("\n      {name}: ")), "{shown}");
+        assert_eq!(text(&answer, true).lines().count(), 4);
+    }
 }

@@ -1,4 +1,4 @@
-//! The format `links` of `sinew-formats`, with bytes that libFuzzer chooses by what they reach.
+//! The format `links` of `sinew-formats`, with bytes that libFuzzer selects by code coverage.
 
 #![no_main]
 

@@ -1,4 +1,4 @@
-//! Wakes a task at an exact time: a timerfd of its own, not a wheel of milliseconds.
+//! A task alarm at an exact time: a timerfd of its own, not a timer wheel of milliseconds.
 
 use std::{
     io,
@@ -11,7 +11,7 @@ use tokio::io::unix::AsyncFd;
 
 use crate::{time::Time, timer::kernel_timer};
 
-/// One timer of the kernel's, on the monotonic clock.
+/// One kernel timer, on the monotonic clock.
 #[derive(Debug)]
 pub struct Alarm {
     timer: AsyncFd<OwnedFd>,
@@ -19,7 +19,7 @@ pub struct Alarm {
 }
 
 impl Alarm {
-    /// A timer that is not set, in the reactor of the calling thread.
+    /// Creates a timer that is not set, in the reactor of the calling thread.
     ///
     /// # Errors
     ///
@@ -37,14 +37,14 @@ impl Alarm {
         if at != self.set_for {
             self.set(at)?;
         }
-        // A readiness that is left over from an earlier setting is cleared, so that the next expiry is an edge.
+        // A readiness of an earlier setting is cleared, so that the next expiry is an edge.
         while let Poll::Ready(guard) = self.timer.poll_read_ready(cx) {
             let mut guard = guard?;
             let mut expirations = [0; 8];
             match rustix::io::read(self.timer.get_ref(), &mut expirations) {
                 Ok(_) => {
                     self.set_for = None;
-                    // The time has come between the caller's look at the clock and now.
+                    // The time passed after the caller read the clock.
                     cx.waker().wake_by_ref();
                     guard.clear_ready();
                 }

@@ -1,4 +1,4 @@
-//! Where there is no timerfd: wakes a task by tokio's wheel, which has a tick of a millisecond.
+//! A task alarm for systems without timerfd: tokio's timer wheel, which has a tick of a millisecond.
 
 use std::{
     io,
@@ -10,7 +10,7 @@ use tokio::time::{Instant, Sleep, sleep};
 
 use crate::time::Time;
 
-/// One timer of the reactor's.
+/// One timer of the reactor.
 #[derive(Debug)]
 pub struct Alarm {
     sleep: Pin<Box<Sleep>>,
@@ -18,7 +18,7 @@ pub struct Alarm {
 }
 
 impl Alarm {
-    /// A timer that is not set, in the reactor of the calling thread.
+    /// Creates a timer that is not set, in the reactor of the calling thread.
     ///
     /// # Errors
     ///
@@ -43,7 +43,7 @@ impl Alarm {
         }
         if self.set_for.is_some() && self.sleep.as_mut().poll(cx) == Poll::Ready(()) {
             self.set_for = None;
-            // The time has come between the caller's look at the clock and now.
+            // The time passed after the caller read the clock.
             cx.waker().wake_by_ref();
         }
         Ok(())

@@ -1,53 +1,59 @@
-//! What makes Sinew's actors live: addresses, messages, mailboxes, supervision, time.
+//! The runtime of Sinew's actors: addresses, messages, mailboxes, supervision, time.
 //!
-//! This crate knows no layer and no socket. Read it in this order:
+//! This crate depends on no layer and no socket. Read it in this order:
 //!
-//! | module | what it is |
+//! | module | content |
 //! | --- | --- |
-//! | [`tid`] | who: the 64-bit transport ID |
-//! | [`time`] | when: nanoseconds of the monotonic clock |
-//! | [`wire`] | what: header, payload, frames |
-//! | [`outcome`] | and then: what became of a message |
-//! | [`undelivered`] | unconfirmed messages that were refused |
-//! | [`router`] | where to: the table that senders read without a lock |
-//! | [`post`] | events into an actor that outlive it |
-//! | [`mailbox`] | messages into an application that outlive it |
-//! | [`monitor`] | who is told of an end |
+//! | [`tid`] | the 64-bit transport ID |
+//! | [`time`] | nanoseconds of the monotonic clock |
+//! | [`wire`] | header, payload, frames |
+//! | [`outcome`] | outcomes of confirmed messages |
+//! | [`undelivered`] | unconfirmed messages that were rejected |
+//! | [`router`] | the routing table, which senders read without a lock |
+//! | [`event_queue`] | event queues of actors, which outlive the actors |
+//! | [`mailbox`] | message queues of applications, which outlive the applications |
+//! | [`monitor`] | notifications of the end of an application |
 //! | [`wakes`] | one wake for a batch of messages |
-//! | [`remedy`] | what mends a system call that has failed |
-//! | [`safe_wake`] | wakes from threads whose thread-local variables are gone |
-//! | [`pending`], [`sender`] | sending, and waiting for what comes of it |
+//! | [`remedy`] | remedies for failed system calls |
+//! | [`safe_wake`] | wakes from threads without usable thread-local variables |
+//! | [`pending`], [`sender`] | sending, and waiting for outcomes and replies |
 //! | [`protection`] | end-to-end protection of commands, and outputs that are safe without them |
-//! | [`schedule`] | what an actor does when |
-//! | [`app`] | what an application is |
+//! | [`schedule`] | the timers of an actor |
+//! | [`app`] | applications |
 //! | [`timer`], [`alarm`] | the kernel's timer, exact to microseconds; a task that it wakes |
-//! | [`supervision`] | who is started, when, and again after a fault |
-//! | [`log`] | what the runtime says of itself, without waiting for who reads it |
+//! | [`supervision`] | starts, restarts and failures of actors |
+//! | [`lock`] | locks that survive the panic of their holder |
+//! | [`log`] | the log of the runtime, which never waits for its reader |
 
 #[cfg_attr(not(target_os = "linux"), path = "alarm_elsewhere.rs")]
 pub mod alarm;
 pub mod app;
+pub mod event_queue;
+#[cfg(feature = "fuzzing")]
+#[doc(hidden)]
+pub mod fuzzing;
+mod locking;
 pub mod log;
 pub mod mailbox;
 pub mod monitor;
 pub mod name;
 pub mod outcome;
 pub mod pending;
-pub mod post;
 pub mod protection;
 pub mod remedy;
 pub mod router;
 pub mod safe_wake;
 pub mod schedule;
-#[cfg(test)]
-mod seeded;
 pub mod sender;
 pub mod supervision;
+mod thread;
 pub mod tid;
 pub mod time;
-// A timerfd; `alarm` stands in for it elsewhere.
+// A timerfd; `alarm` replaces it on other systems.
 #[cfg(target_os = "linux")]
 pub mod timer;
 pub mod undelivered;
 pub mod wakes;
 pub mod wire;
+
+pub use locking::lock;

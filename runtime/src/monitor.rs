@@ -1,4 +1,4 @@
-//! Monitors: who is told when a life of another application ends, and why. In OTP's sense.
+//! Monitors, in OTP's sense: notifications of the end of another application's incarnation, and its reason.
 
 use std::fmt;
 
@@ -10,7 +10,7 @@ use crate::{
     wire::{Class, Payload},
 };
 
-/// Names one monitor; never used twice in a node's life.
+/// The ID of one monitor, unique in the lifetime of a node.
 ///
 /// # Examples
 ///
@@ -33,7 +33,7 @@ use crate::{
 #[serde(transparent)]
 pub struct MonitorId(pub u64);
 
-/// Which kind of end it was.
+/// The kind of end.
 ///
 /// # Examples
 ///
@@ -48,26 +48,26 @@ pub struct MonitorId(pub u64);
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum DownClass {
-    /// It ended by itself, in order.
+    /// The application ended itself, in order.
     Normal,
-    /// It was told to stop, or stopped because it lost what it requires.
+    /// The application was ordered to stop, or stopped because it lost a requirement.
     Shutdown,
-    /// It panicked.
+    /// The application panicked.
     Panic,
-    /// It did not come back in its progress budget.
+    /// The application exceeded its progress budget.
     Hung,
-    /// Its life was taken: it missed a deadline, or lost what it ran on.
+    /// The application was abandoned: it missed a deadline, or lost its thread.
     Killed,
-    /// Its process ended.
+    /// The application's process ended.
     ProcessEnded,
-    /// Its node was lost, left, or is not known. Whether the application lives is not known.
+    /// The application's node was lost, left, or is unknown. Whether the application is alive is unknown.
     NodeLost,
-    /// Nobody has this TID.
+    /// No application has this TID.
     NoSuchAddress,
 }
 
 impl DownClass {
-    /// The class of a life's end.
+    /// Returns the class of an end reason.
     #[must_use]
     pub const fn of(reason: &Reason) -> Self {
         match reason {
@@ -83,10 +83,10 @@ impl DownClass {
     }
 }
 
-/// What a monitor says, once: the life that was watched has ended. The watcher handles it with `handles::<Down>()`; it
-/// goes ahead of every message that waits. A restart behind the same TID is an end, too; who wants to watch the next
-/// life monitors again. That there is nobody ([`DownClass::NoSuchAddress`], [`DownClass::NodeLost`]) is told at once, 256 times;
-/// who goes on to ask is told once every 10 ms.
+/// The one report of a monitor: the watched incarnation has ended. The watcher handles it with
+/// `handles::<Down>()`; it precedes all queued messages. A restart behind the same TID is an end too; to
+/// watch the next incarnation, set a new monitor. An absent target ([`DownClass::NoSuchAddress`],
+/// [`DownClass::NodeLost`]) is reported at once for the first 256 requests, and after that once every 10 ms.
 ///
 /// # Examples
 ///
@@ -100,7 +100,7 @@ impl DownClass {
 ///     type Result = ();
 ///     fn handle(&mut self, down: Delivery<Down>, ctx: &mut Self::Context) {
 ///         println!("{} ended: {}", down.tid, down.why);
-///         // The next life has the same TID, and needs a monitor of its own.
+///         // The next incarnation has the same TID, and needs a monitor of its own.
 ///         let _ = ctx.monitor(down.tid);
 ///     }
 /// }
@@ -109,13 +109,13 @@ impl DownClass {
 /// ```
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Down {
-    /// Which monitor.
+    /// The ID of the monitor.
     pub monitor: MonitorId,
-    /// Who was watched.
+    /// The TID of the watched application.
     pub tid: Tid,
-    /// Which kind of end it was.
+    /// The kind of end.
     pub class: DownClass,
-    /// The reason in words, at most 256 bytes.
+    /// The reason as a text, at most 256 bytes.
     pub why: String,
 }
 
@@ -130,7 +130,7 @@ impl fmt::Display for Down {
     }
 }
 
-/// Why a monitor was not set. Nothing changed.
+/// The reason why a monitor was not set. Nothing changed.
 ///
 /// # Examples
 ///
@@ -142,22 +142,22 @@ impl fmt::Display for Down {
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum MonitorError {
-    /// This is not the TID of one application: a layer, a group, everybody.
+    /// The TID is not that of one application, but of a layer, a group, or all applications.
     #[error("{0} is not the TID of one application")]
     NotOne(Tid),
-    /// This application has as many monitors as it may have.
+    /// The application has its maximum number of monitors.
     #[error("this application has {0} monitors, which is the limit; demonitor some")]
     TooMany(usize),
-    /// The node has as many monitors as it may have.
+    /// The node has its maximum number of monitors.
     #[error("the node has {0} monitors, which is the limit")]
     NodeFull(usize),
-    /// As many applications of that node are watched from here as may be.
+    /// The maximum number of applications of that node is watched from here.
     #[error("{0} applications of that node are watched from here, which is the limit")]
     PeerFull(usize),
-    /// This life of the application was taken.
-    #[error("this life of the application is over; a later one speaks for it")]
+    /// This incarnation of the application was abandoned.
+    #[error("this incarnation of the application has ended; a later one has replaced it")]
     LifeOver,
-    /// Not from here: an application in a process of its own cannot monitor others.
+    /// Not supported here: an application in a process of its own cannot monitor others.
     #[error("an application in a process of its own cannot monitor others")]
     Unsupported,
 }

@@ -2,21 +2,31 @@
 //!
 //! A name is 1 to 63 bytes of UTF-8. It has
 //!
-//! - no control characters, line separators, and no characters without a width or with a direction of their own (`U+200B`, `U+202E`);
+//! - no control characters, line separators, and no characters without a width or with a direction of their
+//!   own (`U+200B`, `U+202E`);
 //! - no white space at its beginning or end;
 //! - no `*` and no `|`: these belong to the language of requirements;
-//! - no form that the language of requirements reads as more than a name: `2 of drives`, `drive at homed`, `camera ?2s`;
-//! - no form of an address: `10.0.0.2`, `10.0.0.2/80000001`.
+//! - no form that the language of requirements reads as more than a name: `2 of drives`, `drive at homed`,
+//!   `camera ?2s`;
+//! - no form of an address: `10.0.0.2`, `10.0.0.2/80000001`;
+//! - no form of a kind's number: `0x80001f2e`.
+//!
+//! The name of a node or a project is also the name of a directory and of files, and appears on command lines
+//! ([`check_node_name`]). It has
+//!
+//! - no `/` and no `=`;
+//! - no `-` and no `.` at its beginning;
+//! - no `.toml` at its end.
 
 use crate::{
     app::Requirement,
     tid::{NodeAddress, Tid},
 };
 
-/// Longest name in bytes.
+/// Maximum length of a name in bytes.
 pub const NAME_BYTES_MAX: usize = 63;
 
-/// Why a text is no name. The caller is at fault.
+/// The reason why a text is not a valid name. This is an error of the caller.
 ///
 /// # Examples
 ///
@@ -28,31 +38,47 @@ pub const NAME_BYTES_MAX: usize = 63;
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum NameError {
-    /// It has no characters.
+    /// The text is empty.
     #[error("it is empty; a name has 1 to {NAME_BYTES_MAX} bytes")]
     Empty,
-    /// It has more than [`NAME_BYTES_MAX`] bytes.
+    /// The text has more than [`NAME_BYTES_MAX`] bytes.
     #[error("it has {0} bytes, and a name has at most {NAME_BYTES_MAX}")]
     TooLong(usize),
-    /// It has a character that a reader would not see.
+    /// The text has a character that a reader would not see.
     #[error("it contains the invisible character U+{:04X}; remove it", u32::from(*.0))]
     Invisible(char),
-    /// White space comes first or last.
+    /// The text begins or ends with white space.
     #[error("it begins or ends with white space; remove that")]
     WhiteSpace,
-    /// It has a character of the language of requirements.
+    /// The text has a character of the language of requirements.
     #[error(
         "'{0}' belongs to the language of requirements (`a | b`, `drive.*`); use letters, digits, '.', '_' or '-' instead"
     )]
     Reserved(char),
-    /// A requirement with this text asks for something else.
+    /// The text has another meaning as a requirement.
     #[error(
         "as a requirement it asks for something else (`2 of drives`, `drive at homed`, `camera ?2s`); choose another name"
     )]
     Expression,
-    /// It reads as an address.
+    /// The text has the form of an address.
     #[error("it reads as the address of a node or an application; choose another name")]
     Address,
+    /// The text has the form of a kind's number.
+    #[error("it reads as the number of a message's kind (`0x80001f2e`); choose another name")]
+    Number,
+    /// The name of a node or a project has a character that cannot be used in file names or command options.
+    #[error(
+        "'{0}' cannot stand in the name of a node or a project, which names directories and files; use letters, digits, '.', '_' or '-' instead"
+    )]
+    File(char),
+    /// The name of a node or a project begins like an option or a hidden file.
+    #[error(
+        "the name of a node or a project begins with a letter, a digit or '_', not with '{0}': it names directories and stands on command lines"
+    )]
+    First(char),
+    /// The name of a node or a project ends like a configuration file.
+    #[error("it reads as the name of a configuration file (`knee.toml`); leave out `.toml`")]
+    Toml,
 }
 
 /// Checks a name against the grammar of this module.
@@ -92,11 +118,60 @@ pub fn check_name(name: &str) -> Result<(), NameError> {
     if name.parse::<NodeAddress>().is_ok() || name.parse::<Tid>().is_ok() {
         return Err(NameError::Address);
     }
+    let is_hexadecimal = |digits: &str| digits.chars().all(|digit| digit.is_ascii_hexdigit());
+    if name.strip_prefix("0x").is_some_and(is_hexadecimal) {
+        return Err(NameError::Number);
+    }
     Ok(())
 }
 
-/// Whether a character changes how the text around it is shown without being seen itself: controls, line and paragraph separators,
-/// characters that set the direction of text, characters of no width, and tags.
+/// Checks a pattern of names, where `*` matches any text. A pattern that no legal name can match is rejected.
+///
+/// # Errors
+/// The first rule that each text of this pattern breaks.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::name::{NameError, check_name_pattern};
+///
+/// assert!(check_name_pattern("leg.*").is_ok());
+/// assert_eq!(check_name_pattern("leg.* | arm.*"), Err(NameError::Reserved('|')));
+/// ```
+pub fn check_name_pattern(pattern: &str) -> Result<(), NameError> {
+    // Any character that is legal everywhere.
+    check_name(&pattern.replace('*', "x"))
+}
+
+/// Checks the name of a node or a project: [`check_name`], and the rules for directories, files and command lines.
+///
+/// # Errors
+/// The first rule that the text breaks.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::name::{NameError, check_name, check_node_name};
+///
+/// assert!(check_name("leg/sensor").is_ok());
+/// assert_eq!(check_node_name("leg/sensor"), Err(NameError::File('/')));
+/// ```
+pub fn check_node_name(name: &str) -> Result<(), NameError> {
+    check_name(name)?;
+    if let Some(unfit) = name.chars().find(|character| "/=".contains(*character)) {
+        return Err(NameError::File(unfit));
+    }
+    if let Some(first) = name.chars().next().filter(|first| "-.".contains(*first)) {
+        return Err(NameError::First(first));
+    }
+    if name.ends_with(".toml") {
+        return Err(NameError::Toml);
+    }
+    Ok(())
+}
+
+/// Returns whether a character is invisible and changes how the text around it is shown: controls, line and
+/// paragraph separators, characters that set the direction of text, characters without width, and tags.
 #[must_use]
 pub fn is_invisible(character: char) -> bool {
     character.is_control()
@@ -109,7 +184,7 @@ pub fn is_invisible(character: char) -> bool {
         )
 }
 
-/// A text from outside as it is shown: each invisible character as its escape, `\u{202e}`.
+/// Returns a text from outside for display: each invisible character as its escape, `\u{202e}`.
 #[must_use]
 pub fn shown(text: &str) -> String {
     let mut shown = String::with_capacity(text.len());
@@ -148,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn a_name_that_requirements_cannot_say_is_refused_with_its_reason() {
+    fn name_that_requirements_cannot_express_is_rejected() {
         for (name, why) in [
             ("", NameError::Empty),
             ("a|b", NameError::Reserved('|')),
@@ -164,6 +239,8 @@ mod tests {
             ("kn\u{200b}ee", NameError::Invisible('\u{200b}')),
             ("10.0.0.2", NameError::Address),
             ("10.0.0.2/80000001", NameError::Address),
+            ("0x10", NameError::Number),
+            ("0x", NameError::Number),
         ] {
             assert_eq!(check_name(name), Err(why), "{name:?}");
         }
@@ -171,7 +248,25 @@ mod tests {
     }
 
     #[test]
-    fn a_text_is_shown_with_its_invisible_characters_escaped() {
+    fn node_name_unusable_in_directory_or_shell_is_rejected() {
+        for (name, why) in [
+            ("a/b", NameError::File('/')),
+            ("a=b", NameError::File('=')),
+            ("-x", NameError::First('-')),
+            ("..", NameError::First('.')),
+            (".hidden", NameError::First('.')),
+            ("x.toml", NameError::Toml),
+            ("a|b", NameError::Reserved('|')),
+        ] {
+            assert_eq!(check_node_name(name), Err(why), "{name:?}");
+        }
+        for name in ["knee", "left-knee.2", "_test", "Knie 2", "膝", "0xy", "sync manager"] {
+            assert_eq!(check_node_name(name), Ok(()), "{name:?}");
+        }
+    }
+
+    #[test]
+    fn invisible_characters_are_shown_escaped() {
         assert_eq!(shown("knee\u{202e}x\n\u{200b}é"), "knee\\u{202e}x\\u{a}\\u{200b}é");
     }
 

@@ -1,8 +1,8 @@
-//! What became of a message: each confirmed send ends in exactly one [`Outcome`].
+//! Outcomes: each confirmed send ends in exactly one [`Outcome`].
 //!
-//! A [`Receipt`] travels with a confirmed message and is settled by whoever decides its fate. A receipt that is
-//! dropped unsettled says [`Outcome::Failed`]: an actor that panics drops the message in its hand, so its sender
-//! learns of it without any further code.
+//! A [`Receipt`] travels with a confirmed message and is settled where its outcome is decided. A receipt that
+//! is dropped unsettled reports [`Outcome::Failed`]. So if an actor panics, its current message is dropped,
+//! and the sender is notified without further code.
 
 mod members;
 
@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 pub use self::members::{MEMBERS_MAX, MemberOutcome, MemberReport, MemberState, MemberTable, REPORTS_MAX};
 use crate::tid::Tid;
 
-/// The fate of a confirmed message.
+/// The outcome of a confirmed message.
 ///
 /// # Examples
 ///
@@ -31,21 +31,23 @@ use crate::tid::Tid;
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Outcome {
-    /// The destination's handler took it and returned.
+    /// The destination's handler handled the message and returned.
     Delivered,
-    /// It was refused and not handled.
+    /// The message was rejected and not handled.
     Rejected(Rejection),
-    /// Its time to live ran out before it was handled, or, of a request, whoever asked waited no more before it was.
+    /// The time to live ended before the message was handled. For a request also: its sender stopped waiting
+    /// before it was handled.
     Expired,
-    /// The destination's handler panicked, or its application ended with the message in hand.
+    /// The destination's handler panicked, or its application ended while it handled the message.
     Failed,
-    /// The connection to its node was lost before it was sent: it was not handled.
+    /// The destination's node was lost before the message was sent: it was not handled.
     PeerLost,
-    /// Its node's connection or process ended after it was sent and before it was confirmed: nobody can say.
+    /// The message was sent, and whether it was handled is unknown: its node, its connection or its process
+    /// was lost before the confirmation, or the deadline passed.
     Unknown,
 }
 
-/// Why a message was refused.
+/// The reason why a message was rejected.
 ///
 /// # Examples
 ///
@@ -61,11 +63,11 @@ pub enum Outcome {
 pub enum Rejection {
     /// No application has this TID.
     NoSuchApplication,
-    /// The node is not known, or not connected yet.
+    /// The node is unknown, or not connected yet.
     NoSuchNode,
     /// The destination does not handle this kind of payload.
     UnknownKind,
-    /// The payload is not what its kind says.
+    /// The payload cannot be decoded as its kind.
     Malformed,
     /// The destination's queue is full.
     QueueFull,
@@ -75,20 +77,21 @@ pub enum Rejection {
     Closed,
     /// The source TID does not belong to the sender.
     ForgedSource,
-    /// The handler refused it.
+    /// The handler rejected the message.
     ByHandler,
-    /// The request does not make sense: a question to a group, for instance.
+    /// The request is not supported, for example a request to a group.
     Unsupported,
-    /// The destination's application has ended, is not ready again, and wants no message kept for it meanwhile.
+    /// The destination's application has ended, is not ready again, and its policy keeps no messages meanwhile.
     Down,
-    /// The access list of the destination's node does not let this source send this to it.
+    /// The access list of the destination's node does not allow this message from this source.
     NotAllowed,
-    /// A confirmed message to many has more members on a node, or more nodes, than one may have, or its source has too many of them under way.
+    /// A confirmed message to many exceeds a limit: of members on a node, of nodes, or of such messages that
+    /// its source has in flight.
     TooManyMembers,
 }
 
 impl Rejection {
-    /// All of them, in the order in which they are declared.
+    /// All rejections, in the order in which they are declared.
     pub(crate) const ALL: [Self; 13] = [
         Self::NoSuchApplication,
         Self::NoSuchNode,
@@ -136,7 +139,7 @@ impl fmt::Display for Rejection {
 }
 
 impl Outcome {
-    /// The byte that stands for this outcome on the wire: `0` delivered, `1` expired, `2` failed, `3` peer lost,
+    /// Returns the byte of this outcome on the wire: `0` delivered, `1` expired, `2` failed, `3` peer lost,
     /// `4` unknown, `16 + n` rejected for the n-th reason in the order of [`Rejection`].
     #[must_use]
     pub fn code(self) -> u8 {
@@ -150,7 +153,7 @@ impl Outcome {
         }
     }
 
-    /// The outcome that `code` stands for; `None` for a byte that stands for none.
+    /// Returns the outcome of a byte on the wire, or `None` for a byte that is not assigned.
     #[must_use]
     pub fn from_code(code: u8) -> Option<Self> {
         match code {
@@ -164,29 +167,29 @@ impl Outcome {
     }
 }
 
-/// Which message a receipt is for.
+/// Identifies the message of a receipt.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Ticket {
-    /// Who sent the message.
+    /// The sender of the message.
     pub source: Tid,
-    /// Whom it was for.
+    /// The destination of the message.
     pub destination: Tid,
-    /// The number by which its sender knows it.
+    /// The number that identifies the message at its sender.
     pub correlation: u64,
 }
 
-/// Carries an outcome back to where a message came from.
+/// Returns an outcome to the origin of a message.
 pub trait ReceiptSink: Send + Sync {
-    /// Takes the one outcome of the message that `ticket` names. Called once for each receipt.
+    /// Accepts the outcome of the message of `ticket`. Called once for each receipt.
     fn settle(&self, ticket: Ticket, outcome: Outcome);
 
-    /// Takes reports about the members of the message to many that `ticket` names, before it is settled. spec: FRAME-7
+    /// Accepts reports about the members of the message to many of `ticket`, before it is settled. spec: FRAME-7
     fn members(&self, ticket: Ticket, reports: &[MemberReport]) {
         let _ = (ticket, reports);
     }
 }
 
-/// The right and the duty to say what became of one confirmed message.
+/// The right and the duty to settle one confirmed message.
 #[must_use = "a dropped receipt says Failed"]
 pub struct Receipt {
     sink: Option<Arc<dyn ReceiptSink>>,
@@ -194,19 +197,19 @@ pub struct Receipt {
 }
 
 impl Receipt {
-    /// A receipt for the message that `ticket` names, to be settled at `sink`.
+    /// Creates a receipt for the message of `ticket`, to be settled at `sink`.
     pub fn new(sink: Arc<dyn ReceiptSink>, ticket: Ticket) -> Self {
         Self { sink: Some(sink), ticket }
     }
 
-    /// Says what became of the message.
+    /// Settles the message with its outcome.
     pub fn settle(mut self, outcome: Outcome) {
         if let Some(sink) = self.sink.take() {
             sink.settle(self.ticket, outcome);
         }
     }
 
-    /// Reports members of the message, which is one to many.
+    /// Reports members of the message, which must be one to many.
     pub fn report(&self, reports: &[MemberReport]) {
         if let Some(sink) = &self.sink
             && !reports.is_empty()
@@ -215,7 +218,7 @@ impl Receipt {
         }
     }
 
-    /// Which message this is for.
+    /// Returns the message that this receipt is for.
     #[must_use]
     pub const fn ticket(&self) -> Ticket {
         self.ticket

@@ -1,4 +1,4 @@
-//! What an application waits for: outcomes of its confirmed messages and replies to its requests.
+//! The pending waits of an application: outcomes of its confirmed messages and replies to its requests.
 
 use std::{
     collections::{HashMap, VecDeque},
@@ -8,20 +8,20 @@ use std::{
 };
 
 use crate::{
+    lock,
     outcome::{MemberOutcome, MemberReport, MemberTable, Outcome, ReceiptSink, Ticket},
-    post::lock,
-    router::{Outlet, Refused},
+    router::{MessageSink, Refused},
     tid::{NodeAddress, Tid},
     time::Time,
     wakes,
     wire::{Flags, Header, Kind, Message},
 };
 
-/// Requests to one application of which it is known that nobody waits any more: of more the oldest is forgotten, and its
-/// deadline is all that says so.
-const UNWANTED_MAX: usize = 1_024;
+/// Maximum number of recorded cancellations of requests to one application. Beyond it the oldest is removed,
+/// and only the deadline of that request shows that it is no longer awaited.
+const CANCELLED_MAX: usize = 1_024;
 
-/// The table of what one application waits for, and of who does not wait for it any more. It outlives the application's incarnations.
+/// The table of an application's waits, and of cancelled requests to it. It outlives the application's incarnations.
 #[derive(Debug)]
 pub struct Pending {
     inner: Mutex<Inner>,
@@ -31,16 +31,17 @@ pub struct Pending {
 #[derive(Debug)]
 struct Inner {
     next: u64,
-    /// Not a tree: that would allocate whenever the first wait is opened.
+    /// Not a tree, which would allocate whenever the first wait is opened.
     slots: HashMap<u64, Slot, BuildHasherDefault<Scatter>>,
-    /// Replies that came when nobody waited for them any more.
+    /// Number of replies that arrived too late.
     late: u64,
-    /// Requests that were taken out of the mailbox before they were given up: who asked, the request's number, and when it was
-    /// given up: a later life of whoever asked counts anew.
-    unwanted: VecDeque<(Tid, u64, Time)>,
+    /// Requests that were taken out of the mailbox before they were cancelled: the sender, the request's
+    /// number, and the time of the cancellation. A later incarnation of the sender uses the same numbers
+    /// again.
+    cancelled: VecDeque<(Tid, u64, Time)>,
 }
 
-/// Spreads numbers that this table gave out itself, one after the other: nobody can choose those that fall together.
+/// A hash function for numbers that this table assigns in sequence: no peer can choose colliding ones.
 #[derive(Clone, Copy, Debug, Default)]
 struct Scatter(u64);
 
@@ -54,7 +55,8 @@ impl Hasher for Scatter {
     }
 
     fn write_u64(&mut self, number: u64) {
-        // 2^64 by the golden ratio: the upper bits, which the table takes as well as the lower ones, differ from number to number.
+        // 2^64 divided by the golden ratio: the upper bits, which the table uses as well as the lower ones,
+        // differ from number to number.
         self.0 = (self.0 ^ number).wrapping_mul(0x9e37_79b9_7f4a_7c15);
     }
 }
@@ -62,54 +64,56 @@ impl Hasher for Scatter {
 #[derive(Debug)]
 struct Slot {
     awaited: Awaited,
-    /// Who may answer: whoever was asked. Set when the message's destination is known.
+    /// The TID that may answer: the destination. Set when the message's destination is known.
     from: Tid,
     waker: Option<Waker>,
     settled: Option<Settlement>,
-    /// Of a message to many: what became of it at each member so far.
+    /// For a message to many: the outcomes of its members so far.
     members: Option<Box<MemberTable>>,
 }
 
-/// What is waited for.
+/// The result that a wait is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Awaited {
     /// The outcome.
     Outcome,
-    /// A reply; an outcome other than `Delivered` ends the wait too, for no reply will come.
+    /// A reply. An outcome other than `Delivered` ends the wait too, as no reply will arrive.
     Reply,
 }
 
-/// What came.
+/// The result of a wait.
 #[derive(Debug)]
 pub enum Settlement {
-    /// The message's fate.
+    /// The outcome of the message.
     Outcome(Outcome),
     /// The reply.
     Reply(Message),
 }
 
 impl Pending {
-    /// An empty table for at most `capacity` waits at once.
+    /// Creates an empty table for at most `capacity` concurrent waits.
     #[must_use]
     pub fn new(capacity: usize) -> Arc<Self> {
         Self::numbered_from(1, capacity)
     }
 
-    /// An empty table whose first wait has this number: for a process that takes another's place, so that no late answer
-    /// to the former is taken for one to its own.
+    /// Creates an empty table; the first wait has this number. For a process that replaces another, so that
+    /// late answers to the former one do not match its own requests.
     #[must_use]
     pub fn numbered_from(first: u64, capacity: usize) -> Arc<Self> {
-        let inner = Inner { next: first, slots: HashMap::default(), late: 0, unwanted: VecDeque::new() };
+        let inner = Inner { next: first, slots: HashMap::default(), late: 0, cancelled: VecDeque::new() };
         Arc::new(Self { inner: Mutex::new(inner), capacity })
     }
 
-    /// Opens a wait for what `from` says; its number is the message's correlation. `None` if too many are open.
+    /// Opens a wait for an answer of `from`; its number is the message's correlation. Returns `None` if too
+    /// many are open.
     pub fn open(self: &Arc<Self>, awaited: Awaited, from: Tid) -> Option<Wait> {
         self.open_slot(Slot { awaited, from, waker: None, settled: None, members: None })
     }
 
-    /// Opens a wait for the outcomes of all members of a message to `destination`, from an application of the node at `here`. It ends when the
-    /// message does; then, or at any time before, [`Wait::members`] has them. `None` if too many are open.
+    /// Opens a wait for the outcomes of all members of a message to `destination`, from an application of the
+    /// node at `here`. It ends with the message; [`Wait::members`] returns the outcomes then, or at any time
+    /// before. Returns `None` if too many are open.
     pub fn open_each(self: &Arc<Self>, destination: Tid, here: NodeAddress) -> Option<Wait> {
         let members = Some(Box::new(MemberTable::new(destination, here)));
         let awaited = Awaited::Outcome;
@@ -127,7 +131,7 @@ impl Pending {
         Some(Wait { pending: self.clone(), id })
     }
 
-    /// Takes a message that answers a wait; hands back any other.
+    /// Consumes a message that answers a wait; returns any other.
     ///
     /// # Errors
     /// The message, which is neither a reply nor an outcome.
@@ -138,7 +142,7 @@ impl Pending {
             return Ok(());
         }
         if message.header.flags.has(Flags::OUTCOME) && message.header.kind == Kind::OUTCOME {
-            // A byte that means nothing is no outcome; the wait ends at its deadline.
+            // A byte that is not assigned is no outcome; the wait ends at its deadline.
             if let Some(outcome) = message.payload.first().and_then(|code| Outcome::from_code(*code)) {
                 self.settle_with(correlation, from, Settlement::Outcome(outcome));
             }
@@ -147,33 +151,33 @@ impl Pending {
         Err(message)
     }
 
-    /// Replies that came when nobody waited for them any more, and were dropped.
+    /// Returns the number of replies that arrived too late and were dropped.
     #[must_use]
     pub fn late_replies(&self) -> u64 {
         lock(&self.inner).late
     }
 
-    /// Nobody waits any more for the reply to this request, which is not in the mailbox.
-    fn give_up(&self, ticket: Ticket) {
-        let unwanted = &mut lock(&self.inner).unwanted;
-        if unwanted.len() >= UNWANTED_MAX {
-            unwanted.pop_front();
+    /// Records the cancellation of this request, which is not in the mailbox any more.
+    fn record_cancellation(&self, ticket: Ticket) {
+        let cancelled = &mut lock(&self.inner).cancelled;
+        if cancelled.len() >= CANCELLED_MAX {
+            cancelled.pop_front();
         }
-        unwanted.push_back((ticket.source, ticket.correlation, Time::now()));
+        cancelled.push_back((ticket.source, ticket.correlation, Time::now()));
     }
 
-    /// Whether `source` is known to have given up its request of this number, which it sent at `sent`.
-    pub(crate) fn is_given_up(&self, source: Tid, correlation: u64, sent: Time) -> bool {
+    /// Returns whether `source` is known to have cancelled its request of this number, which it sent at `sent`.
+    pub(crate) fn is_cancelled(&self, source: Tid, correlation: u64, sent: Time) -> bool {
         let is_it =
             |(by, number, at): &(Tid, u64, Time)| (*by, *number) == (source, correlation) && sent <= *at;
-        lock(&self.inner).unwanted.iter().any(is_it)
+        lock(&self.inner).cancelled.iter().any(is_it)
     }
 
     fn settle_with(&self, id: u64, from: Tid, settlement: Settlement) {
         let waker = {
             let mut inner = lock(&self.inner);
             let Some(slot) = inner.slots.get_mut(&id) else {
-                // Nobody waits any more: the deadline passed, or the asking incarnation is gone.
+                // The wait was closed: the deadline passed, or the requesting incarnation has ended.
                 inner.late += u64::from(matches!(settlement, Settlement::Reply(_)));
                 return;
             };
@@ -182,7 +186,7 @@ impl Pending {
                 (Settlement::Outcome(outcome), Awaited::Reply) => *outcome != Outcome::Delivered,
                 (Settlement::Reply(_), Awaited::Outcome) => false,
             };
-            // Nobody answers for another.
+            // Only the destination may answer.
             if !is_answer || slot.from != from || slot.settled.is_some() {
                 return;
             }
@@ -217,17 +221,17 @@ pub struct Wait {
 }
 
 impl Wait {
-    /// The correlation by which the answer will name this wait.
+    /// Returns the correlation of the answer to this wait.
     #[must_use]
     pub const fn correlation(&self) -> u64 {
         self.id
     }
 
-    /// What came, or `Pending` with the waker kept.
+    /// Returns the result, or `Pending` after storing the waker.
     pub fn poll_settled(&self, cx: &Context<'_>) -> Poll<Settlement> {
         let mut inner = lock(&self.pending.inner);
         let Some(slot) = inner.slots.get_mut(&self.id) else {
-            // The slot lives as long as this wait; it was taken by an earlier poll.
+            // The slot exists as long as this wait; an earlier poll took it.
             return Poll::Ready(Settlement::Outcome(Outcome::Unknown));
         };
         if let Some(settlement) = slot.settled.take() {
@@ -237,8 +241,8 @@ impl Wait {
         Poll::Pending
     }
 
-    /// The outcome of each member, where it is waited for these; `last` is the outcome of the message as a whole, `None` at the deadline. See
-    /// [`MemberTable::finish`].
+    /// Returns the outcome of each member, for a wait of this kind; `last` is the outcome of the message as a
+    /// whole, `None` at the deadline. See [`MemberTable::finish`].
     #[must_use]
     pub fn members(&self, last: Option<Outcome>) -> Vec<MemberOutcome> {
         let mut inner = lock(&self.pending.inner);
@@ -247,7 +251,7 @@ impl Wait {
         table.map_or_else(Vec::new, |table| table.finish(last))
     }
 
-    /// Whether nothing has come yet.
+    /// Returns whether no result has arrived yet.
     pub(crate) fn is_open(&self) -> bool {
         let inner = lock(&self.pending.inner);
         inner.slots.get(&self.id).is_some_and(|slot| slot.settled.is_none())
@@ -260,20 +264,20 @@ impl Drop for Wait {
     }
 }
 
-/// Whether this may be what somebody waits for: looked at first, for most messages are not, and moving one costs as much.
+/// Returns whether this may be an answer. Checked first, because most messages are none, and moving one costs as much.
 const fn is_answer(header: &Header) -> bool {
     header.flags.has(Flags::REPLY) || header.flags.has(Flags::OUTCOME)
 }
 
-/// An application's outlet: answers go to its waits, all else to its mailbox.
-pub struct AppOutlet<O> {
-    /// What the application waits for.
+/// The message sink of an application: answers go to its waits, all other messages to its mailbox.
+pub struct AppSink<O> {
+    /// The pending waits of the application.
     pub pending: Arc<Pending>,
-    /// Where everything else goes.
+    /// The destination of all other messages.
     pub inbox: Arc<O>,
 }
 
-impl<O: Outlet> Outlet for AppOutlet<O> {
+impl<O: MessageSink> MessageSink for AppSink<O> {
     fn submit(&self, message: Message) -> Result<(), Refused> {
         if !is_answer(&message.header) {
             return self.inbox.submit(message);
@@ -290,8 +294,8 @@ impl<O: Outlet> Outlet for AppOutlet<O> {
 
     fn cancel(&self, ticket: Ticket) -> bool {
         if !self.inbox.cancel(ticket) {
-            // Its handler has it, or had it, and may reply yet.
-            self.pending.give_up(ticket);
+            // The handler has or had the request, and may still reply.
+            self.pending.record_cancellation(ticket);
         }
         true
     }
@@ -312,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn a_delivered_request_still_waits_for_its_reply_but_a_failed_one_does_not() {
+    fn delivered_request_waits_for_reply_but_failed_does_not() {
         let pending = Pending::new(4);
         let wait = pending.open(Awaited::Reply, Tid::NONE).unwrap();
         pending.settle(ticket(&wait), Outcome::Delivered);
@@ -322,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_answers_a_request_that_was_put_to_another() {
+    fn other_receiver_cannot_answer_a_request() {
         let pending = Pending::new(4);
         let wait = pending.open(Awaited::Reply, Tid::from_bits(7)).unwrap();
         let reply = |source| {
@@ -346,7 +350,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reply_that_comes_too_late_is_counted() {
+    fn late_reply_is_counted() {
         let pending = Pending::new(1);
         let late = pending.open(Awaited::Reply, Tid::NONE).unwrap();
         let mut header = Header::new(Kind::named("reply"), Tid::NONE, Tid::NONE);
@@ -357,20 +361,20 @@ mod tests {
     }
 
     #[test]
-    fn of_requests_that_were_given_up_the_newest_are_known_and_a_later_life_counts_anew() {
+    fn newest_cancelled_requests_are_known() {
         let pending = Pending::new(1);
-        let asker = Tid::from_bits(7);
-        let request = |correlation| Ticket { source: asker, destination: Tid::NONE, correlation };
+        let requester = Tid::from_bits(7);
+        let request = |correlation| Ticket { source: requester, destination: Tid::NONE, correlation };
         let before = Time::now();
-        (0..=UNWANTED_MAX as u64).for_each(|number| pending.give_up(request(number)));
-        assert!(!pending.is_given_up(asker, 0, before), "the oldest is forgotten");
-        assert!(pending.is_given_up(asker, 1, before));
-        assert!(!pending.is_given_up(Tid::from_bits(8), 1, before), "somebody else's");
-        assert!(!pending.is_given_up(asker, 1, Time::now() + std::time::Duration::from_secs(1)));
+        (0..=CANCELLED_MAX as u64).for_each(|number| pending.record_cancellation(request(number)));
+        assert!(!pending.is_cancelled(requester, 0, before), "the oldest is forgotten");
+        assert!(pending.is_cancelled(requester, 1, before));
+        assert!(!pending.is_cancelled(Tid::from_bits(8), 1, before), "somebody else's");
+        assert!(!pending.is_cancelled(requester, 1, Time::now() + std::time::Duration::from_secs(1)));
     }
 
     #[test]
-    fn an_answer_that_comes_too_late_is_nobodys() {
+    fn late_answer_matches_no_request() {
         let pending = Pending::new(1);
         let late = ticket(&pending.open(Awaited::Outcome, Tid::NONE).unwrap());
         pending.settle(late, Outcome::Delivered);

@@ -1,10 +1,10 @@
-//! What mends a system call that has failed: each error has a remedy of its own.
+//! Remedies for failed system calls: each error has its own.
 
 use std::{borrow::Cow, io};
 
 use rustix::io::Errno;
 
-/// What was asked of the system.
+/// The resource that was requested from the system.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Wanted<'a> {
     /// A descriptor: a socket, a pipe, a timer, an epoll instance.
@@ -15,11 +15,11 @@ pub enum Wanted<'a> {
     Reactor,
     /// A process.
     Process,
-    /// A socket that is bound to an address of `ndl.interface`, with the port of this key of the configuration.
+    /// A socket bound to an address of `ndl.interface`, with the port of this configuration key.
     Port(&'a str),
 }
 
-/// The remedy for `error`.
+/// Returns the remedy for `error`.
 #[must_use]
 pub fn remedy(wanted: Wanted<'_>, error: &io::Error) -> Cow<'static, str> {
     let errno = Errno::from_io_error(error);
@@ -53,7 +53,7 @@ pub fn remedy(wanted: Wanted<'_>, error: &io::Error) -> Cow<'static, str> {
     remedy.into()
 }
 
-/// The remedy for an error that only a bound socket has; `None` where any descriptor may have it.
+/// Returns the remedy for an error that only a bound socket has; `None` if any descriptor can have it.
 fn remedy_of_port(key: &str, errno: Option<Errno>) -> Option<Cow<'static, str>> {
     Some(match errno {
         Some(Errno::ADDRINUSE) => format!(
@@ -77,18 +77,18 @@ fn remedy_of_port(key: &str, errno: Option<Errno>) -> Option<Cow<'static, str>> 
             "the interface is not there: `ip link` lists those of this host; set `ndl.interface` to one of them".into()
         }
         Some(Errno::MFILE | Errno::NFILE | Errno::NOMEM | Errno::NOBUFS | Errno::AGAIN | Errno::NOSYS) => return None,
-        // Of any other error no more is known than where the address and the port come from.
+        // For any other error only the origin of the address and of the port is known.
         Some(_) | None => format!("the address comes from `ndl.interface`, and the port from `{key}`").into(),
     })
 }
 
-/// Whether this host does not have the address of a socket: it may have it later.
+/// Returns whether this host lacks the address of a socket: it may get it later.
 #[must_use]
 pub fn may_come_later(error: &io::Error) -> bool {
     error.kind() == io::ErrorKind::AddrNotAvailable
 }
 
-/// Whether the same call fails again until this program is started elsewhere: a retry is of no use.
+/// Returns whether the same call fails again until this program is started elsewhere: a retry is useless.
 #[must_use]
 pub fn is_permanent(error: &io::Error) -> bool {
     matches!(
@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn only_a_lack_of_descriptors_is_mended_by_the_limit_of_open_files() {
+    fn only_descriptor_shortage_has_the_open_files_remedy() {
         let port = Wanted::Port("ndl.port");
         for wanted in [Wanted::Descriptor, Wanted::Thread, Wanted::Reactor, Wanted::Process, port] {
             assert!(of(wanted, Errno::MFILE).contains("ulimit -n"));
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn each_error_of_a_bound_socket_has_a_remedy_of_its_own() {
+    fn each_bind_error_has_its_own_remedy() {
         for (errno, word) in [
             (Errno::ADDRINUSE, "another node using this port? Set `ndl.port`"),
             (Errno::ADDRNOTAVAIL, "does not have this address"),
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_call_is_permanent_and_a_short_resource_is_not() {
+    fn missing_call_is_permanent_and_shortage_is_not() {
         let is = |errno: Errno| is_permanent(&errno.into());
         assert!(is(Errno::NOSYS) && is(Errno::PERM));
         assert!(!is(Errno::MFILE) && !is(Errno::NOMEM) && !is(Errno::AGAIN));

@@ -1,15 +1,17 @@
-//! Where messages go: the routing table of a node, read by senders without a lock.
+//! The routing table of a node, read by senders without a lock.
 
+mod changes;
 mod copies;
 mod each;
 mod groups;
 pub mod guard;
+mod sink;
 pub mod tap;
 #[cfg(test)]
 mod tests;
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::BTreeMap,
     sync::{
         Arc, Mutex, OnceLock,
         atomic::{AtomicU64, Ordering},
@@ -19,6 +21,7 @@ use std::{
 
 use arc_swap::ArcSwap;
 
+pub use self::sink::{MessageSink, Refused};
 use self::{
     copies::Copies,
     each::OpenSends,
@@ -28,77 +31,32 @@ use self::{
 };
 use crate::{
     outcome::{Rejection, Ticket},
-    post::lock,
     tid::{AppAddress, NodeAddress, Tid},
     undelivered::{RefusalSink, is_noted},
     wire::{Flags, Header, Kind, Message},
 };
 
-/// A place that takes messages: a mailbox, a client's socket, the connection to a node.
-pub trait Outlet: Send + Sync {
-    /// Takes the message, or hands it back with the reason. Never blocks.
-    ///
-    /// # Errors
-    /// The message, untouched, and why it was not taken.
-    fn submit(&self, message: Message) -> Result<(), Refused>;
-
-    /// As [`submit`](Self::submit), by one who keeps what finds a full queue and offers it again: that is not counted as refused. `room`
-    /// is woken, once, when a queue that was full has room again; of several who wait for that, only the last one. An outlet that cannot
-    /// tell wakes nobody.
-    ///
-    /// # Errors
-    /// As `submit`.
-    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
-        let _ = room;
-        self.submit(message)
-    }
-
-    /// Nobody waits any more for the reply to the request that `ticket` names: if it waits here, it is taken out and ends as
-    /// [`Outcome::Expired`](crate::outcome::Outcome::Expired), as if its time were over. Returns whether it was, or whoever has it is told.
-    fn cancel(&self, ticket: Ticket) -> bool {
-        let _ = ticket;
-        false
-    }
-}
-
-/// A message that an [`Outlet`] did not take.
-#[derive(Debug)]
-pub struct Refused {
-    /// The message, untouched.
-    pub message: Message,
-    /// Why it was not taken.
-    pub why: Rejection,
-}
-
-impl Refused {
-    /// Refuses `message` because of `why`.
-    #[must_use]
-    pub const fn new(message: Message, why: Rejection) -> Self {
-        Self { message, why }
-    }
-}
-
-/// One application's line in the routing table.
+/// The route to one application in the routing table.
 #[derive(Clone)]
 pub struct LocalRoute {
-    /// What takes its messages.
-    pub outlet: Arc<dyn Outlet>,
-    /// What it handles, as far as it told: a layer's event that is among it, it gets.
+    /// The destination of its messages.
+    pub sink: Arc<dyn MessageSink>,
+    /// The kinds that it declared to handle: it receives layers' events of these kinds.
     pub events: Arc<[Kind]>,
 }
 
 #[derive(Clone, Default)]
 struct Table {
-    /// Who watches; nobody, as a rule.
+    /// The observer of messages, usually none.
     tap: Option<Arc<dyn Tap>>,
-    /// Who decides what may reach this node's applications; nobody where everything may.
+    /// The access check for this node's applications; `None`: no restriction.
     guard: Option<Arc<dyn Guard>>,
     local: BTreeMap<AppAddress, LocalRoute>,
-    peers: BTreeMap<NodeAddress, Arc<dyn Outlet>>,
+    peers: BTreeMap<NodeAddress, Arc<dyn MessageSink>>,
 }
 
-/// Who is in which group. Apart from the routes: applications join and leave far more often than they come and go, and a change copies the way
-/// to one group, not the routes.
+/// The members of groups. Separate from the routes: memberships change far more often than routes, and a
+/// change copies the path to one group, not the routes.
 #[derive(Clone, Default)]
 struct Members {
     /// Applications of this node.
@@ -107,51 +65,51 @@ struct Members {
     elsewhere: Groups<NodeAddress>,
 }
 
-/// What a sender looks at: both at once, so that no group seems to have nobody where one member hands over to another. A change replaces one
-/// part and shares the other.
+/// The tables that a sender reads. It reads both at once, so that a group never appears empty while one
+/// member replaces another. A change replaces one part and shares the other.
 #[derive(Clone, Default)]
 struct Snapshot {
     table: Arc<Table>,
     members: Members,
 }
 
-/// The groups that each application and each node is in; who holds it is the one writer.
+/// The groups of each application and each node; the holder of its lock is the only writer.
 #[derive(Default)]
 struct Writing {
     here: Joined<AppAddress>,
     elsewhere: Joined<NodeAddress>,
 }
 
-/// How many a message is for.
+/// The number of destinations of a message.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Reach {
-    /// Applications of this node.
+    /// Number of applications of this node.
     pub here: usize,
-    /// Other nodes.
+    /// Number of other nodes.
     pub elsewhere: usize,
 }
 
-/// Who decides about one message; nobody: it may go anywhere.
+/// The guard for one message; `None`: no restriction.
 type Judge<'a> = Option<&'a Arc<dyn Guard>>;
 
 /// The routing table of a node. It is owned by the node, so that it outlives every layer.
 pub struct Router {
     node: NodeAddress,
     snapshot: ArcSwap<Snapshot>,
-    /// Writers take turns; readers never wait for them.
+    /// The lock of writers; readers never wait for it.
     writing: Mutex<Writing>,
-    /// For each reason in the order of [`Rejection`].
+    /// Rejections, indexed in the order of [`Rejection`].
     refused: [AtomicU64; Rejection::ALL.len()],
-    /// Who reports refusals of unconfirmed messages to their senders.
+    /// Reports rejections of unconfirmed messages to their senders.
     refusals: OnceLock<Arc<dyn RefusalSink>>,
-    /// Confirmed messages to many that other nodes have copies of.
+    /// Open confirmed messages to many with copies at other nodes.
     group_sends: Arc<OpenSends>,
-    /// Where everything goes, in a process that knows no route itself.
-    uplink: Option<Arc<dyn Outlet>>,
+    /// The sink for all messages, in a process that has no routes itself.
+    uplink: Option<Arc<dyn MessageSink>>,
 }
 
 impl Router {
-    /// The empty table of the node at `node`.
+    /// Creates the empty table of the node at `node`.
     #[must_use]
     pub fn new(node: NodeAddress) -> Self {
         Self {
@@ -165,20 +123,20 @@ impl Router {
         }
     }
 
-    /// The table of a process that is not the node itself: everything goes out through `uplink` to the node at `node`,
-    /// which knows the routes.
+    /// Creates the table of a process that is not the node itself: all messages leave through `uplink` to the
+    /// node at `node`, which has the routes.
     #[must_use]
-    pub fn through(node: NodeAddress, uplink: Arc<dyn Outlet>) -> Self {
+    pub fn through(node: NodeAddress, uplink: Arc<dyn MessageSink>) -> Self {
         Self { uplink: Some(uplink), ..Self::new(node) }
     }
 
-    /// The node whose table this is.
+    /// Returns the node of this table.
     #[must_use]
     pub const fn node(&self) -> NodeAddress {
         self.node
     }
 
-    /// `tid` with [`NodeAddress::HERE`] replaced by this node's address.
+    /// Returns `tid` with [`NodeAddress::HERE`] replaced by this node's address.
     #[must_use]
     pub fn absolute(&self, tid: Tid) -> Tid {
         if tid.node == NodeAddress::HERE && tid.app != AppAddress::NONE {
@@ -188,10 +146,12 @@ impl Router {
         }
     }
 
-    /// Sends a message from an application of this node. A confirmed message that is refused is also settled so.
+    /// Sends a message from an application of this node. A confirmed message that is rejected is also settled
+    /// as rejected.
     ///
     /// # Errors
-    /// Why nobody took the message. For a multicast: why no member took it, where that can be mended. A group without members is no error.
+    /// The reason of the rejection. For a multicast: why no member accepted it, if that can be remedied. A
+    /// group without members is no error.
     pub fn send(&self, mut message: Message) -> Result<(), Rejection> {
         message.header.destination = self.absolute(message.header.destination);
         let destination = message.header.destination;
@@ -215,7 +175,7 @@ impl Router {
         self.account(result)
     }
 
-    /// How many applications of this node a message from here is handed to, each where it may have it, and to how many other nodes.
+    /// Returns the number of applications of this node that a message from here may reach, and of other nodes.
     #[must_use]
     pub fn reach(&self, destination: Tid) -> Reach {
         let Tid { node, app } = self.absolute(destination);
@@ -238,19 +198,20 @@ impl Router {
         Reach { here, elsewhere }
     }
 
-    /// Hands a message that came from another node to this node's applications: it never leaves the node again.
+    /// Delivers a message from another node to this node's applications: it is never forwarded to a node.
     ///
     /// # Errors
-    /// Why nobody took the message.
+    /// The reason of the rejection.
     pub fn deliver(&self, message: Message) -> Result<(), Rejection> {
         let snapshot = self.snapshot.load();
         self.deliver_by(&snapshot, snapshot.table.guard.as_ref(), message)
     }
 
-    /// The same, by what another guard than the table's own says of it. It copies no table, however many applications there are.
+    /// Same as [`deliver`](Self::deliver), with another guard than the table's own. It copies no table, for
+    /// any number of applications.
     ///
     /// # Errors
-    /// Why nobody took the message.
+    /// The reason of the rejection.
     pub fn deliver_judged_by(&self, message: Message, guard: &Arc<dyn Guard>) -> Result<(), Rejection> {
         self.deliver_by(&self.snapshot.load(), Some(guard), message)
     }
@@ -268,12 +229,12 @@ impl Router {
         result.map_err(|refused| self.refuse_arrived(refused))
     }
 
-    /// Offers a message that came from another node to the one application of this node that it is for. One who is refused because of a
-    /// full queue may offer it again, and is woken for that by `room` as [`Outlet::offer`] says; any other refusal is to be
-    /// [told](Self::refuse).
+    /// Offers a message from another node to its one application on this node. After a full queue the caller
+    /// may offer it again, and `room` is woken for that as in [`MessageSink::offer`]. Any other rejection must be
+    /// [reported](Self::refuse).
     ///
     /// # Errors
-    /// The message, and why it was not taken.
+    /// The message, and the reason of the rejection.
     pub fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
         let table = &self.snapshot.load().table;
         match table.local.get(&message.header.destination.app) {
@@ -281,34 +242,36 @@ impl Router {
                 if guard::refuses(table.guard.as_ref(), message.header.destination.app, &message.header) {
                     return Err(Refused::new(message, Rejection::NotAllowed));
                 }
-                route.outlet.offer(message, room)
+                route.sink.offer(message, room)
             }),
             None => Err(Refused::new(message, Rejection::NoSuchApplication)),
         }
     }
 
-    /// Nobody waits any more for the reply to this request, which came from here or from another node; see [`Outlet::cancel`].
+    /// Cancels this request, from here or from another node, as its reply is no longer awaited; see
+    /// [`MessageSink::cancel`].
     pub fn cancel(&self, ticket: Ticket) -> bool {
         let Tid { node, app } = ticket.destination;
         if let Some(uplink) = &self.uplink {
             return uplink.cancel(ticket);
         }
         let table = &self.snapshot.load().table;
-        let outlet = if node == self.node {
-            table.local.get(&app).map(|route| &route.outlet)
+        let sink = if node == self.node {
+            table.local.get(&app).map(|route| &route.sink)
         } else {
             table.peers.get(&node)
         };
-        outlet.is_some_and(|outlet| outlet.cancel(ticket))
+        sink.is_some_and(|sink| sink.cancel(ticket))
     }
 
-    /// Counts a message that nobody takes, and settles it so.
+    /// Counts a rejected message, and settles it as rejected.
     pub fn refuse(&self, refused: Refused) {
-        // The reason is told to whom the receipt belongs.
+        // The owner of the receipt is notified of the reason.
         let _ = self.account(Err(refused));
     }
 
-    /// The same of a message that came from another node: its sender is told, whether it asked or not.
+    /// Same as [`refuse`](Self::refuse), for a message from another node: its sender is notified, also of an
+    /// unconfirmed message.
     pub fn refuse_arrived(&self, refused: Refused) -> Rejection {
         let Refused { message, why } = refused;
         self.report(message.header.destination, &message.header, why, 1);
@@ -316,13 +279,13 @@ impl Router {
         why
     }
 
-    /// Has refusals of unconfirmed messages told to `sink` from now on. Set once.
+    /// Sets the sink for rejections of unconfirmed messages, once.
     pub fn set_refusal_sink(&self, sink: Arc<dyn RefusalSink>) {
-        // Whoever sets a second one keeps it for itself.
+        // A second call has no effect.
         let _ = self.refusals.set(sink);
     }
 
-    /// `receiver` refused `count` messages with this header, whose sender had gone on.
+    /// Reports that `receiver` rejected `count` messages with this header after their send had returned.
     pub fn report(&self, receiver: Tid, header: &Header, why: Rejection, count: u64) {
         if let Some(sink) = self.refusals.get()
             && is_noted(header, why)
@@ -331,30 +294,30 @@ impl Router {
         }
     }
 
-    /// Hands a layer's message to an application of this node, past the access list and whoever watches.
+    /// Hands a layer's message to an application of this node, without the access list and the tap.
     ///
     /// # Errors
-    /// The message, and why it was not taken.
-    pub fn tell(&self, app: AppAddress, message: Message) -> Result<(), Refused> {
+    /// The message, and the reason of the rejection.
+    pub fn notify_app(&self, app: AppAddress, message: Message) -> Result<(), Refused> {
         match self.snapshot.load().table.local.get(&app) {
-            Some(route) => route.outlet.submit(message),
+            Some(route) => route.sink.submit(message),
             None => Err(Refused::new(message, Rejection::NoSuchApplication)),
         }
     }
 
-    /// Whether the application of this node at `app` subscribed to events of this kind.
+    /// Returns whether the application of this node at `app` subscribed to events of this kind.
     #[must_use]
     pub fn subscribes(&self, app: AppAddress, kind: Kind) -> bool {
         self.snapshot.load().table.local.get(&app).is_some_and(|route| route.events.contains(&kind))
     }
 
-    /// How many messages nobody took.
+    /// Returns the number of rejected messages.
     #[must_use]
     pub fn refused(&self) -> u64 {
         self.refused.iter().map(|count| count.load(Ordering::Relaxed)).sum()
     }
 
-    /// How many messages nobody took, for each reason that there was.
+    /// Returns the number of rejected messages, for each reason that occurred.
     #[must_use]
     pub fn refused_because(&self) -> Vec<(Rejection, u64)> {
         let counts = self.refused.iter().map(|count| count.load(Ordering::Relaxed));
@@ -369,7 +332,7 @@ impl Router {
         })
     }
 
-    fn send_up(uplink: &dyn Outlet, message: Message) -> Result<(), Refused> {
+    fn send_up(uplink: &dyn MessageSink, message: Message) -> Result<(), Refused> {
         if !message.header.destination.is_single() && message.header.flags.has(Flags::ASK) {
             return Err(Refused::new(message, Rejection::Unsupported));
         }
@@ -388,7 +351,7 @@ impl Router {
         }
     }
 
-    /// One copy for each node that has a member, and one for each member here.
+    /// Sends one copy to each node that has a member, and one to each member here.
     fn multicast(&self, snapshot: &Snapshot, message: Message) -> Result<(), Refused> {
         let Tid { node, app } = message.header.destination;
         let mut copies = Copies::default();
@@ -397,7 +360,7 @@ impl Router {
         if node == self.node || node == NodeAddress::ALL {
             copies = self.fan_out(snapshot, table.guard.as_ref(), &message);
         }
-        let mut submit = |peer: &Arc<dyn Outlet>| {
+        let mut submit = |peer: &Arc<dyn MessageSink>| {
             copies.note(peer.submit(copy_of(&message)).err().map(|refused| refused.why));
         };
         if node == NodeAddress::ALL && app.is_group() {
@@ -419,7 +382,8 @@ impl Router {
         }
     }
 
-    /// Of a message to many that others took, so that its sender hears nothing: the copies for which there was no room.
+    /// Counts the copies without room of a message to many that other members accepted, so that its sender is
+    /// not notified.
     fn count(&self, copies: &Copies, header: &Header) {
         for (why, count) in copies.without_room().filter(|(_, count)| *count > 0) {
             self.refused[why as usize].fetch_add(count, Ordering::Relaxed);
@@ -427,11 +391,11 @@ impl Router {
         }
     }
 
-    /// Copies for the members on this node, except the sender itself.
+    /// Submits copies to the members on this node, except the sender itself.
     fn fan_out(&self, snapshot: &Snapshot, guard: Judge<'_>, message: &Message) -> Copies {
         let mut copies = Copies::default();
         let here = self.node;
-        for_each_here(snapshot, message.header.destination.app, |member, outlet| {
+        for_each_here(snapshot, message.header.destination.app, |member, sink| {
             let is_sender = here == message.header.source.node && member == message.header.source.app;
             if is_sender {
                 return;
@@ -439,140 +403,35 @@ impl Router {
             let refused = if guard::refuses(guard, member, &message.header) {
                 Some(Rejection::NotAllowed)
             } else {
-                outlet.submit(copy_of(message)).err().map(|refused| refused.why)
+                sink.submit(copy_of(message)).err().map(|refused| refused.why)
             };
             tap::saw_one_of_many(snapshot.table.tap.as_ref(), Tid::new(here, member), message, refused);
             copies.note(refused);
         });
         copies
     }
-
-    fn change(&self, edit: impl FnOnce(&mut Table)) {
-        let _turn = lock(&self.writing);
-        let mut snapshot = Snapshot::clone(&self.snapshot.load());
-        edit(Arc::make_mut(&mut snapshot.table));
-        self.snapshot.store(Arc::new(snapshot));
-    }
-
-    /// Replaces who is in which group, if `edit` says that anything changed; the caller has the turn.
-    fn regroup(&self, writing: &mut Writing, edit: impl FnOnce(&mut Writing, &mut Members) -> bool) -> bool {
-        let mut snapshot = Snapshot::clone(&self.snapshot.load());
-        let changed = edit(writing, &mut snapshot.members);
-        if changed {
-            self.snapshot.store(Arc::new(snapshot));
-        }
-        changed
-    }
-
-    /// Adds or replaces the route to an application of this node.
-    pub fn set_local(&self, app: AppAddress, route: LocalRoute) {
-        self.change(|table| {
-            table.local.insert(app, route);
-        });
-    }
-
-    /// Removes an application and its memberships.
-    pub fn remove_local(&self, app: AppAddress) {
-        let mut writing = lock(&self.writing);
-        let mut snapshot = Snapshot::clone(&self.snapshot.load());
-        Arc::make_mut(&mut snapshot.table).local.remove(&app);
-        writing.here.set(app, BTreeSet::new(), &mut snapshot.members.here);
-        self.snapshot.store(Arc::new(snapshot));
-    }
-
-    /// Makes `app` a member of `group`, or no longer one. Returns whether anything changed. What it costs does not depend on how many
-    /// applications and groups there are, but on how many members this group has.
-    pub fn set_member(&self, group: AppAddress, app: AppAddress, member: bool) -> bool {
-        self.regroup(&mut lock(&self.writing), |writing, members| {
-            if member {
-                writing.here.join(group, app, &mut members.here)
-            } else {
-                writing.here.leave(group, app, &mut members.here)
-            }
-        })
-    }
-
-    /// Whether `app` is a member of `group`.
-    #[must_use]
-    pub fn is_member(&self, group: AppAddress, app: AppAddress) -> bool {
-        self.snapshot.load().members.here.members(group).binary_search(&app).is_ok()
-    }
-
-    /// The applications of this node that a message to many reaches, in the order of their addresses: the members of a group, every
-    /// application, or the one that has this address. Its sender may be among them, and gets none.
-    #[must_use]
-    pub fn members(&self, of: AppAddress) -> Vec<AppAddress> {
-        let mut reached = Vec::new();
-        for_each_here(&self.snapshot.load(), of, |app, _| reached.push(app));
-        reached
-    }
-
-    /// Memberships of all applications of this node in all groups.
-    #[must_use]
-    pub fn memberships(&self) -> usize {
-        lock(&self.writing).here.memberships()
-    }
-
-    /// Shows messages to `tap` from now on; to nobody, if there is none.
-    pub fn set_tap(&self, tap: Option<Arc<dyn Tap>>) {
-        self.change(|table| table.tap = tap);
-    }
-
-    /// Asks `guard` from now on what may reach the applications of this node.
-    pub fn set_guard(&self, guard: Arc<dyn Guard>) {
-        self.change(|table| table.guard = Some(guard));
-    }
-
-    /// Groups that have a member on this node, in the order of their addresses.
-    #[must_use]
-    pub fn groups(&self) -> Vec<AppAddress> {
-        self.groups_with_members().into_iter().map(|(group, _)| group).collect()
-    }
-
-    /// The same with their members.
-    #[must_use]
-    pub fn groups_with_members(&self) -> Vec<(AppAddress, Arc<[AppAddress]>)> {
-        self.snapshot.load().members.here.all()
-    }
-
-    /// Adds or replaces the route to another node.
-    pub fn set_peer(&self, node: NodeAddress, outlet: Arc<dyn Outlet>) {
-        self.change(|table| {
-            table.peers.insert(node, outlet);
-        });
-    }
-
-    /// Removes the route to another node.
-    pub fn remove_peer(&self, node: NodeAddress) {
-        self.change(|table| {
-            table.peers.remove(&node);
-        });
-    }
-
-    /// States which groups have members on another node. Only the ways to the groups that differ from what was said before are copied.
-    pub fn set_remote_groups(&self, node: NodeAddress, groups: &[AppAddress]) {
-        self.regroup(&mut lock(&self.writing), |writing, members| {
-            writing.elsewhere.set(node, groups.iter().copied().collect(), &mut members.elsewhere)
-        });
-    }
 }
 
-/// Shows `each` the applications of this node that a message to many is for, in the order of their addresses.
-fn for_each_here(snapshot: &Snapshot, of: AppAddress, mut each: impl FnMut(AppAddress, &Arc<dyn Outlet>)) {
+/// Calls `each` for the applications of this node that a message to many reaches, in the order of their addresses.
+fn for_each_here(
+    snapshot: &Snapshot,
+    of: AppAddress,
+    mut each: impl FnMut(AppAddress, &Arc<dyn MessageSink>),
+) {
     let Snapshot { table, members } = snapshot;
     if of.is_group() {
         let routes = members.here.members(of).iter().filter_map(|app| Some((*app, table.local.get(app)?)));
-        routes.for_each(|(app, route)| each(app, &route.outlet));
+        routes.for_each(|(app, route)| each(app, &route.sink));
     } else if of == AppAddress::ALL {
         let apps = table.local.iter().filter(|(app, _)| !app.is_layer());
-        apps.for_each(|(app, route)| each(*app, &route.outlet));
+        apps.for_each(|(app, route)| each(*app, &route.sink));
     } else if let Some(route) = table.local.get(&of) {
         // A broadcast to the application that has this address on every node.
-        each(of, &route.outlet);
+        each(of, &route.sink);
     }
 }
 
-/// Hands a message to the one application of this node that it is for, if it may reach it.
+/// Submits a message to its one application of this node, if the guard allows it.
 fn submit_here(table: &Table, guard: Judge<'_>, message: Message) -> Result<(), Refused> {
     tap::hand_over(table.tap.as_ref(), message, false, |message| {
         let target = message.header.destination.app;
@@ -580,13 +439,13 @@ fn submit_here(table: &Table, guard: Judge<'_>, message: Message) -> Result<(), 
             Some(_) if guard::refuses(guard, target, &message.header) => {
                 Err(Refused::new(message, Rejection::NotAllowed))
             }
-            Some(route) => route.outlet.submit(message),
+            Some(route) => route.sink.submit(message),
             None => Err(Refused::new(message, Rejection::NoSuchApplication)),
         }
     })
 }
 
-/// A copy that shares the payload; receipts are never shared.
+/// Returns a copy that shares the payload, without the receipt.
 fn copy_of(message: &Message) -> Message {
     Message::new(message.header, message.payload.clone())
 }

@@ -1,8 +1,9 @@
-//! Wakes actors from any thread, also from one whose thread-local variables are being destroyed or are gone.
+//! Wakes of actors from any thread, also from one with destroyed thread-local variables.
 //!
-//! An actor is a task of a tokio `LocalSet`, and its waker reads thread-local variables of tokio's. On a thread that runs `atexit`
-//! handlers, or destructors of statics or of thread-local variables, these may be gone: the wake panics, and the task counts as woken and
-//! never runs. Such a thread hands the wake to a thread of this module's own instead.
+//! An actor is a task of a tokio `LocalSet`, and its waker reads tokio's thread-local variables. On a thread
+//! that runs `atexit` handlers, or destructors of statics or of thread-local variables, these may be
+//! destroyed. Then the wake panics, and the task counts as woken and never runs. Such a thread hands the wake
+//! to this module's own thread instead.
 
 use std::{
     collections::VecDeque,
@@ -17,27 +18,28 @@ use tokio::{runtime::Handle, task::LocalSet};
 
 use crate::remedy::{Wanted, remedy};
 
-/// Wakes that are handed over and not yet carried out at most; a thread that hands over one more waits for a place. Each is carried out
-/// within microseconds.
+/// Maximum number of pending wakes that were handed over; a thread that exceeds it waits for a free place.
+/// Each is executed within microseconds.
 const WAITING_MAX: usize = 256;
 
-/// The waker of one task, for all that the task waits for. Kept beside the task, so that a poll allocates nothing.
+/// The waker of one task. Kept beside the task, so that a poll allocates nothing.
 #[derive(Debug, Default)]
 pub struct SafeWaker {
-    known: Option<(Waker, Waker)>,
+    cached: Option<(Waker, Waker)>,
 }
 
 impl SafeWaker {
-    /// A waker that wakes the task of `task` from any thread.
+    /// Returns a waker that wakes the task of `task` from any thread.
     pub fn of(&mut self, task: &Waker) -> &Waker {
-        let known = self.known.take().filter(|(known, _)| known.will_wake(task));
+        let cached = self.cached.take().filter(|(cached, _)| cached.will_wake(task));
         let make = || {
             start();
-            // On the task's own thread, where its thread-local variables are there: a wake at the end of this thread finds them used in order.
+            // On the task's own thread, where its thread-local variables exist: a wake at the end of this
+            // thread then finds the order of destruction.
             let _ = are_thread_locals_alive();
             (task.clone(), Waker::from(Arc::new(Forward(task.clone()))))
         };
-        &self.known.insert(known.unwrap_or_else(make)).1
+        &self.cached.insert(cached.unwrap_or_else(make)).1
     }
 }
 
@@ -72,11 +74,11 @@ impl Wake for Forward {
     }
 
     fn wake_by_ref(self: &Arc<Self>) {
-        if are_thread_locals_alive() { self.0.wake_by_ref() } else { hand_over(self.0.clone()) }
+        if are_thread_locals_alive() { self.0.wake_by_ref() } else { enqueue_late(self.0.clone()) }
     }
 }
 
-/// Its destructor makes the thread-local variable unavailable, which is all that it is for.
+/// A sentinel; its destructor only makes the thread-local variable unavailable.
 struct Sentinel;
 
 impl Drop for Sentinel {
@@ -84,41 +86,44 @@ impl Drop for Sentinel {
 }
 
 thread_local! {
-    /// Destructors run in the reverse order of the first uses, so this one is destroyed before the variables that its initialisation uses.
+    /// Destructors run in the reverse order of the first uses, so this one is destroyed before the variables
+    /// that its initialisation uses.
     static SENTINEL: Option<Sentinel> = use_thread_locals_of_tokio().then_some(Sentinel);
 }
 
-/// Whether those of tokio's that a wake needs can be used on this thread, now and for the rest of this call.
+/// Returns whether tokio's variables that a wake needs can be used on this thread, now and for the rest of this call.
 fn are_thread_locals_alive() -> bool {
     SENTINEL.try_with(Option::is_some).unwrap_or(false)
 }
 
-/// Uses both thread-local variables that a wake uses; whether they are there.
+/// Uses both thread-local variables that a wake uses. Returns whether they exist.
 fn use_thread_locals_of_tokio() -> bool {
     if Handle::try_current().is_err_and(|error| error.is_thread_local_destroyed()) {
         return false;
     }
-    // Panics on a thread that used a `LocalSet` itself and has lost its variable since: it was never woken from there before.
+    // Panics on a thread that used a `LocalSet` itself and has destroyed its variable since: it never
+    // received a wake there before.
     catch_unwind(|| drop(LocalSet::new().enter())).is_ok()
 }
 
 #[derive(Default)]
-struct Late {
+struct LateWakes {
     waiting: Mutex<VecDeque<Waker>>,
-    /// A wake was handed over, or carried out.
+    /// Signals that a wake was handed over, or executed.
     changed: Condvar,
 }
 
-/// `None` where the thread could not be started.
-static LATE: OnceLock<Option<&'static Late>> = OnceLock::new();
+/// `None` if the thread could not be started.
+static LATE_WAKES: OnceLock<Option<&'static LateWakes>> = OnceLock::new();
 
-/// Starts the thread that wakes for others, once for the process. It is there before it is needed: a thread that ends may start none.
+/// Starts the thread that executes such wakes, once per process. It is started in advance, because a thread
+/// at its end may be unable to start one.
 fn start() {
-    LATE.get_or_init(|| {
-        let late: &Late = Box::leak(Box::default());
-        let carry_out = || late.carry_out();
-        match thread::Builder::new().name("late-wakes".to_owned()).spawn(carry_out) {
-            Ok(_) => Some(late),
+    LATE_WAKES.get_or_init(|| {
+        let late_wakes: &LateWakes = Box::leak(Box::default());
+        let run_wakes = || late_wakes.run_wakes();
+        match thread::Builder::new().name("late-wakes".to_owned()).spawn(run_wakes) {
+            Ok(_) => Some(late_wakes),
             Err(error) => {
                 let remedy = remedy(Wanted::Thread, &error);
                 crate::log::warn!(%error, %remedy, "no thread for wakes at the end of the process: stop the node before the end of `main`");
@@ -128,16 +133,16 @@ fn start() {
     });
 }
 
-fn hand_over(waker: Waker) {
-    match LATE.get().copied().flatten() {
-        Some(late) => late.hand_over(waker),
-        // It may fail, and is better than none.
+fn enqueue_late(waker: Waker) {
+    match LATE_WAKES.get().copied().flatten() {
+        Some(late_wakes) => late_wakes.enqueue_late(waker),
+        // This may fail, and is better than no wake.
         None => waker.wake(),
     }
 }
 
-impl Late {
-    fn hand_over(&self, waker: Waker) {
+impl LateWakes {
+    fn enqueue_late(&self, waker: Waker) {
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
         while waiting.len() >= WAITING_MAX {
             waiting = self.changed.wait(waiting).unwrap_or_else(PoisonError::into_inner);
@@ -147,7 +152,7 @@ impl Late {
         self.changed.notify_all();
     }
 
-    fn carry_out(&self) -> ! {
+    fn run_wakes(&self) -> ! {
         loop {
             let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
             let waker = loop {
@@ -158,7 +163,7 @@ impl Late {
             };
             drop(waiting);
             self.changed.notify_all();
-            // A foreign waker may panic: the next wakes are carried out all the same.
+            // A foreign waker may panic: the next wakes are executed all the same.
             let _ = catch_unwind(|| waker.wake());
         }
     }
@@ -191,7 +196,7 @@ mod tests {
         static LAST: RefCell<Option<WakesLate>> = const { RefCell::new(None) };
     }
 
-    /// A task that says when it is polled, for the second time on.
+    /// A task that reports each poll after the first.
     fn task(polls: SyncSender<usize>) -> (thread::JoinHandle<()>, Waker) {
         let (give, given) = sync_channel(1);
         let count = AtomicUsize::new(0);
@@ -217,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn a_task_is_woken_from_destructors_of_thread_locals_in_any_order() {
+    fn task_is_woken_from_thread_local_destructors() {
         let (say, polls) = sync_channel(8);
         let (thread, waker) = task(say);
         assert_eq!(polls.recv_timeout(WATCHDOG), Ok(0));

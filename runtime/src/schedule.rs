@@ -1,10 +1,10 @@
-//! Deadlines of one actor, as a pure table: what is due when, and how late it was.
+//! The timers of one actor, as a pure table: due times, and lateness.
 
 use std::{collections::BTreeMap, time::Duration};
 
 use crate::time::Time;
 
-/// Names one entry of a [`Schedule`].
+/// The ID of one entry of a [`Schedule`].
 ///
 /// # Examples
 ///
@@ -48,17 +48,17 @@ pub struct TimerId(u64);
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Tick {
-    /// When it was due.
+    /// When the timer was due.
     pub scheduled: Time,
-    /// How long after that it fired.
+    /// Time from then to its firing.
     pub lateness: Duration,
-    /// Periods that passed without a firing of their own, because an earlier one took too long.
+    /// Number of periods without a firing of their own, because an earlier one took too long.
     pub missed: u64,
-    /// The n-th firing, from 1.
+    /// The number of the firing, from 1.
     pub number: u64,
 }
 
-/// Entries in the order in which they are due.
+/// A table of timers, in the order in which they are due.
 #[derive(Debug)]
 pub struct Schedule<T> {
     entries: BTreeMap<(Time, TimerId), Entry<T>>,
@@ -72,12 +72,12 @@ struct Entry<T> {
     fired: u64,
 }
 
-/// An entry that is due, taken out of its schedule so that its owner can be lent to the action.
+/// A due entry, taken out of its schedule so that the action can borrow the schedule's owner.
 #[derive(Debug)]
 pub struct Due<T> {
-    /// What is due.
+    /// The action that is due.
     pub action: T,
-    /// When, and how late.
+    /// The due time and the lateness.
     pub tick: Tick,
     id: TimerId,
     entry: (Time, Option<Duration>),
@@ -107,13 +107,13 @@ impl<T> Schedule<T> {
         id
     }
 
-    /// Removes an entry. `false` if there is none: it was due once and has fired, or is being fired.
+    /// Removes an entry. Returns `false` if there is none: a one-time entry has fired, or the entry is firing now.
     pub fn cancel(&mut self, id: TimerId) -> bool {
         let key = self.entries.keys().find(|(_, other)| *other == id).copied();
         key.is_some_and(|key| self.entries.remove(&key).is_some())
     }
 
-    /// When the next entry is due.
+    /// Returns when the next entry is due.
     #[must_use]
     pub fn next_due(&self) -> Option<Time> {
         self.entries.first_key_value().map(|((at, _), _)| *at)
@@ -131,8 +131,8 @@ impl<T> Schedule<T> {
         Some(Due { action, tick, id, entry: (scheduled, period) })
     }
 
-    /// Periodic entries that are due by `now` are next due after it, on their grid: the turns between are neither made up
-    /// for nor counted as missed. Entries that are due once stay due.
+    /// Moves periodic entries that are due by `now` to their next time on the grid after it. The skipped
+    /// turns are neither repeated nor counted as missed. One-time entries stay due.
     pub fn skip_to(&mut self, now: Time) {
         let is_late = |at: &Time, entry: &Entry<T>| *at <= now && entry.period.is_some();
         let late: Vec<_> =
@@ -146,8 +146,8 @@ impl<T> Schedule<T> {
         }
     }
 
-    /// Puts a periodic entry back for its next turn, on the grid of its period: missed turns are skipped, not made up
-    /// for in a burst. An entry that was due once is dropped.
+    /// Puts a periodic entry back for its next turn, on the grid of its period. Missed turns are skipped, not
+    /// repeated in a burst. A one-time entry is dropped.
     pub fn put_back(&mut self, due: Due<T>) {
         let (scheduled, Some(period)) = due.entry else { return };
         let turns = u32::try_from(due.tick.missed + 1).unwrap_or(u32::MAX);
@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn a_late_tick_says_so_and_the_grid_is_kept() {
+    fn late_tick_is_marked_and_the_grid_is_kept() {
         let mut schedule = Schedule::default();
         schedule.every(us(1_000), Duration::from_micros(1_000), ());
         let due = schedule.take_due(us(1_030)).unwrap();
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn missed_periods_are_counted_and_not_made_up_for() {
+    fn missed_periods_are_counted_and_not_repeated() {
         let mut schedule = Schedule::default();
         schedule.every(us(1_000), Duration::from_micros(1_000), ());
         let due = schedule.take_due(us(4_500)).unwrap();
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn after_a_pause_periods_go_on_on_their_grid_and_single_entries_are_due() {
+    fn periods_keep_their_grid_after_a_pause() {
         let mut schedule = Schedule::default();
         schedule.every(us(1_000), Duration::from_micros(1_000), 'p');
         schedule.once(us(1_500), 'o');
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cancelled_entry_never_fires() {
+    fn cancelled_entry_never_fires() {
         let mut schedule = Schedule::default();
         let id = schedule.once(us(1), ());
         assert!(schedule.cancel(id));

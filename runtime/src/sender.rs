@@ -1,8 +1,12 @@
-//! How an application sends: fire and forget, confirmed, or asking.
+//! The sending side of an application: unconfirmed sends, confirmed sends and requests.
 
 mod awaiting;
 mod builder;
 mod clock;
+mod destination;
+mod directory;
+mod expecting;
+mod reply;
 mod unknown_name;
 
 use std::{
@@ -19,86 +23,27 @@ pub(crate) use self::builder::{Content, Via};
 pub use self::{
     awaiting::{Confirmation, GroupConfirmation, Reply},
     builder::{MessageBuilder, Value},
+    destination::Destination,
+    directory::Directory,
+    reply::ReplyTo,
     unknown_name::UnknownNameError,
 };
 use crate::{
     monitor::{MonitorError, MonitorId},
-    outcome::{Outcome, Receipt, Rejection, Ticket},
-    pending::{Awaited, Pending, Wait},
+    outcome::{Outcome, Rejection},
+    pending::Pending,
     protection::{Echo, Flows},
     router::Router,
-    supervision::vitals::Vitals,
+    supervision::liveness::Liveness,
     tid::{AppAddress, Tid},
     time::Time,
-    wire::{Class, DecodeError, Flags, Header, Kind, Message, MessageBuffer, Payload, encode},
+    wire::{Class, DecodeError, Header, Kind, Message, MessageBuffer, Payload, encode},
 };
 
-/// Messages that one process can send at most in its life: at a million a second it is twelve days.
-const SEQUENCES_PER_LIFE: u64 = 1 << 40;
+/// Maximum number of messages that one process can send in its lifetime: twelve days at a million a second.
+const SEQUENCES_PER_INCARNATION: u64 = 1 << 40;
 
-/// What a node knows of names and groups.
-pub trait Directory: Send + Sync {
-    /// The TID that has `name` now, or `None` if nobody has it.
-    fn resolve(&self, name: &str) -> Option<Tid>;
-
-    /// Names of applications that are similar to `name`, three at most, the most similar first; none where no names are at hand. It compares
-    /// names, so it is for what is shown to people.
-    fn nearest(&self, name: &str) -> Vec<String> {
-        let _ = name;
-        Vec::new()
-    }
-
-    /// Makes the application at `app` of this node a member of `group`, or no longer one.
-    fn set_member(&self, app: AppAddress, group: AppAddress, member: bool);
-
-    /// Lets the application at `watcher` of this node watch the present life of `target`.
-    ///
-    /// # Errors
-    /// Why not; nothing changed.
-    fn monitor(&self, watcher: AppAddress, target: Tid) -> Result<MonitorId, MonitorError> {
-        let _ = (watcher, target);
-        Err(MonitorError::Unsupported)
-    }
-
-    /// Ends a monitor of `watcher`. `false` if there is none, or if it has spoken already.
-    fn demonitor(&self, watcher: AppAddress, monitor: MonitorId) -> bool {
-        let _ = (watcher, monitor);
-        false
-    }
-}
-
-/// Whom a message is for: a TID (an application, a group, everybody) or a name.
-///
-/// # Examples
-///
-/// ```
-/// use sinew::{Tid, message::Destination};
-///
-/// let by_name: Destination<'_> = "knee.drive".into();
-/// let by_address: Destination<'_> = Tid::group("drives").into();
-/// assert_ne!(by_name, by_address);
-/// ```
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Destination<'a> {
-    /// By address.
-    Tid(Tid),
-    /// By name, looked up in the directory that all nodes share.
-    Name(&'a str),
-}
-
-impl From<Tid> for Destination<'_> {
-    fn from(tid: Tid) -> Self {
-        Self::Tid(tid)
-    }
-}
-
-impl<'a> From<&'a str> for Destination<'a> {
-    fn from(name: &'a str) -> Self {
-        Self::Name(name)
-    }
-}
-
-/// Why a message was not sent. Nothing changed.
+/// The reason why a message was not sent. Nothing changed.
 ///
 /// # Examples
 ///
@@ -118,33 +63,34 @@ pub enum SendError {
     /// The directory does not know the name.
     #[error(transparent)]
     UnknownName(#[from] UnknownNameError),
-    /// Nobody took the message.
+    /// The message was rejected.
     #[error("{0}")]
     Rejected(#[from] Rejection),
-    /// The sender was replaced: its application hung, or did not stop in its time. A later life speaks for this TID.
-    #[error("this life of the application is over; a later one speaks for it")]
+    /// The sender was replaced: its application hung, or did not stop in time. A later incarnation owns this TID now.
+    #[error("this incarnation of the application has ended; a later one has replaced it")]
     Over,
-    /// Too many confirmed messages and requests wait for their end.
+    /// Too many confirmed messages and requests await their outcomes.
     #[error("too many confirmed messages and requests are under way; wait for some to end")]
     TooManyWaits,
-    /// A group or a broadcast has no outcome of its own: each member has one.
+    /// A group or a broadcast has one outcome per member, not a single one.
     #[error(
         "{0} is more than one application, so that the message has an outcome for each; send it with `confirmed_by_each`"
     )]
     ToMany(Tid),
-    /// Kinds below `0x8000_0000` are the layers' own; see [`Kind`].
+    /// Kinds below `0x8000_0000` are reserved for the layers; see [`Kind`].
     #[error(
         "the kind {0} belongs to Sinew's layers, which would end a connection; take one from `Kind::named`"
     )]
     NotYours(Kind),
-    /// This life of the application has sent protected messages to 1,024 receivers, to each of them within its type's `within` and `age_max`.
+    /// This incarnation of the application has protected messages in 1,024 flows, one for each receiver and
+    /// type. Each flow was used within its type's `within` and `age_max`.
     #[error(
-        "this application sends protected messages to 1,024 receivers already, and can to no further one while it goes on with these"
+        "this application has 1,024 flows of protected messages already (one for each receiver and type), and can begin another one only when one of these is idle"
     )]
     TooManyProtectedFlows,
 }
 
-/// Why a request has no reply.
+/// The reason why a request has no reply.
 ///
 /// # Examples
 ///
@@ -158,21 +104,21 @@ pub enum SendError {
 /// ```
 #[derive(Debug, thiserror::Error)]
 pub enum AskError {
-    /// It was not sent.
+    /// The request was not sent.
     #[error(transparent)]
     Send(#[from] SendError),
-    /// It was sent and not handled.
+    /// The request was sent and not handled.
     #[error("the request ended as {0:?}")]
     Ended(Outcome),
-    /// No reply came in time. The request may have been handled.
+    /// No reply arrived in time. The request may have been handled.
     #[error("no reply came within {0:?}")]
     Deadline(Duration),
-    /// What came is not the reply's type.
+    /// The reply is not a valid value of the reply's type.
     #[error(transparent)]
     Malformed(#[from] DecodeError),
 }
 
-/// The sending side of one TID. Clones share it; any thread may use it.
+/// The sending side of one TID. Clones share its state; any thread may use it.
 ///
 /// # Examples
 ///
@@ -190,9 +136,9 @@ pub enum AskError {
 #[derive(Clone)]
 pub struct Sender {
     shared: Arc<Shared>,
-    /// The life of the application that sends with this; `None` where nobody takes lives.
-    life: Option<Arc<Vitals>>,
-    /// Its flows of protected messages.
+    /// The incarnation that sends with this; `None` if no supervisor fences incarnations.
+    incarnation: Option<Arc<Liveness>>,
+    /// The flows of protected messages of this incarnation.
     flows: Arc<Flows>,
 }
 
@@ -212,7 +158,7 @@ impl std::fmt::Debug for Sender {
 }
 
 impl Sender {
-    /// The sending side of `tid`. Payloads above `payload_max` bytes are refused.
+    /// Creates the sending side of `tid`. Payloads above `payload_max` bytes are rejected.
     #[must_use]
     pub fn new(
         tid: Tid,
@@ -223,43 +169,48 @@ impl Sender {
     ) -> Self {
         let sequence = AtomicU64::new(0);
         let shared = Arc::new(Shared { tid, router, directory, pending, sequence, payload_max });
-        Self { shared, life: None, flows: Arc::new(Flows::new(Time::now())) }
+        Self { shared, incarnation: None, flows: Arc::new(Flows::new(Time::now())) }
     }
 
-    /// The same sending side for one life of its application: with that, it is over.
+    /// Returns the same sending side bound to one incarnation of its application: it stops sending when the
+    /// incarnation is over.
     #[must_use]
-    pub(crate) fn in_life(&self, life: Arc<Vitals>) -> Self {
-        Self { shared: self.shared.clone(), life: Some(life), flows: Arc::new(Flows::new(Time::now())) }
+    pub(crate) fn for_incarnation(&self, incarnation: Arc<Liveness>) -> Self {
+        Self {
+            shared: self.shared.clone(),
+            incarnation: Some(incarnation),
+            flows: Arc::new(Flows::new(Time::now())),
+        }
     }
 
     fn is_over(&self) -> bool {
-        self.life.as_ref().is_some_and(|life| life.is_over())
+        self.incarnation.as_ref().is_some_and(|incarnation| incarnation.is_fenced())
     }
 
-    /// Sequence of the last message that was sent from the TID, as far as this side of it knows.
+    /// Returns the sequence number of the last message sent from the TID, as far as this sender knows.
     #[must_use]
     pub fn last_sequence(&self) -> u64 {
         self.shared.sequence.load(Ordering::Relaxed)
     }
 
-    /// Another sending side of the TID, in another process that began behind the sequence `began`, has sent messages up to
-    /// `last`: this one counts on from there. Returns whether that can be: a number that no process reaches in one life is
-    /// not taken.
+    /// Continues the sequence of another sender of the TID, in another process. That sender started after the
+    /// sequence `began` and has sent messages up to `last`. Returns `false`, and ignores `last`, if no
+    /// process can reach it in one lifetime.
     pub fn count_on_from(&self, last: u64, began: u64) -> bool {
-        let is_plausible = last <= began.saturating_add(SEQUENCES_PER_LIFE);
+        let is_plausible = last <= began.saturating_add(SEQUENCES_PER_INCARNATION);
         if is_plausible {
             self.shared.sequence.fetch_max(last, Ordering::Relaxed);
         }
         is_plausible
     }
 
-    /// The TID that this sends from.
+    /// Returns the TID that this sender sends from.
     #[must_use]
     pub fn tid(&self) -> Tid {
         self.shared.tid
     }
 
-    /// The TID that has `name` now, on any node.
+    /// Returns the TID that has `name` now, on any node.
     ///
     /// # Examples
     ///
@@ -276,8 +227,8 @@ impl Sender {
         self.shared.directory.resolve(name)
     }
 
-    /// Makes this application a member of the group called `name`: what is sent to [`Tid::group`] reaches it. A name that breaks the
-    /// grammar of [names](crate::name) is refused with an error in the log.
+    /// Adds this application to the group called `name`: it receives messages to [`Tid::group`]. A name that
+    /// breaks the grammar of [names](crate::name) is rejected with an error in the log.
     pub fn join(&self, name: &str) {
         if let Err(why) = crate::name::check_name(name) {
             let group: String = name.escape_debug().take(crate::name::NAME_BYTES_MAX).collect();
@@ -287,7 +238,7 @@ impl Sender {
         self.set_member(name, true);
     }
 
-    /// Ends the membership.
+    /// Removes this application from the group called `name`.
     pub fn leave(&self, name: &str) {
         self.set_member(name, false);
     }
@@ -298,11 +249,12 @@ impl Sender {
         }
     }
 
-    /// Watches the present life of the application at `tid`, on any node: when it ends, its node is lost, or nobody has the
-    /// TID, this application gets one [`Down`](crate::monitor::Down). The monitor ends with this application's own life.
+    /// Monitors the current incarnation of the application at `tid`, on any node. This application receives
+    /// one [`Down`](crate::monitor::Down) when that incarnation ends, its node is lost, or no application has
+    /// the TID. The monitor ends with this application's own incarnation.
     ///
     /// # Errors
-    /// The TID is not that of an application, or the bounds of [`MonitorError`] are reached.
+    /// The TID is not that of an application, or a bound of [`MonitorError`] is reached.
     ///
     /// # Examples
     ///
@@ -320,16 +272,17 @@ impl Sender {
         self.shared.directory.monitor(self.shared.tid.app, self.shared.router.absolute(tid))
     }
 
-    /// Ends a monitor. `false` if it has spoken already: its [`Down`](crate::monitor::Down) may wait in the mailbox.
+    /// Removes a monitor. Returns `false` if it has already reported: its [`Down`](crate::monitor::Down) may
+    /// wait in the mailbox.
     #[must_use]
     pub fn demonitor(&self, monitor: MonitorId) -> bool {
         self.shared.directory.demonitor(self.shared.tid.app, monitor)
     }
 
-    /// Sends a value, in the class of its type. Returns when a queue or a socket has taken it.
+    /// Sends a value, in the class of its type. Returns when a queue or a socket has accepted it.
     ///
     /// # Errors
-    /// Nobody took it.
+    /// No queue and no socket accepted the message.
     ///
     /// # Examples
     ///
@@ -351,7 +304,8 @@ impl Sender {
         self.dispatch(message).map(drop)
     }
 
-    /// A value to be sent otherwise than as its type says, confirmed, or as a request: see [`MessageBuilder`].
+    /// Returns a builder for a message with other terms than its type's defaults, for a confirmed message or
+    /// for a request: see [`MessageBuilder`].
     ///
     /// # Examples
     ///
@@ -373,64 +327,13 @@ impl Sender {
         MessageBuilder::new(self, Value { destination: to.into(), value })
     }
 
-    /// The same for memory that [`create_message`](Self::create_message) lent (the paper's SendMessage).
+    /// Same as [`message`](Self::message), for memory from [`create_message`](Self::create_message) (the
+    /// paper's SendMessage).
     pub const fn loaned(&self, buffer: MessageBuffer) -> MessageBuilder<&Self, MessageBuffer> {
         MessageBuilder::new(self, buffer)
     }
 
-    /// Whether whoever asked still waits for the reply, as far as is known here: its deadline is not over, and it has not given
-    /// up. For a handler that works long, or replies later: what nobody wants need not be done.
-    ///
-    /// # Examples
-    ///
-    /// ```
-    /// use sinew::{app::Delivery, message::Sender};
-    ///
-    /// # struct Plan;
-    /// fn is_to_go_on(sender: &Sender, request: &Delivery<Plan>) -> bool {
-    ///     request.reply_to().is_some_and(|reply_to| sender.is_wanted(&reply_to))
-    /// }
-    /// ```
-    #[must_use]
-    pub fn is_wanted(&self, request: &ReplyTo) -> bool {
-        let ReplyTo { source, correlation, sent, until } = *request;
-        Time::now() <= until && !self.shared.pending.is_given_up(source, correlation, sent)
-    }
-
-    /// Replies to requests of this application that came when nobody waited for them any more, and were dropped.
-    #[must_use]
-    pub fn late_replies(&self) -> u64 {
-        self.shared.pending.late_replies()
-    }
-
-    /// Answers a request.
-    ///
-    /// # Errors
-    /// Nobody took the reply, or the message asked for none.
-    ///
-    /// # Examples
-    ///
-    /// ```
-    /// use sinew::{app::Delivery, message::Sender, payload};
-    ///
-    /// payload!("demo.plan" => struct Plan;);
-    /// payload!("demo.planned" => struct Planned { steps: u32 });
-    ///
-    /// /// Replies from a thread that has the time to plan.
-    /// fn plan(sender: Sender, request: Delivery<Plan>) {
-    ///     let Some(reply_to) = request.reply_to() else { return };
-    ///     std::thread::spawn(move || sender.reply(reply_to, &Planned { steps: 12 }));
-    /// }
-    /// ```
-    pub fn reply<R: Payload>(&self, to: ReplyTo, value: &R) -> Result<(), SendError> {
-        let mut message = Message::typed(self.shared.tid, to.source, value);
-        message.header.class = Class::Control;
-        message.header.flags = Flags::REPLY;
-        message.header.correlation = to.correlation;
-        self.dispatch(message).map(drop)
-    }
-
-    /// Writable memory of `length` bytes for a raw payload of `kind` (the paper's CreateMessage).
+    /// Allocates writable memory of `length` bytes for a raw payload of `kind` (the paper's CreateMessage).
     ///
     /// # Errors
     /// The name is unknown, or the payload would be too long.
@@ -459,7 +362,7 @@ impl Sender {
         Ok(MessageBuffer::new(header, length))
     }
 
-    /// Sends a payload that was encoded before.
+    /// Sends an encoded payload.
     pub(crate) fn send_bytes(
         &self,
         destination: Destination<'_>,
@@ -472,7 +375,7 @@ impl Sender {
         self.dispatch(Message::new(header, payload)).map(drop)
     }
 
-    /// A message of the value, in its envelope if its type is protected.
+    /// Builds a message of the value, in its envelope if its type is protected.
     fn typed<P: Payload>(&self, destination: Destination<'_>, value: &P) -> Result<Message, SendError> {
         let destination = self.find(destination)?;
         if P::PROTECTION.is_none() {
@@ -480,7 +383,7 @@ impl Sender {
         }
         let receiver = self.shared.router.absolute(destination);
         if !receiver.is_single() {
-            // Each receiver has its own echo, and its own data_id.
+            // Each receiver has its own echo and its own data ID.
             return Err(Rejection::Unsupported.into());
         }
         let payload = self.flows.seal(self.shared.tid, receiver, value, Time::now());
@@ -488,19 +391,19 @@ impl Sender {
         Ok(Message::of_type::<P>(self.shared.tid, destination, payload))
     }
 
-    /// The TID with its node spelled out.
+    /// Returns the TID with the address of its node filled in.
     pub(crate) fn absolute(&self, tid: Tid) -> Tid {
         self.shared.router.absolute(tid)
     }
 
-    /// The application refused a message that it had taken out of its mailbox: an unconfirmed one is reported to its sender.
+    /// Reports to its sender an unconfirmed message that the application took out of its mailbox and rejected.
     pub fn refused(&self, header: &Header, why: Rejection) {
         self.shared.router.report(self.shared.tid, header, why, 1);
     }
 
-    /// A receiver of protected messages wants this time quoted.
+    /// Records an echo: a receiver of protected messages requests that this time is quoted.
     pub(crate) fn echoed(&self, from: Tid, echo: Echo) {
-        self.flows.heard(from, echo);
+        self.flows.record_echo(from, echo);
     }
 
     fn find(&self, destination: Destination<'_>) -> Result<Tid, SendError> {
@@ -514,39 +417,7 @@ impl Sender {
         }
     }
 
-    /// Returns how long it is waited for, too: no longer than the message lives.
-    fn expect_answer(
-        &self,
-        message: &mut Message,
-        awaited: Awaited,
-        within: Duration,
-    ) -> Result<(Wait, Duration), SendError> {
-        let destination = self.shared.router.absolute(message.header.destination);
-        let wait = self.shared.pending.open(awaited, destination).ok_or(SendError::TooManyWaits)?;
-        let within = self.confirm_to(message, destination, &wait, within);
-        Ok((wait, within))
-    }
-
-    /// The same for the outcomes of all members of a message to many.
-    fn expect_each(&self, message: &mut Message, within: Duration) -> Result<(Wait, Duration), SendError> {
-        let destination = self.shared.router.absolute(message.header.destination);
-        let wait = self.shared.pending.open_each(destination, self.shared.router.node());
-        let wait = wait.ok_or(SendError::TooManyWaits)?;
-        let within = self.confirm_to(message, destination, &wait, within);
-        Ok((wait, within))
-    }
-
-    /// Has the message confirmed to a wait.
-    fn confirm_to(&self, message: &mut Message, destination: Tid, wait: &Wait, within: Duration) -> Duration {
-        message.header.flags = message.header.flags.with(Flags::CONFIRM);
-        message.header.correlation = wait.correlation();
-        let within = message.header.limit_time_to_live(within);
-        let ticket = Ticket { source: self.shared.tid, destination, correlation: wait.correlation() };
-        message.receipt = Some(Receipt::new(self.shared.pending.clone(), ticket));
-        within
-    }
-
-    /// Returns when it was sent.
+    /// Sends the message and returns when it was sent.
     fn dispatch(&self, mut message: Message) -> Result<Time, SendError> {
         if self.is_over() {
             message.reject(Rejection::Closed);
@@ -554,7 +425,7 @@ impl Sender {
         }
         let kind = message.header.kind;
         if !kind.is_user() {
-            // What layers say is asked of no guard, and ends a link where it makes no sense.
+            // Layers' messages bypass the guards, and an invalid one ends a link, so an application must not send them.
             message.reject(Rejection::UnknownKind);
             return Err(SendError::NotYours(kind));
         }
@@ -567,22 +438,5 @@ impl Sender {
         message.header.sent = sent;
         self.shared.router.send(message)?;
         Ok(sent)
-    }
-}
-
-/// Where a reply goes: made from the request that it answers.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ReplyTo {
-    pub(crate) source: Tid,
-    pub(crate) correlation: u64,
-    pub(crate) sent: Time,
-    pub(crate) until: Time,
-}
-
-impl ReplyTo {
-    /// When whoever asked stops waiting, in this host's clock; [`Time::MAX`] if it never does.
-    #[must_use]
-    pub const fn deadline(&self) -> Time {
-        self.until
     }
 }

@@ -1,4 +1,4 @@
-//! The 64-bit transport ID (TID): which application of which node a message is for.
+//! The 64-bit transport ID (TID): the address of an application on a node.
 //!
 //! ```text
 //!  63            32 31             0
@@ -11,11 +11,11 @@
 //!
 //! | range | use |
 //! | --- | --- |
-//! | `0` | nobody; never a destination |
+//! | `0` | no application; never a destination |
 //! | `1..=15` | layers: LNCL 1, sync manager 2, GNCL 3, NDL 4; inspection 5 |
 //! | `16..=0x0fff` | reserved |
 //! | `0x1000..=0x7fff_ffff` | fixed: chosen by the user |
-//! | `0x8000_0000..=0xefff_ffff` | dynamic: given by LNCL |
+//! | `0x8000_0000..=0xefff_ffff` | dynamic: assigned by LNCL |
 //! | `0xf000_0000..=0xffff_fffe` | groups |
 //! | `0xffff_ffff` | every application of the node |
 
@@ -39,24 +39,24 @@ use serde::{Deserialize, Serialize};
 pub struct NodeAddress(u32);
 
 impl NodeAddress {
-    /// The node that the sender itself is on.
+    /// The node of the sender itself.
     pub const HERE: Self = Self(0);
     /// Every node: a broadcast.
     pub const ALL: Self = Self(u32::MAX);
 
-    /// A node address from its 32 bits.
+    /// Creates a node address from its 32 bits.
     #[must_use]
     pub const fn new(bits: u32) -> Self {
         Self(bits)
     }
 
-    /// The 32 bits of this address.
+    /// Returns the 32 bits of this address.
     #[must_use]
     pub const fn bits(self) -> u32 {
         self.0
     }
 
-    /// Whether this names one single node (neither [`HERE`](Self::HERE) nor [`ALL`](Self::ALL)).
+    /// Returns whether this is the address of one node (neither [`HERE`](Self::HERE) nor [`ALL`](Self::ALL)).
     ///
     /// # Examples
     ///
@@ -130,7 +130,7 @@ impl FromStr for NodeAddress {
 pub struct AppAddress(u32);
 
 impl AppAddress {
-    /// Nobody. A message to it is refused.
+    /// No application. A message to it is rejected.
     pub const NONE: Self = Self(0);
     /// Local Node Communication Layer.
     pub const LNCL: Self = Self(1);
@@ -140,7 +140,7 @@ impl AppAddress {
     pub const GNCL: Self = Self(3);
     /// Node Discovery Layer.
     pub const NDL: Self = Self(4);
-    /// Answers questions about its node, for tools; no layer, but a static address like one.
+    /// Answers queries about its node, for tools. It is not a layer, but has a static address like one.
     pub const INSPECT: Self = Self(5);
     /// Every application of a node.
     pub const ALL: Self = Self(u32::MAX);
@@ -149,19 +149,19 @@ impl AppAddress {
     const DYNAMIC_FIRST: u32 = 0x8000_0000;
     const GROUP_FIRST: u32 = 0xf000_0000;
 
-    /// An application address from its 32 bits.
+    /// Creates an application address from its 32 bits.
     #[must_use]
     pub const fn new(bits: u32) -> Self {
         Self(bits)
     }
 
-    /// The 32 bits of this address.
+    /// Returns the 32 bits of this address.
     #[must_use]
     pub const fn bits(self) -> u32 {
         self.0
     }
 
-    /// The `index`-th address that users may choose; `None` past the end of the range.
+    /// Returns the `index`-th address that users may choose; `None` past the end of the range.
     ///
     /// # Examples
     ///
@@ -180,7 +180,7 @@ impl AppAddress {
         }
     }
 
-    /// The `index`-th address that LNCL gives out; `None` past the end of the range.
+    /// Returns the `index`-th address that LNCL assigns; `None` past the end of the range.
     #[must_use]
     pub const fn dynamic(index: u32) -> Option<Self> {
         if index < Self::GROUP_FIRST - Self::DYNAMIC_FIRST {
@@ -190,7 +190,7 @@ impl AppAddress {
         }
     }
 
-    /// The address of the group called `name`: FNV-1a of the name, folded into the group range.
+    /// Returns the address of the group called `name`: FNV-1a of the name, folded into the group range.
     ///
     /// # Examples
     ///
@@ -206,25 +206,25 @@ impl AppAddress {
         Self(Self::GROUP_FIRST + crate::wire::fnv1a(name.as_bytes()) % span)
     }
 
-    /// Whether this is a layer's static address.
+    /// Returns whether this is a layer's static address.
     #[must_use]
     pub const fn is_layer(self) -> bool {
         1 <= self.0 && self.0 <= 15
     }
 
-    /// Whether a user may choose this address.
+    /// Returns whether a user may choose this address.
     #[must_use]
     pub const fn is_fixed(self) -> bool {
         Self::FIXED_FIRST <= self.0 && self.0 < Self::DYNAMIC_FIRST
     }
 
-    /// Whether LNCL gives out this address.
+    /// Returns whether LNCL assigns this address.
     #[must_use]
     pub const fn is_dynamic(self) -> bool {
         Self::DYNAMIC_FIRST <= self.0 && self.0 < Self::GROUP_FIRST
     }
 
-    /// Whether this names a group.
+    /// Returns whether this is the address of a group.
     #[must_use]
     pub const fn is_group(self) -> bool {
         Self::GROUP_FIRST <= self.0 && self.0 < Self::ALL.0
@@ -270,7 +270,7 @@ impl FromStr for AppAddress {
     }
 }
 
-/// Transport ID: the address of an application, of a layer, of a group or of everybody.
+/// Transport ID: the address of an application, a layer, a group or all applications.
 ///
 /// Its text form is `node/application`, the application in hexadecimal or by its layer's name; it parses back.
 ///
@@ -294,12 +294,12 @@ pub struct Tid {
 }
 
 impl Tid {
-    /// Nobody: the source of a message that wants no answer.
+    /// No application: the source of a message that expects no reply.
     pub const NONE: Self = Self::new(NodeAddress::HERE, AppAddress::NONE);
     /// Every application of every node.
     pub const BROADCAST: Self = Self::new(NodeAddress::ALL, AppAddress::ALL);
 
-    /// The TID of `app` on `node`.
+    /// Returns the TID of `app` on `node`.
     ///
     /// # Examples
     ///
@@ -315,7 +315,7 @@ impl Tid {
         Self { node, app }
     }
 
-    /// The members of the group called `name`, on every node.
+    /// Returns the TID of the members of the group called `name`, on every node.
     ///
     /// # Examples
     ///
@@ -331,7 +331,7 @@ impl Tid {
         Self::new(NodeAddress::ALL, AppAddress::group(name))
     }
 
-    /// The TID with these 64 bits, node address in the upper half.
+    /// Creates the TID with these 64 bits, node address in the upper half.
     ///
     /// # Examples
     ///
@@ -347,13 +347,13 @@ impl Tid {
         Self::new(NodeAddress((bits >> 32) as u32), AppAddress(bits as u32))
     }
 
-    /// The 64 bits, node address in the upper half.
+    /// Returns the 64 bits, node address in the upper half.
     #[must_use]
     pub const fn bits(self) -> u64 {
         (self.node.0 as u64) << 32 | self.app.0 as u64
     }
 
-    /// Whether this names exactly one application or layer.
+    /// Returns whether this is the address of exactly one application or layer.
     ///
     /// # Examples
     ///
@@ -395,23 +395,23 @@ impl FromStr for Tid {
     }
 }
 
-/// Why a text is not a TID. The caller is at fault; nothing changed.
+/// The reason why a text is not a TID. This is an error of the caller; nothing changed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ParseTidError {
     /// There is no slash between the node and the application.
     #[error("'{0}' is not a TID: write node/application, as in 10.0.0.7/1001")]
     Form(String),
-    /// The part before the slash is no node address.
+    /// The part before the slash is not a node address.
     #[error("'{0}' is not a node address: write an IPv4 address, '*' for every node or 'here'")]
     Node(String),
-    /// The part after the slash is no application address.
+    /// The part after the slash is not an application address.
     #[error(
         "'{0}' is not an application address: write hexadecimal digits, lncl, sync, gncl, ndl, inspect or '*'"
     )]
     Application(String),
 }
 
-/// Which life of a node or of an application something belongs to; larger is later.
+/// The incarnation of a node or an application; larger is later.
 ///
 /// # Examples
 ///

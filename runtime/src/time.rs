@@ -1,7 +1,8 @@
 //! Points in time: nanoseconds of the host's monotonic clock.
 //!
-//! The clock counts since the host booted, on Linux without the time that the host slept, and is the same for all processes of a host. Cores never read it: a time
-//! comes in as an argument, so that a seed replays a failure. Only shells call [`Time::now`].
+//! The clock counts since the boot of the host, on Linux without sleep time, and is the same for all
+//! processes of a host. Cores never read it: a time is passed as an argument, so that a seed replays a
+//! failure. Only shells call [`Time::now`].
 
 use std::{
     fmt,
@@ -33,7 +34,7 @@ impl Time {
     /// Later than every other time.
     pub const MAX: Self = Self(u64::MAX);
 
-    /// The present moment. For shells only.
+    /// Returns the current time. For shells only.
     ///
     /// # Examples
     ///
@@ -49,10 +50,11 @@ impl Time {
         Self::of(ClockId::Monotonic)
     }
 
-    /// The present moment, and how long the host has slept at least since it booted, in which this clock stands. For shells only.
+    /// Returns the current time, and a lower bound of the host's sleep since its boot, during which this
+    /// clock stops. For shells only.
     ///
-    /// A thread that is held up between its two looks at clocks finds less sleep than there was, never more. Elsewhere than on Linux it is
-    /// zero: there it is not known.
+    /// A thread that is delayed between its two clock reads finds less sleep than there was, never more. On
+    /// systems other than Linux the sleep is unknown, and this returns zero.
     #[must_use]
     pub fn now_and_asleep() -> (Self, Duration) {
         #[cfg(target_os = "linux")]
@@ -70,19 +72,19 @@ impl Time {
         Self(now.tv_sec.unsigned_abs() * 1_000_000_000 + now.tv_nsec.unsigned_abs())
     }
 
-    /// The time `nanos` nanoseconds after the clock's origin.
+    /// Returns the time `nanos` nanoseconds after the clock's origin.
     #[must_use]
     pub const fn from_nanos(nanos: u64) -> Self {
         Self(nanos)
     }
 
-    /// Nanoseconds since the clock's origin.
+    /// Returns the nanoseconds since the clock's origin.
     #[must_use]
     pub const fn as_nanos(self) -> u64 {
         self.0
     }
 
-    /// How long after `earlier` this is; zero if it is not after it.
+    /// Returns the time from `earlier` to this; zero if this is not later.
     ///
     /// # Examples
     ///
@@ -98,7 +100,7 @@ impl Time {
         Duration::from_nanos(self.0.saturating_sub(earlier.0))
     }
 
-    /// This time moved by `nanos`, which may be negative; never before the clock's origin.
+    /// Returns this time moved by `nanos`, which may be negative; never before the clock's origin.
     #[must_use]
     pub const fn shifted(self, nanos: i64) -> Self {
         Self(self.0.saturating_add_signed(nanos))
@@ -132,7 +134,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn arithmetic_stops_at_the_ends() {
+    fn arithmetic_saturates() {
         assert_eq!(Time::ZERO - Duration::from_secs(1), Time::ZERO);
         assert_eq!(Time::MAX + Duration::from_secs(1), Time::MAX);
         assert_eq!(Time::from_nanos(5).since(Time::from_nanos(9)), Duration::ZERO);

@@ -1,11 +1,11 @@
-//! One timer of the kernel's, on the monotonic clock, in the reactor of the thread that makes it.
+//! One kernel timer, on the monotonic clock, in the reactor of the thread that creates it.
 
 use std::{io, os::fd::OwnedFd};
 
 use rustix::time::{TimerfdClockId, TimerfdFlags, timerfd_create};
 use tokio::io::unix::AsyncFd;
 
-/// A timer that is not set.
+/// Creates a timer that is not set.
 ///
 /// # Errors
 ///

@@ -1,7 +1,8 @@
-//! Unconfirmed messages that were refused: what their sender is told, and the trait by which a node learns of each refusal.
+//! Rejected unconfirmed messages: the report to their sender, and the trait that notifies a node of each rejection.
 //!
-//! A confirmed message has its [`Outcome`](crate::outcome::Outcome). An unconfirmed one has none; a node counts its refusals, puts
-//! them together, and reports them to the sender as [`Undelivered`]. Nothing here runs where no message is refused.
+//! A confirmed message has its [`Outcome`](crate::outcome::Outcome). An unconfirmed one has none. A node
+//! counts its rejections, combines them, and reports them to the sender as [`Undelivered`]. This code runs
+//! only when a message is rejected.
 
 use std::fmt;
 
@@ -14,11 +15,12 @@ use crate::{
     wire::{Class, Flags, Header, Kind, Payload},
 };
 
-/// Unconfirmed messages of one sender to one destination that were refused for one reason, since the last report of them.
+/// Unconfirmed messages of one sender to one destination that were rejected for one reason, since the last report.
 ///
-/// An application gets it as an event: `AppSpec::handles::<Undelivered>()` and `Handler<Delivery<Undelivered>>`, in the node's process
-/// and in a process of its own alike. An endpoint takes it with `take_undelivered`. The first refusal is reported at once, later ones
-/// every 100 ms together. Where an application does not handle it, its node logs a warning.
+/// An application receives it as an event: `AppSpec::handles::<Undelivered>()` and
+/// `Handler<Delivery<Undelivered>>`, in the node's process and in a process of its own. An endpoint takes it
+/// with `take_undelivered`. The first rejection is reported at once, later ones together every 100 ms. If an
+/// application does not handle it, its node logs a warning.
 ///
 /// # Examples
 ///
@@ -40,28 +42,30 @@ use crate::{
 /// ```
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Undelivered {
-    /// Destination of the messages; [`Tid::NONE`]: several that are not told apart any more. For an endpoint also its own TID: messages to
-    /// it, or to a group of its, for which it had no room while it waited for an answer.
+    /// The destination of the messages; [`Tid::NONE`]: several that are no longer distinguished. For an
+    /// endpoint also its own TID: messages to it or to one of its groups, for which it had no room while it
+    /// waited for a reply.
     pub destination: Tid,
-    /// Name of the destination, where the node knows one.
+    /// The name of the destination, if the node knows one.
     #[serde(default)]
     pub name: Option<String>,
-    /// Type of the payload; `None`: several, or not known.
+    /// The type of the payload; `None`: several, or unknown.
     #[serde(default)]
     pub kind: Option<Kind>,
-    /// Class of the first message; `None` where it is not known.
+    /// The class of the first message; `None` if it is unknown.
     #[serde(default)]
     pub class: Option<Class>,
-    /// Reason.
+    /// The reason.
     pub why: Rejection,
-    /// Number of messages since the last report. Never 0.
+    /// The number of messages since the last report. Never 0.
     pub count: u64,
-    /// When the first of these was refused, on this host's monotonic clock. Of a refusal by another node: when its report arrived.
+    /// When the first of these was rejected, on this host's monotonic clock. For a rejection by another node:
+    /// when its report arrived.
     pub since: Time,
-    /// Lowest sequence of these messages; `None` where it is not known.
+    /// The lowest sequence number of these messages; `None` if it is unknown.
     #[serde(default)]
     pub first_sequence: Option<u64>,
-    /// Highest sequence of these messages; `None` where it is not known.
+    /// The highest sequence number of these messages; `None` if it is unknown.
     #[serde(default)]
     pub last_sequence: Option<u64>,
 }
@@ -90,16 +94,17 @@ impl fmt::Display for Undelivered {
     }
 }
 
-/// Takes note of unconfirmed messages that were refused after their sender's call had returned. Must not block.
+/// Records unconfirmed messages that were rejected after their send had returned. Must not block.
 pub trait RefusalSink: Send + Sync + fmt::Debug {
-    /// `receiver` refused `count` messages with this header.
+    /// Records that `receiver` rejected `count` messages with this header.
     fn refused(&self, receiver: Tid, header: &Header, why: Rejection, count: u64);
 }
 
-/// Whether the refusal of a message with this header is reported to its sender.
+/// Returns whether the rejection of a message with this header is reported to its sender.
 ///
-/// Not reported: confirmed messages and requests, which have an outcome; replies; frames and events of layers; a refusal by the handler
-/// itself; that an application does not handle the type of a broadcast, which is for all that do.
+/// These are not reported: confirmed messages and requests, which have an outcome; replies; frames and events
+/// of layers; a rejection by the handler itself; an unhandled type of a broadcast, which is only for
+/// applications that handle it.
 #[must_use]
 pub fn is_reported(header: &Header, why: Rejection) -> bool {
     let Header { flags, kind, source, destination, .. } = *header;
@@ -114,8 +119,9 @@ pub fn is_reported(header: &Header, why: Rejection) -> bool {
         && !(is_broadcast && why == Rejection::UnknownKind)
 }
 
-/// Whether the receiver's node notes the refusal of a message with this header: each that is reported, and confirmed messages and requests whose type
-/// the receiver does not handle or cannot read.
+/// Returns whether the receiver's node records the rejection of a message with this header. It records each
+/// reported one, and confirmed messages and requests of a type that the receiver does not handle or cannot
+/// decode.
 #[must_use]
 pub fn is_noted(header: &Header, why: Rejection) -> bool {
     let Header { flags, .. } = *header;
@@ -141,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn refusals_without_an_outcome_of_their_own_are_reported() {
+    fn rejections_without_an_own_outcome_are_reported() {
         let knee = Tid::new(NodeAddress::new(2), AppAddress::fixed(2).unwrap());
         assert!(is_reported(&header(Flags::NONE, knee), Rejection::UnknownKind));
         assert!(is_reported(&header(Flags::NONE, Tid::group("legs")), Rejection::UnknownKind));
@@ -152,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn types_that_are_not_handled_are_noted_of_confirmed_messages_and_requests_too() {
+    fn unhandled_types_are_noted_of_confirmed_messages_too() {
         let knee = Tid::new(NodeAddress::new(2), AppAddress::fixed(2).unwrap());
         for flags in [Flags::NONE, Flags::CONFIRM, Flags::ASK, Flags::CONFIRM.with(Flags::ASK)] {
             assert!(is_noted(&header(flags, knee), Rejection::UnknownKind), "{flags:?}");
@@ -163,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unhandled_broadcast_is_no_fault() {
+    fn unhandled_broadcast_is_no_fault() {
         let all = Tid::new(NodeAddress::ALL, AppAddress::ALL);
         assert!(!is_reported(&header(Flags::NONE, all), Rejection::UnknownKind));
         assert!(is_reported(&header(Flags::NONE, all), Rejection::Malformed));

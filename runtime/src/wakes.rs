@@ -1,64 +1,65 @@
-//! Wakes that are put off until a whole batch of messages has been handed over.
+//! Wakes that are delayed until a whole batch of messages has been handed over.
 //!
-//! Whoever takes many messages from a socket at once hands them to mailboxes one by one. The first of them would wake the
-//! application's thread, which takes it, finds no second one, and sleeps again: a wake for each message, where one for all does.
+//! A thread that reads many messages from a socket at once hands them to mailboxes one by one. Without a
+//! batch the first one would wake the application's thread, which takes it, finds no second one, and sleeps
+//! again: one wake per message, where one is enough for all.
 
 use std::{cell::RefCell, marker::PhantomData, task::Waker};
 
-/// Wakers that are kept at most; of more each is woken at once.
-const KEPT_MAX: usize = 64;
+/// Maximum number of delayed wakers; further ones are woken at once.
+const DELAYED_MAX: usize = 64;
 
 thread_local! {
-    static PUT_OFF: RefCell<PutOff> = const { RefCell::new(PutOff { batches: 0, wakers: Vec::new() }) };
+    static DELAYED: RefCell<DelayedWakes> = const { RefCell::new(DelayedWakes { batches: 0, wakers: Vec::new() }) };
 }
 
-struct PutOff {
-    /// Batches that this thread is in, one in the other.
+struct DelayedWakes {
+    /// The number of nested batches of this thread.
     batches: usize,
     wakers: Vec<Waker>,
 }
 
-/// As long as this lives, whom this thread is to [wake] waits; then all are woken, also at a panic. It is to live for a moment only,
-/// without a wait for anybody in it.
+/// Delays this thread's [`wake`] calls while it lives; then all are woken, also after a panic. It must live
+/// only briefly, without a blocking call.
 #[derive(Debug)]
-#[must_use = "nothing is put off once it is dropped"]
+#[must_use = "nothing is delayed once it is dropped"]
 pub struct Batch(PhantomData<*const ()>);
 
 impl Batch {
-    /// Puts the wakes of this thread off.
+    /// Starts to delay the wakes of this thread.
     pub fn begin() -> Self {
-        // A thread that ends has none any more, and wakes at once.
-        let _ = PUT_OFF.try_with(|put_off| put_off.borrow_mut().batches += 1);
+        // A thread at its end may have destroyed this variable; it then wakes at once.
+        let _ = DELAYED.try_with(|delayed| delayed.borrow_mut().batches += 1);
         Self(PhantomData)
     }
 }
 
 impl Drop for Batch {
     fn drop(&mut self) {
-        let wakers = PUT_OFF.try_with(|put_off| {
-            let put_off = &mut *put_off.borrow_mut();
-            put_off.batches = put_off.batches.saturating_sub(1);
-            // Where nobody is to be woken the memory stays for the next batch.
-            let is_due = put_off.batches == 0 && !put_off.wakers.is_empty();
-            is_due.then(|| std::mem::take(&mut put_off.wakers))
+        let wakers = DELAYED.try_with(|delayed| {
+            let delayed = &mut *delayed.borrow_mut();
+            delayed.batches = delayed.batches.saturating_sub(1);
+            // Without wakers the memory is kept for the next batch.
+            let is_due = delayed.batches == 0 && !delayed.wakers.is_empty();
+            is_due.then(|| std::mem::take(&mut delayed.wakers))
         });
         let Ok(Some(wakers)) = wakers else { return };
-        let mut rest = Rest(wakers);
-        rest.wake();
-        // Its memory is used again, unless one that was woken has begun anew already.
-        let _ = PUT_OFF.try_with(|put_off| {
-            let wakers = &mut put_off.borrow_mut().wakers;
+        let mut remaining = RemainingWakes(wakers);
+        remaining.wake();
+        // The memory is reused, unless a woken task has started a new batch.
+        let _ = DELAYED.try_with(|delayed| {
+            let wakers = &mut delayed.borrow_mut().wakers;
             if wakers.capacity() == 0 {
-                *wakers = std::mem::take(&mut rest.0);
+                *wakers = std::mem::take(&mut remaining.0);
             }
         });
     }
 }
 
-/// Those that are still to be woken, whoever of them panics over it.
-struct Rest(Vec<Waker>);
+/// The remaining wakers, which are woken even if one of them panics.
+struct RemainingWakes(Vec<Waker>);
 
-impl Rest {
+impl RemainingWakes {
     fn wake(&mut self) {
         while let Some(waker) = self.0.pop() {
             waker.wake();
@@ -66,32 +67,32 @@ impl Rest {
     }
 }
 
-impl Drop for Rest {
+impl Drop for RemainingWakes {
     fn drop(&mut self) {
         self.wake();
     }
 }
 
-/// Wakes now, or with the others at the end of this thread's [`Batch`].
+/// Wakes now, or at the end of this thread's [`Batch`].
 pub fn wake(waker: Waker) {
     let mut waker = Some(waker);
-    let is_put_off = PUT_OFF.try_with(|put_off| put_off.borrow_mut().takes(&mut waker)).unwrap_or(false);
-    if let Some(waker) = waker.filter(|_| !is_put_off) {
+    let is_delayed = DELAYED.try_with(|delayed| delayed.borrow_mut().delay(&mut waker)).unwrap_or(false);
+    if let Some(waker) = waker.filter(|_| !is_delayed) {
         waker.wake();
     }
 }
 
-impl PutOff {
-    /// Whether whoever `waker` is for will be woken at the end of a batch. It may be left in its place then, to be dropped by the
-    /// caller: what that runs is foreign.
-    fn takes(&mut self, waker: &mut Option<Waker>) -> bool {
-        if self.batches == 0 || self.wakers.len() >= KEPT_MAX {
+impl DelayedWakes {
+    /// Returns whether the task of `waker` will be woken at the end of a batch. The waker may be left in its
+    /// place then, to be dropped by the caller, because its drop is foreign code.
+    fn delay(&mut self, waker: &mut Option<Waker>) -> bool {
+        if self.batches == 0 || self.wakers.len() >= DELAYED_MAX {
             return false;
         }
-        // Who waits for many messages has a waker with each.
-        let is_kept =
+        // A task that waits for many messages has the same waker for each.
+        let is_queued =
             self.wakers.last().zip(waker.as_ref()).is_some_and(|(last, waker)| last.will_wake(waker));
-        if !is_kept {
+        if !is_queued {
             self.wakers.extend(waker.take());
         }
         true
@@ -114,7 +115,7 @@ mod tests {
     use super::*;
     use crate::{
         mailbox::Mailbox,
-        router::Outlet,
+        router::MessageSink,
         tid::Tid,
         wire::{Header, Kind, Message},
     };
@@ -140,14 +141,14 @@ mod tests {
     }
 
     #[test]
-    fn without_a_batch_it_is_woken_at_once() {
+    fn wake_without_a_batch_is_immediate() {
         let (woken, waker) = woken();
         wake(waker);
         assert_eq!(woken.times(), 1);
     }
 
     #[test]
-    fn whoever_is_to_be_woken_in_a_batch_is_woken_once_at_the_end_of_the_outermost() {
+    fn batched_task_is_woken_once_at_the_outermost_end() {
         let ((one, first), (other, second)) = (woken(), woken());
         let outermost = Batch::begin();
         {
@@ -162,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn who_reads_a_mailbox_is_woken_once_for_a_batch_and_finds_all_of_it() {
+    fn mailbox_reader_is_woken_once_for_a_batch() {
         let (woken, waker) = woken();
         let (mailbox, mut task) = (Mailbox::new(8), Context::from_waker(&waker));
         let mut reader = mailbox.attach();
@@ -179,8 +180,8 @@ mod tests {
     }
 
     #[test]
-    fn those_that_are_too_many_are_woken_at_once_and_nobody_is_forgotten() {
-        let all: Vec<_> = (0..KEPT_MAX + 9).map(|_| woken()).collect();
+    fn excess_wakes_are_immediate_and_none_is_lost() {
+        let all: Vec<_> = (0..DELAYED_MAX + 9).map(|_| woken()).collect();
         let batch = Batch::begin();
         all.iter().for_each(|(_, waker)| wake(waker.clone()));
         assert_eq!(all.iter().filter(|(woken, _)| woken.times() == 1).count(), 9);
@@ -189,8 +190,8 @@ mod tests {
     }
 
     #[test]
-    fn memory_for_wakers_is_used_again_though_a_batch_in_between_wakes_nobody() {
-        let memory = || PUT_OFF.with(|put_off| put_off.borrow().wakers.as_ptr());
+    fn waker_memory_is_reused_after_an_empty_batch() {
+        let memory = || DELAYED.with(|delayed| delayed.borrow().wakers.as_ptr());
         let batch = Batch::begin();
         wake(woken().1);
         let first = memory();
@@ -200,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn a_panic_in_a_batch_leaves_nobody_asleep() {
+    fn panic_in_a_batch_loses_no_wake() {
         let (woken, waker) = woken();
         let panicked = catch_unwind(|| {
             let _batch = Batch::begin();

@@ -1,38 +1,43 @@
-//! The claim: whatever somebody on a secured robot's network does, nobody gets in, nobody is lost, those who talk feel little of it, and
-//! the node's memory stays within its bounds.
+//! The claim: no attack from the network of a secured robot lets an unauthorized peer in or makes a node
+//! lost. Live traffic is hardly slowed down, and the node's memory stays within its bounds.
 //!
-//! Two nodes with keys on hosts of their own, each a process: `hip` asks `knee` a thousand times a second. An attacker on a third host does one
-//! thing to `knee`. First live traffic is timed by turns: left alone, with that done to a decoy on `knee`'s host, and to `knee`. Then it is
-//! looked who gets in and who is lost; meanwhile, where that is the question, an honest peer that `knee` does not know comes from a fourth
-//! host, and a node `ankle` is started there. Hosts are network namespaces joined by veth pairs, which the program makes and removes.
+//! Two nodes with keys run as processes on hosts of their own: `hip` sends a request to `knee` a thousand
+//! times a second. An attacker on a third host runs one attack against `knee`.
 //!
-//! | file | what it is |
+//! - First, live traffic is timed in alternating rounds: without an attack, with the attack on a decoy on
+//!   `knee`'s host, and with the attack on `knee`.
+//! - Then the test checks for intrusions and lost nodes. If the attack concerns newcomers, an honest peer
+//!   unknown to `knee` connects from a fourth host meanwhile, and a node `ankle` is started there.
+//!
+//! Hosts are network namespaces connected by veth pairs, which the program creates and removes.
+//!
+//! | file | content |
 //! | --- | --- |
-//! | `decoy` | the role of the one that is attacked instead of the node |
-//! | `intruder` | a whole node that does not belong there |
+//! | `decoy` | the role of the process that is attacked instead of the node |
+//! | `intruder` | a whole node that does not belong to the robot |
 //! | `keys` | the robot's authority, and another one |
 //! | `node` | the role of each node |
-//! | `rounds` | live traffic's times by turns |
-//! | `robot` | the nodes, as the director sees them |
-//! | `stranger` | a peer by hand: TLS, HELLO, a session |
-//! | `together` | what two nodes do together while a guest is at the door of one |
-//! | `tried/` | what is done, one file each |
-//! | `report` | what was seen |
+//! | `rounds` | latencies of live traffic in alternating rounds |
+//! | `robot` | the nodes, as the scenario sees them |
+//! | `raw_peer` | a hand-written peer: TLS, HELLO, a session |
+//! | `together` | joint work of two nodes while a guest is connected to one of them |
+//! | `tried/` | the attacks, one file each |
+//! | `report` | the results |
 
 mod decoy;
 mod intruder;
 mod keys;
 mod node;
+mod raw_peer;
 mod report;
 mod robot;
 mod rounds;
-mod stranger;
 mod together;
 mod tried;
 
+use sinew_testkit::SetOnDrop;
+use sinew_testkit::join;
 use std::{
-    path::PathBuf,
-    process::ExitCode,
     sync::atomic::{AtomicBool, Ordering},
     thread,
     time::{Duration, Instant},
@@ -42,99 +47,106 @@ use rustix::process::{Resource, Rlimit, getrlimit, setpriority_process, setrlimi
 
 use self::{
     intruder::Intruder,
-    keys::{Keys, Who},
+    keys::{Keys, TestNode},
+    raw_peer::RawPeer,
     robot::{Decoys, Robot, Target},
-    stranger::Stranger,
     tried::Recording,
 };
 pub use self::{
     report::{Report, Row},
     rounds::{Attacked, Done, Rounds},
 };
-use crate::{DEADLINE, Host, Hosts};
+use sinew_testkit::{DEADLINE, Host, Hosts};
 
-/// Which of the hosts is whose.
+/// Indices of the hosts.
 const HIP: usize = 0;
 const KNEE: usize = 1;
 const ATTACKER: usize = 2;
 const NEWCOMER: usize = 3;
-/// Memory that a node may grow by under attack, in bytes.
+/// Maximum growth of a node's memory under attack, in bytes.
 pub const GROWTH_MAX: u64 = 64 << 20;
-/// How much slower live traffic may be at its 99th percentile.
+/// Maximum slowdown of live traffic at its 99th percentile.
 pub const SLOWER_MAX: f64 = 2.0;
-/// Of the answers in each second before an attack, so many are still given while it lasts: fewer is no service, on any machine, however many
-/// others share it (6 % were seen while garbage was poured and compilers ran). How much live traffic feels is said by the 99th percentile, which counts on a machine at rest.
+/// Minimum answer rate during an attack, as a fraction of the rate before it. Below this there is no service,
+/// on any machine, even a shared one (6 % were seen while garbage was sent and compilers ran). The slowdown
+/// of live traffic is measured by the 99th percentile, which is judged only on an idle machine.
 pub const ANSWERED_MIN: f64 = 0.02;
-/// The same on a machine at rest, where nothing else takes them away.
+/// The same on an idle machine, where no other load takes CPU time.
 pub const ANSWERED_AT_REST: f64 = 0.5;
-/// Share of the questions that may be late before an attack, on a machine at rest: with more of them the ratio of times says nothing.
+/// Maximum fraction of requests sent late before an attack, on an idle machine. Above this the latency ratio
+/// is meaningless.
 pub const LATE_AT_REST: f64 = 0.01;
-/// Connections that a node begins to one that comes: a dial, one that crosses the other's (GNCL-4), and two side connections (GNCL-14).
+/// Connections that a node opens to a newcomer: a dial, a dial that crosses the peer's (GNCL-4), and two side
+/// connections (GNCL-14).
 const DIALS_OF_A_NEWCOMER: u64 = 4;
-/// Nodes settle for so long before they are measured.
+/// Settling time of the nodes before a measurement.
 const SETTLING: Duration = Duration::from_secs(1);
-/// Time between two looks at memory, and between two honest peers by hand.
-const LOOK: Duration = Duration::from_millis(100);
-/// Descriptors that the director needs for an attacker's connections.
+/// Interval between two memory samples, and between two honest hand-written peers.
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
+/// File descriptors that the scenario needs for an attacker's connections.
 const DESCRIPTORS: u64 = 16_384;
 
-/// What is to be done.
+/// The parameters of a run.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// A program whose `main` calls [`play`] first.
-    pub program: PathBuf,
-    /// How long each attack lasts while it is looked who gets in.
+    /// Duration of each attack while the test checks for intrusions.
     pub lasts: Duration,
-    /// How long live traffic is timed left alone, with the decoy attacked, and with the node attacked, each in all rounds together.
+    /// Measuring time of live traffic in each of the three states (no attack, decoy attacked, node attacked),
+    /// summed over all rounds.
     pub timed: Duration,
-    /// How often these three take turns: once at least.
+    /// Number of rounds over these three states: at least one.
     pub rounds: u32,
-    /// The names of those that are tried; none: all.
+    /// Names of the attacks to run; empty: all.
     pub only: Vec<String>,
 }
 
-/// Something that is done to a node.
+/// An attack on a node.
 struct Attack {
-    /// Its name, for `--only`.
+    /// The name, for `--only`.
     name: &'static str,
-    /// What is tried, in words.
+    /// A description of the attack.
     tried: &'static str,
-    /// Descriptors of the attacked node; `None`: as many as the system allows.
+    /// File descriptor limit of the attacked node; `None`: the limit of the system.
     descriptors: Option<u32>,
-    /// The attacker hears the robot's datagrams before it begins; meanwhile `ankle` comes and goes, and the attacked node is started again.
+    /// The attacker records the robot's datagrams before it starts. During the recording `ankle` joins and
+    /// leaves, and the attacked node is restarted.
     records: bool,
-    /// Others want to come in meanwhile.
+    /// Honest newcomers connect during the attack.
     others_come: bool,
-    /// He is a process of the attacked node's host: what that one dials is his doing, too.
+    /// The attacker is a process on the attacked node's host, so the dials of that host include its own.
     inside: bool,
-    /// The attacked node has an access list that lets everything be said, and a user of its host in with a few names and a group.
+    /// The attacked node has an access list that allows all messages, and admits a user of its host with a
+    /// few names and a group.
     guests: bool,
-    /// A whole node that tries to get in meanwhile.
+    /// A whole node that tries to join during the attack.
     intruder: Option<Intruder>,
-    /// In whose name he may speak: his own.
-    own: Who,
-    /// Does it until the scene is over.
+    /// The node identity that the attacker may legitimately use: its own.
+    own: TestNode,
+    /// Runs the attack until the scene is over.
     run: fn(&Scene<'_>) -> Happened,
-    /// What of it goes on all the time, and can be done to a decoy, for times; `None`: all of it.
+    /// The continuous part of the attack, for latency measurements; it also runs against a decoy. `None`: all
+    /// of it.
     goes_on: Option<fn(&Scene<'_>) -> Happened>,
 }
 
-/// What came of it, as far as the attacker knows.
+/// The result, as far as the attacker knows it.
 #[derive(Default)]
 struct Happened {
-    /// In words.
+    /// A description.
     what: String,
-    /// What must not have been: for so long a time as the whole of an attack takes.
+    /// Violations that are counted only if an attack runs for its full duration.
     broken: Vec<String>,
-    /// What must not have been for however short a time: who was let in, and what of the robot's own did not get through.
+    /// Violations that count however short the attack is: intruders that were admitted, and legitimate
+    /// traffic of the robot that was blocked.
     let_in: Vec<String>,
-    /// What the node must have refused meanwhile, by cause, and how often at least: an attack that never reached it shows nothing.
+    /// Minimum number of refusals by the node, per cause. An attack that never reached the node proves
+    /// nothing.
     refused: Vec<(&'static str, u64)>,
-    /// Messages that were sent in the sender's own name, and are to arrive.
+    /// Messages sent in the sender's own name, which must arrive.
     own_sent: u64,
     /// The same on a link that broke: some of them may arrive.
     own_perhaps: u64,
-    /// How often what was done.
+    /// Number of times that each action was done.
     done: Done,
 }
 
@@ -143,7 +155,7 @@ impl Happened {
         Self { what, broken, ..Self::default() }
     }
 
-    /// Both this and that.
+    /// Combines both results.
     fn and(mut self, that: Self) -> Self {
         let Self { what, broken, let_in, refused, own_sent, own_perhaps, done } = that;
         self.what = format!("{}; {what}", self.what);
@@ -164,16 +176,15 @@ impl Happened {
     }
 }
 
-/// Where an attack takes place.
+/// The environment of an attack.
 #[derive(Clone, Copy)]
 struct Scene<'a> {
     robot: &'a Robot,
     target: Target,
     keys: &'a Keys,
     hosts: &'a [Host],
-    program: &'a PathBuf,
     lasts: Duration,
-    /// Datagrams of the robot that the attacker has heard before.
+    /// Datagrams of the robot that the attacker recorded before.
     recorded: &'a Recording,
     over: &'a AtomicBool,
 }
@@ -183,7 +194,7 @@ impl Scene<'_> {
         self.over.load(Ordering::Relaxed)
     }
 
-    /// Waits, but not longer than the scene.
+    /// Sleeps, at most until the scene is over.
     fn rest(&self, time: Duration) {
         let until = Instant::now() + time;
         while !self.is_over() && Instant::now() < until {
@@ -191,52 +202,48 @@ impl Scene<'_> {
         }
     }
 
-    /// Does this on the attacker's host until the scene is over, on so many threads, which are nicer than all nodes: the CPUs are shared.
+    /// Runs `work` on the attacker's host in `threads` threads until the scene is over. Their priority is
+    /// below that of all nodes, because the CPUs are shared.
     fn on_threads<R: Send>(&self, threads: usize, work: impl Fn(usize) -> R + Sync) -> Vec<R> {
         self.hosts[ATTACKER].run(|| {
-            give_way();
+            lower_priority();
             thread::scope(|scope| {
                 let work = &work;
                 let running: Vec<_> = (0..threads).map(|number| scope.spawn(move || work(number))).collect();
-                running
-                    .into_iter()
-                    .map(|thread| thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
-                    .collect()
+                running.into_iter().map(join).collect()
             })
         })
     }
 }
 
-/// On a machine whose CPUs the attacker shares with the nodes, he has what they leave.
-fn give_way() {
+/// Lowers the priority of the attacker: on a machine shared with the nodes it gets only the CPU time that
+/// they leave.
+fn lower_priority() {
     const NICEST: i32 = 19;
-    // It goes on as it is where the system refuses it.
+    // If the system refuses, the priority stays as it is.
     let _ = setpriority_process(None, NICEST);
 }
 
-/// Plays the role that this process was started for; `None` if it is the director.
-#[must_use]
-pub fn play() -> Option<ExitCode> {
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
-    match &arguments[..] {
-        [flag, role, rest @ ..] if flag == "--role" && role == "robot-node" => node::play(rest),
-        [flag, role, rest @ ..] if flag == "--role" && role == "decoy" => decoy::play(rest),
-        // That of a client at the door.
-        _ => return crate::clients::play(),
-    }
-    Some(ExitCode::SUCCESS)
+/// Runs the role of a robot's node.
+pub(crate) fn run_node(arguments: &[String]) {
+    node::run(arguments);
 }
 
-/// The names of all attacks, and what each tries.
+/// Runs the role of the process that is attacked instead of a node.
+pub(crate) fn run_decoy(arguments: &[String]) {
+    decoy::run(arguments);
+}
+
+/// Names and descriptions of all attacks.
 #[must_use]
 pub fn known() -> Vec<(&'static str, &'static str)> {
     tried::ATTACKS.iter().map(|attack| (attack.name, attack.tried)).collect()
 }
 
-/// Attacks a robot in all ways of the plan, one after the other, each a new robot.
+/// Runs all attacks of the plan, one after the other, each against a new robot.
 ///
 /// # Errors
-/// A sentence: why no hosts can be made here, or which attack is not known.
+/// A sentence: the reason why no hosts can be created here, or the name of an unknown attack.
 ///
 /// # Panics
 /// If a node does not start, or does not answer.
@@ -253,23 +260,23 @@ pub fn run(plan: &Plan) -> Result<Report, String> {
     Ok(Report { rows, timed: plan.timed, rounds: plan.rounds })
 }
 
-/// For connections that are held by thousands.
+/// Raises the file descriptor limit, for thousands of open connections.
 fn allow_descriptors() {
     let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
     let wanted = maximum.map_or(DESCRIPTORS, |maximum| maximum.min(DESCRIPTORS));
     if current.is_some_and(|current| current < wanted) {
-        // With fewer, fewer are held, and the report says how many.
+        // With a lower limit fewer connections are held, and the report says how many.
         let _ = setrlimit(Resource::Nofile, Rlimit { current: Some(wanted), maximum });
     }
 }
 
-/// One attack on a robot of its own.
+/// Runs one attack on a new robot.
 fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
     let hosts = hosts.all();
     let keys = Keys::make();
-    let mut robot = Robot::start(&plan.program, hosts, &keys, attack);
-    // Nobody stands in for the door.
-    let decoys = (!attack.inside).then(|| Decoys::start(&plan.program, hosts, &keys));
+    let mut robot = Robot::start(hosts, &keys, attack);
+    // A decoy has no client socket, so it cannot replace the node for an attack from inside.
+    let decoys = (!attack.inside).then(|| Decoys::start(hosts, &keys));
     thread::sleep(SETTLING);
     let mut recorded = Recording::default();
     if attack.records {
@@ -284,12 +291,11 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
         target: robot.target(),
         keys: &keys,
         hosts,
-        program: &plan.program,
         lasts: plan.lasts,
         recorded: &recorded,
         over: &over,
     };
-    let rounds = rounds::play(attack, plan, &scene, decoys.as_ref());
+    let rounds = rounds::measure(attack, plan, &scene, decoys.as_ref());
     let (held_then, refused_before) = (robot.held_bytes(), robot.refused());
     robot.window(rounds::BETWEEN);
     let meanwhile = go_through(attack, &scene);
@@ -318,30 +324,30 @@ fn one(attack: &Attack, plan: &Plan, hosts: &Hosts) -> Row {
     Row::of(attack, outcome)
 }
 
-/// What was seen while the whole of an attack took place.
+/// Observations during the full attack.
 struct Meanwhile {
     happened: Happened,
     by_hand: Option<Knocked>,
-    /// Until the node that was started in the middle of it had an answer.
+    /// Time until the node started during the attack received an answer.
     came: Option<Duration>,
-    /// Connections that each node had begun, and when they were counted.
+    /// Connections opened by each node, and the time of the count.
     dials: [u64; 2],
     dialled_by: Instant,
     held_most: u64,
 }
 
-/// The whole of an attack, with those who want to come in meanwhile.
+/// Runs the full attack, with the newcomers that connect meanwhile.
 fn go_through(attack: &Attack, scene: &Scene<'_>) -> Meanwhile {
     let Scene { robot, hosts, lasts, over, .. } = *scene;
     let intruding = attack.intruder.map(|intruder| intruder.start(scene));
     let (mut held_most, mut came) = (robot.held_bytes(), None);
     thread::scope(|scope| {
-        let _ends = EndsIt(over);
+        let _ends = SetOnDrop(over);
         let attacking = scope.spawn(|| (attack.run)(scene));
         let knocking = attack.others_come.then(|| scope.spawn(|| knock(scene)));
         let until = Instant::now() + lasts;
         let ankle = attack.others_come.then(|| {
-            // In the middle of it.
+            // During the attack.
             thread::sleep(lasts / 4);
             let began = Instant::now();
             let ankle = robot.start_newcomer(&hosts[NEWCOMER]);
@@ -350,27 +356,28 @@ fn go_through(attack: &Attack, scene: &Scene<'_>) -> Meanwhile {
         });
         while Instant::now() < until {
             held_most = held_most.max(robot.held_bytes());
-            thread::sleep(LOOK);
+            thread::sleep(POLL_INTERVAL);
         }
-        // Who goes is dialled again until it is lost: that is no attacker's doing.
+        // A node that leaves is redialled until it is declared lost. These dials are not caused by the
+        // attacker.
         let (dials, dialled_by) = (robot.dials(), Instant::now());
         drop(ankle);
         over.store(true, Ordering::Relaxed);
-        let mut happened = attacking.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        let mut happened = join(attacking);
         if let Some(intruding) = intruding {
             happened = happened.and(intruding.end());
         }
-        let by_hand =
-            knocking.map(|knocking| knocking.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
+        let by_hand = knocking.map(|knocking| join(knocking));
         Meanwhile { happened, by_hand, came, dials, dialled_by, held_most }
     })
 }
 
-/// What the robot says of discovery while `ankle` comes and goes, and the attacked node goes and comes again.
+/// Records the robot's discovery datagrams while `ankle` joins and leaves, and the attacked node is
+/// restarted.
 fn record(robot: Robot, hosts: &[Host]) -> (Robot, Recording) {
     let over = AtomicBool::new(false);
     thread::scope(|scope| {
-        let _ends = EndsIt(&over);
+        let _ends = SetOnDrop(&over);
         let (group, over) = (robot.group(), &over);
         let hearing = scope.spawn(move || hosts[KNEE].run(|| tried::listen(group, over)));
         let ankle = robot.start_newcomer(&hosts[NEWCOMER]);
@@ -378,12 +385,12 @@ fn record(robot: Robot, hosts: &[Host]) -> (Robot, Recording) {
         ankle.end();
         let robot = robot.with_knee_anew(&hosts[KNEE]);
         over.store(true, Ordering::Relaxed);
-        let recorded = hearing.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        let recorded = join(hearing);
         (robot, recorded)
     })
 }
 
-/// How much was refused since then.
+/// The refusals counted since `before`.
 fn since(before: &robot::Refused, mut now: robot::Refused) -> robot::Refused {
     for (cause, count) in &mut now {
         *count -= before.get(cause).copied().unwrap_or_default().min(*count);
@@ -391,28 +398,20 @@ fn since(before: &robot::Refused, mut now: robot::Refused) -> robot::Refused {
     now
 }
 
-/// Ends the scene also when something panics: else nobody would hear of it.
-struct EndsIt<'a>(&'a AtomicBool);
-
-impl Drop for EndsIt<'_> {
-    fn drop(&mut self) {
-        self.0.store(true, Ordering::Relaxed);
-    }
-}
-
-/// What honest peers that the node does not know had to do to come in.
+/// Connection attempts of honest peers that the node does not know.
 #[derive(Clone, Debug, Default)]
 struct Knocked {
     came_in: u64,
     attempts: u64,
-    /// The longest time until one was in.
+    /// The longest time until a peer was admitted.
     longest: Duration,
-    /// Why the last attempt of one failed that never came in.
+    /// The last error of a peer that was never admitted.
     never: Option<String>,
 }
 
-/// Honest peers that the node has not heard of, with keys of the project, one after the other: each dials and says hello until it is in, as
-/// a node does, and goes. The last one may need longer than the scene.
+/// Connects honest peers that the node does not know, with keys of the project, one after the other. Each
+/// dials and sends HELLO until it is admitted, as a node does, and then disconnects. The last one may take
+/// longer than the scene.
 fn knock(scene: &Scene<'_>) -> Knocked {
     let tls = scene.keys.tls(keys::SPARE);
     let mut knocked = Knocked::default();
@@ -421,20 +420,20 @@ fn knock(scene: &Scene<'_>) -> Knocked {
             let began = Instant::now();
             loop {
                 knocked.attempts += 1;
-                let greeted = Stranger::dial(scene.target.connections, Some(&tls))
-                    .and_then(|mut stranger| stranger.hello(keys::SPARE, scene.robot.knee_address()));
-                if matches!(greeted, Ok(stranger::Answer::Welcome)) {
+                let greeted = RawPeer::dial(scene.target.connections, Some(&tls))
+                    .and_then(|mut raw_peer| raw_peer.hello(keys::SPARE, scene.robot.knee_address()));
+                if matches!(greeted, Ok(raw_peer::Answer::Welcome)) {
                     break;
                 }
                 if began.elapsed() > DEADLINE {
                     knocked.never = Some(format!("{greeted:?}"));
                     return;
                 }
-                thread::sleep(LOOK);
+                thread::sleep(POLL_INTERVAL);
             }
             knocked.came_in += 1;
             knocked.longest = knocked.longest.max(began.elapsed());
-            scene.rest(LOOK);
+            scene.rest(POLL_INTERVAL);
         }
     });
     knocked

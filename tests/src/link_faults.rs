@@ -1,18 +1,16 @@
-//! The claim: whatever happens to the link between two nodes, every message between them arrives once and in order, or its sender
-//! is told.
+//! The claim: despite any fault of the link between two nodes, every message between them arrives once and in
+//! order, or its sender is notified.
 //!
-//! A program that proves it is its own cast: it starts itself again, with `--role`, for each of the two nodes.
-//!
-//! | file | what it is |
+//! | file | content |
 //! | --- | --- |
-//! | `node` | the role of a node: one application that sends at a rate and takes what comes |
-//! | `pacer` | the thread that sends, and keeps what became of each confirmed message |
-//! | `clerk` | writes down what was sent and got, in rows |
-//! | `pair` | both nodes with the faulty network between them, as their director sees them |
-//! | `progress` | what is said while it goes on |
-//! | `trouble` | what can happen to a link, and how it is healed |
-//! | `wall_clock` | a wall clock of each node's own, which can be set |
-//! | `report` | what was seen, as a table and as JSON |
+//! | `node` | the role of a node: one application that sends at a rate and receives |
+//! | `pacer` | the thread that sends, and records the outcome of each confirmed message |
+//! | `clerk` | notes sent and received messages, in ranges |
+//! | `pair` | both nodes with the faulty network between them, as their scenario sees them |
+//! | `progress` | the progress messages of a run |
+//! | `trouble` | the kinds of link faults, and their repair |
+//! | `wall_clock` | a settable wall clock for each node |
+//! | `report` | the results, as a table and as JSON |
 
 mod clerk;
 mod node;
@@ -23,10 +21,7 @@ mod report;
 mod trouble;
 mod wall_clock;
 
-use std::{
-    path::PathBuf,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use sinew::Class;
 
@@ -35,55 +30,48 @@ use self::{
     report::{Gap, Gaps},
 };
 pub use self::{report::Report, trouble::Trouble};
-use crate::dice::Dice;
+use sinew_testkit::random::SeededRandom;
 
-/// All of them, in the order of their numbers.
+/// All classes, in the order of their numbers.
 const CLASSES: [Class; 3] = [Class::Control, Class::Stream, Class::Bulk];
 
-/// What is to be done.
+/// The parameters of a run.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// A program whose `main` calls [`play`] first.
-    pub program: PathBuf,
-    /// Messages from the first node to the second, a second.
+    /// Messages per second from the first node to the second.
     pub rate: u64,
-    /// Messages the other way, a second.
+    /// Messages per second in the other direction.
     pub back_rate: u64,
-    /// Bytes of each message besides its numbers.
+    /// Filler bytes of each message.
     pub filling: usize,
-    /// What happens, each in turn.
+    /// The kinds of faults, used in turn.
     pub troubles: Vec<Trouble>,
-    /// How often something happens, over all.
+    /// Total number of faults.
     pub faults: u64,
-    /// From one fault to the next, at least. By chance up to half of it more.
+    /// Minimum interval between two faults, randomly extended by up to a half.
     pub spacing: Duration,
-    /// How long a fault lasts that lasts.
+    /// Duration of lasting faults.
     pub hold: Duration,
-    /// One bit of so many bytes is flipped all the time.
+    /// Flips one bit in this many bytes, all the time.
     pub one_flip_in: Option<u32>,
-    /// What all chance comes from.
+    /// Random seed.
     pub seed: u64,
 }
 
-/// Plays the role that this process was started for; `None` if it is the director.
-#[must_use]
-pub fn play() -> Option<std::process::ExitCode> {
-    let mut arguments = std::env::args().skip(1);
-    if arguments.next().as_deref() != Some("--role") {
-        return None;
-    }
-    node::play(&arguments.skip(1).collect::<Vec<_>>());
-    Some(std::process::ExitCode::SUCCESS)
+/// Runs the role of a node.
+pub(crate) fn run_node(arguments: &[String]) {
+    node::run(arguments);
 }
 
-/// Lets things happen to the link and says what became of the messages. While it waits it says on standard error each 10 s how far it is.
+/// Injects faults into the link, and accounts for the messages. While it waits, it prints its progress to
+/// standard error every 10 s.
 ///
 /// # Panics
 /// If a node does not start, or messages do not flow again after a fault has ended.
 #[must_use]
 pub fn run(plan: &Plan) -> Report {
     let mut pair = Pair::start(plan);
-    let mut dice = Dice::new(plan.seed);
+    let mut random = SeededRandom::new(plan.seed);
     let mut gaps = Gaps::default();
     let began = Instant::now();
     for fault in 0..plan.faults {
@@ -94,9 +82,9 @@ pub fn run(plan: &Plan) -> Report {
         pair.suffer(trouble, plan.hold);
         pair.wait_for_flow();
         let flows = struck.elapsed();
-        // A new receiver does not know when its former life got the last one.
+        // A new receiver does not know when its former incarnation received the last message.
         gaps.note(trouble, if trouble == Trouble::KillReceiver { Gap::of_all(flows) } else { pair.gaps() });
-        let pause = plan.spacing + dice.time_below(plan.spacing / 2);
+        let pause = plan.spacing + random.time_below(plan.spacing / 2);
         std::thread::sleep(pause.saturating_sub(struck.elapsed()));
     }
     let seconds = began.elapsed();

@@ -1,58 +1,61 @@
-//! Layers that fail under load: two nodes with traffic inside one and between them, a layer killed again and again.
+//! Layers that fail under load: two nodes with local and inter-node traffic, while layers are killed
+//! repeatedly.
 //!
-//! | file | what it is |
+//! | file | content |
 //! | --- | --- |
-//! | `pacer` | sends at a rate, and keeps what became of each confirmed message |
-//! | `sink` | takes what is sent, and knows what is missing, double or out of order |
-//! | `report` | what was seen, as a table and as JSON |
+//! | `pacer` | sends at a rate, and records the outcome of each confirmed message |
+//! | `record` | the histories of all messages, and the application that receives them |
+//! | `report` | the results, as a table and as JSON |
 
 mod pacer;
+mod record;
 mod report;
-mod sink;
 
+use sinew_testkit::report::Times;
 use std::time::Duration;
 
 use sinew::{NodeHandle, Time, fault::Fault, prelude::*};
 
-pub use self::report::{Account, LayerReport, Report, Times};
+pub use self::report::{LayerReport, Report};
 use self::{
     pacer::{Pacer, Sent},
-    sink::{Sink, Tracks},
+    record::{Record, Sink},
 };
-use crate::{DEADLINE, Ground, all_run, puppet::desk, ready_for, sees};
+use sinew_testkit::{DEADLINE, Loopback, all_run, ready_for, scripted::sender_app, sees};
 
 /// The layers, in the order of their start.
 pub const LAYERS: [&str; 4] = ["LNCL", "sync", "GNCL", "NDL"];
 
-/// What is to be done.
+/// The parameters of a run.
 #[derive(Clone, Copy, Debug)]
 pub struct Plan {
-    /// Layers that are killed, each in turn, on either node.
+    /// Number of kills. The layers are killed in turn, on either node.
     pub panics: u64,
-    /// Messages within the one node, a second.
+    /// Messages per second within the one node.
     pub in_process: u64,
-    /// Messages from the other node to it, a second.
+    /// Messages per second from the other node to it.
     pub between_nodes: u64,
-    /// Least time between two kills.
+    /// Minimum interval between two kills.
     pub spacing: Duration,
 }
 
-/// Where the messages were when a kill had healed: what is missing before belongs to that kill or an earlier one.
+/// The positions of the flows when the node had recovered from a kill. A message missing before belongs to
+/// that kill or an earlier one.
 #[derive(Clone, Copy, Debug)]
 struct Healed {
     layer: usize,
     upto: [u64; 2],
 }
 
-/// Lets layers fail under load and says what was seen.
+/// Makes layers fail under load, and returns the results.
 ///
 /// # Panics
-/// If a node does not start, or a layer does not come back.
+/// If a node does not start, or a layer does not recover.
 #[must_use]
 pub fn run(plan: Plan) -> Report {
-    let ground = Ground::new();
+    let loopback = Loopback::new();
     let node = |name: &str| {
-        ground.node(name).configure(|config| {
+        loopback.node(name).configure(|config| {
             config.mailbox_capacity = 65_536;
             config.gncl.queue_capacity = 65_536;
             config.supervision.layer_restarts_max = 1_000_000;
@@ -60,13 +63,13 @@ pub fn run(plan: Plan) -> Report {
             config.supervision.layer_window = Duration::from_millis(10);
         })
     };
-    let tracks = Tracks::default();
-    let sink = tracks.clone();
-    let sink = AppSpec::new("sink", move || Sink::new(sink.clone()))
-        .handles::<crate::puppet::Job>()
-        .handles::<crate::puppet::Order>()
+    let record = Record::default();
+    let sink = record.clone();
+    let sink = AppSpec::new("sink", move || Sink(sink.clone()))
+        .handles::<sinew_testkit::scripted::Job>()
+        .handles::<sinew_testkit::scripted::Order>()
         .own_thread();
-    let ((near, near_key), (far, far_key)) = (desk("near"), desk("far"));
+    let ((near, near_key), (far, far_key)) = (sender_app("near"), sender_app("far"));
     let here = node("home").app(sink).app(near).start().expect("a node");
     let there = node("there").app(far).start().expect("a node");
     all_run(&[&here, &there]);
@@ -74,9 +77,9 @@ pub fn run(plan: Plan) -> Report {
     sees(&there.handle(), here.address());
 
     let began = Time::now();
-    let inside = Pacer::start(near_key.sender(), plan.in_process);
-    let between = Pacer::start(far_key.sender(), plan.between_nodes);
-    tracks.wait_for_traffic(here.address(), there.address());
+    let inside = Pacer::start(near_key.sender(), plan.in_process, (here.address(), &record));
+    let between = Pacer::start(far_key.sender(), plan.between_nodes, (there.address(), &record));
+    [&here, &there].into_iter().for_each(|node| record.wait_for_next(node.address(), [0, 0]));
     let nodes = [here.handle(), there.handle()];
     let mut layers: [Times; 4] = Default::default();
     let mut gaps = Times::default();
@@ -86,7 +89,7 @@ pub fn run(plan: Plan) -> Report {
         let node = &nodes[usize::from(panic / 4 % 2 == 1)];
         let killed = Time::now();
         layers[layer].note(kill(node, layer));
-        tracks.wait_for_next(there.address(), between.sent_so_far());
+        record.wait_for_next(there.address(), between.sent_so_far());
         gaps.note(Time::now().since(killed));
         healed.push(Healed { layer, upto: between.sent_so_far() });
         std::thread::sleep(plan.spacing.saturating_sub(Time::now().since(killed)));
@@ -96,12 +99,12 @@ pub fn run(plan: Plan) -> Report {
     let restarted =
         ["sink", "near"].iter().map(|name| here.handle().lives(name)).chain([there.handle().lives("far")]);
     let restarted = restarted.map(|lives| lives.expect("it is there").starts - 1).sum();
-    tracks.wait_for_the_last(here.address(), inside.upto);
-    tracks.wait_for_the_last(there.address(), between.upto);
-    report(plan, seconds, restarted, &tracks, (&here, &inside), (&there, &between), (layers, gaps, &healed))
+    record.wait_for_the_last(here.address(), inside.upto);
+    record.wait_for_the_last(there.address(), between.upto);
+    report(plan, seconds, restarted, &record, (&here, &inside), (&there, &between), (layers, gaps, &healed))
 }
 
-/// A layer panics; returns the time until it was ready again.
+/// Makes a layer panic. Returns the time until it is ready again.
 fn kill(node: &NodeHandle, layer: usize) -> Duration {
     let lives = |layer: usize| node.lives(LAYERS[layer]).expect("every node has it");
     let before: Vec<_> = (0..LAYERS.len()).map(|layer| lives(layer).readies).collect();
@@ -113,17 +116,26 @@ fn kill(node: &NodeHandle, layer: usize) -> Duration {
     lives.ready.expect("it is ready").since(lives.struck.expect("it was struck"))
 }
 
+/// Makes a layer panic when a line of the standard input has its name. Prints when it and the layers after it
+/// are ready again.
+pub(crate) fn panic_on_command(node: &NodeHandle) {
+    for name in std::io::stdin().lines().map_while(Result::ok) {
+        kill(node, LAYERS.iter().position(|layer| *layer == name).expect("the name of a layer"));
+        println!("{name} is ready again");
+    }
+}
+
 #[expect(clippy::too_many_arguments, reason = "each is one thing that was measured, used once")]
 fn report(
     plan: Plan,
     seconds: f64,
     restarted: u64,
-    tracks: &Tracks,
+    record: &Record,
     (here, inside): (&Node, &Sent),
     (there, between): (&Node, &Sent),
     (layers, gaps, healed): ([Times; 4], Times, &[Healed]),
 ) -> Report {
-    let missing = tracks.missing(there.address(), between.upto);
+    let missing = record.missing(there.address());
     let lost_by = |layer: usize| {
         let mut from = [0, 0];
         let mut lost = 0;
@@ -145,12 +157,13 @@ fn report(
         panics: plan.panics,
         seconds,
         restarted,
-        in_process: tracks.account(here.address(), inside),
-        between_nodes: tracks.account(there.address(), between),
+        in_process: record.verdict(here.address()),
+        between_nodes: record.verdict(there.address()),
+        again: [inside.again, between.again],
         layers: layers.collect(),
         gaps,
     }
 }
 
-/// No run waits longer than this for one thing.
+/// Maximum wait of a run for one event.
 const PATIENCE: Duration = DEADLINE;

@@ -1,9 +1,9 @@
-//! What a scenario tells the application of `process_under_test`, and what it answers.
+//! Orders of a scenario to the application of `process_under_test`, and its answers.
 
 use sinew::prelude::*;
 
 payload!("process.count", Bulk =>
-    /// One of a row of numbers.
+    /// One of a sequence of numbers.
     #[derive(Debug)]
     pub struct Count {
         /// The number.
@@ -12,7 +12,7 @@ payload!("process.count", Bulk =>
 );
 
 payload!("process.level", Stream =>
-    /// A value of which the newest counts.
+    /// A Stream value, of which the newest counts.
     #[derive(Debug)]
     pub struct Level {
         /// The value.
@@ -21,7 +21,7 @@ payload!("process.level", Stream =>
 );
 
 payload!("process.who" =>
-    /// Asks who handles messages now.
+    /// Asks for the process that handles messages now.
     #[derive(Debug)]
     pub struct Who {}
 );
@@ -30,7 +30,7 @@ payload!("process.me" =>
     /// The answer.
     #[derive(Debug, Clone, PartialEq, Eq)]
     pub struct Me {
-        /// Its process.
+        /// The process id.
         pub pid: u32,
         /// The numbers that this instance has handled.
         pub counts: Vec<u64>,
@@ -38,26 +38,28 @@ payload!("process.me" =>
 );
 
 payload!("process.order" =>
-    /// What the application is to do.
+    /// An order to the application.
     #[derive(Debug)]
     pub enum Order {
         /// Panic.
         Panic,
         /// Stop in order.
         Stop,
-        /// Hold the thread for so many milliseconds.
+        /// Block the thread for this many milliseconds.
         Hold(u64),
-        /// Never come back.
+        /// Block the thread as long as this file exists.
+        HoldWhile(String),
+        /// Block forever.
         Hang,
-        /// End the process with this code.
+        /// Exit with this code.
         Exit(i32),
         /// End the process by `abort`.
         Abort,
         /// Recurse without end.
         OverflowTheStack,
-        /// Kill itself as the kernel does when memory is short.
+        /// Send SIGKILL to itself, as the kernel does when memory is short.
         Kill,
-        /// A memory fault, as far as safe code can have one.
+        /// Cause a memory fault, as far as safe code can.
         Segfault,
         /// Refuse this message.
         Refuse,
@@ -65,23 +67,28 @@ payload!("process.order" =>
         Join(String),
         /// Leave this group.
         Leave(String),
-        /// Send a number to the application of this name, confirmed, and write down what becomes of it.
+        /// Send a confirmed number to the application with this name, and print the outcome.
         Send(String, u64),
-        /// Send a number to the application that has this TID, unconfirmed.
+        /// Send this order, confirmed, to the application with this name, and print the outcome as that of
+        /// number 0.
+        SendOrder(String, Box<Self>),
+        /// Send an unconfirmed number to the application with this TID.
         SendTo(u64),
-        /// Send a number to the group of this name, confirmed by each member, and write down what becomes of it.
+        /// Send a number to the group with this name, confirmed by each member, and print the outcomes.
         SendToGroup(String),
-        /// Ask the application of this name who it is, and write down the answer.
+        /// Send a [`Who`] request to the application with this name, and print the answer.
         Ask(String),
-        /// Send these bytes, in this very order, to the application of this name.
+        /// Send these bytes, as this same order, to the application with this name.
         Echo(String, #[serde(with = "serde_bytes")] Vec<u8>),
-        /// Count its messages as if it had sent more than anybody can, and send one to the application of this name.
+        /// Set the message counter to the highest possible value, and send a message to the application with
+        /// this name.
         ForgeNumbers(String),
-        /// Start a command that ends at once, and write down how it ended.
+        /// Start a command that exits at once, and print its exit status.
         StartACommand,
-        /// Start a command that sleeps for two minutes, and write down its process; in a group of its own, or not.
+        /// Start a command that sleeps for two minutes, and print its process id; in its own process group,
+        /// or not.
         StartASleeper(bool),
-        /// Stop the system of actix that it finds.
+        /// Stop the current actix system.
         StopTheSystem,
     }
 );

@@ -1,122 +1,90 @@
-//! The claim: an application that is too slow for what another node sends to it costs memory within a bound, and the others nothing.
+//! The claim: an application that is too slow for the messages of another node costs a bounded amount of
+//! memory, and does not affect the others.
 //!
-//! A program that proves it is its own cast: it starts itself again, with `--role`, for each of the two nodes. The first node sends
-//! Bulk at a rate to a consumer on the second, and a question at 1 kHz to an application beside it. Three times: without Bulk, with a consumer
-//! that keeps up, with one that does not.
+//! The first node sends Bulk at a rate to a consumer on the second, and a request
+//! at 1 kHz to an application beside it. There are three phases: without Bulk, with a fast consumer, and with
+//! a slow one.
 //!
-//! | file | what it is |
+//! | file | content |
 //! | --- | --- |
 //! | `sender` | the role of the first node |
 //! | `receiver` | the role of the second node |
-//! | `report` | what was seen |
+//! | `report` | the results |
 
 mod receiver;
 mod report;
 mod sender;
 
-use std::{
-    path::{Path, PathBuf},
-    sync::mpsc::{Receiver, sync_channel},
-    time::{Duration, Instant},
-};
+use sinew_testkit::NodeProcess;
+use sinew_testkit::Resources;
+use sinew_testkit::numbers;
+use std::time::{Duration, Instant};
 
 pub use self::report::{Report, Window};
-use crate::{
-    DEADLINE, OwnDirectory,
-    clients::{Held, Performer},
-    own_group,
-};
+use crate::role;
+use sinew_testkit::{DEADLINE, TestDirectory, own_group};
 
-/// Longest time for which the consumer is slow beyond [`Plan::lasts`], as long as not enough was offered.
+/// Maximum time for which the consumer stays slow beyond [`Plan::lasts`], until enough messages were offered.
 const OFFERED_WITHIN: Duration = DEADLINE.saturating_mul(3);
-/// Memory of the sender that is not the messages': what the allocator keeps, threads, tables.
+/// Memory of the sender other than messages: reserves of the allocator, threads, tables.
 const SLACK_BYTES: u64 = 8 << 20;
 
-/// What is to be done.
+/// The parameters of a run.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// A program whose `main` calls [`play`] first.
-    pub program: PathBuf,
-    /// How long the consumer is slow; longer where by then not more was offered than both nodes may hold.
+    /// Duration of the slow phase. It is extended until more was offered than both nodes may hold.
     pub lasts: Duration,
-    /// Bulk messages a second that are offered.
+    /// Bulk messages per second that are offered.
     pub rate: u64,
-    /// Bytes of each.
+    /// Length of each message, in bytes.
     pub length: usize,
-    /// What a slow consumer takes for each.
+    /// Processing time per message of a slow consumer.
     pub takes: Duration,
-    /// Time of each of the two references: no Bulk, a consumer that keeps up.
+    /// Duration of each of the two references: no Bulk, and a fast consumer.
     pub reference: Duration,
 }
 
-/// Plays the role that this process was started for; `None` if it is the director.
-#[must_use]
-pub fn play() -> Option<std::process::ExitCode> {
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let [flag, role, rest @ ..] = &arguments[..] else { return None };
-    match (&**flag, &**role) {
-        ("--role", "sender") => sender::play(rest),
-        ("--role", "receiver") => receiver::play(rest),
-        ("--role", _) => panic!("nobody plays {role:?}"),
-        _ => return None,
-    }
-    Some(std::process::ExitCode::SUCCESS)
+/// Runs the role of the first node.
+pub(crate) fn run_sender(arguments: &[String]) {
+    sender::run(arguments);
 }
 
-/// A node as its director sees it.
-struct Member {
-    performer: Performer,
-    answers: Receiver<String>,
+/// Runs the role of the second node.
+pub(crate) fn run_receiver(arguments: &[String]) {
+    receiver::run(arguments);
 }
 
-impl Member {
-    fn start(program: &Path, role: &str, arguments: &[String]) -> Self {
-        let (say, answers) = sync_channel(16);
-        let hear = move |line: &str| {
-            // Nobody waits for its answers any more when the director is done.
-            let _ = say.send(line.to_owned());
-        };
-        let performer = Performer::start(program, role, arguments, &std::env::temp_dir(), hear);
-        let member = Self { performer, answers };
-        member.answer();
-        member
-    }
-
-    fn answer(&self) -> String {
-        self.answers.recv_timeout(DEADLINE).expect("the node answers")
-    }
-
-    fn ask(&mut self, question: &str) -> String {
-        self.performer.tell(question);
-        self.answer()
-    }
-
-    fn held_bytes(&self) -> u64 {
-        Held::of(self.performer.id()).own_kib << 10
-    }
+fn start(name: &str, arguments: &[String]) -> NodeProcess {
+    let mut command = role(name);
+    command.args(arguments);
+    let mut process = NodeProcess::start(name, command);
+    process.expect("up");
+    process
 }
 
-/// Lets the consumer be slow, and says what that costs.
+fn held_bytes(process: &NodeProcess) -> u64 {
+    Resources::of(process.id()).own_kib << 10
+}
+
+/// Makes the consumer slow, and reports the cost.
 ///
 /// # Panics
 /// If a node does not start, or does not answer.
 #[must_use]
 pub fn run(plan: &Plan) -> Report {
-    let (directory, group) = (OwnDirectory::new(), own_group());
+    let (directory, group) = (TestDirectory::new(), own_group());
     let path = |name: &str, address: u8| {
-        let path = directory.join(&format!("{name}.toml"));
         let text = format!(
             "[node]\nname = \"{name}\"\naddress = \"127.0.0.{address}\"\nproject = \"slow consumer\"\n\
              [ndl]\nmulticast = \"{group}\"\nmdns_port = false\n"
         );
-        std::fs::write(&path, text).expect("the scenario's own directory");
-        path.display().to_string()
+        directory.write(&format!("{name}.toml"), &text).display().to_string()
     };
     let takes = plan.takes.as_micros().to_string();
-    let mut receiver = Member::start(&plan.program, "receiver", &[path("there", 2), takes]);
+    let mut receiver = start("receiver", &[path("there", 2), takes]);
     let flood = [plan.rate.to_string(), plan.length.to_string()];
     let arguments = [vec![path("home", 1)], flood.to_vec()].concat();
-    let mut sender = Member::start(&plan.program, "sender", &arguments);
+    let mut sender = start("sender", &arguments);
 
     let quiet = window(&mut [&mut sender, &mut receiver], plan.reference);
     sender.ask("flood");
@@ -125,9 +93,10 @@ pub fn run(plan: &Plan) -> Report {
     let began = Instant::now();
     let mut slow = window(&mut [&mut sender, &mut receiver], plan.lasts);
     let bounds = bounds();
-    // How much a second can be offered is the machine's affair; that less than has room stays within its bound is no wonder.
+    // The offered rate depends on the machine. A total that fits into the queues would stay within the bound
+    // trivially.
     let [offered, refused] = loop {
-        let [offered, refused] = numbers(&sender.ask("offered"));
+        let [offered, refused] = numbers(&sender.ask("offered"))[..] else { panic!("two numbers") };
         if offered * plan.length as u64 > bounds.iter().sum() || began.elapsed() > plan.lasts + OFFERED_WITHIN
         {
             break [offered, refused];
@@ -135,43 +104,40 @@ pub fn run(plan: &Plan) -> Report {
         slow = slow.and(window(&mut [&mut sender, &mut receiver], plan.lasts));
     };
     let taken = receiver.ask("taken").parse().expect("a number");
-    for member in [sender, receiver] {
-        let status = member.performer.end();
+    for process in [sender, receiver] {
+        let status = process.stop();
         assert!(status.success(), "a node ended with {status}");
     }
     Report { plan: plan.clone(), quiet, fast, slow, taken, offered, refused, bounds }
 }
 
-/// What the default configuration allows to wait, in bytes: at the sender, at the receiver.
+/// The maximum queued data in the default configuration, in bytes: at the sender, at the receiver.
 fn bounds() -> [u64; 2] {
     let config = sinew::config::NodeConfig::new("any");
     let (kept_unacknowledged, frame) = (4 << 20, config.payload_max as u64);
-    // What waits in line for a consumer that is held: a window and two frames there, 4 MiB and one frame here.
+    // Queued data for a held consumer: a window and two frames there, 4 MiB and one frame here.
     let (line_here, line_there) = ((4 << 20) + frame, kept_unacknowledged + 2 * frame);
     let sender = config.gncl.queue_bytes as u64 + kept_unacknowledged + frame + line_here;
     let receiver = config.mailbox_bytes as u64 + frame + line_there;
     [sender + SLACK_BYTES, receiver + SLACK_BYTES]
 }
 
-fn numbers<const N: usize>(line: &str) -> [u64; N] {
-    let numbers: Vec<u64> = line.split_whitespace().map(|word| word.parse().expect("a number")).collect();
-    numbers.try_into().unwrap_or_else(|_| panic!("{line:?} is not {N} numbers"))
-}
-
-/// Looks on for some time.
-fn window([sender, receiver]: &mut [&mut Member; 2], lasts: Duration) -> Window {
-    // What was measured before is not this window's.
+/// Observes the nodes for some time.
+fn window([sender, receiver]: &mut [&mut NodeProcess; 2], lasts: Duration) -> Window {
+    // Discards earlier measurements.
     sender.ask("window");
-    let before = [sender.held_bytes(), receiver.held_bytes()];
+    let before = [held_bytes(sender), held_bytes(receiver)];
     let mut most = before;
     let end = Instant::now() + lasts;
     while Instant::now() < end {
         std::thread::sleep(Duration::from_millis(200));
-        for (most, held) in most.iter_mut().zip([sender.held_bytes(), receiver.held_bytes()]) {
+        for (most, held) in most.iter_mut().zip([held_bytes(sender), held_bytes(receiver)]) {
             *most = held.max(*most);
         }
     }
-    let [count, failed, p50_ns, p99_ns, max_ns] = numbers(&sender.ask("window"));
+    let [count, failed, p50_ns, p99_ns, max_ns] = numbers(&sender.ask("window"))[..] else {
+        panic!("five numbers")
+    };
     let [p50, p99, max] = [p50_ns, p99_ns, max_ns].map(Duration::from_nanos);
     Window { count, failed, p50, p99, max, before, most }
 }

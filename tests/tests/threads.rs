@@ -1,33 +1,33 @@
-//! Which thread an application lives on: its own, one that several name, or the node's.
+//! The thread of an application: its own, one that several name, or the node's.
 
 use std::collections::BTreeSet;
 
 use sinew::{node::CommandError, prelude::*};
-use sinew_tests::{
-    Ground, Log, all_run,
-    puppet::{Puppet, Stage},
+use sinew_testkit::{
+    Log, Loopback, all_run,
+    scripted::{Script, ScriptedApp},
     until,
 };
 
-/// A puppet that writes its name and its thread's number down.
-fn dweller(name: &'static str, threads: &Log<(&'static str, i32)>) -> AppSpec<Puppet> {
+/// A scripted application that records its name and its thread ID.
+fn dweller(name: &'static str, threads: &Log<(&'static str, i32)>) -> AppSpec<ScriptedApp> {
     let threads = threads.clone();
     let here = || rustix::thread::gettid().as_raw_nonzero().get();
-    Stage::new().started(move |_, _| threads.write((name, here()))).app(name).0
+    Script::new().started(move |_, _| threads.write((name, here()))).app(name).0
 }
 
 /// The names of this process's threads.
 fn threads() -> Vec<String> {
     let tasks = std::fs::read_dir("/proc/self/task").expect("it is always there");
-    // A thread may end between the list and the look.
+    // A thread may end between the listing and the read.
     let name = |task: std::fs::DirEntry| std::fs::read_to_string(task.path().join("comm")).ok();
     tasks.filter_map(|task| name(task.ok()?)).map(|name| name.trim().to_owned()).collect()
 }
 
 #[test]
-fn who_is_called_like_a_thread_of_the_node_has_a_thread_of_its_own_all_the_same() {
+fn app_named_like_a_node_thread_gets_its_own() {
     let log = Log::default();
-    let mut node = Ground::new().node("node").app(dweller("reader", &log).on_io_thread());
+    let mut node = Loopback::new().node("node").app(dweller("reader", &log).on_io_thread());
     node = node.app(dweller("ordinary", &log).place(Place::thread("apps")));
     node = node.app(dweller("guest", &log).place(Place::thread("sync")));
     for name in ["io", "sync", "ndl", "apps", "root", "watchdog"] {
@@ -44,25 +44,25 @@ fn who_is_called_like_a_thread_of_the_node_has_a_thread_of_its_own_all_the_same(
 }
 
 #[test]
-fn two_that_ask_for_different_priorities_of_one_thread_are_refused_before_anything_starts() {
+fn conflicting_priorities_of_one_thread_are_rejected() {
     let log = Log::default();
     let at = |priority| Place::thread("leg").realtime(priority);
-    let node = Ground::new().node("node");
+    let node = Loopback::new().node("node");
     let node = node.app(dweller("knee", &log).place(at(50))).app(dweller("hip", &log).place(at(40)));
     let words = node.start().expect_err("one of them would have been lost").to_string();
-    for said in
+    for part in
         ["'hip'", "'knee'", "'leg'", "real-time priority 50", "real-time priority 40", "another thread"]
     {
-        assert!(words.contains(said), "{said} is not in: {words}");
+        assert!(words.contains(part), "{part} is not in: {words}");
     }
     assert!(log.all().is_empty());
 }
 
 #[test]
-fn one_that_comes_later_and_wants_a_thread_to_be_another_is_refused_until_the_former_has_left() {
+fn later_app_with_a_conflicting_thread_is_rejected() {
     let log = Log::default();
     let at = |cpu| Place::thread("late-leg").on_cpu(cpu);
-    let node = Ground::new().node("node").app(dweller("knee", &log).place(at(0))).start().expect("a node");
+    let node = Loopback::new().node("node").app(dweller("knee", &log).place(at(0))).start().expect("a node");
     all_run(&[&node]);
     let hip = || dweller("hip", &log).place(at(usize::MAX));
     let refused = node.handle().add_app(hip(), None).expect_err("the thread has a CPU");

@@ -1,4 +1,5 @@
-//! An application in a process of its own that is killed: how soon another application of its node is told.
+//! Kills an application that runs in its own process, and measures the time until another application of its
+//! node is notified.
 
 use std::{
     sync::mpsc::{Receiver, SyncSender, sync_channel},
@@ -16,20 +17,20 @@ use sinew_figures::{Alone, Figures};
 
 use crate::{nodes::At, observer::DEADLINE, trials::SETTLED};
 
-/// Time within which it is to be told.
+/// Bound on the time until the notification.
 const BOUND: Duration = Duration::from_millis(5);
-/// The one that watches.
+/// The watching application.
 const OBSERVER: &str = "observer";
 
 payload!("detection.me" =>
-    /// Is sent by each life of the application.
+    /// Sent by each incarnation of the application.
     struct Me {
         /// Its process.
         pid: u32,
     }
 );
 
-/// The one that is killed.
+/// The killed application.
 struct Killed;
 
 impl Actor for Killed {
@@ -40,7 +41,7 @@ impl Actor for Killed {
     }
 }
 
-/// What the one that watches got.
+/// An event of the watching application.
 enum Heard {
     Life(u32),
     Down(Time, DownClass),
@@ -69,15 +70,15 @@ impl Handler<Delivery<Down>> for Watch {
     }
 }
 
-/// Kills it so many times. Returns whether that went well. The application's process is this program, started again: it comes as far as to
-/// the start of the node.
+/// Kills the application `trials` times. Returns whether all trials went well. The application's process is
+/// this program, started again: it runs up to the start of the node.
 pub(crate) fn measure(case: &str, trials: u32, seed: u64) -> bool {
     let (tell, heard) = sync_channel(16);
     let watch =
         AppSpec::new(OBSERVER, move || Watch(tell.clone())).handles::<Me>().handles::<Down>().own_thread();
     let killed = AppSpec::new("killed", || Killed).requires([OBSERVER]).own_process();
     let node = At::loopback().node("one").app(watch).app(killed).configure(|config| {
-        // It may be started again for ever, at once.
+        // Unlimited restarts, without delay.
         (config.supervision.app_restarts_max, config.supervision.app_window) =
             (1_000_000, Duration::from_millis(1));
     });
@@ -85,7 +86,7 @@ pub(crate) fn measure(case: &str, trials: u32, seed: u64) -> bool {
     let (mut chance, mut seen, mut right, mut in_time) = (Rng::with_seed(seed), Figures::new(), 0, 0);
     for _ in 0..trials {
         let pid = life(&heard);
-        // It has settled, and what it is told of it comes at no special moment.
+        // The application has settled, and the kill comes at a random moment.
         thread::sleep(SETTLED.mul_f64(1.0 + chance.f64()));
         let began = Time::now();
         kill_process(pid, Signal::KILL).expect("it lives");

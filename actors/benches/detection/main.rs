@@ -1,42 +1,60 @@
-//! How soon a node learns that another one is gone, and why; and that it learns of none that is not.
+//! How soon a node detects that another node is gone, with which reason, and that it never reports a live
+//! node as lost.
 //!
-//! `cargo bench -p sinew --bench detection [-- [--short] [--seed=N] WORD...]` runs the cases whose name holds every WORD; exit code 2 if
-//! there is none. Two hosts made of
-//! network namespaces (needs root and `ip`; says why and skips what is not possible), on each a node in a process of its own: one to which
-//! things happen, and one that watches it. JSON lines are on the standard output, a table on the standard error. Times are microseconds, from
-//! the act, as told by the process that does it, until the observer's application has the event. At which moment of the period an act comes is
-//! decided by the seed (1 if none is given). `--short` does a tenth of the 50 trials. Nothing here asserts a time.
+//! `cargo bench -p sinew --bench detection [-- [--short] [--seed=N] WORD...]` runs the cases that have every
+//! WORD in their names. The exit code is 2 if there are none.
 //!
-//! `WAY-SETTING`, where the settings are nodes that ask each other every 500 ms, every 50 ms, and every 500 ms but a group of `ndl.watch`
-//! every 10 ms (`leg_10ms`); and the ways to go are
+//! The cases run on two hosts made of network namespaces. This needs root and `ip`; the bench reports and
+//! skips cases that are not possible. Each host runs one node in its own process: the subject of the act, and
+//! an observer. The standard output has JSON lines, the standard error a table. Times are in microseconds.
+//! They run from the act, as reported by the acting process, until the observer's application has the event.
+//! The seed (default 1) determines the moment of an act within the period. `--short` runs a tenth of the 50
+//! trials. Nothing here asserts a time.
+//!
+//! Most cases are named `WAY-SETTING`. The settings are: nodes query each other every 500 ms, every 50 ms, or
+//! every 500 ms with a group of `ndl.watch` every 10 ms (`leg_10ms`). The ways are:
 //!
 //! - `kill`: `kill -9`. `leave`: SIGTERM, on which the node stops in order.
 //! - `stop`: SIGSTOP.
-//! - `link_down`: the other end of its interface goes down. `silent_cut`: the network swallows its packets, and all interfaces stay up.
-//! - `stall_busy`, `stall_asleep`: its application's handler keeps its CPU, or sleeps, for longer than it takes to tell; the node lives.
-//! - `restart`: `kill -9`, and started again as soon as the process has ended; `restart_same_ports`: with UDP and TCP ports that are configured.
-//!   `act to new life` is the time to `NodeRestarted`.
+//! - `link_down`: the other end of its interface goes down. `silent_cut`: the network drops its packets, and
+//!   all interfaces stay up.
+//! - `stall_busy`, `stall_asleep`: its application's handler keeps its CPU busy, or sleeps, for longer than
+//!   the stall bound; the node lives.
+//! - `restart`: `kill -9`, and a start as soon as the process has ended; `restart_same_ports`: with
+//!   configured UDP and TCP ports. `act to new life` is the time to `NodeRestarted`.
 //!
-//! `new-SETTING`: a node starts, and the applications of three others are told; from its first announcement, as a socket on one of the other hosts
-//! reads it, and from the call that starts it, until the last of the three has the event. `new_unheard-SETTING`: the network swallows all that it
-//! says until it is up; from when packets are carried, within one period.
+//! `new-SETTING`: a node starts, and the applications of three other nodes are notified. The end of the
+//! measurement is the event at the last of the three. It has two starts: the first announcement, as read by a
+//! socket on one of the other hosts, and the call that starts the node. `new_unheard-SETTING`: the
+//! network drops everything that the node sends until it is up. The measurement starts when packets are
+//! carried, within one period.
 //!
-//! `app_kill`: `kill -9` of an application in a process of its own, until another application of its node, which monitors it, has `Down`. It
-//! needs no root.
+//! `app_kill`: `kill -9` of an application in its own process, until another application of its node, which
+//! monitors it, has `Down`. It needs no root.
 //!
-//! The table has p50, p99, p99.9 and the maximum in columns of their own; of 50 trials the 99th percentile is the maximum.
+//! The table has columns for p50, p99, p99.9 and the maximum. With 50 trials the 99th percentile is the
+//! maximum.
 //!
-//! Beside the times stand how many of the trials told the right reason first (`right`; of a restart the end or the new life), the bound of the
-//! settings (`bound_us`: for a stall 250 ms, one look at the node's progress, and one period), in how many trials a loss or a restart says of itself that
-//! the silence was within its own bound (`held`), in how many the application had the event within it (`in_time`, from the end of the act:
-//! NDL may have a real-time priority, the application has none), by how much either was missed at worst (`over_us`), events that belong to
-//! no act (`surprises`), and how often the observer said of itself that it was starved (`own_stalls`). Each trial that told a wrong reason,
-//! and each that was later than all before it, is told in words.
+//! The table has these further columns:
 //!
-//! `spin-SETTING`, only where `spin` is asked for: four nodes, and eight processes for each CPU that spin at ordinary priority, for 10 minutes
-//! (`--short`: 20 s); and the same where the nodes have no right to real-time priority (`spin_plain`). `lost` are losses told, none of which is
-//! true: with one, the exit code is 1. The times are each second's longest silence of each node at each other one, as the watching node
-//! knows it; without privileges the nodes share this host's loopback interface.
+//! - `right`: trials with the right reason first (for a restart: the end or the new life).
+//! - `bound_us`: the bound of the settings. For a stall it is 250 ms, one check of the node's progress, and
+//!   one period.
+//! - `held`: trials in which a loss or a restart reports that the silence was within its own bound.
+//! - `in_time`: trials in which the application had the event within the bound, from the end of the act. NDL
+//!   may have a real-time priority, the application has none.
+//! - `over_us`: the largest amount by which either was missed.
+//! - `surprises`: events that belong to no act.
+//! - `own_stalls`: how often the observer reported that it was starved itself.
+//!
+//! Each trial with a wrong reason, and each that was later than all before it, is described in a line of
+//! text.
+//!
+//! `spin-SETTING` runs only if `spin` is requested. It has four nodes, and eight processes for each CPU that
+//! spin at ordinary priority, for 10 minutes (`--short`: 20 s). `spin_plain` is the same with nodes that have
+//! no right to real-time priority. `lost` counts reported losses, all of them false: with one, the exit code
+//! is 1. The times are the longest silence in each second, for each node at each other one, as measured by
+//! the watching node. Without privileges the nodes share this host's loopback interface.
 
 mod application;
 mod newcomer;
@@ -64,14 +82,14 @@ use crate::{
     way::{Ports, Way},
 };
 
-/// What all chance comes from, unless another seed is given.
+/// The seed of all random choices, unless another one is given.
 const SEED: u64 = 1;
 /// Trials of each case.
 const TRIALS: u32 = 50;
 /// How long nodes are watched while others spin.
 const SPIN_SECONDS: u64 = 600;
 
-/// What is measured.
+/// A measurement.
 #[derive(Clone, Copy, Debug)]
 enum Case {
     Gone(Way, Setting),
@@ -155,7 +173,7 @@ fn main() -> ExitCode {
     if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
-/// Plays the part that another process of this program gave this one.
+/// Runs the role that another process of this program assigned to this one.
 fn play(role: &str) -> ExitCode {
     let words: Vec<&str> = role.split(' ').collect();
     match words[..] {

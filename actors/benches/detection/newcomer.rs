@@ -1,4 +1,4 @@
-//! A node that starts: how soon the applications of all others are told that it is there.
+//! The start of a node: the time until the applications of all other nodes are notified of it.
 
 use std::{
     net::{Ipv4Addr, SocketAddrV4, UdpSocket},
@@ -17,7 +17,7 @@ use sinew_figures::{
     Alone, Figures,
     process::{self, Process},
 };
-use sinew_hosts::Hosts;
+use sinew_testkit::Hosts;
 use socket2::{Domain, Protocol, Socket, Type};
 
 use crate::{
@@ -30,25 +30,25 @@ use crate::{
 /// Which of the hosts is the newcomer's; the others have a node each.
 const NEWCOMER: usize = 0;
 const OTHERS: u8 = 3;
-/// Time within which all are to be told, if its first announcement gets through.
+/// Bound on the notification of all nodes, if the first announcement arrives.
 const AT_ONCE: Duration = Duration::from_millis(20);
 
-/// Announcements that wait to be looked at; a trial has some dozens at most.
+/// Maximum number of announcements that wait to be checked; a trial has some dozens at most.
 const ANNOUNCED_MAX: usize = 1_024;
 
-/// What becomes of its first announcement.
+/// The fate of the first announcement.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum First {
     /// It gets through.
     Heard,
-    /// The network swallows it, and carries what comes after the node has started.
+    /// The network drops it, and carries packets after the node has started.
     Lost,
 }
 
 impl First {
     pub(crate) const ALL: [Self; 2] = [Self::Heard, Self::Lost];
 
-    /// As it stands in the names of cases.
+    /// The name as part of the names of cases.
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Heard => "new",
@@ -64,7 +64,7 @@ impl First {
     }
 }
 
-/// What was seen in all trials.
+/// The results of all trials.
 #[derive(Default)]
 struct Seen {
     from_start: Figures,
@@ -81,13 +81,14 @@ struct Scene<'a> {
     hosts: Hosts,
     at: At,
     observers: Vec<Observer>,
-    /// When each of the newcomer's words to the group came to the first of the others' hosts.
+    /// Arrival times of the newcomer's multicast announcements at the first of the other hosts.
     announced: Receiver<Time>,
     chance: Rng,
     seen: Seen,
 }
 
-/// Makes the hosts, and starts a newcomer so many times; says why where that is not possible. Returns whether what ran went well.
+/// Creates the hosts, and starts a newcomer `trials` times; reports the reason if that is not possible.
+/// Returns whether all completed trials went well.
 pub(crate) fn measure(case: &str, (first, setting): (First, Setting), trials: u32, seed: u64) -> bool {
     let hosts = match Hosts::new(OTHERS + 1) {
         Ok(hosts) => hosts,
@@ -154,18 +155,18 @@ impl Scene<'_> {
         (newcomer, began)
     }
 
-    /// It goes in order, so that it is a stranger the next time.
+    /// Stops the newcomer in order, so that it is unknown at the next start.
     fn leave(&mut self, newcomer: Process, trial: u32) {
         newcomer.signal(Signal::TERM);
         let has_left = |event: &NodeEvent| matches!(event, NodeEvent::NodeLost { why: LossReason::Left, .. });
         for other in 0..self.observers.len() {
             self.await_event(trial, other, has_left);
         }
-        // What it said last is of no use.
+        // Its remaining events are not needed.
         let _ = newcomer.wait();
     }
 
-    /// When this observer was told so; what it is told before that is a surprise.
+    /// Returns the time of this observer's event; earlier events count as surprises.
     fn await_event(&mut self, trial: u32, observer: usize, is_it: impl Fn(&NodeEvent) -> bool) -> Time {
         loop {
             let Told { at, event, .. } =
@@ -202,7 +203,8 @@ impl Scene<'_> {
     }
 }
 
-/// Hears the group on the first of the others' hosts, and tells when the newcomer says something there.
+/// Listens to the multicast group on the first of the other hosts, and reports the time of each announcement
+/// of the newcomer.
 fn listen(hosts: &Hosts, at: At) -> Receiver<Time> {
     let words = at.to_string();
     let group = words.split_once('@').and_then(|(_, group)| group.parse().ok());
@@ -223,7 +225,7 @@ fn listen(hosts: &Hosts, at: At) -> Receiver<Time> {
 
 fn join(group: SocketAddrV4, interface: Ipv4Addr) -> std::io::Result<UdpSocket> {
     let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
-    // The node of that host hears the group, too.
+    // The node of that host listens to the group, too.
     socket.set_reuse_address(true)?;
     socket.bind(&group.into())?;
     socket.join_multicast_v4(group.ip(), &interface)?;

@@ -1,4 +1,4 @@
-//! The node that watches, and what it is told.
+//! The watching node, and its events.
 
 use std::{
     sync::mpsc::{Receiver, SyncSender, sync_channel},
@@ -15,12 +15,12 @@ use crate::{
 
 /// No wait is longer.
 pub(crate) const DEADLINE: Duration = Duration::from_secs(60);
-/// Things heard that wait to be looked at; each trial takes a few.
+/// Maximum number of events that wait to be checked; each trial takes a few.
 const HEARD_MAX: usize = 1_024;
-/// How often is looked for what nobody tells.
+/// Poll interval for states without an event.
 const LOOK: Duration = Duration::from_millis(1);
 
-/// What the observer's application got.
+/// An event of the observer's application.
 enum Heard {
     Event(Told),
     Held(Time),
@@ -95,14 +95,14 @@ impl Observer {
         loop {
             match self.heard.recv_timeout(DEADLINE) {
                 Ok(Heard::Event(told)) => return told,
-                // Of a turn that was lost with its life.
+                // From a turn that ended with its incarnation.
                 Ok(Heard::Held(_)) => {}
                 Err(_) => panic!("{what} was not told within {DEADLINE:?}"),
             }
         }
     }
 
-    /// Events that nobody has waited for.
+    /// Returns the events that no trial has waited for.
     pub(crate) fn rest(&self) -> Vec<NodeEvent> {
         let event = |heard| match heard {
             Heard::Event(told) => Some(told.event),
@@ -111,7 +111,7 @@ impl Observer {
         self.heard.try_iter().filter_map(event).collect()
     }
 
-    /// Waits until messages reach the subject's application: the link stands, and names are known.
+    /// Waits until messages reach the subject's application: the link is up, and names are known.
     pub(crate) fn reaches_subject(&self) {
         let until = Time::now() + DEADLINE;
         let is_ready = || self.handle().directory().iter().any(|entry| entry.name == SUBJECT && entry.ready);
@@ -121,7 +121,7 @@ impl Observer {
         }
     }
 
-    /// Lets the subject's application have a turn that does not end for so long. Returns when that began.
+    /// Makes a turn of the subject's application last this long. Returns its start.
     pub(crate) fn hold(&self, spins: bool, lasts: Duration) -> Time {
         let for_us = u64::try_from(lasts.as_micros()).expect("some seconds");
         self.sender.send(SUBJECT, &Hold { spins, for_us }).expect("it was reached");

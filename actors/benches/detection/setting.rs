@@ -4,14 +4,14 @@ use std::time::Duration;
 
 use sinew::{NodeConfig, config::WatchGroup};
 
-/// Answers that may be missed in a row, everywhere: what is configured by default.
+/// Default maximum of consecutive missed answers, for every setting.
 const MISSED_MAX: u32 = 3;
-/// Time between two looks at what of a node does not get on, at least, as in `ndl/actor.rs`.
+/// Minimum time between two progress checks, as in `actors/ndl/src/actor.rs`.
 const PROGRESS_PERIOD_MIN: Duration = Duration::from_millis(100);
-/// A turn that lasts this long is told, as docs/protocol/ndl.md says.
+/// Duration of a turn that is reported as stalled, as in docs/protocol/ndl.md.
 const STALLED: Duration = Duration::from_millis(250);
 
-/// How often nodes ask each other.
+/// Interval of the queries between nodes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Setting {
     /// Every 500 ms, as they do by default.
@@ -25,7 +25,7 @@ pub(crate) enum Setting {
 impl Setting {
     pub(crate) const ALL: [Self; 3] = [Self::Relaxed, Self::Brisk, Self::Leg];
 
-    /// As it stands in the names of cases.
+    /// The name as part of the names of cases.
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Relaxed => "500ms",
@@ -47,7 +47,7 @@ impl Setting {
         }
     }
 
-    /// Time between two questions to one node.
+    /// Time between two queries to one node.
     pub(crate) const fn asked_every(self) -> Duration {
         match self {
             Self::Relaxed | Self::Brisk => self.period(),
@@ -60,7 +60,8 @@ impl Setting {
         self.asked_every() * (MISSED_MAX + 1)
     }
 
-    /// Time within which a turn that does not end is told: when it has lasted for long enough, the node is looked at, and then asked.
+    /// Bound on the report of a turn that does not end: the turn lasts this long, then the node is checked,
+    /// and then queried.
     pub(crate) fn stall_bound(self) -> Duration {
         STALLED + self.period().max(PROGRESS_PERIOD_MIN) + self.asked_every()
     }

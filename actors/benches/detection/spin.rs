@@ -1,4 +1,4 @@
-//! Nodes that live, on a machine where far more wants to run than can: who is told to be lost, and how long who was silent.
+//! Live nodes on an overloaded machine: which nodes are reported as lost, and how long each was silent.
 
 use std::{
     thread,
@@ -9,26 +9,26 @@ use rustix::thread::{CapabilitySet, capabilities, set_capabilities};
 use sinew::{NodeHandle, prelude::*};
 use sinew_figures::{
     Alone, Figures,
-    process::{self, Process, await_end, say_there},
+    process::{self, Process, await_end, print_ready},
 };
-use sinew_hosts::Hosts;
+use sinew_testkit::Hosts;
 
 use crate::{nodes::At, observer::Observer, setting::Setting, starved};
 
 /// Nodes, and processes that spin for each CPU: the machine has eight times as much to do as it can.
 const NODES: u8 = 4;
 const SPINNERS_PER_CPU: usize = 8;
-/// A node stays this much longer than it watches, so that nobody sees another one leave.
+/// A node stays this much longer than it watches, so that no other node sees it leave.
 const STAY: Duration = Duration::from_secs(5);
-/// The shortest pause between two looks; a tenth of the period where that is longer.
+/// The shortest pause between two polls; a tenth of the period if that is longer.
 const LOOK_MIN: Duration = Duration::from_millis(5);
-/// Of each of these the longest silence counts.
+/// The longest silence is recorded for each interval of this length.
 const PART: Duration = Duration::from_secs(1);
 
-/// What the nodes may do.
+/// The privileges of the nodes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Rights {
-    /// What this process may.
+    /// The privileges of this process.
     Same,
     /// No real-time priority, as for a user without privileges.
     Plain,
@@ -37,7 +37,7 @@ pub(crate) enum Rights {
 impl Rights {
     pub(crate) const ALL: [Self; 2] = [Self::Same, Self::Plain];
 
-    /// As it stands in the names of cases.
+    /// The name as part of the names of cases.
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Same => "spin",
@@ -51,7 +51,7 @@ impl Rights {
     }
 }
 
-/// What a node saw of the others.
+/// Observations of one node about the others.
 #[derive(Default)]
 struct Seen {
     lost: u64,
@@ -61,7 +61,8 @@ struct Seen {
     silences: Figures,
 }
 
-/// Starts nodes and spinning processes, and tells what the nodes saw. Returns whether nobody was taken for lost.
+/// Starts nodes and spinning processes, and reports the nodes' observations. Returns whether no node was
+/// reported as lost.
 pub(crate) fn measure(case: &str, rights: Rights, setting: Setting, seconds: u64) -> bool {
     let hosts = Hosts::new(NODES).inspect_err(|why| eprintln!("{case}: on one host: {why}")).ok();
     let at = At::loopback();
@@ -122,13 +123,13 @@ pub(crate) fn member(rights: Rights, setting: Setting, seconds: u64, at: At) {
     if rights == Rights::Plain {
         give_up_real_time();
     }
-    // Who started it may be ended by force.
+    // The process that started this one may be killed.
     thread::spawn(|| {
         await_end();
         std::process::exit(0);
     });
     let observer = Observer::start(setting, at);
-    say_there();
+    print_ready();
     let mut found = 0;
     while found < NODES - 1 {
         let told = observer.next("another node");
@@ -169,7 +170,7 @@ fn watch(node: &NodeHandle, setting: Setting, lasts: Duration) -> Seen {
     seen
 }
 
-/// Takes the right to real-time priority from this thread and those that it makes.
+/// Removes the right to real-time priority from this thread and its later child threads.
 fn give_up_real_time() {
     let sets = capabilities(None).and_then(|mut sets| {
         sets.effective.remove(CapabilitySet::SYS_NICE);
@@ -180,13 +181,13 @@ fn give_up_real_time() {
     sets.expect("whoever has a right may give it up");
 }
 
-/// Spins until whoever started it ends it, or ends.
+/// Spins until the process that started it ends it, or ends.
 pub(crate) fn spinner() {
     thread::spawn(|| {
         loop {
             std::hint::spin_loop();
         }
     });
-    say_there();
+    print_ready();
     await_end();
 }

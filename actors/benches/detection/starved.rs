@@ -1,4 +1,4 @@
-//! How often this process's NDL said of itself that it was starved: a word of its log.
+//! Counts NDL's own reports in this process's log that it was starved.
 
 use std::{
     io::{self, Write},
@@ -7,7 +7,7 @@ use std::{
 
 use tracing_subscriber::filter::LevelFilter;
 
-/// What NDL logs then, at most once a second.
+/// NDL's log text for this event, at most once a second.
 const WORDS: &str = "NDL was starved";
 /// Before how late it was.
 const LATE: &str = "late_ms=";
@@ -15,7 +15,7 @@ const LATE: &str = "late_ms=";
 static TIMES: AtomicU64 = AtomicU64::new(0);
 static LATE_MS: AtomicU64 = AtomicU64::new(0);
 
-/// Reads what is logged; shows it where `RUST_LOG` is set, else drops it.
+/// Reads the log; displays it if `RUST_LOG` is set, else drops it.
 struct Reader {
     is_loud: bool,
 }
@@ -43,7 +43,7 @@ fn late_ms(line: &str) -> Option<u64> {
     rest.split(|char: char| !char.is_ascii_digit()).next()?.parse().ok()
 }
 
-/// Begins to read what this process logs.
+/// Starts reading this process's log.
 pub(crate) fn listen() {
     let is_loud = std::env::var_os("RUST_LOG").is_some();
     let reader = move || Reader { is_loud };

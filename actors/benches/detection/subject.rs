@@ -3,7 +3,7 @@
 use std::{process::ExitCode, thread, time::Duration};
 
 use sinew::prelude::*;
-use sinew_figures::process::{await_end, say_there};
+use sinew_figures::process::{await_end, print_ready};
 
 use crate::{nodes::At, observer::DEADLINE, setting::Setting, way::Ports};
 
@@ -11,7 +11,7 @@ use crate::{nodes::At, observer::DEADLINE, setting::Setting, way::Ports};
 pub(crate) const SUBJECT: &str = "subject";
 
 payload!("detection.hold" =>
-    /// Asks for a turn that does not end for so long.
+    /// Requests a turn that lasts this long.
     pub(crate) struct Hold {
         /// Whether it keeps its CPU; else it sleeps.
         pub(crate) spins: bool,
@@ -23,7 +23,7 @@ payload!("detection.hold" =>
 payload!("detection.held" =>
     /// Is sent at the beginning of that turn.
     pub(crate) struct Held {
-        /// When it began, in nanoseconds of the clock that all namespaces share.
+        /// Start of the turn, in nanoseconds of the clock that all namespaces share.
         pub(crate) since_ns: u64,
     }
 );
@@ -51,7 +51,7 @@ impl Handler<Delivery<Hold>> for Subject {
     }
 }
 
-/// Runs the node until a signal stops it, or whoever started it ends.
+/// Runs the node until a signal stops it, or the process that started it ends.
 pub(crate) fn run(ports: Ports, setting: Setting, at: At) -> ExitCode {
     let app = AppSpec::new(SUBJECT, || Subject).handles::<Hold>().own_thread().progress_within(DEADLINE);
     let node = at.node(SUBJECT).app(app).heed_signals().configure(|config| {
@@ -63,7 +63,7 @@ pub(crate) fn run(ports: Ports, setting: Setting, at: At) -> ExitCode {
     });
     let began = Time::now();
     let node = node.start().expect("a node");
-    say_there();
+    print_ready();
     println!("{}", began.as_nanos());
     thread::spawn(|| {
         await_end();

@@ -1,4 +1,4 @@
-//! One way to go, again and again: the act, what is told first, and the way back.
+//! Repeated trials of one way to leave: the act, the first event, and the return.
 
 use std::{thread, time::Duration};
 
@@ -9,7 +9,7 @@ use sinew_figures::{
     Alone, Figures,
     process::{self, Process},
 };
-use sinew_hosts::Hosts;
+use sinew_testkit::Hosts;
 
 use crate::{
     nodes::At,
@@ -19,12 +19,12 @@ use crate::{
     way::{Turn, Way},
 };
 
-/// Which of the hosts is whose.
+/// The hosts of the two nodes.
 const OBSERVER: usize = 0;
 const SUBJECT: usize = 1;
-/// Two nodes that have just met do not know each other well: clocks are measured, names told.
+/// Settling time: two nodes that have just met still measure clocks and exchange names.
 pub(crate) const SETTLED: Duration = Duration::from_millis(200);
-/// How much longer a turn lasts than it may take until it is told.
+/// Time by which a turn exceeds the stall bound.
 const HELD_LONGER: Duration = Duration::from_millis(300);
 
 /// A case.
@@ -36,14 +36,14 @@ pub(crate) struct Plan {
     pub(crate) seed: u64,
 }
 
-/// When something was done: a signal at once, what a program of the system does in some milliseconds.
+/// The time of an act: a signal takes effect at once, a system program takes some milliseconds.
 #[derive(Clone, Copy, Debug)]
 struct Act {
     began: Time,
     over: Time,
 }
 
-/// What was seen in all trials.
+/// The results of all trials.
 #[derive(Default)]
 struct Seen {
     told: Figures,
@@ -60,7 +60,7 @@ struct Scene<'a> {
     case: &'a str,
     plan: Plan,
     observer: Observer,
-    /// Only while it is exchanged for its next life there is none.
+    /// `None` only between two incarnations.
     subject: Option<Process>,
     hosts: Hosts,
     at: At,
@@ -68,7 +68,8 @@ struct Scene<'a> {
     seen: Seen,
 }
 
-/// Makes the hosts, and tries the way so many times; says why where that is not possible. Returns whether what ran went well.
+/// Creates the hosts, and runs the trials; reports the reason if that is not possible. Returns whether all
+/// completed trials went well.
 pub(crate) fn measure(case: &str, plan: Plan) -> bool {
     let hosts = match Hosts::new(2) {
         Ok(hosts) => hosts,
@@ -160,7 +161,7 @@ impl<'a> Scene<'a> {
         match self.plan.way {
             Way::Kill | Way::Leave => {
                 let former = self.subject.take().expect("it is there between acts");
-                // What it said last is of no use.
+                // Its remaining events are not needed.
                 let _ = former.wait();
                 self.start_subject();
             }
@@ -176,7 +177,7 @@ impl<'a> Scene<'a> {
         let Plan { way, setting, .. } = self.plan;
         let after = at.since(act.began);
         let (silent, bound) = match event {
-            // What it says itself.
+            // The event's own values.
             NodeEvent::NodeLost { silent_us, bound_us, .. }
             | NodeEvent::NodeRestarted { silent_us, bound_us, .. } => {
                 (Duration::from_micros(*silent_us), Duration::from_micros(*bound_us))

@@ -1,4 +1,4 @@
-//! The ways in which a node goes, and what the others are to be told.
+//! The ways in which a node leaves, and the expected events at the others.
 
 use std::time::Duration;
 
@@ -6,7 +6,7 @@ use sinew::events::{LossReason, NodeEvent, Trouble};
 
 use crate::{setting::Setting, subject::SUBJECT};
 
-/// What happens to a node.
+/// An act on a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Way {
     Kill,
@@ -18,7 +18,7 @@ pub(crate) enum Way {
     Restart(Ports),
 }
 
-/// What a handler does that does not return.
+/// The behaviour of a handler that does not return.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Turn {
     /// Keeps its CPU.
@@ -27,12 +27,12 @@ pub(crate) enum Turn {
     Sleeps,
 }
 
-/// Where a node listens.
+/// The ports of a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Ports {
-    /// Wherever the system likes, in each life anew.
+    /// Chosen by the system, for each incarnation again.
     Any,
-    /// Where it always does.
+    /// The same ones for every incarnation.
     Same,
 }
 
@@ -63,7 +63,7 @@ impl Way {
         Self::Restart(Ports::Same),
     ];
 
-    /// As it stands in the names of cases.
+    /// The name as part of the names of cases.
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Kill => "kill",
@@ -78,12 +78,12 @@ impl Way {
         }
     }
 
-    /// Where the node listens to which this happens.
+    /// The ports of the subject of the act.
     pub(crate) const fn ports(self) -> Ports {
         if let Self::Restart(ports) = self { ports } else { Ports::Any }
     }
 
-    /// Whether the first thing that is told tells the truth.
+    /// Whether the first event is correct.
     pub(crate) fn is_told_by(self, event: &NodeEvent) -> bool {
         match (self, event) {
             (Self::Stall(_), NodeEvent::AppStalled { app_name, trouble, .. }) => {
@@ -105,7 +105,7 @@ impl Way {
         }
     }
 
-    /// Whether this says that what happened is over.
+    /// Whether this event reports the end of the condition.
     pub(crate) const fn is_ended_by(self, event: &NodeEvent) -> bool {
         match self {
             Self::Kill | Self::Leave | Self::Restart(_) => matches!(event, NodeEvent::NodeRestarted { .. }),
@@ -114,7 +114,7 @@ impl Way {
         }
     }
 
-    /// Time within which what happened is to be told.
+    /// Bound on the report of the act.
     pub(crate) fn bound(self, setting: Setting) -> Duration {
         if let Self::Stall(_) = self { setting.stall_bound() } else { setting.loss_bound() }
     }

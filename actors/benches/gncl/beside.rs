@@ -1,4 +1,4 @@
-//! Control beside Bulk: who asks and floods, who answers and takes.
+//! Control beside Bulk: one application sends requests and a flood, others answer and receive.
 
 use std::{
     sync::{
@@ -14,12 +14,12 @@ use serde::{Deserialize, Serialize};
 use sinew::{message::Sender, prelude::*};
 use sinew_figures::{
     Alone, Figures,
-    process::{await_end, say_there},
+    process::{await_end, print_ready},
 };
 
 use crate::{nodes::At, ping::DEADLINE};
 
-/// From one round trip to the next.
+/// Period of the round trips.
 const PERIOD: Duration = Duration::from_millis(1);
 /// Round trips before any is counted.
 const WARM_UP: u64 = 200;
@@ -28,7 +28,8 @@ const QUEUE: usize = 64;
 
 #[derive(Serialize, Deserialize)]
 struct Ask {
-    /// When it was sent, in nanoseconds since the asker began: one that is late is counted as it is, though others follow it.
+    /// Send time, in nanoseconds since the requester started. A late round trip is counted with its real age,
+    /// even if later ones have started.
     sent_ns: u64,
     #[serde(with = "serde_bytes")]
     block: Vec<u8>,
@@ -61,7 +62,7 @@ impl Payload for Load {
     const CLASS: Class = Class::Bulk;
 }
 
-/// What was measured.
+/// The results.
 struct Seen {
     alone: Figures,
     beside: Figures,
@@ -80,7 +81,7 @@ impl Handler<Delivery<Ask>> for Echo {
 
     fn handle(&mut self, ask: Delivery<Ask>, context: &mut Self::Context) {
         let Ask { sent_ns, block } = ask.payload;
-        // What is refused is missing among the answers.
+        // A refused reply is missing among the answers.
         let _ = context.send(ask.source, &Answer { sent_ns, block });
     }
 }
@@ -104,7 +105,7 @@ impl Handler<Delivery<Load>> for Sink {
     }
 }
 
-struct Asker {
+struct Requester {
     to: Option<Tid>,
     round: u64,
     clock: Instant,
@@ -117,22 +118,23 @@ struct Asker {
     began: Instant,
 }
 
-impl Actor for Asker {
+impl Actor for Requester {
     type Context = AppContext<Self>;
 
     fn started(&mut self, context: &mut Self::Context) {
         self.to = context.resolve("echo");
         let (sender, flood) = (context.sender(), self.flood.clone());
         self.flooding = Some(std::thread::spawn(move || flood.run(&sender)).thread().clone());
-        context.every(PERIOD, |asker: &mut Self, _, context: &mut AppContext<Self>| asker.ask(context));
+        context
+            .every(PERIOD, |requester: &mut Self, _, context: &mut AppContext<Self>| requester.ask(context));
     }
 }
 
-impl Asker {
+impl Requester {
     fn ask(&mut self, context: &AppContext<Self>) {
         let to = self.to.expect("it was found at the start");
         let sent_ns = self.now_ns();
-        // What is refused is asked again a period later.
+        // A refused request is repeated one period later.
         let _ = context.send(to, &Ask { sent_ns, block: vec![7; 64] });
     }
 
@@ -156,14 +158,14 @@ impl Asker {
                 let bytes = self.flood.bytes.load(Ordering::Relaxed);
                 let millis = u64::try_from(self.began.elapsed().as_millis()).unwrap_or(u64::MAX);
                 let bulk_bytes_per_s = bytes * 1_000 / millis.max(1);
-                // The one who waits for it takes one; later rounds are of no use.
+                // The measuring thread takes one result; later rounds are not needed.
                 let _ = self.done.try_send(Seen { alone, beside: figures, bulk_bytes_per_s });
             }
         }
     }
 }
 
-impl Handler<Delivery<Answer>> for Asker {
+impl Handler<Delivery<Answer>> for Requester {
     type Result = ();
 
     fn handle(&mut self, answer: Delivery<Answer>, _: &mut Self::Context) {
@@ -203,21 +205,21 @@ fn node(name: &str, at: At) -> NodeBuilder {
     at.node(name).configure(|config| config.gncl.queue_capacity = QUEUE)
 }
 
-/// The node that answers, until its input ends; `pause` is what the flooded application takes for each message.
+/// Runs the answering node until its input ends. The flooded application takes `pause` for each message.
 pub(crate) fn echo(at: At, pause: Duration) {
     let echo = AppSpec::new("echo", || Echo).handles::<Ask>().own_thread();
     let sink = AppSpec::new("sink", move || Sink { pause }).handles::<Load>().own_thread();
     let _node = node("there", at).app(echo).app(sink).start().expect("a node");
-    say_there();
+    print_ready();
     await_end();
 }
 
-/// The node that asks so many times, and then asks and floods.
+/// Runs the asking node: `rounds` round trips alone, then the same number with the flood.
 pub(crate) fn measure(case: &str, at: At, bulk_bytes: usize, rounds: u64) {
     let (done, seen) = sync_channel(1);
     let flood = Flood { runs: AtomicBool::new(false), bytes: AtomicU64::new(0), message_bytes: bulk_bytes };
     let flood = Arc::new(flood);
-    let asker = move || Asker {
+    let requester = move || Requester {
         to: None,
         round: 0,
         clock: Instant::now(),
@@ -229,8 +231,9 @@ pub(crate) fn measure(case: &str, at: At, bulk_bytes: usize, rounds: u64) {
         alone: None,
         began: Instant::now(),
     };
-    let asker = AppSpec::new("asker", asker).handles::<Answer>().requires(["echo", "sink"]).own_thread();
-    let node = node("home", at).app(asker).start().expect("a node");
+    let requester =
+        AppSpec::new("requester", requester).handles::<Answer>().requires(["echo", "sink"]).own_thread();
+    let node = node("home", at).app(requester).start().expect("a node");
     let seen = seen.recv_timeout(DEADLINE).expect("the rounds end");
     node.stop();
     seen.report(case);

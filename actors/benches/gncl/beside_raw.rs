@@ -1,4 +1,4 @@
-//! The same by bare TCP: round trips through one connection, alone and beside a flood through another one.
+//! The same over bare TCP: round trips on one connection, alone and beside a flood on another one.
 
 use std::{
     io::Write,
@@ -7,17 +7,17 @@ use std::{
     time::Duration,
 };
 
-use sinew_figures::{Alone, Pace, Rounds, process::say_there, stream};
+use sinew_figures::{Alone, Pace, Rounds, process::print_ready, stream};
 
 /// Bytes of a question.
 const ASKED: usize = 64;
 /// Round trips before any is counted.
 const WARM_UP: u32 = 20;
 
-/// Echoes the first connection, takes what comes through the second.
+/// Echoes data of the first connection, and discards data of the second.
 pub(crate) fn echo(address: SocketAddrV4) {
     let listener = TcpListener::bind(address).expect("a free port");
-    say_there();
+    print_ready();
     let (questions, _) = listener.accept().expect("the measuring end");
     questions.set_nodelay(true).expect("TCP has no delay");
     thread::spawn(move || {
@@ -30,7 +30,7 @@ pub(crate) fn echo(address: SocketAddrV4) {
     let _ = std::io::copy(&mut reader, &mut writer);
 }
 
-/// Asks so many times, and then so many times beside a flood that writes so many bytes at once.
+/// Runs `alone` round trips, then `beside` ones with a flood that writes `flooded` bytes at once.
 pub(crate) fn measure(case: &str, address: SocketAddrV4, flooded: usize, [alone, beside]: [u64; 2]) {
     let rounds = |counted: u64| Rounds {
         bytes: ASKED,

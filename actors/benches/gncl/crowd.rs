@@ -1,7 +1,8 @@
-//! The paper's Table 2: every node sends to every other one, 1000 bytes, and gets them back.
+//! Table 2 of the paper: every node sends 1000 bytes to every other one, and receives them back.
 //!
-//! The rate of all nodes together is the same however many they are, so that what a message costs can be compared: the time
-//! that all their processes had a CPU, by the messages that arrived, there and back. A rate of nothing shows what nodes take that have nothing to do.
+//! The total rate of all nodes is the same for every number of nodes, so that the costs of a message can be
+//! compared. The cost is the CPU time of all processes divided by the number of messages that arrived, in
+//! both directions. A rate of zero shows the cost of idle nodes.
 
 use std::{
     net::Ipv4Addr,
@@ -14,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use sinew::prelude::*;
 use sinew_figures::{
     Alone, Figures,
-    process::{self, Process, await_end, say_there},
+    process::{self, Process, await_end, print_ready},
 };
 
 use crate::{nodes::At, ping::DEADLINE};
@@ -33,7 +34,7 @@ pub(crate) const SIZES: [usize; 3] = [3, 8, 16];
 pub(crate) const RATE: u64 = 2_000;
 /// Bytes of a packet.
 pub(crate) const PACKET: usize = 1000;
-/// Until connections stand and buffers are warm.
+/// Time until connections are up and buffers are warm.
 pub(crate) const WARM_UP: Duration = Duration::from_secs(2);
 /// The paper's own mean there and back between three Raspberry Pis, in nanoseconds.
 const PAPER_MEAN_NS: u64 = 552_600;
@@ -52,7 +53,7 @@ impl Payload for There {
 
 #[derive(Serialize, Deserialize)]
 struct Back {
-    /// Of the one that it answers.
+    /// Send time of the request that this message answers.
     sent_ns: u64,
     #[serde(with = "serde_bytes")]
     block: Vec<u8>,
@@ -62,7 +63,7 @@ impl Payload for Back {
     const NAME: &'static str = "gncl.back";
 }
 
-/// What one of them is to do.
+/// The task of one member.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Share {
     pub(crate) index: usize,
@@ -73,13 +74,13 @@ pub(crate) struct Share {
 }
 
 impl Share {
-    /// From one of its own to the next.
+    /// Period of a member's own requests.
     pub(crate) fn period(self) -> Option<Duration> {
         (self.count as u64 * 1_000_000_000).checked_div(self.rate).map(Duration::from_nanos)
     }
 }
 
-/// What one of them has seen.
+/// The results of one member.
 pub(crate) struct Seen {
     figures: Figures,
     total_ns: u64,
@@ -132,7 +133,7 @@ impl Member {
     fn ask(&mut self, context: &AppContext<Self>) {
         let name = &self.others[self.next % self.others.len()];
         self.next += 1;
-        // Whose node is gone answers nothing, and is missing among the times.
+        // An application on a stopped node does not answer; its round trip is missing among the times.
         let _ = context.send(name.as_str(), &There { sent_ns: self.now_ns(), block: vec![7; PACKET] });
     }
 
@@ -162,7 +163,7 @@ impl Handler<Delivery<There>> for Echo {
 
     fn handle(&mut self, there: Delivery<There>, context: &mut Self::Context) {
         let There { sent_ns, block } = there.payload;
-        // What is refused is missing among the times.
+        // A refused reply is missing among the times.
         let _ = context.send(there.source, &Back { sent_ns, block });
     }
 }
@@ -179,7 +180,7 @@ impl Handler<Delivery<Back>> for Member {
     }
 }
 
-/// One of them, in a process of its own: hands over what it has seen.
+/// One member, in its own process: writes its results to the standard output.
 pub(crate) fn member(share: Share, at: At) {
     let Share { index, count, seconds, .. } = share;
     let others: Vec<_> =
@@ -188,7 +189,7 @@ pub(crate) fn member(share: Share, at: At) {
     let required = others.clone();
     let (done, seen) = sync_channel(1);
     let make = move || Member {
-        // Everybody begins with another one.
+        // Each member starts with a different peer.
         next: index,
         others: others.clone(),
         period: share.period(),
@@ -199,12 +200,12 @@ pub(crate) fn member(share: Share, at: At) {
     };
     let member = AppSpec::new("member", make).handles::<Back>().requires(required).on_io_thread();
     let node = at.node(&format!("node-{index}")).app(echo).app(member).start().expect("a node");
-    say_there();
+    print_ready();
     hand_over(seen.recv_timeout(DEADLINE).expect("the rounds end"));
     node.stop();
 }
 
-/// Says what was seen, and waits until all have.
+/// Writes the results to the standard output, and waits until all members have done so.
 pub(crate) fn hand_over(seen: Seen) {
     println!("{} {} {} {}", seen.total_ns, seen.cpu.as_nanos(), seen.sleeps, resident_kib());
     if seen.figures.rounds() > 0 {
@@ -215,14 +216,14 @@ pub(crate) fn hand_over(seen: Seen) {
     await_end();
 }
 
-/// Memory of this process that is there; 0 where the system does not say.
+/// Resident memory of this process in KiB; 0 if the system does not report it.
 fn resident_kib() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
     line.and_then(|line| line.split_whitespace().next()?.parse().ok()).unwrap_or(0)
 }
 
-/// What all of them have seen.
+/// The results of all members.
 #[derive(Default)]
 struct Sum {
     figures: Figures,
@@ -272,7 +273,7 @@ pub(crate) fn measure(case: &str, by: By, share: Share) {
     };
     let mut members: Vec<_> = (0..count).map(|index| Process::start(&role(index))).collect();
     let mut sum = Sum::default();
-    // All of them live until the last one has been heard.
+    // All members live until the last result is read.
     members.iter_mut().for_each(|member| sum.add(member));
     if rate == 0 { sum.report_rest(case, share) } else { sum.report(case, share) }
 }
@@ -291,7 +292,7 @@ impl Sum {
             .report();
     }
 
-    /// Nobody sent anything.
+    /// Reports a run without messages.
     fn report_rest(&self, case: &str, share: Share) {
         let mut seen = Figures::new();
         let nodes_and_seconds = share.count as u64 * share.seconds;

@@ -1,6 +1,8 @@
-//! The same as [`crowd`](crate::crowd) by bare sockets: what the machine itself makes of so many processes.
+//! The same as [`crowd`](crate::crowd) over bare sockets: the machine's own costs with this number of
+//! processes.
 //!
-//! Each has one thread while it measures, a connection to every other one, and a task that reads it.
+//! Each process has one thread during the measurement, a connection to every other process, and a task that
+//! reads it.
 
 use std::{
     cell::RefCell,
@@ -10,7 +12,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew_figures::process::say_there;
+use sinew_figures::process::print_ready;
 use tokio::{
     net::{TcpListener, TcpStream},
     task::LocalSet,
@@ -19,7 +21,7 @@ use tokio::{
 
 use crate::crowd::{PACKET, Seen, Share, WARM_UP, hand_over};
 
-/// A packet with whether it goes back, and when it was sent.
+/// A frame: a packet with its direction and its send time.
 const FRAME: usize = 9 + PACKET;
 const THERE: u8 = 1;
 const BACK: u8 = 2;
@@ -32,13 +34,13 @@ struct Member {
 
 type Shared = Rc<RefCell<Member>>;
 
-/// One of them, in a process of its own: hands over what it has seen.
+/// One member, in its own process: writes its results to the standard output.
 pub(crate) fn member(share: Share, port: u16) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a reactor");
     LocalSet::new().block_on(&runtime, run(share, port));
 }
 
-/// Where the n-th one listens.
+/// The address of member `index`.
 const fn address(index: usize, port: u16) -> SocketAddrV4 {
     SocketAddrV4::new(Ipv4Addr::new(127, 0, 1, index as u8 + 1), port)
 }
@@ -50,7 +52,7 @@ async fn run(share: Share, port: u16) {
     for other in 0..index {
         others.push(TcpStream::connect(address(other, port)).await.expect("it was there before"));
     }
-    say_there();
+    print_ready();
     while others.len() < count - 1 {
         others.push(listener.accept().await.expect("one that comes later").0);
     }
@@ -88,26 +90,27 @@ fn now_ns(member: &Member) -> u64 {
     u64::try_from(member.clock.elapsed().as_nanos()).expect("a bench does not last for centuries")
 }
 
-/// Writes a packet. One that has no room, or whose receiver has ended, is missing among the times.
+/// Writes a packet. If there is no room, or the receiver has ended, the packet is missing among the times.
 fn write(to: &TcpStream, kind: u8, sent_ns: u64) {
     let mut frame = [7; FRAME];
     frame[0] = kind;
     frame[1..9].copy_from_slice(&sent_ns.to_le_bytes());
     match to.try_write(&frame) {
         Ok(FRAME) => {}
-        // The next one would be taken for the rest of it, and what is measured would be of nothing.
+        // The next packet would be parsed as its remainder, and the results would be meaningless.
         Ok(written) => fail(&format!("only {written} of {FRAME} bytes had room: a member is too slow")),
         Err(error) if is_missing(error.kind()) => {}
         Err(error) => fail(&format!("a packet cannot be written: {error}")),
     }
 }
 
-/// Whether nobody gets the packet, and all goes on.
+/// Whether the packet is lost without ending the measurement.
 const fn is_missing(error: ErrorKind) -> bool {
     matches!(error, ErrorKind::WouldBlock | ErrorKind::BrokenPipe | ErrorKind::ConnectionReset)
 }
 
-/// Ends this process, not the task alone: whoever started it misses what was seen, and takes it for failed.
+/// Ends this process, not only the task: the parent process notices the missing results, and reports a
+/// failure.
 fn fail(words: &str) -> ! {
     eprintln!("raw_member: {words}");
     std::process::exit(1)

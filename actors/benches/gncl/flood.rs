@@ -1,4 +1,5 @@
-//! Packets one way, as fast as they go, until the last one is there: confirmed, unconfirmed, and through bare TCP.
+//! One-way packets as fast as possible, until the last one has arrived: confirmed, unconfirmed, and over bare
+//! TCP.
 
 use std::{
     collections::VecDeque,
@@ -15,7 +16,7 @@ use sinew::{
 };
 use sinew_figures::{
     Alone, Figures, Pinning,
-    process::{Process, await_end, say_there},
+    process::{Process, await_end, print_ready},
     stream,
 };
 
@@ -27,14 +28,15 @@ use crate::{
 
 /// Bytes of a packet.
 const PACKET: usize = 1000;
-/// Confirmed packets that are under way at most: as many as a mailbox holds of which nothing was said.
+/// Maximum number of confirmed packets in flight: the number of messages without an outcome that a mailbox
+/// holds.
 const UNDER_WAY: usize = 256;
-/// Packets that bare TCP gets in one write, where it gets many.
+/// Number of packets per write over bare TCP in the batched case.
 const TOGETHER: usize = 32;
 /// How long the sender waits when there is no room.
 const PAUSE: Duration = Duration::from_micros(100);
 
-/// What carries the packets.
+/// The carrier of the packets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Carrier {
     /// Bulk, with an outcome for each packet.
@@ -102,7 +104,8 @@ pub(crate) fn measure(carrier: Carrier, packets: usize, pinning: Pinning, is_sec
         .report();
 }
 
-/// How long all of them take to the process of this role, which is the [`sink`] at the second address.
+/// Returns the time until all packets have reached the process of this role, which is the [`sink`] at the
+/// second address.
 pub(crate) fn run(carrier: Carrier, packets: usize, at: At, role: &str) -> Duration {
     match carrier {
         Carrier::Confirmed | Carrier::Unconfirmed => between_nodes(carrier, packets, at, role),
@@ -111,14 +114,14 @@ pub(crate) fn run(carrier: Carrier, packets: usize, at: At, role: &str) -> Durat
     }
 }
 
-/// The end that takes them.
+/// The receiving end.
 pub(crate) fn sink(carrier: Carrier, packets: usize, at: At) {
     if matches!(carrier, Carrier::Tcp | Carrier::TcpTogether) {
         return raw_sink(packets);
     }
     let app = AppSpec::new("sink", move || Sink { left: packets }).handles::<Packet>().own_thread();
     let _node = keys::node(at, "sink").app(app).start().expect("a node");
-    say_there();
+    print_ready();
     await_end();
 }
 
@@ -238,7 +241,7 @@ fn raw_sink(packets: usize) {
     let stream = UnixStream::from(stream::input());
     let mut reader = BufReader::with_capacity(64 * 1024, &stream);
     let (mut length, mut packet) = ([0; 4], vec![0; PACKET]);
-    say_there();
+    print_ready();
     for _ in 0..packets {
         reader.read_exact(&mut length).expect("the sender lives");
         let length = u32::from_le_bytes(length) as usize;

@@ -27,12 +27,12 @@ use crate::nodes::At;
 pub(crate) const FIRST: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 1);
 pub(crate) const SECOND: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 2);
 
-/// Where the keys of the run at this place are, if its nodes have any: the place is this run's own.
+/// The directory for the keys of this run. Its name contains the run's own port.
 fn directory_of(at: At) -> PathBuf {
     std::env::temp_dir().join(format!("sinew-bench-keys-{}", at.port()))
 }
 
-/// A node there that finds nobody else, with its keys, if they were made.
+/// Returns a node at `at` that finds no other node, with its keys if they exist.
 pub(crate) fn node(at: At, name: &str) -> NodeBuilder {
     let directory = directory_of(at).join(name);
     at.node(name).configure(|config| config.security.keys = directory.exists().then_some(directory))
@@ -94,7 +94,7 @@ impl Keys {
 
 impl Drop for Keys {
     fn drop(&mut self) {
-        // What is left is in the system's directory for temporary files.
+        // Remaining files are in the system's directory for temporary files.
         let _ = fs::remove_dir_all(&self.directory);
     }
 }
@@ -109,7 +109,8 @@ fn put(directory: &Path, name: &str, mode: u32, text: &str) -> io::Result<()> {
     fs::set_permissions(&path, Permissions::from_mode(mode))
 }
 
-/// How long both ends of a TCP connection over loopback take to prove who they are, each on a thread of its own.
+/// Measures the time until both ends of a TCP connection over loopback have authenticated each other, each on
+/// its own thread.
 pub(crate) fn measure_handshakes(count: usize) {
     let at = Ipv4Addr::LOCALHOST;
     let keys = Keys::make(At::loopback(), &[("hip", at), ("knee", at)]);

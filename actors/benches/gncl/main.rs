@@ -1,31 +1,40 @@
-//! What messages between two nodes cost: round trips, floods, crowds of nodes, and one class beside another.
+//! The cost of messages between two nodes: round trips, floods, many nodes, and one class beside another.
 //!
-//! `cargo bench -p sinew --bench gncl [-- [--short] WORD...]` runs the cases whose name holds every WORD, in fresh processes, a
-//! node in each. JSON lines are on the standard output, a table on the standard error. Times are microseconds, there and
-//! back. Nothing here asserts a time. `--short` does a tenth.
+//! `cargo bench -p sinew --bench gncl [-- [--short] WORD...]` runs the cases that have every WORD in their
+//! names, in fresh processes, each with one node. The standard output has JSON lines, the standard error a
+//! table. Times are microseconds per round trip. Nothing here asserts a time. `--short` runs a tenth.
 //!
-//! - `rounds-THREAD-BYTES-PACE-CPUS`: round trips of 8 B, 64 B, 1000 B, 64 KiB and 1 MB in class Control, back to back and one
-//!   every millisecond, between applications on their nodes' IO threads (also with `gncl.spin`) or on threads of their own; beside blocking TCP.
-//!   `sleeps` is how often a thread of either process went to sleep for each message, which another one had to end.
-//! - `flood-CARRIER-CPUS`: packets of 1000 bytes in class Bulk one way, as fast as they go, confirmed or not, and through bare
-//!   TCP, with a write for each and with one for 32.
-//! - `secured-rounds-..`, `secured-flood-..`: the same between nodes with keys (TLS 1.3), beside nodes without; `secured-handshake`: how long it takes until
-//!   both ends of a connection know who is there.
-//! - `table_2-N`: the paper's test, every node to every other one, 1000 bytes with a full echo, 3, 8 and 16 nodes at 2,000 round
-//!   trips a second together; `cpu_ns_each_message` is what all processes needed by what arrived, `sleeps_each_1000_messages` how often a thread of theirs
-//!   went to sleep. `table_2_raw_tcp-N`: the same by bare TCP, one thread a process.
-//! - `idle-N`: so many nodes that know each other and have nothing to do.
-//! - `control_beside_bulk_N`: round trips of 64 bytes in class Control, one every millisecond: first alone, then beside a
-//!   flood of Bulk messages of N bytes to another application of the other node, as fast as they are taken. What counts is the
-//!   p99 beside the flood by the p99 alone (`p99_ratio_percent`). Then bare TCP: a connection beside another one on which as many bytes are written at once.
-//! - `control_beside_slow_consumer`: the same between nodes, and the application that is flooded takes a millisecond for each of its messages.
-//! - `stream_by_WAY-CHANNELS`: values of class Stream one way, one every millisecond on each of 1, 16 and 64 channels, by datagrams and by the connection
-//!   (`gncl.datagrams`): how old they are when they are handled. `cpu_ns_each_value` is what both processes needed, `acks_per_s` what this host sent of datagrams beside the
-//!   values that were handled (acknowledgements, repetitions, a few of NDL's). `superseded` are counted values that did not come; `superseded_on_the_way_with_warm_up` and
-//!   `superseded_in_mailboxes_with_warm_up` say where newer ones took their place, of all that were sent. `--bench stream_allocations` counts what memory is asked for.
-//! - `rest_raw_tcp`: the first 1000 bytes after a rest by bare TCP, on a connection that stays open and on one that is dialled and greeted for them.
-//! - `slow_link`: the same as `control_beside_bulk_1000`, and bare TCP, on two hosts with a link of 10 Mbit/s between them
-//!   (network namespaces: needs root, `ip` and `tc`); `slow_link_priorities`: the hosts send by priority what waits.
+//! - `rounds-THREAD-BYTES-PACE-CPUS`: round trips of 8 B, 64 B, 1000 B, 64 KiB and 1 MB in class Control,
+//!   back to back and one every millisecond. The applications are on their nodes' IO threads (also with
+//!   `gncl.spin`) or on their own threads. The reference is blocking TCP. `sleeps` is the number of sleeps of
+//!   a thread of either process per message that another thread had to end.
+//! - `flood-CARRIER-CPUS`: one-way packets of 1000 bytes in class Bulk, as fast as possible, confirmed or
+//!   not, and over bare TCP, with one write for each packet and one for 32.
+//! - `secured-rounds-..`, `secured-flood-..`: the same between nodes with keys (TLS 1.3), beside nodes
+//!   without. `secured-handshake`: the time until both ends of a connection have authenticated each other.
+//! - `table_2-N`: the paper's test. Every node sends 1000 bytes to every other one with a full echo: 3, 8 and
+//!   16 nodes, together 2,000 round trips a second. `cpu_ns_each_message` is the CPU time of all processes
+//!   per received message, `sleeps_each_1000_messages` the number of sleeps of their threads.
+//!   `table_2_raw_tcp-N`: the same over bare TCP, one thread per process.
+//! - `idle-N`: N connected nodes without traffic.
+//! - `control_beside_bulk_N`: round trips of 64 bytes in class Control, one every millisecond, first alone.
+//!   Then they run beside a flood of N-byte Bulk messages to another application of the other node, as fast
+//!   as it takes them. The result is the p99 beside the flood divided by the p99 alone (`p99_ratio_percent`).
+//!   The reference is bare TCP: a connection beside another one on which as many bytes are written at once.
+//! - `control_beside_slow_consumer`: the same between nodes, and the flooded application takes a millisecond
+//!   for each message.
+//! - `stream_by_WAY-CHANNELS`: one-way values of class Stream, one every millisecond on each of 1, 16 and 64
+//!   channels, by datagrams and by the connection (`gncl.datagrams`). The result is the age of values when
+//!   they are handled. `cpu_ns_each_value` is the CPU time of both processes per value. `acks_per_s` counts
+//!   the datagrams that this host sent besides the handled values (acknowledgements, retransmissions, a few
+//!   of NDL's). `superseded` counts measured values that did not arrive. `superseded_on_the_way_with_warm_up`
+//!   and `superseded_in_mailboxes_with_warm_up` state where newer ones replaced them, over all sent values.
+//!   `--bench stream_allocations` counts memory allocations.
+//! - `rest_raw_tcp`: the first 1000 bytes after a pause over bare TCP, on an open connection and on a new one
+//!   with a handshake.
+//! - `slow_link`: the same as `control_beside_bulk_1000`, and bare TCP, on two hosts with a link of 10 Mbit/s
+//!   between them (network namespaces: needs root, `ip` and `tc`). `slow_link_priorities`: the hosts send
+//!   queued packets by priority.
 
 mod beside;
 mod beside_raw;
@@ -49,7 +58,7 @@ use std::{
 };
 
 use sinew_figures::{Asked, Beside, End, Pace, Pinning, Rounds, process};
-use sinew_hosts::Queue;
+use sinew_testkit::Queue;
 
 use crate::{
     crowd::{By, Share},
@@ -59,7 +68,7 @@ use crate::{
     stream_ends::{By as Way, Plan},
 };
 
-/// What is measured.
+/// A measurement.
 #[derive(Clone, Copy, Debug)]
 enum Case {
     Rounds {
@@ -79,7 +88,7 @@ enum Case {
         /// Round trips of all together, a second.
         rate: u64,
     },
-    /// How many bytes a message of the flood has, and how long whoever takes them takes for each.
+    /// The size of a flood message, and the time that its receiver takes for each.
     Beside {
         name: &'static str,
         bulk_bytes: usize,
@@ -88,7 +97,7 @@ enum Case {
     },
     /// Values of class Stream.
     Stream(Plan),
-    /// First messages after a rest, so many of each sort.
+    /// First messages after a pause: this number of each kind.
     Rest(u64),
     SlowLink(Queue),
     /// Between nodes with keys, beside nodes without.
@@ -202,7 +211,7 @@ impl Case {
                 let at = At::loopback();
                 let _other = process::Process::start(&format!("beside_echo {pause_us} {}", at.host(2)));
                 beside::measure(name, at, bulk_bytes, rounds);
-                // A stream whose other end takes a message a millisecond is no reference: it stands still.
+                // No reference here: a TCP stream stalls if its reader takes a message a millisecond.
                 if pause_us == 0 {
                     let raw = SocketAddrV4::new(Ipv4Addr::LOCALHOST, at.port());
                     let _other = process::Process::start(&format!("beside_raw_echo {raw}"));
@@ -260,7 +269,7 @@ impl Secured {
     }
 }
 
-/// What a message carries, and how round trips follow each other.
+/// The payload sizes, and the pace of their round trips.
 fn payloads(is_short: bool) -> Vec<(usize, Pace)> {
     let mut payloads = vec![(1000, Pace::BackToBack), (1000, Pace::EveryMillisecond)];
     if !is_short {
@@ -283,7 +292,7 @@ fn main() -> ExitCode {
     if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
-/// Plays the part that another process of this program gave this one.
+/// Runs the role that another process of this program assigned to this one.
 fn play(role: &str) -> ExitCode {
     let words: Vec<&str> = role.split(' ').collect();
     match words[..] {

@@ -1,4 +1,4 @@
-//! Where the nodes of a case are.
+//! The addresses of the nodes of a case.
 
 use std::{
     fmt::{Display, Formatter, Result},
@@ -38,7 +38,7 @@ impl At {
         self.on(Ipv4Addr::new(a, b, c, number))
     }
 
-    /// A node there that finds nobody else.
+    /// Returns a node at this address that finds no other node.
     pub(crate) fn node(self, name: &str) -> NodeBuilder {
         Node::builder(name).address(self.address).configure(|config| {
             config.ndl.interface = self.address.into();
@@ -47,7 +47,7 @@ impl At {
         })
     }
 
-    /// What [`Display`] wrote.
+    /// Parses the text of [`Display`].
     pub(crate) fn read(words: &str) -> Self {
         let parts = words.split_once('@').and_then(|(address, group)| {
             Some(Self { address: address.parse().ok()?, group: group.parse().ok()? })

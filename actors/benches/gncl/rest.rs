@@ -1,4 +1,4 @@
-//! The first message after a rest by bare TCP: on a connection that has stayed open, and on one that is dialled for it.
+//! The first message after a pause over bare TCP: on a connection that has stayed open, and on a new one.
 
 use std::{
     io::{Read, Write},
@@ -7,19 +7,20 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew_figures::{Alone, Figures, process::say_there};
+use sinew_figures::{Alone, Figures, process::print_ready};
 
-/// What passes before each message; the connection that stays rests twice as long.
+/// Pause before each message; the connection that stays open pauses twice as long.
 const REST: Duration = Duration::from_millis(100);
 /// Bytes of a message.
 const MESSAGE: usize = 1000;
-/// Bytes of what two nodes say before the first message: HELLO, and WELCOME back.
+/// Bytes of the handshake of two nodes before the first message: HELLO, and WELCOME back.
 const HELLO: usize = 200;
 
-/// Sends back what comes, until this process is ended: on the first connection, which stays, by a thread of its own, and on one further one after the other.
+/// Echoes data until this process is ended. A thread of its own serves the first connection, which stays
+/// open; further ones are served one after the other.
 pub(crate) fn echo(address: SocketAddrV4) {
     let listener = TcpListener::bind(address).expect("a free port");
-    say_there();
+    print_ready();
     let (stays, _) = listener.accept().expect("the measuring end");
     thread::spawn(move || send_back(&stays));
     listener.incoming().for_each(|connection| send_back(&connection.expect("a descriptor")));

@@ -5,7 +5,7 @@ use std::time::Duration;
 use sinew::prelude::*;
 use sinew_figures::{
     Beside, Figures, Pinning, Rounds,
-    process::{self, Process, await_end, say_there},
+    process::{self, Process, await_end, print_ready},
     stream,
 };
 
@@ -15,15 +15,15 @@ use crate::{
     ping::{self, DEADLINE},
 };
 
-/// How long a thread that spins looks: longer than the pause of round trips that are paced.
+/// Poll duration of a spinning thread: longer than the pause of paced round trips.
 const SPIN: Duration = Duration::from_millis(2);
 
-/// Where the two applications live.
+/// The placement of the two applications.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Thread {
     /// On the IO threads of their nodes.
     Io,
-    /// The same, and these look for a while before they sleep.
+    /// The same, and these threads poll for a while before they sleep.
     IoSpin,
     /// On threads of their own.
     Own,
@@ -47,7 +47,7 @@ impl Thread {
         found.expect("a name that this program wrote itself")
     }
 
-    /// Who looks without sleeping needs the other one to have another CPU.
+    /// A thread that polls without sleeping needs a different CPU than its peer.
     pub(crate) fn spins(self) -> bool {
         self == Self::IoSpin
     }
@@ -107,7 +107,7 @@ pub(crate) fn measure(thread: Thread, rounds: Rounds, pinning: Pinning) {
     .report();
 }
 
-/// What is measured, and how often a thread of either process went to sleep for each message.
+/// Runs the measurement, and counts the sleeps of a thread of either process per message.
 fn counting_sleeps(other: &Process, rounds: Rounds, measure: impl FnOnce() -> Figures) -> (Figures, f64) {
     let sleeps = || process::sleeps() + other.sleeps();
     let before = sleeps();
@@ -129,7 +129,7 @@ fn between_nodes(at: At, thread: Thread, rounds: Rounds, pinning: Pinning) -> (F
 /// The node that echoes, until its input ends.
 pub(crate) fn echo(thread: Thread, at: At) {
     let _node = thread.node("echo", at).app(thread.place(ping::echo())).start().expect("a node");
-    say_there();
+    print_ready();
     await_end();
 }
 

@@ -1,23 +1,25 @@
-//! Two hosts with a link of 10 Mbit/s between them: Control beside Bulk, and a bare TCP connection beside another one.
+//! Two hosts with a link of 10 Mbit/s between them: Control beside Bulk, and a bare TCP connection beside
+//! another one.
 
 use std::net::SocketAddrV4;
 
 use sinew_figures::process::{self, Process};
-use sinew_hosts::{Host, Hosts, Queue};
+use sinew_testkit::{Host, Hosts, Queue};
 
 use crate::{beside, beside_raw, nodes::At};
 
-/// What a link carries in a second.
+/// Rate of the link.
 const KBIT_PER_S: u32 = 10_000;
 const PORT: u16 = 20_000;
 /// Round trips without and with the flood.
 const ROUNDS: u64 = 1_000;
-/// Of bare TCP: alone, and beside the flood, in whose line each waits.
+/// Round trips of bare TCP: alone, and beside the flood, where each waits in its queue.
 const ROUNDS_OF_RAW: [u64; 2] = [ROUNDS, ROUNDS / 4];
 /// Bytes of a message of the flood.
 const FLOODED: usize = 1000;
 
-/// Makes the hosts, and runs both on them; says why where that is not possible. Returns whether what ran went well.
+/// Creates the hosts, and runs both measurements on them; reports the reason if that is not possible. Returns
+/// whether all completed runs went well.
 pub(crate) fn measure(case: &str, queue: Queue) -> bool {
     let hosts = Hosts::new(2).and_then(|hosts| hosts.throttle(KBIT_PER_S, queue).map(|()| hosts));
     let hosts = match hosts {

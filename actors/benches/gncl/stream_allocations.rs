@@ -1,7 +1,8 @@
-//! What memory is asked for per value of class Stream, by datagrams and by the connection, at both ends together.
+//! Memory allocations per value of class Stream, by datagrams and by the connection, at both ends together.
 //!
-//! `cargo bench -p sinew --bench stream_allocations [-- --short]`: two nodes in this process, whose allocator counts; so no times. JSON lines are on
-//! the standard output. Half a second passes before anything is counted.
+//! `cargo bench -p sinew --bench stream_allocations [-- --short]` runs two nodes in this process with a
+//! counting allocator, so it measures no times. The standard output has JSON lines. Counting starts after
+//! half a second.
 
 mod stream_ends;
 

@@ -1,4 +1,4 @@
-//! Who gives a value of class Stream to each channel every millisecond, and who takes them.
+//! The sender of a value of class Stream on each channel every millisecond, and its receiver.
 
 use std::{
     sync::{
@@ -12,9 +12,9 @@ use serde::{Deserialize, Serialize};
 use sinew::{Time, prelude::*};
 use sinew_figures::Figures;
 
-/// From one value of a channel to the next.
+/// Period of a channel's values.
 pub(crate) const PERIOD: Duration = Duration::from_millis(1);
-/// Values of each channel before any is counted: datagrams are used once one was answered.
+/// Uncounted values of each channel at the start: datagrams are used after the first one was acknowledged.
 const WARM_UP: u64 = 500;
 
 /// How values go.
@@ -37,7 +37,7 @@ impl By {
     }
 }
 
-/// How much goes, and how.
+/// The number of values, and their transport.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Plan {
     pub(crate) by: By,
@@ -64,15 +64,15 @@ impl Plan {
 /// Counters of the process or the host, which only grow.
 pub(crate) type Meter = fn() -> [u64; 3];
 
-/// What one end has seen.
+/// The results of one end.
 pub(crate) struct Seen {
-    /// How old values were when they were handled; of who gives them none.
+    /// Ages of values when they were handled; empty at the sender.
     pub(crate) ages: Figures,
     /// How far the meter went on meanwhile.
     pub(crate) counted: [u64; 3],
 }
 
-/// What the meter has counted, from when it is made.
+/// Counts of the meter since its creation.
 struct Metered {
     meter: Meter,
     began: [u64; 3],
@@ -131,7 +131,7 @@ impl Giver {
         }
         for to in &self.to {
             let sent_ns = Time::now().as_nanos();
-            // What is refused is missing among those that came.
+            // A refused value is missing among the received ones.
             let _ = context.send(*to, &Angles { number: self.number, sent_ns, joints: [0.5; 4] });
         }
         self.number += 1;
@@ -144,7 +144,7 @@ impl Giver {
     }
 }
 
-/// What all channels have taken.
+/// The received values of all channels.
 struct Taken {
     plan: Plan,
     meter: Meter,
@@ -182,12 +182,13 @@ impl Handler<Delivery<Angles>> for Taker {
     type Result = ();
 
     fn handle(&mut self, angles: Delivery<Angles>, _: &mut Self::Context) {
-        // All of them are on one thread.
+        // All receivers are on one thread.
         self.0.lock().unwrap_or_else(PoisonError::into_inner).take(&angles.payload);
     }
 }
 
-/// This node as the one that takes them, each channel an application on its IO thread, and what it has seen when each has its last value.
+/// Runs this node as the receiver: each channel is an application on its IO thread. Its results are complete
+/// when each channel has its last value.
 pub(crate) fn taker(plan: Plan, node: NodeBuilder, meter: Meter) -> (Node, Receiver<Seen>) {
     let (done, seen) = sync_channel(1);
     let taken = Taken { plan, meter, metered: None, ages: Figures::new(), ended: 0, done };
@@ -200,7 +201,7 @@ pub(crate) fn taker(plan: Plan, node: NodeBuilder, meter: Meter) -> (Node, Recei
     (node.start().expect("a node"), seen)
 }
 
-/// This node as the one that gives them, and what it has seen when it has given the last one.
+/// Runs this node as the sender. Its results are complete when the last value is sent.
 pub(crate) fn giver(plan: Plan, node: NodeBuilder, meter: Meter) -> (Node, Receiver<Seen>) {
     let (done, seen) = sync_channel(1);
     let make = move || Giver { plan, to: Vec::new(), number: 0, meter, metered: None, done: done.clone() };

@@ -1,4 +1,4 @@
-//! What values of class Stream cost, by datagrams and by the connection: a node gives them, another one takes them.
+//! The cost of values of class Stream, by datagrams and by the connection, from one node to another.
 
 use std::time::Duration;
 
@@ -6,7 +6,7 @@ use rustix::time::{ClockId, clock_gettime};
 use sinew::{Node, audit::Place};
 use sinew_figures::{
     Alone, Figures,
-    process::{self, Process, say_there},
+    process::{self, Process, print_ready},
 };
 
 use crate::{
@@ -25,7 +25,7 @@ fn meter() -> [u64; 3] {
     [u64::try_from(cpu.as_nanos()).unwrap_or(u64::MAX), process::sleeps(), datagrams()]
 }
 
-/// Datagrams that this host has sent so far; 0 where it does not say.
+/// Datagrams that this host has sent so far; 0 if the system does not report them.
 fn datagrams() -> u64 {
     let snmp = std::fs::read_to_string("/proc/net/snmp").unwrap_or_default();
     let mut lines = snmp.lines().filter(|line| line.starts_with("Udp:"));
@@ -34,7 +34,8 @@ fn datagrams() -> u64 {
     pairs.find(|(name, _)| *name == "OutDatagrams").and_then(|(_, count)| count.parse().ok()).unwrap_or(0)
 }
 
-/// Values that newer ones took the place of at a node, from its start on: on the way to the other node, and in mailboxes.
+/// Values that newer ones replaced at a node since its start: in its send queue to the other node, and in
+/// mailboxes.
 fn superseded(node: &Node) -> [u64; 2] {
     let mut superseded = [0; 2];
     for entry in node.handle().audit_here().entries {
@@ -52,10 +53,10 @@ fn superseded(node: &Node) -> [u64; 2] {
     superseded
 }
 
-/// The node that takes them, in a process of its own: hands over what it has seen.
+/// The receiving node, in its own process: writes its results to the standard output.
 pub(crate) fn take(plan: Plan, at: At) {
     let (node, seen) = taker(plan, at.node("there"), meter);
-    say_there();
+    print_ready();
     let Seen { ages, counted: [cpu_ns, sleeps, _] } =
         seen.recv_timeout(DEADLINE).expect("the last ones come");
     let [_, in_mailboxes] = superseded(&node);

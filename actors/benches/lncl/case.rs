@@ -1,4 +1,4 @@
-//! The cases: by which way, what, on which CPUs, how often; and the roles of the processes that take part.
+//! The cases: transport, measurement, CPUs and counts; and the roles of the participating processes.
 
 use std::process::ExitCode;
 
@@ -56,7 +56,7 @@ impl Way {
         }
     }
 
-    /// Who looks without sleeping needs the other one to have another CPU.
+    /// An endpoint that polls without sleeping needs a different CPU than its peer.
     const fn spins(self) -> bool {
         match self {
             Self::Socket | Self::Ring | Self::Direct | Self::TaskRing | Self::TaskDirect => false,
@@ -73,7 +73,7 @@ impl Way {
     }
 }
 
-/// What a way is measured beside.
+/// The reference of a transport.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Reference {
     BareFutex,
@@ -93,14 +93,14 @@ impl Reference {
     }
 }
 
-/// What is measured.
+/// A measurement.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum What {
     RoundTrips {
         bytes: usize,
         pace: Pace,
     },
-    /// Round trips of what is written in the ring, beside those of what is copied into it.
+    /// Round trips of payloads written in the ring, beside payloads copied into it.
     Loan {
         bytes: usize,
     },
@@ -111,7 +111,7 @@ enum What {
     Flood,
 }
 
-/// One way, one thing to measure, some CPUs.
+/// A case: one transport, one measurement, one CPU assignment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Case {
     way: Way,
@@ -142,7 +142,7 @@ pub(crate) fn all(is_short: bool) -> impl Iterator<Item = Case> {
         .filter(|case| !case.way.is_of_tasks() || matches!(case.what, What::RoundTrips { .. }))
         // A socket lends nothing.
         .filter(|case| !(matches!(case.what, What::Loan { .. }) && case.way == Way::Socket))
-        // In C++ there is the default way alone.
+        // The C++ case exists for the default transport only.
         .filter(|case| case.what != What::TableOneCpp || case.way == Way::Ring)
 }
 
@@ -294,7 +294,7 @@ impl Case {
     }
 }
 
-/// Plays the part that another process of this program gave this one.
+/// Runs the role that another process of this program assigned to this one.
 pub(crate) fn play(role: &str) -> ExitCode {
     let words: Vec<&str> = role.split(' ').collect();
     match words[..] {
@@ -367,7 +367,7 @@ fn reference_named(name: &str) -> Reference {
     found.expect("a name that this program wrote itself")
 }
 
-/// The words by which another process plays this way's part.
+/// Returns the text that starts another process in this role.
 pub(crate) fn role(part: &str, way: Way, pinning: Pinning, socket: &str) -> String {
     format!("{part} {} {} {socket}", way.name(), pinning.name())
 }

@@ -1,4 +1,4 @@
-//! Many messages at once: eight senders to one, and as many as go through.
+//! Many messages at once: eight senders to one receiver, and maximum throughput.
 
 use std::{
     thread,
@@ -7,7 +7,7 @@ use std::{
 
 use sinew_figures::{
     Figures, Pinning,
-    process::{Process, say_there},
+    process::{Process, print_ready},
 };
 use sinew_runtime::{time::Time, wire::Kind};
 
@@ -18,11 +18,11 @@ use crate::{
 
 /// Bytes of a packet.
 pub(crate) const PACKET: usize = 1000;
-/// Packets of a flood that are under way at most.
+/// Maximum number of packets of a flood in flight.
 pub(crate) const WINDOW: u64 = 128;
-/// Packets of a flood that are answered together.
+/// Number of packets of a flood that are acknowledged together.
 pub(crate) const ANSWERED_EACH: u64 = 32;
-/// Processes that send to one.
+/// Number of sending processes.
 pub(crate) const SENDERS: usize = 8;
 
 const BLOCK: Kind = Kind::named("lncl.block");
@@ -54,7 +54,7 @@ impl Ages {
     }
 }
 
-/// Sends so many packets, one every millisecond on a grid.
+/// Sends this number of packets, one every millisecond on a fixed grid.
 pub(crate) fn paced(packets: u64, mut send: impl FnMut()) {
     let mut next = Instant::now();
     for _ in 0..packets {
@@ -64,14 +64,14 @@ pub(crate) fn paced(packets: u64, mut send: impl FnMut()) {
     }
 }
 
-/// The ages of what eight processes send to one, and how many never came.
+/// Ages of the packets that eight processes send to one, and the number of lost packets.
 pub(crate) fn fan_in(way: Way, packets: u64, pinning: Pinning) -> (Figures, u64) {
     let home = Home::start(pinning);
     let mut endpoint = register(way, home.socket(), "sink");
     let role = format!("{} {packets}", role("sender", way, pinning, home.socket()));
     let senders: Vec<_> = (0..SENDERS).map(|_| Process::start(&role)).collect();
     let expected = packets * SENDERS as u64;
-    // Each has sent its first one, which asks to begin: now that all are there, they may.
+    // Each sender has sent its first packet, a request to start. All are there now, so they may start.
     let mut waiting = Vec::new();
     while waiting.len() < SENDERS {
         let asks = endpoint.receive(DEADLINE).expect("the node lives").expect("the senders are there");
@@ -91,10 +91,10 @@ pub(crate) fn fan_in(way: Way, packets: u64, pinning: Pinning) -> (Figures, u64)
     (figures, lost)
 }
 
-/// One sender of the eight.
+/// One of the eight senders.
 pub(crate) fn send(way: Way, socket: &str, packets: u64) {
     let mut endpoint = register(way, socket, &format!("sender-{}", std::process::id()));
-    say_there();
+    print_ready();
     let sink = endpoint.resolve("sink", DEADLINE).expect("the node lives").expect("it is registered");
     let asks = endpoint.create_message(sink, BEGIN, 1).expect("short");
     endpoint.loaned(asks).send().expect("the node takes it");
@@ -138,7 +138,7 @@ pub(crate) fn flood(way: Way, packets: u64, pinning: Pinning) -> (Figures, f64) 
 /// The sink of a flood: until the measuring end ends this process.
 pub(crate) fn sink(way: Way, socket: &str) {
     let (mut endpoint, mut taken) = (register(way, socket, "sink"), 0_u64);
-    say_there();
+    print_ready();
     while let Some(packet) = endpoint.receive(DEADLINE).expect("the node lives") {
         taken += 1;
         let source = packet.source();

@@ -9,7 +9,7 @@ use sinew::{
 };
 use sinew_figures::{
     Figures, Pinning, Rounds,
-    process::{Process, await_end, say_there},
+    process::{Process, await_end, print_ready},
 };
 use sinew_runtime::{time::Time, wire::Kind};
 
@@ -20,15 +20,15 @@ use crate::{
 
 /// No wait of this bench is longer.
 pub(crate) const DEADLINE: Duration = Duration::from_secs(20);
-/// How long who looks before he sleeps does so: longer than any round trip.
+/// Poll duration of an endpoint that polls before it sleeps: longer than any round trip.
 const LOOKS: Duration = Duration::from_secs(1);
-/// Bytes of a ring, as a node has them that was told nothing.
+/// Bytes of a ring: the default of a node.
 const RING_BYTES: usize = 256 * 1024;
-/// Bytes of a ring that takes the longest message in one piece.
+/// Bytes of a ring that holds the longest message in one piece.
 const LONG_RING_BYTES: usize = 4 * 1024 * 1024;
-/// What is sent back as it came.
+/// A message that is echoed unchanged.
 pub(crate) const BLOCK: Kind = Kind::named("lncl.block");
-/// What is sent back with its age in its first bytes.
+/// A message that is echoed with its age in its first bytes.
 const AGED: Kind = Kind::named("lncl.aged");
 /// Packets of the paper's Table 1.
 pub(crate) const TABLE_ONE: usize = 1024;
@@ -71,11 +71,11 @@ pub(crate) fn node(socket: &str, ring_bytes: usize) {
         config.ndl.mdns_port = None;
     });
     let _node = node.start().expect("a node");
-    say_there();
+    print_ready();
     await_end();
 }
 
-/// The address called `name`, whose messages go this way.
+/// Registers the address `name` with this transport.
 pub(crate) fn register(way: Way, socket: &str, name: &str) -> Endpoint {
     let registration = match way {
         Way::Socket => Registration::new().transport(Transport::Socket),
@@ -111,7 +111,7 @@ impl Memory {
     }
 }
 
-/// Who creates the messages: the endpoint that sends them, or one that has no ring in which they could lie.
+/// The creator of messages: the endpoint that sends them, or another one without a ring for them.
 struct Maker(Option<Endpoint>);
 
 impl Maker {
@@ -123,7 +123,7 @@ impl Maker {
 /// The application that echoes: until the measuring end ends this process.
 pub(crate) fn echo(way: Way, memory: Memory, socket: &str) {
     let (mut endpoint, mut maker) = (register(way, socket, "echo"), memory.maker(socket));
-    say_there();
+    print_ready();
     while let Some(received) = endpoint.receive(DEADLINE).expect("the node lives") {
         let (to, bytes) = (received.source(), received.bytes());
         let mut back = maker.create(&mut endpoint, to, received.kind(), bytes.len());
@@ -145,7 +145,7 @@ pub(crate) fn become_cpp_echo(socket: &str) {
     panic!("no echo in C++: {}", Command::new(program).arg(socket).exec());
 }
 
-/// The application that measures, and the one that echoes.
+/// The measuring application, and the echoing one.
 struct Pair {
     endpoint: Endpoint,
     to: Tid,
@@ -166,7 +166,7 @@ impl Pair {
         Self { endpoint, to, maker: Maker(None), _echo: echo, _home: home }
     }
 
-    /// Sends `buffer`, and fills it with what comes back.
+    /// Sends `buffer`, and fills it with the reply.
     fn round_trip(&mut self, kind: Kind, buffer: &mut [u8]) {
         let mut block = self.maker.create(&mut self.endpoint, self.to, kind, buffer.len());
         block.copy_from_slice(buffer);
@@ -182,7 +182,8 @@ pub(crate) fn round_trips(way: Way, bytes: usize, rounds: Rounds, pinning: Pinni
     rounds.time(|| pair.round_trip(BLOCK, &mut buffer))
 }
 
-/// The same through rings that take it in one piece, and whether it was written in place.
+/// Runs the same round trips through rings that hold the payload in one piece. Returns also whether it was
+/// written in place.
 pub(crate) fn loans(
     way: Way,
     memory: Memory,

@@ -1,22 +1,26 @@
-//! What a message between two processes of one node costs, beside raw references of the same run.
+//! The cost of a message between two processes of one node, beside raw references of the same run.
 //!
-//! `cargo bench -p sinew --bench lncl [-- [--short] WORD...]` runs the cases whose name holds every WORD, each in fresh
-//! processes: a node, and the two applications in processes of their own, which speak through LNCL (`socket`, `ring`; `task_ring`: as
-//! tasks of tokio) or directly (`direct`, `task_direct`), by the blocking NodeAPI unless they are tasks.
-//! JSON lines are on the standard output, the same as rows of a table on the standard error; `--short` does a tenth of the
-//! rounds of the cases at 1000 bytes. Times are microseconds. Nothing here asserts a time.
+//! `cargo bench -p sinew --bench lncl [-- [--short] WORD...]` runs the cases that have every WORD in their
+//! names, each in fresh processes: a node, and the two applications. The applications communicate through
+//! LNCL (`socket`, `ring`; `task_ring`: as tokio tasks) or directly (`direct`, `task_direct`). They use the
+//! blocking NodeAPI unless they are tasks. The standard output has JSON lines, the standard error the same as
+//! rows of a table. `--short` runs a tenth of the rounds of the cases at 1000 bytes. Times are microseconds.
+//! Nothing here asserts a time.
 //!
 //! - Round trips at 8 B, 64 B, 1000 B, 64 KiB and 1 MiB, back to back and one every millisecond.
-//! - `loan`: the same at 64 KiB and 1 MiB through rings that take them in one piece, written in the ring, beside copied into it.
-//! - `table_1`: the paper's test, 1024 packets of 1000 bytes, one way, the first ones included, beside the same of each reference, and the
-//!   paper's mean of 46.2 us, which is another machine's.
-//!   With the receiver in C++ too if `SINEW_CPP_ECHO` is the path of what `echo.cpp` was compiled to, as in `docs/TESTING.md`.
+//! - `loan`: the same at 64 KiB and 1 MiB through rings that hold them in one piece, written in the ring,
+//!   beside copied into it.
+//! - `table_1`: the paper's test, 1024 one-way packets of 1000 bytes, including the first ones. It is shown
+//!   beside the same for each reference and the paper's mean of 46.2 us, which was measured on another
+//!   machine. The C++ receiver is measured too if `SINEW_CPP_ECHO` is the path of the compiled `echo.cpp`, as
+//!   in `docs/book/src/contributing/testing.md`.
 //! - `fan_in`: eight processes send to one, each 1000 bytes every millisecond, one way.
-//! - `flood`: 1000 bytes as fast as a window of 128 unanswered ones lets it.
+//! - `flood`: 1000 bytes as fast as a window of 128 unacknowledged ones allows.
 //!
-//! Each three times: wherever the scheduler likes, all on one CPU, and one CPU for each application (the node has none of its
-//! own then). References: a hand-written ring in shared memory without any check, woken by a futex or polled
-//! (`sinew_shm::bare`), and a unix stream socket between the two. Other people's middleware: `benches/peers`.
+//! Each case runs three times: placed by the scheduler, all on one CPU, and one CPU for each application (the
+//! node then has none of its own). The references are a hand-written ring in shared memory without any
+//! checks, woken by a futex or polled (`sinew_shm::bare`), and a unix stream socket between the two.
+//! `benches/peers` measures other middleware.
 
 #[cfg(target_os = "linux")]
 mod case;

@@ -1,4 +1,4 @@
-//! The references: bare rings and bare sockets, the same payload the same way.
+//! The references: bare rings and bare sockets, with the same payload and the same roles.
 
 use std::{
     io::{Read, Write},
@@ -12,7 +12,7 @@ use rustix::{
 };
 use sinew_figures::{
     End, Figures, Pinning, Rounds,
-    process::{Process, say_there},
+    process::{Process, print_ready},
     stream,
 };
 use sinew_runtime::time::Time;
@@ -52,7 +52,7 @@ pub(crate) fn echo(reference: Reference, bytes: usize) {
     match reference {
         Reference::BareFutex | Reference::BarePoll => {
             let mut end = bare::End::second(stdin(), bytes, waiting(reference));
-            say_there();
+            print_ready();
             loop {
                 end.receive(&mut buffer);
                 end.send(&buffer);
@@ -86,7 +86,7 @@ pub(crate) fn table_one(reference: Reference, pinning: Pinning) -> Ages {
     }
 }
 
-/// What the other end says of the ages of packets that are sent to it one after the other.
+/// Ages of packets that are sent one after the other, as reported by the other end.
 fn ages(mut round_trip: impl FnMut(&mut [u8])) -> Ages {
     let mut packet = [7; PACKET];
     let ages = (0..TABLE_ONE).map(|_| {
@@ -97,13 +97,13 @@ fn ages(mut round_trip: impl FnMut(&mut [u8])) -> Ages {
     Ages::of(&ages.collect::<Vec<_>>())
 }
 
-/// The end that says how old what it receives is: until the measuring end ends this process.
+/// The end that reports the age of each received packet, until the measuring end ends this process.
 pub(crate) fn aged_echo(reference: Reference) {
     let mut packet = [0; PACKET];
     match reference {
         Reference::BareFutex | Reference::BarePoll => {
             let mut end = bare::End::second(stdin(), PACKET, waiting(reference));
-            say_there();
+            print_ready();
             loop {
                 end.receive(&mut packet);
                 put_age(&mut packet);
@@ -112,7 +112,7 @@ pub(crate) fn aged_echo(reference: Reference) {
         }
         Reference::UnixStream => {
             let mut socket = input();
-            say_there();
+            print_ready();
             while socket.read_exact(&mut packet).is_ok() {
                 put_age(&mut packet);
                 if socket.write_all(&packet).is_err() {
@@ -178,7 +178,7 @@ pub(crate) fn flood(packets: u64, pinning: Pinning) -> f64 {
 /// The sink of a flood: until the measuring end ends this process.
 pub(crate) fn sink() {
     let (mut socket, mut packet, mut taken) = (input(), [0; PACKET], 0_u64);
-    say_there();
+    print_ready();
     while socket.read_exact(&mut packet).is_ok() {
         taken += 1;
         if taken.is_multiple_of(ANSWERED_EACH) && socket.write_all(&taken.to_le_bytes()).is_err() {
@@ -187,7 +187,7 @@ pub(crate) fn sink() {
     }
 }
 
-/// The ages of what eight processes send over a unix stream each.
+/// Ages of the packets that eight processes send, each over its own unix stream.
 pub(crate) fn fan_in(packets: u64, pinning: Pinning) -> Figures {
     let role = format!("raw_sender {packets} {}", pinning.name());
     let (mut sockets, mut senders) = (Vec::new(), Vec::new());
@@ -205,7 +205,7 @@ pub(crate) fn fan_in(packets: u64, pinning: Pinning) -> Figures {
         poll(&mut fds, None).expect("sockets can be polled");
         let mut ready =
             fds.iter().map(|fd| fd.revents().contains(PollFlags::IN)).collect::<Vec<_>>().into_iter();
-        // One that has ended was read to its end.
+        // A sender that has ended was read to its end.
         sockets.retain_mut(|socket| ready.next() != Some(true) || read_packet(socket, &mut figures));
     }
     senders.into_iter().for_each(|sender| drop(sender.wait()));
@@ -222,10 +222,10 @@ fn read_packet(socket: &mut UnixStream, figures: &mut Figures) -> bool {
     is_there
 }
 
-/// One sender of the eight.
+/// One of the eight senders.
 pub(crate) fn send(packets: u64) {
     let (mut socket, mut packet) = (input(), [7; PACKET]);
-    say_there();
+    print_ready();
     socket.read_exact(&mut [0; 2]).expect("the word to begin");
     paced(packets, || {
         stamp(&mut packet);

@@ -1,9 +1,10 @@
-//! Sinew's ends as tasks of tokio, each on a runtime of one thread: the same round trips by `AsyncEndpoint`.
+//! Sinew's endpoints as tokio tasks, each on a runtime with one thread: the same round trips through
+//! `AsyncEndpoint`.
 
 use sinew::{AsyncEndpoint, NodeApi, Registration, Tid, client::LoanedMessage};
 use sinew_figures::{
     Figures, Pinning, Rounds,
-    process::{Process, say_there},
+    process::{Process, print_ready},
 };
 use sinew_runtime::wire::Kind;
 use tokio::runtime::{Builder, Runtime};
@@ -33,7 +34,7 @@ fn filled(endpoint: &mut AsyncEndpoint, to: Tid, kind: Kind, bytes: &[u8]) -> Lo
 pub(crate) fn echo(way: Way, socket: &str) {
     runtime().block_on(async {
         let mut endpoint = register(way, socket, "echo").await;
-        say_there();
+        print_ready();
         loop {
             let received = endpoint.receive().await.expect("the node lives");
             let back = filled(&mut endpoint, received.source(), received.kind(), received.bytes());

@@ -6,7 +6,7 @@ use sinew_figures::{Beside, End, Figures, Pinning, process::Process, stream};
 
 use crate::{raw, rounds, sinew_ends};
 
-/// One path, measured against one reference.
+/// A path with its reference.
 pub(crate) struct Case {
     pub(crate) name: &'static str,
     path: Path,
@@ -16,12 +16,14 @@ pub(crate) struct Case {
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Path {
-    /// Two applications on one thread of one node; reference: actix's own `Addr::send` on one arbiter.
+    /// Two applications on one thread of one node; reference: actix's `Addr::send` on one arbiter.
     SameThread,
-    /// Two applications of one node, a thread each; reference: actix's own `Addr::send` across arbiters.
+    /// Two applications of one node, each on its own thread; reference: actix's `Addr::send` across arbiters.
     TwoThreads,
     /// An application of a node and an endpoint in another process; reference: a raw unix stream.
     TwoProcesses,
+    /// An application of a node and another one in a process of its own; reference: a raw unix stream.
+    OwnProcess,
 }
 
 pub(crate) const CASES: &[Case] = &[
@@ -61,6 +63,12 @@ pub(crate) const CASES: &[Case] = &[
         payload_bytes: 65_536,
         reference: "raw_unix_stream",
     },
+    Case {
+        name: "own_process_1000",
+        path: Path::OwnProcess,
+        payload_bytes: 1000,
+        reference: "raw_unix_stream",
+    },
 ];
 
 /// The measuring end.
@@ -76,6 +84,8 @@ pub(crate) fn measure(name: &str, pinning: &str) {
             (sinew_ends::in_process(bytes, pinning, false), raw::actix_send(bytes, pinning, false))
         }
         Path::TwoProcesses => (two_processes(bytes, pinning), raw_unix(bytes, pinning)),
+        // The process of the application runs this program up to the start of its node, and no reference.
+        Path::OwnProcess => (own_process(bytes, pinning), raw_unix(bytes, pinning)),
     };
     Beside {
         bench: "paths",
@@ -117,4 +127,9 @@ fn two_processes(bytes: usize, pinning: Pinning) -> Figures {
     let path = std::env::temp_dir().join(format!("sinew-paths-lncl-{}", std::process::id()));
     let role = format!("echo endpoint {} {}", pinning.name(), path.display());
     sinew_ends::through_lncl(&path, bytes, || Process::start(&role))
+}
+
+fn own_process(bytes: usize, pinning: Pinning) -> Figures {
+    pinning.pin(End::Measuring);
+    sinew_ends::to_own_process(bytes, pinning)
 }

@@ -1,8 +1,9 @@
-//! Round trips on each path a message can take within one node, beside a raw reference of the same run.
+//! Round trips on each path of a message within one node, beside a raw reference of the same run.
 //!
-//! `cargo bench -p sinew --bench paths [-- WORD...]` prints one JSON line a case, of those whose name holds every WORD. Every case runs in fresh processes,
-//! three times: wherever the scheduler likes, with everything on one CPU, and with one CPU for each end. Times are
-//! microseconds, there and back. Nothing here asserts a time.
+//! `cargo bench -p sinew --bench paths [-- WORD...]` prints one JSON line per case, for the cases that have
+//! every WORD in their names. Every case runs in fresh processes, three times: placed by the scheduler, with
+//! everything on one CPU, and with one CPU for each end. Times are microseconds per round trip. Nothing here
+//! asserts a time.
 
 mod case;
 #[path = "../ping/mod.rs"]
@@ -15,7 +16,7 @@ use std::process::ExitCode;
 use case::{CASES, Case};
 use sinew_figures::{Asked, Pace, Pinning, Rounds, process};
 
-/// The environment variable that says another number: a profile needs more.
+/// The environment variable that sets another number of rounds: a profile needs more.
 const ROUNDS_WANTED: &str = "SINEW_PATHS_ROUNDS";
 
 fn main() -> ExitCode {
@@ -33,7 +34,7 @@ fn main() -> ExitCode {
     if failed { ExitCode::FAILURE } else { ExitCode::SUCCESS }
 }
 
-/// How many round trips of so many bytes.
+/// Returns the round trips of this payload size.
 fn rounds(bytes: usize) -> Rounds {
     let rounds = Rounds::of(bytes, Pace::BackToBack, false);
     let wanted = std::env::var(ROUNDS_WANTED).ok().and_then(|wanted| wanted.parse().ok());

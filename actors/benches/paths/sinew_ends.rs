@@ -5,7 +5,7 @@ use std::path::Path;
 use sinew::{NodeApi, Registration, prelude::*};
 use sinew_figures::{
     End, Figures, Pinning,
-    process::{Process, say_there},
+    process::{Process, print_ready},
 };
 
 use crate::{
@@ -13,7 +13,7 @@ use crate::{
     rounds,
 };
 
-/// A node that nobody else finds.
+/// Returns a node that no other node finds.
 fn alone(name: &str) -> NodeBuilder {
     Node::builder(name).configure(|config| {
         config.ndl.multicast = None;
@@ -21,7 +21,7 @@ fn alone(name: &str) -> NodeBuilder {
     })
 }
 
-/// Two applications of one node.
+/// Measures two applications of one node.
 pub(crate) fn in_process(bytes: usize, pinning: Pinning, same_thread: bool) -> Figures {
     let place = |name: &str, end| match pinning.cpu(end) {
         Some(cpu) => Place::thread(name).on_cpu(cpu),
@@ -48,9 +48,20 @@ pub(crate) fn through_lncl(path: &Path, bytes: usize, start_echo: impl FnOnce() 
     figures
 }
 
+/// An application of a node and another one in a process of its own: this program, started again by the node.
+pub(crate) fn to_own_process(bytes: usize, pinning: Pinning) -> Figures {
+    let (ping, figures) = ping(rounds(bytes));
+    // Its process inherits the CPUs of the measuring end.
+    let there = pinning.cpu(End::Echoing).map_or_else(Place::process, |cpu| Place::process().on_cpu(cpu));
+    let node = alone("paths").app(echo().place(there)).app(ping.on_io_thread()).start().expect("a node");
+    let figures = figures.recv_timeout(DEADLINE).expect("the rounds end");
+    node.stop();
+    figures
+}
+
 /// The endpoint that echoes.
 pub(crate) fn echo_endpoint(at: &str) {
-    say_there();
+    print_ready();
     let api = NodeApi::connect(Path::new(at)).expect("the node's door");
     let mut endpoint = api.register_transport_address(Registration::new().name("echo")).expect("an address");
     loop {

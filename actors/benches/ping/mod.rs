@@ -92,12 +92,12 @@ impl Handler<Delivery<Back>> for Ping {
     }
 }
 
-/// The one that echoes, `echo`.
+/// The echoing application, `echo`.
 pub(crate) fn echo() -> AppSpec<Echo> {
     AppSpec::new("echo", || Echo).handles::<There>()
 }
 
-/// The one that measures, and where its figures come out.
+/// The measuring application, and the channel of its results.
 pub(crate) fn ping(rounds: Rounds) -> (AppSpec<Ping>, Receiver<Figures>) {
     let (done, figures) = sync_channel(1);
     let make = move || Ping {

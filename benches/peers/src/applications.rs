@@ -3,7 +3,7 @@
 use sinew::prelude::*;
 use sinew_figures::{
     Figures, Pinning, Rounds,
-    process::{Process, await_end, say_there},
+    process::{Process, await_end, print_ready},
 };
 
 use crate::{
@@ -26,7 +26,7 @@ pub(crate) fn measure(path: Path, rounds: Rounds, pinning: Pinning) -> Figures {
 /// The node that echoes.
 pub(crate) fn echo(path: Path, at: &str) {
     let _node = At::read(at).node("echo").app(place(path, ping::echo())).start().expect("a node");
-    say_there();
+    print_ready();
     await_end();
 }
 

@@ -1,4 +1,4 @@
-//! A flood: packets of 1000 bytes one way, as fast as they go, until the last one is there.
+//! A flood: one-way packets of 1000 bytes as fast as possible, until the last one has arrived.
 
 use std::{
     process::Stdio,
@@ -8,7 +8,7 @@ use std::{
 
 use sinew_figures::{
     Alone, Figures, Pinning,
-    process::{Process, await_end, command, say_there},
+    process::{Process, await_end, command, print_ready},
 };
 use zenoh::Wait;
 
@@ -21,7 +21,7 @@ use crate::{
 
 /// Bytes of a packet.
 const PACKET: usize = 1000;
-/// The first byte of a packet that counts; another one only says that somebody is there.
+/// The first byte of a counted packet; other packets only announce their sender.
 const COUNTS: u8 = 7;
 /// Runs of each case.
 const RUNS: usize = 5;
@@ -29,8 +29,8 @@ const RUNS: usize = 5;
 /// zenoh's name: reliable, batching as it likes.
 const ZENOH: &str = "zenoh";
 
-/// What carries the packets: TCP with a length before each; zenoh; Sinew from application to application on threads of their
-/// own, each packet confirmed, or none.
+/// The carriers: TCP with a length before each packet; zenoh; Sinew between applications on their own
+/// threads, with each packet confirmed, or none.
 const CARRIERS: [&str; 5] = [
     Carrier::Tcp.name(),
     Carrier::TcpTogether.name(),
@@ -39,7 +39,7 @@ const CARRIERS: [&str; 5] = [
     Carrier::Unconfirmed.name(),
 ];
 
-/// Runs every case whose name holds every word.
+/// Runs every case that has every one of these words in its name.
 pub(crate) fn run(is_short: bool, words: &[String]) {
     let packets = if is_short { 100_000 } else { 1_000_000 };
     sinew_figures::head();
@@ -78,7 +78,7 @@ fn run_one(name: &str, carrier: &str, pinning: Pinning, packets: u64) {
         .report();
 }
 
-/// Sends them, and prints how long that took in all.
+/// Sends them, and prints the total time.
 pub(crate) fn measure(carrier: &str, packets: usize, pinning: Pinning) {
     let role = |at: &str| format!("sink {carrier} {} {packets} {at}", pinning.name());
     let took = if carrier == ZENOH {
@@ -90,7 +90,7 @@ pub(crate) fn measure(carrier: &str, packets: usize, pinning: Pinning) {
     println!("{}", took.as_nanos());
 }
 
-/// Takes them, and answers when the last one is there.
+/// Receives the packets, and answers when the last one has arrived.
 pub(crate) fn sink(carrier: &str, packets: usize, at: &str) {
     if carrier == ZENOH {
         zenoh_sink(packets, at);
@@ -125,6 +125,6 @@ fn zenoh_sink(packets: usize, at: &str) {
             back.put([1]).wait().expect("a session");
         }
     });
-    say_there();
+    print_ready();
     await_end();
 }

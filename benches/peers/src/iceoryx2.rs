@@ -6,7 +6,7 @@ use iceoryx2::{
 };
 use sinew_figures::{
     Figures, Pinning, Rounds,
-    process::{Process, say_there},
+    process::{Process, print_ready},
 };
 
 use crate::{
@@ -29,7 +29,7 @@ pub(crate) fn measure(path: Path, rounds: Rounds, pinning: Pinning) -> Figures {
 /// The other end.
 pub(crate) fn echo(path: Path, bytes: usize, run: &str) {
     let (mut end, mut buffer) = (End::new(run, ["back", "there"], path, bytes), vec![0; bytes]);
-    say_there();
+    print_ready();
     loop {
         end.receive(&mut buffer);
         end.send(&buffer);
@@ -40,7 +40,7 @@ pub(crate) fn echo(path: Path, bytes: usize, run: &str) {
 struct End {
     outward: Publisher<ipc::Service, [u8], ()>,
     inward: Subscriber<ipc::Service, [u8], ()>,
-    /// Whom to wake, and by what to be woken; `None`: both look all the time.
+    /// The notifier of the peer, and the listener for its notifications; `None`: both ends poll continuously.
     bells: Option<(Notifier<ipc::Service>, Listener<ipc::Service>)>,
 }
 

@@ -1,17 +1,20 @@
-//! Sinew beside iceoryx2, zenoh and what the system itself gives, in one harness and one table.
+//! Sinew beside iceoryx2, zenoh and the primitives of the system, in one harness and one table.
 //!
-//! `cargo run --release --manifest-path benches/peers/Cargo.toml [-- --short] [WORD...]` runs the cases whose name holds every
-//! WORD. Each path is measured in fresh processes, one after the other, right behind the bare path that is its reference: the
-//! rows of one payload, pace and pinning belong together. JSON lines are on the standard output, the table is on the standard
-//! error; times are microseconds. All traffic stays on the loopback interface.
+//! `cargo run --release --manifest-path benches/peers/Cargo.toml [-- --short] [WORD...]` runs the cases that
+//! have every WORD in their names. Each path is measured in fresh processes, one after the other, directly
+//! after its reference, the bare path. The rows of one payload, pace and pinning belong together. The
+//! standard output has JSON lines, the standard error the table. Times are microseconds. All traffic stays on
+//! the loopback interface.
 //!
-//! On one machine: a bare ring in shared memory woken by a futex (the reference), a unix stream, iceoryx2 woken by its events,
-//! and Sinew's endpoints in two processes with rings through their node, with direct links, and as tasks of tokio. Without
-//! sleeping: a bare ring that is polled (the reference), iceoryx2 polled, and Sinew's direct links that look before they sleep.
-//! Between nodes: blocking TCP (the reference), zenoh's peers over TCP with express publications, and Sinew's applications on
-//! their node's IO thread and on threads of their own.
+//! On one machine: a bare ring in shared memory woken by a futex (the reference), a unix stream, iceoryx2
+//! woken by its events, and Sinew's endpoints in two processes. The latter use rings through their node,
+//! direct links, and tokio tasks. Without sleeping: a polled bare ring (the reference), polled iceoryx2, and
+//! Sinew's direct links that poll before they sleep. Between nodes: blocking TCP (the reference), zenoh's
+//! peers over TCP with express publications, and Sinew's applications. These are on their node's IO thread
+//! and on their own threads.
 //!
-//! A flood is one way: 1000 bytes as fast as they go until the last one is there, each kept until it can be sent.
+//! A flood is one way: 1000 bytes as fast as possible until the last one has arrived; each packet is kept
+//! until it can be sent.
 //!
 //! Sinew's applications are those of its own bench, `cargo bench -p sinew --bench gncl`.
 
@@ -38,13 +41,13 @@ use std::process::ExitCode;
 
 use clap::Parser;
 
-/// Sinew beside iceoryx2, zenoh and what the system itself gives: round trips and floods, one table.
+/// Sinew beside iceoryx2, zenoh and the primitives of the system: round trips and floods, one table.
 #[derive(Parser)]
 struct Arguments {
     /// A tenth of the rounds
     #[arg(long)]
     short: bool,
-    /// Only cases whose name holds every one of these words; `list` prints the names
+    /// Only cases that have every one of these words in their names; `list` prints the names
     words: Vec<String>,
 }
 

@@ -1,4 +1,4 @@
-//! The paths from one process to another, which of them stand beside each other, and the roles of the processes.
+//! The paths from one process to another, their groups for comparison, and the roles of the processes.
 
 use std::process::Stdio;
 
@@ -27,7 +27,7 @@ pub(crate) enum Path {
     NodesOwn,
 }
 
-/// Paths that stand beside each other; the first one is the reference.
+/// Paths that are compared; the first one is the reference.
 const WOKEN: &[Path] = &[
     Path::BareFutex,
     Path::UnixStream,
@@ -73,7 +73,7 @@ impl Path {
         }
     }
 
-    /// The other end: until the measuring one ends this process. `at` is where they meet.
+    /// Runs the other end until the measuring one ends this process. `at` is their rendezvous.
     fn echo(self, bytes: usize, at: &str) {
         match self {
             Self::BareFutex | Self::BarePoll => raw::echo_ring(self, bytes),
@@ -86,12 +86,12 @@ impl Path {
     }
 }
 
-/// The words by which another process is the other end of a path.
+/// Returns the text that starts another process as the other end of a path.
 pub(crate) fn echo_role(path: Path, bytes: usize, pinning: Pinning, at: &str) -> String {
     format!("echo {} {bytes} {} {at}", path.name(), pinning.name())
 }
 
-/// Paths beside each other, at one payload, pace and pinning.
+/// Paths compared at one payload, pace and pinning.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Case {
     group: &'static str,
@@ -107,7 +107,7 @@ pub(crate) fn cases() -> impl Iterator<Item = Case> {
     groups.into_iter().flat_map(|(group, paths)| {
         Pinning::ALL
             .into_iter()
-            // Who looks without sleeping needs the other one to have another CPU.
+            // A thread that polls without sleeping needs a different CPU than its peer.
             .filter(move |pinning| !(group == "polled" && *pinning == Pinning::OneCpu))
             .flat_map(move |pinning| Pace::ALL.map(|pace| (pinning, pace)))
             .flat_map(move |(pinning, pace)| {
@@ -165,7 +165,7 @@ impl Case {
     }
 }
 
-/// Plays the part that another process of this program gave this one.
+/// Runs the role that another process of this program assigned to this one.
 pub(crate) fn play(role: &str) {
     let words: Vec<&str> = role.split(' ').collect();
     match words[..] {

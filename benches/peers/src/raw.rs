@@ -1,10 +1,10 @@
-//! What the system itself gives: a ring in shared memory, a unix stream, TCP.
+//! The primitives of the system: a ring in shared memory, a unix stream, TCP.
 
 use std::os::unix::net::UnixStream;
 
 use sinew_figures::{
     Figures, Pinning, Rounds,
-    process::{Process, say_there},
+    process::{Process, print_ready},
     stream,
 };
 use sinew_shm::bare::{self, End, Waiting};
@@ -30,7 +30,7 @@ pub(crate) fn ring(path: Path, rounds: Rounds, pinning: Pinning) -> Figures {
 /// The other end of a bare ring, which lies in this process's input.
 pub(crate) fn echo_ring(path: Path, bytes: usize) {
     let (mut end, mut buffer) = (End::second(stream::input(), bytes, waiting(path)), vec![0; bytes]);
-    say_there();
+    print_ready();
     loop {
         end.receive(&mut buffer);
         end.send(&buffer);

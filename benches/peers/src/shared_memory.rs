@@ -2,10 +2,14 @@
 
 use std::path::PathBuf;
 
-use sinew::{AsyncEndpoint, Endpoint, NodeApi, Registration, Tid, prelude::*, client::{LoanedMessage, Spin}};
+use sinew::{
+    AsyncEndpoint, Endpoint, NodeApi, Registration, Tid,
+    client::{LoanedMessage, Spin},
+    prelude::*,
+};
 use sinew_figures::{
     Figures, Pinning, Rounds,
-    process::{Process, await_end, say_there},
+    process::{Process, await_end, print_ready},
 };
 use sinew_runtime::wire::Kind;
 use tokio::runtime::{Builder, Runtime};
@@ -15,9 +19,9 @@ use crate::{
     ping::DEADLINE,
 };
 
-/// How long who looks before he sleeps does so: longer than any round trip.
+/// Poll duration of an endpoint that polls before it sleeps: longer than any round trip.
 const LOOKS: Duration = Duration::from_secs(1);
-/// Takes the longest payload in one piece.
+/// Holds the longest payload in one piece.
 const DIRECT_RING_BYTES: usize = 1 << 20;
 const BLOCK: Kind = Kind::named("peers.block");
 
@@ -94,7 +98,7 @@ pub(crate) fn node(socket: &str) {
         config.ndl.mdns_port = None;
     });
     let _node = node.start().expect("a node");
-    say_there();
+    print_ready();
     await_end();
 }
 
@@ -127,7 +131,7 @@ pub(crate) fn echo(way: Way, socket: &str) {
         return runtime().block_on(echo_task(way, socket));
     }
     let mut endpoint = register(way, socket, "echo");
-    say_there();
+    print_ready();
     while let Some(received) = endpoint.receive(DEADLINE).expect("the node lives") {
         let (to, bytes) = (received.source(), received.bytes());
         let mut back = endpoint.create_message(to, BLOCK, bytes.len()).expect("not too long");
@@ -165,7 +169,7 @@ async fn task_round_trip(endpoint: &mut AsyncEndpoint, to: Tid, buffer: &mut [u8
 
 async fn echo_task(way: Way, socket: &str) {
     let mut endpoint = register_task(way, socket, "echo").await;
-    say_there();
+    print_ready();
     loop {
         let received = endpoint.receive().await.expect("the node lives");
         let back = filled(&mut endpoint, received.source(), received.bytes());

@@ -1,5 +1,5 @@
-//! zenoh: two peers over TCP on the loopback interface, publications `express` (sent at once, never batched) and reliable, the
-//! echo in the subscriber's callback: as its own ping and pong have it.
+//! zenoh: two peers over TCP on the loopback interface, with `express` (sent at once, never batched) and
+//! reliable publications. The echo is in the subscriber's callback, as in zenoh's own ping and pong.
 
 use std::{
     net::{Ipv4Addr, TcpListener},
@@ -9,7 +9,7 @@ use std::{
 
 use sinew_figures::{
     Figures, Pinning, Rounds,
-    process::{Process, await_end, say_there},
+    process::{Process, await_end, print_ready},
 };
 use zenoh::{
     Config, Session, Wait,
@@ -26,7 +26,7 @@ use crate::{
 const THERE: &str = "sinew/peers/there";
 const BACK: &str = "sinew/peers/back";
 
-/// A session with nobody but the one that it is told of.
+/// A session that connects only to the given peer.
 pub(crate) fn session(listens: bool, at: &str) -> Session {
     let mut config = Config::default();
     let address = format!(r#"["tcp/{at}"]"#);
@@ -63,12 +63,12 @@ pub(crate) fn subscriber(
     subscriber.callback(callback).wait().expect("a subscriber")
 }
 
-/// What comes back, from the subscriber's callback to the thread that measures.
+/// The channel for replies, from the subscriber's callback to the measuring thread.
 pub(crate) fn answers() -> (SyncSender<Sample>, Receiver<Sample>) {
     sync_channel(16)
 }
 
-/// Publishes until somebody answers: the sessions have found each other then.
+/// Publishes until an answer arrives: then the sessions have found each other.
 pub(crate) fn meet(publisher: &Publisher<'_>, answers: &Receiver<Sample>, payload: &[u8]) {
     let deadline = Instant::now() + DEADLINE;
     while Instant::now() < deadline {
@@ -106,6 +106,6 @@ pub(crate) fn echo(at: &str) {
     let _subscriber = subscriber(&session, true, move |sample| {
         publisher.put(sample.payload().clone()).wait().expect("a session");
     });
-    say_there();
+    print_ready();
     await_end();
 }

@@ -1,9 +1,9 @@
-/* Commands that move something, protected from end to end. A control sends torques, and a drive follows them while they are good:
+/* Commands that move something, protected end to end. A control sends torques, and a drive follows them while they are good:
  *
  *   commands SOCKET control COUNT     sends one each 20 ms
  *   commands SOCKET drive             ends when its output has become safe again
  *
- * Either may be a program in Rust with  struct Torque { newton_metres: f32 }  of that NAME, and Protection::of_period(500 ms).
+  * Either may be a program in Rust with  struct Torque { newton_metres: f32 }  of that NAME, and Protection::of_period(500 ms).
  */
 #define _POSIX_C_SOURCE 200809L
 
@@ -22,7 +22,7 @@ static const sinew_field torque_fields[] = { SINEW_FIELD(struct torque, newton_m
 static const sinew_payload_type torque_payload = SINEW_PAYLOAD("demo.commanded_torque", SINEW_STREAM, struct torque, torque_fields);
 #define TORQUE_LENGTH (1 + 1 + sizeof "newton_metres" - 1 + 5)
 
-/* Whether something has failed; then it says what. */
+/* Whether a call has failed; prints the error if so. */
 static bool is_error(sinew_status status)
 {
     if (status >= 0)
@@ -31,7 +31,7 @@ static bool is_error(sinew_status status)
     return true;
 }
 
-/* Not while an output may be live: the end of the process makes none safe. */
+/* Do not use while an output may be live: the end of the process makes none safe. */
 static sinew_status check(sinew_status status)
 {
     if (is_error(status))
@@ -39,7 +39,7 @@ static sinew_status check(sinew_status status)
     return status;
 }
 
-/* Both ends say the same of the type. It is safe 1.5 s after the last good command; a machine has shorter periods. */
+/* Both ends declare the same type. The output is safe 1.5 s after the last good command; a machine has shorter periods. */
 static sinew_protected_type torque_type(void)
 {
     return sinew_protected_type_of(SINEW_TEXT("demo.commanded_torque"), TORQUE_LENGTH, 500 * MS);
@@ -69,17 +69,17 @@ static int control(sinew_endpoint *endpoint, long count)
     check(sinew_encode_value(&torque_payload, &torque, bytes, sizeof bytes, &length));
     for (long sent = 0; sent < count; sent++) {
         check(sinew_send_protected(endpoint, drive, &type, bytes, length));
-        /* What the drive wants quoted comes here, and is not for us. */
+        /* The drive's echoes, which the library quotes, arrive here; this program ignores them. */
         if (check(sinew_receive_message(endpoint, 20 * MS, &received)) == SINEW_OK)
             check(sinew_settle_message(endpoint, &received, SINEW_DELIVERED));
     }
     return EXIT_SUCCESS;
 }
 
-/* Whatever is the output of a drive; a number here. */
+/* The output of a drive; a number here. */
 struct motor { float newton_metres; };
 
-/* Called by a thread of the library's too: short, and waits for nobody. */
+/* Called by a thread of the library, too: keep it short, and do not wait. */
 static int32_t make_safe(void *output, sinew_output_state why)
 {
     (void)why;
@@ -96,7 +96,7 @@ static sinew_status follow(sinew_guard *guard, const sinew_received *command)
 {
     sinew_status status;
     struct torque torque;
-    /* It is what was sealed, and nothing that we can read: the guard knows its length alone, and takes it for a good one. */
+    /* The seal is valid, but we cannot read the payload: the guard checks only its length, and counts it as good. */
     if (is_error(sinew_decode_value(&torque_payload, command->bytes, command->length, &torque)))
         return sinew_trip(guard);
     status = sinew_apply(guard, move, &torque.newton_metres, NULL);
@@ -107,7 +107,7 @@ static sinew_status follow(sinew_guard *guard, const sinew_received *command)
     return status;
 }
 
-/* Follows what comes until the output has become safe; false after an error, when it may be live. */
+/* Follows commands until the output has become safe; false after an error, when it may be live. */
 static bool follow_all(sinew_endpoint *endpoint, sinew_guard *guard, sinew_kind torque)
 {
     sinew_output_state state = SINEW_SAFE_NOT_ARMED;
@@ -115,7 +115,7 @@ static bool follow_all(sinew_endpoint *endpoint, sinew_guard *guard, sinew_kind 
     bool is_armed = false;
     while (!is_armed || state == SINEW_LIVE) {
         sinew_status status;
-        /* Here somebody has seen that it is safe to; refused until enough good commands have come. Never again by itself. */
+        /* Here a person has checked that it is safe; rejected until enough good commands have arrived. Never automatic. */
         if (!is_armed)
             is_armed = sinew_arm(guard) == SINEW_OK;
         status = sinew_receive_message(endpoint, 20 * MS, &received);
@@ -144,7 +144,7 @@ static int drive(sinew_endpoint *endpoint)
     bool is_well;
     check(sinew_guard_output(endpoint, source, &type, &motor, make_safe, &guard));
     is_well = follow_all(endpoint, guard, sinew_kind_named(type.name));
-    /* Before anything ends, well or not. Where it cannot be made safe the library tries on, while there is this process. */
+    /* Before the program ends, after success or failure. If it cannot be made safe the library retries while this process runs. */
     while (sinew_release(&guard) == SINEW_ERROR_SAFE_FAILS)
         nanosleep(&pause, NULL);
     return is_well ? EXIT_SUCCESS : EXIT_FAILURE;

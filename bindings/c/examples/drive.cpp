@@ -1,4 +1,4 @@
-// The knee's drive: takes angles as they come, answers who asks for a report, ends when nothing comes for 2 s.
+// The knee's drive: receives angles, answers requests for a report, ends when nothing arrives for 2 s.
 #include <sinew.hpp>
 
 #include <cstdio>

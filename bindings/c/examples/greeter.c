@@ -1,4 +1,4 @@
-/* Greets one who says its name to it, as hello.c does, and ends:  greeter SOCKET */
+/* Greets one program that sends its name, as hello.c does, and ends:  greeter SOCKET */
 #include <sinew.h>
 #include <stdio.h>
 #include <stdlib.h>

@@ -1,4 +1,4 @@
-/* Waits for who is called "greeter", says its name to it, and prints the reply:  hello SOCKET */
+/* Waits for the application "greeter", sends its own name to it, and prints the reply:  hello SOCKET */
 #include <sinew.h>
 #include <stdio.h>
 #include <stdlib.h>

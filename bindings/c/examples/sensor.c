@@ -1,4 +1,4 @@
-/* The knee's sensor: waits until the drive is there, sends it an angle each millisecond, then asks what it got.
+/* The knee's sensor: waits until the drive is ready, sends it an angle each millisecond, then requests its report.
  *
  *   sensor SOCKET [ANGLES]
  */
@@ -14,7 +14,7 @@
 
 #define SECOND UINT64_C(1000000000)
 
-/* The types of payloads: a struct, the table of its fields, and the name and class that go with them. */
+/* The payload types: a struct, the table of its fields, and the name and class of the type. */
 struct joint_angle { float degrees; uint32_t number; };
 static const sinew_field angle_fields[] = { SINEW_FIELD(struct joint_angle, degrees), SINEW_FIELD(struct joint_angle, number) };
 static const sinew_payload_type angle_type = SINEW_PAYLOAD("demo.joint_angle", SINEW_STREAM, struct joint_angle, angle_fields);
@@ -23,7 +23,7 @@ struct drive_report { float degrees; uint32_t number; };
 static const sinew_field report_fields[] = { SINEW_FIELD(struct drive_report, degrees), SINEW_FIELD(struct drive_report, number) };
 static const sinew_payload_type report_type = SINEW_PAYLOAD("demo.drive_report", SINEW_CONTROL, struct drive_report, report_fields);
 
-/* A program that controls something does not go on after an error. */
+/* A program that controls something does not continue after an error. */
 static void check(sinew_status status, const char *what)
 {
     if (status < 0) {

@@ -1,11 +1,12 @@
-// Sinew: NodeAPI for C++17 and later, on top of sinew.h, which says what is promised. Header only.
+// Sinew: NodeAPI for C++17 and later, on top of sinew.h, which has the contract. Header only.
 //
-// Errors are exceptions of type sinew::error. A program that goes on with an endpoint that has ended, or with a message that
-// was not sent, moves a limb by chance; an exception cannot be overlooked, a status can. What belongs to the ordinary course
-// of a control loop is no error and throws nothing: no message in time (std::optional), no room in time (send_within: false),
-// a name that nobody has (std::optional), a message that was not handled (its outcome). Programs without exceptions take sinew.h.
+// Errors are exceptions of type sinew::error. A program that continues with an endpoint that has ended, or
+// with a message that was not sent, may move a limb by accident; a status can be overlooked, an exception
+// cannot. The ordinary course of a control loop is no error and throws nothing: no message in time
+// (std::optional), no room in time (send_within: false), an unknown name (std::optional), a message that was
+// not handled (its outcome). Programs without exceptions use sinew.h.
 //
-// Everything here belongs to one thread at a time, with the endpoint that it came from.
+// One thread at a time uses an endpoint and the objects that come from it.
 #ifndef SINEW_HPP
 #define SINEW_HPP
 
@@ -37,7 +38,7 @@ using tid = sinew_tid;
 using kind = sinew_kind;
 using duration = std::chrono::nanoseconds;
 
-/// A call that failed: which status, and the library's sentence about it.
+/// A call that failed: its status, and the library's sentence about it.
 class error : public std::runtime_error {
 public:
     explicit error(sinew_status status) : std::runtime_error(sinew_last_error()), status_(status) {}
@@ -80,7 +81,7 @@ inline duration time(std::uint64_t nanoseconds) noexcept
 /// The kind of the payload type called `name`.
 inline kind kind_named(std::string_view name) { return sinew_kind_named(detail::text(name)); }
 
-/// The members of the group called `name`, on every node.
+/// The address of the group called `name`, for its members on every node.
 inline tid group(std::string_view name) { return sinew_group(detail::text(name)); }
 
 /// A TID as text, as in `10.0.0.7/1001`.
@@ -93,7 +94,7 @@ inline std::string to_string(tid address)
 
 /// The table of a struct's fields: written by SINEW_STRUCT and SINEW_PAYLOAD.
 template <class T> struct layout_of;
-/// A type of payloads, with its name and class: written by SINEW_PAYLOAD.
+/// A payload type, with its name and class: written by SINEW_PAYLOAD.
 template <class T> struct payload_of;
 
 namespace detail {
@@ -137,9 +138,12 @@ template <class M> sinew_field field(const char *name, std::size_t offset)
     return made;
 }
 
+inline std::array<sinew_field, 0> fields() { return {}; }
+template <class... F> std::array<sinew_field, 1 + sizeof...(F)> fields(sinew_field first, F... rest) { return {{first, rest...}}; }
+
 } // namespace detail
 
-/// What an application asks for when it registers; what is left as it is has the default of sinew_options.
+/// Options of a registration; unset ones have the default of sinew_options.
 struct options {
     std::string name;
     std::vector<std::string> required;
@@ -162,7 +166,8 @@ struct barrier {
     std::uint32_t flags = 0;
 };
 
-/// A message that is being made: a container of writable bytes. One that is not sent is discarded at its end.
+/// A message under construction: a container of writable bytes. If it is not sent, its destructor discards
+/// it.
 class message {
 public:
     message(message &&other) noexcept
@@ -181,13 +186,16 @@ public:
 
     std::uint8_t *data() noexcept { return raw_.bytes; }
     std::size_t size() const noexcept { return raw_.length; }
-    /// Has it expire where it waits when it is older than this, instead of its type's time to live: `drive.send(drive.create(to, value).expires_after(20ms))`.
+    /// Sets its time to live, in place of its type's: `drive.send(drive.create(to,
+    /// value).expires_after(20ms))`.
     message &&expires_after(duration time) &&
     {
         detail::check(sinew_expires_after(endpoint_, &raw_, detail::nanoseconds(time)));
         return std::move(*this);
     }
-    /// Has its sending wait for room no longer than this, zero: not at all: `drive.send(drive.create(to, value).room_within(200us))` throws `SINEW_ERROR_STALLED` then, and `send_within` returns false.
+    /// Sets the longest wait for room when it is sent; zero does not wait. Without room in time
+    /// `drive.send(drive.create(to, value).room_within(200us))` throws `SINEW_ERROR_STALLED`, and
+    /// `send_within` returns false.
     message &&room_within(duration time) &&
     {
         detail::check(sinew_room_within(endpoint_, &raw_, detail::nanoseconds(time)));
@@ -204,8 +212,8 @@ private:
     sinew_message raw_;
 };
 
-/// A message that was received: a container of readable bytes. At its end it counts as handled, or as failed if that end
-/// is an exception's doing; settle says something else, or says it sooner.
+/// A received message: a container of readable bytes. Its destructor settles it as handled, or as failed
+/// during an exception; settle reports another outcome, or reports it sooner.
 class received {
 public:
     received(received &&other) noexcept
@@ -235,20 +243,23 @@ public:
     sinew::kind kind() const noexcept { return raw_.kind; }
     std::uint64_t sequence() const noexcept { return raw_.sequence; }
     bool wants_reply() const noexcept { return raw_.wants_reply; }
-    /// Time since it was sent, as wrong as age_error() says; nothing while the clock of the sender's host is not measured, or is known too badly.
+    /// Time since it was sent, with an error of up to age_error(); nothing while the clock of the sender's
+    /// host is not measured, or not precisely enough.
     std::optional<duration> age() const noexcept { return age_of(sinew_age); }
-    /// The error of the age at most: none for a message of this host, nothing where the age is not known.
+    /// The maximum error of the age: none for a message of this host, nothing if the age is not known.
     std::optional<duration> age_error() const noexcept
     {
         return raw_.is_sent_known ? std::optional(detail::time(raw_.sent_error_ns)) : std::nullopt;
     }
-    /// The greatest age that it can have; nothing where that is not known.
+    /// The maximum age; nothing if that is not known.
     std::optional<duration> age_at_most() const noexcept { return age_of(sinew_age_at_most); }
-    /// Whether it may be older than this: for a loop that may use fresh values only. An unknown age counts as too old.
+    /// Whether it may be older than this: for a loop that may use fresh values only. An unknown age counts as
+    /// too old.
     bool is_older_than(duration limit) const noexcept { return sinew_is_older_than(&raw_, detail::nanoseconds(limit)); }
 
-    /// The payload as a value of a type that SINEW_PAYLOAD describes; nothing if the message is of another kind. One that cannot be read throws
-    /// SINEW_ERROR_MALFORMED with the field's name. Of any other struct: its bytes; nothing if it has another size.
+    /// The payload as a value of a type that SINEW_PAYLOAD describes; nothing if the message is of another
+    /// kind. A payload that cannot be read throws SINEW_ERROR_MALFORMED with the field's name. Of any other
+    /// struct: its bytes; nothing if it has another size.
     template <class T> std::optional<T> as() const
     {
         if constexpr (detail::is_described<T>::value) {
@@ -265,7 +276,7 @@ public:
         return value;
     }
 
-    /// Says what became of it, and gives its bytes back.
+    /// Settles it with this outcome, and frees its bytes.
     void settle(sinew_outcome outcome) { detail::check(sinew_settle_message(endpoint_, &raw_, outcome)); }
 
 private:
@@ -282,24 +293,27 @@ private:
     int exceptions_ = std::uncaught_exceptions();
 };
 
-/// A type of payloads that are protected: a `T`, one each `period`; its fields may be changed. `name` must stay, as a literal does.
+/// A type of protected payloads: a `T`, one each `period`; its fields may be changed. `name` must stay, as a
+/// literal does.
 template <class T> sinew_protected_type protected_type(std::string_view name, duration period)
 {
     static_assert(std::is_trivially_copyable_v<T>, "only a plain struct can be sent as its bytes");
     return sinew_protected_type_of(detail::text(name), sizeof(T), detail::nanoseconds(period));
 }
 
-/// The only way to an output: see sinew_guard_output. At its end the output is made safe. Where that fails it is tried on, and the guard's place is free as
-/// soon as it is safe; the output's memory is left to that, and what it refers to must stay. The same holds where a guard ends in a function that a guard
-/// calls, be it its own: it is let go of as soon as nobody has its output in hand. While making safe fails, state and apply throw
-/// SINEW_ERROR_SAFE_FAILS. Any thread may use it.
+/// The only access to an output: see sinew_guard_output. Its destructor makes the output safe. If that fails,
+/// it is retried, and the guard's slot is free as soon as the output is safe. The output's memory is not
+/// freed then, and all that it refers to must stay. The same holds if a guard ends in a function that a guard
+/// calls, even its own: it is released as soon as no thread uses its output. While making safe fails, state
+/// and apply throw SINEW_ERROR_SAFE_FAILS. Any thread may use it.
 template <class Output> class guard {
 public:
-    /// Makes the output safe, on any thread; one that throws is called again each millisecond. An empty one is refused.
+    /// Makes the output safe, on any thread; one that throws is called again each millisecond. An empty one
+    /// is rejected.
     using make_safe = std::function<void(Output &, sinew_output_state)>;
 
     guard(guard &&other) noexcept : held_(std::move(other.held_)), raw_(std::exchange(other.raw_, nullptr)) {}
-    /// Makes the output safe that it had before, as the end of a guard does.
+    /// Makes the output safe that it had before, as the destructor of a guard does.
     guard &operator=(guard &&other) noexcept
     {
         if (this != &other) {
@@ -311,13 +325,14 @@ public:
     }
     ~guard() { release(); }
 
-    /// Makes the output live if enough good messages have come; whether it did.
+    /// Makes the output live if enough good messages have arrived; returns whether it did.
     [[nodiscard]] bool arm()
     {
         const sinew_status status = sinew_arm(raw_);
         return status != SINEW_ERROR_NOT_GOOD && detail::check(status) == SINEW_OK;
     }
-    /// Calls `command(output)` if the output is live; whether it was. What the command throws goes on from here.
+    /// Calls `command(output)` if the output is live; returns whether it was. Rethrows exceptions of the
+    /// command.
     template <class Command> [[nodiscard]] bool apply(Command &&command)
     {
         struct call { Command &command; std::exception_ptr thrown; } argument{command, nullptr};
@@ -332,7 +347,7 @@ public:
             std::rethrow_exception(argument.thrown);
         return is_live;
     }
-    /// Makes the output safe, at once or as soon as nobody has it in hand.
+    /// Makes the output safe, at once or as soon as no thread uses it.
     void trip() { detail::check(sinew_trip(raw_)); }
     sinew_output_state state() const
     {
@@ -353,7 +368,8 @@ private:
     {
         if (raw_ == nullptr || sinew_release(&raw_) == SINEW_OK)
             return;
-        // Where a guard has called the program, maybe this one, or where it is not safe: the library does the rest, and what it calls must be there for that.
+        // In a function that a guard calls, maybe this one, or if the output is not safe: the library
+        // completes the release, and the functions that it calls must be valid for that.
         (void)sinew_release_later(&raw_);
         (void)held_.release();
         raw_ = nullptr;
@@ -370,10 +386,10 @@ private:
     sinew_guard *raw_ = nullptr;
 };
 
-/// A transport address of this process. Its end gives the address back.
+/// A transport address of this process. Its destructor unregisters it.
 class endpoint {
 public:
-    /// Registers at the node whose socket is at `socket`, and waits until everything that is required is ready.
+    /// Registers at the node with the socket `socket`, and waits until all requirements are ready.
     explicit endpoint(std::string_view socket, const options &wanted = {})
     {
         const auto required = texts(wanted.required), handled = texts(wanted.handled);
@@ -400,8 +416,9 @@ public:
         std::swap(raw_, other.raw_);
         return *this;
     }
-    /// Gives the address back, and blocks until the node has taken it: 2 s at most, if the node hangs. What was received and not
-    /// settled ends as failed. To learn whether it was taken call `unregister` first.
+    /// Unregisters, and blocks until the node has released the address: 2 s at most, if the node hangs.
+    /// Received messages that were not settled end as failed. To learn whether the node released it call
+    /// `unregister` first.
     ~endpoint()
     {
         if (raw_ != nullptr)
@@ -416,7 +433,8 @@ public:
         return name != nullptr ? name : "";
     }
 
-    /// Lends writable bytes, all zeros, for a message. One at a time: nothing else goes out until it is sent or at its end.
+    /// Loans writable bytes, all zeros, for a message. One at a time: the endpoint sends nothing else until
+    /// it is sent or destroyed.
     message create(tid destination, kind what, std::size_t length, sinew_message_class how = SINEW_CONTROL)
     {
         message created(raw_);
@@ -424,7 +442,8 @@ public:
         return created;
     }
 
-    /// A message with a value of a type that SINEW_PAYLOAD describes, in the class of that type, for any function that sends.
+    /// Creates a message with a value of a type that SINEW_PAYLOAD describes, in its class, for any function
+    /// that sends.
     template <class T> message create(tid destination, const T &value)
     {
         static_assert(detail::is_described<T>::value, "describe the type by SINEW_PAYLOAD(type, \"name\", class, fields...)");
@@ -435,7 +454,7 @@ public:
     /// Sends a value of a type that SINEW_PAYLOAD describes, in the class of that type.
     template <class T> void send(tid destination, const T &value) { send(create(destination, value)); }
 
-    /// Sends a message; what becomes of it is not told.
+    /// Sends a message, without reporting its outcome.
     void send(message &&made) { detail::check(sinew_send_message(raw_, &made.raw_)); }
     /// Sends a plain struct.
     template <class T> void send(tid destination, kind what, const T &value, sinew_message_class how = SINEW_CONTROL)
@@ -443,7 +462,8 @@ public:
         send(filled(destination, what, value, how));
     }
 
-    /// Sends a message if there is room in time, zero: now; says whether there was. What is not sent is gone.
+    /// Sends a message if there is room in time, zero: now; returns whether there was. A message that is not
+    /// sent is gone.
     [[nodiscard]] bool send_within(message &&made, duration within)
     {
         auto timed = std::move(made).room_within(within);
@@ -457,21 +477,22 @@ public:
         return send_within(filled(destination, what, value, how), within);
     }
 
-    /// Sends a message and waits for what becomes of it; SINEW_UNKNOWN when nobody has said so in time.
+    /// Sends a message and waits for its outcome; SINEW_UNKNOWN if none arrived in time.
     [[nodiscard]] sinew_outcome confirm(message &&made, duration within)
     {
         sinew_outcome outcome = SINEW_UNKNOWN;
         detail::check(sinew_send_message_confirmed(raw_, &made.raw_, detail::nanoseconds(within), &outcome));
         return outcome;
     }
-    /// Sends a plain struct and waits for what becomes of it.
+    /// Sends a plain struct and waits for its outcome.
     template <class T> [[nodiscard]] sinew_outcome confirm(tid destination, kind what, const T &value, duration within)
     {
         return confirm(filled(destination, what, value, SINEW_CONTROL), within);
     }
 
-    /// Sends a message to a group, to every application or to an address on all nodes, and waits for what becomes of it at each member;
-    /// SINEW_UNKNOWN of those that have no outcome in time. Empty for a group without members.
+    /// Sends a message to a group, to every application or to an address on all nodes, and waits for its
+    /// outcome at each member; SINEW_UNKNOWN for those without an outcome in time. Empty for a group without
+    /// members.
     [[nodiscard]] std::vector<sinew_member_outcome> confirm_by_each(message &&made, duration within)
     {
         std::vector<sinew_member_outcome> members(SINEW_MEMBERS_MAX);
@@ -481,7 +502,7 @@ public:
         members.resize(count);
         return members;
     }
-    /// Sends a plain struct to many and waits for what becomes of it at each member.
+    /// Sends a plain struct to many and waits for its outcome at each member.
     template <class T>
     [[nodiscard]] std::vector<sinew_member_outcome> confirm_by_each(tid destination, kind what, const T &value,
                                                                     duration within)
@@ -510,7 +531,7 @@ public:
         reply(request, filled(request.source(), what, value, SINEW_CONTROL));
     }
 
-    /// Replies to a request if there is room in time; says whether there was.
+    /// Replies to a request if there is room in time; returns whether there was.
     [[nodiscard]] bool reply_within(const received &request, message &&made, duration within)
     {
         auto timed = std::move(made).room_within(within);
@@ -523,7 +544,8 @@ public:
         static_assert(std::is_trivially_copyable_v<T>, "only a plain struct can be sent as its bytes");
         detail::check(sinew_send_protected(raw_, destination, &what, &value, sizeof value));
     }
-    /// Has an output moved by what `source` sends of a protected type, and made safe when that is not as it has to be.
+    /// Guards an output: only good messages of a protected type from `source` move it; `make_safe` is called
+    /// otherwise.
     template <class Output>
     [[nodiscard]] sinew::guard<Output> guard(tid source, const sinew_protected_type &what, Output output,
                                              typename sinew::guard<Output>::make_safe safe)
@@ -534,7 +556,7 @@ public:
         return made;
     }
 
-    /// Waits for a message; nothing if none came in time.
+    /// Waits for a message; nothing if none arrived in time.
     [[nodiscard]] std::optional<received> receive(duration within)
     {
         received came(raw_);
@@ -553,7 +575,7 @@ public:
         return next;
     }
 
-    /// Who has a name now, on any node; nothing if nobody has.
+    /// Resolves a name to the application that has it now, on any node; nothing if none has.
     [[nodiscard]] std::optional<tid> resolve(std::string_view name, duration within)
     {
         tid found = 0;
@@ -563,7 +585,8 @@ public:
         return found;
     }
 
-    /// Arrives at a barrier and waits until all parties have; how often it has opened then. An error says who is missing.
+    /// Arrives at a barrier and waits until all parties have; returns the number of its openings. An error
+    /// names the missing parties.
     std::uint64_t meet(const barrier &where)
     {
         const std::vector<sinew_text> parties = texts(where.parties);
@@ -581,7 +604,7 @@ public:
     void join(std::string_view name) { detail::check(sinew_join_group(raw_, detail::text(name))); }
     void leave(std::string_view name) { detail::check(sinew_leave_group(raw_, detail::text(name))); }
 
-    /// Gives the address back and waits until the node has taken it: then the name is free.
+    /// Unregisters and waits until the node has released the address: then the name is free.
     void unregister() { detail::check(sinew_unregister(&raw_)); }
 
 private:
@@ -611,67 +634,81 @@ private:
 
 } // namespace sinew
 
-/// Describes a struct as a type of payloads: SINEW_PAYLOAD(torque, "knee.torque", SINEW_STREAM, newton_metres, number). At file scope, outside of
-/// all namespaces. It is sent as MessagePack with the names of its fields, which Rust reads as the `payload!` of the same name. Fields, 32 at most:
-/// bool, numbers, enums, text (an array of char that ends with a zero), structs with SINEW_STRUCT, and arrays of these but text.
-#define SINEW_PAYLOAD(T, NAME, CLASS, ...) SINEW_PAYLOAD_EXPIRING(T, NAME, CLASS, sinew::duration{}, __VA_ARGS__)
-/// The same with a time to live: SINEW_PAYLOAD_EXPIRING(torque, "knee.torque", SINEW_STREAM, std::chrono::milliseconds(20), newton_metres). A message that is
-/// older expires where it waits.
-#define SINEW_PAYLOAD_EXPIRING(T, NAME, CLASS, EXPIRES_AFTER, ...) \
-    SINEW_STRUCT(T, __VA_ARGS__) \
+/// Describes a struct as a payload type: SINEW_PAYLOAD(torque, "knee.torque", SINEW_STREAM, newton_metres,
+/// number). At file scope, outside of all namespaces. It is sent as MessagePack with the names of its fields,
+/// which Rust reads as the `payload!` of the same name. Fields, at most 32: bool, numbers, enums, text (an
+/// array of char that ends with a zero), structs with SINEW_STRUCT, and arrays of these but text. A struct
+/// without fields, such as a command `struct stop {};`, is described without them: SINEW_PAYLOAD(stop,
+/// "knee.stop", SINEW_CONTROL).
+#define SINEW_PAYLOAD(T, NAME, ...) \
+    SINEW_STRUCT_OF(T, SINEW_EACH(T, __VA_ARGS__)) \
+    SINEW_PAYLOAD_OF(T, NAME, SINEW_FIRST(__VA_ARGS__, ), 0)
+/// The same with a time to live, a constant above zero: SINEW_PAYLOAD_EXPIRING(torque, "knee.torque",
+/// SINEW_STREAM, std::chrono::milliseconds(20), newton_metres). An older message expires in its queue.
+#define SINEW_PAYLOAD_EXPIRING(T, NAME, CLASS, ...) \
+    static_assert(sinew::duration(SINEW_FIRST(__VA_ARGS__, )) > sinew::duration::zero(), "a time to live is above zero"); \
+    SINEW_STRUCT_OF(T, SINEW_EACH(T, __VA_ARGS__)) \
+    SINEW_PAYLOAD_OF(T, NAME, CLASS, sinew::detail::nanoseconds(SINEW_FIRST(__VA_ARGS__, )))
+/// Describes a struct that is a field of another: SINEW_STRUCT(gain, p, d).
+#define SINEW_STRUCT(...) SINEW_STRUCT_OF(SINEW_FIRST(__VA_ARGS__, ), SINEW_EACH(SINEW_FIRST(__VA_ARGS__, ), __VA_ARGS__))
+
+#define SINEW_PAYLOAD_OF(T, NAME, CLASS, EXPIRES_AFTER_NS) \
     template <> struct sinew::payload_of<T> { \
         static const sinew_payload_type &get() \
         { \
-            static const sinew_payload_type type = {sinew::detail::text(NAME), CLASS, sinew::layout_of<T>::get(), sinew::detail::nanoseconds(EXPIRES_AFTER)}; \
+            static const sinew_payload_type type = {sinew::detail::text(NAME), CLASS, sinew::layout_of<T>::get(), EXPIRES_AFTER_NS}; \
             return type; \
         } \
     };
-/// Describes a struct that is a field of another.
-#define SINEW_STRUCT(T, ...) \
+#define SINEW_STRUCT_OF(T, ...) \
     template <> struct sinew::layout_of<T> { \
         static_assert(std::is_standard_layout_v<T> && std::is_trivially_copyable_v<T>, "only a plain struct has fields at fixed places"); \
         static const sinew_layout &get() \
         { \
-            static const sinew_field fields[] = {SINEW_EACH(T, __VA_ARGS__)}; \
-            static const sinew_layout layout = {fields, sizeof fields / sizeof fields[0], sizeof(T)}; \
+            static const auto fields = sinew::detail::fields(__VA_ARGS__); \
+            static_assert(std::is_empty_v<T> || std::tuple_size_v<decltype(fields)> != 0, "name the fields: only a struct without fields is described without them"); \
+            static const sinew_layout layout = {fields.data(), fields.size(), sizeof(T)}; \
             return layout; \
         } \
     };
 
+#define SINEW_FIRST(FIRST, ...) FIRST
 #define SINEW_FIELD_OF(T, M) sinew::detail::field<decltype(T::M)>(#M, offsetof(T, M))
-#define SINEW_EACH_1(T, M) SINEW_FIELD_OF(T, M)
-#define SINEW_EACH_2(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_1(T, __VA_ARGS__)
-#define SINEW_EACH_3(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_2(T, __VA_ARGS__)
-#define SINEW_EACH_4(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_3(T, __VA_ARGS__)
-#define SINEW_EACH_5(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_4(T, __VA_ARGS__)
-#define SINEW_EACH_6(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_5(T, __VA_ARGS__)
-#define SINEW_EACH_7(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_6(T, __VA_ARGS__)
-#define SINEW_EACH_8(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_7(T, __VA_ARGS__)
-#define SINEW_EACH_9(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_8(T, __VA_ARGS__)
-#define SINEW_EACH_10(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_9(T, __VA_ARGS__)
-#define SINEW_EACH_11(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_10(T, __VA_ARGS__)
-#define SINEW_EACH_12(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_11(T, __VA_ARGS__)
-#define SINEW_EACH_13(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_12(T, __VA_ARGS__)
-#define SINEW_EACH_14(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_13(T, __VA_ARGS__)
-#define SINEW_EACH_15(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_14(T, __VA_ARGS__)
-#define SINEW_EACH_16(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_15(T, __VA_ARGS__)
-#define SINEW_EACH_17(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_16(T, __VA_ARGS__)
-#define SINEW_EACH_18(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_17(T, __VA_ARGS__)
-#define SINEW_EACH_19(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_18(T, __VA_ARGS__)
-#define SINEW_EACH_20(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_19(T, __VA_ARGS__)
-#define SINEW_EACH_21(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_20(T, __VA_ARGS__)
-#define SINEW_EACH_22(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_21(T, __VA_ARGS__)
-#define SINEW_EACH_23(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_22(T, __VA_ARGS__)
-#define SINEW_EACH_24(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_23(T, __VA_ARGS__)
-#define SINEW_EACH_25(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_24(T, __VA_ARGS__)
-#define SINEW_EACH_26(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_25(T, __VA_ARGS__)
-#define SINEW_EACH_27(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_26(T, __VA_ARGS__)
-#define SINEW_EACH_28(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_27(T, __VA_ARGS__)
-#define SINEW_EACH_29(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_28(T, __VA_ARGS__)
-#define SINEW_EACH_30(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_29(T, __VA_ARGS__)
-#define SINEW_EACH_31(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_30(T, __VA_ARGS__)
-#define SINEW_EACH_32(T, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_31(T, __VA_ARGS__)
-#define SINEW_PICK(_1, _2, _3, _4, _5, _6, _7, _8, _9, _10, _11, _12, _13, _14, _15, _16, _17, _18, _19, _20, _21, _22, _23, _24, _25, _26, _27, _28, _29, _30, _31, _32, NAME, ...) NAME
-#define SINEW_EACH(T, ...) SINEW_PICK(__VA_ARGS__, SINEW_EACH_32, SINEW_EACH_31, SINEW_EACH_30, SINEW_EACH_29, SINEW_EACH_28, SINEW_EACH_27, SINEW_EACH_26, SINEW_EACH_25, SINEW_EACH_24, SINEW_EACH_23, SINEW_EACH_22, SINEW_EACH_21, SINEW_EACH_20, SINEW_EACH_19, SINEW_EACH_18, SINEW_EACH_17, SINEW_EACH_16, SINEW_EACH_15, SINEW_EACH_14, SINEW_EACH_13, SINEW_EACH_12, SINEW_EACH_11, SINEW_EACH_10, SINEW_EACH_9, SINEW_EACH_8, SINEW_EACH_7, SINEW_EACH_6, SINEW_EACH_5, SINEW_EACH_4, SINEW_EACH_3, SINEW_EACH_2, SINEW_EACH_1, )(T, __VA_ARGS__)
+// The fields after the first argument, T.
+#define SINEW_EACH_0(T, FIRST)
+#define SINEW_EACH_1(T, FIRST, M) SINEW_FIELD_OF(T, M)
+#define SINEW_EACH_2(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_1(T, M, __VA_ARGS__)
+#define SINEW_EACH_3(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_2(T, M, __VA_ARGS__)
+#define SINEW_EACH_4(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_3(T, M, __VA_ARGS__)
+#define SINEW_EACH_5(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_4(T, M, __VA_ARGS__)
+#define SINEW_EACH_6(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_5(T, M, __VA_ARGS__)
+#define SINEW_EACH_7(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_6(T, M, __VA_ARGS__)
+#define SINEW_EACH_8(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_7(T, M, __VA_ARGS__)
+#define SINEW_EACH_9(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_8(T, M, __VA_ARGS__)
+#define SINEW_EACH_10(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_9(T, M, __VA_ARGS__)
+#define SINEW_EACH_11(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_10(T, M, __VA_ARGS__)
+#define SINEW_EACH_12(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_11(T, M, __VA_ARGS__)
+#define SINEW_EACH_13(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_12(T, M, __VA_ARGS__)
+#define SINEW_EACH_14(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_13(T, M, __VA_ARGS__)
+#define SINEW_EACH_15(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_14(T, M, __VA_ARGS__)
+#define SINEW_EACH_16(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_15(T, M, __VA_ARGS__)
+#define SINEW_EACH_17(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_16(T, M, __VA_ARGS__)
+#define SINEW_EACH_18(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_17(T, M, __VA_ARGS__)
+#define SINEW_EACH_19(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_18(T, M, __VA_ARGS__)
+#define SINEW_EACH_20(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_19(T, M, __VA_ARGS__)
+#define SINEW_EACH_21(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_20(T, M, __VA_ARGS__)
+#define SINEW_EACH_22(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_21(T, M, __VA_ARGS__)
+#define SINEW_EACH_23(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_22(T, M, __VA_ARGS__)
+#define SINEW_EACH_24(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_23(T, M, __VA_ARGS__)
+#define SINEW_EACH_25(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_24(T, M, __VA_ARGS__)
+#define SINEW_EACH_26(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_25(T, M, __VA_ARGS__)
+#define SINEW_EACH_27(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_26(T, M, __VA_ARGS__)
+#define SINEW_EACH_28(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_27(T, M, __VA_ARGS__)
+#define SINEW_EACH_29(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_28(T, M, __VA_ARGS__)
+#define SINEW_EACH_30(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_29(T, M, __VA_ARGS__)
+#define SINEW_EACH_31(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_30(T, M, __VA_ARGS__)
+#define SINEW_EACH_32(T, FIRST, M, ...) SINEW_FIELD_OF(T, M), SINEW_EACH_31(T, M, __VA_ARGS__)
+#define SINEW_PICK(_0, _1, _2, _3, _4, _5, _6, _7, _8, _9, _10, _11, _12, _13, _14, _15, _16, _17, _18, _19, _20, _21, _22, _23, _24, _25, _26, _27, _28, _29, _30, _31, _32, NAME, ...) NAME
+#define SINEW_EACH(T, ...) SINEW_PICK(__VA_ARGS__, SINEW_EACH_32, SINEW_EACH_31, SINEW_EACH_30, SINEW_EACH_29, SINEW_EACH_28, SINEW_EACH_27, SINEW_EACH_26, SINEW_EACH_25, SINEW_EACH_24, SINEW_EACH_23, SINEW_EACH_22, SINEW_EACH_21, SINEW_EACH_20, SINEW_EACH_19, SINEW_EACH_18, SINEW_EACH_17, SINEW_EACH_16, SINEW_EACH_15, SINEW_EACH_14, SINEW_EACH_13, SINEW_EACH_12, SINEW_EACH_11, SINEW_EACH_10, SINEW_EACH_9, SINEW_EACH_8, SINEW_EACH_7, SINEW_EACH_6, SINEW_EACH_5, SINEW_EACH_4, SINEW_EACH_3, SINEW_EACH_2, SINEW_EACH_1, SINEW_EACH_0, )(T, __VA_ARGS__)
 
 #endif // SINEW_HPP

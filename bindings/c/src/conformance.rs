@@ -1,9 +1,9 @@
-//! The functions of C behind a face that safe Rust may call, so that NodeAPI's suite of claims (`actors/src/client/tests/`)
-//! holds C to them, too. There with the feature `conformance` alone.
+//! A safe Rust wrapper of the C functions, for NodeAPI's conformance suite (`actors/client/src/tests/`).
+//! Compiled with the feature `conformance` only.
 //!
-//! Each call here is one call of C's, with the structs that C hands over; what it returns is handed on as it is, with its
-//! sentence. Payloads are copied where a program in C would read or write them, since what C promises of memory (not after the
-//! message is gone, not after its endpoint is) is nothing that Rust's borrows could say of a number.
+//! Each method is one call of a C function with the structs that C passes. It returns the status unchanged,
+//! with its sentence. Payloads are copied where a program in C would read or write them: Rust's borrows
+//! cannot express the C rules for memory (invalid after its message is gone, or its endpoint).
 
 use std::{
     ffi::{CStr, c_char},
@@ -18,13 +18,14 @@ use std::{
 pub use crate::{
     message::Undelivered,
     options::{SINEW_DIRECT, SINEW_SOCKET_ONLY, SINEW_WITHOUT_RECONNECT},
+    outcome::Outcome,
     status::Status,
-    words::Outcome,
 };
 use crate::{
     message::{self, Message},
     naming::{sinew_join_group, sinew_leave_group, sinew_resolve},
     options::Options,
+    outcome::sinew_last_error,
     receiving::{sinew_next_undelivered, sinew_receive_message, sinew_settle_message},
     registration::{
         sinew_endpoint_tid, sinew_node_name, sinew_payload_max, sinew_register_transport_address,
@@ -36,21 +37,20 @@ use crate::{
         sinew_send_message_confirmed_by_each,
     },
     text::Text,
-    words::sinew_last_error,
 };
 
-/// What a function of C said that was not `SINEW_OK`.
+/// The result of a C function other than `SINEW_OK`.
 #[derive(Clone, Debug)]
 pub struct Told {
-    /// What it returned.
+    /// The returned status.
     pub status: Status,
-    /// What `sinew_last_error` says of it.
+    /// The text of `sinew_last_error`.
     pub sentence: String,
-    /// What became of a request that was not handled.
+    /// The outcome of a request that was not handled.
     pub ended: Option<Outcome>,
 }
 
-/// What `sinew_options` asks for; zero and empty are the defaults.
+/// The settings of `sinew_options`; zero and empty are the defaults.
 #[derive(Clone, Debug, Default)]
 #[expect(missing_docs, reason = "each is the field of sinew_options that has its name")]
 pub struct Asked {
@@ -70,7 +70,7 @@ pub struct Endpoint {
     handle: usize,
 }
 
-/// A message that is being made; discarded when it is dropped.
+/// A message under construction; discarded when it is dropped.
 #[derive(Debug)]
 pub struct Made {
     owner: usize,
@@ -78,7 +78,7 @@ pub struct Made {
     payload: Vec<u8>,
 }
 
-/// A message in hand; settled when it is dropped, as Failed by a thread that panics and else as Delivered.
+/// A received message. Settled when it is dropped: as Failed by a thread that panics, else as Delivered.
 #[derive(Debug)]
 pub struct InHand {
     owner: usize,
@@ -86,11 +86,11 @@ pub struct InHand {
     payload: Vec<u8>,
 }
 
-/// A struct that C has given, with a pointer in it.
+/// A struct filled in by C, with a pointer in it.
 struct Given<T>(T);
 
-// SAFETY: what C gives may be handed to another thread, its `bytes` too: the header says so; here nobody but the calls of the
-// endpoint follows them.
+// SAFETY: the header allows another thread to use the struct and its `bytes`. Only the calls of the endpoint
+// dereference them here.
 unsafe impl<T> Send for Given<T> {}
 
 impl<T> fmt::Debug for Given<T> {
@@ -99,7 +99,7 @@ impl<T> fmt::Debug for Given<T> {
     }
 }
 
-/// `Ok` if it was done, and what was said instead if not.
+/// Returns `Ok` for `SINEW_OK`, else the error.
 fn done(status: Status) -> Result<(), Told> {
     if status == Status::SinewOk { Ok(()) } else { Err(told(status)) }
 }
@@ -122,7 +122,7 @@ impl Endpoint {
     /// `sinew_register_transport_address`.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C function.
     pub fn register(socket: &Path, asked: &Asked) -> Result<Self, Told> {
         let (required, handled) = (texts(&asked.required), texts(&asked.handled));
         let options = Options {
@@ -145,7 +145,7 @@ impl Endpoint {
         let mut endpoint = MaybeUninit::new(ptr::null_mut());
         let path = text(socket.as_os_str().as_bytes());
         done(sinew_register_transport_address(path, &raw const options, Some(&mut endpoint)))?;
-        // SAFETY: it was made with a value.
+        // SAFETY: it was initialized with a value.
         let endpoint = unsafe { endpoint.assume_init() };
         Ok(Self { handle: endpoint.addr() })
     }
@@ -171,14 +171,15 @@ impl Endpoint {
     pub fn node_name(&self) -> &str {
         let name = sinew_node_name(self.pointer());
         assert!(!name.is_null(), "it is registered, and no other thread is in a call");
-        // SAFETY: it is not NULL, and a C string that stays until the endpoint is unregistered, for which this borrow must be over.
+        // SAFETY: it is not NULL. It is a C string that stays until the endpoint is unregistered, and this
+        // borrow ends before.
         unsafe { CStr::from_ptr(name) }.to_str().expect("a node's name is UTF-8")
     }
 
     /// `sinew_create_message`.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C function.
     pub fn create(
         &mut self,
         destination: u64,
@@ -195,28 +196,29 @@ impl Endpoint {
             length,
             Some(&mut message),
         ))?;
-        // SAFETY: it was made with a value.
+        // SAFETY: it was initialized with a value.
         let message = unsafe { message.assume_init() };
         assert_eq!(message.length, length);
-        // SAFETY: so many bytes are there until the message is sent or discarded, and nobody else has it.
+        // SAFETY: the message has `length` bytes until it is sent or discarded, and nothing else uses them.
         let payload = unsafe { slice::from_raw_parts(message.bytes, length) }.to_vec();
         Ok(Made { owner: self.handle, message: Given(message), payload })
     }
 
-    /// Writes a message where it lies, as a program in C would have done; another endpoint's is left as it is.
+    /// Writes the payload into the message's memory, as a program in C would. Leaves a message of another
+    /// endpoint as it is.
     fn fill(&self, made: &mut Made) {
         if made.owner == self.handle {
             let message = made.message.0;
-            // SAFETY: so many bytes are there: the message was neither sent nor discarded, since it is here, and its endpoint is
-            // this one, which is registered. They are nobody else's.
+            // SAFETY: `message.length` bytes are valid: the message is neither sent nor discarded, since it
+            // is here, and its endpoint is this one, which is registered. Nothing else uses them.
             unsafe { ptr::copy_nonoverlapping(made.payload.as_ptr(), message.bytes, message.length) };
         }
     }
 
-    /// `sinew_send_message`, with a time behind `sinew_room_within`.
+    /// `sinew_send_message`, after `sinew_room_within` if there is a time.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C functions.
     pub fn send(&mut self, mut made: Made, within_ns: Option<u64>) -> Result<(), Told> {
         self.fill(&mut made);
         self.set_room_within(&made, within_ns)?;
@@ -230,7 +232,7 @@ impl Endpoint {
     /// `sinew_send_bytes`.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C function.
     pub fn send_bytes(
         &mut self,
         destination: u64,
@@ -244,20 +246,20 @@ impl Endpoint {
     /// `sinew_send_message_confirmed`.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C function.
     pub fn send_confirmed(&mut self, mut made: Made, within_ns: u64) -> Result<Outcome, Told> {
         self.fill(&mut made);
         let mut outcome = MaybeUninit::new(Outcome::SinewUnknown);
         let message = Some(&mut made.message.0);
         done(sinew_send_message_confirmed(self.pointer(), message, within_ns, Some(&mut outcome)))?;
-        // SAFETY: it was made with a value.
+        // SAFETY: it was initialized with a value.
         Ok(unsafe { outcome.assume_init() })
     }
 
     /// `sinew_send_message_confirmed_by_each`: the TID and the outcome of each member.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C function.
     pub fn send_confirmed_by_each(
         &mut self,
         mut made: Made,
@@ -278,7 +280,7 @@ impl Endpoint {
             Some(&mut count),
         );
         done(status)?;
-        // SAFETY: it was made with a value.
+        // SAFETY: it was initialized with a value.
         let count = unsafe { count.assume_init() };
         Ok(members[..count].iter().map(|member| (member.tid, member.outcome)).collect())
     }
@@ -286,14 +288,14 @@ impl Endpoint {
     /// `sinew_ask`.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C function.
     pub fn ask(&mut self, mut made: Made, within_ns: u64) -> Result<InHand, Told> {
         self.fill(&mut made);
         let mut reply = MaybeUninit::new(message::Received::GONE);
         let mut ended = MaybeUninit::new(Outcome::SinewUnknown);
         let message = Some(&mut made.message.0);
         let status = sinew_ask(self.pointer(), message, within_ns, Some(&mut reply), Some(&mut ended));
-        // SAFETY: it was made with a value.
+        // SAFETY: it was initialized with a value.
         let ended = unsafe { ended.assume_init() };
         done(status).map_err(|told| Told {
             ended: (status == Status::SinewErrorNotHandled).then_some(ended),
@@ -302,10 +304,10 @@ impl Endpoint {
         Ok(self.in_hand(reply))
     }
 
-    /// `sinew_reply`, with a time behind `sinew_room_within`.
+    /// `sinew_reply`, after `sinew_room_within` if there is a time.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C functions.
     pub fn reply(&mut self, request: &InHand, mut made: Made, within_ns: Option<u64>) -> Result<(), Told> {
         self.fill(&mut made);
         self.set_room_within(&made, within_ns)?;
@@ -316,7 +318,7 @@ impl Endpoint {
     /// `sinew_receive_message`.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C function.
     pub fn receive(&mut self, within_ns: u64) -> Result<Option<InHand>, Told> {
         let mut received = MaybeUninit::new(message::Received::GONE);
         let status = sinew_receive_message(self.pointer(), within_ns, Some(&mut received));
@@ -327,9 +329,9 @@ impl Endpoint {
     }
 
     fn in_hand(&self, received: MaybeUninit<message::Received>) -> InHand {
-        // SAFETY: both that call this have made it with a value.
+        // SAFETY: both callers initialized it with a value.
         let received = unsafe { received.assume_init() };
-        // SAFETY: so many bytes are there until it is settled, and nobody writes them.
+        // SAFETY: the message has `received.length` bytes until it is settled, and nothing writes them.
         let payload = unsafe { slice::from_raw_parts(received.bytes, received.length) }.to_vec();
         InHand { owner: self.handle, message: Given(received), payload }
     }
@@ -337,25 +339,25 @@ impl Endpoint {
     /// `sinew_next_undelivered`.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C function.
     pub fn next_undelivered(&mut self) -> Result<Option<Undelivered>, Told> {
         let mut undelivered = MaybeUninit::<Undelivered>::zeroed();
         let status = sinew_next_undelivered(self.pointer(), Some(&mut undelivered));
         if status == Status::SinewNothing {
             return Ok(None);
         }
-        // SAFETY: all zeros are a value of it.
+        // SAFETY: all zeros are a valid value of it.
         done(status).map(|()| Some(unsafe { undelivered.assume_init() }))
     }
 
     /// `sinew_resolve`.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C function.
     pub fn resolve(&mut self, name: &str, within_ns: u64) -> Result<Option<u64>, Told> {
         let mut tid = MaybeUninit::new(u64::MAX);
         let status = sinew_resolve(self.pointer(), text(name.as_bytes()), within_ns, Some(&mut tid));
-        // SAFETY: it was made with a value.
+        // SAFETY: it was initialized with a value.
         let tid = unsafe { tid.assume_init() };
         if status == Status::SinewNothing {
             assert_eq!(tid, 0, "nobody has the name");
@@ -367,7 +369,7 @@ impl Endpoint {
     /// `sinew_join_group`.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C function.
     pub fn join(&mut self, name: &str) -> Result<(), Told> {
         done(sinew_join_group(self.pointer(), text(name.as_bytes())))
     }
@@ -375,7 +377,7 @@ impl Endpoint {
     /// `sinew_leave_group`.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C function.
     pub fn leave(&mut self, name: &str) -> Result<(), Told> {
         done(sinew_leave_group(self.pointer(), text(name.as_bytes())))
     }
@@ -383,7 +385,7 @@ impl Endpoint {
     /// `sinew_unregister`.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C function.
     pub fn unregister(self) -> Result<(), Told> {
         let mut endpoint = self.pointer();
         mem::forget(self);
@@ -393,7 +395,7 @@ impl Endpoint {
 
 impl Drop for Endpoint {
     fn drop(&mut self) {
-        // Whatever it says, nobody is here to be told.
+        // A destructor cannot return the error.
         let _ = sinew_unregister(Some(&mut self.pointer()));
     }
 }
@@ -423,13 +425,13 @@ impl Drop for Made {
 }
 
 impl InHand {
-    /// The struct that C has; its `bytes` are not to be followed.
+    /// The C struct. Do not dereference its `bytes`.
     #[must_use]
     pub const fn fields(&self) -> &message::Received {
         &self.message.0
     }
 
-    /// Its payload.
+    /// The payload.
     #[must_use]
     pub fn payload(&self) -> &[u8] {
         &self.payload
@@ -438,7 +440,7 @@ impl InHand {
     /// `sinew_settle_message`.
     ///
     /// # Errors
-    /// What it says.
+    /// Those of the C function.
     pub fn settle(mut self, outcome: i32) -> Result<(), Told> {
         self.settle_as(outcome)
     }
@@ -453,7 +455,7 @@ impl Drop for InHand {
     fn drop(&mut self) {
         if self.message.0.token != 0 {
             let outcome = if thread::panicking() { Outcome::SinewFailed } else { Outcome::SinewDelivered };
-            // Its endpoint may be gone, which has said Failed of it.
+            // Its endpoint may be gone, which has settled it as Failed.
             let _ = self.settle_as(outcome as i32);
         }
     }

@@ -1,7 +1,8 @@
-//! Tells a child of `fork` from the process that registered.
+//! Distinguishes a child of `fork` from the process that registered.
 //!
-//! Both would write into one connection. So what a process registered is refused to its children, at the cost of one load
-//! a call; asking the system for the process id would be a system call each time.
+//! Parent and child would both write into one connection. So a child's calls on its parent's endpoints are
+//! rejected. The check costs one load per call; asking the system for the process ID would be a system call
+//! each time.
 
 use std::{
     ffi::c_int,
@@ -11,7 +12,7 @@ use std::{
     },
 };
 
-use crate::status::{Fault, Status};
+use crate::status::{CallError, Status};
 
 static FORKS: AtomicU32 = AtomicU32::new(0);
 
@@ -22,26 +23,26 @@ unsafe extern "C" {
     fn pthread_atfork(prepare: Handler, parent: Handler, child: Handler) -> c_int;
 }
 
-/// Runs in every child, when only one thread is there and no lock may be waited for.
+/// Runs in every child, when it has only one thread and must not wait for a lock.
 extern "C" fn count_in_child() {
     FORKS.fetch_add(1, Ordering::Relaxed);
 }
 
-/// From now on, forks are counted.
-pub(crate) fn watch() -> Result<(), Fault> {
+/// Starts counting forks.
+pub(crate) fn watch() -> Result<(), CallError> {
     static WATCHED: OnceLock<c_int> = OnceLock::new();
     let error = *WATCHED.get_or_init(|| {
-        // SAFETY: the handler only counts, which is allowed in a child; this library is not unloaded before the process
-        // ends or, if it is, the C library takes the handler out with it.
+        // SAFETY: the handler only counts, which is allowed in a child. This library is not unloaded before
+        // the process ends; if it is, the C library removes the handler with it.
         unsafe { pthread_atfork(None, None, Some(count_in_child)) }
     });
     if error == 0 {
         return Ok(());
     }
-    Err(Fault::new(Status::SinewErrorTooMany, "the system has no memory to watch for forks"))
+    Err(CallError::new(Status::SinewErrorTooMany, "the system has no memory to watch for forks"))
 }
 
-/// How many forks lie between this process and the one that loaded the library.
+/// The number of forks between this process and the one that loaded the library.
 pub(crate) fn generation() -> u32 {
     FORKS.load(Ordering::Relaxed)
 }

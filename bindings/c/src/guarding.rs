@@ -1,17 +1,17 @@
-//! Protected payloads in: outputs that are safe unless good commands come.
+//! Protected payloads, receiving side: outputs that stay safe unless good commands arrive.
 
 use std::{
     ffi::{c_char, c_void},
     mem::MaybeUninit,
 };
 
-use sinew::{
-    Tid,
+use sinew_runtime::{
     protection::{State, raw::Verdict},
+    tid::Tid,
 };
 
 use crate::{
-    border::{call, present, write},
+    ffi_boundary::{call, present, write},
     message::{Endpoint, TidBits},
     protection::{
         Command, DataId, MakeSafe, OutputGuard, OutputState, ProtectedType, SealedFault, Tally, code_of,
@@ -19,18 +19,22 @@ use crate::{
     },
     registration::with,
     sealing::payload,
-    status::{Fault, Status},
+    status::{CallError, Status},
 };
 
-/// Has `output` moved by what `source` sends to this endpoint of a protected type, and made safe by `safe` when that is not as it has to be: at once, since
-/// it is not armed, and whenever it is not live any more. From now on `sinew_receive_message` hands out of that type only messages of this sender's that are
-/// good, and that come while the output is live, without their envelopes; others are refused and counted. Act on them in `sinew_apply` alone.
+/// Guards `output`: only messages of a protected type that `source` sends to this endpoint move it. `safe` is
+/// called to make it safe: at once, since it is not armed, and each time it stops being live. From now on
+/// `sinew_receive_message` delivers messages of that type, without their envelopes, only if they are good,
+/// come from this sender, and arrive while the output is live. All others are rejected and counted. Act on
+/// these messages in `sinew_apply` only.
 ///
-/// The sender is told what it has to quote while this endpoint is in `sinew_receive_message`: call that at least four times in `age_max_ns`. An endpoint
-/// that came back to another address, or whose sender did, makes its guards anew. `output` may be NULL, and must be there until `sinew_release`
-/// has let go of it; release it before the end of `main`, too. A process has 256 guards at most; its first one starts the thread `safe-output`,
-/// which keeps the watchdogs with a real-time priority of 90, or the highest that is granted (`ulimit -r`). `SINEW_ERROR_SAFE_FAILS`: `safe` has failed at
-/// once and is tried on; the guard is made all the same, and `*guard` set. The endpoint's thread.
+/// The sender has to quote echoes, which are sent to it while this endpoint is in `sinew_receive_message`:
+/// call that at least four times in `age_max_ns`. If this endpoint or its sender returns under another
+/// address, create the guards anew. `output` may be NULL, and must stay valid until `sinew_release` has
+/// released it. Release it before the end of `main`, too. A process has at most 256 guards. The first one
+/// starts the thread `safe-output`, which runs the watchdogs with the real-time priority 90, or the highest
+/// that is granted (`ulimit -r`). `SINEW_ERROR_SAFE_FAILS`: the first call of `safe` has failed and is
+/// retried; the guard is created all the same, and `*guard` set. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_guard_output(
     endpoint: *mut Endpoint,
@@ -49,9 +53,10 @@ pub extern "C" fn sinew_guard_output(
     })
 }
 
-/// The same for messages that come over something else than an endpoint: hand each to `sinew_check_sealed`, and send what `sinew_guard_echo` says to the
-/// sender. The name of the data ID is the one that counts, not that of the type. Needs no node. `*guard` is set after `SINEW_ERROR_SAFE_FAILS`, too.
-/// Any thread.
+/// As `sinew_guard_output`, for messages from another transport than an endpoint: pass each one to
+/// `sinew_check_sealed`, and send the result of `sinew_guard_echo` to the sender. The name in the data ID
+/// counts, not that of the type. Needs no node. `*guard` is set after `SINEW_ERROR_SAFE_FAILS`, too. Any
+/// thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_guard_alone(
     data_id: Option<&DataId>,
@@ -70,9 +75,10 @@ pub extern "C" fn sinew_guard_alone(
     })
 }
 
-/// Has a guard take in a sealed message. `SINEW_OK`: it is good and the output is live; its payload begins at `SINEW_SEALED_HEAD` and is
-/// `SINEW_SEALED_OVERHEAD` bytes shorter. `SINEW_NOTHING`: it is not to be used, since it is bad, or the output is safe. `*fault` is set in both
-/// cases; `fault` may be NULL. Each message is taken once: the second time it is a repeated one. Any thread.
+/// Checks a sealed message with a guard. `SINEW_OK`: it is good and the output is live; its payload begins at
+/// `SINEW_SEALED_HEAD` and is `SINEW_SEALED_OVERHEAD` bytes shorter. `SINEW_NOTHING`: do not use it, since it
+/// is bad, or the output is safe. `*fault` is set in both cases; `fault` may be NULL. Pass each message once:
+/// the second time it counts as repeated. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_check_sealed(
     guard: *mut OutputGuard,
@@ -93,8 +99,9 @@ pub extern "C" fn sinew_check_sealed(
     })
 }
 
-/// The time that the sender is to quote as `echo_ns` of its next messages, on the clock of `sinew_now_ns`. Say it to the sender four times in
-/// `age_max_ns`: the last eight count. For `sinew_guard_alone`; an endpoint does so itself. Any thread.
+/// Gives the time that the sender has to quote as `echo_ns` of its next messages, on the clock of
+/// `sinew_now_ns`. Send it to the sender four times in `age_max_ns`: the last eight count. For
+/// `sinew_guard_alone`; an endpoint sends its echoes itself. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_guard_echo(guard: *mut OutputGuard, at_ns: Option<&mut MaybeUninit<u64>>) -> Status {
     call(|| {
@@ -103,17 +110,19 @@ pub extern "C" fn sinew_guard_echo(guard: *mut OutputGuard, at_ns: Option<&mut M
     })
 }
 
-/// Makes the output live: from now on commands pass. Somebody has seen that it is safe to; nothing does this by itself, and a live output that has become
-/// safe stays so until this is called again. `SINEW_ERROR_NOT_GOOD` until `good_min` good messages in a row have come, the last one in time;
-/// `SINEW_ERROR_SAFE_FAILS` if it could not be made safe. Any thread.
+/// Makes the output live: from now on commands pass. Call it when a person has checked that it is safe to
+/// move. Nothing does this automatically, and a live output that has become safe stays so until this is
+/// called again. `SINEW_ERROR_NOT_GOOD` until `good_min` good messages in a row have arrived, the last one in
+/// time; `SINEW_ERROR_SAFE_FAILS` if the output could not be made safe. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_arm(guard: *mut OutputGuard) -> Status {
     call(|| guards::arm(guard.addr()).map(|()| Status::SinewOk))
 }
 
-/// Calls `command` with the output and `argument` if the output is live, and keeps what makes it safe from doing so meanwhile. `SINEW_NOTHING`: it is safe, and
-/// `command` was not called. `SINEW_ERROR_SAFE_FAILS`: the same, and what makes it safe has failed until now. `*state` says since what in all three cases;
-/// `state` may be NULL. Blocks while another thread has the output in hand. Any thread.
+/// Calls `command` with the output and `argument` if the output is live; `safe` of the guard does not run
+/// meanwhile. `SINEW_NOTHING`: the output is safe, and `command` was not called. `SINEW_ERROR_SAFE_FAILS`:
+/// the same, but making it safe has failed so far. `*state` gives the state and its cause in all three cases;
+/// `state` may be NULL. Blocks while another thread uses the output. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_apply(
     guard: *mut OutputGuard,
@@ -124,7 +133,7 @@ pub extern "C" fn sinew_apply(
     call(|| {
         let command = present(command, "command")?;
         let found = guards::apply(guard.addr(), |output| {
-            // SAFETY: the header asks of the caller that this may be called with these two.
+            // SAFETY: the header requires of the caller that this may be called with these two arguments.
             unsafe { command(output, argument) };
         })?;
         if let Some(state) = state {
@@ -134,15 +143,15 @@ pub extern "C" fn sinew_apply(
     })
 }
 
-/// Makes the output safe: at once or, while another thread has it in hand, as soon as that has not. Does not block, and may be called where a guard
-/// calls the program, too. Any thread.
+/// Makes the output safe: at once or, while another thread uses it, as soon as that ends. Does not block, and
+/// may be called from the functions that a guard calls. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_trip(guard: *mut OutputGuard) -> Status {
     call(|| guards::trip(guard.addr()).map(|()| Status::SinewOk))
 }
 
-/// Whether commands reach the output now and, if not, since what. `SINEW_ERROR_SAFE_FAILS`: they do not, but what makes it safe has failed until now, so
-/// that it may move still; `*state` is set all the same. Any thread.
+/// Gives whether commands reach the output now and, if not, the cause. `SINEW_ERROR_SAFE_FAILS`: they do not,
+/// but making it safe has failed so far, so that it may still move; `*state` is set all the same. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_guard_state(
     guard: *mut OutputGuard,
@@ -157,7 +166,7 @@ pub extern "C" fn sinew_guard_state(
     })
 }
 
-/// What the guard has counted since it was made. Any thread.
+/// Gives the counts of a guard since it was created. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_guard_tally(
     guard: *mut OutputGuard,
@@ -169,24 +178,27 @@ pub extern "C" fn sinew_guard_tally(
     })
 }
 
-/// Makes the output safe and lets go of it: after `SINEW_OK` the library calls nothing of it any more, and `*guard` is NULL. After
-/// `SINEW_ERROR_SAFE_FAILS` it goes on trying, and lets go as soon as the output is safe: the output must be there until then, which is when
-/// another call says `SINEW_OK` or `SINEW_ERROR_NO_SUCH_GUARD`. What comes of its type to its endpoint goes on being refused. Blocks while another thread
-/// has the output in hand. Any thread.
+/// Makes the output safe and releases the guard: after `SINEW_OK` the library calls no function of it any
+/// more, and `*guard` is NULL. After `SINEW_ERROR_SAFE_FAILS` the library keeps trying, and releases it as
+/// soon as the output is safe. The output must stay valid until then, which is when another call returns
+/// `SINEW_OK` or `SINEW_ERROR_NO_SUCH_GUARD`. Messages of its type to its endpoint are still rejected. Blocks
+/// while another thread uses the output. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_release(guard: *mut *mut OutputGuard) -> Status {
     call(|| let_go(guard, guards::release))
 }
 
-/// The same for where a guard calls the program, which may not wait: makes the output safe as `sinew_trip`, and lets go of it as soon as nobody has it in
-/// hand any more and it is safe. `*guard` is NULL then, and no call knows it any more. Nobody says when the library calls nothing of it any more: `output`
-/// and what makes it safe must be there until the end of the process. Does not block. Any thread.
+/// As `sinew_release`, for the functions that a guard calls, which must not wait. Makes the output safe as
+/// `sinew_trip` does, and releases the guard as soon as no thread uses the output any more and it is safe.
+/// `*guard` is NULL then, and all calls reject it. There is no notice of the library's last call of its
+/// functions: `output` and `safe` of the guard must stay valid until the end of the process. Does not block.
+/// Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_release_later(guard: *mut *mut OutputGuard) -> Status {
     call(|| let_go(guard, guards::release_later))
 }
 
-/// A text for an output's state, one of `sinew_output_state`. Never NULL. Any thread.
+/// Gives a text for an output's state, one of `sinew_output_state`. Never NULL. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_output_state_text(state: i32) -> *const c_char {
     let texts = [
@@ -204,25 +216,26 @@ pub extern "C" fn sinew_output_state_text(state: i32) -> *const c_char {
     text.map_or(c"no state of an output".as_ptr(), |text| text.as_ptr())
 }
 
-/// Hands out a guard, whose output may not have become safe.
+/// Returns the handle of a new guard, or an error if its output has not become safe. Sets it in both cases.
 fn hand_out(
     guard: &mut MaybeUninit<*mut OutputGuard>,
     (handle, found): (usize, Found),
-) -> Result<Status, Fault> {
+) -> Result<Status, CallError> {
     let status = write(guard, std::ptr::without_provenance_mut(handle));
     found.check()?;
     Ok(status)
 }
 
-/// Takes a guard out of a program's pointer to it, if that is how it ends.
+/// Calls `release` with a guard and, on success, sets the program's pointer to it to NULL.
 fn let_go(
     guard: *mut *mut OutputGuard,
-    release: impl FnOnce(usize) -> Result<(), Fault>,
-) -> Result<Status, Fault> {
+    release: impl FnOnce(usize) -> Result<(), CallError>,
+) -> Result<Status, CallError> {
     if guard.is_null() {
-        return Err(Fault::plain(Status::SinewErrorNoSuchGuard));
+        return Err(CallError::plain(Status::SinewErrorNoSuchGuard));
     }
-    // SAFETY: not NULL; the header asks of the caller that there is one. It is not borrowed: what makes the output safe may look at it.
+    // SAFETY: not NULL; the header requires that the pointer is valid. No borrow is held: `safe` of the guard
+    // may read it, too.
     let held = unsafe { guard.read() };
     release(held.addr())?;
     // SAFETY: as above.

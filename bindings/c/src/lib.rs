@@ -1,23 +1,24 @@
-//! NodeAPI for C and C++. What it promises is said in `include/sinew.h`, which is written from this source, and in
+//! NodeAPI for C and C++. Its contract is in `include/sinew.h`, which is generated from this source, and in
 //! `README.md`.
 //!
-//! | file | what is there |
+//! | file | contents |
 //! | --- | --- |
-//! | `border.rs` | what every call passes: panics are caught, errors become a number and a sentence, NULL is refused |
-//! | `table.rs` | handles: numbers that are looked up, never followed; one thread at a time |
-//! | `session.rs`, `hand.rs` | an endpoint with the messages that the program in C has in hand |
-//! | `fork.rs` | a child of `fork` is told apart |
-//! | `log.rs`, `log/` | what the library says on the standard error, and the thread that writes it |
+//! | `ffi_boundary.rs` | the wrapper of every call: catches panics, turns errors into a number and a sentence, rejects NULL |
+//! | `table.rs` | handles: numbers that are looked up, never dereferenced; one thread at a time |
+//! | `session.rs`, `handles.rs` | an endpoint with the messages that the program in C holds |
+//! | `fork.rs` | detects a child of `fork` |
+//! | `log.rs`, `log/` | the library's log on the standard error, and the thread that writes it |
 //! | `protection.rs`, `protection/` | protected payloads: their types, and the runtime's guards behind handles |
-//! | `registration.rs`, `sending.rs`, `receiving.rs`, `meeting.rs`, `sealing.rs`, `guarding.rs`, `naming.rs`, `words.rs` | the functions |
+//! | `registration.rs`, `sending.rs`, `receiving.rs`, `meeting.rs`, `naming.rs`, `outcome.rs` | the functions |
+//! | `sealing.rs`, `guarding.rs` | the functions for protected payloads |
 //! | `payload.rs`, `payload/` | typed payloads: a C struct as MessagePack, by a table of its fields |
 //! | `options.rs`, `text.rs`, `message.rs`, `status.rs` | the types |
-//! | `conformance.rs` | for the suite that holds all forms of NodeAPI to the same claims; with the feature `conformance` alone |
+//! | `conformance.rs` | for the conformance suite of all forms of NodeAPI; with the feature `conformance` only |
 //!
-//! All other modules are private: the functions are reached through C only, whose programs must keep what the header asks of
-//! every pointer. That is the one thing that the unsafe blocks here stand on; what can be checked is checked.
+//! All other modules are private: the functions are called through C only. The unsafe blocks rely on one
+//! thing: programs keep the header's requirements for every pointer. All other requirements are checked.
 
-// In this order the functions stand in the header.
+// The functions appear in the header in this order.
 mod registration;
 
 mod naming;
@@ -34,7 +35,7 @@ mod sealing;
 
 mod guarding;
 
-mod words;
+mod outcome;
 
 mod options;
 
@@ -46,11 +47,11 @@ mod text;
 
 mod status;
 
-mod border;
 #[cfg(feature = "conformance")]
 pub mod conformance;
+mod ffi_boundary;
 mod fork;
-mod hand;
+mod handles;
 mod log;
 mod session;
 mod table;

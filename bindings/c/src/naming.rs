@@ -1,19 +1,19 @@
-//! Who is meant: names, groups, kinds, addresses, and the clock.
+//! Names, groups, kinds, addresses, and the clock.
 
 use std::{ffi::c_char, mem::MaybeUninit, time::Duration};
 
-use sinew::{Tid, Time, message::Kind};
+use sinew_runtime::{tid::Tid, time::Time, wire::Kind};
 
 use crate::{
-    border::{call, present, value, write},
+    ffi_boundary::{call, present, value, write},
     message::{Endpoint, KindBits, TidBits},
     registration::with,
-    status::{Fault, Status},
+    status::{CallError, Status},
     text::Text,
 };
 
-/// Asks who has `name` now, on any node; waits `within_ns` at most. `SINEW_NOTHING` and a `*tid` of 0 if nobody has it.
-/// The endpoint's thread.
+/// Resolves `name` to the application that has it now, on any node; waits at most for `within_ns`.
+/// `SINEW_NOTHING` and a `*tid` of 0 if no application has it. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_resolve(
     endpoint: *mut Endpoint,
@@ -32,8 +32,8 @@ pub extern "C" fn sinew_resolve(
     })
 }
 
-/// Joins a group: what is sent to `sinew_group` of this name reaches this endpoint from now on. Waits 2 s at most. The
-/// endpoint's thread.
+/// Joins a group: messages to `sinew_group` of this name reach this endpoint from now on. Waits at most 2 s.
+/// The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_join_group(endpoint: *mut Endpoint, name: Text) -> Status {
     call(|| {
@@ -42,7 +42,7 @@ pub extern "C" fn sinew_join_group(endpoint: *mut Endpoint, name: Text) -> Statu
     })
 }
 
-/// Leaves a group. Waits 2 s at most. The endpoint's thread.
+/// Leaves a group. Waits at most 2 s. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_leave_group(endpoint: *mut Endpoint, name: Text) -> Status {
     call(|| {
@@ -51,45 +51,46 @@ pub extern "C" fn sinew_leave_group(endpoint: *mut Endpoint, name: Text) -> Stat
     })
 }
 
-/// The members of the group called `name`, on every node; 0 if it is no text. Any thread.
+/// The address of the group called `name`, for its members on every node; 0 if `name` is no text. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_group(name: Text) -> TidBits {
     value(0, || Ok(Tid::group(name.read("name")?).bits()))
 }
 
-/// The kind of the payload type called `name`, the same in every program and language; 0 if it is no text.
-/// Any thread.
+/// The kind of the payload type called `name`, the same in every program and language; 0, which no type has,
+/// if `name` is no text. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_kind_named(name: Text) -> KindBits {
     value(0, || Ok(Kind::named(name.read("name")?).bits()))
 }
 
-/// The TID that is written in `text`, as in `10.0.0.7/1001`. Any thread.
+/// Parses a TID from `text`, as in `10.0.0.7/1001`. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_tid_parse(text: Text, tid: Option<&mut MaybeUninit<TidBits>>) -> Status {
     call(|| {
         let tid = present(tid, "tid")?;
-        let parsed = text.read("text")?.parse::<Tid>().map_err(|error| Fault::argument(error.to_string()))?;
+        let parsed =
+            text.read("text")?.parse::<Tid>().map_err(|error| CallError::argument(error.to_string()))?;
         Ok(write(tid, parsed.bits()))
     })
 }
 
-/// Writes a TID as text, ended by a zero, into `capacity` bytes; `SINEW_TID_TEXT` are always enough. Any
+/// Writes a TID as text, terminated by a zero, into `capacity` bytes; `SINEW_TID_TEXT` are always enough. Any
 /// thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_tid_text(tid: TidBits, text: *mut c_char, capacity: usize) -> Status {
     call(|| {
         if text.is_null() {
-            return Err(Fault::argument("`text` is NULL"));
+            return Err(CallError::argument("`text` is NULL"));
         }
         let written = Tid::from_bits(tid).to_string();
         if written.len() >= capacity {
             let sentence = format!("`capacity` is {capacity}: '{written}' and its zero need more");
-            return Err(Fault::argument(sentence));
+            return Err(CallError::argument(sentence));
         }
-        // SAFETY: not NULL; the header asks of the caller that so many bytes are there, and this is shorter.
+        // SAFETY: not NULL; the header requires that `capacity` bytes are valid, and the text is shorter.
         unsafe { std::ptr::copy_nonoverlapping(written.as_ptr(), text.cast(), written.len()) };
-        // SAFETY: as before; this is the byte after them, within the capacity.
+        // SAFETY: as before; this is the byte after the text, within the capacity.
         let end = unsafe { text.add(written.len()) };
         // SAFETY: as before.
         unsafe { end.write(0) };
@@ -97,11 +98,11 @@ pub extern "C" fn sinew_tid_text(tid: TidBits, text: *mut c_char, capacity: usiz
     })
 }
 
-/// Bytes that any TID's text needs, its zero included: `255.255.255.255/ffffffff`.
+/// Bytes that the text of any TID needs, its zero included: `255.255.255.255/ffffffff`.
 #[allow(dead_code, reason = "it is for C")]
 pub const SINEW_TID_TEXT: usize = 32;
 
-/// The present moment in nanoseconds of the host's monotonic clock: the clock of `sent_ns`. Any thread.
+/// The current time in nanoseconds of the host's monotonic clock: the clock of `sent_ns`. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_now_ns() -> u64 {
     Time::now().as_nanos()

@@ -1,116 +1,122 @@
-//! What an application asks for when it registers, in a struct that may grow.
+//! Options of a registration, in a struct that may grow.
 
 use std::{mem::MaybeUninit, ptr, time::Duration};
 
-use sinew::{
-    AppAddress, Registration,
-    client::{Spin, Transport},
-    events::{NodeEvent, RequirementEvent},
-};
+use sinew_client::{Registration, Spin, Transport};
+use sinew_model::facts::NodeEvent;
+use sinew_runtime::{app::RequirementEvent, tid::AppAddress};
 
 use crate::{
-    status::Fault,
+    status::CallError,
     text::{self, Text},
 };
 
 /// For `events` of `sinew_options`: `sinew.node_event`, nodes that are found, lost, restarted.
 pub const SINEW_NODE_EVENTS: u32 = 1;
-/// For `events` of `sinew_options`: `sinew.requirement_event`, what is required is lost or there again.
+/// For `events` of `sinew_options`: `sinew.requirement_event`, requirements that are lost or met again.
 pub const SINEW_REQUIREMENT_EVENTS: u32 = 2;
-/// For `links` of `sinew_options`: through the unix socket alone, no shared memory.
+/// For `links` of `sinew_options`: through the unix socket only, no shared memory.
 pub const SINEW_SOCKET_ONLY: u32 = 1;
-/// For `links` of `sinew_options`: direct links to other processes that ask for them too.
+/// For `links` of `sinew_options`: direct links to other processes that request them, too.
 pub const SINEW_DIRECT: u32 = 2;
-/// For `links` of `sinew_options`: `spin_ns` is the longest to look. It looks about twice as long as messages lately took to come,
-/// and not at all while they take longer than `spin_ns`. Without `spin_ns` this does nothing.
+/// For `links` of `sinew_options`: `spin_ns` is the maximum spin time. The endpoint spins about twice as long
+/// as messages lately took to arrive, and not at all while they take longer than `spin_ns`. Without `spin_ns`
+/// this does nothing.
 pub const SINEW_SPIN_ADAPTIVE: u32 = 4;
-/// For `links` of `sinew_options`: does not register again when the connection to the node has ended. Then every call says
-/// `SINEW_ERROR_CLOSED`. Without this the endpoint comes back by itself.
+/// For `links` of `sinew_options`: does not register again when the connection to the node has ended. Then
+/// every call returns `SINEW_ERROR_CLOSED`. Without this the endpoint reconnects by itself.
 pub const SINEW_WITHOUT_RECONNECT: u32 = 8;
 
-/// What an application asks for when it registers. Set all of it to zero, then `size`, then what is wanted; zero means the
-/// default everywhere. It grows at its end only: a program that was compiled with a shorter one is served as before.
+/// Options of a registration. Set the whole struct to zero, then `size`, then the fields that you need; zero
+/// means the default everywhere. The struct grows at its end only: a program compiled with a shorter one
+/// works as before.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct Options {
-    /// `sizeof(sinew_options)`, by which the library knows what the program was compiled with.
+    /// `sizeof(sinew_options)`: tells the library the version that the program was compiled with.
     pub size: usize,
     /// The name, 1 to 63 bytes without control characters, unique on the node. Default: none.
     pub name: Text,
-    /// What must be met, on this node or any, before this application is ready: `knee.drive`, `*.drive`, `hip.imu | knee.imu`,
-    /// `2 of *.drive`, `knee.drive at homed`, `camera ?2s`. At most 64. Default: none.
+    /// Requirements that must be met, on this node or any, before this application is ready: `knee.drive`,
+    /// `*.drive`, `hip.imu | knee.imu`, `2 of *.drive`, `knee.drive at homed`, `camera ?2s`. At most 64.
+    /// Default: none.
     pub required: *const Text,
-    /// How many.
+    /// Number of requirements.
     pub required_count: usize,
-    /// Names of the payload types that the application sends or handles, so that two which hash alike are found at
-    /// registration. At most 64. Default: none.
+    /// Names of the payload types that the application sends or handles, so that a hash collision of two of
+    /// them is found at registration. At most 64. Default: none.
     pub handled: *const Text,
-    /// How many.
+    /// Number of names.
     pub handled_count: usize,
     /// A fixed address, `0x1000` to `0x7fffffff`. Default: a dynamic one.
     pub fixed_address: u32,
-    /// The events of the node's layers to be received: `SINEW_NODE_EVENTS`, `SINEW_REQUIREMENT_EVENTS`. Default: none.
+    /// The events of the node's layers to receive: `SINEW_NODE_EVENTS`, `SINEW_REQUIREMENT_EVENTS`. Default:
+    /// none.
     pub events: u32,
-    /// How long the registration may take, waiting for what is required included. Default: 60 s.
+    /// Time limit of the registration, waiting for the requirements included. Default: 60 s.
     pub deadline_ns: u64,
-    /// How long a send waits while the node or, on a direct link, the receiver takes nothing; whatever it takes begins that time
-    /// anew. Default: 1 s. For one send alone, and in all: `sinew_room_within`.
+    /// Stall timeout: how long a send waits while the node or, on a direct link, the receiver accepts
+    /// nothing; any progress restarts that time. Default: 1 s. For the total time of one send:
+    /// `sinew_room_within`.
     pub stall_timeout_ns: u64,
-    /// How many received messages wait in this process until no more are taken out of the socket or the rings; more while an
-    /// answer is waited for. Default: 256.
+    /// Received messages that wait in this process before the library stops reading from the socket or the
+    /// rings; more while a call waits for an answer. Default: 256.
     pub inbox_capacity: usize,
-    /// How long a thread that waits at a ring looks at it before it sleeps; at a socket (`SINEW_SOCKET_ONLY`) it never looks.
-    /// Looking keeps a CPU busy and saves the wake, which is most of a short message's way: for a thread with a CPU of its
-    /// own. Default: it sleeps at once.
+    /// Spin time: how long a thread that waits at a ring polls it before it sleeps. At a socket
+    /// (`SINEW_SOCKET_ONLY`) it never spins. Spinning keeps a CPU busy and saves the wake-up, which is most
+    /// of a short message's latency: for a thread with a CPU of its own. Default: it sleeps at once.
     pub spin_ns: u64,
-    /// What carries the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`, `SINEW_WITHOUT_RECONNECT`. Default:
-    /// shared memory where the system has it, all through the node, and again when the connection has ended.
+    /// The transport of the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`,
+    /// `SINEW_WITHOUT_RECONNECT`. Default: shared memory if the system has it, all messages through the node,
+    /// and a reconnect when the connection has ended.
     pub links: u32,
     /// Zero.
     pub reserved: u32,
-    /// Bytes of this side's ring of each direct link, from 4 KiB to 1 MiB (less or more is taken for those), rounded up to a
-    /// power of two and never more than the node's `lncl.ring_bytes`. A message longer than half of it goes in pieces. All
-    /// rings for direct links that a process makes take 64 MiB at most. Default: 64 KiB.
+    /// Size in bytes of this side's ring of each direct link, from 4 KiB to 1 MiB (other values are clamped). It
+    /// is rounded up to a power of two, and never more than the node's `lncl.ring_bytes`. A message longer than
+    /// half of it is sent in pieces. All rings for direct links that a process creates take at most 64 MiB.
+    /// Default: 64 KiB.
     pub direct_ring_bytes: usize,
 }
 
 const KNOWN_LINKS: u32 = SINEW_SOCKET_ONLY | SINEW_DIRECT | SINEW_SPIN_ADAPTIVE | SINEW_WITHOUT_RECONNECT;
 
-/// What says how long the rest is.
+/// The field with the length of the rest.
 const SHORTEST: usize = size_of::<usize>();
 /// No later version is longer.
 const LONGEST: usize = 4096;
 
 impl Options {
-    /// Copies the options of a caller, who may have been compiled with a shorter or a longer struct.
-    pub(crate) fn read(options: *const Self) -> Result<Self, Fault> {
+    /// Copies the options of a caller that may have been compiled with a shorter or a longer struct.
+    pub(crate) fn read(options: *const Self) -> Result<Self, CallError> {
         if !options.is_aligned() {
-            return Err(Fault::argument("`options` is not aligned"));
+            return Err(CallError::argument("`options` is not aligned"));
         }
-        // SAFETY: not NULL (the caller of this looked), aligned, and the header asks that its first field is set.
+        // SAFETY: not NULL (the caller has checked), aligned, and the header requires that its first field is
+        // set.
         let size = unsafe { ptr::read(options.cast::<usize>()) };
         if !(SHORTEST..=LONGEST).contains(&size) {
-            return Err(Fault::argument(format!(
+            return Err(CallError::argument(format!(
                 "`options.size` is {size}: set it to sizeof(sinew_options)"
             )));
         }
-        // SAFETY: the header asks that so many bytes are there; how many, was checked.
+        // SAFETY: the header requires that `size` bytes are valid; `size` was checked.
         let bytes = unsafe { text::memory(options.cast::<u8>(), size) }.unwrap_or_default();
         let (known, later) = bytes.split_at(size_of::<Self>().min(size));
         if later.iter().any(|byte| *byte != 0) {
-            return Err(Fault::argument(
+            return Err(CallError::argument(
                 "`options` asks for what only a later version of this library can do",
             ));
         }
         let mut copy = MaybeUninit::<Self>::zeroed();
-        // SAFETY: both have at least as many bytes, and the copy is nobody else's.
+        // SAFETY: both have at least `known.len()` bytes, and nothing else uses the copy.
         unsafe { ptr::copy_nonoverlapping(known.as_ptr(), copy.as_mut_ptr().cast::<u8>(), known.len()) };
-        // SAFETY: its fields are numbers and pointers, which any bytes are.
+        // SAFETY: its fields are numbers and pointers, for which any bytes are valid.
         Ok(unsafe { copy.assume_init() })
     }
 
-    /// As Rust says it.
-    pub(crate) fn registration(&self) -> Result<Registration, Fault> {
+    /// Converts to the type of Rust's API.
+    pub(crate) fn registration(&self) -> Result<Registration, CallError> {
         let mut registration = Registration::new();
         let name = self.name.read("options.name")?;
         if !name.is_empty() {
@@ -127,9 +133,12 @@ impl Options {
         self.with_links(self.with_limits(self.with_events(registration)?)?)
     }
 
-    fn with_events(&self, mut registration: Registration) -> Result<Registration, Fault> {
+    fn with_events(&self, mut registration: Registration) -> Result<Registration, CallError> {
         if self.events & !(SINEW_NODE_EVENTS | SINEW_REQUIREMENT_EVENTS) != 0 {
-            return Err(Fault::argument(format!("`options.events` is {:#x}: no such events", self.events)));
+            return Err(CallError::argument(format!(
+                "`options.events` is {:#x}: no such events",
+                self.events
+            )));
         }
         if self.events & SINEW_NODE_EVENTS != 0 {
             registration = registration.subscribe::<NodeEvent>();
@@ -140,12 +149,12 @@ impl Options {
         Ok(registration)
     }
 
-    fn with_links(&self, mut registration: Registration) -> Result<Registration, Fault> {
+    fn with_links(&self, mut registration: Registration) -> Result<Registration, CallError> {
         if self.reserved != 0 {
-            return Err(Fault::argument(format!("`options.reserved` is {}: set it to 0", self.reserved)));
+            return Err(CallError::argument(format!("`options.reserved` is {}: set it to 0", self.reserved)));
         }
         if self.links & !KNOWN_LINKS != 0 {
-            return Err(Fault::argument(format!("`options.links` is {:#x}: no such links", self.links)));
+            return Err(CallError::argument(format!("`options.links` is {:#x}: no such links", self.links)));
         }
         if self.links & SINEW_SOCKET_ONLY != 0 {
             registration = registration.transport(Transport::Socket);
@@ -167,7 +176,7 @@ impl Options {
         })
     }
 
-    fn with_limits(&self, mut registration: Registration) -> Result<Registration, Fault> {
+    fn with_limits(&self, mut registration: Registration) -> Result<Registration, CallError> {
         if self.deadline_ns != 0 {
             registration = registration.deadline(Duration::from_nanos(self.deadline_ns));
         }
@@ -175,7 +184,7 @@ impl Options {
             registration = registration.stall_timeout(Duration::from_nanos(self.stall_timeout_ns));
         }
         if self.inbox_capacity > INBOX_MAX {
-            return Err(Fault::argument(format!(
+            return Err(CallError::argument(format!(
                 "`options.inbox_capacity` is {}: at most {INBOX_MAX} messages",
                 self.inbox_capacity
             )));
@@ -187,7 +196,7 @@ impl Options {
     }
 }
 
-/// As many as a node's own applications may have.
+/// The maximum of a node's own applications.
 const INBOX_MAX: usize = 65_536;
 
 #[cfg(test)]
@@ -195,7 +204,7 @@ mod tests {
     use super::*;
 
     fn zeroed(size: usize) -> Options {
-        // SAFETY: its fields are numbers and pointers, which zeros are.
+        // SAFETY: its fields are numbers and pointers, for which zeros are valid.
         let mut options: Options = unsafe { std::mem::zeroed() };
         options.size = size;
         options
@@ -216,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn of_a_shorter_struct_the_rest_is_the_default() {
+    fn shorter_struct_gets_defaults_for_the_rest() {
         let mut options = zeroed(std::mem::offset_of!(Options, stall_timeout_ns));
         options.deadline_ns = 1;
         options.stall_timeout_ns = 2;
@@ -225,24 +234,24 @@ mod tests {
     }
 
     #[test]
-    fn a_longer_struct_is_read_if_it_asks_for_nothing_more() {
+    fn longer_struct_is_accepted_if_the_rest_is_zero() {
         let mut later = Later { options: zeroed(size_of::<Later>()), more: 0 };
         later.options.inbox_capacity = 5;
         assert_eq!(Options::read((&raw const later).cast()).unwrap().inbox_capacity, 5);
         later.more = 1;
-        let fault = format!("{:?}", Options::read((&raw const later).cast()).unwrap_err());
-        assert!(fault.contains("later version"), "{fault}");
+        let error = format!("{:?}", Options::read((&raw const later).cast()).unwrap_err());
+        assert!(error.contains("later version"), "{error}");
     }
 
     #[test]
-    fn a_size_that_no_version_has_is_refused() {
+    fn unknown_struct_size_is_rejected() {
         for size in [0, 7, SHORTEST - 1, LONGEST + 1, usize::MAX] {
             assert!(Options::read(&zeroed(size)).is_err(), "{size}");
         }
     }
 
     #[test]
-    fn links_are_chosen() {
+    fn links_flags_select_the_transport() {
         let mut options = zeroed(size_of::<Options>());
         (options.links, options.spin_ns) = (SINEW_SOCKET_ONLY | SINEW_SPIN_ADAPTIVE, 5_000);
         let asked = format!("{:?}", options.registration().unwrap());
@@ -252,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn the_rings_of_direct_links_and_the_return_are_chosen() {
+    fn ring_bytes_and_reconnect_are_configurable() {
         let mut options = zeroed(size_of::<Options>());
         (options.links, options.direct_ring_bytes) = (SINEW_DIRECT | SINEW_WITHOUT_RECONNECT, 1 << 18);
         let asked = format!("{:?}", options.registration().unwrap());
@@ -261,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn a_program_compiled_before_there_were_ring_bytes_has_the_default() {
+    fn program_without_ring_bytes_gets_the_default() {
         let mut options = zeroed(std::mem::offset_of!(Options, direct_ring_bytes));
         (options.links, options.direct_ring_bytes) = (SINEW_DIRECT, 1 << 18);
         let asked = format!("{:?}", Options::read(&options).unwrap().registration().unwrap());
@@ -269,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_exist_cannot_be_asked_for() {
+    fn unknown_options_are_rejected() {
         let mut options = zeroed(size_of::<Options>());
         options.events = 4;
         assert!(options.registration().is_err());
@@ -278,8 +287,8 @@ mod tests {
         assert!(options.registration().is_err());
         let mut options = zeroed(size_of::<Options>());
         options.reserved = 1;
-        let fault = format!("{:?}", options.registration().unwrap_err());
-        assert!(fault.contains("`options.reserved` is 1"), "{fault}");
+        let error = format!("{:?}", options.registration().unwrap_err());
+        assert!(error.contains("`options.reserved` is 1"), "{error}");
         let mut options = zeroed(size_of::<Options>());
         options.inbox_capacity = INBOX_MAX + 1;
         assert!(options.registration().is_err());

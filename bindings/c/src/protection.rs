@@ -1,11 +1,12 @@
-//! Protected payloads: commands that are checked from end to end, and outputs that are safe without them. What is believed, when an output has to
-//! be safe and who makes it so is the runtime's to say (`sinew::protection`), for C as for Rust; here are the types and handles of C.
+//! Protected payloads: commands that are checked end to end, and outputs that are safe without them. The
+//! runtime (`sinew_runtime::protection`) has the rules for C as for Rust: which messages are accepted, when an output
+//! has to be safe, and which thread makes it so. Here are the types and handles of C.
 //!
-//! | file | what it is |
+//! | file | contents |
 //! | --- | --- |
-//! | `guards.rs` | guards, whose outputs are pointers, and their handles |
-//! | `watchdog.rs` | the threads that make outputs safe, begun for a process of C's |
-//! | `names.rs` | names of types, which stay |
+//! | `guards.rs` | guards with pointers as outputs, and their handles |
+//! | `watchdog.rs` | starts the threads that make outputs safe, for a process in C |
+//! | `names.rs` | names of types, kept until the process ends |
 
 pub(crate) mod guards;
 pub(crate) mod names;
@@ -13,17 +14,17 @@ mod watchdog;
 
 use std::{ffi::c_void, time::Duration};
 
-use sinew::{
-    message::Kind,
+use sinew_runtime::{
     protection::{
-        Cause, Fault as Wrong, OVERHEAD, Protection, State,
+        Cause, OVERHEAD, Protection, ProtectionError as Wrong, State,
         raw::{Protected, Reads},
     },
+    wire::Kind,
 };
 
-pub(crate) use sinew::protection::Ends;
+pub(crate) use sinew_runtime::protection::Ends;
 
-use crate::{message::TidBits, status::Fault, text::Text};
+use crate::{message::TidBits, status::CallError, text::Text};
 
 /// Bytes before the payload of a sealed message.
 pub const SINEW_SEALED_HEAD: usize = 32;
@@ -32,74 +33,79 @@ pub const SINEW_SEALED_OVERHEAD: usize = 40;
 
 const _: () = assert!(SINEW_SEALED_OVERHEAD == OVERHEAD, "the envelope is that of Rust");
 
-/// A type of payloads that are protected: what it is called, and what a receiver bears. Both ends use the same one, best from a header of theirs;
-/// in Rust it is `Payload::NAME` and `Payload::PROTECTION`. `sinew_protected_type_of` fills all of it.
+/// A type of protected payloads: its name, and the limits of the receiver. Both ends use the same one, best
+/// from a shared header; in Rust it is `Payload::NAME` and `Payload::PROTECTION`. `sinew_protected_type_of`
+/// fills all of it.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct ProtectedType {
-    /// Its name, at least 1 byte.
+    /// The name, at least 1 byte.
     pub name: Text,
-    /// Length of each payload in bytes, `sizeof` of a plain struct: one of another length is not sent, and is a bad one where it comes. 0: any. It is all
-    /// that a guard looks at of a payload: whoever cannot read one that came through it calls `sinew_trip`, or it keeps the output live for ever.
+    /// Length of each payload in bytes, `sizeof` of a plain struct: a payload of another length is not sent,
+    /// and counts as bad when it arrives. 0: any length. A guard checks nothing else of a payload: if you
+    /// cannot read one that came through, call `sinew_trip`, or such payloads keep the output live forever.
     pub length: usize,
-    /// Longest time from one good message to the next, above 0: then the output is made safe.
+    /// Maximum time between two good messages, above 0; after it the output is made safe.
     pub within_ns: u64,
-    /// Greatest age of a message, at least 4 ns: from an echo that the receiver has sent to the moment at which the message that quotes it arrives.
+    /// Maximum age of a message, at least 4 ns: from an echo that the receiver has sent to the arrival of the
+    /// message that quotes it.
     pub age_max_ns: u64,
-    /// Messages that may be missing in a row.
+    /// Maximum number of consecutive missing messages.
     pub lost_max: u64,
-    /// Bad ones that may be among the last 64; none of them is used.
+    /// Maximum number of bad messages among the last 64; none of them is used.
     pub bad_max: u32,
-    /// Good ones in a row before the output may be armed, at least 1.
+    /// Number of consecutive good messages before the output may be armed, at least 1.
     pub good_min: u32,
-    /// One of `sinew_message_class`, for the sender. Of `SINEW_STREAM` only the newest one may arrive: those that it replaces are missing ones.
+    /// One of `sinew_message_class`, for the sender. With `SINEW_STREAM` only the newest one may arrive: the
+    /// messages that it replaces count as missing.
     pub message_class: i32,
     /// Zero.
     pub reserved: u32,
 }
 
-/// What a flow of protected messages is called by both of its ends. It is not sent: whoever is not meant computes another checksum.
+/// Identifies a flow of protected messages at both of its ends. It is not sent: any other receiver computes
+/// another checksum.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct DataId {
-    /// Who sends: its whole TID, the node's address included.
+    /// The sender: its whole TID, the node's address included.
     pub source: TidBits,
-    /// Who receives, as well; one application.
+    /// The receiver, in the same form; one application.
     pub destination: TidBits,
     /// Name of the payload's type.
     pub name: Text,
 }
 
-/// What the sender says of one protected message.
+/// The sender's data in one protected message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(C)]
 pub struct Stamp {
     /// Counts the messages of the flow, from 1.
     pub counter: u64,
-    /// Which life of the sender counts: never the same one twice. `sinew_now_ns` at its beginning will do.
+    /// The sender's incarnation, never the same one twice. `sinew_now_ns` at its start is sufficient.
     pub incarnation: u64,
-    /// The newest time that the sender has heard from the receiver (`sinew_guard_echo`); 0 for none.
+    /// The newest time that the sender has received from the receiver (`sinew_guard_echo`); 0 for none.
     pub echo_ns: u64,
 }
 
-/// Whether commands reach an output and, if not, since what.
+/// Whether commands reach an output and, if not, the cause.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(i32)]
 #[allow(clippy::enum_variant_names, reason = "these are the names in C, which has no other name spaces")]
 pub enum OutputState {
-    /// They do.
+    /// Commands reach the output.
     SinewLive = 0,
     /// It was never armed.
     SinewSafeNotArmed = 1,
-    /// No good message came in time.
+    /// No good message arrived in time.
     SinewSafeSilent = 2,
-    /// More messages are missing in a row than is borne.
+    /// More consecutive messages are missing than `lost_max`.
     SinewSafeTooMuchLost = 3,
-    /// More bad messages came than is borne.
+    /// More bad messages arrived than `bad_max`.
     SinewSafeTooManyBad = 4,
-    /// The sender counts anew: it was restarted.
+    /// The sender counts from a new start: it was restarted.
     SinewSafeRestarted = 5,
-    /// The receiver's host has slept: how old commands are that came meanwhile is not known.
+    /// The receiver's host was suspended: the age of the commands that arrived meanwhile is not known.
     SinewSafeSlept = 6,
     /// `sinew_trip` was called, or the guard's endpoint was unregistered.
     SinewSafeTripped = 7,
@@ -107,71 +113,74 @@ pub enum OutputState {
     SinewSafeReleased = 8,
 }
 
-/// What is wrong with a protected message.
+/// The fault of a protected message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(i32)]
 #[allow(clippy::enum_variant_names, reason = "these are the names in C, which has no other name spaces")]
 pub enum SealedFault {
-    /// Nothing.
+    /// None.
     SinewFaultNone = 0,
-    /// Its bytes are not those that were sealed for this receiver by this sender: damaged, inserted, or meant for another.
+    /// Its bytes are not those that this sender sealed for this receiver: damaged, inserted, or meant for
+    /// another receiver.
     SinewFaultCorrupt = 1,
-    /// It quotes no time of this receiver's, or one that is too long ago.
+    /// It quotes no time of this receiver, or one that is too long ago.
     SinewFaultTooOld = 2,
-    /// It has come before.
+    /// It has arrived before.
     SinewFaultRepeated = 3,
-    /// One that was sent later has come before it.
+    /// A message that was sent later has arrived before it.
     SinewFaultBackwards = 4,
-    /// Its sender counts anew: another incarnation than that of the last one.
+    /// Its sender was restarted: its incarnation is not that of the last message.
     SinewFaultRestarted = 5,
-    /// Too many before it are missing.
+    /// Too many messages before it are missing.
     SinewFaultGap = 6,
-    /// It is what was sealed, and its payload is not as long as the type says.
+    /// The seal is valid, but the payload does not have the length of the type.
     SinewFaultUnreadable = 7,
 }
 
-/// What a guard has counted.
+/// The counts of a guard.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(C)]
 pub struct Tally {
     /// Good messages.
     pub good: u64,
-    /// Those of `SINEW_FAULT_CORRUPT`.
+    /// Messages with `SINEW_FAULT_CORRUPT`.
     pub corrupt: u64,
-    /// Those of `SINEW_FAULT_TOO_OLD`.
+    /// Messages with `SINEW_FAULT_TOO_OLD`.
     pub too_old: u64,
-    /// Those of `SINEW_FAULT_REPEATED`.
+    /// Messages with `SINEW_FAULT_REPEATED`.
     pub repeated: u64,
-    /// Those of `SINEW_FAULT_BACKWARDS`.
+    /// Messages with `SINEW_FAULT_BACKWARDS`.
     pub backwards: u64,
-    /// Those of `SINEW_FAULT_RESTARTED`.
+    /// Messages with `SINEW_FAULT_RESTARTED`.
     pub restarted: u64,
-    /// Those of `SINEW_FAULT_GAP`.
+    /// Messages with `SINEW_FAULT_GAP`.
     pub gaps: u64,
-    /// Those of `SINEW_FAULT_UNREADABLE`.
+    /// Messages with `SINEW_FAULT_UNREADABLE`.
     pub unreadable: u64,
-    /// Messages that are missing, by their numbers.
+    /// Missing messages, by their counters.
     pub lost: u64,
-    /// How often the output went from live to safe.
+    /// Number of times that the output went from live to safe.
     pub trips: u64,
 }
 
-/// The only way to an output. Only pointers to it are handed out.
+/// The only access to an output. Programs have only pointers to it.
 #[derive(Debug)]
 pub struct OutputGuard {
     _opaque: (),
 }
 
-/// Makes an output safe, and returns 0; anything else says that it could not, and it is called again each millisecond. Any thread calls it, mostly one of
-/// the library's own: it must be short and wait for nobody, as the outputs of all guards wait for it. It must return, by no exception and no `longjmp`, and
-/// may call nothing of a guard but `sinew_trip` and `sinew_release_later`, and no `sinew_receive_message` of an endpoint that sends or receives protected
-/// payloads: `SINEW_ERROR_BUSY`.
+/// Makes an output safe and returns 0. Any other result means failure; then it is called again each
+/// millisecond. Any thread calls it, mostly one of the library's own: it must be short and must not wait, as
+/// the outputs of all guards wait for it. It must return normally, by no exception and no `longjmp`. Of the
+/// functions of a guard it may call only `sinew_trip` and `sinew_release_later`. It must not call
+/// `sinew_receive_message` of an endpoint that sends or receives protected payloads: `SINEW_ERROR_BUSY`.
 pub type MakeSafe = Option<unsafe extern "C" fn(output: *mut c_void, why: OutputState) -> i32>;
 
-/// Moves an output that is live; what makes it safe waits meanwhile. It must return as `sinew_make_safe`, and soon, and may call as little.
+/// Moves an output that is live; `sinew_make_safe` waits meanwhile. It must return as `sinew_make_safe` does,
+/// and soon, and may call no other functions than that.
 pub type Command = Option<unsafe extern "C" fn(output: *mut c_void, argument: *mut c_void)>;
 
-/// A [`ProtectedType`] that was looked at.
+/// A [`ProtectedType`] that was checked.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Typed<'call> {
     pub(crate) name: &'call str,
@@ -182,20 +191,20 @@ pub(crate) struct Typed<'call> {
 }
 
 impl ProtectedType {
-    pub(crate) fn read(&self) -> Result<Typed<'_>, Fault> {
-        let fault = |words: &str| Err(Fault::argument(words));
+    pub(crate) fn read(&self) -> Result<Typed<'_>, CallError> {
+        let invalid = |sentence: &str| Err(CallError::argument(sentence));
         if self.reserved != 0 {
-            return Err(Fault::argument(format!(
+            return Err(CallError::argument(format!(
                 "`payload_type.reserved` is {}: set it to 0",
                 self.reserved
             )));
         }
         let name = self.name.read("payload_type.name")?;
         if name.is_empty() {
-            return fault("`payload_type.name` is empty");
+            return invalid("`payload_type.name` is empty");
         }
         if self.within_ns == 0 {
-            return fault(
+            return invalid(
                 "`payload_type.within_ns` is 0: each message is late; take some periods of the sender's",
             );
         }
@@ -207,12 +216,12 @@ impl ProtectedType {
             good_min: self.good_min,
         };
         if protection.echo_period().is_zero() {
-            return fault(
+            return invalid(
                 "`payload_type.age_max_ns` is below 4: each message is too old; take some periods of the sender's",
             );
         }
         if protection.good_min == 0 {
-            return fault(
+            return invalid(
                 "`payload_type.good_min` is 0: an output is armed by good messages; take 1 at least",
             );
         }
@@ -222,7 +231,7 @@ impl ProtectedType {
 }
 
 impl Typed<'_> {
-    /// As the runtime has it; `name` stays, and is this one's or that of the data ID that counts.
+    /// Converts to the runtime's type. `name` stays, and is this one's or that of the data ID that counts.
     pub(crate) const fn protected(&self, name: &'static str) -> Protected {
         let reads = match self.length {
             0 => Reads::Any,
@@ -231,12 +240,12 @@ impl Typed<'_> {
         Protected { name, kind: self.kind, protection: self.protection, reads }
     }
 
-    /// A payload of the sender's.
-    pub(crate) fn check_length(&self, length: usize) -> Result<(), Fault> {
+    /// Checks the length of a payload to send.
+    pub(crate) fn check_length(&self, length: usize) -> Result<(), CallError> {
         if self.length == 0 || self.length == length {
             return Ok(());
         }
-        Err(Fault::argument(format!(
+        Err(CallError::argument(format!(
             "`length` is {length}, and each '{}' has {} bytes",
             self.name, self.length
         )))
@@ -273,9 +282,9 @@ impl From<Wrong> for SealedFault {
     }
 }
 
-impl From<sinew::protection::Tally> for Tally {
-    fn from(tally: sinew::protection::Tally) -> Self {
-        let sinew::protection::Tally {
+impl From<sinew_runtime::protection::Tally> for Tally {
+    fn from(tally: sinew_runtime::protection::Tally) -> Self {
+        let sinew_runtime::protection::Tally {
             good,
             corrupt,
             too_old,

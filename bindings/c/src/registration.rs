@@ -1,34 +1,41 @@
-//! An address is asked for, and given back.
+//! Registers and unregisters an address.
 
 use std::mem::MaybeUninit;
 
-use sinew::NodeApi;
+use sinew_client::NodeApi;
 
 use crate::{
-    border::{call, present, value, write},
+    ffi_boundary::{call, present, value, write},
     fork, log,
     message::{Endpoint, TidBits},
     options::Options,
     session::Session,
-    status::{Fault, Status},
+    status::{CallError, Status},
     table::ENDPOINTS,
     text::Text,
 };
 
-/// The version of this header's structs and functions. It grows when a program must be compiled anew.
+/// The version of this header's structs and functions. It grows when programs must be recompiled, counted
+/// from the release 0.1.0 on.
 pub const SINEW_ABI: u32 = 1;
 
-/// The `SINEW_ABI` that the library was built with. A program that loads the library at run time compares. Any thread.
+/// Gives the `SINEW_ABI` that the library was built with. Any thread.
+///
+/// A program that is compiled with this header need not compare: its registration is rejected if the two
+/// differ. A program that loads the functions by their names, or registers no endpoint, has to compare by
+/// itself.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_abi() -> u32 {
     SINEW_ABI
 }
 
-/// Connects to the node whose configuration's `lncl.socket` is `socket`, asks for a transport address, and waits until
-/// everything that is required is ready (the paper's RegisterTransportAddress). `options` may be NULL: a dynamic address,
-/// no name. Any thread, any number at the same time. Blocks until the deadline of the options at most.
+/// Connects to the node with `lncl.socket` = `socket` in its configuration, requests a transport address, and
+/// waits until all requirements are ready (the paper's RegisterTransportAddress). `options` may be NULL: a
+/// dynamic address, no name. Any thread, any number at the same time. Blocks at most until the deadline of
+/// the options.
 ///
-/// The endpoint is one thread's at a time. A process may have 256, if its node lets it: `lncl.clients_per_process_max`, 64.
+/// One thread at a time may use the endpoint. A process may have 256, if its node allows it:
+/// `lncl.clients_per_process_max`, 64.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_register_transport_address(
     socket: Text,
@@ -40,7 +47,7 @@ pub extern "C" fn sinew_register_transport_address(
         let endpoint = present(endpoint, "endpoint")?;
         let path = socket.path("socket")?;
         let registration = if options.is_null() {
-            sinew::Registration::new()
+            sinew_client::Registration::new()
         } else {
             Options::read(options)?.registration()?
         };
@@ -52,44 +59,69 @@ pub extern "C" fn sinew_register_transport_address(
     })
 }
 
-/// Gives the address back, and waits until the node has taken it, 2 s at most: then the name is free. Whatever it returns,
-/// but for `SINEW_ERROR_BUSY` and `SINEW_ERROR_FORKED`, the endpoint is gone and `*endpoint` is NULL. Messages that were
-/// received and not settled end as Failed; one that was made and not sent is discarded; the memory of both is gone. The
-/// endpoint's thread, or any when no other one is in a call on it.
+/// Registers as `sinew_register_transport_address` does, for a program that was compiled with the header of
+/// this `abi`. That function is a macro in C and C++, which calls this one with `SINEW_ABI`.
+/// `SINEW_ERROR_INVALID_ARGUMENT` if the library has another: the shared structs may differ, and none of them
+/// was read. Any thread. Blocks as that does.
+#[unsafe(no_mangle)]
+pub extern "C" fn sinew_register_with_abi(
+    abi: u32,
+    socket: Text,
+    options: *const Options,
+    endpoint: Option<&mut MaybeUninit<*mut Endpoint>>,
+) -> Status {
+    if abi == SINEW_ABI {
+        return sinew_register_transport_address(socket, options, endpoint);
+    }
+    call(|| {
+        Err(CallError::argument(format!(
+            "the program was compiled with a sinew.h of SINEW_ABI {abi}, and this library has SINEW_ABI {SINEW_ABI}; compile the program \
+             with the sinew.h of this library, or install the library of that sinew.h"
+        )))
+    })
+}
+
+/// Unregisters the address, and waits at most 2 s until the node has released it: then the name is free. The
+/// endpoint is gone and `*endpoint` is NULL with every result except `SINEW_ERROR_BUSY` and
+/// `SINEW_ERROR_FORKED`. Received messages that were not settled end as Failed; a message that was created
+/// and not sent is discarded; the memory of both is freed. The endpoint's thread, or any other one while no
+/// call on it is running.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_unregister(endpoint: Option<&mut *mut Endpoint>) -> Status {
     call(|| {
-        let endpoint = endpoint.ok_or_else(|| Fault::plain(Status::SinewErrorNoSuchEndpoint))?;
+        let endpoint = endpoint.ok_or_else(|| CallError::plain(Status::SinewErrorNoSuchEndpoint))?;
         let session = ENDPOINTS.take(endpoint.addr())?;
         *endpoint = std::ptr::null_mut();
         session.unregister().map(|()| Status::SinewOk)
     })
 }
 
-/// The address that was registered; 0 if this is no endpoint or another thread is in a call on it. The endpoint's thread.
+/// Gives the address that was registered; 0 if this is no endpoint or another thread is in a call on it. The
+/// endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_endpoint_tid(endpoint: *const Endpoint) -> TidBits {
     value(0, || with(endpoint, |session| Ok(session.endpoint().tid().bits())))
 }
 
-/// Longest payload that the node takes, in bytes; 0 if this is no endpoint or another thread is in a call on it. The
-/// endpoint's thread.
+/// Gives the length of the longest payload that the node accepts, in bytes; 0 if this is no endpoint or
+/// another thread is in a call on it. The endpoint's thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_payload_max(endpoint: *const Endpoint) -> usize {
     value(0, || with(endpoint, |session| Ok(session.endpoint().payload_max())))
 }
 
-/// The name of the node, ended by a zero, until the endpoint is unregistered; NULL if this is no endpoint or another thread
-/// is in a call on it. The endpoint's thread; what it points to, any.
+/// Gives the name of the node, terminated by a zero and valid until the endpoint is unregistered; NULL if
+/// this is no endpoint or another thread is in a call on it. The endpoint's thread; the text may be read by
+/// any.
 #[unsafe(no_mangle)]
 pub extern "C" fn sinew_node_name(endpoint: *const Endpoint) -> *const std::ffi::c_char {
     value(std::ptr::null(), || with(endpoint, |session| Ok(session.node_name().as_ptr())))
 }
 
-/// Does something with an endpoint of C's.
+/// Calls `body` with the session of an endpoint.
 pub(crate) fn with<R>(
     endpoint: *const Endpoint,
-    body: impl FnOnce(&mut Session) -> Result<R, Fault>,
-) -> Result<R, Fault> {
+    body: impl FnOnce(&mut Session) -> Result<R, CallError>,
+) -> Result<R, CallError> {
     ENDPOINTS.with(endpoint.addr(), body)
 }

@@ -1,4 +1,4 @@
-//! Texts from C: where they begin, how long they are, and that they are UTF-8.
+//! Texts from C: a pointer, a length, and the check that they are UTF-8.
 
 use std::{
     ffi::{OsStr, c_char},
@@ -7,64 +7,67 @@ use std::{
     slice,
 };
 
-use crate::status::Fault;
+use crate::status::CallError;
 
-/// Longest text that is looked at, in bytes: no name and no path is longer.
+/// Maximum length of a text in bytes: no name and no path is longer.
 const LENGTH_MAX: usize = 4096;
-/// Most texts in a list.
+/// Maximum number of texts in a list.
 const COUNT_MAX: usize = 64;
 
-/// A text: UTF-8, not ended by a zero. `SINEW_TEXT("...")` makes one of a literal, `sinew_text_of` of a C string.
+/// A text: UTF-8, not terminated by a zero. `SINEW_TEXT("...")` makes one of a literal, `sinew_text_of` of a
+/// C string.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct Text {
-    /// Its first byte; may be NULL if the length is 0.
+    /// The first byte; may be NULL if the length is 0.
     pub bytes: *const c_char,
-    /// Its length in bytes, a zero at its end not counted.
+    /// Length in bytes, without a zero at its end.
     pub length: usize,
 }
 
 impl Text {
-    /// The text, which C keeps where it is while the call lasts.
-    pub(crate) fn read(&self, name: &str) -> Result<&str, Fault> {
+    /// Returns the text, which C keeps in place during the call.
+    pub(crate) fn read(&self, name: &str) -> Result<&str, CallError> {
         std::str::from_utf8(self.bytes(name)?)
-            .map_err(|error| Fault::argument(format!("`{name}` is no UTF-8: {error}")))
+            .map_err(|error| CallError::argument(format!("`{name}` is no UTF-8: {error}")))
     }
 
-    /// The same for a path, which may have any bytes but zeros.
-    pub(crate) fn path(&self, name: &str) -> Result<&Path, Fault> {
+    /// As [`Self::read`], for a path, which may have any bytes but zeros.
+    pub(crate) fn path(&self, name: &str) -> Result<&Path, CallError> {
         Ok(Path::new(OsStr::from_bytes(self.bytes(name)?)))
     }
 
-    fn bytes(&self, name: &str) -> Result<&[u8], Fault> {
+    fn bytes(&self, name: &str) -> Result<&[u8], CallError> {
         if self.length > LENGTH_MAX {
-            return Err(Fault::argument(format!(
+            return Err(CallError::argument(format!(
                 "`{name}` has {} bytes; at most {LENGTH_MAX} are looked at",
                 self.length
             )));
         }
-        // SAFETY: the header asks of the caller that these bytes are there while the call lasts; how many, was checked.
+        // SAFETY: the header requires that these bytes are valid during the call; the length was checked.
         unsafe { memory(self.bytes.cast(), self.length) }
-            .ok_or_else(|| Fault::argument(format!("`{name}` is NULL, but has a length")))
+            .ok_or_else(|| CallError::argument(format!("`{name}` is NULL, but has a length")))
     }
 }
 
-/// The texts of a list, which C keeps where it is while the call lasts.
-pub(crate) fn read_all(first: *const Text, count: usize, name: &str) -> Result<Vec<&str>, Fault> {
+/// Returns the texts of a list, which C keeps in place during the call.
+pub(crate) fn read_all(first: *const Text, count: usize, name: &str) -> Result<Vec<&str>, CallError> {
     if count > COUNT_MAX {
-        return Err(Fault::argument(format!("`{name}` has {count} texts; at most {COUNT_MAX} are legal")));
+        return Err(CallError::argument(format!(
+            "`{name}` has {count} texts; at most {COUNT_MAX} are legal"
+        )));
     }
-    // SAFETY: the header asks of the caller that so many texts are there while the call lasts; how many, was checked.
+    // SAFETY: the header requires that `count` texts are valid during the call; the count was checked.
     let texts = unsafe { memory(first, count) };
-    let texts = texts.ok_or_else(|| Fault::argument(format!("`{name}` is NULL, but has a count")))?;
+    let texts = texts.ok_or_else(|| CallError::argument(format!("`{name}` is NULL, but has a count")))?;
     texts.iter().map(|text| text.read(name)).collect()
 }
 
-/// Memory of the caller. No memory at all may begin at NULL; `None` if some does.
+/// Memory of the caller. An empty slice may begin at NULL; otherwise NULL gives `None`.
 ///
 /// # Safety
-/// `count` values of `T` are there and do not change while the result is used, unless `first` is NULL; together they have
-/// at most `isize::MAX` bytes.
+/// `count` values of `T` are valid and do not change while the result is used, unless `first` is NULL;
+/// together they have at most `isize::MAX` bytes.
 pub(crate) unsafe fn memory<'call, T>(first: *const T, count: usize) -> Option<&'call [T]> {
     match (first.is_null(), count) {
         (_, 0) => Some(&[]),
@@ -74,11 +77,11 @@ pub(crate) unsafe fn memory<'call, T>(first: *const T, count: usize) -> Option<&
     }
 }
 
-/// Memory of the caller that is written. `None` if it begins at NULL and is not empty.
+/// Memory of the caller, to write. `None` if it begins at NULL and is not empty.
 ///
 /// # Safety
-/// `count` values of `T` are there, for the user of the result alone, unless `first` is NULL; together they have at most
-/// `isize::MAX` bytes, and any bytes are a `T`.
+/// `count` values of `T` are valid, for the user of the result only, unless `first` is NULL; together they
+/// have at most `isize::MAX` bytes, and any bytes are a `T`.
 pub(crate) unsafe fn memory_mut<'call, T>(first: *mut T, count: usize) -> Option<&'call mut [T]> {
     match (first.is_null(), count) {
         (_, 0) => Some(&mut []),
@@ -99,18 +102,18 @@ mod tests {
     }
 
     #[test]
-    fn a_text_is_utf8_of_a_known_length_or_an_error_that_names_it() {
+    fn text_is_utf8_or_an_error_with_its_name() {
         assert_eq!(text("Knöchel".as_bytes()).read("name"), Ok("Knöchel"));
         assert_eq!(Text { bytes: ptr::null(), length: 0 }.read("name"), Ok(""));
         let wrong = [text(b"\xff"), Text { bytes: ptr::null(), length: 3 }, text(&[b'a'; LENGTH_MAX + 1])];
         for text in wrong {
-            let fault = format!("{:?}", text.read("name").unwrap_err());
-            assert!(fault.contains("`name`"), "{fault}");
+            let error = format!("{:?}", text.read("name").unwrap_err());
+            assert!(error.contains("`name`"), "{error}");
         }
     }
 
     #[test]
-    fn a_list_of_texts_is_bounded() {
+    fn list_of_texts_is_bounded() {
         let names = [text(b"hip"), text(b"knee")];
         assert_eq!(read_all(names.as_ptr(), 2, "required"), Ok(vec!["hip", "knee"]));
         assert_eq!(read_all(ptr::null(), 0, "required"), Ok(Vec::new()));

@@ -1,7 +1,8 @@
-//! A node that lives until its process ends, as a plug-in or a Python module holds it: a function registered with `atexit` stops it.
+//! A node that runs until its process ends, as in a plug-in or a Python module: a function registered with
+//! `atexit` stops it.
 //!
-//! The thread-local variables of the thread that ends the process are gone by then. Whether that disturbs the stop is a race, so there are many
-//! lives. This program starts itself again for each.
+//! The thread-local variables of the thread that ends the process are destroyed by then. Whether that
+//! disturbs the stop is a race, so there are many runs. This program starts itself again for each.
 
 use std::{
     io::{Write, stdout},
@@ -11,13 +12,13 @@ use std::{
 };
 
 use sinew::{NodeConfig, prelude::*};
-use sinew_tests::{DEADLINE, OwnDirectory, Program, own_group};
+use sinew_testkit::{DEADLINE, NodeProcess, TestDirectory, own_group};
 
-/// Lives of the node in each mode.
-const LIVES: u32 = 20;
-/// The exit code of each life.
+/// Runs of the node in each mode.
+const RUNS: u32 = 20;
+/// The exit code of each run.
 const CODE: u8 = 3;
-/// What ends a life: `main` returns, `main` calls `exit`, or another thread does.
+/// The end of a run: `main` returns, `main` calls `exit`, or another thread does.
 const MODES: [&str; 3] = ["return", "exit", "exit-of-a-thread"];
 
 static NODE: Mutex<Option<Node>> = Mutex::new(None);
@@ -28,23 +29,23 @@ impl Actor for Idle {
     type Context = AppContext<Self>;
 
     fn stopped(&mut self, _: &mut Self::Context) {
-        say(&format!("{} has stopped", self.0));
+        print_line(&format!("{} has stopped", self.0));
     }
 }
 
-fn say(line: &str) {
-    // Nobody reads it where the test has failed already.
+fn print_line(line: &str) {
+    // There is no reader if the test has failed already.
     let _ = writeln!(stdout(), "{line}");
 }
 
 extern "C" fn at_exit() {
     let node = NODE.lock().ok().and_then(|mut node| node.take());
     if let Some(node) = node {
-        say(&format!("the node has ended: {:?}", node.stop()));
+        print_line(&format!("the node has ended: {:?}", node.stop()));
     }
 }
 
-fn live(mode: &str, config: &str) -> ExitCode {
+fn run_node(mode: &str, config: &str) -> ExitCode {
     let config = NodeConfig::from_file(config).expect("the test's own file");
     let node = Node::builder("held")
         .config(config)
@@ -54,7 +55,8 @@ fn live(mode: &str, config: &str) -> ExitCode {
         .expect("it starts");
     node.handle().wait_until_running(DEADLINE).expect("it runs");
     *NODE.lock().expect("no thread has panicked") = Some(node);
-    // SAFETY: the function takes nothing, returns nothing, and lives as long as the program; a panic in it ends the process at once.
+    // SAFETY: the function takes nothing, returns nothing, and lives as long as the program; a panic in it
+    // ends the process at once.
     let registered = unsafe { libc::atexit(at_exit) };
     assert_eq!(registered, 0, "there is room for a handler");
     match mode {
@@ -69,7 +71,7 @@ fn live(mode: &str, config: &str) -> ExitCode {
 }
 
 fn prove(mode: &str) {
-    let directory = OwnDirectory::new();
+    let directory = TestDirectory::new();
     let (config, socket) = (directory.join("held.toml"), directory.join("held.sock"));
     let text = format!(
         "[node]\nname = \"held\"\naddress = \"127.0.0.1\"\nproject = \"atexit\"\n[lncl]\nsocket = {socket:?}\n\
@@ -78,25 +80,25 @@ fn prove(mode: &str) {
     );
     std::fs::write(&config, text).expect("the test's own directory");
     let this = std::env::current_exe().expect("a test has a path");
-    for life in 1..=LIVES {
+    for run in 1..=RUNS {
         let mut command = Command::new(&this);
-        command.args(["--life", mode]).arg(&config);
-        let mut program = Program::start(mode, command);
-        let code = program.wait_for_end();
-        let said = program.said();
-        let has_said = |words: &str| said.iter().any(|line| line.contains(words));
+        command.args(["--run", mode]).arg(&config);
+        let mut program = NodeProcess::start(mode, command);
+        let code = program.wait_for_exit();
+        let output = program.output();
+        let has_printed = |words: &str| output.iter().any(|line| line.contains(words));
         let words = ["shared has stopped", "alone has stopped", "the node has ended: Stopped"];
-        let is_ordered = words.into_iter().all(has_said);
-        assert_eq!((code, is_ordered), (Some(CODE.into()), true), "{mode}, life {life}: {said:#?}");
-        assert!(!socket.exists(), "{mode}, life {life}: the socket file stays");
+        let is_ordered = words.into_iter().all(has_printed);
+        assert_eq!((code, is_ordered), (Some(CODE.into()), true), "{mode}, run {run}: {output:#?}");
+        assert!(!socket.exists(), "{mode}, run {run}: the socket file stays");
     }
-    println!("{mode}: {LIVES} lives stopped in order");
+    println!("{mode}: {RUNS} runs stopped in order");
 }
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
-        ["--life", mode, config] => live(mode, config),
+        ["--run", mode, config] => run_node(mode, config),
         _ => {
             MODES.into_iter().for_each(prove);
             ExitCode::SUCCESS

@@ -1,4 +1,4 @@
-//! The header and the README that are checked in are what the source says.
+//! The header and the README in the repository match the source.
 
 use std::path::Path;
 
@@ -6,7 +6,7 @@ use std::path::Path;
 const BLESS: &str = "SINEW_BLESS";
 
 #[test]
-fn the_header_is_what_the_source_says() {
+fn header_matches_the_source() {
     let package = Path::new(env!("CARGO_MANIFEST_DIR"));
     let path = package.join("include/sinew.h");
     let config = cbindgen::Config::from_file(package.join("cbindgen.toml")).unwrap();
@@ -17,16 +17,16 @@ fn the_header_is_what_the_source_says() {
         std::fs::write(&path, &header).unwrap();
     }
     let checked_in = std::fs::read_to_string(&path).unwrap_or_default();
-    let differs = header.lines().zip(checked_in.lines()).find(|(says, is)| says != is);
+    let differs = header.lines().zip(checked_in.lines()).find(|(generated, stored)| generated != stored);
     assert!(
         header == checked_in,
-        "include/sinew.h is not what the source says (first difference: {differs:?}); write it anew by \
+        "include/sinew.h differs from the source (first difference: {differs:?}); generate it by \
          `{BLESS}=1 cargo test -p sinew-c --test header`"
     );
 }
 
 #[test]
-fn the_readme_shows_the_example_as_it_is() {
+fn readme_shows_the_example_verbatim() {
     let package = Path::new(env!("CARGO_MANIFEST_DIR"));
     let readme = std::fs::read_to_string(package.join("README.md")).unwrap();
     let example = std::fs::read_to_string(package.join("examples/drive.cpp")).unwrap();
@@ -35,19 +35,19 @@ fn the_readme_shows_the_example_as_it_is() {
 }
 
 #[test]
-fn the_first_page_of_the_api_shows_the_example_as_it_is() {
+fn api_page_shows_the_example_verbatim() {
     let package = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let page = std::fs::read_to_string(package.join("../../actors/src/client/mod.rs")).unwrap();
+    let page = std::fs::read_to_string(package.join("../../actors/client/src/lib.rs")).unwrap();
     let example = std::fs::read_to_string(package.join("examples/hello.c")).unwrap();
     let shown = example.lines().map(|line| format!("//! {line}").trim_end().to_owned() + "\n");
     assert!(
         page.contains(&shown.collect::<String>()),
-        "actors/src/client/mod.rs shows another examples/hello.c"
+        "actors/client/src/lib.rs shows another examples/hello.c"
     );
 }
 
 #[test]
-fn every_function_says_which_thread_may_call_it() {
+fn every_function_documents_its_threads() {
     let header =
         std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("include/sinew.h")).unwrap();
     let mut functions = 0;
@@ -57,12 +57,12 @@ fn every_function_says_which_thread_may_call_it() {
             words.clear();
         }
         words.push_str(line.trim_start_matches(" *"));
-        // The end of a declaration or of a head; types have none of these.
+        // The end of a declaration, or its first line; types have none of these.
         if line.contains(" sinew_") && line.contains('(') && !line.starts_with([' ', '/', '#']) {
             functions += 1;
-            let says = ["Any thread", "The endpoint's thread"];
+            let threads = ["Any thread", "The endpoint's thread"];
             let flat = words.split_whitespace().collect::<Vec<_>>().join(" ");
-            assert!(says.iter().any(|thread| flat.contains(thread)), "which thread? {line}");
+            assert!(threads.iter().any(|thread| flat.contains(thread)), "which thread? {line}");
         }
     }
     assert!(functions > 25, "{functions} functions were found");

@@ -26,7 +26,7 @@ impl Payload for Torque {
 
 const SOON: Duration = Duration::from_millis(20);
 
-/// The TID of a program that comes soon.
+/// Waits for a program that will register this name; returns its TID.
 fn await_name(endpoint: &mut Endpoint, name: &str) -> Tid {
     let begun = Instant::now();
     loop {
@@ -39,7 +39,7 @@ fn await_name(endpoint: &mut Endpoint, name: &str) -> Tid {
 }
 
 #[test]
-fn each_error_makes_an_output_safe_until_it_is_armed_again() {
+fn each_error_makes_the_output_safe_until_armed() {
     if !is_there("gcc") {
         return;
     }
@@ -48,7 +48,7 @@ fn each_error_makes_an_output_safe_until_it_is_armed_again() {
 }
 
 #[test]
-fn a_drive_in_c_follows_a_control_in_c_and_is_safe_when_that_ends() {
+fn drive_follows_control_and_ends_safe() {
     if !is_there("gcc") {
         return;
     }
@@ -57,13 +57,13 @@ fn a_drive_in_c_follows_a_control_in_c_and_is_safe_when_that_ends() {
     let mut drive = ground.start(&commands, &["drive"]);
     let mut control = ground.start(&commands, &["control", "100"]);
     drive.wait_for(&["moved by 2.5 Nm"]);
-    assert_eq!(control.wait_for_end(), Some(0));
+    assert_eq!(control.wait_for_exit(), Some(0));
     drive.wait_for(&["safe: no good message came in time"]);
-    assert_eq!(drive.wait_for_end(), Some(0));
+    assert_eq!(drive.wait_for_exit(), Some(0));
 }
 
 #[test]
-fn a_guard_in_rust_lets_through_what_c_has_sealed() {
+fn rust_guard_accepts_commands_sealed_in_c() {
     if !is_there("gcc") {
         return;
     }
@@ -74,7 +74,7 @@ fn a_guard_in_rust_lets_through_what_c_has_sealed() {
     let guard = drive.guard::<Torque, _>(source, 0.0_f32, |torque, _| *torque = 0.0).expect("a thread");
     let begun = Instant::now();
     loop {
-        // Refused until enough good ones have come.
+        // Rejected until enough good ones have arrived.
         let _ = guard.arm();
         if let Some(received) = drive.receive(SOON).expect("the node lives")
             && received.kind() == Torque::KIND
@@ -89,7 +89,7 @@ fn a_guard_in_rust_lets_through_what_c_has_sealed() {
 }
 
 #[test]
-fn a_guard_in_c_lets_through_what_rust_has_sealed_and_not_what_it_has_not() {
+fn c_guard_accepts_only_commands_sealed_in_rust() {
     if !is_there("gcc") {
         return;
     }
@@ -100,7 +100,7 @@ fn a_guard_in_c_lets_through_what_rust_has_sealed_and_not_what_it_has_not() {
     let (has_moved, is_over) = (AtomicBool::new(false), AtomicBool::new(false));
     std::thread::scope(|scope| {
         scope.spawn(|| {
-            // One more than is borne; good ones go on coming.
+            // One more than the limit; good ones keep arriving.
             let mut bare = 2;
             send_until(&mut control, &is_over, |control| {
                 control.send(to, &Torque { newton_metres: 3.5 }).expect("the node takes it");
@@ -112,15 +112,15 @@ fn a_guard_in_c_lets_through_what_rust_has_sealed_and_not_what_it_has_not() {
         });
         drive.wait_for(&["moved by 3.5 Nm"]);
         has_moved.store(true, Ordering::Relaxed);
-        // Then: what is not sealed moves nothing, and is what makes the output safe.
+        // then: messages without a seal move nothing, and make the output safe
         drive.wait_for(&["safe: too many bad messages came"]);
         is_over.store(true, Ordering::Relaxed);
     });
-    assert_eq!(drive.wait_for_end(), Some(0));
-    assert!(!drive.said().iter().any(|line| line.contains("moved by 32.0 Nm")));
+    assert_eq!(drive.wait_for_exit(), Some(0));
+    assert!(!drive.output().iter().any(|line| line.contains("moved by 32.0 Nm")));
 }
 
-/// Sealed, of the same name and as long, and no torque of the drive's.
+/// Sealed, with the same name and length, but not a torque of the drive.
 #[derive(Serialize, Deserialize)]
 struct OtherTorque {
     newton_meters: f32,
@@ -132,7 +132,7 @@ impl Payload for OtherTorque {
 }
 
 #[test]
-fn a_drive_in_c_that_cannot_read_a_good_command_makes_its_output_safe() {
+fn c_drive_makes_output_safe_on_unreadable_command() {
     if !is_there("gcc") {
         return;
     }
@@ -150,11 +150,11 @@ fn a_drive_in_c_that_cannot_read_a_good_command_makes_its_output_safe() {
         drive.wait_for(&["safe: it was tripped"]);
         is_over.store(true, Ordering::Relaxed);
     });
-    assert_eq!(drive.wait_for_end(), Some(0));
-    assert!(!drive.said().iter().any(|line| line.contains("moved by")));
+    assert_eq!(drive.wait_for_exit(), Some(0));
+    assert!(!drive.output().iter().any(|line| line.contains("moved by")));
 }
 
-/// A torque without an envelope.
+/// Sends a torque without an envelope.
 fn send_bare(control: &mut Endpoint, to: Tid) {
     let mut bare = control.create_message(to, Torque::KIND, 20).expect("it is short");
     bare[..15].copy_from_slice(b"\x81\xadnewton_metres");
@@ -162,12 +162,12 @@ fn send_bare(control: &mut Endpoint, to: Tid) {
     control.loaned(bare).send().expect("the node takes it");
 }
 
-/// Sends, each 20 ms or so, and hears what it has to quote.
+/// Sends about every 20 ms, and receives the echoes to quote.
 fn send_until(control: &mut Endpoint, is_over: &AtomicBool, mut send: impl FnMut(&mut Endpoint)) {
     let begun = Instant::now();
     while !is_over.load(Ordering::Relaxed) && begun.elapsed() < WATCHDOG {
         send(control);
-        // The first echo may be before what it is for, and is for nobody.
+        // The first echo may be sent before the first protected message; it is delivered here and ignored.
         if let Some(received) = control.receive(SOON).expect("the node lives") {
             assert_eq!(received.kind(), Kind::named("sinew.echo"));
         }

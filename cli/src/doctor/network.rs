@@ -1,4 +1,4 @@
-//! Interfaces, and whether multicast comes back at one of them.
+//! Checks the interfaces, and whether multicast is received on one of them.
 
 use std::{
     collections::BTreeMap,
@@ -12,9 +12,9 @@ use socket2::{Domain, Protocol, SockAddr, Socket, Type};
 
 use super::Check;
 
-/// Time for a datagram to come back from this machine's own interface.
-const HEARD_WITHIN: Duration = Duration::from_millis(500);
-/// The groups of the trial; nothing of Sinew's is there.
+/// Time limit for a datagram to return from this machine's own interface.
+const RECEIVE_TIMEOUT: Duration = Duration::from_millis(500);
+/// The groups of the test; Sinew does not use them.
 const GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 255, 77);
 const GROUP6: Ipv6Addr = Ipv6Addr::new(0xff12, 0, 0, 0, 0, 0, 0x8000, 0xff4d);
 /// Flags of an interface (`linux/if.h`).
@@ -26,7 +26,7 @@ const MULTICAST: u32 = 0x1000;
 pub(super) struct Interface {
     pub(super) name: String,
     pub(super) addresses: Vec<IpAddr>,
-    /// The kernel's number of it, where it has an address.
+    /// The kernel's number of it, if it has an address.
     pub(super) number: Option<u32>,
     pub(super) flags: u32,
     /// Whether there is a carrier: a cable, a radio link.
@@ -38,7 +38,7 @@ impl Interface {
         self.addresses.iter().any(IpAddr::is_loopback)
     }
 
-    /// What it lacks to carry nodes' words to other hosts, and what mends that.
+    /// Returns why it cannot carry datagrams of nodes to other hosts, and the fix for that.
     pub(super) fn lacks(&self) -> Option<(&'static str, String)> {
         let name = &self.name;
         if self.flags & UP == 0 {
@@ -78,24 +78,24 @@ impl Interface {
 /// Whether an interface leads to other hosts.
 pub(super) fn interfaces(all: &[Interface]) -> Check {
     const NAME: &str = "interfaces";
-    let seen: Vec<_> = all.iter().map(Interface::in_words).collect();
-    let seen = if seen.is_empty() { "none can be seen".to_owned() } else { seen.join(", ") };
+    let detail: Vec<_> = all.iter().map(Interface::in_words).collect();
+    let detail = if detail.is_empty() { "none can be seen".to_owned() } else { detail.join(", ") };
     if all.iter().any(|interface| !interface.is_loopback() && interface.lacks().is_none()) {
-        return Check::fine(NAME, seen);
+        return Check::fine(NAME, detail);
     }
-    // The one that lacks least: what is behind the last check it passes.
+    // The one that passes the most checks.
     let likeliest = all.iter().filter(|interface| !interface.is_loopback());
     let likeliest = likeliest.max_by_key(|interface| {
         (interface.flags & UP, interface.has_carrier, !interface.addresses.is_empty())
     });
-    let mend = likeliest.and_then(Interface::lacks).map_or_else(
+    let fix = likeliest.and_then(Interface::lacks).map_or_else(
         || "nodes of this host find each other; for others: a network interface".to_owned(),
-        |(_, mend)| mend,
+        |(_, fix)| fix,
     );
-    Check::finding(NAME, format!("none leads to other hosts: {seen}"), mend)
+    Check::finding(NAME, format!("none leads to other hosts: {detail}"), fix)
 }
 
-/// All interfaces, with what the kernel says of them.
+/// Returns all interfaces, with the kernel's data about them.
 pub(super) fn found() -> Vec<Interface> {
     let mut addresses: BTreeMap<String, (Vec<IpAddr>, Option<u32>)> = BTreeMap::new();
     for interface in if_addrs::get_if_addrs().unwrap_or_default() {
@@ -114,7 +114,7 @@ pub(super) fn found() -> Vec<Interface> {
             let flags = u32::from_str_radix(read("flags").trim().trim_start_matches("0x"), 16).ok()?;
             let has_carrier = read("carrier").trim() == "1";
             let (addresses, number) = addresses.remove(&name).unwrap_or_default();
-            // What has never had an address and is down is no way that anybody means (tunnels, shapers).
+            // An interface that is down and has no address is certainly not intended (tunnels, shapers).
             let is_meant = flags & UP != 0
                 || !addresses.is_empty()
                 || fs::exists(format!("/sys/class/net/{name}/device")).unwrap_or(false);
@@ -127,7 +127,7 @@ pub(super) fn found() -> Vec<Interface> {
 
 const MULTICAST_NAME: &str = "multicast";
 
-/// Whether a datagram to a group comes back at each address of these interfaces.
+/// Checks whether a datagram to a group returns at each address of these interfaces.
 pub(super) fn multicast(chosen: &Interfaces, all: &[Interface]) -> Vec<Check> {
     chosen.iter().flat_map(|choice| multicast_at(choice, all)).collect()
 }
@@ -159,29 +159,30 @@ fn multicast_at(choice: &Choice, all: &[Interface]) -> Vec<Check> {
         return checks.into_iter().chain(without_ipv4(choice, families, &at)).collect();
     }
     let names: Vec<_> = all.iter().map(Interface::in_words).collect();
-    let mend = format!(
+    let fix = format!(
         "the node waits until there is one; or set `ndl.interface` to one of this host: {}",
         names.join(", ")
     );
-    vec![Check::finding(MULTICAST_NAME, none, mend)]
+    vec![Check::finding(MULTICAST_NAME, none, fix)]
 }
 
-/// That what is chosen has no IPv4 address, where it may have one: nodes without IPv6 do not see that node. A lease may have ended.
+/// Reports that a chosen interface has no IPv4 address although it may have one: nodes without IPv6 cannot reach that
+/// node. A lease may have ended.
 fn without_ipv4(choice: &Choice, families: Families, at: &[&Interface]) -> Option<Check> {
     let has_ipv4 = at.iter().flat_map(|interface| &interface.addresses).any(IpAddr::is_ipv4);
     if has_ipv4 || !families.has_ipv4() {
         return None;
     }
     let device = at.first().map_or("eth0", |interface| interface.name.as_str());
-    let mend = format!(
+    let fix = format!(
         "sudo ip address add 10.0.0.1/24 dev {device} (an address of your network); or, where IPv6 alone is meant, `ndl.interface` = \"{choice}/ipv6\""
     );
-    let seen = format!("{choice} has no IPv4 address: the node is seen by IPv6 alone");
-    Some(Check::finding(MULTICAST_NAME, seen, mend))
+    let detail = format!("{choice} has no IPv4 address: the node is seen by IPv6 alone");
+    Some(Check::finding(MULTICAST_NAME, detail, fix))
 }
 
-/// Addresses of an interface at which groups are tried: each of IPv4, and of IPv6 one, as the group belongs to the link. Of loopback those
-/// that nodes use there.
+/// Returns the addresses of an interface at which groups are tested: each IPv4 address, and one IPv6 address, because
+/// the group belongs to the link. For loopback, those that nodes use there.
 fn tried(interface: &Interface, choice: &Choice, families: Families) -> impl Iterator<Item = IpAddr> {
     let is_on_loopback = choice.is_loopback();
     let used = interface.addresses.iter().copied().filter(move |ip| ip.is_loopback() || !is_on_loopback);
@@ -189,7 +190,7 @@ fn tried(interface: &Interface, choice: &Choice, families: Families) -> impl Ite
     used.filter(move |ip| families.has_ipv4() && ip.is_ipv4()).chain(of_ipv6)
 }
 
-/// Whether a datagram to a group comes back at the interface that has this address.
+/// Checks whether a datagram to a group returns at the interface with this address.
 fn hears_at(address: IpAddr, zone: Option<&str>, all: &[Interface]) -> Check {
     let is_it = |interface: &&Interface| {
         let has_it = interface.addresses.contains(&address)
@@ -202,22 +203,22 @@ fn hears_at(address: IpAddr, zone: Option<&str>, all: &[Interface]) -> Check {
     }
     let others: Vec<_> =
         all.iter().flat_map(|interface| &interface.addresses).map(IpAddr::to_string).collect();
-    let mend = format!(
+    let fix = format!(
         "set `ndl.interface`, and --interface here, to an address of this host: {}",
         others.join(", ")
     );
-    Check::finding(MULTICAST_NAME, format!("no interface of this host has the address {address}"), mend)
+    Check::finding(MULTICAST_NAME, format!("no interface of this host has the address {address}"), fix)
 }
 
 fn heard_at(address: IpAddr, interface: &Interface) -> Check {
     const NAME: &str = MULTICAST_NAME;
     let device = &interface.name;
     if address.is_ipv6() && address.is_loopback() {
-        let seen =
+        let detail =
             format!("{address} ({device}) has no groups: nodes of this host find each other there by seeds");
-        return Check::fine(NAME, seen);
+        return Check::fine(NAME, detail);
     }
-    let mend = || {
+    let fix = || {
         let (route, key) = match address {
             IpAddr::V4(_) => ("ip route add 239.0.0.0/8", "multicast"),
             IpAddr::V6(_) => ("ip -6 route add multicast ff00::/8 table local", "multicast6"),
@@ -235,18 +236,18 @@ fn heard_at(address: IpAddr, interface: &Interface) -> Check {
             ),
         ),
         Ok(false) => {
-            let seen = format!(
-                "a datagram to a group at {address} ({device}) did not come back within {HEARD_WITHIN:?}"
+            let detail = format!(
+                "a datagram to a group at {address} ({device}) did not come back within {RECEIVE_TIMEOUT:?}"
             );
-            Check::finding(NAME, seen, mend())
+            Check::finding(NAME, detail, fix())
         }
         Err(error) => {
-            Check::finding(NAME, format!("no group can be joined at {address} ({device}): {error}"), mend())
+            Check::finding(NAME, format!("no group can be joined at {address} ({device}): {error}"), fix())
         }
     }
 }
 
-/// Whether what is sent to a group at this interface comes back, never farther than this machine.
+/// Returns whether a datagram to a group on this interface returns; it never leaves this machine.
 fn hears_itself(address: IpAddr, number: Option<u32>) -> io::Result<bool> {
     let family = if address.is_ipv4() { Domain::IPV4 } else { Domain::IPV6 };
     let socket = Socket::new(family, Type::DGRAM, Some(Protocol::UDP))?;
@@ -269,13 +270,13 @@ fn hears_itself(address: IpAddr, number: Option<u32>) -> io::Result<bool> {
         }
     }
     let socket = UdpSocket::from(socket);
-    socket.set_read_timeout(Some(HEARD_WITHIN))?;
-    let said = std::process::id().to_le_bytes();
+    socket.set_read_timeout(Some(RECEIVE_TIMEOUT))?;
+    let sent = std::process::id().to_le_bytes();
     let group = if address.is_ipv4() { IpAddr::V4(GROUP) } else { IpAddr::V6(GROUP6) };
-    socket.send_to(&said, SocketAddr::new(group, socket.local_addr()?.port()))?;
-    let mut heard = [0; 8];
-    match socket.recv_from(&mut heard) {
-        Ok((length, _)) => Ok(heard[..length] == said),
+    socket.send_to(&sent, SocketAddr::new(group, socket.local_addr()?.port()))?;
+    let mut received = [0; 8];
+    match socket.recv_from(&mut received) {
+        Ok((length, _)) => Ok(received[..length] == sent),
         Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
             Ok(false)
         }
@@ -293,67 +294,67 @@ mod tests {
     }
 
     #[test]
-    fn what_an_interface_lacks_has_the_command_that_mends_it() {
+    fn each_interface_defect_has_a_fixing_command() {
         let lo = || interface("lo", Some([127, 0, 0, 1]), UP, true);
         let usable = interface("eth0", Some([10, 0, 0, 5]), UP | MULTICAST, true);
-        assert!(interfaces(&[lo(), usable]).mend.is_none());
-        for (one, mend) in [
+        assert!(interfaces(&[lo(), usable]).fix.is_none());
+        for (one, fix) in [
             (interface("eth0", None, MULTICAST, false), "ip link set dev eth0 up"),
             (interface("eth0", None, UP | MULTICAST, false), "cable of eth0"),
             (interface("eth0", None, UP | MULTICAST, true), "ip address add"),
             (interface("eth0", Some([10, 0, 0, 5]), UP, true), "eth0 multicast on"),
         ] {
             let check = interfaces(&[lo(), one]);
-            assert!(check.mend.as_ref().is_some_and(|said| said.contains(mend)), "{mend}: {:?}", check.mend);
+            assert!(check.fix.as_ref().is_some_and(|text| text.contains(fix)), "{fix}: {:?}", check.fix);
         }
-        assert!(interfaces(&[lo()]).mend.is_some(), "there is only this host");
-        assert!(interfaces(&[]).mend.is_some());
+        assert!(interfaces(&[lo()]).fix.is_some(), "there is only this host");
+        assert!(interfaces(&[]).fix.is_some());
     }
 
     #[test]
-    fn an_address_that_nobody_has_is_told_with_those_that_there_are() {
+    fn unknown_address_is_reported_with_the_existing_ones() {
         let all = [interface("lo", Some([127, 0, 0, 1]), UP, true)];
         let check = hears_at(Ipv4Addr::new(192, 0, 2, 1).into(), None, &all);
-        assert!(check.mend.is_some_and(|mend| mend.contains("127.0.0.1")));
+        assert!(check.fix.is_some_and(|fix| fix.contains("127.0.0.1")));
     }
 
     #[test]
-    fn a_name_that_no_interface_has_and_all_where_there_is_none_are_findings() {
+    fn unmatched_interface_choices_are_findings() {
         let all =
             [interface("lo", Some([127, 0, 0, 1]), UP, true), interface("eth0", None, MULTICAST, false)];
         for (choice, word) in [("eth1", "eth1"), ("all", "`all`"), ("fe80::1%eth1", "fe80::1")] {
             let choice: Choice = choice.parse().unwrap();
             let checks = multicast(&vec![choice].into(), &all);
             assert_eq!(checks.len(), 1);
-            assert!(checks[0].seen.contains(word), "{}", checks[0].seen);
-            assert!(checks[0].mend.as_ref().is_some_and(|mend| mend.contains("eth0") || word == "fe80::1"));
+            assert!(checks[0].detail.contains(word), "{}", checks[0].detail);
+            assert!(checks[0].fix.as_ref().is_some_and(|fix| fix.contains("eth0") || word == "fe80::1"));
         }
     }
 
     #[test]
-    fn that_an_interface_has_no_ipv4_is_a_finding_unless_ipv6_alone_is_chosen() {
+    fn missing_ipv4_is_a_finding_unless_ipv6_is_chosen() {
         let of = |addresses: &[&str], choice: &str| {
             let addresses = addresses.iter().map(|ip| ip.parse().unwrap()).collect();
             let all = [Interface { addresses, ..interface("eth0", None, UP | MULTICAST, true) }];
             let checks = multicast(&vec![choice.parse::<Choice>().unwrap()].into(), &all);
-            checks.into_iter().find(|check| check.seen.contains("no IPv4 address"))
+            checks.into_iter().find(|check| check.detail.contains("no IPv4 address"))
         };
         for choice in ["eth0", "all"] {
             let missing = of(&["fe80::1"], choice).expect("a finding");
-            assert!(missing.mend.is_some_and(|mend| mend.contains(&format!("{choice}/ipv6"))));
+            assert!(missing.fix.is_some_and(|fix| fix.contains(&format!("{choice}/ipv6"))));
             assert!(of(&["fe80::1", "127.0.0.9"], choice).is_none());
         }
         assert!(of(&["fe80::1"], "eth0/ipv6").is_none());
     }
 
     #[test]
-    fn each_address_of_an_interface_is_tried() {
+    fn each_address_of_an_interface_is_tested() {
         let mut lo = interface("lo", Some([127, 0, 0, 1]), UP, true);
         lo.addresses.extend(["127.0.0.2", "::1"].map(|ip| ip.parse::<IpAddr>().unwrap()));
         let all = [lo.clone()];
         let count = |choice: &str| multicast(&vec![choice.parse::<Choice>().unwrap()].into(), &all).len();
         assert_eq!((count("lo"), count("lo/ipv4"), count("lo/ipv6"), count("::1%lo")), (3, 2, 1, 1));
-        // Where nodes do not look: one that is told to the network by routing.
+        // Nodes do not use this one: an address that routing announces to the network.
         lo.addresses.insert(0, [10, 9, 9, 9].into());
         lo.addresses.insert(0, Ipv6Addr::new(0xfd00, 0, 0, 0, 0, 0, 0, 7).into());
         let tried: Vec<_> = tried(&lo, &"lo".parse().unwrap(), Families::Both).collect();

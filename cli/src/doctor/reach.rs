@@ -1,4 +1,4 @@
-//! Whether the nodes of the system that lets us in are seen from other hosts at all.
+//! Checks whether other hosts can reach the nodes of the system.
 
 use std::net::IpAddr;
 
@@ -9,10 +9,11 @@ use crate::table::quoted;
 
 const NAME: &str = "reach";
 
-/// One check for those that are on loopback only because nobody said anything else, one for those that are to be, and one for the others.
+/// Returns one check for nodes on loopback by default, one for those on loopback by configuration, and one for the
+/// others.
 pub(super) fn checks(nodes: &[NodeReport], interfaces: &[Interface]) -> Vec<Check> {
-    // Where GNCL is reached from elsewhere (`gncl.further`, `gncl.announce`) nobody finds the node there as long as it looks on loopback. An
-    // older node says nothing of it.
+    // If GNCL is reachable from other hosts (`gncl.further`, `gncl.announce`), no node discovers it there as long as it
+    // uses loopback. An older node does not report it.
     let is_alone = |node: &&NodeReport| {
         node.is_interface_default == Some(true)
             || node.security.as_ref().is_some_and(|security| !security.is_beyond_host)
@@ -26,7 +27,7 @@ pub(super) fn checks(nodes: &[NodeReport], interfaces: &[Interface]) -> Vec<Chec
     if !left.is_empty() {
         checks.push(finding(&left, interfaces));
     }
-    for (known, why) in [(Some(false), ", as they are told"), (None, "")] {
+    for (known, why) in [(Some(false), ", as configured"), (None, "")] {
         let some = of(known);
         if !some.is_empty() {
             let what = format!("on loopback only{why}: no other host sees them, and they see none");
@@ -44,8 +45,8 @@ fn in_words(nodes: &[&NodeReport]) -> String {
 }
 
 fn finding(alone: &[&NodeReport], interfaces: &[Interface]) -> Check {
-    let seen = format!(
-        "on loopback only, as nobody has said where else: no other host sees them, and they see none: {}",
+    let detail = format!(
+        "on loopback only, as no `interface` is set: no other host sees them, and they see none: {}",
         in_words(alone)
     );
     let line = match interfaces.iter().find_map(Interface::outward) {
@@ -65,26 +66,26 @@ fn finding(alone: &[&NodeReport], interfaces: &[Interface]) -> Check {
     } else {
         let named: Vec<_> = open.iter().map(|node| format!("{}={}", quoted(&node.name), node.node)).collect();
         format!(
-            "first give them keys, or everybody on that network can send to them: sinew keys init {} {}; then ",
+            "first give them keys, or every host on that network can send to them: sinew keys init {} {}; then ",
             quoted(&open[0].project),
             named.join(" ")
         )
     };
-    let mend = format!(
-        "where they are to be seen: {keys}below [ndl] in each one's configuration: {line}{several}; then start them again. Where they are not: interface = \"127.0.0.1\" there says so"
+    let fix = format!(
+        "where other hosts are to reach them: {keys}below [ndl] in each one's configuration: {line}{several}; then start them again. Where they are not: interface = \"127.0.0.1\" there ends this finding"
     );
-    Check::finding(NAME, seen, mend)
+    Check::finding(NAME, detail, fix)
 }
 
 impl Interface {
-    /// An address at which other hosts can be reached, of IPv4 where there is one.
+    /// Returns an address at which other hosts can reach this one, IPv4 if there is one.
     fn outward(&self) -> Option<IpAddr> {
         if self.is_loopback() || self.lacks().is_some() {
             return None;
         }
         let is_of_a_link = |ip: &IpAddr| matches!(ip, IpAddr::V6(ip) if ip.is_unicast_link_local());
         let ipv4 = self.addresses.iter().find(|ip| ip.is_ipv4());
-        // A link-local one needs its interface behind it, and is not the one to begin with.
+        // A link-local one needs a zone, and is not the first choice.
         ipv4.or_else(|| self.addresses.iter().find(|ip| !is_of_a_link(ip))).copied()
     }
 }
@@ -94,7 +95,7 @@ mod tests {
     use sinew::inspect::SecurityReport;
 
     use super::*;
-    use crate::security::tests::{NOW_S, open, said, secured};
+    use crate::security::tests::{NOW_S, node_report, open, secured};
 
     fn interface(name: &str, addresses: &[&str]) -> Interface {
         let addresses = addresses.iter().map(|ip| ip.parse().unwrap()).collect();
@@ -103,61 +104,65 @@ mod tests {
     }
 
     #[test]
-    fn a_node_that_nobody_took_off_loopback_is_a_finding_with_the_line_that_takes_it_to_the_network() {
+    fn default_loopback_is_a_finding_with_the_config_line() {
         let here = [
             interface("lo", &["127.0.0.1"]),
             interface("eth0", &["fe80::5", "10.0.0.5"]),
             interface("eth1", &["10.0.1.5"]),
         ];
-        // Also where it listens elsewhere besides: nobody finds it there.
-        let desk = NodeReport { is_interface_default: Some(true), ..said("desk", 3, open(true)) };
-        let [found, fine] = &checks(&[desk, said("knee", 2, open(true))], &here)[..] else {
+        // This also holds for a node that listens elsewhere: no other host discovers it there.
+        let desk = NodeReport { is_interface_default: Some(true), ..node_report("desk", 3, open(true)) };
+        let [found, fine] = &checks(&[desk, node_report("knee", 2, open(true))], &here)[..] else {
             panic!("that which is alone, and the other")
         };
-        assert!(found.seen.contains("no other host sees") && found.seen.contains("desk"), "{}", found.seen);
-        let mend = found.mend.as_ref().expect("a finding");
-        assert!(mend.contains("[ndl]") && mend.contains("interface = \"10.0.0.5\""), "{mend}");
         assert!(
-            mend.contains("sinew keys init walker desk=192.168.0.3"),
-            "an open one is closed first: {mend}"
-        );
-        assert!(fine.mend.is_none() && fine.seen.contains("knee"), "{}", fine.seen);
-    }
-
-    #[test]
-    fn a_node_that_was_put_on_loopback_is_shown_and_is_no_finding() {
-        let desk = NodeReport { interface: "lo".to_owned(), ..said("desk", 3, open(false)) };
-        let [fine] = &checks(&[desk], &[interface("lo", &["127.0.0.1"])])[..] else { panic!("one") };
-        assert!(fine.mend.is_none(), "{:?}", fine.mend);
-        assert!(
-            fine.seen.contains("no other host sees") && fine.seen.ends_with("desk (lo)"),
+            found.detail.contains("no other host sees") && found.detail.contains("desk"),
             "{}",
-            fine.seen
+            found.detail
         );
-        assert!(fine.seen.contains("as they are told"), "{}", fine.seen);
+        let fix = found.fix.as_ref().expect("a finding");
+        assert!(fix.contains("[ndl]") && fix.contains("interface = \"10.0.0.5\""), "{fix}");
+        assert!(
+            fix.contains("sinew keys init walker desk=192.168.0.3"),
+            "an open one is closed first: {fix}"
+        );
+        assert!(fine.fix.is_none() && fine.detail.contains("knee"), "{}", fine.detail);
     }
 
     #[test]
-    fn who_does_not_say_whether_anybody_chose_loopback_is_not_said_to_be_told_so() {
-        let desk = NodeReport { is_interface_default: None, ..said("desk", 3, open(false)) };
+    fn configured_loopback_is_shown_but_no_finding() {
+        let desk = NodeReport { interface: "lo".to_owned(), ..node_report("desk", 3, open(false)) };
+        let [fine] = &checks(&[desk], &[interface("lo", &["127.0.0.1"])])[..] else { panic!("one") };
+        assert!(fine.fix.is_none(), "{:?}", fine.fix);
+        assert!(
+            fine.detail.contains("no other host sees") && fine.detail.ends_with("desk (lo)"),
+            "{}",
+            fine.detail
+        );
+        assert!(fine.detail.contains("as configured"), "{}", fine.detail);
+    }
+
+    #[test]
+    fn loopback_of_unknown_origin_is_not_called_configured() {
+        let desk = NodeReport { is_interface_default: None, ..node_report("desk", 3, open(false)) };
         let [fine] = &checks(&[desk], &[])[..] else { panic!("one") };
-        assert!(fine.mend.is_none() && fine.seen.contains("desk"), "{}", fine.seen);
-        assert!(!fine.seen.contains("told"), "{}", fine.seen);
+        assert!(fine.fix.is_none() && fine.detail.contains("desk"), "{}", fine.detail);
+        assert!(!fine.detail.contains("configured"), "{}", fine.detail);
     }
 
     #[test]
-    fn who_has_keys_needs_none_and_a_host_without_a_network_is_told_so() {
+    fn fix_omits_keys_that_exist_and_a_missing_network() {
         let security =
             secured(NOW_S, "until-set").map(|keys| SecurityReport { is_beyond_host: false, ..keys });
-        let desk = NodeReport { is_interface_default: Some(true), ..said("desk", 3, security) };
+        let desk = NodeReport { is_interface_default: Some(true), ..node_report("desk", 3, security) };
         let [found] = &checks(&[desk], &[interface("lo", &["127.0.0.1"])])[..] else { panic!("one") };
-        let mend = found.mend.as_ref().expect("a finding");
-        assert!(!mend.contains("sinew keys") && mend.contains("this host has none"), "{mend}");
+        let fix = found.fix.as_ref().expect("a finding");
+        assert!(!fix.contains("sinew keys") && fix.contains("this host has none"), "{fix}");
     }
 
     #[test]
-    fn who_does_not_say_is_not_accused_and_without_nodes_there_is_no_check() {
-        assert!(checks(&[said("hip", 1, None)], &[]).iter().all(|check| check.mend.is_none()));
+    fn missing_report_is_no_finding() {
+        assert!(checks(&[node_report("hip", 1, None)], &[]).iter().all(|check| check.fix.is_none()));
         assert!(checks(&[], &[]).is_empty());
     }
 }

@@ -1,4 +1,4 @@
-//! Limits, real-time rights, and what the CPUs do when nothing is to be done.
+//! Checks limits, real-time rights, and the power management of idle CPUs.
 
 use std::{collections::BTreeSet, fs};
 
@@ -15,31 +15,31 @@ use thread_priority::{
 
 use super::Check;
 
-/// Open files that a node with all its clients and their rings may need.
+/// Number of open files that a node with all its clients and their rings may need.
 const FILES_WANTED: u64 = 4_096;
 /// Memory that a control program may want to lock, in bytes: its stacks, its heap, the rings.
 const LOCKED_WANTED: u64 = 64 << 20;
-/// Where the limits of users are.
+/// The file for limits of users.
 const LIMITS: &str = "/etc/security/limits.d/sinew.conf";
 
 pub(super) fn open_files() -> Check {
     let limit = getrlimit(Resource::Nofile);
     let (now, most) = (limit.current.unwrap_or(u64::MAX), limit.maximum.unwrap_or(u64::MAX));
-    let seen = format!(
+    let detail = format!(
         "a process may have {now} files open (RLIMIT_NOFILE), at most {most}; {FILES_WANTED} are enough for a full node"
     );
     if now >= FILES_WANTED {
-        return Check::fine("open files", seen);
+        return Check::fine("open files", detail);
     }
-    let mend = if most >= FILES_WANTED {
+    let fix = if most >= FILES_WANTED {
         format!("ulimit -n {FILES_WANTED}, or LimitNOFILE={FILES_WANTED} in the service's unit")
     } else {
         format!("echo '* - nofile {FILES_WANTED}' | sudo tee -a {LIMITS}, then log in again")
     };
-    Check::finding("open files", seen, mend)
+    Check::finding("open files", detail, fix)
 }
 
-/// Sinew locks nothing itself; a program with a control loop does.
+/// Sinew itself locks no memory; a program with a control loop does.
 pub(super) fn locked_memory() -> Check {
     const NAME: &str = "locked memory";
     let limit = getrlimit(Resource::Memlock).current;
@@ -59,8 +59,8 @@ pub(super) fn locked_memory() -> Check {
     )
 }
 
-/// Tried on a thread that ends with it: what the limits say is not always so (in containers). What makes outputs safe wants the most of what
-/// a robot cannot be without; the node's watchdog would have a little more.
+/// Tested on a thread that ends with the test: the limits are not always effective (in containers). The threads that
+/// make outputs safe need the highest of the required priorities; the node's watchdog would use a slightly higher one.
 pub(super) fn real_time() -> Check {
     const NAME: &str = "real-time rights";
     let trial = |priority: u8| {
@@ -74,7 +74,7 @@ pub(super) fn real_time() -> Check {
         getrlimit(Resource::Rtprio).current.map_or_else(|| "any".to_owned(), |limit| limit.to_string());
     let capability = if has(CapabilitySet::SYS_NICE) { "with" } else { "without" };
     let known = format!("RLIMIT_RTPRIO {limit}, {capability} CAP_SYS_NICE");
-    let seen = match std::thread::spawn(trials).join() {
+    let detail = match std::thread::spawn(trials).join() {
         Ok((_, Ok(()))) => {
             return Check::fine(
                 NAME,
@@ -92,7 +92,7 @@ pub(super) fn real_time() -> Check {
     };
     Check::finding(
         NAME,
-        seen,
+        detail,
         format!(
             "echo \"$USER - rtprio 99\" | sudo tee -a {LIMITS}, then log in again; or LimitRTPRIO=99 in the service's unit; or sudo setcap \
              cap_sys_nice+ep PROGRAM; in a container: --cap-add SYS_NICE --ulimit rtprio=99"
@@ -100,7 +100,7 @@ pub(super) fn real_time() -> Check {
     )
 }
 
-/// The kernel takes the CPU from real-time threads that never sleep: good to know, not to be mended.
+/// Returns whether the kernel takes the CPU from real-time threads that never sleep: information, not a finding.
 fn throttled() -> String {
     let read = |name| fs::read_to_string(format!("/proc/sys/kernel/{name}")).ok()?.trim().parse::<i64>().ok();
     match (read("sched_rt_runtime_us"), read("sched_rt_period_us")) {
@@ -115,14 +115,14 @@ fn has(capability: CapabilitySet) -> bool {
     capabilities(None).is_ok_and(|sets| sets.effective.contains(capability))
 }
 
-/// A CPU that was clocked down answers its first message late.
+/// Checks the CPU governor: a CPU with a reduced clock handles its first message late.
 pub(super) fn governor() -> Check {
     const NAME: &str = "CPU governor";
     let cpus = fs::read_dir("/sys/devices/system/cpu").into_iter().flatten().flatten();
     let governors =
         cpus.filter_map(|cpu| fs::read_to_string(cpu.path().join("cpufreq/scaling_governor")).ok());
     let governors: BTreeSet<_> = governors.map(|governor| governor.trim().to_owned()).collect();
-    let seen = governors.iter().cloned().collect::<Vec<_>>().join(", ");
+    let detail = governors.iter().cloned().collect::<Vec<_>>().join(", ");
     if governors.is_empty() {
         return Check::fine(
             NAME,
@@ -130,11 +130,11 @@ pub(super) fn governor() -> Check {
         );
     }
     if governors.iter().all(|governor| governor == "performance") {
-        return Check::fine(NAME, seen);
+        return Check::fine(NAME, detail);
     }
     Check::finding(
         NAME,
-        format!("{seen}: a CPU that has slept is slow at first, which a control loop sees as jitter"),
+        format!("{detail}: a CPU that has slept is slow at first, which a control loop sees as jitter"),
         "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor",
     )
 }
@@ -158,7 +158,7 @@ pub(super) fn shared_memory() -> Check {
     }
 }
 
-/// The node watches the process of an application with `own_process` through a descriptor.
+/// Checks pidfd support: the node monitors the process of an application with `own_process` through a descriptor.
 pub(super) fn own_processes() -> Check {
     const NAME: &str = "own processes";
     match pidfd_open(getpid(), PidfdFlags::empty()) {

@@ -1,4 +1,4 @@
-//! Whether nodes that share a host keep each other when its network goes.
+//! Checks whether nodes that share a host stay connected when its network fails.
 
 use std::{
     collections::BTreeMap,
@@ -10,10 +10,10 @@ use sinew::{config::Interface, inspect::NodeReport};
 use super::Check;
 
 const NAME: &str = "one host";
-/// What loopback is called here.
+/// The name of the loopback interface.
 const LOOPBACK: &str = if cfg!(target_os = "macos") { "lo0" } else { "lo" };
 
-/// One check for each host that has several nodes on its network.
+/// Returns one check for each host with several nodes on its network.
 pub(super) fn checks(nodes: &[NodeReport]) -> Vec<Check> {
     let mut hosts = BTreeMap::<IpAddr, Vec<&NodeReport>>::new();
     for node in nodes {
@@ -24,7 +24,8 @@ pub(super) fn checks(nodes: &[NodeReport]) -> Vec<Check> {
     hosts.into_iter().filter(|(_, nodes)| nodes.len() > 1).map(|(ip, nodes)| check(ip, &nodes)).collect()
 }
 
-/// An address that one host alone has: nodes that are there are on it together. Those of loopback need no network.
+/// Returns an address that belongs to one host alone: nodes with the same one share that host. Nodes on loopback need
+/// no network.
 fn shared_ip(udp: &str) -> Option<IpAddr> {
     let ip = udp.parse::<SocketAddr>().ok()?.ip();
     let is_link_local = matches!(ip, IpAddr::V6(ip) if ip.is_unicast_link_local());
@@ -41,16 +42,16 @@ fn check(ip: IpAddr, nodes: &[&NodeReport]) -> Check {
             format!("keep each other also without a network at {ip}: {}", words(nodes)),
         );
     }
-    let seen = format!(
+    let detail = format!(
         "share the host at {ip}, and lose each other when it loses that address, as they have no loopback beside it: {}",
         words(&lack)
     );
     let lines: Vec<_> = lack.iter().map(|node| format!("{} has {}", node.name, line(node))).collect();
-    let mend = format!(
+    let fix = format!(
         "below [ndl] in each one's configuration loopback behind the interfaces that it has, so that {}; then start them again",
         lines.join(", ")
     );
-    Check::finding(NAME, seen, mend)
+    Check::finding(NAME, detail, fix)
 }
 
 fn has_loopback(node: &NodeReport) -> bool {
@@ -67,33 +68,32 @@ fn line(node: &NodeReport) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::security::tests::said;
+    use crate::security::tests::node_report;
 
     fn node(name: &str, udp: &str, interface: &str) -> NodeReport {
         let (udp, interface) = (Some(udp.to_owned()), interface.to_owned());
-        NodeReport { udp, interface, ..said(name, 1, None) }
+        NodeReport { udp, interface, ..node_report(name, 1, None) }
     }
 
     #[test]
-    fn nodes_of_one_host_that_have_no_loopback_beside_its_network_are_a_finding_with_the_line_that_gives_it()
-    {
+    fn missing_loopback_beside_a_network_is_a_finding() {
         let nodes = [
             node("hip", "192.168.1.7:6911", "wlan0, eth0/ipv4"),
             node("knee", "192.168.1.7:6912", "wlan0, lo"),
             node("ankle", "192.168.1.8:6911", "wlan0"),
         ];
         let [found] = &checks(&nodes)[..] else { panic!("of the host that has two") };
-        assert!(found.seen.contains("192.168.1.7") && found.seen.ends_with(": hip"), "{}", found.seen);
-        let mend = found.mend.as_ref().expect("a finding");
-        assert!(mend.contains(r#"interface = ["wlan0", "eth0/ipv4", "lo"]"#), "{mend}");
-        assert!(!mend.contains("knee"), "{mend}");
+        assert!(found.detail.contains("192.168.1.7") && found.detail.ends_with(": hip"), "{}", found.detail);
+        let fix = found.fix.as_ref().expect("a finding");
+        assert!(fix.contains(r#"interface = ["wlan0", "eth0/ipv4", "lo"]"#), "{fix}");
+        assert!(!fix.contains("knee"), "{fix}");
     }
 
     #[test]
-    fn nodes_that_have_loopback_are_fine_and_of_one_alone_or_on_loopback_nothing_is_said() {
+    fn nodes_with_loopback_or_without_neighbours_are_fine() {
         let with = ["hip", "knee"].map(|name| node(name, "192.168.1.7:6911", "192.168.1.7, lo"));
         let [fine] = &checks(&with)[..] else { panic!("one host") };
-        assert!(fine.mend.is_none() && fine.seen.ends_with(": hip, knee"), "{}", fine.seen);
+        assert!(fine.fix.is_none() && fine.detail.ends_with(": hip, knee"), "{}", fine.detail);
         let on_loopback = ["hip", "knee"].map(|name| node(name, "127.0.0.1:6911", "127.0.0.1"));
         let of_a_link = ["hip", "knee"].map(|name| node(name, "[fe80::1%2]:6911", "eth0/ipv6"));
         for nodes in [&with[..1], &on_loopback, &of_a_link] {

@@ -1,4 +1,4 @@
-//! The authority's own key and certificate, and what it signs.
+//! The key and the certificate of the authority, and the certificates that it signs.
 
 use std::time::Duration;
 
@@ -8,17 +8,17 @@ use rcgen::{
 };
 use sinew::security::{Identity, UnixTime, date, project_uri};
 
-use crate::system::Fault;
+use crate::system::SystemError;
 
-/// For how long the authority's own certificate counts: 20 years, the life of a robot and more.
+/// The validity of the authority's own certificate: 20 years, the life of a robot and more.
 const AUTHORITY_DAYS: u64 = 20 * 365;
-/// Certificates count from a little before they are made: the robot's clock may be behind this machine's.
+/// Certificates are valid from shortly before their creation: the robot's clock may be behind this machine's.
 const BEFORE: Duration = Duration::from_secs(3_600);
-/// When `sinew keys` came into being, in seconds since 1970 (2026-01-01): a clock that shows an earlier time is wrong.
+/// The release of `sinew keys`, in seconds since 1970 (2026-01-01): a clock that shows an earlier time is wrong.
 const EARLIEST: u64 = 1_767_225_600;
 const DAY: Duration = Duration::from_secs(24 * 3_600);
 
-/// From when until when certificates count that are made now.
+/// The validity period of certificates that are created now.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Clock {
     pub(super) now: UnixTime,
@@ -38,31 +38,32 @@ pub(super) struct Pair {
 }
 
 impl Clock {
-    /// Refuses a clock that is not set: the certificates would count at another time than was meant.
-    pub(super) fn new(now: UnixTime, days: u32) -> Result<Self, Fault> {
+    /// Refuses a clock that is not set: the certificates would have the wrong validity period.
+    pub(super) fn new(now: UnixTime, days: u32) -> Result<Self, SystemError> {
         if now.as_secs() < EARLIEST {
-            return Err(Fault::Keys(format!(
-                "the clock of this machine says {}, and certificates are made with dates; set it first",
+            return Err(SystemError::Keys(format!(
+                "the clock of this machine shows {}, and certificates have dates; set it first",
                 date(&now)
             )));
         }
         Ok(Self { now, days })
     }
 
-    /// Refuses what would count when its authority does not any more, `until`: nobody would take it then.
-    pub(super) fn must_end_before(self, until: UnixTime) -> Result<(), Fault> {
+    /// Refuses a certificate that would be valid beyond the end of its authority, `until`: no node would accept it
+    /// then.
+    pub(super) fn must_end_before(self, until: UnixTime) -> Result<(), SystemError> {
         let left = until.as_secs().saturating_sub(self.now.as_secs()) / DAY.as_secs();
         if u64::from(self.days) <= left {
             return Ok(());
         }
         let until = date(&until);
-        Err(Fault::Keys(if left == 0 {
+        Err(SystemError::Keys(if left == 0 {
             format!(
                 "the authority's certificate ends on {until}: make this robot's keys anew with `sinew keys init`"
             )
         } else {
             format!(
-                "the authority's certificate counts until {until}, and these should count for {} days: say --days {left} at most, or make \
+                "the authority's certificate is valid until {until}, and these should be valid for {} days: say --days {left} at most, or make \
                  this robot's keys anew with `sinew keys init`",
                 self.days
             )
@@ -79,7 +80,7 @@ impl Clock {
 }
 
 impl Authority {
-    /// A new one, and its certificate as PEM.
+    /// Creates an authority, and its certificate as PEM.
     pub(super) fn make(project: &str, clock: Clock) -> Result<(Self, Pair), rcgen::Error> {
         let key = KeyPair::generate()?;
         let mut params = params_of(project)?;
@@ -88,12 +89,12 @@ impl Authority {
         Ok((Self { project: project.to_owned(), key }, pair))
     }
 
-    /// The one of `project` whose key is in `pem`.
+    /// Reads the authority of `project` with the key in `pem`.
     pub(super) fn read(project: &str, pem: &str) -> Result<Self, rcgen::Error> {
         Ok(Self { project: project.to_owned(), key: KeyPair::from_pem(pem)? })
     }
 
-    /// A key and a certificate for the node `identity`, at both ends of connections.
+    /// Creates a key and a certificate for the node `identity`, for both ends of connections.
     pub(super) fn sign(&self, identity: &Identity, clock: Clock) -> Result<Pair, rcgen::Error> {
         let own = params_of(&self.project)?;
         let issuer = Issuer::from_params(&own, &self.key);
@@ -111,7 +112,7 @@ impl Authority {
     }
 }
 
-/// What an authority says of itself: it signs nodes, and no other authority.
+/// Returns the parameters of an authority: it signs nodes, and no other authority.
 fn params_of(project: &str) -> Result<CertificateParams, rcgen::Error> {
     let mut params = CertificateParams::default();
     params.distinguished_name = named(&format!("{project} (Sinew)"));
@@ -136,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn no_certificate_outlives_the_authority_that_signs_it() {
+    fn certificate_does_not_outlive_its_authority() {
         let in_days = |days: u32| UnixTime::since_unix_epoch(Duration::from_secs(EARLIEST) + DAY * days);
         assert!(clock(365).must_end_before(in_days(365)).is_ok());
         let longer = clock(366).must_end_before(in_days(365)).expect_err("a day too many").to_string();

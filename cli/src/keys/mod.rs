@@ -11,26 +11,29 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 use sinew::security::UnixTime;
 
-use crate::{Report, system::Fault};
+use crate::{Report, system::SystemError};
 use project::Project;
 
-/// What to do with keys.
+/// An operation on keys.
 #[derive(Debug, Subcommand)]
 pub(crate) enum Order {
-    /// Makes a project's authority, and a key and a certificate for each of its nodes, in a new directory; says what is to be copied where
+    /// Makes a project's authority, and a key and a certificate for each of its nodes, in a new directory;
+    /// prints the commands that copy them
     ///
-    /// A node is NAME=ADDRESS, or the configuration file of the node (`hip.toml`), or its name: then its address is that in NAME.toml in this
-    /// directory, where there is such a file, else the next free one from 127.0.0.1 on, for nodes that share one machine. Where all others have
-    /// addresses of a network, it has to be said.
+    /// A node is NAME=ADDRESS, or the configuration file of the node (`hip.toml`), or its name: then its
+    /// address is that in NAME.toml in this directory, where there is such a file, else the next free one
+    /// from 127.0.0.1 on, for nodes that share one machine. Where all others have addresses of a network, it
+    /// has to be given.
     ///
-    /// What exists is not touched: a directory that is not empty is refused.
+    /// Existing files are not touched: a directory that is not empty is refused.
     Init {
         /// The project, as in `node.project`
         project: String,
         /// The nodes
         #[arg(required = true, value_name = "NODE")]
         nodes: Vec<String>,
-        /// The directory that is made. It holds the authority's key: keep it off the robot, and a copy of it in a safe place
+        /// The directory that is made. It holds the authority's key: keep it off the robot, and a copy of it
+        /// in a safe place
         #[arg(long, visible_alias = "keys", value_name = "DIR", default_value = "keys")]
         out: PathBuf,
         #[command(flatten)]
@@ -38,55 +41,55 @@ pub(crate) enum Order {
     },
     /// Makes a key and a certificate for further nodes, or new ones for nodes that have some
     ///
-    /// Those before them count until they end, or are revoked. A node that has an address keeps it, unless another one is named; also one whose
-    /// certificates are all revoked.
+    /// Earlier ones are valid until they end, or are revoked. A node that has an address keeps it, unless
+    /// another one is named; also one with revoked certificates only.
     Issue {
         /// The nodes, each as for `init`
         #[arg(required = true, value_name = "NODE")]
         nodes: Vec<String>,
         #[command(flatten)]
-        place: Place,
+        place: KeyFolder,
         #[command(flatten)]
         time: Time,
     },
-    /// Puts all certificates of nodes on the deny list: the nodes' keys were lost, or somebody else may have them
+    /// Puts all certificates of nodes on the deny list: their keys were lost, or may be in other hands
     ///
-    /// The list counts on a node when it has been copied there.
+    /// The list takes effect on a node when it has been copied there.
     Revoke {
         /// Names of nodes, each with all certificates that it ever had, or numbers of certificates
         #[arg(required = true, value_name = "NAME")]
-        whom: Vec<String>,
+        targets: Vec<String>,
         #[command(flatten)]
-        place: Place,
+        place: KeyFolder,
     },
     /// Every certificate that was made: of which node, from when until when, revoked or not
     ///
-    /// Of the directory of one node, as it is on the robot, that node's. Exit code 1 where a node has no certificate that counts for another
-    /// 30 days.
+    /// Of the directory of one node, as it is on the robot, that node's. Exit code 1 where a node has no
+    /// certificate that is valid for another 30 days.
     Show {
         #[command(flatten)]
-        place: Place,
+        place: KeyFolder,
     },
 }
 
 /// Where the keys are.
 #[derive(Debug, Args)]
-pub(crate) struct Place {
+pub(crate) struct KeyFolder {
     /// The directory that `init` made
     #[arg(long, value_name = "DIR", default_value = "keys")]
     keys: PathBuf,
 }
 
-/// How long certificates count.
+/// How long certificates are valid.
 #[derive(Debug, Args)]
 pub(crate) struct Time {
-    /// For how many days the certificates count
+    /// For how many days the certificates are valid
     #[arg(long, value_name = "DAYS", default_value_t = 365, value_parser = clap::value_parser!(u32).range(1..=3_650))]
     days: u32,
 }
 
 /// Carries out `order`.
-pub(crate) fn show(order: &Order) -> Result<Report, Fault> {
+pub(crate) fn show(order: &Order, is_wide: bool) -> Result<Report, SystemError> {
     let now = UnixTime::now();
     match order {
         Order::Init { project, nodes, out, time } => {
@@ -94,7 +97,7 @@ pub(crate) fn show(order: &Order) -> Result<Report, Fault> {
             let wanted = targets::wanted(project, nodes)?;
             let wanted = targets::placed(wanted, &[], &[])?;
             let made = Project::init(project, out, &wanted, clock)?;
-            Ok(report::made(&made, &wanted))
+            Ok(report::made(&made, &wanted, is_wide))
         }
         Order::Issue { nodes, place, time } => {
             let clock = authority::Clock::new(now, time.days)?;
@@ -102,17 +105,17 @@ pub(crate) fn show(order: &Order) -> Result<Report, Fault> {
             let wanted = targets::wanted(project.name(), nodes)?;
             let wanted = targets::placed(wanted, &project.counting(now)?, &project.issued()?)?;
             let made = project.issue(&wanted, clock)?;
-            Ok(report::made(&made, &wanted))
+            Ok(report::made(&made, &wanted, is_wide))
         }
-        Order::Revoke { whom, place } => {
+        Order::Revoke { targets, place } => {
             let project = Project::open(&place.keys)?;
-            Ok(report::revoked(&project.revoke(whom, now)?, &place.keys))
+            Ok(report::revoked(&project.revoke(targets, now)?, &place.keys))
         }
-        Order::Show { place } => Ok(report::shown(&Project::look(&place.keys)?, now)),
+        Order::Show { place } => Ok(report::shown(&Project::status(&place.keys)?, now, is_wide)),
     }
 }
 
-/// What went wrong at a path, and what to do.
-fn fault(path: &std::path::Path, why: impl std::fmt::Display, remedy: &str) -> Fault {
-    Fault::Keys(format!("{}: {why}; {remedy}", path.display()))
+/// Describes the failure at a path, with its remedy.
+fn fault(path: &std::path::Path, why: impl std::fmt::Display, remedy: &str) -> SystemError {
+    SystemError::Keys(format!("{}: {why}; {remedy}", path.display()))
 }

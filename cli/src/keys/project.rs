@@ -1,4 +1,4 @@
-//! The directory of a project's keys, on the machine that makes them.
+//! The directory of a project's keys, on the machine where they are created.
 //!
 //! ```text
 //! keys/                0700
@@ -6,8 +6,8 @@
 //!   ca.pem             0644   its certificate
 //!   discovery.key      0600   the project's key for datagrams
 //!   denied.txt         0644   the deny list
-//!   issued/NUMBER.pem  0644   every certificate that was ever made: what is not here cannot be revoked
-//!   nodes/NAME/        0700   what goes to the node, as a whole
+//!   issued/NUMBER.pem  0644   every certificate that was ever made: only these can be revoked
+//!   nodes/NAME/        0700   the files for the node, copied as a whole
 //! ```
 
 use std::{
@@ -27,55 +27,55 @@ use super::{
     targets::Wanted,
     write::{self, Readers, Staged},
 };
-use crate::system::Fault;
+use crate::{system::SystemError, table::short, unknown::suggestion};
 
 const AUTHORITY_KEY: &str = "ca.key";
 const ISSUED: &str = "issued";
 const NODES: &str = "nodes";
-/// Certificates of one project at most.
+/// Maximum number of certificates of one project.
 const ISSUED_MAX: usize = DenyList::SERIALS_MAX;
 const HEADING: &str = "# Certificates that are revoked, one number a line. Made by `sinew keys revoke`; copy it to every node.\n";
 const TRY_AGAIN: &str = "check the path, its owner and the room on the disk, and try again";
 
-/// A project's keys, for who may make more of them.
+/// A project's keys, with the authority's key to create more of them.
 pub(super) struct Project {
     directory: PathBuf,
     name: String,
     authority: Authority,
-    /// Nobody else changes the directory meanwhile.
+    /// Locks the directory against other writers.
     _lock: File,
 }
 
-/// A certificate that was made.
+/// A created certificate.
 #[derive(Clone, Debug)]
 pub(super) struct Issued {
     pub(super) identity: Identity,
     certificate: Certificate,
-    /// It is the one that its node is to have now.
+    /// Whether it is the current certificate of its node.
     pub(super) is_current: bool,
 }
 
-/// What was made, where.
-pub(super) struct Made {
+/// The created files, and their directory.
+pub(super) struct CreatedProject {
     pub(super) directory: PathBuf,
     pub(super) project: String,
-    /// When the authority's certificate ends, where that was made, too.
+    /// When the authority's certificate ends, if that was created, too.
     pub(super) authority_until: Option<UnixTime>,
     pub(super) nodes: Vec<Issued>,
-    /// Those of the same nodes that count still.
+    /// Earlier certificates of the same nodes that are still valid.
     pub(super) older: Vec<Issued>,
 }
 
-/// What was revoked.
+/// The result of a revocation.
 pub(super) struct Revoked {
     pub(super) now: Vec<Issued>,
     pub(super) before: Vec<Issued>,
-    /// What those nodes have that are left: the list has to come to them.
+    /// The certificates of the remaining nodes, to which the list must be copied.
     pub(super) left: Vec<Issued>,
 }
 
-/// What is in a directory of keys.
-pub(super) struct Look {
+/// The content of a directory of keys.
+pub(super) struct ProjectStatus {
     pub(super) directory: PathBuf,
     pub(super) project: String,
     pub(super) authority: Certificate,
@@ -93,10 +93,15 @@ impl Issued {
     }
 }
 
-/// Making.
+/// Creation.
 impl Project {
-    /// A new project, all or nothing.
-    pub(super) fn init(project: &str, out: &Path, wanted: &[Wanted], clock: Clock) -> Result<Made, Fault> {
+    /// Creates a new project, completely or not at all.
+    pub(super) fn init(
+        project: &str,
+        out: &Path,
+        wanted: &[Wanted],
+        clock: Clock,
+    ) -> Result<CreatedProject, SystemError> {
         let is_empty = std::fs::read_dir(out).map(|mut inside| inside.next().is_none());
         match is_empty {
             Ok(true) => {}
@@ -115,12 +120,17 @@ impl Project {
         let staged = Staged::beside(out).map_err(failed)?;
         let made = Self::fill(project, staged.path(), wanted, clock)?;
         staged.place(out).map_err(failed)?;
-        Ok(Made { directory: out.to_owned(), ..made })
+        Ok(CreatedProject { directory: out.to_owned(), ..made })
     }
 
-    fn fill(project: &str, directory: &Path, wanted: &[Wanted], clock: Clock) -> Result<Made, Fault> {
+    fn fill(
+        project: &str,
+        directory: &Path,
+        wanted: &[Wanted],
+        clock: Clock,
+    ) -> Result<CreatedProject, SystemError> {
         let (authority, pair) = Authority::make(project, clock).map_err(cryptography)?;
-        let discovery = DiscoveryKey::generate().map_err(|why| Fault::Keys(why.to_string()))?;
+        let discovery = DiscoveryKey::generate().map_err(|why| SystemError::Keys(why.to_string()))?;
         for name in [ISSUED, NODES] {
             let path = directory.join(name);
             write::directory(&path).map_err(|why| fault(&path, why, TRY_AGAIN))?;
@@ -134,11 +144,11 @@ impl Project {
         let made =
             Self { directory: directory.to_owned(), name, authority, _lock: lock }.issue(wanted, clock)?;
         let until = certificate(&directory.join(AUTHORITY))?.validity().until;
-        Ok(Made { authority_until: Some(until), ..made })
+        Ok(CreatedProject { authority_until: Some(until), ..made })
     }
 
     /// Opens a project to change it.
-    pub(super) fn open(directory: &Path) -> Result<Self, Fault> {
+    pub(super) fn open(directory: &Path) -> Result<Self, SystemError> {
         let key = directory.join(AUTHORITY_KEY);
         if !key.exists() {
             let why = "there is no key of an authority (ca.key) here";
@@ -149,12 +159,12 @@ impl Project {
             };
             return Err(fault(directory, why, remedy));
         }
-        files::directory(directory).map_err(|why| Fault::Keys(why.to_string()))?;
+        files::directory(directory).map_err(|why| SystemError::Keys(why.to_string()))?;
         let lock = lock(directory)?;
         let name = project_of(directory)?;
-        let pem = files::secret(&key).map_err(|why| Fault::Keys(why.to_string()))?;
+        let pem = files::secret(&key).map_err(|why| SystemError::Keys(why.to_string()))?;
         let pem = str::from_utf8(&pem).map_err(|why| fault(&key, why, "take it from your copy"))?;
-        // The reason that its reader gives may have lines of it in it.
+        // The reader's error may contain lines of the key.
         let unreadable = |_| fault(&key, "no private key in PEM can be read here", "take it from your copy");
         let authority = Authority::read(&name, pem).map_err(unreadable)?;
         Ok(Self { directory: directory.to_owned(), name, authority, _lock: lock })
@@ -164,20 +174,20 @@ impl Project {
         &self.name
     }
 
-    /// Every certificate that was ever made.
-    pub(super) fn issued(&self) -> Result<Vec<Issued>, Fault> {
+    /// Returns every certificate that was ever created.
+    pub(super) fn issued(&self) -> Result<Vec<Issued>, SystemError> {
         issued(&self.directory)
     }
 
-    /// Those certificates that are not revoked and have not ended.
-    pub(super) fn counting(&self, now: UnixTime) -> Result<Vec<Issued>, Fault> {
+    /// Returns the certificates that are not revoked and have not ended.
+    pub(super) fn counting(&self, now: UnixTime) -> Result<Vec<Issued>, SystemError> {
         let denied = denied(&self.directory)?.1;
         let counts = |issued: &Issued| issued.validity().until >= now && !denied.has(issued.serial());
         Ok(self.issued()?.into_iter().filter(counts).collect())
     }
 
-    /// A key and a certificate for each node, in its directory. Each node's is there whole or not at all.
-    pub(super) fn issue(&self, wanted: &[Wanted], clock: Clock) -> Result<Made, Fault> {
+    /// Creates a key and a certificate for each node, in its directory, each completely or not at all.
+    pub(super) fn issue(&self, wanted: &[Wanted], clock: Clock) -> Result<CreatedProject, SystemError> {
         clock.must_end_before(certificate(&self.directory.join(AUTHORITY))?.validity().until)?;
         let names =
             |issued: &Issued| wanted.iter().any(|wanted| wanted.identity.name == issued.identity.name);
@@ -185,10 +195,10 @@ impl Project {
         let nodes =
             wanted.iter().map(|wanted| self.issue_one(&wanted.identity, clock)).collect::<Result<_, _>>()?;
         let (directory, project) = (self.directory.clone(), self.name.clone());
-        Ok(Made { directory, project, authority_until: None, nodes, older })
+        Ok(CreatedProject { directory, project, authority_until: None, nodes, older })
     }
 
-    fn issue_one(&self, identity: &Identity, clock: Clock) -> Result<Issued, Fault> {
+    fn issue_one(&self, identity: &Identity, clock: Clock) -> Result<Issued, SystemError> {
         let target = self.directory.join(NODES).join(&identity.name);
         let failed = |why: io::Error| fault(&target, why, TRY_AGAIN);
         let Pair { key, certificate } = self.authority.sign(identity, clock).map_err(cryptography)?;
@@ -203,33 +213,35 @@ impl Project {
             let bytes = std::fs::read(&from).map_err(|why| fault(&from, why, "take it from your copy"))?;
             put(path, name, readers, &bytes)?;
         }
-        // As the node will look at them.
+        // Checked as the node will check them.
         let credentials = Credentials::load(path, identity, TimePolicy::Strict, clock.now);
         let credentials =
-            credentials.map_err(|why| Fault::Keys(format!("what was made is not good:\n{why}")))?;
+            credentials.map_err(|why| SystemError::Keys(format!("what was made is not good:\n{why}")))?;
         let serial = credentials.serial().to_string();
-        // First of all where it can be revoked.
+        // First in the directory from which it can be revoked.
         put(&self.directory.join(ISSUED), &format!("{serial}.pem"), Readers::All, certificate.as_bytes())?;
         staged.replace(&target).map_err(failed)?;
         one(&self.directory.join(ISSUED).join(format!("{serial}.pem")))
     }
 }
 
-/// Revoking, and looking.
+/// Revocation and inspection.
 impl Project {
-    /// Puts certificates on the deny list, by their nodes' names or by their numbers.
-    pub(super) fn revoke(&self, whom: &[String], now: UnixTime) -> Result<Revoked, Fault> {
+    /// Puts certificates on the deny list, by the names of their nodes or by their serial numbers.
+    pub(super) fn revoke(&self, targets: &[String], now: UnixTime) -> Result<Revoked, SystemError> {
         let all = issued(&self.directory)?;
         let (text, denied) = denied(&self.directory)?;
         let mut chosen: Vec<Issued> = Vec::new();
-        for word in whom {
+        for word in targets {
             let serial: Option<Serial> = word.parse().ok();
             let is_meant =
                 |issued: &&Issued| issued.identity.name == *word || Some(issued.serial()) == serial.as_ref();
             let meant: Vec<_> = all.iter().filter(is_meant).cloned().collect();
             if meant.is_empty() {
-                return Err(Fault::Whom(format!(
-                    "no certificate of '{word}' was made here; `sinew keys show` has all. Nothing was revoked"
+                let near = suggestion(word, all.iter().map(|issued| issued.identity.name.as_str()));
+                return Err(SystemError::Unknown(format!(
+                    "no certificate of `{}` was made here{near}; `sinew keys show` lists all. Nothing was revoked",
+                    short(word)
                 )));
             }
             let is_new = |issued: &Issued| chosen.iter().all(|chosen| chosen.serial() != issued.serial());
@@ -260,27 +272,27 @@ impl Project {
         Ok(Revoked { now: new, before, left })
     }
 
-    /// What is in a project's directory, or in a node's.
-    pub(super) fn look(directory: &Path) -> Result<Look, Fault> {
+    /// Returns the content of a project's directory, or of a node's.
+    pub(super) fn status(directory: &Path) -> Result<ProjectStatus, SystemError> {
         let authority = certificate(&directory.join(AUTHORITY))?;
         let project = project_of(directory)?;
         let own = directory.join(NODE_CERTIFICATE);
         let issued = if own.exists() { vec![one(&own)?] } else { issued(directory)? };
         let denied = denied(directory)?.1;
-        Ok(Look { directory: directory.to_owned(), project, authority, issued, denied })
+        Ok(ProjectStatus { directory: directory.to_owned(), project, authority, issued, denied })
     }
 }
 
-fn put(directory: &Path, name: &str, readers: Readers, bytes: &[u8]) -> Result<(), Fault> {
+fn put(directory: &Path, name: &str, readers: Readers, bytes: &[u8]) -> Result<(), SystemError> {
     let path = directory.join(name);
     write::file(&path, readers, bytes).map_err(|why| fault(&path, why, TRY_AGAIN))
 }
 
-fn cryptography(why: rcgen::Error) -> Fault {
-    Fault::Keys(format!("no key or certificate can be made: {why}"))
+fn cryptography(why: rcgen::Error) -> SystemError {
+    SystemError::Keys(format!("no key or certificate can be made: {why}"))
 }
 
-fn lock(directory: &Path) -> Result<File, Fault> {
+fn lock(directory: &Path) -> Result<File, SystemError> {
     let failed = |why: io::Error| fault(directory, why, TRY_AGAIN);
     let opened = File::open(directory).map_err(failed)?;
     let order = rustix::fs::FlockOperation::NonBlockingLockExclusive;
@@ -293,11 +305,11 @@ fn lock(directory: &Path) -> Result<File, Fault> {
     Ok(opened)
 }
 
-fn certificate(path: &Path) -> Result<Certificate, Fault> {
-    Certificate::from_file(path).map_err(|why| Fault::Keys(why.to_string()))
+fn certificate(path: &Path) -> Result<Certificate, SystemError> {
+    Certificate::from_file(path).map_err(|why| SystemError::Keys(why.to_string()))
 }
 
-fn one(path: &Path) -> Result<Issued, Fault> {
+fn one(path: &Path) -> Result<Issued, SystemError> {
     let certificate = certificate(path)?;
     let identity = certificate
         .identity()
@@ -305,12 +317,12 @@ fn one(path: &Path) -> Result<Issued, Fault> {
     Ok(Issued { identity, certificate, is_current: true })
 }
 
-/// Every certificate that was made, by name and then by age.
-fn issued(directory: &Path) -> Result<Vec<Issued>, Fault> {
+/// Returns every certificate that was created, by name and then by age.
+fn issued(directory: &Path) -> Result<Vec<Issued>, SystemError> {
     let paths = inside(&directory.join(ISSUED))?;
     let is_pem = |path: &&PathBuf| path.extension().is_some_and(|extension| extension == "pem");
     let mut all: Vec<_> = paths.iter().filter(is_pem).map(|path| one(path)).collect::<Result<_, _>>()?;
-    // Two may have been made in one second: what is in the node's directory is the later one.
+    // Two may have been created in one second: the one in the node's directory is the later one.
     for issued in &mut all {
         let own = directory.join(NODES).join(&issued.identity.name).join(NODE_CERTIFICATE);
         issued.is_current = own.exists() && one(&own)?.serial() == issued.serial();
@@ -322,14 +334,14 @@ fn issued(directory: &Path) -> Result<Vec<Issued>, Fault> {
     Ok(all)
 }
 
-fn inside(directory: &Path) -> Result<Vec<PathBuf>, Fault> {
+fn inside(directory: &Path) -> Result<Vec<PathBuf>, SystemError> {
     let failed = |why: io::Error| {
         fault(directory, why, "name the directory that `sinew keys init` made with --keys DIR")
     };
     let mut paths = Vec::new();
     for entry in std::fs::read_dir(directory).map_err(failed)? {
         let path = entry.map_err(failed)?.path();
-        // Begun by a `sinew keys` that was killed.
+        // An unfinished file of a `sinew keys` that was killed.
         if path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b".")) {
             continue;
         }
@@ -342,15 +354,15 @@ fn inside(directory: &Path) -> Result<Vec<PathBuf>, Fault> {
     Ok(paths)
 }
 
-fn denied(directory: &Path) -> Result<(String, DenyList), Fault> {
+fn denied(directory: &Path) -> Result<(String, DenyList), SystemError> {
     let path = directory.join(DENIED);
-    let remedy = "take it from your copy: without it, what is revoked would count again";
+    let remedy = "take it from your copy: without it, revoked certificates would be valid again";
     let text = std::fs::read_to_string(&path).map_err(|why| fault(&path, why, remedy))?;
     let list = DenyList::read(&text).map_err(|why| fault(&path, why, remedy))?;
     Ok((text, list))
 }
 
-fn project_of(directory: &Path) -> Result<String, Fault> {
+fn project_of(directory: &Path) -> Result<String, SystemError> {
     let path = directory.join(AUTHORITY);
     let project = certificate(&path)?.project();
     project.ok_or_else(|| {

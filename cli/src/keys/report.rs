@@ -1,4 +1,5 @@
-//! What `sinew keys` says: what was made, what is to be copied where, and which lines turn it on.
+//! The output of `sinew keys`: the created files, the commands to copy them, and the configuration lines that enable
+//! them.
 
 use std::{fmt::Write as _, net::Ipv4Addr, path::Path};
 
@@ -9,7 +10,7 @@ use sinew::security::{
 };
 
 use super::{
-    project::{Issued, Look, Made, Revoked},
+    project::{CreatedProject, Issued, ProjectStatus, Revoked},
     targets::{AddressFrom, Wanted},
 };
 use crate::{
@@ -18,13 +19,13 @@ use crate::{
     table::{Table, clean, quoted},
 };
 
-/// Where a node's directory is on its machine, unless somebody decides otherwise.
+/// The default directory of a node's keys on its machine.
 const INSTALLED: &str = "/etc/sinew/keys";
-/// What is in it.
+/// Its files.
 const FILES: [&str; 5] = [NODE_KEY, NODE_CERTIFICATE, AUTHORITY, DISCOVERY_KEY, DENIED];
 
-/// Of `init` and `issue`.
-pub(super) fn made(made: &Made, wanted: &[Wanted]) -> Report {
+/// The report of `init` and `issue`.
+pub(super) fn made(made: &CreatedProject, wanted: &[Wanted], is_wide: bool) -> Report {
     let shown = made.directory.display();
     let mut text = String::new();
     if let Some(until) = made.authority_until {
@@ -36,7 +37,8 @@ pub(super) fn made(made: &Made, wanted: &[Wanted]) -> Report {
             date(&until)
         );
     }
-    let mut table = Table::new(["NODE", "ADDRESS", "", "UNTIL", "COPY"]);
+    let heading = ["NODE", "ADDRESS", "ADDRESS FROM", "UNTIL", "COPY"];
+    let mut table = Table::new(heading).whole(&["ADDRESS", "UNTIL"]).wide(is_wide);
     for (issued, wanted) in made.nodes.iter().zip(wanted) {
         table.row([
             issued.identity.name.clone(),
@@ -76,7 +78,7 @@ pub(super) fn made(made: &Made, wanted: &[Wanted]) -> Report {
     Report { text, json: made_json(made, wanted), is_fine: true }
 }
 
-fn made_json(made: &Made, wanted: &[Wanted]) -> Value {
+fn made_json(made: &CreatedProject, wanted: &[Wanted]) -> Value {
     let node = |(issued, wanted): (&Issued, &Wanted)| {
         json!({
             "name": issued.identity.name,
@@ -103,19 +105,19 @@ fn made_json(made: &Made, wanted: &[Wanted]) -> Value {
 
 fn source(from: &AddressFrom) -> String {
     match from {
-        AddressFrom::Said => "as said".to_owned(),
+        AddressFrom::Given => "as given".to_owned(),
         AddressFrom::File(path) => format!("from {}", path.display()),
         AddressFrom::Before => "as before".to_owned(),
         AddressFrom::Order => "next free here".to_owned(),
     }
 }
 
-fn directory_of(made: &Made, issued: &Issued) -> String {
+fn directory_of(made: &CreatedProject, issued: &Issued) -> String {
     made.directory.join("nodes").join(&issued.identity.name).display().to_string()
 }
 
-/// Where the node looks for its keys: one of this machine takes them from where they were made.
-fn installed(made: &Made, issued: &Issued) -> String {
+/// Returns where the node looks for its keys: a node of this machine uses the directory in which they were created.
+fn installed(made: &CreatedProject, issued: &Issued) -> String {
     let here = directory_of(made, issued);
     if is_here(issued) {
         std::fs::canonicalize(&here).map_or(here, |path| path.display().to_string())
@@ -124,13 +126,14 @@ fn installed(made: &Made, issued: &Issued) -> String {
     }
 }
 
-/// Whether the node's address is one that only this machine reaches.
+/// Returns whether only this machine can reach the node's address.
 fn is_here(issued: &Issued) -> bool {
     Ipv4Addr::from(issued.identity.address.bits()).is_loopback()
 }
 
-/// What copies a node's directory to its machine, over one that is there, for root whoever made it; `None` where it stays.
-fn copy(made: &Made, issued: &Issued) -> Option<String> {
+/// Returns the command that copies a node's directory to its machine, replacing an existing one, owned by root; `None`
+/// if it stays.
+fn copy(made: &CreatedProject, issued: &Issued) -> Option<String> {
     sent(
         &directory_of(made, issued),
         (".", &FILES),
@@ -139,10 +142,11 @@ fn copy(made: &Made, issued: &Issued) -> Option<String> {
     )
 }
 
-/// What has `what` of this directory, which are these files, unpacked on the node's machine, prepared by this; `None` where that is this one.
+/// Returns the command that unpacks `what` from this directory, with these files, on the node's machine, after
+/// `prepared`; `None` for this machine.
 ///
-/// Each file gets its name when all have come whole: the beginning of a deny list is one, too, and a node may read it at any time. An archive
-/// that is cut where a file begins is one of fewer files to `tar`.
+/// Each file gets its name only when all have arrived completely. The start of a deny list is a valid list, too, and a
+/// node may read it at any time. For `tar`, an archive cut at a file's start is a valid archive with fewer files.
 fn sent(directory: &str, (what, files): (&str, &[&str]), issued: &Issued, prepared: &str) -> Option<String> {
     let (from, host) = (quoted(directory), issued.identity.address);
     let files = files.iter().fold(String::new(), |all, file| all + " new/" + file);
@@ -153,9 +157,10 @@ fn sent(directory: &str, (what, files): (&str, &[&str]), issued: &Issued, prepar
     (!is_here(issued)).then(|| format!("  tar -C {from} -c {what} | ssh root@{host} '{unpack}'\n"))
 }
 
-/// What the node's configuration needs. Texts of JSON are texts of TOML. On a network it says the interface, as the default is loopback, where no
-/// other host hears the node, and multicast DNS is off: keys are nothing to it.
-fn configuration(made: &Made, issued: &Issued) -> String {
+/// Returns the lines for the node's configuration. JSON strings are valid TOML strings. On a network they set the
+/// interface, because the default is loopback, where other hosts cannot reach the node. They disable multicast DNS,
+/// which keys do not protect.
+fn configuration(made: &CreatedProject, issued: &Issued) -> String {
     let text = |text: &str| Value::from(text).to_string();
     let identity = &issued.identity;
     let discovery = if is_here(issued) {
@@ -173,21 +178,21 @@ fn configuration(made: &Made, issued: &Issued) -> String {
     )
 }
 
-/// Of `revoke`.
+/// The report of `revoke`.
 pub(super) fn revoked(revoked: &Revoked, directory: &Path) -> Report {
     let mut text = String::new();
-    let line = |issued: &Issued, word: &str| {
+    let line = |issued: &Issued, state: &str| {
         let identity = &issued.identity;
-        format!("{} ({}), number {}: {word}\n", clean(&identity.name), identity.address, issued.serial())
+        format!("{} ({}), number {}: {state}\n", clean(&identity.name), identity.address, issued.serial())
     };
     text.extend(revoked.now.iter().map(|issued| line(issued, "revoked")));
     text.extend(revoked.before.iter().map(|issued| line(issued, "was revoked already")));
     let list = directory.join("denied.txt");
     let _ = write!(
         text,
-        "\nIt counts on a node when {} has been copied beside its keys, as to {INSTALLED}/denied.txt, and `sinew reload` was\n\
-         run there, which ends its links with those; it is in each directory of {} already. Who has a revoked node's files still has the discovery key of the project, with which\n\
-         datagrams can be made that pass for any node's: `sinew keys init` a new project where that matters. `sinew keys issue` gives the node a new certificate.\n",
+        "\nThe list takes effect on a node when {} has been copied beside its keys, as to {INSTALLED}/denied.txt, and `sinew reload` was\n\
+         run there, which ends its links with those; it is in each directory of {} already. The files of a revoked node hold the discovery key of\n\
+         the project, with which datagrams can be made that pass for any node's: `sinew keys init` a new project where that matters. `sinew keys issue` gives the node a new certificate.\n",
         list.display(),
         directory.join("nodes").display()
     );
@@ -217,7 +222,7 @@ fn issued_json(issued: &Issued) -> Value {
     })
 }
 
-/// What a certificate is good for.
+/// The validity of a certificate.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum State {
     Good,
@@ -229,7 +234,7 @@ enum State {
 }
 
 impl State {
-    const fn word(self) -> &'static str {
+    const fn name(self) -> &'static str {
         match self {
             Self::Good => "good",
             Self::EndsSoon => "good, ends soon",
@@ -240,9 +245,9 @@ impl State {
         }
     }
 
-    fn of(issued: &Issued, look: &Look, now: UnixTime) -> Self {
+    fn of(issued: &Issued, status: &ProjectStatus, now: UnixTime) -> Self {
         let validity = issued.validity();
-        if look.denied.has(issued.serial()) {
+        if status.denied.has(issued.serial()) {
             Self::Revoked
         } else if validity.until < now {
             Self::Ended
@@ -258,43 +263,54 @@ impl State {
     }
 }
 
-/// Of `show`.
-pub(super) fn shown(look: &Look, now: UnixTime) -> Report {
-    let states: Vec<_> = look.issued.iter().map(|issued| (issued, State::of(issued, look, now))).collect();
+/// Returns a table with all columns, or with those that fit a terminal.
+fn table(states: &[(&Issued, State)], is_wide: bool) -> String {
+    let mut all = Table::new(["NODE", "ADDRESS", "NUMBER", "FROM", "UNTIL", "STATE"]).wide(true);
+    let mut short = Table::new(["NODE", "ADDRESS", "NUMBER", "UNTIL", "STATE"])
+        .whole(&["ADDRESS", "NUMBER", "UNTIL", "STATE"]);
+    for (issued, state) in states {
+        let Issued { identity, .. } = issued;
+        let (name, address) = (identity.name.clone(), identity.address.to_string());
+        let (number, until) = (issued.serial().to_string(), date(&issued.validity().until));
+        let state = state.name().to_owned();
+        let from = date(&issued.validity().from);
+        if is_wide {
+            all.row([name, address, number, from, until, state]);
+        } else {
+            short.row([name, address, number, until, state]);
+        }
+    }
+    if is_wide { all.text() } else { short.text() }
+}
+
+/// The report of `show`.
+pub(super) fn shown(status: &ProjectStatus, now: UnixTime, is_wide: bool) -> Report {
+    let states: Vec<_> =
+        status.issued.iter().map(|issued| (issued, State::of(issued, status, now))).collect();
     let has_good = |name: &str| {
         states.iter().any(|(issued, state)| issued.identity.name == name && *state == State::Good)
     };
-    let authority = look.authority.validity();
+    let authority = status.authority.validity();
     let is_fine = authority.until >= now && states.iter().all(|(issued, _)| has_good(&issued.identity.name));
-    let mut table = Table::new(["NODE", "ADDRESS", "NUMBER", "FROM", "UNTIL", "IS"]);
-    for (issued, state) in &states {
-        table.row([
-            issued.identity.name.clone(),
-            issued.identity.address.to_string(),
-            issued.serial().to_string(),
-            date(&issued.validity().from),
-            date(&issued.validity().until),
-            state.word().to_owned(),
-        ]);
-    }
+    let table = table(&states, is_wide);
     let heading = format!(
         "Project {}, authority until {}; {} on the deny list\n\n",
-        clean(&look.project),
+        clean(&status.project),
         date(&authority.until),
-        look.denied.len()
+        status.denied.len()
     );
     let certificates = states.iter().map(|(issued, state)| {
         let mut json = issued_json(issued);
-        json["state"] = state.word().into();
+        json["state"] = state.name().into();
         json["revoked"] = (*state == State::Revoked).into();
         json
     });
     let json = json!({
-        "project": look.project,
-        "directory": look.directory,
+        "project": status.project,
+        "directory": status.directory,
         "authority_until": date(&authority.until),
-        "denied": look.denied.len(),
+        "denied": status.denied.len(),
         "certificates": certificates.collect::<Vec<_>>(),
     });
-    Report { text: heading + &table.text(), json, is_fine }
+    Report { text: heading + &table, json, is_fine }
 }

@@ -1,4 +1,4 @@
-//! Which nodes are meant on the command line, and which address each has.
+//! The nodes named on the command line, and their addresses.
 
 use std::{
     collections::BTreeMap,
@@ -6,12 +6,12 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use sinew::{NodeAddress, NodeConfig, security::Identity};
+use sinew::{NodeAddress, NodeConfig, name::check_node_name, security::Identity};
 
 use super::project::Issued;
-use crate::system::Fault;
+use crate::{system::SystemError, table::short};
 
-/// A node that is to have a certificate.
+/// A node that gets a certificate.
 #[derive(Debug)]
 pub(super) struct Wanted {
     pub(super) identity: Identity,
@@ -22,8 +22,8 @@ pub(super) struct Wanted {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum AddressFrom {
     /// On the command line.
-    Said,
-    /// In its configuration.
+    Given,
+    /// In its configuration file.
     File(PathBuf),
     /// In its last certificate, revoked or not.
     Before,
@@ -39,41 +39,45 @@ pub(super) struct Named {
 }
 
 /// Reads `NAME=ADDRESS`, `FILE.toml` or `NAME`.
-pub(super) fn wanted(project: &str, nodes: &[String]) -> Result<Vec<Named>, Fault> {
+pub(super) fn wanted(project: &str, nodes: &[String]) -> Result<Vec<Named>, SystemError> {
+    checked("project", project)?;
     nodes.iter().map(|node| named(project, node)).collect()
 }
 
-fn named(project: &str, node: &str) -> Result<Named, Fault> {
-    let (name, address) = if let Some((name, address)) = node.split_once('=') {
+/// Refuses an invalid name of a node or project: directories and files are named after it.
+fn checked(what: &str, name: &str) -> Result<(), SystemError> {
+    check_node_name(name)
+        .map_err(|why| SystemError::Usage(format!("no {what} can be called `{}`: {why}", short(name))))
+}
+
+fn named(project: &str, node: &str) -> Result<Named, SystemError> {
+    let (name, address) = if let Some((name, address)) = node.rsplit_once('=') {
         let ip: Ipv4Addr = address.parse().map_err(|_| {
-            Fault::Usage(format!(
+            SystemError::Usage(format!(
                 "'{node}': '{address}' is no address; write NAME=ADDRESS as in {name}=192.168.0.11"
             ))
         })?;
-        (name.to_owned(), Some((NodeAddress::from(ip), AddressFrom::Said)))
+        (name.to_owned(), Some((NodeAddress::from(ip), AddressFrom::Given)))
     } else if node.ends_with(".toml") {
         let (name, address) = configured(project, Path::new(node))?;
         (name, Some(address))
     } else {
+        checked("node", node)?;
         (node.to_owned(), beside(project, node)?)
     };
-    if name.contains('/') || name.starts_with(['.', '-']) {
-        return Err(Fault::Usage(format!(
-            "'{name}' cannot be the name of a directory; give the node a name without '/', that begins with a letter"
-        )));
-    }
+    checked("node", &name)?;
     Ok(Named { project: project.to_owned(), name, address })
 }
 
-/// The address in `NAME.toml`, where there is such a file here.
-fn beside(project: &str, name: &str) -> Result<Option<(NodeAddress, AddressFrom)>, Fault> {
+/// Returns the address in `NAME.toml`, if this directory has such a file.
+fn beside(project: &str, name: &str) -> Result<Option<(NodeAddress, AddressFrom)>, SystemError> {
     let file = PathBuf::from(format!("{name}.toml"));
-    if name.contains('/') || !file.exists() {
+    if !file.exists() {
         return Ok(None);
     }
     let (inside, address) = configured(project, &file)?;
     if inside != name {
-        return Err(Fault::Usage(format!(
+        return Err(SystemError::Usage(format!(
             "{} is the configuration of a node called '{inside}'; write {name}=ADDRESS, or correct node.name there",
             file.display()
         )));
@@ -81,11 +85,11 @@ fn beside(project: &str, name: &str) -> Result<Option<(NodeAddress, AddressFrom)
     Ok(Some(address))
 }
 
-fn configured(project: &str, file: &Path) -> Result<(String, (NodeAddress, AddressFrom)), Fault> {
+fn configured(project: &str, file: &Path) -> Result<(String, (NodeAddress, AddressFrom)), SystemError> {
     let config = NodeConfig::from_file(file)
-        .map_err(|faults| Fault::Usage(format!("this is no configuration of a node:\n{faults}")))?;
+        .map_err(|faults| SystemError::Usage(format!("this is no configuration of a node:\n{faults}")))?;
     if config.project != project {
-        return Err(Fault::Usage(format!(
+        return Err(SystemError::Usage(format!(
             "{} is of project '{}', and these keys are of '{project}'; correct node.project there",
             file.display(),
             config.project
@@ -95,11 +99,15 @@ fn configured(project: &str, file: &Path) -> Result<(String, (NodeAddress, Addre
     Ok((config.name, (address, AddressFrom::File(file.to_owned()))))
 }
 
-/// Gives an address to each that has none, and refuses an address or a name that two have. `counting` are those of `all` earlier ones that count
-/// still.
-pub(super) fn placed(named: Vec<Named>, counting: &[Issued], all: &[Issued]) -> Result<Vec<Wanted>, Fault> {
-    // They come by their age: of several certificates of a node the newest says where it is, and of those that count before all others. A
-    // node that has none any more, as they are revoked or have ended, is where it was.
+/// Assigns an address to each node without one, and refuses duplicate addresses and names. `counting` contains those of
+/// `all` earlier certificates that are still valid.
+pub(super) fn placed(
+    named: Vec<Named>,
+    counting: &[Issued],
+    all: &[Issued],
+) -> Result<Vec<Wanted>, SystemError> {
+    // Sorted by age: of several certificates of a node the newest defines its address, and valid ones precede all
+    // others. A node keeps its address even if all its certificates are revoked or have ended.
     let newest: BTreeMap<_, _> = all
         .iter()
         .chain(counting)
@@ -115,7 +123,7 @@ pub(super) fn placed(named: Vec<Named>, counting: &[Issued], all: &[Issued]) -> 
     };
     for (address, name) in named.iter().filter_map(|named| Some((known(named)?.0, &named.name))) {
         if let Some(other) = taken.insert(address, name.clone()) {
-            return Err(Fault::Usage(if other == *name {
+            return Err(SystemError::Usage(if other == *name {
                 format!("'{name}' is named twice; a node has one key")
             } else {
                 format!(
@@ -133,7 +141,7 @@ pub(super) fn placed(named: Vec<Named>, counting: &[Issued], all: &[Issued]) -> 
         };
         taken.insert(address, named.name.clone());
         if wanted.iter().any(|wanted| wanted.identity.name == named.name) {
-            return Err(Fault::Usage(format!("'{}' is named twice; a node has one key", named.name)));
+            return Err(SystemError::Usage(format!("'{}' is named twice; a node has one key", named.name)));
         }
         let identity = Identity { project: named.project, address, name: named.name };
         check(&identity)?;
@@ -142,11 +150,15 @@ pub(super) fn placed(named: Vec<Named>, counting: &[Issued], all: &[Issued]) -> 
     Ok(wanted)
 }
 
-/// The next address for one more node of this machine. Where all others are elsewhere, so will it be: then it has to be said where.
-fn next_free(name: &str, taken: &BTreeMap<NodeAddress, String>) -> Result<(NodeAddress, AddressFrom), Fault> {
+/// Returns the next address for one more node of this machine. If all others are on other machines, the address must be
+/// given explicitly.
+fn next_free(
+    name: &str,
+    taken: &BTreeMap<NodeAddress, String>,
+) -> Result<(NodeAddress, AddressFrom), SystemError> {
     let is_here = |address: &NodeAddress| Ipv4Addr::from(address.bits()).is_loopback();
     if let Some((address, other)) = taken.first_key_value().filter(|_| !taken.keys().any(is_here)) {
-        return Err(Fault::Usage(format!(
+        return Err(SystemError::Usage(format!(
             "which address '{name}' has is not known, and the others have addresses of a network, as '{other}' has {address}: write {name}=ADDRESS \
              with that of its machine, or with one from 127.0.0.1 on if it is to run on this one alone"
         )));
@@ -157,10 +169,10 @@ fn next_free(name: &str, taken: &BTreeMap<NodeAddress, String>) -> Result<(NodeA
     Ok((free.unwrap_or_else(|| NodeAddress::new(first)), AddressFrom::Order))
 }
 
-/// A node with this project, name and address could be configured.
-fn check(identity: &Identity) -> Result<(), Fault> {
+/// Checks that a node with this project, name and address could be configured.
+fn check(identity: &Identity) -> Result<(), SystemError> {
     let mut config = NodeConfig::new(&*identity.name);
     config.project.clone_from(&identity.project);
     config.address = Some(identity.address);
-    config.validate().map_err(|faults| Fault::Usage(faults.to_string()))
+    config.validate().map_err(|faults| SystemError::Usage(faults.to_string()))
 }

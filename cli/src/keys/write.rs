@@ -1,4 +1,4 @@
-//! Files and directories that are there whole, or not at all, and for whom they are meant from the first moment on.
+//! Files and directories that are created completely or not at all, with the intended permissions from the start.
 
 use std::{
     fs::{DirBuilder, File, OpenOptions},
@@ -7,7 +7,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// Who may read a file; only its owner may write.
+/// The permitted readers of a file; only its owner may write.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Readers {
     /// Its owner.
@@ -16,7 +16,8 @@ pub(super) enum Readers {
     All,
 }
 
-/// Writes a file, in the place of one that is there. Whoever reads it reads the old one or the new one, also after the power has failed.
+/// Writes a file, replacing an existing one atomically. A reader gets either the old or the new content, also after a
+/// power failure.
 pub(super) fn file(path: &Path, readers: Readers, bytes: &[u8]) -> io::Result<()> {
     let mode = match readers {
         Readers::Owner => 0o600,
@@ -30,52 +31,52 @@ pub(super) fn file(path: &Path, readers: Readers, bytes: &[u8]) -> io::Result<()
         std::fs::rename(&beside, path)
     })();
     if written.is_err() {
-        // What could not be finished is of no use to anybody.
+        // An unfinished file is useless.
         let _ = std::fs::remove_file(&beside);
     }
     written?;
     sync(path)
 }
 
-/// A directory that only its owner may enter.
+/// Creates a directory that only its owner may enter.
 pub(super) fn directory(path: &Path) -> io::Result<()> {
     DirBuilder::new().mode(0o700).create(path)
 }
 
-/// A directory that is filled before it gets its name; dropped without one it is removed.
+/// A directory that is filled before it is renamed to its final name; if it is dropped before, it is removed.
 pub(super) struct Staged {
     path: PathBuf,
     is_placed: bool,
 }
 
 impl Staged {
-    /// An empty one, beside where it is to be.
+    /// Creates an empty one in the directory of its target.
     pub(super) fn beside(target: &Path) -> io::Result<Self> {
         let path = beside(target)?;
         directory(&path)?;
         Ok(Self { path, is_placed: false })
     }
 
-    /// Where it is now.
+    /// Returns its current path.
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Gives it its name. A directory that is there and not empty stays, and that is an error.
+    /// Renames it to its final name. An existing directory that is not empty stays, and causes an error.
     pub(super) fn place(mut self, target: &Path) -> io::Result<()> {
         std::fs::rename(&self.path, target)?;
         self.is_placed = true;
         sync(target)
     }
 
-    /// Gives it its name, in the place of a directory that is there, which is removed.
+    /// Renames it to its final name, replacing an existing directory, which is removed.
     pub(super) fn replace(self, target: &Path) -> io::Result<()> {
         if !target.exists() {
             return self.place(target);
         }
         let exchange = rustix::fs::RenameFlags::EXCHANGE;
         rustix::fs::renameat_with(rustix::fs::CWD, &self.path, rustix::fs::CWD, target, exchange)?;
-        // What is dropped now is the old one.
+        // The old directory is dropped now.
         sync(target)
     }
 }
@@ -83,19 +84,19 @@ impl Staged {
 impl Drop for Staged {
     fn drop(&mut self) {
         if !self.is_placed {
-            // It has a name that says so, and the next one has another.
+            // Its name marks it as temporary, and the next one has another name.
             let _ = std::fs::remove_dir_all(&self.path);
         }
     }
 }
 
-/// A name beside `path` that nobody else uses.
+/// Returns an unused name in the directory of `path`.
 fn beside(path: &Path) -> io::Result<PathBuf> {
     let name = path.file_name().ok_or_else(|| io::Error::other("this path has no name at its end"))?;
     Ok(path.with_file_name(format!(".{}.{}.new", name.to_string_lossy(), std::process::id())))
 }
 
-/// The name itself is on the disk, too.
+/// Flushes the directory entry to the disk.
 fn sync(path: &Path) -> io::Result<()> {
     let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
     File::open(parent.unwrap_or_else(|| Path::new(".")))?.sync_all()

@@ -6,27 +6,30 @@ use serde_json::{Value, json};
 use sinew::{
     Outcome, Tid, Time,
     client::{ApiError, LoanedMessage},
-    inspect::{AppsReport, AskApps},
     message::{Kind, MemberOutcome},
 };
 
-use super::{ClassName, Order, fault};
+use super::{ClassName, Order, explained, explained::Receiver, fault};
 use crate::{
     Report,
-    system::{Fault, System},
+    system::{System, SystemError},
     table::{clean, time},
+    unknown::Target,
 };
 
-/// Sends it to each member, and says what became of it at each, unless it is not to be confirmed.
+/// Sends a message to each member, and reports the outcome at each, unless it is unconfirmed.
 pub(super) fn to_many(
     system: &mut System,
     to: Tid,
     content: (Kind, &[u8]),
     order: &Order,
-) -> Result<Report, Fault> {
+) -> Result<Report, SystemError> {
     if order.ask {
+        if is_misspelt(order, true) && system.members(to)?.0.is_empty() {
+            return Err(system.unknown(&order.target, Target::OneOrGroup));
+        }
         let target = clean(&order.target);
-        return Err(Fault::Usage(format!(
+        return Err(SystemError::Usage(format!(
             "'{target}' is a group, and --ask asks one application; name a member of it"
         )));
     }
@@ -41,23 +44,25 @@ pub(super) fn to_many(
 fn confirmed(system: &mut System, to: Tid, (kind, payload): (Kind, &[u8]), order: &Order) -> Report {
     let began = Time::now();
     let within = Duration::from_millis(order.within.into());
-    let told = lend(system, to, (kind, payload), order)
+    let sent = lend(system, to, (kind, payload), order)
         .and_then(|loan| system.endpoint.loaned(loan).confirmed_by_each(within));
     let micros = u64::try_from(Time::now().since(began).as_micros()).unwrap_or(u64::MAX);
-    let (members, error) = match told {
+    let (members, error) = match sent {
         Ok(members) => (members, None),
         Err(error) => (Vec::new(), Some(clean(&error.to_string()))),
     };
-    let names = names(system, to, &members);
-    let members: Vec<_> = members.into_iter().map(|member| Line::of(member, to, &names, order)).collect();
+    let receivers = answered(system, to, &members);
+    let members: Vec<_> = members.into_iter().map(|member| Line::of(member, to, &receivers, order)).collect();
     let taken = members.iter().filter(|line| line.fault.is_none()).count();
+    let is_unknown = error.is_none() && is_misspelt(order, members.is_empty());
+    let error = if is_unknown { Some(unknown(system, order)) } else { error };
     let result = match (&error, members.len()) {
         (Some(why), _) => why.clone(),
-        (None, 0) => reached_nobody(order).to_owned(),
+        (None, 0) => REACHED_NONE.to_owned(),
         (None, count) => format!("delivered to {taken} of {count} members, after {}", time(micros)),
     };
     let lines: String = members.iter().map(|line| format!("{}: {}\n", line.label, line.result())).collect();
-    let is_fine = error.is_none() && taken == members.len() && !is_misspelt(order, members.is_empty());
+    let is_fine = error.is_none() && taken == members.len();
     let json = json!({
         "tid": to.to_string(), "kind": kind.to_string(), "bytes": payload.len(), "took_us": micros, "fault": error,
         "members": members.iter().map(Line::json).collect::<Vec<_>>(),
@@ -65,7 +70,7 @@ fn confirmed(system: &mut System, to: Tid, (kind, payload): (Kind, &[u8]), order
     Report { text: format!("{} ({to}): {result}\n{lines}", clean(&order.target)), json, is_fine }
 }
 
-/// What became of it at one member.
+/// The outcome at one member.
 struct Line {
     member: MemberOutcome,
     name: Option<String>,
@@ -74,15 +79,18 @@ struct Line {
 }
 
 impl Line {
-    fn of(member: MemberOutcome, to: Tid, names: &BTreeMap<Tid, String>, order: &Order) -> Self {
+    fn of(member: MemberOutcome, to: Tid, receivers: &BTreeMap<Tid, Receiver>, order: &Order) -> Self {
         let MemberOutcome { tid, outcome } = member;
-        let name = names.get(&tid).cloned();
+        let receiver = receivers.get(&tid);
+        let name = receiver.and_then(|receiver| receiver.app.name.clone());
+        let about = receiver.and_then(|receiver| explained::by_types(outcome, receiver, order));
         let label = match &name {
             Some(name) => format!("{} ({tid})", clean(name)),
             None if is_for_a_node(tid, to) => format!("all members on {}", tid.node),
             None => tid.to_string(),
         };
-        Self { member, name, label, fault: fault(outcome, order) }
+        let fault = fault(outcome, order).map(|fault| clean(&fault) + &about.unwrap_or_default());
+        Self { member, name, label, fault }
     }
 
     fn result(&self) -> &str {
@@ -97,22 +105,19 @@ impl Line {
     }
 }
 
-/// Whether an entry stands for all members of a node, which has not named them.
+/// Returns whether an entry represents all members of a node that has not listed them.
 fn is_for_a_node(tid: Tid, to: Tid) -> bool {
     !tid.is_single() && tid.app == to.app
 }
 
-/// The names of members, as their nodes say; of nodes that have answered.
-fn names(system: &mut System, to: Tid, members: &[MemberOutcome]) -> BTreeMap<Tid, String> {
+/// Returns the members on nodes that have answered, as their nodes report them.
+fn answered(system: &mut System, to: Tid, members: &[MemberOutcome]) -> BTreeMap<Tid, Receiver> {
     let has_answered = |member: &&MemberOutcome| {
         !is_for_a_node(member.tid, to) && !matches!(member.outcome, Outcome::Unknown | Outcome::PeerLost)
     };
-    let mut nodes: Vec<_> =
-        members.iter().filter(has_answered).map(|member| (member.tid.node, String::new())).collect();
+    let mut nodes: Vec<_> = members.iter().filter(has_answered).map(|member| member.tid.node).collect();
     nodes.dedup();
-    let answers = system.ask_these::<AskApps, AppsReport>(nodes);
-    let apps = answers.into_iter().filter_map(|answer| answer.said.ok()).flat_map(|said| said.apps);
-    apps.filter_map(|app| Some((app.tid, app.name?))).collect()
+    explained::receivers(system, nodes)
 }
 
 fn unconfirmed(
@@ -120,10 +125,12 @@ fn unconfirmed(
     to: Tid,
     (kind, payload): (Kind, &[u8]),
     order: &Order,
-) -> Result<Report, Fault> {
+) -> Result<Report, SystemError> {
     let (members, silent) = system.members(to)?;
-    // With nobody there to send to, nothing is sent and nothing can fail.
-    let fault = if members.is_empty() {
+    // Without members nothing is sent, and nothing can fail.
+    let fault = if is_misspelt(order, members.is_empty()) {
+        Some(unknown(system, order))
+    } else if members.is_empty() {
         None
     } else {
         let sent =
@@ -132,7 +139,7 @@ fn unconfirmed(
     };
     let result = match (&fault, members.len()) {
         (Some(why), _) => why.clone(),
-        (None, 0) => reached_nobody(order).to_owned(),
+        (None, 0) => REACHED_NONE.to_owned(),
         (None, 1) => "sent to 1 member, without confirmation".to_owned(),
         (None, count) => format!("sent to {count} members, without confirmation"),
     };
@@ -143,7 +150,7 @@ fn unconfirmed(
         "members": members.iter().map(ToString::to_string).collect::<Vec<_>>(), "silent": silent,
     });
     let text = format!("{} ({to}): {result}\n{silent_lines}", clean(&order.target));
-    let is_fine = fault.is_none() && silent.is_empty() && !is_misspelt(order, members.is_empty());
+    let is_fine = fault.is_none() && silent.is_empty();
     Ok(Report { text, json, is_fine })
 }
 
@@ -159,16 +166,16 @@ fn lend(
     Ok(loan)
 }
 
-/// A group that is named by its TID is known to be one. A bare name that has no member may be misspelt.
+/// Returns whether the name may be misspelt: a group given by its TID exists by definition, but a bare name without a
+/// member may be an error.
 fn is_misspelt(order: &Order, is_empty: bool) -> bool {
     is_empty && order.target.parse::<Tid>().is_err()
 }
 
-fn reached_nobody(order: &Order) -> &'static str {
-    if is_misspelt(order, true) {
-        "no application has this name, and no group of this name has a member; the message reached nobody. \
-         `sinew apps` shows the applications"
-    } else {
-        "no application is a member; the message reached nobody"
-    }
+const REACHED_NONE: &str = "no application is a member; the message reached no application";
+
+/// Returns that no application has the name, with similar names.
+fn unknown(system: &mut System, order: &Order) -> String {
+    let why = system.unknown(&order.target, Target::OneOrGroup);
+    format!("the message reached no application: {why}")
 }

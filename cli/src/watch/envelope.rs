@@ -1,7 +1,7 @@
-//! What is in the envelope of a protected payload, for eyes alone (`docs/protocol/protected.md`).
+//! The content of a protected payload's envelope, for display only (`docs/protocol/protected.md`).
 //!
-//! The checksum is not looked at: it takes the flow's data ID, which is not sent. Whether the bytes are those that the source has sealed, and
-//! not too old, is the receiver's to say.
+//! The checksum is not verified: it includes the flow's data ID, which is not sent. Only the receiver can verify that
+//! the bytes are authentic and not too old.
 
 use sinew::protection::OVERHEAD;
 
@@ -12,15 +12,16 @@ const TAIL: usize = OVERHEAD - HEAD;
 /// The only version that there is; flags and zeros follow it.
 const VERSION: u32 = 1;
 
-/// What an envelope has in it.
+/// The content of an envelope.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Unsealed<'bytes> {
-    /// Which message of its flow it says that it is, from 1.
+    /// The number of the message in its flow, as claimed, from 1.
     pub(super) counter: u64,
     pub(super) payload: &'bytes [u8],
 }
 
-/// Takes an envelope apart; `None` if these bytes are none. No MessagePack value is taken for one: its first byte would be a whole value.
+/// Parses an envelope; `None` if these bytes are none. No MessagePack value is mistaken for one: its first byte would
+/// be a complete value.
 pub(super) fn unsealed(bytes: &[u8]) -> Option<Unsealed<'_>> {
     let (head, rest) = bytes.split_first_chunk::<HEAD>()?;
     let (payload, _checksum) = rest.split_last_chunk::<TAIL>()?;
@@ -40,7 +41,7 @@ mod tests {
 
     use super::*;
 
-    /// As the library seals it, so that the layout here cannot be another one.
+    /// Sealed by the library, so that the layout here cannot differ from it.
     fn sealed(payload: &[u8]) -> Vec<u8> {
         let tid = |app| Tid::new(NodeAddress::from([10, 0, 0, 1]), AppAddress::new(app));
         let data_id = DataId { source: tid(0x1001), destination: tid(0x1002), name: "demo.angle" };
@@ -49,14 +50,14 @@ mod tests {
     }
 
     #[test]
-    fn what_was_sealed_is_seen_with_its_counter() {
+    fn sealed_message_is_shown_with_its_counter() {
         for payload in [&b""[..], &[0x81, 0xa1, b'a', 1], &[7; 4_000]] {
             assert_eq!(unsealed(&sealed(payload)), Some(Unsealed { counter: 103, payload }));
         }
     }
 
     #[test]
-    fn what_is_cut_or_longer_or_has_another_head_is_no_envelope() {
+    fn truncated_or_foreign_bytes_are_no_envelope() {
         let good = sealed(&[1, 2, 3]);
         for length in 0..good.len() {
             assert_eq!(unsealed(&good[..length]), None, "{length} bytes");

@@ -1,4 +1,4 @@
-//! How often messages of each type go by, and how old they are.
+//! The rate and the age of messages per type.
 
 use std::{collections::BTreeMap, time::Duration};
 
@@ -7,10 +7,10 @@ use sinew::inspect::SeenMessage;
 
 use crate::table::time;
 
-/// Types that are told apart at most; further ones are counted together.
+/// Maximum number of distinguished types; further ones are counted together.
 const KINDS_MAX: usize = 256;
 
-/// Counts since the last time that they were said.
+/// Counts since the last report.
 #[derive(Debug, Default)]
 pub(super) struct Rates {
     kinds: BTreeMap<(String, bool), Kind>,
@@ -21,14 +21,14 @@ pub(super) struct Rates {
 struct Kind {
     count: u64,
     bytes: u64,
-    /// Those of them whose age is known.
+    /// Number of messages with a known age.
     aged: u64,
     age_sum_ns: u128,
     age_max_ns: Option<u64>,
     refused: u64,
 }
 
-/// What is said of a time that is over.
+/// The report on a period.
 #[derive(Debug)]
 pub(super) struct Rated {
     rates: Rates,
@@ -37,7 +37,7 @@ pub(super) struct Rated {
 
 impl Rates {
     pub(super) fn add(&mut self, message: &SeenMessage) {
-        let mut key = (super::kind(message), message.is_sent);
+        let mut key = (super::screen::kind(message), message.is_sent);
         if self.kinds.len() >= KINDS_MAX && !self.kinds.contains_key(&key) {
             key.0 = "(others)".to_owned();
         }
@@ -52,12 +52,12 @@ impl Rates {
         kind.refused += u64::from(message.refused.is_some());
     }
 
-    /// So many were not seen.
+    /// Adds messages that were not recorded.
     pub(super) const fn drop(&mut self, count: u64) {
         self.dropped += count;
     }
 
-    /// Begins anew; returns what was counted in this time.
+    /// Starts a new period. Returns the counts of the last one.
     pub(super) fn end(&mut self, over: Duration) -> Rated {
         Rated { rates: std::mem::take(self), over }
     }
@@ -105,13 +105,13 @@ impl Rated {
     }
 }
 
-/// As of a single message: nothing is said of what came from nodes whose clocks nobody has measured.
+/// Formats an age as for a single message: unknown for nodes without a clock measurement.
 fn age(ns: Option<u64>) -> String {
     ns.map_or_else(|| "?".to_owned(), |ns| time(ns / 1_000))
 }
 
 impl Kind {
-    /// `None` where no age is known.
+    /// Returns the mean age; `None` if no age is known.
     fn age_mean_ns(&self) -> Option<u64> {
         let mean = self.age_sum_ns.checked_div(self.aged.into())?;
         Some(u64::try_from(mean).unwrap_or(u64::MAX))
@@ -145,39 +145,39 @@ mod tests {
     }
 
     #[test]
-    fn each_type_has_a_line_and_what_was_dropped_has_one() {
+    fn types_and_dropped_messages_have_lines() {
         let mut rates = Rates::default();
         (0..10).for_each(|number| rates.add(&message("a", Some(number * 2_000), None)));
-        // Of unknown age: it makes no mean.
+        // Of unknown age: it does not count in the mean.
         rates.add(&message("a", None, None));
         rates.add(&message("b", Some(0), Some(Rejection::QueueFull)));
         rates.drop(7);
-        let said = rates.end(Duration::from_secs(2));
+        let shown = rates.end(Duration::from_secs(2));
         assert_eq!(
-            said.text().lines().take(2).collect::<Vec<_>>(),
+            shown.text().lines().take(2).collect::<Vec<_>>(),
             [
                 "   --- -> a: 5.5/s, 550 B/s, age mean 9 us max 18 us",
                 "   --- -> b: 0.5/s, 50 B/s, age mean 0 us max 0 us, 1 REFUSED"
             ]
         );
-        assert!(said.text().contains("   --- 7 further ones"));
+        assert!(shown.text().contains("   --- 7 further ones"));
         assert_eq!(rates.end(Duration::from_secs(1)).text(), "   --- nothing in 1.0 s\n", "it begins anew");
     }
 
     #[test]
-    fn an_age_that_is_not_known_is_not_said_to_be_0() {
+    fn unknown_age_is_not_shown_as_0() {
         let mut rates = Rates::default();
         rates.add(&message("a", None, None));
         rates.add(&message("b", Some(0), None));
-        let said = rates.end(Duration::from_secs(1));
+        let shown = rates.end(Duration::from_secs(1));
         assert_eq!(
-            said.text().lines().collect::<Vec<_>>(),
+            shown.text().lines().collect::<Vec<_>>(),
             [
                 "   --- -> a: 1.0/s, 100 B/s, age mean ? max ?",
                 "   --- -> b: 1.0/s, 100 B/s, age mean 0 us max 0 us"
             ]
         );
-        let json = said.json(0.0);
+        let json = shown.json(0.0);
         let ages = ["age_mean_ns", "age_max_ns"].map(|age| [&json["kinds"][0][age], &json["kinds"][1][age]]);
         assert_eq!(ages, [[&Value::Null, &json!(0)]; 2]);
     }

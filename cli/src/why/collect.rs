@@ -1,4 +1,4 @@
-//! What all nodes say that can be asked, through every socket of this host that lets us in.
+//! Collects the reports of all nodes that can be asked, through every accessible socket of this host.
 
 mod many;
 
@@ -9,135 +9,135 @@ use sinew::{
     audit::Place,
     inspect::{
         AccessReport, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskNode, AskTree, AuditReport,
-        NodeReport, Ping, StreamReport, TreeReport,
+        GroupReport, NodeReport, Ping, StreamReport, TreeReport,
     },
     payload,
 };
 
 use super::{
-    facts::{App, End, Facts, Namesakes, Unsaid},
-    resolve::{Called, by_whom_is_reached},
+    facts::{App, Facts, Namesakes, TrafficEnd, Unreported},
+    resolve::{Resolved, sort_by_reachability},
 };
 use crate::{
     ping,
-    system::{Fault, System},
+    system::{System, SystemError},
 };
 
 /// Every node that was asked.
-pub(super) struct Gathered<'a> {
+pub(super) struct Collected<'a> {
     first: &'a mut System,
     others: Vec<System>,
-    nodes: Vec<Asked>,
+    nodes: Vec<Queried>,
 }
 
 /// A node that was asked, or could not be.
-struct Asked {
+struct Queried {
     node: NodeAddress,
     name: String,
-    said: Result<NodeReport, String>,
-    /// Asked for where it has said who it is.
+    result: Result<NodeReport, String>,
+    /// Asked only if the node's own report arrived.
     apps: Result<AppsReport, String>,
-    /// Through which socket.
+    /// The socket through which it was asked.
     through: usize,
-    /// Whether that is its own.
-    is_own_door: bool,
+    /// Whether that is its own socket.
+    is_own_socket: bool,
 }
 
-impl Asked {
-    fn new(through: usize, (node, name): (NodeAddress, String), said: Result<NodeReport, String>) -> Self {
-        let name = said.as_ref().map_or(name, |said| said.name.clone());
+impl Queried {
+    fn new(through: usize, (node, name): (NodeAddress, String), result: Result<NodeReport, String>) -> Self {
+        let name = result.as_ref().map_or(name, |report| report.name.clone());
         let apps = Err("it was not asked".to_owned());
-        Self { node, name, said, apps, through, is_own_door: false }
+        Self { node, name, result, apps, through, is_own_socket: false }
     }
 
-    fn at_its_door(self) -> Self {
-        Self { is_own_door: true, ..self }
+    fn at_its_socket(self) -> Self {
+        Self { is_own_socket: true, ..self }
     }
 
     fn label(&self) -> String {
         if self.name.is_empty() { self.node.to_string() } else { self.name.clone() }
     }
 
-    /// The applications that it has named.
+    /// Returns the applications that it has listed.
     fn named_apps(&self) -> &[AppReport] {
-        self.apps.as_ref().map_or(&[][..], |said| said.apps.as_slice())
+        self.apps.as_ref().map_or(&[][..], |report| report.apps.as_slice())
     }
 
-    /// Why it may have others, too.
-    fn unsaid(&self) -> Option<Unsaid> {
-        match self.said.as_ref().and(self.apps.as_ref()) {
-            Ok(said) => (said.left_out > 0).then_some(Unsaid::LeftOut(said.left_out)),
-            Err(why) => Some(Unsaid::Silent(why.clone())),
+    /// Returns why it may have further ones.
+    fn unreported(&self) -> Option<Unreported> {
+        match self.result.as_ref().and(self.apps.as_ref()) {
+            Ok(report) => (report.left_out > 0).then_some(Unreported::LeftOut(report.left_out)),
+            Err(why) => Some(Unreported::Silent(why.clone())),
         }
     }
 
-    /// What it says of an application that it is to have; if nothing, why that may be there all the same.
-    fn app(&self, tid: Tid) -> (Option<AppReport>, Option<Unsaid>) {
+    /// Returns its report about an application; or, without one, why the application may exist nevertheless.
+    fn app(&self, tid: Tid) -> (Option<AppReport>, Option<Unreported>) {
         let report = self.named_apps().iter().find(|app| app.tid == tid).cloned();
-        let unsaid = if report.is_none() { self.unsaid() } else { None };
-        (report, unsaid)
+        let unreported = if report.is_none() { self.unreported() } else { None };
+        (report, unreported)
     }
 }
 
-impl<'a> Gathered<'a> {
-    /// Asks the nodes behind these sockets, and all that they know.
-    pub(super) fn from(first: &'a mut System, others: Vec<System>) -> Result<Self, Fault> {
-        let mut gathered = Self { first, others, nodes: Vec::new() };
-        let mut heres = vec![(0, gathered.first.here()?)];
-        for (at, other) in gathered.others.iter_mut().enumerate() {
-            // One that does not answer is known by what the others say of it.
+impl<'a> Collected<'a> {
+    /// Asks the nodes behind these sockets, and all nodes that they know.
+    pub(super) fn from(first: &'a mut System, others: Vec<System>) -> Result<Self, SystemError> {
+        let mut collected = Self { first, others, nodes: Vec::new() };
+        let mut heres = vec![(0, collected.first.here()?)];
+        for (at, other) in collected.others.iter_mut().enumerate() {
+            // A node that does not answer is known from the reports of others.
             heres.extend(other.here().ok().map(|here| (at + 1, here)));
         }
         for (through, here) in &heres {
-            gathered
-                .add(Asked::new(*through, (here.node, here.name.clone()), Ok(here.clone())).at_its_door());
+            collected.add(
+                Queried::new(*through, (here.node, here.name.clone()), Ok(here.clone())).at_its_socket(),
+            );
         }
         for (through, here) in heres {
             let unknown = |node: NodeAddress| {
-                gathered.nodes.iter().all(|asked| asked.node != node || asked.said.is_err())
+                collected.nodes.iter().all(|asked| asked.node != node || asked.result.is_err())
             };
             let peers = here.peers.iter().filter(|peer| unknown(peer.node));
             let peers: Vec<_> =
                 peers.map(|peer| (peer.node, peer.name.clone().unwrap_or_default())).collect();
-            for answer in gathered.system(through).ask_these::<AskNode, NodeReport>(peers) {
-                gathered.add(Asked::new(through, (answer.node, answer.name), answer.said));
+            for answer in collected.system(through).ask_these::<AskNode, NodeReport>(peers) {
+                collected.add(Queried::new(through, (answer.node, answer.name), answer.result));
             }
         }
-        for at in 0..gathered.nodes.len() {
-            let asked = &gathered.nodes[at];
-            if asked.said.is_err() {
+        for at in 0..collected.nodes.len() {
+            let asked = &collected.nodes[at];
+            if asked.result.is_err() {
                 continue;
             }
-            let (through, whom) = (asked.through, (asked.node, asked.name.clone()));
-            let answer = gathered.system(through).ask_these::<AskApps, AppsReport>(vec![whom]).pop();
-            gathered.nodes[at].apps =
-                answer.map_or_else(|| Err("no answer".to_owned()), |answer| answer.said);
+            let (through, destination) = (asked.through, (asked.node, asked.name.clone()));
+            let answer = collected.system(through).ask_these::<AskApps, AppsReport>(vec![destination]).pop();
+            collected.nodes[at].apps =
+                answer.map_or_else(|| Err("no answer".to_owned()), |answer| answer.result);
         }
-        Ok(gathered)
+        Ok(collected)
     }
 
-    /// Gives back the addresses that it had at other nodes.
+    /// Releases the addresses that it had at other nodes.
     pub(super) fn leave(self) {
         self.others.into_iter().for_each(System::leave);
     }
 
-    /// Takes down what one said who was asked, unless it is known already.
-    fn add(&mut self, new: Asked) {
-        let same = |other: &Asked| other.node == new.node;
-        let is_new =
-            match &new.said {
-                // Two lives with one address are two.
-                Ok(said) => self.nodes.iter().filter(|other| same(other)).all(|other| {
-                    other.said.as_ref().is_ok_and(|other| other.incarnation != said.incarnation)
-                }),
-                Err(_) => !self.nodes.iter().any(same),
-            };
+    /// Adds the answer of a node, unless it is known already.
+    fn add(&mut self, new: Queried) {
+        let same = |other: &Queried| other.node == new.node;
+        let is_new = match &new.result {
+            // Two incarnations with one address are two nodes.
+            Ok(report) => self.nodes.iter().filter(|other| same(other)).all(|other| {
+                other.result.as_ref().is_ok_and(|other| other.incarnation != report.incarnation)
+            }),
+            Err(_) => !self.nodes.iter().any(same),
+        };
         if is_new {
             self.nodes.push(new);
-        } else if new.said.is_ok() {
-            // Who did not answer one of the others has answered now.
-            for other in self.nodes.iter_mut().filter(|other| same(other) && other.said.is_err()) {
-                (other.said, other.through) = (new.said.clone(), new.through);
+        } else if new.result.is_ok() {
+            // A node that did not answer one requester has answered now.
+            for other in self.nodes.iter_mut().filter(|other| same(other) && other.result.is_err()) {
+                (other.result, other.through) = (new.result.clone(), new.through);
             }
         }
     }
@@ -149,36 +149,63 @@ impl<'a> Gathered<'a> {
         }
     }
 
-    /// What the rules look at.
+    /// Returns the facts for the rules.
     pub(super) fn facts(&mut self, wanted: [&str; 2]) -> Facts {
         let found = self.find_both(wanted);
         let ends = [self.end(wanted[0], &found[0]), self.end(wanted[1], &found[1])];
-        // What waits for its start answers no ping, and that is known.
+        // An application that waits for its start answers no ping, and that is known.
         let targets = [0, 1].map(|at: usize| found[at].target().filter(|_| ends[at].not_ready().is_none()));
         let pings = [self.ping(found[0].at, targets[1]), self.ping(found[1].at, targets[0])];
         let access = [self.access(&found[0], &found[1]), self.access(&found[1], &found[0])];
-        let waits = self.nodes.iter().flat_map(Asked::named_apps).filter(|app| !app.ready);
+        let waits = self.nodes.iter().flat_map(Queried::named_apps).filter(|app| !app.ready);
         let waits: BTreeMap<_, _> = waits
             .filter_map(|app| {
                 Some((app.name.clone()?, app.missing.iter().map(|missing| missing.name.clone()).collect()))
             })
             .collect();
-        let lacked = self.nodes.iter().flat_map(Asked::named_apps).flat_map(|app| &app.missing);
+        let lacked = self.nodes.iter().flat_map(Queried::named_apps).flat_map(|app| &app.missing);
         let lacked = lacked.filter(|missing| wanted.contains(&missing.name.as_str())).cloned().collect();
-        let unsaid = self.nodes.iter().filter_map(|asked| Some((asked.label(), asked.unsaid()?))).collect();
+        let unreported =
+            self.nodes.iter().filter_map(|asked| Some((asked.label(), asked.unreported()?))).collect();
+        let apps = self.nodes.iter().flat_map(Queried::named_apps).filter_map(|app| app.name.clone());
+        let names = apps.chain(self.nodes.iter().map(|asked| asked.name.clone())).collect();
         let streams = [self.stream(found[0].at, found[1].node), self.stream(found[1].at, found[0].node)];
         let many = self.many(wanted, &found);
         let by_groups = [
             self.by_groups(access[0].as_ref(), (&found[0], &found[1])),
             self.by_groups(access[1].as_ref(), (&found[1], &found[0])),
         ];
-        Facts { ends, pings, streams, access, by_groups, many, waits, lacked, unsaid, shut: Vec::new() }
+        Facts {
+            ends,
+            pings,
+            streams,
+            access,
+            by_groups,
+            many,
+            waits,
+            lacked,
+            names,
+            groups: self.groups(),
+            unreported,
+            shut: Vec::new(),
+        }
     }
 
-    /// Whom two words mean. A name that several applications have stands for the one that the other end's messages reach; where that is open, too,
-    /// the first word is resolved from the node through which we came.
+    /// Returns the groups with members, as far as they are reported, and the number of members of each.
+    fn groups(&self) -> BTreeMap<AppAddress, u64> {
+        let mut groups = BTreeMap::new();
+        let reported =
+            self.nodes.iter().filter_map(|asked| asked.apps.as_ref().ok()).flat_map(|report| &report.groups);
+        for GroupReport { group, members } in reported {
+            *groups.entry(*group).or_default() += members;
+        }
+        groups
+    }
+
+    /// Resolves both words. A name of several applications means the one that the other end's messages reach. If that
+    /// is ambiguous too, the first word is resolved from the entry node.
     fn find_both(&self, wanted: [&str; 2]) -> [Found; 2] {
-        let is_open = wanted.map(|wanted| self.called(wanted).len() > 1);
+        let is_open = wanted.map(|wanted| self.resolved(wanted).len() > 1);
         let here = &self.nodes[0];
         if is_open == [true, false] {
             let second = self.find(wanted[1], here);
@@ -189,25 +216,26 @@ impl<'a> Gathered<'a> {
         [first, second]
     }
 
-    /// The node where that end is; if it cannot be asked, the one through which we came.
-    fn seen_from(&self, end: &Found) -> &Asked {
+    /// Returns the node of that end; if it cannot be asked, the entry node.
+    fn seen_from(&self, end: &Found) -> &Queried {
         let asked = end.at.map(|at| &self.nodes[at]);
-        asked.filter(|asked| asked.said.is_ok()).unwrap_or(&self.nodes[0])
+        asked.filter(|asked| asked.result.is_ok()).unwrap_or(&self.nodes[0])
     }
 
-    /// The applications that have this name.
-    fn called(&self, name: &str) -> Vec<Called> {
+    /// Returns the applications with this name.
+    fn resolved(&self, name: &str) -> Vec<Resolved> {
         let all = self
             .nodes
             .iter()
             .enumerate()
             .flat_map(|(at, asked)| asked.named_apps().iter().map(move |app| (at, app)));
         let named = all.filter(|(_, app)| app.name.as_deref() == Some(name));
-        named.map(|(at, app)| Called { at, tid: app.tid, is_ready: app.ready }).collect()
+        named.map(|(at, app)| Resolved { at, tid: app.tid, is_ready: app.ready }).collect()
     }
 
-    /// An application's TID, a node's address, an application's name as it is resolved from a node, a node's name: the first that it is.
-    fn find(&self, wanted: &str, seen_from: &Asked) -> Found {
+    /// Resolves an application's TID, a node's address, an application's name as seen from a node, or a node's name:
+    /// the first match.
+    fn find(&self, wanted: &str, seen_from: &Queried) -> Found {
         let at_address = |node| self.nodes.iter().position(|asked| asked.node == node);
         if let Ok(tid) = wanted.parse::<Tid>() {
             if many::is_many(tid) {
@@ -219,12 +247,12 @@ impl<'a> Gathered<'a> {
         if let Ok(node) = wanted.parse::<NodeAddress>() {
             return Found { at: at_address(node), node: Some(node), ..Found::default() };
         }
-        let mut called = self.called(wanted);
-        if let Ok(report) = &seen_from.said {
-            by_whom_is_reached(&mut called, report);
+        let mut resolved = self.resolved(wanted);
+        if let Ok(report) = &seen_from.result {
+            sort_by_reachability(&mut resolved, report);
         }
-        if let Some((&Called { at, tid, .. }, others)) = called.split_first() {
-            // Two processes with one address are told apart elsewhere.
+        if let Some((&Resolved { at, tid, .. }, others)) = resolved.split_first() {
+            // Two processes with one address are distinguished elsewhere.
             let others: Vec<_> = others.iter().map(|other| other.tid).filter(|other| *other != tid).collect();
             let namesakes = Namesakes { tid, seen_from: seen_from.name.clone(), others };
             let namesakes = Some(namesakes).filter(|namesakes| !namesakes.others.is_empty());
@@ -233,35 +261,35 @@ impl<'a> Gathered<'a> {
         if let Some(at) = self.nodes.iter().position(|asked| asked.name == wanted) {
             return Found { at: Some(at), node: Some(self.nodes[at].node), ..Found::default() };
         }
-        // Nobody who answers: one that was lost, or is of another project.
-        let reports = || self.nodes.iter().filter_map(|asked| asked.said.as_ref().ok());
+        // No answering node: a lost one, or one of another project.
+        let reports = || self.nodes.iter().filter_map(|asked| asked.result.as_ref().ok());
         let lost =
             reports().flat_map(|report| &report.lost).find(|lost| lost.name == wanted).map(|lost| lost.node);
         let foreign = || reports().flat_map(|report| &report.foreign).find(|other| other.name == wanted);
         Found { node: lost.or_else(|| foreign().map(|other| other.node)), ..Found::default() }
     }
 
-    fn end(&mut self, wanted: &str, found: &Found) -> End {
+    fn end(&mut self, wanted: &str, found: &Found) -> TrafficEnd {
         let (wanted, namesakes) = (wanted.to_owned(), found.namesakes.clone());
-        let mut end = End { wanted, node: found.node, namesakes, ..End::default() };
+        let mut end = TrafficEnd { wanted, node: found.node, namesakes, ..TrafficEnd::default() };
         let Some(at) = found.at else {
             end.app = found.app.map(|_| App::default());
             return end;
         };
         let asked = &self.nodes[at];
-        match &asked.said {
+        match &asked.result {
             Ok(report) => end.report = Some(report.clone()),
             Err(why) => end.silence = Some(why.clone()),
         }
         let others = self.nodes.iter().enumerate().filter(|(other, _)| *other != at);
         let others = others.filter(|(_, other)| other.node == asked.node);
         end.doubles = others
-            .filter_map(|(_, other)| other.said.as_ref().ok())
+            .filter_map(|(_, other)| other.result.as_ref().ok())
             .map(|other| format!("node {} (process {})", other.name, other.pid))
             .collect();
         if let Some(tid) = found.app {
-            let said = asked.app(tid);
-            end.app = Some(self.application(at, tid, said));
+            let report = asked.app(tid);
+            end.app = Some(self.application(at, tid, report));
         }
         end
     }
@@ -270,16 +298,16 @@ impl<'a> Gathered<'a> {
         &mut self,
         at: usize,
         tid: Tid,
-        (report, unsaid): (Option<AppReport>, Option<Unsaid>),
+        (report, unreported): (Option<AppReport>, Option<Unreported>),
     ) -> App {
         let asked = &self.nodes[at];
-        let (through, whom) = (asked.through, (asked.node, asked.name.clone()));
+        let (through, destination) = (asked.through, (asked.node, asked.name.clone()));
         let system = self.system(through);
-        let tree = system.ask_these::<AskTree, TreeReport>(vec![whom.clone()]).pop();
-        let lines = tree.and_then(|answer| answer.said.ok()).map_or_else(Vec::new, |said| said.lines);
-        let audit = system.ask_these::<AskAudit, AuditReport>(vec![whom]).pop();
+        let tree = system.ask_these::<AskTree, TreeReport>(vec![destination.clone()]).pop();
+        let lines = tree.and_then(|answer| answer.result.ok()).map_or_else(Vec::new, |report| report.lines);
+        let audit = system.ask_these::<AskAudit, AuditReport>(vec![destination]).pop();
         let entries =
-            audit.and_then(|answer| answer.said.ok()).map_or_else(Vec::new, |said| said.audit.entries);
+            audit.and_then(|answer| answer.result.ok()).map_or_else(Vec::new, |report| report.audit.entries);
         let is_its = |place: &Place| match place {
             Place::Mailbox { app, .. } | Place::Client { app, .. } => *app == tid.app,
             Place::ToNode { .. }
@@ -291,14 +319,14 @@ impl<'a> Gathered<'a> {
         };
         let refused =
             entries.iter().filter(|entry| is_its(&entry.place)).map(|entry| entry.account.refused).sum();
-        App { report, unsaid, line: lines.into_iter().find(|line| line.tid == Some(tid)), refused }
+        App { report, unreported, line: lines.into_iter().find(|line| line.tid == Some(tid)), refused }
     }
 
-    /// Whether the access list of the target's node lets the source send to it, where both are applications.
+    /// Returns whether the access list of the target's node lets the source send to it, if both are applications.
     fn access(&mut self, source: &Found, target: &Found) -> Option<AccessReport> {
         let asked = AskAccess { source: source.app?, target: target.app? };
         let there = &self.nodes[target.at?];
-        if there.said.is_err() {
+        if there.result.is_err() {
             return None;
         }
         let through = there.through;
@@ -308,10 +336,10 @@ impl<'a> Gathered<'a> {
         system.endpoint.message(inspection, &asked).ask(system.within).ok()
     }
 
-    /// A ping from the very node, if it has a door here.
+    /// Sends a ping from the node itself, if it has a socket here.
     fn ping(&mut self, from: Option<usize>, to: Option<Tid>) -> Option<Result<u64, String>> {
         let (asked, to) = (&self.nodes[from?], to?);
-        if !asked.is_own_door {
+        if !asked.is_own_socket {
             return None;
         }
         let through = asked.through;
@@ -327,32 +355,32 @@ impl<'a> Gathered<'a> {
 }
 
 payload!("sinew.ping", Stream =>
-    /// A sign of life that goes as a value of class Stream does.
+    /// A sign of life that is sent as a value of class Stream.
     struct Value {}
 );
 
-/// Time between two looks whether a value has arrived.
+/// Interval between two checks whether a value has arrived.
 const LOOK: Duration = Duration::from_millis(10);
-/// Time for its acknowledgement: it comes a millisecond and a round trip after it, and is asked for again where it was lost.
+/// Time limit for its acknowledgement: it arrives a millisecond and a round trip later, and is requested again if lost.
 const VALUE_WITHIN: Duration = Duration::from_millis(500);
 
-impl Gathered<'_> {
-    /// Sends a value of class Stream from the very node, if it has a door here, and gives what it has counted when it has arrived, or when
-    /// it should have.
+impl Collected<'_> {
+    /// Sends a value of class Stream from the node itself, if it has a socket here. Returns its counts when the value
+    /// has arrived, or after the time limit.
     fn stream(&mut self, from: Option<usize>, to: Option<NodeAddress>) -> Option<StreamReport> {
         let (asked, to) = (&self.nodes[from?], to?);
-        let of = |said: &NodeReport| said.peers.iter().find(|peer| peer.node == to)?.stream.clone();
-        let before = of(asked.said.as_ref().ok()?).filter(|stream| stream.is_agreed)?;
-        if !asked.is_own_door || asked.node == to {
+        let of = |report: &NodeReport| report.peers.iter().find(|peer| peer.node == to)?.stream.clone();
+        let before = of(asked.result.as_ref().ok()?).filter(|stream| stream.is_agreed)?;
+        if !asked.is_own_socket || asked.node == to {
             return None;
         }
-        let (through, whom) = (asked.through, (asked.node, asked.name.clone()));
+        let (through, destination) = (asked.through, (asked.node, asked.name.clone()));
         let system = self.system(through);
         let until = Time::now() + VALUE_WITHIN.min(system.within);
         system.endpoint.send(Tid::new(to, AppAddress::INSPECT), &Value {}).ok()?;
         loop {
-            let answer = system.ask_these::<AskNode, NodeReport>(vec![whom.clone()]).pop()?;
-            let after = of(&answer.said.ok()?)?;
+            let answer = system.ask_these::<AskNode, NodeReport>(vec![destination.clone()]).pop()?;
+            let after = of(&answer.result.ok()?)?;
             if after.arrived > before.arrived || Time::now() >= until {
                 return Some(after);
             }
@@ -361,20 +389,20 @@ impl Gathered<'_> {
     }
 }
 
-/// Whom a word means.
+/// The meaning of a word.
 #[derive(Default)]
 struct Found {
-    /// Among those that were asked.
+    /// Its index among the asked nodes.
     at: Option<usize>,
     node: Option<NodeAddress>,
     app: Option<Tid>,
     namesakes: Option<Namesakes>,
-    /// If a TID was given that stands for many; then it is nothing else.
+    /// Set if a TID of many was given; then the other fields are empty.
     many: Option<Tid>,
 }
 
 impl Found {
-    /// Whom a message goes to that is for it.
+    /// Returns the destination of a message for it.
     fn target(&self) -> Option<Tid> {
         Some(Tid::new(self.node?, self.app.map_or(AppAddress::INSPECT, |tid| tid.app)))
     }
@@ -386,9 +414,9 @@ mod tests {
     use crate::security;
 
     #[test]
-    fn an_application_that_is_not_named_is_known_to_be_absent_only_where_its_node_has_named_all() {
-        let report = security::tests::said("knee", 2, None);
-        let whom = || (report.node, report.name.clone());
+    fn application_is_absent_only_after_a_complete_report() {
+        let report = security::tests::node_report("knee", 2, None);
+        let destination = || (report.node, report.name.clone());
         let tid = Tid::new(report.node, AppAddress::new(0x1001));
         let apps = |left_out| AppsReport {
             name: "knee".to_owned(),
@@ -396,13 +424,15 @@ mod tests {
             left_out,
             barriers: Vec::new(),
             barriers_left_out: 0,
+            groups: Vec::new(),
+            groups_left_out: 0,
         };
-        let of = |apps| Asked { apps, ..Asked::new(0, whom(), Ok(report.clone())) }.app(tid);
+        let of = |apps| Queried { apps, ..Queried::new(0, destination(), Ok(report.clone())) }.app(tid);
         assert_eq!(of(Ok(apps(0))), (None, None));
-        assert_eq!(of(Ok(apps(3))), (None, Some(Unsaid::LeftOut(3))));
+        assert_eq!(of(Ok(apps(3))), (None, Some(Unreported::LeftOut(3))));
         let full = || "its queue is full".to_owned();
-        assert_eq!(of(Err(full())), (None, Some(Unsaid::Silent(full()))));
-        let silent = Asked::new(0, whom(), Err("no answer".to_owned()));
-        assert_eq!(silent.app(tid), (None, Some(Unsaid::Silent("no answer".to_owned()))));
+        assert_eq!(of(Err(full())), (None, Some(Unreported::Silent(full()))));
+        let silent = Queried::new(0, destination(), Err("no answer".to_owned()));
+        assert_eq!(silent.app(tid), (None, Some(Unreported::Silent("no answer".to_owned()))));
     }
 }

@@ -1,21 +1,21 @@
-//! What `sinew doctor` says of the system that it runs on.
+//! Findings of `sinew doctor` about the host system.
 
-use std::path::Path;
+use std::process::Command;
 
-use sinew_tests::{
-    Program,
+use sinew_testkit::{
+    NodeProcess,
     sandbox::{PIDFD_OPEN, without_system_call},
 };
 
 #[test]
-fn doctor_finds_that_own_processes_cannot_be_watched() {
-    let sinew = Path::new(env!("CARGO_BIN_EXE_sinew"));
-    let Some(mut command) = without_system_call(PIDFD_OPEN, sinew) else { return };
+fn unwatchable_own_processes_are_a_finding() {
+    let sinew = Command::new(env!("CARGO_BIN_EXE_sinew"));
+    let Some(mut command) = without_system_call(PIDFD_OPEN, &sinew) else { return };
     command.arg("doctor");
-    let mut doctor = Program::start("doctor", command);
-    assert_ne!(doctor.wait_for_end(), Some(0));
+    let mut doctor = NodeProcess::start("doctor", command);
+    assert_ne!(doctor.wait_for_exit(), Some(0));
     let finds =
-        |words: &[&str]| doctor.said().iter().any(|line| words.iter().all(|word| line.contains(word)));
-    assert!(finds(&["own processes", "FINDING", "pidfd_open"]), "{:#?}", doctor.said());
-    assert!(finds(&["own processes:", "Linux 5.4"]), "{:#?}", doctor.said());
+        |words: &[&str]| doctor.output().iter().any(|line| words.iter().all(|word| line.contains(word)));
+    assert!(finds(&["own processes", "FINDING", "pidfd_open"]), "{:#?}", doctor.output());
+    assert!(finds(&["own processes:", "Linux 5.4"]), "{:#?}", doctor.output());
 }

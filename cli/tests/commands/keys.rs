@@ -1,4 +1,4 @@
-//! `sinew keys` as a process: what it makes, for whom it can be read, what it never replaces, and that nodes take it.
+//! `sinew keys` as a process: its files, their permissions, protection from overwriting, and nodes that load them.
 
 use std::{
     fs,
@@ -13,12 +13,12 @@ use sinew::security::{
     Credentials, Identity, TimePolicy, Tls, UnixTime,
     rustls::{ClientConnection, ServerConnection, time_provider::DefaultTimeProvider},
 };
-use sinew_tests::OwnDirectory;
+use sinew_testkit::TestDirectory;
 
 use crate::scenario::{Answer, named};
 
 /// Runs `sinew keys` in `directory`.
-fn keys(directory: &OwnDirectory, words: &[&str]) -> Answer {
+fn keys(directory: &TestDirectory, words: &[&str]) -> Answer {
     let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
     command.arg("keys").args(words).current_dir(directory.join("."));
     let Output { status, stdout, stderr } = command.output().expect("the command starts");
@@ -26,17 +26,17 @@ fn keys(directory: &OwnDirectory, words: &[&str]) -> Answer {
     Answer { code: status.code(), out: text(stdout), err: text(stderr) }
 }
 
-/// What it says, which is good.
+/// Returns the JSON of a successful command.
 #[track_caller]
-fn good(directory: &OwnDirectory, words: &[&str]) -> Value {
+fn good(directory: &TestDirectory, words: &[&str]) -> Value {
     let answer = keys(directory, &[words, &["--json"]].concat());
     assert_eq!(answer.code, Some(0), "{words:?}: {}{}", answer.out, answer.err);
     answer.json()
 }
 
-/// What it says, which is a refusal with these parts.
+/// Expects a refusal with this exit code and these parts.
 #[track_caller]
-fn refused(directory: &OwnDirectory, words: &[&str], code: i32, parts: &[&str]) {
+fn refused(directory: &TestDirectory, words: &[&str], code: i32, parts: &[&str]) {
     let answer = keys(directory, words);
     assert_eq!(answer.code, Some(code), "{words:?}: {}{}", answer.out, answer.err);
     for part in parts {
@@ -63,23 +63,23 @@ fn everything(path: &Path) -> Vec<(PathBuf, u32, Vec<u8>)> {
     all
 }
 
-fn credentials(directory: &OwnDirectory, name: &str, address: [u8; 4]) -> Credentials {
+fn credentials(directory: &TestDirectory, name: &str, address: [u8; 4]) -> Credentials {
     let identity = Identity { project: "walker".to_owned(), address: address.into(), name: name.to_owned() };
     let path = directory.join("keys").join("nodes").join(name);
     Credentials::load(&path, &identity, TimePolicy::Strict, UnixTime::now()).expect("nodes take it")
 }
 
 #[test]
-fn four_names_make_a_robot_whose_nodes_know_each_other() {
+fn init_with_four_names_makes_a_connecting_robot() {
     // Given: nothing
-    let directory = OwnDirectory::new();
+    let directory = TestDirectory::new();
     // When
-    let said = good(&directory, &["init", "walker", "hip", "knee", "ankle", "central"]);
-    // Then: the nodes share this machine, in order
+    let json = good(&directory, &["init", "walker", "hip", "knee", "ankle", "central"]);
+    // Then: the nodes share this machine, with addresses in order
     let addresses: Vec<_> =
-        said["nodes"].as_array().expect("nodes").iter().map(|node| &node["address"]).collect();
+        json["nodes"].as_array().expect("nodes").iter().map(|node| &node["address"]).collect();
     assert_eq!(addresses, ["127.0.0.1", "127.0.0.2", "127.0.0.3", "127.0.0.4"]);
-    let hip = named(&said["nodes"], "hip").expect("it");
+    let hip = named(&json["nodes"], "hip").expect("it");
     assert_eq!(hip["copy"], "keys/nodes/hip");
     // And: two of them connect
     let tls = |name: &str, last| {
@@ -104,8 +104,8 @@ fn four_names_make_a_robot_whose_nodes_know_each_other() {
 }
 
 #[test]
-fn files_are_for_whom_they_are_meant_and_nothing_else_is_left() {
-    let directory = OwnDirectory::new();
+fn files_have_restrictive_modes_and_nothing_else_is_left() {
+    let directory = TestDirectory::new();
     good(&directory, &["init", "walker", "hip=10.0.0.2", "--out", "mine"]);
     let keys = directory.join("mine");
     assert_eq!(mode(&keys), 0o700);
@@ -132,14 +132,14 @@ fn files_are_for_whom_they_are_meant_and_nothing_else_is_left() {
     ];
     assert_eq!(names, expected);
     assert_eq!(fs::read_dir(directory.join(".")).expect("it").count(), 1, "nothing beside it");
-    // The authority's key goes to no node.
+    // The authority's key is in no node's directory.
     let authority = fs::read(keys.join("ca.key")).expect("it");
     assert_eq!(all.iter().filter(|(_, _, content)| *content == authority).count(), 1);
 }
 
 #[test]
-fn nothing_that_exists_is_replaced_without_a_word() {
-    let directory = OwnDirectory::new();
+fn existing_files_are_never_overwritten_silently() {
+    let directory = TestDirectory::new();
     good(&directory, &["init", "walker", "hip"]);
     let before = everything(&directory.join("keys"));
     refused(&directory, &["init", "walker", "hip"], 1, &["keys of a project", "sinew keys issue", "--out"]);
@@ -151,15 +151,15 @@ fn nothing_that_exists_is_replaced_without_a_word() {
     refused(&directory, &["init", "walker", "hip", "--out", "no/where"], 1, &["No such file"]);
     assert_eq!(everything(&directory.join("keys")), before);
     assert_eq!(fs::read_dir(directory.join("full")).expect("it").count(), 1);
-    // An empty one is as good as none.
+    // An empty directory counts as absent.
     fs::create_dir(directory.join("empty")).expect("it");
     good(&directory, &["init", "walker", "hip", "--out", "empty"]);
     assert_eq!(mode(&directory.join("empty")), 0o700);
 }
 
 #[test]
-fn names_and_addresses_that_cannot_be_are_refused_before_anything_is_made() {
-    let directory = OwnDirectory::new();
+fn invalid_names_and_addresses_are_refused_before_any_write() {
+    let directory = TestDirectory::new();
     for (nodes, parts) in [
         (&["hip=10.0.0.2", "knee=10.0.0.2"][..], &["'hip' and 'knee' have the same address, 10.0.0.2"][..]),
         (&["hip", "hip"], &["'hip' is named twice"]),
@@ -167,33 +167,41 @@ fn names_and_addresses_that_cannot_be_are_refused_before_anything_is_made() {
         (&["hip=10.0.0.2", "knee"], &["which address 'knee' has", "'hip' has 10.0.0.2", "knee=ADDRESS"]),
         (&["hip=10.0.0"], &["'10.0.0' is no address", "hip=192.168.0.11"]),
         (&["hip=0.0.0.0"], &["node.address"]),
-        (&["../hip"], &["cannot be the name of a directory"]),
-        (&[".hip"], &["cannot be the name of a directory"]),
-        (&["a/b=10.0.0.2"], &["cannot be the name of a directory"]),
-        (&[""], &["node.name"]),
+        // The grammar of names is that of nodes, with the same messages.
+        (&["../hip"], &["no node can be called `../hip`", "'/'"]),
+        (&[".."], &["no node can be called `..`", "'.'"]),
+        (&[".hip"], &["no node can be called `.hip`", "'.'"]),
+        (&["a/b=10.0.0.2"], &["no node can be called `a/b`", "'/'"]),
+        (&["a=b=10.0.0.2"], &["no node can be called `a=b`", "'='"]),
+        (&["x.toml=10.0.0.2"], &["no node can be called `x.toml`", ".toml"]),
+        (&["--", "-x=10.0.0.2"], &["no node can be called `-x`", "'-'"]),
+        (&["-x=10.0.0.2"], &["-- -x"]),
+        (&[&"k".repeat(64)], &["it has 64 bytes, and a name has at most 63"]),
+        (&[""], &["no node can be called ``", "it is empty"]),
         (&["nowhere.toml"], &["nowhere.toml", "this is no configuration of a node"]),
     ] {
         refused(&directory, &[&["init", "walker"], nodes].concat(), 2, parts);
     }
-    refused(&directory, &["init", "", "hip"], 2, &["node.project"]);
+    refused(&directory, &["init", "", "hip"], 2, &["no project can be called ``", "it is empty"]);
+    refused(&directory, &["init", "a/b", "hip"], 2, &["no project can be called `a/b`"]);
     assert_eq!(fs::read_dir(directory.join(".")).expect("it").count(), 0, "nothing was made");
 }
 
 #[test]
-fn an_address_comes_from_the_nodes_configuration_where_there_is_one() {
-    let directory = OwnDirectory::new();
+fn address_is_read_from_the_configuration_of_the_node() {
+    let directory = TestDirectory::new();
     let config = |name: &str, text: &str| fs::write(directory.join(name), text).expect("it");
     config("knee.toml", "[node]\nname = 'knee'\nproject = 'walker'\naddress = '10.0.0.3'\n");
     config("left.toml", "[node]\nname = 'ankle'\nproject = 'walker'\n[ndl]\ninterface = '192.168.0.14'\n");
     config("other.toml", "[node]\nname = 'other'\nproject = 'runner'\n");
     config("wrong.toml", "[node]\nname = 'right'\nproject = 'walker'\n");
-    let said = good(&directory, &["init", "walker", "knee", "left.toml", "wrist=127.0.0.1", "hip"]);
+    let json = good(&directory, &["init", "walker", "knee", "left.toml", "wrist=127.0.0.1", "hip"]);
     for (name, address, from) in [
         ("knee", "10.0.0.3", "from knee.toml"),
         ("ankle", "192.168.0.14", "from left.toml"),
         ("hip", "127.0.0.2", "next free here"),
     ] {
-        let node = named(&said["nodes"], name).expect("it");
+        let node = named(&json["nodes"], name).expect("it");
         assert_eq!((&node["address"], &node["address_from"]), (&address.into(), &from.into()), "{node}");
     }
     refused(
@@ -206,8 +214,8 @@ fn an_address_comes_from_the_nodes_configuration_where_there_is_one() {
 }
 
 #[test]
-fn what_is_said_secures_a_node() {
-    let directory = OwnDirectory::new();
+fn printed_configuration_secures_a_node() {
+    let directory = TestDirectory::new();
     let answer = keys(&directory, &["init", "walker", "hip=10.0.0.9", "knee=127.0.0.1"]);
     for part in [
         "keep it off the robot",
@@ -218,13 +226,13 @@ fn what_is_said_secures_a_node() {
         assert!(answer.out.contains(part), "{part}: {}", answer.out);
     }
     assert!(!answer.out.contains("tar -C keys/nodes/knee"), "what stays here is not copied: {}", answer.out);
-    // A node of this machine takes its keys from where they are.
+    // A node of this machine loads its keys from their place in the project's directory.
     let lines =
         good(&directory, &["issue", "knee"])["nodes"][0]["configuration"].as_str().expect("lines").to_owned();
     let mut config = sinew::NodeConfig::from_toml(&lines).expect("legal");
     assert!(config.ndl.mdns_port.is_some(), "nobody else hears it there: {lines}");
     assert!(config.ndl.interface.are_default(), "loopback is the default: {lines}");
-    // On a network it is heard, and multicast DNS, to which keys are nothing, is off.
+    // On a network the node is reachable, and multicast DNS is off because it bypasses the keys.
     let lines = &good(&directory, &["issue", "hip"])["nodes"][0]["configuration"];
     let on_a_network = sinew::NodeConfig::from_toml(lines.as_str().expect("lines")).expect("legal");
     assert_eq!(on_a_network.ndl.interface.to_string(), "10.0.0.9", "{lines}");
@@ -238,7 +246,7 @@ fn what_is_said_secures_a_node() {
     };
     let loaded = Credentials::load(&path, &identity, config.security.times, UnixTime::now());
     assert_eq!(loaded.expect("they are its own").warnings(), [""; 0]);
-    // Then: the node starts with them
+    // Then: the node starts with these keys
     config.ndl.multicast = None;
     config.ndl.mdns_port = None;
     let node = sinew::Node::builder("knee").configure(|own| *own = config).start();
@@ -246,28 +254,28 @@ fn what_is_said_secures_a_node() {
 }
 
 #[test]
-fn issue_adds_nodes_and_renews_them_and_says_what_still_counts() {
-    let directory = OwnDirectory::new();
+fn issue_adds_and_renews_nodes_and_lists_valid_certificates() {
+    let directory = TestDirectory::new();
     good(&directory, &["init", "walker", "hip=127.0.0.1", "knee=10.0.0.3"]);
     let first = credentials(&directory, "knee", [10, 0, 0, 3]).serial().to_string();
-    // When: one more, and the knee again
-    let said = good(&directory, &["issue", "ankle", "knee", "--days", "30"]);
+    // When: one more node, and the knee again
+    let json = good(&directory, &["issue", "ankle", "knee", "--days", "30"]);
     // Then
-    assert_eq!(named(&said["nodes"], "ankle").expect("it")["address"], "127.0.0.2");
-    let knee = named(&said["nodes"], "knee").expect("it");
+    assert_eq!(named(&json["nodes"], "ankle").expect("it")["address"], "127.0.0.2");
+    let knee = named(&json["nodes"], "knee").expect("it");
     assert_eq!((&knee["address"], &knee["address_from"]), (&"10.0.0.3".into(), &"as before".into()));
-    assert_eq!(said["older"][0]["number"], first.as_str());
+    assert_eq!(json["older"][0]["number"], first.as_str());
     assert_ne!(credentials(&directory, "knee", [10, 0, 0, 3]).serial().to_string(), first);
     assert_eq!(mode(&directory.join("keys/nodes/knee")), 0o700);
     assert_eq!(fs::read_dir(directory.join("keys/nodes")).expect("it").count(), 3, "nothing is left over");
-    // And: an address that another one has is refused
+    // And: an address of another node is refused
     refused(&directory, &["issue", "hip=10.0.0.3"], 2, &["'knee' and 'hip' have the same address"]);
     refused(&directory, &["issue", "wrist", "--keys", "elsewhere"], 1, &["elsewhere", "--keys DIR"]);
 }
 
 #[test]
-fn who_is_revoked_is_on_every_list_and_seen() {
-    let directory = OwnDirectory::new();
+fn revoked_node_is_shown_and_on_every_list() {
+    let directory = TestDirectory::new();
     good(&directory, &["init", "walker", "hip", "knee"]);
     let other = credentials(&directory, "knee", [127, 0, 0, 2]);
     let serial = credentials(&directory, "hip", [127, 0, 0, 1]).serial().to_string();
@@ -275,29 +283,30 @@ fn who_is_revoked_is_on_every_list_and_seen() {
         &directory,
         &["revoke", "hip", "wrist"],
         1,
-        &["no certificate of 'wrist'", "Nothing was revoked"],
+        &["no certificate of `wrist`", "Nothing was revoked"],
     );
+    refused(&directory, &["revoke", "kneee"], 1, &["no certificate of `kneee`", "nearest: knee"]);
     assert!(credentials(&directory, "hip", [127, 0, 0, 1]).validity().until > UnixTime::now());
     // When
-    let said = good(&directory, &["revoke", "hip"]);
-    // Then: on every list
-    assert_eq!(said["revoked"][0]["number"], serial.as_str());
+    let json = good(&directory, &["revoke", "hip"]);
+    // Then: the number is on every list
+    assert_eq!(json["revoked"][0]["number"], serial.as_str());
     for list in ["keys/denied.txt", "keys/nodes/hip/denied.txt", "keys/nodes/knee/denied.txt"] {
         let text = fs::read_to_string(directory.join(list)).expect("it");
         assert!(text.contains(&serial) && text.contains("hip 127.0.0.1, revoked 20"), "{list}: {text}");
     }
-    // And: seen
+    // And: the revocation is shown
     let shown = keys(&directory, &["show", "--json"]);
     assert_eq!(shown.code, Some(1), "a node without a certificate that counts is a finding");
     let hip = named(&shown.json()["certificates"], "hip").expect("it").clone();
     assert_eq!((&hip["state"], &hip["revoked"]), (&"revoked".into(), &true.into()));
-    // And: once is enough
+    // And: a second revocation changes nothing
     let again = good(&directory, &["revoke", &serial]);
     assert_eq!(
         (again["revoked"].as_array().map(Vec::len), &again["revoked_before"][0]["name"]),
         (Some(0), &"hip".into())
     );
-    // And: a new one counts beside it
+    // And: a new certificate is valid beside it
     good(&directory, &["issue", "hip"]);
     assert_eq!(good(&directory, &["show"])["denied"], 1);
     assert!(credentials(&directory, "hip", [127, 0, 0, 1]).serial().to_string() != serial);
@@ -305,41 +314,42 @@ fn who_is_revoked_is_on_every_list_and_seen() {
 }
 
 #[test]
-fn revoke_says_how_the_list_comes_to_each_node_that_is_left() {
-    let directory = OwnDirectory::new();
+fn revoke_prints_a_copy_command_for_each_remaining_node() {
+    let directory = TestDirectory::new();
     good(&directory, &["init", "walker", "hip=10.0.0.2", "knee=10.0.0.3", "ankle=127.0.0.4"]);
     let answer = keys(&directory, &["revoke", "hip"]);
     let copies: Vec<_> = answer.out.lines().filter(|line| line.contains("ssh")).collect();
-    // Not to the one that was revoked, and not to one of this machine, which has its directory here.
+    // No command for the revoked node, nor for the node of this machine, which has its directory here.
     assert_eq!(copies.len(), 1, "{}", answer.out);
     assert!(copies[0].starts_with("  tar -C keys -c denied.txt | ssh root@10.0.0.3 '"), "{}", answer.out);
-    // And: a node that has a new certificate is left, too; it is where it was
-    let said = good(&directory, &["issue", "hip"]);
-    let hip = named(&said["nodes"], "hip").expect("it");
+    // And: a node with a new certificate counts as remaining again, at its previous address
+    let json = good(&directory, &["issue", "hip"]);
+    let hip = named(&json["nodes"], "hip").expect("it");
     assert_eq!((&hip["address"], &hip["address_from"]), (&"10.0.0.2".into(), &"as before".into()));
     let answer = keys(&directory, &["revoke", "knee"]);
     let copies: Vec<_> = answer.out.lines().filter(|line| line.contains("ssh")).collect();
     assert!(copies.len() == 1 && copies[0].contains("root@10.0.0.2"), "{}", answer.out);
 }
 
-/// A machine that is reached by `ssh` as the commands that are printed do: its `/etc/sinew/keys`, and what stands between.
+/// A machine that the printed commands reach by `ssh`: its `/etc/sinew/keys`, and the connection to it.
 struct Robot<'a> {
-    directory: &'a OwnDirectory,
+    directory: &'a TestDirectory,
     keys: PathBuf,
 }
 
 impl<'a> Robot<'a> {
-    fn new(directory: &'a OwnDirectory) -> Self {
+    fn new(directory: &'a TestDirectory) -> Self {
         fs::create_dir(directory.join("bin")).expect("it");
         Self { directory, keys: directory.join("robot/etc/keys") }
     }
 
-    /// Runs the line of `said` that goes there, whose bytes come as `way` has them; whether all went well.
-    fn takes(&self, said: &str, way: &str) -> bool {
+    /// Runs the line of `output` for that machine, and passes its bytes through the command `way`. Returns whether it
+    /// succeeded.
+    fn takes(&self, output: &str, way: &str) -> bool {
         let ssh = self.directory.join("bin/ssh");
         fs::write(&ssh, format!("#!/bin/sh\n{way} | sh -c \"$2\"\n")).expect("it");
         fs::set_permissions(&ssh, fs::Permissions::from_mode(0o755)).expect("it");
-        let line = said.lines().find(|line| line.contains("| ssh root@")).expect("a command");
+        let line = output.lines().find(|line| line.contains("| ssh root@")).expect("a command");
         let line = line.replace("/etc/sinew/keys", self.keys.to_str().expect("a path of the test's own"));
         let path =
             format!("{}:{}", self.directory.join("bin").display(), std::env::var("PATH").expect("one"));
@@ -354,21 +364,21 @@ impl<'a> Robot<'a> {
 }
 
 #[test]
-fn what_is_cut_on_its_way_to_a_node_leaves_what_is_there() {
-    let directory = OwnDirectory::new();
+fn truncated_deny_list_leaves_the_previous_files() {
+    let directory = TestDirectory::new();
     let robot = Robot::new(&directory);
-    // Given: a node whose keys are where they have to be
+    // Given: a node with its keys installed
     let made = keys(&directory, &["init", "walker", "hip=10.0.0.2", "knee=10.0.0.3"]);
     assert!(robot.takes(&made.out, "cat"), "{}", made.out);
     assert_eq!(mode(&robot.keys), 0o700);
     assert_eq!(everything(&robot.keys).len(), 5);
     let empty = robot.denied();
-    // When: a list comes of which a part is lost
+    // When: a list arrives truncated
     let revoked = keys(&directory, &["revoke", "hip"]);
-    assert!(!robot.takes(&revoked.out, "head -c 600"), "it is said that it did not come");
-    // Then: it has the former one
+    assert!(!robot.takes(&revoked.out, "head -c 600"), "the command reports the failure");
+    // Then: the node keeps the previous list
     assert_eq!(robot.denied(), empty);
-    // And: the new one, when that comes whole, and nothing that was left over
+    // And: it accepts the new list when that arrives complete, and no temporary files remain
     assert!(robot.takes(&revoked.out, "cat"));
     assert_eq!(robot.denied(), fs::read_to_string(directory.join("keys/denied.txt")).expect("it"));
     assert_ne!(robot.denied(), empty);
@@ -376,7 +386,7 @@ fn what_is_cut_on_its_way_to_a_node_leaves_what_is_there() {
     assert_eq!(mode(&robot.keys.join("node.key")), 0o600);
 }
 
-/// Length of what `tar` makes of `directory` up to the second file in it.
+/// Length of the archive that `tar` makes of `directory`, up to the second file in it.
 fn length_of_the_first_file_of(directory: &Path) -> usize {
     const BLOCK: usize = 512;
     let mut tar = Command::new("tar");
@@ -389,28 +399,43 @@ fn length_of_the_first_file_of(directory: &Path) -> usize {
 }
 
 #[test]
-fn a_directory_that_is_cut_where_a_file_begins_leaves_what_is_there() {
-    let directory = OwnDirectory::new();
+fn archive_truncated_between_files_leaves_the_previous_files() {
+    let directory = TestDirectory::new();
     let robot = Robot::new(&directory);
     let made = keys(&directory, &["init", "walker", "hip=10.0.0.2"]);
     assert!(robot.takes(&made.out, "cat"), "{}", made.out);
     let before = everything(&robot.keys);
-    // When: a new certificate's directory comes, cut so that it is whole to `tar`
+    // When: a new certificate's directory arrives, cut so that `tar` accepts it as complete
     let issued = keys(&directory, &["issue", "hip"]);
     let length = length_of_the_first_file_of(&directory.join("keys/nodes/hip"));
-    assert!(!robot.takes(&issued.out, &format!("head -c {length}")), "it is said that it did not come");
+    assert!(!robot.takes(&issued.out, &format!("head -c {length}")), "the command reports the failure");
     // Then
     let after: Vec<_> = everything(&robot.keys);
     assert!(before.iter().all(|file| after.contains(file)), "{after:?}");
-    // And: the whole one, which is another one
+    // And: it accepts the complete directory, with its different content
     assert!(robot.takes(&issued.out, "cat"), "{}", issued.out);
     let after = everything(&robot.keys);
     assert!(after.len() == before.len() && after != before);
 }
 
 #[test]
-fn show_tells_who_has_what_until_when_also_on_the_robot() {
-    let directory = OwnDirectory::new();
+fn tables_fit_a_terminal_for_any_names() {
+    let directory = TestDirectory::new();
+    let name = "left-knee.".repeat(7).chars().take(63).collect::<String>();
+    let node = format!("{name}=192.168.100.200");
+    let fits = |table: &str| table.lines().all(|line| line.chars().count() <= 120);
+    let made = keys(&directory, &["init", "walker", &node]);
+    let table = made.out.split("\n\n").find(|part| part.starts_with("NODE")).expect("a table");
+    assert!(made.code == Some(0) && fits(table), "{}{}", made.out, made.err);
+    let shown = keys(&directory, &["show"]);
+    assert!(shown.code == Some(0) && fits(&shown.out) && !shown.out.contains("FROM"), "{}", shown.out);
+    let wide = keys(&directory, &["show", "--wide"]);
+    assert!(wide.out.contains("FROM") && wide.out.contains(&name), "{}", wide.out);
+}
+
+#[test]
+fn show_lists_nodes_and_expiry_also_on_the_robot() {
+    let directory = TestDirectory::new();
     good(&directory, &["init", "walker", "hip=10.0.0.2"]);
     let answer = keys(&directory, &["show"]);
     let lines: Vec<_> = answer.out.lines().collect();
@@ -425,9 +450,9 @@ fn show_tells_who_has_what_until_when_also_on_the_robot() {
         answer.out
     );
     // On the robot: the directory of the node alone
-    let said = good(&directory, &["show", "--keys", "keys/nodes/hip"]);
-    assert_eq!(said["certificates"].as_array().map(Vec::len), Some(1));
-    // And: what ends soon is a finding
+    let json = good(&directory, &["show", "--keys", "keys/nodes/hip"]);
+    assert_eq!(json["certificates"].as_array().map(Vec::len), Some(1));
+    // And: a certificate that expires soon is a finding
     good(&directory, &["issue", "hip", "--days", "3"]);
     let soon = keys(&directory, &["show"]);
     assert!(soon.code == Some(1) && soon.out.contains("good, ends soon"), "{}", soon.out);
@@ -435,8 +460,8 @@ fn show_tells_who_has_what_until_when_also_on_the_robot() {
 }
 
 #[test]
-fn a_directory_that_others_can_get_at_is_not_worked_with() {
-    let directory = OwnDirectory::new();
+fn directory_accessible_to_others_is_refused() {
+    let directory = TestDirectory::new();
     good(&directory, &["init", "walker", "hip"]);
     let key = directory.join("keys/ca.key");
     fs::set_permissions(&key, fs::Permissions::from_mode(0o644)).expect("it");
@@ -446,7 +471,7 @@ fn a_directory_that_others_can_get_at_is_not_worked_with() {
     fs::set_permissions(&own, fs::Permissions::from_mode(0o770)).expect("it");
     refused(&directory, &["revoke", "hip"], 1, &["others can write to keys", "0770", "chmod go-w"]);
     fs::set_permissions(&own, fs::Permissions::from_mode(0o700)).expect("it");
-    // And: two at once do not mix
+    // And: two commands at once exclude each other
     let opened = fs::File::open(directory.join("keys")).expect("it");
     rustix::fs::flock(&opened, rustix::fs::FlockOperation::LockExclusive).expect("it");
     refused(&directory, &["issue", "knee"], 1, &["another `sinew keys` is at work"]);

@@ -1,21 +1,23 @@
-//! docs/MISTAKES.md: each mistake is made with real nodes, and each line that the page quotes is a line that a terminal or `sinew` showed.
+//! docs/book/src/how-to/mistakes.md: makes each mistake with real nodes. Each quoted line must be one that a terminal
+//! or `sinew` showed.
 
-use std::{collections::BTreeMap, path::Path, process::Command};
+use std::{collections::BTreeMap, path::Path};
 
 use rustix::process::Signal;
-use sinew_tests::{Host, Hosts, Program, until};
+use sinew_testkit::{Host, Hosts, NodeProcess, sandbox::after_shell, until};
 
 use crate::{
-    scenario::{Answer, Scenario, node_program},
+    scenario::{Answer, Scenario, node_command},
     secured::make_keys,
 };
 
-const PAGE: &str = include_str!("../../../docs/MISTAKES.md");
+const PAGE: &str = include_str!("../../../docs/book/src/how-to/mistakes.md");
 const MISTAKES: usize = 12;
 /// On the page, any text.
 const ANY: &str = "...";
 
-/// The quotes of one mistake: a command, and lines that it shows. `./knee` is the terminal of the program of that name.
+/// The quotes of one mistake: a command, and lines of its output. `./knee` is the terminal of the program with that
+/// name.
 type Quotes = Vec<(&'static str, Vec<&'static str>)>;
 
 fn sections() -> impl Iterator<Item = &'static str> {
@@ -40,7 +42,8 @@ fn quotes(title: &str) -> Quotes {
     quotes
 }
 
-/// Whether a line is as quoted. Columns are as wide as their longest cell, so that each space may be several.
+/// Returns whether a line matches its quote. Columns are as wide as their longest cell, so each space may stand for
+/// several.
 fn is_as_quoted(line: &str, quoted: &str) -> bool {
     let in_one_space = |text: &str| text.split_whitespace().collect::<Vec<_>>().join(" ");
     let (line, quoted) = (in_one_space(line), in_one_space(quoted));
@@ -60,58 +63,63 @@ fn is_as_quoted(line: &str, quoted: &str) -> bool {
 /// The robot of the page: a hip, which requires the knee, and a knee.
 #[derive(Default)]
 struct Robot {
-    nodes: BTreeMap<&'static str, Program>,
+    nodes: BTreeMap<&'static str, NodeProcess>,
 }
 
 impl Robot {
-    /// A node as a first program starts it: what it logs goes to its terminal.
-    fn start(&mut self, scenario: &Scenario, node: &Node<'_>) {
+    /// Starts a node as a first program does: its log goes to its terminal.
+    fn start(&mut self, scenario: &Scenario, node: &Node<'_>) -> &mut NodeProcess {
         let Node { name, address, changes, more, host } = *node;
         let config = scenario.configure(name, address, changes);
-        let (shell, arguments) = (Path::new("sh"), ["-c", r#"exec "$0" "$@" 2>&1"#]);
-        let mut command = host.map_or_else(|| Command::new(shell), |host| host.command(shell));
-        command.args(arguments).arg(node_program()).arg(config).arg("--default-log").args(more);
+        let mut node = node_command();
+        node.arg(config).arg("--default-log").args(more);
+        let mut command = after_shell("exec 2>&1", &node);
+        if let Some(host) = host {
+            command = host.moved(&command);
+        }
         command.env_remove("SINEW_LOG").env_remove("RUST_LOG");
-        let mut program = Program::start(name, command);
-        program.wait_for(&["the node has started"]);
-        self.nodes.insert(name, program);
+        self.nodes.entry(name).or_insert_with(|| NodeProcess::start(name, command))
     }
 
-    fn of(scenario: &Scenario, nodes: &[Node<'_>]) -> Self {
+    /// Starts the second node after the first one has started. The mistake may end the second one at once.
+    fn of(scenario: &Scenario, [first, second]: [Node<'_>; 2]) -> Self {
         let mut robot = Self::default();
-        nodes.iter().for_each(|node| robot.start(scenario, node));
+        robot.start(scenario, &first).wait_for(&["the node has started"]);
+        robot.start(scenario, &second);
         robot
     }
 
-    /// Waits until everything that the page quotes was shown.
+    /// Waits until every quoted line of the page was shown.
     fn shows(&mut self, title: &str, run: impl Fn(&[&str]) -> Answer) {
         for (command, lines) in quotes(title) {
-            let mut said = Vec::new();
-            let missing = |said: &[String]| {
-                let is_missing = |quoted: &&&str| !said.iter().any(|line| is_as_quoted(line, quoted));
+            let mut shown = Vec::new();
+            let missing = |shown: &[String]| {
+                let is_missing = |quoted: &&&str| !shown.iter().any(|line| is_as_quoted(line, quoted));
                 lines.iter().filter(is_missing).copied().collect::<Vec<_>>()
             };
             let what = format!("'{title}', `{command}` as quoted");
             let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
                 until(&what, || {
-                    said = match command.strip_prefix("./") {
-                        Some(name) => self.nodes.get_mut(name).expect("a node of the page").look().to_vec(),
+                    shown = match command.strip_prefix("./") {
+                        Some(name) => {
+                            self.nodes.get_mut(name).expect("a node of the page").poll_output().to_vec()
+                        }
                         None => {
                             let words: Vec<_> = command.split(' ').skip(1).collect();
                             let Answer { out, err, .. } = run(&words);
                             out.lines().chain(err.lines()).map(str::to_owned).collect()
                         }
                     };
-                    missing(&said).is_empty().then_some(())
+                    missing(&shown).is_empty().then_some(())
                 });
             }));
-            let missing = missing(&said);
-            assert!(outcome.is_ok(), "{what}: missing\n{}\nshown:\n{}", missing.join("\n"), said.join("\n"));
+            let missing = missing(&shown);
+            assert!(outcome.is_ok(), "{what}: missing\n{}\nshown:\n{}", missing.join("\n"), shown.join("\n"));
         }
     }
 }
 
-/// How a node of the page is started.
+/// The parameters for starting a node of the page.
 #[derive(Clone, Copy)]
 struct Node<'a> {
     name: &'static str,
@@ -125,10 +133,10 @@ const HIP: Node<'static> =
     Node { name: "hip", address: 1, changes: &[], more: &["--requires", "knee"], host: None };
 const KNEE: Node<'static> = Node { name: "knee", address: 2, changes: &[], more: &[], host: None };
 
-/// The same on one host, looked at from the hip.
+/// Checks a mistake on one host, as seen from the hip.
 fn check(title: &str, hip: Node<'_>, knee: Node<'_>, mistake: impl FnOnce(&mut Robot)) {
     let scenario = Scenario::new();
-    let mut robot = Robot::of(&scenario, &[hip, knee]);
+    let mut robot = Robot::of(&scenario, [hip, knee]);
     mistake(&mut robot);
     robot.shows(title, |words| scenario.sinew("hip", words));
 }
@@ -136,12 +144,12 @@ fn check(title: &str, hip: Node<'_>, knee: Node<'_>, mistake: impl FnOnce(&mut R
 fn nothing(_: &mut Robot) {}
 
 #[test]
-fn the_page_has_a_section_for_each_mistake_that_is_tried() {
+fn page_has_a_section_for_each_tested_mistake() {
     assert_eq!(sections().count(), MISTAKES);
 }
 
 #[test]
-fn a_quoted_line_is_found_whatever_its_wildcards_stand_for() {
+fn quoted_line_matches_any_text_for_its_wildcards() {
     for (quoted, line, is_so) in [
         ("... WARN a: b", "12:00 WARN a: b", true),
         ("a  fine  up ...", "a      fine   up 3 s", true),
@@ -155,29 +163,29 @@ fn a_quoted_line_is_found_whatever_its_wildcards_stand_for() {
 }
 
 #[test]
-fn a_forgotten_handler_is_shown_as_on_the_page() {
+fn forgotten_handler_is_shown_as_on_the_page() {
     let hip = Node { more: &["--requires", "knee", "--sends-to", "knee"], ..HIP };
     check("1. A forgotten handler", hip, Node { more: &["--forgets-a-handler"], ..KNEE }, nothing);
 }
 
 #[test]
-fn a_wrong_type_is_shown_as_on_the_page() {
+fn wrong_type_is_shown_as_on_the_page() {
     let hip = Node { more: &["--requires", "knee", "--sends-text-to", "knee"], ..HIP };
     check("2. A type that differs", hip, KNEE, nothing);
 }
 
 #[test]
-fn a_misspelt_requirement_is_shown_as_on_the_page() {
+fn misspelt_requirement_is_shown_as_on_the_page() {
     check("3. A misspelt requirement", Node { more: &["--requires", "kneee"], ..HIP }, KNEE, nothing);
 }
 
 #[test]
-fn a_circle_of_requirements_is_shown_as_on_the_page() {
+fn circular_requirements_are_shown_as_on_the_page() {
     check("4. Requirements in a circle", HIP, Node { more: &["--requires", "hip"], ..KNEE }, nothing);
 }
 
 #[test]
-fn a_killed_process_is_shown_as_on_the_page() {
+fn killed_process_is_shown_as_on_the_page() {
     check("5. A process that is killed", HIP, KNEE, |robot| {
         robot.nodes.get_mut("hip").expect("it runs").wait_for(&["started 127"]);
         robot.nodes["knee"].signal(Signal::KILL);
@@ -185,21 +193,21 @@ fn a_killed_process_is_shown_as_on_the_page() {
 }
 
 #[test]
-fn a_crash_loop_is_shown_as_on_the_page() {
+fn crash_loop_is_shown_as_on_the_page() {
     let hip = Node { more: &["--requires", "knee", "--sends-to", "knee"], ..HIP };
     check("6. A crash loop", hip, Node { more: &["--panics"], ..KNEE }, nothing);
 }
 
 #[test]
-fn a_stopped_process_is_shown_as_on_the_page() {
+fn stopped_process_is_shown_as_on_the_page() {
     check("7. A process that stands still", HIP, KNEE, |robot| {
         robot.nodes.get_mut("hip").expect("it runs").wait_for(&["started 127"]);
-        robot.nodes["knee"].freeze();
+        robot.nodes["knee"].pause();
     });
 }
 
 #[test]
-fn a_wrong_project_is_shown_as_on_the_page() {
+fn wrong_project_is_shown_as_on_the_page() {
     let changes = [("project = \"cli\"", "project = \"arm\"")];
     check("10. A wrong project", HIP, Node { changes: &changes, ..KNEE }, nothing);
 }
@@ -214,16 +222,17 @@ fn wrong_keys_are_shown_as_on_the_page() {
     };
     let (own, other) = (of("keys", "hip"), of("other", "knee"));
     let (own, other) = ([("[lncl]", &*own)], [("[lncl]", &*other)]);
-    let mut robot = Robot::of(&scenario, &[Node { changes: &own, ..HIP }, Node { changes: &other, ..KNEE }]);
+    let mut robot = Robot::of(&scenario, [Node { changes: &own, ..HIP }, Node { changes: &other, ..KNEE }]);
     robot.shows("11. Wrong keys", |words| scenario.sinew("hip", words));
 }
 
 #[test]
-fn an_address_that_is_used_twice_is_shown_as_on_the_page() {
+fn duplicate_address_is_shown_as_on_the_page() {
     check("12. One address for two nodes", HIP, Node { address: 1, ..KNEE }, nothing);
 }
 
-/// The hip and the knee on two hosts, where the knee's interface is this; the command is run on the hip's host, and has no socket of the knee's.
+/// Checks a mistake with the hip and the knee on two hosts, and this interface for the knee. The command runs on the
+/// hip's host, without a socket of the knee.
 fn check_on_hosts(title: &str, hosts: Result<Hosts, String>, knee_interface: &str) {
     let Ok(hosts) = hosts.inspect_err(|why| println!("skipped: no hosts can be made here: {why}")) else {
         return;
@@ -238,7 +247,7 @@ fn check_on_hosts(title: &str, hosts: Result<Hosts, String>, knee_interface: &st
     let [hip_host, knee_host] = hosts.all() else { panic!("two hosts") };
     let hip = Node { changes: &hip_changes, host: Some(hip_host), ..HIP };
     let knee = Node { changes: &knee_changes, host: Some(knee_host), ..KNEE };
-    let mut robot = Robot::of(&scenario, &[hip, knee]);
+    let mut robot = Robot::of(&scenario, [hip, knee]);
     robot.shows(title, |words| {
         let mut command = hip_host.command(Path::new(env!("CARGO_BIN_EXE_sinew")));
         command.arg("--socket").arg(&hip_socket).args(["--deadline-ms", "10000"]).args(words);
@@ -247,12 +256,12 @@ fn check_on_hosts(title: &str, hosts: Result<Hosts, String>, knee_interface: &st
 }
 
 #[test]
-fn a_wrong_interface_is_shown_as_on_the_page() {
+fn wrong_interface_is_shown_as_on_the_page() {
     check_on_hosts("8. A wrong interface", Hosts::new(2), "[ndl]");
 }
 
 #[test]
-fn a_network_without_multicast_is_shown_as_on_the_page() {
+fn network_without_multicast_is_shown_as_on_the_page() {
     let hosts = Hosts::on_radio(2, 31).inspect(Hosts::drop_multicast);
     check_on_hosts("9. No multicast", hosts, "[ndl]\ninterface = \"10.77.0.2\"");
 }

@@ -1,4 +1,4 @@
-//! Every command where its output goes to a full disk, or to a pipe that nobody reads.
+//! Every command with its output on a full disk, or on a pipe without a reader.
 
 use std::{
     fs::File,
@@ -7,7 +7,7 @@ use std::{
 
 use crate::scenario::{Answer, Scenario};
 
-/// One of each command that answers by itself, for a node called `hip`.
+/// One invocation of each command that ends by itself, for a node called `hip`.
 const COMMANDS: [&[&str]; 17] = [
     &["--help"],
     &["--version"],
@@ -28,7 +28,7 @@ const COMMANDS: [&[&str]; 17] = [
     &["doctor"],
 ];
 
-/// What a command did that had this standard output and standard error.
+/// Runs a command with this standard output and standard error.
 fn run(scenario: &Scenario, words: &[&str], out: Stdio, err: Stdio) -> Answer {
     let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
     let asks_no_node = matches!(words[0], "keys" | "completions") || words.contains(&"--help");
@@ -51,7 +51,7 @@ fn full_disk() -> Stdio {
     File::options().write(true).open("/dev/full").expect("Linux has it").into()
 }
 
-/// The end of a pipe whose reader has gone.
+/// The write end of a pipe with its read end closed.
 fn closed_pipe() -> Stdio {
     let (reader, writer) = std::io::pipe().expect("a pipe");
     drop(reader);
@@ -59,7 +59,7 @@ fn closed_pipe() -> Stdio {
 }
 
 #[test]
-fn every_command_fails_in_words_where_the_disk_is_full() {
+fn every_command_reports_a_full_disk() {
     let scenario = Scenario::new();
     let mut hip = scenario.start("hip", 1, &[]);
     hip.wait_for(&["started"]);
@@ -77,7 +77,7 @@ fn every_command_fails_in_words_where_the_disk_is_full() {
 }
 
 #[test]
-fn every_command_ends_quietly_where_nobody_reads_it() {
+fn every_command_ends_quietly_on_a_closed_pipe() {
     let scenario = Scenario::new();
     let mut hip = scenario.start("hip", 1, &[]);
     hip.wait_for(&["started"]);
@@ -85,12 +85,12 @@ fn every_command_ends_quietly_where_nobody_reads_it() {
         let answer = run(&scenario, words, closed_pipe(), Stdio::piped());
         assert!(!matches!(answer.code, None | Some(4 | 101)), "{words:?}: {:?} {}", answer.code, answer.err);
         assert!(!answer.err.contains("standard output"), "{words:?}: {}", answer.err);
-        // And where nobody reads its errors either.
+        // Also with standard error on a closed pipe.
         let mute = run(&scenario, words, closed_pipe(), closed_pipe());
         assert!(!matches!(mute.code, None | Some(4 | 101)), "{words:?}: {:?}", mute.code);
     }
     let wrong = run(&scenario, &["nodes", "--wrong"], Stdio::piped(), full_disk());
     assert_eq!(wrong.code, Some(2), "{}", wrong.out);
-    let nobody = run(&scenario, &["--socket", "/nowhere.sock", "nodes"], full_disk(), full_disk());
-    assert!(matches!(nobody.code, Some(2 | 3)), "{:?}", nobody.code);
+    let no_node = run(&scenario, &["--socket", "/nowhere.sock", "nodes"], full_disk(), full_disk());
+    assert!(matches!(no_node.code, Some(2 | 3)), "{:?}", no_node.code);
 }

@@ -1,4 +1,4 @@
-//! Real nodes of a test's own, and the command itself.
+//! Real nodes of a test, and the command itself.
 
 use std::{
     net::SocketAddrV4,
@@ -7,15 +7,15 @@ use std::{
 };
 
 use serde_json::Value;
-use sinew_tests::{OwnDirectory, Program, own_group, program, until};
+use sinew_testkit::{NodeProcess, TestDirectory, own_group, program, until};
 
-/// Nodes of a test's own, each with a socket.
+/// Nodes of one test, each with a socket.
 pub(crate) struct Scenario {
-    pub(crate) directory: OwnDirectory,
+    pub(crate) directory: TestDirectory,
     pub(crate) group: SocketAddrV4,
 }
 
-/// What the command said.
+/// The exit code and the output of the command.
 pub(crate) struct Answer {
     pub(crate) code: Option<i32>,
     pub(crate) out: String,
@@ -23,7 +23,7 @@ pub(crate) struct Answer {
 }
 
 impl Answer {
-    /// Runs it.
+    /// Runs the command.
     pub(crate) fn of(command: &mut Command) -> Self {
         let Output { status, stdout, stderr } = command.output().expect("the command starts");
         let text = |bytes| String::from_utf8(bytes).expect("it writes text");
@@ -37,20 +37,21 @@ impl Answer {
 
 impl Scenario {
     pub(crate) fn new() -> Self {
-        Self { directory: OwnDirectory::new(), group: own_group() }
+        Self { directory: TestDirectory::new(), group: own_group() }
     }
 
     pub(crate) fn socket(&self, name: &str) -> PathBuf {
         self.directory.join(&format!("{name}.sock"))
     }
 
-    /// A node with the application of its name; returns when its layers are up.
-    pub(crate) fn start(&self, name: &str, address: u8, more: &[&str]) -> Program {
+    /// Starts a node with an application of the same name. Returns when its layers are up.
+    pub(crate) fn start(&self, name: &str, address: u8, more: &[&str]) -> NodeProcess {
         self.start_changed(name, address, &[], more)
     }
 
-    /// The hip, which sends counts to the knee all the time, and the knee, which has the first of them.
-    pub(crate) fn start_a_hip_that_sends_to_a_knee(&self) -> (Program, Program) {
+    /// Starts the hip, which sends counts to the knee all the time, and the knee. Returns when the knee has received
+    /// the first counts.
+    pub(crate) fn start_a_hip_that_sends_to_a_knee(&self) -> (NodeProcess, NodeProcess) {
         let mut hip = self.start("hip", 1, &["--requires", "knee", "--sends-to", "knee"]);
         let mut knee = self.start("knee", 2, &[]);
         hip.wait_for(&["started"]);
@@ -58,49 +59,49 @@ impl Scenario {
         (hip, knee)
     }
 
-    /// The hip, which runs, and the knee, which waits for an ankle that is not there.
-    pub(crate) fn start_a_knee_that_waits_for_an_ankle(&self) -> (Program, Program) {
+    /// Starts the hip, which runs, and the knee, which waits for an absent ankle.
+    pub(crate) fn start_a_knee_that_waits_for_an_ankle(&self) -> (NodeProcess, NodeProcess) {
         let mut hip = self.start("hip", 1, &[]);
         hip.wait_for(&["started"]);
         let knee = self.start("knee", 2, &["--requires", "ankle"]);
-        self.until("the knee waits", "hip", &["apps"], |said| {
-            named(&said["apps"], "knee").is_some_and(|app| app["state"] == "waits")
+        self.until("the knee waits", "hip", &["apps"], |json| {
+            named(&json["apps"], "knee").is_some_and(|app| app["state"] == "waits")
         });
         (hip, knee)
     }
 
-    /// As `start`, with these texts of its configuration replaced by others.
+    /// Same as `start`, with these texts of its configuration replaced.
     pub(crate) fn start_changed(
         &self,
         name: &str,
         address: u8,
         changes: &[(&str, &str)],
         more: &[&str],
-    ) -> Program {
+    ) -> NodeProcess {
         let path = self.configure(name, address, changes);
-        let mut command = Command::new(node_program());
+        let mut command = node_command();
         command.arg(&path).args(more);
-        let mut node = Program::start(name, command);
+        let mut node = NodeProcess::start(name, command);
         node.wait_for(&["up"]);
         node
     }
 
-    /// Writes the configuration of a node, with these texts of it replaced by others.
-    pub(crate) fn configure(&self, name: &str, address: u8, changes: &[(&str, &str)]) -> PathBuf {
-        let path = self.directory.join(&format!("{name}.toml"));
+    /// Writes the configuration of a node, with these texts replaced. `place` is its name, after the directory of its
+    /// files if it has a separate one.
+    pub(crate) fn configure(&self, place: &str, address: u8, changes: &[(&str, &str)]) -> PathBuf {
+        let name = place.rsplit('/').next().unwrap_or(place);
         let text = format!(
             "[node]\nname = \"{name}\"\naddress = \"127.0.0.{address}\"\nproject = \"cli\"\n\
              [lncl]\nsocket = \"{}\"\n[ndl]\nmulticast = \"{}\"\nmdns_port = false\n",
-            self.socket(name).display(),
+            self.socket(place).display(),
             self.group
         );
         let text = changes.iter().fold(text, |text, (from, to)| text.replace(from, to));
-        std::fs::write(&path, text).expect("the test's own directory");
-        path
+        self.directory.write(&format!("{place}.toml"), &text)
     }
 
-    /// Runs `sinew` through the socket of the node called `name`. A node of a machine that is slow has more time for its answer than the
-    /// command gives it by itself.
+    /// Runs `sinew` through the socket of the node called `name`. Nodes get more time to answer than the command's
+    /// default, because the machine may be slow.
     pub(crate) fn sinew(&self, name: &str, words: &[&str]) -> Answer {
         let socket = self.socket(name);
         let door = ["--socket", socket.to_str().expect("a short path")];
@@ -109,7 +110,7 @@ impl Scenario {
         sinew(&[&door, patience, words].concat(), Path::new("/"))
     }
 
-    /// Asks again until the JSON that comes is as it is to be.
+    /// Repeats the command until its JSON satisfies the condition.
     pub(crate) fn until(
         &self,
         what: &str,
@@ -122,11 +123,13 @@ impl Scenario {
     }
 }
 
-/// The program of the nodes.
-pub(crate) fn node_program() -> PathBuf {
-    let node = program("node_under_test");
-    assert!(node.exists(), "there is no {}; build it: cargo build -p sinew-tests", node.display());
-    node
+/// A command that starts a node.
+pub(crate) fn node_command() -> Command {
+    let scenarios = program("scenarios");
+    assert!(scenarios.exists(), "there is no {}; build it: cargo build -p sinew-tests", scenarios.display());
+    let mut command = Command::new(scenarios);
+    command.args(["--role", "node_under_test"]);
+    command
 }
 
 pub(crate) fn sinew(words: &[&str], runtime_directory: &Path) -> Answer {
@@ -134,7 +137,16 @@ pub(crate) fn sinew(words: &[&str], runtime_directory: &Path) -> Answer {
     Answer::of(command.args(words).env("XDG_RUNTIME_DIR", runtime_directory).env_remove("SINEW_SOCKET"))
 }
 
-/// The element of `list` whose `name` is this one.
+/// Returns the element of `list` with this `name`.
 pub(crate) fn named<'a>(list: &'a Value, name: &str) -> Option<&'a Value> {
     list.as_array()?.iter().find(|one| one["name"] == name)
+}
+
+/// Returns the blocked steps of `sinew why`, as text.
+pub(crate) fn blocked(json: &Value) -> String {
+    let steps = json["steps"].as_array().expect("a list").iter();
+    let blocked = steps.filter(|step| step["status"] == "blocked");
+    blocked
+        .map(|step| format!("{}: {} - {}\n", step["step"], step["detail"], step["suggested_fix"]))
+        .collect()
 }

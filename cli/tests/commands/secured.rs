@@ -1,18 +1,18 @@
-//! Nodes whose keys `sinew keys` made, and those beside them that have none, or others.
+//! Nodes with keys made by `sinew keys`, beside nodes without keys or with other keys.
 
 use std::path::Path;
 
 use serde_json::Value;
-use sinew_tests::Program;
+use sinew_testkit::NodeProcess;
 
-use crate::scenario::{Scenario, named, sinew};
+use crate::scenario::{Scenario, blocked, named, sinew};
 
-/// Keys of a project of their own, in this directory of the test's.
+/// Makes the keys of a separate project in this directory of the test.
 pub(crate) fn make_keys(scenario: &Scenario, directory: &str, nodes: &[&str]) {
     make_keys_for(scenario, directory, "365", nodes);
 }
 
-/// For so many days.
+/// The same, valid for this number of days.
 fn make_keys_for(scenario: &Scenario, directory: &str, days: &str, nodes: &[&str]) {
     let out = scenario.directory.join(directory);
     let out = out.to_str().expect("a path of the test's own");
@@ -21,21 +21,21 @@ fn make_keys_for(scenario: &Scenario, directory: &str, days: &str, nodes: &[&str
     assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
 }
 
-/// A node with its keys in `directory`.
-fn secured(scenario: &Scenario, directory: &str, name: &str, address: u8, more: &[&str]) -> Program {
+/// Starts a node with its keys in `directory`.
+fn secured(scenario: &Scenario, directory: &str, name: &str, address: u8, more: &[&str]) -> NodeProcess {
     let keys = scenario.directory.join(&format!("{directory}/nodes/{name}"));
     let section = format!("[security]\nkeys = \"{}\"\n[lncl]", keys.display());
     scenario.start_changed(name, address, &[("[lncl]", &section)], more)
 }
 
-fn names(said: &Value) -> Vec<&str> {
-    let nodes = said["nodes"].as_array().expect("a list");
+fn names(json: &Value) -> Vec<&str> {
+    let nodes = json["nodes"].as_array().expect("a list");
     nodes.iter().filter_map(|node| node["name"].as_str()).collect()
 }
 
 #[test]
-fn nodes_with_keys_of_one_project_find_each_other_and_nobody_else() {
-    // Given: beside them, in their group and under their project's name, two nodes without keys, and one with keys of its own
+fn only_nodes_of_one_project_connect() {
+    // Given: beside them, in their group and with their project's name, two nodes without keys, and one with other keys
     let scenario = Scenario::new();
     make_keys(&scenario, "keys", &["hip=127.0.0.1", "knee=127.0.0.2"]);
     make_keys(&scenario, "others", &["thief=127.0.0.5"]);
@@ -44,26 +44,26 @@ fn nodes_with_keys_of_one_project_find_each_other_and_nobody_else() {
         scenario.start("spy2", 4, &[]),
         secured(&scenario, "others", "thief", 5, &[]),
     ];
-    scenario.until("nodes without keys find each other", "spy", &["nodes"], |said| names(said).len() == 2);
+    scenario.until("nodes without keys find each other", "spy", &["nodes"], |json| names(json).len() == 2);
     // When
     let mut hip = secured(&scenario, "keys", "hip", 1, &["--requires", "knee", "--sends-to", "knee"]);
     let mut knee = secured(&scenario, "keys", "knee", 2, &[]);
     // Then
     hip.wait_for(&["started"]);
     knee.wait_for(&["count 50 "]);
-    let said = scenario.until("all connections are up", "hip", &["nodes"], |said| {
-        let links = named(&said["nodes"], "knee").and_then(|node| node["links"].as_array());
+    let json = scenario.until("all connections are up", "hip", &["nodes"], |json| {
+        let links = named(&json["nodes"], "knee").and_then(|node| node["links"].as_array());
         links.is_some_and(|links| links.len() == 3 && links.iter().all(|link| link["up"] == true))
     });
-    assert_eq!(names(&said), ["hip", "knee"], "{said}");
+    assert_eq!(names(&json), ["hip", "knee"], "{json}");
     for (outside, knows) in [("spy", 2), ("thief", 1)] {
-        let said = scenario.sinew(outside, &["nodes", "--json"]).json();
-        assert_eq!(names(&said).len(), knows, "{outside}: {said}");
+        let json = scenario.sinew(outside, &["nodes", "--json"]).json();
+        assert_eq!(names(&json).len(), knows, "{outside}: {json}");
     }
 }
 
 #[test]
-fn a_node_that_is_killed_is_found_again_in_its_next_life() {
+fn restarted_node_is_found_again_after_a_kill() {
     let scenario = Scenario::new();
     make_keys(&scenario, "keys", &["hip=127.0.0.1", "knee=127.0.0.2"]);
     let _hip = secured(&scenario, "keys", "hip", 1, &["--requires", "knee", "--sends-to", "knee"]);
@@ -74,7 +74,7 @@ fn a_node_that_is_killed_is_found_again_in_its_next_life() {
 }
 
 #[test]
-fn the_doctor_and_the_list_of_nodes_say_who_is_open_and_when_a_certificate_ends() {
+fn doctor_and_nodes_show_open_nodes_and_expiry() {
     // Given: a node without keys, one with keys for a year, and one with keys for ten days
     let scenario = Scenario::new();
     make_keys(&scenario, "keys", &["hip=127.0.0.1"]);
@@ -86,30 +86,33 @@ fn the_doctor_and_the_list_of_nodes_say_who_is_open_and_when_a_certificate_ends(
     ];
     // When
     let security = |name: &str| {
-        let said = scenario.sinew(name, &["doctor", "--json"]).json();
-        let checks = said["checks"].as_array().expect("a list");
+        let json = scenario.sinew(name, &["doctor", "--json"]).json();
+        let checks = json["checks"].as_array().expect("a list");
         checks.iter().find(|check| check["check"] == "security").expect("it is there").clone()
     };
     let listed = |name: &str| {
-        let said = scenario.sinew(name, &["nodes", "--json"]).json();
-        named(&said["nodes"], name).expect("itself")["security"].clone()
+        let json = scenario.sinew(name, &["nodes", "--json"]).json();
+        named(&json["nodes"], name).expect("itself")["security"].clone()
     };
-    // Then: whole days, of which the first may have begun
+    // Then: in whole days; the first day may have begun
     let (hip, knee, spy) = (security("hip"), security("knee"), security("spy"));
     let has = |check: &Value, days: [u64; 2]| {
-        let seen = check["seen"].as_str().expect("words");
+        let seen = check["detail"].as_str().expect("words");
         days.iter().any(|days| seen.contains(&format!("({days} days)")))
     };
     assert!(hip["fine"] == true && has(&hip, [364, 365]), "{hip}");
     assert!(knee["fine"] == false && has(&knee, [9, 10]), "{knee}");
-    assert!(knee["mend"].as_str().is_some_and(|mend| mend.contains("sinew keys issue knee")), "{knee}");
+    assert!(
+        knee["suggested_fix"].as_str().is_some_and(|fix| fix.contains("sinew keys issue knee")),
+        "{knee}"
+    );
     assert!(
         spy["fine"] == true
-            && spy["seen"].as_str().is_some_and(|seen| seen.starts_with("open to every user of this host")),
+            && spy["detail"].as_str().is_some_and(|seen| seen.starts_with("open to every user of this host")),
         "{spy}"
     );
     let (hip, knee, spy) = (listed("hip"), listed("knee"), listed("spy"));
-    let left = |said: &Value| said["certificate"]["days_left"].as_u64().expect("a number");
+    let left = |json: &Value| json["certificate"]["days_left"].as_u64().expect("a number");
     assert!(hip["state"] == "secured" && [364, 365].contains(&left(&hip)), "{hip}");
     assert!(knee["state"] == "ends soon" && [9, 10].contains(&left(&knee)), "{knee}");
     assert_eq!((&spy["secured"], &spy["beyond_host"]), (&false.into(), &false.into()), "{spy}");
@@ -117,28 +120,21 @@ fn the_doctor_and_the_list_of_nodes_say_who_is_open_and_when_a_certificate_ends(
     assert!(table.contains("KEYS") && (table.contains("364 d") || table.contains("365 d")), "{table}");
 }
 
-/// What is in the way from the hip to another node, in words.
-fn in_the_way(said: &Value) -> String {
-    let steps = said["steps"].as_array().expect("a list").iter();
-    let blocked = steps.filter(|step| step["state"] == "blocked");
-    blocked.map(|step| format!("{}: {} - {}\n", step["step"], step["seen"], step["mend"])).collect()
-}
-
 #[test]
-fn why_says_of_a_node_with_keys_and_one_without_that_this_is_it() {
+fn why_names_missing_keys_as_the_cause() {
     let scenario = Scenario::new();
     make_keys(&scenario, "keys", &["hip=127.0.0.1"]);
     let _nodes = [secured(&scenario, "keys", "hip", 1, &[]), scenario.start("knee", 2, &[])];
     for here in ["hip", "knee"] {
         let answer = scenario.sinew(here, &["why", "hip", "knee", "--json"]);
-        let said = in_the_way(&answer.json());
-        assert!(answer.code == Some(1) && said.contains("hip has keys, and knee has none"), "{said}");
-        assert!(said.contains("sinew keys issue knee=127.0.0.2") && !said.contains("firewall"), "{said}");
+        let steps = blocked(&answer.json());
+        assert!(answer.code == Some(1) && steps.contains("hip has keys, and knee has none"), "{steps}");
+        assert!(steps.contains("sinew keys issue knee=127.0.0.2") && !steps.contains("firewall"), "{steps}");
     }
 }
 
 #[test]
-fn why_says_of_a_revoked_certificate_what_its_fault_says_and_blames_no_network() {
+fn why_shows_the_fault_of_a_revoked_certificate() {
     let scenario = Scenario::new();
     make_keys(&scenario, "keys", &["hip=127.0.0.1", "knee=127.0.0.2"]);
     let mut hip = secured(&scenario, "keys", "hip", 1, &["--requires", "knee"]);
@@ -151,9 +147,9 @@ fn why_says_of_a_revoked_certificate_what_its_fault_says_and_blames_no_network()
     assert_eq!(revoked.code, Some(0), "{}{}", revoked.out, revoked.err);
     scenario.sinew("hip", &["reload"]);
     // Then
-    let said = scenario.until("a try has failed", "hip", &["why", "hip", "knee"], |said| {
-        in_the_way(said).contains("`sinew keys issue NODE --keys DIR`, where ca.key is, makes it another\"\n")
+    let json = scenario.until("a try has failed", "hip", &["why", "hip", "knee"], |json| {
+        blocked(json).contains("`sinew keys issue NODE --keys DIR`, where ca.key is, makes it another\"\n")
     });
-    let said = in_the_way(&said);
-    assert!(said.contains("is revoked") && !said.contains("TCP does not reach"), "{said}");
+    let steps = blocked(&json);
+    assert!(steps.contains("is revoked") && !steps.contains("TCP does not reach"), "{steps}");
 }

@@ -1,35 +1,32 @@
 //! `sinew watch` of applications here and on another node.
 
-use std::{
-    io::{BufRead, BufReader, Lines},
-    process::{Child, ChildStdout, Command, Stdio},
-};
+use std::process::Command;
 
 use serde_json::Value;
 use sinew::{NodeApi, Registration, message::Kind};
+use sinew_testkit::NodeProcess;
 
 use crate::scenario::{Answer, Scenario};
 
-/// `sinew watch`, until it is dropped.
-struct Watcher {
-    command: Child,
-    out: Lines<BufReader<ChildStdout>>,
-}
+/// A running `sinew watch`.
+struct Watcher(NodeProcess);
 
 impl Watcher {
-    fn of(scenario: &Scenario, whom: &str) -> Self {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
-        command.arg("--socket").arg(scenario.socket("knee")).args(["watch", whom, "--json"]);
-        let mut command = command.stdout(Stdio::piped()).spawn().expect("the command starts");
-        let out = BufReader::new(command.stdout.take().expect("its output is a pipe")).lines();
-        Self { command, out }
+    fn of(scenario: &Scenario, target: &str) -> Self {
+        Self::with(scenario, target, &[])
     }
 
-    /// The next message that is seen. Whenever there was none for as long as rates are said, it is sent again: the watch begins some time.
+    fn with(scenario: &Scenario, target: &str, more: &[&str]) -> Self {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
+        command.arg("--socket").arg(scenario.socket("knee")).args(["watch", target, "--json"]).args(more);
+        Self(NodeProcess::start("sinew watch", command))
+    }
+
+    /// Returns the next shown message. It is sent again after each interval of rates without one, because the watch may
+    /// start later.
     fn message(&mut self, send: impl Fn() -> Answer) -> Value {
         loop {
-            let line = self.out.next().expect("it lives").expect("it says a line");
-            let line: Value = serde_json::from_str(&line).expect("JSON");
+            let line: Value = serde_json::from_str(&self.0.wait_for(&[])).expect("JSON");
             if line["event"] == "message" {
                 return line;
             }
@@ -39,15 +36,7 @@ impl Watcher {
     }
 }
 
-impl Drop for Watcher {
-    fn drop(&mut self) {
-        // It may have ended by itself.
-        let _ = self.command.kill();
-        let _ = self.command.wait();
-    }
-}
-
-/// Each line as JSON.
+/// Parses each line as JSON.
 fn lines(text: &str) -> Vec<Value> {
     text.lines()
         .map(|line| serde_json::from_str(line).unwrap_or_else(|why| panic!("{why}: {line}")))
@@ -55,18 +44,18 @@ fn lines(text: &str) -> Vec<Value> {
 }
 
 #[test]
-fn what_an_application_gets_and_sends_is_seen_decoded_from_either_node() {
+fn traffic_is_shown_decoded_from_either_node() {
     // Given: the hip sends counts to the knee
     let scenario = Scenario::new();
     let (_hip, _knee) = scenario.start_a_hip_that_sends_to_a_knee();
     for here in ["hip", "knee"] {
-        for (whom, is_sent) in [("hip", true), ("knee", false)] {
+        for (target, is_sent) in [("hip", true), ("knee", false)] {
             // When
-            let answer = scenario.sinew(here, &["watch", whom, "--count", "20", "--json"]);
-            // Then: all of them, in order, but for what the node says that it dropped
+            let answer = scenario.sinew(here, &["watch", target, "--count", "20", "--json"]);
+            // Then: all of them, in order, except those that the node reports as dropped
             assert_eq!(answer.code, Some(0), "{}", answer.err);
-            let said = lines(&answer.out);
-            let messages: Vec<_> = said.iter().filter(|line| line["event"] == "message").collect();
+            let events = lines(&answer.out);
+            let messages: Vec<_> = events.iter().filter(|line| line["event"] == "message").collect();
             assert_eq!(messages.len(), 20);
             let numbers: Vec<_> =
                 messages.iter().map(|m| m["payload"]["number"].as_u64().expect("a count")).collect();
@@ -76,7 +65,7 @@ fn what_an_application_gets_and_sends_is_seen_decoded_from_either_node() {
                 assert_eq!((&message["class"], &message["source_name"]), (&"bulk".into(), &"hip".into()));
                 assert!(message["refused"].is_null() && message["age_ns"].is_u64(), "{message}");
             }
-            let rates: Vec<_> = said.iter().filter(|line| line["event"] == "rates").collect();
+            let rates: Vec<_> = events.iter().filter(|line| line["event"] == "rates").collect();
             let counted: u64 = rates
                 .iter()
                 .flat_map(|r| r["kinds"].as_array())
@@ -84,13 +73,13 @@ fn what_an_application_gets_and_sends_is_seen_decoded_from_either_node() {
                 .filter_map(|k| k["count"].as_u64())
                 .sum();
             assert!(counted >= 20, "{rates:?}");
-            // A node that is not asked in time drops what it saw, and says how much.
+            // A node that is not polled in time drops copies, and reports their number.
             let missing = numbers[19] - numbers[0] - 19;
             let dropped: u64 = rates.iter().filter_map(|r| r["dropped"].as_u64()).sum();
             assert!(missing <= dropped, "{numbers:?} {rates:?}");
         }
     }
-    // And: for people, and only what was asked for
+    // And: as text, and only the requested number
     let text = scenario.sinew("hip", &["watch", "knee", "--count", "3"]).out;
     assert!(text.contains("-> scenario.count") && text.contains(r#"{"number":"#), "{text}");
     let none = scenario.sinew("hip", &["watch", "knee", "--sent", "--for", "1", "--json"]);
@@ -100,26 +89,26 @@ fn what_an_application_gets_and_sends_is_seen_decoded_from_either_node() {
 }
 
 #[test]
-fn a_message_that_is_refused_is_seen_with_the_reason() {
+fn rejected_message_is_shown_with_the_reason() {
     let scenario = Scenario::new();
     let mut knee = scenario.start("knee", 2, &[]);
     let tid = knee.wait_for(&["started"]).split_once(' ').expect("it says its TID").1.to_owned();
-    // When: somebody sends to an address that nobody has, and somebody watches that
+    // When: a message is sent to an unused address, and that address is watched
     let mut watcher = Watcher::of(&scenario, "127.0.0.2/1fff");
     let seen = watcher
         .message(|| scenario.sinew("knee", &["send", "127.0.0.2/1fff", "test.any", "[1]", "--unconfirmed"]));
     // Then
     assert_eq!((&seen["refused"], &seen["payload"]), (&"NoSuchApplication".into(), &serde_json::json!([1])));
-    assert_eq!(seen["kind"], format!("{}", Kind::named("test.any")), "nobody has said what this is called");
+    assert_eq!(seen["kind"], format!("{}", Kind::named("test.any")), "no program has named this kind");
     drop(tid);
 }
 
 #[test]
-fn a_name_is_followed_to_where_its_application_is_started_again() {
+fn watched_name_is_followed_to_a_new_address() {
     let scenario = Scenario::new();
     let _knee = scenario.start("knee", 2, &[]);
     for name in ["sensor", "leg/sensor"] {
-        // Given: an application of another process, which is watched by its name
+        // Given: an application of another process, watched by its name
         let register = || {
             let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
             api.register_transport_address(Registration::new().name(name)).expect("it is registered")
@@ -129,7 +118,7 @@ fn a_name_is_followed_to_where_its_application_is_started_again() {
         let mut watcher = Watcher::of(&scenario, name);
         let seen = watcher.message(send);
         assert_eq!(seen["target"], first.tid().to_string());
-        // When: it ends, somebody else takes its address, and it comes again at another
+        // When: it ends, another application takes its address, and it starts again at a different one
         first.unregister().expect("it gives its address back");
         let other = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
         let other = other.register_transport_address(Registration::new()).expect("it is registered");
@@ -143,7 +132,33 @@ fn a_name_is_followed_to_where_its_application_is_started_again() {
 }
 
 #[test]
-fn a_node_is_no_application_to_be_watched() {
+fn unknown_name_is_an_error_without_wait() {
+    let scenario = Scenario::new();
+    let mut node = scenario.start("knee", 2, &[]);
+    node.wait_for(&["started"]);
+    let answer = scenario.sinew("knee", &["watch", "kneee"]);
+    assert!(
+        answer.code == Some(1) && answer.err.contains("`kneee`; nearest: knee (application)"),
+        "{}",
+        answer.err
+    );
+    assert!(answer.err.contains("`--wait` waits for it"), "{}", answer.err);
+    let long = "k".repeat(64);
+    let answer = scenario.sinew("knee", &["watch", &long, "--wait"]);
+    assert!(answer.code == Some(1) && answer.err.contains("it has 64 bytes"), "{}", answer.err);
+    // When: the command waits for it, and an application with the name starts
+    let mut watcher = Watcher::with(&scenario, "sensor", &["--wait"]);
+    let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
+    let sensor =
+        api.register_transport_address(Registration::new().name("sensor")).expect("it is registered");
+    // Then
+    let seen =
+        watcher.message(|| scenario.sinew("knee", &["send", "sensor", "test.any", "1", "--unconfirmed"]));
+    assert_eq!(seen["target"], sensor.tid().to_string());
+}
+
+#[test]
+fn node_cannot_be_watched_as_an_application() {
     let scenario = Scenario::new();
     let _node = scenario.start("knee", 2, &["--requires", "ankle"]);
     let answer = scenario.sinew("knee", &["watch", "127.0.0.2", "--for", "1"]);

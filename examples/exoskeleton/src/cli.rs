@@ -1,71 +1,79 @@
-//! Arguments, and which run they mean.
+//! Command line arguments, and the run that they ask for.
 
-mod faults;
-mod lock_step;
-mod node;
-mod real_time;
-
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
 
 use clap::{Parser, Subcommand};
-use exoskeleton::gait::trial::TrialError;
-use exoskeleton::lockstep::LockStepError;
-use exoskeleton::part::Kill;
-use exoskeleton::report;
-use exoskeleton::robot::launch::LaunchError;
-use exoskeleton::robot::launch::faults::FaultError;
-use exoskeleton::robot::node::NodeError;
+use exoskeleton::output;
+use exoskeleton::report::{self, Report, RunDescription, RunMode, Verdict};
+use exoskeleton::robot::launch::{self, LaunchError, LaunchOptions};
+use exoskeleton::robot::node::{self, NodeError, NodeOptions};
+use exoskeleton::robot::topology::{Control, ControlThread, ReleaseBy};
+use exoskeleton::run_folder;
+use exoskeleton_model::gait::trial::{Trial, TrialError};
+use exoskeleton_model::intention::Intention;
+use exoskeleton_model::lockstep::{self, LockStepConfig, LockStepError};
+use exoskeleton_model::part::Kill;
 use thiserror::Error;
 
 /// A powered leg of four nodes and a simulated person.
 #[derive(Debug, Parser)]
 #[command(version, args_conflicts_with_subcommands = true, after_help = EXIT_CODES)]
 pub(crate) struct Arguments {
-    /// One part alone, or the robot under faults, instead of a walk of the whole robot on this host.
+    /// One part alone, instead of a walk of the whole robot on this host.
     #[command(subcommand)]
     command: Option<SubCommand>,
     /// Virtual time in one thread, bit-identical for a seed; says nothing about real-time performance.
     #[arg(long)]
-    pub(crate) lock_step: bool,
+    lock_step: bool,
     /// Strides to walk; figures count from stride 7 on.
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(8..=5000))]
-    pub(crate) strides: u32,
+    strides: u32,
     /// Seed of stride variation and sensor noise.
     #[arg(long, default_value_t = 1)]
-    pub(crate) seed: u64,
+    seed: u64,
     /// A recorded trial (CSV) to walk instead of the built-in curves.
     #[arg(long, value_name = "FILE")]
-    pub(crate) trial: Option<PathBuf>,
+    trial: Option<PathBuf>,
     /// Write the report as JSON to this file too.
     #[arg(long, value_name = "FILE")]
-    pub(crate) report: Option<PathBuf>,
+    report: Option<PathBuf>,
     /// Kill a node when a stride begins, for example knee@8, and start it again.
     #[arg(long, value_name = "NODE@STRIDE")]
-    pub(crate) kill: Option<Kill>,
+    kill: Option<Kill>,
     /// Silence after which a device damps by itself, ms; without it a device holds its last torque.
     #[arg(long, value_name = "MS")]
-    pub(crate) device_watchdog: Option<u64>,
+    device_watchdog: Option<u64>,
     /// Thread of the control loops: `io`, which reads the sockets too, or `own`. Real time only.
     #[arg(long, value_name = "THREAD", default_value = "io", conflicts_with = "lock_step")]
-    pub(crate) control_thread: real_time::ThreadArgument,
+    control_thread: ThreadArgument,
     /// `SCHED_FIFO` priority of the control loops, 1 to 89; wants `--control-thread own`. Real time only.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=89), conflicts_with = "lock_step")]
-    pub(crate) realtime_priority: Option<u8>,
-    /// Secure the links between nodes with the keys in this directory, made by `sinew keys init exoskeleton central=127.0.0.1 hip=127.0.0.2 knee=127.0.0.3
-    /// ankle=127.0.0.4`. Real time only.
+    realtime_priority: Option<u8>,
+    /// Secure the links between nodes with the keys in this directory, made by `sinew keys init exoskeleton
+    /// central=127.0.0.1 hip=127.0.0.2 knee=127.0.0.3 ankle=127.0.0.4`. Real time only.
     #[arg(long, value_name = "DIR", conflicts_with = "lock_step")]
-    pub(crate) keys: Option<PathBuf>,
+    keys: Option<PathBuf>,
     /// Folder for the run folders.
     #[arg(long, value_name = "DIR", default_value = "runs")]
-    pub(crate) runs: PathBuf,
+    runs: PathBuf,
+}
+
+/// Where the control loops run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum ThreadArgument {
+    /// On the thread that reads the node's sockets.
+    Io,
+    /// On a thread of their own.
+    Own,
 }
 
 #[derive(Debug, Subcommand)]
 enum SubCommand {
     /// Runs one part of the robot until SIGINT, SIGTERM or SIGHUP, so that it can be spread over several hosts.
-    Node(node::NodeArguments),
-    Faults(faults::FaultArguments),
+    Node(NodeOptions),
 }
 
 const EXIT_CODES: &str = "\
@@ -77,28 +85,16 @@ Exit codes:
   4  it walked, but other load on this host disturbed too many strides to judge them (INCONCLUSIVE); use an idle host, more strides,
      or --lock-step, which needs no real time";
 
-/// How a run ended.
-#[derive(Debug, Clone, Copy)]
-pub(crate) enum Verdict {
-    /// A robot walked.
-    Walked(report::Verdict),
-    /// One part ran alone and has ended.
-    NodeEnded(ExitCode),
-}
-
-impl Verdict {
-    /// The exit code; [`EXIT_CODES`] describes them.
-    pub(crate) fn code(self) -> ExitCode {
-        match self {
-            Self::Walked(report::Verdict::Passed) => ExitCode::SUCCESS,
-            Self::Walked(report::Verdict::Failed) => ExitCode::from(3),
-            Self::Walked(report::Verdict::Inconclusive) => ExitCode::from(4),
-            Self::NodeEnded(code) => code,
-        }
+/// The exit code of a walk; [`EXIT_CODES`] describes them.
+fn code(verdict: Verdict) -> ExitCode {
+    match verdict {
+        Verdict::Passed => ExitCode::SUCCESS,
+        Verdict::Failed => ExitCode::from(3),
+        Verdict::Inconclusive => ExitCode::from(4),
     }
 }
 
-/// Why there was no run.
+/// The reason why there was no run.
 #[derive(Debug, Error)]
 pub(crate) enum RunError {
     /// Too few strides are left after the kill.
@@ -107,11 +103,11 @@ pub(crate) enum RunError {
          leaves nothing to judge; ask for --strides {least} or kill earlier"
     )]
     KillTooLate {
-        /// What was asked for.
+        /// The requested kill.
         kill: String,
-        /// Strides asked for.
+        /// Strides requested.
         strides: u32,
-        /// Strides that leave something to judge.
+        /// Number of strides that leaves some to judge.
         least: u32,
     },
     /// The trial is not usable.
@@ -137,18 +133,13 @@ pub(crate) enum RunError {
     /// A part of the robot did not run.
     #[error(transparent)]
     Node(#[from] NodeError),
-    /// The robot did not walk under faults.
-    #[error(transparent)]
-    Faults(#[from] FaultError),
-    /// A phase that no stride has.
-    #[error("--phases {0}: a phase is at least 0 and less than 1")]
-    Phase(f64),
-    /// A device watchdog of no use.
+    /// A device watchdog without effect.
     #[error("--device-watchdog {0}: give 1 to 10000 ms, or leave it out for none")]
     Watchdog(u64),
 }
 
-/// Strides 1 to 6 never count; of the others those before the kill, and those two strides after assistance is back.
+/// Strides 1 to 6 never count; of the others those before the kill count, and those two strides after
+/// assistance is back.
 fn check_kill(arguments: &Arguments) -> Result<(), RunError> {
     let Some(kill) = &arguments.kill else { return Ok(()) };
     let least = kill.stride + 8;
@@ -158,18 +149,101 @@ fn check_kill(arguments: &Arguments) -> Result<(), RunError> {
     Err(RunError::KillTooLate { kill: kill.to_string(), strides: arguments.strides, least })
 }
 
-/// Does what the arguments say.
-pub(crate) fn run(arguments: &Arguments) -> Result<Verdict, RunError> {
+/// Runs the command of the arguments.
+pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode, RunError> {
+    if let Some(SubCommand::Node(options)) = &arguments.command {
+        return Ok(node::run(options)?);
+    }
     check_kill(arguments)?;
-    match &arguments.command {
-        Some(SubCommand::Node(part)) => node::run(part),
-        Some(SubCommand::Faults(arguments)) => faults::run(arguments),
-        None if arguments.lock_step => lock_step::run(arguments),
-        None => real_time::run(arguments),
+    let verdict = if arguments.lock_step { lock_step(arguments) } else { real_time(arguments) };
+    verdict.map(code)
+}
+
+/// Walks in virtual time, prints the table, writes the folder.
+fn lock_step(arguments: &Arguments) -> Result<Verdict, RunError> {
+    let intention = match &arguments.trial {
+        Some(path) => Intention::from_trial(Arc::new(Trial::read(path).map_err(|reason| {
+            let path = path.display().to_string();
+            RunError::Trial { path, reason }
+        })?)),
+        None => Intention::from_curves(arguments.seed),
+    };
+    intention.notes().iter().for_each(|note| output::print(&format!("--trial: {note}\n")));
+    let mut config = LockStepConfig::standard(arguments.strides, arguments.seed, intention);
+    config.kill = arguments.kill;
+    config.plant.watchdog_ns = arguments.device_watchdog.map(|ms| ms * 1_000_000);
+    let record = lockstep::run(&config)?;
+    let report = Report::of(description(arguments), &record);
+    output::print(&report::table(&report));
+    let folder = arguments.runs.join(run_folder::name(&report.run));
+    run_folder::write(&folder, &report, &record, None, arguments.report.as_deref())?;
+    output::print(&format!("written: {}/ gait.svg, run.csv, report.json\n", folder.display()));
+    Ok(report.verdict)
+}
+
+/// Starts the five processes, walks, prints the table, writes the folder.
+fn real_time(arguments: &Arguments) -> Result<Verdict, RunError> {
+    let walk = launch::run(&options(arguments)?)?;
+    output::print(&report::table(&walk.report));
+    output::print(&format!("{}\n", links(arguments.keys.as_deref())));
+    let (report, record) = (&walk.report, &walk.record);
+    run_folder::write(&walk.folder, report, record, Some(&walk.lateness), arguments.report.as_deref())
+        .map_err(|error| RunError::Record(error.to_string()))?;
+    output::print(&format!(
+        "written: {}/ gait.svg, run.csv, report.json, and each process's trace and log\n",
+        walk.folder.display()
+    ));
+    Ok(walk.report.verdict)
+}
+
+fn options(arguments: &Arguments) -> Result<LaunchOptions, RunError> {
+    let device_watchdog = match arguments.device_watchdog {
+        Some(ms) if !(1..=10_000).contains(&ms) => return Err(RunError::Watchdog(ms)),
+        limit => limit.map(Duration::from_millis),
+    };
+    let thread = match arguments.control_thread {
+        // The network must not run at a real-time priority.
+        ThreadArgument::Io if arguments.realtime_priority.is_none() => ControlThread::Io,
+        ThreadArgument::Io | ThreadArgument::Own => ControlThread::Own,
+    };
+    Ok(LaunchOptions {
+        run: description(arguments),
+        trial: arguments.trial.clone(),
+        kill: arguments.kill,
+        device_watchdog,
+        control: Control {
+            thread,
+            realtime_priority: arguments.realtime_priority,
+            release: ReleaseBy::Itself,
+        },
+        keys: arguments.keys.clone(),
+        runs: arguments.runs.clone(),
+    })
+}
+
+fn description(arguments: &Arguments) -> RunDescription {
+    let file_name = |path: &PathBuf| {
+        path.file_name()
+            .map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned())
+    };
+    RunDescription {
+        mode: if arguments.lock_step { RunMode::LockStep } else { RunMode::RealTime },
+        strides: arguments.strides,
+        seed: arguments.seed,
+        trial: arguments.trial.as_ref().map(file_name),
+        kill: arguments.kill.map(|kill| kill.to_string()),
     }
 }
 
-/// An error of the system, with the file it happened at.
-fn at(path: &std::path::Path, error: &std::io::Error) -> std::io::Error {
-    std::io::Error::new(error.kind(), format!("cannot write {}: {error}", path.display()))
+/// Describes the security of the links between nodes.
+fn links(keys: Option<&Path>) -> String {
+    keys.map_or_else(
+        || "links between nodes: open to every program of this host; `--keys DIR` closes them".to_owned(),
+        |keys| {
+            format!(
+                "links between nodes: TLS 1.3, each node proven by its key in {}; those to the plant's devices are open",
+                keys.join("nodes").display()
+            )
+        },
+    )
 }

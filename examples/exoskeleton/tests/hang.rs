@@ -1,58 +1,58 @@
-//! A drive whose thread hangs while it assists: its device is told to damp all the same, and nothing but central's gait makes it give
-//! a torque again; nor does what only looks like its word.
+//! A drive with a thread that hangs while it assists: its device is still ordered to damp. Only central's
+//! gait makes it apply a torque again; forged requests do not.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
-use exoskeleton::joint::Joint;
-use exoskeleton::message::{DriveState, GaitMode, GaitState, JointSample, Stance};
-use exoskeleton::robot::datagram::Reading;
 use exoskeleton::robot::device::{Damper, DriveCommand, JointDevice};
 use exoskeleton::robot::drive::{self, DriveParts};
 use exoskeleton::robot::edges::{Arm, GAIT, Shut, drive_name, sensor_name};
 use exoskeleton::robot::trace::{DriveRow, EventRow, Recording};
+use exoskeleton_model::datagram::Reading;
+use exoskeleton_model::joint::Joint;
+use exoskeleton_model::message::{DriveState, GaitMode, GaitState, JointSample, Stance};
 use sinew::prelude::*;
 use sinew::protection::{DataId, Stamp, seal};
 
-/// How long one thing may take on a machine that is busy with other tests.
+/// Time limit of one step on a machine that is busy with other tests.
 const DEADLINE: Duration = Duration::from_secs(60);
 const PERIOD: Duration = Duration::from_millis(1);
 const JOINT: Joint = Joint::Ankle;
-/// Torque that only assistance gives at this phase, Nm.
+/// Torque that only assistance applies at this phase, Nm.
 const ASSISTING_NM: f64 = 10.0;
 
-/// What a device was told.
+/// An order to a device.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Told {
+enum DeviceOrder {
     Torque(f64),
     Damp,
 }
 
-impl Told {
+impl DeviceOrder {
     fn is_assistance(self) -> bool {
         matches!(self, Self::Torque(torque_nm) if torque_nm.abs() > ASSISTING_NM)
     }
 }
 
-/// A device that writes down what it is told.
+/// A device that records its orders.
 #[derive(Clone, Default)]
-struct Device(Arc<Mutex<Vec<Told>>>);
+struct Device(Arc<Mutex<Vec<DeviceOrder>>>);
 
 impl Device {
-    fn told(&self) -> std::sync::MutexGuard<'_, Vec<Told>> {
+    fn orders(&self) -> std::sync::MutexGuard<'_, Vec<DeviceOrder>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits until this is so of all that it was told.
+    /// Waits until this holds for its orders so far.
     #[track_caller]
-    fn wait(&self, what: &str, is_so: impl Fn(&[Told]) -> bool) {
+    fn wait(&self, what: &str, is_so: impl Fn(&[DeviceOrder]) -> bool) {
         let deadline = Instant::now() + DEADLINE;
-        while !is_so(&self.told()) {
-            let told = self.told();
-            assert!(Instant::now() < deadline, "{what}: {:?}", &told[told.len().saturating_sub(20)..]);
-            drop(told);
+        while !is_so(&self.orders()) {
+            let orders = self.orders();
+            assert!(Instant::now() < deadline, "{what}: {:?}", &orders[orders.len().saturating_sub(20)..]);
+            drop(orders);
             std::thread::sleep(PERIOD);
         }
     }
@@ -64,7 +64,7 @@ impl JointDevice for Device {
     }
 
     fn command(&mut self, _: Time, command: &DriveCommand) {
-        self.told().push(Told::Torque(command.torque_nm));
+        self.orders().push(DeviceOrder::Torque(command.torque_nm));
     }
 
     fn damper(&self) -> Box<dyn Damper> {
@@ -74,17 +74,18 @@ impl JointDevice for Device {
 
 impl Damper for Device {
     fn damp(&self, _: Time, _: DriveState) {
-        self.told().push(Told::Damp);
+        self.orders().push(DeviceOrder::Damp);
     }
 }
 
-/// Whether central says walk, and whether it asks shut drives to hear it again, or somebody in its place who can do all but that.
+/// The behaviour of the test's gait: whether it commands to walk, and whether it arms shut drives or forges
+/// such requests.
 #[derive(Default)]
 struct Will {
     walks: AtomicBool,
     arms: AtomicBool,
     forges: AtomicBool,
-    /// How often the drive has said that central's word does not count.
+    /// Number of times that the drive reported that central's commands do not count.
     shuts: AtomicU64,
 }
 
@@ -132,7 +133,7 @@ impl Handler<Delivery<Shut>> for Gait {
     }
 }
 
-/// As an [`Arm`], by somebody who does not seal it.
+/// Like an [`Arm`], from a sender that does not seal it.
 #[derive(serde::Serialize, serde::Deserialize)]
 struct Unsealed {
     suspect: bool,
@@ -143,8 +144,8 @@ impl Payload for Unsealed {
     const CLASS: Class = Arm::CLASS;
 }
 
-/// Sends `drive` what looks like an [`Arm`] from central's own address: one without an envelope, and one in an envelope that is right but for
-/// the time that it quotes, as one that was kept from another day.
+/// Sends `drive` forged requests from central's own address: one without an envelope, and one in a valid
+/// envelope except for the quoted time, as a recorded one would have.
 fn forge(drive: Tid, context: &AppContext<Gait>) {
     let _ = context.send(drive, &Unsealed { suspect: true });
     let data_id = DataId::of::<Arm>(context.tid(), drive);
@@ -184,7 +185,7 @@ impl Actor for Sensor {
     }
 }
 
-/// Beside the drive on its thread: hangs when it is told to, until it is let go.
+/// An application beside the drive on its thread: hangs on request, until it is released.
 struct Neighbour {
     hangs: Arc<AtomicBool>,
     hung: SyncSender<()>,
@@ -207,7 +208,7 @@ impl Actor for Neighbour {
 
 type Recordings = (Recording<DriveRow>, Recording<EventRow>);
 
-/// A node at 127.0.0.`host` with all that the drive needs, and what has to outlive it.
+/// A node at 127.0.0.`host` with all that the drive needs, and the recordings that have to outlive it.
 fn joint_node(host: u8, device: &Device, will: &Arc<Will>) -> (NodeBuilder, Recordings) {
     let (rows, events) =
         (Recording::begin(None, "").expect("no file"), Recording::begin(None, "").expect("no file"));
@@ -231,8 +232,8 @@ fn joint_node(host: u8, device: &Device, will: &Arc<Will>) -> (NodeBuilder, Reco
 }
 
 #[test]
-fn drive_whose_thread_hangs_has_a_device_that_damps_and_assists_again_only_when_it_is_asked_to() {
-    // Given: a drive that assists
+fn device_of_hung_drive_damps_until_central_arms_it() {
+    // given: a drive that assists
     let device = Device::default();
     let will = Arc::new(Will { arms: true.into(), ..Will::default() });
     let hangs = Arc::new(AtomicBool::new(false));
@@ -243,54 +244,57 @@ fn drive_whose_thread_hangs_has_a_device_that_damps_and_assists_again_only_when_
     let neighbour = move || Neighbour { hangs: to_hang.clone(), hung: hung.clone(), go_on: go_on.clone() };
     let node =
         node.app(AppSpec::new("neighbour", neighbour).place(Place::thread("control"))).start().unwrap();
-    device.wait("the leg is held", |told| told.last() == Some(&Told::Torque(0.0)));
+    device.wait("the leg is held", |orders| orders.last() == Some(&DeviceOrder::Torque(0.0)));
     will.walks.store(true, Ordering::Relaxed);
-    device.wait("it assists", |told| told.last().is_some_and(|told| told.is_assistance()));
+    device.wait("it assists", |orders| orders.last().is_some_and(|order| order.is_assistance()));
 
-    // When: its thread hangs
+    // when: its thread hangs
     will.arms.store(false, Ordering::Relaxed);
     hangs.store(true, Ordering::Relaxed);
     is_hung.recv_timeout(DEADLINE).expect("the neighbour hangs");
 
-    // Then: somebody else tells the device, while it hangs, and not only once, as one may be lost
-    device.wait("the device is told to damp again and again", |told| told.ends_with(&[Told::Damp; 20]));
+    // then: another thread orders the device meanwhile, repeatedly, as one order may be lost
+    device.wait("the device is ordered to damp repeatedly", |orders| {
+        orders.ends_with(&[DeviceOrder::Damp; 20])
+    });
 
-    // When: it goes on, and all inputs are there again
-    let before = device.told().len();
+    // when: it continues, and all inputs have returned
+    let before = device.orders().len();
     let_go.send(()).expect("the neighbour waits");
     let shuts = will.shuts.load(Ordering::Relaxed);
     device.wait("the drive goes on", |_| will.shuts.load(Ordering::Relaxed) > shuts + 20);
 
-    // Then: it gives no torque, until central's gait asks for it
-    assert_eq!(device.told()[before..].iter().find(|told| told.is_assistance()), None);
+    // then: it applies no torque until central's gait requests it
+    assert_eq!(device.orders()[before..].iter().find(|order| order.is_assistance()), None);
     will.arms.store(true, Ordering::Relaxed);
-    device.wait("it assists again", |told| told.last().is_some_and(|told| told.is_assistance()));
+    device.wait("it assists again", |orders| orders.last().is_some_and(|order| order.is_assistance()));
     drop(node);
 }
 
 #[test]
-fn what_only_looks_like_central_asking_makes_no_drive_assist() {
-    // Given: a drive whose guard was never opened, and whatever has the address of central's gait and asks it to without being that
+fn forged_arm_requests_make_no_drive_assist() {
+    // given: a drive with a guard that was never opened, and a forger of requests with the address of
+    // central's gait
     let device = Device::default();
     let will = Arc::new(Will { forges: true.into(), ..Will::default() });
     let (node, _recordings) = joint_node(2, &device, &will);
     let node = node.start().unwrap();
-    let refuses = |told: &[Told], shuts: u64| {
-        told.iter().any(|told| told.is_assistance()) || will.shuts.load(Ordering::Relaxed) > shuts
+    let refuses = |orders: &[DeviceOrder], shuts: u64| {
+        orders.iter().any(|order| order.is_assistance()) || will.shuts.load(Ordering::Relaxed) > shuts
     };
-    device.wait("it was asked in a state in which it may be", |told| refuses(told, 100));
+    device.wait("it was asked in a state in which it may be", |orders| refuses(orders, 100));
 
-    // When: the gait says walk, sealed as it has to be
+    // when: the gait commands to walk, properly sealed
     will.walks.store(true, Ordering::Relaxed);
     let shuts = will.shuts.load(Ordering::Relaxed);
-    device.wait("it is asked again, or assists", |told| refuses(told, shuts + 100));
+    device.wait("it is asked again, or assists", |orders| refuses(orders, shuts + 100));
 
-    // Then: it does not
-    assert_eq!(device.told().iter().find(|told| told.is_assistance()), None);
+    // then: the drive does not assist
+    assert_eq!(device.orders().iter().find(|order| order.is_assistance()), None);
 
-    // And: it does when central's gait itself asks
+    // and: it does when central's gait itself requests it
     will.forges.store(false, Ordering::Relaxed);
     will.arms.store(true, Ordering::Relaxed);
-    device.wait("it assists", |told| told.last().is_some_and(|told| told.is_assistance()));
+    device.wait("it assists", |orders| orders.last().is_some_and(|order| order.is_assistance()));
     drop(node);
 }

@@ -1,17 +1,16 @@
-//! The whole robot in virtual time: limits, faults, and the same bits for the same seed.
+//! The whole robot in virtual time: limits, faults, and identical bits for the same seed.
 
 use std::sync::Arc;
 
-use exoskeleton::central::bit;
-use exoskeleton::gait::trial::Trial;
-use exoskeleton::intention::{Intention, IntentionError};
-use exoskeleton::joint::Joint;
-use exoskeleton::lockstep::{DriveDeath, LockStepConfig, LockStepError, run};
-use exoskeleton::message::DriveState;
-use exoskeleton::metrics::Metrics;
-use exoskeleton::part::{Kill, Part};
-use exoskeleton::record::Record;
 use exoskeleton::report::{Report, RunDescription, RunMode};
+use exoskeleton_model::central::bit;
+use exoskeleton_model::gait::trial::Trial;
+use exoskeleton_model::intention::{Intention, IntentionError};
+use exoskeleton_model::joint::Joint;
+use exoskeleton_model::lockstep::{DriveDeath, LockStepConfig, LockStepError, run};
+use exoskeleton_model::message::DriveState;
+use exoskeleton_model::part::{Kill, Part};
+use exoskeleton_model::record::Record;
 
 fn curves(strides: u32, seed: u64) -> LockStepConfig {
     LockStepConfig::standard(strides, seed, Intention::from_curves(seed))
@@ -30,7 +29,7 @@ fn report(config: &LockStepConfig, record: &Record) -> Report {
         trial: None,
         kill: config.kill.map(|kill| kill.to_string()),
     };
-    Report::of(&description, &Metrics::of(record), None)
+    Report::of(description, record)
 }
 
 fn broken(report: &Report) -> Vec<String> {
@@ -54,7 +53,7 @@ fn recorded_trial_is_walked_within_all_limits() {
 }
 
 #[test]
-fn same_seed_gives_the_same_bits_and_another_seed_does_not() {
+fn only_the_same_seed_gives_the_same_bits() {
     let bits = |record: &Record| -> Vec<u64> {
         record
             .rows
@@ -79,7 +78,7 @@ fn same_seed_gives_the_same_bits_and_another_seed_does_not() {
 }
 
 #[test]
-fn nobody_is_ready_and_torque_is_zero_until_the_late_node_is_there() {
+fn torque_is_zero_until_the_late_node_arrives() {
     let config = curves(8, 1);
     let record = run(&config).unwrap();
     let late_s = config.start_ms[Joint::Hip.index()] as f64 * 1e-3;
@@ -94,20 +93,20 @@ fn nobody_is_ready_and_torque_is_zero_until_the_late_node_is_there() {
 }
 
 #[test]
-fn loss_of_any_node_makes_all_other_drives_safe_and_the_walk_resumes() {
+fn walk_resumes_after_the_loss_of_any_node() {
     for part in Part::ALL {
         let config = LockStepConfig { kill: Some(Kill { part, stride: 8 }), ..curves(20, 1) };
         let record = run(&config).unwrap();
         let report = report(&config, &record);
         assert!(report.passed, "{part}: {:?}", broken(&report));
-        let fault = report.fault.unwrap();
+        let fault = report.figures.fault.unwrap();
         // Ten milliseconds of age, one of transport, one of the tick.
         assert!(fault.all_safe_after_ms.unwrap() <= 12.0, "{part}: {fault:?}");
     }
 }
 
 #[test]
-fn device_of_a_dead_drive_holds_its_torque_until_its_own_watchdog_acts() {
+fn dead_drives_device_holds_torque_until_its_watchdog_acts() {
     let kill = Some(Kill { part: Part::Joint(Joint::Ankle), stride: 8 });
     let ankle = Joint::Ankle.index();
     let held = |watchdog_ns| {
@@ -128,7 +127,7 @@ fn device_of_a_dead_drive_holds_its_torque_until_its_own_watchdog_acts() {
 }
 
 #[test]
-fn drive_that_comes_back_does_not_step_its_torque() {
+fn returning_drive_does_not_step_its_torque() {
     let kill = Some(Kill { part: Part::Joint(Joint::Ankle), stride: 8 });
     let record = run(&LockStepConfig { kill, ..curves(12, 1) }).unwrap();
     for pair in record.rows.windows(2) {
@@ -150,14 +149,14 @@ fn drives_never_walk_without_central() {
 }
 
 #[test]
-fn trial_that_is_too_short_for_the_run_is_refused_with_a_remedy() {
+fn too_short_trial_is_rejected_with_a_remedy() {
     let error = run(&LockStepConfig::standard(500, 1, trial())).unwrap_err();
     assert!(matches!(error, LockStepError::Intention(IntentionError::TrialTooShort { wanted: 500, .. })));
     assert!(error.to_string().contains("--strides"));
 }
 
 #[test]
-fn report_has_the_promised_fields_and_no_real_time_figures() {
+fn report_of_virtual_time_has_no_real_time_figures() {
     let config = curves(8, 1);
     let json = serde_json::to_value(report(&config, &run(&config).unwrap())).unwrap();
     for pointer in [
@@ -190,9 +189,9 @@ fn drive_dies(joint: Joint, phase: f64, watchdog_ms: Option<u64>) -> Record {
     run(&config).expect("a run that ends")
 }
 
-/// Greatest deviation of a joint from what the person means to do, in the stride after the death, degrees.
+/// Maximum deviation of a joint from the person's intention, in the stride after the death, degrees.
 fn deviation_deg(record: &Record, joint: Joint, phase: f64) -> f64 {
-    let deviation = |row: &exoskeleton::record::Row| {
+    let deviation = |row: &exoskeleton_model::record::Row| {
         let joint = &row.joints[joint.index()];
         (joint.angle_rad - joint.intended_rad).abs().to_degrees()
     };
@@ -201,13 +200,14 @@ fn deviation_deg(record: &Record, joint: Joint, phase: f64) -> f64 {
 }
 
 #[test]
-fn death_of_the_knee_drive_leaves_hip_and_ankle_walking_and_flags_the_knee() {
+fn dead_knee_drive_is_flagged_while_others_walk() {
     for phase in [0.12, 0.40, 0.62, 0.75] {
         let record = drive_dies(Joint::Knee, phase, Some(8));
-        let after = |row: &&exoskeleton::record::Row| row.strides_true > 8.0 + phase;
+        let after = |row: &&exoskeleton_model::record::Row| row.strides_true > 8.0 + phase;
         for joint in [Joint::Hip, Joint::Ankle] {
-            let walks =
-                |row: &exoskeleton::record::Row| row.joints[joint.index()].state == Some(DriveState::Walk);
+            let walks = |row: &exoskeleton_model::record::Row| {
+                row.joints[joint.index()].state == Some(DriveState::Walk)
+            };
             assert!(record.rows.iter().filter(after).all(walks), "{joint} at {phase}");
         }
         let flagged: Vec<u8> = record.rows.iter().filter(after).map(|row| row.degraded).collect();
@@ -219,7 +219,7 @@ fn death_of_the_knee_drive_leaves_hip_and_ankle_walking_and_flags_the_knee() {
 }
 
 #[test]
-fn stuck_torque_of_a_dead_ankle_drive_is_what_its_devices_watchdog_is_for() {
+fn device_watchdog_prevents_a_stuck_ankle_torque() {
     let phase = 0.60;
     let protected = deviation_deg(&drive_dies(Joint::Ankle, phase, Some(8)), Joint::Ankle, phase);
     let unprotected = deviation_deg(&drive_dies(Joint::Ankle, phase, None), Joint::Ankle, phase);

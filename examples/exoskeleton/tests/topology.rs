@@ -1,12 +1,12 @@
-//! Topology files: what is read, what is refused, in which words.
+//! Topology files: valid ones, rejected ones, and the error texts.
 
 use std::collections::BTreeSet;
 use std::ffi::OsStr;
 use std::path::Path;
 
-use exoskeleton::joint::Joint;
-use exoskeleton::part::Part;
 use exoskeleton::robot::topology::{ControlThread, Topology, for_this_host};
+use exoskeleton_model::joint::Joint;
+use exoskeleton_model::part::Part;
 use proptest::prelude::*;
 
 const EXAMPLE: &str = include_str!("../topology.toml");
@@ -22,10 +22,10 @@ fn faults(text: &str) -> Vec<String> {
 }
 
 #[test]
-fn example_file_is_a_topology_and_says_what_its_comments_say() {
+fn example_file_matches_its_comments() {
     let topology = Topology::parse(EXAMPLE).unwrap();
     assert_eq!(topology.control.thread, ControlThread::Io);
-    assert_eq!(topology.joint_at([10, 0, 0, 3].into()), Some(Joint::Knee));
+    assert_eq!(topology.joints[Joint::Knee.index()].address, [10, 0, 0, 3].into());
     let config = topology.node_config(Part::Central);
     assert_eq!((config.project.as_str(), config.ndl.period.as_millis()), ("my-leg", 500));
     assert_eq!(config.lncl.socket.as_deref(), Some(Path::new("/tmp/sinew-central.sock")));
@@ -35,20 +35,20 @@ fn example_file_is_a_topology_and_says_what_its_comments_say() {
 }
 
 #[test]
-fn topology_of_a_run_on_this_host_reads_back_from_its_file() {
+fn topology_file_of_a_local_run_reads_back() {
     let topology = for_this_host(7).unwrap();
     assert_eq!(Topology::parse(&topology.to_toml()), Ok(topology));
 }
 
 #[test]
-fn every_node_of_a_run_on_this_host_has_a_socket_of_its_own_that_sinew_finds_by_its_name() {
+fn sinew_finds_the_socket_of_every_local_node() {
     let topology = for_this_host(7).unwrap();
     let id = std::process::id().to_string();
     let mut seen = BTreeSet::new();
     for part in Part::ALL {
         let socket = topology.node_config(part).lncl.socket.expect("a door");
         let name = socket.file_name().and_then(OsStr::to_str).expect("a name");
-        // What `sinew` looks for in /tmp; runs beside each other differ by their process.
+        // The names that `sinew` searches in /tmp; parallel runs differ by their process.
         assert!(name.starts_with("sinew-") && name.ends_with(".sock"), "{name}");
         assert!(name.contains(&id) && name.contains(part.name()), "{name}");
         assert_eq!(socket.parent(), Some(std::env::temp_dir().as_path()));
@@ -57,21 +57,21 @@ fn every_node_of_a_run_on_this_host_has_a_socket_of_its_own_that_sinew_finds_by_
 }
 
 #[test]
-fn all_faults_are_told_together() {
+fn all_faults_are_reported_together() {
     let text = EXAMPLE
         .replacen("\"my-leg\"", "\"\"", 1)
         .replacen("address = \"10.0.0.2\"", "address = \"10.0.0.300\"", 1)
         .replacen("address = \"10.0.0.3\"", "address = \"10.0.0.1\"", 1)
         .replacen("period_ms = 500", "period_ms = 5", 1)
         .replacen("10.0.0.9:6920", "10.0.0.9", 1);
-    let told = faults(&text).join("\n");
+    let text = faults(&text).join("\n");
     for expected in ["project", "hip.address", "knee.address", "discovery.period_ms", "plant.address"] {
-        assert!(told.contains(expected), "{expected} is missing in:\n{told}");
+        assert!(text.contains(expected), "{expected} is missing in:\n{text}");
     }
 }
 
 #[test]
-fn nodes_that_could_never_meet_are_refused() {
+fn nodes_that_could_never_connect_are_rejected() {
     let off = with("multicast = \"239.255.83.119:6910\"", "multicast = \"off\"").replacen(
         "mdns = true",
         "mdns = false",
@@ -83,7 +83,7 @@ fn nodes_that_could_never_meet_are_refused() {
 }
 
 #[test]
-fn a_node_may_be_where_ipv6_is_and_what_is_written_is_read_again() {
+fn ipv6_node_reads_back_as_written() {
     let text = EXAMPLE
         .replacen("interface = \"10.0.0.1\"", "interface = \"eth0/ipv6\"", 1)
         .replacen("address = \"10.0.0.2\"", "address = \"10.0.0.2\"\ninterface = \"fe80::2%eth0\"", 1)
@@ -99,7 +99,7 @@ fn a_node_may_be_where_ipv6_is_and_what_is_written_is_read_again() {
 }
 
 #[test]
-fn priority_of_the_network_thread_is_refused() {
+fn priority_of_the_network_thread_is_rejected() {
     let text = with("# realtime_priority = 50 ", "realtime_priority = 50 #");
     assert!(faults(&text)[0].contains("control.thread = \"own\""));
     let own = text.replacen("thread = \"io\" ", "thread = \"own\"", 1);
@@ -112,13 +112,13 @@ fn key_that_does_not_exist_is_named() {
 }
 
 #[test]
-fn seed_without_a_port_and_socket_with_a_path_too_long_are_refused() {
+fn seed_without_port_and_overlong_socket_path_are_rejected() {
     assert!(faults(&with("10.0.0.1:6911", "10.0.0.1:0"))[0].contains("port 0"));
     for (length, is_legal) in [(0, false), (1, true), (100, true), (101, false)] {
         let text = with("/tmp/sinew-hip.sock", &"x".repeat(length));
-        let told = Topology::parse(&text).map_or_else(|faults| faults.0, |_| Vec::new()).join("\n");
-        assert_eq!(told.is_empty(), is_legal, "{length}: {told}");
-        assert!(is_legal || told.contains(&format!("hip.socket has {length} bytes")), "{told}");
+        let text = Topology::parse(&text).map_or_else(|faults| faults.0, |_| Vec::new()).join("\n");
+        assert_eq!(text.is_empty(), is_legal, "{length}: {text}");
+        assert!(is_legal || text.contains(&format!("hip.socket has {length} bytes")), "{text}");
     }
 }
 
@@ -126,7 +126,7 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn any_damage_to_the_example_gives_a_topology_or_faults(at in 0usize..3000, junk in "\\PC{0,12}") {
+    fn damaged_example_gives_a_topology_or_faults(at in 0usize..3000, junk in "\\PC{0,12}") {
         let at = EXAMPLE.char_indices().map(|(at, _)| at).nth(at).unwrap_or(0);
         let _ = Topology::parse(&format!("{}{junk}{}", &EXAMPLE[..at], &EXAMPLE[at..]));
     }

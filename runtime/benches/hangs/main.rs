@@ -1,15 +1,11 @@
-//! How soon a hang is noticed and a successor ready, and how soon after a panic.
+//! Time from a hang to its detection and to a ready successor, and the same after a panic.
 //!
-//! `cargo bench -p sinew-runtime --bench hangs [-- WORD...]`: 200 hangs of each sort, each in a new life, and 1,000 panics.
-//! A hang's time is that past its budget. The supervisor and its victim run under SCHED_FIFO where that is granted, as on a
-//! robot. One JSON line for each figure on the standard output, a table on the other.
-//! Nothing here asserts a time.
+//! `cargo bench -p sinew-runtime --bench hangs [-- WORD...]`: 200 hangs of each sort, each in a new
+//! incarnation, and 1,000 panics. A hang's time is that past its budget. The supervisor and its victim run
+//! under SCHED_FIFO where that is granted, as on a robot. One JSON line for each figure on the standard
+//! output, a table on the standard error. Nothing here asserts a time.
 
 #![expect(clippy::unwrap_used, reason = "a bench says what failed by failing")]
-
-#[path = "../../tests/stage/mod.rs"]
-#[expect(dead_code, reason = "the tests need more of it")]
-mod stage;
 
 use std::{
     sync::{
@@ -26,22 +22,22 @@ use sinew_runtime::{
     supervision::{ChildId, Place, Reason, SupervisorFact},
     time::Time,
 };
-use stage::{Number, Patience, Stage};
+use sinew_runtime_tests::{Number, Patience, Stage};
 
 const HANGS: u64 = 200;
 const PANICS: u64 = 1_000;
 const BUDGET: Duration = Duration::from_millis(50);
 
-/// What it does with its message.
+/// The fault at a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Fault {
     /// Blocks in the handler.
     Block,
     /// Computes in the handler.
     Spin,
-    /// Blocks in a future of its own, whose start nobody knows.
+    /// Blocks in a spawned future; its start is not recorded.
     BlockInFuture,
-    /// Waits for a future while messages wait for it.
+    /// Waits for a future while messages are queued.
     WaitForEver,
     Panic,
 }
@@ -50,7 +46,7 @@ struct Victim {
     fault: Fault,
     /// When the fault began.
     began: SyncSender<Time>,
-    /// Closed when it may come back.
+    /// Closed when the fault may return.
     gate: Arc<Mutex<Receiver<()>>>,
 }
 
@@ -59,7 +55,7 @@ impl Actor for Victim {
 }
 
 fn block(gate: &Mutex<Receiver<()>>) {
-    // Either it is let go, or the bench is over.
+    // Either the fault is released, or the bench is over.
     let _ = gate.lock().unwrap().recv();
 }
 
@@ -119,7 +115,7 @@ const CASES: [Case; 5] = [
 
 fn main() {
     let wanted = Asked::read(include_str!("main.rs"), &[]).wanted(&CASES, |case| case.name.to_owned());
-    // A thousand panics on the terminal say nothing.
+    // Suppresses a thousand panic messages on the terminal.
     std::panic::set_hook(Box::new(|_| {}));
     head();
     wanted.into_iter().for_each(run);

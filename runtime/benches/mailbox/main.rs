@@ -1,18 +1,16 @@
-//! A real-time actor's queue, beside actix's own: fed from its own CPU, under a backlog, and when it is to stop.
+//! The queue of a real-time actor, beside that of actix: fed from its own CPU, under a backlog, and at its
+//! stop.
 //!
-//! `cargo bench -p sinew-runtime --bench mailbox [-- WORD...]`. The reader runs under SCHED_FIFO 50 on one CPU. On the same CPU
-//! an ordinary thread sends, as fast as it can or 10,000 a second; from another CPU a third thread sends one message each
-//! 100 us, which is timed from its sending to its handling. In the cases with `medium` a SCHED_FIFO 30 thread takes that CPU
-//! for 5 ms of each 20: who holds a lock without priority inheritance is kept from letting it go. One JSON line for each figure
-//! on the standard output, a table on the other. Nothing here asserts a time.
+//! `cargo bench -p sinew-runtime --bench mailbox [-- WORD...]`. The reader runs under SCHED_FIFO 50 on one
+//! CPU. On the same CPU an ordinary thread sends, as fast as it can or 10,000 a second. From another CPU a
+//! third thread sends one message each 100 us, which is timed from its sending to its handling. In the cases
+//! with `medium` a SCHED_FIFO 30 thread takes that CPU for 5 ms of each 20: the holder of a lock without
+//! priority inheritance is kept from releasing it. One JSON line for each figure on the standard output, a
+//! table on the standard error. Nothing here asserts a time.
 
 #![expect(clippy::unwrap_used, reason = "a bench says what failed by failing")]
 
 mod reader;
-#[path = "../../tests/stage/mod.rs"]
-#[expect(dead_code, reason = "the tests need more of it")]
-mod stage;
-
 use std::{
     sync::{
         Arc,
@@ -28,12 +26,12 @@ use sinew_runtime::{supervision::Place, time::Time};
 
 /// Time of one case.
 const RUN: Duration = Duration::from_secs(5);
-/// Time between two messages that are timed.
+/// Time between two timed messages.
 const PROBE: Duration = Duration::from_micros(100);
-/// Messages that wait at the beginning of a backlog, and what each of them costs.
+/// Messages queued at the start of a backlog, and the cost of each.
 const BACKLOG: (u64, Duration) = (20_000, Duration::from_micros(50));
 
-/// What the reader's own CPU does beside.
+/// The other load on the reader's CPU.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Load {
     Flood,
@@ -105,7 +103,7 @@ fn ordinary(reader: &Reader, load: Load, stop: &Arc<AtomicBool>, sent: &Arc<Atom
         while !stop.load(Ordering::Relaxed) {
             sent.fetch_add(u64::from(send(0)), Ordering::Relaxed);
             if load == Load::TenThousand {
-                // What it missed while it had no CPU, it makes up for.
+                // Messages that it missed while it had no CPU are sent late.
                 due = due + PROBE;
                 std::thread::sleep(due.since(Time::now()));
             }
@@ -113,7 +111,7 @@ fn ordinary(reader: &Reader, load: Load, stop: &Arc<AtomicBool>, sent: &Arc<Atom
     })
 }
 
-/// Sends what is timed, from another CPU.
+/// Sends the timed messages, from another CPU.
 fn probe(reader: &Reader, stop: &Arc<AtomicBool>, refused: &Arc<AtomicU64>) -> JoinHandle<()> {
     let (send, stop, refused) = (reader.sender(), stop.clone(), refused.clone());
     std::thread::spawn(move || {
@@ -140,7 +138,8 @@ fn medium(stop: &Arc<AtomicBool>) -> JoinHandle<()> {
     })
 }
 
-/// 20,000 messages wait, each takes 50 us: how late are its periods of 1 ms, and how long does its stop take in the midst?
+/// 20,000 messages are queued, each takes 50 us. Measures how late the periods of 1 ms are, and how long a
+/// stop takes meanwhile.
 fn backlog(case: &str, queue: Queue) {
     let (mut stopping, mut lateness) = (Figures::new(), None);
     for round in 0..5 {
@@ -151,7 +150,7 @@ fn backlog(case: &str, queue: Queue) {
         assert_eq!(taken, BACKLOG.0, "all of it waits");
         reader.go_on();
         if round == 0 {
-            // Until all of it is handled, and whatever had to wait for that.
+            // Until all of it is handled, with a margin for delayed messages.
             std::thread::sleep(BACKLOG.1 * 20_000 * 2);
             let Seen { ticks, .. } = reader.finish();
             lateness = Some(ticks);

@@ -1,4 +1,4 @@
-//! The real-time actor that reads, behind Sinew's mailbox or actix's.
+//! The real-time actor that reads, with Sinew's mailbox or that of actix.
 
 use std::{
     sync::{
@@ -16,14 +16,14 @@ use sinew_runtime::{
     time::Time,
 };
 
-use super::stage::{Number, Patience, Stage};
+use sinew_runtime_tests::{Number, Patience, Stage};
 
 pub(super) const READER_CPU: usize = 0;
-/// Ends the measurement: it answers with what it saw.
+/// Ends the measurement: the reader answers with its figures.
 const END: u64 = u64::MAX;
-/// It waits until it is let go on.
+/// Holds the reader until it is released.
 const HOLD: u64 = u64::MAX - 1;
-/// It is to stop: actix has no other way from outside.
+/// Stops the reader: actix has no other way from outside.
 const STOP: u64 = u64::MAX - 2;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,9 +41,9 @@ impl Queue {
     }
 }
 
-/// What the reader saw.
+/// The reader's figures.
 pub(super) struct Seen {
-    /// Of the timed messages, from sending to handling.
+    /// Ages of the timed messages, from sending to handling.
     pub(super) ages: Figures,
     pub(super) over_10_ms: u64,
     /// How late its periods of 1 ms were.
@@ -56,7 +56,7 @@ impl Seen {
     }
 }
 
-/// What both readers do with a number.
+/// The handling of a number, common to both readers.
 struct Work {
     seen: Seen,
     cost: Duration,
@@ -65,11 +65,11 @@ struct Work {
 }
 
 impl Work {
-    /// Whether to stop.
+    /// Handles a number. Returns whether to stop.
     fn handle(&mut self, number: u64) -> bool {
         match number {
             END => {
-                // Nobody listens when the bench gave up waiting.
+                // The bench no longer listens when it gave up waiting.
                 let _ = self.answer.try_send(std::mem::replace(&mut self.seen, Seen::new()));
             }
             HOLD => {
@@ -168,7 +168,7 @@ pub(super) struct Reader {
 }
 
 impl Reader {
-    /// `cost`: what a message that is not timed takes.
+    /// Starts a reader. `cost`: handling time of a message that is not timed.
     pub(super) fn start(queue: Queue, cost: Duration) -> Self {
         let (say, answer) = sync_channel(1);
         let (open, gate) = sync_channel(1);
@@ -178,7 +178,7 @@ impl Reader {
         let behind = match queue {
             Queue::Sinew => {
                 let spec = AppSpec::new("reader", move || SinewReader(work())).handles::<Number>();
-                // On purpose it is held for a while, and its CPU is taken from it: nobody is to accuse it.
+                // The bench holds it for a while and takes its CPU away: it must not be reported as hung.
                 let spec = spec.place(place).progress_within(Duration::from_secs(60));
                 let stage = Stage::start_with(vec![spec.into()], Patience::Endless);
                 stage.wait_ready(0);
@@ -189,7 +189,7 @@ impl Reader {
         Self { behind, answer, open }
     }
 
-    /// Sends a number; whether it was taken.
+    /// Sends a number; returns whether it was accepted.
     pub(super) fn sender(&self) -> Box<dyn Fn(u64) -> bool + Send> {
         match &self.behind {
             Behind::Sinew(stage) => {
@@ -207,7 +207,7 @@ impl Reader {
         }
     }
 
-    /// It takes nothing more until it [goes on](Self::go_on).
+    /// Holds the reader: it handles no message until it [goes on](Self::go_on).
     pub(super) fn hold(&mut self) {
         assert!(self.sender()(HOLD), "the queue is empty");
     }
@@ -216,7 +216,7 @@ impl Reader {
         self.open.send(()).unwrap();
     }
 
-    /// Ends the measurement, behind all that was sent.
+    /// Ends the measurement, after all sent messages.
     pub(super) fn finish(self) -> Seen {
         let send = self.sender();
         while !send(END) {

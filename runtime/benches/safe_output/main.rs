@@ -1,21 +1,19 @@
-//! How soon after its watchdog's time an output is safe whose commands have stopped.
+//! Time from the deadline of an output's watchdog to its safe state, after its commands have stopped.
 //!
-//! `cargo bench -p sinew-runtime --bench safe_output [-- WORD...]`: a command each millisecond, `within` 3 ms, 1,000 trials of each
-//! case. A trial's time is that from the end of the watchdog's time, counted from the last good command's handler, to the
-//! call that makes the output safe: so it lacks what lies between the look at a command and its handler, some microseconds. Sender,
-//! receiver and watchdog run under SCHED_FIFO where that is granted, as on a robot; in the cases that end in `_busy` as many threads
-//! as there are CPUs, and one more, compute at ordinary priority. Two JSON lines for each case on the standard output, a table on
-//! the other. Nothing here asserts a time.
+//! `cargo bench -p sinew-runtime --bench safe_output [-- WORD...]`: a command each millisecond, `within` 3
+//! ms, 1,000 trials of each case. The time of a trial starts at the deadline of the watchdog, counted from
+//! the handler of the last valid command. It ends at the call that makes the output safe. So it lacks the
+//! time between the check of a command and its handler, some microseconds.
 //!
-//! In the same case a thread with the watchdog's priority that has no part in all this sleeps for `within` again and again: how late it wakes
-//! is what the machine does to any such thread, whatever it is to do (a host that takes the CPU away, a kernel that finishes what it does
-//! for an ordinary thread first, as one that was built without preemption does).
+//! Sender, receiver and watchdog run under SCHED_FIFO where that is granted, as on a robot. In the cases that
+//! end in `_busy` as many threads as there are CPUs, and one more, compute at ordinary priority. Two JSON
+//! lines for each case on the standard output, a table on the standard error. Nothing here asserts a time.
+//!
+//! In the same case an unrelated thread with the watchdog's priority sleeps for `within` again and again. Its
+//! lateness is that of the machine for any such thread. Causes are a host that takes the CPU away, or a
+//! kernel without preemption, which first finishes its work for an ordinary thread.
 
 #![expect(clippy::unwrap_used, reason = "a bench says what failed by failing")]
-
-#[path = "../../tests/stage/mod.rs"]
-#[expect(dead_code, reason = "the tests need more of it")]
-mod stage;
 
 use std::{
     sync::{
@@ -38,12 +36,12 @@ use sinew_runtime::{
     time::Time,
     wire::{Class, Payload},
 };
-use stage::{DEADLINE, Stage};
+use sinew_runtime_tests::{DEADLINE, Stage, tid};
 
 const TRIALS: u64 = 1_000;
 const PERIOD: Duration = Duration::from_millis(1);
 const PROTECTION: Protection = Protection::of_period(PERIOD);
-/// What the watchdog may be late by: targets of the design.
+/// Permitted lateness of the watchdog: a target of the design.
 const LATE: Duration = Duration::from_millis(1);
 
 #[derive(Serialize, Deserialize)]
@@ -57,12 +55,12 @@ impl Payload for Torque {
     const PROTECTION: Option<Protection> = Some(PROTECTION);
 }
 
-/// What stops the commands.
+/// The cause that stops the commands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 enum Fault {
     None,
-    /// The sender sends no more.
+    /// The sender stops sending.
     Silence,
     /// The receiver sleeps in its handler.
     Block,
@@ -70,11 +68,11 @@ enum Fault {
     Spin,
 }
 
-/// What the bench and both applications share.
+/// State that the bench and both applications share.
 #[derive(Default)]
 struct Shared {
     fault: AtomicU8,
-    /// When the last good command was handled, nanoseconds.
+    /// Time at which the last valid command was handled, in nanoseconds.
     good: AtomicU64,
 }
 
@@ -105,7 +103,7 @@ impl Actor for Central {
     }
 }
 
-/// What happened to the motor, and when.
+/// Events at the motor, with their times.
 enum Seen {
     Moved,
     Safe(Time, Cause),
@@ -125,7 +123,7 @@ impl Actor for Drive {
         let safe = |motor: &mut SyncSender<Seen>, cause| motor.send(Seen::Safe(Time::now(), cause)).unwrap();
         self.guard = Some(context.guard::<Torque, _>(self.central, self.motor.clone(), safe).unwrap());
         context.every(PERIOD * 10, |drive, _, _| {
-            // An operator who is quick: refused until enough good ones have come.
+            // A quick operator: rejected until enough valid ones have arrived.
             let _ = drive.guard.as_ref().unwrap().arm();
         });
     }
@@ -138,7 +136,7 @@ impl Handler<Delivery<Torque>> for Drive {
         self.shared.good.store(Time::now().as_nanos(), Ordering::Release);
         let live = self.guard.as_ref().unwrap().apply(|motor| {
             assert!(torque.nm > 0.0);
-            // A full queue: the bench knows that it moves.
+            // A full queue: the bench has enough events that it moves.
             let _ = motor.try_send(Seen::Moved);
         });
         if live.is_err() {
@@ -177,7 +175,7 @@ fn main() {
 fn run(case: &Case) {
     let shared = Arc::new(Shared::default());
     let (motor, seen) = sync_channel(1_000);
-    let [central, drive] = [0, 1].map(stage::tid);
+    let [central, drive] = [0, 1].map(tid);
     let (sends, hears) = (shared.clone(), shared.clone());
     let sender = AppSpec::new("central", move || Central { drive, shared: sends.clone() });
     let receiver = AppSpec::new("drive", move || {
@@ -208,7 +206,7 @@ fn run(case: &Case) {
         while !matches!(next(&seen), Seen::Moved) {}
         shared.set(case.fault);
         let at = loop {
-            // It may have been made safe before, by a machine that stood still: then this is told as well.
+            // A stalled machine may have made it safe before; this event is in the queue as well.
             if let Seen::Safe(at, Cause::Silent) = next(&seen) {
                 break at;
             }
@@ -235,7 +233,7 @@ fn run(case: &Case) {
     stage.stop();
 }
 
-/// How late a thread wakes that only sleeps, and how often it is late by more than [`LATE`].
+/// Measures how late a thread wakes that only sleeps, and how often it is late by more than [`LATE`].
 fn bear_witness(ends: &AtomicBool) -> (Figures, u64) {
     Place::layer("witness").realtime(90).prepare();
     let (mut late, mut over) = (Figures::new(), 0);
@@ -243,7 +241,7 @@ fn bear_witness(ends: &AtomicBool) -> (Figures, u64) {
         let due = Time::now() + PROTECTION.within;
         thread::park_timeout(PROTECTION.within);
         let now = Time::now();
-        // One that was woken for nothing has slept for less.
+        // After a spurious wake it has slept for less.
         if now >= due {
             late.record(now.since(due));
             over += u64::from(now.since(due) > LATE);

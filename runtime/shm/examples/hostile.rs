@@ -1,5 +1,6 @@
-//! A hostile peer for as long as you like: `cargo run --release -p sinew-shm --features hostile-peer --example hostile --
-//! [SECONDS] [SEED]`. Prints one line of what happened each ten seconds. That it still runs at the end is the result.
+//! A hostile peer that runs for any time: `cargo run --release -p sinew-shm --features hostile-peer --example
+//! hostile -- [SECONDS] [SEED]`. Prints a line of figures each ten seconds. The test passes if it still runs
+//! at the end.
 
 use std::time::{Duration, Instant};
 

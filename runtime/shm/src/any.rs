@@ -1,4 +1,4 @@
-//! Waiting for messages of several consumers at once: one thread, one system call, whoever rings first.
+//! Waiting for messages of several consumers at once: one thread, one system call, until the first ring.
 
 use std::{
     io, ptr,
@@ -7,9 +7,9 @@ use std::{
 };
 
 use crate::{
-    bell::{Heard, Woken},
+    bell::{BellState, Woken},
     consumer::Consumer,
-    core::sleep::{Ear, fence_before_looking_again},
+    core::sleep::{WakePlace, fence_before_recheck},
     error::AnyError,
     memory::fence,
     platform,
@@ -18,79 +18,80 @@ use crate::{
     wait::{HangUp, spin},
 };
 
-/// The most consumers that one call waits for: what the system takes.
+/// The most consumers that one call waits for: the limit of the system.
 pub const ENDS_MAX: usize = 128;
 
-/// How often a sleeper looks whether the peers are still there: a futex and a descriptor cannot be waited for at once.
-const HANG_UP_LOOK: Duration = Duration::from_millis(20);
+/// Interval at which a sleeper checks whether the peers are still present: one call cannot wait for a futex
+/// and a descriptor.
+const HANG_UP_CHECK: Duration = Duration::from_millis(20);
 
-/// Consumers that are waited for together, in an order that stays the same during the wait. Their bells are futexes
-/// ([`BellKind::Futex`](crate::BellKind::Futex)).
+/// Consumers that are waited for together, in an order that stays the same during the wait. Their bells are
+/// futexes ([`BellKind::Futex`](crate::BellKind::Futex)).
 pub trait Ends {
-    /// How many there are; at most [`ENDS_MAX`].
+    /// Number of consumers; at most [`ENDS_MAX`].
     fn count(&self) -> usize;
 
-    /// The one at `index`, which is below [`count`](Self::count).
+    /// Returns the consumer at `index`, which is below [`count`](Self::count).
     fn consumer(&self, index: usize) -> &Consumer;
 
-    /// The one at `index`, which is below [`count`](Self::count).
+    /// Returns the consumer at `index`, which is below [`count`](Self::count).
     fn consumer_mut(&mut self, index: usize) -> &mut Consumer;
 
-    /// How the end of the peer at `index` shows, if it does.
+    /// Returns the descriptor that shows the end of the peer at `index`, if there is one.
     fn hang_up(&self, index: usize) -> Option<HangUp<'_>>;
 }
 
-/// What a wait for several consumers ended with.
+/// The result of a wait for several consumers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Any {
-    /// The one at this index has a message.
+    /// The consumer at this index has a message.
     Message(usize),
-    /// The peer at this index is gone, and nothing of it is left in its ring.
+    /// The peer at this index is gone, and its ring is empty.
     HungUp(usize),
     /// The deadline passed.
     TimedOut,
 }
 
-/// The longest that a reactor looks at once: between two such looks others that it runs have their turn.
+/// The longest poll of a reactor: between two polls its other tasks run.
 const SLICE: Duration = Duration::from_micros(10);
 
-/// A look before a sleep that a reactor sleeps by itself: [`Waiter::begin`].
+/// The polling phase before a sleep in a reactor: [`Waiter::begin`].
 #[derive(Debug)]
-pub struct Looking {
+pub struct Polling {
     started: Instant,
     budget: Duration,
 }
 
-/// What a reactor's look has found.
+/// The result of a reactor's poll.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Looked {
-    /// There is something.
-    Something,
-    /// There is nothing, and it is to look again.
+pub enum PollResult {
+    /// A consumer has a message.
+    Ready,
+    /// No message; poll again.
     NotYet,
-    /// There is nothing, and it is to sleep.
-    Nothing,
+    /// No message; sleep.
+    Idle,
 }
 
-impl Looking {
-    /// Looks for 10 microseconds at most.
-    pub fn look(&self, ends: &mut impl Ends) -> Looked {
-        // Corrupt memory shows when it is read.
-        if look(ends).map_or(true, |found| found.is_some()) {
-            return Looked::Something;
+impl Polling {
+    /// Polls for 10 microseconds at most.
+    pub fn poll(&self, ends: &mut impl Ends) -> PollResult {
+        // Corrupt memory is reported when it is read.
+        if check(ends).map_or(true, |found| found.is_some()) {
+            return PollResult::Ready;
         }
         let left = self.budget.saturating_sub(self.started.elapsed());
         if left.is_zero() {
-            return Looked::Nothing;
+            return PollResult::Idle;
         }
         if spin(left.min(SLICE), || (0..ends.count()).any(|index| ends.consumer(index).has_moved())) {
-            return Looked::Something;
+            return PollResult::Ready;
         }
-        Looked::NotYet
+        PollResult::NotYet
     }
 }
 
-/// A thread that waits for several consumers: what it does before it sleeps, and what it has learned about that.
+/// A thread that waits for several consumers: its spinning before a sleep, and the statistics for it.
 #[derive(Debug)]
 pub struct Waiter {
     spinner: Spinner,
@@ -98,20 +99,21 @@ pub struct Waiter {
 }
 
 impl Waiter {
-    /// One that spins as `spin` says before it sleeps.
+    /// Creates a waiter that spins as `spin` specifies before it sleeps.
     #[must_use]
     pub const fn new(spin: Spin) -> Self {
         Self { spinner: Spinner::new(spin), trust: Trust::new() }
     }
 
-    /// Waits until one of `ends` has a message, which is left there, or its peer is gone; until `deadline` at most. A
-    /// deadline that is past means: look, and do not wait.
+    /// Waits until one of `ends` has a message, which stays there, or its peer is gone; until `deadline` at
+    /// most. A deadline in the past means: check, and do not wait.
     ///
-    /// Where all have one [`CommonBell`](crate::CommonBell) that costs one sleep at one word, else one at as many words.
+    /// If all have one [`CommonBell`](crate::CommonBell), that costs one sleep at one word, otherwise one at
+    /// as many words.
     ///
     /// # Errors
-    /// [`AnyError::Corrupt`] when a peer wrote what no peer of ours writes, [`AnyError::System`] when the system refused
-    /// to wait, or one has no futex, or there are more than [`ENDS_MAX`].
+    /// [`AnyError::Corrupt`] when a peer wrote values that no valid peer writes. [`AnyError::System`] when
+    /// the system refused to wait, or one has no futex, or there are more than [`ENDS_MAX`].
     pub fn wait(&mut self, ends: &mut impl Ends, deadline: Instant) -> Result<Any, AnyError> {
         let mut left = deadline.saturating_duration_since(Instant::now());
         loop {
@@ -121,24 +123,25 @@ impl Waiter {
                 return Ok(ended);
             }
             if left.is_zero() {
-                return look_for_the_gone(ends);
+                return check_hang_ups(ends);
             }
         }
     }
 
-    /// As [`wait`](Self::wait), for `left` at most. It may say [`Any::TimedOut`] before, for no reason; so that it need not read
-    /// the clock where something has come. For less than 20 ms it does not look whether a peer is gone, unless it is rung for nothing:
-    /// where there are many peers that costs more than the wait.
+    /// Same as [`wait`](Self::wait), for `left` at most. It may return [`Any::TimedOut`] early, without a
+    /// reason: so it need not read the clock if a message is already present. For less than 20 ms it does not
+    /// check whether a peer is gone, unless it is rung without a message: with many peers that costs more
+    /// than the wait.
     ///
     /// # Errors
     /// As [`wait`](Self::wait).
     pub fn wait_within(&mut self, ends: &mut impl Ends, left: Duration) -> Result<Any, AnyError> {
         let budget = self.spinner.begin();
         if budget.is_zero() && !self.spinner.learns() {
-            // It is looked before the sleep.
+            // The consumers are checked before the sleep.
             return self.sleep(ends, left);
         }
-        if let Some(index) = look(ends)? {
+        if let Some(index) = check(ends)? {
             return Ok(Any::Message(index));
         }
         let started = self.spinner.learns().then(Instant::now);
@@ -149,15 +152,16 @@ impl Waiter {
         Ok(ended)
     }
 
-    /// For a reactor, which sleeps by itself: the look before that. `None` if it is to sleep at once.
-    pub fn begin(&mut self) -> Option<Looking> {
+    /// Starts a wait of a reactor, which sleeps by itself: the polling phase before the sleep. `None` if it
+    /// must sleep at once.
+    pub fn begin(&mut self) -> Option<Polling> {
         let budget = self.spinner.begin();
-        let looks = !budget.is_zero() || self.spinner.learns();
-        looks.then(|| Looking { started: Instant::now(), budget })
+        let polls = !budget.is_zero() || self.spinner.learns();
+        polls.then(|| Polling { started: Instant::now(), budget })
     }
 
-    /// The wait that began with this look is over, whether it slept or not.
-    pub fn end(&mut self, looking: &Looking) {
+    /// Ends the wait that began with this polling phase, whether it slept or not.
+    pub fn end(&mut self, looking: &Polling) {
         if self.spinner.learns() {
             self.spinner.learn(looking.started.elapsed());
         }
@@ -170,7 +174,7 @@ impl Waiter {
         left: Duration,
     ) -> Result<Any, AnyError> {
         if spin(budget, || (0..ends.count()).any(|index| ends.consumer(index).has_moved()))
-            && let Some(index) = look(ends)?
+            && let Some(index) = check(ends)?
         {
             return Ok(Any::Message(index));
         }
@@ -179,63 +183,66 @@ impl Waiter {
 
     /// Sleeps once.
     fn sleep(&mut self, ends: &mut impl Ends, left: Duration) -> Result<Any, AnyError> {
-        let ear = self.trust.ear(Instant::now);
-        let woken = match sleep(ends, ear, left.min(HANG_UP_LOOK))? {
+        let wake_place = self.trust.wake_place(Instant::now);
+        let woken = match sleep(ends, wake_place, left.min(HANG_UP_CHECK))? {
             Slept::Ready(index) => return Ok(Any::Message(index)),
             Slept::Ended(woken) => woken,
-            Slept::Robbed => {
+            Slept::RingLost => {
                 self.trust.doubt(Instant::now());
                 Woken::TimedOut
             }
         };
-        // What was published before the end of the wait, or of the peer, is still a message.
-        if let Some(index) = look(ends)? {
+        // A message published before the end of the wait, or of the peer, is still received.
+        if let Some(index) = check(ends)? {
             return Ok(Any::Message(index));
         }
-        if woken == Woken::TimedOut && left < HANG_UP_LOOK {
+        if woken == Woken::TimedOut && left < HANG_UP_CHECK {
             return Ok(Any::TimedOut);
         }
-        // Rung for nothing, the peer may ring because it goes; or a nap is over.
-        look_for_the_gone(ends)
+        // The peer may ring without a message because it leaves; or a nap is over.
+        check_hang_ups(ends)
     }
 }
 
-/// How one sleep ended.
+/// The result of one sleep.
 enum Slept {
-    /// It did not begin: the one at this index has a message.
+    /// No sleep: the consumer at this index has a message.
     Ready(usize),
     Ended(Woken),
-    /// At its end, although a peer had rung: another one has undone that.
-    Robbed,
+    /// It timed out although a peer had rung: another peer has undone the ring.
+    RingLost,
 }
 
-/// Whether a peer has rung for the sleep that is over, and its bell is as it was before: who rings changes it first, and says that it
-/// has rung afterwards.
-fn has_been_robbed(ends: &impl Ends, heard: &Listened) -> bool {
+/// Whether a peer has rung for the sleep that is over while its bell is unchanged: a peer changes the bell
+/// first and reports the ring afterwards.
+fn has_lost_ring(ends: &impl Ends, seen: &BellStates) -> bool {
     let was_rung = (0..ends.count()).any(|index| ends.consumer(index).was_rung());
-    // SYNC: what a peer did before it said so is seen: `ProducerCore::say_rung`.
+    // SYNC: the peer's stores before its report are visible: `ProducerCore::report_ring`.
     fence(Ordering::Acquire);
-    was_rung && heard.is_unchanged(ends)
+    was_rung && seen.is_unchanged(ends)
 }
 
-fn sleep(ends: &mut impl Ends, ear: Ear, left: Duration) -> Result<Slept, AnyError> {
+fn sleep(ends: &mut impl Ends, wake_place: WakePlace, left: Duration) -> Result<Slept, AnyError> {
     let count = ends.count();
     if count > ENDS_MAX {
         return Err(AnyError::System(io::ErrorKind::InvalidInput.into()));
     }
     if left.is_zero() {
-        return Ok(look(ends)?.map_or(Slept::Ended(Woken::TimedOut), Slept::Ready));
+        return Ok(check(ends)?.map_or(Slept::Ended(Woken::TimedOut), Slept::Ready));
     }
-    let heard = listen(ends, ear).ok_or_else(|| AnyError::System(io::ErrorKind::InvalidInput.into()))?;
-    // Announced after the words were listened to: whoever rings from now on is heard.
+    let seen =
+        listen(ends, wake_place).ok_or_else(|| AnyError::System(io::ErrorKind::InvalidInput.into()))?;
+    // Announced after the words were read: every ring from now on ends the sleep.
     for index in 0..count {
-        ends.consumer_mut(index).announce(ear);
+        ends.consumer_mut(index).announce(wake_place);
     }
-    fence_before_looking_again();
-    let slept = look(ends).and_then(|found| match found {
+    fence_before_recheck();
+    let slept = check(ends).and_then(|found| match found {
         Some(index) => Ok(Slept::Ready(index)),
-        None => match heard.sleep(ends, ear, left).map_err(AnyError::System)? {
-            Woken::TimedOut if ear == Ear::Bell && has_been_robbed(ends, &heard) => Ok(Slept::Robbed),
+        None => match seen.sleep(ends, wake_place, left).map_err(AnyError::System)? {
+            Woken::TimedOut if wake_place == WakePlace::Bell && has_lost_ring(ends, &seen) => {
+                Ok(Slept::RingLost)
+            }
             woken @ (Woken::Rung | Woken::TimedOut | Woken::HungUp) => Ok(Slept::Ended(woken)),
         },
     });
@@ -245,68 +252,69 @@ fn sleep(ends: &mut impl Ends, ear: Ear, left: Duration) -> Result<Slept, AnyErr
     slept
 }
 
-/// What was heard of the words that are slept at.
+/// The values of the words to sleep at.
 #[expect(clippy::large_enum_variant, reason = "it lies on the stack for one sleep, and is not moved")]
-enum Listened {
-    /// All have the same.
-    One(Heard),
-    Each([Heard; ENDS_MAX]),
+enum BellStates {
+    /// All have the same word.
+    One(BellState),
+    Each([BellState; ENDS_MAX]),
 }
 
-/// `None` when one has no such word, or there are none.
-fn listen(ends: &impl Ends, ear: Ear) -> Option<Listened> {
-    let word = |index| (index < ends.count()).then(|| word_of(ends.consumer(index), ear)).flatten();
+/// Reads the words. `None` when a consumer has no such word, or there are no consumers.
+fn listen(ends: &impl Ends, wake_place: WakePlace) -> Option<BellStates> {
+    let word = |index| (index < ends.count()).then(|| word_of(ends.consumer(index), wake_place)).flatten();
     let first = word(0)?;
     let listened = if (1..ends.count()).all(|index| word(index).is_some_and(|other| ptr::eq(other, first))) {
-        Listened::One(Heard(first.load(Ordering::Relaxed)))
+        BellStates::One(BellState(first.load(Ordering::Relaxed)))
     } else {
-        let mut heard = [Heard(0); ENDS_MAX];
-        for (index, heard) in heard.iter_mut().enumerate().take(ends.count()) {
-            *heard = Heard(word(index)?.load(Ordering::Relaxed));
+        let mut seen = [BellState(0); ENDS_MAX];
+        for (index, seen) in seen.iter_mut().enumerate().take(ends.count()) {
+            *seen = BellState(word(index)?.load(Ordering::Relaxed));
         }
-        Listened::Each(heard)
+        BellStates::Each(seen)
     };
-    // SYNC: who heard a ring also sees what it was rung for: `FutexBell::ring`, `ProducerCore::say_rung`.
+    // SYNC: a ring that is seen here makes the stores before it visible: `FutexBell::ring`,
+    // `ProducerCore::report_ring`.
     fence(Ordering::Acquire);
     Some(listened)
 }
 
-fn word_of(consumer: &Consumer, ear: Ear) -> Option<&AtomicU32> {
-    match ear {
-        Ear::Bell => consumer.message_bell().word(),
-        Ear::Own => Some(consumer.own_word()),
+fn word_of(consumer: &Consumer, wake_place: WakePlace) -> Option<&AtomicU32> {
+    match wake_place {
+        WakePlace::Bell => consumer.message_bell().word(),
+        WakePlace::Own => Some(consumer.own_word()),
     }
 }
 
-impl Listened {
+impl BellStates {
     /// Whether the one bell that all have has not been rung since.
     fn is_unchanged(&self, ends: &impl Ends) -> bool {
         match self {
-            Self::One(heard) => word_of(ends.consumer(0), Ear::Bell)
-                .is_some_and(|word| word.load(Ordering::Relaxed) == heard.0),
-            // Each bell has one peer who can write it: that robs nobody else.
+            Self::One(seen) => word_of(ends.consumer(0), WakePlace::Bell)
+                .is_some_and(|word| word.load(Ordering::Relaxed) == seen.0),
+            // Each bell has one peer that can write it: no other peer loses a ring.
             Self::Each(_) => false,
         }
     }
 
-    fn sleep(&self, ends: &impl Ends, ear: Ear, left: Duration) -> io::Result<Woken> {
+    fn sleep(&self, ends: &impl Ends, wake_place: WakePlace, left: Duration) -> io::Result<Woken> {
         let no_word = || io::Error::from(io::ErrorKind::InvalidInput);
         match self {
-            Self::One(heard) => {
-                platform::sleep_at(word_of(ends.consumer(0), ear).ok_or_else(no_word)?, *heard, left)
+            Self::One(seen) => {
+                platform::sleep_at(word_of(ends.consumer(0), wake_place).ok_or_else(no_word)?, *seen, left)
             }
-            Self::Each(heard) => {
-                let mut ears = platform::Ears::new();
-                for (index, heard) in heard.iter().enumerate().take(ends.count()) {
-                    ears.add(word_of(ends.consumer(index), ear).ok_or_else(no_word)?, *heard);
+            Self::Each(seen) => {
+                let mut futexes = platform::FutexSet::new();
+                for (index, seen) in seen.iter().enumerate().take(ends.count()) {
+                    futexes.add(word_of(ends.consumer(index), wake_place).ok_or_else(no_word)?, *seen);
                 }
-                ears.sleep(left)
+                futexes.sleep(left)
             }
         }
     }
 }
 
-fn look(ends: &mut impl Ends) -> Result<Option<usize>, AnyError> {
+fn check(ends: &mut impl Ends) -> Result<Option<usize>, AnyError> {
     for index in 0..ends.count() {
         if ends.consumer_mut(index).is_ready().map_err(|cause| AnyError::Corrupt { index, cause })? {
             return Ok(Some(index));
@@ -315,10 +323,10 @@ fn look(ends: &mut impl Ends) -> Result<Option<usize>, AnyError> {
     Ok(None)
 }
 
-fn look_for_the_gone(ends: &mut impl Ends) -> Result<Any, AnyError> {
+fn check_hang_ups(ends: &mut impl Ends) -> Result<Any, AnyError> {
     let Some(index) = hung_up(ends)? else { return Ok(Any::TimedOut) };
-    // It may have said something before.
-    Ok(look(ends)?.map_or(Any::HungUp(index), Any::Message))
+    // It may have published a message before.
+    Ok(check(ends)?.map_or(Any::HungUp(index), Any::Message))
 }
 
 fn hung_up(ends: &impl Ends) -> Result<Option<usize>, AnyError> {
@@ -355,12 +363,12 @@ mod tests {
     }
 
     #[test]
-    fn a_peer_that_writes_nonsense_is_named() {
+    fn invalid_tail_is_reported_with_its_peer() {
         // given
         let (mut hostile, offer) = Region::create(Capacity::MIN, BellKind::Futex).expect("a region");
         let (side, _offer) = Region::create(Capacity::MIN, BellKind::Futex).expect("a region");
         let (_producer, consumer) = side.connect(offer, &Terms::default()).expect("an honest offer");
-        // when: a tail that is no multiple of 8
+        // when: a tail that is not a multiple of 8
         hostile.scribble(u32::try_from(Word::Tail.index()).expect("a small number"), 3);
         // then
         let ended = Waiter::new(Spin::Off).wait(&mut One(consumer), Instant::now() + Duration::from_secs(20));
@@ -370,8 +378,8 @@ mod tests {
         ));
     }
 
-    /// Its bells ring in a page that nobody listens to: each of its rings is robbed.
-    fn robbed_peer(bell: &CommonBell) -> (One, Producer, (Producer, Consumer)) {
+    /// A peer that rings a page where nothing sleeps: each of its rings is lost.
+    fn ring_losing_peer(bell: &CommonBell) -> (One, Producer, (Producer, Consumer)) {
         let (side, mut offer) = Region::create(Capacity::MIN, Bell::Common(bell.clone())).expect("a region");
         let (other, theirs) = Region::create(Capacity::MIN, BellKind::Futex).expect("a region");
         let (_unheard, unheard) = Region::create(Capacity::MIN, BellKind::Futex).expect("a region");
@@ -383,14 +391,14 @@ mod tests {
     }
 
     #[test]
-    fn who_was_not_woken_by_a_ring_sleeps_where_nobody_can_take_a_ring_away() {
+    fn sleeper_avoids_a_bell_that_lost_a_ring() {
         // given
         let bell = CommonBell::create().expect("a page");
-        let (mut end, mut producer, _rest) = robbed_peer(&bell);
+        let (mut end, mut producer, _rest) = ring_losing_peer(&bell);
         let (mut waiter, until) = (Waiter::new(Spin::Off), Instant::now() + Duration::from_secs(20));
         let sleeps = |producer: &Producer| producer.peer_sleeps();
-        for (number, ear) in [(1, Ear::Bell), (2, Ear::Own), (3, Ear::Own)] {
-            assert_eq!(waiter.trust.ear(Instant::now), ear, "before message {number}");
+        for (number, wake_place) in [(1, WakePlace::Bell), (2, WakePlace::Own), (3, WakePlace::Own)] {
+            assert_eq!(waiter.trust.wake_place(Instant::now), wake_place, "before message {number}");
             // when
             thread::scope(|scope| {
                 scope.spawn(|| {

@@ -1,5 +1,6 @@
-//! What benches stand beside: a ring without checks, loans, deadlines or sleeping flags. Four slots each way, a count for each,
-//! a futex wake for every message or none at all. What it leaves out is what it is the measure of; both ends trust each other.
+//! The reference of the benches: a ring without checks, loans, deadlines or sleeping flags. Four slots in
+//! each direction, a count for each, a futex wake for every message or none at all. The omitted features are
+//! the ones that the comparison measures; both ends trust each other.
 
 use std::{
     os::fd::{AsFd, OwnedFd},
@@ -18,16 +19,17 @@ const COUNT_BYTES: usize = 128;
 /// How an end waits for a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Waiting {
-    /// It sleeps on a futex, which is woken for every message.
+    /// Sleeps on a futex, which is woken for every message.
     Futex,
-    /// It looks again and again; nobody is woken.
+    /// Polls; needs no wake.
     Poll,
 }
 
-/// Memory for both directions, with messages of so many bytes, for two processes: one makes it, the other inherits it.
+/// Creates memory for both directions, with messages of `bytes` bytes, for two processes: one creates it, the
+/// other inherits it.
 ///
 /// # Panics
-/// If the system gives no memory.
+/// If the system provides no memory.
 #[must_use]
 pub fn memory(bytes: usize) -> OwnedFd {
     let memory = memfd_create("bare-ring", MemfdFlags::empty()).expect("a memfd");
@@ -35,7 +37,8 @@ pub fn memory(bytes: usize) -> OwnedFd {
     memory
 }
 
-/// One end. A message is only sent when fewer than four are under way: round trips keep to it by themselves.
+/// One end. A message may be sent only while fewer than four are in flight: round trips keep to this by
+/// themselves.
 #[derive(Debug)]
 pub struct End {
     map: MmapRaw,
@@ -44,18 +47,18 @@ pub struct End {
     /// Messages sent and received so far.
     sent: u32,
     received: u32,
-    /// Which direction this end writes.
+    /// The direction that this end writes.
     outward: usize,
 }
 
 impl End {
-    /// The end of the process that made the memory.
+    /// Creates the end of the process that created the memory.
     #[must_use]
     pub fn first(memory: impl AsFd, bytes: usize, waiting: Waiting) -> Self {
         Self::new(memory, bytes, waiting, 0)
     }
 
-    /// The end of the other process.
+    /// Creates the end of the other process.
     #[must_use]
     pub fn second(memory: impl AsFd, bytes: usize, waiting: Waiting) -> Self {
         Self::new(memory, bytes, waiting, 1)
@@ -73,8 +76,8 @@ impl End {
 
     fn count(&self, direction: usize) -> &AtomicU32 {
         let address = self.start(direction).cast();
-        // SAFETY: the memory is mapped as long as `self`; the length of a message is a multiple of 8, so the address is one
-        // of 4; all access to it is atomic.
+        // SAFETY: the memory is mapped as long as `self`; the length of a message is a multiple of 8, so the
+        // address is a multiple of 4; all access to it is atomic.
         unsafe { AtomicU32::from_ptr(address) }
     }
 
@@ -82,22 +85,23 @@ impl End {
         self.start(direction).wrapping_add(COUNT_BYTES + number as usize % SLOTS * self.bytes)
     }
 
-    /// Sends a message; it has the length that was said in the beginning.
+    /// Sends a message; its length must be that given at creation.
     pub fn send(&mut self, payload: &[u8]) {
         assert_eq!(payload.len(), self.bytes, "messages have one length");
         let slot = self.slot(self.outward, self.sent);
-        // SAFETY: a slot has as many bytes as the payload, which was looked at above; the reader waits for the count.
+        // SAFETY: a slot has as many bytes as the payload, which was checked above; the reader waits for the
+        // count.
         unsafe { slot.copy_from_nonoverlapping(payload.as_ptr(), self.bytes) };
         self.sent = self.sent.wrapping_add(1);
         let count = self.count(self.outward);
-        // SYNC: Release: whoever sees the count sees the payload; pairs with `receive`.
+        // SYNC: Release: a reader that sees the count sees the payload; pairs with `receive`.
         count.store(self.sent, Ordering::Release);
         if self.waiting == Waiting::Futex {
             let _ = futex::wake(count, Flags::empty(), 1);
         }
     }
 
-    /// Waits for a message, for ever if none comes; it has the length that was said in the beginning.
+    /// Waits for a message without a limit; its length must be that given at creation.
     pub fn receive(&mut self, payload: &mut [u8]) {
         assert_eq!(payload.len(), self.bytes, "messages have one length");
         let inward = 1 - self.outward;
@@ -106,14 +110,15 @@ impl End {
         while count.load(Ordering::Acquire) == self.received {
             match self.waiting {
                 Waiting::Poll => std::hint::spin_loop(),
-                // It returns at once if the count has changed; whatever it says, the count is looked at again.
+                // Returns at once if the count has changed; the count is read again in any case.
                 Waiting::Futex => {
                     let _ = futex::wait(count, Flags::empty(), self.received, None);
                 }
             }
         }
         let slot = self.slot(inward, self.received);
-        // SAFETY: a slot has as many bytes as the payload, which was looked at above; the writer waits for the answer.
+        // SAFETY: a slot has as many bytes as the payload, which was checked above; the writer waits for the
+        // answer.
         unsafe { slot.copy_to_nonoverlapping(payload.as_mut_ptr(), self.bytes) };
         self.received = self.received.wrapping_add(1);
     }

@@ -1,4 +1,4 @@
-//! What a sleeping side is woken by. Three ways behind one trait; a side chooses how it wants to be woken.
+//! Wakes of a sleeping side. Three kinds behind one trait; each side chooses the kind for its own wakes.
 
 use std::{
     fmt, io,
@@ -8,17 +8,17 @@ use std::{
 
 use crate::{platform, wait::Waiting};
 
-/// How a side wants to be woken.
+/// How a side is to be woken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum BellKind {
-    /// A futex in a page that both sides write. The quickest for a thread that blocks; nothing for a reactor. Ringing never
-    /// blocks.
+    /// A futex in a page that both sides write. The fastest for a thread that blocks; of no use to a reactor.
+    /// Ringing never blocks.
     Futex,
-    /// An eventfd for each direction: for a reactor. **Only for a peer that is trusted to leave it alone**: who has the
-    /// descriptor can make it blocking and full, and then the next ring blocks.
+    /// An eventfd for each direction: for a reactor. **Only for a trusted peer**: a holder of the descriptor
+    /// can make it blocking and full, and then the next ring blocks.
     EventFd,
-    /// A pair of sockets for each direction: for a reactor. Ringing never blocks, whatever the peer does.
+    /// A socket pair for each direction: for a reactor. Ringing never blocks, for any behaviour of the peer.
     Socket,
 }
 
@@ -59,35 +59,38 @@ impl fmt::Display for BellKind {
     }
 }
 
-/// The bell of a region: one of its own, or one that several have.
+/// The bell of a region: its own, or one shared by several regions.
 #[derive(Clone, Debug)]
 pub enum Bell {
-    /// One of this kind, for this region alone.
+    /// A bell of this kind, for this region alone.
     OfItsOwn(BellKind),
-    /// One for all regions that are made with it: who waits for all of them sleeps at one place.
+    /// One bell for all regions that are created with it: a thread that waits for all of them sleeps at one
+    /// place.
     Common(CommonBell),
 }
 
-/// A futex that several regions have. Who waits for all of them ([`Waiter`](crate::Waiter)) sleeps at one word, however many they are.
+/// A futex that several regions share. A thread that waits for all of them ([`Waiter`](crate::Waiter)) sleeps
+/// at one word, however many they are.
 ///
-/// Each peer gets the page in which it is, and can write it: it can wake this side for nothing, and undo the ring of another
-/// peer in the moment in which this side falls asleep. That message waits for the end of the nap then, 20 ms. Where this side finds it out it
-/// sleeps for a while, each time longer, at words of which each has one writer.
+/// Each peer receives the page of the futex and can write it. It can wake this side without a message. It can
+/// also undo the ring of another peer at the moment when this side falls asleep. That message then waits for
+/// the end of the nap, 20 ms. If this side detects that, it sleeps for a while, each time longer, at words
+/// with one writer each.
 #[derive(Clone, Debug)]
 pub struct CommonBell(pub(crate) platform::SharedPage);
 
 impl CommonBell {
-    /// Makes one.
+    /// Creates a common bell.
     ///
     /// # Errors
-    /// What the system said.
+    /// The error of the system.
     pub fn create() -> io::Result<Self> {
         platform::SharedPage::create().map(Self)
     }
 }
 
 impl Bell {
-    /// The kind of it.
+    /// Returns the kind of the bell.
     #[must_use]
     pub const fn kind(&self) -> BellKind {
         match self {
@@ -103,7 +106,7 @@ impl From<BellKind> for Bell {
     }
 }
 
-/// A region's two bells: the waiting side keeps the ears, the ringing side gets the buttons.
+/// A region's two bells: the waiting side keeps the listening ends, the ringing side receives the buttons.
 pub(crate) struct Bells {
     pub(crate) message: Box<dyn Doorbell>,
     pub(crate) room: Box<dyn Doorbell>,
@@ -113,36 +116,37 @@ pub(crate) struct Bells {
 /// Why a sleep ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Woken {
-    /// Something may have changed.
+    /// A wake; the state may have changed.
     Rung,
     TimedOut,
     HungUp,
 }
 
-/// What was heard of a bell before its ear's owner announced its sleep: a ring after this ends the sleep.
+/// The state of a bell, read before the sleep is announced: a later ring ends the sleep.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Heard(pub(crate) u32);
+pub(crate) struct BellState(pub(crate) u32);
 
-/// One end of a bell. The side that waits calls `listen`, announces its sleep, and calls `sleep`; the side that rings calls
-/// `ring`.
+/// One end of a bell. The waiting side calls `listen`, announces its sleep, and calls `sleep`; the ringing
+/// side calls `ring`.
 pub(crate) trait Doorbell: Send {
-    /// Wakes who sleeps. Never blocks. A peer that is gone is no error here: that shows elsewhere.
+    /// Wakes the sleeper. Never blocks. A peer that is gone is not an error here: other calls report it.
     fn ring(&self);
 
-    /// What was heard so far; before the sleep is announced.
-    fn listen(&self) -> Heard;
+    /// Returns the state of the bell so far; to be called before the sleep is announced.
+    fn listen(&self) -> BellState;
 
-    /// Sleeps until rung after `heard`, until the wait's deadline, or until the peer is gone. May end early without a reason.
-    fn sleep(&self, heard: Heard, waiting: &Waiting<'_>) -> io::Result<Woken>;
+    /// Sleeps until rung after `seen`, until the wait's deadline, or until the peer is gone. May end early
+    /// without a reason.
+    fn sleep(&self, seen: BellState, waiting: &Waiting<'_>) -> io::Result<Woken>;
 
-    /// The word that a ring changes; `None` when there is no such thing.
+    /// Returns the word that a ring changes; `None` if this kind has none.
     fn word(&self) -> Option<&AtomicU32> {
         None
     }
 
-    /// What a reactor waits for; `None` when there is no such thing.
+    /// Returns the descriptor for a reactor; `None` if this kind has none.
     fn fd(&self) -> Option<BorrowedFd<'_>>;
 
-    /// Forgets the rings so far. Never blocks.
+    /// Discards the rings so far. Never blocks.
     fn drain(&self);
 }

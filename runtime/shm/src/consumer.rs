@@ -1,10 +1,10 @@
-//! Receiving: a message is lent in place, read by copying, and its memory goes back when the lending ends.
+//! Receiving: a message is borrowed in place, read by copying, and its memory is returned when the loan ends.
 
 use std::{fmt, io, os::fd::BorrowedFd, sync::atomic::AtomicU32, time::Instant};
 
 use crate::{
-    bell::{Doorbell, Heard, Woken},
-    core::{ConsumerCore, Record, sleep::Ear},
+    bell::{BellState, Doorbell, Woken},
+    core::{ConsumerCore, Record, sleep::WakePlace},
     error::{Corrupt, ReceiveError},
     platform::{OwnHeaderMemory, PeerMemory},
     spin::{Spin, Spinner},
@@ -28,42 +28,45 @@ impl Consumer {
         Self { core, message, room_button, spinner: Spinner::new(Spin::Off) }
     }
 
-    /// What this end does before it sleeps in [`Consumer::receive_before`]. [`Spin::Off`] at first.
+    /// Sets how this end spins before it sleeps in [`Consumer::receive_before`]. [`Spin::Off`] at first.
     pub const fn set_spin(&mut self, spin: Spin) {
         self.spinner = Spinner::new(spin);
     }
 
-    /// The longest message that can come, in bytes: no other length is ever lent.
+    /// Returns the longest possible message, in bytes: longer ones are never returned.
     #[must_use]
     pub const fn payload_max(&self) -> usize {
         self.core.capacity().payload_max() as usize
     }
 
-    /// The oldest message, if there is any. Its memory goes back to the peer when the lending ends, in order.
+    /// Returns the oldest message, if there is any. Its memory is returned to the peer when the loan ends, in
+    /// order.
     ///
     /// # Errors
-    /// [`Corrupt`] when the peer wrote what no peer of ours writes; from then on always.
-    pub fn receive(&mut self) -> Result<Option<Lent<'_>>, Corrupt> {
-        Ok(self.core.next()?.map(|record| Lent { consumer: self, record }))
+    /// [`Corrupt`] when the peer wrote values that no valid peer writes; every later call returns it too.
+    pub fn receive(&mut self) -> Result<Option<ReceivedMessage<'_>>, Corrupt> {
+        Ok(self.core.next()?.map(|record| ReceivedMessage { consumer: self, record }))
     }
 
-    /// The oldest message; waits for it.
+    /// Waits for the oldest message and returns it.
     ///
     /// # Errors
-    /// [`ReceiveError::TimedOut`] at the deadline; [`ReceiveError::HungUp`] when the peer is gone and the ring is empty.
-    pub fn receive_before(&mut self, wait: &Wait<'_>) -> Result<Lent<'_>, ReceiveError> {
+    /// [`ReceiveError::TimedOut`] at the deadline; [`ReceiveError::HungUp`] when the peer is gone and the
+    /// ring is empty.
+    pub fn receive_before(&mut self, wait: &Wait<'_>) -> Result<ReceivedMessage<'_>, ReceiveError> {
         let record = self.await_record(wait)?;
-        Ok(Lent { consumer: self, record })
+        Ok(ReceivedMessage { consumer: self, record })
     }
 
-    /// Gives the memory of the messages that were kept ([`Lent::keep`]) back to the peer, which is woken if it waits for room.
+    /// Returns the memory of the kept messages ([`ReceivedMessage::keep`]) to the peer, and wakes it if it waits for
+    /// room.
     pub fn give_back(&mut self) {
         if self.core.give_back() {
             self.room_button.ring();
         }
     }
 
-    /// Whether there is a message. It stays there.
+    /// Returns whether there is a message. The message stays there.
     ///
     /// # Errors
     /// As [`Consumer::receive`].
@@ -71,7 +74,7 @@ impl Consumer {
         Ok(self.core.next()?.is_some())
     }
 
-    /// Whether the producer has published something since it was last looked at.
+    /// Whether the producer has published a message since the last check.
     pub(crate) fn has_moved(&self) -> bool {
         self.core.has_moved()
     }
@@ -80,28 +83,28 @@ impl Consumer {
         &*self.message
     }
 
-    /// The word that a ring of this peer changes, and nobody else can.
+    /// The word that a ring of this peer changes, and no other peer can write.
     pub(crate) fn own_word(&self) -> &AtomicU32 {
         self.core.peer.rung()
     }
 
-    /// Whether the peer says that it has rung for the sleep that was announced last.
+    /// Whether the peer reports a ring for the sleep that was announced last.
     pub(crate) fn was_rung(&self) -> bool {
         self.core.was_rung()
     }
 
-    /// Says that this side is awake, of a bell that keeps no rings.
+    /// Announces that this side is awake, for a bell that stores no rings.
     pub(crate) fn withdraw(&mut self) {
         self.core.disarm();
     }
 
-    /// Announces sleep, one of several; see [`ConsumerCore::announce`].
-    pub(crate) fn announce(&mut self, ear: Ear) {
-        self.core.announce(ear);
+    /// Announces sleep, as one of several consumers; see [`ConsumerCore::announce`].
+    pub(crate) fn announce(&mut self, wake_place: WakePlace) {
+        self.core.announce(wake_place);
     }
 
-    /// Announces that a reactor is about to wait for [`Consumer::fd`]. Followed by [`Consumer::disarm`] in any case but
-    /// [`Armed::Ready`].
+    /// Announces that a reactor is about to wait for [`Consumer::fd`]. Must be followed by
+    /// [`Consumer::disarm`], except after [`Armed::Ready`].
     ///
     /// # Errors
     /// As [`Consumer::receive`].
@@ -109,13 +112,13 @@ impl Consumer {
         self.core.arm()
     }
 
-    /// Says that the reactor is awake, and forgets the rings so far.
+    /// Announces that the reactor is awake, and discards the rings so far.
     pub fn disarm(&mut self) {
         self.core.disarm();
         self.message.drain();
     }
 
-    /// What a reactor waits for (readable) while armed; `None` for a futex.
+    /// Returns the descriptor that a reactor waits for (readable) while armed; `None` for a futex.
     #[must_use]
     pub fn fd(&self) -> Option<BorrowedFd<'_>> {
         self.message.fd()
@@ -142,12 +145,12 @@ impl Consumer {
             return Ok(record);
         }
         loop {
-            let heard = self.message.listen();
+            let seen = self.message.listen();
             let ended = match self.core.arm()? {
-                Armed::Sleep => self.sleep(heard, &waiting)?,
+                Armed::Sleep => self.sleep(seen, &waiting)?,
                 Armed::Ready => Woken::Rung,
             };
-            // What was published before the end of the wait, or of the peer, is still a message.
+            // A message published before the end of the wait, or of the peer, is still received.
             if let Some(record) = self.core.next()? {
                 return Ok(record);
             }
@@ -159,8 +162,8 @@ impl Consumer {
         }
     }
 
-    fn sleep(&mut self, heard: Heard, waiting: &Waiting<'_>) -> Result<Woken, ReceiveError> {
-        let ended = self.message.sleep(heard, waiting);
+    fn sleep(&mut self, seen: BellState, waiting: &Waiting<'_>) -> Result<Woken, ReceiveError> {
+        let ended = self.message.sleep(seen, waiting);
         self.core.disarm();
         ended.map_err(ReceiveError::System)
     }
@@ -174,28 +177,29 @@ impl fmt::Debug for Consumer {
 
 /// A message in the ring.
 ///
-/// There is no `&[u8]` of it: the peer can change its bytes at any time, and Rust takes bytes behind a reference for
-/// unchanging. They are copied out, each one read once, and then parsed; or read in pieces with [`Lent::reader`].
+/// It offers no `&[u8]`: the peer can change its bytes at any time, and Rust requires that bytes behind a
+/// reference do not change. The bytes are copied out, each one read once, and then parsed; or read in pieces
+/// with [`ReceivedMessage::reader`].
 #[derive(Debug)]
-pub struct Lent<'a> {
+pub struct ReceivedMessage<'a> {
     consumer: &'a mut Consumer,
     record: Record,
 }
 
-impl Lent<'_> {
-    /// Bytes of the message: at most [`Consumer::payload_max`].
+impl ReceivedMessage<'_> {
+    /// Returns the length in bytes: at most [`Consumer::payload_max`].
     #[must_use]
     pub const fn len(&self) -> usize {
         self.record.length as usize
     }
 
-    /// Whether it has no bytes.
+    /// Returns whether the message has no bytes.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.record.length == 0
     }
 
-    /// Copies from byte `from` on, as much as there is and the target holds; how much that was.
+    /// Copies from byte `from` on, as much as there is and the target holds. Returns the number of bytes.
     pub fn copy_at(&self, from: usize, target: &mut [u8]) -> usize {
         let count = self.len().saturating_sub(from).min(target.len());
         if count > 0 {
@@ -204,7 +208,7 @@ impl Lent<'_> {
         count
     }
 
-    /// Copies from the beginning, as much as there is and the target holds; how much that was.
+    /// Copies from the beginning, as much as there is and the target holds. Returns the number of bytes.
     pub fn copy_to(&self, target: &mut [u8]) -> usize {
         self.copy_at(0, target)
     }
@@ -216,7 +220,7 @@ impl Lent<'_> {
         self.copy_to(&mut target[before..]);
     }
 
-    /// The whole message.
+    /// Returns a copy of the whole message.
     #[must_use]
     pub fn to_vec(&self) -> Vec<u8> {
         let mut bytes = vec![0; self.len()];
@@ -224,22 +228,24 @@ impl Lent<'_> {
         bytes
     }
 
-    /// Ends the lending without giving the memory back yet: that is done with the next message's, or by
-    /// [`Consumer::give_back`]. For who reads several at once: a peer that waits for room is woken for all of them.
+    /// Ends the loan without returning the memory yet: that is done with the next message's memory, or by
+    /// [`Consumer::give_back`]. For a reader of several messages at once: a peer that waits for room is woken
+    /// once for all of them.
     pub fn keep(self) {
-        let mut lent = std::mem::ManuallyDrop::new(self);
-        let record = lent.record;
-        lent.consumer.core.keep(record);
+        let mut message = std::mem::ManuallyDrop::new(self);
+        let record = message.record;
+        message.consumer.core.keep(record);
     }
 
-    /// Reads it in pieces, for a decoder. Each byte is read once; a decoder that reads a length twice may see two.
+    /// Returns a reader for a decoder. Each byte is read once; a decoder that reads a length twice may see
+    /// two values.
     #[must_use]
-    pub const fn reader(&self) -> LentReader<'_> {
-        LentReader { lent: self, at: 0 }
+    pub const fn reader(&self) -> MessageReader<'_> {
+        MessageReader { message: self, at: 0 }
     }
 }
 
-impl Drop for Lent<'_> {
+impl Drop for ReceivedMessage<'_> {
     fn drop(&mut self) {
         let consumer = &mut *self.consumer;
         if consumer.core.release(self.record) {
@@ -248,16 +254,16 @@ impl Drop for Lent<'_> {
     }
 }
 
-/// A message as a stream of bytes. Never fails; ends at the message's end.
+/// A message as a stream of bytes. It never fails, and ends at the end of the message.
 #[derive(Debug)]
-pub struct LentReader<'a> {
-    lent: &'a Lent<'a>,
+pub struct MessageReader<'a> {
+    message: &'a ReceivedMessage<'a>,
     at: usize,
 }
 
-impl io::Read for LentReader<'_> {
+impl io::Read for MessageReader<'_> {
     fn read(&mut self, target: &mut [u8]) -> io::Result<usize> {
-        let count = self.lent.copy_at(self.at, target);
+        let count = self.message.copy_at(self.at, target);
         self.at += count;
         Ok(count)
     }

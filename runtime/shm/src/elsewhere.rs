@@ -1,4 +1,5 @@
-//! Platforms without sealed shared memory: making a region is refused in words, and nothing else can be reached.
+//! Platforms without sealed shared memory: creating a region returns an error, and no other code here can
+//! run.
 
 use std::{
     convert::Infallible,
@@ -9,7 +10,7 @@ use std::{
 };
 
 use crate::{
-    bell::{Bell, BellKind, Bells, Doorbell, Heard, Woken},
+    bell::{Bell, BellKind, BellState, Bells, Doorbell, Woken},
     error::{CreateError, PassError, RefusedOffer},
     layout::{Capacity, Word},
     memory::{OwnHeader, OwnRing, Peer},
@@ -26,7 +27,7 @@ pub(crate) fn receive(_: BorrowedFd<'_>) -> Result<Received, PassError> {
 }
 
 pub(crate) fn keep_urgent_in_line(_: BorrowedFd<'_>) -> io::Result<()> {
-    // A unix socket has no urgent bytes but on Linux.
+    // Unix sockets have urgent bytes only on Linux.
     Ok(())
 }
 
@@ -46,7 +47,7 @@ pub(crate) fn adopt(_: OwnedFd, _: Capacity) -> Result<PeerMemory, RefusedOffer>
     Err(RefusedOffer::Unsupported)
 }
 
-/// There is none.
+/// Cannot exist on this platform.
 #[derive(Clone, Debug)]
 pub(crate) struct SharedPage(Infallible);
 
@@ -71,19 +72,19 @@ pub(crate) fn which_ended<'a>(_: impl Iterator<Item = HangUp<'a>>) -> io::Result
     Err(io::ErrorKind::Unsupported.into())
 }
 
-pub(crate) fn sleep_at(_: &AtomicU32, _: Heard, _: Duration) -> io::Result<Woken> {
+pub(crate) fn sleep_at(_: &AtomicU32, _: BellState, _: Duration) -> io::Result<Woken> {
     Err(io::ErrorKind::Unsupported.into())
 }
 
-/// There are none.
-pub(crate) struct Ears;
+/// Cannot exist on this platform.
+pub(crate) struct FutexSet;
 
-impl Ears {
+impl FutexSet {
     pub(crate) const fn new() -> Self {
         Self
     }
 
-    pub(crate) fn add(&mut self, _: &AtomicU32, _: Heard) -> bool {
+    pub(crate) fn add(&mut self, _: &AtomicU32, _: BellState) -> bool {
         false
     }
 
@@ -92,7 +93,7 @@ impl Ears {
     }
 }
 
-/// There is none.
+/// Cannot exist on this platform.
 #[derive(Debug)]
 pub(crate) struct OwnMemory(Infallible);
 
@@ -107,7 +108,7 @@ impl OwnMemory {
     }
 }
 
-/// There is none.
+/// Cannot exist on this platform.
 #[derive(Debug)]
 pub(crate) struct OwnHeaderMemory(Infallible);
 
@@ -117,7 +118,7 @@ impl OwnHeader for OwnHeaderMemory {
     }
 }
 
-/// There is none.
+/// Cannot exist on this platform.
 #[derive(Debug)]
 pub(crate) struct OwnRingMemory(Infallible);
 
@@ -147,7 +148,7 @@ impl OwnRing for OwnRingMemory {
     }
 }
 
-/// There is none.
+/// Cannot exist on this platform.
 #[derive(Clone, Debug)]
 pub(crate) struct PeerMemory(Infallible);
 

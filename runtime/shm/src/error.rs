@@ -1,4 +1,4 @@
-//! What can go wrong, and whose fault it is.
+//! Errors, and the party at fault for each.
 
 use std::io;
 
@@ -6,64 +6,67 @@ use thiserror::Error;
 
 use crate::{bell::BellKind, layout::Capacity};
 
-/// The peer's fault: its shared memory holds what no peer of ours writes. The connection is of no more use; both its
-/// halves repeat this error from now on. Nothing was read or written outside the ring.
+/// The peer's fault: its shared memory holds values that no valid peer writes. The connection is unusable;
+/// both its halves repeat this error from now on. Nothing was read or written outside the ring.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
 pub enum Corrupt {
-    /// The peer's count of published bytes went back, or beyond the ring's capacity, or is no multiple of 8.
+    /// The peer's count of published bytes went back, or beyond the ring's capacity, or is not a multiple of
+    /// 8.
     #[error("the peer's tail of {tail} does not follow {seen}")]
     Tail {
-        /// What the peer wrote.
+        /// The count that the peer wrote.
         tail: u32,
-        /// What it had written before.
+        /// The peer's previous count.
         seen: u32,
     },
-    /// The peer's count of taken bytes went back, or beyond what was published, or is no multiple of 8.
+    /// The peer's count of consumed bytes went back, or beyond the published bytes, or is not a multiple of
+    /// 8.
     #[error("the peer's head of {head} does not lie between {seen} and {tail}")]
     Head {
-        /// What the peer wrote.
+        /// The count that the peer wrote.
         head: u32,
-        /// What it had written before.
+        /// The peer's previous count.
         seen: u32,
-        /// What this side has published.
+        /// This side's count of published bytes.
         tail: u32,
     },
-    /// A record begins with what is no mark.
+    /// A record does not begin with a valid mark.
     #[error("a record begins with {0:#018x}")]
     Mark(u64),
-    /// A message would reach beyond what was published, or beyond the ring's end, or is longer than half the ring.
+    /// A message would reach beyond the published bytes, or beyond the ring's end, or is longer than half the
+    /// ring.
     #[error("a message of {length} bytes where {room} bytes are left")]
     Length {
-        /// What the peer wrote.
+        /// The length that the peer wrote.
         length: u32,
-        /// What could be there, with its mark.
+        /// The greatest possible length, including its mark.
         room: u32,
     },
-    /// A skip to the ring's beginning that leads nowhere.
+    /// A skip to the ring's beginning without a message there.
     #[error("a skip of {skipped} bytes with {published} published")]
     Skip {
-        /// From here to the ring's end.
+        /// Bytes from the skip to the ring's end.
         skipped: u32,
-        /// What was published and not taken.
+        /// Bytes that were published and not consumed.
         published: u32,
     },
 }
 
-/// Why no memory was lent to write a message into.
+/// The reason why no memory was loaned for a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
 pub enum LoanError {
-    /// The caller's fault: no ring of this capacity ever has room for it.
+    /// The caller's fault: no ring of this capacity can ever hold it.
     #[error("{asked} bytes are more than a message may have here ({max})")]
     TooLong {
-        /// What was asked for, in bytes.
+        /// The requested length, in bytes.
         asked: usize,
         /// The longest message, in bytes.
         max: usize,
     },
-    /// The peer has not taken enough yet. Nothing changed; ask again later or wait for room.
+    /// The peer has not consumed enough yet. Nothing changed; try again later or wait for room.
     #[error("no room for {asked} bytes now: {free} at most")]
     Full {
-        /// What was asked for, in bytes.
+        /// The requested length, in bytes.
         asked: usize,
         /// The longest message that would fit now, in bytes; 0 may also mean that none does.
         free: usize,
@@ -73,13 +76,13 @@ pub enum LoanError {
     Corrupt(#[from] Corrupt),
 }
 
-/// Why waiting for a message ended without one.
+/// Why a wait for a message ended without one.
 #[derive(Debug, Error)]
 pub enum ReceiveError {
     /// The deadline passed.
     #[error("no message until the deadline")]
     TimedOut,
-    /// The peer is gone, and all that it had published has been received.
+    /// The peer is gone, and all its published messages have been received.
     #[error("the peer is gone")]
     HungUp,
     /// The peer's fault.
@@ -90,15 +93,15 @@ pub enum ReceiveError {
     System(#[source] io::Error),
 }
 
-/// Why waiting for several consumers ended without any.
+/// Why a wait for several consumers ended without a message.
 #[derive(Debug, Error)]
 pub enum AnyError {
     /// The fault of the peer at this index.
     #[error("{cause}")]
     Corrupt {
-        /// Which of those that were waited for.
+        /// Index of the consumer.
         index: usize,
-        /// What it wrote.
+        /// The error in the peer's memory.
         #[source]
         cause: Corrupt,
     },
@@ -107,13 +110,13 @@ pub enum AnyError {
     System(#[source] io::Error),
 }
 
-/// Why waiting for room ended without any.
+/// Why a wait for room ended without room.
 #[derive(Debug, Error)]
 pub enum RoomError {
-    /// The caller's fault: no ring of this capacity ever has room for it.
+    /// The caller's fault: no ring of this capacity can ever hold it.
     #[error("{asked} bytes are more than a message may have here ({max})")]
     TooLong {
-        /// What was asked for, in bytes.
+        /// The requested length, in bytes.
         asked: usize,
         /// The longest message, in bytes.
         max: usize,
@@ -132,7 +135,7 @@ pub enum RoomError {
     System(#[source] io::Error),
 }
 
-/// Why no region was made.
+/// Why no region was created.
 #[derive(Debug, Error)]
 pub enum CreateError {
     /// The environment's fault: this platform has no sealed shared memory.
@@ -141,113 +144,116 @@ pub enum CreateError {
     /// The environment's fault: no memory, no descriptors, or a system older than Linux 5.1.
     #[error("{step}: {cause}")]
     System {
-        /// What was being done.
+        /// The operation that failed.
         step: &'static str,
-        /// What the system said.
+        /// The error of the system.
         #[source]
         cause: io::Error,
     },
 }
 
-/// Why the peer's offer was not taken. Nothing of it is mapped or kept.
+/// Why the peer's offer was rejected. Nothing of it is mapped or kept.
 #[derive(Debug, Error)]
 pub enum RefusedOffer {
     /// This platform has no sealed shared memory.
     #[error("this platform has no sealed shared memory; use sockets")]
     Unsupported,
-    /// The words of the offer are not those of a region.
+    /// The offer does not have the magic number of a region.
     #[error("the offer does not begin with a region's magic number")]
     Magic,
-    /// The peer speaks another version.
+    /// The peer uses another version.
     #[error("the peer's layout has version {theirs}, this one {ours}")]
     Version {
-        /// The peer's.
+        /// The peer's version.
         theirs: u32,
-        /// This side's.
+        /// This side's version.
         ours: u32,
     },
-    /// The capacity is none.
+    /// The offered capacity is invalid.
     #[error("the offer has a capacity of {0} bytes, which is none")]
     Capacity(u64),
     /// The capacity is more than this side allows.
     #[error("the offer's ring of {offered} is larger than allowed ({allowed})")]
     TooLarge {
-        /// The peer's.
+        /// The peer's capacity.
         offered: Capacity,
-        /// What the terms allow.
+        /// The capacity that the terms allow.
         allowed: Capacity,
     },
-    /// There is no bell of this number.
+    /// No kind of bell has this number.
     #[error("the offer has an unknown kind of bell: {0}")]
     UnknownBell(u8),
-    /// The terms do not allow to be asked for such a wake.
+    /// The terms do not allow this kind of bell.
     #[error("the offer asks to be woken by {0}, which is not allowed here")]
     Bell(BellKind),
-    /// The offer came with too few or too many descriptors.
+    /// The offer arrived with too few or too many descriptors.
     #[error("the offer came with {got} descriptors, not {expected}")]
     Descriptors {
-        /// How many came.
+        /// Number of descriptors that arrived.
         got: usize,
-        /// How many belong to it.
+        /// Number of descriptors that belong to it.
         expected: usize,
     },
     /// The memory could be cut, grown, punched or unsealed later.
     #[error("the offered memory lacks seals: {0}")]
     Seals(String),
-    /// The memory is not what rings are made of: a hole in huge pages is a bus error.
+    /// The memory is not of the required kind: a hole in huge pages causes a bus error.
     #[error("the offered memory is not an ordinary memfd")]
     Kind,
-    /// The memory is not as large as its capacity says.
+    /// The size of the memory differs from its capacity.
     #[error("the offered memory has {got} bytes, not {expected}")]
     Size {
-        /// What the system says.
+        /// The size that the system reports.
         got: u64,
-        /// What the capacity asks for.
+        /// The size that the capacity requires.
         expected: u64,
     },
     /// The memory has holes, which this side would have to fill.
     #[error("the offered memory has holes: {allocated} of {expected} bytes are there")]
     Holes {
-        /// What the system says.
+        /// The allocated size that the system reports.
         allocated: u64,
-        /// What the capacity asks for.
+        /// The size that the capacity requires.
         expected: u64,
     },
-    /// The identity in the memory is not the one in the offer.
-    #[error("the offered memory says that it is something else than the offer says")]
+    /// The identity in the memory differs from that in the offer.
+    #[error("the header of the offered memory differs from the offer")]
     Identity,
-    /// A descriptor that should be a bell is none.
+    /// A descriptor that must be a bell is not one.
     #[error("a descriptor of the offer is no {0}")]
     NotABell(BellKind),
     /// The environment's fault.
     #[error("{step}: {cause}")]
     System {
-        /// What was being done.
+        /// The operation that failed.
         step: &'static str,
-        /// What the system said.
+        /// The error of the system.
         #[source]
         cause: io::Error,
     },
 }
 
-/// Why an offer did not pass over a socket.
+/// Why an offer was not transferred over a socket.
 #[derive(Debug, Error)]
 pub enum PassError {
     /// The peer closed the socket.
     #[error("the peer closed the socket")]
     Closed,
-    /// The peer's fault: what came is shorter than an offer, or has more descriptors than one can have. It is left in the socket.
-    #[error("what came is no whole offer: {bytes} bytes, {descriptors} descriptors, more than that: {cut}")]
+    /// The peer's fault: the message is shorter than an offer, or has too many descriptors for one. It is
+    /// left in the socket.
+    #[error(
+        "the received offer is incomplete: {bytes} bytes, {descriptors} descriptors, more than that: {cut}"
+    )]
     Broken {
-        /// How many bytes were looked at.
+        /// Number of bytes that were read ahead.
         bytes: usize,
-        /// How many descriptors were looked at.
+        /// Number of descriptors that were read ahead.
         descriptors: usize,
         /// Whether there are more.
         cut: bool,
     },
-    /// The environment's fault; `WouldBlock` on a socket that does not block, "too many open files" where this process has no descriptor
-    /// left.
+    /// The environment's fault; `WouldBlock` on a non-blocking socket, "too many open files" if this process
+    /// has no descriptor left.
     #[error("passing an offer: {0}")]
     System(#[source] io::Error),
 }

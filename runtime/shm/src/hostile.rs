@@ -1,5 +1,5 @@
-//! A peer that writes what it likes into all that it may write, while this side uses the connection. For tests, and for the
-//! example `hostile`; never in a robot.
+//! A peer that writes anything into all memory that it may write, while this side uses the connection. For
+//! tests, and for the example `hostile`; never in a robot.
 
 use std::{
     collections::BTreeMap,
@@ -19,12 +19,12 @@ use crate::{
     platform,
 };
 
-/// What came of an assault.
+/// The figures of an attack.
 #[derive(Clone, Debug, Default)]
 pub struct Tally {
     /// Connections.
     pub lives: u64,
-    /// Messages that were taken, forged ones mostly.
+    /// Messages that were received, mostly forged ones.
     pub taken: u64,
     /// Messages that were published.
     pub published: u64,
@@ -32,7 +32,7 @@ pub struct Tally {
     pub timed_out: u64,
     /// Writes of the hostile side.
     pub writes: u64,
-    /// How often the peer was caught, by what it was caught at.
+    /// How often the peer was caught, by the kind of error.
     pub caught: BTreeMap<&'static str, u64>,
 }
 
@@ -49,7 +49,7 @@ impl Tally {
     }
 }
 
-/// What decides: numbers of a seed, or bytes that somebody wrote.
+/// The source of decisions: numbers of a seed, or the bytes of a script.
 #[derive(Clone, Debug)]
 enum Dice {
     /// xorshift64*.
@@ -75,7 +75,7 @@ impl Dice {
         }
     }
 
-    /// Of what was written, no more than the limit needs is read: one more byte is one more decision.
+    /// Reads no more bytes of a script than the limit needs: one more byte is one more decision.
     fn below(&mut self, limit: u32) -> u32 {
         match self {
             Self::Written(bytes) if limit <= 1 << 8 => u32::from(bytes.pop().unwrap_or_default()) % limit,
@@ -83,7 +83,7 @@ impl Dice {
         }
     }
 
-    /// How long a wait is, in microseconds, at most: whoever wrote the script wants to see the end of it.
+    /// The longest wait, in microseconds: a script must end soon.
     const fn patience_us(&self) -> u32 {
         match self {
             Self::Seeded(_) => 300,
@@ -99,8 +99,8 @@ impl Dice {
     }
 }
 
-/// Connects to a hostile peer and uses the connection, so many times. Same seed, same intentions; which of them meet is up
-/// to the scheduler.
+/// Connects to a hostile peer and uses the connection, `lives` times. The same seed gives the same intended
+/// steps; their interleaving depends on the scheduler.
 ///
 /// # Panics
 /// When this side is harmed: a message beyond its bounds, or an error that no peer should be able to cause.
@@ -114,8 +114,8 @@ pub fn assault(seed: u64, lives: u64) -> Tally {
     tally
 }
 
-/// One connection to a hostile peer in which a script says what either side does next, on one thread: for a fuzzer, which
-/// finds by what is reached which script is worth another try.
+/// One connection to a hostile peer, in which a script decides the next step of either side, on one thread.
+/// For a fuzzer, which selects scripts by the code that they reach.
 ///
 /// # Panics
 /// As [`assault`].
@@ -152,7 +152,7 @@ fn one_life(dice: &mut Dice, tally: &mut Tally) {
     tally.lives += 1;
 }
 
-/// Two sides that are connected: one that uses it, and one that is hostile.
+/// Connects two sides: a user of the connection, and an attacker.
 fn meet(dice: &mut Dice) -> (User, Attacker) {
     let bells = [BellKind::Futex, BellKind::EventFd, BellKind::Socket];
     let bell = bells[dice.below(3) as usize];
@@ -162,12 +162,12 @@ fn meet(dice: &mut Dice) -> (User, Attacker) {
     let keys = [&our_offer, &their_offer].map(|offer| duplicate(&offer.descriptors()[0])).into();
     let terms = Terms { bells: bells.to_vec(), ..Terms::default() };
     let (producer, consumer) = ours.connect(their_offer, &terms).expect("honest so far");
-    // Of 256 writes so many are wild; the others are what an honest peer might write, to get further.
+    // This many of 256 writes are random; the others are those of an honest peer, to get further.
     let wild = [0, 1, 4, 32, 256][dice.below(5) as usize];
     (User { producer, consumer, caught: (false, false) }, Attacker::new(theirs, our_offer, keys, wild))
 }
 
-/// Ends the attack also when this side panics: else nobody would hear of it.
+/// Ends the attack also when this side panics: otherwise the panic would not be reported.
 struct EndsIt<'a>(&'a AtomicBool);
 
 impl Drop for EndsIt<'_> {
@@ -180,7 +180,7 @@ fn duplicate(fd: &OwnedFd) -> OwnedFd {
     fd.try_clone().expect("a descriptor")
 }
 
-/// This side, as an application has it.
+/// This side, as in an application.
 struct User {
     producer: Producer,
     consumer: Consumer,
@@ -189,7 +189,8 @@ struct User {
 }
 
 impl User {
-    /// What an application does, in any order, until the peer is caught by both halves or there was enough of it.
+    /// Performs an application's operations, in any order, until both halves have caught the peer or there
+    /// were enough of them.
     fn act_until_caught(&mut self, dice: &mut Dice, tally: &mut Tally) {
         for _ in 0..3_000 {
             self.act(dice, tally);
@@ -217,14 +218,14 @@ impl User {
     }
 }
 
-/// Whether the peer was caught.
+/// Receives. Returns whether the peer was caught.
 fn receive(consumer: &mut Consumer, dice: &mut Dice, tally: &mut Tally, known: bool) -> bool {
     let max = consumer.payload_max();
     let found = match dice.below(16) {
         0 => match consumer.receive_before(&shortly(dice)) {
             Ok(lent) => Ok(Some(lent)),
             Err(ReceiveError::Corrupt(corrupt)) => Err(corrupt),
-            // A bell's other end is in the attacker's hands too.
+            // The attacker also holds the other end of a bell.
             Err(ReceiveError::TimedOut | ReceiveError::HungUp) => {
                 tally.timed_out += 1;
                 Ok(None)
@@ -255,7 +256,7 @@ fn receive(consumer: &mut Consumer, dice: &mut Dice, tally: &mut Tally, known: b
     }
 }
 
-/// Whether the peer was caught.
+/// Sends. Returns whether the peer was caught.
 fn send(producer: &mut Producer, dice: &mut Dice, tally: &mut Tally, known: bool) -> bool {
     let length = dice.below(producer.payload_max() as u32 + 1) as usize;
     let room = match dice.below(16) {
@@ -305,12 +306,12 @@ fn shortly(dice: &mut Dice) -> Wait<'static> {
     Wait::within(Duration::from_micros(u64::from(dice.below(dice.patience_us()))))
 }
 
-/// The other side: its own memory to write, this side's to try to.
+/// The other side: it can write its own memory, and tries to write this side's.
 struct Attacker {
     region: Region,
-    /// What it sees of this side.
+    /// Its view of this side.
     victim: platform::PeerMemory,
-    /// Descriptors of this side's and its own memory.
+    /// Descriptors of the memory of this side, and of its own.
     keys: Vec<OwnedFd>,
     buttons: [Box<dyn crate::bell::Doorbell>; 2],
     wild: u32,
@@ -347,7 +348,8 @@ impl Attacker {
         }
     }
 
-    /// What the seals must not let through. That they do not is another test's claim; here it must harm nobody.
+    /// Attempts operations that the seals must prevent. Another test checks that they do; here they must do
+    /// no harm.
     fn try_the_keys(&self, value: u32) {
         for key in &self.keys {
             let hole = FallocateFlags::PUNCH_HOLE | FallocateFlags::KEEP_SIZE;
@@ -372,7 +374,7 @@ impl Attacker {
         }
     }
 
-    /// What a check has to see, just beside what it lets through.
+    /// Writes values that a check must reject, close to those that it accepts.
     fn lie(&mut self, dice: &mut Dice) {
         let position = self.position_of_a_mark(dice);
         match dice.below(4) {
@@ -390,18 +392,18 @@ impl Attacker {
         }
     }
 
-    /// As an honest producer does.
+    /// Publishes as an honest producer does.
     fn publish(&mut self, length: u32) {
         let capacity = self.region.capacity;
         let record = crate::layout::record_bytes(length).expect("it is small");
         let rest = capacity.rest(self.tail);
         let skip = if record > rest { rest } else { 0 };
-        // What it has lied before may make any number of these.
+        // Earlier false values may give any number here.
         let used = self.tail.wrapping_sub(self.victim.load(Word::Head));
         if u64::from(used) + u64::from(skip) + u64::from(record) > u64::from(capacity.bytes()) {
             return;
         }
-        // Nor does anything keep it from writing there before the victim has read, but this.
+        // Only this keeps the processor from writing there before the victim has read.
         std::sync::atomic::fence(Ordering::Acquire);
         if skip > 0 {
             self.put_mark(capacity.position(self.tail), Mark::Skip);
@@ -409,19 +411,19 @@ impl Attacker {
         let start = self.tail.wrapping_add(skip);
         self.put_mark(capacity.position(start), Mark::Message(length));
         self.tail = start.wrapping_add(record);
-        // Nothing here keeps a processor from showing the tail before the mark but this.
+        // Only this keeps the processor from showing the tail before the mark.
         std::sync::atomic::fence(Ordering::Release);
         self.region.scribble(Word::Tail.index() as u32, self.tail);
     }
 
-    /// As an honest consumer does, in any pieces.
+    /// Consumes as an honest consumer does, in any pieces.
     fn take(&mut self, dice: &mut Dice) {
-        let untaken = self.victim.load(Word::Tail).wrapping_sub(self.head);
-        self.head = self.head.wrapping_add(dice.below(untaken + 1) & !7);
+        let unread = self.victim.load(Word::Tail).wrapping_sub(self.head);
+        self.head = self.head.wrapping_add(dice.below(unread + 1) & !7);
         self.region.scribble(Word::Head.index() as u32, self.head);
     }
 
-    /// Any, or the one that the victim reads next.
+    /// A random position, or the one that the victim reads next.
     fn position_of_a_mark(&self, dice: &mut Dice) -> u32 {
         let capacity = self.region.capacity;
         match dice.below(2) {
@@ -430,7 +432,7 @@ impl Attacker {
         }
     }
 
-    /// A little below or above what a check of the victim's lets through, whichever of them it is; or any short one.
+    /// A length a little below or above the limit of one of the victim's checks, or any short one.
     fn length_at_an_edge(&self, position: u32, dice: &mut Dice) -> u32 {
         let capacity = self.region.capacity;
         let edge = match dice.below(4) {
@@ -464,7 +466,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_peer_that_writes_what_it_likes_harms_nobody_and_is_caught_in_every_way() {
+    fn hostile_peer_harms_nothing_and_is_always_caught() {
         let mut all = Tally::default();
         for seed in 0..40 {
             let tally = assault(seed, 10);
@@ -483,7 +485,7 @@ mod tests {
 
     proptest::proptest! {
         #[test]
-        fn any_script_of_a_hostile_peer_harms_nobody(script in proptest::collection::vec(proptest::num::u8::ANY, 0..4_000)) {
+        fn hostile_script_harms_nothing(script in proptest::collection::vec(proptest::num::u8::ANY, 0..4_000)) {
             let tally = play(&script);
             proptest::prop_assert_eq!(tally.lives, 1);
         }

@@ -1,4 +1,4 @@
-//! What lies where in a region. Both sides of a connection are built from the same layout or refuse each other.
+//! The layout of a region. Both sides of a connection are built from the same layout or reject each other.
 //!
 //! ```text
 //! byte 0     identity: magic, version, capacity        written once, before the region is offered
@@ -10,8 +10,8 @@
 //! byte 4096  the ring: records of 8-byte multiples
 //! ```
 //!
-//! Words of 32 bits that count up and wrap. Each has 128 bytes for itself: two cache lines, because processors fetch the
-//! neighbour too. All words of a region have one writer: the side that made it.
+//! Words of 32 bits that count up and wrap. Each has 128 bytes for itself: two cache lines, because
+//! processors fetch the neighbour too. All words of a region have one writer: the side that created it.
 
 use std::fmt;
 
@@ -21,17 +21,17 @@ use thiserror::Error;
 pub(crate) const MAGIC: u64 = u64::from_le_bytes(*b"SINEWSHM");
 /// Changes whenever a byte changes its meaning.
 pub(crate) const VERSION: u32 = 2;
-/// Where the ring begins: after a page for the header.
+/// Offset of the ring: after a page for the header.
 pub(crate) const HEADER_BYTES: usize = 4096;
 /// A record begins with this, and is padded to a multiple of it.
 pub(crate) const MARK_BYTES: u32 = 8;
 
-/// A header word that counts.
+/// A counting word of the header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Word {
     /// Bytes ever published in the region's ring.
     Tail,
-    /// Bytes ever taken from the peer's ring.
+    /// Bytes ever consumed from the peer's ring.
     Head,
     /// Sleep of the region's consumer, which waits for messages.
     ConsumerSleep,
@@ -42,7 +42,7 @@ pub(crate) enum Word {
 }
 
 impl Word {
-    /// Its place among the header's 32-bit words.
+    /// Its index among the header's 32-bit words.
     pub(crate) const fn index(self) -> usize {
         match self {
             Self::Tail => 128 / 4,
@@ -69,7 +69,7 @@ impl Capacity {
     /// The largest: 1 GiB.
     pub const MAX: Self = Self(1 << 30);
 
-    /// A capacity of so many bytes.
+    /// Creates a capacity of `bytes` bytes.
     ///
     /// # Errors
     /// When `bytes` is not a power of two from 4 KiB to 1 GiB.
@@ -82,31 +82,32 @@ impl Capacity {
         }
     }
 
-    /// A ring so small that models see it wrap at once.
+    /// Creates a ring so small that models see it wrap at once.
     #[cfg(test)]
     pub(crate) fn tiny(bytes: u32) -> Self {
         assert!(bytes.is_power_of_two() && bytes >= 2 * MARK_BYTES, "a ring holds two marks");
         Self(bytes)
     }
 
-    /// Its bytes.
+    /// Returns the number of bytes.
     #[must_use]
     pub const fn bytes(self) -> u32 {
         self.0
     }
 
-    /// The longest message, in bytes. Half the ring, so that it fits into an empty ring wherever that begins.
+    /// Returns the longest message, in bytes. Half the ring, so that it fits into an empty ring at any
+    /// position.
     #[must_use]
     pub const fn payload_max(self) -> u32 {
         self.0 / 2 - MARK_BYTES
     }
 
-    /// The place in the ring of a count of bytes.
+    /// The position in the ring of a count of bytes.
     pub(crate) const fn position(self, count: u32) -> u32 {
         count & (self.0 - 1)
     }
 
-    /// From a count of bytes to where the ring begins again.
+    /// Bytes from a count to the end of the ring.
     pub(crate) const fn rest(self, count: u32) -> u32 {
         self.0 - self.position(count)
     }
@@ -123,10 +124,10 @@ impl fmt::Display for Capacity {
     }
 }
 
-/// What the first eight bytes of a record say.
+/// The content of the first eight bytes of a record.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Mark {
-    /// A message of so many bytes follows.
+    /// A message of this many bytes follows.
     Message(u32),
     /// Nothing until the ring begins again.
     Skip,
@@ -143,7 +144,7 @@ impl Mark {
         }
     }
 
-    /// `None` when no producer of ours writes such a mark.
+    /// Parses a mark. `None` when no valid producer writes such a mark.
     pub(crate) fn from_bits(bits: u64) -> Option<Self> {
         let length = bits as u32;
         match ((bits >> 32) as u32, length) {
@@ -154,7 +155,7 @@ impl Mark {
     }
 }
 
-/// Bytes of a record with a message of `length` bytes; `None` when that is more than can be counted.
+/// Bytes of a record with a message of `length` bytes; `None` when that exceeds the range of counts.
 pub(crate) fn record_bytes(length: u32) -> Option<u32> {
     length.checked_next_multiple_of(MARK_BYTES)?.checked_add(MARK_BYTES)
 }
@@ -164,7 +165,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_capacity_is_a_power_of_two_within_its_limits() {
+    fn capacity_is_a_power_of_two_within_its_limits() {
         for bytes in [4096, 65_536, 1 << 30] {
             assert!(Capacity::new(bytes).is_ok(), "{bytes}");
         }
@@ -174,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mark_is_read_as_it_was_written_and_nothing_else_is_a_mark() {
+    fn mark_round_trips_and_other_bits_are_none() {
         for mark in [Mark::Message(0), Mark::Message(u32::MAX), Mark::Skip] {
             assert_eq!(Mark::from_bits(mark.to_bits()), Some(mark));
         }
@@ -184,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn no_two_header_words_share_a_pair_of_cache_lines_and_all_lie_before_the_ring() {
+    fn header_words_share_no_cache_line_pair() {
         let words = [Word::Tail, Word::Head, Word::ConsumerSleep, Word::ProducerSleep, Word::Rung];
         let pairs: std::collections::BTreeSet<usize> =
             words.iter().map(|word| word.index() * 4 / 128).collect();
@@ -194,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn a_length_near_the_end_of_counting_is_no_record() {
+    fn record_near_the_counting_limit_is_none() {
         assert_eq!(record_bytes(0), Some(8));
         assert_eq!(record_bytes(1), Some(16));
         assert_eq!(record_bytes(u32::MAX), None);

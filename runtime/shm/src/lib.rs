@@ -1,8 +1,9 @@
 //! Message rings in shared memory between two processes that need not trust each other.
 //!
-//! Each side makes one [`Region`]: a sealed piece of memory that only it can write and the other can only read. It holds
-//! the ring of the messages that this side sends and this side's few header words. Both sides exchange an [`Offer`] over a
-//! unix socket, check what they got, and have a [`Producer`] and a [`Consumer`]:
+//! Each side creates one [`Region`]: a sealed piece of memory that only it can write and the other can only
+//! read. It holds the ring of the messages that this side sends and this side's few header words. Both sides
+//! exchange an [`Offer`] over a unix socket, check the other's offer, and have a [`Producer`] and a
+//! [`Consumer`]:
 //!
 //! ```
 //! use std::time::{Duration, Instant};
@@ -20,16 +21,17 @@
 //! loan.publish();                            // now it is a message; dropped instead, it would be given back
 //!
 //! let wait = Wait::until(Instant::now() + Duration::from_secs(1));
-//! let lent = consumer.receive_before(&wait)?;
-//! assert_eq!(lent.to_vec(), b"hello");       // its memory is given back to the producer when `lent` is dropped
+//! let message = consumer.receive_before(&wait)?;
+//! assert_eq!(message.to_vec(), b"hello");    // dropping `message` returns its memory to the producer
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! What a hostile peer can do at worst: send wrong bytes, be silent, take no messages, or make this side say [`Corrupt`].
-//! It cannot make this side read or write outside the ring, crash, hang or grow. The reasons are in
+//! A hostile peer can at worst send wrong bytes, be silent, consume no messages, or cause [`Corrupt`] on this
+//! side. It cannot make this side read or write outside the ring, crash, hang or grow. The reasons are in
 //! `docs/decisions/0010-shared-memory.md`.
 //!
-//! No tokio, no actor, no layer is known here. A reactor waits for [`Consumer::fd`] after [`Consumer::arm`].
+//! This crate does not depend on tokio, actors or layers. A reactor waits for [`Consumer::fd`] after
+//! [`Consumer::arm`].
 
 #![cfg_attr(
     not(target_os = "linux"),
@@ -61,9 +63,9 @@ mod platform;
 #[path = "elsewhere.rs"]
 mod platform;
 
-pub use any::{Any, ENDS_MAX, Ends, Looked, Looking, Waiter};
+pub use any::{Any, ENDS_MAX, Ends, PollResult, Polling, Waiter};
 pub use bell::{Bell, BellKind, CommonBell};
-pub use consumer::{Consumer, Lent, LentReader};
+pub use consumer::{Consumer, MessageReader, ReceivedMessage};
 pub use error::{
     AnyError, Corrupt, CreateError, LoanError, PassError, ReceiveError, RefusedOffer, RoomError,
 };
@@ -76,5 +78,5 @@ pub use region::{Accepted, Region, Terms};
 pub use spin::Spin;
 pub use wait::{Armed, HangUp, Wait};
 
-/// Whether this platform has sealed shared memory; without it [`Region::create`] is refused.
+/// Whether this platform has sealed shared memory; without it [`Region::create`] returns an error.
 pub const SUPPORTED: bool = cfg!(target_os = "linux");

@@ -1,5 +1,5 @@
-//! The two views of shared memory that the protocol needs, and the fence it uses: real ones in `platform`, modelled ones in
-//! tests.
+//! The two views of shared memory that the protocol needs, and the fence that it uses: real ones in
+//! `platform`, modelled ones in tests.
 
 use std::sync::atomic::Ordering;
 
@@ -21,10 +21,10 @@ pub(crate) trait OwnRing: OwnHeader {
     fn put_mark(&mut self, position: u32, bits: u64);
 }
 
-/// The peer's region: whatever is read here may be a lie, and another one the next time.
+/// The peer's region: every value read here may be false, and different the next time.
 pub(crate) trait Peer {
-    /// Reads a word once, relaxed: the mapping is read-only, where nothing stronger is defined. An acquire fence follows
-    /// where the protocol needs one.
+    /// Reads a word once, relaxed: the mapping is read-only, where nothing stronger is defined. An acquire
+    /// fence follows where the protocol needs one.
     fn load(&self, word: Word) -> u32;
 
     /// Reads a mark once, relaxed, at a position that is a multiple of 8 within the ring.

@@ -1,4 +1,4 @@
-//! What a side tells the other: its memory and its bells, as descriptors and a few plain bytes.
+//! The offer of a side to the other: its memory and its bells, as descriptors and a few plain bytes.
 
 use std::{
     io,
@@ -15,11 +15,12 @@ use crate::{
 /// Length of [`Offer::to_bytes`].
 pub const OFFER_BYTES: usize = 24;
 
-/// A region as its peer gets it. Made by [`crate::Region::create`], taken by [`crate::Region::connect`].
+/// A region as its peer receives it. Created by [`crate::Region::create`], consumed by
+/// [`crate::Region::connect`].
 ///
-/// Its bytes, little-endian: magic (8, `SINEWSHM`), version (4), kind of bell (1), zero (3), capacity of the ring (8).
-/// Its descriptors, in this order: the memory; then for a futex the page with both bells, else the bell for messages and the
-/// bell for room.
+/// Its bytes, little-endian: magic (8, `SINEWSHM`), version (4), kind of bell (1), zero (3), capacity of the
+/// ring (8). Its descriptors, in this order: the memory; then for a futex the page with both bells, otherwise
+/// the bell for messages and the bell for room.
 #[derive(Debug)]
 pub struct Offer {
     pub(crate) capacity: Capacity,
@@ -31,19 +32,19 @@ impl Offer {
     /// The most descriptors an offer has.
     pub const DESCRIPTORS_MAX: usize = 3;
 
-    /// Bytes of the ring that is offered.
+    /// Returns the size of the offered ring in bytes.
     #[must_use]
     pub const fn capacity(&self) -> Capacity {
         self.capacity
     }
 
-    /// How the side that offers wants to be woken.
+    /// Returns how the offering side wants to be woken.
     #[must_use]
     pub const fn bell(&self) -> BellKind {
         self.bell
     }
 
-    /// The plain part, for a caller with a frame of its own around it.
+    /// Returns the plain part, for a caller that embeds it in a frame of its own.
     #[must_use]
     pub fn to_bytes(&self) -> [u8; OFFER_BYTES] {
         let mut bytes = [0; OFFER_BYTES];
@@ -54,35 +55,35 @@ impl Offer {
         bytes
     }
 
-    /// The descriptors, to be passed with the plain part and in this order.
+    /// Returns the descriptors, to be passed with the plain part and in this order.
     #[must_use]
     pub fn descriptors(&self) -> &[OwnedFd] {
         &self.descriptors
     }
 
-    /// Sends it over a unix socket: one message with its descriptors beside it. Once it has arrived, this side's copy can be
-    /// dropped.
+    /// Sends it over a unix socket: one message with its descriptors beside it. Once it has arrived, this
+    /// side's copy can be dropped.
     ///
     /// # Errors
-    /// [`PassError::System`], also when a socket that does not block is full.
+    /// [`PassError::System`], also when a non-blocking socket is full.
     pub fn send(&self, socket: impl AsFd) -> Result<(), PassError> {
         platform::send(self, socket.as_fd())
     }
 
-    /// Takes one from a unix socket, on which nothing else may come before it. The descriptors of what is no offer
-    /// are closed; closing what a peer has sent can block (a file on a file system of the peer's own), so this is not for
-    /// a thread that may not.
+    /// Receives an offer from a unix socket, where it must be the next data. The descriptors of an invalid
+    /// offer are closed. Closing a peer's descriptor can block (a file on a file system of the peer's own),
+    /// so this is not for a thread that must not block.
     ///
     /// # Errors
-    /// The outer one as of [`Received::receive`]; the inner one when it is no offer.
+    /// The outer one as of [`Received::receive`]; the inner one when it is not an offer.
     pub fn receive(socket: impl AsFd) -> Result<Result<Self, RefusedOffer>, PassError> {
         Ok(Received::receive(socket)?.into_offer())
     }
 
-    /// An offer from what the peer sent. The descriptors are looked at when it is connected.
+    /// Creates an offer from the data of the peer. The descriptors are checked when it is connected.
     ///
     /// # Errors
-    /// When the bytes are no offer, or the number of descriptors is not what they ask for.
+    /// When the bytes are not an offer, or the number of descriptors is not the one that they require.
     pub fn from_parts(bytes: &[u8; OFFER_BYTES], descriptors: Vec<OwnedFd>) -> Result<Self, RefusedOffer> {
         let (magic, version) = (u64::from_le_bytes(take(bytes, 0)), u32::from_le_bytes(take(bytes, 8)));
         if magic != MAGIC {
@@ -102,33 +103,34 @@ impl Offer {
     }
 }
 
-/// What came where an offer was expected, before any of it is judged or closed.
+/// Data received in the place of an offer, before any of it is validated or closed.
 #[derive(Debug)]
 pub struct Received {
     pub(crate) bytes: [u8; OFFER_BYTES],
-    /// As many as an offer can have, at most.
+    /// At most as many as an offer can have.
     pub(crate) descriptors: Vec<OwnedFd>,
     pub(crate) copies: Vec<OwnedFd>,
 }
 
 impl Received {
-    /// Takes what has an offer's length and no more descriptors than one can have. What has not is left in the socket, as it came: it
-    /// costs this process nothing until the socket is emptied or closed, which can block. Nothing that this closes can.
+    /// Receives a message of an offer's length with no more descriptors than an offer can have. Other data is
+    /// left in the socket, unchanged: it costs this process nothing until the socket is drained or closed,
+    /// which can block. No close in this function can block.
     ///
     /// # Errors
-    /// [`PassError::Closed`], [`PassError::Broken`], and [`PassError::System`]: also when a socket that does not block has nothing, and
-    /// when this process has no descriptor left; then the offer is still there.
+    /// [`PassError::Closed`], [`PassError::Broken`], and [`PassError::System`]: also when a non-blocking
+    /// socket is empty, and when this process has no descriptor left; then the offer is still there.
     pub fn receive(socket: impl AsFd) -> Result<Self, PassError> {
         platform::receive(socket.as_fd())
     }
 
-    /// Further copies of the descriptors; none the second time. While they live nothing that becomes of this is the last close of what
-    /// the peer has passed, the only one that can block.
+    /// Returns further copies of the descriptors; none the second time. While these exist, no close of this
+    /// value's descriptors is the last one of the peer's, the only one that can block.
     pub fn copies(&mut self) -> Vec<OwnedFd> {
         std::mem::take(&mut self.copies)
     }
 
-    /// The offer that it is. What does not belong to one is closed.
+    /// Converts the data into the offer. Data that does not belong to one is closed.
     ///
     /// # Errors
     /// As [`Offer::from_parts`].
@@ -137,38 +139,41 @@ impl Received {
     }
 }
 
-/// Whether descriptors may come over a unix socket.
+/// Whether descriptors may arrive over a unix socket.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Descriptors {
-    /// The system refuses them to who sends them (`EPERM`).
+    /// The system rejects them at the sender (`EPERM`).
     Refused,
-    /// They come, as they do unless somebody has refused them.
+    /// They arrive: the default of the system.
     Taken,
 }
 
-/// Says whether descriptors may come over `socket` from now on; what has come already stays. A connection inherits it from
-/// the socket that listens.
+/// Sets whether descriptors may arrive over `socket` from now on; data that has arrived already stays. A
+/// connection inherits it from the listening socket.
 ///
 /// # Errors
-/// The system does not know how to refuse them: Linux before 6.16. Then they can come, and nothing else has changed.
+/// The system cannot refuse them: Linux before 6.16. Then they can arrive, and nothing else has changed.
 pub fn set_descriptors(socket: impl AsFd, which: Descriptors) -> io::Result<()> {
     platform::set_descriptors(socket.as_fd(), which)
 }
 
-/// Says that a byte which is sent to `socket` as urgent comes in its place among the others. Else it is passed over by who looks at what is there,
-/// with the descriptors beside it, and closed with them by whoever reads on, or closes the socket. Holds for what has come already, too.
+/// Makes an urgent byte that is sent to `socket` arrive in its place among the others. Otherwise a peek skips
+/// it, with its descriptors. These are then closed when the reader reads on or closes the socket. Applies to
+/// data that has arrived already, too.
 ///
 /// # Errors
-/// It is no socket.
+/// It is not a socket.
 pub fn keep_urgent_in_line(socket: impl AsFd) -> io::Result<()> {
     platform::keep_urgent_in_line(socket.as_fd())
 }
 
-/// Returns a descriptor of the process that has connected at the other end of a unix socket, or that listens there. It is readable when
-/// that process has ended, also where its number is unknown because it lives in another PID namespace.
+/// Returns a descriptor of the process that has connected at the other end of a unix socket, or that listens
+/// there. It is readable when that process has ended, also if its ID is unknown because it lives in another
+/// PID namespace.
 ///
 /// # Errors
-/// The system does not have it: Linux before 6.5. Or the process has ended and was reaped (ESRCH or EINVAL).
+/// The system does not support it: Linux before 6.5. Or the process has ended and was reaped (ESRCH or
+/// EINVAL).
 pub fn peer_pidfd(socket: impl AsFd) -> io::Result<OwnedFd> {
     platform::peer_pidfd(socket.as_fd())
 }
@@ -185,7 +190,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_bytes_are_an_offer_or_an_error(bytes: [u8; OFFER_BYTES], like_ours: bool) {
+        fn any_bytes_give_an_offer_or_an_error(bytes: [u8; OFFER_BYTES], like_ours: bool) {
             let mut bytes = bytes;
             if like_ours {
                 bytes[..8].copy_from_slice(&MAGIC.to_le_bytes());
@@ -196,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn another_version_is_refused_with_both_versions() {
+    fn other_version_is_rejected_with_both_versions() {
         let offer = Offer { capacity: Capacity::MIN, bell: BellKind::Futex, descriptors: Vec::new() };
         let mut bytes = offer.to_bytes();
         bytes[8] = 9;

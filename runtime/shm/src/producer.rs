@@ -1,4 +1,4 @@
-//! Sending: room in the ring is lent, written in place, and published or given back.
+//! Sending: room in the ring is loaned, written in place, and published or returned.
 
 use std::{
     fmt,
@@ -8,8 +8,8 @@ use std::{
 };
 
 use crate::{
-    bell::{Doorbell, Heard, Woken},
-    core::{ProducerCore, producer::Reserved, sleep::Ear},
+    bell::{BellState, Doorbell, Woken},
+    core::{ProducerCore, producer::Reserved, sleep::WakePlace},
     error::{Corrupt, LoanError, RoomError},
     platform::{OwnRingMemory, PeerMemory},
     spin::{Spin, Spinner},
@@ -33,28 +33,28 @@ impl Producer {
         Self { core, room, message_button, spinner: Spinner::new(Spin::Off) }
     }
 
-    /// What this end does before it sleeps in [`Producer::loan_before`]. [`Spin::Off`] at first.
+    /// Sets how this end spins before it sleeps in [`Producer::loan_before`]. [`Spin::Off`] at first.
     pub const fn set_spin(&mut self, spin: Spin) {
         self.spinner = Spinner::new(spin);
     }
 
-    /// The longest message, in bytes: half the ring, less 8.
+    /// Returns the longest message, in bytes: half the ring, less 8.
     #[must_use]
     pub const fn payload_max(&self) -> usize {
         self.core.capacity().payload_max() as usize
     }
 
-    /// Lends memory in the ring for a message of so many bytes. What is in it is left over from earlier messages to the
-    /// same peer. Nobody sees it before [`Loan::publish`]; dropped, it is given back.
+    /// Lends memory in the ring for a message of `length` bytes. It still contains bytes of earlier messages
+    /// to the same peer. The peer does not see it before [`Loan::publish`]; a dropped loan is returned.
     ///
     /// # Errors
-    /// [`LoanError::Full`] when the peer has not taken enough yet: nothing changed.
+    /// [`LoanError::Full`] when the peer has not consumed enough yet: nothing changed.
     pub fn loan(&mut self, length: usize) -> Result<Loan<'_>, LoanError> {
         let reserved = self.core.reserve(length)?;
         Ok(Loan { producer: self, reserved })
     }
 
-    /// As [`Producer::loan`], and waits for room.
+    /// Same as [`Producer::loan`], and waits for room.
     ///
     /// # Errors
     /// [`RoomError::TimedOut`] at the deadline, [`RoomError::HungUp`] when the peer is gone.
@@ -63,7 +63,7 @@ impl Producer {
         Ok(Loan { producer: self, reserved })
     }
 
-    /// Takes up again what [`Loan::set_aside`] left.
+    /// Resumes the loan that [`Loan::set_aside`] left.
     pub const fn resume(&mut self) -> Option<Loan<'_>> {
         match self.core.reserved() {
             Some(reserved) => Some(Loan { producer: self, reserved }),
@@ -71,7 +71,7 @@ impl Producer {
         }
     }
 
-    /// The memory that [`Loan::set_aside`] left; empty if there is none.
+    /// Returns the memory that [`Loan::set_aside`] left; empty if there is none.
     #[must_use]
     pub fn aside(&self) -> &[u8] {
         let reserved = self.core.reserved();
@@ -80,7 +80,7 @@ impl Producer {
         })
     }
 
-    /// The same, to be written.
+    /// Returns the same memory, to be written.
     pub fn aside_mut(&mut self) -> &mut [u8] {
         match self.core.reserved() {
             Some(reserved) => {
@@ -102,8 +102,8 @@ impl Producer {
         Ok(())
     }
 
-    /// Announces that a reactor is about to wait for [`Producer::fd`] until there is room for `length` bytes. Followed by
-    /// [`Producer::disarm`] in any case but [`Armed::Ready`].
+    /// Announces that a reactor is about to wait for [`Producer::fd`] until there is room for `length` bytes.
+    /// Must be followed by [`Producer::disarm`], except after [`Armed::Ready`].
     ///
     /// # Errors
     /// [`LoanError::TooLong`] or [`LoanError::Corrupt`]; never `Full`.
@@ -111,36 +111,39 @@ impl Producer {
         self.core.arm(length)
     }
 
-    /// Says that the reactor is awake, and forgets the rings so far.
+    /// Announces that the reactor is awake, and discards the rings so far.
     pub fn disarm(&mut self) {
         self.core.disarm();
         self.room.drain();
     }
 
-    /// What a reactor waits for (readable) while armed; `None` for a futex.
+    /// Returns the descriptor that a reactor waits for (readable) while armed; `None` for a futex.
     #[must_use]
     pub fn fd(&self) -> Option<BorrowedFd<'_>> {
         self.room.fd()
     }
 
-    /// Bytes of the ring that were ever used for messages; wraps. What this grows by with a message is that message's.
+    /// Returns the number of bytes of the ring that were ever used for messages; wraps. The increase by a
+    /// message is the share of that message.
     #[must_use]
     pub const fn published(&self) -> u32 {
         self.core.published()
     }
 
-    /// Bytes of those that the peer has not taken yet. A message among them was not read by an honest peer.
+    /// Returns how many of those bytes the peer has not consumed yet. An honest peer has not read a message
+    /// among them.
     ///
     /// # Errors
-    /// The peer's fault: its count cannot be.
-    pub fn untaken(&mut self) -> Result<u32, Corrupt> {
-        self.core.untaken()
+    /// The peer's fault: its count is impossible.
+    pub fn unread(&mut self) -> Result<u32, Corrupt> {
+        self.core.unread()
     }
 
-    /// Wakes the peer without a message, so that it looks whether this side is still there. For who is about to go.
+    /// Wakes the peer without a message, so that it checks whether this side is still present. For a side
+    /// that is about to leave.
     pub fn ring(&self) {
         self.message_button.ring();
-        self.core.say_rung_anyhow();
+        self.core.force_ring_report();
         self.core.own.wake_rung();
     }
 
@@ -150,16 +153,17 @@ impl Producer {
         self.core.peer_sleeps()
     }
 
-    /// Wakes the consumer, which sleeps.
+    /// Wakes the sleeping consumer.
     fn wake(&self) {
-        match self.core.ear() {
-            // Said afterwards: a sleeper that finds it said, and was not woken, has been robbed of the ring.
-            Ear::Bell => {
+        match self.core.wake_place() {
+            // Reported after the wake: a sleeper that sees the report, and was not woken, has lost a ring to
+            // another peer.
+            WakePlace::Bell => {
                 self.message_button.ring();
-                self.core.say_rung();
+                self.core.report_ring();
             }
-            Ear::Own => {
-                self.core.say_rung();
+            WakePlace::Own => {
+                self.core.report_ring();
                 self.core.own.wake_rung();
             }
         }
@@ -186,9 +190,9 @@ impl Producer {
             return Ok(reserved);
         }
         loop {
-            let heard = self.room.listen();
+            let seen = self.room.listen();
             let ended = match self.core.arm(length) {
-                Ok(Armed::Sleep) => self.sleep(heard, &waiting)?,
+                Ok(Armed::Sleep) => self.sleep(seen, &waiting)?,
                 Ok(Armed::Ready) => Woken::Rung,
                 Err(LoanError::Corrupt(corrupt)) => return Err(corrupt.into()),
                 Err(LoanError::TooLong { asked, max } | LoanError::Full { asked, free: max }) => {
@@ -206,8 +210,8 @@ impl Producer {
         }
     }
 
-    fn sleep(&mut self, heard: Heard, waiting: &Waiting<'_>) -> Result<Woken, RoomError> {
-        let ended = self.room.sleep(heard, waiting);
+    fn sleep(&mut self, seen: BellState, waiting: &Waiting<'_>) -> Result<Woken, RoomError> {
+        let ended = self.room.sleep(seen, waiting);
         self.core.disarm();
         ended.map_err(RoomError::System)
     }
@@ -221,7 +225,7 @@ impl Producer {
         }
     }
 
-    /// Whether the peer was caught writing nonsense by this end.
+    /// Returns the error that this end detected in the peer's memory, if any.
     #[must_use]
     pub const fn corrupt(&self) -> Option<Corrupt> {
         self.core.corrupt()
@@ -242,7 +246,7 @@ pub struct Loan<'a> {
 }
 
 impl Loan<'_> {
-    /// Makes it a message. The peer is woken if it sleeps: then, and only then, this is a system call.
+    /// Publishes it as a message. The peer is woken if it sleeps: then, and only then, this is a system call.
     pub fn publish(self) {
         let producer = &mut *self.producer;
         if producer.core.publish() {
@@ -250,16 +254,17 @@ impl Loan<'_> {
         }
     }
 
-    /// Makes it shorter: what was asked for was an upper bound. A longer length changes nothing.
+    /// Shortens it: the requested length was an upper bound. A longer length changes nothing.
     pub fn truncate(&mut self, length: usize) {
         let shorter = u32::try_from(length).unwrap_or(u32::MAX).min(self.reserved.length);
         self.producer.core.shorten(shorter);
         self.reserved.length = shorter;
     }
 
-    /// Keeps the memory without the borrow, until [`Producer::resume`] takes it up or another loan takes its place.
+    /// Keeps the memory without the borrow, until [`Producer::resume`] continues it or another loan replaces
+    /// it.
     pub fn set_aside(self) {
-        // Its drop would give the memory back. Nothing else is in it but a borrow.
+        // Its drop would return the memory. It contains only a borrow.
         std::mem::forget(self);
     }
 }
@@ -282,7 +287,7 @@ impl DerefMut for Loan<'_> {
 
 impl Drop for Loan<'_> {
     fn drop(&mut self) {
-        // After `publish` nothing is reserved any more.
+        // After `publish` no room is reserved any more.
         self.producer.core.give_back();
     }
 }

@@ -1,4 +1,4 @@
-//! A side's own memory, and how two sides come together.
+//! A side's own memory, and the connection of two sides.
 
 use std::os::fd::BorrowedFd;
 
@@ -13,7 +13,8 @@ use crate::{
     producer::Producer,
 };
 
-/// One side's memory: the ring of what it sends, and its header. Only this side can write it, ever: the system sees to that.
+/// One side's memory: the ring of its sent messages, and its header. Only this side can ever write it: the
+/// system enforces that.
 pub struct Region {
     pub(crate) capacity: Capacity,
     own: platform::OwnMemory,
@@ -21,12 +22,13 @@ pub struct Region {
     room: Box<dyn Doorbell>,
 }
 
-/// What this side accepts from a peer.
+/// The offers that this side accepts from a peer.
 #[derive(Clone, Debug)]
 pub struct Terms {
-    /// The largest ring of the peer's that this side maps. Its memory is the peer's, its addresses are this side's.
+    /// The largest ring of the peer that this side maps. The memory is charged to the peer, the address space
+    /// to this side.
     pub capacity_max: Capacity,
-    /// How the peer may ask to be woken. [`BellKind::EventFd`] is for trusted peers.
+    /// The kinds of bell that the peer may use. [`BellKind::EventFd`] is for trusted peers.
     pub bells: Vec<BellKind>,
 }
 
@@ -41,11 +43,12 @@ impl Default for Terms {
 }
 
 impl Region {
-    /// Makes memory for a ring of this capacity, filled with zeros and sealed, and what the peer needs to use it. `bell` is
-    /// how this side wants to be woken. There is no name in any file system, and all is gone when both sides are.
+    /// Creates memory for a ring of this capacity, filled with zeros and sealed, and the offer for the peer.
+    /// `bell` is how this side wants to be woken. It has no name in any file system, and is freed when both
+    /// sides are gone.
     ///
     /// # Errors
-    /// [`CreateError::Unsupported`] where there is no sealed memory; else what the system said.
+    /// [`CreateError::Unsupported`] where there is no sealed memory; otherwise the error of the system.
     pub fn create(capacity: Capacity, bell: impl Into<Bell>) -> Result<(Self, Offer), CreateError> {
         let (own, memory) = platform::create(capacity)?;
         let bell = bell.into();
@@ -55,17 +58,18 @@ impl Region {
         Ok((Self { capacity, own, message, room }, Offer { capacity, bell, descriptors }))
     }
 
-    /// Maps what the peer offers, if it is what it has to be. The region is used up either way.
+    /// Maps the peer's offer, if it is valid. The region is consumed either way.
     ///
     /// # Errors
-    /// Whose fault and what; then nothing of the offer is kept.
+    /// The fault and its party; then nothing of the offer is kept.
     pub fn connect(self, peer: Offer, terms: &Terms) -> Result<(Producer, Consumer), RefusedOffer> {
         let accepted = self.accept(peer, terms)?;
         Ok(self.join(accepted))
     }
 
-    /// Maps what the peer offers, if it is what it has to be. The region stays, for a caller who may not close it: what a peer that
-    /// knows this side's bells has passed in them goes with them, which can block.
+    /// Maps the peer's offer, if it is valid. The region remains, for a caller that must not close it. Its
+    /// bells may hold descriptors from a peer that knows them; these are closed with the region, which can
+    /// block.
     ///
     /// # Errors
     /// As of [`connect`](Self::connect).
@@ -84,7 +88,7 @@ impl Region {
         Ok(Accepted { peer, capacity: theirs, message, room })
     }
 
-    /// Both rings, this side's and the one that was accepted.
+    /// Joins both rings, this side's and the accepted one.
     #[must_use]
     pub fn join(self, peer: Accepted) -> (Producer, Consumer) {
         let Accepted { peer, capacity: theirs, message, room } = peer;
@@ -94,21 +98,21 @@ impl Region {
         (Producer::new(producer, self.room, message), Consumer::new(consumer, self.message, room))
     }
 
-    /// The descriptors of this side's bells, for messages and for room; `None` for a futex.
+    /// Returns the descriptors of this side's bells, for messages and for room; `None` for a futex.
     #[must_use]
     pub fn bells(&self) -> [Option<BorrowedFd<'_>>; 2] {
         [self.message.fd(), self.room.fd()]
     }
 
-    /// Writes any value at any place: what a hostile peer does. `place` counts 32-bit words from the region's beginning
-    /// and is taken modulo their number.
+    /// Writes any value at any place, like a hostile peer. `place` counts 32-bit words from the region's
+    /// beginning and is taken modulo their number.
     #[cfg(any(test, feature = "hostile-peer"))]
     pub fn scribble(&mut self, place: u32, value: u32) {
         self.own.scribble(place, value);
     }
 }
 
-/// A peer's memory, mapped, and its bells: what it has offered, and was all right. To be used by [`Region::join`].
+/// A peer's validated memory, mapped, and its bells. For [`Region::join`].
 pub struct Accepted {
     peer: platform::PeerMemory,
     capacity: Capacity,

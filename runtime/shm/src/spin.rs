@@ -1,27 +1,29 @@
-//! Looking for a while before sleeping: whether, how long, and what is learned from it.
+//! Spinning before a sleep: whether, how long, and its adaptation.
 
 use std::time::Duration;
 
-/// What a thread does before it sleeps. Spinning keeps a CPU busy and saves the wake, which is most of a short message's way.
+/// How a thread spins before it sleeps. Spinning keeps a CPU busy and saves the wake, which is most of the
+/// latency of a short message.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Spin {
-    /// Sleeps at once. Right when CPUs are shared or power counts.
+    /// Sleeps at once. For shared CPUs, or to save power.
     #[default]
     Off,
-    /// Looks for this long, and never beyond the deadline of the wait. Right when the thread has a CPU of its own. That the peer has ended
-    /// is seen after the look.
+    /// Spins for this long, and never beyond the deadline of the wait. For a thread with a CPU of its own.
+    /// The end of the peer is noticed after the spin.
     For(Duration),
-    /// Looks about twice as long as messages lately took to come, and not at all when they take longer than `max`.
+    /// Spins about twice as long as messages lately took to arrive, and not at all when they take longer than
+    /// `max`.
     Adaptive {
-        /// The longest to look.
+        /// The longest spin.
         max: Duration,
     },
 }
 
-/// Of so many waits that did not spin, one does: the peer may have become quicker.
+/// One of this many waits without a spin does spin: the peer may have become faster.
 const PROBE_EVERY: u32 = 64;
 
-/// How long to spin now. Pure: times come in as arguments.
+/// The length of the next spin. Pure: times are arguments.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Spinner {
     spin: Spin,
@@ -39,7 +41,7 @@ impl Spinner {
         Self { spin, budget, without: 0 }
     }
 
-    /// How long to look before the sleep that comes now.
+    /// Returns how long to spin before the next sleep.
     pub(crate) fn begin(&mut self) -> Duration {
         let Spin::Adaptive { max } = self.spin else {
             return self.budget;
@@ -55,7 +57,7 @@ impl Spinner {
         max
     }
 
-    /// Takes into account how long the wait was, asleep or not.
+    /// Records the length of the wait, asleep or not.
     pub(crate) fn learn(&mut self, waited: Duration) {
         if let Spin::Adaptive { max } = self.spin {
             self.budget = if waited < max {
@@ -68,7 +70,7 @@ impl Spinner {
         }
     }
 
-    /// Whether `learn` has any use for a time: reading the clock costs.
+    /// Whether `learn` uses its argument: reading the clock has a cost.
     pub(crate) const fn learns(&self) -> bool {
         matches!(self.spin, Spin::Adaptive { .. })
     }
@@ -81,7 +83,7 @@ mod tests {
     const MAX: Duration = Duration::from_micros(50);
 
     #[test]
-    fn off_never_spins_and_a_fixed_time_always_does() {
+    fn off_never_spins_and_fixed_always_does() {
         let (mut off, mut fixed) = (Spinner::new(Spin::Off), Spinner::new(Spin::For(MAX)));
         for _ in 0..1_000 {
             assert_eq!((off.begin(), fixed.begin()), (Duration::ZERO, MAX));
@@ -91,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn adaptive_gives_up_on_a_slow_peer_and_then_only_probes() {
+    fn adaptive_stops_for_a_slow_peer_and_probes() {
         let mut spinner = Spinner::new(Spin::Adaptive { max: MAX });
         for _ in 0..8 {
             spinner.begin();
@@ -106,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn adaptive_finds_a_peer_that_became_quick_within_one_probe() {
+    fn adaptive_finds_a_faster_peer_within_one_probe() {
         let mut spinner = Spinner::new(Spin::Adaptive { max: MAX });
         for _ in 0..8 {
             spinner.begin();

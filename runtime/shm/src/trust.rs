@@ -1,15 +1,15 @@
-//! Whether a thread sleeps at the bell that all its peers can write, or at words of which each has one writer. Pure.
+//! The choice of the sleeping place: the bell that all peers can write, or words with one writer each. Pure.
 
 use std::time::{Duration, Instant};
 
-use crate::core::sleep::Ear;
+use crate::core::sleep::WakePlace;
 
-/// How long the bell is not slept at when a ring was robbed for the first time. Each further time it is twice as long.
+/// Time for which the bell is avoided after the first lost ring. Each further time it is twice as long.
 const FIRST: Duration = Duration::from_secs(10);
-/// After so many times it stays as long: 21 minutes.
+/// After this many times it stays the same: 21 minutes.
 const DOUBLINGS_MAX: u32 = 7;
 
-/// What a thread has learned about the bell that its peers have in common.
+/// A thread's record of the bell that its peers have in common.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Trust {
     doubts: u32,
@@ -21,15 +21,15 @@ impl Trust {
         Self { doubts: 0, until: None }
     }
 
-    /// Where to sleep now. The clock is read where that makes a difference.
-    pub(crate) fn ear(&self, now: impl FnOnce() -> Instant) -> Ear {
+    /// Returns where to sleep now. The clock is read only if that makes a difference.
+    pub(crate) fn wake_place(&self, now: impl FnOnce() -> Instant) -> WakePlace {
         match self.until {
-            Some(until) if now() < until => Ear::Own,
-            Some(_) | None => Ear::Bell,
+            Some(until) if now() < until => WakePlace::Own,
+            Some(_) | None => WakePlace::Bell,
         }
     }
 
-    /// A peer has rung, and the sleeper was not woken.
+    /// Records that a peer has rung, and the sleeper was not woken.
     pub(crate) fn doubt(&mut self, now: Instant) {
         self.until = Some(now + FIRST * 2_u32.pow(self.doubts));
         self.doubts = (self.doubts + 1).min(DOUBLINGS_MAX);
@@ -41,14 +41,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_bell_that_was_robbed_is_not_slept_at_for_a_while_that_doubles_up_to_a_bound() {
+    fn bell_that_lost_rings_is_avoided_for_doubling_times() {
         let (mut trust, mut now) = (Trust::new(), Instant::now());
-        assert_eq!(trust.ear(|| now), Ear::Bell);
+        assert_eq!(trust.wake_place(|| now), WakePlace::Bell);
         for times in [1, 2, 4, 8, 16, 32, 64, 128, 128, 128] {
             trust.doubt(now);
             now += FIRST * times;
-            assert_eq!(trust.ear(|| now - Duration::from_nanos(1)), Ear::Own, "{times}");
-            assert_eq!(trust.ear(|| now), Ear::Bell, "{times}");
+            assert_eq!(trust.wake_place(|| now - Duration::from_nanos(1)), WakePlace::Own, "{times}");
+            assert_eq!(trust.wake_place(|| now), WakePlace::Bell, "{times}");
         }
     }
 }

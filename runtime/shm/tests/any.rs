@@ -40,7 +40,7 @@ impl Ends for Sides {
     }
 }
 
-/// The other end of a side; dropping it is the end of a peer.
+/// The other end of a side; dropping it ends the peer.
 struct Peer {
     producer: Producer,
     _socket: UnixStream,
@@ -61,7 +61,7 @@ fn sides(count: usize) -> (Sides, Vec<Peer>) {
     (Sides(sides), peers)
 }
 
-/// The same, who all ring one bell.
+/// The same, with one bell that all peers ring.
 fn sides_with_one_bell(count: usize) -> (Sides, Vec<Peer>) {
     let bell = CommonBell::create().expect("a page");
     let (sides, peers) = (0..count).map(|_| pair(Bell::Common(bell.clone()))).unzip();
@@ -73,7 +73,7 @@ fn in_time() -> Instant {
 }
 
 #[test]
-fn every_message_of_every_peer_wakes_the_one_who_sleeps() {
+fn each_message_of_each_peer_wakes_the_sleeper() {
     let looks = Spin::Adaptive { max: Duration::from_micros(50) };
     for (make, count, spin) in [
         (sides as fn(usize) -> (Sides, Vec<Peer>), 1, Spin::Off),
@@ -109,8 +109,8 @@ fn every_message_of_every_peer_wakes_the_one_who_sleeps() {
 }
 
 #[test]
-fn the_end_of_one_peer_is_told_after_all_that_was_said() {
-    // given: the second of three says something and goes
+fn end_of_a_peer_is_reported_after_its_messages() {
+    // given: the second of three sends a message and leaves
     let (mut ends, mut peers) = sides(3);
     let mut second = peers.remove(1);
     second.producer.send(b"last words").expect("room");
@@ -123,7 +123,7 @@ fn the_end_of_one_peer_is_told_after_all_that_was_said() {
 }
 
 #[test]
-fn who_is_rung_for_nothing_sees_the_end_at_once() {
+fn ring_without_message_reveals_the_end_at_once() {
     let (mut ends, mut peers) = sides(2);
     let gone = peers.remove(0);
     let waiting =
@@ -134,7 +134,7 @@ fn who_is_rung_for_nothing_sees_the_end_at_once() {
 }
 
 #[test]
-fn nothing_until_the_deadline_is_said_and_a_past_deadline_is_a_look() {
+fn wait_times_out_and_past_deadline_only_checks() {
     let (mut ends, mut peers) = sides(2);
     let mut waiter = Waiter::new(Spin::For(Duration::from_micros(10)));
     let started = Instant::now();
@@ -146,7 +146,7 @@ fn nothing_until_the_deadline_is_said_and_a_past_deadline_is_a_look() {
 }
 
 #[test]
-fn what_cannot_be_waited_for_together_is_refused() {
+fn invalid_combination_of_consumers_is_rejected() {
     let (odd, _peer) = pair(BellKind::Socket);
     let error = Waiter::new(Spin::Off).wait(&mut Sides(vec![odd]), in_time()).expect_err("no futex");
     assert!(matches!(error, AnyError::System(_)), "{error}");

@@ -1,4 +1,4 @@
-//! Two sides in one process, over real sealed memory: the connection as a user has it.
+//! Two sides in one process, over real sealed memory: the connection as a user sees it.
 #![cfg(target_os = "linux")]
 
 use std::{
@@ -23,7 +23,8 @@ fn terms() -> Terms {
     Terms { bells: BELLS.to_vec(), ..Terms::default() }
 }
 
-/// One direction of a connection; the other one's ends are returned too, as a connection lives as long as its parts.
+/// One direction of a connection; the ends of the other one are returned too, as a connection lives as long
+/// as its parts.
 fn pair(capacity: u64, bell: BellKind) -> (Producer, Consumer, (Consumer, Producer)) {
     let capacity = Capacity::new(capacity).expect("a power of two");
     let (left, left_offer) = Region::create(capacity, bell).expect("a region");
@@ -38,7 +39,7 @@ fn soon() -> Wait<'static> {
 }
 
 #[test]
-fn messages_arrive_whole_and_in_order_whatever_their_length_bell_and_spin() {
+fn messages_arrive_whole_and_in_order() {
     for bell in BELLS {
         for spin in [
             Spin::Off,
@@ -70,7 +71,7 @@ fn messages_arrive_whole_and_in_order_whatever_their_length_bell_and_spin() {
 }
 
 #[test]
-fn a_loan_is_memory_in_the_ring_that_nobody_sees_until_it_is_published() {
+fn loan_is_invisible_until_it_is_published() {
     let (mut producer, mut consumer, _rest) = pair(4096, BellKind::Futex);
     // given: one dropped, one cut short, one set aside
     producer.loan(100).expect("room").fill(1);
@@ -93,7 +94,7 @@ fn a_loan_is_memory_in_the_ring_that_nobody_sees_until_it_is_published() {
 }
 
 #[test]
-fn a_message_is_lent_again_until_its_lending_has_ended() {
+fn message_is_lent_again_until_its_loan_ends() {
     let (mut producer, mut consumer, _rest) = pair(4096, BellKind::Futex);
     producer.send(b"once").expect("room");
     std::mem::forget(consumer.receive().expect("honest"));
@@ -102,7 +103,7 @@ fn a_message_is_lent_again_until_its_lending_has_ended() {
 }
 
 #[test]
-fn a_message_is_read_in_pieces_and_from_anywhere() {
+fn message_is_read_in_pieces_from_any_offset() {
     let (mut producer, mut consumer, _rest) = pair(4096, BellKind::Futex);
     let sent: Vec<u8> = (0..=255).collect();
     producer.send(&sent).expect("room");
@@ -118,7 +119,7 @@ fn a_message_is_read_in_pieces_and_from_anywhere() {
 }
 
 #[test]
-fn a_full_ring_says_what_would_fit_and_no_message_is_longer_than_half_of_it() {
+fn full_ring_reports_the_room_that_is_left() {
     let (mut producer, mut consumer, _rest) = pair(4096, BellKind::Futex);
     assert_eq!((producer.payload_max(), consumer.payload_max()), (2040, 2040));
     assert_eq!(producer.loan(2041).map(drop), Err(LoanError::TooLong { asked: 2041, max: 2040 }));
@@ -136,7 +137,7 @@ fn a_full_ring_says_what_would_fit_and_no_message_is_longer_than_half_of_it() {
 }
 
 #[test]
-fn waiting_ends_at_its_deadline_with_every_bell_however_long_it_looks_before_it_sleeps() {
+fn wait_ends_at_its_deadline_with_every_bell() {
     let max = Duration::from_secs(60);
     for (bell, spin) in BELLS
         .into_iter()
@@ -160,14 +161,14 @@ fn waiting_ends_at_its_deadline_with_every_bell_however_long_it_looks_before_it_
 }
 
 #[test]
-fn who_sleeps_is_woken_by_a_message_and_by_room_with_every_bell() {
+fn sleeper_is_woken_by_message_and_by_room() {
     for bell in BELLS {
         let (mut producer, mut consumer, _rest) = pair(4096, bell);
         let (asleep, was_asleep) = sync_channel(0);
         let receiving = thread::spawn(move || {
             for _ in 0..50 {
                 asleep.send(()).expect("the test waits");
-                // Its end is the claim: without a wake this times out.
+                // The return is the claim: without a wake this times out.
                 assert_eq!(consumer.receive_before(&soon()).expect("woken").to_vec(), [5; 2040]);
             }
         });
@@ -181,7 +182,7 @@ fn who_sleeps_is_woken_by_a_message_and_by_room_with_every_bell() {
 }
 
 #[test]
-fn a_reactor_is_told_by_a_descriptor_and_never_sleeps_on_a_message() {
+fn reactor_is_notified_and_never_sleeps_on_a_message() {
     for bell in [BellKind::EventFd, BellKind::Socket] {
         let (mut producer, mut consumer, _rest) = pair(4096, bell);
         let readable = |fd: std::os::fd::BorrowedFd<'_>| {
@@ -190,7 +191,7 @@ fn a_reactor_is_told_by_a_descriptor_and_never_sleeps_on_a_message() {
                 .expect("poll")
                 == 1
         };
-        // when nobody sleeps, then nothing rings
+        // when no side sleeps, then no ring
         producer.send(b"1").expect("room");
         assert!(!readable(consumer.fd().expect("it has one")));
         assert_eq!(consumer.arm().expect("honest"), Armed::Ready);
@@ -215,7 +216,7 @@ fn a_reactor_is_told_by_a_descriptor_and_never_sleeps_on_a_message() {
 }
 
 #[test]
-fn a_peer_that_is_gone_is_noticed_after_its_last_message() {
+fn departed_peer_is_noticed_after_its_last_message() {
     for bell in BELLS {
         // given
         let (mut producer, mut consumer, rest) = pair(4096, bell);
@@ -231,14 +232,14 @@ fn a_peer_that_is_gone_is_noticed_after_its_last_message() {
 }
 
 #[test]
-fn an_offer_passes_over_a_socket() {
+fn offer_passes_over_a_socket() {
     for bell in BELLS {
         // given
         let (left, right) = UnixStream::pair().expect("a pair");
         let (here, offer) = Region::create(Capacity::MIN, bell).expect("a region");
         offer.send(&left).expect("an empty socket");
         drop(offer);
-        // when: the other side takes it and answers with its own
+        // when: the other side receives it and answers with its own
         let taken = Offer::receive(&right).expect("whole").expect("an offer");
         assert_eq!((taken.capacity(), taken.bell()), (Capacity::MIN, bell));
         let (there, answer) = Region::create(Capacity::MIN, bell).expect("a region");
@@ -253,7 +254,7 @@ fn an_offer_passes_over_a_socket() {
 }
 
 #[test]
-fn what_is_no_whole_offer_is_refused() {
+fn incomplete_offer_is_rejected() {
     use std::io::Write;
     let (mut left, right) = UnixStream::pair().expect("a pair");
     left.write_all(b"SINEWSHM").expect("room");
@@ -261,7 +262,7 @@ fn what_is_no_whole_offer_is_refused() {
         Offer::receive(&right),
         Err(PassError::Broken { bytes: 8, descriptors: 0, cut: false })
     ));
-    // It was left there, and has an offer's length with what comes now.
+    // It was left there, and has an offer's length with the bytes that arrive now.
     left.write_all(&[0; 16]).expect("room");
     assert!(matches!(
         Offer::receive(&right),
@@ -276,7 +277,7 @@ fn what_is_no_whole_offer_is_refused() {
 }
 
 #[test]
-fn what_has_more_descriptors_than_an_offer_stays_in_the_socket() {
+fn message_with_too_many_descriptors_stays_in_the_socket() {
     use std::{io::IoSlice, mem::MaybeUninit, os::fd::AsFd};
 
     use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
@@ -292,7 +293,7 @@ fn what_has_more_descriptors_than_an_offer_stays_in_the_socket() {
     };
     for count in [Offer::DESCRIPTORS_MAX + 1, 253] {
         pass(count);
-        // Each time: nothing of it is taken.
+        // Each time: nothing of it is read.
         for _ in 0..2 {
             let broken = Offer::receive(&right).expect_err("too many");
             assert!(
@@ -310,7 +311,7 @@ fn what_has_more_descriptors_than_an_offer_stays_in_the_socket() {
 }
 
 #[test]
-fn terms_bound_what_a_peer_can_ask_for() {
+fn terms_bound_a_peers_offers() {
     // given
     let region = || Region::create(Capacity::MIN, BellKind::Futex).expect("a region").0;
     let offer = |capacity, bell| Region::create(capacity, bell).expect("a region").1;
@@ -325,7 +326,7 @@ fn terms_bound_what_a_peer_can_ask_for() {
 }
 
 #[test]
-fn a_descriptor_that_is_no_bell_is_refused() {
+fn descriptor_that_is_no_bell_is_rejected() {
     for bell in [BellKind::EventFd, BellKind::Socket] {
         let (_theirs, offer) = Region::create(Capacity::MIN, bell).expect("a region");
         let null = || OwnedFd::from(std::fs::File::open("/dev/null").expect("it is there"));
@@ -338,9 +339,10 @@ fn a_descriptor_that_is_no_bell_is_refused() {
     }
 }
 
-/// Why [`BellKind::EventFd`] is for trusted peers only. The system's behaviour, not this package's.
+/// The reason why [`BellKind::EventFd`] is for trusted peers only. The system's behaviour, not this
+/// package's.
 #[test]
-fn an_eventfd_that_a_peer_filled_blocks_its_ringer_and_a_socket_does_not() {
+fn full_eventfd_blocks_its_ringer_but_a_socket_never() {
     use rustix::fs::{OFlags, fcntl_setfl};
     let (_theirs, offer) = Region::create(Capacity::MIN, BellKind::EventFd).expect("a region");
     let bell = offer.descriptors()[1].try_clone().expect("a descriptor");

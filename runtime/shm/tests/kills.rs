@@ -1,4 +1,5 @@
-//! `kill -9` at any instant, again and again: nothing is left. In a process of its own, whose descriptors it counts.
+//! `kill -9` at any instant, again and again, leaves no resources behind. In a process of its own, because
+//! the test counts its descriptors.
 //!
 //! `SINEW_SHM_KILLS=1000 cargo test --release -p sinew-shm --test kills` for the long form.
 #![cfg(target_os = "linux")]
@@ -18,7 +19,7 @@ fn the_other_process() {
 }
 
 #[test]
-fn kills_at_any_instant_leave_whole_messages_in_order_and_neither_descriptors_nor_memory() {
+fn kills_leave_whole_messages_and_no_resources() {
     let kills: u64 = std::env::var("SINEW_SHM_KILLS").map_or(30, |kills| kills.parse().expect("a number"));
     // given
     one(0);
@@ -33,7 +34,7 @@ fn kills_at_any_instant_leave_whole_messages_in_order_and_neither_descriptors_no
     println!("{kills} kills, {seen} messages, descriptors {before} before and after");
 }
 
-/// One life of a peer that is killed at an instant chosen by `seed`: how many of its messages came.
+/// Runs one peer that is killed at an instant chosen by `seed`. Returns how many of its messages arrived.
 fn one(seed: u64) -> u64 {
     let bell = BELLS[(seed % 3) as usize];
     let (ours, theirs) = UnixStream::pair().expect("a pair");
@@ -44,7 +45,7 @@ fn one(seed: u64) -> u64 {
     let mut number = 0;
     let ended = loop {
         if number == last_words {
-            // What happens meanwhile is the instant.
+            // The duration selects the instant of the kill.
             std::thread::sleep(Duration::from_micros(seed % 7 * 30));
             peer.kill();
         }

@@ -1,4 +1,4 @@
-//! A process that has no descriptor left. The only test of its process: the limit is that of all threads.
+//! A process without free descriptors. The only test of its process: the limit applies to all threads.
 #![cfg(target_os = "linux")]
 
 use std::{fs::File, io, os::unix::net::UnixStream};
@@ -9,12 +9,12 @@ use rustix::{
 };
 use sinew_shm::{BellKind, Capacity, Offer, PassError, Received, Region};
 
-/// More than a process has that does nothing.
+/// More than an idle process has.
 const FEW: u64 = 64;
 
 #[test]
-fn an_offer_for_which_there_is_no_descriptor_left_is_there_when_there_is_one_again() {
-    // Given: an offer on its way, and a process that has all descriptors which it may have.
+fn offer_without_free_descriptors_stays_until_there_are_some() {
+    // Given: an offer in flight, and a process that has all descriptors that it may have.
     let (left, right) = UnixStream::pair().expect("a pair");
     let (region, offer) = Region::create(Capacity::MIN, BellKind::Socket).expect("a region");
     offer.send(&left).expect("room");
@@ -30,7 +30,7 @@ fn an_offer_for_which_there_is_no_descriptor_left_is_there_when_there_is_one_aga
     };
     let is_full = |error: &io::Error| error.raw_os_error() == Some(Errno::MFILE.raw_os_error());
     assert!(is_full(&full), "{full}");
-    // When: it is taken with room for some of its descriptors and their copies, but not for all.
+    // When: it is received with room for some of its descriptors and their copies, but not for all.
     for room in 0..2 * Offer::DESCRIPTORS_MAX {
         // Then:
         match Received::receive(&right) {

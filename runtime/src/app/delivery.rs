@@ -1,4 +1,4 @@
-//! A message as its handler sees it.
+//! A message as its handler receives it.
 
 use std::{ops::Deref, time::Duration};
 
@@ -11,7 +11,7 @@ use crate::{
     wire::{Flags, Header, Kind, may_be_older},
 };
 
-/// A payload with where it came from and how old it is.
+/// A payload with its source and its age.
 ///
 /// # Examples
 ///
@@ -35,19 +35,20 @@ use crate::{
 /// ```
 #[derive(Clone, Debug)]
 pub struct Delivery<P> {
-    /// What was sent.
+    /// The value that was sent.
     pub payload: P,
-    /// Who sent it; the sender's node answers for it.
+    /// The sender. The sender's node guarantees this address.
     pub source: Tid,
-    /// Whom it was sent to: this application, a group, or everybody.
+    /// The destination of the message: this application, a group, or all applications.
     pub destination: Tid,
-    /// The source's n-th message.
+    /// The sequence number that the source gave to this message.
     pub sequence: u64,
-    /// When it was sent, in this host's clock; `None` where that is not known ([`age_error`](Self::age_error)).
+    /// When the message was sent, in this host's clock. `None` if the time is unknown;
+    /// [`age_error`](Self::age_error) is its error.
     pub sent: Option<Time>,
-    /// Time from sending to handling, as wrong as [`age_error`](Self::age_error) says; `None` where it is not known.
+    /// Time from sending to handling, with an error of [`age_error`](Self::age_error). `None` if the age is unknown.
     ///
-    /// A handler that may use fresh values only asks [`is_older_than`](Self::is_older_than).
+    /// A handler that accepts only fresh values checks [`is_older_than`](Self::is_older_than).
     pub age: Option<Duration>,
     /// Type of the payload.
     pub kind: Kind,
@@ -72,23 +73,26 @@ impl<P> Delivery<P> {
         }
     }
 
-    /// The error of `age`, and of `sent`, at most: zero for a message of this host. `None` where the age is not known: the clock of the
-    /// sender's host was not measured yet, or not for so long that it may be wrong by more than 32 s.
+    /// Returns the maximum error of `age` and of `sent`: zero for a message of this host. Returns `None` if
+    /// the age is unknown: the clock of the sender's host was not measured yet, or not for so long that the
+    /// error may exceed 32 s.
     ///
-    /// It holds as long as the hosts' clocks drift apart as clocks do (`docs/protocol/ndl.md`, NDL-6.1).
+    /// The bound holds as long as the drift of the hosts' clocks is within its limits
+    /// (`docs/protocol/ndl.md`, NDL-6.1).
     #[must_use]
     pub const fn age_error(&self) -> Option<Duration> {
         self.age_error
     }
 
-    /// The greatest age that the message can have had: `age` and its error; `None` where it is not known.
+    /// Returns the maximum age that the message can have had: `age` plus its error. Returns `None` if the age
+    /// is unknown.
     #[must_use]
     pub fn age_at_most(&self) -> Option<Duration> {
         Some(self.age?.saturating_add(self.age_error?))
     }
 
-    /// Whether the message may have been older than `limit` when its handler was called. An unknown age counts as too old, as a handler
-    /// that may use fresh values only needs it.
+    /// Returns whether the message may have been older than `limit` when its handler was called. An unknown
+    /// age counts as too old: this is safe for a handler that accepts only fresh values.
     ///
     /// # Examples
     ///
@@ -105,7 +109,7 @@ impl<P> Delivery<P> {
         may_be_older(self.age_at_most(), limit)
     }
 
-    /// Where the sender waits for a reply; `None` if it does not.
+    /// Returns the destination of the reply, or `None` if the sender does not wait for a reply.
     #[must_use]
     pub const fn reply_to(&self) -> Option<ReplyTo> {
         self.reply_to
@@ -124,7 +128,7 @@ impl<P: 'static> actix::Message for Delivery<P> {
     type Result = ();
 }
 
-/// The bytes of a payload as they came, without a copy.
+/// The bytes of a payload as they were received, without a copy.
 ///
 /// # Examples
 ///

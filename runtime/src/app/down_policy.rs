@@ -1,12 +1,13 @@
-//! While an application is away: what becomes of messages for it, and what is said on its behalf when it has died.
+//! Policies for an application that is down: handling of messages for it, and its last wills.
 //!
-//! An application is away from its end, as its supervisor knows it, until its next Ready. Its node keeps an [`Absence`]
-//! for it, and tells it of both, on the supervisor's thread and before a new life is started.
+//! An application is down from its end, as its supervisor detects it, until its next Ready. Its node keeps a
+//! [`DownState`] for it. The node reports the end and the return to the [`DownState`] on the supervisor's thread,
+//! before it starts a new incarnation.
 
 use std::{
     sync::{
         Arc,
-        atomic::{AtomicU64, Ordering},
+        atomic::{AtomicBool, AtomicU64, Ordering},
     },
     time::Duration,
 };
@@ -23,10 +24,10 @@ use crate::{
     wire::{Class, Kind, Payload, encode},
 };
 
-/// Last wills of one application at most.
+/// Maximum number of last wills of one application.
 pub const WILLS_MAX: usize = 8;
 
-/// What becomes of messages for an application between its end and its next Ready.
+/// Policy for messages to an application between its end and its next Ready.
 ///
 /// # Examples
 ///
@@ -45,17 +46,18 @@ pub const WILLS_MAX: usize = 8;
 /// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum DownPolicy {
-    /// They are kept, up to the mailbox's bound, and handed to its next life in order.
+    /// Keeps messages, up to the mailbox's bound, and delivers them to the next incarnation in order.
     #[default]
     Hold,
-    /// They are refused at once as [`Rejection::Down`](crate::outcome::Rejection::Down), those too that waited when it
-    /// ended: for setpoints and whatever else would be stale.
+    /// Rejects messages at once as [`Rejection::Down`](crate::outcome::Rejection::Down), including those that
+    /// were queued when the application ended. For setpoints and other data that would be stale.
     Drop,
-    /// They are kept for this long; from then on, and with those that wait by then, as [`Drop`](Self::Drop).
+    /// Keeps messages for this long. After that, rejects the queued ones and all later ones, as
+    /// [`Drop`](Self::Drop) does.
     HoldFor(Duration),
 }
 
-/// When a last will is sent.
+/// Selects the ends of an application after which a last will is sent.
 ///
 /// # Examples
 ///
@@ -71,23 +73,24 @@ pub enum DownPolicy {
 /// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LastWill {
-    /// When it died: by a panic, a hang, its process's end, a missed deadline. Not when it ended in order.
+    /// Sends the will after a failure: a panic, a hang, the end of its process, a missed deadline. It is not
+    /// sent after an orderly end.
     #[default]
     OnDeath,
-    /// Whenever it has ended.
+    /// Sends the will after every end.
     Always,
 }
 
-/// Whom a will is for. A name is looked up when the will is sent.
+/// The recipient of a will. A name is resolved when the will is sent.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Heir {
-    /// An application, a group, everybody.
+pub enum WillRecipient {
+    /// An application, a group, or all applications.
     Tid(Tid),
-    /// Whoever has this name then.
+    /// The application that has this name when the will is sent.
     Name(String),
 }
 
-impl From<Destination<'_>> for Heir {
+impl From<Destination<'_>> for WillRecipient {
     fn from(destination: Destination<'_>) -> Self {
         match destination {
             Destination::Tid(tid) => Self::Tid(tid),
@@ -96,8 +99,8 @@ impl From<Destination<'_>> for Heir {
     }
 }
 
-impl Heir {
-    /// The same, to send to.
+impl WillRecipient {
+    /// Returns the recipient as a destination for a send.
     #[must_use]
     pub fn destination(&self) -> Destination<'_> {
         match self {
@@ -110,24 +113,24 @@ impl Heir {
 /// A message that is sent on behalf of an application that has ended.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Will {
-    /// To whom.
-    pub heir: Heir,
+    /// The recipient.
+    pub recipient: WillRecipient,
     /// Type of the payload.
     pub kind: Kind,
-    /// In which class it travels.
+    /// The class of the message.
     pub class: Class,
-    /// The payload as it was when the will was made.
+    /// The payload, encoded when the will was declared.
     pub payload: Bytes,
-    /// After which ends.
+    /// The ends after which the will is sent.
     pub when: LastWill,
 }
 
 impl Will {
-    fn new<P: Payload>(when: LastWill, heir: Heir, value: &P) -> Self {
-        Self { heir, kind: P::KIND, class: P::CLASS, payload: encode(value), when }
+    fn new<P: Payload>(when: LastWill, recipient: WillRecipient, value: &P) -> Self {
+        Self { recipient, kind: P::KIND, class: P::CLASS, payload: encode(value), when }
     }
 
-    /// Whether it is sent after an end of this kind.
+    /// Returns whether the will is sent after an end with this reason.
     #[must_use]
     pub fn applies_to(&self, reason: &Reason) -> bool {
         self.when == LastWill::Always || reason.is_failure()
@@ -135,17 +138,17 @@ impl Will {
 }
 
 impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
-    /// What becomes of messages for it between its end and its next Ready. Default: they are kept. Before its first
-    /// start they are kept whatever is said here.
+    /// Sets the policy for messages to the application between its end and its next Ready. Default: messages
+    /// are kept. Before its first start they are always kept.
     #[must_use]
-    pub const fn while_down(mut self, away: DownPolicy) -> Self {
-        self.common.away = away;
+    pub const fn while_down(mut self, policy: DownPolicy) -> Self {
+        self.common.down_policy = policy;
         self
     }
 
-    /// A message that is sent from its TID the moment that it is known dead, before a new life is started; at most 8.
-    /// Where it dies again, it is sent again. Its heir is a name, which is looked up then, or a TID: an application, a
-    /// group, everybody.
+    /// Adds a last will, at most 8. It is a message that is sent from the application's TID as soon as its
+    /// death is detected, before a new incarnation is started. Each death sends it again. Its recipient is a
+    /// name, which is resolved then, or a TID: an application, a group, or all applications.
     ///
     /// # Examples
     ///
@@ -164,7 +167,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self.last_will_when(LastWill::OnDeath, to, value)
     }
 
-    /// The same, saying after which ends.
+    /// Same as [`last_will`](Self::last_will), for the given ends.
     #[must_use]
     pub fn last_will_when<'a, P: Payload>(
         mut self,
@@ -177,21 +180,27 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     }
 }
 
-/// What a node keeps of one application for the time that it is away.
+/// The state that a node keeps for one application while the application is down.
 #[derive(Clone, Debug)]
-pub struct Absence {
-    /// The node's own sending side of the application's TID: a life that hangs may have lost its own.
+pub struct DownState {
+    /// The node's own sender for the application's TID: a hung incarnation may have lost its own.
     sender: Sender,
     mailbox: Arc<Mailbox>,
-    away: DownPolicy,
+    policy: DownPolicy,
     wills: Arc<[Will]>,
-    /// Counts ends and returns, so that a late timer does not speak for a later absence.
+    /// Counts ends and returns, so that a late timer does not act after a later end.
     turn: Arc<AtomicU64>,
+    /// Whether the application has been ready since its last end.
+    was_ready: Arc<AtomicBool>,
 }
 
-impl Absence {
-    pub(super) fn new(AppWiring { sender, mailbox }: AppWiring, away: DownPolicy, wills: Vec<Will>) -> Self {
-        Self { sender, mailbox, away, wills: wills.into(), turn: Arc::default() }
+impl DownState {
+    pub(super) fn new(
+        AppWiring { sender, mailbox }: AppWiring,
+        policy: DownPolicy,
+        wills: Vec<Will>,
+    ) -> Self {
+        Self { sender, mailbox, policy, wills: wills.into(), turn: Arc::default(), was_ready: Arc::default() }
     }
 
     /// The application's TID.
@@ -200,48 +209,58 @@ impl Absence {
         self.sender.tid()
     }
 
-    /// Its last wills.
+    /// The last wills of the application.
     #[must_use]
     pub fn wills(&self) -> Arc<[Will]> {
         self.wills.clone()
     }
 
-    /// Its life has ended: its mailbox does as declared, and its last wills are sent, each once. They come after all that
-    /// this life has sent in the same class. A will that nobody takes is logged, and counted by the router.
+    /// Handles the end of an incarnation: applies the policy to the mailbox and sends each last will once.
+    /// The wills arrive after all messages that this incarnation sent in the same class. A will that no queue
+    /// accepts is logged, and counted by the router.
     ///
-    /// Called on a thread of actix's where [`DownPolicy::HoldFor`] is used.
-    pub fn begins(&self, reason: &Reason) {
-        // SYNC: Relaxed; begins, ends and the timer between them run on one thread.
+    /// A start that [failed by an explicit call](Reason::StartFailed) does not end an incarnation that was
+    /// ready, so it changes nothing. Otherwise an application without its device would send its last wills at
+    /// each retry.
+    ///
+    /// Must run on an actix thread if [`DownPolicy::HoldFor`] is used.
+    pub fn on_end(&self, reason: &Reason) {
+        // SYNC: Relaxed; `on_end`, `on_ready` and the timer between them run on one thread.
+        let was_ready = self.was_ready.swap(false, Ordering::Relaxed);
+        if !was_ready && matches!(reason, Reason::StartFailed(_)) {
+            return self.mailbox.forget_events();
+        }
         let turn = self.turn.fetch_add(1, Ordering::Relaxed) + 1;
         self.mailbox.forget_events();
-        match self.away {
+        match self.policy {
             DownPolicy::Hold => {}
-            DownPolicy::Drop => self.mailbox.refuse_while_away(),
+            DownPolicy::Drop => self.mailbox.refuse_while_down(),
             DownPolicy::HoldFor(time) => self.refuse_after(time, turn),
         }
         for will in self.wills.iter().filter(|will| will.applies_to(reason)) {
             if let Err(error) = self.execute(will) {
-                crate::log::error!(tid = %self.tid(), heir = ?will.heir, %error, "a last will was not taken");
+                crate::log::error!(tid = %self.tid(), recipient = ?will.recipient, %error, "a last will was rejected");
             }
         }
     }
 
-    /// It is ready again.
-    pub fn ends(&self) {
+    /// Handles the next Ready of the application.
+    pub fn on_ready(&self) {
+        self.was_ready.store(true, Ordering::Relaxed);
         self.turn.fetch_add(1, Ordering::Relaxed);
-        self.mailbox.is_back();
+        self.mailbox.accept_again();
     }
 
     fn execute(&self, will: &Will) -> Result<(), SendError> {
-        self.sender.send_bytes(will.heir.destination(), will.kind, will.class, will.payload.clone())
+        self.sender.send_bytes(will.recipient.destination(), will.kind, will.class, will.payload.clone())
     }
 
     fn refuse_after(&self, time: Duration, turn: u64) {
-        let absence = self.clone();
+        let state = self.clone();
         actix_rt::spawn(async move {
             tokio::time::sleep(time).await;
-            if absence.turn.load(Ordering::Relaxed) == turn {
-                absence.mailbox.refuse_while_away();
+            if state.turn.load(Ordering::Relaxed) == turn {
+                state.mailbox.refuse_while_down();
             }
         });
     }

@@ -1,7 +1,7 @@
-//! The heart of a running application: fires what is due, then hands over one message, then looks at the clock again.
+//! The event loop of a running application: it fires due timers, handles one message, then checks the clock again.
 //!
-//! A backlog cannot starve the timers, because they are looked at before every message; nor the stop order or the other
-//! actors of the thread, because a turn is bounded.
+//! A backlog cannot starve the timers, because they are checked before every message. It cannot starve the
+//! stop order or other actors of the thread either, because a turn is bounded.
 
 use std::{
     pin::Pin,
@@ -19,23 +19,23 @@ use crate::{
     app::{
         AppContext, Delivery, Raw, WatchId,
         context::Action,
-        input_watch::Looked,
+        input_watch::WatchCheck,
         requirement::{Requirements, event_in},
     },
     mailbox::MailboxReader,
     outcome::{Outcome, Rejection},
-    protection::{Echo, Fault, Verdict},
+    protection::{Echo, ProtectionError, Verdict},
     remedy::{Wanted, remedy},
     schedule::Due,
-    supervision::vitals::{Doing, Vitals},
+    supervision::liveness::{Activity, Liveness},
     time::Time,
     wire::{Kind, Message, Payload, decode_as},
 };
 
-/// Messages and timers that are handled before the other tasks of the thread have their turn.
+/// Maximum number of messages and timers handled before the other tasks of the thread have their turn.
 const TURN_MAX: usize = 64;
-/// Time after which no further message or timer is begun in this turn: of slow ones 64 would keep the others, and the
-/// order to stop, waiting for seconds.
+/// Time after which no further message or timer is started in this turn. Otherwise 64 slow ones would delay
+/// the other tasks and the stop order for seconds.
 const TURN_LONGEST: Duration = Duration::from_millis(1);
 
 /// Decodes a payload and calls its handler.
@@ -59,13 +59,13 @@ where
         })?,
         Some(_) => unseal::<A, P>(context, message, now)?,
     };
-    // Only now: bytes that are no `P` are no sign of life of its sender.
+    // Only after decoding: bytes that are no valid `P` are no evidence that the sender is alive.
     note_arrival(context, message, now);
     actor.handle(Delivery::new(payload, &message.header, now), context);
     Ok(())
 }
 
-/// The value of a protected payload, if it is good and its output is live.
+/// Returns the value of a protected payload, if the message is valid and its output is live.
 fn unseal<A, P>(context: &mut AppContext<A>, message: &Message, now: Time) -> Result<P, Rejection>
 where
     A: Actor<Context = AppContext<A>>,
@@ -73,7 +73,9 @@ where
 {
     let source = message.header.source;
     let Some(guard) = context.guard_of::<P>(source) else {
-        context.warn_of_payload(source, &"it is protected, and nothing here is guarded for this sender", now);
+        let (why, remedy) =
+            ("it is protected, and nothing here is guarded for this sender", "call `ctx.guard` for it");
+        context.warn_of_refusal(source, &why, remedy, now);
         return Err(Rejection::Unsupported);
     };
     let mut unread = None;
@@ -81,13 +83,13 @@ where
     match (guard.take(&message.payload, read), unread) {
         (Verdict::Apply(value), _) => Ok(value),
         (Verdict::Hold, _) => Err(Rejection::ByHandler),
-        (Verdict::Refused(Fault::Unreadable), Some(error)) => {
+        (Verdict::Refused(ProtectionError::Unreadable), Some(error)) => {
             context.warn_of_payload(source, &error, now);
             Err(Rejection::Malformed)
         }
         (Verdict::Refused(fault), _) => {
-            context.warn_of_payload(source, &fault, now);
-            Err(if fault == Fault::Corrupt { Rejection::Malformed } else { Rejection::ByHandler })
+            context.warn_of_fault(source, fault, now);
+            Err(if fault == ProtectionError::Corrupt { Rejection::Malformed } else { Rejection::ByHandler })
         }
     }
 }
@@ -107,18 +109,18 @@ where
     Ok(())
 }
 
-/// The future, spawned into the actor's context, that drives it.
+/// The future that runs the event loop, spawned into the actor's context.
 pub(super) struct Drive<A: Actor<Context = AppContext<A>>> {
     reader: MailboxReader,
     handlers: Vec<(Kind, Dispatch<A>)>,
     requirements: Requirements<A>,
-    /// What others see of this incarnation.
-    vitals: Arc<Vitals>,
+    /// The liveness state of this incarnation, read by other threads.
+    liveness: Arc<Liveness>,
     alarm: Option<Alarm>,
-    /// A timer had the last step: a waiting message has the next one, so that a handler that overruns its period does not
-    /// shut the mailbox out.
+    /// Whether the last step was a timer. Then a queued message has the next step, so that a handler that
+    /// overruns its period does not starve the mailbox.
     timer_was_last: bool,
-    /// When the present turn had its first step.
+    /// When the first step of the current turn began.
     turn_began: Option<Time>,
 }
 
@@ -127,16 +129,24 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         reader: MailboxReader,
         handlers: Vec<(Kind, Dispatch<A>)>,
         requirements: Requirements<A>,
-        vitals: Arc<Vitals>,
+        liveness: Arc<Liveness>,
     ) -> Self {
-        Self { reader, handlers, requirements, vitals, alarm: None, timer_was_last: false, turn_began: None }
+        Self {
+            reader,
+            handlers,
+            requirements,
+            liveness,
+            alarm: None,
+            timer_was_last: false,
+            turn_began: None,
+        }
     }
 
-    /// Steps until there is nothing more to do, or others must have their turn.
+    /// Runs steps until no work is left or the turn's bound is reached.
     fn steps(&mut self, actor: &mut A, context: &mut AppContext<A>, task: &mut Context<'_>) -> Poll<()> {
         self.turn_began = None;
         for _ in 0..TURN_MAX {
-            // A handler called `stop` or `wait`: actix has to see that before the next message.
+            // A handler called `stop` or `wait`: actix must process that before the next message.
             if actix::AsyncContext::waiting(context) {
                 task.waker().wake_by_ref();
                 return Poll::Pending;
@@ -154,7 +164,7 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         Poll::Pending
     }
 
-    /// One turn's step. `Ready(true)`: there may be more to do; `Ready(false)`: the application is to end.
+    /// Runs one step. `Ready(true)`: more work may be ready; `Ready(false)`: the application must end.
     fn step(&mut self, actor: &mut A, context: &mut AppContext<A>, task: &mut Context<'_>) -> Poll<bool> {
         let now = Time::now();
         if now.since(*self.turn_began.get_or_insert(now)) >= TURN_LONGEST {
@@ -169,7 +179,7 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         {
             self.timer_was_last = true;
             self.reader.count();
-            self.vitals.begins(Doing::Timer, Some(now));
+            self.liveness.begin(Activity::Timer, Some(now));
             fire(actor, context, due, now);
             self.leave_if_over();
             return Poll::Ready(true);
@@ -188,7 +198,7 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         }
     }
 
-    /// The same in a pause: nothing but the layers' events.
+    /// Runs one step of a paused application: only layers' events are handled.
     fn step_paused(
         &mut self,
         actor: &mut A,
@@ -211,25 +221,26 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
             message.settle(Outcome::Expired);
             return;
         }
-        self.vitals.begins(Doing::Message(message.header.kind), Some(now));
-        let is_confirmed = message.receipt.take().map(|receipt| self.vitals.hold(receipt)).is_some();
-        // One that was fenced off while it took this message must not begin with it.
+        self.liveness.begin(Activity::Message(message.header.kind), Some(now));
+        let is_confirmed =
+            message.receipt.take().map(|receipt| self.liveness.hold_receipt(receipt)).is_some();
+        // An incarnation that was fenced while it took this message must not handle it.
         self.leave_if_over();
         let outcome = self.dispatch(actor, context, message, now);
         self.leave_if_over();
         self.reader.finish(outcome);
         if is_confirmed {
-            self.vitals.settle(outcome);
+            self.liveness.settle(outcome);
         }
         if let Outcome::Rejected(why) = outcome {
             context.refused(&message.header, why);
         }
     }
 
-    /// A life that was taken while its thread was in the actor's own code goes no further.
+    /// Ends this thread's work for an incarnation that was fenced while the actor's own code ran.
     fn leave_if_over(&self) {
-        if self.vitals.is_over() {
-            self.vitals.leave();
+        if self.liveness.is_fenced() {
+            self.liveness.unwind_turn();
         }
     }
 
@@ -257,7 +268,8 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         }
         let handler = self.handlers.iter().find(|(kind, _)| *kind == message.header.kind);
         let Some((_, dispatch)) = handler else {
-            // An event that nobody handles has served its policy; who asks for a sign of life has it.
+            // An event without a handler is complete after its policy, and a liveness request is answered by
+            // being processed.
             let is_served = event.is_some() || message.header.kind == Kind::PING;
             let served = is_served.then_some(Outcome::Delivered);
             return served.unwrap_or(Outcome::Rejected(Rejection::UnknownKind));
@@ -273,7 +285,7 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         }
     }
 
-    /// Sets the alarm for the next deadline. An application without deadlines has no timer at all.
+    /// Sets the alarm for the next deadline. An application without deadlines has no timer.
     fn sleep(&mut self, context: &AppContext<A>, task: &mut Context<'_>) {
         let next = context.schedule.next_due();
         if self.alarm.is_none() && next.is_some() {
@@ -302,17 +314,17 @@ impl<A: Actor<Context = AppContext<A>>> ActorFuture<A> for Drive<A> {
     ) -> Poll<()> {
         let this = self.get_mut();
         if let Some(ready) = context.ready.take() {
-            // `started` has run and did not ask for more time.
+            // `started` has run and did not hold the readiness.
             ready.reached();
         }
         let polled = this.steps(actor, context, task);
-        // What runs next in this turn is nothing that was taken here.
+        // The tasks that run next in this turn are not messages of this mailbox.
         this.reader.count();
         let next = match context.state() {
-            ActorState::Started | ActorState::Running => Doing::Task,
-            ActorState::Stopping | ActorState::Stopped => Doing::Stop,
+            ActorState::Started | ActorState::Running => Activity::Task,
+            ActorState::Stopping | ActorState::Stopped => Activity::Stop,
         };
-        this.vitals.begins(next, None);
+        this.liveness.begin(next, None);
         polled
     }
 }
@@ -334,7 +346,7 @@ where
     A: Actor<Context = AppContext<A>>,
 {
     for (index, watch) in context.watches.iter_mut().enumerate() {
-        // Only after a timeout: until then one timer is set for each limit, not one for each message.
+        // Only after a timeout: until then one timer is set per limit, not one per message.
         if let Some(at) = watch.input.note(&message.header, now) {
             context.schedule.once(at, Action::CheckWatch(WatchId(index)));
         }
@@ -346,12 +358,12 @@ where
     A: Actor<Context = AppContext<A>>,
 {
     let watch = &mut context.watches[id.0];
-    let timeout = match watch.input.look(now) {
-        Looked::DueAt(at) => {
+    let timeout = match watch.input.check(now) {
+        WatchCheck::DueAt(at) => {
             context.schedule.once(at, Action::CheckWatch(id));
             return;
         }
-        Looked::Over(timeout) => timeout,
+        WatchCheck::TimedOut(timeout) => timeout,
     };
     if let Some(mut action) = watch.action.take() {
         action(actor, timeout, context);

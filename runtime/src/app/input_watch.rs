@@ -8,7 +8,7 @@ use crate::{
     wire::{Header, Kind},
 };
 
-/// What an input watchdog judges by.
+/// The criterion by which an input watchdog judges.
 ///
 /// # Examples
 ///
@@ -31,7 +31,7 @@ pub enum InputCriterion {
     Age,
 }
 
-/// An input that is silent, or whose values are too old: what an input watchdog reports.
+/// The report of an input watchdog: an input is silent, or its values are too old.
 ///
 /// # Examples
 ///
@@ -54,25 +54,25 @@ pub enum InputCriterion {
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct InputTimeout {
-    /// Sender that the watchdog expects; `None`: any sender.
+    /// The sender that the watchdog expects; `None`: any sender.
     pub source: Option<Tid>,
-    /// Type that the watchdog expects.
+    /// The type that the watchdog expects.
     pub kind: Kind,
-    /// What the watchdog judges by.
+    /// The criterion of the watchdog.
     pub criterion: InputCriterion,
-    /// Limit of the watchdog.
+    /// The limit of the watchdog.
     pub limit: Duration,
     /// Time since a value arrived, or since the watchdog was set.
     pub silent: Duration,
-    /// The greatest age that the value which arrived last can have now: its age and the error of that. `None` where its age is not known,
-    /// and where no value has arrived.
+    /// The maximum age that the value which arrived last can have now: its age plus the error of the age.
+    /// `None` if its age is unknown, or if no value has arrived.
     pub age: Option<Duration>,
-    /// How much later than its limit this was noticed.
+    /// Time from the limit to the detection of this timeout.
     pub lateness: Duration,
 }
 
 impl InputTimeout {
-    /// Whether values stay away. Else they arrive, and are too old or of unknown age.
+    /// Returns whether values fail to arrive. Otherwise they arrive, but are too old or of unknown age.
     #[must_use]
     pub fn is_silent(&self) -> bool {
         self.silent >= self.limit
@@ -104,27 +104,27 @@ pub(super) struct InputWatch {
     kind: Kind,
     criterion: InputCriterion,
     limit: Duration,
-    /// When a value arrived last, or when the watchdog was set.
+    /// When the last value arrived, or when the watchdog was set.
     arrived: Time,
-    /// The earliest moment at which that value can have been sent, if it is known.
+    /// The earliest time at which that value can have been sent, if it is known.
     sent: Option<Time>,
-    /// The moment from which the limit counts.
+    /// The time from which the limit counts.
     fed: Time,
-    /// A timeout was reported, and no value has fed the watchdog since.
+    /// Whether a timeout was reported and no value has fed the watchdog since.
     is_over: bool,
 }
 
-/// What the look at a watchdog finds.
+/// The result of a check of a watchdog.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Looked {
-    /// It was fed; it is due then.
+pub(super) enum WatchCheck {
+    /// The watchdog was fed; its next check is due at this time.
     DueAt(Time),
-    /// It was not.
-    Over(InputTimeout),
+    /// The watchdog timed out.
+    TimedOut(InputTimeout),
 }
 
 impl InputWatch {
-    /// A watchdog whose limit counts from `now`.
+    /// Creates a watchdog; its limit counts from `now`.
     pub(super) const fn new(
         source: Option<Tid>,
         kind: Kind,
@@ -134,7 +134,7 @@ impl InputWatch {
         Self { source, kind, criterion, limit, arrived: now, sent: None, fed: now, is_over: false }
     }
 
-    /// A message is handled. Returns when to look at the watchdog, if nothing was due for it until now.
+    /// Records a message that is handled. Returns when to check the watchdog, if no check was scheduled until now.
     pub(super) fn note(&mut self, header: &Header, now: Time) -> Option<Time> {
         if self.kind != header.kind || self.source.is_some_and(|source| source != header.source) {
             return None;
@@ -153,14 +153,14 @@ impl InputWatch {
         Some(self.deadline())
     }
 
-    /// The time at which the watchdog was due.
-    pub(super) fn look(&mut self, now: Time) -> Looked {
+    /// Checks the watchdog at its due time.
+    pub(super) fn check(&mut self, now: Time) -> WatchCheck {
         let deadline = self.deadline();
         if now < deadline {
-            return Looked::DueAt(deadline);
+            return WatchCheck::DueAt(deadline);
         }
         self.is_over = true;
-        Looked::Over(InputTimeout {
+        WatchCheck::TimedOut(InputTimeout {
             source: self.source,
             kind: self.kind,
             criterion: self.criterion,
@@ -171,7 +171,7 @@ impl InputWatch {
         })
     }
 
-    /// A pause of this length is over: the limit counts as if it had not been.
+    /// Resumes after a pause of this length: the limit counts as if the pause had not occurred.
     pub(super) fn resume(&mut self, pause: Duration) {
         self.arrived = self.arrived + pause;
         self.fed = self.fed + pause;
@@ -201,7 +201,8 @@ mod tests {
         Tid::new(NodeAddress::new(1), AppAddress::new(app))
     }
 
-    /// A value that is sent at `sent`; `error` is `None` while the clock of the sender's host is not measured.
+    /// A value that is sent at `sent`; `error` is `None` while the clock of the sender's host is not
+    /// measured.
     fn value(sent: Time, error: Option<Duration>) -> Header {
         let mut header = Header::new(KIND, sender(7), Tid::NONE);
         header.sent = sent;
@@ -214,13 +215,13 @@ mod tests {
     }
 
     fn over(watch: &mut InputWatch, now: Time) -> InputTimeout {
-        match watch.look(now) {
-            Looked::Over(timeout) => timeout,
-            Looked::DueAt(at) => panic!("due at {at:?} only"),
+        match watch.check(now) {
+            WatchCheck::TimedOut(timeout) => timeout,
+            WatchCheck::DueAt(at) => panic!("due at {at:?} only"),
         }
     }
 
-    /// The values of each millisecond, each `late` after it was sent.
+    /// One value for each millisecond, each `late` after it was sent.
     fn stream(watch: &mut InputWatch, (from, to): (u64, u64), late: u64, error: Option<Duration>) {
         for at in from..to {
             watch.note(&value(ms(at - late), error), ms(at));
@@ -231,7 +232,7 @@ mod tests {
     fn silence_trips_either_watchdog_once() {
         for criterion in BY_BOTH {
             let mut watch = watch(criterion);
-            assert_eq!(watch.look(ms(9)), Looked::DueAt(ms(10)));
+            assert_eq!(watch.check(ms(9)), WatchCheck::DueAt(ms(10)));
             let timeout = over(&mut watch, ms(11));
             assert_eq!((timeout.criterion, timeout.silent), (criterion, Duration::from_millis(11)));
             assert_eq!((timeout.age, timeout.lateness), (None, Duration::from_millis(1)));
@@ -240,12 +241,12 @@ mod tests {
     }
 
     #[test]
-    fn late_values_that_keep_arriving_trip_the_watchdog_by_age_alone() {
+    fn late_values_trip_only_the_watchdog_by_age() {
         let [mut by_arrival, mut by_age] = BY_BOTH.map(watch);
         for watch in [&mut by_arrival, &mut by_age] {
             stream(watch, (15, 100), 15, Some(Duration::ZERO));
         }
-        assert_eq!(by_arrival.look(ms(100)), Looked::DueAt(ms(109)));
+        assert_eq!(by_arrival.check(ms(100)), WatchCheck::DueAt(ms(109)));
         let timeout = over(&mut by_age, ms(100));
         assert_eq!(timeout.criterion, InputCriterion::Age);
         assert_eq!(
@@ -260,29 +261,29 @@ mod tests {
     }
 
     #[test]
-    fn values_within_the_limit_feed_the_watchdog_by_age_until_they_are_as_old() {
+    fn values_within_the_limit_feed_the_watchdog_by_age() {
         let mut watch = watch(InputCriterion::Age);
         stream(&mut watch, (5, 50), 4, Some(Duration::from_millis(1)));
         // The last one was sent at 45, or 1 ms before.
-        assert_eq!(watch.look(ms(50)), Looked::DueAt(ms(54)));
+        assert_eq!(watch.check(ms(50)), WatchCheck::DueAt(ms(54)));
         assert_eq!(over(&mut watch, ms(54)).age, Some(LIMIT));
     }
 
     #[test]
-    fn the_error_of_an_age_counts_as_age() {
+    fn clock_error_counts_as_age() {
         let mut watch = watch(InputCriterion::Age);
         stream(&mut watch, (5, 50), 4, Some(Duration::from_millis(7)));
         assert_eq!(over(&mut watch, ms(50)).age, Some(Duration::from_millis(12)));
     }
 
     #[test]
-    fn values_whose_age_becomes_unknown_trip_the_watchdog_by_age_and_known_ones_feed_it_again() {
+    fn unknown_age_trips_the_watchdog_by_age() {
         let [mut by_arrival, mut by_age] = BY_BOTH.map(watch);
         for watch in [&mut by_arrival, &mut by_age] {
             stream(watch, (1, 20), 1, Some(Duration::ZERO));
             stream(watch, (20, 40), 1, None);
         }
-        assert_eq!(by_arrival.look(ms(40)), Looked::DueAt(ms(49)));
+        assert_eq!(by_arrival.check(ms(40)), WatchCheck::DueAt(ms(49)));
         let timeout = over(&mut by_age, ms(40));
         assert_eq!((timeout.silent, timeout.age), (Duration::from_millis(1), None));
         assert!(timeout.to_string().contains("their age is not known"), "{timeout}");
@@ -291,7 +292,7 @@ mod tests {
         assert_eq!(by_age.note(&value(ms(20), Some(Duration::ZERO)), ms(42)), None, "it is too old");
         assert_eq!(by_age.note(&value(ms(42), Some(Duration::ZERO)), ms(43)), Some(ms(52)));
         assert_eq!(by_age.note(&value(ms(43), Some(Duration::ZERO)), ms(44)), None, "a look is due already");
-        assert_eq!(by_age.look(ms(52)), Looked::DueAt(ms(53)));
+        assert_eq!(by_age.check(ms(52)), WatchCheck::DueAt(ms(53)));
     }
 
     #[test]
@@ -305,27 +306,29 @@ mod tests {
     }
 
     #[test]
-    fn a_pause_is_no_silence() {
+    fn pause_is_no_silence() {
         for criterion in BY_BOTH {
             let mut watch = watch(criterion);
             watch.resume(Duration::from_secs(1));
-            assert_eq!(watch.look(ms(1_009)), Looked::DueAt(ms(1_010)));
+            assert_eq!(watch.check(ms(1_009)), WatchCheck::DueAt(ms(1_010)));
         }
     }
 
     proptest! {
-        /// Whatever arrives: the watchdog by age is quiet exactly as long as a value that surely is not older than the limit was there.
+        /// For any arrivals, the watchdog by age is quiet exactly as long as a value is present that is
+        /// certainly not older than the limit.
         #[test]
-        fn the_watchdog_by_age_is_quiet_while_and_only_while_a_value_is_surely_fresh(
+        fn fresh_value_keeps_the_watchdog_by_age_quiet(
             arrivals in prop::collection::vec((0..8u64, 0..20u64, prop::option::of(0..5u64)), 1..50),
         ) {
             let (mut watch, mut now) = (watch(InputCriterion::Age), 100);
             watch = InputWatch { arrived: ms(now), fed: ms(now), ..watch };
-            // When the youngest value can have been sent at the earliest; at first when the watchdog was set.
+            // The earliest possible send time of the youngest value; at first the time when the watchdog was
+            // set.
             let mut youngest = now;
             for (later, late, error) in arrivals {
                 now += later;
-                let is_over = matches!(watch.look(ms(now)), Looked::Over(_));
+                let is_over = matches!(watch.check(ms(now)), WatchCheck::TimedOut(_));
                 prop_assert_eq!(is_over, now - youngest >= 10);
                 watch.note(&value(ms(now - late), error.map(Duration::from_millis)), ms(now));
                 if let Some(error) = error {

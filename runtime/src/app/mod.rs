@@ -1,8 +1,8 @@
-//! Applications: actix actors that get typed messages, exact periods and input watchdogs.
+//! Applications: actix actors with typed messages, exact periods and input watchdogs.
 //!
-//! An application is any `Actor<Context = AppContext<Self>>`. It says in its [`AppSpec`] which payloads it handles, and
-//! has a `Handler<Delivery<P>>` for each. Everything that actix gives an actor (spawned futures, `run_later`, an
-//! `Addr`) works as usual.
+//! An application is any `Actor<Context = AppContext<Self>>`. Its [`AppSpec`] declares the payloads that it
+//! handles, and it has a `Handler<Delivery<P>>` for each. All features of an actix actor (spawned futures,
+//! `run_later`, an `Addr`) work as usual.
 
 mod context;
 mod delivery;
@@ -16,7 +16,7 @@ mod spec;
 
 pub use context::{AppContext, WatchId};
 pub use delivery::{Delivery, Raw};
-pub use down_policy::{Absence, DownPolicy, Heir, LastWill, WILLS_MAX, Will};
+pub use down_policy::{DownPolicy, DownState, LastWill, WILLS_MAX, Will, WillRecipient};
 pub use input_watch::{InputCriterion, InputTimeout};
 pub use required::{
     ALTERNATIVES_MAX, REQUIREMENT_BYTES_MAX, Requirement, RequirementError, is_pattern, is_phase, matches,

@@ -1,16 +1,16 @@
-//! What an application requires: names of the system, so many of them, and for how long it waits for what it can do without.
+//! The requirements of an application: names in the system, a minimum count, and a wait limit for optional ones.
 //!
-//! A requirement is a line of text, the same in an `AppSpec`, over LNCL and in C; the list of an application's
-//! requirements is met when each of them is.
+//! A requirement is a line of text, with the same syntax in an `AppSpec`, over LNCL and in C. The
+//! requirements of an application are met when each one in its list is met.
 //!
 //! | text | met when |
 //! | --- | --- |
 //! | `knee.drive` | an application of this name is ready |
-//! | `*.drive` | one whose name matches is: `*` stands for any characters, also for none |
+//! | `*.drive` | one whose name matches is; `*` matches any characters, also none |
 //! | `hip.imu \| knee.imu` | any of these is |
-//! | `2 of *.drive` | at least 2 applications are, each counted once, where several nodes have a name each of them |
-//! | `knee.drive at homed`, `2 of *.drive at homed` | it has reached the phase `homed` in its present life, ready or not |
-//! | `camera ?500ms`, `2 of *.drive ?2s` | it is, or the application has waited so long: then it starts without |
+//! | `2 of *.drive` | at least 2 applications are; applications of one name on several nodes count once each |
+//! | `knee.drive at homed`, `2 of *.drive at homed` | it has reached the phase `homed` in its current incarnation, ready or not |
+//! | `camera ?500ms`, `2 of *.drive ?2s` | it is, or the application has waited this long: it then starts without it |
 
 use std::{fmt, str::FromStr, time::Duration};
 
@@ -18,16 +18,16 @@ use serde::{Deserialize, Serialize};
 
 use crate::name::{NAME_BYTES_MAX, is_invisible};
 
-/// Longest requirement in bytes.
+/// Maximum length of a requirement in bytes.
 pub const REQUIREMENT_BYTES_MAX: usize = 255;
-/// Names or patterns between which one requirement chooses, at most.
+/// Maximum number of names or patterns in one requirement.
 pub const ALTERNATIVES_MAX: usize = 16;
-/// What ends the count of a requirement.
+/// The separator after the count of a requirement.
 const OF: &str = " of ";
-/// What begins the phase of a requirement.
+/// The separator before the phase of a requirement.
 const AT: &str = " at ";
 
-/// One requirement of an application: its text, and what it says.
+/// One requirement of an application: its text and its parsed form.
 ///
 /// # Examples
 ///
@@ -54,31 +54,32 @@ pub struct Requirement {
     or_after: Option<Duration>,
 }
 
-/// Why a text is no requirement. The caller is at fault.
+/// An invalid requirement text. This is an error of the caller.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the requirement {text:?} cannot be used: {why}")]
 pub struct RequirementError {
     /// The text, or its beginning.
     pub text: String,
-    /// What is wrong with it, and what would be right.
+    /// The cause and the correct syntax.
     pub why: &'static str,
 }
 
 impl Requirement {
-    /// An application of this name, or whose name matches this pattern, is ready.
+    /// Requires an application that is ready and has this name, or a name that matches this pattern.
     #[must_use]
     pub fn name(name: impl Into<String>) -> Self {
         Self::at_least(1, [name])
     }
 
-    /// An application of any of these names or patterns is ready.
+    /// Requires an application that is ready and has any of these names or patterns.
     #[must_use]
     pub fn any<N: Into<String>>(names: impl IntoIterator<Item = N>) -> Self {
         Self::at_least(1, names)
     }
 
-    /// At least `count` applications whose names are among these or match them are ready. Each application counts once, and
-    /// where several nodes have one of a name, each of them does; the one that requires it counts too: it does not wait for itself.
+    /// Requires at least `count` ready applications with names that are in this list or match it. Each
+    /// application counts once. Applications of one name on several nodes count once each. The application
+    /// that declares the requirement counts too: it does not wait for itself.
     ///
     /// # Examples
     ///
@@ -98,8 +99,8 @@ impl Requirement {
         Self { text: String::new(), at_least: count, of, phase: None, or_after: None }.spelled()
     }
 
-    /// It is enough, and needed, that they have reached this phase in their present lives, be they ready or not. A phase is one word
-    /// ([`is_phase`]).
+    /// Requires that the applications have reached this phase in their current incarnations. They need not be
+    /// ready. A phase is one word ([`is_phase`]).
     ///
     /// # Examples
     ///
@@ -115,8 +116,9 @@ impl Requirement {
         self.spelled()
     }
 
-    /// After this time at the barrier the application starts without it, and is told so
-    /// ([`RequirementEvent::Without`](crate::app::RequirementEvent::Without)). Whole milliseconds.
+    /// Makes the requirement optional after this wait at the barrier: the application then starts without it
+    /// and receives [`RequirementEvent::Without`](crate::app::RequirementEvent::Without). The wait is a whole
+    /// number of milliseconds.
     ///
     /// # Examples
     ///
@@ -133,7 +135,7 @@ impl Requirement {
         self.spelled()
     }
 
-    /// With the text that says it.
+    /// Sets the text from the parsed form.
     fn spelled(mut self) -> Self {
         self.text = self.of.join(" | ");
         if self.at_least != 1 {
@@ -148,43 +150,43 @@ impl Requirement {
         self
     }
 
-    /// Its text.
+    /// Returns the text of the requirement.
     #[must_use]
     pub fn as_str(&self) -> &str {
         &self.text
     }
 
-    /// How many applications it takes.
+    /// Returns how many applications are required.
     #[must_use]
     pub const fn count(&self) -> usize {
         self.at_least
     }
 
-    /// The names and patterns that count for it.
+    /// Returns the names and patterns that count for the requirement.
     #[must_use]
     pub fn alternatives(&self) -> &[String] {
         &self.of
     }
 
-    /// The phase that they have to have reached; `None`: they have to be ready.
+    /// Returns the phase that the applications must have reached. `None`: they must be ready.
     #[must_use]
     pub fn phase(&self) -> Option<&str> {
         self.phase.as_deref()
     }
 
-    /// For how long an application waits for it at most; `None`: it does not start without.
+    /// Returns the maximum wait for the requirement. `None`: the application does not start without it.
     #[must_use]
     pub const fn wait_max(&self) -> Option<Duration> {
         self.or_after
     }
 
-    /// The one name that it asks for, if that is all that it asks for.
+    /// Returns the name if the requirement is one plain name and nothing else.
     #[must_use]
     pub fn only_name(&self) -> Option<&str> {
         self.one_name().filter(|_| self.phase.is_none() && self.or_after.is_none())
     }
 
-    /// The one name that it asks for, in whichever phase and for however long.
+    /// Returns the name if the requirement is one name, with any phase and any wait.
     #[must_use]
     pub fn one_name(&self) -> Option<&str> {
         match self.of.as_slice() {
@@ -193,34 +195,34 @@ impl Requirement {
         }
     }
 
-    /// Whether an application of this name counts for it.
+    /// Returns whether an application of this name counts for the requirement.
     #[must_use]
     pub fn counts(&self, name: &str) -> bool {
         self.of.iter().any(|pattern| matches(pattern, name))
     }
 }
 
-/// Whether a text can be a phase: one word of 1 to 63 bytes, without `*`, `|` and `?`.
+/// Returns whether the text is a valid phase: one word of 1 to 63 bytes, without `*`, `|` and `?`.
 #[must_use]
 pub fn is_phase(text: &str) -> bool {
     let is_odd = |letter: char| letter.is_whitespace() || letter.is_control() || "*|?".contains(letter);
     (1..=NAME_BYTES_MAX).contains(&text.len()) && !text.contains(is_odd)
 }
 
-/// Whether a text stands for more than the one name that it spells.
+/// Returns whether the text is a pattern, which may match more than one name.
 #[must_use]
 pub fn is_pattern(text: &str) -> bool {
     text.contains('*')
 }
 
-/// Whether `name` is what `pattern` says, in which `*` stands for any characters, also for none.
+/// Returns whether `name` matches `pattern`, in which `*` matches any characters, also none.
 #[must_use]
 pub fn matches(pattern: &str, name: &str) -> bool {
     let mut parts = pattern.split('*');
     let first = parts.next().unwrap_or_default();
     let Some(mut rest) = name.strip_prefix(first) else { return false };
     let Some(last) = parts.next_back() else { return rest.is_empty() };
-    // The earliest place of each part leaves the most to those behind it.
+    // The earliest match of each part leaves the most text to the parts after it.
     for part in parts {
         let Some(at) = rest.find(part) else { return false };
         rest = &rest[at + part.len()..];
@@ -274,13 +276,13 @@ fn parse(text: &str) -> Result<Requirement, &'static str> {
     Ok(Requirement { text: text.to_owned(), at_least: usize::from(at_least), of, phase, or_after })
 }
 
-/// A name or pattern, each run of `*` in it being one: they say the same, and cost more.
+/// Normalizes a name or pattern: each run of `*` becomes one `*`, which matches the same names at less cost.
 fn plain(name: &str) -> String {
     let mut before = None;
     name.chars().filter(|letter| before.replace(*letter) != Some('*') || *letter != '*').collect()
 }
 
-/// `500ms`, `2s`.
+/// Parses `500ms` or `2s`.
 fn duration(text: &str) -> Option<Duration> {
     let (number, unit_ms) = match text.strip_suffix("ms") {
         Some(number) => (number, 1),
@@ -321,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn each_form_says_what_its_text_says() {
+    fn each_form_parses_to_its_meaning() {
         assert_eq!(read("knee.drive").only_name(), Some("knee.drive"));
         assert_eq!(read("a | b|c").alternatives(), ["a", "b", "c"]);
         let counted = read("2 of *.drive ?1500ms");
@@ -345,7 +347,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_built_reads_as_it_was_built() {
+    fn built_requirement_equals_its_text_form() {
         let built = [
             Requirement::name("knee"),
             Requirement::any(["a", "b*"]),
@@ -358,7 +360,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_requirement_is_refused_with_words() {
+    fn invalid_requirement_is_rejected_with_reason() {
         let long = "x".repeat(64);
         let many = vec!["a"; 300].join("|");
         for bad in ["", "a |", "0 of a", "a ?soon", "a ?", "a\nb", long.as_str(), many.as_str()] {
@@ -373,7 +375,7 @@ mod tests {
     }
 
     #[test]
-    fn a_star_stands_for_any_characters() {
+    fn star_matches_any_characters() {
         for (pattern, name, expected) in [
             ("*.drive", "knee.drive", true),
             ("*.drive", "drive", false),
@@ -404,12 +406,12 @@ mod tests {
 
     proptest! {
         #[test]
-        fn matching_is_what_a_star_says(pattern in "[ab*]{0,7}", name in "[ab]{0,8}") {
+        fn matching_agrees_with_the_definition(pattern in "[ab*]{0,7}", name in "[ab]{0,8}") {
             prop_assert_eq!(matches(&pattern, &name), by_definition(pattern.as_bytes(), name.as_bytes()));
         }
 
         #[test]
-        fn any_text_is_a_requirement_or_refused(text in ".{0,40}") {
+        fn any_text_is_a_requirement_or_rejected(text in ".{0,40}") {
             if let Ok(requirement) = text.parse::<Requirement>() {
                 prop_assert_eq!(requirement.as_str(), text.as_str());
                 prop_assert!(requirement.count() > 0 && !requirement.alternatives().is_empty());

@@ -1,4 +1,4 @@
-//! What an application does when it loses what it requires: carry on, pause, go to its safe state, or start anew.
+//! The reaction of an application to the loss of a requirement: carry on, pause, enter the safe state, or restart.
 
 use std::{cell::RefCell, collections::BTreeSet, rc::Rc, sync::Arc};
 
@@ -7,14 +7,14 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     app::{AppContext, AppSpec},
-    supervision::{Life, Reason},
+    supervision::{Reason, RunningActor},
     tid::AppAddress,
     time::Time,
     wire::{Class, Message, Payload},
 };
 
-/// A requirement changed. Applications that require something and handle this payload get it from their node's sync
-/// manager, ahead of every message that waits for them.
+/// A change of a requirement. An application that has requirements and handles this payload receives it from
+/// its node's sync manager, ahead of all queued messages.
 ///
 /// # Examples
 ///
@@ -43,26 +43,27 @@ use crate::{
 /// ```
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum RequirementEvent {
-    /// What this application requires is not ready any more.
+    /// A requirement of this application is no longer ready.
     Lost {
-        /// The requirement's text: the name, where it is one.
+        /// The text of the requirement: the name, if the requirement is one name.
         name: String,
     },
-    /// It is ready again.
+    /// The requirement is ready again.
     Met {
-        /// The requirement's text.
+        /// The text of the requirement.
         name: String,
     },
-    /// What this application can do without ([`Requirement::or_after`](crate::app::Requirement::or_after)) is not there: it was
-    /// started without it, or it went later. No policy applies. `Met` follows when it is there.
+    /// An optional requirement of this application
+    /// ([`Requirement::or_after`](crate::app::Requirement::or_after)) is not ready. The application was
+    /// started without it, or it was lost later. No policy applies. `Met` follows when it is ready.
     Without {
-        /// The requirement's text.
+        /// The text of the requirement.
         name: String,
     },
 }
 
 impl RequirementEvent {
-    /// The text of the requirement that is lost, met or missing.
+    /// Returns the text of the requirement that is lost, met or missing.
     #[must_use]
     pub fn name(&self) -> &str {
         match self {
@@ -76,8 +77,8 @@ impl Payload for RequirementEvent {
     const CLASS: Class = Class::Control;
 }
 
-/// What an application does when it loses what it requires. Whatever it is, its `Handler<Delivery<RequirementEvent>>`
-/// is called as well, if it declares one, after what stands here.
+/// Policy for the loss of a requirement. In every case the application's
+/// `Handler<Delivery<RequirementEvent>>`, if it declares one, is called after the policy was applied.
 ///
 /// # Examples
 ///
@@ -92,23 +93,26 @@ impl Payload for RequirementEvent {
 /// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum RequirementPolicy {
-    /// It goes on as before.
+    /// Continues without a change.
     #[default]
     CarryOn,
-    /// No message is handled and no timer of its context fires until all is met again. Messages are kept, up to the
-    /// mailbox's bound; periods go on on their grid, without a turn for the time between; input watchdogs count as if
-    /// that time had not been. A stop works as ever. Futures that it spawned are not paused.
+    /// Pauses the application until all requirements are met again: no message is handled, and no timer of
+    /// its context fires. Messages are kept, up to the mailbox's bound. Periodic timers keep their grid and
+    /// skip the turns of the pause. Input watchdogs do not count the pause. An order to stop is executed as
+    /// usual. Futures that the application spawned are not paused.
     Pause,
-    /// Its safe state, declared with [`AppSpec::safe_state`], is entered at once; it is left when all is met again.
+    /// Enters the safe state, declared with [`AppSpec::safe_state`], at once, and leaves it when all
+    /// requirements are met again.
     SafeState,
-    /// It is stopped in order, and started anew when all that it requires is ready. That is no failure: it is not counted
-    /// among the restarts, and no last will is sent but for those that are always.
+    /// Stops the application in order and starts it again when all its requirements are ready. This is no
+    /// failure: it does not count as a restart, and only the last wills with
+    /// [`LastWill::Always`](crate::app::LastWill::Always) are sent.
     Restart,
 }
 
 type Change<A> = Arc<dyn Fn(&mut A, &RequirementEvent, &mut AppContext<A>) + Send + Sync>;
 
-/// How an application enters and leaves its safe state.
+/// The functions that enter and leave the safe state of an application.
 pub(super) struct SafeState<A: Actor<Context = AppContext<A>>> {
     enter: Change<A>,
     leave: Change<A>,
@@ -121,15 +125,16 @@ impl<A: Actor<Context = AppContext<A>>> Clone for SafeState<A> {
 }
 
 impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
-    /// What it does when it loses what it requires. Default: it carries on.
+    /// Sets the policy for the loss of a requirement. Default: the application carries on.
     #[must_use]
     pub const fn on_requirement_lost(mut self, policy: RequirementPolicy) -> Self {
         self.common.on_lost = policy;
         self
     }
 
-    /// When it loses what it requires, `enter` is called, once for each name, ahead of every message that waits; when all
-    /// is met again, `leave`. Between them it handles messages as ever.
+    /// Declares a safe state. `enter` is called when requirements are lost, once for each name, ahead of all
+    /// queued messages. `leave` is called when all are met again. Between them the application handles
+    /// messages as usual.
     ///
     /// # Examples
     ///
@@ -158,33 +163,37 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     }
 }
 
-/// Says how a life ended that ended itself because of its policy.
-pub(super) type Parting = Rc<RefCell<Option<Reason>>>;
+/// The end reason of an incarnation that stopped itself because of its policy.
+pub(super) type EndReason = Rc<RefCell<Option<Reason>>>;
 
-/// What one life knows of its requirements, and does about them.
+/// The requirements of one incarnation as far as it knows them, and its policy for their loss.
 pub(super) struct Requirements<A: Actor<Context = AppContext<A>>> {
     policy: RequirementPolicy,
     safe_state: Option<SafeState<A>>,
-    /// The names that are not ready, as far as it was told.
+    /// The names that are not ready, according to the events received so far.
     lost: BTreeSet<String>,
-    /// The same of what it can do without.
+    /// The optional requirements that are not ready.
     without: BTreeSet<String>,
     paused: Option<Time>,
-    parting: Parting,
+    end_reason: EndReason,
 }
 
 impl<A: Actor<Context = AppContext<A>>> Requirements<A> {
-    pub(super) fn new(policy: RequirementPolicy, safe_state: Option<SafeState<A>>, parting: Parting) -> Self {
-        Self { policy, safe_state, lost: BTreeSet::new(), without: BTreeSet::new(), paused: None, parting }
+    pub(super) fn new(
+        policy: RequirementPolicy,
+        safe_state: Option<SafeState<A>>,
+        end_reason: EndReason,
+    ) -> Self {
+        Self { policy, safe_state, lost: BTreeSet::new(), without: BTreeSet::new(), paused: None, end_reason }
     }
 
-    /// Whether neither messages nor timers are handled.
+    /// Returns whether the handling of messages and timers is paused.
     pub(super) const fn is_paused(&self) -> bool {
         self.paused.is_some()
     }
 
-    /// Takes note of a change and does what the policy says. Returns whether it is news to this life: an event that was
-    /// meant for the life before may be left.
+    /// Records a change and applies the policy. Returns whether the change is new to this incarnation: an
+    /// event for the previous incarnation may still be queued.
     pub(super) fn take(
         &mut self,
         actor: &mut A,
@@ -194,11 +203,11 @@ impl<A: Actor<Context = AppContext<A>>> Requirements<A> {
     ) -> bool {
         match event {
             RequirementEvent::Lost { name } => {
-                let is_news = self.lost.insert(name.clone());
-                if is_news {
+                let is_new = self.lost.insert(name.clone());
+                if is_new {
                     self.on_lost(actor, context, event, now);
                 }
-                is_news
+                is_new
             }
             RequirementEvent::Met { name } => {
                 let was_lost = self.lost.remove(name);
@@ -223,7 +232,7 @@ impl<A: Actor<Context = AppContext<A>>> Requirements<A> {
                 }
             }
             RequirementPolicy::Restart => {
-                *self.parting.borrow_mut() = Some(Reason::RequirementLost(event.name().to_owned()));
+                *self.end_reason.borrow_mut() = Some(Reason::RequirementLost(event.name().to_owned()));
                 context.stop();
             }
         }
@@ -245,7 +254,8 @@ impl<A: Actor<Context = AppContext<A>>> Requirements<A> {
     }
 }
 
-/// The event in a message, if it is the word of this node's sync manager and not of somebody who says it by that name.
+/// Returns the event in a message, if the message is from this node's sync manager and not from another
+/// sender that uses its kind.
 pub(super) fn event_in<A: Actor<Context = AppContext<A>>>(
     context: &AppContext<A>,
     message: &Message,
@@ -255,10 +265,10 @@ pub(super) fn event_in<A: Actor<Context = AppContext<A>>>(
     if message.header.kind == RequirementEvent::KIND && is_ours { message.decode().ok() } else { None }
 }
 
-/// An application whose factory could not make its actor.
-pub(super) struct Unmade(pub(super) String);
+/// An application without an actor, because its factory failed.
+pub(super) struct FailedStart(pub(super) String);
 
-impl Life for Unmade {
+impl RunningActor for FailedStart {
     fn poll(&mut self, _: &mut std::task::Context<'_>) -> std::task::Poll<Reason> {
         std::task::Poll::Ready(Reason::StartFailed(std::mem::take(&mut self.0)))
     }
@@ -268,22 +278,22 @@ impl Life for Unmade {
     fn terminate(&mut self) {}
 }
 
-/// A life that may say itself how it ended.
-pub(super) struct PartingLife {
-    pub(super) life: Box<dyn Life>,
-    pub(super) parting: Parting,
+/// An incarnation that may set its own end reason.
+pub(super) struct WithEndReason {
+    pub(super) actor: Box<dyn RunningActor>,
+    pub(super) end_reason: EndReason,
 }
 
-impl Life for PartingLife {
+impl RunningActor for WithEndReason {
     fn poll(&mut self, cx: &mut std::task::Context<'_>) -> std::task::Poll<Reason> {
-        self.life.poll(cx).map(|reason| self.parting.borrow_mut().take().unwrap_or(reason))
+        self.actor.poll(cx).map(|reason| self.end_reason.borrow_mut().take().unwrap_or(reason))
     }
 
     fn stop(&mut self) {
-        self.life.stop();
+        self.actor.stop();
     }
 
     fn terminate(&mut self) {
-        self.life.terminate();
+        self.actor.terminate();
     }
 }

@@ -1,4 +1,4 @@
-//! Outcomes that come to their sender as messages: one handler for all, instead of a future for each.
+//! Outcomes delivered to the sender as messages: one handler for all outcomes, instead of one future for each.
 
 use std::time::Duration;
 
@@ -10,7 +10,7 @@ use crate::{
     sender::{Confirmation, Content, GroupConfirmation, MessageBuilder, SendError, Sender, Via},
 };
 
-/// What became of a message that was sent with [`MessageBuilder::with_tag`].
+/// The outcome of a message that was sent with [`MessageBuilder::with_tag`].
 ///
 /// # Examples
 ///
@@ -36,9 +36,9 @@ use crate::{
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SendOutcome {
-    /// The number that its sender gave it.
+    /// The tag that the sender gave to the message.
     pub tag: u64,
-    /// Its fate.
+    /// The outcome of the message.
     pub outcome: Outcome,
 }
 
@@ -46,7 +46,7 @@ impl Message for SendOutcome {
     type Result = ();
 }
 
-/// What became of a message to many that was sent with [`MessageBuilder::with_tag`], at each of its members.
+/// The outcomes of a message to many that was sent with [`MessageBuilder::with_tag`], one for each member.
 ///
 /// # Examples
 ///
@@ -66,9 +66,9 @@ impl Message for SendOutcome {
 /// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct GroupOutcome {
-    /// The number that its sender gave it.
+    /// The tag that the sender gave to the message.
     pub tag: u64,
-    /// One for each member, in the order of their TIDs.
+    /// The outcomes, one for each member, in the order of their TIDs.
     pub members: Vec<MemberOutcome>,
 }
 
@@ -76,7 +76,7 @@ impl Message for GroupOutcome {
     type Result = ();
 }
 
-/// A context that is to get outcomes as messages.
+/// An application context that receives outcomes as messages.
 pub struct Tagged<'a, A: Actor<Context = AppContext<A>>> {
     context: &'a mut AppContext<A>,
     tag: u64,
@@ -89,24 +89,26 @@ impl<A: Actor<Context = AppContext<A>>> Via for Tagged<'_, A> {
 }
 
 impl<'a, A: Actor<Context = AppContext<A>>, C: Content> MessageBuilder<&'a mut AppContext<A>, C> {
-    /// Sends it, and asks what becomes of it: see [`Confirmation`] and [`Sender::message`].
+    /// Sends the message and returns a future of its outcome: see [`Confirmation`] and [`Sender::message`].
     ///
     /// # Errors
-    /// No queue and no socket took it, it is of class Stream, or it is for more than one application ([`SendError::ToMany`]).
+    /// No queue and no socket accepted the message, it is of class Stream, or its destination is more than
+    /// one application ([`SendError::ToMany`]).
     pub fn confirmed(self, within: Duration) -> Result<Confirmation, SendError> {
         self.confirm(within).map(|(_, confirmation)| confirmation)
     }
 
-    /// Sends it to many, and asks what becomes of it at each member: see [`MessageBuilder::confirmed_by_each`] of a [`Sender`], which this is
-    /// for an actor.
+    /// Sends the message to many and returns a future of the outcome at each member. See
+    /// [`MessageBuilder::confirmed_by_each`] of a [`Sender`]; this is the same method for an actor.
     ///
     /// # Errors
-    /// It is of class Stream, its node is not known, or it has too many members.
+    /// The message is of class Stream, its node is unknown, or it has too many members.
     pub fn confirmed_by_each(self, within: Duration) -> Result<GroupConfirmation, SendError> {
         self.confirm_by_each(within).map(|(_, confirmation)| confirmation)
     }
 
-    /// Has its outcome come to this actor as a [`SendOutcome`] with `tag`, or as a [`GroupOutcome`], instead of as a future.
+    /// Delivers the outcome to this actor as a [`SendOutcome`] or a [`GroupOutcome`] with `tag`, instead of
+    /// as a future.
     ///
     /// # Examples
     ///
@@ -140,11 +142,12 @@ impl<A, C: Content> MessageBuilder<Tagged<'_, A>, C>
 where
     A: Actor<Context = AppContext<A>> + Handler<SendOutcome, Result = ()>,
 {
-    /// Sends it; what becomes of it comes to this actor as a [`SendOutcome`], once, in a turn of its own. The next life of the
-    /// application does not get it.
+    /// Sends the message. Its outcome is delivered to this actor once, as a [`SendOutcome`], in a turn of its
+    /// own. The next incarnation of the application does not receive it.
     ///
     /// # Errors
-    /// No queue and no socket took it, it is of class Stream, or it is for more than one application; no `SendOutcome` comes.
+    /// No queue and no socket accepted the message, it is of class Stream, or its destination is more than
+    /// one application. No `SendOutcome` is delivered then.
     pub fn confirmed(self, within: Duration) -> Result<(), SendError> {
         let (Tagged { context, tag }, confirmation) = self.confirm(within)?;
         let handled = fut::wrap_future::<_, A>(confirmation)
@@ -158,8 +161,9 @@ impl<A, C: Content> MessageBuilder<Tagged<'_, A>, C>
 where
     A: Actor<Context = AppContext<A>> + Handler<GroupOutcome, Result = ()>,
 {
-    /// Sends it to many; what becomes of it at each member comes to this actor as a [`GroupOutcome`], once, in a turn of its own: when the last
-    /// member is settled, and at the latest `within` this time. The next life of the application does not get it.
+    /// Sends the message to many. The outcomes of all members are delivered to this actor once, as one
+    /// [`GroupOutcome`], in a turn of its own. It arrives when the last member is settled, and at the latest
+    /// `within` this time. The next incarnation of the application does not receive it.
     ///
     /// # Examples
     ///
@@ -189,7 +193,8 @@ where
     /// ```
     ///
     /// # Errors
-    /// It is of class Stream, its node is not known, or it has too many members; no `GroupOutcome` comes.
+    /// The message is of class Stream, its node is unknown, or it has too many members. No `GroupOutcome` is
+    /// delivered then.
     pub fn confirmed_by_each(self, within: Duration) -> Result<(), SendError> {
         let (Tagged { context, tag }, confirmation) = self.confirm_by_each(within)?;
         let handled = fut::wrap_future::<_, A>(confirmation)

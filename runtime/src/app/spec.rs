@@ -1,4 +1,4 @@
-//! What a node must know of an application before it can start it.
+//! The declaration of an application, which a node needs to start it.
 
 use std::{sync::Arc, time::Duration};
 
@@ -6,18 +6,21 @@ use actix::{Actor, AsyncContext, Handler};
 
 use crate::{
     app::{
-        Absence, AppContext, Delivery, DownPolicy, Raw, RequirementEvent, RequirementPolicy, WILLS_MAX, Will,
+        AppContext, Delivery, DownPolicy, DownState, Raw, RequirementEvent, RequirementPolicy, WILLS_MAX,
+        Will,
         drive::{Dispatch, Drive, dispatch_raw, dispatch_typed},
-        requirement::{Parting, PartingLife, Requirements, SafeState, Unmade},
+        requirement::{EndReason, FailedStart, Requirements, SafeState, WithEndReason},
     },
     mailbox::Mailbox,
     sender::Sender,
-    supervision::{Launch, Life, Place, Policy, Restart, StartRetry, life, vitals::Vitals},
+    supervision::{
+        Launch, Place, Policy, Restart, RunningActor, StartRetry, liveness::Liveness, running_actor,
+    },
     tid::AppAddress,
     wire::{Kind, Payload, remember},
 };
 
-/// Declares an application: how to make its actor, its name, what it handles, what it requires, where it runs.
+/// Declares an application: its factory, its name, the payloads that it handles, its requirements and its place.
 ///
 /// # Examples
 ///
@@ -55,7 +58,7 @@ pub(super) struct Common {
     kinds: Vec<(Kind, &'static str)>,
     policy: Policy,
     place: Place,
-    pub(super) away: DownPolicy,
+    pub(super) down_policy: DownPolicy,
     pub(super) wills: Vec<Will>,
     pub(super) on_lost: RequirementPolicy,
     has_safe_state: bool,
@@ -64,14 +67,15 @@ pub(super) struct Common {
 }
 
 impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
-    /// An application called `name` (1 to 63 bytes, unique on its node). `factory` makes a new actor for its start and
-    /// for each restart. It runs on the thread that the node's applications share, until a place is set.
+    /// Declares an application called `name` (1 to 63 bytes, unique on its node). `factory` makes a new actor
+    /// for the start and for each restart. The application runs on the thread that the node's applications
+    /// share, unless a place is set.
     pub fn new(name: impl Into<String>, factory: impl Fn() -> A + Send + Sync + 'static) -> Self {
         Self::made_by(name.into(), Arc::new(move || Ok(factory())))
     }
 
-    /// The same with a factory that may fail, as it opens a device for example. Its error fails the start, as
-    /// [`AppContext::fail_start`] does.
+    /// Same as [`new`](Self::new), with a factory that may fail, for example if it opens a device. Its error
+    /// fails the start, as [`AppContext::fail_start`] does.
     ///
     /// # Examples
     ///
@@ -98,7 +102,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
             kinds: Vec::new(),
             policy: Policy { held: true, ..Policy::default() },
             place: Place::thread("apps"),
-            away: DownPolicy::default(),
+            down_policy: DownPolicy::default(),
             wills: Vec::new(),
             on_lost: RequirementPolicy::default(),
             has_safe_state: false,
@@ -108,7 +112,8 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         Self { factory, handlers: Vec::new(), common, safe_state: None }
     }
 
-    /// It handles payloads of type `P`. Layers' events are payloads too: to handle `NodeEvent` is to subscribe to it.
+    /// Declares that the application handles payloads of type `P`. The events of layers are payloads too: an
+    /// application that handles `NodeEvent` is subscribed to it.
     ///
     /// # Examples
     ///
@@ -139,7 +144,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
-    /// It handles the raw bytes of `kind`.
+    /// Declares that the application handles the raw bytes of `kind`.
     #[must_use]
     pub fn handles_raw(mut self, kind: Kind) -> Self
     where
@@ -150,9 +155,10 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
-    /// It starts when all of these are met, on this node or on any other: names (`knee.drive`), patterns (`*.drive`), any of
-    /// several (`hip.imu | knee.imu`), so many of them (`2 of *.drive`), or what it waits for no longer than a time
-    /// (`camera ?2s`). See [`Requirement`](crate::app::Requirement), which can be given instead of its text.
+    /// Declares requirements. The application starts when all of them are met, on this node or on any other.
+    /// A requirement is a name (`knee.drive`), a pattern (`*.drive`), alternatives (`hip.imu | knee.imu`), a
+    /// minimum count (`2 of *.drive`), or optional after a time (`camera ?2s`). See
+    /// [`Requirement`](crate::app::Requirement), which can be given instead of its text.
     ///
     /// # Examples
     ///
@@ -170,26 +176,28 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
-    /// It has this address instead of one that LNCL chooses; see [`AppAddress::fixed`].
+    /// Sets a fixed address, instead of one that LNCL assigns; see [`AppAddress::fixed`].
     #[must_use]
     pub fn address(mut self, address: AppAddress) -> Self {
         self.common.address = Some(address);
         self
     }
 
-    /// It has a thread of its own: isolation, for one more thread wake each way.
+    /// Runs the application on a thread of its own: it is isolated, at the cost of one more thread wake in
+    /// each direction.
     #[must_use]
     pub fn own_thread(self) -> Self {
         self.place(Place::own_thread())
     }
 
-    /// It has a process of its own, a child of the node's: nothing that it does harms the node, and it can be killed. See
-    /// [`Place::process`].
+    /// Runs the application in a process of its own, a child of the node's process. A crash does not harm the
+    /// node, and the process can be killed. See [`Place::process`].
     ///
-    /// That process is this program, started again with the same arguments for each life of the application: its `main` runs again,
-    /// up to the line that starts the node, which does not return there. Whatever comes before that line happens in each such
-    /// process as well, so keep it short, and leave to the application itself what only one process can have (a port, a
-    /// device, a file that is written). It can do all that it can in a thread, but `monitor` others.
+    /// The process is this program, started again with the same arguments for each incarnation of the
+    /// application. Its `main` runs again, up to the line that starts the node, which does not return there.
+    /// The code before that line runs in each such process as well, so keep it short. Let the application
+    /// itself open resources that only one process can have (a port, a device, a file that is written). The
+    /// application has all the features that it has in a thread, except `monitor`.
     ///
     /// # Examples
     ///
@@ -207,14 +215,15 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self.place(Place::process())
     }
 
-    /// It shares the thread that reads the node's sockets: the lowest latency; its handlers must be short.
+    /// Runs the application on the thread that reads the node's sockets. This has the lowest latency; its
+    /// handlers must be short.
     #[must_use]
     pub fn on_io_thread(self) -> Self {
         self.place(Place::io())
     }
 
-    /// It runs in this place: a thread with a name, and perhaps a real-time priority and a CPU. A node in which two ask
-    /// for different priorities or CPUs of one thread does not start.
+    /// Sets the place in which the application runs: a named thread, and optionally a real-time priority and
+    /// a CPU. A node does not start if two applications request different priorities or CPUs for one thread.
     ///
     /// # Examples
     ///
@@ -233,7 +242,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
-    /// A fault strikes it, in all its lives together. Only with the feature `fault-points`.
+    /// Injects a fault into the application, counted over all its incarnations. Only with the feature `fault-points`.
     #[cfg(feature = "fault-points")]
     #[must_use]
     pub fn fault(mut self, fault: crate::supervision::fault::Fault) -> Self {
@@ -241,25 +250,27 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
-    /// When it is started again after it ended. Default: always. A node cannot tell a fault that will pass from one that will not
-    /// (a device that is not there, a configuration that is wrong): a start that fails is tried again, too, until its supervisor
-    /// has had its fill of restarts; by default that is the sixth failure within ten seconds.
+    /// Sets when the application is restarted after it ended. Default: always. A node cannot distinguish a
+    /// transient fault from a permanent one (a missing device, a wrong configuration), so a failed start is
+    /// retried too. Retries end when the supervisor's restart intensity is exceeded: by default at the sixth
+    /// failure within ten seconds. A start that fails by an explicit call (`fail_start`, an error of
+    /// [`try_new`](Self::try_new)) does not count: see [`StartRetry`](crate::supervision::StartRetry).
     #[must_use]
     pub const fn restart(mut self, restart: Restart) -> Self {
         self.common.policy.restart = restart;
         self
     }
 
-    /// Its end may be the end of its supervisor; see [`AutoShutdown`](crate::supervision::AutoShutdown). For one that is
-    /// transient or temporary.
+    /// Marks the application as significant: its end may end its supervisor; see
+    /// [`AutoShutdown`](crate::supervision::AutoShutdown). For transient or temporary applications.
     #[must_use]
     pub const fn significant(mut self) -> Self {
         self.common.policy.significant = true;
         self
     }
 
-    /// The wait before it is started again: `min` at first, doubled by each failure in a row up to `max`, then shortened by
-    /// chance by up to a quarter. Default 1 ms to 2 s.
+    /// Sets the wait before a restart: `min` at first, doubled by each consecutive failure up to `max`, then
+    /// shortened by a random part of up to a quarter. Default 1 ms to 2 s.
     #[must_use]
     pub const fn backoff(mut self, min: Duration, max: Duration) -> Self {
         self.common.policy.backoff_min = min;
@@ -267,8 +278,9 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
-    /// How a start is tried again that failed by [`AppContext::fail_start`] or by the error of [`try_new`](Self::try_new). Default: after 100 ms
-    /// at first, doubled each time up to 5 s, without an end.
+    /// Sets the retry policy for a start that failed by [`AppContext::fail_start`] or by an error of
+    /// [`try_new`](Self::try_new)'s factory. Default: after 100 ms at first, doubled each time up to 5 s,
+    /// without a limit on retries.
     ///
     /// # Examples
     ///
@@ -287,16 +299,18 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
-    /// Time that it has to become ready once it is started. Default 10 s; after it the start has failed and is tried again.
-    /// One that holds its readiness (`hold_ready`) for a device that may be off sets what it is willing to wait.
+    /// Sets the time in which the application must become ready after its start. Default 10 s; after that the
+    /// start has failed and is retried. An application that holds its readiness (`hold_ready`) for a device
+    /// that may be off sets the time that it can wait.
     #[must_use]
     pub const fn start_within(mut self, time: Duration) -> Self {
         self.common.policy.start_within = time;
         self
     }
 
-    /// Longest time that one turn (a handler, a timer, `started`) may take, and that it may leave its messages waiting while
-    /// it waits for something else. After it the application counts as hung and is replaced. Default 1 s.
+    /// Sets the maximum duration of one turn (a handler, a timer, `started`). It is also the maximum time for
+    /// which messages may wait while the application waits for something else. After that the application
+    /// counts as hung and is replaced. Default 1 s.
     ///
     /// # Examples
     ///
@@ -315,7 +329,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
         self
     }
 
-    /// Time that it has for its orderly stop. Default 500 ms.
+    /// Sets the time for an orderly stop. Default 500 ms.
     #[must_use]
     pub const fn stop_within(mut self, time: Duration) -> Self {
         self.common.policy.stop_within = time;
@@ -324,27 +338,27 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
 }
 
 impl Common {
-    /// Subscribes it to what its policy needs to know.
-    fn hear_of_requirements(&mut self) {
-        let told = (RequirementEvent::KIND, RequirementEvent::NAME);
-        if self.on_lost != RequirementPolicy::CarryOn && !self.kinds.contains(&told) {
-            self.kinds.push(told);
+    /// Subscribes the application to the events that its requirement policy needs.
+    fn subscribe_to_requirements(&mut self) {
+        let kind = (RequirementEvent::KIND, RequirementEvent::NAME);
+        if self.on_lost != RequirementPolicy::CarryOn && !self.kinds.contains(&kind) {
+            self.kinds.push(kind);
         }
     }
 }
 
-/// An [`AppSpec`] whose actor type is no longer named: what a node keeps.
+/// An [`AppSpec`] without its actor type, as a node stores it.
 pub struct DynApp {
     common: Common,
     wire: Box<dyn Fn(AppWiring) -> Launch + Send>,
 }
 
-/// What a node gives to an application.
+/// The endpoints that a node gives to an application.
 #[derive(Clone)]
 pub struct AppWiring {
-    /// How it sends.
+    /// The sender of the application.
     pub sender: Sender,
-    /// What it receives.
+    /// The mailbox of the application.
     pub mailbox: Arc<Mailbox>,
 }
 
@@ -352,34 +366,35 @@ impl<A: Actor<Context = AppContext<A>>> From<AppSpec<A>> for DynApp {
     fn from(spec: AppSpec<A>) -> Self {
         let AppSpec { factory, handlers, mut common, safe_state } = spec;
         let on_lost = common.on_lost;
-        common.hear_of_requirements();
+        common.subscribe_to_requirements();
         common.has_safe_state = safe_state.is_some();
         let kinds: Arc<[_]> = common.kinds.clone().into();
         let wire = move |wiring: AppWiring| {
             let (factory, handlers, safe_state) = (factory.clone(), handlers.clone(), safe_state.clone());
             let kinds = kinds.clone();
             let launch: Launch = Arc::new(move |ready| {
-                // A launch outside of a guard has nobody who would take its life.
-                let vitals = Vitals::present().unwrap_or_else(|| Vitals::new("unguarded"));
-                // Before the factory: if that comes back after another life has taken this one's place, the reader is the
-                // other's, and stays so.
+                // A launch outside of a guard has no supervisor that could fence its incarnation.
+                let liveness = Liveness::current().unwrap_or_else(|| Liveness::new("unguarded"));
+                // The reader is attached before the factory runs. If the factory returns after another
+                // incarnation has taken this one's place, the reader belongs to that incarnation, and remains
+                // there.
                 let reader = wiring.mailbox.attach();
                 let made = factory();
-                if vitals.is_over() {
-                    vitals.leave();
+                if liveness.is_fenced() {
+                    liveness.unwind_turn();
                 }
                 let actor = match made {
                     Ok(actor) => actor,
-                    Err(why) => return Box::new(Unmade(why)) as Box<dyn Life>,
+                    Err(why) => return Box::new(FailedStart(why)) as Box<dyn RunningActor>,
                 };
-                vitals.reads(wiring.mailbox.clone(), reader.epoch(), kinds.clone());
-                let sender = wiring.sender.in_life(vitals.clone());
-                let parting = Parting::default();
-                let requirements = Requirements::new(on_lost, safe_state.clone(), parting.clone());
-                let drive = Drive::new(reader, handlers.clone(), requirements, vitals);
-                let mut running = AppContext::into_life(sender, ready, actor, parting.clone());
+                liveness.attach_mailbox(wiring.mailbox.clone(), reader.epoch(), kinds.clone());
+                let sender = wiring.sender.for_incarnation(liveness.clone());
+                let end_reason = EndReason::default();
+                let requirements = Requirements::new(on_lost, safe_state.clone(), end_reason.clone());
+                let drive = Drive::new(reader, handlers.clone(), requirements, liveness);
+                let mut running = AppContext::into_running(sender, ready, actor, end_reason.clone());
                 running.ctx().spawn(drive);
-                Box::new(PartingLife { life: life(running), parting })
+                Box::new(WithEndReason { actor: running_actor(running), end_reason })
             });
             launch
         };
@@ -388,68 +403,68 @@ impl<A: Actor<Context = AppContext<A>>> From<AppSpec<A>> for DynApp {
 }
 
 impl DynApp {
-    /// Its name.
+    /// Returns the name of the application.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.common.name
     }
 
-    /// The fixed address that it wants.
+    /// Returns the fixed address that the application requests.
     #[must_use]
     pub const fn address(&self) -> Option<AppAddress> {
         self.common.address
     }
 
-    /// What it requires.
+    /// Returns the requirements of the application.
     #[must_use]
     pub fn requires(&self) -> &[String] {
         &self.common.requires
     }
 
-    /// What it handles: kinds, with the names of their types.
+    /// Returns the kinds that the application handles, with the names of their types.
     #[must_use]
     pub fn kinds(&self) -> &[(Kind, &'static str)] {
         &self.common.kinds
     }
 
-    /// What its supervisor may do with it.
+    /// Returns the supervision policy of the application.
     #[must_use]
     pub const fn policy(&self) -> &Policy {
         &self.common.policy
     }
 
-    /// Where it runs.
+    /// Returns the place of the application.
     #[must_use]
     pub const fn place(&self) -> &Place {
         &self.common.place
     }
 
-    /// One more fault strikes it.
+    /// Adds one more injected fault.
     #[cfg(feature = "fault-points")]
     pub fn plan_fault(&mut self, fault: crate::supervision::fault::Fault) {
         self.common.faults.push(fault);
     }
 
-    /// The faults that strike it.
+    /// Returns the injected faults.
     #[cfg(feature = "fault-points")]
     #[must_use]
     pub fn faults(&self) -> &[crate::supervision::fault::Fault] {
         &self.common.faults
     }
 
-    /// What it does when it loses what it requires.
+    /// Returns the policy for the loss of a requirement.
     #[must_use]
     pub const fn requirement_policy(&self) -> RequirementPolicy {
         self.common.on_lost
     }
 
-    /// What is sent on its behalf when it has ended.
+    /// Returns the last wills of the application.
     #[must_use]
     pub fn wills(&self) -> &[Will] {
         &self.common.wills
     }
 
-    /// What is wrong with its declaration, in words.
+    /// Returns the error in the declaration, as a text, if it has one.
     #[must_use]
     pub fn fault(&self) -> Option<String> {
         let Common { wills, on_lost, has_safe_state, .. } = &self.common;
@@ -468,13 +483,13 @@ impl DynApp {
         }
     }
 
-    /// What its node keeps for the time that it is away.
+    /// Creates the state that the node keeps for the time when the application is down.
     #[must_use]
-    pub fn absence(&self, wiring: AppWiring) -> Absence {
-        Absence::new(wiring, self.common.away, self.common.wills.clone())
+    pub fn down_state(&self, wiring: AppWiring) -> DownState {
+        DownState::new(wiring, self.common.down_policy, self.common.wills.clone())
     }
 
-    /// How it is started, on the thread of its place, with what its node gives it.
+    /// Creates the launch function, which starts the application on the thread of its place.
     #[must_use]
     pub fn launch(&self, wiring: AppWiring) -> Launch {
         (self.wire)(wiring)

@@ -1,4 +1,4 @@
-//! An event of the log: taken down where it happens, told to its reader elsewhere.
+//! A log event: recorded on its own thread, and handed to its reader on another one.
 
 use std::{
     cell::RefCell,
@@ -18,91 +18,92 @@ use tracing::{
 
 use super::{
     stderr::{self, Line},
-    writer::enter,
+    writer::enqueue,
 };
 
-/// Fields of one event at most; more are left out.
+/// Maximum number of fields of one event; further ones are left out.
 const FIELDS_MAX: usize = 16;
-/// Bytes of one field's text at most; the rest is left out.
+/// Maximum length of one field's text in bytes; the rest is left out.
 const TEXT_BYTES_MAX: usize = 4_096;
 
-/// Whether anybody reads events of this level.
+/// Returns whether events of this level have a reader.
 #[must_use]
 pub fn is_on(level: Level) -> bool {
     begin_default();
     level <= LevelFilter::current()
 }
 
-/// Has the default log count among those that may read events. It is nobody's default subscriber.
+/// Registers the default log as a reader of events. It is never a thread's default subscriber.
 fn begin_default() {
     static BEGUN: Once = Once::new();
-    // What `tracing` asks a new subscriber leads to no event.
-    BEGUN.call_once(|| _ = notebook(Reader::Default));
+    // The calls of `tracing` to a new subscriber cause no event.
+    BEGUN.call_once(|| _ = recorder(Reader::Default));
 }
 
-/// Has the event that `say` says told to this thread's subscriber, or written by the default log, on the log's thread. Waits for nobody.
-pub fn apart(say: impl FnOnce()) {
+/// Passes the event of `log_event` to the subscriber of this thread, or to the default log, on the log thread.
+/// Never blocks.
+pub fn apart(log_event: impl FnOnce()) {
     let reader = get_default(Dispatch::clone);
     let is_default = reader.is::<NoSubscriber>();
-    with_default(notebook(if is_default { Reader::Default } else { Reader::Subscriber }), say);
-    // A thread that is about to end has no notebook any more.
-    let Some(noted) = NOTED.try_with(RefCell::take).ok().flatten() else { return };
+    with_default(recorder(if is_default { Reader::Default } else { Reader::Subscriber }), log_event);
+    // A thread at its end may have destroyed this variable.
+    let Some(recorded) = RECORDED.try_with(RefCell::take).ok().flatten() else { return };
     if is_default {
-        enter(Box::new(move || noted.write()));
+        enqueue(Box::new(move || recorded.write()));
     } else {
-        enter(Box::new(move || noted.tell(&reader)));
+        enqueue(Box::new(move || recorded.dispatch_to(&reader)));
     }
 }
 
-/// Has the event that `say` says told to this thread's subscriber here and now. Where there is none, it goes to the default log as with
-/// [`apart`]: for programs that have no node, and may have been forked.
-pub fn here(say: impl FnOnce()) {
+/// Passes the event of `log_event` to this thread's subscriber immediately. Without a subscriber it goes to the
+/// default log, as with [`apart`]. For programs that have no node, and may have been forked.
+pub fn here(log_event: impl FnOnce()) {
     if get_default(|reader| reader.is::<NoSubscriber>()) {
-        apart(say);
+        apart(log_event);
     } else {
-        say();
+        log_event();
     }
 }
 
-/// On the log's thread: has the event that `say` says told or written now.
-pub(super) fn at_once(say: impl FnOnce()) {
+/// Passes on or writes the event of `log_event` immediately. On the log thread only.
+pub(super) fn immediately(log_event: impl FnOnce()) {
     if stderr::is_replaced() {
-        return say();
+        return log_event();
     }
-    with_default(notebook(Reader::Default), say);
-    if let Some(noted) = NOTED.take() {
-        noted.write();
+    with_default(recorder(Reader::Default), log_event);
+    if let Some(recorded) = RECORDED.take() {
+        recorded.write();
     }
 }
 
 thread_local! {
-    /// What was said last on this thread.
-    static NOTED: RefCell<Option<Noted>> = const { RefCell::new(None) };
+    /// The last event recorded on this thread.
+    static RECORDED: RefCell<Option<RecordedEvent>> = const { RefCell::new(None) };
 }
 
-/// For which reader an event is taken down.
+/// The reader for which an event is recorded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Reader {
-    /// The program's own.
+    /// The program's own subscriber.
     Subscriber,
     /// The default log.
     Default,
 }
 
-/// The subscriber that takes down what is said for this reader.
-fn notebook(reader: Reader) -> &'static Dispatch {
-    static NOTEBOOKS: [OnceLock<Dispatch>; 2] = [const { OnceLock::new() }; 2];
-    NOTEBOOKS[usize::from(reader == Reader::Default)].get_or_init(|| Dispatch::new(Notebook(reader)))
+/// Returns the subscriber that records events for this reader.
+fn recorder(reader: Reader) -> &'static Dispatch {
+    static RECORDERS: [OnceLock<Dispatch>; 2] = [const { OnceLock::new() }; 2];
+    RECORDERS[usize::from(reader == Reader::Default)].get_or_init(|| Dispatch::new(Recorder(reader)))
 }
 
-struct Notebook(Reader);
+struct Recorder(Reader);
 
-impl Subscriber for Notebook {
+impl Subscriber for Recorder {
     fn enabled(&self, metadata: &Metadata<'_>) -> bool {
         self.0 == Reader::Subscriber || stderr::wants(metadata)
     }
 
-    // For a subscriber's events it wants nothing itself: which ones there are is that one's business.
+    // For a subscriber's events it requests nothing itself: the subscriber decides which events there are.
     fn register_callsite(&self, metadata: &'static Metadata<'static>) -> Interest {
         match self.0 {
             Reader::Default if stderr::wants(metadata) => Interest::sometimes(),
@@ -119,9 +120,10 @@ impl Subscriber for Notebook {
 
     fn event(&self, event: &Event<'_>) {
         let time = (self.0 == Reader::Default).then(now);
-        let mut noted = Noted { metadata: event.metadata(), fields: Vec::with_capacity(FIELDS_MAX), time };
-        event.record(&mut noted);
-        let _ = NOTED.try_with(|last| last.replace(Some(noted)));
+        let mut recorded =
+            RecordedEvent { metadata: event.metadata(), fields: Vec::with_capacity(FIELDS_MAX), time };
+        event.record(&mut recorded);
+        let _ = RECORDED.try_with(|last| last.replace(Some(recorded)));
     }
 
     fn new_span(&self, _: &span::Attributes<'_>) -> span::Id {
@@ -137,39 +139,39 @@ impl Subscriber for Notebook {
     fn exit(&self, _: &span::Id) {}
 }
 
-/// An event with all that it says.
-struct Noted {
+/// A recorded event with all its fields.
+struct RecordedEvent {
     metadata: &'static Metadata<'static>,
-    fields: Vec<(Field, Said)>,
-    /// When it happened, where that is to be written.
+    fields: Vec<(Field, FieldValue)>,
+    /// When the event occurred, if that must be written.
     time: Option<SystemTime>,
 }
 
-/// The time that a line of the log shows.
+/// Returns the time for a line of the log.
 #[expect(clippy::disallowed_methods, reason = "people compare the time of a line with a clock on the wall")]
 pub(crate) fn now() -> SystemTime {
     SystemTime::now()
 }
 
-/// What a field says.
-enum Said {
+/// The value of a field.
+enum FieldValue {
     Bool(bool),
     Signed(i64),
     Unsigned(u64),
     Real(f64),
     Text(String),
-    /// Written by what it is of, and to be read as it stands.
-    Words(String),
+    /// A text formatted by the value itself, to be shown unchanged.
+    Formatted(String),
 }
 
-impl Noted {
-    /// Tells it to `reader`, if that wants it.
-    fn tell(&self, reader: &Dispatch) {
-        // Said on this thread, which has no subscriber of its own: it retires the default log where that has become idle.
+impl RecordedEvent {
+    /// Passes the event to `reader`, if it is enabled there.
+    fn dispatch_to(&self, reader: &Dispatch) {
+        // Called on this thread, which has no subscriber of its own: it retires the default log once that is replaced.
         let _ = stderr::is_replaced();
-        let words: Vec<_> = self.fields.iter().map(|(_, said)| said.words()).collect();
+        let words: Vec<_> = self.fields.iter().map(|(_, value)| value.formatted()).collect();
         let values: Vec<&dyn Value> =
-            self.fields.iter().zip(&words).map(|((_, said), words)| said.value(words)).collect();
+            self.fields.iter().zip(&words).map(|((_, value), words)| value.as_value(words)).collect();
         let Some((first, _)) = self.fields.first() else { return };
         let mut pairs: [(&Field, Option<&dyn Value>); FIELDS_MAX] = [(first, None); FIELDS_MAX];
         for (pair, ((field, _), value)) in pairs.iter_mut().zip(self.fields.iter().zip(values)) {
@@ -182,33 +184,33 @@ impl Noted {
         }
     }
 
-    /// Writes it as a line of the default log; tells the program's subscriber, if there is one by now.
+    /// Writes the event as a line of the default log, or passes it to the program's subscriber, if there is one now.
     fn write(self) {
         if stderr::is_replaced() {
-            return self.tell(&get_default(Dispatch::clone));
+            return self.dispatch_to(&get_default(Dispatch::clone));
         }
         let time = self.time.unwrap_or_else(now);
         let mut line = Line::new(time, *self.metadata.level(), self.metadata.target());
         let (message, fields): (Vec<_>, Vec<_>) =
             self.fields.iter().partition(|(field, _)| field.name() == "message");
-        for (_, said) in message {
-            line.message(&said.shown());
+        for (_, value) in message {
+            line.message(&value.shown());
         }
-        for (field, said) in fields {
-            line.field(field.name(), &said.shown());
+        for (field, value) in fields {
+            line.field(field.name(), &value.shown());
         }
         line.write();
     }
 
-    fn note(&mut self, field: &Field, said: Said) {
+    fn push_field(&mut self, field: &Field, value: FieldValue) {
         if self.fields.len() < FIELDS_MAX {
-            self.fields.push((field.clone(), said));
+            self.fields.push((field.clone(), value));
         }
     }
 }
 
-impl Said {
-    /// What a line shows of it.
+impl FieldValue {
+    /// Returns the text of the value in a line.
     fn shown(&self) -> String {
         match self {
             Self::Bool(value) => value.to_string(),
@@ -216,27 +218,27 @@ impl Said {
             Self::Unsigned(value) => value.to_string(),
             Self::Real(value) => value.to_string(),
             Self::Text(text) => format!("{text:?}"),
-            Self::Words(words) => words.clone(),
+            Self::Formatted(words) => words.clone(),
         }
     }
 
-    fn words(&self) -> tracing::field::DisplayValue<&str> {
+    fn formatted(&self) -> tracing::field::DisplayValue<&str> {
         match self {
-            Self::Words(words) => display(words.as_str()),
+            Self::Formatted(words) => display(words.as_str()),
             Self::Bool(_) | Self::Signed(_) | Self::Unsigned(_) | Self::Real(_) | Self::Text(_) => {
                 display("")
             }
         }
     }
 
-    fn value<'a>(&'a self, words: &'a dyn Value) -> &'a dyn Value {
+    fn as_value<'a>(&'a self, words: &'a dyn Value) -> &'a dyn Value {
         match self {
             Self::Bool(value) => value,
             Self::Signed(value) => value,
             Self::Unsigned(value) => value,
             Self::Real(value) => value,
             Self::Text(text) => text,
-            Self::Words(_) => words,
+            Self::Formatted(_) => words,
         }
     }
 }
@@ -249,40 +251,40 @@ impl fmt::Write for Short {
     fn write_str(&mut self, more: &str) -> fmt::Result {
         let room = TEXT_BYTES_MAX - self.0.len();
         self.0.push_str(&more[..more.floor_char_boundary(room)]);
-        // Whoever writes stops here.
+        // The error ends the formatting here.
         if more.len() > room { Err(fmt::Error) } else { Ok(()) }
     }
 }
 
 fn short(words: fmt::Arguments<'_>) -> String {
     let mut text = Short::default();
-    // Too long: what there is of it is said.
+    // On overflow the text so far is used.
     let _ = fmt::write(&mut text, words);
     text.0
 }
 
-impl Visit for Noted {
+impl Visit for RecordedEvent {
     fn record_f64(&mut self, field: &Field, value: f64) {
-        self.note(field, Said::Real(value));
+        self.push_field(field, FieldValue::Real(value));
     }
 
     fn record_i64(&mut self, field: &Field, value: i64) {
-        self.note(field, Said::Signed(value));
+        self.push_field(field, FieldValue::Signed(value));
     }
 
     fn record_u64(&mut self, field: &Field, value: u64) {
-        self.note(field, Said::Unsigned(value));
+        self.push_field(field, FieldValue::Unsigned(value));
     }
 
     fn record_bool(&mut self, field: &Field, value: bool) {
-        self.note(field, Said::Bool(value));
+        self.push_field(field, FieldValue::Bool(value));
     }
 
     fn record_str(&mut self, field: &Field, value: &str) {
-        self.note(field, Said::Text(short(format_args!("{value}"))));
+        self.push_field(field, FieldValue::Text(short(format_args!("{value}"))));
     }
 
     fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
-        self.note(field, Said::Words(short(format_args!("{value:?}"))));
+        self.push_field(field, FieldValue::Formatted(short(format_args!("{value:?}"))));
     }
 }

@@ -1,26 +1,26 @@
-//! Which events the default log writes. Pure.
+//! The filter of events for the default log. Pure.
 
 use tracing::{Level, level_filters::LevelFilter};
 
-/// The crates whose events these are begin with this.
+/// The prefix of the names of Sinew's crates.
 const OWN: &str = "sinew";
 
-/// What `SINEW_LOG` says: `warn`, `info,sinew::gncl=debug`, `off`. The syntax is that of `EnvFilter` of `tracing-subscriber`, without
-/// its spans and fields, of which there are none here.
+/// The parsed directives of `SINEW_LOG`: `warn`, `info,sinew::gncl=debug`, `off`. The syntax is that of `EnvFilter` of
+/// `tracing-subscriber`, without spans and fields, which do not occur here.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Filter {
-    /// Beginnings of targets, the longest first, and the most that is wanted of each.
+    /// Prefixes of targets, the longest first, with the maximum level of each.
     targets: Vec<(String, LevelFilter)>,
-    /// Of all others.
+    /// The maximum level of all other targets.
     rest: LevelFilter,
 }
 
 impl Filter {
-    /// Reads directives. Those that cannot be read are left out. Where none is about Sinew, everything up to `usual` is wanted:
-    /// `RUST_LOG` may be set for other parts of the program alone.
-    pub(super) fn read(said: &str, usual: LevelFilter) -> Self {
+    /// Parses directives. Invalid ones are ignored. If none is about Sinew, all events up to `usual` pass:
+    /// `RUST_LOG` may be set only for other parts of the program.
+    pub(super) fn read(setting: &str, usual: LevelFilter) -> Self {
         let (mut targets, mut rest) = (Vec::new(), None);
-        for directive in said.split(',').map(str::trim).filter(|directive| !directive.is_empty()) {
+        for directive in setting.split(',').map(str::trim).filter(|directive| !directive.is_empty()) {
             match directive.split_once('=') {
                 Some((target, level)) => {
                     // `sinew[span{field}]=info` is about spans.
@@ -36,19 +36,19 @@ impl Filter {
         }
         let is_ours = |target: &str| target.starts_with(OWN) || OWN.starts_with(target);
         let is_about_us = targets.iter().any(|(target, _)| is_ours(target));
-        // As with `EnvFilter`: who names targets wants those.
+        // As with `EnvFilter`: if targets are named, only those pass.
         let others = if is_about_us { LevelFilter::OFF } else { usual };
         targets.sort_by_key(|(target, _)| std::cmp::Reverse(target.len()));
         Self { targets, rest: rest.unwrap_or(others) }
     }
 
-    /// Whether an event of this level is written that comes from `target`.
+    /// Returns whether an event of this level from `target` is written.
     pub(super) fn wants(&self, target: &str, level: Level) -> bool {
         let known = self.targets.iter().find(|(start, _)| target.starts_with(start));
         target.starts_with(OWN) && level <= known.map_or(self.rest, |(_, most)| *most)
     }
 
-    /// The most that is written of anything.
+    /// Returns the maximum level that is written for any target.
     pub(super) fn most(&self) -> LevelFilter {
         self.targets.iter().map(|(_, most)| *most).fold(self.rest, LevelFilter::max)
     }
@@ -58,9 +58,9 @@ impl Filter {
 mod tests {
     use super::*;
 
-    /// The lowest level that is written of GNCL, NDL, and the runtime.
-    fn levels(said: &str) -> [LevelFilter; 3] {
-        let filter = Filter::read(said, LevelFilter::INFO);
+    /// The lowest levels that are written for GNCL, NDL, and the runtime.
+    fn levels(setting: &str) -> [LevelFilter; 3] {
+        let filter = Filter::read(setting, LevelFilter::INFO);
         ["sinew::gncl::actor", "sinew::ndl", "sinew_runtime::app"].map(|target| {
             let levels = [Level::TRACE, Level::DEBUG, Level::INFO, Level::WARN, Level::ERROR];
             let most = levels.into_iter().find(|level| filter.wants(target, *level));
@@ -69,21 +69,21 @@ mod tests {
     }
 
     #[test]
-    fn a_level_counts_for_all_and_a_longer_target_before_a_shorter_one() {
+    fn level_applies_to_all_and_longer_targets_first() {
         use LevelFilter as L;
-        for (said, wanted) in [
+        for (setting, wanted) in [
             ("warn", [L::WARN; 3]),
             ("OFF", [L::OFF; 3]),
             ("warn,sinew::gncl=debug", [L::DEBUG, L::WARN, L::WARN]),
             (" sinew=error , sinew::gncl=trace ", [L::TRACE, L::ERROR, L::ERROR]),
             ("sinew::gncl=debug", [L::DEBUG, L::OFF, L::OFF]),
             ("sinew::gncl", [L::TRACE, L::OFF, L::OFF]),
-            // Nothing about Sinew, or nothing that can be read.
+            // No directive for Sinew, or none that is valid.
             ("my_robot=debug", [L::INFO; 3]),
             ("sinew[span]=debug,sinew=verbose,,", [L::INFO; 3]),
             ("my_robot=debug,error", [L::ERROR; 3]),
         ] {
-            assert_eq!(levels(said), wanted, "{said}");
+            assert_eq!(levels(setting), wanted, "{setting}");
         }
     }
 

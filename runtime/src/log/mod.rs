@@ -1,14 +1,15 @@
-//! What the runtime logs of itself: through a bounded queue and a thread of its own, so that a log which takes nothing stops
-//! nobody. What does not fit is dropped and counted.
+//! The runtime's own log, through a bounded queue and a thread of its own, so that a blocked log blocks no
+//! other thread. Entries that do not fit are dropped and counted.
 //!
-//! The macros here are those of `tracing`. An event is taken down where it happens, and given to the subscriber that was
-//! the thread's own there, later and on the log's thread: its time is when it is written, and it stands in no span.
+//! The macros here are those of `tracing`. An event is recorded where it occurs. Later, on the log thread, it
+//! is given to the subscriber of the recording thread. Its time is that of the writing, and it is in no span.
 //!
 //! Where the program has installed no subscriber, lines on the standard error are the default: see `stderr`.
 
 mod event;
 mod filter;
 mod stderr;
+mod target;
 mod writer;
 
 pub(crate) use event::now;
@@ -16,48 +17,55 @@ pub(crate) use event::now;
 pub use event::{apart, here, is_on};
 pub use stderr::set_level;
 pub(crate) use stderr::{Line, is_replaced, write_text};
-pub(crate) use writer::enter;
+#[doc(hidden)]
+pub use target::target;
+pub(crate) use writer::enqueue;
 pub use writer::{begin, flush, lost, print};
 
 #[doc(hidden)]
 pub use tracing;
 
-/// An error: something failed and somebody should look at it.
+/// Logs an error: a failure that needs attention.
 #[macro_export]
 #[doc(hidden)]
 macro_rules! log_error {
-    ($($said:tt)*) => { $crate::log_apart!(ERROR, $crate::log::tracing::error!($($said)*)) };
+    (target: $($args:tt)*) => { $crate::log_apart!(ERROR, $crate::log::tracing::error!(target: $($args)*)) };
+    ($($args:tt)*) => { $crate::log_apart!(ERROR, $crate::log::tracing::error!(target: $crate::log::target(module_path!()), $($args)*)) };
 }
 
-/// A warning: something is not as it should be, and things go on.
+/// Logs a warning: a deviation after which operation continues.
 #[macro_export]
 #[doc(hidden)]
 macro_rules! log_warn {
-    ($($said:tt)*) => { $crate::log_apart!(WARN, $crate::log::tracing::warn!($($said)*)) };
+    (target: $($args:tt)*) => { $crate::log_apart!(WARN, $crate::log::tracing::warn!(target: $($args)*)) };
+    ($($args:tt)*) => { $crate::log_apart!(WARN, $crate::log::tracing::warn!(target: $crate::log::target(module_path!()), $($args)*)) };
 }
 
-/// Something that happens seldom and is as it should be.
+/// Logs a rare event that is in order.
 #[macro_export]
 #[doc(hidden)]
 macro_rules! log_info {
-    ($($said:tt)*) => { $crate::log_apart!(INFO, $crate::log::tracing::info!($($said)*)) };
+    (target: $($args:tt)*) => { $crate::log_apart!(INFO, $crate::log::tracing::info!(target: $($args)*)) };
+    ($($args:tt)*) => { $crate::log_apart!(INFO, $crate::log::tracing::info!(target: $crate::log::target(module_path!()), $($args)*)) };
 }
 
-/// For who looks for a fault.
+/// Logs an event for fault analysis.
 #[macro_export]
 #[doc(hidden)]
 macro_rules! log_debug {
-    ($($said:tt)*) => { $crate::log_apart!(DEBUG, $crate::log::tracing::debug!($($said)*)) };
+    (target: $($args:tt)*) => { $crate::log_apart!(DEBUG, $crate::log::tracing::debug!(target: $($args)*)) };
+    ($($args:tt)*) => { $crate::log_apart!(DEBUG, $crate::log::tracing::debug!(target: $crate::log::target(module_path!()), $($args)*)) };
 }
 
-/// For who looks very closely.
+/// Logs an event for very detailed analysis.
 #[macro_export]
 #[doc(hidden)]
 macro_rules! log_trace {
-    ($($said:tt)*) => { $crate::log_apart!(TRACE, $crate::log::tracing::trace!($($said)*)) };
+    (target: $($args:tt)*) => { $crate::log_apart!(TRACE, $crate::log::tracing::trace!(target: $($args)*)) };
+    ($($args:tt)*) => { $crate::log_apart!(TRACE, $crate::log::tracing::trace!(target: $crate::log::target(module_path!()), $($args)*)) };
 }
 
-/// One event of this level, if anybody reads events of this level.
+/// Logs an event of this level, if events of this level have a reader.
 #[macro_export]
 #[doc(hidden)]
 macro_rules! log_apart {
@@ -68,14 +76,18 @@ macro_rules! log_apart {
     };
 }
 
-/// The same of an event that the program's subscriber is told on the calling thread: `log::here!(warn: %peer, "...")`.
+/// Same as the above, but the program's subscriber is called on the calling thread: `log::here!(warn: %peer, "...")`.
 #[macro_export]
 #[doc(hidden)]
 macro_rules! log_here {
-    (error: $($said:tt)*) => { $crate::log_here!(ERROR, $crate::log::tracing::error!($($said)*)) };
-    (warn: $($said:tt)*) => { $crate::log_here!(WARN, $crate::log::tracing::warn!($($said)*)) };
-    (info: $($said:tt)*) => { $crate::log_here!(INFO, $crate::log::tracing::info!($($said)*)) };
-    (debug: $($said:tt)*) => { $crate::log_here!(DEBUG, $crate::log::tracing::debug!($($said)*)) };
+    (error: target: $($args:tt)*) => { $crate::log_here!(ERROR, $crate::log::tracing::error!(target: $($args)*)) };
+    (error: $($args:tt)*) => { $crate::log_here!(ERROR, $crate::log::tracing::error!(target: $crate::log::target(module_path!()), $($args)*)) };
+    (warn: target: $($args:tt)*) => { $crate::log_here!(WARN, $crate::log::tracing::warn!(target: $($args)*)) };
+    (warn: $($args:tt)*) => { $crate::log_here!(WARN, $crate::log::tracing::warn!(target: $crate::log::target(module_path!()), $($args)*)) };
+    (info: target: $($args:tt)*) => { $crate::log_here!(INFO, $crate::log::tracing::info!(target: $($args)*)) };
+    (info: $($args:tt)*) => { $crate::log_here!(INFO, $crate::log::tracing::info!(target: $crate::log::target(module_path!()), $($args)*)) };
+    (debug: target: $($args:tt)*) => { $crate::log_here!(DEBUG, $crate::log::tracing::debug!(target: $($args)*)) };
+    (debug: $($args:tt)*) => { $crate::log_here!(DEBUG, $crate::log::tracing::debug!(target: $crate::log::target(module_path!()), $($args)*)) };
     ($level:ident, $event:expr) => {
         if $crate::log::is_on($crate::log::tracing::Level::$level) {
             $crate::log::here(|| $event);

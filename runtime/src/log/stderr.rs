@@ -1,8 +1,10 @@
-//! The default log: lines on the standard error, where the program has installed no subscriber of `tracing`.
+//! The default log: lines on the standard error, if the program has installed no `tracing` subscriber.
 //!
-//! It is no global default of `tracing`: a program can install its subscriber at any time, and has all events from then on.
+//! It is not a global default of `tracing`: a program can install its subscriber at any time, and receives
+//! all events from then on.
 //!
-//! What is written is set by `SINEW_LOG`, else by `RUST_LOG`, else by the configuration of the node, which is `info` by default.
+//! The filter is set by `SINEW_LOG`, else by `RUST_LOG`, else by the configuration of the node, which is
+//! `info` by default.
 
 use std::{
     fmt::Write as _,
@@ -24,10 +26,10 @@ use super::filter::Filter;
 
 /// The environment variable of Sinew's own log.
 const OWN_VARIABLE: &str = "SINEW_LOG";
-/// The one that many programs in Rust read.
+/// The environment variable that many Rust programs read.
 const COMMON_VARIABLE: &str = "RUST_LOG";
 
-/// The program has a subscriber by now: nothing is written here any more.
+/// Whether the program has a subscriber now: then no line is written here.
 static IS_RETIRED: AtomicBool = AtomicBool::new(false);
 
 fn filter() -> &'static ArcSwap<Filter> {
@@ -35,31 +37,31 @@ fn filter() -> &'static ArcSwap<Filter> {
     FILTER.get_or_init(|| ArcSwap::from_pointee(chosen(LevelFilter::INFO)))
 }
 
-/// What the environment says, and `usual` where it says nothing.
+/// Returns the filter of the environment, or `usual` without one.
 fn chosen(usual: LevelFilter) -> Filter {
-    let set = |variable| std::env::var(variable).ok().filter(|said: &String| !said.trim().is_empty());
-    let said = set(OWN_VARIABLE).or_else(|| set(COMMON_VARIABLE)).unwrap_or_default();
-    Filter::read(&said, usual)
+    let set = |variable| std::env::var(variable).ok().filter(|setting: &String| !setting.trim().is_empty());
+    let setting = set(OWN_VARIABLE).or_else(|| set(COMMON_VARIABLE)).unwrap_or_default();
+    Filter::read(&setting, usual)
 }
 
-/// Sets how much the default log writes where the environment says nothing of it: the configuration of a node.
+/// Sets the level of the default log for an environment without a filter: the configuration of a node.
 pub fn set_level(usual: LevelFilter) {
     filter().store(Arc::new(chosen(usual)));
     rebuild_interest_cache();
 }
 
-/// Whether events of this origin and level are written here.
+/// Returns whether events of this origin and level are written here.
 pub(super) fn wants(metadata: &Metadata<'_>) -> bool {
     !IS_RETIRED.load(Ordering::Relaxed) && filter().load().wants(metadata.target(), *metadata.level())
 }
 
-/// The most that is written of anything.
+/// Returns the maximum level that is written for any target.
 pub(super) fn most() -> LevelFilter {
     if IS_RETIRED.load(Ordering::Relaxed) { LevelFilter::OFF } else { filter().load().most() }
 }
 
-/// Whether the program has a subscriber by now. Asked on the log's thread, which has none of its own. The default log ends with
-/// the first answer that is yes.
+/// Returns whether the program has a subscriber now. Called on the log thread, which has none of its own. The
+/// default log ends when this first returns `true`.
 pub(crate) fn is_replaced() -> bool {
     if IS_RETIRED.load(Ordering::Relaxed) {
         return true;
@@ -73,40 +75,40 @@ pub(crate) fn is_replaced() -> bool {
     true
 }
 
-/// Whether an error of the node's is written here. Asked on the log's thread.
+/// Returns whether an error of the node is written here. Called on the log thread.
 pub(super) fn writes_errors() -> bool {
     !is_replaced() && filter().load().wants(module_path!(), Level::ERROR)
 }
 
-/// A line as it is put together.
+/// A line under construction.
 #[derive(Debug)]
 pub(crate) struct Line {
     text: String,
     is_coloured: bool,
 }
 
-/// How a part of a line looks on a terminal.
+/// The style of a part of a line on a terminal.
 #[derive(Clone, Copy)]
-enum Look {
+enum Style {
     Dim,
     Italic,
     Level(Level),
 }
 
 impl Line {
-    /// The line of an event at `time`: time, level, origin.
+    /// Creates the line of an event at `time`: time, level, origin.
     pub(crate) fn new(time: SystemTime, level: Level, target: &str) -> Self {
         let mut line = Self { text: String::with_capacity(160), is_coloured: is_coloured() };
         let time = humantime::format_rfc3339_millis(time).to_string();
-        line.push(Look::Dim, &time);
+        line.push(Style::Dim, &time);
         line.text.push(' ');
-        line.push(Look::Level(level), &format!("{level:>5}"));
+        line.push(Style::Level(level), &format!("{level:>5}"));
         line.text.push(' ');
-        line.push(Look::Dim, &format!("{}:", layer(target)));
+        line.push(Style::Dim, &format!("{}:", layer(target)));
         line
     }
 
-    /// Appends what the event says.
+    /// Appends the message of the event.
     pub(crate) fn message(&mut self, words: &str) {
         self.text.push(' ');
         self.plain(words);
@@ -115,18 +117,18 @@ impl Line {
     /// Appends a field.
     pub(crate) fn field(&mut self, name: &str, value: &str) {
         self.text.push(' ');
-        self.push(Look::Italic, name);
+        self.push(Style::Italic, name);
         self.text.push('=');
         self.plain(value);
     }
 
-    /// Writes it. Waits for who reads the standard error. One that is closed takes nothing.
+    /// Writes the line. Blocks while the reader of the standard error does. A closed standard error is ignored.
     pub(crate) fn write(mut self) {
         self.text.push('\n');
         write_text(&self.text);
     }
 
-    /// Text of anybody's: it begins no line that looks like one of the log's, and no control character reaches the terminal.
+    /// Appends untrusted text, so that it cannot start a line of its own or send control characters to the terminal.
     fn plain(&mut self, words: &str) {
         for part in words.chars() {
             match part {
@@ -137,18 +139,18 @@ impl Line {
         }
     }
 
-    fn push(&mut self, look: Look, words: &str) {
+    fn push(&mut self, style: Style, words: &str) {
         if !self.is_coloured {
             return self.text.push_str(words);
         }
-        let code = match look {
-            Look::Dim => "2",
-            Look::Italic => "3",
-            Look::Level(Level::ERROR) => "31",
-            Look::Level(Level::WARN) => "33",
-            Look::Level(Level::INFO) => "32",
-            Look::Level(Level::DEBUG) => "34",
-            Look::Level(Level::TRACE) => "35",
+        let code = match style {
+            Style::Dim => "2",
+            Style::Italic => "3",
+            Style::Level(Level::ERROR) => "31",
+            Style::Level(Level::WARN) => "33",
+            Style::Level(Level::INFO) => "32",
+            Style::Level(Level::DEBUG) => "34",
+            Style::Level(Level::TRACE) => "35",
         };
         // Writing to a text does not fail.
         let _ = write!(self.text, "\x1b[{code}m{words}\x1b[0m");
@@ -157,7 +159,7 @@ impl Line {
 
 /// Writes to the standard error, in one piece.
 pub(crate) fn write_text(text: &str) {
-    // There is no other place to say that this one takes nothing.
+    // A write error has no other place to be reported.
     let _ = stderr().write_all(text.as_bytes());
 }
 
@@ -166,7 +168,7 @@ fn layer(target: &str) -> &str {
     target.match_indices("::").nth(1).map_or(target, |(end, _)| &target[..end])
 }
 
-/// Whether the standard error is a terminal, and nobody has asked for no colours (<https://no-color.org>).
+/// Returns whether the standard error is a terminal and `NO_COLOR` is not set (<https://no-color.org>).
 fn is_coloured() -> bool {
     static IS_COLOURED: OnceLock<bool> = OnceLock::new();
     *IS_COLOURED.get_or_init(|| {
@@ -192,19 +194,19 @@ mod tests {
     }
 
     #[test]
-    fn a_line_has_time_level_layer_message_and_fields_and_no_control_character_of_others() {
+    fn line_has_all_parts_and_no_foreign_control_characters() {
         let text = line(false);
         let head = "2026-09-21T14:13:20.123Z  WARN sinew::gncl:";
         assert_eq!(text, format!("{head} first\n    ERROR \\u{{1b}}[31mforged\\r node=10.0.0.7"));
     }
 
     #[test]
-    fn names_of_fields_have_a_look_of_their_own_on_a_terminal() {
+    fn field_names_are_styled_on_a_terminal() {
         assert!(line(true).contains("\x1b[3mnode\x1b[0m=10.0.0.7"));
     }
 
     #[test]
-    fn a_target_is_shown_as_its_layer() {
+    fn target_is_shown_as_its_layer() {
         let shown = ["sinew", "sinew::node", "sinew_runtime::app::context::deep"].map(layer);
         assert_eq!(shown, ["sinew", "sinew::node", "sinew_runtime::app"]);
     }

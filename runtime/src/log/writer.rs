@@ -1,4 +1,4 @@
-//! The log's thread, and the bounded queue to it.
+//! The log thread, and its bounded queue.
 
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
@@ -12,66 +12,67 @@ use std::{
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-use super::{event::at_once, stderr};
+use super::{event::immediately, stderr};
 
-/// What waits to be written, at most. What comes then is dropped and counted.
+/// Maximum number of queued entries. Further ones are dropped and counted.
 const QUEUE_MAX: usize = 1_024;
 
-/// Time for a standard error that takes nothing to take something after all.
-const PATIENCE: Timespec = Timespec { tv_sec: 0, tv_nsec: 20_000_000 };
+/// Time for a blocked standard error to become writable.
+const WRITABLE_WITHIN: Timespec = Timespec { tv_sec: 0, tv_nsec: 20_000_000 };
 
-/// Time between two looks whether a full queue has room.
+/// Time between two checks of a full queue.
 const PACE: Duration = Duration::from_millis(1);
 
-/// Something to be done on the log's thread, however long it takes.
+/// Work for the log thread, of any duration.
 type Entry = Box<dyn FnOnce() + Send>;
 
-/// What was dropped so far.
+/// Number of dropped entries so far.
 static LOST: AtomicU64 = AtomicU64::new(0);
 
-/// How many events were not written, because the log took nothing for so long that its queue was full.
+/// Returns the number of events that were not written, because the log was blocked until its queue was full.
 #[must_use]
 pub fn lost() -> u64 {
     LOST.load(Ordering::Relaxed)
 }
 
-/// Starts the log's thread, where it does not run. The first one who logs does it otherwise, in whatever he is in the middle of.
+/// Starts the log thread, if it does not run. Otherwise the first thread that logs starts it, in the middle
+/// of its own work.
 pub fn begin() {
     let _ = queue();
 }
 
-/// Puts this at the end of the queue, if there is room. Never waits.
-pub(crate) fn enter(entry: Entry) {
-    if !is_entered(entry) {
+/// Queues an entry, if there is room. Never blocks.
+pub(crate) fn enqueue(entry: Entry) {
+    if !try_enqueue(entry) {
         LOST.fetch_add(1, Ordering::Relaxed);
     }
 }
 
-/// Writes a line to the standard error, behind what is logged already: the words of an error that the log has too. Where the log is written
-/// there anyway, nothing is added.
+/// Writes a line to the standard error, behind the queued log entries. For the text of an error that is
+/// logged too. If the log itself goes to the standard error, nothing is added.
 pub fn print(line: String) {
-    enter(Box::new(move || {
+    enqueue(Box::new(move || {
         if !stderr::writes_errors() {
             stderr::write_text(&format!("{line}\n"));
         }
     }));
 }
 
-/// Waits until what was logged so far is written, and no longer than this: before the process ends, say. Where the standard
-/// error takes nothing, hardly at all.
+/// Waits until the current log entries are written, at most for `within`, for example before the process
+/// ends. If the standard error is blocked, it returns almost at once.
 pub fn flush(within: Duration) {
     let stderr = std::io::stderr();
-    if poll(&mut [PollFd::new(&stderr, PollFlags::OUT)], Some(&PATIENCE)) == Ok(0) {
+    if poll(&mut [PollFd::new(&stderr, PollFlags::OUT)], Some(&WRITABLE_WITHIN)) == Ok(0) {
         return;
     }
     let until = Instant::now() + within;
-    let (say, written) = sync_channel(1);
-    let is_there = || {
-        let say = say.clone();
-        is_entered(Box::new(move || _ = say.send(())))
+    let (done, written) = sync_channel(1);
+    let is_queued = || {
+        let done = done.clone();
+        try_enqueue(Box::new(move || _ = done.send(())))
     };
-    // There is room as soon as something is written.
-    while !is_there() {
+    // The queue has room as soon as an entry is written.
+    while !is_queued() {
         if Instant::now() >= until {
             return;
         }
@@ -80,11 +81,11 @@ pub fn flush(within: Duration) {
     let _ = written.recv_timeout(until.saturating_duration_since(Instant::now()));
 }
 
-fn is_entered(entry: Entry) -> bool {
+fn try_enqueue(entry: Entry) -> bool {
     queue().is_some_and(|queue| queue.try_send(entry).is_ok())
 }
 
-/// The queue, with its thread; `None` if the system gives none.
+/// Returns the queue, and starts its thread; `None` if the system gives none.
 fn queue() -> Option<&'static SyncSender<Entry>> {
     static QUEUE: OnceLock<Option<SyncSender<Entry>>> = OnceLock::new();
     let start = || {
@@ -96,17 +97,17 @@ fn queue() -> Option<&'static SyncSender<Entry>> {
 }
 
 fn write(entries: &Receiver<Entry>) {
-    crate::supervision::writes_the_log();
-    // Who logged first may be one that all others give way to.
-    crate::supervision::make_like_any_other();
-    let mut said = 0;
+    crate::thread::mark_log_thread();
+    // The thread that logged first may have an idle or a real-time schedule, which this thread inherits.
+    crate::thread::reset_schedule();
+    let mut reported = 0;
     for entry in entries {
-        // A subscriber that panics is told by the panic hook, and has the next event all the same.
+        // A panic of a subscriber is reported by the panic hook, and the subscriber receives the next event.
         let _ = catch_unwind(AssertUnwindSafe(|| {
             let lost = lost();
-            let new = lost - std::mem::replace(&mut said, lost);
+            let new = lost - std::mem::replace(&mut reported, lost);
             if new > 0 {
-                at_once(|| {
+                immediately(|| {
                     tracing::warn!(lost = new, "the log took nothing for a while: events are missing here");
                 });
             }

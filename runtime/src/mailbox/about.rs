@@ -1,4 +1,4 @@
-//! Which node an event of a layer is about: its place among that node's messages depends on it.
+//! The node that a layer's event is about, which determines its position among that node's messages.
 
 use super::is_event;
 use crate::{
@@ -6,33 +6,33 @@ use crate::{
     wire::{Flags, Header},
 };
 
-/// Set in the correlation of an event that is about the end of a node; the node's address is below it.
+/// Set in the correlation of an event about the end of a node; the node's address is below it.
 const END: u64 = 1 << 32;
 
-/// What an event that a layer tells an application is about. It is written into the event's correlation, so that every queue on the way
-/// knows it, also in other processes.
+/// The subject of an event that a layer sends to an application. It is encoded in the event's correlation, so
+/// that every queue on the path knows it, also in other processes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum About {
-    /// The end of a life of this node: it comes behind all messages of that node.
+    /// The end of an incarnation of this node: the event follows all messages of that node.
     End(NodeAddress),
-    /// Anything else of this node: it comes behind what was said of its end.
+    /// Any other event about this node: it follows the events about the node's end.
     Node(NodeAddress),
 }
 
 impl About {
-    /// What the event with this header is about, if it is one and says so.
+    /// Returns the subject of the event with this header, if it is an event with one.
     #[must_use]
     pub fn of(header: &Header) -> Option<Self> {
         let Header { correlation, flags, .. } = *header;
         if correlation == 0 || flags.has(Flags::REPLY) || flags.has(Flags::ASK) || !is_event(header) {
             return None;
         }
-        // The lower half is the address, whatever is above.
+        // The lower half is the address, independent of the upper half.
         let node = NodeAddress::new(correlation as u32);
         Some(if correlation & END == 0 { Self::Node(node) } else { Self::End(node) })
     }
 
-    /// Says so in the header of an event.
+    /// Encodes the subject in the header of an event.
     pub fn write(self, header: &mut Header) {
         header.correlation = match self {
             Self::End(node) => END | u64::from(node.bits()),
@@ -40,7 +40,7 @@ impl About {
         };
     }
 
-    /// The node.
+    /// Returns the node.
     #[must_use]
     pub const fn node(self) -> NodeAddress {
         match self {

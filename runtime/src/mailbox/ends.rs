@@ -1,4 +1,4 @@
-//! What is left of nodes that are gone, in a queue: each node's messages, and behind them what is said of its end.
+//! The remaining messages of lost nodes in a queue: each node's messages, followed by the event about its end.
 
 #[cfg(test)]
 mod tests;
@@ -13,14 +13,14 @@ use crate::{
     wire::{Class, Header, Message},
 };
 
-/// Messages, and the bytes of their payloads.
+/// A number of messages, and the bytes of their payloads.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Held {
+pub(super) struct Usage {
     pub(super) messages: usize,
     pub(super) bytes: usize,
 }
 
-impl Held {
+impl Usage {
     const fn count(&mut self, message: &Message) {
         self.messages += 1;
         self.bytes += message.payload.len();
@@ -32,46 +32,46 @@ impl Held {
     }
 }
 
-/// Whose place a message holds until it is taken.
+/// The queue position that a message occupies until it is taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Place {
-    /// One of its class's lane.
+    /// A position in the lane of its class.
     Lane,
-    /// One beside the lanes: an event that is [kept behind](ClassQueue::keep_behind) messages.
-    Kept,
+    /// A position beside the lanes: an event that is [kept behind](ClassQueue::queue_behind) messages.
+    Behind,
 }
 
-/// Messages that go before all others, in their order. Each holds its place as if it still waited where it came from: what is brought
+/// Messages that precede all others, in their order. Each still occupies its former position: moving messages
 /// here makes no room for more.
 #[derive(Debug, Default)]
 pub(super) struct Ends {
     messages: VecDeque<(Place, Message)>,
-    /// Of each class, what holds a place of its lane.
-    of_lanes: [Held; 3],
-    kept: Held,
+    /// For each class, the messages that occupy positions of its lane.
+    of_lanes: [Usage; 3],
+    behind: Usage,
 }
 
 impl Ends {
     fn push(&mut self, place: Place, message: Message) {
-        self.held_in(place, &message).count(&message);
+        self.usage_in(place, &message).count(&message);
         self.messages.push_back((place, message));
     }
 
     fn push_first(&mut self, message: Message) {
-        self.held_in(Place::Lane, &message).count(&message);
+        self.usage_in(Place::Lane, &message).count(&message);
         self.messages.push_front((Place::Lane, message));
     }
 
     pub(super) fn pop(&mut self) -> Option<Message> {
         let (place, next) = self.messages.pop_front()?;
-        self.held_in(place, &next).count_out(&next);
+        self.usage_in(place, &next).count_out(&next);
         Some(next)
     }
 
-    const fn held_in(&mut self, place: Place, message: &Message) -> &mut Held {
+    const fn usage_in(&mut self, place: Place, message: &Message) -> &mut Usage {
         match place {
             Place::Lane => &mut self.of_lanes[message.header.class as usize],
-            Place::Kept => &mut self.kept,
+            Place::Behind => &mut self.behind,
         }
     }
 
@@ -79,21 +79,21 @@ impl Ends {
         self.messages.iter().map(|(_, message)| message)
     }
 
-    /// What holds places of the lane of this class.
-    pub(super) const fn of_lane(&self, class: usize) -> Held {
+    /// Returns the messages that occupy positions of the lane of this class.
+    pub(super) const fn of_lane(&self, class: usize) -> Usage {
         self.of_lanes[class]
     }
 
     pub(super) fn bytes(&self) -> usize {
-        self.kept.bytes + self.of_lanes.iter().map(|held| held.bytes).sum::<usize>()
+        self.behind.bytes + self.of_lanes.iter().map(|held| held.bytes).sum::<usize>()
     }
 
     pub(super) fn take_all(&mut self) -> impl Iterator<Item = Message> + use<> {
         std::mem::take(self).messages.into_iter().map(|(_, message)| message)
     }
 
-    /// Takes out those of which this is true.
-    fn take_those(&mut self, is_it: impl Fn(&Message) -> bool) -> Vec<Message> {
+    /// Removes the messages that match `is_it`.
+    fn remove_if(&mut self, is_it: impl Fn(&Message) -> bool) -> Vec<Message> {
         let mut taken = Vec::new();
         for (place, message) in std::mem::take(self).messages {
             if is_it(&message) {
@@ -105,37 +105,37 @@ impl Ends {
         taken
     }
 
-    /// Takes out what has expired by `now`; returns when the next of the rest does.
+    /// Removes the messages that have expired by `now`. Returns when the next of the others expires.
     pub(super) fn take_expired(&mut self, now: Time, expired: &mut Vec<Message>) -> Time {
-        expired.extend(self.take_those(|message| message.header.is_expired(now)));
+        expired.extend(self.remove_if(|message| message.header.is_expired(now)));
         self.iter().map(|message| message.header.expiry()).min().unwrap_or(Time::MAX)
     }
 
     pub(super) fn take_request(&mut self, ticket: Ticket) -> Option<Message> {
         let at = self.messages.iter().rposition(|(_, message)| message.is_request(ticket))?;
         let (place, request) = self.messages.remove(at)?;
-        self.held_in(place, &request).count_out(&request);
+        self.usage_in(place, &request).count_out(&request);
         Some(request)
     }
 
-    /// Whether something of this node is here, or is said of it.
+    /// Returns whether this has a message from this node or an event about it.
     fn has_any_of(&self, node: NodeAddress) -> bool {
         self.iter().any(|message| is_of(node, &message.header))
     }
 
-    /// Whether a value of this stream is here. One that comes now does not take its place: an end is between them.
+    /// Returns whether this has a value of this stream. A new value does not replace it: an end is between them.
     pub(super) fn has_value_of(&self, stream: &Header) -> bool {
         let is_one = |header: &Header| header.class == Class::Stream && is_same_stream(header, stream);
         self.iter().any(|message| is_one(&message.header))
     }
 }
 
-/// The node that this is of, or is said of.
+/// Returns the node that sent the message, or that the event is about.
 fn node_of(header: &Header) -> NodeAddress {
     About::of(header).map_or(header.source.node, About::node)
 }
 
-/// Whether this is said of a node's end.
+/// Returns whether the event is about the end of a node.
 pub(super) fn is_end(header: &Header) -> bool {
     matches!(About::of(header), Some(About::End(_)))
 }
@@ -145,22 +145,23 @@ fn is_of(node: NodeAddress, header: &Header) -> bool {
 }
 
 impl ClassQueue {
-    /// Keeps an event that is [about](About) a node behind what waits here of it: of its end, behind all of its messages, which go before
-    /// all others now; of anything else, behind what is said of its end. Hands it back where it has nothing to wait for.
+    /// Keeps an event that is [about](About) a node behind the queued messages that it must follow. The end
+    /// of a node follows all messages of that node, which now precede all others. Any other event follows the
+    /// events about the node's end. Returns the event if it need not wait.
     ///
-    /// It holds no place of a class: who keeps events bounds how many are [kept](Self::kept_events).
-    pub fn keep_behind(&mut self, event: Message) -> Option<Message> {
+    /// The event occupies no position of a class: the caller must limit the [kept events](Self::events_behind).
+    pub fn queue_behind(&mut self, event: Message) -> Option<Message> {
         let length = event.payload.len();
-        let event = self.place_behind(event, Place::Kept);
+        let event = self.place_behind(event, Place::Behind);
         if event.is_none() {
             self.add(length);
         }
         event
     }
 
-    /// Whether [`keep_behind`](Self::keep_behind) would keep the event with this header.
+    /// Returns whether [`queue_behind`](Self::queue_behind) would keep the event with this header.
     #[must_use]
-    pub fn keeps(&self, event: &Header) -> bool {
+    pub fn queues_behind(&self, event: &Header) -> bool {
         let waits_in_a_lane = |node| self.lanes.iter().flatten().any(|message| is_of(node, &message.header));
         match About::of(event) {
             Some(About::End(node)) => self.ends.has_any_of(node) || waits_in_a_lane(node),
@@ -169,13 +170,13 @@ impl ClassQueue {
         }
     }
 
-    /// Events that are [kept behind](Self::keep_behind) messages.
+    /// Returns the number of events that are [kept behind](Self::queue_behind) messages.
     #[must_use]
-    pub const fn kept_events(&self) -> usize {
-        self.ends.kept.messages
+    pub const fn events_behind(&self) -> usize {
+        self.ends.behind.messages
     }
 
-    /// The same of one whose bytes are counted.
+    /// Same as [`queue_behind`](Self::queue_behind), for an event with bytes that are already counted.
     pub(super) fn place_behind(&mut self, event: Message, place: Place) -> Option<Message> {
         let Some(about) = About::of(&event.header) else { return Some(event) };
         if let About::End(node) = about {
@@ -188,7 +189,8 @@ impl ClassQueue {
         None
     }
 
-    /// What waits of this node, or is said of it, goes before all others, in the order of the classes, each class in its own.
+    /// Moves the queued messages of this node and events about it before all others. The classes are kept in
+    /// order, and the messages in each class.
     fn bring_forward(&mut self, node: NodeAddress) {
         for (lane, bytes) in self.lanes.iter_mut().zip(&mut self.bytes) {
             if !lane.iter().any(|message| is_of(node, &message.header)) {
@@ -206,11 +208,11 @@ impl ClassQueue {
         }
     }
 
-    /// Puts a message back that was popped, before what is left of its node and is said of its end: that came later. Hands it back where
-    /// nothing is.
+    /// Puts a popped message back before its node's remaining messages and end, which are later. Returns the
+    /// message if there are none.
     pub(super) fn put_back_before_end(&mut self, message: Message) -> Option<Message> {
         let node = node_of(&message.header);
-        // Nearly always there is none: then nothing is looked at, however much waits.
+        // Usually there is none: then no message is examined, for any queue length.
         if self.ends_in_lanes > 0 {
             let is_its_end = |other: &Message| About::of(&other.header) == Some(About::End(node));
             if self.lanes.iter().flatten().any(is_its_end) {
@@ -224,10 +226,10 @@ impl ClassQueue {
         None
     }
 
-    /// Takes out the layers' events that wait behind messages.
+    /// Removes the layers' events that wait behind messages.
     pub(super) fn take_events(&mut self) -> Vec<Message> {
-        let events = self.ends.take_those(|message| is_event(&message.header));
-        self.give(events.iter().map(|event| event.payload.len()).sum());
+        let events = self.ends.remove_if(|message| is_event(&message.header));
+        self.release(events.iter().map(|event| event.payload.len()).sum());
         events
     }
 }

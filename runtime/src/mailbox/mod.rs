@@ -1,15 +1,15 @@
-//! Mailboxes: bounded, outside the actor, outliving its restarts.
+//! Mailboxes: bounded, outside of the actor, and kept through its restarts.
 //!
-//! A mailbox belongs to a TID, not to an actor. Any thread puts messages in; the present incarnation of the actor takes
-//! them out. When the actor panics the message in its hand ends as `Failed`, the rest stays and goes to the next
-//! incarnation. Queue and waker stand under one mutex, see [`post`](crate::post).
+//! A mailbox belongs to a TID, not to an actor. Any thread adds messages; the current incarnation of the
+//! actor takes them out. When the actor panics, its current message ends as `Failed`; the others stay for the
+//! next incarnation. Queue and waker are under one mutex, see [`event_queue`](crate::event_queue).
 
 mod about;
 mod budget;
 mod ends;
-mod lender;
 mod queue;
 mod reader;
+mod remote_reader;
 mod request;
 mod room;
 mod source;
@@ -25,16 +25,16 @@ use std::{
 
 pub use about::About;
 pub use budget::Budget;
-pub use lender::Lender;
 pub use queue::{Bounds, ClassQueue, is_same_stream};
 pub use reader::MailboxReader;
+pub use remote_reader::RemoteReader;
 pub use source::Source;
 pub use tally::Tally;
 
 use crate::{
+    lock,
     outcome::{Outcome, Rejection, Ticket},
-    post::lock,
-    router::{Outlet, Refused},
+    router::{MessageSink, Refused},
     tid::Tid,
     time::Time,
     undelivered::{RefusalSink, is_reported},
@@ -46,46 +46,55 @@ use crate::{
 #[derive(Debug)]
 pub struct Mailbox {
     shared: Mutex<Shared>,
-    /// Where its messages wait, if not here.
+    /// The source of its messages, if they are not queued here.
     source: Option<Arc<dyn Source>>,
-    /// Who reports refusals of what had been taken, and whose mailbox this is.
+    /// The sink for rejections of accepted messages, and the TID of this mailbox.
     refusals: OnceLock<(Tid, Arc<dyn RefusalSink>)>,
 }
 
 #[derive(Debug)]
 struct Shared {
     queue: ClassQueue,
-    /// What this node's layers say: ahead of everything else, but for what is [said of a node's end](About::End).
+    /// Events of this node's layers: before all other messages, except those that must precede a [node's
+    /// end](About::End).
     events: VecDeque<Message>,
     events_max: usize,
-    /// The reader takes nothing but events, and is not woken for anything else.
+    /// Whether the reader takes only events, and is not woken for other messages.
     paused: bool,
     waker: Option<Waker>,
-    /// Which reader is the present one.
+    /// Woken when a message or an event is removed, because an event found no room.
+    event_waits: Option<Waker>,
+    /// The number of the current reader.
     epoch: u64,
-    /// Class of the message in the present reader's hand.
-    in_hand: Option<Class>,
-    /// Messages taken out so far.
+    /// The class of the message that the reader handles.
+    current: Option<Class>,
+    /// The number of messages taken out so far.
     taken_out: u64,
-    /// Messages of each class that are out with a [`Lender`].
-    lent: [u64; 3],
-    /// The present reader is a [`Lender`].
-    is_lent: bool,
+    /// The number of messages of each class that are in flight to a [`RemoteReader`].
+    in_flight: [u64; 3],
+    /// Whether the current reader is a [`RemoteReader`].
+    is_remote: bool,
     closed: bool,
-    /// The application is away and wants nothing kept for it.
+    /// Whether the application is down and its policy keeps no messages.
     refuses: bool,
     tallies: [Tally; 3],
     high_water: usize,
 }
 
 impl Shared {
-    /// Takes out everything that waits, to be refused.
+    /// Returns the wakers of the senders that wait for room, after a removal. An event is offered again after each
+    /// removal, as its place may depend on each message.
+    fn room_made(&mut self) -> [Option<Waker>; 2] {
+        [self.queue.room_made(), self.event_waits.take()]
+    }
+
+    /// Removes all queued messages, to be rejected.
     fn empty(&mut self) -> Vec<Message> {
         let waiting = self.queue.drain_all().collect();
         self.rejected(waiting)
     }
 
-    /// Takes out every event.
+    /// Removes all events.
     fn take_events(&mut self) -> Vec<Message> {
         let mut events = Vec::from(std::mem::take(&mut self.events));
         events.extend(self.queue.take_events());
@@ -107,19 +116,19 @@ impl Shared {
         self.events.len() + self.queue.len()
     }
 
-    /// Half of the places are not for events that wait behind messages: what ends a pause is an event itself, and those wait as long as
-    /// the pause lasts.
+    /// Reserves half of the positions for events that do not wait behind messages. The end of a pause is an
+    /// event itself, and those that wait behind messages stay for as long as the pause.
     fn has_room_for_event(&self, event: &Header) -> bool {
-        let kept = self.queue.kept_events();
+        let kept = self.queue.events_behind();
         if self.events.len() + kept >= self.events_max {
             return false;
         }
-        // Behind which messages a borrower keeps an event about a node is not known here.
-        let (stay, stays) = if self.is_lent {
+        // The messages behind which a remote reader keeps an event about a node are unknown here.
+        let (stay, stays) = if self.is_remote {
             let about_nodes = self.events.iter().filter(|event| About::of(&event.header).is_some()).count();
             (kept + about_nodes, About::of(event).is_some())
         } else {
-            (kept, self.queue.keeps(event))
+            (kept, self.queue.queues_behind(event))
         };
         !stays || stay < self.events_max / 2
     }
@@ -132,8 +141,8 @@ impl Shared {
             return Err(Refused::new(event, Rejection::QueueFull));
         }
         tally.taken += 1;
-        let Some(event) = self.queue.keep_behind(event) else {
-            // It waits with messages, which are not taken in a pause.
+        let Some(event) = self.queue.queue_behind(event) else {
+            // The event is queued with messages, which are not taken during a pause.
             self.high_water = self.high_water.max(self.waiting());
             return Ok(if self.paused { None } else { self.waker.take() });
         };
@@ -142,31 +151,31 @@ impl Shared {
         Ok(self.waker.take())
     }
 
-    /// Messages of `class` that wait, or are in hand, or lent: counted one by one.
+    /// Returns the number of messages of `class` that are queued, being handled, or in flight: counted one by one.
     fn held(&self, class: Class) -> u64 {
         let events = self.events.iter().filter(|event| event.header.class == class).count();
-        let in_hand = u64::from(self.in_hand == Some(class));
-        (events + self.queue.len_of(class)) as u64 + in_hand + self.lent[class as usize]
+        let current = u64::from(self.current == Some(class));
+        (events + self.queue.len_of(class)) as u64 + current + self.in_flight[class as usize]
     }
 
-    const fn hands_out(&mut self, message: &Message) -> Option<Class> {
+    const fn begin_handling(&mut self, message: &Message) -> Option<Class> {
         self.taken_out += 1;
-        self.in_hand = Some(message.header.class);
-        self.in_hand
+        self.current = Some(message.header.class);
+        self.current
     }
 
-    /// The message in the reader's hand has ended so.
+    /// Counts the outcome of the reader's current message.
     fn count(&mut self, finished: Option<(Class, Outcome)>) {
         if let Some((class, outcome)) = finished {
             self.tallies[class as usize].count(outcome);
-            self.in_hand = None;
+            self.current = None;
         }
     }
 
-    /// Fences the present reader off; what it has in its hand has failed.
+    /// Fences the current reader; its current message has failed.
     fn next_reader(&mut self) {
         self.epoch += 1;
-        if let Some(class) = self.in_hand.take() {
+        if let Some(class) = self.current.take() {
             self.tallies[class as usize].count(Outcome::Failed);
         }
     }
@@ -181,13 +190,13 @@ impl Shared {
 }
 
 impl Mailbox {
-    /// An empty mailbox that holds at most so much of each class.
+    /// Creates an empty mailbox with these bounds for each class.
     #[must_use]
     pub fn new(bounds: impl Into<Bounds>) -> Arc<Self> {
         Arc::new(Self::with_source(bounds.into(), None))
     }
 
-    /// The mailbox of a process that hosts one application: its reader takes from `source`.
+    /// Creates the mailbox of a process that hosts one application: its reader takes messages from `source`.
     #[must_use]
     pub fn fed_by(source: Arc<dyn Source>) -> Arc<Self> {
         Arc::new(Self::with_source(Bounds { messages: 0, bytes: 0 }, Some(source)))
@@ -200,11 +209,12 @@ impl Mailbox {
             events_max: bounds.messages,
             paused: false,
             waker: None,
+            event_waits: None,
             epoch: 0,
-            in_hand: None,
+            current: None,
             taken_out: 0,
-            lent: [0; 3],
-            is_lent: false,
+            in_flight: [0; 3],
+            is_remote: false,
             closed: false,
             refuses: false,
             tallies: [Tally::default(); 3],
@@ -213,13 +223,13 @@ impl Mailbox {
         Self { shared: Mutex::new(shared), source, refusals: OnceLock::new() }
     }
 
-    /// Has refusals of unconfirmed messages that had been taken here told to `sink`, as by `owner`. Set once.
+    /// Sets the sink for rejections of unconfirmed messages that were accepted here, reported for `owner`. Set once.
     pub fn report_refusals(&self, owner: Tid, sink: Arc<dyn RefusalSink>) {
-        // Whoever sets a second one keeps it for itself.
+        // A second call has no effect.
         let _ = self.refusals.set((owner, sink));
     }
 
-    /// Refuses a message that had been taken. To be called without a lock.
+    /// Rejects a message that was accepted. Must be called without a lock.
     pub(super) fn reject(&self, message: Message, why: Rejection) {
         if let Some((owner, sink)) = self.refusals.get()
             && is_reported(&message.header, why)
@@ -229,13 +239,13 @@ impl Mailbox {
         message.reject(why);
     }
 
-    /// Takes over the reading end for a new incarnation; the former reader is fenced off.
+    /// Attaches a new incarnation as the reader; the former reader is fenced.
     #[must_use]
     pub fn attach(self: &Arc<Self>) -> MailboxReader {
         let (epoch, former) = {
             let mut shared = lock(&self.shared);
             shared.next_reader();
-            (shared.paused, shared.is_lent) = (false, false);
+            (shared.paused, shared.is_remote) = (false, false);
             (shared.epoch, shared.waker.take())
         };
         if let Some(waker) = former {
@@ -244,7 +254,7 @@ impl Mailbox {
         MailboxReader::new(self.clone(), epoch)
     }
 
-    /// Fences reader number `epoch` off, if it is the present one. What waits is kept for the next.
+    /// Fences reader number `epoch`, if it is the current one. Queued messages are kept for the next.
     pub(crate) fn detach(&self, epoch: u64) {
         let mut shared = lock(&self.shared);
         if shared.epoch == epoch {
@@ -252,7 +262,7 @@ impl Mailbox {
         }
     }
 
-    /// Messages that wait to be taken, and how many were taken out so far; `None` if somebody is at it this very moment.
+    /// Returns the number of queued messages, and of those taken out so far. Returns `None` if the mailbox is locked.
     pub(crate) fn backlog(&self) -> Option<(usize, u64)> {
         if let Some(source) = &self.source {
             return source.backlog();
@@ -262,19 +272,20 @@ impl Mailbox {
             Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
             Err(TryLockError::WouldBlock) => return None,
         };
-        // In a pause only the layers' events are to be taken.
+        // During a pause only the layers' events can be taken.
         let waiting = if shared.paused { shared.events.len() } else { shared.waiting() };
         Some((waiting, shared.taken_out))
     }
 
-    /// Refuses everything that waits and everything that comes.
+    /// Rejects all queued and all new messages.
     pub fn close(&self) {
         let (waiting, wakers) = {
             let mut shared = lock(&self.shared);
             shared.closed = true;
             let mut waiting = shared.take_events();
             waiting.extend(shared.empty());
-            (waiting, [shared.waker.take(), shared.queue.awaited_no_more()])
+            let wakers = [shared.waker.take(), shared.queue.awaited_no_more(), shared.event_waits.take()];
+            (waiting, wakers)
         };
         for message in waiting {
             self.reject(message, Rejection::Closed);
@@ -282,80 +293,96 @@ impl Mailbox {
         wakers.into_iter().flatten().for_each(Waker::wake);
     }
 
-    /// The application is away: refuses everything that waits and everything that comes, until it [is back](Self::is_back).
-    pub fn refuse_while_away(&self) {
-        let (waiting, waker) = {
+    /// Rejects all queued and all new messages while the application is down, until
+    /// [`accept_again`](Self::accept_again).
+    pub fn refuse_while_down(&self) {
+        let (waiting, wakers) = {
             let mut shared = lock(&self.shared);
             shared.refuses = true;
-            (shared.empty(), shared.queue.awaited_no_more())
+            (shared.empty(), [shared.queue.awaited_no_more(), shared.event_waits.take()])
         };
         for message in waiting {
             self.reject(message, Rejection::Down);
         }
-        waker.into_iter().for_each(Waker::wake);
+        wakers.into_iter().flatten().for_each(Waker::wake);
     }
 
-    /// Drops the layers' events that wait: the life that they were for has ended.
+    /// Drops the queued events of layers: the incarnation that they were for has ended.
     pub fn forget_events(&self) {
-        let events = lock(&self.shared).take_events();
+        let (events, waker) = {
+            let mut shared = lock(&self.shared);
+            (shared.take_events(), shared.event_waits.take())
+        };
         for event in events {
             event.reject(Rejection::Down);
         }
+        waker.into_iter().for_each(Waker::wake);
     }
 
-    /// The application is ready again.
-    pub fn is_back(&self) {
+    /// Accepts messages again: the application is ready.
+    pub fn accept_again(&self) {
         lock(&self.shared).refuses = false;
     }
 
-    /// Takes messages again, after it was [closed](Self::close).
+    /// Accepts messages again, after a [`close`](Self::close).
     pub fn reopen(&self) {
         lock(&self.shared).closed = false;
     }
 
-    /// Messages that wait now.
+    /// Returns the number of queued messages.
     #[must_use]
     pub fn depth(&self) -> usize {
         lock(&self.shared).waiting()
     }
 
-    /// The most messages that ever waited at once.
+    /// Returns the maximum number of messages that were ever queued at once.
     #[must_use]
     pub fn high_water(&self) -> usize {
         lock(&self.shared).high_water
     }
 
-    /// What became of the messages of `class`, and how many wait, are in hand or lent at that same moment:
-    /// [`Tally::open`] of the former is the latter.
+    /// Returns the results of the messages of `class`, and the number that is queued, being handled or in
+    /// flight at the same moment: [`Tally::open`] of the former equals the latter.
     #[must_use]
     pub fn account(&self, class: Class) -> (Tally, u64) {
         let shared = lock(&self.shared);
         (shared.tallies[class as usize], shared.held(class))
     }
 
-    /// What became of the messages of `class`.
+    /// Returns the results of the messages of `class`.
     #[must_use]
     pub fn tally(&self, class: Class) -> Tally {
         lock(&self.shared).tallies[class as usize]
     }
 }
 
-impl Outlet for Mailbox {
+impl Mailbox {
+    /// Accepts an event, or calls `is_full` with the lock held.
+    fn take_event(&self, event: Message, is_full: impl FnOnce(&mut Shared)) -> Result<(), Refused> {
+        let mut shared = lock(&self.shared);
+        if shared.closed {
+            shared.tallies[event.header.class as usize].refused += 1;
+            return Err(Refused::new(event, Rejection::Closed));
+        }
+        let waker = shared.submit_event(event).inspect_err(|_| is_full(&mut shared))?;
+        drop(shared);
+        waker.into_iter().for_each(wakes::wake);
+        Ok(())
+    }
+}
+
+impl MessageSink for Mailbox {
     fn submit(&self, message: Message) -> Result<(), Refused> {
         let class = message.header.class as usize;
-        let mut expired = Vec::new();
-        let is_event = is_event(&message.header);
+        if is_event(&message.header) {
+            return self.take_event(message, |_| {});
+        }
+        let (mut expired, mut event_waits) = (Vec::new(), None);
         let taken = {
             let mut shared = lock(&self.shared);
             if shared.closed {
                 shared.tallies[class].refused += 1;
                 return Err(Refused::new(message, Rejection::Closed));
-            }
-            if is_event {
-                let waker = shared.submit_event(message)?;
-                drop(shared);
-                waker.into_iter().for_each(wakes::wake);
-                return Ok(());
             }
             if shared.refuses {
                 shared.tallies[class].refused += 1;
@@ -366,8 +393,12 @@ impl Outlet for Mailbox {
                 return Err(Refused::new(message, Rejection::Unsupported));
             }
             if !shared.queue.has_room_for(&message) {
-                // An application that waits for its start takes nothing out: what has expired makes room.
+                // An application that waits for its start takes no messages, so expired ones are removed here
+                // to make room.
                 expired = shared.expire(Time::now());
+                if !expired.is_empty() {
+                    event_waits = shared.event_waits.take();
+                }
             }
             match shared.queue.push(message) {
                 Ok(superseded) => {
@@ -382,19 +413,28 @@ impl Outlet for Mailbox {
                 }
             }
         };
-        // Settled and woken outside the lock, so that nobody who is told runs into it.
+        // Settled and woken without the lock, so that a notified thread does not wait for it.
         for mut message in expired {
             message.settle(Outcome::Expired);
         }
+        event_waits.into_iter().for_each(Waker::wake);
         taken.map(|waker| waker.into_iter().for_each(wakes::wake))
     }
 
     fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
+        if is_event(&message.header) {
+            let class = message.header.class as usize;
+            return self.take_event(message, |shared| {
+                // The event is offered again.
+                shared.tallies[class].refused -= 1;
+                shared.event_waits = room.cloned();
+            });
+        }
         let result = self.submit(message);
         if let Err(Refused { message, why: Rejection::QueueFull }) = &result {
             let waker = {
                 let mut shared = lock(&self.shared);
-                // It is offered again.
+                // The message is offered again.
                 shared.tallies[message.header.class as usize].refused -= 1;
                 room.and_then(|room| shared.queue.offered(message, room))
             };
@@ -404,11 +444,11 @@ impl Outlet for Mailbox {
     }
 
     fn cancel(&self, ticket: Ticket) -> bool {
-        self.take_back(ticket)
+        self.cancel_request(ticket)
     }
 }
 
-/// Whether one of the node's own layers says something to an application of it: who is there, what it requires, who died.
+/// Returns whether a message is an event of one of the node's own layers for an application: nodes, requirements, ends.
 #[must_use]
 pub fn is_event(header: &Header) -> bool {
     header.source.app.is_layer() && header.source.node == header.destination.node && header.kind.is_user()

@@ -1,4 +1,4 @@
-//! The pure queue behind mailboxes and connections: one lane a class, each with its own bound.
+//! The pure queue of mailboxes and connections: one lane per class, each with its own bound.
 
 #[cfg(test)]
 mod tests;
@@ -7,7 +7,7 @@ use std::{collections::VecDeque, sync::Arc, task::Waker};
 
 use super::{
     Budget,
-    ends::{Ends, Held, Place, is_end},
+    ends::{Ends, Place, Usage, is_end},
     room::Awaited,
 };
 use crate::{
@@ -17,66 +17,67 @@ use crate::{
     wire::{Class, Header, Message},
 };
 
-/// So many messages of more urgent classes pass a waiting one before it has its turn: urgent traffic that never ends
-/// must not stop the rest for ever.
+/// Number of messages of more urgent classes that pass a queued one before its turn. Otherwise endless urgent
+/// traffic would stop the others forever.
 const PASSED_OVER_MAX: u32 = 32;
 
-/// What a queue holds at most, each class by itself.
+/// The bounds of a queue, for each class separately.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Bounds {
-    /// Messages.
+    /// Maximum number of messages.
     pub messages: usize,
-    /// Bytes of their payloads, all together. One message is held where nothing else is, however long it is.
+    /// Maximum total bytes of their payloads. One message of any length fits in an empty lane.
     pub bytes: usize,
 }
 
 impl Bounds {
-    /// Whether `length` bytes more have room beside `held`.
+    /// Returns whether `length` more bytes have room besides `held`.
     const fn has_bytes_for(self, length: usize, held: usize) -> bool {
         held == 0 || length <= self.bytes.saturating_sub(held)
     }
 
-    /// Whether one message more of this `length` has room beside what is `held`.
-    const fn has_room_for(self, length: usize, held: Held) -> bool {
+    /// Returns whether one more message of this `length` has room besides the `held` ones.
+    const fn has_room_for(self, length: usize, held: Usage) -> bool {
         held.messages < self.messages && self.has_bytes_for(length, held.bytes)
     }
 }
 
 impl From<usize> for Bounds {
-    /// So many messages, however long: where who puts them in bounds their bytes.
+    /// A bound on the number alone, for a caller that limits the bytes itself.
     fn from(messages: usize) -> Self {
         Self { messages, bytes: usize::MAX }
     }
 }
 
-/// Messages in the order in which they are to be handled: Control, then Stream, then Bulk.
+/// A queue of messages in the order of their handling: Control, then Stream, then Bulk.
 ///
-/// - Control and Bulk keep the order in which they came.
-/// - Stream keeps one message for each source and kind: a newer one takes the place of the older, and its turn.
-/// - A lane that was passed over 32 times has one turn.
-/// - What is left of a node whose end is told, and that, goes before all else. It holds its lane's places until it is taken.
-/// - A full lane refuses; it never drops. It is full when it holds as many messages, or as many bytes, as it may.
+/// - Control and Bulk keep the order of arrival.
+/// - Stream keeps one message per source and kind: a newer one replaces the older, at its position.
+/// - A lane that was passed over 32 times gets one turn.
+/// - Remaining messages of a lost node, and the event about its end, precede all others. They occupy their
+///   lane's positions until they are taken.
+/// - A full lane rejects; it never drops. It is full at its maximum number of messages or of bytes.
 #[derive(Debug)]
 pub struct ClassQueue {
     pub(super) lanes: [VecDeque<Message>; 3],
-    /// What is left of nodes that are gone, each with what is said of that behind it.
+    /// The remaining messages of lost nodes, each followed by the event about its end.
     pub(super) ends: Ends,
-    /// Of what waits in the lanes, how much is said of a node's end.
+    /// The number of events about a node's end in the lanes.
     pub(super) ends_in_lanes: usize,
     /// Bytes of the payloads in each lane.
     pub(super) bytes: [usize; 3],
     passed_over: [u32; 3],
     bounds: Bounds,
-    /// What it shares with others.
+    /// The budget that it shares with other queues.
     pub(super) budget: Option<Arc<Budget>>,
-    /// Nothing that waits expires before this.
+    /// No queued message expires before this.
     earliest_expiry: Time,
-    /// Who waits for room.
+    /// The waker that waits for room.
     awaited: Option<Awaited>,
 }
 
 impl ClassQueue {
-    /// An empty queue that holds at most so much of each class.
+    /// Creates an empty queue with these bounds for each class.
     #[must_use]
     pub fn new(bounds: impl Into<Bounds>) -> Self {
         Self {
@@ -92,7 +93,7 @@ impl ClassQueue {
         }
     }
 
-    /// The same, within a budget that it shares with other queues.
+    /// Same as [`new`](Self::new), within a budget that it shares with other queues.
     #[must_use]
     pub fn sharing(bounds: impl Into<Bounds>, budget: Arc<Budget>) -> Self {
         let mut queue = Self::new(bounds);
@@ -100,10 +101,10 @@ impl ClassQueue {
         queue
     }
 
-    /// Takes a message. Returns the older Stream message that it replaced, if any.
+    /// Queues a message. Returns the older Stream message that it replaced, if any.
     ///
     /// # Errors
-    /// The message itself, if the lane of its class is full. An older value that waits stays there then.
+    /// The message itself, if the lane of its class is full. An older queued value then stays.
     pub fn push(&mut self, message: Message) -> Result<Option<Message>, Refused> {
         let (class, length) = (message.header.class, message.payload.len());
         let held = self.held(class as usize);
@@ -112,7 +113,7 @@ impl ClassQueue {
         {
             let former = older.payload.len();
             if !self.bounds.has_bytes_for(length, held.bytes - former)
-                || !takes_instead(self.budget.as_deref(), length, former)
+                || !swap_budget(self.budget.as_deref(), length, former)
             {
                 return Err(Refused::new(message, Rejection::QueueFull));
             }
@@ -123,7 +124,7 @@ impl ClassQueue {
             self.ends_in_lanes -= usize::from(is_end(&older.header));
             return Ok(Some(std::mem::replace(older, message)));
         }
-        if !self.bounds.has_room_for(length, held) || !takes_instead(self.budget.as_deref(), length, 0) {
+        if !self.bounds.has_room_for(length, held) || !swap_budget(self.budget.as_deref(), length, 0) {
             return Err(Refused::new(message, Rejection::QueueFull));
         }
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
@@ -134,8 +135,8 @@ impl ClassQueue {
         Ok(None)
     }
 
-    /// Takes a message behind all others of its class, whatever the bound, and replaces none. For the few whose place in the
-    /// order counts; who uses it bounds how many there are.
+    /// Queues a message behind all others of its class, beyond the bound, and replaces none. For the few
+    /// messages that depend on the order; the caller must limit their number.
     pub fn push_beyond(&mut self, message: Message) {
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
         self.add(message.payload.len());
@@ -143,31 +144,32 @@ impl ClassQueue {
         self.lanes[message.header.class as usize].push_back(message);
     }
 
-    /// Whether there is room for this message beside all that waits.
+    /// Returns whether there is room for this message.
     #[must_use]
     pub fn has_room_for(&self, message: &Message) -> bool {
         self.bounds.has_room_for(message.payload.len(), self.held(message.header.class as usize))
     }
 
-    /// What holds places of a lane: what waits in it, and what was brought forward from it.
-    pub(super) fn held(&self, class: usize) -> Held {
+    /// Returns the messages that occupy positions of a lane: those queued in it, and those moved forward from it.
+    pub(super) fn held(&self, class: usize) -> Usage {
         let at_ends = self.ends.of_lane(class);
-        Held {
+        Usage {
             messages: self.lanes[class].len() + at_ends.messages,
             bytes: self.bytes[class] + at_ends.bytes,
         }
     }
 
-    /// Somebody keeps this message, which found no room, and waits for some: [`room_made`](Self::room_made) says when. Returns the waker if
-    /// there is room by now. One waits at most; another one takes its place.
+    /// Registers a caller that keeps this message, which found no room. [`room_made`](Self::room_made) then
+    /// returns its waker when there is room. Returns the waker if there is room already. Only one can be
+    /// registered; a new one replaces it.
     pub fn offered(&mut self, message: &Message, room: &Waker) -> Option<Waker> {
         let (class, length) = (message.header.class, message.payload.len());
         self.awaited = Some(Awaited::with(self.awaited.take(), class, length, room));
         self.room_made()
     }
 
-    /// Whoever waits for room, once there is: half of the places of its class, and of the bytes half or what it needs. To be asked
-    /// whenever a message was taken out; to be woken without a lock.
+    /// Returns the registered waker, once there is room: half of the positions of its class, and half of the
+    /// bytes or as many as it needs. Call it after each removal of a message, and wake without a lock.
     pub fn room_made(&mut self) -> Option<Waker> {
         let awaited = self.awaited.as_ref()?;
         let has_room = awaited.any(|class, length| {
@@ -179,12 +181,12 @@ impl ClassQueue {
         if has_room { self.awaited_no_more() } else { None }
     }
 
-    /// Whoever waits for room, whether there is or not: it is told something else.
+    /// Returns the registered waker, with or without room, because the caller must be notified of another change.
     pub fn awaited_no_more(&mut self) -> Option<Waker> {
         self.awaited.take().map(Awaited::into_waker)
     }
 
-    /// Whether a newer value of this Stream message waits.
+    /// Returns whether a newer value of this Stream message is queued.
     #[must_use]
     pub fn supersedes(&self, older: &Header) -> bool {
         let lane = &self.lanes[Class::Stream as usize];
@@ -193,8 +195,8 @@ impl ClassQueue {
                 || lane.iter().any(|newer| is_same_stream(&newer.header, older)))
     }
 
-    /// Puts a message back that was popped, before all others of its class, whatever the bound. Hands it back if it is
-    /// of a Stream whose newer value waits here.
+    /// Puts a popped message back before all others of its class, beyond the bound. Returns the message if it
+    /// is of a Stream with a newer queued value.
     pub fn put_back(&mut self, message: Message) -> Option<Message> {
         if self.supersedes(&message.header) {
             return Some(message);
@@ -208,10 +210,10 @@ impl ClassQueue {
         None
     }
 
-    /// The next message to handle.
+    /// Removes and returns the next message to handle.
     pub fn pop(&mut self) -> Option<Message> {
         if let Some(next) = self.ends.pop() {
-            self.give(next.payload.len());
+            self.release(next.payload.len());
             return Some(next);
         }
         let first = self.lanes.iter().position(|lane| !lane.is_empty())?;
@@ -229,41 +231,41 @@ impl ClassQueue {
         Some(next)
     }
 
-    /// The next message of a class, if it is of the sort that goes with one that was [popped](Self::pop).
+    /// Removes and returns the next message of a class, if it belongs to one that was [popped](Self::pop).
     pub fn pop_if(&mut self, class: Class, is_it: impl FnOnce(&Message) -> bool) -> Option<Message> {
         let next = self.lanes[class as usize].pop_front_if(|message| is_it(message))?;
         self.left_lane(&next);
         Some(next)
     }
 
-    /// A message comes to wait in the lane of its class.
+    /// Accounts for a message that enters the lane of its class.
     fn enters_lane(&mut self, message: &Message) {
         self.bytes[message.header.class as usize] += message.payload.len();
         self.ends_in_lanes += usize::from(is_end(&message.header));
     }
 
-    /// A message was taken out of the lane of its class, and of the queue.
+    /// Accounts for a message that left the lane of its class, and the queue.
     fn left_lane(&mut self, message: &Message) {
         self.bytes[message.header.class as usize] -= message.payload.len();
         self.ends_in_lanes -= usize::from(is_end(&message.header));
-        self.give(message.payload.len());
+        self.release(message.payload.len());
     }
 
-    /// So many bytes are held more, whatever the bounds.
+    /// Adds held bytes, beyond the bounds.
     pub(super) fn add(&self, bytes: usize) {
         if let Some(budget) = &self.budget {
             budget.add(bytes);
         }
     }
 
-    /// So many bytes are held no more.
-    pub(super) fn give(&self, bytes: usize) {
+    /// Subtracts held bytes.
+    pub(super) fn release(&self, bytes: usize) {
         if let Some(budget) = &self.budget {
-            budget.give(bytes);
+            budget.release(bytes);
         }
     }
 
-    /// Takes out what has expired by `now`. Costs nothing as long as nothing can have.
+    /// Removes the messages that have expired by `now`. Costs nothing while none can have expired.
     pub fn take_expired(&mut self, now: Time) -> Vec<Message> {
         let mut expired = Vec::new();
         if now <= self.earliest_expiry {
@@ -282,23 +284,23 @@ impl ClassQueue {
                 }
             }
         }
-        self.give(expired.iter().map(|message| message.payload.len()).sum());
+        self.release(expired.iter().map(|message| message.payload.len()).sum());
         expired
     }
 
-    /// Nothing that waits expires before this.
+    /// Returns the time before which no queued message expires.
     #[must_use]
     pub const fn next_expiry(&self) -> Time {
         self.earliest_expiry
     }
 
-    /// Takes the request that `ticket` names out, if it waits.
+    /// Removes and returns the request of `ticket`, if it is queued.
     pub fn take_request(&mut self, ticket: Ticket) -> Option<Message> {
         if let Some(request) = self.ends.take_request(ticket) {
-            self.give(request.payload.len());
+            self.release(request.payload.len());
             return Some(request);
         }
-        // Who gives a request up has mostly just made it.
+        // A request is usually cancelled soon after it was made, so the search starts at the end.
         let place = |lane: &VecDeque<Message>| lane.iter().rposition(|message| message.is_request(ticket));
         let (lane, at) = (0..3).find_map(|lane| Some((lane, place(&self.lanes[lane])?)))?;
         let request = self.lanes[lane].remove(at)?;
@@ -306,31 +308,31 @@ impl ClassQueue {
         Some(request)
     }
 
-    /// All that waits, most urgent class first.
+    /// Returns the queued messages, most urgent class first.
     pub fn iter(&self) -> impl Iterator<Item = &Message> {
         self.ends.iter().chain(self.lanes.iter().flatten())
     }
 
-    /// Messages that wait.
+    /// Returns the number of queued messages.
     #[must_use]
     pub fn len(&self) -> usize {
         self.ends.iter().len() + self.lanes.iter().map(VecDeque::len).sum::<usize>()
     }
 
-    /// Messages of `class` that wait.
+    /// Returns the number of queued messages of `class`.
     #[must_use]
     pub fn len_of(&self, class: Class) -> usize {
         let at_ends = self.ends.iter().filter(|message| message.header.class == class).count();
         at_ends + self.lanes[class as usize].len()
     }
 
-    /// Bytes of the payloads that wait.
+    /// Returns the bytes of the queued payloads.
     #[must_use]
     pub fn bytes(&self) -> usize {
         self.ends.bytes() + self.bytes.iter().sum::<usize>()
     }
 
-    /// Whether none waits.
+    /// Returns whether the queue is empty.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.ends.iter().len() == 0 && self.lanes.iter().all(VecDeque::is_empty)
@@ -338,7 +340,7 @@ impl ClassQueue {
 
     /// Empties the queue, most urgent class first.
     pub fn drain_all(&mut self) -> impl Iterator<Item = Message> + use<> {
-        self.give(self.bytes());
+        self.release(self.bytes());
         (self.bytes, self.ends_in_lanes) = ([0; 3], 0);
         self.ends.take_all().chain(std::mem::take(&mut self.lanes).into_iter().flatten())
     }
@@ -346,22 +348,23 @@ impl ClassQueue {
 
 impl Drop for ClassQueue {
     fn drop(&mut self) {
-        self.give(self.bytes());
+        self.release(self.bytes());
     }
 }
 
-/// Whether a budget has room for `length` bytes in the place of `former` ones; if so, they are counted.
-fn takes_instead(budget: Option<&Budget>, length: usize, former: usize) -> bool {
+/// Returns whether a budget has room for `length` bytes in place of `former` ones; if so, they are counted.
+fn swap_budget(budget: Option<&Budget>, length: usize, former: usize) -> bool {
     let Some(budget) = budget else { return true };
     if let Some(fewer) = former.checked_sub(length) {
-        budget.give(fewer);
+        budget.release(fewer);
         return true;
     }
     budget.take(length - former)
 }
 
-/// The value whose place one with this header takes: none that waits before a [mark](ClassQueue::push_beyond) of the same
-/// source, for the mark says that what was sent before it comes before it.
+/// Returns the queued value that one with this header replaces. A value before a
+/// [mark](ClassQueue::push_beyond) of the same source is never replaced, because messages sent before the
+/// mark must stay before it.
 fn older_value<'a>(lane: &'a mut VecDeque<Message>, header: &Header) -> Option<&'a mut Message> {
     let is_mark = |other: &Header| {
         !other.kind.is_user() && other.source == header.source && other.destination == header.destination
@@ -371,7 +374,7 @@ fn older_value<'a>(lane: &'a mut VecDeque<Message>, header: &Header) -> Option<&
     is_same_stream(&found.header, header).then_some(found)
 }
 
-/// Whether the newer of the two takes the place of the older, both being of class Stream.
+/// Returns whether the newer of two Stream messages replaces the older.
 #[must_use]
 pub fn is_same_stream(one: &Header, other: &Header) -> bool {
     one.source == other.source && one.kind == other.kind && one.destination == other.destination

@@ -1,4 +1,4 @@
-//! The reading end of a mailbox: one message at a time into the hand, and what became of it.
+//! The reading end of a mailbox: takes one message at a time, and records its outcome.
 
 use std::{
     sync::Arc,
@@ -7,8 +7,8 @@ use std::{
 
 use super::Mailbox;
 use crate::{
+    lock,
     outcome::Outcome,
-    post::lock,
     wire::{Class, Message},
 };
 
@@ -17,17 +17,17 @@ use crate::{
 pub struct MailboxReader {
     mailbox: Arc<Mailbox>,
     epoch: u64,
-    in_hand: Option<Class>,
+    current: Option<Class>,
     finished: Option<(Class, Outcome)>,
 }
 
 impl MailboxReader {
-    /// Takes the next message into the hand. `None` once the mailbox is closed or a later incarnation reads it.
+    /// Takes the next message. `None` if the mailbox is closed or a later incarnation reads it.
     pub fn poll_take(&mut self, cx: &mut Context<'_>) -> Poll<Option<Message>> {
         if let Some(source) = &self.mailbox.source {
             let taken = source.poll_take(cx);
             if let Poll::Ready(Some(message)) = &taken {
-                self.in_hand = Some(message.header.class);
+                self.current = Some(message.header.class);
             }
             return taken;
         }
@@ -38,10 +38,10 @@ impl MailboxReader {
         shared.count(self.finished.take());
         shared.paused = false;
         if let Some(message) = shared.next() {
-            self.in_hand = shared.hands_out(&message);
-            let room = shared.queue.room_made();
+            self.current = shared.begin_handling(&message);
+            let room = shared.room_made();
             drop(shared);
-            room.into_iter().for_each(Waker::wake);
+            room.into_iter().flatten().for_each(Waker::wake);
             return Poll::Ready(Some(message));
         }
         if shared.closed {
@@ -51,12 +51,12 @@ impl MailboxReader {
         Poll::Pending
     }
 
-    /// The same for the layers' events alone; everything else is left where it is.
+    /// Takes the next layer event; all other messages stay queued.
     pub fn poll_event(&mut self, cx: &mut Context<'_>) -> Poll<Option<Message>> {
         if let Some(source) = &self.mailbox.source {
             let taken = source.poll_event(cx);
             if let Poll::Ready(Some(event)) = &taken {
-                self.in_hand = Some(event.header.class);
+                self.current = Some(event.header.class);
             }
             return taken;
         }
@@ -66,7 +66,10 @@ impl MailboxReader {
         }
         shared.count(self.finished.take());
         if let Some(event) = shared.events.pop_front() {
-            self.in_hand = shared.hands_out(&event);
+            self.current = shared.begin_handling(&event);
+            let room = shared.event_waits.take();
+            drop(shared);
+            room.into_iter().for_each(Waker::wake);
             return Poll::Ready(Some(event));
         }
         if shared.closed {
@@ -77,10 +80,10 @@ impl MailboxReader {
         Poll::Pending
     }
 
-    /// The message in hand has ended so. Counted with the next [`poll_take`](Self::poll_take), under its lock, or when
-    /// this reader is dropped.
+    /// Records the outcome of the current message. It is counted with the next
+    /// [`poll_take`](Self::poll_take), under its lock, or when this reader is dropped.
     pub fn finish(&mut self, outcome: Outcome) {
-        let Some(class) = self.in_hand.take() else { return };
+        let Some(class) = self.current.take() else { return };
         match &self.mailbox.source {
             Some(source) => source.finish(outcome),
             None => self.finished = Some((class, outcome)),
@@ -89,13 +92,13 @@ impl MailboxReader {
 }
 
 impl MailboxReader {
-    /// The reader of `mailbox` with this number; its mailbox knows no other from now on.
+    /// Creates the reader of `mailbox` with this number; it is the only one from now on.
     pub(super) const fn new(mailbox: Arc<Mailbox>, epoch: u64) -> Self {
-        Self { mailbox, epoch, in_hand: None, finished: None }
+        Self { mailbox, epoch, current: None, finished: None }
     }
 
-    /// Counts the message that has ended now, before code runs that may not come back: one that is fenced off in it has
-    /// nothing in its hand.
+    /// Counts the ended message now, before code runs that may not return: a reader that is fenced during
+    /// that code has no current message.
     pub(crate) fn count(&mut self) {
         if self.finished.is_some() {
             let mut shared = lock(&self.mailbox.shared);
@@ -105,7 +108,7 @@ impl MailboxReader {
         }
     }
 
-    /// Which reader of its mailbox this is.
+    /// Returns the number of this reader at its mailbox.
     pub(crate) const fn epoch(&self) -> u64 {
         self.epoch
     }
@@ -113,13 +116,13 @@ impl MailboxReader {
 
 impl Drop for MailboxReader {
     fn drop(&mut self) {
-        if let Some(source) = self.mailbox.source.as_ref().filter(|_| self.in_hand.is_some()) {
+        if let Some(source) = self.mailbox.source.as_ref().filter(|_| self.current.is_some()) {
             source.finish(Outcome::Failed);
         }
         let mut shared = lock(&self.mailbox.shared);
         if shared.epoch == self.epoch {
             shared.count(self.finished.take());
-            shared.count(self.in_hand.take().map(|class| (class, Outcome::Failed)));
+            shared.count(self.current.take().map(|class| (class, Outcome::Failed)));
         }
     }
 }

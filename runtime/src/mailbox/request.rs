@@ -1,25 +1,25 @@
-//! Requests that nobody waits for any more are taken back where they wait.
+//! The removal of queued requests that were cancelled.
 
 use std::task::Waker;
 
 use super::Mailbox;
 use crate::{
+    lock,
     outcome::{Outcome, Ticket},
-    post::lock,
 };
 
 impl Mailbox {
-    /// Takes the request that `ticket` names out, if it waits: its time is over. Returns whether it did.
-    pub(super) fn take_back(&self, ticket: Ticket) -> bool {
+    /// Removes the request of `ticket`, if it is queued, and ends it as expired. Returns whether it was queued.
+    pub(super) fn cancel_request(&self, ticket: Ticket) -> bool {
         let (mut request, room) = {
             let mut shared = lock(&self.shared);
             let Some(request) = shared.queue.take_request(ticket) else { return false };
             shared.tallies[request.header.class as usize].expired += 1;
-            (request, shared.queue.room_made())
+            (request, shared.room_made())
         };
-        // Settled and woken outside the lock, so that nobody who is told runs into it.
+        // Settled and woken without the lock, so that a notified thread does not wait for it.
         request.settle(Outcome::Expired);
-        room.into_iter().for_each(Waker::wake);
+        room.into_iter().flatten().for_each(Waker::wake);
         true
     }
 }
@@ -34,13 +34,13 @@ mod tests {
     use super::*;
     use crate::{
         mailbox::MailboxReader,
-        router::Outlet,
+        router::MessageSink,
         tid::Tid,
         wire::{Class, Flags, Header, Kind, Message},
     };
 
     #[test]
-    fn a_request_that_nobody_waits_for_is_taken_out_and_counted_and_the_others_keep_their_order() {
+    fn cancelled_request_is_removed_and_counted() {
         let mailbox = Mailbox::new(3);
         let request = |correlation| {
             let mut header = Header::new(Kind::named("test"), Tid::NONE, Tid::NONE);

@@ -1,19 +1,19 @@
-//! Who waits for room in a queue.
+//! The registration of a waiter for room in a queue.
 
 use std::task::Waker;
 
 use crate::wire::Class;
 
-/// One who keeps messages for a full queue, and wants to be woken when it has room for one of them.
+/// A caller that keeps messages for a full queue, to be woken when it has room for one of them.
 #[derive(Debug)]
 pub(super) struct Awaited {
-    /// Of each class the length of the shortest message that waits, if any does, in bytes of its payload.
+    /// For each class, the payload length in bytes of the shortest message that waits, if any does.
     shortest: [Option<usize>; 3],
     waker: Waker,
 }
 
 impl Awaited {
-    /// `waker` waits for room for a message of this class and length, beside what the `former` one waited for.
+    /// Adds a message of this class and length to the messages that `former` waited for, and replaces its waker.
     pub(super) fn with(former: Option<Self>, class: Class, length: usize, waker: &Waker) -> Self {
         let mut awaited = match former {
             Some(mut former) => {
@@ -27,7 +27,7 @@ impl Awaited {
         awaited
     }
 
-    /// Whether `has_room` says so of a class and the length of the shortest message of it.
+    /// Returns whether `has_room` is true for a class and the length of its shortest message.
     pub(super) fn any(&self, has_room: impl Fn(usize, usize) -> bool) -> bool {
         let mut awaited = self.shortest.iter().enumerate();
         awaited.any(|(class, shortest)| shortest.is_some_and(|length| has_room(class, length)))
@@ -52,10 +52,10 @@ mod tests {
     use futures_util::task::noop_waker;
 
     use crate::{
-        mailbox::{Bounds, Mailbox, MailboxReader},
+        mailbox::{Bounds, Mailbox, MailboxReader, RemoteReader},
         outcome::Rejection,
-        router::Outlet,
-        tid::Tid,
+        router::MessageSink,
+        tid::{AppAddress, Tid},
         wire::{Header, Kind, Message},
     };
 
@@ -80,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn who_keeps_a_message_for_a_full_mailbox_is_woken_once_when_half_of_it_is_free() {
+    fn waiting_sender_is_woken_once_at_half_free_mailbox() {
         let woken = Arc::<Woken>::default();
         let waker = Waker::from(woken.clone());
         let mailbox = Mailbox::new(4);
@@ -99,14 +99,14 @@ mod tests {
     }
 
     #[test]
-    fn who_keeps_a_long_message_is_woken_when_that_one_has_room_and_not_before() {
+    fn sender_of_a_long_message_waits_until_it_fits() {
         let woken = Arc::<Woken>::default();
         let waker = Waker::from(woken.clone());
         let of = |length: usize| Message::new(message().header, vec![0; length].into());
         let mailbox = Mailbox::new(Bounds { messages: 8, bytes: 100 });
         let mut reader = mailbox.attach();
         (0..2).for_each(|_| mailbox.submit(of(10)).unwrap());
-        // It has room only where nothing else waits; half of the places are free, and are no use to it.
+        // It fits only into an empty mailbox; half of the slots are free, and do not help it.
         mailbox.offer(of(1_000), Some(&waker)).unwrap_err();
         assert_eq!(woken.0.load(Ordering::Relaxed), 0);
         assert!(takes(&mut reader));
@@ -116,14 +116,68 @@ mod tests {
     }
 
     #[test]
-    fn who_keeps_a_message_is_woken_when_the_mailbox_wants_none_any_more() {
-        for stop in [Mailbox::close, Mailbox::refuse_while_away] {
+    fn waiting_sender_is_woken_when_the_mailbox_closes() {
+        for stop in [Mailbox::close, Mailbox::refuse_while_down] {
             let woken = Arc::<Woken>::default();
             let waker = Waker::from(woken.clone());
             let mailbox = Mailbox::new(1);
             mailbox.submit(message()).unwrap();
             mailbox.offer(message(), Some(&waker)).unwrap_err();
             stop(&mailbox);
+            assert_eq!(woken.0.load(Ordering::Relaxed), 1);
+        }
+    }
+
+    fn event() -> Message {
+        let mut event = message();
+        event.header.source.app = AppAddress::SYNC;
+        event
+    }
+
+    #[test]
+    fn event_sender_is_woken_at_the_next_removal() {
+        let woken = Arc::<Woken>::default();
+        let waker = Waker::from(woken.clone());
+        let mailbox = Mailbox::new(2);
+        let mut reader = mailbox.attach();
+        (0..2).for_each(|_| mailbox.submit(event()).unwrap());
+        for before in 0..2 {
+            assert_eq!(mailbox.offer(event(), Some(&waker)).unwrap_err().why, Rejection::QueueFull);
+            assert_eq!(woken.0.load(Ordering::Relaxed), before);
+            let event_alone = reader.poll_event(&mut Context::from_waker(&noop_waker()));
+            assert!(event_alone.is_ready());
+            assert_eq!(woken.0.load(Ordering::Relaxed), before + 1);
+            mailbox.offer(event(), Some(&waker)).unwrap();
+        }
+        assert!(takes(&mut reader));
+        assert_eq!(woken.0.load(Ordering::Relaxed), 2, "none waits");
+        let tally = mailbox.tally(Class::Control);
+        assert_eq!((tally.taken, tally.refused), (4, 0), "what is offered again is not refused");
+    }
+
+    #[test]
+    fn event_sender_is_woken_when_events_are_dropped() {
+        for stop in [Mailbox::close, Mailbox::refuse_while_down, Mailbox::forget_events] {
+            let woken = Arc::<Woken>::default();
+            let waker = Waker::from(woken.clone());
+            let mailbox = Mailbox::new(1);
+            mailbox.submit(event()).unwrap();
+            mailbox.offer(event(), Some(&waker)).unwrap_err();
+            stop(&mailbox);
+            assert_eq!(woken.0.load(Ordering::Relaxed), 1);
+        }
+    }
+
+    #[test]
+    fn event_sender_is_woken_by_each_remote_take() {
+        for take in [RemoteReader::take, RemoteReader::take_event, RemoteReader::take_event_without_node] {
+            let woken = Arc::<Woken>::default();
+            let waker = Waker::from(woken.clone());
+            let mailbox = Mailbox::new(1);
+            let reader = mailbox.attach_remote();
+            mailbox.submit(event()).unwrap();
+            mailbox.offer(event(), Some(&waker)).unwrap_err();
+            assert!(take(&reader).is_some());
             assert_eq!(woken.0.load(Ordering::Relaxed), 1);
         }
     }

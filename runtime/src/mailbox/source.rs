@@ -1,4 +1,4 @@
-//! A mailbox whose messages wait elsewhere: in the node, for the process that hosts an application.
+//! A mailbox with messages that are queued elsewhere: in the node, for the process that hosts an application.
 
 use std::{
     fmt::Debug,
@@ -7,17 +7,17 @@ use std::{
 
 use crate::{outcome::Outcome, wire::Message};
 
-/// Where a mailbox's reader takes its messages from, one at a time.
+/// The source of messages for a mailbox's reader, one at a time.
 pub trait Source: Debug + Send + Sync {
-    /// Takes the next message into the hand. `None` once there will be none.
+    /// Takes the next message. `None` once there will be no more.
     fn poll_take(&self, cx: &mut Context<'_>) -> Poll<Option<Message>>;
 
-    /// The same for the layers' events alone; everything else is left where it is.
+    /// Takes the next layer event; all other messages stay queued.
     fn poll_event(&self, cx: &mut Context<'_>) -> Poll<Option<Message>>;
 
-    /// Messages that wait to be taken, and how many were taken so far; `None` if somebody is at it this very moment.
+    /// Returns the number of queued messages, and of those taken so far. Returns `None` if the source is locked.
     fn backlog(&self) -> Option<(usize, u64)>;
 
-    /// The message in hand has ended so.
+    /// Records the outcome of the current message.
     fn finish(&self, outcome: Outcome);
 }

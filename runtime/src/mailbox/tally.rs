@@ -1,24 +1,25 @@
-//! What became of the messages of one class: counters that obey a conservation law.
+//! The results of the messages of one class: counters that obey a conservation law.
 
 use crate::outcome::Outcome;
 
-/// What became of the messages of one class: `taken = delivered + superseded + rejected + expired + failed + waiting`,
-/// `waiting` being those in the queue and the one in hand.
+/// The results of the messages of one class:
+/// `taken = delivered + superseded + rejected + expired + failed + waiting`.
+/// `waiting` includes the queued messages and the one that is being handled.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Tally {
     /// Accepted by the mailbox.
     pub taken: u64,
-    /// Not accepted: the queue was full, the application had ended, or it was away and keeps nothing.
+    /// Not accepted: the queue was full, the application had ended, or it was down and its policy keeps nothing.
     pub refused: u64,
     /// Handled.
     pub delivered: u64,
     /// Replaced by a newer value.
     pub superseded: u64,
-    /// Taken, then refused by the application.
+    /// Accepted, then rejected by the application.
     pub rejected: u64,
-    /// Too old when their turn came, or requests whose asker waited no more.
+    /// Too old at their turn, or requests that were cancelled.
     pub expired: u64,
-    /// In the hand of an actor that panicked or ended.
+    /// In handling by an actor that panicked or ended.
     pub failed: u64,
 }
 
@@ -32,7 +33,7 @@ impl Tally {
         }
     }
 
-    /// Messages whose fate is still open, by the conservation law.
+    /// Returns the number of messages without a result, by the conservation law.
     #[must_use]
     pub const fn open(&self) -> u64 {
         self.taken - self.delivered - self.superseded - self.rejected - self.expired - self.failed

@@ -1,4 +1,4 @@
-//! Mailboxes and their readers: what outlives whom, and what becomes of each message.
+//! Mailboxes and their readers: their lifetimes, and the outcome of each message.
 
 use std::task::{Context, Poll};
 
@@ -36,7 +36,7 @@ fn messages_behind_a_panic_reach_the_next_incarnation() {
 }
 
 #[test]
-fn a_fenced_reader_gets_nothing() {
+fn fenced_reader_receives_nothing() {
     let mailbox = Mailbox::new(8);
     let mut zombie = mailbox.attach();
     let _present = mailbox.attach();
@@ -45,7 +45,7 @@ fn a_fenced_reader_gets_nothing() {
 }
 
 #[test]
-fn what_a_reader_has_in_its_hand_when_it_is_fenced_off_has_failed_whatever_it_says_later() {
+fn message_held_by_a_fenced_reader_has_failed() {
     let mailbox = Mailbox::new(8);
     mailbox.submit(message()).unwrap();
     mailbox.submit(message()).unwrap();
@@ -65,7 +65,7 @@ fn what_a_reader_has_in_its_hand_when_it_is_fenced_off_has_failed_whatever_it_sa
 }
 
 #[test]
-fn a_reader_that_is_not_the_present_one_cannot_be_fenced_off() {
+fn former_reader_cannot_be_fenced() {
     let mailbox = Mailbox::new(8);
     let former = mailbox.attach().epoch();
     let mut present = mailbox.attach();
@@ -75,7 +75,7 @@ fn a_reader_that_is_not_the_present_one_cannot_be_fenced_off() {
 }
 
 #[test]
-fn what_has_expired_makes_room_in_a_full_mailbox_that_nobody_reads() {
+fn expired_messages_make_room_in_a_full_mailbox() {
     let mailbox = Mailbox::new(1);
     let mut old = message();
     (old.header.sent, old.header.time_to_live_us) = (Time::from_nanos(1), 1);
@@ -87,7 +87,7 @@ fn what_has_expired_makes_room_in_a_full_mailbox_that_nobody_reads() {
 }
 
 #[test]
-fn the_layers_events_go_ahead_of_everything_and_alone_in_a_pause() {
+fn layer_events_come_first_and_alone_in_a_pause() {
     let mailbox = Mailbox::new(8);
     let mut event = message();
     event.header.source = Tid::new(Tid::NONE.node, crate::tid::AppAddress::SYNC);
@@ -103,19 +103,19 @@ fn the_layers_events_go_ahead_of_everything_and_alone_in_a_pause() {
 }
 
 #[test]
-fn a_mailbox_whose_application_is_away_and_keeps_nothing_refuses_until_it_is_back() {
+fn mailbox_of_a_down_app_that_keeps_nothing_rejects() {
     let mailbox = Mailbox::new(8);
     mailbox.submit(message()).unwrap();
-    mailbox.refuse_while_away();
+    mailbox.refuse_while_down();
     assert_eq!(mailbox.submit(message()).unwrap_err().why, Rejection::Down);
-    mailbox.is_back();
+    mailbox.accept_again();
     mailbox.submit(message()).unwrap();
     let tally = mailbox.tally(Class::Control);
     assert_eq!((tally.taken, tally.rejected, tally.refused, tally.open()), (2, 1, 1, 1));
 }
 
 #[test]
-fn a_closed_mailbox_refuses_what_waits_and_what_comes() {
+fn closed_mailbox_rejects_waiting_and_new_messages() {
     let mailbox = Mailbox::new(8);
     mailbox.submit(message()).unwrap();
     mailbox.close();

@@ -1,7 +1,8 @@
-//! What became of a confirmed message at each of its members: the reports that travel, and the table that collects them. Pure.
+//! The outcomes of a confirmed message at each of its members: the reports on the wire, and the table that
+//! collects them. Pure.
 //!
-//! A message to a group, to every application, or to one address on all nodes is one send with one outcome for each member. A report is
-//! about one member, or about one node that has members:
+//! A message to a group, to every application, or to one address on all nodes is one send with one outcome
+//! for each member. A report is about one member, or about one node that has members:
 //!
 //! ```text
 //!  TID (8)   state (1)       for each report: 9 bytes, little-endian; 128 in one frame at most
@@ -9,7 +10,7 @@
 //!
 //! | state | of a member | of a node (its application address is 0) |
 //! | --- | --- | --- |
-//! | an outcome's code | its outcome | the outcome of the node's copy: what no member of it has settled before ends so |
+//! | an outcome's code | its outcome | the outcome of the node's copy: it applies to members that have no outcome of their own |
 //! | `0xfe` | | all of its members have been reported |
 //! | `0xff` | it has a copy | it has a copy, and reports its members itself |
 
@@ -18,9 +19,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::Outcome;
 use crate::tid::{AppAddress, NodeAddress, Tid};
 
-/// Members and nodes of one table at most, and so entries of one list. Members of which there are more are unknown by an entry of their node.
+/// Maximum number of members and nodes in one table, and so of entries in one list. Members above it are
+/// unknown, through an entry of their node.
 pub const MEMBERS_MAX: usize = 4_096;
-/// Reports in one frame at most: it is short enough for the control frames of every layer.
+/// Maximum number of reports in one frame, small enough for the control frames of every layer.
 pub const REPORTS_MAX: usize = 128;
 
 /// Bytes of one report.
@@ -28,10 +30,10 @@ const EACH: usize = 9;
 const LISTED: u8 = 0xfe;
 const PENDING: u8 = 0xff;
 
-/// What became of a confirmed message at one of its members.
+/// The outcome of a confirmed message at one of its members.
 ///
-/// Where a node did not name its members, the entry has the node's address and the application address that the message was sent to: it
-/// stands for all members of that node.
+/// If a node did not list its members, the entry has the node's address and the application address of the
+/// message's destination. It represents all members of that node.
 ///
 /// # Examples
 ///
@@ -46,46 +48,46 @@ const PENDING: u8 = 0xff;
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct MemberOutcome {
-    /// The member.
+    /// The TID of the member.
     pub tid: Tid,
-    /// What became of its copy.
+    /// The outcome of its copy.
     pub outcome: Outcome,
 }
 
-/// How far a member, or a node, has come.
+/// The state of a member, or of a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MemberState {
-    /// It has a copy, and no outcome yet.
+    /// The member or node has a copy, and no outcome yet.
     Pending,
-    /// Of a node: all of its members have been reported.
+    /// For a node: all of its members have been reported.
     Listed,
-    /// The outcome of its copy.
+    /// The copy has this outcome.
     Settled(Outcome),
 }
 
-/// One report about a member, or about a node: then its application address is [`AppAddress::NONE`].
+/// One report about a member, or about a node, which has the application address [`AppAddress::NONE`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MemberReport {
-    /// The member, or the node.
+    /// The TID of the member or node.
     pub tid: Tid,
-    /// How far it has come.
+    /// The state of the member or node.
     pub state: MemberState,
 }
 
 impl MemberReport {
-    /// A report about a member.
+    /// Creates a report about a member.
     #[must_use]
     pub const fn of_member(tid: Tid, state: MemberState) -> Self {
         Self { tid, state }
     }
 
-    /// A report about a node.
+    /// Creates a report about a node.
     #[must_use]
     pub const fn of_node(node: NodeAddress, state: MemberState) -> Self {
         Self { tid: Tid::new(node, AppAddress::NONE), state }
     }
 
-    /// Writes the reports of one frame.
+    /// Encodes the reports of one frame.
     #[must_use]
     pub fn encode(reports: &[Self]) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(EACH * reports.len());
@@ -100,8 +102,8 @@ impl MemberReport {
         bytes
     }
 
-    /// Reads the reports of one frame; a state that this version does not know is left out. `None`: these are no whole reports, or none, or
-    /// more than [`REPORTS_MAX`].
+    /// Decodes the reports of one frame, and skips states that this version does not know. Returns `None` if
+    /// the payload is empty, has an incomplete report, or has more than [`REPORTS_MAX`] reports.
     #[must_use]
     pub fn decode(payload: &[u8]) -> Option<Vec<Self>> {
         let (reports, rest) = payload.as_chunks::<EACH>();
@@ -109,7 +111,7 @@ impl MemberReport {
         is_right.then(|| reports.iter().filter_map(Self::decode_one).collect())
     }
 
-    /// How many reports a frame has whose payload is no longer than this; one at least.
+    /// Returns how many reports fit in a payload of this length: at least one, at most [`REPORTS_MAX`].
     #[must_use]
     pub const fn in_payload(payload_max: usize) -> usize {
         let fitting = payload_max / EACH;
@@ -133,18 +135,18 @@ impl MemberReport {
     }
 }
 
-/// How far a node has come.
+/// The state of a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum NodeState {
-    /// It has not named all of its members.
+    /// The node has not listed all of its members.
     Pending,
-    /// It has, and the outcome of its copy is not known.
+    /// The node has listed its members, and the outcome of its copy is unknown.
     Listed,
-    /// The outcome of its copy came.
+    /// The outcome of the node's copy arrived.
     Settled { listed: bool, outcome: Outcome },
 }
 
-/// The members of one confirmed message, and the outcome of each as far as it is known.
+/// The members of one confirmed message, and their outcomes as far as they are known.
 ///
 /// Reports may come in any order and more than once: the first outcome of a member counts.
 #[derive(Debug)]
@@ -154,13 +156,14 @@ pub struct MemberTable {
     here: NodeAddress,
     members: BTreeMap<Tid, Option<Outcome>>,
     nodes: BTreeMap<NodeAddress, NodeState>,
-    /// Nodes that have members for which there was no room.
+    /// Nodes with members for which the table had no room.
     cut: BTreeSet<NodeAddress>,
     members_max: usize,
 }
 
 impl MemberTable {
-    /// The table of a message from an application of the node at `here` to `destination`. No member is known before that node reports.
+    /// Creates the table of a message from an application of the node at `here` to `destination`. No member
+    /// is known before that node reports.
     #[must_use]
     pub fn new(destination: Tid, here: NodeAddress) -> Self {
         Self::bounded(destination, here, MEMBERS_MAX)
@@ -171,7 +174,8 @@ impl MemberTable {
         Self { destination, here, members: BTreeMap::new(), nodes, cut: BTreeSet::new(), members_max }
     }
 
-    /// Takes reports in. Those of a node that was not reported before are ignored, and so are further members of a full table.
+    /// Applies reports. Reports of a node that was not reported before are ignored, as are further members of
+    /// a full table.
     pub fn note(&mut self, reports: &[MemberReport]) {
         for report in reports {
             if report.tid.app == AppAddress::NONE {
@@ -193,7 +197,7 @@ impl MemberTable {
                 *known = NodeState::Settled { listed: *known == NodeState::Listed, outcome };
             }
             (Some(NodeState::Settled { listed, .. }), MemberState::Listed) => *listed = true,
-            // Reported before, or of a node that has no copy.
+            // The node was reported before, or has no copy.
             (None | Some(_), MemberState::Pending | MemberState::Listed | MemberState::Settled(_)) => {}
         }
     }
@@ -221,14 +225,16 @@ impl MemberTable {
         self.members.len() + self.nodes.len() >= self.members_max
     }
 
-    /// Whether nothing is missing: every node has named its members, or cannot any more, and each member has an outcome.
+    /// Returns whether the table is complete: every node has listed its members, or no longer can, and each
+    /// member has an outcome.
     #[must_use]
     pub fn is_complete(&self) -> bool {
         let is_known = self.nodes.values().all(|state| *state != NodeState::Pending);
         is_known && self.members.keys().all(|tid| self.outcome_of(*tid).is_some())
     }
 
-    /// The outcome of a member, its own or that of its node's copy. A copy that was delivered says nothing of a member without an outcome.
+    /// Returns the outcome of a member: its own, or that of its node's copy. A delivered copy is no outcome
+    /// of a member that has none of its own.
     fn outcome_of(&self, tid: Tid) -> Option<Outcome> {
         let own = self.members.get(&tid).copied().flatten();
         own.or_else(|| match self.nodes.get(&tid.node) {
@@ -237,10 +243,12 @@ impl MemberTable {
         })
     }
 
-    /// One entry for each member, in the order of their TIDs. `last` is the outcome of the message as a whole, `None` at its deadline.
+    /// Returns one entry per member, in the order of TIDs. `last` is the outcome of the message as a whole,
+    /// `None` at its deadline.
     ///
-    /// A member without an outcome ends as `last` says, and where that is no answer as [`Outcome::Unknown`]. So does a node that has not named
-    /// its members: it has one entry for all of them.
+    /// A member without an outcome gets `last`, or [`Outcome::Unknown`] if `last` is `None` or
+    /// [`Outcome::Delivered`]. A node that has not listed its members gets one entry for all of them in the
+    /// same way.
     #[must_use]
     pub fn finish(mut self, last: Option<Outcome>) -> Vec<MemberOutcome> {
         if self.destination.is_single() {

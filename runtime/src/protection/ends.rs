@@ -1,11 +1,12 @@
-//! Both ends of protected messages for who has no context and no timers: an endpoint of NodeAPI, which says what came, and when.
+//! Both ends of protected messages for a NodeAPI endpoint. It has no context and no timers, so the endpoint
+//! supplies messages and times.
 
 use std::{collections::BTreeSet, io, sync::Arc};
 
 use bytes::Bytes;
 
 use super::{
-    Cause, Echo, Fault, Flows, Guard, Guarded, Verdict,
+    Cause, Echo, Flows, Guard, Guarded, ProtectionError, Verdict,
     envelope::payload_of,
     raw::{NotSafe, Protected, Reads, or_panics},
 };
@@ -20,76 +21,75 @@ use crate::{
 #[derive(Debug)]
 pub struct Ends {
     flows: Flows,
-    held: Vec<Held>,
-    /// What has ever been guarded stays so: what is protected is not for who asks for anything.
+    guards: Vec<GuardEntry>,
+    /// The kinds that were ever guarded. They stay guarded, so a protected message is never delivered without
+    /// its check.
     kinds: BTreeSet<Kind>,
 }
 
-struct Held {
+struct GuardEntry {
     guard: Arc<dyn Guarded>,
     kind: Kind,
-    /// Which payloads are values of that type. They are read here and once more by who receives them: he may not be able to, and then they must
-    /// not count.
+    /// The valid payloads of the type. A payload is decoded here, and again by the receiver: one that the
+    /// receiver cannot decode must not count as good.
     reads: Reads,
-    /// When its sender is to be told the next time to quote.
+    /// When the next echo to the sender is due.
     echo_at: Time,
 }
 
-impl std::fmt::Debug for Held {
+impl std::fmt::Debug for GuardEntry {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "Held({:?})", self.guard.data_id())
+        write!(f, "GuardEntry({:?})", self.guard.data_id())
     }
 }
 
-/// What a message that has come is.
+/// The result of checking a received message.
 #[derive(Debug)]
 pub enum Came {
-    /// It is for the receiver, as it came: nothing here guards its kind.
+    /// The message is for the receiver unchanged: its kind is not guarded here.
     Plain(Message),
-    /// It is for the receiver, without its envelope: it is good, which includes that it can be read, and its output is live.
+    /// The message is for the receiver, without its envelope: it is good, so it can be decoded, and its output is live.
     Good(Message),
-    /// It is refused, or was not for the receiver; its sender is told.
+    /// The message was rejected, or was not for the receiver; its sender is notified.
     Settled,
 }
 
-/// What is to be done with a message that has come, for who has its bytes.
+/// The result of checking a received payload, for a caller that has only its bytes.
 #[derive(Clone, Copy, Debug)]
 pub enum Judged<'message> {
-    /// It is for the receiver, as it came: nothing here guards its kind.
+    /// The payload is for the receiver unchanged: its kind is not guarded here.
     Plain,
-    /// This of it is for the receiver: it is good, and its output is live.
+    /// This part of the payload is for the receiver: the message is good, and its output is live.
     Good(&'message [u8]),
-    /// It is not for the receiver; its sender is to be told this.
+    /// The message is not for the receiver; its sender must be notified of this outcome.
     Settled(Outcome),
 }
 
-/// Why a protected payload cannot be sent. The caller is at fault; nothing was sent.
+/// The reason why a protected payload cannot be sent. This is an error of the caller; nothing was sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SealError {
-    /// It is for many: each receiver has an echo and a data ID of its own.
+    /// The destination is more than one application: each receiver has its own echo and data ID.
     #[error(
         "it is protected, and so for one application, not for a group or for all; send it to each by itself"
     )]
     ToMany,
-    /// There are 1,024 flows of protected messages, of one type to one receiver each, and all of them go on.
-    #[error(
-        "this sender goes on with 1024 flows of protected messages, which is the most; register another endpoint"
-    )]
+    /// All 1,024 flows of protected messages, of one type to one receiver each, are in use.
+    #[error("this sender uses 1024 flows of protected messages, the maximum; register another endpoint")]
     TooManyFlows,
 }
 
 impl Ends {
-    /// Those of a life that began at `now`.
+    /// Creates the ends of an incarnation that began at `now`.
     #[must_use]
     pub const fn new(now: Time) -> Self {
-        Self { flows: Flows::new(now), held: Vec::new(), kinds: BTreeSet::new() }
+        Self { flows: Flows::new(now), guards: Vec::new(), kinds: BTreeSet::new() }
     }
 
-    /// A message of the value, in its envelope if its type is protected, sent at `now`. `source` and `receiver` are absolute; `destination`
-    /// is `receiver` as the caller has said it.
+    /// Builds a message of the value, in its envelope if its type is protected, sent at `now`. `source` and
+    /// `receiver` are absolute; `destination` is `receiver` as the caller gave it.
     ///
     /// # Errors
-    /// Its type is protected, and it cannot be sealed. One that is sealed and not sent then uses up a number.
+    /// The type is protected, and the value cannot be sealed. A message that is sealed and not sent uses up a counter.
     pub fn message<P: Payload>(
         &self,
         (source, receiver): (Tid, Tid),
@@ -105,10 +105,10 @@ impl Ends {
         Ok(Message::of_type::<P>(source, destination, payload))
     }
 
-    /// The payload of such a message, for who knows its type at run time alone.
+    /// Builds the payload of such a message, for a type that is known at run time only.
     ///
     /// # Errors
-    /// Those of [`message`](Self::message).
+    /// The errors of [`message`](Self::message).
     #[doc(hidden)]
     pub fn seal(
         &self,
@@ -122,12 +122,13 @@ impl Ends {
         sealed.ok_or(SealError::TooManyFlows)
     }
 
-    /// Has `output` moved by what `source` sends to `receiver` of type `P`; see [`Guard::new`]. From `now` on its sender is to be told
-    /// [echoes](Self::echo).
+    /// Guards `output`: values of type `P` from `source` to `receiver` control it; see [`Guard::new`]. From
+    /// `now` on, [echoes](Self::echo) to their sender are due.
     ///
     /// # Errors
-    /// The thread that keeps the watchdogs cannot be started or is not more urgent than this one, this is guarded already, or [`age_max`](super::Protection::age_max) of the
-    /// type is below 4 ns, so that no echo could be quoted in time.
+    /// The thread `safe-output` cannot be started or does not have a higher priority than the calling thread,
+    /// or this flow is guarded already. Also if [`age_max`](super::Protection::age_max) of the type is below 4
+    /// ns, so that no echo could be quoted in time.
     pub fn guard<P: Payload, O: Send + 'static>(
         &mut self,
         (source, receiver): (Tid, Tid),
@@ -138,10 +139,10 @@ impl Ends {
         self.hold((source, receiver), Protected::of::<P>(), now, (output, or_panics(safe)))
     }
 
-    /// The same for who knows the type at run time alone; see [`Guard::of`].
+    /// Same as [`guard`](Self::guard), for a type that is known at run time only; see [`Guard::of`].
     ///
     /// # Errors
-    /// Those of [`guard`](Self::guard) and of [`Guard::of`].
+    /// The errors of [`guard`](Self::guard) and of [`Guard::of`].
     #[doc(hidden)]
     pub fn hold<O: Send + 'static>(
         &mut self,
@@ -165,31 +166,31 @@ impl Ends {
         }
         let guard = Guard::of((source, receiver), protected, output, safe)?;
         self.kinds.insert(kind);
-        self.held.push(Held { guard: guard.guarded(), kind, reads, echo_at: now });
+        self.guards.push(GuardEntry { guard: guard.guarded(), kind, reads, echo_at: now });
         Ok(guard)
     }
 
-    /// Whether what `source` sends of this type is guarded.
+    /// Returns whether messages of this type from `source` are guarded.
     #[doc(hidden)]
     #[must_use]
     pub fn is_held(&self, source: Tid, kind: Kind) -> bool {
-        self.live().any(|held| held.kind == kind && held.guard.data_id().source == source)
+        self.active().any(|entry| entry.kind == kind && entry.guard.data_id().source == source)
     }
 
-    /// Whether nothing protected was ever sent or guarded here.
+    /// Returns whether no protected message was ever sent or guarded here.
     #[doc(hidden)]
     #[must_use]
     pub fn are_idle(&self) -> bool {
-        self.kinds.is_empty() && self.flows.are_none()
+        self.kinds.is_empty() && self.flows.is_empty()
     }
 
     /// Makes all outputs safe, as [`Guard::trip`] does.
     #[doc(hidden)]
     pub fn trip(&self) {
-        self.held.iter().for_each(|held| held.guard.trip());
+        self.guards.iter().for_each(|entry| entry.guard.trip());
     }
 
-    /// Takes a message in that has come.
+    /// Checks a received message.
     pub fn take(&mut self, mut message: Message) -> Came {
         let Header { source, kind, .. } = message.header;
         match self.judge((source, kind), &message.payload) {
@@ -206,17 +207,17 @@ impl Ends {
         }
     }
 
-    /// The same for who has the bytes of a message, and who sent it.
+    /// Same as [`take`](Self::take), for a caller that has the payload and the source of a message.
     #[doc(hidden)]
     pub fn judge<'message>(
         &mut self,
         (source, kind): (Tid, Kind),
         payload: &'message [u8],
     ) -> Judged<'message> {
-        if kind == Echo::KIND && self.flows.are_to(source) {
+        if kind == Echo::KIND && self.flows.has_flow_to(source) {
             return Judged::Settled(match decode::<Echo>(payload) {
                 Ok(echo) => {
-                    self.flows.heard(source, echo);
+                    self.flows.record_echo(source, echo);
                     Outcome::Delivered
                 }
                 Err(_) => Outcome::Rejected(Rejection::Malformed),
@@ -226,51 +227,54 @@ impl Ends {
             return Judged::Plain;
         }
         self.forget_orphans();
-        let is_of_it = |held: &&Held| held.kind == kind && held.guard.data_id().source == source;
-        let verdict = self.held.iter().find(is_of_it).map(|held| held.guard.check(payload, held.reads));
+        let is_of_it = |entry: &&GuardEntry| entry.kind == kind && entry.guard.data_id().source == source;
+        let verdict = self.guards.iter().find(is_of_it).map(|entry| entry.guard.check(payload, entry.reads));
         Judged::Settled(Outcome::Rejected(match verdict {
             Some(Verdict::Apply(())) => return Judged::Good(payload_of(payload)),
-            Some(Verdict::Refused(Fault::Corrupt | Fault::Unreadable)) => Rejection::Malformed,
+            Some(Verdict::Refused(ProtectionError::Corrupt | ProtectionError::Unreadable)) => {
+                Rejection::Malformed
+            }
             Some(Verdict::Hold | Verdict::Refused(_)) => Rejection::ByHandler,
             None => Rejection::Unsupported,
         }))
     }
 
-    /// When [`echo`](Self::echo) has something to say next.
+    /// Returns when the next [`echo`](Self::echo) is due.
     #[must_use]
     pub fn echo_due(&self) -> Option<Time> {
-        self.live().map(|held| held.echo_at).min()
+        self.active().map(|entry| entry.echo_at).min()
     }
 
-    /// Lets go of the outputs of guards that nobody has any more: a sender that comes back has a TID of its own each time.
+    /// Removes guards without an owner: a sender that returns has a new TID each time.
     fn forget_orphans(&mut self) {
-        self.held.retain(|held| !held.guard.is_orphan());
+        self.guards.retain(|entry| !entry.guard.is_orphan());
     }
 
-    /// The next echo that is due, from `own`; its sender is told it whenever it can be.
+    /// Returns the next due echo, from `own`. Send it to its destination as soon as possible.
     pub fn echo(&mut self, own: Tid, now: Time) -> Option<Message> {
         self.next_echo(now).map(|(source, echo)| Message::typed(own, source, &echo))
     }
 
-    /// Its payload, and whom it is for.
+    /// Returns the payload of the next due echo, and its destination.
     #[doc(hidden)]
     pub fn echo_payload(&mut self, now: Time) -> Option<(Tid, Bytes)> {
         self.next_echo(now).map(|(source, echo)| (source, encode(&echo)))
     }
 
     fn next_echo(&mut self, now: Time) -> Option<(Tid, Echo)> {
-        let held = self.held.iter_mut().filter(|held| !held.guard.is_orphan());
-        let held = held.min_by_key(|held| held.echo_at).filter(|held| held.echo_at <= now)?;
-        // Not on a grid: who looks late says one and not many.
-        held.echo_at = now + held.guard.echo_period();
-        let (source, kind, at) = (held.guard.data_id().source, held.kind, held.guard.echo());
-        let others = self.live().filter(|held| held.kind != kind && held.guard.data_id().source == source);
-        let others = others.map(|held| (held.kind, held.guard.last_echo().as_nanos())).collect();
+        let entry = self.guards.iter_mut().filter(|entry| !entry.guard.is_orphan());
+        let entry = entry.min_by_key(|entry| entry.echo_at).filter(|entry| entry.echo_at <= now)?;
+        // Not on a grid: a late caller sends one echo, not several.
+        entry.echo_at = now + entry.guard.echo_period();
+        let (source, kind, at) = (entry.guard.data_id().source, entry.kind, entry.guard.echo());
+        let others =
+            self.active().filter(|entry| entry.kind != kind && entry.guard.data_id().source == source);
+        let others = others.map(|entry| (entry.kind, entry.guard.last_echo().as_nanos())).collect();
         Some((source, Echo { others, ..Echo::new(kind, at) }))
     }
 
-    fn live(&self) -> impl Iterator<Item = &Held> {
-        self.held.iter().filter(|held| !held.guard.is_orphan())
+    fn active(&self) -> impl Iterator<Item = &GuardEntry> {
+        self.guards.iter().filter(|entry| !entry.guard.is_orphan())
     }
 }
 
@@ -315,7 +319,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_guard_was_made_for_is_for_nobody_without_it() {
+    fn guarded_kind_is_received_only_with_a_guard() {
         let mut ends = Ends::new(NOW);
         assert!(matches!(ends.take(from(1, Torque::KIND)), Came::Plain(_)), "nothing is guarded yet");
         let first = guard(&mut ends).expect("a thread");
@@ -331,21 +335,21 @@ mod tests {
     }
 
     #[test]
-    fn an_output_goes_with_its_guard_whatever_its_sender_is_called_later() {
+    fn output_is_dropped_with_its_guard() {
         let (mut ends, output) = (Ends::new(NOW), Arc::new(()));
         for app in 1..=3 {
             let moved = output.clone();
             let guard = ends.guard::<Torque, _>((tid(app), tid(9)), NOW, moved, |_, _| {});
             drop(guard.expect("a thread"));
-            assert_eq!((ends.held.len(), Arc::strong_count(&output)), (1, 2), "{app}");
+            assert_eq!((ends.guards.len(), Arc::strong_count(&output)), (1, 2), "{app}");
         }
-        // And: the next message of the kind is enough, which is for nobody
+        // And: the next message of the kind is sufficient; no guard receives it
         assert!(matches!(ends.take(from(3, Torque::KIND)), Came::Settled));
-        assert_eq!((ends.held.len(), Arc::strong_count(&output)), (0, 1));
+        assert_eq!((ends.guards.len(), Arc::strong_count(&output)), (0, 1));
         assert!(matches!(ends.take(from(4, Torque::KIND)), Came::Settled));
     }
 
-    /// For whom no machine is too slow.
+    /// No machine is too slow for this protection.
     #[derive(Serialize, Deserialize)]
     struct Angle {
         radians: f32,
@@ -356,7 +360,7 @@ mod tests {
         const PROTECTION: Option<Protection> = Some(Protection::of_period(Duration::from_secs(60)));
     }
 
-    /// The sender's next version of it.
+    /// The next version of the type in the sender.
     #[derive(Serialize, Deserialize)]
     struct LaterAngle {
         degrees: f32,
@@ -368,7 +372,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_read_is_not_received_and_counts_as_bad() {
+    fn undecodable_message_is_not_received_and_counts_as_bad() {
         let (mut sender, mut receiver) = (Ends::new(NOW), Ends::new(NOW));
         let guard = receiver.guard::<Angle, _>((tid(1), tid(9)), NOW, (), |(), _| {}).expect("a thread");
         let angle = Angle { radians: 1.0 };
@@ -388,7 +392,7 @@ mod tests {
     }
 
     #[test]
-    fn a_guard_that_would_have_to_be_told_echoes_all_the_time_is_refused() {
+    fn guard_that_needs_endless_echoes_is_rejected() {
         #[derive(Serialize, Deserialize)]
         struct Instant;
 
@@ -404,14 +408,15 @@ mod tests {
     }
 
     #[test]
-    fn echoes_are_said_when_they_are_due_and_heard_by_who_sends() {
+    fn echoes_are_sent_when_due_and_reach_the_sender() {
         let (mut sender, mut receiver) = (Ends::new(NOW), Ends::new(NOW));
         let _guard = guard(&mut receiver).expect("a thread");
         let mut echo = || receiver.echo(tid(9), NOW);
         let (first, none) = (echo().expect("at once"), echo());
         assert!(none.is_none() && first.header.destination == tid(1));
         assert_eq!(receiver.echo_due(), Some(NOW + PROTECTION.echo_period()));
-        // Who sends it nothing that is protected has no use for it, and does not know it.
+        // A sender that has sent no protected message does not use the echo, and receives it as an ordinary
+        // message.
         assert!(matches!(sender.take(first), Came::Plain(_)));
         sender.message((tid(1), tid(9)), tid(9), &Torque(1.0), NOW).expect("it is for one");
         let second = receiver.echo(tid(9), NOW + PROTECTION.echo_period()).expect("it is due");

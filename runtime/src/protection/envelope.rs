@@ -1,36 +1,37 @@
-//! The bytes around a protected payload.
+//! The envelope of a protected payload.
 //!
-//! Little-endian: version (1 byte), flags (1, all zero), zero (2), length of the payload (4), counter (8), incarnation (8),
-//! echo (8), payload, CRC-64 (8). The CRC is CRC-64/XZ (ECMA-182, reflected), as in AUTOSAR's E2E profile 7; it is taken over the
-//! data ID, then all that stands before it. The data ID itself is not sent: whoever is not meant computes another one.
+//! Little-endian: version (1 byte), flags (1, all zero), zero (2), length of the payload (4), counter (8),
+//! incarnation (8), echo (8), payload, CRC-64 (8). The CRC is CRC-64/XZ (ECMA-182, reflected), as in
+//! AUTOSAR's E2E profile 7; it is taken over the data ID, then all bytes before the CRC. The data ID itself
+//! is not sent: a receiver that is not the addressee computes another one.
 
 use bytes::{BufMut, Bytes, BytesMut};
 use crc64fast::Digest;
 
 use crate::{tid::Tid, time::Time, wire::Payload};
 
-/// Bytes before the payload.
+/// Length of the header before the payload, in bytes.
 pub(super) const HEAD: usize = 32;
-/// Bytes behind it.
+/// Length of the CRC after the payload, in bytes.
 const TAIL: usize = 8;
 /// Bytes that protection adds to a payload.
 pub const OVERHEAD: usize = HEAD + TAIL;
 
 const VERSION: u8 = 1;
 
-/// What a flow of protected messages is called by both of its ends: who sends, who receives, what it is. Not sent.
+/// The data ID of a flow of protected messages: source, destination and type. Both ends know it; it is not sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DataId {
-    /// Who sends.
+    /// The sender.
     pub source: Tid,
-    /// Who receives. One application: a group has no data_id.
+    /// The receiver. One application: a group has no data ID.
     pub destination: Tid,
     /// [`Payload::NAME`].
     pub name: &'static str,
 }
 
 impl DataId {
-    /// That of the values of type `P` from `source` to `destination`.
+    /// Returns the data ID of values of type `P` from `source` to `destination`.
     #[must_use]
     pub const fn of<P: Payload>(source: Tid, destination: Tid) -> Self {
         Self { source, destination, name: P::NAME }
@@ -46,24 +47,24 @@ impl DataId {
     }
 }
 
-/// What the sender says of one message.
+/// The header fields that the sender sets for one message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stamp {
-    /// Counts the messages of the flow, from 1.
+    /// The counter of the messages of the flow, from 1.
     pub counter: u64,
-    /// Which life of the sender counts.
+    /// The incarnation of the sender that counts.
     pub incarnation: u64,
-    /// The newest time of the receiver's clock that the sender has heard from it; [`Time::ZERO`] for none.
+    /// The newest time of the receiver's clock that the sender has received from it; [`Time::ZERO`] for none.
     pub echo: Time,
 }
 
-/// Puts `payload` into an envelope.
+/// Seals `payload` in an envelope.
 #[must_use]
 pub fn seal(data_id: &DataId, stamp: Stamp, payload: &[u8]) -> Bytes {
     let mut bytes = BytesMut::with_capacity(OVERHEAD + payload.len());
     bytes.put_u8(VERSION);
     bytes.put_bytes(0, 3);
-    // A length that 32 bits cannot say is refused by `payload_max`, which is smaller.
+    // A length above 32 bits is rejected by `payload_max`, which is smaller.
     bytes.put_u32_le(payload.len() as u32);
     bytes.put_u64_le(stamp.counter);
     bytes.put_u64_le(stamp.incarnation);
@@ -75,13 +76,14 @@ pub fn seal(data_id: &DataId, stamp: Stamp, payload: &[u8]) -> Bytes {
     bytes.freeze()
 }
 
-/// Takes the payload out of its envelope; `None` if these are not the bytes that were sealed under this data_id.
+/// Opens an envelope and returns its payload. Returns `None` if the bytes are not those that were sealed
+/// under this data ID.
 #[must_use]
 pub fn open(data_id: &DataId, bytes: &Bytes) -> Option<(Stamp, Bytes)> {
     look(data_id, bytes).map(|(stamp, payload)| (stamp, bytes.slice_ref(payload)))
 }
 
-/// The same of memory that is not to be kept.
+/// Same as [`open`], for borrowed memory.
 #[must_use]
 pub fn look<'bytes>(data_id: &DataId, bytes: &'bytes [u8]) -> Option<(Stamp, &'bytes [u8])> {
     let (sealed, sum) = bytes.split_last_chunk::<TAIL>()?;
@@ -93,14 +95,14 @@ pub fn look<'bytes>(data_id: &DataId, bytes: &'bytes [u8]) -> Option<(Stamp, &'b
     let (head, payload) = sealed.split_first_chunk::<HEAD>()?;
     let word = |at: usize| head.get(at..at + 8).and_then(|word| word.try_into().ok()).map(u64::from_le_bytes);
     let (first, counter, incarnation, echo) = (word(0)?, word(8)?, word(16)?, word(24)?);
-    // Version, flags and zeros are the lower half of the first word, the length is the upper one.
+    // Version, flags and zeros are the lower half of the first word; the length is the upper half.
     let is_known = first as u32 == u32::from(VERSION);
     let is_whole = first >> 32 == payload.len() as u64;
     let stamp = Stamp { counter, incarnation, echo: Time::from_nanos(echo) };
     (is_known && is_whole).then_some((stamp, payload))
 }
 
-/// The payload of a message that was looked at, and was good.
+/// Returns the payload of a message that was checked and was good.
 pub(super) fn payload_of(sealed: &[u8]) -> &[u8] {
     sealed.get(HEAD..sealed.len().saturating_sub(TAIL)).unwrap_or_default()
 }

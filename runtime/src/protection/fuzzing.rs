@@ -1,5 +1,6 @@
-//! A script of protected messages and echoes between a sender in several lives and a live receiver: honest, lost, held up, repeated,
-//! out of order, damaged, forged. A model beside it, in the plainest form, knows of each what has to come of it.
+//! A script of protected messages and echoes between the incarnations of a sender and a live receiver.
+//! Messages are valid, lost, delayed, repeated, out of order, corrupted or forged. A model in the simplest
+//! form gives the expected result of each.
 
 use std::collections::VecDeque;
 
@@ -7,7 +8,7 @@ use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Cause, DataId, Echo, Fault, Protection, Stamp, State,
+    Cause, DataId, Echo, Protection, ProtectionError, Stamp, State,
     envelope::seal,
     receiver::{Opened, Receiver, Verdict},
     sender::Flows,
@@ -18,7 +19,7 @@ use crate::{
     wire::{Payload, decode, encode},
 };
 
-/// A live output is moved, and each kind of error comes.
+/// A script that moves a live output and has each kind of error.
 pub const SOME_MESSAGES: &[u8] = &[
     15, 0, 1, 0, 2, 1, 1, 0, 2, 0, 2, 1, 15, 3, 1, 5, 9, 4, 1, 3, 4, 1, 60, 15, 5, 200, 0, 15, 7, 6, 0, 8, 9,
     1, 0, 15, 10, 1, 0, 2, 10, 0, 1, 3, 0, 11, 7, 12, 3, 1, 2, 3, 13, 4, 1, 2, 3, 4, 14, 15, 1, 1, 1, 1, 0,
@@ -26,11 +27,11 @@ pub const SOME_MESSAGES: &[u8] = &[
 ];
 
 const PROTECTION: Protection = Protection::of_period(std::time::Duration::from_millis(1));
-/// Messages that can come again, at most.
+/// Maximum number of messages that can be repeated.
 const KEPT: usize = 64;
-/// Echoes that count; see the receiver.
+/// Number of valid echoes; see the receiver.
 const ECHOES: usize = 8;
-/// Messages that are remembered.
+/// Number of recorded messages.
 const WINDOW: usize = 64;
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -43,20 +44,20 @@ impl Payload for Torque {
     const PROTECTION: Option<Protection> = Some(PROTECTION);
 }
 
-/// A message under the right data ID, whoever has sealed it.
+/// A message sealed under the right data ID, by any sender.
 struct Sealed {
     bytes: Bytes,
     stamp: Stamp,
     payload: Bytes,
 }
 
-/// What a receiver has to know, written down a second time.
+/// The required state of a receiver, implemented a second time.
 struct Model {
     state: State,
     last: Option<(u64, u64)>,
-    heard: Time,
+    last_good: Time,
     good: u32,
-    /// The newest first; `true` for a bad one.
+    /// The newest first; `true` for a bad message.
     window: VecDeque<bool>,
     /// The newest first.
     echoes: VecDeque<Time>,
@@ -65,7 +66,7 @@ struct Model {
 struct Play {
     now: Time,
     flows: Flows,
-    /// Of the sender's next message.
+    /// The stamp of the sender's next message.
     next: Stamp,
     receiver: Receiver,
     model: Model,
@@ -80,7 +81,7 @@ pub fn protected(mut script: &[u8]) -> bool {
     while !script.is_empty() {
         play.step(&mut script);
         assert_eq!(play.receiver.state(), play.model.state);
-        let deadline = (play.model.state == State::Live).then(|| play.model.heard + PROTECTION.within);
+        let deadline = (play.model.state == State::Live).then(|| play.model.last_good + PROTECTION.within);
         assert_eq!(play.receiver.deadline(), deadline);
     }
     play.applied > 0
@@ -103,7 +104,7 @@ fn bytes<'a>(script: &mut &'a [u8], count: u8) -> &'a [u8] {
     script.split_off(..count).unwrap_or_default()
 }
 
-/// Near to `word`, or far from it.
+/// Returns a number near to `word`, or far from it.
 fn around(word: u64, off: u8) -> u64 {
     match off.cast_signed() {
         i8::MIN => 0,
@@ -117,7 +118,7 @@ impl Play {
         let model = Model {
             state: State::Safe(Cause::NotArmed),
             last: None,
-            heard: Time::ZERO,
+            last_good: Time::ZERO,
             good: 0,
             window: VecDeque::new(),
             echoes: VecDeque::new(),
@@ -131,7 +132,7 @@ impl Play {
             kept: VecDeque::new(),
             applied: 0,
         };
-        // The first one makes the flow that echoes are for.
+        // The first message creates the flow that the echoes are for.
         play.send();
         play
     }
@@ -199,7 +200,7 @@ impl Play {
         }
     }
 
-    /// As a channel in order does it.
+    /// Runs an ordered channel until the output is live.
     fn come_alive(&mut self) {
         for _ in 0..=PROTECTION.good_min {
             self.pass(1_000_000);
@@ -223,17 +224,17 @@ impl Play {
         self.receiver.echo(self.now)
     }
 
-    /// What says that it is the receiver's tells the sender times.
+    /// Passes an echo, which may claim to be the receiver's, to the sender.
     fn hears(&mut self, echo: Echo) {
         let times = std::iter::once((echo.kind, echo.at_ns)).chain(echo.others.iter().copied());
         let newest = times.take(super::sender::FLOWS_MAX).filter(|(kind, _)| *kind == Torque::KIND).last();
         if let Some((_, at_ns)) = newest.filter(|_| self.next.counter > 0) {
             self.next.echo = Time::from_nanos(at_ns);
         }
-        self.flows.heard(tid(2), echo);
+        self.flows.record_echo(tid(2), echo);
     }
 
-    /// The sender's next message: the newest of those that can come.
+    /// Sends the sender's next message: the newest of those that can be repeated.
     fn send(&mut self) {
         self.next.counter += 1;
         let torque = Torque { number: self.next.counter };
@@ -272,8 +273,8 @@ impl Play {
 
     fn arm(&mut self) {
         self.model.expire(self.now);
-        let may =
-            self.model.good >= PROTECTION.good_min && self.now.since(self.model.heard) < PROTECTION.within;
+        let may = self.model.good >= PROTECTION.good_min
+            && self.now.since(self.model.last_good) < PROTECTION.within;
         assert_eq!(self.receiver.arm(self.now).is_ok(), may);
         if may {
             self.model.state = State::Live;
@@ -283,7 +284,7 @@ impl Play {
 
 impl Model {
     fn expire(&mut self, now: Time) {
-        if self.state == State::Live && now >= self.heard + PROTECTION.within {
+        if self.state == State::Live && now >= self.last_good + PROTECTION.within {
             self.trip(Cause::Silent);
         }
     }
@@ -295,21 +296,21 @@ impl Model {
         self.good = 0;
     }
 
-    /// What has to come of a message; `None`: nobody has sealed it so.
+    /// Returns the expected result of a message; `None`: not sealed by any sender in this form.
     fn take(&mut self, now: Time, sealed: Option<&Sealed>) -> Verdict<Bytes> {
         self.expire(now);
-        let fault = sealed.map_or(Some(Fault::Corrupt), |sealed| {
+        let fault = sealed.map_or(Some(ProtectionError::Corrupt), |sealed| {
             let is_unreadable = decode::<Torque>(&sealed.payload).is_err();
-            self.fault(now, sealed.stamp).or_else(|| is_unreadable.then_some(Fault::Unreadable))
+            self.fault(now, sealed.stamp).or_else(|| is_unreadable.then_some(ProtectionError::Unreadable))
         });
         self.window.push_front(fault.is_some());
         self.window.truncate(WINDOW);
         if fault.is_some() {
             self.good = 0;
         } else {
-            let is_silent = now >= self.heard + PROTECTION.within;
+            let is_silent = now >= self.last_good + PROTECTION.within;
             self.good = if is_silent { 1 } else { self.good + 1 };
-            self.heard = now;
+            self.last_good = now;
         }
         let verdict = match (fault, self.state, sealed) {
             (None, State::Live, Some(sealed)) => Verdict::Apply(sealed.payload.clone()),
@@ -323,25 +324,25 @@ impl Model {
         verdict
     }
 
-    fn fault(&mut self, now: Time, stamp: Stamp) -> Option<Fault> {
+    fn fault(&mut self, now: Time, stamp: Stamp) -> Option<ProtectionError> {
         let is_young = now.since(stamp.echo) <= PROTECTION.age_max;
         if stamp.echo == Time::ZERO || !self.echoes.contains(&stamp.echo) || !is_young {
-            return Some(Fault::TooOld);
+            return Some(ProtectionError::TooOld);
         }
         let before = self.last.replace((stamp.incarnation, stamp.counter));
         let (incarnation, counter) = before?;
         if incarnation != stamp.incarnation {
             self.trip(Cause::Restarted);
-            return Some(Fault::Restarted);
+            return Some(ProtectionError::Restarted);
         }
         let missing = i128::from(stamp.counter) - i128::from(counter) - 1;
         if missing < 0 {
             self.last = before;
-            return Some(if missing == -1 { Fault::Repeated } else { Fault::Backwards });
+            return Some(if missing == -1 { ProtectionError::Repeated } else { ProtectionError::Backwards });
         }
         if missing > i128::from(PROTECTION.lost_max) {
             self.trip(Cause::TooMuchLost);
-            return Some(Fault::Gap);
+            return Some(ProtectionError::Gap);
         }
         None
     }
@@ -352,13 +353,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn script_to_begin_with_moves_the_output() {
+    fn initial_script_moves_the_output() {
         assert!(protected(SOME_MESSAGES));
     }
 
     proptest::proptest! {
         #[test]
-        fn receiver_says_of_any_script_what_the_model_says(
+        fn receiver_agrees_with_the_model_for_any_script(
             script in proptest::collection::vec((0_u8..16, 0_u8..=255, 0_u8..=255), 0..200)
         ) {
             let script: Vec<u8> = script.into_iter().flat_map(|(step, a, b)| [step, a, b]).collect();

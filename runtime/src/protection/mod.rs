@@ -1,8 +1,9 @@
-//! End-to-end protection of commands: from the application that sends to the output that it moves, whatever lies between.
+//! End-to-end protection of commands, from the sending application to the controlled output, independent of
+//! the channel between them.
 //!
-//! Marked on the payload's type ([`Payload::PROTECTION`]): the sender's context, or its endpoint, puts each value
-//! into an envelope, the receiver's lets nothing else through. Queues, rings, sockets, layers and networks between them
-//! are a black channel, of which nothing is believed.
+//! A payload's type declares it ([`Payload::PROTECTION`]). The sender's context, or its endpoint, seals each
+//! value in an envelope; the receiver's accepts nothing else. Queues, rings, sockets, layers and networks
+//! between them are a black channel, which is not trusted.
 //!
 //! | error | counter | watchdog | age by echo | data ID | CRC-64 |
 //! | --- | --- | --- | --- | --- | --- |
@@ -15,22 +16,24 @@
 //! | masquerade | | | | x | x |
 //! | wrong addressee | | | | x | x |
 //!
-//! Modelled on IEC 61784-3 and AUTOSAR E2E; the mechanisms are theirs, and no certified level is claimed.
+//! Modelled on IEC 61784-3 and AUTOSAR E2E; it uses their mechanisms, and no certified level is claimed.
 //!
-//! The output belongs to a [`Guard`]. It is safe at first, live after [`Guard::arm`], and safe again, until it is armed again, once
-//! something is wrong that the type's [`Protection`] does not bear. The watchdog is kept by a thread of its own, `safe-output`,
-//! which needs no layer and no reactor, and has neither the CPUs nor the priority of whoever made the first guard. All outputs of a process share it: what makes one of them safe must be short.
+//! The output belongs to a [`Guard`]. It is safe at first, and live after [`Guard::arm`]. An error beyond the
+//! limits of the type's [`Protection`] makes it safe again, until it is armed again. The watchdog runs on a
+//! thread of its own, `safe-output`, which needs no layer and no reactor. That thread does not inherit the
+//! CPUs or the priority of the thread that made the first guard. All outputs of a process share it: a safe
+//! function must be short.
 //!
-//! | file | what it is |
+//! | file | content |
 //! | --- | --- |
-//! | `envelope` | the bytes |
-//! | `sender` | counters and echoes of those who send |
-//! | `receiver` | what is believed, and when the output has to be safe |
+//! | `envelope` | the bytes on the wire |
+//! | `sender` | counters and echoes of the sending end |
+//! | `receiver` | the checks of a message, and when the output must be safe |
 //! | `guard` | the output |
-//! | `keeper` | the thread that makes outputs safe |
-//! | `said` | what is said of that in the log |
+//! | `safe_output` | the thread `safe-output`, which makes outputs safe |
+//! | `log_queue` | the log entries of that thread |
 //! | `ends` | both ends for an endpoint of NodeAPI |
-//! | `raw` | all of that for types that are known at run time alone |
+//! | `raw` | the same for types that are known at run time only |
 
 mod ends;
 mod envelope;
@@ -38,11 +41,11 @@ mod envelope;
 #[doc(hidden)]
 pub mod fuzzing;
 mod guard;
-mod keeper;
+mod log_queue;
 #[doc(hidden)]
 pub mod raw;
 mod receiver;
-mod said;
+mod safe_output;
 mod sender;
 #[cfg(test)]
 mod tests;
@@ -57,76 +60,18 @@ pub use self::{
     guard::Guard,
 };
 pub(crate) use self::{guard::Guarded, receiver::Verdict, sender::Flows};
+pub use crate::wire::Protection;
 use crate::{
     time::Time,
     wire::{Class, Kind, Payload},
 };
 
-/// SCHED_FIFO priority of the thread that makes outputs safe: above all that controls. An application's own is below it, and the system must
-/// grant it (`ulimit -r 99`, or CAP_SYS_NICE): where it does not, the thread has the highest that is granted, which the log says.
+/// SCHED_FIFO priority of the thread that makes outputs safe, above all control threads. The priority of an
+/// application must be lower. The system must grant it (`ulimit -r 99`, or CAP_SYS_NICE). Otherwise the
+/// thread gets the highest priority that is granted, which is logged.
 pub const SAFE_OUTPUT_PRIORITY: u8 = 90;
 
-/// What a receiver of protected messages bears.
-///
-/// # Examples
-///
-/// ```
-/// use sinew::{prelude::*, protection::Protection, serde::{Deserialize, Serialize}};
-///
-/// #[derive(Serialize, Deserialize)]
-/// #[serde(crate = "sinew::serde")]
-/// struct Torque { newton_metres: f32 }
-///
-/// impl Payload for Torque {
-///     const NAME: &'static str = "demo.torque";
-///     const CLASS: Class = Class::Stream;
-///     /// One each 5 ms, of which no more than one in a row may be missing.
-///     const PROTECTION: Option<Protection> =
-///         Some(Protection { lost_max: 1, ..Protection::of_period(Duration::from_millis(5)) });
-/// }
-/// ```
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Protection {
-    /// Longest time from one good message to the next.
-    pub within: Duration,
-    /// Greatest age of a message: measured in the receiver's clock, from an echo that it sent to the moment at which the message that
-    /// quotes it arrives. So it holds the echo's way, the time until the sender sends next, the message's way, and the echo's period.
-    pub age_max: Duration,
-    /// Messages that may be missing in a row.
-    pub lost_max: u64,
-    /// Bad ones that may be among the last 64; none of them is used.
-    pub bad_max: u32,
-    /// Good ones in a row before the output may be armed, at least 1: none bad among them, and from one to the next less than `within`.
-    pub good_min: u32,
-}
-
-impl Protection {
-    /// For a message each `period`: two may be late or missing, one in 64 bad, and the output may be armed after eight good ones.
-    ///
-    /// # Examples
-    ///
-    /// ```
-    /// use sinew::{prelude::*, protection::Protection};
-    ///
-    /// let bears = Protection::of_period(Duration::from_millis(5));
-    /// assert_eq!(bears.within, Duration::from_millis(15));
-    /// assert_eq!(bears.age_max, Duration::from_millis(40));
-    /// ```
-    #[must_use]
-    pub const fn of_period(period: Duration) -> Self {
-        let within = period.saturating_mul(3);
-        let age_max = period.saturating_mul(8);
-        Self { within, age_max, lost_max: 2, bad_max: 1, good_min: 8 }
-    }
-
-    /// Time between two echoes: a quarter of the greatest age.
-    #[must_use]
-    pub const fn echo_period(&self) -> Duration {
-        Duration::from_nanos((self.age_max.as_nanos() / 4) as u64)
-    }
-}
-
-/// Whether commands reach the output.
+/// The state of an output: whether commands reach it.
 ///
 /// # Examples
 ///
@@ -144,13 +89,13 @@ impl Protection {
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
-    /// They do.
+    /// Commands reach the output.
     Live,
-    /// They do not, since this; it stays so until the output is armed.
+    /// Commands do not reach the output, for this cause, until it is armed again.
     Safe(Cause),
 }
 
-/// Why an output is safe.
+/// The cause for which an output is safe.
 ///
 /// # Examples
 ///
@@ -161,59 +106,60 @@ pub enum State {
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Cause {
-    /// It was never armed.
+    /// The output was never armed.
     #[error("it was not armed yet")]
     NotArmed,
-    /// No good message came in time.
+    /// No good message arrived in time.
     #[error("no good message came in time")]
     Silent,
-    /// More messages are missing in a row than is borne.
+    /// More consecutive messages are missing than the limit allows.
     #[error("too many messages in a row are missing")]
     TooMuchLost,
-    /// More bad messages came than is borne.
+    /// More bad messages arrived than the limit allows.
     #[error("too many bad messages came")]
     TooManyBad,
-    /// The sender counts anew: it was restarted.
+    /// The sender was restarted: its counter starts again.
     #[error("the sender was restarted")]
     Restarted,
-    /// The receiver's host has slept: how old commands are that came meanwhile is not known.
+    /// The receiver's host has slept, so the age of commands that were in flight is unknown.
     #[error("the host has slept")]
     Slept,
-    /// The receiver said so.
+    /// The receiver tripped the guard.
     #[error("the receiver tripped it")]
     Tripped,
-    /// Nobody has the guard any more: its application has ended.
+    /// The guard has no owner any more: its application has ended.
     #[error("the application that had it has ended")]
     Dropped,
 }
 
-/// What is wrong with a message.
+/// The fault of a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum Fault {
-    /// Its bytes are not those that were sealed for this receiver by this sender: damaged, inserted, or meant for another.
-    #[error("it is damaged, or was sealed by or for somebody else")]
+pub enum ProtectionError {
+    /// The bytes are not those that this sender sealed for this receiver: they are corrupted, inserted, or
+    /// for another receiver.
+    #[error("it is damaged, or was sealed under another data ID")]
     Corrupt,
-    /// It quotes no time of this receiver's, or one that is too long ago.
-    #[error("it is too old, or its sender has heard no echo yet")]
+    /// The message quotes no echo of this receiver, or one that is too old.
+    #[error("it is too old, or its sender has received no echo yet")]
     TooOld,
-    /// It has come before.
-    #[error("it has come before")]
+    /// The message was received before.
+    #[error("it was received before")]
     Repeated,
-    /// One that was sent later has come before it.
-    #[error("one that was sent later came before it")]
+    /// A message that was sent later was received before it.
+    #[error("a message that was sent later was received before it")]
     Backwards,
-    /// Its sender counts anew.
+    /// The sender was restarted.
     #[error("its sender was restarted")]
     Restarted,
-    /// Too many before it are missing.
+    /// Too many messages before this one are missing.
     #[error("too many before it are missing")]
     Gap,
-    /// It is what was sealed, and no value of the receiver's type: its sender has another version of that.
+    /// The message is intact, but no valid value of the receiver's type: its sender has another version of the type.
     #[error("it is no value of the receiver's type, of which its sender has another version")]
     Unreadable,
 }
 
-/// Why an output cannot be armed.
+/// The reason why an output cannot be armed.
 ///
 /// # Examples
 ///
@@ -231,26 +177,25 @@ pub enum Fault {
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ArmError {
-    /// Too few good messages have come, or the last one too long ago.
+    /// Too few good messages have arrived, or the last one too long ago.
     #[error(
-        "{good} good messages in a row have come, the last one {silent:?} ago; wait for {wanted}, and for the next one to be in time"
+        "{good} good messages in a row were received{}; wait for {wanted}, and for the next one to be in time",
+        .silent.map_or_else(String::new, |silent| format!(", the last one {silent:.1?} ago"))
     )]
     NotGood {
-        /// Good messages in a row that have come, [`Protection::within`] apart at most.
+        /// Consecutive good messages that have arrived, at most [`Protection::within`] apart.
         good: u32,
-        /// How many must have come.
+        /// Good messages that are required.
         wanted: u32,
-        /// Time since the last one.
-        silent: Duration,
+        /// Time since the last one of them; `None` if there is none.
+        silent: Option<Duration>,
     },
-    /// What makes the output safe has panicked, or says that it has failed, and goes on to: whether it is safe is not known.
-    #[error(
-        "what makes the output safe has panicked, or says that it has failed, and is tried again; see the log"
-    )]
+    /// The safe function has panicked or reported a failure, and still does: whether the output is safe is unknown.
+    #[error("the output's safe function panicked or failed, and is retried; see the log")]
     SafeFails,
 }
 
-/// What a receiver has counted.
+/// The counters of a receiver.
 ///
 /// # Examples
 ///
@@ -264,52 +209,52 @@ pub enum ArmError {
 /// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Tally {
-    /// Good messages.
+    /// Number of good messages.
     pub good: u64,
-    /// Those of [`Fault::Corrupt`].
+    /// Number of messages with [`ProtectionError::Corrupt`].
     pub corrupt: u64,
-    /// Those of [`Fault::TooOld`].
+    /// Number of messages with [`ProtectionError::TooOld`].
     pub too_old: u64,
-    /// Those of [`Fault::Repeated`].
+    /// Number of messages with [`ProtectionError::Repeated`].
     pub repeated: u64,
-    /// Those of [`Fault::Backwards`].
+    /// Number of messages with [`ProtectionError::Backwards`].
     pub backwards: u64,
-    /// Those of [`Fault::Restarted`].
+    /// Number of messages with [`ProtectionError::Restarted`].
     pub restarted: u64,
-    /// Those of [`Fault::Gap`].
+    /// Number of messages with [`ProtectionError::Gap`].
     pub gaps: u64,
-    /// Those of [`Fault::Unreadable`].
+    /// Number of messages with [`ProtectionError::Unreadable`].
     pub unreadable: u64,
-    /// Messages that are missing, by their numbers.
+    /// Number of missing messages, according to the counters.
     pub lost: u64,
-    /// How often the output went from live to safe.
+    /// Number of changes of the output from live to safe.
     pub trips: u64,
 }
 
 impl Tally {
-    const fn count(&mut self, fault: Fault) {
+    const fn count(&mut self, fault: ProtectionError) {
         let counter = match fault {
-            Fault::Corrupt => &mut self.corrupt,
-            Fault::TooOld => &mut self.too_old,
-            Fault::Repeated => &mut self.repeated,
-            Fault::Backwards => &mut self.backwards,
-            Fault::Restarted => &mut self.restarted,
-            Fault::Gap => &mut self.gaps,
-            Fault::Unreadable => &mut self.unreadable,
+            ProtectionError::Corrupt => &mut self.corrupt,
+            ProtectionError::TooOld => &mut self.too_old,
+            ProtectionError::Repeated => &mut self.repeated,
+            ProtectionError::Backwards => &mut self.backwards,
+            ProtectionError::Restarted => &mut self.restarted,
+            ProtectionError::Gap => &mut self.gaps,
+            ProtectionError::Unreadable => &mut self.unreadable,
         };
         *counter += 1;
     }
 }
 
-/// From a receiver of protected messages to their sender: to be quoted in the next one.
+/// An echo, sent by a receiver of protected messages to their sender, which quotes it in its next message.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Echo {
-    /// The type that is protected.
+    /// The protected type.
     pub(crate) kind: Kind,
     /// Nanoseconds of the receiver's clock.
     pub(crate) at_ns: u64,
-    /// The same of the other types that it guards of this sender, as they were said last: of class Stream only the newest message may
-    /// arrive, whichever type it is for.
+    /// The last echoes of the other types that it guards for this sender. Of class Stream only the newest
+    /// message may arrive, for any of the types.
     #[serde(default)]
     pub(crate) others: Vec<(Kind, u64)>,
 }

@@ -1,70 +1,74 @@
-//! Protection for who knows a type at run time alone, as a binding to another language does: bytes in, verdict out. The guards, the ends and
-//! the watchdogs are those of Rust's types, which are one [`Protected`] each.
+//! Protection for types that are known at run time only, as in a binding to another language: the input is
+//! bytes, the output a verdict. The guards, the ends and the watchdogs are those of Rust's types; each of
+//! those types is one [`Protected`].
 //!
-//! What is here beside it, all of it on the types that everybody has: [`Guard::of`](super::Guard::of), [`check`](super::Guard::check),
-//! [`echo`](super::Guard::echo), [`release`](super::Guard::release), [`is_released`](super::Guard::is_released) and [`is_owed`](super::Guard::is_owed);
-//! [`Ends::hold`](super::Ends::hold), [`seal`](super::Ends::seal), [`judge`](super::Ends::judge), [`echo_payload`](super::Ends::echo_payload),
-//! [`is_held`](super::Ends::is_held), [`are_idle`](super::Ends::are_idle) and [`trip`](super::Ends::trip).
+//! The public types have these further functions for it: [`Guard::of`](super::Guard::of),
+//! [`check`](super::Guard::check), [`echo`](super::Guard::echo), [`release`](super::Guard::release),
+//! [`is_released`](super::Guard::is_released) and [`is_owed`](super::Guard::is_owed);
+//! [`Ends::hold`](super::Ends::hold), [`seal`](super::Ends::seal), [`judge`](super::Ends::judge),
+//! [`echo_payload`](super::Ends::echo_payload), [`is_held`](super::Ends::is_held),
+//! [`are_idle`](super::Ends::are_idle) and [`trip`](super::Ends::trip).
 
 use std::io;
 
-use super::{Cause, Echo, Protection, keeper};
+use super::{Cause, Echo, Protection, safe_output};
 pub use super::{ends::Judged, envelope::look, receiver::Verdict};
 use crate::wire::{Kind, Payload, decode};
 
-/// The kind of the messages that tell a sender what to quote.
+/// The kind of the messages that send a time to quote to a sender.
 pub const ECHO: Kind = Echo::KIND;
 
 /// A type of protected payloads.
 #[derive(Clone, Copy, Debug)]
 pub struct Protected {
-    /// What data IDs call it.
+    /// The name in data IDs.
     pub name: &'static str,
-    /// What messages call it.
+    /// The kind in messages.
     pub kind: Kind,
-    /// What a receiver bears. `good_min` is at least 1.
+    /// The limits of a receiver. `good_min` is at least 1.
     pub protection: Protection,
-    /// Which payloads are values of it.
+    /// The valid payloads of the type.
     pub reads: Reads,
 }
 
-/// Which payloads are values of a type.
+/// The valid payloads of a type.
 #[derive(Clone, Copy, Debug)]
 pub enum Reads {
-    /// All of them.
+    /// All payloads.
     Any,
-    /// Those of so many bytes.
+    /// Payloads of this length in bytes.
     OfLength(usize),
-    /// Those of which this says so.
+    /// Payloads that this function accepts.
     By(fn(&[u8]) -> bool),
 }
 
-/// What makes an output safe says that it has failed. It is called again, as where it panics.
+/// The error of a safe function. It is called again, as after a panic.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NotSafe;
 
-/// What came of a release.
+/// The result of a release.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Released {
-    /// The output is safe for good: what makes it safe is not called any more.
+    /// The output is safe permanently: its safe function is not called again.
     Now,
-    /// It was released before.
+    /// The guard was released before.
     Before,
-    /// What makes the output safe has failed. That is tried on, and it is a guard until it is done; then it is released.
+    /// The safe function failed. It is called again until it succeeds; until then the guard exists, and then
+    /// it is released.
     NotSafe,
 }
 
-/// Starts the threads that keep the watchdogs of this process, if there are none, as the first guard does. They take the signals that the calling
-/// thread takes then.
+/// Starts the watchdog threads of this process, if there are none, as the first guard does. They accept the
+/// signals that the calling thread accepts at that time.
 ///
 /// # Errors
-/// Those of [`Guard::new`](super::Guard::new).
+/// The errors of [`Guard::new`](super::Guard::new).
 pub fn begin() -> io::Result<()> {
-    keeper::begun()?;
+    safe_output::started()?;
     Ok(())
 }
 
-/// What makes an output safe and has no word for a failure but a panic.
+/// Wraps a safe function that can fail only by a panic.
 pub(super) fn or_panics<O: 'static>(
     mut safe: impl FnMut(&mut O, Cause) + Send + 'static,
 ) -> impl FnMut(&mut O, Cause) -> Result<(), NotSafe> + Send + 'static {
@@ -75,7 +79,8 @@ pub(super) fn or_panics<O: 'static>(
 }
 
 impl Protected {
-    /// One of Rust's. It has a protection that can be kept, or the program is not compiled.
+    /// Returns the description of a Rust type. A type with a protection that cannot be kept is rejected at
+    /// compile time.
     pub(super) fn of<P: Payload>() -> Self {
         let protection = const {
             match P::PROTECTION {
@@ -86,7 +91,7 @@ impl Protected {
                     );
                     protection
                 }
-                None => panic!("a guard is for a payload whose PROTECTION says what is borne"),
+                None => panic!("a guard needs a payload type with a PROTECTION"),
             }
         };
         let reads = Reads::By(|payload| decode::<P>(payload).is_ok());
@@ -95,7 +100,7 @@ impl Protected {
 }
 
 impl Reads {
-    /// Whether this is a value.
+    /// Returns whether the payload is a valid value.
     #[must_use]
     pub fn is_value(self, payload: &[u8]) -> bool {
         match self {
@@ -120,7 +125,7 @@ mod tests {
     use super::*;
     use crate::{
         outcome::Outcome,
-        protection::{ArmError, Ends, Fault, Guard, State},
+        protection::{ArmError, Ends, Guard, ProtectionError, State},
         tid::{AppAddress, NodeAddress, Tid},
         time::Time,
     };
@@ -131,14 +136,14 @@ mod tests {
         Tid::new(NodeAddress::new(7), AppAddress::new(0x1000 + app))
     }
 
-    /// For whom no machine is too slow.
+    /// No machine is too slow for this protection.
     fn angle() -> Protected {
         let protection = Protection::of_period(Duration::from_secs(60));
         let name = "test.raw.angle";
         Protected { name, kind: Kind::named(name), protection, reads: Reads::OfLength(8) }
     }
 
-    /// Both ends, of which the one has heard of the other, and an output that is live.
+    /// Both ends, after the first echo, and a live output.
     fn live() -> (Ends, Ends, Guard<()>) {
         let (mut sender, mut receiver) = (Ends::new(NOW), Ends::new(NOW));
         let guard =
@@ -161,10 +166,10 @@ mod tests {
     }
 
     #[test]
-    fn a_payload_of_another_length_has_come_and_is_not_good() {
+    fn payload_of_another_length_is_received_but_not_valid() {
         let (sender, mut receiver, guard) = live();
         let longer = seal(&sender, &[7; 9]);
-        assert_eq!(guard.check(&longer, angle().reads), Verdict::Refused(Fault::Unreadable));
+        assert_eq!(guard.check(&longer, angle().reads), Verdict::Refused(ProtectionError::Unreadable));
         let next = seal(&sender, &[5; 8]);
         let judged = receiver.judge((tid(1), angle().kind), &next);
         assert!(
@@ -175,11 +180,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_released_is_never_live_again_and_nobody_hears_of_it() {
+    fn released_output_is_never_live_again() {
         let (sender, mut receiver, guard) = live();
         assert_eq!(guard.release(), Released::Now);
         assert_eq!((guard.release(), guard.is_released()), (Released::Before, true));
-        // When: good ones go on coming for somebody who has looked it up before that.
+        // When: valid messages keep arriving for a holder that looked it up before the release.
         for _ in 0..16 {
             assert_eq!(guard.check(&seal(&sender, &[7; 8]), angle().reads), Verdict::Hold);
         }
@@ -191,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn an_output_of_which_it_is_said_that_it_is_not_safe_is_tried_again_and_released_when_it_is() {
+    fn failed_release_is_retried_until_it_succeeds() {
         let (fails, (done, is_done)) = (Arc::new(AtomicBool::new(true)), sync_channel(1));
         let does_fail = fails.clone();
         let safe = move |(): &mut (), _: Cause| {
@@ -205,16 +210,16 @@ mod tests {
         assert!(guard.is_owed(), "it has failed at once");
         assert_eq!((guard.release(), guard.is_released()), (Released::NotSafe, false));
         assert_eq!(guard.arm(), Err(ArmError::SafeFails));
-        // When: it does not fail any more.
+        // When: it no longer fails.
         fails.store(false, Ordering::Release);
         is_done.recv_timeout(Duration::from_secs(60)).expect("it is tried until it is done");
-        // Then: who does that finishes the release; this waits until it is done with that.
+        // Then: the successful call completes the release; this call waits for its end.
         assert_eq!((guard.release(), guard.is_owed()), (Released::Before, false));
         assert!(guard.is_released());
     }
 
     #[test]
-    fn who_asks_again_for_a_release_that_has_failed_may_be_the_one_that_does_it() {
+    fn repeated_release_may_complete_a_failed_one() {
         let mut tries = 0;
         let safe = move |(): &mut (), _: Cause| {
             tries += 1;
@@ -226,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn a_guard_that_no_message_would_have_to_arm_is_refused() {
+    fn guard_that_no_message_would_arm_is_rejected() {
         let protection = Protection { good_min: 0, ..angle().protection };
         let refused = Guard::of((tid(1), tid(5)), Protected { protection, ..angle() }, (), |(), _| Ok(()));
         assert_eq!(refused.map(drop).expect_err("it takes one at least").kind(), io::ErrorKind::InvalidInput);

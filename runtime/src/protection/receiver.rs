@@ -1,30 +1,31 @@
-//! The receiving end without clock and thread: what is believed, and when the output has to be safe.
+//! The receiving end without clock and thread: the checks of a message, and when the output must be safe.
 
 use std::time::Duration;
 
 use bytes::Bytes;
 
-use super::{ArmError, Cause, DataId, Fault, Protection, Stamp, State, Tally, envelope::open};
+use super::{ArmError, Cause, DataId, Protection, ProtectionError, Stamp, State, Tally, envelope::open};
 use crate::time::Time;
 
-/// Echoes that a sender may answer with. One is sent each quarter of the longest age, so that the oldest is twice too old.
+/// Number of echoes that a sender may quote. One is sent each quarter of the maximum age, so the oldest is
+/// twice too old.
 const ECHOES: usize = 8;
-/// So much more sleep of the host than was known is one: less may be due to how it is read.
+/// Minimum increase of the host's sleep time that counts as a sleep: a smaller one may be an error of the measurement.
 const SLEEP_MIN: Duration = Duration::from_millis(5);
 
-/// What is in a message, as far as that can be said without its receiver.
+/// The content of a message, as far as it can be checked without its receiver's state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Opened {
-    /// Not what was sealed under this data_id.
+    /// The bytes were not sealed under this data ID.
     Corrupt,
-    /// What was sealed, and no value of the type that the receiver has.
+    /// The message is intact, but no valid value of the receiver's type.
     Unreadable(Stamp),
-    /// A value.
+    /// The message contains a value.
     Value(Stamp),
 }
 
 impl Opened {
-    /// Takes a message out of its envelope, and reads it. How it is read is the user's code: nobody else waits for it.
+    /// Opens an envelope and decodes its payload. Decoding is user code: it runs without a lock.
     pub(crate) fn of<T>(
         data_id: &DataId,
         bytes: &Bytes,
@@ -33,7 +34,7 @@ impl Opened {
         Self::read(open(data_id, bytes), read)
     }
 
-    /// Reads what was in an envelope, if that was one.
+    /// Decodes the payload of an envelope, if it could be opened.
     pub(crate) fn read<B, T>(
         opened: Option<(Stamp, B)>,
         read: impl FnOnce(B) -> Option<T>,
@@ -44,44 +45,44 @@ impl Opened {
     }
 }
 
-/// What comes of one message.
+/// The result of checking one message.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Verdict<T> {
-    /// It is good, and the output is live.
+    /// The message is good, and the output is live.
     Apply(T),
-    /// It is good, and the output is safe until it is armed again.
+    /// The message is good, and the output is safe until it is armed again.
     Hold,
-    /// It is not to be used.
-    Refused(Fault),
+    /// The message must not be used.
+    Refused(ProtectionError),
 }
 
 impl Verdict<()> {
-    /// The same of the message's value.
+    /// Replaces the content of the verdict by the message's value.
     pub(crate) fn of<T>(self, value: Option<T>) -> Verdict<T> {
         match self {
-            // Only a value is ever good.
-            Self::Apply(()) => value.map_or(Verdict::Refused(Fault::Unreadable), Verdict::Apply),
+            // Only a value can be good.
+            Self::Apply(()) => value.map_or(Verdict::Refused(ProtectionError::Unreadable), Verdict::Apply),
             Self::Hold => Verdict::Hold,
             Self::Refused(fault) => Verdict::Refused(fault),
         }
     }
 }
 
-/// What is known of one flow of protected messages.
+/// The state of one flow of protected messages.
 #[derive(Debug)]
 pub(crate) struct Receiver {
     protection: Protection,
     state: State,
-    /// Incarnation and counter of the last message that was believed.
+    /// Incarnation and counter of the last accepted message.
     last: Option<(u64, u64)>,
-    /// When that came.
-    heard: Time,
-    /// Good messages in a row: none bad among them, and no silence.
+    /// When that message arrived.
+    last_good: Time,
+    /// Consecutive good messages: with no bad one among them, and no silence.
     good: u32,
     /// The last 64 messages, the newest at the lowest bit: 1 for a bad one.
     history: u64,
     echoes: [Time; ECHOES],
-    /// How long the host has slept in all.
+    /// Total time that the host has slept.
     asleep: Duration,
     tally: Tally,
 }
@@ -92,7 +93,7 @@ impl Receiver {
             protection,
             state: State::Safe(Cause::NotArmed),
             last: None,
-            heard: Time::ZERO,
+            last_good: Time::ZERO,
             good: 0,
             history: 0,
             echoes: [Time::ZERO; ECHOES],
@@ -109,19 +110,19 @@ impl Receiver {
         self.tally
     }
 
-    /// When [`expire`](Self::expire) has something to say; `None` while the output is safe.
+    /// Returns when [`expire`](Self::expire) is due; `None` while the output is safe.
     pub(crate) fn deadline(&self) -> Option<Time> {
-        (self.state == State::Live).then(|| self.heard + self.protection.within)
+        (self.state == State::Live).then(|| self.last_good + self.protection.within)
     }
 
-    /// The time that the sender is to send back, sent to it each [`Protection::echo_period`].
+    /// Returns the time that the sender must quote, sent to it each [`Protection::echo_period`].
     pub(crate) fn echo(&mut self, now: Time) -> Time {
         self.echoes.rotate_right(1);
         self.echoes[0] = now;
         now
     }
 
-    /// The last of them; zero before there was one.
+    /// Returns the last echo; zero before the first one.
     pub(crate) const fn last_echo(&self) -> Time {
         self.echoes[0]
     }
@@ -131,8 +132,8 @@ impl Receiver {
     }
 
     // spec: E2E-9
-    /// The host has slept for so long in all. Clocks stand meanwhile: what was under way has an age that nobody knows, so nothing counts that
-    /// quotes an echo from before.
+    /// Records the total time that the host has slept. Clocks stop during a sleep, so the age of messages in
+    /// flight is unknown. Messages that quote an earlier echo no longer count.
     pub(crate) fn has_slept(&mut self, asleep: Duration) {
         if asleep >= self.asleep + SLEEP_MIN {
             self.echoes = [Time::ZERO; ECHOES];
@@ -142,14 +143,14 @@ impl Receiver {
     }
 
     // spec: E2E-6
-    /// The output is safe if the watchdog's time is over.
+    /// Makes the output safe if the watchdog's deadline has passed.
     pub(crate) fn expire(&mut self, now: Time) {
         if self.deadline().is_some_and(|deadline| now >= deadline) {
             self.trip(Cause::Silent);
         }
     }
 
-    /// The output is safe from now on, until it is armed again. Why it is, is what happened first.
+    /// Makes the output safe until it is armed again. The first cause is kept.
     pub(crate) const fn trip(&mut self, cause: Cause) {
         if matches!(self.state, State::Live) {
             self.tally.trips += 1;
@@ -158,18 +159,18 @@ impl Receiver {
         self.good = 0;
     }
 
-    /// Takes one message in.
+    /// Checks one message.
     pub(crate) fn take(&mut self, now: Time, opened: Opened) -> Verdict<()> {
-        // However late the thread is that keeps the watchdog.
+        // Independent of how late the thread `safe-output` is.
         self.expire(now);
         let verdict = match self.examine(now, opened) {
             Ok(()) => {
                 self.history <<= 1;
-                // A row ends with a silence that would have made a live output safe.
-                let is_next = now.since(self.heard) < self.protection.within;
+                // A run of good messages ends with a silence that would have made a live output safe.
+                let is_next = now.since(self.last_good) < self.protection.within;
                 self.good = if is_next { self.good.saturating_add(1) } else { 1 };
                 self.tally.good += 1;
-                self.heard = now;
+                self.last_good = now;
                 if self.state == State::Live { Verdict::Apply(()) } else { Verdict::Hold }
             }
             Err(fault) => {
@@ -181,30 +182,30 @@ impl Receiver {
         };
         // spec: E2E-5
         if self.history.count_ones() > self.protection.bad_max {
-            // What is remembered has had its effect: the way back begins with a clean sheet.
+            // The recorded faults have had their effect: recovery starts with an empty history.
             self.history = 0;
             self.trip(Cause::TooManyBad);
         }
         verdict
     }
 
-    fn examine(&mut self, now: Time, opened: Opened) -> Result<(), Fault> {
+    fn examine(&mut self, now: Time, opened: Opened) -> Result<(), ProtectionError> {
         match opened {
             // spec: E2E-1
-            Opened::Corrupt => Err(Fault::Corrupt),
+            Opened::Corrupt => Err(ProtectionError::Corrupt),
             Opened::Value(stamp) => self.follow(now, stamp),
             // spec: E2E-8
-            // It has come: none is missing because of it, and it does not come again.
-            Opened::Unreadable(stamp) => self.follow(now, stamp).and(Err(Fault::Unreadable)),
+            // The message has arrived: it causes no gap, and is not accepted again.
+            Opened::Unreadable(stamp) => self.follow(now, stamp).and(Err(ProtectionError::Unreadable)),
         }
     }
 
-    /// Whether this is a young message, and the next one.
-    fn follow(&mut self, now: Time, stamp: Stamp) -> Result<(), Fault> {
+    /// Checks that this message is young, and the next one of the flow.
+    fn follow(&mut self, now: Time, stamp: Stamp) -> Result<(), ProtectionError> {
         // spec: E2E-2
         let is_ours = stamp.echo != Time::ZERO && self.echoes.contains(&stamp.echo);
         if !is_ours || now.since(stamp.echo) > self.protection.age_max {
-            return Err(Fault::TooOld);
+            return Err(ProtectionError::TooOld);
         }
         // spec: E2E-3
         let Some((incarnation, counter)) = self.last else {
@@ -214,36 +215,36 @@ impl Receiver {
         if stamp.incarnation != incarnation {
             self.last = Some((stamp.incarnation, stamp.counter));
             self.trip(Cause::Restarted);
-            return Err(Fault::Restarted);
+            return Err(ProtectionError::Restarted);
         }
         // spec: E2E-4
         if stamp.counter == counter {
-            return Err(Fault::Repeated);
+            return Err(ProtectionError::Repeated);
         }
         if stamp.counter < counter {
-            return Err(Fault::Backwards);
+            return Err(ProtectionError::Backwards);
         }
         self.last = Some((incarnation, stamp.counter));
         let lost = stamp.counter - counter - 1;
-        // It comes from outside.
+        // The counter is untrusted input.
         self.tally.lost = self.tally.lost.saturating_add(lost);
         if lost > self.protection.lost_max {
             self.trip(Cause::TooMuchLost);
-            return Err(Fault::Gap);
+            return Err(ProtectionError::Gap);
         }
         Ok(())
     }
 
     // spec: E2E-7
-    /// Makes the output live.
+    /// Arms the output.
     pub(crate) fn arm(&mut self, now: Time) -> Result<(), ArmError> {
         self.expire(now);
         let wanted = self.protection.good_min;
-        if self.good < wanted || now.since(self.heard) >= self.protection.within {
+        if self.good < wanted || now.since(self.last_good) >= self.protection.within {
             return Err(ArmError::NotGood {
                 good: self.good.min(wanted),
                 wanted,
-                silent: now.since(self.heard),
+                silent: (self.good > 0).then(|| now.since(self.last_good)),
             });
         }
         self.state = State::Live;

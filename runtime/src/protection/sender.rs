@@ -1,4 +1,4 @@
-//! The sending end: a counter and the newest echo of each flow of protected messages.
+//! The sending end: a counter and the newest echo for each flow of protected messages.
 
 use std::{
     collections::BTreeMap,
@@ -19,10 +19,10 @@ use crate::{
     wire::{Kind, Payload, encode},
 };
 
-/// Flows of protected messages that one life of an application can have at once.
+/// Maximum number of concurrent flows of protected messages in one incarnation of an application.
 pub(crate) const FLOWS_MAX: usize = 1_024;
 
-/// The flows of protected messages of one life of an application.
+/// The flows of protected messages of one incarnation of an application.
 #[derive(Debug)]
 pub(crate) struct Flows {
     incarnation: u64,
@@ -32,7 +32,8 @@ pub(crate) struct Flows {
 #[derive(Debug, Default)]
 struct Table {
     flows: BTreeMap<(Tid, Kind), Flow>,
-    /// The greatest counter of a flow that was forgotten. New ones begin above it: one that comes back says no number twice.
+    /// The greatest counter of a removed flow. New flows start above it, so a flow that is opened again never
+    /// repeats a counter.
     forgotten: u64,
 }
 
@@ -40,9 +41,9 @@ struct Table {
 struct Flow {
     counter: u64,
     echo: Time,
-    /// When something was sent last.
+    /// When the last message of the flow was sent.
     used: Time,
-    /// Time without a message after which the receiver's output is safe, however long the last one was under way.
+    /// Time without a message after which the receiver's output is safe, at any message latency.
     lasts: Duration,
 }
 
@@ -58,8 +59,9 @@ impl Flow {
 }
 
 impl Table {
-    /// Whether there is room for one more: the one that is over and was used longest ago is forgotten for it. One that goes on is not, as
-    /// more receivers than there are flows would all lose theirs by turns.
+    /// Returns whether the table has room for one more flow, and removes an idle flow if it is full: the one
+    /// that was used longest ago. A flow that is in use is never removed. Otherwise a sender with more
+    /// receivers than flows would lose each of them in turn.
     fn makes_room(&mut self, now: Time) -> bool {
         if self.flows.len() < FLOWS_MAX {
             return true;
@@ -73,7 +75,7 @@ impl Table {
 }
 
 impl Flows {
-    /// Those of a life that began at `now`: no two lives at a TID begin at the same time.
+    /// Creates the flows of an incarnation that began at `now`: no two incarnations at a TID begin at the same time.
     pub(crate) const fn new(now: Time) -> Self {
         let table = Table { flows: BTreeMap::new(), forgotten: 0 };
         Self { incarnation: now.as_nanos(), table: Mutex::new(table) }
@@ -83,7 +85,8 @@ impl Flows {
         self.table.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// `value` in the next envelope of its flow; `None` if there are too many flows that go on, or if its type is not protected.
+    /// Seals `value` in the next envelope of its flow. Returns `None` if too many flows are in use, or if the
+    /// type is not protected.
     pub(crate) fn seal<P: Payload>(
         &self,
         source: Tid,
@@ -95,7 +98,7 @@ impl Flows {
         Some(seal(&DataId::of::<P>(source, destination), stamp, &encode(value)))
     }
 
-    /// The same for who knows the type at run time alone: `payload` is a value of it.
+    /// Same as [`seal`](Self::seal), for a type that is known at run time only: `payload` is an encoded value of it.
     pub(crate) fn seal_payload(
         &self,
         (source, destination): (Tid, Tid),
@@ -107,8 +110,8 @@ impl Flows {
         Some(seal(&DataId { source, destination, name: protected.name }, stamp, payload))
     }
 
-    /// Whether nothing was ever sealed here.
-    pub(crate) fn are_none(&self) -> bool {
+    /// Returns whether no message was ever sealed.
+    pub(crate) fn is_empty(&self) -> bool {
         self.lock().flows.is_empty()
     }
 
@@ -124,16 +127,16 @@ impl Flows {
         Some(Stamp { counter: flow.counter, incarnation: self.incarnation, echo: flow.echo })
     }
 
-    /// Whether there are flows to `receiver`.
-    pub(crate) fn are_to(&self, receiver: Tid) -> bool {
+    /// Returns whether there are flows to `receiver`.
+    pub(crate) fn has_flow_to(&self, receiver: Tid) -> bool {
         self.lock().flows.keys().any(|(destination, _)| *destination == receiver)
     }
 
-    /// `from` is to find these times in the next messages that are sent to it.
-    pub(crate) fn heard(&self, from: Tid, echo: Echo) {
+    /// Stores the echoed times of `from`, to be quoted in the next messages to it.
+    pub(crate) fn record_echo(&self, from: Tid, echo: Echo) {
         let mut table = self.lock();
         let echoes = std::iter::once((echo.kind, echo.at_ns)).chain(echo.others);
-        // It comes from outside.
+        // The list is untrusted input, so its length is limited.
         for (kind, at_ns) in echoes.take(FLOWS_MAX) {
             if let Some(flow) = table.flows.get_mut(&(from, kind)) {
                 flow.echo = Time::from_nanos(at_ns);

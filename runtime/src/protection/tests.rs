@@ -1,6 +1,6 @@
-//! A sender and a receiver without anything between them, and guards that trip each other.
+//! A sender and a receiver without a channel between them, and guards that trip each other.
 //!
-//! | file | what it is |
+//! | file | content |
 //! | --- | --- |
 //! | `black_channel` | each class of error, injected between the two |
 //! | `outside` | bytes from outside |
@@ -41,14 +41,14 @@ fn tid(app: u32) -> Tid {
 
 const CENTRAL: u32 = 1;
 const DRIVE: u32 = 2;
-/// Which life of the sender counts.
+/// The incarnation of the sender.
 const LIFE: Time = Time::from_nanos(5);
 
 fn data_id() -> DataId {
     DataId::of::<Torque>(tid(CENTRAL), tid(DRIVE))
 }
 
-/// A sender and a receiver, a message and an echo each millisecond.
+/// A sender and a receiver, with a message and an echo each millisecond.
 struct Bench {
     now: Time,
     flows: Flows,
@@ -66,12 +66,12 @@ impl Bench {
         let now = Time::from_nanos(1_000_000_000);
         let receiver = Receiver::new(protection);
         let mut bench = Self { now, flows: Flows::new(LIFE), receiver, sent: 0, applied: Vec::new() };
-        // The first message makes the flow that an echo is for.
+        // The first message creates the flow of the echoes.
         bench.seal();
         bench
     }
 
-    /// A live one.
+    /// Creates one with a live output.
     fn live() -> Self {
         Self::live_of(PROTECTION)
     }
@@ -82,7 +82,7 @@ impl Bench {
         bench
     }
 
-    /// Good messages come until the output can be armed, and it is.
+    /// Passes valid messages until the output can be armed, and arms it.
     fn come_alive(&mut self) {
         for _ in 0..PROTECTION.good_min {
             let message = self.next();
@@ -96,15 +96,15 @@ impl Bench {
         self.flows.seal(tid(CENTRAL), tid(DRIVE), &Torque { nm: self.sent }, self.now).expect("one flow")
     }
 
-    /// One period later: the sender's next message, with a fresh echo.
+    /// Advances by one period: returns the sender's next message, with a fresh echo.
     fn next(&mut self) -> Bytes {
         self.now = self.now + MS;
         let at = self.receiver.echo(self.now);
-        self.flows.heard(tid(DRIVE), Echo::new(Torque::KIND, at));
+        self.flows.record_echo(tid(DRIVE), Echo::new(Torque::KIND, at));
         self.seal()
     }
 
-    /// The only way to the output, for good messages and bad ones.
+    /// The only path to the output, for valid messages and bad ones.
     fn take(&mut self, bytes: &Bytes) -> Verdict<Bytes> {
         let (opened, payload) = Opened::of(&data_id(), bytes, Some);
         let verdict = self.receiver.take(self.now, opened).of(payload);
@@ -114,7 +114,7 @@ impl Bench {
         verdict
     }
 
-    /// Whether the sender's next message is applied, as a good one is in a channel that is in order.
+    /// Whether the sender's next message is applied, as a valid one is in a working channel.
     fn applies_the_next(&mut self) -> bool {
         let message = self.next();
         let before = self.applied.len();
@@ -123,7 +123,7 @@ impl Bench {
 }
 
 #[test]
-fn what_is_sealed_is_applied_once_armed_and_not_before() {
+fn sealed_message_is_applied_only_once_armed() {
     let mut bench = Bench::new();
     for _ in 1..PROTECTION.good_min {
         let message = bench.next();
@@ -132,7 +132,7 @@ fn what_is_sealed_is_applied_once_armed_and_not_before() {
     let (good, wanted) = (PROTECTION.good_min - 1, PROTECTION.good_min);
     assert_eq!(
         bench.receiver.arm(bench.now),
-        Err(ArmError::NotGood { good, wanted, silent: Duration::ZERO })
+        Err(ArmError::NotGood { good, wanted, silent: Some(Duration::ZERO) })
     );
     let message = bench.next();
     assert_eq!(bench.take(&message), Verdict::Hold);
@@ -143,21 +143,21 @@ fn what_is_sealed_is_applied_once_armed_and_not_before() {
 }
 
 #[test]
-fn a_silence_ends_a_row_of_good_messages_while_the_output_is_safe() {
+fn silence_ends_a_run_of_valid_messages() {
     let mut bench = Bench::new();
     for _ in 1..PROTECTION.good_min {
         let message = bench.next();
         assert_eq!(bench.take(&message), Verdict::Hold);
     }
-    // When: nothing comes for just as long as a live output bears.
+    // When: no message arrives for exactly as long as a live output permits.
     bench.now = bench.now + PROTECTION.within - MS;
     let message = bench.next();
     assert_eq!(bench.take(&message), Verdict::Hold);
-    // Then: that was the first one of a new row.
+    // Then: the last message was the first one of a new run.
     let wanted = PROTECTION.good_min;
     assert_eq!(
         bench.receiver.arm(bench.now),
-        Err(ArmError::NotGood { good: 1, wanted, silent: Duration::ZERO })
+        Err(ArmError::NotGood { good: 1, wanted, silent: Some(Duration::ZERO) })
     );
     for good in 2..=wanted {
         assert!(bench.receiver.arm(bench.now).is_err(), "{good}");
@@ -168,8 +168,8 @@ fn a_silence_ends_a_row_of_good_messages_while_the_output_is_safe() {
 }
 
 #[test]
-fn what_cannot_be_read_keeps_no_output_live_and_arms_none() {
-    // Given: one that bears bad messages, from a sender of a later version.
+fn undecodable_messages_neither_keep_live_nor_arm() {
+    // Given: an output that tolerates bad messages, from a sender of a later version.
     let mut bench = Bench::live_of(Protection { bad_max: 64, ..PROTECTION });
     let of_later_version = |bench: &mut Bench| {
         let message = bench.next();
@@ -178,15 +178,15 @@ fn what_cannot_be_read_keeps_no_output_live_and_arms_none() {
     };
     let deadline = bench.receiver.deadline();
     for _ in 1..3 {
-        assert_eq!(of_later_version(&mut bench), Verdict::Refused(Fault::Unreadable));
+        assert_eq!(of_later_version(&mut bench), Verdict::Refused(ProtectionError::Unreadable));
         assert_eq!(bench.receiver.deadline(), deadline, "it is none that was waited for");
     }
-    // And: it has come, so that nothing is missing.
+    // And: they arrived, so none is missing.
     assert_eq!(bench.receiver.tally().lost, 0);
-    assert_eq!(of_later_version(&mut bench), Verdict::Refused(Fault::Unreadable));
+    assert_eq!(of_later_version(&mut bench), Verdict::Refused(ProtectionError::Unreadable));
     assert_eq!(bench.receiver.state(), State::Safe(Cause::Silent));
     for _ in 0..2 * PROTECTION.good_min {
-        assert_eq!(of_later_version(&mut bench), Verdict::Refused(Fault::Unreadable));
+        assert_eq!(of_later_version(&mut bench), Verdict::Refused(ProtectionError::Unreadable));
         assert!(bench.receiver.arm(bench.now).is_err());
     }
     let tally = bench.receiver.tally();
@@ -200,19 +200,19 @@ fn what_cannot_be_read_keeps_no_output_live_and_arms_none() {
 }
 
 #[test]
-fn a_sender_that_hears_no_echo_is_not_believed() {
+fn sender_without_echoes_is_not_trusted() {
     let mut bench = Bench::new();
     for _ in 0..100 {
         bench.now = bench.now + MS;
         bench.receiver.echo(bench.now);
         let message = bench.seal();
-        assert_eq!(bench.take(&message), Verdict::Refused(Fault::TooOld));
+        assert_eq!(bench.take(&message), Verdict::Refused(ProtectionError::TooOld));
     }
     assert!(bench.receiver.arm(bench.now).is_err());
 }
 
 #[test]
-fn what_was_under_way_while_the_host_slept_moves_nothing() {
+fn messages_in_flight_during_host_sleep_move_nothing() {
     let mut bench = Bench::live();
     bench.receiver.has_slept(Duration::from_secs(7));
     assert_eq!(bench.receiver.state(), State::Safe(Cause::Slept), "however long it had slept before");
@@ -224,29 +224,30 @@ fn what_was_under_way_while_the_host_slept_moves_nothing() {
     bench.receiver.has_slept(Duration::from_secs(3_607));
     assert_eq!(bench.receiver.state(), State::Safe(Cause::Slept));
     for message in &waiting {
-        assert_eq!(bench.take(message), Verdict::Refused(Fault::TooOld));
+        assert_eq!(bench.take(message), Verdict::Refused(ProtectionError::TooOld));
         assert!(bench.receiver.arm(bench.now).is_err());
     }
-    // And: what is sent after an echo counts, behind those that are missing; and no sleep that is known counts twice.
+    // And: messages sent after an echo are valid, after the missing ones; and a known sleep is not counted
+    // twice.
     bench.receiver.has_slept(Duration::from_secs(3_600));
     let message = bench.next();
-    assert_eq!(bench.take(&message), Verdict::Refused(Fault::Gap));
+    assert_eq!(bench.take(&message), Verdict::Refused(ProtectionError::Gap));
     bench.receiver.has_slept(Duration::from_secs(3_607));
     bench.come_alive();
     assert!(bench.applies_the_next());
 }
 
 #[test]
-fn one_bad_message_is_borne_and_the_second_of_64_is_not() {
+fn one_of_64_bad_messages_is_tolerated() {
     let mut bench = Bench::live();
     let bad = Bytes::from_static(b"noise");
-    assert_eq!(bench.take(&bad), Verdict::Refused(Fault::Corrupt));
+    assert_eq!(bench.take(&bad), Verdict::Refused(ProtectionError::Corrupt));
     assert_eq!(bench.receiver.state(), State::Live);
     for _ in 0..62 {
         let message = bench.next();
         assert!(matches!(bench.take(&message), Verdict::Apply(_)));
     }
-    assert_eq!(bench.take(&bad), Verdict::Refused(Fault::Corrupt));
+    assert_eq!(bench.take(&bad), Verdict::Refused(ProtectionError::Corrupt));
     assert_eq!(bench.receiver.state(), State::Safe(Cause::TooManyBad));
 
     let mut bench = Bench::live();
@@ -260,7 +261,7 @@ fn one_bad_message_is_borne_and_the_second_of_64_is_not() {
 }
 
 #[test]
-fn the_bytes_are_those_of_the_page() {
+fn bytes_match_the_documentation() {
     let stamp = Stamp { counter: 3, incarnation: 5, echo: Time::from_nanos(7) };
     let sealed = seal(&DataId { source: tid(1), destination: tid(2), name: "a.b" }, stamp, b"xyz");
     let mut head = vec![1, 0, 0, 0, 3, 0, 0, 0];
@@ -276,16 +277,16 @@ fn the_bytes_are_those_of_the_page() {
 }
 
 #[test]
-fn a_flow_that_is_over_gives_its_place_up_and_comes_back_above_all_that_it_has_said() {
+fn ended_flow_frees_its_slot_and_counts_on() {
     let mut bench = Bench::live();
     let said = bench.sent;
-    // Given: as many receivers as there may be, all of them one after the other.
+    // Given: the maximum number of receivers, one after the other.
     let to =
         |bench: &Bench, app| bench.flows.seal(tid(CENTRAL), tid(DRIVE + app), &Torque { nm: 0 }, bench.now);
     for app in 1..1_024 {
         assert!(to(&bench, app).is_some(), "{app}");
     }
-    // Then: nobody who goes on is forgotten; whoever is over is, the first one first.
+    // Then: active flows are kept; ended ones are removed, the oldest first.
     let lasts = PROTECTION.within + PROTECTION.age_max;
     bench.now = bench.now + lasts;
     assert!(to(&bench, 1_024).is_none(), "all go on");
@@ -294,21 +295,21 @@ fn a_flow_that_is_over_gives_its_place_up_and_comes_back_above_all_that_it_has_s
     for app in 1_024..=2_000 {
         assert!(to(&bench, app).is_some(), "{app}: its place is that of one that is over");
     }
-    // When: the first one comes back.
+    // When: the first one returns.
     let echo = bench.receiver.echo(bench.now);
     let message = bench.seal();
     let (stamp, _) = open(&data_id(), &message).expect("it is its own");
     assert!(stamp.counter > said && stamp.incarnation == LIFE.as_nanos());
     assert_eq!(stamp.echo, Time::ZERO, "what it had heard is forgotten");
-    assert_eq!(bench.take(&message), Verdict::Refused(Fault::TooOld));
+    assert_eq!(bench.take(&message), Verdict::Refused(ProtectionError::TooOld));
     assert_eq!(bench.receiver.state(), State::Safe(Cause::Silent), "since long ago");
-    // And: who has never heard of it begins there.
-    bench.flows.heard(tid(DRIVE), Echo::new(Torque::KIND, echo));
+    // And: a receiver without a known sender starts at this point.
+    bench.flows.record_echo(tid(DRIVE), Echo::new(Torque::KIND, echo));
     bench.come_alive();
     assert!(bench.applies_the_next());
 }
 
-/// A live output, and whose `safe` is called with what is in its slot.
+/// A live output; its `safe` trips the guard in its slot.
 fn live_guard(slot: &Arc<Mutex<Option<Guard<()>>>>) -> Guard<()> {
     let peer = slot.clone();
     let safe = move |(): &mut (), _| {
@@ -319,21 +320,21 @@ fn live_guard(slot: &Arc<Mutex<Option<Guard<()>>>>) -> Guard<()> {
     live_with(safe)
 }
 
-/// A live output, and what makes it safe.
+/// A live output with this safe function.
 fn live_with(safe: impl FnMut(&mut (), Cause) + Send + 'static) -> Guard<()> {
     let guard = Guard::new::<Patient>(tid(CENTRAL), tid(DRIVE), (), safe).expect("a thread");
     let (flows, guarded) = (Flows::new(Time::from_nanos(5)), guard.guarded());
     let seal = || flows.seal(tid(CENTRAL), tid(DRIVE), &Patient, LIFE).expect("one flow");
     seal();
     for _ in 0..8 {
-        flows.heard(tid(DRIVE), Echo::new(Patient::KIND, guarded.echo()));
+        flows.record_echo(tid(DRIVE), Echo::new(Patient::KIND, guarded.echo()));
         assert_eq!(guarded.take(&seal(), Some), Verdict::Hold);
     }
     guard.arm().expect("good ones have come");
     guard
 }
 
-/// For whom no machine is too slow.
+/// No machine is too slow for this protection.
 #[derive(Serialize, Deserialize)]
 struct Patient;
 
@@ -343,7 +344,7 @@ impl Payload for Patient {
 }
 
 #[test]
-fn guards_that_trip_each_other_are_both_safe_and_wait_for_nobody() {
+fn guards_that_trip_each_other_do_not_deadlock() {
     let (done, is_done) = std::sync::mpsc::sync_channel(1);
     std::thread::spawn(move || {
         for _ in 0..200 {
@@ -352,7 +353,7 @@ fn guards_that_trip_each_other_are_both_safe_and_wait_for_nobody() {
             *slots[0].lock().expect("it is new") = Some(guards[1].clone());
             *slots[1].lock().expect("it is new") = Some(guards[0].clone());
             std::thread::scope(|scope| guards.iter().for_each(|guard| drop(scope.spawn(|| guard.trip()))));
-            // Whom the other one had in hand the thread of the watchdogs trips.
+            // A guard that the other one had locked is tripped by the thread of the watchdogs.
             while guards.iter().any(|guard| guard.state() == State::Live) {
                 std::thread::yield_now();
             }
@@ -364,7 +365,7 @@ fn guards_that_trip_each_other_are_both_safe_and_wait_for_nobody() {
 }
 
 #[test]
-fn an_output_whose_guard_goes_and_whose_making_safe_panics_is_tried_again() {
+fn safe_function_that_panics_at_drop_is_retried() {
     let (safe, made_safe) = std::sync::mpsc::sync_channel(1);
     let mut fails = true;
     drop(live_with(move |(), cause| {
@@ -376,9 +377,9 @@ fn an_output_whose_guard_goes_and_whose_making_safe_panics_is_tried_again() {
     made_safe.recv_timeout(Duration::from_secs(60)).expect("it is tried until it is done");
 }
 
-/// In a process of its own: in this one other tests wake the thread, which would sleep for minutes where nobody wakes it.
+/// In a process of its own: in this one other tests wake the thread. Without them it would sleep for minutes.
 #[test]
-fn an_output_that_was_tripped_and_whose_making_safe_panics_is_tried_again_at_once() {
+fn safe_function_that_panics_at_trip_is_retried() {
     let tests = std::env::current_exe().expect("it runs");
     let alone = ["--exact", "--ignored", "protection::tests::a_tripped_output_alone_is_tried_again_at_once"];
     let run = std::process::Command::new(tests).args(alone).output().expect("it can be run");

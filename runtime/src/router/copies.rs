@@ -1,12 +1,12 @@
-//! What becomes of the copies of a message to many.
+//! The results of the copies of a message to many.
 
 use crate::outcome::Rejection;
 
-/// How many were taken, and why the others were not.
+/// The number of accepted copies, and the rejections of the others.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Copies {
     taken: usize,
-    /// By [`Rejection`].
+    /// Indexed by [`Rejection`].
     refused: [u64; Rejection::ALL.len()],
 }
 
@@ -18,17 +18,18 @@ impl Copies {
         }
     }
 
-    /// Whether anybody took one.
+    /// Returns whether any copy was accepted.
     pub(super) const fn is_taken(&self) -> bool {
         self.taken > 0
     }
 
-    /// Those for which there was no room. Whom a guard keeps out, or who is not there, is meant to get none.
+    /// Returns the copies without room. A member that a guard excludes, or that does not exist, is meant to get none.
     pub(super) fn without_room(&self) -> impl Iterator<Item = (Rejection, u64)> {
         [Rejection::QueueFull, Rejection::TooLong].into_iter().map(|why| (why, self.refused[why as usize]))
     }
 
-    /// Why none was taken, where a sender can mend it. `None`: there is no member that could take one, which is no fault.
+    /// Returns the reason why no copy was accepted, if the sender can remedy it. `None`: no member could
+    /// accept one, which is no fault.
     pub(super) fn why_none(&self) -> Option<Rejection> {
         let mendable = [Rejection::TooLong, Rejection::QueueFull, Rejection::NotAllowed];
         mendable.into_iter().find(|why| self.refused[*why as usize] > 0)
@@ -43,7 +44,7 @@ mod tests {
 
     use crate::{
         outcome::Rejection,
-        router::{LocalRoute, Outlet, Refused, Router},
+        router::{LocalRoute, MessageSink, Refused, Router},
         tid::{AppAddress, NodeAddress, Tid},
         wire::{Header, Kind, Message},
     };
@@ -52,19 +53,19 @@ mod tests {
     const PEER: NodeAddress = NodeAddress::new(0x7f00_0002);
     const MEMBER: AppAddress = AppAddress::new(0x1001);
 
-    /// Takes everything, or nothing.
+    /// Accepts everything, or nothing.
     struct Sink(Option<Rejection>);
 
-    impl Outlet for Sink {
+    impl MessageSink for Sink {
         fn submit(&self, message: Message) -> Result<(), Refused> {
             self.0.map_or(Ok(()), |why| Err(Refused::new(message, why)))
         }
     }
 
-    /// A node with a member here and at a peer, which take what they are sent or not.
+    /// A node with one member here and one at a peer; each accepts messages or rejects them for this reason.
     fn router(here: Option<Rejection>, there: Option<Rejection>) -> Router {
         let (router, group) = (Router::new(NODE), AppAddress::group("legs"));
-        router.set_local(MEMBER, LocalRoute { outlet: Arc::new(Sink(here)), events: Arc::new([]) });
+        router.set_local(MEMBER, LocalRoute { sink: Arc::new(Sink(here)), events: Arc::new([]) });
         router.set_member(group, MEMBER, true);
         router.set_peer(PEER, Arc::new(Sink(there)));
         router.set_remote_groups(PEER, &[group]);
@@ -76,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn a_copy_without_room_is_counted_where_another_was_taken() {
+    fn rejected_copy_is_counted_if_another_was_accepted() {
         for (here, there) in [(None, Some(Rejection::QueueFull)), (Some(Rejection::QueueFull), None)] {
             let router = router(here, there);
             assert_eq!(router.send(to_group()), Ok(()));
@@ -85,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_is_not_there_or_may_not_have_it_is_no_loss() {
+    fn absent_or_forbidden_member_is_no_loss() {
         for why in [Rejection::Closed, Rejection::Down, Rejection::NotAllowed] {
             let router = router(Some(why), None);
             assert_eq!(router.send(to_group()), Ok(()));
@@ -94,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn where_nobody_takes_one_the_sender_hears_what_it_can_mend() {
+    fn rejection_by_all_gives_the_remediable_reason() {
         let full = Some(Rejection::QueueFull);
         for (here, there, said) in [
             (full, full, Rejection::QueueFull),
@@ -110,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn a_group_without_a_member_that_is_there_is_no_error_and_no_refusal() {
+    fn group_without_present_members_is_no_error() {
         let router = router(Some(Rejection::Closed), Some(Rejection::Closed));
         assert_eq!(router.send(to_group()), Ok(()));
         router.remove_local(MEMBER);
@@ -119,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn a_group_of_a_node_that_is_not_known_is_refused() {
+    fn unknown_group_is_rejected() {
         let (router, unknown) = (router(None, None), NodeAddress::new(0x7f00_0003));
         let mut message = to_group();
         message.header.destination.node = unknown;
@@ -127,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn a_copy_of_what_another_node_sent_is_counted_too() {
+    fn copies_of_remote_messages_are_counted_too() {
         let router = router(Some(Rejection::QueueFull), None);
         assert_eq!(router.deliver(to_group()), Ok(()));
         assert_eq!(router.refused_because(), [(Rejection::QueueFull, 1)]);

@@ -1,8 +1,10 @@
-//! One confirmed message to many: a copy with a receipt for each member on this node, and one for each other node that has members.
+//! One confirmed message to many: a copy with a receipt for each member on this node, and one for each other
+//! node that has members.
 //!
-//! Each receipt holds the [`GroupSend`]. Its last one that is settled, or dropped, ends it: then the message's own receipt is settled. So a
-//! group send ends however its members, nodes and links end, and nothing of it is left. Other nodes report their members meanwhile, by
-//! messages that name the send; those that are open are in [`OpenSends`] for that, and the table has no further hold of them.
+//! Each receipt holds a reference to the [`GroupSend`]. It ends when its last receipt is settled or dropped:
+//! then the message's own receipt is settled. So a group send ends and is freed with any kind of end of its
+//! members, nodes and links. Meanwhile other nodes report their members by messages that name the send.
+//! [`OpenSends`] has weak references to the open sends for that.
 //!
 //! | rule | |
 //! | --- | --- |
@@ -17,39 +19,41 @@ use std::{
     sync::{Arc, Mutex, Weak},
 };
 
-use super::{Judge, Outlet, Refused, Router, Snapshot, copy_of, for_each_here, guard, tap};
+use super::{Judge, MessageSink, Refused, Router, Snapshot, copy_of, for_each_here, guard, tap};
 use crate::{
+    lock,
     outcome::{MemberReport, MemberState, Outcome, Receipt, ReceiptSink, Rejection, Ticket},
-    post::lock,
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wire::{Header, Message},
 };
 
-/// Members of this node that one confirmed message reaches at most. spec: FRAME-7.4
+/// Maximum number of members of this node that one confirmed message reaches. spec: FRAME-7.4
 const MEMBERS_HERE_MAX: usize = 256;
-/// Other nodes that one confirmed message reaches at most. spec: FRAME-7.4
+/// Maximum number of other nodes that one confirmed message reaches. spec: FRAME-7.4
 const NODES_MAX: usize = 256;
-/// Confirmed messages to many on other nodes that one application has open at most, each until its time to live is over. spec: FRAME-7.4
+/// Maximum number of open confirmed messages to many on other nodes, per application, each until its time to
+/// live ends. spec: FRAME-7.4
 const OPEN_OF_ONE_MAX: usize = 64;
 
 impl Router {
-    /// What the node at `from` reports of the members of the confirmed message to many that `ticket` names. spec: FRAME-7.3
+    /// Handles the reports of the node at `from` about members of the confirmed message to many of `ticket`.
+    /// spec: FRAME-7.3
     pub fn members_reported(&self, from: NodeAddress, ticket: Ticket, reports: &[MemberReport]) {
         self.group_sends.reported(from, ticket, reports);
     }
 
-    /// Confirmed messages to many that are open at other nodes.
+    /// Returns the number of confirmed messages to many that are open at other nodes.
     #[cfg(test)]
     fn open_group_sends(&self) -> usize {
         self.group_sends.len()
     }
 
-    /// One confirmed copy for each node that has a member, and one for each member here. spec: FRAME-7
+    /// Sends one confirmed copy to each node that has a member, and one to each member here. spec: FRAME-7
     pub(super) fn send_to_each(&self, snapshot: &Snapshot, message: Message) -> Result<(), Refused> {
         let Tid { node, app } = message.header.destination;
         let Snapshot { table, members } = snapshot;
-        let peers: Vec<(NodeAddress, &Arc<dyn Outlet>)> = if node == NodeAddress::ALL && app.is_group() {
+        let peers: Vec<(NodeAddress, &Arc<dyn MessageSink>)> = if node == NodeAddress::ALL && app.is_group() {
             let nodes = members.elsewhere.members(app).iter();
             nodes.filter_map(|node| Some((*node, table.peers.get(node)?))).collect()
         } else if node == NodeAddress::ALL {
@@ -74,7 +78,7 @@ impl Router {
         Ok(())
     }
 
-    /// A confirmed copy of what came from another node for each member here. spec: FRAME-7
+    /// Delivers a confirmed copy of a message from another node to each member here. spec: FRAME-7
     pub(super) fn deliver_to_each(
         &self,
         snapshot: &Snapshot,
@@ -87,7 +91,7 @@ impl Router {
         Ok(())
     }
 
-    /// The members of this node, but for the sender.
+    /// Returns the members of this node, except the sender.
     fn members_but(&self, snapshot: &Snapshot, header: &Header) -> Vec<AppAddress> {
         let mut here = Vec::new();
         for_each_here(snapshot, header.destination.app, |app, _| {
@@ -98,10 +102,10 @@ impl Router {
         here
     }
 
-    /// Takes the receipt of a message to many for its copies, and reports who has one.
+    /// Moves the receipt of a message to many into a group send, and reports the members that have a copy.
     ///
     /// # Errors
-    /// The message, with its receipt: there are too many. spec: FRAME-7.4
+    /// The message, with its receipt: it has too many members. spec: FRAME-7.4
     fn open_send(
         &self,
         mut message: Message,
@@ -125,7 +129,7 @@ impl Router {
         }
     }
 
-    /// A copy for each member on this node, except the sender itself.
+    /// Submits a copy to each member on this node, except the sender itself.
     fn submit_to_each(
         &self,
         snapshot: &Snapshot,
@@ -133,7 +137,7 @@ impl Router {
         message: &Message,
         send: &Arc<GroupSend>,
     ) {
-        for_each_here(snapshot, message.header.destination.app, |app, outlet| {
+        for_each_here(snapshot, message.header.destination.app, |app, sink| {
             let member = Tid::new(self.node, app);
             if member == message.header.source {
                 return;
@@ -142,13 +146,13 @@ impl Router {
                 if guard::refuses(guard, app, &message.header) {
                     return Err(Refused::new(copy, Rejection::NotAllowed));
                 }
-                outlet.submit(copy)
+                sink.submit(copy)
             });
             tap::saw_one_of_many(snapshot.table.tap.as_ref(), member, message, refused);
         });
     }
 
-    /// One copy, whose receipt says what becomes of it at `of`. One that is refused is settled so.
+    /// Submits one copy, with a receipt for its outcome at `of`. A rejected copy is settled as rejected.
     fn submit_copy(
         &self,
         message: &Message,
@@ -165,21 +169,21 @@ impl Router {
 /// One confirmed message to many, until all of its copies have ended.
 struct GroupSend {
     here: NodeAddress,
-    /// Other nodes that have a copy, in the order of their addresses.
+    /// The other nodes that have a copy, in the order of their addresses.
     nodes: Vec<NodeAddress>,
-    /// That of the message as a whole.
+    /// The receipt of the message as a whole.
     receipt: Option<Receipt>,
-    /// Where its other nodes find it.
+    /// The table in which other nodes' reports find this send.
     open: Option<Arc<OpenSends>>,
 }
 
 impl GroupSend {
-    /// A group send whose copies stay on this node.
+    /// Creates a group send with copies on this node only.
     fn within(here: NodeAddress, receipt: Receipt) -> Arc<Self> {
         Arc::new(Self { here, nodes: Vec::new(), receipt: Some(receipt), open: None })
     }
 
-    /// Reports all that have a copy: members on this node, and other nodes. spec: FRAME-7.1
+    /// Reports all copies: members on this node, and other nodes. spec: FRAME-7.1
     fn begin(&self, members: &[AppAddress]) {
         let members = members
             .iter()
@@ -189,21 +193,21 @@ impl GroupSend {
         self.report(&members.chain(nodes).chain([last]).collect::<Vec<_>>());
     }
 
-    /// The receipt of the copy for a member on this node, or for the members of another.
+    /// Creates the receipt of the copy for a member on this node, or for the members of another node.
     fn receipt(self: &Arc<Self>, of: Tid) -> Receipt {
         let ticket = self.ticket();
         let ticket = Ticket { source: ticket.source, destination: of, correlation: ticket.correlation };
         Receipt::new(self.clone(), ticket)
     }
 
-    /// What the node at `from` reports of its members. spec: FRAME-7.3
+    /// Handles the reports of the node at `from` about its members. spec: FRAME-7.3
     fn reported(&self, from: NodeAddress, reports: &[MemberReport]) {
         if self.nodes.binary_search(&from).is_err() {
             return;
         }
         let is_its_own = |report: &&MemberReport| {
             let Tid { node, app } = report.tid;
-            // The outcome of a node's copy is said by its own OUTCOME, or by the loss of the node.
+            // The outcome of a node's copy arrives with its own OUTCOME, or with the loss of the node.
             let is_of_node = app == AppAddress::NONE && report.state == MemberState::Listed;
             node == from && (is_of_node || report.tid.is_single())
         };
@@ -223,7 +227,7 @@ impl GroupSend {
     }
 }
 
-/// The outcome of one copy. spec: FRAME-7.2
+/// Reports the outcome of one copy. spec: FRAME-7.2
 impl ReceiptSink for GroupSend {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
         let Tid { node, .. } = ticket.destination;
@@ -247,21 +251,21 @@ impl Drop for GroupSend {
     }
 }
 
-/// Group sends of this node's applications that other nodes have copies of, by source and correlation.
+/// Open group sends of this node's applications with copies at other nodes, by source and correlation.
 #[derive(Default)]
 pub(super) struct OpenSends(Mutex<BTreeMap<(Tid, u64), Open>>);
 
 struct Open {
     send: Weak<GroupSend>,
-    /// When its time to live is over: then a member that hangs with its copy takes no room from later sends.
+    /// When its time to live ends: after that, a member that hangs with its copy takes no room from later sends.
     until: Time,
 }
 
 impl OpenSends {
-    /// A group send of which `nodes`, in the order of their addresses, have copies `until` then.
+    /// Opens a group send with copies at `nodes`, in the order of their addresses, `until` that time.
     ///
     /// # Errors
-    /// The receipt: its application has too many of them open at `now`, or one of this number. spec: FRAME-7.4
+    /// The receipt: its application has too many open at `now`, or one with this number. spec: FRAME-7.4
     fn open(
         self: &Arc<Self>,
         (here, nodes): (NodeAddress, Vec<NodeAddress>),
@@ -285,9 +289,9 @@ impl OpenSends {
         Ok(send)
     }
 
-    /// What the node at `from` reports of the members of the send that `ticket` names.
+    /// Handles the reports of the node at `from` about members of the send of `ticket`.
     fn reported(&self, from: NodeAddress, ticket: Ticket, reports: &[MemberReport]) {
-        // Not with the lock in hand: this may be the last hold of it, which closes it.
+        // Without the lock: this may be the last reference, and its drop closes the send.
         let send =
             lock(&self.0).get(&(ticket.source, ticket.correlation)).and_then(|open| open.send.upgrade());
         if let Some(send) = send {

@@ -1,7 +1,8 @@
-//! Who is in which group, as senders read it: a tree of which no part changes that somebody may read.
+//! The members of groups, as senders read them: an immutable tree that is copied on change.
 //!
-//! A change copies the members of its group and the way to them, and shares everything else with the tree before it: at most seven branches
-//! of 16 parts and one leaf of 16 groups, however many groups there are and whichever addresses they have. The root is swapped by the router.
+//! A change copies the members of its group and the path to them, and shares all other parts with the
+//! previous tree. It copies at most seven branches of 16 parts and one leaf of 16 groups, for any number of
+//! groups and any addresses. The router swaps the root.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -11,26 +12,26 @@ use std::{
 
 use crate::tid::AppAddress;
 
-/// Bits of an address that one branch looks at.
+/// Bits of an address per branch level.
 const BITS: u32 = 4;
-/// Parts of a branch. As many groups are in a leaf at most: below the last branch there are no more addresses than that.
+/// Parts of a branch. A leaf has at most as many groups: below the last branch there are no more addresses.
 const WIDTH: usize = 1 << BITS;
-/// A branch that has no more groups than this is a leaf again, so that what comes and goes leaves no branches behind.
+/// A branch with at most this many groups becomes a leaf again, so that removed groups leave no branches.
 const FEW: usize = WIDTH / 2;
 
 /// The members of each group that has any: applications of this node, or nodes.
 #[derive(Clone)]
 pub(super) struct Groups<M>(Arc<Part<M>>);
 
-/// A group with its members in their order, of which there is at least one.
+/// A group with its members in order, at least one.
 type Group<M> = (AppAddress, Arc<[M]>);
 
-/// Some of the groups: those whose addresses begin with the same bits.
+/// The groups with addresses that begin with the same bits.
 #[derive(Clone)]
 enum Part<M> {
     /// In the order of their addresses.
     Leaf(Vec<Group<M>>),
-    /// By the next bits of their addresses.
+    /// Indexed by the next bits of their addresses.
     Branch([Option<Arc<Self>>; WIDTH]),
 }
 
@@ -47,7 +48,7 @@ impl<M> Default for Part<M> {
 }
 
 impl<M: Copy + Ord> Groups<M> {
-    /// The members of `group`, in their order.
+    /// Returns the members of `group`, in order.
     pub(super) fn members(&self, group: AppAddress) -> &[M] {
         let (mut part, mut depth) = (&*self.0, 0);
         loop {
@@ -67,14 +68,14 @@ impl<M: Copy + Ord> Groups<M> {
         }
     }
 
-    /// Every group and its members, in the order of the groups' addresses.
+    /// Returns every group and its members, in the order of the groups' addresses.
     pub(super) fn all(&self) -> Vec<(AppAddress, Arc<[M]>)> {
         let mut all = Vec::new();
         self.0.put_into(&mut all);
         all
     }
 
-    /// Makes `member` one of `group`, of which it was none.
+    /// Adds `member` to `group`; it must not be a member.
     pub(super) fn join(&mut self, group: AppAddress, member: M) {
         let root = Arc::make_mut(&mut self.0);
         match root.members_mut(group, 0) {
@@ -83,12 +84,12 @@ impl<M: Copy + Ord> Groups<M> {
         }
     }
 
-    /// Takes `member` out of `group`, in which it was.
+    /// Removes `member` from `group`; it must be a member.
     pub(super) fn leave(&mut self, group: AppAddress, member: M) {
         let root = Arc::make_mut(&mut self.0);
         let Some(members) = root.members_mut(group, 0) else { return };
         let left = without(members, member);
-        // Whoever joins and leaves groups without end must not fill the table with empty ones.
+        // Endless joins and leaves of new groups must not fill the table with empty ones.
         if left.is_empty() {
             root.remove(group, 0);
         } else {
@@ -105,7 +106,7 @@ impl<M: Copy + Ord> Part<M> {
         }
     }
 
-    /// The members of `group`, to be replaced. The way to them is copied where somebody else may read it.
+    /// Returns the members of `group` for replacement. Copies the parts of the path that other references share.
     fn members_mut(&mut self, group: AppAddress, depth: u32) -> Option<&mut Arc<[M]>> {
         match self {
             Self::Leaf(groups) => {
@@ -119,7 +120,7 @@ impl<M: Copy + Ord> Part<M> {
         }
     }
 
-    /// Adds a group that is not there.
+    /// Adds a group that does not exist.
     fn add(&mut self, group: Group<M>, depth: u32) {
         match self {
             Self::Leaf(groups) => {
@@ -154,7 +155,7 @@ impl<M: Copy + Ord> Part<M> {
         }
     }
 
-    /// How many groups a leaf has; a branch has more than a few.
+    /// Returns the number of groups in a leaf; a branch has more than [`FEW`].
     const fn count_few(&self) -> usize {
         match self {
             Self::Leaf(groups) => groups.len(),
@@ -163,7 +164,7 @@ impl<M: Copy + Ord> Part<M> {
     }
 }
 
-/// Which part of a branch, so far down, `group` is in: the highest bits are looked at first.
+/// Returns the part of a branch at this depth that `group` is in: the highest bits come first.
 const fn slot(group: AppAddress, depth: u32) -> usize {
     (group.bits() << (BITS * depth) >> (u32::BITS - BITS)) as usize
 }
@@ -181,7 +182,7 @@ fn without<M: Copy + Ord>(members: &[M], member: M) -> Arc<[M]> {
     members.iter().copied().filter(|other| *other != member).collect()
 }
 
-/// The same from the other side: which groups each member is in. Writers alone have it.
+/// The reverse index: the groups of each member. Only writers have it.
 pub(super) struct Joined<M> {
     by_member: BTreeMap<M, BTreeSet<AppAddress>>,
     memberships: usize,
@@ -194,12 +195,13 @@ impl<M> Default for Joined<M> {
 }
 
 impl<M: Copy + Ord> Joined<M> {
-    /// How many memberships there are, of all in all groups.
+    /// Returns the number of memberships, of all members in all groups.
     pub(super) const fn memberships(&self) -> usize {
         self.memberships
     }
 
-    /// Makes `member` one of these groups and of no other: what it is in already is not touched. Returns whether anything changed.
+    /// Makes `member` a member of exactly these groups; existing memberships among them are not touched.
+    /// Returns whether anything changed.
     pub(super) fn set(&mut self, member: M, wanted: BTreeSet<AppAddress>, groups: &mut Groups<M>) -> bool {
         let before = self.by_member.remove(&member).unwrap_or_default();
         before.difference(&wanted).for_each(|group| groups.leave(*group, member));
@@ -212,7 +214,7 @@ impl<M: Copy + Ord> Joined<M> {
         changed
     }
 
-    /// Makes `member` one of `group`. Returns whether anything changed.
+    /// Adds `member` to `group`. Returns whether anything changed.
     pub(super) fn join(&mut self, group: AppAddress, member: M, groups: &mut Groups<M>) -> bool {
         let joins = self.by_member.entry(member).or_default().insert(group);
         if joins {
@@ -222,7 +224,7 @@ impl<M: Copy + Ord> Joined<M> {
         joins
     }
 
-    /// Takes `member` out of `group`. Returns whether anything changed.
+    /// Removes `member` from `group`. Returns whether anything changed.
     pub(super) fn leave(&mut self, group: AppAddress, member: M, groups: &mut Groups<M>) -> bool {
         let Some(own) = self.by_member.get_mut(&member) else { return false };
         let leaves = own.remove(&group);
@@ -244,7 +246,7 @@ mod tests {
     use super::*;
 
     const APP: AppAddress = AppAddress::new(0x1000);
-    /// The longest way to a group: of branches and the leaf.
+    /// The longest path to a group: branches and the leaf.
     const WAY_MAX: usize = 8;
     type Change = fn(&mut Groups<AppAddress>, AppAddress, AppAddress);
 
@@ -252,7 +254,7 @@ mod tests {
         AppAddress::new(0xf000_0000 + number)
     }
 
-    /// Where the parts are in memory, and where the members are.
+    /// Memory addresses of the parts, and of the member lists.
     #[derive(Default)]
     struct Places {
         parts: BTreeSet<usize>,
@@ -276,7 +278,7 @@ mod tests {
             }
         }
 
-        /// Parts, and members of groups, that the tree before does not have.
+        /// Counts the parts, and the member lists, that the tree before does not have.
         fn copied_since(&self, before: &Self) -> (usize, usize) {
             let parts = self.parts.difference(&before.parts).count();
             (parts, self.members.difference(&before.members).count())
@@ -284,15 +286,15 @@ mod tests {
     }
 
     #[test]
-    fn a_change_copies_the_way_to_its_group_and_shares_all_others_with_who_reads_the_tree_before() {
-        // Given: many groups, whose addresses are strewn or follow one another
+    fn change_copies_only_the_path_to_its_group() {
+        // Given: many groups, with scattered or consecutive addresses
         let strewn = (0..4_096).map(|number| AppAddress::group(&format!("group {number}")));
         for addresses in [strewn.collect::<BTreeSet<_>>(), (0..4_096).map(group).collect()] {
             let mut groups = Groups::default();
             addresses.iter().for_each(|group| groups.join(*group, APP));
             for changed in addresses.iter().step_by(397) {
                 let (before, other) = (groups.clone(), AppAddress::new(0x1001));
-                // When: somebody joins and leaves one that is there, and it comes and goes
+                // When: an application joins and leaves an existing group, and a group is added and removed
                 let changes: [(&str, Change); 3] = [
                     ("join", |groups, group, other| groups.join(group, other)),
                     ("leave", |groups, group, other| groups.leave(group, other)),
@@ -314,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn what_comes_and_goes_leaves_no_branches_behind() {
+    fn removed_groups_leave_no_branches() {
         let mut groups = Groups::default();
         (0..1_000).for_each(|number| groups.join(group(number), APP));
         (1..1_000).for_each(|number| groups.leave(group(number), APP));
@@ -324,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn members_are_in_their_order_and_groups_in_that_of_their_addresses() {
+    fn members_and_groups_are_in_order() {
         let mut groups = Groups::default();
         for number in [40, 3, 7, 39, 3_000_000] {
             for app in [0x1002, 0x1000, 0x1001] {
@@ -345,7 +347,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn it_says_what_a_plain_table_says(steps in prop::collection::vec((some_group(), 0..4_u32, any::<bool>()), 0..600)) {
+        fn tree_agrees_with_a_plain_table(steps in prop::collection::vec((some_group(), 0..4_u32, any::<bool>()), 0..600)) {
             let (mut groups, mut joined) = (Groups::default(), Joined::default());
             let mut plain = BTreeSet::new();
             for (group, app, joins) in steps {
@@ -362,7 +364,7 @@ mod tests {
             let all = groups.all();
             let told = all.iter().flat_map(|(group, members)| members.iter().map(|app| (*group, *app)));
             prop_assert_eq!(told.collect::<BTreeSet<_>>(), plain.clone());
-            // Whoever goes is in no group any more.
+            // An application that leaves is in no group any more.
             joined.set(APP, BTreeSet::new(), &mut groups);
             plain.retain(|(_, app)| *app != APP);
             prop_assert_eq!(joined.memberships(), plain.len());

@@ -1,7 +1,8 @@
-//! Who may send what to whom, asked where every route to an application of this node ends.
+//! The access check of messages, at the end of every route to an application of this node.
 //!
-//! A [`Guard`] stands in the routing table itself, which every sender reads anyway: while there is none, a message costs one look at a
-//! pointer. What comes from other nodes, from other processes and from this one is asked the same question at the same place.
+//! A [`Guard`] is stored in the routing table itself, which every sender reads anyway: without one, a message
+//! costs one read of a pointer. Messages from other nodes, from other processes and from this process pass
+//! the same check at the same place.
 
 use std::sync::Arc;
 
@@ -10,31 +11,33 @@ use crate::{
     wire::{Flags, Header},
 };
 
-/// Whoever decides. It is called on the thread of whoever sends, for every message, so it neither waits nor holds a lock for long.
+/// The access check. It is called on the sending thread, for every message, so it must not block or hold a
+/// lock for long.
 pub trait Guard: Send + Sync {
-    /// Whether what this header says may reach the application of this node at `target`; its destination may be a group that the
-    /// application is a member of, or every application. It is told of each message once for each target, and of one that found a full
-    /// queue each time that it is offered again.
+    /// Returns whether the message of this header may reach the application of this node at `target`. Its
+    /// destination may be a group of the application, or every application. It is called once for each target
+    /// of a message, and again each time that a message is offered again after a full queue.
     fn allows(&self, header: &Header, target: AppAddress) -> bool;
 
-    /// An application of this node sends this question to one application; said before anybody can answer it.
+    /// Reports that an application of this node sends a request to one application; called before the request
+    /// can be answered.
     fn asks(&self, header: &Header);
 }
 
-/// Whether what this header says may not reach `target`.
+/// Returns whether the message of this header must not reach `target`.
 ///
-/// What layers say, and what is said to them, is their protocols' business.
+/// Messages from and to layers are checked by their protocols.
 #[inline]
 pub(super) fn refuses(guard: Option<&Arc<dyn Guard>>, target: AppAddress, header: &Header) -> bool {
     guard.is_some_and(|guard| is_guarded(header, target) && !guard.allows(header, target))
 }
 
-/// Whether a guard is asked at all.
+/// Returns whether the message is subject to a guard.
 const fn is_guarded(header: &Header, target: AppAddress) -> bool {
     header.kind.is_user() && !target.is_layer()
 }
 
-/// Tells the guard of a question, if it is one.
+/// Reports a request to the guard, if the message is one.
 #[inline]
 pub(super) fn note(guard: Option<&Arc<dyn Guard>>, header: &Header) {
     if let Some(guard) = guard
@@ -53,7 +56,7 @@ mod tests {
     use super::*;
     use crate::{
         outcome::Rejection,
-        router::{LocalRoute, Outlet, Refused, Router},
+        router::{LocalRoute, MessageSink, Refused, Router},
         tid::{NodeAddress, Tid},
         wire::{Kind, Message},
     };
@@ -63,13 +66,14 @@ mod tests {
 
     struct Sink;
 
-    impl Outlet for Sink {
+    impl MessageSink for Sink {
         fn submit(&self, _: Message) -> Result<(), Refused> {
             Ok(())
         }
     }
 
-    /// Says the same of everything, and sees to it that nobody has another hold of the application's route than before.
+    /// Returns the same verdict for everything, and checks that the application's route has no additional
+    /// owner.
     struct Same {
         allows: bool,
         route: Arc<Sink>,
@@ -86,10 +90,10 @@ mod tests {
     }
 
     #[test]
-    fn one_message_is_judged_by_another_guard_without_a_copy_of_the_table() {
+    fn replaced_guard_applies_without_copying_the_table() {
         let (router, route) = (Router::new(NODE), Arc::new(Sink));
-        router.set_local(HEIR, LocalRoute { outlet: route.clone(), events: Arc::new([]) });
-        // Here, in the guard, and in the table that is read.
+        router.set_local(HEIR, LocalRoute { sink: route.clone(), events: Arc::new([]) });
+        // Here, in the guard, and in the table that senders read.
         let guard = |allows| Arc::new(Same { allows, route: route.clone(), held: 3 }) as Arc<dyn Guard>;
         let to = |app| {
             let header = Header::new(Kind::named("test.will"), Tid::NONE, Tid::new(NODE, app));

@@ -1,8 +1,8 @@
-//! Seeing what passes the routing table, while somebody watches.
+//! Observation of messages at the routing table, while there is an observer.
 //!
-//! A [`Tap`] stands in the table itself, which every sender reads anyway: while there is none, a message costs one look at a pointer
-//! that lies beside the table's root. It sees what is handed over in the node's process, which is all but what goes over the direct
-//! links between other processes.
+//! A [`Tap`] is stored in the table itself, which every sender reads anyway: without one, a message costs one
+//! read of a pointer beside the table's root. It sees the messages that are handed over in the node's
+//! process. Those on direct links between other processes are not seen.
 
 use std::sync::Arc;
 
@@ -15,48 +15,48 @@ use crate::{
     wire::{Header, Message},
 };
 
-/// Whoever watches. It is called on the thread of whoever sends, so it never waits.
+/// An observer of messages. It is called on the sending thread, so it must never block.
 pub trait Tap: Send + Sync {
-    /// Whether anybody watches what this application sends or gets.
+    /// Returns whether messages from or to this application are observed.
     fn watches(&self, app: Tid) -> bool;
 
-    /// A message from or for an application that is watched was handed over, or not.
+    /// Receives a message from or to an observed application, which was accepted or rejected.
     fn saw(&self, app: Tid, passage: &Passage<'_>);
 }
 
-/// A message that was handed over, or not.
+/// A message that was accepted or rejected.
 #[derive(Clone, Copy, Debug)]
 pub struct Passage<'a> {
-    /// Which way, as its application sees it.
+    /// The direction, from the application's side.
     pub way: Way,
-    /// Its header.
+    /// The header of the message.
     pub header: &'a Header,
-    /// Its payload.
+    /// The payload of the message.
     pub payload: &'a Bytes,
-    /// Why it was not taken; `None` if a queue or a connection has it.
+    /// The reason of the rejection; `None` if a queue or a connection accepted the message.
     pub refused: Option<Rejection>,
 }
 
-/// Which way a message goes.
+/// The direction of a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Way {
     /// To the application.
     In,
-    /// From it.
+    /// From the application.
     Out,
 }
 
-/// What is kept of a message, to be shown when it is known what became of it.
+/// The parts of a message that are kept until its result is known.
 #[derive(Debug)]
-pub(super) struct Look {
+pub(super) struct ObservedMessage {
     header: Header,
     payload: Bytes,
     source: bool,
     target: bool,
 }
 
-impl Look {
-    /// `None` if nobody watches either end, or it is no application's message.
+impl ObservedMessage {
+    /// Returns `None` if neither end is observed, or if it is no application's message.
     fn at(tap: &dyn Tap, message: &Message) -> Option<Self> {
         let Header { source, destination, kind, .. } = message.header;
         let (is_out, is_in) = (tap.watches(source), tap.watches(destination));
@@ -81,8 +81,8 @@ impl Look {
     }
 }
 
-/// Hands a message to one outlet, and shows it to whoever watches. One that is refused for want of room and will be offered again is
-/// shown then.
+/// Hands a message to one sink, and reports it to the observer. A message that is rejected for lack of room
+/// and will be offered again is reported at that later time.
 #[inline]
 pub(super) fn hand_over(
     tap: Option<&Arc<dyn Tap>>,
@@ -91,28 +91,28 @@ pub(super) fn hand_over(
     take: impl FnOnce(Message) -> Result<(), Refused>,
 ) -> Result<(), Refused> {
     let Some(tap) = tap else { return take(message) };
-    hand_over_watched(&**tap, message, is_offer, take)
+    hand_over_observed(&**tap, message, is_offer, take)
 }
 
 #[cold]
-fn hand_over_watched(
+fn hand_over_observed(
     tap: &dyn Tap,
     message: Message,
     is_offer: bool,
     take: impl FnOnce(Message) -> Result<(), Refused>,
 ) -> Result<(), Refused> {
-    let look = Look::at(tap, &message);
+    let observed = ObservedMessage::at(tap, &message);
     let result = take(message);
     let refused = result.as_ref().err().map(|refused| refused.why);
-    if let Some(look) = look
+    if let Some(observed) = observed
         && !(is_offer && refused == Some(Rejection::QueueFull))
     {
-        look.show(tap, refused);
+        observed.show(tap, refused);
     }
     result
 }
 
-/// One message to many, as its sender sees it: once.
+/// Reports one message to many for its sender, once.
 pub(super) fn saw_sent_to_many(tap: Option<&Arc<dyn Tap>>, message: &Message) {
     let Some(tap) = tap else { return };
     if message.header.kind.is_user() && tap.watches(message.header.source) {
@@ -121,7 +121,7 @@ pub(super) fn saw_sent_to_many(tap: Option<&Arc<dyn Tap>>, message: &Message) {
     }
 }
 
-/// One message to many, as one of them sees it.
+/// Reports one message to many for one of its members.
 pub(super) fn saw_one_of_many(
     tap: Option<&Arc<dyn Tap>>,
     member: Tid,
@@ -141,8 +141,8 @@ mod tests {
 
     use super::*;
     use crate::{
-        post::lock,
-        router::{LocalRoute, Outlet, Router},
+        lock,
+        router::{LocalRoute, MessageSink, Router},
         tid::{AppAddress, NodeAddress},
         wire::{Kind, Message},
     };
@@ -151,12 +151,12 @@ mod tests {
     const WATCHED: AppAddress = AppAddress::new(0x1001);
     const OTHER: AppAddress = AppAddress::new(0x1002);
 
-    /// Takes all but for one kind, of which it says that there is no room.
+    /// Accepts all kinds except one, which it rejects for lack of room.
     struct Picky;
 
     const FULL: Kind = Kind::named("test.full");
 
-    impl Outlet for Picky {
+    impl MessageSink for Picky {
         fn submit(&self, message: Message) -> Result<(), Refused> {
             if message.header.kind == FULL {
                 Err(Refused::new(message, Rejection::QueueFull))
@@ -183,7 +183,7 @@ mod tests {
     fn router() -> (Router, Arc<Notes>) {
         let router = Router::new(NODE);
         for app in [WATCHED, OTHER] {
-            router.set_local(app, LocalRoute { outlet: Arc::new(Picky), events: Arc::new([]) });
+            router.set_local(app, LocalRoute { sink: Arc::new(Picky), events: Arc::new([]) });
         }
         let notes = Arc::new(Notes::default());
         router.set_tap(Some(notes.clone()));
@@ -195,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn what_an_application_gets_and_sends_is_seen_with_what_becomes_of_it_and_nothing_of_others() {
+    fn tap_sees_messages_of_its_app_with_results() {
         let (router, notes) = router();
         let any = Kind::named("test.any");
         let nobody = AppAddress::new(0x1fff);
@@ -204,7 +204,7 @@ mod tests {
         router.send(message(FULL, WATCHED, OTHER)).expect_err("it is full");
         router.send(message(any, WATCHED, nobody)).expect_err("nobody is there");
         router.deliver(message(any, OTHER, WATCHED)).expect("it is taken");
-        // Layers' own words are none of the watcher's.
+        // Messages of the layers are not seen by the watcher.
         router.send(message(Kind::OUTCOME, OTHER, WATCHED)).expect("it is taken");
         let seen = std::mem::take(&mut *lock(&notes.0));
         assert_eq!(
@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_offered_again_and_again_is_seen_when_it_is_taken() {
+    fn retried_message_is_seen_when_it_is_accepted() {
         let (router, notes) = router();
         let refused = router.offer(message(FULL, OTHER, WATCHED), None).expect_err("it is full");
         let mut again = refused.message;
@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn a_message_to_a_group_is_seen_once_by_who_watches_its_source_or_a_member() {
+    fn group_message_is_seen_once_by_source_or_member() {
         let (router, notes) = router();
         let group = AppAddress::group("knees");
         for app in [WATCHED, OTHER] {

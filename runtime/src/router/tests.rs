@@ -1,4 +1,4 @@
-//! Who gets what is sent to a group, and what it costs to join one.
+//! The receivers of messages to a group, and the cost of a join.
 
 use bytes::Bytes;
 
@@ -11,11 +11,11 @@ const OTHER: NodeAddress = NodeAddress::new(0x7f00_0003);
 const DRIVES: AppAddress = AppAddress::group("drives");
 const LEGS: AppAddress = AppAddress::group("legs");
 
-/// Counts what it is sent.
+/// Counts its messages.
 #[derive(Default)]
 struct Sink(AtomicU64);
 
-impl Outlet for Sink {
+impl MessageSink for Sink {
     fn submit(&self, _: Message) -> Result<(), Refused> {
         self.0.fetch_add(1, Ordering::Relaxed);
         Ok(())
@@ -26,12 +26,12 @@ fn app(number: u32) -> AppAddress {
     AppAddress::new(0x1000 + number)
 }
 
-/// A router with so many applications, each with its sink.
+/// A router with this many applications, each with its sink.
 fn router(apps: u32) -> (Router, Vec<Arc<Sink>>) {
     let router = Router::new(NODE);
     let sinks: Vec<_> = (0..apps).map(|_| Arc::new(Sink::default())).collect();
     for (number, sink) in (0..).zip(&sinks) {
-        router.set_local(app(number), LocalRoute { outlet: sink.clone(), events: Arc::new([]) });
+        router.set_local(app(number), LocalRoute { sink: sink.clone(), events: Arc::new([]) });
     }
     (router, sinks)
 }
@@ -46,7 +46,7 @@ fn got(sinks: &[Arc<Sink>]) -> Vec<u64> {
 }
 
 #[test]
-fn who_joins_and_leaves_copies_no_route_and_no_other_group() {
+fn join_and_leave_copy_only_their_group() {
     // Given
     let (router, _) = router(3);
     router.set_member(LEGS, app(0), true);
@@ -57,7 +57,7 @@ fn who_joins_and_leaves_copies_no_route_and_no_other_group() {
     // Then
     assert!(Arc::ptr_eq(&routes, &router.snapshot.load().table));
     assert!(Arc::ptr_eq(&legs[0].1, &router.groups_with_members()[0].1));
-    // And: what changes nothing replaces nothing
+    // And: a change without effect replaces nothing
     let members = router.snapshot.load_full();
     assert!(!router.set_member(LEGS, app(0), true) && !router.set_member(DRIVES, app(0), false));
     router.set_remote_groups(PEER, &[LEGS, DRIVES]);
@@ -65,7 +65,7 @@ fn who_joins_and_leaves_copies_no_route_and_no_other_group() {
 }
 
 #[test]
-fn a_group_reaches_its_members_here_and_elsewhere_as_they_come_and_go() {
+fn group_reaches_present_members_here_and_elsewhere() {
     let (router, sinks) = router(3);
     let peers = [PEER, OTHER].map(|node| {
         let sink = Arc::new(Sink::default());
@@ -92,7 +92,7 @@ fn a_group_reaches_its_members_here_and_elsewhere_as_they_come_and_go() {
 }
 
 #[test]
-fn what_a_message_reaches_is_known_before_it_is_sent() {
+fn reach_of_a_message_is_known_before_sending() {
     let (router, _) = router(3);
     for peer in [PEER, OTHER] {
         router.set_peer(peer, Arc::new(Sink::default()));
@@ -115,22 +115,22 @@ fn what_a_message_reaches_is_known_before_it_is_sent() {
 }
 
 #[test]
-fn who_has_an_address_next_is_in_no_group_of_the_one_before() {
+fn reused_address_is_in_no_group_of_its_predecessor() {
     let (router, sinks) = router(1);
     [DRIVES, LEGS].into_iter().for_each(|group| assert!(router.set_member(group, app(0), true)));
     assert_eq!(router.memberships(), 2);
     router.remove_local(app(0));
     assert_eq!((router.groups(), router.memberships()), (Vec::new(), 0));
-    router.set_local(app(0), LocalRoute { outlet: sinks[0].clone(), events: Arc::new([]) });
+    router.set_local(app(0), LocalRoute { sink: sinks[0].clone(), events: Arc::new([]) });
     assert_eq!(router.send(to(DRIVES)), Ok(()));
     assert_eq!(got(&sinks), [0]);
     assert!(!router.is_member(DRIVES, app(0)));
 }
 
 #[test]
-fn whom_many_are_is_told_as_a_message_to_them_goes() {
+fn members_are_listed_as_a_message_reaches_them() {
     let (router, _) = router(3);
-    let layer = LocalRoute { outlet: Arc::new(Sink::default()), events: Arc::new([]) };
+    let layer = LocalRoute { sink: Arc::new(Sink::default()), events: Arc::new([]) };
     router.set_local(AppAddress::SYNC, layer);
     [2, 0, 9].into_iter().for_each(|number| assert!(router.set_member(DRIVES, app(number), true)));
     assert_eq!(router.members(DRIVES), [app(0), app(2)], "one that is not there gets nothing");
@@ -140,12 +140,12 @@ fn whom_many_are_is_told_as_a_message_to_them_goes() {
     assert!(router.is_member(DRIVES, app(2)) && !router.is_member(DRIVES, app(1)));
 }
 
-/// One member hands over to another, again and again, and nobody who sends ever finds the group empty.
+/// One member hands over to another, again and again, and a sender never finds the group empty.
 #[test]
-fn whoever_sends_while_members_and_routes_change_reaches_somebody() {
+fn send_during_member_changes_reaches_a_member() {
     let router = Arc::new(Router::new(NODE));
-    let sink: Arc<dyn Outlet> = Arc::new(Sink::default());
-    let route = || LocalRoute { outlet: sink.clone(), events: Arc::new([]) };
+    let sink: Arc<dyn MessageSink> = Arc::new(Sink::default());
+    let route = || LocalRoute { sink: sink.clone(), events: Arc::new([]) };
     router.set_local(app(0), route());
     router.set_member(LEGS, app(0), true);
     let sender = std::thread::spawn({

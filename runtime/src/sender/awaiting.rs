@@ -1,4 +1,4 @@
-//! What a sender waits for: the outcome of a confirmed message, or the reply to a request, each with its deadline.
+//! Futures of a sender: the outcome of a confirmed message, or the reply to a request, each with its deadline.
 
 use std::{
     marker::PhantomData,
@@ -17,7 +17,7 @@ use crate::{
     wire::Payload,
 };
 
-/// A request whose reply is awaited.
+/// A request with a pending reply.
 pub(super) struct Request {
     pub(super) router: Arc<Router>,
     pub(super) ticket: Ticket,
@@ -29,8 +29,8 @@ impl std::fmt::Debug for Request {
     }
 }
 
-/// A wait with its deadline, which counts from the send. The timer is made at the first poll: by the runtime of the thread
-/// that polls, and where there is none by one that is kept for that.
+/// A wait with its deadline, which counts from the send. The timer is created at the first poll, by the
+/// runtime of the polling thread. On a thread without a runtime it is created by a shared runtime for timers.
 #[derive(Debug)]
 pub(super) struct Deadline {
     wait: Wait,
@@ -43,7 +43,7 @@ impl Deadline {
         Self { wait, until, timer: None }
     }
 
-    /// What came, or `None` at the deadline.
+    /// Polls the wait. Returns its result, or `None` at the deadline.
     fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Option<Settlement>> {
         if let Poll::Ready(settlement) = self.wait.poll_settled(cx) {
             return Poll::Ready(Some(settlement));
@@ -55,7 +55,7 @@ impl Deadline {
             }
             self.timer = clock::sleep(self.until.since(now));
         }
-        // Where there is no timer nobody can say when the deadline is: it is now.
+        // Without a timer the deadline cannot be detected, so the wait ends now.
         if let Some(timer) = &mut self.timer {
             ready!(timer.as_mut().poll(cx));
         }
@@ -63,8 +63,8 @@ impl Deadline {
     }
 }
 
-/// The future outcome of a confirmed message. Any thread may poll it, with any executor; in a runtime of tokio's, one whose
-/// time is enabled.
+/// The future outcome of a confirmed message. Any thread may poll it, with any executor. A tokio runtime that
+/// polls it must have its time enabled.
 ///
 /// # Examples
 ///
@@ -80,7 +80,7 @@ impl Deadline {
 /// }
 /// ```
 #[derive(Debug)]
-#[must_use = "an outcome that nobody reads is no better than an unconfirmed send"]
+#[must_use = "an outcome that is not read is no better than an unconfirmed send"]
 pub struct Confirmation(Deadline);
 
 impl Confirmation {
@@ -100,8 +100,8 @@ impl Future for Confirmation {
     }
 }
 
-/// The future outcomes of a confirmed message to many, one for each member, in the order of their TIDs. Any thread may poll it, with any
-/// executor; in a runtime of tokio's, one whose time is enabled.
+/// The future outcomes of a confirmed message to many, one for each member, in the order of their TIDs. Any
+/// thread may poll it, with any executor. A tokio runtime that polls it must have its time enabled.
 ///
 /// # Examples
 ///
@@ -118,7 +118,7 @@ impl Future for Confirmation {
 /// }
 /// ```
 #[derive(Debug)]
-#[must_use = "outcomes that nobody reads are no better than an unconfirmed send"]
+#[must_use = "outcomes that are not read are no better than an unconfirmed send"]
 pub struct GroupConfirmation(Deadline);
 
 impl GroupConfirmation {
@@ -139,11 +139,11 @@ impl Future for GroupConfirmation {
     }
 }
 
-/// The future reply to a request. Any thread may poll it, with any executor; in a runtime of tokio's, one whose time is
-/// enabled.
+/// The future reply to a request. Any thread may poll it, with any executor. A tokio runtime that polls it
+/// must have its time enabled.
 ///
-/// Dropping it before it has ended gives the request up: where it still waits for its handler it is taken back, on any node, and
-/// a handler that has begun can [see](super::Sender::is_wanted) it.
+/// Dropping it before it has ended cancels the request. A request that still waits for its handler is
+/// cancelled, on any node. A handler that has begun can [detect](super::Sender::is_wanted) the cancellation.
 ///
 /// # Examples
 ///
@@ -159,11 +159,11 @@ impl Future for GroupConfirmation {
 /// }
 /// ```
 #[derive(Debug)]
-#[must_use = "a reply that nobody reads need not be asked for"]
+#[must_use = "a reply that is not read need not be requested"]
 pub struct Reply<R> {
     deadline: Deadline,
     within: Duration,
-    /// `None` once this has ended.
+    /// `None` after the future has ended.
     request: Option<Request>,
     reply: PhantomData<fn() -> R>,
 }
@@ -173,7 +173,7 @@ impl<R> Reply<R> {
         Self { deadline, within, request: Some(request), reply: PhantomData }
     }
 
-    /// The number of the request: the `correlation` in its header, by which its sender tells it from its others.
+    /// Returns the number of the request: the `correlation` in its header, unique among the requests of its sender.
     #[must_use]
     pub const fn correlation(&self) -> u64 {
         self.deadline.wait.correlation()
@@ -185,7 +185,7 @@ impl<R: Payload> Future for Reply<R> {
 
     fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Self::Output> {
         let settled = ready!(self.deadline.poll(cx));
-        // At its deadline it expires where it waits, by itself.
+        // At its deadline the queued request expires without a cancellation.
         self.request = None;
         Poll::Ready(match settled {
             Some(Settlement::Reply(message)) => message.decode().map_err(AskError::from),

@@ -1,4 +1,4 @@
-//! One builder for all messages that an application of a node's process sends.
+//! One builder for all messages that applications in a node's process send.
 
 use std::{fmt, time::Duration};
 
@@ -13,10 +13,11 @@ use crate::{
     wire::{Class, Flags, Message, MessageBuffer, Payload},
 };
 
-/// A message to be sent: made by [`Sender::message`], [`AppContext::message`](crate::app::AppContext::message) or [`Sender::loaned`].
+/// A message to send: made by [`Sender::message`], [`AppContext::message`](crate::app::AppContext::message)
+/// or [`Sender::loaned`].
 ///
-/// What it does not say is as its type says. It is sent by [`send`](Self::send), [`confirmed`](Self::confirmed),
-/// [`confirmed_by_each`](Self::confirmed_by_each) or [`ask`](Self::ask), and not before.
+/// Terms that are not set have the defaults of the type. The message is sent only by [`send`](Self::send),
+/// [`confirmed`](Self::confirmed), [`confirmed_by_each`](Self::confirmed_by_each) or [`ask`](Self::ask).
 ///
 /// # Examples
 ///
@@ -34,7 +35,7 @@ pub struct MessageBuilder<V, C> {
     pub(crate) terms: Terms,
 }
 
-/// What one call says of its message, beside what its type says.
+/// The terms of one message that differ from the defaults of its type.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Terms {
     class: Option<Class>,
@@ -48,9 +49,9 @@ pub struct Value<'a, P> {
     pub(crate) value: &'a P,
 }
 
-/// What sends: a [`Sender`], or the context of an application.
+/// The sender of a message: a [`Sender`], or the context of an application.
 pub trait Via {
-    /// The sending side.
+    /// Returns the sending side.
     fn sender(&self) -> &Sender;
 }
 
@@ -60,12 +61,12 @@ impl Via for &Sender {
     }
 }
 
-/// What is sent: a [`Value`], or a [`MessageBuffer`].
+/// The content of a message: a [`Value`], or a [`MessageBuffer`].
 pub trait Content {
-    /// The message from `sender`.
+    /// Builds the message from `sender`.
     ///
     /// # Errors
-    /// The destination is not known, or the payload cannot be sealed.
+    /// The destination is unknown, or the payload cannot be sealed.
     fn into_message(self, sender: &Sender) -> Result<Message, SendError>;
 }
 
@@ -92,7 +93,7 @@ impl<V, C> MessageBuilder<V, C> {
         Self { via, content, terms: Terms { class: None, expires_after: None } }
     }
 
-    /// The class in which it travels, instead of its type's.
+    /// Sets the class of the message, instead of its type's class.
     ///
     /// # Examples
     ///
@@ -111,8 +112,9 @@ impl<V, C> MessageBuilder<V, C> {
         self
     }
 
-    /// Has it expire where it waits when it is older than this, instead of its type's [`TIME_TO_LIVE`](Payload::TIME_TO_LIVE). At most
-    /// [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s: a longer time counts as that.
+    /// Sets the age at which the message expires while it is queued, instead of its type's
+    /// [`TIME_TO_LIVE`](Payload::TIME_TO_LIVE). At most [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX),
+    /// 71 minutes and 35 s: a longer time counts as that.
     ///
     /// # Examples
     ///
@@ -138,7 +140,7 @@ impl Terms {
             message.header.class = class;
         }
         if let Some(time) = self.expires_after {
-            // An unconfirmed message is not waited for.
+            // No wait depends on the time to live of an unconfirmed message.
             let _ = message.header.set_time_to_live(time);
         }
     }
@@ -152,10 +154,10 @@ impl<V: Via, C: Content> MessageBuilder<V, C> {
         Ok((via, message))
     }
 
-    /// Sends it, and does not ask what becomes of it. Returns when a queue or a socket has taken it.
+    /// Sends the message without a confirmation. Returns when a queue or a socket has accepted it.
     ///
     /// # Errors
-    /// No queue and no socket took it.
+    /// No queue and no socket accepted the message.
     pub fn send(self) -> Result<(), SendError> {
         let (via, message) = self.message()?;
         via.sender().dispatch(message).map(drop)
@@ -184,17 +186,18 @@ impl<V: Via, C: Content> MessageBuilder<V, C> {
     fn confirmable(self) -> Result<(V, Message), SendError> {
         let (via, message) = self.message()?;
         if message.header.class == Class::Stream {
-            // Newest wins, so an older one has no fate of its own.
+            // Newer values replace older ones, so an older one has no outcome of its own.
             return Err(Rejection::Unsupported.into());
         }
         Ok((via, message))
     }
 
-    /// Sends it as a request, in class Control; the returned future ends with the reply, an error, or at the deadline. A longer `within` than
-    /// [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s, counts as that.
+    /// Sends the message as a request, in class Control. The returned future ends with the reply, an error,
+    /// or at the deadline. A longer `within` than [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX), 71
+    /// minutes and 35 s, counts as that.
     ///
     /// # Errors
-    /// No queue and no socket took it. The future's own errors are [`AskError`](super::AskError)s.
+    /// No queue and no socket accepted the message. The future's own errors are [`AskError`](super::AskError)s.
     ///
     /// # Examples
     ///
@@ -232,13 +235,16 @@ impl<V: Via, C: Content> MessageBuilder<V, C> {
 }
 
 impl<C: Content> MessageBuilder<&Sender, C> {
-    /// Sends it, and asks what becomes of it: the returned future ends in exactly one [`Outcome`](crate::outcome::Outcome). The message
-    /// expires where it waits once it is older than `within`. The future ends as [`Outcome::Unknown`](crate::outcome::Outcome::Unknown) when
-    /// no outcome has come by then, whenever it is polled first. No message lives longer than
-    /// [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s: a longer `within` counts as that.
+    /// Sends the message and requests a confirmation. The returned future ends in exactly one
+    /// [`Outcome`](crate::outcome::Outcome). A queued message expires when it is older than `within`. If no
+    /// outcome has arrived by then, the future ends as
+    /// [`Outcome::Unknown`](crate::outcome::Outcome::Unknown), independent of its first poll. No message
+    /// lives longer than [`TIME_TO_LIVE_MAX`](crate::wire::TIME_TO_LIVE_MAX), 71 minutes and 35 s: a longer
+    /// `within` counts as that.
     ///
     /// # Errors
-    /// No queue and no socket took it, it is of class Stream, or it is for more than one application ([`SendError::ToMany`]).
+    /// No queue and no socket accepted the message, it is of class Stream, or its destination is more than
+    /// one application ([`SendError::ToMany`]).
     ///
     /// # Examples
     ///
@@ -256,13 +262,16 @@ impl<C: Content> MessageBuilder<&Sender, C> {
         self.confirm(within).map(|(_, confirmation)| confirmation)
     }
 
-    /// Sends it to a group, to every application ([`Tid::BROADCAST`]) or to an address on all nodes, and asks what becomes of it at each member.
-    /// The returned future ends with one [`MemberOutcome`](crate::outcome::MemberOutcome) for each member that is known when the message
-    /// arrives at its node, without the sender: as soon as the last one is settled, and at the latest `within` this time. A member that has
-    /// no outcome by then has [`Outcome::Unknown`](crate::outcome::Outcome::Unknown), as have all members of a node that is lost. A node that
-    /// has not named its members has one entry for them. A group without members gives an empty list.
+    /// Sends the message and requests a confirmation from each member. The destination is a group, every
+    /// application ([`Tid::BROADCAST`]) or one address on all nodes. The returned future ends with one
+    /// [`MemberOutcome`](crate::outcome::MemberOutcome) for each member that is known when the message
+    /// arrives at its node, without the sender. It ends when the last member is settled, and at the latest
+    /// `within` this time. A member without an outcome by then has
+    /// [`Outcome::Unknown`](crate::outcome::Outcome::Unknown), as do all members of a lost node. A node that
+    /// has not listed its members has one entry for all of them. A group without members gives an empty list.
     ///
-    /// At most 256 members of one node and 256 other nodes are reached, and an application has 64 such messages to other nodes under way.
+    /// At most 256 members of one node and 256 other nodes are reached. An application can have 64 such
+    /// messages to other nodes in flight.
     ///
     /// # Examples
     ///
@@ -280,13 +289,13 @@ impl<C: Content> MessageBuilder<&Sender, C> {
     /// ```
     ///
     /// # Errors
-    /// It is of class Stream, its node is not known, or it has too many members.
+    /// The message is of class Stream, its node is unknown, or it has too many members.
     pub fn confirmed_by_each(self, within: Duration) -> Result<GroupConfirmation, SendError> {
         self.confirm_by_each(within).map(|(_, confirmation)| confirmation)
     }
 }
 
-/// Whether a message to `destination` has an outcome for each of several.
+/// Returns whether a message to `destination` has several outcomes.
 fn is_many(destination: Tid) -> bool {
     !destination.is_single() && destination.app != AppAddress::NONE
 }

@@ -1,4 +1,4 @@
-//! Timers for whoever polls a future of this crate's: by tokio, with or without a runtime of tokio's on the polling thread.
+//! Timers for the futures of this crate: tokio timers, with or without a tokio runtime on the polling thread.
 
 use std::{
     future::pending,
@@ -14,38 +14,39 @@ use tokio::{
     time::Sleep,
 };
 
-/// A timer that ends after `within`. `None` where there is no runtime, and the system gives none: that is logged.
+/// Creates a timer that ends after `within`. Returns `None`, and logs that, if the thread has no runtime and
+/// none can be created.
 pub(super) fn sleep(within: Duration) -> Option<Pin<Box<Sleep>>> {
     if Handle::try_current().is_ok() {
         return Some(Box::pin(tokio::time::sleep(within)));
     }
-    let kept = kept()?;
-    let _entered = kept.enter();
+    let runtime = shared_runtime()?;
+    let _entered = runtime.enter();
     Some(Box::pin(tokio::time::sleep(within)))
 }
 
-/// The runtime that is kept for those who have none. It has nothing but timers, and is made when the first one needs it.
-fn kept() -> Option<Handle> {
-    static KEPT: Mutex<Option<Handle>> = Mutex::new(None);
-    // Whoever panicked with it has left it whole.
-    let mut kept = KEPT.lock().unwrap_or_else(PoisonError::into_inner);
-    if kept.is_none() {
-        match begin() {
-            Ok(handle) => *kept = Some(handle),
+/// Returns the shared runtime for threads without one. It has only timers, and is created at its first use.
+fn shared_runtime() -> Option<Handle> {
+    static SHARED: Mutex<Option<Handle>> = Mutex::new(None);
+    // A thread that panicked with the lock cannot leave the value inconsistent.
+    let mut runtime = SHARED.lock().unwrap_or_else(PoisonError::into_inner);
+    if runtime.is_none() {
+        match start_runtime() {
+            Ok(handle) => *runtime = Some(handle),
             Err(error) => {
                 let remedy = remedy(Wanted::Reactor, &error);
                 crate::log::error!(%error, %remedy, "no timer, so that a wait without a runtime ends at once");
             }
         }
     }
-    kept.clone()
+    runtime.clone()
 }
 
-fn begin() -> std::io::Result<Handle> {
+fn start_runtime() -> std::io::Result<Handle> {
     let runtime = Builder::new_current_thread().enable_time().build()?;
     let handle = runtime.handle().clone();
     std::thread::Builder::new().name("deadlines".to_owned()).spawn(move || {
-        // Who is woken is foreign, and may panic over it: the others have their timers all the same.
+        // A woken task is foreign code and may panic; other timers must continue.
         while catch_unwind(|| runtime.block_on(pending::<()>())).is_err() {}
     })?;
     Ok(handle)

@@ -1,4 +1,4 @@
-//! The error of a name that no application has.
+//! The error for a name that no application has.
 
 use std::{
     error::Error,
@@ -10,8 +10,8 @@ use super::Directory;
 
 /// No application has the name now.
 ///
-/// It can say which names are similar. They are looked for when it is shown, not when the message is refused: so a loop that sends to a name
-/// which is away pays nothing for them.
+/// The error can list similar names. They are searched when the error is displayed, not when the message is
+/// rejected. So a loop that sends to an absent name has no cost for the search.
 ///
 /// # Examples
 ///
@@ -27,7 +27,7 @@ use super::Directory;
 #[derive(Clone)]
 pub struct UnknownNameError {
     name: String,
-    /// Gone with the node.
+    /// Dropped with the node.
     directory: Weak<dyn Directory>,
 }
 
@@ -36,14 +36,14 @@ impl UnknownNameError {
         Self { name: name.to_owned(), directory: Arc::downgrade(directory) }
     }
 
-    /// The name that no application has.
+    /// Returns the name that no application has.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Names of applications that are similar and there now, three at most, the most similar first. An application in a process of its own
-    /// knows of none.
+    /// Returns similar names of present applications, three at most, the most similar first. An application
+    /// in a process of its own gets none.
     #[must_use]
     pub fn nearest(&self) -> Vec<String> {
         self.directory.upgrade().map_or_else(Vec::new, |directory| directory.nearest(&self.name))
@@ -66,6 +66,10 @@ impl fmt::Debug for UnknownNameError {
 
 impl fmt::Display for UnknownNameError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let directory = self.directory.upgrade();
+        if let Some(why) = directory.and_then(|directory| directory.why_not(&self.name)) {
+            return write!(f, "'{}' is required, and is not there now: {why}", self.name);
+        }
         write!(f, "no application is called '{}' now; ", self.name)?;
         match &*self.nearest() {
             [] => {}
@@ -82,9 +86,14 @@ mod tests {
     use super::*;
     use crate::tid::{AppAddress, Tid};
 
+    /// The directory of a node with an application that requires `ankle`; the node of `ankle` is lost.
     struct Names;
 
     impl Directory for Names {
+        fn why_not(&self, name: &str) -> Option<String> {
+            (name == "ankle").then(|| "its node was lost (2.0 s ago)".to_owned())
+        }
+
         fn resolve(&self, _: &str) -> Option<Tid> {
             None
         }
@@ -97,12 +106,19 @@ mod tests {
     }
 
     #[test]
-    fn it_shows_the_nearest_names_while_the_node_is_there() {
+    fn nearest_names_are_shown_while_the_node_is_there() {
         let directory: Arc<dyn Directory> = Arc::new(Names);
         let error = UnknownNameError::new("knee.driev", &directory);
         let text = error.to_string();
         assert!(text.contains("'knee.driev' now; nearest: knee.drive, hip.drive; correct"), "{text}");
         drop(directory);
         assert!(error.to_string().contains("'knee.driev' now; correct"), "{error}");
+    }
+
+    #[test]
+    fn required_name_has_its_reason_and_no_other_names() {
+        let directory: Arc<dyn Directory> = Arc::new(Names);
+        let text = UnknownNameError::new("ankle", &directory).to_string();
+        assert_eq!(text, "'ankle' is required, and is not there now: its node was lost (2.0 s ago)");
     }
 }

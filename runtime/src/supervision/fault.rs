@@ -1,10 +1,11 @@
-//! Fault points: a supervised actor panics, hangs, stops or is slow on its n-th event, on purpose. For tests and demos.
+//! Fault points: a supervised actor panics, hangs, stops or is slow on its n-th event. For tests and demos.
 //!
-//! Only in builds with the feature `fault-points`: without it neither this module nor any call into it exists. What a
-//! fault is and how it is written down is here, pure; [`FaultPoints`] makes it strike.
+//! Only in builds with the feature `fault-points`: without it neither this module nor any call into it
+//! exists. The definition and syntax of faults are here, pure; [`FaultPoints`] injects them.
 //!
-//! An *event* is a message in the hand of an application, or what a layer takes out of its post. The n-th is counted
-//! over all lives of the actor, from the start of its node or, for an injected fault, from the injection.
+//! An *event* is a message that an application handles, or an event that a layer takes out of its queue. The
+//! n-th is counted over all incarnations of the actor, from the start of its node or, for an injected fault,
+//! from the injection.
 //!
 //! ```
 //! use sinew_runtime::supervision::fault::{Fault, FaultPlan};
@@ -22,40 +23,40 @@ use std::{fmt, ops::Range, str::FromStr, time::Duration};
 pub use self::point::{FaultPoints, INJECTED_MAX, Lives};
 pub(crate) use self::point::{strike, strike_message};
 
-/// What happens to the actor.
+/// The effect of a fault.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FaultKind {
-    /// It panics, with the event in its hand.
+    /// The actor panics while it handles the event.
     Panic,
-    /// It blocks its thread for this time, or for ever.
+    /// The actor blocks its thread for this time, or forever.
     Hang(Option<Duration>),
-    /// It ends by itself, in order.
+    /// The actor ends itself, in order.
     Stop,
-    /// It blocks its thread for this time and then handles the event.
+    /// The actor blocks its thread for this time and then handles the event.
     Slow(Duration),
 }
 
-/// When it happens.
+/// The moment of a fault.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum FaultMoment {
-    /// At its next turn, event or not.
+    /// At the actor's next turn, with or without an event.
     Now,
-    /// On its n-th event, counted from 1.
+    /// At the actor's n-th event, counted from 1.
     Event(u64),
-    /// On each of these events; the end is not among them.
+    /// At each of these events; the end is excluded.
     Events(Range<u64>),
-    /// On each n-th event.
+    /// At each n-th event.
     EveryEvents(u64),
-    /// When it is started for the n-th time, before its actor is made.
+    /// At the n-th start of the actor, before it is created.
     Start(u64),
 }
 
-/// A fault of one actor: what, and when.
+/// A fault of one actor: its effect and its moment.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Fault {
-    /// What happens.
+    /// The effect.
     pub kind: FaultKind,
-    /// When.
+    /// The moment.
     pub moment: FaultMoment,
 }
 
@@ -64,55 +65,55 @@ impl Fault {
         Self { kind, moment: FaultMoment::Now }
     }
 
-    /// A panic at the next turn.
+    /// Returns a panic at the next turn.
     #[must_use]
     pub const fn panic() -> Self {
         Self::now(FaultKind::Panic)
     }
 
-    /// A turn that takes this long, next.
+    /// Returns a next turn of this duration.
     #[must_use]
     pub const fn hang(time: Duration) -> Self {
         Self::now(FaultKind::Hang(Some(time)))
     }
 
-    /// A next turn that never ends. Its thread stays until the process ends.
+    /// Returns a next turn that never ends. Its thread exists until the process ends.
     #[must_use]
     pub const fn hang_for_ever() -> Self {
         Self::now(FaultKind::Hang(None))
     }
 
-    /// An end by itself, next.
+    /// Returns an orderly end at the next turn.
     #[must_use]
     pub const fn stop() -> Self {
         Self::now(FaultKind::Stop)
     }
 
-    /// A next turn that takes this much longer.
+    /// Returns a next turn that takes this much longer.
     #[must_use]
     pub const fn slow(time: Duration) -> Self {
         Self::now(FaultKind::Slow(time))
     }
 
-    /// The same on the n-th event, from 1.
+    /// Moves the fault to the n-th event, from 1.
     #[must_use]
     pub fn at_event(self, number: u64) -> Self {
         Self { moment: FaultMoment::Event(number), ..self }
     }
 
-    /// The same on each of these events; the end is not among them.
+    /// Moves the fault to each of these events; the end is excluded.
     #[must_use]
     pub fn at_events(self, numbers: Range<u64>) -> Self {
         Self { moment: FaultMoment::Events(numbers), ..self }
     }
 
-    /// The same on each n-th event.
+    /// Moves the fault to each n-th event.
     #[must_use]
     pub fn at_every(self, number: u64) -> Self {
         Self { moment: FaultMoment::EveryEvents(number), ..self }
     }
 
-    /// The same at the n-th start, from 1.
+    /// Moves the fault to the n-th start, from 1.
     #[must_use]
     pub fn at_start(self, number: u64) -> Self {
         Self { moment: FaultMoment::Start(number), ..self }
@@ -120,7 +121,7 @@ impl Fault {
 }
 
 impl FaultMoment {
-    /// Whether the event with this number, from 1, is struck.
+    /// Returns whether the fault affects the event with this number, from 1.
     const fn strikes_event(&self, number: u64) -> bool {
         match self {
             Self::Event(at) => *at == number,
@@ -134,13 +135,13 @@ impl FaultMoment {
         matches!(self, Self::Start(at) if *at == number)
     }
 
-    /// Whether nothing can be struck any more after so many events and starts.
+    /// Returns whether the fault can have no effect any more after this many events and starts.
     const fn is_over(&self, events: u64, starts: u64) -> bool {
         match self {
             Self::Event(at) => events >= *at,
             Self::Events(range) => events + 1 >= range.end,
             Self::Start(at) => starts >= *at,
-            // One is never over, the other when it has struck.
+            // The one never ends, the other is removed at its effect.
             Self::EveryEvents(_) | Self::Now => false,
         }
     }
@@ -171,7 +172,7 @@ impl fmt::Display for Fault {
     }
 }
 
-/// A time in the largest of the three units that shows it whole.
+/// A duration, displayed in the largest of the three units that shows it exactly.
 struct Shown(Duration);
 
 impl fmt::Display for Shown {
@@ -187,13 +188,13 @@ impl fmt::Display for Shown {
     }
 }
 
-/// A text that is no fault, or a fault that nobody can have. The caller's mistake; nothing was planned.
+/// An invalid fault, or a fault that cannot be injected. This is an error of the caller; nothing was planned.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("fault `{fault}`: {why}")]
 pub struct FaultError {
-    /// What was given.
+    /// The given text.
     pub fault: String,
-    /// What is wrong with it, and what to write instead.
+    /// The cause, and the correct syntax.
     pub why: String,
 }
 
@@ -252,13 +253,13 @@ fn read_moment(text: &str) -> Result<FaultMoment, String> {
     }
 }
 
-/// `word(inside)`, taken apart.
+/// Splits `word(inside)`.
 fn in_brackets(text: &str) -> Option<(&str, &str)> {
     let (word, rest) = text.split_once('(')?;
     Some((word.trim(), rest.strip_suffix(')')?.trim()))
 }
 
-/// Longest time that can be planned: an hour, so that a slip of the pen is noticed.
+/// Maximum duration that can be planned: an hour, so that typing errors are detected.
 const TIME_MAX: Duration = Duration::from_secs(3_600);
 
 fn read_time(text: &str) -> Result<Duration, String> {
@@ -279,15 +280,15 @@ fn read_time(text: &str) -> Result<Duration, String> {
     if time > TIME_MAX { Err(wrong()) } else { Ok(time) }
 }
 
-/// Faults of several actors, each under its actor's name: `NAME:FAULT, NAME:FAULT`.
+/// The faults of several actors, each with its actor's name: `NAME:FAULT, NAME:FAULT`.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct FaultPlan(Vec<(String, Fault)>);
 
-/// Faults in one plan at most.
+/// Maximum number of faults in one plan.
 const PLANNED_MAX: usize = 1_024;
 
 impl FaultPlan {
-    /// The faults, each with the name of its actor, in the order in which they were written.
+    /// Returns the faults, each with the name of its actor, in the order of the text.
     #[must_use]
     pub fn faults(&self) -> &[(String, Fault)] {
         &self.0
@@ -308,11 +309,11 @@ impl FromStr for FaultPlan {
 }
 
 fn read_entry(entry: &str) -> Result<(String, Fault), FaultError> {
-    // A name may have a colon in it; a fault has none.
+    // A name may contain a colon; a fault does not.
     let Some((name, fault)) = entry.rsplit_once(':').filter(|(name, _)| !name.trim().is_empty()) else {
         return Err(FaultError::new(
             entry,
-            "whose? write the actor's name before it, as in knee.drive:panic@1000",
+            "it names no actor; write the actor's name before it, as in knee.drive:panic@1000",
         ));
     };
     let fault = fault.parse().map_err(|error: FaultError| FaultError::new(entry, error.why))?;

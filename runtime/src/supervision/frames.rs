@@ -1,12 +1,12 @@
-//! The frames of a panic that its reader can do something about: those of the program's own code.
+//! The stack frames of a panic that are useful to its reader: those of the program's own code.
 
 use std::{backtrace::Backtrace, sync::OnceLock};
 
-/// Frames of the program's own code that are shown, from the panic outwards.
+/// Maximum number of frames of the program's own code that are shown, from the panic outwards.
 const SHOWN_MAX: usize = 10;
 
 /// The crates between an application's code and its thread.
-const LIBRARIES: [&str; 15] = [
+const LIBRARIES: [&str; 11] = [
     "std",
     "core",
     "alloc",
@@ -18,29 +18,44 @@ const LIBRARIES: [&str; 15] = [
     "actix_rt",
     "futures_core",
     "futures_util",
-    "sinew",
-    "sinew_runtime",
-    "sinew_shm",
-    "sinew_c",
 ];
 
-/// Parts of the paths of files that are not the program's own: the standard library's, and those of crates from a registry.
+/// The packages of Sinew, and the folders of their sources.
+const SINEW: [(&str, &str); 14] = [
+    ("sinew", "actors/src/"),
+    ("sinew_c", "bindings/c/src/"),
+    ("sinew_client", "actors/client/src/"),
+    ("sinew_gncl", "actors/gncl/src/"),
+    ("sinew_lncl", "actors/lncl/src/"),
+    ("sinew_model", "actors/model/src/"),
+    ("sinew_ndl", "actors/ndl/src/"),
+    ("sinew_node", "actors/node/src/"),
+    ("sinew_protocol", "actors/protocol/src/"),
+    ("sinew_runtime", "runtime/src/"),
+    ("sinew_security", "actors/security/src/"),
+    ("sinew_session", "actors/session/src/"),
+    ("sinew_shm", "runtime/shm/src/"),
+    ("sinew_sync", "actors/sync/src/"),
+];
+
+/// Path fragments of files that are not the program's own: the standard library's, and those of crates from a registry.
 const FOREIGN_PATHS: [&str; 4] = ["/rustc/", "/registry/src/", "/library/std/src/", "/library/core/src/"];
 
-/// Functions of the C library's below every thread, whose file is known where its debug information is there.
+/// Functions of the C library at the bottom of every thread; their file is known if debug information is
+/// installed.
 const C_STARTS: [&str; 4] = ["start_thread", "clone", "__libc_start", "_start"];
 
-/// Which frames of a panic are shown.
+/// The frames of a panic that are shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Frames {
     None,
-    /// Those of the program's own code.
+    /// The frames of the program's own code.
     Own,
     All,
 }
 
 impl Frames {
-    /// What the environment asks for: `RUST_BACKTRACE=0` for none, `full` for all.
+    /// Returns the setting of the environment: `RUST_BACKTRACE=0` for none, `full` for all.
     pub(super) fn wanted() -> Self {
         static WANTED: OnceLock<Frames> = OnceLock::new();
         *WANTED.get_or_init(|| match std::env::var("RUST_BACKTRACE").as_deref() {
@@ -51,7 +66,7 @@ impl Frames {
     }
 }
 
-/// One line for each frame. Looks up names, which may take long at the first time in a process.
+/// Returns one line per frame. Resolves names, which may take long at the first time in a process.
 pub(super) fn frames(backtrace: &Backtrace, wanted: Frames) -> Vec<String> {
     match wanted {
         Frames::None => Vec::new(),
@@ -60,10 +75,10 @@ pub(super) fn frames(backtrace: &Backtrace, wanted: Frames) -> Vec<String> {
     }
 }
 
-/// Where the sources of Sinew are, which may be a folder of the program's own.
+/// The directories of Sinew's sources, which may be inside the program's own.
 struct Homes {
     folders: Vec<String>,
-    /// The working folder, which the standard library leaves out of paths.
+    /// The working directory, which the standard library omits from paths.
     here: String,
 }
 
@@ -71,8 +86,7 @@ impl Homes {
     fn of_sinew() -> Self {
         let runtime = env!("CARGO_MANIFEST_DIR");
         let root = runtime.strip_suffix("/runtime").unwrap_or(runtime);
-        let folders =
-            [format!("{runtime}/src/"), format!("{runtime}/shm/src/"), format!("{root}/actors/src/")];
+        let folders = SINEW.map(|(_, folder)| format!("{root}/{folder}"));
         let here = std::env::current_dir().unwrap_or_default();
         Self { folders: folders.into(), here: here.to_string_lossy().into_owned() }
     }
@@ -84,8 +98,8 @@ impl Homes {
     }
 }
 
-/// The frames of the program's own code, of what the standard library writes of a backtrace: for each frame a line
-/// `  4: name`, and one `at file:line:column` where that is known.
+/// Returns the frames of the program's own code from the standard library's text of a backtrace. That text
+/// has a line `  4: name` per frame, and a line `at file:line:column` if the location is known.
 fn own(written: &str, sinew: &Homes) -> Vec<String> {
     let mut shown: Vec<String> = Vec::new();
     let mut lines = written.lines().peekable();
@@ -105,14 +119,15 @@ fn is_own(name: &str, file: Option<&str>, sinew: &Homes) -> bool {
     let is_foreign = |file: &str| FOREIGN_PATHS.iter().any(|part| file.contains(part)) || sinew.are_of(file);
     match (crate_of(name), file) {
         (Some(library), _) if LIBRARIES.contains(&library) => false,
+        (Some(library), _) if SINEW.iter().any(|(package, _)| *package == library) => false,
         (None, _) if C_STARTS.iter().any(|start| name.starts_with(start)) => false,
         (_, Some(file)) => !is_foreign(file),
-        // A name of the C library's: `start_thread`.
+        // A name of the C library, such as `start_thread`.
         (found, None) => found.is_some(),
     }
 }
 
-/// The crate that a function's name begins with: `hip` of `<hip::Hip as actix::Handler<Torque>>::handle`.
+/// Returns the crate at the beginning of a function's name: `hip` of `<hip::Hip as actix::Handler<Torque>>::handle`.
 fn crate_of(name: &str) -> Option<&str> {
     let start = name.trim_start_matches(['<', '&', '(', '*', '[']);
     let start =
@@ -169,14 +184,14 @@ mod tests {
     }
 
     #[test]
-    fn sinew_in_a_folder_of_the_program_is_not_its_own_code() {
+    fn sinew_in_a_program_folder_is_not_own_code() {
         let homes =
             Homes { folders: vec!["/robot/sinew/runtime/src/".to_owned()], here: "/robot".to_owned() };
         assert!(homes.are_of("./sinew/runtime/src/app/drive.rs") && !homes.are_of("./src/main.rs"));
     }
 
     #[test]
-    fn no_more_frames_are_shown_than_a_screen_has_room_for() {
+    fn number_of_shown_frames_is_limited() {
         let frame = |number: usize| format!("  {number}: hip::deep\n             at ./src/deep.rs:1:1\n");
         let written: String = (0..100).map(frame).collect();
         assert_eq!(own(&written, &homes()).len(), SHOWN_MAX);

@@ -1,4 +1,4 @@
-//! The guard around a supervised actor: catches its panics, takes its stop order, and says how it ended.
+//! The guard around a supervised actor: it catches panics, executes the stop order, and reports the end.
 
 use std::{
     any::Any,
@@ -14,29 +14,29 @@ use actix::{
 };
 
 use super::{
-    Burials, Launch, ReadyGate, Reason,
+    DropQueue, Launch, ReadyGate, Reason,
+    actor_handle::{ActorEvent, ActorHandle},
+    liveness::{Activity, FencedUnwind, Liveness},
     panics::Caught,
-    tenant::{Fate, Tenant},
-    vitals::{Doing, Over, Vitals},
 };
 use crate::{outcome::Outcome, safe_wake::SafeWaker, time::Time};
 
-/// A running actor of any type, as its guard sees it.
-pub trait Life {
-    /// Lets it run. Ready when it has ended, with how.
+/// A running actor of any type, as its guard uses it.
+pub trait RunningActor {
+    /// Polls the actor. Ready when the actor has ended, with the reason.
     fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Reason>;
-    /// Asks it to stop; actix then asks its `stopping`.
+    /// Requests a stop; actix then calls the actor's `stopping`.
     fn stop(&mut self);
-    /// Makes sure that dropping it runs no more of its code than its `Drop`.
+    /// Ensures that dropping the actor runs none of its code except its `Drop`.
     fn terminate(&mut self);
 }
 
-struct ActixLife<A, C>(ContextFut<A, C>)
+struct ActixActor<A, C>(ContextFut<A, C>)
 where
     C: AsyncContextParts<A> + Unpin,
     A: Actor<Context = C>;
 
-impl<A, C> Life for ActixLife<A, C>
+impl<A, C> RunningActor for ActixActor<A, C>
 where
     C: AsyncContextParts<A> + Unpin,
     A: Actor<Context = C>,
@@ -50,60 +50,70 @@ where
     }
 
     fn terminate(&mut self) {
-        // Without it the drop would poll the actor once more, on its broken state (`docs/decisions/0001-actix.md`).
+        // Otherwise the drop would poll the actor once more, in its inconsistent state
+        // (`docs/decisions/0001-actix.md`).
         self.0.ctx().terminate();
     }
 }
 
 /// A running actix actor, to be guarded.
-pub fn life<A, C>(actor: ContextFut<A, C>) -> Box<dyn Life>
+pub fn running_actor<A, C>(actor: ContextFut<A, C>) -> Box<dyn RunningActor>
 where
     C: AsyncContextParts<A> + Unpin + 'static,
     A: Actor<Context = C>,
 {
-    Box::new(ActixLife(actor))
+    Box::new(ActixActor(actor))
 }
 
 /// The guarded actor: a future that never panics and reports its end exactly once.
 pub(super) struct Guard {
-    life: Option<Box<dyn Life>>,
-    tenant: Tenant,
-    /// Out while the actor has its turn.
-    vitals: Option<Arc<Vitals>>,
+    actor: Option<Box<dyn RunningActor>>,
+    handle: ActorHandle,
+    /// `None` during the actor's turn.
+    liveness: Option<Arc<Liveness>>,
     was_polled: bool,
     has_reported: bool,
-    /// How it ended does not depend on its drop.
+    /// Whether a panic of its drop is ignored in its end reason.
     ends_before_its_drop: bool,
-    /// Where what its panics carry is dropped.
-    burials: Burials,
+    /// The queue where the payloads of its panics are dropped.
+    drop_queue: DropQueue,
     waker: SafeWaker,
 }
 
 impl Guard {
-    /// Guards an actor that is made.
-    pub(super) fn around(life: Option<Box<dyn Life>>, tenant: Tenant, burials: Burials) -> Self {
-        let vitals = Some(tenant.vitals().clone());
+    /// Creates the guard of an actor that exists.
+    pub(super) fn around(
+        actor: Option<Box<dyn RunningActor>>,
+        handle: ActorHandle,
+        drop_queue: DropQueue,
+    ) -> Self {
+        let liveness = Some(handle.liveness().clone());
         let (was_polled, has_reported, ends_before_its_drop) = (false, false, false);
         let waker = SafeWaker::default();
-        Self { life, tenant, vitals, was_polled, has_reported, ends_before_its_drop, burials, waker }
+        Self { actor, handle, liveness, was_polled, has_reported, ends_before_its_drop, drop_queue, waker }
     }
 
-    /// Guards one that has done all that it is for when it has ended: what it drops then is not its own.
-    pub(super) fn around_overseer(life: Box<dyn Life>, tenant: Tenant) -> Self {
-        let mut guard = Self::around(Some(life), tenant, Burials::default());
+    /// Creates the guard of an overseer, which is complete when it ends: the values that it drops then are not its own.
+    pub(super) fn around_overseer(actor: Box<dyn RunningActor>, handle: ActorHandle) -> Self {
+        let mut guard = Self::around(Some(actor), handle, DropQueue::default());
         guard.ends_before_its_drop = true;
         guard
     }
 
-    /// Makes an actor, on its thread. `None` if its code panicked, which is reported.
-    pub(super) fn make(launch: &Launch, ready: ReadyGate, tenant: Tenant, burials: Burials) -> Option<Self> {
-        let mut guard = Self::around(None, tenant, burials);
-        let made = Vitals::turn(&mut guard.vitals, Doing::Start, || {
+    /// Creates an actor, on its thread. Returns `None` if its code panicked, which is reported.
+    pub(super) fn make(
+        launch: &Launch,
+        ready: ReadyGate,
+        handle: ActorHandle,
+        drop_queue: DropQueue,
+    ) -> Option<Self> {
+        let mut guard = Self::around(None, handle, drop_queue);
+        let made = Liveness::turn(&mut guard.liveness, Activity::Start, || {
             catch_unwind(AssertUnwindSafe(|| launch(ready)))
         });
         match made {
-            Ok(life) => {
-                guard.life = Some(life);
+            Ok(actor) => {
+                guard.actor = Some(actor);
                 Some(guard)
             }
             Err(panic) => {
@@ -113,66 +123,70 @@ impl Guard {
         }
     }
 
-    /// What a turn is called until something in it has a better name.
-    const fn doing(&self, stops: bool) -> Doing {
+    /// Returns the activity of a turn before a more specific one is known.
+    const fn activity(&self, stops: bool) -> Activity {
         match (self.was_polled, stops) {
-            (_, true) => Doing::Stop,
-            (false, false) => Doing::Start,
-            (true, false) => Doing::Task,
+            (_, true) => Activity::Stop,
+            (false, false) => Activity::Start,
+            (true, false) => Activity::Task,
         }
     }
 
-    /// It panicked. That is told before anything becomes of what the panic carries.
+    /// Ends the actor after a panic. The end is reported before the panic's payload is dropped.
     fn end_in(&mut self, panic: Box<dyn Any + Send>) {
-        let Caught { words, carried } = Caught::new(panic);
-        self.end(Reason::Panic(words));
-        self.bury_carried(carried);
+        let Caught { message, payload } = Caught::new(panic);
+        self.end(Reason::Panic(message));
+        self.defer_payload_drop(payload);
     }
 
-    fn bury_carried(&self, carried: Option<Box<dyn Any + Send>>) {
-        if let Some(carried) = carried {
-            self.burials.bury(self.tenant.vitals().name(), carried);
+    fn defer_payload_drop(&self, payload: Option<Box<dyn Any + Send>>) {
+        if let Some(payload) = payload {
+            self.drop_queue.push(self.handle.liveness().name(), payload);
         }
     }
 
     fn end(&mut self, mut reason: Reason) {
-        let mut carried = None;
-        if let Some(life) = self.life.take() {
-            let caught = Vitals::turn(&mut self.vitals, Doing::Drop, || bury(life));
+        let mut payload = None;
+        if let Some(actor) = self.actor.take() {
+            let caught = Liveness::turn(&mut self.liveness, Activity::Drop, || drop_actor(actor));
             if let Some(caught) = caught {
-                carried = caught.carried;
-                // Not where it has failed already: the first failure is the reason.
+                payload = caught.payload;
+                // Not if it has failed already: the first failure is the reason.
                 if !reason.is_failure() && !self.ends_before_its_drop {
-                    reason = Reason::Panic(caught.words);
+                    reason = Reason::Panic(caught.message);
                 }
             }
         }
         if !std::mem::replace(&mut self.has_reported, true) {
-            let vitals = self.tenant.vitals();
-            // A message in the hand of one that panicked was settled by nobody.
-            vitals.settle(Outcome::Failed);
-            // Who holds its sender on another thread does not speak beside its next life.
-            vitals.fence();
-            vitals.set_gone();
-            if let Some(since) = self.tenant.holds_its_thread() {
-                let (actor, away) = (vitals.name(), Time::now().since(since));
-                crate::log::warn!(actor, ?away, "came back too late: it is dropped, and its thread ends");
+            let liveness = self.handle.liveness();
+            // The message that a panicking actor was handling is not settled yet.
+            liveness.settle(Outcome::Failed);
+            // Another thread may hold its sender, which must not send beside the next incarnation.
+            liveness.fence();
+            liveness.set_ended();
+            if let Some(since) = self.handle.blocked_since() {
+                let (actor, blocked) = (liveness.name(), Time::now().since(since));
+                crate::log::warn!(
+                    actor,
+                    ?blocked,
+                    "the actor returned too late: it is dropped, and its thread ends"
+                );
             }
-            self.tenant.report(Fate::Ended(reason));
+            self.handle.report(ActorEvent::Ended(reason));
         }
-        self.bury_carried(carried);
+        self.defer_payload_drop(payload);
     }
 }
 
-/// Drops an actor whose code may panic while it is dropped, even if that is not the first time; its panic then.
-fn bury(mut life: Box<dyn Life>) -> Option<Caught> {
-    let buried = catch_unwind(AssertUnwindSafe(|| {
-        life.terminate();
-        drop(life);
+/// Drops an actor; its drop may panic, perhaps after an earlier panic. Returns that panic.
+fn drop_actor(mut actor: Box<dyn RunningActor>) -> Option<Caught> {
+    let dropped = catch_unwind(AssertUnwindSafe(|| {
+        actor.terminate();
+        drop(actor);
     }));
-    let panic = buried.err()?;
-    // A life that was taken leaves its drop as it leaves any turn.
-    (!panic.is::<Over>()).then(|| Caught::new(panic))
+    let panic = dropped.err()?;
+    // A fenced incarnation leaves its drop in the same way as a turn.
+    (!panic.is::<FencedUnwind>()).then(|| Caught::new(panic))
 }
 
 impl Future for Guard {
@@ -180,32 +194,32 @@ impl Future for Guard {
 
     fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<()> {
         let this = &mut *self;
-        // All that the actor waits for wakes it by this one.
+        // Every wake of the actor goes through this waker.
         let mut safe = std::mem::take(&mut this.waker);
         let mut cx = Context::from_waker(safe.of(cx.waker()));
-        let told = this.tenant.told(cx.waker());
-        if told.kill {
+        let orders = this.handle.take_orders(cx.waker());
+        if orders.kill {
             this.end(Reason::Killed);
             return Poll::Ready(());
         }
-        let doing = this.doing(told.stop);
+        let activity = this.activity(orders.stop);
         this.was_polled = true;
-        let Some(life) = &mut this.life else { return Poll::Ready(()) };
-        let polled = Vitals::turn(&mut this.vitals, doing, || {
+        let Some(actor) = &mut this.actor else { return Poll::Ready(()) };
+        let polled = Liveness::turn(&mut this.liveness, activity, || {
             catch_unwind(AssertUnwindSafe(|| {
-                if told.stop {
-                    life.stop();
+                if orders.stop {
+                    actor.stop();
                 }
-                life.poll(&mut cx)
+                actor.poll(&mut cx)
             }))
         });
         let reason = match polled {
-            Ok(Poll::Pending) if !this.tenant.vitals().is_over() => {
+            Ok(Poll::Pending) if !this.handle.liveness().is_fenced() => {
                 this.waker = safe;
                 return Poll::Pending;
             }
             Ok(Poll::Pending) => Reason::Killed,
-            Err(panic) if panic.is::<Over>() => Reason::Killed,
+            Err(panic) if panic.is::<FencedUnwind>() => Reason::Killed,
             Ok(Poll::Ready(reason)) => reason,
             Err(panic) => {
                 this.end_in(panic);
@@ -219,7 +233,7 @@ impl Future for Guard {
 
 impl Drop for Guard {
     fn drop(&mut self) {
-        // The arbiter's thread ends with the actor still in it.
+        // The arbiter's thread ends before the actor.
         self.end(Reason::ThreadEnded);
     }
 }

@@ -1,73 +1,62 @@
 //! Supervision: every layer and every application is a supervised actor.
 //!
-//! | file | what it is |
+//! | file | content |
 //! | --- | --- |
 //! | [`core`] | the decisions, pure |
-//! | `supervisor` | the actix actor that carries them out |
-//! | `child` | one child as its supervisor's shell holds it |
-//! | `guard` | the future around each actor: catches its panics, takes its stop order, reports its end |
-//! | `alone` | one actor under a guard and under no supervisor |
-//! | `burial` | where the user's values are dropped that nobody needs any more |
-//! | `orphans` | what becomes of the children of a supervisor that fails itself |
-//! | `roster` | who is supervised, for the supervisor's owner |
-//! | `ready` | when an actor may say that it is ready |
-//! | `place` | where an actor is to run |
-//! | `threads` | where actors live |
-//! | `own_system` | what an actor stops that stops actix's system: nothing of the node's |
-//! | `tenant` | one life of an actor, as its supervisor, its thread and the watchdog hold it |
-//! | `vitals` | its signs of life, and its fence |
-//! | `watchdog` | who does not come back |
-//! | `panics` | where a panic was, and who is told of it |
-//! | `frames` | the frames of a panic that are the program's own |
-//! | `linux`, `elsewhere` | what the system does for a thread |
-//! | `fault` | faults on purpose, with the feature `fault-points` only |
+//! | `supervisor` | the actix actor that executes the decisions |
+//! | `child` | one child, as its supervisor's shell holds it |
+//! | `guard` | the future around each actor: catches its panics, executes its stop order, reports its end |
+//! | `unsupervised` | one actor with a guard and without a supervisor |
+//! | `deferred_drop` | the drop of user values that are no longer needed |
+//! | `orphans` | the stop of the children of a failed supervisor |
+//! | `supervisor_handle` | the handle of a supervisor, for its owner: its children and its commands |
+//! | `ready` | readiness of an actor |
+//! | `place` | the thread or process of an actor |
+//! | `threads` | the threads of actors |
+//! | `own_system` | an actix system per thread, so that an actor that stops its system does not stop the node |
+//! | `actor_handle` | one incarnation of an actor, as its supervisor, its thread and the watchdog hold it |
+//! | `liveness` | the liveness state of an incarnation, and its fence |
+//! | `watchdog` | the detection of hung actors |
+//! | `panics` | the location of a panic, and its report |
+//! | `frames` | the stack frames of a panic in the program's own code |
+//! | `fault` | injected faults, with the feature `fault-points` only |
 
-mod alone;
-mod burial;
+mod actor_handle;
 mod child;
 pub mod core;
-#[cfg(not(target_os = "linux"))]
-mod elsewhere;
+mod deferred_drop;
 #[cfg(feature = "fault-points")]
 pub mod fault;
 mod frames;
 mod guard;
-#[cfg(target_os = "linux")]
-mod linux;
+pub(crate) mod liveness;
 mod orphans;
 mod own_system;
 mod panics;
 mod place;
 mod ready;
-mod roster;
 mod supervisor;
-mod tenant;
+mod supervisor_handle;
 mod threads;
-pub(crate) mod vitals;
+mod unsupervised;
 mod watchdog;
 
-#[cfg(not(target_os = "linux"))]
-use self::elsewhere as system;
-#[cfg(target_os = "linux")]
-use self::linux as system;
+pub(crate) use self::place::{realtime_priority, set_highest_priority};
 pub use self::{
-    alone::{Alone, AloneHandle, Watcher, alone, overseen},
-    burial::Burials,
     core::{
-        AutoShutdown, BranchView, ChildId, ChildIds, ChildState, ChildView, Command, Flags, Generation,
-        Input, Intensity, Policy, Reason, Refusal, Restart, StartRetry, Strategy,
+        AutoShutdown, BranchView, ChildCommandError, ChildId, ChildIds, ChildState, ChildView, Command,
+        Flags, Generation, Input, Intensity, Policy, Reason, Restart, StartRetry, Strategy,
     },
-    guard::{Life, life},
-    own_system::{part_from_threads, tell_of_a_stop},
+    deferred_drop::DropQueue,
+    guard::{RunningActor, running_actor},
+    liveness::{at_fence, is_fenced},
+    own_system::{detach_threads, log_system_stop},
     panics::UNWINDS,
-    place::{Owner, Place, make_ordinary},
+    place::{Owner, Place},
     ready::{ReadyGate, ReadyPart},
-    roster::{Listed, Roster},
     supervisor::{ChildSpec, Launch, PlannedChild, Supervisor, SupervisorFact, SupervisorPlan},
+    supervisor_handle::{ChildInfo, SupervisorHandle},
     threads::{Threads, Turn},
-    vitals::{at_fence, is_fenced},
+    unsupervised::{Unsupervised, UnsupervisedHandle, WatchdogHandle, overseen, run_unsupervised},
 };
-pub(crate) use self::{
-    panics::writes_the_log,
-    place::{make_foremost, make_like_any_other, realtime_priority},
-};
+pub use crate::thread::set_normal_schedule;

@@ -1,7 +1,7 @@
-//! Children whose supervisor is gone without an end of its own: told to stop, waited for, and their lives taken if need be.
+//! The stop of the children of a failed supervisor: each is stopped, and abandoned after its deadline.
 //!
-//! Nobody decides for them any more, so nothing is decided: each has the time to stop that it was declared with, then its
-//! life is taken. Whoever listened to their supervisor hears of each end, as of any other.
+//! No restart is decided any more. Each child has its declared time to stop; after that it is abandoned. The
+//! supervisor's listener is notified of each end as usual.
 
 use std::{
     cell::RefCell,
@@ -16,186 +16,191 @@ use tokio::time::timeout;
 
 use super::{
     Reason, SupervisorFact, Threads,
+    actor_handle::ActorHandle,
     core::{ChildId, Input},
-    panics::words,
-    tenant::Tenant,
-    watchdog::Reprieve,
+    panics::panic_message,
+    watchdog::DeadlineExtension,
 };
-use crate::{post::Post, time::Time};
+use crate::{event_queue::EventQueue, time::Time};
 
-/// Time in which a thread that does not hang lets go a child whose life is taken.
-pub(super) const LETTING_GO: Duration = Duration::from_millis(200);
+/// Time in which a thread that is not hung releases an abandoned child.
+pub(super) const RELEASE_WITHIN: Duration = Duration::from_millis(200);
 
-/// Whoever is told what happens to a supervisor's children.
+/// The receiver of facts about a supervisor's children.
 pub(super) type Listener = Box<dyn FnMut(SupervisorFact)>;
 
-/// Where a supervisor that fails leaves its children, for whoever oversees it.
-pub(super) type Legacy = Rc<RefCell<Option<Orphans>>>;
+/// The slot where a failed supervisor leaves its children for its overseer.
+pub(super) type OrphanSlot = Rc<RefCell<Option<Orphans>>>;
 
-/// A child whose end nobody was told of.
+/// A child without a reported end.
 pub(super) struct Orphan {
-    pub(super) tenant: Tenant,
+    pub(super) handle: ActorHandle,
     pub(super) stop_within: Duration,
 }
 
-/// All children of a supervisor that are left. Dropping them takes their lives.
+/// The remaining children of a supervisor. Dropping them fences all of them.
 pub(super) struct Orphans {
-    left: BTreeMap<ChildId, Left>,
+    remaining: BTreeMap<ChildId, Remaining>,
     threads: Rc<RefCell<Threads>>,
-    post: Post<Input>,
+    queue: EventQueue<Input>,
     listener: Listener,
 }
 
-/// One that is left, and how long it has for what it does.
-struct Left {
-    tenant: Tenant,
-    does: Does,
+/// One remaining child, and the deadline of its current step.
+struct Remaining {
+    handle: ActorHandle,
+    phase: StopPhase,
     until: Time,
-    reprieve: Reprieve,
+    extension: DeadlineExtension,
 }
 
 #[derive(Clone, Copy)]
-enum Does {
-    /// It was told to stop.
+enum StopPhase {
+    /// The child was ordered to stop.
     Stop,
-    /// Its life is taken and its end is told; its thread is to let it go.
-    LetGo,
+    /// The child is fenced and its end is reported; its thread must release it.
+    Release,
 }
 
-impl Left {
-    fn new(tenant: Tenant, does: Does, within: Duration, threads: &Threads) -> Self {
-        let reprieve = threads.reprieve(&tenant, within);
-        Self { tenant, does, until: Time::now() + within, reprieve }
+impl Remaining {
+    fn new(handle: ActorHandle, phase: StopPhase, within: Duration, threads: &Threads) -> Self {
+        let extension = threads.deadline_extension(&handle, within);
+        Self { handle, phase, until: Time::now() + within, extension }
     }
 
-    /// Whether its time is over. Who was not given it has more.
+    /// Returns whether the deadline has passed, after an extension for CPU time that the child did not get.
     fn is_late(&mut self, now: Time) -> bool {
         if self.until > now {
             return false;
         }
-        let is_leaving = self.tenant.vitals().is_leaving();
+        let is_ending = self.handle.liveness().is_ending();
         let later =
-            if self.tenant.has_ended() { None } else { self.reprieve.until(self.until, now, is_leaving) };
+            if self.handle.has_ended() { None } else { self.extension.until(self.until, now, is_ending) };
         self.until = later.unwrap_or(self.until);
         later.is_none()
     }
 }
 
 impl Orphans {
-    /// Takes the children over, and tells each to stop.
+    /// Takes over the children, and orders each to stop.
     pub(super) fn take_over(
         orphans: impl Iterator<Item = (ChildId, Orphan)>,
         threads: Rc<RefCell<Threads>>,
-        post: Post<Input>,
+        queue: EventQueue<Input>,
         listener: Listener,
     ) -> Self {
-        let tell = |(id, Orphan { tenant, stop_within }): (ChildId, Orphan)| {
-            tenant.stop();
-            (id, Left::new(tenant, Does::Stop, stop_within, &threads.borrow()))
+        let stop = |(id, Orphan { handle, stop_within }): (ChildId, Orphan)| {
+            handle.stop();
+            (id, Remaining::new(handle, StopPhase::Stop, stop_within, &threads.borrow()))
         };
-        let left = orphans.map(tell).collect();
-        Self { left, threads, post, listener }
+        let remaining = orphans.map(stop).collect();
+        Self { remaining, threads, queue, listener }
     }
 
-    /// Sees to it that all of them end, on the calling thread, with nobody who waits for that.
-    pub(super) fn end_apart(mut self) {
+    /// Ends all children on the calling thread, without a caller that waits.
+    pub(super) fn stop_detached(mut self) {
         let has_a_loop =
             actix_rt::Arbiter::try_current().is_some() && tokio::runtime::Handle::try_current().is_ok();
         if has_a_loop {
             actix_rt::spawn(async move {
                 let why = Reason::GaveUp("its supervisor was dropped".to_owned());
-                self.end_all(&why).await;
-                self.tell(SupervisorFact::Ended(why));
+                self.stop_all(&why).await;
+                self.notify(SupervisorFact::Ended(why));
             });
         }
-        // Without one the thread ends, and nobody can wait: dropped here, they have no time at all.
+        // Without an event loop the thread is ending, and no wait is possible: the children are dropped here
+        // without a grace period.
     }
 
-    /// Waits until each has ended or its time is over; `listener` is told of each. An end in order is none here: `why` their
-    /// supervisor failed is why they end.
-    pub(super) async fn end_all(&mut self, why: &Reason) {
-        let mut events = self.post.attach();
+    /// Waits until each child has ended or its deadline has passed, and notifies `listener` of each end. An
+    /// orderly end is reported with the reason `why`: the failure of the supervisor.
+    pub(super) async fn stop_all(&mut self, why: &Reason) {
+        let mut events = self.queue.attach();
         while let Some(Some(event)) = events.next().now_or_never() {
-            self.hear(event, why);
+            self.handle_event(event, why);
         }
-        self.bury(why);
-        while let Some(next) = self.left.values().map(|left| left.until).min() {
+        self.report_ended(why);
+        while let Some(next) = self.remaining.values().map(|remaining| remaining.until).min() {
             match timeout(next.since(Time::now()), events.next()).await {
-                Ok(Some(event)) => self.hear(event, why),
-                // Another reader came, which nobody makes: dropped, they have no time any more.
+                Ok(Some(event)) => self.handle_event(event, why),
+                // Another reader was attached, which never happens: the children are dropped without a grace period.
                 Ok(None) => return,
-                Err(_) => self.time_is_over(Time::now(), why),
+                Err(_) => self.handle_deadlines(Time::now(), why),
             }
         }
     }
 
-    fn hear(&mut self, event: Input, why: &Reason) {
+    fn handle_event(&mut self, event: Input, why: &Reason) {
         let (Input::Ended(id, _, reason) | Input::Hung(id, _, reason)) = event else { return };
-        let Some(Left { tenant, does, .. }) = self.left.get(&id) else { return };
-        match does {
-            // What is told of a former life is told late: this one can still act.
-            _ if !tenant.vitals().is_over() => {}
-            Does::Stop => {
+        let Some(Remaining { handle, phase, .. }) = self.remaining.get(&id) else { return };
+        match phase {
+            // The event is late and belongs to a former incarnation: this one is not fenced yet.
+            _ if !handle.liveness().is_fenced() => {}
+            StopPhase::Stop => {
                 let reason = if reason.is_failure() { reason } else { why.clone() };
-                self.lose(id, reason);
+                self.end_child(id, reason);
             }
-            Does::LetGo if tenant.has_ended() => _ = self.left.remove(&id),
-            Does::LetGo => {}
+            StopPhase::Release if handle.has_ended() => _ = self.remaining.remove(&id),
+            StopPhase::Release => {}
         }
     }
 
-    /// Those that ended without a word that anybody has heard.
-    fn bury(&mut self, why: &Reason) {
-        let ended = self.left.iter().filter(|(_, left)| left.tenant.has_ended());
+    /// Reports the children that ended without a report.
+    fn report_ended(&mut self, why: &Reason) {
+        let ended = self.remaining.iter().filter(|(_, remaining)| remaining.handle.has_ended());
         for id in ended.map(|(id, _)| *id).collect::<Vec<_>>() {
-            self.lose(id, why.clone());
+            self.end_child(id, why.clone());
         }
     }
 
-    fn time_is_over(&mut self, now: Time, why: &Reason) {
-        let late =
-            self.left.iter_mut().filter_map(|(id, left)| left.is_late(now).then_some((*id, left.does)));
-        for (id, does) in late.collect::<Vec<_>>() {
-            match does {
-                Does::Stop => {
-                    let has_ended = self.left.get(&id).is_some_and(|left| left.tenant.has_ended());
-                    self.lose(id, if has_ended { why.clone() } else { Reason::Killed });
+    fn handle_deadlines(&mut self, now: Time, why: &Reason) {
+        let late = self
+            .remaining
+            .iter_mut()
+            .filter_map(|(id, remaining)| remaining.is_late(now).then_some((*id, remaining.phase)));
+        for (id, phase) in late.collect::<Vec<_>>() {
+            match phase {
+                StopPhase::Stop => {
+                    let has_ended =
+                        self.remaining.get(&id).is_some_and(|remaining| remaining.handle.has_ended());
+                    self.end_child(id, if has_ended { why.clone() } else { Reason::Killed });
                 }
-                Does::LetGo => {
-                    if let Some(left) = self.left.remove(&id) {
-                        self.give_up(&left.tenant);
+                StopPhase::Release => {
+                    if let Some(remaining) = self.remaining.remove(&id) {
+                        self.abandon(&remaining.handle);
                     }
                 }
             }
         }
     }
 
-    /// It does nothing any more, and that is told. What is left of it is its thread's business, for a while.
-    fn lose(&mut self, id: ChildId, reason: Reason) {
-        let Some(Left { tenant, .. }) = self.left.remove(&id) else { return };
-        tenant.kill();
-        crate::log::warn!(child = tenant.vitals().name(), %reason, "ended without its supervisor");
-        self.tell(SupervisorFact::Gone(id, reason));
-        if tenant.holds_its_thread().is_some() {
-            self.give_up(&tenant);
-        } else if !tenant.has_ended() {
-            let left = Left::new(tenant, Does::LetGo, LETTING_GO, &self.threads.borrow());
-            self.left.insert(id, left);
+    /// Fences a child and reports its end. Its thread has a limited time to release it.
+    fn end_child(&mut self, id: ChildId, reason: Reason) {
+        let Some(Remaining { handle, .. }) = self.remaining.remove(&id) else { return };
+        handle.kill();
+        crate::log::warn!(child = handle.liveness().name(), %reason, "ended without its supervisor");
+        self.notify(SupervisorFact::Gone(id, reason));
+        if handle.blocked_since().is_some() {
+            self.abandon(&handle);
+        } else if !handle.has_ended() {
+            let remaining =
+                Remaining::new(handle, StopPhase::Release, RELEASE_WITHIN, &self.threads.borrow());
+            self.remaining.insert(id, remaining);
         }
     }
 
-    fn give_up(&self, tenant: &Tenant) {
-        if !tenant.has_ended() {
-            self.threads.borrow_mut().give_up(tenant);
+    fn abandon(&self, handle: &ActorHandle) {
+        if !handle.has_ended() {
+            self.threads.borrow_mut().abandon(handle);
         }
     }
 
-    /// Whoever listens may be why the supervisor failed.
-    fn tell(&mut self, fact: SupervisorFact) {
+    /// The listener may be the cause of the supervisor's failure, so its panics are caught.
+    fn notify(&mut self, fact: SupervisorFact) {
         if let Err(panic) = catch_unwind(AssertUnwindSafe(|| (self.listener)(fact))) {
             crate::log::error!(
-                said = words(panic),
-                "whoever listens to a supervisor panicked, and is told the rest"
+                panic = panic_message(panic),
+                "the listener of a supervisor panicked; it receives the remaining facts"
             );
         }
     }
@@ -203,9 +208,9 @@ impl Orphans {
 
 impl Drop for Orphans {
     fn drop(&mut self) {
-        for left in self.left.values() {
-            // One that has ended takes no notice.
-            left.tenant.kill();
+        for remaining in self.remaining.values() {
+            // Has no effect on a child that has ended.
+            remaining.handle.kill();
         }
     }
 }

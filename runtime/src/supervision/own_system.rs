@@ -1,7 +1,7 @@
-//! A thread's own system of actix: what an actor stops when it calls `actix::System::current().stop()` is that, and not its
-//! node.
+//! An actix system per thread: an actor that calls `actix::System::current().stop()` stops that system, and
+//! not its node.
 
-use std::cell::RefCell;
+use std::{cell::RefCell, io};
 
 use actix_rt::{Runtime, System, SystemStop};
 
@@ -9,7 +9,7 @@ thread_local! {
     static OWN: RefCell<Option<System>> = const { RefCell::new(None) };
 }
 
-/// A thread's runtime, with a system that is the thread's own.
+/// The runtime of a thread, with an actix system of its own.
 pub(super) struct OwnSystem(pub(super) tokio::runtime::Runtime);
 
 impl From<OwnSystem> for Runtime {
@@ -18,35 +18,40 @@ impl From<OwnSystem> for Runtime {
         OWN.set(System::try_current());
         // The arbiter drives this runtime, and with it the system.
         let (runtime, stop) = runner.into_parts();
-        runtime.spawn(tell_of_a_stop(stop));
+        runtime.spawn(log_system_stop(stop));
         runtime
     }
 }
 
-/// Makes the thread's own system the current one. The arbiter has made that of whoever started it.
-pub(super) fn settle_in() {
+/// Makes the thread's own system the current one. The arbiter has set that of the creating thread.
+pub(super) fn set_own_system() {
     if let Some(own) = OWN.take() {
         System::set_current(own);
     }
 }
 
-/// Registers the threads that are made on the calling one, the root's, with nobody who could end them all: an actor that
-/// finds the system in which they were made stops nothing with it.
+/// Registers the threads that are created on the calling one, the root thread, with a system that has no
+/// controller. An actor that stops the system of their creation then stops nothing.
 ///
-/// Call it within that thread's own system, once.
-pub fn part_from_threads() {
-    // Its controller ends here.
-    drop(System::new());
+/// Call it once, within that thread's own system.
+///
+/// # Errors
+/// The system refuses a descriptor or memory for a reactor.
+pub fn detach_threads() -> io::Result<()> {
+    let reactor = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    // The controller of this system ends here.
+    drop(System::with_tokio_rt(|| reactor));
+    Ok(())
 }
 
-/// Says it, when an actor stops a system that is not its own to stop.
-pub async fn tell_of_a_stop(stop: SystemStop) {
+/// Logs an actor's attempt to stop a system that it does not own.
+pub async fn log_system_stop(stop: SystemStop) {
     if stop.await.is_ok() {
-        let thread = super::system::thread_id();
+        let thread = crate::thread::system::thread_id();
         crate::log::error!(
             thread,
-            "an actor on this thread has called `actix::System::current().stop()`: it ends nothing but what that actor \
-             has started on arbiters of its own; an application ends by `context.stop()`, its node by `NodeHandle::stop`"
+            "an actor on this thread has called `actix::System::current().stop()`: that ends only the tasks \
+             that the actor has started on its own arbiters; an application ends by `context.stop()`, its node by `NodeHandle::stop`"
         );
     }
 }

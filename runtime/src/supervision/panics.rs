@@ -1,10 +1,10 @@
-//! Where a panic was, and who is told of it: a hook that remembers the place for the guard, and lets the log's thread do all
-//! that may take time. Of a panic in an actor its supervisor hears first; what a log that takes nothing holds up is the log.
+//! The report of panics. A hook stores the location for the guard, and the log thread does all slow work. The
+//! supervisor of an actor is notified of a panic first; a blocked log delays only the log.
 
 use std::{
     any::Any,
     backtrace::Backtrace,
-    cell::{Cell, RefCell},
+    cell::RefCell,
     panic::{AssertUnwindSafe, PanicHookInfo, catch_unwind},
     sync::{Arc, Once, RwLock},
     time::{Duration, SystemTime},
@@ -18,72 +18,54 @@ use tracing::{
 
 use super::{
     frames::{Frames, frames},
-    system,
-    vitals::{Doing, Vitals},
+    liveness::{Activity, Liveness},
 };
-use crate::{log, tid::Tid};
+use crate::{
+    log,
+    thread::{self, Role, system},
+    tid::Tid,
+};
 
-/// Whether this program unwinds from a panic. One that is built with `panic = "abort"` ends with its first panic, whatever
-/// supervisors it has. Cargo builds every crate of a program with the same strategy, so this crate's is the program's.
+/// Whether this program unwinds from a panic. A program with `panic = "abort"` ends with its first panic,
+/// independent of its supervisors. Cargo builds all crates of a program with the same strategy, so this
+/// crate's strategy is the program's.
 pub const UNWINDS: bool = cfg!(panic = "unwind");
 
 /// Time for the log before the process aborts.
-const LAST_WORDS: Duration = Duration::from_secs(1);
+const FLUSH_WITHIN: Duration = Duration::from_secs(1);
 
 type Hook = Box<dyn Fn(&PanicHookInfo<'_>) + Send + Sync>;
 
-/// The panic hook that was there before.
+/// The previously installed panic hook.
 struct Former {
     hook: Hook,
-    /// It is the standard library's, which names the thread that it is called on and looks up that one's backtrace: of a panic
-    /// that is told elsewhere neither is true.
+    /// Whether it is the standard library's hook. That hook names the calling thread and prints its
+    /// backtrace, which is wrong for a panic reported from another thread.
     is_standard: bool,
 }
 
 impl Former {
-    /// Takes it away.
+    /// Removes and returns the installed hook.
     fn take() -> Self {
         let hook = std::panic::take_hook();
-        // Where none is set any more, this is the standard library's.
+        // If no hook is set any more, this is the standard library's.
         let standard = std::panic::take_hook();
         let is_standard = std::ptr::eq(&raw const *hook, &raw const *standard);
         Self { hook, is_standard }
     }
 }
 
-/// Whose a thread is.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Station {
-    /// Nobody's that is known here.
-    Foreign,
-    /// The runtime's: whoever holds it up holds up actors, or those who watch them.
-    Runtime,
-    /// The log's.
-    Log,
-}
-
 thread_local! {
-    /// Where the last panic on this thread was.
+    /// The location of the last panic on this thread.
     static LAST: RefCell<Option<String>> = const { RefCell::new(None) };
-    static STATION: Cell<Station> = const { Cell::new(Station::Foreign) };
 }
 
-/// Read by who may hold the standard library's lock on backtraces for long: it prints a panic while it has that lock. Who
-/// must not wait takes a backtrace only where nobody reads this.
+/// Locked for reading by threads that may hold the standard library's backtrace lock for long, as they print
+/// a panic. A thread that must not wait takes a backtrace only if this is not locked.
 static PRINTS: RwLock<()> = RwLock::new(());
 
-/// The calling thread is the runtime's: a panic on it is told elsewhere.
-pub(super) fn is_the_runtimes() {
-    STATION.set(Station::Runtime);
-}
-
-/// The calling thread is the log's.
-pub(crate) fn writes_the_log() {
-    STATION.set(Station::Log);
-}
-
-/// Makes panics remember where they were. The hook that was there before is called: on the thread that panics where nobody
-/// waits for that, and else on the log's.
+/// Installs the hook that stores the location of a panic. The previous hook is still called: on the panicking
+/// thread if no actor depends on that thread, otherwise on the log thread.
 pub(super) fn install_hook() {
     static INSTALLED: Once = Once::new();
     INSTALLED.call_once(|| {
@@ -94,29 +76,28 @@ pub(super) fn install_hook() {
 
 fn hook(info: &PanicHookInfo<'_>, former: &Arc<Former>) {
     let place = info.location().map(|at| format!("{}:{}", at.file(), at.line()));
-    // A thread that is about to end has no such memory any more; then nobody asks either.
+    // A thread at its end may have destroyed this variable; then no reader needs the location.
     let _ = LAST.try_with(|last| {
         if let Ok(mut last) = last.try_borrow_mut() {
             *last = place;
         }
     });
-    let vitals = Vitals::present();
-    if let Some(vitals) = &vitals {
-        vitals.begins(Doing::Panic, None);
+    let liveness = Liveness::current();
+    if let Some(liveness) = &liveness {
+        liveness.begin(Activity::Panic, None);
     }
-    let station = STATION.try_with(Cell::get).unwrap_or(Station::Foreign);
-    match (station, &vitals) {
-        (Station::Log, _) => (former.hook)(info),
-        (Station::Runtime, _) | (Station::Foreign, Some(_)) if UNWINDS => {
-            let panicked = Panicked::new(info, vitals.as_deref());
+    match (thread::role(), &liveness) {
+        (Role::Log, _) => (former.hook)(info),
+        (Role::Runtime, _) | (Role::Foreign, Some(_)) if UNWINDS => {
+            let panicked = Panicked::new(info, liveness.as_deref());
             let former = former.clone();
-            log::enter(Box::new(move || panicked.tell(&former)));
-            if is_the_last(info) {
-                log::flush(LAST_WORDS);
+            log::enqueue(Box::new(move || panicked.report(&former)));
+            if aborts_process(info) {
+                log::flush(FLUSH_WITHIN);
             }
         }
-        (Station::Runtime | Station::Foreign, _) => {
-            // The former hook says it. A subscriber may be all that anybody reads.
+        (Role::Runtime | Role::Foreign, _) => {
+            // The previous hook prints it. A subscriber may be the only output that is read.
             if !get_default(|reader| reader.is::<NoSubscriber>()) {
                 let thread = system::thread_id();
                 log::error!(thread, "outside of any supervised actor's turn: {}", sentence(info));
@@ -127,57 +108,58 @@ fn hook(info: &PanicHookInfo<'_>, former: &Arc<Former>) {
     }
 }
 
-/// Whether the process aborts when the hook returns. It is not said otherwise in a stable way.
-fn is_the_last(info: &PanicHookInfo<'_>) -> bool {
-    info.payload_as_str().is_some_and(|said| said.starts_with("panic in a "))
+/// Returns whether the process aborts when the hook returns. No stable API reports this, so the message is checked.
+fn aborts_process(info: &PanicHookInfo<'_>) -> bool {
+    info.payload_as_str().is_some_and(|message| message.starts_with("panic in a "))
 }
 
-/// A panic that is to be told on the log's thread.
+/// A panic to be reported by the log thread.
 struct Panicked {
-    /// The actor and its address.
+    /// The name of the actor and its address.
     actor: Option<(String, Option<Tid>)>,
     thread: i32,
-    said: String,
+    message: String,
     backtrace: Option<Backtrace>,
     reader: Dispatch,
     time: SystemTime,
 }
 
 impl Panicked {
-    /// Waits for nobody: where a backtrace is printed now, this panic has none.
-    fn new(info: &PanicHookInfo<'_>, vitals: Option<&Vitals>) -> Self {
+    /// Records a panic without blocking: while another thread prints a backtrace, this panic has none.
+    fn new(info: &PanicHookInfo<'_>, liveness: Option<&Liveness>) -> Self {
         let is_wanted = Frames::wanted() != Frames::None;
         let backtrace = PRINTS.try_write().ok().filter(|_| is_wanted).map(|_held| Backtrace::force_capture());
         Self {
-            actor: vitals.map(|vitals| (vitals.name().to_owned(), vitals.tid())),
+            actor: liveness.map(|liveness| (liveness.name().to_owned(), liveness.tid())),
             thread: system::thread_id(),
-            said: sentence(info),
+            message: sentence(info),
             backtrace,
             reader: get_default(Dispatch::clone),
             time: log::now(),
         }
     }
 
-    /// Says it once: to the subscriber that reads the log, and where there is none to the standard error. A hook of the program's own
-    /// is called in any case; where there is no subscriber it alone says the panic, as it would for any other.
-    fn tell(&self, former: &Former) {
+    /// Reports the panic once: to the subscriber that reads the log, or to the standard error if there is
+    /// none. A custom hook of the program is always called; without a subscriber it alone reports the panic,
+    /// as it does for other panics.
+    fn report(&self, former: &Former) {
         let _prints = PRINTS.read();
-        // A subscriber that came after the panic has the events of this thread.
+        // A subscriber that was set after the panic receives the events of this thread.
         let has_reader = !self.reader.is::<NoSubscriber>() || log::is_replaced();
-        let is_said = has_reader && self.is_logged();
+        let is_reported = has_reader && self.is_logged();
         if !former.is_standard {
-            let mut words = self.words();
-            if !is_said {
-                words.extend(self.frames().iter().map(|frame| format!("\n{frame}")));
+            let mut message = self.summary();
+            if !is_reported {
+                message.extend(self.frames().iter().map(|frame| format!("\n{frame}")));
             }
-            // A hook takes what only a panic can make.
-            let _ = catch_unwind(|| std::panic::panic_any(words));
-        } else if !is_said {
+            // The hook's argument can be created only by a panic.
+            let _ = catch_unwind(|| std::panic::panic_any(message));
+        } else if !is_reported {
             self.write();
         }
     }
 
-    /// Tells the subscriber, if it takes errors.
+    /// Logs the panic, if the subscriber accepts errors.
     fn is_logged(&self) -> bool {
         if self.reader.is::<NoSubscriber>() {
             return self.log();
@@ -185,13 +167,13 @@ impl Panicked {
         with_default(&self.reader, || self.log())
     }
 
-    /// Who panicked, where, and what it said.
-    fn words(&self) -> String {
-        let Self { actor, thread, said, .. } = self;
+    /// Returns the actor, the location and the message of the panic.
+    fn summary(&self) -> String {
+        let Self { actor, thread, message, .. } = self;
         match actor {
-            Some((name, Some(tid))) => format!("the actor '{name}' ({tid}) on thread {thread} {said}"),
-            Some((name, None)) => format!("the actor '{name}' on thread {thread} {said}"),
-            None => format!("a task that is no actor's on thread {thread} {said}"),
+            Some((name, Some(tid))) => format!("the actor '{name}' ({tid}) on thread {thread} {message}"),
+            Some((name, None)) => format!("the actor '{name}' on thread {thread} {message}"),
+            None => format!("a task that is no actor's on thread {thread} {message}"),
         }
     }
 
@@ -199,11 +181,11 @@ impl Panicked {
         self.backtrace.as_ref().map(|backtrace| frames(backtrace, Frames::wanted())).unwrap_or_default()
     }
 
-    /// Writes it to the standard error, as the standard hook would, whatever the log is set to. The frames come last: their names may
-    /// take a while to look up.
+    /// Writes the panic to the standard error, as the standard hook would, independent of the log's filter.
+    /// The frames come last: resolving their names may take a while.
     fn write(&self) {
         let mut line = log::Line::new(self.time, Level::ERROR, module_path!());
-        line.message(&self.words());
+        line.message(&self.summary());
         line.write();
         let frames = self.frames();
         if !frames.is_empty() {
@@ -215,62 +197,62 @@ impl Panicked {
         if !tracing::enabled!(Level::ERROR) {
             return false;
         }
-        let Self { actor, thread, said, .. } = self;
+        let Self { actor, thread, message, .. } = self;
         let frames: String = self.frames().iter().map(|frame| format!("\n{frame}")).collect();
         match actor {
             Some((actor, tid)) => {
                 let tid = tid.map(tracing::field::display);
-                tracing::error!(actor, tid, thread, "{said}{frames}");
+                tracing::error!(actor, tid, thread, "{message}{frames}");
             }
-            None => tracing::error!(thread, "outside of any supervised actor's turn: {said}{frames}"),
+            None => tracing::error!(thread, "outside of any supervised actor's turn: {message}{frames}"),
         }
         true
     }
 }
 
 fn sentence(info: &PanicHookInfo<'_>) -> String {
-    let said = info.payload_as_str().unwrap_or(SPEECHLESS);
+    let message = info.payload_as_str().unwrap_or(NO_TEXT);
     match info.location() {
-        Some(at) => format!("panicked at {at}: {said}"),
-        None => format!("panicked: {said}"),
+        Some(at) => format!("panicked at {at}: {message}"),
+        None => format!("panicked: {message}"),
     }
 }
 
-const SPEECHLESS: &str = "something that is not text";
+const NO_TEXT: &str = "something that is not text";
 
-/// A panic that was caught.
+/// A caught panic.
 pub(super) struct Caught {
-    /// What it said on this thread, and where: `said at file:line`.
-    pub(super) words: String,
-    /// What it carried, if that is more than text: the user's, and so is its drop, which may last, never end, or panic.
-    pub(super) carried: Option<Box<dyn Any + Send>>,
+    /// The message on this thread, and the location: `message at file:line`.
+    pub(super) message: String,
+    /// The payload, if it is more than text. It is a user value, and its drop may take long, never end, or panic.
+    pub(super) payload: Option<Box<dyn Any + Send>>,
 }
 
 impl Caught {
-    /// Of what `catch_unwind` returned, on the thread that panicked.
+    /// Creates it from the result of `catch_unwind`, on the thread that panicked.
     pub(super) fn new(panic: Box<dyn Any + Send>) -> Self {
         let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
         let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
-        let carried = text.is_none().then_some(panic);
-        let said = text.unwrap_or_else(|| SPEECHLESS.to_owned());
-        let words = match LAST.try_with(|last| last.borrow_mut().take()).ok().flatten() {
-            Some(place) => format!("{said} at {place}"),
-            None => said,
+        let payload = text.is_none().then_some(panic);
+        let message = text.unwrap_or_else(|| NO_TEXT.to_owned());
+        let message = match LAST.try_with(|last| last.borrow_mut().take()).ok().flatten() {
+            Some(place) => format!("{message} at {place}"),
+            None => message,
         };
-        Self { words, carried }
+        Self { message, payload }
     }
 }
 
-/// What a panic on this thread said, and where, for whom nobody waits: drops what it carries here, whose drop may panic too.
-pub(super) fn words(panic: Box<dyn Any + Send>) -> String {
-    let Caught { words, carried } = Caught::new(panic);
-    if let Some(carried) = carried {
-        discard(carried);
+/// Returns the message and location of a panic on this thread. Drops the payload here, which may block and may panic.
+pub(super) fn panic_message(panic: Box<dyn Any + Send>) -> String {
+    let Caught { message, payload } = Caught::new(panic);
+    if let Some(payload) = payload {
+        discard(payload);
     }
-    words
+    message
 }
 
-/// Drops what a panic carries. If that panics in its turn, the same again, a few times; the last is kept for ever.
+/// Drops the payload of a panic. If the drop panics, its payload is dropped too, a few times; the last one is leaked.
 fn discard(mut panic: Box<dyn Any + Send>) {
     for _ in 0..8 {
         match catch_unwind(AssertUnwindSafe(|| drop(panic))) {
@@ -286,11 +268,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_caught_panic_says_what_and_where() {
+    fn caught_panic_has_message_and_location() {
         install_hook();
         let line = line!() + 1;
         let panic = catch_unwind(|| panic!("number {}", 13)).expect_err("it panicked");
-        assert_eq!(words(panic), format!("number 13 at {}:{line}", file!()));
+        assert_eq!(panic_message(panic), format!("number 13 at {}:{line}", file!()));
     }
 
     /// Panics when it is dropped, with another like itself.
@@ -303,8 +285,8 @@ mod tests {
     }
 
     #[test]
-    fn a_panic_that_carries_panics_without_end_is_caught_all_the_same() {
+    fn panic_with_endless_nested_panics_is_caught() {
         let panic = catch_unwind(|| std::panic::panic_any(Endless)).expect_err("it panicked");
-        assert!(words(panic).starts_with(SPEECHLESS));
+        assert!(panic_message(panic).starts_with(NO_TEXT));
     }
 }

@@ -1,4 +1,4 @@
-//! Where an actor runs: a thread with a name, or a process of its own.
+//! The place of an actor: a named thread, or a process of its own.
 
 use std::ffi::CString;
 
@@ -7,10 +7,10 @@ use thread_priority::{
     set_thread_priority_and_policy, thread_native_id, thread_schedule_policy_param,
 };
 
-use super::system;
+use crate::thread::{set_normal_schedule, system};
 
-/// Where an actor runs: a thread with a name. Actors that name the same one share it; what they ask of it besides must be the
-/// same, too.
+/// The place of an actor: a thread with a name. Actors that name the same thread share it, and must request
+/// the same priority and CPU.
 ///
 /// # Examples
 ///
@@ -29,30 +29,31 @@ use super::system;
 /// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Place {
-    /// Name of the thread; the kernel shows its first 15 bytes.
+    /// The name of the thread; the kernel shows its first 15 bytes.
     pub thread: String,
-    /// Whose thread it is.
+    /// The owner of the thread.
     pub owner: Owner,
-    /// SCHED_FIFO priority, 1 to 99; an application's is below [that of the thread which makes outputs
-    /// safe](crate::protection::SAFE_OUTPUT_PRIORITY). Where the system refuses it, the node says so once and goes on without.
+    /// SCHED_FIFO priority, 1 to 99. An application's must be below [that of the thread which makes outputs
+    /// safe](crate::protection::SAFE_OUTPUT_PRIORITY). If the system refuses it, the node logs that once and
+    /// runs without it.
     pub realtime_priority: Option<u8>,
-    /// A priority for the node's own thread where the system grants one; nothing is said where it does not.
+    /// A priority for the node's own thread, if the system grants one; a refusal is not logged.
     pub at_best: Option<u8>,
-    /// The one CPU that the thread may run on.
+    /// The only CPU on which the thread may run.
     pub cpu: Option<usize>,
-    /// The thread is in a process of its own, a child of the node's.
+    /// Whether the thread is in a process of its own, a child of the node's process.
     pub own_process: bool,
 }
 
-/// Whose a thread is. Threads of the same name and of different owners are different threads: nobody comes to live on another
-/// one's because he happens to be called like it.
+/// The owner of a thread. Threads of the same name and of different owners are different threads, so that
+/// equal names cannot share one by accident.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Owner {
-    /// The node's: its layers live there, and on the one that reads its sockets whoever asks for [`Place::io`].
+    /// The node: for its layers; the thread that reads its sockets also runs applications that use [`Place::io`].
     Node,
-    /// Everybody's who names it.
+    /// All actors that name it.
     Everybody,
-    /// The application's that it is called like, and nobody else's.
+    /// The application of the same name, and no other one.
     Application,
 }
 
@@ -61,20 +62,20 @@ impl Place {
         Self { thread, owner, realtime_priority: None, at_best: None, cpu: None, own_process: false }
     }
 
-    /// The thread called `name`, scheduled like any other, shared by all who name it. Those that name none share the one called
-    /// `apps`.
+    /// Returns the thread called `name`, with the ordinary schedule, shared by all actors that name it.
+    /// Actors without a place share the thread `apps`.
     #[must_use]
     pub fn thread(name: impl Into<String>) -> Self {
         Self::of(Owner::Everybody, name.into())
     }
 
-    /// A thread that is shared with nobody, called like the application that has it: its declaration fills the name in.
+    /// Returns an unshared thread, named like its application: the declaration sets the name.
     #[must_use]
     pub const fn own_thread() -> Self {
         Self::of(Owner::Application, String::new())
     }
 
-    /// The place of the application called `name`.
+    /// Returns the place of the application called `name`.
     #[must_use]
     pub(crate) fn of_application(mut self, name: &str) -> Self {
         if self.owner == Owner::Application {
@@ -83,19 +84,19 @@ impl Place {
         self
     }
 
-    /// The thread that reads the node's sockets. Its priority and its CPU are the node's.
+    /// Returns the thread that reads the node's sockets. The node sets its priority and its CPU.
     #[must_use]
     pub fn io() -> Self {
         Self::layer("io")
     }
 
-    /// A thread for layers of the node.
+    /// Returns a thread for layers of the node.
     #[must_use]
     pub fn layer(name: impl Into<String>) -> Self {
         Self::of(Owner::Node, name.into())
     }
 
-    /// A process of its own, a child of the node's: its thread is called like the application.
+    /// Returns a process of its own, a child of the node's process: its thread is named like the application.
     ///
     /// # Examples
     ///
@@ -114,8 +115,9 @@ impl Place {
         place
     }
 
-    /// The same thread under SCHED_FIFO with this priority, 1 to 99; an application with 90 or more is refused by its node, as
-    /// [what makes outputs safe](crate::protection::SAFE_OUTPUT_PRIORITY) has to come before what it guards.
+    /// Sets SCHED_FIFO with this priority, 1 to 99. A node rejects an application with 90 or more, because
+    /// the [thread that makes outputs safe](crate::protection::SAFE_OUTPUT_PRIORITY) must preempt the threads
+    /// that it guards.
     ///
     /// # Examples
     ///
@@ -131,26 +133,27 @@ impl Place {
         self
     }
 
-    /// The same thread under SCHED_FIFO with this priority, 1 to 99, where the system allows it, and as any other where it does not.
+    /// Sets SCHED_FIFO with this priority, 1 to 99, if the system allows it, and otherwise the ordinary schedule.
     #[must_use]
     pub const fn realtime_at_best(mut self, priority: u8) -> Self {
         self.at_best = Some(priority);
         self
     }
 
-    /// The same thread on one CPU only.
+    /// Pins the thread to one CPU.
     #[must_use]
     pub const fn on_cpu(mut self, cpu: usize) -> Self {
         self.cpu = Some(cpu);
         self
     }
 
-    /// Which thread of a node this is.
+    /// Returns the key of the thread in its node.
     pub(super) fn key(&self) -> (Owner, String) {
         (self.owner, self.thread.clone())
     }
 
-    /// What is wrong with `other`, if it names this thread and asks for another priority or CPU. In words, without a remedy.
+    /// Returns the conflict with `other`, if it names this thread and requests another priority or CPU. A
+    /// text without a remedy.
     #[must_use]
     pub fn clash(&self, other: &Self) -> Option<String> {
         let is_same =
@@ -175,24 +178,24 @@ impl Place {
         }
     }
 
-    /// Makes the calling thread, which is new, the thread of this place.
+    /// Configures the calling thread, which must be new, for this place.
     pub fn prepare(&self) {
         let name: Vec<u8> = self.thread.bytes().filter(|byte| *byte != 0).take(15).collect();
         if let Ok(name) = CString::new(name) {
             system::name_thread(&name);
         }
         if let Some(cpu) = self.cpu
-            && let Err(error) = system::keep_on(cpu)
+            && let Err(error) = system::pin_to(cpu)
         {
             crate::log::warn!(thread = self.thread, cpu, %error, "the thread stays on any CPU; does this one exist?");
         }
         if let Some(priority) = self.at_best {
-            let granted = make_realtime(priority).is_ok();
+            let granted = set_realtime_priority(priority).is_ok();
             crate::log::debug!(
                 thread = self.thread,
                 priority,
                 granted,
-                "a real-time priority, where one is to be had"
+                "a real-time priority, if one is granted"
             );
         }
         if let Some(priority) = self.realtime_priority {
@@ -201,7 +204,7 @@ impl Place {
     }
 
     fn make_realtime(&self, priority: u8) {
-        if let Err(error) = make_realtime(priority) {
+        if let Err(error) = set_realtime_priority(priority) {
             crate::log::warn!(
                 thread = self.thread,
                 priority,
@@ -212,21 +215,22 @@ impl Place {
     }
 }
 
-/// Makes the calling thread, which is new and has the CPUs and the priority of whoever made it, one that depends on neither: it may run on any
-/// CPU, under SCHED_FIFO with the priority `wanted`, or with the highest that is granted. Says which it has, as does the log.
-pub(crate) fn make_foremost(thread: &str, wanted: u8) -> u8 {
-    if let Err(error) = system::keep_on_any() {
-        crate::log::warn!(thread, %error, "the thread stays on the CPUs of whoever made it");
+/// Configures the calling thread, which is new, to be independent of the thread that created it. It may run
+/// on any CPU, under SCHED_FIFO with the priority `wanted`, or the highest one that is granted. Returns the
+/// granted priority, and logs it.
+pub(crate) fn set_highest_priority(thread: &str, wanted: u8) -> u8 {
+    if let Err(error) = system::unpin() {
+        crate::log::warn!(thread, %error, "the thread stays on the CPUs of the thread that created it");
     }
     let (policy, inherited) = schedule();
     let granted = priorities(wanted, system::realtime_limit(), inherited)
         .into_iter()
         .flatten()
-        .any(|priority| make_realtime(priority).is_ok());
-    // Whoever made it may be one that waits for all others.
-    let gives_way = matches!(policy, Some(ThreadSchedulePolicy::Normal(normal)) if normal != NormalThreadSchedulePolicy::Other);
-    if !granted && gives_way {
-        make_ordinary();
+        .any(|priority| set_realtime_priority(priority).is_ok());
+    // The creating thread may have the idle schedule, which yields to all others.
+    let yields_to_others = matches!(policy, Some(ThreadSchedulePolicy::Normal(normal)) if normal != NormalThreadSchedulePolicy::Other);
+    if !granted && yields_to_others {
+        set_normal_schedule();
     }
     let (_, has) = schedule();
     if has >= wanted {
@@ -236,34 +240,34 @@ pub(crate) fn make_foremost(thread: &str, wanted: u8) -> u8 {
             thread,
             wanted,
             has,
-            "the system refuses this thread its real-time priority; it has another (0: none), and what has one as high or higher or, without one, a busy CPU \
-             makes it late; allow it with `ulimit -r 99` or `setcap cap_sys_nice+ep` on the program"
+            "the system refuses this thread its real-time priority; it has another (0: none), so threads of the same or a higher priority delay it, and without \
+             one any busy CPU does; allow it with `ulimit -r 99` or `setcap cap_sys_nice+ep` on the program"
         );
     }
     has
 }
 
-/// The calling thread's real-time priority, 0 for none.
+/// Returns the calling thread's real-time priority, 0 for none.
 pub(crate) fn realtime_priority() -> u8 {
     let (_, priority) = schedule();
     priority
 }
 
-/// The real-time priorities to ask for, one after the other, of a thread that has inherited one, 0 for none: the one that is wanted, and the
-/// highest that the limit grants, where that is more than it has.
+/// Returns the real-time priorities to request, in order, for a thread that inherited one, 0 for none: the
+/// wanted one, then the highest one within the limit, if that is above the inherited one.
 fn priorities(wanted: u8, limit: u8, inherited: u8) -> [Option<u8>; 2] {
     [Some(wanted), Some(limit.min(wanted)).filter(|granted| *granted > inherited)]
 }
 
-/// How the calling thread is scheduled, and its real-time priority, 0 for none.
+/// Returns the scheduling policy of the calling thread, and its real-time priority, 0 for none.
 fn schedule() -> (Option<ThreadSchedulePolicy>, u8) {
     thread_schedule_policy_param(thread_native_id()).map_or((None, 0), |(policy, params)| {
         (Some(policy), u8::try_from(params.sched_priority).unwrap_or(0))
     })
 }
 
-/// Puts the calling thread under SCHED_FIFO with this priority, 1 to 99.
-pub(super) fn make_realtime(priority: u8) -> Result<(), thread_priority::Error> {
+/// Sets the calling thread to SCHED_FIFO with this priority, 1 to 99.
+pub(super) fn set_realtime_priority(priority: u8) -> Result<(), thread_priority::Error> {
     let level = priority
         .try_into()
         .map_err(|_| thread_priority::Error::Priority("a real-time priority is 1 to 99"))?;
@@ -271,30 +275,12 @@ pub(super) fn make_realtime(priority: u8) -> Result<(), thread_priority::Error> 
     set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(level), policy)
 }
 
-/// The middle of `thread_priority`'s scale of 0 to 99, which is a niceness of 0.
-const MIDDLE: u8 = 48;
-
-/// Puts the calling thread under the ordinary schedule: a thread begins with that of who made it.
-pub fn make_ordinary() {
-    let policy = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Other);
-    let level = ThreadPriority::Crossplatform(MIDDLE.try_into().expect("it is on the scale"));
-    // The schedule itself is refused to nobody; the niceness stays where that is.
-    let _ = set_thread_priority_and_policy(thread_native_id(), level, policy);
-}
-
-/// The same, and on the CPUs that the process was started with.
-pub(crate) fn make_like_any_other() {
-    // Refused, it stays where whoever made it is.
-    let _ = system::keep_on_the_processes();
-    make_ordinary();
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn a_thread_that_two_name_has_one_priority_and_one_cpu() {
+    fn shared_thread_has_one_priority_and_one_cpu() {
         let leg = || Place::thread("leg");
         let words = leg().realtime(40).clash(&leg().on_cpu(1)).expect("they ask for different things");
         assert_eq!(
@@ -309,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn a_thread_that_is_refused_its_priority_takes_the_highest_that_is_granted() {
+    fn refused_priority_falls_back_to_the_highest_granted() {
         let asked = |limit, inherited| -> Vec<u8> {
             priorities(90, limit, inherited).into_iter().flatten().collect()
         };

@@ -5,10 +5,11 @@ use std::sync::{
     atomic::{AtomicUsize, Ordering},
 };
 
-/// Says once that an actor is ready, when all its parts are.
+/// Reports once that an actor is ready, when all its parts are.
 ///
-/// The paper's section 6: a layer may not mark itself as started before all of its threads have reached the intended
-/// point of execution. Each sub-task owns one [`ReadyPart`]; the last one that is reached speaks for all.
+/// The paper's section 6: a layer may not mark itself as started before all of its threads have reached the
+/// intended point of execution. Each sub-task owns one [`ReadyPart`]; the last one that is reached opens the
+/// gate.
 ///
 /// # Examples
 ///
@@ -29,7 +30,7 @@ use std::sync::{
 /// }
 /// ```
 pub struct ReadyGate {
-    say: Box<dyn FnOnce() + Send>,
+    on_ready: Box<dyn FnOnce() + Send>,
 }
 
 impl std::fmt::Debug for ReadyGate {
@@ -39,17 +40,17 @@ impl std::fmt::Debug for ReadyGate {
 }
 
 impl ReadyGate {
-    /// A gate that calls `say` when it opens.
-    pub fn new(say: impl FnOnce() + Send + 'static) -> Self {
-        Self { say: Box::new(say) }
+    /// Creates a gate that calls `on_ready` when it opens.
+    pub fn new(on_ready: impl FnOnce() + Send + 'static) -> Self {
+        Self { on_ready: Box::new(on_ready) }
     }
 
-    /// The actor is ready, having no parts to wait for.
+    /// Opens the gate of an actor without parts.
     pub fn reached(self) {
-        (self.say)();
+        (self.on_ready)();
     }
 
-    /// One part for each sub-task; the gate opens when all `N` are reached.
+    /// Splits the gate into one part per sub-task; the gate opens when all `N` are reached.
     #[must_use]
     pub fn parts<const N: usize>(self) -> [ReadyPart; N] {
         let shared = Arc::new(Parts { left: AtomicUsize::new(N), gate: std::sync::Mutex::new(Some(self)) });
@@ -62,7 +63,7 @@ struct Parts {
     gate: std::sync::Mutex<Option<ReadyGate>>,
 }
 
-/// One sub-task's share of a [`ReadyGate`].
+/// The part of a [`ReadyGate`] that one sub-task owns.
 pub struct ReadyPart(Arc<Parts>);
 
 impl std::fmt::Debug for ReadyPart {
@@ -72,11 +73,11 @@ impl std::fmt::Debug for ReadyPart {
 }
 
 impl ReadyPart {
-    /// This sub-task has reached its intended point.
+    /// Marks this sub-task as having reached its intended point.
     pub fn reached(self) {
-        // SYNC: AcqRel, so that whoever sees the count at zero also sees what the other parts did before.
+        // SYNC: AcqRel, so that the thread that sees the count at zero also sees the earlier writes of the other parts.
         if self.0.left.fetch_sub(1, Ordering::AcqRel) == 1
-            && let Some(gate) = crate::post::lock(&self.0.gate).take()
+            && let Some(gate) = crate::lock(&self.0.gate).take()
         {
             gate.reached();
         }
@@ -88,7 +89,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gate_opens_when_the_last_part_is_reached_and_not_before() {
+    fn gate_opens_only_when_the_last_part_is_reached() {
         let opened = Arc::new(AtomicUsize::new(0));
         let counter = opened.clone();
         let [first, second] = ReadyGate::new(move || {

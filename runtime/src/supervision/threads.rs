@@ -1,4 +1,4 @@
-//! The threads that actors live on, by name.
+//! The threads of actors, by name.
 
 use std::{
     cell::RefCell,
@@ -14,175 +14,178 @@ use actix_rt::{Arbiter, ArbiterHandle};
 use thread_priority::{ThreadId, ThreadPriority, set_thread_priority_and_policy, thread_native_id};
 
 use super::{
-    Burials, Place, Reason,
-    own_system::{OwnSystem, settle_in},
-    panics::is_the_runtimes,
+    DropQueue, Place, Reason,
+    actor_handle::{ActorEvent, ActorHandle, WeakActorHandle},
+    liveness::Neighbours,
+    own_system::{OwnSystem, set_own_system},
     place::Owner,
-    system,
-    tenant::{Fate, Tenant, WeakTenant},
-    vitals::Neighbours,
-    watchdog::{Reprieve, Watchdog},
+    watchdog::{DeadlineExtension, Watchdog},
 };
-use crate::{post::lock, time::Time};
+use crate::{
+    lock,
+    thread::{mark_runtime_thread, system},
+    time::Time,
+};
 
-/// One thread of a node, from its making to its end.
+/// One thread of a node, from its creation to its end.
 #[derive(Debug)]
-pub(super) struct Seat {
+pub(super) struct ThreadSlot {
     place: Place,
-    /// The kernel's number of the thread, while it lives.
+    /// The kernel's ID of the thread, while it exists.
     tid: AtomicI32,
-    /// What a thread's priority is set by. Held by whoever sets it, so that the thread does not end meanwhile.
+    /// The handle for changes of its priority. Its lock keeps the thread from ending during a change.
     native: Mutex<Option<ThreadId>>,
-    given_up: AtomicBool,
-    /// Who lives on it.
-    tenants: Mutex<Vec<WeakTenant>>,
-    /// Threads of the node that were given up and have not ended.
+    is_abandoned: AtomicBool,
+    /// The incarnations that run on the thread.
+    actors: Mutex<Vec<WeakActorHandle>>,
+    /// Number of abandoned threads of the node that have not ended.
     abandoned: Arc<AtomicUsize>,
 }
 
-impl Seat {
+impl ThreadSlot {
     fn new(place: &Place, abandoned: Arc<AtomicUsize>) -> Arc<Self> {
         Arc::new(Self {
             place: place.clone(),
             tid: AtomicI32::new(0),
             native: Mutex::new(None),
-            given_up: AtomicBool::new(false),
-            tenants: Mutex::default(),
+            is_abandoned: AtomicBool::new(false),
+            actors: Mutex::default(),
             abandoned,
         })
     }
 
-    /// The seat of the calling thread, which is no node's: nobody gives it up.
+    /// Creates the entry of the calling thread, which belongs to no node and is never abandoned.
     pub(super) fn of_this_thread(place: &Place) -> Arc<Self> {
-        let seat = Self::new(place, Arc::default());
-        seat.clone().occupy();
-        seat
+        let slot = Self::new(place, Arc::default());
+        slot.clone().register_thread();
+        slot
     }
 
-    /// The kernel's number of the thread; `None` before its first and after its last breath.
+    /// Returns the kernel's ID of the thread; `None` before its start and after its end.
     pub(super) fn tid(&self) -> Option<i32> {
         Some(self.tid.load(Ordering::Relaxed)).filter(|tid| *tid > 0)
     }
 
-    /// Counts the thread among those that were given up, once. `None` if it was before, or has ended.
-    fn set_given_up(&self) -> Option<usize> {
-        // Under this lock, which the thread takes when it ends: it is counted down as often as up.
+    /// Marks the thread as abandoned, and returns the number of abandoned threads. Returns `None` if it was
+    /// abandoned before, or has ended.
+    fn mark_abandoned(&self) -> Option<usize> {
+        // The thread takes this lock when it ends, so each increment has one decrement.
         let native = lock(&self.native);
-        if native.is_none() || self.given_up.swap(true, Ordering::AcqRel) {
+        if native.is_none() || self.is_abandoned.swap(true, Ordering::AcqRel) {
             return None;
         }
         Some(self.abandoned.fetch_add(1, Ordering::AcqRel) + 1)
     }
 
-    /// Lets the thread run only when the CPU has nothing else to do, whatever priority it had.
+    /// Lowers the thread to idle scheduling, from any priority.
     pub(super) fn demote(&self) {
         let native = lock(&self.native);
         if let Some(native) = *native {
-            // A system that refuses this has the thread go on as before: nothing here depends on it.
+            // If the system refuses, the thread continues as before; nothing here depends on it.
             let _ = set_thread_priority_and_policy(native, ThreadPriority::Min, system::IDLE);
         }
     }
 
-    /// What its tenants but this one do.
-    pub(super) fn others_than(&self, tenant: &Tenant) -> Neighbours {
+    /// Returns the activity of the thread's actors except this one.
+    pub(super) fn neighbours_of(&self, handle: &ActorHandle) -> Neighbours {
         let mut neighbours = Neighbours::default();
-        for other in lock(&self.tenants).iter().filter_map(WeakTenant::living) {
-            if !Arc::ptr_eq(other.vitals(), tenant.vitals()) {
-                let sight = other.vitals().sight();
-                neighbours.are_busy |= sight.is_busy();
-                neighbours.turns = neighbours.turns.wrapping_add(sight.turn);
+        for other in lock(&self.actors).iter().filter_map(WeakActorHandle::living) {
+            if !Arc::ptr_eq(other.liveness(), handle.liveness()) {
+                let snapshot = other.liveness().snapshot();
+                neighbours.are_busy |= snapshot.is_busy();
+                neighbours.turns = neighbours.turns.wrapping_add(snapshot.turn);
             }
         }
         neighbours
     }
 
-    fn add(&self, tenant: &Tenant) {
-        let mut tenants = lock(&self.tenants);
-        tenants.retain(|tenant| tenant.living().is_some());
-        tenants.push(tenant.downgrade());
+    fn add(&self, handle: &ActorHandle) {
+        let mut actors = lock(&self.actors);
+        actors.retain(|handle| handle.living().is_some());
+        actors.push(handle.downgrade());
     }
 
-    /// Sits down on the calling thread.
-    fn occupy(self: Arc<Self>) {
+    /// Registers the calling thread in this entry.
+    fn register_thread(self: Arc<Self>) {
         self.tid.store(system::thread_id(), Ordering::Relaxed);
         *lock(&self.native) = Some(thread_native_id());
-        is_the_runtimes();
-        OCCUPIED.set(Some(Occupied(self)));
+        mark_runtime_thread();
+        REGISTRATION.set(Some(Registration(self)));
     }
 }
 
 thread_local! {
-    /// The seat of this thread, which is told when the thread ends.
-    static OCCUPIED: RefCell<Option<Occupied>> = const { RefCell::new(None) };
+    /// The entry of this thread, which is updated when the thread ends.
+    static REGISTRATION: RefCell<Option<Registration>> = const { RefCell::new(None) };
 }
 
-struct Occupied(Arc<Seat>);
+struct Registration(Arc<ThreadSlot>);
 
-impl Drop for Occupied {
+impl Drop for Registration {
     fn drop(&mut self) {
         self.0.tid.store(0, Ordering::Relaxed);
         let mut native = lock(&self.0.native);
         *native = None;
-        if self.0.given_up.load(Ordering::Acquire) {
+        if self.0.is_abandoned.load(Ordering::Acquire) {
             self.0.abandoned.fetch_sub(1, Ordering::AcqRel);
         }
     }
 }
 
-/// What an actor did when somebody looked.
+/// The activity of an actor at one moment.
 #[derive(Clone, Debug)]
 pub struct Turn {
-    /// Its name.
+    /// The name of the actor.
     pub actor: String,
-    /// Another number for each turn of one life.
+    /// The number of the turn, different for each turn of one incarnation.
     pub number: u64,
-    /// Whether it is in the middle of that turn, or rests after it.
+    /// Whether the turn is in progress; otherwise the actor is idle after it.
     pub is_on: bool,
-    /// When the turn began, if the actor knew; else whoever looks twice knows since when it lasts at least.
+    /// When the turn began, if the actor recorded it. Otherwise two observations give a lower bound of its duration.
     pub begun: Option<Time>,
 }
 
 impl Turn {
-    /// What this one does now.
-    pub(super) fn of(tenant: &Tenant) -> Self {
-        let vitals = tenant.vitals();
-        let sight = vitals.sight();
+    /// Returns the current activity of an actor.
+    pub(super) fn of(handle: &ActorHandle) -> Self {
+        let liveness = handle.liveness();
+        let snapshot = liveness.snapshot();
         Self {
-            actor: vitals.name().to_owned(),
-            number: sight.turn,
-            is_on: sight.is_busy(),
-            begun: sight.begun,
+            actor: liveness.name().to_owned(),
+            number: snapshot.turn,
+            is_on: snapshot.is_busy(),
+            begun: snapshot.begun,
         }
     }
 }
 
-/// The threads of a node. Made when the first actor needs them; used on the node's root thread only.
+/// The threads of a node. Each is created for its first actor; used on the node's root thread only.
 #[derive(Debug, Default)]
 pub struct Threads {
-    arbiters: BTreeMap<(Owner, String), (Arbiter, Arc<Seat>)>,
+    arbiters: BTreeMap<(Owner, String), (Arbiter, Arc<ThreadSlot>)>,
     watchdog: Watchdog,
     abandoned: Arc<AtomicUsize>,
-    burials: Burials,
+    drop_queue: DropQueue,
 }
 
 impl Threads {
-    /// Where to drop what is foreign.
+    /// Returns the queue for drops of user values.
     #[must_use]
-    pub fn burials(&self) -> Burials {
-        self.burials.clone()
+    pub fn drop_queue(&self) -> DropQueue {
+        self.drop_queue.clone()
     }
 
-    /// The thread of `place`, a new one if it has none that lives.
+    /// Returns the thread of `place`, and creates it if none exists.
     ///
     /// # Errors
-    /// In words: the system gives no thread, or no descriptors for its reactor; or the thread has another real-time
-    /// priority or CPU than `place` asks for.
-    pub(super) fn get(&mut self, place: &Place) -> Result<(ArbiterHandle, Arc<Seat>), String> {
+    /// A text: the system gives no thread, or no descriptors for its reactor; or the thread has another
+    /// real-time priority or CPU than `place` requests.
+    pub(super) fn get(&mut self, place: &Place) -> Result<(ArbiterHandle, Arc<ThreadSlot>), String> {
         self.arbiters.retain(|_, (arbiter, _)| arbiter.alive());
-        if let Some((arbiter, seat)) = self.arbiters.get(&place.key()) {
-            return match seat.place.clash(place) {
-                None => Ok((arbiter.handle(), seat.clone())),
-                Some(why) => Err(format!("{why}; give all who live there the same")),
+        if let Some((arbiter, slot)) = self.arbiters.get(&place.key()) {
+            return match slot.place.clash(place) {
+                None => Ok((arbiter.handle(), slot.clone())),
+                Some(why) => Err(format!("{why}; give all actors of this thread the same")),
             };
         }
         let made = self.make(place);
@@ -192,24 +195,24 @@ impl Threads {
         })
     }
 
-    fn make(&mut self, place: &Place) -> std::io::Result<(ArbiterHandle, Arc<Seat>)> {
-        let seat = Seat::new(place, self.abandoned.clone());
-        let (prepared, occupied) = (place.clone(), seat.clone());
+    fn make(&mut self, place: &Place) -> std::io::Result<(ArbiterHandle, Arc<ThreadSlot>)> {
+        let slot = ThreadSlot::new(place, self.abandoned.clone());
+        let (prepared, new_slot) = (place.clone(), slot.clone());
         let arbiter = Arbiter::try_with_tokio_rt(move || {
             prepared.prepare();
-            occupied.occupy();
+            new_slot.register_thread();
             tokio::runtime::Builder::new_current_thread().enable_all().build().map(OwnSystem)
         })?;
-        arbiter.spawn_fn(settle_in);
+        arbiter.spawn_fn(set_own_system);
         let handle = arbiter.handle();
-        self.arbiters.insert(place.key(), (arbiter, seat.clone()));
-        Ok((handle, seat))
+        self.arbiters.insert(place.key(), (arbiter, slot.clone()));
+        Ok((handle, slot))
     }
 
-    /// Somebody who lived at `place` will never again: its thread ends, unless it has other tenants.
+    /// Removes an actor of `place`: its thread ends, unless it has other actors.
     pub(super) fn leave(&mut self, place: &Place) {
-        let is_empty = |seat: &Seat| lock(&seat.tenants).iter().all(|tenant| tenant.living().is_none());
-        if self.arbiters.get(&place.key()).is_some_and(|(_, seat)| is_empty(seat)) {
+        let is_empty = |slot: &ThreadSlot| lock(&slot.actors).iter().all(|handle| handle.living().is_none());
+        if self.arbiters.get(&place.key()).is_some_and(|(_, slot)| is_empty(slot)) {
             self.end(&place.key());
         }
     }
@@ -220,40 +223,42 @@ impl Threads {
         }
     }
 
-    /// What every actor on these threads does. Reads what their threads write, and waits for none of them.
+    /// Returns the activity of every actor on these threads. Reads the state that their threads write,
+    /// without waiting for them.
     #[must_use]
     pub fn turns(&self) -> Vec<Turn> {
-        let seats = self.arbiters.values().map(|(_, seat)| seat);
-        let tenants = seats
-            .flat_map(|seat| lock(&seat.tenants).iter().filter_map(WeakTenant::living).collect::<Vec<_>>());
-        tenants.map(|tenant| Turn::of(&tenant)).collect()
+        let slots = self.arbiters.values().map(|(_, slot)| slot);
+        let actors = slots.flat_map(|slot| {
+            lock(&slot.actors).iter().filter_map(WeakActorHandle::living).collect::<Vec<_>>()
+        });
+        actors.map(|handle| Turn::of(&handle)).collect()
     }
 
-    /// A life moves in: its thread knows it, and the watchdog watches it.
-    pub(super) fn settle(&self, tenant: &Tenant) {
-        if let Some(seat) = tenant.seat() {
-            seat.add(tenant);
+    /// Registers an incarnation with its thread and the watchdog.
+    pub(super) fn register(&self, handle: &ActorHandle) {
+        if let Some(slot) = handle.slot() {
+            slot.add(handle);
         }
-        self.watchdog.watch(tenant);
+        self.watchdog.watch(handle);
     }
 
-    /// A life has so much time for something, from now on.
-    pub(super) fn reprieve(&self, tenant: &Tenant, within: Duration) -> Reprieve {
-        self.watchdog.reprieve(tenant, within)
+    /// Starts a deadline of an incarnation that can be extended.
+    pub(super) fn deadline_extension(&self, handle: &ActorHandle, within: Duration) -> DeadlineExtension {
+        self.watchdog.deadline_extension(handle, within)
     }
 
-    /// Gives up the thread that `hung` does not let go: it ends when it comes back; the next actor of this place gets a new
-    /// one. Its other tenants are lost with it.
-    pub(super) fn give_up(&mut self, hung: &Tenant) {
-        let Some(seat) = hung.seat() else { return };
-        let Some(abandoned) = seat.set_given_up() else { return };
-        seat.demote();
-        let neighbours: Vec<_> = lock(&seat.tenants)
+    /// Abandons the thread that `hung` blocks: it ends when the actor returns, and the next actor of this
+    /// place gets a new one. Its other actors are lost with it.
+    pub(super) fn abandon(&mut self, hung: &ActorHandle) {
+        let Some(slot) = hung.slot() else { return };
+        let Some(abandoned) = slot.mark_abandoned() else { return };
+        slot.demote();
+        let neighbours: Vec<_> = lock(&slot.actors)
             .iter()
-            .filter_map(WeakTenant::living)
-            .filter(|other| !Arc::ptr_eq(other.vitals(), hung.vitals()))
+            .filter_map(WeakActorHandle::living)
+            .filter(|other| !Arc::ptr_eq(other.liveness(), hung.liveness()))
             .collect();
-        let (thread, child) = (&seat.place.thread, hung.vitals().name());
+        let (thread, child) = (&slot.place.thread, hung.liveness().name());
         crate::log::error!(
             child,
             thread,
@@ -263,21 +268,21 @@ impl Threads {
         );
         for neighbour in neighbours {
             neighbour.kill();
-            neighbour.report(Fate::Ended(Reason::ThreadEnded));
+            neighbour.report(ActorEvent::Ended(Reason::ThreadEnded));
         }
-        let key = seat.place.key();
-        if self.arbiters.get(&key).is_some_and(|(_, present)| Arc::ptr_eq(present, seat)) {
+        let key = slot.place.key();
+        if self.arbiters.get(&key).is_some_and(|(_, present)| Arc::ptr_eq(present, slot)) {
             self.end(&key);
         }
     }
 
-    /// Threads that were given up and have not ended.
+    /// Returns the number of abandoned threads that have not ended.
     #[must_use]
     pub fn abandoned(&self) -> usize {
         self.abandoned.load(Ordering::Acquire)
     }
 
-    /// Ends all threads.
+    /// Stops all threads.
     pub fn stop(&mut self) {
         for (arbiter, _) in std::mem::take(&mut self.arbiters).into_values() {
             arbiter.stop();
@@ -287,7 +292,7 @@ impl Threads {
 
 impl Drop for Threads {
     fn drop(&mut self) {
-        // Nobody is left who could end them, or would hear who hangs.
+        // No owner is left that could stop them or receive a report of a hang.
         self.stop();
     }
 }

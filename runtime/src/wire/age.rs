@@ -1,20 +1,20 @@
-//! How wrong a message's send time may be, in the 16 bits of the header that a session between two nodes has used up by then: so each message
-//! carries it, to other processes of the host too, and nobody is asked.
+//! The error of a message's send time, in the 16 header bits that a session between two nodes no longer needs
+//! then. So each message carries it, also to other processes of the host, without a query.
 
 use std::time::Duration;
 
 use super::Header;
 use crate::time::Time;
 
-/// In these bits: it is not known.
+/// The value of these bits for an unknown error.
 const UNKNOWN: u16 = u16::MAX;
-/// From here on milliseconds, below it microseconds.
+/// The unit is milliseconds from here on, microseconds below it.
 const MILLIS: u16 = 1 << 15;
 
 impl Header {
-    /// The error of `sent` at most, where a node has turned it into the clock of this host: zero for what was sent on this host, `None`
-    /// where nobody has measured the clock of the sender's host. Less than 33 ms is said in whole microseconds, more in whole milliseconds,
-    /// rounded up.
+    /// Returns the maximum error of `sent`, after a node has converted it to the clock of this host: zero for
+    /// a message of this host, `None` if the clock of the sender's host was not measured. Errors below 33 ms
+    /// are in whole microseconds, larger ones in whole milliseconds, rounded up.
     #[must_use]
     pub const fn sent_error(&self) -> Option<Duration> {
         match self.number {
@@ -24,7 +24,7 @@ impl Header {
         }
     }
 
-    /// Says how wrong `sent` may be; one that may be wrong by more than 32 s is not known.
+    /// Sets the error of `sent`; an error above 32 s counts as unknown.
     pub fn set_sent_error(&mut self, error: Option<Duration>) {
         self.number = error.map_or(UNKNOWN, |error| {
             let in_micros =
@@ -38,26 +38,27 @@ impl Header {
         });
     }
 
-    /// When it was sent, in this host's clock; `None` where that is not known.
+    /// Returns when the message was sent, in this host's clock; `None` if that is unknown.
     #[must_use]
     pub const fn known_sent(&self) -> Option<Time> {
         if self.number == UNKNOWN { None } else { Some(self.sent) }
     }
 
-    /// Time from sending to `now`, as wrong as [`sent_error`](Self::sent_error) says; `None` where it is not known.
+    /// Returns the time from sending to `now`, with the error [`sent_error`](Self::sent_error); `None` if it
+    /// is unknown.
     #[must_use]
     pub const fn age(&self, now: Time) -> Option<Duration> {
         if self.number == UNKNOWN { None } else { Some(now.since(self.sent)) }
     }
 
-    /// The greatest age that it can have at `now`: its age and the error of that; `None` where it is not known.
+    /// Returns the maximum age at `now`: the age plus its error; `None` if it is unknown.
     #[must_use]
     pub fn age_at_most(&self, now: Time) -> Option<Duration> {
         Some(self.age(now)?.saturating_add(self.sent_error()?))
     }
 }
 
-/// Whether something of this greatest age may be older than `limit`. What has an unknown age may be.
+/// Returns whether a message of this maximum age may be older than `limit`. An unknown age may be.
 #[must_use]
 pub fn may_be_older(age_at_most: Option<Duration>, limit: Duration) -> bool {
     age_at_most.is_none_or(|age| age > limit)
@@ -79,7 +80,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn an_error_is_never_said_to_be_smaller(nanos in prop_oneof![any::<u64>(), 0..100_000_000u64, 0..100_000_000_000u64]) {
+        fn error_is_never_rounded_down(nanos in prop_oneof![any::<u64>(), 0..100_000_000u64, 0..100_000_000_000u64]) {
             let error = Duration::from_nanos(nanos);
             match header(Some(error)).sent_error() {
                 Some(said) => {
@@ -92,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_sent_on_this_host_has_the_age_that_it_has() {
+    fn message_of_this_host_has_its_exact_age() {
         let header =
             Header { sent: Time::from_nanos(1_000), ..Header::new(Kind::PING, Tid::NONE, Tid::NONE) };
         let now = Time::from_nanos(5_000);
@@ -105,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_age_is_none_and_older_than_every_limit() {
+    fn unknown_age_is_none_and_exceeds_every_limit() {
         let (header, now) = (header(None), Time::from_nanos(5_000));
         assert_eq!((header.sent_error(), header.known_sent()), (None, None));
         assert_eq!((header.age(now), header.age_at_most(now)), (None, None));
@@ -113,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn a_message_is_older_than_a_limit_if_it_may_be() {
+    fn message_exceeds_a_limit_if_it_may() {
         let (header, now) = (header(Some(Duration::from_micros(2))), Time::from_nanos(5_000));
         assert_eq!(header.age(now), Some(Duration::from_micros(4)));
         let may_be_older = |micros| may_be_older(header.age_at_most(now), Duration::from_micros(micros));

@@ -5,19 +5,19 @@ use tokio_util::codec::{Decoder, Encoder};
 
 use crate::wire::{HEADER_LEN, Header, HeaderError, Message, long, memory};
 
-/// Why a stream of frames cannot go on. The connection is of no use after it.
+/// The reason why a stream of frames cannot continue. The connection is unusable after it.
 #[derive(Debug, thiserror::Error)]
 pub enum FrameError {
-    /// A header that cannot be used.
+    /// An invalid header.
     #[error(transparent)]
     Header(#[from] HeaderError),
-    /// The frame is longer than this node takes.
+    /// The frame is longer than this node accepts.
     #[error(
-        "a payload of {said} bytes is above this node's limit of {limit}; raise `node.payload_max` on both sides"
+        "a payload of {length} bytes is above this node's limit of {limit}; raise `node.payload_max` on both sides"
     )]
     TooLong {
-        /// Length in the header.
-        said: usize,
+        /// The length in the header.
+        length: usize,
         /// The limit in force.
         limit: usize,
     },
@@ -26,37 +26,37 @@ pub enum FrameError {
     Io(#[from] std::io::Error),
 }
 
-/// The payloads of frames that are shorter are copied out of the buffer that they came in.
+/// Frames below this length have their payloads copied out of the receive buffer.
 const COPIED_BELOW: usize = 8 * 1024;
 
 /// Cuts a byte stream into messages and writes messages to one.
 ///
-/// The length in a header is checked before memory is reserved for it. A payload holds its own bytes in memory and little
-/// more: no message that waits long keeps the buffer that it came in. A short one is in one of the few buffers that the
-/// reading thread uses again, as if it had been written there.
+/// The length in a header is checked before memory is reserved for it. A payload keeps its own bytes in
+/// memory and little more: a message that waits long does not keep its receive buffer. A short one is copied
+/// to one of the reading thread's reusable buffers.
 #[derive(Clone, Copy, Debug)]
 pub struct FrameCodec {
     payload_max: usize,
     checksum: Checksum,
-    /// Where the present buffer ends, by which it is known again.
+    /// The end of the current buffer, by which it is recognised.
     end: usize,
-    /// The most that it was seen to have room for: what is cut off from its front does not show any more.
+    /// The largest observed capacity: bytes cut off from the front no longer count in the current one.
     largest: usize,
 }
 
-/// What a frame's last four header bytes are.
+/// The kind of a frame's last four header bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Checksum {
-    /// The CRC-32 of header and payload: the bytes went over a wire.
+    /// The CRC-32 of header and payload, for bytes on a wire.
     Crc,
-    /// The same, and the length has a guard of its own, which is checked before the rest is waited for.
+    /// The same, and the length has its own guard, which is checked before the rest is awaited.
     Guarded,
-    /// Zero, and not looked at: the bytes stayed in memory.
+    /// Zero, and not checked: the bytes stayed in memory.
     None,
 }
 
 impl Checksum {
-    /// The first 64 bytes of a frame.
+    /// Returns the first 64 bytes of a frame.
     #[must_use]
     pub fn encode(self, header: &Header, payload: &[u8]) -> [u8; HEADER_LEN] {
         match self {
@@ -76,23 +76,23 @@ impl Checksum {
 }
 
 impl FrameCodec {
-    /// A codec that takes payloads of at most `payload_max` bytes.
+    /// Creates a codec for payloads of at most `payload_max` bytes.
     #[must_use]
     pub const fn new(payload_max: usize) -> Self {
         Self { payload_max, checksum: Checksum::Crc, end: 0, largest: 0 }
     }
 
-    /// Takes payloads of at most `payload_max` bytes from now on.
+    /// Sets the maximum payload to `payload_max` bytes from now on.
     pub const fn set_payload_max(&mut self, payload_max: usize) {
         self.payload_max = payload_max;
     }
 
-    /// Frames have this for a checksum from now on.
+    /// Sets the checksum of frames from now on.
     pub const fn set_checksum(&mut self, checksum: Checksum) {
         self.checksum = checksum;
     }
 
-    /// A codec for frames that stay in memory: without checksums.
+    /// Creates a codec for frames that stay in memory: without checksums.
     #[must_use]
     pub const fn in_memory(payload_max: usize) -> Self {
         Self { payload_max, checksum: Checksum::None, end: 0, largest: 0 }
@@ -105,22 +105,22 @@ impl Decoder for FrameCodec {
 
     fn decode(&mut self, source: &mut BytesMut) -> Result<Option<Message>, FrameError> {
         let Some(start) = source.first_chunk::<8>() else { return Ok(None) };
-        let said = Header::payload_len(start)? as usize;
-        if said > self.payload_max {
-            return Err(FrameError::TooLong { said, limit: self.payload_max });
+        let length = Header::payload_len(start)? as usize;
+        if length > self.payload_max {
+            return Err(FrameError::TooLong { length, limit: self.payload_max });
         }
         self.watch(source);
         if self.checksum == Checksum::Guarded {
             match source.first_chunk::<HEADER_LEN>() {
                 Some(head) => Header::check_guard(head)?,
                 None => {
-                    // Nothing is believed of the length yet.
+                    // The length is not trusted yet.
                     self.make_room(source, HEADER_LEN);
                     return Ok(None);
                 }
             }
         }
-        let whole = HEADER_LEN + said;
+        let whole = HEADER_LEN + length;
         if source.len() < whole {
             self.make_room(source, whole);
             return Ok(None);
@@ -133,12 +133,13 @@ impl Decoder for FrameCodec {
 }
 
 impl FrameCodec {
-    /// A longer frame has a buffer of its own, which goes with it, and a longer buffer that nothing is left in is given back.
+    /// Maximum length of a buffer that is kept. A longer frame has a buffer of its own, which the payload
+    /// keeps; a longer empty buffer is freed.
     pub const BUFFER_KEPT: usize = 256 * 1024;
 
-    /// How much to read next at the end of `buffer`, `most` bytes at most: a longer buffer than [`BUFFER_KEPT`](Self::BUFFER_KEPT) was
-    /// made for the frame that is coming, and is filled to its end. With what comes behind that it would grow, and each payload in
-    /// it keep all of it.
+    /// Returns how much to read next at the end of `buffer`, at most `most` bytes. A buffer longer than
+    /// [`BUFFER_KEPT`](Self::BUFFER_KEPT) was created for the current frame, and is filled to its end only.
+    /// With later bytes it would grow, and each payload in it would keep all of it.
     #[must_use]
     pub fn room(buffer: &BytesMut, most: usize) -> usize {
         match buffer.capacity() - buffer.len() {
@@ -147,17 +148,17 @@ impl FrameCodec {
         }
     }
 
-    /// Sees how large the allocation is that payloads would keep.
+    /// Records the size of the allocation that payloads would keep.
     fn watch(&mut self, source: &BytesMut) {
         let end = source.as_ptr().addr() + source.capacity();
         self.largest = if end == self.end { self.largest.max(source.capacity()) } else { source.capacity() };
         self.end = end;
     }
 
-    /// Sees to it that the rest of a frame of `whole` bytes has room.
+    /// Ensures that the rest of a frame of `whole` bytes has room.
     fn make_room(&self, source: &mut BytesMut, whole: usize) {
         if whole <= Self::BUFFER_KEPT {
-            // Where the one before it is not needed any more its memory is used again.
+            // If the previous buffer is no longer used its memory is reused.
             source.reserve(whole - source.len());
         } else if source.capacity() < whole {
             let mut own = long::with_room(whole);
@@ -166,9 +167,9 @@ impl FrameCodec {
         }
     }
 
-    /// The payload of the first frame of `source`, which has `whole` bytes.
+    /// Splits off the payload of the first frame of `source`, which has `whole` bytes.
     fn take_payload(&self, source: &mut BytesMut, whole: usize) -> Bytes {
-        // It may wait for long, and must not keep much more than itself.
+        // The payload may wait for long, and must not keep much more than itself.
         let fills_its_buffer = whole >= COPIED_BELOW && whole >= self.largest / 4;
         if fills_its_buffer && (whole <= Self::BUFFER_KEPT || whole == source.len()) {
             let mut frame = source.split_to(whole).freeze();
@@ -182,7 +183,7 @@ impl FrameCodec {
         payload
     }
 
-    /// Gives a long buffer back that has become empty; a shorter one begins at its front again, if no payload keeps it.
+    /// Frees a long buffer that has become empty. Resets a shorter one to its front, if no payload keeps it.
     fn tidy(&self, source: &mut BytesMut) {
         if !source.is_empty() {
             return;
@@ -190,7 +191,7 @@ impl FrameCodec {
         if self.largest > 2 * Self::BUFFER_KEPT {
             *source = BytesMut::new();
         } else {
-            // Where a payload keeps it this is tried again when there is to be room.
+            // If a payload keeps it, this is tried again when room is needed.
             let _ = source.try_reclaim(self.largest);
         }
     }
@@ -200,11 +201,11 @@ impl Encoder<&Message> for FrameCodec {
     type Error = FrameError;
 
     fn encode(&mut self, message: &Message, target: &mut BytesMut) -> Result<(), FrameError> {
-        let said = message.payload.len();
-        if said > self.payload_max {
-            return Err(FrameError::TooLong { said, limit: self.payload_max });
+        let length = message.payload.len();
+        if length > self.payload_max {
+            return Err(FrameError::TooLong { length, limit: self.payload_max });
         }
-        target.reserve(HEADER_LEN + said);
+        target.reserve(HEADER_LEN + length);
         target.put_slice(&self.checksum.encode(&message.header, &message.payload));
         target.put_slice(&message.payload);
         Ok(())
@@ -217,11 +218,11 @@ pub fn encode_frame(header: &Header, payload: &[u8], target: &mut BytesMut) {
     target.put_slice(payload);
 }
 
-/// Reads a datagram, which must be exactly one frame. A short payload is in one of the few buffers that the reading thread uses again, as
-/// [`FrameCodec`]'s are.
+/// Decodes a datagram, which must be exactly one frame. A short payload is copied to one of the reading
+/// thread's reusable buffers, as in [`FrameCodec`].
 ///
 /// # Errors
-/// What is wrong with the bytes.
+/// The fault in the bytes.
 pub fn decode_datagram(bytes: &[u8]) -> Result<Message, HeaderError> {
     let Some(start) = bytes.first_chunk::<HEADER_LEN>() else { return Err(HeaderError::NotAFrame) };
     let payload = &bytes[HEADER_LEN..];
@@ -261,7 +262,7 @@ mod tests {
         }
 
         #[test]
-        fn frames_in_memory_are_read_without_a_checksum_and_garbage_is_no_panic(payload: Vec<u8>, noise: Vec<u8>) {
+        fn frames_in_memory_are_read_without_a_checksum(payload: Vec<u8>, noise: Vec<u8>) {
             let mut codec = FrameCodec::in_memory(1 << 20);
             let (mut buffer, header) = (BytesMut::new(), Header::new(Kind::named("test"), Tid::NONE, Tid::BROADCAST));
             codec.encode(&Message::new(header, payload.clone().into()), &mut buffer).unwrap();
@@ -271,14 +272,14 @@ mod tests {
         }
 
         #[test]
-        fn garbage_is_an_error_or_a_wait_and_never_a_panic(bytes: Vec<u8>) {
+        fn garbage_is_an_error_or_a_wait(bytes: Vec<u8>) {
             let mut buffer = BytesMut::from(bytes.as_slice());
             let _ = FrameCodec::new(1024).decode(&mut buffer);
             let _ = decode_datagram(&bytes);
         }
 
         #[test]
-        fn a_truncated_datagram_is_refused(payload: Vec<u8>, keep in 0.0f64..1.0) {
+        fn truncated_datagram_is_rejected(payload: Vec<u8>, keep in 0.0f64..1.0) {
             let whole = frame(&payload);
             let kept = (whole.len() as f64 * keep) as usize;
             prop_assert!(decode_datagram(&whole[..kept]).is_err());
@@ -286,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn a_short_message_does_not_keep_the_buffer_that_it_came_in_and_a_long_one_takes_it_along() {
+    fn only_a_long_message_keeps_its_receive_buffer() {
         let (mut codec, mut buffer) = (FrameCodec::new(1 << 20), BytesMut::with_capacity(1 << 20));
         buffer.extend_from_slice(&frame(&[1; 10]));
         buffer.extend_from_slice(&frame(&[2; 100_000]));
@@ -310,19 +311,19 @@ mod tests {
     }
 
     #[test]
-    fn the_payload_of_a_datagram_is_in_a_buffer_of_its_thread_that_is_used_again() {
+    fn datagram_payload_reuses_a_buffer_of_its_thread() {
         let datagrams = [frame(&[1; 100]), frame(&[2; 1_100])];
         let read = |at: usize| decode_datagram(&datagrams[at]).unwrap().payload;
         let place = memory::copied(b"something").as_ptr();
         assert_eq!([0, 1, 0].map(|at| read(at).as_ptr()), [place; 3]);
-        // The newest value of a flow waits until its application takes it: others are elsewhere meanwhile.
+        // The newest value of a flow waits until its application receives it: others are elsewhere meanwhile.
         let (waits, next) = (read(0), read(1));
         assert_ne!(next.as_ptr(), place);
         assert_eq!((&waits[..], &next[..]), (&[1; 100][..], &[2; 1_100][..]));
     }
 
     #[test]
-    fn a_buffer_whose_payload_is_gone_is_used_again_and_one_that_is_kept_is_not() {
+    fn freed_buffer_is_reused_and_kept_one_is_not() {
         let (mut codec, mut buffer) = (FrameCodec::new(1 << 20), BytesMut::new());
         let mut next = |value: u8| {
             buffer.extend_from_slice(&frame(&[value; 60_000]));
@@ -343,7 +344,7 @@ mod tests {
         #![proptest_config(ProptestConfig::with_cases(32))]
 
         #[test]
-        fn what_a_payload_keeps_is_a_few_times_its_length_whatever_came_before(
+        fn payload_keeps_a_few_times_its_length_at_most(
             lengths in proptest::collection::vec(prop_oneof![0usize..200, 8_000usize..9_000, 20_000usize..700_000], 1..20),
             piece in 1_000usize..300_000,
         ) {
@@ -369,7 +370,7 @@ mod tests {
     }
 
     #[test]
-    fn an_oversized_length_is_refused_before_memory_is_reserved() {
+    fn oversized_length_is_rejected_before_memory_is_reserved() {
         let mut buffer = frame(&[]);
         buffer[4..8].copy_from_slice(&u32::MAX.to_le_bytes());
         let capacity = buffer.capacity();
@@ -379,7 +380,7 @@ mod tests {
 
     /// The example at the end of `docs/protocol/frame.md`.
     #[test]
-    fn the_documented_frame_is_what_is_written() {
+    fn documented_frame_is_written_exactly() {
         let mut header = Header::new(
             Kind::named("demo.angle"),
             "10.0.0.7/1001".parse().unwrap(),
@@ -395,7 +396,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_done_for_a_guarded_length_before_its_guard_has_come_and_a_damaged_one_is_refused_then() {
+    fn damaged_length_is_rejected_once_its_guard_arrives() {
         let mut codec = FrameCodec::new(1 << 20);
         codec.set_checksum(Checksum::Guarded);
         let header = Header::new(Kind::OUTCOME, Tid::NONE, Tid::NONE);

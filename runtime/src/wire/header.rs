@@ -16,11 +16,15 @@
 //!     32    8 sequence: the source's n-th message
 //!     40    8 correlation: ties a reply or an outcome to its message
 //!     48    8 send time, nanoseconds of the sender's monotonic clock
-//!     56    4 time to live, microseconds; 0 = for ever
+//!     56    4 time to live, microseconds; 0 = forever
 //!     60    4 CRC-32 (IEEE 802.3) of bytes 0..60 and the payload
 //! ```
 //!
-//! Bytes 0 to 8 keep their meaning in every later version, so that any two versions can refuse each other in words.
+//! Bytes 0 to 8 keep their meaning in every later version, so that any two versions can reject each other
+//! with a clear error.
+
+#[cfg(test)]
+mod tests;
 
 use std::time::Duration;
 
@@ -30,19 +34,19 @@ use crate::{tid::Tid, time::Time, wire::Kind};
 
 /// First two bytes of every frame.
 pub const MAGIC: [u8; 2] = *b"Sw";
-/// The version of the protocol that this code speaks.
+/// The version of the protocol that this code implements.
 pub const VERSION: u8 = 1;
 /// Length of the header in bytes.
 pub const HEADER_LEN: usize = 64;
-/// The longest time to live, as it travels in 32 bits of microseconds: 71 minutes and 35 s.
+/// The maximum time to live, sent as 32 bits of microseconds: 71 minutes and 35 s.
 pub const TIME_TO_LIVE_MAX: Duration = Duration::from_micros(u32::MAX as u64);
 
-/// Where a guarded frame has the guard of its length: the upper 16 bits of the sequence.
+/// The position of the length's guard in a guarded frame: the upper 16 bits of the sequence.
 const GUARD_AT: usize = 38;
-/// The largest sequence beside a guard: at a million messages a second that is nine years.
+/// The largest sequence beside a guard: nine years at a million messages a second.
 const SEQUENCE_MAX: u64 = (1 << 48) - 1;
 
-/// How urgent a message is, and what a newer one does to an older.
+/// The urgency of a message, and the effect of a newer one on an older one.
 ///
 /// # Examples
 ///
@@ -57,10 +61,10 @@ const SEQUENCE_MAX: u64 = (1 << 48) - 1;
 /// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub enum Class {
-    /// Ordered and ahead of all else.
+    /// Ordered, and before all other classes.
     #[default]
     Control,
-    /// Newest value wins, for each source and kind: a late setpoint is a hazard.
+    /// The newest value replaces older ones, for each source and kind: a late setpoint is a hazard.
     Stream,
     /// Ordered; yields to the other classes.
     Bulk,
@@ -83,72 +87,72 @@ impl Class {
     }
 }
 
-/// What is asked of a message's receiver: the bits of header byte 13.
+/// The requests to a message's receiver: the bits of header byte 13.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub struct Flags(u8);
 
 impl Flags {
-    /// Nothing is asked.
+    /// No request.
     pub const NONE: Self = Self(0);
-    /// Bit 0: the source wants to know the outcome.
+    /// Bit 0: the source requests the outcome.
     pub const CONFIRM: Self = Self(1);
     /// Bit 1: the source waits for a reply.
     pub const ASK: Self = Self(2);
     /// Bit 2: this is a reply; `correlation` names the request.
     pub const REPLY: Self = Self(4);
-    /// Bit 3: this is the outcome of the message that `correlation` names.
+    /// Bit 3: this is the outcome of the message with this `correlation`.
     pub const OUTCOME: Self = Self(8);
 
     const KNOWN: u8 = 0x0f;
 
-    /// The flags of both.
+    /// Returns the flags of both.
     #[must_use]
     pub const fn with(self, other: Self) -> Self {
         Self(self.0 | other.0)
     }
 
-    /// These flags except those of `other`.
+    /// Returns these flags except those of `other`.
     #[must_use]
     pub const fn without(self, other: Self) -> Self {
         Self(self.0 & !other.0)
     }
 
-    /// Whether all flags of `other` are set.
+    /// Returns whether all flags of `other` are set.
     #[must_use]
     pub const fn has(self, other: Self) -> bool {
         self.0 & other.0 == other.0
     }
 }
 
-/// The header of a message; `docs/protocol/frame.md` has its bytes.
+/// The header of a message; `docs/protocol/frame.md` specifies its bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
-    /// Type of the payload.
+    /// The type of the payload.
     pub kind: Kind,
-    /// How urgent it is.
+    /// The class of the message.
     pub class: Class,
-    /// What is asked of the receiver.
+    /// The requests to the receiver.
     pub flags: Flags,
-    /// Who sent it. The sender's node answers for it.
+    /// The sender. The sender's node guarantees this address.
     pub source: Tid,
-    /// Whom it is for.
+    /// The destination.
     pub destination: Tid,
-    /// Between two nodes: the lower 16 bits of its number in their session. From a node to its applications: how wrong `sent` may be
-    /// ([`sent_error`](Self::sent_error)). Else zero.
+    /// Between two nodes: the lower 16 bits of the message's number in their session. From a node to its
+    /// applications: the error of `sent` ([`sent_error`](Self::sent_error)). Otherwise zero.
     pub number: u16,
-    /// The source's n-th message, from 1.
+    /// The sequence number of the source, from 1.
     pub sequence: u64,
-    /// Ties a reply or an outcome to its message; 0 where there is none.
+    /// Connects a reply or an outcome to its message; 0 without one.
     pub correlation: u64,
-    /// When it was sent. On the wire in the sender's clock; a receiving layer turns it into its own. Where that is not known it is when it
-    /// arrived, and [`sent_error`](Self::sent_error) says so.
+    /// When the message was sent. On the wire in the sender's clock; a receiving layer converts it to its
+    /// own. If that is unknown it is the time of arrival, as [`sent_error`](Self::sent_error) shows.
     pub sent: Time,
-    /// How long after `sent` it is still worth handling, in microseconds; 0 = for ever. [`TIME_TO_LIVE_MAX`] is the longest.
+    /// Microseconds after `sent` at which the message expires; 0: never. [`TIME_TO_LIVE_MAX`] is the maximum.
     pub time_to_live_us: u32,
 }
 
 impl Header {
-    /// A header of class Control with nothing asked.
+    /// Creates a header of class Control without flags.
     #[must_use]
     pub const fn new(kind: Kind, source: Tid, destination: Tid) -> Self {
         Self {
@@ -165,18 +169,18 @@ impl Header {
         }
     }
 
-    /// Has it expire when it is older than `within`, which is cut to what the wire has room for: a microsecond to [`TIME_TO_LIVE_MAX`].
-    /// Returns how long whoever waits for what becomes of it is to wait: as long, and no longer than the longest of these.
-    #[must_use = "who waits longer waits for what nobody says any more"]
+    /// Sets the age at which the message expires, limited to the range of the wire: a microsecond to
+    /// [`TIME_TO_LIVE_MAX`]. Returns how long to wait for its outcome: `within`, at most this maximum.
+    #[must_use = "a wait beyond this time has no result"]
     pub fn set_time_to_live(&mut self, within: Duration) -> Duration {
         let within = within.min(TIME_TO_LIVE_MAX);
-        // Zero would be for ever.
+        // Zero would mean forever.
         self.time_to_live_us = u32::try_from(within.as_micros()).unwrap_or(u32::MAX).max(1);
         within
     }
 
-    /// The same for a message whose own time to live may be shorter: that stays.
-    #[must_use = "who waits longer waits for what nobody says any more"]
+    /// Same as [`set_time_to_live`](Self::set_time_to_live), but a shorter time to live of the message is kept.
+    #[must_use = "a wait beyond this time has no result"]
     pub fn limit_time_to_live(&mut self, within: Duration) -> Duration {
         let own = self.time_to_live_us;
         let within = self.set_time_to_live(within);
@@ -186,13 +190,13 @@ impl Header {
         within
     }
 
-    /// Whether the time to live has run out at `now`.
+    /// Returns whether the time to live has ended at `now`.
     #[must_use]
     pub fn is_expired(&self, now: Time) -> bool {
         now > self.expiry()
     }
 
-    /// When the time to live runs out; [`Time::MAX`] if it never does.
+    /// Returns when the time to live ends; [`Time::MAX`] if it never does.
     #[must_use]
     pub fn expiry(&self) -> Time {
         match self.time_to_live_us {
@@ -213,8 +217,8 @@ impl Header {
         bytes
     }
 
-    /// Writes the first 64 bytes of a frame that stays in memory, for a payload of `length` bytes: its checksum is 0 and
-    /// is not looked at, because memory is no wire.
+    /// Writes the first 64 bytes of a frame that stays in memory, for a payload of `length` bytes. Its
+    /// checksum is 0 and is not checked, because memory is no wire.
     ///
     /// # Panics
     /// Never for payloads below 4 GiB, which every configured limit is.
@@ -239,8 +243,9 @@ impl Header {
         bytes
     }
 
-    /// As [`encode`](Self::encode), with a guard of the length in the upper 16 bits of the sequence, which no source's messages
-    /// ever reach: who reads it finds a damaged length before it waits for so many bytes.
+    /// Same as [`encode`](Self::encode), with a guard of the length in the upper 16 bits of the sequence,
+    /// which no source's messages ever reach. A reader then detects a corrupted length before it waits for
+    /// that many bytes.
     ///
     /// # Panics
     /// Never for payloads below 4 GiB, which every configured limit is.
@@ -254,10 +259,10 @@ impl Header {
         bytes
     }
 
-    /// Checks the guard of a length, before anything is done because of it.
+    /// Checks the guard of a length, before the length is used.
     ///
     /// # Errors
-    /// The bytes changed on their way.
+    /// The bytes were corrupted.
     pub fn check_guard(bytes: &[u8; HEADER_LEN]) -> Result<(), HeaderError> {
         if field::<2>(bytes, GUARD_AT) == guard_of(bytes) { Ok(()) } else { Err(HeaderError::Guard) }
     }
@@ -292,11 +297,11 @@ impl Header {
     /// Reads a header and checks it against its payload.
     ///
     /// # Errors
-    /// What is wrong with the bytes; the peer is at fault, or the network.
+    /// The fault in the bytes; the peer or the network caused it.
     pub fn decode(bytes: &[u8; HEADER_LEN], payload: &[u8]) -> Result<Self, HeaderError> {
         let length = Self::payload_len(&field(bytes, 0))?;
         if length as usize != payload.len() {
-            return Err(HeaderError::Length { said: length, found: payload.len() });
+            return Err(HeaderError::Length { declared: length, found: payload.len() });
         }
         if u32::from_le_bytes(field(bytes, 60)) != checksum(bytes, payload) {
             return Err(HeaderError::Checksum);
@@ -304,10 +309,10 @@ impl Header {
         Self::decode_in_memory(bytes)
     }
 
-    /// Reads a header that [`encode_in_memory`](Self::encode_in_memory) wrote. Its length is the caller's to check.
+    /// Reads a header that [`encode_in_memory`](Self::encode_in_memory) wrote. The caller must check its length.
     ///
     /// # Errors
-    /// What is wrong with the bytes; the peer is at fault.
+    /// The fault in the bytes; the peer caused it.
     pub fn decode_in_memory(bytes: &[u8; HEADER_LEN]) -> Result<Self, HeaderError> {
         Self::payload_len(&field(bytes, 0))?;
         if bytes[13] & !Flags::KNOWN != 0 {
@@ -328,14 +333,14 @@ impl Header {
     }
 }
 
-/// The `N` bytes of a header from `at`; every caller stays inside the 64.
+/// Returns the `N` bytes of a header from `at`; every caller stays inside the 64.
 fn field<const N: usize>(bytes: &[u8; HEADER_LEN], at: usize) -> [u8; N] {
     let mut out = [0; N];
     out.copy_from_slice(&bytes[at..at + N]);
     out
 }
 
-/// The lower 16 bits of the CRC-32 of magic, version and lengths.
+/// Returns the lower 16 bits of the CRC-32 of magic, version and lengths.
 fn guard_of(header: &[u8; HEADER_LEN]) -> [u8; 2] {
     (crc32fast::hash(&header[..8]) as u16).to_le_bytes()
 }
@@ -347,13 +352,13 @@ fn checksum(header: &[u8; HEADER_LEN], payload: &[u8]) -> u32 {
     crc.finalize()
 }
 
-/// Why bytes are not a header that this node can use. The peer or the network is at fault; nothing changed.
+/// The reason why this node cannot use a header. The peer or the network caused it; nothing changed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum HeaderError {
     /// The magic bytes or the header's length are wrong.
     #[error("these bytes are not a Sinew frame")]
     NotAFrame,
-    /// The peer speaks another version.
+    /// The peer uses another version.
     #[error(
         "the peer speaks version {theirs} of the protocol and this node version {VERSION}; update the older one"
     )]
@@ -361,144 +366,24 @@ pub enum HeaderError {
         /// The version in the frame.
         theirs: u8,
     },
-    /// The payload is shorter or longer than the header says.
-    #[error("the header says {said} payload bytes and {found} are there")]
+    /// The payload is shorter or longer than the length in the header.
+    #[error("the header declares {declared} payload bytes, and {found} are there")]
     Length {
-        /// Length in the header.
-        said: u32,
-        /// Length found.
+        /// The length in the header.
+        declared: u32,
+        /// The actual length.
         found: usize,
     },
-    /// The bytes changed on their way.
+    /// The bytes were corrupted.
     #[error("the checksum is wrong: the frame was damaged on its way")]
     Checksum,
-    /// The length changed on its way.
-    #[error("the length is not what its guard says: the frame was damaged on its way")]
+    /// The length was corrupted.
+    #[error("the length does not match its guard: the frame was damaged on its way")]
     Guard,
     /// Bits that this version keeps at zero are set.
     #[error("reserved bits are set")]
     Reserved,
-    /// The class byte means nothing.
+    /// The class byte is not assigned.
     #[error("there is no message class {0}")]
     Class(u8),
-}
-
-#[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-
-    fn any_header() -> impl Strategy<Value = Header> {
-        (any::<[u64; 5]>(), any::<[u32; 2]>(), any::<u16>(), 0u8..3, 0u8..16).prop_map(
-            |(long, short, number, class, flags)| Header {
-                kind: Kind::from_bits(short[0]),
-                class: Class::from_code(class).unwrap(),
-                flags: Flags(flags),
-                source: Tid::from_bits(long[0]),
-                destination: Tid::from_bits(long[1]),
-                number,
-                sequence: long[2],
-                correlation: long[3],
-                sent: Time::from_nanos(long[4]),
-                time_to_live_us: short[1],
-            },
-        )
-    }
-
-    proptest! {
-        #[test]
-        fn what_is_written_is_read_back(header in any_header(), payload: Vec<u8>) {
-            prop_assert_eq!(Header::decode(&header.encode(&payload), &payload), Ok(header));
-        }
-
-        #[test]
-        fn one_flipped_bit_is_noticed(header in any_header(), payload: Vec<u8>, bit in 0usize..512) {
-            let mut bytes = header.encode(&payload);
-            bytes[bit / 8] ^= 1 << (bit % 8);
-            prop_assert!(Header::decode(&bytes, &payload).is_err());
-        }
-
-        #[test]
-        fn a_guarded_header_is_read_back_and_by_those_who_know_no_guard_but_for_its_sequence(
-            header in any_header(), payload: Vec<u8>,
-        ) {
-            let header = Header { sequence: header.sequence & SEQUENCE_MAX, ..header };
-            let bytes = header.encode_guarded(&payload);
-            prop_assert_eq!(Header::check_guard(&bytes), Ok(()));
-            prop_assert_eq!(Header::decode_guarded(&bytes, &payload), Ok(header));
-            let plain = Header::decode(&bytes, &payload).unwrap();
-            prop_assert_eq!(Header { sequence: header.sequence, ..plain }, header);
-        }
-
-        #[test]
-        fn one_or_two_flipped_bits_in_a_length_or_its_guard_are_noticed_without_the_payload(
-            header in any_header(), payload: Vec<u8>, first in 32usize..80, second in 32usize..80,
-        ) {
-            let mut bytes = header.encode_guarded(&payload);
-            // Of 48 bits the first 32 are the length, the others the guard.
-            let mut flip = |bit: usize| {
-                let bit = if bit < 64 { bit } else { GUARD_AT * 8 + bit - 64 };
-                bytes[bit / 8] ^= 1 << (bit % 8);
-            };
-            flip(first);
-            if second != first {
-                flip(second);
-            }
-            prop_assert_eq!(Header::check_guard(&bytes), Err(HeaderError::Guard));
-        }
-
-        #[test]
-        fn any_bytes_are_a_header_or_an_error(bytes in proptest::collection::vec(any::<u8>(), 64), payload: Vec<u8>) {
-            let bytes: [u8; 64] = bytes.try_into().unwrap();
-            let _ = Header::decode(&bytes, &payload);
-        }
-    }
-
-    #[test]
-    fn another_version_is_named_before_anything_else_is_believed() {
-        let mut bytes = Header::new(Kind::OUTCOME, Tid::NONE, Tid::NONE).encode(&[]);
-        bytes[2] = 9;
-        assert_eq!(Header::decode(&bytes, &[]), Err(HeaderError::Version { theirs: 9 }));
-    }
-
-    #[test]
-    fn a_time_to_live_is_never_for_ever_nor_another_one_where_it_is_too_long_for_the_wire() {
-        let (micro, most) = (Duration::from_micros(1), TIME_TO_LIVE_MAX);
-        assert_eq!(
-            most.as_secs(),
-            71 * 60 + 34,
-            "and 0.967 s: 71 minutes and 35 s, as the documentation says"
-        );
-        let cases = [
-            (Duration::ZERO, 1, Duration::ZERO),
-            (Duration::from_nanos(1), 1, Duration::from_nanos(1)),
-            (Duration::from_secs(3_600), 3_600_000_000, Duration::from_secs(3_600)),
-            (most - micro, u32::MAX - 1, most - micro),
-            (most, u32::MAX, most),
-            (most + micro, u32::MAX, most),
-            // Cut to 32 bits these would be 1 us and 2 us.
-            (micro * 2 + most, u32::MAX, most),
-            (Duration::from_secs(48 * 3_600), u32::MAX, most),
-            (Duration::MAX, u32::MAX, most),
-        ];
-        for (within, micros, waits) in cases {
-            let mut header = Header::new(Kind::OUTCOME, Tid::NONE, Tid::NONE);
-            assert_eq!(
-                (header.set_time_to_live(within), header.time_to_live_us),
-                (waits, micros),
-                "{within:?}"
-            );
-        }
-    }
-
-    #[test]
-    fn time_to_live_counts_from_the_send_time() {
-        let mut header = Header::new(Kind::OUTCOME, Tid::NONE, Tid::NONE);
-        header.sent = Time::from_nanos(1_000);
-        assert!(!header.is_expired(Time::MAX));
-        header.time_to_live_us = 1;
-        assert!(!header.is_expired(Time::from_nanos(2_000)));
-        assert!(header.is_expired(Time::from_nanos(2_001)));
-    }
 }

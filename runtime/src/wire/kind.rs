@@ -1,4 +1,4 @@
-//! Stable ids of payload types.
+//! Stable IDs of payload types.
 
 use std::fmt;
 
@@ -16,10 +16,10 @@ pub const fn fnv1a(bytes: &[u8]) -> u32 {
     hash
 }
 
-/// Stable id of a payload's type.
+/// The stable ID of a payload's type.
 ///
-/// Ids below `0x8000_0000` belong to Sinew's own layers; a user's kind is the hash of its name with the top bit set.
-/// Two names of one node that hash alike are refused when the second is registered.
+/// IDs below `0x8000_0000` belong to Sinew's own layers; a user's kind is the hash of its name with the top
+/// bit set. Two names on one node with equal hashes are rejected when the second is registered.
 ///
 /// # Examples
 ///
@@ -38,7 +38,7 @@ pub struct Kind(u32);
 impl Kind {
     /// The outcome of a confirmed message: one byte, see [`Outcome::code`](crate::outcome::Outcome::code).
     pub const OUTCOME: Self = Self(1);
-    /// Nobody waits any more for the reply to the request that its correlation names.
+    /// Cancels the request of its correlation: the reply is no longer awaited.
     pub const CANCEL: Self = Self(2);
     /// Reports about the members of a confirmed message to many: see [`MemberReport`](crate::outcome::MemberReport).
     pub const MEMBERS: Self = Self(3);
@@ -46,102 +46,102 @@ impl Kind {
     pub const GNCL_HELLO: Self = Self(0x10);
     /// Answer to a hello that is accepted.
     pub const GNCL_WELCOME: Self = Self(0x11);
-    /// Answer to a hello that is not accepted: a sentence that says why.
+    /// Answer to a hello that is rejected: a sentence with the reason.
     pub const GNCL_REFUSAL: Self = Self(0x12);
-    /// Asks the peer's GNCL actor for a sign of life.
+    /// Requests a sign of life from the peer's GNCL actor.
     pub const GNCL_PING: Self = Self(0x13);
     /// The sign of life.
     pub const GNCL_PONG: Self = Self(0x14);
     /// Orderly end of a connection.
     pub const GNCL_GOODBYE: Self = Self(0x15);
-    /// Says what its sender takes next.
+    /// The next sequence that its sender expects.
     pub const GNCL_ACK: Self = Self(0x16);
-    /// Stands for a message that lost its use before it arrived.
+    /// Replaces a message that became obsolete before it arrived.
     pub const GNCL_VOID: Self = Self(0x17);
     /// Several outcomes of confirmed messages.
     pub const GNCL_OUTCOMES: Self = Self(0x18);
-    /// Where its sender reads datagrams.
+    /// The address at which its sender reads datagrams.
     pub const GNCL_DATAGRAMS: Self = Self(0x19);
-    /// Unconfirmed messages of the receiver's applications that its sender refused.
+    /// Unconfirmed messages of the receiver's applications that its sender rejected.
     pub const GNCL_UNDELIVERED: Self = Self(0x1a);
-    /// A node asks who is there, or whether a known node lives.
+    /// A query for present nodes, or whether a known node is alive.
     pub const NDL_QUERY: Self = Self(0x20);
     /// The matched answer.
     pub const NDL_ANSWER: Self = Self(0x21);
-    /// A node leaves in order.
+    /// An orderly departure of a node.
     pub const NDL_LEAVE: Self = Self(0x22);
     /// The names that a node's applications have, and which of them are ready.
     pub const SYNC_DIRECTORY: Self = Self(0x30);
-    /// A node says whose applications' lives it watches on the receiver's node.
+    /// The applications of the receiver's node that the sender monitors, by incarnation.
     pub const SYNC_WATCH: Self = Self(0x31);
-    /// Which life each of them is in, and how the last one ended.
+    /// The current incarnation of each of them, and the end reason of its last one.
     pub const SYNC_LIVES: Self = Self(0x32);
     /// The last wills of a node's applications, to be held.
     pub const SYNC_WILLS: Self = Self(0x33);
-    /// A node asks another where every message is.
+    /// A query for the state of all messages of a node.
     pub const SYNC_AUDIT_ASK: Self = Self(0x34);
-    /// What it says of itself.
+    /// The answer to it.
     pub const SYNC_AUDIT: Self = Self(0x35);
-    /// Who waits at run-time barriers on a node, and which generation of each has opened.
+    /// The waiters at run-time barriers on a node, and the open generation of each barrier.
     pub const SYNC_ARRIVALS: Self = Self(0x36);
-    /// A process asks for a transport address.
+    /// A process requests a transport address.
     pub const LNCL_REGISTER: Self = Self(0x40);
-    /// The address it got.
+    /// The assigned address.
     pub const LNCL_REGISTERED: Self = Self(0x41);
-    /// Why it got none, or why the connection ends: a sentence.
+    /// The reason why no address was assigned, or why the connection ends: a sentence.
     pub const LNCL_REFUSAL: Self = Self(0x42);
-    /// A process gives its address back.
+    /// A process releases its address.
     pub const LNCL_UNREGISTER: Self = Self(0x43);
     /// A process joins or leaves a group.
     pub const LNCL_GROUP: Self = Self(0x44);
-    /// A process asks for the TID of a name.
+    /// A process requests the TID of a name.
     pub const LNCL_RESOLVE: Self = Self(0x45);
     /// The TID of a name, or none.
     pub const LNCL_RESOLVED: Self = Self(0x46);
-    /// A process asks for a direct link to an application of another process.
+    /// A process requests a direct link to an application of another process.
     pub const LNCL_INTRODUCE: Self = Self(0x48);
-    /// It is asked for one; the link's socket comes beside it.
+    /// The request to that process; the link's socket is attached.
     pub const LNCL_INTRODUCTION: Self = Self(0x49);
-    /// The other side has agreed; the link's socket comes beside it.
+    /// The confirmation of the other side; the link's socket is attached.
     pub const LNCL_INTRODUCED: Self = Self(0x4a);
-    /// From here on a process sends to another one on their link only.
+    /// From here on a process sends to another one only on their link.
     pub const LNCL_SWITCH: Self = Self(0x4b);
-    /// A process is told which of its unconfirmed messages nobody has taken.
+    /// Reports to a process which of its unconfirmed messages were not accepted.
     pub const LNCL_UNDELIVERED: Self = Self(0x4c);
-    /// A process is told that the one at the other end of a direct link has ended.
+    /// Reports to a process that the peer of a direct link has ended.
     pub const LNCL_GONE: Self = Self(0x4d);
-    /// LNCL tells a client that waits what it waits for.
+    /// Reports to a waiting client the conditions that it waits for.
     pub const LNCL_WAITING: Self = Self(0x4e);
 
-    /// A node tells the process that it started for an application who it is: the first frame.
+    /// The first frame from a node to the process that it started for an application: the application's identity.
     pub const HOST_WELCOME: Self = Self(0x50);
     /// The application in that process is ready.
     pub const HOST_READY: Self = Self(0x51);
-    /// It has ended with one message and takes the next into its hand.
+    /// The application has finished one message and takes the next.
     pub const HOST_TURN: Self = Self(0x52);
-    /// The node asks it to stop in order.
+    /// The node orders the application to stop.
     pub const HOST_STOP: Self = Self(0x53);
-    /// It has ended, and how; its process ends next.
+    /// The application has ended, with the reason; its process ends next.
     pub const HOST_ENDED: Self = Self(0x54);
     /// A sign of life.
     pub const HOST_BEAT: Self = Self(0x55);
-    /// It does not come back in its progress budget, and what it is in.
+    /// The application exceeded its progress budget, with its activity.
     pub const HOST_HUNG: Self = Self(0x56);
-    /// It asks who has a name, and wants to be told when that changes.
+    /// The application looks up a name, and subscribes to its changes.
     pub const HOST_LOOK: Self = Self(0x57);
-    /// Who has some names now.
+    /// The current TIDs of some names.
     pub const HOST_NAMES: Self = Self(0x58);
 
-    /// Asks for a sign of life: confirmed, it ends as `Delivered` once whoever it is for has come to it.
+    /// Requests a sign of life: confirmed, it ends as `Delivered` once its destination has handled it.
     pub const PING: Self = Self::named("sinew.ping");
 
-    /// Whether this is said only between a node and a process that it started.
+    /// Returns whether this is used only between a node and a process that it started.
     #[must_use]
     pub const fn is_host(self) -> bool {
         matches!(self.0, 0x50..0x60)
     }
 
-    /// The id of the user's payload type called `name`.
+    /// Returns the ID of the user's payload type called `name`.
     ///
     /// # Examples
     ///
@@ -157,19 +157,19 @@ impl Kind {
         Self(fnv1a(name.as_bytes()) | 0x8000_0000)
     }
 
-    /// The id with these 32 bits.
+    /// Returns the ID with these 32 bits.
     #[must_use]
     pub const fn from_bits(bits: u32) -> Self {
         Self(bits)
     }
 
-    /// The 32 bits of this id.
+    /// Returns the 32 bits of this ID.
     #[must_use]
     pub const fn bits(self) -> u32 {
         self.0
     }
 
-    /// Whether this belongs to a user's type, not to a layer.
+    /// Returns whether this belongs to a user's type, not to a layer.
     #[must_use]
     pub const fn is_user(self) -> bool {
         self.0 >= 0x8000_0000
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn named_kinds_never_meet_the_layers_kinds() {
+    fn named_kinds_never_equal_layer_kinds() {
         assert!(Kind::named("exo.joint_sample").is_user());
         assert!(!Kind::NDL_QUERY.is_user());
     }

@@ -1,64 +1,64 @@
-//! Memory for long payloads: a thread keeps two buffers, each of which is used again once nobody holds the payload that was in it.
+//! Memory for long payloads: a thread keeps two buffers, each reused once the payload in it is dropped.
 //!
-//! An allocator gives memory of that length back to the system each time, so that every page of the next payload is a fault:
-//! that cost more than all copies of it.
+//! An allocator returns memory of that length to the system each time, so that every page of the next payload
+//! causes a fault. That cost more than all copies of the payload.
 
 use std::cell::RefCell;
 
 use bytes::BytesMut;
 
-/// Memory of shorter payloads an allocator keeps by itself.
+/// Minimum length: the allocator itself keeps memory of shorter payloads.
 const SHORTEST: usize = 64 * 1024;
-/// The longest buffer that is kept: a payload of 1 MiB, with its header.
+/// Maximum length of a reused buffer: a payload of 1 MiB, with its header.
 const LONGEST: usize = 1024 * 1024 + 4096;
-/// Buffers of one thread: for one payload that has come, and one that is being made.
+/// Number of buffers per thread: for one received payload, and one under construction.
 const BUFFERS_MAX: usize = 2;
 
 thread_local! {
-    static KEPT: RefCell<Kept> = const { RefCell::new(Kept(Vec::new())) };
+    static BUFFERS: RefCell<Buffers> = const { RefCell::new(Buffers(Vec::new())) };
 }
 
-/// Empty memory with room for `length` bytes, and less than for twice as many.
+/// Returns empty memory with room for `length` bytes, and less than for twice as many.
 pub(super) fn with_room(length: usize) -> BytesMut {
-    kept(length).unwrap_or_else(|| BytesMut::with_capacity(length))
+    reuse(length).unwrap_or_else(|| BytesMut::with_capacity(length))
 }
 
-/// Zeroed memory of `length` bytes.
+/// Returns zeroed memory of `length` bytes.
 pub(super) fn zeroed(length: usize) -> BytesMut {
-    let Some(mut memory) = kept(length) else { return BytesMut::zeroed(length) };
+    let Some(mut memory) = reuse(length) else { return BytesMut::zeroed(length) };
     memory.resize(length, 0);
     memory
 }
 
-fn kept(length: usize) -> Option<BytesMut> {
+fn reuse(length: usize) -> Option<BytesMut> {
     if !(SHORTEST..=LONGEST).contains(&length) {
         return None;
     }
-    // A thread that ends has none any more.
-    KEPT.try_with(|kept| kept.borrow_mut().take(length)).ok().flatten()
+    // A thread at its end may have destroyed this variable.
+    BUFFERS.try_with(|buffers| buffers.borrow_mut().take(length)).ok().flatten()
 }
 
 /// The buffers of a thread.
-struct Kept(Vec<Buffer>);
+struct Buffers(Vec<Buffer>);
 
 struct Buffer {
-    /// Its handle. It has no room itself while a payload has the memory.
+    /// The handle of the memory. It has no capacity itself while a payload has the memory.
     memory: BytesMut,
-    /// How much memory that is.
+    /// The size of the memory.
     bytes: usize,
 }
 
-impl Kept {
-    /// Memory of one that nobody holds, or of a new one if there may be more.
+impl Buffers {
+    /// Returns the memory of a free buffer, or of a new one below the maximum.
     fn take(&mut self, length: usize) -> Option<BytesMut> {
         let fits = |buffer: &Buffer| (length..length * 2).contains(&buffer.bytes);
         let found = self.0.iter_mut().position(|buffer| fits(buffer) && buffer.is_free());
         let place = found.or_else(|| self.place_for(length))?;
-        // The handle stays, without room of its own.
+        // The handle stays, without capacity of its own.
         Some(self.0[place].memory.split_off(0))
     }
 
-    /// Where a new one is, in the place of one that does not fit if there must not be more; `None` if all are held.
+    /// Returns the index of a new buffer, which replaces a free one at the maximum. `None` if all are in use.
     fn place_for(&mut self, length: usize) -> Option<usize> {
         let place = if self.0.len() < BUFFERS_MAX {
             self.0.push(Buffer { memory: BytesMut::new(), bytes: 0 });
@@ -89,11 +89,11 @@ mod tests {
     }
 
     fn buffers() -> Vec<usize> {
-        KEPT.with(|kept| kept.borrow().0.iter().map(|buffer| buffer.bytes).collect())
+        BUFFERS.with(|buffers| buffers.borrow().0.iter().map(|buffer| buffer.bytes).collect())
     }
 
     #[test]
-    fn a_long_payload_that_has_ended_leaves_its_memory_to_the_next_of_about_its_length() {
+    fn freed_long_payload_memory_is_reused_for_similar_lengths() {
         let first = payload(1, 1 << 20);
         let place = first.as_ptr();
         drop(first);
@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn long_payloads_that_live_at_once_never_share_memory_and_few_of_them_are_kept() {
+    fn long_payloads_never_share_memory_and_few_are_kept() {
         let payloads: Vec<_> = (0..9).map(|n| payload(n, 100_000 * (1 + usize::from(n) % 3))).collect();
         for (n, payload) in (0..).zip(&payloads) {
             assert!(payload.iter().all(|byte| *byte == n), "payload {n}");
@@ -114,13 +114,13 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_gives_its_place_to_what_is_needed_now() {
+    fn unsuitable_buffer_is_replaced_by_a_needed_one() {
         drop((payload(1, 100_000), payload(2, 100_000)));
         let last = payload(3, 1_000_000);
         assert_eq!(buffers(), [1_000_000, 100_000]);
         drop(last);
         assert!(zeroed(1_000_000).iter().all(|byte| *byte == 0), "what was in it is gone");
         assert_eq!((payload(4, 10).len(), payload(5, 3 << 20).len()), (10, 3 << 20));
-        assert_eq!(buffers(), [1_000_000, 100_000], "neither short nor very long ones are kept");
+        assert_eq!(buffers(), [1_000_000, 100_000], "neither short nor very long ones are reused");
     }
 }

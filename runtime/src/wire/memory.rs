@@ -1,8 +1,8 @@
-//! Memory for payloads: a few buffers a thread, each used again as soon as nobody holds the payload that was in it.
+//! Memory for payloads: a few buffers per thread, each reused as soon as the payload in it is dropped.
 //!
-//! A payload is shared by reference count on its way, so that whoever drops it last, on whatever thread, makes its
-//! buffer free: nothing is sent back. A payload that is kept for long keeps its buffer; the thread makes others, up to a
-//! bound, and then memory is allocated for each payload.
+//! A payload is shared by reference count, so dropping its last reference on any thread frees its buffer:
+//! nothing is sent back. A payload that is kept for long keeps its buffer. The thread then creates others, up
+//! to a bound; after that, memory is allocated for each payload.
 
 use std::{
     cell::RefCell,
@@ -13,30 +13,32 @@ use bytes::{Bytes, BytesMut};
 
 use super::long;
 
-/// Bytes of a buffer: a payload of 4 KiB and what MessagePack puts around it.
+/// Length of a buffer in bytes: a payload of 4 KiB and its MessagePack overhead.
 const BUFFER_BYTES: usize = 4 * 1024 + 256;
-/// Buffers of one thread. More payloads than that under way at once are allocated one by one.
+/// Maximum number of buffers per thread. Further concurrent payloads are allocated one by one.
 const BUFFERS_MAX: usize = 64;
-/// Buffers that are looked at first: with few payloads under way, the same few are used, which are in the cache.
+/// Number of buffers that are checked first: with few concurrent payloads the same few are used, which are in
+/// the cache.
 const FIRST: usize = 4;
-/// Buffers that are looked at beyond those, each time others. Payloads end in the order in which they began, mostly: two are enough
-/// for those that leave one by one, and where bursts end out of their order, runs of some in use lie between free ones.
+/// Number of buffers that are checked after those, different ones each time. Payloads mostly end in the order
+/// of their creation: two checks are enough for those that end one by one. When bursts end out of order, runs
+/// of used buffers lie between free ones.
 const IN_TURN: usize = 8;
-/// Bytes to begin with where memory is allocated for one payload.
+/// Initial bytes of an allocation for one payload.
 const SHORT: usize = 128;
 
 thread_local! {
     static BUFFERS: RefCell<Buffers> = const { RefCell::new(Buffers { all: Vec::new(), next: FIRST }) };
 }
 
-/// The bytes that `write` writes.
+/// Returns the bytes that `write` writes.
 pub(super) fn written<E>(write: impl FnOnce(&mut Writer) -> Result<(), E>) -> Result<Bytes, E> {
     let mut writer = Writer(Buffer::take());
     write(&mut writer)?;
     Ok(writer.0.cut().freeze())
 }
 
-/// A payload that is these bytes.
+/// Returns a payload that is a copy of these bytes.
 pub(super) fn copied(bytes: &[u8]) -> Bytes {
     if bytes.is_empty() || bytes.len() > BUFFER_BYTES {
         return Bytes::copy_from_slice(bytes);
@@ -46,7 +48,7 @@ pub(super) fn copied(bytes: &[u8]) -> Bytes {
     buffer.cut().freeze()
 }
 
-/// Zeroed memory of `length` bytes.
+/// Returns zeroed memory of `length` bytes.
 pub(super) fn zeroed(length: usize) -> BytesMut {
     if length > BUFFER_BYTES {
         return long::zeroed(length);
@@ -56,7 +58,7 @@ pub(super) fn zeroed(length: usize) -> BytesMut {
     buffer.cut()
 }
 
-/// Writes at the end of a buffer.
+/// A writer that appends to a buffer.
 pub(super) struct Writer(Buffer);
 
 impl Write for Writer {
@@ -80,10 +82,10 @@ impl Write for Writer {
     }
 }
 
-/// A buffer in use; it goes back to its thread when this is dropped, at a panic of the payload's own code too.
+/// A buffer in use. It returns to its thread when this is dropped, also after a panic of the payload's own code.
 struct Buffer {
     memory: BytesMut,
-    /// Its place among the thread's; `None` if it is not one of them, and grows as it must.
+    /// The index of the buffer in its thread; `None` if it belongs to no thread, and grows as needed.
     place: Option<usize>,
 }
 
@@ -92,13 +94,13 @@ impl Buffer {
         Self::of_thread().unwrap_or_else(|| Self { memory: BytesMut::with_capacity(SHORT), place: None })
     }
 
-    /// One of the thread's, if one is free.
+    /// Returns a buffer of the thread, if one is free.
     fn of_thread() -> Option<Self> {
-        // A thread that ends has none any more.
+        // A thread at its end may have destroyed this variable.
         BUFFERS.try_with(|buffers| buffers.borrow_mut().take()).ok().flatten()
     }
 
-    /// Other memory with what was written so far, and room for `length` bytes in all.
+    /// Returns new memory with the bytes written so far, and room for `length` bytes in all.
     #[cold]
     fn outgrown(&self, length: usize) -> Self {
         let mut memory = BytesMut::with_capacity(length);
@@ -106,7 +108,7 @@ impl Buffer {
         Self { memory, place: None }
     }
 
-    /// What was written. It keeps the buffer from being used again as long as it lives.
+    /// Splits off the written bytes. They keep the buffer from being reused while they exist.
     fn cut(&mut self) -> BytesMut {
         if self.place.is_some() { self.memory.split() } else { std::mem::take(&mut self.memory) }
     }
@@ -117,21 +119,21 @@ impl Drop for Buffer {
         let Some(place) = self.place else { return };
         let mut memory = std::mem::take(&mut self.memory);
         memory.clear();
-        // A thread that ends has none any more.
+        // A thread at its end may have destroyed this variable.
         let _ = BUFFERS.try_with(|buffers| buffers.borrow_mut().all[place] = memory);
     }
 }
 
 /// The buffers of a thread.
 struct Buffers {
-    /// Those in use now are empty and have no room.
+    /// Buffers in use are empty and have no capacity here.
     all: Vec<BytesMut>,
-    /// Which one has its turn when the first few are all in use.
+    /// The buffer to check next when the first few are all in use.
     next: usize,
 }
 
 impl Buffers {
-    /// A free buffer, or a new one if there may be more.
+    /// Returns a free buffer, or a new one below the maximum.
     fn take(&mut self) -> Option<Buffer> {
         let found = self.free().or_else(|| self.added());
         found.map(|place| Buffer { memory: std::mem::take(&mut self.all[place]), place: Some(place) })
@@ -142,7 +144,7 @@ impl Buffers {
         first.or_else(|| (0..IN_TURN).find_map(|_| self.in_turn()))
     }
 
-    /// The buffer that has its turn, if it is free. The turn goes on in any case.
+    /// Returns the index of the next buffer to check, if it is free. Advances in any case.
     fn in_turn(&mut self) -> Option<usize> {
         let place = self.next;
         self.next = if place + 1 < self.all.len() { place + 1 } else { FIRST };
@@ -177,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn a_payload_that_has_ended_leaves_its_memory_to_the_next() {
+    fn freed_payload_memory_is_reused() {
         let first = payload(1, 1000);
         let place = first.as_ptr();
         drop(first);
@@ -187,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn payloads_that_live_at_once_never_share_memory_however_many_they_are() {
+    fn live_payloads_never_share_memory() {
         let mut kept = Vec::new();
         for round in 0..3 {
             kept.extend((0..BUFFERS_MAX + 9).map(|n| payload(n as u8, 1 + n * 67)));
@@ -216,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn a_free_buffer_is_found_between_runs_of_those_in_use() {
+    fn free_buffer_is_found_between_used_ones() {
         let mut all: Vec<_> = (0..BUFFERS_MAX).map(|_| payload(1, 1000)).collect();
         let places: HashSet<_> = all.iter().map(|payload| payload.as_ptr()).collect();
         let mut place = 0;
@@ -234,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn a_payload_of_any_length_is_what_was_written() {
+    fn payload_of_any_length_round_trips() {
         for length in [0, 1, BUFFER_BYTES - 1, BUFFER_BYTES, BUFFER_BYTES + 1, 100_000] {
             let bytes: Vec<u8> = (0..length).map(|n| n as u8).collect();
             let (head, tail) = bytes.split_at(length / 3);
@@ -247,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn a_payload_whose_own_code_sends_or_panics_costs_no_buffer() {
+    fn payload_code_that_sends_or_panics_leaks_no_buffer() {
         let outer = written(|writer| {
             writer.write_all(b"outer")?;
             assert_eq!(payload(7, 3), [7, 7, 7][..]);

@@ -1,4 +1,4 @@
-//! A message in memory: header, payload bytes, and the duty to say what became of it.
+//! A message in memory: header, payload bytes, and the receipt to settle.
 
 use std::{
     ops::{Deref, DerefMut},
@@ -10,12 +10,11 @@ use serde::{Serialize, de::DeserializeOwned};
 
 use crate::{
     outcome::{MemberReport, Outcome, Receipt, Rejection, Ticket},
-    protection::Protection,
     tid::Tid,
-    wire::{Class, Flags, Header, Kind, memory, read::decode_payload, remember},
+    wire::{Class, Flags, Header, Kind, Protection, memory, read::decode_payload, remember},
 };
 
-/// A type that travels as MessagePack (a map with field names, so that any language can read it).
+/// A type that is sent as MessagePack (a map with field names, so that any language can read it).
 ///
 /// # Examples
 ///
@@ -32,20 +31,21 @@ use crate::{
 /// }
 /// ```
 pub trait Payload: Serialize + DeserializeOwned + Send + 'static {
-    /// Name of the type, the same in every program: `project.type`.
+    /// The name of the type, the same in every program: `project.type`.
     const NAME: &'static str;
-    /// Id of the type on the wire.
+    /// The ID of the type on the wire.
     const KIND: Kind = Kind::named(Self::NAME);
-    /// Class that this type travels in unless the sender says otherwise.
+    /// The class of this type, unless the sender sets another.
     const CLASS: Class = Class::Control;
-    /// How long after it was sent a message of this type is still worth handling: it expires where it waits when it is older. `None`: for
-    /// ever. What one message says of itself comes first: [`MessageBuilder::expires_after`](crate::sender::MessageBuilder::expires_after).
+    /// The age at which a queued message of this type expires. `None`: never. A time that is set for one
+    /// message has precedence:
+    /// [`MessageBuilder::expires_after`](crate::sender::MessageBuilder::expires_after).
     const TIME_TO_LIVE: Option<Duration> = None;
-    /// What a receiver bears, for a type that is protected from end to end: see [`protection`](crate::protection).
+    /// The limits of a receiver, for a type with end-to-end protection: see [`protection`](crate::protection).
     const PROTECTION: Option<Protection> = None;
 }
 
-/// Why a payload could not be read. The peer is at fault: its type of this name is another one.
+/// The reason why a payload could not be decoded. This is an error of the peer: its type of this name differs.
 #[derive(Debug, thiserror::Error)]
 #[error("this is not a {name}: {cause}")]
 pub struct DecodeError {
@@ -54,7 +54,7 @@ pub struct DecodeError {
 }
 
 impl DecodeError {
-    /// Of a `P` that is protected and came through no guard.
+    /// Returns the error for a protected `P` that was received without a guard.
     #[must_use]
     pub fn unguarded<P: Payload>() -> Self {
         let words = "it is protected, and did not come through a guard; make one for its sender".to_owned();
@@ -62,25 +62,25 @@ impl DecodeError {
     }
 }
 
-/// A message on its way.
+/// A message, sent or to be sent.
 #[derive(Debug)]
 pub struct Message {
-    /// Who, to whom, what, when.
+    /// Source, destination, type and times of the message.
     pub header: Header,
-    /// The payload, not copied on its way through a process.
+    /// The payload, shared without a copy within a process.
     pub payload: Bytes,
-    /// Who wants to know what becomes of it; `None` for an unconfirmed message.
+    /// The receipt for its outcome; `None` for an unconfirmed message.
     pub receipt: Option<Receipt>,
 }
 
 impl Message {
-    /// An unconfirmed message.
+    /// Creates an unconfirmed message.
     #[must_use]
     pub const fn new(header: Header, payload: Bytes) -> Self {
         Self { header, payload, receipt: None }
     }
 
-    /// What became of the message that `ticket` names, for the one who sent it. Takes no memory.
+    /// Creates the message that carries the outcome of the message of `ticket` to its sender. Allocates no memory.
     #[must_use]
     pub fn outcome(ticket: Ticket, outcome: Outcome) -> Self {
         let mut header = Header::new(Kind::OUTCOME, ticket.destination, ticket.source);
@@ -89,8 +89,8 @@ impl Message {
         Self::new(header, code_of(outcome))
     }
 
-    /// Reports about the members of the message to many that `ticket` names, in frames with payloads of at most `payload_max` bytes, or one
-    /// report. spec: FRAME-7
+    /// Creates the reports about the members of the message to many of `ticket`, in frames with payloads of
+    /// at most `payload_max` bytes, or one report. spec: FRAME-7
     pub fn members(
         ticket: Ticket,
         reports: &[MemberReport],
@@ -104,7 +104,7 @@ impl Message {
         })
     }
 
-    /// Says to whoever was asked that nobody waits any more for the reply to the request that `ticket` names.
+    /// Creates the message that cancels the request of `ticket` at its receiver.
     #[must_use]
     pub const fn cancel(ticket: Ticket) -> Self {
         let mut header = Header::new(Kind::CANCEL, ticket.source, ticket.destination);
@@ -112,30 +112,32 @@ impl Message {
         Self::new(header, Bytes::new())
     }
 
-    /// A message of the given type, in its own class. A type that is [protected](crate::protection) does not compile here: its messages
-    /// are made by the context, or the [`Sender`](crate::sender::Sender), of an application.
+    /// Creates a message of the given type, in its own class. A type that is [protected](crate::protection)
+    /// does not compile here: its messages are created by the context, or the
+    /// [`Sender`](crate::sender::Sender), of an application.
     ///
     /// # Panics
-    /// If the type's `Serialize` refuses its own value (a map with two equal keys, say): a fault of the program.
+    /// If the type's `Serialize` fails for its own value (for example a map with two equal keys): an error of
+    /// the program.
     #[must_use]
     pub fn typed<P: Payload>(source: Tid, destination: Tid, value: &P) -> Self {
         const { assert!(P::PROTECTION.is_none(), "a protected payload is sent by the context of an application") };
         Self::of_type::<P>(source, destination, encode(value))
     }
 
-    /// The same, of bytes that stand for a `P`.
+    /// Same as [`typed`](Self::typed), for the encoded bytes of a `P`.
     pub(crate) fn of_type<P: Payload>(source: Tid, destination: Tid, payload: Bytes) -> Self {
         remember::<P>();
         let mut header = Header::new(P::KIND, source, destination);
         header.class = P::CLASS;
         if let Some(time) = P::TIME_TO_LIVE {
-            // Nothing is waited for here.
+            // No wait depends on it here.
             let _ = header.set_time_to_live(time);
         }
         Self::new(header, payload)
     }
 
-    /// Reads the payload as a `P`.
+    /// Decodes the payload as a `P`.
     ///
     /// # Errors
     /// The bytes are not a `P`.
@@ -143,39 +145,39 @@ impl Message {
         decode_as(&self.payload)
     }
 
-    /// Says what became of this message, if anybody wants to know.
+    /// Settles the message with its outcome, if it is confirmed.
     pub fn settle(&mut self, outcome: Outcome) {
         if let Some(receipt) = self.receipt.take() {
             receipt.settle(outcome);
         }
     }
 
-    /// Refuses this message.
+    /// Rejects this message.
     pub fn reject(mut self, why: Rejection) {
         self.settle(Outcome::Rejected(why));
     }
 
-    /// What names this message in an outcome.
+    /// Returns the ticket that identifies this message in an outcome.
     #[must_use]
     pub const fn ticket(&self) -> Ticket {
         let Header { source, destination, correlation, .. } = self.header;
         Ticket { source, destination, correlation }
     }
 
-    /// Whether this is the request that `ticket` names.
+    /// Returns whether this is the request of `ticket`.
     #[must_use]
     pub fn is_request(&self, ticket: Ticket) -> bool {
         self.header.flags.has(Flags::ASK) && self.ticket() == ticket
     }
 
-    /// Bytes that this message takes in a queue: its header and its payload.
+    /// Returns the bytes that this message occupies in a queue: its header and its payload.
     #[must_use]
     pub fn size(&self) -> usize {
         super::HEADER_LEN + self.payload.len()
     }
 }
 
-/// The payload of an OUTCOME, without asking for memory.
+/// Returns the payload of an OUTCOME, without an allocation.
 fn code_of(outcome: Outcome) -> Bytes {
     static CODES: [u8; 256] = {
         let mut codes = [0; 256];
@@ -190,16 +192,16 @@ fn code_of(outcome: Outcome) -> Bytes {
     Bytes::from_static(&CODES[at..=at])
 }
 
-/// The MessagePack form of `value`.
+/// Encodes `value` as MessagePack.
 ///
 /// # Panics
-/// If the type's `Serialize` refuses its own value: a fault of the program, found by its first send.
+/// If the type's `Serialize` fails for its own value: an error of the program, found at its first send.
 pub fn encode<T: Serialize>(value: &T) -> Bytes {
     memory::written(|writer| rmp_serde::encode::write_named(writer, value))
         .expect("a payload type can be written as MessagePack")
 }
 
-/// Reads a value from the bytes of a payload that is a `P`.
+/// Decodes a value from the bytes of a payload that is a `P`.
 pub(crate) fn decode_as<P: Payload>(bytes: &[u8]) -> Result<P, DecodeError> {
     let read = decode_payload(bytes).or_else(|cause| without_fields(bytes).ok_or(cause));
     read.map_err(|cause| DecodeError { name: P::NAME, cause })
@@ -208,14 +210,15 @@ pub(crate) fn decode_as<P: Payload>(bytes: &[u8]) -> Result<P, DecodeError> {
 /// MessagePack forms of a value without fields: an empty map, an empty array, nil.
 const NO_FIELDS: [&[u8]; 3] = [&[0x80], &[0x90], &[0xc0]];
 
-/// Reads a type without fields (`struct Stop;`, `struct Stop {}`), whichever form of none its sender has chosen, also no bytes at all.
+/// Decodes a type without fields (`struct Stop;`, `struct Stop {}`), from any form of an empty value, also no
+/// bytes at all.
 fn without_fields<T: DeserializeOwned + Serialize>(bytes: &[u8]) -> Option<T> {
-    // A type of no size has no fields with values in them: nothing is read that the sender has not written.
+    // A type of size zero has no fields with values: no value is read that the sender has not written.
     let is_one = size_of::<T>() == 0 && (bytes.is_empty() || NO_FIELDS.contains(&bytes));
     NO_FIELDS.into_iter().filter(|_| is_one).find_map(|form| decode_payload(form).ok())
 }
 
-/// Writable memory for a raw payload: what `create_message` lends.
+/// Writable memory for a raw payload, from `create_message`.
 ///
 /// # Examples
 ///
@@ -238,19 +241,19 @@ pub struct MessageBuffer {
 }
 
 impl MessageBuffer {
-    /// Zeroed memory for `length` payload bytes.
+    /// Creates zeroed memory for `length` payload bytes.
     #[must_use]
     pub fn new(header: Header, length: usize) -> Self {
         Self { header, payload: memory::zeroed(length) }
     }
 
-    /// The message, its payload no longer writable.
+    /// Returns the message; its payload is no longer writable.
     #[must_use]
     pub fn freeze(self) -> Message {
         Message::new(self.header, self.payload.freeze())
     }
 
-    /// The class in which it will travel.
+    /// Sets the class of the message.
     pub fn set_class(&mut self, class: Class) {
         self.header.class = class;
     }
@@ -284,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn a_payload_nested_without_end_is_an_error_and_does_not_overflow_the_stack() {
+    fn endless_nesting_is_an_error_without_stack_overflow() {
         let list_in_list = vec![0x91; 100_000];
         let mut unknown_field = vec![0x81, 0xa1, b'y'];
         unknown_field.extend(&list_in_list);
@@ -295,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn a_type_without_fields_is_read_from_each_form_of_none_and_no_other_type_is() {
+    fn unit_types_read_each_form_of_none() {
         #[derive(Debug, Serialize, serde::Deserialize)]
         struct Unit;
         #[derive(Debug, Serialize, serde::Deserialize)]
@@ -319,7 +322,7 @@ mod tests {
         impl Payload for Angle {
             const NAME: &'static str = "test.angle";
         }
-        // As docs/protocol/frame.md says.
+        // As documented in docs/protocol/frame.md.
         assert_eq!((&encode(&Unit)[..], &encode(&Braces {})[..]), (&[0x90][..], &[0x80][..]));
         for bytes in [&[][..], &[0x80], &[0x90], &[0xc0]] {
             assert!(decode_as::<Unit>(bytes).is_ok() && decode_as::<Braces>(bytes).is_ok(), "{bytes:?}");

@@ -1,7 +1,8 @@
-//! What travels: one fixed header before every payload, and the rules by which bytes become messages.
+//! The wire format: one fixed header before every payload, and the rules by which bytes become messages.
 //!
-//! The same frame (header, then payload) is used on unix sockets, on TCP and in datagrams; `docs/protocol/frame.md`
-//! specifies it byte by byte. Nothing here allocates on the word of a peer: lengths are checked first.
+//! The same frame (header, then payload) is used on unix sockets, on TCP and in datagrams;
+//! `docs/protocol/frame.md` specifies it byte by byte. No length from a peer is trusted for an allocation:
+//! lengths are checked first.
 
 mod age;
 mod codec;
@@ -10,6 +11,7 @@ mod kind;
 mod long;
 mod memory;
 mod message;
+mod protection;
 mod read;
 mod strict;
 mod type_names;
@@ -20,5 +22,6 @@ pub use header::{Class, Flags, HEADER_LEN, Header, HeaderError, MAGIC, TIME_TO_L
 pub use kind::{Kind, fnv1a};
 pub(crate) use message::decode_as;
 pub use message::{DecodeError, Message, MessageBuffer, Payload, encode};
+pub use protection::Protection;
 pub use read::decode;
 pub(crate) use type_names::remember;

@@ -1,4 +1,4 @@
-//! Reads values from MessagePack: every number fits its field, and an error names the field.
+//! Decoding of MessagePack: every number fits its field, and an error names the field.
 
 use std::fmt;
 
@@ -13,30 +13,32 @@ use super::{
     strict::{DEPTH_MAX, Strict, Trail},
 };
 
-/// Bytes of an error's text at most: a part of it can be a text of the sender's.
+/// Maximum length of an error's text in bytes: a part of it can be text from the sender.
 const WORDS_BYTES_MAX: usize = 400;
 
-/// Reads a value from its MessagePack form.
+/// Decodes a value from MessagePack.
 ///
-/// A number that does not fit its field is refused: an integer out of range, a floating-point number that would become infinite or lose
-/// its fraction, an integer that an `f32` or `f64` field does not hold exactly. A floating-point number is rounded to the nearest `f32`
-/// where the field is one. NaN and infinity are taken as they were sent.
+/// A number that does not fit its field is rejected. Rejected numbers are integers out of range, and
+/// floating-point numbers that would become infinite or lose their fraction. An integer that an `f32` or
+/// `f64` field does not hold exactly is rejected too. A floating-point number is rounded to the nearest `f32`
+/// for an `f32` field. NaN and infinity are accepted unchanged.
 ///
-/// Values nested deeper than 64 levels are refused: rmp-serde's own limit of 1,024 lets a payload of 1,100 bytes, each the
-/// start of a list, overflow the stack of a thread and so end the process. Of enums it has no limit.
+/// Values nested deeper than 64 levels are rejected. With rmp-serde's own limit of 1,024, a payload of 1,100
+/// bytes, each the start of a list, can overflow the stack of a thread. That would end the process. rmp-serde
+/// has no limit for enums.
 ///
 /// # Errors
 /// The bytes are not a `T`. The text names the field: "field `kp`: expected f32, found string".
 pub fn decode<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, Error> {
     let trail = Trail::default();
-    read(bytes, &trail).map_err(|error| in_words(error, &trail))
+    read(bytes, &trail).map_err(|error| with_path(error, &trail))
 }
 
-/// The same of a value that can be written again: numbers in flattened structs and untagged enums, which pass through serde's own memory,
-/// are refused too where they would become infinite.
+/// Same as [`decode`], for a value that can be encoded again. Numbers in flattened structs and untagged enums
+/// pass through serde's own memory; they are rejected too if they would become infinite.
 pub(super) fn decode_payload<T: DeserializeOwned + Serialize>(bytes: &[u8]) -> Result<T, Error> {
     let trail = Trail::default();
-    let value = read(bytes, &trail).map_err(|error| in_words(error, &trail))?;
+    let value = read(bytes, &trail).map_err(|error| with_path(error, &trail))?;
     if trail.is_doubtful() && infinities(&encode(&value)) > infinities(bytes) {
         let words =
             "a number is beyond the largest f32, and its field is one, in a flattened or untagged part";
@@ -51,10 +53,10 @@ fn read<T: DeserializeOwned>(bytes: &[u8], trail: &Trail) -> Result<T, Error> {
     T::deserialize(Strict::new(&mut inner, trail))
 }
 
-/// An error with the field that it is about.
+/// Returns an error with the name of its field.
 #[cold]
-fn in_words(error: Error, trail: &Trail) -> Error {
-    let (path, mut words) = (trail.path(), words_of(error, trail.wanted()));
+fn with_path(error: Error, trail: &Trail) -> Error {
+    let (path, mut words) = (trail.path(), describe(error, trail.wanted()));
     if words.len() > WORDS_BYTES_MAX {
         words.truncate(words.floor_char_boundary(WORDS_BYTES_MAX));
         words.push_str("...");
@@ -62,9 +64,9 @@ fn in_words(error: Error, trail: &Trail) -> Error {
     Error::Syntax(if path.is_empty() { words } else { format!("field `{path}`: {words}") })
 }
 
-fn words_of(error: Error, wanted: &str) -> String {
+fn describe(error: Error, wanted: &str) -> String {
     match error {
-        Error::Syntax(words) | Error::Uncategorized(words) => turned(words),
+        Error::Syntax(words) | Error::Uncategorized(words) => reworded(words),
         Error::InvalidMarkerRead(_) | Error::InvalidDataRead(_) => {
             "the payload ends before its value does".to_owned()
         }
@@ -82,12 +84,12 @@ fn words_of(error: Error, wanted: &str) -> String {
     }
 }
 
-/// What is no number, by a part of its marker's name.
+/// Values that are not numbers, by a part of their marker's name.
 const KINDS: [(&str, &str); 5] =
     [("Str", "string"), ("Array", "sequence"), ("Map", "map"), ("Bin", "byte array"), ("Ext", "extension")];
 
-/// What serde says of a value of another type, in the order in which a reader needs it.
-fn turned(words: String) -> String {
+/// Rewrites serde's text about a value of another type into the order that a reader needs.
+fn reworded(words: String) -> String {
     let said = words.strip_prefix("invalid type: ").or_else(|| words.strip_prefix("invalid value: "));
     match said.and_then(|said| said.rsplit_once(", expected ")) {
         Some((found, expected)) => format!("expected {expected}, found {found}"),
@@ -95,12 +97,12 @@ fn turned(words: String) -> String {
     }
 }
 
-/// How many infinite numbers there are in a value.
+/// Returns the number of infinite numbers in a value.
 fn infinities(bytes: &[u8]) -> usize {
     let mut count = 0;
     let mut inner = rmp_serde::Deserializer::from_read_ref(bytes);
     inner.set_max_depth(DEPTH_MAX.into());
-    // What cannot be read was refused before.
+    // A value that cannot be read was rejected before.
     let _ = Census(&mut count).deserialize(&mut inner);
     count
 }
@@ -116,7 +118,7 @@ impl<'de> DeserializeSeed<'de> for Census<'_> {
     }
 }
 
-macro_rules! counts_nothing {
+macro_rules! forward_uncounted {
     ($($method:ident($value:ty))*) => {$(
         fn $method<E>(self, _: $value) -> Result<(), E> {
             Ok(())
@@ -131,7 +133,7 @@ impl<'de> Visitor<'de> for Census<'_> {
         formatter.write_str("any value")
     }
 
-    counts_nothing! { visit_bool(bool) visit_i64(i64) visit_u64(u64) visit_str(&str) visit_bytes(&[u8]) }
+    forward_uncounted! { visit_bool(bool) visit_i64(i64) visit_u64(u64) visit_str(&str) visit_bytes(&[u8]) }
 
     fn visit_f64<E>(self, value: f64) -> Result<(), E> {
         *self.0 += usize::from(value.is_infinite());
@@ -219,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn a_float_that_would_be_infinite_is_refused_wherever_it_is() {
+    fn float_that_would_be_infinite_is_rejected() {
         let huge = "expected f32, found 1e300, which is beyond the largest f32, 3.4028235e38";
         for (field, value) in [
             ("gains.kp", json!({"gains": {"kp": 1e300}})),
@@ -241,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn integers_fit_their_field_or_are_refused() {
+    fn integers_fit_their_field_or_are_rejected() {
         for (words, value) in [
             ("field `pair[0]`: expected u8, found integer `300`", json!({"pair": [300, 0]})),
             ("field `pair[1]`: expected i16, found integer `-40000`", json!({"pair": [1, -40000]})),
@@ -271,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn a_value_of_another_shape_names_its_field() {
+    fn wrong_structure_names_its_field() {
         for (words, value) in [
             ("field `gains.kp`: expected f32, found string", json!({"gains": {"kp": "x"}})),
             ("field `gains.kp`: expected f32, found unit value", json!({"gains": {"kp": null}})),
@@ -298,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_sent_arrives() {
+    fn sent_value_arrives_unchanged() {
         let robot = Robot {
             gains: Some(Gains { kp: f32::MAX, kd: Some(f32::MIN_POSITIVE) }),
             legs: vec![Gains { kp: f32::INFINITY, kd: None }],
@@ -312,7 +314,7 @@ mod tests {
             serial: u128::MAX,
         };
         assert_eq!(decode_payload::<Robot>(&encode(&robot)).unwrap(), robot);
-        // A sender that has no `f32`: rounded to the nearest, and what is no number stays none.
+        // A sender without `f32`: rounded to the nearest, and NaN stays NaN.
         let doubles = |kp: f64| decode_payload::<Gains>(&encode(&BTreeMap::from([("kp", kp)]))).unwrap().kp;
         assert_eq!((doubles(0.1), doubles(1e-300), doubles(f64::INFINITY)), (0.1, 0.0, f32::INFINITY));
         assert!(doubles(f64::NAN).is_nan());
@@ -336,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn a_number_in_a_flattened_or_untagged_part_does_not_become_infinite_either() {
+    fn flattened_or_untagged_number_never_becomes_infinite() {
         for huge in [
             refusal::<Flat>(&bytes(json!({"name": "hip", "kp": 1e300}))),
             refusal::<Either>(&bytes(json!({"kp": 1e300}))),
@@ -356,7 +358,7 @@ mod tests {
     struct Chain(Option<Box<Self>>);
 
     #[test]
-    fn enums_and_newtypes_without_end_are_refused_and_do_not_overflow_the_stack() {
+    fn endless_enums_and_newtypes_are_rejected() {
         let nots: Vec<u8> = [0x81, 0xa3, b'N', b'o', b't'].repeat(100_000);
         for words in [refusal::<Tree>(&nots), refusal::<Chain>(&[0x01])] {
             assert!(words.contains("values are nested deeper than 64 levels"), "{words}");

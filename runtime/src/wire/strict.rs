@@ -1,8 +1,12 @@
-//! A deserializer around another one that refuses values which do not fit their field, and knows which field that was.
+//! A deserializer around another one that rejects values which do not fit their field, and records which
+//! field that was.
 //!
-//! serde's own number types turn `1e300` into an infinite `f32`, and round integers that an `f32` or `f64` cannot hold. A control
-//! loop must not be given either. What is added for a value is a comparison; the names of fields are borrowed from the bytes, and
-//! put together to a path only where an error passes them.
+//! serde's own number types turn `1e300` into an infinite `f32`, and round integers that an `f32` or `f64`
+//! cannot hold. A control loop must not receive either. The added cost per value is a comparison. Field names
+//! are borrowed from the bytes, and combined to a path only when an error passes them.
+
+mod keys;
+mod numbers;
 
 use std::{
     cell::{Cell, RefCell},
@@ -10,15 +14,19 @@ use std::{
 };
 
 use serde::de::{
-    DeserializeSeed, Deserializer, EnumAccess, Error, MapAccess, SeqAccess, Unexpected, VariantAccess,
-    Visitor,
+    DeserializeSeed, Deserializer, EnumAccess, Error, MapAccess, SeqAccess, VariantAccess, Visitor,
 };
 
-/// Names in the path of a field that an error tells at most. Outer ones are left out beyond it.
+use self::{
+    keys::KeySeed,
+    numbers::{Double, Single, Unsigned128, is_beyond_single},
+};
+
+/// Maximum number of names in the path of an error's field. Outer ones are left out beyond it.
 const SEGMENTS_MAX: usize = 32;
-/// Bytes of one name in the path of a field that an error tells at most.
+/// Maximum length in bytes of one name in the path of an error's field.
 const NAME_BYTES_MAX: usize = 64;
-/// Values in values, and so on: lists, maps, enums, newtypes.
+/// Maximum nesting depth of values: lists, maps, enums, newtypes.
 pub(super) const DEPTH_MAX: u8 = 64;
 
 /// The path from a value that failed to the root.
@@ -26,18 +34,18 @@ pub(super) const DEPTH_MAX: u8 = 64;
 pub(super) struct Trail {
     /// The innermost name first.
     steps: RefCell<Vec<Step>>,
-    /// Whether there is any: read after each value.
+    /// Whether the path has a step: read after each value.
     is_begun: Cell<bool>,
-    /// The type of the last number that was not read.
+    /// The type of the last number that could not be read.
     wanted: Cell<&'static str>,
-    /// A number was read that no `f32` holds, and serde alone knows into which type.
+    /// Whether a number was read that no `f32` holds, with a target type that only serde knows.
     is_doubtful: Cell<bool>,
 }
 
-/// One name of a path, or one number.
+/// One name or one number of a path.
 #[derive(Clone, Copy, Debug)]
 enum Key<'de> {
-    /// A key that is no text and no number.
+    /// A key that is neither a text nor a number.
     Unnamed,
     Name(&'de str),
     Number(u64),
@@ -50,7 +58,7 @@ enum Step {
 }
 
 impl Trail {
-    /// Notes that an error passes `key` on its way out.
+    /// Records that an error passes `key` on its way out.
     #[cold]
     fn note(&self, key: Key<'_>) {
         self.is_begun.set(true);
@@ -64,24 +72,25 @@ impl Trail {
         }
     }
 
-    /// Forgets an error that the type took for an answer.
+    /// Clears an error that the type handled itself.
     #[cold]
     fn clear(&self) {
         self.is_begun.set(false);
         self.steps.borrow_mut().clear();
     }
 
-    /// The type of the number that was not read: `f32`.
+    /// Returns the type of the number that could not be read, such as `f32`.
     pub(super) const fn wanted(&self) -> &'static str {
         self.wanted.get()
     }
 
-    /// Whether a number may have become infinite where only serde could see it: in a flattened struct, say.
+    /// Returns whether a number may have become infinite where only serde could see it, for example in a
+    /// flattened struct.
     pub(super) const fn is_doubtful(&self) -> bool {
         self.is_doubtful.get()
     }
 
-    /// The path of the field whose error came out: `legs[2].gains.kp`. Empty where the whole value is meant.
+    /// Returns the path of the error's field: `legs[2].gains.kp`. Empty if the error is about the whole value.
     pub(super) fn path(&self) -> String {
         let mut path = String::new();
         for step in self.steps.borrow().iter().rev() {
@@ -95,18 +104,18 @@ impl Trail {
     }
 }
 
-/// A name of the sender's, for a line in the log.
+/// Returns a name from the sender, for a line in the log.
 fn shown(name: &str) -> String {
     name[..name.floor_char_boundary(NAME_BYTES_MAX)].escape_debug().to_string()
 }
 
-/// A deserializer whose values fit their fields.
+/// A deserializer that checks that values fit their fields.
 pub(super) struct Strict<'t, D> {
     inner: D,
     at: At<'t>,
 }
 
-/// Where a value is.
+/// The position of a value.
 #[derive(Clone, Copy)]
 struct At<'t> {
     trail: &'t Trail,
@@ -114,7 +123,7 @@ struct At<'t> {
 }
 
 impl At<'_> {
-    /// One level further in.
+    /// Returns the position one level deeper.
     fn deeper<E: Error>(self) -> Result<Self, E> {
         if self.depth >= DEPTH_MAX {
             return Err(E::custom(format_args!("values are nested deeper than {DEPTH_MAX} levels")));
@@ -122,7 +131,7 @@ impl At<'_> {
         Ok(Self { depth: self.depth + 1, ..self })
     }
 
-    /// Notes what the field was to hold, where reading a number fails.
+    /// Records the type that the field requires, if reading a number fails.
     #[inline]
     fn wanting<T, E>(self, name: &'static str, result: Result<T, E>) -> Result<T, E> {
         match result {
@@ -134,10 +143,10 @@ impl At<'_> {
         }
     }
 
-    /// Notes the way of an error.
+    /// Records the path of an error.
     #[inline]
     fn noting<'k, T, E>(self, key: impl FnOnce() -> Key<'k>, result: Result<T, E>) -> Result<T, E> {
-        // Taken apart and put together: a copy of it as a whole costs more than reading a number.
+        // The result is matched and rebuilt: a copy of it as a whole costs more than reading a number.
         match result {
             Ok(value) => {
                 if self.trail.is_begun.get() {
@@ -154,7 +163,7 @@ impl At<'_> {
 }
 
 impl<'t, D> Strict<'t, D> {
-    /// Reads from `inner`; the way to a value that does not fit is in `trail`.
+    /// Creates a deserializer that reads from `inner`; `trail` receives the path to a value that does not fit.
     pub(super) const fn new(inner: D, trail: &'t Trail) -> Self {
         Self { inner, at: At { trail, depth: 0 } }
     }
@@ -164,8 +173,8 @@ impl<'t, D> Strict<'t, D> {
     }
 }
 
-/// Values that have no others in them: nothing of them can fail in a way that the outer visitor does not see.
-macro_rules! as_ever {
+/// Values without inner values: none of their errors escapes the outer visitor.
+macro_rules! forward {
     ($($method:ident)*) => {$(
         fn $method<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, D::Error> {
             self.inner.$method(visitor)
@@ -173,7 +182,7 @@ macro_rules! as_ever {
     )*};
 }
 
-/// Numbers: rmp-serde does not say which one it was to read.
+/// Numbers: rmp-serde does not report which type it was to read.
 macro_rules! number {
     ($($method:ident($name:literal))*) => {$(
         fn $method<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, D::Error> {
@@ -194,7 +203,7 @@ macro_rules! within {
 impl<'de, D: Deserializer<'de>> Deserializer<'de> for Strict<'_, D> {
     type Error = D::Error;
 
-    as_ever! {
+    forward! {
         deserialize_char deserialize_str deserialize_string deserialize_bytes deserialize_byte_buf deserialize_unit
         deserialize_identifier deserialize_ignored_any
     }
@@ -215,7 +224,7 @@ impl<'de, D: Deserializer<'de>> Deserializer<'de> for Strict<'_, D> {
         self.at.wanting("f64", self.inner.deserialize_f64(Double(visitor)))
     }
 
-    // Not as ever: rmp-serde takes -1 for the largest of them.
+    // Different from the others: rmp-serde reads -1 as the largest of them.
     fn deserialize_u128<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, D::Error> {
         self.inner.deserialize_any(Unsigned128(visitor))
     }
@@ -277,21 +286,22 @@ impl<'de, D: Deserializer<'de>> Deserializer<'de> for Strict<'_, D> {
     }
 }
 
-/// A visitor whose inner values are checked too.
+/// A visitor that checks inner values too.
 struct Within<'t, V> {
     visitor: V,
     at: At<'t>,
-    /// The fields of the struct that is read, where that comes as a list.
+    /// The fields of the struct that is read, if it is encoded as a list.
     fields: &'static [&'static str],
 }
 
-macro_rules! visit_as_ever {
+macro_rules! forward_visits {
     ($($method:ident($value:ty))*) => {$(
         fn $method<E: Error>(self, value: $value) -> Result<V::Value, E> {
             self.visitor.$method(value)
         }
     )*};
 }
+use forward_visits;
 
 impl<'de, V: Visitor<'de>> Visitor<'de> for Within<'_, V> {
     type Value = V::Value;
@@ -300,7 +310,7 @@ impl<'de, V: Visitor<'de>> Visitor<'de> for Within<'_, V> {
         self.visitor.expecting(formatter)
     }
 
-    visit_as_ever! {
+    forward_visits! {
         visit_bool(bool) visit_i8(i8) visit_i16(i16) visit_i32(i32) visit_i64(i64) visit_i128(i128)
         visit_u8(u8) visit_u16(u16) visit_u32(u32) visit_u64(u64) visit_u128(u128)
         visit_f32(f32) visit_char(char) visit_str(&str) visit_borrowed_str(&'de str) visit_string(String)
@@ -327,7 +337,7 @@ impl<'de, V: Visitor<'de>> Visitor<'de> for Within<'_, V> {
     }
 
     fn visit_newtype_struct<D: Deserializer<'de>>(self, inner: D) -> Result<V::Value, D::Error> {
-        // A type of its own in itself would be read for ever: it takes no bytes.
+        // A type that contains only itself would be read forever: it takes no bytes.
         let at = self.at.deeper()?;
         self.visitor.visit_newtype_struct(Strict { inner, at })
     }
@@ -348,113 +358,7 @@ impl<'de, V: Visitor<'de>> Visitor<'de> for Within<'_, V> {
     }
 }
 
-/// Whether an `f32` would be infinite that is made of this number.
-const fn is_beyond_single(value: f64) -> bool {
-    value.is_finite() && (value as f32).is_infinite()
-}
-
-/// The visitor of an `f32`.
-struct Single<V>(V);
-
-/// The visitor of an `f64`.
-struct Double<V>(V);
-
-/// Whole numbers: a field takes those that it holds exactly. Shorter ones it always does.
-macro_rules! visit_whole {
-    ($name:literal, $float:ty, $digits:literal: $($method:ident($value:ty))*) => {$(
-        fn $method<E: Error>(self, value: $value) -> Result<V::Value, E> {
-            let number = i128::from(value);
-            if number.unsigned_abs() <= 1 << $digits || number as $float as i128 == number {
-                self.0.$method(value)
-            } else {
-                Err(inexact($name, number))
-            }
-        }
-    )*};
-}
-
-macro_rules! visit_number_as_ever {
-    ($($method:ident($value:ty))*) => {$(
-        fn $method<E: Error>(self, value: $value) -> Result<V::Value, E> {
-            self.0.$method(value)
-        }
-    )*};
-}
-
-/// What a field of floating-point numbers is given that is none.
-macro_rules! visit_others_as_ever {
-    () => {
-        type Value = V::Value;
-
-        fn expecting(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-            self.0.expecting(formatter)
-        }
-
-        visit_number_as_ever! {
-            visit_bool(bool) visit_i8(i8) visit_i16(i16) visit_u8(u8) visit_u16(u16) visit_f32(f32) visit_char(char)
-            visit_str(&str) visit_borrowed_str(&'de str) visit_string(String) visit_bytes(&[u8])
-            visit_borrowed_bytes(&'de [u8]) visit_byte_buf(Vec<u8>)
-        }
-
-        fn visit_none<E: Error>(self) -> Result<V::Value, E> {
-            self.0.visit_none()
-        }
-
-        fn visit_unit<E: Error>(self) -> Result<V::Value, E> {
-            self.0.visit_unit()
-        }
-
-        fn visit_some<D: Deserializer<'de>>(self, inner: D) -> Result<V::Value, D::Error> {
-            self.0.visit_some(inner)
-        }
-
-        fn visit_newtype_struct<D: Deserializer<'de>>(self, inner: D) -> Result<V::Value, D::Error> {
-            self.0.visit_newtype_struct(inner)
-        }
-
-        fn visit_seq<A: SeqAccess<'de>>(self, inner: A) -> Result<V::Value, A::Error> {
-            self.0.visit_seq(inner)
-        }
-
-        fn visit_map<A: MapAccess<'de>>(self, inner: A) -> Result<V::Value, A::Error> {
-            self.0.visit_map(inner)
-        }
-
-        fn visit_enum<A: EnumAccess<'de>>(self, inner: A) -> Result<V::Value, A::Error> {
-            self.0.visit_enum(inner)
-        }
-    };
-}
-
-impl<'de, V: Visitor<'de>> Visitor<'de> for Single<V> {
-    visit_others_as_ever! {}
-
-    visit_whole! { "f32", f32, 24: visit_i32(i32) visit_i64(i64) visit_u32(u32) visit_u64(u64) }
-
-    fn visit_f64<E: Error>(self, value: f64) -> Result<V::Value, E> {
-        if is_beyond_single(value) { Err(beyond_single(value)) } else { self.0.visit_f64(value) }
-    }
-}
-
-impl<'de, V: Visitor<'de>> Visitor<'de> for Double<V> {
-    visit_others_as_ever! {}
-
-    visit_number_as_ever! { visit_i32(i32) visit_u32(u32) visit_f64(f64) }
-
-    visit_whole! { "f64", f64, 53: visit_i64(i64) visit_u64(u64) }
-}
-
-#[cold]
-fn beyond_single<E: Error>(value: f64) -> E {
-    E::custom(format_args!("expected f32, found {value:e}, which is beyond the largest f32, {:e}", f32::MAX))
-}
-
-#[cold]
-fn inexact<E: Error>(name: &str, number: i128) -> E {
-    E::custom(format_args!("expected {name}, found integer {number}, which {name} does not hold exactly"))
-}
-
-/// A seed whose value is read strictly.
+/// A seed for a strictly read value.
 struct Seed<'t, S> {
     seed: S,
     at: At<'t>,
@@ -566,164 +470,5 @@ impl<'de, A: VariantAccess<'de>> VariantAccess<'de> for Variant<'_, 'de, A> {
         let at = self.at;
         let visitor = Within { visitor, at, fields };
         at.noting(|| self.key, self.inner.struct_variant(fields, visitor))
-    }
-}
-
-/// A seed of a key, or of a variant's name, which is kept for the path.
-struct KeySeed<'k, 'de, S> {
-    seed: S,
-    key: &'k mut Key<'de>,
-}
-
-impl<'de, S: DeserializeSeed<'de>> DeserializeSeed<'de> for KeySeed<'_, 'de, S> {
-    type Value = S::Value;
-
-    fn deserialize<D: Deserializer<'de>>(self, inner: D) -> Result<S::Value, D::Error> {
-        self.seed.deserialize(KeyReader { inner, key: self.key })
-    }
-}
-
-/// A deserializer of a key, which is kept for the path.
-struct KeyReader<'k, 'de, D> {
-    inner: D,
-    key: &'k mut Key<'de>,
-}
-
-macro_rules! read_key {
-    ($($method:ident($($argument:ident: $type:ty),*))*) => {$(
-        fn $method<V: Visitor<'de>>(self, $($argument: $type,)* visitor: V) -> Result<V::Value, D::Error> {
-            self.inner.$method($($argument,)* KeyVisitor { visitor, key: self.key })
-        }
-    )*};
-}
-
-impl<'de, D: Deserializer<'de>> Deserializer<'de> for KeyReader<'_, 'de, D> {
-    type Error = D::Error;
-
-    read_key! {
-        deserialize_any() deserialize_bool() deserialize_i8() deserialize_i16() deserialize_i32() deserialize_i64()
-        deserialize_i128() deserialize_u8() deserialize_u16() deserialize_u32() deserialize_u64()
-        deserialize_f32() deserialize_f64() deserialize_char() deserialize_str() deserialize_string()
-        deserialize_bytes() deserialize_byte_buf() deserialize_option() deserialize_unit()
-        deserialize_unit_struct(name: &'static str) deserialize_newtype_struct(name: &'static str)
-        deserialize_seq() deserialize_tuple(len: usize) deserialize_tuple_struct(name: &'static str, len: usize)
-        deserialize_map() deserialize_struct(name: &'static str, fields: &'static [&'static str])
-        deserialize_enum(name: &'static str, variants: &'static [&'static str])
-        deserialize_identifier() deserialize_ignored_any()
-    }
-
-    fn deserialize_u128<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, D::Error> {
-        self.inner.deserialize_any(Unsigned128(visitor))
-    }
-
-    fn is_human_readable(&self) -> bool {
-        self.inner.is_human_readable()
-    }
-}
-
-struct KeyVisitor<'k, 'de, V> {
-    visitor: V,
-    key: &'k mut Key<'de>,
-}
-
-macro_rules! visit_number {
-    ($($method:ident($value:ty))*) => {$(
-        fn $method<E: Error>(self, value: $value) -> Result<V::Value, E> {
-            *self.key = Key::Number(value.into());
-            self.visitor.$method(value)
-        }
-    )*};
-}
-
-impl<'de, V: Visitor<'de>> Visitor<'de> for KeyVisitor<'_, 'de, V> {
-    type Value = V::Value;
-
-    fn expecting(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.visitor.expecting(formatter)
-    }
-
-    visit_number! { visit_u8(u8) visit_u16(u16) visit_u32(u32) visit_u64(u64) }
-
-    visit_as_ever! {
-        visit_i8(i8) visit_i16(i16) visit_i32(i32) visit_i64(i64) visit_i128(i128) visit_u128(u128)
-        visit_bool(bool) visit_f32(f32) visit_f64(f64) visit_char(char) visit_str(&str) visit_string(String)
-        visit_bytes(&[u8]) visit_borrowed_bytes(&'de [u8]) visit_byte_buf(Vec<u8>)
-    }
-
-    fn visit_borrowed_str<E: Error>(self, name: &'de str) -> Result<V::Value, E> {
-        *self.key = Key::Name(name);
-        self.visitor.visit_borrowed_str(name)
-    }
-
-    fn visit_none<E: Error>(self) -> Result<V::Value, E> {
-        self.visitor.visit_none()
-    }
-
-    fn visit_unit<E: Error>(self) -> Result<V::Value, E> {
-        self.visitor.visit_unit()
-    }
-
-    fn visit_some<D: Deserializer<'de>>(self, inner: D) -> Result<V::Value, D::Error> {
-        self.visitor.visit_some(KeyReader { inner, key: self.key })
-    }
-
-    fn visit_newtype_struct<D: Deserializer<'de>>(self, inner: D) -> Result<V::Value, D::Error> {
-        self.visitor.visit_newtype_struct(KeyReader { inner, key: self.key })
-    }
-
-    fn visit_seq<A: SeqAccess<'de>>(self, inner: A) -> Result<V::Value, A::Error> {
-        self.visitor.visit_seq(inner)
-    }
-
-    fn visit_map<A: MapAccess<'de>>(self, inner: A) -> Result<V::Value, A::Error> {
-        self.visitor.visit_map(inner)
-    }
-
-    fn visit_enum<A: EnumAccess<'de>>(self, inner: A) -> Result<V::Value, A::Error> {
-        self.visitor.visit_enum(KeyVariant { inner, key: self.key })
-    }
-}
-
-/// A variant as a key, whose name is kept for the path.
-struct KeyVariant<'k, 'de, A> {
-    inner: A,
-    key: &'k mut Key<'de>,
-}
-
-impl<'de, A: EnumAccess<'de>> EnumAccess<'de> for KeyVariant<'_, 'de, A> {
-    type Error = A::Error;
-    type Variant = A::Variant;
-
-    fn variant_seed<S: DeserializeSeed<'de>>(self, seed: S) -> Result<(S::Value, A::Variant), A::Error> {
-        self.inner.variant_seed(KeySeed { seed, key: self.key })
-    }
-}
-
-/// The visitor of a `u128`: 16 bytes, or a number.
-struct Unsigned128<V>(V);
-
-impl<'de, V: Visitor<'de>> Visitor<'de> for Unsigned128<V> {
-    type Value = V::Value;
-
-    fn expecting(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.expecting(formatter)
-    }
-
-    fn visit_u64<E: Error>(self, value: u64) -> Result<V::Value, E> {
-        self.0.visit_u128(value.into())
-    }
-
-    fn visit_i64<E: Error>(self, value: i64) -> Result<V::Value, E> {
-        match u128::try_from(value) {
-            Ok(value) => self.0.visit_u128(value),
-            Err(_) => Err(E::invalid_value(Unexpected::Signed(value), &self)),
-        }
-    }
-
-    fn visit_bytes<E: Error>(self, bytes: &[u8]) -> Result<V::Value, E> {
-        match bytes.try_into() {
-            Ok(bytes) => self.0.visit_u128(u128::from_be_bytes(bytes)),
-            Err(_) => Err(E::invalid_length(bytes.len(), &self)),
-        }
     }
 }

@@ -1,12 +1,13 @@
-//! Names of payload types by their ids, as far as this process sends or handles them: for logs, which show names and not numbers.
+//! The names of payload types by their IDs, for types that this process sends or handles: for logs, which
+//! show names and not numbers.
 
 use std::sync::OnceLock;
 
 use super::{Kind, Payload};
 
-/// Places of the table. A program with more types shows the ids of the others.
+/// Number of entries in the table. A program with more types shows the IDs of the others.
 const PLACES: usize = 512;
-/// Places at which a name is looked for, from that of its id on.
+/// Number of entries that are searched for a name, starting at that of its ID.
 const PROBES: usize = 8;
 
 struct Names {
@@ -15,7 +16,7 @@ struct Names {
     rust: &'static str,
 }
 
-/// Written once each and never taken out, so that a look is one load without a lock.
+/// Each entry is written once and never removed, so that a lookup is one load without a lock.
 static NAMES: [OnceLock<Names>; PLACES] = [const { OnceLock::new() }; PLACES];
 
 fn places(kind: Kind) -> impl Iterator<Item = &'static OnceLock<Names>> {
@@ -23,7 +24,7 @@ fn places(kind: Kind) -> impl Iterator<Item = &'static OnceLock<Names>> {
     (0..PROBES).filter_map(move |probe| NAMES.get((first + probe) % PLACES))
 }
 
-/// Remembers the names of `P`. After its first call for a type it compares one number.
+/// Records the names of `P`. After its first call for a type it compares one number.
 pub(crate) fn remember<P: Payload>() {
     for place in places(P::KIND) {
         let names =
@@ -39,13 +40,13 @@ fn find(kind: Kind) -> Option<&'static Names> {
 }
 
 impl Kind {
-    /// Name of the payload type with this id, if this process has sent it or declared that it handles it.
+    /// Returns the name of the payload type with this ID, if this process has sent it or declared that it handles it.
     #[must_use]
     pub fn type_name(self) -> Option<&'static str> {
         find(self).map(|names| names.name)
     }
 
-    /// The same in Rust, without its module.
+    /// Returns the type's name in Rust, without its module.
     #[must_use]
     pub fn rust_name(self) -> Option<&'static str> {
         find(self).map(|names| names.rust.rsplit("::").next().unwrap_or(names.rust))
@@ -66,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn a_type_that_was_sent_has_its_names() {
+    fn sent_type_has_its_names() {
         assert_eq!(Kind::named("test.type_names.never").type_name(), None);
         remember::<Angle>();
         remember::<Angle>();

@@ -1,25 +1,25 @@
-//! A case that has no reference, as a JSON line and as a line of a table.
+//! Results of a case without a reference, as a JSON line and as a table row.
 
 use serde_json::{Map, Value, json};
 
 use crate::{Figures, machine};
 
-/// What was timed in one case.
+/// The timings of one case.
 #[derive(Debug)]
 pub struct Alone<'a> {
-    /// The bench.
+    /// Name of the bench.
     pub bench: &'a str,
-    /// The case.
+    /// Name of the case.
     pub case: &'a str,
-    /// What was timed.
+    /// Name of the timed quantity.
     pub figure: &'a str,
-    /// Its times.
+    /// The recorded times.
     pub seen: &'a Figures,
-    /// Counts beside the times.
+    /// Named counters printed beside the times.
     pub counts: &'a [(&'a str, u64)],
 }
 
-/// Prints the machine and the head of the table.
+/// Prints the machine description and the table header.
 pub fn head() {
     eprintln!("machine: {}", machine());
     eprintln!(
@@ -29,7 +29,7 @@ pub fn head() {
 }
 
 impl Alone<'_> {
-    /// Prints both lines.
+    /// Prints the JSON line and the table row.
     pub fn report(&self) {
         let Self { bench, case, figure, seen, counts } = self;
         let (n, [p50, p99, p999, max]) = (seen.rounds(), seen.quantiles_us(1));

@@ -1,40 +1,40 @@
-//! A case beside its reference, as a JSON line.
+//! Results of a case beside its reference, as a JSON line.
 
 use serde_json::{Value, json};
 
 use crate::{Figures, round};
 
-/// Round trips of one case, and of the reference that ran right before it.
+/// Round-trip times of one case, and of the reference that ran immediately before it.
 #[derive(Debug)]
 pub struct Beside<'a> {
-    /// The bench.
+    /// Name of the bench.
     pub bench: &'a str,
-    /// The case.
+    /// Name of the case.
     pub case: &'a str,
-    /// What a message carries, in bytes.
+    /// Payload of a message, in bytes.
     pub payload_bytes: usize,
-    /// Which CPUs the two ends use.
+    /// Pinning of the two ends to CPUs.
     pub pinning: &'a str,
-    /// How round trips follow each other.
+    /// Pace of the round trips.
     pub pace: &'a str,
-    /// The case's times.
+    /// Times of the case.
     pub seen: &'a Figures,
-    /// What it stands beside.
+    /// Name of the reference.
     pub reference: &'a str,
-    /// The reference's times.
+    /// Times of the reference.
     pub raw: &'a Figures,
-    /// Counts beside the times.
+    /// Named counters printed beside the times.
     pub counts: &'a [(&'a str, f64)],
 }
 
 impl Beside<'_> {
-    /// Prints the head of the table whose rows [`report`](Self::report) prints.
+    /// Prints the header of the table with the rows that [`report`](Self::report) prints.
     pub fn head() {
         eprintln!("| case | payload | CPUs | pace | p50 | p99 | p99.9 | max | reference | its p50 | ratio |");
         eprintln!("| --- | ---: | --- | --- | ---: | ---: | ---: | ---: | --- | ---: | ---: |");
     }
 
-    /// Prints the line, and a row of a table for a page of documentation.
+    /// Prints the JSON line, and a table row for a page of documentation.
     pub fn report(&self) {
         let Self { bench, case, payload_bytes, pinning, pace, seen, reference, raw, counts } = self;
         let [p50, p99, p999, max] = seen.quantiles_us(3);

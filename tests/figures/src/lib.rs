@@ -1,15 +1,20 @@
-//! Times of many runs, and the lines in which Sinew's benches say them: [`Beside`] where a reference of the same run stands
-//! next to the case, [`Alone`] where none does. JSON lines are on the standard output, all else is on the standard error.
+//! Latency histograms and the output format of Sinew's benches: [`Beside`] for a case with a reference in the
+//! same run, [`Alone`] for a case without one. JSON lines go to standard output, everything else goes to
+//! standard error.
 //!
-//! And what benches share besides: what they are asked for ([`Asked`]), the processes that they start ([`process`]), how many round trips at which pace
-//! ([`Rounds`]), and the streams of the system beside which they measure ([`stream`]).
+//! The crate also holds the parts that all benches share: command-line arguments ([`Asked`]), child processes
+//! ([`process`]), number and pace of round trips ([`Rounds`]), stalls of the host ([`stalls`]),
+//! operating-system streams used as references ([`stream`]), and pictures of measured runs ([`canvas`]).
 
 mod alone;
 mod asked;
 mod beside;
+pub mod canvas;
+pub mod documentation;
 mod pinning;
 pub mod process;
 mod rounds;
+pub mod stalls;
 pub mod stream;
 
 pub use alone::{Alone, head};
@@ -22,34 +27,35 @@ use std::time::Duration;
 
 use hdrhistogram::{Histogram, iterators::IterationValue};
 
-/// The times of one run: 1 ns to 60 s, with three digits.
+/// The times of one run: 1 ns to 60 s, with three significant digits.
 #[derive(Debug)]
 pub struct Figures(Histogram<u64>);
 
 impl Figures {
-    /// No times yet.
+    /// An empty histogram.
     ///
     /// # Panics
-    /// Never: its bounds are legal.
+    /// Never: the bounds of the histogram are valid.
     #[must_use]
     pub fn new() -> Self {
         Self(Histogram::new_with_bounds(1, 60_000_000_000, 3).expect("1 ns to 60 s with three digits"))
     }
 
-    /// Counts one time; one that is longer than 60 s counts as 60 s.
+    /// Records one time. A time above 60 s counts as 60 s.
     pub fn record(&mut self, time: Duration) {
         self.0.saturating_record(u64::try_from(time.as_nanos()).unwrap_or(u64::MAX).max(1));
     }
 
-    /// Counts all those of another.
+    /// Adds all times of another histogram.
     ///
     /// # Panics
-    /// Never: all have the same bounds.
+    /// Never: all histograms have the same bounds.
     pub fn add(&mut self, other: &Self) {
         self.0.add(&other.0).expect("all have the same bounds");
     }
 
-    /// Prints them for the process that asked for them: how many times of how many nanoseconds, a line each.
+    /// Prints the histogram for the parent process: one line per bucket, with its count and its value in
+    /// nanoseconds.
     pub fn hand_over(&self) {
         let line =
             |step: IterationValue<u64>| format!("{} {}\n", step.count_at_value(), step.value_iterated_to());
@@ -57,7 +63,7 @@ impl Figures {
         print!("{lines}");
     }
 
-    /// What [`hand_over`](Self::hand_over) has printed; `None` if these are no such lines.
+    /// Parses the output of [`hand_over`](Self::hand_over); `None` if the lines are malformed.
     #[must_use]
     pub fn taken(printed: &str) -> Option<Self> {
         let mut figures = Self::new();
@@ -68,24 +74,24 @@ impl Figures {
         (figures.rounds() > 0).then_some(figures)
     }
 
-    /// How many times were counted.
+    /// Number of recorded times.
     #[must_use]
     pub fn rounds(&self) -> u64 {
         self.0.len()
     }
 
-    /// The time that 99 of 100 do not exceed.
+    /// The 99th percentile.
     #[must_use]
     pub fn p99(&self) -> Duration {
         Duration::from_nanos(self.0.value_at_quantile(0.99))
     }
 
-    /// The time that this share of all do not exceed, in microseconds.
+    /// The time at this quantile, in microseconds.
     fn us(&self, quantile: f64) -> f64 {
         self.0.value_at_quantile(quantile) as f64 / 1_000.0
     }
 
-    /// p50, p99, p99.9 and the maximum, in microseconds with this many digits after the point.
+    /// p50, p99, p99.9 and the maximum, in microseconds, with this many decimal places.
     fn quantiles_us(&self, digits: i32) -> [f64; 4] {
         [0.5, 0.99, 0.999, 1.0].map(|quantile| round(self.us(quantile), digits))
     }
@@ -102,7 +108,7 @@ fn round(value: f64, digits: i32) -> f64 {
     (value * unit).round() / unit
 }
 
-/// The machine and how busy it is, in a line.
+/// The machine and its current load, in one line.
 #[must_use]
 pub fn machine() -> String {
     let cpus = std::thread::available_parallelism().map_or(0, usize::from);

@@ -1,37 +1,37 @@
-//! Which CPUs the ends of a case use, so that the scheduler does not decide what is measured.
+//! Pinning of the ends of a case to CPUs, so that the scheduler does not decide the result.
 
 use rustix::thread::{CpuSet, sched_setaffinity};
 
-/// More than a machine of ours has.
+/// Exceeds the number of CPUs of any machine in use.
 const CPUS_MAX: usize = 256;
 
-/// Which CPUs the processes or threads of a case use.
+/// Pinning of the processes or threads of a case to CPUs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pinning {
-    /// Wherever the scheduler likes.
+    /// No pinning: the scheduler decides.
     Anywhere,
-    /// All on the first CPU.
+    /// Everything on the first CPU.
     OneCpu,
-    /// The measuring end on the first CPU, the echoing one on the second.
+    /// The measuring end on the first CPU, the echoing end on the second.
     OneCpuEach,
 }
 
-/// Who is to be pinned.
+/// An end that is to be pinned.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum End {
-    /// Sends first, and takes the time.
+    /// Sends first and measures the time.
     Measuring,
-    /// Answers.
+    /// Echoes.
     Echoing,
-    /// Stands between them or beside them: a node, the senders of a crowd.
+    /// Any other participant: a node between the ends, or the senders of a crowd.
     Other,
 }
 
 impl Pinning {
-    /// All three.
+    /// All variants.
     pub const ALL: [Self; 3] = [Self::Anywhere, Self::OneCpu, Self::OneCpuEach];
 
-    /// As it stands in the benches' lines.
+    /// The name used in the output of the benches.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -41,17 +41,17 @@ impl Pinning {
         }
     }
 
-    /// The one with that name.
+    /// The variant with this name.
     ///
     /// # Panics
-    /// If there is none: a bench reads the names that it wrote itself.
+    /// If there is none: a bench reads only names that it wrote itself.
     #[must_use]
     pub fn named(name: &str) -> Self {
         let found = Self::ALL.into_iter().find(|pinning| pinning.name() == name);
         found.expect("a name that this program wrote itself")
     }
 
-    /// The CPU of this end, if it has a certain one.
+    /// The CPU of this end, if it is pinned.
     #[must_use]
     pub const fn cpu(self, end: End) -> Option<usize> {
         match (self, end) {
@@ -61,8 +61,8 @@ impl Pinning {
         }
     }
 
-    /// Keeps the calling thread, and the threads and processes that it makes, on the CPUs of this end. Where the machine
-    /// does not allow it, that is said, and the run goes on.
+    /// Pins the calling thread, and all threads and processes that it starts, to the CPUs of this end. If the
+    /// system refuses, prints a message and continues.
     pub fn pin(self, end: End) {
         if self == Self::Anywhere {
             return;
@@ -70,7 +70,7 @@ impl Pinning {
         let mut set = CpuSet::new();
         match self.cpu(end) {
             Some(cpu) => set.set(cpu),
-            // The mask of the measuring end was inherited, which is too narrow; what the machine lacks is left out.
+            // The mask inherited from the measuring end is too narrow. CPUs that do not exist are ignored.
             None => (0..CPUS_MAX).for_each(|cpu| set.set(cpu)),
         }
         if let Err(error) = sched_setaffinity(None, &set) {

@@ -1,4 +1,4 @@
-//! The processes of a bench: its own program, in other roles.
+//! Child processes of a bench: the same program in other roles.
 
 use std::{
     io::{BufRead, BufReader, Read},
@@ -8,20 +8,20 @@ use std::{
 
 use rustix::process::{Pid, Signal, kill_process};
 
-/// The environment variable that gives a bench's program a role.
+/// The environment variable that selects the role of a bench's program.
 const ROLE: &str = "SINEW_BENCH_ROLE";
 const THERE: &str = "there";
 
-/// The role that this process was started in, unless a person started it.
+/// The role of this process; `None` if it was started from the command line.
 #[must_use]
 pub fn role() -> Option<String> {
     std::env::var(ROLE).ok()
 }
 
-/// This program in another role.
+/// A command that runs this program in another role.
 ///
 /// # Panics
-/// If the system does not say where this program is.
+/// If the path of this program is unknown.
 #[must_use]
 pub fn command(role: &str) -> Command {
     let mut command = Command::new(std::env::current_exe().expect("this program has a path"));
@@ -29,13 +29,13 @@ pub fn command(role: &str) -> Command {
     command
 }
 
-/// Runs this program in another role until it has ended, and says whether that went well.
+/// Runs this program in another role until it exits. Returns whether it succeeded.
 #[must_use]
 pub fn has_run(mut command: Command) -> bool {
     command.stdin(Stdio::null()).status().is_ok_and(|status| status.success())
 }
 
-/// Another process of a bench; it is ended when this is dropped.
+/// A child process of a bench. It is terminated on drop.
 #[derive(Debug)]
 pub struct Process {
     child: Child,
@@ -43,28 +43,29 @@ pub struct Process {
 }
 
 impl Process {
-    /// Starts a role, and waits until it says that it is there. Its input ends with this value.
+    /// Starts a role and waits until it reports that it is ready. Its standard input closes when this value
+    /// is dropped.
     ///
     /// # Panics
-    /// If it ends before.
+    /// If the process exits before it is ready.
     #[must_use]
     pub fn start(role: &str) -> Self {
         Self::start_command(command(role), role)
     }
 
-    /// The same with a command that runs this program, such as one on another host.
+    /// Like [`start`](Self::start), with a command that runs this program, such as one on another host.
     ///
     /// # Panics
-    /// If it ends before.
+    /// If the process exits before it is ready.
     #[must_use]
     pub fn start_command(command: Command, role: &str) -> Self {
         Self::start_with(command, Stdio::piped(), role)
     }
 
-    /// The same with a descriptor as its input.
+    /// Like [`start`](Self::start), with a file descriptor as standard input.
     ///
     /// # Panics
-    /// If it ends before.
+    /// If the process exits before it is ready.
     #[must_use]
     pub fn start_on(role: &str, input: OwnedFd) -> Self {
         Self::start_with(command(role), Stdio::from(input), role)
@@ -82,35 +83,35 @@ impl Process {
     /// Sends it a signal.
     ///
     /// # Panics
-    /// If it is no process any more.
+    /// If the process no longer exists.
     pub fn signal(&self, signal: Signal) {
         let id = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw).expect("a process id");
         kill_process(id, signal).expect("a child that nobody has collected takes signals");
     }
 
-    /// How often its threads have gone to sleep so far.
+    /// Number of times that its threads have gone to sleep so far.
     #[must_use]
     pub fn sleeps(&self) -> u64 {
         sleeps_of(&self.child.id().to_string())
     }
 
-    /// The next line that it says.
+    /// The next line of its output. At the end of the output the line is empty.
     ///
     /// # Panics
-    /// If the pipe breaks; at its end the line is empty.
+    /// If reading from the pipe fails.
     pub fn line(&mut self) -> String {
         let mut line = String::new();
-        self.output.read_line(&mut line).expect("the other process is heard");
+        self.output.read_line(&mut line).expect("the other process can be read");
         line.trim_end().to_owned()
     }
 
-    /// Waits until it has ended by itself, and hands out what it said last.
+    /// Waits until it has exited, and returns the rest of its output.
     #[must_use]
     pub fn wait(mut self) -> String {
         let mut rest = String::new();
-        // What cannot be read was not said.
+        // Unreadable output is ignored.
         let _ = self.output.read_to_string(&mut rest);
-        // Dropping it collects it.
+        // The drop reaps the process.
         let _ = self.child.wait();
         rest
     }
@@ -118,19 +119,19 @@ impl Process {
 
 impl Drop for Process {
     fn drop(&mut self) {
-        // It may have ended by itself.
+        // The process may have exited already.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-/// How often the threads of this process have gone to sleep so far: each time, something must wake them.
+/// Number of times that the threads of this process have gone to sleep so far. Each sleep requires a wakeup.
 #[must_use]
 pub fn sleeps() -> u64 {
     sleeps_of("self")
 }
 
-/// What Linux counts as voluntary context switches, of all threads that live now; 0 where it does not say.
+/// Voluntary context switches of all live threads, as Linux counts them; 0 if they are unknown.
 fn sleeps_of(process: &str) -> u64 {
     let tasks = std::fs::read_dir(format!("/proc/{process}/task"));
     let statuses = tasks.into_iter().flatten().flatten();
@@ -143,12 +144,12 @@ fn counted(status: &str) -> Option<u64> {
     line.trim().parse().ok()
 }
 
-/// Tells the process that started this one that it can go on.
-pub fn say_there() {
+/// Tells the parent process that this process is ready.
+pub fn print_ready() {
     println!("{THERE}");
 }
 
-/// Until the process that started this one closes the pipe, or ends this one.
+/// Blocks until the parent process closes the pipe or terminates this process.
 pub fn await_end() {
     let _ = std::io::stdin().read(&mut [0]);
 }

@@ -1,4 +1,4 @@
-//! How many round trips, at which pace.
+//! Number and pace of round trips.
 
 use std::{
     thread,
@@ -7,20 +7,20 @@ use std::{
 
 use crate::Figures;
 
-/// How round trips follow each other.
+/// Pace of round trips.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pace {
-    /// The next one begins where one ends.
+    /// The next round trip starts as soon as the previous one ends.
     BackToBack,
-    /// A millisecond passes before each.
+    /// Each round trip is preceded by a pause of one millisecond.
     EveryMillisecond,
 }
 
 impl Pace {
-    /// Both.
+    /// Both variants.
     pub const ALL: [Self; 2] = [Self::BackToBack, Self::EveryMillisecond];
 
-    /// As it stands in the benches' lines.
+    /// The name used in the output of the benches.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -29,17 +29,17 @@ impl Pace {
         }
     }
 
-    /// The one with that name.
+    /// The variant with this name.
     ///
     /// # Panics
-    /// If there is none: a bench reads the names that it wrote itself.
+    /// If there is none: a bench reads only names that it wrote itself.
     #[must_use]
     pub fn named(name: &str) -> Self {
         let found = Self::ALL.into_iter().find(|pace| pace.name() == name);
         found.expect("a name that this program wrote itself")
     }
 
-    /// What passes before each round trip.
+    /// The pause before each round trip.
     #[must_use]
     pub const fn pause(self) -> Duration {
         match self {
@@ -49,21 +49,21 @@ impl Pace {
     }
 }
 
-/// How many round trips of how many bytes, at which pace.
+/// Number of round trips, payload size and pace.
 #[derive(Clone, Copy, Debug)]
 pub struct Rounds {
-    /// What a message carries.
+    /// Payload of a message, in bytes.
     pub bytes: usize,
-    /// How they follow each other.
+    /// Pace of the round trips.
     pub pace: Pace,
-    /// Not counted.
+    /// Round trips that are not recorded.
     pub warm_up: u32,
-    /// Counted.
+    /// Round trips that are recorded.
     pub counted: u32,
 }
 
 impl Rounds {
-    /// As many as make a figure, fewer of what takes longer; a tenth of them in a short run.
+    /// Enough round trips for a stable figure, fewer for slow cases, and a tenth of them in a short run.
     #[must_use]
     pub const fn of(bytes: usize, pace: Pace, is_short: bool) -> Self {
         let (warm_up, counted) = match pace {
@@ -77,7 +77,7 @@ impl Rounds {
         Self { bytes, pace, warm_up, counted: counted / part }
     }
 
-    /// The times of these round trips.
+    /// Runs these round trips and returns their times.
     pub fn time(self, mut round_trip: impl FnMut()) -> Figures {
         let mut times = Figures::new();
         for round in 0..self.warm_up + self.counted {

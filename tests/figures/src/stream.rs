@@ -1,4 +1,4 @@
-//! What the system's own streams give: the references of most benches.
+//! Round trips over operating-system streams: the references of most benches.
 
 use std::{
     io::{Read, Write},
@@ -9,12 +9,12 @@ use std::{
     },
 };
 
-use crate::{Figures, Rounds, process::say_there};
+use crate::{Figures, Rounds, process::print_ready};
 
-/// Two connected sockets on the loopback interface, without delay.
+/// Two connected TCP sockets on the loopback interface, with `TCP_NODELAY`.
 ///
 /// # Panics
-/// If the system has none.
+/// If the system cannot provide sockets.
 #[must_use]
 pub fn tcp_pair() -> (TcpStream, TcpStream) {
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
@@ -26,19 +26,19 @@ pub fn tcp_pair() -> (TcpStream, TcpStream) {
     (ours, theirs)
 }
 
-/// What this process was given as its input.
+/// The descriptor that this process received as its standard input.
 ///
 /// # Panics
-/// If it has no descriptor left.
+/// If no file descriptor is left.
 #[must_use]
 pub fn input() -> OwnedFd {
     std::io::stdin().as_fd().try_clone_to_owned().expect("a descriptor")
 }
 
-/// Round trips through a stream with somebody who [echoes](echo).
+/// Runs round trips over a stream with a peer that [echoes](echo).
 ///
 /// # Panics
-/// If the other end goes away.
+/// If the peer closes the stream.
 pub fn round_trips(mut stream: impl Read + Write, rounds: Rounds) -> Figures {
     let mut buffer = vec![7; rounds.bytes];
     rounds.time(|| {
@@ -47,10 +47,10 @@ pub fn round_trips(mut stream: impl Read + Write, rounds: Rounds) -> Figures {
     })
 }
 
-/// Sends back what comes through the stream that is this process's input, until that ends.
+/// Echoes all data from the stream on standard input, until the stream ends.
 pub fn echo(bytes: usize) {
-    // Reading and writing are the same for both sorts of streams.
+    // Reads and writes are the same system calls for both kinds of streams.
     let (mut stream, mut buffer) = (UnixStream::from(input()), vec![0; bytes]);
-    say_there();
+    print_ready();
     while stream.read_exact(&mut buffer).and_then(|()| stream.write_all(&buffer)).is_ok() {}
 }

@@ -1,12 +1,10 @@
-//! What people and their tools write: configurations, keys, recorded trials, topologies.
+//! Files written by users and their tools: configurations, keys, recorded trials, topologies.
 
-use exoskeleton::{
+use exoskeleton::robot::topology::Topology;
+use exoskeleton_model::{
+    datagram::{CommandFrame, Reading},
     gait::trial::Trial,
     joint::Joint,
-    robot::{
-        datagram::{Reading, Word},
-        topology::Topology,
-    },
 };
 use sinew::{
     AppAddress, NodeAddress, NodeConfig, Tid,
@@ -15,7 +13,7 @@ use sinew::{
     security::{Certificate, DenyList, DiscoveryKey, Serial, rustls::pki_types::CertificateDer},
 };
 
-/// Longer texts are the same again and again.
+/// Maximum length of a text, in bytes. Longer texts only repeat the same structures.
 const TEXT_MAX: usize = 16 * 1024;
 
 pub(crate) fn some_configurations() -> Vec<Vec<u8>> {
@@ -37,7 +35,8 @@ pub(crate) fn some_configurations() -> Vec<Vec<u8>> {
     texts.map(|text| text.as_bytes().to_vec()).into()
 }
 
-/// A configuration file, a deny list, a key, a fault of `SINEW_FAULTS`, and every address and requirement that stands in one.
+/// A configuration file, a deny list, a key, a fault of `SINEW_FAULTS`, and every address and requirement
+/// that occurs in one.
 pub(crate) fn configuration(bytes: &[u8]) -> bool {
     let is_key = DiscoveryKey::read(bytes).is_some_and(|key| {
         let again = DiscoveryKey::read(key.text().as_bytes()).expect("what was written can be read");
@@ -73,12 +72,12 @@ pub(crate) fn configuration(bytes: &[u8]) -> bool {
     is_key || others.contains(&true)
 }
 
-/// One that `sinew keys issue` made for a node: what is kept of it is the same.
+/// A node certificate made by `sinew keys issue`. The copy in the corpus is the same.
 pub(crate) fn some_certificates() -> Vec<Vec<u8>> {
     vec![include_bytes!("../../../fuzz/corpus/certificate/seed-node").to_vec()]
 }
 
-/// What a stranger shows in the handshake of TLS, before anything of it is proven.
+/// A certificate that a peer presents in the TLS handshake, before anything of it is verified.
 pub(crate) fn certificate(der: &[u8]) -> bool {
     let Ok(read) = Certificate::read(CertificateDer::from(der.to_vec())) else { return false };
     let _ = (read.identity(), read.project(), read.validity());
@@ -88,8 +87,8 @@ pub(crate) fn certificate(der: &[u8]) -> bool {
 
 pub(crate) fn some_trials() -> Vec<Vec<u8>> {
     let mut text = "time_s,hip_r_deg,knee_r_deg,ankle_r_deg,grf_v_r,stance_r\n".to_owned();
-    // As short as a trial may be: eight strides of half a second, 50 rows each second. Each joint turns as a leg that walks has it: the hip is
-    // flexed at heel strike, the knee most at 72 % of the stride, the ankle at 45 %.
+    // The shortest valid trial: eight strides of half a second, 50 rows per second. Each joint moves as in a
+    // walking leg: the hip is flexed at heel strike, the knee peaks at 72 % of the stride, the ankle at 45 %.
     for row in 0..208 {
         let time = f64::from(row) * 0.02;
         let stance = u8::from(row % 25 < 15);
@@ -104,10 +103,10 @@ pub(crate) fn some_trials() -> Vec<Vec<u8>> {
     vec![text.into_bytes()]
 }
 
-/// A recorded trial, and the datagrams of devices that a robot's nodes exchange with a plant.
+/// A recorded trial, and the device datagrams that a robot's nodes exchange with a plant.
 pub(crate) fn trial(bytes: &[u8]) -> bool {
-    if let Ok(word) = Word::decode(bytes) {
-        assert!(Word::decode(&word.encode()).is_ok());
+    if let Ok(command) = CommandFrame::decode(bytes) {
+        assert!(CommandFrame::decode(&command.encode()).is_ok());
     }
     if let Ok(reading) = Reading::decode(bytes) {
         assert!(Reading::decode(&reading.encode()).is_ok());
@@ -141,7 +140,7 @@ pub(crate) fn some_topologies() -> Vec<Vec<u8>> {
     files.map(|file| file.as_bytes().to_vec()).into()
 }
 
-/// Which node of a robot is where.
+/// The mapping of a robot's nodes to hosts.
 pub(crate) fn topology(bytes: &[u8]) -> bool {
     let Some(text) = std::str::from_utf8(bytes).ok().filter(|text| text.len() <= TEXT_MAX) else {
         return false;

@@ -1,4 +1,4 @@
-//! What every connection and datagram consists of: headers, and frames in any pieces.
+//! The wire format of every connection and datagram: headers, and frames split into arbitrary pieces.
 
 use bytes::BytesMut;
 use sinew_runtime::{
@@ -8,7 +8,7 @@ use sinew_runtime::{
 use tokio_util::codec::{Decoder as _, Encoder as _};
 
 const PAYLOAD_MAX: usize = 4096;
-/// Of a header: all but its checksum, which stands behind.
+/// Length of the part of a header that the checksum covers; the checksum itself follows it.
 const CHECKED: usize = HEADER_LEN - 4;
 
 fn frame(payload: &[u8]) -> BytesMut {
@@ -26,7 +26,8 @@ pub(crate) fn some_frames() -> Vec<Vec<u8>> {
     vec![pieces(0), pieces(255)]
 }
 
-/// One header and its payload: a message or an error in each form, and what was read is written the same.
+/// One header and its payload. In each form it decodes to a message or an error, and encoding the result
+/// yields the same bytes.
 pub(crate) fn header(bytes: &[u8]) -> bool {
     let Some((head, payload)) = bytes.split_first_chunk::<HEADER_LEN>() else {
         assert!(decode_datagram(bytes).is_err(), "shorter than a header");
@@ -40,7 +41,7 @@ pub(crate) fn header(bytes: &[u8]) -> bool {
     }
     let _ = Header::check_guard(head);
     let _ = decode_datagram(bytes);
-    // No fuzzer guesses a checksum: the same, as if it were right.
+    // A fuzzer does not find a valid checksum by chance, so the rest runs as if it were valid.
     let mut head = *head;
     head[..4].copy_from_slice(&[MAGIC[0], MAGIC[1], VERSION, HEADER_LEN as u8]);
     head[4..8].copy_from_slice(&(payload.len() as u32).to_le_bytes());
@@ -49,28 +50,29 @@ pub(crate) fn header(bytes: &[u8]) -> bool {
     let whole = [&header.encode(payload)[..], payload].concat();
     let read = decode_datagram(&whole).expect("its checksum is right");
     assert_eq!((read.header, &read.payload[..]), (header, payload));
-    // Whatever times it says, nothing overflows over them.
+    // Arithmetic on timestamps does not overflow for any value in the header.
     let _ = header.is_expired(header.expiry());
     true
 }
 
-/// Any bytes on a connection, in any pieces: they are messages or an error, no frame is longer than the limit, no more memory is reserved
-/// than frames within it need, and what was read is written back the same.
+/// Any bytes on a connection, split into any pieces. They decode to messages or an error. No frame exceeds
+/// the limit, and no more memory is reserved than frames within the limit need. Encoding the result yields
+/// the same bytes.
 pub(crate) fn frames(bytes: &[u8]) -> bool {
     let Some((piece, bytes)) = bytes.split_first() else { return false };
     let (mut bytes, pieces) = (bytes.to_vec(), 1 + usize::from(*piece));
     let mut guarded = FrameCodec::new(PAYLOAD_MAX);
     guarded.set_checksum(Checksum::Guarded);
-    // A guard is not written back by who does not know of it: only that nothing breaks is looked at.
+    // A reader without guard support does not encode the guard again, so this run only checks for panics.
     let _ = read_all(guarded, &bytes, pieces, false);
     read_all(FrameCodec::new(PAYLOAD_MAX), &bytes, pieces, true);
-    // No fuzzer guesses what a frame starts with, or a checksum.
+    // A fuzzer does not find a valid frame prefix or checksum by chance.
     mend(&mut bytes);
     read_all(FrameCodec::in_memory(PAYLOAD_MAX), &bytes, pieces, true);
     read_all(FrameCodec::new(PAYLOAD_MAX), &bytes, pieces, true) > 0
 }
 
-/// Each frame begins as frames do, and has its checksum; of lengths, the lower 13 bits are left.
+/// Gives each frame a valid prefix and checksum, and keeps only the lower 13 bits of each length.
 fn mend(mut bytes: &mut [u8]) {
     while bytes.len() >= HEADER_LEN {
         bytes[..2].copy_from_slice(&MAGIC);

@@ -1,8 +1,11 @@
-//! Every byte format that comes from outside, each as one function that takes any bytes, panics where a promise is broken, and says
-//! whether it understood any of them.
+//! Every byte format that the project reads from outside, each as one function. The function accepts any
+//! bytes, panics if an invariant is broken, and returns whether it understood any of them.
 //!
-//! The same functions are played by libFuzzer, which chooses bytes by what they reach (`fuzz/`), by the program `sweep`, which changes known
-//! ones by chance and needs nothing but this compiler, and by the tests, which play all that is kept in `fuzz/corpus/`.
+//! Three drivers call the same functions:
+//!
+//! - libFuzzer, which selects inputs by code coverage (`fuzz/`);
+//! - the program `sweep`, which mutates known inputs at random and needs only this compiler;
+//! - the tests, which replay everything in `fuzz/corpus/`.
 
 mod files;
 mod frames;
@@ -15,16 +18,16 @@ pub use mutation::mutate;
 /// A byte format.
 #[derive(Clone, Copy, Debug)]
 pub struct Format {
-    /// Its name: that of its target in `fuzz/`, and of its directory of inputs.
+    /// The name, also of its fuzz target in `fuzz/` and of its input directory.
     pub name: &'static str,
-    /// Who writes such bytes, for people.
+    /// The origin of such bytes, for people.
     pub from: &'static str,
-    /// Plays bytes. Returns whether anything in them was understood.
+    /// Runs the bytes through the format. Returns whether any part of them was understood.
     pub play: fn(&[u8]) -> bool,
     seeds: fn() -> Vec<Vec<u8>>,
 }
 
-/// All of them.
+/// All formats.
 pub const FORMATS: [Format; 18] = [
     Format {
         name: "header",
@@ -122,21 +125,21 @@ pub const FORMATS: [Format; 18] = [
 ];
 
 impl Format {
-    /// The one of this name.
+    /// The format with this name.
     #[must_use]
     pub fn named(name: &str) -> Option<Self> {
         FORMATS.into_iter().find(|format| format.name == name)
     }
 
-    /// Inputs to begin with: what the other side of the format writes, and what is kept in its directory of `corpus`.
+    /// Initial inputs: the built-in seeds, and the files in the format's directory of `corpus`.
     ///
     /// # Errors
-    /// That directory cannot be read, or is not there.
+    /// The directory cannot be read or does not exist.
     pub fn inputs(&self, corpus: &Path) -> io::Result<Vec<Vec<u8>>> {
         let mut inputs = (self.seeds)();
         let kept = corpus.join(self.name);
         let read = std::fs::read_dir(&kept);
-        // Without what is kept a run tries less, and would look the same.
+        // A run without the corpus would test less and look the same.
         let read = read.map_err(|error| {
             let what = format!(
                 "no inputs of {} in {}: {error}; name the directory with --corpus",
@@ -146,7 +149,7 @@ impl Format {
             io::Error::new(error.kind(), what)
         })?;
         let mut paths = read.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>()?;
-        // The same seed means the same run, whatever order the system has.
+        // Sorted, so that the same seed gives the same run on every system.
         paths.sort();
         for path in paths {
             inputs.push(std::fs::read(path)?);
@@ -154,14 +157,15 @@ impl Format {
         Ok(inputs)
     }
 
-    /// What the other side of the format writes.
+    /// The built-in seed inputs: bytes produced by the writing side of the format.
     #[must_use]
     pub fn seeds(&self) -> Vec<Vec<u8>> {
         (self.seeds)()
     }
 }
 
-/// A hostile peer in shared memory whose every act a script chooses, and when this side acts between them.
+/// A hostile peer in shared memory. A script chooses each of its actions, and the points at which this side
+/// runs.
 fn ring(script: &[u8]) -> bool {
     sinew_shm::hostile::play(script).writes > 0
 }

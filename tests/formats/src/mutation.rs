@@ -1,13 +1,13 @@
-//! Known inputs changed by chance: what a driver without a fuzzer plays. All chance comes from the caller.
+//! Random mutation of known inputs, for a driver without a fuzzer. The caller supplies the random generator.
 
 use fastrand::Rng;
 
-/// Longest input, in bytes: some frames, and a header of each.
+/// Maximum length of an input, in bytes: some frames, each with a header.
 const LENGTH_MAX: usize = 4_096;
-/// Changes of one input at most.
+/// Maximum number of changes to one input.
 const CHANGES_MAX: usize = 8;
 
-/// One of `inputs` with some changes, perhaps with a part of another one.
+/// Returns one of `inputs` with some changes, possibly spliced with a part of another one.
 #[must_use]
 pub fn mutate(random: &mut Rng, inputs: &[Vec<u8>]) -> Vec<u8> {
     let any = |random: &mut Rng| random.choice(inputs).cloned().unwrap_or_default();
@@ -25,7 +25,7 @@ pub fn mutate(random: &mut Rng, inputs: &[Vec<u8>]) -> Vec<u8> {
             }
             6 => bytes.truncate(at),
             7 => {
-                // A number at one of the ends of its range, of any width.
+                // A number near the minimum or maximum of its type, of any width.
                 let width = 1 << random.u32(0..=3);
                 let number =
                     *random.choice(&[0, 1, u64::MAX, u64::MAX >> 1, 1 << 31, 1 << 16, 1 << 13]).unwrap_or(&0);
@@ -61,7 +61,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_same_chance_makes_the_same_inputs_of_bounded_length() {
+    fn same_seed_gives_same_inputs_of_bounded_length() {
         let inputs = [vec![0; 10], vec![7; LENGTH_MAX], Vec::new()];
         let of = |seed| {
             let mut random = Rng::with_seed(seed);

@@ -1,15 +1,16 @@
-//! Every input that is kept, and some changes of each.
+//! Replays every input of the corpus, and some mutations of each.
 
 use std::path::Path;
 
 use sinew_formats::{FORMATS, Format, mutate};
 
 const CORPUS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../fuzz/corpus");
-/// Changed inputs of each format: enough to see that the driver works. `sweep` plays more, and the fuzzer most.
+/// Number of mutated inputs per format: enough to show that the driver works. `sweep` runs more, the fuzzer
+/// most.
 const CHANGED: usize = 2_000;
 
 #[test]
-fn every_input_that_is_kept_is_played_and_what_the_other_side_writes_is_understood() {
+fn corpus_is_replayed_and_seeds_are_understood() {
     for format in FORMATS {
         let inputs = format.inputs(Path::new(CORPUS)).expect("the source tree can be read");
         let mut understood = 0;
@@ -34,7 +35,7 @@ fn every_input_that_is_kept_is_played_and_what_the_other_side_writes_is_understo
 }
 
 #[test]
-fn changed_inputs_break_no_promise() {
+fn mutated_inputs_break_no_invariant() {
     for format in FORMATS {
         let inputs = format.inputs(Path::new(CORPUS)).expect("the source tree can be read");
         let mut random = fastrand::Rng::with_seed(1);
@@ -45,7 +46,7 @@ fn changed_inputs_break_no_promise() {
 }
 
 #[test]
-fn every_format_has_a_target_for_the_fuzzer() {
+fn every_format_has_a_fuzz_target() {
     let fuzz = Path::new(CORPUS).parent().expect("it is a directory of `fuzz`").to_owned();
     let manifest = std::fs::read_to_string(fuzz.join("Cargo.toml")).expect("the source tree can be read");
     for Format { name, .. } in FORMATS {

@@ -1,8 +1,10 @@
-//! The role of the one that is attacked instead of the node: what a machine's CPUs and its kernel give to an attack, whoever is attacked.
+//! The role of the process that is attacked instead of the node. It shows how much of a machine's CPU and
+//! kernel time an attack takes from any victim.
 //!
-//! It is in the node's place, a process of the same host, and does no more than nobody can do without who has a port in a network: takes
-//! connections at the node's pace, begins TLS with who begins it, closes the oldest one beyond as many as a node lets wait, and throws
-//! away what it reads. As in a node, a thread takes connections and a nicer one has the rest.
+//! It runs in the node's place, on the same host, and does only the minimum that any process with an open
+//! port must do: it accepts connections at the node's pace and answers TLS handshakes. It closes the oldest
+//! connection above the node's limit, and discards the data that it reads. As in a node, one thread accepts
+//! connections, and a thread with lower priority does the rest.
 
 use std::{
     collections::VecDeque,
@@ -29,15 +31,23 @@ use tokio::{
 };
 use tokio_util::task::AbortOnDropHandle;
 
-use super::keys::{self, Who};
+use super::keys::{self, TestNode};
 
-/// Where it takes connections and datagrams.
+/// The ports for connections and datagrams.
 pub(super) const CONNECTIONS_PORT: u16 = 7_710;
 pub(super) const DATAGRAMS_PORT: u16 = 7_711;
 
-/// As a node's, whose pace its attackers are to have here, too: connections that wait in the kernel, that are taken without a pause, the pause,
-/// in which one is saved up, those that are saved up at most, those that may be open, time for a handshake, how much nicer the thread of handshakes
-/// is, datagrams that are none of the project's and are read without a pause in the long run, and that pause.
+/// The limits of a node, so that its attackers have the same pace here. In this order:
+///
+/// - the listen backlog
+/// - connections accepted in a burst
+/// - the pause after a burst, in which one more is saved up
+/// - the maximum that can be saved up
+/// - the maximum number of open connections
+/// - the handshake timeout
+/// - the priority decrease of the handshake thread
+/// - the sustained number of foreign datagrams read without a pause
+/// - the pause after these
 const BACKLOG: i32 = 1_024;
 const AT_ONCE_MAX: u32 = 4;
 const REST: Duration = Duration::from_millis(1);
@@ -48,63 +58,64 @@ const NICER: i32 = 5;
 const DATAGRAMS_AT_ONCE: u32 = 16;
 const DATAGRAMS_REST: Duration = Duration::from_millis(1);
 
-/// Bytes that are read at once.
+/// Maximum length of one read, in bytes.
 const READ_LEN: usize = 16 << 10;
-/// The first byte of a connection by TLS.
+/// The first byte of a TLS connection.
 const HANDSHAKE_RECORD: u8 = 0x16;
 
-/// `NAME KEYS GROUP`: that of the node in whose place it is, its keys, and the group that it hears. Says `up` when it can be attacked, and
-/// ends when it is told no more.
-pub(super) fn play(arguments: &[String]) {
+/// `NAME KEYS GROUP`: the name of the node that it replaces, its keys, and its multicast group. Prints `up`
+/// when it can be attacked, and exits when its standard input closes.
+pub(super) fn run(arguments: &[String]) {
     let [name, keys, group] = arguments else { panic!("a name, keys, and a group, not {arguments:?}") };
-    let who = [keys::HIP, keys::KNEE].into_iter().find(|who| who.name == name).expect("a node of the robot");
-    let group: Ipv4Addr = group.parse().expect("the director's group");
-    let (tls, listener, datagrams) = (server(who, Path::new(keys)), listen(who), datagrams_to(who, group));
+    let node =
+        [keys::HIP, keys::KNEE].into_iter().find(|node| node.name == name).expect("a node of the robot");
+    let group: Ipv4Addr = group.parse().expect("the scenario's group");
+    let (tls, listener, datagrams) = (server(node, Path::new(keys)), listen(node), datagrams_to(node, group));
     let reactor = || Builder::new_current_thread().enable_all().build().expect("a reactor");
     let (takes, shakes) = (reactor(), reactor());
     let handshakes = shakes.handle().clone();
     thread::spawn(move || {
-        give_way();
+        lower_priority();
         shakes.block_on(std::future::pending::<()>());
     });
     thread::spawn(move || takes.block_on(take(listener, Handshakes { tls, runtime: handshakes })));
     thread::spawn(move || swallow(&datagrams));
     println!("up");
-    // Nothing is said to it but that it is over.
+    // Only the end of the input is significant.
     io::stdin().lines().map_while(Result::ok).for_each(drop);
 }
 
-/// As nice as a node's thread of handshakes.
-fn give_way() {
+/// Lowers the priority as a node does for its handshake thread.
+fn lower_priority() {
     if let Ok(nice) = getpriority_process(None) {
-        // It goes on as it is where the system refuses it.
+        // If the system refuses, the priority stays as it is.
         let _ = setpriority_process(None, nice + NICER);
     }
 }
 
-fn server(who: Who, keys: &Path) -> Arc<ServerConfig> {
-    let credentials = Credentials::load(keys, &who.identity(), TimePolicy::default(), UnixTime::now());
+fn server(node: TestNode, keys: &Path) -> Arc<ServerConfig> {
+    let credentials = Credentials::load(keys, &node.identity(), TimePolicy::default(), UnixTime::now());
     let tls = Tls::new(&credentials.expect("keys that were just made"), Arc::new(DefaultTimeProvider));
     tls.expect("a key that rustls takes").server()
 }
 
-fn listen(who: Who) -> std::net::TcpListener {
+fn listen(node: TestNode) -> std::net::TcpListener {
     let socket = Socket::new(Domain::IPV4, Type::STREAM.nonblocking().cloexec(), None).expect("a socket");
     socket.set_reuse_address(true).expect("a socket");
     socket
-        .bind(&SocketAddr::from((who.address(), CONNECTIONS_PORT)).into())
+        .bind(&SocketAddr::from((node.address(), CONNECTIONS_PORT)).into())
         .expect("a port of the host's own");
     socket.listen(BACKLOG).expect("a port that was bound");
     socket.into()
 }
 
-fn datagrams_to(who: Who, group: Ipv4Addr) -> UdpSocket {
+fn datagrams_to(node: TestNode, group: Ipv4Addr) -> UdpSocket {
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, DATAGRAMS_PORT)).expect("a port of the host's own");
-    socket.join_multicast_v4(&group, &who.address()).expect("the host's own interface");
+    socket.join_multicast_v4(&group, &node.address()).expect("the host's own interface");
     socket
 }
 
-/// What is done on the nicer thread.
+/// The state of a connection on the low-priority thread.
 #[derive(Clone)]
 struct Handshakes {
     tls: Arc<ServerConfig>,
@@ -119,7 +130,7 @@ async fn take(listener: std::net::TcpListener, handshakes: Handshakes) {
         let accepted = listener.accept().await;
         pace.took_one();
         let Ok((socket, _)) = accepted else {
-            // Whoever came has gone, or there are no descriptors left.
+            // The peer has disconnected, or no file descriptors are left.
             sleep(REST).await;
             continue;
         };
@@ -129,13 +140,13 @@ async fn take(listener: std::net::TcpListener, handshakes: Handshakes) {
         }
         let handshakes = handshakes.clone();
         open.push_back(AbortOnDropHandle::new(tokio::spawn(async move {
-            // However it ends, that is the attacker's business.
-            let _ = hear(socket, handshakes).await;
+            // The result concerns only the attacker.
+            let _ = receive(socket, handshakes).await;
         })));
     }
 }
 
-/// How fast connections are taken.
+/// The pace at which connections are accepted.
 struct Pace {
     saved: u32,
     as_of: Instant,
@@ -149,7 +160,7 @@ impl Pace {
         Self { saved: SAVED_MAX, as_of: now, at_once: 0, last: now }
     }
 
-    /// Returns when the next one may be taken.
+    /// Returns when the next connection may be accepted.
     async fn keep(&mut self) {
         loop {
             self.pass_time();
@@ -180,8 +191,8 @@ impl Pace {
     }
 }
 
-/// Reads until the other end has enough of it, or the time for a handshake is over.
-async fn hear(mut socket: TcpStream, handshakes: Handshakes) -> io::Result<()> {
+/// Reads until the peer disconnects or the handshake timeout expires.
+async fn receive(mut socket: TcpStream, handshakes: Handshakes) -> io::Result<()> {
     let mut first = [0];
     let came = timeout(HANDSHAKE, socket.peek(&mut first)).await??;
     if came > 0 && first == [HANDSHAKE_RECORD] {
@@ -197,7 +208,7 @@ async fn hear(mut socket: TcpStream, handshakes: Handshakes) -> io::Result<()> {
     timeout(HANDSHAKE, all).await?
 }
 
-/// Goes on without end with whom it has shaken hands.
+/// Completes the handshake, then keeps reading without a limit.
 async fn shake(mut socket: TcpStream, tls: Arc<ServerConfig>) -> io::Result<()> {
     let (mut tls, mut buffer) = (ServerConnection::new(tls).map_err(io::Error::other)?, vec![0; READ_LEN]);
     let shake = async {
@@ -212,8 +223,8 @@ async fn shake(mut socket: TcpStream, tls: Arc<ServerConfig>) -> io::Result<()> 
     }
 }
 
-/// What came next is taken, answered as TLS wants it, and thrown away. Like a node's thread of handshakes, this one goes on if nobody else
-/// wants to.
+/// Reads the next bytes, answers them as TLS requires, and discards the content. Like a node's handshake
+/// thread, it yields to other threads afterwards.
 async fn step(socket: &mut TcpStream, tls: &mut ServerConnection, buffer: &mut [u8]) -> io::Result<()> {
     let count = socket.read(buffer).await?;
     if count == 0 {
@@ -223,8 +234,8 @@ async fn step(socket: &mut TcpStream, tls: &mut ServerConnection, buffer: &mut [
     while !bytes.is_empty() && fault.is_none() {
         tls.read_tls(&mut bytes)?;
         fault = tls.process_new_packets().err();
-        let mut said = [0; 4_096];
-        while tls.reader().read(&mut said).is_ok_and(|count| count > 0) {}
+        let mut plaintext = [0; 4_096];
+        while tls.reader().read(&mut plaintext).is_ok_and(|count| count > 0) {}
     }
     let mut answer = Vec::new();
     while tls.wants_write() {
@@ -235,12 +246,12 @@ async fn step(socket: &mut TcpStream, tls: &mut ServerConnection, buffer: &mut [
     fault.map_or(Ok(()), |fault| Err(io::Error::other(fault)))
 }
 
-/// Reads datagrams, and rests as a node's thread of discovery does.
+/// Reads datagrams, and pauses as a node's discovery thread does.
 fn swallow(datagrams: &UdpSocket) {
     let mut buffer = [0; 2_048];
     loop {
         for _ in 0..DATAGRAMS_AT_ONCE {
-            // What the network has to say of an earlier one is nothing to it.
+            // An error about an earlier datagram is ignored.
             let _ = datagrams.recv(&mut buffer);
         }
         thread::sleep(DATAGRAMS_REST);

@@ -1,4 +1,5 @@
-//! Keys of the robot that is attacked, as `sinew keys` makes them, and of a project of the same name whose authority is another one.
+//! Keys of the attacked robot, as `sinew keys` makes them, and keys of a project with the same name but
+//! another authority.
 
 use std::{
     fs, io,
@@ -15,30 +16,30 @@ use sinew::{
     },
 };
 
-use super::stranger::Client;
-use crate::{OwnDirectory, keys::put};
+use super::raw_peer::Client;
+use sinew_testkit::{TestDirectory, keys::put};
 
 /// The project of the robot.
 pub(super) const PROJECT: &str = "attacked";
-/// A node of the robot, whose keys were stolen or are carried by somebody whom nobody knows yet.
-pub(super) const SPARE: Who = Who { name: "spare", host: 9 };
-/// One whose certificate was revoked.
-pub(super) const REVOKED: Who = Who { name: "revoked", host: 10 };
-/// Those of the robot itself.
-pub(super) const HIP: Who = Who { name: "hip", host: 1 };
-pub(super) const KNEE: Who = Who { name: "knee", host: 2 };
-pub(super) const ANKLE: Who = Who { name: "ankle", host: 4 };
-/// One of the other authority, on the attacker's host.
-pub(super) const MALLORY: Who = Who { name: "mallory", host: 3 };
+/// A node of the robot with stolen keys, or with the keys of a peer that the other nodes do not know yet.
+pub(super) const SPARE: TestNode = TestNode { name: "spare", host: 9 };
+/// A node with a revoked certificate.
+pub(super) const REVOKED: TestNode = TestNode { name: "revoked", host: 10 };
+/// The nodes of the robot itself.
+pub(super) const HIP: TestNode = TestNode { name: "hip", host: 1 };
+pub(super) const KNEE: TestNode = TestNode { name: "knee", host: 2 };
+pub(super) const ANKLE: TestNode = TestNode { name: "ankle", host: 4 };
+/// A node of the other authority, on the attacker's host.
+pub(super) const MALLORY: TestNode = TestNode { name: "mallory", host: 3 };
 
 /// A node's name, and the last byte of its address.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Who {
+pub(super) struct TestNode {
     pub(super) name: &'static str,
     pub(super) host: u8,
 }
 
-impl Who {
+impl TestNode {
     pub(super) const fn address(self) -> Ipv4Addr {
         Ipv4Addr::new(10, 77, 0, self.host)
     }
@@ -52,9 +53,9 @@ impl Who {
     }
 }
 
-/// All keys of one robot. They go with it.
+/// All keys of one robot. The files are removed on drop.
 pub(super) struct Keys {
-    directory: OwnDirectory,
+    directory: TestDirectory,
 }
 
 impl Keys {
@@ -63,53 +64,53 @@ impl Keys {
     }
 
     fn try_make() -> io::Result<Self> {
-        let keys = Self { directory: OwnDirectory::new() };
+        let keys = Self { directory: TestDirectory::new() };
         make(&keys.directory.join("ours"), &[HIP, KNEE, ANKLE, SPARE, REVOKED])?;
         make(&keys.directory.join("others"), &[MALLORY, HIP])?;
         let revoked = Certificate::from_file(&keys.of(REVOKED).join(files::NODE_CERTIFICATE))
             .map_err(io::Error::other)?;
-        for who in [HIP, KNEE, ANKLE] {
-            put(&keys.of(who), files::DENIED, 0o644, &format!("{}\n", revoked.serial()))?;
+        for node in [HIP, KNEE, ANKLE] {
+            put(&keys.of(node), files::DENIED, 0o644, &format!("{}\n", revoked.serial()))?;
         }
         Ok(keys)
     }
 
-    /// A directory of the scene's own.
+    /// A path in the directory of this scene.
     pub(super) fn path(&self, name: &str) -> PathBuf {
         self.directory.join(name)
     }
 
-    /// The directory of a node of the robot's.
-    pub(super) fn of(&self, who: Who) -> PathBuf {
-        self.directory.join(&format!("ours/{}", who.name))
+    /// The key directory of a node of the robot.
+    pub(super) fn of(&self, node: TestNode) -> PathBuf {
+        self.directory.join(&format!("ours/{}", node.name))
     }
 
-    /// The directory of a node of the other authority's.
-    pub(super) fn of_others(&self, who: Who) -> PathBuf {
-        self.directory.join(&format!("others/{}", who.name))
+    /// The key directory of a node of the other authority.
+    pub(super) fn of_others(&self, node: TestNode) -> PathBuf {
+        self.directory.join(&format!("others/{}", node.name))
     }
 
-    /// A client that shows this certificate, and takes any server.
-    pub(super) fn tls(&self, who: Who) -> Arc<Client> {
-        client(&self.of(who))
+    /// A TLS client that presents this certificate and accepts any server.
+    pub(super) fn tls(&self, node: TestNode) -> Arc<Client> {
+        client(&self.of(node))
     }
 
-    /// The same of the other authority's.
-    pub(super) fn tls_of_others(&self, who: Who) -> Arc<Client> {
-        client(&self.of_others(who))
+    /// The same with a certificate of the other authority.
+    pub(super) fn tls_of_others(&self, node: TestNode) -> Arc<Client> {
+        client(&self.of_others(node))
     }
 }
 
 fn client(directory: &Path) -> Arc<Client> {
     let certificate =
         Certificate::from_file(&directory.join(files::NODE_CERTIFICATE)).expect("it was just made");
-    let key = fs::read(directory.join(crate::keys::NODE_KEY_DER)).expect("it was just made");
+    let key = fs::read(directory.join(sinew_testkit::keys::NODE_KEY_DER)).expect("it was just made");
     let key = PrivateKeyDer::from(PrivatePkcs8KeyDer::from(key));
     let chain: Vec<CertificateDer<'static>> = vec![certificate.der().clone()];
-    super::stranger::client(Some((chain, key)))
+    super::raw_peer::client(Some((chain, key)))
 }
 
-fn make(directory: &Path, nodes: &[Who]) -> io::Result<()> {
-    let identities: Vec<Identity> = nodes.iter().map(|who| who.identity()).collect();
-    crate::keys::make(directory, &identities)
+fn make(directory: &Path, nodes: &[TestNode]) -> io::Result<()> {
+    let identities: Vec<Identity> = nodes.iter().map(|node| node.identity()).collect();
+    sinew_testkit::keys::make(directory, &identities)
 }

@@ -1,11 +1,12 @@
-//! The role of each node of the robot: an application that answers, one that looks who is there, and one that asks.
+//! The role of each node of the robot: one application answers requests, one tracks the membership, and one
+//! sends requests.
 
 use std::{
     collections::BTreeMap,
     fmt,
     io::BufRead,
     sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
+        Arc, Mutex,
         atomic::{AtomicBool, Ordering},
     },
     time::{Duration, Instant},
@@ -16,34 +17,36 @@ use sinew::{
     message::{Reply, Sender},
     prelude::*,
 };
+use sinew_runtime::lock;
 
 use super::together;
-use crate::{
+use sinew_testkit::report::Times;
+use sinew_testkit::scripted::reactor;
+use sinew_testkit::{
     DEADLINE,
-    load::Times,
-    puppet::{Order, desk},
+    scripted::{Order, sender_app},
     until,
 };
 
 /// The name of the application that answers.
 pub(super) const ECHO: &str = "echo";
-/// Questions that may wait for their answers at once: one that takes long holds up none, as in a control loop, and a stall of the machine is
-/// no queue that lasts for many times as long.
+/// Maximum number of unanswered requests. A slow answer does not delay the next request, as in a control
+/// loop. The bound keeps a stall of the machine from building up a queue that lasts many times as long.
 const OPEN_MAX: usize = 64;
-/// Time between the moments at which two questions are due.
+/// Time between the due times of two requests.
 const PACE: Duration = Duration::from_millis(1);
 
-/// How long another answer may take when the attack is over, on a machine that is shared.
+/// Maximum wait for an answer after the attack, on a shared machine.
 const AGAIN: Duration = Duration::from_secs(30);
 
-/// All by the last byte of a node's address.
+/// Counters, each by the last byte of a node's address.
 #[derive(Default)]
 struct Counts {
-    /// How often it was lost.
+    /// Number of times that the node was lost.
     lost: BTreeMap<u8, u64>,
-    /// How often it was found.
+    /// Number of times that the node was found.
     found: BTreeMap<u8, u64>,
-    /// Messages that nobody asks with, which say that they are from there: nobody of the robot sends any.
+    /// Messages with this source that are not requests. No node of the robot sends any.
     sent: BTreeMap<u8, u64>,
 }
 
@@ -56,35 +59,36 @@ impl Echo {
     }
 }
 
-/// What was measured since the last time that somebody asked for it.
+/// Measurements since the last query.
 ///
-/// A question is due each [`PACE`], whether the one before has its answer or not, and its answer is timed from then on: what waits behind a
-/// silence has waited, too.
+/// A request is due each [`PACE`], even if the previous one has no answer yet. Its latency counts from its
+/// due time, so that requests delayed by a stall include the wait.
 struct Measured {
     since: Instant,
-    /// In the window that began then.
+    /// The window that started at `since`.
     window: Window,
-    /// When the oldest question was due that has no answer yet.
+    /// Due time of the oldest unanswered request.
     due: Instant,
-    /// Answers in all.
+    /// Total number of answers.
     answers: u64,
 }
 
-/// What was measured in a window, or in several.
+/// The measurements of one or several windows.
 #[derive(Default)]
 struct Window {
     times: Times,
     count: u64,
     failed: u64,
-    /// Questions that were asked more than a pace after they were due, because who asks had no CPU, or [`OPEN_MAX`] had no answer.
+    /// Requests sent more than one pace after their due time, because the sender had no CPU or [`OPEN_MAX`]
+    /// requests were unanswered.
     late: u64,
-    /// Questions that were due and had no answer at the end.
+    /// Requests that were due but unanswered at the end.
     waiting: u64,
     lasted: Duration,
 }
 
 impl Window {
-    /// What was measured in another one is measured in this one, too.
+    /// Adds the measurements of another window.
     fn add(&mut self, other: Self) {
         let Self { times, count, failed, late, waiting, lasted } = other;
         self.times.add(times);
@@ -110,13 +114,13 @@ impl Measured {
         Self { since: now, window: Window::default(), due: now, answers: 0 }
     }
 
-    /// The question that was `due` then has been asked.
+    /// Records that the request due at `due` was sent.
     fn asked(&mut self, due: Instant, now: Instant) {
         self.window.late += u64::from(now.saturating_duration_since(due) > PACE);
     }
 
-    /// The oldest one, which was `due` then, has its answer, or will never have one. An answer to one of before this window counted there, as
-    /// one that waits.
+    /// Records that the oldest request, due at `due`, was answered or failed. A request due before this
+    /// window already counted as unanswered in the previous one, so its answer is not counted again.
     fn ended(&mut self, due: Instant, now: Instant, is_answered: bool) {
         self.answers += u64::from(is_answered);
         self.window.failed += u64::from(!is_answered);
@@ -127,8 +131,8 @@ impl Measured {
         self.due = (due + PACE).max(self.since);
     }
 
-    /// Ends the window, and begins the next one. Questions that were due and have no answer count with the time that they have waited: else
-    /// silence would look like no traffic at all.
+    /// Ends the window and starts the next one. Due but unanswered requests count with their waiting time so
+    /// far. Otherwise a stall would look like no traffic.
     fn window(&mut self, now: Instant) -> Window {
         let mut window = std::mem::take(&mut self.window);
         let mut due = self.due;
@@ -163,18 +167,27 @@ impl Handler<Delivery<NodeEvent>> for Echo {
         match &event.payload {
             NodeEvent::NodeFound { node, .. } => self.note(|counts| &mut counts.found, *node),
             NodeEvent::NodeLost { node, .. } => self.note(|counts| &mut counts.lost, *node),
-            // Neither comes nor goes.
+            // Not a change of the membership.
             NodeEvent::AppStalled { .. } | NodeEvent::AppResumed { .. } | NodeEvent::NodeRestarted { .. } => {
             }
         }
     }
 }
 
-/// `CONFIGURATION [asks | tries]`: says `up` when all runs; one that tries to get in says `runs` then, and `up` if it has got in. `window
-/// NAME`: what was measured since the last one, with all that was called so before; `again`: whether questions are answered from now on; `seen`: who was lost, who was found, and what came unasked; `refused`: what the node refused, for each cause; `tid`: that of
-/// the application that answers. What it does with another one is told in words of [`together::Part::answer`].
-pub(super) fn play(arguments: &[String]) {
-    let config = NodeConfig::from_file(&arguments[0]).expect("the director's configuration");
+/// `CONFIGURATION [asks | tries]`: prints `up` when everything runs. An intruder prints `runs` then, and `up`
+/// once it has joined.
+///
+/// Commands on standard input:
+///
+/// - `window NAME`: measurements since the last window, added to all earlier windows of this name
+/// - `again`: whether requests are answered from now on
+/// - `seen`: nodes that were lost, nodes that were found, and unrequested messages
+/// - `refused`: refusals of the node, by cause
+/// - `tid`: the TID of the application that answers
+///
+/// The commands for joint work with the other node are those of [`together::Part::answer`].
+pub(super) fn run(arguments: &[String]) {
+    let config = NodeConfig::from_file(&arguments[0]).expect("the scenario's configuration");
     let tries = arguments.get(1).is_some_and(|what| what == "tries");
     let asks = tries || arguments.get(1).is_some_and(|what| what == "asks");
     let counts: Arc<Mutex<Counts>> = Arc::default();
@@ -184,9 +197,9 @@ pub(super) fn play(arguments: &[String]) {
         .handles::<Order>()
         .handles::<NodeEvent>()
         .own_thread();
-    let (asker, key) = desk("asker");
+    let (requester, key) = sender_app("requester");
     let (party, mut part) = together::part_of(&config.name);
-    let builder = Node::builder(config.name.clone()).config(config).app(echo).app(asker).app(party);
+    let builder = Node::builder(config.name.clone()).config(config).app(echo).app(requester).app(party);
     let node = builder.start().expect("a node");
     node.handle().wait_until_running(DEADLINE).expect("it requires nothing");
     if tries {
@@ -201,7 +214,7 @@ pub(super) fn play(arguments: &[String]) {
         std::thread::spawn(move || question(&sender, &over, &measured))
     });
     if asks {
-        // It is up when it has an answer.
+        // It is up once it has an answer.
         until("the first answer", || (lock(&measured).answers > 0).then_some(()));
     }
     println!("up");
@@ -229,9 +242,9 @@ pub(super) fn play(arguments: &[String]) {
             "tid" => println!("{}", echo.bits()),
             _ => {
                 let name = line.strip_prefix("window ");
-                let name = name.unwrap_or_else(|| panic!("{line:?} is nothing that a node is told"));
+                let name = name.unwrap_or_else(|| panic!("{line:?} is no command of a node"));
                 let all = windows.entry(name.to_owned()).or_default();
-                // Whoever asks waits for no reckoning.
+                // Printed after the lock is released, so that the requesting threads do not wait.
                 let window = lock(&measured).window(Instant::now());
                 all.add(window);
                 println!("{all}");
@@ -243,11 +256,7 @@ pub(super) fn play(arguments: &[String]) {
     node.stop();
 }
 
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// Waits for the answer to a question that is asked from now on: the first one that comes may be to an older one.
+/// Waits for the answer to a request sent after this call: the first answer may belong to an older request.
 fn is_answered(measured: &Mutex<Measured>) -> bool {
     let (before, deadline) = (lock(measured).answers, Instant::now() + AGAIN);
     while lock(measured).answers < before + 2 {
@@ -259,14 +268,13 @@ fn is_answered(measured: &Mutex<Measured>) -> bool {
     true
 }
 
-/// Asks when a question is due, whether those before have their answers or not; another thread takes these, which come in the order of the
-/// questions.
+/// Sends each request at its due time, even if earlier ones are unanswered. Another thread awaits the
+/// answers, which arrive in the order of the requests.
 fn question(sender: &Sender, over: &AtomicBool, measured: &Mutex<Measured>) {
     let (put, taken) = std::sync::mpsc::sync_channel::<(u64, Instant, Option<Reply<Order>>)>(OPEN_MAX);
     std::thread::scope(|threads| {
         threads.spawn(|| {
-            let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build();
-            let runtime = runtime.expect("a reactor with nothing but a timer");
+            let runtime = reactor();
             for (number, due, asked) in taken {
                 let answer = asked.and_then(|asked| runtime.block_on(asked).ok());
                 assert!(
@@ -300,8 +308,8 @@ mod tests {
     }
 
     #[test]
-    fn what_waits_behind_a_silence_is_late_and_as_slow_as_it_was_for_who_waited() {
-        // Given: 100 questions, each answered in 100 us, but for the tenth, which takes 50 ms
+    fn requests_delayed_by_a_stall_count_their_waiting_time() {
+        // Given: 100 requests, each answered in 100 us, except for the tenth, which takes 50 ms
         let (begin, quick) = (Instant::now(), Duration::from_micros(100));
         let mut measured = Measured::new(begin);
         let mut now = begin;
@@ -312,7 +320,7 @@ mod tests {
             now += if number == 9 { Duration::from_millis(50) } else { quick };
             measured.ended(due, now, true);
         }
-        // Then: half of those that it held up waited for 25 ms and more, not one of a hundred
+        // Then: half of the delayed requests waited for at least 25 ms, not just one in a hundred
         let seen = window(&mut measured, now);
         let [count, failed, late, waiting, _, p99, max, _] = seen[..] else { panic!("{seen:?}") };
         assert_eq!((count, failed, waiting), (100, 0, 0));
@@ -322,11 +330,11 @@ mod tests {
     }
 
     #[test]
-    fn a_silence_that_does_not_end_is_all_that_is_due_in_it_and_the_next_window_begins_anew() {
+    fn unanswered_requests_count_in_one_window_only() {
         let begin = Instant::now();
         let mut measured = Measured::new(begin);
         measured.asked(begin, begin);
-        // When: nothing comes for 20 ms, and the answer 5 ms later
+        // When: no answer arrives for 20 ms, and the first one arrives 5 ms later
         let seen = window(&mut measured, begin + PACE * 20);
         measured.ended(begin, begin + PACE * 25, true);
         // Then
@@ -336,14 +344,14 @@ mod tests {
         measured.asked(begin + PACE * 20, begin + PACE * 25);
         measured.ended(begin + PACE * 20, begin + PACE * 25, false);
         let seen = window(&mut measured, begin + PACE * 26);
-        // One that was asked late and failed, and five that have no answer.
+        // One request was sent late and failed, and five are unanswered.
         assert_eq!(seen[..4], [0, 1, 1, 5]);
     }
 
     #[test]
-    fn windows_of_one_name_are_one_whose_percentiles_are_those_of_all_their_answers() {
+    fn merged_windows_have_percentiles_over_all_answers() {
         let (begin, mut all) = (Instant::now(), Window::default());
-        // Given: three windows of 100 answers each, of which the second alone has slow ones
+        // Given: three windows of 100 answers each, where only the second one has slow answers
         for (at, slow) in [(0, 0), (1_000, 4), (2_000, 0)] {
             let mut measured = Measured::new(begin + PACE * at);
             for number in 0..100 {
@@ -354,7 +362,7 @@ mod tests {
             let window = measured.window(measured.due);
             all.add(window);
         }
-        // Then: 4 of 300 are slow, so one of a hundred is
+        // Then: 4 of 300 answers are slow, so the 99th percentile is slow
         let numbers: Vec<u128> = all.to_string().split(' ').map(|word| word.parse().unwrap()).collect();
         let quick = (PACE / 10).as_nanos();
         assert_eq!(numbers[..4], [300, 0, 0, 0]);

@@ -1,4 +1,4 @@
-//! What was seen, as a table and as JSON.
+//! Results as a table and as JSON.
 
 use std::{collections::BTreeMap, fmt, time::Duration};
 
@@ -12,78 +12,78 @@ use super::{
     rounds::{Attacked, Rounds},
 };
 
-/// What came of all attacks.
+/// The results of all attacks.
 #[derive(Debug)]
 pub struct Report {
-    /// One each.
+    /// One row per attack.
     pub rows: Vec<Row>,
-    /// How long live traffic was timed in each of its three states.
+    /// Measuring time of live traffic in each of its three states.
     pub timed: Duration,
-    /// In so many rounds.
+    /// Number of rounds.
     pub rounds: u32,
 }
 
-/// What came of one attack.
+/// The result of one attack.
 #[derive(Debug)]
 pub struct Row {
-    /// Its name.
+    /// Name of the attack.
     pub name: &'static str,
-    /// What was tried.
+    /// Description of the attack.
     pub tried: &'static str,
-    /// What happened.
+    /// Description of the outcome.
     pub happened: String,
-    /// Live traffic left alone, with the decoy attacked, and with the node attacked.
+    /// Live traffic without an attack, with the decoy attacked, and with the node attacked.
     pub rounds: Rounds,
-    /// And while it was looked who gets in.
+    /// Live traffic during the check for intrusions.
     pub lived: Window,
-    /// The most of the attacked node's memory above that before, in bytes.
+    /// Peak memory of the attacked node above its memory before, in bytes.
     pub growth: u64,
-    /// What must not be, apart from times: none of that if the node has held.
+    /// Violations other than slow answers; empty if the node has held.
     pub broken: Vec<String>,
 }
 
 impl Row {
     pub(super) fn of(attack: &Attack, outcome: Outcome) -> Self {
-        let mut said = vec![outcome.happened.what.clone()];
+        let mut summary = vec![outcome.happened.what.clone()];
         let Happened { broken, let_in, .. } = &outcome.happened;
         let mut broken = [&broken[..], let_in].concat();
         if let Some(came) = outcome.came {
-            said.push(format!("ankle talks after {} ms", came.as_millis()));
+            summary.push(format!("ankle talks after {} ms", came.as_millis()));
         }
         if let Some(Knocked { came_in, attempts, longest, never }) = &outcome.by_hand {
-            said.push(format!(
-                "{came_in} honest strangers came in by {attempts} attempts, the last of them after {} ms",
+            summary.push(format!(
+                "{came_in} honest peers came in by {attempts} attempts, the last of them after {} ms",
                 longest.as_millis()
             ));
-            broken.extend(never.iter().map(|why| format!("an honest stranger never came in: {why}")));
+            broken.extend(never.iter().map(|why| format!("an honest peer never came in: {why}")));
         }
         outcome.members(&mut broken);
-        outcome.messages(attack.own.host, &mut said, &mut broken);
+        outcome.messages(attack.own.host, &mut summary, &mut broken);
         outcome.service(&mut broken);
-        outcome.refusals(&mut said, &mut broken);
-        outcome.dials(attack.inside, &mut said, &mut broken);
+        outcome.refusals(&mut summary, &mut broken);
+        outcome.dials(attack.inside, &mut summary, &mut broken);
         let Outcome { rounds, lived, growth, .. } = outcome;
         if growth > GROWTH_MAX {
             broken.push(format!("memory grew by {} MiB", growth >> 20));
         }
-        let (name, tried, happened) = (attack.name, attack.tried, said.join("; "));
+        let (name, tried, happened) = (attack.name, attack.tried, summary.join("; "));
         Self { name, tried, happened, rounds, lived, growth, broken }
     }
 
-    /// How much longer 99 of 100 answers took with the node attacked, whatever they took left alone.
+    /// Ratio of the 99th percentile with the node attacked to that without an attack.
     #[must_use]
     pub fn ratio(&self) -> f64 {
         ratio(&self.rounds.node.window, &self.rounds.before)
     }
 
-    /// The same with the decoy attacked: that much is the machine's.
+    /// The same with the decoy attacked: this part is due to the machine.
     #[must_use]
     pub fn decoy_ratio(&self) -> Option<f64> {
         self.rounds.decoy.as_ref().map(|decoy| ratio(&decoy.window, &self.rounds.before))
     }
 
-    /// Of what 99 of 100 answers took longer with the node attacked, the share that they took longer with the decoy attacked: 0 to 1.
-    /// `None`: without a decoy, or where they took no longer.
+    /// Fraction of the slowdown at the 99th percentile that also occurs with the decoy attacked: 0 to 1.
+    /// `None` if there is no decoy or no slowdown.
     #[must_use]
     pub fn decoy_share(&self) -> Option<f64> {
         let Rounds { before, decoy, node, .. } = &self.rounds;
@@ -92,32 +92,34 @@ impl Row {
         (all > 0.0).then(|| (machine / all).clamp(0.0, 1.0))
     }
 
-    /// All that has to hold on every machine holds: nobody got in, nobody was lost, memory is bounded.
+    /// Returns whether the invariants that hold on every machine held: no intruder, no lost node, bounded
+    /// memory.
     #[must_use]
     pub const fn has_held(&self) -> bool {
         self.broken.is_empty()
     }
 
-    /// The machine was at rest where nobody was attacked: else times say nothing.
+    /// Returns whether the machine was idle without an attack; otherwise latencies are meaningless.
     #[must_use]
     pub fn was_at_rest(&self) -> bool {
         self.rounds.was_at_rest()
     }
 
-    /// The attacker came to do something in the rounds, to each: else times say nothing.
+    /// Returns whether the attacker was active in the rounds against each target; otherwise latencies are
+    /// meaningless.
     #[must_use]
     pub fn was_timed(&self) -> bool {
         let Rounds { decoy, node, .. } = &self.rounds;
         node.is_attack() && decoy.as_ref().is_none_or(Attacked::is_attack)
     }
 
-    /// Live traffic did not feel it, on a machine that would have shown it.
+    /// Returns whether live traffic was not slowed down, on a machine that would have shown a slowdown.
     #[must_use]
     pub fn is_unfelt(&self) -> bool {
         self.was_at_rest() && self.was_timed() && self.ratio() <= SLOWER_MAX
     }
 
-    /// In words, in one column.
+    /// The text of the verdict column.
     fn verdict(&self) -> String {
         match (self.has_held(), self.is_unfelt()) {
             (false, _) => "NO".to_owned(),
@@ -152,31 +154,32 @@ impl Row {
     }
 }
 
-/// What was seen of one attack.
+/// Observations of one attack.
 pub(super) struct Outcome {
-    /// By the attacker.
+    /// Observed by the attacker.
     pub(super) happened: Happened,
-    /// By the node that asks, in the rounds and while the whole of it took place.
+    /// Observed by the requesting node, in the rounds and during the full attack.
     pub(super) rounds: Rounds,
     pub(super) lived: Window,
-    /// A question that was asked afterwards has an answer.
+    /// Whether a request sent afterwards was answered.
     pub(super) answers_again: bool,
-    /// Of the attacked node's memory, in bytes.
+    /// Memory growth of the attacked node, in bytes.
     pub(super) growth: u64,
-    /// By the attacked node meanwhile.
+    /// Refusals by the attacked node meanwhile.
     pub(super) refused: Refused,
-    /// By both nodes.
+    /// Observed by both nodes.
     pub(super) seen: [Seen; 2],
-    /// The node that was started in the middle of it, after so long.
+    /// Time until the node started during the attack had joined.
     pub(super) came: Option<Duration>,
     pub(super) by_hand: Option<Knocked>,
-    /// Connections that both nodes have begun in the rounds and in the whole of it, and how long that took.
+    /// Connections that both nodes opened in the rounds and during the full attack, and the duration of both.
     pub(super) dials: [u64; 2],
     pub(super) dialled_for: Duration,
 }
 
 impl Outcome {
-    /// Who is of the robot is there; the one that is started in the middle of it comes once, and goes once.
+    /// Checks that the nodes of the robot stay members. The node started during the attack joins once and
+    /// leaves once.
     fn members(&self, broken: &mut Vec<String>) {
         let once = u64::from(self.came.is_some());
         for ((seen, name), peer) in self.seen.iter().zip(["hip", "knee"]).zip([keys::KNEE, keys::HIP]) {
@@ -194,8 +197,9 @@ impl Outcome {
         }
     }
 
-    /// Nobody speaks for others, and who speaks for himself is heard.
-    fn messages(&self, own: u8, said: &mut Vec<String>, broken: &mut Vec<String>) {
+    /// Checks that no message with a forged source was accepted, and that messages with the sender's own name
+    /// arrived.
+    fn messages(&self, own: u8, summary: &mut Vec<String>, broken: &mut Vec<String>) {
         for (seen, name) in self.seen.iter().zip(["hip", "knee"]) {
             let forged: u64 =
                 seen.sent.iter().filter(|(node, _)| **node != own).map(|(_, count)| count).sum();
@@ -206,15 +210,15 @@ impl Outcome {
         let (Happened { own_sent: sent, own_perhaps: perhaps, .. }, [_, knee]) = (&self.happened, &self.seen);
         let taken = knee.sent.get(&own).copied().unwrap_or_default();
         if taken > 0 {
-            said.push(format!("{taken} taken in the sender's own name"));
+            summary.push(format!("{taken} taken in the sender's own name"));
         }
-        // All but a tenth: what is under way when the link ends is nobody's promise.
+        // A tenth may be missing: messages in flight when the link ends have no guarantee.
         if sent + perhaps > 0 && (taken > sent + perhaps || taken < sent - sent / 10) {
             broken.push(format!("{taken} messages were taken in the sender's own name, of {sent}"));
         }
     }
 
-    /// Answers go on meanwhile, and afterwards.
+    /// Checks that requests were answered during and after the attack.
     fn service(&self, broken: &mut Vec<String>) {
         let Self { rounds: Rounds { before, decoy, node, .. }, lived, .. } = self;
         let attacked = [Some(lived), Some(&node.window), decoy.as_ref().map(|decoy| &decoy.window)];
@@ -232,15 +236,16 @@ impl Outcome {
         }
     }
 
-    /// Nobody has a node dial whom it would not: one that comes is dialled, and again as seldom as GNCL-8 says; and of a member that misses an
-    /// answer, as happens where a flood leaves it no CPU, the host is tried, once a period (NDL-4.6).
-    fn dials(&self, inside: bool, said: &mut Vec<String>, broken: &mut Vec<String>) {
+    /// Checks that the attack does not make a node dial excessively. A newcomer is dialled, and redialled no
+    /// more often than GNCL-8 allows. The host of a member that misses an answer (as under a flood that
+    /// leaves it no CPU) is tried once per period (NDL-4.6).
+    fn dials(&self, inside: bool, summary: &mut Vec<String>, broken: &mut Vec<String>) {
         let newcomers = u64::from(self.came.is_some());
         let of_newcomers = newcomers * (DIALS_OF_A_NEWCOMER + dials_again(self.lived.lasted));
         let most = of_newcomers + (1 + newcomers) * hosts_tried(self.dialled_for);
         let hosts = if inside { 1 } else { 2 };
         for (dials, name) in self.dials.iter().zip(["hip", "knee"]).take(hosts) {
-            said.push(format!("{name} dialled {dials} times"));
+            summary.push(format!("{name} dialled {dials} times"));
             if *dials > most {
                 broken.push(format!(
                     "{name} dialled {dials} times, and {most} is the most that it had reason to"
@@ -249,13 +254,13 @@ impl Outcome {
         }
     }
 
-    /// The attack reached the node: it counted what it refused.
-    fn refusals(&self, said: &mut Vec<String>, broken: &mut Vec<String>) {
+    /// Checks that the attack reached the node: it must have counted its refusals.
+    fn refusals(&self, summary: &mut Vec<String>, broken: &mut Vec<String>) {
         let counted = |cause: &str| self.refused.get(cause).copied().unwrap_or_default();
         let some = self.refused.iter().filter(|(_, count)| **count > 0);
         let words: Vec<_> = some.map(|(cause, count)| format!("'{cause}' {count}")).collect();
         if !words.is_empty() {
-            said.push(format!("knee counted {}", words.join(", ")));
+            summary.push(format!("knee counted {}", words.join(", ")));
         }
         for (cause, least) in &self.happened.refused {
             if counted(cause) < *least {
@@ -266,26 +271,27 @@ impl Outcome {
 }
 
 impl Report {
-    /// Every attack was held off.
+    /// Returns whether every attack was held off.
     #[must_use]
     pub fn has_held(&self) -> bool {
         self.rows.iter().all(Row::has_held)
     }
 
-    /// And live traffic felt none.
+    /// Returns whether no attack slowed down live traffic.
     #[must_use]
     pub fn is_unfelt(&self) -> bool {
         self.rows.iter().all(Row::is_unfelt)
     }
 
-    /// One object for each attack.
+    /// One JSON object per attack.
     #[must_use]
     pub fn json(&self) -> Value {
         self.rows.iter().map(Row::json).collect()
     }
 }
 
-/// How often a node dials one again within this time: after 10 ms, then twice that, up to 1 s, each a fifth less by chance (GNCL-8, by default).
+/// Maximum number of redials within this time. The backoff is 10 ms, doubled up to 1 s, with up to a fifth of
+/// random reduction (GNCL-8, defaults).
 fn dials_again(within: Duration) -> u64 {
     let (mut wait, mut all, mut dials) = (Duration::from_millis(10), Duration::ZERO, 0);
     loop {
@@ -298,12 +304,12 @@ fn dials_again(within: Duration) -> u64 {
     }
 }
 
-/// How often the host of one member is tried within this time at most.
+/// Maximum number of attempts to reach the host of one member within this time.
 fn hosts_tried(within: Duration) -> u64 {
     within.as_nanos().div_ceil(NDL_PERIOD.as_nanos()) as u64
 }
 
-/// How much longer 99 of 100 answers took.
+/// Ratio of the 99th percentiles.
 fn ratio(attacked: &Window, before: &Window) -> f64 {
     attacked.p99.as_secs_f64() / before.p99.as_secs_f64().max(f64::MIN_POSITIVE)
 }
@@ -312,7 +318,7 @@ fn us(time: Duration) -> String {
     format!("{} us", time.as_micros())
 }
 
-/// What was done in a second, in words.
+/// The rate of each action, as text.
 fn words(done: &BTreeMap<&'static str, f64>) -> String {
     let words: Vec<_> = done.iter().map(|(what, rate)| format!("{rate:.0} {what}")).collect();
     words.join(", ")
@@ -376,8 +382,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_node_has_no_reason_to_dial_more_often_than_its_waits_let_it() {
-        // 10, 20, 40 ... 640 ms are 1.27 s, and then one a second, all a fifth less.
+    fn allowed_redials_follow_the_backoff() {
+        // 10, 20, 40 ... 640 ms sum up to 1.27 s, then one per second, all reduced by a fifth.
         let [second, ten] = [1, 10].map(|seconds| dials_again(Duration::from_secs(seconds)));
         assert_eq!((dials_again(Duration::from_millis(7)), second, ten), (0, 6, 18));
     }
@@ -404,12 +410,12 @@ mod tests {
     }
 
     #[test]
-    fn an_attack_that_is_felt_says_how_much_of_it_the_decoy_shows() {
-        // Given: what took 500 us takes 2000, of which the decoy costs 900
+    fn slowdown_reports_the_share_of_the_decoy() {
+        // Given: answers that took 500 us take 2000 us, and the decoy accounts for 900 us of this
         let felt = row(500, Some(1_400), 2_000);
         assert_eq!((felt.ratio(), felt.decoy_ratio()), (4.0, Some(2.8)));
         assert_eq!(felt.verdict(), "yes, and felt: 60 % of it with the decoy, too");
-        // Then: it is felt, however much of it is the machine's
+        // Then: it counts as a slowdown, however much of it is due to the machine
         let machine = row(500, Some(2_500), 2_000);
         assert!(!machine.is_unfelt());
         assert_eq!(machine.verdict(), "yes, and felt: 100 % of it with the decoy, too");
@@ -420,7 +426,7 @@ mod tests {
     }
 
     #[test]
-    fn times_without_an_attack_or_without_one_on_the_decoy_say_nothing() {
+    fn idle_attacker_makes_latencies_untimed() {
         let mut none = row(500, Some(500), 500);
         none.rounds.node.done.clear();
         assert!(!none.is_unfelt());

@@ -1,4 +1,4 @@
-//! The nodes of a robot on their hosts, as the director sees them.
+//! The nodes of a robot on their hosts, as the scenario sees them.
 
 use std::{
     collections::BTreeMap,
@@ -7,89 +7,84 @@ use std::{
     os::unix::fs::PermissionsExt as _,
     path::{Path, PathBuf},
     process::Command,
-    sync::{
-        Mutex, MutexGuard, PoisonError,
-        mpsc::{Receiver, sync_channel},
-    },
+    sync::{Mutex, MutexGuard, PoisonError},
     time::Duration,
 };
 
 use sinew::{NodeAddress, Tid};
+use sinew_runtime::lock;
 
 use super::{
     Attack, decoy,
-    keys::{self, Keys, PROJECT, Who},
+    keys::{self, Keys, PROJECT, TestNode},
 };
 use crate::{
-    DEADLINE, Host,
-    clients::{
-        Held, Performer,
-        hostile::{GRANTED, GUEST, VISITORS},
-    },
-    own_group,
+    clients::hostile::{GRANTED, GUEST, VISITORS},
+    role,
 };
+use sinew_testkit::{Host, NodeProcess, Resources, numbers, own_group, sandbox::after_shell};
 
-/// Ports that the attacked nodes listen at: each has a host of its own.
+/// Ports of the attacked nodes; each node has its own host.
 const GNCL_PORT: u16 = 7_700;
 pub(super) const NDL_PORT: u16 = 7_701;
-/// How often they ask each other whether they are there.
+/// Period of the liveliness requests between them.
 pub(super) const NDL_PERIOD: Duration = Duration::from_millis(100);
 
-/// How long answers took.
+/// Latencies of answers.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Window {
-    /// Answers.
+    /// Number of answers.
     pub count: u64,
-    /// Questions without one.
+    /// Requests that failed.
     pub failed: u64,
-    /// Questions that were asked late, because the one before had no answer.
+    /// Requests that were sent late, because the previous one had no answer.
     pub late: u64,
-    /// Questions that were due and had no answer at the end.
+    /// Requests that were due but unanswered at the end.
     pub waiting: u64,
-    /// Half of the answers took no longer, from the moment on at which their question was due. A question that still has none
-    /// counts as long as it has waited.
+    /// Median latency, from the due time of the request. An unanswered request counts with its waiting time
+    /// so far.
     pub p50: Duration,
-    /// 99 of 100.
+    /// 99th percentile.
     pub p99: Duration,
-    /// The longest.
+    /// Maximum.
     pub max: Duration,
-    /// How long all that was measured.
+    /// Duration of the measurement.
     pub lasted: Duration,
 }
 
 impl Window {
-    /// Answers in a second.
+    /// Answers per second.
     #[must_use]
     pub fn rate(&self) -> f64 {
         self.count as f64 / self.lasted.as_secs_f64().max(f64::MIN_POSITIVE)
     }
 
-    /// Questions that were due.
+    /// Number of requests that were due.
     #[must_use]
     pub const fn asked(&self) -> u64 {
         self.count + self.waiting + self.failed
     }
 
-    /// Questions that were not asked in time, or had no answer.
+    /// Requests that were sent late or not answered.
     #[must_use]
     pub const fn missed(&self) -> u64 {
         self.late + self.waiting + self.failed
     }
 }
 
-/// What a node has seen of others, by the last byte of their addresses.
+/// A node's view of other nodes, by the last byte of their addresses.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Seen {
-    /// How often each was lost.
+    /// Number of times that each node was lost.
     pub(super) lost: BTreeMap<u8, u64>,
-    /// How often each was found.
+    /// Number of times that each node was found.
     pub(super) found: BTreeMap<u8, u64>,
-    /// Messages that nobody of the robot sends and that say that they are from there.
+    /// Messages with this source that no node of the robot sends.
     pub(super) sent: BTreeMap<u8, u64>,
 }
 
 impl Seen {
-    /// What of it was not there before.
+    /// The difference to an earlier view.
     pub(super) fn since(mut self, before: &Self) -> Self {
         for (now, before) in
             [(&mut self.lost, &before.lost), (&mut self.found, &before.found), (&mut self.sent, &before.sent)]
@@ -100,21 +95,22 @@ impl Seen {
     }
 }
 
-/// Who is attacked.
+/// The kind of target.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Is {
     Node,
-    /// It answers nothing but what TLS wants.
+    /// It answers only as TLS requires.
     Decoy,
 }
 
-/// Whom an attack is against.
+/// The target of an attack.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Target {
     pub(super) is: Is,
-    /// Where it takes connections.
+    /// The address for connections.
     pub(super) connections: SocketAddr,
-    /// Where it takes datagrams of discovery, where the one in the other node's place does, and the group.
+    /// The addresses for discovery datagrams: of the target, of its counterpart in the other node's place,
+    /// and of the group.
     pub(super) datagrams: [SocketAddr; 3],
 }
 
@@ -125,20 +121,18 @@ pub(super) struct Decoys {
 }
 
 impl Decoys {
-    /// Starts both, and returns when they can be attacked. The group is one that no node hears.
-    pub(super) fn start(program: &Path, hosts: &[Host], keys: &Keys) -> Self {
+    /// Starts both, and returns when they can be attacked. They use a group that no node has joined.
+    pub(super) fn start(hosts: &[Host], keys: &Keys) -> Self {
         let group = *own_group().ip();
-        let start = |who: Who, host: usize| {
-            let mut command = Command::new(program);
-            command.args(["--role", "decoy", who.name]).arg(keys.of(who)).arg(group.to_string());
-            let member = Member::start(hosts[host].moved(&command), "decoy");
-            member.answer("up");
-            member
+        let start = |node: TestNode, host: usize| {
+            let mut command = role("decoy");
+            command.arg(node.name).arg(keys.of(node)).arg(group.to_string());
+            Member::start(hosts[host].moved(&command), "decoy")
         };
         Self { group, members: [start(keys::KNEE, super::KNEE), start(keys::HIP, super::HIP)] }
     }
 
-    /// The decoy in the place of the attacked node, as its attackers see it.
+    /// The decoy of the attacked node, as its attackers see it.
     pub(super) fn target(&self) -> Target {
         let datagrams = [keys::KNEE.address(), keys::HIP.address(), self.group];
         let connections = (keys::KNEE.address(), decoy::CONNECTIONS_PORT).into();
@@ -152,47 +146,33 @@ impl Decoys {
     }
 }
 
-/// What a node refused, for each cause.
+/// Refusals of a node, by cause.
 pub(super) type Refused = BTreeMap<String, u64>;
 
 /// A node in its process.
-pub(super) struct Member {
-    performer: Mutex<Performer>,
-    /// Nobody but the director reads them; attackers look at the rest of the robot.
-    answers: Mutex<Receiver<String>>,
-}
+pub(super) struct Member(Mutex<NodeProcess>);
 
 impl Member {
+    /// Starts it, and returns when it is up.
     fn start(command: Command, role: &str) -> Self {
-        let (say, answers) = sync_channel(16);
-        let hear = move |line: &str| {
-            // Nobody waits for its answers any more when the director is done.
-            let _ = say.send(line.to_owned());
-        };
-        Self {
-            performer: Mutex::new(Performer::start_command(command, role, hear)),
-            answers: Mutex::new(answers),
-        }
+        let mut process = NodeProcess::start(role, command);
+        process.expect("up");
+        Self(Mutex::new(process))
     }
 
-    fn performer(&self) -> MutexGuard<'_, Performer> {
-        self.performer.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn answer(&self, to: &str) -> String {
-        let answer = self.answers.lock().unwrap_or_else(PoisonError::into_inner).recv_timeout(DEADLINE);
-        answer.unwrap_or_else(|_| panic!("a node did not answer `{to}` within {DEADLINE:?}"))
+    fn process(&self) -> MutexGuard<'_, NodeProcess> {
+        lock(&self.0)
     }
 
     /// Ends it in order.
     pub(super) fn end(self) {
-        let status = self.performer.into_inner().unwrap_or_else(PoisonError::into_inner).end();
+        let status = self.0.into_inner().unwrap_or_else(PoisonError::into_inner).stop();
         assert!(status.success(), "a node ended with {status}");
     }
 
-    /// How often its host has begun a connection since there is one.
+    /// Connections that its host has opened since the host was created.
     fn dials(&self) -> u64 {
-        let path = format!("/proc/{}/net/snmp", self.performer().id());
+        let path = format!("/proc/{}/net/snmp", self.process().id());
         let text = fs::read_to_string(path).expect("the kernel counts what hosts do");
         let mut lines = text.lines().filter(|line| line.starts_with("Tcp:"));
         let [names, counts] = [lines.next(), lines.next()].map(|line| line.unwrap_or_default().split(' '));
@@ -201,11 +181,9 @@ impl Member {
         count.parse().expect("a number")
     }
 
-    /// What it says to this.
+    /// Sends a command and returns the answer.
     pub(super) fn ask(&self, question: &str) -> String {
-        let mut performer = self.performer();
-        performer.tell(question);
-        self.answer(question)
+        self.process().ask(question)
     }
 
     fn seen(&self) -> Seen {
@@ -231,13 +209,8 @@ impl Member {
     }
 }
 
-fn numbers(line: &str) -> Vec<u64> {
-    line.split_whitespace().map(|word| word.parse().expect("a number")).collect()
-}
-
-/// The two nodes that talk, of which one is attacked.
+/// The two communicating nodes, one of which is attacked.
 pub(super) struct Robot {
-    program: PathBuf,
     directory: PathBuf,
     group: std::net::SocketAddrV4,
     hip: Member,
@@ -248,47 +221,45 @@ pub(super) struct Robot {
 }
 
 impl Robot {
-    /// Starts both, and returns when they talk. The attacked one is as this attack has it.
-    pub(super) fn start(program: &Path, hosts: &[Host], keys: &Keys, attack: &Attack) -> Self {
+    /// Starts both, and returns when they communicate. The attack determines the configuration of the
+    /// attacked node.
+    pub(super) fn start(hosts: &[Host], keys: &Keys, attack: &Attack) -> Self {
         let (group, directory) = (own_group(), keys.path(""));
         let config =
-            |who: Who, further| configuration(&directory, group, (who, Some(&keys.of(who))), further);
+            |node: TestNode, further| configuration(&directory, group, (node, Some(&keys.of(node))), further);
         let security = if attack.guests { access_list(&directory) } else { String::new() };
-        // With as many strangers as are allowed by default, descriptors would never run out.
+        // With the default limit of unauthenticated connections, the node would never run out of file
+        // descriptors.
         let gncl = if attack.descriptors.is_some() { "strangers_max = 1024\n" } else { "" };
         let knee_config = config(keys::KNEE, Further { gncl, security: &security });
-        let (knee, echo) = start_knee(program, &hosts[super::KNEE], &knee_config, attack.descriptors);
+        let (knee, echo) = start_knee(&hosts[super::KNEE], &knee_config, attack.descriptors);
         let hip_config = config(keys::HIP, Further::default());
-        let hip =
-            Member::start(hosts[super::HIP].moved(&as_role(program, &hip_config, &["asks"])), "robot-node");
-        hip.answer("up");
+        let hip = Member::start(hosts[super::HIP].moved(&robot_node(&hip_config, &["asks"])), "robot-node");
         let newcomer_keys = keys.of(keys::ANKLE);
-        Self { program: program.to_owned(), directory, group, hip, knee, knee_config, newcomer_keys, echo }
+        Self { directory, group, hip, knee, knee_config, newcomer_keys, echo }
     }
 
-    /// Ends the attacked node in order, and starts its next life; returns when both talk again.
+    /// Ends the attacked node in order and starts its next incarnation. Returns when both communicate again.
     pub(super) fn with_knee_anew(self, host: &Host) -> Self {
         self.knee.end();
-        let (knee, echo) = start_knee(&self.program, host, &self.knee_config, None);
+        let (knee, echo) = start_knee(host, &self.knee_config, None);
         let robot = Self { knee, echo, ..self };
-        assert!(robot.answers_again(), "the next life of the attacked node gives no answer");
+        assert!(robot.answers_again(), "the next incarnation of the attacked node gives no answer");
         robot
     }
 
-    /// A node of the robot's that was not there; returns when it has an answer of the attacked one.
+    /// Starts a new node of the robot, and returns when it has an answer from the attacked one.
     pub(super) fn start_newcomer(&self, host: &Host) -> Member {
         let ankle = (keys::ANKLE, Some(&*self.newcomer_keys));
         let config = configuration(&self.directory, self.group, ankle, Further::default());
-        let asks = as_role(&self.program, &config, &["asks"]);
-        let ankle = Member::start(host.moved(&asks), "robot-node");
-        ankle.answer("up");
-        ankle
+        let asks = robot_node(&config, &["asks"]);
+        Member::start(host.moved(&asks), "robot-node")
     }
 
-    /// A command that starts a whole node there, with keys that it should not have, or none.
+    /// A command that starts a whole node on this host, with unauthorized keys or none.
     pub(super) fn foreign_node(&self, host: &Host, keys: Option<&Path>) -> Command {
         let config = configuration(&self.directory, self.group, (keys::MALLORY, keys), Further::default());
-        host.moved(&as_role(&self.program, &config, &["tries"]))
+        host.moved(&robot_node(&config, &["tries"]))
     }
 
     #[expect(clippy::unused_self, reason = "it is the robot's, whichever is attacked")]
@@ -298,17 +269,17 @@ impl Robot {
 
     /// The attacked node, as its attackers see it.
     pub(super) fn target(&self) -> Target {
-        let [knee, hip] = [keys::KNEE, keys::HIP].map(|who| SocketAddr::from((who.address(), NDL_PORT)));
+        let [knee, hip] = [keys::KNEE, keys::HIP].map(|node| SocketAddr::from((node.address(), NDL_PORT)));
         let connections = (keys::KNEE.address(), GNCL_PORT).into();
         Target { is: Is::Node, connections, datagrams: [knee, hip, self.group.into()] }
     }
 
-    /// Both, for what they do together: `hip`, and `knee`.
+    /// Both nodes, for their joint work: `hip` and `knee`.
     pub(super) const fn talkers(&self) -> [&Member; 2] {
         [&self.hip, &self.knee]
     }
 
-    /// How often each of both has begun a connection, since there is its host.
+    /// Connections that each of both hosts has opened since it was created.
     pub(super) fn dials(&self) -> [u64; 2] {
         [self.hip.dials(), self.knee.dials()]
     }
@@ -317,17 +288,18 @@ impl Robot {
         self.group
     }
 
-    /// The socket of the attacked node's door.
-    pub(super) fn door(&self) -> PathBuf {
+    /// The path of the attacked node's client socket.
+    pub(super) fn socket(&self) -> PathBuf {
         self.directory.join(format!("{}.sock", keys::KNEE.name))
     }
 
-    /// The TID of the application that is asked: everybody who has been a member knows it.
+    /// The TID of the application that answers: every former member knows it.
     pub(super) const fn echo(&self) -> Tid {
         self.echo
     }
 
-    /// What the asking node measured since the last one: from now on a part of all that is called so, which is returned.
+    /// Measurements of the requesting node since the last call. They are added to the window with this name,
+    /// and the sum is returned.
     pub(super) fn window(&self, name: &str) -> Window {
         let line = self.hip.ask(&format!("window {name}"));
         let [count, failed, late, waiting, p50, p99, max, lasted] = numbers(&line)[..] else {
@@ -337,30 +309,30 @@ impl Robot {
         Window { count, failed, late, waiting, p50, p99, max, lasted }
     }
 
-    /// Whether a question that is asked from now on is answered in time.
+    /// Returns whether a request sent from now on is answered in time.
     pub(super) fn answers_again(&self) -> bool {
         self.hip.ask("again") == "1"
     }
 
-    /// What the attacked node refused in its life.
+    /// Refusals counted by the attacked node in this incarnation.
     pub(super) fn refused(&self) -> Refused {
         self.knee.refused()
     }
 
-    /// What both have seen since then.
+    /// Observations of both nodes since then.
     pub(super) fn seen_since(&self, before: &[Seen; 2]) -> [Seen; 2] {
         let [hip, knee] = self.seen();
         [hip.since(&before[0]), knee.since(&before[1])]
     }
 
-    /// What both have seen.
+    /// Observations of both nodes.
     pub(super) fn seen(&self) -> [Seen; 2] {
         [self.hip.seen(), self.knee.seen()]
     }
 
     /// Memory of the attacked node, in bytes.
     pub(super) fn held_bytes(&self) -> u64 {
-        Held::of(self.knee.performer().id()).own_kib << 10
+        Resources::of(self.knee.process().id()).own_kib << 10
     }
 
     /// Ends both in order.
@@ -369,42 +341,35 @@ impl Robot {
     }
 }
 
-/// The attacked node with so many descriptors, and its application that answers.
-fn start_knee(program: &Path, host: &Host, config: &Path, descriptors: Option<u32>) -> (Member, Tid) {
-    let knee = as_role(program, config, &[]);
+/// Starts the attacked node with this file descriptor limit. Returns it, and the TID of its application that
+/// answers.
+fn start_knee(host: &Host, config: &Path, descriptors: Option<u32>) -> (Member, Tid) {
+    let knee = robot_node(config, &[]);
     let knee = match descriptors {
-        Some(descriptors) => limited(&knee, descriptors),
+        Some(descriptors) => after_shell(&format!("ulimit -n {descriptors}"), &knee),
         None => knee,
     };
     let knee = Member::start(host.moved(&knee), "robot-node");
-    knee.answer("up");
     let echo = Tid::from_bits(numbers(&knee.ask("tid"))[0]);
     (knee, echo)
 }
 
-fn as_role(program: &Path, config: &Path, more: &[&str]) -> Command {
-    let mut command = Command::new(program);
-    command.args(["--role", "robot-node"]).arg(config).args(more);
+fn robot_node(config: &Path, more: &[&str]) -> Command {
+    let mut command = role("robot-node");
+    command.arg(config).args(more);
     command
 }
 
-/// The same command with so many descriptors.
-fn limited(command: &Command, descriptors: u32) -> Command {
-    let mut limited = Command::new("sh");
-    limited.args(["-c", r#"ulimit -n $0 && exec "$@""#, &descriptors.to_string()]);
-    limited.arg(command.get_program()).args(command.get_args());
-    limited
-}
-
-/// Further lines of tables of a configuration.
+/// Additional lines for tables of a configuration.
 #[derive(Clone, Copy, Default)]
 struct Further<'a> {
     gncl: &'a str,
     security: &'a str,
 }
 
-/// Writes an access list that lets everything be said, a guest in with names and one group of its own, and visitors with names and any group,
-/// where they can get at the door beside it. Returns the line that names it.
+/// Writes an access list that allows all messages. It admits a guest with names and one group of its own, and
+/// visitors with names and any group. They can reach the client socket in this directory. Returns the
+/// configuration line that names the list.
 fn access_list(directory: &Path) -> String {
     let path = directory.join("access.toml");
     let visitor = |uid: u32| format!("[[client]]\nuid = {uid}\nnames = ['visitor.*']\ngroups = ['*']\n");
@@ -413,21 +378,22 @@ fn access_list(directory: &Path) -> String {
         "[[rule]]\nfrom = ['*']\nto = ['*']\n[[client]]\nuid = {GUEST}\nnames = ['guest.*']\ngroups = ['{GRANTED}']\n{visitors}"
     );
     let written = fs::write(&path, text);
-    // Whatever umask there is: nobody else writes there, and everybody comes to what is there for him.
+    // Independent of the umask: only the owner writes here, and each user can reach the files intended for
+    // it.
     let opened = fs::set_permissions(directory, Permissions::from_mode(0o755));
     written.and(opened).expect("the scene's own directory");
     format!("access = {path:?}\n")
 }
 
-/// Writes one.
+/// Writes a configuration file.
 fn configuration(
     directory: &Path,
     group: std::net::SocketAddrV4,
-    (who, keys): (Who, Option<&Path>),
+    (node, keys): (TestNode, Option<&Path>),
     Further { gncl, security }: Further<'_>,
 ) -> PathBuf {
-    let path = directory.join(format!("{}.toml", who.name));
-    let (name, address, socket) = (who.name, who.address(), directory.join(format!("{}.sock", who.name)));
+    let path = directory.join(format!("{}.toml", node.name));
+    let (name, address, socket) = (node.name, node.address(), directory.join(format!("{}.sock", node.name)));
     let keys = keys.map_or_else(|| "false".to_owned(), |keys| format!("{keys:?}"));
     let period = NDL_PERIOD.as_millis();
     let text = format!(

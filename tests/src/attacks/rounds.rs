@@ -1,5 +1,6 @@
-//! Live traffic's times by turns: left alone, with an attack on the decoy, with the same attack on the node. Whatever else the machine does
-//! meanwhile falls on all three, and what the decoy shows the node has no part in.
+//! Latencies of live traffic in alternating rounds: without an attack, with an attack on the decoy, with the
+//! same attack on the node. Other load on the machine affects all three equally. The node has no part in the
+//! slowdown that the decoy shows.
 
 use std::{
     collections::BTreeMap,
@@ -8,50 +9,52 @@ use std::{
     time::Duration,
 };
 
+use sinew_testkit::{SetOnDrop, join};
+
 use super::{
-    Attack, EndsIt, Happened, LATE_AT_REST, Plan, Scene,
+    Attack, Happened, LATE_AT_REST, Plan, Scene,
     robot::{Decoys, Target, Window},
 };
 
-/// What is measured in no round.
+/// The name of the window between rounds.
 pub(super) const BETWEEN: &str = "between";
-/// Time after each attack, in which a node has done with the connections that still wait for it in the kernel: 1,024 at most, one each
-/// millisecond.
+/// Pause after each attack. In this time a node accepts the connections that still wait in the kernel: at
+/// most 1,024, one per millisecond.
 const PAUSE: Duration = Duration::from_millis(1_100);
 
-/// How often each thing was done.
+/// Number of times that each action was done.
 pub type Done = BTreeMap<&'static str, u64>;
 
-/// Live traffic's times with an attack on somebody, in all rounds.
+/// Latencies of live traffic with an attack on one target, over all rounds.
 #[derive(Clone, Debug, Default)]
 pub struct Attacked {
-    /// Its times.
+    /// The latencies.
     pub window: Window,
-    /// What the attacker did meanwhile.
+    /// Actions of the attacker meanwhile.
     pub done: Done,
 }
 
 impl Attacked {
-    /// What he did in a second.
+    /// Actions per second.
     #[must_use]
     pub fn done_per_s(&self) -> BTreeMap<&'static str, f64> {
         let seconds = self.window.lasted.as_secs_f64().max(f64::MIN_POSITIVE);
         self.done.iter().map(|(what, count)| (*what, *count as f64 / seconds)).collect()
     }
 
-    /// He did something.
+    /// Returns whether the attacker did anything.
     #[must_use]
     pub fn is_attack(&self) -> bool {
         self.done.values().any(|count| *count > 0)
     }
 }
 
-/// Live traffic's times, in all rounds.
+/// Latencies of live traffic, over all rounds.
 #[derive(Clone, Debug, Default)]
 pub struct Rounds {
-    /// Left alone.
+    /// Without an attack.
     pub before: Window,
-    /// With the decoy attacked, where one can stand in for the node.
+    /// With the decoy attacked, if a decoy can replace the node.
     pub decoy: Option<Attacked>,
     /// With the node attacked.
     pub node: Attacked,
@@ -59,19 +62,19 @@ pub struct Rounds {
     pub(super) own_sent: u64,
     /// The same on links that broke.
     pub(super) own_perhaps: u64,
-    /// What must not have been for however short a time: who was let in by the node, say.
+    /// Violations that count however short the attack is, such as an intruder admitted by the node.
     pub(super) let_in: Vec<String>,
 }
 
 impl Rounds {
-    /// The machine was at rest where nobody was attacked: else times say nothing.
+    /// Returns whether the machine was idle without an attack; otherwise latencies are meaningless.
     pub(super) fn was_at_rest(&self) -> bool {
         self.before.missed() as f64 <= LATE_AT_REST * self.before.asked() as f64
     }
 }
 
-/// Measures them with this attack.
-pub(super) fn play(attack: &Attack, plan: &Plan, scene: &Scene<'_>, decoys: Option<&Decoys>) -> Rounds {
+/// Measures the latencies with this attack.
+pub(super) fn measure(attack: &Attack, plan: &Plan, scene: &Scene<'_>, decoys: Option<&Decoys>) -> Rounds {
     let lasts = plan.timed / plan.rounds.max(1);
     let mut rounds = Rounds { decoy: decoys.map(|_| Attacked::default()), ..Rounds::default() };
     for _ in 0..plan.rounds.max(1) {
@@ -90,23 +93,23 @@ pub(super) fn play(attack: &Attack, plan: &Plan, scene: &Scene<'_>, decoys: Opti
     rounds
 }
 
-/// The same against this one, for so long.
+/// The same scene with this target and duration.
 fn aimed<'a>(scene: &Scene<'a>, target: Target, lasts: Duration) -> Scene<'a> {
     Scene { target, lasts, ..*scene }
 }
 
-/// One round of an attack, and the pause after it.
+/// Runs one round of an attack, and the pause after it.
 fn go_on(attack: &Attack, name: &str, scene: &Scene<'_>, attacked: &mut Attacked) -> Happened {
     let (over, attack) = (AtomicBool::new(false), attack.goes_on.unwrap_or(attack.run));
     let scene = Scene { over: &over, ..*scene };
     let happened = thread::scope(|scope| {
-        let _ends = EndsIt(&over);
+        let _ends = SetOnDrop(&over);
         scene.robot.window(BETWEEN);
         let attacking = scope.spawn(|| attack(&scene));
         thread::sleep(scene.lasts);
         attacked.window = scene.robot.window(name);
         over.store(true, Ordering::Relaxed);
-        attacking.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+        join(attacking)
     });
     for (what, count) in &happened.done {
         *attacked.done.entry(what).or_default() += count;

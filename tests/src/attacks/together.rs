@@ -1,13 +1,13 @@
-//! What two nodes of the robot do together that somebody at a door could disturb without touching a message: `hip` sends to a group in which
-//! `knee` alone has a member, and both meet at barriers.
+//! Joint work of two nodes of the robot, which a local client could disturb without touching a message: `hip`
+//! sends to a group with `knee` as its only member, and both meet at barriers.
 //!
-//! Of the barriers each doubling of the rounds has a name of its own: one that was known before an attack says nothing of whether there is
-//! room for one more.
+//! Each doubling of the number of rounds uses a barrier with a new name. A barrier that was known before an
+//! attack does not show whether there is room for another one.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
     sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
+        Arc, Mutex, MutexGuard,
         atomic::{AtomicBool, AtomicU64, Ordering},
         mpsc::{Receiver, SyncSender, sync_channel},
     },
@@ -21,12 +21,14 @@ use sinew::{
     prelude::*,
 };
 use sinew_runtime::app::DynApp;
+use sinew_runtime::lock;
 
 use super::{
     keys::{HIP, KNEE},
     robot::{Member, Robot},
 };
-use crate::{DEADLINE, until};
+use sinew_testkit::scripted::reactor;
+use sinew_testkit::{DEADLINE, until};
 
 payload!("attacks.call", Control =>
     /// Sent to the group.
@@ -34,32 +36,33 @@ payload!("attacks.call", Control =>
     struct Call { run: u64, number: u64 }
 );
 
-/// The group of the robot's own. Its address is among the highest, so that it is among the last that have room in a list of groups.
+/// A group of the robot. Its address is among the highest, so it is among the last that fit in a list of
+/// groups.
 const GROUP: &str = "joints";
-/// Time between two calls, and from one barrier to the next: little beside the questions that are timed, as nobody calls while those are
-/// timed that are left alone.
+/// Time between two calls, and between two barriers. Their load is small compared with the timed requests:
+/// there are no calls while requests are timed without an attack.
 const PACE: Duration = Duration::from_millis(10);
 const PAUSE: Duration = Duration::from_millis(50);
-/// How long a party waits at a barrier that is open as soon as the other one is there.
+/// Timeout of a party at a barrier. The barrier opens as soon as the other party arrives.
 const WITHIN: Duration = Duration::from_secs(10);
-/// Time for a call that is under way when no more are sent.
+/// Grace period for calls in flight after the last one was sent.
 const GRACE: Duration = Duration::from_secs(10);
-/// Time between two looks at whether it is over.
-const LOOK: Duration = Duration::from_millis(20);
+/// Interval between checks for the end.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
-/// Which calls of which run have come.
+/// The received calls of each run.
 #[derive(Default)]
-struct Heard(Mutex<BTreeMap<u64, BTreeSet<u64>>>);
+struct ReceivedCalls(Mutex<BTreeMap<u64, BTreeSet<u64>>>);
 
-impl Heard {
+impl ReceivedCalls {
     fn calls(&self) -> MutexGuard<'_, BTreeMap<u64, BTreeSet<u64>>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 }
 
 struct Party {
     lend: SyncSender<Sender>,
-    heard: Arc<Heard>,
+    received: Arc<ReceivedCalls>,
     is_member: bool,
 }
 
@@ -70,7 +73,7 @@ impl Actor for Party {
         if self.is_member {
             context.join(GROUP);
         }
-        // A later life has the same one, and nobody waits for it.
+        // A later incarnation sends the same value, but it has no receiver then.
         let _ = self.lend.try_send(context.sender());
     }
 }
@@ -79,32 +82,32 @@ impl Handler<Delivery<Call>> for Party {
     type Result = ();
 
     fn handle(&mut self, call: Delivery<Call>, _: &mut Self::Context) {
-        self.heard.calls().entry(call.run).or_default().insert(call.number);
+        self.received.calls().entry(call.run).or_default().insert(call.number);
     }
 }
 
-/// The name of a node's application that does all this.
+/// The name of a node's application for the joint work.
 fn name_on(node: &str) -> String {
     format!("robot.{node}")
 }
 
-/// The application of a node, and its part in what is done.
+/// The application of a node, and its part in the joint work.
 pub(super) fn part_of(node: &str) -> (DynApp, Part) {
     let (lend, lent) = sync_channel(1);
-    let (heard, is_member) = (Arc::<Heard>::default(), node == KNEE.name);
-    let noted = heard.clone();
-    let party = move || Party { lend: lend.clone(), heard: noted.clone(), is_member };
+    let (received, is_member) = (Arc::<ReceivedCalls>::default(), node == KNEE.name);
+    let noted = received.clone();
+    let party = move || Party { lend: lend.clone(), received: noted.clone(), is_member };
     let app = AppSpec::new(name_on(node), party).handles::<Call>().own_thread().into();
-    (app, Part { leads: node == HIP.name, lent, sender: None, heard, running: None })
+    (app, Part { leads: node == HIP.name, lent, sender: None, received, running: None })
 }
 
-/// What one node does.
+/// The part of one node.
 pub(super) struct Part {
-    /// It calls, and goes first when they part.
+    /// It sends the calls, and leaves first at the end.
     leads: bool,
     lent: Receiver<Sender>,
     sender: Option<Sender>,
-    heard: Arc<Heard>,
+    received: Arc<ReceivedCalls>,
     running: Option<Running>,
 }
 
@@ -114,12 +117,12 @@ struct Running {
     meeting: JoinHandle<Went>,
 }
 
-/// How often something was tried, and how it failed.
+/// Number of attempts and failures.
 #[derive(Default)]
 struct Went {
     tried: u64,
     failed: u64,
-    /// The first time.
+    /// The first error.
     words: Option<String>,
 }
 
@@ -134,24 +137,29 @@ impl Went {
 }
 
 impl Part {
-    /// The answer to what the director says; `None` if that is about something else. `call`: one call in no run; `together RUN`: begins it;
-    /// `apart`: it is to end; `parted`: `no`, or `SENT MET FAILED WORDS`; `heard RUN`: how many calls of it have come.
+    /// Answers a command of the scenario; `None` if it is not about the joint work. Commands:
+    ///
+    /// - `call`: one call outside of any run
+    /// - `together RUN`: starts the run
+    /// - `apart`: ends it
+    /// - `parted`: `no`, or `SENT MET FAILED WORDS`
+    /// - `received RUN`: the number of received calls of this run
     pub(super) fn answer(&mut self, line: &str) -> Option<String> {
         let (word, run) = line.split_once(' ').unwrap_or((line, "0"));
         let run = || run.parse().expect("a run's number");
         match word {
             "call" => {
-                // Whether anybody hears it is what the director looks at.
+                // The scenario checks whether the call is received.
                 let _ = self.sender().send(Tid::group(GROUP), &Call { run: 0, number: 0 });
                 Some("called".to_owned())
             }
             "together" => Some(self.begin(run())),
             "apart" => {
                 self.running.iter().for_each(|running| running.over.store(true, Ordering::Relaxed));
-                Some("told".to_owned())
+                Some("stopping".to_owned())
             }
             "parted" => Some(self.parted()),
-            "heard" => Some(self.heard.calls().get(&run()).map_or(0, BTreeSet::len).to_string()),
+            "received" => Some(self.received.calls().get(&run()).map_or(0, BTreeSet::len).to_string()),
             _ => None,
         }
     }
@@ -165,7 +173,7 @@ impl Part {
     }
 
     fn begin(&mut self, run: u64) -> String {
-        self.heard.calls().retain(|heard, _| *heard == run);
+        self.received.calls().retain(|number, _| *number == run);
         let over = Arc::new(AtomicBool::new(false));
         let calling = self.leads.then(|| {
             let (sender, over) = (self.sender(), over.clone());
@@ -187,12 +195,12 @@ impl Part {
         let join = |thread: JoinHandle<Went>| thread.join().expect("it only tries");
         let (called, met) = (running.calling.map(join).unwrap_or_default(), join(running.meeting));
         let words = [met.words, called.words].into_iter().flatten().next().unwrap_or_default();
-        // A call that was not taken has not come either: it is missed.
+        // A call that was not accepted has not arrived either: it counts as missed.
         format!("{} {} {} {words}", called.tried, met.tried - met.failed, met.failed)
     }
 }
 
-/// Calls the group until it is over.
+/// Sends calls to the group until the run is over.
 fn call(sender: &Sender, run: u64, over: &AtomicBool) -> Went {
     let mut went = Went::default();
     for number in 0.. {
@@ -205,21 +213,21 @@ fn call(sender: &Sender, run: u64, over: &AtomicBool) -> Went {
     went
 }
 
-/// Meets the other one again and again. Who leads ends between two rounds; the other one, which waits in vain then, when it is told to.
+/// Meets the other node at barriers repeatedly. The leader ends between two rounds. The other party then
+/// waits in vain, and ends on command.
 fn meet(sender: &Sender, run: u64, leads: bool, over: &AtomicBool) -> Went {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build();
-    let runtime = runtime.expect("a reactor with nothing but a timer");
+    let runtime = reactor();
     let (mut went, is_over) = (Went::default(), || over.load(Ordering::Relaxed));
     for round in 1_u64.. {
         if is_over() {
             break;
         }
         let name = format!("robot.{run}.{}", round.ilog2());
-        let barrier = Barrier::new(name, [HIP, KNEE].map(|who| name_on(who.name))).within(WITHIN);
+        let barrier = Barrier::new(name, [HIP, KNEE].map(|node| name_on(node.name))).within(WITHIN);
         let passed = runtime.block_on(async {
             let mut meeting = sender.meet(&barrier);
             loop {
-                match tokio::time::timeout(LOOK, &mut meeting).await {
+                match tokio::time::timeout(POLL_INTERVAL, &mut meeting).await {
                     Ok(passed) => break Some(passed),
                     Err(_) if is_over() && !leads => break None,
                     Err(_) => {}
@@ -233,29 +241,29 @@ fn meet(sender: &Sender, run: u64, leads: bool, over: &AtomicBool) -> Went {
     went
 }
 
-/// One time that they do it, as the director sees it.
+/// One run of the joint work, as the scenario sees it.
 pub(super) struct Run<'a> {
     robot: &'a Robot,
     number: u64,
 }
 
-/// What came of it.
+/// The result.
 #[derive(Debug, Default)]
 pub(super) struct Together {
-    /// Calls to the group.
+    /// Calls sent to the group.
     pub(super) sent: u64,
-    /// Those of them that came.
-    pub(super) heard: u64,
+    /// Calls that arrived.
+    pub(super) received: u64,
     /// Barriers that opened for `hip`.
     pub(super) met: u64,
-    /// Times that one did not open for one of both, and why.
+    /// Number of times that a barrier did not open for one of them, and the reason.
     pub(super) failed: u64,
     pub(super) words: String,
 }
 
-/// Has both begin, as soon as a call of `hip` reaches `knee`.
+/// Starts both, as soon as a call of `hip` reaches `knee`.
 pub(super) fn begin(robot: &Robot) -> Run<'_> {
-    /// No run is called 0.
+    /// No run has the number 0.
     static RUNS: AtomicU64 = AtomicU64::new(1);
     let number = RUNS.fetch_add(1, Ordering::Relaxed);
     let [hip, knee] = robot.talkers();
@@ -273,31 +281,31 @@ pub(super) fn begin(robot: &Robot) -> Run<'_> {
 }
 
 impl Run<'_> {
-    /// Has both end, and says what came of it when what was under way has had its time.
+    /// Ends both, and returns the result after a grace period for the calls in flight.
     pub(super) fn end(self) -> Together {
         let [hip, knee] = self.robot.talkers();
         let (sent, met, failed, words) = part(hip);
         let (_, _, failed_there, words_there) = part(knee);
         let until = Instant::now() + GRACE;
-        let mut heard = count(knee, self.number);
-        while heard < sent && Instant::now() < until {
-            thread::sleep(LOOK);
-            heard = count(knee, self.number);
+        let mut received = count(knee, self.number);
+        while received < sent && Instant::now() < until {
+            thread::sleep(POLL_INTERVAL);
+            received = count(knee, self.number);
         }
         let words = if words.is_empty() { words_there } else { words };
-        Together { sent, heard, met, failed: failed + failed_there, words }
+        Together { sent, received, met, failed: failed + failed_there, words }
     }
 }
 
 fn count(knee: &Member, run: u64) -> u64 {
-    knee.ask(&format!("heard {run}")).parse().expect("a number")
+    knee.ask(&format!("received {run}")).parse().expect("a number")
 }
 
-/// Has it end: calls that were sent, barriers that opened and that did not, and why.
+/// Ends its part. Returns the number of calls sent, of barriers that opened and that did not, and the reason.
 fn part(node: &Member) -> (u64, u64, u64, String) {
     node.ask("apart");
     let line = until("one of both ends", || Some(node.ask("parted")).filter(|line| line != "no"));
-    // Where nothing failed there is no fourth word.
+    // Without a failure there is no fourth word.
     let mut words = line.splitn(4, ' ');
     let mut number = || {
         let word = words.next().and_then(|word| word.parse().ok());

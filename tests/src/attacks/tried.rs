@@ -1,4 +1,4 @@
-//! What is done to a node, one file each.
+//! The attacks on a node, one file each.
 
 mod client;
 mod connections;
@@ -20,10 +20,10 @@ use super::{
     keys::{KNEE, SPARE},
 };
 
-/// Descriptors of a node that is to run out of them: some 40 are its own.
+/// File descriptor limit of a node that is to run out of them: some 40 are its own.
 const FEW: u32 = 96;
 
-/// What most attacks have in common.
+/// Common properties of most attacks.
 const COMMON: Attack = Attack {
     name: "",
     tried: "",
@@ -38,15 +38,15 @@ const COMMON: Attack = Attack {
     goes_on: None,
 };
 
-/// What those of guests have in common.
+/// Common properties of the attacks by guests.
 const OF_GUEST: Attack = Attack { inside: true, guests: true, own: KNEE, ..COMMON };
 
-/// So much of it was done.
+/// The number of actions of one kind.
 fn done(what: &'static str, count: u64) -> BTreeMap<&'static str, u64> {
     BTreeMap::from([(what, count)])
 }
 
-/// All of them, the quietest first.
+/// All attacks, the quietest first.
 pub(super) const ATTACKS: &[Attack] = &[
     Attack {
         name: "wrong-authority",

@@ -1,57 +1,57 @@
-//! The claim: of what 8 processes with 64 addresses send each other, and applications of the node besides, every message has
-//! one fate that is true, whichever of the processes are killed.
+//! The claim: 8 processes with 64 addresses, and applications of the node, send each other messages while
+//! processes are killed. Every message has exactly one true fate.
 
+use sinew_runtime::lock;
+use sinew_testkit::NodeProcess;
 use std::{
     fmt,
-    path::PathBuf,
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
 use sinew::audit::Audit;
 
 use super::{
-    Performer, Stage, StageLimits,
+    FixtureLimits, NodeFixture,
     entry::{Entry, Poster},
-    ledger::{Account, Fate, Ledger},
+    fate_tracker::{Account, Fate, FateTracker},
     poster::{CAPACITY, POSTERS},
 };
-use crate::{dice::Dice, until};
+use sinew_testkit::{random::SeededRandom, until};
 
-/// Posters in the node's own process, besides those in processes of their own.
+/// Posters in the node's own process, in addition to those in processes of their own.
 const RESIDENTS: Poster = 8;
 
-/// What is to be done.
+/// The parameters of a run.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// A program whose `main` calls [`play`](super::play) first.
-    pub program: PathBuf,
-    /// Processes, each with 8 addresses.
+    /// Number of processes, each with 8 addresses.
     pub processes: Poster,
-    /// How often a process is killed.
+    /// Number of kills.
     pub kills: u32,
     /// Mean time between two kills.
     pub spacing: Duration,
-    /// How long a poster waits for messages before it sends again, at most.
+    /// Maximum time that a poster waits for messages before it sends again.
     pub pause: Duration,
-    /// Decides who is killed when, and who sends what to whom.
+    /// Seed of the kills and of all messages.
     pub seed: u64,
 }
 
-/// What was seen.
+/// The results.
 #[derive(Debug)]
 pub struct Report {
-    /// What became of the messages.
+    /// The fates of the messages.
     pub account: Account,
     seconds: f64,
     seed: u64,
     refused: u64,
-    /// What the node itself says of all messages, at the end.
+    /// The node's own audit of all messages, at the end.
     pub audit: Audit,
 }
 
 impl Report {
-    /// The law held, in the history and in the node's own counters, and every kind of message was there.
+    /// Returns whether the law held, in the history and in the node's own counters, and every kind of message
+    /// occurred.
     #[must_use]
     pub fn holds(&self) -> bool {
         self.audit.missing() == 0
@@ -71,7 +71,7 @@ impl fmt::Display for Report {
             account.sent()
         )?;
         write!(f, "{account}")?;
-        // A line for each of so many applications is read when something is wrong.
+        // The lines per application are of interest only if messages are missing.
         if audit.missing() > 0 {
             write!(f, "\n{audit}")
         } else {
@@ -80,97 +80,96 @@ impl fmt::Display for Report {
     }
 }
 
-type Shared = Arc<Mutex<Ledger>>;
+type Shared = Arc<Mutex<FateTracker>>;
 
-fn lock(ledger: &Shared) -> MutexGuard<'_, Ledger> {
-    ledger.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// The processes, with the number of the life that each is in.
-struct Cast {
+/// The processes, each with its incarnation number.
+struct Scenario {
     plan: Plan,
-    stage: Stage,
-    ledger: Shared,
-    lives: Vec<(u32, Option<Performer>)>,
+    fixture: NodeFixture,
+    tracker: Shared,
+    processes: Vec<(u32, Option<NodeProcess>)>,
 }
 
-impl Cast {
+impl Scenario {
     fn new(plan: Plan) -> Self {
-        let limits = StageLimits { mailbox_capacity: CAPACITY, payload_max: 1 << 20, clients_max: 256 };
-        let (ledger, first) = (Shared::default(), plan.processes * POSTERS);
+        let limits = FixtureLimits { mailbox_capacity: CAPACITY, payload_max: 1 << 20, clients_max: 256 };
+        let (tracker, first) = (Shared::default(), plan.processes * POSTERS);
         let arguments =
             [u64::from(first), u64::from(first + RESIDENTS), plan.seed].map(|number| number.to_string());
-        let residents = ledger.clone();
-        let stage =
-            Stage::with_residents(&plan.program, limits, &arguments, move |line| note(&residents, 1, line));
-        let lives = (0..plan.processes).map(|_| (0, None)).collect();
-        let mut cast = Self { plan, stage, ledger, lives };
-        (0..cast.plan.processes).for_each(|process| cast.start(process));
-        cast
+        let residents = tracker.clone();
+        let fixture = NodeFixture::with_residents(limits, &arguments, move |line| note(&residents, 1, line));
+        let processes = (0..plan.processes).map(|_| (0, None)).collect();
+        let mut scenario = Self { plan, fixture, tracker, processes };
+        (0..scenario.plan.processes).for_each(|process| scenario.start(process));
+        scenario
     }
 
     fn start(&mut self, process: Poster) {
         let Plan { processes, seed, pause, .. } = self.plan;
-        let place = &mut self.lives[usize::from(process)];
+        let place = &mut self.processes[usize::from(process)];
         place.0 += 1;
-        let (life, ledger) = (place.0, self.ledger.clone());
+        let (incarnation, tracker) = (place.0, self.tracker.clone());
         let all = processes * POSTERS + RESIDENTS;
-        let arguments = [u64::from(process), life.into(), all.into(), seed, pause.as_millis() as u64];
+        let arguments = [u64::from(process), incarnation.into(), all.into(), seed, pause.as_millis() as u64];
         let arguments = arguments.map(|number| number.to_string());
-        place.1 = Some(self.stage.start("poster", &arguments, move |line| note(&ledger, life, line)));
+        let take = move |line: &str| {
+            note(&tracker, incarnation, line);
+            true
+        };
+        place.1 = Some(self.fixture.start_with("poster", &arguments.each_ref().map(|word| &**word), take));
     }
 
     fn kill(&mut self, process: Poster) {
-        let place = &mut self.lives[usize::from(process)];
-        let lived = place.1.take().expect("it was started").kill();
-        let mut ledger = lock(&self.ledger);
-        if !lived {
+        let place = &mut self.processes[usize::from(process)];
+        let was_alive = place.1.take().expect("it was started").kill();
+        let mut tracker = lock(&self.tracker);
+        if !was_alive {
             let why = Entry::Broken("its process ended by itself".to_owned());
-            ledger.note(process * POSTERS, place.0, why);
+            tracker.note(process * POSTERS, place.0, why);
         }
-        posters_of(process).for_each(|poster| ledger.killed(poster, place.0));
+        posters_of(process).for_each(|poster| tracker.killed(poster, place.0));
     }
 
-    /// Whether every poster has its address.
+    /// Returns whether every poster has its address.
     fn is_up(&self) -> bool {
-        let ledger = lock(&self.ledger);
-        (0..)
-            .zip(&self.lives)
-            .all(|(process, (life, _))| posters_of(process).all(|poster| ledger.is_up(poster, *life)))
+        let tracker = lock(&self.tracker);
+        (0..).zip(&self.processes).all(|(process, (incarnation, _))| {
+            posters_of(process).all(|poster| tracker.is_up(poster, *incarnation))
+        })
     }
 
     fn kill_some(&mut self) {
-        let mut dice = Dice::new(self.plan.seed);
+        let mut random = SeededRandom::new(self.plan.seed);
         for _ in 0..self.plan.kills {
-            std::thread::sleep(dice.time_below(self.plan.spacing * 2));
-            let process = dice.below(self.plan.processes.into()) as Poster;
+            std::thread::sleep(random.time_below(self.plan.spacing * 2));
+            let process = random.below(self.plan.processes.into()) as Poster;
             self.kill(process);
             self.start(process);
         }
         until("every poster has its address", || self.is_up().then_some(()));
-        // What is sent when all are there is owed to all.
+        // Messages sent while all posters are up must reach all of them.
         std::thread::sleep(self.plan.spacing);
     }
 
     fn come_to_rest(&mut self) {
-        for (_, performer) in &mut self.lives {
-            performer.as_mut().expect("it was started").tell("quiet");
+        for (_, process) in &mut self.processes {
+            process.as_mut().expect("it was started").send_line("quiet");
         }
-        self.stage.quiet();
-        until("the posters send no more", || lock(&self.ledger).is_quiet().then_some(()));
-        // What is on its way after that is in the report.
-        let end = Instant::now() + crate::DEADLINE;
-        while lock(&self.ledger).account().of(Fate::InFlight) > 0 && Instant::now() < end {
+        self.fixture.quiet();
+        until("the posters send no more", || lock(&self.tracker).is_quiet().then_some(()));
+        // Messages still in flight after the deadline show up in the report.
+        let end = Instant::now() + sinew_testkit::DEADLINE;
+        while lock(&self.tracker).account().of(Fate::InFlight) > 0 && Instant::now() < end {
             std::thread::sleep(Duration::from_millis(20));
         }
     }
 
-    fn end(self) -> Stage {
-        for (_, performer) in self.lives {
-            let status = performer.expect("it was started").end();
+    fn end(self) -> NodeFixture {
+        for (_, process) in self.processes {
+            let status = process.expect("it was started").stop();
             assert!(status.success(), "a poster ended with {status}");
         }
-        self.stage
+        self.fixture
     }
 }
 
@@ -178,31 +177,31 @@ fn posters_of(process: Poster) -> std::ops::Range<Poster> {
     process * POSTERS..(process + 1) * POSTERS
 }
 
-fn note(ledger: &Shared, life: u32, line: &str) {
-    let (who, entry) = line.split_once(' ').unwrap_or((line, ""));
-    let (who, entry): (Poster, Entry) = match (who.parse(), entry.parse()) {
-        (Ok(who), Ok(entry)) => (who, entry),
-        (who, entry) => panic!("{line:?}: {who:?} {entry:?}"),
+fn note(tracker: &Shared, incarnation: u32, line: &str) {
+    let (poster, entry) = line.split_once(' ').unwrap_or((line, ""));
+    let (poster, entry): (Poster, Entry) = match (poster.parse(), entry.parse()) {
+        (Ok(poster), Ok(entry)) => (poster, entry),
+        (poster, entry) => panic!("{line:?}: {poster:?} {entry:?}"),
     };
-    lock(ledger).note(who, life, entry);
+    lock(tracker).note(poster, incarnation, entry);
 }
 
-/// Lets the processes send and be killed, and says what became of the messages.
+/// Lets the processes send, kills them at random, and accounts for all messages.
 ///
 /// # Panics
-/// If one does not start, or does not come to rest.
+/// If a process does not start, or messages do not come to rest.
 #[must_use]
 pub fn run(plan: Plan) -> Report {
     let (seed, began) = (plan.seed, Instant::now());
-    let mut cast = Cast::new(plan);
-    until("every poster has its address", || cast.is_up().then_some(()));
-    cast.kill_some();
-    cast.come_to_rest();
-    let ledger = cast.ledger.clone();
-    let mut stage = cast.end();
-    let refused = stage.refused();
-    let audit = stage.audit();
-    stage.end();
-    let account = lock(&ledger).account();
+    let mut scenario = Scenario::new(plan);
+    until("every poster has its address", || scenario.is_up().then_some(()));
+    scenario.kill_some();
+    scenario.come_to_rest();
+    let tracker = scenario.tracker.clone();
+    let mut fixture = scenario.end();
+    let refused = fixture.refused();
+    let audit = fixture.audit();
+    fixture.end();
+    let account = lock(&tracker).account();
     Report { account, seconds: began.elapsed().as_secs_f64(), seed, refused, audit }
 }

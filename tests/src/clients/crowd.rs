@@ -1,17 +1,18 @@
-//! The role of a process that takes all places that it can have at the door, and keeps them.
+//! The role of a process that takes all client slots that it can get, and keeps them.
 
 use std::os::unix::net::UnixStream;
 
 use sinew::{NodeApi, Registration, client::ApiError};
 
-use super::{say, told};
+use super::{commands, print_line};
 
-/// More than a node lets be silent.
+/// More silent connections than a node allows.
 const SILENT: usize = 300;
 
-/// `SOCKET`: says how many addresses it has got, and why no more; then that it has connections besides which say nothing.
-pub(super) fn play(arguments: &[String]) {
-    let api = NodeApi::connect(&arguments[0]).expect("the door is open");
+/// `SOCKET`: prints the number of addresses that it received, and the error at which it stopped. Then it
+/// prints a line once it also has silent connections.
+pub(super) fn run(arguments: &[String]) {
+    let api = NodeApi::connect(&arguments[0]).expect("the node accepts clients");
     let mut addresses = Vec::new();
     let refused = loop {
         match api.register_transport_address(Registration::new()) {
@@ -20,9 +21,9 @@ pub(super) fn play(arguments: &[String]) {
             Err(error) => panic!("{error}"),
         }
     };
-    say(&format!("has {}", addresses.len()));
-    say(&format!("refused {refused}"));
+    print_line(&format!("has {}", addresses.len()));
+    print_line(&format!("refused {refused}"));
     let silent: Vec<_> = (0..SILENT).map(|_| UnixStream::connect(&arguments[0])).collect();
-    say(&format!("silent {}", silent.iter().filter(|one| one.is_ok()).count()));
-    told().for_each(drop);
+    print_line(&format!("silent {}", silent.iter().filter(|one| one.is_ok()).count()));
+    commands().for_each(drop);
 }

@@ -1,13 +1,13 @@
-//! What a poster tells the ledger, one line each.
+//! The reports of a poster to the fate tracker, one line each.
 
 use std::{fmt, str::FromStr};
 
 use sinew::{Class, Outcome, Time};
 
-/// A poster: its address counted from 0, the same in every life of its process.
+/// A poster: the index of its address from 0, the same in every incarnation of its process.
 pub type Poster = u16;
 
-/// Where messages go: to this poster, in this class.
+/// Destination and class of messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Way {
     /// The destination.
@@ -16,24 +16,25 @@ pub struct Way {
     pub class: Class,
 }
 
-/// One thing that a poster did or saw.
+/// An action or observation of a poster.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Entry {
-    /// It has its address since this time.
+    /// It has had its address since this time.
     Up(Time),
-    /// It is about to send so many messages from this number on, without asking what becomes of them.
+    /// It is about to send this many unconfirmed messages, starting at this number.
     Sends(Way, u64, u64, Time),
-    /// It is about to send this one, and waits for its outcome.
+    /// It is about to send this confirmed message, and waits for its outcome.
     Asks(Way, u64, Time),
-    /// This one was not sent, and its sender was told so at once.
+    /// This message was not sent, and the send returned an error at once.
     NotSent(Way, u64),
-    /// What became of a confirmed one.
+    /// The outcome of a confirmed message.
     Outcome(Way, u64, Outcome),
-    /// It has one in its hand, from this poster in this life of its process. It says so before it settles it.
+    /// It has received a message from this poster in this incarnation. It reports this before it settles the
+    /// message.
     Got(Poster, u32, Class, u64),
-    /// It sends no more.
+    /// It sends no more messages.
     Quiet,
-    /// What must not be was seen.
+    /// It observed a violation.
     Broken(String),
 }
 
@@ -56,8 +57,8 @@ impl fmt::Display for Entry {
             Self::Outcome(to, number, outcome) => {
                 write!(f, "outcome {} {number} {}", way(to), outcome.code())
             }
-            Self::Got(from, life, class, number) => {
-                write!(f, "got {from} {life} {} {number}", number_of(*class))
+            Self::Got(from, incarnation, class, number) => {
+                write!(f, "got {from} {incarnation} {} {number}", number_of(*class))
             }
             Self::Quiet => f.write_str("quiet"),
             Self::Broken(why) => write!(f, "broken {}", why.replace('\n', " ")),
@@ -75,7 +76,7 @@ impl FromStr for Entry {
         }
         let numbers: Result<Vec<u64>, _> = rest.split_whitespace().map(str::parse).collect();
         let numbers = numbers.map_err(|error| format!("{line:?}: {error}"))?;
-        read(verb, &numbers).ok_or_else(|| format!("{line:?} is nothing that a poster says"))
+        read(verb, &numbers).ok_or_else(|| format!("{line:?} is no entry of a poster"))
     }
 }
 
@@ -95,8 +96,8 @@ fn read(verb: &str, numbers: &[u64]) -> Option<Entry> {
         ("outcome", &[to, in_class, number, code]) => {
             Entry::Outcome(way(to, in_class)?, number, Outcome::from_code(u8::try_from(code).ok()?)?)
         }
-        ("got", &[from, life, in_class, number]) => {
-            Entry::Got(poster(from)?, u32::try_from(life).ok()?, class(in_class)?, number)
+        ("got", &[from, incarnation, in_class, number]) => {
+            Entry::Got(poster(from)?, u32::try_from(incarnation).ok()?, class(in_class)?, number)
         }
         ("quiet", []) => Entry::Quiet,
         _ => return None,
@@ -110,7 +111,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_entry_is_read_as_it_was_written() {
+    fn every_entry_survives_a_round_trip() {
         let (way, at) = (Way { to: 63, class: Class::Stream }, Time::from_nanos(12));
         for entry in [
             Entry::Up(at),

@@ -1,27 +1,31 @@
-//! The claim: whatever a client does, the node lives within its bounds, serves the others, and counts what it refuses; and so do those
-//! who let it have a direct link with them.
+//! The claim: no client can push the node out of its bounds or keep it from serving others, and the node
+//! counts every refusal. The same holds for processes that accept direct links from clients.
 //!
-//! | file | what it is |
+//! | file | content |
 //! | --- | --- |
-//! | `stranger` | a connection by hand |
-//! | `guest` | the roles of those whom only the access list lets in |
-//! | `lingering` | what takes for ever to close, and who keeps it from closing |
+//! | `raw_connection` | a hand-written connection |
+//! | `guest` | the roles of users that only the access list admits |
+//! | `slow_close` | descriptors that block on close, and the process that keeps them open |
 //! | `ring` | the hostile end of rings |
-//! | `tricks` | what a hostile client does |
+//! | `tricks` | the attacks of a hostile client |
 
 mod guest;
-mod lingering;
+mod raw_connection;
 mod ring;
-mod stranger;
+mod slow_close;
 mod tricks;
 
+use sinew_runtime::lock;
+use sinew_testkit::NodeProcess;
+use sinew_testkit::Resources;
+use sinew_testkit::SetOnDrop;
+use sinew_testkit::numbers;
 use std::{
     fmt,
-    path::{Path, PathBuf},
+    path::Path,
     sync::{
-        Arc, Mutex, PoisonError,
+        Arc, Mutex,
         atomic::{AtomicBool, Ordering},
-        mpsc::{Receiver, sync_channel},
     },
     thread,
     time::{Duration, Instant},
@@ -30,100 +34,97 @@ use std::{
 use rustix::process::{Signal, getpid, kill_process};
 use sinew::{NodeApi, Registration, message::Kind};
 
-pub(super) use self::guest::{play as play_guest, play_visitor};
+pub(super) use self::guest::{run as run_guest, run_visitor};
 pub(crate) use self::{
     guest::{GRANTED, GUEST, VISITORS},
-    lingering::Keeper,
+    slow_close::Keeper,
 };
 use self::{
-    stranger::{Frame, Stranger},
+    raw_connection::{Frame, RawConnection},
     tricks::{Attacker, Tally},
 };
 use super::{
-    Kernel, Performer, Stage, StageLimits,
-    held::Held,
+    FixtureLimits, Kernel, NodeFixture, commands,
     host::HOSTS,
-    say,
+    print_line,
     steady::{ECHO, Window},
-    told,
 };
-use crate::{DEADLINE, dice::Dice, until};
+use sinew_testkit::{DEADLINE, random::SeededRandom, until};
 
-/// Attackers at a time.
+/// Number of concurrent attackers.
 const ATTACKERS: u64 = 2;
-/// How long an attacker lives; some are killed before.
+/// Lifetime of an attacker; some are killed earlier.
 const LIFE: Duration = Duration::from_secs(2);
-/// Sentences that are kept of those that newcomers are told.
-const TOLD_MAX: usize = 8;
-/// How often the node's memory is looked at.
-const LOOK: Duration = Duration::from_millis(50);
-const LIMITS: StageLimits = StageLimits { mailbox_capacity: 32, payload_max: 16 * 1024, clients_max: 64 };
+/// Maximum number of distinct error messages kept from newcomers.
+const ERRORS_MAX: usize = 8;
+/// Interval between samples of the node's memory.
+const SAMPLE_INTERVAL: Duration = Duration::from_millis(50);
+const LIMITS: FixtureLimits = FixtureLimits { mailbox_capacity: 32, payload_max: 16 * 1024, clients_max: 64 };
 
-/// What is to be done.
+/// The parameters of a run.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// A program whose `main` calls [`play`](super::play) first.
-    pub program: PathBuf,
-    /// How long.
+    /// Duration.
     pub lasts: Duration,
-    /// Decides what is tried.
+    /// Seed of the attacks.
     pub seed: u64,
-    /// What the node and the hosts run on.
+    /// The kernel of the node and the hosts.
     pub kernel: Kernel,
-    /// Nobody else's round trip takes longer. What does not close holds up whoever waits for it until it is closed, 3 s: as questions
-    /// follow each other at once, one of them for nearly all of that.
+    /// Maximum round trip of other clients. A slow-closing descriptor blocks the process that closes it for
+    /// up to 3 s. As requests follow each other at once, one of them is delayed for nearly that long.
     pub held_up_max: Duration,
 }
 
-/// What was seen.
+/// The results.
 #[derive(Debug)]
 pub struct Report {
     seconds: f64,
     held_up_max: Duration,
     kernel: Kernel,
     tally: Tally,
-    /// What the node refused.
+    /// Refusals counted by the node.
     pub refused: u64,
-    /// The most of the node's memory at any look, above the start.
+    /// Peak memory of the node above its memory at the start.
     pub grown_kib: u64,
-    held: (Held, Held),
+    held: (Resources, Resources),
     windows: [Window; 2],
     hosts: Vec<Host>,
     newcomers: Newcomers,
 }
 
-/// What was seen of one that lets everybody have a direct link with it.
+/// Observations of a process that accepts direct links from all clients.
 #[derive(Debug)]
 struct Host {
     name: &'static str,
     grown_kib: u64,
-    held: (Held, Held),
-    /// Round trips of an honest one on a direct link with it.
+    held: (Resources, Resources),
+    /// Round trips of an honest client on a direct link with it.
     windows: [Window; 2],
 }
 
-/// Honest ones that asked for an address during the attack.
+/// Honest clients that registered during the attack.
 #[derive(Clone, Debug, Default)]
 struct Newcomers {
     served: u64,
-    /// What those were told that got none.
+    /// The errors of those that received no address.
     turned_away: Vec<String>,
 }
 
 impl Report {
-    /// The most that the node may hold for all clients: full queues, outcomes that are owed, a frame that is being read, the reading itself.
+    /// Maximum memory of the node for all clients: full queues, pending outcomes, partial frames, and read
+    /// buffers.
     #[must_use]
     pub const fn bound_kib() -> u64 {
-        let StageLimits { mailbox_capacity, payload_max, clients_max } = LIMITS;
+        let FixtureLimits { mailbox_capacity, payload_max, clients_max } = LIMITS;
         let queues = 3 * mailbox_capacity * (payload_max + 512);
         let owed = 10 * mailbox_capacity * 512;
         let reading = 2 * (payload_max + 16 * 1024);
-        // The node's own application is like one client more.
+        // The node's own application counts as one more client.
         ((clients_max + 1) * (queues + owed + reading) / 1024) as u64
     }
 
-    /// The most that one who has direct links may hold for them: of each a ring of either side and a frame, and what waits to be
-    /// received.
+    /// Maximum memory of a process with direct links: per link a ring of each side and a frame, plus the
+    /// messages that wait to be received.
     #[must_use]
     pub const fn host_bound_kib() -> u64 {
         const LINKS: u64 = 64;
@@ -136,7 +137,8 @@ impl Report {
         Duration::from_micros(hosts.chain([self.windows[1].max_us]).max().unwrap_or_default())
     }
 
-    /// The node lived within its bound, served the others, counted every refusal that it told, and gave all back.
+    /// Returns whether the node stayed within its bound, served the others, counted every refusal, and
+    /// released everything.
     #[must_use]
     pub fn holds(&self) -> bool {
         self.refused >= self.tally.refused
@@ -151,8 +153,8 @@ impl Report {
     }
 }
 
-/// Whether nothing is kept of an attack but what an allocator keeps, however long it was.
-fn is_given_back((before, after): &(Held, Held)) -> bool {
+/// Returns whether only the allocator's reserve remains after an attack, however long it lasted.
+fn is_given_back((before, after): &(Resources, Resources)) -> bool {
     const KEPT_KIB: u64 = 16 << 10;
     after.is_back_at(before) && after.own_kib <= before.own_kib + KEPT_KIB
 }
@@ -186,20 +188,20 @@ impl fmt::Display for Report {
             tricks,
             connections,
             bytes,
-            refused: told,
+            refused: reported,
             rings,
             lies,
             links,
-            lingering,
-            lingering_came,
+            slow_closes,
+            slow_closes_sent,
         } = tally;
         writeln!(f, "{seconds:.1} s, {tricks} tricks on {connections} connections, {bytes} bytes taken")?;
         writeln!(f, "{rings} links with rings, {links} direct links, {lies} lies written into their memory")?;
         writeln!(
             f,
-            "{lingering} descriptors that do not close were passed, on {kernel}: {lingering_came} came, the others were refused by the system"
+            "{slow_closes} descriptors that do not close were passed, on {kernel}: {slow_closes_sent} were sent, the others were refused by the system"
         )?;
-        writeln!(f, "refusals: {told} told to the hostile ones, {refused} counted by the node")?;
+        writeln!(f, "refusals: {reported} reported to the hostile clients, {refused} counted by the node")?;
         let Newcomers { served, turned_away } = newcomers;
         writeln!(f, "newcomers: {served} served, {} turned away {turned_away:?}", turned_away.len())?;
         writeln!(f, "node before {}\n     after  {}", held.0, held.1)?;
@@ -219,120 +221,114 @@ impl fmt::Display for Report {
     }
 }
 
-/// The role of an attacker, `SOCKET SEED MILLISECONDS KEEPER`: tells what it did at its end.
-pub(super) fn play_attacker(arguments: &[String]) {
+/// The role of an attacker, `SOCKET SEED MILLISECONDS PORT`: prints its counters at its end.
+pub(super) fn run_attacker(arguments: &[String]) {
     let number = |index: usize| arguments[index].parse::<u64>().expect("a number");
     let end = Instant::now() + Duration::from_millis(number(2));
-    let mut attacker = Attacker::new(Path::new(&arguments[0]), Dice::new(number(1)), number(3) as u16);
+    let mut attacker =
+        Attacker::new(Path::new(&arguments[0]), SeededRandom::new(number(1)), number(3) as u16);
     while Instant::now() < end {
         attacker.play_one();
     }
-    let Tally { tricks, connections, bytes, refused, rings, lies, links, lingering, lingering_came } =
+    let Tally { tricks, connections, bytes, refused, rings, lies, links, slow_closes, slow_closes_sent } =
         attacker.tally;
-    say(&format!(
-        "{tricks} {connections} {bytes} {refused} {rings} {lies} {links} {lingering} {lingering_came}"
+    print_line(&format!(
+        "{tricks} {connections} {bytes} {refused} {rings} {lies} {links} {slow_closes} {slow_closes_sent}"
     ));
 }
 
-/// The role of one that stops in mid-frame, `SOCKET`: stops itself, and goes on where it was if it is let.
-pub(super) fn play_sleeper(arguments: &[String]) {
+/// The role of a process that stops in mid-frame, `SOCKET`: sends SIGSTOP to itself, and continues if it is
+/// resumed.
+pub(super) fn run_sleeper(arguments: &[String]) {
     let socket = Path::new(&arguments[0]);
     let frame = Frame::new(
         &sinew_runtime::wire::Header::new(Kind::named("x"), sinew::Tid::NONE, sinew::Tid::BROADCAST),
         vec![7; 5_000],
     );
-    // The node may have no place for it just now.
-    if let Ok(Some(mut stranger)) = Stranger::register(socket)
-        && stranger.write(&frame.bytes()[..3_000]).is_ok()
+    // The node may have no free slot at the moment.
+    if let Ok(Some(mut connection)) = RawConnection::register(socket)
+        && connection.write(&frame.bytes()[..3_000]).is_ok()
     {
         kill_process(getpid(), Signal::STOP).expect("a process may signal itself");
-        let _ = stranger.write(&frame.bytes()[3_000..]);
+        let _ = connection.write(&frame.bytes()[3_000..]);
     }
-    told().for_each(drop);
+    commands().for_each(drop);
 }
 
-struct Cast {
+struct Scenario {
     plan: Plan,
-    stage: Stage,
-    echo: Performer,
-    hosts: Vec<Performer>,
+    fixture: NodeFixture,
+    echo: NodeProcess,
+    hosts: Vec<NodeProcess>,
     /// Of the echo, then of each host.
-    pingers: Vec<Performer>,
-    answers: Receiver<String>,
+    pingers: Vec<NodeProcess>,
     tally: Arc<Mutex<Tally>>,
     keeper: Arc<Keeper>,
-    dice: Dice,
+    random: SeededRandom,
 }
 
-impl Cast {
+impl Scenario {
     fn new(plan: Plan) -> Self {
-        let stage = Stage::on(plan.kernel, &plan.program, LIMITS);
-        let (say, answers) = sync_channel(64);
-        let start = |role: &str, arguments: &[String]| {
-            let say = say.clone();
-            // Nobody hears it any more when the director has gone.
-            let performer = stage.start(role, arguments, move |line| drop(say.send(line.to_owned())));
-            assert_eq!(answers.recv_timeout(DEADLINE).as_deref(), Ok("up"), "{role} comes up");
-            performer
+        let fixture = NodeFixture::on(plan.kernel, LIMITS);
+        let start = |role: &str, arguments: &[&str]| {
+            let mut process = fixture.start(role, arguments);
+            process.expect("up");
+            process
         };
-        let echo = start("taker", &[ECHO.to_owned()]);
-        let names = HOSTS.map(|(name, _)| name.to_owned());
-        let hosts = names.iter().map(|name| start("host", std::slice::from_ref(name))).collect();
-        let of_hosts = names.iter().map(|name| start("pinger", std::slice::from_ref(name)));
+        let echo = start("taker", &[ECHO]);
+        let names = HOSTS.map(|(name, _)| name);
+        let hosts = names.iter().map(|name| start("host", &[name])).collect();
+        let of_hosts = names.iter().map(|name| start("pinger", &[name]));
         let pingers = std::iter::once(start("pinger", &[])).chain(of_hosts).collect();
-        let dice = Dice::new(plan.seed);
+        let random = SeededRandom::new(plan.seed);
         Self {
             plan,
-            stage,
+            fixture,
             echo,
             hosts,
             pingers,
-            answers,
             tally: Arc::default(),
             keeper: Arc::new(Keeper::new()),
-            dice,
+            random,
         }
     }
 
-    /// What each of the others measured since the last one; at least one round trip.
+    /// Measurements of each other client since the last call, with at least one round trip each.
     fn windows(&mut self) -> Vec<Window> {
-        let answers = &self.answers;
-        let window = |pinger: &mut Performer| {
+        let window = |pinger: &mut NodeProcess| {
             until("a round trip ends", || {
-                pinger.tell("window");
-                let window = Window::read(&answers.recv_timeout(DEADLINE).expect("the pinger answers"));
+                let window = Window::read(&pinger.ask("window"));
                 (window.count + window.failed > 0).then_some(window)
             })
         };
         self.pingers.iter_mut().map(window).collect()
     }
 
-    /// What the node holds, then each host.
-    fn held(&self) -> Vec<Held> {
-        self.processes().into_iter().map(Held::of).collect()
+    /// The resources of the node, then of each host.
+    fn held(&self) -> Vec<Resources> {
+        self.processes().into_iter().map(Resources::of).collect()
     }
 
     fn processes(&self) -> Vec<u32> {
-        std::iter::once(self.stage.node_id()).chain(self.hosts.iter().map(Performer::id)).collect()
+        std::iter::once(self.fixture.node().id()).chain(self.hosts.iter().map(NodeProcess::id)).collect()
     }
 
     /// Ends all in order.
     fn end(self) {
         for one in self.pingers.into_iter().chain(self.hosts).chain([self.echo]) {
-            let status = one.end();
+            let status = one.stop();
             assert!(status.success(), "one of the others ended with {status}");
         }
-        self.stage.end();
+        self.fixture.end();
     }
 
-    fn start_attacker(&mut self) -> Performer {
+    fn start_attacker(&mut self) -> NodeProcess {
         let tally = self.tally.clone();
         let keeper = self.keeper.port().to_string();
-        let arguments = [self.dice.roll().to_string(), LIFE.as_millis().to_string(), keeper];
-        self.stage.start("attacker", &arguments, move |line| {
-            let numbers: Vec<u64> =
-                line.split_whitespace().map(|word| word.parse().expect("a number")).collect();
-            let mut tally = tally.lock().unwrap_or_else(PoisonError::into_inner);
+        let (seed, lasts) = (self.random.number().to_string(), LIFE.as_millis().to_string());
+        self.fixture.start_with("attacker", &[&seed, &lasts, &keeper], move |line| {
+            let numbers = numbers(line);
+            let mut tally = lock(&tally);
             tally.tricks += numbers[0];
             tally.connections += numbers[1];
             tally.bytes += numbers[2];
@@ -340,28 +336,30 @@ impl Cast {
             tally.rings += numbers[4];
             tally.lies += numbers[5];
             tally.links += numbers[6];
-            tally.lingering += numbers[7];
-            tally.lingering_came += numbers[8];
+            tally.slow_closes += numbers[7];
+            tally.slow_closes_sent += numbers[8];
+            true
         })
     }
 
-    /// Attackers, and one that sleeps, again and again: for the plan's time, and on a slow machine until each sort of trick was played.
+    /// Runs attackers, and one stopped process, repeatedly: for the plan's time, and on a slow machine until
+    /// every kind of trick was played.
     fn attack(&mut self) {
         let end = Instant::now() + self.plan.lasts;
         let tally = self.tally.clone();
-        let has_tried_all = || tally.lock().unwrap_or_else(PoisonError::into_inner).has_all_sorts();
+        let has_tried_all = || lock(&tally).has_all_sorts();
         let goes_on = |now: Instant| now < end || !has_tried_all() && now < end + DEADLINE;
         while goes_on(Instant::now()) {
-            let sleeper = self.stage.start("sleeper", &[], |_| {});
+            let sleeper = self.fixture.start("sleeper", &[]);
             let attackers: Vec<_> = (0..ATTACKERS).map(|_| self.start_attacker()).collect();
             thread::sleep(LIFE.mul_f64(0.5));
             sleeper.signal(Signal::CONT);
-            for attacker in attackers {
-                if self.dice.once_in(4) {
-                    // It may be over by now.
+            for mut attacker in attackers {
+                if self.random.once_in(4) {
+                    // The attacker may have exited already.
                     let _ = attacker.kill();
                 } else {
-                    let status = attacker.end();
+                    let status = attacker.stop();
                     assert!(status.success(), "an attacker ended with {status}");
                 }
             }
@@ -371,73 +369,69 @@ impl Cast {
     }
 }
 
-/// Ends the look also when the attack panics: else nobody would hear of it.
-struct EndsIt<'a>(&'a AtomicBool);
-
-impl Drop for EndsIt<'_> {
-    fn drop(&mut self) {
-        self.0.store(true, Ordering::Relaxed);
-    }
-}
-
-/// Looks at these processes' memory until it is told not to; returns the most that each had.
+/// Samples the memory of these processes until `over`. Returns the peak of each.
 fn watch(processes: &[u32], over: &AtomicBool) -> Vec<u64> {
     let mut most = vec![0; processes.len()];
     while !over.load(Ordering::Relaxed) {
         for (most, process) in most.iter_mut().zip(processes) {
-            *most = Held::of(*process).own_kib.max(*most);
+            *most = Resources::of(*process).own_kib.max(*most);
         }
-        thread::sleep(LOOK);
+        thread::sleep(SAMPLE_INTERVAL);
     }
     most
 }
 
-/// Asks for an address again and again, until it is told not to, as a program does that is started.
-fn come(socket: &Path, over: &AtomicBool) -> Newcomers {
+/// Registers repeatedly until `over`, as newly started programs do.
+fn register_repeatedly(socket: &Path, over: &AtomicBool) -> Newcomers {
     let mut newcomers = Newcomers::default();
     while !over.load(Ordering::Relaxed) {
-        let api = NodeApi::connect(socket).expect("the door is open");
+        let api = NodeApi::connect(socket).expect("the node accepts clients");
         match api.register_transport_address(Registration::new()) {
             Ok(_) => newcomers.served += 1,
-            Err(error) if newcomers.turned_away.len() < TOLD_MAX => {
+            Err(error) if newcomers.turned_away.len() < ERRORS_MAX => {
                 newcomers.turned_away.push(error.to_string())
             }
             Err(_) => {}
         }
-        thread::sleep(LOOK);
+        thread::sleep(SAMPLE_INTERVAL);
     }
     newcomers
 }
 
-/// Lets hostile clients do what they like, and says what the node and the hosts made of it.
+/// Runs hostile clients, and reports the effect on the node and the hosts.
 ///
 /// # Panics
-/// If the node or one of the others ends.
+/// If the node or one of the others exits.
 #[must_use]
 pub fn run(plan: Plan) -> Report {
     let (kernel, held_up_max) = (plan.kernel, plan.held_up_max);
-    let mut cast = Cast::new(plan);
-    cast.windows();
-    thread::sleep(cast.plan.lasts / 8);
-    let alone = cast.windows();
-    let (before, over, began) = (cast.held(), AtomicBool::new(false), Instant::now());
-    let (socket, processes, keeper) = (cast.stage.socket(), cast.processes(), cast.keeper.clone());
+    let mut scenario = Scenario::new(plan);
+    scenario.windows();
+    thread::sleep(scenario.plan.lasts / 8);
+    let alone = scenario.windows();
+    let (before, over, began) = (scenario.held(), AtomicBool::new(false), Instant::now());
+    let (socket, processes, keeper) =
+        (scenario.fixture.socket(), scenario.processes(), scenario.keeper.clone());
     let (most, newcomers) = thread::scope(|scope| {
         let watching = scope.spawn(|| watch(&processes, &over));
-        let coming = scope.spawn(|| come(&socket, &over));
+        let coming = scope.spawn(|| register_repeatedly(&socket, &over));
         scope.spawn(|| keeper.keep(&over));
-        let ends = EndsIt(&over);
-        cast.attack();
+        let ends = SetOnDrop(&over);
+        scenario.attack();
         drop(ends);
-        (watching.join().expect("it only looks"), coming.join().expect("the door is open all the time"))
+        (
+            watching.join().expect("it only looks"),
+            coming.join().expect("the node accepts clients all the time"),
+        )
     });
-    let attacked = cast.windows();
+    let attacked = scenario.windows();
     let end = Instant::now() + DEADLINE;
-    let is_back = |now: &[Held]| now.iter().zip(&before).all(|(now, before)| now.is_back_at(before));
-    while !is_back(&cast.held()) && Instant::now() < end {
-        thread::sleep(LOOK);
+    let is_back = |now: &[Resources]| now.iter().zip(&before).all(|(now, before)| now.is_back_at(before));
+    while !is_back(&scenario.held()) && Instant::now() < end {
+        thread::sleep(SAMPLE_INTERVAL);
     }
-    let (seconds, refused, after) = (began.elapsed().as_secs_f64(), cast.stage.refused(), cast.held());
+    let (seconds, refused, after) =
+        (began.elapsed().as_secs_f64(), scenario.fixture.refused(), scenario.held());
     let seen = |at: usize| Host {
         name: at.checked_sub(1).map_or("node", |host| HOSTS[host].0),
         grown_kib: most[at].max(after[at].own_kib).saturating_sub(before[at].own_kib),
@@ -446,7 +440,7 @@ pub fn run(plan: Plan) -> Report {
     };
     let Host { grown_kib, held, windows, .. } = seen(0);
     let hosts = (1..=HOSTS.len()).map(seen).collect();
-    let tally = *cast.tally.lock().unwrap_or_else(PoisonError::into_inner);
-    cast.end();
+    let tally = *lock(&scenario.tally);
+    scenario.end();
     Report { seconds, held_up_max, kernel, tally, refused, grown_kib, held, windows, hosts, newcomers }
 }

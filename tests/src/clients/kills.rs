@@ -1,19 +1,21 @@
-//! The claim: processes that are killed at any instant, with loans in their hands, leave nothing behind, and the others do not
-//! feel it.
+//! The claim: processes that are killed at any instant while they hold loans leave nothing behind, and the
+//! others are not affected.
 //!
-//! Times in which nobody ends, in which processes end in order, and in which they are killed follow each other in short segments of one
-//! length, each first as often as the others: what the machine does besides is in all of them alike.
+//! There are three kinds of segments: no process ends, processes end in order, and processes are killed. They
+//! alternate in short segments of one length, and each kind comes first equally often. Other load on the
+//! machine affects all of them equally.
 
 mod felt;
 
+use sinew_testkit::NodeProcess;
+use sinew_testkit::Resources;
 use std::{
     collections::BTreeSet,
-    fmt,
+    fmt, fs,
     path::PathBuf,
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
-        mpsc::{Receiver, sync_channel},
     },
     thread,
     time::{Duration, Instant},
@@ -22,69 +24,71 @@ use std::{
 use rustix::process::setpriority_process;
 
 use super::{
-    Performer, Stage, StageLimits,
-    held::{Held, files_of_the_host},
+    FixtureLimits, NodeFixture,
     steady::{ECHO, PARTS, SINK, Window},
 };
-use crate::{DEADLINE, dice::Dice, until};
+use sinew_testkit::{DEADLINE, random::SeededRandom, until};
 
 pub use felt::{Felt, Verdict};
 
 /// Processes that are killed.
 const VICTIMS: u16 = 4;
-/// Kills before anything is measured.
+/// Kills before the measurement starts.
 const WARM_UP: u32 = 20;
-/// Processes that end in one segment. Those that take their places are started while nothing is measured, since what starting a program
-/// costs a machine of two CPUs is not what is asked here.
+/// Processes that end in one segment. Their replacements are started outside of the measurement, because the
+/// cost of starting a program on a machine with two CPUs is not the subject here.
 const ENDS_A_SEGMENT: u32 = 20;
-/// Of so many kills one waits until its victim holds loans: on a machine that is slow none would come so far by itself.
+/// One of this many kills waits until its victim holds loans: on a slow machine no victim would get that far
+/// by itself.
 const HOLDS_EACH: u32 = 4;
-/// Growth of the memory of one process that its allocator may have for itself.
+/// Memory growth of one process that its allocator may keep for itself.
 const GROWTH_MAX_KIB: u64 = 2 * 1024;
 
-/// What is to be done.
+/// The parameters of a run.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// A program whose `main` calls [`play`](super::play) first.
-    pub program: PathBuf,
-    /// How often a process is killed.
+    /// Number of kills.
     pub kills: u32,
-    /// One process ends in each such time, at any instant of it.
+    /// One process ends in each such interval, at a random instant.
     pub spacing: Duration,
-    /// Of so many segments with kills one has a segment with orderly ends beside it, and one in which nobody ends.
+    /// One of this many segments with kills is accompanied by a segment with orderly ends, and one without
+    /// ends.
     pub reference_each: u32,
-    /// Decides who is killed when.
+    /// Seed of the victims and the instants.
     pub seed: u64,
-    /// Those that are killed have the lowest priority, as programs beside a control loop should: what is measured is what they cost
-    /// the node and its other clients, not what four busy processes cost a machine of two CPUs.
+    /// Runs the victims at the lowest priority, as programs beside a control loop should. The measurement is
+    /// about their cost for the node and its other clients, not about four busy processes on a machine with
+    /// two CPUs.
     pub yields: bool,
 }
 
-/// What was seen.
+/// The results.
 #[derive(Debug)]
 pub struct Report {
     kills: u32,
     seconds: f64,
-    /// Killed while all its addresses held messages that they had received, and lent memory.
+    /// Victims killed while all their addresses held received messages and lent memory.
     pub held_loans: u32,
-    /// Ended by themselves, which none should have.
+    /// Processes that ended by themselves, which none should.
     pub ended_by_themselves: u32,
-    /// Of each process that lives on: before and after the kills.
-    pub held: Vec<(&'static str, Held, Held)>,
-    /// Round trips of others, in all segments of each sort: nobody ends, as many as are killed end in order, they are killed.
+    /// Resources of each surviving process, before and after the kills.
+    pub held: Vec<(&'static str, Resources, Resources)>,
+    /// Round trips of the others in all segments of each kind: no ends, orderly ends, kills.
     pub windows: [Window; 3],
-    /// Those in which nobody ends, every other one of them: two figures that would be one, were there enough of them and no chance.
+    /// The segments without ends, split into alternate halves. With enough round trips and no noise both
+    /// would be equal.
     pub halves: [Window; 2],
     spacing: Duration,
-    /// Files that were not there before.
+    /// Files that did not exist before.
     pub left: Vec<PathBuf>,
 }
 
 impl Report {
-    /// Everything was given back, nothing was left, and everybody was served. How fast is not asked: that is [`felt`](Self::felt).
+    /// Returns whether everything was released, nothing was left behind, and all others were served. Latency
+    /// is judged by [`felt`](Self::felt).
     #[must_use]
     pub fn holds(&self) -> bool {
-        let is_back = |(_, before, after): &(&str, Held, Held)| {
+        let is_back = |(_, before, after): &(&str, Resources, Resources)| {
             after.is_back_at(before) && after.own_kib <= before.own_kib + GROWTH_MAX_KIB
         };
         self.left.is_empty()
@@ -94,7 +98,7 @@ impl Report {
             && self.windows.iter().all(|window| window.failed == 0)
     }
 
-    /// Whether others felt the kills.
+    /// Returns whether the others were slowed down by the kills.
     #[must_use]
     pub fn felt(&self) -> Felt {
         Felt::new(&self.windows, &self.halves, self.spacing)
@@ -109,8 +113,8 @@ impl fmt::Display for Report {
             "{kills} kills, one in {spacing:?}, in {seconds:.1} s; {held_loans} of them while every address held loans"
         )?;
         writeln!(f, "{ended_by_themselves} processes ended by themselves")?;
-        for (who, before, after) in held {
-            writeln!(f, "{who:<8} before {before}\n{:<8} after  {after}", "")?;
+        for (role, before, after) in held {
+            writeln!(f, "{role:<8} before {before}\n{:<8} after  {after}", "")?;
         }
         for (what, window) in ["nobody ends", "they end in order", "they are killed"].iter().zip(windows) {
             writeln!(f, "{what:<18} {window}")?;
@@ -125,46 +129,45 @@ impl fmt::Display for Report {
     }
 }
 
-struct Cast {
+struct Scenario {
     plan: Plan,
-    stage: Stage,
-    steady: Vec<(&'static str, Performer)>,
-    answers: Receiver<String>,
+    fixture: NodeFixture,
+    steady: Vec<(&'static str, NodeProcess)>,
     victims: Vec<Option<Victim>>,
     understudies: Vec<Victim>,
     started: u64,
-    dice: Dice,
+    random: SeededRandom,
     held_loans: u32,
     ended_by_themselves: u32,
 }
 
-/// A process that is killed, and what it has said.
+/// A process to be killed, and its reports.
 struct Victim {
-    performer: Performer,
-    /// It runs, and waits for its place.
+    process: NodeProcess,
+    /// It runs, and waits for its slot.
     waits: Arc<AtomicBool>,
     /// All its addresses hold loans.
     holds: Arc<AtomicBool>,
 }
 
-/// How a victim ends.
+/// The way a victim ends.
 #[derive(Clone, Copy)]
 enum End {
     Killed,
     InOrder,
 }
 
-/// What is measured by itself.
+/// The parts of the measurement.
 #[derive(Clone, Copy)]
 enum Part {
     NobodyEnds,
-    /// Every other segment of these.
+    /// Every other segment without ends.
     NobodyEndsEither,
     InOrder,
     Killed,
 }
 
-const _: () = assert!(Part::Killed as usize + 1 == PARTS, "the pinger tells so many apart");
+const _: () = assert!(Part::Killed as usize + 1 == PARTS, "the pinger distinguishes as many");
 
 impl Part {
     const fn ends(self) -> Option<End> {
@@ -176,66 +179,65 @@ impl Part {
     }
 }
 
-impl Cast {
+impl Scenario {
     fn new(plan: Plan) -> Self {
-        let limits = StageLimits { mailbox_capacity: 256, payload_max: 1 << 20, clients_max: 256 };
-        let stage = Stage::new(&plan.program, limits);
-        let (say, answers) = sync_channel(64);
+        let limits = FixtureLimits { mailbox_capacity: 256, payload_max: 1 << 20, clients_max: 256 };
+        let fixture = NodeFixture::new(limits);
         let start = |role: &'static str, arguments: &[&str]| {
-            let say = say.clone();
-            let arguments: Vec<_> = arguments.iter().map(|&argument| argument.to_owned()).collect();
-            // Nobody hears it any more when the director has gone.
-            let performer = stage.start(role, &arguments, move |line| drop(say.send(line.to_owned())));
-            assert_eq!(answers.recv_timeout(DEADLINE).as_deref(), Ok("up"), "{role} comes up");
-            performer
+            let mut process = fixture.start(role, arguments);
+            process.expect("up");
+            process
         };
         let steady = vec![
             (ECHO, start("taker", &[ECHO])),
             (SINK, start("taker", &[SINK])),
             ("pinger", start("pinger", &[])),
         ];
-        let (dice, victims) = (Dice::new(plan.seed), (0..VICTIMS).map(|_| None).collect());
-        let mut cast = Self {
+        let (random, victims) = (SeededRandom::new(plan.seed), (0..VICTIMS).map(|_| None).collect());
+        let mut scenario = Self {
             plan,
-            stage,
+            fixture,
             steady,
-            answers,
             victims,
             understudies: Vec::new(),
             started: 0,
-            dice,
+            random,
             held_loans: 0,
             ended_by_themselves: 0,
         };
-        if cast.plan.yields {
+        if scenario.plan.yields {
             // Inherited by every process that this thread starts from now on.
             setpriority_process(None, 19).expect("anybody may be nicer");
         }
-        cast.fill();
-        cast
+        scenario.fill();
+        scenario
     }
 
-    /// Starts processes that wait for their place.
+    /// Starts processes that wait for their slot.
     fn prepare(&mut self, how_many: u32) {
         for _ in 0..how_many {
             self.started += 1;
             let (waits, holds) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
             let (says_it_waits, says_it_holds) = (waits.clone(), holds.clone());
-            let hear = move |line: &str| match line {
-                "waits" => says_it_waits.store(true, Ordering::Relaxed),
-                "holds" => says_it_holds.store(true, Ordering::Relaxed),
-                _ => panic!("no victim says {line:?}"),
+            let take = move |line: &str| {
+                match line {
+                    "waits" => says_it_waits.store(true, Ordering::Relaxed),
+                    "holds" => says_it_holds.store(true, Ordering::Relaxed),
+                    _ => panic!("no victim prints {line:?}"),
+                }
+                true
             };
-            let seed = (self.plan.seed ^ self.started).to_string();
-            let performer = self.stage.start("victim", &[VICTIMS.to_string(), seed], hear);
-            self.understudies.push(Victim { performer, waits, holds });
+            let [all, seed] =
+                [u64::from(VICTIMS), self.plan.seed ^ self.started].map(|number| number.to_string());
+            let process = self.fixture.start_with("victim", &[&all, &seed], take);
+            self.understudies.push(Victim { process, waits, holds });
         }
         until("all understudies wait", || {
             self.understudies.iter().all(|one| one.waits.load(Ordering::Relaxed)).then_some(())
         });
     }
 
-    /// Every place is taken.
+    /// Fills every slot.
     fn fill(&mut self) {
         self.prepare(VICTIMS.into());
         (0..VICTIMS).for_each(|place| self.take_place(place));
@@ -243,7 +245,7 @@ impl Cast {
 
     fn take_place(&mut self, place: u16) {
         let mut victim = self.understudies.pop().expect("as many were started as end");
-        victim.performer.tell(&place.to_string());
+        victim.process.send_line(&place.to_string());
         self.victims[usize::from(place)] = Some(victim);
     }
 
@@ -255,37 +257,38 @@ impl Cast {
     }
 
     fn end(&mut self, place: u16, how: End) {
-        let Some(Victim { performer, holds, .. }) = self.victims[usize::from(place)].take() else { return };
+        let Some(Victim { mut process, holds, .. }) = self.victims[usize::from(place)].take() else { return };
         match how {
             End::Killed => {
-                self.ended_by_themselves += u32::from(!performer.kill());
+                self.ended_by_themselves += u32::from(!process.kill());
                 self.held_loans += u32::from(holds.load(Ordering::Relaxed));
             }
-            End::InOrder => self.ended_by_themselves += u32::from(!performer.end().success()),
+            End::InOrder => self.ended_by_themselves += u32::from(!process.stop().success()),
         }
     }
 
-    /// One segment: each process ends at any instant of its part of the time, and another one takes its place at once.
+    /// Runs one segment: each process ends at a random instant of its interval, and another one takes its
+    /// slot at once.
     fn measure(&mut self, part: Part, times: u32) {
         self.tell_pinger(&format!("measure {}", part as usize));
         let (began, spacing) = (Instant::now(), self.plan.spacing);
         for time in 0..times {
-            let instant = spacing * time + self.dice.time_below(spacing);
+            let instant = spacing * time + self.random.time_below(spacing);
             thread::sleep((began + instant).saturating_duration_since(Instant::now()));
             let Some(how) = part.ends() else { continue };
-            let place = self.dice.below(VICTIMS.into()) as u16;
+            let place = self.random.below(VICTIMS.into()) as u16;
             if time % HOLDS_EACH == HOLDS_EACH - 1 && matches!(how, End::Killed) {
                 self.wait_until_it_holds(place);
             }
             self.end(place, how);
             self.take_place(place);
         }
-        // What the last one has left is felt here, and not in the next segment.
+        // Effects of the last end must fall into this segment, not into the next one.
         thread::sleep((began + spacing * (times + 1)).saturating_duration_since(Instant::now()));
         self.tell_pinger("rest");
     }
 
-    /// All segments.
+    /// Runs all segments.
     fn measure_all(&mut self) {
         let mut left = self.plan.kills;
         for round in 0_usize.. {
@@ -309,27 +312,32 @@ impl Cast {
     }
 
     fn tell_pinger(&mut self, order: &str) {
-        self.steady.last_mut().expect("it is the pinger").1.tell(order);
+        self.pinger().send_line(order);
     }
 
-    /// What the pinger measured in these parts.
+    fn pinger(&mut self) -> &mut NodeProcess {
+        &mut self.steady.last_mut().expect("it is the pinger").1
+    }
+
+    /// Measurements of the pinger in these parts.
     fn window(&mut self, parts: &[Part]) -> Window {
         let parts: Vec<_> = parts.iter().map(|part| (*part as usize).to_string()).collect();
-        self.tell_pinger(&format!("window {}", parts.join(" ")));
-        Window::read(&self.answers.recv_timeout(DEADLINE).expect("the pinger answers"))
+        Window::read(&self.pinger().ask(&format!("window {}", parts.join(" "))))
     }
 
-    /// What everybody holds who lives on, when all victims are gone.
-    fn held_at_rest(&mut self, before: Option<&[Held]>) -> Vec<Held> {
+    /// The resources of all surviving processes once all victims are gone.
+    fn held_at_rest(&mut self, before: Option<&[Resources]>) -> Vec<Resources> {
         (0..VICTIMS).for_each(|victim| self.end(victim, End::Killed));
-        let processes: Vec<u32> =
-            [self.stage.node_id()].into_iter().chain(self.steady.iter().map(|(_, one)| one.id())).collect();
-        let now = || -> Vec<Held> { processes.iter().map(|process| Held::of(*process)).collect() };
+        let processes: Vec<u32> = [self.fixture.node().id()]
+            .into_iter()
+            .chain(self.steady.iter().map(|(_, one)| one.id()))
+            .collect();
+        let now = || -> Vec<Resources> { processes.iter().map(|process| Resources::of(*process)).collect() };
         let end = Instant::now() + DEADLINE;
-        let is_back = |now: &[Held]| {
+        let is_back = |now: &[Resources]| {
             before.is_none_or(|before| now.iter().zip(before).all(|(now, before)| now.is_back_at(before)))
         };
-        // Links that are being made or ended count as neither.
+        // Samples until stable, so that links being made or closed do not count.
         let mut last = Vec::new();
         until("nobody holds more or less than before", || {
             thread::sleep(Duration::from_millis(300));
@@ -345,44 +353,55 @@ impl Cast {
     }
 
     fn files(&self) -> BTreeSet<PathBuf> {
-        files_of_the_host().into_iter().chain(self.stage.files()).collect()
+        files_of_the_host().into_iter().chain(self.fixture.files()).collect()
     }
 }
 
-/// Kills processes and says what that left.
+/// Kills processes and reports the effects.
 ///
 /// # Panics
-/// If one does not start, or those that are not killed end.
+/// If a process does not start, or one that was not killed exits.
 #[must_use]
 pub fn run(plan: Plan) -> Report {
     let (kills, spacing) = (plan.kills, plan.spacing);
-    let mut cast = Cast::new(plan);
-    cast.prepare(WARM_UP);
-    cast.measure(Part::Killed, WARM_UP);
-    let before = cast.held_at_rest(None);
-    let files = cast.files();
-    cast.fill();
-    cast.tell_pinger("forget");
+    let mut scenario = Scenario::new(plan);
+    scenario.prepare(WARM_UP);
+    scenario.measure(Part::Killed, WARM_UP);
+    let before = scenario.held_at_rest(None);
+    let files = scenario.files();
+    scenario.fill();
+    scenario.tell_pinger("forget");
 
-    cast.held_loans = 0;
+    scenario.held_loans = 0;
     let began = Instant::now();
-    cast.measure_all();
-    let (seconds, held_loans) = (began.elapsed().as_secs_f64(), cast.held_loans);
-    let halves = [Part::NobodyEnds, Part::NobodyEndsEither].map(|part| cast.window(&[part]));
+    scenario.measure_all();
+    let (seconds, held_loans) = (began.elapsed().as_secs_f64(), scenario.held_loans);
+    let halves = [Part::NobodyEnds, Part::NobodyEndsEither].map(|part| scenario.window(&[part]));
     let windows = [&[Part::NobodyEnds, Part::NobodyEndsEither][..], &[Part::InOrder], &[Part::Killed]];
-    let windows = windows.map(|parts| cast.window(parts));
-    let ended_by_themselves = cast.ended_by_themselves;
+    let windows = windows.map(|parts| scenario.window(parts));
+    let ended_by_themselves = scenario.ended_by_themselves;
 
-    let after = cast.held_at_rest(Some(&before));
-    let left = cast.files().difference(&files).cloned().collect();
-    let names = ["node"].into_iter().chain(cast.steady.iter().map(|(name, _)| *name));
+    let after = scenario.held_at_rest(Some(&before));
+    let left = scenario.files().difference(&files).cloned().collect();
+    let names = ["node"].into_iter().chain(scenario.steady.iter().map(|(name, _)| *name));
     let held = names.zip(before.into_iter().zip(after)).map(|(name, (before, after))| (name, before, after));
     let held = held.collect();
-    // The one that asks first.
-    for (who, performer) in cast.steady.into_iter().rev() {
-        let status = performer.end();
-        assert!(status.success(), "{who} ended with {status}");
+    // The requesting client ends first.
+    for (role, process) in scenario.steady.into_iter().rev() {
+        let status = process.stop();
+        assert!(status.success(), "{role} ended with {status}");
     }
-    cast.stage.end();
+    scenario.fixture.end();
     Report { kills, seconds, held_loans, ended_by_themselves, held, windows, halves, spacing, left }
+}
+
+/// Files that outlive the process that made them: named shared memory, and Sinew's temporary files.
+fn files_of_the_host() -> BTreeSet<PathBuf> {
+    let list = |path: &str| fs::read_dir(path).into_iter().flatten().flatten().map(|entry| entry.path());
+    let is_ours = |path: &PathBuf| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        // Other tests of this run have directories of their own.
+        name.contains("sinew") && !name.starts_with("sinew-test-")
+    };
+    list("/dev/shm").chain(list("/tmp").filter(is_ours)).collect()
 }

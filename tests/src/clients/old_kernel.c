@@ -1,5 +1,5 @@
-/* A kernel before 6.16, for who decides over descriptors on a socket: SO_PASSRIGHTS is not known. Loaded before the C library
- * (LD_PRELOAD). Every other option is as it is. */
+/* Emulates a kernel before 6.16 that does not know the socket option SO_PASSRIGHTS. Loaded before the C library (LD_PRELOAD).
+ * All other options stay unchanged. */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <sys/socket.h>

@@ -1,4 +1,4 @@
-//! The role of one that is stopped: says of each message that it gets which one it was.
+//! The role of a process that is stopped: reports the number of each message that it receives.
 
 use std::{
     sync::{
@@ -12,27 +12,27 @@ use std::{
 use sinew::{Endpoint, NodeApi, Payload as _};
 
 use super::{
+    commands, print_line,
     registration::{register, wishes},
-    say, told,
 };
-use crate::puppet::{Job, Order, Value};
+use sinew_testkit::scripted::{Job, Order, Value};
 
 /// `SOCKET NAME`
-pub(super) fn play(arguments: &[String]) {
-    let api = NodeApi::connect(&arguments[0]).expect("the door is open");
+pub(super) fn run(arguments: &[String]) {
+    let api = NodeApi::connect(&arguments[0]).expect("the node accepts clients");
     let endpoint = register(&api, &wishes().name(&*arguments[1]));
     let over = Arc::new(AtomicBool::new(false));
     let ends = over.clone();
     let recorder = thread::spawn(move || record(endpoint, &ends));
-    say(&"up");
-    told().for_each(drop);
+    print_line(&"up");
+    commands().for_each(drop);
     over.store(true, Ordering::Relaxed);
-    recorder.join().expect("the node lives as long as this");
+    recorder.join().expect("the node outlives this process");
 }
 
 fn record(mut endpoint: Endpoint, over: &AtomicBool) {
     while !over.load(Ordering::Relaxed) {
-        let Some(received) = endpoint.receive(Duration::from_millis(100)).expect("the node lives") else {
+        let Some(received) = endpoint.receive(Duration::from_millis(100)).expect("the node is alive") else {
             continue;
         };
         let unreadable = "the test sends nothing else";
@@ -40,12 +40,12 @@ fn record(mut endpoint: Endpoint, over: &AtomicBool) {
             Job::KIND => ("bulk", received.decode::<Job>().expect(unreadable).number),
             Value::KIND => ("stream", received.decode::<Value>().expect(unreadable).number),
             Order::KIND => ("control", received.decode::<Order>().expect(unreadable).number),
-            // Bytes laid out by the test: a number, and many more.
+            // Bytes laid out by the test: a number, followed by filler.
             _ => {
                 let number = received.bytes().first_chunk().copied().map(u64::from_le_bytes);
                 ("load", number.expect(unreadable))
             }
         };
-        say(&format!("{class} {number}"));
+        print_line(&format!("{class} {number}"));
     }
 }

@@ -1,4 +1,4 @@
-//! An address for a process of the cast.
+//! Addresses for the processes of the scenario.
 
 use std::{
     thread,
@@ -10,9 +10,10 @@ use sinew::{
     client::{ApiError, Transport},
 };
 
-use crate::DEADLINE;
+use sinew_testkit::DEADLINE;
 
-/// The environment's word for what carries messages: `socket`, `ring`, or `direct` (rings, and direct links); else what is usual.
+/// The environment variable that selects the transport: `socket`, `ring`, or `direct` (rings and direct
+/// links). Without it the default applies.
 const TRANSPORT: &str = "SINEW_TEST_TRANSPORT";
 
 /// The fixed address number `index`.
@@ -20,8 +21,8 @@ pub(super) fn address(index: u16) -> AppAddress {
     AppAddress::fixed(u32::from(index)).expect("the range is wide")
 }
 
-/// What every process of the cast asks for, if it asks for nothing else. Its stall timeout is long: where there are more threads
-/// than processors, a node that is not run for a second hangs as little as its clients do.
+/// The common registration of all processes of the scenario. The stall timeout is long: with more
+/// threads than CPUs, a node that is not scheduled for a second is not hung, and neither are its clients.
 pub(super) fn wishes() -> Registration {
     let registration = Registration::new().stall_timeout(DEADLINE);
     match std::env::var(TRANSPORT).as_deref() {
@@ -33,10 +34,10 @@ pub(super) fn wishes() -> Registration {
     }
 }
 
-/// Registers; an address that a killed life has is there for this one when the node has seen that death.
+/// Registers. An address held by a killed incarnation becomes free once the node has noticed the death.
 ///
 /// # Panics
-/// If it is not there in time.
+/// If it does not become free in time.
 pub(super) fn register(api: &NodeApi, registration: &Registration) -> Endpoint {
     let until = Instant::now() + DEADLINE;
     loop {

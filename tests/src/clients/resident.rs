@@ -1,5 +1,5 @@
-//! Posters that live in the node's own process, as ordinary applications. They do not wait for one outcome before they ask
-//! for the next.
+//! Posters that are ordinary applications in the node's own process. They send further confirmed messages
+//! while earlier outcomes are pending.
 
 use std::{collections::BTreeMap, time::Duration};
 
@@ -8,22 +8,22 @@ use sinew::prelude::*;
 use super::{
     entry::{Entry, Poster, Way},
     poster::{Card, Parcel, Wire, body, is_posting, within},
+    print_line,
     registration::address,
-    say,
 };
-use crate::{DEADLINE, dice::Dice};
+use sinew_testkit::{DEADLINE, random::SeededRandom};
 
 /// Time between two turns of a poster.
 const TURN: Duration = Duration::from_millis(10);
-/// Outcomes that it waits for at a time, at most.
+/// Maximum number of pending outcomes.
 const WAITS_MAX: usize = 32;
 
-/// The poster `me` of so many.
+/// The poster `me` of `all`.
 pub(super) fn app(me: Poster, all: Poster, seed: u64) -> AppSpec<Resident> {
     let make = move || Resident {
         me,
         all,
-        dice: Dice::new(seed ^ u64::from(me) << 40),
+        random: SeededRandom::new(seed ^ u64::from(me) << 40),
         numbers: BTreeMap::new(),
         waits: 0,
         is_quiet: false,
@@ -33,7 +33,7 @@ pub(super) fn app(me: Poster, all: Poster, seed: u64) -> AppSpec<Resident> {
         .handles::<Wire>()
         .handles::<Card>()
         .handles::<Parcel>()
-        // The director may be slow to hear what it tells.
+        // The scenario may be slow to read its output.
         .progress_within(DEADLINE)
         .place(Place::thread(format!("posters {}", me % 2)))
 }
@@ -41,7 +41,7 @@ pub(super) fn app(me: Poster, all: Poster, seed: u64) -> AppSpec<Resident> {
 pub(super) struct Resident {
     me: Poster,
     all: Poster,
-    dice: Dice,
+    random: SeededRandom,
     numbers: BTreeMap<Way, u64>,
     waits: usize,
     is_quiet: bool,
@@ -51,14 +51,14 @@ impl Actor for Resident {
     type Context = AppContext<Self>;
 
     fn started(&mut self, context: &mut Self::Context) {
-        self.tell(&Entry::Up(Time::now()));
+        self.report(&Entry::Up(Time::now()));
         context.every(TURN, |this, _, context| this.take_turn(context));
     }
 }
 
 impl Resident {
-    fn tell(&self, entry: &Entry) {
-        say(&format!("{} {entry}", self.me));
+    fn report(&self, entry: &Entry) {
+        print_line(&format!("{} {entry}", self.me));
     }
 
     fn take_turn(&mut self, context: &mut AppContext<Self>) {
@@ -69,12 +69,12 @@ impl Resident {
             }
         } else if self.waits == 0 && !self.is_quiet {
             self.is_quiet = true;
-            self.tell(&Entry::Quiet);
+            self.report(&Entry::Quiet);
         }
     }
 
     fn next(&mut self, class: Class, context: &AppContext<Self>) -> (Way, Tid, u64) {
-        let other = (self.me + 1 + self.dice.below(u32::from(self.all) - 1) as Poster) % self.all;
+        let other = (self.me + 1 + self.random.below(u32::from(self.all) - 1) as Poster) % self.all;
         let way = Way { to: other, class };
         let number = self.numbers.entry(way).or_default();
         *number += 1;
@@ -82,17 +82,17 @@ impl Resident {
     }
 
     fn send_one(&mut self, context: &AppContext<Self>) {
-        let class = [Class::Control, Class::Stream, Class::Bulk][self.dice.below(3) as usize];
+        let class = [Class::Control, Class::Stream, Class::Bulk][self.random.below(3) as usize];
         let (way, tid, number) = self.next(class, context);
-        let (life, body) = (1, body(&mut self.dice, number));
-        self.tell(&Entry::Sends(way, number, 1, Time::now()));
+        let (incarnation, body) = (1, body(&mut self.random, number));
+        self.report(&Entry::Sends(way, number, 1, Time::now()));
         let sent = match class {
-            Class::Control => context.send(tid, &Wire { life, number, body }),
-            Class::Stream => context.send(tid, &Card { life, number, body }),
-            Class::Bulk => context.send(tid, &Parcel { life, number, body }),
+            Class::Control => context.send(tid, &Wire { incarnation, number, body }),
+            Class::Stream => context.send(tid, &Card { incarnation, number, body }),
+            Class::Bulk => context.send(tid, &Parcel { incarnation, number, body }),
         };
         if sent.is_err() {
-            self.tell(&Entry::NotSent(way, number));
+            self.report(&Entry::NotSent(way, number));
         }
     }
 
@@ -100,32 +100,34 @@ impl Resident {
         if self.waits >= WAITS_MAX {
             return;
         }
-        let class = if self.dice.once_in(2) { Class::Control } else { Class::Bulk };
+        let class = if self.random.once_in(2) { Class::Control } else { Class::Bulk };
         let (way, tid, number) = self.next(class, context);
-        let (life, body, within) = (1, body(&mut self.dice, number), within(&mut self.dice));
-        self.tell(&Entry::Asks(way, number, Time::now()));
+        let (incarnation, body, within) = (1, body(&mut self.random, number), within(&mut self.random));
+        self.report(&Entry::Asks(way, number, Time::now()));
         let asked = if class == Class::Control {
-            context.message(tid, &Wire { life, number, body }).confirmed(within)
+            context.message(tid, &Wire { incarnation, number, body }).confirmed(within)
         } else {
-            context.message(tid, &Parcel { life, number, body }).confirmed(within)
+            context.message(tid, &Parcel { incarnation, number, body }).confirmed(within)
         };
-        let Ok(confirmation) = asked else { return self.tell(&Entry::NotSent(way, number)) };
+        let Ok(confirmation) = asked else { return self.report(&Entry::NotSent(way, number)) };
         self.waits += 1;
         let wait = confirmation.into_actor(self).map(move |outcome, this: &mut Self, _: &mut _| {
             this.waits -= 1;
-            this.tell(&Entry::Outcome(way, number, outcome));
+            this.report(&Entry::Outcome(way, number, outcome));
         });
         context.spawn(wait);
     }
 
-    /// Says that it has it in its hand; whether to refuse it.
-    fn note(&mut self, from: Tid, class: Class, (life, number): (u32, u64), body: &[u8]) -> bool {
+    /// Reports that it has received the message. Returns whether to refuse it.
+    fn note(&mut self, from: Tid, class: Class, (incarnation, number): (u32, u64), body: &[u8]) -> bool {
         let from = (from.app.bits() - address(0).bits()) as Poster;
         if body.iter().any(|byte| *byte != number as u8) {
-            self.tell(&Entry::Broken(format!("{number} of {from} in life {life} has other bytes")));
+            self.report(&Entry::Broken(format!(
+                "{number} of {from} in incarnation {incarnation} has other bytes"
+            )));
         }
-        self.tell(&Entry::Got(from, life, class, number));
-        self.dice.once_in(16)
+        self.report(&Entry::Got(from, incarnation, class, number));
+        self.random.once_in(16)
     }
 }
 
@@ -135,7 +137,7 @@ macro_rules! handles {
             type Result = ();
 
             fn handle(&mut self, letter: Delivery<$type>, context: &mut Self::Context) {
-                let which = (letter.life, letter.number);
+                let which = (letter.incarnation, letter.number);
                 if self.note(letter.source, Class::$class, which, &letter.body) {
                     context.reject();
                 }

@@ -1,10 +1,12 @@
-//! The roles of those who are not to feel what happens to others: one that asks at a steady pace and measures, one that
-//! answers, and one that takes what comes.
+//! Roles that must stay unaffected by the others: one sends requests at a steady pace and measures, one
+//! answers, and one only receives.
 
+use sinew_runtime::lock;
+use sinew_testkit::numbers;
 use std::{
     fmt,
     sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
+        Arc, Mutex,
         atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     thread,
@@ -14,44 +16,44 @@ use std::{
 use sinew::{Endpoint, NodeApi, Payload as _, client::ApiError};
 
 use super::{
-    heir,
+    commands, fd_holder, print_line,
     registration::{register, wishes},
-    say, told,
 };
-use crate::{DEADLINE, puppet::Order};
+use sinew_testkit::{DEADLINE, scripted::Order};
 
-/// The name of the one that answers.
+/// The name of the process that answers.
 pub(super) const ECHO: &str = "echo";
-/// The name of the one that takes what comes.
+/// The name of the process that only receives.
 pub(super) const SINK: &str = "sink";
 
-/// Time between two questions.
+/// Time between two requests.
 const PACE: Duration = Duration::from_millis(1);
 
-/// How long answers took.
+/// Latencies of answers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Window {
-    /// Answers.
+    /// Number of answers.
     pub count: u64,
-    /// Questions without an answer when the scenario's deadline was over.
+    /// Requests without an answer within the scenario's deadline.
     pub failed: u64,
-    /// Half of the answers took no longer, in microseconds.
+    /// Median latency, in microseconds.
     pub p50_us: u64,
-    /// 99 of 100.
+    /// 99th percentile.
     pub p99_us: u64,
-    /// The longest.
+    /// Maximum.
     pub max_us: u64,
 }
 
 impl Window {
-    /// As it was said by the one that asks.
+    /// Parses the output of the measuring process.
     ///
     /// # Panics
-    /// If it was not.
+    /// If it is malformed.
     #[must_use]
     pub fn read(line: &str) -> Self {
-        let numbers: Vec<u64> = line.split_whitespace().map(|word| word.parse().expect("a number")).collect();
-        let [count, failed, p50_us, p99_us, max_us] = numbers[..] else { panic!("{line:?} is no window") };
+        let [count, failed, p50_us, p99_us, max_us] = numbers(line)[..] else {
+            panic!("{line:?} is no window")
+        };
         Self { count, failed, p50_us, p99_us, max_us }
     }
 }
@@ -63,12 +65,13 @@ impl fmt::Display for Window {
     }
 }
 
-/// Parts of a measurement that are told apart.
+/// Number of separately measured parts.
 pub(super) const PARTS: usize = 4;
-/// What takes longer is counted as this long: then only the longest is known exactly.
+/// Longer times count as this long; only the maximum is exact.
 const TIME_MAX_US: usize = 1 << 16;
 
-/// How many answers of one part took how many microseconds. Its memory does not grow with them: what the one that asks holds is counted.
+/// A histogram of one part, in microseconds. Its memory does not grow with the number of answers, because the
+/// memory of the measuring process is checked.
 #[derive(Clone, Debug)]
 struct Times {
     counts: Vec<u32>,
@@ -87,7 +90,7 @@ impl Times {
         self.max_us = self.max_us.max(us);
     }
 
-    /// What was measured in these parts together.
+    /// The measurements of these parts together.
     fn window(parts: &[&Self]) -> Window {
         let at = |us: usize| parts.iter().map(|part| u64::from(part.counts[us])).sum::<u64>();
         let count: u64 = (0..=TIME_MAX_US).map(at).sum();
@@ -105,11 +108,15 @@ impl Times {
     }
 }
 
-/// `SOCKET [NAME]`: asks the one of this name, directly where it can, or the echo. `measure PART`: what it asks from now on belongs to
-/// this part, at first to part 0; `rest`: to none. `window [PARTS]`: it says what it measured in these parts, else in part 0; `forget`: it
-/// begins anew with all.
-pub(super) fn play_pinger(arguments: &[String]) {
-    let api = NodeApi::connect(&arguments[0]).expect("the door is open");
+/// `SOCKET [NAME]`: sends requests to the process with this name, over a direct link if possible, or else to
+/// the echo. Commands:
+///
+/// - `measure PART`: the following requests belong to this part (initially part 0)
+/// - `rest`: the following requests belong to no part
+/// - `window [PARTS]`: prints the measurements of these parts, by default of part 0
+/// - `forget`: clears all parts
+pub(super) fn run_pinger(arguments: &[String]) {
+    let api = NodeApi::connect(&arguments[0]).expect("the node accepts clients");
     let (name, is_direct) = arguments.get(1).map_or((ECHO, false), |name| (&**name, true));
     let wishes = wishes().requires([name]);
     let mut endpoint = register(&api, &if is_direct { wishes.direct(true) } else { wishes });
@@ -131,7 +138,7 @@ pub(super) fn play_pinger(arguments: &[String]) {
                 }
                 Err(error) => {
                     eprintln!("question {number} after {took:?}: {error}");
-                    // Wherever it belongs: none may fail.
+                    // A failure counts in any part: there must be none.
                     measured[part.min(PARTS - 1)].failed += 1;
                 }
             }
@@ -139,8 +146,8 @@ pub(super) fn play_pinger(arguments: &[String]) {
             thread::sleep(PACE.saturating_sub(asked.elapsed()));
         }
     });
-    say(&"up");
-    for order in told() {
+    print_line(&"up");
+    for order in commands() {
         let mut words = order.split_whitespace();
         let word = words.next().unwrap_or_default();
         let parts: Vec<usize> = words.map(|part| part.parse().expect("the number of a part")).collect();
@@ -153,48 +160,44 @@ pub(super) fn play_pinger(arguments: &[String]) {
                 lock(&measured)[0] = Times::new();
             }
             "window" => say_window(&lock(&measured), &parts),
-            _ => panic!("the pinger is told {order:?}"),
+            _ => panic!("the pinger gets the order {order:?}"),
         }
     }
-}
-
-fn lock(measured: &Mutex<Vec<Times>>) -> MutexGuard<'_, Vec<Times>> {
-    measured.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn say_window(measured: &[Times], parts: &[usize]) {
     let parts: Vec<_> = parts.iter().map(|part| &measured[*part]).collect();
     let Window { count, failed, p50_us, p99_us, max_us } = Times::window(&parts);
-    say(&format!("{count} {failed} {p50_us} {p99_us} {max_us}"));
+    print_line(&format!("{count} {failed} {p50_us} {p99_us} {max_us}"));
 }
 
-/// `SOCKET NAME`: answers questions, and lets go of everything else. Leaves a child behind if it is told to (`fork`).
-pub(super) fn play_taker(arguments: &[String]) {
-    let api = NodeApi::connect(&arguments[0]).expect("the door is open");
+/// `SOCKET NAME`: answers requests, and drops everything else. Leaves a child behind on the command `fork`.
+pub(super) fn run_taker(arguments: &[String]) {
+    let api = NodeApi::connect(&arguments[0]).expect("the node accepts clients");
     let endpoint = register(&api, &wishes().direct(true).name(&*arguments[1]));
     let over = Arc::new(AtomicBool::new(false));
     let ends = over.clone();
     let taker = thread::spawn(move || take(endpoint, &ends));
-    say(&"up");
-    for order in told() {
+    print_line(&"up");
+    for order in commands() {
         assert_eq!(order, "fork");
-        say(&format!("forked {}", heir::fork()));
+        print_line(&format!("forked {}", fd_holder::fork()));
     }
     over.store(true, Ordering::Relaxed);
-    taker.join().expect("the node lives as long as this");
+    taker.join().expect("the node outlives this process");
 }
 
 fn take(mut endpoint: Endpoint, over: &AtomicBool) {
     while !over.load(Ordering::Relaxed) {
         let received = match endpoint.receive(Duration::from_millis(100)) {
             Ok(Some(received)) => received,
-            // It comes back by itself when its node was replaced.
+            // It reconnects by itself after its node was replaced.
             Ok(None) | Err(ApiError::Disconnected(_)) => continue,
             Err(error) => panic!("{error}"),
         };
         if received.kind() == Order::KIND && received.wants_reply() {
-            let question: Order = received.decode().expect("whoever asks here asks so");
-            // Whoever asked may have been killed meanwhile.
+            let question: Order = received.decode().expect("each question here is an order");
+            // The requester may have been killed meanwhile.
             let _ = endpoint.reply(&received, &question);
         }
     }

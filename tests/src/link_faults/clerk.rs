@@ -1,27 +1,28 @@
-//! Writes down what was sent and got: rows of numbers, not each one.
+//! Notes sent and received messages, as ranges of numbers.
 
 use std::{
     collections::BTreeMap,
     io::Write,
-    sync::{Arc, Mutex, PoisonError},
+    sync::{Arc, Mutex},
 };
 
 use sinew::Class;
+use sinew_runtime::lock;
 
-use crate::history::{Note, Party, Station};
+use sinew_testkit::history::{Note, Party, Station};
 
-/// What one party writes down. Clones write in the same book.
+/// The notes of one party. Clones share the same notes.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Clerk(Arc<Mutex<Book>>);
 
-/// A row that may go on.
+/// A range that may grow.
 #[derive(Clone, Copy, Debug)]
 struct Row {
     first: u64,
     count: u64,
 }
 
-/// What the numbers of a row have in common.
+/// The common properties of the numbers in a range.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Column {
     Sent { to: Station, class: Class, asked: bool },
@@ -35,27 +36,27 @@ struct Book {
 }
 
 impl Clerk {
-    /// This message was sent.
+    /// Notes that this message was sent.
     pub(super) fn sent(&self, to: Station, class: Class, number: u64, asked: bool) {
         let other = Column::Sent { to, class, asked: !asked };
         self.with(|book| {
-            // What is read is in the order of the numbers.
+            // Lines are printed in the order of the numbers.
             book.close(other);
             book.add(Column::Sent { to, class, asked }, number);
         });
     }
 
-    /// This message was got. If its sender waits, everything is said at once.
+    /// Notes that this message was received. A confirmed message is printed at once, with all earlier notes.
     pub(super) fn got(&self, from: Party, class: Class, number: u64, is_awaited: bool) {
         self.with(|book| {
             book.add(Column::Got { from, class }, number);
             if is_awaited {
-                book.say();
+                book.report();
             }
         });
     }
 
-    /// This happened, after all that was written down before.
+    /// Adds a note after all earlier ones.
     pub(super) fn note(&self, note: Note) {
         self.with(|book| {
             book.close_all();
@@ -63,13 +64,13 @@ impl Clerk {
         });
     }
 
-    /// Says everything now.
-    pub(super) fn say(&self) {
-        self.with(Book::say);
+    /// Prints all notes now.
+    pub(super) fn report(&self) {
+        self.with(Book::report);
     }
 
     fn with(&self, act: impl FnOnce(&mut Book)) {
-        act(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner));
+        act(&mut lock(&self.0));
     }
 }
 
@@ -102,11 +103,12 @@ impl Book {
         columns.into_iter().for_each(|column| self.close(column));
     }
 
-    /// In whole lines, and before whoever waits for it goes on: a killed process has said what it has said.
-    fn say(&mut self) {
+    /// Writes complete lines, before the sender of a confirmed message continues: the notes of a killed
+    /// process are not lost.
+    fn report(&mut self) {
         self.close_all();
         let mut out = std::io::stdout().lock();
-        // Nobody listens: the director is gone, and this process soon too.
+        // The scenario is gone, and this process will soon be, too.
         let _ = out.write_all(self.text.as_bytes()).and_then(|()| out.flush());
         self.text.clear();
     }

@@ -1,24 +1,25 @@
-//! The role of a node: one application that sends at a rate and takes what comes.
+//! The role of a node: one application that sends at a rate and receives.
 
 use std::{
     io::BufRead,
     sync::{
-        Arc, Mutex, PoisonError,
+        Arc, Mutex,
         atomic::{AtomicU64, Ordering},
     },
     time::SystemTime,
 };
 
 use sinew::{Class, NodeHandle, Time, fault::Fault, prelude::*};
+use sinew_runtime::lock;
 
 use super::{
     clerk::Clerk,
     pacer::{Bulk, Control, Numbers, Pacer, Stream, filling, name, pattern},
 };
-use crate::{
+use sinew_testkit::{
     DEADLINE,
     history::{Note, Party, Station},
-    puppet::desk,
+    scripted::sender_app,
     until,
 };
 
@@ -30,11 +31,11 @@ struct Office {
     lulls: Arc<Lulls>,
     pattern: Arc<Vec<u8>>,
     length: usize,
-    /// Whether the peer's node is there, as far as this one was told.
+    /// Whether the peer's node is up, according to the notifications.
     is_peer_there: bool,
 }
 
-/// The longest time between two messages that came.
+/// The longest time between two received messages.
 #[derive(Debug, Default)]
 struct Lull {
     last: Mutex<Option<Time>>,
@@ -43,7 +44,7 @@ struct Lull {
 
 impl Lull {
     fn end(&self, now: Time) {
-        let last = self.last.lock().unwrap_or_else(PoisonError::into_inner).replace(now);
+        let last = lock(&self.last).replace(now);
         if let Some(last) = last {
             let lull = u64::try_from(now.since(last).as_nanos()).unwrap_or(u64::MAX);
             self.longest_ns.fetch_max(lull, Ordering::Relaxed);
@@ -51,7 +52,8 @@ impl Lull {
     }
 }
 
-/// The same of all messages, and of those of each class by itself: one that flows says nothing of another that stalls.
+/// The same for all messages, and for each class separately: a class that flows does not show that another
+/// one stalls.
 #[derive(Debug, Default)]
 struct Lulls {
     all: Lull,
@@ -60,13 +62,13 @@ struct Lulls {
 }
 
 impl Lulls {
-    /// One of this class came.
+    /// Records a message of this class.
     fn end(&self, class: Class, now: Time) {
         self.all.end(now);
         self.each[class as usize].end(now);
     }
 
-    /// The longest since this was asked last, in nanoseconds: of all, then of each class.
+    /// The longest times since the last call, in nanoseconds: of all, then of each class.
     fn take(&self) -> String {
         let all = std::iter::once(&self.all).chain(&self.each);
         let all = all.map(|lull| lull.longest_ns.swap(0, Ordering::Relaxed).to_string());
@@ -79,9 +81,9 @@ impl Actor for Office {
 }
 
 impl Office {
-    fn got(&self, (class, life, number): (Class, u32, u64), filled: &[u8], is_awaited: bool) {
+    fn got(&self, (class, incarnation, number): (Class, u32, u64), filled: &[u8], is_awaited: bool) {
         self.lulls.end(class, Time::now());
-        let from = Party { station: self.peer, life };
+        let from = Party { station: self.peer, incarnation };
         if filled != filling(&self.pattern, number, self.length) {
             self.clerk.note(Note::Damaged { from, class, number });
         }
@@ -97,7 +99,7 @@ impl Handler<Delivery<Bulk>> for Office {
     type Result = ();
 
     fn handle(&mut self, bulk: Delivery<Bulk>, _: &mut Self::Context) {
-        self.got((Class::Bulk, bulk.life, bulk.number), &bulk.filling, false);
+        self.got((Class::Bulk, bulk.incarnation, bulk.number), &bulk.filling, false);
     }
 }
 
@@ -105,7 +107,7 @@ impl Handler<Delivery<Stream>> for Office {
     type Result = ();
 
     fn handle(&mut self, stream: Delivery<Stream>, _: &mut Self::Context) {
-        self.got((Class::Stream, stream.life, stream.number), &stream.filling, false);
+        self.got((Class::Stream, stream.incarnation, stream.number), &stream.filling, false);
     }
 }
 
@@ -113,7 +115,7 @@ impl Handler<Delivery<Control>> for Office {
     type Result = ();
 
     fn handle(&mut self, control: Delivery<Control>, _: &mut Self::Context) {
-        self.got((Class::Control, control.life, control.number), &control.filling, control.asked);
+        self.got((Class::Control, control.incarnation, control.number), &control.filling, control.asked);
     }
 }
 
@@ -123,7 +125,7 @@ impl Handler<Delivery<NodeEvent>> for Office {
     fn handle(&mut self, event: Delivery<NodeEvent>, _: &mut Self::Context) {
         match event.payload {
             NodeEvent::NodeFound { .. } => self.is_peer_there = true,
-            // The office tells what becomes of messages, and waits for nobody who is only slow.
+            // The office only records outcomes, and a merely slow peer does not matter to it.
             NodeEvent::AppStalled { .. } | NodeEvent::AppResumed { .. } => {}
             NodeEvent::NodeLost { .. } => {
                 self.is_peer_there = false;
@@ -139,15 +141,15 @@ impl Handler<Delivery<NodeEvent>> for Office {
 }
 
 /// `CONFIGURATION STATION LIFE PEER FILLING`
-pub(super) fn play(arguments: &[String]) {
+pub(super) fn run(arguments: &[String]) {
     if std::env::var_os("RUST_LOG").is_some() {
         let filter = tracing_subscriber::EnvFilter::from_default_env();
         tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
     }
-    // A thousand panics would fill the terminal; their words are in each supervisor's log.
+    // Suppresses the messages of a thousand panics; they are in each supervisor's log.
     std::panic::set_hook(Box::new(|_| {}));
     let number = |at: usize| arguments[at].parse::<u64>().expect("a number");
-    let (station, life, peer) = (number(1) as Station, number(2) as u32, number(3) as Station);
+    let (station, incarnation, peer) = (number(1) as Station, number(2) as u32, number(3) as Station);
     let (clerk, numbers, lulls) =
         (Clerk::default(), Arc::new(Numbers::default()), Arc::new(Lulls::default()));
     let length = number(4) as usize;
@@ -165,16 +167,16 @@ pub(super) fn play(arguments: &[String]) {
         })
     };
     let office = office.handles::<Bulk>().handles::<Control>().handles::<Stream>().handles::<NodeEvent>();
-    let (desk, key) = desk("desk");
-    let config = NodeConfig::from_file(&arguments[0]).expect("the director's configuration");
-    let node = Node::builder(config.name.clone()).config(config).app(office.own_thread()).app(desk);
+    let (sender_app, key) = sender_app("sender");
+    let config = NodeConfig::from_file(&arguments[0]).expect("the scenario's configuration");
+    let node = Node::builder(config.name.clone()).config(config).app(office.own_thread()).app(sender_app);
     let node = node.start().expect("a node");
     node.handle().wait_until_running(DEADLINE).expect("it requires nothing");
-    serve(&node, Pacer { sender: key.sender(), clerk, numbers, to: peer, life, length }, &lulls);
+    serve(&node, Pacer { sender: key.sender(), clerk, numbers, to: peer, incarnation, length }, &lulls);
     node.stop();
 }
 
-/// Says where the node is, and does what it is told until it is told no more.
+/// Prints the address of the node, and executes commands until standard input closes.
 fn serve(node: &Node, pacer: Pacer, lulls: &Lulls) {
     let handle = node.handle();
     let address = |address: Option<std::net::SocketAddr>| address.expect("its layers are ready");
@@ -187,7 +189,7 @@ fn serve(node: &Node, pacer: Pacer, lulls: &Lulls) {
             ["rate", rate] => numbers.rate.store(rate.parse().expect("a number"), Ordering::Relaxed),
             ["panic"] => println!("ready {}", panic_gncl(&handle).as_nanos()),
             ["gap"] => println!("gap {}", lulls.take()),
-            ["say"] => clerk.say(),
+            ["report"] => clerk.report(),
             ["wall"] => println!("wall {}", wall_seconds()),
             ["queues"] => println!("queues {}", queues(&handle)),
             ["audit"] => {
@@ -197,16 +199,16 @@ fn serve(node: &Node, pacer: Pacer, lulls: &Lulls) {
             ["quiet"] => {
                 numbers.quiet.store(true, Ordering::Relaxed);
                 until("the pacer ends", || pacing.is_finished().then_some(()));
-                clerk.say();
+                clerk.report();
                 println!("quiet");
             }
-            _ => panic!("{line:?} is nothing that a node is told"),
+            _ => panic!("{line:?} is no command of a node"),
         }
     }
-    clerk.say();
+    clerk.report();
 }
 
-/// What stands in which queue of the node now, in words.
+/// The current queue lengths of the node, as text.
 fn queues(node: &NodeHandle) -> String {
     let queues = node.audit_here().entries.into_iter().filter_map(|entry| {
         let (place, waiting, under_way) = (entry.place, entry.account.waiting, entry.account.unacknowledged);
@@ -219,13 +221,13 @@ fn queues(node: &NodeHandle) -> String {
     if queues.is_empty() { "nothing waits".to_owned() } else { queues.join("; ") }
 }
 
-/// Seconds since 1970, as the wall clock says.
+/// Seconds since 1970, by the wall clock.
 #[expect(clippy::disallowed_methods, reason = "it is the very clock that is to jump")]
 pub(super) fn wall_seconds() -> u64 {
     SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).expect("it is later").as_secs()
 }
 
-/// GNCL panics; returns the time until it was ready again.
+/// Makes GNCL panic. Returns the time until it is ready again.
 fn panic_gncl(node: &NodeHandle) -> Duration {
     let lives = || node.lives("GNCL").expect("every node has it");
     let before = lives().readies;
@@ -240,7 +242,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_class_that_stalls_shows_though_the_others_flow() {
+    fn stalled_class_is_visible_while_others_flow() {
         let lulls = Lulls::default();
         for ms in 0..=30 {
             let now = Time::from_nanos(ms * 1_000_000);

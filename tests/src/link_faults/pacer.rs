@@ -1,32 +1,31 @@
-//! The thread that sends, a batch each millisecond: Bulk, Control, Stream, some of them confirmed.
+//! The thread that sends, a batch per millisecond: Bulk, Control, Stream, some of them confirmed.
 
 use std::{
-    collections::VecDeque,
-    pin::Pin,
     sync::{
         Arc,
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
-    task::{Context, Poll, Waker},
     time::{Duration, Instant},
 };
 
 use sinew::{
     Class,
-    message::{Confirmation, SendError, Sender},
+    message::{SendError, Sender},
     prelude::*,
 };
 
 use super::clerk::Clerk;
-use crate::{
+use sinew_testkit::PendingOutcomes;
+use sinew_testkit::scripted::reactor;
+use sinew_testkit::{
     DEADLINE,
     history::{Note, Station},
 };
 
 const TICK: Duration = Duration::from_millis(1);
-/// Of so many messages one is confirmed Control, one unconfirmed Control, one Stream; the others are Bulk.
+/// Of this many messages one is confirmed Control, one unconfirmed Control, one Stream; the others are Bulk.
 const SHARE: u64 = 20;
-/// How many of all messages are of this class, as a part of 1.
+/// The fraction of messages of this class.
 pub(super) const fn share(class: Class) -> f64 {
     let of_each = match class {
         Class::Control => 2,
@@ -36,42 +35,43 @@ pub(super) const fn share(class: Class) -> f64 {
     of_each as f64 / SHARE as f64
 }
 
-/// Confirmed messages under way at most.
+/// Maximum number of confirmed messages in flight.
 const WAITS_MAX: usize = 1_000;
-/// The time to live of what is confirmed: more than a run takes, so that each outcome is somebody's word and not the end of a wait.
+/// The time to live of confirmed messages: longer than a run, so that each outcome is a report and not a
+/// timeout.
 const OUTCOME_WITHIN: Duration = Duration::from_secs(3_600);
-/// What could not be sent for longer than this is not made up for.
+/// Messages that could not be sent for longer than this are not caught up on.
 const DEBT: Duration = Duration::from_millis(100);
-/// Longest filling of a message, in bytes.
+/// Maximum filler of a message, in bytes.
 pub(super) const FILLING_MAX: usize = 64 << 10;
 
 payload!("link.bulk", Bulk => #[derive(Debug)] pub(super) struct Bulk {
-    pub(super) life: u32,
+    pub(super) incarnation: u32,
     pub(super) number: u64,
     #[serde(with = "serde_bytes")]
     pub(super) filling: Vec<u8>,
 });
 payload!("link.control", Control => #[derive(Debug)] pub(super) struct Control {
-    pub(super) life: u32,
+    pub(super) incarnation: u32,
     pub(super) number: u64,
-    /// Whether its sender waits for its outcome.
+    /// Whether the sender waits for its outcome.
     pub(super) asked: bool,
     #[serde(with = "serde_bytes")]
     pub(super) filling: Vec<u8>,
 });
 payload!("link.stream", Stream => #[derive(Debug)] pub(super) struct Stream {
-    pub(super) life: u32,
+    pub(super) incarnation: u32,
     pub(super) number: u64,
     #[serde(with = "serde_bytes")]
     pub(super) filling: Vec<u8>,
 });
 
-/// Bytes of which a part fills each message, another one for each number.
+/// The pattern from which each message takes a part as filler, depending on its number.
 pub(super) fn pattern() -> Vec<u8> {
-    crate::dice::Dice::new(1).bytes(FILLING_MAX + 256)
+    sinew_testkit::random::SeededRandom::new(1).bytes(FILLING_MAX + 256)
 }
 
-/// What fills this message.
+/// The filler of this message.
 pub(super) fn filling(pattern: &[u8], number: u64, length: usize) -> &[u8] {
     let from = number as usize % 256;
     &pattern[from..from + length]
@@ -82,14 +82,14 @@ pub(super) fn name(station: Station) -> String {
     format!("party-{station}")
 }
 
-/// What the pacer and the application share.
+/// State shared by the pacer and the application.
 #[derive(Debug, Default)]
 pub(super) struct Numbers {
-    /// The last numbers of Control, Stream, Bulk that were handed over, or are just being.
+    /// The last numbers of Control, Stream, Bulk that were or are being handed over.
     tried: [AtomicU64; 3],
-    /// Messages a second.
+    /// Messages per second.
     pub(super) rate: AtomicU64,
-    /// No more is to be sent.
+    /// Stops sending.
     pub(super) quiet: AtomicBool,
 }
 
@@ -99,23 +99,23 @@ impl Numbers {
     }
 }
 
-/// Sends until it is told to be quiet, and returns when the last confirmed message has its outcome.
+/// Sends until it is told to stop, and returns when the last confirmed message has its outcome.
 pub(super) struct Pacer {
     pub(super) sender: Sender,
     pub(super) clerk: Clerk,
     pub(super) numbers: Arc<Numbers>,
     pub(super) to: Station,
-    pub(super) life: u32,
+    pub(super) incarnation: u32,
     pub(super) length: usize,
 }
 
 impl Pacer {
     pub(super) fn run(self) {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build();
-        let runtime = runtime.expect("a reactor with nothing but a timer");
+        let runtime = reactor();
         let _entered = runtime.enter();
         let name = name(self.to);
-        Work { pacer: self, name, pattern: pattern(), last: [0; 3], waiting: VecDeque::new() }.run();
+        Work { pacer: self, name, pattern: pattern(), last: [0; 3], waiting: PendingOutcomes::default() }
+            .run();
     }
 }
 
@@ -123,9 +123,9 @@ struct Work {
     pacer: Pacer,
     name: String,
     pattern: Vec<u8>,
-    /// The last numbers that were taken: of Control, Stream, Bulk.
+    /// The last numbers that were accepted: of Control, Stream, Bulk.
     last: [u64; 3],
-    waiting: VecDeque<(u64, Confirmation)>,
+    waiting: PendingOutcomes,
 }
 
 impl Work {
@@ -144,14 +144,14 @@ impl Work {
             std::thread::sleep(TICK);
         }
         let until = Instant::now() + DEADLINE;
-        // One that still waits then is written down as one without an outcome.
+        // A message that is still pending then is noted without an outcome.
         while !self.waiting.is_empty() && Instant::now() < until {
             self.look();
             std::thread::sleep(TICK);
         }
     }
 
-    /// Sends the next message; `false` if it was not taken and is to be sent again later, with the same number.
+    /// Sends the next message; `false` if it was not accepted and must be resent later with the same number.
     fn send(&mut self, count: u64) -> bool {
         let (class, asked) = match count % SHARE {
             0 => (Class::Control, true),
@@ -171,38 +171,31 @@ impl Work {
     }
 
     fn hand_over(&mut self, class: Class, number: u64, asked: bool) -> Result<(), SendError> {
-        let Pacer { sender, life, length, .. } = &self.pacer;
-        let (life, filling) = (*life, filling(&self.pattern, number, *length).to_vec());
+        let Pacer { sender, incarnation, length, .. } = &self.pacer;
+        let (incarnation, filling) = (*incarnation, filling(&self.pattern, number, *length).to_vec());
         let name = &*self.name;
         match class {
-            Class::Bulk => sender.send(name, &Bulk { life, number, filling }),
-            Class::Stream => sender.send(name, &Stream { life, number, filling }),
+            Class::Bulk => sender.send(name, &Bulk { incarnation, number, filling }),
+            Class::Stream => sender.send(name, &Stream { incarnation, number, filling }),
             Class::Control if asked => {
                 if self.waiting.len() >= WAITS_MAX {
                     return Err(SendError::TooManyWaits);
                 }
-                let control = Control { life, number, asked, filling };
+                let control = Control { incarnation, number, asked, filling };
                 let confirmation = sender.message(name, &control).confirmed(OUTCOME_WITHIN)?;
-                self.waiting.push_back((number, confirmation));
+                self.waiting.push(number, confirmation);
                 Ok(())
             }
-            Class::Control => sender.send(name, &Control { life, number, asked, filling }),
+            Class::Control => sender.send(name, &Control { incarnation, number, asked, filling }),
         }
     }
 
-    /// Takes the outcomes that have come, and says what was written down.
+    /// Records the outcomes that have arrived, and prints the notes.
     fn look(&mut self) {
-        let mut context = Context::from_waker(Waker::noop());
-        for _ in 0..self.waiting.len() {
-            let Some((number, mut confirmation)) = self.waiting.pop_front() else { break };
-            match Pin::new(&mut confirmation).poll(&mut context) {
-                Poll::Ready(outcome) => {
-                    let (to, class) = (self.pacer.to, Class::Control);
-                    self.pacer.clerk.note(Note::Ended { to, class, number, outcome });
-                }
-                Poll::Pending => self.waiting.push_back((number, confirmation)),
-            }
+        let (to, class) = (self.pacer.to, Class::Control);
+        for (number, outcome) in self.waiting.poll() {
+            self.pacer.clerk.note(Note::Ended { to, class, number, outcome });
         }
-        self.pacer.clerk.say();
+        self.pacer.clerk.report();
     }
 }

@@ -1,12 +1,11 @@
-//! Both nodes with the faulty network between them, as their director sees them.
+//! Both nodes with the faulty network between them, as their scenario sees them.
 
+use sinew_runtime::lock;
+use sinew_testkit::NodeProcess;
 use std::{
     net::{Ipv4Addr, SocketAddr},
     num::NonZeroU32,
-    sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
-        mpsc::{Receiver, SyncSender, sync_channel},
-    },
+    sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
@@ -25,90 +24,86 @@ use super::{
     trouble::Trouble,
     wall_clock::{self, JUMP, WallClock},
 };
-use crate::{
-    DEADLINE, OwnDirectory,
-    clients::Performer,
+use crate::role;
+use sinew_testkit::{
+    DEADLINE, TestDirectory,
     history::{Fault, History, Party, Station, Verdict},
+    network::{Counts, Cut, FaultyNetwork, Listener, Side},
     preload::Preload,
-    proxy::{Counts, Cut, Door, Proxy, Side},
     unique, until,
 };
 
-/// The one that sends most.
+/// The node that sends most.
 const FIRST: Station = 1;
-/// The other.
+/// The other node.
 const SECOND: Station = 2;
 
-/// The doors: to the second node's GNCL, to the first's, to the second's NDL, and to both GNCLs' datagrams at the places of the first two.
+/// The listeners of the network: to the second node's GNCL, to the first's, to the second's NDL, and to both
+/// GNCLs' datagrams, at the indices of the first two.
 const TO_SECOND: usize = 0;
 const TO_FIRST: usize = 1;
 const TO_SECOND_UDP: usize = 2;
 const TO_SECOND_STREAM: usize = 3;
 const TO_FIRST_STREAM: usize = 4;
-/// Longest wait for what lies behind a full queue that is carried piece by piece.
+/// Maximum wait for a message behind a full queue that is carried piece by piece.
 const BACKLOG_WITHIN: Duration = DEADLINE.saturating_mul(10);
-/// Between two looks at how far the messages are.
+/// Interval between two checks of the progress.
 const LOOK: Duration = Duration::from_millis(1);
-/// Where GNCL is reached, at an address that only this has.
+/// The port of GNCL, at an address that only this run has.
 const PORT: u16 = 6_912;
 
 type Shared = Arc<Mutex<History>>;
 
-fn lock(history: &Shared) -> MutexGuard<'_, History> {
-    history.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// One of the nodes, in the life that it is in.
+/// One of the nodes, in its current incarnation.
 struct Member {
     station: Station,
-    life: u32,
+    incarnation: u32,
     interface: Ipv4Addr,
-    performer: Performer,
-    /// Where it has one of its own.
+    process: NodeProcess,
+    /// Its wall clock, if it has one of its own.
     clock: Option<WallClock>,
-    answers: Receiver<String>,
 }
 
 pub(super) struct Pair {
     plan: Plan,
-    proxy: Proxy,
+    network: FaultyNetwork,
     history: Shared,
     members: [Member; 2],
-    directory: OwnDirectory,
-    /// Where wall clocks are to be set.
+    directory: TestDirectory,
+    /// The library for settable wall clocks, if they are needed.
     clocks: Option<Preload>,
     progress: Progress,
 }
 
 impl Pair {
-    /// Starts the nodes, and lets messages flow.
+    /// Starts the nodes and the traffic.
     pub(super) fn start(plan: &Plan) -> Self {
         let listen = SocketAddr::from(([127, 0, 0, 1], 0));
         let [second, first] = [(); 2].map(|()| SocketAddr::from((own_interface(), PORT)));
-        let door = |side, listen, datagrams| Door { side, listen, datagrams };
-        let doors = [
-            door(Side::Right, second, false),
-            door(Side::Left, first, false),
-            door(Side::Right, listen, true),
-            door(Side::Right, second, true),
-            door(Side::Left, first, true),
+        let listener = |side, listen, datagrams| Listener { side, listen, datagrams };
+        let listeners = [
+            listener(Side::Right, second, false),
+            listener(Side::Left, first, false),
+            listener(Side::Right, listen, true),
+            listener(Side::Right, second, true),
+            listener(Side::Left, first, true),
         ];
-        let proxy = Proxy::start(&doors, plan.seed).expect("ports on loopback");
+        let network = FaultyNetwork::start(&listeners, plan.seed).expect("ports on loopback");
         for side in [Side::Left, Side::Right] {
-            proxy.change(side, |faults| {
+            network.change(side, |faults| {
                 faults.one_flip_in = plan.one_flip_in.and_then(NonZeroU32::new);
             });
         }
-        let (history, directory) = (Shared::default(), OwnDirectory::new());
+        let (history, directory) = (Shared::default(), TestDirectory::new());
         let sets_clocks =
             plan.troubles.iter().any(|one| matches!(one, Trouble::ClockOn | Trouble::ClockBack));
         let clocks = sets_clocks.then(|| wall_clock::library(&directory.join("")));
         let members = [FIRST, SECOND].map(|station| {
             let interface = own_interface();
-            start((station, 1), interface, (plan, &proxy), (&history, &directory, clocks.as_ref()))
+            start((station, 1), interface, (plan, &network), (&history, &directory, clocks.as_ref()))
         });
         let progress = Progress::begin(plan.faults);
-        let mut pair = Self { plan: plan.clone(), proxy, history, members, directory, clocks, progress };
+        let mut pair = Self { plan: plan.clone(), network, history, members, directory, clocks, progress };
         [FIRST, SECOND].into_iter().for_each(|station| pair.begin(station));
         pair.wait_for_flow();
         pair
@@ -119,24 +114,25 @@ impl Pair {
     }
 
     fn party(&self, station: Station) -> Party {
-        Party { station, life: self.members[usize::from(station - FIRST)].life }
+        Party { station, incarnation: self.members[usize::from(station - FIRST)].incarnation }
     }
 
-    /// Messages flow from `station` as soon as it sees the other.
+    /// Starts the traffic from `station` as soon as it sees the other.
     fn begin(&mut self, station: Station) {
         let rate = if station == FIRST { self.plan.rate } else { self.plan.back_rate };
-        self.member(station).performer.tell(&format!("rate {rate}"));
+        self.member(station).process.send_line(&format!("rate {rate}"));
     }
 
-    /// The last number of this class that has come from `from`.
+    /// The last number of this class received from `from`.
     fn last_got(&self, (from, to, class): (Station, Station, Class)) -> u64 {
         lock(&self.history).last_got(self.party(from), to, class)
     }
 
-    /// Waits until messages that are sent after this come, both ways: those of each class at the second node, whose [gaps](Self::gaps) are
-    /// over then.
+    /// Waits until messages sent after this call arrive, both ways: at the second node those of each class,
+    /// so that its [gaps](Self::gaps) are over.
     ///
-    /// What is sent is written down a little later: what was under way then is less than what this waits for.
+    /// Sent messages are noted with a small delay. The numbers in flight at the call are fewer than the
+    /// margin added here.
     pub(super) fn wait_for_flow(&mut self) {
         let there = CLASSES.map(|class| (FIRST, SECOND, class));
         for way @ (from, to, class) in there.into_iter().chain([(SECOND, FIRST, Class::Bulk)]) {
@@ -150,22 +146,22 @@ impl Pair {
         }
     }
 
-    /// Waits until this number has come, for as long as any come: where connections end faster than they carry what is sent, as with many
-    /// flipped bits on a busy host, a full queue lies before it.
+    /// Waits until this number has arrived, as long as any messages arrive. If connections end faster than
+    /// they carry the traffic (as with many flipped bits on a busy host), a full queue precedes it.
     fn wait_to_get(&mut self, upto: u64, way: (Station, Station, Class)) {
         let (began, (from, to, class)) = (Instant::now(), way);
-        let (mut got, mut since, mut network) = (self.last_got(way), began, self.proxy.counts());
+        let (mut got, mut since, mut network) = (self.last_got(way), began, self.network.counts());
         while got < upto {
             let now = self.last_got(way);
             if now > got {
-                (got, since, network) = (now, Instant::now(), self.proxy.counts());
+                (got, since, network) = (now, Instant::now(), self.network.counts());
             }
             assert!(
                 since.elapsed() < DEADLINE && began.elapsed() < BACKLOG_WITHIN,
                 "{class:?} from {from} to {to}, {got} was got {:?} ago, and {upto} is waited for since {:?}; the network then and now:\n{network:?}\n{:?}",
                 since.elapsed(),
                 began.elapsed(),
-                self.proxy.counts()
+                self.network.counts()
             );
             if self.progress.is_due(Instant::now()) {
                 self.say_progress(&format!(
@@ -177,12 +173,12 @@ impl Pair {
         }
     }
 
-    /// The next fault strikes.
+    /// Records the next fault.
     pub(super) fn strikes(&mut self, trouble: Trouble) {
         self.progress.strikes(trouble);
     }
 
-    /// Says how far the run is. Both nodes are asked, so nothing else may be that they have not answered.
+    /// Prints the progress of the run. It queries both nodes, so no other query may be pending.
     fn say_progress(&mut self, waits_for: &str) {
         let way = |from, to, rate| {
             let (history, party) = (lock(&self.history), self.party(from));
@@ -192,10 +188,10 @@ impl Pair {
         };
         let ways = [way(FIRST, SECOND, self.plan.rate), way(SECOND, FIRST, self.plan.back_rate)];
         let queues = [FIRST, SECOND].map(|station| (station, self.member(station).ask("queues")));
-        eprintln!("{}", self.progress.say(Instant::now(), ways, waits_for, &queues));
+        eprintln!("{}", self.progress.line(Instant::now(), ways, waits_for, &queues));
     }
 
-    /// The longest times without a message at the second node since this was asked last, or since it was started.
+    /// The longest times without a message at the second node since the last call, or since its start.
     pub(super) fn gaps(&mut self) -> Gap {
         let nanos = self.member(SECOND).ask("gap");
         let gaps: Vec<_> = nanos.split_whitespace().map(|nanos| nanos.parse().expect("a number")).collect();
@@ -203,7 +199,7 @@ impl Pair {
         Gap { all: Duration::from_nanos(all), each: each.map(Duration::from_nanos) }
     }
 
-    /// Something happens. Returns when it is over.
+    /// Injects a fault, and returns when it is over.
     pub(super) fn suffer(&mut self, trouble: Trouble, hold: Duration) {
         match trouble {
             Trouble::Cut => self.cut(Cut::Reset),
@@ -214,9 +210,9 @@ impl Pair {
             Trouble::PartThere => self.hold(&[Side::Right], hold, |faults| faults.parted = true),
             Trouble::PartBack => self.hold(&[Side::Left], hold, |faults| faults.parted = true),
             Trouble::Freeze => {
-                self.member(SECOND).performer.freeze();
+                self.member(SECOND).process.pause();
                 std::thread::sleep(hold);
-                self.member(SECOND).performer.signal(Signal::CONT);
+                self.member(SECOND).process.signal(Signal::CONT);
             }
             Trouble::KillReceiver => self.replace(SECOND),
             Trouble::KillSender => self.replace(FIRST),
@@ -225,7 +221,7 @@ impl Pair {
         }
     }
 
-    /// The wall clocks of both nodes jump, and both see it.
+    /// Makes the wall clocks of both nodes jump, and waits until both have noticed.
     fn set_clocks(&mut self, jump: i64) {
         for member in &mut self.members {
             let clock = member.clock.as_mut().expect("it was made where clocks are to be set");
@@ -234,74 +230,75 @@ impl Pair {
             let seen: u64 = member.ask("wall").parse().expect("a number");
             assert!(
                 seen.abs_diff(right) <= DEADLINE.as_secs(),
-                "the clock says {seen} s, and was set to {right}"
+                "the clock shows {seen} s, and was set to {right}"
             );
         }
     }
 
     fn cut(&self, how: Cut) {
-        // One that is being made at this moment is not there yet.
-        until("there is a connection", || (self.proxy.counts().open > 0).then_some(()));
-        let before = self.proxy.counts();
-        self.proxy.cut(how);
+        // A connection being established is not counted yet.
+        until("there is a connection", || (self.network.counts().open > 0).then_some(()));
+        let before = self.network.counts();
+        self.network.cut(how);
         until("it is cut", || {
-            let now = self.proxy.counts();
+            let now = self.network.counts();
             (now.cut > before.cut || now.made > before.made).then_some(())
         });
     }
 
-    fn hold(&self, sides: &[Side], hold: Duration, change: impl Fn(&mut crate::proxy::Faults)) {
-        sides.iter().for_each(|side| self.proxy.change(*side, &change));
+    fn hold(&self, sides: &[Side], hold: Duration, change: impl Fn(&mut sinew_testkit::network::Faults)) {
+        sides.iter().for_each(|side| self.network.change(*side, &change));
         std::thread::sleep(hold);
         for side in sides {
-            self.proxy.change(*side, |faults| (faults.stalled, faults.parted) = (false, false));
+            self.network.change(*side, |faults| (faults.stalled, faults.parted) = (false, false));
         }
     }
 
-    /// Kills a node, and starts its next life. As on a host of its own, nobody listens in between.
+    /// Kills a node, and starts its next incarnation. As on a separate host, no process listens in between.
     fn replace(&mut self, station: Station) {
         let party = self.party(station);
-        self.proxy.refuse(true);
-        self.member(station).performer.kill_now();
+        self.network.refuse(true);
+        self.member(station).process.kill();
         lock(&self.history).killed(party);
         let interface = self.member(station).interface;
         let next = start(
-            (station, party.life + 1),
+            (station, party.incarnation + 1),
             interface,
-            (&self.plan, &self.proxy),
+            (&self.plan, &self.network),
             (&self.history, &self.directory, self.clocks.as_ref()),
         );
         *self.member(station) = next;
-        self.proxy.refuse(false);
+        self.network.refuse(false);
         self.begin(station);
     }
 
-    /// No more is sent; waits until what was sent has arrived, and says what became of everything.
+    /// Stops sending, waits until all messages have arrived, and returns the fates of all messages.
     pub(super) fn finish(mut self) -> (Verdict, Counts, Audit) {
         for side in [Side::Left, Side::Right] {
-            self.proxy.change(side, |faults| faults.one_flip_in = None);
+            self.network.change(side, |faults| faults.one_flip_in = None);
         }
-        self.members.iter_mut().for_each(|member| member.performer.tell("quiet"));
-        self.members.iter_mut().for_each(|member| drop(member.wait_for("quiet")));
+        self.members.iter_mut().for_each(|member| member.process.send_line("quiet"));
+        self.members.iter_mut().for_each(|member| drop(member.process.expect("quiet")));
         let end = Instant::now() + DEADLINE;
         let mut verdict = lock(&self.history).verdict();
-        // What is on its way counts as lost as long as it is.
+        // A message in flight counts as lost until it arrives.
         while verdict.count(Fault::Lost) > 0 && Instant::now() < end {
-            self.members.iter_mut().for_each(|member| member.performer.tell("say"));
+            self.members.iter_mut().for_each(|member| member.process.send_line("report"));
             std::thread::sleep(Duration::from_millis(100));
             verdict = lock(&self.history).verdict();
         }
         let audit = self.audit_once_quiet();
-        let network = self.proxy.counts();
+        let network = self.network.counts();
         for member in self.members {
-            let status = member.performer.end();
+            let status = member.process.stop();
             assert!(status.success(), "node {} ended with {status}", member.station);
         }
         (verdict, network, audit)
     }
 
-    /// What both nodes say of all messages, once none waits but perhaps the audit's own question and answer, which are Bulk, and no value is
-    /// under way: one that went by datagram, and whose place a newer one took, is so until its time is over.
+    /// The audit of both nodes, once no message waits other than the audit's own request and answer, which
+    /// are Bulk. No Stream value may be in flight either: a value sent by datagram and superseded by a newer
+    /// one counts as in flight until it expires.
     fn audit_once_quiet(&mut self) -> Audit {
         const OWN: u64 = 2;
         let first = self.member(FIRST);
@@ -326,23 +323,24 @@ impl Pair {
     }
 }
 
-/// A loopback address that no other test of this host has at the same time, but for one whose process's id is 4,096 further, or a multiple of that.
+/// A loopback address that no other test of this host has at the same time, except for a process with an id
+/// that differs by a multiple of 4,096.
 fn own_interface() -> Ipv4Addr {
     let [_, b, c, d] = unique().to_be_bytes();
-    // Any of them is a host's: the network's ends are not among these.
+    // Every such address is valid for a host: the network and broadcast addresses are not among them.
     Ipv4Addr::new(127, 64 | b & 63, c, d)
 }
 
 fn start(
-    (station, life): (Station, u32),
+    (station, incarnation): (Station, u32),
     interface: Ipv4Addr,
-    (plan, proxy): (&Plan, &Proxy),
-    (history, directory, clocks): (&Shared, &OwnDirectory, Option<&Preload>),
+    (plan, network): (&Plan, &FaultyNetwork),
+    (history, directory, clocks): (&Shared, &TestDirectory, Option<&Preload>),
 ) -> Member {
     let (announce, seeds) = if station == FIRST {
-        (proxy.address(TO_FIRST), format!("[\"{}\"]", proxy.address(TO_SECOND_UDP)))
+        (network.address(TO_FIRST), format!("[\"{}\"]", network.address(TO_SECOND_UDP)))
     } else {
-        (proxy.address(TO_SECOND), "[]".to_owned())
+        (network.address(TO_SECOND), "[]".to_owned())
     };
     let text = format!(
         "[node]\nname = \"node-{station}\"\nproject = \"link faults\"\nmailbox_capacity = 65536\n\
@@ -350,57 +348,43 @@ fn start(
          [ndl]\ninterface = \"{interface}\"\nmulticast = false\nmdns_port = false\nseeds = {seeds}\n\
          [supervision]\nlayer_restarts_max = 1000000\nlayer_window_ms = 10\n"
     );
-    let path = directory.join(&format!("node-{station}.toml"));
-    std::fs::write(&path, text).expect("the scenario's own directory");
+    let path = directory.write(&format!("node-{station}.toml"), &text);
     let arguments =
-        [u64::from(station), life.into(), u64::from(FIRST + SECOND - station), plan.filling as u64];
-    let arguments: Vec<String> =
-        [path.display().to_string()].into_iter().chain(arguments.map(|number| number.to_string())).collect();
-    let (say, answers) = sync_channel(64);
-    let (party, notes) = (Party { station, life }, history.clone());
-    let hear = move |line: &str| hear(party, &notes, &say, line);
-    // A new life's clock is right again.
-    let clock = clocks.map(|library| WallClock::new(library, &format!("clock-{station}-{life}")));
-    let environment: Vec<_> = clock.iter().flat_map(WallClock::environment).collect();
-    let performer = Performer::start_with(&plan.program, "node", &arguments, &environment, hear);
-    let member = Member { station, life, interface, performer, clock, answers };
-    let places = member.wait_for("up");
+        [u64::from(station), incarnation.into(), u64::from(FIRST + SECOND - station), plan.filling as u64];
+    let mut command = role("link-node");
+    command.arg(path).args(arguments.map(|number| number.to_string()));
+    let (party, notes) = (Party { station, incarnation }, history.clone());
+    let take = move |line: &str| {
+        let note = line.parse();
+        note.map(|note| lock(&notes).note(party, note)).is_ok()
+    };
+    // The clock of a new incarnation starts correct.
+    let clock = clocks.map(|library| WallClock::new(library, &format!("clock-{station}-{incarnation}")));
+    command.envs(clock.iter().flat_map(WallClock::environment));
+    let mut process = NodeProcess::start_with(&format!("node {station}"), command, take);
+    let places = process.expect("up");
+    let member = Member { station, incarnation, interface, process, clock };
     let places: Vec<SocketAddr> =
         places.split_whitespace().map(|place| place.parse().expect("an address")).collect();
     if station == FIRST {
-        proxy.lead(TO_FIRST, places[0]);
-        // The same port, as nobody else has this address.
-        proxy.lead(TO_FIRST_STREAM, places[0]);
+        network.set_destination(TO_FIRST, places[0]);
+        // The port can stay the same, because no other process has this address.
+        network.set_destination(TO_FIRST_STREAM, places[0]);
     } else {
-        proxy.lead(TO_SECOND, places[0]);
-        proxy.lead(TO_SECOND_STREAM, places[0]);
-        proxy.lead(TO_SECOND_UDP, places[1]);
+        network.set_destination(TO_SECOND, places[0]);
+        network.set_destination(TO_SECOND_STREAM, places[0]);
+        network.set_destination(TO_SECOND_UDP, places[1]);
     }
     member
 }
 
-fn hear(party: Party, history: &Shared, say: &SyncSender<String>, line: &str) {
-    match line.parse() {
-        Ok(note) => lock(history).note(party, note),
-        // Nobody waits for its answers any more when the director is done.
-        Err(_) => drop(say.send(line.to_owned())),
-    }
-}
-
 impl Member {
-    fn wait_for(&self, word: &str) -> String {
-        let answer = self.answers.recv_timeout(DEADLINE);
-        let answer = answer.unwrap_or_else(|_| panic!("node {} does not say {word:?}", self.station));
-        let rest = answer.strip_prefix(word);
-        rest.unwrap_or_else(|| panic!("{answer:?} instead of {word:?}")).trim().to_owned()
-    }
-
     fn ask(&mut self, question: &str) -> String {
         self.ask_as(question, question)
     }
 
     fn ask_as(&mut self, question: &str, answer: &str) -> String {
-        self.performer.tell(question);
-        self.wait_for(answer)
+        self.process.send_line(question);
+        self.process.expect(answer)
     }
 }

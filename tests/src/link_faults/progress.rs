@@ -1,5 +1,5 @@
-//! What a run says while it goes on: how far it is, and what stands in which queue, so that whoever looks on can tell a loaded machine from a
-//! link that stalls.
+//! Progress messages of a run: its position and the queue lengths. They show whether the machine is loaded or
+//! a link stalls.
 
 use std::{
     fmt::Write as _,
@@ -8,25 +8,25 @@ use std::{
 
 use super::trouble::Trouble;
 
-/// From one word to the next, at least.
+/// Minimum interval between two messages.
 const PERIOD: Duration = Duration::from_secs(10);
 
-/// One way of the link.
+/// One direction of the link.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Way {
-    /// Messages of class Bulk that were sent on it so far, by the sender's present life.
+    /// Bulk messages sent so far by the sender's current incarnation.
     pub(super) sent: u64,
-    /// The last of them that came.
+    /// The last of them that arrived.
     pub(super) got: u64,
-    /// Messages a second of all classes that are to be sent on it.
+    /// Messages per second, of all classes, that are to be sent.
     pub(super) rate: u64,
 }
 
-/// How far a run is.
+/// The progress of a run.
 #[derive(Debug)]
 pub(super) struct Progress {
     began: Instant,
-    said: Instant,
+    printed_at: Instant,
     before: [Way; 2],
     faults: u64,
     fault: u64,
@@ -34,32 +34,33 @@ pub(super) struct Progress {
 }
 
 impl Progress {
-    /// A run begins that has so many faults.
+    /// Starts a run with this many faults.
     pub(super) fn begin(faults: u64) -> Self {
         let now = Instant::now();
-        Self { began: now, said: now, before: [Way::default(); 2], faults, fault: 0, trouble: None }
+        Self { began: now, printed_at: now, before: [Way::default(); 2], faults, fault: 0, trouble: None }
     }
 
-    /// The next fault strikes.
+    /// Records the next fault.
     pub(super) const fn strikes(&mut self, trouble: Trouble) {
         self.fault += 1;
         self.trouble = Some(trouble);
     }
 
-    /// Whether it is time to say how far the run is.
+    /// Returns whether the next progress message is due.
     pub(super) fn is_due(&self, now: Instant) -> bool {
-        now.duration_since(self.said) >= PERIOD
+        now.duration_since(self.printed_at) >= PERIOD
     }
 
-    /// How far the run is: what went the two ways, for what it waits, and what stands in which queue of which node, as the nodes say.
-    pub(super) fn say(
+    /// Formats the progress: the traffic in both directions, the event that it waits for, and the queue
+    /// lengths reported by the nodes.
+    pub(super) fn line(
         &mut self,
         now: Instant,
         ways: [Way; 2],
         waits_for: &str,
         queues: &[(u16, String)],
     ) -> String {
-        let seconds = now.duration_since(self.said).as_secs_f64();
+        let seconds = now.duration_since(self.printed_at).as_secs_f64();
         let mut text = format!(
             "after {:.0} s: fault {} of {}{}",
             now.duration_since(self.began).as_secs_f64(),
@@ -72,7 +73,7 @@ impl Progress {
             .zip(ways.into_iter().zip(self.before))
             .filter(|(_, (way, _))| way.rate > 0)
         {
-            // A new life counts from 1.
+            // A new incarnation counts from 1.
             let each_second = |now: u64, before: u64| now.saturating_sub(before) as f64 / seconds;
             let _ = write!(
                 text,
@@ -88,7 +89,7 @@ impl Progress {
         for (station, queues) in queues {
             let _ = write!(text, "\n  node {station}: {queues}");
         }
-        (self.said, self.before) = (now, ways);
+        (self.printed_at, self.before) = (now, ways);
         text
     }
 }
@@ -98,13 +99,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_run_says_how_far_it_is_once_in_a_period_and_how_fast_it_went_since_the_last_word() {
+    fn progress_is_reported_per_period_with_rates() {
         let mut progress = Progress::begin(1_000);
         let begin = progress.began;
         progress.strikes(Trouble::Cut);
         assert!(!progress.is_due(begin) && progress.is_due(begin + PERIOD));
         let way = |sent, got, rate| Way { sent, got, rate };
-        let first = progress.say(begin + PERIOD, [way(850, 800, 100), way(0, 0, 0)], "number 860", &[]);
+        let first = progress.line(begin + PERIOD, [way(850, 800, 100), way(0, 0, 0)], "number 860", &[]);
         assert_eq!(
             first,
             "after 10 s: fault 1 of 1000 (cut); there Bulk 850 sent (85 a second; 100 of all classes are asked for), 800 delivered (80 a \
@@ -113,7 +114,7 @@ mod tests {
         assert!(!progress.is_due(begin + PERIOD));
         let queues = [(1, "nothing waits".to_owned())];
         let next =
-            progress.say(begin + 2 * PERIOD, [way(950, 950, 100), way(0, 0, 0)], "number 960", &queues);
+            progress.line(begin + 2 * PERIOD, [way(950, 950, 100), way(0, 0, 0)], "number 960", &queues);
         assert!(next.contains("950 sent (10 a second"), "{next}");
         assert!(next.ends_with("\n  node 1: nothing waits"), "{next}");
     }

@@ -1,4 +1,4 @@
-//! What was seen of a link to which things happened, as a table and as JSON.
+//! Results of a run with link faults, as a table and as JSON.
 
 use std::{collections::BTreeMap, fmt, time::Duration};
 
@@ -6,25 +6,26 @@ use serde_json::{Value, json};
 use sinew::{Class, audit::Audit};
 
 use super::{CLASSES, Plan, trouble::Trouble};
-use crate::{history::Verdict, load::Times, proxy::Counts};
+use sinew_testkit::report::Times;
+use sinew_testkit::{history::Verdict, network::Counts};
 
 /// The longest time without a message after one fault.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Gap {
-    /// Of whatever class.
+    /// Without a message of any class.
     pub(super) all: Duration,
-    /// Without one of each class, in the order of [`CLASSES`].
+    /// Without a message of each class, in the order of [`CLASSES`].
     pub(super) each: [Duration; 3],
 }
 
 impl Gap {
-    /// One that was the same for all.
+    /// The same gap for all classes.
     pub(super) const fn of_all(gap: Duration) -> Self {
         Self { all: gap, each: [gap; 3] }
     }
 }
 
-/// The longest times without a message, by what had happened.
+/// The longest times without a message, by kind of fault.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Gaps(BTreeMap<Trouble, Row>);
 
@@ -70,23 +71,23 @@ impl fmt::Display for Gaps {
     }
 }
 
-/// What was seen.
+/// The results.
 #[derive(Debug)]
 pub struct Report {
     pub(super) plan: Plan,
     pub(super) seconds: f64,
-    /// What became of the messages.
+    /// The fates of the messages.
     pub verdict: Verdict,
-    /// What the network did.
+    /// The counters of the network.
     pub network: Counts,
     pub(super) gaps: Gaps,
-    /// What the nodes themselves say of all messages, at the end.
+    /// The nodes' own audit of all messages, at the end.
     pub audit: Audit,
 }
 
 impl Report {
-    /// Nothing was lost in silence, double, out of order or told falsely; where no node was lost, everything arrived. And the nodes can
-    /// explain every message.
+    /// Returns whether no message was lost silently, duplicated, reordered or reported falsely. If no node
+    /// was lost, every message must have arrived. The nodes must be able to explain every message.
     #[must_use]
     pub fn holds(&self) -> bool {
         if self.audit.missing() > 0 {
@@ -99,7 +100,7 @@ impl Report {
         }
     }
 
-    /// One line for other programs.
+    /// Machine-readable output in one line.
     #[must_use]
     pub fn json(&self) -> Value {
         let Counts { made, cut, flips, lost, passed, .. } = self.network;
@@ -134,7 +135,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_kind_of_fault_has_a_figure_for_each_class() {
+    fn gaps_are_listed_by_fault_and_class() {
         let mut gaps = Gaps::default();
         let ms = Duration::from_millis;
         gaps.note(Trouble::Cut, Gap { all: ms(1), each: [ms(12), ms(3), ms(15)] });

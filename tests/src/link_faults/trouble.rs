@@ -1,38 +1,38 @@
-//! What can happen to a link.
+//! The kinds of link faults.
 
 use std::{fmt, str::FromStr};
 
-/// What can happen to the link between the first node, which sends most, and the second.
+/// A fault of the link between the first node, which sends most, and the second.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Trouble {
-    /// The connections are cut by RST.
+    /// Cuts the connections by RST.
     Cut,
-    /// The connections are cut by FIN.
+    /// Cuts the connections by FIN.
     Finish,
-    /// GNCL panics on the first node.
+    /// Makes GNCL panic on the first node.
     PanicSender,
-    /// GNCL panics on the second.
+    /// Makes GNCL panic on the second node.
     PanicReceiver,
-    /// Nothing passes for some time, both ways.
+    /// Blocks both directions for some time.
     Stall,
-    /// Nothing passes from the first to the second for some time; datagrams are lost.
+    /// Blocks the direction from the first to the second for some time; datagrams are lost.
     PartThere,
-    /// Nothing passes from the second to the first for some time; datagrams are lost.
+    /// Blocks the direction from the second to the first for some time; datagrams are lost.
     PartBack,
-    /// The second node's process is stopped for some time.
+    /// Stops the second node's process for some time.
     Freeze,
-    /// The second node's process is killed, and another one started.
+    /// Kills the second node's process, and starts another one.
     KillReceiver,
-    /// The first node's process is killed, and another one started.
+    /// Kills the first node's process, and starts another one.
     KillSender,
-    /// The wall clocks of both nodes are set a day on.
+    /// Sets the wall clocks of both nodes a day forward.
     ClockOn,
-    /// They are set a day back.
+    /// Sets them a day back.
     ClockBack,
 }
 
 impl Trouble {
-    /// All of them, with their names.
+    /// All variants, with their names.
     pub const ALL: [(&'static str, Self); 12] = [
         ("cut", Self::Cut),
         ("finish", Self::Finish),
@@ -48,7 +48,7 @@ impl Trouble {
         ("clock-back", Self::ClockBack),
     ];
 
-    /// Whether it ends no node and lasts for no time, so that every message must arrive.
+    /// Returns whether it ends no node and is instantaneous, so that every message must arrive.
     #[must_use]
     pub const fn is_short(self) -> bool {
         match self {

@@ -1,5 +1,5 @@
-/* A wall clock that a test sets: CLOCK_REALTIME, as a program gets it from its C library, is off by the seconds in the file that
- * SINEW_WALL_CLOCK names. Loaded before the C library (LD_PRELOAD). Every other clock is as it is. */
+/* A wall clock that a test can set: adds the seconds in the file named by SINEW_WALL_CLOCK to CLOCK_REALTIME, as the C library
+ * returns it. Loaded before the C library (LD_PRELOAD). All other clocks stay unchanged. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <fcntl.h>

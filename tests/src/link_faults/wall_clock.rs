@@ -1,6 +1,7 @@
-//! A wall clock of a process's own, which its director sets while it runs. Nobody else's clock changes, and it takes no privileges.
+//! A wall clock for a single process, set by its scenario at run time. No other clock changes, and no
+//! privileges are needed.
 //!
-//! The process loads a library before its C library's (`wall_clock.c`), which adds what stands in a file to CLOCK_REALTIME.
+//! The process preloads a library (`wall_clock.c`) that adds the content of a file to CLOCK_REALTIME.
 
 use std::{
     fs::File,
@@ -8,12 +9,12 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use crate::preload::Preload;
+use sinew_testkit::preload::Preload;
 
-/// How far one jump goes: a day, in seconds.
+/// Size of one jump: a day, in seconds.
 pub(super) const JUMP: i64 = 24 * 60 * 60;
 
-/// The library that a process with such a clock loads first, in `directory`.
+/// Compiles the library that a process with such a clock preloads, into `directory`.
 ///
 /// # Panics
 /// If there is no C compiler called `cc`.
@@ -27,12 +28,12 @@ pub(super) struct WallClock {
     library: PathBuf,
     path: PathBuf,
     file: File,
-    /// Seconds by which it is off.
+    /// Its offset in seconds.
     pub(super) off_by: i64,
 }
 
 impl WallClock {
-    /// A clock that is right; `name` is no other's.
+    /// A correct clock; `name` is unique.
     pub(super) fn new(library: &Preload, name: &str) -> Self {
         let path = library.path().with_file_name(name);
         let file = File::create(&path).expect("the scenario's own directory");
@@ -41,12 +42,12 @@ impl WallClock {
         clock
     }
 
-    /// What the process has in its environment.
+    /// The environment variables of the process.
     pub(super) fn environment(&self) -> [(&'static str, &Path); 2] {
         [(Preload::VARIABLE, &self.library), ("SINEW_WALL_CLOCK", &self.path)]
     }
 
-    /// It jumps by so many seconds.
+    /// Makes the clock jump by this many seconds.
     pub(super) fn jump(&mut self, seconds: i64) {
         self.off_by += seconds;
         self.write();

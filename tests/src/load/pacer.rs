@@ -1,29 +1,34 @@
-//! A thread that sends at a rate, a batch each millisecond: Bulk and Control, some of them confirmed.
+//! A thread that sends at a rate, a batch per millisecond: Bulk and Control, some of them confirmed.
 
 use std::{
-    collections::VecDeque,
-    pin::Pin,
     sync::{
         Arc,
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
-    task::{Context, Poll, Waker},
     thread::JoinHandle,
     time::{Duration, Instant},
 };
 
 use sinew::{
-    Outcome,
-    message::{Confirmation, SendError, Sender},
+    Class, NodeAddress,
+    message::{SendError, Sender},
 };
 
-use super::PATIENCE;
-use crate::puppet::{Job, Order};
+use super::{
+    PATIENCE,
+    record::{CLASSES, Record},
+};
+use sinew_testkit::PendingOutcomes;
+use sinew_testkit::scripted::reactor;
+use sinew_testkit::{
+    history::Note,
+    scripted::{Job, Order},
+};
 
 const TICK: Duration = Duration::from_millis(1);
-/// Of so many messages one is a confirmed Control message and one an unconfirmed; the others are Bulk.
+/// Of this many messages one is a confirmed Control message and one an unconfirmed one; the others are Bulk.
 const SHARE: u64 = 10;
-/// Confirmed messages under way at most; the node's own limit is a little higher.
+/// Maximum number of confirmed messages in flight; the node's own limit is slightly higher.
 const WAITS_MAX: usize = 1_000;
 
 /// A running pacer.
@@ -33,27 +38,25 @@ pub(super) struct Pacer {
     thread: JoinHandle<Sent>,
 }
 
-/// What was sent, and what became of it.
+/// The sent messages.
 #[derive(Debug, Default)]
 pub(super) struct Sent {
     /// The last numbers: of Bulk, of Control. Each class is numbered from 1.
     pub(super) upto: [u64; 2],
-    /// The outcome of each confirmed Control message.
-    pub(super) outcomes: Vec<(u64, Outcome)>,
-    /// How often a message found no room, or nobody, and was sent again with the same number.
+    /// Number of messages that found no room or no receiver, and were resent with the same number.
     pub(super) again: u64,
 }
 
 impl Pacer {
-    pub(super) fn start(sender: Sender, rate: u64) -> Self {
+    pub(super) fn start(sender: Sender, rate: u64, (node, record): (NodeAddress, &Record)) -> Self {
         let (stop, upto) =
             (Arc::new(AtomicBool::new(false)), Arc::new([AtomicU64::new(0), AtomicU64::new(0)]));
-        let (stopped, told) = (stop.clone(), upto.clone());
+        let (stopped, sent_upto, record) = (stop.clone(), upto.clone(), record.clone());
         let thread = std::thread::spawn(move || {
-            let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build();
-            let runtime = runtime.expect("a reactor with nothing but a timer");
+            let runtime = reactor();
             let _entered = runtime.enter();
-            Work { sender, told, sent: Sent::default(), waiting: VecDeque::new() }.run(rate, &stopped)
+            let (sent, notes, waiting) = (Sent::default(), Vec::new(), PendingOutcomes::default());
+            Work { sender, node, record, notes, sent_upto, sent, waiting }.run(rate, &stopped)
         });
         Self { stop, upto, thread }
     }
@@ -71,9 +74,13 @@ impl Pacer {
 
 struct Work {
     sender: Sender,
-    told: Arc<[AtomicU64; 2]>,
+    node: NodeAddress,
+    record: Record,
+    /// Sent messages and outcomes, in order, that are not yet in the record.
+    notes: Vec<Note>,
+    sent_upto: Arc<[AtomicU64; 2]>,
     sent: Sent,
-    waiting: VecDeque<(u64, Confirmation)>,
+    waiting: PendingOutcomes,
 }
 
 impl Work {
@@ -97,7 +104,7 @@ impl Work {
         self.sent
     }
 
-    /// Sends the next message; `false` if it was not taken and is to be sent again later.
+    /// Sends the next message; `false` if it was not accepted and must be resent later.
     fn send(&mut self, count: u64) -> bool {
         let class = usize::from(count.is_multiple_of(SHARE / 2));
         let number = self.sent.upto[class] + 1;
@@ -112,8 +119,9 @@ impl Work {
             self.sent.again += 1;
             return false;
         }
+        self.notes.push(Record::sent(CLASSES[class], number, count.is_multiple_of(SHARE)));
         self.sent.upto[class] = number;
-        self.told[class].store(number, Ordering::Relaxed);
+        self.sent_upto[class].store(number, Ordering::Relaxed);
         true
     }
 
@@ -122,19 +130,14 @@ impl Work {
             return Err(SendError::TooManyWaits);
         }
         let confirmation = self.sender.message("sink", &Order { number }).confirmed(PATIENCE)?;
-        self.waiting.push_back((number, confirmation));
+        self.waiting.push(number, confirmation);
         Ok(())
     }
 
-    /// Takes the outcomes that have come.
+    /// Records the sent messages, and the outcomes that have arrived.
     fn look(&mut self) {
-        let mut context = Context::from_waker(Waker::noop());
-        for _ in 0..self.waiting.len() {
-            let Some((number, mut confirmation)) = self.waiting.pop_front() else { return };
-            match Pin::new(&mut confirmation).poll(&mut context) {
-                Poll::Ready(outcome) => self.sent.outcomes.push((number, outcome)),
-                Poll::Pending => self.waiting.push_back((number, confirmation)),
-            }
-        }
+        let ended = |(number, outcome)| Record::ended(Class::Control, number, outcome);
+        self.notes.extend(self.waiting.poll().into_iter().map(ended));
+        self.record.note(self.node, self.notes.drain(..));
     }
 }

@@ -1,4 +1,4 @@
-//! The role of the second node: a consumer that keeps up or does not, and an application beside it that answers.
+//! The role of the second node: a slow or fast consumer, and an application beside it that answers.
 
 use std::{
     io::BufRead,
@@ -10,7 +10,7 @@ use std::{
 
 use sinew::prelude::*;
 
-use crate::{DEADLINE, puppet::Order};
+use sinew_testkit::{DEADLINE, scripted::echo};
 
 payload!("slow.load", Bulk => #[derive(Debug)] pub(super) struct Load {
     #[serde(with = "serde_bytes")]
@@ -19,7 +19,7 @@ payload!("slow.load", Bulk => #[derive(Debug)] pub(super) struct Load {
 
 /// The name of the consumer.
 pub(super) const CONSUMER: &str = "consumer";
-/// The name of the one that answers.
+/// The name of the application that answers.
 pub(super) const ECHO: &str = "echo";
 
 #[derive(Default)]
@@ -48,31 +48,15 @@ impl Handler<Delivery<Load>> for Consumer {
     }
 }
 
-struct Echo;
-
-impl Actor for Echo {
-    type Context = AppContext<Self>;
-}
-
-impl Handler<Delivery<Order>> for Echo {
-    type Result = ();
-
-    fn handle(&mut self, order: Delivery<Order>, context: &mut Self::Context) {
-        // Whoever asked may have gone meanwhile.
-        let _ = context.reply(&order, &Order { number: order.number });
-    }
-}
-
 /// `CONFIGURATION TAKES_US`
-pub(super) fn play(arguments: &[String]) {
-    let config = NodeConfig::from_file(&arguments[0]).expect("the director's configuration");
+pub(super) fn run(arguments: &[String]) {
+    let config = NodeConfig::from_file(&arguments[0]).expect("the scenario's configuration");
     let takes = Duration::from_micros(arguments[1].parse().expect("a number"));
     let counts = Arc::new(Counts::default());
     let held = counts.clone();
     let consumer = AppSpec::new(CONSUMER, move || Consumer { counts: held.clone(), takes });
-    let echo = AppSpec::new(ECHO, || Echo).handles::<Order>().own_thread();
     let node = Node::builder(config.name.clone()).config(config);
-    let node = node.app(consumer.handles::<Load>().own_thread()).app(echo).start().expect("a node");
+    let node = node.app(consumer.handles::<Load>().own_thread()).app(echo(ECHO)).start().expect("a node");
     node.handle().wait_until_running(DEADLINE).expect("it requires nothing");
     println!("up");
     for line in std::io::stdin().lock().lines().map_while(Result::ok) {
@@ -83,10 +67,10 @@ pub(super) fn play(arguments: &[String]) {
                 println!("slow");
             }
             "taken" => println!("{}", counts.taken.load(Ordering::Relaxed)),
-            _ => panic!("{line:?} is nothing that the receiver is told"),
+            _ => panic!("{line:?} is no command of the receiver"),
         }
     }
-    // It has more in its hands than it can take in its time to stop.
+    // It holds more messages than it can process in its time to stop.
     counts.slow.store(false, Ordering::Relaxed);
     node.stop();
 }

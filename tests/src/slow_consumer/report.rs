@@ -1,4 +1,4 @@
-//! What was seen of a slow consumer.
+//! Results of a run with a slow consumer.
 
 use std::{fmt, time::Duration};
 
@@ -6,30 +6,30 @@ use serde_json::{Value, json};
 
 use super::Plan;
 
-/// How much longer the questions of others may take, 99 of 100: more than this is felt.
+/// Maximum ratio of the p99 of other requests. A higher ratio counts as a slowdown.
 const RATIO_MAX: f64 = 1.5;
 
-/// One look at the two nodes.
+/// One observation of the two nodes.
 #[derive(Clone, Copy, Debug)]
 pub struct Window {
-    /// Questions that were answered.
+    /// Answered requests.
     pub count: u64,
-    /// Questions without an answer.
+    /// Requests without an answer.
     pub failed: u64,
-    /// Half of the answers took no longer.
+    /// Median latency.
     pub p50: Duration,
-    /// 99 of 100.
+    /// 99th percentile.
     pub p99: Duration,
-    /// The longest.
+    /// Maximum.
     pub max: Duration,
-    /// Memory of sender and receiver at the beginning, in bytes.
+    /// Memory of sender and receiver at the start, in bytes.
     pub before: [u64; 2],
-    /// The most that was seen.
+    /// Peak memory.
     pub most: [u64; 2],
 }
 
 impl Window {
-    /// With one that follows it; of the times of both the longer ones.
+    /// Combines it with the following observation; of the latencies the longer ones count.
     pub(super) fn and(self, next: Self) -> Self {
         Self {
             count: self.count + next.count,
@@ -43,47 +43,47 @@ impl Window {
     }
 }
 
-/// What was seen.
+/// The results.
 #[derive(Clone, Debug)]
 pub struct Report {
     pub(super) plan: Plan,
     /// Without Bulk.
     pub quiet: Window,
-    /// With a consumer that keeps up.
+    /// With a fast consumer.
     pub fast: Window,
-    /// With one that does not.
+    /// With a slow consumer.
     pub slow: Window,
-    /// Messages that the slow consumer took.
+    /// Messages handled by the slow consumer.
     pub taken: u64,
-    /// Messages that were offered, over all.
+    /// Messages offered in total.
     pub offered: u64,
-    /// Of these, refused at once, as there was no room.
+    /// Offered messages that were rejected at once, for lack of room.
     pub refused: u64,
-    /// What sender and receiver may hold more than before, in bytes.
+    /// Maximum memory growth of sender and receiver, in bytes.
     pub bounds: [u64; 2],
 }
 
 impl Report {
-    /// What sender and receiver held more than before the consumer was slow, in bytes.
+    /// Memory growth of sender and receiver while the consumer was slow, in bytes.
     #[must_use]
     pub fn growth(&self) -> [u64; 2] {
         [0, 1].map(|node: usize| self.slow.most[node].saturating_sub(self.quiet.before[node]))
     }
 
-    /// Whether both nodes stayed within their bounds, and no question was left without an answer.
+    /// Returns whether both nodes stayed within their bounds, and every request was answered.
     #[must_use]
     pub fn is_bounded(&self) -> bool {
         let [here, there] = self.growth();
         here <= self.bounds[0] && there <= self.bounds[1] && self.slow.failed == 0
     }
 
-    /// How much longer the others' questions took than beside a consumer that keeps up.
+    /// Ratio of the others' latency to that beside a fast consumer.
     #[must_use]
     pub fn ratio(&self) -> f64 {
         self.ratio_to(&self.fast)
     }
 
-    /// And than where no Bulk goes at all: beside what the slowness costs, what the messages themselves do.
+    /// Ratio to the latency without Bulk: it includes the cost of the messages themselves.
     #[must_use]
     pub fn ratio_to_quiet(&self) -> f64 {
         self.ratio_to(&self.quiet)
@@ -93,13 +93,13 @@ impl Report {
         self.slow.p99.as_secs_f64() / reference.p99.as_secs_f64().max(f64::MIN_POSITIVE)
     }
 
-    /// Whether the others did not feel it.
+    /// Returns whether the others were not slowed down.
     #[must_use]
     pub fn is_unfelt(&self) -> bool {
         self.ratio() <= RATIO_MAX
     }
 
-    /// One line for other programs.
+    /// Machine-readable output in one line.
     #[must_use]
     pub fn json(&self) -> Value {
         let window = |window: &Window| {

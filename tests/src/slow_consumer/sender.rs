@@ -1,27 +1,29 @@
-//! The role of the first node: offers Bulk at a rate, and asks at 1 kHz.
+//! The role of the first node: offers Bulk at a rate, and sends requests at 1 kHz.
 
 use std::{
     io::BufRead,
     sync::{
-        Arc, Mutex, PoisonError,
+        Arc, Mutex,
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
     time::Instant,
 };
 
 use sinew::{message::Sender, prelude::*};
+use sinew_runtime::lock;
 
 use super::receiver::{CONSUMER, ECHO, Load};
-use crate::{
+use sinew_testkit::report::Times;
+use sinew_testkit::scripted::reactor;
+use sinew_testkit::{
     DEADLINE,
-    load::Times,
-    puppet::{Order, desk},
+    scripted::{Order, sender_app},
     until,
 };
 
-/// Time between two questions, and between two batches of Bulk.
+/// Time between two requests, and between two batches of Bulk.
 const PACE: Duration = Duration::from_millis(1);
-/// What could not be offered for longer than this is not made up for.
+/// Messages that could not be offered for longer than this are not caught up on.
 const DEBT: Duration = Duration::from_millis(20);
 
 #[derive(Default)]
@@ -40,12 +42,12 @@ impl Shared {
 }
 
 /// `CONFIGURATION RATE LENGTH`
-pub(super) fn play(arguments: &[String]) {
-    let config = NodeConfig::from_file(&arguments[0]).expect("the director's configuration");
+pub(super) fn run(arguments: &[String]) {
+    let config = NodeConfig::from_file(&arguments[0]).expect("the scenario's configuration");
     let number = |at: usize| arguments[at].parse::<u64>().expect("a number");
     let (rate, length) = (number(1), number(2) as usize);
-    let ((flooder, flood_key), (asker, ask_key)) = (desk("flooder"), desk("asker"));
-    let node = Node::builder(config.name.clone()).config(config).app(flooder).app(asker);
+    let ((flooder, flood_key), (requester, ask_key)) = (sender_app("flooder"), sender_app("requester"));
+    let node = Node::builder(config.name.clone()).config(config).app(flooder).app(requester);
     let node = node.start().expect("a node");
     node.handle().wait_until_running(DEADLINE).expect("it requires nothing");
     let (flood, ask) = (flood_key.sender(), ask_key.sender());
@@ -66,7 +68,7 @@ pub(super) fn play(arguments: &[String]) {
                 println!("flood");
             }
             "window" => {
-                let mut measured = shared.measured.lock().unwrap_or_else(PoisonError::into_inner);
+                let mut measured = lock(&shared.measured);
                 let (times, failed) = std::mem::take(&mut *measured);
                 drop(measured);
                 let [p50, p99, max] = [0.5, 0.99, 1.0].map(|share| times.percentile(share).as_nanos());
@@ -76,7 +78,7 @@ pub(super) fn play(arguments: &[String]) {
                 let of = |count: &AtomicU64| count.load(Ordering::Relaxed);
                 println!("{} {}", of(&shared.offered), of(&shared.refused));
             }
-            _ => panic!("{line:?} is nothing that the sender is told"),
+            _ => panic!("{line:?} is no command of the sender"),
         }
     }
     shared.over.store(true, Ordering::Relaxed);
@@ -95,7 +97,7 @@ fn offer(sender: &Sender, shared: &Shared, rate: u64, length: usize) {
             due -= 1.0;
             shared.offered.fetch_add(1, Ordering::Relaxed);
             if sender.send(CONSUMER, &load).is_err() {
-                // There is no room. What was due in this batch is not offered again.
+                // There is no room. The rest of this batch is not offered again.
                 shared.refused.fetch_add(1, Ordering::Relaxed);
                 due = 0.0;
             }
@@ -105,8 +107,7 @@ fn offer(sender: &Sender, shared: &Shared, rate: u64, length: usize) {
 }
 
 fn question(sender: &Sender, shared: &Shared) {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build();
-    let runtime = runtime.expect("a reactor with nothing but a timer");
+    let runtime = reactor();
     for number in 0.. {
         if shared.is_over() {
             return;
@@ -116,7 +117,7 @@ fn question(sender: &Sender, shared: &Shared) {
             sender.message(ECHO, &Order { number }).ask::<Order>(DEADLINE).ok()?.await.ok()
         });
         let took = asked.elapsed();
-        let mut measured = shared.measured.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut measured = lock(&shared.measured);
         match answer {
             Some(answer) => {
                 assert_eq!(answer.number, number, "the answer to another question");

@@ -1,4 +1,4 @@
-//! What an application does when it loses what it requires.
+//! The policies of an application that loses a requirement.
 
 use std::{
     sync::{
@@ -10,31 +10,31 @@ use std::{
 };
 
 use sinew::{Endpoint, NodeApi, Registration, StartError, message::Sender, node::LifeState, prelude::*};
-use sinew_tests::{
-    DEADLINE, Ground, Log, OwnDirectory, all_run,
-    puppet::{Job, Order, Puppet, Seen, Stage, desk, numbers},
+use sinew_testkit::{
+    DEADLINE, Log, Loopback, TestDirectory, all_run,
+    scripted::{Job, Order, Script, ScriptedApp, Seen, numbers, sender_app},
     until,
 };
 
-/// A node on which a walker requires an anchor that the test registers and drops.
+/// A node on which a walker requires an anchor; the test registers and drops the anchor.
 struct Scene {
     node: Node,
     sender: Sender,
     api: NodeApi,
-    _directory: OwnDirectory,
+    _directory: TestDirectory,
 }
 
-fn start(walker: AppSpec<Puppet>, witness: Option<AppSpec<Puppet>>) -> Scene {
-    let (directory, (desk, key)) = (OwnDirectory::new(), desk("desk"));
+fn start(walker: AppSpec<ScriptedApp>, witness: Option<AppSpec<ScriptedApp>>) -> Scene {
+    let (directory, (sender_app, key)) = (TestDirectory::new(), sender_app("sender"));
     let socket = directory.join("node.sock");
-    let mut node = Ground::new()
+    let mut node = Loopback::new()
         .node("node")
         .configure(|config| config.lncl.socket = Some(socket.clone()))
         .app(walker.requires(["anchor"]).handles::<RequirementEvent>());
     if let Some(witness) = witness {
         node = node.app(witness.requires(["anchor"]).handles::<RequirementEvent>());
     }
-    let node = node.app(desk).start().expect("a node");
+    let node = node.app(sender_app).start().expect("a node");
     let api = NodeApi::connect(socket).expect("the node listens");
     Scene { node, sender: key.sender(), api, _directory: directory }
 }
@@ -42,7 +42,7 @@ fn start(walker: AppSpec<Puppet>, witness: Option<AppSpec<Puppet>>) -> Scene {
 impl Scene {
     fn anchor(&self) -> Endpoint {
         let anchor = Registration::new().name("anchor");
-        // Its name is free a moment after its former holder has gone.
+        // The name becomes free a moment after its former holder has left.
         until("the anchor is registered", || self.api.register_transport_address(anchor.clone()).ok())
     }
 }
@@ -60,23 +60,23 @@ fn position(log: &Log<Seen>, of: &Seen) -> usize {
 }
 
 #[test]
-fn an_application_that_pauses_handles_no_message_and_no_period_until_all_is_met_again() {
+fn pause_holds_messages_and_periods_until_met() {
     const LIMIT: Duration = Duration::from_secs(4);
     const PERIOD: Duration = Duration::from_millis(1);
-    // As many as the pause has; a machine that is busy misses fewer.
+    // The number of periods that fit into the pause; on a busy machine fewer are missed.
     const MADE_UP_FOR: u64 = (LIMIT.as_millis() / PERIOD.as_millis()) as u64;
-    // Given: a period, and an input watchdog that would accuse within the pause
-    let (walker, log) = Stage::new()
+    // Given: a period, and an input watchdog that would trip within the pause
+    let (walker, log) = Script::new()
         .started(|_, context| {
-            context.every(PERIOD, |puppet, tick, _| {
-                puppet.say(if tick.missed < MADE_UP_FOR { "tick" } else { "made up for" });
+            context.every(PERIOD, |scripted, tick, _| {
+                scripted.note(if tick.missed < MADE_UP_FOR { "tick" } else { "made up for" });
             });
-            context.watch_input::<Job>(None, LIMIT, |puppet, _, _| puppet.say("accused"));
+            context.watch_input::<Job>(None, LIMIT, |scripted, _, _| scripted.note("accused"));
         })
         .app("walker");
     let scene = start(walker.on_requirement_lost(RequirementPolicy::Pause), None);
     let anchor = scene.anchor();
-    log.wait_for(Seen::Said(1, "tick"));
+    log.wait_for(Seen::Note(1, "tick"));
     // When
     drop(anchor);
     log.wait_for(lost());
@@ -92,17 +92,17 @@ fn an_application_that_pauses_handles_no_message_and_no_period_until_all_is_met_
     assert_eq!(last, first + 1, "between them it did nothing");
     assert_eq!(numbers(&all), (1..=10).collect::<Vec<_>>());
     for never in ["made up for", "accused"] {
-        assert!(!all.contains(&Seen::Said(1, never)), "{never}");
+        assert!(!all.contains(&Seen::Note(1, never)), "{never}");
     }
-    let ticks = all.iter().filter(|seen| **seen == Seen::Said(1, "tick")).count();
-    log.wait_for_many(Seen::Said(1, "tick"), ticks + 3);
+    let ticks = all.iter().filter(|seen| **seen == Seen::Note(1, "tick")).count();
+    log.wait_for_many(Seen::Note(1, "tick"), ticks + 3);
 }
 
 #[test]
-fn the_tree_shows_who_is_paused_and_why_and_who_was_stopped_is_not_said_to_have_failed() {
-    let ((walker, log), (anchor, _)) = (Stage::new().app("walker"), Stage::new().app("anchor"));
+fn tree_shows_paused_and_stopped_without_failure() {
+    let ((walker, log), (anchor, _)) = (Script::new().app("walker"), Script::new().app("anchor"));
     let walker = walker.requires(["anchor"]).on_requirement_lost(RequirementPolicy::Pause);
-    let node = Ground::new().node("node").app(anchor).app(walker).start().expect("a node");
+    let node = Loopback::new().node("node").app(anchor).app(walker).start().expect("a node");
     all_run(&[&node]);
     log.wait_for(Seen::Started(1));
     let walker = || node.handle().tree().ok()?.find("walker").cloned();
@@ -124,8 +124,8 @@ fn the_tree_shows_who_is_paused_and_why_and_who_was_stopped_is_not_said_to_have_
 }
 
 #[test]
-fn an_application_that_pauses_is_stopped_in_order() {
-    let (walker, log) = Stage::new().app("walker");
+fn paused_application_stops_in_order() {
+    let (walker, log) = Script::new().app("walker");
     let scene = start(walker.on_requirement_lost(RequirementPolicy::Pause), None);
     drop(scene.anchor());
     log.wait_for(lost());
@@ -134,67 +134,67 @@ fn an_application_that_pauses_is_stopped_in_order() {
 }
 
 #[test]
-fn a_safe_state_is_entered_ahead_of_every_message_that_waits_and_left_when_all_is_met() {
-    // Given: a walker with a message in its hand and a backlog behind it, and one that witnesses the loss
+fn safe_state_precedes_queued_messages() {
+    // Given: a walker that handles a message with a backlog behind it, and a witness of the loss
     let (let_go, held): (SyncSender<()>, _) = sync_channel(1);
     let held = Mutex::new(held);
-    let (walker, log) = Stage::new()
-        .got(move |puppet, _| {
-            if puppet.number == 1 {
-                puppet.say("in hand");
+    let (walker, log) = Script::new()
+        .got(move |scripted, _| {
+            if scripted.number == 1 {
+                scripted.note("in hand");
                 let held = held.lock().expect("nobody panics with it").recv_timeout(DEADLINE);
                 held.expect("the test lets it go on");
             }
         })
         .app("walker");
     let walker = walker.safe_state(
-        |puppet, lost, _| {
+        |scripted, lost, _| {
             assert_eq!(lost.name(), "anchor");
-            puppet.say("safe");
+            scripted.note("safe");
         },
-        |puppet, _, _| puppet.say("back"),
+        |scripted, _, _| scripted.note("back"),
     );
-    let (witness, witnessed) = Stage::new().app("witness");
+    let (witness, witnessed) = Script::new().app("witness");
     let scene = start(walker, Some(witness));
     let anchor = scene.anchor();
     all_run(&[&scene.node]);
     let sender = &scene.sender;
     sender.send("walker", &Order { number: 1 }).expect("it has room");
-    log.wait_for(Seen::Said(1, "in hand"));
+    log.wait_for(Seen::Note(1, "in hand"));
     for number in 2..=200 {
         sender.send("walker", &Order { number }).expect("it has room");
     }
-    // When: the witness, registered behind the walker, is told behind it
+    // When: the witness, registered after the walker, is notified after it
     drop(anchor);
     witnessed.wait_for(lost());
     let_go.send(()).expect("it waits");
     // Then
     log.wait_for(Seen::Got(1, 200));
-    let hand = position(&log, &Seen::Said(1, "in hand"));
-    assert_eq!(log.all()[hand + 1..hand + 4], [Seen::Said(1, "safe"), lost(), Seen::Got(1, 2)]);
+    let hand = position(&log, &Seen::Note(1, "in hand"));
+    assert_eq!(log.all()[hand + 1..hand + 4], [Seen::Note(1, "safe"), lost(), Seen::Got(1, 2)]);
     let _anchor = scene.anchor();
-    log.wait_for(Seen::Said(1, "back"));
+    log.wait_for(Seen::Note(1, "back"));
 }
 
 #[test]
-fn an_application_that_restarts_goes_through_the_barrier_again_as_often_as_it_must() {
-    let (walker, log) = Stage::new().app("walker");
+fn restart_policy_passes_the_barrier_each_time() {
+    let (walker, log) = Script::new().app("walker");
     let walker = walker.on_requirement_lost(RequirementPolicy::Restart).restart(Restart::Transient);
     let scene = start(walker, None);
-    // More often than the node would bear failures.
-    for life in 1..=8 {
+    // More often than the node would tolerate failures.
+    for incarnation in 1..=8 {
         let anchor = scene.anchor();
-        log.wait_for(Seen::Started(life));
-        assert!(!log.all().contains(&Seen::Started(life + 1)));
+        log.wait_for(Seen::Started(incarnation));
+        assert!(!log.all().contains(&Seen::Started(incarnation + 1)));
         drop(anchor);
-        log.wait_for(Seen::Stopping(life));
+        log.wait_for(Seen::Stopping(incarnation));
     }
     assert_eq!(scene.node.stop(), sinew::node::NodeEnd::Stopped);
 }
 
 #[test]
-fn an_application_that_carries_on_is_told_and_handles_what_comes() {
-    let (walker, log) = Stage::new().app("walker");
+fn carry_on_policy_notifies_and_keeps_handling() {
+    let (walker, log) = Script::new().app("walker");
     let scene = start(walker, None);
     drop(scene.anchor());
     log.wait_for(lost());
@@ -205,10 +205,10 @@ fn an_application_that_carries_on_is_told_and_handles_what_comes() {
 }
 
 #[test]
-fn a_safe_state_that_is_not_declared_is_refused_in_words() {
-    let (walker, _log) = Stage::new().app("walker");
+fn undeclared_safe_state_is_rejected_with_reason() {
+    let (walker, _log) = Script::new().app("walker");
     let walker = walker.on_requirement_lost(RequirementPolicy::SafeState);
-    let error = Ground::new().node("node").app(walker).start().expect_err("it has none");
+    let error = Loopback::new().node("node").app(walker).start().expect_err("it has none");
     assert!(matches!(error, StartError::Application { .. }));
     assert!(error.to_string().contains("declare it with `safe_state`"), "{error}");
 }

@@ -1,4 +1,4 @@
-//! The same with endpoints for both ends.
+//! The black channel with endpoints at both ends.
 
 use std::{
     sync::{
@@ -15,14 +15,14 @@ use sinew::{
     prelude::*,
     protection::{Cause, DataId, Guard, Protection, State, Tally, open},
 };
-use sinew_tests::{DEADLINE, Ground, OwnDirectory};
+use sinew_testkit::{DEADLINE, Loopback, TestDirectory};
 
 use super::{ECHO, central, drive, node, relay};
 
-/// So long that a busy machine makes nothing old, and so short that a test can wait for it.
+/// Long enough that nothing expires on a busy machine, and short enough for a test to wait for it.
 const AGE_MAX: Duration = Duration::from_secs(4);
 const LOOK: Duration = Duration::from_millis(1);
-/// What an output is that is safe.
+/// The safe value of an output.
 const SAFE: u64 = 0;
 
 #[derive(Debug, sinew::serde::Serialize, sinew::serde::Deserialize)]
@@ -45,13 +45,13 @@ struct Line {
     output: Arc<AtomicU64>,
     number: u64,
     _nodes: [Node; 4],
-    _directory: OwnDirectory,
+    _directory: TestDirectory,
 }
 
 impl Line {
     fn start() -> Self {
-        let directory = OwnDirectory::new();
-        let (one, two) = (Ground::new(), Ground::new());
+        let directory = TestDirectory::new();
+        let (one, two) = (Loopback::new(), Loopback::new());
         let nodes = [
             node(&one, 1, "one.central", &directory),
             node(&one, 2, "one.relay", &directory),
@@ -60,7 +60,7 @@ impl Line {
         ];
         let nodes = nodes.map(|node| node.start().expect("a node"));
         for (node, other) in [(0, 1), (1, 0), (2, 3), (3, 2)] {
-            sinew_tests::sees(&nodes[node].handle(), nodes[other].address());
+            sinew_testkit::sees(&nodes[node].handle(), nodes[other].address());
         }
         let mut own = relay("two.drive", drive(), &directory);
         let output = Arc::new(AtomicU64::new(1));
@@ -79,14 +79,14 @@ impl Line {
         }
     }
 
-    /// The bytes of central's next level, as the relay gets them. Echoes pass as they are.
+    /// Returns the bytes of central's next level, as the relay receives them. Forwards echoes unchanged.
     fn next(&mut self) -> Vec<u8> {
         assert!(self.drive.receive(LOOK).expect("it is connected").is_none(), "nothing was passed on");
         while let Some(echo) = self.to_drive.receive(LOOK).expect("it is connected") {
             assert_eq!(echo.kind(), ECHO);
             put(&mut self.to_central, central(), ECHO, echo.bytes());
         }
-        // Before it has sent the first one nothing says to it that this is for the layer below.
+        // Before central has sent the first level, it cannot know that an echo is for the protection layer.
         while let Some(other) = self.central.receive(LOOK).expect("it is connected") {
             assert_eq!((other.kind(), self.number), (ECHO, 0));
         }
@@ -97,7 +97,7 @@ impl Line {
         level.bytes().to_vec()
     }
 
-    /// Passes bytes on to the drive; what it receives of them.
+    /// Forwards bytes to the drive; returns the message that the drive receives, if any.
     fn pass(&mut self, bytes: &[u8]) -> Option<Received> {
         let before = all(&self.guard.tally());
         put(&mut self.to_drive, drive(), Level::KIND, bytes);
@@ -111,7 +111,7 @@ impl Line {
         }
     }
 
-    /// Good ones until the output has been moved by one.
+    /// Sends valid levels until the output is live and one has moved it.
     fn come_alive(&mut self) {
         let deadline = Instant::now() + DEADLINE;
         loop {
@@ -121,7 +121,7 @@ impl Line {
                 self.apply(&received);
                 return;
             }
-            let _ = self.guard.arm(); // refused until enough have come
+            let _ = self.guard.arm(); // rejected until enough valid ones have arrived
         }
     }
 
@@ -138,7 +138,7 @@ fn put(by: &mut Endpoint, to: Tid, kind: Kind, bytes: &[u8]) {
     by.loaned(message).send().expect("it is sent");
 }
 
-/// Everything that has come.
+/// Number of all messages that arrived.
 const fn all(tally: &Tally) -> u64 {
     tally.good
         + tally.corrupt
@@ -150,7 +150,8 @@ const fn all(tally: &Tally) -> u64 {
         + tally.unreadable
 }
 
-/// What the relay does, by its name; what it passes on last, and what that is counted as.
+/// One error of the relay: its name, the bytes that it forwards last, the counter that must count them, and
+/// the cause of the safe state.
 type Error = (&'static str, fn(&mut Line) -> Vec<u8>, fn(&Tally) -> u64, Cause);
 
 const ERRORS: [Error; 6] = [
@@ -209,7 +210,7 @@ const ERRORS: [Error; 6] = [
         "unacceptable delay",
         |line| {
             let bytes = line.next();
-            // Only time makes it old.
+            // Only elapsed time makes it too old.
             std::thread::sleep(AGE_MAX);
             bytes
         },
@@ -219,7 +220,7 @@ const ERRORS: [Error; 6] = [
 ];
 
 #[test]
-fn whatever_a_relay_does_to_commands_of_an_endpoint_is_found_and_makes_the_output_safe() {
+fn relay_errors_are_detected_and_make_output_safe() {
     let mut line = Line::start();
     assert_eq!(line.output.load(Ordering::Relaxed), SAFE, "before anything else");
     for (class, make, counted, cause) in ERRORS {
@@ -234,20 +235,20 @@ fn whatever_a_relay_does_to_commands_of_an_endpoint_is_found_and_makes_the_outpu
         assert_eq!(line.guard.state(), State::Safe(cause), "{class}");
         assert_eq!(line.output.load(Ordering::Relaxed), SAFE, "{class}");
     }
-    // Behind all of them commands are applied as before, once somebody arms.
+    // After all of them commands are applied as before, once the output is armed.
     line.come_alive();
 }
 
 #[test]
-fn command_that_came_through_no_guard_cannot_be_read_by_mistake() {
-    let directory = OwnDirectory::new();
-    let ground = Ground::new();
-    let _node = node(&ground, 1, "one", &directory).start().expect("a node");
+fn unguarded_command_cannot_be_decoded() {
+    let directory = TestDirectory::new();
+    let loopback = Loopback::new();
+    let _node = node(&loopback, 1, "one", &directory).start().expect("a node");
     let mut central = relay("one", central(), &directory);
     let mut other = relay("one", super::stranger(), &directory);
     central.send(other.tid(), &Level(7)).expect("it is there");
     let received = other.receive(DEADLINE).expect("it is connected").expect("it comes");
-    // Its first byte would be a number.
+    // The first byte of a plain payload would be a number.
     assert_eq!((received.kind(), received.bytes()[0]), (Level::KIND, 1));
     let error = received.decode::<Level>().expect_err("it is sealed");
     assert!(error.to_string().contains("did not come through a guard"), "{error}");

@@ -2,19 +2,15 @@
 
 use std::time::Duration;
 
-use sinew_tests::{
-    clients::{
-        conservation::{Plan, run},
-        ledger::Fate,
-    },
-    program,
+use sinew_tests::clients::{
+    conservation::{Plan, run},
+    fate_tracker::Fate,
 };
 
 #[test]
-fn whoever_is_killed_every_message_of_64_addresses_has_one_fate_that_is_true() {
+fn each_message_has_one_true_outcome_despite_kills() {
     let seed = u64::from(std::process::id());
     let report = run(Plan {
-        program: program("conservation"),
         processes: 8,
         kills: 12,
         spacing: Duration::from_millis(200),
@@ -24,7 +20,7 @@ fn whoever_is_killed_every_message_of_64_addresses_has_one_fate_that_is_true() {
     println!("{report}");
     assert!(
         report.holds(),
-        "replay with `--bin conservation -- --seed {seed} --kills 12 --spacing-ms 200 --pause-ms 40`:\n{report}"
+        "replay with `conservation --seed {seed} --kills 12 --spacing-ms 200 --pause-ms 40`:\n{report}"
     );
     assert_eq!(report.account.killed, 12 * 8);
     assert!(report.account.of(Fate::LostWithDestination) > 0, "kills were felt:\n{report}");

@@ -1,44 +1,42 @@
-//! Who takes all that one process may have leaves the others their places.
+//! A process that uses all registrations of its share leaves the other processes theirs.
 
 use sinew::{NodeApi, Registration};
-use sinew_tests::{
-    Log,
-    clients::{Performer, Stage, StageLimits},
-    program,
-};
+use sinew_testkit::NodeProcess;
 
-/// Of which one process may have a quarter.
+use sinew_tests::clients::{FixtureLimits, NodeFixture};
+
+/// One process may have a quarter of these.
 const CLIENTS: usize = 12;
 
-fn crowd(stage: &Stage) -> (Performer, Log<String>) {
-    let says: Log<String> = Log::default();
-    let heard = says.clone();
-    let performer = stage.start("crowd", &[], move |line| heard.write(line.to_owned()));
-    says.wait("it has all that it can have", |lines| {
-        lines.iter().any(|line| line.starts_with("silent")).then_some(())
-    });
-    (performer, says)
+/// Starts a process that takes all that it can have. Returns it and its first two lines.
+fn crowd(fixture: &NodeFixture) -> (NodeProcess, [String; 2]) {
+    let mut process = fixture.start("crowd", &[]);
+    let lines = [process.wait_for(&[]), process.wait_for(&[])];
+    process.expect("silent");
+    (process, lines)
 }
 
 #[test]
-fn a_process_that_takes_every_place_that_it_can_have_keeps_nobody_else_out() {
-    // Given: a node, and a process that registers until it is refused, and has connections besides that say nothing.
-    let limits = StageLimits { mailbox_capacity: 16, payload_max: 4_096, clients_max: CLIENTS };
-    let stage = Stage::new(&program("client_kills"), limits);
-    let (first, says) = crowd(&stage);
-    assert!(says.all().contains(&format!("has {}", CLIENTS / 4)), "{:?}", says.all());
-    let refused = says.all().into_iter().find(|line| line.starts_with("refused")).expect("it was refused");
-    assert!(refused.contains("`lncl.clients_per_process_max`"), "{refused}");
+fn process_at_its_limit_locks_out_no_other() {
+    // Given: a node, and a process that registers until it is rejected and also has silent connections.
+    let limits = FixtureLimits { mailbox_capacity: 16, payload_max: 4_096, clients_max: CLIENTS };
+    let fixture = NodeFixture::new(limits);
+    let (first, [has, refused]) = crowd(&fixture);
+    assert_eq!(has, format!("has {}", CLIENTS / 4));
+    assert!(
+        refused.starts_with("refused") && refused.contains("`lncl.clients_per_process_max`"),
+        "{refused}"
+    );
 
-    // When: another one registers, while the silent ones have their time.
-    let api = NodeApi::connect(stage.socket()).expect("the door is open");
+    // When: another process registers while the silent connections are within their time limit.
+    let api = NodeApi::connect(fixture.socket()).expect("the door is open");
     let endpoint = api.register_transport_address(Registration::new());
 
-    // Then: it has its place; and so has a second crowd.
+    // Then: it is registered, and so is a second crowd.
     assert!(endpoint.is_ok(), "{endpoint:?}");
-    let (second, says) = crowd(&stage);
-    assert!(says.all().contains(&format!("has {}", CLIENTS / 4)), "{:?}", says.all());
+    let (second, [has, _]) = crowd(&fixture);
+    assert_eq!(has, format!("has {}", CLIENTS / 4));
     drop(endpoint);
-    assert!(first.end().success() && second.end().success());
-    stage.end();
+    assert!(first.stop().success() && second.stop().success());
+    fixture.end();
 }

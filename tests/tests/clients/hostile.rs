@@ -2,30 +2,27 @@
 
 use std::time::Duration;
 
-use sinew_tests::{
-    clients::{
-        Kernel,
-        hostile::{Plan, run},
-    },
-    program,
+use sinew_tests::clients::{
+    Kernel,
+    hostile::{Plan, run},
 };
 
 fn attack(kernel: Kernel) {
     let seed = u64::from(std::process::id());
     let lasts = Duration::from_secs(5);
-    // A deadline and no limit of speed, on a machine that others share: the long form allows one second.
+    // A deadline and not a speed limit, because the machine is shared. The long form allows one second.
     let held_up_max = Duration::from_secs(10);
-    let report = run(Plan { program: program("hostile_client"), lasts, seed, kernel, held_up_max });
+    let report = run(Plan { lasts, seed, kernel, held_up_max });
     println!("{report}");
-    assert!(report.holds(), "replay with `--bin hostile_client -- --seed {seed}`, on {kernel}:\n{report}");
+    assert!(report.holds(), "replay with `hostile_client --seed {seed}`, on {kernel}:\n{report}");
 }
 
 #[test]
-fn a_node_lives_within_its_bounds_and_serves_the_others_whatever_a_client_does() {
+fn hostile_client_harms_neither_node_nor_others() {
     attack(Kernel::Present);
 }
 
 #[test]
-fn so_it_does_where_the_kernel_cannot_refuse_descriptors() {
+fn hostile_client_is_harmless_without_kernel_fd_rejection() {
     attack(Kernel::WithoutPassRights);
 }

@@ -1,16 +1,12 @@
-//! Processes that are killed with loans in their hands, in short: the long form is the program `client_kills`.
+//! Processes that are killed while they hold loans, in short. The long form is the program `client_kills`.
 
 use std::time::Duration;
 
-use sinew_tests::{
-    clients::kills::{Plan, run},
-    program,
-};
+use sinew_tests::clients::kills::{Plan, run};
 
 #[test]
-fn twenty_killed_processes_that_held_loans_leave_nothing_behind() {
+fn killed_loan_holders_leave_nothing_behind() {
     let report = run(Plan {
-        program: program("client_kills"),
         kills: 20,
         spacing: Duration::from_millis(40),
         reference_each: 1,

@@ -1,4 +1,5 @@
-//! Processes that speak to a node through its door: killed, stopped, hostile. One binary, one module a claim.
+//! Processes that connect to a node through its client socket: killed, stopped, hostile. One binary, one
+//! module for each claim.
 
 mod conservation;
 mod crowd;

@@ -1,4 +1,5 @@
-//! What an application's factory captured is the user's, and so is its drop: slow, without end, or a panic.
+//! User values that an application's factory captured. Their drop is user code: it can be slow, never return,
+//! or panic.
 
 use std::sync::{
     Mutex,
@@ -10,13 +11,13 @@ use sinew::{
     node::{CommandError, NodeEnd},
     prelude::*,
 };
-use sinew_tests::{
-    DEADLINE, Ground, Log, all_run,
-    puppet::{DeskKey, Seen, Stage, desk, outcome_of_job},
+use sinew_testkit::{
+    DEADLINE, Log, Loopback, all_run,
+    scripted::{Script, Seen, SenderApp, outcome_of_job, sender_app},
     until,
 };
 
-/// Is not dropped before the test says so.
+/// Its drop does not return before the test permits it.
 struct Captured {
     log: Log<&'static str>,
     end: Mutex<Receiver<()>>,
@@ -31,7 +32,7 @@ impl Drop for Captured {
     }
 }
 
-/// What lets the drop end, when this is dropped, and what is written of it.
+/// Lets the drop return when this is dropped, and holds the log of the drop.
 struct Hold {
     log: Log<&'static str>,
     end: Option<SyncSender<()>>,
@@ -54,7 +55,7 @@ fn captured() -> (Captured, Hold) {
     (Captured { log: log.clone(), end: Mutex::new(until) }, Hold { log, end: Some(end) })
 }
 
-/// An application whose factory has captured something.
+/// An application; its factory has captured a value.
 fn holder<T: Send + Sync + 'static>(name: &str, captured: T) -> AppSpec<Nothing> {
     AppSpec::new(name, move || {
         let _ = &captured;
@@ -68,25 +69,26 @@ impl Actor for Nothing {
     type Context = AppContext<Self>;
 }
 
-/// A node with somebody who fails at 13, and who can tell it to.
-fn with_a_knee(ground: &Ground) -> (NodeBuilder, Log<Seen>, DeskKey) {
-    let ((desk, key), stage) = (desk("desk"), Stage::new().got(|puppet, _| assert!(puppet.number != 13)));
-    let (knee, log) = stage.app("knee");
-    (ground.node("node").app(knee).app(desk), log, key)
+/// A node with an application that fails at 13, and a key to send to it.
+fn with_a_knee(loopback: &Loopback) -> (NodeBuilder, Log<Seen>, SenderApp) {
+    let ((sender_app, key), script) =
+        (sender_app("sender"), Script::new().got(|scripted, _| assert!(scripted.number != 13)));
+    let (knee, log) = script.app("knee");
+    (loopback.node("node").app(knee).app(sender_app), log, key)
 }
 
-/// Somebody else fails, and comes back.
-fn supervision_goes_on(key: DeskKey, log: &Log<Seen>) {
+/// Checks that another application fails and is restarted.
+fn supervision_goes_on(key: SenderApp, log: &Log<Seen>) {
     assert_eq!(outcome_of_job(&key.sender(), "knee", 13), Outcome::Failed);
     log.wait_for(Seen::Started(2));
 }
 
 #[test]
-fn what_a_removed_application_captured_and_does_not_let_go_holds_up_no_supervision() {
+fn captured_value_of_removed_app_does_not_block_supervision() {
     let (captured, hold) = captured();
-    let (builder, log, key) = with_a_knee(&Ground::new());
+    let (builder, log, key) = with_a_knee(&Loopback::new());
     let node = builder.app(holder("app", captured)).start().expect("a node");
-    // Lets go before the node ends, whatever the test sees.
+    // Releases the drop before the node ends, also if the test fails.
     let mut hold = hold;
     all_run(&[&node]);
     node.handle().stop_app("app").expect("it stops");
@@ -98,9 +100,9 @@ fn what_a_removed_application_captured_and_does_not_let_go_holds_up_no_supervisi
 }
 
 #[test]
-fn what_an_application_captured_that_was_not_taken_in_holds_up_no_supervision() {
+fn captured_value_of_rejected_app_does_not_block_supervision() {
     let (captured, hold) = captured();
-    let (builder, log, key) = with_a_knee(&Ground::new());
+    let (builder, log, key) = with_a_knee(&Loopback::new());
     let node = builder.start().expect("a node");
     let mut hold = hold;
     all_run(&[&node]);
@@ -112,30 +114,30 @@ fn what_an_application_captured_that_was_not_taken_in_holds_up_no_supervision() 
 }
 
 #[test]
-fn a_node_ends_whatever_its_applications_captured() {
+fn node_ends_despite_captured_values() {
     let (captured, mut hold) = captured();
-    let (builder, _, _) = with_a_knee(&Ground::new());
+    let (builder, _, _) = with_a_knee(&Loopback::new());
     let node = builder.app(holder("app", captured)).start().expect("a node");
     all_run(&[&node]);
-    let (say, heard) = sync_channel(1);
-    std::thread::spawn(move || say.send(node.stop()).expect("it is waited for"));
-    let end = heard.recv_timeout(DEADLINE);
+    let (sender, receiver) = sync_channel(1);
+    std::thread::spawn(move || sender.send(node.stop()).expect("it is waited for"));
+    let end = receiver.recv_timeout(DEADLINE);
     assert_ne!(end, Err(RecvTimeoutError::Timeout), "the node waits for what is not its own");
     hold.ends();
 }
 
 #[test]
-fn a_start_that_fails_is_told_whatever_its_applications_captured() {
+fn failed_start_is_reported_despite_captured_values() {
     let ((first, mut held), (second, mut held_too)) = (captured(), captured());
     let address = AppAddress::fixed(7).expect("a fixed one");
     let [first, second] =
         [("first", first), ("second", second)].map(|(name, it)| holder(name, it).address(address));
-    let (say, heard) = sync_channel(1);
+    let (sender, receiver) = sync_channel(1);
     std::thread::spawn(move || {
-        let started = Ground::new().node("node").app(first).app(second).start();
-        say.send(started.map(drop)).expect("it is waited for");
+        let started = Loopback::new().node("node").app(first).app(second).start();
+        sender.send(started.map(drop)).expect("it is waited for");
     });
-    let started = heard.recv_timeout(DEADLINE).expect("the start does not wait for what is not its own");
+    let started = receiver.recv_timeout(DEADLINE).expect("the start does not wait for what is not its own");
     assert!(matches!(started, Err(StartError::Application { .. })), "{started:?}");
     held.ends();
     held_too.ends();
@@ -150,8 +152,8 @@ impl Drop for Panics {
 }
 
 #[test]
-fn a_panic_in_the_drop_of_what_a_removed_application_captured_is_nobody_elses() {
-    let (builder, log, key) = with_a_knee(&Ground::new());
+fn panic_in_drop_of_captured_value_affects_no_other() {
+    let (builder, log, key) = with_a_knee(&Loopback::new());
     let node = builder.app(holder("app", Panics)).start().expect("a node");
     all_run(&[&node]);
     node.handle().stop_app("app").expect("it stops");

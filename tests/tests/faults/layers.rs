@@ -1,19 +1,24 @@
-//! Layers that fail while applications run: who is restarted, who is not, and what nobody notices.
+//! Layers that fail while applications run: which actors restart, which do not, and which failures stay
+//! unnoticed.
 
 use sinew::{NodeHandle, fault::Fault, message::Sender, prelude::*};
-use sinew_tests::{
-    DEADLINE, Ground, Log, all_run,
-    puppet::{Job, Seen, Stage, desk, lives, numbers, outcome_of_job, send_jobs, wait, wait_for_numbers},
-    ready_for, sees, until,
+use sinew_testkit::{
+    DEADLINE, Log, Loopback, all_run, ready_for,
+    scripted::{
+        Job, Script, Seen, incarnations, numbers, outcome_of_job, send_jobs, sender_app, wait,
+        wait_for_numbers,
+    },
+    sees, until,
 };
+use sinew_tests::load::LAYERS;
 
-const LAYERS: [&str; 4] = ["LNCL", "sync", "GNCL", "NDL"];
+use crate::{gets_through, perform};
 
 fn readies(node: &NodeHandle) -> [u64; 4] {
     LAYERS.map(|layer| node.lives(layer).expect("every node has it").readies)
 }
 
-/// A layer panics, and it and those behind it are ready again.
+/// Lets a layer panic, and waits until it and the layers after it are ready again.
 #[track_caller]
 fn kill(node: &NodeHandle, layer: &str) {
     let from = LAYERS.iter().position(|name| *name == layer).expect("a layer");
@@ -24,47 +29,43 @@ fn kill(node: &NodeHandle, layer: &str) {
     }
 }
 
-/// Two nodes that see each other: a puppet there, the test's own sender here, a witness on each.
+/// Two connected nodes: a scripted application on one, the test's own sender on the other, a witness on each.
 struct Pair {
     here: Node,
     there: Node,
     sender: Sender,
-    puppet: Log<Seen>,
+    scripted: Log<Seen>,
     witnesses: [Log<Seen>; 2],
 }
 
 impl Pair {
     fn new() -> Self {
-        let ground = Ground::new();
-        let ((puppet, log), (desk, key)) = (Stage::new().app("puppet"), desk("desk"));
+        let loopback = Loopback::new();
+        let ((scripted, log), (sender_app, key)) = (Script::new().app("scripted"), sender_app("sender"));
         let witness = |name| {
-            let (app, log) = Stage::new().app(name);
-            (app.handles::<NodeEvent>().handles::<RequirementEvent>().requires(["puppet"]), log)
+            let (app, log) = Script::new().app(name);
+            (app.handles::<NodeEvent>().handles::<RequirementEvent>().requires(["scripted"]), log)
         };
         let ((first, at_first), (second, at_second)) = (witness("first"), witness("second"));
-        let there = ground.node("there").app(puppet).app(second).start().expect("a node");
-        let here = ground.node("home").app(desk).app(first).start().expect("a node");
+        let there = loopback.node("there").app(scripted).app(second).start().expect("a node");
+        let here = loopback.node("home").app(sender_app).app(first).start().expect("a node");
         all_run(&[&there, &here]);
         sees(&here.handle(), there.address());
         sees(&there.handle(), here.address());
         for log in [&at_first, &at_second] {
-            log.wait("it hears who is there", |seen| {
+            log.wait("it is notified of the nodes", |seen| {
                 seen.iter().any(|seen| matches!(seen, Seen::Node(_))).then_some(())
             });
         }
-        Self { here, there, sender: key.sender(), puppet: log, witnesses: [at_first, at_second] }
+        Self { here, there, sender: key.sender(), scripted: log, witnesses: [at_first, at_second] }
     }
 
-    /// The next job that gets through; those before it had an outcome, too.
     #[track_caller]
     fn gets_through(&self, number: u64) {
-        until("a job gets through", || {
-            let sent = self.sender.message("puppet", &Job { number }).confirmed(DEADLINE).ok()?;
-            (wait(sent) == Outcome::Delivered).then_some(())
-        });
+        gets_through(&self.sender, number);
     }
 
-    /// That each witness heard of the other node once, of no loss, and lives its first life.
+    /// Checks that each witness saw the other node once, saw no loss, and runs its first incarnation.
     #[track_caller]
     fn nobody_noticed(&self) {
         for log in &self.witnesses {
@@ -74,14 +75,14 @@ impl Pair {
         self.nobody_is_lost();
     }
 
-    /// The same, but that a link that is down for long may take a requirement away until it is back; not from whoever is on the
-    /// node of what it requires.
+    /// The same, except that a long link failure may lose a requirement until the link is back. An
+    /// application on the node of its requirement never loses it.
     #[track_caller]
     fn nobody_is_lost(&self) {
         let at_home = self.witnesses[1].all();
         assert!(!at_home.iter().any(|seen| matches!(seen, Seen::Requirement(_))), "{at_home:?}");
         for log in &self.witnesses {
-            let name = || "puppet".to_owned();
+            let name = || "scripted".to_owned();
             let (lost, met) =
                 (RequirementEvent::Lost { name: name() }, RequirementEvent::Met { name: name() });
             let (lost, met) = (Seen::Requirement(lost), Seen::Requirement(met));
@@ -91,15 +92,15 @@ impl Pair {
             });
             let nodes: Vec<_> = all.iter().filter(|seen| matches!(seen, Seen::Node(_))).collect();
             assert!(matches!(*nodes, [Seen::Node(NodeEvent::NodeFound { .. })]), "{nodes:?}");
-            assert_eq!(lives(log), 1);
+            assert_eq!(incarnations(log), 1);
         }
     }
 }
 
 #[test]
-fn a_layer_takes_those_behind_it_along_and_no_application() {
-    let (puppet, log) = Stage::new().app("puppet");
-    let node = Ground::new().node("node").app(puppet).start().expect("a node");
+fn layer_failure_restarts_later_layers_but_no_application() {
+    let (scripted, log) = Script::new().app("scripted");
+    let node = Loopback::new().node("node").app(scripted).start().expect("a node");
     all_run(&[&node]);
     let handle = node.handle();
     for (layer, expected) in
@@ -112,8 +113,8 @@ fn a_layer_takes_those_behind_it_along_and_no_application() {
 }
 
 #[test]
-fn layers_become_ready_again_in_the_order_of_their_start() {
-    let node = Ground::new().node("node").start().expect("a node");
+fn layers_become_ready_in_start_order() {
+    let node = Loopback::new().node("node").start().expect("a node");
     kill(&node.handle(), "LNCL");
     let ready =
         LAYERS.map(|layer| node.handle().lives(layer).and_then(|lives| lives.ready).expect("it was ready"));
@@ -121,8 +122,8 @@ fn layers_become_ready_again_in_the_order_of_their_start() {
 }
 
 #[test]
-fn a_layer_that_stops_by_itself_is_started_again() {
-    let node = Ground::new().node("node").start().expect("a node");
+fn layer_that_stops_by_itself_is_restarted() {
+    let node = Loopback::new().node("node").start().expect("a node");
     for (layer, count) in [("NDL", 2), ("GNCL", 2), ("sync", 2)] {
         node.handle().inject(layer, Fault::stop()).expect("every node has it");
         ready_for(&node.handle(), layer, count);
@@ -131,37 +132,34 @@ fn a_layer_that_stops_by_itself_is_started_again() {
 }
 
 #[test]
-fn names_stay_registered_whichever_layer_dies() {
-    let ((puppet, _log), (desk, key)) = (Stage::new().app("puppet"), desk("desk"));
-    let node = Ground::new().node("node").app(puppet).app(desk).start().expect("a node");
+fn names_stay_registered_through_layer_deaths() {
+    let (node, sender, _log) = perform(Script::new(), |app| app);
     all_run(&[&node]);
-    let sender = key.sender();
-    let tid = sender.resolve("puppet").expect("it is registered");
+    let tid = sender.resolve("scripted").expect("it is registered");
     for layer in LAYERS {
         kill(&node.handle(), layer);
-        assert_eq!(sender.resolve("puppet"), Some(tid), "after {layer}");
-        assert!(node.handle().directory().iter().any(|entry| entry.name == "puppet"), "after {layer}");
+        assert_eq!(sender.resolve("scripted"), Some(tid), "after {layer}");
+        assert!(node.handle().directory().iter().any(|entry| entry.name == "scripted"), "after {layer}");
     }
 }
 
 #[test]
-fn messages_within_a_node_flow_while_each_layer_dies() {
-    let ((puppet, log), (desk, key)) = (Stage::new().app("puppet"), desk("desk"));
-    let node = Ground::new().node("node").app(puppet).app(desk).start().expect("a node");
+fn local_messages_flow_through_layer_deaths() {
+    let (node, sender, log) = perform(Script::new(), |app| app);
     all_run(&[&node]);
-    let (sender, handle) = (key.sender(), node.handle());
+    let handle = node.handle();
     let killer = std::thread::spawn(move || LAYERS.map(|layer| kill(&handle, layer)));
     let mut number = 0;
     while !killer.is_finished() {
         number += 1;
-        assert_eq!(outcome_of_job(&sender, "puppet", number), Outcome::Delivered);
+        assert_eq!(outcome_of_job(&sender, "scripted", number), Outcome::Delivered);
     }
     killer.join().expect("each layer comes back");
     assert_eq!(numbers(&log.all()), (1..=number).collect::<Vec<_>>());
 }
 
 #[test]
-fn a_link_comes_back_after_gncl_died_and_nobody_is_lost() {
+fn link_returns_after_gncl_death_without_loss() {
     let pair = Pair::new();
     pair.gets_through(1);
     kill(&pair.here.handle(), "GNCL");
@@ -184,51 +182,54 @@ fn both_ends_of_a_link_may_die_at_once() {
 }
 
 #[test]
-fn membership_is_kept_while_ndl_dies_on_either_node() {
+fn membership_survives_ndl_death_on_either_node() {
     let pair = Pair::new();
     for node in [&pair.here, &pair.there, &pair.here, &pair.there] {
         kill(&node.handle(), "NDL");
         assert_eq!(pair.here.handle().members().len(), 1);
         assert_eq!(pair.there.handle().members().len(), 1);
         assert_eq!(
-            outcome_of_job(&pair.sender, "puppet", 1),
+            outcome_of_job(&pair.sender, "scripted", 1),
             Outcome::Delivered,
             "the link is none of NDL's"
         );
     }
-    // A change of membership would be told before an answer that is asked for now.
+    // A change of membership would arrive before a reply that is requested now.
     pair.gets_through(2);
     pair.nobody_noticed();
 }
 
 #[test]
-fn a_new_node_is_found_by_an_ndl_that_was_just_restarted() {
-    let ground = Ground::new();
-    let here = ground.node("home").start().expect("a node");
+fn restarted_ndl_finds_a_new_node() {
+    let loopback = Loopback::new();
+    let here = loopback.node("home").start().expect("a node");
     kill(&here.handle(), "NDL");
-    let there = ground.node("there").start().expect("a node");
+    let there = loopback.node("there").start().expect("a node");
     sees(&here.handle(), there.address());
     sees(&there.handle(), here.address());
 }
 
 #[test]
-fn a_barrier_keeps_its_state_while_the_sync_manager_dies() {
-    let ground = Ground::new();
-    let (puppet, log) = Stage::new().app("puppet");
-    let here = ground.node("home").app(puppet.requires(["gate"])).start().expect("a node");
+fn barrier_state_survives_sync_manager_death() {
+    let loopback = Loopback::new();
+    let (scripted, log) = Script::new().app("scripted");
+    let here = loopback.node("home").app(scripted.requires(["gate"])).start().expect("a node");
     for layer in ["sync", "LNCL", "GNCL"] {
         kill(&here.handle(), layer);
         let waiting = here.handle().waiting();
-        assert!(waiting.iter().any(|waiting| waiting.application == "puppet"), "after {layer}: {waiting:?}");
+        assert!(
+            waiting.iter().any(|waiting| waiting.application == "scripted"),
+            "after {layer}: {waiting:?}"
+        );
     }
     assert_eq!(log.all(), [], "it was not let through");
-    let there = ground.node("there").app(Stage::new().app("gate").0).start().expect("a node");
+    let there = loopback.node("there").app(Script::new().app("gate").0).start().expect("a node");
     all_run(&[&there, &here]);
     assert_eq!(log.all(), [Seen::Made(1), Seen::Started(1)]);
 }
 
 #[test]
-fn what_is_required_of_another_node_is_there_again_after_a_sync_manager_died() {
+fn remote_requirement_returns_after_sync_manager_death() {
     let pair = Pair::new();
     for node in [&pair.here, &pair.there] {
         kill(&node.handle(), "sync");
@@ -238,21 +239,21 @@ fn what_is_required_of_another_node_is_there_again_after_a_sync_manager_died() {
 }
 
 #[test]
-fn a_requirement_that_fails_while_the_sync_manager_is_away_is_never_lost_for_good() {
+fn failure_during_sync_manager_death_loses_no_requirement() {
     let pair = Pair::new();
     pair.gets_through(1);
-    // Away for so long: its next start takes its time.
+    // The sync manager stays away for this long: its next start is slow.
     let slow = Fault::slow(Duration::from_millis(50)).at_start(1);
     pair.here.handle().inject("sync", slow).expect("every node has it");
     pair.here.handle().inject("sync", Fault::panic()).expect("every node has it");
-    pair.there.handle().inject("puppet", Fault::panic()).expect("it is there");
-    pair.puppet.wait_for(Seen::Started(2));
+    pair.there.handle().inject("scripted", Fault::panic()).expect("it is there");
+    pair.scripted.wait_for(Seen::Started(2));
     pair.gets_through(2);
     let [lost, met] = [
-        RequirementEvent::Lost { name: "puppet".to_owned() },
-        RequirementEvent::Met { name: "puppet".to_owned() },
+        RequirementEvent::Lost { name: "scripted".to_owned() },
+        RequirementEvent::Met { name: "scripted".to_owned() },
     ];
-    // Lost and met again, or neither was seen: never lost for good.
+    // Lost and then met again, or neither was seen: never lost for good.
     pair.witnesses[0].wait("as often met as lost", |seen| {
         let count = |what: &RequirementEvent| {
             seen.iter().filter(|one| **one == Seen::Requirement(what.clone())).count()
@@ -262,7 +263,7 @@ fn a_requirement_that_fails_while_the_sync_manager_is_away_is_never_lost_for_goo
 }
 
 #[test]
-fn confirmed_messages_between_nodes_have_exactly_one_outcome_while_gncl_dies() {
+fn confirmed_messages_have_one_outcome_while_gncl_dies() {
     let pair = Pair::new();
     pair.gets_through(0);
     let mut outcomes = Vec::new();
@@ -270,7 +271,7 @@ fn confirmed_messages_between_nodes_have_exactly_one_outcome_while_gncl_dies() {
         let sent: Vec<_> = (1..=50)
             .map(|number| round * 100 + number)
             .filter_map(|number| {
-                Some((number, pair.sender.message("puppet", &Job { number }).confirmed(DEADLINE).ok()?))
+                Some((number, pair.sender.message("scripted", &Job { number }).confirmed(DEADLINE).ok()?))
             })
             .collect();
         kill(&pair.here.handle(), "GNCL");
@@ -281,7 +282,7 @@ fn confirmed_messages_between_nodes_have_exactly_one_outcome_while_gncl_dies() {
         });
         pair.gets_through(round * 100 + 99);
     }
-    let got = numbers(&pair.puppet.all());
+    let got = numbers(&pair.scripted.all());
     for (number, outcome) in &outcomes {
         let times = got.iter().filter(|one| *one == number).count();
         match outcome {
@@ -298,31 +299,31 @@ fn confirmed_messages_between_nodes_have_exactly_one_outcome_while_gncl_dies() {
 }
 
 #[test]
-fn messages_that_waited_for_a_link_survive_the_death_of_their_own_gncl() {
+fn messages_waiting_for_a_link_survive_gncl_death() {
     let pair = Pair::new();
     pair.gets_through(1);
-    // The link is away for as long as GNCL's next start takes.
+    // The link is down while GNCL's next start takes its time.
     let handle = pair.here.handle();
     handle.inject("GNCL", Fault::slow(Duration::from_millis(30)).at_start(1)).expect("every node has it");
     handle.inject("GNCL", Fault::panic()).expect("every node has it");
     until("GNCL is being started", || (handle.lives("GNCL")?.starts == 2).then_some(()));
-    send_jobs(&pair.sender, "puppet", 2..=30);
-    let got = wait_for_numbers(&pair.puppet, 30);
+    send_jobs(&pair.sender, "scripted", 2..=30);
+    let got = wait_for_numbers(&pair.scripted, 30);
     assert_eq!(got, (1..=30).collect::<Vec<_>>());
 }
 
 #[test]
-fn groups_reach_their_members_on_other_nodes_after_each_layer_died() {
-    let ground = Ground::new();
-    let stage = Stage::new().started(|_, context| context.join("listeners"));
-    let ((puppet, log), (desk, key)) = (stage.app("puppet"), desk("desk"));
-    let there = ground.node("there").app(puppet).start().expect("a node");
-    let here = ground.node("home").app(desk).start().expect("a node");
+fn groups_reach_remote_members_after_layer_deaths() {
+    let loopback = Loopback::new();
+    let script = Script::new().started(|_, context| context.join("listeners"));
+    let ((scripted, log), (sender_app, key)) = (script.app("scripted"), sender_app("sender"));
+    let there = loopback.node("there").app(scripted).start().expect("a node");
+    let here = loopback.node("home").app(sender_app).start().expect("a node");
     all_run(&[&there, &here]);
     let sender = key.sender();
     let reaches = |number| {
         until("the group is reached", || {
-            // Nobody takes it while the link or the member is not known again.
+            // The message is not accepted while the link or the member is not known again.
             let _ = sender.send(Tid::group("listeners"), &Job { number });
             numbers(&log.all()).contains(&number).then_some(())
         });
@@ -336,9 +337,9 @@ fn groups_reach_their_members_on_other_nodes_after_each_layer_died() {
 }
 
 #[test]
-fn a_layer_whose_restart_fails_is_tried_again() {
+fn failed_layer_restart_is_retried() {
     let node =
-        Ground::new().node("node").fault("GNCL:panic@start(2), GNCL:panic@start(3), NDL:panic@start(2)");
+        Loopback::new().node("node").fault("GNCL:panic@start(2), GNCL:panic@start(3), NDL:panic@start(2)");
     let node = node.start().expect("the first start succeeds");
     node.handle().inject("GNCL", Fault::panic()).expect("every node has it");
     ready_for(&node.handle(), "NDL", 2);
@@ -346,9 +347,9 @@ fn a_layer_whose_restart_fails_is_tried_again() {
 }
 
 #[test]
-fn a_layer_that_never_comes_back_ends_the_node_and_its_applications_are_told() {
-    let (puppet, log) = Stage::new().app("puppet");
-    let node = Ground::new().node("node").app(puppet);
+fn permanently_failed_layer_ends_the_node() {
+    let (scripted, log) = Script::new().app("scripted");
+    let node = Loopback::new().node("node").app(scripted);
     let node = (2..9).fold(node, |node, start| node.fault(format!("sync:panic@start({start})")));
     let node = node.start().expect("the first start succeeds");
     all_run(&[&node]);
@@ -359,7 +360,7 @@ fn a_layer_that_never_comes_back_ends_the_node_and_its_applications_are_told() {
 }
 
 #[test]
-fn two_layers_that_die_at_once_both_come_back() {
+fn two_layers_that_die_at_once_both_return() {
     let pair = Pair::new();
     pair.gets_through(1);
     let handle = pair.here.handle();
@@ -375,22 +376,23 @@ fn two_layers_that_die_at_once_both_come_back() {
 }
 
 #[test]
-fn an_application_and_a_layer_that_die_at_once_both_come_back() {
+fn app_and_layer_that_die_at_once_both_return() {
     let pair = Pair::new();
     pair.gets_through(1);
-    pair.there.handle().inject("puppet", Fault::panic()).expect("it is there");
+    pair.there.handle().inject("scripted", Fault::panic()).expect("it is there");
     kill(&pair.there.handle(), "sync");
-    pair.puppet.wait_for(Seen::Started(2));
+    pair.scripted.wait_for(Seen::Started(2));
     pair.gets_through(2);
 }
 
-/// Two nodes whose applications wait for each other, with a fault in the layers of one; all of them run in the end.
+/// Two nodes with applications that wait for each other, with a fault in the layers of one; all of them run
+/// in the end.
 #[track_caller]
 fn all_run_with(fault: &str) {
-    let ground = Ground::new();
-    let app = |name: &str, requires: &[&str]| Stage::new().app(name).0.requires(requires.iter().copied());
-    let here = ground.node("home").app(app("a", &["b"])).app(app("b", &[])).app(app("c", &["d"]));
-    let there = ground.node("there").app(app("d", &["a"])).app(app("e", &["c"]));
+    let loopback = Loopback::new();
+    let app = |name: &str, requires: &[&str]| Script::new().app(name).0.requires(requires.iter().copied());
+    let here = loopback.node("home").app(app("a", &["b"])).app(app("b", &[])).app(app("c", &["d"]));
+    let there = loopback.node("there").app(app("d", &["a"])).app(app("e", &["c"]));
     let here = here.fault(fault).start().expect("a node");
     let there = there.start().expect("a node");
     println!("with {fault}");
@@ -400,16 +402,16 @@ fn all_run_with(fault: &str) {
 }
 
 #[test]
-fn a_sync_manager_may_die_with_any_event_of_the_start_in_its_hand() {
+fn sync_manager_may_die_at_any_start_event() {
     (1..=12).for_each(|event| all_run_with(&format!("sync:panic@{event}")));
 }
 
 #[test]
-fn an_ndl_may_die_with_any_event_of_the_start_in_its_hand() {
+fn ndl_may_die_at_any_start_event() {
     (1..=8).for_each(|event| all_run_with(&format!("NDL:panic@{event}")));
 }
 
 #[test]
-fn a_gncl_may_die_with_any_event_of_the_start_in_its_hand() {
+fn gncl_may_die_at_any_start_event() {
     (1..=3).for_each(|event| all_run_with(&format!("GNCL:panic@{event}")));
 }

@@ -1,8 +1,9 @@
-//! Nobody reads what a node logs: its standard error is a pipe that is full. Who panics is dead and back all the same.
+//! A node with an unread log: its standard error is a full pipe. A panicking actor is reported and restarted
+//! all the same.
 
+use sinew_tests::role;
 use std::{
     io::{PipeReader, PipeWriter, Write},
-    process::Command,
     time::Instant,
 };
 
@@ -11,12 +12,13 @@ use rustix::{
     process::Signal,
 };
 use sinew::prelude::Duration;
-use sinew_tests::{Ground, OwnDirectory, Program, program};
+use sinew_testkit::{Loopback, NodeProcess, TestDirectory};
 
-/// Time for what follows a panic: generous, as a backtrace is looked up in it, and less than the deadline that each of the three words has.
+/// Time limit for the events after a panic: generous, because a backtrace is looked up, and less than the
+/// deadline of each of the three lines.
 const SOON: Duration = Duration::from_secs(45);
 
-/// A pipe that takes nothing, and its other end, from which nobody reads.
+/// A full pipe, and its other end, which nothing reads.
 fn full_pipe() -> (PipeWriter, PipeReader) {
     let (reader, mut writer) = std::io::pipe().expect("a pipe");
     fcntl_setfl(&writer, OFlags::NONBLOCK).expect("a pipe may not wait");
@@ -26,36 +28,35 @@ fn full_pipe() -> (PipeWriter, PipeReader) {
     (writer, reader)
 }
 
-/// A node whose standard error is full from its first instant.
+/// A node with a full standard error from the start.
 struct Mute {
-    node: Program,
-    _directory: OwnDirectory,
+    node: NodeProcess,
+    _directory: TestDirectory,
     _reader: PipeReader,
 }
 
 fn mute(backtrace: &str, arguments: &[&str]) -> Mute {
-    let (directory, ground) = (OwnDirectory::new(), Ground::new());
-    let path = directory.join("mute.toml");
+    let (directory, loopback) = (TestDirectory::new(), Loopback::new());
     let text = format!(
         "[node]\nname = \"mute\"\naddress = \"127.0.0.1\"\n[ndl]\nmulticast = \"{}\"\nmdns_port = false\n",
-        ground.group
+        loopback.group
     );
-    std::fs::write(&path, text).expect("the test's own directory");
+    let path = directory.write("mute.toml", &text);
     let (writer, reader) = full_pipe();
-    let mut command = Command::new(program("unread_log"));
+    let mut command = role("unread_log");
     command.arg(path).args(arguments).env("RUST_BACKTRACE", backtrace).stderr(writer);
-    Mute { node: Program::start("mute", command), _directory: directory, _reader: reader }
+    Mute { node: NodeProcess::start("mute", command), _directory: directory, _reader: reader }
 }
 
-/// The time that a line says, in microseconds.
+/// The time in a line, in microseconds.
 fn time(line: &str) -> u64 {
     line.rsplit(' ').next().and_then(|time| time.parse().ok()).unwrap_or_else(|| panic!("no time: {line}"))
 }
 
 impl Mute {
-    /// Lets the hip panic, and waits for all that has to follow.
+    /// Lets the hip panic, and waits for all events that must follow.
     fn panic_and_be_back(&mut self) -> u64 {
-        self.node.tell("panic");
+        self.node.send_line("panic");
         let panicked = time(&self.node.wait_for(&["panics"]));
         let began = Instant::now();
         let [will, _, back] = ["will", "down Panic", "started"].map(|what| {
@@ -68,7 +69,7 @@ impl Mute {
     }
 }
 
-/// Three deaths, and an end in order.
+/// Checks three deaths, and a clean end.
 fn dies_and_is_back(backtrace: &str, arguments: &[&str]) {
     let mut mute = mute(backtrace, arguments);
     for what in ["started", "watching"] {
@@ -78,25 +79,25 @@ fn dies_and_is_back(backtrace: &str, arguments: &[&str]) {
         mute.panic_and_be_back();
     }
     mute.node.signal(Signal::TERM);
-    assert_eq!(mute.node.wait_for_end(), Some(0), "it ends in order as well");
+    assert_eq!(mute.node.wait_for_exit(), Some(0), "it ends in order as well");
 }
 
 #[test]
-fn who_panics_is_dead_and_back_where_nobody_reads_the_log() {
+fn panic_is_handled_with_an_unread_log() {
     dies_and_is_back("0", &["--subscriber"]);
 }
 
 #[test]
-fn who_panics_is_dead_and_back_where_nobody_reads_the_log_and_backtraces_are_wanted() {
+fn panic_with_backtrace_is_handled_with_an_unread_log() {
     dies_and_is_back("1", &["--subscriber"]);
 }
 
 #[test]
-fn who_panics_is_dead_and_back_where_the_standard_panic_hook_is_stuck() {
+fn panic_is_handled_with_a_stuck_standard_hook() {
     dies_and_is_back("1", &[]);
 }
 
 #[test]
-fn who_panics_in_a_process_of_its_own_is_dead_and_back_where_nobody_reads_the_log() {
+fn panic_in_a_process_is_handled_with_unread_log() {
     dies_and_is_back("0", &["--subscriber", "--place"]);
 }

@@ -1,4 +1,4 @@
-//! Endpoints that come back by themselves when LNCL was restarted.
+//! Endpoints that reconnect by themselves after a restart of LNCL.
 
 use std::thread;
 
@@ -8,25 +8,25 @@ use sinew::{
     fault::Fault,
     prelude::*,
 };
-use sinew_tests::{DEADLINE, Ground, OwnDirectory, all_run, puppet::Job, ready_for, until};
+use sinew_testkit::{DEADLINE, Loopback, TestDirectory, all_run, ready_for, scripted::Job, until};
 
-/// A node, the way to it, and the directory where its socket lies.
-fn node_and_its_door() -> (Node, NodeApi, OwnDirectory) {
-    let directory = OwnDirectory::new();
+/// A node, a connection to it, and the directory of its socket.
+fn node_and_its_door() -> (Node, NodeApi, TestDirectory) {
+    let directory = TestDirectory::new();
     let socket = directory.join("node.sock");
     let door = socket.clone();
-    let node = Ground::new().node("node").configure(|config| config.lncl.socket = Some(door));
+    let node = Loopback::new().node("node").configure(|config| config.lncl.socket = Some(door));
     let node = node.start().expect("a node");
     all_run(&[&node]);
     let api = NodeApi::connect(&socket).expect("somebody listens");
     (node, api, directory)
 }
 
-/// Receives, and answers nobody, until the endpoint has registered `times`.
+/// Receives, without answering, until the endpoint has registered `times` times.
 fn come_back(endpoint: &mut Endpoint, times: u64) {
     until("the endpoint is back", || {
         match endpoint.receive(Duration::from_millis(20)) {
-            // It says once that its connection has ended.
+            // It reports the end of its connection once.
             Ok(None) | Err(ApiError::Disconnected(_)) => {}
             other => panic!("{other:?}"),
         }
@@ -52,11 +52,11 @@ fn comes_back(transport: Transport) {
     // When
     node.handle().inject("LNCL", Fault::panic()).expect("every node has it");
     ready_for(&node.handle(), "LNCL", 2);
-    // Then: nobody can say any more what became of the message
+    // Then: the fate of the message is unknown
     let (mut hip, outcome) = asking.join().expect("no panic");
     assert!(matches!(outcome, Ok(Outcome::Unknown | Outcome::Failed)), "{outcome:?}");
     in_hand.settle(Outcome::Delivered);
-    // Then: both are back behind the same names and addresses, and in their groups
+    // And: both are back under the same names and addresses, and in their groups
     come_back(&mut drive, 2);
     come_back(&mut hip, 2);
     assert_eq!((drive.tid(), hip.tid()), (drive_tid, hip_tid));
@@ -67,24 +67,24 @@ fn comes_back(transport: Transport) {
 }
 
 #[test]
-fn endpoints_at_rings_come_back_when_lncl_panics() {
+fn ring_endpoints_reconnect_after_lncl_panics() {
     comes_back(Transport::Ring);
 }
 
 #[test]
-fn endpoints_at_sockets_come_back_when_lncl_panics() {
+fn socket_endpoints_reconnect_after_lncl_panics() {
     comes_back(Transport::Socket);
 }
 
-/// A node gives up after 2 s whoever has begun to register and does not go on.
+/// After 2 s a node gives up a client that began to register and does not continue.
 #[test]
-fn an_endpoint_that_is_used_every_two_seconds_and_a_bit_comes_back_all_the_same() {
+fn endpoint_used_rarely_still_reconnects() {
     let (node, api, _directory) = node_and_its_door();
     let mut seldom = api.register_transport_address(Registration::new().name("seldom")).expect("an address");
     let to = seldom.tid();
     node.handle().inject("LNCL", Fault::panic()).expect("every node has it");
     ready_for(&node.handle(), "LNCL", 2);
-    // Three on a machine that is quick: each goes as far as what it is answered at once.
+    // Three on a fast machine: each proceeds as far as it is answered at once.
     let calls = (1..=20).find(|_| {
         thread::sleep(Duration::from_millis(2_100));
         seldom.send(to, &Job { number: 1 }).is_ok()

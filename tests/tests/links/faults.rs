@@ -2,19 +2,15 @@
 
 use std::time::Duration;
 
-use sinew_tests::{
-    link_faults::{Plan, Report, Trouble, run},
-    program,
-};
+use sinew_tests::link_faults::{Plan, Report, Trouble, run};
 
-/// What happens at 3,000 messages a second.
+/// Runs the faults at 3,000 messages a second.
 fn report(troubles: &[Trouble], faults: u64) -> Report {
     plan(troubles, faults, |_| {})
 }
 
 fn plan(troubles: &[Trouble], faults: u64, change: impl FnOnce(&mut Plan)) -> Report {
     let mut plan = Plan {
-        program: program("link_faults"),
         rate: 3_000,
         back_rate: 300,
         filling: 128,
@@ -32,7 +28,7 @@ fn plan(troubles: &[Trouble], faults: u64, change: impl FnOnce(&mut Plan)) -> Re
 }
 
 #[test]
-fn cuts_and_panics_of_gncl_on_both_sides_lose_double_and_reorder_nothing() {
+fn cuts_and_gncl_panics_lose_and_reorder_nothing() {
     let troubles = [Trouble::Cut, Trouble::PanicSender, Trouble::Finish, Trouble::PanicReceiver];
     let report = report(&troubles, 40);
     assert!(report.holds() && report.verdict.is_perfect(), "{report}");
@@ -40,15 +36,16 @@ fn cuts_and_panics_of_gncl_on_both_sides_lose_double_and_reorder_nothing() {
     agrees(&report);
 }
 
-/// Where no node was lost, what the nodes say of the messages is what the history says.
+/// Without a lost node, the counters of the nodes agree with the recorded history.
 #[track_caller]
 fn agrees(report: &Report) {
     let total = report.audit.total();
-    // A value that goes by the connection after all, as no word came that it had arrived by datagram, counts as two, of which one is superseded.
+    // A value is resent by the connection if the acknowledgement of its datagram does not arrive. It counts
+    // as two values, of which one is superseded.
     assert!(total.superseded >= report.verdict.superseded, "{report}");
     assert_eq!((total.expired, total.failed, total.lost, total.unknown), (0, 0, 0, 0), "{report}");
     for link in &report.audit.links {
-        // The audit's own question and answer may lie between the readings.
+        // The audit's own request and reply may lie between the readings.
         let taken = link.taken.expect("both ends speak of one session");
         assert!(link.sent.abs_diff(taken) <= 1, "{link}\n{report}");
     }
@@ -66,21 +63,21 @@ fn flipped_bits_cost_connections_and_no_message() {
 }
 
 #[test]
-fn a_link_that_is_stalled_or_parted_for_less_than_a_loss_takes_loses_nothing() {
+fn link_stalled_for_less_than_a_loss_loses_nothing() {
     let report = report(&[Trouble::Stall, Trouble::PartThere, Trouble::PartBack], 3);
     assert!(report.verdict.is_perfect(), "{report}");
     agrees(&report);
 }
 
 #[test]
-fn of_a_killed_node_every_confirmed_message_has_its_outcome() {
+fn confirmed_messages_of_a_killed_node_have_outcomes() {
     let report = report(&[Trouble::KillReceiver, Trouble::KillSender], 4);
     assert!(report.holds(), "{report}");
     assert!(report.verdict.got > 0 && report.verdict.asked > 0, "{report}");
 }
 
 #[test]
-fn wall_clocks_that_jump_by_a_day_are_noticed_by_no_message() {
+fn wall_clock_jumps_affect_no_message() {
     if std::process::Command::new("cc").arg("--version").output().is_err() {
         println!("skipped: there is no cc on this machine, which a clock that is set needs");
         return;

@@ -1,4 +1,4 @@
-//! Whole nodes with keys on this host: one whose clock began anew, and one whose certificate is revoked.
+//! Whole nodes with keys on this host: one with a reset clock, and one with a revoked certificate.
 
 use std::{
     net::{Ipv4Addr, SocketAddrV4},
@@ -13,11 +13,12 @@ use sinew::{
     prelude::*,
     security::{Certificate, Identity, files},
 };
-use sinew_tests::{DEADLINE, OwnDirectory, Program, keys, node_under_test, own_group, until};
+use sinew_testkit::{DEADLINE, NodeProcess, TestDirectory, keys, own_group, until};
+use sinew_tests::node_under_test;
 
 payload!("keys.torque", Control => struct Torque { newton_metres: f64 });
 
-/// Takes every torque.
+/// Accepts every torque.
 struct Drive;
 
 impl Actor for Drive {
@@ -32,22 +33,22 @@ impl Handler<Delivery<Torque>> for Drive {
 
 const PROJECT: &str = "keys";
 const NAMES: [&str; 2] = ["hip", "knee"];
-/// Half a minute after the beginning of 1970, in microseconds: a board without a battery for its clock.
+/// Half a minute after the start of 1970, in microseconds: a board without a battery for its clock.
 const AT_THE_BEGINNING: &str = "30000000";
-/// For so long a lost life bars an earlier one (NDL-5.2).
+/// Time for which a lost incarnation bars an earlier one (NDL-5.2).
 const BARRED: Duration = Duration::from_secs(15);
-/// Time in which a machine that is slow and busy otherwise starts a node and has it found.
+/// Time in which a slow and busy machine starts a node and the node is found.
 const FOUND: Duration = Duration::from_secs(45);
 
 /// Two nodes with keys of one project, each with an address of its own on loopback.
 struct Robot {
-    directory: OwnDirectory,
+    directory: TestDirectory,
     group: SocketAddrV4,
 }
 
 impl Robot {
     fn new() -> Self {
-        let directory = OwnDirectory::new();
+        let directory = TestDirectory::new();
         let identity = |index: usize| Identity {
             project: PROJECT.to_owned(),
             address: address(index).into(),
@@ -61,7 +62,7 @@ impl Robot {
         self.directory.join("keys").join(NAMES[index])
     }
 
-    fn start(&self, index: usize, more: &[&str]) -> Program {
+    fn start(&self, index: usize, more: &[&str]) -> NodeProcess {
         let path = self.directory.join(&format!("{}.toml", NAMES[index]));
         let text = format!(
             "[node]\nname = \"{}\"\naddress = \"{}\"\nproject = \"{PROJECT}\"\n[ndl]\nmulticast = \"{}\"\nmdns_port = false\n\
@@ -77,7 +78,7 @@ impl Robot {
 }
 
 impl Robot {
-    /// The same in this process.
+    /// The same node, in this process.
     fn builder(&self, index: usize) -> NodeBuilder {
         Node::builder(NAMES[index]).address(address(index)).configure(|config| {
             config.project = PROJECT.to_owned();
@@ -105,19 +106,19 @@ fn address(index: usize) -> Ipv4Addr {
 
 // spec: NDL-5.2
 #[test]
-fn a_node_whose_clock_began_anew_is_there_again_15_s_after_its_loss() {
-    // Given: two nodes that have proven themselves to each other
+fn node_with_reset_clock_returns_after_15_s() {
+    // Given: two nodes that have authenticated each other
     let robot = Robot::new();
     let mut hip = robot.start(0, &["--requires", "knee", "--sends-to", "knee", "--logs"]);
     let mut knee = robot.start(1, &[]);
     knee.wait_for(&["count 1 from 127.0.0.1"]);
-    // When: one loses its power, and is back with a clock that stands at 1970
+    // When: one loses its power, and returns with a clock at 1970
     knee.signal(Signal::KILL);
     hip.wait_for(&["NodeLost", "knee", "Crashed"]);
     let lost = Instant::now();
     let mut knee = robot.start(1, &["--incarnation", AT_THE_BEGINNING]);
-    // Then: it is barred, with a reason in words, and then it is not
-    hip.wait_for(&["NDL answer of a former life", "its clock went back"]);
+    // Then: it is barred, with a reason in the log, and later it is not
+    hip.wait_for(&["NDL answer of a former incarnation", "its clock went back"]);
     hip.wait_for(&["NodeRestarted", "knee", AT_THE_BEGINNING]);
     let took = lost.elapsed();
     println!("found {took:?} after its loss");
@@ -132,7 +133,7 @@ fn send(gait: &mut Endpoint, to: Tid, within: Duration) -> Outcome {
 
 // spec: GNCL-18
 #[test]
-fn who_is_revoked_reaches_nobody_from_when_the_deny_list_is_read_again() {
+fn revoked_node_is_cut_off_by_the_deny_list() {
     // Given: the hip sends to a drive of the knee
     let robot = Robot::new();
     let drive = AppSpec::new("drive", || Drive).handles::<Torque>();
@@ -143,7 +144,7 @@ fn who_is_revoked_reaches_nobody_from_when_the_deny_list_is_read_again() {
     let mut gait = api.register_transport_address(registration).expect("it is registered");
     let drive = gait.resolve("drive", DEADLINE).expect("an answer").expect("it is there");
     assert_eq!(send(&mut gait, drive, DEADLINE), Outcome::Delivered);
-    // When: a list with a fault, which changes nothing
+    // When: an invalid list, which changes nothing
     keys::put(&robot.keys(1), files::DENIED, 0o644, "hip\n").expect("the test's own directory");
     let faults = knee.handle().reload_deny_list().expect_err("that is no number").to_string();
     assert!(faults.contains("line 1") && faults.contains("stays"), "{faults}");
@@ -151,21 +152,21 @@ fn who_is_revoked_reaches_nobody_from_when_the_deny_list_is_read_again() {
     // When: the hip is revoked
     robot.revoke(0, 1);
     assert_eq!(knee.handle().reload_deny_list().expect("it is good").denied, 1);
-    // Then: the link ends, and there is no other one; a message may be late before, on a machine that is slow
+    // Then: the link ends, and there is no other one; on a slow machine a message may arrive late before that
     let soon = Duration::from_millis(500);
     let mut missed = 0;
     until("it reaches nobody any more", || {
         missed = if send(&mut gait, drive, soon) == Outcome::Delivered { 0 } else { missed + 1 };
         (missed == 4).then_some(())
     });
-    // When: the knee itself
+    // When: the knee itself is revoked
     robot.revoke(1, 1);
     let own = knee.handle().reload_deny_list();
     assert!(matches!(own, Err(DenyListError::Own { .. })), "{own:?}");
 }
 
 #[test]
-fn a_node_without_keys_has_no_deny_list_to_read() {
-    let node = sinew_tests::Ground::new().node("hip").start().expect("a node");
+fn node_without_keys_has_no_deny_list() {
+    let node = sinew_testkit::Loopback::new().node("hip").start().expect("a node");
     assert!(matches!(node.handle().reload_deny_list(), Err(DenyListError::None)));
 }

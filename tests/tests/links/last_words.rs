@@ -1,6 +1,8 @@
-//! Whoever is told that a node is lost gets no message of that life of it afterwards: slow receivers under a flood, whose sender is killed
-//! at any moment, an actor and an endpoint in another process's place.
+//! After the report of a node's loss, no message of that incarnation of the node is delivered. The receivers
+//! are slow and under a flood: an actor, and an endpoint in the role of another process. The sender is killed
+//! at any moment.
 
+use sinew_testkit::SetOnDrop;
 use std::{
     sync::atomic::{AtomicBool, Ordering},
     time::Instant,
@@ -8,13 +10,14 @@ use std::{
 
 use rustix::process::Signal;
 use sinew::{Endpoint, NodeApi, Registration, events::DownClass, message::Kind, prelude::*};
-use sinew_tests::{Ground, Log, OwnDirectory, Program, node_under_test};
+use sinew_testkit::{Log, Loopback, NodeProcess, TestDirectory};
+use sinew_tests::node_under_test;
 
-/// Lives of the sender, each of which ends by a kill.
-const LIVES: usize = 6;
-/// Counts that both have got before it is killed.
+/// Incarnations of the sender, each of which is killed.
+const INCARNATIONS: usize = 6;
+/// Messages that both receivers have received before a kill.
 const BEFORE: usize = 3_000;
-/// What handling one takes: more come.
+/// Handling time of one message: more arrive in this time.
 const TAKES: Duration = Duration::from_micros(50);
 
 payload!("scenario.count", Bulk => struct Count { number: u64 });
@@ -79,16 +82,7 @@ const fn saw(event: &NodeEvent) -> Saw {
     }
 }
 
-/// Says that it is over, also where the test fails.
-struct Over<'a>(&'a AtomicBool);
-
-impl Drop for Over<'_> {
-    fn drop(&mut self) {
-        self.0.store(true, Ordering::Relaxed);
-    }
-}
-
-/// Receives until it is over.
+/// Receives until the flag is set.
 fn receive(mut endpoint: Endpoint, log: &Log<Saw>, is_over: &AtomicBool) {
     while !is_over.load(Ordering::Relaxed) {
         let Some(message) = endpoint.receive(Duration::from_millis(20)).expect("the node lives") else {
@@ -105,23 +99,22 @@ fn receive(mut endpoint: Endpoint, log: &Log<Saw>, is_over: &AtomicBool) {
     }
 }
 
-/// After each end, the first count is the first one of the next life.
+/// Checks that after each end the first count is the first one of the next incarnation.
 fn judge(who: &str, log: &Log<Saw>, end: Saw) {
     let all = log.all();
-    assert_eq!(all.iter().filter(|saw| **saw == end).count(), LIVES, "{who}: {end:?}");
+    assert_eq!(all.iter().filter(|saw| **saw == end).count(), INCARNATIONS, "{who}: {end:?}");
     for (at, _) in all.iter().enumerate().filter(|(_, saw)| **saw == end) {
         let next = all[at..].iter().find(|saw| matches!(saw, Saw::Count(_)));
         assert!(matches!(next, None | Some(Saw::Count(1))), "{who}: {next:?} came after {end:?}");
     }
 }
 
-fn sender(directory: &OwnDirectory, ground: &Ground) -> Program {
-    let path = directory.join("flood.toml");
+fn sender(directory: &TestDirectory, loopback: &Loopback) -> NodeProcess {
     let text = format!(
         "[node]\nname = \"flood\"\naddress = \"127.0.0.9\"\n[ndl]\nmulticast = \"{}\"\nmdns_port = false\n",
-        ground.group
+        loopback.group
     );
-    std::fs::write(&path, text).expect("the test's own directory");
+    let path = directory.write("flood.toml", &text);
     node_under_test(
         None,
         &path,
@@ -130,36 +123,37 @@ fn sender(directory: &OwnDirectory, ground: &Ground) -> Program {
 }
 
 #[test]
-fn who_is_told_of_a_lost_node_gets_no_message_of_that_life_afterwards() {
-    let (ground, directory) = (Ground::new(), OwnDirectory::new());
+fn no_message_follows_the_report_of_a_nodes_loss() {
+    let (loopback, directory) = (Loopback::new(), TestDirectory::new());
     let (slow, client, is_over) = (Log::default(), Log::default(), AtomicBool::new(false));
     let log = slow.clone();
     let spec = AppSpec::new("slow", move || Slow(log.clone()));
     let spec = spec.handles::<Count>().handles::<NodeEvent>().handles::<Down>().own_thread();
     let socket = directory.join("hub.sock");
-    let node = ground.node("hub").configure(|config| config.lncl.socket = Some(socket.clone()));
+    let node = loopback.node("hub").configure(|config| config.lncl.socket = Some(socket.clone()));
     let _node = node.app(spec).start().expect("a node");
     let api = NodeApi::connect(&socket).expect("the node is up");
     let registration = Registration::new().name("client").subscribe::<NodeEvent>();
     let endpoint = api.register_transport_address(registration).expect("the name is free");
     std::thread::scope(|scope| {
         scope.spawn(|| receive(endpoint, &client, &is_over));
-        let _over = Over(&is_over);
-        for life in 1..=LIVES {
-            let flood = sender(&directory, &ground);
+        let _over = SetOnDrop(&is_over);
+        for incarnation in 1..=INCARNATIONS {
+            let flood = sender(&directory, &loopback);
             for log in [&slow, &client] {
                 let has_begun = |all: &[Saw]| {
                     let lost = all.iter().filter(|saw| **saw == Saw::Lost).count();
                     let counts = all.iter().rev().take_while(|saw| **saw != Saw::Lost).count();
-                    (lost == life - 1 && counts > BEFORE).then_some(())
+                    (lost == incarnation - 1 && counts > BEFORE).then_some(())
                 };
                 log.wait("the flood", has_begun);
             }
             flood.signal(Signal::KILL);
             for (log, end) in [(&slow, Saw::Lost), (&slow, Saw::Down), (&client, Saw::Lost)] {
-                let is_told =
-                    |all: &[Saw]| (all.iter().filter(|saw| **saw == end).count() == life).then_some(());
-                log.wait(&format!("{end:?} of life {life}"), is_told);
+                let is_told = |all: &[Saw]| {
+                    (all.iter().filter(|saw| **saw == end).count() == incarnation).then_some(())
+                };
+                log.wait(&format!("{end:?} of incarnation {incarnation}"), is_told);
             }
         }
     });

@@ -1,9 +1,9 @@
-//! What becomes of messages to a node that is killed, as each form of the API tells its sender: an actor by a future and by a message, an
-//! endpoint by the end of a call and of a task, and C. What had arrived there is `Unknown`, what never left is `PeerLost`.
+//! Outcomes of messages to a node that is killed, in each form of the API: an actor by a future and by a
+//! message, an endpoint by a blocking call and by an async task, and C. A message that had arrived there is
+//! `Unknown`; a message that was never sent is `PeerLost`.
 
 use std::{
     collections::BTreeSet,
-    fs,
     net::SocketAddr,
     path::{Path, PathBuf},
     thread,
@@ -13,36 +13,37 @@ use rustix::process::Signal;
 use sinew::{Endpoint, NodeApi, Registration, audit::Place, client::Received, message::Sender, prelude::*};
 use sinew_c::conformance::{self, Asked};
 use sinew_runtime::wire::Message;
-use sinew_tests::{
-    DEADLINE, Ground, Log, OwnDirectory, Program, all_run, node_under_test,
-    proxy::{Cut, Door, Proxy, Side},
-    puppet::desk,
+use sinew_testkit::{
+    DEADLINE, Log, Loopback, NodeProcess, TestDirectory, all_run,
+    network::{Cut, FaultyNetwork, Listener, Side},
+    scripted::sender_app,
     until,
 };
+use sinew_tests::node_under_test;
 
-/// Beyond what the test waits for anything: an outcome that comes is no deadline's.
+/// Longer than any wait of the test: an outcome that arrives is not that of a deadline.
 const WITHIN: Duration = DEADLINE.saturating_mul(10);
 
-/// Doors of the network: to the sender's GNCL, and to nobody's.
+/// Listeners of the network: to the sender's GNCL, and to nowhere.
 const TO_HUB: usize = 0;
 const TO_NOBODY: usize = 1;
 
-/// Rounds: while the connection stands, and when it is broken.
+/// Rounds: while the connection is up, and when it is broken.
 const ARRIVES: u64 = 1;
 const WAITS: u64 = 2;
 
 const AWAITED: &str = "a future of an actor";
-const TOLD: &str = "a message to an actor";
+const REPORTED: &str = "a message to an actor";
 const ENDPOINT: &str = "an endpoint";
 const TASK: &str = "an endpoint of a task";
 const IN_C: &str = "an endpoint in C";
-const FORMS: [&str; 5] = [AWAITED, TOLD, ENDPOINT, TASK, IN_C];
+const FORMS: [&str; 5] = [AWAITED, REPORTED, ENDPOINT, TASK, IN_C];
 
-/// Sends from an endpoint of its own, through the node that listens there, and returns with the outcome.
+/// Sends from an endpoint of its own, through the node at this socket, and returns the outcome.
 type SendOne = fn(&Path, Tid, &Held) -> Outcome;
 const BLOCKING: [(&str, SendOne); 3] = [(ENDPOINT, by_endpoint), (TASK, by_task), (IN_C, in_c)];
 
-/// Of which round, in which form, what was told.
+/// The round, the form, and the outcome.
 type Ended = (u64, &'static str, Outcome);
 
 payload!("lost_words.held" => struct Held { round: u64, form: String });
@@ -70,15 +71,15 @@ impl Handler<Delivery<Go>> for Clerk {
             clerk.0.write((round, AWAITED, outcome));
         });
         context.spawn(awaited);
-        context.message(to, &held(round, TOLD)).with_tag(round).confirmed(WITHIN).expect("it has room");
+        context.message(to, &held(round, REPORTED)).with_tag(round).confirmed(WITHIN).expect("it has room");
     }
 }
 
 impl Handler<SendOutcome> for Clerk {
     type Result = ();
 
-    fn handle(&mut self, told: SendOutcome, _: &mut Self::Context) {
-        self.0.write((told.tag, TOLD, told.outcome));
+    fn handle(&mut self, outcome: SendOutcome, _: &mut Self::Context) {
+        self.0.write((outcome.tag, REPORTED, outcome.outcome));
     }
 }
 
@@ -113,57 +114,57 @@ fn in_c(socket: &Path, to: Tid, held: &Held) -> Outcome {
     Outcome::from_code(code).expect("it is one")
 }
 
-/// Two nodes, of which the hub, here, sends to an application of the other one, which takes what comes and says nothing of it. Their
-/// connections pass the network, their datagrams do not.
+/// Two nodes. The hub, in this process, sends to an application of the other one, which receives messages and
+/// does not settle them. The connections between them pass through the network, their datagrams do not.
 struct Scenario {
-    network: Proxy,
-    desk: Sender,
+    network: FaultyNetwork,
+    sender_app: Sender,
     hub: Node,
     socket: PathBuf,
     ended: Log<Ended>,
-    knee: Program,
+    knee: NodeProcess,
     holder: Endpoint,
     to: Tid,
-    // Last: removed when nobody uses it.
-    _directory: OwnDirectory,
+    // Last, so that it is removed after its users.
+    _directory: TestDirectory,
 }
 
 impl Scenario {
     fn start() -> Self {
-        let (ground, directory) = (Ground::new(), OwnDirectory::new());
+        let (loopback, directory) = (Loopback::new(), TestDirectory::new());
         let listen = SocketAddr::from(([127, 0, 0, 1], 0));
-        let doors = [Side::Left, Side::Right].map(|side| Door { side, listen, datagrams: false });
-        let network = Proxy::start(&doors, 1).expect("ports on loopback");
-        let (knee, door) = (directory.join("knee.sock"), network.address(TO_NOBODY));
-        let (program, holder) = start_knee(&ground, &directory, &knee, door);
+        let listeners = [Side::Left, Side::Right].map(|side| Listener { side, listen, datagrams: false });
+        let network = FaultyNetwork::start(&listeners, 1).expect("ports on loopback");
+        let (knee, listener) = (directory.join("knee.sock"), network.address(TO_NOBODY));
+        let (program, holder) = start_knee(&loopback, &directory, &knee, listener);
 
         let (ended, socket) = (Log::default(), directory.join("hub.sock"));
-        let (log, (desk, key)) = (ended.clone(), desk("desk"));
+        let (log, (sender_app, key)) = (ended.clone(), sender_app("sender"));
         let clerk = AppSpec::new("clerk", move || Clerk(log.clone())).handles::<Go>();
-        let SocketAddr::V4(announced) = network.address(TO_HUB) else { panic!("its door is of IPv4") };
-        // The higher address of both: while its own dials lead nowhere, it takes the other one's.
-        let hub = ground.node("hub").address([127, 0, 0, 9]).configure(|config| {
+        let SocketAddr::V4(announced) = network.address(TO_HUB) else { panic!("its listener is of IPv4") };
+        // The higher address of both: while its own dials lead nowhere, it accepts those of the other node.
+        let hub = loopback.node("hub").address([127, 0, 0, 9]).configure(|config| {
             config.gncl.announce = Some(announced);
             config.lncl.socket = Some(socket.clone());
         });
-        let hub = hub.app(clerk).app(desk).start().expect("a node");
-        network.lead(TO_HUB, hub.handle().gncl_address().expect("its layers are ready"));
+        let hub = hub.app(clerk).app(sender_app).start().expect("a node");
+        network.set_destination(TO_HUB, hub.handle().gncl_address().expect("its layers are ready"));
         all_run(&[&hub]);
         let to = until("the hub knows the holder", || hub.handle().resolve("holder"));
-        let desk = key.sender();
-        Self { network, desk, hub, socket, ended, knee: program, holder, to, _directory: directory }
+        let sender_app = key.sender();
+        Self { network, sender_app, hub, socket, ended, knee: program, holder, to, _directory: directory }
     }
 
-    /// Sends one in each form.
+    /// Sends one message in each form.
     fn send(&self, round: u64) {
-        self.desk.send("clerk", &Go { round, to: self.to.bits() }).expect("it has room");
+        self.sender_app.send("clerk", &Go { round, to: self.to.bits() }).expect("it has room");
         for (form, send) in BLOCKING {
             let (socket, to, ended) = (self.socket.clone(), self.to, self.ended.clone());
             thread::spawn(move || ended.write((round, form, send(&socket, to, &held(round, form)))));
         }
     }
 
-    /// One of each form, as the application of the other node has them in hand.
+    /// Returns one message of each form, as the application of the other node received them.
     fn take(&mut self) -> Vec<Received> {
         let mut in_hand = Vec::new();
         while in_hand.len() < FORMS.len() {
@@ -180,19 +181,19 @@ impl Scenario {
         in_hand
     }
 
-    /// The connections end, and there are no others; returns when the hub knows.
+    /// Ends the connections and prevents new ones; returns when the hub has noticed.
     fn cut(&self) {
-        // A dial from now on is ended by the door that leads nowhere.
-        self.network.lead(TO_HUB, self.network.address(TO_NOBODY));
+        // From now on the network to nowhere ends each dial.
+        self.network.set_destination(TO_HUB, self.network.address(TO_NOBODY));
         self.network.cut(Cut::Reset);
         until("no connection is open", || (self.network.counts().open == 0).then_some(()));
         until("what is sent to the lost connection waits", || {
-            self.desk.send(self.to, &Probe {}).expect("it has room");
+            self.sender_app.send(self.to, &Probe {}).expect("it has room");
             self.hub.handle().traffic().iter().any(|traffic| traffic.waiting > 0).then_some(())
         });
     }
 
-    /// Messages of applications that the hub has taken for the other node, sent or not.
+    /// Messages of applications that the hub has accepted for the other node, sent or not.
     fn taken(&self) -> u64 {
         let entries = self.hub.handle().audit_here().entries;
         let to_knee = entries.iter().filter(|entry| matches!(entry.place, Place::ToNode { .. }));
@@ -200,21 +201,20 @@ impl Scenario {
     }
 }
 
-/// The node that is killed, which is reached by its dials alone, and its application.
+/// The node to be killed, which is connected by its own dials only, and its application.
 fn start_knee(
-    ground: &Ground,
-    directory: &OwnDirectory,
+    loopback: &Loopback,
+    directory: &TestDirectory,
     socket: &Path,
-    door: SocketAddr,
-) -> (Program, Endpoint) {
-    let path = directory.join("knee.toml");
+    listener: SocketAddr,
+) -> (NodeProcess, Endpoint) {
     let text = format!(
-        "[node]\nname = \"knee\"\naddress = \"127.0.0.2\"\n[lncl]\nsocket = \"{}\"\n[gncl]\nannounce = \"{door}\"\n\
+        "[node]\nname = \"knee\"\naddress = \"127.0.0.2\"\n[lncl]\nsocket = \"{}\"\n[gncl]\nannounce = \"{listener}\"\n\
          [ndl]\nmulticast = \"{}\"\nmdns_port = false\n",
         socket.display(),
-        ground.group
+        loopback.group
     );
-    fs::write(&path, text).expect("the test's own directory");
+    let path = directory.write("knee.toml", &text);
     let mut knee = node_under_test(None, &path, &[]);
     knee.wait_for(&["up"]);
     let api = NodeApi::connect(socket).expect("the node is up");
@@ -223,18 +223,18 @@ fn start_knee(
 }
 
 #[test]
-fn each_form_tells_of_a_killed_node_what_had_arrived_there_as_unknown_and_what_waited_as_lost() {
-    // Given: of each form, one confirmed message that is in its receiver's hand,
+fn outcome_tells_arrived_from_unsent_after_a_kill() {
+    // Given: in each form, one confirmed message that its receiver holds,
     let mut scenario = Scenario::start();
     scenario.send(ARRIVES);
     let in_hand = scenario.take();
-    // and one that came when the connection was broken, and the node still there as far as anybody knows
+    // and one that was sent when the connection was broken and the node still counted as present
     scenario.cut();
     let before = scenario.taken();
     scenario.send(WAITS);
     let of_each = before + FORMS.len() as u64;
     until("the hub has taken one more of each form", || (scenario.taken() >= of_each).then_some(()));
-    assert_eq!(scenario.ended.all(), [], "nobody has said anything of them");
+    assert_eq!(scenario.ended.all(), [], "no outcome is reported");
     // When
     scenario.knee.signal(Signal::KILL);
     // Then
@@ -243,9 +243,9 @@ fn each_form_tells_of_a_killed_node_what_had_arrived_there_as_unknown_and_what_w
         scenario.ended.wait("an outcome of each", |ended| (ended.len() >= all).then(|| ended.to_vec()));
     for (round, outcome) in [(ARRIVES, Outcome::Unknown), (WAITS, Outcome::PeerLost)] {
         for form in FORMS {
-            let told = ended.iter().filter(|(of, by, _)| (*of, *by) == (round, form));
-            let told: Vec<_> = told.map(|(_, _, outcome)| *outcome).collect();
-            assert_eq!(told, [outcome], "of round {round} to {form}; all of them: {ended:?}");
+            let outcomes = ended.iter().filter(|(of, by, _)| (*of, *by) == (round, form));
+            let outcomes: Vec<_> = outcomes.map(|(_, _, outcome)| *outcome).collect();
+            assert_eq!(outcomes, [outcome], "of round {round} to {form}; all of them: {ended:?}");
         }
     }
     drop(in_hand);

@@ -2,15 +2,11 @@
 
 use std::time::Duration;
 
-use sinew_tests::{
-    program,
-    slow_consumer::{Plan, run},
-};
+use sinew_tests::slow_consumer::{Plan, run};
 
 #[test]
-fn a_consumer_that_does_not_keep_up_makes_neither_node_hold_more_than_its_bound() {
+fn slow_consumer_fills_neither_node_beyond_its_bound() {
     let plan = Plan {
-        program: program("slow_consumer"),
         lasts: Duration::from_secs(3),
         rate: 2_000,
         length: 40_000,
@@ -21,7 +17,7 @@ fn a_consumer_that_does_not_keep_up_makes_neither_node_hold_more_than_its_bound(
     println!("{report}");
     assert!(report.is_bounded(), "{report}");
     assert!(report.taken > 0 && report.slow.count > 0, "{report}");
-    // Else it would be no wonder.
+    // The load must exceed the capacity; otherwise the test shows nothing.
     let offered = report.offered * plan.length as u64;
     assert!(offered > report.bounds.iter().sum(), "{offered} bytes were offered:\n{report}");
 }

@@ -1,10 +1,12 @@
-//! A node whose port is stormed: thousands of connections that say nothing, and no descriptors left, while peers are served.
+//! A node under a connection flood: thousands of silent connections and no free descriptors, while peers are
+//! served.
 
+use sinew_testkit::sandbox::after_shell;
+use sinew_tests::role;
 use std::{
     collections::VecDeque,
     net::{Ipv4Addr, SocketAddr, SocketAddrV4, TcpListener, TcpStream},
     path::{Path, PathBuf},
-    process::Command,
     sync::{
         Arc,
         atomic::{AtomicBool, AtomicUsize, Ordering},
@@ -14,17 +16,18 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew_tests::{DEADLINE, OwnDirectory, Program, node_under_test, own_group, program};
+use sinew_testkit::{DEADLINE, NodeProcess, TestDirectory, own_group};
+use sinew_tests::node_under_test;
 
-/// Descriptors of the stormed node: some 40 are its own.
+/// Descriptor limit of the flooded node: it uses about 40 itself.
 const DESCRIPTORS: &str = "96";
-/// Connections that each of the storm's threads holds at once.
+/// Connections that each thread of the flood holds at the same time.
 const HELD: usize = 400;
 const THREADS: usize = 4;
-/// Connections that were made before it counts as a storm.
+/// Connections that must have been made before it counts as a flood.
 const MANY: usize = 4_000;
 
-/// Connects and says nothing, again and again, until it is dropped.
+/// Connects without sending, again and again, until it is dropped.
 struct Storm {
     made: Arc<AtomicUsize>,
     is_over: Arc<AtomicBool>,
@@ -39,7 +42,7 @@ impl Storm {
             std::thread::spawn(move || {
                 let mut held = VecDeque::new();
                 while !is_over.load(Ordering::Relaxed) {
-                    // Where the queue of those that wait is full, the system takes no more for a while.
+                    // If the accept queue is full, the system accepts no connection for a while.
                     if let Ok(silent) = TcpStream::connect_timeout(&target, Duration::from_millis(100)) {
                         made.fetch_add(1, Ordering::Relaxed);
                         held.push_back(silent);
@@ -67,46 +70,43 @@ impl Drop for Storm {
     fn drop(&mut self) {
         self.is_over.store(true, Ordering::Relaxed);
         for thread in self.threads.drain(..) {
-            // A panic there is not this thread's to repeat.
+            // A panic of that thread is not repeated here.
             let _ = thread.join();
         }
     }
 }
 
 fn configuration(
-    directory: &OwnDirectory,
+    directory: &TestDirectory,
     group: SocketAddrV4,
     (name, address): (&str, u8),
     gncl: &str,
 ) -> PathBuf {
-    let path = directory.join(&format!("{name}.toml"));
     let text = format!(
         "[node]\nname = \"{name}\"\naddress = \"127.0.0.{address}\"\nproject = \"storm\"\n[gncl]\n{gncl}\n\
          [ndl]\nmulticast = \"{group}\"\nmdns_port = false\nmissed_max = 20\n"
     );
-    std::fs::write(&path, text).expect("the test's own directory");
-    path
+    directory.write(&format!("{name}.toml"), &text)
 }
 
-/// A port that is free now.
+/// Returns a port that is free now.
 fn free_port() -> u16 {
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("loopback has a free port");
     listener.local_addr().expect("it is bound").port()
 }
 
-/// A node that has few descriptors, however many its limit would allow.
-fn starved_node(configuration: &Path) -> Program {
-    let mut command = Command::new("sh");
-    command.args(["-c", r#"ulimit -n $0 && exec "$@""#, DESCRIPTORS]).arg(program("node_under_test"));
+/// A node with few descriptors, even if its hard limit allows more.
+fn starved_node(configuration: &Path) -> NodeProcess {
+    let mut command = role("node_under_test");
     command.arg(configuration);
-    Program::start("knee", command)
+    NodeProcess::start("knee", after_shell(&format!("ulimit -n {DESCRIPTORS}"), &command))
 }
 
 #[test]
-fn a_peer_is_served_and_a_new_one_taken_while_thousands_say_nothing_and_no_descriptors_are_left() {
-    let (directory, group, port) = (OwnDirectory::new(), own_group(), free_port());
+fn peers_are_served_during_a_connection_flood() {
+    let (directory, group, port) = (TestDirectory::new(), own_group(), free_port());
     let write = |name, address, gncl: &str| configuration(&directory, group, (name, address), gncl);
-    // So many strangers are allowed that the descriptors run out first.
+    // Enough unauthenticated connections are allowed for the descriptors to run out first.
     let gncl = format!("port = {port}\nstrangers_max = 1024\nhandshake_ms = 60000");
     let (knee, hip) = (write("knee", 2, &gncl), write("hip", 1, ""));
     let mut knee = starved_node(&knee);
@@ -121,11 +121,11 @@ fn a_peer_is_served_and_a_new_one_taken_while_thousands_say_nothing_and_no_descr
     ankle.wait_for(&["started"]);
     knee.wait_for(&["count 1 from 127.0.0.3"]);
     storm.wait();
-    // Each with a deadline of its own: how many a second come is the machine's affair.
+    // Each with a deadline of its own: the rate depends on the machine.
     for count in [250, 500, 750, 1_000] {
         knee.wait_for(&[&format!("count {count} from 127.0.0.3")]);
     }
-    assert!(knee.said().iter().all(|line| !line.contains("NodeLost")), "nobody was lost meanwhile");
+    assert!(knee.output().iter().all(|line| !line.contains("NodeLost")), "nobody was lost meanwhile");
     hip.signal(Signal::TERM);
     knee.wait_for(&["NodeLost", "hip", "Left"]);
 }

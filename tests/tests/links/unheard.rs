@@ -1,4 +1,4 @@
-//! Nodes between which NDL's datagrams are lost, and whose connections deliver.
+//! Nodes that lose NDL datagrams while their connections deliver.
 
 use std::{
     net::{SocketAddr, UdpSocket},
@@ -6,43 +6,44 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew_tests::{
-    OwnDirectory, Program, node_under_test,
-    proxy::{Door, Proxy, Side},
+use sinew_testkit::{
+    NodeProcess, TestDirectory,
+    network::{FaultyNetwork, Listener, Side},
 };
+use sinew_tests::node_under_test;
 
-/// Two nodes, of which the first knows where the second is, and sends to it; all their datagrams pass the proxy.
+/// Two nodes; the first knows the address of the second and sends to it. All their datagrams pass through the
+/// network.
 struct Scenario {
-    directory: OwnDirectory,
-    proxy: Proxy,
+    directory: TestDirectory,
+    network: FaultyNetwork,
     second_at: SocketAddr,
 }
 
 impl Scenario {
     fn new() -> Self {
         let listen = SocketAddr::from(([127, 0, 0, 1], 0));
-        let doors = [Door { side: Side::Right, listen, datagrams: true }];
-        let proxy = Proxy::start(&doors, 1).expect("ports on loopback");
+        let listeners = [Listener { side: Side::Right, listen, datagrams: true }];
+        let network = FaultyNetwork::start(&listeners, 1).expect("ports on loopback");
         let free = UdpSocket::bind(listen).expect("a port on loopback");
         let second_at = free.local_addr().expect("it is bound");
-        proxy.lead(0, second_at);
-        Self { directory: OwnDirectory::new(), proxy, second_at }
+        network.set_destination(0, second_at);
+        Self { directory: TestDirectory::new(), network, second_at }
     }
 
-    /// With a period that bears what a machine does that runs real-time threads of other tests: their connections have to deliver within it.
+    /// The period allows for a machine that runs real-time threads of other tests: the connections must
+    /// deliver within it.
     fn configuration(&self, name: &str, address: u8, ndl: &str) -> PathBuf {
-        let path = self.directory.join(&format!("{name}.toml"));
         let text = format!(
             "[node]\nname = \"{name}\"\naddress = \"127.0.0.{address}\"\nproject = \"unheard\"\n\
              [ndl]\nmulticast = false\nmdns_port = false\nperiod_ms = 500\n{ndl}\n"
         );
-        std::fs::write(&path, text).expect("the test's own directory");
-        path
+        self.directory.write(&format!("{name}.toml"), &text)
     }
 
-    fn start(&self) -> (Program, Program) {
+    fn start(&self) -> (NodeProcess, NodeProcess) {
         let knee = self.configuration("knee", 2, &format!("port = {}", self.second_at.port()));
-        let hip = self.configuration("hip", 1, &format!("seeds = [\"{}\"]", self.proxy.address(0)));
+        let hip = self.configuration("hip", 1, &format!("seeds = [\"{}\"]", self.network.address(0)));
         let mut knee = node_under_test(None, &knee, &[]);
         knee.wait_for(&["up"]);
         let mut hip = node_under_test(None, &hip, &["--requires", "knee", "--sends-to", "knee"]);
@@ -53,13 +54,13 @@ impl Scenario {
 
     fn lose_datagrams(&self, are_lost: bool) {
         for side in [Side::Left, Side::Right] {
-            self.proxy.change(side, |faults| faults.parted = are_lost);
+            self.network.change(side, |faults| faults.parted = are_lost);
         }
     }
 }
 
 #[test]
-fn nodes_whose_connections_deliver_are_not_lost_and_it_is_said_that_their_ndl_is_not_heard() {
+fn node_with_lost_datagrams_is_kept_and_reported() {
     let scenario = Scenario::new();
     let (mut hip, mut knee) = scenario.start();
     for _ in 0..2 {
@@ -70,12 +71,12 @@ fn nodes_whose_connections_deliver_are_not_lost_and_it_is_said_that_their_ndl_is
         hip.wait_for(&["AppResumed", "knee", "NDL"]);
         knee.wait_for(&["AppResumed", "hip", "NDL"]);
     }
-    let all = [hip.said(), knee.said()].concat();
+    let all = [hip.output(), knee.output()].concat();
     assert!(all.iter().all(|line| !line.contains("NodeLost")), "{all:?}");
 }
 
 #[test]
-fn of_a_node_that_is_not_heard_it_is_known_when_it_ends_or_hangs() {
+fn end_or_hang_of_an_unheard_node_is_noticed() {
     for (signal, why) in [(Signal::KILL, "Crashed"), (Signal::STOP, "Hung")] {
         let scenario = Scenario::new();
         let (mut hip, knee) = scenario.start();

@@ -1,9 +1,11 @@
-//! Nodes that are started before their host has the address that they are to use: they wait, warn, and go on when it is there.
+//! Nodes that start before their host has their address: they wait, warn, and continue once the address is
+//! present.
 
-use sinew_hosts::Addresses;
-use sinew_tests::{Hosts, OwnDirectory, node_under_test, own_group};
+use sinew_testkit::Addresses;
+use sinew_testkit::{Hosts, TestDirectory, own_group};
+use sinew_tests::node_under_test;
 
-/// What `ndl.interface` says, the address that comes, and what is logged then.
+/// The value of `ndl.interface`, the address that is added, and the log line that follows.
 const FORMS: [(&str, &str, &str); 6] = [
     ("\"10.9.0.2\"", "10.9.0.2/24", "10.9.0.2"),
     ("[\"10.9.0.3\", \"10.9.0.4\"]", "10.9.0.3/24", "10.9.0.3"),
@@ -14,20 +16,19 @@ const FORMS: [(&str, &str, &str); 6] = [
 ];
 
 #[test]
-fn a_node_waits_for_its_address_however_that_is_written_and_goes_on_when_it_is_there() {
+fn node_waits_for_its_address_in_any_notation() {
     let hosts = match Hosts::with_addresses(1, 1, Addresses::LinkLocal) {
         Ok(hosts) => hosts,
         Err(why) => return println!("skipped: no hosts with IPv6 can be made here: {why}"),
     };
-    let (host, directory, group) = (&hosts.all()[0], OwnDirectory::new(), own_group());
+    let (host, directory, group) = (&hosts.all()[0], TestDirectory::new(), own_group());
     host.ip("address del fe80::1/64 dev eth0").unwrap_or_else(|error| panic!("{error}"));
     let start = |(nth, (interface, ..)): (usize, &(&str, &str, &str))| {
-        let path = directory.join(&format!("node{nth}.toml"));
         let text = format!(
             "[node]\nname = \"node{nth}\"\nproject = \"later{nth}\"\naddress = \"10.9.1.{nth}\"\n\
              [ndl]\nmdns_port = false\nmulticast = \"{group}\"\ninterface = {interface}\n"
         );
-        std::fs::write(&path, text).expect("the test's own directory");
+        let path = directory.write(&format!("node{nth}.toml"), &text);
         node_under_test(Some(host), &path, &["--logs-info"])
     };
     let mut nodes: Vec<_> = FORMS.iter().enumerate().map(start).collect();
@@ -45,19 +46,18 @@ fn a_node_waits_for_its_address_however_that_is_written_and_goes_on_when_it_is_t
 }
 
 #[test]
-fn two_nodes_whose_addresses_come_after_their_start_find_each_other_and_talk() {
+fn nodes_find_each_other_when_addresses_come_later() {
     let hosts = match Hosts::new(2) {
         Ok(hosts) => hosts,
         Err(why) => return println!("skipped: no hosts can be made here: {why}"),
     };
-    let (directory, group) = (OwnDirectory::new(), own_group());
+    let (directory, group) = (TestDirectory::new(), own_group());
     let node = |nth: usize, more: &[&str]| {
-        let path = directory.join(&format!("late{nth}.toml"));
         let text = format!(
             "[node]\nname = \"late{nth}\"\nproject = \"late\"\n\
              [ndl]\nmdns_port = false\nmulticast = \"{group}\"\ninterface = \"10.9.0.{nth}\"\n"
         );
-        std::fs::write(&path, text).expect("the test's own directory");
+        let path = directory.write(&format!("late{nth}.toml"), &text);
         node_under_test(Some(&hosts.all()[nth - 1]), &path, more)
     };
     let mut first = node(1, &["--requires", "late2", "--sends-to", "late2", "--logs"]);
@@ -70,7 +70,7 @@ fn two_nodes_whose_addresses_come_after_their_start_find_each_other_and_talk() {
     }
     second.wait_for(&["count 20 from 10.9.0.1"]);
     for node in [&first, &second] {
-        let warnings = node.said().iter().filter(|line| line.contains("warns each minute")).count();
-        assert_eq!(warnings, 1, "{:?}", node.said());
+        let warnings = node.output().iter().filter(|line| line.contains("warns each minute")).count();
+        assert_eq!(warnings, 1, "{:?}", node.output());
     }
 }

@@ -1,10 +1,11 @@
-//! Nodes on hosts that have IPv6, alone or beside IPv4: found over a link that nobody gave addresses to, talking, cut off, and there as long as
-//! either family carries.
+//! Nodes on hosts that have IPv6, alone or beside IPv4. They are found over a link without configured
+//! addresses, exchange messages, are cut off, and stay present as long as either family works.
 
 use std::net::{Ipv6Addr, SocketAddrV4};
 
-use sinew_hosts::Addresses;
-use sinew_tests::{Host, Hosts, OwnDirectory, Program, node_under_test, own_group};
+use sinew_testkit::Addresses;
+use sinew_testkit::{Host, Hosts, NodeProcess, TestDirectory, own_group};
+use sinew_tests::node_under_test;
 
 const NAMES: [&str; 2] = ["central", "hip"];
 const SENDS: [&str; 5] = ["--requires", "hip", "--sends-to", "hip", "--logs-info"];
@@ -13,20 +14,20 @@ const LOGS: [&str; 1] = ["--logs-info"];
 /// Two nodes on two hosts, the first of which sends to the second.
 struct Scenario {
     hosts: Hosts,
-    directory: OwnDirectory,
+    directory: TestDirectory,
     group: SocketAddrV4,
-    /// Both nodes are on the first one.
+    /// Whether both nodes are on the first host.
     is_one_host: bool,
     period_ms: u32,
 }
 
 impl Scenario {
-    /// `None`: no hosts can be made here, or they have no IPv6, which is said.
+    /// `None` if no hosts can be created here, or they have no IPv6; this is reported.
     fn new(networks: u8, addresses: Addresses) -> Option<Self> {
         let hosts = Hosts::with_addresses(2, networks, addresses);
         let hosts =
             hosts.inspect_err(|why| println!("skipped: no hosts with IPv6 can be made here: {why}")).ok()?;
-        let directory = OwnDirectory::new();
+        let directory = TestDirectory::new();
         Some(Self { hosts, directory, group: own_group(), is_one_host: false, period_ms: 250 })
     }
 
@@ -34,33 +35,32 @@ impl Scenario {
         self.hosts.all()[host].ip(arguments).unwrap_or_else(|error| panic!("{error}"));
     }
 
-    /// A node whose `ndl` table says this besides.
-    fn start(&self, index: usize, ndl: &str) -> Program {
+    /// A node with these additional lines in its `ndl` table.
+    fn start(&self, index: usize, ndl: &str) -> NodeProcess {
         self.start_with(index, ndl, "false")
     }
 
     /// The same with this port of multicast DNS.
-    fn start_with(&self, index: usize, ndl: &str, mdns_port: &str) -> Program {
+    fn start_with(&self, index: usize, ndl: &str, mdns_port: &str) -> NodeProcess {
         let (name, address, period_ms) = (NAMES[index], index + 1, self.period_ms);
-        let path = self.directory.join(&format!("{name}.toml"));
         let text = format!(
             "[node]\nname = \"{name}\"\nproject = \"ipv6\"\naddress = \"10.77.0.{address}\"\n\
              [ndl]\nmdns_port = {mdns_port}\nperiod_ms = {period_ms}\n{ndl}\n"
         );
-        std::fs::write(&path, text).expect("the test's own directory");
+        let path = self.directory.write(&format!("{name}.toml"), &text);
         let more: &[&str] = if index == 0 { &SENDS } else { &LOGS };
         let host = if self.is_one_host { 0 } else { index };
         node_under_test(Some(&self.hosts.all()[host]), &path, more)
     }
 
-    /// Both, on interfaces that each of them is told, found by multicast.
-    fn start_both(&self, interface: &str) -> [Program; 2] {
+    /// Both, on the interfaces that are named to each of them, found by multicast.
+    fn start_both(&self, interface: &str) -> [NodeProcess; 2] {
         let ndl = format!("interface = {interface}\nmulticast = \"{}\"", self.group);
         [self.start(0, &ndl), self.start(1, &ndl)]
     }
 }
 
-/// The number and the one before it in a line that says which count came.
+/// The number and the one before it, from a line that reports a count.
 fn count_in(line: &str) -> Option<(u64, u64)> {
     let words: Vec<_> = line.split(' ').collect();
     match words[..] {
@@ -69,18 +69,18 @@ fn count_in(line: &str) -> Option<(u64, u64)> {
     }
 }
 
-/// So many counts are there, in order, and nobody was lost.
-fn all_came(central: &Program, hip: &mut Program, count: u64) {
+/// Checks that this many counts arrived in order, and that no node was lost.
+fn all_came(central: &NodeProcess, hip: &mut NodeProcess, count: u64) {
     hip.wait_for(&[&format!("count {count} from 10.77.0.1")]);
-    let counts: Vec<_> = hip.said().iter().filter_map(|line| count_in(line)).collect();
+    let counts: Vec<_> = hip.output().iter().filter_map(|line| count_in(line)).collect();
     assert!(counts.iter().all(|(number, last)| *number == last + 1), "{counts:?}");
     for node in [central, hip] {
-        assert!(node.said().iter().all(|line| !line.contains("NodeLost")), "{:?}", node.said());
+        assert!(node.output().iter().all(|line| !line.contains("NodeLost")), "{:?}", node.output());
     }
 }
 
 #[test]
-fn two_hosts_with_nothing_but_a_link_find_each_other_talk_and_notice_that_it_is_cut() {
+fn two_hosts_with_only_a_link_meet() {
     let Some(scenario) = Scenario::new(1, Addresses::LinkLocal) else { return };
     let [mut central, mut hip] = scenario.start_both("\"eth0\"");
     central.wait_for(&["started"]);
@@ -96,11 +96,11 @@ fn two_hosts_with_nothing_but_a_link_find_each_other_talk_and_notice_that_it_is_
 }
 
 #[test]
-fn of_two_links_on_which_a_host_has_the_same_link_local_address_either_may_be_cut() {
+fn either_link_with_the_same_address_may_be_cut() {
     let Some(scenario) = Scenario::new(2, Addresses::LinkLocal) else { return };
     let [mut central, mut hip] = scenario.start_both("\"all/ipv6\"");
     central.wait_for(&["started"]);
-    // Each has found that the other one answers on the second link, too.
+    // Each has found that the other one also answers on the second link.
     for node in [&mut central, &mut hip] {
         node.wait_for(&["listens there now"]);
     }
@@ -114,7 +114,7 @@ fn of_two_links_on_which_a_host_has_the_same_link_local_address_either_may_be_cu
 }
 
 #[test]
-fn nobody_is_lost_while_one_of_two_families_carries() {
+fn no_node_is_lost_while_one_family_works() {
     let Some(scenario) = Scenario::new(1, Addresses::Both) else { return };
     let [mut central, mut hip] = scenario.start_both("\"eth0\"");
     central.wait_for(&["started"]);
@@ -122,17 +122,17 @@ fn nobody_is_lost_while_one_of_two_families_carries() {
         node.wait_for(&["listens there now", "fe80"]);
     }
     all_came(&central, &mut hip, 50);
-    // IPv4 goes at one of them.
+    // One of them loses IPv4.
     scenario.ip(0, "address del 10.77.0.1/24 dev eth0");
     all_came(&central, &mut hip, 350);
-    // It is back, and IPv6 goes at the other one.
+    // It is back, and the other one loses IPv6.
     scenario.ip(0, "address add 10.77.0.1/24 dev eth0");
     hip.wait_for(&["listens there now", "10.77.0.1"]);
     scenario.ip(1, "address del fe80::2/64 dev eth0");
     all_came(&central, &mut hip, 700);
 }
 
-/// Both ends of each TCP connection of IPv6 that a host has, but for their ports.
+/// Both ends of each IPv6 TCP connection of a host, without their ports.
 fn connections(host: &Host) -> Vec<[Ipv6Addr; 2]> {
     let table =
         host.run(|| std::fs::read_to_string("/proc/thread-self/net/tcp6")).expect("the kernel's table");
@@ -151,12 +151,13 @@ fn connections(host: &Host) -> Vec<[Ipv6Addr; 2]> {
 }
 
 #[test]
-fn connections_go_from_announced_address_to_announced_address_though_the_kernel_prefers_another_one() {
+fn connections_use_announced_addresses_at_both_ends() {
     let Some(mut scenario) = Scenario::new(1, Addresses::LinkLocal) else { return };
-    // So seldom that no answer is missed, and no connection tried for that, from wherever the kernel likes.
+    // So rare that no answer is missed. A missed answer would cause a connection attempt from an address that
+    // the kernel chooses.
     scenario.period_ms = 20_000;
     for host in 0..2 {
-        // As with temporary addresses, what the kernel takes by itself is not what the node is known by.
+        // As with temporary addresses: the kernel's default source is not the announced address of the node.
         let number = host + 1;
         scenario.ip(host, &format!("address add fd77::{number}/64 dev eth0 nodad preferred_lft 0"));
         scenario.ip(host, &format!("address add fd77::6{number}/64 dev eth0 nodad"));
@@ -173,16 +174,16 @@ fn connections_go_from_announced_address_to_announced_address_though_the_kernel_
 }
 
 #[test]
-fn a_family_that_is_asked_for_alone_is_the_only_one() {
+fn family_requested_alone_is_the_only_one() {
     let Some(scenario) = Scenario::new(1, Addresses::Both) else { return };
     let [mut central, mut hip] = scenario.start_both("\"eth0/ipv4\"");
     central.wait_for(&["started"]);
     all_came(&central, &mut hip, 50);
-    assert!(hip.said().iter().all(|line| !line.contains("fe80")), "{:?}", hip.said());
+    assert!(hip.output().iter().all(|line| !line.contains("fe80")), "{:?}", hip.output());
 }
 
 #[test]
-fn seeds_lead_to_a_link_by_the_name_of_the_interface_and_to_a_site_by_the_address_alone() {
+fn seeds_name_the_interface_only_for_link_local_addresses() {
     let Some(scenario) = Scenario::new(1, Addresses::LinkLocal) else { return };
     let alone = "multicast = false\nport = 6911";
     let seeds =
@@ -202,7 +203,7 @@ fn seeds_lead_to_a_link_by_the_name_of_the_interface_and_to_a_site_by_the_addres
 }
 
 #[test]
-fn an_address_that_comes_later_is_used_when_no_other_host_has_it() {
+fn address_added_later_is_used_if_unique() {
     let Some(scenario) = Scenario::new(1, Addresses::LinkLocal) else { return };
     let alone = "multicast = false\nport = 6911";
     let mut hip = scenario.start(1, &format!("interface = \"fd77::2\"\n{alone}"));
@@ -213,42 +214,47 @@ fn an_address_that_comes_later_is_used_when_no_other_host_has_it() {
     }
     scenario.ip(0, "address add fd77::1/64 dev eth0 nodad");
     central.wait_for(&["NDL sends and receives here now", "fd77::1"]);
-    // The kernel asks first; nothing of the node fails for that.
+    // The kernel checks for duplicates first; this causes no failure in the node.
     scenario.ip(1, "address add fd77::2/64 dev eth0");
     hip.wait_for(&["NDL sends and receives here now", "fd77::2"]);
     central.wait_for(&["started"]);
     all_came(&central, &mut hip, 50);
-    assert!(hip.said().iter().all(|line| !line.contains("cannot use UDP")), "{:?}", hip.said());
+    assert!(hip.output().iter().all(|line| !line.contains("cannot use UDP")), "{:?}", hip.output());
 }
 
 #[test]
-fn an_address_that_another_host_has_is_not_used_and_that_is_said() {
+fn duplicate_address_is_not_used_and_is_reported() {
     let Some(scenario) = Scenario::new(1, Addresses::LinkLocal) else { return };
     scenario.ip(0, "address add fd77::9/64 dev eth0 nodad");
     scenario.ip(1, "address add fd77::9/64 dev eth0");
     let mut hip = scenario.start(1, "interface = \"fd77::9\"\nmulticast = false");
     hip.wait_for(&["another host on the link has it", "fd77::9"]);
-    assert!(hip.said().iter().all(|line| !line.contains("sends and receives here now")), "{:?}", hip.said());
+    assert!(
+        hip.output().iter().all(|line| !line.contains("sends and receives here now")),
+        "{:?}",
+        hip.output()
+    );
 }
 
 #[test]
-fn a_host_without_ipv6_goes_on_with_ipv4_and_says_so_once() {
+fn host_without_ipv6_uses_ipv4_and_reports_it_once() {
     let Some(scenario) = Scenario::new(1, Addresses::Both) else { return };
     for host in scenario.hosts.all() {
-        // What stands there is that of the network namespace of the thread that writes.
+        // This file is that of the network namespace of the writing thread.
         let written = host.run(|| std::fs::write("/proc/sys/net/ipv6/conf/all/disable_ipv6", "1"));
         written.expect("the kernel takes IPv6 from a host");
     }
     let [mut central, mut hip] = scenario.start_both("\"eth0\"");
     central.wait_for(&["started"]);
     all_came(&central, &mut hip, 100);
-    let said =
-        |node: &Program| node.said().iter().filter(|line| line.contains("this host has no IPv6")).count();
-    assert_eq!([said(&central), said(&hip)], [1, 1]);
+    let count = |node: &NodeProcess| {
+        node.output().iter().filter(|line| line.contains("this host has no IPv6")).count()
+    };
+    assert_eq!([count(&central), count(&hip)], [1, 1]);
 }
 
 #[test]
-fn multicast_dns_finds_a_node_by_its_link_local_address_alone() {
+fn mdns_alone_finds_a_link_local_address() {
     let Some(scenario) = Scenario::new(1, Addresses::LinkLocal) else { return };
     let ndl = "interface = \"eth0/ipv6\"\nmulticast = false";
     let [mut central, mut hip] = [0, 1].map(|index| scenario.start_with(index, ndl, "5353"));
@@ -257,7 +263,7 @@ fn multicast_dns_finds_a_node_by_its_link_local_address_alone() {
 }
 
 #[test]
-fn nodes_of_one_host_meet_at_its_loopback_address_by_seeds() {
+fn nodes_of_one_host_meet_at_loopback_by_seeds() {
     let Some(mut scenario) = Scenario::new(1, Addresses::LinkLocal) else { return };
     scenario.is_one_host = true;
     let alone = "interface = \"::1\"\nmulticast = false";

@@ -1,5 +1,5 @@
-//! Two nodes between which datagrams are lost by chance: values of class Stream, newest wins and the last one comes, messages of class Control
-//! once and in order, and nobody is taken for lost.
+//! Two nodes with random datagram loss between them. Of class Stream the newest value wins and the last one
+//! arrives. Messages of class Control arrive once and in order. No node counts as lost.
 
 use std::{
     net::{SocketAddr, SocketAddrV4},
@@ -8,21 +8,22 @@ use std::{
 
 use sinew::message::Sender;
 use sinew::prelude::*;
-use sinew_tests::{
+use sinew_testkit::{
     DEADLINE, Log, all_run,
-    proxy::{Door, Proxy, Side},
-    puppet::{Order, Seen, Stage, Value, desk, wait},
+    network::{FaultyNetwork, Listener, Side},
+    scripted::{Order, Script, Seen, Value, sender_app, wait},
     until,
 };
 
-/// Rounds, at the end of each of which nothing newer follows.
+/// Rounds; after the last value of each there is a pause without newer ones.
 const ROUNDS: u64 = 30;
-/// Values of a round, one a millisecond.
+/// Values of a round, one each millisecond.
 const VALUES: u64 = 50;
-/// What a value's number is above: those of orders are below.
+/// Numbers of values are above this, those of orders below.
 const ABOVE: u64 = 1 << 32;
 
-/// The doors, each for connections and datagrams: to the first node's GNCL, to the second's, and to the second's NDL.
+/// The proxies, each for connections and datagrams: to the first node's GNCL, to the second's, and to the
+/// second's NDL.
 const TO_FIRST: [usize; 2] = [0, 1];
 const TO_SECOND: [usize; 2] = [2, 3];
 const TO_SECOND_NDL: usize = 4;
@@ -34,29 +35,31 @@ fn v4(address: SocketAddr) -> SocketAddrV4 {
     }
 }
 
-/// Doors at two ports that each are free for connections and for datagrams.
-fn network(seed: u64) -> Proxy {
-    let door = |side, port, datagrams| Door { side, listen: ([127, 0, 0, 1], port).into(), datagrams };
+/// Proxies at two ports, each of which is free for connections and for datagrams.
+fn network(seed: u64) -> FaultyNetwork {
+    let listener =
+        |side, port, datagrams| Listener { side, listen: ([127, 0, 0, 1], port).into(), datagrams };
     until("two free ports", || {
         let [first, second] = [(); 2].map(|()| {
             let free = std::net::TcpListener::bind("127.0.0.1:0").expect("a port on loopback");
             free.local_addr().expect("it is bound").port()
         });
-        let pair = |side, port| [door(side, port, false), door(side, port, true)];
-        let doors =
-            [pair(Side::Left, first), pair(Side::Right, second), [door(Side::Right, 0, true); 2]].concat();
-        Proxy::start(&doors[..=TO_SECOND_NDL], seed).ok()
+        let pair = |side, port| [listener(side, port, false), listener(side, port, true)];
+        let listeners =
+            [pair(Side::Left, first), pair(Side::Right, second), [listener(Side::Right, 0, true); 2]]
+                .concat();
+        FaultyNetwork::start(&listeners[..=TO_SECOND_NDL], seed).ok()
     })
 }
 
-/// Two nodes that reach each other over the network alone.
+/// Two nodes that reach each other only over this network.
 struct Pair {
-    network: Proxy,
+    network: FaultyNetwork,
     sender: Sender,
-    /// What the application of the second node has got.
+    /// Messages that the application of the second node received.
     got: Log<Seen>,
-    /// What both heard of each other.
-    heard: [Log<Seen>; 2],
+    /// Events that each node received about the other.
+    seen: [Log<Seen>; 2],
     nodes: [Node; 2],
 }
 
@@ -71,21 +74,25 @@ impl Pair {
                 config.ndl.seeds = seeds.into_iter().map(Into::into).collect();
             })
         };
-        let listener = |name| Stage::new().app(name);
-        let ((sink, got), (second_hears, second_heard)) = (listener("sink"), listener("second hears"));
+        let listener = |name| Script::new().app(name);
+        let ((sink, got), (second_hears, second_seen)) = (listener("sink"), listener("second hears"));
         let second = node("second", 2, TO_SECOND, Vec::new()).app(sink);
         let second = second.app(second_hears.handles::<NodeEvent>()).start().expect("a node");
         let at = |address: Option<SocketAddr>| address.expect("its layers are ready");
-        network.lead(TO_SECOND_NDL, at(second.handle().ndl_address()));
-        TO_SECOND.into_iter().for_each(|door| network.lead(door, at(second.handle().gncl_address())));
-        let ((desk, key), (first_hears, first_heard)) = (desk("desk"), listener("first hears"));
+        network.set_destination(TO_SECOND_NDL, at(second.handle().ndl_address()));
+        TO_SECOND
+            .into_iter()
+            .for_each(|listener| network.set_destination(listener, at(second.handle().gncl_address())));
+        let ((sender_app, key), (first_hears, first_seen)) = (sender_app("sender"), listener("first hears"));
         let first = node("first", 1, TO_FIRST, vec![network.address(TO_SECOND_NDL)]);
-        let first = first.app(desk).app(first_hears.handles::<NodeEvent>().requires(["sink"]));
+        let first = first.app(sender_app).app(first_hears.handles::<NodeEvent>().requires(["sink"]));
         let first = first.start().expect("a node");
-        TO_FIRST.into_iter().for_each(|door| network.lead(door, at(first.handle().gncl_address())));
+        TO_FIRST
+            .into_iter()
+            .for_each(|listener| network.set_destination(listener, at(first.handle().gncl_address())));
         all_run(&[&first, &second]);
-        let heard = [first_heard, second_heard];
-        Self { network, sender: key.sender(), got, heard, nodes: [first, second] }
+        let seen = [first_seen, second_seen];
+        Self { network, sender: key.sender(), got, seen, nodes: [first, second] }
     }
 
     fn lose_one_in(&self, count: u32) {
@@ -94,14 +101,14 @@ impl Pair {
         }
     }
 
-    /// Sends a round of values, and an order with the first of them; returns when the last one has come.
+    /// Sends a round of values, and an order with the first of them; returns when the last one has arrived.
     fn round(&self, round: u64) {
         let confirmation =
             self.sender.message("sink", &Order { number: round }).confirmed(DEADLINE).expect("it has room");
         let first = ABOVE + round * VALUES;
         for number in first..first + VALUES {
             self.sender.send("sink", &Value { number }).expect("the newest one has room");
-            // The pace of a control loop.
+            // The rate of a control loop.
             std::thread::sleep(Duration::from_millis(1));
         }
         self.got.wait_for(Seen::Got(1, first + VALUES - 1));
@@ -125,21 +132,21 @@ fn values_arrive_where_one_is_lost_of(count: u32) {
     );
     assert_eq!(orders, (0..ROUNDS).collect::<Vec<_>>(), "once and in order");
     let lost = |seen: &Seen| matches!(seen, Seen::Node(NodeEvent::NodeLost { .. }));
-    for heard in &pair.heard {
-        assert!(!heard.all().iter().any(lost), "{:?}", heard.all());
+    for seen in &pair.seen {
+        assert!(!seen.all().iter().any(lost), "{:?}", seen.all());
     }
-    // More than NDL alone says in that time.
+    // More than NDL alone sends in that time.
     assert!(pair.network.counts().lost > 5, "values went by datagram: {:?}", pair.network.counts());
     let audit = pair.nodes[0].handle().audit(DEADLINE).expect("nobody else asks");
     assert_eq!(audit.missing(), 0, "{audit}");
 }
 
 #[test]
-fn with_one_datagram_in_a_hundred_lost_the_newest_value_wins_and_the_last_one_comes() {
+fn one_percent_loss_keeps_the_newest_value() {
     values_arrive_where_one_is_lost_of(100);
 }
 
 #[test]
-fn with_one_datagram_in_twenty_lost_the_newest_value_wins_and_the_last_one_comes() {
+fn five_percent_loss_keeps_the_newest_value() {
     values_arrive_where_one_is_lost_of(20);
 }

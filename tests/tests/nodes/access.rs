@@ -1,4 +1,4 @@
-//! An access list between whole nodes: default deny, and another list without a restart.
+//! An access list between whole nodes: default deny, and a changed list without a restart.
 
 use std::{os::unix::fs::PermissionsExt, path::Path};
 
@@ -8,11 +8,11 @@ use sinew::{
     node::{AccessError, AccessSummary},
     prelude::*,
 };
-use sinew_tests::{DEADLINE, Ground, OwnDirectory, until};
+use sinew_testkit::{DEADLINE, Loopback, TestDirectory, until};
 
 payload!("access.torque", Control => struct Torque { newton_metres: f64 });
 
-/// Takes every torque.
+/// Accepts every torque.
 struct Drive;
 
 impl Actor for Drive {
@@ -38,14 +38,14 @@ fn send(gait: &mut Endpoint, to: Tid) -> Outcome {
 }
 
 #[test]
-fn only_who_is_on_the_list_reaches_a_drive_and_another_list_counts_at_once() {
-    // Given: a drive behind a list, and two applications of another node, of which one is on it
-    let (ground, directory) = (Ground::new(), OwnDirectory::new());
+fn only_listed_senders_reach_a_drive() {
+    // Given: a drive behind an access list, and two applications of another node, one of which is listed
+    let (loopback, directory) = (Loopback::new(), TestDirectory::new());
     let (list, socket) = (directory.join("access.toml"), directory.join("hip.sock"));
     write(&list, OPEN);
-    let hip = ground.node("hip").configure(|config| config.lncl.socket = Some(socket.clone()));
+    let hip = loopback.node("hip").configure(|config| config.lncl.socket = Some(socket.clone()));
     let hip = hip.start().expect("a node");
-    let knee = ground.node("knee").configure(|config| config.security.access = Some(list.clone()));
+    let knee = loopback.node("knee").configure(|config| config.security.access = Some(list.clone()));
     let knee = knee.app(AppSpec::new("drive", || Drive).handles::<Torque>()).start().expect("a node");
     let api = NodeApi::connect(&socket).expect("its door");
     let register = |name| {
@@ -54,7 +54,7 @@ fn only_who_is_on_the_list_reaches_a_drive_and_another_list_counts_at_once() {
     };
     let (mut gait, mut log) = (register("gait"), register("log"));
     let drive = gait.resolve("drive", DEADLINE).expect("an answer").expect("it is there");
-    // Then: as soon as the knee knows who is called so, and never for the other one
+    // Then: as soon as the knee knows the name, and never for the other one
     until("the knee knows the name", || (send(&mut gait, drive) == Outcome::Delivered).then_some(()));
     let not_allowed = Outcome::Rejected(Rejection::NotAllowed);
     let before = knee.handle().refused();
@@ -64,7 +64,7 @@ fn only_who_is_on_the_list_reaches_a_drive_and_another_list_counts_at_once() {
     write(&list, SHUT);
     assert_eq!(knee.handle().reload_access().expect("it is good"), AccessSummary { rules: 1, clients: 0 });
     assert_eq!(send(&mut gait, drive), not_allowed);
-    // When: one with a fault, which changes nothing
+    // When: an invalid list, which changes nothing
     write(&list, "[[rule]]\nfrom = ['*']\nto = ['*']\nclasses = ['fast']\n");
     let faults = knee.handle().reload_access().expect_err("there is no such class").to_string();
     assert!(faults.contains("line 4") && faults.contains("access.toml"), "{faults}");
@@ -76,25 +76,25 @@ fn only_who_is_on_the_list_reaches_a_drive_and_another_list_counts_at_once() {
 }
 
 #[test]
-fn a_node_whose_list_cannot_be_used_does_not_start_and_one_without_has_none_to_read() {
-    let (ground, directory) = (Ground::new(), OwnDirectory::new());
+fn node_with_an_unusable_list_does_not_start() {
+    let (loopback, directory) = (Loopback::new(), TestDirectory::new());
     let list = directory.join("access.toml");
     write(&list, "[[rule]]\nfrom = ['*']\n");
-    let node = ground.node("knee").configure(|config| config.security.access = Some(list.clone()));
+    let node = loopback.node("knee").configure(|config| config.security.access = Some(list.clone()));
     let why = node.start().expect_err("nobody is meant").to_string();
     assert!(why.contains("access.toml") && why.contains("rule.to (") && why.contains("line 1"), "{why}");
-    // One that others can write to, and one that is no file, which would hold the start up for ever.
+    // A list that others can write to, and one that is not a file, which would block the start forever.
     write(&list, OPEN);
     std::fs::set_permissions(&list, std::fs::Permissions::from_mode(0o666)).expect("the test's own file");
     for wrong in ["chmod go-w", "no file"] {
-        let node = ground.node("knee").configure(|config| config.security.access = Some(list.clone()));
+        let node = loopback.node("knee").configure(|config| config.security.access = Some(list.clone()));
         let why = node.start().expect_err("it is not taken").to_string();
         assert!(why.contains("access.toml") && why.contains(wrong), "{why}");
         std::fs::remove_file(&list).expect("the test's own file");
         let mode = rustix::fs::Mode::from_raw_mode(0o600);
         rustix::fs::mknodat(rustix::fs::CWD, &list, rustix::fs::FileType::Fifo, mode, 0).expect("a pipe");
     }
-    // One that others could put another one in the place of.
+    // A list that others could replace.
     std::fs::remove_file(&list).expect("the test's own file");
     write(&list, OPEN);
     let common = directory.join("common");
@@ -104,10 +104,10 @@ fn a_node_whose_list_cannot_be_used_does_not_start_and_one_without_has_none_to_r
     write(&there, OPEN);
     std::os::unix::fs::symlink(&there, &link).expect("the test's own directory");
     for list in [there, link] {
-        let node = ground.node("knee").configure(|config| config.security.access = Some(list.clone()));
+        let node = loopback.node("knee").configure(|config| config.security.access = Some(list.clone()));
         let why = node.start().expect_err("it is not taken").to_string();
         assert!(why.contains("others can write to") && why.contains("common"), "{why}");
     }
-    let open = ground.node("knee").start().expect("a node");
+    let open = loopback.node("knee").start().expect("a node");
     assert!(matches!(open.handle().reload_access(), Err(AccessError::None)));
 }

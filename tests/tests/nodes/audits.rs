@@ -1,4 +1,5 @@
-//! Where is every message? What the audit says of a node, of two, and of two with a faulty network between them.
+//! The audit: the location of every message in one node, in two, and in two with a faulty network between
+//! them.
 
 use std::sync::{Mutex, mpsc::sync_channel};
 
@@ -8,28 +9,28 @@ use sinew::{
     message::Sender,
     prelude::*,
 };
-use sinew_tests::{
-    DEADLINE, Ground, OwnDirectory, all_run,
-    puppet::{Job, Order, Stage, Value, desk, outcome_of_job, wait},
+use sinew_testkit::{
+    DEADLINE, Loopback, TestDirectory, all_run,
+    scripted::{Job, Order, Script, Value, outcome_of_job, sender_app, wait},
     sees, until,
 };
 
-/// What holds the application up.
+/// The message that blocks the application.
 const HOLD: u64 = 1;
-/// What it refuses.
+/// The message that it rejects.
 const REFUSED: u64 = 99;
-/// What it panics at.
+/// The message at which it panics.
 const FATAL: u64 = 13;
-/// Messages of a class that wait for it at most.
+/// Capacity of its mailbox for each class.
 const MAILBOX: usize = 16;
 
-/// Of all classes of the mailbox of the application called `name`.
+/// The sum over all classes of the mailbox of the application called `name`.
 fn mailbox(audit: &NodeAudit, wanted: &str) -> Account {
     let is_it = |place: &Place| matches!(place, Place::Mailbox { name, .. } if name == wanted);
     audit.entries.iter().filter(|entry| is_it(&entry.place)).map(|entry| entry.account).sum()
 }
 
-/// Every place of this node knows where each of its messages is.
+/// Checks that every queue of this node accounts for each of its messages.
 #[track_caller]
 fn balances(audit: &NodeAudit) {
     for entry in &audit.entries {
@@ -37,15 +38,15 @@ fn balances(audit: &NodeAudit) {
     }
 }
 
-/// One message of every sort for the held application: 3 values, 1 that expires, 1 refused, 1 fatal, jobs until nothing has room.
-/// Returns how many jobs were taken.
+/// Sends messages of every sort to the blocked application: 3 values, 1 that expires, 1 rejected, 1 fatal,
+/// and jobs until nothing fits. Returns the number of jobs that were accepted.
 fn send_every_sort(sender: &Sender, to: &str) -> u64 {
     for number in 2..5 {
         sender.send(to, &Value { number }).expect("it replaces the one before");
     }
     let late =
         sender.message(to, &Order { number: 5 }).confirmed(Duration::from_millis(1)).expect("it is taken");
-    assert_eq!(wait(late), Outcome::Unknown, "nobody has said anything in its time");
+    assert_eq!(wait(late), Outcome::Unknown, "no outcome arrived in its time");
     for number in [REFUSED, FATAL, 6] {
         sender.send(to, &Order { number }).expect("there is room");
     }
@@ -53,14 +54,14 @@ fn send_every_sort(sender: &Sender, to: &str) -> u64 {
 }
 
 #[test]
-fn every_sort_of_end_in_a_node_is_counted_and_nothing_is_unexplained() {
-    // Given: an application that is held up
-    let ((go, gate), (say, held)) = (sync_channel::<()>(1), sync_channel(1));
+fn every_outcome_in_a_node_is_counted() {
+    // Given: an application that is blocked
+    let ((go, gate), (holds, held)) = (sync_channel::<()>(1), sync_channel(1));
     let gate = Mutex::new(gate);
-    let (sink, _log) = Stage::new()
-        .got(move |puppet, context| match puppet.number {
+    let (sink, _log) = Script::new()
+        .got(move |scripted, context| match scripted.number {
             HOLD => {
-                say.send(()).expect("the test waits");
+                holds.send(()).expect("the test waits");
                 gate.lock().expect("one has it").recv().expect("the test lets it go");
             }
             REFUSED => context.reject(),
@@ -68,24 +69,24 @@ fn every_sort_of_end_in_a_node_is_counted_and_nothing_is_unexplained() {
             _ => {}
         })
         .app("sink");
-    let (desk, key) = desk("desk");
-    let ground = Ground::new();
-    let node = ground.node("one").configure(|config| config.mailbox_capacity = MAILBOX);
-    let node = node.app(sink.progress_within(DEADLINE)).app(desk).start().expect("a node");
+    let (sender_app, key) = sender_app("sender");
+    let loopback = Loopback::new();
+    let node = loopback.node("one").configure(|config| config.mailbox_capacity = MAILBOX);
+    let node = node.app(sink.progress_within(DEADLINE)).app(sender_app).start().expect("a node");
     all_run(&[&node]);
     let (handle, sender) = (node.handle(), key.sender());
     sender.send("sink", &Order { number: HOLD }).expect("there is room");
     held.recv_timeout(DEADLINE).expect("waited for it to be held");
-    // When: it is sent every sort of message
+    // When: it is sent messages of every sort
     let jobs = send_every_sort(&sender, "sink");
     let nobody = Tid::new(node.address(), AppAddress::fixed(7).expect("a fixed one"));
     sender.send(nobody, &Job { number: 0 }).expect_err("nobody has this address");
-    // Then: what waits is counted while it waits, and what became of it when it has ended
+    // Then: waiting messages are counted while they wait, and their outcomes when they have ended
     let audit = handle.audit_here();
     balances(&audit);
     let account = mailbox(&audit, "sink");
     assert_eq!(account.waiting, 1 + 1 + 3 + jobs, "held, value, orders, jobs: {account:?}");
-    // What was late made way when there was no room.
+    // The expired message was removed when there was no room.
     assert_eq!((account.expired, account.superseded, account.refused), (1, 2, 1), "{account:?}");
     assert_eq!(jobs, MAILBOX as u64);
     assert_eq!(audit.refused.get("not taken: NoSuchApplication"), Some(&1), "{:?}", audit.refused);
@@ -98,7 +99,7 @@ fn every_sort_of_end_in_a_node_is_counted_and_nothing_is_unexplained() {
     let account = mailbox(&audit, "sink");
     assert_eq!((account.rejected, account.failed, account.expired), (1, 1, 1), "{account:?}");
     assert_eq!(account.delivered, 1 + 1 + 1 + jobs, "held, value, order, jobs: {account:?}");
-    // And: of one that is gone it is still known
+    // And: the counters of a removed application are kept
     handle.stop_app("sink").expect("it is there");
     handle.remove_app("sink").expect("it has stopped");
     let audit = handle.audit_here();
@@ -108,13 +109,13 @@ fn every_sort_of_end_in_a_node_is_counted_and_nothing_is_unexplained() {
 }
 
 #[test]
-fn what_a_client_is_given_is_counted_while_it_is_there_and_when_it_has_gone() {
-    let (directory, ground) = (OwnDirectory::new(), Ground::new());
+fn client_messages_are_counted_until_after_its_end() {
+    let (directory, loopback) = (TestDirectory::new(), Loopback::new());
     let socket = directory.join("node.sock");
-    let ((sink, _log), (desk, key)) = (Stage::new().app("sink"), desk("desk"));
+    let ((sink, _log), (sender_app, key)) = (Script::new().app("sink"), sender_app("sender"));
     let door = socket.clone();
-    let node = ground.node("one").configure(move |config| config.lncl.socket = Some(door));
-    let node = node.app(sink).app(desk).start().expect("a node");
+    let node = loopback.node("one").configure(move |config| config.lncl.socket = Some(door));
+    let node = node.app(sink).app(sender_app).start().expect("a node");
     all_run(&[&node]);
     let (handle, sender) = (node.handle(), key.sender());
     // Given
@@ -145,9 +146,10 @@ fn what_a_client_is_given_is_counted_while_it_is_there_and_when_it_has_gone() {
     assert_eq!(former.delivered - former.own, 7, "{former:?}");
 }
 
-/// The audit of the whole system, which `nodes` are, once nothing waits or is under way. At every moment before, nothing is unexplained.
+/// Returns the audit of the system of these `nodes` once no message waits or is in flight. At every moment
+/// before, no message is unexplained.
 fn once_quiet(nodes: [&NodeHandle; 2]) -> Audit {
-    // Each says so of itself, since a node answers another one 16 times a second and no more often.
+    // Each node is asked directly, since a node answers another one at most 16 times a second.
     until("nothing waits or is under way", || {
         nodes
             .map(NodeHandle::audit_here)
@@ -166,14 +168,14 @@ fn once_quiet(nodes: [&NodeHandle; 2]) -> Audit {
 }
 
 #[test]
-fn an_audit_of_two_nodes_explains_every_message_while_they_flow_and_when_all_is_quiet() {
+fn audit_of_two_nodes_explains_every_message() {
     // Given: two nodes, and messages of every class from one to the other
     const JOBS: u64 = 300;
-    let ground = Ground::new();
-    let (sink, _log) = Stage::new().app("sink");
-    let (desk, key) = desk("desk");
-    let there = ground.node("there").app(sink).start().expect("a node");
-    let here = ground.node("home").app(desk).start().expect("a node");
+    let loopback = Loopback::new();
+    let (sink, _log) = Script::new().app("sink");
+    let (sender_app, key) = sender_app("sender");
+    let there = loopback.node("there").app(sink).start().expect("a node");
+    let here = loopback.node("home").app(sender_app).start().expect("a node");
     all_run(&[&there, &here]);
     let (handle, sender) = (here.handle(), key.sender());
     sees(&handle, there.address());
@@ -192,11 +194,12 @@ fn an_audit_of_two_nodes_explains_every_message_while_they_flow_and_when_all_is_
     sender.send(nobody, &Job { number: 0 }).expect("its node is there");
     // When
     let audit = once_quiet([&handle, &there.handle()]);
-    // Then: each message that the desk has sent is where it ended, and both ends of every link agree
+    // Then: each message of the sender is accounted for at its destination, and both ends of every link
+    // agree
     assert_eq!((audit.silent.len(), audit.nodes.len(), audit.links.len()), (0, 2, 6), "{audit}");
     for link in &audit.links {
         let taken = link.taken.unwrap_or_else(|| panic!("both speak of one session: {audit}"));
-        // The audit's own question and answer may lie between the readings.
+        // The audit's own request and reply may lie between the readings.
         assert!(link.sent.abs_diff(taken) <= 1, "{link}\n{audit}");
     }
     let there = audit.nodes.iter().find(|node| node.name == "there").expect("it answered");
@@ -211,7 +214,7 @@ fn an_audit_of_two_nodes_explains_every_message_while_they_flow_and_when_all_is_
     };
     assert_eq!((of(Class::Bulk).taken, of(Class::Bulk).delivered), (JOBS + 1, JOBS + 1), "{audit}");
     let (values, on_the_way) = (of(Class::Stream), to(&audit, &handle, there.node, Class::Stream));
-    // What went by the connection may come behind what went by datagram.
+    // Values by the connection may arrive after values by datagram.
     let arrived = there.account(&Place::FromNode { node: here.address(), class: Some(Class::Stream) });
     let superseded = values.superseded + on_the_way.superseded + arrived.superseded;
     assert_eq!(values.delivered + superseded, JOBS, "{audit}");
@@ -221,7 +224,7 @@ fn an_audit_of_two_nodes_explains_every_message_while_they_flow_and_when_all_is_
     assert!(audit.to_string().contains("every message is explained"), "{audit}");
 }
 
-/// What a node says of what it has sent to another one.
+/// A node's account of the messages that it has sent to another one.
 fn to(audit: &Audit, from: &NodeHandle, to: NodeAddress, class: Class) -> Account {
     let from = audit.nodes.iter().find(|node| node.node == from.address()).expect("it asked");
     from.account(&Place::ToNode { node: to, class: Some(class) })

@@ -1,4 +1,4 @@
-//! Bytes from outside: refused and counted, and the node lives on.
+//! Bytes from outside: they are rejected and counted, and the node keeps running.
 
 use std::{
     io::{Read, Write},
@@ -10,7 +10,7 @@ use std::{
 
 use sinew::{Class, NodeApi, Registration, message::Kind, prelude::*};
 use sinew_runtime::wire::{Header, encode_frame};
-use sinew_tests::{DEADLINE, OwnDirectory, own_group};
+use sinew_testkit::{DEADLINE, TestDirectory, own_group};
 
 payload!("bad_input.count", Bulk => struct Count { number: u64 });
 
@@ -28,20 +28,20 @@ impl Handler<Delivery<Count>> for Witness {
     }
 }
 
-/// A node with all its doors open, and proof that it lives.
+/// A node with all its sockets open, and a check that it works.
 struct Victim {
     node: Node,
     socket: PathBuf,
     seen: Receiver<u64>,
-    _directory: OwnDirectory,
+    _directory: TestDirectory,
 }
 
 impl Victim {
     fn start() -> Self {
-        let directory = OwnDirectory::new();
+        let directory = TestDirectory::new();
         let socket = directory.join("lncl");
-        let (say, seen) = sync_channel(100);
-        let witness = AppSpec::new("witness", move || Witness(say.clone())).handles::<Count>();
+        let (sees, seen) = sync_channel(100);
+        let witness = AppSpec::new("witness", move || Witness(sees.clone())).handles::<Count>();
         let (group, door) = (own_group(), socket.clone());
         let node = Node::builder("victim").app(witness).configure(move |config| {
             config.ndl.multicast = Some(group);
@@ -61,9 +61,9 @@ impl Victim {
         self.node.handle().ndl_address().expect("NDL listens")
     }
 
-    /// A fresh client's message still reaches the application.
+    /// Checks that a new client's message still reaches the application.
     fn assert_lives(&self, number: u64) {
-        let api = NodeApi::connect(&self.socket).expect("the door is open");
+        let api = NodeApi::connect(&self.socket).expect("the node accepts clients");
         let mut endpoint = api.register_transport_address(Registration::new()).expect("an address");
         let outcome =
             endpoint.message(self.witness(), &Count { number }).confirmed(DEADLINE).expect("an outcome");
@@ -84,7 +84,7 @@ fn frame(change: impl FnOnce(&mut [u8])) -> Vec<u8> {
     bytes.to_vec()
 }
 
-/// Frames that no peer and no client may send, with what is wrong with them.
+/// Frames that no peer and no client may send, with the name of each fault.
 fn bad_frames() -> Vec<(&'static str, Vec<u8>)> {
     vec![
         ("garbage", (0..997u32).map(|n| (n * 31) as u8).collect()),
@@ -97,18 +97,18 @@ fn bad_frames() -> Vec<(&'static str, Vec<u8>)> {
     ]
 }
 
-/// Writes the bytes, closes the writing half, reads to the end: the node has ended the connection.
+/// Writes the bytes, closes the writing half, and reads to the end: the node has closed the connection.
 fn offer(mut stream: impl Read + Write, close: impl FnOnce(), bytes: &[u8]) {
-    // The node may refuse after the first bytes, and then the rest is not taken.
+    // The node may reject the first bytes, and then the rest is not accepted.
     let _ = stream.write_all(bytes);
     close();
-    let mut said = Vec::new();
-    // A connection that is reset ends just as well.
-    let _ = stream.read_to_end(&mut said);
+    let mut answer = Vec::new();
+    // A connection reset is as good an end.
+    let _ = stream.read_to_end(&mut answer);
 }
 
 #[test]
-fn bad_frames_end_their_own_connection_to_gncl_and_nothing_else() {
+fn bad_frames_close_only_their_gncl_connection() {
     let victim = Victim::start();
     for (what, bytes) in bad_frames() {
         let stream = TcpStream::connect(victim.gncl()).unwrap_or_else(|error| panic!("{what}: {error}"));
@@ -121,7 +121,7 @@ fn bad_frames_end_their_own_connection_to_gncl_and_nothing_else() {
 }
 
 #[test]
-fn bad_frames_end_their_own_connection_to_lncl_and_nothing_else() {
+fn bad_frames_close_only_their_lncl_connection() {
     let victim = Victim::start();
     for (what, bytes) in bad_frames() {
         let stream = UnixStream::connect(&victim.socket).unwrap_or_else(|error| panic!("{what}: {error}"));
@@ -134,24 +134,24 @@ fn bad_frames_end_their_own_connection_to_lncl_and_nothing_else() {
 }
 
 #[test]
-fn a_flood_of_datagrams_is_refused_and_the_node_lives() {
+fn datagram_flood_is_rejected_and_the_node_survives() {
     let victim = Victim::start();
     let flood = UdpSocket::bind("127.0.0.1:0").expect("a socket");
     let mut datagrams: Vec<_> = bad_frames().into_iter().map(|(_, bytes)| bytes).collect();
     datagrams.push(Vec::new());
     for round in 0..20_000 {
-        // The kernel may have no room for it: then that one was refused even earlier.
+        // If the kernel has no room for it, it is rejected even earlier.
         let _ = flood.send_to(&datagrams[round % datagrams.len()], victim.ndl());
     }
     victim.assert_lives(3);
     assert!(victim.node.handle().refused() > 0, "refusals are counted");
 }
 
-/// Registers by hand, as a client in another language would, and then lies about its source.
+/// Registers by hand, like a client in another language, and then sends a forged source.
 #[test]
-fn a_forged_source_is_refused_and_counted() {
+fn forged_source_is_rejected_and_counted() {
     let victim = Victim::start();
-    let api = NodeApi::connect(&victim.socket).expect("the door is open");
+    let api = NodeApi::connect(&victim.socket).expect("the node accepts clients");
     let honest = api.register_transport_address(Registration::new()).expect("an address");
     let mut liar = register_by_hand(&victim.socket);
     let mut header = Header::new(Count::KIND, honest.tid(), victim.witness());
@@ -164,9 +164,9 @@ fn a_forged_source_is_refused_and_counted() {
     assert!(victim.node.handle().refused() > 0, "refusals are counted");
 }
 
-/// LNCL_REGISTER as `docs/protocol/lncl.md` has it: an empty map asks for any address.
+/// LNCL_REGISTER as `docs/protocol/lncl.md` specifies it: an empty map requests any address.
 fn register_by_hand(socket: &Path) -> UnixStream {
-    let mut stream = UnixStream::connect(socket).expect("the door is open");
+    let mut stream = UnixStream::connect(socket).expect("the node accepts clients");
     let header = Header::new(Kind::LNCL_REGISTER, Tid::NONE, Tid::new(NodeAddress::HERE, AppAddress::LNCL));
     let mut bytes = bytes::BytesMut::new();
     encode_frame(&header, &[0x80], &mut bytes);

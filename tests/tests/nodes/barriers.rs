@@ -1,4 +1,5 @@
-//! Run-time barriers on real nodes: actors, threads and tasks of other processes' kind meet, in any number of rounds.
+//! Run-time barriers on real nodes: actors, threads and tasks, as in other processes, meet in any number of
+//! rounds.
 
 use std::{
     path::{Path, PathBuf},
@@ -12,13 +13,13 @@ use sinew::{
     barrier::{Barrier, BarrierError, BarrierStatus, Meet, OnPartyLoss},
     prelude::*,
 };
-use sinew_tests::{DEADLINE, Ground, OwnDirectory, all_run, sees, until};
+use sinew_testkit::{DEADLINE, Loopback, TestDirectory, all_run, sees, until};
 
-/// Arrives as soon as it runs, so many times, and says which generations it passed.
+/// Arrives this many times, from its start on, and reports the generations that it passed.
 struct Party {
     barrier: Barrier,
     rounds: u32,
-    said: SyncSender<(Tid, Result<u64, String>)>,
+    results: SyncSender<(Tid, Result<u64, String>)>,
 }
 
 impl Actor for Party {
@@ -37,7 +38,7 @@ impl Party {
         self.rounds -= 1;
         let meeting = context.meet(&self.barrier).into_actor(self);
         context.spawn(meeting.map(|passed, this, context| {
-            this.said
+            this.results
                 .send((context.tid(), passed.map_err(|error| error.to_string())))
                 .expect("the test listens");
             this.go(context);
@@ -49,16 +50,16 @@ fn party(
     name: &str,
     barrier: &Barrier,
     rounds: u32,
-    said: &SyncSender<(Tid, Result<u64, String>)>,
+    results: &SyncSender<(Tid, Result<u64, String>)>,
 ) -> AppSpec<Party> {
-    let (barrier, said) = (barrier.clone(), said.clone());
-    AppSpec::new(name, move || Party { barrier: barrier.clone(), rounds, said: said.clone() })
+    let (barrier, results) = (barrier.clone(), results.clone());
+    AppSpec::new(name, move || Party { barrier: barrier.clone(), rounds, results: results.clone() })
 }
 
-/// Arrives, arrives again, and gives the first wait up.
+/// Arrives, arrives again, and cancels the first wait.
 struct Undecided {
     barrier: Barrier,
-    said: SyncSender<Result<u64, String>>,
+    results: SyncSender<Result<u64, String>>,
 }
 
 impl Actor for Undecided {
@@ -69,15 +70,15 @@ impl Actor for Undecided {
         let meeting = context.meet(&self.barrier).into_actor(self);
         drop(given_up);
         context.spawn(meeting.map(|passed, this, _| {
-            this.said.send(passed.map_err(|error| error.to_string())).expect("the test listens");
+            this.results.send(passed.map_err(|error| error.to_string())).expect("the test listens");
         }));
     }
 }
 
-/// A node with a door for other processes.
-fn with_door(ground: &Ground, directory: &OwnDirectory, name: &str) -> (NodeBuilder, PathBuf) {
+/// A node with a client socket.
+fn with_door(loopback: &Loopback, directory: &TestDirectory, name: &str) -> (NodeBuilder, PathBuf) {
     let socket = directory.join(&format!("{name}.sock"));
-    let node = ground.node(name).configure(|config| config.lncl.socket = Some(socket.clone()));
+    let node = loopback.node(name).configure(|config| config.lncl.socket = Some(socket.clone()));
     (node, socket)
 }
 
@@ -87,20 +88,22 @@ fn endpoint(socket: &Path, name: &str) -> Endpoint {
 }
 
 #[test]
-fn actors_of_three_nodes_go_through_every_generation_together() {
+fn actors_of_three_nodes_pass_every_generation_together() {
     const ROUNDS: u32 = 20;
-    let ground = Ground::new();
-    let (said, heard) = sync_channel(64);
+    let loopback = Loopback::new();
+    let (results, reports) = sync_channel(64);
     let barrier = Barrier::new("step", ["hip", "knee", "ankle"]).within(DEADLINE);
     let nodes: Vec<Node> = ["hip", "knee", "ankle"]
         .into_iter()
-        .map(|name| ground.node(name).app(party(name, &barrier, ROUNDS, &said)).start().expect("it starts"))
+        .map(|name| {
+            loopback.node(name).app(party(name, &barrier, ROUNDS, &results)).start().expect("it starts")
+        })
         .collect();
     all_run(&nodes.iter().collect::<Vec<_>>());
     let mut passed: Vec<(u64, Tid)> = Vec::new();
     for _ in 0..3 * ROUNDS {
-        let (who, generation) = heard.recv_timeout(DEADLINE).expect("all meet");
-        passed.push((generation.expect("it opens"), who));
+        let (member, generation) = reports.recv_timeout(DEADLINE).expect("all meet");
+        passed.push((generation.expect("it opens"), member));
     }
     passed.sort();
     let generations: Vec<u64> = passed.iter().map(|(generation, _)| *generation).collect();
@@ -108,19 +111,19 @@ fn actors_of_three_nodes_go_through_every_generation_together() {
     assert_eq!(generations, expected);
 }
 
-/// Who is missing and why.
+/// The missing parties, with reasons.
 fn missing(status: &BarrierStatus) -> Vec<(&str, &str)> {
     status.missing.iter().map(|absence| (&*absence.name, &*absence.why)).collect()
 }
 
 #[test]
-fn a_thread_a_task_and_an_actor_of_two_nodes_meet_and_it_is_said_who_is_missing() {
-    let (ground, directory) = (Ground::new(), OwnDirectory::new());
-    let (said, heard) = sync_channel(64);
+fn thread_task_and_actor_meet_at_a_barrier() {
+    let (loopback, directory) = (Loopback::new(), TestDirectory::new());
+    let (results, passed) = sync_channel(64);
     let barrier = Barrier::new("calibrated", ["hip.drive", "2 of *.imu"]).within(DEADLINE);
-    let (hip, hip_api) = with_door(&ground, &directory, "hip");
-    let (knee, knee_api) = with_door(&ground, &directory, "knee");
-    let hip = hip.app(party("hip.drive", &barrier, 1, &said)).start().expect("it starts");
+    let (hip, hip_api) = with_door(&loopback, &directory, "hip");
+    let (knee, knee_api) = with_door(&loopback, &directory, "knee");
+    let hip = hip.app(party("hip.drive", &barrier, 1, &results)).start().expect("it starts");
     let knee = knee.start().expect("it starts");
     sees(&hip.handle(), knee.handle().address());
     all_run(&[&hip]);
@@ -143,13 +146,13 @@ fn a_thread_a_task_and_an_actor_of_two_nodes_meet_and_it_is_said_who_is_missing(
     });
     assert_eq!(generation.expect("it opens"), 1);
     assert_eq!(blocking.join().expect("it ends").expect("it opens"), 1);
-    assert_eq!(heard.recv_timeout(DEADLINE).expect("the drive, too").1, Ok(1));
+    assert_eq!(passed.recv_timeout(DEADLINE).expect("the drive, too").1, Ok(1));
 }
 
 #[test]
-fn who_does_not_want_to_wait_for_a_lost_party_is_told_and_who_does_meets_its_next_life() {
-    let (ground, directory) = (Ground::new(), OwnDirectory::new());
-    let (node, api) = with_door(&ground, &directory, "hip");
+fn lost_party_is_reported_or_awaited_as_requested() {
+    let (loopback, directory) = (Loopback::new(), TestDirectory::new());
+    let (node, api) = with_door(&loopback, &directory, "hip");
     let node = node.start().expect("it starts");
     let barrier = Barrier::new("homed", ["a", "b"]).within(DEADLINE);
     let (mut a, b) = (endpoint(&api, "a"), endpoint(&api, "b"));
@@ -169,26 +172,26 @@ fn who_does_not_want_to_wait_for_a_lost_party_is_told_and_who_does_meets_its_nex
 }
 
 #[test]
-fn who_gives_a_wait_up_still_waits_by_a_later_one() {
-    let (ground, directory) = (Ground::new(), OwnDirectory::new());
-    let (say, heard) = sync_channel(1);
+fn cancelled_wait_leaves_a_later_wait_intact() {
+    let (loopback, directory) = (Loopback::new(), TestDirectory::new());
+    let (results, passed) = sync_channel(1);
     let barrier = Barrier::new("homed", ["a", "b"]).within(DEADLINE);
-    let (node, api) = with_door(&ground, &directory, "hip");
+    let (node, api) = with_door(&loopback, &directory, "hip");
     let spec = {
         let barrier = barrier.clone();
-        AppSpec::new("a", move || Undecided { barrier: barrier.clone(), said: say.clone() })
+        AppSpec::new("a", move || Undecided { barrier: barrier.clone(), results: results.clone() })
     };
     let node = node.app(spec).start().expect("it starts");
     all_run(&[&node]);
     let mut b = endpoint(&api, "b");
     assert_eq!(b.meet(&barrier).expect("it opens"), 1);
-    assert_eq!(heard.recv_timeout(DEADLINE).expect("a, too"), Ok(1));
+    assert_eq!(passed.recv_timeout(DEADLINE).expect("a, too"), Ok(1));
 }
 
 #[test]
-fn who_is_no_party_or_asks_for_nobody_is_refused_with_words() {
-    let (ground, directory) = (Ground::new(), OwnDirectory::new());
-    let (node, api) = with_door(&ground, &directory, "hip");
+fn invalid_barrier_or_party_is_rejected() {
+    let (loopback, directory) = (Loopback::new(), TestDirectory::new());
+    let (node, api) = with_door(&loopback, &directory, "hip");
     let _node = node.start().expect("it starts");
     let mut a = endpoint(&api, "a");
     for (barrier, why) in [

@@ -1,9 +1,9 @@
-//! The directory of names, as an application sees it that wants to hear of it.
+//! The directory of names, as a subscribed application sees it.
 
 use std::sync::mpsc::{SyncSender, sync_channel};
 
 use sinew::{events::DirectoryEvent, prelude::*};
-use sinew_tests::{DEADLINE, Ground};
+use sinew_testkit::{DEADLINE, Loopback};
 
 payload!("scenario.angle" => struct Angle { degrees: f32 });
 
@@ -36,15 +36,19 @@ impl Handler<Delivery<DirectoryEvent>> for Watcher {
 }
 
 #[test]
-fn who_watches_hears_of_an_application_of_another_node_and_of_its_end() {
-    let ground = Ground::new();
-    let (say, heard) = sync_channel(64);
-    let watcher = AppSpec::new("watcher", move || Watcher(say.clone())).handles::<DirectoryEvent>();
-    let _hip = ground.node("hip").app(watcher).start().expect("it starts");
-    let knee =
-        ground.node("knee").app(AppSpec::new("knee", || Knee).handles::<Angle>()).start().expect("it starts");
+fn watcher_is_notified_of_remote_start_and_end() {
+    let loopback = Loopback::new();
+    let (events, received) = sync_channel(64);
+    let watcher = AppSpec::new("watcher", move || Watcher(events.clone())).handles::<DirectoryEvent>();
+    let _hip = loopback.node("hip").app(watcher).start().expect("it starts");
+    let knee = loopback
+        .node("knee")
+        .app(AppSpec::new("knee", || Knee).handles::<Angle>())
+        .start()
+        .expect("it starts");
     let wait_for = |what: &str, is_it: &dyn Fn(&DirectoryEvent) -> bool| loop {
-        let event = heard.recv_timeout(DEADLINE).unwrap_or_else(|_| panic!("it does not hear that {what}"));
+        let event =
+            received.recv_timeout(DEADLINE).unwrap_or_else(|_| panic!("it is not notified that {what}"));
         if is_it(&event) {
             break;
         }

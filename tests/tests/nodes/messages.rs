@@ -1,31 +1,26 @@
-//! What messages do between two nodes of one process: requests, outcomes, groups, broadcasts, ages, order by class.
+//! Messages between two nodes of one process: requests, outcomes, groups, broadcasts, ages, order by class.
 
-use std::{
-    net::SocketAddrV4,
-    sync::mpsc::{Receiver, SyncSender, sync_channel},
-};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
 use sinew::{
     StartError,
     message::{Rejection, SendError},
     prelude::*,
 };
-use sinew_tests::{DEADLINE, own_group, until};
+use sinew_testkit::{DEADLINE, Loopback, until};
 
 payload!("messages.question", Control => struct Question { number: u64 });
 payload!("messages.answer", Control => struct Answer { number: u64 });
 payload!("messages.word", Bulk => struct Word { text: String });
 payload!("messages.unheard", Control => struct Unheard;);
 
-/// A node of a pair that finds only the other.
-fn node(name: &str, address: u8, group: SocketAddrV4) -> NodeBuilder {
-    Node::builder(name).address([127, 0, 0, address]).configure(|config| {
-        config.ndl.multicast = Some(group);
-        config.ndl.mdns_port = None;
-    })
+/// The nodes of a pair, which find only each other. Each has its address, whichever starts first.
+fn pair() -> (NodeBuilder, NodeBuilder) {
+    let loopback = Loopback::new();
+    (loopback.node("home"), loopback.node("there"))
 }
 
-/// Doubles numbers, refuses 99, panics at 13; says which words it heard.
+/// Doubles numbers, rejects 99, panics at 13; reports the words that it received.
 struct Oracle(SyncSender<String>);
 
 impl Actor for Oracle {
@@ -44,7 +39,7 @@ impl Handler<Delivery<Question>> for Oracle {
         if question.number == 99 {
             context.reject();
         } else if question.reply_to().is_some() {
-            context.reply(&question, &Answer { number: question.number * 2 }).expect("the asker waits");
+            context.reply(&question, &Answer { number: question.number * 2 }).expect("the requester waits");
         }
     }
 }
@@ -53,58 +48,60 @@ impl Handler<Delivery<Word>> for Oracle {
     type Result = ();
 
     fn handle(&mut self, word: Delivery<Word>, _: &mut Self::Context) {
-        // The first one may come before anybody here has measured the other's clock.
+        // The first one may arrive before this node has measured the other's clock.
         assert!(word.age.is_none_or(|age| age < DEADLINE), "{:?}", word.age);
         self.0.send(word.payload.text).expect("the test listens");
     }
 }
 
 fn oracle(name: &str) -> (AppSpec<Oracle>, Receiver<String>) {
-    let (say, heard) = sync_channel(1_000);
-    let spec = AppSpec::new(name, move || Oracle(say.clone())).handles::<Question>().handles::<Word>();
-    (spec, heard)
+    let (sender, received) = sync_channel(1_000);
+    let spec = AppSpec::new(name, move || Oracle(sender.clone())).handles::<Question>().handles::<Word>();
+    (spec, received)
 }
 
-/// Runs a story in an actor's own future and says when it is told.
-struct Teller<F> {
+/// Runs a story in an actor's own future and reports its end.
+struct Storyteller<F> {
     story: F,
-    told: SyncSender<()>,
+    ends: SyncSender<()>,
 }
 
-impl<F: AsyncFn(sinew::message::Sender) + Clone + Unpin + 'static> Actor for Teller<F> {
+impl<F: AsyncFn(sinew::message::Sender) + Clone + Unpin + 'static> Actor for Storyteller<F> {
     type Context = AppContext<Self>;
 
     fn started(&mut self, context: &mut Self::Context) {
-        let (story, sender, told) = (self.story.clone(), context.sender(), self.told.clone());
-        let telling = async move {
+        let (story, sender, ends) = (self.story.clone(), context.sender(), self.ends.clone());
+        let running = async move {
             story(sender).await;
-            told.send(()).expect("the test waits");
+            ends.send(()).expect("the test waits");
         };
-        context.spawn(telling.into_actor(self));
+        context.spawn(running.into_actor(self));
     }
 }
 
-/// Two nodes: the story is told on the first, once the applications on the second are ready. Dropping them stops them.
+/// Starts two nodes: the story runs on the first, once the applications on the second are ready. Dropping
+/// them stops them.
 #[must_use]
-fn tell<F>(second: impl FnOnce(NodeBuilder) -> NodeBuilder, requires: &[&str], story: F) -> (Node, Node)
+fn run_story<F>(second: impl FnOnce(NodeBuilder) -> NodeBuilder, requires: &[&str], story: F) -> (Node, Node)
 where
     F: AsyncFn(sinew::message::Sender) + Clone + Send + Sync + Unpin + 'static,
 {
-    let group = own_group();
-    let (told, is_told) = sync_channel(1);
-    let teller = AppSpec::new("teller", move || Teller { story: story.clone(), told: told.clone() });
-    let there = second(node("there", 2, group)).start().expect("a node");
-    let here = node("home", 1, group).app(teller.requires(requires.iter().copied())).start().expect("a node");
-    if is_told.recv_timeout(DEADLINE).is_err() {
-        panic!("the story was not told; who waits: {:?}", here.handle().waiting());
+    let (home, there) = pair();
+    let (ends, has_ended) = sync_channel(1);
+    let storyteller =
+        AppSpec::new("storyteller", move || Storyteller { story: story.clone(), ends: ends.clone() });
+    let there = second(there).start().expect("a node");
+    let here = home.app(storyteller.requires(requires.iter().copied())).start().expect("a node");
+    if has_ended.recv_timeout(DEADLINE).is_err() {
+        panic!("the story did not end; these wait: {:?}", here.handle().waiting());
     }
     (here, there)
 }
 
 #[test]
-fn requests_to_another_node_are_answered_and_every_confirmed_send_has_its_outcome() {
-    let (spec, _heard) = oracle("oracle");
-    let _nodes = tell(
+fn remote_requests_and_confirmed_sends_have_outcomes() {
+    let (spec, _received) = oracle("oracle");
+    let _nodes = run_story(
         |node| node.app(spec),
         &["oracle"],
         async |sender: sinew::message::Sender| {
@@ -131,11 +128,11 @@ fn requests_to_another_node_are_answered_and_every_confirmed_send_has_its_outcom
 }
 
 #[test]
-fn requests_that_nobody_waits_for_any_more_take_no_places_and_their_late_replies_disturb_nobody() {
-    /// More than may be waited for at once.
+fn cancelled_requests_free_their_slots() {
+    /// More than may be pending at the same time.
     const DROPPED: u64 = 5_000;
-    let (spec, _heard) = oracle("oracle");
-    let _nodes = tell(
+    let (spec, _received) = oracle("oracle");
+    let _nodes = run_story(
         |node| node.app(spec),
         &["oracle"],
         async |sender: sinew::message::Sender| {
@@ -146,14 +143,14 @@ fn requests_that_nobody_waits_for_any_more_take_no_places_and_their_late_replies
                         drop(reply);
                         asked += 1;
                     }
-                    // The way there is full for the moment.
+                    // The path to the other node is full for the moment.
                     Err(SendError::Rejected(Rejection::QueueFull)) => {
                         actix::clock::sleep(Duration::from_millis(1)).await;
                     }
                     Err(other) => panic!("{other:?} after {asked}"),
                 }
             }
-            // Behind all of them; what comes now is its own.
+            // After all of them: the reply that arrives now belongs to this request.
             let last = loop {
                 match sender.message("oracle", &Question { number: 21 }).ask::<Answer>(DEADLINE) {
                     Ok(reply) => break reply,
@@ -165,10 +162,10 @@ fn requests_that_nobody_waits_for_any_more_take_no_places_and_their_late_replies
     );
 }
 
-/// Of a request whose time may be over before it is handled.
+/// A request that may expire before it is handled.
 const HASTY: u64 = 3;
 
-/// Replies only when nobody waits any more.
+/// Replies only when the requester no longer waits.
 struct Ponderer;
 
 impl Actor for Ponderer {
@@ -194,23 +191,23 @@ impl Handler<Delivery<Question>> for Ponderer {
 }
 
 #[test]
-fn a_handler_sees_that_nobody_waits_for_its_reply_any_more_and_a_late_reply_is_counted() {
-    let _nodes = tell(
+fn handler_sees_a_cancelled_request_and_late_replies_count() {
+    let _nodes = run_story(
         |node| node.app(AppSpec::new("ponderer", || Ponderer).handles::<Question>()),
         &["ponderer"],
         async |sender: sinew::message::Sender| {
             let ask = |within| sender.message("ponderer", &Question { number: 1 }).ask::<Answer>(within);
-            // Given up by whoever asked: the deadline is beyond the test's.
+            // Cancelled by the requester: the deadline is beyond the test's.
             let reply = ask(DEADLINE * 2).expect("it is sent");
             let behind = sender.message("ponderer", &Question { number: 2 }).confirmed(DEADLINE);
             assert_eq!(behind.expect("it is sent").await, Outcome::Delivered, "so the request is handled");
             drop(reply);
-            // Its time is over: one that waited for its handler so long is not handled, and has no reply.
+            // Its deadline passes: a request that expires in the mailbox is not handled, and has no reply.
             while sender.late_replies() < 2 {
                 let hasty = Question { number: HASTY };
                 let over = sender.message("ponderer", &hasty).ask::<Answer>(Duration::from_millis(100));
                 assert!(over.expect("it is sent").await.is_err(), "nobody replied in time");
-                // The reply is on its way, if there is one.
+                // The reply is in flight, if there is one.
                 let behind = sender.message("ponderer", &Question { number: 2 }).confirmed(DEADLINE);
                 assert_eq!(behind.expect("it is sent").await, Outcome::Delivered);
             }
@@ -219,14 +216,15 @@ fn a_handler_sees_that_nobody_waits_for_its_reply_any_more_and_a_late_reply_is_c
 }
 
 #[test]
-fn all_that_was_sent_arrives_before_the_node_that_sent_it_is_gone() {
+fn sent_messages_arrive_before_their_stopping_node_leaves() {
     const WORDS: usize = 900;
-    let (spec, heard) = oracle("oracle");
-    let (here, _there) = tell(
+    let (spec, received) = oracle("oracle");
+    let (here, _there) = run_story(
         |node| node.app(spec),
         &["oracle"],
         async |sender: sinew::message::Sender| {
-            // More than sockets and the session's window hold: most of it waits when the node is told to stop.
+            // More than sockets and the session's window hold: most of it waits when the node is asked to
+            // stop.
             for number in 0..WORDS {
                 let text = format!("{number:>16384}");
                 sender.send("oracle", &Word { text }).expect("there is room for it");
@@ -235,30 +233,30 @@ fn all_that_was_sent_arrives_before_the_node_that_sent_it_is_gone() {
     );
     here.stop();
     for number in 0..WORDS {
-        let word = heard.recv_timeout(DEADLINE).expect("it was sent before the node stopped");
+        let word = received.recv_timeout(DEADLINE).expect("it was sent before the node stopped");
         assert_eq!(word.trim_start(), number.to_string());
     }
 }
 
 #[test]
-fn a_group_and_a_broadcast_reach_each_member_on_every_node_once() {
+fn group_and_broadcast_reach_each_member_once() {
     let ((first, at_first), (second, at_second)) = (oracle("first"), oracle("second"));
-    let (here, there) = tell(
+    let (here, there) = run_story(
         |node| node.app(first).app(second),
         &["first", "second"],
         async |sender: sinew::message::Sender| {
             let word = |text: &str| Word { text: text.to_owned() };
-            // The membership follows the readiness by one list; until then nobody takes the message.
+            // The membership arrives one list after the readiness; until then the message is not accepted.
             while sender.send(Tid::group("listeners"), &word("group")).is_err() {
                 actix::clock::sleep(Duration::from_millis(1)).await;
             }
             sender.send(Tid::BROADCAST, &word("everybody")).expect("somebody takes it");
         },
     );
-    for heard in [at_first, at_second] {
-        let words = [heard.recv_timeout(DEADLINE), heard.recv_timeout(DEADLINE)];
+    for received in [at_first, at_second] {
+        let words = [received.recv_timeout(DEADLINE), received.recv_timeout(DEADLINE)];
         assert_eq!(words, [Ok("group".to_owned()), Ok("everybody".to_owned())]);
-        assert_eq!(heard.try_recv().ok(), None);
+        assert_eq!(received.try_recv().ok(), None);
     }
     let sent = here.handle().traffic();
     assert_eq!(sent.len(), 1, "one peer");
@@ -267,8 +265,8 @@ fn a_group_and_a_broadcast_reach_each_member_on_every_node_once() {
 
 #[test]
 fn a_thousand_messages_arrive_once_and_in_order() {
-    let (spec, heard) = oracle("oracle");
-    let _nodes = tell(
+    let (spec, received) = oracle("oracle");
+    let _nodes = run_story(
         |node| node.configure(|config| config.mailbox_capacity = 2_000).app(spec),
         &["oracle"],
         async |sender: sinew::message::Sender| {
@@ -278,45 +276,45 @@ fn a_thousand_messages_arrive_once_and_in_order() {
         },
     );
     for number in 0..1_000 {
-        assert_eq!(heard.recv_timeout(DEADLINE), Ok(number.to_string()));
+        assert_eq!(received.recv_timeout(DEADLINE), Ok(number.to_string()));
     }
 }
 
 #[test]
-fn requirements_in_a_circle_are_refused_with_the_circle_spelled_out() {
+fn circular_requirements_are_rejected_with_the_circle() {
     let (first, _a) = oracle("first");
     let (second, _b) = oracle("second");
-    let node = node("circle", 1, own_group()).app(first.requires(["second"])).app(second.requires(["first"]));
+    let node = Loopback::new().node("circle").app(first.requires(["second"])).app(second.requires(["first"]));
     let error = node.start().expect_err("nobody can be the first");
     assert!(error.to_string().contains("first requires second requires first"), "{error}");
 }
 
 #[test]
-fn a_requirement_that_anything_else_can_meet_closes_no_circle_at_the_start() {
+fn pattern_with_another_match_closes_no_circle() {
     let app = |name: &str, requires: &str| oracle(name).0.requires([requires]);
     let either =
-        node("either", 1, own_group()).app(app("first", "second | other")).app(app("second", "first"));
+        Loopback::new().node("either").app(app("first", "second | other")).app(app("second", "first"));
     either.start().expect("another node may have `other`");
-    let many = node("many", 1, own_group()).app(app("first", "2 of second.*")).app(app("second.a", "first"));
+    let many = Loopback::new().node("many").app(app("first", "2 of second.*")).app(app("second.a", "first"));
     many.start().expect("other nodes may have more of them");
     let limited =
-        node("limited", 1, own_group()).app(app("first", "second")).app(app("second", "first ?50ms"));
+        Loopback::new().node("limited").app(app("first", "second")).app(app("second", "first ?50ms"));
     let limited = limited.start().expect("one of them goes on without the other");
     limited.handle().wait_until_running(DEADLINE).expect("both run");
 }
 
 #[test]
-fn a_run_ends_with_a_circle_through_another_node_and_a_node_that_runs_others_goes_on() {
+fn circle_through_another_node_ends_only_idle_nodes() {
     // Given: a node that runs another application beside the one in the circle
-    let group = own_group();
+    let (home, there) = pair();
     let app = |name: &str| oracle(name).0;
-    let there = node("there", 2, group).app(app("other")).app(app("knee").requires(["hip"]));
+    let there = there.app(app("other")).app(app("knee").requires(["hip"]));
     let there = there.start().expect("the layers start");
     until("the other one runs", || there.handle().directory().iter().any(|entry| entry.ready).then_some(()));
     let handle = there.handle();
     let runs_on = std::thread::spawn(move || there.run());
-    // When: a node starts that closes the circle, and runs nothing else
-    let here = node("home", 1, group).app(app("hip").requires(["knee"])).start().expect("the layers start");
+    // When: a node starts that closes the circle, and runs no other application
+    let here = home.app(app("hip").requires(["knee"])).start().expect("the layers start");
     let asked = here.handle();
     let error = asked.wait_until_running(DEADLINE).expect_err("nobody can be the first");
     assert!(error.to_string().contains("hip requires knee (node there) requires hip"), "{error}");
@@ -329,42 +327,52 @@ fn a_run_ends_with_a_circle_through_another_node_and_a_node_that_runs_others_goe
 }
 
 #[test]
-fn a_circle_that_was_opened_on_another_node_is_told_of_no_more() {
-    // Given: two nodes whose applications require each other
-    let group = own_group();
+fn opened_circle_is_no_longer_reported() {
+    // Given: two nodes with applications that require each other
+    let (home, there) = pair();
     let oracle = |name: &str| oracle(name).0;
-    let here =
-        node("home", 1, group).app(oracle("hip").requires(["knee"])).start().expect("the layers start");
-    let there =
-        node("there", 2, group).app(oracle("knee").requires(["hip"])).start().expect("the layers start");
+    let here = home.app(oracle("hip").requires(["knee"])).start().expect("the layers start");
+    let there = there.app(oracle("knee").requires(["hip"])).start().expect("the layers start");
     let error = here.handle().wait_until_running(DEADLINE).expect_err("nobody can be the first");
     assert!(matches!(error, StartError::Cycle(_)), "{error}");
-    // When: the other one requires it no more
+    // When: the other one no longer requires it
     there.handle().stop_app("knee").expect("it is there");
     there.handle().remove_app("knee").expect("it has stopped");
     there.handle().add_app(oracle("knee"), None).expect("its name is free");
-    // Until `here` has heard of that the circle stands, as far as it knows.
+    // As far as `here` knows, the circle exists until it is notified of the change.
     until("both run", || here.handle().wait_until_running(DEADLINE).ok());
-    // Then: who waits is not told of the circle
+    // Then: a waiting application is not notified of the circle
     here.handle().add_app(oracle("late").requires(["never"]), None).expect("its name is free");
     let error = here.handle().wait_until_running(Duration::from_millis(50)).expect_err("it waits");
     assert!(matches!(error, StartError::Waiting { .. }), "{error}");
 }
 
-#[test]
-fn who_waits_for_whom_can_be_asked() {
-    let (spec, _heard) = oracle("oracle");
-    let node = node("alone", 1, own_group()).app(spec.requires(["never"])).start().expect("the layers start");
-    let error = node.handle().wait_until_running(Duration::from_millis(50)).expect_err("it waits");
-    let words = error.to_string();
-    assert!(words.contains("oracle") && words.contains("never (not there; missing for "), "{words}");
+struct Unplugged;
+
+impl Actor for Unplugged {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        context.fail_start("/dev/encoder: No such file or directory");
+    }
 }
 
 #[test]
-fn a_port_in_use_fails_the_start_in_words() {
-    let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
-    let port = taken.local_addr().expect("it is bound").port();
-    let node = node("late", 1, own_group()).configure(|config| config.gncl.port = port);
-    let words = node.start().expect_err("the port is taken").to_string();
-    assert!(words.contains(&port.to_string()) && words.contains("gncl.port"), "{words}");
+fn wait_for_all_applications_names_a_failing_start() {
+    let app = AppSpec::new("encoder", || Unplugged);
+    let node = Loopback::new().node("alone").app(app).start().expect("the layers start");
+    let words = until("the first start has failed", || {
+        let error = node.handle().wait_until_running(Duration::from_millis(50)).expect_err("it never starts");
+        Some(error.to_string()).filter(|words| words.contains("No such file"))
+    });
+    assert!(words.contains("these are not ready:\n  encoder: "), "{words}");
+}
+
+#[test]
+fn waiting_applications_and_requirements_are_listed() {
+    let (spec, _received) = oracle("oracle");
+    let node = Loopback::new().node("alone").app(spec.requires(["never"])).start().expect("the layers start");
+    let error = node.handle().wait_until_running(Duration::from_millis(50)).expect_err("it waits");
+    let words = error.to_string();
+    assert!(words.contains("oracle") && words.contains("never (not there; missing for "), "{words}");
 }

@@ -1,4 +1,4 @@
-//! A node in another language, written from `docs/protocol` alone, beside one of ours.
+//! A node in another language, written from `docs/protocol` alone, beside one of Sinew.
 
 use std::{
     process::{Command, Stdio},
@@ -10,38 +10,38 @@ use std::{
 };
 
 use sinew::prelude::*;
-use sinew_tests::{
-    DEADLINE, Ground, Program, all_run,
-    puppet::{Order, Seen, Stage, Value, desk, wait},
+use sinew_testkit::{
+    DEADLINE, Loopback, NodeProcess, all_run,
+    scripted::{Order, Script, Seen, Value, sender_app, wait},
 };
 
 const NODE: &str = include_str!("other_language/node.py");
-/// Messages each way.
+/// Messages in each direction.
 const COUNT: u64 = 40;
 /// The value that the node in Python sends.
 const VALUE: u64 = 1_000_000;
 
-/// The node in Python, or `None`, which is said, on a machine without Python 3.
-fn python(ground: &Ground, more: &[&str]) -> Option<Program> {
+/// The node in Python; `None` on a machine without Python 3, which is reported.
+fn python(loopback: &Loopback, more: &[&str]) -> Option<NodeProcess> {
     let is_there = Command::new("python3").arg("--version").stdout(Stdio::null()).status();
     if !is_there.is_ok_and(|status| status.success()) {
         println!("skipped: there is no python3 on this machine");
         return None;
     }
     let mut python = Command::new("python3");
-    python.args(["-c", NODE, "sinew", "127.0.0.9", &ground.group.to_string(), "python.arm", "drive"]);
+    python.args(["-c", NODE, "sinew", "127.0.0.9", &loopback.group.to_string(), "python.arm", "drive"]);
     python.args([Order::NAME, &COUNT.to_string()]).args(more);
-    Some(Program::start("node.py", python))
+    Some(NodeProcess::start("node.py", python))
 }
 
 #[test]
-fn a_node_in_python_is_found_sends_takes_confirms_and_leaves() {
-    let ground = Ground::new();
-    let Some(mut python) = python(&ground, &[]) else { return };
-    let ((drive, log), (desk, key)) = (Stage::new().app("drive"), desk("desk"));
-    let (waiter, events) = Stage::new().app("waiter");
+fn python_node_is_found_and_exchanges_messages() {
+    let loopback = Loopback::new();
+    let Some(mut python) = python(&loopback, &[]) else { return };
+    let ((drive, log), (sender_app, key)) = (Script::new().app("drive"), sender_app("sender"));
+    let (waiter, events) = Script::new().app("waiter");
     let waiter = waiter.requires(["python.arm"]).handles::<NodeEvent>();
-    let node = ground.node("rust").app(drive).app(desk).app(waiter).start().expect("a node");
+    let node = loopback.node("rust").app(drive).app(sender_app).app(waiter).start().expect("a node");
     all_run(&[&node]);
 
     let sender = key.sender();
@@ -54,7 +54,7 @@ fn a_node_in_python_is_found_sends_takes_confirms_and_leaves() {
         python.wait_for(&[&format!("outcome {number} 0")]);
     }
     python.wait_for(&["left"]);
-    assert_eq!(python.wait_for_end(), Some(0));
+    assert_eq!(python.wait_for_exit(), Some(0));
 
     let got = log.all().into_iter().filter(|seen| matches!(seen, Seen::Got(..)));
     assert!(got.eq((1..=COUNT).map(|number| Seen::Got(1, number))), "once and in order");
@@ -67,12 +67,12 @@ fn a_node_in_python_is_found_sends_takes_confirms_and_leaves() {
 }
 
 #[test]
-fn a_node_in_python_has_a_connection_for_each_class_and_sends_and_takes_values_by_datagram() {
-    let ground = Ground::new();
-    let Some(mut python) = python(&ground, &[Value::NAME, &VALUE.to_string()]) else { return };
-    let ((drive, log), (desk, key)) = (Stage::new().app("drive"), desk("desk"));
-    let waiter = Stage::new().app("waiter").0.requires(["python.arm"]);
-    let node = ground.node("rust").app(drive).app(desk).app(waiter).start().expect("a node");
+fn python_node_uses_class_connections_and_datagrams() {
+    let loopback = Loopback::new();
+    let Some(mut python) = python(&loopback, &[Value::NAME, &VALUE.to_string()]) else { return };
+    let ((drive, log), (sender_app, key)) = (Script::new().app("drive"), sender_app("sender"));
+    let waiter = Script::new().app("waiter").0.requires(["python.arm"]);
+    let node = loopback.node("rust").app(drive).app(sender_app).app(waiter).start().expect("a node");
     all_run(&[&node]);
 
     let sender = key.sender();
@@ -92,7 +92,7 @@ fn a_node_in_python_has_a_connection_for_each_class_and_sends_and_takes_values_b
                 if has_come.load(Ordering::Relaxed) {
                     return;
                 }
-                // At the end the other one leaves.
+                // At the end the other node leaves.
                 let _ = sender.send("python.arm", &Value { number });
                 std::thread::sleep(Duration::from_millis(5));
             }
@@ -104,7 +104,7 @@ fn a_node_in_python_has_a_connection_for_each_class_and_sends_and_takes_values_b
     python.wait_for(&["value acknowledged"]);
     log.wait_for(Seen::Got(1, VALUE));
     python.wait_for(&["left"]);
-    assert_eq!(python.wait_for_end(), Some(0));
+    assert_eq!(python.wait_for_exit(), Some(0));
     let got = log.all().into_iter().filter(|seen| matches!(seen, Seen::Got(_, VALUE)));
     assert_eq!(got.count(), 1, "however often it was sent");
 }

@@ -1,4 +1,4 @@
-//! Phases on real nodes: applications that come up in steps, before they are ready, and one that is started again.
+//! Phases on real nodes: applications that start in steps before they are ready, and one that is restarted.
 
 use std::sync::mpsc::{SyncSender, sync_channel};
 
@@ -7,14 +7,14 @@ use sinew::{
     prelude::*,
     supervision::ReadyGate,
 };
-use sinew_tests::{DEADLINE, Ground, until};
+use sinew_testkit::{DEADLINE, Loopback, until};
 
 const DRIVES: [&str; 2] = ["hip.drive", "knee.drive"];
 
-/// Homes, is ready when all drives are homed, and says so.
+/// Homes, becomes ready when all drives are homed, and reports it.
 struct Drive {
     held: Option<ReadyGate>,
-    said: SyncSender<Result<u64, String>>,
+    results: SyncSender<Result<u64, String>>,
 }
 
 impl Actor for Drive {
@@ -25,18 +25,18 @@ impl Actor for Drive {
         let homed = Barrier::phase("homed", DRIVES).within(DEADLINE);
         let meeting = context.meet(&homed).into_actor(self);
         context.spawn(meeting.map(|passed, this, _| {
-            this.said.send(passed.map_err(|error| error.to_string())).expect("the test listens");
+            this.results.send(passed.map_err(|error| error.to_string())).expect("the test listens");
             this.held.take().expect("it was held").reached();
         }));
     }
 }
 
-fn drive(name: &str, said: &SyncSender<Result<u64, String>>) -> AppSpec<Drive> {
-    let said = said.clone();
-    AppSpec::new(name, move || Drive { held: None, said: said.clone() }).start_within(DEADLINE)
+fn drive(name: &str, results: &SyncSender<Result<u64, String>>) -> AppSpec<Drive> {
+    let results = results.clone();
+    AppSpec::new(name, move || Drive { held: None, results: results.clone() }).start_within(DEADLINE)
 }
 
-/// Needs homed drives, ready or not.
+/// Requires homed drives, ready or not.
 struct Gait(SyncSender<()>);
 
 impl Actor for Gait {
@@ -48,13 +48,13 @@ impl Actor for Gait {
 }
 
 #[test]
-fn drives_of_two_nodes_come_up_together_and_one_that_is_started_again_brings_nobody_back() {
-    let ground = Ground::new();
-    let (say, heard) = sync_channel(16);
+fn drives_start_together_and_a_restart_affects_no_other() {
+    let loopback = Loopback::new();
+    let (results, passed) = sync_channel(16);
     let (start, started) = sync_channel(16);
     let gait = AppSpec::new("gait", move || Gait(start.clone())).requires(["2 of *.drive at homed"]);
-    let hip = ground.node("hip").app(drive("hip.drive", &say)).app(gait).start().expect("it starts");
-    // Given: one drive is homed, and is seen to wait for the other.
+    let hip = loopback.node("hip").app(drive("hip.drive", &results)).app(gait).start().expect("it starts");
+    // Given: one drive is homed, and waits for the other.
     let status = until("the hip's drive waits", || hip.handle().barriers().pop());
     assert_eq!((status.barrier.as_str(), status.kind), ("homed", BarrierKind::Phase));
     let missing: Vec<_> = status.missing.iter().map(|absence| (&*absence.name, &*absence.why)).collect();
@@ -62,19 +62,19 @@ fn drives_of_two_nodes_come_up_together_and_one_that_is_started_again_brings_nob
     let waits = until("the gait waits", || hip.handle().waiting().pop());
     let missing: Vec<_> = waits.missing.iter().map(|absence| (&*absence.name, &*absence.why)).collect();
     assert_eq!(missing, [("2 of *.drive at homed (1 there)", "not there")]);
-    assert!(heard.try_recv().is_err() && started.try_recv().is_err(), "nobody has gone on");
-    // When the other one comes, then both go on, and so does who needs them.
-    let knee = ground.node("knee").app(drive("knee.drive", &say)).start().expect("it starts");
+    assert!(passed.try_recv().is_err() && started.try_recv().is_err(), "nobody has gone on");
+    // When the other one starts, then both continue, and so does the application that requires them.
+    let knee = loopback.node("knee").app(drive("knee.drive", &results)).start().expect("it starts");
     for _ in DRIVES {
-        assert_eq!(heard.recv_timeout(DEADLINE).expect("both go on"), Ok(1));
+        assert_eq!(passed.recv_timeout(DEADLINE).expect("both go on"), Ok(1));
     }
     started.recv_timeout(DEADLINE).expect("the gait starts");
-    // When one is started again, then it goes through its phase alone.
+    // When one is restarted, then it goes through its phase alone.
     until("the knee's drive is ready", || {
         knee.handle().directory().iter().any(|entry| entry.name == "knee.drive" && entry.ready).then_some(())
     });
     knee.handle().stop_app("knee.drive").expect("it stops");
     knee.handle().restart_app("knee.drive").expect("it is started again");
-    assert_eq!(heard.recv_timeout(DEADLINE).expect("it goes on"), Ok(1));
-    assert!(heard.try_recv().is_err(), "the hip's is not brought back");
+    assert_eq!(passed.recv_timeout(DEADLINE).expect("it goes on"), Ok(1));
+    assert!(passed.try_recv().is_err(), "the hip's is not brought back");
 }

@@ -1,4 +1,4 @@
-//! An application that is slower than those who send to it from another node: it holds them back, and nobody else.
+//! An application that is slower than its senders on another node: it slows these down, and no others.
 
 use std::{
     sync::mpsc::{Receiver, SyncSender, sync_channel},
@@ -9,20 +9,20 @@ use sinew::{
     message::{Rejection, SendError},
     prelude::*,
 };
-use sinew_tests::{DEADLINE, own_group};
+use sinew_testkit::{DEADLINE, Loopback};
 
 payload!("slow.job", Bulk => struct Job { number: u64 });
 payload!("slow.question", Bulk => struct Question { number: u64 });
 payload!("slow.answer", Bulk => struct Answer { number: u64 });
 
-/// Jobs that the slow application is sent.
+/// Jobs that are sent to the slow application.
 const JOBS: u64 = 1_500;
-/// How long it takes for each.
+/// Its handling time for each.
 const PAUSE: Duration = Duration::from_millis(1);
-/// Messages that any queue of these nodes holds: far fewer than there are jobs.
+/// Capacity of each queue of these nodes: far less than the number of jobs.
 const QUEUE: usize = 64;
 
-/// Takes its time, and says what it did.
+/// Handles slowly, and reports each job.
 struct Slow(SyncSender<u64>);
 
 impl Actor for Slow {
@@ -48,18 +48,18 @@ impl Handler<Delivery<Question>> for Quick {
     type Result = ();
 
     fn handle(&mut self, question: Delivery<Question>, context: &mut Self::Context) {
-        context.reply(&question, &Answer { number: question.number }).expect("the asker waits");
+        context.reply(&question, &Answer { number: question.number }).expect("the requester waits");
     }
 }
 
-/// What the sender saw.
+/// The sender's record.
 #[derive(Debug)]
 struct Seen {
     refused: u64,
     answered: u64,
 }
 
-/// Sends jobs as fast as they are taken, and asks the quick one in between.
+/// Sends jobs as fast as they are accepted, and sends requests to the quick application in between.
 struct Sending(SyncSender<Seen>);
 
 impl Actor for Sending {
@@ -73,7 +73,7 @@ impl Actor for Sending {
                 while let Err(error) = sender.send("slow", &Job { number }) {
                     assert!(matches!(error, SendError::Rejected(Rejection::QueueFull)), "{error}");
                     seen.refused += 1;
-                    // It is full now and here: the quick one is asked until it is not.
+                    // The path is full now and then: the request is repeated until there is room.
                     let ask = sender.message("quick", &Question { number }).ask::<Answer>(DEADLINE);
                     let answer = ask.expect("what is for others is taken").await.expect("and answered");
                     assert_eq!(answer.number, number);
@@ -86,32 +86,31 @@ impl Actor for Sending {
     }
 }
 
-fn node(name: &str, address: u8, group: std::net::SocketAddrV4) -> NodeBuilder {
-    Node::builder(name).address([127, 0, 0, address]).configure(|config| {
-        config.ndl.multicast = Some(group);
-        config.ndl.mdns_port = None;
+fn node(loopback: &Loopback, name: &str) -> NodeBuilder {
+    loopback.node(name).configure(|config| {
         config.mailbox_capacity = QUEUE;
         config.gncl.queue_capacity = QUEUE;
     })
 }
 
-fn in_order(did: &Receiver<u64>) {
+fn in_order(done: &Receiver<u64>) {
     for number in 0..JOBS {
-        assert_eq!(did.recv_timeout(DEADLINE).expect("each job is done"), number);
+        assert_eq!(done.recv_timeout(DEADLINE).expect("each job is done"), number);
     }
 }
 
 #[test]
-fn a_slow_application_gets_everything_in_order_and_those_beside_it_are_answered_meanwhile() {
-    let group = own_group();
-    let (say, did) = sync_channel(JOBS as usize);
-    let (done, seen) = sync_channel(1);
-    let slow = AppSpec::new("slow", move || Slow(say.clone())).handles::<Job>().own_thread();
+fn slow_app_keeps_order_and_delays_no_neighbour() {
+    let loopback = Loopback::new();
+    let (home, there) = (node(&loopback, "home"), node(&loopback, "there"));
+    let (reports, done) = sync_channel(JOBS as usize);
+    let (results, seen) = sync_channel(1);
+    let slow = AppSpec::new("slow", move || Slow(reports.clone())).handles::<Job>().own_thread();
     let quick = AppSpec::new("quick", || Quick).handles::<Question>().own_thread();
-    let _there = node("there", 2, group).app(slow).app(quick).start().expect("a node");
-    let sending = AppSpec::new("sending", move || Sending(done.clone())).requires(["slow", "quick"]);
-    let here = node("home", 1, group).app(sending).start().expect("a node");
-    in_order(&did);
+    let _there = there.app(slow).app(quick).start().expect("a node");
+    let sending = AppSpec::new("sending", move || Sending(results.clone())).requires(["slow", "quick"]);
+    let here = home.app(sending).start().expect("a node");
+    in_order(&done);
     let seen = seen.recv_timeout(DEADLINE).expect("all were sent");
     assert!(seen.refused > 0 && seen.answered == seen.refused, "{seen:?}");
     let traffic = here.handle().traffic();

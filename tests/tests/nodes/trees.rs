@@ -1,4 +1,5 @@
-//! Supervisors that a user builds, on real nodes: strategies, escalation, children that come and go while the node runs.
+//! Supervisors that a user builds, on real nodes: strategies, escalation, children added and removed while
+//! the node runs.
 
 use std::sync::Mutex;
 
@@ -7,22 +8,23 @@ use sinew::{
     message::Rejection,
     node::{CommandError, LifeState, NodeEnd, Supervised},
     prelude::*,
-    supervision::Refusal,
+    supervision::ChildCommandError,
 };
-use sinew_tests::{
-    DEADLINE, Ground, Log, all_run,
-    puppet::{Job, Puppet, Seen, Stage, desk, lives, outcome_of_job},
+use sinew_testkit::{
+    DEADLINE, Log, Loopback, all_run,
+    scripted::{Job, Script, ScriptedApp, Seen, incarnations, outcome_of_job, sender_app},
     until,
 };
 
-/// A puppet that panics over message 13, and writes the beginning of each life into a log that it shares.
-fn member(name: &'static str, order: &Log<String>) -> (AppSpec<Puppet>, Log<Seen>) {
-    let (begun, told) = (order.clone(), order.clone());
-    Stage::new()
-        .started(move |puppet, _| begun.write(format!("{name} {}", puppet.life)))
-        .got(|puppet, _| assert!(puppet.number != 13, "thirteen"))
+/// A scripted application that panics at message 13, and writes the start of each incarnation into a shared
+/// log.
+fn member(name: &'static str, order: &Log<String>) -> (AppSpec<ScriptedApp>, Log<Seen>) {
+    let (begun, stopped) = (order.clone(), order.clone());
+    Script::new()
+        .started(move |scripted, _| begun.write(format!("{name} {}", scripted.incarnation)))
+        .got(|scripted, _| assert!(scripted.number != 13, "thirteen"))
         .stopping(move |_, _| {
-            told.write(format!("stop {name}"));
+            stopped.write(format!("stop {name}"));
             Running::Stop
         })
         .app(name)
@@ -33,12 +35,12 @@ fn begun(order: &Log<String>) -> Vec<String> {
 }
 
 #[test]
-fn one_for_all_starts_in_order_and_takes_all_siblings_with_the_one_that_fails() {
+fn one_for_all_restarts_all_siblings_in_order() {
     let order = Log::default();
     let [(a, _), (b, _), (c, _)] = ["a", "b", "c"].map(|name| member(name, &order));
-    let (desk, key) = desk("desk");
+    let (sender_app, key) = sender_app("sender");
     let leg = SupervisorSpec::new("leg").strategy(Strategy::OneForAll).app(a).app(b).app(c);
-    let node = Ground::new().node("node").supervisor(leg).app(desk).start().expect("a node");
+    let node = Loopback::new().node("node").supervisor(leg).app(sender_app).start().expect("a node");
     all_run(&[&node]);
     assert_eq!(begun(&order), ["a 1", "b 1", "c 1"]);
     assert_eq!(outcome_of_job(&key.sender(), "b", 13), Outcome::Failed);
@@ -47,12 +49,12 @@ fn one_for_all_starts_in_order_and_takes_all_siblings_with_the_one_that_fails() 
 }
 
 #[test]
-fn rest_for_one_leaves_those_before_alone() {
+fn rest_for_one_restarts_only_later_siblings() {
     let order = Log::default();
     let [(a, _), (b, _), (c, _)] = ["a", "b", "c"].map(|name| member(name, &order));
-    let (desk, key) = desk("desk");
+    let (sender_app, key) = sender_app("sender");
     let leg = SupervisorSpec::new("leg").strategy(Strategy::RestForOne).app(a).app(b).app(c);
-    let node = Ground::new().node("node").supervisor(leg).app(desk).start().expect("a node");
+    let node = Loopback::new().node("node").supervisor(leg).app(sender_app).start().expect("a node");
     all_run(&[&node]);
     let sender = key.sender();
     assert_eq!(outcome_of_job(&sender, "b", 13), Outcome::Failed);
@@ -62,26 +64,26 @@ fn rest_for_one_leaves_those_before_alone() {
 }
 
 #[test]
-fn one_that_holds_its_readiness_keeps_those_after_it_from_starting() {
+fn child_that_is_not_ready_delays_later_children() {
     let order = Log::default();
     let (open, opened) = std::sync::mpsc::sync_channel::<()>(1);
     let opened = Mutex::new(Some(opened));
-    let (slow, slow_log) = Stage::new()
-        .started(move |puppet, context| {
-            let gate = context.hold_ready().expect("asked for once in this life");
-            let opened = opened.lock().unwrap().take().expect("it has one life");
+    let (slow, slow_log) = Script::new()
+        .started(move |scripted, context| {
+            let gate = context.hold_ready().expect("asked for once in this incarnation");
+            let opened = opened.lock().unwrap().take().expect("it has one incarnation");
             std::thread::spawn(move || {
                 opened.recv_timeout(DEADLINE).expect("the test opens it");
                 gate.reached();
             });
-            puppet.say("holds");
+            scripted.note("holds");
         })
         .app("slow");
     let (next, _) = member("next", &order);
     let leg = SupervisorSpec::new("leg").strategy(Strategy::RestForOne).app(slow).app(next);
-    let node = Ground::new().node("node").supervisor(leg).start().expect("a node");
-    slow_log.wait_for(Seen::Said(1, "holds"));
-    // What requires nothing is released at once, so that only the order can hold it.
+    let node = Loopback::new().node("node").supervisor(leg).start().expect("a node");
+    slow_log.wait_for(Seen::Note(1, "holds"));
+    // A child without requirements is released at once, so only the order can hold it.
     until("the barrier is open", || node.handle().waiting().is_empty().then_some(()));
     assert_eq!(begun(&order), [""; 0]);
     open.send(()).unwrap();
@@ -90,12 +92,13 @@ fn one_that_holds_its_readiness_keeps_those_after_it_from_starting() {
 }
 
 #[test]
-fn a_supervisor_that_gives_up_is_restarted_with_a_fresh_set_and_its_neighbours_live_on() {
+fn failed_supervisor_restarts_without_its_neighbours() {
     let order = Log::default();
     let [(a, _), (b, _), (outside, outside_log)] = ["a", "b", "outside"].map(|name| member(name, &order));
-    let (desk, key) = desk("desk");
+    let (sender_app, key) = sender_app("sender");
     let leg = SupervisorSpec::new("leg").intensity(1, DEADLINE).app(a).app(b);
-    let node = Ground::new().node("node").supervisor(leg).app(outside).app(desk).start().expect("a node");
+    let node =
+        Loopback::new().node("node").supervisor(leg).app(outside).app(sender_app).start().expect("a node");
     all_run(&[&node]);
     let sender = key.sender();
     assert_eq!(outcome_of_job(&sender, "a", 13), Outcome::Failed);
@@ -105,16 +108,16 @@ fn a_supervisor_that_gives_up_is_restarted_with_a_fresh_set_and_its_neighbours_l
         order.wait_for(line.to_owned());
     }
     assert_eq!(outcome_of_job(&sender, "a", 1), Outcome::Delivered);
-    assert_eq!(lives(&outside_log), 1);
+    assert_eq!(incarnations(&outside_log), 1);
 }
 
 #[test]
-fn escalation_ends_the_node_and_says_who_failed_on_each_floor() {
+fn escalation_ends_the_node_and_names_each_level() {
     let order = Log::default();
-    let (knee, _) = Stage::new().started(|_, _| panic!("no bus")).app("knee");
+    let (knee, _) = Script::new().started(|_, _| panic!("no bus")).app("knee");
     let (other, _) = member("other", &order);
     let leg = SupervisorSpec::new("leg").intensity(1, DEADLINE).app(knee);
-    let node = Ground::new().node("node").app(other).supervisor(leg);
+    let node = Loopback::new().node("node").app(other).supervisor(leg);
     // However long the restarts take.
     let node = node.configure(|config| {
         (config.supervision.app_restarts_max, config.supervision.app_window) = (1, 10 * DEADLINE);
@@ -123,30 +126,30 @@ fn escalation_ends_the_node_and_says_who_failed_on_each_floor() {
         panic!("it stopped as if nothing had been");
     };
     assert!(why.contains("'leg'") && why.contains("'knee'") && why.contains("no bus"), "{why}");
-    assert!(order.all().contains(&"stop other".to_owned()), "who still lives is told");
+    assert!(order.all().contains(&"stop other".to_owned()), "an application that still runs is notified");
 }
 
 #[test]
-fn stop_runs_backwards_through_all_floors() {
+fn stop_runs_in_reverse_order_through_all_levels() {
     let order = Log::default();
     let [(a, _), (b, _), (c, _), (d, _)] = ["a", "b", "c", "d"].map(|name| member(name, &order));
     let toes = SupervisorSpec::new("toes").app(c);
     let leg = SupervisorSpec::new("leg").app(b).supervisor(toes);
-    let node = Ground::new().node("node").app(a).supervisor(leg).app(d).start().expect("a node");
+    let node = Loopback::new().node("node").app(a).supervisor(leg).app(d).start().expect("a node");
     all_run(&[&node]);
     assert_eq!(node.stop(), NodeEnd::Stopped);
     assert_eq!(order.all()[4..], ["stop d", "stop c", "stop b", "stop a"]);
 }
 
 #[test]
-fn an_application_added_at_run_time_is_one_like_all_others() {
+fn app_added_at_run_time_behaves_like_others() {
     let order = Log::default();
-    let (desk, key) = desk("desk");
-    let node = Ground::new().node("node").app(desk).supervisor(SupervisorSpec::new("leg")).start();
+    let (sender_app, key) = sender_app("sender");
+    let node = Loopback::new().node("node").app(sender_app).supervisor(SupervisorSpec::new("leg")).start();
     let node = node.expect("a node");
     let sender = key.sender();
     let (late, _) = member("late", &order);
-    node.handle().add_app(late.requires(["desk"]), Some("leg")).expect("it is taken in");
+    node.handle().add_app(late.requires(["sender"]), Some("leg")).expect("it is taken in");
     all_run(&[&node]);
     assert_eq!(outcome_of_job(&sender, "late", 1), Outcome::Delivered);
     assert_eq!(outcome_of_job(&sender, "late", 13), Outcome::Failed);
@@ -155,9 +158,9 @@ fn an_application_added_at_run_time_is_one_like_all_others() {
 }
 
 #[test]
-fn an_application_that_cannot_be_added_leaves_nothing_behind_and_the_error_says_why() {
+fn rejected_app_leaves_nothing_and_error_says_why() {
     let order = Log::default();
-    let node = Ground::new().node("node").app(member("first", &order).0).start().expect("a node");
+    let node = Loopback::new().node("node").app(member("first", &order).0).start().expect("a node");
     let handle = node.handle();
     let words = |result: Result<(), CommandError>| result.expect_err("it is refused").to_string();
     let same = words(handle.add_app(member("first", &order).0, None));
@@ -172,10 +175,10 @@ fn an_application_that_cannot_be_added_leaves_nothing_behind_and_the_error_says_
 }
 
 #[test]
-fn a_stopped_application_refuses_messages_keeps_its_tid_and_comes_back_when_it_is_told_to() {
+fn stopped_app_keeps_its_tid_and_can_restart() {
     let order = Log::default();
-    let ((app, log), (desk, key)) = (member("app", &order), desk("desk"));
-    let node = Ground::new().node("node").app(app).app(desk).start().expect("a node");
+    let ((app, log), (sender_app, key)) = (member("app", &order), sender_app("sender"));
+    let node = Loopback::new().node("node").app(app).app(sender_app).start().expect("a node");
     all_run(&[&node]);
     let (handle, sender) = (node.handle(), key.sender());
     let tid = handle.resolve("app").expect("it is there");
@@ -191,13 +194,16 @@ fn a_stopped_application_refuses_messages_keeps_its_tid_and_comes_back_when_it_i
 }
 
 #[test]
-fn only_a_stopped_application_can_be_restarted_or_removed_and_a_removed_one_frees_its_name() {
+fn only_a_stopped_app_can_be_restarted_or_removed() {
     let order = Log::default();
-    let node = Ground::new().node("node").app(member("app", &order).0).start().expect("a node");
+    let node = Loopback::new().node("node").app(member("app", &order).0).start().expect("a node");
     all_run(&[&node]);
     let handle = node.handle();
     for refused in [handle.restart_app("app"), handle.remove_app("app")] {
-        assert!(matches!(refused, Err(CommandError::Refused { why: Refusal::Running, .. })), "{refused:?}");
+        assert!(
+            matches!(refused, Err(CommandError::Refused { why: ChildCommandError::Running, .. })),
+            "{refused:?}"
+        );
     }
     handle.stop_app("app").expect("it stops");
     handle.remove_app("app").expect("it is removed");
@@ -208,9 +214,9 @@ fn only_a_stopped_application_can_be_restarted_or_removed_and_a_removed_one_free
 }
 
 #[test]
-fn who_may_not_do_what_he_asks_is_told_what_to_do_instead() {
+fn forbidden_command_is_rejected_with_remedy() {
     let order = Log::default();
-    let node = Ground::new().node("node").app(member("app", &order).0).start().expect("a node");
+    let node = Loopback::new().node("node").app(member("app", &order).0).start().expect("a node");
     all_run(&[&node]);
     let handle = node.handle();
     let words = |result: Result<(), CommandError>| result.expect_err("it is refused").to_string();
@@ -223,7 +229,7 @@ fn who_may_not_do_what_he_asks_is_told_what_to_do_instead() {
             assert!(refused.contains("is a layer") && refused.contains("`NodeHandle::stop`"), "{refused}");
         }
     }
-    // Those that the node has by itself, as its tree names them.
+    // The supervisors that every node has, as the tree names them.
     let own: Vec<_> = handle.tree().expect("it runs").supervisors.into_iter().map(|own| own.name).collect();
     assert_eq!(own, ["layers", "applications"]);
     for own in &own {
@@ -237,11 +243,11 @@ fn who_may_not_do_what_he_asks_is_told_what_to_do_instead() {
 }
 
 #[test]
-fn a_stopped_supervisor_has_stopped_its_children_and_brings_them_back() {
+fn stopped_supervisor_restarts_its_children() {
     let order = Log::default();
     let [(a, _), (b, _)] = ["a", "b"].map(|name| member(name, &order));
     let leg = SupervisorSpec::new("leg").app(a).app(b);
-    let node = Ground::new().node("node").supervisor(leg).start().expect("a node");
+    let node = Loopback::new().node("node").supervisor(leg).start().expect("a node");
     all_run(&[&node]);
     node.handle().stop_app("leg").expect("it stops");
     assert_eq!(order.all()[2..], ["stop b", "stop a"]);
@@ -252,16 +258,16 @@ fn a_stopped_supervisor_has_stopped_its_children_and_brings_them_back() {
 }
 
 #[test]
-fn the_end_of_a_significant_application_is_the_end_of_the_node_in_order() {
+fn end_of_a_significant_app_ends_the_node() {
     let order = Log::default();
-    let (job, _) = Stage::new().got(|_, context| context.stop()).app("job");
-    let ((other, _), (desk, key)) = (member("other", &order), desk("desk"));
-    let node = Ground::new()
+    let (job, _) = Script::new().got(|_, context| context.stop()).app("job");
+    let ((other, _), (sender_app, key)) = (member("other", &order), sender_app("sender"));
+    let node = Loopback::new()
         .node("node")
         .auto_shutdown(AutoShutdown::AnySignificant)
         .app(other)
         .app(job.restart(Restart::Transient).significant())
-        .app(desk)
+        .app(sender_app)
         .start()
         .expect("a node");
     all_run(&[&node]);
@@ -271,19 +277,19 @@ fn the_end_of_a_significant_application_is_the_end_of_the_node_in_order() {
 }
 
 #[test]
-fn one_that_had_done_its_work_comes_back_with_its_group_and_takes_messages() {
+fn finished_app_restarts_with_its_group() {
     let order = Log::default();
-    let (job, job_log) = Stage::new()
-        .got(|puppet, context| {
-            if puppet.life == 1 {
+    let (job, job_log) = Script::new()
+        .got(|scripted, context| {
+            if scripted.incarnation == 1 {
                 context.stop();
             }
         })
         .app("job");
-    let ((other, _), (desk, key)) = (member("other", &order), desk("desk"));
+    let ((other, _), (sender_app, key)) = (member("other", &order), sender_app("sender"));
     let pair = SupervisorSpec::new("pair").strategy(Strategy::OneForAll);
     let pair = pair.app(other).app(job.restart(Restart::Transient));
-    let node = Ground::new().node("node").supervisor(pair).app(desk).start().expect("a node");
+    let node = Loopback::new().node("node").supervisor(pair).app(sender_app).start().expect("a node");
     all_run(&[&node]);
     let sender = key.sender();
     sender.send("job", &Job { number: 1 }).expect("it is there");
@@ -295,9 +301,9 @@ fn one_that_had_done_its_work_comes_back_with_its_group_and_takes_messages() {
 }
 
 #[test]
-fn a_node_that_has_ended_answers_no_command() {
+fn ended_node_answers_no_command() {
     let order = Log::default();
-    let node = Ground::new().node("node").app(member("app", &order).0).start().expect("a node");
+    let node = Loopback::new().node("node").app(member("app", &order).0).start().expect("a node");
     let handle = node.handle();
     node.stop();
     assert!(matches!(handle.stop_app("app"), Err(CommandError::NotRunning)));
@@ -306,30 +312,30 @@ fn a_node_that_has_ended_answers_no_command() {
 }
 
 #[test]
-fn who_waits_until_all_run_is_told_that_the_node_ended_and_not_that_nobody_is_waited_for() {
+fn wait_for_running_reports_the_end_of_the_node() {
     let order = Log::default();
     let waits = member("app", &order).0.requires(["nobody"]);
-    let node = Ground::new().node("node").app(waits).start().expect("a node");
-    let (handle, (say, heard)) = (node.handle(), std::sync::mpsc::sync_channel(1));
-    std::thread::spawn(move || say.send(handle.wait_until_running(DEADLINE * 2)).expect("it is heard"));
+    let node = Loopback::new().node("node").app(waits).start().expect("a node");
+    let (handle, (sender, receiver)) = (node.handle(), std::sync::mpsc::sync_channel(1));
+    std::thread::spawn(move || sender.send(handle.wait_until_running(DEADLINE * 2)).expect("the test waits"));
     let handle = node.handle();
     until("the application is waited for", || (!handle.waiting().is_empty()).then_some(()));
     node.stop();
-    let told = heard.recv_timeout(DEADLINE).expect("it does not wait longer than the node lives");
-    assert!(matches!(told, Err(StartError::Ended)), "{told:?}");
+    let result = receiver.recv_timeout(DEADLINE).expect("it does not wait longer than the node lives");
+    assert!(matches!(result, Err(StartError::Ended)), "{result:?}");
 }
 
 #[test]
-fn the_tree_says_who_is_there_in_which_life_and_why_the_last_one_ended() {
+fn tree_lists_apps_with_incarnation_and_last_end() {
     let order = Log::default();
-    let ((knee, log), (desk, key)) = (member("knee", &order), desk("desk"));
+    let ((knee, log), (sender_app, key)) = (member("knee", &order), sender_app("sender"));
     let waits = member("waits", &order).0.requires(["nobody"]);
     let leg = SupervisorSpec::new("leg").strategy(Strategy::RestForOne).app(knee).app(waits);
-    let node = Ground::new().node("node").app(desk).supervisor(leg).start().expect("a node");
+    let node = Loopback::new().node("node").app(sender_app).supervisor(leg).start().expect("a node");
     log.wait_for(Seen::Started(1));
     let handle = node.handle();
     assert_eq!(outcome_of_job(&key.sender(), "knee", 13), Outcome::Failed);
-    let tree = until("knee is ready in its second life", || {
+    let tree = until("knee is ready in its second incarnation", || {
         let is_back = |knee: &Supervised| knee.generation == 2 && knee.state == LifeState::Ready;
         handle.tree().ok().filter(|tree| tree.find("knee").is_some_and(is_back))
     });
@@ -350,22 +356,22 @@ fn the_tree_says_who_is_there_in_which_life_and_why_the_last_one_ended() {
 }
 
 #[test]
-fn the_tree_is_told_while_an_application_does_not_come_back() {
+fn tree_is_answered_while_an_app_hangs() {
     let (wake, sleep) = std::sync::mpsc::sync_channel::<()>(1);
     let sleep = Mutex::new(Some(sleep));
-    let (sleeper, log) = Stage::new()
+    let (sleeper, log) = Script::new()
         .got(move |_, _| {
             if let Some(sleep) = sleep.lock().unwrap().take() {
-                // Over when the test is.
+                // Ends with the test.
                 _ = sleep.recv_timeout(DEADLINE);
             }
         })
         .app("sleeper");
-    let (desk, key) = desk("desk");
-    let node = Ground::new()
+    let (sender_app, key) = sender_app("sender");
+    let node = Loopback::new()
         .node("node")
         .app(sleeper.progress_within(DEADLINE * 2))
-        .app(desk)
+        .app(sender_app)
         .start()
         .expect("a node");
     let sender = key.sender();

@@ -1,19 +1,20 @@
-//! Every way in which a process ends, or does not; and never an orphan.
+//! Every way in which a process ends or hangs, without an orphan.
 
 use std::{fs, time::Duration};
 
 use rustix::process::Signal;
 use sinew::Outcome;
-use sinew_tests::{OwnDirectory, orders::Order, process_under_test, until, wait_until_frozen};
+use sinew_testkit::{TestDirectory, until, wait_until_paused};
+use sinew_tests::{orders::Order, process_under_test};
 
-use crate::fence::parent_of;
-use crate::scenario::{Scenario, Watched, configuration, signal};
+use super::fence::parent_of;
+use super::scenario::{Scenario, Watched, configuration, signal};
 
 /// Its applications may be restarted as often as they fail.
 const RESTARTS: &str = "[supervision]\napp_restarts_max = 1000\napp_window_ms = 1\n";
 
 #[test]
-fn an_application_in_a_process_of_its_own_answers_from_there() {
+fn app_in_own_process_answers_from_there() {
     let mut scenario = Scenario::start(&[]);
     let me = scenario.who();
     assert_ne!(me.pid, scenario.node.id());
@@ -22,7 +23,7 @@ fn an_application_in_a_process_of_its_own_answers_from_there() {
 }
 
 #[test]
-fn a_killed_process_is_replaced_and_the_messages_behind_are_kept_in_order() {
+fn killed_process_is_replaced_and_queue_keeps_order() {
     let mut scenario = Scenario::start(&[]);
     let first = scenario.who();
     scenario.order(Order::Hold(60_000));
@@ -37,20 +38,20 @@ fn a_killed_process_is_replaced_and_the_messages_behind_are_kept_in_order() {
 }
 
 #[test]
-fn an_audit_knows_what_is_lent_to_a_process_and_what_fails_when_it_is_killed() {
+fn audit_knows_lent_and_failed_messages_of_a_process() {
     let mut scenario = Scenario::start(&["--audits"]);
     let first = scenario.who();
     scenario.order(Order::Hold(60_000));
     scenario.node.wait_for(&["holds"]);
     (1..=20).for_each(|number| scenario.count(number));
-    // The order that is in its hand, and those behind it, wherever they wait.
+    // The order that it handles, and those behind it, in whichever queue they wait.
     scenario.node.wait_for(&["audit: 1 delivered, 0 failed, 21 waiting, 0 unexplained"]);
     signal(first.pid, Signal::KILL);
     scenario.node.wait_for(&["audit: 21 delivered, 1 failed, 0 waiting, 0 unexplained"]);
 }
 
 #[test]
-fn every_death_is_survived_and_named_and_fails_the_message_in_hand() {
+fn every_death_is_named_and_fails_the_handled_message() {
     let deaths = [
         (Order::Exit(3), "its process ended: exit code 3"),
         (Order::Abort, "killed by signal 6 (SIGABRT)"),
@@ -69,7 +70,7 @@ fn every_death_is_survived_and_named_and_fails_the_message_in_hand() {
 }
 
 #[test]
-fn a_handler_that_does_not_return_is_killed_and_replaced() {
+fn endless_handler_is_killed_and_replaced() {
     let mut scenario = Scenario::start(&[]);
     let process = Watched::new(scenario.who().pid);
     assert_eq!(scenario.order_confirmed(Order::Hang), Outcome::Failed);
@@ -79,7 +80,7 @@ fn a_handler_that_does_not_return_is_killed_and_replaced() {
 }
 
 #[test]
-fn a_process_that_was_stopped_is_killed_and_replaced() {
+fn stopped_process_is_killed_and_replaced() {
     let mut scenario = Scenario::start(&[]);
     let pid = scenario.who().pid;
     let process = Watched::new(pid);
@@ -90,7 +91,7 @@ fn a_process_that_was_stopped_is_killed_and_replaced() {
 }
 
 #[test]
-fn a_process_that_is_only_busy_is_let_alone() {
+fn busy_process_is_left_alone() {
     let mut scenario = Scenario::start(&["--turns-within", "2000"]);
     let pid = scenario.who().pid;
     // Twice its progress budget in all, and no single turn above it.
@@ -99,11 +100,11 @@ fn a_process_that_is_only_busy_is_let_alone() {
 }
 
 #[test]
-fn a_node_that_was_stopped_does_not_accuse_its_processes_when_it_wakes() {
+fn resumed_node_does_not_accuse_its_processes() {
     let mut scenario = Scenario::start(&[]);
     let pid = scenario.who().pid;
     for _ in 0..3 {
-        scenario.node.freeze();
+        scenario.node.pause();
         // Longer than the progress budget of the application.
         std::thread::sleep(Duration::from_millis(1_500));
         scenario.node.signal(Signal::CONT);
@@ -113,7 +114,7 @@ fn a_node_that_was_stopped_does_not_accuse_its_processes_when_it_wakes() {
 }
 
 #[test]
-fn a_process_dies_with_its_node_whatever_it_does() {
+fn process_dies_with_its_node() {
     let busy = [None, Some(Order::Hold(60_000)), Some(Order::Hang)];
     for order in busy {
         let mut scenario = Scenario::start(&[]);
@@ -125,44 +126,44 @@ fn a_process_dies_with_its_node_whatever_it_does() {
 }
 
 #[test]
-fn a_stopped_process_dies_with_its_node_too() {
+fn stopped_process_dies_with_its_node() {
     let mut scenario = Scenario::start(&[]);
     let pid = scenario.who().pid;
     let process = Watched::new(pid);
     signal(pid, Signal::STOP);
-    wait_until_frozen(pid);
+    wait_until_paused(pid);
     scenario.node.signal(Signal::KILL);
     process.wait_for_end();
 }
 
 #[test]
-fn a_process_that_does_not_stop_in_its_time_is_killed() {
-    // Its turn may last: only that it does not stop is held against it.
+fn process_that_exceeds_its_stop_limit_is_killed() {
+    // Its turn may last: only the stop limit applies.
     let mut scenario = Scenario::start(&["--turns-within", "600000"]);
     let process = Watched::new(scenario.who().pid);
     scenario.order(Order::Hold(60_000));
     scenario.node.wait_for(&["holds"]);
     scenario.node.signal(Signal::TERM);
-    scenario.node.wait_for(&["its life is taken"]);
+    scenario.node.wait_for(&["the incarnation is abandoned"]);
     process.wait_for_end();
-    assert_eq!(scenario.node.wait_for_end(), Some(0));
+    assert_eq!(scenario.node.wait_for_exit(), Some(0));
 }
 
 #[test]
-fn a_process_that_dies_at_each_start_makes_the_node_give_up_and_say_of_what() {
-    let directory = OwnDirectory::new();
+fn death_at_each_start_ends_the_node_with_reason() {
+    let directory = TestDirectory::new();
     // However long each start takes.
     let window = "[supervision]\napp_window_ms = 3600000\n";
     let mut node = process_under_test(&configuration(&directory, window), &["--dies-at-start", "3"]);
     node.wait_for(&["gave up", "applications: more than 5 restarts", "its process ended: exit code 3"]);
-    assert_eq!(node.wait_for_end(), Some(1));
+    assert_eq!(node.wait_for_exit(), Some(1));
 }
 
 #[test]
-fn the_next_process_begins_when_the_one_that_was_killed_has_ended_however_long_that_takes() {
-    let directory = OwnDirectory::new();
-    // Never ready, each is killed when its time is over, and has half a gibibyte to give back.
-    // On a busy host some are killed before they say anything: it goes on until three have.
+fn next_process_waits_for_the_end_of_the_killed() {
+    let directory = TestDirectory::new();
+    // Each process is never ready, is killed when its time is over, and has half a gibibyte to free. On a
+    // busy host some are killed before they report anything: the test continues until three have reported.
     let configuration = configuration(&directory, RESTARTS);
     let mut node = process_under_test(&configuration, &["--swells-at-start", "512"]);
     for _ in 0..3 {
@@ -172,7 +173,7 @@ fn the_next_process_begins_when_the_one_that_was_killed_has_ended_however_long_t
 }
 
 #[test]
-fn a_command_that_the_application_starts_is_no_host() {
+fn command_started_by_the_app_is_no_host() {
     let mut scenario = Scenario::start(&[]);
     scenario.order(Order::StartACommand);
     scenario.node.wait_for(&["command Ok(ExitStatus(unix_wait_status(0)))"]);
@@ -190,7 +191,7 @@ fn two_hundred_deaths_leave_nothing_behind() {
         process.wait_for_end();
         pid
     };
-    // The first ones make what stays: threads, their stacks and descriptors.
+    // The first ones create lasting resources: threads, their stacks and descriptors.
     for _ in 0..5 {
         die(&mut scenario);
     }
@@ -198,7 +199,7 @@ fn two_hundred_deaths_leave_nothing_behind() {
     let before = descriptors(node);
     let pids: Vec<_> = (0..200).map(|_| die(&mut scenario)).collect();
     scenario.who();
-    // The last one may be about to be buried.
+    // The drop of the last one may still be pending.
     until(&format!("{before} descriptors are left"), || (descriptors(node) <= before).then_some(()));
     let is_left = |pid: &u32| parent_of(*pid) == Some(node);
     until("no zombies are left", || (!pids.iter().any(is_left)).then_some(()));

@@ -1,29 +1,31 @@
-//! Processes whose lives were taken: no orphan, no late word, no forged number.
+//! Processes with fenced incarnations: no orphan, no late message, no forged number.
 
 use std::fs;
 
 use rustix::process::Signal;
-use sinew_tests::{OwnDirectory, Program, orders::Order, process_under_test, until};
+use sinew_testkit::{NodeProcess, TestDirectory, until};
+use sinew_tests::{orders::Order, process_under_test};
 
-use crate::scenario::{Scenario, configuration};
+use super::scenario::{Scenario, configuration};
 
-/// The number of the process that says this.
-fn who_says(node: &mut Program, words: &[&str]) -> u32 {
+/// The ID of the process that writes this line.
+fn process_of_line(node: &mut NodeProcess, words: &[&str]) -> u32 {
     let line = node.wait_for(words);
     line.split(' ').next().and_then(|pid| pid.parse().ok()).expect("each line begins with the process")
 }
 
-/// Whoever listens to a process is on the `io` thread, which may hang on somebody else's account.
+/// The thread `io` listens to the process, and may hang because of another application on it.
 #[test]
-fn no_process_outlives_its_turn_when_the_thread_that_listens_to_it_hangs_again_and_again() {
-    let directory = OwnDirectory::new();
+fn no_process_outlives_its_turn_when_its_listener_hangs() {
+    let directory = TestDirectory::new();
     let arguments = ["--neighbour-hangs", "0", "--stays"];
     let mut node = process_under_test(&configuration(&directory, ""), &arguments);
-    let first = who_says(&mut node, &[" started "]);
+    let first = process_of_line(&mut node, &[" started "]);
     node.wait_for(&["hangs"]);
     let is_over = || (parent_of(first) != Some(node.id())).then_some(());
     until(&format!("process {first} has ended, while its node lives"), is_over);
-    // Four threads are given up: one more than may be. What the later ones say depends on how far they come.
+    // Four threads are abandoned: one more than allowed. The output of the later ones depends on their
+    // progress.
     node.wait_for(&["gave up"]);
     node.wait_for(&["node has ended"]);
     until("the program lives on, and none of its processes", || {
@@ -32,29 +34,29 @@ fn no_process_outlives_its_turn_when_the_thread_that_listens_to_it_hangs_again_a
 }
 
 #[test]
-fn late_words_of_a_process_whose_life_was_taken_do_not_come_between_its_successors() {
-    let directory = OwnDirectory::new();
+fn late_messages_of_a_fenced_process_are_dropped() {
+    let directory = TestDirectory::new();
     let arguments = ["--neighbour-hangs", "1000", "--talks"];
     let mut node = process_under_test(&configuration(&directory, ""), &arguments);
-    let first = who_says(&mut node, &[" started "]);
-    let second = who_says(&mut node, &[" started "]);
+    let first = process_of_line(&mut node, &[" started "]);
+    let second = process_of_line(&mut node, &[" started "]);
     node.wait_for(&[&format!("heard {second} ")]);
     node.wait_for(&["comes back"]);
-    // It has the lowest priority now, and ends when it has dropped what it held.
+    // It has the lowest priority now, and ends when it has dropped its values.
     until("the thread that was given up has ended", || (threads_called(node.id(), "io") == 1).then_some(()));
     node.signal(Signal::TERM);
-    assert_eq!(node.wait_for_end(), Some(0));
-    let heard: Vec<_> = node.said().iter().filter(|line| line.contains(" heard ")).collect();
+    assert_eq!(node.wait_for_exit(), Some(0));
+    let received: Vec<_> = node.output().iter().filter(|line| line.contains(" heard ")).collect();
     let since =
-        heard.iter().position(|line| line.contains(&format!("heard {second} "))).expect("it was heard");
+        received.iter().position(|line| line.contains(&format!("heard {second} "))).expect("it was heard");
     let late: Vec<_> =
-        heard[since..].iter().filter(|line| line.contains(&format!("heard {first} "))).collect();
+        received[since..].iter().filter(|line| line.contains(&format!("heard {first} "))).collect();
     assert!(since > 0, "the first one was heard before it was taken");
     assert!(late.is_empty(), "{first} was heard after {second}: {late:?}");
 }
 
 #[test]
-fn a_process_that_forges_the_number_of_a_message_is_ended_in_words_and_nobody_counts_on_from_there() {
+fn process_that_forges_message_numbers_is_killed() {
     let mut scenario = Scenario::start(&["--talks"]);
     scenario.order(Order::ForgeNumbers("witness".to_owned()));
     scenario.node.wait_for(&["a child failed", "it was killed: its message number", "is out of reach"]);
@@ -63,7 +65,7 @@ fn a_process_that_forges_the_number_of_a_message_is_ended_in_words_and_nobody_co
     let sequence = line.rsplit(' ').next().and_then(|number| number.parse::<u64>().ok());
     assert!(sequence.is_some_and(|sequence| sequence < 1 << 32), "{line}");
     let is_forged = |line: &String| line.contains("heard 0 in");
-    assert!(!scenario.node.said().iter().any(is_forged), "what had a forged number was not heard");
+    assert!(!scenario.node.output().iter().any(is_forged), "what had a forged number was not heard");
 }
 
 fn threads_called(process: u32, name: &str) -> usize {
@@ -82,7 +84,7 @@ fn children_of(process: u32) -> Vec<u32> {
 /// The parent of a process that is in the kernel's table, alive or not.
 pub(crate) fn parent_of(process: u32) -> Option<u32> {
     let stat = fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
-    // The name in parentheses may have anything in it.
+    // The name in parentheses may contain any characters.
     let (_, rest) = stat.rsplit_once(')')?;
     rest.split_whitespace().nth(1)?.parse().ok()
 }

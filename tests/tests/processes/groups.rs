@@ -1,12 +1,12 @@
-//! What a process of a node's has started: it ends with it.
+//! Processes that a node's process has started: they end with it.
 
 use rustix::process::Signal;
 use sinew::Outcome;
 use sinew_tests::orders::Order;
 
-use crate::scenario::{Scenario, Watched, signal};
+use super::scenario::{Scenario, Watched, signal};
 
-/// Something that the application has started.
+/// A process that the application has started.
 fn sleeper(scenario: &mut Scenario, in_own_group: bool) -> Watched {
     scenario.order(Order::StartASleeper(in_own_group));
     let line = scenario.node.wait_for(&["sleeper"]);
@@ -17,7 +17,7 @@ fn sleeper(scenario: &mut Scenario, in_own_group: bool) -> Watched {
 }
 
 #[test]
-fn what_a_process_has_started_ends_with_it_however_that_ends() {
+fn descendants_end_with_their_process_however_it_ends() {
     let restarts = "[supervision]\napp_restarts_max = 1000\napp_window_ms = 1\n";
     let mut scenario = Scenario::start_with(restarts, &[]);
     for order in [Order::Kill, Order::Exit(0), Order::Panic, Order::Hang] {
@@ -29,16 +29,16 @@ fn what_a_process_has_started_ends_with_it_however_that_ends() {
 }
 
 #[test]
-fn what_a_process_has_started_ends_with_it_when_its_node_stops_in_order() {
+fn descendants_end_when_the_node_stops_in_order() {
     let mut scenario = Scenario::start(&[]);
     let sleeper = sleeper(&mut scenario, false);
     scenario.node.signal(Signal::TERM);
-    assert_eq!(scenario.node.wait_for_end(), Some(0));
+    assert_eq!(scenario.node.wait_for_exit(), Some(0));
     sleeper.wait_for_end();
 }
 
 #[test]
-fn what_a_process_has_started_in_another_group_is_let_alone() {
+fn descendants_in_another_group_are_left_alone() {
     let mut scenario = Scenario::start(&[]);
     let pid = scenario.who().pid;
     let (ours, other) = (sleeper(&mut scenario, false), sleeper(&mut scenario, true));

@@ -1,4 +1,4 @@
-//! The same application in a thread and in a process of its own: what can be observed is the same.
+//! The same application in a thread and in a process of its own: the observable behaviour is the same.
 
 use std::time::{Duration, Instant};
 
@@ -8,15 +8,12 @@ use sinew::{
     message::{Kind, Rejection},
     payload,
 };
-use sinew_tests::{
-    DEADLINE,
-    orders::{Count, Level, Me, Order, Who},
-    until,
-};
+use sinew_testkit::{DEADLINE, until};
+use sinew_tests::orders::{Count, Level, Me, Order, Who};
 
-use crate::scenario::Scenario;
+use super::scenario::Scenario;
 
-/// Each claim is tried with the application in every place.
+/// Runs each test with the application in every place.
 macro_rules! in_every_place {
     ($($claim:ident)+) => {
         mod in_a_thread { $( #[test] fn $claim() { super::$claim("thread"); } )+ }
@@ -26,22 +23,22 @@ macro_rules! in_every_place {
 
 in_every_place! {
     messages_of_a_class_are_handled_in_order
-    outcomes_are_what_the_handler_made_of_the_message
-    a_message_that_waits_too_long_expires
-    of_a_stream_that_waits_the_newest_value_is_handled
+    outcome_reflects_the_handlers_result
+    message_that_waits_too_long_expires
+    newest_waiting_stream_value_is_handled
     urgent_messages_overtake_those_that_wait
-    a_panic_fails_the_message_in_hand_and_keeps_those_behind
-    an_application_that_stops_ramps_down_and_is_started_again
-    it_sends_with_known_outcomes_and_asks
-    it_is_a_member_of_a_group_until_it_leaves_and_across_restarts
-    it_hears_the_outcome_of_each_member_of_a_group_and_is_one_itself
-    an_input_that_goes_silent_is_noticed
-    a_lost_requirement_is_told_and_its_name_resolves_anew
-    it_pauses_until_what_it_requires_is_back_whatever_waits
-    it_is_started_anew_when_what_it_requires_is_back
+    panic_fails_the_handled_message_and_keeps_the_queue
+    stopped_application_ramps_down_and_restarts
+    sends_and_requests_have_outcomes
+    group_membership_survives_restarts
+    group_send_reports_each_members_outcome
+    silent_input_is_noticed
+    lost_requirement_is_reported_and_resolved_again
+    pause_lasts_until_the_requirement_returns
+    restart_waits_until_the_requirement_returns
     large_messages_go_both_ways
-    a_node_that_is_told_to_stop_lets_it_ramp_down
-    whoever_stops_the_system_of_actix_ends_nothing_and_the_log_says_what_would
+    stopping_node_lets_the_application_ramp_down
+    stopping_the_actix_system_ends_nothing_and_is_logged
 }
 
 fn start(place: &str) -> Scenario {
@@ -60,29 +57,30 @@ fn messages_of_a_class_are_handled_in_order(place: &str) {
 
 payload!("process.unknown" => struct Unknown {});
 
-fn outcomes_are_what_the_handler_made_of_the_message(place: &str) {
+fn outcome_reflects_the_handlers_result(place: &str) {
     let mut scenario = start(place);
     assert_eq!(scenario.count_confirmed(1), Outcome::Delivered);
     assert_eq!(scenario.order_confirmed(Order::Refuse), Outcome::Rejected(Rejection::ByHandler));
     let (endpoint, drive) = (&mut scenario.endpoint, scenario.drive);
-    let told = endpoint.message(drive, &Unknown {}).confirmed(DEADLINE).expect("the node takes it");
-    assert_eq!(told, Outcome::Rejected(Rejection::UnknownKind));
+    let outcome = endpoint.message(drive, &Unknown {}).confirmed(DEADLINE).expect("the node takes it");
+    assert_eq!(outcome, Outcome::Rejected(Rejection::UnknownKind));
     assert_eq!(scenario.order_confirmed(Order::Panic), Outcome::Failed);
     assert_eq!(scenario.count_confirmed(2), Outcome::Delivered);
 }
 
-fn a_message_that_waits_too_long_expires(place: &str) {
+fn message_that_waits_too_long_expires(place: &str) {
     let mut scenario = sent_while_it_holds(place, |_| {});
     let (endpoint, drive) = (&mut scenario.endpoint, scenario.drive);
-    let told = endpoint
+    let outcome = endpoint
         .message(drive, &Count { number: 1 })
         .confirmed(Duration::from_millis(1))
         .expect("the node takes it");
-    assert!(matches!(told, Outcome::Unknown | Outcome::Expired), "{told:?}");
+    assert!(matches!(outcome, Outcome::Unknown | Outcome::Expired), "{outcome:?}");
     assert_eq!(scenario.who().counts, [0; 0], "it was not handled");
 }
 
-/// Where this was sent while one handler ran, which on a machine that is slow has to run for longer.
+/// Returns a scenario in which this was sent while one handler ran. On a slow machine the handler has to run
+/// for longer.
 fn sent_while_it_holds(place: &str, send: impl Fn(&mut Scenario)) -> Scenario {
     for millis in [1_000, 5_000, 30_000] {
         let mut scenario = Scenario::start(&["--place", place, "--turns-within", "600000"]);
@@ -90,7 +88,7 @@ fn sent_while_it_holds(place: &str, send: impl Fn(&mut Scenario)) -> Scenario {
         scenario.order(Order::Hold(millis));
         scenario.node.wait_for(&["holds"]);
         send(&mut scenario);
-        // What follows comes before its end, too.
+        // The following messages arrive before its end, too.
         if began.elapsed() < Duration::from_millis(millis) / 2 {
             return scenario;
         }
@@ -98,14 +96,14 @@ fn sent_while_it_holds(place: &str, send: impl Fn(&mut Scenario)) -> Scenario {
     panic!("what is sent takes 15 s");
 }
 
-fn of_a_stream_that_waits_the_newest_value_is_handled(place: &str) {
+fn newest_waiting_stream_value_is_handled(place: &str) {
     let mut scenario = sent_while_it_holds(place, |scenario| {
         for value in 1..=1_000 {
             scenario.endpoint.send(scenario.drive, &Level { value }).expect("the node takes it");
         }
     });
     scenario.node.wait_for(&["level 1000"]);
-    let levels = scenario.node.said().iter().filter(|line| line.contains("level")).count();
+    let levels = scenario.node.output().iter().filter(|line| line.contains("level")).count();
     assert!(levels < 500, "{levels} of 1000 values were handled, although all came while one handler ran");
 }
 
@@ -116,7 +114,7 @@ fn urgent_messages_overtake_those_that_wait(place: &str) {
     assert!(handled <= 32, "{handled} of 200 messages that yield were handled before an urgent one");
 }
 
-fn a_panic_fails_the_message_in_hand_and_keeps_those_behind(place: &str) {
+fn panic_fails_the_handled_message_and_keeps_the_queue(place: &str) {
     let mut scenario = start(place);
     scenario.count_confirmed(1);
     scenario.order(Order::Hold(300));
@@ -128,7 +126,7 @@ fn a_panic_fails_the_message_in_hand_and_keeps_those_behind(place: &str) {
     scenario.node.wait_for(&["a child failed", "a panic at", "process_under_test.rs"]);
 }
 
-fn an_application_that_stops_ramps_down_and_is_started_again(place: &str) {
+fn stopped_application_ramps_down_and_restarts(place: &str) {
     let mut scenario = start(place);
     scenario.order(Order::Stop);
     scenario.node.wait_for(&["ramping down"]);
@@ -138,7 +136,7 @@ fn an_application_that_stops_ramps_down_and_is_started_again(place: &str) {
     assert_eq!(scenario.count_confirmed(1), Outcome::Delivered);
 }
 
-fn it_sends_with_known_outcomes_and_asks(place: &str) {
+fn sends_and_requests_have_outcomes(place: &str) {
     let mut scenario = start(place);
     scenario.order(Order::Send("test".to_owned(), 7));
     let received = scenario.endpoint.receive(DEADLINE).expect("the node is there").expect("a number");
@@ -173,38 +171,38 @@ fn it_sends_with_known_outcomes_and_asks(place: &str) {
     scenario.node.wait_for(&["sent 9: Delivered"]);
 }
 
-fn it_is_a_member_of_a_group_until_it_leaves_and_across_restarts(place: &str) {
+fn group_membership_survives_restarts(place: &str) {
     let mut scenario = start(place);
     let group = Tid::group("drives");
     let send = |scenario: &mut Scenario, value| {
         scenario.endpoint.send(group, &Level { value }).expect("the node takes it")
     };
-    // Handled means that the node has heard of it: what it sends comes in order.
-    let heard = |scenario: &mut Scenario| {
+    // Once it is handled, the node has processed the order before it: its messages arrive in order.
+    let wait_until_handled = |scenario: &mut Scenario| {
         scenario.order(Order::Send("test".to_owned(), 1));
         drop(scenario.endpoint.receive(DEADLINE).expect("the node is there").expect("a number"));
     };
     scenario.order(Order::Join("drives".to_owned()));
-    heard(&mut scenario);
+    wait_until_handled(&mut scenario);
     send(&mut scenario, 1);
     scenario.node.wait_for(&["level 1"]);
     assert_eq!(scenario.order_confirmed(Order::Panic), Outcome::Failed);
     send(&mut scenario, 2);
     scenario.node.wait_for(&["level 2"]);
     scenario.order(Order::Leave("drives".to_owned()));
-    heard(&mut scenario);
+    wait_until_handled(&mut scenario);
     send(&mut scenario, 3);
     scenario.endpoint.send(scenario.drive, &Level { value: 4 }).expect("the node takes it");
     scenario.node.wait_for(&["level 4"]);
-    assert!(scenario.node.said().iter().all(|line| !line.contains("level 3")));
+    assert!(scenario.node.output().iter().all(|line| !line.contains("level 3")));
 }
 
-fn it_hears_the_outcome_of_each_member_of_a_group_and_is_one_itself(place: &str) {
+fn group_send_reports_each_members_outcome(place: &str) {
     let mut scenario = start(place);
-    // Nobody is in it.
+    // The group is empty.
     scenario.order(Order::SendToGroup("drives".to_owned()));
     scenario.node.wait_for(&["group 1: "]);
-    // Two in other processes: the one takes it, and the other does not handle it.
+    // Two members in other processes: one accepts the message, and the other does not handle it.
     let register = || {
         let member = scenario.api.register_transport_address(Registration::new());
         let mut member = member.expect("the node takes it");
@@ -216,9 +214,9 @@ fn it_hears_the_outcome_of_each_member_of_a_group_and_is_one_itself(place: &str)
     takes.receive(DEADLINE).expect("the node is there").expect("a number").settle(Outcome::Delivered);
     let refused = Outcome::Rejected(Rejection::UnknownKind);
     refuses.receive(DEADLINE).expect("the node is there").expect("a number").settle(refused);
-    let told = format!("group 1: {}: Delivered, {}: Rejected(UnknownKind)", takes.tid(), refuses.tid());
-    scenario.node.wait_for(&[&told]);
-    // And: what is sent to its group has its outcome, too
+    let line = format!("group 1: {}: Delivered, {}: Rejected(UnknownKind)", takes.tid(), refuses.tid());
+    scenario.node.wait_for(&[&line]);
+    // And: a message to the application's group has its outcome, too
     takes.leave("drives").expect("it was in it");
     assert_eq!(scenario.order_confirmed(Order::Join("drives".to_owned())), Outcome::Delivered);
     let (drive, count) = (scenario.drive, Count { number: 2 });
@@ -230,7 +228,7 @@ fn it_hears_the_outcome_of_each_member_of_a_group_and_is_one_itself(place: &str)
     assert_eq!(entry.outcome, Outcome::Delivered);
 }
 
-fn an_input_that_goes_silent_is_noticed(place: &str) {
+fn silent_input_is_noticed(place: &str) {
     let mut scenario = start(place);
     scenario.node.wait_for(&["silence"]);
     scenario.endpoint.send(scenario.drive, &Level { value: 1 }).expect("the node takes it");
@@ -238,7 +236,7 @@ fn an_input_that_goes_silent_is_noticed(place: &str) {
     scenario.node.wait_for(&["silence"]);
 }
 
-fn a_lost_requirement_is_told_and_its_name_resolves_anew(place: &str) {
+fn lost_requirement_is_reported_and_resolved_again(place: &str) {
     let mut scenario = Scenario::start_requiring("helper", &["--place", place]);
     let former = scenario.helper.take().expect("it was required");
     let former_tid = former.tid();
@@ -252,7 +250,7 @@ fn a_lost_requirement_is_told_and_its_name_resolves_anew(place: &str) {
     scenario.node.wait_for(&["requirement Met", &format!("helper is Some({:?})", helper.tid())]);
 }
 
-fn it_pauses_until_what_it_requires_is_back_whatever_waits(place: &str) {
+fn pause_lasts_until_the_requirement_returns(place: &str) {
     let mut scenario = Scenario::start_requiring("helper", &["--place", place, "--on-lost", "pause"]);
     scenario.helper.take().expect("it was required").unregister().expect("the node answers");
     scenario.node.wait_for(&["requirement Lost"]);
@@ -267,7 +265,7 @@ fn it_pauses_until_what_it_requires_is_back_whatever_waits(place: &str) {
     drop(helper);
 }
 
-fn it_is_started_anew_when_what_it_requires_is_back(place: &str) {
+fn restart_waits_until_the_requirement_returns(place: &str) {
     let mut scenario = Scenario::start_requiring("helper", &["--place", place, "--on-lost", "restart"]);
     scenario.node.wait_for(&["started"]);
     scenario.helper.take().expect("it was required").unregister().expect("the node answers");
@@ -277,7 +275,7 @@ fn it_is_started_anew_when_what_it_requires_is_back(place: &str) {
     scenario.node.wait_for(&["started"]);
     assert_eq!(scenario.count_confirmed(2), Outcome::Delivered);
     assert_eq!(scenario.who().counts, [1, 2]);
-    assert!(scenario.node.said().iter().all(|line| !line.contains("a child failed")));
+    assert!(scenario.node.output().iter().all(|line| !line.contains("a child failed")));
     drop(helper);
 }
 
@@ -305,15 +303,15 @@ fn large_messages_go_both_ways(place: &str) {
     );
 }
 
-fn a_node_that_is_told_to_stop_lets_it_ramp_down(place: &str) {
+fn stopping_node_lets_the_application_ramp_down(place: &str) {
     let mut scenario = start(place);
     scenario.node.signal(Signal::TERM);
     scenario.node.wait_for(&["ramping down"]);
     scenario.node.wait_for(&["stopping"]);
-    assert_eq!(scenario.node.wait_for_end(), Some(0));
+    assert_eq!(scenario.node.wait_for_exit(), Some(0));
 }
 
-fn whoever_stops_the_system_of_actix_ends_nothing_and_the_log_says_what_would(place: &str) {
+fn stopping_the_actix_system_ends_nothing_and_is_logged(place: &str) {
     let mut scenario = start(place);
     assert_eq!(scenario.count_confirmed(1), Outcome::Delivered);
     for count in 2..=3 {
@@ -321,7 +319,7 @@ fn whoever_stops_the_system_of_actix_ends_nothing_and_the_log_says_what_would(pl
         assert_eq!(scenario.count_confirmed(count), Outcome::Delivered);
     }
     scenario.node.wait_for(&["actix::System::current().stop()", "NodeHandle::stop"]);
-    assert_eq!(scenario.who().counts, [1, 2, 3], "it is the same life");
+    assert_eq!(scenario.who().counts, [1, 2, 3], "it is the same incarnation");
     scenario.node.signal(Signal::TERM);
-    assert_eq!(scenario.node.wait_for_end(), Some(0), "and the node still ends in order");
+    assert_eq!(scenario.node.wait_for_exit(), Some(0), "and the node still ends in order");
 }

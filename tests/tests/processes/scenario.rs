@@ -1,4 +1,4 @@
-//! A node whose application does as it is told, and an endpoint that tells it.
+//! A node with an application that follows orders, and an endpoint that sends them.
 
 use std::path::PathBuf;
 
@@ -7,22 +7,22 @@ use rustix::{
     process::{Pid, PidfdFlags, Signal, kill_process, pidfd_open, pidfd_send_signal},
 };
 use sinew::{Endpoint, NodeApi, Outcome, Registration, Tid};
+use sinew_testkit::{DEADLINE, NodeProcess, TestDirectory, own_group};
 use sinew_tests::{
-    DEADLINE, OwnDirectory, Program,
     orders::{Count, Me, Order, Who},
-    own_group, process_under_test,
+    process_under_test,
 };
 
 /// A node with its application `drive`, and an endpoint called `test`.
 pub(crate) struct Scenario {
-    pub(crate) node: Program,
+    pub(crate) node: NodeProcess,
     pub(crate) api: NodeApi,
     pub(crate) endpoint: Endpoint,
     pub(crate) drive: Tid,
-    /// What the application requires.
+    /// The requirement of the application.
     pub(crate) helper: Option<Endpoint>,
-    // Last: removed when nobody uses it.
-    _directory: OwnDirectory,
+    // Last, so that it is removed after its users.
+    _directory: TestDirectory,
 }
 
 impl Scenario {
@@ -30,18 +30,18 @@ impl Scenario {
         Self::start_all("", None, arguments)
     }
 
-    /// The application requires an endpoint of this name, which is there.
+    /// Starts an application that requires an endpoint of this name, which is registered.
     pub(crate) fn start_requiring(name: &str, arguments: &[&str]) -> Self {
         Self::start_all("", Some(name), &[arguments, &["--requires", name]].concat())
     }
 
-    /// With `more` in its configuration.
+    /// Starts it with `more` in its configuration.
     pub(crate) fn start_with(more: &str, arguments: &[&str]) -> Self {
         Self::start_all(more, None, arguments)
     }
 
     fn start_all(more: &str, required: Option<&str>, arguments: &[&str]) -> Self {
-        let directory = OwnDirectory::new();
+        let directory = TestDirectory::new();
         let mut node = process_under_test(&configuration(&directory, more), arguments);
         node.wait_for(&["is up"]);
         let api = NodeApi::connect(directory.join("robot.sock")).expect("the node is up");
@@ -55,7 +55,8 @@ impl Scenario {
         Self { node, api, endpoint, drive, helper, _directory: directory }
     }
 
-    /// Asks the application who it is. All counts before it, too: they are asked for in the same class.
+    /// Asks the application for its identity. All counts sent before are handled first: the request has the
+    /// same class.
     pub(crate) fn who(&mut self) -> Me {
         self.endpoint.message(self.drive, &Who {}).ask(DEADLINE).expect("the drive answers")
     }
@@ -64,15 +65,15 @@ impl Scenario {
         self.endpoint.send(self.drive, &order).expect("the node takes it");
     }
 
-    /// Gives an order whose handler does not return as it should; returns what is told of it.
+    /// Sends an order to a handler that does not return normally; returns the outcome.
     pub(crate) fn order_confirmed(&mut self, order: Order) -> Outcome {
         self.endpoint.message(self.drive, &order).confirmed(DEADLINE).expect("the node answers")
     }
 
-    /// What was sent before it in its class has been handled then.
+    /// Counts a number. Earlier messages of its class have been handled when this returns.
     pub(crate) fn count_confirmed(&mut self, number: u64) -> Outcome {
-        let told = self.endpoint.message(self.drive, &Count { number }).confirmed(DEADLINE);
-        told.expect("the node answers")
+        let outcome = self.endpoint.message(self.drive, &Count { number }).confirmed(DEADLINE);
+        outcome.expect("the node answers")
     }
 
     pub(crate) fn count(&mut self, number: u64) {
@@ -80,7 +81,7 @@ impl Scenario {
     }
 }
 
-pub(crate) fn configuration(directory: &OwnDirectory, more: &str) -> PathBuf {
+pub(crate) fn configuration(directory: &TestDirectory, more: &str) -> PathBuf {
     let (path, socket) = (directory.join("robot.toml"), directory.join("robot.sock"));
     let text = format!(
         "[node]\nname = \"robot\"\naddress = \"127.0.0.1\"\nproject = \"processes\"\n\
@@ -100,7 +101,7 @@ pub(crate) fn signal(id: u32, signal: Signal) {
     kill_process(process(id), signal).expect("it is alive");
 }
 
-/// A process that somebody else started, held by a descriptor: its id cannot be given to another meanwhile.
+/// A process that another process started, held by a descriptor: its ID cannot be reused meanwhile.
 pub(crate) struct Watched(std::os::fd::OwnedFd);
 
 impl Watched {
@@ -108,7 +109,7 @@ impl Watched {
         Self(pidfd_open(process(id), PidfdFlags::empty()).expect("it is alive"))
     }
 
-    /// Whether it lives.
+    /// Whether it is alive.
     pub(crate) fn is_alive(&self) -> bool {
         let now = Timespec { tv_sec: 0, tv_nsec: 0 };
         poll(&mut [PollFd::new(&self.0, PollFlags::IN)], Some(&now)) == Ok(0)

@@ -1,15 +1,15 @@
-//! A process of its own as a member of a supervisor of the user's: stopped, restarted and given up with its siblings.
+//! A process of its own as a member of a user's supervisor: stopped and restarted with its siblings, also
+//! when the supervisor gives up.
 
 use rustix::process::Signal;
 use sinew::{Outcome, Tid};
-use sinew_tests::{
-    DEADLINE,
-    orders::{Me, Order, Who},
-};
+use sinew_testkit::DEADLINE;
+use sinew_tests::orders::{Me, Order, Who};
 
-use crate::scenario::{Scenario, Watched, signal};
+use super::scenario::{Scenario, Watched, signal};
 
-/// A node with `leader` in a thread of it and then `drive` in a process of its own, both under the supervisor `leg`.
+/// A node with `leader` in one of its threads and then `drive` in a process of its own, both under the
+/// supervisor `leg`.
 struct Leg {
     scenario: Scenario,
     leader: Tid,
@@ -23,8 +23,8 @@ impl Leg {
     }
 
     fn leader_panics(&mut self) {
-        let told = self.scenario.endpoint.message(self.leader, &Order::Panic).confirmed(DEADLINE);
-        assert_eq!(told.expect("the node answers"), Outcome::Failed);
+        let outcome = self.scenario.endpoint.message(self.leader, &Order::Panic).confirmed(DEADLINE);
+        assert_eq!(outcome.expect("the node answers"), Outcome::Failed);
     }
 
     fn leader_is_back(&mut self) {
@@ -32,28 +32,29 @@ impl Leg {
         assert_eq!(me.pid, self.scenario.node.id());
     }
 
-    /// The process that says this ended before the next life of the leader began, and the next process began behind that.
+    /// Checks the order: the process with these last words ended before the next incarnation of the leader
+    /// started, and the next process started after that.
     #[track_caller]
     fn ended_and_came_back_in_order(&self, first: u32, last_words: &str, second: u32) {
-        let (said, node) = (self.scenario.node.said(), self.scenario.node.id());
+        let (lines, node) = (self.scenario.node.output(), self.scenario.node.id());
         let all = |what: String| {
             let is_it = move |(index, line): (usize, &String)| line.starts_with(&what).then_some(index);
-            said.iter().enumerate().filter_map(is_it).collect::<Vec<_>>()
+            lines.iter().enumerate().filter_map(is_it).collect::<Vec<_>>()
         };
-        let last = *all(format!("{first} {last_words}")).last().expect("it said so");
+        let last = *all(format!("{first} {last_words}")).last().expect("it was printed");
         let leader = *all(format!("{node} started")).last().expect("it was started again");
         let next = *all(format!("{second} started")).last().expect("it was started");
-        assert!(last < leader && leader < next, "{last}, {leader}, {next} of {said:#?}");
+        assert!(last < leader && leader < next, "{last}, {leader}, {next} of {lines:#?}");
     }
 }
 
 #[test]
-fn a_process_is_stopped_in_order_and_started_again_behind_the_one_before_it_that_failed() {
+fn process_is_restarted_in_order_behind_a_failed_sibling() {
     let mut leg = Leg::start("rest-for-one");
     let first = leg.scenario.who().pid;
     let process = Watched::new(first);
     leg.leader_panics();
-    // Sent to one that is told to stop, has ended, or is not started yet: kept all the same.
+    // Sent while it is asked to stop, has ended, or is not started yet: kept all the same.
     (1..=200).for_each(|number| leg.scenario.count(number));
     process.wait_for_end();
     let second = leg.scenario.who();
@@ -66,7 +67,7 @@ fn a_process_is_stopped_in_order_and_started_again_behind_the_one_before_it_that
 }
 
 #[test]
-fn a_process_that_does_not_stop_with_its_group_is_killed_and_the_group_comes_back() {
+fn process_that_ignores_a_group_stop_is_killed() {
     let mut leg = Leg::start("rest-for-one");
     let first = leg.scenario.who().pid;
     let process = Watched::new(first);
@@ -78,7 +79,7 @@ fn a_process_that_does_not_stop_with_its_group_is_killed_and_the_group_comes_bac
 }
 
 #[test]
-fn a_process_goes_with_its_supervisor_that_gives_up_and_comes_back_with_it() {
+fn process_ends_and_returns_with_its_supervisor() {
     let mut leg = Leg::start("escalation");
     let first = leg.scenario.who().pid;
     let process = Watched::new(first);
@@ -96,7 +97,7 @@ fn a_process_goes_with_its_supervisor_that_gives_up_and_comes_back_with_it() {
 }
 
 #[test]
-fn a_process_that_is_killed_too_often_takes_its_supervisor_and_its_siblings_along_and_all_come_back() {
+fn process_killed_too_often_restarts_its_supervisor() {
     let mut leg = Leg::start("escalation");
     let node = leg.scenario.node.id();
     let mut pids = vec![leg.scenario.who().pid];
@@ -109,13 +110,13 @@ fn a_process_that_is_killed_too_often_takes_its_supervisor_and_its_siblings_alon
     pids.dedup();
     assert_eq!(pids.len(), 3, "{pids:?}");
     leg.leader_is_back();
-    // In order, although it was not its own failure.
+    // In order, although it did not fail itself.
     leg.scenario.node.wait_for(&[&format!("{node} stopping")]);
     leg.scenario.node.wait_for(&["more than 1 restarts"]);
 }
 
 #[test]
-fn no_message_for_a_process_fails_while_its_supervisor_gives_up_and_comes_back() {
+fn messages_for_a_process_survive_its_supervisors_restart() {
     let mut leg = Leg::start("escalation");
     let first = leg.scenario.who().pid;
     let process = Watched::new(first);

@@ -1,9 +1,10 @@
-//! Unconfirmed messages that are not delivered: from an application in a process of its own, and to one.
+//! Undelivered unconfirmed messages: from an application in a process of its own, and to one.
 
 use sinew::{AppAddress, Tid, message::Rejection, prelude::*};
-use sinew_tests::{orders::Order, until};
+use sinew_testkit::until;
+use sinew_tests::orders::Order;
 
-use crate::scenario::Scenario;
+use super::scenario::Scenario;
 
 payload!("process.unheard", Control =>
     #[derive(Debug)]
@@ -11,7 +12,7 @@ payload!("process.unheard", Control =>
 );
 
 #[test]
-fn an_application_in_a_process_of_its_own_is_told_what_nobody_took() {
+fn app_in_own_process_is_told_of_undelivered_messages() {
     let mut scenario = Scenario::start(&[]);
     let nobody = Tid::new(scenario.drive.node, AppAddress::fixed(9).expect("in the range"));
     scenario.order(Order::SendTo(nobody.bits()));
@@ -24,7 +25,7 @@ fn an_application_in_a_process_of_its_own_is_told_what_nobody_took() {
 }
 
 #[test]
-fn the_sender_of_a_type_that_such_an_application_does_not_handle_is_told() {
+fn sender_is_told_of_types_that_the_app_lacks() {
     let mut scenario = Scenario::start(&[]);
     scenario.endpoint.send(scenario.drive, &Unheard {}).expect("the node takes it");
     scenario.node.wait_for(&["drive (", "does not handle", "sent by test (", "to its AppSpec"]);

@@ -1,4 +1,5 @@
-//! A struct to MessagePack: a map with the names of its fields.
+//! A struct to MessagePack: a map with the names of its fields; without fields an empty array, like Rust's
+//! unit structs.
 
 use std::io::{self, Write};
 
@@ -8,24 +9,24 @@ use super::{
     FIELDS_MAX, Field, FieldType, Layout, SINEW_FIELD_ARRAY, SINEW_FIELD_COUNTED, SINEW_FIELD_OPTIONAL,
     check_depth, struct_memory::StructMemory,
 };
-use crate::status::Fault;
+use crate::status::CallError;
 
-/// How many bytes a value has as MessagePack.
-pub(super) fn length(layout: &Layout, value: StructMemory<'_>) -> Result<usize, Fault> {
+/// Returns the length of a value as MessagePack, in bytes.
+pub(super) fn length(layout: &Layout, value: StructMemory<'_>) -> Result<usize, CallError> {
     let mut counter = Counter(0);
     write_struct(layout, value, &mut counter, 0)?;
     Ok(counter.0)
 }
 
-/// Writes a value to memory that has room for it; how many bytes it has.
-pub(super) fn write(layout: &Layout, value: StructMemory<'_>, memory: &mut [u8]) -> Result<usize, Fault> {
+/// Writes a value to memory that has room for it; returns its length in bytes.
+pub(super) fn write(layout: &Layout, value: StructMemory<'_>, memory: &mut [u8]) -> Result<usize, CallError> {
     let room = memory.len();
     let mut rest = memory;
     write_struct(layout, value, &mut rest, 0)?;
     Ok(room - rest.len())
 }
 
-/// Counts what is written.
+/// Counts the written bytes.
 struct Counter(usize);
 
 impl Write for Counter {
@@ -44,10 +45,14 @@ fn write_struct(
     value: StructMemory<'_>,
     to: &mut impl Write,
     depth: usize,
-) -> Result<(), Fault> {
+) -> Result<(), CallError> {
     check_depth(depth)?;
     let fields = layout.fields()?;
     debug_assert!(fields.len() <= FIELDS_MAX, "the table was checked");
+    if fields.is_empty() {
+        // Rust also reads this form as a field, where it does not read a unit struct from an empty map.
+        return msgpack::write_array_len(to, 0).map(|_| ()).map_err(no_room);
+    }
     msgpack::write_map_len(to, fields.len() as u32).map_err(no_room)?;
     for field in fields {
         msgpack::write_str(to, field.name()?).map_err(no_room)?;
@@ -61,7 +66,7 @@ fn write_field(
     value: StructMemory<'_>,
     to: &mut impl Write,
     depth: usize,
-) -> Result<(), Fault> {
+) -> Result<(), CallError> {
     if field.has(SINEW_FIELD_OPTIONAL) && value.read::<1>(field.extra_offset)? == [0] {
         return msgpack::write_nil(to).map_err(|error| no_room(ValueWriteError::InvalidMarkerWrite(error)));
     }
@@ -89,14 +94,14 @@ fn write_field(
         return write_element(field, value, field.offset, to, depth);
     }
     let count = count(field, value, capacity)?;
-    let announced = u32::try_from(count).map_err(|_| Fault::argument("an array is too long"))?;
+    let announced = u32::try_from(count).map_err(|_| CallError::argument("an array is too long"))?;
     msgpack::write_array_len(to, announced).map_err(no_room)?;
     let size = field.element_size()?;
     (0..count).try_for_each(|at| write_element(field, value, field.offset + at * size, to, depth))
 }
 
-/// How many elements of an array are in use.
-fn count(field: &Field, value: StructMemory<'_>, capacity: usize) -> Result<usize, Fault> {
+/// Number of elements of an array that are in use.
+fn count(field: &Field, value: StructMemory<'_>, capacity: usize) -> Result<usize, CallError> {
     if !field.has(SINEW_FIELD_COUNTED) {
         return Ok(capacity);
     }
@@ -105,17 +110,17 @@ fn count(field: &Field, value: StructMemory<'_>, capacity: usize) -> Result<usiz
         return Ok(count);
     }
     let name = field.name()?;
-    Err(Fault::argument(format!(
+    Err(CallError::argument(format!(
         "field `{name}`: its count is {count}, and the array has {capacity} elements"
     )))
 }
 
-fn write_text(field: &Field, value: StructMemory<'_>, to: &mut impl Write) -> Result<(), Fault> {
+fn write_text(field: &Field, value: StructMemory<'_>, to: &mut impl Write) -> Result<(), CallError> {
     let bytes = value.bytes(field.offset, field.size)?;
     let length = bytes.iter().position(|byte| *byte == 0).unwrap_or(bytes.len());
     let text = std::str::from_utf8(&bytes[..length]).map_err(|error| {
         let name = field.name().unwrap_or_default();
-        Fault::argument(format!("field `{name}`: its text is not UTF-8: {error}"))
+        CallError::argument(format!("field `{name}`: its text is not UTF-8: {error}"))
     })?;
     msgpack::write_str(to, text).map_err(no_room)
 }
@@ -126,7 +131,7 @@ fn write_element(
     at: usize,
     to: &mut impl Write,
     depth: usize,
-) -> Result<(), Fault> {
+) -> Result<(), CallError> {
     let written = match field.field_type()? {
         FieldType::SinewTypeBool => {
             msgpack::write_bool(to, value.read::<1>(at)? != [0]).map_err(ValueWriteError::InvalidMarkerWrite)
@@ -146,7 +151,7 @@ fn write_element(
             return write_struct(layout, value.part(at, layout.size)?, to, depth + 1);
         }
         FieldType::SinewTypeText | FieldType::SinewTypeBytes => {
-            return Err(Fault::argument("an array of texts is not supported: take an array of structs"));
+            return Err(CallError::argument("an array of texts is not supported: take an array of structs"));
         }
     };
     written.map_err(no_room)
@@ -160,7 +165,7 @@ fn unsigned(to: &mut impl Write, value: impl Into<u64>) -> Result<(), ValueWrite
     msgpack::write_uint(to, value.into()).map(|_| ())
 }
 
-/// Only where the value was changed between the two looks at it: its length was measured.
-fn no_room(error: ValueWriteError<io::Error>) -> Fault {
-    Fault::argument(format!("the value was changed by another thread while it was written: {error}"))
+/// Occurs only if the value was changed between measuring and writing.
+fn no_room(error: ValueWriteError<io::Error>) -> CallError {
+    CallError::argument(format!("the value was changed by another thread while it was written: {error}"))
 }

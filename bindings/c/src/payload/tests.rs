@@ -150,10 +150,10 @@ fn empty() -> Outer {
 fn read_as_c(bytes: &[u8]) -> Result<Outer, String> {
     let mut value = empty();
     let status = with_outer(|outer| read(outer, bytes, (&raw mut value).cast()));
-    status.map(|_| value).map_err(|fault| format!("{fault:?}"))
+    status.map(|_| value).map_err(|error| format!("{error:?}"))
 }
 
-fn written_in_c(value: &Outer) -> Result<Vec<u8>, Fault> {
+fn written_in_c(value: &Outer) -> Result<Vec<u8>, CallError> {
     with_outer(|outer| {
         let value = StructMemory::new(std::ptr::from_ref(value).cast(), &outer.layout)?;
         let mut bytes = vec![0; encode::length(&outer.layout, value)?];
@@ -164,7 +164,7 @@ fn written_in_c(value: &Outer) -> Result<Vec<u8>, Fault> {
 }
 
 #[test]
-fn a_struct_of_c_and_one_of_rust_read_each_other() {
+fn c_and_rust_structs_read_each_other() {
     let bytes = rmp_serde::to_vec_named(&in_rust()).unwrap();
     let in_c = read_as_c(&bytes).unwrap();
     assert_eq!((in_c.torque, in_c.number, in_c.offset, in_c.is_armed), (2.5, 7, -300, true));
@@ -181,7 +181,7 @@ fn a_struct_of_c_and_one_of_rust_read_each_other() {
 }
 
 #[test]
-fn a_value_that_does_not_fit_names_its_field() {
+fn value_that_does_not_fit_names_its_field() {
     let json =
         serde_json::to_value(RustOuter { inner: RustInner { gain: 0.0, axis: 0 }, ..in_rust() }).unwrap();
     let cases = [
@@ -198,16 +198,85 @@ fn a_value_that_does_not_fit_names_its_field() {
         ("torque", serde_json::json!("fast"), "field `torque`: expected a number, found a text"),
         ("torque", serde_json::json!(16_777_217), "field `torque`: expected float, found the integer"),
     ];
-    for (field, wrong, words) in cases {
+    for (field, wrong, text) in cases {
         let mut value = json.clone();
         value[field] = wrong;
         let found = read_as_c(&rmp_serde::to_vec_named(&value).unwrap()).unwrap_err();
-        assert!(found.contains(words) && found.contains("test.outer"), "{field}: {found}");
+        assert!(found.contains(text) && found.contains("test.outer"), "{field}: {found}");
+    }
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Unit;
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Braces {}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct RustWithout {
+    unit: Unit,
+    braces: Braces,
+}
+
+/// A type without fields and with a struct of this length.
+fn without_fields(size: usize) -> PayloadType {
+    let name = "test.stop";
+    PayloadType {
+        name: Text { bytes: name.as_ptr().cast(), length: name.len() },
+        message_class: 0,
+        layout: Layout { fields: std::ptr::null(), fields_count: 0, size },
+        expires_after_ns: 0,
     }
 }
 
 #[test]
-fn a_count_above_the_array_and_a_text_that_is_not_utf8_are_not_sent() {
+fn type_without_fields_needs_no_value() {
+    for size in [0, 1, usize::MAX] {
+        let stop = without_fields(size);
+        let value = StructMemory::new(std::ptr::null(), &stop.layout).unwrap();
+        let mut bytes = [0; 1];
+        assert_eq!(encode::length(&stop.layout, value), Ok(1));
+        assert_eq!(encode::write(&stop.layout, value, &mut bytes), Ok(1));
+        assert_eq!(bytes[..], rmp_serde::to_vec_named(&Unit).unwrap());
+        for bytes in [&[][..], &[0x80], &[0x90], &[0xc0], &[0x81, 0xa1, b'x', 1]] {
+            assert_eq!(read(&stop, bytes, std::ptr::null_mut()), Ok(Status::SinewOk), "{bytes:?}");
+        }
+        for bytes in
+            [&[0x01][..], &[0xc1], &[0xc2], &[0xa1, b'x'], &[0x90, 0x90], &[0x81], &[0x81, 0xa1, b'x', 0xc1]]
+        {
+            let error = read(&stop, bytes, std::ptr::null_mut()).unwrap_err();
+            assert_eq!(error.status, Status::SinewErrorMalformed, "{bytes:?}");
+        }
+    }
+    let no_value = with_outer(|outer| read(outer, &[0x80], std::ptr::null_mut())).unwrap_err();
+    assert!(format!("{no_value:?}").contains("`value` is NULL"), "{no_value:?}");
+    assert!(read_as_c(&[]).is_err());
+}
+
+#[test]
+fn empty_struct_as_field_is_read_by_both_languages() {
+    let none = without_fields(1).layout;
+    let field = |name: &CStr, offset| Field {
+        layout: &raw const none,
+        ..plain(name, FieldType::SinewTypeStruct, offset, 1)
+    };
+    let fields = [field(c"unit", 0), field(c"braces", 1)];
+    let layout = Layout { fields: fields.as_ptr(), fields_count: 2, size: 2 };
+    let mut memory = [7_u8; 2];
+    let value = StructMemory::new(memory.as_ptr().cast(), &layout).unwrap();
+    let mut bytes = vec![0; encode::length(&layout, value).unwrap()];
+    encode::write(&layout, value, &mut bytes).unwrap();
+    let in_rust = RustWithout { unit: Unit, braces: Braces {} };
+    assert_eq!(rmp_serde::from_slice::<RustWithout>(&bytes).unwrap(), in_rust);
+    let bytes = rmp_serde::to_vec_named(&in_rust).unwrap();
+    let mut value = StructMemoryMut::new(memory.as_mut_ptr().cast(), &layout).unwrap();
+    decode::check(&layout, &bytes, "test.without").unwrap();
+    decode::read(&layout, &bytes, &mut value).unwrap();
+    assert_eq!(memory, [7; 2], "nothing of it is written");
+}
+
+#[test]
+fn excessive_count_and_invalid_utf8_are_not_sent() {
     let too_many = Outer { points_count: 5, ..empty() };
     assert!(format!("{:?}", written_in_c(&too_many).unwrap_err()).contains("field `points`"));
     let no_text = Outer { mode: [0xff; 8], ..empty() };
@@ -215,7 +284,7 @@ fn a_count_above_the_array_and_a_text_that_is_not_utf8_are_not_sent() {
 }
 
 #[test]
-fn a_field_outside_of_its_struct_is_refused() {
+fn field_outside_its_struct_is_rejected() {
     let fields = [plain(c"far", FieldType::SinewTypeF64, 8, 8)];
     let layout = Layout { fields: fields.as_ptr(), fields_count: 1, size: 8 };
     let mut value = 0.0_f64;
@@ -227,7 +296,7 @@ fn a_field_outside_of_its_struct_is_refused() {
 }
 
 #[test]
-fn unknown_fields_are_skipped_and_a_list_that_lies_about_its_length_ends() {
+fn unknown_fields_are_skipped_and_false_lengths_end() {
     let mut json =
         serde_json::to_value(RustOuter { inner: RustInner { gain: 0.0, axis: 0 }, ..in_rust() }).unwrap();
     json["later"] = serde_json::json!({"a": [1, "b", null, true, 1.5, {"c": []}]});

@@ -1,42 +1,45 @@
-//! Names of protected types, kept for the life of the process: a data ID is compared for ever.
+//! Names of protected types, kept for the life of the process: a data ID is compared until the process ends.
 //!
-//! Who seals a message each millisecond looks its name up each time, and must not wait for a thread that brings a new one. So no lock is here: a
-//! place is filled once and never emptied, and a name lies in the first place from its hash on that was free when it came. All places before that one are
-//! filled by then, so that who looks for it waits at none.
+//! A thread that seals a message each millisecond looks its name up each time, and must not wait for a thread
+//! that adds a new one. So there is no lock: a slot is filled once and never emptied. A name is in the first
+//! slot, from its hash on, that was free when it was added. All slots before that one are filled by then, so
+//! that a lookup waits at none of them.
 
 use std::sync::OnceLock;
 
-use sinew::message::Kind;
+use sinew_runtime::wire::Kind;
 
-use crate::status::{Fault, Status};
+use crate::status::{CallError, Status};
 
-/// Names of protected types of one process at most: nothing here is ever forgotten.
+/// Maximum number of names of protected types in one process: none is ever removed.
 const NAMES_MAX: usize = 1024;
 
-/// The same name, which stays. Where it is known, this waits for nobody and asks for no memory.
-pub(crate) fn kept(name: &str) -> Result<&'static str, Fault> {
+/// Returns the same name with static lifetime. If the name is known, this neither waits nor allocates.
+pub(crate) fn kept(name: &str) -> Result<&'static str, CallError> {
     static NAMES: Names<NAMES_MAX> = Names::new();
     NAMES.kept(name, || name.into()).ok_or_else(|| {
         let sentence = format!("this process has {NAMES_MAX} names of protected types already");
-        Fault::new(Status::SinewErrorTooMany, sentence)
+        CallError::new(Status::SinewErrorTooMany, sentence)
     })
 }
 
 struct Names<const MAX: usize> {
-    places: [OnceLock<Box<str>>; MAX],
+    slots: [OnceLock<Box<str>>; MAX],
 }
 
 impl<const MAX: usize> Names<MAX> {
     const fn new() -> Self {
-        Self { places: [const { OnceLock::new() }; MAX] }
+        Self { slots: [const { OnceLock::new() }; MAX] }
     }
 
-    /// The same name, which is made by `own` if it is new; `None` if it is, and all places are taken.
+    /// Returns the kept copy of the name, created by `own` if it is new; `None` if it is new and all slots
+    /// are taken.
     fn kept(&self, name: &str, own: impl Fn() -> Box<str>) -> Option<&str> {
         let first = Kind::named(name).bits() as usize % MAX;
-        let (before, from) = self.places.split_at(first);
-        // Another thread may fill a free place first, with the same name or with another one: then that is what is compared.
-        from.iter().chain(before).map(|place| &**place.get_or_init(&own)).find(|kept| *kept == name)
+        let (before, from) = self.slots.split_at(first);
+        // Another thread may fill a free slot first, with the same name or with another one: then that name
+        // is compared.
+        from.iter().chain(before).map(|slot| &**slot.get_or_init(&own)).find(|kept| *kept == name)
     }
 }
 
@@ -50,13 +53,13 @@ mod tests {
     const WATCHDOG: Duration = Duration::from_secs(30);
 
     #[test]
-    fn a_name_is_kept_once_and_no_more_of_them_than_there_are_places() {
-        // given: as many as there may be, whatever their hashes are
+    fn names_are_kept_once_and_bounded() {
+        // given: as many names as there are slots, with any hashes
         let names = Names::<3>::new();
         let keep = |name: &'static str| names.kept(name, || name.into());
         let first = ["hip", "knee", "ankle"].map(keep);
         assert_eq!(first, [Some("hip"), Some("knee"), Some("ankle")]);
-        // when: they come again, and one more
+        // when: the same names are added again, and one more
         let again = ["hip", "knee", "ankle"].map(|name| names.kept(name, || panic!("it is known")));
         // then
         assert_eq!(first.map(|name| name.map(str::as_ptr)), again.map(|name| name.map(str::as_ptr)));
@@ -64,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn threads_that_bring_one_name_at_once_get_the_same_one() {
+    fn concurrent_additions_of_a_name_share_one_copy() {
         let names = Names::<8>::new();
         let kept: Vec<_> = thread::scope(|scope| {
             let bring = |name: &'static str| {
@@ -81,8 +84,8 @@ mod tests {
     }
 
     #[test]
-    fn who_looks_for_a_known_name_does_not_wait_for_who_brings_a_new_one() {
-        // given: a thread that was interrupted while it brings the second of two names
+    fn lookup_does_not_wait_for_an_insertion() {
+        // given: a thread that was interrupted while it adds the second of two names
         let names = Names::<2>::new();
         assert_eq!(names.kept("hip", || "hip".into()), Some("hip"));
         let ((begins, has_begun), (allow, may_end)) = (sync_channel(1), sync_channel::<()>(1));
@@ -90,8 +93,8 @@ mod tests {
             let names = &names;
             scope.spawn(move || {
                 names.kept("knee", || {
-                    begins.send(()).expect("somebody waits for it");
-                    // Where nothing comes the test has failed.
+                    begins.send(()).expect("the test waits for it");
+                    // Without an answer the test has failed.
                     let _ = may_end.recv_timeout(WATCHDOG);
                     "knee".into()
                 })

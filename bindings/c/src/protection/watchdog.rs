@@ -1,39 +1,44 @@
-//! What makes outputs safe in time: the runtime's threads, begun for a process of C's.
+//! Starts the runtime's threads that make outputs safe in time, for a process in C.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use sinew::protection::raw;
+use sinew_runtime::protection::raw;
 
 use crate::{
     fork,
     log::{self, without_signals},
-    status::{Fault, Status},
+    status::{CallError, Status},
 };
 
-/// No guard was wanted yet. So many forks no process has behind it.
+/// No guard was requested yet. No process has this number of forks.
 const NEVER: u32 = u32::MAX;
 
-/// How many forks the process had behind it that first wanted a guard, whether it got one or not: a child has no such threads, and what they had locked stays so.
-static BORN: AtomicU32 = AtomicU32::new(NEVER);
+/// Number of forks when this process first requested a guard, successfully or not. A child of `fork` has no
+/// such threads, and locks that they held stay locked in it.
+static FIRST_FORKS: AtomicU32 = AtomicU32::new(NEVER);
 
-/// Starts the threads if there are none, and refuses whoever would not be interrupted by them. They take no signals: those are the program's.
-pub(super) fn begin() -> Result<(), Fault> {
+/// Starts the threads if there are none, and rejects a thread that they could not preempt. All signals are
+/// blocked in them: those are the program's.
+pub(super) fn begin() -> Result<(), CallError> {
     log::begin();
     fork::watch()?;
-    // Before they are there: who forks meanwhile has a child that is refused, and not one whose outputs nobody makes safe.
-    // SYNC: Relaxed, as nothing is read behind it; a child has all that its parent's thread has written or seen.
-    let _ = BORN.compare_exchange(NEVER, fork::generation(), Ordering::Relaxed, Ordering::Relaxed);
+    // Set before the threads exist: a child that is forked meanwhile is rejected, instead of having outputs
+    // that no thread makes safe.
+    // SYNC: Relaxed, as no other data depends on it; a child sees everything that its parent's thread has
+    // written or seen.
+    let _ = FIRST_FORKS.compare_exchange(NEVER, fork::generation(), Ordering::Relaxed, Ordering::Relaxed);
     check_fork()?;
-    without_signals(raw::begin).map_err(|error| Fault::new(Status::SinewErrorNoWatchdog, error.to_string()))
+    without_signals(raw::begin)
+        .map_err(|error| CallError::new(Status::SinewErrorNoWatchdog, error.to_string()))
 }
 
-/// Refuses a child of the process whose guards these are.
-pub(super) fn check_fork() -> Result<(), Fault> {
-    let born = BORN.load(Ordering::Relaxed);
-    if born == NEVER || born == fork::generation() {
+/// Rejects a child of the process that has the guards.
+pub(super) fn check_fork() -> Result<(), CallError> {
+    let first = FIRST_FORKS.load(Ordering::Relaxed);
+    if first == NEVER || first == fork::generation() {
         return Ok(());
     }
     let sentence =
         "the guards belong to the process that this one was forked from, which keeps their watchdogs";
-    Err(Fault::new(Status::SinewErrorForked, sentence))
+    Err(CallError::new(Status::SinewErrorForked, sentence))
 }

@@ -1,4 +1,4 @@
-/* What a wait at a barrier comes to when it does not open:  barriers SOCKET
+/* The results of waits at a barrier that does not open:  barriers SOCKET
  * Each line is a case, its status, and the sentence about it. */
 #include <sinew.h>
 #include <stdio.h>

@@ -1,17 +1,19 @@
-//! What the programs in C and C++ stand on: a compiler, a node in a process of its own, a directory, and endpoints in Rust beside them.
+//! The environment of the programs in C and C++: a compiler, a node in a process of its own, a directory, and
+//! endpoints in Rust beside them.
 
 use std::{
+    io::Write,
     path::{Path, PathBuf},
     process::{Command, Stdio},
 };
 
 use sinew::{Endpoint, NodeApi, Registration};
-use sinew_tests::{OwnDirectory, Program, own_group};
+use sinew_testkit::{NodeProcess, TestDirectory, own_group, program};
 
-/// Time for what has to happen anyway, as on a loaded machine.
-pub(crate) const WATCHDOG: std::time::Duration = sinew_tests::DEADLINE;
+/// Time limit for events that must occur, as on a loaded machine.
+pub(crate) const WATCHDOG: std::time::Duration = sinew_testkit::DEADLINE;
 
-/// How strict the compilers are.
+/// Strict warnings of the compilers.
 const STRICT: [&str; 4] = ["-Wall", "-Wextra", "-Werror", "-pedantic"];
 
 /// A compiler, as the user would call it.
@@ -21,11 +23,12 @@ pub(crate) struct Compiler {
     standard: &'static str,
 }
 
+pub(crate) const C99: Compiler = Compiler { command: "gcc", standard: "-std=c99" };
 pub(crate) const C: Compiler = Compiler { command: "gcc", standard: "-std=c11" };
 pub(crate) const CPP: Compiler = Compiler { command: "g++", standard: "-std=c++17" };
 pub(crate) const CPP20: Compiler = Compiler { command: "g++", standard: "-std=c++20" };
 
-/// Where the library is: beside this test, which is linked with it.
+/// The directory of the library: beside this test, which is linked with it.
 fn library_directory() -> PathBuf {
     let test = std::env::current_exe().expect("a test has a path");
     test.parent().expect("it lies in a directory").to_owned()
@@ -40,10 +43,26 @@ impl Compiler {
         self.compile(source, ground, &[&search, "-lsinew_c", &path, "-lm", "-pthread"])
     }
 
-    /// The same with the static library.
+    /// As [`Self::shared`], with the static library.
     pub(crate) fn static_(self, source: &str, ground: &Ground) -> PathBuf {
         let library = library_directory().join("libsinew_c.a").display().to_string();
         self.compile(source, ground, &[&library, "-lm", "-lpthread", "-ldl"])
+    }
+
+    /// Returns the compiler's errors about a source that it rejects.
+    pub(crate) fn refuses(self, source: &str) -> String {
+        let package = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let mut command = Command::new(self.command);
+        command.arg(self.standard).args(STRICT).arg("-fsyntax-only").arg("-I").arg(package.join("include"));
+        command.args(["-x", if self.command == "gcc" { "c" } else { "c++" }, "-"]).env("LC_ALL", "C");
+        let piped = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
+        let mut compiling = piped.spawn().expect("the compiler runs: it did before");
+        let mut stdin = compiling.stdin.take().expect("it is piped");
+        stdin.write_all(source.as_bytes()).expect("it reads its source");
+        drop(stdin);
+        let output = compiling.wait_with_output().expect("it ends");
+        assert!(!output.status.success(), "this compiles:\n{source}");
+        String::from_utf8_lossy(&output.stderr).into_owned()
     }
 
     fn compile(self, source: &str, ground: &Ground, link: &[&str]) -> PathBuf {
@@ -54,13 +73,13 @@ impl Compiler {
         command.arg(self.standard).args(STRICT).arg("-g").arg("-I").arg(package.join("include"));
         command.arg(source).args(link).arg("-o").arg(&program);
         let output = command.output().expect("the compiler runs: it did before");
-        let says = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.success(), "{command:?} says:\n{says}");
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{command:?} prints:\n{errors}");
         program
     }
 }
 
-/// Whether a command is there. If not, says that the test is skipped, and why.
+/// Whether a command is installed. If not, prints that the test is skipped, and why.
 pub(crate) fn is_there(command: &str) -> bool {
     let is_there = Command::new(command).arg("--version").output().is_ok();
     if !is_there {
@@ -69,10 +88,10 @@ pub(crate) fn is_there(command: &str) -> bool {
     is_there
 }
 
-fn start_node(config: &Path) -> Program {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_sinew-node"));
+fn start_node(config: &Path) -> NodeProcess {
+    let mut command = Command::new(program("sinew-node"));
     command.arg(config);
-    let mut node = Program::start("sinew-node", command);
+    let mut node = NodeProcess::start("sinew-node", command);
     node.wait_for(&["up"]);
     node
 }
@@ -85,13 +104,13 @@ pub(crate) fn endpoint(ground: &Ground, registration: Registration) -> Endpoint 
 
 /// A node in a process of its own, and a directory for its socket and for the programs.
 pub(crate) struct Ground {
-    pub(crate) node: Program,
-    directory: OwnDirectory,
+    pub(crate) node: NodeProcess,
+    directory: TestDirectory,
 }
 
 impl Ground {
     pub(crate) fn new() -> Self {
-        let directory = OwnDirectory::new();
+        let directory = TestDirectory::new();
         let config = directory.join("node.toml");
         let socket = directory.join("node.sock");
         let group = own_group();
@@ -103,43 +122,43 @@ impl Ground {
         Self { node: start_node(&config), directory }
     }
 
-    /// After its node has ended.
+    /// Starts the node again, after it has ended.
     pub(crate) fn start_node_again(&mut self) {
         self.node = start_node(&self.directory.join("node.toml"));
     }
 
-    /// Where the node listens.
+    /// The socket of the node.
     pub(crate) fn socket(&self) -> PathBuf {
         self.directory.join("node.sock")
     }
 
     /// Starts a program that gets the node's socket as its first argument.
-    pub(crate) fn start(&self, program: &Path, arguments: &[&str]) -> Program {
+    pub(crate) fn start(&self, program: &Path, arguments: &[&str]) -> NodeProcess {
         self.start_under(&[], program, arguments)
     }
 
-    /// Runs a program that checks all by itself: it says so, and ends well.
-    pub(crate) fn run(&self, program: &Path, says: &str) {
+    /// Runs a program that does all checks itself: it has to print `line`, and exit with success.
+    pub(crate) fn run(&self, program: &Path, line: &str) {
         let mut running = self.start(program, &[]);
-        running.wait_for(&[says]);
-        assert_eq!(running.wait_for_end(), Some(0));
+        running.wait_for(&[line]);
+        assert_eq!(running.wait_for_exit(), Some(0));
     }
 
-    /// Starts one under another program. What they say on their standard errors is kept, too.
-    pub(crate) fn start_under(&self, over: &[&str], program: &Path, arguments: &[&str]) -> Program {
+    /// Starts a program under another one. Their standard errors are captured, too.
+    pub(crate) fn start_under(&self, over: &[&str], program: &Path, arguments: &[&str]) -> NodeProcess {
         let mut command = Command::new("sh");
         command.args(["-c", r#"exec "$@" 2>&1"#, "sh"]).args(over).arg(program);
         command.arg(self.socket()).args(arguments);
         // Cargo's own search path may lead to the library of an earlier build.
         command.env_remove("LD_LIBRARY_PATH");
-        Program::start(&program.display().to_string(), command)
+        NodeProcess::start(&program.display().to_string(), command)
     }
 
-    /// The same with all of the library's log on this standard error.
-    pub(crate) fn start_logging_to(&self, stderr: impl Into<Stdio>, program: &Path) -> Program {
+    /// As [`Self::start`], with all of the library's log on this standard error.
+    pub(crate) fn start_logging_to(&self, stderr: impl Into<Stdio>, program: &Path) -> NodeProcess {
         let mut command = Command::new(program);
         command.arg(self.socket()).env("SINEW_LOG", "debug").stderr(stderr);
         command.env_remove("LD_LIBRARY_PATH");
-        Program::start(&program.display().to_string(), command)
+        NodeProcess::start(&program.display().to_string(), command)
     }
 }

@@ -1,4 +1,4 @@
-/* Holds what it gets of kind test.held for ever, and doubles torques. */
+/* Never settles messages of kind test.held, and doubles torques. */
 #include <sinew.h>
 
 #include <stdio.h>

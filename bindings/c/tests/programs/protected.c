@@ -1,4 +1,4 @@
-/* What a guard believes and what not, without a node: each error once, silence, and that it stays safe until it is armed again. */
+/* The rules of a guard, without a node: each error once, silence, and that it stays safe until it is armed again. */
 #define _POSIX_C_SOURCE 200809L
 
 #include <sinew.h>
@@ -24,7 +24,7 @@ static void expect(int line, const char *claim, int holds)
 
 struct torque { float newton_metres; uint32_t number; };
 
-/* The output is a number; what makes it safe runs on a thread of the library's, too. */
+/* The output is a number; the function that makes it safe also runs on a thread of the library. */
 struct motor { _Atomic int torque; _Atomic int safe_count; _Atomic int why; _Atomic int fails; };
 
 static int32_t make_safe(void *output, sinew_output_state why)
@@ -52,7 +52,7 @@ static sinew_protected_type torque_type(uint64_t period_ns)
 
 static const sinew_data_id data_id = { UINT64_C(0x700001001), UINT64_C(0x700001002), { "test.torque", 11 } };
 
-/* A sender that keeps its own numbers, and what it has sent last. */
+/* A sender that keeps its own counter, and the last message that it sent. */
 struct bench {
     sinew_guard *guard;
     struct motor motor;
@@ -122,7 +122,7 @@ static void is_safe(struct bench *bench, sinew_output_state why)
     EXPECT(bench->motor.torque == 0 && bench->motor.why == SINEW_SAFE_RELEASED);
 }
 
-/* Late is nothing here, whatever the machine does. */
+/* No message is late here, however slow the machine is. */
 static void begin_patient(struct bench *bench)
 {
     begin(bench, 60 * SECOND);
@@ -210,7 +210,7 @@ static void silence(void)
     is_safe(&bench, SINEW_SAFE_SILENT);
 }
 
-/* While it is asked to. */
+/* Fails while the flag is set. */
 static int32_t unless(void *output, sinew_output_state why)
 {
     const _Atomic int *fails = output;
@@ -252,7 +252,7 @@ static void let_go(void *output, void *argument)
     EXPECT(sinew_release_later(&gone) == SINEW_ERROR_NO_SUCH_GUARD && gone != NULL);
 }
 
-/* More of them than there are places. */
+/* More guards than there are slots. */
 static void ends_in_hand(void)
 {
     static struct bench bench;
@@ -263,7 +263,7 @@ static void ends_in_hand(void)
     }
 }
 
-/* What is not known to be safe is not called so, and its release is finished by the library. */
+/* An output that is not known to be safe is not reported as safe, and the library completes its release. */
 static void failures(void)
 {
     static _Atomic int fails = 1;
@@ -289,7 +289,7 @@ static void failures(void)
     EXPECT(sinew_release(&guard) == SINEW_ERROR_NO_SUCH_GUARD);
 }
 
-/* An endpoint that is unregistered, or asked, by somebody who has an output in hand. */
+/* An endpoint that is unregistered, or called, by a thread that uses an output. */
 struct walk {
     sinew_endpoint *control, *drive;
     sinew_guard *guard;
@@ -323,7 +323,7 @@ static void begin_walk(struct walk *walk, const char *socket)
     for (int look = 0; look < 3000 && status != SINEW_OK; look++) {
         EXPECT(sinew_send_protected(walk->control, to, &type, &torque, sizeof torque) == SINEW_OK);
         EXPECT(sinew_receive_message(walk->drive, 10 * MS, &received) == SINEW_NOTHING);
-        /* The first echo may be before what it is for, and is for nobody; an echo is each two minutes. */
+        /* The first echo may be sent before the first protected message; it is ignored. Echoes are two minutes apart. */
         while (sinew_receive_message(walk->control, 0, &received) == SINEW_OK)
             EXPECT(sinew_settle_message(walk->control, &received, SINEW_DELIVERED) == SINEW_OK);
         status = sinew_arm(walk->guard);
@@ -341,7 +341,7 @@ static void endpoints(const char *socket)
     EXPECT(sinew_guard_state(walk.guard, &state) == SINEW_OK && state == SINEW_LIVE);
     walk.motor.torque = 7;
     EXPECT(sinew_unregister(&walk.drive) == SINEW_OK);
-    /* First: where the library's thread was faster, this waits for it. */
+    /* First: if the library's thread was faster, this waits for it. */
     EXPECT(sinew_guard_state(walk.guard, &state) == SINEW_OK && state == SINEW_SAFE_TRIPPED);
     EXPECT(walk.motor.torque == 0 && walk.motor.why == SINEW_SAFE_TRIPPED);
     EXPECT(sinew_release(&walk.guard) == SINEW_OK);
@@ -376,7 +376,7 @@ static void misuse(void)
     EXPECT(strcmp(sinew_output_state_text(99), "no state of an output") == 0);
 }
 
-/* As many as there may be: a place is another guard's after a release, and a handle is not. */
+/* As many guards as possible: a slot is reused after a release, a handle is not. */
 static void many(void)
 {
     static sinew_guard *guards[256];
@@ -394,7 +394,7 @@ static void many(void)
         EXPECT(sinew_release(&guards[at]) == SINEW_OK);
 }
 
-/* Its parent's threads are not in it. */
+/* The child does not have its parent's threads. */
 static void in_a_child(void)
 {
     static struct bench bench;

@@ -1,4 +1,4 @@
-/* Sends to itself through a node that stands still: what is said where there is no room, and that nothing is lost by it. */
+/* Sends to itself through a node that is stopped: the status without room, and that no message is lost. */
 #include <sinew.h>
 
 #include <stdio.h>
@@ -15,7 +15,7 @@ static void expect(int line, const char *claim, int holds)
     exit(EXIT_FAILURE);
 }
 
-/* The test says when to go on. */
+/* The test gives the signal to continue. */
 static void await_word(const char *before)
 {
     char line[16];
@@ -53,7 +53,7 @@ int main(int argc, char **argv)
     while ((status = send_number(endpoint, kind, sent, 0)) == SINEW_OK)
         sent++;
     EXPECT(sent > 0 && status == SINEW_ERROR_STALLED && strstr(sinew_last_error(), "no room") != NULL);
-    /* What has no room does not come; and who has a time waits so long. */
+    /* A message without room does not arrive; a send with a time limit waits that long. */
     EXPECT(send_number(endpoint, kind, 1000000, 0) == SINEW_ERROR_STALLED);
     began = sinew_now_ns();
     EXPECT(send_number(endpoint, kind, 1000000, SECOND / 50) == SINEW_ERROR_STALLED);

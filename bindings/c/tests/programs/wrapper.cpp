@@ -1,4 +1,4 @@
-// What sinew.hpp adds to sinew.h: ends of scopes, exceptions, moves.
+// The additions of sinew.hpp to sinew.h: scopes, exceptions, moves.
 #include <sinew.hpp>
 
 #include <atomic>
@@ -29,6 +29,14 @@ struct other { float torque; };
 SINEW_PAYLOAD(other, "test.other", SINEW_CONTROL, torque)
 struct brief { float torque; };
 SINEW_PAYLOAD_EXPIRING(brief, "test.brief", SINEW_CONTROL, 1us, torque)
+struct stop {};
+SINEW_PAYLOAD(stop, "test.stop", SINEW_CONTROL)
+struct brief_stop {};
+SINEW_PAYLOAD_EXPIRING(brief_stop, "test.brief_stop", SINEW_CONTROL, 1us)
+struct idle {};
+SINEW_STRUCT(idle)
+struct report { idle state; float torque; stop stops[2]; };
+SINEW_PAYLOAD(report, "test.report", SINEW_CONTROL, state, torque, stops)
 
 static const auto what = sinew::kind_named("test.wrapper");
 
@@ -52,7 +60,7 @@ static void errors_are_exceptions(sinew::endpoint &endpoint)
     EXPECT(endpoint.confirm(0x7777, what, pair{1, 2}, 10s) == SINEW_REJECTED_NO_SUCH_APPLICATION);
 }
 
-// What was sent without asking and reached nobody is said with its number.
+// Unconfirmed messages that were not delivered are reported with their number.
 static void undelivered_messages_are_counted(sinew::endpoint &endpoint)
 {
     EXPECT(!endpoint.take_undelivered());
@@ -71,7 +79,8 @@ static void undelivered_messages_are_counted(sinew::endpoint &endpoint)
     EXPECT(count == 3);
 }
 
-// A described struct comes as it was sent, one of another kind is none, and one that does not fit is an error that names the field.
+// A described struct arrives as it was sent; one of another kind gives none; a mismatch is an error with the
+// field's name.
 static void values_are_typed(sinew::endpoint &endpoint)
 {
     const setpoint sent{2.5f, -7, true, mode::walking, "knee", {1, 2, 3}, {{1.0, 0.5}, {2.0, 0.25}}};
@@ -91,7 +100,23 @@ static void values_are_typed(sinew::endpoint &endpoint)
     EXPECT(endpoint.confirm(endpoint.create(0x7777, other{1.0f}), 10s) == SINEW_REJECTED_NO_SUCH_APPLICATION);
 }
 
-// What is older than its type, or its send, lets it live is not received.
+// A struct without fields is a payload, and may be a field of another.
+static void types_without_fields(sinew::endpoint &endpoint)
+{
+    const sinew::tid own = endpoint.address();
+    endpoint.send(own, brief_stop{});
+    std::this_thread::sleep_for(1ms);
+    EXPECT(!endpoint.receive(0ns));
+    endpoint.send(own, stop{});
+    auto message = endpoint.receive(20s);
+    EXPECT(message && message->as<stop>() && !message->as<other>() && message->size() == 1);
+    endpoint.send(own, report{{}, 2.5f, {}});
+    EXPECT(endpoint.receive(20s)->as<report>()->torque == 2.5f);
+    endpoint.send(endpoint.create(own, sinew::kind_named("test.stop"), 0));
+    EXPECT(endpoint.receive(20s)->as<stop>());
+}
+
+// A message that is older than its type, or its send, allows is not received.
 static void old_messages_expire(sinew::endpoint &endpoint)
 {
     const sinew::tid own = endpoint.address();
@@ -111,7 +136,7 @@ static void old_messages_expire(sinew::endpoint &endpoint)
     }
 }
 
-// How the receiver ends with the message in hand decides what its sender is told.
+// The way in which the receiver destroys a message decides the outcome that its sender gets.
 static void scopes_settle(sinew::endpoint &sender, sinew::endpoint receiver)
 {
     const sinew::tid to = receiver.address();
@@ -140,7 +165,7 @@ static void scopes_settle(sinew::endpoint &sender, sinew::endpoint receiver)
     receiving.join();
 }
 
-// One is lent at a time: it is given back at the end of its scope.
+// One message is on loan at a time: the end of its scope discards it.
 static void unsent_messages_are_given_back(sinew::endpoint &endpoint)
 {
     for (int made = 0; made < 1000; made++) {
@@ -155,7 +180,7 @@ static void unsent_messages_are_given_back(sinew::endpoint &endpoint)
     }
 }
 
-// No room in time is of a control loop's ordinary course: it throws nothing.
+// No room in time is normal in a control loop: it throws nothing.
 static void sends_may_have_a_time(sinew::endpoint &endpoint)
 {
     EXPECT(endpoint.send_within(endpoint.address(), what, pair{5, 6}, 0ns));
@@ -194,7 +219,7 @@ static void groups_and_names(const char *socket)
     EXPECT(member.address() == 0);
 }
 
-// Good ones come until the first of them has passed a guard that is live.
+// Sends good messages until the first of them has passed a guard that is live.
 static std::optional<pair> come_alive(sinew::endpoint &sender, sinew::endpoint &receiver, const sinew_protected_type &type,
                                       sinew::guard<int> &guard)
 {
@@ -211,7 +236,7 @@ static std::optional<pair> come_alive(sinew::endpoint &sender, sinew::endpoint &
     return came;
 }
 
-// Whether it is; what is not known to be safe is an exception.
+// Whether the guard is tripped; an output that is not known to be safe is an exception.
 static bool is_tripped(const sinew::guard<int> &guard)
 {
     try {
@@ -222,7 +247,7 @@ static bool is_tripped(const sinew::guard<int> &guard)
     }
 }
 
-// What a guard had is let go of when it gets another one's.
+// A guard releases its output when another guard is assigned to it.
 static void guards_are_assigned(sinew::endpoint &receiver, sinew::tid source)
 {
     const auto one = sinew::protected_type<pair>("test.wrapper_one", 20s);
@@ -232,7 +257,7 @@ static void guards_are_assigned(sinew::endpoint &receiver, sinew::tid source)
     auto second = receiver.guard(source, other, 7, safe);
     guard = std::move(second);
     EXPECT(guard.state() == SINEW_SAFE_NOT_ARMED);
-    second = receiver.guard(source, one, 7, safe); // Refused, while that is guarded.
+    second = receiver.guard(source, one, 7, safe); // Rejected while that is guarded.
     EXPECT(second.state() == SINEW_SAFE_NOT_ARMED);
     try {
         (void)receiver.guard(source, sinew::protected_type<pair>("test.wrapper_empty", 20s), 7, {});
@@ -242,7 +267,7 @@ static void guards_are_assigned(sinew::endpoint &receiver, sinew::tid source)
     }
 }
 
-// An output that is moved by good commands alone, and whose making safe is tried again where it throws.
+// Only good commands move a guarded output; its make_safe is called again if it throws.
 static void outputs_are_guarded(const char *socket)
 {
     const auto type = sinew::protected_type<pair>("test.wrapper_command", 20s);
@@ -278,7 +303,7 @@ static void outputs_are_guarded(const char *socket)
     }
 }
 
-// One that ends while it calls the program is let go of then: another one may have its place.
+// A guard that ends in a function that it calls is released then: another one may have its slot.
 static void guards_end_in_their_own_functions(const char *socket)
 {
     const auto moved = sinew::protected_type<pair>("test.wrapper_ends_moved", 20s);
@@ -307,7 +332,7 @@ static void guards_end_in_their_own_functions(const char *socket)
     guard->trip();
     while (!has_ended)
         std::this_thread::sleep_for(1ms);
-    // It is let go of when what makes it safe has returned, which may be on another thread.
+    // It is released when make_safe has returned, which may be on another thread.
     const auto guarded_again = [&]() -> std::optional<sinew_output_state> {
         try {
             return receiver.guard(sender.address(), tripped, 7, [](int &, sinew_output_state) {}).state();
@@ -330,6 +355,7 @@ int main(int argc, char **argv)
     sinew::endpoint endpoint(socket);
     errors_are_exceptions(endpoint);
     values_are_typed(endpoint);
+    types_without_fields(endpoint);
     old_messages_expire(endpoint);
     undelivered_messages_are_counted(endpoint);
     scopes_settle(endpoint, sinew::endpoint(socket));

@@ -1,4 +1,5 @@
-//! Whom a message to many reaches, the members of a group or everybody, as the nodes say at which they are.
+//! Collects the receivers of a message to many, the members of a group or all applications, from the nodes that host
+//! them.
 
 use sinew::{
     AppAddress, NodeAddress, Outcome, Payload, Tid,
@@ -8,23 +9,24 @@ use sinew::{
 };
 
 use super::{
-    super::facts::{End, Many, Member, MembersOn},
-    Found, Gathered,
+    super::facts::{Many, Member, MembersOn, TrafficEnd},
+    Collected, Found,
 };
 use crate::system::in_words;
 
-/// Whether it names more than one application, or may: a group, every application, or the one at an address on every node.
+/// Returns whether it names, or may name, more than one application: a group, every application, or an address on every
+/// node.
 pub(super) fn is_many(tid: Tid) -> bool {
     !tid.is_single() && tid.app != AppAddress::NONE && !tid.app.is_layer()
 }
 
-impl Gathered<'_> {
-    /// The one of the two that is many, if one is; of two the second, as nothing is sent by many.
+impl Collected<'_> {
+    /// Returns the end that is many; if both are, the second, because many do not send.
     pub(super) fn many(&mut self, wanted: [&str; 2], found: &[Found; 2]) -> Option<Many> {
         for end in [1, 0] {
             let (tid, is_guessed) = match (found[end].many, found[end].node) {
                 (Some(tid), _) => (tid, false),
-                // No node and no application is called so; a group may be, where somebody is in it.
+                // No node and no application has this name; a group may have, if it has a member.
                 (None, None) => (Tid::group(wanted[end]), true),
                 (None, Some(_)) => continue,
             };
@@ -36,7 +38,7 @@ impl Gathered<'_> {
         None
     }
 
-    /// Asks every node whom of its applications it would reach.
+    /// Asks every node which of its applications it would reach.
     fn reached(&mut self, end: usize, tid: Tid, sender: &Found) -> Many {
         let here = if tid.node == NodeAddress::HERE { self.nodes[0].node } else { tid.node };
         let tid = Tid::new(here, tid.app);
@@ -46,7 +48,7 @@ impl Gathered<'_> {
             is_judged: sender.app.is_some(),
             is_sender_many: sender.many.is_some(),
             places: Vec::new(),
-            unsaid: Vec::new(),
+            unreported: Vec::new(),
         };
         let node = sender.node.unwrap_or(NodeAddress::HERE);
         let question = AskReach {
@@ -60,20 +62,20 @@ impl Gathered<'_> {
                 continue;
             }
             let label = asked.label();
-            let said = match asked.said.clone() {
-                Ok(report) => self.ask_reach(at, &question).map(|said| self.place(at, report, said)),
+            let on_node = match asked.result.clone() {
+                Ok(report) => self.ask_reach(at, &question).map(|reach| self.place(at, report, reach)),
                 Err(why) => Err(why),
             };
-            match said {
-                // Nobody there gets it: what is told are those who do.
+            match on_node {
+                // It has no receivers: only nodes with receivers are listed.
                 Ok(place) if place.members.is_empty() && place.left_out == 0 => {}
                 Ok(place) => many.places.push(place),
-                Err(why) => many.unsaid.push((label, why)),
+                Err(why) => many.unreported.push((label, why)),
             }
         }
         if !self.nodes.iter().any(|asked| is_meant(asked.node)) {
             let why = "no node that was asked knows it".to_owned();
-            many.unsaid.push((tid.node.to_string(), why));
+            many.unreported.push((tid.node.to_string(), why));
         }
         many
     }
@@ -91,8 +93,8 @@ impl Gathered<'_> {
         })
     }
 
-    /// Those of one node, without this program itself.
-    fn place(&self, at: usize, report: NodeReport, said: ReachReport) -> MembersOn {
+    /// Returns the receivers on one node, without this program itself.
+    fn place(&self, at: usize, report: NodeReport, reach: ReachReport) -> MembersOn {
         let asked = &self.nodes[at];
         let is_own = |tid: Tid| {
             self.first.own.contains(&tid) || self.others.iter().any(|other| other.own.contains(&tid))
@@ -101,32 +103,37 @@ impl Gathered<'_> {
             let app = asked.named_apps().iter().find(|app| app.tid == tid);
             app.and_then(|app| app.name.clone()).unwrap_or_else(|| tid.to_string())
         };
-        let members = said.reached.into_iter().filter(|one| !is_own(one.app));
-        let members =
-            members.map(|Reached { app, verdicts, .. }| Member { label: label(app), verdicts }).collect();
-        let node =
-            End { wanted: asked.label(), node: Some(asked.node), report: Some(report), ..End::default() };
-        MembersOn { node, is_given: said.is_given, members, left_out: said.left_out }
+        let members = reach.reached.into_iter().filter(|one| !is_own(one.app));
+        let members = members
+            .map(|Reached { app, verdicts, .. }| Member { label: label(app), app, verdicts })
+            .collect();
+        let node = TrafficEnd {
+            wanted: asked.label(),
+            node: Some(asked.node),
+            report: Some(report),
+            ..TrafficEnd::default()
+        };
+        MembersOn { node, is_given: reach.is_given, members, left_out: reach.left_out }
     }
 
-    /// By which groups the one reaches the other otherwise than by itself, where both are applications and the list of the node of the other
-    /// says something of the two.
+    /// Returns the groups for which the verdict of the receiver's list differs from that on direct messages, if both
+    /// ends are applications and the list applies to them.
     pub(super) fn by_groups(
         &mut self,
-        said: Option<&AccessReport>,
+        access: Option<&AccessReport>,
         (source, target): (&Found, &Found),
     ) -> Vec<Member> {
         let (Some(source), Some(member), Some(at)) = (source.app, target.app, target.at) else {
             return Vec::new();
         };
-        if !said.is_some_and(|said| said.is_given) {
+        if !access.is_some_and(|access| access.is_given) {
             return Vec::new();
         }
-        // A node of an older version does not know the question; what it says of the two alone is told.
-        let reached = self.ask_reach(at, &AskGroups { source, member }).map(|said| said.reached);
+        // A node of an older version does not know the question; its verdict on direct messages is reported.
+        let reached = self.ask_reach(at, &AskGroups { source, member }).map(|report| report.reached);
         let reached = reached.unwrap_or_default().into_iter();
         let label = |to: AppAddress| Tid::new(NodeAddress::ALL, to).to_string();
-        reached.map(|Reached { to, verdicts, .. }| Member { label: label(to), verdicts }).collect()
+        reached.map(|Reached { to, app, verdicts }| Member { label: label(to), app, verdicts }).collect()
     }
 }
 
@@ -135,7 +142,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn groups_everybody_and_an_address_on_each_node_are_many_and_layers_and_one_application_are_not() {
+    fn groups_and_broadcasts_are_many_unlike_single_addresses() {
         for (tid, is_it) in [
             ("*/f0000007", true),
             ("10.0.0.2/f0000007", true),

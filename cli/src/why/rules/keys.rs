@@ -1,20 +1,21 @@
-//! Whether two nodes prove themselves in the same way: by keys of their project, or not at all. Those with keys and those without refuse each other.
+//! Checks whether two nodes authenticate in the same way: by keys of their project, or not at all. Nodes with keys and
+//! nodes without refuse each other.
 
 use sinew::inspect::{NodeReport, RefusalReport, SecurityReport};
 
-use super::{super::facts::End, RECENT_US, Steps};
+use super::{super::facts::TrafficEnd, RECENT_US, Steps};
 use crate::table::{quoted, time};
 
-/// Under which a node with keys counts datagrams of discovery that it does not take.
+/// The cause under which a node with keys counts discovery datagrams that it refuses.
 const NOT_OURS: &str = "NDL datagram not of this project's keys";
-/// Under which a node without keys counts those of nodes with keys.
+/// The cause under which a node without keys counts datagrams of nodes with keys.
 const SEALED: &str = "sealed NDL datagram at a node without keys";
-/// Under which connections are counted where somebody is not taken for who he says he is.
+/// The causes for connections with an unauthenticated peer.
 const UNPROVEN: [&str; 2] = ["peer not proven", "security"];
 
 impl Steps {
-    /// Both have keys, or neither has.
-    pub(super) fn keys(&mut self, a: &End, b: &End) {
+    /// Checks that both nodes have keys, or neither has.
+    pub(super) fn keys(&mut self, a: &TrafficEnd, b: &TrafficEnd) {
         let (Some(ours), Some(theirs)) = (&a.report, &b.report) else { return };
         let (Some(has_ours), Some(has_theirs)) = (has_keys(ours), has_keys(theirs)) else { return };
         let what = "both have keys, or neither has";
@@ -26,7 +27,7 @@ impl Steps {
         };
         self.blocked(
             what,
-            format!("{} has keys, and {} has none: each refuses what the other says", secured.name, open.name),
+            format!("{} has keys, and {} has none: each rejects the datagrams of the other", secured.name, open.name),
             format!(
                 "where the ca.key of project {} is: sinew keys issue {}={} --keys DIR; copy them as it says, set security.keys of {}, and start \
                  it again; or take security.keys from the configuration of {}: then both are open",
@@ -40,20 +41,20 @@ impl Steps {
     }
 }
 
-/// `None`: it is of a version that does not say.
+/// Returns whether the node has keys; `None` if its version does not report it.
 pub(super) fn has_keys(report: &NodeReport) -> Option<bool> {
     report.security.as_ref().map(|SecurityReport { certificate, .. }| certificate.is_some())
 }
 
-/// Whether it is known that one of them has keys and the other none.
+/// Returns whether one of them is known to have keys and the other none.
 pub(super) fn are_unlike(one: &NodeReport, other: &NodeReport) -> bool {
     has_keys(one).zip(has_keys(other)).is_some_and(|(one, other)| one != other)
 }
 
-/// That `from` has keys and refuses the datagrams of the other just now, with what mends it.
+/// Returns that `from` has keys and currently refuses the other's datagrams, with the suggested fix.
 pub(super) fn refused_datagrams(from: &NodeReport, theirs: &NodeReport) -> Option<(String, String)> {
     let udp = theirs.udp.as_deref()?;
-    // The address is the first word.
+    // The detail starts with the address.
     let is_theirs = |refusal: &&RefusalReport| {
         let rest = refusal.detail.strip_prefix(udp);
         refusal.cause == NOT_OURS
@@ -61,33 +62,35 @@ pub(super) fn refused_datagrams(from: &NodeReport, theirs: &NodeReport) -> Optio
             && rest.is_some_and(|rest| rest.starts_with(": "))
     };
     let refusal = from.refusals.iter().find(is_theirs)?;
-    let seen = format!("{} refused its datagram {} ago: {}", from.name, time(refusal.ago_us), refusal.detail);
-    let mend = format!(
+    let detail =
+        format!("{} refused its datagram {} ago: {}", from.name, time(refusal.ago_us), refusal.detail);
+    let fix = format!(
         "have both keys of one project, made by one `sinew keys init`: compare `sinew keys show --keys DIR` of their directories; for new ones \
          where the ca.key is: sinew keys issue {} --keys DIR",
         quoted(&theirs.name)
     );
-    Some((seen, mend))
+    Some((detail, fix))
 }
 
-/// That it refuses somebody's datagrams just now for their keys, or for want of them: of a node that cannot be asked nobody knows whose they are.
+/// Returns that the node currently refuses datagrams because of keys, or missing keys. The sender of such datagrams is
+/// unknown if that node cannot be asked.
 pub(super) fn refused_of_anybody(from: &NodeReport) -> String {
     let is_for_keys = |refusal: &&RefusalReport| {
         [NOT_OURS, SEALED].contains(&refusal.cause.as_str()) && refusal.ago_us < RECENT_US
     };
     let refused = from.refusals.iter().find(is_for_keys);
     refused.map_or_else(String::new, |refusal| {
-        format!("; {} ago it refused somebody's: {}", time(refusal.ago_us), refusal.detail)
+        format!("; {} ago it refused a datagram of another node: {}", time(refusal.ago_us), refusal.detail)
     })
 }
 
-/// What a node says to do that has refused a connection because nothing was proven on it.
+/// Returns the remedy of a node that has refused an unauthenticated connection.
 pub(super) fn remedy_of<'a>(mut refusals: impl Iterator<Item = &'a RefusalReport>) -> Option<String> {
     let unproven = refusals.find(|refusal| UNPROVEN.contains(&refusal.cause.as_str()))?;
     Some(remedy(&unproven.detail).to_owned())
 }
 
-/// What a fault says is to be done: behind what it says is so, where these are told apart.
+/// Returns the remedy part of a fault, if it is separate from the description.
 pub(super) fn remedy(fault: &str) -> &str {
     fault.split_once("; ").map_or(fault, |(_, remedy)| remedy)
 }

@@ -1,19 +1,20 @@
-//! Whom a message to many reaches, the members of a group or everybody, and which rule of which node's access list decides of each.
+//! The applications that a message to many reaches, the members of a group or all, and the access list rule that
+//! decides on each.
 
 use sinew::{AppAddress, Tid};
 
 use super::{
-    super::facts::{End, Facts, Many, Member, MembersOn},
+    super::facts::{Facts, Many, Member, MembersOn, TrafficEnd},
     State, Step, Steps,
-    access::in_words,
+    access::{in_words, sender},
 };
 
-/// Members, groups or nodes that are told by name in one step.
+/// Maximum number of members, groups or nodes that are named in one step.
 const SHOWN: usize = 8;
 
 impl Many {
-    /// What it is, for people.
-    fn seen(&self) -> String {
+    /// Returns a description for users.
+    fn detail(&self) -> String {
         match self.tid.app {
             app if app.is_group() => format!("group {}", self.tid),
             AppAddress::ALL => format!("every application at {}", self.tid),
@@ -23,25 +24,27 @@ impl Many {
 }
 
 impl Steps {
-    /// Every step from the one that sends to each of the many, in the order in which a message meets them. Nothing comes back from many.
+    /// Adds every step from the sender to each of the many, in the order in which a message passes them. Many have no
+    /// path back.
     pub(super) fn towards_many(&mut self, many: &Many, facts: &Facts) {
         let (from, to) = (&facts.ends[1 - many.end], &facts.ends[many.end]);
         if many.is_sender_many {
-            let seen = "it stands for many, and a message has one sender";
-            self.blocked(format!("{} sends", from.label()), seen, "name the application that sends");
+            let detail = "it stands for several applications, and a message has one sender";
+            self.blocked(format!("{} sends", from.label()), detail, "name the application that sends");
         } else {
-            self.there(from, facts);
+            self.there(from, to, facts);
             self.meant(from);
             self.address(facts);
             self.application((from, to), None, facts);
         }
         self.members(many, to);
         self.ways(many, from);
+        self.handled_by_many(many, from);
         self.may_send_to_many(many, from, to);
     }
 
-    /// Who would get it.
-    fn members(&mut self, many: &Many, to: &End) {
+    /// Adds the step of the receivers.
+    fn members(&mut self, many: &Many, to: &TrafficEnd) {
         let what = format!("{} has members", to.label());
         let at = |on: &MembersOn| {
             let more = if on.left_out > 0 {
@@ -53,28 +56,28 @@ impl Steps {
         };
         let places: Vec<_> = many.places.iter().take(SHOWN).map(at).collect();
         let more = more(many.places.len() - places.len(), "nodes");
-        let unsaid: Vec<_> = many
-            .unsaid
+        let unreported: Vec<_> = many
+            .unreported
             .iter()
             .take(SHOWN)
-            .map(|(node, why)| format!("; {node} did not say whom it has: {why}"))
+            .map(|(node, why)| format!("; {node} did not report its members: {why}"))
             .collect();
-        let unsaid = unsaid.concat();
-        let (seen, is_known) = (many.seen(), many.unsaid.is_empty());
+        let unreported = unreported.concat();
+        let (detail, is_known) = (many.detail(), many.unreported.is_empty());
         let ask_again = "ask again, with more time if need be (--deadline-ms); `sinew nodes` shows its links";
         if !many.places.is_empty() {
-            let seen = format!("{seen}: {}{more}{unsaid}", places.join("; "));
-            if is_known { self.fine(what, seen) } else { self.note(what, seen, ask_again) }
+            let detail = format!("{detail}: {}{more}{unreported}", places.join("; "));
+            if is_known { self.fine(what, detail) } else { self.note(what, detail, ask_again) }
         } else if is_known {
-            let mend = "is the name spelled right? A member has joined by it (`join`) and is registered; the sender gets nothing of its own";
-            self.blocked(what, format!("{seen}: no application of any node that was asked"), mend);
+            let fix = "is the name spelled right? A member has joined by it (`join`) and is registered; the sender gets nothing of its own";
+            self.blocked(what, format!("{detail}: no application of any node that was asked"), fix);
         } else {
-            self.blocked(what, format!("{seen}: none that is known{unsaid}"), ask_again);
+            self.blocked(what, format!("{detail}: none that is known{unreported}"), ask_again);
         }
     }
 
-    /// Whether messages flow to the nodes where the members are; those that are as they should be in one step.
-    fn ways(&mut self, many: &Many, from: &End) {
+    /// Adds the steps of the connections to the nodes of the members; the working ones share one step.
+    fn ways(&mut self, many: &Many, from: &TrafficEnd) {
         if from.report.is_none() {
             return;
         }
@@ -101,9 +104,9 @@ impl Steps {
         }
     }
 
-    /// What the list of each member's node says. That of many some may not get it is often meant so; that nobody may
-    /// who is known is in the way.
-    fn may_send_to_many(&mut self, many: &Many, from: &End, to: &End) {
+    /// Adds the verdicts of the list of each member's node. A refusal for some of many is often intended; a refusal for
+    /// all known members blocks.
+    fn may_send_to_many(&mut self, many: &Many, from: &TrafficEnd, to: &TrafficEnd) {
         let has_list = many.places.iter().any(|on| on.is_given);
         if !many.is_judged {
             if has_list && from.node.is_some() {
@@ -130,59 +133,68 @@ impl Steps {
                 } else {
                     what.clone()
                 };
-                let mend = mend(many, to, on);
-                self.allowed(what, &part, (is_for_nobody, mend));
+                let fix = fix(many, (from, to), on);
+                self.allowed(what, &part, (is_for_nobody, fix));
             }
         }
     }
 
-    /// What the list says of some for whom it says the same, whether that is in the way where it refuses, and what mends it.
-    fn allowed(&mut self, what: String, part: &[&Member], (is_in_the_way, mend): (bool, String)) {
+    /// Adds the step of members with the same verdicts: whether a refusal blocks, and the suggested fix.
+    fn allowed(&mut self, what: String, part: &[&Member], (is_in_the_way, fix): (bool, String)) {
         let Some((first, others)) = part.split_first() else { return };
         let same = if others.is_empty() {
             String::new()
         } else {
             format!("; the same for {}", named(others.iter().copied()))
         };
-        let seen = format!("{}{same}", in_words(&first.verdicts));
-        if first.verdicts.iter().all(|verdict| verdict.is_allowed) {
-            self.fine(what, seen);
+        let detail = format!("{}{same}", in_words(&first.verdicts));
+        if first.is_allowed_all() {
+            self.fine(what, detail);
         } else if is_in_the_way {
-            self.blocked(what, seen, mend);
+            self.blocked(what, detail, fix);
         } else {
-            self.note(what, seen, mend);
+            self.note(what, detail, fix);
         }
     }
 
-    /// Groups of the one by which the list lets through what it refuses to it alone, or the other way round. What goes to it alone does not
-    /// go that way, so nothing of this is in the way.
-    pub(super) fn by_groups(&mut self, a: &End, b: &End, facts: &Facts) {
+    /// Adds the groups of the receiver for which the list's verdict differs from that on messages to it alone. Messages
+    /// to it alone do not use a group, so this never blocks.
+    pub(super) fn by_groups(&mut self, a: &TrafficEnd, b: &TrafficEnd, facts: &Facts) {
         let [there, back] = &facts.by_groups;
-        for (groups, from, to) in [(there, a, b), (back, b, a)] {
+        for (groups, from, to, is_asked_for) in [(there, a, b, true), (back, b, a, false)] {
             for part in alike(groups) {
+                // Nothing on the way from `a` to `b` needs a group of `a`.
+                if !is_asked_for && part.iter().any(|member| !member.is_allowed_all()) {
+                    continue;
+                }
                 let what = format!(
                     "{} may send to {} by group {}",
                     from.label(),
                     to.label(),
                     named(part.iter().copied())
                 );
-                let mend = format!(
+                let fix = format!(
                     "have a [[rule]] of that list allow it, with `groups` or `to`, before any that refuses it; then `sinew reload` on the host of {}",
                     to.node_label()
                 );
-                self.allowed(what, &part, (false, mend));
+                self.allowed(what, &part, (false, fix));
             }
         }
     }
 }
 
 impl Member {
-    /// Whether the list lets nothing through to it.
+    /// Returns whether the list allows no class.
     fn is_refused_all(&self) -> bool {
         !self.verdicts.is_empty() && self.verdicts.iter().all(|verdict| !verdict.is_allowed)
     }
 
-    /// What the list says of each class, and by which rule: its number stands first in what is said of it, and for whom behind it.
+    fn is_allowed_all(&self) -> bool {
+        self.verdicts.iter().all(|verdict| verdict.is_allowed)
+    }
+
+    /// Returns the verdict on each class and its rule: the text starts with the number of the rule, followed by the
+    /// names.
     fn rules(&self) -> Vec<(bool, &str)> {
         let rules = self.verdicts.iter().map(|verdict| {
             let why = verdict.why.as_str();
@@ -192,7 +204,7 @@ impl Member {
     }
 }
 
-/// Those of whom a list says the same by the same rules, together.
+/// Returns the members grouped by equal verdicts of equal rules.
 fn alike(members: &[Member]) -> Vec<Vec<&Member>> {
     let mut parts: Vec<Vec<&Member>> = Vec::new();
     for member in members {
@@ -206,7 +218,7 @@ fn alike(members: &[Member]) -> Vec<Vec<&Member>> {
     parts
 }
 
-/// The first of them by name, and how many more there are.
+/// Returns the first of them by name, and the number of further ones.
 fn named<'a>(members: impl ExactSizeIterator<Item = &'a Member>) -> String {
     let count = members.len();
     let shown: Vec<_> = members.take(SHOWN).map(|member| member.label.as_str()).collect();
@@ -218,8 +230,8 @@ fn more(count: usize, of_what: &str) -> String {
     if count == 0 { String::new() } else { words.trim_end().to_owned() }
 }
 
-/// What lets it through to those on one node.
-fn mend(many: &Many, to: &End, on: &MembersOn) -> String {
+/// Returns the fix that allows messages to the members on one node.
+fn fix(many: &Many, (from, to): (&TrafficEnd, &TrafficEnd), on: &MembersOn) -> String {
     let host = on.node.label();
     let reload = format!("before any that refuses it, then `sinew reload` on the host of {host}");
     if !many.tid.app.is_group() {
@@ -227,10 +239,9 @@ fn mend(many: &Many, to: &End, on: &MembersOn) -> String {
             "have a [[rule]] of that list allow it (`to`: what is for all is judged member by member), {reload}"
         );
     }
-    // What travels is a number, from which no name comes back.
+    // A message carries the group's number, from which the name cannot be derived.
     let is_number = to.wanted.parse::<Tid>().is_ok();
     let name = if is_number { "THE GROUP'S NAME" } else { to.wanted.as_str() };
-    format!(
-        "have a [[rule]] of that list allow it (`groups = [\"{name}\"]`: every member; `to`: some), {reload}"
-    )
+    let rule = format!("[[rule]]\nfrom = [\"{}\"]\ngroups = [\"{name}\"]", sender(from));
+    format!("have a rule of that list allow it (`groups`: every member; `to`: some), {reload}:\n{rule}")
 }

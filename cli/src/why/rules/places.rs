@@ -1,23 +1,24 @@
-//! Where nodes say that they are, and where others look for them.
+//! The announced addresses of nodes, and the addresses at which others look for them.
 
 use sinew::{
     config::{Interface, Seed},
     inspect::NodeReport,
 };
 
-/// Whether a node looks for others on its own host only: none of its interfaces leads out of it.
+/// Returns whether a node discovers others on its own host only: none of its interfaces leads out of it.
 pub(super) fn is_on_loopback(interfaces: &str) -> bool {
     interfaces.split(", ").all(|choice| choice.parse().is_ok_and(|choice: Interface| choice.is_loopback()))
 }
 
-/// Whether a seed is where a node says that it is. The interface behind a link-local address is each host's own: one calls it by its name,
-/// another by its number, and it may be another one.
+/// Returns whether a seed is the announced address of a node. The zone of a link-local address is local to each host,
+/// as a name or a number, so it is not compared.
 pub(super) fn names(seed: &str, udp: &str) -> bool {
     let at = |text: &str| text.parse::<Seed>().ok().map(|seed| seed.address);
     seed == udp || at(seed).is_some_and(|seed| at(udp) == Some(seed))
 }
 
-/// A seed of `of` that names the host of the other and not its port: the other takes another one at each start, or the seed is mistyped.
+/// Returns a seed of `of` with the host of the other but not its port: the other takes another port at each start, or
+/// the seed is mistyped.
 pub(super) fn useless_seed(of: &NodeReport, other: &NodeReport) -> Option<(String, String)> {
     let udp = other.udp.as_ref()?;
     let address = udp.parse::<Seed>().ok()?.address;
@@ -26,16 +27,16 @@ pub(super) fn useless_seed(of: &NodeReport, other: &NodeReport) -> Option<(Strin
         named.is_some_and(|named| named.ip() == address.ip() && named.port() != address.port())
     };
     let seed = of.seeds.iter().find(is_useless)?;
-    let seen = format!(
+    let detail = format!(
         "the seed {seed} of {} names the host of {} but not its port: it listens at {udp}",
         of.name, other.name
     );
     let port = address.port();
-    let mend = format!(
+    let fix = format!(
         "with `port = 0` (an ephemeral port) a node takes another one at each start: set [ndl] port in {}, and the same one in the seed; now it is {port}",
         other.name
     );
-    Some((seen, mend))
+    Some((detail, fix))
 }
 
 #[cfg(test)]
@@ -43,7 +44,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_seed_names_a_node_whatever_the_interface_is_called_on_either_host() {
+    fn seed_matches_a_node_for_any_interface_name() {
         for (seed, udp, is_it) in [
             ("[fe80::2%eth0]:6911", "[fe80::2%2]:6911", true),
             ("[fe80::2]:6911", "[fe80::2%2]:6911", true),
@@ -59,7 +60,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_on_loopback_is_so_by_each_name_of_it() {
+    fn loopback_is_recognised_by_each_of_its_names() {
         for interface in ["127.0.0.1", "::1", "::1%lo", "lo/ipv6", "127.0.0.1, ::1%lo"] {
             assert!(is_on_loopback(interface), "{interface}");
         }

@@ -1,14 +1,14 @@
-//! Which way values of class Stream go: by UDP, or by the connection, and why.
+//! Checks whether values of class Stream use UDP or the connection, and why.
 
 use sinew::inspect::StreamReport;
 
-use super::{End, Steps, keys::has_keys};
+use super::{Steps, TrafficEnd, keys::has_keys};
 
 impl Steps {
-    /// Which way they go from `from` to `to`. `after` is what was counted when one had just been sent.
-    pub(super) fn streamed(&mut self, from: &End, to: &End, after: Option<&StreamReport>) {
+    /// Adds the step of values from `from` to `to`. `after` contains the counts after a value was sent.
+    pub(super) fn streamed(&mut self, from: &TrafficEnd, to: &TrafficEnd, after: Option<&StreamReport>) {
         let peer = to.node.and_then(|node| from.peer(node));
-        // Where there is no connection nothing goes any way.
+        // Without a connection no values are sent.
         let Some(peer) =
             peer.filter(|peer| !peer.links.is_empty() && peer.links.iter().all(|link| link.is_up))
         else {
@@ -16,27 +16,27 @@ impl Steps {
         };
         let what = format!("class Stream from {} to {}", from.label(), to.label());
         let Some(before) = &peer.stream else { return };
-        // Before the others: between these no setting lets datagrams through, so none is named.
+        // Before the other checks: no setting enables datagrams between these nodes, so none is suggested.
         if !before.is_agreed && both_have_keys(from, to) {
             return self.fine(what, "by the connection (TCP), as nodes with keys do");
         }
         if !before.is_on {
-            let mend =
+            let fix =
                 format!("`datagrams = true` under [gncl] of {}, where UDP gets through", from.node_label());
-            return self.note(what, "by the connection (TCP): datagrams are switched off here", mend);
+            return self.note(what, "by the connection (TCP): datagrams are switched off here", fix);
         }
         if !before.is_agreed {
-            let mend = format!(
+            let fix = format!(
                 "`datagrams = true` under [gncl] of {}; if it is so, its version knows none",
                 to.node_label()
             );
-            return self.note(what, "by the connection (TCP): the other end takes no datagrams", mend);
+            return self.note(what, "by the connection (TCP): the other end takes no datagrams", fix);
         }
         if let Some(payload_max) = after.unwrap_or(before).payload_max {
-            let seen = format!(
+            let detail = format!(
                 "values of up to {payload_max} bytes by datagram (UDP), longer ones by the connection (TCP): longer datagrams do not arrive"
             );
-            return self.note(what, seen, long_packets(from, to));
+            return self.note(what, detail, long_packets(from, to));
         }
         let Some(after) = after else {
             let StreamReport { sent, arrived, .. } = before;
@@ -50,18 +50,19 @@ impl Steps {
     }
 }
 
-/// Whether both have keys. One that does not say has them if the other one has: they are connected, and those with and without refuse each other.
-fn both_have_keys(from: &End, to: &End) -> bool {
-    let said = |end: &End| end.report.as_ref().and_then(has_keys);
-    match (said(from), said(to)) {
+/// Returns whether both have keys. A node that does not report it has keys if the other one has: they are connected,
+/// and nodes with and without keys refuse each other.
+fn both_have_keys(from: &TrafficEnd, to: &TrafficEnd) -> bool {
+    let keys = |end: &TrafficEnd| end.report.as_ref().and_then(has_keys);
+    match (keys(from), keys(to)) {
         (Some(one), Some(other)) => one && other,
         (Some(either), None) | (None, Some(either)) => either,
         (None, None) => false,
     }
 }
 
-/// What lets long packets through.
-fn long_packets(from: &End, to: &End) -> String {
+/// Returns the fix that lets long packets through.
+fn long_packets(from: &TrafficEnd, to: &TrafficEnd) -> String {
     format!(
         "give the interfaces of {}, of {} and of all between them one MTU (`ip link` shows it, `sudo ip link set eth0 mtu 1500` sets it), and let ICMP \
          \"packet too big\" through every firewall",
@@ -70,10 +71,10 @@ fn long_packets(from: &End, to: &End) -> String {
     )
 }
 
-/// What lets datagrams through.
-fn blocked(from: &End, to: &End) -> String {
+/// Returns the fix that lets datagrams through.
+fn blocked(from: &TrafficEnd, to: &TrafficEnd) -> String {
     // A node reads them at the port of its connections, if that is free.
-    let port = |end: &End| {
+    let port = |end: &TrafficEnd| {
         let gncl = end.report.as_ref().and_then(|report| report.gncl.clone());
         format!("{} of {}", gncl.unwrap_or_else(|| "the port".to_owned()), end.node_label())
     };

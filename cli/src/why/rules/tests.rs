@@ -1,10 +1,12 @@
-//! A way that is free, and each thing that can stand in it.
+//! Verdicts on a free path, and on each obstacle.
 
 mod access;
 mod address;
 mod cases;
+mod guards;
 mod keys;
 mod many;
+mod silent;
 mod stream;
 mod unnamed;
 
@@ -12,8 +14,9 @@ use sinew::{
     AppAddress, Class, NodeAddress, Tid,
     address::Incarnation,
     inspect::{
-        AccessReport, AccessVerdict, AppReport, DialReport, ForeignReport, LinkReport, Missing,
-        RefusalReport, StreamReport, TreeLine, UnhandledReport,
+        AccessReport, AccessVerdict, AppReport, DialReport, ForeignReport, LinkReport, LostEchoReport,
+        LostReport, Missing, RefusalReport, StreamReport, TreeLine, TroubleReport, UnguardedReport,
+        UnhandledReport,
     },
 };
 
@@ -54,7 +57,7 @@ fn peer(number: u8) -> PeerReport {
     }
 }
 
-/// Datagrams are agreed on, and so many values have arrived by one.
+/// Datagrams are agreed on, and this many values have arrived by datagram.
 fn values(arrived: u64) -> StreamReport {
     StreamReport { is_on: true, is_agreed: true, sent: arrived, arrived, payload_max: None }
 }
@@ -90,6 +93,8 @@ fn report(number: u8, name: &str, other: u8) -> NodeReport {
         foreign_left_out: 0,
         refusals: Vec::new(),
         unhandled: Vec::new(),
+        unguarded: Vec::new(),
+        lost_echoes: Vec::new(),
         refusals_left_out: 0,
         peers: vec![peer(other)],
         left_out: 0,
@@ -123,16 +128,16 @@ fn app(name: &str) -> App {
         waiting_most: Some(3),
         strategy: None,
     };
-    App { report: Some(report), unsaid: None, line: Some(line), refused: 0 }
+    App { report: Some(report), unreported: None, line: Some(line), refused: 0 }
 }
 
 /// The hip at 10.0.0.1, and knee.drive on the knee at 10.0.0.2.
 fn free() -> Facts {
-    let end = |wanted: &str, report: NodeReport| End {
+    let end = |wanted: &str, report: NodeReport| TrafficEnd {
         wanted: wanted.to_owned(),
         node: Some(report.node),
         report: Some(report),
-        ..End::default()
+        ..TrafficEnd::default()
     };
     let mut facts = Facts {
         ends: [end("hip", report(1, "hip", 2)), end("knee.drive", report(2, "knee", 1))],
@@ -170,20 +175,21 @@ fn lost(why: &str) -> LostReport {
     }
 }
 
-/// Neither has found the other.
+/// Neither node has discovered the other.
 fn strangers(facts: &mut Facts) {
     hip(facts).peers.clear();
     knee(facts).peers.clear();
 }
 
-/// It asks these groups.
+/// The node queries these groups.
 fn asks(report: &mut NodeReport, groups: &[&str]) {
     report.groups = groups.iter().map(|group| (*group).to_owned()).collect();
     report.group = report.groups.first().cloned();
 }
 
 fn never_answered(facts: &mut Facts) {
-    facts.ends[1] = End { wanted: "10.0.0.2".to_owned(), node: Some(node(2)), ..End::default() };
+    facts.ends[1] =
+        TrafficEnd { wanted: "10.0.0.2".to_owned(), node: Some(node(2)), ..TrafficEnd::default() };
     hip(facts).peers.clear();
 }
 
@@ -196,20 +202,20 @@ fn waits(facts: &mut Facts, missing: &str) {
 }
 
 #[test]
-fn a_free_way_has_nothing_to_mend() {
+fn free_path_needs_no_fix() {
     let steps = judge(&free());
     let not_fine: Vec<_> =
-        steps.iter().filter(|step| step.state != State::Fine || step.mend.is_some()).collect();
+        steps.iter().filter(|step| step.state != State::Fine || step.fix.is_some()).collect();
     assert!(not_fine.is_empty(), "{not_fine:?}");
-    // Each end, one project, both ways known, linked, for Stream and pinged, and the application.
+    // Each end, one project, both directions known, linked, for Stream and pinged, and the application.
     assert_eq!(steps.len(), 12, "{steps:?}");
 }
 
-/// A change, and what is seen of it.
+/// A change, and the text of the note that follows from it.
 type Note = (fn(&mut Facts), &'static str);
 
 #[test]
-fn what_should_be_known_does_not_stand_in_the_way() {
+fn notes_do_not_block_the_path() {
     let notes: [Note; 5] = [
         (|facts| hip(facts).peers[0].missed = 2, "missed its last 2 answers"),
         (|facts| facts.pings[1] = None, "not tried from there: this command has no socket of knee"),
@@ -231,55 +237,59 @@ fn what_should_be_known_does_not_stand_in_the_way() {
             "from node hip the name stands for 10.0.0.2/1001, not for 10.0.0.3/1001, 10.0.0.4/1001, 10.0.0.5/1001, 10.0.0.6/1001 and 1 more",
         ),
     ];
-    for (change, seen) in notes {
+    for (change, detail) in notes {
         let mut facts = free();
         change(&mut facts);
         let steps = judge(&facts);
         assert!(steps.iter().all(|step| step.state != State::Blocked), "{steps:#?}");
-        assert!(steps.iter().any(|step| step.state == State::Note && step.seen.contains(seen)), "{steps:#?}");
+        assert!(
+            steps.iter().any(|step| step.state == State::Note && step.detail.contains(detail)),
+            "{steps:#?}"
+        );
     }
 }
 
 #[test]
-fn a_way_back_that_was_not_tried_is_told_with_where_to_try_it() {
+fn untried_way_back_is_noted_with_a_command() {
     let mut facts = free();
     facts.pings[1] = None;
     let steps = judge(&facts);
-    let back = steps.iter().find(|step| step.what == "a message goes from knee to hip").expect("it is told");
-    let mend = back.mend.as_deref().expect("it can be tried");
-    assert!(mend.starts_with("`sinew why knee.drive hip` on the host of knee"), "{mend}");
-    // What cannot be asked at all stands in the way, and that is told once.
+    let back =
+        steps.iter().find(|step| step.what == "a message goes from knee to hip").expect("it is a step");
+    let fix = back.fix.as_deref().expect("it can be tried");
+    assert!(fix.starts_with("`sinew why knee.drive hip` on the host of knee"), "{fix}");
+    // An end that cannot be queried at all blocks the path, and is reported once.
     facts.ends[1].report = None;
     assert!(judge(&facts).iter().all(|step| step.what != "a message goes from knee.drive to hip"));
 }
 
 #[test]
-fn a_message_to_an_application_that_waits_to_be_started_is_not_tried_and_its_wait_is_the_reason() {
-    // Given: no ping was sent to it, or one had no answer before its node said that it waits
+fn waiting_application_explains_an_unanswered_ping() {
+    // Given: no ping was sent to it, or a ping had no answer before its node reported that it waits
     for ping in [None, Some(Err("no answer within 2s: its thread is busy or hangs".to_owned()))] {
         let mut facts = free();
         waits(&mut facts, "ankle");
         facts.pings[0] = ping;
         // When
         let steps = judge(&facts);
-        // Then: it stands in the way once, where it takes no messages
+        // Then: it blocks the path once, at the step for accepting messages
         let blocked: Vec<_> = steps.iter().filter(|step| step.state == State::Blocked).collect();
         assert!(blocked.len() == 1 && blocked[0].what == "knee.drive takes messages", "{blocked:#?}");
         let there = steps.iter().find(|step| step.what == "a message goes from hip to knee.drive");
-        let there = there.expect("it is told");
-        let seen = "not tried: it is not ready: has waited 2.0 s for ankle (not there)";
-        assert_eq!((there.state, there.seen.as_str(), &there.mend), (State::Note, seen, &None));
-        // And: the way back is another one
+        let there = there.expect("it is a step");
+        let detail = "not tried: it is not ready: has waited 2.0 s for ankle (not there)";
+        assert_eq!((there.state, there.detail.as_str(), &there.fix), (State::Note, detail, &None));
+        // And: the way back has its own step
         let back = steps.iter().find(|step| step.what == "a message goes from knee to hip");
         assert_eq!(back.map(|step| step.state), Some(State::Fine));
     }
 }
 
 #[test]
-fn an_address_of_a_third_node_that_is_used_twice_does_not_stand_in_the_way() {
+fn duplicate_address_of_a_third_node_does_not_block() {
     let mut facts = free();
     let cause = "NDL node address used twice".to_owned();
-    // The elder one of the two is where the knee was once.
+    // The elder of the two is at a former place of the knee.
     let detail =
         "10.0.0.21 is at 10.0.0.2:7000; the process at 10.0.0.9:7000 claims the same node address".to_owned();
     hip(&mut facts).refusals.push(RefusalReport { cause, count: 4, detail, ago_us: 1_000_000 });
@@ -287,7 +297,7 @@ fn an_address_of_a_third_node_that_is_used_twice_does_not_stand_in_the_way() {
 }
 
 #[test]
-fn what_was_refused_of_a_third_node_with_a_longer_address_is_not_told_of_this_one() {
+fn refusals_of_a_longer_address_do_not_match() {
     for (detail, is_of_it) in [
         ("node 10.0.0.1 says: your clock is odd", true),
         ("10.0.0.1:7001 proves nothing", true),
@@ -303,14 +313,14 @@ fn what_was_refused_of_a_third_node_with_a_longer_address_is_not_told_of_this_on
         let steps = judge(&facts);
         let step = steps.iter().find(|step| step.what == "knee.drive is connected to hip");
         let step = step.expect("it is looked at");
-        assert_eq!((step.state, step.seen.contains("refused: ")), (State::Blocked, is_of_it), "{step:?}");
+        assert_eq!((step.state, step.detail.contains("refused: ")), (State::Blocked, is_of_it), "{step:?}");
     }
 }
 
 #[test]
-fn two_applications_of_one_node_need_no_connection() {
+fn applications_of_one_node_need_no_connection() {
     let mut facts = free();
-    facts.ends[0] = End { app: Some(app("knee.sensor")), ..facts.ends[1].clone() };
+    facts.ends[0] = TrafficEnd { app: Some(app("knee.sensor")), ..facts.ends[1].clone() };
     facts.ends[0].wanted = "knee.sensor".to_owned();
     knee(&mut facts).peers.clear();
     assert!(judge(&facts).iter().all(|step| step.state == State::Fine));

@@ -1,40 +1,79 @@
-//! Whether an application handles the types of the messages that it gets.
+//! Checks whether an application handles the types of the messages that it receives.
 
-use sinew::inspect::UnhandledReport;
+use sinew::{
+    Tid,
+    inspect::{NodeReport, UnhandledReport},
+};
 
-use super::{End, RECENT_US, Steps};
+use super::{
+    super::facts::{Many, Member},
+    RECENT_US, State, Step, Steps, TrafficEnd,
+};
 use crate::table::time;
 
 impl Steps {
-    /// Messages that `to` did not handle or could not read: of `from` they stand in the way, of others they are told.
-    pub(super) fn handled(&mut self, from: &End, to: &End) {
-        let Some(receiver) = to.app.as_ref().and_then(|app| app.report.as_ref()).map(|app| app.tid) else {
-            return;
-        };
-        let sender = from.app.as_ref().and_then(|app| app.report.as_ref()).map(|app| app.tid);
-        let unhandled = to.report.iter().flat_map(|report| &report.unhandled);
-        for said in unhandled.filter(|said| said.receiver == receiver) {
-            let what = format!("{} handles what it is sent", to.label());
-            let is_of_it = sender == Some(said.sender);
-            let kind = said.kind_name.clone().or_else(|| name_at(from, said));
-            let seen = seen(said, kind, if is_of_it { Some(from.label()) } else { None });
-            if is_of_it && said.ago_us < RECENT_US {
-                self.blocked(what, seen, said.remedy.clone());
-            } else {
-                self.note(what, seen, said.remedy.clone());
+    /// Adds the messages that `to` did not handle or could not read: those of `from` block on the way that the user has
+    /// asked for, all others are only reported.
+    pub(super) fn handled(&mut self, (from, to): (&TrafficEnd, &TrafficEnd), is_asked_for: bool) {
+        if let Some((receiver, report)) = to.app_tid().zip(to.report.as_ref()) {
+            let mut steps = unhandled(from, report, (receiver, to.label()));
+            if !is_asked_for {
+                unblock(&mut steps);
+            }
+            self.0.extend(steps);
+        }
+    }
+
+    /// Adds the messages that members did not handle or could not read. Those of `from` block if no member takes them.
+    pub(super) fn handled_by_many(&mut self, many: &Many, from: &TrafficEnd) {
+        let mut steps = Vec::new();
+        let mut is_for_nobody = true;
+        for on in &many.places {
+            let Some(report) = &on.node.report else { continue };
+            is_for_nobody &= on.left_out == 0;
+            for Member { label, app, .. } in &on.members {
+                let of_member = unhandled(from, report, (*app, label));
+                is_for_nobody &= of_member.iter().any(|step| step.state == State::Blocked);
+                steps.extend(of_member);
             }
         }
+        if !is_for_nobody {
+            unblock(&mut steps);
+        }
+        self.0.extend(steps);
     }
 }
 
-/// The name of the type at its sender: a receiver that does not handle it does not know its name.
-fn name_at(sender: &End, said: &UnhandledReport) -> Option<String> {
-    let mut known = sender.report.iter().flat_map(|report| &report.unhandled);
-    known.find(|known| known.kind == said.kind)?.kind_name.clone()
+fn unblock(steps: &mut [Step]) {
+    steps.iter_mut().filter(|step| step.state == State::Blocked).for_each(|step| step.state = State::Note);
 }
 
-fn seen(said: &UnhandledReport, name: Option<String>, sender: Option<&str>) -> String {
-    let UnhandledReport { sender: tid, kind, count, ago_us, is_malformed, .. } = said;
+/// Returns the steps of an application, by its label: messages of `from` that it did not handle recently block, all
+/// others are notes.
+fn unhandled(from: &TrafficEnd, report: &NodeReport, (receiver, label): (Tid, &str)) -> Vec<Step> {
+    let of_it = report.unhandled.iter().filter(|entry| entry.receiver == receiver);
+    let steps = of_it.map(|entry| {
+        let is_of_sender = from.app_tid() == Some(entry.sender);
+        let kind = entry.kind_name.clone().or_else(|| name_at(from, entry));
+        let is_in_the_way = is_of_sender && entry.ago_us < RECENT_US;
+        Step {
+            what: format!("{label} handles what it is sent"),
+            state: if is_in_the_way { State::Blocked } else { State::Note },
+            detail: detail(entry, kind, is_of_sender.then(|| from.label())),
+            fix: Some(entry.remedy.clone()),
+        }
+    });
+    steps.collect()
+}
+
+/// Returns the name of the type at its sender: a receiver that does not handle a type does not know its name.
+fn name_at(sender: &TrafficEnd, entry: &UnhandledReport) -> Option<String> {
+    let mut known = sender.report.iter().flat_map(|report| &report.unhandled);
+    known.find(|known| known.kind == entry.kind)?.kind_name.clone()
+}
+
+fn detail(entry: &UnhandledReport, name: Option<String>, sender: Option<&str>) -> String {
+    let UnhandledReport { sender: tid, kind, count, ago_us, is_malformed, .. } = entry;
     let kind = name.unwrap_or_else(|| format!("kind {kind}"));
     let sender = sender.map_or_else(|| tid.to_string(), str::to_owned);
     let ago = time(*ago_us);

@@ -1,11 +1,11 @@
-//! Whether two nodes speak different versions of the protocol.
+//! Checks whether two nodes use different versions of the protocol.
 
 use sinew::inspect::NodeReport;
 
 use super::speaks_of;
 use crate::table::time;
 
-/// What either of them has refused of the other because it is of another version.
+/// Returns a refusal by either node because of the other's version.
 pub(super) fn differs(a: &NodeReport, b: &NodeReport) -> Option<(String, String)> {
     refused(a, b).or_else(|| refused(b, a))
 }
@@ -16,7 +16,7 @@ fn refused(at: &NodeReport, of: &NodeReport) -> Option<(String, String)> {
         |detail: &str| speaks_of(detail, &node) || of.udp.as_ref().is_some_and(|udp| speaks_of(detail, udp));
     let refusal =
         at.refusals.iter().find(|refusal| refusal.cause.ends_with("version") && is_meant(&refusal.detail))?;
-    let seen = format!(
+    let detail = format!(
         "{} (Sinew {}) refused the protocol version of {} (Sinew {}) {} ago: {}",
         at.name,
         at.version,
@@ -25,5 +25,5 @@ fn refused(at: &NodeReport, of: &NodeReport) -> Option<(String, String)> {
         time(refusal.ago_us),
         refusal.detail
     );
-    Some((seen, "run the same version of Sinew on both; update the older one".to_owned()))
+    Some((detail, "run the same version of Sinew on both; update the older one".to_owned()))
 }

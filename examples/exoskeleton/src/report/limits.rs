@@ -1,11 +1,11 @@
-//! The limits a run must hold: class C (any machine, functional) of steps 1 and 2 of the demonstration, and of the
+//! The limits for a run: class C (any machine, functional) of steps 1 and 2 of the demonstration, and of the
 //! fault steps when a node is killed.
 
+use exoskeleton_model::joint::Joint;
+use exoskeleton_model::metrics::Metrics;
 use serde::Serialize;
 
 use super::{Disturbance, RunDescription, Verdict};
-use crate::joint::Joint;
-use crate::metrics::Metrics;
 
 /// Largest RMS against the reference, degrees: hip, knee, ankle.
 const RMS_MAX_DEG: [f64; 3] = [2.0, 2.5, 3.0];
@@ -14,29 +14,30 @@ const WORK_POSITIVE_J: (f64, f64) = (10.0, 16.0);
 const SATURATION_MAX_PERCENT: f64 = 1.0;
 const READY_SKEW_MAX_MS: f64 = 50.0;
 const TORQUE_RATE_MAX_NM_S: f64 = 2000.0;
-/// Share by which a limit may be passed: differences of floating-point numbers, nothing else. Zero stays zero.
+/// Relative tolerance of a limit: for differences of floating-point numbers only. Zero stays zero.
 const ROUNDING: f64 = 1e-9;
 /// With a kill one stride before or after it is enough.
 const STRIDES_COUNTED_MIN: f64 = 1.0;
-/// Loss noticed within 200 ms and all drives damping within 50 ms more.
+/// Loss detected within 200 ms and all drives damping within 50 ms more.
 const ALL_SAFE_MAX_MS: f64 = 250.0;
 
-/// One limit: what was expected, what was seen.
+/// One limit: the expectation and the observation.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LimitCheck {
-    /// What is limited, with its unit.
+    /// The limited quantity, with its unit.
     pub name: String,
-    /// What is expected, in words.
+    /// The expectation, as text.
     pub expected: String,
-    /// What was seen; `null` when it never happened.
+    /// The observation; `null` if it never happened.
     pub seen: Option<f64>,
     /// Whether the limit held.
     pub held: bool,
-    /// Whether the host disturbed the run where this was measured: a limit that did not hold is not judged then.
+    /// Whether the host disturbed the run where this was measured: a limit that did not hold is not judged
+    /// then.
     pub disturbed: bool,
 }
 
-/// A broken limit decides where the host did not disturb it.
+/// The verdict: a broken limit counts if the host did not disturb it.
 pub(super) fn verdict(limits: &[LimitCheck]) -> Verdict {
     let mut broken = limits.iter().filter(|limit| !limit.held).peekable();
     if broken.peek().is_none() {
@@ -52,14 +53,15 @@ pub(super) fn verdict(limits: &[LimitCheck]) -> Verdict {
 pub(super) fn check(
     whole: &Metrics,
     judged: &Metrics,
-    disturbance: &Disturbance<'_>,
+    disturbance: &Disturbance,
     run: &RunDescription,
 ) -> Vec<LimitCheck> {
     let disturbed = |disturbed: bool, checks: Vec<LimitCheck>| {
         checks.into_iter().map(move |check| LimitCheck { disturbed, ..check })
     };
-    let start = vec![at_most("spread of READY, ms", READY_SKEW_MAX_MS, whole.ready_skew_ms)];
-    let mut checks = vec![at_most("torque before release, Nm", 0.0, Some(whole.torque_before_release_nm))];
+    let start = vec![at_most("spread of READY, ms", READY_SKEW_MAX_MS, whole.barrier.ready_skew_ms)];
+    let mut checks =
+        vec![at_most("torque before release, Nm", 0.0, Some(whole.barrier.torque_before_release_nm))];
     checks.extend(disturbed(disturbance.at_start, start));
     checks.extend(disturbed(disturbance.too_few, of_strides(judged)));
     checks.push(at_most("torque rate, Nm/s", TORQUE_RATE_MAX_NM_S, Some(whole.torque_rate_max_nm_s)));
@@ -79,20 +81,15 @@ fn of_strides(metrics: &Metrics) -> Vec<LimitCheck> {
         let i = joint.index();
         checks.push(at_most(&format!("{joint} RMS, deg"), RMS_MAX_DEG[i], Some(metrics.rms_deg[i])));
     }
-    checks.push(within(
-        "work into the leg, J/stride",
-        WORK_POSITIVE_J,
-        metrics.work_positive_j_per_stride.iter().sum(),
-    ));
+    let (low, high) = WORK_POSITIVE_J;
+    let work_j = metrics.work_positive_j_per_stride.iter().sum();
+    checks.push(check_of("work into the leg, J/stride", format!("{low}..{high}"), Some(work_j), |seen| {
+        (low..=high).contains(&seen)
+    }));
     for joint in Joint::ALL {
+        let (name, expected) = (format!("{joint} at torque limit, %"), format!("< {SATURATION_MAX_PERCENT}"));
         let seen = metrics.saturation_percent[joint.index()];
-        checks.push(LimitCheck {
-            name: format!("{joint} at torque limit, %"),
-            expected: format!("< {SATURATION_MAX_PERCENT}"),
-            seen: Some(seen),
-            held: seen < SATURATION_MAX_PERCENT,
-            disturbed: false,
-        });
+        checks.push(check_of(&name, expected, Some(seen), |seen| seen < SATURATION_MAX_PERCENT));
     }
     checks
 }
@@ -106,31 +103,14 @@ fn of_fault(metrics: &Metrics) -> Vec<LimitCheck> {
 }
 
 fn at_most(name: &str, limit: f64, seen: Option<f64>) -> LimitCheck {
-    LimitCheck {
-        name: name.to_owned(),
-        expected: if limit == 0.0 { "exactly 0".to_owned() } else { format!("<= {limit}") },
-        seen,
-        held: seen.is_some_and(|seen| seen <= limit * (1.0 + ROUNDING)),
-        disturbed: false,
-    }
+    let expected = if limit == 0.0 { "exactly 0".to_owned() } else { format!("<= {limit}") };
+    check_of(name, expected, seen, |seen| seen <= limit * (1.0 + ROUNDING))
 }
 
 fn at_least(name: &str, limit: f64, seen: Option<f64>) -> LimitCheck {
-    LimitCheck {
-        name: name.to_owned(),
-        expected: format!(">= {limit}"),
-        seen,
-        held: seen.is_some_and(|seen| seen >= limit),
-        disturbed: false,
-    }
+    check_of(name, format!(">= {limit}"), seen, |seen| seen >= limit)
 }
 
-fn within(name: &str, (low, high): (f64, f64), seen: f64) -> LimitCheck {
-    LimitCheck {
-        name: name.to_owned(),
-        expected: format!("{low}..{high}"),
-        seen: Some(seen),
-        held: (low..=high).contains(&seen),
-        disturbed: false,
-    }
+fn check_of(name: &str, expected: String, seen: Option<f64>, holds: impl Fn(f64) -> bool) -> LimitCheck {
+    LimitCheck { name: name.to_owned(), expected, seen, held: seen.is_some_and(holds), disturbed: false }
 }

@@ -1,16 +1,16 @@
-//! The application `central.coordinator`: when all drives have started it releases walking.
+//! The application `central.coordinator`: it releases walking when all drives have started.
 //!
-//! It stands for the operator's hand. In this simulation it presses the button by itself; on a device it would wait for
-//! a person.
+//! It acts for the operator. In this simulation it presses the button by itself; on a device it would wait
+//! for a person.
 
+use exoskeleton_model::joint::Joint;
 use sinew::prelude::*;
 
 use super::edges::{GAIT, Release, drive_name};
-use crate::joint::Joint;
 
-/// From the start of the last drive to the release: everybody sees the leg held with zero torque.
+/// From the start of the last drive to the release: a spectator sees the leg held with zero torque.
 const RELEASE_AFTER: Duration = Duration::from_millis(500);
-/// Time for gait to say that it was released; after it the release is sent again.
+/// Time for gait to confirm the release; after it the release is sent again.
 const PATIENCE: Duration = Duration::from_millis(500);
 
 /// The coordinator.
@@ -36,7 +36,7 @@ impl Coordinator {
             if outcome == Outcome::Delivered {
                 tracing::info!("central's gait has taken the release");
             } else {
-                // To be released twice is no more than once.
+                // A second release has no further effect.
                 tracing::warn!(?outcome, "the release was not taken; it is sent again");
                 context.after(PATIENCE, |this, _, context| this.release(context));
             }

@@ -1,4 +1,4 @@
-//! The seam to the hardware: what a sensor and a drive need of their joint's device, and the device behind UDP.
+//! The hardware interface: the device that a joint's sensor and drive use, and its implementation over UDP.
 //!
 //! A real motor on CAN or EtherCAT implements [`JointDevice`]; nothing above this file changes.
 
@@ -7,78 +7,80 @@ use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
+use exoskeleton_model::datagram::{CommandFrame, Order, READING_BYTES, Reading};
+use exoskeleton_model::joint::Joint;
+use exoskeleton_model::message::DriveState;
 use sinew::Time;
 
-use super::datagram::{Order, READING_BYTES, Reading, Word};
-use crate::joint::Joint;
-use crate::message::DriveState;
-
-/// Time between two wishes for readings, ns.
-const WISH_PERIOD_NS: u64 = 100_000_000;
-/// Datagrams looked at in one call: more than the socket's buffer holds after any pause, and still a bound.
+/// Time between two requests for readings, ns.
+const REQUEST_PERIOD_NS: u64 = 100_000_000;
+/// Datagrams read in one call: more than the socket's buffer holds after any pause, but still a bound.
 const READS_MAX: usize = 4_096;
 
-/// What a drive says to its device each millisecond.
+/// The command of a drive to its device, each millisecond.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DriveCommand {
-    /// Torque to give, Nm.
+    /// Torque to apply, Nm.
     pub torque_nm: f64,
     /// Whether walking is released.
     pub released: bool,
-    /// Whether the torque law met its limit.
+    /// Whether the torque law reached its limit.
     pub saturated: bool,
-    /// State of the drive, as a status word.
+    /// State of the drive.
     pub state: DriveState,
 }
 
-/// The motor device of one joint. Nothing here waits.
+/// The motor device of one joint. No method blocks.
 pub trait JointDevice {
-    /// The newest reading since the last call; `None` when there is none.
+    /// Returns the newest reading since the last call; `None` if there is none.
     fn read_newest(&mut self, now: Time) -> Option<Reading>;
 
-    /// Gives a command. One that is lost is made good by the next; a device that hears none holds its last torque.
+    /// Sends a command. The next one replaces a lost one; a device that receives none holds its last torque.
     fn command(&mut self, now: Time, command: &DriveCommand);
 
-    /// Who says [`Damper::damp`] to this device, whatever becomes of the thread that has the device.
+    /// Returns a sender of [`Damper::damp`] to this device that works even if the thread that owns the device
+    /// hangs.
     fn damper(&self) -> Box<dyn Damper>;
 }
 
-/// Takes a device its torque away, from any thread.
+/// Removes the torque of a device, from any thread.
 pub trait Damper: Send {
-    /// Has the device damp softly by itself, until it is given a torque again; `state` is the drive's. It neither waits nor takes a lock: it is
-    /// called by the thread that makes outputs safe, for which all outputs of the process wait.
+    /// Orders the device to damp softly by itself until its next torque; `state` is the drive's. It neither
+    /// waits nor takes a lock: the thread that makes outputs safe calls it, and all outputs of the process
+    /// wait for that thread.
     fn damp(&self, now: Time, state: DriveState);
 }
 
 /// The device of a joint, behind the plant's UDP address.
 #[derive(Debug)]
 pub struct UdpDevice {
-    mouth: Mouth,
-    wished_at: Option<Time>,
-    refused: u64,
+    sender: DeviceSender,
+    requested_at: Option<Time>,
 }
 
-/// What speaks to the device. Its clones count their words together, as the device takes none that is older than the last.
+/// The sender to the device. Its clones share one counter, because the device accepts no frame older than the
+/// last.
 #[derive(Debug, Clone)]
-struct Mouth {
+struct DeviceSender {
     joint: Joint,
     socket: Arc<UdpSocket>,
     seq: Arc<AtomicU32>,
 }
 
-impl Mouth {
-    /// Says `word`, whose joint, number and time are filled in here.
-    fn say(&self, now: Time, word: Word) {
-        // SYNC: Relaxed, the number stands for itself.
+impl DeviceSender {
+    /// Sends `frame`; fills in its joint, number and time.
+    fn send(&self, now: Time, frame: CommandFrame) {
+        // SYNC: Relaxed, no other data depends on the number.
         let seq = self.seq.fetch_add(1, Ordering::Relaxed).wrapping_add(1);
-        let word = Word { joint: self.joint, seq, t_ns: now.as_nanos(), ..word };
-        // No plant yet, or a full queue: the next word comes in a millisecond, and silence is the plant's to notice.
-        let _ = self.socket.send(&word.encode());
+        let frame = CommandFrame { joint: self.joint, seq, t_ns: now.as_nanos(), ..frame };
+        // There is no plant yet, or a full queue: the next frame follows in a millisecond, and the plant
+        // detects silence.
+        let _ = self.socket.send(&frame.encode());
     }
 
-    /// A word that says nothing.
-    const fn word(&self) -> Word {
-        Word {
+    /// Creates a frame without an order.
+    const fn frame(&self) -> CommandFrame {
+        CommandFrame {
             joint: self.joint,
             seq: 0,
             t_ns: 0,
@@ -90,59 +92,54 @@ impl Mouth {
     }
 }
 
-impl Damper for Mouth {
+impl Damper for DeviceSender {
     fn damp(&self, now: Time, state: DriveState) {
-        self.say(now, Word { order: Some(Order::Damp), state, ..self.word() });
+        self.send(now, CommandFrame { order: Some(Order::Damp), state, ..self.frame() });
     }
 }
 
 impl UdpDevice {
-    /// The way to the device; nothing is sent yet.
+    /// Creates the connection to the device; sends nothing yet.
     ///
     /// # Errors
-    /// The system gives no socket, or the address cannot be reached from here.
+    /// The system provides no socket, or the address cannot be reached from here.
     pub fn connect(joint: Joint, plant: SocketAddr) -> io::Result<Self> {
         let socket = match plant {
             SocketAddr::V4(_) => UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?,
             SocketAddr::V6(_) => UdpSocket::bind((Ipv6Addr::UNSPECIFIED, 0))?,
         };
-        // From now on the kernel drops what comes from anybody else.
+        // From now on the kernel drops datagrams from all other senders.
         socket.connect(plant)?;
         socket.set_nonblocking(true)?;
-        let mouth = Mouth { joint, socket: Arc::new(socket), seq: Arc::default() };
-        Ok(Self { mouth, wished_at: None, refused: 0 })
+        let sender = DeviceSender { joint, socket: Arc::new(socket), seq: Arc::default() };
+        Ok(Self { sender, requested_at: None })
     }
 
-    /// Datagrams that were no readings of this joint.
-    #[must_use]
-    pub const fn refused(&self) -> u64 {
-        self.refused
-    }
-
-    /// The device forgets who wants its readings when it is restarted, so it is told now and then.
-    fn wish_for_readings(&mut self, now: Time) {
-        let due = self.wished_at.is_none_or(|at| now.since(at).as_nanos() >= u128::from(WISH_PERIOD_NS));
+    /// Requests readings at intervals, since a restarted device forgets its listeners.
+    fn request_readings(&mut self, now: Time) {
+        let due =
+            self.requested_at.is_none_or(|at| now.since(at).as_nanos() >= u128::from(REQUEST_PERIOD_NS));
         if due {
-            self.wished_at = Some(now);
-            self.mouth.say(now, self.mouth.word());
+            self.requested_at = Some(now);
+            self.sender.send(now, self.sender.frame());
         }
     }
 }
 
 impl JointDevice for UdpDevice {
     fn read_newest(&mut self, now: Time) -> Option<Reading> {
-        self.wish_for_readings(now);
+        self.request_readings(now);
         let mut newest = None;
         let mut buffer = [0; READING_BYTES + 1];
         for _ in 0..READS_MAX {
-            match self.mouth.socket.recv(&mut buffer) {
-                Ok(length) => match Reading::decode(&buffer[..length]) {
-                    // All that wait are read: after a pause the first of them are old.
-                    Ok(reading) if reading.joint == self.mouth.joint => newest = Some(reading),
-                    Ok(_) | Err(_) => self.refused += 1,
-                },
+            match self.sender.socket.recv(&mut buffer) {
+                Ok(length) => {
+                    // Reads all that wait: after a pause the first of them are old. Others are dropped.
+                    let reading = Reading::decode(&buffer[..length]).ok();
+                    newest = reading.filter(|reading| reading.joint == self.sender.joint).or(newest);
+                }
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => break,
-                // The plant's port is closed: it is not there yet, or not any more.
+                // The plant's port is closed: it is not open yet, or not any more.
                 Err(_) => {}
             }
         }
@@ -152,10 +149,10 @@ impl JointDevice for UdpDevice {
     fn command(&mut self, now: Time, command: &DriveCommand) {
         let DriveCommand { torque_nm, released, saturated, state } = *command;
         let order = Some(Order::Torque(torque_nm));
-        self.mouth.say(now, Word { order, released, saturated, state, ..self.mouth.word() });
+        self.sender.send(now, CommandFrame { order, released, saturated, state, ..self.sender.frame() });
     }
 
     fn damper(&self) -> Box<dyn Damper> {
-        Box::new(self.mouth.clone())
+        Box::new(self.sender.clone())
     }
 }

@@ -1,35 +1,42 @@
 //! The application `X.drive`: the shell around [`DriveCore`].
 //!
-//! It starts when its own sensor is ready, so that a new instance of a drive that failed can bring the torque that its
-//! device still holds to zero, whoever else is missing. It is ready when central's gait is heard too, which speaks only
-//! when all three sensors do; until then, and until walking is released, the torque is zero. Inputs carry
-//! the time at which they were sent, in this host's clock ([`Delivery::sent`]). Silence of an input is noticed twice,
-//! independently: by the core, which refuses what is older than 10 ms in the tick in which it would use it, and by the
-//! runtime's input watchdogs, which write it down. What central says is protected from end to end, by `PROTECTION` of
-//! [`GaitState`]: a guard lets through what is central's, whole, in order and young; else it is shut. When it shuts, the
-//! device is told at once to damp by itself, by a thread that is there for that: also when this application hangs, or the
-//! thread on which it runs. Another one repeats it, as it may be lost. No device can do without a watchdog of its own for all that: both
-//! threads end, or stand still, with the process. Torque goes to the device through the open guard, or is on its way to zero. A shut guard stays
-//! so until central's gait asks for it ([`Arm`]), in a state in which no torque comes of central's word. When the drive is told
-//! to stop, the torque ramps to zero first.
+//! It starts when its own sensor is ready, even if all other parts are missing: a new instance of a drive
+//! that failed can then ramp the torque that its device still holds to zero. It is ready when it also
+//! receives from central's gait, which sends only when all three sensors do. Until then, and until walking is
+//! released, the torque is zero. Inputs carry the time of sending, in this host's clock ([`Delivery::sent`]).
+//!
+//! Silence of an input is detected twice, independently. The core rejects an input that is older than 10 ms
+//! in the tick that would use it; the runtime's input watchdogs record the silence.
+//!
+//! Commands of central are protected end to end, by `PROTECTION` of [`GaitState`]. A guard accepts those that
+//! are from central, complete, in order and young; otherwise it shuts. When it shuts, a dedicated thread at
+//! once orders the device to damp by itself. That works also when this application hangs, or the thread on
+//! which it runs. Another thread repeats the order, as it may be lost. A device still needs a watchdog of its
+//! own: both threads end, or stop, with the process.
+//!
+//! Torque goes to the device through the open guard, or is being ramped to zero. A shut guard stays shut
+//! until central's gait requests otherwise ([`Arm`]), in a state in which central's commands cause no torque.
+//! When the drive is ordered to stop, it ramps the torque to zero first.
 
+mod anomaly;
 mod burden;
-mod lookout;
+mod command;
+mod damping_repeater;
 mod order;
-mod suspicion;
-mod word;
 
 use std::io;
 use std::path::{Path, PathBuf};
 
+use exoskeleton_model::control::drive::{DriveConfig, DriveCore, DriveOutput};
+use exoskeleton_model::joint::Joint;
+use exoskeleton_model::message::{DriveState, GaitMode, GaitState, JointSample, TorqueSet};
 use sinew::prelude::*;
 use sinew::protection::Guard;
 use sinew::supervision::ReadyGate;
 
-pub use self::burden::Burden;
-use self::lookout::{Lookout, Watch};
+use self::command::{Armed, CentralCommands, Output};
+use self::damping_repeater::{DampingRepeater, RepeaterHandle};
 use self::order::Order;
-use self::word::{Armed, Output, Word};
 use super::PERIOD;
 use super::device::{Damper, DriveCommand, JointDevice};
 use super::edges::{
@@ -39,29 +46,28 @@ use super::edges::{
 use super::figures::LoopFigures;
 use super::sensor::DeviceMaker;
 use super::trace::{DriveRow, EventRow, Trace};
-use crate::control::drive::{DriveConfig, DriveCore, DriveOutput};
-use crate::joint::Joint;
-use crate::message::{DriveState, GaitMode, GaitState, JointSample, TorqueSet};
 
-/// Silence of an input that is noticed, and the greatest age of what asks for central's word to count.
+pub use self::burden::Burden;
+
+/// Silence of an input that is detected, and the maximum age of a request to open the guard.
 const SILENCE_MAX: Duration = Duration::from_millis(10);
 /// Ticks between two statuses: 200 statuses a second.
 const STATUS_TICKS: u64 = 5;
 
-/// What a drive is made with, in each of its lives.
+/// The constructor arguments of a drive, the same for each incarnation.
 #[derive(Clone)]
 pub struct DriveParts {
     /// The joint.
     pub joint: Joint,
-    /// The way to its device.
+    /// Creates the connection to its device.
     pub device: DeviceMaker,
-    /// Where its ticks go.
+    /// Trace of its ticks.
     pub trace: Trace<DriveRow>,
-    /// Where it writes down what happens once.
+    /// Trace of single events.
     pub events: Trace<EventRow>,
-    /// Where it leaves its figures at its end, as JSON.
+    /// File for its figures at its end, as JSON.
     pub figures: Option<PathBuf>,
-    /// CPU time that it wastes in each tick once the person walks: a planted fault, see [`Burden`].
+    /// CPU time that it wastes in each tick once the person walks: an injected fault, see [`Burden`].
     pub burden: Option<Burden>,
 }
 
@@ -72,25 +78,25 @@ pub struct Drive {
     device: Box<dyn JointDevice>,
     damper: Box<dyn Damper>,
     sample: Option<JointSample>,
-    /// Central's newest word, for as long as all that comes from there is good.
-    word: Option<Word>,
-    /// Whether the device was last told a torque by this drive: it may hold that for as long as it is told nothing else.
+    /// Central's commands, for as long as the present incarnation of central is known.
+    commands: Option<CentralCommands>,
+    /// Whether this drive's last order was a torque: the device may hold it until the next order.
     gives: bool,
-    /// Who repeats the order to damp when this thread does not; there before any torque of central's word.
-    lookout: Option<Lookout>,
-    /// Whether it was said that central's word cannot be guarded.
+    /// Repeats the order to damp when this thread does not; created before any torque of central's commands.
+    repeater: Option<DampingRepeater>,
+    /// Whether it was reported that central's commands cannot be guarded.
     unguarded: bool,
-    /// Whether central was heard in this life.
-    central_heard: bool,
+    /// Whether this incarnation has received from central.
+    has_central_input: bool,
     ticked_at: Option<Time>,
     figures: LoopFigures,
     stopping: bool,
-    /// When central asked for walking first, for its burden.
+    /// Time of central's first request to walk, for its burden.
     walks_since: Option<Time>,
-    /// Whom the inputs are believed from.
+    /// The only accepted senders of the inputs.
     sensor: Addressee,
     central: Addressee,
-    /// Reached when all inputs are there for the first time.
+    /// Reached when all inputs have arrived for the first time.
     ready: Option<ReadyGate>,
 }
 
@@ -122,11 +128,11 @@ impl Drive {
             ready: None,
             parts,
             sample: None,
-            word: None,
+            commands: None,
             gives: false,
-            lookout: None,
+            repeater: None,
             unguarded: false,
-            central_heard: false,
+            has_central_input: false,
             ticked_at: None,
             figures: LoopFigures::default(),
             stopping: false,
@@ -136,13 +142,13 @@ impl Drive {
 
     fn tick(&mut self, tick: Tick, context: &mut AppContext<Self>) {
         let now = Time::now();
-        let gait = self.word(now, context);
+        let gait = self.newest_command(now, context);
         let is_shut = self.is_shut();
         if is_shut {
-            self.core.disbelieve_gait();
+            self.core.distrust_gait();
         }
-        if let Some(Err(error)) = self.word.as_mut().map(|word| word.look(context)) {
-            self.tell_unguarded(&error);
+        if let Some(Err(error)) = self.commands.as_mut().map(|commands| commands.poll(context)) {
+            self.report_unguarded(&error);
         }
         let mut output = self.core.tick(now.as_nanos(), self.sample.as_ref(), gait.as_ref());
         output.command_nm = self.command(now, &output, gait.as_ref());
@@ -150,13 +156,13 @@ impl Drive {
         if output.state != DriveState::Init
             && let Some(gate) = self.ready.take()
         {
-            tracing::info!(joint = %self.parts.joint, "all parts are heard: the drive is ready");
+            tracing::info!(joint = %self.parts.joint, "all inputs have arrived: the drive is ready");
             gate.reached();
         }
         self.note(now, tick, &output);
         if tick.number.is_multiple_of(STATUS_TICKS) {
             let status = self.core.status(now.as_nanos());
-            // Nobody may want to know.
+            // There may be no receiver.
             let _ = context.send(Tid::group(STATUS), &status);
             if let Some(central) = self.central.at(now, context) {
                 let _ = context.send(central, &status);
@@ -165,7 +171,8 @@ impl Drive {
         }
         if self.stopping && self.at_rest(&output) {
             if output.command_nm.is_none() {
-                // Not heard: it may hold a torque all the same, from an earlier life of this drive.
+                // No reading has arrived: the device may still hold a torque, from an earlier incarnation of
+                // this drive.
                 self.damper.damp(now, output.state);
             }
             context.stop();
@@ -182,54 +189,56 @@ impl Drive {
         }
     }
 
-    /// What central says, if that is good. Guarded from the moment on at which it is there.
-    fn word(&mut self, now: Time, context: &mut AppContext<Self>) -> Option<GaitState> {
+    /// Returns central's newest command if it is good. Creates the guard as soon as central is known.
+    fn newest_command(&mut self, now: Time, context: &mut AppContext<Self>) -> Option<GaitState> {
         let central = self.central.at(now, context)?;
-        if self.word.as_ref().is_none_or(|word| word.central != central) {
-            // What another life of central has said is worth nothing any more.
-            self.word = None;
+        if self.commands.as_ref().is_none_or(|commands| commands.central != central) {
+            // Commands of an earlier incarnation of central do not count any more.
+            self.commands = None;
             match self.guard(central, context) {
-                Ok(guard) => self.word = Some(Word::new(central, guard)),
-                Err(error) => self.tell_unguarded(&error),
+                Ok(guard) => self.commands = Some(CentralCommands::new(central, guard)),
+                Err(error) => self.report_unguarded(&error),
             }
         }
-        self.word.as_ref()?.guard.apply(|output| output.word).ok().flatten()
+        self.commands.as_ref()?.guard.apply(|output| output.command).ok().flatten()
     }
 
-    /// Says once that a guard cannot be had; it is tried again in the next tick.
-    fn tell_unguarded(&mut self, error: &io::Error) {
+    /// Reports once that there is no guard; its creation is retried in the next tick.
+    fn report_unguarded(&mut self, error: &io::Error) {
         if !std::mem::replace(&mut self.unguarded, true) {
             let joint = self.parts.joint;
-            tracing::error!(%joint, %error, "central's word cannot be guarded: no torque comes of it");
+            tracing::error!(%joint, %error, "central's commands cannot be guarded: no torque comes of it");
         }
     }
 
-    /// The only way to the device for what may assist, with who repeats the order to damp.
+    /// The only access to the device for assisting torques, with the thread that repeats the order to damp.
     fn guard(&mut self, central: Tid, context: &mut AppContext<Self>) -> io::Result<Guard<Output>> {
-        let lookout = match self.lookout.take() {
-            Some(lookout) => lookout,
-            None => Lookout::start(self.device.damper())?,
+        let repeater = match self.repeater.take() {
+            Some(repeater) => repeater,
+            None => DampingRepeater::start(self.device.damper())?,
         };
-        let again = self.lookout.insert(lookout).watch().clone();
+        let again = self.repeater.insert(repeater).handle().clone();
         let output = Output::new(self.device.damper(), again);
         context.guard::<GaitState, _>(central, output, |output, _| output.make_safe())
     }
 
-    /// Whether central's word does not count, though it is known whose it is.
+    /// Whether central is known, but its commands do not count.
     fn is_shut(&self) -> bool {
-        self.word.as_ref().is_some_and(Word::is_shut)
+        self.commands.as_ref().is_some_and(CentralCommands::is_shut)
     }
 
-    /// Gives the device its command, and returns what it is to give, Nm; `None` when it is told nothing, or to damp by itself.
+    /// Sends the device its order, and returns the torque, Nm; `None` if the device gets no order, or the one
+    /// to damp.
     ///
-    /// What may assist goes through the open guard, so that none follows the order to damp, however long this thread was held up
-    /// before it came here. With a shut one the device is left to damp by itself; what is on its way to zero goes on while it is young.
+    /// Torques that may assist go through the open guard, so that none follows the order to damp, even if
+    /// this thread was delayed before. With a shut guard the device is ordered to damp by itself; a torque
+    /// that is being ramped to zero continues while it is young.
     fn command(&mut self, now: Time, output: &DriveOutput, gait: Option<&GaitState>) -> Option<f64> {
         let released = gait.is_some_and(|gait| !matches!(gait.mode, GaitMode::Hold | GaitMode::Stop));
         let (saturated, state, command_nm) = (output.saturated, output.state, output.command_nm);
         let was_giving = self.gives;
-        let Self { word, device, damper, gives, core, lookout, .. } = self;
-        let mut tell = |order| match order {
+        let Self { commands, device, damper, gives, core, repeater, .. } = self;
+        let mut send_order = |order| match order {
             Order::Torque(torque_nm) => {
                 device.command(now, &DriveCommand { torque_nm, released, saturated, state });
                 *gives = torque_nm != 0.0;
@@ -241,43 +250,44 @@ impl Drive {
             }
             Order::Nothing => None,
         };
-        let through = word.as_ref().map(|word| {
-            word.guard.apply(|to| {
+        let through = commands.as_ref().map(|commands| {
+            commands.guard.apply(|to| {
                 let order = Order::through_open(command_nm, to.gives || was_giving);
                 if let Order::Torque(torque_nm) = order {
                     to.gives = torque_nm != 0.0;
                     to.again.rests();
                 }
-                (tell(order), order)
+                (send_order(order), order)
             })
         });
         if let Some(Ok((given, order))) = through {
             if order == Order::Damp {
-                // It was told so now, and not when this tick began.
+                // The order was sent now, not when this tick began.
                 core.let_device_damp(Time::now().as_nanos());
             }
             return given;
         }
         let order = Order::past_shut(state, command_nm, was_giving, Time::now().since(now));
-        let again = lookout.as_ref().map(Lookout::watch);
+        let again = repeater.as_ref().map(DampingRepeater::handle);
         match order {
             Order::Damp => {
-                let given = tell(order);
+                let given = send_order(order);
                 core.let_device_damp(Time::now().as_nanos());
                 return given;
             }
-            Order::Torque(0.0) => again.into_iter().for_each(Watch::rests),
-            Order::Torque(_) => again.into_iter().for_each(Watch::ramps),
+            Order::Torque(0.0) => again.into_iter().for_each(RepeaterHandle::rests),
+            Order::Torque(_) => again.into_iter().for_each(RepeaterHandle::ramps),
             Order::Nothing => {}
         }
-        tell(order)
+        send_order(order)
     }
 
-    /// Tells central that its word does not count, though it comes; what becomes of that is central's to say.
+    /// Reports to central that its commands arrive, but do not count. Central decides whether to open the
+    /// guard.
     fn ask_to_be_armed(&self, context: &AppContext<Self>) {
-        let Some(word) = self.word.as_ref().filter(|word| word.is_shut()) else { return };
-        // It is asked again.
-        let _ = context.send(word.central, &Shut { suspect: word.is_suspect() });
+        let Some(commands) = self.commands.as_ref().filter(|commands| commands.is_shut()) else { return };
+        // A lost report is followed by the next.
+        let _ = context.send(commands.central, &Shut { suspect: commands.is_suspect() });
     }
 
     fn at_rest(&self, output: &DriveOutput) -> bool {
@@ -308,19 +318,13 @@ impl Drive {
         self.parts.trace.note(row);
     }
 
-    /// Writes down what happened once, now.
-    fn note_event(&self, what: &str, whom: &str, how: String) {
-        let (what, whom) = (what.to_owned(), whom.to_owned());
-        self.parts.events.note(EventRow { t_ns: Time::now().as_nanos(), what, whom, how });
-    }
-
     fn note_silence(&self, input: &str, silence: InputTimeout) {
         let (joint, silent) = (self.parts.joint, silence.silent);
         tracing::warn!(%joint, input, ?silent, age = ?silence.age, lateness = ?silence.lateness, "an input is silent");
-        self.note_event("input_silent", input, format!("nothing for {silent:?}"));
+        self.parts.events.event("input_silent", input, format!("nothing for {silent:?}"));
     }
 
-    fn tell_figures(&self) {
+    fn report_figures(&self) {
         let (joint, counters, summary) = (self.parts.joint, *self.core.counters(), self.figures.summary());
         tracing::info!(
             %joint,
@@ -347,7 +351,7 @@ fn write_json(path: &Path, value: &impl serde::Serialize) -> io::Result<()> {
     std::fs::write(path, serde_json::to_string_pretty(value).map_err(io::Error::other)?)
 }
 
-/// Whole microseconds; more than an hour is an hour and a bit.
+/// Whole microseconds; saturates at about 71 minutes.
 pub(super) fn micros(time: Duration) -> u32 {
     u32::try_from(time.as_micros()).unwrap_or(u32::MAX)
 }
@@ -372,7 +376,7 @@ impl Actor for Drive {
     }
 
     fn stopped(&mut self, _: &mut Self::Context) {
-        self.tell_figures();
+        self.report_figures();
     }
 }
 
@@ -385,7 +389,7 @@ impl Handler<Delivery<JointSample>> for Drive {
             return;
         }
         if self.sample.is_none() {
-            // From the first one on: before it there is nothing that could fall silent.
+            // From the first one on: before it there is no silence to detect.
             context.watch_input::<JointSample>(None, SILENCE_MAX, |this, silence, _| {
                 this.note_silence("joint sample", silence);
             });
@@ -399,18 +403,18 @@ impl Handler<Delivery<GaitState>> for Drive {
     type Result = ();
 
     fn handle(&mut self, gait: Delivery<GaitState>, context: &mut Self::Context) {
-        // What is not central's, damaged, old, repeated or out of order does not come here.
-        let Some(word) = self.word.as_ref().filter(|word| word.central == gait.source) else {
+        // Commands that are not from central, damaged, old, repeated or out of order do not arrive here.
+        let Some(commands) = self.commands.as_ref().filter(|commands| commands.central == gait.source) else {
             context.reject();
             return;
         };
         let (t_ns, t_error_ns) = sent(&gait, gait.t_ns);
         let gait = GaitState { t_ns, t_error_ns, ..gait.payload };
-        if word.guard.apply(|output| output.word = Some(gait)).is_err() {
+        if commands.guard.apply(|output| output.command = Some(gait)).is_err() {
             context.reject();
             return;
         }
-        if !std::mem::replace(&mut self.central_heard, true) {
+        if !std::mem::replace(&mut self.has_central_input, true) {
             context.watch_input::<GaitState>(None, SILENCE_MAX, |this, silence, _| {
                 this.note_silence("gait state", silence);
             });
@@ -441,11 +445,11 @@ impl Handler<Delivery<Arm>> for Drive {
 
     fn handle(&mut self, arm: Delivery<Arm>, context: &mut Self::Context) {
         let state = self.core.state();
-        let Some(word) = self.word.as_mut().filter(|word| word.central == arm.source) else {
+        let Some(commands) = self.commands.as_mut().filter(|commands| commands.central == arm.source) else {
             context.reject();
             return;
         };
-        match word.arm(&arm, state) {
+        match commands.arm(&arm, state) {
             Armed::Now => {}
             Armed::Before => return,
             Armed::Refused => {
@@ -453,7 +457,7 @@ impl Handler<Delivery<Arm>> for Drive {
                 return;
             }
         }
-        self.note_event("armed", &arm.source.to_string(), String::new());
+        self.parts.events.event("armed", &arm.source.to_string(), String::new());
     }
 }
 
@@ -461,10 +465,10 @@ impl Handler<Delivery<EmergencyStop>> for Drive {
     type Result = ();
 
     fn handle(&mut self, stop: Delivery<EmergencyStop>, _: &mut Self::Context) {
-        // From anybody: to stop needs no right.
+        // Accepted from any sender: stopping needs no permission.
         tracing::warn!(joint = %self.parts.joint, by = %stop.source, "the e-stop was pressed");
         self.core.emergency_stop();
-        self.note_event("e_stop", &stop.source.to_string(), String::new());
+        self.parts.events.event("e_stop", &stop.source.to_string(), String::new());
     }
 }
 
@@ -478,7 +482,7 @@ impl Handler<Delivery<Reset>> for Drive {
             return;
         }
         match self.core.reset(now.as_nanos()) {
-            Ok(()) => self.note_event("reset", &reset.source.to_string(), String::new()),
+            Ok(()) => self.parts.events.event("reset", &reset.source.to_string(), String::new()),
             Err(refusal) => {
                 tracing::warn!(joint = %self.parts.joint, %refusal, "the e-stop stays");
                 context.reject();

@@ -1,17 +1,15 @@
 //! Timing figures of a control loop, with an error of at most a tenth of a per cent and bounded memory.
 
+use exoskeleton_model::message::DriveState;
 use hdrhistogram::Histogram;
-use serde::Serialize;
+use sinew_figures::stalls::LATE_MAX;
 
 use super::PERIOD;
 use super::trace::DriveRow;
-use crate::message::DriveState;
 use crate::plot::Lateness;
-use crate::report::PercentilesUs;
+use crate::report::{LoopSummary, PercentilesUs};
 
-/// A tick that is later than this is a missed deadline, us.
-pub const LATE_MAX_US: u64 = 2_000;
-/// Longest time that is told apart, us.
+/// Maximum time that is resolved, us.
 const LONGEST_US: u64 = 60_000_000;
 const BUCKET_US: f64 = 25.0;
 const BUCKETS: usize = 120;
@@ -26,32 +24,10 @@ pub struct LoopFigures {
     deadline_misses: u64,
 }
 
-/// The figures as they are told.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct LoopSummary {
-    /// Ticks.
-    pub ticks: u64,
-    /// Time between ticks.
-    pub period_us: PercentilesUs,
-    /// How late ticks came.
-    pub lateness_us: PercentilesUs,
-    /// Age of the joint sample that was used while walking: from its sensor's reading to the drive's tick.
-    pub sample_age_us: PercentilesUs,
-    /// Age of the gait state that was used while walking: from central's tick to the drive's.
-    pub gait_age_us: PercentilesUs,
-    /// Turns that did not come within 2 ms of their time.
-    pub deadline_misses: u64,
-}
-
 impl Default for LoopFigures {
     fn default() -> Self {
-        Self {
-            period: histogram(),
-            lateness: histogram(),
-            sample_age: histogram(),
-            gait_age: histogram(),
-            deadline_misses: 0,
-        }
+        let [period, lateness, sample_age, gait_age] = [(); 4].map(|()| histogram());
+        Self { period, lateness, sample_age, gait_age, deadline_misses: 0 }
     }
 }
 
@@ -74,7 +50,7 @@ impl LoopFigures {
         }
     }
 
-    /// The figures so far.
+    /// Returns the figures so far.
     #[must_use]
     pub fn summary(&self) -> LoopSummary {
         LoopSummary {
@@ -87,7 +63,7 @@ impl LoopFigures {
         }
     }
 
-    /// The lateness for the picture; what is later than its right edge is in the last bucket.
+    /// The lateness for the picture; values beyond its right edge are in the last bucket.
     #[must_use]
     pub fn lateness(&self) -> Lateness {
         let mut counts = vec![0; BUCKETS];
@@ -99,7 +75,7 @@ impl LoopFigures {
     }
 }
 
-/// The percentiles of these times, us.
+/// Returns the percentiles of these times, us.
 pub fn percentiles_of(times_us: impl IntoIterator<Item = u32>) -> PercentilesUs {
     let mut histogram = histogram();
     times_us.into_iter().for_each(|time_us| histogram.saturating_record(u64::from(time_us)));
@@ -110,9 +86,9 @@ fn histogram() -> Histogram<u64> {
     Histogram::new_with_bounds(1, LONGEST_US, 3).expect("1 is at least 1 and 3 digits are few")
 }
 
-/// Turns that were lost for their deadline by a tick that is `late_us` late: itself, and those it ran over.
+/// Turns that missed their deadline by a tick that is `late_us` late: itself, and those that it delayed.
 fn misses(late_us: u64) -> u64 {
-    late_us.saturating_sub(LATE_MAX_US).div_ceil(PERIOD.as_micros() as u64)
+    late_us.saturating_sub(LATE_MAX.as_micros() as u64).div_ceil(PERIOD.as_micros() as u64)
 }
 
 fn percentiles(histogram: &Histogram<u64>) -> PercentilesUs {
@@ -121,11 +97,5 @@ fn percentiles(histogram: &Histogram<u64>) -> PercentilesUs {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn turns_that_a_late_tick_ran_over_count_as_missed_too() {
-        assert_eq!([0, 2_000, 2_001, 3_000, 3_001, 5_200].map(misses), [0, 0, 1, 1, 2, 4]);
-    }
-}
+#[path = "../../tests/unit/figures.rs"]
+mod tests;

@@ -1,11 +1,15 @@
 //! The application `central.gait`: the shell around [`CentralCore`].
 //!
-//! It starts when the three sensors are ready, and is ready itself when all inputs are fresh. That a joint is gone it
-//! hears in three ways, and the first counts: its samples are older than 10 ms, its node is lost, its sensor is.
+//! It starts when the three sensors are ready, and is ready itself when all inputs are fresh. It detects the
+//! loss of a joint in three ways, and the first counts: its samples are older than 10 ms, its node is lost,
+//! or its sensor is.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
+use exoskeleton_model::central::{CentralConfig, CentralCore, CentralInput, Resume, bit};
+use exoskeleton_model::joint::{Joint, PerJoint};
+use exoskeleton_model::message::{DriveStatus, FootLoad, GaitMode, GaitState, JointSample};
 use sinew::prelude::*;
 use sinew::{NodeAddress, events::Down, supervision::ReadyGate};
 
@@ -16,30 +20,27 @@ use super::edges::{
     drive_name, joint_of_sensor, sensor_name, sent,
 };
 use super::trace::{EventRow, GaitRow, Trace};
-use crate::central::{CentralConfig, CentralCore, CentralInput, Resume, bit};
-use crate::joint::{Joint, PerJoint};
-use crate::message::{DriveStatus, FootLoad, GaitMode, GaitState, JointSample};
 
 /// Ticks between two statuses: 20 a second.
 const STATUS_TICKS: u64 = 50;
 
-/// What the gait application is made with, in each of its lives.
+/// The constructor arguments of the gait application, the same for each incarnation.
 #[derive(Clone)]
 pub struct GaitParts {
     /// Addresses of the joint nodes.
     pub joints: PerJoint<NodeAddress>,
-    /// Epoch of the next life: begins at the node's incarnation in seconds, so that it grows over restarts of the node
-    /// and of the application.
+    /// Epoch of the next incarnation: begins at the node's incarnation in seconds, so that it grows over
+    /// restarts of the node and of the application.
     pub epoch: Arc<AtomicU32>,
-    /// Where its ticks go.
+    /// Trace of its ticks.
     pub trace: Trace<GaitRow>,
-    /// Where it writes down what happens once.
+    /// Trace of single events.
     pub events: Trace<EventRow>,
-    /// How it goes on after a loss.
+    /// How it continues after a loss.
     pub resume: Resume,
 }
 
-/// How a joint is known to be gone.
+/// The signs that a joint is lost.
 #[derive(Debug, Clone, Copy, Default)]
 struct Gone {
     node: bool,
@@ -50,9 +51,10 @@ struct Gone {
 pub struct Gait {
     parts: GaitParts,
     core: CentralCore,
-    /// Whom the gait is told, one by one: what moves a joint is protected from here to its drive.
+    /// The receivers of the gait, one by one: commands that move a joint are protected from here to its
+    /// drive.
     drives: PerJoint<Addressee>,
-    /// What they were told last to do.
+    /// The last command to them.
     mode: Option<GaitMode>,
     samples: PerJoint<Option<JointSample>>,
     load: Option<FootLoad>,
@@ -61,7 +63,7 @@ pub struct Gait {
     late_max: Duration,
     /// Joints that were flagged as degraded last.
     degraded: u8,
-    /// Joints of whose drives this is told the end.
+    /// Joints with a monitor on their drive.
     monitored: PerJoint<bool>,
 }
 
@@ -113,7 +115,7 @@ impl Gait {
         if let Some(state) = &state {
             for drive in &mut self.drives {
                 if let Some(drive) = drive.at(now, context) {
-                    // One that cannot be reached hears nothing, and lets go by itself.
+                    // A drive that cannot be reached receives nothing, and stops assisting by itself.
                     let _ = context.send(drive, state);
                 }
             }
@@ -151,21 +153,15 @@ impl Gait {
         }
     }
 
-    /// Tells once that a joint walks without its drive's help, and once that it does not any more.
+    /// Reports once that a joint walks without its drive's help, and once that this has ended.
     fn flag_degraded(&mut self) {
         let degraded = self.core.degraded();
         let changed = std::mem::replace(&mut self.degraded, degraded) ^ degraded;
         for joint in Joint::ALL.into_iter().filter(|joint| changed & bit(*joint) != 0) {
             let what = if degraded & bit(joint) != 0 { "degraded" } else { "assisted_again" };
             tracing::warn!(%joint, what, "a drive that is asked to assist changes");
-            self.note_event(what, joint.name());
+            self.parts.events.event(what, joint.name(), String::new());
         }
-    }
-
-    fn note_event(&self, what: &str, whom: &str) {
-        let t_ns = Time::now().as_nanos();
-        let (what, whom) = (what.to_owned(), whom.to_owned());
-        self.parts.events.note(EventRow { t_ns, what, whom, how: String::new() });
     }
 
     fn joint_at(&self, node: NodeAddress) -> Option<Joint> {
@@ -226,7 +222,7 @@ impl Handler<Delivery<Release>> for Gait {
     type Result = ();
 
     fn handle(&mut self, release: Delivery<Release>, context: &mut Self::Context) {
-        // Only by somebody on central itself.
+        // Only from an application on central itself.
         if release.source.node != context.tid().node {
             context.reject();
             return;
@@ -245,10 +241,10 @@ impl Handler<Delivery<EmergencyStop>> for Gait {
     type Result = ();
 
     fn handle(&mut self, stop: Delivery<EmergencyStop>, _: &mut Self::Context) {
-        // From anybody: to stop needs no right.
+        // Accepted from any sender: stopping needs no permission.
         tracing::warn!(by = %stop.source, "the e-stop was pressed");
         self.core.stop();
-        self.note_event("e_stop", &stop.source.to_string());
+        self.parts.events.event("e_stop", &stop.source.to_string(), String::new());
     }
 }
 
@@ -256,14 +252,14 @@ impl Handler<Delivery<Reset>> for Gait {
     type Result = ();
 
     fn handle(&mut self, reset: Delivery<Reset>, context: &mut Self::Context) {
-        // Only by somebody on central itself.
+        // Only from an application on central itself.
         if reset.source.node != context.tid().node {
             context.reject();
             return;
         }
         tracing::info!(by = %reset.source, "the e-stop is taken back");
         self.core.reset();
-        self.note_event("reset", &reset.source.to_string());
+        self.parts.events.event("reset", &reset.source.to_string(), String::new());
     }
 }
 
@@ -274,24 +270,25 @@ impl Handler<Delivery<DriveStatus>> for Gait {
         match self.joint_at(status.source.node) {
             Some(joint) => {
                 let monitored = &mut self.monitored[joint.index()];
-                // Without a monitor its silence is noticed all the same, 25 ms later.
+                // Without a monitor its silence is detected all the same, 25 ms later.
                 *monitored = *monitored || context.monitor(status.source).is_ok();
                 let (t_ns, t_error_ns) = sent(&status, status.t_ns);
                 let status = DriveStatus { t_ns, t_error_ns, ..status.payload };
-                self.core.drive_heard(Time::now().as_nanos(), joint, &status);
+                self.core.on_drive_status(Time::now().as_nanos(), joint, &status);
             }
             None => context.reject(),
         }
     }
 }
 
-/// Whether a drive may let central's word count again. While a part is missing it waits for what comes of that. One in whose words
-/// somebody has meddled waits until the leg is held, after which walking is released anew.
+/// Whether a drive may accept central's commands again. While a part is missing it has to wait for the
+/// outcome of that. A drive with manipulated commands waits until the leg is held, after which walking is
+/// released again.
 const fn may_arm(mode: Option<GaitMode>, suspect: bool) -> bool {
     match mode {
-        // No torque comes of these.
+        // These commands cause no torque.
         Some(GaitMode::Hold | GaitMode::Stop) => true,
-        // Walking is released: words were late or lost, or the drive is a new one.
+        // Walking is released: commands were late or lost, or the drive is a new one.
         Some(GaitMode::Sync | GaitMode::Walk) => !suspect,
         Some(GaitMode::Safe) | None => false,
     }
@@ -308,7 +305,7 @@ impl Handler<Delivery<Shut>> for Gait {
         if self.drives[joint.index()].at(Time::now(), context) != Some(shut.source) {
             context.reject();
         } else if may_arm(self.mode, shut.suspect) {
-            // One that cannot be reached asks again.
+            // A drive that cannot be reached asks again.
             let _ = context.send(shut.source, &Arm { suspect: shut.suspect });
         }
     }
@@ -320,7 +317,7 @@ impl Handler<Delivery<Down>> for Gait {
     fn handle(&mut self, down: Delivery<Down>, _: &mut Self::Context) {
         let Some(joint) = self.joint_at(down.payload.tid.node) else { return };
         tracing::warn!(%joint, why = %down.payload, "a drive has ended");
-        // The next life is watched from its first word on.
+        // The next incarnation is monitored from its first message on.
         self.monitored[joint.index()] = false;
         self.core.drive_ended(joint, Time::now().as_nanos());
     }
@@ -336,7 +333,7 @@ impl Handler<Delivery<NodeEvent>> for Gait {
                     self.learn(joint, |gone| gone.node = true);
                 }
             }
-            // Its drives' own watches, and the requirements, say sooner what that means for the gait.
+            // Its drives' own watchdogs, and the requirements, report the effect on the gait sooner.
             NodeEvent::AppStalled { .. } | NodeEvent::AppResumed { .. } => {}
             NodeEvent::NodeFound { node, .. } | NodeEvent::NodeRestarted { node, .. } => {
                 if let Some(joint) = self.joint_at(node) {
@@ -362,15 +359,5 @@ impl Handler<Delivery<RequirementEvent>> for Gait {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn word_counts_again_where_no_torque_comes_of_it_or_walking_is_released_and_nobody_has_meddled() {
-        let modes = [GaitMode::Hold, GaitMode::Sync, GaitMode::Walk, GaitMode::Safe, GaitMode::Stop];
-        let may = |suspect| modes.map(|mode| may_arm(Some(mode), suspect));
-        assert_eq!(may(false), [true, true, true, false, true]);
-        assert_eq!(may(true), [true, false, false, false, true]);
-        assert!(!may_arm(None, false), "nobody is told anything yet");
-    }
-}
+#[path = "../../tests/unit/gait.rs"]
+mod tests;

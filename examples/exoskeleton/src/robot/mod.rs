@@ -19,13 +19,12 @@
 //!        status screen                               plant: the leg, its person, three motors
 //! ```
 //!
-//! Read it in this order: [`topology`] (who is where), [`device`] and [`datagram`] (the seam to the hardware),
-//! [`sensor`], [`drive`], [`gait`], [`coordinator`], [`watch`] (the applications: thin shells around the cores),
-//! [`node`] (a process with some of them), [`plant`] (the process that stands for hardware and person), [`launch`] (all
-//! five on this host). [`trace`] is what each leaves behind.
+//! Reading order: [`topology`] (the places of all parts), [`device`] (the hardware
+//! interface), [`sensor`], [`drive`], [`gait`], [`coordinator`], [`watch`] (the applications: thin shells
+//! around the cores), [`node`] (a process with some of them), [`plant`] (the process that simulates hardware
+//! and person), [`launch`] (all five on this host). [`trace`] is the record of each.
 
 pub mod coordinator;
-pub mod datagram;
 pub mod device;
 pub mod drive;
 pub mod edges;

@@ -7,6 +7,9 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::SystemTime;
 
+use exoskeleton_model::central::Resume;
+use exoskeleton_model::joint::Joint;
+use exoskeleton_model::part::Part;
 use sinew::address::Incarnation;
 use sinew::prelude::*;
 use sinew::signals::StopSignals;
@@ -22,35 +25,35 @@ use super::topology::{ControlThread, DrivePlace, ReleaseBy, Topology, TopologyFa
 use super::trace::{EventRow, Recording, TraceRow};
 use super::watch::WatchParts;
 use super::{coordinator, drive, gait, sensor, watch};
-use crate::central::Resume;
-use crate::joint::Joint;
-use crate::part::Part;
 
-/// What to run.
-#[derive(Debug, Clone)]
+/// The command line of a process.
+#[derive(Debug, Clone, clap::Args)]
 pub struct NodeOptions {
-    /// Which process.
+    /// central, hip, knee, ankle or plant.
     pub role: Role,
-    /// The topology file.
+    /// Which node of the robot is where; see `examples/exoskeleton/topology.toml`.
+    #[arg(long, value_name = "FILE")]
     pub topology: PathBuf,
-    /// Where it leaves its traces; `None`: nowhere.
+    /// Folder for its traces; without it there are none.
+    #[arg(long, value_name = "DIR")]
     pub run_dir: Option<PathBuf>,
-    /// Whether it stops in order when its standard input ends: so that it dies with whoever started it.
+    /// Stop when the standard input ends: for a program that starts this one.
+    #[arg(long)]
     pub stop_with_stdin: bool,
 }
 
-/// Why a process of the robot does not run.
+/// The reason why a process of the robot does not run.
 #[derive(Debug, Error)]
 pub enum NodeError {
-    /// The topology is of no use.
+    /// The topology is invalid.
     #[error("{path}: {faults}")]
     Topology {
         /// The file.
         path: String,
-        /// What is wrong with it.
+        /// Its faults.
         faults: TopologyFaults,
     },
-    /// A trace cannot be begun.
+    /// A trace cannot be started.
     #[error("no trace can be written: {0}")]
     Trace(io::Error),
     /// The node does not start.
@@ -59,16 +62,17 @@ pub enum NodeError {
     /// The plant does not start, or ended early.
     #[error(transparent)]
     Plant(#[from] PlantError),
-    /// The system gives no thread.
+    /// The system provides no thread.
     #[error("no thread: {0}; raise `ulimit -u`")]
     Thread(io::Error),
 }
 
-/// Runs a process of the robot until SIGINT, SIGTERM or SIGHUP.
+/// Runs a process of the robot until SIGINT, SIGTERM or SIGHUP. It logs to standard error.
 ///
 /// # Errors
 /// It did not start, or the plant ended early.
 pub fn run(options: &NodeOptions) -> Result<ExitCode, NodeError> {
+    log_to_stderr();
     let topology = Topology::read(&options.topology)
         .map_err(|faults| NodeError::Topology { path: options.topology.display().to_string(), faults })?;
     match options.role {
@@ -78,7 +82,7 @@ pub fn run(options: &NodeOptions) -> Result<ExitCode, NodeError> {
             stop_on_signals(stop.clone())?;
             if options.stop_with_stdin {
                 let stop = stop.clone();
-                // SYNC: Relaxed, the flag carries nothing but itself.
+                // SYNC: Relaxed, no other data depends on the flag.
                 when_stdin_ends(move || stop.store(true, Ordering::Relaxed))?;
             }
             plant::run(&topology.plant, options.run_dir.as_deref(), &stop)?;
@@ -87,7 +91,16 @@ pub fn run(options: &NodeOptions) -> Result<ExitCode, NodeError> {
     }
 }
 
-/// The node's builder with everything that its part of the robot needs.
+/// `RUST_LOG` sets the log filter; without it everything from `info` on.
+fn log_to_stderr() {
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(io::stderr).with_ansi(false);
+    // It would report a failing standard error on standard error, and panic.
+    log.log_internal_errors(false).init();
+}
+
+/// Runs a node with all that its part of the robot needs.
 fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<ExitCode, NodeError> {
     let incarnation = incarnation();
     let events = record::<EventRow>(options, &format!("{part}-events"))?;
@@ -112,7 +125,7 @@ fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<Ex
                 ReleaseBy::Operator => builder,
             };
             let code = start_and_run(builder, &watched, options)?;
-            tell_lost_rows(trace.finish());
+            report_lost_rows(trace.finish());
             code
         }
         Part::Joint(joint) => {
@@ -130,11 +143,11 @@ fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<Ex
                 .app(sensor::spec(joint, device, events.trace(), place(topology)))
                 .app(drive::spec(parts, drive_place(joint, topology)));
             let code = start_and_run(builder, &watched, options)?;
-            tell_lost_rows(trace.finish());
+            report_lost_rows(trace.finish());
             code
         }
     };
-    tell_lost_rows(events.finish());
+    report_lost_rows(events.finish());
     Ok(code)
 }
 
@@ -145,7 +158,7 @@ fn start_and_run(
 ) -> Result<ExitCode, NodeError> {
     let node = builder.start()?;
     let handle = node.handle();
-    // Nobody else sets it.
+    // Nothing else sets it.
     let _ = watched.set(handle.clone());
     if options.stop_with_stdin {
         when_stdin_ends(move || handle.stop())?;
@@ -157,7 +170,7 @@ fn record<R: TraceRow>(options: &NodeOptions, name: &str) -> Result<Recording<R>
     Recording::begin(options.run_dir.as_deref(), name).map_err(NodeError::Trace)
 }
 
-fn tell_lost_rows(lost: u64) {
+fn report_lost_rows(lost: u64) {
     if lost > 0 {
         tracing::warn!(lost, "rows of a trace were lost: the disk was too slow");
     }
@@ -188,7 +201,7 @@ fn drive_place(joint: Joint, topology: &Topology) -> Place {
 fn device_maker(joint: Joint, topology: &Topology) -> DeviceMaker {
     let plant = topology.plant.address;
     Arc::new(move || -> Box<dyn JointDevice> {
-        // The application fails with these words, and its supervisor tries again within its limit.
+        // The application fails with this text, and its supervisor tries again within its limit.
         let device = UdpDevice::connect(joint, plant).unwrap_or_else(|e| {
             panic!("no way to the {joint} device at {plant}: {e}; is this host's route to it up?")
         });
@@ -196,8 +209,11 @@ fn device_maker(joint: Joint, topology: &Topology) -> DeviceMaker {
     })
 }
 
-/// Larger than that of any life before, as long as the host's clock does not go back.
-#[expect(clippy::disallowed_methods, reason = "read once, at the start: a later life needs a larger number")]
+/// Larger than that of any earlier run, as long as the host's clock does not go back.
+#[expect(
+    clippy::disallowed_methods,
+    reason = "read once, at the start: a later incarnation needs a larger number"
+)]
 fn incarnation() -> Incarnation {
     let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     Incarnation(u64::try_from(since_1970.as_micros()).unwrap_or(u64::MAX))
@@ -206,7 +222,7 @@ fn incarnation() -> Incarnation {
 fn when_stdin_ends(act: impl FnOnce() + Send + 'static) -> Result<(), NodeError> {
     let wait = move || {
         let mut byte = [0];
-        // Whoever started this says nothing; an error is an end too.
+        // The parent process writes nothing; an error is an end, too.
         while matches!(io::stdin().read(&mut byte), Ok(1)) {}
         act();
     };
@@ -214,7 +230,7 @@ fn when_stdin_ends(act: impl FnOnce() + Send + 'static) -> Result<(), NodeError>
     Ok(())
 }
 
-/// For the plant, which is no node and has no runtime that heeds signals.
+/// For the plant, which is no node and has no runtime that handles signals.
 fn stop_on_signals(stop: Arc<AtomicBool>) -> Result<(), NodeError> {
     let runtime =
         tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(NodeError::Thread)?;
@@ -227,7 +243,7 @@ fn stop_on_signals(stop: Arc<AtomicBool>) -> Result<(), NodeError> {
                     return;
                 }
             }
-            // SYNC: Relaxed, the flag carries nothing but itself.
+            // SYNC: Relaxed, no other data depends on the flag.
             stop.store(true, Ordering::Relaxed);
         });
     };

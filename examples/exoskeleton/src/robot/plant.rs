@@ -1,8 +1,8 @@
 //! The plant process: person, leg and three motor devices behind UDP, stepped at exactly 1 kHz.
 //!
-//! It is no part of the product and knows nothing of Sinew: drives and sensors meet it as they would meet hardware. A
-//! device holds the last torque of a drive that falls silent. The person begins to walk when all three drives say that
-//! walking is released. A line on standard output tells each stride.
+//! It is no part of the product and knows nothing of Sinew: drives and sensors use it as they would use
+//! hardware. A device holds the last torque of a drive that falls silent. The person begins to walk when all
+//! three drives report that walking is released. It prints a line for each stride.
 
 use std::io;
 use std::net::{SocketAddr, UdpSocket};
@@ -10,41 +10,41 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use rustix::thread::{ClockId, clock_nanosleep_absolute};
+use exoskeleton_model::datagram::{COMMAND_BYTES, CommandFrame, Order, Reading};
+use exoskeleton_model::gait::trial::{Trial, TrialError};
+use exoskeleton_model::intention::Intention;
+use exoskeleton_model::joint::{Joint, PerJoint};
+use exoskeleton_model::plant::{PlantConfig, PlantCore, PlantReadings};
 use sinew::Time;
+use sinew_figures::stalls::sleep_until;
 use thiserror::Error;
 
 use super::PERIOD;
-use super::datagram::{Order, Reading, WORD_BYTES, Word};
 use super::topology::PlantPlace;
 use super::trace::{PlantRow, Recording, Trace};
-use crate::gait::trial::{Trial, TrialError};
-use crate::intention::Intention;
-use crate::joint::{Joint, PerJoint};
 use crate::output;
-use crate::plant::{PlantConfig, PlantCore, PlantReadings};
 
 const PERIOD_NS: u64 = PERIOD.as_nanos() as u64;
-/// Steps that are made up for at once after the process was held up; the world waits for the rest.
+/// Maximum number of delayed steps that are made up for at once; the simulation omits the rest.
 const STEPS_MAX: u64 = 100;
-/// Datagrams taken in one step; the rest waits in the socket.
+/// Datagrams read in one step; the rest waits in the socket.
 const READS_MAX: usize = 64;
 /// Silence after which a drive counts as silent in the record, ns. Shorter is jitter.
 const SILENT_AFTER_NS: u64 = 5_000_000;
-/// Silence after which a sender that counts from the beginning is a new one, ns.
+/// Silence after which a restarted counter is accepted as a new sender, ns.
 const NEW_SENDER_AFTER_NS: u64 = 10_000_000;
 
-/// Why the plant does not run.
+/// The reason why the plant does not run.
 #[derive(Debug, Error)]
 pub enum PlantError {
-    /// Its address cannot be had.
+    /// Its address is not available.
     #[error(
         "the plant cannot have {address}: {cause}; is another plant running? choose another plant.address"
     )]
     Address {
         /// The address.
         address: SocketAddr,
-        /// What the system said.
+        /// The error of the system.
         cause: io::Error,
     },
     /// The trial is not usable.
@@ -55,7 +55,7 @@ pub enum PlantError {
         /// Place and remedy.
         reason: TrialError,
     },
-    /// Its trace cannot be begun.
+    /// Its trace cannot be started.
     #[error("no trace can be written: {0}")]
     Trace(io::Error),
     /// The system's timer fails.
@@ -63,7 +63,7 @@ pub enum PlantError {
     Clock(rustix::io::Errno),
 }
 
-/// What the person of `place` means to do.
+/// The intention of the person of `place`.
 ///
 /// # Errors
 /// The trial is not usable.
@@ -91,11 +91,11 @@ pub fn run(place: &PlantPlace, folder: Option<&Path>, stop: &AtomicBool) -> Resu
         devices: Devices::new(socket),
         trace: recording.trace(),
         walking: false,
-        stride_told: None,
+        printed_stride: None,
         skipped: 0,
         seq: 0,
     };
-    tell("ready");
+    print_line("ready");
     let outcome = plant.run(stop);
     let (refused, skipped) = (plant.devices.refused, plant.skipped);
     let lost_rows = recording.finish();
@@ -108,7 +108,7 @@ struct Plant {
     devices: Devices,
     trace: Trace<PlantRow>,
     walking: bool,
-    stride_told: Option<u64>,
+    printed_stride: Option<u64>,
     skipped: u64,
     seq: u32,
 }
@@ -116,11 +116,11 @@ struct Plant {
 impl Plant {
     fn run(&mut self, stop: &AtomicBool) -> Result<(), PlantError> {
         let mut due = Time::now() + PERIOD;
-        // SYNC: Relaxed, the flag carries nothing but itself.
+        // SYNC: Relaxed, no other data depends on the flag.
         while !stop.load(Ordering::Relaxed) {
-            sleep_until(due)?;
+            sleep_until(due.as_nanos()).map_err(PlantError::Clock)?;
             let now = Time::now();
-            self.devices.listen(now);
+            self.devices.receive(now);
             self.start_when_released(now);
             let behind = now.since(due).as_nanos() as u64 / PERIOD_NS;
             let steps = 1 + behind.min(STEPS_MAX);
@@ -146,11 +146,11 @@ impl Plant {
         let readings = self.core.step(PERIOD_NS, &commands_nm);
         self.note(due, now);
         self.seq = self.seq.wrapping_add(1);
-        self.devices.tell(self.seq, due, &readings);
-        self.tell_stride();
+        self.devices.send_readings(self.seq, due, &readings);
+        self.print_stride();
     }
 
-    /// The person is a patient one: they wait for all three drives.
+    /// Starts walking when all three drives are released; the person waits for that without a time limit.
     fn start_when_released(&mut self, now: Time) {
         if !self.walking && self.devices.all_released(now) {
             self.walking = true;
@@ -160,8 +160,10 @@ impl Plant {
 
     fn note(&self, due: Time, now: Time) {
         let truth = self.core.truth();
-        let heard =
-            self.devices.words.map(|heard| heard.filter(|heard| !heard.is_silent(now, SILENT_AFTER_NS)));
+        let commands = self
+            .devices
+            .commands
+            .map(|command| command.filter(|command| !command.is_silent(now, SILENT_AFTER_NS)));
         self.trace.note(PlantRow {
             t_ns: due.as_nanos(),
             late_us: super::drive::micros(now.since(due)),
@@ -171,59 +173,43 @@ impl Plant {
             velocity_rad_s: truth.leg.velocity_rad_s,
             intended_rad: truth.intended.angle_rad,
             applied_nm: truth.applied_nm,
-            commanded_nm: heard.map(|heard| heard?.torque_nm()),
-            state: heard.map(|heard| heard.map(|heard| heard.word.state)),
-            saturated: heard.map(|heard| heard.is_some_and(|heard| heard.word.saturated)),
+            commanded_nm: commands.map(|command| command?.torque_nm()),
+            state: commands.map(|command| command.map(|command| command.frame.state)),
+            saturated: commands.map(|command| command.is_some_and(|command| command.frame.saturated)),
             watchdog: truth.watchdog_active,
         });
     }
 
-    fn tell_stride(&mut self) {
+    fn print_stride(&mut self) {
         if !self.walking {
             return;
         }
         let stride = self.core.truth().intended.strides as u64;
-        if self.stride_told != Some(stride) {
-            self.stride_told = Some(stride);
-            tell(&format!("stride {stride}"));
+        if self.printed_stride != Some(stride) {
+            self.printed_stride = Some(stride);
+            print_line(&format!("stride {stride}"));
         }
     }
 }
 
-/// Prints a line for the program that started the plant. Once a stride, so that it may take the microseconds of a write.
-fn tell(line: &str) {
+/// Prints a line for the program that started the plant. Once a stride, so that a write may take its
+/// microseconds.
+fn print_line(line: &str) {
     output::print(&format!("{line}\n"));
-}
-
-/// Sleeps until a moment of the host's clock.
-pub(super) fn sleep_until(due: Time) -> Result<(), PlantError> {
-    let nanos = due.as_nanos();
-    let request = rustix::thread::Timespec {
-        tv_sec: (nanos / 1_000_000_000).cast_signed(),
-        tv_nsec: (nanos % 1_000_000_000).cast_signed(),
-    };
-    loop {
-        match clock_nanosleep_absolute(ClockId::Monotonic, &request) {
-            Ok(()) => return Ok(()),
-            // A signal came in between; the time has not.
-            Err(rustix::io::Errno::INTR) => {}
-            Err(error) => return Err(PlantError::Clock(error)),
-        }
-    }
 }
 
 /// The last command of a drive.
 #[derive(Debug, Clone, Copy)]
-struct Heard {
-    word: Word,
+struct LastCommand {
+    frame: CommandFrame,
     order: Order,
     at: Time,
-    /// Not yet given to the device.
+    /// Not yet passed to the device.
     is_new: bool,
 }
 
-impl Heard {
-    /// What it is to give, Nm; `None` when that is the device's own matter.
+impl LastCommand {
+    /// The torque to apply, Nm; `None` when the device decides that itself.
     const fn torque_nm(&self) -> Option<f64> {
         match self.order {
             Order::Torque(torque_nm) => Some(torque_nm),
@@ -236,26 +222,26 @@ impl Heard {
     }
 }
 
-/// The motor devices' side of the wire.
+/// The network side of the motor devices.
 struct Devices {
     socket: UdpSocket,
-    /// Who wants the readings of each joint.
+    /// The receivers of the readings of each joint.
     listeners: PerJoint<Option<SocketAddr>>,
-    words: PerJoint<Option<Heard>>,
+    commands: PerJoint<Option<LastCommand>>,
     refused: u64,
 }
 
 impl Devices {
     const fn new(socket: UdpSocket) -> Self {
-        Self { socket, listeners: [None; 3], words: [None; 3], refused: 0 }
+        Self { socket, listeners: [None; 3], commands: [None; 3], refused: 0 }
     }
 
-    fn listen(&mut self, now: Time) {
-        let mut buffer = [0; WORD_BYTES + 1];
+    fn receive(&mut self, now: Time) {
+        let mut buffer = [0; COMMAND_BYTES + 1];
         for _ in 0..READS_MAX {
             match self.socket.recv_from(&mut buffer) {
-                Ok((length, source)) => match Word::decode(&buffer[..length]) {
-                    Ok(word) => self.take(word, source, now),
+                Ok((length, source)) => match CommandFrame::decode(&buffer[..length]) {
+                    Ok(frame) => self.accept(frame, source, now),
                     Err(_) => self.refused += 1,
                 },
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => return,
@@ -265,38 +251,39 @@ impl Devices {
         }
     }
 
-    fn take(&mut self, word: Word, source: SocketAddr, now: Time) {
-        let joint = word.joint.index();
-        let Some(order) = word.order else {
+    fn accept(&mut self, frame: CommandFrame, source: SocketAddr, now: Time) {
+        let joint = frame.joint.index();
+        let Some(order) = frame.order else {
             self.listeners[joint] = Some(source);
             return;
         };
-        let follows = self.words[joint].is_none_or(|last| {
-            let ahead = word.seq.wrapping_sub(last.word.seq).cast_signed();
+        let follows = self.commands[joint].is_none_or(|last| {
+            let ahead = frame.seq.wrapping_sub(last.frame.seq).cast_signed();
             ahead > 0 || last.is_silent(now, NEW_SENDER_AFTER_NS)
         });
         if follows {
-            self.words[joint] = Some(Heard { word, order, at: now, is_new: true });
+            self.commands[joint] = Some(LastCommand { frame, order, at: now, is_new: true });
         } else {
             self.refused += 1;
         }
     }
 
-    /// What the devices are told in this step; `None` for a drive that said nothing since the last.
+    /// The orders for the devices in this step; `None` for a drive that sent none since the last.
     fn take_orders(&mut self) -> PerJoint<Option<Order>> {
-        self.words.each_mut().map(|heard| {
-            let heard = heard.as_mut().filter(|heard| heard.is_new)?;
-            heard.is_new = false;
-            Some(heard.order)
+        self.commands.each_mut().map(|command| {
+            let command = command.as_mut().filter(|command| command.is_new)?;
+            command.is_new = false;
+            Some(command.order)
         })
     }
 
     fn all_released(&self, now: Time) -> bool {
-        let released = |heard: &Heard| heard.word.released && !heard.is_silent(now, SILENT_AFTER_NS);
-        self.words.iter().all(|heard| heard.as_ref().is_some_and(released))
+        let released =
+            |command: &LastCommand| command.frame.released && !command.is_silent(now, SILENT_AFTER_NS);
+        self.commands.iter().all(|command| command.as_ref().is_some_and(released))
     }
 
-    fn tell(&self, seq: u32, at: Time, readings: &PlantReadings) {
+    fn send_readings(&self, seq: u32, at: Time, readings: &PlantReadings) {
         for joint in Joint::ALL {
             let Some(listener) = self.listeners[joint.index()] else { continue };
             let reading = Reading {
@@ -306,7 +293,7 @@ impl Devices {
                 device: readings.joints[joint.index()],
                 foot: (joint == Joint::Ankle).then_some(readings.foot),
             };
-            // A listener that is gone is noticed by nobody here: a device does not care.
+            // A listener that is gone is not detected here: a device does not care.
             let _ = self.socket.send_to(&reading.encode(), listener);
         }
     }

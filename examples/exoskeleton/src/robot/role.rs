@@ -3,14 +3,14 @@
 use std::fmt;
 use std::str::FromStr;
 
-use crate::part::Part;
+use exoskeleton_model::part::Part;
 
 /// A process of the robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Role {
     /// A node.
     Node(Part),
-    /// What stands for hardware and person.
+    /// The simulation of hardware and person.
     Plant,
 }
 

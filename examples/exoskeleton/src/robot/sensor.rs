@@ -1,10 +1,14 @@
-//! The application `X.sensor`: reads the device each millisecond and tells its own drive and central.
+//! The application `X.sensor`: reads the device each millisecond and sends the sample to its own drive and to
+//! central.
 //!
-//! It is ready when the first reading came. A reading is told once, never again with a newer stamp: when the device
-//! falls silent so does the sensor, and silence is what its listeners watch for.
+//! It is ready when the first reading has arrived. A reading is sent once, never again with a newer stamp:
+//! when the device falls silent so does the sensor, and its receivers watch for silence.
 
 use std::sync::Arc;
 
+use exoskeleton_model::joint::Joint;
+use exoskeleton_model::message::{FootLoad, JointSample};
+use exoskeleton_model::sensor::{SensorConfig, SensorCore};
 use sinew::prelude::*;
 use sinew::supervision::ReadyGate;
 
@@ -12,19 +16,16 @@ use super::PERIOD;
 use super::device::JointDevice;
 use super::edges::{AS_LONG_AS_IT_TAKES, Addressee, GAIT, drive_name, sensor_name};
 use super::trace::{EventRow, Trace};
-use crate::joint::Joint;
-use crate::message::{FootLoad, JointSample};
-use crate::sensor::{SensorConfig, SensorCore};
 
-/// Silence of the device that is worth a line in the log.
+/// Silence of the device that is logged.
 const SILENCE_MAX: Duration = Duration::from_millis(10);
 
-/// Makes the way to a joint's device, anew for each life of an application.
+/// Creates the connection to a joint's device, for each incarnation of an application.
 pub type DeviceMaker = Arc<dyn Fn() -> Box<dyn JointDevice> + Send + Sync>;
 
-/// A tick that is later than this is written down, for whoever wonders why samples were old.
+/// A tick that is later than this is recorded, to explain why samples were old.
 const LATE_MAX: Duration = Duration::from_millis(5);
-/// What it is written down as.
+/// Name of that record.
 pub const SENSOR_LATE: &str = "sensor_late";
 
 /// The sensor of one joint.
@@ -65,7 +66,9 @@ impl Sensor {
 
     fn tick(&mut self, tick: Tick, context: &AppContext<Self>) {
         let now = Time::now();
-        self.note_lateness(now, tick.lateness);
+        if tick.lateness > LATE_MAX {
+            self.events.event(SENSOR_LATE, self.joint.name(), format!("{:?}", tick.lateness));
+        }
         let Some(reading) = self.device.read_newest(now) else {
             self.judge_silence(now);
             return;
@@ -75,14 +78,20 @@ impl Sensor {
         let t_ns = now.as_nanos();
         let sample = self.core.sample(t_ns, &reading.device);
         let load = reading.foot.map(|foot| self.core.foot_load(t_ns, &foot));
-        self.tell(now, &sample, load.as_ref(), context);
+        self.send_sample(now, &sample, load.as_ref(), context);
         if let Some(gate) = self.ready.take() {
             gate.reached();
         }
     }
 
-    /// To whom it cannot be told now it is not told: both know silence when they hear it.
-    fn tell(&mut self, now: Time, sample: &JointSample, load: Option<&FootLoad>, context: &AppContext<Self>) {
+    /// Sends to the receivers that can be reached now; both detect silence.
+    fn send_sample(
+        &mut self,
+        now: Time,
+        sample: &JointSample,
+        load: Option<&FootLoad>,
+        context: &AppContext<Self>,
+    ) {
         if let Some(drive) = self.drive.at(now, context) {
             let _ = context.send(drive, sample);
         }
@@ -90,13 +99,6 @@ impl Sensor {
         let _ = context.send(gait, sample);
         if let Some(load) = load {
             let _ = context.send(gait, load);
-        }
-    }
-
-    fn note_lateness(&self, now: Time, lateness: Duration) {
-        if lateness > LATE_MAX {
-            let (what, whom) = (SENSOR_LATE.to_owned(), self.joint.name().to_owned());
-            self.events.note(EventRow { t_ns: now.as_nanos(), what, whom, how: format!("{lateness:?}") });
         }
     }
 

@@ -1,4 +1,4 @@
-//! Which node of the robot is where: `topology.toml`, read once, with all its faults told together.
+//! The places of the robot's nodes: `topology.toml`, read once, with all its faults reported together.
 
 mod file;
 mod free;
@@ -8,22 +8,22 @@ use std::net::{SocketAddr, SocketAddrV4};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use exoskeleton_model::joint::PerJoint;
+use exoskeleton_model::part::Part;
+use serde::{Deserialize, Serialize};
 use sinew::config::{Interfaces, Seed};
 use sinew::{NodeAddress, NodeConfig};
 use thiserror::Error;
-
-use crate::joint::{Joint, PerJoint};
-use crate::part::Part;
 
 pub use free::for_this_host;
 
 /// Port of multicast DNS (RFC 6762).
 const MDNS_PORT: u16 = 5353;
 
-/// Where everything of one robot is.
+/// The places of all parts of one robot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Topology {
-    /// Name that keeps this robot's nodes apart from those of others. 1 to 63 bytes.
+    /// Name that separates this robot's nodes from those of others. 1 to 63 bytes.
     pub project: String,
     /// How nodes find each other.
     pub discovery: Discovery,
@@ -44,7 +44,7 @@ pub struct Topology {
 pub struct Discovery {
     /// Group and port of the cyclic query; `None`: off.
     pub multicast: Option<SocketAddrV4>,
-    /// Whether multicast DNS is used too.
+    /// Whether multicast DNS is used, too.
     pub mdns: bool,
     /// Time between two queries. 10 ms to 60 s; default 500 ms.
     pub period: Duration,
@@ -53,68 +53,76 @@ pub struct Discovery {
 }
 
 /// The thread that a node's control loops run on.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum ControlThread {
-    /// The one that reads the node's sockets: no thread wake between the network and the loop.
+    /// The thread that reads the node's sockets: no thread wake between the network and the loop. The
+    /// default.
+    #[default]
     Io,
-    /// One of its own: the network cannot hold the loop up, for one more wake a message.
+    /// A thread of its own: the network cannot delay the loop, for one more wake per message.
     Own,
 }
 
 /// How the control loops run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct Control {
     /// On which thread.
     pub thread: ControlThread,
     /// `SCHED_FIFO` priority of that thread, 1 to 89; only for a thread of its own.
     pub realtime_priority: Option<u8>,
-    /// Who lets the person walk.
+    /// The source of the release to walk.
     pub release: ReleaseBy,
 }
 
-/// Who lets the person walk, at the start and after the loss of a part.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// The source of the release to walk, at the start and after the loss of a part.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum ReleaseBy {
-    /// The coordinator presses the button half a second after all drives have started, and after a loss the walk goes
-    /// on by itself: for a simulation.
+    /// The coordinator presses the button half a second after all drives have started, and after a loss the
+    /// walk continues by itself: for a simulation.
     Itself,
-    /// Somebody at central, each time. The default.
+    /// A person at central, each time. The default.
+    #[default]
     Operator,
 }
 
-/// Where a node is.
+/// The place of a node.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NodePlace {
     /// Its address in the project.
     pub address: NodeAddress,
     /// The network interface that it uses, by address or by name.
     pub interface: Interfaces,
-    /// UDP port of its discovery; 0: any free one. Set it where others list this node as a seed.
+    /// UDP port of its discovery; 0: any free one. Set it if others list this node as a seed.
     pub port: u16,
-    /// UDP addresses of nodes to ask in any case.
+    /// UDP addresses of nodes to query in any case.
     pub seeds: Vec<Seed>,
-    /// Path of the unix socket for processes of its host: the status screen (at central) and the `sinew` tool. 1 to 100
-    /// bytes; `None`: no such door.
+    /// Path of the unix socket for processes of its host: the status screen (at central) and the `sinew`
+    /// tool. 1 to 100 bytes; `None`: no socket.
     pub socket: Option<PathBuf>,
-    /// Where the drive of a joint runs; of no meaning at central.
+    /// The process in which the drive of a joint runs; without meaning at central.
     pub drive: DrivePlace,
 }
 
-/// Where the drive of a joint runs.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// The process in which the drive of a joint runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum DrivePlace {
     /// In its node's process, on the thread of the control loops. The default: the lowest latency.
+    #[default]
     Node,
-    /// In a process of its own, a child of the node's: whatever becomes of it, the sensor beside it goes on.
+    /// In a process of its own, a child of the node: if it fails, the sensor beside it continues.
     Process,
 }
 
-/// Where the plant is and who is in it.
+/// The place of the plant, and its person.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlantPlace {
     /// UDP address of its devices.
     pub address: SocketAddr,
-    /// Silence after which a device damps by itself; `None`: it holds its last torque for ever.
+    /// Silence after which a device damps by itself; `None`: it holds its last torque forever.
     pub device_watchdog: Option<Duration>,
     /// Seed of stride variation and sensor noise.
     pub seed: u64,
@@ -122,7 +130,7 @@ pub struct PlantPlace {
     pub trial: Option<PathBuf>,
 }
 
-/// Everything that is wrong with a topology. The user is at fault; nothing was started.
+/// All faults of a topology. The user is at fault; nothing was started.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub struct TopologyFaults(pub Vec<String>);
 
@@ -138,28 +146,28 @@ impl Topology {
     /// Reads a topology file.
     ///
     /// # Errors
-    /// All that is wrong with it, each with its place and a remedy.
+    /// All its faults, each with its place and a remedy.
     pub fn read(path: &Path) -> Result<Self, TopologyFaults> {
         let text = std::fs::read_to_string(path)
             .map_err(|e| TopologyFaults(vec![format!("{} cannot be read: {e}", path.display())]))?;
         Self::parse(&text)
     }
 
-    /// Reads a topology from its text.
+    /// Parses a topology from its text.
     ///
     /// # Errors
-    /// All that is wrong with it, each with its place and a remedy.
+    /// All its faults, each with its place and a remedy.
     pub fn parse(text: &str) -> Result<Self, TopologyFaults> {
         file::parse(text)
     }
 
-    /// The text that reads back as this topology.
+    /// Returns the text that reads back as this topology.
     #[must_use]
     pub fn to_toml(&self) -> String {
         file::write(self)
     }
 
-    /// Where a node is.
+    /// Returns the place of a node.
     #[must_use]
     pub const fn place(&self, part: Part) -> &NodePlace {
         match part {
@@ -168,13 +176,7 @@ impl Topology {
         }
     }
 
-    /// The joint whose node has this address.
-    #[must_use]
-    pub fn joint_at(&self, address: NodeAddress) -> Option<Joint> {
-        Joint::ALL.into_iter().find(|joint| self.joints[joint.index()].address == address)
-    }
-
-    /// The configuration of a node.
+    /// Returns the configuration of a node.
     #[must_use]
     pub fn node_config(&self, part: Part) -> NodeConfig {
         let place = self.place(part);

@@ -1,39 +1,40 @@
-//! The application `X.watch` of each node: tells who waits for whom, and writes down which nodes come and go.
+//! The application `X.watch` of each node: reports waiting applications, and records nodes that appear and
+//! disappear.
 
 use std::sync::{Arc, OnceLock};
 
+use exoskeleton_model::part::Part;
 use sinew::NodeHandle;
 use sinew::prelude::*;
 
 use super::edges::{BarrierStatus, STATUS};
 use super::trace::{EventRow, Trace};
-use crate::part::Part;
 
 const STATUS_PERIOD: Duration = Duration::from_millis(100);
 
-/// What the watch is made with, in each of its lives.
+/// The constructor arguments of the watch, the same for each incarnation.
 #[derive(Clone)]
 pub struct WatchParts {
     /// The node; empty until it has started.
     pub node: Arc<OnceLock<NodeHandle>>,
-    /// Where it writes down what happens.
+    /// Trace of the events.
     pub events: Trace<EventRow>,
 }
 
 /// The watch of a node.
 pub struct Watch(WatchParts);
 
-/// Declares the watch of a node. It requires nothing: it speaks while the others wait.
+/// Declares the watch of a node. It has no requirements: it reports while the others wait.
 #[must_use]
 pub fn spec(part: Part, parts: WatchParts) -> AppSpec<Watch> {
     AppSpec::new(format!("{part}.watch"), move || Watch(parts.clone())).handles::<NodeEvent>()
 }
 
 impl Watch {
-    fn tell(&self, context: &AppContext<Self>) {
+    fn send_status(&self, context: &AppContext<Self>) {
         let Some(node) = self.0.node.get() else { return };
         let waiting = node.waiting().iter().map(ToString::to_string).collect();
-        // Nobody may want to know.
+        // There may be no receiver.
         let _ = context.send(Tid::group(STATUS), &BarrierStatus { waiting });
     }
 }
@@ -42,7 +43,7 @@ impl Actor for Watch {
     type Context = AppContext<Self>;
 
     fn started(&mut self, context: &mut Self::Context) {
-        context.every(STATUS_PERIOD, |this, _, context| this.tell(context));
+        context.every(STATUS_PERIOD, |this, _, context| this.send_status(context));
     }
 }
 
@@ -63,7 +64,7 @@ impl Handler<Delivery<NodeEvent>> for Watch {
                 ("node_lost", name, format!("{why:?}, silent for {silent_us} us of {bound_us} us"))
             }
         };
-        tracing::info!(what, whom, how, "a change in who is there");
-        self.0.events.note(EventRow { t_ns: Time::now().as_nanos(), what: what.to_owned(), whom, how });
+        tracing::info!(what, whom, how, "a part has appeared, changed or gone");
+        self.0.events.event(what, &whom, how);
     }
 }

@@ -1,4 +1,4 @@
-//! The robot walks; its parts alone start, end and refuse.
+//! The robot walks; its parts start, end and fail alone.
 
 use std::path::Path;
 
@@ -20,7 +20,7 @@ fn topology_of_this_test() -> Topology {
 }
 
 #[test]
-fn five_processes_wait_for_the_late_one_without_torque_and_then_walk() {
+fn five_processes_wait_for_the_late_one() {
     let _alone = alone();
     let folder = folder("walk");
     let (report, runs) = (folder.join("report.json"), folder.join("runs"));
@@ -29,12 +29,12 @@ fn five_processes_wait_for_the_late_one_without_torque_and_then_walk() {
 
     let output = end(start(&folder, &arguments), "the walk ends");
 
-    let told = String::from_utf8_lossy(&output.stdout);
+    let stdout = String::from_utf8_lossy(&output.stdout);
     let failed = String::from_utf8_lossy(&output.stderr);
-    assert!(told.contains("waits for hip.sensor"), "the late hip is waited for:\n{told}\n{failed}");
-    assert!(told.contains("stride 8 of 8"), "{told}\n{failed}");
+    assert!(stdout.contains("waits for hip.sensor"), "the late hip is waited for:\n{stdout}\n{failed}");
+    assert!(stdout.contains("stride 8 of 8"), "{stdout}\n{failed}");
     // Whether limits hold depends on the machine; that it walked does not.
-    assert!(matches!(output.status.code(), Some(0 | 3 | 4)), "{:?}\n{told}\n{failed}", output.status);
+    assert!(matches!(output.status.code(), Some(0 | 3 | 4)), "{:?}\n{stdout}\n{failed}", output.status);
     let report: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(report).unwrap()).unwrap();
     assert_eq!(report["barrier"]["torque_before_release_nm"], 0.0);
     assert!(report["barrier"]["held_s"].as_f64().unwrap() > 1.0, "{report}");
@@ -43,7 +43,7 @@ fn five_processes_wait_for_the_late_one_without_torque_and_then_walk() {
 }
 
 #[test]
-fn node_with_a_bad_topology_is_refused_in_words_with_exit_code_1() {
+fn bad_topology_is_rejected_with_exit_code_1() {
     let folder = folder("refused");
     let text = topology_of_this_test().to_toml().replacen("127.0.0.3", "127.0.0.2", 1);
     let file = topology_file(&folder, &text);
@@ -57,7 +57,7 @@ fn node_with_a_bad_topology_is_refused_in_words_with_exit_code_1() {
 }
 
 #[test]
-fn node_and_plant_alone_end_in_order_when_their_starter_does() {
+fn node_and_plant_stop_in_order_with_their_parent() {
     let folder = folder("alone");
     let file = topology_file(&folder, &topology_of_this_test().to_toml());
     for role in ["plant", "hip", "central"] {
@@ -70,7 +70,7 @@ fn node_and_plant_alone_end_in_order_when_their_starter_does() {
 }
 
 #[test]
-fn second_plant_at_the_same_address_says_what_is_wrong() {
+fn second_plant_at_the_same_address_names_the_cause() {
     let folder = folder("twice");
     let taken = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
     let mut topology = topology_of_this_test();

@@ -13,7 +13,7 @@ pub(crate) fn measure(mut end: End, bytes: usize, pace: Pace) -> Figures {
     })
 }
 
-/// Until the measuring end ends this process.
+/// Echoes until the measuring end kills this process.
 pub(crate) fn echo(mut end: End, bytes: usize) {
     let mut buffer = vec![0; bytes];
     loop {

@@ -1,4 +1,4 @@
-//! The cases: which end, which payload, which CPUs, which pace, which reference; and the two processes of each.
+//! The cases: the end, the payload, the CPUs, the pace and the reference; and the two processes of each.
 
 use std::{
     os::{fd::OwnedFd, unix::net::UnixStream},
@@ -62,12 +62,12 @@ impl Kind {
         }
     }
 
-    /// How the bare ring's ends wait.
+    /// How the ends of the bare ring wait.
     const fn waiting(self) -> Waiting {
         if self.spins() { Waiting::Poll } else { Waiting::Futex }
     }
 
-    /// Who looks without sleeping needs the other one to have another CPU.
+    /// Whether an end polls without sleeping: it then needs the other end on another CPU.
     const fn spins(self) -> bool {
         matches!(self, Self::Spin | Self::Adaptive | Self::BarePoll)
     }
@@ -97,7 +97,7 @@ pub(crate) fn all() -> impl Iterator<Item = Case> {
     places
         .flat_map(move |pinning| paces.map(|pace| (pinning, pace)))
         .flat_map(|(pinning, pace)| [8, 64, 1000, 65_536].map(|bytes| (pinning, pace, bytes)))
-        // At a millisecond's pace the payload hardly shows; one will do.
+        // At a pace of one millisecond the payload hardly matters; one size is enough.
         .filter(|(_, pace, bytes)| *pace == Pace::BackToBack || *bytes == 1000)
         .flat_map(|(pinning, pace, payload_bytes)| {
             let pairs =
@@ -164,7 +164,7 @@ pub(crate) fn echo(role: &str) {
     }
 }
 
-/// Another process of this program; it is ended when this is dropped.
+/// Another process of this program; dropping it kills the process.
 struct Echo(Child);
 
 impl Echo {

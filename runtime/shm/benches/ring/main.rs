@@ -1,11 +1,12 @@
 //! Round trips through rings in shared memory, beside bare references of the same run.
 //!
-//! `cargo bench -p sinew-shm --bench ring [-- WORD...]` prints one JSON line a case: those whose name holds every WORD. Two
-//! processes; both on one CPU, or one CPU each; back to back, or one round trip every millisecond. The reference runs right
-//! before its case. Times are microseconds, there and back. Nothing here asserts a time.
+//! `cargo bench -p sinew-shm --bench ring [-- WORD...]` prints one JSON line for each case with every WORD in
+//! its name. Two processes; both on one CPU, or one CPU each; back to back, or one round trip every
+//! millisecond. The reference runs right before its case. Times are microseconds, for the round trip. Nothing
+//! here asserts a time.
 //!
-//! References: a ring of four slots with a futex that is woken for every message, or polled without one, written by hand in
-//! `bare.rs`, without checks; and a unix stream socket.
+//! References: a ring of four slots with a futex that is woken for every message, or polled without one,
+//! written by hand in `bare.rs`, without checks; and a unix stream socket.
 
 #[cfg(target_os = "linux")]
 mod bare;

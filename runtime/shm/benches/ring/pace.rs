@@ -1,4 +1,4 @@
-//! How round trips follow each other.
+//! The pace of round trips.
 
 use std::{
     thread,
@@ -7,7 +7,7 @@ use std::{
 
 use sinew_figures::Figures;
 
-/// How round trips follow each other.
+/// The pace of round trips.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Pace {
     BackToBack,
@@ -22,7 +22,7 @@ impl Pace {
         }
     }
 
-    /// Round trips that are not counted, and that are.
+    /// Numbers of round trips: uncounted warm-up, and measured.
     const fn rounds(self) -> (u32, u32) {
         match self {
             Self::BackToBack => (1_000, 20_000),

@@ -1,8 +1,8 @@
-//! The reading half of a ring: the function that meets whatever the peer has written.
+//! The reading half of a ring: validates everything that the peer has written.
 
 use std::sync::atomic::Ordering;
 
-use super::sleep::{Ear, Sleep, Waking};
+use super::sleep::{Sleep, WakePlace, Waking};
 use crate::{
     error::Corrupt,
     layout::{Capacity, MARK_BYTES, Mark, Word, record_bytes},
@@ -10,28 +10,28 @@ use crate::{
     wait::Armed,
 };
 
-/// A message in the ring. Its bytes lie within the ring, whatever the peer does from now on.
+/// A message in the ring. Its bytes lie within the ring, independent of later writes of the peer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Record {
-    /// Where its bytes begin in the ring.
+    /// Position of its first byte in the ring.
     pub(crate) position: u32,
-    /// How many they are.
+    /// Number of its bytes.
     pub(crate) length: u32,
-    /// What this side will have taken when it is released.
+    /// This side's count of consumed bytes after its release.
     end: u32,
 }
 
-/// What the reading half knows. It trusts nothing but its own counts.
+/// The state of the reading half. It trusts only its own counts.
 #[derive(Debug)]
 pub(crate) struct ConsumerCore<O, P> {
     pub(crate) own: O,
     pub(crate) peer: P,
     capacity: Capacity,
-    /// Bytes ever taken.
+    /// Bytes ever consumed.
     head: u32,
-    /// Bytes of those that the producer knows to be free again.
+    /// Consumed bytes that the producer has been told are free again.
     given_back: u32,
-    /// Bytes that the producer was last seen to have published; always at most `capacity` ahead of `head`.
+    /// Published bytes of the producer at the last check; always at most `capacity` ahead of `head`.
     tail_seen: u32,
     sleep: Sleep,
     waking: Waking,
@@ -57,7 +57,7 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
         self.capacity
     }
 
-    /// The oldest message that was not released, if there is any.
+    /// Returns the oldest message that was not released, if there is any.
     pub(crate) fn next(&mut self) -> Result<Option<Record>, Corrupt> {
         if let Some(corrupt) = self.corrupt {
             return Err(corrupt);
@@ -69,27 +69,29 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
         found
     }
 
-    /// Gives a message's memory back to the producer, and that of those kept before it. True when the producer sleeps and has to
-    /// be woken.
+    /// Returns a message's memory to the producer, and that of the messages kept before it. True when the
+    /// producer sleeps and must be woken.
     pub(crate) fn release(&mut self, record: Record) -> bool {
         self.keep(record);
         self.give_back()
     }
 
-    /// Goes on to the next message. This one's memory is given back with that of a later one, or all that is kept together.
+    /// Advances to the next message. This one's memory is returned with that of a later one, or together with
+    /// all kept messages.
     pub(crate) fn keep(&mut self, record: Record) {
         self.head = record.end;
     }
 
-    /// Gives back what is kept. True when the producer sleeps and has to be woken.
+    /// Returns the memory of the kept messages. True when the producer sleeps and must be woken.
     pub(crate) fn give_back(&mut self) -> bool {
         if self.given_back == self.head {
             return false;
         }
         self.given_back = self.head;
-        // SYNC: this side's reads of the records are over for who reads this head and fences: `ProducerCore::look`.
+        // SYNC: this side's reads of the records are over for a producer that reads this head and fences:
+        // `ProducerCore::look`.
         self.own.store(Word::Head, self.head, Ordering::Release);
-        self.waking.is_owed(&self.peer)
+        self.waking.needs_ring(&self.peer)
     }
 
     /// Announces sleep until there is a message.
@@ -108,27 +110,27 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
         }
     }
 
-    /// Announces sleep to this peer, one of several. After all of them a fence follows, and another look.
-    pub(crate) fn announce(&mut self, ear: Ear) {
-        self.sleep.announce_at(ear, &self.own);
+    /// Announces sleep to this peer, one of several. After all of them a fence follows, and another check.
+    pub(crate) fn announce(&mut self, wake_place: WakePlace) {
+        self.sleep.announce_at(wake_place, &self.own);
     }
 
-    /// Whether the peer says that it has rung for the sleep that was announced last.
+    /// Whether the peer reports a ring for the sleep that was announced last.
     pub(crate) fn was_rung(&self) -> bool {
         self.peer.load(Word::Rung) == self.sleep.announced()
     }
 
-    /// Says that this side is awake again.
+    /// Announces that this side is awake again.
     pub(crate) fn disarm(&mut self) {
         self.sleep.end(&self.own);
     }
 
-    /// Whether the producer has published something since it was last looked at.
+    /// Whether the producer has published a message since the last check.
     pub(crate) fn has_moved(&self) -> bool {
         self.peer.load(Word::Tail) != self.tail_seen
     }
 
-    /// As if so much had been published and taken already.
+    /// Sets the counts as if this much had been published and consumed already.
     #[cfg(all(test, not(loom)))]
     pub(super) fn start_at(&mut self, count: u32) {
         (self.head, self.given_back, self.tail_seen) = (count, count, count);
@@ -137,7 +139,7 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
 
     fn find(&mut self) -> Result<Option<Record>, Corrupt> {
         if self.tail_seen == self.head {
-            self.look()?;
+            self.refresh()?;
             if self.tail_seen == self.head {
                 return Ok(None);
             }
@@ -148,7 +150,7 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
         }
     }
 
-    /// A skip leads to the ring's beginning, where a message is: a producer publishes both at once.
+    /// Reads the message at the ring's beginning after a skip: a producer publishes both at once.
     fn message_after_skip(&self) -> Result<Record, Corrupt> {
         let (skipped, published) = (self.capacity.rest(self.head), self.published(self.head));
         let corrupt = Corrupt::Skip { skipped, published };
@@ -176,7 +178,7 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
         }
     }
 
-    /// What lies between `start` and the tail.
+    /// The published bytes between `start` and the tail.
     const fn published(&self, start: u32) -> u32 {
         self.tail_seen.wrapping_sub(start)
     }
@@ -187,8 +189,9 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
         Mark::from_bits(bits).ok_or(Corrupt::Mark(bits))
     }
 
-    /// Reads the producer's tail once and believes it only if it lies between the last one and the ring's capacity.
-    fn look(&mut self) -> Result<(), Corrupt> {
+    /// Reads the producer's tail once, and accepts it only if it lies between the last one and the ring's
+    /// capacity.
+    fn refresh(&mut self) -> Result<(), Corrupt> {
         let tail = self.peer.load(Word::Tail);
         // SYNC: the bytes of all records before this tail are visible: the store of tail in `ProducerCore::publish`.
         fence(Ordering::Acquire);

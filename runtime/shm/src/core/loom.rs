@@ -1,4 +1,4 @@
-//! Every interleaving, and every value that a processor may show meanwhile, of the ring's atomics.
+//! Checks every interleaving of the ring's atomics, and every value that a processor may show meanwhile.
 //!
 //! `RUSTFLAGS="--cfg loom" cargo test --release -p sinew-shm --lib --target-dir target/loom core::loom`
 
@@ -11,7 +11,7 @@ use loom::{
 
 use super::{
     model::{Receiver, Sender, fill, read, ring},
-    sleep::{Ear, fence_before_looking_again},
+    sleep::{WakePlace, fence_before_recheck},
 };
 use crate::{
     layout::{Capacity, Word},
@@ -19,7 +19,8 @@ use crate::{
     wait::Armed,
 };
 
-/// What a futex does, and a descriptor: rung after it was listened to, a sleep ends. The lock is the system's.
+/// A model of a futex or a descriptor: a ring after the call of `listen` ends the sleep. The lock is the
+/// system's.
 struct Bell {
     word: AtomicU32,
     sleepers: Mutex<()>,
@@ -42,9 +43,9 @@ impl Bell {
         self.word.load(Ordering::Acquire)
     }
 
-    fn sleep(&self, heard: u32) {
+    fn sleep(&self, seen: u32) {
         let sleepers = self.sleepers.lock().unwrap();
-        if self.word.load(Ordering::Relaxed) == heard {
+        if self.word.load(Ordering::Relaxed) == seen {
             drop(self.woken.wait(sleepers).unwrap());
         }
     }
@@ -56,7 +57,7 @@ fn send(sender: &mut Sender, bytes: usize, number: u64) -> bool {
     sender.publish()
 }
 
-/// Takes one message if there is any: its words, and whether the sender has to be woken.
+/// Receives one message if there is any: returns its words, and whether the sender must be woken.
 fn take(receiver: &mut Receiver) -> Option<(Vec<u64>, bool)> {
     let record = receiver.next().expect("an honest peer")?;
     let words = read(receiver, record);
@@ -68,9 +69,9 @@ fn take_sleeping(receiver: &mut Receiver, bell: &Bell) -> (Vec<u64>, bool) {
         if let Some(taken) = take(receiver) {
             return taken;
         }
-        let heard = bell.listen();
+        let seen = bell.listen();
         if receiver.arm().expect("an honest peer") == Armed::Sleep {
-            bell.sleep(heard);
+            bell.sleep(seen);
             receiver.disarm();
         }
     }
@@ -78,16 +79,16 @@ fn take_sleeping(receiver: &mut Receiver, bell: &Bell) -> (Vec<u64>, bool) {
 
 fn reserve_sleeping(sender: &mut Sender, bell: &Bell) {
     while sender.reserve(8).is_err() {
-        let heard = bell.listen();
+        let seen = bell.listen();
         if sender.arm(8).expect("an honest peer") == Armed::Sleep {
-            bell.sleep(heard);
+            bell.sleep(seen);
             sender.disarm();
         }
     }
 }
 
 #[test]
-fn a_message_that_is_seen_is_seen_whole() {
+fn visible_message_is_complete() {
     loom::model(|| {
         let (mut sender, mut receiver) = ring(Capacity::tiny(64));
         let sending = thread::spawn(move || {
@@ -107,9 +108,9 @@ fn a_message_that_is_seen_is_seen_whole() {
 }
 
 #[test]
-fn memory_that_is_used_again_is_no_longer_read() {
+fn reused_memory_is_no_longer_read() {
     loom::model(|| {
-        // 32 bytes: two messages of 8. The third takes the place of the first, as soon as that is released.
+        // 32 bytes: two messages of 8. The third reuses the memory of the first, as soon as that is released.
         let (mut sender, mut receiver) = ring(Capacity::tiny(32));
         send(&mut sender, 8, 1);
         send(&mut sender, 8, 2);
@@ -130,7 +131,7 @@ fn memory_that_is_used_again_is_no_longer_read() {
 }
 
 #[test]
-fn a_consumer_that_sleeps_is_woken_for_every_message() {
+fn sleeping_consumer_is_woken_for_every_message() {
     loom::model(|| {
         let (mut sender, mut receiver) = ring(Capacity::tiny(64));
         let bell = Bell::new();
@@ -150,7 +151,7 @@ fn a_consumer_that_sleeps_is_woken_for_every_message() {
 }
 
 #[test]
-fn a_producer_that_sleeps_is_woken_for_room() {
+fn sleeping_producer_is_woken_for_room() {
     loom::model(|| {
         let (mut sender, mut receiver) = ring(Capacity::tiny(32));
         send(&mut sender, 8, 1);
@@ -158,9 +159,9 @@ fn a_producer_that_sleeps_is_woken_for_room() {
         let bell = Bell::new();
         let button = Arc::clone(&bell);
         let receiving = thread::spawn(move || {
-            let (words, owed) = take(&mut receiver).expect("it was published before");
+            let (words, needs_ring) = take(&mut receiver).expect("it was published before");
             assert_eq!(words, [1]);
-            if owed {
+            if needs_ring {
                 button.ring();
             }
             receiver
@@ -176,7 +177,7 @@ fn a_producer_that_sleeps_is_woken_for_room() {
 }
 
 #[test]
-fn a_producer_that_sleeps_is_woken_for_what_is_given_back_together() {
+fn sleeping_producer_is_woken_for_kept_messages() {
     loom::model(|| {
         let (mut sender, mut receiver) = ring(Capacity::tiny(32));
         send(&mut sender, 8, 1);
@@ -199,7 +200,7 @@ fn a_producer_that_sleeps_is_woken_for_what_is_given_back_together() {
 }
 
 #[test]
-fn a_loan_that_is_given_back_is_never_seen() {
+fn returned_loan_is_never_visible() {
     loom::model(|| {
         let (mut sender, mut receiver) = ring(Capacity::tiny(64));
         let sending = thread::spawn(move || {
@@ -218,7 +219,8 @@ fn a_loan_that_is_given_back_is_never_seen() {
     });
 }
 
-/// What a sleeper for several rings sleeps at: one bell that all ring, or the words of the wakers' own. The lock is the system's.
+/// The sleeping place for several rings: one bell that all ring, or the words of the wakers' own regions. The
+/// lock is the system's.
 struct Place {
     bell: AtomicU32,
     sleepers: Mutex<()>,
@@ -236,36 +238,37 @@ impl Place {
         drop(sleepers);
     }
 
-    /// As `Producer::publish` does.
+    /// Like `Producer::publish`.
     fn send(&self, sender: &mut Sender, number: u64) {
         if !send(sender, 8, number) {
             return;
         }
-        match sender.ear() {
-            Ear::Bell => {
+        match sender.wake_place() {
+            WakePlace::Bell => {
                 self.bell.fetch_add(1, Ordering::Release);
                 self.wake();
-                sender.say_rung();
+                sender.report_ring();
             }
-            Ear::Own => {
-                sender.say_rung();
+            WakePlace::Own => {
+                sender.report_ring();
                 self.wake();
             }
         }
     }
 
-    fn words<const N: usize>(&self, receivers: &[Receiver; N], ear: Ear) -> [u32; N] {
-        std::array::from_fn(|index| match ear {
-            Ear::Bell => self.bell.load(Ordering::Relaxed),
-            Ear::Own => receivers[index].peer.load(Word::Rung),
+    fn words<const N: usize>(&self, receivers: &[Receiver; N], wake_place: WakePlace) -> [u32; N] {
+        std::array::from_fn(|index| match wake_place {
+            WakePlace::Bell => self.bell.load(Ordering::Relaxed),
+            WakePlace::Own => receivers[index].peer.load(Word::Rung),
         })
     }
 
-    /// The order of steps of `any.rs`: listen, announce to all, fence once, look, sleep, withdraw from all.
+    /// The steps of `any.rs` in their order: listen, announce to all, fence once, check, sleep, withdraw from
+    /// all.
     fn take<const N: usize>(
         &self,
         receivers: &mut [Receiver; N],
-        ears: &mut impl Iterator<Item = Ear>,
+        wake_places: &mut impl Iterator<Item = WakePlace>,
     ) -> Vec<u64> {
         loop {
             for receiver in receivers.iter_mut() {
@@ -273,14 +276,14 @@ impl Place {
                     return words;
                 }
             }
-            let ear = ears.next().unwrap();
-            let heard = self.words(receivers, ear);
+            let wake_place = wake_places.next().unwrap();
+            let seen = self.words(receivers, wake_place);
             fence(Ordering::Acquire);
-            receivers.iter_mut().for_each(|receiver| receiver.announce(ear));
-            fence_before_looking_again();
+            receivers.iter_mut().for_each(|receiver| receiver.announce(wake_place));
+            fence_before_recheck();
             if receivers.iter_mut().all(|receiver| receiver.next().unwrap().is_none()) {
                 let sleepers = self.sleepers.lock().unwrap();
-                if self.words(receivers, ear) == heard {
+                if self.words(receivers, wake_place) == seen {
                     drop(self.woken.wait(sleepers).unwrap());
                 }
             }
@@ -289,7 +292,7 @@ impl Place {
     }
 }
 
-fn who_sleeps_at_two_rings_takes_both_messages(ears: [Ear; 2]) {
+fn sleeper_at_two_rings_takes_both_messages(wake_places: [WakePlace; 2]) {
     loom::model(move || {
         let (mut first, first_end) = ring(Capacity::tiny(64));
         let (mut second, second_end) = ring(Capacity::tiny(64));
@@ -299,9 +302,10 @@ fn who_sleeps_at_two_rings_takes_both_messages(ears: [Ear; 2]) {
             button.send(&mut second, 2);
             button.send(&mut first, 1);
         });
-        let (mut receivers, mut ears) = ([first_end, second_end], ears.into_iter().cycle());
+        let (mut receivers, mut wake_places) = ([first_end, second_end], wake_places.into_iter().cycle());
         // A lost wake is a deadlock, which loom reports.
-        let mut taken = vec![place.take(&mut receivers, &mut ears), place.take(&mut receivers, &mut ears)];
+        let mut taken =
+            vec![place.take(&mut receivers, &mut wake_places), place.take(&mut receivers, &mut wake_places)];
         taken.sort();
         assert_eq!(taken, [[1], [2]]);
         sending.join().unwrap();
@@ -309,26 +313,26 @@ fn who_sleeps_at_two_rings_takes_both_messages(ears: [Ear; 2]) {
 }
 
 #[test]
-fn who_sleeps_at_one_bell_is_woken_for_every_message_of_either_ring() {
-    who_sleeps_at_two_rings_takes_both_messages([Ear::Bell; 2]);
+fn sleeper_at_one_bell_is_woken_by_either_ring() {
+    sleeper_at_two_rings_takes_both_messages([WakePlace::Bell; 2]);
 }
 
 #[test]
-fn who_sleeps_at_the_wakers_own_words_is_woken_for_every_message_of_either_ring() {
-    who_sleeps_at_two_rings_takes_both_messages([Ear::Own; 2]);
+fn sleeper_at_wakers_words_is_woken_by_either_ring() {
+    sleeper_at_two_rings_takes_both_messages([WakePlace::Own; 2]);
 }
 
 #[test]
-fn who_goes_from_the_bell_to_the_wakers_own_word_and_back_is_woken_for_every_message() {
-    for ears in [[Ear::Bell, Ear::Own], [Ear::Own, Ear::Bell]] {
+fn sleeper_that_changes_its_place_is_woken() {
+    for wake_places in [[WakePlace::Bell, WakePlace::Own], [WakePlace::Own, WakePlace::Bell]] {
         loom::model(move || {
             let (mut sender, end) = ring(Capacity::tiny(64));
             let place = Place::new();
             let button = Arc::clone(&place);
             let sending = thread::spawn(move || (1..=2).for_each(|number| button.send(&mut sender, number)));
-            let (mut receivers, mut ears) = ([end], ears.into_iter().cycle());
-            assert_eq!(place.take(&mut receivers, &mut ears), [1]);
-            assert_eq!(place.take(&mut receivers, &mut ears), [2]);
+            let (mut receivers, mut wake_places) = ([end], wake_places.into_iter().cycle());
+            assert_eq!(place.take(&mut receivers, &mut wake_places), [1]);
+            assert_eq!(place.take(&mut receivers, &mut wake_places), [2]);
             sending.join().unwrap();
         });
     }

@@ -1,5 +1,5 @@
-//! The protocol of a ring, over any memory: who may write what when, in which order the other side sees it, and who has to
-//! be woken. No system call, no clock.
+//! The protocol of a ring, over any memory: write access, the order of stores that the other side sees, and
+//! wakes. No system call, no clock.
 
 pub(crate) mod consumer;
 pub(crate) mod producer;

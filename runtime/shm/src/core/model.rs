@@ -1,4 +1,5 @@
-//! A region as plain atomics, for tests of the protocol: shared by both sides, who keep to what is theirs.
+//! A region as plain atomics, for tests of the protocol. Both sides share it, and each writes only its own
+//! part.
 
 use std::sync::{Arc, atomic::Ordering};
 
@@ -96,7 +97,7 @@ fn look(cell: &AtomicU64) -> u64 {
     cell.load(Ordering::Relaxed)
 }
 
-/// As if it were no atomic: loom then also fails when the sender may write it at the same time.
+/// Loads like a non-atomic: loom then also fails when the sender may write it at the same time.
 #[cfg(loom)]
 fn look(cell: &AtomicU64) -> u64 {
     // SAFETY: loom ends the test when another access does not happen before or after this one.

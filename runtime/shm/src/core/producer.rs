@@ -2,7 +2,7 @@
 
 use std::sync::atomic::Ordering;
 
-use super::sleep::{Ear, Sleep, Waking};
+use super::sleep::{Sleep, WakePlace, Waking};
 use crate::{
     error::{Corrupt, LoanError},
     layout::{Capacity, MARK_BYTES, Mark, Word, record_bytes},
@@ -19,7 +19,7 @@ pub(crate) struct Reserved {
     pub(crate) length: u32,
 }
 
-/// What the writing half knows. It trusts nothing but its own counts.
+/// The state of the writing half. It trusts only its own counts.
 #[derive(Debug)]
 pub(crate) struct ProducerCore<O, P> {
     pub(crate) own: O,
@@ -27,7 +27,7 @@ pub(crate) struct ProducerCore<O, P> {
     capacity: Capacity,
     /// Bytes ever published.
     tail: u32,
-    /// Bytes that the consumer was last seen to have taken; always at most `capacity` behind `tail`.
+    /// Consumed bytes of the consumer at the last check; always at most `capacity` behind `tail`.
     head_seen: u32,
     reserved: Option<Reserved>,
     sleep: Sleep,
@@ -54,17 +54,17 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
         self.capacity
     }
 
-    /// What the peer was caught at.
+    /// The error of the peer, if one was detected.
     pub(crate) const fn corrupt(&self) -> Option<Corrupt> {
         self.corrupt
     }
 
-    /// The room that is reserved, if any.
+    /// The reserved room, if any.
     pub(crate) const fn reserved(&self) -> Option<Reserved> {
         self.reserved
     }
 
-    /// Reserves room for a message of `length` bytes. Room that was reserved before and not published is forgotten.
+    /// Reserves room for a message of `length` bytes. Discards an earlier reservation that was not published.
     pub(crate) fn reserve(&mut self, length: usize) -> Result<Reserved, LoanError> {
         self.intact()?;
         self.reserved = None;
@@ -72,7 +72,7 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
         let rest = self.capacity.rest(self.tail);
         let skip = if record > rest { rest } else { 0 };
         if record + skip > self.free() {
-            self.look()?;
+            self.refresh()?;
         }
         if record + skip > self.free() {
             return Err(LoanError::Full { asked: length as usize, free: self.longest_now() });
@@ -82,19 +82,19 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
         Ok(reserved)
     }
 
-    /// Where the reserved message's bytes are in the ring.
+    /// Position of the reserved message's bytes in the ring.
     pub(crate) const fn payload_position(&self, reserved: Reserved) -> u32 {
         self.capacity.position(self.tail.wrapping_add(reserved.skip)) + MARK_BYTES
     }
 
-    /// Makes the reserved message shorter than it was asked for.
+    /// Makes the reserved message shorter than requested.
     pub(crate) fn shorten(&mut self, length: u32) {
         if let Some(reserved) = &mut self.reserved {
             reserved.length = reserved.length.min(length);
         }
     }
 
-    /// Makes the reserved room a message. True when the consumer sleeps and has to be woken.
+    /// Publishes the reserved room as a message. True when the consumer sleeps and must be woken.
     pub(crate) fn publish(&mut self) -> bool {
         let Some(Reserved { skip, length }) = self.reserved.take() else {
             return false;
@@ -106,19 +106,20 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
         self.own.put_mark(self.capacity.position(start), Mark::Message(length).to_bits());
         let record = record_bytes(length).expect("it was counted when it was reserved");
         self.tail = start.wrapping_add(record);
-        // SYNC: the record's bytes become visible to who reads this tail and fences: `ConsumerCore::look`.
+        // SYNC: the record's bytes become visible to a consumer that reads this tail and fences:
+        // `ConsumerCore::look`.
         self.own.store(Word::Tail, self.tail, Ordering::Release);
-        self.waking.is_owed(&self.peer)
+        self.waking.needs_ring(&self.peer)
     }
 
-    /// Gives the reserved room back: it was never seen by anyone.
+    /// Discards the reserved room; it was never visible to the consumer.
     pub(crate) fn give_back(&mut self) {
         self.reserved = None;
     }
 
-    /// Where the consumer sleeps that has to be woken.
-    pub(crate) const fn ear(&self) -> Ear {
-        self.waking.ear()
+    /// The sleeping place of the consumer that must be woken.
+    pub(crate) const fn wake_place(&self) -> WakePlace {
+        self.waking.wake_place()
     }
 
     /// Whether the consumer has announced that it sleeps.
@@ -127,21 +128,21 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
         self.peer.load(Word::ConsumerSleep) % 2 == 1
     }
 
-    /// Says for which sleep of the consumer this side has rung.
-    pub(crate) fn say_rung(&self) {
-        // SYNC: who sleeps at this word and sees it also sees what it was rung for.
+    /// Reports the sleep of the consumer for which this side has rung.
+    pub(crate) fn report_ring(&self) {
+        // SYNC: a consumer that sleeps at this word and sees it also sees the stores before the ring.
         self.own.store(Word::Rung, self.waking.rung_for(), Ordering::Release);
     }
 
-    /// The same for a sleep that need not have been announced: for who is about to go.
-    pub(crate) fn say_rung_anyhow(&self) {
+    /// The same for a sleep that need not have been announced: for a side that is about to leave.
+    pub(crate) fn force_ring_report(&self) {
         self.own.store(Word::Rung, self.peer.load(Word::ConsumerSleep), Ordering::Release);
     }
 
     /// Announces sleep until there is room for `length` bytes.
     pub(crate) fn arm(&mut self, length: usize) -> Result<Armed, LoanError> {
         self.sleep.announce(&self.own);
-        let found = self.intact().map_err(LoanError::from).and_then(|()| self.look_for_room(length));
+        let found = self.intact().map_err(LoanError::from).and_then(|()| self.check_room(length));
         match found {
             Ok(false) => Ok(Armed::Sleep),
             Ok(true) => {
@@ -155,36 +156,36 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
         }
     }
 
-    /// Says that this side is awake again.
+    /// Announces that this side is awake again.
     pub(crate) fn disarm(&mut self) {
         self.sleep.end(&self.own);
     }
 
-    /// Bytes ever published, with all that lies between messages; wraps.
+    /// Bytes ever published, including the gaps between messages; wraps.
     pub(crate) const fn published(&self) -> u32 {
         self.tail
     }
 
-    /// Bytes that are published and not taken.
-    pub(crate) fn untaken(&mut self) -> Result<u32, Corrupt> {
-        self.look()?;
+    /// Bytes that are published and not consumed.
+    pub(crate) fn unread(&mut self) -> Result<u32, Corrupt> {
+        self.refresh()?;
         Ok(self.tail.wrapping_sub(self.head_seen))
     }
 
-    /// Whether the consumer has taken something since it was last looked at.
+    /// Whether the consumer has consumed a message since the last check.
     pub(crate) fn has_moved(&self) -> bool {
         self.peer.load(Word::Head) != self.head_seen
     }
 
-    /// As if so much had been published and taken already.
+    /// Sets the counts as if this much had been published and consumed already.
     #[cfg(all(test, not(loom)))]
     pub(super) fn start_at(&mut self, count: u32) {
         (self.tail, self.head_seen) = (count, count);
         self.own.store(Word::Tail, count, Ordering::Relaxed);
     }
 
-    fn look_for_room(&mut self, length: usize) -> Result<bool, LoanError> {
-        self.look()?;
+    fn check_room(&mut self, length: usize) -> Result<bool, LoanError> {
+        self.refresh()?;
         let (_, record) = self.record_for(length)?;
         let rest = self.capacity.rest(self.tail);
         let skip = if record > rest { rest } else { 0 };
@@ -210,10 +211,11 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
         before.max(after).min(self.capacity.payload_max()) as usize
     }
 
-    /// Reads the consumer's head once and believes it only if it lies between the last one and the tail.
-    fn look(&mut self) -> Result<(), Corrupt> {
+    /// Reads the consumer's head once, and accepts it only if it lies between the last one and the tail.
+    fn refresh(&mut self) -> Result<(), Corrupt> {
         let head = self.peer.load(Word::Head);
-        // SYNC: the consumer's reads of what it took are over: its store of head in `ConsumerCore::release`.
+        // SYNC: the consumer's reads of the consumed messages are over: its store of head in
+        // `ConsumerCore::release`.
         fence(Ordering::Acquire);
         let (moved, most) = (head.wrapping_sub(self.head_seen), self.tail.wrapping_sub(self.head_seen));
         if moved > most || !head.is_multiple_of(MARK_BYTES) {

@@ -10,11 +10,12 @@
 //! S4 nothing new: sleep           W4 ring
 //! ```
 //!
-//! Whatever the timing, S3 sees W1 or W3 sees S1: the two fences have an order. The waker cannot clear the sleeper's word
-//! (the memory is not its own), so it remembers for which number it has rung, and rings once for each.
+//! Whatever the timing, S3 sees W1 or W3 sees S1: the two fences have an order. The waker cannot clear the
+//! sleeper's word (the memory is not its own), so it records the number for which it has rung, and rings once
+//! for each.
 //!
-//! Who sleeps for many rings announces to all of them and fences once. Its number says by what it is woken: by the bell of all its peers,
-//! or by each peer's own word (`any.rs`): 4k+1 and 4k+3 while it sleeps, 4k awake.
+//! A sleeper for many rings announces to all of them and fences once. Its number names the place of its wake:
+//! 4k+1 for the bell of all its peers, 4k+3 for each peer's own word (`any.rs`), 4k while awake.
 
 use std::sync::atomic::Ordering;
 
@@ -23,12 +24,12 @@ use crate::{
     memory::{OwnHeader, Peer, fence},
 };
 
-/// By what a sleeper is woken.
+/// The place at which a sleeper is woken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Ear {
+pub(crate) enum WakePlace {
     /// The bell that it gave its peers, perhaps the same to all of them: any of them can write it.
     Bell,
-    /// The word in the waker's own region, which nobody else can write.
+    /// The word in the waker's own region, which only the waker can write.
     Own,
 }
 
@@ -36,9 +37,9 @@ const ASLEEP: u32 = 1;
 const AT_OWN: u32 = 2;
 const STEP: u32 = 4;
 
-/// Between announcing one's sleep and looking again.
-pub(crate) fn fence_before_looking_again() {
-    // SYNC: S2, with W2 in `Waking::is_owed`.
+/// The fence between the announcement of a sleep and the next check.
+pub(crate) fn fence_before_recheck() {
+    // SYNC: S2, with W2 in `Waking::needs_ring`.
     fence(Ordering::SeqCst);
 }
 
@@ -54,23 +55,24 @@ impl Sleep {
         Self { word, number: 0 }
     }
 
-    /// Says that this side is about to sleep. What it waits for has to be looked at again after this.
+    /// Announces that this side is about to sleep. The awaited state must be checked again after this.
     pub(crate) fn announce(&mut self, own: &impl OwnHeader) {
-        self.announce_at(Ear::Bell, own);
-        fence_before_looking_again();
+        self.announce_at(WakePlace::Bell, own);
+        fence_before_recheck();
     }
 
     /// The same, without the fence.
-    pub(crate) fn announce_at(&mut self, ear: Ear, own: &impl OwnHeader) {
-        let at = match ear {
-            Ear::Bell => 0,
-            Ear::Own => AT_OWN,
+    pub(crate) fn announce_at(&mut self, wake_place: WakePlace, own: &impl OwnHeader) {
+        let at = match wake_place {
+            WakePlace::Bell => 0,
+            WakePlace::Own => AT_OWN,
         };
         self.number = (self.number & !(STEP - 1)).wrapping_add(STEP) | ASLEEP | at;
         own.store(self.word, self.number, Ordering::Relaxed);
     }
 
-    /// Says that this side is awake. When the waker sees this late, it rings in vain, which harms nobody.
+    /// Announces that this side is awake. If the waker sees this late, it rings without effect, which is
+    /// harmless.
     pub(crate) fn end(&mut self, own: &impl OwnHeader) {
         if self.number & ASLEEP != 0 {
             own.store(self.word, self.number & !(STEP - 1), Ordering::Relaxed);
@@ -84,7 +86,7 @@ impl Sleep {
     }
 }
 
-/// The other side's sleep, and what this side has done about it.
+/// The other side's sleep, and the number that this side last rang for.
 #[derive(Debug)]
 pub(crate) struct Waking {
     word: Word,
@@ -96,25 +98,25 @@ impl Waking {
         Self { word, rung_for: 0 }
     }
 
-    /// Whether the other side has to be woken for what was just stored: then the caller rings.
-    pub(crate) fn is_owed(&mut self, peer: &impl Peer) -> bool {
+    /// Whether the other side must be woken for the last store: then the caller rings.
+    pub(crate) fn needs_ring(&mut self, peer: &impl Peer) -> bool {
         // SYNC: W2, with S2 in `Sleep::announce`.
         fence(Ordering::SeqCst);
         let number = peer.load(self.word);
-        let owed = number & ASLEEP != 0 && number != self.rung_for;
-        if owed {
+        let needs_ring = number & ASLEEP != 0 && number != self.rung_for;
+        if needs_ring {
             self.rung_for = number;
         }
-        owed
+        needs_ring
     }
 
-    /// The number for which it was owed last.
+    /// The number for which a ring was due last.
     pub(crate) const fn rung_for(&self) -> u32 {
         self.rung_for
     }
 
-    /// Where the other side sleeps for which it was owed last.
-    pub(crate) const fn ear(&self) -> Ear {
-        if self.rung_for & AT_OWN == 0 { Ear::Bell } else { Ear::Own }
+    /// The place of the other side's sleep for which a ring was due last.
+    pub(crate) const fn wake_place(&self) -> WakePlace {
+        if self.rung_for & AT_OWN == 0 { WakePlace::Bell } else { WakePlace::Own }
     }
 }

@@ -1,4 +1,4 @@
-//! The protocol against a queue, and against a peer that writes what it likes. Runs under Miri too.
+//! The protocol against a queue, and against a peer that writes anything. Runs under Miri too.
 
 use std::{
     collections::VecDeque,
@@ -41,8 +41,8 @@ const CASES: u32 = if cfg!(miri) { 3 } else { 500 };
 proptest! {
     #![proptest_config(ProptestConfig { cases: CASES, failure_persistence: None, ..ProptestConfig::default() })]
 
-    /// Whatever the order of steps: what is taken is what was published, in order; a ring that is full says so truly, and an
-    /// empty one too.
+    /// For any order of steps: messages are received as published, in order. A ring that reports full is
+    /// full, and one that reports empty is empty.
     #[test]
     fn a_ring_is_a_queue(steps in proptest::collection::vec(step(), 1..200), log in 4..9_u32) {
         let capacity = Capacity::tiny(1 << log);
@@ -107,10 +107,10 @@ proptest! {
         }
     }
 
-    /// Whatever a peer writes into its header and its ring, before or meanwhile: a value or an error, and every message
-    /// lies within the ring.
+    /// For any bytes that a peer writes into its header and its ring, before or meanwhile: the result is a
+    /// value or an error, and every message lies within the ring.
     #[test]
-    fn any_memory_is_messages_or_an_error(
+    fn any_memory_gives_messages_or_an_error(
         words in proptest::collection::vec((0..40_u32, any::<u64>(), 0..5_u8), 1..60),
     ) {
         let capacity = Capacity::tiny(256);
@@ -118,7 +118,7 @@ proptest! {
         let mut receiver = ConsumerCore::new(Arc::clone(&own), Arc::clone(&peer), capacity);
         let mut sender = ProducerCore::new(own, Arc::clone(&peer), capacity);
         for (place, value, like) in words {
-            // Likely values lead deeper than any value.
+            // Likely values reach deeper checks than random ones.
             let small = value as u32 % 300;
             match (like, place) {
                 (0, _) => peer.word(Word::Tail).store(value as u32, Ordering::Relaxed),
@@ -149,8 +149,8 @@ proptest! {
 }
 
 #[test]
-fn a_message_that_does_not_fit_before_the_end_begins_anew_and_the_rest_is_skipped() {
-    // given: 64 bytes, 40 of them used and taken
+fn message_that_does_not_fit_skips_to_the_start() {
+    // given: 64 bytes, 40 of them used and consumed
     let (mut sender, mut receiver) = ring(Capacity::tiny(64));
     for _ in 0..2 {
         sender.reserve(8).expect("room");
@@ -161,7 +161,7 @@ fn a_message_that_does_not_fit_before_the_end_begins_anew_and_the_rest_is_skippe
     while let Some(record) = receiver.next().expect("honest") {
         receiver.release(record);
     }
-    // when: 32 bytes are asked for, with 24 to the end
+    // when: 32 bytes are requested, with 24 to the end
     let reserved = sender.reserve(24).expect("64 bytes are free");
     // then: they lie at the beginning
     assert_eq!(sender.payload_position(reserved), 8);
@@ -171,8 +171,8 @@ fn a_message_that_does_not_fit_before_the_end_begins_anew_and_the_rest_is_skippe
 }
 
 #[test]
-fn what_is_kept_is_given_back_together_and_its_producer_is_woken_once() {
-    // given: a full ring, whose producer waits for room
+fn kept_memory_is_returned_together_with_one_wake() {
+    // given: a full ring with a producer that waits for room
     let (mut sender, mut receiver) = ring(Capacity::tiny(32));
     for _ in 0..2 {
         sender.reserve(8).expect("room");
@@ -187,12 +187,12 @@ fn what_is_kept_is_given_back_together_and_its_producer_is_woken_once() {
     }
     assert_eq!(receiver.next(), Ok(None));
     assert!(receiver.give_back(), "the producer is to be woken");
-    assert_eq!(sender.untaken(), Ok(0));
+    assert_eq!(sender.unread(), Ok(0));
     assert!(!receiver.give_back(), "there is nothing more");
 }
 
 #[test]
-fn counts_wrap_at_32_bits_without_a_trace() {
+fn counts_wrap_at_32_bits() {
     // given: both halves a little before the end of counting; only whole capacities are added by hand
     let capacity = Capacity::tiny(64);
     let (mut sender, mut receiver) = ring(capacity);
@@ -211,7 +211,7 @@ fn counts_wrap_at_32_bits_without_a_trace() {
 }
 
 #[test]
-fn an_error_is_repeated_even_when_the_peer_mends_its_memory() {
+fn error_persists_after_the_peer_repairs_its_memory() {
     // given
     let (sender, mut receiver) = ring(Capacity::tiny(64));
     sender.own.word(Word::Tail).store(4, Ordering::Relaxed);
@@ -224,7 +224,7 @@ fn an_error_is_repeated_even_when_the_peer_mends_its_memory() {
 }
 
 #[test]
-fn a_tail_or_head_that_goes_back_or_too_far_is_corrupt() {
+fn invalid_tail_or_head_is_corrupt() {
     for tail in [72, 0_u32.wrapping_sub(8), u32::MAX, 1] {
         let (sender, mut receiver) = ring(Capacity::tiny(64));
         sender.own.word(Word::Tail).store(tail, Ordering::Relaxed);
@@ -238,7 +238,7 @@ fn a_tail_or_head_that_goes_back_or_too_far_is_corrupt() {
             sender.publish();
         }
         receiver.own.word(Word::Head).store(head, Ordering::Relaxed);
-        // when: there is room without looking, then there is not
+        // when: there is room without a new check, then there is not
         sender.reserve(24).expect("the other half");
         sender.publish();
         let error = Corrupt::Head { head, seen: 0, tail: 64 };
@@ -249,9 +249,10 @@ fn a_tail_or_head_that_goes_back_or_too_far_is_corrupt() {
     }
 }
 
-/// Found by the hostile peer: such a message lay within the ring, but buffers of `payload_max` bytes were too short for it.
+/// Found by the hostile peer: such a message lay within the ring, but buffers of `payload_max` bytes were too
+/// short for it.
 #[test]
-fn a_message_longer_than_half_the_ring_is_corrupt_although_it_fits() {
+fn message_longer_than_half_the_ring_is_corrupt() {
     let (sender, mut receiver) = ring(Capacity::tiny(64));
     sender.own.cell(0).store(Mark::Message(32).to_bits(), Ordering::Relaxed);
     sender.own.word(Word::Tail).store(40, Ordering::Relaxed);
@@ -259,7 +260,7 @@ fn a_message_longer_than_half_the_ring_is_corrupt_although_it_fits() {
 }
 
 #[test]
-fn no_skip_follows_a_skip_and_none_leads_to_nothing() {
+fn skip_after_skip_or_to_nothing_is_corrupt() {
     for published in [64, 32] {
         let (sender, mut receiver) = ring(Capacity::tiny(64));
         sender.own.cell(0).store(Mark::Skip.to_bits(), Ordering::Relaxed);
@@ -269,7 +270,7 @@ fn no_skip_follows_a_skip_and_none_leads_to_nothing() {
 }
 
 #[test]
-fn a_peer_that_sleeps_for_ever_costs_one_ring_for_each_number_that_it_writes() {
+fn peer_gets_one_ring_for_each_sleep_number() {
     // given
     let (mut sender, receiver) = ring(Capacity::tiny(256));
     receiver.own.word(Word::ConsumerSleep).store(5, Ordering::Relaxed);

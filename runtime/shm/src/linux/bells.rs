@@ -1,4 +1,4 @@
-//! The three bells: a futex, an eventfd, a pair of sockets.
+//! The three bells: a futex, an eventfd, a socket pair.
 
 use std::{
     io::{self, IoSliceMut},
@@ -27,7 +27,7 @@ use super::{
     rights::{keep_urgent_in_line, set_descriptors},
 };
 use crate::{
-    bell::{Bell, BellKind, Bells, CommonBell, Doorbell, Heard, Woken},
+    bell::{Bell, BellKind, BellState, Bells, CommonBell, Doorbell, Woken},
     error::{CreateError, RefusedOffer},
     offer::Descriptors,
     wait::{HangUp, Waiting},
@@ -36,7 +36,7 @@ use crate::{
 /// For messages, and for room.
 type Both = (Box<dyn Doorbell>, Box<dyn Doorbell>);
 
-/// A region's bells.
+/// Creates a region's bells.
 pub(crate) fn bells(bell: &Bell) -> Result<Bells, CreateError> {
     let made = match bell {
         Bell::OfItsOwn(BellKind::Futex) => SharedPage::create().and_then(|page| page.bells()),
@@ -78,21 +78,22 @@ fn pair_of<T: Doorbell + 'static>(make: fn() -> io::Result<(T, OwnedFd)>) -> io:
 }
 
 fn event() -> io::Result<(EventBell, OwnedFd)> {
-    let ear = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
-    let button = rustix::io::fcntl_dupfd_cloexec(&ear, 0)?;
-    Ok((EventBell(ear), button))
+    let listener = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
+    let button = rustix::io::fcntl_dupfd_cloexec(&listener, 0)?;
+    Ok((EventBell(listener), button))
 }
 
 fn socket() -> io::Result<(SocketBell, OwnedFd)> {
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-    let (ear, button) = socketpair(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
-    // Who drains the ear would close them. Where the system does not know it (Linux before 6.16) it is looked at first.
-    let looks = set_descriptors(ear.as_fd(), Descriptors::Refused).is_err();
-    keep_urgent_in_line(ear.as_fd())?;
-    Ok((SocketBell { socket: ear, looks }, button))
+    let (listener, button) = socketpair(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
+    // Draining the listener would close descriptors. If the system cannot refuse them (Linux before 6.16), the
+    // listener is peeked first.
+    let peeks = set_descriptors(listener.as_fd(), Descriptors::Refused).is_err();
+    keep_urgent_in_line(listener.as_fd())?;
+    Ok((SocketBell { socket: listener, peeks }, button))
 }
 
-/// The peer's bells, to be rung by this side, if the descriptors are such.
+/// Creates this side's ends of the peer's bells, if the descriptors are valid.
 pub(crate) fn buttons(kind: BellKind, fds: Vec<OwnedFd>) -> Result<Both, RefusedOffer> {
     let mut fds = fds.into_iter();
     match (kind, fds.next(), fds.next()) {
@@ -111,19 +112,22 @@ pub(crate) fn buttons(kind: BellKind, fds: Vec<OwnedFd>) -> Result<Both, Refused
     }
 }
 
-/// Whether it is the end of a connection of unix sockets, in which nothing lies: that, descriptors beside it, would be closed with it. Nothing
-/// more comes: a button is rung, not read, and no copy of it that the peer has kept takes this back.
+/// Whether it is a connected unix socket with an empty receive queue: descriptors in the queue would be
+/// closed with it. Shuts down its receiving direction. A button is rung and never read, and no copy that the
+/// peer has kept can undo the shutdown.
 fn is_button(fd: &OwnedFd) -> bool {
-    // One that has no other end could listen, now or later, and what waits to be accepted would be closed with it.
+    // A socket without another end could listen, now or later, and its queued connections would be closed
+    // with it.
     let is_end = sockopt::socket_domain(fd) == Ok(AddressFamily::UNIX)
         && sockopt::socket_type(fd) == Ok(SocketType::STREAM)
         && getpeername(fd).is_ok();
     if !is_end {
         return false;
     }
-    // It fails where the other end has gone, from which nothing comes either.
+    // It fails if the other end has gone, from which no data arrives either.
     let _ = shutdown(fd, Shutdown::Read);
-    // Counted, not looked at: an urgent byte is passed over by a look, and so is what lies before the place from where the peer has it look.
+    // Counted, not peeked: a peek skips an urgent byte, and data before the offset that the peer has set for
+    // peeks.
     ioctl_fionread(fd) == Ok(0)
 }
 
@@ -136,14 +140,14 @@ fn is_eventfd(fd: &OwnedFd) -> Result<bool, RefusedOffer> {
     Ok(name.as_bytes() == b"anon_inode:[eventfd]")
 }
 
-/// How often who sleeps on a futex looks whether the peer is still there: a futex and a descriptor cannot be waited for at
-/// once.
-const HANG_UP_LOOK: Duration = Duration::from_millis(20);
+/// Interval at which a sleeper on a futex checks whether the peer is still present: one call cannot wait for
+/// a futex and a descriptor.
+const HANG_UP_CHECK: Duration = Duration::from_millis(20);
 
 const MESSAGE_WORD: usize = 0;
 const ROOM_WORD: usize = 32;
 
-/// Wakes one who sleeps at a word.
+/// Wakes one sleeper at a word.
 pub(super) fn wake(word: &AtomicU32) {
     // Not private: the sleeper is in another process. It can fail only for a bad address, which this is not.
     let _ = futex::wake(word, futex::Flags::empty(), 1);
@@ -151,9 +155,10 @@ pub(super) fn wake(word: &AtomicU32) {
 
 /// A word that each ring changes, in a page that both sides write.
 ///
-/// Not the tail or head itself: the sleeper's mapping of those is read-only, and a futex on a read-only mapping costs half a
-/// microsecond more each time. What a hostile peer writes here ends sleeps early, or lets rings go unheard: its own and, where several regions have
-/// the page, those of others until `Waiter` has found that out.
+/// Not the tail or head itself: the sleeper's mapping of those is read-only, and a futex on a read-only
+/// mapping costs half a microsecond more each time. A hostile peer's writes here end sleeps early, or lose
+/// rings. These are its own rings, and where several regions share the page, those of others until `Waiter`
+/// has detected that.
 struct FutexBell {
     page: Arc<Mapping>,
     index: usize,
@@ -171,20 +176,20 @@ impl Doorbell for FutexBell {
     }
 
     fn ring(&self) {
-        // SYNC: who hears this ring in `listen` also sees what it was rung for.
+        // SYNC: a sleeper that sees this ring in `listen` also sees the stores before it.
         self.counter().fetch_add(1, Ordering::Release);
         wake(self.counter());
     }
 
-    fn listen(&self) -> Heard {
-        Heard(self.counter().load(Ordering::Acquire))
+    fn listen(&self) -> BellState {
+        BellState(self.counter().load(Ordering::Acquire))
     }
 
-    fn sleep(&self, heard: Heard, waiting: &Waiting<'_>) -> io::Result<Woken> {
+    fn sleep(&self, seen: BellState, waiting: &Waiting<'_>) -> io::Result<Woken> {
         let left = waiting.left(Instant::now());
-        let now = waiting.hang_up.map_or(left, |_| left.min(HANG_UP_LOOK));
-        match futex::wait(self.counter(), futex::Flags::empty(), heard.0, Some(&timespec(now))) {
-            // Rung before the sleep; a signal came. The caller looks again.
+        let now = waiting.hang_up.map_or(left, |_| left.min(HANG_UP_CHECK));
+        match futex::wait(self.counter(), futex::Flags::empty(), seen.0, Some(&timespec(now))) {
+            // Rung before the sleep, or interrupted by a signal. The caller checks again.
             Ok(()) | Err(Errno::AGAIN | Errno::INTR) => return Ok(Woken::Rung),
             Err(Errno::TIMEDOUT) => {}
             Err(errno) => return Err(errno.into()),
@@ -194,7 +199,8 @@ impl Doorbell for FutexBell {
         } else if now == left {
             Ok(Woken::TimedOut)
         } else {
-            // The caller looks again: another one who may write the word can have taken the ring, and put the number back.
+            // The caller checks again: another writer of the word may have undone the ring by restoring the
+            // number.
             Ok(Woken::Rung)
         }
     }
@@ -204,12 +210,12 @@ impl Doorbell for FutexBell {
     }
 
     fn drain(&self) {
-        // A futex keeps nothing.
+        // A futex stores no rings.
     }
 }
 
-/// A descriptor keeps a ring until it is drained.
-const HEARD_IN_THE_DESCRIPTOR: Heard = Heard(0);
+/// A descriptor stores a ring until it is drained.
+const STATE_IN_THE_DESCRIPTOR: BellState = BellState(0);
 
 struct EventBell(OwnedFd);
 
@@ -219,11 +225,11 @@ impl Doorbell for EventBell {
         let _ = rustix::io::write(&self.0, &1_u64.to_ne_bytes());
     }
 
-    fn listen(&self) -> Heard {
-        HEARD_IN_THE_DESCRIPTOR
+    fn listen(&self) -> BellState {
+        STATE_IN_THE_DESCRIPTOR
     }
 
-    fn sleep(&self, _: Heard, waiting: &Waiting<'_>) -> io::Result<Woken> {
+    fn sleep(&self, _: BellState, waiting: &Waiting<'_>) -> io::Result<Woken> {
         poll_for(self, waiting)
     }
 
@@ -232,7 +238,7 @@ impl Doorbell for EventBell {
     }
 
     fn drain(&self) {
-        // Not a plain read: the peer may have made the descriptor, which is shared with it, blocking.
+        // Not a plain read: the peer may have made the shared descriptor blocking.
         let mut count = [0; 8];
         let at_the_file_position = u64::MAX;
         let _ = preadv2(
@@ -246,28 +252,28 @@ impl Doorbell for EventBell {
 
 struct SocketBell {
     socket: OwnedFd,
-    /// Descriptors may come with what is heard.
-    looks: bool,
+    /// Whether descriptors may arrive with the rings.
+    peeks: bool,
 }
 
-/// A bell of the peer's, of which nothing is heard.
+/// Creates a button for the peer's bell, which is never read.
 const fn button(socket: OwnedFd) -> SocketBell {
-    SocketBell { socket, looks: false }
+    SocketBell { socket, peeks: false }
 }
 
 impl Doorbell for SocketBell {
     fn ring(&self) {
-        // Full means that it is rung already; closed means that nobody waits.
+        // Full means that it is rung already; closed means that no sleeper is left.
         let _ = send(&self.socket, &[1], SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
     }
 
-    fn listen(&self) -> Heard {
-        HEARD_IN_THE_DESCRIPTOR
+    fn listen(&self) -> BellState {
+        STATE_IN_THE_DESCRIPTOR
     }
 
-    fn sleep(&self, _: Heard, waiting: &Waiting<'_>) -> io::Result<Woken> {
-        if self.looks && undescribed(&self.socket, &mut [0; RINGS_MAX]).is_none() {
-            // It would end every sleep, and can be taken out by nobody who may not wait.
+    fn sleep(&self, _: BellState, waiting: &Waiting<'_>) -> io::Result<Woken> {
+        if self.peeks && undescribed(&self.socket, &mut [0; RINGS_MAX]).is_none() {
+            // The descriptor would end every sleep, and a thread that must not block cannot remove it.
             return Ok(Woken::HungUp);
         }
         poll_for(self, waiting)
@@ -279,25 +285,27 @@ impl Doorbell for SocketBell {
 
     fn drain(&self) {
         let mut rings = [0; RINGS_MAX];
-        let count = if self.looks { undescribed(&self.socket, &mut rings) } else { Some(RINGS_MAX) };
+        let count = if self.peeks { undescribed(&self.socket, &mut rings) } else { Some(RINGS_MAX) };
         if let Some(count) = count {
             let _ = recv(&self.socket, &mut rings[..count], RecvFlags::DONTWAIT);
         }
     }
 }
 
-/// Bytes that are drained at once. More was rung only by a peer that rings for fun; then the next sleep ends early.
+/// Bytes that are drained at once. Only a peer that rings without need exceeds this; then the next sleep ends
+/// early.
 const RINGS_MAX: usize = 64;
 
-/// So many bytes can be taken without a descriptor beside them; `None` if there is one. All stays where it is.
+/// Peeks into the queue. Returns the number of bytes that can be read without a descriptor beside them;
+/// `None` if there is one.
 fn undescribed(socket: &OwnedFd, rings: &mut [u8]) -> Option<usize> {
     let flags = RecvFlags::DONTWAIT | RecvFlags::PEEK;
-    // Without room for descriptors: that they are there is said, and none is made ours.
+    // Without space for descriptors: the kernel reports their presence, and installs none in this process.
     let mut none = RecvAncillaryBuffer::default();
     match recvmsg(socket, &mut [IoSliceMut::new(rings)], &mut none, flags) {
         Ok(got) if got.flags.contains(ReturnFlags::CTRUNC) => None,
         Ok(got) => Some(got.bytes),
-        // There is nothing, or will be nothing.
+        // The queue is empty, or will stay empty.
         Err(_) => Some(0),
     }
 }
@@ -308,8 +316,8 @@ fn poll_for(bell: &impl Doorbell, waiting: &Waiting<'_>) -> io::Result<Woken> {
         return Ok(Woken::Rung);
     };
     let left = timespec(waiting.left(Instant::now()));
-    let ear = PollFd::from_borrowed_fd(fd, PollFlags::IN);
-    let mut fds = [ear.clone(), waiting.hang_up.map_or(ear, end_of)];
+    let listener = PollFd::from_borrowed_fd(fd, PollFlags::IN);
+    let mut fds = [listener.clone(), waiting.hang_up.map_or(listener, end_of)];
     let count = if waiting.hang_up.is_some() { 2 } else { 1 };
     match poll(&mut fds[..count], Some(&left)) {
         Ok(0) => Ok(Woken::TimedOut),
@@ -318,7 +326,7 @@ fn poll_for(bell: &impl Doorbell, waiting: &Waiting<'_>) -> io::Result<Woken> {
             Ok(Woken::Rung)
         }
         Ok(_) => Ok(Woken::HungUp),
-        // A signal came. The caller looks again.
+        // Interrupted by a signal. The caller checks again.
         Err(Errno::INTR) => Ok(Woken::Rung),
         Err(errno) => Err(errno.into()),
     }
@@ -340,7 +348,7 @@ pub(crate) fn has_ended(hang_up: HangUp<'_>) -> io::Result<bool> {
     first_ended(&mut [end_of(hang_up)]).map(|ended| ended.is_some())
 }
 
-/// The first of those peers that are gone: one system call for all of them. Does not wait.
+/// Returns the first of those peers that are gone: one system call for all of them. Does not wait.
 pub(crate) fn which_ended<'a>(hang_ups: impl Iterator<Item = HangUp<'a>>) -> io::Result<Option<usize>> {
     first_ended(&mut hang_ups.map(end_of).collect::<Vec<_>>())
 }
@@ -353,7 +361,7 @@ fn first_ended(ends: &mut [PollFd<'_>]) -> io::Result<Option<usize>> {
     }
 }
 
-/// Far more than a lifetime is a lifetime.
+/// Converts a time; values far beyond a lifetime are capped.
 pub(super) fn timespec(time: Duration) -> Timespec {
     Timespec {
         tv_sec: i64::try_from(time.as_secs()).unwrap_or(i64::MAX).min(1 << 32),

@@ -1,20 +1,22 @@
-//! Mapped regions as typed memory. **All of Sinew's unsafe code about shared memory is in this file**, in four blocks.
+//! Mapped regions as typed memory. **All of Sinew's unsafe code about shared memory is in this file**, in
+//! four blocks.
 //!
 //! They rest on these facts:
 //!
-//! - M1. `MmapRaw` keeps `len()` bytes mapped at `as_ptr()`, page-aligned, until it is dropped; it is not dropped while any
-//!   of the types here lives (`Arc`). `Mapping::new` checks that `len()` is header plus ring.
-//! - M2. The file behind it cannot shrink or be punched: it has the seals SHRINK and FUTURE_WRITE, set by `memfd::create` or
-//!   checked by `memfd::adopt`. So every byte stays there and no access is a bus error.
-//! - M3. An own region is written by this process only: nobody else can map it writable or write to it (seal FUTURE_WRITE,
-//!   set before its descriptor leaves this process).
-//! - M4. Of an own region, the header is touched only as atomics, and the ring only through the one `OwnRingMemory` that
-//!   `OwnMemory::split` makes of it: it is neither `Clone` nor `Copy`.
-//! - M5. Of a peer's region, which changes at any time, everything is touched only by relaxed atomic loads of 4 or 8 aligned
-//!   bytes, each place always in the same size: header 4, ring 8. These are defined on read-only mappings too. The word `Rung` is also
-//!   slept at, which makes the kernel load it.
-//! - M6. A page of bells is written by both sides, and touched only as atomics of 4 bytes. It cannot shrink (seal SHRINK); a
-//!   hole in it reads as zeros.
+//! - M1. `MmapRaw` keeps `len()` bytes mapped at `as_ptr()`, page-aligned, until it is dropped; it is not
+//!   dropped while any of the types here lives (`Arc`). `Mapping::new` checks that `len()` is header plus
+//!   ring.
+//! - M2. The file behind it cannot shrink or be punched: it has the seals SHRINK and FUTURE_WRITE, set by
+//!   `memfd::create` or checked by `memfd::adopt`. So every byte stays there and no access is a bus error.
+//! - M3. An own region is written by this process only: no other process can map it writable or write to it
+//!   (seal FUTURE_WRITE, set before its descriptor leaves this process).
+//! - M4. In an own region, the header is accessed only as atomics, and the ring only through the one
+//!   `OwnRingMemory` that `OwnMemory::split` creates for it: it is neither `Clone` nor `Copy`.
+//! - M5. A peer's region changes at any time. It is accessed only by relaxed atomic loads of 4 or 8 aligned
+//!   bytes, each place always in the same size: header 4, ring 8. These are defined on read-only mappings
+//!   too. The word `Rung` is also slept at, which makes the kernel load it.
+//! - M6. A page of bells is written by both sides, and accessed only as atomics of 4 bytes. It cannot shrink
+//!   (seal SHRINK); a hole in it reads as zeros.
 
 use std::{
     slice,
@@ -40,7 +42,7 @@ pub(super) struct Mapping {
 }
 
 impl Mapping {
-    /// A region of this capacity; `None` when the mapping has another size.
+    /// Creates a region of this capacity; `None` when the mapping has another size.
     pub(super) fn new(raw: MmapRaw, capacity: Capacity) -> Option<Self> {
         let ring_bytes = capacity.bytes() as usize;
         (raw.len() == HEADER_BYTES + ring_bytes).then_some(Self { raw, ring_bytes })
@@ -48,19 +50,21 @@ impl Mapping {
 
     fn header(&self) -> &[AtomicU32] {
         let start = self.raw.as_ptr().cast::<AtomicU32>();
-        // SAFETY: M1: so many bytes are mapped there and aligned to a page; M4, M5 and M6: all access to them in this process
-        // is atomic and of this size. Through a read-only mapping `PeerMemory` and `identity` only load, relaxed.
+        // SAFETY: M1: this many bytes are mapped there and aligned to a page; M4, M5 and M6: all access to
+        // them in this process is atomic and of this size. Through a read-only mapping `PeerMemory` and
+        // `identity` only load, relaxed.
         unsafe { slice::from_raw_parts(start, HEADER_BYTES / size_of::<AtomicU32>()) }
     }
 
     fn ring_words(&self) -> &[AtomicU64] {
         let start = self.raw.as_ptr().wrapping_add(HEADER_BYTES).cast::<AtomicU64>();
-        // SAFETY: M1: so many bytes are mapped there, and the header's length keeps the alignment; M5: all access to them
-        // in this process is atomic and of this size, since only `PeerMemory`, which has no other access, calls this.
+        // SAFETY: M1: this many bytes are mapped there, and the header's length keeps the alignment; M5: all
+        // access to them in this process is atomic and of this size, since only `PeerMemory`, which has no
+        // other access, calls this.
         unsafe { slice::from_raw_parts(start, self.ring_bytes / size_of::<AtomicU64>()) }
     }
 
-    /// A page of words without a ring; `None` when the mapping has another size.
+    /// Creates a page of words without a ring; `None` when the mapping has another size.
     pub(super) fn page(raw: MmapRaw) -> Option<Self> {
         (raw.len() == HEADER_BYTES).then_some(Self { raw, ring_bytes: 0 })
     }
@@ -70,7 +74,7 @@ impl Mapping {
         &self.header()[index]
     }
 
-    /// What the first words say: magic, version, capacity. Each is read once.
+    /// Reads the first words: magic, version, capacity. Each is read once.
     pub(super) fn identity(&self) -> (u64, u32, u32) {
         let word = |index: usize| self.header()[index].load(Ordering::Relaxed);
         (u64::from(word(0)) | u64::from(word(1)) << 32, word(2), word(3))
@@ -82,9 +86,9 @@ impl Mapping {
 pub(crate) struct OwnMemory(Arc<Mapping>);
 
 impl OwnMemory {
-    /// Takes a writable mapping of zeros and writes the identity into it.
+    /// Wraps a writable mapping of zeros and writes the identity into it.
     ///
-    /// The caller has made the file, and seals it (M2, M3) before the peer gets it.
+    /// The caller has created the file, and seals it (M2, M3) before the peer receives it.
     pub(super) fn new(mapping: Mapping) -> Self {
         let header = mapping.header();
         let capacity = u32::try_from(mapping.ring_bytes).expect("a capacity has 32 bits");
@@ -95,7 +99,8 @@ impl OwnMemory {
         Self(Arc::new(mapping))
     }
 
-    /// The header, for the consumer; header and ring, for the producer. There is one of each (M4).
+    /// Splits into the header, for the consumer, and header and ring, for the producer. There is one of each
+    /// (M4).
     pub(crate) fn split(self) -> (OwnHeaderMemory, OwnRingMemory) {
         (OwnHeaderMemory(Arc::clone(&self.0)), OwnRingMemory(OwnHeaderMemory(self.0)))
     }
@@ -106,7 +111,7 @@ impl OwnMemory {
         match place.checked_sub(HEADER_BYTES / 4) {
             None => self.0.header()[place].store(value, Ordering::Relaxed),
             Some(word) => {
-                // A view for this call only; nobody else has one before `split`.
+                // A view for this call only; no other view exists before `split`.
                 let mut ring = OwnRingMemory(OwnHeaderMemory(Arc::clone(&self.0)));
                 let position = u32::try_from(word * 4).expect("a capacity has 32 bits");
                 ring.bytes_mut(position, 4).copy_from_slice(&value.to_ne_bytes());
@@ -136,7 +141,7 @@ impl OwnHeader for OwnHeaderMemory {
 pub(crate) struct OwnRingMemory(OwnHeaderMemory);
 
 impl OwnRingMemory {
-    /// Wakes who sleeps at the word that says for what this side has rung.
+    /// Wakes the sleeper at the word in which this side reports its rings.
     pub(crate) fn wake_rung(&self) {
         wake(self.0.word(Word::Rung));
     }
@@ -145,17 +150,20 @@ impl OwnRingMemory {
     pub(crate) fn bytes(&self, position: u32, length: u32) -> &[u8] {
         let mapping = &self.0.0;
         let start = mapping.raw.as_ptr().wrapping_add(HEADER_BYTES);
-        // SAFETY: M1: so many bytes are mapped there; M3 and M4: nobody writes them while `self` is borrowed.
+        // SAFETY: M1: this many bytes are mapped there; M3 and M4: no code writes them while `self` is
+        // borrowed.
         let ring = unsafe { slice::from_raw_parts(start, mapping.ring_bytes) };
         &ring[position as usize..][..length as usize]
     }
 
-    /// Bytes of the ring, to be written. The peer may read them at any time, which changes nothing for this side.
+    /// Bytes of the ring, to be written. The peer may read them at any time, which changes nothing for this
+    /// side.
     pub(crate) fn bytes_mut(&mut self, position: u32, length: u32) -> &mut [u8] {
         let mapping = &self.0.0;
         let start = mapping.raw.as_mut_ptr().wrapping_add(HEADER_BYTES);
-        // SAFETY: M1: so many bytes are mapped there, writable as this is an own region; M3 and M4: nobody else in this
-        // process has them while `self` is borrowed, nobody else at all writes them.
+        // SAFETY: M1: this many bytes are mapped there, writable as this is an own region; M3 and M4: no
+        // other code in this process has access to them while `self` is borrowed, and no other process writes
+        // them.
         let ring = unsafe { slice::from_raw_parts_mut(start, mapping.ring_bytes) };
         &mut ring[position as usize..][..length as usize]
     }
@@ -163,7 +171,7 @@ impl OwnRingMemory {
 
 #[cfg(all(test, not(loom)))]
 impl OwnRingMemory {
-    /// The same memory as a peer sees it. Nobody writes it any more.
+    /// The same memory as a peer sees it. It is not written any more.
     pub(super) fn into_peer(self) -> PeerMemory {
         PeerMemory(self.0.0)
     }
@@ -181,7 +189,7 @@ impl OwnRing for OwnRingMemory {
     }
 }
 
-/// The peer's region: read-only, and never to be believed.
+/// The peer's region: read-only, and never trusted.
 #[derive(Clone, Debug)]
 pub(crate) struct PeerMemory(Arc<Mapping>);
 
@@ -190,13 +198,13 @@ impl PeerMemory {
         Self(Arc::new(mapping))
     }
 
-    /// The word that says for what the peer has rung: to be loaded, relaxed, and slept at.
+    /// The word in which the peer reports its rings: to be loaded, relaxed, and slept at.
     pub(crate) fn rung(&self) -> &AtomicU32 {
         &self.0.header()[Word::Rung.index()]
     }
 
-    /// Copies bytes of the ring, each read once, in words of 8: no instruction in it can be torn apart by the compiler, and
-    /// what the peer does meanwhile decides only which bytes are copied.
+    /// Copies bytes of the ring, each read once, in words of 8. The compiler cannot tear any of these loads.
+    /// A concurrent write of the peer decides only which bytes are copied.
     ///
     /// # Panics
     /// When the bytes do not lie within the ring: the core has checked that they do.

@@ -1,4 +1,4 @@
-//! Memory without a name, sealed: making one's own, and checking a peer's before it is mapped.
+//! Memory without a name, sealed: its creation, and the checks of a peer's memory before it is mapped.
 
 use std::{io, os::fd::OwnedFd};
 
@@ -17,20 +17,21 @@ use crate::{
     layout::{Capacity, HEADER_BYTES, MAGIC, VERSION},
 };
 
-/// What tmpfs, and so every ordinary memfd, says that it is. Memory in huge pages says something else.
+/// The file system type of tmpfs, and so of every ordinary memfd. Memory in huge pages reports another one.
 const TMPFS_MAGIC: i64 = 0x0102_1994;
 
-/// Without these a peer could pull memory away from under this side: cut it, or punch holes (FUTURE_WRITE), or unseal it.
+/// Without these a peer could remove memory that this side uses: by cutting it, by punching holes
+/// (FUTURE_WRITE), or by unsealing it.
 const NEEDED: SealFlags =
     SealFlags::SHRINK.union(SealFlags::GROW).union(SealFlags::FUTURE_WRITE).union(SealFlags::SEAL);
 
-/// Makes a region: all of its memory is there from now on, and nobody but this mapping can write it.
+/// Creates a region: all of its memory is allocated now, and only this mapping can write it.
 pub(crate) fn create(capacity: Capacity) -> Result<(OwnMemory, OwnedFd), CreateError> {
     let step = |step| move |errno: Errno| CreateError::System { step, cause: errno.into() };
     let memory = unnamed().map_err(step("making memory (memfd_create)"))?;
     let bytes = capacity.region_bytes();
     ftruncate(&memory, bytes).map_err(step("sizing memory (ftruncate)"))?;
-    // Now, and not at the first touch: running out of memory is an error here, and a bus error there.
+    // Now, and not at the first access: a lack of memory is an error here, and a bus error there.
     fallocate(&memory, FallocateFlags::empty(), 0, bytes).map_err(step("reserving memory (fallocate)"))?;
     let mapped = |cause| CreateError::System { step: "mapping memory (mmap)", cause };
     let raw = options(capacity).and_then(|options| options.map_raw(&memory)).map_err(mapped)?;
@@ -40,7 +41,7 @@ pub(crate) fn create(capacity: Capacity) -> Result<(OwnMemory, OwnedFd), CreateE
     Ok((own, memory))
 }
 
-/// Not executable where the system knows that (Linux 6.3).
+/// Not executable where the system supports that (Linux 6.3).
 fn unnamed() -> Result<OwnedFd, Errno> {
     let flags = MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING;
     match memfd_create("sinew-ring", flags | MemfdFlags::NOEXEC_SEAL) {
@@ -49,10 +50,10 @@ fn unnamed() -> Result<OwnedFd, Errno> {
     }
 }
 
-/// Maps a peer's region read-only, if it is one.
+/// Maps a peer's region read-only, if it is valid.
 ///
-/// The order matters: reading the seals is answered by the kernel itself for every kind of file, while asking a file system
-/// of the peer's own for a size could take for ever.
+/// The order matters: the kernel itself returns the seals for every kind of file, while a request for the
+/// size to the peer's own file system could block forever.
 pub(crate) fn adopt(memory: OwnedFd, capacity: Capacity) -> Result<PeerMemory, RefusedOffer> {
     let step = |step| move |errno: Errno| RefusedOffer::System { step, cause: errno.into() };
     let seals = fcntl_get_seals(&memory).map_err(|_| RefusedOffer::Kind)?;
@@ -81,10 +82,10 @@ pub(crate) fn adopt(memory: OwnedFd, capacity: Capacity) -> Result<PeerMemory, R
     Ok(PeerMemory::new(mapping))
 }
 
-/// What both sides write and neither believes can still not be cut.
+/// A page that both sides write and neither trusts still must not shrink.
 const NEEDED_OF_PAGE: SealFlags = SealFlags::SHRINK.union(SealFlags::GROW).union(SealFlags::SEAL);
 
-/// Makes a page of bells: both sides write it.
+/// Creates a page of bells: both sides write it.
 pub(super) fn create_page() -> io::Result<(Mapping, OwnedFd)> {
     let memory = unnamed()?;
     ftruncate(&memory, HEADER_BYTES as u64)?;
@@ -94,7 +95,7 @@ pub(super) fn create_page() -> io::Result<(Mapping, OwnedFd)> {
     Ok((mapping.ok_or(io::ErrorKind::InvalidData)?, memory))
 }
 
-/// Maps a peer's page of bells, if it is one; `None` if not.
+/// Maps a peer's page of bells, if it is valid; `None` if not.
 pub(super) fn adopt_page(memory: &OwnedFd) -> io::Result<Option<Mapping>> {
     let sealed = fcntl_get_seals(memory).is_ok_and(|seals| seals.contains(NEEDED_OF_PAGE));
     if !sealed || fstatfs(memory)?.f_type != TMPFS_MAGIC || fstat(memory)?.st_size != HEADER_BYTES as i64 {
@@ -103,7 +104,7 @@ pub(super) fn adopt_page(memory: &OwnedFd) -> io::Result<Option<Mapping>> {
     Ok(Mapping::page(MmapOptions::new().len(HEADER_BYTES).populate().map_raw(memory)?))
 }
 
-/// Mapped with all its pages: the first message meets no page fault.
+/// Mapped with all its pages: the first message causes no page fault.
 fn options(capacity: Capacity) -> io::Result<MmapOptions> {
     let bytes = usize::try_from(capacity.region_bytes()).map_err(|_| io::ErrorKind::OutOfMemory)?;
     let mut options = MmapOptions::new();

@@ -1,7 +1,7 @@
 //! Linux: sealed memfds, futexes, eventfds.
 
 mod bells;
-mod ears;
+mod futex_set;
 mod mapping;
 mod memfd;
 mod passing;
@@ -10,7 +10,7 @@ mod rights;
 mod tests;
 
 pub(crate) use bells::{SharedPage, bells, buttons, which_ended};
-pub(crate) use ears::{Ears, sleep_at};
+pub(crate) use futex_set::{FutexSet, sleep_at};
 pub(crate) use mapping::{OwnHeaderMemory, OwnMemory, OwnRingMemory, PeerMemory};
 pub(crate) use memfd::{adopt, create};
 pub(crate) use passing::{receive, send};

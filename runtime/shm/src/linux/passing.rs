@@ -34,8 +34,9 @@ pub(crate) fn send(offer: &Offer, socket: BorrowedFd<'_>) -> Result<(), PassErro
     }
 }
 
-/// Looks at it first: the kernel installs a copy of each descriptor then, and keeps its own in the queue, so that nothing that is closed
-/// before the bytes are taken is the last one. What is more than an offer, or less, is left where it is.
+/// Peeks first. The kernel then installs a copy of each descriptor and keeps its own in the queue. So no
+/// close before the bytes are read is the last one. A message with more than an offer, or less, is left in
+/// the socket.
 pub(crate) fn receive(socket: BorrowedFd<'_>) -> Result<Received, PassError> {
     let mut bytes = [0; OFFER_BYTES];
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(Offer::DESCRIPTORS_MAX))];
@@ -50,14 +51,14 @@ pub(crate) fn receive(socket: BorrowedFd<'_>) -> Result<Received, PassError> {
     if cut && descriptors.len() < Offer::DESCRIPTORS_MAX {
         return Err(PassError::System(Errno::MFILE.into()));
     }
-    // The space is aligned, and has room for a few more than was asked for.
+    // The space is aligned, and has room for a few more than requested.
     let cut = cut || descriptors.len() > Offer::DESCRIPTORS_MAX;
     if cut || seen.bytes != OFFER_BYTES {
         return Err(PassError::Broken { bytes: seen.bytes, descriptors: descriptors.len(), cut });
     }
     let copies = descriptors.iter().map(OwnedFd::try_clone).collect::<Result<_, _>>();
     let copies = copies.map_err(PassError::System)?;
-    // Without room for descriptors: the kernel lets go of its own.
+    // Without space for descriptors: the kernel drops its own.
     retried(|| recv(socket, &mut bytes[..], RecvFlags::DONTWAIT))?;
     Ok(Received { bytes, descriptors, copies })
 }
@@ -66,14 +67,14 @@ fn taken(control: &mut RecvAncillaryBuffer<'_>) -> Vec<OwnedFd> {
     control
         .drain()
         .filter_map(|message| {
-            // Other kinds come only to sockets that ask for them.
+            // Other kinds arrive only at sockets that request them.
             if let RecvAncillaryMessage::ScmRights(rights) = message { Some(rights) } else { None }
         })
         .flatten()
         .collect()
 }
 
-/// A signal is no reason to give up.
+/// Retries after an interruption by a signal.
 fn retried<T>(mut call: impl FnMut() -> Result<T, Errno>) -> Result<T, PassError> {
     loop {
         match call() {

@@ -1,5 +1,6 @@
-//! Whether descriptors may come over a unix socket, and whether they are seen; a descriptor of the process at its other end. The only unsafe
-//! code of this package beside that about memory (`mapping`): three calls.
+//! Controls whether descriptors may arrive over a unix socket, and whether they are seen; opens a descriptor
+//! of the process at the other end. The only unsafe code of this package beside that about memory
+//! (`mapping`): three calls.
 
 use std::{
     io,
@@ -23,7 +24,8 @@ pub(crate) fn peer_pidfd(socket: BorrowedFd<'_>) -> io::Result<OwnedFd> {
     let mut length = size_of_val(&descriptor) as libc::socklen_t;
     let place = (&raw mut descriptor).cast();
     let socket = socket.as_raw_fd();
-    // SAFETY: `place` is that of `descriptor`, which has `length` bytes; both live beyond the call, which writes no more than that.
+    // SAFETY: `place` is that of `descriptor`, which has `length` bytes; both live longer than the call,
+    // which writes no more than that.
     let got = unsafe { libc::getsockopt(socket, libc::SOL_SOCKET, SO_PEERPIDFD, place, &raw mut length) };
     if got != 0 {
         return Err(io::Error::last_os_error());
@@ -31,7 +33,7 @@ pub(crate) fn peer_pidfd(socket: BorrowedFd<'_>) -> io::Result<OwnedFd> {
     if descriptor < 0 {
         return Err(io::ErrorKind::InvalidData.into());
     }
-    // SAFETY: the kernel has just made this descriptor for this call, so that nothing else owns it.
+    // SAFETY: the kernel has just created this descriptor for this call, so it has no other owner.
     Ok(unsafe { OwnedFd::from_raw_fd(descriptor) })
 }
 
@@ -39,7 +41,8 @@ pub(crate) fn set_descriptors(socket: BorrowedFd<'_>, which: Descriptors) -> io:
     let value = libc::c_int::from(which == Descriptors::Taken);
     let length = size_of_val(&value) as libc::socklen_t;
     let place = (&raw const value).cast();
-    // SAFETY: `place` is that of `value`, which has so many bytes and lives beyond the call; the kernel only reads it.
+    // SAFETY: `place` is that of `value`, which has this many bytes and lives longer than the call; the
+    // kernel only reads it.
     let set = unsafe { libc::setsockopt(socket.as_raw_fd(), libc::SOL_SOCKET, SO_PASSRIGHTS, place, length) };
     if set == 0 { Ok(()) } else { Err(io::Error::last_os_error()) }
 }

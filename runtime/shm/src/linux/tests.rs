@@ -1,4 +1,4 @@
-//! The mapped memory itself, and all that a peer could offer instead of it.
+//! The mapped memory itself, and every invalid memory that a peer could offer instead.
 
 use memmap2::{MmapOptions, MmapRaw};
 use proptest::prelude::*;
@@ -7,7 +7,7 @@ use super::mapping::{Mapping, OwnMemory};
 use crate::layout::{Capacity, Word};
 use crate::memory::{OwnHeader, OwnRing, Peer};
 
-/// Memory that is in no file: what Miri can run.
+/// Memory that is in no file, so that Miri can run the tests.
 fn anonymous(capacity: Capacity) -> Mapping {
     let bytes = usize::try_from(capacity.region_bytes()).expect("it is small");
     let raw = MmapRaw::from(MmapOptions::new().len(bytes).map_anon().expect("a few pages"));
@@ -20,7 +20,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: CASES, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn bytes_are_copied_out_as_they_are_from_anywhere(from in 0..4096_usize, length in 0..200_usize) {
+    fn bytes_are_copied_out_unchanged_from_any_position(from in 0..4096_usize, length in 0..200_usize) {
         let length = length.min(4096 - from);
         let mapping = anonymous(Capacity::MIN);
         let (_, mut ring) = OwnMemory::new(mapping).split();
@@ -35,7 +35,7 @@ proptest! {
 }
 
 #[test]
-fn words_and_marks_are_where_both_sides_look_for_them() {
+fn words_and_marks_agree_for_both_sides() {
     // given
     let (header, mut ring) = OwnMemory::new(anonymous(Capacity::MIN)).split();
     // when
@@ -56,12 +56,12 @@ fn words_and_marks_are_where_both_sides_look_for_them() {
 }
 
 #[test]
-fn a_mapping_of_another_size_is_none() {
+fn mapping_of_another_size_is_none() {
     let raw = MmapRaw::from(MmapOptions::new().len(4096).map_anon().expect("a page"));
     assert!(Mapping::new(raw, Capacity::MIN).is_none());
 }
 
-/// What only a real memfd can show.
+/// Tests that need a real memfd.
 #[cfg(not(miri))]
 mod memory {
     use std::{fs::File, os::fd::OwnedFd};
@@ -97,7 +97,7 @@ mod memory {
     }
 
     #[test]
-    fn offered_memory_can_be_neither_cut_nor_grown_nor_punched_nor_written_nor_mapped_for_writing() {
+    fn offered_memory_cannot_be_changed_by_its_receiver() {
         // given
         let (_own, memory) = create(Capacity::MIN).expect("a region");
         // when, then
@@ -113,7 +113,7 @@ mod memory {
     }
 
     #[test]
-    fn offered_memory_opened_anew_is_sealed_as_well() {
+    fn reopened_memory_is_sealed_as_well() {
         let (_own, memory) = create(Capacity::MIN).expect("a region");
         let path = format!("/proc/self/fd/{}", std::os::fd::AsRawFd::as_raw_fd(&memory));
         let again: OwnedFd = File::options().read(true).write(true).open(path).expect("it is ours").into();
@@ -122,8 +122,8 @@ mod memory {
     }
 
     #[test]
-    fn a_hole_reads_as_zeros_and_is_no_bus_error() {
-        // given: memory of a kind that is refused, because it can be punched
+    fn hole_reads_as_zeros_without_bus_error() {
+        // given: memory of a kind that is rejected, because it can be punched
         let memory = filled();
         rustix::io::pwrite(&memory, &[7; 8], 4096).expect("not sealed");
         let raw = MmapOptions::new().len(8192).map_raw_read_only(&memory).expect("a mapping");
@@ -136,7 +136,7 @@ mod memory {
     }
 
     #[test]
-    fn memory_that_lacks_a_seal_is_refused_with_its_name() {
+    fn memory_without_a_seal_is_rejected_by_name() {
         for missing in [SealFlags::SHRINK, SealFlags::GROW, SealFlags::FUTURE_WRITE, SealFlags::SEAL] {
             let memory = filled();
             fcntl_add_seals(&memory, SEALS.difference(missing)).expect("a new memfd takes seals");
@@ -146,12 +146,12 @@ mod memory {
     }
 
     #[test]
-    fn what_is_no_ordinary_memfd_is_refused_unasked() {
+    fn file_that_is_no_memfd_is_rejected_unread() {
         let (pipe, _other) = rustix::pipe::pipe().expect("a pipe");
         assert!(matches!(refused(pipe), RefusedOffer::Kind));
         let null = File::open("/dev/null").expect("it is there");
         assert!(matches!(refused(null.into()), RefusedOffer::Kind));
-        // Huge pages can be sealed too, and a hole in them is a bus error.
+        // Huge pages can be sealed too, and a hole in them causes a bus error.
         let huge = memfd_create("sinew-test", MemfdFlags::ALLOW_SEALING | MemfdFlags::HUGETLB);
         if let Ok(huge) = huge {
             fcntl_add_seals(&huge, SEALS).expect("huge pages take seals");
@@ -160,7 +160,7 @@ mod memory {
     }
 
     #[test]
-    fn memory_of_another_size_with_holes_or_of_another_identity_is_refused() {
+    fn memory_with_other_size_holes_or_identity_is_rejected() {
         for bytes in [0, 4096, 8191, 8193, 1 << 20] {
             let memory = memory(bytes, MemfdFlags::CLOEXEC);
             fcntl_add_seals(&memory, SEALS).expect("a new memfd takes seals");

@@ -15,7 +15,7 @@ fn the_other_process() {
 }
 
 #[test]
-fn messages_of_any_length_go_there_and_back_with_every_bell() {
+fn messages_make_round_trips_with_every_bell() {
     for bell in BELLS {
         let (ours, theirs) = UnixStream::pair().expect("a pair");
         let peer = Peer::start(Role::Echo, bell, theirs);
@@ -31,7 +31,7 @@ fn messages_of_any_length_go_there_and_back_with_every_bell() {
 }
 
 #[test]
-fn a_process_killed_with_a_loan_in_hand_leaves_its_messages_and_no_memory() {
+fn process_killed_with_a_loan_leaves_no_memory() {
     for bell in BELLS {
         // given
         let (ours, theirs) = UnixStream::pair().expect("a pair");
@@ -56,7 +56,7 @@ fn a_process_killed_with_a_loan_in_hand_leaves_its_messages_and_no_memory() {
 }
 
 #[test]
-fn a_process_killed_with_a_message_in_hand_ends_the_wait_for_room() {
+fn process_killed_with_a_message_ends_the_wait() {
     for bell in BELLS {
         // given: a ring filled behind a message that is not released
         let (ours, theirs) = UnixStream::pair().expect("a pair");
@@ -79,7 +79,7 @@ fn a_process_killed_with_a_message_in_hand_ends_the_wait_for_room() {
 }
 
 #[test]
-fn a_producer_killed_in_the_middle_of_sending_is_noticed_by_another_process() {
+fn producer_killed_while_sending_is_noticed() {
     for bell in BELLS {
         // given: two other processes, connected with each other
         let (here, there) = UnixStream::pair().expect("a pair");

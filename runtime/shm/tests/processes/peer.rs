@@ -19,18 +19,18 @@ const ROLE: &str = "SINEW_SHM_ROLE";
 pub(crate) const BELLS: [BellKind; 3] = [BellKind::Futex, BellKind::EventFd, BellKind::Socket];
 pub(crate) const CAPACITY: u64 = 64 * 1024;
 
-/// What the other process does after it has connected.
+/// The task of the other process after it has connected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Role {
-    /// Sends back what it gets, until its peer is gone.
+    /// Returns each message, until its peer is gone.
     Echo,
-    /// Publishes "before", takes a loan and writes into it, says so, and stays.
+    /// Publishes "before", takes a loan and writes into it, reports it, and stays.
     HoldsLoan,
-    /// Receives a message, says so, and stays, with the message in hand.
+    /// Receives a message, reports it, and stays, holding the message.
     HoldsMessage,
-    /// Sends numbered messages as fast as there is room, with a loan or a message in hand at any time.
+    /// Sends numbered messages as fast as there is room, holding a loan or a message at any time.
     Sprays,
-    /// Receives numbered messages until its peer is gone; succeeds when that is how it ended.
+    /// Receives numbered messages until its peer is gone; succeeds if that is how it ended.
     Counts,
 }
 
@@ -38,15 +38,15 @@ impl Role {
     const ALL: [Self; 5] = [Self::Echo, Self::HoldsLoan, Self::HoldsMessage, Self::Sprays, Self::Counts];
 }
 
-/// What a process says when it has come so far.
+/// The line of a process that has reached its state.
 const SO_FAR: &str = "so far";
 
-/// Patience for what comes at once, on a machine that others share.
+/// A wait for an immediate event, on a machine that others share.
 pub(crate) fn soon() -> Wait<'static> {
     Wait::within(Duration::from_secs(30))
 }
 
-/// The other process. Ended when dropped.
+/// The other process. Killed when dropped.
 pub(crate) struct Peer {
     child: Child,
     output: BufReader<ChildStdout>,
@@ -69,7 +69,7 @@ impl Peer {
         Self { child, output, pidfd }
     }
 
-    /// Waits until it says that it has come so far.
+    /// Waits for its report.
     pub(crate) fn has_come_so_far(&mut self) {
         let mut lines = (&mut self.output).lines().map_while(Result::ok);
         assert!(lines.any(|line| line.ends_with(SO_FAR)), "it ended before it came so far");
@@ -97,7 +97,7 @@ impl Drop for Peer {
     }
 }
 
-/// One side's ends, and by which numbers the system knows both sides' memory.
+/// One side's ends, and the inode numbers of both sides' memory.
 pub(crate) struct Connected {
     pub(crate) producer: Producer,
     pub(crate) consumer: Consumer,
@@ -118,18 +118,18 @@ pub(crate) fn connect(bell: BellKind, socket: impl AsFd) -> Connected {
 
 fn inodes(offer: &Offer) -> Vec<u64> {
     let files = offer.descriptors().iter().map(|fd| fd.try_clone().map(std::fs::File::from));
-    // Event descriptors all have the same number, which says nothing.
+    // Event descriptors all have the same number, which identifies nothing.
     let memory = if offer.bell() == BellKind::Futex { 2 } else { 1 };
     files.take(memory).map(|file| file.and_then(|file| file.metadata()).expect("it is open").ino()).collect()
 }
 
-/// Who has one of these pieces of memory mapped or open, as lines of `/proc`.
+/// The processes that have one of these pieces of memory mapped or open, as lines of `/proc`.
 pub(crate) fn holders(memory: &[u64]) -> Vec<String> {
     let processes = std::fs::read_dir("/proc").expect("it is there").flatten();
     let processes = processes.filter(|entry| entry.file_name().to_string_lossy().parse::<u32>().is_ok());
     let mut found = Vec::new();
     for process in processes {
-        // A process may end while it is looked at.
+        // A process may end while it is inspected.
         let maps = std::fs::read_to_string(process.path().join("maps")).unwrap_or_default();
         let held = maps.lines().filter(|line| line.contains("sinew-ring") && is_one_of(line, memory));
         found.extend(held.map(|line| format!("{}: {line}", process.path().display())));
@@ -148,14 +148,14 @@ fn is_one_of(line: &str, memory: &[u64]) -> bool {
     line.split_whitespace().nth(4).and_then(|inode| inode.parse().ok()).is_some_and(|it| memory.contains(&it))
 }
 
-/// The numbered message: as long as its number says, filled with it.
+/// The numbered message: length and content follow from its number.
 pub(crate) fn numbered(number: u64) -> Vec<u8> {
     let mut bytes = number.to_le_bytes().to_vec();
     bytes.resize(8 + (number * 7919 % 3000) as usize, number as u8);
     bytes
 }
 
-/// The other process's life.
+/// The main function of the other process.
 pub(crate) fn play() {
     let Ok(role) = std::env::var(ROLE) else {
         return;
@@ -199,7 +199,7 @@ fn holds_message(connected: &mut Connected, socket: &OwnedFd) {
 
 fn say_and_stay(socket: &OwnedFd) {
     println!("{SO_FAR}");
-    // Until the test ends this process, or itself.
+    // Until the test kills this process, or ends itself.
     let _ = rustix::io::read(socket, &mut [0; 1]);
 }
 

@@ -1,4 +1,4 @@
-//! What is said of a node's end, and where it stands in a queue.
+//! Events about a node's end, and their place in a queue.
 
 use std::{
     collections::BTreeMap,
@@ -12,7 +12,7 @@ use super::*;
 use crate::{
     mailbox::{Bounds, Mailbox},
     outcome::Outcome,
-    router::Outlet,
+    router::MessageSink,
     tid::{AppAddress, NodeAddress, Tid},
     wire::{Class, Header, Kind},
 };
@@ -40,7 +40,7 @@ fn all(queue: &mut ClassQueue) -> Vec<u64> {
 }
 
 #[test]
-fn what_is_said_of_a_nodes_end_comes_behind_its_messages_of_every_class_and_before_all_others() {
+fn end_event_follows_its_nodes_messages_and_precedes_others() {
     let mut queue = ClassQueue::new(8);
     let classes = [Class::Bulk, Class::Stream, Class::Control];
     for (number, class) in classes.into_iter().enumerate() {
@@ -56,53 +56,53 @@ fn what_is_said_of_a_nodes_end_comes_behind_its_messages_of_every_class_and_befo
 }
 
 #[test]
-fn an_event_that_has_nothing_to_wait_for_is_like_any_other() {
+fn end_event_without_messages_to_follow_is_ordinary() {
     let mut queue = ClassQueue::new(8);
     queue.push(of(OTHER, Class::Control, 1)).unwrap();
-    assert!(queue.keep_behind(event(About::End(GONE), 2)).is_some());
+    assert!(queue.queue_behind(event(About::End(GONE), 2)).is_some());
     queue.push(of(GONE, Class::Control, 3)).unwrap();
-    assert!(queue.keep_behind(event(About::Node(GONE), 4)).is_some(), "it is not its end");
+    assert!(queue.queue_behind(event(About::Node(GONE), 4)).is_some(), "it is not its end");
     queue.push(event(About::Node(GONE), 5)).unwrap();
     assert_eq!(all(&mut queue), [1, 3, 5]);
 }
 
 #[test]
-fn events_that_wait_behind_messages_are_forgotten_like_others_and_the_messages_stay() {
+fn removed_events_leave_the_messages_before_them() {
     let mut queue = ClassQueue::new(8);
     queue.push(of(GONE, Class::Bulk, 1)).unwrap();
-    assert!(queue.keep_behind(event(About::End(GONE), 2)).is_none());
+    assert!(queue.queue_behind(event(About::End(GONE), 2)).is_none());
     assert_eq!(queue.take_events().len(), 1);
     assert_eq!((queue.len(), queue.bytes()), (1, 4));
     assert_eq!(all(&mut queue), [1]);
 }
 
 #[test]
-fn what_goes_before_all_others_holds_its_classs_places_until_it_is_taken() {
+fn advanced_message_keeps_its_slot_until_taken() {
     let mut queue = ClassQueue::new(Bounds { messages: 2, bytes: 8 });
     for round in 0..3 {
         queue.push(of(GONE, Class::Bulk, round)).unwrap();
         queue.push(of(GONE, Class::Bulk, round)).unwrap();
-        assert!(queue.keep_behind(event(About::End(GONE), 9)).is_none());
+        assert!(queue.queue_behind(event(About::End(GONE), 9)).is_none());
         let refused = queue.push(of(GONE, Class::Bulk, round)).unwrap_err();
-        assert!(!queue.has_room_for(&refused.message) && queue.kept_events() == 1);
+        assert!(!queue.has_room_for(&refused.message) && queue.events_behind() == 1);
         assert_eq!(all(&mut queue), [round, round, 9]);
     }
 }
 
 #[test]
-fn who_waits_for_room_is_not_woken_by_what_is_only_brought_forward() {
+fn advancing_messages_does_not_wake_senders() {
     let mut queue = ClassQueue::new(2);
     queue.push(of(GONE, Class::Bulk, 1)).unwrap();
     queue.push(of(GONE, Class::Bulk, 2)).unwrap();
     assert!(queue.offered(&of(OTHER, Class::Bulk, 3), Waker::noop()).is_none());
-    assert!(queue.keep_behind(event(About::End(GONE), 4)).is_none());
+    assert!(queue.queue_behind(event(About::End(GONE), 4)).is_none());
     assert!(queue.room_made().is_none());
     queue.pop();
     assert!(queue.room_made().is_some());
 }
 
 #[test]
-fn what_is_put_back_comes_before_what_was_said_of_its_nodes_end_meanwhile() {
+fn returned_message_precedes_its_nodes_end_event() {
     for rest in [0, 1] {
         let mut queue = ClassQueue::new(8);
         queue.push(of(GONE, Class::Bulk, 1)).unwrap();
@@ -115,7 +115,7 @@ fn what_is_put_back_comes_before_what_was_said_of_its_nodes_end_meanwhile() {
 }
 
 #[test]
-fn of_a_stream_the_newer_value_wins_also_where_it_was_brought_forward() {
+fn newer_stream_value_wins_also_when_advanced() {
     let mut queue = ClassQueue::new(8);
     queue.push(of(GONE, Class::Stream, 1)).unwrap();
     let older = queue.pop().unwrap();
@@ -123,13 +123,13 @@ fn of_a_stream_the_newer_value_wins_also_where_it_was_brought_forward() {
     queue.push(event(About::End(GONE), 3)).unwrap();
     assert!(queue.supersedes(&older.header));
     assert!(queue.put_back(older).is_some());
-    // What the next life says takes nobody's place.
+    // A value of the next incarnation replaces none of the former one.
     assert!(queue.push(of(GONE, Class::Stream, 4)).unwrap().is_none());
     assert_eq!(all(&mut queue), [2, 3, 4]);
 }
 
 #[test]
-fn what_is_said_of_ends_in_the_lanes_is_counted_on_every_way_in_and_out() {
+fn end_events_in_lanes_are_counted_on_all_paths() {
     let said_of = |class, sequence| {
         let mut event = event(About::End(GONE), sequence);
         event.header.class = class;
@@ -139,7 +139,7 @@ fn what_is_said_of_ends_in_the_lanes_is_counted_on_every_way_in_and_out() {
     let counts = |queue: &ClassQueue, expected| {
         assert_eq!((queue.ends_in_lanes, ends_in_lanes(queue)), (expected, expected));
     };
-    // Of class Stream one takes the other's place.
+    // Of class Stream, a newer event replaces the older one.
     queue.push(said_of(Class::Stream, 1)).unwrap();
     assert!(queue.push(said_of(Class::Stream, 2)).unwrap().is_some());
     counts(&queue, 1);
@@ -166,7 +166,8 @@ fn what_is_said_of_ends_in_the_lanes_is_counted_on_every_way_in_and_out() {
     counts(&queue, 0);
 }
 
-/// Looks at the order in which messages are taken: of each node nothing comes behind its end that came before it.
+/// Checks the order in which messages are received: no message of a node that arrived before its end follows
+/// its end event.
 #[derive(Default)]
 struct Order {
     ends: BTreeMap<NodeAddress, u64>,
@@ -192,7 +193,7 @@ impl Order {
     }
 }
 
-/// How much is said of ends in the lanes, found by looking.
+/// Counts the end events in the lanes by a scan.
 fn ends_in_lanes(queue: &ClassQueue) -> usize {
     queue.lanes.iter().flatten().filter(|message| is_end(&message.header)).count()
 }
@@ -202,7 +203,7 @@ const BOUNDS: Bounds = Bounds { messages: 6, bytes: 20 };
 proptest! {
     /// As on the way to a client: events are messages of class Control like any others.
     #[test]
-    fn a_queue_holds_no_more_than_its_bounds_however_often_nodes_end(
+    fn queue_stays_within_bounds_however_often_nodes_end(
         steps in proptest::collection::vec((0u8..12, 0usize..3, any::<bool>()), 1..200),
     ) {
         let mut queue = ClassQueue::new(BOUNDS);
@@ -228,7 +229,7 @@ proptest! {
                 _ => if let Some(message) = hand.take() { drop(queue.put_back(message)) },
             }
             for class in 0..3 {
-                // What is put back has room beyond the bound.
+                // A returned message has room beyond the bound.
                 prop_assert!(queue.held(class).messages <= BOUNDS.messages + 1);
                 prop_assert!(queue.held(class).bytes <= BOUNDS.bytes + 4);
                 prop_assert_eq!(queue.len_of(Class::ALL[class]), queue.held(class).messages);
@@ -240,12 +241,12 @@ proptest! {
             order.taken(&message.header)?;
         }
         prop_assert_eq!((queue.bytes(), queue.held(0), queue.held(1), queue.held(2)),
-            (0, Held::default(), Held::default(), Held::default()));
+            (0, Usage::default(), Usage::default(), Usage::default()));
     }
 
-    /// As in an application's mailbox, also while it is paused: then nothing is taken but events that go ahead.
+    /// As in an application's mailbox, also while it is paused: then only priority events are received.
     #[test]
-    fn a_mailbox_holds_no_more_than_its_bounds_however_often_nodes_end(
+    fn mailbox_stays_within_bounds_however_often_nodes_end(
         steps in proptest::collection::vec((0u8..10, 0usize..3, any::<bool>()), 1..200),
     ) {
         let mailbox = Mailbox::new(BOUNDS);
@@ -274,7 +275,7 @@ proptest! {
             prop_assert!(submitted.is_ok() || mailbox.depth() > 0, "an empty one refuses nothing");
             prop_assert!(mailbox.depth() <= 4 * BOUNDS.messages, "three classes, and events");
             for class in Class::ALL {
-                // One may be in hand; events are of class Control.
+                // One may be handled at present; events are of class Control.
                 let events_max = if class == Class::Control { BOUNDS.messages } else { 0 };
                 let (tally, held) = mailbox.account(class);
                 prop_assert!(held <= (BOUNDS.messages + events_max + 1) as u64);
@@ -287,9 +288,9 @@ proptest! {
         }
     }
 
-    /// What ends a pause is told in it, whatever waits for the end of it.
+    /// The event that ends a pause is received during the pause, even if messages wait.
     #[test]
-    fn an_event_that_need_not_wait_has_room_in_a_pause_whatever_is_kept(capacity in 1usize..9, ends in 0u64..40) {
+    fn priority_event_has_room_in_a_pause(capacity in 1usize..9, ends in 0u64..40) {
         let mailbox = Mailbox::new(capacity);
         let mut reader = mailbox.attach();
         let mut cx = Context::from_waker(Waker::noop());
@@ -305,9 +306,10 @@ proptest! {
         prop_assert!(mailbox.depth() <= capacity + 1);
     }
 
-    /// However they come: of each node nothing comes behind its end that came before it, and each class stays in order.
+    /// For any order of arrival: no earlier message of a node follows its end event, and each class stays in
+    /// order.
     #[test]
-    fn ends_are_ends(steps in proptest::collection::vec((0u8..5, 0usize..3), 1..100)) {
+    fn no_message_follows_its_nodes_end(steps in proptest::collection::vec((0u8..5, 0usize..3), 1..100)) {
         let mut queue = ClassQueue::new(1_000);
         for (sequence, (what, class)) in (1..).zip(steps) {
             let node = if what % 2 == 0 { GONE } else { OTHER };

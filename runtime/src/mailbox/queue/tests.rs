@@ -1,4 +1,4 @@
-//! What a queue holds, counts and hands out, and in which order.
+//! The contents, the counters and the order of a queue.
 
 use bytes::Bytes;
 use proptest::prelude::*;
@@ -27,7 +27,7 @@ fn control_passes_everything_and_bulk_yields() {
 }
 
 #[test]
-fn newest_value_of_a_stream_takes_the_olders_turn() {
+fn newest_stream_value_takes_the_place_of_the_older() {
     let mut queue = ClassQueue::new(4);
     queue.push(message(Class::Stream, 7, 1)).unwrap();
     queue.push(message(Class::Stream, 8, 2)).unwrap();
@@ -38,7 +38,7 @@ fn newest_value_of_a_stream_takes_the_olders_turn() {
 }
 
 #[test]
-fn endless_control_traffic_does_not_stop_bulk_for_ever() {
+fn endless_control_traffic_does_not_stop_bulk() {
     let mut queue = ClassQueue::new(64);
     queue.push(message(Class::Bulk, 1, 999)).unwrap();
     let mut pops = 0;
@@ -59,7 +59,7 @@ fn long(class: Class, source: u32, length: usize) -> Message {
 }
 
 #[test]
-fn a_class_holds_so_many_bytes_and_the_others_have_theirs() {
+fn byte_limit_applies_to_each_class() {
     let mut queue = ClassQueue::new(Bounds { messages: 8, bytes: 100 });
     queue.push(long(Class::Bulk, 1, 60)).unwrap();
     queue.push(long(Class::Bulk, 1, 40)).unwrap();
@@ -75,7 +75,7 @@ fn a_class_holds_so_many_bytes_and_the_others_have_theirs() {
 }
 
 #[test]
-fn one_message_has_room_where_nothing_else_is_however_long_it_is() {
+fn single_message_fits_however_long_it_is() {
     let mut queue = ClassQueue::new(Bounds { messages: 8, bytes: 10 });
     queue.push(long(Class::Control, 1, 1_000)).unwrap();
     assert!(queue.push(long(Class::Control, 1, 1)).is_err());
@@ -85,7 +85,7 @@ fn one_message_has_room_where_nothing_else_is_however_long_it_is() {
 }
 
 #[test]
-fn a_newer_value_counts_instead_of_the_older_and_a_longer_one_without_room_leaves_it_there() {
+fn replacement_counts_the_newer_value_and_needs_room() {
     let mut queue = ClassQueue::new(Bounds { messages: 8, bytes: 100 });
     queue.push(long(Class::Stream, 1, 50)).unwrap();
     queue.push(long(Class::Stream, 2, 50)).unwrap();
@@ -99,7 +99,7 @@ fn a_newer_value_counts_instead_of_the_older_and_a_longer_one_without_room_leave
 
 proptest! {
     #[test]
-    fn the_bytes_that_are_counted_are_those_that_wait_and_within_the_bound(
+    fn counted_bytes_equal_waiting_bytes_within_the_bound(
         inputs in proptest::collection::vec((0usize..3, 0u32..3, 0usize..40, 0u8..8), 0..200),
     ) {
         const BOUNDS: Bounds = Bounds { messages: 6, bytes: 64 };

@@ -1,4 +1,4 @@
-//! Members of several nodes, each with a fate, and their reports in any order.
+//! Members of several nodes, each with an outcome, and their reports in any order.
 
 use proptest::prelude::*;
 
@@ -12,7 +12,7 @@ fn member(node: u32, app: u32) -> Tid {
     Tid::new(NodeAddress::new(node), AppAddress::new(0x1000 + app))
 }
 
-/// What becomes of a member's copy: settled and reported, or nothing comes.
+/// The outcome of a member's copy: settled and reported, or no report arrives.
 fn fates() -> impl Strategy<Value = Option<Outcome>> {
     prop_oneof![
         Just(Some(Outcome::Delivered)),
@@ -23,7 +23,7 @@ fn fates() -> impl Strategy<Value = Option<Outcome>> {
     ]
 }
 
-/// Another node: its members, whether its list of them came, and the outcome of its copy, if one came.
+/// Another node: its members, whether their list arrived, and the outcome of its copy, if one arrived.
 #[derive(Clone, Debug)]
 struct Node {
     members: Vec<Option<Outcome>>,
@@ -44,7 +44,7 @@ fn nodes() -> impl Strategy<Value = Vec<Node>> {
 }
 
 impl Node {
-    /// The reports about it that come in any order, once all nodes are known.
+    /// The reports about it, which arrive in any order once all nodes are known.
     fn reports(&self, node: u32) -> Vec<MemberReport> {
         let address = NodeAddress::new(node);
         let mut reports = Vec::new();
@@ -61,7 +61,7 @@ impl Node {
         reports
     }
 
-    /// The entries of it at the end, where nothing else is said of the message as a whole.
+    /// Its entries at the end, if the message as a whole has no other outcome.
     fn expected(&self, node: u32) -> Vec<MemberOutcome> {
         let rest = self.end.filter(|end| *end != Outcome::Delivered).unwrap_or(Outcome::Unknown);
         if self.is_listed {
@@ -85,7 +85,7 @@ impl Node {
 
 proptest! {
     #[test]
-    fn each_member_has_one_entry_whatever_order_the_reports_have(
+    fn each_member_has_one_entry_for_any_report_order(
         nodes in nodes(),
         order in any::<u64>(),
         doubled in any::<bool>(),
@@ -97,7 +97,7 @@ proptest! {
             table.note(&[MemberReport::of_node(NodeAddress::new(node), MemberState::Pending)]);
         }
         table.note(&[MemberReport::of_node(HERE, MemberState::Listed)]);
-        // When: their reports come in this order
+        // When: their reports arrive in this order
         let mut reports: Vec<_> = others.clone().zip(&nodes).flat_map(|(at, node)| node.reports(at)).collect();
         let mut random = order;
         for at in (1..reports.len()).rev() {
@@ -115,7 +115,7 @@ proptest! {
     }
 
     #[test]
-    fn what_is_written_is_read(all in proptest::collection::vec((any::<u64>(), any::<u8>()), 1..=REPORTS_MAX)) {
+    fn reports_round_trip(all in proptest::collection::vec((any::<u64>(), any::<u8>()), 1..=REPORTS_MAX)) {
         let bytes: Vec<u8> = all.iter().flat_map(|(tid, code)| {
             let mut one = tid.to_le_bytes().to_vec();
             one.push(*code);
@@ -127,7 +127,7 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_are_a_bounded_number_of_reports_or_none(bytes in proptest::collection::vec(any::<u8>(), 0..2_000)) {
+    fn any_bytes_are_bounded_reports_or_none(bytes in proptest::collection::vec(any::<u8>(), 0..2_000)) {
         let is_right = !bytes.is_empty() && bytes.len() % EACH == 0 && bytes.len() <= REPORTS_MAX * EACH;
         let read = MemberReport::decode(&bytes);
         prop_assert_eq!(read.is_some(), is_right);
@@ -138,7 +138,7 @@ proptest! {
 }
 
 #[test]
-fn a_group_without_members_gives_an_empty_list() {
+fn group_without_members_gives_an_empty_list() {
     let mut table = MemberTable::new(GROUP, HERE);
     assert!(!table.is_complete());
     table.note(&[MemberReport::of_node(HERE, MemberState::Listed)]);
@@ -147,7 +147,7 @@ fn a_group_without_members_gives_an_empty_list() {
 }
 
 #[test]
-fn a_message_without_any_report_has_one_entry_of_its_destination() {
+fn message_without_reports_has_one_entry() {
     for (last, outcome) in [
         (None, Outcome::Unknown),
         (Some(Outcome::Unknown), Outcome::Unknown),
@@ -159,7 +159,7 @@ fn a_message_without_any_report_has_one_entry_of_its_destination() {
 }
 
 #[test]
-fn a_message_to_one_application_has_its_outcome() {
+fn message_to_one_application_has_its_outcome() {
     let table = MemberTable::new(member(2, 1), HERE);
     let entry = MemberOutcome { tid: member(2, 1), outcome: Outcome::Delivered };
     assert_eq!(table.finish(Some(Outcome::Delivered)), [entry]);
@@ -183,7 +183,7 @@ fn members_beyond_the_bound_are_unknown_by_their_node() {
 }
 
 #[test]
-fn nobody_reports_members_of_a_node_without_a_copy() {
+fn node_without_a_copy_has_no_reports() {
     let mut table = MemberTable::new(GROUP, HERE);
     table.note(&[
         MemberReport::of_member(member(7, 1), MemberState::Settled(Outcome::Delivered)),
@@ -194,7 +194,7 @@ fn nobody_reports_members_of_a_node_without_a_copy() {
 }
 
 #[test]
-fn the_documentation_shows_the_bytes_of_two_reports() {
+fn documentation_shows_the_bytes_of_two_reports() {
     let page = include_str!("../../../../docs/protocol/frame.md");
     let shown = page.split_once("```members").expect("the block begins").1;
     let shown = shown.split_once("```").expect("the block ends").0;

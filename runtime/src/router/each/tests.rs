@@ -1,4 +1,4 @@
-//! Group sends between three nodes, whose members settle, refuse, die or hang, and whose nodes are lost, at any moment.
+//! Group sends between three nodes. At any moment members settle, reject, die or hang, and nodes are lost.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -12,7 +12,7 @@ use super::*;
 use crate::{
     outcome::{MemberOutcome, Rejection},
     pending::{Pending, Settlement, Wait},
-    router::{LocalRoute, Outlet, Refused, Router},
+    router::{LocalRoute, MessageSink, Refused, Router},
     wire::{Flags, Header, Kind, Message},
 };
 
@@ -27,7 +27,7 @@ fn member(number: u32, app: u32) -> Tid {
     Tid::new(node(number), AppAddress::new(0x1000 + app))
 }
 
-/// Numbers that follow from a seed.
+/// Pseudorandom numbers of a seed.
 struct Random(u64);
 
 impl Random {
@@ -37,18 +37,18 @@ impl Random {
     }
 }
 
-/// A mailbox whose messages wait until the test says what becomes of them.
+/// A mailbox with messages that wait until the test decides their outcomes.
 #[derive(Default)]
 struct Mailbox(Mutex<VecDeque<Message>>);
 
-impl Outlet for Mailbox {
+impl MessageSink for Mailbox {
     fn submit(&self, message: Message) -> Result<(), Refused> {
         lock(&self.0).push_back(message);
         Ok(())
     }
 }
 
-/// What travels between the first node and another one.
+/// Frames between the first node and another one.
 enum Frame {
     Copy(Message),
     Outcome(Ticket, Outcome),
@@ -60,7 +60,7 @@ struct Link {
     to: NodeAddress,
     there: VecDeque<Frame>,
     back: VecDeque<Frame>,
-    /// Receipts of copies whose outcome has not come.
+    /// Receipts of copies without an outcome so far.
     open: BTreeMap<u64, Receipt>,
     is_lost: bool,
 }
@@ -68,7 +68,7 @@ struct Link {
 #[derive(Clone)]
 struct Wire(Arc<Mutex<Link>>);
 
-impl Outlet for Wire {
+impl MessageSink for Wire {
     fn submit(&self, mut message: Message) -> Result<(), Refused> {
         let mut link = lock(&self.0);
         let receipt = message.receipt.take().expect("each copy is confirmed");
@@ -99,7 +99,7 @@ impl Node {
         let router = Router::new(node(number));
         let mailboxes: Vec<_> = (0..members).map(|app| (member(number, app), Arc::default())).collect();
         for (tid, mailbox) in &mailboxes {
-            router.set_local(tid.app, LocalRoute { outlet: Arc::clone(mailbox) as _, events: Arc::new([]) });
+            router.set_local(tid.app, LocalRoute { sink: Arc::clone(mailbox) as _, events: Arc::new([]) });
             router.set_member(GROUP.app, tid.app, true);
         }
         Self { router, mailboxes }
@@ -110,7 +110,7 @@ struct World {
     nodes: Vec<Node>,
     wires: Vec<Wire>,
     pending: Arc<Pending>,
-    /// What became of each member that was decided.
+    /// The decided outcome of each member.
     decided: BTreeMap<(u64, Tid), Outcome>,
     random: Random,
 }
@@ -144,7 +144,7 @@ impl World {
         Ok(wait)
     }
 
-    /// One frame goes over a link.
+    /// Carries one frame over a link.
     fn carry(&mut self) {
         let at = self.random.below(self.wires.len());
         let wire = self.wires[at].clone();
@@ -179,7 +179,7 @@ impl World {
         }
     }
 
-    /// A member comes to its next message.
+    /// Lets a member handle its next message.
     fn handle(&mut self) {
         let of = self.random.below(self.nodes.len());
         let boxes = self.nodes[of].mailboxes.len();
@@ -191,7 +191,7 @@ impl World {
         let outcome = match self.random.below(3) {
             0 => Outcome::Delivered,
             1 => Outcome::Rejected(Rejection::UnknownKind),
-            // It dies with the message in hand.
+            // It dies while it handles the message.
             _ => Outcome::Failed,
         };
         self.decided.insert((message.header.correlation, *tid), outcome);
@@ -200,7 +200,7 @@ impl World {
         }
     }
 
-    /// The node at the other end of a link is lost.
+    /// Loses the node at the other end of a link.
     fn lose(&mut self) {
         let at = self.random.below(self.wires.len());
         let receipts = {
@@ -232,7 +232,8 @@ fn ended(wait: &Wait) -> Option<Outcome> {
     }
 }
 
-/// Every entry says what became of its member, and each member has one entry, or its node one for all that it did not name.
+/// Checks that every entry has the outcome of its member. Each member has one entry, or its node has one for
+/// all members that it did not name.
 fn check(
     world: &World,
     correlation: u64,
@@ -264,7 +265,7 @@ fn check(
 
 proptest! {
     #[test]
-    fn each_member_has_one_outcome_and_nothing_is_left_however_members_and_nodes_end(
+    fn each_member_has_one_outcome_and_nothing_leaks(
         seed in any::<u64>(),
         members in [0..3_u32, 0..3_u32, 0..3_u32],
         steps in 0..400_usize,
@@ -272,19 +273,19 @@ proptest! {
         // Given
         let mut world = World::new(seed, members);
         let mut waits = Vec::new();
-        // When: some are sent, and this much happens
+        // When: some messages are sent, and this many steps happen
         for step in 0..steps {
             if step % 50 == 0 {
                 waits.push(world.send().expect("a group takes it"));
             }
             world.step();
         }
-        // Then: each has ended with all outcomes, or has those that are known at its deadline
+        // Then: each send has ended with all outcomes, or has those that are known at its deadline
         for wait in waits {
             let last = ended(&wait);
             check(&world, wait.correlation(), &wait.members(last), last.is_some())?;
         }
-        // And: when members that hang are gone, too, nothing is left
+        // And: when hung members are gone, too, nothing is left
         world.nodes.iter().flat_map(|node| &node.mailboxes).for_each(|(_, mailbox)| {
             let dropped = std::mem::take(&mut *lock(&mailbox.0));
             drop(dropped);
@@ -298,7 +299,7 @@ proptest! {
 }
 
 #[test]
-fn an_empty_group_ends_at_once_with_an_empty_list() {
+fn empty_group_ends_at_once_with_an_empty_list() {
     let world = World::new(0, [0, 0, 0]);
     let wait = world.send().expect("it is no error");
     let last = ended(&wait);
@@ -307,7 +308,7 @@ fn an_empty_group_ends_at_once_with_an_empty_list() {
 }
 
 #[test]
-fn a_group_of_too_many_members_is_refused_as_a_whole() {
+fn send_to_too_many_members_is_rejected() {
     let world = World::new(0, [MEMBERS_HERE_MAX as u32 + 1, 0, 0]);
     assert_eq!(world.send().err(), Some(Rejection::TooManyMembers));
     let (_, mailbox) = &world.nodes[0].mailboxes[0];
@@ -315,7 +316,7 @@ fn a_group_of_too_many_members_is_refused_as_a_whole() {
 }
 
 #[test]
-fn an_application_has_so_many_open_to_other_nodes_until_their_time_is_over() {
+fn open_sends_to_other_nodes_are_limited() {
     let world = World::new(0, [0, 1, 0]);
     let waits: Vec<_> = (0..OPEN_OF_ONE_MAX).map(|_| world.send().expect("there is room")).collect();
     assert_eq!(world.send().err(), Some(Rejection::TooManyMembers));
@@ -327,7 +328,7 @@ fn an_application_has_so_many_open_to_other_nodes_until_their_time_is_over() {
 }
 
 #[test]
-fn a_send_whose_time_is_over_takes_no_room_from_later_ones() {
+fn expired_send_takes_no_room_from_later_ones() {
     let (open, sink) = (Arc::new(OpenSends::default()), Pending::new(1));
     let receipt = |correlation| {
         let ticket = Ticket { source: SENDER, destination: GROUP, correlation };
@@ -348,7 +349,7 @@ fn a_send_whose_time_is_over_takes_no_room_from_later_ones() {
 }
 
 #[test]
-fn a_node_without_a_copy_reports_nothing_and_none_speaks_for_another() {
+fn node_reports_only_its_own_members() {
     let world = World::new(0, [0, 1, 0]);
     let wait = world.send().expect("there is room");
     let ticket = Ticket { source: SENDER, destination: GROUP, correlation: wait.correlation() };

@@ -1,22 +1,22 @@
-//! One child, as its supervisor remembers it.
+//! The state of one child of a supervisor.
 
 use std::time::Duration;
 
 use super::{ChildId, Generation, Policy, Reason, Restart, StartRetry};
 use crate::time::Time;
 
-/// Where a child is in its life.
+/// The state of a child in its life cycle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ChildState {
-    /// Does not live; waits for its turn, or for its release, or is not wanted.
+    /// Not alive: waits for its turn or its release, or is not wanted.
     Down,
-    /// Failed; is started again at this time.
+    /// Failed, and will be started again at this time.
     BackingOff(Time),
-    /// Lives, is not ready, has time until then.
+    /// Alive and not ready, with this deadline.
     Starting(Time),
-    /// Lives and is ready.
+    /// Alive and ready.
     Ready,
-    /// Was told to stop, has time until then.
+    /// Ordered to stop, with this deadline.
     Stopping(Time),
 }
 
@@ -33,30 +33,30 @@ impl ChildState {
     }
 }
 
-/// What a supervisor knows of a child, for who asks.
+/// The state of a child, for queries.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ChildView {
-    /// Where it is in its life.
+    /// The current state.
     pub state: ChildState,
-    /// Since when.
+    /// When the current state began.
     pub since: Time,
-    /// Which life it is.
+    /// The current generation.
     pub generation: Generation,
-    /// How often it was started again.
+    /// The number of restarts.
     pub restarts: u64,
-    /// How its last life ended.
+    /// The reason for the end of its last incarnation.
     pub last_reason: Option<Reason>,
-    /// Since when it says at each start that it cannot start now.
+    /// When the first of its consecutive failed starts was, if there is one.
     pub cannot_start_since: Option<Time>,
-    /// Whether it should live. One that is down and should not was terminated or has ended by itself.
+    /// Whether the child should be alive. A child that is down and not wanted was terminated or has ended by itself.
     pub wanted: bool,
-    /// Whether its release is what it waits for.
+    /// Whether the child waits for its release.
     pub waits_for_release: bool,
-    /// Former lives of it that were taken and have not let go of their threads.
+    /// The number of its abandoned incarnations that have not released their threads.
     pub abandoned: usize,
 }
 
-/// What a supervisor remembers of a child.
+/// The state of a child, as its supervisor keeps it.
 #[derive(Debug)]
 pub(super) struct Child {
     pub(super) id: ChildId,
@@ -64,27 +64,27 @@ pub(super) struct Child {
     pub(super) state: ChildState,
     pub(super) since: Time,
     pub(super) generation: Generation,
-    /// Should live.
+    /// Whether the child should be alive.
     pub(super) wanted: bool,
-    /// What it requires is ready. Forgotten when it ends, for then its requirements are asked for again.
+    /// Whether its requirements are ready. Cleared when the child ends, because they are checked again then.
     pub(super) released: bool,
-    /// Lives, and must be replaced because a sibling failed.
+    /// Whether the child is alive and must be replaced because a sibling failed.
     pub(super) stale: bool,
-    /// Commands to terminate it that were not answered yet.
+    /// The number of unanswered commands to terminate the child.
     pub(super) terminations: u32,
     pub(super) failures_in_a_row: u32,
-    /// When it said first that it cannot start, if it has not been ready since.
+    /// When its first consecutive start failed, if it has not been ready since.
     pub(super) cannot_start_since: Option<Time>,
-    /// How often in a row it has said so.
+    /// The number of consecutive failed starts.
     pub(super) failed_starts: u32,
-    /// How often it was started.
+    /// The number of starts.
     pub(super) starts: u64,
     pub(super) ready_since: Time,
     pub(super) last_reason: Option<Reason>,
 }
 
 impl Child {
-    /// A child whose first life will follow `generation`.
+    /// Creates a child; its first incarnation follows `generation`.
     pub(super) const fn new(id: ChildId, policy: Policy, generation: Generation) -> Self {
         Self {
             id,
@@ -105,7 +105,7 @@ impl Child {
         }
     }
 
-    /// What the next life of its supervisor takes over: the past, for who asks, and a release that came since.
+    /// Takes over state from the previous incarnation of its supervisor: the history, for queries, and a release since.
     pub(super) fn renew(&mut self, former: Option<&Self>) {
         let Some(former) = former else { return };
         self.released = former.released;
@@ -127,7 +127,8 @@ impl Child {
         self.state == ChildState::Down && self.policy.held && !self.released
     }
 
-    /// The wait before the next start: doubled by each failure in a row, forgotten after a `healthy` life.
+    /// Returns the wait before the next start: doubled by each consecutive failure, reset after an
+    /// incarnation that lasted for `healthy`.
     pub(super) fn next_backoff(&mut self, now: Time, healthy: Duration) -> Duration {
         if self.ready_since > Time::ZERO && now.since(self.ready_since) > healthy {
             self.failures_in_a_row = 0;
@@ -137,7 +138,7 @@ impl Child {
         self.policy.backoff_min.saturating_mul(1 << doublings).min(self.policy.backoff_max)
     }
 
-    /// A life has ended: whether it could not start and said so, since when.
+    /// Records the end of an incarnation: whether its start failed explicitly, and since when.
     pub(super) fn note_start(&mut self, now: Time, reason: &Reason) {
         if matches!((self.state, reason), (ChildState::Starting(_), Reason::StartFailed(_))) {
             self.cannot_start_since.get_or_insert(now);
@@ -147,12 +148,12 @@ impl Child {
         }
     }
 
-    /// It has started, or failed in another way.
+    /// Records a start, or a failure of another kind.
     pub(super) const fn can_start(&mut self) {
         (self.cannot_start_since, self.failed_starts) = (None, 0);
     }
 
-    /// The wait before it is tried again to start it, if that is no restart that counts.
+    /// Returns the wait before the next retry of a start, if the retry does not count as a restart.
     pub(super) fn start_retry(&self, now: Time) -> Option<Duration> {
         let since = self.cannot_start_since?;
         let StartRetry { wait_min, wait_max, give_up_after } = self.policy.start_retry;

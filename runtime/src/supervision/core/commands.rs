@@ -1,20 +1,21 @@
-//! Children added, terminated, restarted and deleted at run time, with OTP's meaning. Each command has one answer.
+//! Commands that add, terminate, restart and delete children at run time, with OTP's semantics. Each command
+//! has one reply.
 
-use super::{Child, ChildId, ChildState, Command, Core, Input, Order, Policy, Reason, Refusal};
+use super::{Child, ChildCommandError, ChildId, ChildState, Command, Core, Input, Order, Policy, Reason};
 use crate::time::Time;
 
 impl Core {
     pub(super) fn add(&mut self, id: ChildId, policy: Policy) {
         if self.ending.is_some() {
-            return self.refuse(Command::Add, id, Refusal::Ending);
+            return self.refuse(Command::Add, id, ChildCommandError::Ending);
         }
         if self.position(id).is_some() {
-            return self.refuse(Command::Add, id, Refusal::Present);
+            return self.refuse(Command::Add, id, ChildCommandError::Present);
         }
         let mut child = Child::new(id, policy, 0);
         child.wanted = self.started;
         self.children.push(child);
-        self.said_all_ready = false;
+        self.reported_all_ready = false;
         self.orders.push_back(Order::Done(Command::Add, id));
     }
 
@@ -23,7 +24,7 @@ impl Core {
         let child = &mut self.children[index];
         child.terminations += 1;
         if child.state.is_alive() {
-            // The rest follows when it has stopped. A failure of its group before that starts it again.
+            // The reply follows when it has stopped. A failure of its group before that starts it again.
             child.wanted = false;
             return;
         }
@@ -46,7 +47,7 @@ impl Core {
             Some(refusal) => self.refuse(Command::Restart, id, refusal),
             None => {
                 self.children[index].wanted = true;
-                self.said_all_ready = false;
+                self.reported_all_ready = false;
                 self.orders.push_back(Order::Done(Command::Restart, id));
             }
         }
@@ -63,26 +64,26 @@ impl Core {
         }
     }
 
-    /// Whom a command is for; refuses one that is for nobody.
+    /// Returns the index of the command's child; refuses a command for an unknown one.
     fn commanded(&mut self, command: Command, id: ChildId) -> Option<usize> {
         if self.ending.is_some() {
-            self.refuse(command, id, Refusal::Ending);
+            self.refuse(command, id, ChildCommandError::Ending);
             return None;
         }
         let index = self.position(id);
         if index.is_none() {
-            self.refuse(command, id, Refusal::Unknown);
+            self.refuse(command, id, ChildCommandError::Unknown);
         }
         index
     }
 
-    fn why_not_terminated(&self, index: usize) -> Option<Refusal> {
+    fn why_not_terminated(&self, index: usize) -> Option<ChildCommandError> {
         let child = &self.children[index];
         match child.state {
-            ChildState::BackingOff(_) => Some(Refusal::Restarting),
+            ChildState::BackingOff(_) => Some(ChildCommandError::Restarting),
             ChildState::Down if !child.wanted => None,
             ChildState::Down | ChildState::Starting(_) | ChildState::Ready | ChildState::Stopping(_) => {
-                Some(Refusal::Running)
+                Some(ChildCommandError::Running)
             }
         }
     }
@@ -97,17 +98,17 @@ impl Core {
         self.orders.extend(answers);
     }
 
-    fn refuse(&mut self, command: Command, id: ChildId, refusal: Refusal) {
+    fn refuse(&mut self, command: Command, id: ChildId, refusal: ChildCommandError) {
         self.orders.push_back(Order::Refused(command, id, refusal));
     }
 
-    /// After the end a command comes too late; and a release is kept for the next life.
-    pub(super) fn hear_after_the_end(&mut self, input: &Input) {
+    /// Handles an input after the end: a command is too late, and a release is kept for the next incarnation.
+    pub(super) fn handle_after_end(&mut self, input: &Input) {
         if let Input::Released(id) = input {
             self.released(*id);
         }
         if let Some((command, id)) = input.command() {
-            self.refuse(command, id, Refusal::Ending);
+            self.refuse(command, id, ChildCommandError::Ending);
         }
     }
 }

@@ -1,40 +1,41 @@
-//! What a supervisor is told, and what it orders.
+//! The inputs and orders of a supervisor.
 
 use super::{ChildId, Generation, Policy, Reason};
 use crate::time::Time;
 
-/// What a supervisor is told.
+/// An input of a supervisor.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Input {
     /// Start the children.
     Started,
-    /// What this child requires is ready.
+    /// The requirements of this child are ready.
     Released(ChildId),
-    /// This child takes messages.
+    /// This child is ready and takes messages.
     BecameReady(ChildId, Generation),
-    /// This child does not come back: the reason says what it is in. Its life is taken.
+    /// This child hangs: the reason has its activity. It must be abandoned.
     Hung(ChildId, Generation, Reason),
-    /// This child is gone.
+    /// This child has ended.
     Ended(ChildId, Generation, Reason),
-    /// This life was not given all of its time to start or to stop: it has until then. Judges no deadline, so that several may
-    /// be reprieved before the next event does.
-    Reprieved(ChildId, Generation, Time),
+    /// The deadline of this incarnation to start or to stop is extended to this time, because it did not get
+    /// its CPU time. Triggers no deadline check, so that several children can be extended before the next
+    /// event.
+    DeadlineExtended(ChildId, Generation, Time),
     /// A deadline may have passed.
     TimePassed,
     /// Stop the children, last first.
     StopOrdered,
-    /// Take this child in, after the others, and start it in its turn.
+    /// Add this child after the others, and start it in its turn.
     AddChild(ChildId, Policy),
-    /// Stop this child and do not start it again. It is kept, unless it is temporary: then it is forgotten.
+    /// Stop this child and do not start it again. It is kept, unless it is temporary: then it is deleted.
     TerminateChild(ChildId),
-    /// Start this child again, which was terminated or has ended by itself.
+    /// Start this child again. It was terminated or has ended by itself.
     RestartChild(ChildId),
-    /// Forget this child, which was terminated or has ended by itself.
+    /// Delete this child. It was terminated or has ended by itself.
     DeleteChild(ChildId),
 }
 
 impl Input {
-    /// Which command it is, and for whom, if it is one.
+    /// Returns the command and its child, if this input is a command.
     #[must_use]
     pub const fn command(&self) -> Option<(Command, ChildId)> {
         match self {
@@ -47,14 +48,14 @@ impl Input {
             | Self::BecameReady(..)
             | Self::Hung(..)
             | Self::Ended(..)
-            | Self::Reprieved(..)
+            | Self::DeadlineExtended(..)
             | Self::TimePassed
             | Self::StopOrdered => None,
         }
     }
 }
 
-/// What a supervisor was asked to do with a child at run time.
+/// A command on a child at run time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Command {
     /// [`Input::AddChild`].
@@ -67,24 +68,24 @@ pub enum Command {
     Delete,
 }
 
-/// Why a command is not carried out. Nothing has changed.
+/// The reason why a command is refused. Nothing has changed.
 ///
 /// # Examples
 ///
 /// ```
-/// use sinew::supervision::Refusal;
+/// use sinew::supervision::ChildCommandError;
 ///
-/// assert_eq!(Refusal::Running.to_string(), "it runs; stop it first, with `stop_app`");
+/// assert_eq!(ChildCommandError::Running.to_string(), "it runs; stop it first, with `stop_app`");
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum Refusal {
+pub enum ChildCommandError {
     /// The supervisor has no such child.
     #[error("there is no such child")]
     Unknown,
-    /// The supervisor has a child of this id already.
+    /// The supervisor already has a child with this ID.
     #[error("this child is there already")]
     Present,
-    /// The child lives, or is about to be started.
+    /// The child is alive, or is about to be started.
     #[error("it runs; stop it first, with `stop_app`")]
     Running,
     /// The child failed and is about to be started again.
@@ -95,30 +96,30 @@ pub enum Refusal {
     Ending,
 }
 
-/// What a supervisor orders its shell to do, and what it says to others.
+/// An order of a supervisor to its shell, or a fact for its listener.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Order {
-    /// Make a new instance of this child.
+    /// Create a new instance of this child.
     Spawn(ChildId, Generation),
-    /// Tell this child to stop.
+    /// Order this child to stop.
     Stop(ChildId, Generation),
-    /// Take this child's life without waiting for it.
+    /// Abandon this child without waiting for it.
     Abandon(ChildId, Generation),
-    /// For others: this child failed or was stopped, and is started again if its turn comes.
+    /// Fact: this child failed or was stopped, and will be started again in its turn.
     Failed(ChildId, Reason),
-    /// For others: this child is ready.
+    /// Fact: this child is ready.
     Ready(ChildId),
-    /// For others: this child is gone. It is not started again unless by a command, or together with its group.
+    /// Fact: this child has ended. Only a command, or a restart of its group, starts it again.
     Gone(ChildId, Reason),
-    /// For others: this child is forgotten.
+    /// Fact: this child was deleted.
     Deleted(ChildId),
-    /// For others: every child that is wanted is ready. Said again after each restart.
+    /// Fact: every wanted child is ready. Repeated after each restart.
     AllReady,
-    /// For who asked: the command is carried out. A terminated child has ended; a child that was added or restarted has its
-    /// start before it.
+    /// Reply: the command was executed. A terminated child has ended. The start of an added or restarted
+    /// child comes before this reply.
     Done(Command, ChildId),
-    /// For who asked: the command is not carried out.
-    Refused(Command, ChildId, Refusal),
-    /// For others: no child lives any more, and why. The last order.
+    /// Reply: the command was refused.
+    Refused(Command, ChildId, ChildCommandError),
+    /// Fact: no child is alive any more, with the reason. The last order.
     Ended(Reason),
 }

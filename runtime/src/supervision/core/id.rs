@@ -1,11 +1,11 @@
-//! Which child of a node, and which life of it.
+//! The IDs of children in a node, and their generations.
 
 use std::sync::{
     Arc,
     atomic::{AtomicU64, Ordering},
 };
 
-/// A child of any supervisor of one node. Stays the same through restarts; is never given to another child.
+/// The ID of a child of any supervisor of one node. It stays the same through restarts, and is never reused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ChildId(pub u64);
 
@@ -15,18 +15,18 @@ impl std::fmt::Display for ChildId {
     }
 }
 
-/// Which life of a child; 0 before its first.
+/// The number of an incarnation of a child; 0 before the first.
 pub type Generation = u64;
 
-/// Hands out ids. All supervisors of a node share one, so that their children never have the same.
+/// Assigns IDs. All supervisors of a node share one generator, so that IDs are unique.
 #[derive(Clone, Debug, Default)]
 pub struct ChildIds(Arc<AtomicU64>);
 
 impl ChildIds {
-    /// An id that was not handed out before.
+    /// Returns a new ID.
     #[must_use]
     pub fn next(&self) -> ChildId {
-        // SYNC: Relaxed; the number itself is all that is shared.
+        // SYNC: Relaxed; the number itself is the only shared state.
         ChildId(self.0.fetch_add(1, Ordering::Relaxed))
     }
 }

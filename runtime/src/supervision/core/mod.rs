@@ -1,21 +1,22 @@
-//! The supervisor's decisions, as a pure state machine: (history, now, event) to orders.
+//! The decisions of a supervisor, as a pure state machine: (history, now, event) to orders.
 //!
-//! Erlang/OTP's vocabulary and rules (stdlib, module `supervisor`): restart types, strategies, restart intensity over a
-//! window, ordered start, stop in reverse order, significant children, children added and removed at run time. Added to
-//! them: readiness (a child is started when those before it have said Ready), a deadline on every wait, exponential
-//! back-off with jitter, children that are held until they are released, and a bound on lives that were taken and did not
-//! let go. Left out: one-for-one's `simple` form.
+//! It follows Erlang/OTP's vocabulary and rules (stdlib, module `supervisor`): restart types, strategies,
+//! restart intensity over a window, ordered start, stop in reverse order, significant children, children
+//! added and removed at run time. These are additions: readiness (a child is started when those before it are
+//! Ready), a deadline on every wait, and exponential back-off with jitter; held children that wait for a
+//! release; a bound on abandoned incarnations that have not ended. The `simple` form of one-for-one is left
+//! out.
 //!
-//! After every [`handle`](Core::handle) the shell drains [`poll`](Core::poll) until nothing is left, then sleeps until
-//! [`next_wake`](Core::next_wake). Every event carries the generation of the child that it speaks of; an event of an
-//! earlier generation is ignored.
+//! After every [`handle`](Core::handle) the shell drains [`poll`](Core::poll), then sleeps until
+//! [`next_wake`](Core::next_wake). Every event carries the generation of its child; an event of an earlier
+//! generation is ignored.
 //!
-//! | file | what it is |
+//! | file | content |
 //! | --- | --- |
-//! | `policy` | what the supervisor may do |
-//! | `event` | what it is told, what it orders |
-//! | `child` | what it remembers of one child |
-//! | `restart` | what follows when a child has ended |
+//! | `policy` | supervision policies |
+//! | `event` | inputs and orders |
+//! | `child` | the state of one child |
+//! | `restart` | the decisions after the end of a child |
 //! | `commands` | children added, terminated, restarted, deleted |
 //! | `reconcile` | stops and starts, in order |
 //! | `tree` | supervisors in supervisors |
@@ -24,14 +25,10 @@ mod child;
 mod commands;
 mod event;
 mod id;
-#[cfg(test)]
-mod model;
 mod policy;
 mod reason;
 mod reconcile;
 mod restart;
-#[cfg(test)]
-mod simulation;
 #[cfg(test)]
 mod table;
 #[cfg(test)]
@@ -45,7 +42,7 @@ use std::collections::{BTreeSet, VecDeque};
 
 use child::Child;
 pub use child::{ChildState, ChildView};
-pub use event::{Command, Input, Order, Refusal};
+pub use event::{ChildCommandError, Command, Input, Order};
 pub use id::{ChildId, ChildIds, Generation};
 pub use policy::{AutoShutdown, Flags, Intensity, Policy, Restart, StartRetry, Strategy};
 pub use reason::Reason;
@@ -54,29 +51,29 @@ use window::{Chance, Window};
 
 use crate::time::Time;
 
-/// A supervisor's memory; see the [module](self).
+/// The state of a supervisor; see the [module](self).
 #[derive(Debug)]
 pub struct Core {
     flags: Flags,
     chance: Chance,
     children: Vec<Child>,
     restarts: Window,
-    /// Restarts because a child lost its thread.
+    /// Restarts of children that lost their thread.
     losses: Window,
-    /// Lives that were taken and have not ended yet.
+    /// Abandoned incarnations that have not ended yet.
     abandoned: BTreeSet<(ChildId, Generation)>,
-    /// The highest generation that any child had.
+    /// The highest generation of any child so far.
     last_generation: Generation,
     started: bool,
-    /// Set once the children are to end.
+    /// Set once the children must end.
     ending: Option<Reason>,
     ended: bool,
-    said_all_ready: bool,
+    reported_all_ready: bool,
     orders: VecDeque<Order>,
 }
 
 impl Core {
-    /// A supervisor of these children, in the order of their start. `seed` makes the chance in its waits.
+    /// Creates a supervisor of these children, in the order of their start. `seed` seeds the jitter of its waits.
     #[must_use]
     pub fn new(flags: Flags, seed: u64, children: Vec<(ChildId, Policy)>) -> Self {
         let mut core = Self {
@@ -90,36 +87,36 @@ impl Core {
             started: false,
             ending: None,
             ended: false,
-            said_all_ready: false,
+            reported_all_ready: false,
             orders: VecDeque::new(),
         };
-        core.take_in(children);
+        core.set_children(children);
         core
     }
 
-    /// The same supervisor in its next life, with these children. It has forgotten everything but which lives of theirs were
-    /// before, which of those have not let go, and who was released since.
+    /// Creates the next incarnation of this supervisor, with these children. It keeps only the generations of
+    /// its children, their abandoned incarnations that have not ended, and the releases since.
     #[must_use]
     pub fn renewed(&self, children: Vec<(ChildId, Policy)>) -> Self {
         let mut core = Self::new(self.flags, self.chance.seed(), Vec::new());
         core.last_generation = self.last_generation;
         core.abandoned.clone_from(&self.abandoned);
-        core.take_in(children);
+        core.set_children(children);
         for child in &mut core.children {
             child.renew(self.children.iter().find(|former| former.id == child.id));
         }
         core
     }
 
-    fn take_in(&mut self, children: Vec<(ChildId, Policy)>) {
+    fn set_children(&mut self, children: Vec<(ChildId, Policy)>) {
         let before = self.last_generation;
         self.children = children.into_iter().map(|(id, policy)| Child::new(id, policy, before)).collect();
     }
 
-    /// Takes an event. Then drain [`poll`](Self::poll).
+    /// Handles an event. Call [`poll`](Self::poll) afterwards until it returns `None`.
     pub fn handle(&mut self, now: Time, input: Input) {
         if self.ended {
-            return self.hear_after_the_end(&input);
+            return self.handle_after_end(&input);
         }
         match input {
             Input::Started => self.start(),
@@ -127,16 +124,18 @@ impl Core {
             Input::Released(id) => self.released(id),
             Input::BecameReady(id, generation) => self.became_ready(now, id, generation),
             Input::Hung(id, generation, reason) => {
-                if let Some(index) = self.alive(id, generation) {
+                if let Some(index) = self.live_index(id, generation) {
                     self.abandon(now, index, reason);
                 }
             }
-            Input::Ended(id, generation, reason) => match self.alive(id, generation) {
+            Input::Ended(id, generation, reason) => match self.live_index(id, generation) {
                 Some(index) => self.child_ended(now, index, reason),
-                // Perhaps one whose life was taken: it has let go at last.
+                // Perhaps an abandoned incarnation, which has ended now.
                 None => _ = self.abandoned.remove(&(id, generation)),
             },
-            Input::Reprieved(id, generation, until) => return self.reprieve(id, generation, until),
+            Input::DeadlineExtended(id, generation, until) => {
+                return self.extend_deadline(id, generation, until);
+            }
             Input::TimePassed => {}
             Input::AddChild(id, policy) => self.add(id, policy),
             Input::TerminateChild(id) => self.terminate(now, id),
@@ -147,54 +146,54 @@ impl Core {
         self.reconcile(now);
     }
 
-    /// The next order, oldest first.
+    /// Returns the next order, oldest first.
     pub fn poll(&mut self) -> Option<Order> {
         self.orders.pop_front()
     }
 
-    /// When [`Input::TimePassed`] is due.
+    /// Returns when [`Input::TimePassed`] is due.
     #[must_use]
     pub fn next_wake(&self) -> Option<Time> {
         self.children.iter().filter_map(|child| child.state.deadline()).min()
     }
 
-    /// The children, in the order of their start.
+    /// Returns the children, in the order of their start.
     pub fn children(&self) -> impl Iterator<Item = ChildId> + '_ {
         self.children.iter().map(|child| child.id)
     }
 
-    /// What is known of a child.
+    /// Returns the state of a child.
     #[must_use]
     pub fn child(&self, id: ChildId) -> Option<ChildView> {
         let abandoned = self.abandoned.iter().filter(|(child, _)| *child == id).count();
         Some(self.children[self.position(id)?].view(abandoned))
     }
 
-    /// How it treats its children.
+    /// Returns the policy for its children as a group.
     #[must_use]
     pub const fn flags(&self) -> &Flags {
         &self.flags
     }
 
-    /// Restarts in the window that ends now.
+    /// Returns the number of restarts in the window that ends now.
     #[must_use]
     pub fn restarts_in_window(&self, now: Time) -> usize {
         self.restarts.count(now, self.flags.intensity.window)
     }
 
-    /// Lives that were taken and have not let go.
+    /// Returns the number of abandoned incarnations that have not ended.
     #[must_use]
     pub fn abandoned(&self) -> usize {
         self.abandoned.len()
     }
 
-    /// Whether it stops its children, or has.
+    /// Returns whether the supervisor stops its children, or has stopped them.
     #[must_use]
     pub const fn is_ending(&self) -> bool {
         self.ending.is_some()
     }
 
-    /// Whether it has said its last word.
+    /// Returns whether the supervisor has emitted its last order.
     #[must_use]
     pub const fn has_ended(&self) -> bool {
         self.ended
@@ -204,8 +203,8 @@ impl Core {
         self.children.iter().position(|child| child.id == id)
     }
 
-    /// Where this life is among the children, if it has not ended.
-    fn alive(&self, id: ChildId, generation: Generation) -> Option<usize> {
+    /// Returns the index of the child with this incarnation, if that has not ended.
+    fn live_index(&self, id: ChildId, generation: Generation) -> Option<usize> {
         let index = self.position(id)?;
         let child = &self.children[index];
         (child.generation == generation && child.state.is_alive()).then_some(index)
@@ -224,7 +223,7 @@ impl Core {
     }
 
     fn became_ready(&mut self, now: Time, id: ChildId, generation: Generation) {
-        if let Some(index) = self.alive(id, generation)
+        if let Some(index) = self.live_index(id, generation)
             && let ChildState::Starting(_) = self.children[index].state
         {
             self.children[index].enter(ChildState::Ready, now);
@@ -234,8 +233,8 @@ impl Core {
         }
     }
 
-    fn reprieve(&mut self, id: ChildId, generation: Generation, until: Time) {
-        let Some(index) = self.alive(id, generation) else { return };
+    fn extend_deadline(&mut self, id: ChildId, generation: Generation, until: Time) {
+        let Some(index) = self.live_index(id, generation) else { return };
         match &mut self.children[index].state {
             ChildState::Starting(deadline) | ChildState::Stopping(deadline) => {
                 *deadline = until.max(*deadline);
@@ -244,10 +243,10 @@ impl Core {
         }
     }
 
-    /// Lets every wait end whose time is over.
+    /// Handles all deadlines that have passed.
     fn expire(&mut self, now: Time) {
         let over = |child: &Child| child.state.deadline().is_some_and(|deadline| deadline <= now);
-        // Ends: what is done with a child takes it out of the state whose time was over.
+        // Terminates: each step moves the late child out of its state.
         while let Some(index) = self.children.iter().position(over) {
             match self.children[index].state {
                 ChildState::Starting(_) => self.abandon(now, index, Reason::StartTimeout),

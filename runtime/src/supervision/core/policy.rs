@@ -1,8 +1,8 @@
-//! What a supervisor may do with its children: strategy, restart type, times, intensity.
+//! Supervision policies: strategy, restart type, times, restart intensity.
 
 use std::time::Duration;
 
-/// Who is restarted when one child fails.
+/// Selects the children that are restarted when one child fails.
 ///
 /// # Examples
 ///
@@ -14,17 +14,17 @@ use std::time::Duration;
 /// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Strategy {
-    /// That child alone.
+    /// Restarts the failed child alone.
     #[default]
     OneForOne,
-    /// That child and those started after it.
+    /// Restarts the failed child and the children started after it.
     RestForOne,
-    /// All children.
+    /// Restarts all children.
     OneForAll,
 }
 
 impl Strategy {
-    /// Whether children are started in order, each when those before it are ready.
+    /// Returns whether children are started in order, each one when those before it are ready.
     pub(super) const fn is_ordered(self) -> bool {
         match self {
             Self::OneForOne => false,
@@ -33,7 +33,7 @@ impl Strategy {
     }
 }
 
-/// When a child that ended is started again.
+/// Selects when a child that ended is started again.
 ///
 /// # Examples
 ///
@@ -48,16 +48,17 @@ impl Strategy {
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Restart {
-    /// Always.
+    /// Restarts after every end.
     Permanent,
-    /// Only if it failed.
+    /// Restarts only after a failure.
     Transient,
-    /// Never, not even with its group; its supervisor forgets it when it ends.
+    /// Never restarts the child, not even with its group. Its supervisor removes it when it ends.
     Temporary,
 }
 
-/// Whether a supervisor ends by itself when its [significant](Policy::significant) children have done their work: when one
-/// that is transient ends without a failure, or one that is temporary ends in whatever way.
+/// Selects whether a supervisor shuts down when its [significant](Policy::significant) children have
+/// finished. A transient child finishes when it ends without a failure, a temporary one when it ends in any
+/// way.
 ///
 /// # Examples
 ///
@@ -73,42 +74,42 @@ pub enum Restart {
 /// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum AutoShutdown {
-    /// It does not.
+    /// Does not shut down.
     #[default]
     Never,
-    /// When the first of them has.
+    /// Shuts down when the first significant child has finished.
     AnySignificant,
-    /// When the last of them has.
+    /// Shuts down when the last significant child has finished.
     AllSignificant,
 }
 
-/// What a supervisor may do with a child.
+/// The supervision policy of a child.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Policy {
-    /// When it is started again. Default [`Restart::Permanent`].
+    /// When the child is started again. Default [`Restart::Permanent`].
     pub restart: Restart,
-    /// Whether its end may be the end of its supervisor; see [`AutoShutdown`]. Of no effect on a permanent child, whose
-    /// end is never its last word. Default no.
+    /// Whether the end of the child may end its supervisor; see [`AutoShutdown`]. Has no effect on a
+    /// permanent child, which is always restarted. Default no.
     pub significant: bool,
-    /// Time to become ready. Default 10 s.
+    /// Time for the child to become ready. Default 10 s.
     pub start_within: Duration,
-    /// Time to stop before it is abandoned. Default 500 ms.
+    /// Time for the child to stop before it is abandoned. Default 500 ms.
     pub stop_within: Duration,
-    /// First wait before a restart; doubles with each failure in a row, and is then shortened by chance by up to a quarter.
-    /// Default 1 ms.
+    /// First wait before a restart. It doubles with each consecutive failure, and is then shortened by a
+    /// random part of up to a quarter. Default 1 ms.
     pub backoff_min: Duration,
     /// Longest wait before a restart. Default 2 s.
     pub backoff_max: Duration,
-    /// Longest time that one turn (a handler, a timer, `started`) may take before the actor counts as hung. Default 1 s;
-    /// `None`: it may take as long as it likes.
+    /// Maximum duration of one turn (a handler, a timer, `started`) before the actor counts as hung. Default
+    /// 1 s; `None`: no limit.
     pub progress_within: Option<Duration>,
-    /// Whether it waits for its release before its first start and after each failure. Default no.
+    /// Whether the child waits for its release before its first start and after each failure. Default no.
     pub held: bool,
-    /// How a start that [failed by an explicit call](super::Reason::StartFailed) is tried again.
+    /// The retry policy for a start that [failed by an explicit call](super::Reason::StartFailed).
     pub start_retry: StartRetry,
 }
 
-/// How a start that failed by an explicit call is tried again. Such failures do not count towards restart intensity.
+/// The retry policy for a start that failed by an explicit call. Such failures do not count towards restart intensity.
 ///
 /// # Examples
 ///
@@ -121,11 +122,13 @@ pub struct Policy {
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct StartRetry {
-    /// First wait; doubles with each such failure in a row, and is then shortened by chance by up to a quarter. Default 100 ms.
+    /// First wait. It doubles with each consecutive failure of this kind, and is then shortened by a random
+    /// part of up to a quarter. Default 100 ms.
     pub wait_min: Duration,
     /// Longest wait. Default 5 s.
     pub wait_max: Duration,
-    /// Time after the first such failure in a row from which they count as restarts do. Default `None`: never.
+    /// Time after the first of consecutive failures of this kind from which they count as restarts. Default
+    /// `None`: never.
     pub give_up_after: Option<Duration>,
 }
 
@@ -152,15 +155,15 @@ impl Default for Policy {
     }
 }
 
-/// How many restarts are too many.
+/// The limit of restarts: restart intensity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Intensity {
-    /// Restarts allowed in one window; one more and the supervisor gives up. Default 5.
+    /// Maximum number of restarts in one window; one more and the supervisor gives up. Default 5.
     pub restarts_max: usize,
-    /// Restarts allowed in one window because a child lost its thread: the fault of who was on the thread with it, so they
-    /// are counted apart. Default 50.
+    /// Maximum number of restarts in one window because a child lost its thread. Another actor on the same
+    /// thread caused these, so they are counted separately. Default 50.
     pub losses_max: usize,
-    /// The window. Default 10 s.
+    /// The length of the window. Default 10 s.
     pub window: Duration,
 }
 
@@ -170,17 +173,18 @@ impl Default for Intensity {
     }
 }
 
-/// How a supervisor treats its children as a group.
+/// The policy of a supervisor for its children as a group.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Flags {
-    /// Who is restarted when one fails. Default [`Strategy::OneForOne`].
+    /// The children that are restarted when one fails. Default [`Strategy::OneForOne`].
     pub strategy: Strategy,
-    /// How many restarts are too many.
+    /// The limit of restarts.
     pub intensity: Intensity,
-    /// Whether it ends with its significant children. Default [`AutoShutdown::Never`].
+    /// Whether the supervisor shuts down with its significant children. Default [`AutoShutdown::Never`].
     pub auto_shutdown: AutoShutdown,
-    /// Lives that were taken and have not let go of their threads, at most; one more and the supervisor gives up. Each keeps
-    /// a thread. Counted for each supervisor, and not forgotten when the supervisor itself is restarted. Default 3.
+    /// Maximum number of abandoned incarnations that have not released their threads; one more and the
+    /// supervisor gives up. Each keeps a thread. The count is kept per supervisor, also when the supervisor
+    /// itself is restarted. Default 3.
     pub abandoned_max: usize,
 }
 

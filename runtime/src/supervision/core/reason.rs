@@ -1,6 +1,6 @@
-//! How a child ended.
+//! The reason for the end of a child.
 
-/// How a child ended.
+/// The reason for the end of a child.
 ///
 /// # Examples
 ///
@@ -12,32 +12,32 @@
 /// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Reason {
-    /// By itself, in order.
+    /// The child ended itself, in order.
     Normal,
-    /// Because it was told to.
+    /// The child was ordered to stop.
     Shutdown,
-    /// It panicked; what it said.
+    /// The child panicked; the message.
     Panic(String),
-    /// It did not become ready in its time.
+    /// The child did not become ready in time.
     StartTimeout,
-    /// It cannot start now and said why: a device that is not plugged in, for example.
+    /// The child cannot start now; its reason, for example a device that is not plugged in.
     StartFailed(String),
-    /// It did not come back in its progress budget; who says so, since when, and in what.
+    /// The child exceeded its progress budget; the detector, the start and the activity.
     Hung(String),
-    /// It did not stop in its time.
+    /// The child did not stop in time.
     Killed,
-    /// The thread under it ended.
+    /// The child's thread ended.
     ThreadEnded,
-    /// The process that it was ended; its exit code or the signal, in words.
+    /// The child's process ended; its exit code or signal, as a text.
     ProcessEnded(String),
-    /// It stopped in order because it lost what it requires, to be started again when that is there; the name.
+    /// The child stopped in order because it lost a requirement, and is started again when that is ready; the name.
     RequirementLost(String),
-    /// A supervisor gave up; why.
+    /// A supervisor gave up; the reason.
     GaveUp(String),
 }
 
 impl Reason {
-    /// Whether this counts as a failure.
+    /// Returns whether this reason counts as a failure.
     #[must_use]
     pub const fn is_failure(&self) -> bool {
         !matches!(self, Self::Normal | Self::Shutdown | Self::RequirementLost(_))

@@ -1,4 +1,4 @@
-//! Brings the children nearer to what is wanted: stops, then starts.
+//! Moves the children towards their wanted states: stops, then starts.
 
 use super::{Child, ChildState, Core, Order};
 use crate::time::Time;
@@ -18,18 +18,18 @@ impl Core {
         }
         self.start_in_order(now);
         let settled = |child: &Child| !child.wanted || child.state == ChildState::Ready;
-        if !self.said_all_ready && self.children.iter().all(settled) {
-            self.said_all_ready = true;
+        if !self.reported_all_ready && self.children.iter().all(settled) {
+            self.reported_all_ready = true;
             self.orders.push_back(Order::AllReady);
         }
     }
 
-    /// Stops whom it must. Returns whether nothing may be started until they have ended.
+    /// Stops unwanted children. Returns whether no child may be started until they have ended.
     fn stop_the_unwanted(&mut self, now: Time) -> bool {
         if self.flags.strategy.is_ordered() || self.ending.is_some() {
             return self.stop_the_last_unwanted(now);
         }
-        // Each child is on its own: one that takes its time to stop keeps nobody waiting.
+        // The children are independent: a slow stop of one does not delay the others.
         for index in (0..self.children.len()).rev() {
             if self.children[index].is_unwanted() {
                 self.stop(index, now);
@@ -55,7 +55,7 @@ impl Core {
         }
     }
 
-    /// Starts whom it can: in order where the strategy ties children to those before them, else all at once.
+    /// Starts children: in order if the strategy ties them to those before them, otherwise all at once.
     fn start_in_order(&mut self, now: Time) {
         let ordered = self.flags.strategy.is_ordered();
         for child in &mut self.children {
@@ -74,7 +74,7 @@ impl Core {
 }
 
 impl Child {
-    /// Lives, and should not, or not this life of it.
+    /// Returns whether the child is alive and should not be, or has a stale incarnation.
     fn is_unwanted(&self) -> bool {
         self.state.is_alive() && (self.stale || !self.wanted)
     }

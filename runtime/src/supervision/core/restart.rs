@@ -1,18 +1,20 @@
-//! What follows when a child has ended: nothing, a restart, or the end of all.
+//! The decisions after the end of a child: nothing, a restart, or the end of all children.
 
 use super::{AutoShutdown, ChildState, Core, Intensity, Order, Reason, Restart, Strategy};
 use crate::time::Time;
 
 impl Core {
-    /// Takes the life of a child that does not answer. More such lives than allowed, and the supervisor gives up.
+    /// Abandons a child that does not respond. If more incarnations are abandoned than allowed, the
+    /// supervisor gives up.
     pub(super) fn abandon(&mut self, now: Time, index: usize, reason: Reason) {
         let (id, generation) = (self.children[index].id, self.children[index].generation);
         self.orders.push_back(Order::Abandon(id, generation));
         self.abandoned.insert((id, generation));
         self.child_ended(now, index, reason);
-        let (lives, max) = (self.abandoned.len(), self.flags.abandoned_max);
-        if lives > max {
-            let why = format!("{lives} lives were taken and have not let go of their threads; {max} may");
+        let (count, max) = (self.abandoned.len(), self.flags.abandoned_max);
+        if count > max {
+            let why =
+                format!("{count} abandoned incarnations have not let go of their threads; at most {max} may");
             self.end(now, Reason::GaveUp(why));
         }
     }
@@ -24,10 +26,10 @@ impl Core {
         child.enter(ChildState::Down, now);
         child.released = false;
         child.stale = false;
-        // Whoever is told to stop ends in order: that it did so is not its own doing.
+        // A child that was ordered to stop ends in order: that was not its own decision.
         let is_order = was_to_end && reason == Reason::Normal;
         child.last_reason = Some(if is_order { Reason::Shutdown } else { reason.clone() });
-        self.said_all_ready = false;
+        self.reported_all_ready = false;
         if was_to_end {
             self.ended_as_ordered(index, reason);
         } else {
@@ -35,7 +37,7 @@ impl Core {
         }
     }
 
-    /// By a command, with its group, or with all.
+    /// Handles an end that was ordered by a command, with the child's group, or with all children.
     fn ended_as_ordered(&mut self, index: usize, reason: Reason) {
         let child = &mut self.children[index];
         let (id, terminations) = (child.id, std::mem::take(&mut child.terminations));
@@ -55,7 +57,7 @@ impl Core {
     fn ended_by_itself(&mut self, now: Time, index: usize, reason: Reason) {
         let child = &mut self.children[index];
         if let Reason::RequirementLost(_) = reason {
-            // It waits to be released again, whatever its restart type: it did not fail, and has not done its work.
+            // The child waits for its release again, with any restart type: it did not fail, and has not finished.
             self.orders.push_back(Order::Failed(child.id, reason));
             return;
         }
@@ -80,7 +82,7 @@ impl Core {
         }
     }
 
-    /// The end of a significant child may be the end of all.
+    /// Ends all children if the end of a significant child requires it.
     fn significant_ended(&mut self, now: Time) {
         let ends = match self.flags.auto_shutdown {
             AutoShutdown::Never => false,
@@ -97,7 +99,8 @@ impl Core {
 
     fn restart(&mut self, now: Time, index: usize, reason: &Reason) {
         if let Some(wait) = self.children[index].start_retry(now) {
-            // It failed alone, before anything depended on it: neither the intensity nor its group is concerned.
+            // The start failed before another child depended on it, so neither the restart intensity nor its
+            // group is affected.
             let wait = self.chance.jitter(wait);
             self.children[index].enter(ChildState::BackingOff(now + wait), now);
             return;
@@ -120,8 +123,8 @@ impl Core {
         self.restart_group_of(index);
     }
 
-    /// Those who go with a child that is restarted: they are stopped, then started in order. Among them are, as in OTP, those
-    /// who were terminated before; not those who are temporary.
+    /// Restarts the group of a restarted child: its members are stopped, then started in order. As in OTP,
+    /// the group includes terminated children and excludes temporary ones.
     fn restart_group_of(&mut self, index: usize) {
         let others = match self.flags.strategy {
             Strategy::OneForOne => return,
@@ -131,12 +134,12 @@ impl Core {
         for other in others.filter(|other| *other != index) {
             let child = &mut self.children[other];
             child.stale = child.state.is_alive();
-            // A temporary one has done its work when its group is stopped; if it waits for its first start, it has not.
+            // A temporary child is finished when its group is stopped, unless it still waits for its first start.
             child.wanted = if child.is_temporary() { child.wanted && !child.stale } else { true };
         }
     }
 
-    /// Ends all children. The first reason counts.
+    /// Ends all children. The first reason is kept.
     pub(super) fn end(&mut self, now: Time, why: Reason) {
         self.ending.get_or_insert(why);
         for child in &mut self.children {

@@ -1,7 +1,8 @@
-//! Every state of a child, times every input: the new state and the orders, as the file `table.txt`.
+//! Every state of a child, with every input: the new state and the orders, as the file `table.txt`.
 //!
-//! The child has a sibling on each side, so that the table shows for whom its end matters. A change of behaviour shows as a
-//! difference; `SINEW_WRITE_TABLE=1 cargo test -p sinew-runtime table` writes the file anew, for a person to read.
+//! The child has a sibling on each side, so that the table shows the siblings that its end affects. A change
+//! of behaviour shows as a difference; `SINEW_WRITE_TABLE=1 cargo test -p sinew-runtime table` writes the
+//! file anew, for review.
 
 use std::time::Duration;
 
@@ -16,7 +17,7 @@ const NOW: Time = Time::from_nanos(1_000_000_000);
 const LATER: Time = Time::from_nanos(60_000_000_000);
 
 #[test]
-fn every_state_answers_every_input_as_the_table_says() {
+fn every_state_answers_every_input_as_in_the_table() {
     let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(FILE);
     let table = table();
     if std::env::var_os(WRITE_VARIABLE).is_some() {
@@ -77,13 +78,13 @@ fn inputs() -> Vec<(&'static str, Time, Input)> {
         ("Started", NOW, Input::Started),
         ("Released", NOW, Input::Released(CHILD)),
         ("BecameReady", NOW, Input::BecameReady(CHILD, 1)),
-        ("BecameReady, an earlier life", NOW, Input::BecameReady(CHILD, 0)),
+        ("BecameReady, an earlier generation", NOW, Input::BecameReady(CHILD, 0)),
         ("Hung", NOW, Input::Hung(CHILD, 1, Reason::Hung("busy".into()))),
         ("Ended, normal", NOW, Input::Ended(CHILD, 1, Reason::Normal)),
         ("Ended, panic", NOW, Input::Ended(CHILD, 1, panic())),
         ("Ended, thread", NOW, Input::Ended(CHILD, 1, Reason::ThreadEnded)),
-        ("Ended, an earlier life", NOW, Input::Ended(CHILD, 0, panic())),
-        ("Reprieved", NOW, Input::Reprieved(CHILD, 1, LATER + Duration::from_nanos(1))),
+        ("Ended, an earlier generation", NOW, Input::Ended(CHILD, 0, panic())),
+        ("DeadlineExtended", NOW, Input::DeadlineExtended(CHILD, 1, LATER + Duration::from_nanos(1))),
         ("TimePassed, too early", NOW, Input::TimePassed),
         ("TimePassed, late", LATER, Input::TimePassed),
         ("StopOrdered", NOW, Input::StopOrdered),

@@ -1,4 +1,4 @@
-//! Claims about single decisions. All histories are in `simulation`, all states in `table`.
+//! Tests of single decisions. `tests/runtime/tests/simulation` covers all histories, `table` all states.
 
 use std::time::Duration;
 
@@ -39,7 +39,7 @@ fn panicked(index: usize, generation: u64) -> Input {
 }
 
 #[test]
-fn a_child_is_started_when_the_one_before_it_is_ready() {
+fn child_starts_when_the_one_before_is_ready() {
     let mut core = supervisor(Strategy::RestForOne, 2);
     assert_eq!(orders(&mut core), [Order::Spawn(ChildId(0), 1)]);
     core.handle(at(5), Input::BecameReady(ChildId(0), 1));
@@ -49,7 +49,7 @@ fn a_child_is_started_when_the_one_before_it_is_ready() {
 }
 
 #[test]
-fn rest_for_one_stops_those_after_last_first_and_starts_them_again_in_order() {
+fn rest_for_one_restarts_later_children_in_order() {
     let mut core = supervisor(Strategy::RestForOne, 3);
     all_ready(&mut core, 3);
     core.handle(at(10), panicked(0, 1));
@@ -73,7 +73,7 @@ fn one_for_one_leaves_the_siblings_alone() {
 }
 
 #[test]
-fn an_event_of_an_earlier_life_is_ignored() {
+fn event_of_an_earlier_incarnation_is_ignored() {
     let mut core = supervisor(Strategy::OneForOne, 1);
     all_ready(&mut core, 1);
     core.handle(at(10), panicked(0, 1));
@@ -85,7 +85,7 @@ fn an_event_of_an_earlier_life_is_ignored() {
 }
 
 #[test]
-fn too_many_restarts_in_the_window_end_it_with_words() {
+fn too_many_restarts_in_the_window_end_it() {
     let mut core = supervisor(Strategy::OneForOne, 2);
     all_ready(&mut core, 2);
     for generation in 1..=6 {
@@ -101,7 +101,7 @@ fn too_many_restarts_in_the_window_end_it_with_words() {
 }
 
 #[test]
-fn a_child_that_never_becomes_ready_is_abandoned_and_tried_again() {
+fn child_that_never_becomes_ready_is_retried() {
     let mut core = supervisor(Strategy::RestForOne, 1);
     orders(&mut core);
     core.handle(core.next_wake().unwrap(), Input::TimePassed);
@@ -114,15 +114,15 @@ fn a_child_that_never_becomes_ready_is_abandoned_and_tried_again() {
 }
 
 #[test]
-fn one_that_was_not_given_its_time_has_more_of_it_and_not_without_end() {
+fn extended_deadline_ends_at_the_latest_extension() {
     let mut core = supervisor(Strategy::RestForOne, 2);
     all_ready(&mut core, 2);
     core.handle(at(10), Input::StopOrdered);
     orders(&mut core);
     let (deadline, later) = (core.next_wake().unwrap(), core.next_wake().unwrap() + Duration::from_secs(1));
-    core.handle(deadline, Input::Reprieved(ChildId(1), 1, later));
-    core.handle(deadline, Input::Reprieved(ChildId(1), 1, deadline));
-    core.handle(deadline, Input::Reprieved(ChildId(1), 0, later + Duration::from_secs(1)));
+    core.handle(deadline, Input::DeadlineExtended(ChildId(1), 1, later));
+    core.handle(deadline, Input::DeadlineExtended(ChildId(1), 1, deadline));
+    core.handle(deadline, Input::DeadlineExtended(ChildId(1), 0, later + Duration::from_secs(1)));
     core.handle(deadline, Input::TimePassed);
     assert_eq!((orders(&mut core), core.next_wake()), (vec![], Some(later)));
     core.handle(later, Input::TimePassed);
@@ -134,7 +134,7 @@ fn one_that_was_not_given_its_time_has_more_of_it_and_not_without_end() {
 }
 
 #[test]
-fn stop_runs_backwards_and_abandons_who_does_not_obey() {
+fn stop_runs_in_reverse_and_abandons_late_children() {
     let mut core = supervisor(Strategy::RestForOne, 2);
     all_ready(&mut core, 2);
     core.handle(at(10), Input::StopOrdered);
@@ -148,7 +148,7 @@ fn stop_runs_backwards_and_abandons_who_does_not_obey() {
 }
 
 #[test]
-fn a_held_child_starts_when_it_is_released_and_waits_again_after_a_failure() {
+fn held_child_waits_for_release_also_after_a_failure() {
     let policy = Policy { held: true, ..Policy::default() };
     let mut core = Core::new(Strategy::OneForOne.into(), 0, vec![(ChildId(0), policy)]);
     core.handle(at(0), Input::Started);
@@ -164,7 +164,7 @@ fn a_held_child_starts_when_it_is_released_and_waits_again_after_a_failure() {
 }
 
 #[test]
-fn a_release_that_comes_during_the_back_off_is_not_forgotten() {
+fn release_during_the_back_off_is_kept() {
     let policy = Policy { held: true, ..Policy::default() };
     let mut core = Core::new(Strategy::OneForOne.into(), 0, vec![(ChildId(0), policy)]);
     core.handle(at(0), Input::Started);
@@ -190,7 +190,7 @@ fn of(restart: Restart) -> Policy {
 }
 
 #[test]
-fn a_terminated_child_stays_down_until_it_is_restarted_and_a_deleted_one_is_forgotten() {
+fn terminated_child_stays_down_and_deleted_one_is_gone() {
     let mut core = core_of(Flags::default(), &[of(Restart::Permanent)]);
     core.handle(at(1), Input::TerminateChild(child(0)));
     assert_eq!(orders(&mut core), [Order::Stop(child(0), 1)]);
@@ -200,11 +200,11 @@ fn a_terminated_child_stays_down_until_it_is_restarted_and_a_deleted_one_is_forg
     core.handle(at(3), Input::RestartChild(child(0)));
     assert_eq!(orders(&mut core), [Order::Done(Command::Restart, child(0)), Order::Spawn(child(0), 2)]);
     core.handle(at(4), Input::DeleteChild(child(0)));
-    assert_eq!(orders(&mut core), [Order::Refused(Command::Delete, child(0), Refusal::Running)]);
+    assert_eq!(orders(&mut core), [Order::Refused(Command::Delete, child(0), ChildCommandError::Running)]);
 }
 
 #[test]
-fn one_that_takes_its_time_to_stop_keeps_no_independent_sibling_waiting() {
+fn slow_stop_does_not_delay_independent_siblings() {
     let mut core = core_of(Flags::default(), &[of(Restart::Permanent), of(Restart::Permanent)]);
     core.handle(at(1), Input::TerminateChild(child(1)));
     core.handle(at(1), panicked(0, 1));
@@ -214,7 +214,7 @@ fn one_that_takes_its_time_to_stop_keeps_no_independent_sibling_waiting() {
 }
 
 #[test]
-fn the_end_of_the_last_significant_child_is_the_end_of_all() {
+fn end_of_the_last_significant_child_ends_all() {
     let flags = Flags { auto_shutdown: AutoShutdown::AllSignificant, ..Flags::default() };
     let works = Policy { significant: true, ..of(Restart::Transient) };
     let mut core = core_of(flags, &[works.clone(), works, of(Restart::Permanent)]);
@@ -227,8 +227,9 @@ fn the_end_of_the_last_significant_child_is_the_end_of_all() {
 }
 
 #[test]
-fn a_temporary_child_that_is_stopped_with_its_group_has_done_its_work() {
-    // Found by the simulation: it counted as working until it had stopped, and its supervisor lived on with nothing to do.
+fn temporary_child_stopped_with_its_group_is_finished() {
+    // Found by the simulation: it counted as working until it had stopped, and its supervisor remained
+    // without any work.
     let flags = Flags { auto_shutdown: AutoShutdown::AllSignificant, ..Strategy::RestForOne.into() };
     let works = |restart| Policy { significant: true, ..of(restart) };
     let mut core =
@@ -240,7 +241,7 @@ fn a_temporary_child_that_is_stopped_with_its_group_has_done_its_work() {
 }
 
 #[test]
-fn who_lost_its_thread_through_a_neighbour_does_not_pay_for_it() {
+fn thread_loss_by_a_neighbour_is_not_counted() {
     let flags =
         Flags { intensity: Intensity { restarts_max: 0, ..Intensity::default() }, ..Flags::default() };
     let mut core = core_of(flags, &[of(Restart::Permanent)]);
@@ -252,7 +253,7 @@ fn who_lost_its_thread_through_a_neighbour_does_not_pay_for_it() {
 }
 
 #[test]
-fn more_lives_that_do_not_let_go_than_allowed_end_it_and_one_that_let_go_does_not_count() {
+fn too_many_abandoned_incarnations_end_it() {
     let flags = Flags { abandoned_max: 1, ..Flags::default() };
     let mut core = core_of(flags, &[of(Restart::Permanent)]);
     let hung = |generation| Input::Hung(child(0), generation, Reason::Hung("busy".into()));
@@ -272,7 +273,7 @@ fn more_lives_that_do_not_let_go_than_allowed_end_it_and_one_that_let_go_does_no
 }
 
 #[test]
-fn the_same_seed_gives_the_same_waits_and_others_give_others() {
+fn same_seed_gives_the_same_waits() {
     let wait = |seed| {
         let policy = Policy { backoff_min: Duration::from_millis(100), ..Policy::default() };
         let mut core = Core::new(Flags::default(), seed, vec![(child(0), policy)]);
@@ -290,7 +291,7 @@ fn cannot_start(generation: u64) -> Input {
     Input::Ended(child(0), generation, Reason::StartFailed("no device".to_owned()))
 }
 
-/// Lets the first child be started again; returns how long that took.
+/// Restarts the first child; returns the time until the restart.
 fn started_again(core: &mut Core, now: &mut Time) -> Duration {
     let due = core.next_wake().expect("it is tried again");
     let waited = due.since(*now);
@@ -301,7 +302,7 @@ fn started_again(core: &mut Core, now: &mut Time) -> Duration {
 }
 
 #[test]
-fn a_start_that_fails_by_a_call_is_tried_without_end_at_growing_intervals() {
+fn start_that_fails_by_a_call_is_retried_forever() {
     let mut core = supervisor(Strategy::OneForOne, 1);
     orders(&mut core);
     let (mut now, mut waits) = (at(0), Vec::new());
@@ -319,7 +320,7 @@ fn a_start_that_fails_by_a_call_is_tried_without_end_at_growing_intervals() {
 }
 
 #[test]
-fn panics_between_failed_starts_count_and_so_does_a_failed_start_of_one_that_was_ready() {
+fn panics_between_failed_starts_are_counted() {
     let mut core = supervisor(Strategy::OneForOne, 1);
     orders(&mut core);
     let mut now = at(0);

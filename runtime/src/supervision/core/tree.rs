@@ -1,66 +1,67 @@
-//! Supervisors in supervisors: what one core orders of a child that is a supervisor is told to that one's core, and what
-//! becomes of it is told to its parent's. All that leaves the tree is about children that are not supervisors, and facts.
+//! Nested supervisors. An order of a core for a child that is a supervisor goes to that child's core, and its
+//! result goes to the parent's core. The orders that leave the tree are those for children that are not
+//! supervisors, and facts.
 //!
-//! A supervisor that gives up has stopped its children in order; for its parent that is the failure of a child. Its next life
-//! begins with the children of its declaration: those added at run time too, unless they are temporary; those deleted are
-//! gone. It is ready when all its children are.
+//! A supervisor that gives up has stopped its children in order; its parent handles that as the failure of a
+//! child. Its next incarnation starts with its declared children and those added at run time, except
+//! temporary ones and deleted ones. It is ready when all its children are.
 
 use std::{
     collections::{BTreeMap, VecDeque},
     time::Duration,
 };
 
-use super::{ChildId, ChildView, Command, Core, Flags, Generation, Input, Order, Policy, Refusal};
+use super::{ChildCommandError, ChildId, ChildView, Command, Core, Flags, Generation, Input, Order, Policy};
 use crate::time::Time;
 
-/// A supervisor to be: how it treats its children, and who they are, in the order of their start.
+/// The declaration of a supervisor: its group policy and its children, in the order of their start.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// Which child of its node it is.
+    /// The ID of the supervisor in its node.
     pub id: ChildId,
-    /// How it treats its children.
+    /// The policy for its children as a group.
     pub flags: Flags,
     /// Its children.
     pub children: Vec<Planned>,
 }
 
-/// A child to be.
+/// The declaration of a child.
 #[derive(Clone, Debug)]
 pub enum Planned {
     /// An actor.
     Worker(ChildId, Policy),
-    /// A supervisor with children of its own, and what its parent may do with it: its deadlines are of no effect, for it keeps
-    /// those of its children.
+    /// A supervisor with children of its own, and its parent's policy for it. The deadlines of that policy
+    /// have no effect, as each child has its own.
     Supervisor(Plan, Policy),
 }
 
-/// No deadline of a supervisor: each of its children has its own. (136 years.)
+/// The deadline of a supervisor, which is none: each of its children has its own. (136 years.)
 const NEVER: Duration = Duration::from_secs(u32::MAX as u64);
 
-/// What is known of a supervisor, for who asks.
+/// The state of a supervisor, for queries.
 #[derive(Clone, Debug)]
 pub struct BranchView {
-    /// Which child of its node it is.
+    /// The ID of the supervisor in its node.
     pub id: ChildId,
-    /// How it treats its children.
+    /// The policy for its children as a group.
     pub flags: Flags,
-    /// Its restarts in the window that ends now.
+    /// The number of restarts in the window that ends now.
     pub restarts_in_window: usize,
-    /// Lives of its children that were taken and have not let go.
+    /// The number of its children's abandoned incarnations that have not ended.
     pub abandoned: usize,
-    /// Whether it stops its children, or has.
+    /// Whether it stops its children, or has stopped them.
     pub is_ending: bool,
-    /// Its children, with what they supervise.
+    /// Its children, with their own children.
     pub children: Vec<(ChildId, ChildView, Option<Self>)>,
 }
 
 #[derive(Debug)]
 struct Branch {
     core: Core,
-    /// Whom its next life begins with. Empty for the top, which has one life.
+    /// The children of its next incarnation. Empty for the top, which has one incarnation.
     declared: Vec<(ChildId, Policy)>,
-    /// Which life of it the core is.
-    life: Generation,
+    /// The incarnation of the core.
+    generation: Generation,
 }
 
 /// The decisions of a tree of supervisors.
@@ -68,13 +69,13 @@ struct Branch {
 pub struct Tree {
     top: ChildId,
     branches: BTreeMap<ChildId, Branch>,
-    /// Whose child each is.
+    /// The supervisor of each child.
     owners: BTreeMap<ChildId, ChildId>,
     orders: VecDeque<Order>,
 }
 
 impl Tree {
-    /// A tree that has not started yet. `seed` makes the chance in its waits.
+    /// Creates a tree that has not started yet. `seed` seeds the jitter of its waits.
     #[must_use]
     pub fn new(plan: Plan, seed: u64) -> Self {
         let top = plan.id;
@@ -102,48 +103,49 @@ impl Tree {
             children.push((id, policy));
         }
         let core = Core::new(plan.flags, seed, children.clone());
-        self.branches.insert(plan.id, Branch { core, declared: children, life: 0 });
+        self.branches.insert(plan.id, Branch { core, declared: children, generation: 0 });
     }
 
-    /// Takes an event. Then drain [`poll`](Self::poll). A child is added by [`add`](Self::add): here nobody knows under whom.
+    /// Handles an event. Call [`poll`](Self::poll) afterwards. A child is added by [`add`](Self::add),
+    /// because the event has no supervisor.
     pub fn handle(&mut self, now: Time, input: Input) {
         match &input {
-            Input::Started | Input::StopOrdered => self.tell(now, self.top, input),
+            Input::Started | Input::StopOrdered => self.dispatch(now, self.top, input),
             Input::TimePassed => {
                 let is_due = |branch: &Branch| branch.core.next_wake().is_some_and(|wake| wake <= now);
                 let due: Vec<_> =
                     self.branches.iter().filter(|(_, b)| is_due(b)).map(|(id, _)| *id).collect();
-                due.into_iter().for_each(|id| self.tell(now, id, Input::TimePassed));
+                due.into_iter().for_each(|id| self.dispatch(now, id, Input::TimePassed));
             }
-            // How a supervisor is, its own core says and nobody else.
+            // The state of a supervisor is reported only by its own core.
             Input::BecameReady(id, _)
             | Input::Hung(id, ..)
             | Input::Ended(id, ..)
-            | Input::Reprieved(id, ..)
+            | Input::DeadlineExtended(id, ..)
                 if self.branches.contains_key(id) => {}
             Input::Released(id)
             | Input::BecameReady(id, _)
             | Input::Hung(id, ..)
             | Input::Ended(id, ..)
-            | Input::Reprieved(id, ..)
+            | Input::DeadlineExtended(id, ..)
             | Input::AddChild(id, _)
             | Input::TerminateChild(id)
             | Input::RestartChild(id)
             | Input::DeleteChild(id) => match self.owners.get(id) {
-                _ if self.has_ended() => self.refuse(&input, Refusal::Ending),
-                Some(owner) => self.tell(now, *owner, input),
-                None => self.refuse(&input, Refusal::Unknown),
+                _ if self.has_ended() => self.refuse(&input, ChildCommandError::Ending),
+                Some(owner) => self.dispatch(now, *owner, input),
+                None => self.refuse(&input, ChildCommandError::Unknown),
             },
         }
     }
 
-    /// Takes a child in, as the last one of the supervisor `under`.
+    /// Adds a child, as the last one of the supervisor `under`.
     pub fn add(&mut self, now: Time, under: ChildId, id: ChildId, policy: Policy) {
         if let Some(refusal) = self.why_not_added(under, id) {
             return self.orders.push_back(Order::Refused(Command::Add, id, refusal));
         }
         self.owners.insert(id, under);
-        self.tell(now, under, Input::AddChild(id, policy.clone()));
+        self.dispatch(now, under, Input::AddChild(id, policy.clone()));
         let is_top = under == self.top;
         let taken = self.branches.get_mut(&under).filter(|branch| branch.core.child(id).is_some());
         match taken {
@@ -155,46 +157,46 @@ impl Tree {
         }
     }
 
-    fn why_not_added(&self, under: ChildId, id: ChildId) -> Option<Refusal> {
+    fn why_not_added(&self, under: ChildId, id: ChildId) -> Option<ChildCommandError> {
         if self.has_ended() {
-            return Some(Refusal::Ending);
+            return Some(ChildCommandError::Ending);
         }
         if self.owners.contains_key(&id) {
-            return Some(Refusal::Present);
+            return Some(ChildCommandError::Present);
         }
-        (!self.branches.contains_key(&under)).then_some(Refusal::Unknown)
+        (!self.branches.contains_key(&under)).then_some(ChildCommandError::Unknown)
     }
 
-    /// The next order, oldest first.
+    /// Returns the next order, oldest first.
     pub fn poll(&mut self) -> Option<Order> {
         self.orders.pop_front()
     }
 
-    /// When [`Input::TimePassed`] is due.
+    /// Returns when [`Input::TimePassed`] is due.
     #[must_use]
     pub fn next_wake(&self) -> Option<Time> {
         self.branches.values().filter_map(|branch| branch.core.next_wake()).min()
     }
 
-    /// The supervisor of all.
+    /// Returns the top supervisor.
     #[must_use]
     pub const fn top(&self) -> ChildId {
         self.top
     }
 
-    /// Whose child it is.
+    /// Returns the supervisor of a child.
     #[must_use]
     pub fn owner(&self, id: ChildId) -> Option<ChildId> {
         self.owners.get(&id).copied()
     }
 
-    /// What is known of a child.
+    /// Returns the state of a child.
     #[must_use]
     pub fn child(&self, id: ChildId) -> Option<ChildView> {
         self.branches.get(self.owners.get(&id)?)?.core.child(id)
     }
 
-    /// What is known of all.
+    /// Returns the state of the whole tree.
     #[must_use]
     pub fn view(&self, now: Time) -> BranchView {
         self.view_of(now, self.top, &self.branches[&self.top])
@@ -217,44 +219,50 @@ impl Tree {
         self.branches.get(&self.top).is_none_or(|top| top.core.has_ended())
     }
 
-    fn refuse(&mut self, input: &Input, why: Refusal) {
+    fn refuse(&mut self, input: &Input, why: ChildCommandError) {
         if let Some((command, id)) = input.command() {
             self.orders.push_back(Order::Refused(command, id, why));
         }
     }
 
-    fn tell(&mut self, now: Time, supervisor: ChildId, input: Input) {
+    fn dispatch(&mut self, now: Time, supervisor: ChildId, input: Input) {
         let Some(branch) = self.branches.get_mut(&supervisor) else { return };
         branch.core.handle(now, input);
         while let Some(order) = self.branches.get_mut(&supervisor).and_then(|branch| branch.core.poll()) {
-            self.carry(now, supervisor, order);
+            self.route(now, supervisor, order);
         }
     }
 
-    fn tell_parent(&mut self, now: Time, of: ChildId, what: impl FnOnce(Generation) -> Input) {
+    fn notify_parent(&mut self, now: Time, of: ChildId, what: impl FnOnce(Generation) -> Input) {
         if let (Some(parent), Some(branch)) = (self.owners.get(&of), self.branches.get(&of)) {
-            self.tell(now, *parent, what(branch.life));
+            self.dispatch(now, *parent, what(branch.generation));
         }
     }
 
-    /// Carries an order of the core of `supervisor` to whom it is for.
-    fn carry(&mut self, now: Time, supervisor: ChildId, order: Order) {
+    /// Routes an order of the core of `supervisor`.
+    fn route(&mut self, now: Time, supervisor: ChildId, order: Order) {
         match order {
             Order::Spawn(id, generation) if self.branches.contains_key(&id) => {
                 self.begin(now, id, generation)
             }
-            Order::Stop(id, _) if self.branches.contains_key(&id) => self.tell(now, id, Input::StopOrdered),
+            Order::Stop(id, _) if self.branches.contains_key(&id) => {
+                self.dispatch(now, id, Input::StopOrdered)
+            }
             Order::AllReady if supervisor != self.top => {
-                self.tell_parent(now, supervisor, |life| Input::BecameReady(supervisor, life));
+                self.notify_parent(now, supervisor, |generation| Input::BecameReady(supervisor, generation));
             }
             Order::Ended(reason) if supervisor != self.top => {
-                self.tell_parent(now, supervisor, |life| Input::Ended(supervisor, life, reason));
+                self.notify_parent(now, supervisor, |generation| {
+                    Input::Ended(supervisor, generation, reason)
+                });
             }
             Order::Deleted(id) if self.is_declared(supervisor, id) => {
-                // A temporary one: the next life of its supervisor begins with it again. Or else a command follows.
+                // Either a temporary child, which the next incarnation of its supervisor starts again, or a
+                // child that a later command deletes.
             }
             Order::Deleted(id) => self.forget(supervisor, id),
-            Order::Done(Command::Delete, id) | Order::Refused(Command::Delete, id, Refusal::Unknown) => {
+            Order::Done(Command::Delete, id)
+            | Order::Refused(Command::Delete, id, ChildCommandError::Unknown) => {
                 if self.owners.contains_key(&id) {
                     self.forget(supervisor, id);
                 }
@@ -273,14 +281,14 @@ impl Tree {
         }
     }
 
-    /// A new life of a supervisor.
-    fn begin(&mut self, now: Time, supervisor: ChildId, life: Generation) {
+    /// Starts a new incarnation of a supervisor.
+    fn begin(&mut self, now: Time, supervisor: ChildId, generation: Generation) {
         if let Some(branch) = self.branches.get_mut(&supervisor) {
-            if branch.life > 0 {
+            if branch.generation > 0 {
                 branch.core = branch.core.renewed(branch.declared.clone());
             }
-            branch.life = life;
-            self.tell(now, supervisor, Input::Started);
+            branch.generation = generation;
+            self.dispatch(now, supervisor, Input::Started);
         }
     }
 
@@ -290,7 +298,7 @@ impl Tree {
             .is_some_and(|branch| branch.declared.iter().any(|(child, _)| *child == id))
     }
 
-    /// Forgets a child, and all that it supervised.
+    /// Removes a child, and all children below it.
     fn forget(&mut self, supervisor: ChildId, id: ChildId) {
         if let Some(branch) = self.branches.get_mut(&supervisor) {
             branch.declared.retain(|(child, _)| *child != id);

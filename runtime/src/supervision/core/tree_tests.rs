@@ -1,9 +1,13 @@
-//! Trees of supervisors: claims, and random histories.
+//! Trees of supervisors: single claims, and random histories.
 
 use std::{collections::BTreeMap, time::Duration};
 
-use super::{simulation::SEED_VARIABLE, window::Chance, *};
-use crate::seeded::{Seed, number};
+use sinew_sim::{Seed, number};
+
+use super::{window::Chance, *};
+
+/// The one history to replay.
+const SEED_VARIABLE: &str = "SINEW_HISTORY";
 
 fn at(ms: u64) -> Time {
     Time::from_nanos((ms + 1) * 1_000_000)
@@ -43,7 +47,7 @@ fn running(mut tree: Tree) -> Tree {
 }
 
 #[test]
-fn a_supervisor_is_ready_when_its_last_child_is() {
+fn supervisor_is_ready_when_its_last_child_is() {
     let mut tree = two_floors(Strategy::RestForOne.into());
     tree.handle(at(0), Input::Started);
     assert_eq!(orders(&mut tree), [Order::Spawn(id(1), 1), Order::Spawn(id(11), 1)]);
@@ -55,7 +59,7 @@ fn a_supervisor_is_ready_when_its_last_child_is() {
 }
 
 #[test]
-fn a_supervisor_that_gives_up_stops_its_children_and_is_restarted_with_a_fresh_set() {
+fn failed_supervisor_restarts_with_a_fresh_set() {
     let flags = Flags {
         intensity: Intensity { restarts_max: 0, ..Intensity::default() },
         ..Strategy::OneForAll.into()
@@ -77,7 +81,7 @@ fn a_supervisor_that_gives_up_stops_its_children_and_is_restarted_with_a_fresh_s
 }
 
 #[test]
-fn a_release_that_comes_while_its_supervisor_is_away_is_not_forgotten() {
+fn release_while_its_supervisor_is_down_is_kept() {
     let held = Planned::Worker(id(11), Policy { held: true, ..Policy::default() });
     let below =
         Flags { intensity: Intensity { restarts_max: 0, ..Intensity::default() }, ..Flags::default() };
@@ -94,7 +98,7 @@ fn a_release_that_comes_while_its_supervisor_is_away_is_not_forgotten() {
 }
 
 #[test]
-fn stop_runs_backwards_through_all_floors() {
+fn stop_runs_in_reverse_through_all_levels() {
     let mut tree = running(two_floors(Flags::default()));
     tree.handle(at(1), Input::StopOrdered);
     let mut stopped = Vec::new();
@@ -108,7 +112,7 @@ fn stop_runs_backwards_through_all_floors() {
 }
 
 #[test]
-fn a_child_added_at_run_time_is_there_in_the_next_life_of_its_supervisor_and_a_deleted_one_is_not() {
+fn added_child_survives_a_supervisor_restart() {
     let below =
         Flags { intensity: Intensity { restarts_max: 0, ..Intensity::default() }, ..Flags::default() };
     let mut tree = running(two_floors(below));
@@ -126,7 +130,7 @@ fn a_child_added_at_run_time_is_there_in_the_next_life_of_its_supervisor_and_a_d
 }
 
 #[test]
-fn a_supervisor_that_gives_up_again_and_again_takes_its_parent_with_it() {
+fn supervisor_that_fails_repeatedly_fails_its_parent() {
     let below =
         Flags { intensity: Intensity { restarts_max: 0, ..Intensity::default() }, ..Flags::default() };
     let mut tree = running(two_floors(below));
@@ -154,7 +158,7 @@ fn a_supervisor_that_gives_up_again_and_again_takes_its_parent_with_it() {
     assert!(matches!(&end, Reason::GaveUp(why) if why.contains("oh")), "{end:?}");
 }
 
-/// What lives, as a shell would see it.
+/// The running incarnations, as a shell would see them.
 #[derive(Default)]
 struct World {
     alive: BTreeMap<ChildId, Generation>,
@@ -227,16 +231,16 @@ fn any_plan(chance: &mut Chance, next: &mut u64, floors: u64) -> Plan {
 }
 
 #[test]
-fn any_history_of_any_tree_keeps_one_life_of_each_child_and_comes_to_an_end() {
+fn any_tree_history_keeps_one_incarnation_and_ends() {
     let only = number(SEED_VARIABLE);
     for number in only.map_or(0..20_000, |only| only..only + 1) {
         let test = "supervision::core::tree_tests::any_history";
-        let seed = Seed { number, variable: SEED_VARIABLE, package: "sinew-runtime", test };
+        let seed = Seed { number, variable: SEED_VARIABLE, package: "sinew-runtime", target: "--lib", test };
         seed.run(|| any_history(number));
     }
 }
 
-/// Panics where a child has two lives, or the tree no end.
+/// Panics if a child has two incarnations, or the tree never ends.
 fn any_history(seed: u64) {
     let mut chance = Chance::new(seed);
     let mut next = 0;
@@ -291,7 +295,7 @@ fn any_history(seed: u64) {
 }
 
 #[test]
-fn a_supervisor_has_no_deadline_of_its_own() {
+fn supervisor_has_no_deadline_of_its_own() {
     let mut tree = two_floors(Flags::default());
     tree.handle(at(0), Input::Started);
     tree.handle(at(0), Input::BecameReady(id(1), 1));

@@ -1,15 +1,15 @@
-//! How often something happened of late, and how far to wait with doing it again.
+//! Restart counts over a window, and the jitter of waits.
 
 use std::{collections::VecDeque, time::Duration};
 
 use crate::time::Time;
 
-/// The times of the last restarts: as many as may be in one window, and one more.
+/// The times of the last restarts: as many as one window may have, and one more.
 #[derive(Debug, Default)]
 pub(super) struct Window(VecDeque<Time>);
 
 impl Window {
-    /// Counts one at `now`. Whether there are more than `max` in the window that ends now.
+    /// Adds one restart at `now`. Returns whether the window that ends now has more than `max`.
     pub(super) fn add(&mut self, now: Time, max: usize, window: Duration) -> bool {
         self.0.push_back(now);
         while self.0.front().is_some_and(|at| now.since(*at) > window) {
@@ -18,13 +18,13 @@ impl Window {
         self.0.len() > max
     }
 
-    /// How many there are in the window that ends now.
+    /// Returns the number of restarts in the window that ends now.
     pub(super) fn count(&self, now: Time, window: Duration) -> usize {
         self.0.iter().filter(|at| now.since(**at) <= window).count()
     }
 }
 
-/// Chance from a seed: the same seed gives the same numbers.
+/// A random generator with a seed: equal seeds give equal numbers.
 #[derive(Clone, Debug)]
 pub(super) struct Chance(fastrand::Rng);
 
@@ -33,7 +33,7 @@ impl Chance {
         Self(fastrand::Rng::with_seed(seed))
     }
 
-    /// From which the same numbers come as from here on.
+    /// Returns the seed that continues the current sequence.
     pub(super) fn seed(&self) -> u64 {
         self.0.get_seed()
     }
@@ -43,8 +43,8 @@ impl Chance {
         self.0.u64(..)
     }
 
-    /// `wait`, shortened by up to a quarter of it: children that failed together do not come back together. Never
-    /// lengthened, so that the longest wait stays what the policy says.
+    /// Returns `wait`, shortened by a random part of up to a quarter, so that children that failed together
+    /// are not restarted together. It is never lengthened, so the policy's maximum wait holds.
     pub(super) fn jitter(&mut self, wait: Duration) -> Duration {
         let shorter_permille = self.0.u32(..=250);
         wait - wait * shorter_permille / 1_000

@@ -1,4 +1,4 @@
-//! Where faults strike: around each armed actor, with no word to the actor itself.
+//! Injection of faults: a wrapper around each armed actor, without a change of the actor itself.
 
 use std::{
     cell::RefCell,
@@ -13,12 +13,12 @@ use std::{
 
 use super::{Fault, FaultError, FaultKind, FaultMoment};
 use crate::{
-    post::lock,
-    supervision::{Launch, Life, ReadyGate, Reason},
+    lock,
+    supervision::{Launch, ReadyGate, Reason, RunningActor},
     time::Time,
 };
 
-/// Faults that wait to strike one actor at most; one more is refused.
+/// Maximum number of pending faults of one actor; further ones are refused.
 pub const INJECTED_MAX: usize = 1_024;
 
 /// The fault points of one node: one for each of its actors, by name.
@@ -26,27 +26,27 @@ pub const INJECTED_MAX: usize = 1_024;
 pub struct FaultPoints(Arc<Mutex<BTreeMap<String, Arc<FaultPoint>>>>);
 
 impl FaultPoints {
-    /// A launch that makes the same actor with its fault point around it.
+    /// Returns a launch function that creates the same actor with its fault point.
     #[must_use]
     pub fn arm(&self, name: &str, launch: Launch) -> Launch {
         let point = self.point(name);
         point.is_there.store(true, Ordering::Relaxed);
         Arc::new(move |ready| {
             let _entered = Entered::new(&point);
-            point.starts();
-            let told = point.clone();
+            point.record_start();
+            let ready_point = point.clone();
             let ready = ReadyGate::new(move || {
-                told.is_ready();
+                ready_point.record_ready();
                 ready.reached();
             });
-            Box::new(FaultyLife { inner: launch(ready), point: point.clone() })
+            Box::new(FaultyActor { inner: launch(ready), point: point.clone() })
         })
     }
 
-    /// Keeps a fault for the actor called `name`, whether it was armed yet or not.
+    /// Plans a fault for the actor called `name`, whether it is armed already or not.
     ///
     /// # Errors
-    /// Too many faults wait for it already.
+    /// Too many faults are pending for it.
     pub fn plan(&self, name: &str, fault: Fault) -> Result<(), FaultError> {
         self.point(name).plan(fault).map_err(|fault| {
             let why = format!("{INJECTED_MAX} faults wait for it already");
@@ -54,26 +54,26 @@ impl FaultPoints {
         })
     }
 
-    /// Lets a fault strike the actor called `name`. [`FaultMoment::Now`]: at its next turn, which comes at once.
+    /// Injects a fault into the actor called `name`. [`FaultMoment::Now`]: at its next turn, which follows at once.
     ///
     /// # Errors
-    /// Nobody of this name was armed, or too many faults wait for it already.
+    /// No actor of this name was armed, or too many faults are pending for it.
     pub fn inject(&self, name: &str, fault: Fault) -> Result<(), FaultError> {
         if self.names().iter().any(|known| known == name) {
             return self.plan(name, fault);
         }
-        let why = format!("nobody here is called that; there are {}", self.names().join(", "));
+        let why = format!("no actor has this name; there are {}", self.names().join(", "));
         Err(FaultError::new(format_args!("{name}:{fault}"), why))
     }
 
-    /// What became of the actor called `name` so far, if it was armed.
+    /// Returns the history of the actor called `name`, if it was armed.
     #[must_use]
     pub fn lives(&self, name: &str) -> Option<Lives> {
         let point = lock(&self.0).get(name).cloned();
         point.filter(|point| point.is_there.load(Ordering::Relaxed)).map(|point| lock(&point.inner).lives)
     }
 
-    /// Who can be struck, in the order of their names.
+    /// Returns the names of the armed actors, in order.
     #[must_use]
     pub fn names(&self) -> Vec<String> {
         let points = lock(&self.0);
@@ -86,28 +86,28 @@ impl FaultPoints {
     }
 }
 
-/// The lives of an armed actor.
+/// The history of an armed actor.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Lives {
-    /// How often it was started.
+    /// The number of starts.
     pub starts: u64,
-    /// How often it said that it is ready.
+    /// How often the actor became ready.
     pub readies: u64,
-    /// When a fault struck it last.
+    /// When the last fault was injected.
     pub struck: Option<Time>,
-    /// When it said last that it is ready.
+    /// When the actor last became ready.
     pub ready: Option<Time>,
 }
 
-/// The faults that wait for one actor, through all its lives.
+/// The pending faults of one actor, through all its incarnations.
 #[derive(Debug, Default)]
 struct FaultPoint {
-    /// Whether there is an actor around which it stands; a plan may name one that is not, or not yet.
+    /// Whether the actor exists; a plan may name an actor that does not exist, or not yet.
     is_there: AtomicBool,
     events: AtomicU64,
-    /// Whether there is anything to look for: an actor without a fault pays for this load alone.
+    /// Whether any fault is pending: an actor without a fault has only the cost of this load.
     is_armed: AtomicBool,
-    /// A stop was due in the middle of a turn; it follows at the end of it.
+    /// Whether a stop became due within a turn; it follows at the end of the turn.
     stops: AtomicBool,
     inner: Mutex<Waiting>,
 }
@@ -122,7 +122,7 @@ struct Waiting {
 #[derive(Debug)]
 struct Planned {
     fault: Fault,
-    /// What had been counted when it was planned.
+    /// The counts at the time of the plan.
     events_before: u64,
     starts_before: u64,
 }
@@ -137,7 +137,7 @@ impl FaultPoint {
             let events_before = self.events.load(Ordering::Relaxed);
             let starts_before = inner.lives.starts;
             inner.faults.push(Planned { fault, events_before, starts_before });
-            // SYNC: Relaxed; whoever sees it takes the lock before it looks further.
+            // SYNC: Relaxed; a reader that sees it takes the lock before it reads further.
             self.is_armed.store(true, Ordering::Relaxed);
             inner.waker.take()
         };
@@ -147,8 +147,8 @@ impl FaultPoint {
         Ok(())
     }
 
-    /// The actor takes its turn.
-    fn turns(&self, waker: &Waker) {
+    /// Injects faults at a turn of the actor.
+    fn record_turn(&self, waker: &Waker) {
         let due = {
             let mut inner = lock(&self.inner);
             if inner.waker.as_ref().is_none_or(|former| !former.will_wake(waker)) {
@@ -159,8 +159,8 @@ impl FaultPoint {
         self.strike(&due, "its turn");
     }
 
-    /// The actor is made again.
-    fn starts(&self) {
+    /// Injects faults at a start of the actor.
+    fn record_start(&self) {
         let due = {
             let mut inner = lock(&self.inner);
             inner.lives.starts += 1;
@@ -171,13 +171,13 @@ impl FaultPoint {
         self.strike(&due, "its start");
     }
 
-    fn is_ready(&self) {
+    fn record_ready(&self) {
         let mut inner = lock(&self.inner);
         inner.lives.readies += 1;
         inner.lives.ready = Some(Time::now());
     }
 
-    /// An event is in the actor's hand.
+    /// Injects faults at an event that the actor handles.
     fn event(&self) {
         self.events.fetch_add(1, Ordering::Relaxed);
         if !self.is_armed.load(Ordering::Relaxed) {
@@ -189,7 +189,7 @@ impl FaultPoint {
         self.strike(&due, "an event");
     }
 
-    /// What is due, and takes out what can never be due again.
+    /// Returns the due faults, and removes faults that can never be due again.
     fn take(&self, inner: &mut Waiting, is_due: impl Fn(&Planned, u64, u64) -> bool) -> Vec<FaultKind> {
         let (events, starts) = (self.events.load(Ordering::Relaxed), inner.lives.starts);
         let mut due = Vec::new();
@@ -231,49 +231,50 @@ fn hang_for_ever() -> ! {
 
 thread_local! {
     /// The fault point of the actor that has its turn on this thread.
-    static PRESENT: RefCell<Option<Arc<FaultPoint>>> = const { RefCell::new(None) };
+    static CURRENT: RefCell<Option<Arc<FaultPoint>>> = const { RefCell::new(None) };
 }
 
-/// The actor whose turn it is has taken an event out of its post.
+/// Injects faults after the actor on this thread took an event out of its queue.
 pub(crate) fn strike() {
-    if let Some(point) = PRESENT.with_borrow(Clone::clone) {
+    if let Some(point) = CURRENT.with_borrow(Clone::clone) {
         point.event();
     }
 }
 
-/// The application whose turn it is has a message in its hand. Returns whether it is to stop after it.
+/// Injects faults while the application on this thread handles a message. Returns whether the application
+/// must stop after it.
 pub(crate) fn strike_message() -> bool {
-    PRESENT.with_borrow(Clone::clone).is_some_and(|point| {
+    CURRENT.with_borrow(Clone::clone).is_some_and(|point| {
         point.event();
         point.stops.swap(false, Ordering::Relaxed)
     })
 }
 
-/// Makes a point the present one, until it is dropped, by a panic or not.
+/// Sets the fault point of this thread, until it is dropped, also by a panic.
 struct Entered(Option<Arc<FaultPoint>>);
 
 impl Entered {
     fn new(point: &Arc<FaultPoint>) -> Self {
-        Self(PRESENT.replace(Some(point.clone())))
+        Self(CURRENT.replace(Some(point.clone())))
     }
 }
 
 impl Drop for Entered {
     fn drop(&mut self) {
-        PRESENT.set(self.0.take());
+        CURRENT.set(self.0.take());
     }
 }
 
-/// An actor with its fault point around it.
-struct FaultyLife {
-    inner: Box<dyn Life>,
+/// An actor wrapped with its fault point.
+struct FaultyActor {
+    inner: Box<dyn RunningActor>,
     point: Arc<FaultPoint>,
 }
 
-impl Life for FaultyLife {
+impl RunningActor for FaultyActor {
     fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Reason> {
         let _entered = Entered::new(&self.point);
-        self.point.turns(cx.waker());
+        self.point.record_turn(cx.waker());
         let polled = self.inner.poll(cx);
         if polled.is_pending() && self.point.stops.swap(false, Ordering::Relaxed) {
             self.inner.stop();

@@ -1,4 +1,4 @@
-//! What a plan means, and when a fault point strikes.
+//! The meaning of a plan, and the time of a fault.
 
 use std::{
     sync::{Arc, Mutex},
@@ -10,8 +10,8 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::{
-    post::{Post, PostStream},
-    supervision::{Launch, Life, ReadyGate, Reason},
+    event_queue::{EventQueue, EventStream},
+    supervision::{Launch, ReadyGate, Reason, RunningActor},
 };
 
 fn fault(text: &str) -> Fault {
@@ -23,7 +23,7 @@ fn words(text: &str) -> String {
 }
 
 #[test]
-fn the_grammar_says_what_and_when() {
+fn grammar_gives_fault_and_trigger() {
     let ms = Duration::from_millis;
     assert_eq!(fault("panic"), Fault::panic());
     assert_eq!(fault("panic@1000"), Fault::panic().at_event(1_000));
@@ -35,7 +35,7 @@ fn the_grammar_says_what_and_when() {
 }
 
 #[test]
-fn a_plan_names_each_actor_even_one_with_spaces_and_colons() {
+fn plan_names_actors_even_with_spaces_and_colons() {
     let plan: FaultPlan = "sync manager:stop@1;\n a:b:panic ,".parse().expect("a plan");
     let expected =
         [("sync manager".to_owned(), Fault::stop().at_event(1)), ("a:b".to_owned(), Fault::panic())];
@@ -44,7 +44,7 @@ fn a_plan_names_each_actor_even_one_with_spaces_and_colons() {
 }
 
 #[test]
-fn what_is_wrong_is_said_with_what_to_write() {
+fn invalid_plan_is_rejected_with_a_correction() {
     for (text, teaches) in [
         ("knee:explode@3", "`explode` is nothing that can happen; write panic, stop, hang"),
         ("knee:slow@3", "write slow(3ms)"),
@@ -82,7 +82,7 @@ fn any_fault() -> impl Strategy<Value = Fault> {
 
 proptest! {
     #[test]
-    fn every_plan_is_read_as_it_was_written(faults in prop::collection::vec(("[a-z.]{1,9}", any_fault()), 0..9)) {
+    fn every_plan_round_trips(faults in prop::collection::vec(("[a-z.]{1,9}", any_fault()), 0..9)) {
         let plan = FaultPlan(faults);
         prop_assert_eq!(plan.to_string().parse(), Ok(plan));
     }
@@ -93,10 +93,10 @@ proptest! {
     }
 }
 
-/// Takes events out of a post and keeps them; `None` marks a stop.
-struct Clerk(PostStream<u32>, Arc<Mutex<Vec<Option<u32>>>>);
+/// Takes events out of an event queue and keeps them; `None` marks a stop.
+struct Clerk(EventStream<u32>, Arc<Mutex<Vec<Option<u32>>>>);
 
-impl Life for Clerk {
+impl RunningActor for Clerk {
     fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Reason> {
         while let Poll::Ready(Some(event)) = self.0.poll_next_unpin(cx) {
             self.1.lock().expect("one thread").push(Some(event));
@@ -111,37 +111,37 @@ impl Life for Clerk {
     fn terminate(&mut self) {}
 }
 
-/// An armed clerk, its post, and what it did.
+/// An armed clerk, its event queue, and its record.
 struct Office {
     points: FaultPoints,
     launch: Launch,
-    post: Post<u32>,
+    queue: EventQueue<u32>,
     done: Arc<Mutex<Vec<Option<u32>>>>,
 }
 
 impl Office {
     fn new() -> Self {
-        let (points, post) = (FaultPoints::default(), Post::new(100));
+        let (points, queue) = (FaultPoints::default(), EventQueue::new(100));
         let done = Arc::new(Mutex::new(Vec::new()));
-        let (reads, writes) = (post.clone(), done.clone());
+        let (reads, writes) = (queue.clone(), done.clone());
         let launch: Launch = Arc::new(move |_| Box::new(Clerk(reads.attach(), writes.clone())));
         let launch = points.arm("clerk", launch);
-        Self { points, launch, post, done }
+        Self { points, launch, queue, done }
     }
 
     fn inject(&self, text: &str) {
         self.points.inject("clerk", fault(text)).expect("it is armed");
     }
 
-    fn start(&self) -> Result<Box<dyn Life>, String> {
+    fn start(&self) -> Result<Box<dyn RunningActor>, String> {
         let start = std::panic::AssertUnwindSafe(|| (self.launch)(ReadyGate::new(|| {})));
-        std::panic::catch_unwind(start).map_err(crate::supervision::panics::words)
+        std::panic::catch_unwind(start).map_err(crate::supervision::panics::panic_message)
     }
 
     /// Whether it panicked on these.
-    fn work(&self, clerk: &mut Box<dyn Life>, events: std::ops::RangeInclusive<u32>) -> bool {
+    fn work(&self, clerk: &mut Box<dyn RunningActor>, events: std::ops::RangeInclusive<u32>) -> bool {
         for event in events {
-            self.post.post(event).expect("it has room");
+            self.queue.post(event).expect("it has room");
         }
         let turn = std::panic::AssertUnwindSafe(|| clerk.poll(&mut Context::from_waker(&noop_waker())));
         std::panic::catch_unwind(turn).is_err()
@@ -153,7 +153,7 @@ impl Office {
 }
 
 #[test]
-fn the_nth_event_is_counted_over_all_lives_and_strikes_once() {
+fn nth_event_counts_over_incarnations_and_strikes_once() {
     let office = Office::new();
     office.inject("panic@3");
     let mut first = office.start().expect("it starts");
@@ -165,7 +165,7 @@ fn the_nth_event_is_counted_over_all_lives_and_strikes_once() {
 }
 
 #[test]
-fn an_injected_number_counts_from_the_injection_and_every_goes_on() {
+fn injected_number_counts_from_injection() {
     let office = Office::new();
     let mut clerk = office.start().expect("it starts");
     assert!(!office.work(&mut clerk, 1..=4));
@@ -176,7 +176,7 @@ fn an_injected_number_counts_from_the_injection_and_every_goes_on() {
 }
 
 #[test]
-fn now_strikes_the_next_turn_once_even_without_an_event() {
+fn now_strikes_the_next_turn_once_without_an_event() {
     let office = Office::new();
     let mut clerk = office.start().expect("it starts");
     office.inject("panic");
@@ -187,7 +187,7 @@ fn now_strikes_the_next_turn_once_even_without_an_event() {
 }
 
 #[test]
-fn a_stop_follows_the_turn_in_which_it_was_due() {
+fn stop_follows_the_turn_in_which_it_was_due() {
     let office = Office::new();
     office.inject("stop@2");
     let mut clerk = office.start().expect("it starts");
@@ -196,7 +196,7 @@ fn a_stop_follows_the_turn_in_which_it_was_due() {
 }
 
 #[test]
-fn the_nth_start_fails() {
+fn nth_start_fails() {
     let office = Office::new();
     office.inject("panic@start(2)");
     assert!(office.start().is_ok());
@@ -205,7 +205,7 @@ fn the_nth_start_fails() {
 }
 
 #[test]
-fn who_is_not_there_and_one_fault_too_many_are_said() {
+fn unknown_actor_and_excess_fault_are_reported() {
     let office = Office::new();
     let words = office.points.inject("clark", Fault::panic()).expect_err("nobody").to_string();
     assert!(words.contains("clark:panic") && words.contains("there are clerk"), "{words}");

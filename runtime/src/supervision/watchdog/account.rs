@@ -1,25 +1,25 @@
-//! The account of the time that a thread was not given: by the system's clock, and by the kernel's word.
+//! The account of time in which a thread got no CPU, from the system's clock and from the kernel.
 
 use std::time::Duration;
 
 use super::processor::{Condition, Sample};
 
-/// Time that was not given to a thread, since its account was opened.
+/// The time in which a thread got no CPU, since the account was opened.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Account {
-    /// Lateness of the watchdog itself.
+    /// The lateness of the watchdog itself.
     pub(super) late: Duration,
     first: Option<Sample>,
     last: Option<Sample>,
 }
 
 impl Account {
-    /// An account that begins with this lateness.
+    /// Creates an account that begins with this lateness.
     pub(super) fn opened(late: Duration) -> Self {
         Self { late, ..Self::default() }
     }
 
-    /// Whether the thread waits for a CPU at this moment.
+    /// Records a sample. Returns whether the thread waits for a CPU at this moment.
     pub(super) fn enter(&mut self, sample: Option<Sample>) -> bool {
         let Some(sample) = sample else { return false };
         let former = self.last.replace(sample);
@@ -37,7 +37,7 @@ impl Account {
         self.late + self.waited()
     }
 
-    /// Time for which it waited for a CPU.
+    /// Returns the time for which the thread waited for a CPU.
     pub(super) fn waited(&self) -> Duration {
         let waited = match (self.first, self.last) {
             (Some(first), Some(last)) => last.waited.saturating_sub(first.waited),

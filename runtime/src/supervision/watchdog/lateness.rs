@@ -1,4 +1,4 @@
-//! How late the watchdog comes to its looks, summed up: time in which the process was stopped, or the host stood still.
+//! The total lateness of the watchdog's checks: time in which the process was stopped, or the host was suspended.
 
 use std::{
     sync::{
@@ -9,12 +9,12 @@ use std::{
 };
 
 use super::PERIOD_MAX;
-use crate::{post::lock, time::Time};
+use crate::{lock, time::Time};
 
-/// Lateness that is the system's ordinary one.
+/// Lateness that is ordinary for the system.
 const ORDINARY: Duration = Duration::from_millis(1);
 
-/// The watchdog's lateness. It is kept up to date while there is somebody who reads it.
+/// The watchdog's lateness. It is kept up to date while it has readers.
 #[derive(Debug, Default)]
 pub(super) struct Lateness {
     state: Mutex<State>,
@@ -24,7 +24,7 @@ pub(super) struct Lateness {
 #[derive(Clone, Copy, Debug, Default)]
 struct State {
     sum: Duration,
-    /// When the next look is due; `None` if none is.
+    /// When the next check is due; `None` if none is.
     due: Option<Time>,
 }
 
@@ -36,21 +36,21 @@ impl State {
 }
 
 impl Lateness {
-    /// The watchdog looks. Returns how late it is.
-    pub(super) fn looks(&self, now: Time) -> Duration {
+    /// Records a check. Returns how late it is.
+    pub(super) fn record_check(&self, now: Time) -> Duration {
         let mut state = lock(&self.state);
         let late = state.late(now);
-        // It may stand still before it can say when the next one is due.
+        // The thread may be suspended before it records when the next check is due.
         *state = State { sum: state.sum + late, due: Some(now + PERIOD_MAX) };
         late
     }
 
-    /// The next look is due then.
-    pub(super) fn is_due(&self, at: Option<Time>) {
+    /// Records when the next check is due.
+    pub(super) fn set_due(&self, at: Option<Time>) {
         lock(&self.state).due = at;
     }
 
-    /// All lateness so far, that of a look which is overdue at this moment too.
+    /// Returns the total lateness so far, including that of a check that is overdue at this moment.
     pub(super) fn sum(&self, now: Time) -> Duration {
         let state = *lock(&self.state);
         state.sum + state.late(now)
@@ -60,7 +60,7 @@ impl Lateness {
         self.readers.load(Ordering::Relaxed) > 0
     }
 
-    /// Somebody reads it from now on. The watchdog is woken after this: its look is due.
+    /// Registers a reader. The watchdog must be woken after this: its check is due.
     pub(super) fn add_reader(&self, now: Time) {
         self.readers.fetch_add(1, Ordering::Relaxed);
         lock(&self.state).due.get_or_insert(now + PERIOD_MAX);
@@ -80,14 +80,14 @@ mod tests {
     }
 
     #[test]
-    fn a_look_that_is_overdue_counts_before_it_comes_and_once() {
+    fn overdue_check_counts_once_before_it_runs() {
         let lateness = Lateness::default();
-        lateness.is_due(Some(ms(5)));
+        lateness.set_due(Some(ms(5)));
         assert_eq!(lateness.sum(ms(6)), Duration::ZERO, "the ordinary lateness");
         assert_eq!(lateness.sum(ms(305)), Duration::from_millis(300));
-        assert_eq!(lateness.looks(ms(405)), Duration::from_millis(400));
+        assert_eq!(lateness.record_check(ms(405)), Duration::from_millis(400));
         assert_eq!(lateness.sum(ms(510)), Duration::from_millis(500), "the next one may never come");
-        lateness.is_due(None);
+        lateness.set_due(None);
         assert_eq!(lateness.sum(ms(9_999)), Duration::from_millis(400), "it sleeps until it is needed");
         lateness.add_reader(ms(9_995));
         assert_eq!(lateness.sum(ms(10_100)), Duration::from_millis(500), "it does not come when it is");

@@ -1,13 +1,13 @@
-//! The watchdog: one thread that looks at every actor of a node, and says who does not come back.
+//! The watchdog: one thread that checks every actor of a node, and reports hung ones.
 //!
-//! It reads what the actors' threads write (`vitals`), judges (`suspect`, pure), and accuses: the life is fenced at once,
-//! its thread is demoted, its supervisor is told. It logs nothing and takes no lock that an actor's code could hold, so
-//! that what hangs an actor does not hang it.
+//! It reads the state that the actors' threads write (`liveness`), judges (`suspect`, pure), and acts on a
+//! hang: the incarnation is fenced at once, its thread is demoted, its supervisor is notified. It logs
+//! nothing and takes no lock that an actor's code could hold, so that a hung actor cannot block it.
 
 mod account;
+mod deadline_extension;
 mod lateness;
 mod processor;
-mod reprieve;
 mod suspect;
 
 use std::{
@@ -21,38 +21,41 @@ use std::{
     time::Duration,
 };
 
+pub(super) use deadline_extension::DeadlineExtension;
 use lateness::Lateness;
 use processor::sample;
-pub(super) use reprieve::Reprieve;
-use suspect::{Hang, Look, Stall, StallSuspect, TurnSuspect};
+use suspect::{Check, Hang, Stall, StallSuspect, TurnSuspect};
 
 use super::{
     Reason,
-    panics::{is_the_runtimes, words},
-    place::make_realtime,
-    system,
-    tenant::{Fate, Tenant},
-    vitals::Neighbours,
+    actor_handle::{ActorEvent, ActorHandle},
+    liveness::Neighbours,
+    panics::panic_message,
+    place::set_realtime_priority,
 };
-use crate::{post::lock, time::Time};
+use crate::{
+    lock,
+    thread::{mark_runtime_thread, system},
+    time::Time,
+};
 
-/// Time between two looks at most, at who is in the middle of something.
+/// Maximum time between two checks of an actor with a turn in progress.
 const PERIOD_MAX: Duration = Duration::from_millis(5);
-/// The same while nobody is, and nobody lets messages wait: each look wakes a CPU.
-const REST_MAX: Duration = Duration::from_millis(40);
-/// Of a budget: so much at most goes by before it is seen that somebody is in the middle of something, and what he was not given
-/// meanwhile is not excused.
-const REST_OF_BUDGET: u32 = 25;
-/// Time between two looks at least, however small a budget is.
+/// The same if no turn is in progress and no messages wait: each check wakes a CPU.
+const IDLE_PERIOD_MAX: Duration = Duration::from_millis(40);
+/// Fraction of a budget that may pass until a turn in progress is seen. CPU time that the actor did not get
+/// before that is not excused.
+const IDLE_BUDGET_DIVISOR: u32 = 25;
+/// Minimum time between two checks, for any budget.
 const PERIOD_MIN: Duration = Duration::from_millis(1);
-/// Above every actor: it runs for microseconds at a time.
+/// Above every actor: the thread runs for microseconds at a time.
 const PRIORITY: u8 = 95;
-/// Time that the thread has to begin, where somebody waits for that.
-const BEGINS_WITHIN: Duration = Duration::from_secs(5);
-/// Lives that are watched at once at most. One more lives unwatched, and that is said.
+/// Time for the thread to start, if a caller waits for that.
+const STARTS_WITHIN: Duration = Duration::from_secs(5);
+/// Maximum number of watched incarnations. Further ones are not watched, which is logged.
 const WATCHED_MAX: usize = 4_096;
 
-/// The watchdog of a node. Its thread is made when the first life is to be watched, and ends with this.
+/// The watchdog of a node. Its thread is created when the first incarnation is watched, and ends with this.
 #[derive(Debug, Default)]
 pub(super) struct Watchdog {
     shared: Arc<Shared>,
@@ -62,7 +65,7 @@ pub(super) struct Watchdog {
 #[derive(Default)]
 struct Shared {
     arrivals: Mutex<Vec<Watched>>,
-    /// Held by the thread while it looks; outlives it.
+    /// Locked by the thread during a check; outlives the thread.
     table: Mutex<Vec<Watched>>,
     count: AtomicUsize,
     lateness: Arc<Lateness>,
@@ -70,49 +73,49 @@ struct Shared {
 
 impl std::fmt::Debug for Shared {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{} lives", self.count.load(Ordering::Relaxed))
+        write!(f, "{} incarnations", self.count.load(Ordering::Relaxed))
     }
 }
 
 impl Watchdog {
-    /// Watches a life until it ends, if it has a budget.
-    pub(super) fn watch(&self, tenant: &Tenant) {
-        let Some(budget) = tenant.progress_within() else { return };
+    /// Watches an incarnation until it ends, if it has a budget.
+    pub(super) fn watch(&self, handle: &ActorHandle) {
+        let Some(budget) = handle.progress_within() else { return };
         if self.shared.count.fetch_add(1, Ordering::Relaxed) >= WATCHED_MAX {
             self.shared.count.fetch_sub(1, Ordering::Relaxed);
-            let name = tenant.vitals().name();
+            let name = handle.liveness().name();
             crate::log::error!(
                 name,
                 WATCHED_MAX,
-                "the watchdog's table is full; nobody sees if this one hangs"
+                "the watchdog's table is full: a hang of this actor is not detected"
             );
             return;
         }
-        lock(&self.shared.arrivals).push(Watched::new(tenant.clone(), budget));
+        lock(&self.shared.arrivals).push(Watched::new(handle.clone(), budget));
         self.wake();
     }
 
-    /// Begins to keep an account of what this life is given of the time that it has for something from now on.
-    pub(super) fn reprieve(&self, tenant: &Tenant, within: Duration) -> Reprieve {
-        let reprieve = Reprieve::new(tenant.clone(), within, self.shared.lateness.clone());
+    /// Starts the account of the CPU time that this incarnation gets for one step, which can extend its deadline.
+    pub(super) fn deadline_extension(&self, handle: &ActorHandle, within: Duration) -> DeadlineExtension {
+        let extension = DeadlineExtension::new(handle.clone(), within, self.shared.lateness.clone());
         self.wake();
-        reprieve
+        extension
     }
 
-    /// Makes the thread, and waits until it depends on the calling one no more. Until then it has that one's CPUs and priority: whoever
-    /// never sleeps there would never let it begin.
+    /// Creates the thread, and waits until it no longer depends on the calling one. Until then it has the
+    /// CPUs and the priority of the calling thread, which would keep it from starting by never sleeping.
     pub(super) fn begin(&self) {
         let (prepared, is_prepared) = sync_channel(1);
         self.wake_or_make(Some(prepared));
-        // Where there is no thread, that has been said.
-        if is_prepared.recv_timeout(BEGINS_WITHIN) == Err(RecvTimeoutError::Timeout) {
+        // A failure to create the thread was logged before.
+        if is_prepared.recv_timeout(STARTS_WITHIN) == Err(RecvTimeoutError::Timeout) {
             crate::log::error!(
-                "the watchdog has not begun within {BEGINS_WITHIN:?}: does a thread of a higher real-time priority keep all CPUs?"
+                "the watchdog has not begun within {STARTS_WITHIN:?}: does a thread of a higher real-time priority keep all CPUs?"
             );
         }
     }
 
-    /// Wakes the thread; makes one if there is none that lives.
+    /// Wakes the thread; creates it if it does not exist.
     fn wake(&self) {
         self.wake_or_make(None);
     }
@@ -125,14 +128,14 @@ impl Watchdog {
         let shared = Arc::downgrade(&self.shared);
         match std::thread::Builder::new().name("watchdog".to_owned()).spawn(move || run(&shared, prepared)) {
             Ok(new) => *thread = Some(new),
-            Err(error) => crate::log::error!(%error, "no thread for the watchdog; nobody sees who hangs"),
+            Err(error) => crate::log::error!(%error, "no thread for the watchdog: hangs are not detected"),
         }
     }
 }
 
 impl Drop for Watchdog {
     fn drop(&mut self) {
-        // The thread sees that nobody is left to report to.
+        // The thread sees that its owner is gone, and ends.
         self.shared = Arc::default();
         if let Some(thread) = lock(&self.thread).as_ref() {
             thread.thread().unpark();
@@ -141,13 +144,13 @@ impl Drop for Watchdog {
 }
 
 fn run(shared: &Weak<Shared>, prepared: Option<SyncSender<()>>) {
-    is_the_runtimes();
-    // Whoever woke it first may be kept on one CPU, and hang there. Refused, it stays there, too.
-    let _ = system::keep_on_any();
-    if let Err(error) = make_realtime(PRIORITY) {
-        static SAID: Once = Once::new();
-        SAID.call_once(|| {
-            // Usual on a computer for development; who asks for a priority for an actor is warned.
+    mark_runtime_thread();
+    // The creating thread may be pinned to one CPU, and hang there. If this is refused, the thread stays there too.
+    let _ = system::unpin();
+    if let Err(error) = set_realtime_priority(PRIORITY) {
+        static LOGGED: Once = Once::new();
+        LOGGED.call_once(|| {
+            // Usual on a development computer; a refused priority of an actor is logged as a warning.
             crate::log::info!(
                 ?error,
                 "the watchdog has no real-time priority: on a busy CPU it notices a hang late; allow it with `ulimit -r 99`"
@@ -155,18 +158,18 @@ fn run(shared: &Weak<Shared>, prepared: Option<SyncSender<()>>) {
         });
     }
     if let Some(prepared) = prepared {
-        // Whoever waits no more has said so.
+        // A caller that timed out has logged that.
         let _ = prepared.send(());
     }
     while let Some(shared) = shared.upgrade() {
-        // A fault in here must not leave the node without a watchdog.
-        let looked = catch_unwind(AssertUnwindSafe(|| shared.look()));
-        let next = looked.unwrap_or_else(|panic| {
-            crate::log::error!(said = words(panic), "the watchdog panicked, and goes on");
+        // A fault here must not leave the node without a watchdog.
+        let result = catch_unwind(AssertUnwindSafe(|| shared.check()));
+        let next = result.unwrap_or_else(|panic| {
+            crate::log::error!(panic = panic_message(panic), "the watchdog panicked, and continues");
             Some(Time::now() + PERIOD_MAX)
         });
-        shared.lateness.is_due(next);
-        // Whoever owns this must be able to end it while it sleeps.
+        shared.lateness.set_due(next);
+        // The owner must be able to end the thread while it sleeps.
         drop(shared);
         match next {
             Some(next) => std::thread::park_timeout(next.since(Time::now())),
@@ -176,48 +179,48 @@ fn run(shared: &Weak<Shared>, prepared: Option<SyncSender<()>>) {
 }
 
 impl Shared {
-    /// One look at everybody. Returns when the next is due; `None` if there is nobody.
-    fn look(&self) -> Option<Time> {
+    /// Checks all watched actors. Returns when the next check is due; `None` if none are watched.
+    fn check(&self) -> Option<Time> {
         let now = Time::now();
-        let late = self.lateness.looks(now);
+        let late = self.lateness.record_check(now);
         let mut table = lock(&self.table);
         table.append(&mut lock(&self.arrivals));
         let reading = self.lateness.has_readers().then_some(PERIOD_MAX);
         let period = table.iter().map(|watched| watched.period).chain(reading).min()?;
         let before = table.len();
-        table.retain_mut(|watched| look_at(watched, now, late, period));
+        table.retain_mut(|watched| check_one(watched, now, late, period));
         self.count.fetch_sub(before - table.len(), Ordering::Relaxed);
-        let rest = table.iter().map(Watched::rest).chain(reading).min()?;
+        let check_interval = table.iter().map(Watched::check_interval).chain(reading).min()?;
         let deadline = table.iter().filter_map(Watched::deadline).min();
-        // One that is over already waits for a CPU, or has just been seen: it is looked at again after a period.
+        // A late actor waits for a CPU, or was just checked: the next check is after a period.
         let deadline = deadline.filter(|deadline| *deadline > now);
-        Some(deadline.map_or(now + rest, |deadline| deadline.min(now + rest)))
+        Some(deadline.map_or(now + check_interval, |deadline| deadline.min(now + check_interval)))
     }
 }
 
-/// Looks at one life. Returns whether it is to be watched further.
-fn look_at(watched: &mut Watched, now: Time, late: Duration, period: Duration) -> bool {
-    let vitals = watched.tenant.vitals();
-    if vitals.is_gone() || vitals.is_over() {
+/// Checks one incarnation. Returns whether it must be watched further.
+fn check_one(watched: &mut Watched, now: Time, late: Duration, period: Duration) -> bool {
+    let liveness = watched.handle.liveness();
+    if liveness.has_ended() || liveness.is_fenced() {
         return false;
     }
-    match catch_unwind(AssertUnwindSafe(|| watched.look(now, late, period))) {
+    match catch_unwind(AssertUnwindSafe(|| watched.check(now, late, period))) {
         Ok(goes_on) => goes_on,
         Err(panic) => {
-            let name = watched.tenant.vitals().name();
+            let name = watched.handle.liveness().name();
             crate::log::error!(
                 name,
-                said = words(panic),
-                "the watchdog panicked over this one and leaves it"
+                panic = panic_message(panic),
+                "the watchdog panicked over this actor, and no longer watches it"
             );
             false
         }
     }
 }
 
-/// One life that is watched.
+/// One watched incarnation.
 struct Watched {
-    tenant: Tenant,
+    handle: ActorHandle,
     budget: Duration,
     period: Duration,
     turn: TurnSuspect,
@@ -225,84 +228,84 @@ struct Watched {
 }
 
 impl Watched {
-    fn new(tenant: Tenant, budget: Duration) -> Self {
+    fn new(handle: ActorHandle, budget: Duration) -> Self {
         let period = (budget / 10).clamp(PERIOD_MIN, PERIOD_MAX);
-        Self { tenant, budget, period, turn: TurnSuspect::new(budget), stall: StallSuspect::new(budget) }
+        Self { handle, budget, period, turn: TurnSuspect::new(budget), stall: StallSuspect::new(budget) }
     }
 
-    /// Time until the next look, unless a deadline comes first.
-    fn rest(&self) -> Duration {
+    /// Returns the time until the next check, unless a deadline is earlier.
+    fn check_interval(&self) -> Duration {
         if self.turn.is_open() || self.stall.is_open() {
             return self.period;
         }
-        (self.budget / REST_OF_BUDGET).clamp(self.period, REST_MAX)
+        (self.budget / IDLE_BUDGET_DIVISOR).clamp(self.period, IDLE_PERIOD_MAX)
     }
 
     fn deadline(&self) -> Option<Time> {
-        self.turn.deadline(self.tenant.vitals().sight())
+        self.turn.deadline(self.handle.liveness().snapshot())
     }
 
-    fn look(&mut self, now: Time, late: Duration, period: Duration) -> bool {
-        let vitals = self.tenant.vitals();
-        let look = Look { now, late, sight: vitals.sight() };
-        let seat = self.tenant.seat().cloned();
-        let cpu = || sample(seat.as_ref()?.tid()?);
-        if let Some(hang) = self.turn.look(look, period, cpu) {
-            let what = format!("{} has not come back", vitals.words(look.sight.doing));
-            self.accuse(hang, &what, true);
+    fn check(&mut self, now: Time, late: Duration, period: Duration) -> bool {
+        let liveness = self.handle.liveness();
+        let check = Check { now, late, snapshot: liveness.snapshot() };
+        let slot = self.handle.slot().cloned();
+        let cpu = || sample(slot.as_ref()?.tid()?);
+        if let Some(hang) = self.turn.check(check, period, cpu) {
+            let what = format!("{} has not come back", liveness.describe(check.snapshot.activity));
+            self.report_hang(hang, &what, true);
             return false;
         }
-        self.look_for_stall(look, cpu)
+        self.check_for_stall(check, cpu)
     }
 
-    fn look_for_stall(&mut self, look: Look, cpu: impl FnOnce() -> Option<processor::Sample>) -> bool {
-        let vitals = self.tenant.vitals();
-        if !vitals.should_take() {
-            self.stall.calm(look.now);
+    fn check_for_stall(&mut self, check: Check, cpu: impl FnOnce() -> Option<processor::Sample>) -> bool {
+        let liveness = self.handle.liveness();
+        if !liveness.should_take() {
+            self.stall.reset(check.now);
             return true;
         }
-        // Nothing where somebody is in the mailbox this very moment: then things go on.
-        let Some((waiting, taken)) = vitals.backlog() else { return true };
+        // No judgement while the mailbox is locked: then it is in use.
+        let Some((waiting, taken)) = liveness.backlog() else { return true };
         let neighbours =
-            || self.tenant.seat().map_or_else(Neighbours::default, |seat| seat.others_than(&self.tenant));
-        match self.stall.look(look, (waiting, taken), neighbours, cpu) {
+            || self.handle.slot().map_or_else(Neighbours::default, |slot| slot.neighbours_of(&self.handle));
+        match self.stall.check(check, (waiting, taken), neighbours, cpu) {
             Stall::None => true,
             Stall::Probe => {
-                self.tenant.wake();
+                self.handle.wake();
                 true
             }
             Stall::Waits(hang) => {
                 let what = format!("waits on a future; {waiting} messages wait for it");
-                self.accuse(hang, &what, false);
+                self.report_hang(hang, &what, false);
                 false
             }
             Stall::ThreadIsAway(hang) => {
                 let what = format!(
                     "its thread does not come back from something that is no actor's; {waiting} messages wait"
                 );
-                self.accuse(hang, &what, true);
+                self.report_hang(hang, &what, true);
                 false
             }
         }
     }
 
-    /// Fences the life, says so, and only then does what may take time.
-    fn accuse(&self, hang: Hang, what: &str, holds_its_thread: bool) {
+    /// Fences the incarnation, reports it, and only then does the slow steps.
+    fn report_hang(&self, hang: Hang, what: &str, blocks_thread: bool) {
         let Hang { since, lasted, excused } = hang;
-        let vitals = self.tenant.vitals();
-        vitals.fence();
-        if holds_its_thread {
-            self.tenant.set_holds_its_thread(since);
+        let liveness = self.handle.liveness();
+        liveness.fence();
+        if blocks_thread {
+            self.handle.set_blocks_thread(since);
         }
         let mut words = format!("{what}, for {lasted:.1?} of {:?} allowed", self.budget);
         if !excused.is_zero() {
             words.push_str(&format!(" (without {excused:.1?} in which it had no CPU)"));
         }
-        self.tenant.report(Fate::Hung(Reason::Hung(words)));
-        if holds_its_thread && let Some(seat) = self.tenant.seat() {
-            seat.demote();
+        self.handle.report(ActorEvent::Hung(Reason::Hung(words)));
+        if blocks_thread && let Some(slot) = self.handle.slot() {
+            slot.demote();
         }
-        vitals.empty_hands();
+        liveness.release_inbox();
     }
 }
 
@@ -312,49 +315,51 @@ mod tests {
 
     use super::*;
     use crate::supervision::{
-        tenant::Report,
-        vitals::{Doing, Vitals},
+        actor_handle::Report,
+        liveness::{Activity, Liveness},
     };
 
-    /// A life in the middle of a turn that began long ago.
-    fn hung(report: Report) -> Tenant {
-        let vitals = Vitals::new("hung");
-        vitals.begins(Doing::Timer, Some(Time::from_nanos(1)));
-        Tenant::new(vitals, None, Some(Duration::from_millis(20)), report)
+    /// An incarnation in the middle of a turn that began long ago.
+    fn hung(report: Report) -> ActorHandle {
+        let liveness = Liveness::new("hung");
+        liveness.begin(Activity::Timer, Some(Time::from_nanos(1)));
+        ActorHandle::new(liveness, None, Some(Duration::from_millis(20)), report)
     }
 
     #[test]
-    fn a_watchdog_that_panics_over_one_goes_on_with_the_others() {
+    fn watchdog_continues_after_a_panic_over_one_actor() {
         let watchdog = Watchdog::default();
         let (say, heard) = sync_channel(1);
         watchdog.watch(&hung(Box::new(|_| panic!("whoever hears of it panics"))));
-        let told = hung(Box::new(move |fate| say.send(format!("{fate:?}")).expect("it is waited for")));
+        let told = hung(Box::new(move |event| say.send(format!("{event:?}")).expect("it is waited for")));
         watchdog.watch(&told);
-        let fate = heard.recv_timeout(Duration::from_secs(20)).expect("the other one is accused");
-        assert!(fate.contains("in a timer has not come back"), "{fate}");
-        assert!(told.vitals().is_over());
+        let event = heard.recv_timeout(Duration::from_secs(20)).expect("the other one is accused");
+        assert!(event.contains("in a timer has not come back"), "{event}");
+        assert!(told.liveness().is_fenced());
     }
 
-    /// Time until the next look at a life with this budget.
-    fn rest(vitals: &Arc<Vitals>, budget: Duration) -> Duration {
-        let tenant = Tenant::new(vitals.clone(), None, Some(budget), Box::new(|fate| panic!("{fate:?}")));
-        let mut watched = Watched::new(tenant, budget);
-        assert!(watched.look(Time::from_nanos(2), Duration::ZERO, PERIOD_MAX));
-        watched.rest()
+    /// Time until the next check of an incarnation with this budget.
+    fn check_interval(liveness: &Arc<Liveness>, budget: Duration) -> Duration {
+        let handle =
+            ActorHandle::new(liveness.clone(), None, Some(budget), Box::new(|event| panic!("{event:?}")));
+        let mut watched = Watched::new(handle, budget);
+        assert!(watched.check(Time::from_nanos(2), Duration::ZERO, PERIOD_MAX));
+        watched.check_interval()
     }
 
     #[test]
-    fn who_is_in_the_middle_of_nothing_is_looked_at_seldom() {
-        let vitals = Vitals::new("calm");
-        let rests =
-            [20, 100, 500, 1_000, 60_000].map(|ms| rest(&vitals, Duration::from_millis(ms)).as_millis());
+    fn idle_incarnation_is_checked_rarely() {
+        let liveness = Liveness::new("idle");
+        let rests = [20, 100, 500, 1_000, 60_000]
+            .map(|ms| check_interval(&liveness, Duration::from_millis(ms)).as_millis());
         assert_eq!(
             rests,
             [2, 5, 20, 40, 40],
             "a 25th of its budget, 40 ms at most, and not less than a period"
         );
-        vitals.begins(Doing::Timer, Some(Time::from_nanos(1)));
-        let rests = [20, 100, 1_000].map(|ms| rest(&vitals, Duration::from_millis(ms)).as_millis());
+        liveness.begin(Activity::Timer, Some(Time::from_nanos(1)));
+        let rests =
+            [20, 100, 1_000].map(|ms| check_interval(&liveness, Duration::from_millis(ms)).as_millis());
         assert_eq!(
             rests,
             [2, 5, 5],
@@ -363,17 +368,17 @@ mod tests {
     }
 
     #[test]
-    fn a_life_that_has_ended_or_has_no_budget_is_not_accused() {
+    fn ended_or_unlimited_incarnation_is_not_accused() {
         let watchdog = Watchdog::default();
-        let accused = || -> Report { Box::new(|fate| panic!("{fate:?}")) };
+        let accused = || -> Report { Box::new(|event| panic!("{event:?}")) };
         let gone = hung(accused());
-        gone.vitals().set_gone();
-        let free = Tenant::new(hung(accused()).vitals().clone(), None, None, accused());
+        gone.liveness().set_ended();
+        let free = ActorHandle::new(hung(accused()).liveness().clone(), None, None, accused());
         watchdog.watch(&gone);
         watchdog.watch(&free);
         let (say, heard) = sync_channel(1);
         watchdog.watch(&hung(Box::new(move |_| say.send(()).expect("it is waited for"))));
         heard.recv_timeout(Duration::from_secs(20)).expect("one that came after them is accused");
-        assert!(!gone.vitals().is_over() && !free.vitals().is_over());
+        assert!(!gone.liveness().is_fenced() && !free.liveness().is_fenced());
     }
 }

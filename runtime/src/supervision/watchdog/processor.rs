@@ -1,27 +1,28 @@
-//! What the kernel says of a thread's use of the CPU: whether it was let run at all.
+//! The kernel's account of a thread's CPU use.
 
-/// What a thread is about, as far as the kernel knows.
+/// The state of a thread, according to the kernel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Condition {
-    /// It runs, or would if it were given a CPU.
+    /// The thread runs, or waits for a CPU.
     Runnable,
-    /// It waits for something.
+    /// The thread is blocked.
     Blocked,
-    /// It was stopped by a signal or a debugger.
+    /// The thread was stopped by a signal or a debugger.
     Stopped,
 }
 
-/// A thread's use of the CPU since it began.
+/// The CPU use of a thread since its start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Sample {
-    /// Nanoseconds on a CPU. The kernel brings it up to date at each tick and each switch.
+    /// Nanoseconds on a CPU. The kernel updates it at each tick and each switch.
     pub(super) ran: u64,
-    /// Nanoseconds in which it would have run and had no CPU; the present wait is added when it ends.
+    /// Nanoseconds of waiting for a CPU; the present wait is added when it ends.
     pub(super) waited: u64,
     pub(super) condition: Condition,
 }
 
-/// The use of the CPU by the thread `tid` of this process; `None` if it has ended, or the kernel keeps no account of it.
+/// Returns the CPU use of the thread `tid` of this process; `None` if it has ended, or the kernel keeps no
+/// account of it.
 pub(super) fn sample(tid: i32) -> Option<Sample> {
     let read = |file: &str| std::fs::read_to_string(format!("/proc/self/task/{tid}/{file}")).ok();
     parse(&read("schedstat")?, &read("stat")?)
@@ -30,7 +31,7 @@ pub(super) fn sample(tid: i32) -> Option<Sample> {
 fn parse(schedstat: &str, stat: &str) -> Option<Sample> {
     let mut numbers = schedstat.split_ascii_whitespace().map_while(|word| word.parse().ok());
     let (ran, waited) = (numbers.next()?, numbers.next()?);
-    // The name before it is in brackets and may have brackets and blanks of its own.
+    // The name before it is in brackets and may itself have brackets and spaces.
     let (_, after_name) = stat.rsplit_once(')')?;
     let condition = match after_name.trim_start().bytes().next()? {
         b'R' => Condition::Runnable,
@@ -45,21 +46,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_thread_with_a_malicious_name_is_read_all_the_same() {
+    fn thread_with_a_malicious_name_is_parsed() {
         let stat = "123 (evil) R (x) S 1 123 123 0";
         let sample = Sample { ran: 7, waited: 9, condition: Condition::Blocked };
         assert_eq!(parse("7 9 3\n", stat), Some(sample));
     }
 
     #[test]
-    fn what_is_no_account_is_none() {
+    fn invalid_account_is_none() {
         assert_eq!(parse("", "1 (a) R"), None);
         assert_eq!(parse("1 2 3", "nonsense"), None);
         assert_eq!(parse("1 2 3", "1 (a"), None);
     }
 
     #[test]
-    fn the_calling_thread_runs() {
+    fn calling_thread_is_runnable() {
         let tid = rustix::thread::gettid().as_raw_nonzero().get();
         assert_eq!(sample(tid).map(|sample| sample.condition), Some(Condition::Runnable));
     }

@@ -1,48 +1,50 @@
-//! The watchdog's judgement of one actor, pure: what was seen at each look, to who hangs.
+//! The watchdog's judgement of one actor, pure: from the observations of its checks to a hang.
 //!
-//! Nobody is accused for time in which he was given no CPU: neither for the watchdog's own lateness (the process was
-//! stopped, the host stood still) nor for what the kernel says his thread waited for its turn.
+//! Time in which an actor got no CPU never counts. One part is the watchdog's own lateness: the process was
+//! stopped, or the host was suspended. The other part is the time for which its thread waited for a CPU,
+//! according to the kernel.
 
 use std::time::Duration;
 
 use super::{account::Account, processor::Sample};
 use crate::{
-    supervision::vitals::{Doing, Neighbours, Sight},
+    supervision::liveness::{Activity, ActivitySnapshot, Neighbours},
     time::Time,
 };
 
-/// Looks before the end of a budget at which the CPU's account is read, so that the last of them has one to compare with.
-const LAST_LOOKS: u32 = 4;
+/// Number of last checks of a budget that read the CPU account, so that the last one has an earlier one to
+/// compare with.
+const LAST_CHECKS: u32 = 4;
 
-/// Time for a panic at least: a hook of the program's own may look up a backtrace.
+/// Minimum time for a panic: a custom panic hook may resolve a backtrace.
 const PANIC_WITHIN: Duration = Duration::from_secs(1);
 
-/// One look at an actor.
+/// One check of an actor.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Look {
+pub(super) struct Check {
     pub(super) now: Time,
-    /// How much later than intended this look is.
+    /// How much later than scheduled this check is.
     pub(super) late: Duration,
-    pub(super) sight: Sight,
+    pub(super) snapshot: ActivitySnapshot,
 }
 
-/// Who does not come back.
+/// A detected hang.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Hang {
     pub(super) since: Time,
     pub(super) lasted: Duration,
-    /// Of that, time that it was not given.
+    /// The part of that time in which the thread got no CPU.
     pub(super) excused: Duration,
 }
 
-/// Watches one turn after the other.
+/// Detects turns that do not end.
 #[derive(Debug)]
 pub(super) struct TurnSuspect {
     budget: Duration,
     turn: u64,
     is_busy: bool,
     first_seen: Time,
-    looks: u32,
+    checks: u32,
     account: Account,
 }
 
@@ -53,79 +55,79 @@ impl TurnSuspect {
             turn: 0,
             is_busy: false,
             first_seen: Time::ZERO,
-            looks: 0,
+            checks: 0,
             account: Account::default(),
         }
     }
 
-    /// Takes a look. `sample` reads the CPU's account; it is called only when that matters.
-    pub(super) fn look(
+    /// Handles a check. `sample` reads the CPU account; it is called only if that matters.
+    pub(super) fn check(
         &mut self,
-        look: Look,
+        check: Check,
         period: Duration,
         sample: impl FnOnce() -> Option<Sample>,
     ) -> Option<Hang> {
-        let Look { now, late, sight } = look;
-        self.is_busy = sight.is_busy();
-        if sight.turn != self.turn || !sight.is_busy() {
-            let (account, turn) = (Account::opened(late), sight.turn);
-            *self = Self { turn, first_seen: now, looks: 0, account, ..*self };
+        let Check { now, late, snapshot } = check;
+        self.is_busy = snapshot.is_busy();
+        if snapshot.turn != self.turn || !snapshot.is_busy() {
+            let (account, turn) = (Account::opened(late), snapshot.turn);
+            *self = Self { turn, first_seen: now, checks: 0, account, ..*self };
             return None;
         }
-        self.looks = self.looks.saturating_add(1);
+        self.checks = self.checks.saturating_add(1);
         self.account.late += late;
-        let since = sight.begun.unwrap_or(self.first_seen);
+        let since = snapshot.begun.unwrap_or(self.first_seen);
         let lasted = now.since(since);
-        if self.looks > 1 && lasted + period * LAST_LOOKS < self.budget {
+        if self.checks > 1 && lasted + period * LAST_CHECKS < self.budget {
             return None;
         }
         let waits_for_cpu = self.account.enter(sample());
         let excused = self.account.excused();
-        let hangs = lasted >= self.budget_of(sight) + excused && !waits_for_cpu;
+        let hangs = lasted >= self.budget_of(snapshot) + excused && !waits_for_cpu;
         hangs.then_some(Hang { since, lasted, excused })
     }
 
-    /// Whether it was in the middle of a turn at the last look.
+    /// Returns whether a turn was in progress at the last check.
     pub(super) const fn is_open(&self) -> bool {
         self.is_busy
     }
 
-    /// One that panicked is on its way out, and has time for it.
-    fn budget_of(&self, sight: Sight) -> Duration {
-        if sight.doing == Doing::Panic { self.budget.max(PANIC_WITHIN) } else { self.budget }
+    /// Returns the time limit of a turn: a panicking actor is ending, and has more time.
+    fn budget_of(&self, snapshot: ActivitySnapshot) -> Duration {
+        if snapshot.activity == Activity::Panic { self.budget.max(PANIC_WITHIN) } else { self.budget }
     }
 
-    /// When the turn that was seen last is too long.
-    pub(super) fn deadline(&self, sight: Sight) -> Option<Time> {
-        let begun = sight.begun.unwrap_or(self.first_seen);
-        let is_same = sight.is_busy() && sight.turn == self.turn;
-        is_same.then(|| begun + self.budget_of(sight) + self.account.excused())
+    /// Returns when the turn of the last check exceeds its limit.
+    pub(super) fn deadline(&self, snapshot: ActivitySnapshot) -> Option<Time> {
+        let begun = snapshot.begun.unwrap_or(self.first_seen);
+        let is_same = snapshot.is_busy() && snapshot.turn == self.turn;
+        is_same.then(|| begun + self.budget_of(snapshot) + self.account.excused())
     }
 }
 
-/// What the watchdog does about an actor for which messages wait.
+/// The reaction to an actor with queued messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Stall {
-    /// Nothing.
+    /// No reaction.
     None,
-    /// Wakes it, to see whether its thread comes to it.
+    /// Wake the actor, to see whether its thread reaches it.
     Probe,
-    /// It had its turn and takes nothing: it waits for something else. So many messages wait since then.
+    /// The actor had a turn and takes no messages: it waits for something else.
     Waits(Hang),
-    /// Its thread did not come to it.
+    /// The actor's thread did not reach it.
     ThreadIsAway(Hang),
 }
 
-/// Watches whether an actor for which messages wait takes any.
+/// Detects an actor that does not take its queued messages.
 #[derive(Debug)]
 pub(super) struct StallSuspect {
     budget: Duration,
-    /// `None` before the first look.
+    /// `None` before the first check.
     taken: Option<u64>,
     since: Time,
-    /// Messages waited at the last look, and none had been taken since the one before.
+    /// Whether messages were queued at the last check, and none had been taken since the one before.
     is_open: bool,
-    /// The turn that it had when it was probed, and what the others of its thread did.
+    /// The actor's turn number at the probe, and the activity of the other actors on its thread.
     probed: Option<(u64, Neighbours)>,
     account: Account,
 }
@@ -142,19 +144,19 @@ impl StallSuspect {
         }
     }
 
-    /// Takes a look at an actor that should take messages; of its backlog so many wait, and so many were taken so far. Where it
-    /// matters it asks what the `neighbours` do, the others of its thread.
-    pub(super) fn look(
+    /// Handles a check of an actor that should take messages. `waiting` messages are queued, and `taken` were
+    /// taken so far. If it matters, `neighbours` reads the activity of the other actors on its thread.
+    pub(super) fn check(
         &mut self,
-        look: Look,
+        check: Check,
         (waiting, taken): (usize, u64),
         neighbours: impl FnOnce() -> Neighbours,
         sample: impl FnOnce() -> Option<Sample>,
     ) -> Stall {
-        let Look { now, late, sight, .. } = look;
+        let Check { now, late, snapshot, .. } = check;
         if waiting == 0 || self.taken != Some(taken) {
             self.taken = Some(taken);
-            self.calm(now);
+            self.reset(now);
             return Stall::None;
         }
         self.is_open = true;
@@ -164,18 +166,18 @@ impl StallSuspect {
             if lasted < self.budget / 2 {
                 return Stall::None;
             }
-            self.probed = Some((sight.turn, neighbours()));
+            self.probed = Some((snapshot.turn, neighbours()));
             self.account.enter(sample());
             return Stall::Probe;
         };
-        // At each look from here on: whoever gets a CPU and loses it again waits for it now, whatever he had before.
+        // At each check from here on: a thread that lost its CPU waits for one now, independent of earlier samples.
         let waits_for_cpu = self.account.enter(sample());
-        if lasted < self.budget + self.account.late || sight.is_busy() {
-            // A turn that does not end is judged as such.
+        if lasted < self.budget + self.account.late || snapshot.is_busy() {
+            // A turn in progress is judged by `TurnSuspect`.
             return Stall::None;
         }
         let hang = |excused| Hang { since: self.since, lasted, excused };
-        if sight.turn >= turn + 2 {
+        if snapshot.turn >= turn + 2 {
             return Stall::Waits(hang(self.account.late));
         }
         let excused = self.account.excused();
@@ -185,18 +187,18 @@ impl StallSuspect {
         let after = neighbours();
         if after.are_busy || after != before {
             // One of them has the thread, or has just had it: they are judged themselves.
-            self.calm(now);
+            self.reset(now);
             return Stall::None;
         }
         Stall::ThreadIsAway(hang(excused))
     }
 
-    /// Begins anew: whatever there was has an excuse.
-    pub(super) fn calm(&mut self, now: Time) {
+    /// Resets the detection: the time so far is excused.
+    pub(super) fn reset(&mut self, now: Time) {
         (self.since, self.is_open, self.probed, self.account) = (now, false, None, Account::default());
     }
 
-    /// Whether it let messages wait at the last look.
+    /// Returns whether messages were left queued at the last check.
     pub(super) const fn is_open(&self) -> bool {
         self.is_open
     }

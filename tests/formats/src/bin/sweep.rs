@@ -1,8 +1,10 @@
-//! Plays known inputs of every byte format, changed by chance: what a fuzzer does, without one.
+//! Runs randomly mutated known inputs through every byte format: a driver that needs no fuzzer.
 //!
-//! `cargo run --release -p sinew-formats --bin sweep -- --executions 100000`; `--help` names the options.
+//! `cargo run --release -p sinew-formats --bin sweep -- --executions 100000`; `--help` lists the options.
 //!
-//! Exit code 1: a format has no directory of inputs, or none of its inputs was understood, which tries nothing. 101: a promise is broken. The input lies where the last lines say, and `--replay` plays it again.
+//! Exit code 1: a format has no input directory, or none of its inputs was understood, so that nothing was
+//! tested. Exit code 101: an invariant is broken. The last lines name the file with the input; `--replay`
+//! runs it again.
 
 use std::{
     collections::VecDeque,
@@ -15,27 +17,27 @@ use std::{
 use clap::Parser;
 use sinew_formats::{FORMATS, Format, mutate};
 
-/// Inputs that were understood and are changed further, at most.
+/// Maximum number of understood inputs that are kept for further mutation.
 const KEPT: usize = 1_024;
 
-/// Plays known inputs of every byte format, changed by chance.
+/// Runs randomly mutated known inputs through every byte format.
 #[derive(Parser)]
 struct Arguments {
-    /// Which formats; none: all of them.
+    /// The formats to run; all of them by default.
     formats: Vec<String>,
-    /// Inputs for each format.
+    /// Number of inputs per format.
     #[arg(long, default_value_t = 100_000)]
     executions: u64,
-    /// Decides all of them.
+    /// Seed of all mutations.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Where each format has a directory of inputs.
+    /// The directory with one input directory per format.
     #[arg(long, default_value = "fuzz/corpus")]
     corpus: PathBuf,
-    /// Writes what the other side of each format writes into that directory, for libFuzzer, and plays nothing.
+    /// Writes the built-in seed inputs of each format into that directory, for libFuzzer, and runs nothing.
     #[arg(long)]
     write_seeds: bool,
-    /// Plays this one input of the format that is named.
+    /// Replays this one input with the named format.
     #[arg(long)]
     replay: Option<PathBuf>,
 }
@@ -75,19 +77,19 @@ fn main() -> ExitCode {
     }
 }
 
-/// Returns how many inputs were played.
+/// Returns the number of inputs that were run.
 fn sweep(format: Format, arguments: &Arguments) -> std::io::Result<u64> {
     let mut random = fastrand::Rng::with_seed(arguments.seed);
     let inputs = format.inputs(&arguments.corpus)?;
     let (began, mut understood) = (Instant::now(), 0_u64);
     let mut kept: VecDeque<Vec<u8>> = inputs.iter().cloned().collect();
     for number in 0..arguments.executions {
-        // First each as it is.
+        // Each known input first runs unchanged.
         let known = usize::try_from(number).ok().and_then(|at| inputs.get(at)).cloned();
         let input = known.unwrap_or_else(|| mutate(&mut random, kept.make_contiguous()));
         if play(format, &input)? {
             understood += 1;
-            // What was understood is changed further, in the place of another one.
+            // An understood input is mutated further. If the list is full, it replaces another one.
             if kept.len() >= KEPT.max(inputs.len()) {
                 let at = random.usize(0..kept.len());
                 kept.swap_remove_back(at);
@@ -111,7 +113,7 @@ fn sweep(format: Format, arguments: &Arguments) -> std::io::Result<u64> {
     Ok(count)
 }
 
-/// Whether it was understood.
+/// Returns whether the input was understood.
 fn play(format: Format, input: &[u8]) -> std::io::Result<bool> {
     match catch_unwind(AssertUnwindSafe(|| (format.play)(input))) {
         Ok(is_understood) => Ok(is_understood),
@@ -138,7 +140,7 @@ fn write_seeds(format: Format, corpus: &Path) -> std::io::Result<()> {
     Ok(())
 }
 
-/// A name for these bytes (FNV-1a, 64 bits).
+/// A file name for these bytes (FNV-1a, 64 bits).
 fn hash(bytes: &[u8]) -> u64 {
     bytes
         .iter()

@@ -1,50 +1,42 @@
-//! Who is on the node's own host, with its own user's rights, and means harm.
+//! A malicious process on the node's own host, with the privileges of the node's user.
 
-use std::{
-    process::Command,
-    sync::{Arc, Mutex, PoisonError},
-    thread,
-};
+use std::{process::Command, thread};
 
 use super::{super::KNEE, Happened, Scene, done};
-use crate::clients::{Performer, hostile::Keeper};
+use crate::{clients::hostile::Keeper, role};
+use sinew_testkit::{NodeProcess, numbers};
 
 const ATTACKERS: usize = 2;
 
 pub(super) fn at_the_door(scene: &Scene<'_>) -> Happened {
     let host = &scene.hosts[KNEE];
-    // On the same host: what does not close is a connection to it.
+    // On the same host, because the lingering socket is a connection to it.
     let keeper = host.run(Keeper::new);
-    let said: Arc<Mutex<Vec<u64>>> = Arc::default();
+    let mut counts: Vec<Vec<u64>> = Vec::new();
     thread::scope(|scope| {
         scope.spawn(|| keeper.keep(scene.over));
         let attackers: Vec<_> = (0..ATTACKERS)
             .map(|number| {
-                // As all attackers it has the CPU that is left: any program of this user could take that, without a node.
+                // Like all attackers it gets only the CPU time that is left. Any program of this user could
+                // take more, even without a node.
                 let mut command = Command::new("nice");
-                command
-                    .args(["-n", "19"])
-                    .arg(scene.program)
-                    .args(["--role", "attacker"])
-                    .arg(scene.robot.door());
+                let attacker = role("attacker");
+                command.args(["-n", "19"]).arg(attacker.get_program()).args(attacker.get_args());
+                command.arg(scene.robot.socket());
                 command.args([(number + 1).to_string(), scene.lasts.as_millis().to_string()]);
                 command.arg(keeper.port().to_string());
-                let said = said.clone();
-                Performer::start_command(host.moved(&command), "attacker", move |line| {
-                    let numbers = line.split_whitespace().filter_map(|word| word.parse::<u64>().ok());
-                    said.lock().unwrap_or_else(PoisonError::into_inner).extend(numbers.take(4));
-                })
+                NodeProcess::start("attacker", host.moved(&command))
             })
             .collect();
         scene.rest(scene.lasts);
-        for attacker in attackers {
+        for mut attacker in attackers {
             // It ends by itself.
-            let status = attacker.end();
-            assert!(status.success(), "an attacker ended with {status}");
+            let code = attacker.wait_for_exit();
+            assert_eq!(code, Some(0), "an attacker's exit");
+            counts.extend(attacker.output().iter().map(|line| numbers(line)));
         }
     });
-    let said = said.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let sum = |at: usize| said.iter().skip(at).step_by(4).sum::<u64>();
+    let sum = |at: usize| counts.iter().filter_map(|counts| counts.get(at)).sum::<u64>();
     let broken = if sum(0) == 0 { vec!["no trick was played".to_owned()] } else { Vec::new() };
     Happened {
         done: done("tricks", sum(0)),

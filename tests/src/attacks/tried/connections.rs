@@ -1,4 +1,4 @@
-//! Who connects, and says nothing.
+//! Attackers that open connections and send nothing.
 
 use std::{
     collections::VecDeque,
@@ -9,22 +9,22 @@ use std::{
 use super::{Happened, Scene, done};
 
 const THREADS: usize = 4;
-/// Connections that are held at once, of all threads together.
+/// Connections held open at the same time, over all threads.
 const HELD: usize = 10_000;
-/// What the system may take to make one: beyond that it has no room for now.
-const PATIENCE: Duration = Duration::from_millis(200);
+/// Connect timeout: beyond it the system has no capacity at the moment.
+const TIMEOUT: Duration = Duration::from_millis(200);
 
 pub(super) fn ten_thousand(scene: &Scene<'_>) -> Happened {
     let seen = scene.on_threads(THREADS, |_| {
         let (mut made, mut held, mut most, mut longest) = (0_u64, VecDeque::new(), 0, Duration::ZERO);
         while !scene.is_over() {
             let began = Instant::now();
-            if let Ok(silent) = TcpStream::connect_timeout(&scene.target.connections, PATIENCE) {
+            if let Ok(silent) = TcpStream::connect_timeout(&scene.target.connections, TIMEOUT) {
                 made += 1;
                 held.push_back(silent);
                 longest = longest.max(began.elapsed());
             } else {
-                // There are no ports or descriptors left, or the node's system has no room.
+                // No ports or file descriptors are left, or the node's system has no capacity.
                 std::thread::sleep(Duration::from_millis(1));
                 held.pop_front();
             }
@@ -51,7 +51,8 @@ pub(super) fn ten_thousand(scene: &Scene<'_>) -> Happened {
     }
 }
 
-/// The same to a node that has no descriptors for them: it has run out of them, else this shows nothing.
+/// The same against a node without enough file descriptors. The node must run out of them, otherwise this
+/// proves nothing.
 pub(super) fn until_none_are_left(scene: &Scene<'_>) -> Happened {
     Happened { refused: vec![("not accepted", 1)], ..ten_thousand(scene) }
 }

@@ -1,4 +1,4 @@
-//! Who shows what is not his, or nothing.
+//! Attackers with foreign credentials or none.
 
 use std::{
     io,
@@ -10,9 +10,9 @@ use sinew::security::rustls::{AlertDescription, Error};
 
 use super::{
     super::{
-        keys::{self, Who},
+        keys::{self, TestNode},
+        raw_peer::{Answer, Client, RawPeer, client},
         robot::Is,
-        stranger::{Answer, Client, Stranger, client},
     },
     Happened, Scene, done,
 };
@@ -20,19 +20,21 @@ use super::{
 /// Time between two handshakes.
 const PACE: Duration = Duration::from_millis(20);
 
-/// The node's words for who has not proven who he is, and for who has proven to be another one.
+/// The node's causes for a peer without a proven identity, and for a peer with a proven but different
+/// identity.
 pub(super) const NOT_PROVEN: &str = "peer not proven";
 pub(super) const SECURITY: &str = "security";
 
-/// What a node says of every certificate that it reads and does not take: why is for its own log.
+/// A node's alert for every certificate that it can parse but rejects. The reason is only in its own log.
 const NOT_TAKEN: AlertDescription = AlertDescription::CertificateUnknown;
 
-/// How an attempt is to end.
+/// The expected end of an attempt.
 #[derive(Clone, Copy)]
 enum Expected {
-    /// By an alert of TLS. Where the node has closed before this end has read it, the system says that the connection was cut.
+    /// A TLS alert. If the node closes before this end has read the alert, the system reports a connection
+    /// reset.
     Alert(AlertDescription),
-    /// By a REFUSAL whose sentence has these words.
+    /// A REFUSAL with a reason that contains these words.
     Refusal(&'static str),
 }
 
@@ -46,18 +48,18 @@ impl Expected {
     }
 }
 
-/// What became of handshakes.
+/// The results of the handshakes.
 #[derive(Default)]
 struct Tally {
     tried: u64,
     came_in: u64,
-    /// Ended as they are to.
+    /// Ended as expected.
     as_expected: u64,
-    /// Ended without a word that this end could read.
+    /// Ended without a readable message.
     cut: u64,
-    /// Of one that ended as it is to.
+    /// Message of an attempt that ended as expected.
     words: Option<String>,
-    /// Of one that ended otherwise.
+    /// Message of an attempt that ended otherwise.
     otherwise: Option<String>,
 }
 
@@ -79,18 +81,18 @@ impl Tally {
         self.words = Some(words);
     }
 
-    fn happened(self, who: &str, expected: Expected) -> Happened {
+    fn happened(self, label: &str, expected: Expected) -> Happened {
         let Self { tried, came_in, as_expected, cut, words, otherwise } = self;
         let (mut broken, mut let_in) = (Vec::new(), Vec::new());
         if came_in > 0 {
-            let_in.push(format!("{who}: {came_in} of {tried} came in"));
+            let_in.push(format!("{label}: {came_in} of {tried} came in"));
         }
         if as_expected == 0 {
-            broken.push(format!("{who}: none of {tried} was refused as it is to be, {cut} were cut"));
+            broken.push(format!("{label}: none of {tried} was refused as it is to be, {cut} were cut"));
         }
-        broken.extend(otherwise.map(|words| format!("{who}: one ended otherwise: {words}")));
+        broken.extend(otherwise.map(|words| format!("{label}: one ended otherwise: {words}")));
         let words = words.unwrap_or_else(|| "nothing".to_owned());
-        let what = format!("{who}: {tried} tried, {came_in} came in, {cut} cut; told: {words}");
+        let what = format!("{label}: {tried} tried, {came_in} came in, {cut} cut; reported: {words}");
         Happened {
             let_in,
             refused: vec![(expected.cause(), tried)],
@@ -110,56 +112,57 @@ fn is_cut(error: &io::Error) -> bool {
     matches!(error.kind(), BrokenPipe | ConnectionAborted | ConnectionReset | UnexpectedEof)
 }
 
-/// Who tries, what he shows, and how that is to end.
+/// An attempt: its client, its credentials, and the expected end.
 struct Attempt<'a> {
-    who: &'static str,
+    label: &'static str,
     shows: Option<&'a Arc<Client>>,
-    says: Who,
+    claimed: TestNode,
     expected: Expected,
 }
 
-/// Tries it again and again for so long.
+/// Repeats the attempt for this duration.
 fn shake(scene: &Scene<'_>, lasts: Duration, attempt: &Attempt<'_>) -> Happened {
-    let &Attempt { who, shows, says, expected } = attempt;
+    let &Attempt { label, shows, claimed, expected } = attempt;
     let until = Instant::now() + lasts;
     let mut tallies = scene.on_threads(1, |_| {
         let mut tally = Tally::default();
         while !scene.is_over() && Instant::now() < until {
-            let dialled = Stranger::dial(scene.target.connections, shows);
+            let dialled = RawPeer::dial(scene.target.connections, shows);
             match scene.target.is {
                 Is::Node => {
                     let peer = scene.robot.knee_address();
-                    let answer = dialled.and_then(|mut stranger| stranger.hello(says, peer));
+                    let answer = dialled.and_then(|mut raw_peer| raw_peer.hello(claimed, peer));
                     tally.note(answer, expected);
                 }
                 Is::Decoy => {
-                    // Where nobody listens nothing was tried. Nothing is said in return, and whether what is said there still arrives is all the same.
+                    // Without a listener nothing was tried. The decoy sends no reply, and it does not matter
+                    // whether the HELLO arrives.
                     tally.tried += u64::from(dialled.is_ok());
-                    let _ = dialled.and_then(|mut it| it.say_hello(says, scene.robot.knee_address()));
+                    let _ = dialled.and_then(|mut it| it.send_hello(claimed, scene.robot.knee_address()));
                 }
             }
             scene.rest(PACE);
         }
         tally
     });
-    tallies.pop().unwrap_or_default().happened(who, expected)
+    tallies.pop().unwrap_or_default().happened(label, expected)
 }
 
-/// Tries one after the other, each for as long.
+/// Runs the attempts one after the other, each for the same duration.
 fn shake_in_turn(scene: &Scene<'_>, attempts: &[Attempt<'_>]) -> Happened {
     let lasts = scene.lasts / attempts.len().max(1) as u32;
     attempts.iter().map(|attempt| shake(scene, lasts, attempt)).reduce(Happened::and).unwrap_or_default()
 }
 
 pub(super) fn wrong_authority(scene: &Scene<'_>) -> Happened {
-    let [own, hip] = [keys::MALLORY, keys::HIP].map(|who| scene.keys.tls_of_others(who));
+    let [own, hip] = [keys::MALLORY, keys::HIP].map(|node| scene.keys.tls_of_others(node));
     let expected = Expected::Alert(NOT_TAKEN);
     let attempts = [
-        Attempt { who: "as itself", shows: Some(&own), says: keys::MALLORY, expected },
+        Attempt { label: "as itself", shows: Some(&own), claimed: keys::MALLORY, expected },
         Attempt {
-            who: "as hip, with a certificate that says so",
+            label: "as hip, with a certificate that says so",
             shows: Some(&hip),
-            says: keys::HIP,
+            claimed: keys::HIP,
             expected,
         },
     ];
@@ -170,15 +173,15 @@ pub(super) fn none(scene: &Scene<'_>) -> Happened {
     let nothing = client(None);
     let attempts = [
         Attempt {
-            who: "TLS",
+            label: "TLS",
             shows: Some(&nothing),
-            says: keys::MALLORY,
+            claimed: keys::MALLORY,
             expected: Expected::Alert(AlertDescription::CertificateRequired),
         },
         Attempt {
-            who: "without TLS",
+            label: "without TLS",
             shows: None,
-            says: keys::MALLORY,
+            claimed: keys::MALLORY,
             expected: Expected::Refusal("you do not speak TLS"),
         },
     ];
@@ -189,12 +192,12 @@ pub(super) fn stolen(scene: &Scene<'_>) -> Happened {
     let (spare, revoked) = (scene.keys.tls(keys::SPARE), scene.keys.tls(keys::REVOKED));
     let another = Expected::Refusal("your certificate is of node");
     let attempts = [
-        Attempt { who: "as hip", shows: Some(&spare), says: keys::HIP, expected: another },
-        Attempt { who: "as knee itself", shows: Some(&spare), says: keys::KNEE, expected: another },
+        Attempt { label: "as hip", shows: Some(&spare), claimed: keys::HIP, expected: another },
+        Attempt { label: "as knee itself", shows: Some(&spare), claimed: keys::KNEE, expected: another },
         Attempt {
-            who: "revoked",
+            label: "revoked",
             shows: Some(&revoked),
-            says: keys::REVOKED,
+            claimed: keys::REVOKED,
             expected: Expected::Alert(NOT_TAKEN),
         },
     ];

@@ -1,4 +1,4 @@
-//! Who hears the robot's datagrams of discovery, and sends them again.
+//! An attacker that records the robot's discovery datagrams, and replays them.
 
 use std::{
     io::{self, Read as _},
@@ -13,29 +13,29 @@ use super::{
     super::{keys::MALLORY, robot::NDL_PORT},
     Happened, Scene, done,
 };
-use crate::dice::Dice;
+use sinew_testkit::random::SeededRandom;
 
-/// Datagrams that are recorded at most.
+/// Maximum number of recorded datagrams.
 const KEPT: usize = 8_192;
-/// Datagrams each millisecond.
+/// Datagrams sent per millisecond.
 const AT_ONCE: usize = 4;
 
-/// What is sent.
+/// Kinds of datagrams.
 const KINDS: [&str; 3] = ["sent again", "changed", "made up"];
-/// Where to.
+/// Destinations.
 const DESTINATIONS: [&str; 3] = ["knee", "hip", "the group"];
-/// The node's word for a datagram that nobody of its project has made, or that it has taken before.
+/// The node's cause for a datagram that was not made by its project, or that it has received before.
 pub(in super::super) const NOT_OURS: &str = "NDL datagram not of this project's keys";
 
-/// What was heard of the robot.
+/// The recorded datagrams of the robot.
 #[derive(Default)]
 pub(in super::super) struct Recording {
     datagrams: Vec<Vec<u8>>,
-    /// Of these, so many were said to one node alone.
+    /// The number of unicast datagrams among them.
     to_one: usize,
 }
 
-/// What the network took of each kind for each destination, and why it did not take the last one that it did not.
+/// Datagrams that the network accepted, by kind and destination, and the last error per destination.
 #[derive(Default)]
 struct Sent {
     counts: [[u64; 3]; 3],
@@ -68,27 +68,27 @@ pub(super) fn replayed_and_forged(scene: &Scene<'_>) -> Happened {
 }
 
 fn send(scene: &Scene<'_>) -> Sent {
-    let (recorded, mut dice, mut sent) = (&scene.recorded.datagrams, Dice::new(7), Sent::default());
+    let (recorded, mut random, mut sent) = (&scene.recorded.datagrams, SeededRandom::new(7), Sent::default());
     let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP)).expect("a socket");
     socket.bind(&SocketAddrV4::new(Ipv4Addr::UNSPECIFIED, NDL_PORT).into()).expect("the attacker's own port");
-    // His host has no route to groups: without this nothing that he says to one leaves it.
+    // The attacker's host has no multicast route: without this no multicast datagram leaves it.
     socket.set_multicast_if_v4(&MALLORY.address()).expect("the attacker's own interface");
     let socket = UdpSocket::from(socket);
     while !scene.is_over() {
         for _ in 0..AT_ONCE {
-            let kind = (dice.roll() % 3) as usize;
-            let mut datagram = match recorded.get(dice.roll() as usize % recorded.len().max(1)) {
+            let kind = (random.number() % 3) as usize;
+            let mut datagram = match recorded.get(random.number() as usize % recorded.len().max(1)) {
                 Some(datagram) if kind < 2 => datagram.clone(),
-                // Nothing to send again: that is not counted as if it were.
+                // No datagram to replay: this does not count as one.
                 None if kind < 2 => continue,
-                _ => (0..dice.roll() % 1_400).map(|_| dice.roll() as u8).collect(),
+                _ => (0..random.number() % 1_400).map(|_| random.number() as u8).collect(),
             };
             if kind == 1 && !datagram.is_empty() {
-                let at = dice.roll() as usize % datagram.len();
-                datagram[at] ^= 1 << (dice.roll() % 8);
+                let at = random.number() as usize % datagram.len();
+                datagram[at] ^= 1 << (random.number() % 8);
             }
-            let to = (dice.roll() % 3) as usize;
-            // What the network does not take is not sent again.
+            let to = (random.number() % 3) as usize;
+            // A datagram that the network does not accept is not sent again.
             match socket.send_to(&datagram, scene.target.datagrams[to]) {
                 Ok(_) => sent.counts[kind][to] += 1,
                 Err(error) => sent.errors[to] = Some(error),
@@ -99,9 +99,10 @@ fn send(scene: &Scene<'_>) -> Sent {
     sent
 }
 
-/// What passes on this host's interface of discovery, to the group or to one node, until it is over.
+/// Records the discovery datagrams on this host's interface, multicast and unicast, until it is over.
 pub(in super::super) fn listen(group: SocketAddrV4, over: &AtomicBool) -> Recording {
-    /// All of the host's packets, those that it sends too (`ETH_P_ALL`), which the system takes in the network's order.
+    /// All packets of the host, including those that it sends (`ETH_P_ALL`), which the system expects in
+    /// network byte order.
     const ALL_PACKETS: u16 = 0x0003;
     let all = Protocol::from(i32::from(ALL_PACKETS.to_be()));
     let mut socket = Socket::new(Domain::PACKET, Type::DGRAM, Some(all)).expect("a right of root");
@@ -118,7 +119,7 @@ pub(in super::super) fn listen(group: SocketAddrV4, over: &AtomicBool) -> Record
     recorded
 }
 
-/// The UDP datagram in an IPv4 packet to one of these ports, and to whom it is.
+/// Returns the UDP datagram in an IPv4 packet to one of these ports, and its destination.
 fn datagram(packet: &[u8], ports: [u16; 2]) -> Option<(Ipv4Addr, &[u8])> {
     const UDP: u8 = 17;
     let word = |bytes: &[u8], at: usize| Some(u16::from_be_bytes([*bytes.get(at)?, *bytes.get(at + 1)?]));

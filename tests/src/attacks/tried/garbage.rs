@@ -1,4 +1,4 @@
-//! Who pours random bytes on every port, as fast as they go.
+//! An attacker that sends random bytes to every port, as fast as possible.
 
 use std::{
     collections::BTreeMap,
@@ -12,24 +12,24 @@ use super::{
     credentials::{NOT_PROVEN, SECURITY},
     datagrams::NOT_OURS,
 };
-use crate::dice::Dice;
+use sinew_testkit::random::SeededRandom;
 
 const THREADS: usize = 3;
-/// The first bytes of a connection by TLS, and of one that is none.
+/// The first bytes of a TLS connection, and of one that is not TLS.
 const LIKE_TLS: [u8; 3] = [0x16, 3, 1];
 const UNLIKE_TLS: [u8; 1] = [0];
-const PATIENCE: Duration = Duration::from_millis(200);
-/// Bytes of a datagram.
+const TIMEOUT: Duration = Duration::from_millis(200);
+/// Length of a datagram, in bytes.
 const DATAGRAM: usize = 1_200;
 
 pub(super) fn pour(scene: &Scene<'_>) -> Happened {
     let poured = scene.on_threads(THREADS, |number| {
-        let mut dice = Dice::new(number as u64 + 1);
-        let garbage: Vec<u8> = (0..64 << 10).map(|_| dice.roll() as u8).collect();
+        let mut random = SeededRandom::new(number as u64 + 1);
+        let garbage: Vec<u8> = (0..64 << 10).map(|_| random.number() as u8).collect();
         match number {
             0 => by_udp(scene, &garbage),
-            1 => by_tcp(scene, &LIKE_TLS, &garbage, &mut dice),
-            _ => by_tcp(scene, &UNLIKE_TLS, &garbage, &mut dice),
+            1 => by_tcp(scene, &LIKE_TLS, &garbage, &mut random),
+            _ => by_tcp(scene, &UNLIKE_TLS, &garbage, &mut random),
         }
     });
     let datagrams = poured[0];
@@ -37,7 +37,8 @@ pub(super) fn pour(scene: &Scene<'_>) -> Happened {
     let broken =
         if datagrams == 0 || bytes == 0 { vec!["nothing was poured".to_owned()] } else { Vec::new() };
     Happened {
-        // What is no TLS; what looked like it and was none; what is no datagram of the project.
+        // Connections that are not TLS, connections that only start like TLS, and datagrams of no known
+        // project.
         refused: vec![(SECURITY, 1), (NOT_PROVEN, 1), (NOT_OURS, 1)],
         done: BTreeMap::from([("MiB by TCP", bytes >> 20), ("datagrams", datagrams)]),
         ..Happened::new(
@@ -47,7 +48,7 @@ pub(super) fn pour(scene: &Scene<'_>) -> Happened {
     }
 }
 
-/// Returns the datagrams.
+/// Returns the number of datagrams.
 fn by_udp(scene: &Scene<'_>, garbage: &[u8]) -> u64 {
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).expect("a port of the attacker's");
     let mut sent = 0_u64;
@@ -58,18 +59,18 @@ fn by_udp(scene: &Scene<'_>, garbage: &[u8]) -> u64 {
     sent
 }
 
-/// Begins each connection so. Returns the bytes.
-fn by_tcp(scene: &Scene<'_>, first: &[u8], garbage: &[u8], dice: &mut Dice) -> u64 {
+/// Starts each connection with `first`. Returns the number of bytes.
+fn by_tcp(scene: &Scene<'_>, first: &[u8], garbage: &[u8], random: &mut SeededRandom) -> u64 {
     let mut bytes = 0;
     while !scene.is_over() {
-        let Ok(mut socket) = TcpStream::connect_timeout(&scene.target.connections, PATIENCE) else {
+        let Ok(mut socket) = TcpStream::connect_timeout(&scene.target.connections, TIMEOUT) else {
             continue;
         };
-        // Whom nobody reads any more does not wait for ever.
-        if socket.set_write_timeout(Some(PATIENCE)).is_err() {
+        // Bounded, so that a write to a peer that does not read does not block forever.
+        if socket.set_write_timeout(Some(TIMEOUT)).is_err() {
             continue;
         }
-        let at = dice.roll() as usize % 1_024;
+        let at = random.number() as usize % 1_024;
         if socket.write_all(first).is_err() {
             continue;
         }

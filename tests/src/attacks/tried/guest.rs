@@ -1,15 +1,7 @@
-//! Who is on the node's own host as another user, whom only the access list lets in, and has what that grants: a guest with names and
-//! one group, and visitors with names and any group.
+//! An attacker on the node's own host as another user, admitted only by the access list and with the rights
+//! granted there: a guest with names and one group, and visitors with names and any group.
 
-use std::{
-    process::Command,
-    sync::{
-        Arc, Mutex, PoisonError,
-        mpsc::{Receiver, sync_channel},
-    },
-    thread,
-    time::Duration,
-};
+use std::{thread, time::Duration};
 
 use super::{
     super::{
@@ -18,80 +10,81 @@ use super::{
     },
     Happened, Scene, done,
 };
-use crate::{
-    DEADLINE,
-    clients::{Performer, hostile::VISITORS},
-};
+use crate::{clients::hostile::VISITORS, role};
+use sinew_testkit::{NodeProcess, numbers};
 
-/// What the node counts when it refuses a connection of a guest that comes too often.
+/// The node's cause for refusing a connection of a guest that connects too often.
 const TOO_OFTEN: &str = "too many connections of a guest";
-/// When what it sends has to wait.
+/// The node's cause for throttling a guest.
 const TOO_FAST: &str = "guest too fast";
-/// And when it does not let one into a group.
+/// The node's cause for refusing a group membership.
 const NOT_GRANTED: &str = "membership";
 
-/// Groups that a visitor is in at most: the share of a user.
+/// Maximum number of groups of a visitor: the share of a user.
 const OF_VISITOR: u64 = 512;
-/// Those that it asks for beyond it.
+/// Groups requested above that maximum.
 const BEYOND: u64 = 256;
-/// How long the robot's own do what they do when all visitors are in their groups: time for the node to tell others of these.
+/// Duration of the robot's joint work once all visitors are in their groups. It gives the node time to
+/// announce these groups to others.
 const VISIT: Duration = Duration::from_millis(500);
 
-/// What it came to, as the guest saw it.
+/// The result, as the guest saw it.
 struct Did {
     clients: u64,
     done: u64,
     granted: u64,
     refused: u64,
-    /// Arrivals at barriers that were answered as beyond its share.
+    /// Arrivals at barriers that were rejected because they exceed its share.
     beyond: u64,
 }
 
 /// Clients that join and leave groups.
 pub(super) fn groups(scene: &Scene<'_>) -> Happened {
-    let (_, happened) = play(scene, "groups", "changes of memberships");
+    let (_, happened) = attack(scene, "groups", "changes of memberships");
     Happened { refused: vec![(NOT_GRANTED, 1)], ..happened }
 }
 
-/// Clients that ask for as many groups as they may have and are let into none, and visitors that are in as many as they may.
+/// Clients that request as many groups as they may have and are admitted to none, and visitors in as many as
+/// they may have.
 pub(super) fn memberships(scene: &Scene<'_>) -> Happened {
     let together = together::begin(scene.robot);
-    let visitors = [0, 1].map(|number| Visitor::start(scene, number));
+    let mut visitors = [0, 1].map(|number| Visitor::start(scene, number));
     let guest = Guest::start(scene, "memberships");
     scene.rest(scene.lasts);
-    // On a slow machine the scene may be over before they are.
-    let granted = visitors.each_ref().map(Visitor::granted);
+    // On a slow machine the scene may end before they are in all groups.
+    let granted = visitors.each_mut().map(Visitor::granted);
     thread::sleep(VISIT);
     let together = together.end();
     let did = guest.end();
     visitors.into_iter().for_each(Visitor::end);
     let happened = judge_visits(granted, judge(&did, &together, "memberships asked for"));
-    // One of the guest's own at least.
+    // At least one of the guest's own.
     let least = VISITORS.len() as u64 * BEYOND + 1;
     Happened { refused: vec![(NOT_GRANTED, least)], ..happened }
 }
 
 /// Clients that arrive at barriers.
 pub(super) fn barriers(scene: &Scene<'_>) -> Happened {
-    let (did, happened) = play(scene, "barriers", "arrivals");
+    let (did, happened) = attack(scene, "barriers", "arrivals");
     judge_arrivals(&did, happened)
 }
 
-/// Clients that send to everybody.
+/// Clients that send to every application.
 pub(super) fn messages(scene: &Scene<'_>) -> Happened {
-    let (_, happened) = play(scene, "messages", "messages to all");
+    let (_, happened) = attack(scene, "messages", "messages to all");
     Happened { refused: vec![(TOO_FAST, 1)], ..happened }
 }
 
 /// Connections that are closed at once, and clients that leave at once.
 pub(super) fn connections(scene: &Scene<'_>) -> Happened {
-    let (_, happened) = play(scene, "connections", "connections");
-    // Else it has not come often enough to show anything.
+    let (_, happened) = attack(scene, "connections", "connections");
+    // Otherwise the guest has not connected often enough to prove anything.
     Happened { refused: vec![(TOO_OFTEN, 1)], ..happened }
 }
 
-/// Has the guest do this until the scene is over, while two nodes of the robot do together what it could disturb.
-fn play(scene: &Scene<'_>, does: &str, what: &'static str) -> (Did, Happened) {
+/// Runs this action of the guest until the scene is over, while two nodes of the robot do joint work that it
+/// could disturb.
+fn attack(scene: &Scene<'_>, does: &str, what: &'static str) -> (Did, Happened) {
     let together = together::begin(scene.robot);
     let guest = Guest::start(scene, does);
     scene.rest(scene.lasts);
@@ -101,67 +94,51 @@ fn play(scene: &Scene<'_>, does: &str, what: &'static str) -> (Did, Happened) {
     (did, happened)
 }
 
-/// The process of the guest, and what it says.
-struct Guest {
-    performer: Performer,
-    said: Arc<Mutex<Vec<u64>>>,
-}
+/// The process of the guest.
+struct Guest(NodeProcess);
 
 impl Guest {
     fn start(scene: &Scene<'_>, does: &str) -> Self {
-        let said: Arc<Mutex<Vec<u64>>> = Arc::default();
-        let hears = said.clone();
-        let mut command = Command::new(scene.program);
-        command.args(["--role", "guest"]).arg(scene.robot.door());
-        command.args([does, &scene.lasts.as_millis().to_string()]);
-        let performer = Performer::start_command(scene.hosts[KNEE].moved(&command), "guest", move |line| {
-            let numbers = line.split_whitespace().filter_map(|word| word.parse::<u64>().ok());
-            hears.lock().unwrap_or_else(PoisonError::into_inner).extend(numbers.take(5));
-        });
-        Self { performer, said }
+        let mut command = role("guest");
+        command.arg(scene.robot.socket()).args([does, &scene.lasts.as_millis().to_string()]);
+        Self(NodeProcess::start("guest", scene.hosts[KNEE].moved(&command)))
     }
 
     /// It ends by itself.
-    fn end(self) -> Did {
-        let status = self.performer.end();
-        assert!(status.success(), "the guest ended with {status}");
-        let said = self.said.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        let [clients, done, granted, refused, beyond] = said[..] else { panic!("the guest said {said:?}") };
+    fn end(mut self) -> Did {
+        let code = self.0.wait_for_exit();
+        assert_eq!(code, Some(0), "the guest's exit");
+        let counts = self.0.output().last().map(|line| numbers(line)).unwrap_or_default();
+        let [clients, done, granted, refused, beyond] = counts[..] else {
+            panic!("the guest printed {counts:?}")
+        };
         Did { clients, done, granted, refused, beyond }
     }
 }
 
-/// The process of a visitor, and what it says.
-struct Visitor {
-    performer: Performer,
-    answers: Receiver<String>,
-}
+/// The process of a visitor.
+struct Visitor(NodeProcess);
 
 impl Visitor {
     fn start(scene: &Scene<'_>, number: usize) -> Self {
-        let (say, answers) = sync_channel(1);
-        let mut command = Command::new(scene.program);
-        command.args(["--role", "visitor"]).arg(scene.robot.door()).arg(number.to_string());
-        let performer = Performer::start_command(scene.hosts[KNEE].moved(&command), "visitor", move |line| {
-            // Nobody waits for it any more when the director is done.
-            let _ = say.send(line.to_owned());
-        });
-        Self { performer, answers }
+        let mut command = role("visitor");
+        command.arg(scene.robot.socket()).arg(number.to_string());
+        Self(NodeProcess::start("visitor", scene.hosts[KNEE].moved(&command)))
     }
 
-    /// How many groups it is in, as soon as it is in all that it may.
-    fn granted(&self) -> u64 {
-        let line = self.answers.recv_timeout(DEADLINE).expect("a visitor says how many groups it is in");
-        line.parse().expect("a number")
+    /// The number of its groups, as soon as it is in all that it may have.
+    fn granted(&mut self) -> u64 {
+        self.0.expect("").parse().expect("a number")
     }
 
     fn end(self) {
-        let status = self.performer.end();
+        let status = self.0.stop();
         assert!(status.success(), "a visitor ended with {status}");
     }
 }
 
-/// What must not be is that a visitor is in more groups than are the share of a user; with fewer, it has displaced nothing.
+/// A violation is a visitor in more groups than the share of a user. With fewer groups the attack has
+/// displaced nothing.
 fn judge_visits(granted: [u64; 2], mut happened: Happened) -> Happened {
     for granted in granted.into_iter().filter(|granted| *granted > OF_VISITOR) {
         happened
@@ -179,7 +156,7 @@ fn judge_visits(granted: [u64; 2], mut happened: Happened) -> Happened {
     happened
 }
 
-/// Whoever was refused nothing beyond its share has not come so far that barriers became few.
+/// A guest without a rejection for its share has not come far enough to make barriers scarce.
 fn judge_arrivals(did: &Did, mut happened: Happened) -> Happened {
     let Did { done, beyond, .. } = *did;
     if beyond == 0 {
@@ -189,14 +166,14 @@ fn judge_arrivals(did: &Did, mut happened: Happened) -> Happened {
     happened
 }
 
-/// What must not be for however short a time is that a call is missed, a barrier does not open, or the guest is let into a group that its
-/// list does not grant.
+/// Violations that count however short the attack is: a missed call, a barrier that does not open, or a guest
+/// in a group that its list does not grant.
 fn judge(did: &Did, together: &Together, what: &'static str) -> Happened {
     let Did { clients, done: count, granted, refused, beyond: _ } = *did;
-    let Together { sent, heard, met, failed, words } = together;
+    let Together { sent, received, met, failed, words } = together;
     let mut never = Vec::new();
-    if heard < sent {
-        never.push(format!("{} of {sent} calls of hip to knee's group never came: {words}", sent - heard));
+    if received < sent {
+        never.push(format!("{} of {sent} calls of hip to knee's group never came: {words}", sent - received));
     }
     if *failed > 0 {
         never.push(format!("{failed} times a barrier of hip and knee did not open: {words}"));
@@ -213,7 +190,7 @@ fn judge(did: &Did, together: &Together, what: &'static str) -> Happened {
     }
     let words = format!(
         "{clients} clients of a guest, {count} {what}, {refused} connections refused or ended; asserted: each of hip's calls to knee's group \
-         comes ({heard} of {sent}), each barrier of both opens ({met}, {failed} did not), and the guest is in no group but its own ({granted})"
+         comes ({received} of {sent}), each barrier of both opens ({met}, {failed} did not), and the guest is in no group but its own ({granted})"
     );
     Happened { let_in: never, done: done(what, count), ..Happened::new(words, broken) }
 }
@@ -231,31 +208,31 @@ mod tests {
     }
 
     #[test]
-    fn one_call_that_is_missed_one_barrier_that_stays_shut_and_one_group_too_much_are_told() {
-        let all = Together { sent: 100, heard: 100, met: 9, ..Together::default() };
+    fn single_missed_call_barrier_or_extra_group_is_reported() {
+        let all = Together { sent: 100, received: 100, met: 9, ..Together::default() };
         assert!(judged(0, &all).let_in.is_empty() && judged(0, &all).broken.is_empty());
-        let missed = Together { heard: 99, ..all };
+        let missed = Together { received: 99, ..all };
         assert!(judged(0, &missed).let_in[0].contains("1 of 100 calls"));
-        let shut = Together { heard: 100, failed: 1, words: "256 barriers".to_owned(), ..missed };
+        let shut = Together { received: 100, failed: 1, words: "256 barriers".to_owned(), ..missed };
         assert!(judged(0, &shut).let_in[0].contains("did not open: 256 barriers"));
         let open = Together { failed: 0, ..shut };
         assert!(judged(1, &open).let_in[0].contains("let into 1 groups"));
     }
 
     #[test]
-    fn where_nobody_did_anything_nothing_is_shown() {
+    fn idle_run_proves_nothing() {
         let nothing = judged(0, &Together::default());
         assert!(nothing.let_in.is_empty() && nothing.broken.len() == 1, "{:?}", nothing.broken);
     }
     #[test]
-    fn arrivals_of_which_none_was_refused_for_a_share_show_nothing() {
+    fn arrivals_without_a_share_rejection_prove_nothing() {
         let arrived = |beyond| judge_arrivals(&Did { beyond, ..did(0) }, Happened::default());
         assert!(arrived(0).broken[0].contains("none of the guest's 1000 arrivals"));
         assert!(arrived(1).broken.is_empty());
     }
 
     #[test]
-    fn visitors_are_in_as_many_groups_as_are_their_share_no_more_and_no_less() {
+    fn visitors_must_have_exactly_their_share_of_groups() {
         let visited = |granted| judge_visits(granted, Happened::default());
         let just = visited([OF_VISITOR; 2]);
         assert!(just.broken.is_empty() && just.let_in.is_empty());

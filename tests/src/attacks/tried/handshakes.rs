@@ -1,4 +1,4 @@
-//! Who begins handshakes of TLS, which cost the node more than himself, and ends none.
+//! Attackers that start TLS handshakes, which cost the node more than the attacker, and complete none.
 
 use std::{
     collections::VecDeque,
@@ -11,16 +11,16 @@ use std::{
 use sinew::security::{Tls, rustls::ClientConnection};
 
 use super::{
-    super::stranger::{Client, client},
+    super::raw_peer::{Client, client},
     Happened, Scene, done,
 };
 
 const THREADS: usize = 2;
-/// Connections of each thread that are left open, so that the node goes on with them.
+/// Connections of each thread that stay open, so that the node continues with them.
 const HELD: usize = 256;
-const PATIENCE: Duration = Duration::from_millis(200);
+const TIMEOUT: Duration = Duration::from_millis(200);
 
-/// The first bytes of a right handshake: whose they are is not asked before the node has answered.
+/// The first bytes of a valid handshake. The node answers before it checks the identity.
 pub(super) fn beginning(client: &Arc<Client>) -> Vec<u8> {
     let mut tls = ClientConnection::new(client.clone(), Tls::server_name()).expect("a configuration of ours");
     let mut bytes = Vec::new();
@@ -33,9 +33,9 @@ pub(super) fn begun(scene: &Scene<'_>) -> Happened {
     let begun = scene.on_threads(THREADS, |_| {
         let (mut begun, mut answered, mut held) = (0_u64, 0_u64, VecDeque::new());
         while !scene.is_over() {
-            let connected = TcpStream::connect_timeout(&scene.target.connections, PATIENCE);
+            let connected = TcpStream::connect_timeout(&scene.target.connections, TIMEOUT);
             if let Ok(mut socket) = connected {
-                // It may have been closed already.
+                // The node may have closed it already.
                 begun += u64::from(socket.write_all(&beginning).is_ok());
                 held.push_back(socket);
             }
@@ -56,7 +56,7 @@ pub(super) fn begun(scene: &Scene<'_>) -> Happened {
     }
 }
 
-/// Whether the node has done its part, and has sent its ServerHello.
+/// Returns whether the node has done its part and has sent its ServerHello.
 fn is_answered(mut socket: &TcpStream) -> bool {
     const HANDSHAKE_RECORD: u8 = 0x16;
     let mut first = [0];

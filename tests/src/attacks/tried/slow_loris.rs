@@ -1,4 +1,4 @@
-//! Who speaks so slowly that he never comes to an end.
+//! An attacker that sends so slowly that the handshake never completes.
 
 use std::{
     io::{self, Read as _, Write as _},
@@ -6,15 +6,15 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::{super::stranger::client, Happened, Scene, done, handshakes::beginning};
+use super::{super::raw_peer::client, Happened, Scene, done, handshakes::beginning};
 
 const CONNECTIONS: usize = 256;
-/// Of a node that takes 64 strangers.
+/// Number of connections to a node that accepts 64 unauthenticated ones.
 const FEW: usize = 48;
-/// Until when each of these must be closed: many times `gncl.handshake`, on a machine that is shared.
+/// Deadline for the node to close each of these: many times `gncl.handshake`, for a shared machine.
 const CLOSED: Duration = Duration::from_secs(30);
 const PACE: Duration = Duration::from_millis(100);
-const PATIENCE: Duration = Duration::from_millis(200);
+const TIMEOUT: Duration = Duration::from_millis(200);
 
 pub(super) fn drip(scene: &Scene<'_>) -> Happened {
     let beginning = beginning(&client(None));
@@ -26,14 +26,14 @@ pub(super) fn drip(scene: &Scene<'_>) -> Happened {
     let ((made, bytes), Few { open, longest, error }) = &seen[0];
     let mut broken = Vec::new();
     if *bytes == 0 {
-        broken.push("nothing was said".to_owned());
+        broken.push("nothing was sent".to_owned());
     }
     if *open > 0 {
         broken.push(format!("{open} of {FEW} slow connections were not closed within {CLOSED:?}"));
     }
     broken.extend(error.iter().map(|error| format!("{FEW} connections were not made: {error}")));
     Happened {
-        // Some of them may come before the node knows that the many have gone.
+        // Some of them may connect before the node has noticed that the many others are closed.
         refused: vec![("too late", FEW as u64 / 2)],
         ..Happened::new(
             format!(
@@ -46,7 +46,7 @@ pub(super) fn drip(scene: &Scene<'_>) -> Happened {
     }
 }
 
-/// The many alone, for as long as the scene lasts.
+/// Only the many connections, for the duration of the scene.
 pub(super) fn drip_from_many(scene: &Scene<'_>) -> Happened {
     let (beginning, until) = (beginning(&client(None)), Instant::now() + scene.lasts);
     let seen = scene.on_threads(1, |_| come_again(scene, &beginning, until));
@@ -55,25 +55,26 @@ pub(super) fn drip_from_many(scene: &Scene<'_>) -> Happened {
     Happened { done: done("connections", made), ..Happened::new(what, Vec::new()) }
 }
 
-/// So many that the node has to choose whom it closes. Returns the connections and the bytes.
+/// So many connections that the node has to choose which one to close. Returns the number of connections and
+/// of bytes.
 fn come_again(scene: &Scene<'_>, beginning: &[u8], until: Instant) -> (u64, u64) {
     let mut connections: Vec<Option<(TcpStream, usize)>> = (0..CONNECTIONS).map(|_| None).collect();
     let (mut made, mut bytes) = (0_u64, 0_u64);
     while !scene.is_over() && Instant::now() < until {
         for place in &mut connections {
             if place.is_none() {
-                *place = TcpStream::connect_timeout(&scene.target.connections, PATIENCE)
+                *place = TcpStream::connect_timeout(&scene.target.connections, TIMEOUT)
                     .ok()
                     .map(|socket| (socket, 0));
                 made += u64::from(place.is_some());
             }
-            let Some((socket, said)) = place else { continue };
-            let byte = beginning.get(*said..=*said).unwrap_or(&[0]);
+            let Some((socket, sent)) = place else { continue };
+            let byte = beginning.get(*sent..=*sent).unwrap_or(&[0]);
             if socket.write_all(byte).is_ok() {
-                *said += 1;
+                *sent += 1;
                 bytes += 1;
             } else {
-                // The node has closed it: he comes again.
+                // The node has closed it: the attacker reconnects.
                 *place = None;
             }
         }
@@ -82,18 +83,19 @@ fn come_again(scene: &Scene<'_>, beginning: &[u8], until: Instant) -> (u64, u64)
     (made, bytes)
 }
 
-/// What became of those that the node has room for.
+/// The fate of the connections that the node has room for.
 #[derive(Default)]
 struct Few {
     /// Still open at the end.
     open: usize,
-    /// Until the last of them was closed.
+    /// Time until the last of them was closed.
     longest: Duration,
-    /// Why not all were made.
+    /// The reason if not all were opened.
     error: Option<io::Error>,
 }
 
-/// Fewer than the node has places for strangers: only its deadline for a handshake ends these, whether the scene is over or not.
+/// Fewer connections than the node accepts unauthenticated ones. Only its handshake deadline closes these,
+/// even after the scene is over.
 fn few(scene: &Scene<'_>, beginning: &[u8]) -> Few {
     let mut seen = Few::default();
     let mut connections = Vec::new();
@@ -124,7 +126,7 @@ fn few(scene: &Scene<'_>, beginning: &[u8]) -> Few {
     seen
 }
 
-/// The other end has closed it.
+/// Returns whether the peer has closed the connection.
 fn is_ended(socket: &mut TcpStream) -> bool {
     match socket.read(&mut [0; 256]) {
         Ok(count) => count == 0,

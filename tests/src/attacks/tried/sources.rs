@@ -1,4 +1,4 @@
-//! Who is in, and speaks for others.
+//! An authenticated peer that sends with forged sources.
 
 use std::{io, time::Duration};
 
@@ -7,17 +7,17 @@ use sinew_runtime::wire::{Header, Kind};
 
 use super::{
     super::{
-        keys::{self, SPARE, Who},
+        keys::{self, SPARE, TestNode},
+        raw_peer::{Answer, RawPeer, words},
         robot::Is,
-        stranger::{Answer, Stranger, words},
     },
     Happened, Scene, done,
 };
-use crate::puppet::Order;
+use sinew_testkit::scripted::Order;
 
-/// Messages in each millisecond.
+/// Messages per millisecond.
 const AT_ONCE: u64 = 5;
-/// An application of the one that speaks.
+/// An application of the sending peer.
 const OWN: AppAddress = AppAddress::new(0x8000_0001);
 
 pub(super) fn forged(scene: &Scene<'_>) -> Happened {
@@ -47,41 +47,43 @@ pub(super) fn forged(scene: &Scene<'_>) -> Happened {
     }
 }
 
-/// Counts how many were `sent` in its own name, and in others'.
+/// Counts in `sent` the messages in its own name and those in others' names.
 fn speak(scene: &Scene<'_>, sent: &mut [u64; 2]) -> io::Result<()> {
     let (peer, echo) = (scene.robot.knee_address(), scene.robot.echo());
-    // It comes several times, and numbers its messages from 1 each time.
-    let mut stranger =
-        Stranger::dial(scene.target.connections, Some(&scene.keys.tls(SPARE)))?.in_a_new_life();
+    // It connects several times, and numbers its messages from 1 each time.
+    let mut raw_peer =
+        RawPeer::dial(scene.target.connections, Some(&scene.keys.tls(SPARE)))?.in_a_new_incarnation();
     match scene.target.is {
-        Is::Node => begin(&mut stranger, peer)?,
-        // It takes what comes, and says nothing.
+        Is::Node => begin(&mut raw_peer, peer)?,
+        // The decoy reads the data and sends nothing.
         Is::Decoy => {}
     }
     let mut number = 0_u64;
     while !scene.is_over() {
-        for says in [SPARE, keys::HIP, keys::KNEE, keys::HIP, keys::KNEE].into_iter().take(AT_ONCE as usize) {
+        for claimed in
+            [SPARE, keys::HIP, keys::KNEE, keys::HIP, keys::KNEE].into_iter().take(AT_ONCE as usize)
+        {
             number += 1;
-            stranger.send(&header(says, echo, number), &words(&Order { number }))?;
-            sent[usize::from(says.host != SPARE.host)] += 1;
+            raw_peer.send(&header(claimed, echo, number), &words(&Order { number }))?;
+            sent[usize::from(claimed.host != SPARE.host)] += 1;
         }
         std::thread::sleep(Duration::from_millis(1));
     }
     if scene.target.is == Is::Node {
-        stranger.wait_for_taken(number)?;
+        raw_peer.wait_for_taken(number)?;
     }
     Ok(())
 }
 
-fn begin(stranger: &mut Stranger, peer: NodeAddress) -> io::Result<()> {
-    if let Answer::Refused(why) = stranger.hello(SPARE, peer)? {
+fn begin(raw_peer: &mut RawPeer, peer: NodeAddress) -> io::Result<()> {
+    if let Answer::Refused(why) = raw_peer.hello(SPARE, peer)? {
         return Err(io::Error::other(why));
     }
-    stranger.begin_session(SPARE, peer)
+    raw_peer.begin_session(SPARE, peer)
 }
 
-fn header(says: Who, to: Tid, number: u64) -> Header {
-    let mut header = Header::new(Kind::named(Order::NAME), Tid::new(says.node(), OWN), to);
+fn header(claimed: TestNode, to: Tid, number: u64) -> Header {
+    let mut header = Header::new(Kind::named(Order::NAME), Tid::new(claimed.node(), OWN), to);
     (header.number, header.sequence) = (number as u16, number);
     header
 }

@@ -1,5 +1,5 @@
-//! The roles of users whom only the access list lets in: a guest, which does one thing to its node as often as it can, and a visitor, which is
-//! a member of as many groups as it may.
+//! The roles of users that only the access list admits. A guest does one thing to its node as often as it
+//! can. A visitor is a member of as many groups as it may be.
 
 use std::{
     io,
@@ -24,59 +24,62 @@ use sinew::{
 use sinew_runtime::wire::{Flags, Header, decode, encode};
 
 use super::{
-    super::{say, told},
-    stranger::{Frame, Said, Stranger},
+    super::{commands, print_line},
+    raw_connection::{Frame, NodeFrame, RawConnection},
 };
 
 payload!("guest.registration" => struct Registration { name: String });
 payload!("guest.membership" => struct Membership { group: u32, member: bool });
 
-/// Its user and its group; no account needs to have that number.
+/// User id and group id of the guest; no account needs to have this number.
 pub(crate) const GUEST: u32 = 54_321;
 /// The group that the access list grants it.
 pub(crate) const GRANTED: &str = "guest.news";
-/// Further users, whom the access list grants all groups. Two of them may be in as many together as are in a node's list (1,024): if that had
-/// those of the lowest addresses, whoever they are of, it would have none of the robot's own.
+/// Further users, to which the access list grants all groups. Two of them together may fill a node's group
+/// list (1,024). If that list kept the lowest addresses regardless of their owners, it would have no room for
+/// the robot's own groups.
 pub(crate) const VISITORS: [u32; 2] = [54_322, 54_323];
 
-/// Its clients at once at most: those that one process may have by default.
+/// Maximum number of its concurrent clients: the default limit per process.
 const CLIENTS_MAX: usize = 64;
-/// Groups of one client at most, as LNCL has it.
+/// Maximum number of groups of one client, as LNCL defines it.
 const GROUPS_MAX: u32 = 256;
-/// Clients of a visitor, each of which asks for as many groups as one client may have: two have all that is a user's share (512).
+/// Number of clients of a visitor. Each requests as many groups as one client may have; two of them use up
+/// the user's share (512).
 const VISITING: u32 = 3;
-/// The lowest address of a group: a node whose list has no room for all its groups names those first.
+/// The lowest group address: a node with a full list announces the lowest addresses first.
 const LOWEST_GROUP: u32 = 0xF000_0000;
-/// Frames that a client writes in one go. An even number: whoever joined has left at the end of them.
+/// Frames that a client writes in one go. The number is even, so that each join is followed by its leave.
 const BATCH: u32 = 32;
-/// Bytes of what it says to all.
+/// Length of a message to all, in bytes.
 const WORD_BYTES: usize = 1_000;
-/// Barriers at which one application may wait at once.
+/// Maximum number of barriers at which one application may wait at the same time.
 const WAITS_MAX: u32 = 16;
-/// Until it tries to have one client more, when it was refused.
+/// Delay before another client is tried after a refusal.
 const AGAIN: Duration = Duration::from_millis(20);
-/// Time for the answers to what it asks about groups: the node lets others have their turn in between.
-const PATIENCE: Duration = Duration::from_secs(5);
-/// Who waits for nothing has the CPU that is left.
+/// Timeout of the answers about groups: the node lets others have their turn in between.
+const READ_TIMEOUT: Duration = Duration::from_secs(5);
+/// Lowest priority: a client that never waits gets only the CPU time that is left.
 const NICEST: i32 = 19;
 
-/// What it came to.
+/// The counters.
 #[derive(Clone, Copy, Debug, Default)]
 struct Tally {
-    /// Clients at once; of those that go again at once, all.
+    /// Concurrent clients; if clients leave at once, their total number.
     clients: u64,
-    /// How often it did what it does.
+    /// Number of actions.
     done: u64,
-    /// Groups that it was let into, of those that its list does not grant.
+    /// Groups that it was admitted to but its list does not grant.
     granted: u64,
-    /// Connections that were refused, or ended by the node.
+    /// Connections that the node refused or closed.
     refused: u64,
-    /// Arrivals at barriers that the node refused because they were beyond its share, by the answers that came.
+    /// Arrivals at barriers that the node rejected because they exceeded the share, according to the answers.
     beyond: u64,
 }
 
-/// `SOCKET WHAT MILLISECONDS`: becomes the guest, and does that. Tells what it came to at its end: `CLIENTS DONE GRANTED REFUSED BEYOND`.
-pub(in crate::clients) fn play(arguments: &[String]) {
+/// `SOCKET WHAT MILLISECONDS`: becomes the guest, and does this. Prints its counters at its end: `CLIENTS
+/// DONE GRANTED REFUSED BEYOND`.
+pub(in crate::clients) fn run(arguments: &[String]) {
     let [socket, what, lasts] = arguments else { panic!("a socket, what, and how long, not {arguments:?}") };
     become_user(GUEST);
     let lasts = Duration::from_millis(lasts.parse().expect("a number"));
@@ -95,101 +98,103 @@ pub(in crate::clients) fn play(arguments: &[String]) {
         _ => panic!("{what:?} is nothing that a guest does"),
     }
     let Tally { clients, done, granted, refused, beyond } = guest.tally;
-    say(&format!("{clients} {done} {granted} {refused} {beyond}"));
+    print_line(&format!("{clients} {done} {granted} {refused} {beyond}"));
 }
 
-/// `SOCKET NUMBER`: becomes that one of the visitors, and asks for more groups at the lowest addresses than it may have. Tells how many it is
-/// in, and stays there until it is told to end.
-pub(in crate::clients) fn play_visitor(arguments: &[String]) {
+/// `SOCKET NUMBER`: becomes this visitor, and requests more groups at the lowest addresses than it may have.
+/// Prints the number of groups that it is in, and stays a member until it is asked to end.
+pub(in crate::clients) fn run_visitor(arguments: &[String]) {
     let [socket, number] = arguments else { panic!("a socket and a number, not {arguments:?}") };
     let number: u32 = number.parse().expect("a number");
     become_user(VISITORS[number as usize]);
     let (mut clients, mut granted) = (Vec::new(), 0);
     for client in 0..VISITING {
         let lowest = LOWEST_GROUP + (number * VISITING + client) * GROUPS_MAX;
-        // Who does not come in is in fewer groups, which is told.
+        // A client that is not admitted lowers the number of groups, which is printed.
         let Ok(Some(mut visitor)) = Client::register(Path::new(socket), "visitor", client) else { break };
         granted += visitor.join(lowest..lowest + GROUPS_MAX).unwrap_or_default();
         clients.push(visitor);
     }
-    say(&granted);
-    told().for_each(drop);
+    print_line(&granted);
+    commands().for_each(drop);
 }
 
-/// While there is one thread: each has a user of its own, as the kernel sees it, and takes over that of who starts it.
+/// Must run while there is only one thread: for the kernel each thread has its own user, inherited from its
+/// creator.
 fn become_user(user: u32) {
-    // It goes on as it is where the system refuses it.
+    // If the system refuses, the priority stays as it is.
     let _ = setpriority_process(None, NICEST);
-    set_thread_gid(Gid::from_raw(user)).expect("its director is root");
-    set_thread_uid(Uid::from_raw(user)).expect("its director is root");
+    set_thread_gid(Gid::from_raw(user)).expect("its scenario is root");
+    set_thread_uid(Uid::from_raw(user)).expect("its scenario is root");
 }
 
-/// One connection, and what is on its way to the node.
+/// A connection, and the bytes not yet written to the node.
 struct Client {
-    stranger: Stranger,
+    connection: RawConnection,
     name: String,
     bytes: Vec<u8>,
     written: usize,
-    /// How much is done when these are written.
+    /// Number of actions that count once these bytes are written.
     counts: u32,
-    /// What of the node's next frame has come.
+    /// The received part of the node's next frame.
     unread: Vec<u8>,
-    /// Arrivals beyond its share, by the answers.
+    /// Rejected arrivals beyond its share, according to the answers.
     beyond: u64,
 }
 
-/// What a client writes next, and how much that counts; nothing: it has done what it does.
+/// Returns the next bytes of a client, and the number of actions in them; empty: the client has finished.
 type Next<'a> = &'a mut dyn FnMut(Tid, &str) -> (Vec<u8>, u32);
 
 impl Client {
-    /// `None` if the node has no place for it, or lets it come later only.
+    /// `None` if the node has no free slot for it, or asks it to return later.
     fn register(socket: &Path, role: &str, number: u32) -> io::Result<Option<Self>> {
         let name = format!("{role}.{}.{number}", std::process::id());
-        let mut stranger = Stranger::connect(socket)?;
+        let mut connection = RawConnection::connect(socket)?;
         let wishes = Registration { name: name.clone() };
-        stranger.write(&Frame::of_lncl(Kind::LNCL_REGISTER, Tid::NONE, &wishes).bytes())?;
-        let Some(said) = stranger.read()? else { return Ok(None) };
-        if said.kind != Kind::LNCL_REGISTERED {
+        connection.write(&Frame::of_lncl(Kind::LNCL_REGISTER, Tid::NONE, &wishes).bytes())?;
+        let Some(answer) = connection.read()? else { return Ok(None) };
+        if answer.kind != Kind::LNCL_REGISTERED {
             return Ok(None);
         }
-        stranger.tid = Tid::from_bits(said.source);
+        connection.tid = Tid::from_bits(answer.source);
         let (bytes, unread) = (Vec::new(), Vec::new());
-        Ok(Some(Self { stranger, name, bytes, written: 0, counts: 0, unread, beyond: 0 }))
+        Ok(Some(Self { connection, name, bytes, written: 0, counts: 0, unread, beyond: 0 }))
     }
 
-    /// Asks to be a member of these, and waits for the answers: how many said yes.
+    /// Requests membership in these groups, and waits for the answers. Returns how many were granted.
     fn join(&mut self, groups: impl Iterator<Item = u32>) -> io::Result<u64> {
         let lncl = Tid::new(NodeAddress::HERE, AppAddress::LNCL);
         let (mut bytes, mut asked) = (Vec::new(), 0);
         for group in groups {
-            let mut header = Header::new(Kind::LNCL_GROUP, self.stranger.tid, lncl);
+            let mut header = Header::new(Kind::LNCL_GROUP, self.connection.tid, lncl);
             asked += 1;
             (header.flags, header.correlation) = (Flags::CONFIRM, asked);
             bytes.extend(Frame::new(&header, encode(&Membership { group, member: true }).to_vec()).bytes());
         }
-        self.stranger.stream.set_read_timeout(Some(PATIENCE))?;
-        self.stranger.write(&bytes)?;
+        self.connection.stream.set_read_timeout(Some(READ_TIMEOUT))?;
+        self.connection.write(&bytes)?;
         let mut granted = 0;
         for _ in 0..asked {
-            let said = self.stranger.read()?.ok_or(io::ErrorKind::UnexpectedEof)?;
+            let answer = self.connection.read()?.ok_or(io::ErrorKind::UnexpectedEof)?;
             // Delivered.
-            granted += u64::from(said.kind == Kind::OUTCOME && said.payload == [0]);
+            granted += u64::from(answer.kind == Kind::OUTCOME && answer.payload == [0]);
         }
         Ok(granted)
     }
 
-    /// Writes as much as the socket takes at once, and reads what the node says. Returns how much is done by that.
+    /// Writes as much as the socket accepts, and reads from the node. Returns the number of completed
+    /// actions.
     fn go_on(&mut self, next: Next<'_>) -> io::Result<u32> {
         self.listen()?;
         if self.written == self.bytes.len() {
-            (self.bytes, self.counts) = next(self.stranger.tid, &self.name);
+            (self.bytes, self.counts) = next(self.connection.tid, &self.name);
             self.written = 0;
         }
         if self.bytes.is_empty() {
             return Ok(0);
         }
         let flags = SendFlags::DONTWAIT | SendFlags::NOSIGNAL;
-        match send(&self.stranger.stream, &self.bytes[self.written..], flags) {
+        match send(&self.connection.stream, &self.bytes[self.written..], flags) {
             Ok(count) => self.written += count,
             Err(Errno::AGAIN) => {}
             Err(error) => return Err(error.into()),
@@ -197,19 +202,19 @@ impl Client {
         Ok(if self.written == self.bytes.len() { self.counts } else { 0 })
     }
 
-    /// Counts what was beyond its share, and throws away what else has come.
+    /// Counts rejections beyond its share, and discards everything else that has arrived.
     fn listen(&mut self) -> io::Result<()> {
         let mut bytes = [0_u8; 16 << 10];
         loop {
-            match recv(&self.stranger.stream, &mut bytes[..], RecvFlags::DONTWAIT) {
+            match recv(&self.connection.stream, &mut bytes[..], RecvFlags::DONTWAIT) {
                 Ok((_, 0)) => return Err(io::ErrorKind::UnexpectedEof.into()),
                 Ok((_, count)) => self.unread.extend_from_slice(&bytes[..count]),
                 Err(Errno::AGAIN) => return Ok(()),
                 Err(error) => return Err(error.into()),
             }
             let mut read = 0;
-            while let Some((said, length)) = Said::first_of(&self.unread[read..]) {
-                self.beyond += u64::from(is_beyond_share(&said));
+            while let Some((frame, length)) = NodeFrame::first_of(&self.unread[read..]) {
+                self.beyond += u64::from(is_beyond_share(&frame));
                 read += length;
             }
             self.unread.drain(..read);
@@ -217,22 +222,23 @@ impl Client {
     }
 }
 
-/// Whether an arrival was refused for what users that are not the node's own may have, of which all such answers speak.
-fn is_beyond_share(said: &Said) -> bool {
-    said.kind == BarrierAnswer::KIND
-        && matches!(decode(&said.payload), Ok(BarrierAnswer::Refused { why }) if why.contains("other user"))
+/// Returns whether an arrival was rejected because of the share of foreign users, which all such answers
+/// mention.
+fn is_beyond_share(frame: &NodeFrame) -> bool {
+    frame.kind == BarrierAnswer::KIND
+        && matches!(decode(&frame.payload), Ok(BarrierAnswer::Refused { why }) if why.contains("other user"))
 }
 
 struct Guest {
     socket: PathBuf,
     end: Instant,
-    /// Names that it has asked for.
+    /// Number of names requested so far.
     names: u32,
     tally: Tally,
 }
 
 impl Guest {
-    /// Joins the group that it may be in, and some that it may not, and leaves them again.
+    /// Joins the group that it may join and some that it may not, and leaves them again.
     fn toggle_groups(&mut self) {
         let mut turn = 0;
         self.crowd(
@@ -250,7 +256,7 @@ impl Guest {
         );
     }
 
-    /// Is a member of as many groups as it is let, at the lowest addresses that there are.
+    /// Joins as many groups as allowed, at the lowest addresses.
     fn fill_groups(&mut self) {
         self.crowd(
             |client, number| {
@@ -261,7 +267,7 @@ impl Guest {
         );
     }
 
-    /// Arrives at one barrier after the other, each of another name, and waits at none of them for more than a millisecond.
+    /// Arrives at one barrier after the other, each with a new name, and waits at most a millisecond at each.
     fn arrive_everywhere(&mut self) {
         let mut barriers = 0_u64;
         self.crowd(|_, _| (0, Ok(0)), &mut |tid, name| {
@@ -283,7 +289,7 @@ impl Guest {
         });
     }
 
-    /// Sends what nobody knows to each application of each node.
+    /// Sends messages of an unknown kind to each application of each node.
     fn say_to_all(&mut self) {
         self.crowd(|_, _| (0, Ok(0)), &mut |tid, _| {
             let header = Header::new(Kind::named("guest.word"), tid, Tid::BROADCAST);
@@ -292,10 +298,10 @@ impl Guest {
         });
     }
 
-    /// Connects and closes, and beside that registers and leaves.
+    /// Connects and closes, and also registers and leaves.
     fn come_and_go(&mut self) {
         let (socket, end) = (self.socket.clone(), self.end);
-        // Before all that it may is used up by who only connects.
+        // Registers first, before the mere connections use up its share.
         let first = matches!(Client::register(&socket, "guest", 0), Ok(Some(_)));
         let registering = thread::spawn(move || {
             let mut tally = Tally::default();
@@ -317,8 +323,8 @@ impl Guest {
         self.tally.done += closed + 1;
     }
 
-    /// Has as many clients as the node lets it. Each does at first one thing, which says how much of it was done and how much granted, and then
-    /// what is next, again and again.
+    /// Runs as many clients as the node admits. Each performs a first action, which returns the number of
+    /// actions and of grants, and then repeats the next one.
     fn crowd(
         &mut self,
         mut at_first: impl FnMut(&mut Client, u32) -> (u64, io::Result<u64>),

@@ -1,5 +1,5 @@
-//! The hostile end of rings, to the node or to another process: writes what it likes into all that it may write. The layout is
-//! in `docs/decisions/0010-shared-memory.md`.
+//! The hostile end of rings, connected to the node or to another process. It writes arbitrary data into all
+//! memory that it may write. The layout is in `docs/decisions/0010-shared-memory.md`.
 
 use std::{
     io,
@@ -20,19 +20,19 @@ use sinew::{Tid, message::Kind, payload};
 use sinew_runtime::wire::decode;
 use sinew_shm::{BellKind, Capacity, Offer, Producer, Region, Terms};
 
-use super::stranger::{Frame, Stranger};
-use crate::dice::Dice;
+use super::raw_connection::{Frame, RawConnection};
+use sinew_testkit::random::SeededRandom;
 
 payload!("hostile.ring" => struct WithRing { ring: bool, direct: bool });
 
-/// What is looked at of the node's answer.
+/// The fields of the node's answer that are used.
 #[derive(serde::Deserialize)]
 struct Answer {
     #[serde(default)]
     ring: Option<u32>,
 }
 
-/// Words of a region, by their place in it.
+/// Word offsets in a region.
 const TAIL: u32 = 128 / 4;
 const HEAD: u32 = 256 / 4;
 const SLEEPS: [u32; 2] = [384 / 4, 512 / 4];
@@ -40,46 +40,46 @@ const HEADER_BYTES: u32 = 4096;
 const MESSAGE: u32 = 0xDA7A_0001;
 const SKIP: [u32; 2] = [0, 0x5C1B_0002];
 
-/// A link whose node has offered its memory.
+/// A link with a node that has offered its memory.
 pub(super) struct HostileRing {
-    pub(super) stranger: Stranger,
+    pub(super) connection: RawConnection,
     end: RingEnd,
 }
 
-/// One end of a pair of rings; the other has offered its memory.
+/// One end of a pair of rings. The peer has offered its memory.
 pub(super) struct RingEnd {
     capacity: u32,
     region: Region,
-    /// What the other has offered: its memory, its bells.
+    /// The memory and the bells offered by the peer.
     victim: Offer,
-    /// What wakes one that sleeps at a futex.
+    /// Wakes a peer that sleeps on a futex.
     ringer: Option<Producer>,
-    /// A second descriptor of the own memory, for what the seals must not let through.
+    /// A second descriptor of the own memory, used for operations that the seals must forbid.
     key: OwnedFd,
     tail: u32,
 }
 
-/// Registers and asks for rings; returns the length of a ring.
-pub(super) fn ask_for_rings(socket: &Path) -> io::Result<(Stranger, Offer, Capacity)> {
-    let mut stranger = Stranger::connect(socket)?;
+/// Registers and requests rings. Returns the length of a ring.
+pub(super) fn ask_for_rings(socket: &Path) -> io::Result<(RawConnection, Offer, Capacity)> {
+    let mut connection = RawConnection::connect(socket)?;
     let wish = Frame::of_lncl(Kind::LNCL_REGISTER, Tid::NONE, &WithRing { ring: true, direct: true });
-    stranger.write(&wish.bytes())?;
-    let said = stranger.read()?.ok_or(io::ErrorKind::UnexpectedEof)?;
-    stranger.tid = Tid::from_bits(said.source);
-    let answer: Answer = decode(&said.payload).map_err(io::Error::other)?;
-    // A refusal has no such field, nor has the answer of a node without rings.
+    connection.write(&wish.bytes())?;
+    let frame = connection.read()?.ok_or(io::ErrorKind::UnexpectedEof)?;
+    connection.tid = Tid::from_bits(frame.source);
+    let answer: Answer = decode(&frame.payload).map_err(io::Error::other)?;
+    // A refusal has no such field, and neither has the answer of a node without rings.
     let bytes = answer.ring.ok_or(io::ErrorKind::Unsupported)?;
     let capacity = Capacity::new(u64::from(bytes).next_power_of_two()).map_err(io::Error::other)?;
-    let offer = Offer::receive(&stranger.stream).map_err(io::Error::other)?.map_err(io::Error::other)?;
-    Ok((stranger, offer, capacity))
+    let offer = Offer::receive(&connection.stream).map_err(io::Error::other)?.map_err(io::Error::other)?;
+    Ok((connection, offer, capacity))
 }
 
 impl HostileRing {
-    /// A link as an honest client makes it.
+    /// Sets up a link as an honest client does.
     pub(super) fn join(socket: &Path) -> io::Result<Self> {
-        let (stranger, victim, capacity) = ask_for_rings(socket)?;
-        let end = RingEnd::offer(&stranger.stream, victim, capacity, BellKind::Socket)?;
-        Ok(Self { stranger, end })
+        let (connection, victim, capacity) = ask_for_rings(socket)?;
+        let end = RingEnd::offer(&connection.stream, victim, capacity, BellKind::Socket)?;
+        Ok(Self { connection, end })
     }
 }
 
@@ -98,7 +98,7 @@ impl DerefMut for HostileRing {
 }
 
 impl RingEnd {
-    /// Offers own memory over `socket` to who has offered `victim`.
+    /// Offers own memory over `socket` to the peer that has offered `victim`.
     pub(super) fn offer(
         socket: impl AsFd,
         victim: Offer,
@@ -111,18 +111,18 @@ impl RingEnd {
         Self::of(region, key, victim, capacity)
     }
 
-    /// The end whose own memory is `region`, which is offered, with a second descriptor of it.
+    /// The end with `region` as its own memory, which has been offered, and with a second descriptor of it.
     pub(super) fn of(region: Region, key: OwnedFd, victim: Offer, capacity: Capacity) -> io::Result<Self> {
         let ringer = ringer(&victim)?;
         Ok(Self { capacity: capacity.bytes(), region, victim, ringer, key, tail: 0 })
     }
 
-    /// Bytes of the longest record that an honest side writes.
+    /// Maximum length of a record written by an honest side, in bytes.
     pub(super) const fn record_max(&self) -> usize {
         self.capacity as usize / 2 - 8
     }
 
-    /// A word of the other's memory.
+    /// Reads a word of the peer's memory.
     fn read_word(&self, place: u32) -> io::Result<u32> {
         let mut word = [0; 4];
         pread(&self.victim.descriptors()[0], &mut word, u64::from(place * 4))?;
@@ -135,7 +135,7 @@ impl RingEnd {
         self.region.scribble(place + 1, mark[1]);
     }
 
-    /// Publishes a record as an honest client does; `false` if the other has not taken enough yet.
+    /// Publishes a record as an honest client does; `false` if the peer has not consumed enough yet.
     pub(super) fn publish(&mut self, bytes: &[u8]) -> io::Result<bool> {
         let length = u32::try_from(bytes.len()).map_err(io::Error::other)?;
         let record = 8 + length.next_multiple_of(8);
@@ -156,30 +156,30 @@ impl RingEnd {
         }
         self.put_mark(start, [length, MESSAGE]);
         self.tail = start.wrapping_add(record);
-        // What was written before is seen before, or not; whoever is hostile does not care.
+        // Without memory ordering: earlier writes may become visible later. A hostile client does not care.
         self.region.scribble(TAIL, self.tail);
         self.press(1)?;
         Ok(true)
     }
 
-    /// Takes all that the other has published, unread.
+    /// Consumes everything that the peer has published, without reading it.
     pub(super) fn take(&mut self) -> io::Result<()> {
         let head = self.read_word(TAIL)?;
         self.region.scribble(HEAD, head);
         self.press(2)
     }
 
-    /// Whether the other's bells are sockets.
+    /// Returns whether the peer's bells are sockets.
     pub(super) fn has_bells(&self) -> bool {
         self.victim.bell() == BellKind::Socket
     }
 
-    /// The socket of the other's bell number `bell`, from 1 on.
+    /// The socket of the peer's bell with number `bell`, from 1 on.
     pub(super) fn bell(&self, bell: usize) -> io::Result<UnixStream> {
         Ok(self.victim.descriptors()[bell].try_clone()?.into())
     }
 
-    /// Rings one of the other's bells.
+    /// Rings one of the peer's bells.
     fn press(&self, bell: usize) -> io::Result<()> {
         if let Some(ringer) = &self.ringer {
             ringer.ring();
@@ -187,16 +187,16 @@ impl RingEnd {
         }
         let Some(button) = self.victim.descriptors().get(bell) else { return Ok(()) };
         match send(button, &[1], SendFlags::DONTWAIT | SendFlags::NOSIGNAL) {
-            // It has been rung often enough.
+            // The bell has been rung often enough.
             Ok(_) | Err(rustix::io::Errno::AGAIN) => Ok(()),
             Err(error) => Err(error.into()),
         }
     }
 
-    /// One thing that no honest client does.
-    pub(super) fn lie(&mut self, dice: &mut Dice) -> io::Result<()> {
-        let (value, small) = (dice.roll() as u32, dice.below(600));
-        match dice.below(11) {
+    /// Does one thing that an honest client never does.
+    pub(super) fn lie(&mut self, random: &mut SeededRandom) -> io::Result<()> {
+        let (value, small) = (random.number() as u32, random.below(600));
+        match random.below(11) {
             0 => self.region.scribble(TAIL, value),
             1 => self.region.scribble(HEAD, value),
             2 => self.region.scribble(TAIL, self.tail.wrapping_add(small)),
@@ -207,13 +207,13 @@ impl RingEnd {
             7 => (0..small).try_for_each(|_| self.press(1 + small as usize % 2))?,
             8 => self.try_the_keys(value),
             9 => self.forge_bells(value, small)?,
-            // Any place: bytes of some message, perhaps while they are read.
-            _ => self.region.scribble(value, dice.roll() as u32),
+            // Any place: bytes of some message, possibly while they are read.
+            _ => self.region.scribble(value, random.number() as u32),
         }
         self.press(1 + small as usize % 2)
     }
 
-    /// Counts on the page of a futex that nobody has rung for.
+    /// Changes counters on the page of a futex without ringing.
     fn forge_bells(&self, value: u32, small: u32) -> io::Result<()> {
         if self.ringer.is_some() {
             let (page, word) = (&self.victim.descriptors()[1], small % 64);
@@ -222,7 +222,7 @@ impl RingEnd {
         Ok(())
     }
 
-    /// What the seals must not let through.
+    /// Tries operations that the seals must forbid.
     fn try_the_keys(&self, value: u32) {
         for key in [&self.key, &self.victim.descriptors()[0]] {
             let hole = FallocateFlags::PUNCH_HOLE | FallocateFlags::KEEP_SIZE;
@@ -236,7 +236,7 @@ impl RingEnd {
     }
 }
 
-/// What wakes the one who has made this offer, if it sleeps at a futex: only who has mapped its page can do that.
+/// Wakes the process that has made this offer if it sleeps on a futex. This requires a mapping of its page.
 fn ringer(victim: &Offer) -> io::Result<Option<Producer>> {
     if victim.bell() != BellKind::Futex {
         return Ok(None);

@@ -1,47 +1,49 @@
-//! Whether others felt the kills: their p99 beside that of segments in which nobody ends, and in which as many end in order.
+//! Whether the others were slowed down by the kills: their p99 compared with segments without ends, and with
+//! as many orderly ends.
 
 use std::{fmt, time::Duration};
 
 use crate::clients::steady::Window;
 
-/// The p99 with kills is so many times as long as either other one at most: more than this is felt.
+/// Maximum ratio of the p99 with kills to either other p99. A higher ratio counts as a slowdown.
 const RATIO_MAX: f64 = 1.1;
-/// Round trips below which a p99 is not believed: a hundred are above it.
+/// Minimum number of round trips for a p99: a hundred of them are above it.
 const COUNT_MIN: u64 = 10_000;
-/// What is noise in any case: two halves that happen to be alike do not say that there is none.
+/// Minimum noise to assume: two halves that happen to be equal do not prove that there is none.
 const NOISE_MIN: f64 = 1.05;
-/// The limit is for ends that follow each other no sooner.
+/// The limit applies only to ends at least this far apart.
 const SPACING_MIN: Duration = Duration::from_secs(1);
 
-/// What the p99 of others says.
+/// The evaluation of the p99 of the others.
 #[derive(Clone, Copy, Debug)]
 pub struct Felt {
-    /// With kills, of that while nobody ends, and of that with orderly ends.
+    /// Ratio of the p99 with kills to that without ends, and to that with orderly ends.
     ratios: [f64; 2],
-    /// While nobody ends, in every other segment, and in those between, in microseconds.
+    /// p99 without ends, in every other segment and in those between, in microseconds.
     halves: [u64; 2],
     is_enough: bool,
-    /// One process ended in each such time.
+    /// One process ended in each such interval.
     spacing: Duration,
 }
 
-/// Whether the limit is kept.
+/// The verdict on the limit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// It is.
+    /// The limit is kept.
     Kept,
-    /// It is broken, by no more than two halves of one sort of segments differ.
+    /// The limit is exceeded, but by no more than two halves of one kind of segments differ.
     Noise,
-    /// It is broken by more than that.
+    /// The limit is exceeded by more than that.
     Broken,
-    /// The same, where processes ended faster than the limit is for.
+    /// The same, but processes ended faster than the limit allows for.
     Crowded,
-    /// Nobody knows: there were too few round trips.
+    /// Unknown: there were too few round trips.
     TooFew,
 }
 
 impl Felt {
-    /// Of the round trips while nobody ends, with orderly ends, and with kills, one in each `spacing`; and of two halves of the first.
+    /// From the round trips without ends, with orderly ends, and with kills, one in each `spacing`, and from
+    /// two halves of the first.
     pub(super) fn new(windows: &[Window; 3], halves: &[Window; 2], spacing: Duration) -> Self {
         let [quiet, in_order, killed] = windows;
         let ratio = |reference: &Window| killed.p99_us as f64 / reference.p99_us.max(1) as f64;
@@ -53,13 +55,14 @@ impl Felt {
         }
     }
 
-    /// How much longer one half's p99 is than the other's: they would be one, were there no chance. One draw of it: at least [`NOISE_MIN`].
+    /// Ratio of the higher to the lower p99 of the halves, at least [`NOISE_MIN`]. Without noise both would
+    /// be equal; this is one sample of it.
     fn noise(&self) -> f64 {
         let [one, other] = self.halves;
         (one.max(other) as f64 / one.min(other).max(1) as f64).max(NOISE_MIN)
     }
 
-    /// Whether the p99 with kills is within 10 % of both others, as far as can be said.
+    /// Returns whether the p99 with kills is within 10 % of both others, as far as can be known.
     #[must_use]
     pub fn verdict(&self) -> Verdict {
         let worst = self.ratios[0].max(self.ratios[1]);
@@ -117,14 +120,14 @@ mod tests {
     }
 
     #[test]
-    fn a_tenth_longer_than_both_references_is_within_the_limit() {
-        // A thousand kills at rest, as `docs/performance/shared-memory.md` has them.
+    fn ten_percent_above_both_references_is_within_limit() {
+        // A thousand kills on an idle machine, from `docs/performance/log/shared-memory.md`.
         assert_eq!(felt([200, 215, 218], [201, 199]).verdict(), Verdict::Kept);
         assert_eq!(felt([200, 200, 220], [200, 200]).verdict(), Verdict::Kept);
     }
 
     #[test]
-    fn more_than_a_tenth_longer_than_either_reference_is_felt() {
+    fn more_than_ten_percent_above_a_reference_breaks_limit() {
         for windows in [[200, 240, 240], [240, 200, 240], [163, 1_605, 1_858]] {
             let felt = felt(windows, [201, 199]);
             assert_eq!(felt.verdict(), Verdict::Broken, "{felt}");
@@ -133,33 +136,33 @@ mod tests {
     }
 
     #[test]
-    fn what_two_halves_of_one_sort_differ_by_is_noise_and_more_than_that_is_felt() {
+    fn excess_beyond_difference_of_halves_breaks_limit() {
         assert_eq!(felt([200, 200, 240], [180, 200]).verdict(), Verdict::Noise);
         assert_eq!(felt([200, 200, 240], [200, 180]).verdict(), Verdict::Noise);
         assert_eq!(felt([200, 200, 250], [200, 180]).verdict(), Verdict::Broken);
     }
 
     #[test]
-    fn of_too_few_round_trips_nothing_is_said() {
+    fn too_few_round_trips_give_no_verdict() {
         let few = |p99_us| Window { count: COUNT_MIN - 1, ..window(p99_us) };
         for index in 0..3 {
             let mut windows = [200, 200, 900].map(window);
             windows[index] = few(windows[index].p99_us);
             assert_eq!(Felt::new(&windows, &[200, 200].map(window), SPACING_MIN).verdict(), Verdict::TooFew);
         }
-        // The other half has no segment in the suite's short form.
+        // In the suite's short form the other half has no segment.
         let halves = [window(200), Window::default()];
         assert_eq!(Felt::new(&[200, 200, 900].map(window), &halves, SPACING_MIN).verdict(), Verdict::TooFew);
     }
 
     #[test]
-    fn halves_that_happen_to_be_alike_do_not_say_that_there_is_no_noise() {
+    fn equal_halves_still_allow_minimum_noise() {
         assert_eq!(felt([200, 200, 230], [200, 200]).verdict(), Verdict::Noise);
         assert_eq!(felt([200, 200, 232], [200, 200]).verdict(), Verdict::Broken);
     }
 
     #[test]
-    fn ends_that_come_faster_than_the_limit_is_for_are_not_judged_by_it() {
+    fn limit_does_not_apply_to_faster_ends() {
         let felt =
             |p99_us, spacing| Felt::new(&[200, 200, p99_us].map(window), &[200, 200].map(window), spacing);
         let fast = SPACING_MIN - Duration::from_millis(1);

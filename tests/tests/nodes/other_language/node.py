@@ -121,7 +121,7 @@ udp.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
 group_address = (group.split(":")[0], int(group.split(":")[1]))
 announcement = {"project": project, "node": here, "name": "python", "incarnation": incarnation, "boot_nonce": boot_nonce,
                 "gncl_ip": here, "gncl_port": listener.getsockname()[1], "period_us": int(period * 1e6)}
-askers = {}  # node: its address
+requesters = {}  # node: its address
 
 
 def ask_the_group():
@@ -138,9 +138,9 @@ def read_datagram():
     them, _ = unpack(query.payload)
     if them["project"] != project or them["boot_nonce"] == boot_nonce or query.source != them["node"] << 32 | NDL:
         return
-    if them["node"] not in askers:
+    if them["node"] not in requesters:
         say("asked by", them["name"])
-    askers[them["node"]] = address
+    requesters[them["node"]] = address
     answer = {"announcement": announcement, "query_sent_ns": query.sent, "query_received_ns": received}
     udp.sendto(frame(ANSWER, here << 32 | NDL, query.source, pack(answer), REPLY, correlation=query.correlation), address)
 
@@ -423,7 +423,7 @@ while not is_done():
 # In order (NDL-4.4, GNCL-10): what the peer has sent is acknowledged, then it is said to all that we leave.
 for link in links:
     link.session.acknowledge()
-for node, address in askers.items():
+for node, address in requesters.items():
     udp.sendto(frame(LEAVE, here << 32 | NDL, node << 32 | NDL, pack(announcement)), address)
 for link in links:
     link.own(GOODBYE)

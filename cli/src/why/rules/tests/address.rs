@@ -1,8 +1,8 @@
-//! An address that two processes have, or had.
+//! A node address that two processes have, or had.
 
 use super::*;
 
-/// The hip has refused a second process with the knee's address so long ago, in microseconds.
+/// The hip refused a second process with the knee's address this long ago, in microseconds.
 fn claimed(ago_us: u64) -> Facts {
     let mut facts = free();
     let cause = "NDL node address used twice".to_owned();
@@ -17,34 +17,34 @@ fn step(facts: &Facts) -> Option<Step> {
 }
 
 #[test]
-fn an_address_that_was_used_twice_and_is_not_any_more_is_a_note() {
-    // Given: nobody has claimed it for 20 s, all links are up, and messages are confirmed both ways
+fn resolved_duplicate_address_is_a_note() {
+    // Given: no process has claimed it for 20 s, all links are up, and messages are confirmed both ways
     let facts = claimed(20_000_000);
     // When
     let note = step(&facts).expect("it is told");
     // Then
     assert_eq!(note.state, State::Note, "{note:?}");
-    assert!(note.seen.starts_with("seen once, 20.0 s ago; over since: 10.0.0.2 is that of"), "{note:?}");
+    assert!(note.detail.starts_with("seen once, 20.0 s ago; over since: 10.0.0.2 is that of"), "{note:?}");
     assert!(judge(&facts).iter().all(|step| step.state != State::Blocked));
-    // And: of several times it is the last one that is told, and of one that is long ago nothing
+    // And: of several claims the latest is reported, and claims of long ago are omitted
     let mut facts = claimed(20_000_000);
     hip(&mut facts).refusals[0].count = 9;
-    assert!(step(&facts).expect("it is told").seen.starts_with("seen last 20.0 s ago; over since"));
+    assert!(step(&facts).expect("it is told").detail.starts_with("seen last 20.0 s ago; over since"));
     assert_eq!(step(&claimed(60_000_000)), None);
 }
 
 #[test]
-fn an_address_that_is_claimed_still_stands_in_the_way_though_messages_pass() {
+fn recent_claim_blocks_although_messages_pass() {
     assert_eq!(step(&claimed(4_999_999)).map(|step| step.state), Some(State::Blocked));
     assert_eq!(step(&claimed(5_000_000)).map(|step| step.state), Some(State::Note));
-    // A node that asks more rarely refuses it more rarely.
+    // A node that queries less often also refuses the claim less often.
     let mut facts = claimed(20_000_000);
     hip(&mut facts).peers[0].asked_every_us = Some(5_000_001);
     assert_eq!(step(&facts).map(|step| step.state), Some(State::Blocked));
 }
 
 #[test]
-fn an_address_that_was_used_twice_stands_in_the_way_while_messages_do_not_pass() {
+fn duplicate_address_blocks_while_messages_do_not_pass() {
     let changes: [fn(&mut Facts); 5] = [
         |facts| facts.pings[0] = Some(Err("no answer within 2s".to_owned())),
         |facts| facts.pings[1] = Some(Err("no answer within 2s".to_owned())),
@@ -57,7 +57,7 @@ fn an_address_that_was_used_twice_stands_in_the_way_while_messages_do_not_pass()
         change(&mut facts);
         assert_eq!(step(&facts).map(|step| step.state), Some(State::Blocked), "case {number}");
     }
-    // What was not tried, or is refused to this command alone, says nothing against it.
+    // A ping that was not tried, or was refused only to this command, is no evidence against it.
     for ping in [None, Some(Err(Rejection::NotAllowed.to_string()))] {
         let mut facts = claimed(20_000_000);
         facts.pings[0] = ping;

@@ -1,18 +1,18 @@
-//! Each thing that can stand in a way, what is said of it, and what mends it.
+//! Each possible obstacle, with its reported text and suggested fix.
 
 use super::*;
 
-/// What stands in the way of facts that were changed so: the step, what is seen, what mends it.
+/// A change to the facts, and the expected blocking step: its name, its detail, its suggested fix.
 struct Case(fn(&mut Facts), [&'static str; 3]);
 
 const CASES: &[Case] = &[
     Case(
-        |facts| facts.ends[1] = End { wanted: "ankle".to_owned(), ..End::default() },
+        |facts| facts.ends[1] = TrafficEnd { wanted: "ankle".to_owned(), ..TrafficEnd::default() },
         ["ankle is there", "'ankle'", "sinew apps"],
     ),
     Case(
         |facts| {
-            facts.ends[1] = End { wanted: "ankle".to_owned(), ..End::default() };
+            facts.ends[1] = TrafficEnd { wanted: "ankle".to_owned(), ..TrafficEnd::default() };
             let cause = "NDL node address used twice".to_owned();
             let detail = "10.0.0.9 is that of the node 'arm' at 10.0.0.9:7000; the node 'ankle' at 10.0.0.8:7000 claims it".to_owned();
             hip(facts).refusals.push(RefusalReport { cause, count: 1, detail, ago_us: 90_000_000 });
@@ -25,7 +25,7 @@ const CASES: &[Case] = &[
     ),
     Case(
         |facts| {
-            facts.ends[1] = End { wanted: "ankle".to_owned(), ..End::default() };
+            facts.ends[1] = TrafficEnd { wanted: "ankle".to_owned(), ..TrafficEnd::default() };
             hip(facts).peers.clear();
         },
         [
@@ -36,7 +36,7 @@ const CASES: &[Case] = &[
     ),
     Case(
         |facts| {
-            facts.ends[1] = End { wanted: "ankle".to_owned(), ..End::default() };
+            facts.ends[1] = TrafficEnd { wanted: "ankle".to_owned(), ..TrafficEnd::default() };
             hip(facts).peers.clear();
             hip(facts).interface = "127.0.0.1".to_owned();
         },
@@ -159,7 +159,7 @@ const CASES: &[Case] = &[
         |facts| {
             strangers(facts);
             asks(knee(facts), &["239.0.0.2:7000"]);
-            // It is of a version that says one group alone.
+            // Its version reports only one group.
             hip(facts).groups.clear();
         },
         ["hip knows knee.drive", "in the group 239.0.0.1:7000, the other in 239.0.0.2", "same `multicast`"],
@@ -202,7 +202,7 @@ const CASES: &[Case] = &[
         },
         ["hip knows knee.drive", "the other in [ff12::1]:7000", "both of IPv6"],
     ),
-    // Its groups are of no use to whom nothing of it reaches.
+    // Groups do not help if no datagram reaches the other node.
     Case(
         |facts| {
             strangers(facts);
@@ -252,8 +252,8 @@ const CASES: &[Case] = &[
         },
         [
             "hip is connected to knee.drive",
-            "control down, broken 2.0 s ago; 5 dials in vain",
-            "nobody listens at 10.0.0.2:7001",
+            "control down, broken 2.0 s ago; 5 failed dials",
+            "nothing listens at 10.0.0.2:7001",
         ],
     ),
     Case(
@@ -297,9 +297,9 @@ const CASES: &[Case] = &[
     Case(
         |facts| {
             facts.ends[1].report = None;
-            facts.shut.push("the socket /run/knee.sock lets nobody in".to_owned());
+            facts.shut.push("the socket /run/knee.sock does not accept this command".to_owned());
         },
-        ["knee.drive is there", "/run/knee.sock lets nobody in", "is it running"],
+        ["knee.drive is there", "/run/knee.sock does not accept this command", "is it running"],
     ),
     Case(
         |facts| facts.pings[0] = Some(Err("no answer within 2s".to_owned())),
@@ -308,16 +308,16 @@ const CASES: &[Case] = &[
 ];
 
 #[test]
-fn whatever_stands_in_the_way_is_named_with_what_mends_it() {
-    for (number, Case(change, [what, seen, mend])) in CASES.iter().enumerate() {
+fn every_obstacle_is_reported_with_its_fix() {
+    for (number, Case(change, [what, detail, fix])) in CASES.iter().enumerate() {
         let mut facts = free();
         change(&mut facts);
         let steps = judge(&facts);
         let blocked: Vec<_> = steps.iter().filter(|step| step.state == State::Blocked).collect();
         let is_it = |step: &&&Step| {
             step.what.contains(what)
-                && step.seen.contains(seen)
-                && step.mend.as_ref().is_some_and(|said| said.contains(mend))
+                && step.detail.contains(detail)
+                && step.fix.as_ref().is_some_and(|text| text.contains(fix))
         };
         assert!(blocked.iter().any(|step| is_it(&step)), "case {number}, {what}: {blocked:#?}");
     }

@@ -1,4 +1,4 @@
-//! Keys that one of two nodes has and the other has not, that are not of one project, or that are revoked.
+//! Keys that only one of two nodes has, keys of different projects, and revoked keys.
 
 use sinew::inspect::{CertificateReport, SecurityReport};
 
@@ -24,16 +24,16 @@ fn refuse(report: &mut NodeReport, cause: &str, detail: &str) {
     report.refusals.push(RefusalReport { cause, count: 3, detail, ago_us: 1_000_000 });
 }
 
-/// The steps in the way: what, what is seen, what mends it.
+/// The blocking steps: name, detail, suggested fix.
 fn blocked(facts: &Facts) -> Vec<(String, String, String)> {
     let steps = judge(facts).into_iter().filter(|step| step.state == State::Blocked);
-    steps.map(|step| (step.what, step.seen, step.mend.unwrap_or_default())).collect()
+    steps.map(|step| (step.what, step.detail, step.fix.unwrap_or_default())).collect()
 }
 
 #[test]
-fn nodes_of_which_one_has_keys_are_told_so_with_the_command_and_no_firewall_is_blamed() {
+fn keys_on_one_node_only_are_the_cause() {
     for is_hip_secured in [true, false] {
-        // Given: a seed names it, and no answer has come
+        // Given: a seed names the other node, and no answer has arrived
         let mut facts = free();
         strangers(&mut facts);
         hip(&mut facts).seeds.push("10.0.0.2:7000".to_owned());
@@ -49,18 +49,19 @@ fn nodes_of_which_one_has_keys_are_told_so_with_the_command_and_no_firewall_is_b
         // Then
         let (secured, other, address) =
             if is_hip_secured { ("hip", "knee", "10.0.0.2") } else { ("knee", "hip", "10.0.0.1") };
-        let (_, seen, mend) = told.iter().find(|(what, ..)| what.contains("both have keys")).expect("a step");
-        assert!(seen.starts_with(&format!("{secured} has keys, and {other} has none")), "{seen}");
-        assert!(mend.contains(&format!("sinew keys issue {other}={address} --keys DIR")), "{mend}");
-        assert!(mend.contains("project leg") && mend.contains("security.keys"), "{mend}");
-        assert!(told.iter().all(|(.., mend)| !mend.contains("firewall")), "{told:#?}");
+        let (_, detail, fix) =
+            told.iter().find(|(what, ..)| what.contains("both have keys")).expect("a step");
+        assert!(detail.starts_with(&format!("{secured} has keys, and {other} has none")), "{detail}");
+        assert!(fix.contains(&format!("sinew keys issue {other}={address} --keys DIR")), "{fix}");
+        assert!(fix.contains("project leg") && fix.contains("security.keys"), "{fix}");
+        assert!(told.iter().all(|(.., fix)| !fix.contains("firewall")), "{told:#?}");
     }
 }
 
 #[test]
-fn nodes_that_both_have_keys_or_neither_are_fine_and_of_an_older_version_nothing_is_said() {
+fn equally_secured_nodes_are_fine_and_old_versions_unjudged() {
     let set: [(fn(&mut NodeReport), _); 2] = [(secure, "both have"), (open, "neither has: both are open")];
-    for (set, seen) in set {
+    for (set, detail) in set {
         let mut facts = free();
         set(hip(&mut facts));
         let has_step =
@@ -68,22 +69,22 @@ fn nodes_that_both_have_keys_or_neither_are_fine_and_of_an_older_version_nothing
         assert_eq!(has_step(&facts), None, "the knee does not say");
         set(knee(&mut facts));
         let step = has_step(&facts).expect("both say");
-        assert_eq!((step.state, step.seen.as_str()), (State::Fine, seen));
+        assert_eq!((step.state, step.detail.as_str()), (State::Fine, detail));
     }
 }
 
 #[test]
-fn between_nodes_with_keys_stream_goes_by_the_connection_and_no_setting_is_blamed() {
-    // Both say that they have keys, or one alone, as the other one cannot be asked.
-    for who_says in [[true, true], [true, false], [false, true]] {
+fn stream_between_nodes_with_keys_uses_the_connection() {
+    // Both report that they have keys, or only one does because the other cannot be queried.
+    for reports in [[true, true], [true, false], [false, true]] {
         for is_on in [true, false] {
             // Given
             let mut facts = free();
             facts.streams = [None, None];
-            if who_says[0] {
+            if reports[0] {
                 secure(hip(&mut facts));
             }
-            if who_says[1] {
+            if reports[1] {
                 secure(knee(&mut facts));
             }
             hip(&mut facts).peers[0].stream = Some(StreamReport { is_on, is_agreed: false, ..values(0) });
@@ -92,22 +93,22 @@ fn between_nodes_with_keys_stream_goes_by_the_connection_and_no_setting_is_blame
             // Then
             let what = "class Stream from hip to knee.drive";
             let step = steps.iter().find(|step| step.what == what).expect("it is looked at");
-            assert_eq!((step.state, step.mend.as_deref()), (State::Fine, None), "{who_says:?}: {step:?}");
-            assert_eq!(step.seen, "by the connection (TCP), as nodes with keys do");
+            assert_eq!((step.state, step.fix.as_deref()), (State::Fine, None), "{reports:?}: {step:?}");
+            assert_eq!(step.detail, "by the connection (TCP), as nodes with keys do");
         }
     }
-    // And: where neither has keys the setting is what is to be looked at
+    // And: if neither has keys, the fix is the setting
     let mut facts = free();
     open(hip(&mut facts));
     open(knee(&mut facts));
     hip(&mut facts).peers[0].stream = Some(StreamReport { is_agreed: false, ..values(0) });
-    let is_setting = |step: &Step| step.mend.as_ref().is_some_and(|mend| mend.contains("`datagrams = true`"));
+    let is_setting = |step: &Step| step.fix.as_ref().is_some_and(|fix| fix.contains("`datagrams = true`"));
     assert!(judge(&facts).iter().any(is_setting));
 }
 
 #[test]
-fn datagrams_that_are_refused_for_their_keys_are_the_reason_and_not_a_firewall() {
-    let words = "it was not made with this project's keys: somebody pretends";
+fn refused_datagrams_are_the_cause_instead_of_a_firewall() {
+    let words = "it was not made with this project's keys: an impostor sent it";
     for is_refused_by_hip in [true, false] {
         let mut facts = free();
         strangers(&mut facts);
@@ -119,15 +120,17 @@ fn datagrams_that_are_refused_for_their_keys_are_the_reason_and_not_a_firewall()
         };
         refuse(by, "NDL datagram not of this project's keys", &format!("{from}: {words}"));
         let told = blocked(&facts);
-        assert!(told.iter().any(|(_, seen, mend)| seen.contains(words) && mend.contains("sinew keys show")));
-        assert!(told.iter().all(|(.., mend)| !mend.contains("firewall")), "{told:#?}");
+        assert!(
+            told.iter().any(|(_, detail, fix)| detail.contains(words) && fix.contains("sinew keys show"))
+        );
+        assert!(told.iter().all(|(.., fix)| !fix.contains("firewall")), "{told:#?}");
     }
-    // And: those of a third one are no reason
+    // And: refused datagrams of a third node are no cause
     let mut facts = free();
     strangers(&mut facts);
     refuse(hip(&mut facts), "NDL datagram not of this project's keys", "10.0.0.2:70001: it is forged");
-    assert!(blocked(&facts).iter().all(|(_, seen, _)| !seen.contains("forged")));
-    // And: where the other cannot be asked it may be its
+    assert!(blocked(&facts).iter().all(|(_, detail, _)| !detail.contains("forged")));
+    // And: if the other node cannot be queried, the refused datagrams may be from it
     let mut facts = free();
     never_answered(&mut facts);
     refuse(
@@ -136,13 +139,12 @@ fn datagrams_that_are_refused_for_their_keys_are_the_reason_and_not_a_firewall()
         "datagram from 10.0.0.2:7000: it is sealed",
     );
     assert!(
-        blocked(&facts)
-            .iter()
-            .any(|(_, seen, _)| seen.contains("refused somebody's") && seen.contains("it is sealed"))
+        blocked(&facts).iter().any(|(_, detail, _)| detail.contains("refused a datagram of another node")
+            && detail.contains("it is sealed"))
     );
 }
 
-/// The hip's last dial of the knee failed so.
+/// The hip's last connection attempt to the knee failed with this error.
 fn dialled(facts: &mut Facts, fault: &str, error: &str) {
     let peer = &mut hip(facts).peers[0];
     peer.links.clear();
@@ -151,44 +153,49 @@ fn dialled(facts: &mut Facts, fault: &str, error: &str) {
 }
 
 #[test]
-fn what_mends_a_dial_depends_on_how_far_it_came_and_of_a_revoked_certificate_the_fault_says_it_itself() {
+fn fix_of_a_failed_dial_depends_on_its_progress() {
     const REVOKED: &str = "the certificate of node \"knee\" (10.0.0.2) of project \"leg\", number 7, is revoked; if this is the real one, \
                            `sinew keys issue NODE --keys DIR`, where ca.key is, makes it another";
-    for (fault, error, mend) in [
+    for (fault, error, fix) in [
         (
             "not proven",
             REVOKED,
-            "TCP reaches 10.0.0.2:7001, and it is not proven who is there: if this is the real one, `sinew keys issue NODE --keys DIR`",
+            "TCP reaches 10.0.0.2:7001, and the node there is not authenticated: if this is the real one, `sinew keys issue NODE --keys DIR`",
         ),
         (
             "not proven",
             "the other end does not speak TLS",
-            "not proven who is there: the other end does not speak TLS",
+            "the node there is not authenticated: the other end does not speak TLS",
         ),
-        ("hung up", "unexpected end of file", "TCP reaches 10.0.0.2:7001, and whoever is there hung up"),
-        ("refused", "Connection refused (os error 111)", "nobody listens at 10.0.0.2:7001"),
+        (
+            "hung up",
+            "unexpected end of file",
+            "TCP reaches 10.0.0.2:7001, and the other end closed the connection",
+        ),
+        ("refused", "Connection refused (os error 111)", "nothing listens at 10.0.0.2:7001"),
         (
             "system",
             "No route to host (os error 113)",
             "TCP does not reach 10.0.0.2:7001: is there a route (`ip route get 10.0.0.2`)",
         ),
-        // Of a version that says the error alone.
-        ("", "Connection refused (os error 111)", "nobody listens at 10.0.0.2:7001"),
+        // A version that reports only the error.
+        ("", "Connection refused (os error 111)", "nothing listens at 10.0.0.2:7001"),
         ("", "No route to host (os error 113)", "ip route get 10.0.0.2"),
     ] {
         let mut facts = free();
         dialled(&mut facts, fault, error);
         let told = blocked(&facts);
-        let is_it = |(_, seen, said): &(String, String, String)| seen.contains(error) && said.contains(mend);
+        let is_it =
+            |(_, detail, advice): &(String, String, String)| detail.contains(error) && advice.contains(fix);
         assert!(told.iter().any(is_it), "{fault}: {told:#?}");
     }
-    // And: who was dialled and refuses says it, too
+    // And: the refusing node reports it, too
     let mut facts = free();
     hip(&mut facts).peers[0].links.clear();
     refuse(knee(&mut facts), "peer not proven", &REVOKED.replace("knee\" (10.0.0.2)", "hip\" (10.0.0.1)"));
     let told = blocked(&facts);
     assert!(
-        told.iter().any(|(.., mend)| mend == "if this is the real one, `sinew keys issue NODE --keys DIR`, where ca.key is, makes it another"),
+        told.iter().any(|(.., fix)| fix == "if this is the real one, `sinew keys issue NODE --keys DIR`, where ca.key is, makes it another"),
         "{told:#?}"
     );
 }

@@ -1,4 +1,4 @@
-//! Which way values of class Stream go, as either end says it.
+//! The transport for values of class Stream, as reported by either end.
 
 use super::*;
 
@@ -7,13 +7,13 @@ fn of_stream(facts: &mut Facts) -> &mut StreamReport {
 }
 
 #[test]
-fn which_way_stream_goes_is_said_at_both_ends_with_what_lets_datagrams_through() {
+fn stream_transport_is_reported_at_both_ends() {
     let steps = judge(&free());
-    let said =
-        |what: &str| steps.iter().find(|step| step.what == what).expect("it is looked at").seen.clone();
-    assert_eq!(said("class Stream from hip to knee.drive"), "by datagram (UDP)");
-    // Nobody could send one from there.
-    assert!(said("class Stream from knee.drive to hip").starts_with("7 values by datagram (UDP) so far"));
+    let detail =
+        |what: &str| steps.iter().find(|step| step.what == what).expect("it is looked at").detail.clone();
+    assert_eq!(detail("class Stream from hip to knee.drive"), "by datagram (UDP)");
+    // No value could be sent from there.
+    assert!(detail("class Stream from knee.drive to hip").starts_with("7 values by datagram (UDP) so far"));
     let notes: [(fn(&mut Facts), _, _); 4] = [
         (
             |facts| facts.streams[0] = Some(values(7)),
@@ -36,13 +36,13 @@ fn which_way_stream_goes_is_said_at_both_ends_with_what_lets_datagrams_through()
             "one MTU (`ip link` shows it",
         ),
     ];
-    for (change, seen, mend) in notes {
+    for (change, detail, fix) in notes {
         let mut facts = free();
         change(&mut facts);
         let steps = judge(&facts);
         assert!(steps.iter().all(|step| step.state != State::Blocked), "{steps:#?}");
-        let is_it = |step: &&Step| step.state == State::Note && step.seen.contains(seen);
+        let is_it = |step: &&Step| step.state == State::Note && step.detail.contains(detail);
         let note = steps.iter().find(is_it).expect("it is a note");
-        assert!(note.mend.as_ref().expect("it can be mended").contains(mend), "{note:?}");
+        assert!(note.fix.as_ref().expect("it has a fix").contains(fix), "{note:?}");
     }
 }

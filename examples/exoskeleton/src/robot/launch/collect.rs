@@ -1,34 +1,34 @@
-//! From the traces of all processes to one record and its figures.
+//! Combines the traces of all processes into one record and its figures.
 
 use std::collections::BTreeMap;
 use std::io;
 use std::path::Path;
 
-use serde::Serialize;
+use exoskeleton_model::joint::{Joint, PerJoint};
+use exoskeleton_model::message::DriveState;
+use exoskeleton_model::metrics::{Counting, Metrics};
+use exoskeleton_model::part::Part;
+use exoskeleton_model::record::{JointRow, Outage, Record, Row, Stall};
 use sinew::Time;
+use sinew_figures::stalls::{CpuTimes, Evidence, HostCpu, HostStall, Testimony, merged};
 
 use super::LaunchError;
-use super::blame::{self, Evidence, HostStall};
-use super::children::{CpuTimes, HostCpu};
-use super::witness::Testimony;
-use crate::joint::{Joint, PerJoint};
-use crate::message::DriveState;
-use crate::metrics::{Counting, Metrics};
-use crate::part::Part;
 use crate::plot::Lateness;
-use crate::record::{JointRow, Outage, Record, Row, Stall};
-use crate::report::{MeasuredTiming, PercentilesUs};
-use crate::robot::figures::{LoopFigures, LoopSummary, percentiles_of};
+use crate::report::{
+    HostFigures, KillFigures, LoopSummary, RealTimeFigures, Report, RunDescription, Timing, UnstalledFigures,
+};
+use crate::robot::figures::{LoopFigures, percentiles_of};
 use crate::robot::role::Role;
-use crate::robot::trace::{DriveRow, EventRow, GaitRow, PlantRow, read_lives};
+use crate::robot::trace::{DriveRow, EventRow, GaitRow, PlantRow, read_incarnations};
 
-/// A word of central that is older than this says nothing about now, ns.
+/// Maximum age of a command of central that is still current, ns.
 const NEWS_NS: u64 = 5_000_000;
 
-/// A trace that ends so much before the walk was cut off, ns: its rows come a tenth of a second late at most, and after a stall.
+/// A trace that ends this long before the walk was cut off, ns: its rows are at most a tenth of a second
+/// late, longer after a stall.
 const TRACE_CUT_NS: u64 = 2_000_000_000;
 
-/// A kill, in the host's clock.
+/// The times of a kill, in the host's clock.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct KillTimes {
     pub(super) part: Part,
@@ -36,7 +36,7 @@ pub(super) struct KillTimes {
     pub(super) to: Option<Time>,
 }
 
-/// What the launcher saw of the run, in the host's clock.
+/// The launcher's record of the run, in the host's clock.
 #[derive(Debug, Default)]
 pub(super) struct RunTimes {
     pub(super) strides: u32,
@@ -52,147 +52,98 @@ pub(super) struct RunTimes {
     pub(super) testimonies: Vec<Testimony>,
 }
 
-/// What only a real-time run can say.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct RealTimeFigures {
-    /// The drives' loops, all three together, from the first readiness to the last stride.
-    pub drives: LoopSummary,
-    /// Lateness of central's loop, us.
-    pub central_late_us: PercentilesUs,
-    /// Lateness of the plant's loop, us.
-    pub plant_late_us: PercentilesUs,
-    /// CPU time of each process while walking, per cent of one CPU.
-    pub cpu_percent: BTreeMap<String, f64>,
-    /// All of them, per cent of one CPU.
-    pub cpu_percent_total: f64,
-    /// What the witness saw of the host.
-    pub host: HostFigures,
-    /// The figures of undisturbed strides alone; `null` where the host did not stall.
-    pub without_stalls: Option<UnstalledFigures>,
-    /// How the death of a node was noticed, if one was killed.
-    pub kill: Option<KillFigures>,
+impl RunTimes {
+    /// Seconds of the run at this time of the host's clock, ns.
+    fn seconds(&self, t_ns: u64) -> f64 {
+        let start_ns = self.first_start.unwrap_or(Time::ZERO).as_nanos();
+        (i128::from(t_ns) - i128::from(start_ns)) as f64 * 1e-9
+    }
 }
 
-/// What the witness saw of the host: threads of the launcher that only sleep, one on each CPU.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct HostFigures {
-    /// CPUs with a witness.
-    pub witnesses: usize,
-    /// Times at which the witnesses were woken.
-    pub wakes: u64,
-    /// Of these, more than 2 ms late: the deadline of a drive's tick.
-    pub deadline_misses: u64,
-    /// Stalls of the host, in which a witness was at least 5 ms late: seconds of the run. The strides around them count apart.
-    pub stalls: Vec<Stall>,
-    /// Stalls that the robot has caused itself, by its use of CPU time. Their strides count.
-    pub own_stalls: Vec<Stall>,
-    /// Strides that count apart, the first stride being 1.
-    pub strides_disturbed: Vec<u32>,
-    /// CPU time of all other programs while walking, per cent of all CPUs.
-    pub others_cpu_percent: Option<f64>,
-    /// CPU time that a hypervisor says it took while walking, per cent of all CPUs.
-    pub stolen_cpu_percent: Option<f64>,
-}
-
-/// How the death of a node was noticed: times since the kill, ms; `null` where it was not.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct KillFigures {
-    /// Until each other drive damped.
-    pub safe_after_ms: BTreeMap<String, Option<f64>>,
-    /// Until each other node's discovery said `NodeLost`.
-    pub node_lost_after_ms: BTreeMap<String, Option<f64>>,
-}
-
-/// What the walk was outside the stalls of the host.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct UnstalledFigures {
-    /// RMS against the reference, degrees: hip, knee, ankle.
-    pub rms_deg: PerJoint<f64>,
-    /// RMS of the phase error, per cent.
-    pub phase_rms_percent: f64,
-}
-
-/// All that the traces hold.
-pub(super) struct Collected {
-    pub(super) record: Record,
-    pub(super) timing: MeasuredTiming,
-    pub(super) lateness: Lateness,
-    pub(super) torque_rate_max_nm_s: f64,
-    pub(super) figures: RealTimeFigures,
-}
-
-/// What all processes wrote, up to the stop order.
-pub(super) struct Traces {
-    pub(super) plant: Vec<PlantRow>,
-    pub(super) gait: Vec<GaitRow>,
-    /// The rows of each drive, life by life.
-    pub(super) drives: PerJoint<Vec<Vec<DriveRow>>>,
-    pub(super) events: BTreeMap<Part, Vec<EventRow>>,
+/// The traces of all processes, up to the stop order.
+#[derive(Debug)]
+pub struct Traces {
+    /// The rows of the plant.
+    pub plant: Vec<PlantRow>,
+    /// The rows of central.
+    pub gait: Vec<GaitRow>,
+    /// The rows of each drive, by incarnation.
+    pub drives: PerJoint<Vec<Vec<DriveRow>>>,
+    /// The events of each node.
+    pub events: BTreeMap<Part, Vec<EventRow>>,
 }
 
 impl Traces {
-    pub(super) fn read(folder: &Path, stop: Time) -> io::Result<Self> {
+    /// Reads them from the folder of a run.
+    ///
+    /// # Errors
+    /// A trace cannot be read.
+    pub fn read(folder: &Path, stop: Time) -> io::Result<Self> {
         let until = stop.as_nanos();
-        let [hip, knee, ankle] = Joint::ALL.map(|joint| read_lives::<DriveRow>(folder, joint.name()));
+        let [hip, knee, ankle] = Joint::ALL.map(|joint| read_incarnations::<DriveRow>(folder, joint.name()));
         let mut drives = [hip?, knee?, ankle?];
-        drives.iter_mut().flatten().for_each(|life| life.retain(|row| row.t_ns <= until));
+        drives.iter_mut().flatten().for_each(|incarnation| incarnation.retain(|row| row.t_ns <= until));
         let mut events = BTreeMap::new();
         for part in Part::ALL {
-            events
-                .insert(part, read_lives(folder, &format!("{part}-events"))?.into_iter().flatten().collect());
+            events.insert(
+                part,
+                read_incarnations(folder, &format!("{part}-events"))?.into_iter().flatten().collect(),
+            );
         }
         Ok(Self {
-            plant: up_to(read_lives(folder, "plant")?, |row: &PlantRow| row.t_ns <= until),
-            gait: up_to(read_lives(folder, Part::Central.name())?, |row: &GaitRow| row.t_ns <= until),
+            plant: up_to(read_incarnations(folder, "plant")?, |row: &PlantRow| row.t_ns <= until),
+            gait: up_to(read_incarnations(folder, Part::Central.name())?, |row: &GaitRow| row.t_ns <= until),
             drives,
             events,
         })
     }
 }
 
-/// All lives in one, without what came after the stop order.
-fn up_to<R>(lives: Vec<Vec<R>>, holds: impl Fn(&R) -> bool) -> Vec<R> {
-    lives.into_iter().flatten().filter(|row| holds(row)).collect()
+/// All incarnations in one, without the rows after the stop order.
+fn up_to<R>(incarnations: Vec<Vec<R>>, holds: impl Fn(&R) -> bool) -> Vec<R> {
+    incarnations.into_iter().flatten().filter(|row| holds(row)).collect()
 }
 
-impl Collected {
-    /// # Errors
-    /// A trace cannot be opened, or ends before the walk does.
-    pub(super) fn read(folder: &Path, times: &RunTimes) -> Result<Self, LaunchError> {
-        let traces = Traces::read(folder, times.stop)?;
-        check_whole(&traces, folder, times.stop)?;
-        let mut loops = LoopFigures::default();
-        for life in traces.drives.iter().flatten() {
-            life.iter().filter(|row| row.state != DriveState::Init).for_each(|row| loops.note(row));
-        }
-        let summary = loops.summary();
-        let (stalls, own_stalls) = stalls(&traces, times);
-        let record = record(&traces, times, stalls);
-        Ok(Self {
-            figures: figures(&traces, times, summary, &record, own_stalls),
-            record,
-            timing: MeasuredTiming {
-                period_us: summary.period_us,
-                age_us: summary.gait_age_us,
-                deadline_misses: summary.deadline_misses,
-                ticks: summary.ticks,
-                witness_misses: times.testimonies.iter().map(|seen| seen.misses).sum(),
-                witness_wakes: times.testimonies.iter().map(|seen| seen.wakes).sum(),
-            },
-            lateness: loops.lateness(),
-            torque_rate_max_nm_s: torque_rate_max(&traces.drives),
-        })
+/// Reads the traces of a run; returns its report, its record, and the lateness of the drives' ticks.
+///
+/// # Errors
+/// A trace cannot be opened, or ends before the walk does.
+pub(super) fn read(
+    folder: &Path,
+    times: &RunTimes,
+    run: RunDescription,
+) -> Result<(Report, Record, Lateness), LaunchError> {
+    let traces = Traces::read(folder, times.stop)?;
+    check_whole(&traces, folder, times.stop)?;
+    let mut loops = LoopFigures::default();
+    for incarnation in traces.drives.iter().flatten() {
+        incarnation.iter().filter(|row| row.state != DriveState::Init).for_each(|row| loops.note(row));
     }
+    let summary = loops.summary();
+    let (stalls, own_stalls) = stalls(&traces, times);
+    let record = record(&traces, times, stalls);
+    let timing = Timing {
+        timing_measured: true,
+        period_us: Some(summary.period_us),
+        age_us: Some(summary.gait_age_us),
+        deadline_misses: Some(summary.deadline_misses),
+        ticks: Some(summary.ticks),
+        witness_misses: Some(times.testimonies.iter().map(|seen| seen.misses).sum()),
+        witness_wakes: Some(times.testimonies.iter().map(|seen| seen.wakes).sum()),
+    };
+    let figures = figures(&traces, times, summary, &record, own_stalls);
+    let rate_max_nm_s = torque_rate_max(&traces.drives);
+    let report = Report::of_real_time(run, &record, rate_max_nm_s, timing, figures);
+    Ok((report, record, loops.lateness()))
 }
 
 fn record(traces: &Traces, times: &RunTimes, stalls: Vec<Stall>) -> Record {
-    let start_ns = times.first_start.unwrap_or(Time::ZERO).as_nanos();
-    let seconds = |t_ns: u64| (i128::from(t_ns) - i128::from(start_ns)) as f64 * 1e-9;
+    let seconds = |t_ns| times.seconds(t_ns);
     let is_ready = |row: &&DriveRow| row.state == DriveState::Ready;
     let ready_s = traces
         .drives
         .each_ref()
-        .map(|lives| lives.iter().flatten().find(is_ready).map(|row| seconds(row.t_ns)));
+        .map(|incarnations| incarnations.iter().flatten().find(is_ready).map(|row| seconds(row.t_ns)));
     let outage = times.outage.map(|kill| Outage {
         part: kill.part,
         from_s: seconds(kill.from.as_nanos()),
@@ -221,7 +172,8 @@ fn record(traces: &Traces, times: &RunTimes, stalls: Vec<Stall>) -> Record {
     }
 }
 
-/// A walk that is not recorded to its end cannot be judged. A drive that was killed has an end of its own.
+/// Checks that the walk is recorded to its end; otherwise it cannot be judged. A killed drive ends early by
+/// design.
 fn check_whole(traces: &Traces, folder: &Path, stop: Time) -> Result<(), LaunchError> {
     let central = Role::Node(Part::Central);
     let ends = [
@@ -238,10 +190,9 @@ fn check_whole(traces: &Traces, folder: &Path, stop: Time) -> Result<(), LaunchE
     Ok(())
 }
 
-/// The stalls that were the host's, and those that the robot has caused itself.
+/// The stalls of the host, and those that the robot has caused itself.
 fn stalls(traces: &Traces, times: &RunTimes) -> (Vec<Stall>, Vec<Stall>) {
-    let start_ns = times.first_start.unwrap_or(Time::ZERO).as_nanos();
-    let seconds = |t_ns: u64| (i128::from(t_ns) - i128::from(start_ns)) as f64 * 1e-9;
+    let seconds = |t_ns| times.seconds(t_ns);
     let drive = |joint: Joint| traces.drives[joint.index()].iter().flatten().map(|row| row.t_ns).collect();
     let mut ticks: Vec<(&str, Vec<u64>)> =
         Joint::ALL.into_iter().map(|joint| (joint.name(), drive(joint))).collect();
@@ -251,10 +202,10 @@ fn stalls(traces: &Traces, times: &RunTimes) -> (Vec<Stall>, Vec<Stall>) {
         samples: &times.samples,
         ticks,
         cpus: times.testimonies.len(),
-        walks_from_ns: traces.plant.iter().find(|row| row.walking).map_or(u64::MAX, |row| row.t_ns),
+        ticks_from_ns: traces.plant.iter().find(|row| row.walking).map_or(u64::MAX, |row| row.t_ns),
     };
     let until = times.stop.as_nanos();
-    let all = blame::merged(&times.testimonies);
+    let all = merged(&times.testimonies);
     let (own, hosts): (Vec<HostStall>, Vec<HostStall>) =
         all.iter().filter(|stall| stall.at.from_ns < until).partition(|stall| evidence.is_own(stall));
     let of_the_run = |stalls: Vec<HostStall>| {
@@ -272,9 +223,10 @@ fn host_figures(times: &RunTimes, record: &Record, own_stalls: Vec<Stall>) -> Ho
         busy: to.busy - from.busy,
         stolen: to.stolen - from.stolen,
     });
-    let seconds = times.cpu_from.as_ref().zip(times.cpu_to.as_ref()).map(|(from, to)| to.0.since(from.0));
+    let seconds =
+        times.cpu_from.as_ref().zip(times.cpu_to.as_ref()).map(|(from, to)| (to.0 - from.0) as f64 * 1e-9);
     // Per cent of one CPU, over the seconds of the walk, in hundredths of a second.
-    let robot = cpu_percent(times).values().sum::<f64>() * seconds.unwrap_or_default().as_secs_f64();
+    let robot = cpu_percent(times).values().sum::<f64>() * seconds.unwrap_or_default();
     HostFigures {
         witnesses: times.testimonies.len(),
         wakes: sum(|seen| seen.wakes),
@@ -309,14 +261,18 @@ fn row(t_s: f64, plant: &PlantRow, gait: Option<&GaitRow>) -> Row {
     }
 }
 
-/// In the drives' own time: a tick that comes late may move the torque further, at the same rate.
+/// In the drives' own time: a late tick may move the torque further, at the same rate.
 fn torque_rate_max(drives: &PerJoint<Vec<Vec<DriveRow>>>) -> f64 {
     let rate = |pair: &[DriveRow]| {
         let (before, after) = (pair[0].torque_nm?, pair[1].torque_nm?);
         let dt_s = pair[1].t_ns.checked_sub(pair[0].t_ns).filter(|dt_ns| *dt_ns > 0)? as f64 * 1e-9;
         Some((after - before).abs() / dt_s)
     };
-    drives.iter().flatten().flat_map(|life| life.windows(2).filter_map(rate)).fold(0.0, f64::max)
+    drives
+        .iter()
+        .flatten()
+        .flat_map(|incarnation| incarnation.windows(2).filter_map(rate))
+        .fold(0.0, f64::max)
 }
 
 fn figures(
@@ -346,9 +302,9 @@ fn cpu_percent(times: &RunTimes) -> BTreeMap<String, f64> {
     let (Some((from, used_before)), Some((to, used))) = (&times.cpu_from, &times.cpu_to) else {
         return BTreeMap::new();
     };
-    let seconds = to.since(*from).as_secs_f64().max(1e-3);
+    let seconds = ((to - from) as f64 * 1e-9).max(1e-3);
     let share = |name: &str, used: f64| {
-        // A process that was started again began at zero.
+        // A restarted process began at zero.
         let before = used_before.get(name).copied().filter(|before| *before <= used).unwrap_or(0.0);
         100.0 * (used - before) / seconds
     };

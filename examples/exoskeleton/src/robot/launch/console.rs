@@ -1,49 +1,56 @@
-//! The launcher as an application of central's node in a process of its own: it listens to how things stand.
+//! The launcher as an application of central's node in a process of its own: it receives the statuses.
 
 use std::collections::BTreeMap;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use exoskeleton_model::joint::{Joint, PerJoint};
+use exoskeleton_model::message::DriveStatus;
+use exoskeleton_model::part::Part;
 use sinew::{
     NodeAddress, NodeApi, Payload, Registration, Time,
     client::{ApiError, Received},
 };
 
-use crate::joint::{Joint, PerJoint};
-use crate::message::DriveStatus;
-use crate::part::Part;
 use crate::robot::edges::{BarrierStatus, GaitStatus, STATUS};
 use crate::robot::topology::Topology;
 
-/// Between two tries to reach a node that is not there.
+/// Time between two attempts to connect to a node that is not running.
 const RETRY_PERIOD: Duration = Duration::from_millis(100);
 /// Longest time until an order to stop is seen.
 const RECEIVE_PERIOD: Duration = Duration::from_millis(100);
-/// Older news is no news.
+/// Maximum age of a status that is shown.
 const NEWS: Duration = Duration::from_millis(250);
 
-/// The newest that was heard.
+/// The newest statuses.
 #[derive(Debug, Clone, Default)]
-pub(super) struct View {
-    pub(super) gait: Option<(Time, GaitStatus)>,
-    pub(super) drives: PerJoint<Option<(Time, DriveStatus)>>,
+pub struct View {
+    gait: Option<(Time, GaitStatus)>,
+    drives: PerJoint<Option<(Time, DriveStatus)>>,
     barrier: BTreeMap<Part, (Time, BarrierStatus)>,
 }
 
-/// The thread that listens.
-pub(super) struct Console {
-    view: Arc<Mutex<View>>,
-    stop: Arc<AtomicBool>,
+/// The thread that receives.
+#[derive(Debug)]
+pub struct Console {
+    shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
 }
 
+#[derive(Debug, Default)]
+struct Shared {
+    view: Mutex<View>,
+    stop: AtomicBool,
+}
+
 impl View {
-    /// Who waits for whom, as told within the last quarter of a second.
-    pub(super) fn waiting(&self) -> Vec<String> {
+    /// The waiting applications and the ones they wait for, as received within the last quarter of a second.
+    #[must_use]
+    pub fn waiting(&self) -> Vec<String> {
         self.barrier
             .values()
             .filter(|(at, _)| is_news(*at))
@@ -51,11 +58,15 @@ impl View {
             .collect()
     }
 
-    pub(super) fn gait(&self) -> Option<GaitStatus> {
+    /// Central's status of the last quarter of a second.
+    #[must_use]
+    pub fn gait(&self) -> Option<GaitStatus> {
         self.gait.filter(|(at, _)| is_news(*at)).map(|(_, status)| status)
     }
 
-    pub(super) fn drive(&self, joint: Joint) -> Option<DriveStatus> {
+    /// A drive's status of the last quarter of a second.
+    #[must_use]
+    pub fn drive(&self, joint: Joint) -> Option<DriveStatus> {
         self.drives[joint.index()].filter(|(at, _)| is_news(*at)).map(|(_, status)| status)
     }
 }
@@ -65,33 +76,33 @@ fn is_news(at: Time) -> bool {
 }
 
 impl Console {
-    pub(super) fn start(topology: &Topology) -> io::Result<Self> {
-        let view = Arc::new(Mutex::new(View::default()));
-        let stop = Arc::new(AtomicBool::new(false));
-        let thread = match topology.central.socket.clone() {
-            None => None,
-            Some(socket) => {
-                let listener = Listener {
-                    socket,
-                    parts: Part::ALL.map(|part| (topology.place(part).address, part)),
-                    view: view.clone(),
-                    stop: stop.clone(),
-                };
-                Some(std::thread::Builder::new().name("console".to_owned()).spawn(move || listener.run())?)
-            }
+    /// Starts the thread, which connects to central as soon as that runs.
+    ///
+    /// # Errors
+    /// The system provides no thread.
+    pub fn start(topology: &Topology) -> io::Result<Self> {
+        let shared = Arc::<Shared>::default();
+        let parts = Part::ALL.map(|part| (topology.place(part).address, part));
+        let listen = |socket| {
+            let listener = Listener { socket, parts, shared: shared.clone() };
+            std::thread::Builder::new().name("console".to_owned()).spawn(move || listener.run())
         };
-        Ok(Self { view, stop, thread })
+        let thread = topology.central.socket.clone().map(listen).transpose()?;
+        Ok(Self { shared, thread })
     }
 
-    pub(super) fn view(&self) -> View {
-        self.view.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    /// Returns the newest statuses.
+    #[must_use]
+    pub fn view(&self) -> View {
+        self.shared.view.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    pub(super) fn stop(&mut self) {
-        // SYNC: Relaxed, the flag carries nothing but itself.
-        self.stop.store(true, Ordering::Relaxed);
+    /// Ends the thread.
+    pub fn stop(&mut self) {
+        // SYNC: Relaxed, no other data depends on the flag.
+        self.shared.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            // It has nothing left to say.
+            // It has no result.
             let _ = thread.join();
         }
     }
@@ -106,26 +117,25 @@ impl Drop for Console {
 struct Listener {
     socket: PathBuf,
     parts: [(NodeAddress, Part); 4],
-    view: Arc<Mutex<View>>,
-    stop: Arc<AtomicBool>,
+    shared: Arc<Shared>,
 }
 
 impl Listener {
     fn run(&self) {
-        while !self.stop.load(Ordering::Relaxed) {
-            // Central is not there yet, or is being started again: then there is nothing to show of it.
-            let _ = self.listen(&self.socket);
-            if !self.stop.load(Ordering::Relaxed) {
+        while !self.shared.stop.load(Ordering::Relaxed) {
+            // Central is not running yet, or is being restarted: then there is nothing to show of it.
+            let _ = self.listen();
+            if !self.shared.stop.load(Ordering::Relaxed) {
                 std::thread::sleep(RETRY_PERIOD);
             }
         }
     }
 
-    fn listen(&self, socket: &Path) -> Result<(), ApiError> {
+    fn listen(&self) -> Result<(), ApiError> {
         let registration = Registration::new().name("console").deadline(Duration::from_secs(2));
-        let mut endpoint = NodeApi::connect(socket)?.register_transport_address(registration)?;
+        let mut endpoint = NodeApi::connect(&self.socket)?.register_transport_address(registration)?;
         endpoint.join(STATUS)?;
-        while !self.stop.load(Ordering::Relaxed) {
+        while !self.shared.stop.load(Ordering::Relaxed) {
             if let Some(message) = endpoint.receive(RECEIVE_PERIOD)? {
                 self.heed(&message);
             }
@@ -138,8 +148,8 @@ impl Listener {
             return;
         };
         let (kind, now) = (message.kind(), Time::now());
-        let mut view = self.view.lock().unwrap_or_else(PoisonError::into_inner);
-        // What cannot be read is not shown.
+        let mut view = self.shared.view.lock().unwrap_or_else(PoisonError::into_inner);
+        // Payloads that cannot be read are not shown.
         if kind == GaitStatus::KIND {
             view.gait = message.decode().ok().map(|status| (now, status));
         } else if kind == BarrierStatus::KIND

@@ -1,20 +1,20 @@
-//! Who starts when: shuffled by the seed, one joint two seconds late.
+//! The start order of the processes: shuffled by the seed, one joint two seconds late.
 
 use std::time::Duration;
 
+use exoskeleton_model::chance::Chance;
+use exoskeleton_model::joint::Joint;
+use exoskeleton_model::part::Part;
 use sinew::Time;
 
-use crate::chance::Chance;
-use crate::joint::Joint;
-use crate::part::Part;
 use crate::robot::role::Role;
 
-/// The purpose of the chance here; other numbers are drawn for the plant.
+/// The purpose of the random numbers here; the plant draws others.
 const PURPOSE: u64 = 7;
 const APART_MS: (u64, u64) = (50, 250);
 const LATE: Duration = Duration::from_secs(2);
 
-/// Starts to come, soonest last.
+/// Remaining starts, soonest last.
 pub(super) struct Plan {
     starts: Vec<(Time, Role)>,
     late: Role,
@@ -53,27 +53,13 @@ impl Plan {
         self.starts.pop().map(|(_, role)| role)
     }
 
-    /// The order in words.
-    pub(super) fn words(&self) -> String {
+    /// The order as text.
+    pub(super) fn description(&self) -> String {
         let order: Vec<&str> = self.starts.iter().rev().map(|(_, role)| role.name()).collect();
         format!("start order: {}; {} comes {} s late", order.join(", "), self.late, LATE.as_secs())
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_process_starts_once_and_a_joint_is_last() {
-        for seed in 0..50 {
-            let mut plan = Plan::shuffled(seed, Time::ZERO);
-            assert_eq!(plan.take_due(Time::ZERO).map(|_| plan.starts.len()), Some(4));
-            let mut rest: Vec<Role> = std::iter::from_fn(|| plan.take_due(Time::MAX)).collect();
-            assert!(matches!(rest[3], Role::Node(Part::Joint(_))), "{rest:?}");
-            rest.sort_unstable();
-            rest.dedup();
-            assert_eq!(rest.len(), 4);
-        }
-    }
-}
+#[path = "../../../tests/unit/plan.rs"]
+mod tests;

@@ -2,15 +2,15 @@
 
 use std::io::{self, IsTerminal};
 
+use exoskeleton_model::joint::Joint;
 use sinew::Time;
 
 use super::console::View;
-use crate::joint::Joint;
 use crate::output;
 
 const BAR: usize = 30;
 const UP_AND_CLEAR: &str = "\x1b[1A\x1b[2K";
-/// Long lines end at the terminal's edge: a wrapped one would be two to take away.
+/// Long lines end at the terminal's edge: a wrapped one would be two to remove.
 const CLIP: &str = "\x1b[?7l";
 const WRAP: &str = "\x1b[?7h";
 
@@ -18,14 +18,14 @@ pub(super) struct Screen {
     is_terminal: bool,
     strides: u32,
     began: Time,
-    /// Lines of the picture that stands on the terminal.
+    /// Lines of the picture on the terminal.
     drawn: usize,
-    told: Told,
+    printed: Printed,
 }
 
-/// What was told last, where only changes are.
+/// The last printed state, where only changes are printed.
 #[derive(Default)]
-struct Told {
+struct Printed {
     waiting: Vec<String>,
     strides: Option<u32>,
     states: String,
@@ -34,17 +34,17 @@ struct Told {
 impl Screen {
     pub(super) fn new(strides: u32, began: Time) -> Self {
         let is_terminal = io::stdout().is_terminal();
-        Self { is_terminal, strides, began, drawn: 0, told: Told::default() }
+        Self { is_terminal, strides, began, drawn: 0, printed: Printed::default() }
     }
 
-    /// A line that stays.
-    pub(super) fn say(&mut self, line: &str) {
+    /// Prints a line that stays.
+    pub(super) fn print(&mut self, line: &str) {
         let time = self.time();
         let clear = self.clear();
         output::print(&format!("{clear}{time} {line}\n"));
     }
 
-    /// How things stand.
+    /// Shows the statuses.
     pub(super) fn show(&mut self, view: &View, strides: Option<u32>) {
         if self.is_terminal {
             let lines = self.picture(view, strides);
@@ -52,11 +52,11 @@ impl Screen {
             self.drawn = lines.len();
             output::print(&format!("{clear}{CLIP}{}\n{WRAP}", lines.join("\n")));
         } else {
-            self.tell_changes(view, strides);
+            self.print_changes(view, strides);
         }
     }
 
-    /// Takes the picture away.
+    /// Removes the picture.
     pub(super) fn close(&mut self) {
         let clear = self.clear();
         output::print(&clear);
@@ -70,27 +70,21 @@ impl Screen {
         format!("{:6.1} s", Time::now().since(self.began).as_secs_f64())
     }
 
-    fn tell_changes(&mut self, view: &View, strides: Option<u32>) {
+    fn print_changes(&mut self, view: &View, strides: Option<u32>) {
         // Without the times, which change always.
-        let waiting: Vec<String> = view.waiting().iter().map(|words| untimed(words)).collect();
-        if waiting != self.told.waiting {
-            for line in
-                waiting.iter().filter(|line| !self.told.waiting.contains(line)).cloned().collect::<Vec<_>>()
-            {
-                self.say(&line);
-            }
-            self.told.waiting = waiting;
-        }
+        let waiting: Vec<String> = view.waiting().iter().map(|line| untimed(line)).collect();
+        let printed = std::mem::replace(&mut self.printed.waiting, waiting.clone());
+        waiting.iter().filter(|line| !printed.contains(line)).for_each(|line| self.print(line));
         let states = states(view);
-        if states != self.told.states {
-            self.say(&states);
-            self.told.states = states;
+        if states != self.printed.states {
+            self.print(&states);
+            self.printed.states = states;
         }
-        if strides != self.told.strides {
-            self.told.strides = strides;
+        if strides != self.printed.strides {
+            self.printed.strides = strides;
             let stride = strides.unwrap_or(0) + 1;
             if stride <= self.strides {
-                self.say(&format!("stride {stride} of {}", self.strides));
+                self.print(&format!("stride {stride} of {}", self.strides));
             }
         }
     }
@@ -141,10 +135,10 @@ fn states(view: &View) -> String {
 }
 
 /// "X has waited 1.3 s for Y" without the time.
-fn untimed(words: &str) -> String {
-    match (words.split_once(" has waited "), words.split_once(" for ")) {
-        (Some((who, _)), Some((_, whom))) => format!("{who} waits for {whom}"),
-        (Some(_) | None, Some(_) | None) => words.to_owned(),
+fn untimed(line: &str) -> String {
+    match (line.split_once(" has waited "), line.split_once(" for ")) {
+        (Some((waiter, _)), Some((_, target))) => format!("{waiter} waits for {target}"),
+        (Some(_) | None, Some(_) | None) => line.to_owned(),
     }
 }
 
@@ -154,13 +148,5 @@ fn bar(phase: f32) -> String {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn waiting_is_told_without_its_time() {
-        let words = "knee.drive has waited 1.3 s for hip.sensor (not there)";
-        assert_eq!(untimed(words), "knee.drive waits for hip.sensor (not there)");
-        assert_eq!(untimed("something else"), "something else");
-    }
-}
+#[path = "../../../tests/unit/screen.rs"]
+mod tests;

@@ -7,18 +7,16 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::Duration;
 
+use exoskeleton_model::joint::Joint;
+use exoskeleton_model::part::Part;
 use serde::{Deserialize, Serialize};
 use sinew::NodeAddress;
 use sinew::config::{Interface, Interfaces, Seed};
 
-use super::{
-    Control, ControlThread, Discovery, DrivePlace, NodePlace, PlantPlace, ReleaseBy, Topology, TopologyFaults,
-};
-use crate::joint::Joint;
-use crate::part::Part;
+use super::{Control, ControlThread, Discovery, DrivePlace, NodePlace, PlantPlace, Topology, TopologyFaults};
 
 const OFF: &str = "off";
-/// The path of a unix socket has at most 107 bytes; Sinew takes 100.
+/// The path of a unix socket has at most 107 bytes; Sinew accepts 100.
 const SOCKET_PATH_MAX: usize = 100;
 const SEEDS_MAX: usize = 256;
 
@@ -31,7 +29,7 @@ struct File {
     #[serde(default)]
     discovery: DiscoveryTable,
     #[serde(default)]
-    control: ControlTable,
+    control: Control,
     central: NodeTable,
     hip: NodeTable,
     knee: NodeTable,
@@ -54,14 +52,6 @@ impl Default for DiscoveryTable {
     }
 }
 
-#[derive(Debug, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-struct ControlTable {
-    thread: Option<String>,
-    realtime_priority: Option<u64>,
-    release: Option<String>,
-}
-
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct NodeTable {
@@ -71,10 +61,10 @@ struct NodeTable {
     port: u16,
     #[serde(default)]
     seeds: Vec<String>,
-    /// The door for processes of the same host.
+    /// The socket for processes of the same host.
     socket: Option<PathBuf>,
-    /// Where the drive runs; at a joint only.
-    drive: Option<String>,
+    /// The process in which the drive runs; at a joint only.
+    drive: Option<DrivePlace>,
 }
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -91,7 +81,7 @@ const fn first_seed() -> u64 {
     1
 }
 
-/// Collects what is wrong while the reading goes on.
+/// Collects faults while reading continues.
 #[derive(Default)]
 struct Faults(Vec<String>);
 
@@ -118,7 +108,7 @@ pub(super) fn parse(text: &str) -> Result<Topology, TopologyFaults> {
     let places: Vec<Option<NodePlace>> =
         Part::ALL.into_iter().zip(tables).map(|(part, table)| node(&mut faults, part, table)).collect();
     let discovery = discovery(&mut faults, &file.discovery);
-    let control = control(&mut faults, &file.control);
+    check_control(&mut faults, file.control);
     let plant = plant(&mut faults, file.plant);
     check_together(&mut faults, &places, discovery.as_ref());
     let places: Option<Vec<NodePlace>> = places.into_iter().collect();
@@ -126,7 +116,15 @@ pub(super) fn parse(text: &str) -> Result<Topology, TopologyFaults> {
     match (places, discovery, plant) {
         (Some([central, hip, knee, ankle]), Some(discovery), Some(plant)) if faults.0.is_empty() => {
             let joints = [hip, knee, ankle];
-            Ok(Topology { project, keys: file.keys, discovery, control, central, joints, plant })
+            Ok(Topology {
+                project,
+                keys: file.keys,
+                discovery,
+                control: file.control,
+                central,
+                joints,
+                plant,
+            })
         }
         (Some(_) | None, Some(_) | None, Some(_) | None) => Err(TopologyFaults(faults.0)),
     }
@@ -151,23 +149,12 @@ fn node(faults: &mut Faults, part: Part, table: &NodeTable) -> Option<NodePlace>
     let seeds = seeds(faults, &format!("{part}.seeds"), &table.seeds);
     let socket = table.socket.clone();
     check_socket(faults, part, socket.as_deref());
-    let drive = drive_place(faults, part, table.drive.as_deref());
-    let (address, port) = (NodeAddress::from(address?), table.port);
-    Some(NodePlace { address, interface: interface?, port, seeds, socket, drive })
-}
-
-fn drive_place(faults: &mut Faults, part: Part, text: Option<&str>) -> DrivePlace {
-    faults.note(part != Part::Central || text.is_none(), || {
+    faults.note(part != Part::Central || table.drive.is_none(), || {
         "central.drive: central has none; take it out here".to_owned()
     });
-    match text {
-        None | Some("node") => DrivePlace::Node,
-        Some("process") => DrivePlace::Process,
-        Some(other) => {
-            faults.0.push(format!("{part}.drive = \"{other}\" is none; write \"node\" or \"process\""));
-            DrivePlace::Node
-        }
-    }
+    let drive = table.drive.unwrap_or_default();
+    let (address, port) = (NodeAddress::from(address?), table.port);
+    Some(NodePlace { address, interface: interface?, port, seeds, socket, drive })
 }
 
 fn seeds(faults: &mut Faults, place: &str, texts: &[String]) -> Vec<Seed> {
@@ -209,34 +196,14 @@ fn discovery(faults: &mut Faults, table: &DiscoveryTable) -> Option<Discovery> {
     Some(Discovery { multicast, mdns: table.mdns, period, missed_max: table.missed_max })
 }
 
-fn control(faults: &mut Faults, table: &ControlTable) -> Control {
-    let thread = match table.thread.as_deref() {
-        None | Some("io") => ControlThread::Io,
-        Some("own") => ControlThread::Own,
-        Some(other) => {
-            faults.0.push(format!("control.thread = \"{other}\" is none; write \"io\" or \"own\""));
-            ControlThread::Own
-        }
-    };
-    if let Some(priority) = table.realtime_priority {
-        faults.note((1..=89).contains(&priority), || {
-            format!("control.realtime_priority = {priority} is not within 1 to 89")
-        });
-        faults.note(thread == ControlThread::Own, || {
-            "control.realtime_priority needs control.thread = \"own\": the network must not run at it"
-                .to_owned()
-        });
-    }
-    let realtime_priority = table.realtime_priority.and_then(|priority| u8::try_from(priority).ok());
-    let release = match table.release.as_deref() {
-        Some("itself") => ReleaseBy::Itself,
-        None | Some("operator") => ReleaseBy::Operator,
-        Some(other) => {
-            faults.0.push(format!("control.release = \"{other}\" is none; write \"operator\" or \"itself\""));
-            ReleaseBy::Operator
-        }
-    };
-    Control { thread, realtime_priority, release }
+fn check_control(faults: &mut Faults, control: Control) {
+    let Some(priority) = control.realtime_priority else { return };
+    faults.note((1..=89).contains(&priority), || {
+        format!("control.realtime_priority = {priority} is not within 1 to 89")
+    });
+    faults.note(control.thread == ControlThread::Own, || {
+        "control.realtime_priority needs control.thread = \"own\": the network must not run at it".to_owned()
+    });
 }
 
 fn plant(faults: &mut Faults, table: PlantTable) -> Option<PlantPlace> {
@@ -252,7 +219,7 @@ fn plant(faults: &mut Faults, table: PlantTable) -> Option<PlantPlace> {
     Some(PlantPlace { address, device_watchdog, seed: table.seed, trial: table.trial })
 }
 
-/// What concerns several nodes at once.
+/// Checks that concern several nodes at once.
 fn check_together(faults: &mut Faults, places: &[Option<NodePlace>], discovery: Option<&Discovery>) {
     let known: Vec<(Part, &NodePlace)> =
         Part::ALL.into_iter().zip(places).filter_map(|(part, place)| Some((part, place.as_ref()?))).collect();
@@ -268,7 +235,7 @@ fn check_together(faults: &mut Faults, places: &[Option<NodePlace>], discovery: 
     });
     let Some(discovery) = discovery else { return };
     let seeded = known.iter().filter(|(_, place)| !place.seeds.is_empty()).count();
-    // Of n nodes, n - 1 that ask are enough; with fewer somebody stays alone.
+    // Of n nodes, n - 1 that query are enough; with fewer a node may stay alone.
     faults.note(discovery.multicast.is_some() || discovery.mdns || seeded + 1 >= known.len(), || {
         "discovery.multicast and discovery.mdns are off and too few nodes have seeds: they cannot find each other; \
          switch one on, or list seeds"
@@ -285,21 +252,10 @@ pub(super) fn write(topology: &Topology) -> String {
             port: place.port,
             seeds: place.seeds.iter().map(ToString::to_string).collect(),
             socket: place.socket.clone(),
-            drive: match place.drive {
-                DrivePlace::Process if part != Part::Central => Some("process".to_owned()),
-                DrivePlace::Process | DrivePlace::Node => None,
-            },
+            drive: (place.drive == DrivePlace::Process && part != Part::Central).then_some(place.drive),
         }
     };
-    let (discovery, control, plant) = (&topology.discovery, &topology.control, &topology.plant);
-    let thread = match control.thread {
-        ControlThread::Io => "io",
-        ControlThread::Own => "own",
-    };
-    let release = match control.release {
-        ReleaseBy::Itself => "itself",
-        ReleaseBy::Operator => "operator",
-    };
+    let (discovery, plant) = (&topology.discovery, &topology.plant);
     let file = File {
         project: topology.project.clone(),
         keys: topology.keys.clone(),
@@ -309,11 +265,7 @@ pub(super) fn write(topology: &Topology) -> String {
             period_ms: discovery.period.as_millis() as u64,
             missed_max: discovery.missed_max,
         },
-        control: ControlTable {
-            thread: Some(thread.to_owned()),
-            realtime_priority: control.realtime_priority.map(u64::from),
-            release: Some(release.to_owned()),
-        },
+        control: topology.control,
         central: node(Part::Central),
         hip: node(Part::Joint(Joint::Hip)),
         knee: node(Part::Joint(Joint::Knee)),

@@ -1,15 +1,15 @@
-//! A topology for one run on this host, which never meets another run's.
+//! A topology for one run on this host, separate from those of all other runs.
 
 use std::io;
 use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
 use std::path::PathBuf;
 use std::time::Duration;
 
+use exoskeleton_model::joint::Joint;
+use exoskeleton_model::part::Part;
 use sinew::NodeAddress;
 
 use super::{Control, ControlThread, Discovery, DrivePlace, NodePlace, PlantPlace, ReleaseBy, Topology};
-use crate::joint::Joint;
-use crate::part::Part;
 
 /// A topology on loopback with a project name, a multicast port, a plant port and sockets of its own.
 ///
@@ -17,8 +17,9 @@ use crate::part::Part;
 /// The system has no free UDP port.
 pub fn for_this_host(seed: u64) -> io::Result<Topology> {
     let id = std::process::id();
-    // Both held at once, so that they differ. Whoever takes one of them in the moment before the nodes do is met by
-    // an error in words at their start.
+    // Both are held at once, so that they differ. If another process takes one before the nodes do, they
+    // report that at their start.
+    let free_port = || UdpSocket::bind((Ipv4Addr::LOCALHOST, 0));
     let (query, plant) = (free_port()?, free_port()?);
     let group = Ipv4Addr::new(239, 255, (id >> 8) as u8, id as u8);
     let node = |part, last| NodePlace {
@@ -46,12 +47,8 @@ pub fn for_this_host(seed: u64) -> io::Result<Topology> {
     })
 }
 
-fn free_port() -> io::Result<UdpSocket> {
-    UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))
-}
-
-/// `sinew` finds `/tmp/sinew-*.sock` by itself. Not in the run folder: the path of a socket has at most 107 bytes,
-/// of which Sinew takes 100.
+/// `sinew` finds `/tmp/sinew-*.sock` by itself. Not in the run folder: the path of a socket has at most 107
+/// bytes, and Sinew accepts 100.
 fn socket_path(id: u32, part: Part) -> PathBuf {
     std::env::temp_dir().join(format!("sinew-exoskeleton-{id}-{part}.sock"))
 }

@@ -1,4 +1,4 @@
-//! What a hostile peer does to bells that are sockets, besides ringing them.
+//! Attacks of a hostile peer on bells that are sockets, besides rings.
 
 use std::{io::IoSlice, mem::MaybeUninit, os::unix::net::UnixStream};
 
@@ -25,7 +25,7 @@ fn pass_by(flags: SendFlags, through: &OwnedFd, descriptor: &OwnedFd) -> Result<
     sendmsg(through, &[IoSlice::new(&[1])], &mut control, flags)
 }
 
-/// A descriptor, and the other end that hangs up when nobody has it any more.
+/// A descriptor, and the other end, which hangs up when the last copy of the descriptor is closed.
 fn witnessed() -> (OwnedFd, OwnedFd) {
     pair()
 }
@@ -35,9 +35,9 @@ fn nobody_has_the_other_end_of(witness: &OwnedFd) -> bool {
 }
 
 #[test]
-fn an_ear_lets_no_descriptors_come_where_the_system_knows_that() {
-    let (ear, button) = socket().expect("a bell");
-    if ear.looks {
+fn ear_refuses_descriptors_where_supported() {
+    let (listener, button) = socket().expect("a bell");
+    if listener.peeks {
         return;
     }
     let (given, _witness) = witnessed();
@@ -46,29 +46,29 @@ fn an_ear_lets_no_descriptors_come_where_the_system_knows_that() {
 }
 
 #[test]
-fn an_ear_at_which_they_can_come_is_not_drained_of_them_and_is_an_end_to_who_sleeps_there() {
-    // Given: a system that cannot refuse them.
+fn ear_with_descriptors_is_not_drained_and_hangs_up() {
+    // Given: a system that cannot refuse descriptors.
     let (socket, button) = pair();
-    let ear = SocketBell { socket, looks: true };
+    let listener = SocketBell { socket, peeks: true };
     assert_eq!(send(&button, &[1], SendFlags::NOSIGNAL), Ok(1));
-    ear.drain();
-    assert_eq!(undescribed(&ear.socket, &mut [0; 1]), Some(0), "what is rung is drained");
+    listener.drain();
+    assert_eq!(undescribed(&listener.socket, &mut [0; 1]), Some(0), "what is rung is drained");
 
     // When:
     let (given, witness) = witnessed();
     assert_eq!(pass(&button, &given), Ok(1));
     drop(given);
-    ear.drain();
+    listener.drain();
 
     // Then:
     assert!(!nobody_has_the_other_end_of(&witness), "it was not closed");
     let waiting = Wait::within(Duration::from_secs(10)).begin(Instant::now());
-    assert_eq!(ear.sleep(ear.listen(), &waiting).expect("it sleeps"), Woken::HungUp);
+    assert_eq!(listener.sleep(listener.listen(), &waiting).expect("it sleeps"), Woken::HungUp);
 }
 
 #[test]
-fn who_sleeps_at_a_word_has_a_look_now_and_then_whether_or_not_it_is_rung() {
-    // Given: another peer that takes each ring, and puts the word back.
+fn sleeper_at_a_word_checks_regularly_without_a_ring() {
+    // Given: another peer that undoes each ring by restoring the word.
     let bells = SharedPage::create().and_then(|page| page.bells()).expect("a page");
     let (peer, _its_end) = UnixStream::pair().expect("a pair");
     let wait = Wait::within(Duration::from_secs(10)).or_hang_up(HangUp::Socket(peer.as_fd()));
@@ -79,8 +79,8 @@ fn who_sleeps_at_a_word_has_a_look_now_and_then_whether_or_not_it_is_rung() {
 }
 
 #[test]
-fn a_button_in_which_something_lies_is_refused_and_nothing_comes_into_one_that_is_not() {
-    // Given: two that a peer offers, and keeps copies of.
+fn nonempty_button_is_rejected_and_empty_one_stays_empty() {
+    // Given: two buttons that a peer offers and keeps copies of.
     let ((full, full_ear), (empty, empty_ear)) = (pair(), pair());
     let (given, _witness) = witnessed();
     assert_eq!(pass(&full_ear, &given), Ok(1));
@@ -89,7 +89,7 @@ fn a_button_in_which_something_lies_is_refused_and_nothing_comes_into_one_that_i
     // Then:
     assert!(!is_button(&full));
     assert!(is_button(&empty));
-    // Whatever it does to its copy.
+    // Whatever the peer does to its copy.
     let _ = set_descriptors(copy.as_fd(), Descriptors::Taken);
     assert_eq!(pass(&empty_ear, &given), Err(Errno::PIPE));
     assert_eq!(send(&empty, &[1], SendFlags::NOSIGNAL), Ok(1), "it can be rung");
@@ -97,23 +97,23 @@ fn a_button_in_which_something_lies_is_refused_and_nothing_comes_into_one_that_i
 }
 
 #[test]
-fn a_button_is_refused_in_which_an_urgent_byte_lies_that_a_look_passes_over() {
-    let (button, ear) = pair();
+fn button_with_an_urgent_byte_is_rejected() {
+    let (button, listener) = pair();
     let (given, _witness) = witnessed();
-    assert_eq!(pass_by(SendFlags::OOB | SendFlags::NOSIGNAL, &ear, &given), Ok(1));
+    assert_eq!(pass_by(SendFlags::OOB | SendFlags::NOSIGNAL, &listener, &given), Ok(1));
     let look = RecvFlags::DONTWAIT | RecvFlags::PEEK;
     assert_eq!(recv(&button, &mut [0; 1][..], look).err(), Some(Errno::AGAIN), "a look passes it over");
     assert!(!is_button(&button));
 }
 
 #[test]
-fn a_button_is_refused_that_is_no_end_of_a_connection() {
-    // Datagrams, of which one may be empty and have descriptors all the same.
+fn button_that_is_not_a_connected_stream_is_rejected() {
+    // Datagram sockets: a datagram may be empty and still carry descriptors.
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
     let (datagrams, _) =
         socketpair(AddressFamily::UNIX, SocketType::DGRAM, flags, None).expect("two sockets");
     assert!(!is_button(&datagrams));
-    // One that has no other end, before it listens and after.
+    // A socket without another end, before it listens and after.
     let alone =
         rustix::net::socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None).expect("a socket");
     assert!(!is_button(&alone));
@@ -124,17 +124,17 @@ fn a_button_is_refused_that_is_no_end_of_a_connection() {
 }
 
 #[test]
-fn an_urgent_byte_with_a_descriptor_is_seen_at_an_ear_before_it_is_drained() {
-    // Given: a system that cannot refuse it.
+fn urgent_byte_with_a_descriptor_is_found_before_draining() {
+    // Given: a system that cannot refuse descriptors.
     let (SocketBell { socket, .. }, button) = socket().expect("a bell");
     let _ = set_descriptors(socket.as_fd(), Descriptors::Taken);
-    let ear = SocketBell { socket, looks: true };
+    let listener = SocketBell { socket, peeks: true };
     let (given, witness) = witnessed();
     // When:
     assert_eq!(pass_by(SendFlags::OOB | SendFlags::NOSIGNAL, &button, &given), Ok(1));
     drop(given);
-    assert_eq!(undescribed(&ear.socket, &mut [0; 1]), None);
-    ear.drain();
+    assert_eq!(undescribed(&listener.socket, &mut [0; 1]), None);
+    listener.drain();
     // Then:
     assert!(!nobody_has_the_other_end_of(&witness), "it was not closed");
 }

@@ -1,0 +1,497 @@
+//! The direct links of one endpoint: a ring to and a ring from each of some other processes, in addition to
+//! the path through the node.
+//!
+//! `routes.rs` decides which path a message takes; this module holds the sockets and the memory.
+
+mod budget;
+mod descriptors;
+mod established;
+mod in_flight;
+mod link_setup;
+mod peer_fd;
+mod reorder;
+mod room;
+#[cfg(test)]
+mod tests;
+
+use std::{
+    collections::{BTreeMap, VecDeque},
+    os::unix::net::UnixStream,
+    sync::Arc,
+    time::Duration,
+};
+
+use budget::{Budget, PROCESS, Share};
+use reorder::ReorderBuffer;
+use rustix::net::Shutdown;
+use sinew_protocol::{
+    payload::{self, Gone, Introduce, Introduction, Registered, Switch},
+    ring::{self as rings, Exchange, ExchangeError, RingError},
+};
+use sinew_runtime::{
+    outcome::{Outcome, ReceiptSink, Rejection, Ticket},
+    tid::Tid,
+    time::Time,
+    wire::{Class, Flags, Kind, Message},
+};
+use sinew_shm::{Any, AnyError, Spin, Waiter};
+
+use super::{
+    ApiError,
+    link::{LinkOptions, Writer, loan::InRing, ring, ring::CHECK_INTERVAL, socket},
+    loan::Draft,
+    routes::{Directness, HangUpAction, LINKS_MAX, LinkNumber, Route, Routes, Unread},
+};
+pub(super) use established::{AllEnds, EstablishedLink, LinkRead};
+use established::{LinkEnds, Pair, Put};
+use in_flight::InFlightRequest;
+pub(super) use in_flight::{PEER_END_TIMEOUT, Resolution};
+use peer_fd::{DEFERRED_CLOSE, DeferredClose, LocalHalf, PeerSocket};
+pub(super) use reorder::ReorderDecision;
+pub(super) use room::Room;
+
+/// Bytes of a direct link's ring, if the configuration sets no other size.
+pub(super) const RING_BYTES: usize = 64 * 1024;
+/// Maximum bytes of a peer's ring.
+const RING_BYTES_MAX: usize = 1 << 20;
+/// Interval between checks whether a ring has room for pending messages to a peer.
+const FLUSH_INTERVAL: Duration = Duration::from_millis(1);
+
+/// The settings that all direct links of an endpoint share.
+pub(super) struct Terms {
+    /// The address of this endpoint.
+    pub(super) own: Tid,
+    /// Bytes of each ring.
+    pub(super) ring_bytes: usize,
+    /// Longest payload in bytes.
+    pub(super) payload_max: usize,
+    pub(super) options: LinkOptions,
+    /// The limit for the memory of all rings together.
+    budget: &'static Budget,
+    /// The threads that close unexpected descriptors passed by peers.
+    closing: &'static DeferredClose,
+}
+
+/// A link with a local half that the peer knows, while the peer's half is pending.
+struct Offered {
+    peer: Tid,
+    number: LinkNumber,
+    socket: PeerSocket,
+    half: LocalHalf,
+    share: Share,
+}
+
+/// The direct links of an endpoint.
+pub(super) struct Direct {
+    terms: Terms,
+    routes: Routes,
+    /// The socket to the node, through which the ends of links arrive. `None` if there are no links.
+    control: Option<Arc<UnixStream>>,
+    offered: Vec<Offered>,
+    /// Links that are written to but not read yet.
+    held: Vec<EstablishedLink>,
+    /// Links that are written to and read.
+    pub(super) open: Vec<EstablishedLink>,
+    /// Messages that arrived through the node but were sent after messages that are still in that link's
+    /// ring.
+    reordered: BTreeMap<Tid, ReorderBuffer>,
+    /// When to check next for closed links and for messages to repeat.
+    next_check: Time,
+    /// When an endpoint that only sends checks next for answers of the node.
+    next_poll: Time,
+    /// When the pending messages are written next.
+    next_flush: Time,
+    /// The link to which a caller writes a frame; the caller must learn first that the frame is written.
+    writing: Option<LinkNumber>,
+    /// The message that was half written there when the link ended.
+    cut: Option<Message>,
+    /// The confirmed message that waits for its answer, if it was sent on a link.
+    in_flight: Option<InFlightRequest>,
+    /// Stream values that were lost with a link, per destination, and that the endpoint has not counted yet.
+    unsent: BTreeMap<Tid, u64>,
+}
+
+/// The result of sending a message on a direct link.
+pub(super) enum Sent {
+    /// The message is in the ring, or waits for room as the newest of its Stream.
+    Taken,
+    /// Part of the message is in the ring; [`Direct::write_on`] writes the rest.
+    Begun,
+    /// The ring has no room.
+    Full(Draft),
+    /// The peer has gone.
+    Gone(Draft),
+}
+
+/// The progress of a partly written message.
+pub(super) enum Writing {
+    Whole,
+    /// The ring has no room for more.
+    Part,
+    /// The link has ended before the message was complete: nobody has received it.
+    Cut(Draft),
+}
+
+/// The connection to the node, and the counter of the correlation numbers that this endpoint has used for its
+/// requests.
+pub(super) struct NodeWriter<'a> {
+    pub(super) writer: &'a Arc<Writer>,
+    pub(super) correlation: &'a mut u64,
+}
+
+impl Terms {
+    pub(super) fn of(registered: &Registered, options: &LinkOptions) -> Self {
+        Self {
+            own: Tid::new(registered.node, registered.app),
+            ring_bytes: options.direct_ring_bytes.min(registered.ring.unwrap_or_default() as usize),
+            payload_max: registered.payload_max as usize,
+            options: options.clone(),
+            budget: &PROCESS,
+            closing: &DEFERRED_CLOSE,
+        }
+    }
+}
+
+impl NodeWriter<'_> {
+    /// Sends a request if there is room. Returns the correlation number of its outcome.
+    fn ask(&mut self, mut frame: Message) -> Option<u64> {
+        *self.correlation += 1;
+        frame.header.correlation = *self.correlation;
+        frame.header.flags = Flags::CONFIRM;
+        self.writer.try_write(&frame).then_some(*self.correlation)
+    }
+
+    fn answer(&self, own: Tid, to: Tid, correlation: u64, outcome: Outcome) {
+        self.writer.settle(Ticket { source: to, destination: own, correlation }, outcome);
+    }
+}
+
+impl Direct {
+    /// Returns the links of an endpoint that receives its link ends over `control`; without it the endpoint
+    /// has no links.
+    pub(super) const fn new(terms: Terms, control: Option<Arc<UnixStream>>) -> Self {
+        let directness = if control.is_some() { Directness::Allowed } else { Directness::Off };
+        let routes = Routes::new(terms.own, directness);
+        Self {
+            terms,
+            routes,
+            control,
+            offered: Vec::new(),
+            held: Vec::new(),
+            open: Vec::new(),
+            reordered: BTreeMap::new(),
+            next_check: Time::ZERO,
+            next_poll: Time::ZERO,
+            next_flush: Time::ZERO,
+            writing: None,
+            cut: None,
+            in_flight: None,
+            unsent: BTreeMap::new(),
+        }
+    }
+
+    /// Returns the link for a message to `destination`, or `None` if it goes through the node. In that case a
+    /// link is requested from the node if that is useful.
+    pub(super) fn route(
+        &mut self,
+        destination: Tid,
+        now: Time,
+        node: &mut NodeWriter<'_>,
+    ) -> Option<LinkNumber> {
+        self.control.as_ref()?;
+        match self.routes.route(destination, now) {
+            Route::Direct(number) => Some(number),
+            Route::ViaNode => None,
+            Route::RequestLink if !self.has_room() => {
+                self.routes.no_room(destination, now);
+                None
+            }
+            Route::RequestLink => {
+                let introduce = Introduce { to: destination.bits() };
+                let lncl = payload::lncl_of(destination.node);
+                let frame = payload::frame(Kind::LNCL_INTRODUCE, self.terms.own, lncl, &introduce);
+                match node.ask(frame) {
+                    Some(correlation) => self.routes.asked(destination, correlation, now),
+                    None => self.routes.not_asked(destination, now),
+                }
+                None
+            }
+        }
+    }
+
+    /// Returns whether this process may have one more link, and whether unexpected descriptors that arrive on
+    /// it can be closed.
+    fn has_room(&self) -> bool {
+        self.terms.budget.has_room(self.terms.ring_bytes) && self.terms.closing.is_room()
+    }
+
+    /// Returns the link for a message to `destination`. Does not request a new link.
+    pub(super) fn link_to(&self, destination: Tid) -> Option<LinkNumber> {
+        // Whether a link is established does not depend on the time.
+        match self.routes.route(destination, Time::ZERO) {
+            Route::Direct(number) => self.control.as_ref().map(|_| number),
+            Route::ViaNode | Route::RequestLink => None,
+        }
+    }
+
+    /// Lends room in the ring of a link, or returns `None` if there is none now.
+    pub(super) fn lend(&mut self, number: LinkNumber, length: usize) -> Option<InRing> {
+        self.established(number)?.writer.lend(length)
+    }
+
+    /// Sends on a link, as far as there is room.
+    ///
+    /// # Errors
+    /// [`ApiError::LoanActive`], or an error if the message is too long for the rings.
+    pub(super) fn send(&mut self, number: LinkNumber, draft: Draft, now: Time) -> Result<Sent, ApiError> {
+        let Some(link) = self.established(number) else { return Ok(Sent::Gone(draft)) };
+        match link.send_draft(draft) {
+            Err((ApiError::Closed(_), draft)) => {
+                let peer = link.peer;
+                self.on_closed(peer, now);
+                Ok(Sent::Gone(draft))
+            }
+            Err((error, _)) => Err(error),
+            Ok(Put::Taken) => Ok(Sent::Taken),
+            Ok(Put::Begun) => {
+                self.cut = None;
+                Ok(Sent::Begun)
+            }
+            Ok(Put::Full(message)) => Ok(Sent::Full(message.into())),
+        }
+    }
+
+    fn established(&mut self, number: LinkNumber) -> Option<&mut EstablishedLink> {
+        self.open.iter_mut().chain(&mut self.held).find(|link| link.number == number)
+    }
+
+    /// Returns whether this link is still established.
+    pub(super) fn has(&self, number: LinkNumber) -> bool {
+        self.open.iter().chain(&self.held).any(|link| link.number == number)
+    }
+
+    /// Checks periodically for closed links and for messages to repeat.
+    pub(super) fn check(&mut self, now: Time, node: &mut NodeWriter<'_>) {
+        if now >= self.next_flush {
+            self.next_flush = now + CHECK_INTERVAL;
+            self.flush();
+        }
+        if now < self.next_check {
+            return;
+        }
+        self.next_check = now + CHECK_INTERVAL;
+        self.check_hang_ups(now);
+        while let Some((peer, number)) = self.routes.switch_due(now) {
+            match node.ask(self.switch_to(peer, number)) {
+                Some(correlation) => self.routes.switched(peer, correlation, now),
+                None => self.routes.not_switched(peer, now),
+            }
+        }
+    }
+
+    /// Records the link on which a caller waits for room. An answer to its frame must not be read before the
+    /// caller knows that the frame is written.
+    pub(super) const fn is_writing_on(&mut self, link: Option<LinkNumber>) {
+        self.writing = link;
+    }
+
+    pub(super) fn flush(&mut self) {
+        let writing = self.writing;
+        for link in self.open.iter_mut().chain(&mut self.held).filter(|link| Some(link.number) != writing) {
+            link.flush();
+        }
+    }
+
+    /// Returns whether there are no links, neither established nor pending.
+    pub(super) fn is_empty(&self) -> bool {
+        self.open.is_empty() && self.held.is_empty() && self.offered.is_empty() && self.reordered.is_empty()
+    }
+
+    /// Returns whether the answer to a link request, or a peer's reason for not reading, may have arrived.
+    /// True once per `CHECK_INTERVAL`.
+    pub(super) fn is_asking(&mut self, now: Time) -> bool {
+        if now < self.next_poll {
+            return false;
+        }
+        self.next_poll = now + CHECK_INTERVAL;
+        self.routes.is_asking() || self.open.iter().chain(&self.held).any(|link| link.is_stalled)
+    }
+
+    /// Returns whether an event without a wake-up may be due: a SWITCH, or the end of a link that is not read
+    /// yet.
+    pub(super) fn needs_checks(&self) -> bool {
+        !self.is_empty() || self.routes.is_asking()
+    }
+
+    /// Records that a task was woken by one of the open links.
+    pub(super) const fn on_wake(&mut self, has_one_hung_up: bool) {
+        if has_one_hung_up {
+            self.next_check = Time::ZERO;
+        }
+    }
+
+    /// Ends the open link at `index` because its ring holds invalid data.
+    pub(super) fn fail<T>(&mut self, index: usize, why: &RingError) -> Option<T> {
+        let (peer, number) = (self.open[index].peer, self.open[index].number);
+        sinew_runtime::log::here!(warn: %peer, %why, "a direct link is closed; messages to that peer go through the node");
+        self.end(peer, number, Time::now());
+        None
+    }
+
+    /// Returns the latest time of the next check, at most `deadline`. Only the link `rings` wakes the caller
+    /// for room, so pending messages on other links need the check.
+    pub(super) fn wake_by(&mut self, deadline: Time, now: Time, rings: Option<LinkNumber>) -> Time {
+        let mut others = self.open.iter().chain(&self.held).filter(|link| Some(link.number) != rings);
+        if !others.any(EstablishedLink::has_pending) {
+            return deadline;
+        }
+        self.next_flush = now + FLUSH_INTERVAL;
+        deadline.min(self.next_flush)
+    }
+
+    /// Returns whether pending messages on some link may still find room.
+    pub(super) fn has_pending(&self) -> bool {
+        self.links_with_pending().next().is_some()
+    }
+
+    /// Waits for room on a link with pending messages, for `within` at most.
+    pub(super) fn await_pending(&mut self, within: Duration) {
+        let first = self.links_with_pending().next().map(|link| link.number);
+        if let Some(link) = first.and_then(|number| self.established(number)) {
+            link.await_pending(within);
+        }
+    }
+
+    /// Returns the links with pending messages to peers that are connected and still read.
+    fn links_with_pending(&self) -> impl Iterator<Item = &EstablishedLink> {
+        let links = self.open.iter().chain(&self.held);
+        links.filter(|link| link.has_pending() && !link.is_stalled && !socket::has_hung_up(&link.socket))
+    }
+
+    /// Reports the pending messages that will find no room any more.
+    pub(super) fn log_unsent(&self) {
+        self.open.iter().chain(&self.held).for_each(EstablishedLink::log_unsent);
+    }
+
+    /// Records the result of a wait for the node and the open links.
+    pub(super) fn note(&mut self, ended: &Result<Any, AnyError>) {
+        match ended {
+            Ok(Any::HungUp(1..)) => self.next_check = Time::ZERO,
+            Err(AnyError::Corrupt { index: index @ 1.., cause }) => {
+                self.fail::<()>(*index - 1, &RingError::from(*cause));
+            }
+            Ok(Any::Message(_) | Any::TimedOut | Any::HungUp(_))
+            | Err(AnyError::Corrupt { .. } | AnyError::System(_)) => {}
+        }
+    }
+
+    /// Records that the connection to the node has ended; another one may follow.
+    pub(super) fn on_node_end(&mut self, now: Time) {
+        self.routes.on_node_end(now);
+    }
+
+    /// Records a new connection to the node or to its next incarnation; the links stay established.
+    pub(super) fn on_reconnect(&mut self, terms: Terms, control: Option<Arc<UnixStream>>) {
+        (self.terms, self.control) = (terms, control);
+    }
+
+    /// Waits until a message arrives on an open link, for `left` at most. May return early without a reason.
+    pub(super) fn wait(&mut self, left: Duration) {
+        let now = Time::now();
+        let left = self.wake_by(now + left, now, None).since(now);
+        let ended = Waiter::new(Spin::Off).wait_within(&mut LinkEnds(&mut self.open), left);
+        let at = |index: usize| index + 1;
+        self.note(&match ended {
+            Ok(Any::HungUp(index)) => Ok(Any::HungUp(at(index))),
+            Err(AnyError::Corrupt { index, cause }) => Err(AnyError::Corrupt { index: at(index), cause }),
+            other @ (Ok(Any::Message(_) | Any::TimedOut) | Err(AnyError::System(_))) => other,
+        });
+    }
+
+    /// Ends the links that their peers have closed, once the rings are empty.
+    fn check_hang_ups(&mut self, now: Time) {
+        let established =
+            self.open.iter().chain(&self.held).map(|link| (link.peer, link.number, &link.socket));
+        let offered = self.offered.iter().map(|link| (link.peer, link.number, &link.socket));
+        let links: Vec<_> = established.chain(offered).collect();
+        if links.is_empty() {
+            return;
+        }
+        let gone: Vec<_> = socket::which_hung_up(links.iter().map(|(_, _, socket)| &****socket))
+            .into_iter()
+            .map(|index| (links[index].0, links[index].1))
+            .chain(self.reordered.iter().map(|(peer, buffer)| (*peer, buffer.after)))
+            .filter(|(peer, number)| self.routes.link(*peer) == Some(*number))
+            .collect();
+        for (peer, number) in gone {
+            let unread = self.unread(number);
+            match (self.routes.on_hang_up(peer, unread, now), unread) {
+                (HangUpAction::Keep, _) | (HangUpAction::Drain, Unread::Some) => {}
+                (HangUpAction::Drop, _) | (HangUpAction::Drain, Unread::None) => self.end(peer, number, now),
+            }
+        }
+    }
+
+    fn unread(&mut self, number: LinkNumber) -> Unread {
+        let mut established = self.open.iter_mut().chain(&mut self.held);
+        let has_unread = match established.find(|link| link.number == number) {
+            Some(link) => link.has_unsorted(),
+            None => {
+                self.offered.iter().any(|link| link.number == number && descriptors::holds_data(&link.socket))
+            }
+        };
+        if has_unread { Unread::Some } else { Unread::None }
+    }
+
+    /// Ends a link: the peer observes that its socket is closed.
+    pub(super) fn end(&mut self, peer: Tid, number: LinkNumber, now: Time) {
+        if self.writing == Some(number) {
+            self.cut = self.established(number).and_then(|link| link.cut());
+        }
+        // The caller gets back the message that it was writing.
+        let has_caller = self.writing == Some(number);
+        if let Some(link) = self.established(number) {
+            link.log_unsent();
+            let cut = link.cut().filter(|cut| !has_caller && cut.header.class == Class::Stream);
+            let waiting = link.waiting() + usize::from(cut.is_some());
+            self.add_unsent(peer, waiting as u64);
+        }
+        self.open.retain(|link| link.number != number);
+        self.held.retain(|link| link.number != number);
+        self.offered.retain(|link| link.number != number);
+        if self.routes.link(peer) == Some(number) {
+            self.routes.ended(peer, now);
+        }
+    }
+}
+
+/// Values that are lost when a link ends.
+impl Direct {
+    /// Counts Stream values that were waiting for room on a link to this peer.
+    fn add_unsent(&mut self, peer: Tid, values: u64) {
+        if values > 0 {
+            let is_full = self.unsent.len() >= LINKS_MAX && !self.unsent.contains_key(&peer);
+            *self.unsent.entry(if is_full { Tid::NONE } else { peer }).or_default() += values;
+        }
+    }
+
+    /// Ends all links.
+    pub(super) fn end_all(&mut self) {
+        let links =
+            self.open.iter().chain(&self.held).map(|link| (link.peer, link.number)).collect::<Vec<_>>();
+        let now = Time::now();
+        links.into_iter().for_each(|(peer, number)| self.end(peer, number, now));
+    }
+
+    /// Returns the number of Stream values that were waiting for room in links that have ended since the last
+    /// call, per destination.
+    pub(super) fn take_unsent(&mut self) -> BTreeMap<Tid, u64> {
+        std::mem::take(&mut self.unsent)
+    }
+}
+
+/// Shuts the socket down, so that the peer observes the end even if another process holds a copy. An error
+/// means that it is closed already.
+fn hang_up(socket: &UnixStream) {
+    let _ = rustix::net::shutdown(socket, Shutdown::Both);
+}

@@ -1,0 +1,322 @@
+//! Incoming messages, from the node and from direct links: reading without waiting, and the wait.
+
+use std::{future::poll_fn, pin::pin, time::Duration};
+
+use sinew_protocol::ring::Taken;
+use sinew_runtime::{
+    outcome::Rejection,
+    tid::Tid,
+    time::Time,
+    wire::{Header, Kind, Message},
+};
+
+use super::{
+    ApiError, Endpoint,
+    direct::{AllEnds, LinkRead, NodeWriter, ReorderDecision, Room},
+    endpoint::LNCL,
+    inbox::{Answer, Awaited, Sorted},
+    link::{Read, Reader, ring::CHECK_INTERVAL},
+    reactor::Until,
+    routes::LinkNumber,
+    undelivered::unsent,
+    wait_mode::WaitMode,
+};
+
+/// Chunks of 64 KiB that are read before the caller continues. In tests each poll reads one chunk, so that a
+/// message at its end must not be left unhandled until more data arrives.
+const READS_PER_POLL: usize = if cfg!(test) { 1 } else { 16 };
+
+/// The policy for messages when the inbox is full.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum WhenFull {
+    /// Leave them in the socket: the caller is about to make room.
+    Leave,
+    /// Keep them beyond the inbox's capacity, and refuse them beyond a bound in bytes: the awaited answer may
+    /// be behind them.
+    Refuse,
+}
+
+impl Endpoint {
+    /// Sorts in all messages that have arrived, without waiting. Returns the awaited answer if it was among
+    /// them.
+    pub(super) fn poll_incoming(
+        &mut self,
+        wanted: Option<Wanted>,
+        when_full: WhenFull,
+        now: Time,
+    ) -> Result<Option<Answer>, ApiError> {
+        // The node first: there a peer may announce that its link is to be read from now on.
+        let answer = self.poll_node(wanted, when_full, now);
+        let answer = answer.map(|answer| answer.or_else(|| self.poll_links(wanted, when_full, now)));
+        self.refusals.count_own(self.tid, self.inbox.take_unreported(), now);
+        self.count_unsent(now);
+        answer
+    }
+
+    /// Counts the values that were lost with direct links.
+    pub(super) fn count_unsent(&mut self, now: Time) {
+        for (destination, count) in self.direct.take_unsent() {
+            self.refusals.add(unsent(destination, Rejection::Closed, count, now));
+        }
+    }
+
+    /// Sorts in the messages that have arrived on direct links.
+    fn poll_links(&mut self, wanted: Option<Wanted>, when_full: WhenFull, now: Time) -> Option<Answer> {
+        if self.direct.is_empty() {
+            return None;
+        }
+        let mut node = NodeWriter { writer: &self.node.writer, correlation: &mut self.requests.correlation };
+        self.direct.check(now, &mut node);
+        if let Some(answer) = self.poll_reordered(wanted, when_full, now) {
+            return Some(answer);
+        }
+        // From the last one on, so that a link that ends does not skip another one's turn.
+        let mut links = (0..self.direct.open.len()).rev();
+        let answer = links.find_map(|index| self.poll_link(index, wanted, when_full));
+        answer.or_else(|| self.poll_reordered(wanted, when_full, now))
+    }
+
+    /// Sorts in the messages on links that are about to end; messages without room are refused.
+    pub(super) fn drain_links(&mut self) {
+        for index in (0..self.direct.open.len()).rev() {
+            self.poll_link(index, None, WhenFull::Refuse);
+        }
+    }
+
+    /// Sorts in messages that arrived through the node but were sent after the content of a link's ring.
+    fn poll_reordered(&mut self, wanted: Option<Wanted>, when_full: WhenFull, now: Time) -> Option<Answer> {
+        while when_full == WhenFull::Refuse || self.inbox.has_room() {
+            let message = self.direct.next_reordered(now)?;
+            let awaited = self.awaited_from_node(&message, wanted);
+            if let Sorted::Answer(answer) = self.inbox.sort(message, awaited) {
+                return Some(answer);
+            }
+        }
+        None
+    }
+
+    pub(super) fn poll_node(
+        &mut self,
+        wanted: Option<Wanted>,
+        when_full: WhenFull,
+        now: Time,
+    ) -> Result<Option<Answer>, ApiError> {
+        self.node.continue_writing();
+        for read in 0.. {
+            if let Some(answer) = self.sort_in(wanted, when_full)? {
+                return Ok(Some(answer));
+            }
+            let is_full = when_full == WhenFull::Leave && !self.inbox.has_room();
+            if is_full || read == READS_PER_POLL {
+                return Ok(None);
+            }
+            match self.node.reader.read(now) {
+                Read::Some => {}
+                Read::Nothing => return Ok(None),
+                Read::Ended(ended) => {
+                    self.end(ended);
+                    return Ok(None);
+                }
+            }
+        }
+        Ok(None)
+    }
+
+    /// Sorts in the messages that have been read from the node.
+    fn sort_in(&mut self, wanted: Option<Wanted>, when_full: WhenFull) -> Result<Option<Answer>, ApiError> {
+        while when_full == WhenFull::Refuse || self.inbox.has_room() {
+            let Some(message) = self.node.reader.next()? else { break };
+            let Some(message) = self.handle_frame(message, wanted) else { continue };
+            let message = match self.direct.reorder(message) {
+                ReorderDecision::Deliver(message) => message,
+                ReorderDecision::Kept => continue,
+                ReorderDecision::Refuse(message) => {
+                    self.inbox.refuse(message);
+                    continue;
+                }
+            };
+            let awaited = self.awaited_from_node(&message, wanted);
+            match self.inbox.sort(message, awaited) {
+                Sorted::Answer(answer) => return Ok(Some(answer)),
+                Sorted::Refusal(refusal) => self.end(refusal.into()),
+                Sorted::Undelivered(undelivered) => {
+                    self.refusals.on_report(self.tid, undelivered, Time::now())
+                }
+                Sorted::Message | Sorted::Nothing => {}
+            }
+        }
+        Ok(None)
+    }
+
+    /// Returns the awaited number if this message of the node may answer it. The node forwards messages only
+    /// with their true source. Its own report about a message (no such application, full queue, lost) has the
+    /// destination of that message as its source. The number is a counter: guessing it does not allow an
+    /// answer in another application's name.
+    fn awaited_from_node(&self, message: &Message, wanted: Option<Wanted>) -> Option<(u64, Awaited)> {
+        wanted.and_then(|wanted| wanted.from(self.absolute(message.header.source)))
+    }
+
+    /// Handles messages about direct links and about groups that the endpoint re-joined. Returns all others.
+    fn handle_frame(&mut self, message: Message, wanted: Option<Wanted>) -> Option<Message> {
+        let Header { kind, correlation, .. } = message.header;
+        // The number alone is not sufficient: a mark and an introduction carry numbers that other processes
+        // have chosen.
+        let is_answer = matches!(kind, Kind::OUTCOME | Kind::MEMBERS | Kind::LNCL_RESOLVED)
+            && wanted.is_some_and(|wanted| wanted.number == correlation);
+        if kind.is_user() || is_answer {
+            return Some(message);
+        }
+        let is_of_lncl = kind == Kind::OUTCOME && self.absolute(message.header.source) == self.absolute(LNCL);
+        if is_of_lncl && self.reconnect.on_rejoin_outcome(&message, self.tid) {
+            return None;
+        }
+        let mut node = NodeWriter { writer: &self.node.writer, correlation: &mut self.requests.correlation };
+        self.direct.handle_frame(message, Time::now(), &mut node)
+    }
+
+    /// Sorts in the messages that have arrived on an open link.
+    fn poll_link(&mut self, index: usize, wanted: Option<Wanted>, when_full: WhenFull) -> Option<Answer> {
+        for read in 0.. {
+            while when_full == WhenFull::Refuse || self.inbox.has_room() {
+                let link = &mut self.direct.open[index];
+                let awaited = wanted.and_then(|wanted| wanted.from(link.peer));
+                match link.next() {
+                    Ok(LinkRead::Nothing) => break,
+                    Ok(LinkRead::Refused) => {}
+                    Ok(LinkRead::Message(message)) => {
+                        if let Sorted::Answer(answer) = self.inbox.sort_from(&link.sink, message, awaited) {
+                            return Some(answer);
+                        }
+                    }
+                    Err(why) => return self.direct.fail(index, &why),
+                }
+            }
+            let is_full = when_full == WhenFull::Leave && !self.inbox.has_room();
+            if is_full || read == READS_PER_POLL {
+                return None;
+            }
+            match self.direct.open[index].take() {
+                Ok(Taken::Some) => {}
+                Ok(Taken::Nothing) => return None,
+                Err(why) => return self.direct.fail(index, &why),
+            }
+        }
+        None
+    }
+
+    /// Waits until a message arrives, from the node or a link, or until there is something to do.
+    pub(super) async fn wait(&mut self, deadline: Time, now: Time) {
+        let deadline = self.wake_by(deadline, now, None);
+        match &mut self.wait_mode {
+            WaitMode::Blocking => self.block(deadline.since(now)),
+            WaitMode::Async(reactor) => {
+                let until = Until { deadline, room: None };
+                yield_if_ready(reactor.wait(
+                    &mut self.node.reader,
+                    &self.node.writer,
+                    &mut self.direct,
+                    until,
+                ))
+                .await;
+            }
+        }
+    }
+
+    /// The same for a task, and until there may be room on a direct link. Without a node it waits for the
+    /// links alone.
+    pub(super) async fn wait_for_room(&mut self, room: Room, deadline: Time, now: Time) {
+        let deadline = self.wake_by(deadline, now, Some(room.link)).min(now + CHECK_INTERVAL);
+        let WaitMode::Async(reactor) = &mut self.wait_mode else { return };
+        let until = Until { deadline, room: Some(room) };
+        if !self.inbox.has_room() {
+            // Messages that wait in a ring would end each wait at once.
+            reactor.wait_for_room(&mut self.direct, room, deadline).await;
+        } else if self.node.ended.is_some() || self.node.reader.has_ended(now) {
+            reactor.wait_for_links(&mut self.direct, until).await;
+        } else {
+            reactor.wait(&mut self.node.reader, &self.node.writer, &mut self.direct, until).await;
+        }
+    }
+
+    /// Returns the latest time of the next check, if no event occurs before.
+    fn wake_by(&mut self, deadline: Time, now: Time, rings: Option<LinkNumber>) -> Time {
+        let deadline = self.node.wake_by(deadline, now);
+        // There is no notification of room for pending requests to the node.
+        let deadline = if self.leaves.has_pending() { deadline.min(now + CHECK_INTERVAL) } else { deadline };
+        let deadline = self.direct.wake_by(deadline, now, rings);
+        match self.wait_mode {
+            // A thread wakes at least once per `CHECK_INTERVAL` in any case.
+            WaitMode::Blocking => deadline,
+            WaitMode::Async(_) if self.node.writer.has_pending() || self.direct.needs_checks() => {
+                deadline.min(now + CHECK_INTERVAL)
+            }
+            WaitMode::Async(_) => deadline,
+        }
+    }
+
+    fn block(&mut self, left: Duration) {
+        match &mut self.node.reader {
+            Reader::Ring(reader) if !self.direct.open.is_empty() => {
+                let links = &mut self.direct.open[..];
+                let ended = reader.wait_for_all(left, |node| AllEnds { node, links });
+                reader.note(&ended);
+                self.direct.note(&ended);
+            }
+            Reader::Ring(_) => self.node.reader.wait(left),
+            // There is no notification here when another thread leaves a pending outcome.
+            Reader::Socket(_) => self.node.reader.wait(left.min(CHECK_INTERVAL)),
+        }
+    }
+}
+
+/// Waits, and yields to other tasks of the thread if the wait ended at once. An endpoint that receives
+/// constantly would otherwise occupy the thread until its awaited answer arrives.
+async fn yield_if_ready(wait: impl Future<Output = ()>) {
+    let mut wait = pin!(wait);
+    let mut has_waited = false;
+    poll_fn(|cx| {
+        let polled = wait.as_mut().poll(cx);
+        has_waited |= polled.is_pending();
+        polled
+    })
+    .await;
+    if !has_waited {
+        tokio::task::yield_now().await;
+    }
+}
+
+/// The answer that a call waits for.
+#[derive(Clone, Copy)]
+pub(super) struct Wanted {
+    pub(super) number: u64,
+    pub(super) what: Awaited,
+    /// The application that must answer.
+    pub(super) of: Tid,
+}
+
+impl Wanted {
+    /// Returns the awaited answer if `peer` is the application that must answer: no other may answer for it.
+    fn from(self, peer: Tid) -> Option<(u64, Awaited)> {
+        (peer == self.of).then_some((self.number, self.what))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::future::ready;
+
+    use futures_util::poll;
+    use tokio::task::yield_now;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn instant_wait_yields_and_real_wait_continues() {
+        let mut at_once = pin!(yield_if_ready(ready(())));
+        assert!(poll!(at_once.as_mut()).is_pending());
+        assert!(poll!(at_once.as_mut()).is_ready());
+        let mut waits = pin!(yield_if_ready(yield_now()));
+        assert!(poll!(waits.as_mut()).is_pending());
+        assert!(poll!(waits.as_mut()).is_ready());
+    }
+}

@@ -1,0 +1,354 @@
+//! The waits of a task: the runtime's reactor replaces the futexes and `poll` of a blocking thread.
+//!
+//! The wake-up sockets of the ring, or the socket, are watched through duplicate descriptors. So the end of a
+//! link does not remove a descriptor that the reactor uses. Each wait that sleeps costs one wake of the
+//! task's thread, as for a thread.
+
+mod links;
+
+use std::{
+    future::poll_fn,
+    io,
+    os::{
+        fd::{AsFd, BorrowedFd},
+        unix::net,
+    },
+    sync::Arc,
+};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use sinew_runtime::time::Time;
+use sinew_shm::{Armed, PollResult, Polling};
+use tokio::{
+    io::Interest,
+    net::UnixStream,
+    sync::oneshot,
+    task::{spawn_blocking, yield_now},
+};
+
+use links::{LinkEvent, Links, forget};
+
+use super::{
+    direct::{AllEnds, Direct, EstablishedLink, Room},
+    link::{
+        Link, Reader, Writer,
+        ring::{self, CHECK_INTERVAL, Rest},
+    },
+    reconnect::{Reconnect, reconnect_blocking},
+};
+
+/// The descriptors that are watched for a task.
+pub(super) struct Reactor {
+    watches: Watches,
+    links: Links,
+    /// The reconnection in progress.
+    reconnect: Option<oneshot::Receiver<Link>>,
+    /// The reconnecting thread stops when this is dropped.
+    wanted: Arc<()>,
+}
+
+enum Watches {
+    Socket(UnixStream),
+    Ring {
+        message: UnixStream,
+        room: UnixStream,
+        /// Closes when the node closes it.
+        socket: UnixStream,
+    },
+}
+
+/// The conditions that end a wait.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Until {
+    pub(super) deadline: Time,
+    /// Room, or possible room, on a direct link.
+    pub(super) room: Option<Room>,
+}
+
+impl Reactor {
+    /// Watches a link, for the runtime of the calling task.
+    pub(super) fn new(reader: &Reader, writer: &Writer) -> io::Result<Self> {
+        let (watches, links) = (Watches::of(reader, writer)?, Links::default());
+        Ok(Self { watches, links, reconnect: None, wanted: Arc::new(()) })
+    }
+
+    /// Waits until there may be something to read or to do, or the requested room, until `deadline` at most.
+    pub(super) async fn wait(
+        &mut self,
+        reader: &mut Reader,
+        writer: &Writer,
+        direct: &mut Direct,
+        until: Until,
+    ) {
+        match (&self.watches, reader) {
+            (Watches::Socket(socket), _) => tokio::select! {
+                () = ready(socket, Interest::READABLE, PollFlags::IN) => {}
+                () = writer.pending_added() => {}
+                () = at(until.deadline) => {}
+            },
+            (Watches::Ring { .. }, Reader::Ring(reader)) => {
+                // Spinning does not detect room.
+                let looking = until.room.is_none().then(|| reader.begin_spin()).flatten();
+                let has_arrived = match &looking {
+                    Some(looking) => {
+                        spin_until_arrival(looking, until.deadline, reader, &mut direct.open).await
+                    }
+                    None => false,
+                };
+                if !has_arrived {
+                    self.sleep(reader, writer, direct, until).await;
+                }
+                if let Some(looking) = looking {
+                    reader.end_spin(&looking);
+                }
+            }
+            (Watches::Ring { .. }, Reader::Socket(_)) => unreachable!("both are of one link"),
+        }
+    }
+
+    /// Sleeps at the node's ring and the links, once.
+    async fn sleep(
+        &mut self,
+        reader: &mut ring::Reader,
+        writer: &Writer,
+        direct: &mut Direct,
+        Until { deadline, room }: Until,
+    ) {
+        let Watches::Ring { message, socket, .. } = &self.watches else { return };
+        self.links.follow(direct, room);
+        let Some(mut listening) = Listening::begin(Some(reader), direct, room) else { return };
+        let links = &mut self.links;
+        let event = tokio::select! {
+            () = rung(message) => LinkEvent::Bell,
+            () = ready(socket, Interest::READABLE, PollFlags::RDHUP) => {
+                listening.check_at_once();
+                LinkEvent::Bell
+            }
+            event = poll_fn(|cx| links.poll(cx)) => event,
+            () = writer.pending_added() => LinkEvent::Bell,
+            () = at(deadline) => LinkEvent::Bell,
+        };
+        drop(listening);
+        direct.on_wake(event == LinkEvent::HungUp);
+    }
+
+    /// The same while there is no node: for direct links alone.
+    pub(super) async fn wait_for_links(&mut self, direct: &mut Direct, Until { deadline, room }: Until) {
+        self.links.follow(direct, room);
+        let Some(listening) = Listening::begin(None, direct, room) else { return };
+        let links = &mut self.links;
+        let event = tokio::select! {
+            event = poll_fn(|cx| links.poll(cx)) => event,
+            () = at(deadline) => LinkEvent::Bell,
+        };
+        drop(listening);
+        direct.on_wake(event == LinkEvent::HungUp);
+    }
+
+    /// Waits for room on a direct link alone: no further incoming messages can be read.
+    pub(super) async fn wait_for_room(&mut self, direct: &mut Direct, room: Room, deadline: Time) {
+        self.links.follow(direct, Some(room));
+        if direct.arm_room(room) == Armed::Ready {
+            return;
+        }
+        let links = &mut self.links;
+        // Not disarmed if this is dropped: the peer may cause one needless wake.
+        tokio::select! {
+            () = poll_fn(|cx| links.poll_room(cx)) => {}
+            () = at(deadline) => {}
+        }
+        direct.disarm_room(room);
+    }
+
+    /// Waits until there may be room for a frame of `length` bytes, or for the rest of one, until `deadline`
+    /// at most.
+    pub(super) async fn room(&self, writer: &Writer, rest: &mut Option<Rest>, length: usize, deadline: Time) {
+        match &self.watches {
+            Watches::Socket(socket) => tokio::select! {
+                () = ready(socket, Interest::WRITABLE, PollFlags::OUT) => {}
+                () = at(deadline) => {}
+            },
+            Watches::Ring { room, socket, .. } => {
+                let armed = match rest {
+                    Some(rest) => rest.arm(),
+                    None => writer.arm(length),
+                };
+                if armed == Armed::Ready {
+                    return;
+                }
+                // Not disarmed if this is dropped: the node may cause one needless wake.
+                tokio::select! {
+                    () = rung(room) => {}
+                    () = ready(socket, Interest::READABLE, PollFlags::RDHUP) => {}
+                    () = at(deadline) => {}
+                }
+                match rest {
+                    Some(rest) => rest.disarm(),
+                    None => writer.disarm(),
+                }
+            }
+        }
+    }
+
+    /// Reconnects on a thread of the runtime's blocking pool. Returns the new link once it is established.
+    pub(super) fn poll_reconnect(&mut self, reconnect: &Reconnect) -> Option<Link> {
+        let found = self.reconnect.get_or_insert_with(|| {
+            let (found, receiver) = oneshot::channel();
+            let (reconnect, wanted) = (reconnect.another(), Arc::downgrade(&self.wanted));
+            spawn_blocking(move || {
+                if let Some(link) = reconnect_blocking(reconnect, || wanted.strong_count() > 0) {
+                    // If the link is not wanted any more, dropping it releases the address.
+                    let _ = found.send(link);
+                }
+            });
+            receiver
+        });
+        let link = found.try_recv();
+        if !matches!(link, Err(oneshot::error::TryRecvError::Empty)) {
+            self.reconnect = None;
+        }
+        link.ok()
+    }
+
+    /// Waits until the reconnection succeeds, until a message arrives on a direct link, or until `deadline`.
+    pub(super) async fn await_reconnect(
+        &mut self,
+        reconnect: &Reconnect,
+        direct: &mut Direct,
+        deadline: Time,
+    ) -> Option<Link> {
+        if let Some(link) = self.poll_reconnect(reconnect) {
+            return Some(link);
+        }
+        if !direct.open.is_empty() {
+            let now = Time::now();
+            let deadline = direct.wake_by(deadline.min(now + CHECK_INTERVAL), now, None);
+            self.wait_for_links(direct, Until { deadline, room: None }).await;
+            return self.poll_reconnect(reconnect);
+        }
+        let found = self.reconnect.as_mut()?;
+        let link = tokio::select! {
+            link = found => link.ok(),
+            () = at(deadline) => return None,
+        };
+        self.reconnect = None;
+        link
+    }
+
+    /// Watches another link.
+    pub(super) fn change(&mut self, reader: &Reader, writer: &Writer) -> io::Result<()> {
+        self.watches = Watches::of(reader, writer)?;
+        Ok(())
+    }
+}
+
+impl Watches {
+    fn of(reader: &Reader, writer: &Writer) -> io::Result<Self> {
+        match (reader, writer) {
+            (Reader::Ring(reader), Writer::Ring(writer)) => {
+                let no_bell = || io::Error::from(io::ErrorKind::Unsupported);
+                let message = watch(reader.bell().ok_or_else(no_bell)?)?;
+                let room = writer.with_bell(|bell| watch(bell.ok_or_else(no_bell)?))?;
+                Ok(Self::Ring { message, room, socket: watch(reader.socket().as_fd())? })
+            }
+            (Reader::Socket(reader), _) => Ok(Self::Socket(watch(reader.fd())?)),
+            (Reader::Ring(_), Writer::Socket(_)) => unreachable!("both are of one link"),
+        }
+    }
+}
+
+/// Spins before a sleep, for the configured time and at most until `deadline`. Returns whether anything has
+/// arrived. Other tasks run in between.
+async fn spin_until_arrival(
+    looking: &Polling,
+    deadline: Time,
+    reader: &mut ring::Reader,
+    links: &mut [EstablishedLink],
+) -> bool {
+    loop {
+        match reader.look(looking, |node| AllEnds { node, links }) {
+            PollResult::Ready => return true,
+            PollResult::Idle => return false,
+            PollResult::NotYet if Time::now() >= deadline => return false,
+            PollResult::NotYet => yield_now().await,
+        }
+    }
+}
+
+/// The announced sleepers: the readers, and the sender that waits for room. Dropping it disarms them.
+struct Listening<'a> {
+    node: Option<&'a mut ring::Reader>,
+    direct: &'a mut Direct,
+    room: Option<Room>,
+}
+
+impl<'a> Listening<'a> {
+    /// Announces the sleep. Returns `None` if there is something to do already.
+    fn begin(node: Option<&'a mut ring::Reader>, direct: &'a mut Direct, room: Option<Room>) -> Option<Self> {
+        let mut listening = Self { node, direct, room };
+        let Self { node, direct, room } = &mut listening;
+        let is_silent = node.as_mut().is_none_or(|node| node.arm() == Armed::Sleep)
+            && direct.open.iter_mut().all(|link| link.arm() == Armed::Sleep)
+            && room.is_none_or(|room| direct.arm_room(room) == Armed::Sleep);
+        is_silent.then_some(listening)
+    }
+
+    /// Makes the next poll check the node's socket.
+    fn check_at_once(&mut self) {
+        if let Some(node) = &mut self.node {
+            node.check_at_once();
+        }
+    }
+}
+
+impl Drop for Listening<'_> {
+    fn drop(&mut self) {
+        if let Some(node) = &mut self.node {
+            node.disarm();
+        }
+        self.direct.open.iter_mut().for_each(EstablishedLink::disarm);
+        if let Some(room) = self.room {
+            self.direct.disarm_room(room);
+        }
+    }
+}
+
+/// Registers a duplicate of a descriptor with the reactor.
+fn watch(fd: BorrowedFd<'_>) -> io::Result<UnixStream> {
+    let socket = net::UnixStream::from(fd.try_clone_to_owned()?);
+    // The reactor requires it; no code here blocks on a descriptor in any case.
+    socket.set_nonblocking(true)?;
+    UnixStream::from_std(socket)
+}
+
+/// Resolves when a wake-up socket is signalled. The state is checked after this, so that no signal is lost.
+async fn rung(bell: &UnixStream) {
+    // An error is an end, which is detected elsewhere.
+    if bell.readable().await.is_ok() {
+        forget(bell);
+    }
+}
+
+/// Resolves when the system reports this readiness of the socket now, despite reads or writes in between.
+async fn ready(socket: &UnixStream, interest: Interest, what: PollFlags) {
+    let now = || {
+        let nothing = Timespec { tv_sec: 0, tv_nsec: 0 };
+        match poll(&mut [PollFd::new(socket, what)], Some(&nothing)) {
+            Ok(0) => Err(io::Error::from(io::ErrorKind::WouldBlock)),
+            Ok(_) | Err(_) => Ok(()),
+        }
+    };
+    while socket.ready(interest).await.is_ok() {
+        if socket.try_io(interest, now).is_ok() {
+            return;
+        }
+    }
+}
+
+/// Resolves at `deadline`.
+async fn at(deadline: Time) {
+    if deadline == Time::MAX {
+        return std::future::pending().await;
+    }
+    tokio::time::sleep(deadline.since(Time::now())).await;
+}

@@ -1,0 +1,471 @@
+//! Which path a message to another application takes, and from which path its messages may be read. Pure.
+//!
+//! At first all messages go through the node. An endpoint that sends to another application of the node asks
+//! LNCL for an introduction, and continues through the node meanwhile. If the other side agrees, both have a
+//! *direct link*: a ring in each direction that bypasses the node.
+//!
+//! ```text
+//!   A (asks)                  LNCL                       B (is asked)
+//!   Asked  ── INTRODUCE ────► │ ── INTRODUCTION ───────► Offered: its offer lies in the link's socket
+//!          ◄─ INTRODUCED ──── │ ◄─ taken ───────────────
+//!   Direct: its offer lies in the socket, too; from now on A writes to its ring only, and leaves B's ring unread
+//!          ── SWITCH ───────► │ ── three marks ────────► Direct: B reads A's ring, and writes to its own only
+//!          ◄─ three marks ─── │ ◄─ SWITCH ──────────────
+//!   Direct, open: A reads B's ring
+//! ```
+//!
+//! **Order is preserved.** The node keeps the order of each class, but not between classes: a lane that was
+//! skipped gets its turn before others. So a SWITCH becomes one mark in each class, behind all messages sent
+//! through the node before it. A ring is read when all three marks have arrived. The sender does not wait for
+//! that: it writes into the ring at once.
+
+mod events;
+
+use std::{collections::BTreeMap, time::Duration};
+
+use sinew_runtime::{
+    outcome::{Outcome, Rejection},
+    tid::Tid,
+    time::Time,
+    wire::Class,
+};
+
+pub use events::{HangUpAction, MarkEffect, NodeDelivery, OutcomeEffect, Unread};
+
+/// Maximum number of direct links per endpoint, including those being set up. Messages beyond it go through
+/// the node.
+pub(super) const LINKS_MAX: usize = 64;
+/// Maximum number of remembered refusals; the one that ends first is replaced.
+const REFUSALS_MAX: usize = 256;
+/// Time until an introduction that failed temporarily is requested again.
+const SHORT_RETRY: Duration = Duration::from_millis(100);
+/// Time until an introduction is requested again that this destination will hardly ever allow.
+const LONG_RETRY: Duration = Duration::from_secs(10);
+/// Time until an unanswered introduction is abandoned: the peer answers only within its own calls.
+const INTRODUCTION_TIMEOUT: Duration = Duration::from_secs(10);
+/// Time until a SWITCH for which there was no room is sent again.
+const SWITCH_RETRY: Duration = Duration::from_millis(10);
+/// Time until a SWITCH that was refused or not answered is sent again.
+const SWITCH_TIMEOUT: Duration = Duration::from_secs(1);
+/// Time for which the ring of a closed peer waits for its marks. LNCL sends them even after the peer's end.
+/// They are missing only if the peer ended before its SWITCH, or LNCL with it.
+pub const MARKS_AFTER_END: Duration = Duration::from_secs(10);
+
+/// The current path of a message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Route {
+    /// Through the node.
+    ViaNode,
+    /// Through the node, and LNCL is asked for an introduction: [`Routes::asked`].
+    RequestLink,
+    /// Into the ring of this link.
+    Direct(LinkNumber),
+}
+
+/// The number that LNCL has assigned to a link.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct LinkNumber(pub u64);
+
+/// Classes with a received mark.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Marks {
+    classes: [bool; 3],
+    confirm: Option<u64>,
+}
+
+impl Marks {
+    const fn has(&self, class: Class) -> bool {
+        self.classes[class as usize]
+    }
+
+    /// Records a mark. Returns whether all have arrived.
+    fn note(&mut self, class: Class, confirm: Option<u64>) -> bool {
+        self.classes[class as usize] = true;
+        self.confirm = self.confirm.or(confirm);
+        self.classes == [true; 3]
+    }
+}
+
+/// Whether the peer has accepted our SWITCH.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Switch {
+    /// Never sent yet: messages go through the node. If this process ended now, its ring would not be read.
+    Unsent {
+        at: Time,
+    },
+    /// Sent; repeated at `again` without an answer.
+    Sent {
+        correlation: u64,
+        again: Time,
+    },
+    /// To be sent again.
+    Resend {
+        at: Time,
+    },
+    Taken,
+}
+
+impl Switch {
+    /// Returns when it must be sent, if no answer arrives before.
+    const fn due(&self) -> Option<Time> {
+        match self {
+            Self::Unsent { at } | Self::Resend { at } | Self::Sent { again: at, .. } => Some(*at),
+            Self::Taken => None,
+        }
+    }
+}
+
+/// Whether the peer's ring is read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum PeerRing {
+    Held(Marks),
+    Open,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Peer {
+    /// Through the node; requested again from `until` on.
+    Refused { until: Time },
+    /// Through the node; LNCL has been asked.
+    Asked { correlation: u64, until: Time },
+    /// Through the node; the peer has requested a link, and our offer is in the link's socket.
+    Offered { number: LinkNumber, marks: Marks, ended_at: Option<Time> },
+    /// Through our ring, until the peer has ended.
+    Direct { number: LinkNumber, switch: Switch, peer_ring: PeerRing, ended_at: Option<Time> },
+}
+
+impl Peer {
+    const fn link(&self) -> Option<LinkNumber> {
+        match self {
+            Self::Refused { .. } | Self::Asked { .. } => None,
+            Self::Offered { number, .. } | Self::Direct { number, .. } => Some(*number),
+        }
+    }
+
+    const fn correlation(&self) -> Option<u64> {
+        match self {
+            Self::Asked { correlation, .. }
+            | Self::Direct { switch: Switch::Sent { correlation, .. }, .. } => Some(*correlation),
+            Self::Refused { .. } | Self::Offered { .. } | Self::Direct { .. } => None,
+        }
+    }
+}
+
+/// Whether an endpoint has direct links at all.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Directness {
+    /// The endpoint has direct links, up to the maximum.
+    Allowed,
+    /// All messages go through the node.
+    Off,
+}
+
+/// The paths to all destinations of one endpoint.
+#[derive(Debug)]
+pub struct Routes {
+    own: Tid,
+    directness: Directness,
+    peers: BTreeMap<Tid, Peer>,
+    /// Number of links, including those that may become one.
+    links: usize,
+}
+
+impl Routes {
+    /// Creates the paths of `own`: all messages go through the node at first.
+    pub const fn new(own: Tid, directness: Directness) -> Self {
+        Self { own, directness, peers: BTreeMap::new(), links: 0 }
+    }
+
+    /// Returns the path to `destination`, which is absolute.
+    pub fn route(&self, destination: Tid, now: Time) -> Route {
+        match self.peers.get(&destination) {
+            Some(Peer::Direct { switch: Switch::Unsent { .. }, .. } | Peer::Offered { .. }) => Route::ViaNode,
+            Some(Peer::Direct { number, ended_at: None, .. }) => Route::Direct(*number),
+            Some(Peer::Direct { .. }) => Route::ViaNode,
+            Some(Peer::Refused { until } | Peer::Asked { until, .. }) if now < *until => Route::ViaNode,
+            // The request was not answered.
+            Some(Peer::Asked { .. }) => Route::RequestLink,
+            Some(Peer::Refused { .. }) | None if self.may_ask(destination) => Route::RequestLink,
+            Some(Peer::Refused { .. }) | None => Route::ViaNode,
+        }
+    }
+
+    /// Records that LNCL has been asked for an introduction to `peer`.
+    pub fn asked(&mut self, peer: Tid, correlation: u64, now: Time) {
+        self.set(peer, Peer::Asked { correlation, until: now + INTRODUCTION_TIMEOUT });
+    }
+
+    /// Records that LNCL could not be asked.
+    pub fn not_asked(&mut self, peer: Tid, now: Time) {
+        self.refuse(peer, now + SHORT_RETRY);
+    }
+
+    /// Records that this process has no memory for one more link, or cannot close further unexpected
+    /// descriptors of peers.
+    pub fn no_room(&mut self, peer: Tid, now: Time) {
+        self.refuse(peer, now + LONG_RETRY);
+    }
+
+    /// Handles LNCL's report that `peer` has agreed to a link. Returns whether the link is still wanted;
+    /// otherwise its descriptor is closed.
+    pub fn introduced(&self, peer: Tid, correlation: u64) -> bool {
+        matches!(self.peers.get(&peer), Some(Peer::Asked { correlation: asked, .. }) if *asked == correlation)
+    }
+
+    /// Handles LNCL's report that `peer` requests a link.
+    ///
+    /// # Errors
+    /// Returns why there is no link; the peer may ask again.
+    pub fn on_introduction(&self, peer: Tid) -> Result<(), Rejection> {
+        if self.directness == Directness::Off || peer == self.own {
+            return Err(Rejection::Unsupported);
+        }
+        match self.peers.get(&peer) {
+            // Both ask at once: the link that the smaller one requested is set up.
+            Some(Peer::Asked { .. }) if self.own < peer => Err(Rejection::QueueFull),
+            Some(Peer::Asked { .. }) => Ok(()),
+            Some(Peer::Offered { .. } | Peer::Direct { .. }) => Err(Rejection::QueueFull),
+            Some(Peer::Refused { .. }) | None if self.links < LINKS_MAX => Ok(()),
+            Some(Peer::Refused { .. }) | None => Err(Rejection::QueueFull),
+        }
+    }
+
+    /// Records that our offer is in the socket of the link that `peer` has requested.
+    pub fn offered(&mut self, peer: Tid, number: LinkNumber) {
+        self.set(peer, Peer::Offered { number, marks: Marks::default(), ended_at: None });
+    }
+
+    /// Records that the link is established and whether our SWITCH was sent, behind all messages through the
+    /// node so far. Without room for it, it is sent later. The peer's ring is open if its SWITCH established
+    /// the link.
+    pub fn connected(&mut self, peer: Tid, number: LinkNumber, sent: Option<u64>, now: Time) {
+        let (peer_ring, ended_at) = match self.peers.get(&peer) {
+            Some(Peer::Offered { ended_at, .. }) => (PeerRing::Open, *ended_at),
+            Some(Peer::Refused { .. } | Peer::Asked { .. } | Peer::Direct { .. }) | None => {
+                (PeerRing::Held(Marks::default()), None)
+            }
+        };
+        let later = Switch::Unsent { at: now + SWITCH_RETRY };
+        let switch =
+            sent.map_or(later, |correlation| Switch::Sent { correlation, again: now + SWITCH_TIMEOUT });
+        self.set(peer, Peer::Direct { number, switch, peer_ring, ended_at });
+    }
+
+    /// Handles a mark of `peer`'s SWITCH.
+    pub fn on_mark(
+        &mut self,
+        peer: Tid,
+        number: LinkNumber,
+        class: Class,
+        confirm: Option<u64>,
+    ) -> MarkEffect {
+        match self.peers.get_mut(&peer) {
+            // It was repeated; the first one is answered when all marks have arrived.
+            Some(
+                Peer::Offered { number: ours, marks, .. }
+                | Peer::Direct { number: ours, peer_ring: PeerRing::Held(marks), .. },
+            ) if *ours == number && marks.confirm.is_some() && confirm.is_some() => MarkEffect::Known,
+            Some(Peer::Offered { number: ours, marks, .. }) if *ours == number => {
+                if !marks.note(class, confirm) {
+                    return MarkEffect::Wait;
+                }
+                MarkEffect::Connect { confirm: marks.confirm }
+            }
+            Some(Peer::Direct { number: ours, peer_ring, .. }) if *ours == number => {
+                let PeerRing::Held(marks) = peer_ring else { return MarkEffect::Known };
+                if !marks.note(class, confirm) {
+                    return MarkEffect::Wait;
+                }
+                let confirm = marks.confirm;
+                *peer_ring = PeerRing::Open;
+                MarkEffect::Open { confirm }
+            }
+            Some(Peer::Refused { .. } | Peer::Asked { .. } | Peer::Offered { .. } | Peer::Direct { .. })
+            | None => MarkEffect::Unknown,
+        }
+    }
+
+    /// Handles an OUTCOME for `correlation`.
+    pub fn on_outcome(&mut self, correlation: u64, outcome: Outcome, now: Time) -> OutcomeEffect {
+        let ours = self.peers.iter().find(|(_, peer)| peer.correlation() == Some(correlation));
+        let Some((tid, peer)) = ours.map(|(tid, peer)| (*tid, *peer)) else { return OutcomeEffect::NotOurs };
+        let Peer::Direct { number, .. } = peer else {
+            self.refuse(tid, now + pause(outcome));
+            return OutcomeEffect::Noted;
+        };
+        match outcome {
+            Outcome::Delivered => self.set_switch(tid, Switch::Taken),
+            // The peer itself reports that it has no such link. The close of its socket may still be in
+            // transit.
+            Outcome::Rejected(Rejection::Unsupported | Rejection::Malformed) => {
+                return OutcomeEffect::End(tid, number);
+            }
+            // A node or queue in between has failed or is full: the link's end would show by itself.
+            Outcome::Rejected(_)
+            | Outcome::Expired
+            | Outcome::Failed
+            | Outcome::PeerLost
+            | Outcome::Unknown => self.set_switch(tid, Switch::Resend { at: now + SWITCH_TIMEOUT }),
+        }
+        OutcomeEffect::Noted
+    }
+
+    /// Returns a peer that needs its SWITCH again by `now`: [`switched`](Self::switched), or
+    /// [`not_switched`](Self::not_switched).
+    pub fn switch_due(&self, now: Time) -> Option<(Tid, LinkNumber)> {
+        self.peers.iter().find_map(|(tid, peer)| match peer {
+            Peer::Direct { number, switch, ended_at: None, .. }
+                if switch.due().is_some_and(|at| at <= now) =>
+            {
+                Some((*tid, *number))
+            }
+            Peer::Refused { .. } | Peer::Asked { .. } | Peer::Offered { .. } | Peer::Direct { .. } => None,
+        })
+    }
+
+    /// Records that the SWITCH was repeated.
+    pub fn switched(&mut self, peer: Tid, correlation: u64, now: Time) {
+        self.set_switch(peer, Switch::Sent { correlation, again: now + SWITCH_TIMEOUT });
+    }
+
+    /// Records that the SWITCH could not be sent; it is sent later.
+    pub fn not_switched(&mut self, peer: Tid, now: Time) {
+        if let Some(Peer::Direct { switch, .. }) = self.peers.get_mut(&peer) {
+            let at = now + SWITCH_RETRY;
+            *switch = match switch {
+                Switch::Unsent { .. } => Switch::Unsent { at },
+                Switch::Sent { .. } | Switch::Resend { .. } | Switch::Taken => Switch::Resend { at },
+            };
+        }
+    }
+
+    /// Handles a message from `source` that arrived through the node for this application alone.
+    pub fn on_node_message(&mut self, source: Tid, class: Class, now: Time) -> NodeDelivery {
+        match self.peers.get_mut(&source) {
+            Some(Peer::Direct { number, peer_ring: PeerRing::Open, ended_at, .. }) => {
+                ended_at.get_or_insert(now);
+                NodeDelivery::AfterLink(*number)
+            }
+            Some(
+                Peer::Direct { number, peer_ring: PeerRing::Held(marks), ended_at, .. }
+                | Peer::Offered { number, marks, ended_at },
+            ) if marks.has(class) => {
+                ended_at.get_or_insert(now);
+                NodeDelivery::AfterLink(*number)
+            }
+            Some(Peer::Refused { .. } | Peer::Asked { .. } | Peer::Offered { .. } | Peer::Direct { .. })
+            | None => NodeDelivery::Take,
+        }
+    }
+
+    /// Handles the close of the link by the peer, or the end of its process, with this much `unread` data.
+    /// Called repeatedly while its ring is kept.
+    pub fn on_hang_up(&mut self, peer: Tid, unread: Unread, now: Time) -> HangUpAction {
+        match self.peers.get_mut(&peer) {
+            Some(Peer::Direct { peer_ring: PeerRing::Open, ended_at, .. }) => {
+                ended_at.get_or_insert(now);
+                HangUpAction::Drain
+            }
+            // The peer sent its SWITCH before it wrote anything.
+            Some(Peer::Direct { .. } | Peer::Offered { .. }) if unread == Unread::None => HangUpAction::Drop,
+            Some(
+                Peer::Direct { peer_ring: PeerRing::Held(_), ended_at, .. } | Peer::Offered { ended_at, .. },
+            ) => {
+                if now < *ended_at.get_or_insert(now) + MARKS_AFTER_END {
+                    HangUpAction::Keep
+                } else {
+                    HangUpAction::Drop
+                }
+            }
+            Some(Peer::Refused { .. } | Peer::Asked { .. }) | None => HangUpAction::Drop,
+        }
+    }
+
+    /// Records that the link with `peer` has ended. A later one may be requested.
+    pub fn ended(&mut self, peer: Tid, now: Time) {
+        self.refuse(peer, now + SHORT_RETRY);
+    }
+
+    /// Records the end of the connection to the node. Requests to the node are dropped, and each unanswered
+    /// SWITCH is sent again over the next connection.
+    pub fn on_node_end(&mut self, now: Time) {
+        for peer in self.peers.values_mut() {
+            match peer {
+                Peer::Asked { .. } => {
+                    *peer = Peer::Refused { until: now };
+                    self.links -= 1;
+                }
+                Peer::Direct { switch: switch @ Switch::Sent { .. }, .. } => {
+                    *switch = Switch::Resend { at: now };
+                }
+                Peer::Direct { .. } | Peer::Offered { .. } | Peer::Refused { .. } => {}
+            }
+        }
+    }
+
+    /// Returns whether LNCL has been asked and has not answered.
+    pub fn is_asking(&self) -> bool {
+        self.peers.values().any(|peer| matches!(peer, Peer::Asked { .. }))
+    }
+
+    /// Returns whether the ring of `peer` is read.
+    pub fn is_open(&self, peer: Tid) -> bool {
+        matches!(self.peers.get(&peer), Some(Peer::Direct { peer_ring: PeerRing::Open, .. }))
+    }
+
+    /// Returns the link with `peer`, if it exists or is being set up.
+    pub fn link(&self, peer: Tid) -> Option<LinkNumber> {
+        self.peers.get(&peer).and_then(Peer::link)
+    }
+
+    fn may_ask(&self, destination: Tid) -> bool {
+        self.directness == Directness::Allowed
+            && self.links < LINKS_MAX
+            && destination != self.own
+            && destination.node == self.own.node
+            && destination.is_single()
+            && !destination.app.is_layer()
+    }
+
+    fn set_switch(&mut self, peer: Tid, to: Switch) {
+        if let Some(Peer::Direct { switch, .. }) = self.peers.get_mut(&peer) {
+            *switch = to;
+        }
+    }
+
+    fn refuse(&mut self, peer: Tid, until: Time) {
+        self.set(peer, Peer::Refused { until });
+        if self.peers.len() - self.links > REFUSALS_MAX {
+            let refusals = self.peers.iter().filter_map(|(tid, peer)| match peer {
+                Peer::Refused { until } => Some((*until, *tid)),
+                Peer::Asked { .. } | Peer::Offered { .. } | Peer::Direct { .. } => None,
+            });
+            if let Some((_, first)) = refusals.min() {
+                self.peers.remove(&first);
+            }
+        }
+    }
+
+    fn set(&mut self, tid: Tid, peer: Peer) {
+        let is_link = |peer: &Peer| !matches!(peer, Peer::Refused { .. });
+        self.links += usize::from(is_link(&peer));
+        if let Some(former) = self.peers.insert(tid, peer) {
+            self.links -= usize::from(is_link(&former));
+        }
+    }
+}
+
+/// Returns how long an introduction with this outcome is not requested again.
+const fn pause(outcome: Outcome) -> Duration {
+    match outcome {
+        // The destination is in the node's own process, on another node, a client with a plain socket, or
+        // without direct links.
+        Outcome::Rejected(Rejection::Unsupported) => LONG_RETRY,
+        Outcome::Delivered
+        | Outcome::Rejected(_)
+        | Outcome::Expired
+        | Outcome::Failed
+        | Outcome::PeerLost
+        | Outcome::Unknown => SHORT_RETRY,
+    }
+}

@@ -1,0 +1,29 @@
+//! The wait modes of an endpoint: one semantics, two ways to wait.
+//!
+//! The behaviour of an endpoint is implemented once, as futures (`endpoint.rs`, `outgoing.rs`, `incoming.rs`,
+//! `node_link.rs`, `reconnect.rs`). The mode decides only how it waits. A thread blocks in the wait, so that
+//! its futures are ready at the first poll; a task yields its thread.
+
+use std::{
+    future::Future,
+    pin::pin,
+    task::{Context, Poll, Waker},
+};
+
+use super::reactor::Reactor;
+
+/// The kind of caller that waits.
+pub(super) enum WaitMode {
+    /// The calling thread.
+    Blocking,
+    /// A task, on any thread of its runtime.
+    Async(Box<Reactor>),
+}
+
+/// Returns the value of a future of an endpoint with [`WaitMode::Blocking`].
+pub(super) fn block_ready<T>(future: impl Future<Output = T>) -> T {
+    match pin!(future).poll(&mut Context::from_waker(Waker::noop())) {
+        Poll::Ready(value) => value,
+        Poll::Pending => unreachable!("a blocking endpoint has waited when the future returns"),
+    }
+}

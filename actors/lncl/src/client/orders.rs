@@ -1,0 +1,165 @@
+//! Execution of the orders of a client's session.
+
+use std::ops::ControlFlow;
+
+use sinew_model::facts::User;
+use sinew_protocol::payload::{self, Resolved};
+use sinew_runtime::{
+    lock,
+    outcome::{Outcome, Rejection, Ticket},
+    tid::Tid,
+    time::Time,
+    wire::{Flags, Header, Kind, Message},
+};
+
+use super::{
+    super::{
+        link_broker::LinkRequest,
+        registrar,
+        session::{MembershipError, Order},
+    },
+    Client,
+    end::ConnectionEnd,
+};
+use crate::undelivered::{self, Entry};
+
+impl Client {
+    /// Executes an order. Returns the end of the connection if the order ends it.
+    pub(super) fn execute(&self, order: Order) -> ControlFlow<ConnectionEnd> {
+        match order {
+            Order::Route(message) => self.route(message),
+            Order::Settle { source, correlation, outcome } => self.settle(source, correlation, outcome),
+            Order::SetMember { group, member, confirm } => self.set_member(group, member, confirm),
+            Order::RefuseMembership { destination, correlation, outcome, why } => {
+                self.count_membership_error(why);
+                self.send_outcome(destination, correlation, outcome);
+            }
+            Order::Resolve { name, nearest, correlation } => self.resolve(&name, nearest, correlation),
+            Order::Introduce { to, correlation } => self.broker_link(to, correlation),
+            Order::Switch { to, number, correlation } => self.switch(to, number, correlation),
+            Order::RefuseMessage { message, why } => self.refuse_message(&message, why),
+            Order::Unregister => return ControlFlow::Break(ConnectionEnd::Unregistered),
+            Order::End(violation) => {
+                return ControlFlow::Break(ConnectionEnd::Refused(violation.to_string()));
+            }
+            Order::Register(_) => {
+                return ControlFlow::Break(ConnectionEnd::Refused("registered already".to_owned()));
+            }
+        }
+        ControlFlow::Continue(())
+    }
+
+    fn route(&self, mut message: Message) {
+        let router = &self.server.state.ctx.router;
+        let destination = router.absolute(message.header.destination);
+        let is_confirmed = message.header.flags.has(Flags::CONFIRM);
+        if is_confirmed {
+            let correlation = message.header.correlation;
+            let ticket = Ticket { source: self.tid, destination, correlation };
+            let Some(receipt) = self.outcomes.receipt(ticket) else { return };
+            message.receipt = Some(receipt);
+        }
+        let header = Header { destination, ..message.header };
+        let sent = self.within_share(message).and_then(|message| router.send(message));
+        if let Err(why) = sent
+            && !is_confirmed
+            && undelivered::is_fault(destination, why)
+        {
+            // The sender of a confirmed message is notified by its outcome.
+            let (detail, now) = (format!("from {} to {destination}: {why}", self.tid), Time::now());
+            self.server.refusals.count(now, "unconfirmed message not taken", &detail);
+            self.server.state.undelivered.count(now, Entry::of(&header, why, 1, now));
+        }
+    }
+
+    /// Returns the message if the client belongs to the node's own user, or if the quota of guests has room for it.
+    fn within_share(&self, message: Message) -> Result<Message, Rejection> {
+        let User::Guest(uid) = self.user else { return Ok(message) };
+        let state = &self.server.state;
+        state.guest_quotas.admit(state.ctx.node, uid, message).map_err(|refused| {
+            let why = refused.why;
+            // Counted and reported to the receipt's owner, like a message that a full queue rejects.
+            state.ctx.router.refuse(refused);
+            why
+        })
+    }
+
+    fn settle(&self, source: Tid, correlation: u64, outcome: Outcome) {
+        let ticket = Ticket { source, destination: self.tid, correlation };
+        if !self.outlet.confirm(ticket, outcome) {
+            let detail = format!("{} settles a message {correlation} of {source} that it has not", self.tid);
+            self.server.refusals.count(Time::now(), "outcome of nothing", &detail);
+        }
+    }
+
+    // spec: LNCL-19
+    fn resolve(&self, name: &str, nearest: bool, correlation: u64) {
+        let tid = registrar::resolve(&self.server.state, name).map(Tid::bits);
+        // Similar names cost the node's time to find, so guests do not get them.
+        let gets_nearest = nearest && tid.is_none() && self.user == User::Own;
+        let nearest = if gets_nearest { registrar::nearest(&self.server.state, name) } else { Vec::new() };
+        let lncl = payload::lncl_of(self.tid.node);
+        let mut answer = payload::frame(Kind::LNCL_RESOLVED, lncl, self.tid, &Resolved { tid, nearest });
+        answer.header.correlation = correlation;
+        self.outcomes.answer(answer);
+    }
+
+    fn broker_link(&self, to: Tid, correlation: u64) {
+        // The node can neither check messages on a direct link, nor stop them when the list changes. spec: LNCL-10
+        if self.server.state.security.access.get().is_some() {
+            let to = self.server.state.ctx.router.absolute(to);
+            return self.send_outcome(to, correlation, Outcome::Rejected(Rejection::Unsupported));
+        }
+        let number = lock(&self.server.state.registry).new_link();
+        let to = self.server.state.ctx.router.absolute(to);
+        let link_broker = &self.server.link_broker;
+        if let Err(why) =
+            link_broker.introduce(self.tid, to, LinkRequest { number, correlation }, Time::now())
+        {
+            self.send_outcome(to, correlation, Outcome::Rejected(why));
+        }
+    }
+
+    // spec: LNCL-11
+    fn switch(&self, to: Tid, number: u64, correlation: u64) {
+        let to = self.server.state.ctx.router.absolute(to);
+        let ticket = Ticket { source: self.tid, destination: to, correlation };
+        let Some(receipt) = self.outcomes.receipt(ticket) else { return };
+        // Marks bypass the access list on their way into the peer's queues. A client without links has none to switch
+        // to.
+        if self.server.state.security.access.get().is_some() {
+            return receipt.settle(Outcome::Rejected(Rejection::Unsupported));
+        }
+        if let Err((receipt, why)) = self.server.link_broker.pass_marks(self.tid, to, number, receipt) {
+            receipt.settle(Outcome::Rejected(why));
+        }
+    }
+
+    fn refuse_message(&self, message: &Message, why: Rejection) {
+        let Header { source, destination, correlation, flags, .. } = message.header;
+        let detail = format!("{} sent a message of {source} to {destination}: {why}", self.tid);
+        let cause = if why == Rejection::ForgedSource { "forged source" } else { "unsupported flags" };
+        let now = Time::now();
+        self.server.refusals.count(now, cause, &detail);
+        if flags.has(Flags::CONFIRM) {
+            self.send_outcome(destination, correlation, Outcome::Rejected(why));
+        } else {
+            // The message may name another source, but this client sent it.
+            let destination = self.server.state.ctx.router.absolute(destination);
+            let header = Header { source: self.tid, destination, ..message.header };
+            self.server.state.undelivered.count(now, Entry::of(&header, why, 1, now));
+        }
+    }
+
+    /// Logs it like a membership that the access list refuses.
+    fn count_membership_error(&self, why: MembershipError) {
+        self.orders.count();
+        let detail = format!("of {} ({}): {why}", self.name, self.tid);
+        self.server.refusals.count(Time::now(), "membership", &detail);
+    }
+
+    pub(super) fn send_outcome(&self, about: Tid, correlation: u64, outcome: Outcome) {
+        let ticket = Ticket { source: self.tid, destination: about, correlation };
+        self.outcomes.send(ticket, outcome);
+    }
+}

@@ -1,0 +1,132 @@
+//! Whether the reference is that of the code.
+
+use super::*;
+use crate::config::file::KEYS;
+
+const MARKERS: [&str; 2] = ["<!-- generated: begin -->", "<!-- generated: end -->"];
+/// Set, the files are written instead of compared.
+const UPDATE: &str = "UPDATE";
+const COMMAND: &str = "UPDATE=1 cargo test --workspace --lib -- config::check::reference";
+
+fn reference(file: &str) -> std::path::PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/book/src/reference").join(file)
+}
+
+fn read(file: &str) -> String {
+    std::fs::read_to_string(reference(file)).unwrap_or_else(|error| panic!("{file}: {error}"))
+}
+
+/// Writes `file` if an update is requested. Returns its content.
+fn updated(file: &str, text: &str) -> String {
+    if std::env::var_os(UPDATE).is_some() {
+        std::fs::write(reference(file), text).unwrap_or_else(|error| panic!("{file}: {error}"));
+    }
+    read(file)
+}
+
+/// A file with `value` for `key`, and with neighbours that allow every legal value.
+fn file_with(key: &str, value: &Value) -> String {
+    let (section, leaf) = key.split_once('.').unwrap();
+    let name = if key == "node.name" { "" } else { "name = 'knee'\n" };
+    let neighbour = match key {
+        "gncl.redial_min_ms" => "redial_max_ms = 60000\n",
+        "gncl.redial_max_ms" => "redial_min_ms = 1\n",
+        _ => "",
+    };
+    let section = if section == "node" { String::new() } else { format!("[{section}]\n") };
+    format!("[node]\n{name}{section}{leaf} = {value}\n{neighbour}")
+}
+
+/// Values of a key that are legal, and none that is so by chance.
+fn legal(kind: &Kind) -> Vec<Value> {
+    match kind {
+        Kind::Number(range) => vec![range.low.into(), range.high.into()],
+        Kind::NumberOrFalse(range) => vec![range.low.into(), range.high.into(), false.into()],
+        Kind::Truth => vec![true.into(), false.into()],
+        Kind::OneOf(texts) => texts.iter().map(|text| json!(text)).collect(),
+        Kind::PathOrFalse(bytes) => vec![json!("k".repeat(*bytes)), false.into()],
+        Kind::Name => vec![json!("n".repeat(NAME_BYTES_MAX))],
+        Kind::NodeAddress => vec![json!("10.0.0.7")],
+        Kind::EndpointOrFalse { pattern, .. } if *pattern == IPV6_PORT => {
+            vec![json!("[ff02::77]:7"), false.into()]
+        }
+        Kind::EndpointOrFalse { .. } => vec![false.into()],
+        Kind::Interfaces => vec![json!("10.0.0.7"), json!(["10.0.0.7", "eth0/ipv6"])],
+        Kind::Addresses(_) => vec![json!(["10.0.0.7", "10.0.0.8"])],
+        Kind::Seeds(_) => vec![json!(["10.0.0.7:7", "[fe80::7%eth0]:7"])],
+        // TOML encodes tables differently than JSON.
+        Kind::Watch => vec![json!([])],
+    }
+}
+
+#[test]
+fn every_key_that_the_reader_accepts_has_a_row() {
+    assert_eq!(
+        ROWS.iter().map(|row| row.key).collect::<Vec<_>>(),
+        KEYS,
+        "rows of check/reference/rows.rs, and keys"
+    );
+    let sections: Vec<_> = SECTIONS.iter().map(|(section, _)| *section).collect();
+    assert!(ROWS.iter().all(|row| sections.contains(&row.section())));
+}
+
+#[test]
+fn every_row_is_about_the_setting_of_its_key() {
+    for row in ROWS {
+        for value in legal(&row.kind) {
+            let text = file_with(row.key, &value);
+            let config = NodeConfig::from_toml(&text).unwrap_or_else(|faults| panic!("{faults}\n{text}"));
+            assert_eq!((row.value)(&config), value, "{}", row.key);
+        }
+        if let Kind::Number(range) | Kind::NumberOrFalse(range) = &row.kind {
+            assert_eq!(range.key, row.key);
+        }
+    }
+}
+
+#[test]
+fn choices_match_the_reader() {
+    for row in ROWS {
+        let Kind::OneOf(texts) = &row.kind else { continue };
+        let faults = NodeConfig::from_toml(&file_with(row.key, &json!("none of them"))).unwrap_err();
+        let named: Vec<_> = faults.faults()[0].legal.split('"').skip(1).step_by(2).collect();
+        assert_eq!(named, *texts, "{}", row.key);
+    }
+}
+
+#[test]
+fn every_cell_is_a_short_sentence() {
+    for row in ROWS {
+        for sentence in [row.effect, row.note] {
+            let words = sentence.split_whitespace().count();
+            assert!(words <= 25 && sentence.len() <= CELL_MAX, "{}, {words} words: {sentence}", row.key);
+            assert!(sentence.is_empty() || sentence.ends_with('.') && !sentence.contains('|'), "{sentence}");
+        }
+        assert!(!row.effect.is_empty(), "{}", row.key);
+    }
+}
+
+#[test]
+fn the_page_has_the_tables_of_the_code() {
+    const FILE: &str = "configuration.md";
+    let page = read(FILE);
+    let (before, rest) = page.split_once(MARKERS[0]).expect("the generated part begins");
+    let (_, after) = rest.split_once(MARKERS[1]).expect("the generated part ends");
+    let expected = [before, MARKERS[0], "\n", &tables(), MARKERS[1], after].concat();
+    assert_eq!(updated(FILE, &expected), expected, "write it anew: {COMMAND}");
+}
+
+#[test]
+fn the_complete_file_has_the_keys_of_the_code() {
+    let expected = complete_file();
+    assert_eq!(updated("node.toml", &expected), expected, "write it anew: {COMMAND}");
+}
+
+#[test]
+fn the_schema_has_the_keys_of_the_code() {
+    let expected = schema();
+    let written = updated("node.schema.json", &format!("{expected:#}\n"));
+    // The order of keys is that of serde_json, which a feature of it changes.
+    let written: Value = serde_json::from_str(&written).expect("it is JSON");
+    assert!(written == expected, "write it anew: {COMMAND}");
+}

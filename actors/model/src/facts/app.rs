@@ -1,0 +1,47 @@
+//! The facts that LNCL reports to the sync manager.
+
+use sinew_runtime::{tid::AppAddress, wire::Kind};
+
+/// The user that an application runs as.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum User {
+    /// The node's own user or root: the application is one of the robot's own.
+    Own,
+    /// This user, which the access list admits.
+    Guest(u32),
+}
+
+impl User {
+    /// Returns the kind of user of a process of `uid`, at a node that runs as `own`.
+    pub const fn of(uid: u32, own: u32) -> Self {
+        if uid == own || uid == 0 { Self::Own } else { Self::Guest(uid) }
+    }
+}
+
+/// A change of an application of this node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[expect(missing_docs, reason = "each field is what its name says")]
+pub enum AppFact {
+    /// It has an address. The fact contains its name, if any, the names that it requires, and its user. One fact
+    /// contains all of them, so that no receiver takes a guest for one of the node's own applications in between.
+    Registered { app: AppAddress, name: Option<String>, requires: Vec<String>, user: User },
+    /// The payloads that a registered application handles, if it reports them.
+    Handles { app: AppAddress, kinds: Vec<Kind> },
+    /// It has started, and receives messages.
+    Ready { app: AppAddress },
+    /// It receives no messages: it has failed, and is not restarted yet.
+    Down { app: AppAddress },
+    /// It receives no messages: it was stopped, or has ended normally.
+    Stopped { app: AppAddress },
+    /// It is unregistered.
+    Unregistered { app: AppAddress },
+    /// The groups with members on this node changed.
+    GroupsChanged,
+}
+
+impl AppFact {
+    /// Returns the fact of a registered application of the node's own user.
+    pub fn own_registered(app: AppAddress, name: Option<String>, requires: Vec<String>) -> Self {
+        Self::Registered { app, name, requires, user: User::Own }
+    }
+}

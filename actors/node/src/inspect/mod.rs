@@ -1,0 +1,42 @@
+//! Inspection: every node answers questions about itself, for tools like `sinew`.
+//!
+//! Any application that can send a message can ask, from any node. The questions go to `node/inspect`
+//! ([`AppAddress::INSPECT`]) by `ask`, as to any application. Inspection only
+//! reads; the one exception is that it can make the node read its access list again.
+//!
+//! | rule | |
+//! | --- | --- |
+//! | INSPECT-1 | Every node answers from its start to its end, without configuration. The address is in no list of applications and in no broadcast. |
+//! | INSPECT-2 | One thread answers, one question after the other. At most 32 questions are queued, 8 of guests of the node, 4 of one user; a further one is refused as `QueueFull`. After each report the thread pauses for 1 ms. No layer and no application waits for it. |
+//! | INSPECT-3 | An answer has the bounds of its type, and is at most `node.payload_max` long. Entries that do not fit are left out, last ones first, and counted (`left_out`, and for one list among others `kinds_left_out`, `barriers_left_out`, `waiting_left_out`, `missing_left_out`, `groups_left_out`, `lost_left_out`, `foreign_left_out`, `refusals_left_out`). |
+//! | INSPECT-4 | A kind that is no question is refused as `UnknownKind`. `sinew.ping`, confirmed, ends as `Delivered`. |
+//! | INSPECT-5 | A panic in an answer costs that answer, which ends as `Failed`, and nothing else. |
+//! | INSPECT-6 | A watch records the messages that the routing table delivers: all that an application of this node sends and gets, except on direct links between processes. There are at most 8 watches, 4 of guests of the node. Each keeps 2,048 messages and 1 MiB of payloads until the next question; further ones are counted as dropped. No sender waits for it. It ends 3 s after the last question, and without a watch it costs a sender one pointer check. Its answers have class Bulk. |
+//! | INSPECT-7 | The node's access list does not apply to questions. Only a program on the node's own host can request that its file is read again; a file with faults changes nothing. |
+//! | INSPECT-8 | The applications that a message to many reaches are computed from the routing table by the same code that delivers such a message. Nothing is sent, so no application gets a message, nothing is counted, and no watch shows it. |
+//!
+//! `docs/protocol/inspect.md` lists the fields.
+
+mod access;
+mod answers;
+mod inspector;
+mod reach;
+mod refused;
+mod reports;
+#[cfg(test)]
+mod tests;
+mod watches;
+
+pub(crate) use inspector::begin;
+pub use reports::{
+    APPS_MAX, AccessReport, AccessVerdict, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskGroups,
+    AskNode, AskReach, AskReload, AskTree, AskWatch, AuditReport, BarrierReport, CertificateReport,
+    DialReport, ForeignReport, GroupReport, IdleReport, KindReport, LinkReport, LostEchoReport, LostReport,
+    Missing, NodeReport, PEERS_MAX, PeerReport, Ping, REACHED_MAX, ReachReport, Reached, RefusalReport,
+    ReloadReport, RouteReport, SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage, SourceReport,
+    StallReport, StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport, UnguardedReport,
+    UnhandledReport, WaitReport, WatchReport,
+};
+
+#[cfg(doc)]
+use sinew_runtime::tid::AppAddress;

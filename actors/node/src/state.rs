@@ -1,0 +1,88 @@
+//! The state of a node: what all layers share, and the state of each layer. It outlives every layer.
+
+use std::sync::Arc;
+
+use sinew_model::{config::NodeConfig, context::NodeContext, limits::EVENT_QUEUE_CAPACITY};
+use sinew_runtime::{
+    event_queue::EventQueue,
+    lock,
+    tid::{AppAddress, Incarnation},
+};
+use sinew_security::SecurityState;
+
+use super::root::{RootEvent, RootQueue};
+use crate::audit;
+
+/// The state of a node. The root owns it, and lends its parts to each new instance of a layer.
+pub(crate) struct NodeState {
+    /// What all layers share.
+    pub(crate) ctx: Arc<NodeContext>,
+    /// The security in force.
+    pub(crate) security: Arc<SecurityState>,
+    /// The events of the root.
+    pub(crate) root: EventQueue<RootEvent>,
+    /// The state of LNCL.
+    pub(crate) lncl: Arc<sinew_lncl::State>,
+    /// The state of GNCL.
+    pub(crate) gncl: Arc<sinew_gncl::State>,
+    /// The state of NDL.
+    pub(crate) ndl: Arc<sinew_ndl::State>,
+    /// The state of the sync manager.
+    pub(crate) sync: Arc<sinew_sync::State>,
+    /// The audit questions that this node has sent, and those that it has received.
+    pub(crate) questions: audit::Questions,
+}
+
+impl NodeState {
+    /// Returns the state of a node that has not started yet, its layers connected.
+    pub(crate) fn new(config: NodeConfig, incarnation: Incarnation) -> Arc<Self> {
+        let root = EventQueue::new(EVENT_QUEUE_CAPACITY);
+        let ctx = NodeContext::new(config, incarnation, Arc::new(RootQueue(root.clone())));
+        let security = Arc::new(SecurityState::default());
+        let lncl = sinew_lncl::State::new(ctx.clone(), security.clone());
+        let gncl = sinew_gncl::State::new(ctx.clone(), security.clone());
+        let ndl = sinew_ndl::State::new(ctx.clone(), security.clone());
+        let sync = sinew_sync::State::new(ctx.clone(), security.clone());
+        let state = Arc::new(Self {
+            ctx,
+            security,
+            root,
+            lncl,
+            gncl,
+            ndl,
+            sync,
+            questions: audit::Questions::default(),
+        });
+        state.connect();
+        state
+    }
+
+    /// Connects the ports of the layers.
+    fn connect(self: &Arc<Self>) {
+        let ports = &self.ctx.ports;
+        ports.connect_applications(&(self.lncl.clone() as Arc<_>));
+        ports.connect_links(&(self.gncl.clone() as Arc<_>));
+        ports.connect_members(&(self.ndl.clone() as Arc<_>));
+        ports.connect_names(&(self.sync.clone() as Arc<_>));
+        ports.connect_app_lifecycle(&(self.sync.clone() as Arc<_>));
+        let audits = Arc::new(audit::Frames(Arc::downgrade(self)));
+        // It is set once, here.
+        let _ = self.sync.audits.set(audits);
+    }
+
+    /// Releases the node's socket and its address for inspection, so that another node can use them even if a
+    /// hung thread still holds the state.
+    pub(crate) fn close(&self) {
+        self.lncl.client_socket.close();
+        self.ctx.router.remove_local(AppAddress::INSPECT);
+        self.gncl.store.close();
+        self.gncl.store.end_threads();
+        lock(&self.ndl.sockets).close_all();
+    }
+
+    /// Returns the state of a node that has only the layers that a test starts.
+    #[cfg(test)]
+    pub(crate) fn for_test(config: NodeConfig, incarnation: Incarnation) -> Arc<Self> {
+        Self::new(config, incarnation)
+    }
+}

@@ -1,0 +1,443 @@
+//! Confirmed messages without a known outcome, by destination, and their bounds: a slow destination takes no
+//! place of others.
+//!
+//! They have a separate lock. No thread writes or waits while it holds this lock. Outcomes are settled, and
+//! overdue ones given up, while another thread writes to the connection, however long that takes. A thread
+//! may take this lock while it holds the outlet's lock, never the other way round.
+
+use std::{
+    collections::{BTreeMap, VecDeque},
+    sync::{
+        Mutex, PoisonError,
+        atomic::{AtomicUsize, Ordering},
+    },
+    task::Waker,
+    time::Duration,
+};
+
+use sinew_runtime::{
+    outcome::{Outcome, Receipt, Ticket},
+    tid::Tid,
+    time::Time,
+    wire::Message,
+};
+
+use super::{OutletLimits, deferred::DeferredActions, numbering::Session};
+
+/// Time after a sent message's time to live in which its outcome may still arrive.
+pub(super) const OUTCOME_GRACE: Duration = Duration::from_secs(1);
+/// With a session, the bound for all destinations is this multiple of the bound for one.
+const UNCONFIRMED_DESTINATIONS: usize = 8;
+/// Maximum number of empty destinations that are kept, because most destinations are used again.
+const EMPTY_DESTINATIONS_MAX: usize = 64;
+
+/// Returns the destination that must report the outcome of a message; `None` if none must.
+pub(super) fn confirming_destination(message: &Message) -> Option<Tid> {
+    message.receipt.as_ref().map(|receipt| receipt.ticket().destination)
+}
+
+/// A sent message with a pending outcome.
+pub(super) struct SentMessage {
+    pub(super) receipt: Receipt,
+    pub(super) expiry: Time,
+    /// The connection's count of written bytes after this message.
+    pub(super) written: u64,
+}
+
+/// The pending outcomes of one destination.
+#[derive(Default)]
+struct Destination {
+    /// Sent messages, the oldest first: outcomes arrive in about this order.
+    sent: VecDeque<SentMessage>,
+    /// Messages that wait to be sent, in the queue or in the backlog.
+    waiting: usize,
+}
+
+impl Destination {
+    fn is_empty(&self) -> bool {
+        self.sent.is_empty() && self.waiting == 0
+    }
+}
+
+/// Bounds on the number of pending outcomes.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Shares {
+    unconfirmed_max: usize,
+    /// The number of outcomes that the peer has room for; `None` without a session.
+    outcome_room: Option<usize>,
+}
+
+impl Shares {
+    pub(super) fn of(limits: OutletLimits, session: Option<&Session>) -> Self {
+        let outcome_room = session.map(|session| session.outcome_room);
+        Self { unconfirmed_max: limits.unconfirmed_max, outcome_room }
+    }
+}
+
+/// Confirmed messages and their lock. A queued one stays until it is sent or dropped, a sent one until its
+/// outcome is known.
+pub(super) struct Open {
+    all: Mutex<Outstanding>,
+    /// The number of these messages.
+    count: AtomicUsize,
+}
+
+impl Open {
+    pub(super) fn new(shares: Shares) -> Self {
+        Self { all: Mutex::new(Outstanding::new(shares)), count: AtomicUsize::new(0) }
+    }
+
+    /// Calls the method of this name of [`Outstanding`], as do the following methods.
+    pub(super) fn add_waiting(&self, confirming_destination: Option<Tid>) {
+        if confirming_destination.is_some() {
+            self.with(|all| all.add_waiting(confirming_destination));
+        }
+    }
+
+    pub(super) fn remove_waiting(&self, confirming_destination: Option<Tid>) {
+        if confirming_destination.is_some() {
+            self.with(|all| all.remove_waiting(confirming_destination));
+        }
+    }
+
+    pub(super) fn clear_waiting(&self) {
+        self.with(Outstanding::clear_waiting);
+    }
+
+    pub(super) fn begin_write(&self, ticket: Ticket) {
+        self.with(|all| all.writing = Some((ticket, None)));
+    }
+
+    pub(super) fn end_write(&self) {
+        self.with(|all| all.writing = None);
+    }
+
+    pub(super) fn sent(&self, sent: SentMessage) -> Option<(Receipt, Outcome)> {
+        self.with(|all| all.sent(sent))
+    }
+
+    pub(super) fn take_all(&self) -> std::vec::IntoIter<SentMessage> {
+        self.with(Outstanding::take_all)
+    }
+
+    pub(super) fn confirm(&self, ticket: Ticket, outcome: Outcome, deferred: &mut DeferredActions) -> bool {
+        self.with(|all| all.confirm(ticket, outcome, deferred))
+    }
+
+    /// Settles the outcomes that were pending, and leaves the others in `outcomes`.
+    pub(super) fn confirm_all(&self, outcomes: &mut Vec<(Ticket, Outcome)>, deferred: &mut DeferredActions) {
+        if self.len() > 0 {
+            self.with(|all| outcomes.retain(|(ticket, outcome)| !all.confirm(*ticket, *outcome, deferred)));
+        }
+    }
+
+    /// Gives up outcomes that are `grace` overdue, to free their places. By then the senders have stopped
+    /// waiting.
+    pub(super) fn give_up_overdue(&self, now: Time, grace: Duration, deferred: &mut DeferredActions) {
+        if self.len() > 0 {
+            self.with(|all| {
+                let overdue = all.take_overdue(now, grace);
+                deferred.settle(overdue.into_iter().map(|receipt| (receipt, Outcome::Unknown)));
+                all.wake_if_fewer_open(deferred);
+            });
+        }
+    }
+
+    pub(super) fn wake_if_fewer_open(&self, deferred: &mut DeferredActions) {
+        self.with(|all| all.wake_if_fewer_open(deferred));
+    }
+
+    pub(super) fn is_at_bound(&self, destination: Tid) -> bool {
+        self.with(|all| all.is_at_bound(destination))
+    }
+
+    /// Registers a sender that found too many pending outcomes of this destination. It is woken when there
+    /// are [fewer](Self::wake_if_fewer_open). Returns whether there still are too many.
+    pub(super) fn await_fewer(&self, destination: Tid, room: Option<&Waker>) -> bool {
+        self.with(|all| {
+            let is_at_bound = all.is_at_bound(destination);
+            if is_at_bound {
+                all.awaited = room.map(|room| (destination, room.clone()));
+            }
+            is_at_bound
+        })
+    }
+
+    /// Takes the waker of the sender that waited for fewer pending outcomes; the caller must wake it.
+    pub(super) fn awaited_no_more(&self) -> Option<Waker> {
+        self.with(|all| all.awaited.take().map(|(_, waker)| waker))
+    }
+
+    /// Returns the number of all messages, queued or sent.
+    pub(super) fn len(&self) -> usize {
+        // SYNC: Acquire, with the Release below. A message is counted before it is written, so a thread that
+        // has its outcome from the peer sees the count.
+        self.count.load(Ordering::Acquire)
+    }
+
+    /// Runs `step` under the lock. No step can panic halfway.
+    fn with<R>(&self, step: impl FnOnce(&mut Outstanding) -> R) -> R {
+        let all = &mut *self.all.lock().unwrap_or_else(PoisonError::into_inner);
+        let result = step(all);
+        // SYNC: see `len`.
+        self.count.store(all.open(), Ordering::Release);
+        result
+    }
+}
+
+/// The state under that lock.
+struct Outstanding {
+    shares: Shares,
+    destinations: BTreeMap<Tid, Destination>,
+    sent: usize,
+    waiting: usize,
+    /// The message that is being written, and its outcome if that arrived before the write returned.
+    writing: Option<(Ticket, Option<Outcome>)>,
+    /// The sender that waits for fewer pending outcomes, and its destination.
+    awaited: Option<(Tid, Waker)>,
+}
+
+impl Outstanding {
+    const fn new(shares: Shares) -> Self {
+        Self { shares, destinations: BTreeMap::new(), sent: 0, waiting: 0, writing: None, awaited: None }
+    }
+
+    /// Counts a queued message of this destination with a pending outcome. Does nothing for `None`.
+    fn add_waiting(&mut self, confirming_destination: Option<Tid>) {
+        let Some(destination) = confirming_destination else { return };
+        self.destinations.entry(destination).or_default().waiting += 1;
+        self.waiting += 1;
+    }
+
+    /// Removes a message counted by [`add_waiting`](Self::add_waiting) that will not be sent.
+    fn remove_waiting(&mut self, confirming_destination: Option<Tid>) {
+        let Some(destination) = confirming_destination else { return };
+        let count = self.destinations.len();
+        let Some(pending) = self.destinations.get_mut(&destination) else { return };
+        pending.waiting -= 1;
+        self.waiting -= 1;
+        if pending.is_empty() && count > EMPTY_DESTINATIONS_MAX {
+            self.destinations.remove(&destination);
+        }
+    }
+
+    /// Removes all queued messages, which will not be sent.
+    fn clear_waiting(&mut self) {
+        self.destinations.values_mut().for_each(|pending| pending.waiting = 0);
+        self.waiting = 0;
+    }
+
+    /// Moves a message counted by [`add_waiting`](Self::add_waiting) to the sent ones. Returns its outcome if
+    /// the peer has already reported it.
+    fn sent(&mut self, sent: SentMessage) -> Option<(Receipt, Outcome)> {
+        let ticket = sent.receipt.ticket();
+        let reported =
+            self.writing.take().filter(|(writing, _)| *writing == ticket).and_then(|(_, reported)| reported);
+        if let Some(outcome) = reported {
+            self.remove_waiting(Some(ticket.destination));
+            return Some((sent.receipt, outcome));
+        }
+        let pending = self.destinations.entry(ticket.destination).or_default();
+        pending.waiting -= 1;
+        pending.sent.push_back(sent);
+        self.waiting -= 1;
+        self.sent += 1;
+        None
+    }
+
+    /// Returns the number of all messages, queued or sent.
+    const fn open(&self) -> usize {
+        self.sent + self.waiting
+    }
+
+    /// Returns the numbers of sent and of queued messages of one destination.
+    fn of(&self, destination: Tid) -> (usize, usize) {
+        self.destinations.get(&destination).map_or((0, 0), |pending| (pending.sent.len(), pending.waiting))
+    }
+
+    /// Removes the sent message that `ticket` names.
+    fn take(&mut self, ticket: Ticket) -> Option<Receipt> {
+        let count = self.destinations.len();
+        let pending = self.destinations.get_mut(&ticket.destination)?;
+        let at = pending.sent.iter().position(|sent| sent.receipt.ticket() == ticket)?;
+        let sent = pending.sent.remove(at)?;
+        self.sent -= 1;
+        if pending.is_empty() && count > EMPTY_DESTINATIONS_MAX {
+            self.destinations.remove(&ticket.destination);
+        }
+        Some(sent.receipt)
+    }
+
+    /// Removes sent messages that expired more than `grace` before `now`, the oldest first per destination.
+    /// Visits each message once, however many are removed, because a sender may wait for the lock.
+    fn take_overdue(&mut self, now: Time, grace: Duration) -> Vec<Receipt> {
+        let mut overdue = Vec::new();
+        let is_overdue = |sent: &SentMessage| sent.expiry != Time::MAX && now > sent.expiry + grace;
+        for pending in self.destinations.values_mut() {
+            // There is nearly always none, and the entry stays unchanged.
+            let Some(first) = pending.sent.iter().position(is_overdue) else { continue };
+            for sent in pending.sent.split_off(first) {
+                if is_overdue(&sent) {
+                    overdue.push(sent.receipt);
+                } else {
+                    pending.sent.push_back(sent);
+                }
+            }
+        }
+        self.sent -= overdue.len();
+        if self.destinations.len() > EMPTY_DESTINATIONS_MAX {
+            self.destinations.retain(|_, pending| !pending.is_empty());
+        }
+        overdue
+    }
+
+    /// Removes all sent messages.
+    fn take_all(&mut self) -> std::vec::IntoIter<SentMessage> {
+        let mut all = Vec::with_capacity(self.sent);
+        self.destinations.values_mut().for_each(|pending| all.extend(pending.sent.drain(..)));
+        self.destinations.retain(|_, pending| !pending.is_empty());
+        self.sent = 0;
+        all.into_iter()
+    }
+
+    /// Settles the message that `ticket` names. Returns whether it was pending.
+    fn confirm(&mut self, ticket: Ticket, outcome: Outcome, deferred: &mut DeferredActions) -> bool {
+        if let Some(receipt) = self.take(ticket) {
+            deferred.settle([(receipt, outcome)]);
+            self.wake_if_fewer_open(deferred);
+            return true;
+        }
+        match &mut self.writing {
+            // The outcome arrived before the write returned: the writing thread settles it.
+            Some((writing, reported @ None)) if *writing == ticket => {
+                *reported = Some(outcome);
+                true
+            }
+            Some(_) | None => false,
+        }
+    }
+
+    /// Wakes the waiting sender once its destination has room for half of its share. Other destinations may
+    /// stay at their bound forever.
+    fn wake_if_fewer_open(&mut self, deferred: &mut DeferredActions) {
+        let Some((destination, _)) = &self.awaited else { return };
+        if self.room_for_all() > 0 && 2 * self.room_for(*destination) >= self.share_of_one() {
+            deferred.room.extend(self.awaited.take().map(|(_, waker)| waker));
+        }
+    }
+
+    /// Whether the destination or all destinations together are at their bound. With a session, each
+    /// destination has the bound, and all together have a multiple of it, limited by the peer's room for
+    /// outcomes. A destination that reports nothing for long therefore does not block others.
+    fn is_at_bound(&self, destination: Tid) -> bool {
+        self.room_for_all() == 0 || self.room_for(destination) == 0
+    }
+
+    /// Returns how many more outcomes may be pending in total. Without a session, each destination's bound is
+    /// also the bound of all.
+    fn room_for_all(&self) -> usize {
+        let bound = UNCONFIRMED_DESTINATIONS * self.shares.unconfirmed_max;
+        let bound = self.shares.outcome_room.map_or(usize::MAX, |there| bound.min(there));
+        bound.saturating_sub(self.open())
+    }
+
+    /// Returns the share of one destination: of the peer's room for outcomes no larger a part than of the
+    /// bound for all.
+    fn share_of_one(&self) -> usize {
+        let outcome_room = self.shares.outcome_room.unwrap_or(usize::MAX);
+        self.shares.unconfirmed_max.min((outcome_room / UNCONFIRMED_DESTINATIONS).max(1))
+    }
+
+    /// Returns how many more outcomes of this destination may be pending.
+    fn room_for(&self, destination: Tid) -> usize {
+        let (bound, share) = (self.shares.unconfirmed_max, self.share_of_one());
+        if self.shares.outcome_room.is_none() {
+            return bound.saturating_sub(self.open());
+        }
+        let (sent, waiting) = self.of(destination);
+        // The queue and the pending bound the queued messages, and the bound for all is a multiple of these.
+        // If the peer has less room, the queued messages of one destination alone could use all of it.
+        let open = if share < bound { sent + waiting } else { sent };
+        share.saturating_sub(open)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::{Arc, Mutex};
+
+    use proptest::prelude::*;
+    use sinew_runtime::{
+        outcome::ReceiptSink,
+        tid::{AppAddress, NodeAddress},
+    };
+
+    use super::*;
+
+    const GRACE: Duration = Duration::from_nanos(10);
+
+    /// A sink for outcomes that only records the tickets.
+    #[derive(Default)]
+    struct NullSink(Mutex<Vec<Ticket>>);
+
+    impl ReceiptSink for NullSink {
+        fn settle(&self, ticket: Ticket, _: Outcome) {
+            self.0.lock().unwrap().push(ticket);
+        }
+    }
+
+    fn tid(app: u32) -> Tid {
+        Tid::new(NodeAddress::new(2), AppAddress::new(0x1000 + app))
+    }
+
+    /// Messages numbered from 0, each to one of the destinations; `None` as expiry: never.
+    fn outstanding(sent: &[(u32, Option<u64>)]) -> Outstanding {
+        let shares = Shares { unconfirmed_max: usize::MAX / UNCONFIRMED_DESTINATIONS, outcome_room: None };
+        let (mut outstanding, sink) = (Outstanding::new(shares), Arc::new(NullSink::default()));
+        for (correlation, (to, expiry)) in (0..).zip(sent) {
+            let ticket = Ticket { source: tid(0), destination: tid(*to), correlation };
+            let expiry = expiry.map_or(Time::MAX, Time::from_nanos);
+            outstanding.add_waiting(Some(ticket.destination));
+            let sent = SentMessage { receipt: Receipt::new(sink.clone(), ticket), expiry, written: 0 };
+            assert!(outstanding.sent(sent).is_none(), "no outcome was reported");
+        }
+        outstanding
+    }
+
+    fn correlations(receipts: &[Receipt]) -> Vec<u64> {
+        receipts.iter().map(|receipt| receipt.ticket().correlation).collect()
+    }
+
+    proptest! {
+        #[test]
+        fn overdue_messages_are_removed_in_order(
+            sent in proptest::collection::vec((0..4_u32, proptest::option::of(0..100_u64)), 0..60),
+            now in 0..130_u64,
+        ) {
+            let mut outstanding = outstanding(&sent);
+            let is_over = |expiry: Option<u64>| expiry.is_some_and(|expiry| now > expiry + 10);
+            // By destination, and of each the oldest first.
+            let mut all: Vec<(u32, u64, bool)> =
+                (0..).zip(&sent).map(|(number, (to, expiry))| (*to, number, is_over(*expiry))).collect();
+            all.sort_unstable();
+            let those = |over: bool| all.iter().filter(|(.., is)| *is == over).map(|(_, number, _)| *number).collect::<Vec<_>>();
+            let overdue = outstanding.take_overdue(Time::from_nanos(now), GRACE);
+            prop_assert_eq!(correlations(&overdue), those(true));
+            prop_assert_eq!(outstanding.open(), those(false).len());
+            let left: Vec<Receipt> = outstanding.take_all().map(|sent| sent.receipt).collect();
+            prop_assert_eq!(correlations(&left), those(false));
+        }
+    }
+
+    #[test]
+    fn silent_destinations_leave_no_state() {
+        let sent: Vec<_> = (0..10_000).map(|to| (to, Some(1))).collect();
+        let mut outstanding = outstanding(&sent);
+        assert_eq!(outstanding.take_overdue(Time::MAX, GRACE).len(), sent.len());
+        assert!(
+            outstanding.destinations.len() <= EMPTY_DESTINATIONS_MAX,
+            "{} destinations",
+            outstanding.destinations.len()
+        );
+    }
+}

@@ -1,0 +1,171 @@
+//! Messages that arrive faster than one write for each could send them.
+
+use std::thread;
+
+use super::*;
+
+/// Counts the writes to a wire.
+struct Counting {
+    wire: Arc<Wire>,
+    writes: Arc<AtomicUsize>,
+}
+
+impl Socket for Counting {
+    fn try_write_vectored(&mut self, parts: &[IoSlice<'_>]) -> io::Result<usize> {
+        self.writes.fetch_add(1, Ordering::Relaxed);
+        self.wire.try_write_vectored(parts)
+    }
+
+    fn poll_writable(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.wire.poll_writable(cx)
+    }
+}
+
+struct Burst {
+    outlet: Arc<SocketWriter<Gathering<Counting>>>,
+    wire: Arc<Wire>,
+    writes: Arc<AtomicUsize>,
+    link: LinkNumber,
+}
+
+impl Burst {
+    fn new(room: usize) -> Self {
+        let limits = OutletLimits { queue_capacity: 200, ..LIMITS };
+        let (outlet, wire, writes) =
+            (Arc::new(SocketWriter::new(limits)), Arc::new(Wire::default()), Arc::default());
+        wire.room.store(room, Ordering::Relaxed);
+        let socket = Counting { wire: Arc::clone(&wire), writes: Arc::clone(&writes) };
+        let link = outlet.connect(Gathering::new(socket, Checksum::Crc), usize::MAX, None);
+        Self { outlet, wire, writes, link }
+    }
+
+    /// Submits all at the same moment, before the clock that reports the end of a write.
+    fn submit(&self, values: std::ops::Range<u8>) {
+        for value in values {
+            let mut message = message(Class::Bulk, value);
+            message.header.sent = Time::from_nanos(1_000_000);
+            self.outlet.submit(message).unwrap();
+        }
+    }
+
+    fn drain(&self) {
+        assert!((0..16).find_map(|_| self.outlet.drain(self.link).now_or_never()).is_none());
+    }
+
+    /// Expires until this number of frames is there, from any writer.
+    async fn await_frames(&self, frames: usize) {
+        let await_frames = async {
+            while self.seen().len() < frames {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+            }
+        };
+        tokio::time::timeout(Duration::from_secs(60), await_frames).await.expect("all frames within 60 s");
+    }
+
+    fn seen(&self) -> Vec<u8> {
+        frames(&self.wire.bytes.lock().unwrap()).iter().map(|message| message.payload[0]).collect()
+    }
+
+    fn writes(&self) -> usize {
+        self.writes.load(Ordering::Relaxed)
+    }
+}
+
+#[test]
+fn burst_is_batched_after_its_first_messages() {
+    let burst = Burst::new(PLENTY);
+    burst.submit(0..24);
+    assert_eq!((burst.seen(), burst.writes(), burst.outlet.waiting()), (vec![0, 1, 2, 3], 4, 20));
+    burst.drain();
+    assert_eq!((burst.seen(), burst.writes(), burst.outlet.waiting()), ((0..24).collect(), 5, 0));
+    assert_eq!(burst.outlet.counts(), OutletCounts { sent: 24, ..OutletCounts::default() });
+}
+
+#[test]
+fn bursting_sender_writes_if_drainer_falls_behind() {
+    let burst = Burst::new(PLENTY);
+    burst.submit(0..132);
+    assert_eq!((burst.seen(), burst.writes(), burst.outlet.waiting()), ((0..132).collect(), 5, 0));
+}
+
+#[test]
+fn partial_writes_keep_frames_whole_and_ordered() {
+    for bytes in [1, 7, 50, 81, 82, 83, 1_000] {
+        let burst = Burst::new(0);
+        burst.submit(0..100);
+        for _ in 0..100_000 {
+            if burst.outlet.waiting() == 0 {
+                break;
+            }
+            burst.wire.room.store(bytes, Ordering::Relaxed);
+            burst.drain();
+        }
+        assert_eq!(burst.seen(), (0..100).collect::<Vec<u8>>(), "{bytes} at a time");
+    }
+}
+
+#[test]
+fn new_message_follows_gathered_ones() {
+    let burst = Burst::new(PLENTY);
+    burst.submit(0..20);
+    burst.wire.room.store(100, Ordering::Relaxed);
+    burst.drain();
+    assert!(burst.outlet.waiting() > 0, "the wire has taken a part of what was gathered");
+    burst.wire.room.store(PLENTY, Ordering::Relaxed);
+    let mut later = message(Class::Control, 42);
+    later.header.sent = Time::from_nanos(1_000_000_000);
+    burst.outlet.submit(later).unwrap();
+    burst.drain();
+    assert_eq!(burst.seen(), (0..20).chain([42]).collect::<Vec<u8>>());
+}
+
+#[test]
+fn end_with_gathered_frames_is_not_at_frame_boundary() {
+    let burst = Burst::new(PLENTY);
+    burst.submit(0..20);
+    burst.wire.room.store(100, Ordering::Relaxed);
+    burst.drain();
+    assert!(!burst.outlet.disconnect(burst.link));
+}
+
+#[cfg(target_os = "linux")]
+#[tokio::test(flavor = "current_thread")]
+async fn remainder_of_burst_is_sent_by_delayed_wake() {
+    let burst = Burst::new(PLENTY);
+    let (outlet, link) = (burst.outlet.clone(), burst.link);
+    let drainer = tokio::spawn(async move { outlet.drain(link).await });
+    // The first burst has the timer made.
+    burst.submit(0..20);
+    burst.await_frames(20).await;
+    thread::scope(|scope| scope.spawn(|| burst.submit(20..40)).join().unwrap());
+    let is_asleep = burst.outlet.lock().connection.is_drainer_asleep();
+    assert!(is_asleep && burst.outlet.waiting() > 0);
+    burst.await_frames(40).await;
+    assert_eq!(burst.seen(), (0..40).collect::<Vec<u8>>());
+    drainer.abort();
+}
+
+#[test]
+fn gathered_urgent_message_counts_until_its_last_byte() {
+    // Given: the wire accepts nothing, and an urgent message follows a burst.
+    let burst = Burst::new(0);
+    burst.submit(0..8);
+    let mut ping = message(Class::Control, 100);
+    ping.header.kind = Kind::GNCL_PING;
+    burst.outlet.submit_urgent(ping, usize::MAX).expect("it is the first");
+    let has_arrived = || burst.seen().contains(&100);
+    // When: the wire accepts a few bytes at a time.
+    for _ in 0..1_000 {
+        if has_arrived() {
+            break;
+        }
+        // Then
+        assert_ne!(burst.outlet.urgent_left(), 0);
+        burst.wire.room.store(7, Ordering::Relaxed);
+        burst.drain();
+    }
+    assert!(has_arrived());
+    burst.wire.room.store(PLENTY, Ordering::Relaxed);
+    burst.drain();
+    assert_eq!(burst.outlet.urgent_left(), 0);
+}

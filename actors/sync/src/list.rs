@@ -1,0 +1,469 @@
+//! The list that a node publishes about itself: payload of `Kind::SYNC_DIRECTORY`, a MessagePack map.
+//!
+//! The parser here checks all bounds once: `docs/protocol/sync.md` has the fields and the bounds.
+
+use std::{borrow::Borrow, collections::BTreeSet, fmt, ops::Deref, sync::Arc};
+
+use bytes::Bytes;
+use serde::{Deserialize, Serialize};
+use sinew_model::{bounded::at_most, limits::NAME_BYTES_MAX};
+use sinew_runtime::{
+    app::Requirement,
+    name::is_invisible,
+    tid::{AppAddress, Incarnation},
+    wire::Kind,
+};
+
+/// Maximum number of applications in one list.
+pub const ENTRIES_MAX: usize = 1_024;
+/// Maximum number of groups in one list.
+pub const GROUPS_MAX: usize = 1_024;
+/// Maximum number of groups with only guests in one list, if the robot's own groups leave room.
+pub const GUESTS_GROUPS_MAX: usize = 128;
+/// Maximum number of requirements of one application in a list.
+pub const REQUIRES_MAX: usize = 64;
+/// Maximum number of phases that one application has reached.
+pub const PHASES_MAX: usize = 16;
+/// Maximum number of payload kinds of one application in a list.
+pub const KINDS_MAX: usize = 64;
+/// Size of a group in a list, in bytes.
+const GROUP_BYTES: usize = 5;
+
+/// The list of a node.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct List {
+    /// The incarnation of the node.
+    pub incarnation: Incarnation,
+    /// Counter of the changes in that incarnation, from 1.
+    pub version: u64,
+    /// The node's applications that have a name.
+    #[serde(deserialize_with = "at_most::<_, _, ENTRIES_MAX>")]
+    pub entries: Vec<Entry>,
+    /// The groups that have members on the node. Groups of the robot's own come first, because groups without
+    /// room are left out from the end.
+    #[serde(default, deserialize_with = "at_most::<_, _, GROUPS_MAX>")]
+    pub groups: Vec<AppAddress>,
+}
+
+/// One application in a list.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Entry {
+    /// The application's name, unique on its node.
+    pub name: Name,
+    /// The application's address on its node.
+    pub app: AppAddress,
+    /// Whether the application has started and accepts messages.
+    pub ready: bool,
+    /// How the previous life ended, while the application is not ready again.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ended: Option<Ended>,
+    /// The phases that the application has reached in its current life.
+    #[serde(
+        default,
+        skip_serializing_if = "Vec::is_empty",
+        deserialize_with = "at_most::<_, _, PHASES_MAX>"
+    )]
+    pub phases: Vec<Name>,
+    /// The requirements, so that every node can detect a cycle.
+    #[serde(default, deserialize_with = "at_most::<_, _, REQUIRES_MAX>")]
+    pub requires: Vec<Requirement>,
+    /// The payloads that the application handles, as far as it reports them.
+    #[serde(default, deserialize_with = "at_most::<_, _, KINDS_MAX>")]
+    pub kinds: Vec<Kind>,
+}
+
+/// How a life of an application ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Ended {
+    /// The life ended by a fault.
+    Failed,
+    /// The life was stopped in order.
+    Stopped,
+}
+
+/// A legal name: 1 to 63 bytes of UTF-8 without control characters, which would forge log lines.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(try_from = "String")]
+pub struct Name(String);
+
+impl TryFrom<String> for Name {
+    type Error = &'static str;
+
+    fn try_from(text: String) -> Result<Self, Self::Error> {
+        if text.is_empty() || text.len() > NAME_BYTES_MAX {
+            return Err("a name has 1 to 63 bytes");
+        }
+        if text.chars().any(is_invisible) {
+            return Err("a name has no control characters and no invisible ones");
+        }
+        Ok(Self(text))
+    }
+}
+
+impl Deref for Name {
+    type Target = str;
+
+    fn deref(&self) -> &str {
+        &self.0
+    }
+}
+
+impl Borrow<str> for Name {
+    fn borrow(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Display for Name {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+/// The groups that a node publishes, and the number of those without room.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Published {
+    /// The published groups: those with a member among the robot's own applications, then those with only
+    /// guests. Each part is in the order of addresses.
+    pub groups: Vec<AppAddress>,
+    /// How many of the published groups have a member among the robot's own.
+    pub own: usize,
+    /// The number of the robot's own groups without room.
+    pub own_left_out: usize,
+    /// The number of groups with only guests without room.
+    pub guests_left_out: usize,
+}
+
+impl Published {
+    /// Selects the published groups. Groups with only guests never displace a group of the robot's own.
+    pub fn of(groups: Vec<(AppAddress, Arc<[AppAddress]>)>, guests: &BTreeSet<AppAddress>) -> Self {
+        let is_own = |members: &[AppAddress]| members.iter().any(|app| !guests.contains(app));
+        let (own, foreign): (Vec<_>, Vec<_>) = groups.into_iter().partition(|(_, members)| is_own(members));
+        let room = GROUPS_MAX.saturating_sub(own.len()).min(GUESTS_GROUPS_MAX);
+        let (own_left_out, guests_left_out) =
+            (own.len().saturating_sub(GROUPS_MAX), foreign.len().saturating_sub(room));
+        let own_listed = own.len() - own_left_out;
+        let listed = own.into_iter().take(own_listed).chain(foreign.into_iter().take(room));
+        let groups = listed.map(|(group, _)| group).collect();
+        Self { groups, own: own_listed, own_left_out, guests_left_out }
+    }
+
+    /// Returns the groups without room, with a remedy. Returns `None` if all groups are published.
+    pub fn left_out(&self) -> Option<LeftOut> {
+        let Self { own_left_out, guests_left_out, .. } = *self;
+        (own_left_out + guests_left_out > 0).then_some(LeftOut { own_left_out, guests_left_out })
+    }
+}
+
+/// Groups that are not in a node's list. Their `Display` is the message for the log.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LeftOut {
+    own_left_out: usize,
+    guests_left_out: usize,
+}
+
+impl fmt::Display for LeftOut {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { own_left_out, guests_left_out } = self;
+        if *own_left_out > 0 {
+            write!(
+                f,
+                "{own_left_out} groups of the robot's own are not in this node's directory, which has at most {GROUPS_MAX}: messages of other nodes \
+                 to these groups do not arrive here; use fewer groups, or more nodes"
+            )?;
+        }
+        if *own_left_out > 0 && *guests_left_out > 0 {
+            f.write_str("; ")?;
+        }
+        if *guests_left_out > 0 {
+            write!(
+                f,
+                "{guests_left_out} groups that only guests are in are not in this node's directory, which has at most {GUESTS_GROUPS_MAX} of these: \
+                 messages of other nodes to these groups do not arrive here; allow fewer `groups` in [[client]] of the access list"
+            )?;
+        }
+        Ok(())
+    }
+}
+
+/// The error of a malformed list. The peer is at fault; nothing changed.
+#[derive(Debug, thiserror::Error)]
+pub enum ListError {
+    /// The bytes are not the MessagePack map of a list, or exceed its bounds.
+    #[error("this is not a directory: {0}")]
+    Malformed(#[from] rmp_serde::decode::Error),
+    /// The address belongs to no application.
+    #[error("{0} is not an application's address")]
+    Address(AppAddress),
+    /// The address belongs to no group.
+    #[error("{0} is not a group's address")]
+    Group(AppAddress),
+    /// A name, an address or a group occurs twice.
+    #[error("{0} occurs twice")]
+    Twice(String),
+}
+
+impl List {
+    /// Parses the list of a peer. Allocates at most the legal bounds, even if the bytes claim larger lengths.
+    pub fn parse(bytes: &[u8]) -> Result<Self, ListError> {
+        // spec: SYNC-4
+        let list: Self = sinew_runtime::wire::decode(bytes)?;
+        let (mut names, mut apps, mut groups) = (BTreeSet::new(), BTreeSet::new(), BTreeSet::new());
+        for Entry { name, app, .. } in &list.entries {
+            if !(app.is_fixed() || app.is_dynamic()) {
+                return Err(ListError::Address(*app));
+            }
+            if !names.insert(name) || !apps.insert(*app) {
+                return Err(ListError::Twice(format!("{name} ({app})")));
+            }
+        }
+        for group in &list.groups {
+            if !group.is_group() {
+                return Err(ListError::Group(*group));
+            }
+            if !groups.insert(*group) {
+                return Err(ListError::Twice(format!("group {group}")));
+            }
+        }
+        Ok(list)
+    }
+
+    /// Returns the encoded list. All its groups count as the robot's own.
+    #[cfg(any(test, feature = "fuzzing"))]
+    pub fn encode(self, bytes_max: usize) -> (Bytes, usize) {
+        let own_groups = self.groups.len();
+        self.encode_within(bytes_max, own_groups)
+    }
+
+    /// Returns the encoded list, at most `bytes_max` bytes (64 for an empty list). Elements that do not fit
+    /// are left out, the last ones first. The order is: groups behind the first `own_groups`, which have only
+    /// guests, then entries, of which the robot's own are first, then the remaining groups. Also returns how
+    /// many elements were left out.
+    pub fn encode_within(mut self, bytes_max: usize, own_groups: usize) -> (Bytes, usize) {
+        let whole = self.entries.len() + self.groups.len();
+        self.groups.truncate(GROUPS_MAX);
+        self.entries.truncate(ENTRIES_MAX);
+        loop {
+            let bytes = encode(&self);
+            if bytes.len() <= bytes_max || (self.entries.is_empty() && self.groups.is_empty()) {
+                return (bytes.into(), whole - self.entries.len() - self.groups.len());
+            }
+            let excess = bytes.len() - bytes_max;
+            let has_guests_groups = self.groups.len() > own_groups;
+            if has_guests_groups || self.entries.is_empty() {
+                let kept = if has_guests_groups { own_groups } else { 0 };
+                let fitting = self.groups.len().saturating_sub(excess.div_ceil(GROUP_BYTES));
+                self.groups.truncate(fitting.max(kept));
+            } else {
+                self.drop_entries_worth(excess);
+            }
+        }
+    }
+
+    /// Removes entries from the end until they amount to `bytes`.
+    fn drop_entries_worth(&mut self, bytes: usize) {
+        let mut freed = 0;
+        while freed < bytes
+            && let Some(entry) = self.entries.pop()
+        {
+            freed += encode(&entry).len();
+        }
+    }
+}
+
+fn encode<T: Serialize>(value: &T) -> Vec<u8> {
+    rmp_serde::to_vec_named(value).expect("maps of numbers, texts and truths into memory cannot fail")
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn name(text: &str) -> Name {
+        Name::try_from(text.to_owned()).unwrap()
+    }
+
+    fn entry(index: u32, text: &str) -> Entry {
+        Entry {
+            name: name(text),
+            app: AppAddress::fixed(index).unwrap(),
+            ready: true,
+            ended: None,
+            phases: Vec::new(),
+            requires: Vec::new(),
+            kinds: Vec::new(),
+        }
+    }
+
+    fn list(entries: Vec<Entry>) -> List {
+        List { incarnation: Incarnation(7), version: 1, entries, groups: vec![AppAddress::group("drives")] }
+    }
+
+    fn many(count: u32) -> Vec<Entry> {
+        (0..count).map(|n| entry(n, &format!("app{n}"))).collect()
+    }
+
+    fn any_list() -> impl Strategy<Value = List> {
+        let entry = ("[a-z.]{1,63}", any::<bool>(), proptest::collection::vec("[a-z]{1,8}", 0..4));
+        let entries = proptest::collection::vec(entry, 0..8);
+        (any::<u64>(), any::<u64>(), entries).prop_map(|(incarnation, version, entries)| List {
+            incarnation: Incarnation(incarnation),
+            version,
+            entries: (0u32..)
+                .zip(entries)
+                .map(|(n, (text, ready, requires))| Entry {
+                    name: name(&format!("{n}{}", &text[..text.len().min(60)])),
+                    app: AppAddress::fixed(n).unwrap(),
+                    ready,
+                    ended: (!ready).then_some(Ended::Failed),
+                    phases: if ready { vec![name("homed")] } else { Vec::new() },
+                    requires: requires.iter().map(|text| text.parse().unwrap()).collect(),
+                    kinds: vec![Kind::named("demo.angle")],
+                })
+                .collect(),
+            groups: Vec::new(),
+        })
+    }
+
+    proptest! {
+        #[test]
+        fn encoded_list_decodes_to_the_same(list in any_list()) {
+            let (bytes, left_out) = list.clone().encode(usize::MAX);
+            prop_assert_eq!(left_out, 0);
+            prop_assert_eq!(List::parse(&bytes).unwrap(), list);
+        }
+
+        #[test]
+        fn any_bytes_are_a_list_or_an_error(bytes: Vec<u8>) {
+            let _ = List::parse(&bytes);
+        }
+
+        #[test]
+        fn a_damaged_list_is_a_list_or_an_error(list in any_list(), at: prop::sample::Index, byte: u8, cut: prop::sample::Index) {
+            let mut bytes = list.encode(usize::MAX).0.to_vec();
+            let at = at.index(bytes.len());
+            bytes[at] = byte;
+            let _ = List::parse(&bytes);
+            bytes.truncate(cut.index(bytes.len()));
+            let _ = List::parse(&bytes);
+        }
+    }
+
+    #[test]
+    fn the_documented_bytes_are_a_list() {
+        let text = include_str!("../../../docs/protocol/sync.md");
+        let block = text.split("```").find(|block| block.starts_with("text\n84")).unwrap();
+        let is_byte = |token: &&str| token.len() == 2 && u8::from_str_radix(token, 16).is_ok();
+        let tokens = block.lines().flat_map(|line| line.split_whitespace().take_while(is_byte));
+        let bytes: Vec<u8> = tokens.map(|token| u8::from_str_radix(token, 16).unwrap()).collect();
+        let documented = List { version: 3, groups: Vec::new(), ..list(vec![entry(0, "knee.drive")]) };
+        assert_eq!(encode(&documented), bytes);
+        assert_eq!(List::parse(&bytes).unwrap(), documented);
+    }
+
+    #[test]
+    fn false_lengths_reserve_no_memory() {
+        // A map with "entries": an array that claims 2^32 - 1 elements.
+        let mut bytes = vec![0x81, 0xa7];
+        bytes.extend_from_slice(b"entries");
+        bytes.extend_from_slice(&[0xdd, 0xff, 0xff, 0xff, 0xff]);
+        assert!(List::parse(&bytes).is_err());
+        assert!(List::parse(&[0x91; 100_000]).is_err(), "depth without end is refused");
+    }
+
+    #[test]
+    fn list_holds_exactly_its_maximum_of_entries() {
+        assert!(List::parse(&encode(&list(many(ENTRIES_MAX as u32)))).is_ok());
+        assert!(List::parse(&encode(&list(many(ENTRIES_MAX as u32 + 1)))).is_err());
+    }
+
+    #[test]
+    fn names_of_1_to_63_bytes_are_legal() {
+        for (text, legal) in
+            [("", false), ("a", true), (&"x".repeat(63), true), (&"x".repeat(64), false), ("a\nb", false)]
+        {
+            assert_eq!(Name::try_from(text.to_owned()).is_ok(), legal, "{text:?}");
+        }
+    }
+
+    #[test]
+    fn duplicates_and_foreign_addresses_are_rejected() {
+        let mut layer = entry(0, "a");
+        layer.app = AppAddress::SYNC;
+        let mut groups = list(Vec::new());
+        groups.groups.push(groups.groups[0]);
+        let mut no_group = list(Vec::new());
+        no_group.groups.push(AppAddress::fixed(0).unwrap());
+        let same_name = list(vec![entry(0, "a"), entry(1, "a")]);
+        let same_app = list(vec![entry(0, "a"), entry(0, "b")]);
+        for bad in [list(vec![layer]), groups, no_group, same_name, same_app] {
+            assert!(List::parse(&encode(&bad)).is_err(), "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn list_above_the_payload_limit_leaves_out_the_rest() {
+        let (bytes, left_out) = list(many(100)).encode(1_000);
+        let read = List::parse(&bytes).unwrap();
+        assert!(bytes.len() <= 1_000 && bytes.len() > 900, "{}", bytes.len());
+        assert_eq!(read.entries.len() + left_out, 100);
+        assert_eq!(list(many(2_000)).encode(usize::MAX).1, 2_000 - ENTRIES_MAX);
+    }
+
+    /// Returns this many groups from this one on, each with these members.
+    fn joined(first: u32, count: usize, members: &[AppAddress]) -> Vec<(AppAddress, Arc<[AppAddress]>)> {
+        (first..)
+            .take(count)
+            .map(|number| (AppAddress::new(0xf000_0000 + number), Arc::from(members)))
+            .collect()
+    }
+
+    #[test]
+    fn groups_of_guests_come_last_and_displace_no_others() {
+        let [own, guest] = [0x1000, 0x8000_0000].map(AppAddress::new);
+        let guests = BTreeSet::from([guest]);
+        // Given: guests in more groups than a list holds, all with lower addresses than the groups of the robot's own
+        let low = joined(0, 1_280, &[guest]);
+        for (count, room) in [(1, 128), (900, 124), (GROUPS_MAX, 0), (GROUPS_MAX + 3, 0)] {
+            let its = joined(10_000, count, &[own]);
+            // When
+            let published = Published::of([low.clone(), its.clone()].concat(), &guests);
+            // Then
+            let listed = count.min(GROUPS_MAX);
+            assert_eq!((published.groups.len(), published.own), (listed + room, listed));
+            assert!(
+                its.iter()
+                    .take(listed)
+                    .map(|(group, _)| *group)
+                    .eq(published.groups[..listed].iter().copied())
+            );
+            assert_eq!((published.own_left_out, published.guests_left_out), (count - listed, 1_280 - room));
+            let words = published.left_out().expect("guests have no room").to_string();
+            assert!(words.contains("[[client]]") && !words.contains("payload_max"), "{words}");
+            assert_eq!(words.contains("more nodes"), count > GROUPS_MAX, "{words}");
+        }
+    }
+
+    #[test]
+    fn group_of_the_robot_stays_own_with_guests() {
+        let [own, guest] = [0x1000, 0x8000_0000].map(AppAddress::new);
+        let both = [joined(5, 1, &[own, guest]), joined(9, 1, &[guest])].concat();
+        let published = Published::of([joined(1, 1, &[guest]), both].concat(), &BTreeSet::from([guest]));
+        assert_eq!(published.groups, [5, 1, 9].map(|number| AppAddress::new(0xf000_0000 + number)));
+        assert_eq!(published.left_out(), None);
+        assert_eq!(Published::of(Vec::new(), &BTreeSet::new()), Published::default());
+    }
+
+    #[test]
+    fn groups_that_do_not_fit_are_left_out_too() {
+        let groups: Vec<_> = (0..100).map(|n| AppAddress::group(&n.to_string())).collect();
+        let (bytes, left_out) = List { groups: groups.clone(), ..list(many(10)) }.encode(200);
+        let read = List::parse(&bytes).unwrap();
+        assert_eq!(read.groups, groups[..read.groups.len()], "the last ones go");
+        assert!(bytes.len() <= 200 && bytes.len() > 190, "{}", bytes.len());
+        assert_eq!((read.entries.len(), read.groups.len() + left_out), (0, 110));
+        assert!(list(Vec::new()).encode(64).0.len() <= 64);
+    }
+}

@@ -1,0 +1,116 @@
+//! Central's commands, the guard that accepts only them, and the conditions for opening it.
+
+use std::io;
+
+use exoskeleton_model::message::{DriveState, GaitState};
+use sinew::prelude::{AppContext, Delivery, Tid, Time};
+use sinew::protection::{Guard, State};
+
+use super::anomaly::Anomaly;
+use super::damping_repeater::RepeaterHandle;
+use super::{Drive, SILENCE_MAX};
+use crate::robot::device::Damper;
+use crate::robot::edges::Arm;
+
+/// The commands of central.
+pub(super) struct CentralCommands {
+    /// The central application that sends them.
+    pub(super) central: Tid,
+    pub(super) guard: Guard<Output>,
+    /// Accepts requests to open the other guard. It exists only while that is shut, so that no request of
+    /// another time counts.
+    arms: Option<Guard<()>>,
+    anomaly: Anomaly,
+}
+
+/// The state that is removed as soon as central's commands do not count, by the thread that detects it first.
+pub(super) struct Output {
+    pub(super) command: Option<GaitState>,
+    device: Box<dyn Damper>,
+    /// Whether the device was ordered to apply a torque: a device without torque is left unchanged.
+    pub(super) gives: bool,
+    pub(super) again: RepeaterHandle,
+}
+
+/// The result of an [`Arm`].
+pub(super) enum Armed {
+    /// Central's commands count from now on.
+    Now,
+    /// They counted before.
+    Before,
+    /// They do not count.
+    Refused,
+}
+
+impl Output {
+    pub(super) fn new(device: Box<dyn Damper>, again: RepeaterHandle) -> Self {
+        Self { command: None, device, gives: false, again }
+    }
+
+    pub(super) fn make_safe(&mut self) {
+        self.command = None;
+        if std::mem::take(&mut self.gives) {
+            self.device.damp(Time::now(), DriveState::Safe);
+            // The order may be lost, and the drive's thread may hang.
+            self.again.damps();
+        }
+    }
+}
+
+impl CentralCommands {
+    pub(super) fn new(central: Tid, guard: Guard<Output>) -> Self {
+        Self { central, guard, arms: None, anomaly: Anomaly::default() }
+    }
+
+    /// Whether central's commands do not count.
+    pub(super) fn is_shut(&self) -> bool {
+        self.guard.state() != State::Live
+    }
+
+    /// Whether there are signs of manipulation.
+    pub(super) const fn is_suspect(&self) -> bool {
+        self.anomaly.is_there()
+    }
+
+    /// Looks for an anomaly in the guard's counts, and accepts requests to open the guard while it is
+    /// shut.
+    ///
+    /// # Errors
+    /// The requests cannot be guarded, so none is accepted; the next call retries.
+    pub(super) fn poll(&mut self, context: &mut AppContext<Drive>) -> io::Result<()> {
+        let is_shut = self.is_shut();
+        self.anomaly.note(&self.guard.tally(), !is_shut);
+        if !is_shut {
+            self.arms = None;
+        } else if let Some(arms) = &self.arms {
+            // It moves nothing by itself. Rejected until one has arrived, against which the next can be
+            // counted.
+            let _ = arms.arm();
+        } else {
+            self.arms = Some(context.guard::<Arm, _>(self.central, (), |_, _| {})?);
+        }
+        Ok(())
+    }
+
+    /// Opens the guard for central's commands again, if the conditions hold. `state` is the drive's.
+    pub(super) fn arm(&mut self, arm: &Delivery<Arm>, state: DriveState) -> Armed {
+        if !self.is_shut() {
+            return Armed::Before;
+        }
+        // Rejected in WALK: the tick that makes the drive safe has not run yet, and an old intention of
+        // central may be obsolete. Rejected, too, until eight good commands in a row have arrived, and if the
+        // request was sent before central knew of the manipulation.
+        self.anomaly.note(&self.guard.tally(), false);
+        let is_known = arm.suspect || !self.anomaly.is_there();
+        let is_old = arm.is_older_than(SILENCE_MAX);
+        if state == DriveState::Walk || is_old || !is_known || self.guard.arm().is_err() {
+            return Armed::Refused;
+        }
+        self.anomaly.forget();
+        // Other requests that are in flight answer earlier reports.
+        self.arms = None;
+        // The device may be in a ramp to zero.
+        let _ = self.guard.apply(|output| output.gives = true);
+        Armed::Now
+    }
+}

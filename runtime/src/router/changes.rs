@@ -1,0 +1,123 @@
+//! The changes of the routing table, and the lists of its groups and their members.
+
+use std::{collections::BTreeSet, sync::Arc};
+
+use super::{
+    LocalRoute, Members, MessageSink, Router, Snapshot, Table, Writing, for_each_here, guard::Guard, tap::Tap,
+};
+use crate::{
+    lock,
+    tid::{AppAddress, NodeAddress},
+};
+
+impl Router {
+    fn change(&self, edit: impl FnOnce(&mut Table)) {
+        let _turn = lock(&self.writing);
+        let mut snapshot = Snapshot::clone(&self.snapshot.load());
+        edit(Arc::make_mut(&mut snapshot.table));
+        self.snapshot.store(Arc::new(snapshot));
+    }
+
+    /// Replaces the group members, if `edit` returns that anything changed; the caller holds the writers' lock.
+    fn regroup(&self, writing: &mut Writing, edit: impl FnOnce(&mut Writing, &mut Members) -> bool) -> bool {
+        let mut snapshot = Snapshot::clone(&self.snapshot.load());
+        let changed = edit(writing, &mut snapshot.members);
+        if changed {
+            self.snapshot.store(Arc::new(snapshot));
+        }
+        changed
+    }
+
+    /// Adds or replaces the route to an application of this node.
+    pub fn set_local(&self, app: AppAddress, route: LocalRoute) {
+        self.change(|table| {
+            table.local.insert(app, route);
+        });
+    }
+
+    /// Removes an application and its memberships.
+    pub fn remove_local(&self, app: AppAddress) {
+        let mut writing = lock(&self.writing);
+        let mut snapshot = Snapshot::clone(&self.snapshot.load());
+        Arc::make_mut(&mut snapshot.table).local.remove(&app);
+        writing.here.set(app, BTreeSet::new(), &mut snapshot.members.here);
+        self.snapshot.store(Arc::new(snapshot));
+    }
+
+    /// Adds `app` to `group`, or removes it. Returns whether anything changed. The cost depends on the number
+    /// of this group's members, and not on the number of applications and groups.
+    pub fn set_member(&self, group: AppAddress, app: AppAddress, member: bool) -> bool {
+        self.regroup(&mut lock(&self.writing), |writing, members| {
+            if member {
+                writing.here.join(group, app, &mut members.here)
+            } else {
+                writing.here.leave(group, app, &mut members.here)
+            }
+        })
+    }
+
+    /// Returns whether `app` is a member of `group`.
+    #[must_use]
+    pub fn is_member(&self, group: AppAddress, app: AppAddress) -> bool {
+        self.snapshot.load().members.here.members(group).binary_search(&app).is_ok()
+    }
+
+    /// Returns the applications of this node that a message to many reaches, in the order of their addresses:
+    /// the members of a group, all applications, or the one with this address. The sender may be in the list,
+    /// although it gets no copy.
+    #[must_use]
+    pub fn members(&self, of: AppAddress) -> Vec<AppAddress> {
+        let mut reached = Vec::new();
+        for_each_here(&self.snapshot.load(), of, |app, _| reached.push(app));
+        reached
+    }
+
+    /// Returns the number of memberships of all applications of this node in all groups.
+    #[must_use]
+    pub fn memberships(&self) -> usize {
+        lock(&self.writing).here.memberships()
+    }
+
+    /// Sets the tap that observes messages from now on; `None` removes it.
+    pub fn set_tap(&self, tap: Option<Arc<dyn Tap>>) {
+        self.change(|table| table.tap = tap);
+    }
+
+    /// Sets the guard that checks messages to the applications of this node from now on.
+    pub fn set_guard(&self, guard: Arc<dyn Guard>) {
+        self.change(|table| table.guard = Some(guard));
+    }
+
+    /// Returns the groups that have a member on this node, in the order of their addresses.
+    #[must_use]
+    pub fn groups(&self) -> Vec<AppAddress> {
+        self.groups_with_members().into_iter().map(|(group, _)| group).collect()
+    }
+
+    /// Same as [`groups`](Self::groups), with their members.
+    #[must_use]
+    pub fn groups_with_members(&self) -> Vec<(AppAddress, Arc<[AppAddress]>)> {
+        self.snapshot.load().members.here.all()
+    }
+
+    /// Adds or replaces the route to another node.
+    pub fn set_peer(&self, node: NodeAddress, sink: Arc<dyn MessageSink>) {
+        self.change(|table| {
+            table.peers.insert(node, sink);
+        });
+    }
+
+    /// Removes the route to another node.
+    pub fn remove_peer(&self, node: NodeAddress) {
+        self.change(|table| {
+            table.peers.remove(&node);
+        });
+    }
+
+    /// Sets the groups that have members on another node. Only the paths to the groups that changed are copied.
+    pub fn set_remote_groups(&self, node: NodeAddress, groups: &[AppAddress]) {
+        self.regroup(&mut lock(&self.writing), |writing, members| {
+            writing.elsewhere.set(node, groups.iter().copied().collect(), &mut members.elsewhere)
+        });
+    }
+}

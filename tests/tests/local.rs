@@ -1,0 +1,6 @@
+//! Whole nodes of this host. One binary, which is linked once; one module for each theme.
+
+mod away;
+mod black_channel;
+mod nodes;
+mod processes;

@@ -1,0 +1,9 @@
+//! Several hosts, each a network namespace that the test creates and removes; where that is not possible, the
+//! tests are skipped and report it.
+
+mod addresses;
+mod hosts;
+mod ipv6;
+mod lengths;
+mod lossy;
+mod seeds;

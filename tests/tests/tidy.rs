@@ -1,0 +1,236 @@
+//! Rules for the source files of this project, beyond those of the formatter and of clippy.
+//!
+//! Many readers learned English as a second language. They have to translate free relatives first (`who asks`,
+//! `what was sent`), and persons in place of programs (`he`), so these are limited: CONTRIBUTING, section "Style".
+
+use std::{
+    collections::BTreeMap,
+    fs,
+    path::{Path, PathBuf},
+};
+
+/// Limit of `who` and its forms, for 1,000 words of a package's comments.
+const WHO_MAX: usize = 1;
+/// Limit of `what` and `whatever`, for 1,000 words of a package's comments.
+const WHAT_MAX: usize = 3;
+/// Maximum characters of a line with a comment. The formatter leaves comments alone.
+const WIDTH_MAX: usize = 120;
+/// Maximum lines of a source file: the parts of a longer one are files of their own.
+const LINES_MAX: usize = 500;
+/// Folders without sources of this project.
+const SKIPPED: [&str; 4] = ["target", ".git", "corpus", "docs"];
+
+/// Names in a private dialect that this code once had, and the field's term for each.
+const BANNED: [(&str, &str); 48] = [
+    ("Absences", "DownPolicies"),
+    ("Acquaintance", "PeerState"),
+    ("Aftermath", "NodeDownEvents"),
+    ("Believed", "ServerTrust"),
+    ("Burial", "PendingDrop"),
+    ("Burials", "DropQueue"),
+    ("ByDatagram", "DatagramShare"),
+    ("Codename", "DataId"),
+    ("Courtesy", "YieldPolicy"),
+    ("Errand", "InFlightRequest"),
+    ("Farewell", "HangUpAction"),
+    ("Frill", "FrameOrigin::Link"),
+    ("Greeting", "RegistrationHandshake"),
+    ("HandedOn", "Forwarded"),
+    ("Heirs", "SupervisorHandles"),
+    ("InTurn", "ReorderBuffer"),
+    ("LentMessage", "LoanedMessage"),
+    ("LinkEnd", "PeerSocket"),
+    ("NoDoor", "NoSocketError"),
+    ("NoPlace", "LimitError"),
+    ("Openers", "SocketAccess"),
+    ("Outlet", "MessageSink"),
+    ("Post", "EventQueue"),
+    ("ProcessLife", "ProcessSupervision"),
+    ("Roster", "SupervisorHandle"),
+    ("Shelf", "ReceiveBacklog"),
+    ("Tenant", "ActorHandle"),
+    ("Unproven", "AuthError"),
+    ("Untaken", "Undelivered"),
+    ("Untold", "EventBacklog"),
+    ("Vitals", "Liveness"),
+    ("Voices", "RemoteViews"),
+    ("ask_for_a_sign", "request_liveness"),
+    ("bury", "push"),
+    ("come_home", "reconnect_blocking"),
+    ("connect_found", "connect_trusted"),
+    ("give_way", "yield"),
+    ("gives_a_sign", "mark_alive"),
+    ("hear_the_rest", "drain"),
+    ("is_bystander", "hosts_other_node"),
+    ("is_one_of_a_flood", "is_burst"),
+    ("is_patient", "is_delayable"),
+    ("look_home", "ensure_connected"),
+    ("poll_roused", "poll_delayed_wake"),
+    ("reprieve", "deadline_extension"),
+    ("rouse_later", "wake_later"),
+    ("send_told", "send_with_tag"),
+    ("while_away", "while_down"),
+];
+
+const WHO: [&str; 5] = ["who", "whom", "whose", "whoever", "whomever"];
+const WHAT: [&str; 2] = ["what", "whatever"];
+const HE: [&str; 4] = ["he", "him", "his", "himself"];
+
+/// A source file, and the path by which a message names it.
+struct Source {
+    path: PathBuf,
+    text: String,
+}
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ is in the root")
+}
+
+fn sources() -> Vec<Source> {
+    let (mut folders, mut found) = (vec![root().to_owned()], Vec::new());
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(&folder).expect("the folder is readable") {
+            let path = entry.expect("the folder is readable").path();
+            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            if path.is_dir() && !SKIPPED.contains(&&*name) {
+                folders.push(path);
+            } else if name.ends_with(".rs") {
+                let text = fs::read_to_string(&path).expect("a source is text");
+                let path = path.strip_prefix(root()).expect("it is below the root").to_owned();
+                found.push(Source { path, text });
+            }
+        }
+    }
+    assert!(found.len() > 500, "only {} sources were found: are the folders right?", found.len());
+    found
+}
+
+/// Returns the folder of the package that has this file: the closest one with a manifest.
+fn package(path: &Path) -> PathBuf {
+    let has_manifest = |folder: &&Path| root().join(folder).join("Cargo.toml").is_file();
+    path.ancestors().skip(1).find(has_manifest).unwrap_or_else(|| Path::new("")).to_owned()
+}
+
+/// Returns the text of a line's comment, if the line has nothing else.
+fn comment(line: &str) -> Option<&str> {
+    let text = line.trim_start().strip_prefix("//")?;
+    Some(text.strip_prefix(['/', '!']).unwrap_or(text))
+}
+
+/// Returns the lower-case words of a comment, without code in backticks.
+fn words(comment: &str) -> impl Iterator<Item = String> {
+    let prose: String = comment.split('`').step_by(2).collect::<Vec<_>>().join(" ");
+    let words: Vec<_> = prose
+        .split(|character: char| !character.is_alphabetic() && character != '\'')
+        .filter(|word| !word.is_empty())
+        .map(str::to_lowercase)
+        .collect();
+    words.into_iter()
+}
+
+/// The counted words of one package, with the places of the limited ones.
+#[derive(Default)]
+struct Count {
+    words: usize,
+    places: [Vec<String>; 3],
+}
+
+fn count(sources: &[Source]) -> BTreeMap<PathBuf, Count> {
+    let mut packages: BTreeMap<PathBuf, Count> = BTreeMap::new();
+    for Source { path, text } in sources {
+        let count = packages.entry(package(path)).or_default();
+        for (line, text) in (1..).zip(text.lines()) {
+            for word in comment(text).into_iter().flat_map(words) {
+                count.words += 1;
+                let lists = [&WHO[..], &WHAT[..], &HE[..]];
+                for (list, places) in lists.into_iter().zip(&mut count.places) {
+                    if list.contains(&&*word) {
+                        places.push(format!("{}:{line}: {word}", path.display()));
+                    }
+                }
+            }
+        }
+    }
+    packages
+}
+
+#[test]
+fn comments_use_few_free_relatives_and_no_persons() {
+    for (package, Count { words, places: [who, what, he] }) in count(&sources()) {
+        let thousands = words.div_ceil(1_000);
+        for (places, max) in [(who, WHO_MAX * thousands), (what, WHAT_MAX * thousands), (he, 0)] {
+            let (package, found) = (package.display(), places.len());
+            assert!(
+                found <= max,
+                "{package}: {found} of {words} words, at most {max}:\n{}",
+                places.join("\n")
+            );
+        }
+    }
+}
+
+/// Returns the lines of a file whose comments are too wide. Tables, code and drawings keep the width that they need.
+fn wide_lines(Source { path, text }: &Source) -> Vec<String> {
+    let (mut is_code, mut wide) = (false, Vec::new());
+    for (number, line) in (1..).zip(text.lines()) {
+        let Some(comment) = comment(line) else {
+            is_code = false;
+            continue;
+        };
+        is_code ^= comment.trim_start().starts_with("```");
+        let is_free = is_code || comment.starts_with(" |") || comment.starts_with("  ");
+        if line.chars().count() > WIDTH_MAX && !is_free {
+            wide.push(format!("{}:{number}", path.display()));
+        }
+    }
+    wide
+}
+
+#[test]
+fn comments_fit_the_width_of_the_code() {
+    let wide: Vec<_> = sources().iter().flat_map(wide_lines).collect();
+    assert!(wide.is_empty(), "wider than {WIDTH_MAX} characters:\n{}", wide.join("\n"));
+}
+
+#[test]
+fn files_are_short() {
+    let sources = sources();
+    let long = sources.iter().map(|source| (source.text.lines().count(), source.path.display()));
+    let long: Vec<_> = long.filter(|(lines, _)| *lines > LINES_MAX).collect();
+    assert!(long.is_empty(), "longer than {LINES_MAX} lines: {long:?}");
+}
+
+/// Returns the uses of banned names in the code of a file.
+fn banned_names(Source { path, text }: &Source) -> Vec<String> {
+    let mut found = Vec::new();
+    let is_word = |character: char| character.is_alphanumeric() || character == '_';
+    let code = text.lines().map(|line| if comment(line).is_some() { "" } else { line });
+    for (number, line) in (1..).zip(code) {
+        for name in line.split(|character: char| !is_word(character)) {
+            if let Some((name, term)) = BANNED.iter().find(|(banned, _)| *banned == name) {
+                found.push(format!("{}:{number}: {name}: say {term}", path.display()));
+            }
+        }
+    }
+    found
+}
+
+#[test]
+fn names_are_terms_of_the_field() {
+    // The list itself has them all.
+    let sources = sources().into_iter().filter(|source| !source.path.ends_with("tests/tidy.rs"));
+    let found: Vec<_> = sources.flat_map(|source| banned_names(&source)).collect();
+    assert!(found.is_empty(), "use the field's terms:\n{}", found.join("\n"));
+}
+
+#[test]
+fn rules_find_planted_violations() {
+    let text = "/// Tells who asked.\nfn ask() {}\n// What he sent, and `whom` it names.\n";
+    let wide = format!("//! {}\n//! | {}\n", "wide ".repeat(30), "table ".repeat(30));
+    let planted = |text: &str| Source { path: PathBuf::from("tests/planted.rs"), text: text.to_owned() };
+    let counted = count(&[planted(text)]).remove(Path::new("tests")).expect("the package of tests");
+    assert_eq!(counted.places.map(|places| places.len()), [1, 1, 1]);
+    assert_eq!(wide_lines(&planted(&wide)), ["tests/planted.rs:1"]);
+    let named = banned_names(&planted("// a Roster\nlet x: Roster = is_rostered();\n"));
+    assert_eq!(named, ["tests/planted.rs:2: Roster: say SupervisorHandle"]);
+}
