@@ -105,6 +105,13 @@ impl Process {
         line.trim_end().to_owned()
     }
 
+    /// Closes its standard input, and waits until it has exited. Returns whether it succeeded.
+    #[must_use]
+    pub fn end(mut self) -> bool {
+        drop(self.child.stdin.take());
+        self.child.wait().is_ok_and(|status| status.success())
+    }
+
     /// Waits until it has exited, and returns the rest of its output.
     #[must_use]
     pub fn wait(mut self) -> String {
