@@ -34,7 +34,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Class, Flags, Kind, Message},
 };
-use sinew_shm::{Any, AnyError, Spin, Waiter};
+use sinew_shm::{Any, AnyError, Ready, Spin};
 
 use super::{
     ApiError,
@@ -92,6 +92,8 @@ pub(super) struct Direct {
     held: Vec<EstablishedLink>,
     /// Links that are written to and read.
     pub(super) open: Vec<EstablishedLink>,
+    /// The index in `open` of each place in the set of all rings.
+    by_slot: BTreeMap<u8, usize>,
     /// Messages that arrived through the node but were sent after messages that are still in that link's
     /// ring.
     reordered: BTreeMap<Tid, ReorderBuffer>,
@@ -179,6 +181,7 @@ impl Direct {
             offered: Vec::new(),
             held: Vec::new(),
             open: Vec::new(),
+            by_slot: BTreeMap::new(),
             reordered: BTreeMap::new(),
             next_check: Time::ZERO,
             next_poll: Time::ZERO,
@@ -270,14 +273,39 @@ impl Direct {
         self.open.iter().chain(&self.held).any(|link| link.number == number)
     }
 
-    /// Checks periodically for closed links and for messages to repeat.
-    pub(super) fn check(&mut self, now: Time, node: &mut NodeWriter<'_>) {
+    /// Reads from a link from now on.
+    fn read_from(&mut self, link: EstablishedLink) {
+        link.open();
+        self.open.push(link);
+        self.index_slots();
+    }
+
+    fn index_slots(&mut self) {
+        let slots = self.open.iter().enumerate();
+        self.by_slot = slots.filter_map(|(index, link)| Some((link.slot()?, index))).collect();
+    }
+
+    /// Returns the places of the links that report messages, if all rings of the endpoint are a set.
+    pub(super) fn ready(&self) -> Option<Ready> {
+        let set = self.terms.options.set()?;
+        set.look();
+        Some(set.ready())
+    }
+
+    /// Returns the index of the open link at this place.
+    pub(super) fn at_slot(&self, slot: u8) -> Option<usize> {
+        self.by_slot.get(&slot).copied()
+    }
+
+    /// Checks periodically for closed links and for messages to repeat. Returns whether it has done so, which is also the
+    /// time to check all rings.
+    pub(super) fn check(&mut self, now: Time, node: &mut NodeWriter<'_>) -> bool {
         if now >= self.next_flush {
             self.next_flush = now + CHECK_INTERVAL;
             self.flush();
         }
         if now < self.next_check {
-            return;
+            return false;
         }
         self.next_check = now + CHECK_INTERVAL;
         self.check_hang_ups(now);
@@ -287,6 +315,7 @@ impl Direct {
                 None => self.routes.not_switched(peer, now),
             }
         }
+        true
     }
 
     /// Records the link on which a caller waits for room. An answer to its frame must not be read before the
@@ -380,7 +409,7 @@ impl Direct {
             Err(AnyError::Corrupt { index: index @ 1.., cause }) => {
                 self.fail::<()>(*index - 1, &RingError::from(*cause));
             }
-            Ok(Any::Message(_) | Any::TimedOut | Any::HungUp(_))
+            Ok(Any::Message(_) | Any::Ready | Any::TimedOut | Any::HungUp(_))
             | Err(AnyError::Corrupt { .. } | AnyError::System(_)) => {}
         }
     }
@@ -399,12 +428,13 @@ impl Direct {
     pub(super) fn wait(&mut self, left: Duration) {
         let now = Time::now();
         let left = self.wake_by(now + left, now, None).since(now);
-        let ended = Waiter::new(Spin::Off).wait_within(&mut LinkEnds(&mut self.open), left);
+        let mut waiter = ring::waiter(&LinkOptions { spin: Spin::Off, ..self.terms.options.clone() });
+        let ended = waiter.wait_within(&mut LinkEnds(&mut self.open), left);
         let at = |index: usize| index + 1;
         self.note(&match ended {
             Ok(Any::HungUp(index)) => Ok(Any::HungUp(at(index))),
             Err(AnyError::Corrupt { index, cause }) => Err(AnyError::Corrupt { index: at(index), cause }),
-            other @ (Ok(Any::Message(_) | Any::TimedOut) | Err(AnyError::System(_))) => other,
+            other @ (Ok(Any::Message(_) | Any::Ready | Any::TimedOut) | Err(AnyError::System(_))) => other,
         });
     }
 
@@ -457,6 +487,7 @@ impl Direct {
             self.add_unsent(peer, waiting as u64);
         }
         self.open.retain(|link| link.number != number);
+        self.index_slots();
         self.held.retain(|link| link.number != number);
         self.offered.retain(|link| link.number != number);
         if self.routes.link(peer) == Some(number) {

@@ -14,7 +14,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Header, Kind, Payload},
 };
-use sinew_shm::{Bell, CommonBell};
+use sinew_shm::{Bell, WaitSet};
 use tokio::task::coop;
 
 use super::{
@@ -92,8 +92,8 @@ impl std::fmt::Debug for Endpoint {
 impl Endpoint {
     pub(super) fn register(path: &Path, mut registration: Registration) -> Result<Self, ApiError> {
         if registration.register.direct {
-            // Without it, each link has its own wake-up descriptor, and the wait covers all of them.
-            registration.link.bell = CommonBell::create().map_or(registration.link.bell, Bell::Common);
+            // Without it, each link has its own bell, and the wait covers all of them.
+            registration.link.bell = WaitSet::create().map_or(registration.link.bell, Bell::Set);
         }
         let link = registration.register_at(path, registration.deadline, || true)?;
         Ok(Self::new(path, registration, link, WaitMode::Blocking))

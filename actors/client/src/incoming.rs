@@ -66,14 +66,31 @@ impl Endpoint {
             return None;
         }
         let mut node = NodeWriter { writer: &self.node.writer, correlation: &mut self.requests.correlation };
-        self.direct.check(now, &mut node);
+        if self.direct.check(now, &mut node) {
+            self.check_all_rings();
+        }
         if let Some(answer) = self.poll_reordered(wanted, when_full, now) {
             return Some(answer);
         }
-        // From the last one on, so that a link that ends does not skip another one's turn.
-        let mut links = (0..self.direct.open.len()).rev();
-        let answer = links.find_map(|index| self.poll_link(index, wanted, when_full));
+        let answer = match self.direct.ready() {
+            Some(mut ready) => ready.find_map(|slot| {
+                let index = self.direct.at_slot(slot)?;
+                self.poll_link(index, wanted, when_full)
+            }),
+            // From the last one on, so that a link that ends does not skip another one's turn.
+            None => (0..self.direct.open.len()).rev().find_map(|index| self.poll_link(index, wanted, when_full)),
+        };
         answer.or_else(|| self.poll_reordered(wanted, when_full, now))
+    }
+
+    /// Checks each ring for messages whose report another peer has undone.
+    fn check_all_rings(&mut self) {
+        if let Reader::Ring(reader) = &mut self.node.reader {
+            let links = &mut self.direct.open[..];
+            let checked = reader.check_all(|node| AllEnds { node, links });
+            reader.note(&checked);
+            self.direct.note(&checked);
+        }
     }
 
     /// Sorts in the messages on links that are about to end; messages without room are refused.

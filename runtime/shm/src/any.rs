@@ -1,7 +1,7 @@
 //! Waiting for messages of several consumers at once: one thread, one system call, until the first ring.
 
 use std::{
-    io, ptr,
+    io,
     sync::atomic::{AtomicU32, Ordering},
     time::{Duration, Instant},
 };
@@ -9,13 +9,14 @@ use std::{
 use crate::{
     bell::{BellState, Woken},
     consumer::Consumer,
-    core::sleep::{WakePlace, fence_before_recheck},
+    core::sleep::fence_before_recheck,
     error::AnyError,
     memory::fence,
     platform,
     spin::{Spin, Spinner},
     trust::Trust,
     wait::{HangUp, spin},
+    wait_set::WaitSet,
 };
 
 /// The most consumers that one call waits for: the limit of the system.
@@ -23,10 +24,10 @@ pub const ENDS_MAX: usize = 128;
 
 /// Interval at which a sleeper checks whether the peers are still present: one call cannot wait for a futex
 /// and a descriptor.
-const HANG_UP_CHECK: Duration = Duration::from_millis(20);
+pub(crate) const HANG_UP_CHECK: Duration = Duration::from_millis(20);
 
 /// Consumers that are waited for together, in an order that stays the same during the wait. Their bells are
-/// futexes ([`BellKind::Futex`](crate::BellKind::Futex)).
+/// futexes ([`BellKind::Futex`](crate::BellKind::Futex)), or all are of one [`WaitSet`].
 pub trait Ends {
     /// Number of consumers; at most [`ENDS_MAX`].
     fn count(&self) -> usize;
@@ -46,6 +47,8 @@ pub trait Ends {
 pub enum Any {
     /// The consumer at this index has a message.
     Message(usize),
+    /// Consumers of the [`WaitSet`] have messages: [`WaitSet::ready`].
+    Ready,
     /// The peer at this index is gone, and its ring is empty.
     HungUp(usize),
     /// The deadline passed.
@@ -95,21 +98,39 @@ impl Polling {
 #[derive(Debug)]
 pub struct Waiter {
     spinner: Spinner,
-    trust: Trust,
+    pub(crate) trust: Trust,
+    set: Option<WaitSet>,
 }
 
 impl Waiter {
     /// Creates a waiter that spins as `spin` specifies before it sleeps.
     #[must_use]
     pub const fn new(spin: Spin) -> Self {
-        Self { spinner: Spinner::new(spin), trust: Trust::new() }
+        Self { spinner: Spinner::new(spin), trust: Trust::new(), set: None }
+    }
+
+    /// Waits for consumers of this set from now on, and for no others.
+    #[must_use]
+    pub fn of_set(self, set: WaitSet) -> Self {
+        Self { set: Some(set), ..self }
+    }
+
+    /// Checks the rings of a set one by one. Until then a message of a peer whose report was undone by another peer is
+    /// not found if this side never sleeps; so this is to be called every 20 ms.
+    ///
+    /// # Errors
+    /// [`AnyError::Corrupt`].
+    pub fn check_all(&mut self, ends: &mut impl Ends) -> Result<(), AnyError> {
+        if let Some(set) = self.set.clone() {
+            self.find_unreported(&set, ends)?;
+        }
+        Ok(())
     }
 
     /// Waits until one of `ends` has a message, which stays there, or its peer is gone; until `deadline` at
     /// most. A deadline in the past means: check, and do not wait.
     ///
-    /// If all have one [`CommonBell`](crate::CommonBell), that costs one sleep at one word, otherwise one at
-    /// as many words.
+    /// For a [`WaitSet`] that costs one look and one sleep at one word, otherwise one at as many words.
     ///
     /// # Errors
     /// [`AnyError::Corrupt`] when a peer wrote values that no valid peer writes. [`AnyError::System`] when
@@ -123,7 +144,7 @@ impl Waiter {
                 return Ok(ended);
             }
             if left.is_zero() {
-                return check_hang_ups(ends);
+                return self.check_hang_ups(ends);
             }
         }
     }
@@ -141,8 +162,8 @@ impl Waiter {
             // The consumers are checked before the sleep.
             return self.sleep(ends, left);
         }
-        if let Some(index) = check(ends)? {
-            return Ok(Any::Message(index));
+        if let Some(found) = self.find(ends)? {
+            return Ok(found);
         }
         let started = self.spinner.learns().then(Instant::now);
         let ended = self.spin_or_sleep(ends, budget.min(left), left)?;
@@ -173,24 +194,44 @@ impl Waiter {
         budget: Duration,
         left: Duration,
     ) -> Result<Any, AnyError> {
-        if spin(budget, || (0..ends.count()).any(|index| ends.consumer(index).has_moved()))
-            && let Some(index) = check(ends)?
+        let has_moved = || match &self.set {
+            Some(set) => set.has_reports(),
+            None => (0..ends.count()).any(|index| ends.consumer(index).has_moved()),
+        };
+        if spin(budget, has_moved)
+            && let Some(found) = self.find(ends)?
         {
-            return Ok(Any::Message(index));
+            return Ok(found);
         }
         self.sleep(ends, left.saturating_sub(budget))
     }
 
+    /// Looks for a message.
+    fn find(&self, ends: &mut impl Ends) -> Result<Option<Any>, AnyError> {
+        match &self.set {
+            Some(set) => Ok(set.look().then_some(Any::Ready)),
+            None => Ok(check(ends)?.map(Any::Message)),
+        }
+    }
+
+    pub(crate) fn check_hang_ups(&mut self, ends: &mut impl Ends) -> Result<Any, AnyError> {
+        let Some(index) = hung_up(ends)? else { return Ok(Any::TimedOut) };
+        // It may have published a message before.
+        let found = match self.set.clone() {
+            Some(set) => self.find_unreported(&set, ends)?.then_some(Any::Ready),
+            None => check(ends)?.map(Any::Message),
+        };
+        Ok(found.unwrap_or(Any::HungUp(index)))
+    }
+
     /// Sleeps once.
     fn sleep(&mut self, ends: &mut impl Ends, left: Duration) -> Result<Any, AnyError> {
-        let wake_place = self.trust.wake_place(Instant::now);
-        let woken = match sleep(ends, wake_place, left.min(HANG_UP_CHECK))? {
+        if let Some(set) = self.set.clone() {
+            return self.sleep_for_set(&set, ends, left);
+        }
+        let woken = match sleep(ends, left.min(HANG_UP_CHECK))? {
             Slept::Ready(index) => return Ok(Any::Message(index)),
             Slept::Ended(woken) => woken,
-            Slept::RingLost => {
-                self.trust.doubt(Instant::now());
-                Woken::TimedOut
-            }
         };
         // A message published before the end of the wait, or of the peer, is still received.
         if let Some(index) = check(ends)? {
@@ -200,7 +241,7 @@ impl Waiter {
             return Ok(Any::TimedOut);
         }
         // The peer may ring without a message because it leaves; or a nap is over.
-        check_hang_ups(ends)
+        self.check_hang_ups(ends)
     }
 }
 
@@ -209,20 +250,9 @@ enum Slept {
     /// No sleep: the consumer at this index has a message.
     Ready(usize),
     Ended(Woken),
-    /// It timed out although a peer had rung: another peer has undone the ring.
-    RingLost,
 }
 
-/// Whether a peer has rung for the sleep that is over while its bell is unchanged: a peer changes the bell
-/// first and reports the ring afterwards.
-fn has_lost_ring(ends: &impl Ends, seen: &BellStates) -> bool {
-    let was_rung = (0..ends.count()).any(|index| ends.consumer(index).was_rung());
-    // SYNC: the peer's stores before its report are visible: `ProducerCore::report_ring`.
-    fence(Ordering::Acquire);
-    was_rung && seen.is_unchanged(ends)
-}
-
-fn sleep(ends: &mut impl Ends, wake_place: WakePlace, left: Duration) -> Result<Slept, AnyError> {
+fn sleep(ends: &mut impl Ends, left: Duration) -> Result<Slept, AnyError> {
     let count = ends.count();
     if count > ENDS_MAX {
         return Err(AnyError::System(io::ErrorKind::InvalidInput.into()));
@@ -230,21 +260,15 @@ fn sleep(ends: &mut impl Ends, wake_place: WakePlace, left: Duration) -> Result<
     if left.is_zero() {
         return Ok(check(ends)?.map_or(Slept::Ended(Woken::TimedOut), Slept::Ready));
     }
-    let seen =
-        listen(ends, wake_place).ok_or_else(|| AnyError::System(io::ErrorKind::InvalidInput.into()))?;
+    let seen = Words::read(ends, Consumer::bell_word)?;
     // Announced after the words were read: every ring from now on ends the sleep.
     for index in 0..count {
-        ends.consumer_mut(index).announce(wake_place);
+        ends.consumer_mut(index).announce();
     }
     fence_before_recheck();
     let slept = check(ends).and_then(|found| match found {
         Some(index) => Ok(Slept::Ready(index)),
-        None => match seen.sleep(ends, wake_place, left).map_err(AnyError::System)? {
-            Woken::TimedOut if wake_place == WakePlace::Bell && has_lost_ring(ends, &seen) => {
-                Ok(Slept::RingLost)
-            }
-            woken @ (Woken::Rung | Woken::TimedOut | Woken::HungUp) => Ok(Slept::Ended(woken)),
-        },
+        None => seen.sleep(ends, Consumer::bell_word, left).map(Slept::Ended),
     });
     for index in 0..count {
         ends.consumer_mut(index).withdraw();
@@ -252,66 +276,39 @@ fn sleep(ends: &mut impl Ends, wake_place: WakePlace, left: Duration) -> Result<
     slept
 }
 
-/// The values of the words to sleep at.
-#[expect(clippy::large_enum_variant, reason = "it lies on the stack for one sleep, and is not moved")]
-enum BellStates {
-    /// All have the same word.
-    One(BellState),
-    Each([BellState; ENDS_MAX]),
-}
+/// Words to sleep at, one of each consumer, with their values.
+pub(crate) struct Words([BellState; ENDS_MAX]);
 
-/// Reads the words. `None` when a consumer has no such word, or there are no consumers.
-fn listen(ends: &impl Ends, wake_place: WakePlace) -> Option<BellStates> {
-    let word = |index| (index < ends.count()).then(|| word_of(ends.consumer(index), wake_place)).flatten();
-    let first = word(0)?;
-    let listened = if (1..ends.count()).all(|index| word(index).is_some_and(|other| ptr::eq(other, first))) {
-        BellStates::One(BellState(first.load(Ordering::Relaxed)))
-    } else {
+/// Returns the word of a consumer at which its peer wakes.
+pub(crate) type WordOf = fn(&Consumer) -> Option<&AtomicU32>;
+
+impl Words {
+    /// Reads them.
+    pub(crate) fn read(ends: &impl Ends, word_of: WordOf) -> Result<Self, AnyError> {
+        if !(1..=ENDS_MAX).contains(&ends.count()) {
+            return Err(no_word());
+        }
         let mut seen = [BellState(0); ENDS_MAX];
         for (index, seen) in seen.iter_mut().enumerate().take(ends.count()) {
-            *seen = BellState(word(index)?.load(Ordering::Relaxed));
+            *seen = BellState(word_of(ends.consumer(index)).ok_or_else(no_word)?.load(Ordering::Relaxed));
         }
-        BellStates::Each(seen)
-    };
-    // SYNC: a ring that is seen here makes the stores before it visible: `FutexBell::ring`,
-    // `ProducerCore::report_ring`.
-    fence(Ordering::Acquire);
-    Some(listened)
-}
+        // SYNC: a ring that is seen here makes the stores before it visible: `FutexBell::ring`,
+        // `ProducerCore::report_ring`.
+        fence(Ordering::Acquire);
+        Ok(Self(seen))
+    }
 
-fn word_of(consumer: &Consumer, wake_place: WakePlace) -> Option<&AtomicU32> {
-    match wake_place {
-        WakePlace::Bell => consumer.message_bell().word(),
-        WakePlace::Own => Some(consumer.own_word()),
+    pub(crate) fn sleep(&self, ends: &impl Ends, word_of: WordOf, left: Duration) -> Result<Woken, AnyError> {
+        let mut futexes = platform::FutexSet::new();
+        for (index, seen) in self.0.iter().enumerate().take(ends.count()) {
+            futexes.add(word_of(ends.consumer(index)).ok_or_else(no_word)?, *seen);
+        }
+        futexes.sleep(left).map_err(AnyError::System)
     }
 }
 
-impl BellStates {
-    /// Whether the one bell that all have has not been rung since.
-    fn is_unchanged(&self, ends: &impl Ends) -> bool {
-        match self {
-            Self::One(seen) => word_of(ends.consumer(0), WakePlace::Bell)
-                .is_some_and(|word| word.load(Ordering::Relaxed) == seen.0),
-            // Each bell has one peer that can write it: no other peer loses a ring.
-            Self::Each(_) => false,
-        }
-    }
-
-    fn sleep(&self, ends: &impl Ends, wake_place: WakePlace, left: Duration) -> io::Result<Woken> {
-        let no_word = || io::Error::from(io::ErrorKind::InvalidInput);
-        match self {
-            Self::One(seen) => {
-                platform::sleep_at(word_of(ends.consumer(0), wake_place).ok_or_else(no_word)?, *seen, left)
-            }
-            Self::Each(seen) => {
-                let mut futexes = platform::FutexSet::new();
-                for (index, seen) in seen.iter().enumerate().take(ends.count()) {
-                    futexes.add(word_of(ends.consumer(index), wake_place).ok_or_else(no_word)?, *seen);
-                }
-                futexes.sleep(left)
-            }
-        }
-    }
+fn no_word() -> AnyError {
+    AnyError::System(io::ErrorKind::InvalidInput.into())
 }
 
 fn check(ends: &mut impl Ends) -> Result<Option<usize>, AnyError> {
@@ -321,12 +318,6 @@ fn check(ends: &mut impl Ends) -> Result<Option<usize>, AnyError> {
         }
     }
     Ok(None)
-}
-
-fn check_hang_ups(ends: &mut impl Ends) -> Result<Any, AnyError> {
-    let Some(index) = hung_up(ends)? else { return Ok(Any::TimedOut) };
-    // It may have published a message before.
-    Ok(check(ends)?.map_or(Any::HungUp(index), Any::Message))
 }
 
 fn hung_up(ends: &impl Ends) -> Result<Option<usize>, AnyError> {
@@ -340,7 +331,8 @@ mod tests {
     use std::thread;
 
     use super::*;
-    use crate::{Bell, BellKind, Capacity, CommonBell, Corrupt, Producer, Region, Terms, layout::Word};
+    use crate::core::sleep::WakePlace;
+    use crate::{Bell, BellKind, Capacity, Corrupt, Producer, Region, Terms, layout::Word};
 
     struct One(Consumer);
 
@@ -378,24 +370,26 @@ mod tests {
         ));
     }
 
-    /// A peer that rings a page where nothing sleeps: each of its rings is lost.
-    fn ring_losing_peer(bell: &CommonBell) -> (One, Producer, (Producer, Consumer)) {
-        let (side, mut offer) = Region::create(Capacity::MIN, Bell::Common(bell.clone())).expect("a region");
+    /// A peer that reports and rings in a page where nobody looks: each of its reports is lost.
+    fn unheard_peer(set: &WaitSet) -> (One, Producer, (Producer, Consumer)) {
+        let (side, mut offer) = Region::create(Capacity::MIN, Bell::Set(set.clone())).expect("a region");
         let (other, theirs) = Region::create(Capacity::MIN, BellKind::Futex).expect("a region");
-        let (_unheard, unheard) = Region::create(Capacity::MIN, BellKind::Futex).expect("a region");
-        offer.descriptors.truncate(1);
-        offer.descriptors.extend(unheard.descriptors.into_iter().skip(1));
+        let elsewhere = WaitSet::create().expect("pages");
+        let (_unheard, unheard) = Region::create(Capacity::MIN, Bell::Set(elsewhere)).expect("a region");
+        offer.descriptors[1] = unheard.descriptors.into_iter().nth(1).expect("the shared page");
         let (back, consumer) = side.connect(theirs, &Terms::default()).expect("an honest offer");
         let (producer, forth) = other.connect(offer, &Terms::default()).expect("an honest offer");
+        set.set_open(&consumer, true);
         (One(consumer), producer, (back, forth))
     }
 
     #[test]
-    fn sleeper_avoids_a_bell_that_lost_a_ring() {
+    fn sleeper_avoids_a_bell_that_lost_a_report() {
         // given
-        let bell = CommonBell::create().expect("a page");
-        let (mut end, mut producer, _rest) = ring_losing_peer(&bell);
-        let (mut waiter, until) = (Waiter::new(Spin::Off), Instant::now() + Duration::from_secs(20));
+        let set = WaitSet::create().expect("pages");
+        let (mut end, mut producer, _rest) = unheard_peer(&set);
+        let mut waiter = Waiter::new(Spin::Off).of_set(set.clone());
+        let until = Instant::now() + Duration::from_secs(20);
         let sleeps = |producer: &Producer| producer.peer_sleeps();
         for (number, wake_place) in [(1, WakePlace::Bell), (2, WakePlace::Own), (3, WakePlace::Own)] {
             assert_eq!(waiter.trust.wake_place(Instant::now), wake_place, "before message {number}");
@@ -409,9 +403,11 @@ mod tests {
                     producer.send(&[number]).expect("room");
                 });
                 // then
-                assert!(matches!(waiter.wait(&mut end, until), Ok(Any::Message(0))), "message {number}");
+                assert!(matches!(waiter.wait(&mut end, until), Ok(Any::Ready)), "message {number}");
             });
-            end.0.receive().expect("an honest peer").expect("a message");
+            assert!(set.is_ready(&end.0), "message {number}");
+            drop(end.0.receive().expect("an honest peer").expect("a message"));
+            set.was_emptied(&end.0);
         }
     }
 }

@@ -6,7 +6,10 @@ use std::{
     sync::atomic::AtomicU32,
 };
 
-use crate::{platform, wait::Waiting};
+use crate::{
+    wait::Waiting,
+    wait_set::{Slot, WaitSet},
+};
 
 /// How a side is to be woken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -20,6 +23,8 @@ pub enum BellKind {
     EventFd,
     /// A socket pair for each direction: for a reactor. Ringing never blocks, for any behaviour of the peer.
     Socket,
+    /// A futex for all regions of a [`WaitSet`].
+    Set,
 }
 
 impl BellKind {
@@ -27,7 +32,7 @@ impl BellKind {
     pub(crate) const fn descriptors(self) -> usize {
         match self {
             Self::Futex => 1,
-            Self::EventFd | Self::Socket => 2,
+            Self::EventFd | Self::Socket | Self::Set => 2,
         }
     }
 
@@ -36,6 +41,7 @@ impl BellKind {
             Self::Futex => 1,
             Self::EventFd => 2,
             Self::Socket => 3,
+            Self::Set => 4,
         }
     }
 
@@ -44,6 +50,7 @@ impl BellKind {
             1 => Some(Self::Futex),
             2 => Some(Self::EventFd),
             3 => Some(Self::Socket),
+            4 => Some(Self::Set),
             _ => None,
         }
     }
@@ -55,38 +62,18 @@ impl fmt::Display for BellKind {
             Self::Futex => "futex",
             Self::EventFd => "eventfd",
             Self::Socket => "socket",
+            Self::Set => "set",
         })
     }
 }
 
-/// The bell of a region: its own, or one shared by several regions.
+/// The bell of a region: its own, or that of a set of regions.
 #[derive(Clone, Debug)]
 pub enum Bell {
-    /// A bell of this kind, for this region alone.
+    /// A bell of this kind, for this region alone. Not [`BellKind::Set`].
     OfItsOwn(BellKind),
-    /// One bell for all regions that are created with it: a thread that waits for all of them sleeps at one
-    /// place.
-    Common(CommonBell),
-}
-
-/// A futex that several regions share. A thread that waits for all of them ([`Waiter`](crate::Waiter)) sleeps
-/// at one word, however many they are.
-///
-/// Each peer receives the page of the futex and can write it. It can wake this side without a message. It can
-/// also undo the ring of another peer at the moment when this side falls asleep. That message then waits for
-/// the end of the nap, 20 ms. If this side detects that, it sleeps for a while, each time longer, at words
-/// with one writer each.
-#[derive(Clone, Debug)]
-pub struct CommonBell(pub(crate) platform::SharedPage);
-
-impl CommonBell {
-    /// Creates a common bell.
-    ///
-    /// # Errors
-    /// The error of the system.
-    pub fn create() -> io::Result<Self> {
-        platform::SharedPage::create().map(Self)
-    }
+    /// The bell of a set: a thread that waits for all its regions sleeps at one place.
+    Set(WaitSet),
 }
 
 impl Bell {
@@ -95,7 +82,7 @@ impl Bell {
     pub const fn kind(&self) -> BellKind {
         match self {
             Self::OfItsOwn(kind) => *kind,
-            Self::Common(_) => BellKind::Futex,
+            Self::Set(_) => BellKind::Set,
         }
     }
 }
@@ -111,6 +98,8 @@ pub(crate) struct Bells {
     pub(crate) message: Box<dyn Doorbell>,
     pub(crate) room: Box<dyn Doorbell>,
     pub(crate) buttons: Vec<OwnedFd>,
+    /// The place in a set.
+    pub(crate) slot: Option<Slot>,
 }
 
 /// Why a sleep ended.

@@ -4,11 +4,12 @@ use std::{fmt, io, os::fd::BorrowedFd, sync::atomic::AtomicU32, time::Instant};
 
 use crate::{
     bell::{BellState, Doorbell, Woken},
-    core::{ConsumerCore, Record, sleep::WakePlace},
+    core::{ConsumerCore, Record},
     error::{Corrupt, ReceiveError},
     platform::{OwnHeaderMemory, PeerMemory},
     spin::{Spin, Spinner},
     wait::{Armed, Wait, Waiting, spin},
+    wait_set::Slot,
 };
 
 /// The receiving end of a connection: one thread at a time.
@@ -17,6 +18,7 @@ pub struct Consumer {
     message: Box<dyn Doorbell>,
     room_button: Box<dyn Doorbell>,
     spinner: Spinner,
+    slot: Option<Slot>,
 }
 
 impl Consumer {
@@ -24,8 +26,15 @@ impl Consumer {
         core: ConsumerCore<OwnHeaderMemory, PeerMemory>,
         message: Box<dyn Doorbell>,
         room_button: Box<dyn Doorbell>,
+        slot: Option<Slot>,
     ) -> Self {
-        Self { core, message, room_button, spinner: Spinner::new(Spin::Off) }
+        Self { core, message, room_button, spinner: Spinner::new(Spin::Off), slot }
+    }
+
+    /// Returns its place in a [`WaitSet`](crate::WaitSet), below 128.
+    #[must_use]
+    pub fn slot(&self) -> Option<u8> {
+        self.slot.as_ref().map(Slot::number)
     }
 
     /// Sets how this end spins before it sleeps in [`Consumer::receive_before`]. [`Spin::Off`] at first.
@@ -52,7 +61,8 @@ impl Consumer {
     ///
     /// # Errors
     /// [`ReceiveError::TimedOut`] at the deadline; [`ReceiveError::HungUp`] when the peer is gone and the
-    /// ring is empty.
+    /// ring is empty; [`ReceiveError::System`] in a [`WaitSet`](crate::WaitSet), which a
+    /// [`Waiter`](crate::Waiter) waits for.
     pub fn receive_before(&mut self, wait: &Wait<'_>) -> Result<ReceivedMessage<'_>, ReceiveError> {
         let record = self.await_record(wait)?;
         Ok(ReceivedMessage { consumer: self, record })
@@ -79,8 +89,9 @@ impl Consumer {
         self.core.has_moved()
     }
 
-    pub(crate) fn message_bell(&self) -> &dyn Doorbell {
-        &*self.message
+    /// The word that a ring changes; `None` if the bell is no futex.
+    pub(crate) fn bell_word(&self) -> Option<&AtomicU32> {
+        self.message.word()
     }
 
     /// The word that a ring of this peer changes, and no other peer can write.
@@ -88,9 +99,14 @@ impl Consumer {
         self.core.peer.rung()
     }
 
-    /// Whether the peer reports a ring for the sleep that was announced last.
-    pub(crate) fn was_rung(&self) -> bool {
-        self.core.was_rung()
+    /// Whether the peer reports a ring for this sleep of the set.
+    pub(crate) fn was_rung_for(&self, sleep: u32) -> bool {
+        self.core.was_rung_for(sleep)
+    }
+
+    /// Whether the peer has reported all messages that were found to the set.
+    pub(crate) fn is_reported(&self) -> bool {
+        self.core.is_reported()
     }
 
     /// Announces that this side is awake, for a bell that stores no rings.
@@ -99,8 +115,8 @@ impl Consumer {
     }
 
     /// Announces sleep, as one of several consumers; see [`ConsumerCore::announce`].
-    pub(crate) fn announce(&mut self, wake_place: WakePlace) {
-        self.core.announce(wake_place);
+    pub(crate) fn announce(&mut self) {
+        self.core.announce();
     }
 
     /// Announces that a reactor is about to wait for [`Consumer::fd`]. Must be followed by
@@ -137,6 +153,9 @@ impl Consumer {
     }
 
     fn spin_or_sleep(&mut self, wait: &Wait<'_>) -> Result<Record, ReceiveError> {
+        if self.slot.is_some() {
+            return Err(ReceiveError::System(io::ErrorKind::InvalidInput.into()));
+        }
         let now = Instant::now();
         let waiting = wait.begin(now);
         if spin(self.spinner.begin().min(waiting.left(now)), || self.core.has_moved())

@@ -55,16 +55,60 @@ impl SharedPage {
     pub(crate) fn create() -> io::Result<Self> {
         Err(io::ErrorKind::Unsupported.into())
     }
+
+    pub(crate) fn bells(&self) -> (Box<dyn Doorbell>, Box<dyn Doorbell>) {
+        match self.0 {}
+    }
+
+    pub(crate) fn descriptor(&self) -> io::Result<OwnedFd> {
+        match self.0 {}
+    }
+
+    pub(crate) fn message_word(&self) -> &AtomicU32 {
+        match self.0 {}
+    }
+
+    pub(crate) fn reports(&self) -> &[AtomicU32] {
+        match self.0 {}
+    }
+}
+
+/// Cannot exist on this platform.
+#[derive(Debug)]
+pub(crate) struct Announcement(Infallible);
+
+impl Announcement {
+    pub(crate) fn create() -> io::Result<Self> {
+        Err(io::ErrorKind::Unsupported.into())
+    }
+
+    pub(crate) fn descriptor(&self) -> io::Result<OwnedFd> {
+        match self.0 {}
+    }
+}
+
+impl OwnHeader for Announcement {
+    fn store(&self, _: Word, _: u32, _: Ordering) {
+        match self.0 {}
+    }
 }
 
 pub(crate) fn bells(_: &Bell) -> Result<Bells, CreateError> {
     Err(CreateError::Unsupported)
 }
 
-/// For messages, and for room.
-type Buttons = (Box<dyn Doorbell>, Box<dyn Doorbell>);
+/// This side's ends of a peer's bells.
+pub(crate) struct Buttons {
+    pub(crate) message: Box<dyn Doorbell>,
+    pub(crate) room: Box<dyn Doorbell>,
+    pub(crate) place: Option<PeerPlace>,
+}
 
-pub(crate) fn buttons(_: BellKind, _: Vec<OwnedFd>) -> Result<Buttons, RefusedOffer> {
+/// Cannot exist on this platform.
+#[derive(Clone, Debug)]
+pub(crate) struct PeerPlace(Infallible);
+
+pub(crate) fn buttons(_: BellKind, _: u8, _: Vec<OwnedFd>) -> Result<Buttons, RefusedOffer> {
     Err(RefusedOffer::Unsupported)
 }
 
@@ -153,6 +197,10 @@ impl OwnRing for OwnRingMemory {
 pub(crate) struct PeerMemory(Infallible);
 
 impl PeerMemory {
+    pub(crate) fn at(self, _: Option<PeerPlace>) -> Self {
+        self
+    }
+
     pub(crate) fn rung(&self) -> &AtomicU32 {
         match self.0 {}
     }

@@ -141,6 +141,9 @@ pub enum CreateError {
     /// The environment's fault: this platform has no sealed shared memory.
     #[error("this platform has no sealed shared memory; use sockets")]
     Unsupported,
+    /// The caller's fault: the wait set has its most regions.
+    #[error("the wait set has its most rings")]
+    SetFull,
     /// The environment's fault: no memory, no descriptors, or a system older than Linux 5.1.
     #[error("{step}: {cause}")]
     System {
@@ -183,6 +186,9 @@ pub enum RefusedOffer {
     /// No kind of bell has this number.
     #[error("the offer has an unknown kind of bell: {0}")]
     UnknownBell(u8),
+    /// No wait set has this place.
+    #[error("the offer names the place {0} of a set, which has 128")]
+    Slot(u8),
     /// The terms do not allow this kind of bell.
     #[error("the offer asks to be woken by {0}, which is not allowed here")]
     Bell(BellKind),

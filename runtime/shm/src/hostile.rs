@@ -323,9 +323,9 @@ impl Attacker {
     fn new(region: Region, victim: Offer, keys: Vec<OwnedFd>, wild: u32) -> Self {
         let mut fds = victim.descriptors.into_iter();
         let memory = platform::adopt(fds.next().expect("it comes first"), victim.capacity);
-        let (message, room) = platform::buttons(victim.bell, fds.collect()).expect("honest bells");
+        let buttons = platform::buttons(victim.bell, victim.slot, fds.collect()).expect("honest bells");
         let victim = memory.expect("honest memory");
-        Self { region, victim, keys, buttons: [message, room], wild, tail: 0, head: 0 }
+        Self { region, victim, keys, buttons: [buttons.message, buttons.room], wild, tail: 0, head: 0 }
     }
 
     fn write(&mut self, dice: &mut Dice) {

@@ -7,6 +7,7 @@
 //! byte 384   sleep of this side's consumer              odd while it sleeps
 //! byte 512   sleep of this side's producer              odd while it sleeps
 //! byte 640   rung                                       the peer's sleep for which this side has rung last
+//! byte 768   reported                                   tail that this side has reported to the peer's wait set
 //! byte 4096  the ring: records of 8-byte multiples
 //! ```
 //!
@@ -20,7 +21,7 @@ use thiserror::Error;
 /// "SINEWSHM", read as little-endian.
 pub(crate) const MAGIC: u64 = u64::from_le_bytes(*b"SINEWSHM");
 /// Changes whenever a byte changes its meaning.
-pub(crate) const VERSION: u32 = 2;
+pub(crate) const VERSION: u32 = 3;
 /// Offset of the ring: after a page for the header.
 pub(crate) const HEADER_BYTES: usize = 4096;
 /// A record begins with this, and is padded to a multiple of it.
@@ -39,6 +40,8 @@ pub(crate) enum Word {
     ProducerSleep,
     /// The sleep of the peer's consumer for which the region's producer has rung last. The consumer may sleep at it.
     Rung,
+    /// Bytes published when the region's producer has set its bit in the peer's wait set last.
+    Reported,
 }
 
 impl Word {
@@ -50,6 +53,7 @@ impl Word {
             Self::ConsumerSleep => 384 / 4,
             Self::ProducerSleep => 512 / 4,
             Self::Rung => 640 / 4,
+            Self::Reported => 768 / 4,
         }
     }
 }
@@ -186,7 +190,8 @@ mod tests {
 
     #[test]
     fn header_words_share_no_cache_line_pair() {
-        let words = [Word::Tail, Word::Head, Word::ConsumerSleep, Word::ProducerSleep, Word::Rung];
+        let words =
+            [Word::Tail, Word::Head, Word::ConsumerSleep, Word::ProducerSleep, Word::Rung, Word::Reported];
         let pairs: std::collections::BTreeSet<usize> =
             words.iter().map(|word| word.index() * 4 / 128).collect();
         assert_eq!(pairs.len(), words.len());

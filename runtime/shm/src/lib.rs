@@ -52,9 +52,11 @@ mod memory;
 mod offer;
 mod producer;
 mod region;
+mod set_sleep;
 mod spin;
 mod trust;
 mod wait;
+mod wait_set;
 
 #[cfg(target_os = "linux")]
 #[path = "linux/mod.rs"]
@@ -64,7 +66,7 @@ mod platform;
 mod platform;
 
 pub use any::{Any, ENDS_MAX, Ends, PollResult, Polling, Waiter};
-pub use bell::{Bell, BellKind, CommonBell};
+pub use bell::{Bell, BellKind};
 pub use consumer::{Consumer, MessageReader, ReceivedMessage};
 pub use error::{
     AnyError, Corrupt, CreateError, LoanError, PassError, ReceiveError, RefusedOffer, RoomError,
@@ -77,6 +79,7 @@ pub use producer::{Loan, Producer};
 pub use region::{Accepted, Region, Terms};
 pub use spin::Spin;
 pub use wait::{Armed, HangUp, Wait};
+pub use wait_set::{Ready, WaitSet};
 
 /// Whether this platform has sealed shared memory; without it [`Region::create`] returns an error.
 pub const SUPPORTED: bool = cfg!(target_os = "linux");

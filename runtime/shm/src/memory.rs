@@ -29,4 +29,9 @@ pub(crate) trait Peer {
 
     /// Reads a mark once, relaxed, at a position that is a multiple of 8 within the ring.
     fn mark(&self, position: u32) -> u64;
+
+    /// Reports to the peer's wait set that this ring has a message. Returns `false` if the peer waits without a set.
+    fn report_message(&self) -> bool {
+        false
+    }
 }

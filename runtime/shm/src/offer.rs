@@ -10,6 +10,7 @@ use crate::{
     error::{PassError, RefusedOffer},
     layout::{Capacity, MAGIC, VERSION},
     platform,
+    wait_set::SLOTS_MAX,
 };
 
 /// Length of [`Offer::to_bytes`].
@@ -18,13 +19,16 @@ pub const OFFER_BYTES: usize = 24;
 /// A region as its peer receives it. Created by [`crate::Region::create`], consumed by
 /// [`crate::Region::connect`].
 ///
-/// Its bytes, little-endian: magic (8, `SINEWSHM`), version (4), kind of bell (1), zero (3), capacity of the
-/// ring (8). Its descriptors, in this order: the memory; then for a futex the page with both bells, otherwise
-/// the bell for messages and the bell for room.
+/// Its bytes, little-endian: magic (8, `SINEWSHM`), version (4), kind of bell (1), place in the set (1), zero (2),
+/// capacity of the ring (8). Its descriptors, in this order: the memory; then for a futex the page with both bells; for
+/// a set the page with bells and bits, and the page with the announcement; otherwise the bell for messages and the bell
+/// for room.
 #[derive(Debug)]
 pub struct Offer {
     pub(crate) capacity: Capacity,
     pub(crate) bell: BellKind,
+    /// The place in the set of the offering side; 0 without a set.
+    pub(crate) slot: u8,
     pub(crate) descriptors: Vec<OwnedFd>,
 }
 
@@ -51,6 +55,7 @@ impl Offer {
         bytes[..8].copy_from_slice(&MAGIC.to_le_bytes());
         bytes[8..12].copy_from_slice(&VERSION.to_le_bytes());
         bytes[12] = self.bell.number();
+        bytes[13] = self.slot;
         bytes[16..].copy_from_slice(&u64::from(self.capacity.bytes()).to_le_bytes());
         bytes
     }
@@ -93,13 +98,17 @@ impl Offer {
             return Err(RefusedOffer::Version { theirs: version, ours: VERSION });
         }
         let bell = BellKind::numbered(bytes[12]).ok_or(RefusedOffer::UnknownBell(bytes[12]))?;
+        let slot = bytes[13];
+        if usize::from(slot) >= SLOTS_MAX {
+            return Err(RefusedOffer::Slot(slot));
+        }
         let capacity = Capacity::new(u64::from_le_bytes(take(bytes, 16)))
             .map_err(|error| RefusedOffer::Capacity(error.0))?;
         let expected = 1 + bell.descriptors();
         if descriptors.len() != expected {
             return Err(RefusedOffer::Descriptors { got: descriptors.len(), expected });
         }
-        Ok(Self { capacity, bell, descriptors })
+        Ok(Self { capacity, bell, slot, descriptors })
     }
 }
 
@@ -202,10 +211,11 @@ mod tests {
 
     #[test]
     fn other_version_is_rejected_with_both_versions() {
-        let offer = Offer { capacity: Capacity::MIN, bell: BellKind::Futex, descriptors: Vec::new() };
+        let offer =
+            Offer { capacity: Capacity::MIN, bell: BellKind::Futex, slot: 0, descriptors: Vec::new() };
         let mut bytes = offer.to_bytes();
         bytes[8] = 9;
         let refused = Offer::from_parts(&bytes, Vec::new()).expect_err("version 9 is not known");
-        assert_eq!(refused.to_string(), "the peer's layout has version 9, this one 2");
+        assert_eq!(refused.to_string(), "the peer's layout has version 9, this one 3");
     }
 }

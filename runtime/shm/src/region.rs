@@ -11,6 +11,7 @@ use crate::{
     offer::Offer,
     platform,
     producer::Producer,
+    wait_set::Slot,
 };
 
 /// One side's memory: the ring of its sent messages, and its header. Only this side can ever write it: the
@@ -20,6 +21,7 @@ pub struct Region {
     own: platform::OwnMemory,
     message: Box<dyn Doorbell>,
     room: Box<dyn Doorbell>,
+    slot: Option<Slot>,
 }
 
 /// The offers that this side accepts from a peer.
@@ -37,7 +39,7 @@ impl Default for Terms {
     fn default() -> Self {
         Self {
             capacity_max: Capacity::new(16 * 1024 * 1024).expect("a power of two within the limits"),
-            bells: vec![BellKind::Futex, BellKind::Socket],
+            bells: vec![BellKind::Futex, BellKind::Socket, BellKind::Set],
         }
     }
 }
@@ -48,14 +50,16 @@ impl Region {
     /// sides are gone.
     ///
     /// # Errors
-    /// [`CreateError::Unsupported`] where there is no sealed memory; otherwise the error of the system.
+    /// [`CreateError::Unsupported`] where there is no sealed memory; [`CreateError::SetFull`]; otherwise the error of
+    /// the system.
     pub fn create(capacity: Capacity, bell: impl Into<Bell>) -> Result<(Self, Offer), CreateError> {
         let (own, memory) = platform::create(capacity)?;
         let bell = bell.into();
-        let Bells { message, room, buttons } = platform::bells(&bell)?;
+        let Bells { message, room, buttons, slot } = platform::bells(&bell)?;
         let descriptors = [memory].into_iter().chain(buttons).collect();
-        let bell = bell.kind();
-        Ok((Self { capacity, own, message, room }, Offer { capacity, bell, descriptors }))
+        let offered_slot = slot.as_ref().map_or(0, Slot::number);
+        let offer = Offer { capacity, bell: bell.kind(), slot: offered_slot, descriptors };
+        Ok((Self { capacity, own, message, room, slot }, offer))
     }
 
     /// Maps the peer's offer, if it is valid. The region is consumed either way.
@@ -74,7 +78,7 @@ impl Region {
     /// # Errors
     /// As of [`connect`](Self::connect).
     pub fn accept(&self, peer: Offer, terms: &Terms) -> Result<Accepted, RefusedOffer> {
-        let Offer { capacity: theirs, bell, descriptors } = peer;
+        let Offer { capacity: theirs, bell, slot, descriptors } = peer;
         if theirs > terms.capacity_max {
             return Err(RefusedOffer::TooLarge { offered: theirs, allowed: terms.capacity_max });
         }
@@ -84,8 +88,9 @@ impl Region {
         let mut descriptors = descriptors.into_iter();
         let memory = descriptors.next().ok_or(RefusedOffer::Descriptors { got: 0, expected: 1 })?;
         let peer = platform::adopt(memory, theirs)?;
-        let (message, room) = platform::buttons(bell, descriptors.collect())?;
-        Ok(Accepted { peer, capacity: theirs, message, room })
+        let platform::Buttons { message, room, place } =
+            platform::buttons(bell, slot, descriptors.collect())?;
+        Ok(Accepted { peer: peer.at(place), capacity: theirs, message, room })
     }
 
     /// Joins both rings, this side's and the accepted one.
@@ -95,7 +100,7 @@ impl Region {
         let (header, ring) = self.own.split();
         let producer = ProducerCore::new(ring, peer.clone(), self.capacity);
         let consumer = ConsumerCore::new(header, peer, theirs);
-        (Producer::new(producer, self.room, message), Consumer::new(consumer, self.message, room))
+        (Producer::new(producer, self.room, message), Consumer::new(consumer, self.message, room, self.slot))
     }
 
     /// Returns the descriptors of this side's bells, for messages and for room; `None` for a futex.

@@ -8,8 +8,8 @@ use std::{
 };
 
 use sinew_shm::{
-    Any, AnyError, Bell, BellKind, Capacity, CommonBell, Consumer, ENDS_MAX, Ends, HangUp, Producer, Region,
-    Spin, Terms, Waiter,
+    Any, AnyError, Bell, BellKind, Capacity, Consumer, ENDS_MAX, Ends, HangUp, Producer, Region,
+    Spin, Terms, WaitSet, Waiter,
 };
 
 /// Longer than any test takes.
@@ -61,10 +61,10 @@ fn sides(count: usize) -> (Sides, Vec<Peer>) {
     (Sides(sides), peers)
 }
 
-/// The same, with one bell that all peers ring.
-fn sides_with_one_bell(count: usize) -> (Sides, Vec<Peer>) {
-    let bell = CommonBell::create().expect("a page");
-    let (sides, peers) = (0..count).map(|_| pair(Bell::Common(bell.clone()))).unzip();
+/// The same in a set.
+fn sides_of(set: &WaitSet, count: usize) -> (Sides, Vec<Peer>) {
+    let (sides, peers): (Vec<_>, _) = (0..count).map(|_| pair(Bell::Set(set.clone()))).unzip();
+    sides.iter().for_each(|side| set.set_open(&side.consumer, true));
     (Sides(sides), peers)
 }
 
@@ -75,16 +75,17 @@ fn in_time() -> Instant {
 #[test]
 fn each_message_of_each_peer_wakes_the_sleeper() {
     let looks = Spin::Adaptive { max: Duration::from_micros(50) };
-    for (make, count, spin) in [
-        (sides as fn(usize) -> (Sides, Vec<Peer>), 1, Spin::Off),
-        (sides, 3, Spin::Off),
-        (sides, 3, looks),
-        (sides_with_one_bell, 1, Spin::Off),
-        (sides_with_one_bell, 70, Spin::Off),
-        (sides_with_one_bell, 3, looks),
+    for (is_set, count, spin) in [
+        (false, 1, Spin::Off),
+        (false, 3, Spin::Off),
+        (false, 3, looks),
+        (true, 1, Spin::Off),
+        (true, 70, Spin::Off),
+        (true, 3, looks),
     ] {
         // given
-        let (mut ends, mut peers) = make(count);
+        let set = is_set.then(|| WaitSet::create().expect("pages"));
+        let (mut ends, mut peers) = set.as_ref().map_or_else(|| sides(count), |set| sides_of(set, count));
         let (tell, told) = std::sync::mpsc::sync_channel::<usize>(1);
         let sending = thread::spawn(move || {
             while let Ok(index) = told.recv() {
@@ -92,16 +93,29 @@ fn each_message_of_each_peer_wakes_the_sleeper() {
             }
             peers
         });
-        let mut waiter = Waiter::new(spin);
+        let mut waiter = match &set {
+            Some(set) => Waiter::new(spin).of_set(set.clone()),
+            None => Waiter::new(spin),
+        };
         for number in 0..2_000 {
             // when
             let index = number * 7 % count;
             tell.send(index).expect("the sender lives");
             // then
             let woken = waiter.wait(&mut ends, in_time()).expect("honest peers");
-            assert_eq!(woken, Any::Message(index));
+            match &set {
+                None => assert_eq!(woken, Any::Message(index)),
+                Some(set) => {
+                    assert_eq!(woken, Any::Ready);
+                    assert_eq!(set.ready().map(Some).collect::<Vec<_>>(), [ends.consumer(index).slot()]);
+                }
+            }
             let lent = ends.consumer_mut(index).receive().expect("honest").expect("it is ready");
             assert_eq!(lent.to_vec(), [index as u8]);
+            drop(lent);
+            if let Some(set) = &set {
+                set.was_emptied(ends.consumer(index));
+            }
         }
         drop(tell);
         sending.join().expect("no panic");
@@ -157,4 +171,60 @@ fn invalid_combination_of_consumers_is_rejected() {
     let (mut all, mut peers) = sides(ENDS_MAX);
     peers[ENDS_MAX - 1].producer.send(b"x").expect("room");
     assert_eq!(Waiter::new(Spin::Off).wait(&mut all, in_time()).expect("honest"), Any::Message(ENDS_MAX - 1));
+}
+
+#[test]
+fn place_of_an_ended_ring_is_given_again() {
+    let set = WaitSet::create().expect("pages");
+    let (mut all, peers) = sides_of(&set, 128);
+    let places: std::collections::BTreeSet<_> = all.0.iter().map(|side| side.consumer.slot()).collect();
+    assert_eq!(places.len(), 128);
+    assert!(matches!(
+        Region::create(Capacity::MIN, Bell::Set(set.clone())),
+        Err(sinew_shm::CreateError::SetFull)
+    ));
+    // When: one ends, with a message
+    let gone = all.0.remove(7).consumer.slot();
+    let mut peers = peers;
+    peers[7].producer.send(b"late").expect("room");
+    // Then: the next ring has its place, and the late message makes it no more than an empty look
+    let (next, _peer) = pair(Bell::Set(set.clone()));
+    assert_eq!(next.consumer.slot(), gone);
+    set.set_open(&next.consumer, true);
+    all.0.push(next);
+    assert!(set.look());
+    let last = all.consumer_mut(127);
+    assert!(last.receive().expect("honest").is_none());
+    set.was_emptied(all.consumer(127));
+    assert!(!set.look());
+}
+
+#[test]
+fn end_of_a_peer_of_a_set_is_reported_after_its_messages() {
+    let set = WaitSet::create().expect("pages");
+    let (mut ends, mut peers) = sides_of(&set, 3);
+    let mut second = peers.remove(1);
+    second.producer.send(b"last words").expect("room");
+    drop(second);
+    let mut waiter = Waiter::new(Spin::Off).of_set(set.clone());
+    assert_eq!(waiter.wait(&mut ends, in_time()).expect("honest"), Any::Ready);
+    drop(ends.consumer_mut(1).receive());
+    set.was_emptied(ends.consumer(1));
+    assert_eq!(waiter.wait(&mut ends, in_time()).expect("honest"), Any::HungUp(1));
+    assert_eq!(waiter.wait(&mut Sides(Vec::new()), Instant::now()).expect("honest"), Any::TimedOut);
+}
+
+#[test]
+fn ring_that_is_not_read_ends_no_wait() {
+    // Given: a closed ring with a message
+    let set = WaitSet::create().expect("pages");
+    let (mut ends, mut peers) = sides_of(&set, 2);
+    set.set_open(&ends.0[1].consumer, false);
+    peers[1].producer.send(b"early").expect("room");
+    let mut waiter = Waiter::new(Spin::Off).of_set(set.clone());
+    let soon = Instant::now() + Duration::from_millis(30);
+    assert_eq!(waiter.wait(&mut Sides(vec![ends.0.remove(0)]), soon).expect("honest"), Any::TimedOut);
+    // When: it is read. Then: the message is there
+    set.set_open(&ends.0[0].consumer, true);
+    assert_eq!(waiter.wait(&mut ends, in_time()).expect("honest"), Any::Ready);
 }

@@ -15,9 +15,10 @@ use sinew_runtime::{
     tid::Tid,
     wire::{Class, Flags, HEADER_LEN, Kind, Message},
 };
-use sinew_shm::{Armed, Consumer, Ends, HangUp};
+use sinew_shm::{Armed, Consumer, Ends, HangUp, WaitSet};
 
 use super::{
+    Terms,
     budget::Share,
     hang_up,
     peer_fd::{self, PeerSocket},
@@ -43,6 +44,8 @@ pub(crate) struct EstablishedLink {
     /// The receipts of messages that arrive on this link are settled on it.
     pub(crate) sink: Arc<dyn ReceiptSink>,
     consumer: Consumer,
+    /// The set of all rings of the endpoint, if it has one.
+    set: Option<WaitSet>,
     /// The share of this link's rings in the budget of the process.
     _share: Share,
     frames: RingFrames,
@@ -88,9 +91,10 @@ impl EstablishedLink {
         writer: ring::Writer,
         consumer: Consumer,
         share: Share,
-        payload_max: usize,
+        terms: &Terms,
     ) -> Self {
         let Pair { own, peer, number, socket } = pair;
+        let (payload_max, set) = (terms.payload_max, terms.options.set().cloned());
         let (writer, frames) = (Arc::new(writer), RingFrames::new(payload_max));
         Self {
             own,
@@ -100,6 +104,7 @@ impl EstablishedLink {
             sink: writer.clone(),
             writer,
             consumer,
+            set,
             _share: share,
             frames,
             parked: Vec::new(),
@@ -325,7 +330,23 @@ impl EstablishedLink {
 
     /// Takes the content of the ring, without waiting.
     pub(crate) fn take(&mut self) -> Result<Taken, RingError> {
-        Ok(self.frames.take(&mut self.consumer, ENOUGH)?)
+        let taken = self.frames.take(&mut self.consumer, ENOUGH)?;
+        if let (Taken::Nothing, Some(set)) = (taken, &self.set) {
+            set.was_emptied(&self.consumer);
+        }
+        Ok(taken)
+    }
+
+    /// Ends waits with its messages from now on: it is read.
+    pub(super) fn open(&self) {
+        if let Some(set) = &self.set {
+            set.set_open(&self.consumer, true);
+        }
+    }
+
+    /// Returns its place in the set.
+    pub(super) fn slot(&self) -> Option<u8> {
+        self.consumer.slot()
     }
 
     /// Returns whether the ring holds data, or data taken from it is not sorted in yet.

@@ -129,7 +129,7 @@ impl Direct {
         copies.release();
         let writer = ring::Writer::new(Arc::clone(&socket), producer, &self.terms.options);
         let pair = Pair { own: self.terms.own, peer, number, socket };
-        Ok(EstablishedLink::new(pair, writer, consumer, share, self.terms.payload_max))
+        Ok(EstablishedLink::new(pair, writer, consumer, share, &self.terms))
     }
 
     pub(super) fn switch_to(&self, peer: Tid, number: LinkNumber) -> Message {
@@ -150,8 +150,10 @@ impl Direct {
                 confirm.map(|correlation| (correlation, Outcome::Rejected(Rejection::Unsupported)))
             }
             MarkEffect::Open { confirm } => {
-                let index = self.held.iter().position(|link| link.number == number);
-                self.open.extend(index.map(|index| self.held.swap_remove(index)));
+                if let Some(index) = self.held.iter().position(|link| link.number == number) {
+                    let link = self.held.swap_remove(index);
+                    self.read_from(link);
+                }
                 confirm.map(|correlation| (correlation, Outcome::Delivered))
             }
             MarkEffect::Connect { confirm } => {
@@ -180,7 +182,7 @@ impl Direct {
         let theirs = PeerHalf::take(&offered.socket);
         match theirs.and_then(|theirs| self.connect(offered, theirs)) {
             Ok(link) => {
-                self.open.push(link);
+                self.read_from(link);
                 let sent = node.ask(self.switch_to(peer, number));
                 self.routes.connected(peer, number, sent, now);
                 true

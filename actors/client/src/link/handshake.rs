@@ -189,7 +189,7 @@ impl RegistrationHandshake {
         let (producer, consumer) = exchange.join(theirs);
         let (socket, options, payload_max) =
             (self.socket.clone(), &self.options, registered.payload_max as usize);
-        let reader = ring::Reader::new(socket.clone(), consumer, payload_max, options.spin);
+        let reader = ring::Reader::new(socket.clone(), consumer, payload_max, options);
         let writer = Writer::Ring(Arc::new(ring::Writer::new(socket, producer, options)));
         Ok(Some(Link { registered, writer: Arc::new(writer), reader: Reader::Ring(Box::new(reader)) }))
     }

@@ -22,7 +22,7 @@ use sinew_runtime::{
     time::Time,
     wire::Message,
 };
-use sinew_shm::{Armed, Bell, Spin};
+use sinew_shm::{Armed, Bell, Spin, WaitSet};
 use socket2::{Domain, SockAddr, Socket, Type};
 
 use super::{
@@ -58,13 +58,23 @@ pub(super) struct LinkOptions {
     pub(super) spin: Spin,
     /// How long a send waits for room.
     pub(super) stall_timeout: Duration,
-    /// The wake-up method of this side: one futex for all links of the endpoint if threads wait, one socket
-    /// per link if tasks do.
+    /// The wake-up method of this side: a set of all rings of the endpoint if a thread waits, one socket per link if a
+    /// task does.
     pub(super) bell: Bell,
     /// Bytes of this side's ring of a direct link.
     pub(super) direct_ring_bytes: usize,
     /// The processes that each connection trusts as the node.
     pub(super) server_trust: ServerTrust,
+}
+
+impl LinkOptions {
+    /// The set of all rings of the endpoint, if it has one.
+    pub(super) const fn set(&self) -> Option<&WaitSet> {
+        match &self.bell {
+            Bell::Set(set) => Some(set),
+            Bell::OfItsOwn(_) => None,
+        }
+    }
 }
 
 /// A registered link.

@@ -28,8 +28,8 @@ use sinew_runtime::{
     wire::{FrameCodec, Kind, Message},
 };
 use sinew_shm::{
-    Any, AnyError, Armed, BellKind, Capacity, Consumer, Ends, HangUp, LoanError, PollResult, Polling,
-    Producer, Region, RoomError, Spin, Wait, Waiter,
+    Any, AnyError, Armed, BellKind, Capacity, Consumer, Corrupt, Ends, HangUp, LoanError, PollResult,
+    Polling, Producer, Region, RoomError, Wait, WaitSet, Waiter,
 };
 use tokio::sync::Notify;
 use tokio_util::codec::Decoder;
@@ -279,6 +279,8 @@ pub(super) fn received_refusal(socket: &UnixStream) -> Option<Ended> {
 /// The reading half.
 pub(crate) struct Reader {
     end: End,
+    /// The set of all rings of the endpoint, if it has one.
+    set: Option<WaitSet>,
     frames: RingFrames,
     waiter: Waiter,
     /// When the socket is checked next.
@@ -287,6 +289,15 @@ pub(crate) struct Reader {
     ended: Option<Ended>,
     /// Data that has arrived is not taken either.
     is_stopped: bool,
+}
+
+/// Returns what a thread waits with.
+pub(crate) fn waiter(options: &LinkOptions) -> Waiter {
+    let waiter = Waiter::new(options.spin);
+    match options.set() {
+        Some(set) => waiter.of_set(set.clone()),
+        None => waiter,
+    }
 }
 
 /// The ring and the socket to wait for.
@@ -314,12 +325,22 @@ impl Ends for End {
 }
 
 impl Reader {
-    pub(super) fn new(socket: Arc<UnixStream>, consumer: Consumer, payload_max: usize, spin: Spin) -> Self {
+    pub(super) fn new(
+        socket: Arc<UnixStream>,
+        consumer: Consumer,
+        payload_max: usize,
+        options: &LinkOptions,
+    ) -> Self {
         let (end, frames) = (End { socket, consumer }, RingFrames::new(payload_max));
+        let (waiter, set) = (waiter(options), options.set().cloned());
+        if let Some(set) = &set {
+            set.set_open(&end.consumer, true);
+        }
         Self {
             end,
+            set,
             frames,
-            waiter: Waiter::new(spin),
+            waiter,
             next_check: Time::ZERO,
             ended: None,
             is_stopped: false,
@@ -333,6 +354,7 @@ impl Reader {
 
     /// Stops taking data.
     pub(super) fn stop_reading(&mut self) {
+        self.leave_set();
         self.is_stopped = true;
         self.ended = Some(Ended::without_reason());
     }
@@ -342,18 +364,51 @@ impl Reader {
         if let (true, Some(why)) = (self.is_stopped, &self.ended) {
             return Read::Ended(why.clone());
         }
-        match self.frames.take(&mut self.end.consumer, ENOUGH) {
+        match self.take() {
             Err(corrupt) => {
+                self.leave_set();
                 Read::Ended(Ended::permanent(format!("shared memory holds what it cannot: {corrupt}")))
             }
             Ok(Taken::Some) => Read::Some,
             Ok(Taken::Nothing) => match self.ended.clone() {
-                Some(why) => Read::Ended(why),
+                Some(why) => {
+                    self.leave_set();
+                    Read::Ended(why)
+                }
                 // Data published before the end is taken by the next poll.
                 None if self.has_ended(now) => Read::Some,
                 None => Read::Nothing,
             },
         }
+    }
+
+    /// Takes the content of the ring, if it reports any or has ended.
+    fn take(&mut self) -> Result<Taken, Corrupt> {
+        let Some(set) = &self.set else { return self.frames.take(&mut self.end.consumer, ENOUGH) };
+        set.look();
+        if !set.is_ready(&self.end.consumer) && self.ended.is_none() {
+            return Ok(Taken::Nothing);
+        }
+        let taken = self.frames.take(&mut self.end.consumer, ENOUGH)?;
+        if taken == Taken::Nothing {
+            set.was_emptied(&self.end.consumer);
+        }
+        Ok(taken)
+    }
+
+    /// Ends no wait any more: this ring is not read any longer.
+    fn leave_set(&self) {
+        if let Some(set) = &self.set {
+            set.set_open(&self.end.consumer, false);
+        }
+    }
+
+    /// Checks all rings of the set, those whose reports were undone included.
+    pub(crate) fn check_all<'a, E: Ends>(
+        &'a mut self,
+        all: impl FnOnce(&'a mut End) -> E,
+    ) -> Result<Any, AnyError> {
+        self.waiter.check_all(&mut all(&mut self.end)).map(|()| Any::Ready)
     }
 
     /// Returns whether the node's end was observed. A ring accepts messages even after that end, and a caller
@@ -407,7 +462,7 @@ impl Reader {
     pub(crate) fn note(&mut self, ended: &Result<Any, AnyError>) {
         match ended {
             Ok(Any::HungUp(0)) => self.ended = Some(end_reason(&self.end.socket)),
-            Ok(Any::Message(_) | Any::TimedOut | Any::HungUp(_))
+            Ok(Any::Message(_) | Any::Ready | Any::TimedOut | Any::HungUp(_))
             | Err(AnyError::Corrupt { index: 1.., .. }) => {}
             Err(error @ (AnyError::Corrupt { .. } | AnyError::System(_))) => {
                 self.ended = Some(Ended::permanent(error.to_string()))

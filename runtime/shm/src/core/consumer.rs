@@ -2,7 +2,7 @@
 
 use std::sync::atomic::Ordering;
 
-use super::sleep::{Sleep, WakePlace, Waking};
+use super::sleep::{Sleep, Waking};
 use crate::{
     error::Corrupt,
     layout::{Capacity, MARK_BYTES, Mark, Word, record_bytes},
@@ -111,13 +111,21 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
     }
 
     /// Announces sleep to this peer, one of several. After all of them a fence follows, and another check.
-    pub(crate) fn announce(&mut self, wake_place: WakePlace) {
-        self.sleep.announce_at(wake_place, &self.own);
+    pub(crate) fn announce(&mut self) {
+        self.sleep.announce_unfenced(&self.own);
     }
 
-    /// Whether the peer reports a ring for the sleep that was announced last.
-    pub(crate) fn was_rung(&self) -> bool {
-        self.peer.load(Word::Rung) == self.sleep.announced()
+    /// Whether the peer reports a ring for this sleep of a set.
+    pub(crate) fn was_rung_for(&self, sleep: u32) -> bool {
+        self.peer.load(Word::Rung) == sleep
+    }
+
+    /// Whether the peer has reported all messages that were found to this side's wait set.
+    pub(crate) fn is_reported(&self) -> bool {
+        let reported = self.peer.load(Word::Reported);
+        // SYNC: the bit was set before: `ProducerCore::publish`.
+        fence(Ordering::Acquire);
+        reported.wrapping_sub(self.tail_seen) <= self.capacity.bytes()
     }
 
     /// Announces that this side is awake again.

@@ -10,8 +10,8 @@ use loom::{
 };
 
 use super::{
-    model::{Receiver, Sender, fill, read, ring},
-    sleep::{WakePlace, fence_before_recheck},
+    model::{Receiver, Sender, Set, fill, read, ring, ring_in},
+    sleep::{WakePlace, asleep_after, awake_after, fence_before_recheck},
 };
 use crate::{
     layout::{Capacity, Word},
@@ -219,17 +219,43 @@ fn returned_loan_is_never_visible() {
     });
 }
 
-/// The sleeping place for several rings: one bell that all ring, or the words of the wakers' own regions. The
+/// The sleeping place for the rings of a set: one bell that all ring, or the words of the wakers' own regions. The
 /// lock is the system's.
 struct Place {
+    set: Arc<Set>,
     bell: AtomicU32,
     sleepers: Mutex<()>,
     woken: Condvar,
 }
 
+/// The owner of a set.
+struct Owner<const N: usize> {
+    place: Arc<Place>,
+    receivers: [Receiver; N],
+    /// Rings that were reported and not read empty.
+    ready: u32,
+    sleep: u32,
+}
+
 impl Place {
     fn new() -> Arc<Self> {
-        Arc::new(Self { bell: AtomicU32::new(0), sleepers: Mutex::new(()), woken: Condvar::new() })
+        Arc::new(Self {
+            set: Arc::new(Set { reports: AtomicU32::new(0), sleep: AtomicU32::new(0) }),
+            bell: AtomicU32::new(0),
+            sleepers: Mutex::new(()),
+            woken: Condvar::new(),
+        })
+    }
+
+    fn ring<const N: usize>(self: &Arc<Self>) -> ([Sender; N], Owner<N>) {
+        let ring = |index: usize| ring_in(Some((Arc::clone(&self.set), 1 << index)), Capacity::tiny(64));
+        let (mut senders, mut receivers) = (Vec::new(), Vec::new());
+        (0..N).map(ring).for_each(|(sender, receiver)| {
+            senders.push(sender);
+            receivers.push(receiver);
+        });
+        let (senders, receivers) = (senders.try_into().unwrap(), receivers.try_into().unwrap());
+        (senders, Owner { place: Arc::clone(self), receivers, ready: 0, sleep: 0 })
     }
 
     fn wake(&self) {
@@ -255,57 +281,72 @@ impl Place {
             }
         }
     }
+}
 
-    fn words<const N: usize>(&self, receivers: &[Receiver; N], wake_place: WakePlace) -> [u32; N] {
+impl<const N: usize> Owner<N> {
+    /// Like `WaitSet::look`.
+    fn look(&mut self) -> bool {
+        if self.place.set.reports.load(Ordering::Relaxed) != 0 {
+            self.ready |= self.place.set.reports.swap(0, Ordering::Acquire);
+            fence(Ordering::SeqCst);
+        }
+        self.ready != 0
+    }
+
+    fn words(&self, wake_place: WakePlace) -> [u32; N] {
         std::array::from_fn(|index| match wake_place {
-            WakePlace::Bell => self.bell.load(Ordering::Relaxed),
-            WakePlace::Own => receivers[index].peer.load(Word::Rung),
+            WakePlace::Bell => self.place.bell.load(Ordering::Relaxed),
+            WakePlace::Own => self.receivers[index].peer.load(Word::Rung),
         })
     }
 
-    /// The steps of `any.rs` in their order: listen, announce to all, fence once, check, sleep, withdraw from
-    /// all.
-    fn take<const N: usize>(
-        &self,
-        receivers: &mut [Receiver; N],
-        wake_places: &mut impl Iterator<Item = WakePlace>,
-    ) -> Vec<u64> {
+    /// Takes the message of a ring that is to be read.
+    fn take_ready(&mut self) -> Option<Vec<u64>> {
+        while self.look() {
+            let index = self.ready.trailing_zeros();
+            match take(&mut self.receivers[index as usize]) {
+                Some((words, _)) => return Some(words),
+                None => self.ready &= !(1 << index),
+            }
+        }
+        None
+    }
+
+    /// The steps of `any.rs` in their order: look, listen, announce, fence, look, sleep, withdraw.
+    fn take(&mut self, wake_places: &mut impl Iterator<Item = WakePlace>) -> Vec<u64> {
         loop {
-            for receiver in receivers.iter_mut() {
-                if let Some((words, _)) = take(receiver) {
-                    return words;
-                }
+            if let Some(words) = self.take_ready() {
+                return words;
             }
             let wake_place = wake_places.next().unwrap();
-            let seen = self.words(receivers, wake_place);
+            let seen = self.words(wake_place);
             fence(Ordering::Acquire);
-            receivers.iter_mut().for_each(|receiver| receiver.announce(wake_place));
+            self.sleep = asleep_after(self.sleep, wake_place);
+            self.place.set.sleep.store(self.sleep, Ordering::Relaxed);
             fence_before_recheck();
-            if receivers.iter_mut().all(|receiver| receiver.next().unwrap().is_none()) {
-                let sleepers = self.sleepers.lock().unwrap();
-                if self.words(receivers, wake_place) == seen {
-                    drop(self.woken.wait(sleepers).unwrap());
+            if !self.look() {
+                let place = Arc::clone(&self.place);
+                let sleepers = place.sleepers.lock().unwrap();
+                if self.words(wake_place) == seen {
+                    drop(place.woken.wait(sleepers).unwrap());
                 }
             }
-            receivers.iter_mut().for_each(Receiver::disarm);
+            self.place.set.sleep.store(awake_after(self.sleep), Ordering::Relaxed);
         }
     }
 }
 
-fn sleeper_at_two_rings_takes_both_messages(wake_places: [WakePlace; 2]) {
+fn sleeper_for_two_rings_takes_both_messages(wake_places: [WakePlace; 2]) {
     loom::model(move || {
-        let (mut first, first_end) = ring(Capacity::tiny(64));
-        let (mut second, second_end) = ring(Capacity::tiny(64));
         let place = Place::new();
-        let button = Arc::clone(&place);
+        let ([mut first, mut second], mut owner) = place.ring();
         let sending = thread::spawn(move || {
-            button.send(&mut second, 2);
-            button.send(&mut first, 1);
+            place.send(&mut second, 2);
+            place.send(&mut first, 1);
         });
-        let (mut receivers, mut wake_places) = ([first_end, second_end], wake_places.into_iter().cycle());
+        let mut wake_places = wake_places.into_iter().cycle();
         // A lost wake is a deadlock, which loom reports.
-        let mut taken =
-            vec![place.take(&mut receivers, &mut wake_places), place.take(&mut receivers, &mut wake_places)];
+        let mut taken = vec![owner.take(&mut wake_places), owner.take(&mut wake_places)];
         taken.sort();
         assert_eq!(taken, [[1], [2]]);
         sending.join().unwrap();
@@ -313,27 +354,42 @@ fn sleeper_at_two_rings_takes_both_messages(wake_places: [WakePlace; 2]) {
 }
 
 #[test]
-fn sleeper_at_one_bell_is_woken_by_either_ring() {
-    sleeper_at_two_rings_takes_both_messages([WakePlace::Bell; 2]);
+fn sleeper_at_the_bell_of_a_set_is_woken_by_either_ring() {
+    sleeper_for_two_rings_takes_both_messages([WakePlace::Bell; 2]);
 }
 
 #[test]
 fn sleeper_at_wakers_words_is_woken_by_either_ring() {
-    sleeper_at_two_rings_takes_both_messages([WakePlace::Own; 2]);
+    sleeper_for_two_rings_takes_both_messages([WakePlace::Own; 2]);
 }
 
 #[test]
 fn sleeper_that_changes_its_place_is_woken() {
     for wake_places in [[WakePlace::Bell, WakePlace::Own], [WakePlace::Own, WakePlace::Bell]] {
         loom::model(move || {
-            let (mut sender, end) = ring(Capacity::tiny(64));
             let place = Place::new();
-            let button = Arc::clone(&place);
-            let sending = thread::spawn(move || (1..=2).for_each(|number| button.send(&mut sender, number)));
-            let (mut receivers, mut wake_places) = ([end], wake_places.into_iter().cycle());
-            assert_eq!(place.take(&mut receivers, &mut wake_places), [1]);
-            assert_eq!(place.take(&mut receivers, &mut wake_places), [2]);
+            let ([mut sender], mut owner) = place.ring();
+            let sending = thread::spawn(move || (1..=2).for_each(|number| place.send(&mut sender, number)));
+            let mut wake_places = wake_places.into_iter().cycle();
+            assert_eq!(owner.take(&mut wake_places), [1]);
+            assert_eq!(owner.take(&mut wake_places), [2]);
             sending.join().unwrap();
         });
     }
+}
+
+#[test]
+fn message_after_a_report_is_found_without_another_one() {
+    loom::model(|| {
+        // Given: a message that was reported
+        let place = Place::new();
+        let ([mut sender], mut owner) = place.ring();
+        place.send(&mut sender, 1);
+        let sending = thread::spawn(move || place.send(&mut sender, 2));
+        // Then: the next one is found, whether its sender finds its bit still set or not
+        let mut wake_places = std::iter::repeat(WakePlace::Bell);
+        assert_eq!(owner.take(&mut wake_places), [1]);
+        assert_eq!(owner.take(&mut wake_places), [2]);
+        sending.join().unwrap();
+    });
 }

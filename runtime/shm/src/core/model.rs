@@ -12,17 +12,18 @@ use super::{ConsumerCore, ProducerCore, Record, producer::Reserved};
 use crate::{
     layout::{Capacity, Word},
     memory::{OwnHeader, OwnRing, Peer},
+    wait_set::report,
 };
 
 /// One side's region.
 #[derive(Debug)]
 pub(super) struct Side {
-    words: [AtomicU32; 5],
+    words: [AtomicU32; 6],
     ring: Vec<AtomicU64>,
 }
 
 pub(super) type Shared = Arc<Side>;
-pub(super) type Sender = ProducerCore<Shared, Shared>;
+pub(super) type Sender = ProducerCore<Shared, Waiting>;
 pub(super) type Receiver = ConsumerCore<Shared, Shared>;
 
 impl Side {
@@ -39,6 +40,7 @@ impl Side {
             Word::ConsumerSleep => &self.words[2],
             Word::ProducerSleep => &self.words[3],
             Word::Rung => &self.words[4],
+            Word::Reported => &self.words[5],
         }
     }
 
@@ -59,6 +61,45 @@ impl OwnRing for Shared {
     }
 }
 
+/// A set of rings.
+#[derive(Debug)]
+pub(super) struct Set {
+    pub(super) reports: AtomicU32,
+    pub(super) sleep: AtomicU32,
+}
+
+/// The region of a side that waits for messages, by itself or for a set.
+#[derive(Clone, Debug)]
+pub(super) struct Waiting {
+    side: Shared,
+    /// The set, and the bit of this ring.
+    set: Option<(Arc<Set>, u32)>,
+}
+
+impl Peer for Waiting {
+    fn load(&self, word: Word) -> u32 {
+        match &self.set {
+            Some((set, _)) if word == Word::ConsumerSleep => set.sleep.load(Ordering::Relaxed),
+            Some(_) | None => self.side.load(word),
+        }
+    }
+
+    fn mark(&self, position: u32) -> u64 {
+        self.side.mark(position)
+    }
+
+    fn report_message(&self) -> bool {
+        let Some((set, bit)) = &self.set else { return false };
+        report(
+            || set.reports.load(Ordering::Relaxed) & bit != 0,
+            || {
+                set.reports.fetch_or(*bit, Ordering::Release);
+            },
+        );
+        true
+    }
+}
+
 impl Peer for Shared {
     fn load(&self, word: Word) -> u32 {
         self.word(word).load(Ordering::Relaxed)
@@ -71,8 +112,14 @@ impl Peer for Shared {
 
 /// A ring from one side to another.
 pub(super) fn ring(capacity: Capacity) -> (Sender, Receiver) {
+    ring_in(None, capacity)
+}
+
+/// The same, to a side that waits for a set: this bit is the ring's.
+pub(super) fn ring_in(set: Option<(Arc<Set>, u32)>, capacity: Capacity) -> (Sender, Receiver) {
     let (source, target) = (Side::new(capacity), Side::new(capacity));
-    let sender = ProducerCore::new(Arc::clone(&source), Arc::clone(&target), capacity);
+    let waiting = Waiting { side: Arc::clone(&target), set };
+    let sender = ProducerCore::new(Arc::clone(&source), waiting, capacity);
     (sender, ConsumerCore::new(target, source, capacity))
 }
 

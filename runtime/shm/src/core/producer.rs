@@ -109,6 +109,10 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
         // SYNC: the record's bytes become visible to a consumer that reads this tail and fences:
         // `ConsumerCore::look`.
         self.own.store(Word::Tail, self.tail, Ordering::Release);
+        if self.peer.report_message() {
+            // SYNC: a consumer that reads this count and finds no bit has lost the bit to another peer: `is_reported`.
+            self.own.store(Word::Reported, self.tail, Ordering::Release);
+        }
         self.waking.needs_ring(&self.peer)
     }
 

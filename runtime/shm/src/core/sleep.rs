@@ -14,8 +14,8 @@
 //! sleeper's word (the memory is not its own), so it records the number for which it has rung, and rings once
 //! for each.
 //!
-//! A sleeper for many rings announces to all of them and fences once. Its number names the place of its wake:
-//! 4k+1 for the bell of all its peers, 4k+3 for each peer's own word (`any.rs`), 4k while awake.
+//! A sleeper for a set of rings announces to all of them in one place (`wait_set.rs`). Its number names the place of its
+//! wake: 4k+1 for the bell of all its peers, 4k+3 for each peer's own word (`any.rs`), 4k while awake.
 
 use std::sync::atomic::Ordering;
 
@@ -37,6 +37,20 @@ const ASLEEP: u32 = 1;
 const AT_OWN: u32 = 2;
 const STEP: u32 = 4;
 
+/// The number that announces the sleep after `number`.
+pub(crate) const fn asleep_after(number: u32, wake_place: WakePlace) -> u32 {
+    let at = match wake_place {
+        WakePlace::Bell => 0,
+        WakePlace::Own => AT_OWN,
+    };
+    (number & !(STEP - 1)).wrapping_add(STEP) | ASLEEP | at
+}
+
+/// The number that announces the end of the sleep `number`.
+pub(crate) const fn awake_after(number: u32) -> u32 {
+    number & !(STEP - 1)
+}
+
 /// The fence between the announcement of a sleep and the next check.
 pub(crate) fn fence_before_recheck() {
     // SYNC: S2, with W2 in `Waking::needs_ring`.
@@ -57,17 +71,13 @@ impl Sleep {
 
     /// Announces that this side is about to sleep. The awaited state must be checked again after this.
     pub(crate) fn announce(&mut self, own: &impl OwnHeader) {
-        self.announce_at(WakePlace::Bell, own);
+        self.announce_unfenced(own);
         fence_before_recheck();
     }
 
     /// The same, without the fence.
-    pub(crate) fn announce_at(&mut self, wake_place: WakePlace, own: &impl OwnHeader) {
-        let at = match wake_place {
-            WakePlace::Bell => 0,
-            WakePlace::Own => AT_OWN,
-        };
-        self.number = (self.number & !(STEP - 1)).wrapping_add(STEP) | ASLEEP | at;
+    pub(crate) fn announce_unfenced(&mut self, own: &impl OwnHeader) {
+        self.number = asleep_after(self.number, WakePlace::Bell);
         own.store(self.word, self.number, Ordering::Relaxed);
     }
 
@@ -75,14 +85,9 @@ impl Sleep {
     /// harmless.
     pub(crate) fn end(&mut self, own: &impl OwnHeader) {
         if self.number & ASLEEP != 0 {
-            own.store(self.word, self.number & !(STEP - 1), Ordering::Relaxed);
+            own.store(self.word, awake_after(self.number), Ordering::Relaxed);
             self.number &= !ASLEEP;
         }
-    }
-
-    /// The number that was announced last.
-    pub(crate) const fn announced(&self) -> u32 {
-        self.number | ASLEEP
     }
 }
 

@@ -22,15 +22,18 @@ use rustix::{
 };
 
 use super::{
-    mapping::Mapping,
-    memfd::{adopt_page, create_page},
+    mapping::{Mapping, OwnHeaderMemory, PeerPlace},
+    memfd::{adopt_own_page, adopt_page, create_own_page, create_page},
     rights::{keep_urgent_in_line, set_descriptors},
 };
 use crate::{
-    bell::{Bell, BellKind, BellState, Bells, CommonBell, Doorbell, Woken},
+    bell::{Bell, BellKind, BellState, Bells, Doorbell, Woken},
     error::{CreateError, RefusedOffer},
+    layout::Word,
+    memory::OwnHeader,
     offer::Descriptors,
     wait::{HangUp, Waiting},
+    wait_set::READY_WORDS,
 };
 
 /// For messages, and for room.
@@ -39,15 +42,23 @@ type Both = (Box<dyn Doorbell>, Box<dyn Doorbell>);
 /// Creates a region's bells.
 pub(crate) fn bells(bell: &Bell) -> Result<Bells, CreateError> {
     let made = match bell {
-        Bell::OfItsOwn(BellKind::Futex) => SharedPage::create().and_then(|page| page.bells()),
+        Bell::OfItsOwn(BellKind::Futex) => SharedPage::create().and_then(|page| {
+            let (message, room) = page.bells();
+            Ok(Bells { message, room, buttons: vec![page.descriptor()?], slot: None })
+        }),
         Bell::OfItsOwn(BellKind::EventFd) => pair_of(event),
         Bell::OfItsOwn(BellKind::Socket) => pair_of(socket),
-        Bell::Common(CommonBell(page)) => page.bells(),
+        Bell::OfItsOwn(BellKind::Set) => Err(io::ErrorKind::InvalidInput.into()),
+        Bell::Set(set) => return set.join().map_err(not_made)?.ok_or(CreateError::SetFull),
     };
-    made.map_err(|cause| CreateError::System { step: "making bells", cause })
+    made.map_err(not_made)
 }
 
-/// A page of futexes, for one region or several.
+const fn not_made(cause: io::Error) -> CreateError {
+    CreateError::System { step: "making bells", cause }
+}
+
+/// A page of futexes and of the bits of a set.
 #[derive(Clone, Debug)]
 pub(crate) struct SharedPage {
     page: Arc<Mapping>,
@@ -60,9 +71,46 @@ impl SharedPage {
         Ok(Self { page: Arc::new(page), memory: Arc::new(memory) })
     }
 
-    fn bells(&self) -> io::Result<Bells> {
-        let (message, room) = on_page(Arc::clone(&self.page));
-        Ok(Bells { message, room, buttons: vec![self.memory.try_clone()?] })
+    pub(crate) fn bells(&self) -> Both {
+        on_page(Arc::clone(&self.page))
+    }
+
+    pub(crate) fn descriptor(&self) -> io::Result<OwnedFd> {
+        self.memory.try_clone()
+    }
+
+    /// The word that a ring for messages changes.
+    pub(crate) fn message_word(&self) -> &AtomicU32 {
+        self.page.shared_word(MESSAGE_WORD)
+    }
+
+    /// The bits of a set.
+    pub(crate) fn reports(&self) -> &[AtomicU32] {
+        self.page.shared_words(REPORT_WORD, READY_WORDS)
+    }
+}
+
+/// The page in which the owner of a set announces its sleep.
+#[derive(Debug)]
+pub(crate) struct Announcement {
+    page: OwnHeaderMemory,
+    memory: OwnedFd,
+}
+
+impl Announcement {
+    pub(crate) fn create() -> io::Result<Self> {
+        let (page, memory) = create_own_page()?;
+        Ok(Self { page, memory })
+    }
+
+    pub(crate) fn descriptor(&self) -> io::Result<OwnedFd> {
+        self.memory.try_clone()
+    }
+}
+
+impl OwnHeader for Announcement {
+    fn store(&self, word: Word, value: u32, order: Ordering) {
+        self.page.store(word, value, order);
     }
 }
 
@@ -74,7 +122,7 @@ fn on_page(page: Arc<Mapping>) -> Both {
 fn pair_of<T: Doorbell + 'static>(make: fn() -> io::Result<(T, OwnedFd)>) -> io::Result<Bells> {
     let ((message, message_button), (room, room_button)) = (make()?, make()?);
     let buttons = vec![message_button, room_button];
-    Ok(Bells { message: Box::new(message), room: Box::new(room), buttons })
+    Ok(Bells { message: Box::new(message), room: Box::new(room), buttons, slot: None })
 }
 
 fn event() -> io::Result<(EventBell, OwnedFd)> {
@@ -93,23 +141,49 @@ fn socket() -> io::Result<(SocketBell, OwnedFd)> {
     Ok((SocketBell { socket: listener, peeks }, button))
 }
 
-/// Creates this side's ends of the peer's bells, if the descriptors are valid.
-pub(crate) fn buttons(kind: BellKind, fds: Vec<OwnedFd>) -> Result<Both, RefusedOffer> {
+/// This side's ends of a peer's bells.
+pub(crate) struct Buttons {
+    pub(crate) message: Box<dyn Doorbell>,
+    pub(crate) room: Box<dyn Doorbell>,
+    /// The place of this side's ring in the peer's set.
+    pub(crate) place: Option<PeerPlace>,
+}
+
+impl From<Both> for Buttons {
+    fn from((message, room): Both) -> Self {
+        Self { message, room, place: None }
+    }
+}
+
+/// Creates this side's ends of the peer's bells, if the descriptors are valid. `slot` is the place in the peer's set.
+pub(crate) fn buttons(kind: BellKind, slot: u8, fds: Vec<OwnedFd>) -> Result<Buttons, RefusedOffer> {
+    let system = |cause| RefusedOffer::System { step: "mapping the offered page of bells", cause };
     let mut fds = fds.into_iter();
-    match (kind, fds.next(), fds.next()) {
+    let both: Both = match (kind, fds.next(), fds.next()) {
+        (BellKind::Set, Some(shared), Some(announcement)) => {
+            let shared = adopt_page(&shared).map_err(system)?.ok_or(RefusedOffer::NotABell(kind))?;
+            let announcement = adopt_own_page(&announcement).map_err(system)?;
+            let announcement = announcement.ok_or(RefusedOffer::NotABell(kind))?;
+            let shared = Arc::new(shared);
+            let (message, room) = on_page(Arc::clone(&shared));
+            let place = Some(PeerPlace::new(shared, Arc::new(announcement), slot));
+            return Ok(Buttons { message, room, place });
+        }
         (BellKind::Futex, Some(fd), None) => {
-            let page = adopt_page(&fd)
-                .map_err(|cause| RefusedOffer::System { step: "mapping the offered page of bells", cause })?;
-            page.map(Arc::new).map(on_page).ok_or(RefusedOffer::NotABell(kind))
+            let page = adopt_page(&fd).map_err(system)?;
+            page.map(Arc::new).map(on_page).ok_or(RefusedOffer::NotABell(kind))?
         }
         (BellKind::EventFd, Some(message), Some(room)) if is_eventfd(&message)? && is_eventfd(&room)? => {
-            Ok((Box::new(EventBell(message)), Box::new(EventBell(room))))
+            (Box::new(EventBell(message)), Box::new(EventBell(room)))
         }
         (BellKind::Socket, Some(message), Some(room)) if is_button(&message) && is_button(&room) => {
-            Ok((Box::new(button(message)), Box::new(button(room))))
+            (Box::new(button(message)), Box::new(button(room)))
         }
-        (BellKind::Futex | BellKind::EventFd | BellKind::Socket, _, _) => Err(RefusedOffer::NotABell(kind)),
-    }
+        (BellKind::Futex | BellKind::EventFd | BellKind::Socket | BellKind::Set, _, _) => {
+            return Err(RefusedOffer::NotABell(kind));
+        }
+    };
+    Ok(both.into())
 }
 
 /// Whether it is a connected unix socket with an empty receive queue: descriptors in the queue would be
@@ -146,6 +220,8 @@ const HANG_UP_CHECK: Duration = Duration::from_millis(20);
 
 const MESSAGE_WORD: usize = 0;
 const ROOM_WORD: usize = 32;
+/// The first word of the bits of a set.
+pub(super) const REPORT_WORD: usize = 64;
 
 /// Wakes one sleeper at a word.
 pub(super) fn wake(word: &AtomicU32) {

@@ -16,7 +16,8 @@
 //!   bytes, each place always in the same size: header 4, ring 8. These are defined on read-only mappings
 //!   too. The word `Rung` is also slept at, which makes the kernel load it.
 //! - M6. A page of bells is written by both sides, and accessed only as atomics of 4 bytes. It cannot shrink
-//!   (seal SHRINK); a hole in it reads as zeros.
+//!   (seal SHRINK); a hole in it reads as zeros. A page with an announcement is like the header of a region: M3 for its
+//!   owner, M5 for its peers.
 
 use std::{
     slice,
@@ -28,10 +29,11 @@ use std::{
 
 use memmap2::MmapRaw;
 
-use super::bells::wake;
+use super::bells::{REPORT_WORD, wake};
 use crate::{
     layout::{Capacity, HEADER_BYTES, MAGIC, VERSION, Word},
     memory::{OwnHeader, OwnRing, Peer},
+    wait_set::{bit_of, report},
 };
 
 /// A region in this process's address space.
@@ -72,6 +74,11 @@ impl Mapping {
     /// A word of a page that both sides write.
     pub(super) fn shared_word(&self, index: usize) -> &AtomicU32 {
         &self.header()[index]
+    }
+
+    /// Words of such a page.
+    pub(super) fn shared_words(&self, first: usize, count: usize) -> &[AtomicU32] {
+        &self.header()[first..first + count]
     }
 
     /// Reads the first words: magic, version, capacity. Each is read once.
@@ -125,6 +132,11 @@ impl OwnMemory {
 pub(crate) struct OwnHeaderMemory(Arc<Mapping>);
 
 impl OwnHeaderMemory {
+    /// Wraps a page that this side alone can write (M3).
+    pub(super) fn of_page(page: Mapping) -> Self {
+        Self(Arc::new(page))
+    }
+
     fn word(&self, word: Word) -> &AtomicU32 {
         &self.0.header()[word.index()]
     }
@@ -173,7 +185,7 @@ impl OwnRingMemory {
 impl OwnRingMemory {
     /// The same memory as a peer sees it. It is not written any more.
     pub(super) fn into_peer(self) -> PeerMemory {
-        PeerMemory(self.0.0)
+        PeerMemory { region: self.0.0, place: None }
     }
 }
 
@@ -191,16 +203,51 @@ impl OwnRing for OwnRingMemory {
 
 /// The peer's region: read-only, and never trusted.
 #[derive(Clone, Debug)]
-pub(crate) struct PeerMemory(Arc<Mapping>);
+pub(crate) struct PeerMemory {
+    region: Arc<Mapping>,
+    place: Option<PeerPlace>,
+}
+
+/// The place of this side's ring in the peer's set.
+#[derive(Clone, Debug)]
+pub(crate) struct PeerPlace {
+    /// Has the bits, which all peers of the set write.
+    shared: Arc<Mapping>,
+    /// Has the announcement of the peer's sleep, which the peer alone writes.
+    announcement: Arc<Mapping>,
+    slot: u8,
+}
+
+impl PeerPlace {
+    pub(super) const fn new(shared: Arc<Mapping>, announcement: Arc<Mapping>, slot: u8) -> Self {
+        Self { shared, announcement, slot }
+    }
+
+    fn report(&self) {
+        let (word, bit) = bit_of(self.slot);
+        let word = self.shared.shared_word(REPORT_WORD + word);
+        report(
+            || word.load(Ordering::Relaxed) & bit != 0,
+            || {
+                word.fetch_or(bit, Ordering::Release);
+            },
+        );
+    }
+}
 
 impl PeerMemory {
     pub(super) fn new(mapping: Mapping) -> Self {
-        Self(Arc::new(mapping))
+        Self { region: Arc::new(mapping), place: None }
+    }
+
+    /// The same, where the peer waits for several rings.
+    pub(crate) fn at(self, place: Option<PeerPlace>) -> Self {
+        Self { place, ..self }
     }
 
     /// The word in which the peer reports its rings: to be loaded, relaxed, and slept at.
     pub(crate) fn rung(&self) -> &AtomicU32 {
-        &self.0.header()[Word::Rung.index()]
+        &self.region.header()[Word::Rung.index()]
     }
 
     /// Copies bytes of the ring, each read once, in words of 8. The compiler cannot tear any of these loads.
@@ -209,7 +256,7 @@ impl PeerMemory {
     /// # Panics
     /// When the bytes do not lie within the ring: the core has checked that they do.
     pub(crate) fn copy_out(&self, position: usize, target: &mut [u8]) {
-        let words = &self.0.ring_words()[position / 8..(position + target.len()).div_ceil(8)];
+        let words = &self.region.ring_words()[position / 8..(position + target.len()).div_ceil(8)];
         let skew = position % 8;
         let (lead, target) = target.split_at_mut(target.len().min((8 - skew) % 8));
         let words = if lead.is_empty() {
@@ -232,10 +279,18 @@ impl PeerMemory {
 
 impl Peer for PeerMemory {
     fn load(&self, word: Word) -> u32 {
-        self.0.header()[word.index()].load(Ordering::Relaxed)
+        let page = match &self.place {
+            Some(place) if word == Word::ConsumerSleep => &place.announcement,
+            Some(_) | None => &self.region,
+        };
+        page.header()[word.index()].load(Ordering::Relaxed)
     }
 
     fn mark(&self, position: u32) -> u64 {
-        self.0.ring_words()[position as usize / 8].load(Ordering::Relaxed)
+        self.region.ring_words()[position as usize / 8].load(Ordering::Relaxed)
+    }
+
+    fn report_message(&self) -> bool {
+        self.place.as_ref().map(PeerPlace::report).is_some()
     }
 }

@@ -11,7 +11,7 @@ use rustix::{
     io::Errno,
 };
 
-use super::mapping::{Mapping, OwnMemory, PeerMemory};
+use super::mapping::{Mapping, OwnHeaderMemory, OwnMemory, PeerMemory};
 use crate::{
     error::{CreateError, RefusedOffer},
     layout::{Capacity, HEADER_BYTES, MAGIC, VERSION},
@@ -82,6 +82,30 @@ pub(crate) fn adopt(memory: OwnedFd, capacity: Capacity) -> Result<PeerMemory, R
     Ok(PeerMemory::new(mapping))
 }
 
+/// Creates a page that only this side can write, for the announcement of its sleep.
+pub(super) fn create_own_page() -> io::Result<(OwnHeaderMemory, OwnedFd)> {
+    let memory = unnamed()?;
+    ftruncate(&memory, HEADER_BYTES as u64)?;
+    fallocate(&memory, FallocateFlags::empty(), 0, HEADER_BYTES as u64)?;
+    let mapping = Mapping::page(MmapOptions::new().len(HEADER_BYTES).populate().map_raw(&memory)?);
+    fcntl_add_seals(&memory, NEEDED)?;
+    Ok((OwnHeaderMemory::of_page(mapping.ok_or(io::ErrorKind::InvalidData)?), memory))
+}
+
+/// Maps a peer's page that only the peer can write, if it is valid; `None` if not.
+pub(super) fn adopt_own_page(memory: &OwnedFd) -> io::Result<Option<Mapping>> {
+    if !is_page(memory, NEEDED)? {
+        return Ok(None);
+    }
+    Ok(Mapping::page(MmapOptions::new().len(HEADER_BYTES).populate().map_raw_read_only(memory)?))
+}
+
+/// Whether it is memory of one page with these seals.
+fn is_page(memory: &OwnedFd, needed: SealFlags) -> io::Result<bool> {
+    let sealed = fcntl_get_seals(memory).is_ok_and(|seals| seals.contains(needed));
+    Ok(sealed && fstatfs(memory)?.f_type == TMPFS_MAGIC && fstat(memory)?.st_size == HEADER_BYTES as i64)
+}
+
 /// A page that both sides write and neither trusts still must not shrink.
 const NEEDED_OF_PAGE: SealFlags = SealFlags::SHRINK.union(SealFlags::GROW).union(SealFlags::SEAL);
 
@@ -97,8 +121,7 @@ pub(super) fn create_page() -> io::Result<(Mapping, OwnedFd)> {
 
 /// Maps a peer's page of bells, if it is valid; `None` if not.
 pub(super) fn adopt_page(memory: &OwnedFd) -> io::Result<Option<Mapping>> {
-    let sealed = fcntl_get_seals(memory).is_ok_and(|seals| seals.contains(NEEDED_OF_PAGE));
-    if !sealed || fstatfs(memory)?.f_type != TMPFS_MAGIC || fstat(memory)?.st_size != HEADER_BYTES as i64 {
+    if !is_page(memory, NEEDED_OF_PAGE)? {
         return Ok(None);
     }
     Ok(Mapping::page(MmapOptions::new().len(HEADER_BYTES).populate().map_raw(memory)?))

@@ -9,7 +9,7 @@ mod rights;
 #[cfg(all(test, not(loom)))]
 mod tests;
 
-pub(crate) use bells::{SharedPage, bells, buttons, which_ended};
+pub(crate) use bells::{Announcement, Buttons, SharedPage, bells, buttons, which_ended};
 pub(crate) use futex_set::{FutexSet, sleep_at};
 pub(crate) use mapping::{OwnHeaderMemory, OwnMemory, OwnRingMemory, PeerMemory};
 pub(crate) use memfd::{adopt, create};

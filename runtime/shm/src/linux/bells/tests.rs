@@ -69,11 +69,11 @@ fn ear_with_descriptors_is_not_drained_and_hangs_up() {
 #[test]
 fn sleeper_at_a_word_checks_regularly_without_a_ring() {
     // Given: another peer that undoes each ring by restoring the word.
-    let bells = SharedPage::create().and_then(|page| page.bells()).expect("a page");
+    let (message, room) = SharedPage::create().expect("a page").bells();
     let (peer, _its_end) = UnixStream::pair().expect("a pair");
     let wait = Wait::within(Duration::from_secs(10)).or_hang_up(HangUp::Socket(peer.as_fd()));
     // Then:
-    for bell in [bells.message, bells.room] {
+    for bell in [message, room] {
         assert_eq!(bell.sleep(bell.listen(), &wait.begin(Instant::now())).expect("it sleeps"), Woken::Rung);
     }
 }
