@@ -7,6 +7,7 @@ mod budget;
 mod descriptors;
 mod established;
 mod in_flight;
+mod link_maker;
 mod link_setup;
 mod peer_fd;
 mod reorder;
@@ -21,7 +22,7 @@ use std::{
     time::Duration,
 };
 
-use budget::{Budget, PROCESS, Share};
+use budget::{Budget, PROCESS};
 use reorder::ReorderBuffer;
 use rustix::net::Shutdown;
 use sinew_protocol::{
@@ -34,7 +35,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Class, Flags, Kind, Message},
 };
-use sinew_shm::{Any, AnyError, Ready, Spin};
+use sinew_shm::{Any, AnyError, Ready, Spin, WaitSet};
 
 use super::{
     ApiError,
@@ -46,7 +47,9 @@ pub(super) use established::{AllEnds, EstablishedLink, LinkRead};
 use established::{LinkEnds, Pair, Put};
 use in_flight::InFlightRequest;
 pub(super) use in_flight::{PEER_END_TIMEOUT, Resolution};
-use peer_fd::{DEFERRED_CLOSE, DeferredClose, LocalHalf, PeerSocket};
+use link_maker::LinkTasks;
+use link_setup::LinkSetup;
+use peer_fd::{DEFERRED_CLOSE, DeferredClose};
 pub(super) use reorder::ReorderDecision;
 pub(super) use room::Room;
 
@@ -72,22 +75,15 @@ pub(super) struct Terms {
     closing: &'static DeferredClose,
 }
 
-/// A link with a local half that the peer knows, while the peer's half is pending.
-struct Offered {
-    peer: Tid,
-    number: LinkNumber,
-    socket: PeerSocket,
-    half: LocalHalf,
-    share: Share,
-}
-
 /// The direct links of an endpoint.
 pub(super) struct Direct {
     terms: Terms,
     routes: Routes,
     /// The socket to the node, through which the ends of links arrive. `None` if there are no links.
     control: Option<Arc<UnixStream>>,
-    offered: Vec<Offered>,
+    /// Links that are being set up.
+    setups: Vec<LinkSetup>,
+    tasks: LinkTasks,
     /// Links that are written to but not read yet.
     held: Vec<EstablishedLink>,
     /// Links that are written to and read.
@@ -178,7 +174,8 @@ impl Direct {
             terms,
             routes,
             control,
-            offered: Vec::new(),
+            setups: Vec::new(),
+            tasks: LinkTasks::default(),
             held: Vec::new(),
             open: Vec::new(),
             by_slot: BTreeMap::new(),
@@ -297,9 +294,16 @@ impl Direct {
         self.by_slot.get(&slot).copied()
     }
 
-    /// Checks periodically for closed links and for messages to repeat. Returns whether it has done so, which is also the
+    /// Records that the endpoint looks for what another thread has woken it for.
+    pub(super) fn take_wake(&self) {
+        // The results are found by their number.
+        let _ = self.terms.options.set().is_some_and(WaitSet::take_wake);
+    }
+
+    /// Continues the setup of links. Checks periodically for closed links and for messages to repeat. Returns whether it has done so, which is also the
     /// time to check all rings.
     pub(super) fn check(&mut self, now: Time, node: &mut NodeWriter<'_>) -> bool {
+        self.continue_setups(now, node);
         if now >= self.next_flush {
             self.next_flush = now + CHECK_INTERVAL;
             self.flush();
@@ -333,7 +337,11 @@ impl Direct {
 
     /// Returns whether there are no links, neither established nor pending.
     pub(super) fn is_empty(&self) -> bool {
-        self.open.is_empty() && self.held.is_empty() && self.offered.is_empty() && self.reordered.is_empty()
+        self.open.is_empty()
+            && self.held.is_empty()
+            && self.setups.is_empty()
+            && self.reordered.is_empty()
+            && self.tasks.is_empty()
     }
 
     /// Returns whether the answer to a link request, or a peer's reason for not reading, may have arrived.
@@ -428,6 +436,7 @@ impl Direct {
     pub(super) fn wait(&mut self, left: Duration) {
         let now = Time::now();
         let left = self.wake_by(now + left, now, None).since(now);
+        self.take_wake();
         let mut waiter = ring::waiter(&LinkOptions { spin: Spin::Off, ..self.terms.options.clone() });
         let ended = waiter.wait_within(&mut LinkEnds(&mut self.open), left);
         let at = |index: usize| index + 1;
@@ -442,8 +451,8 @@ impl Direct {
     fn check_hang_ups(&mut self, now: Time) {
         let established =
             self.open.iter().chain(&self.held).map(|link| (link.peer, link.number, &link.socket));
-        let offered = self.offered.iter().map(|link| (link.peer, link.number, &link.socket));
-        let links: Vec<_> = established.chain(offered).collect();
+        let setups = self.setups.iter().map(|link| (link.peer, link.number, &link.socket));
+        let links: Vec<_> = established.chain(setups).collect();
         if links.is_empty() {
             return;
         }
@@ -466,9 +475,7 @@ impl Direct {
         let mut established = self.open.iter_mut().chain(&mut self.held);
         let has_unread = match established.find(|link| link.number == number) {
             Some(link) => link.has_unsorted(),
-            None => {
-                self.offered.iter().any(|link| link.number == number && descriptors::holds_data(&link.socket))
-            }
+            None => self.setups.iter().any(|link| link.number == number && link.has_unread()),
         };
         if has_unread { Unread::Some } else { Unread::None }
     }
@@ -489,7 +496,7 @@ impl Direct {
         self.open.retain(|link| link.number != number);
         self.index_slots();
         self.held.retain(|link| link.number != number);
-        self.offered.retain(|link| link.number != number);
+        self.setups.retain(|link| link.number != number);
         if self.routes.link(peer) == Some(number) {
             self.routes.ended(peer, now);
         }

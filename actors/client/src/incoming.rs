@@ -62,6 +62,7 @@ impl Endpoint {
 
     /// Sorts in the messages that have arrived on direct links.
     fn poll_links(&mut self, wanted: Option<Wanted>, when_full: WhenFull, now: Time) -> Option<Answer> {
+        self.direct.take_wake();
         if self.direct.is_empty() {
             return None;
         }
@@ -78,7 +79,9 @@ impl Endpoint {
                 self.poll_link(index, wanted, when_full)
             }),
             // From the last one on, so that a link that ends does not skip another one's turn.
-            None => (0..self.direct.open.len()).rev().find_map(|index| self.poll_link(index, wanted, when_full)),
+            None => {
+                (0..self.direct.open.len()).rev().find_map(|index| self.poll_link(index, wanted, when_full))
+            }
         };
         answer.or_else(|| self.poll_reordered(wanted, when_full, now))
     }

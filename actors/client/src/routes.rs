@@ -78,11 +78,15 @@ impl Marks {
         self.classes[class as usize]
     }
 
+    fn are_all(&self) -> bool {
+        self.classes == [true; 3]
+    }
+
     /// Records a mark. Returns whether all have arrived.
     fn note(&mut self, class: Class, confirm: Option<u64>) -> bool {
         self.classes[class as usize] = true;
         self.confirm = self.confirm.or(confirm);
-        self.classes == [true; 3]
+        self.are_all()
     }
 }
 
@@ -265,6 +269,10 @@ impl Routes {
                 Peer::Offered { number: ours, marks, .. }
                 | Peer::Direct { number: ours, peer_ring: PeerRing::Held(marks), .. },
             ) if *ours == number && marks.confirm.is_some() && confirm.is_some() => MarkEffect::Known,
+            // All have arrived before: the link is being connected.
+            Some(Peer::Offered { number: ours, marks, .. }) if *ours == number && marks.are_all() => {
+                MarkEffect::Known
+            }
             Some(Peer::Offered { number: ours, marks, .. }) if *ours == number => {
                 if !marks.note(class, confirm) {
                     return MarkEffect::Wait;

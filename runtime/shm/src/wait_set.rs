@@ -25,7 +25,7 @@ use std::{
     fmt, io,
     sync::{
         Arc, Mutex, PoisonError,
-        atomic::{AtomicU32, Ordering},
+        atomic::{AtomicBool, AtomicU32, Ordering},
     },
 };
 
@@ -62,6 +62,8 @@ struct Shared {
     ready: [AtomicU32; READY_WORDS],
     /// Rings that the owner reads.
     open: [AtomicU32; READY_WORDS],
+    /// Whether another thread of this process has work for the owner.
+    is_woken: AtomicBool,
     /// The places that are taken.
     slots: Mutex<[u32; READY_WORDS]>,
 }
@@ -86,7 +88,23 @@ impl WaitSet {
         let (page, announcement) = (platform::SharedPage::create()?, platform::Announcement::create()?);
         let (sleep, slots) = (AtomicU32::new(0), Mutex::default());
         let (ready, open) = (Default::default(), Default::default());
-        Ok(Self(Arc::new(Shared { page, announcement, sleep, ready, open, slots })))
+        let is_woken = AtomicBool::new(false);
+        Ok(Self(Arc::new(Shared { page, announcement, sleep, ready, open, is_woken, slots })))
+    }
+
+    /// Ends the owner's wait, or its next one, from another thread of this process: the owner has something to do beside
+    /// its rings.
+    pub fn wake(&self) {
+        // SYNC: an owner that finds this has a view of all that was done before.
+        self.0.is_woken.store(true, Ordering::Release);
+        // After the store: an owner that has not found it sleeps at a word that this changes.
+        self.0.page.bells().0.ring();
+    }
+
+    /// Returns whether [`wake`](Self::wake) was called since the last call. Until then no wait sleeps.
+    #[must_use]
+    pub fn take_wake(&self) -> bool {
+        self.0.is_woken.load(Ordering::Relaxed) && self.0.is_woken.swap(false, Ordering::Acquire)
     }
 
     /// Sets whether a ring is read from now on. At first it is not: its messages wait, and nothing reports them here.
@@ -101,9 +119,9 @@ impl WaitSet {
     }
 
     /// Looks which rings have reported messages since the last look, at one place for all of them. Returns whether any
-    /// open ring is to be read: [`ready`](Self::ready).
+    /// open ring is to be read: [`ready`](Self::ready), or whether the owner was woken: [`take_wake`](Self::take_wake).
     pub fn look(&self) -> bool {
-        let mut any = false;
+        let mut any = self.0.is_woken.load(Ordering::Relaxed);
         let words = self.0.ready.iter().zip(&self.0.open).zip(self.0.page.reports());
         for ((ready, open), reported) in words {
             let mut own = ready.load(Ordering::Relaxed);

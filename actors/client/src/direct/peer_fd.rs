@@ -111,9 +111,10 @@ impl LocalHalf {
     }
 
     /// Returns both rings if the peer's half is valid.
-    pub(super) fn join(mut self, theirs: Offer) -> Result<(Producer, Consumer), ExchangeError> {
+    pub(super) fn join(mut self, theirs: Offer) -> Result<UnusedRings, ExchangeError> {
         let theirs = self.exchange.as_ref().expect("it is there until it is joined").accept(theirs)?;
-        Ok(self.exchange.take().expect("it is there until it is joined").join(theirs))
+        let rings = self.exchange.take().expect("it is there until it is joined").join(theirs);
+        Ok(UnusedRings(Some(rings)))
     }
 }
 
@@ -122,6 +123,24 @@ impl Drop for LocalHalf {
         if let Some(exchange) = &self.exchange {
             // spec: LNCL-18
             exchange.bells().into_iter().flatten().for_each(empty);
+        }
+    }
+}
+
+/// Both rings of a link that is not established yet. Dropping them drains their wake-up sockets.
+pub(super) struct UnusedRings(Option<(Producer, Consumer)>);
+
+impl UnusedRings {
+    pub(super) fn take(mut self) -> (Producer, Consumer) {
+        self.0.take().expect("they are there until they are taken")
+    }
+}
+
+impl Drop for UnusedRings {
+    fn drop(&mut self) {
+        if let Some((producer, consumer)) = &self.0 {
+            // spec: LNCL-18
+            [producer.fd(), consumer.fd()].into_iter().for_each(empty_bell);
         }
     }
 }

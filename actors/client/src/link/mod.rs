@@ -219,11 +219,20 @@ impl Writer {
         }
     }
 
-    /// Resolves when another thread has left an outcome that waits for room.
+    /// Resolves when another thread has left an outcome that waits for room, or has called
+    /// [`wake_task`](Self::wake_task).
     pub(super) async fn pending_added(&self) {
         match self {
             Self::Socket(writer) => writer.pending_notify.notified().await,
             Self::Ring(writer) => writer.pending_notify.notified().await,
+        }
+    }
+
+    /// Ends the wait of the endpoint's task, or its next one.
+    pub(super) fn wake_task(&self) {
+        match self {
+            Self::Socket(writer) => writer.pending_notify.notify_one(),
+            Self::Ring(writer) => writer.pending_notify.notify_one(),
         }
     }
 

@@ -336,15 +336,7 @@ impl Reader {
         if let Some(set) = &set {
             set.set_open(&end.consumer, true);
         }
-        Self {
-            end,
-            set,
-            frames,
-            waiter,
-            next_check: Time::ZERO,
-            ended: None,
-            is_stopped: false,
-        }
+        Self { end, set, frames, waiter, next_check: Time::ZERO, ended: None, is_stopped: false }
     }
 
     /// Returns the next frame of those that were taken.

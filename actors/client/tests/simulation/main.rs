@@ -22,7 +22,8 @@ fn step_without_faults() -> impl Strategy<Value = Step> {
         5 => app.clone().prop_map(Step::NodeWrites),
         5 => app.clone().prop_map(Step::Poll),
         4 => (app.clone(), app.clone()).prop_map(|(at, peer)| Step::PollLink(at, peer)),
-        2 => app.prop_map(Step::PollEnds),
+        2 => app.clone().prop_map(Step::PollEnds),
+        3 => app.prop_map(Step::FinishMaking),
     ]
 }
 
@@ -99,6 +100,7 @@ fn busy_peers_end_with_one_open_link() {
             .chain(both(Step::NodeWrites))
             .chain(both(Step::Poll))
             .chain(both(Step::Poll))
+            .chain(both(Step::FinishMaking))
             .chain([Step::PollLink(0, 1), Step::PollLink(1, 0), Step::PollLink(0, 1), Step::PollLink(1, 0)])
     });
     let world = run(steps.collect());

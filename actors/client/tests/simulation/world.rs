@@ -76,6 +76,13 @@ struct Link {
     ends: BTreeMap<Tid, End>,
 }
 
+/// A step of the setup of a link that takes a while.
+enum Making {
+    Offer { number: LinkNumber },
+    Accept { peer: Tid, number: LinkNumber, confirm: Option<u64> },
+    Connect { peer: Tid, number: LinkNumber, correlation: u64 },
+}
+
 pub(super) struct App {
     tid: Tid,
     incarnation: u64,
@@ -91,6 +98,8 @@ pub(super) struct App {
     queue: ClassQueue,
     /// Messages that came through the node and were sent after the remaining messages in that link's ring.
     reordered: VecDeque<(LinkNumber, Message)>,
+    /// Links for which another thread makes the memory.
+    making: VecDeque<Making>,
     /// The incarnation and the number of the newest message taken, for each source and class.
     seen: BTreeMap<(Tid, Class), (u64, u64)>,
 }
@@ -109,6 +118,7 @@ impl App {
             from_node: VecDeque::new(),
             queue: ClassQueue::new(QUEUE),
             reordered: VecDeque::new(),
+            making: VecDeque::new(),
             seen: BTreeMap::new(),
         }
     }
@@ -167,9 +177,15 @@ impl World {
     pub(super) fn switching(meanwhile: &[Step]) -> Self {
         let mut world = Self::new();
         let send = |class| Step::Send { from: 0, to: 1, class, confirm: false, times: 1 };
-        let ask =
-            [send(Class::Control), Step::NodeReads(0), Step::NodeReads(0), Step::Poll(1), Step::NodeReads(1)];
-        let switch = [Step::Poll(0), Step::NodeReads(0)];
+        let ask = [
+            send(Class::Control),
+            Step::NodeReads(0),
+            Step::NodeReads(0),
+            Step::Poll(1),
+            Step::FinishMaking(1),
+            Step::NodeReads(1),
+        ];
+        let switch = [Step::Poll(0), Step::FinishMaking(0), Step::NodeReads(0)];
         let direct = [send(Class::Control), send(Class::Bulk), send(Class::Stream)];
         for step in ask.iter().chain(meanwhile).chain(&switch).chain(&direct) {
             world.step(*step);
@@ -249,7 +265,8 @@ impl World {
                 self.poll_link(at, tid(peer));
             }
             Step::PollEnds(at) if self.apps[at].alive => self.poll_ends(at),
-            Step::Poll(_) | Step::PollLink(..) | Step::PollEnds(_) => {}
+            Step::FinishMaking(at) if self.apps[at].alive => self.finish_making(at),
+            Step::Poll(_) | Step::PollLink(..) | Step::PollEnds(_) | Step::FinishMaking(_) => {}
             Step::Kill(at) => self.kill(at),
             Step::Revive(at) => self.revive(at),
             Step::RestartNode => self.restart_node(),
@@ -279,6 +296,7 @@ impl World {
             self.step(Step::NodeWrites(at));
             self.step(Step::Poll(at));
             self.step(Step::PollEnds(at));
+            self.step(Step::FinishMaking(at));
             for peer in 0..APPS {
                 self.step(Step::PollLink(at, peer));
             }
@@ -287,7 +305,8 @@ impl World {
 
     fn is_idle(&self) -> bool {
         self.apps.iter().all(|app| {
-            app.to_node.is_empty() && (!app.alive || app.from_node.is_empty() && app.queue.is_empty())
+            let is_idle = app.from_node.is_empty() && app.queue.is_empty() && app.making.is_empty();
+            app.to_node.is_empty() && (!app.alive || is_idle)
         })
     }
 
@@ -369,6 +388,8 @@ pub(super) enum Step {
     Poll(usize),
     PollLink(usize, usize),
     PollEnds(usize),
+    /// The memory for one link of this application is there.
+    FinishMaking(usize),
     Kill(usize),
     Revive(usize),
     RestartNode,

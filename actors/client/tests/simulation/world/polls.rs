@@ -18,9 +18,8 @@ impl World {
                     MarkEffect::Wait => None,
                     MarkEffect::Connect { confirm } => {
                         assert!(self.other_end(number, tid(at)).offered, "it is offered before the SWITCH");
-                        self.end_mut(number, tid(at)).connected = true;
-                        self.connect(at, source, number);
-                        confirm.map(|number| (number, Outcome::Delivered))
+                        self.apps[at].making.push_back(Making::Accept { peer: source, number, confirm });
+                        None
                     }
                     MarkEffect::Open { confirm } => confirm.map(|number| (number, Outcome::Delivered)),
                     MarkEffect::Known => confirm.map(|number| (number, Outcome::Delivered)),
@@ -58,19 +57,54 @@ impl World {
     pub(super) fn take_introduction(&mut self, at: usize, peer: Tid, number: LinkNumber) {
         self.poll_ends(at);
         let own = self.apps[at].tid;
-        let answer = match self.apps[at].routes.on_introduction(peer) {
+        match self.apps[at].routes.on_introduction(peer) {
             Ok(()) => {
-                self.end_mut(number, own).offered = true;
                 self.apps[at].routes.offered(peer, number);
-                Outcome::Delivered
+                self.apps[at].making.push_back(Making::Offer { number });
             }
             Err(why) => {
                 self.links.get_mut(&number).expect("made before").close(own);
-                Outcome::Rejected(why)
+                self.answer_introduction(at, number, Outcome::Rejected(why));
             }
-        };
+        }
+    }
+
+    fn answer_introduction(&mut self, at: usize, number: LinkNumber, answer: Outcome) {
         let lncl = Tid::new(NODE, AppAddress::LNCL);
-        self.apps[at].to_node.push_back(outcome(own, lncl, number.0, answer));
+        let answer = outcome(self.apps[at].tid, lncl, number.0, answer);
+        self.apps[at].to_node.push_back(answer);
+    }
+
+    /// What was made for one link of an application is there.
+    pub(super) fn finish_making(&mut self, at: usize) {
+        let Some(made) = self.apps[at].making.pop_front() else { return };
+        let own = self.apps[at].tid;
+        match made {
+            Making::Offer { number } => {
+                // Unless the link has ended meanwhile.
+                if self.end_mut(number, own).here {
+                    self.end_mut(number, own).offered = true;
+                    self.answer_introduction(at, number, Outcome::Delivered);
+                }
+            }
+            Making::Accept { peer, number, confirm } if self.apps[at].routes.link(peer) == Some(number) => {
+                self.end_mut(number, own).connected = true;
+                self.connect(at, peer, number);
+                if let Some(correlation) = confirm {
+                    self.settle_through_node(at, peer, correlation, Outcome::Delivered);
+                }
+            }
+            Making::Connect { peer, number, correlation }
+                if self.apps[at].routes.introduced(peer, correlation) =>
+            {
+                self.end_mut(number, own).offered = true;
+                self.end_mut(number, own).connected = true;
+                self.connect(at, peer, number);
+            }
+            Making::Accept { number, .. } | Making::Connect { number, .. } => {
+                self.links.get_mut(&number).expect("made before").close(own);
+            }
+        }
     }
 
     pub(super) fn take_introduced(&mut self, at: usize, peer: Tid, number: LinkNumber, correlation: u64) {
@@ -84,9 +118,7 @@ impl World {
             }
             return;
         }
-        self.end_mut(number, own).offered = true;
-        self.end_mut(number, own).connected = true;
-        self.connect(at, peer, number);
+        self.apps[at].making.push_back(Making::Connect { peer, number, correlation });
     }
 
     /// As [`send_switch`](Self::send_switch) for a link that is established from now on; sometimes there is
