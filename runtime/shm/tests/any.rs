@@ -8,8 +8,8 @@ use std::{
 };
 
 use sinew_shm::{
-    Any, AnyError, Bell, BellKind, Capacity, Consumer, ENDS_MAX, Ends, HangUp, Producer, Region,
-    Spin, Terms, WaitSet, Waiter,
+    Any, AnyError, Bell, BellKind, Capacity, Consumer, ENDS_MAX, Ends, HangUp, Producer, Region, Spin, Terms,
+    WaitSet, Waiter,
 };
 
 /// Longer than any test takes.
@@ -227,4 +227,30 @@ fn ring_that_is_not_read_ends_no_wait() {
     // When: it is read. Then: the message is there
     set.set_open(&ends.0[0].consumer, true);
     assert_eq!(waiter.wait(&mut ends, in_time()).expect("honest"), Any::Ready);
+}
+
+#[test]
+fn other_thread_ends_this_wait_or_the_next() {
+    const WAKES: u32 = 1_000;
+    let set = WaitSet::create().expect("pages");
+    let (mut ends, _peers) = sides_of(&set, 2);
+    let mut waiter = Waiter::new(Spin::Off).of_set(set.clone());
+    let (taken, next) = std::sync::mpsc::sync_channel(0);
+    thread::scope(|scope| {
+        let waking = set.clone();
+        scope.spawn(move || {
+            for _ in 0..WAKES {
+                waking.wake();
+                next.recv_timeout(WATCHDOG).expect("the owner takes each");
+            }
+        });
+        for _ in 0..WAKES {
+            while !set.take_wake() {
+                assert_eq!(waiter.wait(&mut ends, in_time()).expect("honest"), Any::Ready);
+            }
+            taken.send(()).expect("the other thread waits for it");
+        }
+    });
+    assert!(!set.take_wake());
+    assert_eq!(waiter.wait(&mut ends, Instant::now()).expect("honest"), Any::TimedOut);
 }
