@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use sinew_figures::{Alone, Beside, End, Figures, Pace, Pinning, Rounds, process};
 
 use crate::{
-    crowds,
+    crowds::{self, Flood},
     ends::{self, Memory},
     raw, tasks,
 };
@@ -109,6 +109,8 @@ enum What {
     TableOneCpp,
     FanIn,
     Flood,
+    /// Round trips of Control beside a flood of Bulk to the same receiver.
+    Commands,
 }
 
 /// A case: one transport, one measurement, one CPU assignment.
@@ -123,7 +125,8 @@ pub(crate) struct Case {
 pub(crate) fn all(is_short: bool) -> impl Iterator<Item = Case> {
     let back_to_back = |bytes| What::RoundTrips { bytes, pace: Pace::BackToBack };
     let paced = |bytes| What::RoundTrips { bytes, pace: Pace::EveryMillisecond };
-    let mut things = vec![back_to_back(1000), paced(1000), What::TableOne, What::FanIn, What::Flood];
+    let mut things =
+        vec![back_to_back(1000), paced(1000), What::TableOne, What::FanIn, What::Flood, What::Commands];
     if std::env::var_os(ends::CPP_ECHO).is_some() {
         things.push(What::TableOneCpp);
     }
@@ -156,6 +159,7 @@ impl Case {
             What::TableOneCpp => format!("{way}-table_1_cpp-{pinning}"),
             What::FanIn => format!("{way}-fan_in-{pinning}"),
             What::Flood => format!("{way}-flood-{pinning}"),
+            What::Commands => format!("{way}-commands-{pinning}"),
         }
     }
 
@@ -182,6 +186,7 @@ impl Case {
             What::TableOneCpp => self.table_one("table_1_cpp", "cpp_echo"),
             What::FanIn => self.fan_in(if is_short { 150 } else { 1_500 }),
             What::Flood => self.flood(if is_short { 20_480 } else { 204_800 }),
+            What::Commands => self.commands(if is_short { 1_000 } else { 10_000 }),
         }
     }
 
@@ -289,6 +294,24 @@ impl Case {
         self.report("32 sent to answered", &windows, &counts);
     }
 
+    fn commands(self, rounds: u64) {
+        let raw = crowds::commands(self.way, Flood::None, rounds, self.pinning);
+        let seen = crowds::commands(self.way, Flood::Bulk, rounds, self.pinning);
+        let [raw_p99, p99] = [&raw, &seen].map(|figures| figures.p99().as_secs_f64() * 1e6);
+        Beside {
+            bench: "lncl",
+            case: &format!("{}_commands_beside_bulk", self.way.name()),
+            payload_bytes: crowds::COMMAND_BYTES,
+            pinning: self.pinning.name(),
+            pace: Pace::EveryMillisecond.name(),
+            seen: &seen,
+            reference: "the same without Bulk",
+            raw: &raw,
+            counts: &[("reference_p99_us", raw_p99), ("ratio_p99", p99 / raw_p99)],
+        }
+        .report();
+    }
+
     fn report(self, figure: &str, seen: &Figures, counts: &[(&str, u64)]) {
         Alone { bench: "lncl", case: &self.name(), figure, seen, counts }.report();
     }
@@ -325,6 +348,10 @@ pub(crate) fn play(role: &str) -> ExitCode {
         ["sink", way, pinning, socket] => {
             raw::pin(pinning, End::Echoing);
             crowds::sink(way_named(way), socket);
+        }
+        ["commanded", way, pinning, socket] => {
+            raw::pin(pinning, End::Echoing);
+            crowds::answer_commands(way_named(way), socket);
         }
         ["sender", way, pinning, socket, packets] => {
             raw::pin(pinning, End::Other);

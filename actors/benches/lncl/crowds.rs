@@ -1,4 +1,4 @@
-//! Many messages at once: eight senders to one receiver, and maximum throughput.
+//! Many messages at once: eight senders to one receiver, maximum throughput, and Control beside a flood of Bulk.
 
 use std::{
     thread,
@@ -9,7 +9,10 @@ use sinew_figures::{
     Figures, Pinning,
     process::{Process, print_ready},
 };
-use sinew_runtime::{time::Time, wire::Kind};
+use sinew_runtime::{
+    time::Time,
+    wire::{Class, Kind},
+};
 
 use crate::{
     case::{Way, role},
@@ -28,6 +31,9 @@ pub(crate) const SENDERS: usize = 8;
 const BLOCK: Kind = Kind::named("lncl.block");
 const ANSWER: Kind = Kind::named("lncl.answer");
 const BEGIN: Kind = Kind::named("lncl.begin");
+const COMMAND: Kind = Kind::named("lncl.command");
+/// Bytes of a command.
+pub(crate) const COMMAND_BYTES: usize = 64;
 
 /// How old packets were when they were received.
 pub(crate) struct Ages {
@@ -146,6 +152,57 @@ pub(crate) fn sink(way: Way, socket: &str) {
         if taken.is_multiple_of(ANSWERED_EACH) {
             let answer = endpoint.create_message(source, ANSWER, 8).expect("short");
             endpoint.loaned(answer).send().expect("the node takes it");
+        }
+    }
+}
+
+/// Whether Bulk is sent beside the commands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Flood {
+    None,
+    Bulk,
+}
+
+/// Round trips of commands of class Control, one every millisecond, from the call of `send` to the answer.
+pub(crate) fn commands(way: Way, flood: Flood, rounds: u64, pinning: Pinning) -> Figures {
+    let home = Home::start(pinning);
+    let _sink = Process::start(&role("commanded", way, pinning, home.socket()));
+    let mut endpoint = register(way, home.socket(), "commander");
+    let sink = endpoint.resolve("sink", DEADLINE).expect("the node lives").expect("it is registered");
+    let (mut figures, mut sent_at, mut next) = (Figures::new(), None, Instant::now());
+    while figures.rounds() < rounds {
+        if sent_at.is_none() && Instant::now() >= next {
+            let command = endpoint.create_message(sink, COMMAND, COMMAND_BYTES).expect("short");
+            sent_at = Some(Instant::now());
+            endpoint.loaned(command).class(Class::Control).send().expect("the sink reads");
+        }
+        if flood == Flood::Bulk {
+            let mut packet = endpoint.create_message(sink, BLOCK, PACKET).expect("not too long");
+            packet.fill(7);
+            endpoint.loaned(packet).class(Class::Bulk).send().expect("the sink reads");
+        }
+        let within = match (flood, sent_at) {
+            (Flood::Bulk, _) => Duration::ZERO,
+            (Flood::None, Some(_)) => DEADLINE,
+            (Flood::None, None) => next.saturating_duration_since(Instant::now()),
+        };
+        if endpoint.receive(within).expect("the node lives").is_some() {
+            let sent_at = sent_at.take().expect("one answer for each command");
+            figures.record(sent_at.elapsed());
+            next += Duration::from_millis(1);
+        }
+    }
+    figures
+}
+
+/// Answers commands, and drops everything else: until the measuring end ends this process.
+pub(crate) fn answer_commands(way: Way, socket: &str) {
+    let mut endpoint = register(way, socket, "sink");
+    print_ready();
+    while let Some(received) = endpoint.receive(DEADLINE).expect("the node lives") {
+        if received.kind() == COMMAND {
+            let answer = endpoint.create_message(received.source(), COMMAND, COMMAND_BYTES).expect("short");
+            endpoint.loaned(answer).class(Class::Control).send().expect("the commander reads");
         }
     }
 }

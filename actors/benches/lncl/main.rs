@@ -16,6 +16,8 @@
 //!   in `docs/book/src/contributing/testing.md`.
 //! - `fan_in`: eight processes send to one, each 1000 bytes every millisecond, one way.
 //! - `flood`: 1000 bytes as fast as a window of 128 unacknowledged ones allows.
+//! - `commands`: 64 bytes of class Control there and back every millisecond, beside a flood of Bulk of 1000 bytes from
+//!   the same sender to the same receiver, and without it.
 //!
 //! Each case runs three times: placed by the scheduler, all on one CPU, and one CPU for each application (the
 //! node then has none of its own). The references are a hand-written ring in shared memory without any
