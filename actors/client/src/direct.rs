@@ -9,6 +9,7 @@ mod established;
 mod in_flight;
 mod link_maker;
 mod link_setup;
+mod observer;
 mod peer_fd;
 mod reorder;
 mod room;
@@ -26,7 +27,7 @@ use budget::{Budget, PROCESS};
 use reorder::ReorderBuffer;
 use rustix::net::Shutdown;
 use sinew_protocol::{
-    payload::{self, Gone, Introduce, Introduction, Registered, Switch},
+    payload::{self, Gone, Introduce, Introduction, Observe, Registered, Switch},
     ring::{self as rings, Exchange, ExchangeError, RingError},
 };
 use sinew_runtime::{
@@ -49,6 +50,7 @@ use in_flight::InFlightRequest;
 pub(super) use in_flight::{PEER_END_TIMEOUT, Resolution};
 use link_maker::LinkTasks;
 use link_setup::LinkSetup;
+use observer::Observer;
 use peer_fd::{DEFERRED_CLOSE, DeferredClose};
 pub(super) use reorder::ReorderDecision;
 pub(super) use room::Room;
@@ -105,6 +107,8 @@ pub(super) struct Direct {
     cut: Option<Message>,
     /// The confirmed message that waits for its answer, if it was sent on a link.
     in_flight: Option<InFlightRequest>,
+    /// While somebody watches this application.
+    observer: Option<Observer>,
     /// Stream values that were lost with a link, per destination, and that the endpoint has not counted yet.
     unsent: BTreeMap<Tid, u64>,
 }
@@ -186,6 +190,7 @@ impl Direct {
             writing: None,
             cut: None,
             in_flight: None,
+            observer: None,
             unsent: BTreeMap::new(),
         }
     }
@@ -344,14 +349,14 @@ impl Direct {
             && self.tasks.is_empty()
     }
 
-    /// Returns whether the answer to a link request, or a peer's reason for not reading, may have arrived.
-    /// True once per `CHECK_INTERVAL`.
-    pub(super) fn is_asking(&mut self, now: Time) -> bool {
+    /// Returns whether the node may have said something about links: the answer to a request, a peer's end, whether
+    /// this application is watched. True once per `CHECK_INTERVAL`.
+    pub(super) fn must_poll_node(&mut self, now: Time) -> bool {
         if now < self.next_poll {
             return false;
         }
         self.next_poll = now + CHECK_INTERVAL;
-        self.routes.is_asking() || self.open.iter().chain(&self.held).any(|link| link.is_stalled)
+        self.needs_checks()
     }
 
     /// Returns whether an event without a wake-up may be due: a SWITCH, or the end of a link that is not read
@@ -430,6 +435,8 @@ impl Direct {
     /// Records a new connection to the node or to its next incarnation; the links stay established.
     pub(super) fn on_reconnect(&mut self, terms: Terms, control: Option<Arc<UnixStream>>) {
         (self.terms, self.control) = (terms, control);
+        // The node says it again.
+        self.observer = None;
     }
 
     /// Waits until a message arrives on an open link, for `left` at most. May return early without a reason.

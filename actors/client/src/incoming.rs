@@ -204,6 +204,8 @@ impl Endpoint {
                     Ok(LinkRead::Nothing) => break,
                     Ok(LinkRead::Refused) => {}
                     Ok(LinkRead::Message(message)) => {
+                        self.direct.report_received(&message.header, &message.payload, &self.node.writer);
+                        let link = &self.direct.open[index];
                         if let Sorted::Answer(answer) = self.inbox.sort_from(&link.sink, message, awaited) {
                             return Some(answer);
                         }

@@ -145,9 +145,13 @@ pub(super) enum Content {
 
 impl Content {
     pub(super) fn len(&self) -> usize {
+        self.bytes().len()
+    }
+
+    pub(super) fn bytes(&self) -> &[u8] {
         match self {
-            Self::Bytes(bytes) => bytes.len(),
-            Self::InRing(room) => room.payload().len(),
+            Self::Bytes(bytes) => bytes,
+            Self::InRing(room) => room.payload(),
         }
     }
 

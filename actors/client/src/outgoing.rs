@@ -280,8 +280,10 @@ impl Endpoint {
             draft.header.destination = destination;
             let is_awaited = draft.header.flags.has(Flags::CONFIRM);
             let request = if is_awaited { self.direct.begin_request(link) } else { None };
+            let report = self.direct.report_of(&draft);
             match self.send_on(link, draft, limit, now).await? {
                 None => {
+                    self.direct.report_sent(report, &self.node.writer);
                     self.direct.set_in_flight(request);
                     return Ok(Some(link));
                 }
@@ -300,9 +302,9 @@ impl Endpoint {
     fn route(&mut self, destination: Tid, now: Time) -> Option<LinkNumber> {
         let mut node = NodeWriter { writer: &self.node.writer, correlation: &mut self.requests.correlation };
         self.direct.check(now, &mut node);
-        if self.direct.is_asking(now) {
-            // An endpoint that only sends polls for the answer here. A read failure is reported when it
-            // receives.
+        if self.direct.must_poll_node(now) {
+            // An endpoint that only sends reads here what the node says about links. A read failure is reported
+            // when it receives.
             let _ = self.poll_node(None, WhenFull::Leave, now);
         }
         let mut node = NodeWriter { writer: &self.node.writer, correlation: &mut self.requests.correlation };

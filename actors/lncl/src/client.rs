@@ -116,6 +116,7 @@ async fn introduce(
         | Order::Resolve { .. }
         | Order::Introduce { .. }
         | Order::Switch { .. }
+        | Order::Observe(_)
         | Order::RefuseMessage { .. }
         | Order::Unregister => Err("an unregistered connection can only register".to_owned()),
     }
@@ -357,6 +358,8 @@ impl Client {
         if self.wants_links {
             let peer = LinkPeer::new(self.tid, self.pid(), self.outlet.clone(), self.peer.stream.clone());
             self.server.link_broker.add(peer);
+            let state = &self.server.state;
+            state.observed_links.add(&state.ctx.router, self.tid);
         }
     }
 

@@ -111,7 +111,8 @@ fn converse(bytes: &[u8], pieces: usize) -> bool {
                 | Order::RefuseMembership { .. }
                 | Order::Resolve { .. }
                 | Order::Introduce { .. }
-                | Order::Switch { .. } => assert!(is_registered && source == CLIENT),
+                | Order::Switch { .. }
+                | Order::Observe(_) => assert!(is_registered && source == CLIENT),
             }
         }
         assert!(buffer.capacity() <= 2 * FrameCodec::BUFFER_KEPT);

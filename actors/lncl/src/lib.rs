@@ -22,6 +22,7 @@
 //! | LNCL-15 | A connection ends with the process that connected, even while a child that it forked holds the socket open. |
 //! | LNCL-16 | Each confirmed message of a client has an outcome, even if its queue is full. A client that does not read its outcomes is not read. |
 //! | LNCL-17 | A client with a direct link to a process that has ended is notified, even while a child of that process holds the link's end. |
+//! | LNCL-20 | While an application with direct links is watched, its client reports the messages on them; a report never delays a message. |
 
 #![allow(
     missing_docs,
@@ -41,6 +42,7 @@ mod guest_reads;
 mod link;
 mod link_broker;
 mod listener;
+mod observed_links;
 mod ports;
 mod reader;
 mod registrar;

@@ -1,6 +1,6 @@
 //! What other layers ask LNCL.
 
-use std::fmt::Display;
+use std::{collections::BTreeSet, fmt::Display};
 
 use sinew_model::{ports::Applications, undelivered::Report};
 use sinew_runtime::{
@@ -18,6 +18,10 @@ impl Applications for State {
 
     fn resolve(&self, name: &str) -> Option<AppAddress> {
         lock(&self.registry).resolve(name)
+    }
+
+    fn observe_links(&self, apps: &BTreeSet<AppAddress>) {
+        self.observed_links.observe(&self.ctx.router, apps);
     }
 
     fn undelivered_elsewhere(&self, node: NodeAddress, report: Report, refuse: &mut dyn FnMut(&dyn Display)) {

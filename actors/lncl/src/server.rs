@@ -187,6 +187,7 @@ impl Server {
         for outlet in self.clients.borrow().values() {
             outlet.expire(now);
         }
+        self.state.observed_links.retry(&self.state.ctx.router);
         undelivered::report(&self.state, now);
     }
 }

@@ -8,7 +8,10 @@ use sinew_runtime::{
     wire::{Class, Flags, Kind, Message},
 };
 
-use sinew_protocol::payload::{self, Group, Introduce, Register, Resolve, Switch};
+use sinew_protocol::{
+    observed::Observed,
+    payload::{self, Group, Introduce, Register, Resolve, Switch},
+};
 
 /// Maximum number of groups of one client.
 pub const GROUPS_MAX: usize = 256;
@@ -51,6 +54,8 @@ pub enum Order {
     Introduce { to: Tid, correlation: u64 },
     /// Notify `to`, behind all earlier messages of the client to it, that the client continues on their link `number`.
     Switch { to: Tid, number: u64, correlation: u64 },
+    /// Report a message on a direct link of the client to the tap.
+    Observe(Box<Observed>),
     /// Count a rejected message, and send the outcome if the client requested it. The connection continues.
     RefuseMessage { message: Message, why: Rejection },
     /// The client ends normally.
@@ -157,6 +162,7 @@ impl Session {
             Kind::LNCL_RESOLVE => read_resolve(&message),
             Kind::LNCL_INTRODUCE => read_introduce(&message),
             Kind::LNCL_SWITCH => read_switch(&message),
+            Kind::LNCL_OBSERVED => read_observed(&message),
             Kind::LNCL_UNREGISTER => Ok(Order::Unregister),
             Kind::LNCL_REGISTER => Err(ProtocolError::RegisteredTwice),
             // Not a Rust enum, but an open set of numbers.
@@ -239,6 +245,11 @@ fn read_introduce(message: &Message) -> Result<Order, ProtocolError> {
 fn read_switch(message: &Message) -> Result<Order, ProtocolError> {
     let Switch { peer, number } = read_payload(message)?;
     Ok(Order::Switch { to: Tid::from_bits(peer), number, correlation: message.header.correlation })
+}
+
+fn read_observed(message: &Message) -> Result<Order, ProtocolError> {
+    let observed = Observed::read(&message.payload).map_err(|cause| malformed(message, &cause))?;
+    Ok(Order::Observe(Box::new(observed)))
 }
 
 fn read_payload<P: serde::de::DeserializeOwned>(message: &Message) -> Result<P, ProtocolError> {

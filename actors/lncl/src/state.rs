@@ -15,7 +15,10 @@ use sinew_runtime::tid::Incarnation;
 use sinew_security::SecurityState;
 use sinew_session::book::Book;
 
-use super::{ClientSocket, ListenError, Registry, SocketAccess, undelivered::Undelivered};
+use super::{
+    ClientSocket, ListenError, Registry, SocketAccess, observed_links::ObservedLinks,
+    undelivered::Undelivered,
+};
 
 /// The state of LNCL that outlives its actor. The node's root lends it to each new instance.
 pub struct State {
@@ -31,6 +34,8 @@ pub struct State {
     pub guest_quotas: GuestQuotas,
     /// Unconfirmed messages that were refused without a report to their senders.
     pub undelivered: Arc<Undelivered>,
+    /// The clients with direct links, and which of them are watched.
+    pub observed_links: ObservedLinks,
     /// Counts messages, except those of GNCL's peers.
     pub book: Book,
 }
@@ -47,6 +52,7 @@ impl State {
             registry: Mutex::new(Registry::counting_links_from(RandomState::new().hash_one(()))),
             guest_quotas: GuestQuotas::default(),
             undelivered,
+            observed_links: ObservedLinks::default(),
             book: Book::default(),
         })
     }

@@ -2,10 +2,12 @@
 //!
 //! | module | content |
 //! | --- | --- |
+//! | [`observed`] | a message on a direct link, as a client reports it for a watch |
 //! | [`payload`] | the payloads between LNCL and its clients |
 //! | [`ring`] | frames in rings of shared memory, and how two processes exchange the rings |
 //! | [`user_namespace`] | users that a namespace does not map |
 
+pub mod observed;
 pub mod payload;
 pub mod ring;
 pub mod user_namespace;

@@ -157,6 +157,13 @@ pub struct Gone {
     pub number: u64,
 }
 
+/// Requests reports of the messages on the direct links of a client, or ends them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Observe {
+    /// Whether the client reports from now on.
+    pub on: bool,
+}
+
 /// Unconfirmed messages of the client that were not delivered, since the last report.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Undelivered {

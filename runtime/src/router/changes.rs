@@ -3,7 +3,9 @@
 use std::{collections::BTreeSet, sync::Arc};
 
 use super::{
-    LocalRoute, Members, MessageSink, Router, Snapshot, Table, Writing, for_each_here, guard::Guard, tap::Tap,
+    LocalRoute, Members, MessageSink, Router, Snapshot, Table, Writing, for_each_here,
+    guard::Guard,
+    tap::{Passage, Tap},
 };
 use crate::{
     lock,
@@ -81,6 +83,23 @@ impl Router {
     /// Sets the tap that observes messages from now on; `None` removes it.
     pub fn set_tap(&self, tap: Option<Arc<dyn Tap>>) {
         self.change(|table| table.tap = tap);
+    }
+
+    /// Returns whether a tap observes messages from or to this application.
+    #[must_use]
+    pub fn is_observed(&self, app: Tid) -> bool {
+        self.snapshot.load().table.tap.as_ref().is_some_and(|tap| tap.watches(app))
+    }
+
+    /// Reports a message of an application to the tap that did not pass through this table, and how many others are not
+    /// reported.
+    pub fn observe(&self, app: Tid, passage: &Passage<'_>, missed: u64) {
+        let snapshot = self.snapshot.load();
+        let Some(tap) = snapshot.table.tap.as_ref().filter(|tap| tap.watches(app)) else { return };
+        if missed > 0 {
+            tap.missed(app, missed);
+        }
+        tap.saw(app, passage);
     }
 
     /// Sets the guard that checks messages to the applications of this node from now on.

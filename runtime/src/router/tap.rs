@@ -2,7 +2,7 @@
 //!
 //! A [`Tap`] is stored in the table itself, which every sender reads anyway: without one, a message costs one
 //! read of a pointer beside the table's root. It sees the messages that are handed over in the node's
-//! process. Those on direct links between other processes are not seen.
+//! process. Those on direct links between other processes are reported to it: [`Router::observe`].
 
 use std::sync::Arc;
 
@@ -22,6 +22,9 @@ pub trait Tap: Send + Sync {
 
     /// Receives a message from or to an observed application, which was accepted or rejected.
     fn saw(&self, app: Tid, passage: &Passage<'_>);
+
+    /// Records messages from or to an observed application that could not be reported.
+    fn missed(&self, app: Tid, messages: u64);
 }
 
 /// A message that was accepted or rejected.
@@ -31,8 +34,10 @@ pub struct Passage<'a> {
     pub way: Way,
     /// The header of the message.
     pub header: &'a Header,
-    /// The payload of the message.
+    /// The payload of the message; empty if it was not reported because of its length.
     pub payload: &'a Bytes,
+    /// Bytes of the payload.
+    pub length: usize,
     /// The reason of the rejection; `None` if a queue or a connection accepted the message.
     pub refused: Option<Rejection>,
 }
@@ -71,7 +76,8 @@ impl ObservedMessage {
 
     fn show(self, tap: &dyn Tap, refused: Option<Rejection>) {
         let Self { header, payload, source, target } = self;
-        let passage = |way| Passage { way, header: &header, payload: &payload, refused };
+        let length = payload.len();
+        let passage = |way| Passage { way, header: &header, payload: &payload, length, refused };
         if source {
             tap.saw(header.source, &passage(Way::Out));
         }
@@ -117,7 +123,8 @@ pub(super) fn saw_sent_to_many(tap: Option<&Arc<dyn Tap>>, message: &Message) {
     let Some(tap) = tap else { return };
     if message.header.kind.is_user() && tap.watches(message.header.source) {
         let Message { header, payload, .. } = message;
-        tap.saw(header.source, &Passage { way: Way::Out, header, payload, refused: None });
+        let length = payload.len();
+        tap.saw(header.source, &Passage { way: Way::Out, header, payload, length, refused: None });
     }
 }
 
@@ -131,7 +138,8 @@ pub(super) fn saw_one_of_many(
     let Some(tap) = tap else { return };
     if message.header.kind.is_user() && tap.watches(member) {
         let Message { header, payload, .. } = message;
-        tap.saw(member, &Passage { way: Way::In, header, payload, refused });
+        let length = payload.len();
+        tap.saw(member, &Passage { way: Way::In, header, payload, length, refused });
     }
 }
 
@@ -178,6 +186,8 @@ mod tests {
             assert_eq!(app, Tid::new(NODE, WATCHED));
             lock(&self.0).push((passage.way, passage.header.kind, passage.refused));
         }
+
+        fn missed(&self, _: Tid, _: u64) {}
     }
 
     fn router() -> (Router, Arc<Notes>) {

@@ -98,6 +98,8 @@ impl Kind {
     pub const LNCL_RESOLVE: Self = Self(0x45);
     /// The TID of a name, or none.
     pub const LNCL_RESOLVED: Self = Self(0x46);
+    /// Requests or ends reports of the messages on the direct links of a process.
+    pub const LNCL_OBSERVE: Self = Self(0x47);
     /// A process requests a direct link to an application of another process.
     pub const LNCL_INTRODUCE: Self = Self(0x48);
     /// The request to that process; the link's socket is attached.
@@ -112,6 +114,8 @@ impl Kind {
     pub const LNCL_GONE: Self = Self(0x4d);
     /// Reports to a waiting client the conditions that it waits for.
     pub const LNCL_WAITING: Self = Self(0x4e);
+    /// Reports a message on a direct link of a process.
+    pub const LNCL_OBSERVED: Self = Self(0x4f);
 
     /// The first frame from a node to the process that it started for an application: the application's identity.
     pub const HOST_WELCOME: Self = Self(0x50);

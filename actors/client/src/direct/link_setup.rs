@@ -64,6 +64,7 @@ impl Direct {
             Kind::LNCL_INTRODUCED => self.on_introduced(&message, now, node),
             Kind::LNCL_SWITCH => self.on_mark(&message, node),
             Kind::LNCL_GONE => self.on_gone(&message),
+            Kind::LNCL_OBSERVE => self.on_observe(&message),
             Kind::OUTCOME => return self.on_outcome(message, now),
             // Not an enum of this crate: an open set of numbers.
             _ => return Some(message),
@@ -282,6 +283,11 @@ impl Direct {
             hang_up(socket);
             self.next_check = Time::ZERO;
         }
+    }
+
+    fn on_observe(&mut self, message: &Message) {
+        let Ok(Observe { on }) = payload::read(&message.payload) else { return };
+        self.observer = on.then(|| Observer::new(self.terms.own));
     }
 
     fn on_outcome(&mut self, message: Message, now: Time) -> Option<Message> {

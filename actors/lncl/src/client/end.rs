@@ -203,6 +203,7 @@ impl Drop for Client {
     fn drop(&mut self) {
         let departure = std::mem::replace(&mut self.departure, Departure::LinksRemain);
         self.server.link_broker.remove(self.tid, departure);
+        self.server.state.observed_links.remove(self.tid);
         registrar::remove_owner(&self.server.state, self.peer.owner(), &self.cause);
         self.server.remove_client(self.peer.id);
         if !self.is_notified {

@@ -3,10 +3,14 @@
 use std::ops::ControlFlow;
 
 use sinew_model::facts::User;
-use sinew_protocol::payload::{self, Resolved};
+use sinew_protocol::{
+    observed::Observed,
+    payload::{self, Resolved},
+};
 use sinew_runtime::{
     lock,
     outcome::{Outcome, Rejection, Ticket},
+    router::tap::{Passage, Way},
     tid::Tid,
     time::Time,
     wire::{Flags, Header, Kind, Message},
@@ -37,6 +41,7 @@ impl Client {
             Order::Resolve { name, nearest, correlation } => self.resolve(&name, nearest, correlation),
             Order::Introduce { to, correlation } => self.broker_link(to, correlation),
             Order::Switch { to, number, correlation } => self.switch(to, number, correlation),
+            Order::Observe(observed) => self.observe(&observed),
             Order::RefuseMessage { message, why } => self.refuse_message(&message, why),
             Order::Unregister => return ControlFlow::Break(ConnectionEnd::Unregistered),
             Order::End(violation) => {
@@ -133,6 +138,19 @@ impl Client {
         if let Err((receipt, why)) = self.server.link_broker.pass_marks(self.tid, to, number, receipt) {
             receipt.settle(Outcome::Rejected(why));
         }
+    }
+
+    // spec: LNCL-20: only about its own messages.
+    fn observe(&self, observed: &Observed) {
+        let Observed { is_sent, missed, header, length, payload } = observed;
+        let (way, own) = if *is_sent { (Way::Out, header.source) } else { (Way::In, header.destination) };
+        if own != self.tid || !header.kind.is_user() {
+            let detail = format!("{} reports a message that is not its own", self.tid);
+            return self.server.refusals.count(Time::now(), "report of another's message", &detail);
+        }
+        let length = *length as usize;
+        let passage = Passage { way, header, payload, length, refused: None };
+        self.server.state.ctx.router.observe(self.tid, &passage, u64::from(*missed));
     }
 
     fn refuse_message(&self, message: &Message, why: Rejection) {

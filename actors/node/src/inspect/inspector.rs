@@ -95,13 +95,16 @@ fn next(questions: &Receiver<Message>, answers: &Answers, watches: &mut Watches)
             Err(RecvTimeoutError::Timeout) => {}
         }
         let tap = watches.expire(Time::now());
-        install_tap(&*answers.state()?, tap);
+        install_tap(&*answers.state()?, watches, tap);
     }
 }
 
-fn install_tap(state: &NodeState, tap: NewTap) {
+fn install_tap(state: &NodeState, watches: &Watches, tap: NewTap) {
     if let Some(tap) = tap {
         state.ctx.router.set_tap(tap);
+        if let Some(applications) = state.ctx.ports.applications() {
+            applications.observe_links(&watches.apps());
+        }
     }
 }
 
@@ -147,7 +150,8 @@ fn watch(
     let AskWatch { app, received, sent } = question.decode().map_err(|_| Rejection::Malformed)?;
     let now = Time::now();
     // An ended watch frees its place for another one.
-    install_tap(state, watches.expire(now));
+    let tap = watches.expire(now);
+    install_tap(state, watches, tap);
     let watched = Tid::new(state.ctx.node, app.app);
     let bytes_max = WATCH_BYTES.min(state.ctx.config.payload_max / 2);
     let directions = Directions { received, sent };
@@ -159,7 +163,7 @@ fn watch(
         )));
     }
     let (fetched, tap) = watches.fetch(now, key, directions, bytes_max);
-    install_tap(state, tap);
+    install_tap(state, watches, tap);
     let Some(fetched) = fetched else {
         return Ok(refused(format!(
             "this node shows {WATCHES_MAX} watches at once, and so many are there; end another one"

@@ -8,7 +8,7 @@
 //! [`WatchTap`] in the routing table.
 
 use std::{
-    collections::{BTreeMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, VecDeque},
     sync::{
         Arc, Mutex, MutexGuard, TryLockError,
         atomic::{AtomicU64, Ordering},
@@ -18,7 +18,7 @@ use std::{
 
 use sinew_runtime::{
     router::tap::{Passage, Tap, Way},
-    tid::Tid,
+    tid::{AppAddress, Tid},
     time::Time,
     wire::Header,
 };
@@ -79,25 +79,25 @@ impl TrafficWatch {
     /// Records a message, if there is room and no other thread is recording one. Never waits.
     fn put(&self, passage: &Passage<'_>) {
         let payload = if passage.payload.len() <= SEEN_BYTES_MAX { &passage.payload[..] } else { &[] };
-        let Some(mut queue) = self.try_queue() else { return self.drop_one() };
+        let Some(mut queue) = self.try_queue() else { return self.count_dropped(1) };
         if queue.messages.len() >= KEPT_MAX || queue.bytes + payload.len() > KEPT_BYTES_MAX {
             drop(queue);
-            return self.drop_one();
+            return self.count_dropped(1);
         }
         queue.bytes += payload.len();
         queue.messages.push_back(Observed {
             at: Time::now(),
             way: passage.way,
             header: *passage.header,
-            length: passage.payload.len(),
+            length: passage.length,
             payload: payload.to_vec(),
             refused: passage.refused,
         });
     }
 
-    fn drop_one(&self) {
+    fn count_dropped(&self, messages: u64) {
         // SYNC: Relaxed; a counter on which no other data depends.
-        self.dropped.fetch_add(1, Ordering::Relaxed);
+        self.dropped.fetch_add(messages, Ordering::Relaxed);
     }
 
     /// Tries to take the lock. A thread holds it for less than a microsecond, unless it is preempted; no
@@ -163,6 +163,10 @@ impl Tap for WatchTap {
         };
         self.0.iter().filter(wants).for_each(|watch| watch.put(passage));
     }
+
+    fn missed(&self, app: Tid, messages: u64) {
+        self.0.iter().filter(|watch| watch.app == app).for_each(|watch| watch.count_dropped(messages));
+    }
 }
 
 /// All watches of a node; owned by the answering thread.
@@ -216,6 +220,11 @@ impl Watches {
         self.0.values().map(|(_, until)| *until).min()
     }
 
+    /// Returns the watched applications.
+    pub(super) fn apps(&self) -> BTreeSet<AppAddress> {
+        self.0.values().map(|(watch, _)| watch.app.app).collect()
+    }
+
     fn tap(&self) -> Option<Arc<dyn Tap>> {
         let watches: Vec<_> = self.0.values().map(|(watch, _)| watch.clone()).collect();
         (!watches.is_empty()).then(|| Arc::new(WatchTap(watches)) as Arc<dyn Tap>)
@@ -225,10 +234,7 @@ impl Watches {
 #[cfg(test)]
 mod tests {
     use bytes::Bytes;
-    use sinew_runtime::{
-        tid::{AppAddress, NodeAddress},
-        wire::Kind,
-    };
+    use sinew_runtime::{tid::NodeAddress, wire::Kind};
 
     use super::*;
 
@@ -240,7 +246,8 @@ mod tests {
 
     fn show(tap: &dyn Tap, way: Way, payload: &Bytes) {
         let header = Header::new(Kind::named("test.any"), tid(0x1001), tid(0x1002));
-        tap.saw(tid(0x1001), &Passage { way, header: &header, payload, refused: None });
+        let length = payload.len();
+        tap.saw(tid(0x1001), &Passage { way, header: &header, payload, length, refused: None });
     }
 
     /// A watch of 0x1001 by 0x1fff, and its tap.

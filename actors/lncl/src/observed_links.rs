@@ -1,0 +1,71 @@
+//! The clients whose direct links are observed: they report their messages, which pass the node by. spec: LNCL-20
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::{Mutex, MutexGuard, PoisonError},
+};
+
+use sinew_protocol::payload::{self, Observe};
+use sinew_runtime::{
+    router::Router,
+    tid::{AppAddress, Tid},
+    wire::Kind,
+};
+
+/// The clients that can have direct links.
+#[derive(Debug, Default)]
+pub struct ObservedLinks(Mutex<BTreeMap<Tid, Observation>>);
+
+/// Whether a client's links are observed, and what the client was told last.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Observation {
+    is_wanted: bool,
+    is_told: bool,
+}
+
+impl ObservedLinks {
+    /// Adds a client.
+    pub(super) fn add(&self, router: &Router, client: Tid) {
+        let mut clients = self.lock();
+        let observation = clients.entry(client).or_default();
+        *observation = Observation { is_wanted: router.is_observed(client), is_told: false };
+        observation.tell(router, client);
+    }
+
+    pub(super) fn remove(&self, client: Tid) {
+        self.lock().remove(&client);
+    }
+
+    /// Observes the links of these applications, and of no others.
+    pub(super) fn observe(&self, router: &Router, apps: &BTreeSet<AppAddress>) {
+        for (client, observation) in self.lock().iter_mut() {
+            observation.is_wanted = apps.contains(&client.app);
+            observation.tell(router, *client);
+        }
+    }
+
+    /// Tells the clients whose queues were full.
+    pub(super) fn retry(&self, router: &Router) {
+        for (client, observation) in self.lock().iter_mut() {
+            observation.tell(router, *client);
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<Tid, Observation>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Observation {
+    /// Tells the client, unless it knows. Without room in its queue it is told later.
+    fn tell(&mut self, router: &Router, client: Tid) {
+        if self.is_wanted == self.is_told {
+            return;
+        }
+        let observe = Observe { on: self.is_wanted };
+        let frame = payload::frame(Kind::LNCL_OBSERVE, payload::lncl_of(client.node), client, &observe);
+        if router.notify_app(client.app, frame).is_ok() {
+            self.is_told = self.is_wanted;
+        }
+    }
+}
