@@ -28,6 +28,11 @@ impl Observer {
 }
 
 impl Direct {
+    #[cfg(test)]
+    pub(crate) const fn is_observed(&self) -> bool {
+        self.observer.is_some()
+    }
+
     /// Returns the report of a message that is about to be sent on a link, if the endpoint is observed.
     #[inline]
     pub(crate) fn report_of(&self, draft: &Draft) -> Option<Observed> {

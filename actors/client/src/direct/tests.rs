@@ -3,6 +3,7 @@
 
 mod hostile;
 mod incarnations;
+mod observed;
 mod room;
 
 use std::{thread, time::Duration};

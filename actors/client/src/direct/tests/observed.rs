@@ -1,0 +1,108 @@
+//! A watched endpoint reports the messages on its links.
+
+use std::{collections::BTreeSet, sync::Arc};
+
+use sinew_runtime::{
+    lock,
+    router::tap::{Passage, Tap, Way},
+    tid::Tid,
+    wire::{Header, Kind},
+};
+
+use super::*;
+
+/// What a watcher of one application sees.
+struct Notes {
+    app: Tid,
+    seen: std::sync::Mutex<Vec<(Way, Header, Vec<u8>)>>,
+}
+
+impl Tap for Notes {
+    fn watches(&self, app: Tid) -> bool {
+        self.app == app
+    }
+
+    fn saw(&self, _: Tid, passage: &Passage<'_>) {
+        assert_eq!(passage.length, passage.payload.len());
+        lock(&self.seen).push((passage.way, *passage.header, passage.payload.to_vec()));
+    }
+
+    fn missed(&self, _: Tid, messages: u64) {
+        panic!("{messages} of a few messages were not reported");
+    }
+}
+
+impl Notes {
+    fn numbers(&self, way: Way) -> Vec<u64> {
+        let seen = lock(&self.seen);
+        let of_way = seen.iter().filter(|(seen, header, _)| *seen == way && header.kind == Counted::KIND);
+        of_way.map(|(_, _, payload)| rmp_serde::from_slice::<Counted>(payload).unwrap().0).collect()
+    }
+}
+
+/// Sends this number there, and the same back.
+fn exchange(one: &mut Endpoint, other: &mut Endpoint, number: u64) {
+    one.send(other.tid(), &Counted(number)).unwrap();
+    drop(other.receive(WATCHDOG).unwrap().expect("the message"));
+    other.send(one.tid(), &Counted(number)).unwrap();
+    drop(one.receive(WATCHDOG).unwrap().expect("the answer"));
+}
+
+#[test]
+fn watched_endpoint_reports_messages_on_its_links() {
+    // Given: a link, and a watcher of one end
+    let node = TestNode::start();
+    let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+    link(&mut one, &mut other);
+    let notes = Arc::new(Notes { app: one.tid(), seen: std::sync::Mutex::default() });
+    let links = &node.state.observed_links;
+    node.router().set_tap(Some(notes.clone()));
+    links.observe(node.router(), &BTreeSet::from([one.tid().app]));
+    // When: messages flow until the first is reported
+    let deadline = Time::now() + WATCHDOG;
+    let mut last = 0;
+    while notes.numbers(Way::In).is_empty() {
+        assert!(Time::now() < deadline, "waited for a report");
+        last += 1;
+        exchange(&mut one, &mut other, last);
+    }
+    (last + 1..last + 10).for_each(|number| exchange(&mut one, &mut other, number));
+    // Then: both directions are there, each message once and in order
+    for way in [Way::In, Way::Out] {
+        while !notes.numbers(way).contains(&(last + 9)) {
+            assert!(Time::now() < deadline, "waited for the report of the last message");
+            thread::yield_now();
+        }
+        let numbers = notes.numbers(way);
+        assert!(numbers.windows(2).all(|pair| pair[0] + 1 == pair[1]), "{numbers:?}");
+    }
+    // When: the watcher has gone, and the endpoint has learned it
+    node.router().set_tap(None);
+    links.observe(node.router(), &BTreeSet::new());
+    let seen = lock(&notes.seen).len();
+    while one.direct.is_observed() {
+        assert!(Time::now() < deadline, "waited for the end of the reports");
+        exchange(&mut one, &mut other, 0);
+    }
+    // Then: nothing more is shown
+    assert_eq!(lock(&notes.seen).len(), seen);
+}
+
+// spec: LNCL-20
+#[test]
+fn report_of_another_application_is_dropped() {
+    let node = TestNode::start();
+    let (mut one, other) = (endpoint(&node), endpoint(&node));
+    let notes = Arc::new(Notes { app: other.tid(), seen: std::sync::Mutex::default() });
+    node.router().set_tap(Some(notes.clone()));
+    let header = Header::new(Kind::named("test.forged"), one.tid(), other.tid());
+    for (claimed, is_sent) in [(one.tid(), false), (other.tid(), true)] {
+        let header = Header { source: claimed, ..header };
+        let observed = sinew_protocol::observed::Observed::of(&header, &[1], is_sent);
+        one.node.writer.write(&observed.frame(one.tid())).unwrap();
+    }
+    // A round trip through the node comes behind the reports.
+    assert_eq!(one.resolve("nobody", WATCHDOG).unwrap(), None);
+    assert_eq!(node.refused("report of another's message"), 2);
+    assert!(lock(&notes.seen).is_empty());
+}
