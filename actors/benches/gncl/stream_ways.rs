@@ -44,9 +44,11 @@ fn superseded(node: &Node) -> [u64; 2] {
             Place::ToNode { .. } | Place::ToFormerNodes => superseded[0] += entry.account.superseded,
             Place::Mailbox { .. } => superseded[1] += entry.account.superseded,
             Place::Client { .. }
+            | Place::DirectLink { .. }
             | Place::FromNode { .. }
             | Place::OtherMailboxes
             | Place::OtherClients
+            | Place::OtherDirectLinks
             | Place::FromFormerNodes => {}
         }
     }

@@ -3,6 +3,7 @@
 //!
 //! `routes.rs` decides which path a message takes; this module holds the sockets and the memory.
 
+mod accounts;
 mod budget;
 mod descriptors;
 mod established;
@@ -23,6 +24,7 @@ use std::{
     time::Duration,
 };
 
+use accounts::LinkAccounts;
 use budget::{Budget, PROCESS};
 use reorder::ReorderBuffer;
 use rustix::net::Shutdown;
@@ -36,7 +38,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Class, Flags, Kind, Message},
 };
-use sinew_shm::{Any, AnyError, Ready, Spin, WaitSet};
+use sinew_shm::{Any, AnyError, Counters, Ready, Spin, WaitSet};
 
 use super::{
     ApiError,
@@ -71,6 +73,8 @@ pub(super) struct Terms {
     /// Longest payload in bytes.
     pub(super) payload_max: usize,
     pub(super) options: LinkOptions,
+    /// The counters that the node can read.
+    counters: Option<Counters>,
     /// The limit for the memory of all rings together.
     budget: &'static Budget,
     /// The threads that close unexpected descriptors passed by peers.
@@ -109,6 +113,8 @@ pub(super) struct Direct {
     in_flight: Option<InFlightRequest>,
     /// While somebody watches this application.
     observer: Option<Observer>,
+    /// `None` if there are no links.
+    accounts: Option<LinkAccounts>,
     /// Stream values that were lost with a link, per destination, and that the endpoint has not counted yet.
     unsent: BTreeMap<Tid, u64>,
 }
@@ -142,12 +148,13 @@ pub(super) struct NodeWriter<'a> {
 }
 
 impl Terms {
-    pub(super) fn of(registered: &Registered, options: &LinkOptions) -> Self {
+    pub(super) fn of(registered: &Registered, options: &LinkOptions, writer: &Writer) -> Self {
         Self {
             own: Tid::new(registered.node, registered.app),
             ring_bytes: options.direct_ring_bytes.min(registered.ring.unwrap_or_default() as usize),
             payload_max: registered.payload_max as usize,
             options: options.clone(),
+            counters: writer.counters(),
             budget: &PROCESS,
             closing: &DEFERRED_CLOSE,
         }
@@ -171,9 +178,10 @@ impl NodeWriter<'_> {
 impl Direct {
     /// Returns the links of an endpoint that receives its link ends over `control`; without it the endpoint
     /// has no links.
-    pub(super) const fn new(terms: Terms, control: Option<Arc<UnixStream>>) -> Self {
+    pub(super) fn new(terms: Terms, control: Option<Arc<UnixStream>>) -> Self {
         let directness = if control.is_some() { Directness::Allowed } else { Directness::Off };
         let routes = Routes::new(terms.own, directness);
+        let accounts = terms.counters.clone().map(LinkAccounts::new);
         Self {
             terms,
             routes,
@@ -191,6 +199,7 @@ impl Direct {
             cut: None,
             in_flight: None,
             observer: None,
+            accounts,
             unsent: BTreeMap::new(),
         }
     }
@@ -437,6 +446,12 @@ impl Direct {
         (self.terms, self.control) = (terms, control);
         // The node says it again.
         self.observer = None;
+        // The node has kept what was counted in the former connection.
+        self.accounts = self.terms.counters.clone().map(LinkAccounts::new);
+        for link in self.open.iter_mut().chain(&mut self.held) {
+            link.account =
+                self.accounts.as_mut().map(|accounts| accounts.begin(link.peer)).unwrap_or_default();
+        }
     }
 
     /// Waits until a message arrives on an open link, for `left` at most. May return early without a reason.
@@ -499,6 +514,10 @@ impl Direct {
             let cut = link.cut().filter(|cut| !has_caller && cut.header.class == Class::Stream);
             let waiting = link.waiting() + usize::from(cut.is_some());
             self.add_unsent(peer, waiting as u64);
+        }
+        if let Some(link) = self.established(number) {
+            let account = std::mem::take(&mut link.account);
+            self.accounts.iter_mut().for_each(|accounts| accounts.end(account));
         }
         self.open.retain(|link| link.number != number);
         self.index_slots();

@@ -104,7 +104,7 @@ impl Endpoint {
         let Registration { mut register, deadline: _, inbox_capacity, link: options, returning } =
             registration;
         let Link { registered, writer, reader } = link;
-        let terms = Terms::of(&registered, &options);
+        let terms = Terms::of(&registered, &options, &writer);
         let Registered { node: address, app, node_name, payload_max, ring: _ } = registered;
         let control = reader.control().filter(|_| register.direct);
         let inbox = Inbox::new(Tid::new(address, app), inbox_capacity, payload_max as usize, writer.clone());

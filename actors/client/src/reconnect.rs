@@ -273,7 +273,7 @@ impl Endpoint {
         let Link { registered, writer, reader } = link;
         let control = reader.control().filter(|_| self.reconnect.register.direct);
         let own = Tid::new(registered.node, registered.app);
-        let terms = Terms::of(&registered, &self.reconnect.options);
+        let terms = Terms::of(&registered, &self.reconnect.options, &writer);
         if own == self.tid {
             self.direct.on_reconnect(terms, control);
         } else {

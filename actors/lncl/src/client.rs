@@ -329,7 +329,7 @@ impl Client {
         write_soon(&self.peer.stream, encoded(&self.registered(Some(capacity.bytes())))).await?;
         self.ring = Ring::Announced;
         let exchange = link::exchange(half, &self.peer.stream, payload_max, self.server.rings());
-        let (socket, reader) = match tokio::time::timeout(HANDSHAKE, exchange).await {
+        let (socket, reader, counters) = match tokio::time::timeout(HANDSHAKE, exchange).await {
             Ok(Ok(both)) => both,
             Ok(Err(why)) => return Err(why.into()),
             Err(_) => {
@@ -339,6 +339,7 @@ impl Client {
             }
         };
         let link = self.outlet.connect(socket, payload_max, None);
+        self.server.state.book.add_links(self.peer.id, Arc::new(counters));
         self.join_link_broker();
         Ok((reader, link))
     }

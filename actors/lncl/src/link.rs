@@ -7,10 +7,18 @@ use std::{
     task::{Context, Poll},
 };
 
-use sinew_protocol::ring::{self, Exchange, ExchangeError, RingError, RingFrames, Taken};
+use sinew_protocol::{
+    link_counts::{self, LinkCounts},
+    ring::{self, Exchange, ExchangeError, RingError, RingFrames, Taken},
+};
 use sinew_runtime::wire::{Checksum, FrameError};
-use sinew_session::outlet::{Account, Socket};
-use sinew_shm::{Armed, BellKind, Capacity, Consumer, Descriptors, LoanError, Offer, PassError, Producer};
+use sinew_session::{
+    direct_links::{CountsLinks, DirectCounts, DirectReading},
+    outlet::{Account, Socket},
+};
+use sinew_shm::{
+    Armed, BellKind, Capacity, Consumer, Descriptors, LoanError, Offer, PassError, PeerCounters, Producer,
+};
 use tokio::{
     io::{Interest, unix::AsyncFd},
     net::UnixStream,
@@ -87,7 +95,7 @@ pub(super) async fn exchange(
     stream: &Arc<UnixStream>,
     payload_max: usize,
     rings: &Rings,
-) -> Result<(ClientSocket, ClientReader), ExchangeError> {
+) -> Result<(ClientSocket, ClientReader, ClientCounters), ExchangeError> {
     let RingHalf { exchange, offer } = half;
     offer.send(stream)?;
     // The sent offer holds its own descriptors.
@@ -110,11 +118,26 @@ pub(super) async fn exchange(
         Ok::<_, ExchangeError>((handle.keep(producer), handle.keep(consumer)))
     };
     let (producer, consumer) = rings.run(map).await.ok_or(ExchangeError::Fault)??;
+    let counters = ClientCounters(rings.keep(producer.peer_counters()));
     let socket = RingSocket { producer: watch(Out(producer))?, wanted: 0, written: 0 };
     let consumer = watch(In(consumer))?;
     let frames = RingFrames::new(payload_max);
     let reader = RingReader { consumer, frames, reads: 0, bytes: 0, waits: 0, idle: 0, has_hung_up: false };
-    Ok((ClientSocket::Ring(socket), ClientReader::Ring(reader)))
+    Ok((ClientSocket::Ring(socket), ClientReader::Ring(reader), counters))
+}
+
+/// The counters of a client, in its own memory.
+pub(super) struct ClientCounters(DropElsewhere<PeerCounters>);
+
+impl CountsLinks for ClientCounters {
+    fn read(&self) -> DirectReading {
+        let of = |LinkCounts { sent, superseded, taken }| DirectCounts { sent, superseded, taken };
+        let (links, ended) = link_counts::read(&self.0.read());
+        DirectReading {
+            links: links.into_iter().map(|(peer, counts)| (peer.app, of(counts))).collect(),
+            ended: of(ended),
+        }
+    }
 }
 
 /// Resolves when the client has sent data, or has closed. Reads none of it, since another thread must close the

@@ -9,6 +9,7 @@ use sinew_runtime::{lock, mailbox::Mailbox, tid::AppAddress, wire::Class};
 
 use crate::{
     counts::Account,
+    direct_links::{self, CountsLinks, DirectCounts},
     outlet::{OutletAccount, Socket, SocketWriter, Taking},
     place::Place,
 };
@@ -63,6 +64,7 @@ struct Places {
     clients: BTreeMap<ClientId, Client>,
     former_mailboxes: Account,
     former_clients: Account,
+    former_links: DirectCounts,
 }
 
 #[derive(Clone)]
@@ -70,6 +72,8 @@ struct Client {
     app: AppAddress,
     name: Arc<str>,
     outlet: Arc<dyn Accounted>,
+    /// The counters of its direct links, if it can have any.
+    links: Option<Arc<dyn CountsLinks>>,
 }
 
 impl Book {
@@ -90,14 +94,24 @@ impl Book {
 
     /// Adds the outlet of a client.
     pub fn add_client(&self, id: ClientId, app: AppAddress, name: &str, outlet: Arc<dyn Accounted>) {
-        lock(&self.0).clients.insert(id, Client { app, name: name.into(), outlet });
+        lock(&self.0).clients.insert(id, Client { app, name: name.into(), outlet, links: None });
+    }
+
+    /// Adds the counters of a client's direct links.
+    pub fn add_links(&self, id: ClientId, links: Arc<dyn CountsLinks>) {
+        if let Some(client) = lock(&self.0).clients.get_mut(&id) {
+            client.links = Some(links);
+        }
     }
 
     /// Removes a disconnected client after the end of its outlet.
     pub fn remove_client(&self, id: ClientId) {
         let mut places = lock(&self.0);
-        if let Some(Client { outlet, .. }) = places.clients.remove(&id) {
+        if let Some(Client { outlet, links, .. }) = places.clients.remove(&id) {
             places.former_clients = places.former_clients + Account::from(&outlet.account()).over();
+            if let Some(links) = links {
+                places.former_links = places.former_links + links.read().sum();
+            }
         }
     }
 
@@ -106,7 +120,7 @@ impl Book {
     pub fn takings(&self) -> Vec<ClientTaking> {
         let clients = lock(&self.0).clients.clone();
         let taking = |(id, client): (ClientId, Client)| {
-            let Client { app, name, outlet } = client;
+            let Client { app, name, outlet, links: _ } = client;
             Some(ClientTaking { id, app, name, taking: outlet.taking()? })
         };
         clients.into_iter().filter_map(taking).collect()
@@ -114,25 +128,30 @@ impl Book {
 
     /// Returns the current accounts of all places.
     pub fn read(&self) -> Vec<(Place, Account)> {
-        let (mailboxes, clients, mut read) = self.list();
+        let (mailboxes, clients, former_links, mut read) = self.list();
         for (app, (name, mailbox)) in mailboxes {
             read.extend(Class::ALL.map(|class| {
                 let place = Place::Mailbox { app, name: name.to_string(), class };
                 (place, Account::of_mailbox(mailbox.account(class)))
             }));
         }
-        for Client { app, name, outlet } in clients {
+        let mut linked = Vec::new();
+        for Client { app, name, outlet, links } in clients {
             let place = Place::Client { app, name: name.to_string() };
             read.push((place, Account::from(&outlet.account())));
+            linked.extend(links.map(|links| direct_links::Reader { app, name, reading: links.read() }));
         }
+        read.extend(direct_links::accounts(&linked, former_links));
         read
     }
 
     /// Returns the places, and the accounts of those that have ended. Each place is in exactly one of the
     /// lists, even if it ends before it is read. Places are added and removed under this lock, which is not
     /// held while all accounts are read.
-    #[expect(clippy::type_complexity, reason = "three lists of one moment, for the function above alone")]
-    fn list(&self) -> (Vec<(AppAddress, (Arc<str>, Arc<Mailbox>))>, Vec<Client>, Vec<(Place, Account)>) {
+    #[expect(clippy::type_complexity, reason = "the state of one moment, for the function above alone")]
+    fn list(
+        &self,
+    ) -> (Vec<(AppAddress, (Arc<str>, Arc<Mailbox>))>, Vec<Client>, DirectCounts, Vec<(Place, Account)>) {
         let mut places = lock(&self.0);
         places.write_off(0);
         let closing: Account = places.closing.iter().map(|mailbox| whole(mailbox)).sum();
@@ -141,7 +160,7 @@ impl Book {
             (Place::OtherClients, places.former_clients),
         ];
         let mailboxes = places.mailboxes.iter().map(|(app, mailbox)| (*app, mailbox.clone())).collect();
-        (mailboxes, places.clients.values().cloned().collect(), ended)
+        (mailboxes, places.clients.values().cloned().collect(), places.former_links, ended)
     }
 }
 

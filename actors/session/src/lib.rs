@@ -35,6 +35,7 @@ pub mod book;
 pub mod counts;
 #[cfg(test)]
 mod credit_model;
+pub mod direct_links;
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
 pub mod fuzzing;

@@ -31,6 +31,17 @@ pub enum Place {
         /// The name of the application.
         name: String,
     },
+    /// Messages on the direct link of two applications, in one direction. Their processes count them.
+    DirectLink {
+        /// The address of the sender.
+        from: AppAddress,
+        /// The name of the sender.
+        from_name: String,
+        /// The address of the receiver.
+        to: AppAddress,
+        /// The name of the receiver.
+        to_name: String,
+    },
     /// Messages to another node: delivered once that node has acknowledged them.
     ToNode {
         /// The address of the other node.
@@ -49,6 +60,8 @@ pub enum Place {
     OtherMailboxes,
     /// Clients that have disconnected, or that did not fit into an answer.
     OtherClients,
+    /// Direct links that have ended, or that did not fit into an answer.
+    OtherDirectLinks,
     /// Messages to incarnations of nodes that have ended.
     ToFormerNodes,
     /// Messages from incarnations of nodes that have ended.
@@ -63,12 +76,16 @@ impl fmt::Display for Place {
                 write!(f, "mailbox {} ({app}), {class:?}", cut(name))
             }
             Self::Client { app, name } => write!(f, "client {} ({app})", cut(name)),
+            Self::DirectLink { from, from_name, to, to_name } => {
+                write!(f, "direct {} ({from}) -> {} ({to})", cut(from_name), cut(to_name))
+            }
             Self::ToNode { node, class: Some(class) } => write!(f, "to {node}, {class:?}"),
             Self::ToNode { node, class: None } => write!(f, "to {node}"),
             Self::FromNode { node, class: Some(class) } => write!(f, "from {node}, {class:?}"),
             Self::FromNode { node, class: None } => write!(f, "from {node}"),
             Self::OtherMailboxes => f.write_str("other mailboxes, and ended ones"),
             Self::OtherClients => f.write_str("other clients, and ended ones"),
+            Self::OtherDirectLinks => f.write_str("other direct links, and ended ones"),
             Self::ToFormerNodes => f.write_str("to ended incarnations of nodes"),
             Self::FromFormerNodes => f.write_str("from ended incarnations of nodes"),
         }

@@ -310,10 +310,12 @@ impl<'a> Collected<'a> {
             audit.and_then(|answer| answer.result.ok()).map_or_else(Vec::new, |report| report.audit.entries);
         let is_its = |place: &Place| match place {
             Place::Mailbox { app, .. } | Place::Client { app, .. } => *app == tid.app,
-            Place::ToNode { .. }
+            Place::DirectLink { .. }
+            | Place::ToNode { .. }
             | Place::FromNode { .. }
             | Place::OtherMailboxes
             | Place::OtherClients
+            | Place::OtherDirectLinks
             | Place::ToFormerNodes
             | Place::FromFormerNodes => false,
         };

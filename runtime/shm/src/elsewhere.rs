@@ -12,7 +12,7 @@ use std::{
 use crate::{
     bell::{Bell, BellKind, BellState, Bells, Doorbell, Woken},
     error::{CreateError, PassError, RefusedOffer},
-    layout::{Capacity, Word},
+    layout::{COUNTERS, Capacity, Word},
     memory::{OwnHeader, OwnRing, Peer},
     offer::{Descriptors, Offer, Received},
     wait::HangUp,
@@ -167,6 +167,10 @@ impl OwnHeader for OwnHeaderMemory {
 pub(crate) struct OwnRingMemory(Infallible);
 
 impl OwnRingMemory {
+    pub(crate) fn counters(&self) -> Counters {
+        match self.0 {}
+    }
+
     pub(crate) fn wake_rung(&self) {
         match self.0 {}
     }
@@ -192,11 +196,41 @@ impl OwnRing for OwnRingMemory {
     }
 }
 
+/// Counters of this side that the peer can read, even after this process has ended. Nothing else depends on them.
+#[derive(Clone, Debug)]
+pub struct Counters(Infallible);
+
+impl Counters {
+    /// How many there are. Each is 0 at first.
+    pub const LEN: usize = COUNTERS;
+
+    /// Sets one.
+    pub fn set(&self, _: usize, _: u64) {
+        match self.0 {}
+    }
+}
+
+/// The counters of the peer, which may hold anything.
+#[derive(Clone, Debug)]
+pub struct PeerCounters(Infallible);
+
+impl PeerCounters {
+    /// Returns all of them. Each is read once, and not all at the same moment.
+    #[must_use]
+    pub fn read(&self) -> [u64; Counters::LEN] {
+        match self.0 {}
+    }
+}
+
 /// Cannot exist on this platform.
 #[derive(Clone, Debug)]
 pub(crate) struct PeerMemory(Infallible);
 
 impl PeerMemory {
+    pub(crate) fn counters(&self) -> PeerCounters {
+        match self.0 {}
+    }
+
     pub(crate) fn at(self, _: Option<PeerPlace>) -> Self {
         self
     }

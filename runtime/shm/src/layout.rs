@@ -8,10 +8,11 @@
 //! byte 512   sleep of this side's producer              odd while it sleeps
 //! byte 640   rung                                       the peer's sleep for which this side has rung last
 //! byte 768   reported                                   tail that this side has reported to the peer's wait set
+//! byte 1024  counters                                   384 numbers of 64 bits for the peer to read, of any meaning
 //! byte 4096  the ring: records of 8-byte multiples
 //! ```
 //!
-//! Words of 32 bits that count up and wrap. Each has 128 bytes for itself: two cache lines, because
+//! The others are words of 32 bits that count up and wrap. Each has 128 bytes for itself: two cache lines, because
 //! processors fetch the neighbour too. All words of a region have one writer: the side that created it.
 
 use std::fmt;
@@ -24,6 +25,10 @@ pub(crate) const MAGIC: u64 = u64::from_le_bytes(*b"SINEWSHM");
 pub(crate) const VERSION: u32 = 3;
 /// Offset of the ring: after a page for the header.
 pub(crate) const HEADER_BYTES: usize = 4096;
+/// Offset of the counters.
+pub(crate) const COUNTERS_AT: usize = 1024;
+/// How many there are.
+pub(crate) const COUNTERS: usize = 384;
 /// A record begins with this, and is padded to a multiple of it.
 pub(crate) const MARK_BYTES: u32 = 8;
 

@@ -75,6 +75,7 @@ pub use layout::{Capacity, CapacityError};
 pub use offer::{
     Descriptors, OFFER_BYTES, Offer, Received, keep_urgent_in_line, peer_pidfd, set_descriptors,
 };
+pub use platform::{Counters, PeerCounters};
 pub use producer::{Loan, Producer};
 pub use region::{Accepted, Region, Terms};
 pub use spin::Spin;

@@ -11,7 +11,7 @@ use crate::{
     bell::{BellState, Doorbell, Woken},
     core::{ProducerCore, producer::Reserved, sleep::WakePlace},
     error::{Corrupt, LoanError, RoomError},
-    platform::{OwnRingMemory, PeerMemory},
+    platform::{Counters, OwnRingMemory, PeerCounters, PeerMemory},
     spin::{Spin, Spinner},
     wait::{Armed, Wait, Waiting, spin},
 };
@@ -36,6 +36,18 @@ impl Producer {
     /// Sets how this end spins before it sleeps in [`Producer::loan_before`]. [`Spin::Off`] at first.
     pub const fn set_spin(&mut self, spin: Spin) {
         self.spinner = Spinner::new(spin);
+    }
+
+    /// Returns the counters of this side.
+    #[must_use]
+    pub fn counters(&self) -> Counters {
+        self.core.own.counters()
+    }
+
+    /// Returns the counters of the peer.
+    #[must_use]
+    pub fn peer_counters(&self) -> PeerCounters {
+        self.core.peer.counters()
     }
 
     /// Returns the longest message, in bytes: half the ring, less 8.

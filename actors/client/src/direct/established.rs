@@ -19,6 +19,7 @@ use sinew_shm::{Armed, Consumer, Ends, HangUp, WaitSet};
 
 use super::{
     Terms,
+    accounts::LinkAccount,
     budget::Share,
     hang_up,
     peer_fd::{self, PeerSocket},
@@ -56,6 +57,10 @@ pub(crate) struct EstablishedLink {
     has_forged: bool,
     /// Whether a sender has reached its stall timeout on this link.
     pub(super) is_stalled: bool,
+    /// Counts its messages for the node.
+    pub(super) account: LinkAccount,
+    /// Whether the frame that has begun is counted when it is whole.
+    counts_rest: bool,
 }
 
 /// The two ends of a link.
@@ -111,6 +116,8 @@ impl EstablishedLink {
             rest: None,
             has_forged: false,
             is_stalled: false,
+            account: LinkAccount::default(),
+            counts_rest: false,
         }
     }
 
@@ -143,6 +150,7 @@ impl EstablishedLink {
                 if loan.is_of(&self.writer) && (header.class != Class::Stream || self.parked.is_empty()) =>
             {
                 loan.publish(&header);
+                self.account.sent();
                 Ok(Put::Taken)
             }
             // Behind waiting values the message goes as a copy.
@@ -163,6 +171,7 @@ impl EstablishedLink {
         let same_kind = |other: &&mut Message| is_stream && other.header.kind == message.header.kind;
         if let Some(parked) = self.parked.iter_mut().find(same_kind) {
             *parked = message;
+            self.account.superseded();
             self.flush();
             return Ok(Put::Taken);
         }
@@ -174,9 +183,18 @@ impl EstablishedLink {
         match put {
             Put::Full(message) if is_stream && self.parked.len() < PARKED_MAX => {
                 self.parked.push(message);
+                self.account.sent();
                 Ok(Put::Taken)
             }
-            whole_or_full @ (Put::Taken | Put::Begun | Put::Full(_)) => Ok(whole_or_full),
+            Put::Taken => {
+                self.account.sent();
+                Ok(Put::Taken)
+            }
+            Put::Begun => {
+                self.counts_rest = true;
+                Ok(Put::Begun)
+            }
+            Put::Full(message) => Ok(Put::Full(message)),
         }
     }
 
@@ -222,6 +240,7 @@ impl EstablishedLink {
 
     /// Withdraws the partly written message: the peer receives nothing of it.
     pub(super) fn withdraw(&mut self) {
+        self.counts_rest = false;
         if let Some(rest) = &mut self.rest {
             rest.withdraw();
         }
@@ -240,6 +259,9 @@ impl EstablishedLink {
         let is_whole = self.rest.as_mut().map_or(Ok(true), Rest::continue_writing)?;
         if is_whole {
             self.rest = None;
+            if std::mem::take(&mut self.counts_rest) {
+                self.account.sent();
+            }
         }
         Ok(is_whole)
     }
@@ -322,6 +344,9 @@ impl EstablishedLink {
         let is_for_us =
             header.destination == self.own && (header.kind.is_user() || header.kind == Kind::OUTCOME);
         if header.source == self.peer && is_for_us {
+            if header.kind.is_user() {
+                self.account.took();
+            }
             return Ok(LinkRead::Message(message));
         }
         self.refuse(&message);

@@ -201,7 +201,7 @@ impl Direct {
     }
 
     fn establish(
-        &self,
+        &mut self,
         peer: Tid,
         number: LinkNumber,
         socket: PeerSocket,
@@ -211,7 +211,9 @@ impl Direct {
         let (producer, consumer) = rings.take();
         let writer = ring::Writer::new(Arc::clone(&socket), producer, &self.terms.options);
         let pair = Pair { own: self.terms.own, peer, number, socket };
-        EstablishedLink::new(pair, writer, consumer, share, &self.terms)
+        let mut link = EstablishedLink::new(pair, writer, consumer, share, &self.terms);
+        link.account = self.accounts.as_mut().map(|accounts| accounts.begin(peer)).unwrap_or_default();
+        link
     }
 
     pub(super) fn switch_to(&self, peer: Tid, number: LinkNumber) -> Message {

@@ -22,7 +22,7 @@ use sinew_runtime::{
     time::Time,
     wire::Message,
 };
-use sinew_shm::{Armed, Bell, Spin, WaitSet};
+use sinew_shm::{Armed, Bell, Counters, Spin, WaitSet};
 use socket2::{Domain, SockAddr, Socket, Type};
 
 use super::{
@@ -165,6 +165,14 @@ impl Writer {
         match self {
             Self::Socket(writer) => writer.write(message),
             Self::Ring(writer) => writer.write(message),
+        }
+    }
+
+    /// Returns the counters of this side that the node can read.
+    pub(super) fn counters(&self) -> Option<Counters> {
+        match self {
+            Self::Socket(_) => None,
+            Self::Ring(writer) => writer.counters(),
         }
     }
 

@@ -108,6 +108,12 @@ impl Writer {
         written
     }
 
+    /// Returns the counters of this side that the peer can read; `None` while the ring is lent.
+    pub(crate) fn counters(&self) -> Option<Counters> {
+        let producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
+        producer.as_deref().map(Producer::counters)
+    }
+
     /// Writes one frame if there is contiguous room for all of it now. Returns whether there was.
     pub(crate) fn try_write(&self, message: &Message) -> Result<bool, ApiError> {
         self.flush_pending();

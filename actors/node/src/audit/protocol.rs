@@ -43,10 +43,12 @@ pub(crate) fn put_together(audit: &mut NodeAudit) -> bool {
     let others = |place: &Place| match place {
         Place::Mailbox { .. } => Some(Place::OtherMailboxes),
         Place::Client { .. } => Some(Place::OtherClients),
+        Place::DirectLink { .. } => Some(Place::OtherDirectLinks),
         Place::ToNode { .. }
         | Place::FromNode { .. }
         | Place::OtherMailboxes
         | Place::OtherClients
+        | Place::OtherDirectLinks
         | Place::ToFormerNodes
         | Place::FromFormerNodes => None,
     };

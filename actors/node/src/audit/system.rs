@@ -190,8 +190,10 @@ impl Audit {
             }
             Place::Mailbox { .. }
             | Place::Client { .. }
+            | Place::DirectLink { .. }
             | Place::OtherMailboxes
             | Place::OtherClients
+            | Place::OtherDirectLinks
             | Place::ToFormerNodes => account,
         }
     }

@@ -1,5 +1,5 @@
 //! Mapped regions as typed memory. **All of Sinew's unsafe code about shared memory is in this file**, in
-//! four blocks.
+//! five blocks.
 //!
 //! They rest on these facts:
 //!
@@ -13,7 +13,7 @@
 //! - M4. In an own region, the header is accessed only as atomics, and the ring only through the one
 //!   `OwnRingMemory` that `OwnMemory::split` creates for it: it is neither `Clone` nor `Copy`.
 //! - M5. A peer's region changes at any time. It is accessed only by relaxed atomic loads of 4 or 8 aligned
-//!   bytes, each place always in the same size: header 4, ring 8. These are defined on read-only mappings
+//!   bytes, each place always in the same size: header 4, counters and ring 8. These are defined on read-only mappings
 //!   too. The word `Rung` is also slept at, which makes the kernel load it.
 //! - M6. A page of bells is written by both sides, and accessed only as atomics of 4 bytes. It cannot shrink
 //!   (seal SHRINK); a hole in it reads as zeros. A page with an announcement is like the header of a region: M3 for its
@@ -31,7 +31,7 @@ use memmap2::MmapRaw;
 
 use super::bells::{REPORT_WORD, wake};
 use crate::{
-    layout::{Capacity, HEADER_BYTES, MAGIC, VERSION, Word},
+    layout::{COUNTERS, COUNTERS_AT, Capacity, HEADER_BYTES, MAGIC, VERSION, Word},
     memory::{OwnHeader, OwnRing, Peer},
     wait_set::{bit_of, report},
 };
@@ -55,7 +55,15 @@ impl Mapping {
         // SAFETY: M1: this many bytes are mapped there and aligned to a page; M4, M5 and M6: all access to
         // them in this process is atomic and of this size. Through a read-only mapping `PeerMemory` and
         // `identity` only load, relaxed.
-        unsafe { slice::from_raw_parts(start, HEADER_BYTES / size_of::<AtomicU32>()) }
+        unsafe { slice::from_raw_parts(start, COUNTERS_AT / size_of::<AtomicU32>()) }
+    }
+
+    fn counters(&self) -> &[AtomicU64] {
+        let start = self.raw.as_ptr().wrapping_add(COUNTERS_AT).cast::<AtomicU64>();
+        // SAFETY: M1: this many bytes of the header's page are mapped there, aligned to 8; M4 and M5: all access
+        // to them in this process is atomic and of this size. Through a read-only mapping `PeerCounters` only loads,
+        // relaxed.
+        unsafe { slice::from_raw_parts(start, COUNTERS) }
     }
 
     fn ring_words(&self) -> &[AtomicU64] {
@@ -116,7 +124,13 @@ impl OwnMemory {
     pub(crate) fn scribble(&mut self, place: u32, value: u32) {
         let place = place as usize % (self.0.raw.len() / 4);
         match place.checked_sub(HEADER_BYTES / 4) {
-            None => self.0.header()[place].store(value, Ordering::Relaxed),
+            None => match place.checked_sub(COUNTERS_AT / 4) {
+                None => self.0.header()[place].store(value, Ordering::Relaxed),
+                Some(word) => {
+                    let counter = self.0.counters().get(word / 2);
+                    counter.into_iter().for_each(|counter| counter.store(value.into(), Ordering::Relaxed));
+                }
+            },
             Some(word) => {
                 // A view for this call only; no other view exists before `split`.
                 let mut ring = OwnRingMemory(OwnHeaderMemory(Arc::clone(&self.0)));
@@ -153,6 +167,10 @@ impl OwnHeader for OwnHeaderMemory {
 pub(crate) struct OwnRingMemory(OwnHeaderMemory);
 
 impl OwnRingMemory {
+    pub(crate) fn counters(&self) -> Counters {
+        Counters(Arc::clone(&self.0.0))
+    }
+
     /// Wakes the sleeper at the word in which this side reports its rings.
     pub(crate) fn wake_rung(&self) {
         wake(self.0.word(Word::Rung));
@@ -178,6 +196,37 @@ impl OwnRingMemory {
         // them.
         let ring = unsafe { slice::from_raw_parts_mut(start, mapping.ring_bytes) };
         &mut ring[position as usize..][..length as usize]
+    }
+}
+
+/// Counters of this side that the peer can read, even after this process has ended. Nothing else depends on them.
+#[derive(Clone, Debug)]
+pub struct Counters(Arc<Mapping>);
+
+impl Counters {
+    /// How many there are. Each is 0 at first.
+    pub const LEN: usize = COUNTERS;
+
+    /// Sets one.
+    ///
+    /// # Panics
+    /// If `index` is not below [`LEN`](Self::LEN).
+    pub fn set(&self, index: usize, value: u64) {
+        // SYNC: Relaxed: no other data depends on it.
+        self.0.counters()[index].store(value, Ordering::Relaxed);
+    }
+}
+
+/// The counters of the peer, which may hold anything.
+#[derive(Clone, Debug)]
+pub struct PeerCounters(Arc<Mapping>);
+
+impl PeerCounters {
+    /// Returns all of them. Each is read once, and not all at the same moment.
+    #[must_use]
+    pub fn read(&self) -> [u64; Counters::LEN] {
+        let counters = self.0.counters();
+        std::array::from_fn(|index| counters[index].load(Ordering::Relaxed))
     }
 }
 
@@ -243,6 +292,10 @@ impl PeerMemory {
     /// The same, where the peer waits for several rings.
     pub(crate) fn at(self, place: Option<PeerPlace>) -> Self {
         Self { place, ..self }
+    }
+
+    pub(crate) fn counters(&self) -> PeerCounters {
+        PeerCounters(Arc::clone(&self.region))
     }
 
     /// The word in which the peer reports its rings: to be loaded, relaxed, and slept at.

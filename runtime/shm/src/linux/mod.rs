@@ -11,6 +11,7 @@ mod tests;
 
 pub(crate) use bells::{Announcement, Buttons, SharedPage, bells, buttons, which_ended};
 pub(crate) use futex_set::{FutexSet, sleep_at};
+pub use mapping::{Counters, PeerCounters};
 pub(crate) use mapping::{OwnHeaderMemory, OwnMemory, OwnRingMemory, PeerMemory};
 pub(crate) use memfd::{adopt, create};
 pub(crate) use passing::{receive, send};
