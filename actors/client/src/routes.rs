@@ -20,6 +20,7 @@
 //! that: it writes into the ring at once.
 
 mod events;
+mod peer;
 
 use std::{collections::BTreeMap, time::Duration};
 
@@ -31,6 +32,7 @@ use sinew_runtime::{
 };
 
 pub use events::{HangUpAction, MarkEffect, NodeDelivery, OutcomeEffect, Unread};
+use peer::{Marks, Peer, PeerRing, Switch};
 
 /// Maximum number of direct links per endpoint, including those being set up. Messages beyond it go through
 /// the node.
@@ -65,91 +67,6 @@ pub enum Route {
 /// The number that LNCL has assigned to a link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct LinkNumber(pub u64);
-
-/// Classes with a received mark.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-struct Marks {
-    classes: [bool; 3],
-    confirm: Option<u64>,
-}
-
-impl Marks {
-    const fn has(&self, class: Class) -> bool {
-        self.classes[class as usize]
-    }
-
-    /// Records a mark. Returns whether all have arrived.
-    fn note(&mut self, class: Class, confirm: Option<u64>) -> bool {
-        self.classes[class as usize] = true;
-        self.confirm = self.confirm.or(confirm);
-        self.classes == [true; 3]
-    }
-}
-
-/// Whether the peer has accepted our SWITCH.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Switch {
-    /// Never sent yet: messages go through the node. If this process ended now, its ring would not be read.
-    Unsent {
-        at: Time,
-    },
-    /// Sent; repeated at `again` without an answer.
-    Sent {
-        correlation: u64,
-        again: Time,
-    },
-    /// To be sent again.
-    Resend {
-        at: Time,
-    },
-    Taken,
-}
-
-impl Switch {
-    /// Returns when it must be sent, if no answer arrives before.
-    const fn due(&self) -> Option<Time> {
-        match self {
-            Self::Unsent { at } | Self::Resend { at } | Self::Sent { again: at, .. } => Some(*at),
-            Self::Taken => None,
-        }
-    }
-}
-
-/// Whether the peer's ring is read.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum PeerRing {
-    Held(Marks),
-    Open,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Peer {
-    /// Through the node; requested again from `until` on.
-    Refused { until: Time },
-    /// Through the node; LNCL has been asked.
-    Asked { correlation: u64, until: Time },
-    /// Through the node; the peer has requested a link, and our offer is in the link's socket.
-    Offered { number: LinkNumber, marks: Marks, ended_at: Option<Time> },
-    /// Through our ring, until the peer has ended.
-    Direct { number: LinkNumber, switch: Switch, peer_ring: PeerRing, ended_at: Option<Time> },
-}
-
-impl Peer {
-    const fn link(&self) -> Option<LinkNumber> {
-        match self {
-            Self::Refused { .. } | Self::Asked { .. } => None,
-            Self::Offered { number, .. } | Self::Direct { number, .. } => Some(*number),
-        }
-    }
-
-    const fn correlation(&self) -> Option<u64> {
-        match self {
-            Self::Asked { correlation, .. }
-            | Self::Direct { switch: Switch::Sent { correlation, .. }, .. } => Some(*correlation),
-            Self::Refused { .. } | Self::Offered { .. } | Self::Direct { .. } => None,
-        }
-    }
-}
 
 /// Whether an endpoint has direct links at all.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
