@@ -37,10 +37,10 @@ use sinew_runtime::{
 use sinew_shm::{Any, AnyError, Ready, Spin};
 
 use super::{
-    ApiError,
+    ApiError, DirectLinks,
     link::{LinkOptions, Writer, loan::InRing, ring, ring::CHECK_INTERVAL, socket},
     loan::Draft,
-    routes::{Directness, HangUpAction, LINKS_MAX, LinkNumber, Route, Routes, Unread},
+    routes::{HangUpAction, LINKS_MAX, LinkNumber, Route, Routes, Unread},
 };
 pub(super) use established::{AllEnds, EstablishedLink, LinkRead};
 use established::{LinkEnds, Pair, Put};
@@ -172,8 +172,8 @@ impl Direct {
     /// Returns the links of an endpoint that receives its link ends over `control`; without it the endpoint
     /// has no links.
     pub(super) const fn new(terms: Terms, control: Option<Arc<UnixStream>>) -> Self {
-        let directness = if control.is_some() { Directness::Allowed } else { Directness::Off };
-        let routes = Routes::new(terms.own, directness);
+        let links = if control.is_some() { terms.options.direct_links } else { DirectLinks::Never };
+        let routes = Routes::new(terms.own, links);
         Self {
             terms,
             routes,
@@ -230,11 +230,12 @@ impl Direct {
 
     /// Returns the link for a message to `destination`. Does not request a new link.
     pub(super) fn link_to(&self, destination: Tid) -> Option<LinkNumber> {
-        // Whether a link is established does not depend on the time.
-        match self.routes.route(destination, Time::ZERO) {
-            Route::Direct(number) => self.control.as_ref().map(|_| number),
-            Route::ViaNode | Route::RequestLink => None,
-        }
+        self.control.as_ref().and_then(|_| self.routes.written_link(destination))
+    }
+
+    /// Records that a message to `destination` was sent through the node.
+    pub(super) fn sent_through_node(&mut self, destination: Tid, now: Time) {
+        self.routes.sent_through_node(destination, now);
     }
 
     /// Lends room in the ring of a link, or returns `None` if there is none now.

@@ -2,7 +2,7 @@
 
 use std::{mem::MaybeUninit, ptr, time::Duration};
 
-use sinew_client::{Registration, Spin, Transport};
+use sinew_client::{DirectLinks, Registration, Spin, Transport};
 use sinew_model::facts::NodeEvent;
 use sinew_runtime::{app::RequirementEvent, tid::AppAddress};
 
@@ -160,7 +160,7 @@ impl Options {
             registration = registration.transport(Transport::Socket);
         }
         if self.links & SINEW_DIRECT != 0 {
-            registration = registration.direct(true);
+            registration = registration.direct(DirectLinks::Always);
         }
         if self.direct_ring_bytes != 0 {
             registration = registration.direct_ring_bytes(self.direct_ring_bytes);
@@ -265,7 +265,8 @@ mod tests {
         let mut options = zeroed(size_of::<Options>());
         (options.links, options.direct_ring_bytes) = (SINEW_DIRECT | SINEW_WITHOUT_RECONNECT, 1 << 18);
         let asked = format!("{:?}", options.registration().unwrap());
-        let wanted = Registration::new().direct(true).direct_ring_bytes(1 << 18).without_reconnect();
+        let wanted =
+            Registration::new().direct(DirectLinks::Always).direct_ring_bytes(1 << 18).without_reconnect();
         assert_eq!(asked, format!("{wanted:?}"));
     }
 
@@ -274,7 +275,7 @@ mod tests {
         let mut options = zeroed(std::mem::offset_of!(Options, direct_ring_bytes));
         (options.links, options.direct_ring_bytes) = (SINEW_DIRECT, 1 << 18);
         let asked = format!("{:?}", Options::read(&options).unwrap().registration().unwrap());
-        assert_eq!(asked, format!("{:?}", Registration::new().direct(true)));
+        assert_eq!(asked, format!("{:?}", Registration::new().direct(DirectLinks::Always)));
     }
 
     #[test]

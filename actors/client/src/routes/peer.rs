@@ -62,8 +62,10 @@ pub(super) enum PeerRing {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Peer {
-    /// Through the node; requested again from `until` on.
+    /// Through the node; a link is not requested before `until`.
     Refused { until: Time },
+    /// Through the node. `count` messages were sent in the interval that ends at `until`.
+    Counted { until: Time, count: u32 },
     /// Through the node; LNCL has been asked.
     Asked { correlation: u64, until: Time },
     /// Through the node; the peer has requested a link, and our offer is in the link's socket.
@@ -75,8 +77,29 @@ pub(super) enum Peer {
 impl Peer {
     pub(super) const fn link(&self) -> Option<LinkNumber> {
         match self {
-            Self::Refused { .. } | Self::Asked { .. } => None,
+            Self::Refused { .. } | Self::Counted { .. } | Self::Asked { .. } => None,
             Self::Offered { number, .. } | Self::Direct { number, .. } => Some(*number),
+        }
+    }
+
+    /// Returns the link that messages are written to.
+    pub(super) const fn written_link(&self) -> Option<LinkNumber> {
+        match self {
+            Self::Direct { switch: Switch::Unsent { .. }, .. } => None,
+            Self::Direct { number, ended_at: None, .. } => Some(*number),
+            Self::Direct { .. }
+            | Self::Refused { .. }
+            | Self::Counted { .. }
+            | Self::Asked { .. }
+            | Self::Offered { .. } => None,
+        }
+    }
+
+    /// Returns until when this state has an effect, if there is neither a link nor a request for one.
+    pub(super) const fn expires(&self) -> Option<Time> {
+        match self {
+            Self::Refused { until } | Self::Counted { until, .. } => Some(*until),
+            Self::Asked { .. } | Self::Offered { .. } | Self::Direct { .. } => None,
         }
     }
 
@@ -84,7 +107,7 @@ impl Peer {
         match self {
             Self::Asked { correlation, .. }
             | Self::Direct { switch: Switch::Sent { correlation, .. }, .. } => Some(*correlation),
-            Self::Refused { .. } | Self::Offered { .. } | Self::Direct { .. } => None,
+            Self::Refused { .. } | Self::Counted { .. } | Self::Offered { .. } | Self::Direct { .. } => None,
         }
     }
 }

@@ -13,9 +13,12 @@ use std::{
 };
 
 use bytes::Bytes;
-use sinew_client::routes::{
-    Directness, HangUpAction, LinkNumber, MARKS_AFTER_END, MarkEffect, NodeDelivery, OutcomeEffect, Route,
-    Routes, Unread,
+use sinew_client::{
+    DirectLinks,
+    routes::{
+        HangUpAction, LinkNumber, MARKS_AFTER_END, MarkEffect, NodeDelivery, OutcomeEffect, Route, Routes,
+        Unread,
+    },
 };
 use sinew_runtime::{
     mailbox::ClassQueue,
@@ -101,7 +104,7 @@ impl App {
             tid,
             incarnation,
             alive: true,
-            routes: Routes::new(tid, Directness::Allowed),
+            routes: Routes::new(tid, DirectLinks::Always),
             sequence: 0,
             correlation: 0,
             pending: BTreeMap::new(),

@@ -33,7 +33,7 @@ use sinew_runtime::{
     wire::{Class, Header, Kind, Message, Payload},
 };
 
-use crate::{ApiError, Registration, Transport, reconnect::ReconnectPolicy};
+use crate::{ApiError, DirectLinks, Registration, Transport, reconnect::ReconnectPolicy};
 
 const RAW: Kind = Kind::named("test.raw");
 
@@ -157,7 +157,7 @@ fn asked(registration: &Registration) -> Asked {
     let (register, link) = (&registration.register, &registration.link);
     let chosen = [
         (link.transport == Transport::Socket, SINEW_SOCKET_ONLY),
-        (register.direct, SINEW_DIRECT),
+        (link.direct_links == DirectLinks::Always, SINEW_DIRECT),
         (matches!(registration.returning, ReconnectPolicy::Never), SINEW_WITHOUT_RECONNECT),
     ];
     Asked {
