@@ -4,7 +4,7 @@ use std::{os::unix::process::CommandExt, path::PathBuf, process::Command, time::
 
 use sinew::{
     Endpoint, NodeApi, Registration,
-    client::{LoanedMessage, Spin, Transport},
+    client::{DirectLinks, LoanedMessage, Spin, Transport},
     prelude::*,
 };
 use sinew_figures::{
@@ -79,7 +79,7 @@ pub(crate) fn node(socket: &str, ring_bytes: usize) {
 pub(crate) fn register(way: Way, socket: &str, name: &str) -> Endpoint {
     let registration = match way {
         Way::Socket => Registration::new().transport(Transport::Socket),
-        Way::Ring => Registration::new(),
+        Way::Ring => Registration::new().direct(DirectLinks::Never),
         Way::TaskRing | Way::TaskDirect => unreachable!("its ends are in tasks.rs"),
         Way::Direct => direct(),
         Way::DirectSpin => direct().spin(Spin::For(LOOKS)),
@@ -90,7 +90,7 @@ pub(crate) fn register(way: Way, socket: &str, name: &str) -> Endpoint {
 
 /// Rings of the longest sort, for the long payloads.
 fn direct() -> Registration {
-    Registration::new().direct(true).direct_ring_bytes(1 << 20)
+    Registration::new().direct(DirectLinks::Always).direct_ring_bytes(1 << 20)
 }
 
 /// Where a payload is written.

@@ -1,7 +1,10 @@
 //! Sinew's endpoints as tokio tasks, each on a runtime with one thread: the same round trips through
 //! `AsyncEndpoint`.
 
-use sinew::{AsyncEndpoint, NodeApi, Registration, Tid, client::LoanedMessage};
+use sinew::{
+    AsyncEndpoint, NodeApi, Registration, Tid,
+    client::{DirectLinks, LoanedMessage},
+};
 use sinew_figures::{
     Figures, Pinning, Rounds,
     process::{Process, print_ready},
@@ -20,7 +23,8 @@ fn runtime() -> Runtime {
 
 async fn register(way: Way, socket: &str, name: &str) -> AsyncEndpoint {
     let api = NodeApi::connect(socket).expect("the node's door");
-    let registration = Registration::new().name(name).direct(way == Way::TaskDirect);
+    let links = if way == Way::TaskDirect { DirectLinks::Always } else { DirectLinks::Never };
+    let registration = Registration::new().name(name).direct(links);
     api.register_transport_address_async(registration).await.expect("an address")
 }
 

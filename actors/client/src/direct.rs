@@ -6,6 +6,7 @@
 mod accounts;
 mod budget;
 mod descriptors;
+mod ends;
 mod established;
 mod in_flight;
 mod link_maker;
@@ -41,10 +42,10 @@ use sinew_runtime::{
 use sinew_shm::{Any, AnyError, Counters, Ready, Spin, WaitSet};
 
 use super::{
-    ApiError,
+    ApiError, DirectLinks,
     link::{LinkOptions, Writer, loan::InRing, ring, ring::CHECK_INTERVAL, socket},
     loan::Draft,
-    routes::{Directness, HangUpAction, LINKS_MAX, LinkNumber, Route, Routes, Unread},
+    routes::{LinkNumber, Route, Routes},
 };
 pub(super) use established::{AllEnds, EstablishedLink, LinkRead};
 use established::{LinkEnds, Pair, Put};
@@ -179,8 +180,8 @@ impl Direct {
     /// Returns the links of an endpoint that receives its link ends over `control`; without it the endpoint
     /// has no links.
     pub(super) fn new(terms: Terms, control: Option<Arc<UnixStream>>) -> Self {
-        let directness = if control.is_some() { Directness::Allowed } else { Directness::Off };
-        let routes = Routes::new(terms.own, directness);
+        let links = if control.is_some() { terms.options.direct_links } else { DirectLinks::Never };
+        let routes = Routes::new(terms.own, links);
         let accounts = terms.counters.clone().map(LinkAccounts::new);
         Self {
             terms,
@@ -241,11 +242,12 @@ impl Direct {
 
     /// Returns the link for a message to `destination`. Does not request a new link.
     pub(super) fn link_to(&self, destination: Tid) -> Option<LinkNumber> {
-        // Whether a link is established does not depend on the time.
-        match self.routes.route(destination, Time::ZERO) {
-            Route::Direct(number) => self.control.as_ref().map(|_| number),
-            Route::ViaNode | Route::RequestLink => None,
-        }
+        self.control.as_ref().and_then(|_| self.routes.written_link(destination))
+    }
+
+    /// Records that a message to `destination` was sent through the node.
+    pub(super) fn sent_through_node(&mut self, destination: Tid, now: Time) {
+        self.routes.sent_through_node(destination, now);
     }
 
     /// Lends room in the ring of a link, or returns `None` if there is none now.
@@ -467,90 +469,6 @@ impl Direct {
             Err(AnyError::Corrupt { index, cause }) => Err(AnyError::Corrupt { index: at(index), cause }),
             other @ (Ok(Any::Message(_) | Any::Ready | Any::TimedOut) | Err(AnyError::System(_))) => other,
         });
-    }
-
-    /// Ends the links that their peers have closed, once the rings are empty.
-    fn check_hang_ups(&mut self, now: Time) {
-        let established =
-            self.open.iter().chain(&self.held).map(|link| (link.peer, link.number, &link.socket));
-        let setups = self.setups.iter().map(|link| (link.peer, link.number, &link.socket));
-        let links: Vec<_> = established.chain(setups).collect();
-        if links.is_empty() {
-            return;
-        }
-        let gone: Vec<_> = socket::which_hung_up(links.iter().map(|(_, _, socket)| &****socket))
-            .into_iter()
-            .map(|index| (links[index].0, links[index].1))
-            .chain(self.reordered.iter().map(|(peer, buffer)| (*peer, buffer.after)))
-            .filter(|(peer, number)| self.routes.link(*peer) == Some(*number))
-            .collect();
-        for (peer, number) in gone {
-            let unread = self.unread(number);
-            match (self.routes.on_hang_up(peer, unread, now), unread) {
-                (HangUpAction::Keep, _) | (HangUpAction::Drain, Unread::Some) => {}
-                (HangUpAction::Drop, _) | (HangUpAction::Drain, Unread::None) => self.end(peer, number, now),
-            }
-        }
-    }
-
-    fn unread(&mut self, number: LinkNumber) -> Unread {
-        let mut established = self.open.iter_mut().chain(&mut self.held);
-        let has_unread = match established.find(|link| link.number == number) {
-            Some(link) => link.has_unsorted(),
-            None => self.setups.iter().any(|link| link.number == number && link.has_unread()),
-        };
-        if has_unread { Unread::Some } else { Unread::None }
-    }
-
-    /// Ends a link: the peer observes that its socket is closed.
-    pub(super) fn end(&mut self, peer: Tid, number: LinkNumber, now: Time) {
-        if self.writing == Some(number) {
-            self.cut = self.established(number).and_then(|link| link.cut());
-        }
-        // The caller gets back the message that it was writing.
-        let has_caller = self.writing == Some(number);
-        if let Some(link) = self.established(number) {
-            link.log_unsent();
-            let cut = link.cut().filter(|cut| !has_caller && cut.header.class == Class::Stream);
-            let waiting = link.waiting() + usize::from(cut.is_some());
-            self.add_unsent(peer, waiting as u64);
-        }
-        if let Some(link) = self.established(number) {
-            let account = std::mem::take(&mut link.account);
-            self.accounts.iter_mut().for_each(|accounts| accounts.end(account));
-        }
-        self.open.retain(|link| link.number != number);
-        self.index_slots();
-        self.held.retain(|link| link.number != number);
-        self.setups.retain(|link| link.number != number);
-        if self.routes.link(peer) == Some(number) {
-            self.routes.ended(peer, now);
-        }
-    }
-}
-
-/// Values that are lost when a link ends.
-impl Direct {
-    /// Counts Stream values that were waiting for room on a link to this peer.
-    fn add_unsent(&mut self, peer: Tid, values: u64) {
-        if values > 0 {
-            let is_full = self.unsent.len() >= LINKS_MAX && !self.unsent.contains_key(&peer);
-            *self.unsent.entry(if is_full { Tid::NONE } else { peer }).or_default() += values;
-        }
-    }
-
-    /// Ends all links.
-    pub(super) fn end_all(&mut self) {
-        let links =
-            self.open.iter().chain(&self.held).map(|link| (link.peer, link.number)).collect::<Vec<_>>();
-        let now = Time::now();
-        links.into_iter().for_each(|(peer, number)| self.end(peer, number, now));
-    }
-
-    /// Returns the number of Stream values that were waiting for room in links that have ended since the last
-    /// call, per destination.
-    pub(super) fn take_unsent(&mut self) -> BTreeMap<Tid, u64> {
-        std::mem::take(&mut self.unsent)
     }
 }
 

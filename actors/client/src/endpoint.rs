@@ -91,7 +91,7 @@ impl std::fmt::Debug for Endpoint {
 }
 impl Endpoint {
     pub(super) fn register(path: &Path, mut registration: Registration) -> Result<Self, ApiError> {
-        if registration.register.direct {
+        if registration.link.direct_links.accepts() {
             // Without it, each link has its own bell, and the wait covers all of them.
             registration.link.bell = WaitSet::create().map_or(registration.link.bell, Bell::Set);
         }
@@ -106,7 +106,7 @@ impl Endpoint {
         let Link { registered, writer, reader } = link;
         let terms = Terms::of(&registered, &options, &writer);
         let Registered { node: address, app, node_name, payload_max, ring: _ } = registered;
-        let control = reader.control().filter(|_| register.direct);
+        let control = reader.control().filter(|_| options.direct_links.accepts());
         let inbox = Inbox::new(Tid::new(address, app), inbox_capacity, payload_max as usize, writer.clone());
         register.former = Some(app);
         sinew_runtime::log::here!(debug: tid = %Tid::new(address, app), node = node_name, "registered");

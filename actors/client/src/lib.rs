@@ -31,7 +31,7 @@
 //! | protect commands from end to end, and make an output safe without them ([`protection`](sinew_runtime::protection)) | [`Endpoint::guard`] | not there: `bindings/c/README.md` |
 //! | receive events of nodes that connect and leave | [`Registration::subscribe`] | `events` of `sinew_options` |
 //! | continue after a restart of the node | nothing to do; [`ApiError::Disconnected`] reports it once | `SINEW_ERROR_DISCONNECTED` |
-//! | the shortest way to another process | [`Registration::direct`], [`Registration::spin`] | `SINEW_DIRECT`, `spin_ns` |
+//! | the shortest way to another process | [`Registration::direct`], [`Registration::spin`] | `SINEW_DIRECT_ALWAYS`, `spin_ns` |
 //! | get an error's details | [`ApiError`]: cause, place, remedy | `sinew_last_error` |
 //!
 //! # A thread
@@ -171,6 +171,7 @@ mod async_endpoint;
 mod barrier;
 mod builder;
 mod direct;
+mod direct_links;
 mod endpoint;
 mod error;
 mod inbox;
@@ -198,6 +199,7 @@ mod wait_mode;
 pub use async_endpoint::AsyncEndpoint;
 pub use barrier::{Barrier, BarrierError, Meet, Meeting};
 pub use builder::{MessageBuilder, Value};
+pub use direct_links::DirectLinks;
 pub use endpoint::Endpoint;
 pub use error::ApiError;
 pub use link::Transport;

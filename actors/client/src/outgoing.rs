@@ -223,7 +223,7 @@ impl Endpoint {
         }
         let loan = self.lender.lend()?;
         let destination = self.absolute(header.destination);
-        // A link is requested now if there is none: while the ring to the node is lent, it cannot carry the
+        // A link is requested now if one is wanted: while the ring to the node is lent, it cannot carry the
         // request.
         let link = self.direct.link_to(destination).or_else(|| self.route(destination, Time::now()));
         let room = match link {
@@ -295,7 +295,9 @@ impl Endpoint {
             return Err(self.explain(ApiError::Closed("the node has gone".to_owned())));
         }
         let written = self.node.write(draft, limit, &mut self.wait_mode).await;
-        written.map(|()| None).map_err(|error| self.explain(error))
+        written.map_err(|error| self.explain(error))?;
+        self.direct.sent_through_node(destination, now);
+        Ok(None)
     }
 
     /// Returns the link for a message to `destination` now, or `None` for the path through the node.

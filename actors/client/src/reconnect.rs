@@ -271,7 +271,7 @@ impl Endpoint {
     /// Continues with a new connection, as a member of the same groups.
     fn continue_on(&mut self, link: Link) {
         let Link { registered, writer, reader } = link;
-        let control = reader.control().filter(|_| self.reconnect.register.direct);
+        let control = reader.control().filter(|_| self.reconnect.options.direct_links.accepts());
         let own = Tid::new(registered.node, registered.app);
         let terms = Terms::of(&registered, &self.reconnect.options, &writer);
         if own == self.tid {

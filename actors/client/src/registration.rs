@@ -11,7 +11,7 @@ use sinew_runtime::{
 use sinew_shm::{BellKind, Spin};
 
 use super::{
-    ApiError, Transport, direct,
+    ApiError, DirectLinks, Transport, direct,
     link::{Link, LinkOptions, RegistrationHandshake, ServerTrust},
     reconnect::ReconnectPolicy,
 };
@@ -55,6 +55,7 @@ impl Default for Registration {
                 spin: Spin::Off,
                 stall_timeout: Duration::from_secs(1),
                 bell: BellKind::Futex.into(),
+                direct_links: DirectLinks::default(),
                 direct_ring_bytes: direct::RING_BYTES,
                 server_trust: ServerTrust::AnyUser,
             },
@@ -176,23 +177,23 @@ impl Registration {
         self
     }
 
-    /// Sets whether messages to and from other processes of the node may use direct rings, if LNCL introduces
-    /// the two and both allow it; otherwise all messages go through the node. A link is set up at the first
-    /// message to another process. It costs a ring of each side
-    /// ([`direct_ring_bytes`](Self::direct_ring_bytes)), allocated at once, and some time in the call that
-    /// sets it up. Default false; only with [`Transport::Ring`].
+    /// Sets when this endpoint has direct links with other processes of the node. A direct link is a pair of
+    /// rings that bypass the node, if LNCL introduces the two and both allow it; otherwise their messages go
+    /// through the node. It costs a ring of each side ([`direct_ring_bytes`](Self::direct_ring_bytes)),
+    /// allocated at once, and some time in the call that sets it up. Default [`DirectLinks::Never`]; only with
+    /// [`Transport::Ring`].
     ///
     /// # Examples
     ///
     /// ```
-    /// use sinew::Registration;
+    /// use sinew::{Registration, client::DirectLinks};
     ///
-    /// // The shortest way to another process of the node, where that one registers with `direct`, too.
-    /// let registration = Registration::new().name("knee.sensor").direct(true);
+    /// // The shortest way to another process of the node, if that one accepts links, too.
+    /// let registration = Registration::new().name("knee.sensor").direct(DirectLinks::Always);
     /// ```
     #[must_use]
-    pub const fn direct(mut self, direct: bool) -> Self {
-        self.register.direct = direct;
+    pub const fn direct(mut self, links: DirectLinks) -> Self {
+        self.link.direct_links = links;
         self
     }
 

@@ -1,8 +1,8 @@
 //! Which path a message to another application takes, and from which path its messages may be read. Pure.
 //!
-//! At first all messages go through the node. An endpoint that sends to another application of the node asks
-//! LNCL for an introduction, and continues through the node meanwhile. If the other side agrees, both have a
-//! *direct link*: a ring in each direction that bypasses the node.
+//! At first all messages go through the node. An endpoint that wants a link with another application of the
+//! node ([`DirectLinks`]) asks LNCL for an introduction, and continues through the node meanwhile. If the other
+//! side agrees, both have a *direct link*: a ring in each direction that bypasses the node.
 //!
 //! ```text
 //!   A (asks)                  LNCL                       B (is asked)
@@ -20,6 +20,9 @@
 //! that: it writes into the ring at once.
 
 mod events;
+mod peer;
+#[cfg(test)]
+mod tests;
 
 use std::{collections::BTreeMap, time::Duration};
 
@@ -30,13 +33,22 @@ use sinew_runtime::{
     wire::Class,
 };
 
+use crate::DirectLinks;
 pub use events::{HangUpAction, MarkEffect, NodeDelivery, OutcomeEffect, Unread};
+use peer::{Marks, Peer, PeerRing, Switch};
 
 /// Maximum number of direct links per endpoint, including those being set up. Messages beyond it go through
 /// the node.
 pub(super) const LINKS_MAX: usize = 64;
-/// Maximum number of remembered refusals; the one that ends first is replaced.
-const REFUSALS_MAX: usize = 256;
+/// Maximum number of remembered destinations without a link, refused or counted. One more replaces the one
+/// that expires first.
+const UNLINKED_MAX: usize = 256;
+/// Number of messages to one destination within [`COUNT_INTERVAL`] at which an endpoint with automatic links
+/// requests one. A control loop at 1 kHz has its link after 8 ms; an occasional command costs no memory.
+const FREQUENT_MESSAGES: u32 = 8;
+/// Time in which the messages to one destination are counted. Below 8 Hz the wake that a link saves is not
+/// worth a ring of each side.
+const COUNT_INTERVAL: Duration = Duration::from_secs(1);
 /// Time until an introduction that failed temporarily is requested again.
 const SHORT_RETRY: Duration = Duration::from_millis(100);
 /// Time until an introduction is requested again that this destination will hardly ever allow.
@@ -66,109 +78,11 @@ pub enum Route {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct LinkNumber(pub u64);
 
-/// Classes with a received mark.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-struct Marks {
-    classes: [bool; 3],
-    confirm: Option<u64>,
-}
-
-impl Marks {
-    const fn has(&self, class: Class) -> bool {
-        self.classes[class as usize]
-    }
-
-    fn are_all(&self) -> bool {
-        self.classes == [true; 3]
-    }
-
-    /// Records a mark. Returns whether all have arrived.
-    fn note(&mut self, class: Class, confirm: Option<u64>) -> bool {
-        self.classes[class as usize] = true;
-        self.confirm = self.confirm.or(confirm);
-        self.are_all()
-    }
-}
-
-/// Whether the peer has accepted our SWITCH.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Switch {
-    /// Never sent yet: messages go through the node. If this process ended now, its ring would not be read.
-    Unsent {
-        at: Time,
-    },
-    /// Sent; repeated at `again` without an answer.
-    Sent {
-        correlation: u64,
-        again: Time,
-    },
-    /// To be sent again.
-    Resend {
-        at: Time,
-    },
-    Taken,
-}
-
-impl Switch {
-    /// Returns when it must be sent, if no answer arrives before.
-    const fn due(&self) -> Option<Time> {
-        match self {
-            Self::Unsent { at } | Self::Resend { at } | Self::Sent { again: at, .. } => Some(*at),
-            Self::Taken => None,
-        }
-    }
-}
-
-/// Whether the peer's ring is read.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum PeerRing {
-    Held(Marks),
-    Open,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Peer {
-    /// Through the node; requested again from `until` on.
-    Refused { until: Time },
-    /// Through the node; LNCL has been asked.
-    Asked { correlation: u64, until: Time },
-    /// Through the node; the peer has requested a link, and our offer is in the link's socket.
-    Offered { number: LinkNumber, marks: Marks, ended_at: Option<Time> },
-    /// Through our ring, until the peer has ended.
-    Direct { number: LinkNumber, switch: Switch, peer_ring: PeerRing, ended_at: Option<Time> },
-}
-
-impl Peer {
-    const fn link(&self) -> Option<LinkNumber> {
-        match self {
-            Self::Refused { .. } | Self::Asked { .. } => None,
-            Self::Offered { number, .. } | Self::Direct { number, .. } => Some(*number),
-        }
-    }
-
-    const fn correlation(&self) -> Option<u64> {
-        match self {
-            Self::Asked { correlation, .. }
-            | Self::Direct { switch: Switch::Sent { correlation, .. }, .. } => Some(*correlation),
-            Self::Refused { .. } | Self::Offered { .. } | Self::Direct { .. } => None,
-        }
-    }
-}
-
-/// Whether an endpoint has direct links at all.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Directness {
-    /// The endpoint has direct links, up to the maximum.
-    Allowed,
-    /// All messages go through the node.
-    Off,
-}
-
 /// The paths to all destinations of one endpoint.
 #[derive(Debug)]
 pub struct Routes {
     own: Tid,
-    directness: Directness,
+    direct_links: DirectLinks,
     peers: BTreeMap<Tid, Peer>,
     /// Number of links, including those that may become one.
     links: usize,
@@ -176,22 +90,48 @@ pub struct Routes {
 
 impl Routes {
     /// Creates the paths of `own`: all messages go through the node at first.
-    pub const fn new(own: Tid, directness: Directness) -> Self {
-        Self { own, directness, peers: BTreeMap::new(), links: 0 }
+    pub const fn new(own: Tid, direct_links: DirectLinks) -> Self {
+        Self { own, direct_links, peers: BTreeMap::new(), links: 0 }
     }
 
     /// Returns the path to `destination`, which is absolute.
     pub fn route(&self, destination: Tid, now: Time) -> Route {
         match self.peers.get(&destination) {
-            Some(Peer::Direct { switch: Switch::Unsent { .. }, .. } | Peer::Offered { .. }) => Route::ViaNode,
-            Some(Peer::Direct { number, ended_at: None, .. }) => Route::Direct(*number),
-            Some(Peer::Direct { .. }) => Route::ViaNode,
+            Some(peer @ (Peer::Direct { .. } | Peer::Offered { .. })) => {
+                peer.written_link().map_or(Route::ViaNode, Route::Direct)
+            }
             Some(Peer::Refused { until } | Peer::Asked { until, .. }) if now < *until => Route::ViaNode,
             // The request was not answered.
             Some(Peer::Asked { .. }) => Route::RequestLink,
-            Some(Peer::Refused { .. }) | None if self.may_ask(destination) => Route::RequestLink,
-            Some(Peer::Refused { .. }) | None => Route::ViaNode,
+            Some(Peer::Counted { until, count }) if now < *until && *count + 1 >= FREQUENT_MESSAGES => {
+                self.request(destination)
+            }
+            Some(Peer::Refused { .. }) | None if self.direct_links == DirectLinks::Always => {
+                self.request(destination)
+            }
+            Some(Peer::Refused { .. } | Peer::Counted { .. }) | None => Route::ViaNode,
         }
+    }
+
+    /// Returns the link that messages to `destination` are written to.
+    pub fn written_link(&self, destination: Tid) -> Option<LinkNumber> {
+        self.peers.get(&destination).and_then(Peer::written_link)
+    }
+
+    /// Records that a message to `destination` was sent through the node. [`route`](Self::route) does not
+    /// count, because a loaned message asks for its path twice. After a refusal the count starts again, so
+    /// that an occasional sender does not repeat its request.
+    pub fn sent_through_node(&mut self, destination: Tid, now: Time) {
+        if self.direct_links != DirectLinks::Automatic || !self.may_have_link(destination) {
+            return;
+        }
+        let (until, count) = match self.peers.get(&destination) {
+            Some(Peer::Asked { .. } | Peer::Offered { .. } | Peer::Direct { .. }) => return,
+            Some(Peer::Refused { until }) if now < *until => return,
+            Some(Peer::Counted { until, count }) if now < *until => (*until, *count + 1),
+            Some(Peer::Refused { .. } | Peer::Counted { .. }) | None => (now + COUNT_INTERVAL, 1),
+        };
+        self.set_unlinked(destination, Peer::Counted { until, count });
     }
 
     /// Records that LNCL has been asked for an introduction to `peer`.
@@ -221,7 +161,7 @@ impl Routes {
     /// # Errors
     /// Returns why there is no link; the peer may ask again.
     pub fn on_introduction(&self, peer: Tid) -> Result<(), Rejection> {
-        if self.directness == Directness::Off || peer == self.own {
+        if !self.direct_links.accepts() || peer == self.own {
             return Err(Rejection::Unsupported);
         }
         match self.peers.get(&peer) {
@@ -229,8 +169,8 @@ impl Routes {
             Some(Peer::Asked { .. }) if self.own < peer => Err(Rejection::QueueFull),
             Some(Peer::Asked { .. }) => Ok(()),
             Some(Peer::Offered { .. } | Peer::Direct { .. }) => Err(Rejection::QueueFull),
-            Some(Peer::Refused { .. }) | None if self.links < LINKS_MAX => Ok(()),
-            Some(Peer::Refused { .. }) | None => Err(Rejection::QueueFull),
+            Some(Peer::Refused { .. } | Peer::Counted { .. }) | None if self.links < LINKS_MAX => Ok(()),
+            Some(Peer::Refused { .. } | Peer::Counted { .. }) | None => Err(Rejection::QueueFull),
         }
     }
 
@@ -245,9 +185,8 @@ impl Routes {
     pub fn connected(&mut self, peer: Tid, number: LinkNumber, sent: Option<u64>, now: Time) {
         let (peer_ring, ended_at) = match self.peers.get(&peer) {
             Some(Peer::Offered { ended_at, .. }) => (PeerRing::Open, *ended_at),
-            Some(Peer::Refused { .. } | Peer::Asked { .. } | Peer::Direct { .. }) | None => {
-                (PeerRing::Held(Marks::default()), None)
-            }
+            Some(Peer::Refused { .. } | Peer::Counted { .. } | Peer::Asked { .. } | Peer::Direct { .. })
+            | None => (PeerRing::Held(Marks::default()), None),
         };
         let later = Switch::Unsent { at: now + SWITCH_RETRY };
         let switch =
@@ -288,7 +227,13 @@ impl Routes {
                 *peer_ring = PeerRing::Open;
                 MarkEffect::Open { confirm }
             }
-            Some(Peer::Refused { .. } | Peer::Asked { .. } | Peer::Offered { .. } | Peer::Direct { .. })
+            Some(
+                Peer::Refused { .. }
+                | Peer::Counted { .. }
+                | Peer::Asked { .. }
+                | Peer::Offered { .. }
+                | Peer::Direct { .. },
+            )
             | None => MarkEffect::Unknown,
         }
     }
@@ -327,7 +272,11 @@ impl Routes {
             {
                 Some((*tid, *number))
             }
-            Peer::Refused { .. } | Peer::Asked { .. } | Peer::Offered { .. } | Peer::Direct { .. } => None,
+            Peer::Refused { .. }
+            | Peer::Counted { .. }
+            | Peer::Asked { .. }
+            | Peer::Offered { .. }
+            | Peer::Direct { .. } => None,
         })
     }
 
@@ -361,7 +310,13 @@ impl Routes {
                 ended_at.get_or_insert(now);
                 NodeDelivery::AfterLink(*number)
             }
-            Some(Peer::Refused { .. } | Peer::Asked { .. } | Peer::Offered { .. } | Peer::Direct { .. })
+            Some(
+                Peer::Refused { .. }
+                | Peer::Counted { .. }
+                | Peer::Asked { .. }
+                | Peer::Offered { .. }
+                | Peer::Direct { .. },
+            )
             | None => NodeDelivery::Take,
         }
     }
@@ -385,7 +340,9 @@ impl Routes {
                     HangUpAction::Drop
                 }
             }
-            Some(Peer::Refused { .. } | Peer::Asked { .. }) | None => HangUpAction::Drop,
+            Some(Peer::Refused { .. } | Peer::Counted { .. } | Peer::Asked { .. }) | None => {
+                HangUpAction::Drop
+            }
         }
     }
 
@@ -406,7 +363,7 @@ impl Routes {
                 Peer::Direct { switch: switch @ Switch::Sent { .. }, .. } => {
                     *switch = Switch::Resend { at: now };
                 }
-                Peer::Direct { .. } | Peer::Offered { .. } | Peer::Refused { .. } => {}
+                Peer::Direct { .. } | Peer::Offered { .. } | Peer::Refused { .. } | Peer::Counted { .. } => {}
             }
         }
     }
@@ -426,9 +383,13 @@ impl Routes {
         self.peers.get(&peer).and_then(Peer::link)
     }
 
-    fn may_ask(&self, destination: Tid) -> bool {
-        self.directness == Directness::Allowed
-            && self.links < LINKS_MAX
+    /// Returns the path of a message for which a link is wanted.
+    fn request(&self, destination: Tid) -> Route {
+        if self.may_have_link(destination) { Route::RequestLink } else { Route::ViaNode }
+    }
+
+    fn may_have_link(&self, destination: Tid) -> bool {
+        self.links < LINKS_MAX
             && destination != self.own
             && destination.node == self.own.node
             && destination.is_single()
@@ -442,20 +403,24 @@ impl Routes {
     }
 
     fn refuse(&mut self, peer: Tid, until: Time) {
-        self.set(peer, Peer::Refused { until });
-        if self.peers.len() - self.links > REFUSALS_MAX {
-            let refusals = self.peers.iter().filter_map(|(tid, peer)| match peer {
-                Peer::Refused { until } => Some((*until, *tid)),
-                Peer::Asked { .. } | Peer::Offered { .. } | Peer::Direct { .. } => None,
-            });
-            if let Some((_, first)) = refusals.min() {
+        self.set_unlinked(peer, Peer::Refused { until });
+    }
+
+    /// Remembers a destination without a link. The newest one stays: otherwise no destination could be counted
+    /// while the others are refused for longer.
+    fn set_unlinked(&mut self, tid: Tid, peer: Peer) {
+        self.set(tid, peer);
+        if self.peers.len() - self.links > UNLINKED_MAX {
+            let others = self.peers.iter().filter(|(other, _)| **other != tid);
+            let expiries = others.filter_map(|(other, peer)| Some((peer.expires()?, *other)));
+            if let Some((_, first)) = expiries.min() {
                 self.peers.remove(&first);
             }
         }
     }
 
     fn set(&mut self, tid: Tid, peer: Peer) {
-        let is_link = |peer: &Peer| !matches!(peer, Peer::Refused { .. });
+        let is_link = |peer: &Peer| peer.expires().is_none();
         self.links += usize::from(is_link(&peer));
         if let Some(former) = self.peers.insert(tid, peer) {
             self.links -= usize::from(is_link(&former));

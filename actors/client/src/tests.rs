@@ -16,7 +16,7 @@ use sinew_runtime::{
     wire::{Class, Flags, Kind, Message, Payload},
 };
 
-use super::{ApiError, NodeApi, Registration, Transport};
+use super::{ApiError, DirectLinks, NodeApi, Registration, Transport};
 
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Torque {
@@ -104,7 +104,8 @@ on_every_transport! {
 }
 
 fn on(under: Under) -> Registration {
-    Registration::new().transport(under.transport).direct(under.direct)
+    let links = if under.direct { DirectLinks::Always } else { DirectLinks::Never };
+    Registration::new().transport(under.transport).direct(links)
 }
 
 fn register(under: Under, node: &TestNode, registration: Registration) -> Client {

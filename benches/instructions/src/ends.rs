@@ -1,6 +1,10 @@
 //! The processes of the paths.
 
-use sinew::{Endpoint, NodeApi, Registration, client::LoanedMessage, prelude::*};
+use sinew::{
+    Endpoint, NodeApi, Registration,
+    client::{DirectLinks, LoanedMessage},
+    prelude::*,
+};
 use sinew_figures::{
     Pace, Rounds,
     process::{await_end, print_ready},
@@ -67,7 +71,8 @@ fn node(socket: &str) {
 
 fn register(path: Path, socket: &str, name: &str) -> Endpoint {
     let api = NodeApi::connect(socket).expect("the node's door");
-    let registration = Registration::new().direct(path == Path::Direct).name(name).deadline(DEADLINE);
+    let links = if path == Path::Direct { DirectLinks::Always } else { DirectLinks::Never };
+    let registration = Registration::new().direct(links).name(name).deadline(DEADLINE);
     api.register_transport_address(registration).expect("an address")
 }
 

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use sinew::{
     AsyncEndpoint, Endpoint, NodeApi, Registration, Tid,
-    client::{LoanedMessage, Spin},
+    client::{DirectLinks, LoanedMessage, Spin},
     prelude::*,
 };
 use sinew_figures::{
@@ -58,8 +58,10 @@ impl Way {
     fn registration(self, name: &str) -> Registration {
         let registration = Registration::new().name(name);
         match self {
-            Self::Ring | Self::TaskRing => registration,
-            Self::Direct | Self::TaskDirect => registration.direct(true).direct_ring_bytes(DIRECT_RING_BYTES),
+            Self::Ring | Self::TaskRing => registration.direct(DirectLinks::Never),
+            Self::Direct | Self::TaskDirect => {
+                registration.direct(DirectLinks::Always).direct_ring_bytes(DIRECT_RING_BYTES)
+            }
             Self::DirectSpin => Self::Direct.registration(name).spin(Spin::For(LOOKS)),
         }
     }

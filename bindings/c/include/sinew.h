@@ -118,9 +118,22 @@
 #define SINEW_SOCKET_ONLY 1
 
 /**
- * For `links` of `sinew_options`: direct links to other processes that request them, too.
+ * For `links` of `sinew_options`: direct links with other processes that also have them. The endpoint accepts
+ * links, and requests one to each peer with frequent messages: at the 8th message within one second. Of
+ * `SINEW_DIRECT_AUTOMATIC`, `SINEW_DIRECT_ALWAYS` and `SINEW_DIRECT_NEVER` set one at most.
  */
-#define SINEW_DIRECT 2
+#define SINEW_DIRECT_AUTOMATIC 16
+
+/**
+ * For `links` of `sinew_options`: direct links with other processes that also have them. The endpoint accepts
+ * links, and requests one at the first message to a peer.
+ */
+#define SINEW_DIRECT_ALWAYS 2
+
+/**
+ * For `links` of `sinew_options`: all messages go through the node. This is the default.
+ */
+#define SINEW_DIRECT_NEVER 32
 
 /**
  * For `links` of `sinew_options`: `spin_ns` is the maximum spin time. The endpoint spins about twice as long
@@ -667,9 +680,9 @@ typedef struct sinew_options {
      */
     uint64_t spin_ns;
     /**
-     * The transport of the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`,
-     * `SINEW_WITHOUT_RECONNECT`. Default: shared memory if the system has it, all messages through the node,
-     * and a reconnect when the connection has ended.
+     * The transport of the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT_AUTOMATIC`, `SINEW_DIRECT_ALWAYS`,
+     * `SINEW_DIRECT_NEVER`, `SINEW_SPIN_ADAPTIVE`, `SINEW_WITHOUT_RECONNECT`. Default: shared memory if the
+     * system has it, all messages through the node, and a reconnect when the connection has ended.
      */
     uint32_t links;
     /**

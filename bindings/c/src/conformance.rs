@@ -17,7 +17,10 @@ use std::{
 
 pub use crate::{
     message::Undelivered,
-    options::{SINEW_DIRECT, SINEW_SOCKET_ONLY, SINEW_WITHOUT_RECONNECT},
+    options::{
+        SINEW_DIRECT_ALWAYS, SINEW_DIRECT_AUTOMATIC, SINEW_DIRECT_NEVER, SINEW_SOCKET_ONLY,
+        SINEW_WITHOUT_RECONNECT,
+    },
     outcome::Outcome,
     status::Status,
 };

@@ -2,7 +2,7 @@
 
 use std::{mem::MaybeUninit, ptr, time::Duration};
 
-use sinew_client::{Registration, Spin, Transport};
+use sinew_client::{DirectLinks, Registration, Spin, Transport};
 use sinew_model::facts::NodeEvent;
 use sinew_runtime::{app::RequirementEvent, tid::AppAddress};
 
@@ -17,8 +17,15 @@ pub const SINEW_NODE_EVENTS: u32 = 1;
 pub const SINEW_REQUIREMENT_EVENTS: u32 = 2;
 /// For `links` of `sinew_options`: through the unix socket only, no shared memory.
 pub const SINEW_SOCKET_ONLY: u32 = 1;
-/// For `links` of `sinew_options`: direct links to other processes that request them, too.
-pub const SINEW_DIRECT: u32 = 2;
+/// For `links` of `sinew_options`: direct links with other processes that also have them. The endpoint accepts
+/// links, and requests one to each peer with frequent messages: at the 8th message within one second. Of
+/// `SINEW_DIRECT_AUTOMATIC`, `SINEW_DIRECT_ALWAYS` and `SINEW_DIRECT_NEVER` set one at most.
+pub const SINEW_DIRECT_AUTOMATIC: u32 = 16;
+/// For `links` of `sinew_options`: direct links with other processes that also have them. The endpoint accepts
+/// links, and requests one at the first message to a peer.
+pub const SINEW_DIRECT_ALWAYS: u32 = 2;
+/// For `links` of `sinew_options`: all messages go through the node. This is the default.
+pub const SINEW_DIRECT_NEVER: u32 = 32;
 /// For `links` of `sinew_options`: `spin_ns` is the maximum spin time. The endpoint spins about twice as long
 /// as messages lately took to arrive, and not at all while they take longer than `spin_ns`. Without `spin_ns`
 /// this does nothing.
@@ -66,9 +73,9 @@ pub struct Options {
     /// (`SINEW_SOCKET_ONLY`) it never spins. Spinning keeps a CPU busy and saves the wake-up, which is most
     /// of a short message's latency: for a thread with a CPU of its own. Default: it sleeps at once.
     pub spin_ns: u64,
-    /// The transport of the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT`, `SINEW_SPIN_ADAPTIVE`,
-    /// `SINEW_WITHOUT_RECONNECT`. Default: shared memory if the system has it, all messages through the node,
-    /// and a reconnect when the connection has ended.
+    /// The transport of the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT_AUTOMATIC`, `SINEW_DIRECT_ALWAYS`,
+    /// `SINEW_DIRECT_NEVER`, `SINEW_SPIN_ADAPTIVE`, `SINEW_WITHOUT_RECONNECT`. Default: shared memory if the
+    /// system has it, all messages through the node, and a reconnect when the connection has ended.
     pub links: u32,
     /// Zero.
     pub reserved: u32,
@@ -79,7 +86,9 @@ pub struct Options {
     pub direct_ring_bytes: usize,
 }
 
-const KNOWN_LINKS: u32 = SINEW_SOCKET_ONLY | SINEW_DIRECT | SINEW_SPIN_ADAPTIVE | SINEW_WITHOUT_RECONNECT;
+/// Of these, `links` has one at most.
+const DIRECT_LINKS: u32 = SINEW_DIRECT_AUTOMATIC | SINEW_DIRECT_ALWAYS | SINEW_DIRECT_NEVER;
+const KNOWN_LINKS: u32 = SINEW_SOCKET_ONLY | DIRECT_LINKS | SINEW_SPIN_ADAPTIVE | SINEW_WITHOUT_RECONNECT;
 
 /// The field with the length of the rest.
 const SHORTEST: usize = size_of::<usize>();
@@ -159,8 +168,8 @@ impl Options {
         if self.links & SINEW_SOCKET_ONLY != 0 {
             registration = registration.transport(Transport::Socket);
         }
-        if self.links & SINEW_DIRECT != 0 {
-            registration = registration.direct(true);
+        if let Some(links) = self.direct_links()? {
+            registration = registration.direct(links);
         }
         if self.direct_ring_bytes != 0 {
             registration = registration.direct_ring_bytes(self.direct_ring_bytes);
@@ -174,6 +183,21 @@ impl Options {
             (_, 0) => registration.spin(Spin::For(longest)),
             (_, _) => registration.spin(Spin::Adaptive { max: longest }),
         })
+    }
+
+    /// Returns the requested direct links, or `None` for the default.
+    fn direct_links(&self) -> Result<Option<DirectLinks>, CallError> {
+        match self.links & DIRECT_LINKS {
+            0 => Ok(None),
+            SINEW_DIRECT_AUTOMATIC => Ok(Some(DirectLinks::Automatic)),
+            SINEW_DIRECT_ALWAYS => Ok(Some(DirectLinks::Always)),
+            SINEW_DIRECT_NEVER => Ok(Some(DirectLinks::Never)),
+            _ => Err(CallError::argument(format!(
+                "`options.links` is {:#x}: set one of SINEW_DIRECT_AUTOMATIC, SINEW_DIRECT_ALWAYS and \
+                 SINEW_DIRECT_NEVER at most",
+                self.links
+            ))),
+        }
     }
 
     fn with_limits(&self, mut registration: Registration) -> Result<Registration, CallError> {
@@ -261,20 +285,46 @@ mod tests {
     }
 
     #[test]
+    fn links_flags_select_the_direct_links() {
+        let mut options = zeroed(size_of::<Options>());
+        for (flag, links) in [
+            (SINEW_DIRECT_AUTOMATIC, DirectLinks::Automatic),
+            (SINEW_DIRECT_ALWAYS, DirectLinks::Always),
+            (SINEW_DIRECT_NEVER, DirectLinks::Never),
+        ] {
+            options.links = flag;
+            let asked = format!("{:?}", options.registration().unwrap());
+            assert_eq!(asked, format!("{:?}", Registration::new().direct(links)));
+        }
+    }
+
+    #[test]
+    fn several_direct_links_flags_are_rejected() {
+        let mut options = zeroed(size_of::<Options>());
+        let several = [SINEW_DIRECT_AUTOMATIC | SINEW_DIRECT_ALWAYS, SINEW_DIRECT_ALWAYS | SINEW_DIRECT_NEVER];
+        for links in several {
+            options.links = links;
+            let error = format!("{:?}", options.registration().unwrap_err());
+            assert!(error.contains("set one of SINEW_DIRECT_AUTOMATIC"), "{error}");
+        }
+    }
+
+    #[test]
     fn ring_bytes_and_reconnect_are_configurable() {
         let mut options = zeroed(size_of::<Options>());
-        (options.links, options.direct_ring_bytes) = (SINEW_DIRECT | SINEW_WITHOUT_RECONNECT, 1 << 18);
+        (options.links, options.direct_ring_bytes) = (SINEW_DIRECT_ALWAYS | SINEW_WITHOUT_RECONNECT, 1 << 18);
         let asked = format!("{:?}", options.registration().unwrap());
-        let wanted = Registration::new().direct(true).direct_ring_bytes(1 << 18).without_reconnect();
+        let wanted = Registration::new().direct(DirectLinks::Always).direct_ring_bytes(1 << 18);
+        let wanted = wanted.without_reconnect();
         assert_eq!(asked, format!("{wanted:?}"));
     }
 
     #[test]
     fn program_without_ring_bytes_gets_the_default() {
         let mut options = zeroed(std::mem::offset_of!(Options, direct_ring_bytes));
-        (options.links, options.direct_ring_bytes) = (SINEW_DIRECT, 1 << 18);
+        (options.links, options.direct_ring_bytes) = (SINEW_DIRECT_ALWAYS, 1 << 18);
         let asked = format!("{:?}", Options::read(&options).unwrap().registration().unwrap());
-        assert_eq!(asked, format!("{:?}", Registration::new().direct(true)));
+        assert_eq!(asked, format!("{:?}", Registration::new().direct(DirectLinks::Always)));
     }
 
     #[test]
@@ -283,7 +333,7 @@ mod tests {
         options.events = 4;
         assert!(options.registration().is_err());
         let mut options = zeroed(size_of::<Options>());
-        options.links = 16;
+        options.links = 64;
         assert!(options.registration().is_err());
         let mut options = zeroed(size_of::<Options>());
         options.reserved = 1;

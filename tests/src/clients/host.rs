@@ -12,7 +12,7 @@ use std::{
 
 use sinew::{
     AsyncEndpoint, Endpoint, NodeApi, Payload as _, Registration,
-    client::{ApiError, Received},
+    client::{ApiError, DirectLinks, Received},
 };
 
 use super::{commands, print_line, registration::register};
@@ -32,7 +32,8 @@ pub(super) fn run(arguments: &[String]) {
     let [socket, name] = arguments else { panic!("{arguments:?} are not a socket and a name") };
     let is_task = HOSTS.iter().any(|(one, is_task)| one == name && *is_task);
     let api = NodeApi::connect(socket).expect("the node accepts clients");
-    let registration = Registration::new().direct(true).name(name.as_str()).stall_timeout(ROOM_TIMEOUT);
+    let registration = Registration::new().direct(DirectLinks::Always);
+    let registration = registration.name(name.as_str()).stall_timeout(ROOM_TIMEOUT);
     let over = Arc::new(AtomicBool::new(false));
     let ends = over.clone();
     let host = thread::spawn(move || {

@@ -7,7 +7,7 @@ use std::{
 
 use sinew::{
     AppAddress, Endpoint, NodeApi, Registration,
-    client::{ApiError, Transport},
+    client::{ApiError, DirectLinks, Transport},
 };
 
 use sinew_testkit::DEADLINE;
@@ -27,8 +27,8 @@ pub(super) fn wishes() -> Registration {
     let registration = Registration::new().stall_timeout(DEADLINE);
     match std::env::var(TRANSPORT).as_deref() {
         Ok("socket") => registration.transport(Transport::Socket),
-        Ok("ring") => registration.transport(Transport::Ring),
-        Ok("direct") => registration.transport(Transport::Ring).direct(true),
+        Ok("ring") => registration.transport(Transport::Ring).direct(DirectLinks::Never),
+        Ok("direct") => registration.transport(Transport::Ring).direct(DirectLinks::Always),
         Ok(other) => panic!("{TRANSPORT} is {other:?}: none of socket, ring, direct"),
         Err(_) => registration,
     }

@@ -13,7 +13,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew::{Endpoint, NodeApi, Payload as _, client::ApiError};
+use sinew::{
+    Endpoint, NodeApi, Payload as _,
+    client::{ApiError, DirectLinks},
+};
 
 use super::{
     commands, fd_holder, print_line,
@@ -119,7 +122,7 @@ pub(super) fn run_pinger(arguments: &[String]) {
     let api = NodeApi::connect(&arguments[0]).expect("the node accepts clients");
     let (name, is_direct) = arguments.get(1).map_or((ECHO, false), |name| (&**name, true));
     let wishes = wishes().requires([name]);
-    let mut endpoint = register(&api, &if is_direct { wishes.direct(true) } else { wishes });
+    let mut endpoint = register(&api, &if is_direct { wishes.direct(DirectLinks::Always) } else { wishes });
     let echo = endpoint.resolve(name, DEADLINE).expect("the node answers").expect("it is ready");
     let measured = Arc::new(Mutex::new(vec![Times::new(); PARTS]));
     let measuring = measured.clone();
@@ -174,7 +177,7 @@ fn say_window(measured: &[Times], parts: &[usize]) {
 /// `SOCKET NAME`: answers requests, and drops everything else. Leaves a child behind on the command `fork`.
 pub(super) fn run_taker(arguments: &[String]) {
     let api = NodeApi::connect(&arguments[0]).expect("the node accepts clients");
-    let endpoint = register(&api, &wishes().direct(true).name(&*arguments[1]));
+    let endpoint = register(&api, &wishes().direct(DirectLinks::Always).name(&*arguments[1]));
     let over = Arc::new(AtomicBool::new(false));
     let ends = over.clone();
     let taker = thread::spawn(move || take(endpoint, &ends));

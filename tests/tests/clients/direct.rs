@@ -13,7 +13,12 @@ use rustix::{
     process::{Pid, Signal, kill_process},
     thread::gettid,
 };
-use sinew::{Endpoint, NodeApi, Registration, client::ApiError, message::Rejection, prelude::*};
+use sinew::{
+    Endpoint, NodeApi, Registration,
+    client::{ApiError, DirectLinks},
+    message::Rejection,
+    prelude::*,
+};
 use sinew_testkit::NodeProcess;
 use sinew_testkit::{DEADLINE, scripted::Order, until, wait_until_asleep};
 use sinew_tests::clients::{FixtureLimits, NodeFixture};
@@ -34,8 +39,8 @@ impl Scene {
         let fixture = NodeFixture::new(limits);
         let echo = start_echo(&fixture);
         let api = NodeApi::connect(fixture.socket()).expect("the door is open");
-        let mut asking =
-            api.register_transport_address(Registration::new().direct(true)).expect("an address");
+        let registration = Registration::new().direct(DirectLinks::Always);
+        let mut asking = api.register_transport_address(registration).expect("an address");
         let to = asking.resolve("echo", DEADLINE).expect("the node answers").expect("it is registered");
         Self { fixture, echo, asking, to }
     }

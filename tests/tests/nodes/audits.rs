@@ -6,6 +6,7 @@ use std::sync::{Mutex, mpsc::sync_channel};
 use sinew::{
     NodeApi, NodeHandle, Registration,
     audit::{Account, Audit, NodeAudit, Place},
+    client::DirectLinks,
     message::Sender,
     prelude::*,
 };
@@ -144,6 +145,64 @@ fn client_messages_are_counted_until_after_its_end() {
         (audit.account(&place) == Account::default()).then(|| audit.account(&Place::OtherClients))
     });
     assert_eq!(former.delivered - former.own, 7, "{former:?}");
+}
+
+#[test]
+fn messages_on_direct_links_are_counted_until_after_their_end() {
+    const MESSAGES: u64 = 20;
+    // Given: two clients with a direct link
+    let (directory, loopback) = (TestDirectory::new(), Loopback::new());
+    let socket = directory.join("node.sock");
+    let door = socket.clone();
+    let node = loopback.node("one").configure(move |config| config.lncl.socket = Some(door));
+    let node = node.start().expect("a node");
+    let api = NodeApi::connect(&socket).expect("the door is open");
+    let register = |name: &str| {
+        let registration = Registration::new().direct(DirectLinks::Always).name(name);
+        api.register_transport_address(registration).expect("the name is free")
+    };
+    let (mut hip, mut knee) = (register("hip"), register("knee"));
+    let link = Place::DirectLink {
+        from: hip.tid().app,
+        from_name: "hip".to_owned(),
+        to: knee.tid().app,
+        to_name: "knee".to_owned(),
+    };
+    let of_link = || {
+        let audit = node.handle().audit_here();
+        balances(&audit);
+        audit.account(&link)
+    };
+    let mut number = 0;
+    until("a message goes by the link", || {
+        number += 1;
+        hip.send(knee.tid(), &Job { number }).expect("there is room");
+        drop(knee.receive(DEADLINE).expect("the node lives").expect("the message"));
+        drop(hip.receive(Duration::ZERO).expect("the node lives"));
+        (of_link().taken > 0).then_some(())
+    });
+    // When
+    let before = of_link();
+    for number in 0..MESSAGES {
+        hip.send(knee.tid(), &Job { number }).expect("there is room");
+    }
+    // Then
+    let sent = of_link();
+    assert_eq!((sent.taken - before.taken, sent.waiting), (MESSAGES, MESSAGES), "{sent:?}");
+    // When: half of them are read, and the sender ends
+    for _ in 0..MESSAGES / 2 {
+        drop(knee.receive(DEADLINE).expect("the node lives").expect("a message"));
+    }
+    drop(hip);
+    // Then: what was sent is still known, and all of it arrives
+    let former = until("it has gone, and its messages are read", || {
+        drop(knee.receive(Duration::from_millis(1)).expect("the node lives"));
+        let audit = node.handle().audit_here();
+        balances(&audit);
+        let others = audit.account(&Place::OtherDirectLinks);
+        (others.taken == sent.taken && others.unknown == 0).then_some(others)
+    });
+    assert_eq!(former.delivered, sent.taken, "{former:?}");
 }
 
 /// Returns the audit of the system of these `nodes` once no message waits or is in flight. At every moment

@@ -12,11 +12,12 @@ use serde::{Deserialize, Serialize};
 use sinew_lncl::testing::{TestNode, WATCHDOG};
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
+    tid::Tid,
     time::Time,
     wire::{Class, Kind, Payload},
 };
 
-use crate::{ApiError, Endpoint, NodeApi, Registration};
+use crate::{ApiError, DirectLinks, Endpoint, NodeApi, Registration};
 
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Counted(u64);
@@ -61,8 +62,12 @@ fn register(node: &TestNode, registration: Registration) -> Endpoint {
     NodeApi::connect(node.path()).unwrap().register_transport_address(registration).unwrap()
 }
 
+fn with_links() -> Registration {
+    Registration::new().direct(DirectLinks::Always)
+}
+
 fn endpoint(node: &TestNode) -> Endpoint {
-    register(node, Registration::new().direct(true))
+    register(node, with_links())
 }
 
 fn has_link(from: &Endpoint, to: &Endpoint) -> bool {
@@ -128,6 +133,43 @@ fn send_only_endpoint_gets_a_link() {
         one.send(other.tid(), &Counted(1)).unwrap();
         drop(other.receive(Duration::from_millis(1)).unwrap());
     }
+}
+
+/// Sends messages until there is a link.
+fn send_until_linked(one: &mut Endpoint, other: &mut Endpoint, send: impl Fn(&mut Endpoint, Tid)) {
+    let deadline = Time::now() + WATCHDOG;
+    while !(has_link(one, other) && has_link(other, one)) {
+        assert!(Time::now() < deadline, "waited for a link between {one:?} and {other:?}");
+        send(one, other.tid());
+        for endpoint in [&mut *one, &mut *other] {
+            drop(endpoint.receive(Duration::from_millis(1)).unwrap());
+        }
+    }
+}
+
+#[test]
+fn frequent_messages_get_an_automatic_link() {
+    let node = TestNode::start();
+    let automatic = || register(&node, Registration::new().direct(DirectLinks::Automatic));
+    let (mut one, mut other) = (automatic(), automatic());
+    for _ in 0..7 {
+        one.send(other.tid(), &Counted(1)).unwrap();
+        drop(other.receive(WATCHDOG).unwrap().expect("a message"));
+    }
+    assert!(!one.direct.needs_checks(), "it does not request a link for seven messages");
+    send_until_linked(&mut one, &mut other, |one, to| one.send(to, &Counted(1)).unwrap());
+}
+
+/// While the ring to the node is lent, it cannot carry the request.
+#[test]
+fn frequent_loans_get_an_automatic_link() {
+    let node = TestNode::start();
+    let mut one = register(&node, Registration::new().direct(DirectLinks::Automatic));
+    let mut other = endpoint(&node);
+    send_until_linked(&mut one, &mut other, |one, to| {
+        let loan = one.create_message(to, Kind::named("test.loan"), 8).unwrap();
+        one.loaned(loan).send().unwrap();
+    });
 }
 
 #[test]
@@ -202,7 +244,7 @@ fn link_is_established_despite_equal_request_number() {
 fn endpoint_without_links_gets_none() {
     let node = TestNode::start();
     let mut one = endpoint(&node);
-    let mut other = register(&node, Registration::new().direct(false));
+    let mut other = register(&node, Registration::new().direct(DirectLinks::Never));
     for _ in 0..20 {
         one.send(other.tid(), &Counted(1)).unwrap();
         drop(other.receive(WATCHDOG).unwrap().expect("a message"));

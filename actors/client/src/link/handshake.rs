@@ -66,7 +66,7 @@ impl RegistrationHandshake {
     ) -> Result<Self, ApiError> {
         let socket = Arc::new(connect(path, options.server_trust, deadline)?);
         let lncl = payload::lncl_of(NodeAddress::HERE);
-        let asked = asked(register, options.transport);
+        let asked = asked(register, &options);
         let frame = payload::frame(Kind::LNCL_REGISTER, Tid::NONE, lncl, &asked);
         let written = socket::Writer::new(socket.clone(), &options).write(&frame);
         let frame = BytesMut::zeroed(HEADER_LEN);

@@ -26,7 +26,7 @@ use sinew_shm::{Armed, Bell, Counters, Spin, WaitSet};
 use socket2::{Domain, SockAddr, Socket, Type};
 
 use super::{
-    ApiError,
+    ApiError, DirectLinks,
     loan::{Content, Draft},
 };
 
@@ -61,6 +61,7 @@ pub(super) struct LinkOptions {
     /// The wake-up method of this side: a set of all rings of the endpoint if a thread waits, one socket per link if a
     /// task does.
     pub(super) bell: Bell,
+    pub(super) direct_links: DirectLinks,
     /// Bytes of this side's ring of a direct link.
     pub(super) direct_ring_bytes: usize,
     /// The processes that each connection trusts as the node.
@@ -419,9 +420,10 @@ impl Reader {
 }
 
 /// Returns the registration to send, with the fields of the link itself filled in.
-fn asked(register: &Register, transport: Transport) -> Register {
-    let ring = transport == Transport::Ring && ring::is_available();
-    Register { ring, waits: !register.requires.is_empty(), ..register.clone() }
+fn asked(register: &Register, options: &LinkOptions) -> Register {
+    let ring = options.transport == Transport::Ring && ring::is_available();
+    let direct = options.direct_links.accepts();
+    Register { ring, direct, waits: !register.requires.is_empty(), ..register.clone() }
 }
 
 #[cfg(test)]

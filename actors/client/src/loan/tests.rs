@@ -10,7 +10,7 @@ use sinew_runtime::{
     wire::{Class, Kind},
 };
 
-use crate::{Endpoint, NodeApi, Registration, Transport, tests::TORQUE};
+use crate::{DirectLinks, Endpoint, NodeApi, Registration, Transport, tests::TORQUE};
 
 const RAW: Kind = Kind::named("test.raw");
 
@@ -140,7 +140,7 @@ fn loan_from_full_ring_waits_for_room_at_send() {
 
 /// Sends and receives until each has a link with the other.
 fn linked(node: &TestNode) -> (Endpoint, Endpoint) {
-    let direct = || register(node, Registration::new().direct(true));
+    let direct = || register(node, Registration::new().direct(DirectLinks::Always));
     let (mut one, mut other) = (direct(), direct());
     let deadline = Time::now() + WATCHDOG;
     send(&mut one, other.tid(), b"hello");

@@ -3,7 +3,8 @@
 
 mod world;
 
-use proptest::prelude::*;
+use proptest::{array::uniform3, prelude::*};
+use sinew_client::DirectLinks;
 use sinew_runtime::wire::Class;
 
 use self::world::{APPS, Step, World, tid};
@@ -38,8 +39,17 @@ fn step_with_faults() -> impl Strategy<Value = Step> {
     ]
 }
 
-fn run(steps: Vec<Step>) -> World {
-    let mut world = World::new();
+/// The settings of all applications: each accepts links or not, and requests them early, late, or never.
+fn direct_links() -> impl Strategy<Value = [DirectLinks; APPS]> {
+    uniform3(prop_oneof![
+        4 => Just(DirectLinks::Always),
+        4 => Just(DirectLinks::Automatic),
+        1 => Just(DirectLinks::Never),
+    ])
+}
+
+fn run(direct_links: [DirectLinks; APPS], steps: Vec<Step>) -> World {
+    let mut world = World::new(direct_links);
     for step in steps {
         world.step(step);
     }
@@ -57,16 +67,18 @@ proptest! {
 
     #[test]
     fn path_changes_keep_messages_complete_and_ordered(
+        links in direct_links(),
         steps in proptest::collection::vec(step_without_faults(), 1..400),
     ) {
-        run(steps);
+        run(links, steps);
     }
 
     #[test]
     fn restarts_keep_messages_ordered_and_unique(
+        links in direct_links(),
         steps in proptest::collection::vec(step_with_faults(), 1..400),
     ) {
-        run(steps);
+        run(links, steps);
     }
 }
 
@@ -88,8 +100,7 @@ fn ring_messages_of_dead_sender_stay_in_order() {
     finish(world);
 }
 
-#[test]
-fn busy_peers_end_with_one_open_link() {
+fn busy_peers_end_with_one_open_link(links: DirectLinks) {
     let steps = (0..400).flat_map(|_| {
         let send = |from, to| Step::Send { from, to, class: Class::Control, confirm: true, times: 1 };
         let both = |step: fn(usize) -> Step| [step(0), step(1)];
@@ -103,11 +114,21 @@ fn busy_peers_end_with_one_open_link() {
             .chain(both(Step::FinishMaking))
             .chain([Step::PollLink(0, 1), Step::PollLink(1, 0), Step::PollLink(0, 1), Step::PollLink(1, 0)])
     });
-    let world = run(steps.collect());
+    let world = run([links; APPS], steps.collect());
     let number = world.apps[0].routes.link(tid(1)).expect("a link");
     assert_eq!(world.apps[1].routes.link(tid(0)), Some(number));
     assert!(world.apps[0].routes.is_open(tid(1)) && world.apps[1].routes.is_open(tid(0)));
     assert!(world.on_links > 300, "{} went directly", world.on_links);
+}
+
+#[test]
+fn busy_peers_that_always_have_links_end_with_one_open_link() {
+    busy_peers_end_with_one_open_link(DirectLinks::Always);
+}
+
+#[test]
+fn busy_peers_with_automatic_links_end_with_one_open_link() {
+    busy_peers_end_with_one_open_link(DirectLinks::Automatic);
 }
 
 /// The newest value of a Stream replaces an older one that waits at the node. It also replaces one of another

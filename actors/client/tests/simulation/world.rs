@@ -13,9 +13,12 @@ use std::{
 };
 
 use bytes::Bytes;
-use sinew_client::routes::{
-    Directness, HangUpAction, LinkNumber, MARKS_AFTER_END, MarkEffect, NodeDelivery, OutcomeEffect, Route,
-    Routes, Unread,
+use sinew_client::{
+    DirectLinks,
+    routes::{
+        HangUpAction, LinkNumber, MARKS_AFTER_END, MarkEffect, NodeDelivery, OutcomeEffect, Route, Routes,
+        Unread,
+    },
 };
 use sinew_runtime::{
     mailbox::ClassQueue,
@@ -87,6 +90,7 @@ pub(super) struct App {
     tid: Tid,
     incarnation: u64,
     alive: bool,
+    direct_links: DirectLinks,
     pub(super) routes: Routes,
     sequence: u64,
     correlation: u64,
@@ -105,12 +109,13 @@ pub(super) struct App {
 }
 
 impl App {
-    fn new(tid: Tid, incarnation: u64) -> Self {
+    fn new(tid: Tid, incarnation: u64, direct_links: DirectLinks) -> Self {
         Self {
             tid,
             incarnation,
             alive: true,
-            routes: Routes::new(tid, Directness::Allowed),
+            direct_links,
+            routes: Routes::new(tid, direct_links),
             sequence: 0,
             correlation: 0,
             pending: BTreeMap::new(),
@@ -153,8 +158,9 @@ pub(super) struct World {
 }
 
 impl World {
-    pub(super) fn new() -> Self {
-        let apps = (0..APPS).map(|index| App::new(tid(index), index as u64)).collect();
+    pub(super) fn new(direct_links: [DirectLinks; APPS]) -> Self {
+        let apps = direct_links.into_iter().enumerate();
+        let apps = apps.map(|(index, links)| App::new(tid(index), index as u64, links)).collect();
         Self {
             now: Time::ZERO,
             apps,
@@ -175,7 +181,7 @@ impl World {
     /// Returns a world in which the first application has switched to its link with the second one, which has
     /// not polled since. Between request and switch the first one did the steps of `meanwhile`.
     pub(super) fn switching(meanwhile: &[Step]) -> Self {
-        let mut world = Self::new();
+        let mut world = Self::new([DirectLinks::Always; APPS]);
         let send = |class| Step::Send { from: 0, to: 1, class, confirm: false, times: 1 };
         let ask = [
             send(Class::Control),
@@ -224,7 +230,10 @@ impl World {
                 self.on_links += 1;
                 self.end_mut(number, tid(from)).ring.push_back(message);
             }
-            Route::ViaNode => app.to_node.push_back(message),
+            Route::ViaNode => {
+                app.to_node.push_back(message);
+                app.routes.sent_through_node(destination, self.now);
+            }
             Route::RequestLink => {
                 app.to_node.push_back(message);
                 let correlation = app.correlate();

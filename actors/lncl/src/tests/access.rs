@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sinew_client::{NodeApi, Registration};
+use sinew_client::{DirectLinks, NodeApi, Registration};
 use sinew_model::{
     accept_limiter::{IN_A_ROW_MAX, PAUSE},
     facts::AppFact,
@@ -53,8 +53,8 @@ fn messages_of_two_processes_stay_under_the_access_list() {
     // Given: two clients that both request a direct link, and a list that allows all their messages
     let node = TestNode::start_guarded("[[rule]]\nfrom = ['*']\nto = ['*']\n");
     let api = NodeApi::connect(node.path()).unwrap();
-    let register =
-        || api.register_transport_address(Registration::new().direct(true).deadline(WATCHDOG)).unwrap();
+    let registration = Registration::new().direct(DirectLinks::Always).deadline(WATCHDOG);
+    let register = || api.register_transport_address(registration.clone()).unwrap();
     let (mut taker, mut requester) = (register(), register());
     let to = taker.tid();
     let is_over = AtomicBool::new(false);

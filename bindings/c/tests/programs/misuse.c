@@ -400,7 +400,7 @@ int main(int argc, char **argv)
     in_another_hand(endpoint);
     whose_it_is_after_an_error(endpoint);
     one_at_a_time("rings", 0);
-    one_at_a_time("direct links", SINEW_DIRECT);
+    one_at_a_time("direct links", SINEW_DIRECT_ALWAYS);
     one_at_a_time("the socket", SINEW_SOCKET_ONLY);
     unregistered();
     two_threads(endpoint);

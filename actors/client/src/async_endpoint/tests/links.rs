@@ -15,7 +15,7 @@ use tokio::time::timeout;
 
 use super::{RAW, number_of, numbered, runtime};
 use crate::{
-    AsyncEndpoint, Endpoint, NodeApi, Registration,
+    AsyncEndpoint, DirectLinks, Endpoint, NodeApi, Registration,
     direct::{Room, Sent},
     incoming::WhenFull,
     node_link::NodeLink,
@@ -24,7 +24,7 @@ use crate::{
 };
 
 fn with_links() -> Registration {
-    Registration::new().direct(true).stall_timeout(WATCHDOG)
+    Registration::new().direct(DirectLinks::Always).stall_timeout(WATCHDOG)
 }
 
 async fn task(node: &TestNode) -> AsyncEndpoint {

@@ -162,7 +162,7 @@ fn refused_introduction_leaves_no_descriptor_in_socket() {
 fn send_only_endpoint_learns_end_of_stuck_peer() {
     // Given: a full link with a peer that reads nothing.
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let mut one = register(&node, Registration::new().direct(true).stall_timeout(Duration::from_millis(1)));
+    let mut one = register(&node, with_links().stall_timeout(Duration::from_millis(1)));
     let mut other = endpoint(&node);
     link(&mut one, &mut other);
     while one.send(other.tid(), &Counted(1)).is_ok() {}

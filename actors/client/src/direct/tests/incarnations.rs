@@ -35,7 +35,7 @@ fn messages_before_peer_end_are_received_first() {
 fn former_incarnations_ring_is_read_before_the_next() {
     // given
     let node = TestNode::start();
-    let wanted = || Registration::new().direct(true).fixed_address(AppAddress::fixed(7).unwrap());
+    let wanted = || with_links().fixed_address(AppAddress::fixed(7).unwrap());
     let (mut one, mut other) = (register(&node, wanted()), endpoint(&node));
     link(&mut one, &mut other);
     for number in 1..=3 {
@@ -66,8 +66,7 @@ fn former_incarnations_ring_is_read_before_the_next() {
 fn kept_ring_messages_survive_sender_end() {
     // given
     let node = TestNode::start();
-    let (mut one, mut other) =
-        (endpoint(&node), register(&node, Registration::new().direct(true).inbox_capacity(1)));
+    let (mut one, mut other) = (endpoint(&node), register(&node, with_links().inbox_capacity(1)));
     link(&mut one, &mut other);
     for number in 1..=5 {
         one.send(other.tid(), &Counted(number)).unwrap();
@@ -170,7 +169,7 @@ fn links_outlive_node_and_numbers_are_not_reused() {
     // given: a link with messages that were not received
     let mut node = TestNode::start();
     let path = node.path();
-    let fixed = |index| Registration::new().direct(true).fixed_address(AppAddress::fixed(index).unwrap());
+    let fixed = |index| with_links().fixed_address(AppAddress::fixed(index).unwrap());
     let (mut one, mut other) = (register(&node, fixed(1)), register(&node, fixed(2)));
     link(&mut one, &mut other);
     let former = one.direct.open[0].number;

@@ -114,7 +114,7 @@ fn waiting_value_counts_as_undelivered_at_link_end() {
 #[test]
 fn stuck_peer_costs_stall_timeout_but_not_link() {
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let mut one = register(&node, Registration::new().direct(true).stall_timeout(Duration::from_millis(10)));
+    let mut one = register(&node, with_links().stall_timeout(Duration::from_millis(10)));
     let mut other = endpoint(&node);
     link(&mut one, &mut other);
     let mut taken = 0;
@@ -156,7 +156,7 @@ fn long_message_is_split_for_short_ring() {
 fn mutual_waits_for_room_read_meanwhile() {
     // given: rings that hold a fraction of the messages that each sends before it receives anything
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let wanted = || Registration::new().direct(true).stall_timeout(WATCHDOG / 2);
+    let wanted = || with_links().stall_timeout(WATCHDOG / 2);
     let (mut one, mut other) = (register(&node, wanted()), register(&node, wanted()));
     link(&mut one, &mut other);
     let (one_tid, other_tid, number) = (one.tid(), other.tid(), one.direct.open[0].number);
@@ -187,7 +187,7 @@ fn send_long(from: &mut Endpoint, to: Tid, length: usize) -> Result<(), ApiError
 #[test]
 fn timed_out_long_message_delivers_nothing() {
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let mut one = register(&node, Registration::new().direct(true).stall_timeout(Duration::from_millis(1)));
+    let mut one = register(&node, with_links().stall_timeout(Duration::from_millis(1)));
     let mut other = endpoint(&node);
     link(&mut one, &mut other);
     let to = other.tid();
@@ -215,7 +215,7 @@ fn timed_out_long_message_delivers_nothing() {
 #[test]
 fn exit_after_timed_out_message_keeps_accepted_ones() {
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let mut one = register(&node, Registration::new().direct(true).stall_timeout(Duration::from_millis(10)));
+    let mut one = register(&node, with_links().stall_timeout(Duration::from_millis(10)));
     let mut other = endpoint(&node);
     link(&mut one, &mut other);
     let mut sent = 0;
@@ -247,7 +247,7 @@ fn exit_after_timed_out_message_keeps_accepted_ones() {
 fn long_message_cut_by_link_end_goes_through_node_once() {
     // given
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let mut one = register(&node, Registration::new().direct(true).stall_timeout(WATCHDOG / 2));
+    let mut one = register(&node, with_links().stall_timeout(WATCHDOG / 2));
     let mut other = endpoint(&node);
     link(&mut one, &mut other);
     let (to, peer) = (other.tid(), one.tid());
@@ -276,7 +276,7 @@ fn long_message_cut_by_link_end_goes_through_node_once() {
 #[test]
 fn newest_stream_value_arrives_despite_sender_exit() {
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
-    let mut one = register(&node, Registration::new().direct(true).stall_timeout(WATCHDOG));
+    let mut one = register(&node, with_links().stall_timeout(WATCHDOG));
     let mut other = endpoint(&node);
     link(&mut one, &mut other);
     for number in 1..=1_000 {
@@ -382,7 +382,7 @@ fn no_new_links_while_all_closing_threads_are_busy() {
 fn stuck_peer_costs_stall_timeout_only_once() {
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
     let stall_timeout = WATCHDOG / 30;
-    let mut one = register(&node, Registration::new().direct(true).stall_timeout(stall_timeout));
+    let mut one = register(&node, with_links().stall_timeout(stall_timeout));
     let (mut other, mut third) = (endpoint(&node), endpoint(&node));
     link(&mut one, &mut other);
     while one.send(other.tid(), &Counted(1)).is_ok() {}

@@ -22,8 +22,8 @@
 use std::{path::Path, time::Duration};
 
 use sinew_c::conformance::{
-    Asked, Endpoint, InHand, Made, Outcome as Code, SINEW_DIRECT, SINEW_SOCKET_ONLY, SINEW_WITHOUT_RECONNECT,
-    Status, Told,
+    Asked, Endpoint, InHand, Made, Outcome as Code, SINEW_DIRECT_ALWAYS, SINEW_DIRECT_AUTOMATIC,
+    SINEW_DIRECT_NEVER, SINEW_SOCKET_ONLY, SINEW_WITHOUT_RECONNECT, Status, Told,
 };
 use sinew_runtime::{
     outcome::{MemberOutcome, Outcome},
@@ -33,7 +33,7 @@ use sinew_runtime::{
     wire::{Class, Header, Kind, Message, Payload},
 };
 
-use crate::{ApiError, Registration, Transport, reconnect::ReconnectPolicy};
+use crate::{ApiError, DirectLinks, Registration, Transport, reconnect::ReconnectPolicy};
 
 const RAW: Kind = Kind::named("test.raw");
 
@@ -157,7 +157,9 @@ fn asked(registration: &Registration) -> Asked {
     let (register, link) = (&registration.register, &registration.link);
     let chosen = [
         (link.transport == Transport::Socket, SINEW_SOCKET_ONLY),
-        (register.direct, SINEW_DIRECT),
+        (link.direct_links == DirectLinks::Automatic, SINEW_DIRECT_AUTOMATIC),
+        (link.direct_links == DirectLinks::Always, SINEW_DIRECT_ALWAYS),
+        (link.direct_links == DirectLinks::Never, SINEW_DIRECT_NEVER),
         (matches!(registration.returning, ReconnectPolicy::Never), SINEW_WITHOUT_RECONNECT),
     ];
     Asked {

@@ -65,7 +65,7 @@ impl World {
             // Link ends that the node had given to the former incarnation were closed with it.
             self.links.values_mut().for_each(|link| link.close(tid(at)));
             self.incarnations += 1;
-            self.apps[at] = App::new(tid(at), self.incarnations);
+            self.apps[at] = App::new(tid(at), self.incarnations, self.apps[at].direct_links);
         }
     }
 
