@@ -39,7 +39,7 @@ use peer::{Marks, Peer, PeerRing, Switch};
 
 /// Maximum number of direct links per endpoint, including those being set up. Messages beyond it go through
 /// the node.
-pub(super) const LINKS_MAX: usize = 64;
+pub(super) use sinew_protocol::link_counts::LINKS_MAX;
 /// Maximum number of remembered destinations without a link, refused or counted. One more replaces the one
 /// that expires first.
 const UNLINKED_MAX: usize = 256;

@@ -321,7 +321,18 @@ impl<'a> Collected<'a> {
         };
         let refused =
             entries.iter().filter(|entry| is_its(&entry.place)).map(|entry| entry.account.refused).sum();
-        App { report, unreported, line: lines.into_iter().find(|line| line.tid == Some(tid)), refused }
+        let direct = entries.iter().filter_map(|entry| match &entry.place {
+            Place::DirectLink { from, to, .. } if *from == tid.app => Some((*to, entry.account)),
+            _ => None,
+        });
+        let direct = direct.collect();
+        App {
+            report,
+            unreported,
+            line: lines.into_iter().find(|line| line.tid == Some(tid)),
+            refused,
+            direct,
+        }
     }
 
     /// Returns whether the access list of the target's node lets the source send to it, if both are applications.

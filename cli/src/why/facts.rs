@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use sinew::{
     AppAddress, NodeAddress, Tid,
+    audit::Account,
     inspect::{
         AccessReport, AccessVerdict, AppReport, Missing, NodeReport, PeerReport, StreamReport, TreeLine,
     },
@@ -131,6 +132,8 @@ pub(super) struct App {
     pub(super) line: Option<TreeLine>,
     /// Number of refused messages for it so far.
     pub(super) refused: u64,
+    /// What it has sent on direct links, by the addresses of the receivers.
+    pub(super) direct: Vec<(AppAddress, Account)>,
 }
 
 impl TrafficEnd {

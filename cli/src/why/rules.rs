@@ -2,6 +2,7 @@
 
 mod access;
 mod address;
+mod direct;
 mod groups;
 mod guards;
 mod keys;
@@ -81,6 +82,8 @@ pub(super) fn judge(facts: &Facts) -> Vec<Step> {
     for ((end, other), ping) in [(a, b), (b, a)].into_iter().zip([back, there]) {
         steps.application((end, other), ping, facts);
     }
+    steps.direct(a, b);
+    steps.direct(b, a);
     steps.handled((a, b), true);
     steps.handled((b, a), false);
     steps.guarded(a, b);

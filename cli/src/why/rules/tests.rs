@@ -3,6 +3,7 @@
 mod access;
 mod address;
 mod cases;
+mod direct;
 mod guards;
 mod keys;
 mod many;
@@ -128,7 +129,7 @@ fn app(name: &str) -> App {
         waiting_most: Some(3),
         strategy: None,
     };
-    App { report: Some(report), unreported: None, line: Some(line), refused: 0 }
+    App { report: Some(report), unreported: None, line: Some(line), refused: 0, direct: Vec::new() }
 }
 
 /// The hip at 10.0.0.1, and knee.drive on the knee at 10.0.0.2.
