@@ -32,6 +32,7 @@ const WOKEN: &[Path] = &[
     Path::BareFutex,
     Path::UnixStream,
     Path::Iceoryx2Event,
+    Path::Endpoints(Way::Default),
     Path::Endpoints(Way::Direct),
     Path::Endpoints(Way::Ring),
     Path::Endpoints(Way::TaskDirect),

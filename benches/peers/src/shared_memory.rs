@@ -28,6 +28,8 @@ const BLOCK: Kind = Kind::named("peers.block");
 /// How messages travel between the two endpoints.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Way {
+    /// As an endpoint that asks for nothing.
+    Default,
     /// Rings from each to the node.
     Ring,
     /// Rings from each to the other.
@@ -43,6 +45,7 @@ pub(crate) enum Way {
 impl Way {
     pub(crate) const fn name(self) -> &'static str {
         match self {
+            Self::Default => "sinew_default",
             Self::Ring => "sinew_ring",
             Self::Direct => "sinew_direct",
             Self::DirectSpin => "sinew_direct_spin",
@@ -58,6 +61,7 @@ impl Way {
     fn registration(self, name: &str) -> Registration {
         let registration = Registration::new().name(name);
         match self {
+            Self::Default => registration,
             Self::Ring | Self::TaskRing => registration.direct(DirectLinks::Never),
             Self::Direct | Self::TaskDirect => {
                 registration.direct(DirectLinks::Always).direct_ring_bytes(DIRECT_RING_BYTES)

@@ -12,8 +12,8 @@ use sinew::{
 
 use sinew_testkit::DEADLINE;
 
-/// The environment variable that selects the transport: `socket`, `ring`, or `direct` (rings and direct
-/// links). Without it the default applies.
+/// The environment variable that selects the transport: `socket`, `ring` (without direct links), `direct` (with a
+/// link to each peer), or `automatic` (with links to frequent peers). Without it the default applies.
 const TRANSPORT: &str = "SINEW_TEST_TRANSPORT";
 
 /// The fixed address number `index`.
@@ -29,7 +29,8 @@ pub(super) fn wishes() -> Registration {
         Ok("socket") => registration.transport(Transport::Socket),
         Ok("ring") => registration.transport(Transport::Ring).direct(DirectLinks::Never),
         Ok("direct") => registration.transport(Transport::Ring).direct(DirectLinks::Always),
-        Ok(other) => panic!("{TRANSPORT} is {other:?}: none of socket, ring, direct"),
+        Ok("automatic") => registration.transport(Transport::Ring).direct(DirectLinks::Automatic),
+        Ok(other) => panic!("{TRANSPORT} is {other:?}: none of socket, ring, direct, automatic"),
         Err(_) => registration,
     }
 }
