@@ -31,7 +31,7 @@ use reorder::ReorderBuffer;
 use rustix::net::Shutdown;
 use sinew_protocol::{
     payload::{self, Gone, Introduce, Introduction, Observe, Registered, Switch},
-    ring::{self as rings, Exchange, ExchangeError, RingError},
+    ring::{ExchangeError, RingError},
 };
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Rejection, Ticket},

@@ -37,7 +37,7 @@ impl ObservedLinks {
     }
 
     /// Observes the links of these applications, and of no others.
-    pub(super) fn observe(&self, router: &Router, apps: &BTreeSet<AppAddress>) {
+    pub fn observe(&self, router: &Router, apps: &BTreeSet<AppAddress>) {
         for (client, observation) in self.lock().iter_mut() {
             observation.is_wanted = apps.contains(&client.app);
             observation.tell(router, *client);

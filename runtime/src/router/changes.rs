@@ -9,7 +9,7 @@ use super::{
 };
 use crate::{
     lock,
-    tid::{AppAddress, NodeAddress},
+    tid::{AppAddress, NodeAddress, Tid},
 };
 
 impl Router {

@@ -50,9 +50,9 @@ impl Direct {
             let waiting = link.waiting() + usize::from(cut.is_some());
             self.add_unsent(peer, waiting as u64);
         }
-        if let Some(link) = self.established(number) {
-            let account = std::mem::take(&mut link.account);
-            self.accounts.iter_mut().for_each(|accounts| accounts.end(account));
+        let account = self.established(number).map(|link| std::mem::take(&mut link.account));
+        if let (Some(accounts), Some(account)) = (&mut self.accounts, account) {
+            accounts.end(account);
         }
         self.open.retain(|link| link.number != number);
         self.index_slots();

@@ -264,7 +264,7 @@ mod tests {
         slow_close::pass(&theirs, &[0; OFFER_BYTES], passed).unwrap();
         // When: it is taken and refused.
         let (report, reported) = sync_channel(1);
-        std::thread::spawn(move || {
+        thread::spawn(move || {
             let ours = Arc::new(ours);
             let PeerHalf { received, copies } = PeerHalf::take(&ours).map_err(|why| why.to_string()).unwrap();
             let is_refused = received.into_offer().is_err();

@@ -28,7 +28,7 @@ use sinew_runtime::{
     wire::{FrameCodec, Kind, Message},
 };
 use sinew_shm::{
-    Any, AnyError, Armed, BellKind, Capacity, Consumer, Corrupt, Ends, HangUp, LoanError, PollResult,
+    Any, AnyError, Armed, BellKind, Capacity, Consumer, Corrupt, Counters, Ends, HangUp, LoanError, PollResult,
     Polling, Producer, Region, RoomError, Wait, WaitSet, Waiter,
 };
 use tokio::sync::Notify;
