@@ -84,9 +84,9 @@ pub(crate) enum Command {
     /// Shows the messages that an application receives and sends: decoded payloads, type, class, source, age,
     /// and each type's rate once a second
     ///
-    /// The copies come from the application's node, as far as it has room for them: others are counted, and
-    /// the application does not wait. Messages over direct links between processes (`Registration::direct`)
-    /// are not shown. With --json each line is an object.
+    /// The copies come from the application's node, as far as it has room for them, and those of messages on
+    /// direct links from the application's process: others are counted, and the application does not wait. With
+    /// --json each line is an object.
     #[command(after_help = r#"Examples:
   sinew watch knee.drive --received
   sinew watch drives --kind demo.stop         messages to a group, at each member

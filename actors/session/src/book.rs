@@ -119,9 +119,12 @@ impl Book {
     /// lock: a sender waits for it as long as for another sender's message.
     pub fn takings(&self) -> Vec<ClientTaking> {
         let clients = lock(&self.0).clients.clone();
+        let links = direct_links::progress(&linked(clients.values()));
         let taking = |(id, client): (ClientId, Client)| {
             let Client { app, name, outlet, links: _ } = client;
-            Some(ClientTaking { id, app, name, taking: outlet.taking()? })
+            let taking = outlet.taking()?;
+            let taking = links.get(&app).map_or(taking, |progress| progress.beside(taking));
+            Some(ClientTaking { id, app, name, taking })
         };
         clients.into_iter().filter_map(taking).collect()
     }
@@ -135,13 +138,11 @@ impl Book {
                 (place, Account::of_mailbox(mailbox.account(class)))
             }));
         }
-        let mut linked = Vec::new();
-        for Client { app, name, outlet, links } in clients {
+        read.extend(direct_links::accounts(&linked(&clients), former_links));
+        for Client { app, name, outlet, links: _ } in clients {
             let place = Place::Client { app, name: name.to_string() };
             read.push((place, Account::from(&outlet.account())));
-            linked.extend(links.map(|links| direct_links::Reader { app, name, reading: links.read() }));
         }
-        read.extend(direct_links::accounts(&linked, former_links));
         read
     }
 
@@ -180,6 +181,15 @@ impl Places {
             !is_over
         });
     }
+}
+
+/// Reads the counters of those that can have direct links.
+fn linked<'a>(clients: impl IntoIterator<Item = &'a Client>) -> Vec<direct_links::Reader> {
+    let read = |client: &Client| {
+        let reading = client.links.as_ref()?.read();
+        Some(direct_links::Reader { app: client.app, name: client.name.clone(), reading })
+    };
+    clients.into_iter().filter_map(read).collect()
 }
 
 /// Returns the account of all classes of a mailbox.

@@ -4,7 +4,10 @@ use std::{collections::BTreeMap, sync::Arc};
 
 use sinew_runtime::tid::AppAddress;
 
-use crate::{counts::Account, place::Place};
+use crate::{counts::Account, outlet::Taking, place::Place};
+
+/// The golden ratio in 64 bits: odd, and far from small multiples.
+const MARK_STEP: u64 = 0x9e37_79b9_7f4a_7c15;
 
 /// The messages that a client counts on one of its links, or on several.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -57,6 +60,42 @@ pub(crate) struct Reader {
     pub(crate) app: AppAddress,
     pub(crate) name: Arc<str>,
     pub(crate) reading: DirectReading,
+}
+
+/// How far an application has read the messages on its direct links.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Progress {
+    taken: u64,
+    leaves_some: bool,
+}
+
+impl Progress {
+    /// Returns the progress with these messages and those through the node together.
+    pub(crate) const fn beside(self, through_node: Taking) -> Taking {
+        let (first, second) = through_node.mark;
+        // Both change when messages are taken. A multiple of an odd number, so that one does not undo the other.
+        let mark = (first, second.wrapping_add(self.taken.wrapping_mul(MARK_STEP)));
+        Taking { mark, leaves_some: through_node.leaves_some || self.leaves_some }
+    }
+}
+
+/// Returns the progress of each application with a direct link.
+pub(crate) fn progress(clients: &[Reader]) -> BTreeMap<AppAddress, Progress> {
+    let mut sent: BTreeMap<(AppAddress, AppAddress), u64> = BTreeMap::new();
+    for Reader { app, reading, .. } in clients {
+        for (peer, counts) in &reading.links {
+            sent.insert((*app, *peer), counts.sent.saturating_sub(counts.superseded));
+        }
+    }
+    let mut progress: BTreeMap<AppAddress, Progress> = BTreeMap::new();
+    for Reader { app, reading, .. } in clients.iter().filter(|client| !client.reading.links.is_empty()) {
+        let of_app = progress.entry(*app).or_default();
+        for (peer, counts) in &reading.links {
+            of_app.taken = of_app.taken.wrapping_add(counts.taken);
+            of_app.leaves_some |= sent.get(&(*peer, *app)).is_some_and(|sent| *sent > counts.taken);
+        }
+    }
+    progress
 }
 
 /// Returns the account of each link in each direction, and that of the links of which only one end is left or none.
@@ -139,6 +178,20 @@ mod tests {
         assert_eq!(of(1), one);
         assert_eq!(of(2), Account { taken: 4, delivered: 3, waiting: 1, ..Account::default() });
         assert_eq!(read.last(), Some(&(Place::OtherDirectLinks, Account::default())));
+    }
+
+    #[test]
+    fn unread_message_on_a_link_leaves_some() {
+        let clients = |taken| {
+            [
+                client(1, &[(2, counts(5, 1, 0))], DirectCounts::default()),
+                client(2, &[(1, counts(0, 0, taken))], DirectCounts::default()),
+            ]
+        };
+        let taking = Taking { mark: (1, 2), leaves_some: false };
+        let of = |taken: u64| progress(&clients(taken))[&AppAddress::new(2)].beside(taking);
+        assert!(of(3).leaves_some && !of(4).leaves_some);
+        assert_ne!(of(3).mark, of(4).mark);
     }
 
     #[test]

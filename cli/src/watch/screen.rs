@@ -69,7 +69,7 @@ impl Screen {
         if !self.is_json {
             let target = clean(target);
             output::note(format_args!(
-                "{target} ({app}): received (->) and sent (<-) messages; Ctrl-C ends it. Not shown: direct links between processes"
+                "{target} ({app}): received (->) and sent (<-) messages; Ctrl-C ends it"
             ));
         }
     }

@@ -1,7 +1,10 @@
 //! Counts the messages on direct links where the node can read them, even after the end of this process.
 
 use sinew_protocol::link_counts::{LINKS_MAX, LinkCounters, LinkCounts};
-use sinew_runtime::tid::Tid;
+use sinew_runtime::{
+    tid::Tid,
+    wire::{Flags, Header, Kind},
+};
 use sinew_shm::Counters;
 
 /// The counters of an endpoint.
@@ -21,6 +24,9 @@ struct Account {
     counters: LinkCounters,
     counts: LinkCounts,
 }
+
+/// What a receiver of protected messages sends back to their sender (`sinew_runtime::protection`).
+const ECHO: Kind = Kind::named("sinew.echo");
 
 const _: () = assert!(LINKS_MAX == u64::BITS as usize, "a bit for each place");
 
@@ -53,26 +59,34 @@ impl LinkAccounts {
 }
 
 impl LinkAccount {
-    pub(super) fn sent(&mut self) {
-        self.count(|counts| counts.sent += 1);
+    pub(super) fn sent(&mut self, header: &Header) {
+        self.count(header, |counts| counts.sent += 1);
     }
 
     /// Counts a value that replaces another one before that was written.
-    pub(super) fn superseded(&mut self) {
-        self.count(|counts| {
+    pub(super) fn superseded(&mut self, header: &Header) {
+        self.count(header, |counts| {
             counts.sent += 1;
             counts.superseded += 1;
         });
     }
 
-    pub(super) fn took(&mut self) {
-        self.count(|counts| counts.taken += 1);
+    pub(super) fn took(&mut self, header: &Header) {
+        self.count(header, |counts| counts.taken += 1);
     }
 
-    fn count(&mut self, count: impl FnOnce(&mut LinkCounts)) {
-        if let Some(Account { counters, counts, .. }) = &mut self.0 {
+    fn count(&mut self, header: &Header, count: impl FnOnce(&mut LinkCounts)) {
+        if let Some(Account { counters, counts, .. }) = &mut self.0
+            && is_counted(header)
+        {
             count(counts);
             counters.set(*counts);
         }
     }
+}
+
+/// Returns whether this is a message for the program of its receiver: no outcome, and none that the endpoint answers or
+/// keeps by itself, since a program that only sends need not read those.
+fn is_counted(header: &Header) -> bool {
+    header.kind.is_user() && !header.flags.has(Flags::REPLY) && ![Kind::PING, ECHO].contains(&header.kind)
 }

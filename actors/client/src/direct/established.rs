@@ -13,7 +13,7 @@ use sinew_protocol::ring::{RingError, RingFrames, Taken};
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Rejection, Ticket},
     tid::Tid,
-    wire::{Class, Flags, HEADER_LEN, Kind, Message},
+    wire::{Class, Flags, HEADER_LEN, Header, Kind, Message},
 };
 use sinew_shm::{Armed, Consumer, Ends, HangUp, WaitSet};
 
@@ -59,8 +59,8 @@ pub(crate) struct EstablishedLink {
     pub(super) is_stalled: bool,
     /// Counts its messages for the node.
     pub(super) account: LinkAccount,
-    /// Whether the frame that has begun is counted when it is whole.
-    counts_rest: bool,
+    /// The frame that has begun, to be counted when it is whole.
+    begun: Option<Header>,
 }
 
 /// The two ends of a link.
@@ -117,7 +117,7 @@ impl EstablishedLink {
             has_forged: false,
             is_stalled: false,
             account: LinkAccount::default(),
-            counts_rest: false,
+            begun: None,
         }
     }
 
@@ -150,7 +150,7 @@ impl EstablishedLink {
                 if loan.is_of(&self.writer) && (header.class != Class::Stream || self.parked.is_empty()) =>
             {
                 loan.publish(&header);
-                self.account.sent();
+                self.account.sent(&header);
                 Ok(Put::Taken)
             }
             // Behind waiting values the message goes as a copy.
@@ -170,8 +170,8 @@ impl EstablishedLink {
         let is_stream = message.header.class == Class::Stream;
         let same_kind = |other: &&mut Message| is_stream && other.header.kind == message.header.kind;
         if let Some(parked) = self.parked.iter_mut().find(same_kind) {
+            self.account.superseded(&message.header);
             *parked = message;
-            self.account.superseded();
             self.flush();
             return Ok(Put::Taken);
         }
@@ -179,19 +179,20 @@ impl EstablishedLink {
             self.flush();
         }
         // An earlier message of the same class goes first.
+        let header = message.header;
         let put = if is_stream && !self.parked.is_empty() { Put::Full(message) } else { self.put(message)? };
         match put {
             Put::Full(message) if is_stream && self.parked.len() < PARKED_MAX => {
                 self.parked.push(message);
-                self.account.sent();
+                self.account.sent(&header);
                 Ok(Put::Taken)
             }
             Put::Taken => {
-                self.account.sent();
+                self.account.sent(&header);
                 Ok(Put::Taken)
             }
             Put::Begun => {
-                self.counts_rest = true;
+                self.begun = Some(header);
                 Ok(Put::Begun)
             }
             Put::Full(message) => Ok(Put::Full(message)),
@@ -240,7 +241,7 @@ impl EstablishedLink {
 
     /// Withdraws the partly written message: the peer receives nothing of it.
     pub(super) fn withdraw(&mut self) {
-        self.counts_rest = false;
+        self.begun = None;
         if let Some(rest) = &mut self.rest {
             rest.withdraw();
         }
@@ -259,8 +260,8 @@ impl EstablishedLink {
         let is_whole = self.rest.as_mut().map_or(Ok(true), Rest::continue_writing)?;
         if is_whole {
             self.rest = None;
-            if std::mem::take(&mut self.counts_rest) {
-                self.account.sent();
+            if let Some(header) = self.begun.take() {
+                self.account.sent(&header);
             }
         }
         Ok(is_whole)
@@ -344,9 +345,7 @@ impl EstablishedLink {
         let is_for_us =
             header.destination == self.own && (header.kind.is_user() || header.kind == Kind::OUTCOME);
         if header.source == self.peer && is_for_us {
-            if header.kind.is_user() {
-                self.account.took();
-            }
+            self.account.took(header);
             return Ok(LinkRead::Message(message));
         }
         self.refuse(&message);
