@@ -29,11 +29,11 @@ use super::Registration;
 pub enum DirectLinks {
     /// Accepts links, and requests one to each peer with frequent messages: at the 8th message within one
     /// second. A control loop at 1 kHz has its link after 8 ms; an occasional command costs no memory.
+    #[default]
     Automatic,
     /// Accepts links, and requests one at the first message to a peer.
     Always,
     /// Sends and receives all messages through the node.
-    #[default]
     Never,
 }
 

@@ -179,16 +179,15 @@ impl Registration {
 
     /// Sets when this endpoint has direct links with other processes of the node. A direct link is a pair of
     /// rings that bypass the node, if LNCL introduces the two and both allow it; otherwise their messages go
-    /// through the node. It costs a ring of each side ([`direct_ring_bytes`](Self::direct_ring_bytes)),
-    /// allocated at once, and some time in the call that sets it up. Default [`DirectLinks::Never`]; only with
-    /// [`Transport::Ring`].
+    /// through the node. It costs a ring of each side ([`direct_ring_bytes`](Self::direct_ring_bytes)), which
+    /// another thread of the process makes. Default [`DirectLinks::Automatic`]; only with [`Transport::Ring`].
     ///
     /// # Examples
     ///
     /// ```
     /// use sinew::{Registration, client::DirectLinks};
     ///
-    /// // The shortest way to another process of the node, if that one accepts links, too.
+    /// // The link is there before the control loop begins, if one message is sent before that.
     /// let registration = Registration::new().name("knee.sensor").direct(DirectLinks::Always);
     /// ```
     #[must_use]

@@ -131,7 +131,7 @@
 #define SINEW_DIRECT_ALWAYS 2
 
 /**
- * For `links` of `sinew_options`: all messages go through the node. This is the default.
+ * For `links` of `sinew_options`: all messages go through the node.
  */
 #define SINEW_DIRECT_NEVER 32
 
@@ -682,7 +682,7 @@ typedef struct sinew_options {
     /**
      * The transport of the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT_AUTOMATIC`, `SINEW_DIRECT_ALWAYS`,
      * `SINEW_DIRECT_NEVER`, `SINEW_SPIN_ADAPTIVE`, `SINEW_WITHOUT_RECONNECT`. Default: shared memory if the
-     * system has it, all messages through the node, and a reconnect when the connection has ended.
+     * system has it, `SINEW_DIRECT_AUTOMATIC`, and a reconnect when the connection has ended.
      */
     uint32_t links;
     /**

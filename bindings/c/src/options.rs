@@ -24,7 +24,7 @@ pub const SINEW_DIRECT_AUTOMATIC: u32 = 16;
 /// For `links` of `sinew_options`: direct links with other processes that also have them. The endpoint accepts
 /// links, and requests one at the first message to a peer.
 pub const SINEW_DIRECT_ALWAYS: u32 = 2;
-/// For `links` of `sinew_options`: all messages go through the node. This is the default.
+/// For `links` of `sinew_options`: all messages go through the node.
 pub const SINEW_DIRECT_NEVER: u32 = 32;
 /// For `links` of `sinew_options`: `spin_ns` is the maximum spin time. The endpoint spins about twice as long
 /// as messages lately took to arrive, and not at all while they take longer than `spin_ns`. Without `spin_ns`
@@ -75,7 +75,7 @@ pub struct Options {
     pub spin_ns: u64,
     /// The transport of the messages: `SINEW_SOCKET_ONLY`, `SINEW_DIRECT_AUTOMATIC`, `SINEW_DIRECT_ALWAYS`,
     /// `SINEW_DIRECT_NEVER`, `SINEW_SPIN_ADAPTIVE`, `SINEW_WITHOUT_RECONNECT`. Default: shared memory if the
-    /// system has it, all messages through the node, and a reconnect when the connection has ended.
+    /// system has it, `SINEW_DIRECT_AUTOMATIC`, and a reconnect when the connection has ended.
     pub links: u32,
     /// Zero.
     pub reserved: u32,
