@@ -7,7 +7,7 @@ use sinew_figures::{Alone, Beside, End, Figures, Pace, Pinning, Rounds, process}
 use crate::{
     crowds::{self, Flood},
     ends::{self, Memory},
-    raw, tasks,
+    mesh, raw, tasks,
 };
 
 /// The environment variable that makes a run short.
@@ -22,6 +22,8 @@ pub(crate) enum Way {
     Socket,
     /// Rings from each to the node.
     Ring,
+    /// As an endpoint that asks for nothing: a direct link to a frequent peer.
+    Default,
     /// Rings from each to the other, once they are introduced.
     Direct,
     /// The same, the applications looking before they sleep.
@@ -33,13 +35,21 @@ pub(crate) enum Way {
 }
 
 impl Way {
-    const ALL: [Self; 6] =
-        [Self::Socket, Self::Ring, Self::Direct, Self::DirectSpin, Self::TaskRing, Self::TaskDirect];
+    const ALL: [Self; 7] = [
+        Self::Socket,
+        Self::Ring,
+        Self::Default,
+        Self::Direct,
+        Self::DirectSpin,
+        Self::TaskRing,
+        Self::TaskDirect,
+    ];
 
     const fn name(self) -> &'static str {
         match self {
             Self::Socket => "socket",
             Self::Ring => "ring",
+            Self::Default => "default",
             Self::Direct => "direct",
             Self::DirectSpin => "direct_spin",
             Self::TaskRing => "task_ring",
@@ -49,7 +59,7 @@ impl Way {
 
     const fn references(self) -> &'static [Reference] {
         match self {
-            Self::Socket | Self::Ring | Self::Direct | Self::TaskRing | Self::TaskDirect => {
+            Self::Socket | Self::Ring | Self::Default | Self::Direct | Self::TaskRing | Self::TaskDirect => {
                 &[Reference::BareFutex, Reference::UnixStream]
             }
             Self::DirectSpin => &[Reference::BarePoll],
@@ -59,7 +69,9 @@ impl Way {
     /// An endpoint that polls without sleeping needs a different CPU than its peer.
     const fn spins(self) -> bool {
         match self {
-            Self::Socket | Self::Ring | Self::Direct | Self::TaskRing | Self::TaskDirect => false,
+            Self::Socket | Self::Ring | Self::Default | Self::Direct | Self::TaskRing | Self::TaskDirect => {
+                false
+            }
             Self::DirectSpin => true,
         }
     }
@@ -67,7 +79,7 @@ impl Way {
     /// Whether the applications are tasks: then there are round trips only.
     const fn is_of_tasks(self) -> bool {
         match self {
-            Self::Socket | Self::Ring | Self::Direct | Self::DirectSpin => false,
+            Self::Socket | Self::Ring | Self::Default | Self::Direct | Self::DirectSpin => false,
             Self::TaskRing | Self::TaskDirect => true,
         }
     }
@@ -111,6 +123,8 @@ enum What {
     Flood,
     /// Round trips of Control beside a flood of Bulk to the same receiver.
     Commands,
+    /// 64 addresses that all send to all others.
+    Mesh,
 }
 
 /// A case: one transport, one measurement, one CPU assignment.
@@ -125,8 +139,15 @@ pub(crate) struct Case {
 pub(crate) fn all(is_short: bool) -> impl Iterator<Item = Case> {
     let back_to_back = |bytes| What::RoundTrips { bytes, pace: Pace::BackToBack };
     let paced = |bytes| What::RoundTrips { bytes, pace: Pace::EveryMillisecond };
-    let mut things =
-        vec![back_to_back(1000), paced(1000), What::TableOne, What::FanIn, What::Flood, What::Commands];
+    let mut things = vec![
+        back_to_back(1000),
+        paced(1000),
+        What::TableOne,
+        What::FanIn,
+        What::Flood,
+        What::Commands,
+        What::Mesh,
+    ];
     if std::env::var_os(ends::CPP_ECHO).is_some() {
         things.push(What::TableOneCpp);
     }
@@ -143,6 +164,8 @@ pub(crate) fn all(is_short: bool) -> impl Iterator<Item = Case> {
             things.clone().into_iter().map(move |what| Case { way, what, pinning })
         })
         .filter(|case| !case.way.is_of_tasks() || matches!(case.what, What::RoundTrips { .. }))
+        // An endpoint that spins needs a CPU of its own.
+        .filter(|case| !(case.what == What::Mesh && (case.way.spins() || case.pinning != Pinning::Anywhere)))
         // A socket lends nothing.
         .filter(|case| !(matches!(case.what, What::Loan { .. }) && case.way == Way::Socket))
         // The C++ case exists for the default transport only.
@@ -160,6 +183,7 @@ impl Case {
             What::FanIn => format!("{way}-fan_in-{pinning}"),
             What::Flood => format!("{way}-flood-{pinning}"),
             What::Commands => format!("{way}-commands-{pinning}"),
+            What::Mesh => format!("{way}-mesh-{pinning}"),
         }
     }
 
@@ -186,6 +210,7 @@ impl Case {
             What::TableOneCpp => self.table_one("table_1_cpp", "cpp_echo"),
             What::FanIn => self.fan_in(if is_short { 150 } else { 1_500 }),
             What::Flood => self.flood(if is_short { 20_480 } else { 204_800 }),
+            What::Mesh => self.mesh(if is_short { 20 } else { 200 }),
             What::Commands => self.commands(if is_short { 1_000 } else { 10_000 }),
         }
     }
@@ -312,6 +337,12 @@ impl Case {
         .report();
     }
 
+    fn mesh(self, rounds: usize) {
+        let per_second = mesh::measure(self.way, rounds, self.pinning);
+        let counts = [("messages_per_second", per_second as u64)];
+        self.report("none", &Figures::new(), &counts);
+    }
+
     fn report(self, figure: &str, seen: &Figures, counts: &[(&str, u64)]) {
         Alone { bench: "lncl", case: &self.name(), figure, seen, counts }.report();
     }
@@ -352,6 +383,10 @@ pub(crate) fn play(role: &str) -> ExitCode {
         ["commanded", way, pinning, socket] => {
             raw::pin(pinning, End::Echoing);
             crowds::answer_commands(way_named(way), socket);
+        }
+        ["mesh", way, pinning, socket, index, rounds] => {
+            raw::pin(pinning, End::Other);
+            mesh::take_part(way_named(way), socket, number(index) as usize, number(rounds) as usize);
         }
         ["sender", way, pinning, socket, packets] => {
             raw::pin(pinning, End::Other);

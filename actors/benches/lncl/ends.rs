@@ -81,6 +81,7 @@ pub(crate) fn register(way: Way, socket: &str, name: &str) -> Endpoint {
         Way::Socket => Registration::new().transport(Transport::Socket),
         Way::Ring => Registration::new().direct(DirectLinks::Never),
         Way::TaskRing | Way::TaskDirect => unreachable!("its ends are in tasks.rs"),
+        Way::Default => Registration::new(),
         Way::Direct => direct(),
         Way::DirectSpin => direct().spin(Spin::For(LOOKS)),
     };
