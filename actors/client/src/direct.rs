@@ -217,6 +217,7 @@ impl Direct {
         match self.routes.route(destination, now) {
             Route::Direct(number) => Some(number),
             Route::ViaNode => None,
+            Route::RequestLink if !self.routes.is_link_useful(now) => None,
             Route::RequestLink if !self.has_room() => {
                 self.routes.no_room(destination, now);
                 None

@@ -13,7 +13,8 @@ use super::Registration;
 /// | `Always` | yes | at the first message to it |
 /// | `Never` | no | never |
 ///
-/// An endpoint has 64 links at most. Messages to further peers go through the node.
+/// An endpoint has 64 links at most, 16 if they are automatic: with more frequent peers than that, all of them are
+/// reached through the node, which is quicker then. Messages to further peers go through the node, too.
 ///
 /// # Examples
 ///

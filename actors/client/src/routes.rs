@@ -46,6 +46,10 @@ const UNLINKED_MAX: usize = 256;
 /// Number of messages to one destination within [`COUNT_INTERVAL`] at which an endpoint with automatic links
 /// requests one. A control loop at 1 kHz has its link after 8 ms; an occasional command costs no memory.
 const FREQUENT_MESSAGES: u32 = 8;
+/// Maximum number of automatic links per endpoint, and of frequent peers with which it requests any: among many
+/// endpoints that all send to all others, each link carries little, and the node wakes a receiver for more messages at
+/// once. See `docs/decisions/0013-two-routes.md` for the figures.
+const AUTOMATIC_LINKS_MAX: usize = 16;
 /// Time in which the messages to one destination are counted. Below 8 Hz the wake that a link saves is not
 /// worth a ring of each side.
 const COUNT_INTERVAL: Duration = Duration::from_secs(1);
@@ -169,7 +173,9 @@ impl Routes {
             Some(Peer::Asked { .. }) if self.own < peer => Err(Rejection::QueueFull),
             Some(Peer::Asked { .. }) => Ok(()),
             Some(Peer::Offered { .. } | Peer::Direct { .. }) => Err(Rejection::QueueFull),
-            Some(Peer::Refused { .. } | Peer::Counted { .. }) | None if self.links < LINKS_MAX => Ok(()),
+            Some(Peer::Refused { .. } | Peer::Counted { .. }) | None if self.links < self.links_max() => {
+                Ok(())
+            }
             Some(Peer::Refused { .. } | Peer::Counted { .. }) | None => Err(Rejection::QueueFull),
         }
     }
@@ -388,8 +394,35 @@ impl Routes {
         if self.may_have_link(destination) { Route::RequestLink } else { Route::ViaNode }
     }
 
+    /// Returns whether one more link is useful. If an endpoint with automatic links has too many frequent peers, all of
+    /// them are reached through the node for a while.
+    pub fn is_link_useful(&mut self, now: Time) -> bool {
+        let is_frequent = |peer: &Peer| match peer {
+            Peer::Counted { until, count } => now < *until && *count >= FREQUENT_MESSAGES / 2,
+            Peer::Refused { .. } => false,
+            Peer::Asked { .. } | Peer::Offered { .. } | Peer::Direct { .. } => true,
+        };
+        let is_useful = self.direct_links != DirectLinks::Automatic
+            || self.peers.values().filter(|peer| is_frequent(peer)).count() <= AUTOMATIC_LINKS_MAX;
+        if !is_useful {
+            let counted = self.peers.values_mut().filter(|peer| matches!(peer, Peer::Counted { .. }));
+            for peer in counted.filter(|peer| is_frequent(peer)) {
+                *peer = Peer::Refused { until: now + LONG_RETRY };
+            }
+        }
+        is_useful
+    }
+
+    const fn links_max(&self) -> usize {
+        match self.direct_links {
+            DirectLinks::Automatic => AUTOMATIC_LINKS_MAX,
+            DirectLinks::Always => LINKS_MAX,
+            DirectLinks::Never => 0,
+        }
+    }
+
     fn may_have_link(&self, destination: Tid) -> bool {
-        self.links < LINKS_MAX
+        self.links < self.links_max()
             && destination != self.own
             && destination.node == self.own.node
             && destination.is_single()

@@ -66,6 +66,34 @@ fn automatic_counts_each_destination_alone() {
 }
 
 #[test]
+fn automatic_link_is_not_useful_among_many_frequent_peers() {
+    let useful_among = |peers: u32, direct_links| {
+        let mut routes = routes(direct_links);
+        (0..7).for_each(|millis| (1..=peers).for_each(|peer| drop(send(&mut routes, tid(peer), at(millis)))));
+        // Occasional ones do not count.
+        (100..150).for_each(|peer| drop(send(&mut routes, tid(peer), at(7))));
+        let is_useful = routes.is_link_useful(at(8));
+        let asks = (1..=peers).any(|peer| send(&mut routes, tid(peer), at(9)));
+        assert!(is_useful || !asks, "after that, none of them gets a link");
+        is_useful
+    };
+    let most = u32::try_from(AUTOMATIC_LINKS_MAX).unwrap();
+    assert!(useful_among(most, DirectLinks::Automatic));
+    assert!(!useful_among(most + 1, DirectLinks::Automatic));
+    assert!(useful_among(most + 1, DirectLinks::Always));
+}
+
+#[test]
+fn automatic_accepts_few_links() {
+    let mut routes = routes(DirectLinks::Automatic);
+    for number in 1..=AUTOMATIC_LINKS_MAX as u32 {
+        assert_eq!(routes.on_introduction(tid(number)), Ok(()));
+        routes.offered(tid(number), LinkNumber(number.into()));
+    }
+    assert_eq!(routes.on_introduction(tid(100)), Err(Rejection::QueueFull));
+}
+
+#[test]
 fn automatic_accepts_introductions() {
     let mut routes = routes(DirectLinks::Automatic);
     assert_eq!(routes.on_introduction(tid(1)), Ok(()));
