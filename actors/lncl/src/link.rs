@@ -164,6 +164,10 @@ fn watch<B: AsRawFd>(bell: B) -> Result<AsyncFd<B>, ExchangeError> {
 }
 
 /// The writing half.
+#[expect(
+    clippy::large_enum_variant,
+    reason = "there is one for each connection, and a message takes no detour"
+)]
 pub(super) enum ClientSocket {
     Plain(Arc<UnixStream>),
     Ring(RingSocket),
@@ -285,6 +289,7 @@ fn corrupt(error: LoanError) -> io::Error {
 }
 
 /// The reading half.
+#[expect(clippy::large_enum_variant, reason = "as above")]
 pub(super) enum ClientReader {
     Plain(Reader),
     Ring(RingReader),

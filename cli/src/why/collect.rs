@@ -321,11 +321,14 @@ impl<'a> Collected<'a> {
         };
         let refused =
             entries.iter().filter(|entry| is_its(&entry.place)).map(|entry| entry.account.refused).sum();
-        let direct = entries.iter().filter_map(|entry| match &entry.place {
-            Place::DirectLink { from, to, .. } if *from == tid.app => Some((*to, entry.account)),
-            _ => None,
-        });
-        let direct = direct.collect();
+        let mut direct = Vec::new();
+        for entry in &entries {
+            if let Place::DirectLink { from, to, .. } = &entry.place
+                && *from == tid.app
+            {
+                direct.push((*to, entry.account));
+            }
+        }
         App {
             report,
             unreported,

@@ -169,7 +169,7 @@ impl Direct {
                 self.answer(introduction, Outcome::Rejected(Rejection::QueueFull), node);
             }
             (Stage::Accepting { switch }, Ok(Made::Rings(rings, share))) => {
-                let link = self.establish(peer, number, socket, rings, share);
+                let link = self.establish(Pair { own: self.terms.own, peer, number, socket }, rings, share);
                 self.read_from(link);
                 let sent = node.ask(self.switch_to(peer, number));
                 self.routes.connected(peer, number, sent, now);
@@ -183,7 +183,8 @@ impl Direct {
             (Stage::Connecting { correlation }, made) if self.routes.introduced(peer, correlation) => {
                 match made {
                     Ok(Made::Rings(rings, share)) => {
-                        let link = self.establish(peer, number, socket, rings, share);
+                        let link =
+                            self.establish(Pair { own: self.terms.own, peer, number, socket }, rings, share);
                         self.held.push(link);
                         let sent = node.ask(self.switch_to(peer, number));
                         self.routes.connected(peer, number, sent, now);
@@ -200,19 +201,12 @@ impl Direct {
         }
     }
 
-    fn establish(
-        &mut self,
-        peer: Tid,
-        number: LinkNumber,
-        socket: PeerSocket,
-        rings: UnusedRings,
-        share: Share,
-    ) -> EstablishedLink {
+    fn establish(&mut self, pair: Pair, rings: UnusedRings, share: Share) -> EstablishedLink {
         let (producer, consumer) = rings.take();
-        let writer = ring::Writer::new(Arc::clone(&socket), producer, &self.terms.options);
-        let pair = Pair { own: self.terms.own, peer, number, socket };
+        let writer = ring::Writer::new(Arc::clone(&pair.socket), producer, &self.terms.options);
+        let account = self.accounts.as_mut().map(|accounts| accounts.begin(pair.peer)).unwrap_or_default();
         let mut link = EstablishedLink::new(pair, writer, consumer, share, &self.terms);
-        link.account = self.accounts.as_mut().map(|accounts| accounts.begin(peer)).unwrap_or_default();
+        link.account = account;
         link
     }
 

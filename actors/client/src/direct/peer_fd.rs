@@ -114,7 +114,7 @@ impl LocalHalf {
     pub(super) fn join(mut self, theirs: Offer) -> Result<UnusedRings, ExchangeError> {
         let theirs = self.exchange.as_ref().expect("it is there until it is joined").accept(theirs)?;
         let rings = self.exchange.take().expect("it is there until it is joined").join(theirs);
-        Ok(UnusedRings(Some(rings)))
+        Ok(UnusedRings(Some(Box::new(rings))))
     }
 }
 
@@ -128,17 +128,18 @@ impl Drop for LocalHalf {
 }
 
 /// Both rings of a link that is not established yet. Dropping them drains their wake-up sockets.
-pub(super) struct UnusedRings(Option<(Producer, Consumer)>);
+pub(super) struct UnusedRings(Option<Box<(Producer, Consumer)>>);
 
 impl UnusedRings {
     pub(super) fn take(mut self) -> (Producer, Consumer) {
-        self.0.take().expect("they are there until they are taken")
+        *self.0.take().expect("they are there until they are taken")
     }
 }
 
 impl Drop for UnusedRings {
     fn drop(&mut self) {
-        if let Some((producer, consumer)) = &self.0 {
+        if let Some(rings) = &self.0 {
+            let (producer, consumer) = &**rings;
             // spec: LNCL-18
             [producer.fd(), consumer.fd()].into_iter().for_each(empty_bell);
         }

@@ -69,9 +69,13 @@ fn automatic_counts_each_destination_alone() {
 fn automatic_link_is_not_useful_among_many_frequent_peers() {
     let useful_among = |peers: u32, direct_links| {
         let mut routes = routes(direct_links);
-        (0..7).for_each(|millis| (1..=peers).for_each(|peer| drop(send(&mut routes, tid(peer), at(millis)))));
+        for peer in 1..=peers {
+            requested_at(&mut routes, tid(peer), 0..7);
+        }
         // Occasional ones do not count.
-        (100..150).for_each(|peer| drop(send(&mut routes, tid(peer), at(7))));
+        for peer in 100..150 {
+            send(&mut routes, tid(peer), at(7));
+        }
         let is_useful = routes.is_link_useful(at(8));
         let asks = (1..=peers).any(|peer| send(&mut routes, tid(peer), at(9)));
         assert!(is_useful || !asks, "after that, none of them gets a link");
