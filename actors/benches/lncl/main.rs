@@ -2,8 +2,8 @@
 //!
 //! `cargo bench -p sinew --bench lncl [-- [--short] WORD...]` runs the cases that have every WORD in their
 //! names, each in fresh processes: a node, and the two applications. The applications communicate through
-//! LNCL (`socket`, `ring`; `task_ring`: as tokio tasks) or directly (`direct`, `task_direct`; `default`: once they are frequent peers). They use the
-//! blocking NodeAPI unless they are tasks. The standard output has JSON lines, the standard error the same as
+//! LNCL (`socket`, `ring`; `task_ring`: as tokio tasks) or directly (`direct`, `task_direct`; `default`: once they are
+//! frequent peers). They use the blocking NodeAPI unless they are tasks. The standard output has JSON lines, the standard error the same as
 //! rows of a table. `--short` runs a tenth of the rounds of the cases at 1000 bytes. Times are microseconds.
 //! Nothing here asserts a time.
 //!
@@ -18,7 +18,8 @@
 //! - `flood`: 1000 bytes as fast as a window of 128 unacknowledged ones allows.
 //! - `commands`: 64 bytes of class Control there and back every millisecond, beside a flood of Bulk of 1000 bytes from
 //!   the same sender to the same receiver, and without it.
-//! - `mesh`: 64 addresses in eight processes, each of which sends 1000 bytes to all others as fast as they are received.
+//! - `mesh`: 64 addresses in eight processes, each of which sends 1000 bytes to all others as fast as they are
+//!   received.
 //!
 //! Each case runs three times: placed by the scheduler, all on one CPU, and one CPU for each application (the
 //! node then has none of its own). The references are a hand-written ring in shared memory without any

@@ -317,8 +317,8 @@ impl Direct {
         let _ = self.terms.options.set().is_some_and(WaitSet::take_wake);
     }
 
-    /// Continues the setup of links. Checks periodically for closed links and for messages to repeat. Returns whether it has done so, which is also the
-    /// time to check all rings.
+    /// Continues the setup of links. Checks periodically for closed links and for messages to repeat. Returns whether
+    /// it has done so, which is also the time to check all rings.
     pub(super) fn check(&mut self, now: Time, node: &mut NodeWriter<'_>) -> bool {
         self.continue_setups(now, node);
         if now >= self.next_flush {

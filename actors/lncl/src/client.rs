@@ -2,6 +2,7 @@
 
 mod barrier;
 mod end;
+mod introduction;
 pub(super) mod liveness;
 mod memberships;
 mod orders;
@@ -43,7 +44,7 @@ use super::{
     reader::{Reader, Received},
     registrar,
     server::{Server, refuse, send_refusal},
-    session::{Order, Session},
+    session::Session,
     unauthenticated::Slot,
 };
 use crate::State;
@@ -65,7 +66,11 @@ pub(super) async fn serve(
     let mut reader = Reader::new(REGISTER_BYTES_MAX);
     let mut session = Session::default();
     // spec: LNCL-1
-    let register = match tokio::time::timeout(HANDSHAKE, introduce(&mut reader, &stream, &mut session)).await
+    let register = match tokio::time::timeout(
+        HANDSHAKE,
+        introduction::receive(&mut reader, &stream, &mut session),
+    )
+    .await
     {
         Ok(Ok(Some(register))) => {
             drop(place);
@@ -95,31 +100,6 @@ pub(super) async fn serve(
     session.registered(client.tid);
     let end = client.live(reader, &mut session).await;
     client.finish(end).await;
-}
-
-/// Returns the first frame, or `None` if the peer closed the connection before it.
-async fn introduce(
-    reader: &mut Reader,
-    stream: &UnixStream,
-    session: &mut Session,
-) -> Result<Option<Register>, String> {
-    let Some(message) = reader.next(stream).await.map_err(|error| error.to_string())? else {
-        return Ok(None);
-    };
-    match session.handle(message) {
-        Order::Register(register) => Ok(Some(register)),
-        Order::End(violation) => Err(violation.to_string()),
-        Order::Route(_)
-        | Order::Settle { .. }
-        | Order::SetMember { .. }
-        | Order::RefuseMembership { .. }
-        | Order::Resolve { .. }
-        | Order::Introduce { .. }
-        | Order::Switch { .. }
-        | Order::Observe(_)
-        | Order::RefuseMessage { .. }
-        | Order::Unregister => Err("an unregistered connection can only register".to_owned()),
-    }
 }
 
 /// The other end of a connection.

@@ -152,8 +152,8 @@ pub trait Applications: Send + Sync {
     /// Returns the application of this node called `name`.
     fn resolve(&self, name: &str) -> Option<AppAddress>;
 
-    /// Observes the direct links of these applications of this node, and of no others: their processes report the messages
-    /// to the routing table's tap.
+    /// Observes the direct links of these applications of this node, and of no others: their processes report the
+    /// messages to the routing table's tap.
     fn observe_links(&self, apps: &BTreeSet<AppAddress>);
 
     /// Adds the rejections that `node` reports. Calls `refuse` for each that `node` cannot have caused.

@@ -1,4 +1,5 @@
-//! The counts of messages on direct links, in the counters of a client's region; `docs/protocol/lncl.md` has the layout.
+//! The counts of messages on direct links, in the counters of a client's region; `docs/protocol/lncl.md` has the
+//! layout.
 
 use sinew_runtime::tid::Tid;
 use sinew_shm::Counters;

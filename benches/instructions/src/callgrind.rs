@@ -34,7 +34,9 @@ impl Counted {
     /// Runs this program in another role until it ends.
     pub(crate) fn run(&mut self, role: &str) -> Result<(), String> {
         let has_run = process::has_run(self.command(role));
-        has_run.then_some(()).ok_or_else(|| format!("the process with the role `{role}` failed under valgrind"))
+        has_run
+            .then_some(())
+            .ok_or_else(|| format!("the process with the role `{role}` failed under valgrind"))
     }
 
     fn command(&mut self, role: &str) -> Command {
@@ -42,7 +44,10 @@ impl Counted {
         let plain = process::command(role);
         let mut command = Command::new("valgrind");
         command.args(["--quiet", "--tool=callgrind"]);
-        command.arg(format!("--callgrind-out-file={}", self.directory.join(format!("{}.out", self.started)).display()));
+        command.arg(format!(
+            "--callgrind-out-file={}",
+            self.directory.join(format!("{}.out", self.started)).display()
+        ));
         command.arg(plain.get_program());
         for (name, value) in plain.get_envs() {
             match value {
@@ -57,7 +62,8 @@ impl Counted {
     pub(crate) fn total(self) -> Result<u64, String> {
         let count = |number: u32| {
             let path = self.directory.join(format!("{number}.out"));
-            let text = fs::read_to_string(&path).map_err(|why| format!("callgrind left no {}: {why}", path.display()))?;
+            let text = fs::read_to_string(&path)
+                .map_err(|why| format!("callgrind left no {}: {why}", path.display()))?;
             total_of(&text).ok_or_else(|| format!("callgrind left no total in {}", path.display()))
         };
         (1..=self.started).map(count).sum()

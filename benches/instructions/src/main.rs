@@ -75,7 +75,12 @@ fn run(wanted: &[Path], stores: bool) -> Result<bool, String> {
         let verdict = Verdict::of(count, stored);
         is_well &= verdict != Verdict::Grown;
         let shown = stored.map_or_else(|| "-".to_owned(), |stored| stored.to_string());
-        println!("{:16} {count:>12} {shown:>12} {:>8} {}", path.name(), stored::change(count, stored), verdict.words());
+        println!(
+            "{:16} {count:>12} {shown:>12} {:>8} {}",
+            path.name(),
+            stored::change(count, stored),
+            verdict.words()
+        );
         counted.insert(path.name().to_owned(), count);
     }
     if stores {

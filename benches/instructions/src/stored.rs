@@ -45,13 +45,15 @@ impl Verdict {
 
 /// The change in percent, as text.
 pub(crate) fn change(count: u64, stored: Option<u64>) -> String {
-    stored.map_or_else(String::new, |stored| format!("{:+.1} %", 100.0 * (count as f64 / stored as f64 - 1.0)))
+    stored
+        .map_or_else(String::new, |stored| format!("{:+.1} %", 100.0 * (count as f64 / stored as f64 - 1.0)))
 }
 
 /// The compiler, the C library and the profile.
 pub(crate) fn key() -> Result<String, String> {
     let output = Command::new("ldd").arg("--version").output();
-    let output = output.map_err(|why| format!("`ldd --version`, which names the C library, does not run: {why}"))?;
+    let output =
+        output.map_err(|why| format!("`ldd --version`, which names the C library, does not run: {why}"))?;
     let text = String::from_utf8_lossy(&output.stdout);
     // "ldd (Debian GLIBC 2.36-9+deb12u14) 2.36"
     let version = text.lines().next().and_then(|line| line.rsplit(' ').next()).unwrap_or("unknown");

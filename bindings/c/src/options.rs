@@ -301,7 +301,8 @@ mod tests {
     #[test]
     fn several_direct_links_flags_are_rejected() {
         let mut options = zeroed(size_of::<Options>());
-        let several = [SINEW_DIRECT_AUTOMATIC | SINEW_DIRECT_ALWAYS, SINEW_DIRECT_ALWAYS | SINEW_DIRECT_NEVER];
+        let several =
+            [SINEW_DIRECT_AUTOMATIC | SINEW_DIRECT_ALWAYS, SINEW_DIRECT_ALWAYS | SINEW_DIRECT_NEVER];
         for links in several {
             options.links = links;
             let error = format!("{:?}", options.registration().unwrap_err());

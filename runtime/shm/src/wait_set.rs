@@ -92,8 +92,8 @@ impl WaitSet {
         Ok(Self(Arc::new(Shared { page, announcement, sleep, ready, open, is_woken, slots })))
     }
 
-    /// Ends the owner's wait, or its next one, from another thread of this process: the owner has something to do beside
-    /// its rings.
+    /// Ends the owner's wait, or its next one, from another thread of this process: the owner has something to do
+    /// beside its rings.
     pub fn wake(&self) {
         // SYNC: an owner that finds this has a view of all that was done before.
         self.0.is_woken.store(true, Ordering::Release);

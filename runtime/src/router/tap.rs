@@ -2,7 +2,8 @@
 //!
 //! A [`Tap`] is stored in the table itself, which every sender reads anyway: without one, a message costs one
 //! read of a pointer beside the table's root. It sees the messages that are handed over in the node's
-//! process. Those on direct links between other processes are reported to it: [`Router::observe`].
+//! process. Those on direct links between other processes are reported to it:
+//! [`Router::observe`](super::Router::observe).
 
 use std::sync::Arc;
 

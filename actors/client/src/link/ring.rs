@@ -28,8 +28,8 @@ use sinew_runtime::{
     wire::{FrameCodec, Kind, Message},
 };
 use sinew_shm::{
-    Any, AnyError, Armed, BellKind, Capacity, Consumer, Corrupt, Counters, Ends, HangUp, LoanError, PollResult,
-    Polling, Producer, Region, RoomError, Wait, WaitSet, Waiter,
+    Any, AnyError, Armed, BellKind, Capacity, Consumer, Corrupt, Counters, Ends, HangUp, LoanError,
+    PollResult, Polling, Producer, Region, RoomError, Wait, WaitSet, Waiter,
 };
 use tokio::sync::Notify;
 use tokio_util::codec::Decoder;

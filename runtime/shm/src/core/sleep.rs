@@ -14,8 +14,8 @@
 //! sleeper's word (the memory is not its own), so it records the number for which it has rung, and rings once
 //! for each.
 //!
-//! A sleeper for a set of rings announces to all of them in one place (`wait_set.rs`). Its number names the place of its
-//! wake: 4k+1 for the bell of all its peers, 4k+3 for each peer's own word (`any.rs`), 4k while awake.
+//! A sleeper for a set of rings announces to all of them in one place (`wait_set.rs`). Its number names the place
+//! of its wake: 4k+1 for the bell of all its peers, 4k+3 for each peer's own word (`any.rs`), 4k while awake.
 
 use std::sync::atomic::Ordering;
 
