@@ -3,8 +3,8 @@
 //! `cargo bench -p sinew --bench lncl [-- [--short] WORD...]` runs the cases that have every WORD in their
 //! names, each in fresh processes: a node, and the two applications. The applications communicate through
 //! LNCL (`socket`, `ring`; `task_ring`: as tokio tasks) or directly (`direct`, `task_direct`; `default`: once they are
-//! frequent peers). They use the blocking NodeAPI unless they are tasks. The standard output has JSON lines, the standard error the same as
-//! rows of a table. `--short` runs a tenth of the rounds of the cases at 1000 bytes. Times are microseconds.
+//! frequent peers). They use the blocking NodeAPI unless they are tasks. The standard output has JSON lines, the
+//! standard error the same as rows of a table. `--short` runs a tenth of the rounds of the cases at 1000 bytes. Times are microseconds.
 //! Nothing here asserts a time.
 //!
 //! - Round trips at 8 B, 64 B, 1000 B, 64 KiB and 1 MiB, back to back and one every millisecond.

@@ -23,6 +23,9 @@ use clap::Parser;
 
 use crate::{paths::Path, stored::Verdict};
 
+/// Runs of a path at most.
+const RUNS: usize = 3;
+
 /// Counts the instructions of a round trip on six paths of a message, and compares them with stored figures.
 ///
 /// Needs valgrind. Exit code 1: a path has at least 3 % more instructions than stored.
@@ -58,6 +61,19 @@ fn main() -> ExitCode {
     }
 }
 
+/// Counts the instructions of a path. Which thread wakes first changes a count by a few percent, so the least of
+/// [`RUNS`] runs counts, or the first that is enough.
+fn least(path: Path, is_enough: impl Fn(u64) -> bool) -> Result<u64, String> {
+    let mut least = path.instructions()?;
+    for _ in 1..RUNS {
+        if is_enough(least) {
+            break;
+        }
+        least = least.min(path.instructions()?);
+    }
+    Ok(least)
+}
+
 /// Counts and compares these paths. Returns whether none has grown.
 fn run(wanted: &[Path], stores: bool) -> Result<bool, String> {
     let key = stored::key()?;
@@ -70,8 +86,8 @@ fn run(wanted: &[Path], stores: bool) -> Result<bool, String> {
     let mut counted = before.clone();
     let mut is_well = true;
     for path in wanted {
-        let count = path.instructions()?;
         let stored = before.get(path.name()).copied();
+        let count = least(*path, |count| !stores && Verdict::of(count, stored) != Verdict::Grown)?;
         let verdict = Verdict::of(count, stored);
         is_well &= verdict != Verdict::Grown;
         let shown = stored.map_or_else(|| "-".to_owned(), |stored| stored.to_string());

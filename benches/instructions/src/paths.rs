@@ -5,8 +5,8 @@ use sinew_figures::process::Process;
 use crate::{callgrind::Counted, nodes::At};
 
 /// Round trips of the two runs of a path. Links are made within the first ones.
-const FEW: u32 = 500;
-const MANY: u32 = 2_500;
+const FEW: u32 = 200;
+const MANY: u32 = 1_000;
 
 /// A path of a message of 1000 bytes, there and back.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
