@@ -4,8 +4,8 @@
 //! names, each in fresh processes: a node, and the two applications. The applications communicate through
 //! LNCL (`socket`, `ring`; `task_ring`: as tokio tasks) or directly (`direct`, `task_direct`; `default`: once they are
 //! frequent peers). They use the blocking NodeAPI unless they are tasks. The standard output has JSON lines, the
-//! standard error the same as rows of a table. `--short` runs a tenth of the rounds of the cases at 1000 bytes. Times are microseconds.
-//! Nothing here asserts a time.
+//! standard error the same as rows of a table. `--short` runs a tenth of the rounds of the cases at 1000 bytes.
+//! Times are microseconds. Nothing here asserts a time.
 //!
 //! - Round trips at 8 B, 64 B, 1000 B, 64 KiB and 1 MiB, back to back and one every millisecond.
 //! - `loan`: the same at 64 KiB and 1 MiB through rings that hold them in one piece, written in the ring,
