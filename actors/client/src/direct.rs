@@ -17,6 +17,7 @@ mod reorder;
 mod room;
 #[cfg(test)]
 mod tests;
+mod turns;
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -39,7 +40,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Class, Flags, Kind, Message},
 };
-use sinew_shm::{Any, AnyError, Counters, Ready, Spin, WaitSet};
+use sinew_shm::{Any, AnyError, Counters, Spin, WaitSet};
 
 use super::{
     ApiError, DirectLinks,
@@ -57,6 +58,7 @@ use observer::Observer;
 use peer_fd::{DEFERRED_CLOSE, DeferredClose};
 pub(super) use reorder::ReorderDecision;
 pub(super) use room::Room;
+use turns::Turns;
 
 /// Bytes of a direct link's ring, if the configuration sets no other size.
 pub(super) const RING_BYTES: usize = 64 * 1024;
@@ -97,6 +99,7 @@ pub(super) struct Direct {
     pub(super) open: Vec<EstablishedLink>,
     /// The index in `open` of each place in the set of all rings.
     by_slot: BTreeMap<u8, usize>,
+    turns: Turns,
     /// Messages that arrived through the node but were sent after messages that are still in that link's
     /// ring.
     reordered: BTreeMap<Tid, ReorderBuffer>,
@@ -192,6 +195,7 @@ impl Direct {
             held: Vec::new(),
             open: Vec::new(),
             by_slot: BTreeMap::new(),
+            turns: Turns::default(),
             reordered: BTreeMap::new(),
             next_check: Time::ZERO,
             next_poll: Time::ZERO,
@@ -297,13 +301,6 @@ impl Direct {
     fn index_slots(&mut self) {
         let slots = self.open.iter().enumerate();
         self.by_slot = slots.filter_map(|(index, link)| Some((link.slot()?, index))).collect();
-    }
-
-    /// Returns the places of the links that report messages, if all rings of the endpoint are a set.
-    pub(super) fn ready(&self) -> Option<Ready> {
-        let set = self.terms.options.set()?;
-        set.look();
-        Some(set.ready())
     }
 
     /// Returns the index of the open link at this place.

@@ -45,9 +45,19 @@ impl Endpoint {
         when_full: WhenFull,
         now: Time,
     ) -> Result<Option<Answer>, ApiError> {
-        // The node first: there a peer may announce that its link is to be read from now on.
-        let answer = self.poll_node(wanted, when_full, now);
-        let answer = answer.map(|answer| answer.or_else(|| self.poll_links(wanted, when_full, now)));
+        let answer = if self.direct.have_links_turn() {
+            match self.poll_links(wanted, when_full, now) {
+                Some(answer) => Ok(Some(answer)),
+                None => self.poll_node(wanted, when_full, now),
+            }
+        } else {
+            // There a peer may announce that its link is to be read from now on.
+            let answer = self.poll_node(wanted, when_full, now);
+            answer.map(|answer| answer.or_else(|| self.poll_links(wanted, when_full, now)))
+        };
+        if !self.inbox.has_room() {
+            self.direct.change_turns();
+        }
         self.refusals.count_own(self.tid, self.inbox.take_unreported(), now);
         self.count_unsent(now);
         answer
@@ -76,11 +86,12 @@ impl Endpoint {
         let answer = match self.direct.ready() {
             Some(mut ready) => ready.find_map(|slot| {
                 let index = self.direct.at_slot(slot)?;
-                self.poll_link(index, wanted, when_full)
+                self.poll_link_in_turn(index, slot.into(), wanted, when_full)
             }),
-            // From the last one on, so that a link that ends does not skip another one's turn.
             None => {
-                (0..self.direct.open.len()).rev().find_map(|index| self.poll_link(index, wanted, when_full))
+                let (first, count) = (self.direct.first_turn(), self.direct.open.len());
+                let mut turns = (0..count).map(|turn| (first + turn) % count);
+                turns.find_map(|index| self.poll_link_in_turn(index, index, wanted, when_full))
             }
         };
         answer.or_else(|| self.poll_reordered(wanted, when_full, now))
@@ -192,6 +203,26 @@ impl Endpoint {
         }
         let mut node = NodeWriter { writer: &self.node.writer, correlation: &mut self.requests.correlation };
         self.direct.handle_frame(message, Time::now(), &mut node)
+    }
+
+    /// Sorts in the messages of a link. If the inbox is full then, the links behind it come first the next time.
+    fn poll_link_in_turn(
+        &mut self,
+        index: usize,
+        turn: usize,
+        wanted: Option<Wanted>,
+        when_full: WhenFull,
+    ) -> Option<Answer> {
+        // Another link may have ended meanwhile.
+        if index >= self.direct.open.len() {
+            return None;
+        }
+        let had_room = self.inbox.has_room();
+        let answer = self.poll_link(index, wanted, when_full);
+        if had_room && !self.inbox.has_room() {
+            self.direct.set_first_turn(turn + 1);
+        }
+        answer
     }
 
     /// Sorts in the messages that have arrived on an open link.

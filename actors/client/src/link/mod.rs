@@ -61,6 +61,7 @@ pub(super) struct LinkOptions {
     /// The wake-up method of this side: a set of all rings of the endpoint if a thread waits, one socket per link if a
     /// task does.
     pub(super) bell: Bell,
+    /// When the endpoint has direct links.
     pub(super) direct_links: DirectLinks,
     /// Bytes of this side's ring of a direct link.
     pub(super) direct_ring_bytes: usize,

@@ -430,3 +430,31 @@ fn messages_waiting_for_ring_end_are_bounded_in_bytes() {
     assert_eq!(kept * LENGTH, 4 << 20);
     assert!(matches!(keep(), ReorderDecision::Refuse(_)));
 }
+
+/// Receives until messages of all three sources have come, each of which has more than the inbox has room for.
+#[test]
+fn flood_of_one_source_does_not_keep_others_waiting() {
+    for capacity in [1, 4] {
+        // Given: many messages from the node's side, and on each of two links
+        let node = TestNode::start();
+        let mut other = register(&node, with_links().inbox_capacity(capacity));
+        let mut peers = [endpoint(&node), endpoint(&node)];
+        let app = node.local(1);
+        for peer in &mut peers {
+            link(peer, &mut other);
+        }
+        for number in 0..40 {
+            node.router().send(Message::typed(app.tid, other.tid(), &Counted(number))).unwrap();
+            for peer in &mut peers {
+                peer.send(other.tid(), &Counted(number)).unwrap();
+            }
+        }
+        // When: some are received. Then: some of each source are among them.
+        let mut sources = std::collections::BTreeMap::new();
+        for _ in 0..40 {
+            let received = other.receive(WATCHDOG).unwrap().expect("a message");
+            *sources.entry(received.source()).or_insert(0) += 1;
+        }
+        assert!(sources.len() == 3 && sources.values().all(|count| *count >= 5), "{capacity}: {sources:?}");
+    }
+}
