@@ -257,7 +257,11 @@ impl World {
         self.note(process, || format!("GNCL reports {fact:?}"));
         self.judge.link_changed(self.queue.now(), process, &fact);
         match fact {
-            LinkFact::LinkUp { .. } => self.coverage.count("links up"),
+            LinkFact::LinkUp { node, .. } => {
+                self.coverage.count("links up");
+                // Also where the link ends before anything looks for it.
+                self.processes[process].unlinked_since.remove(&node);
+            }
             LinkFact::LinkBroken { .. } => self.coverage.count("links broken"),
             LinkFact::PeerLeft { node, incarnation, .. } => {
                 self.coverage.count("departures");
