@@ -365,8 +365,9 @@ impl Judge {
             .then(|| format!("generation {generation} opens for {} with {here:?} only", app.name))
     }
 
-    /// Returns the last generation that the application of this name has passed, as far as the present nodes can know it:
-    /// a node that ends or leaves may have opened one for its own applications alone, and its report is lost with it.
+    /// Returns the last generation that the application of this name has passed, as far as the present nodes can
+    /// know it: a node that ends or leaves may have opened one for its own applications alone, and its report is lost
+    /// with it.
     fn known_generation(&self, name: &str) -> Option<u64> {
         let is_present = |process: usize| {
             let mut states = self.incarnations.values();
