@@ -61,8 +61,8 @@ fn main() -> ExitCode {
     }
 }
 
-/// Counts the instructions of a path to be stored: the most of three counts. Which thread wakes first changes a count by
-/// some percent, that of two threads by fifteen.
+/// Counts the instructions of a path to be stored: the most of three counts. Which thread wakes first changes a count
+/// by some percent, that of two threads by fifteen.
 fn most(path: Path) -> Result<u64, String> {
     let counts = [path.instructions()?, path.instructions()?, path.instructions()?];
     Ok(counts.into_iter().fold(0, u64::max))
