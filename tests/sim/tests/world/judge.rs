@@ -342,7 +342,7 @@ impl Judge {
     /// The barrier opens for an application: each party has arrived for this generation, and each passes it
     /// once.
     pub(crate) fn opened(&mut self, now: Time, process: usize, app: &App, generation: u64) -> Option<String> {
-        let last = self.known_generation(&app.name);
+        let last = self.last_generation(&app.name);
         if last.is_some_and(|last| last >= generation) {
             return Some(format!("{} passes generation {generation} after {last:?}", app.name));
         }
@@ -363,26 +363,6 @@ impl Judge {
             self.arrivals.iter().filter(|arrival| counts(arrival)).map(|arrival| &arrival.party).collect();
         (here.len() < crate::plan::NODES)
             .then(|| format!("generation {generation} opens for {} with {here:?} only", app.name))
-    }
-
-    /// Returns the last generation that the application of this name has passed, as far as the present nodes can
-    /// know it: a node that ends or leaves may have opened one for its own applications alone, and its report is lost
-    /// with it.
-    fn known_generation(&self, name: &str) -> Option<u64> {
-        let is_present = |process: usize| {
-            let mut states = self.incarnations.values();
-            states.any(|state| state.process == process && !state.has_ended && !state.has_left)
-        };
-        let passed = |arrival: &Arrival| match arrival.outcome {
-            Wait::Passed(generation) => Some((arrival.process, generation)),
-            Wait::Pending | Wait::Over(_) => None,
-        };
-        let is_known = |generation: u64| {
-            let others = self.arrivals.iter().filter_map(passed);
-            others.filter(|(_, other)| *other >= generation).any(|(process, _)| is_present(process))
-        };
-        let of_party = self.arrivals.iter().filter(|arrival| arrival.party == name).filter_map(passed);
-        of_party.map(|(_, generation)| generation).filter(|generation| is_known(*generation)).max()
     }
 
     /// Returns the last generation that the application of this name has passed.
