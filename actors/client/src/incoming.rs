@@ -97,7 +97,7 @@ impl Endpoint {
         answer.or_else(|| self.poll_reordered(wanted, when_full, now))
     }
 
-    /// Checks each ring for messages whose report another peer has undone.
+    /// Checks each ring for unreported messages: a hostile peer can clear the bit that reports them.
     fn check_all_rings(&mut self) {
         if let Reader::Ring(reader) = &mut self.node.reader {
             let links = &mut self.direct.open[..];

@@ -1,4 +1,4 @@
-//! The clients whose direct links are observed: they report their messages, which pass the node by. spec: LNCL-20
+//! Observation of direct links: their messages bypass the node, so the watched client reports them. spec: LNCL-20
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -44,7 +44,7 @@ impl ObservedLinks {
         }
     }
 
-    /// Tells the clients whose queues were full.
+    /// Notifies the clients that had no room in their queues.
     pub(super) fn retry(&self, router: &Router) {
         for (client, observation) in self.lock().iter_mut() {
             observation.tell(router, *client);

@@ -17,6 +17,7 @@ use sinew_runtime::{
     event_queue::EventQueue,
     lock,
     outcome::{Outcome, Rejection},
+    protection::raw::ECHO,
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     undelivered::{RefusalSink, is_reported},
@@ -34,9 +35,6 @@ pub use self::{
 
 /// Maximum number of senders and nodes with stored rejections. Rejections for further ones are only counted.
 const READERS_MAX: usize = 1_024;
-
-/// The type of the echoes that the receiver of protected messages sends to each sender that it guards.
-const ECHO: Kind = Kind::named("sinew.echo");
 
 /// Returns whether a rejection is a fault that the sender of an unconfirmed message must learn of. A group without
 /// members is no fault; the empty destination is one.

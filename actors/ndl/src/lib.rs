@@ -32,7 +32,7 @@
 //! | NDL-4.4 | when it announces that, from its own address, in its own incarnation: `Left`. |
 //! | NDL-4.8 | or when it announces that it gave up: `GaveUp`, with its reason. |
 //! | NDL-4.6 | The host is probed from the first missed answer on: `Hung` if it accepts, `Crashed` if it refuses, else `LinkDown`. |
-//! | NDL-4.7 | But not while GNCL receives from it: it is alive, and its NDL is reported as not heard. |
+//! | NDL-4.7 | While GNCL still receives from the node, it is not lost. It is alive, and its NDL is reported as unheard. |
 //! | NDL-5 | A node has one incarnation at a time. |
 //! | NDL-5.1 | A higher incarnation replaces a lower one: `NodeRestarted`. |
 //! | NDL-5.2 | A lower one is rejected, also after the loss of the higher one, for 15 s. |

@@ -2,6 +2,7 @@
 
 use sinew_protocol::link_counts::{LINKS_MAX, LinkCounters, LinkCounts};
 use sinew_runtime::{
+    protection::raw::ECHO,
     tid::Tid,
     wire::{Flags, Header, Kind},
 };
@@ -24,9 +25,6 @@ struct Account {
     counters: LinkCounters,
     counts: LinkCounts,
 }
-
-/// What a receiver of protected messages sends back to their sender (`sinew_runtime::protection`).
-const ECHO: Kind = Kind::named("sinew.echo");
 
 const _: () = assert!(LINKS_MAX == u64::BITS as usize, "a bit for each place");
 

@@ -2,8 +2,8 @@
 
 use super::Direct;
 
-/// Which source of messages is read first. They take turns when the inbox is full, so that a flood of one does not keep
-/// the messages of the others waiting for ever.
+/// The source of messages that is read first. The sources take turns while the inbox is full, so that a flood from one
+/// does not starve the others.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Turns {
     /// Whether the links are read before the node.

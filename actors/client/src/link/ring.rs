@@ -401,7 +401,7 @@ impl Reader {
         }
     }
 
-    /// Checks all rings of the set, those whose reports were undone included.
+    /// Checks all rings of the set, including those without a report.
     pub(crate) fn check_all<'a, E: Ends>(
         &'a mut self,
         all: impl FnOnce(&'a mut End) -> E,

@@ -14,7 +14,7 @@
 //!
 //! A new source (a directory service, a radio's own list) needs a variant of [`Source`] and a task of the
 //! shell. The task feeds [`Input::AddressNamed`](super::Input), as `browse` does for mDNS. Nothing else in
-//! the core depends on the kind of source. A source whose addresses are queried for longer than a candidate's
+//! the core depends on the kind of source. A source with addresses that are queried for longer than a candidate's
 //! is a list in the core, as `memory` is. Its contacts are made in `begin` and in `use_paths`.
 
 use std::collections::BTreeMap;

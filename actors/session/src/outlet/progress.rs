@@ -1,6 +1,9 @@
 //! Whether the peer takes the messages for its program.
 
-use sinew_runtime::wire::{Flags, Header, Kind};
+use sinew_runtime::{
+    protection::raw::ECHO,
+    wire::{Flags, Header, Kind},
+};
 
 /// The peer's progress with the messages sent to it, at one moment. The peer itself writes a part of this and
 /// can write arbitrary values.
@@ -12,10 +15,6 @@ pub struct Taking {
     /// determined: whether an application message waits for room in the socket.
     pub leaves_some: bool,
 }
-
-/// The kind of the message that a receiver of protected messages sends back to their sender
-/// (`sinew_runtime::protection`).
-const ECHO: Kind = Kind::named("sinew.echo");
 
 /// Returns whether this is an application's message for the program at the other end. A program that only
 /// sends need not read other frames. These are frames and events of the layers, outcomes, and messages that a
