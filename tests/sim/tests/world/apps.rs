@@ -212,6 +212,18 @@ impl World {
         is_near && stays && self.judge.was_ready_since(name, since)
     }
 
+    /// The applications of a process stop because their node does. They do not start again.
+    pub(crate) fn stop_apps(&mut self, process: usize) {
+        let now = self.queue.now();
+        for slot in 0..=TOP {
+            let app = &mut self.processes[process].apps[slot];
+            let ended = app.clone();
+            (app.stage, app.waits) = (Stage::Waiting, None);
+            app.incarnation += 1;
+            self.judge.app_ended(now, process, &ended);
+        }
+    }
+
     /// An application fails, and waits for its next release.
     pub(crate) fn app_fails(&mut self, process: usize, slot: usize) {
         let app = &mut self.processes[process].apps[slot];

@@ -61,6 +61,10 @@ impl World {
     }
 
     pub(crate) fn sync(&mut self, process: usize, input: Input) {
+        // The sync manager of a leaving node has ended, see `leave`.
+        if self.processes[process].is_leaving {
+            return;
+        }
         let now = self.local(process);
         let p = &mut self.processes[process];
         let unread = p.posts.sync.len();

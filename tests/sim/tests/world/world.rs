@@ -389,6 +389,8 @@ impl World {
         self.coverage.count("leaves");
         self.processes[process].is_leaving = true;
         self.judge.left(process);
+        // The root stops the applications, then the layers, of which the sync manager is the first.
+        self.stop_apps(process);
         self.ndl_input(process, NdlInput::Stopping);
         let peers = self.processes[process].store.0.iter();
         let undelivered_to = peers.filter(|(_, peer)| peer.left() > 0).map(|(node, _)| *node).collect();
