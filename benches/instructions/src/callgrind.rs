@@ -11,14 +11,18 @@ use sinew_figures::process::{self, Process};
 /// The processes of one run of a path. Each writes its count at its end.
 pub(crate) struct Counted {
     directory: PathBuf,
+    is_kept: bool,
     started: u32,
 }
 
 impl Counted {
-    pub(crate) fn new() -> Result<Self, String> {
-        let directory = std::env::temp_dir().join(format!("sinew-instructions-{}", std::process::id()));
+    /// Creates the directory for a run. With `kept`, callgrind's files stay there.
+    pub(crate) fn new(kept: Option<PathBuf>) -> Result<Self, String> {
+        let is_kept = kept.is_some();
+        let temporary = || std::env::temp_dir().join(format!("sinew-instructions-{}", std::process::id()));
+        let directory = kept.unwrap_or_else(temporary);
         fs::create_dir_all(&directory).map_err(|why| format!("{}: {why}", directory.display()))?;
-        Ok(Self { directory, started: 0 })
+        Ok(Self { directory, is_kept, started: 0 })
     }
 
     /// A directory for sockets.
@@ -72,8 +76,10 @@ impl Counted {
 
 impl Drop for Counted {
     fn drop(&mut self) {
-        // What is left there is temporary anyway.
-        let _ = fs::remove_dir_all(&self.directory);
+        if !self.is_kept {
+            // What is left there is temporary anyway.
+            let _ = fs::remove_dir_all(&self.directory);
+        }
     }
 }
 

@@ -17,7 +17,7 @@ mod paths;
 mod ping;
 mod stored;
 
-use std::process::ExitCode;
+use std::{path::PathBuf, process::ExitCode};
 
 use clap::Parser;
 
@@ -34,8 +34,19 @@ struct Arguments {
     /// Store the counted figures for this compiler, C library and profile
     #[arg(long)]
     store: bool,
+    /// Count each path once, and keep callgrind's files in this directory, for callgrind_annotate
+    #[arg(long, value_name = "DIRECTORY", conflicts_with = "store")]
+    keep: Option<PathBuf>,
     /// Only the paths with all of these words in their names
     words: Vec<String>,
+}
+
+/// What is done with the counts.
+enum Counting {
+    Compare,
+    Store,
+    /// Callgrind's files are kept in this directory.
+    Keep(PathBuf),
 }
 
 fn main() -> ExitCode {
@@ -51,7 +62,12 @@ fn main() -> ExitCode {
         eprintln!("no path has {} in its name; there are {names}", arguments.words.join(" and "));
         return ExitCode::from(2);
     }
-    match run(&wanted, arguments.store) {
+    let counting = match (arguments.store, arguments.keep) {
+        (true, _) => Counting::Store,
+        (false, Some(directory)) => Counting::Keep(directory),
+        (false, None) => Counting::Compare,
+    };
+    match run(&wanted, &counting) {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::FAILURE,
         Err(why) => {
@@ -64,27 +80,28 @@ fn main() -> ExitCode {
 /// Counts the instructions of a path to be stored: the most of three counts. Which thread wakes first changes a count
 /// by some percent, that of two threads by fifteen.
 fn most(path: Path) -> Result<u64, String> {
-    let counts = [path.instructions()?, path.instructions()?, path.instructions()?];
+    let counts = [path.instructions(None)?, path.instructions(None)?, path.instructions(None)?];
     Ok(counts.into_iter().fold(0, u64::max))
 }
 
 /// Counts the instructions of a path to be compared: the first count that has not grown, or the least of [`RUNS`].
 fn least(path: Path, stored: Option<u64>) -> Result<u64, String> {
-    let mut least = path.instructions()?;
+    let mut least = path.instructions(None)?;
     for _ in 1..RUNS {
         if Verdict::of(least, stored) != Verdict::Grown {
             break;
         }
-        least = least.min(path.instructions()?);
+        least = least.min(path.instructions(None)?);
     }
     Ok(least)
 }
 
 /// Counts and compares these paths. Returns whether none has grown.
-fn run(wanted: &[Path], stores: bool) -> Result<bool, String> {
+fn run(wanted: &[Path], counting: &Counting) -> Result<bool, String> {
     let key = stored::key()?;
     let before = stored::read(&key)?;
     println!("{key}");
+    let stores = matches!(counting, Counting::Store);
     if before.is_empty() && !stores {
         println!("nothing is stored for this compiler, C library and profile: nothing is compared");
     }
@@ -93,7 +110,11 @@ fn run(wanted: &[Path], stores: bool) -> Result<bool, String> {
     let mut is_well = true;
     for path in wanted {
         let stored = before.get(path.name()).copied();
-        let count = if stores { most(*path)? } else { least(*path, stored)? };
+        let count = match counting {
+            Counting::Compare => least(*path, stored)?,
+            Counting::Store => most(*path)?,
+            Counting::Keep(directory) => path.instructions(Some(directory))?,
+        };
         let verdict = Verdict::of(count, stored);
         is_well &= verdict != Verdict::Grown;
         let shown = stored.map_or_else(|| "-".to_owned(), |stored| stored.to_string());

@@ -1,5 +1,7 @@
 //! The six paths, and how their processes are started and ended.
 
+use std::path;
+
 use sinew_figures::process::Process;
 
 use crate::{callgrind::Counted, nodes::At};
@@ -49,17 +51,18 @@ impl Path {
         found.expect("a name that this program wrote itself")
     }
 
-    /// Counts the instructions of a round trip, of all processes together.
+    /// Counts the instructions of a round trip, of all processes together. Callgrind's files stay in the directory
+    /// `kept`, if there is one.
     ///
     /// # Errors
     /// Valgrind does not run, or a process fails.
-    pub(crate) fn instructions(self) -> Result<u64, String> {
-        let [few, many] = [self.total(FEW)?, self.total(MANY)?];
+    pub(crate) fn instructions(self, kept: Option<&path::Path>) -> Result<u64, String> {
+        let [few, many] = [self.total(FEW, kept)?, self.total(MANY, kept)?];
         Ok(many.saturating_sub(few) / u64::from(MANY - FEW))
     }
 
-    fn total(self, rounds: u32) -> Result<u64, String> {
-        let mut counted = Counted::new()?;
+    fn total(self, rounds: u32, kept: Option<&path::Path>) -> Result<u64, String> {
+        let mut counted = Counted::new(kept.map(|kept| kept.join(format!("{}-{rounds}", self.name()))))?;
         let name = self.name();
         match self {
             Self::SameThread | Self::TwoThreads => counted.run(&format!("{name} {rounds}"))?,
