@@ -167,6 +167,9 @@ impl Peers {
             && !peer.is_former(incarnation)
         {
             (peer.linked, peer.has_reported) = (None, false);
+            // A link to a lost incarnation may still come up, and says no more than that it ran then.
+            let gone = peer.gone.filter(|(gone, _)| *gone == incarnation);
+            peer.lost = peer.lost.or(gone.map(|(_, why)| why));
             // Another incarnation was found while this one was linked.
             peer.found.into_iter().for_each(|found| peer.expect(found));
         }
@@ -187,7 +190,8 @@ impl Peers {
             && !peer.is_former(incarnation)
         {
             // A node is unreachable after its goodbye: the first reason stays.
-            (peer.lost, peer.has_reported) = (peer.lost.or(Some(why)), false);
+            let why = peer.lost.unwrap_or(why);
+            (peer.lost, peer.gone, peer.has_reported) = (Some(why), Some((incarnation, why)), false);
         }
     }
 
@@ -199,6 +203,7 @@ impl Peers {
             && !peer.is_former(incarnation)
         {
             peer.found = Some(incarnation);
+            peer.gone = None;
             if peer.lost.is_some() || peer.linked.is_none_or(|linked| linked == incarnation) {
                 peer.expect(incarnation);
             }

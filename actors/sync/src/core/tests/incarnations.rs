@@ -115,6 +115,23 @@ fn lost_incarnation_is_over_despite_a_late_link_down() {
     assert!(bench.core.called("drive").is_empty());
 }
 
+// spec: SYNC-3
+#[test]
+fn incarnation_that_left_stays_lost_after_a_late_link() {
+    let mut bench = Bench::new();
+    bench.links(KNEE, INCARNATION);
+    bench.list(KNEE, list(1, &[("drive", true, &[])]));
+    bench.breaks(KNEE);
+    bench.lost(KNEE, LossReason::Left);
+    bench.links(KNEE, INCARNATION);
+    bench.breaks(KNEE);
+    assert!(bench.core.called("drive").is_empty());
+    found(&mut bench, INCARNATION);
+    bench.links(KNEE, INCARNATION);
+    bench.breaks(KNEE);
+    assert_eq!(bench.core.called("drive"), [Tid::new(KNEE, app(0))]);
+}
+
 // spec: SYNC-13
 #[test]
 fn fail_on_loss_wait_ends_when_the_party_restarted() {
