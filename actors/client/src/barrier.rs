@@ -3,7 +3,7 @@
 use std::{
     collections::VecDeque,
     future::Future,
-    pin::Pin,
+    pin::{Pin, pin},
     task::{Context, Poll},
     time::Duration,
 };
@@ -362,7 +362,7 @@ impl Endpoint {
     /// # Errors
     /// Not all parties arrived in time, a party was lost, or the node did not allow the wait.
     pub fn meet(&mut self, barrier: &Barrier) -> Result<u64, BarrierError> {
-        let answer = block_ready(self.await_opening(barrier))?;
+        let answer = block_ready(pin!(self.await_opening(barrier)))?;
         barrier.judge(answer)
     }
 

@@ -1,6 +1,6 @@
 //! The builder for all messages that an endpoint sends, from a thread or a task.
 
-use std::{fmt, time::Duration};
+use std::{fmt, pin::pin, time::Duration};
 
 use sinew_runtime::{
     outcome::{MemberOutcome, Outcome},
@@ -291,7 +291,7 @@ impl<C: Content> MessageBuilder<'_, Endpoint, C> {
     /// The message was not sent, and loaned memory is returned. [`ApiError::Stalled`]: there was no room in
     /// time.
     pub fn send(self) -> Result<(), ApiError> {
-        block_ready(self.endpoint.send_as(self.content, self.terms))
+        block_ready(pin!(self.endpoint.send_as(self.content, self.terms)))
     }
 
     /// Sends the message and waits for its outcome: [`Outcome::Unknown`] if none arrives `within` this time.
@@ -327,7 +327,7 @@ impl<C: Content> MessageBuilder<'_, Endpoint, C> {
     /// }
     /// ```
     pub fn confirmed(self, within: Duration) -> Result<Outcome, ApiError> {
-        block_ready(self.endpoint.confirm_as(self.content, self.terms, within))
+        block_ready(pin!(self.endpoint.confirm_as(self.content, self.terms, within)))
     }
 
     /// Sends the message to a group, to every application ([`Tid::BROADCAST`]) or to an address on all nodes,
@@ -362,7 +362,7 @@ impl<C: Content> MessageBuilder<'_, Endpoint, C> {
     /// No member has a copy: the message was not sent, is of class Stream, its node is not known, or it has
     /// too many members.
     pub fn confirmed_by_each(self, within: Duration) -> Result<Vec<MemberOutcome>, ApiError> {
-        block_ready(self.endpoint.confirm_by_each_as(self.content, self.terms, within))
+        block_ready(pin!(self.endpoint.confirm_by_each_as(self.content, self.terms, within)))
     }
 
     /// Sends the message as a request, in class Control, and waits for the reply. A `within` longer than
@@ -397,7 +397,7 @@ impl<C: Content> MessageBuilder<'_, Endpoint, C> {
     /// # Errors
     /// The message was not sent or not handled, or no reply arrived `within` this time.
     pub fn ask_raw(self, within: Duration) -> Result<Received, ApiError> {
-        block_ready(self.endpoint.ask_as(self.content, self.terms, within))
+        block_ready(pin!(self.endpoint.ask_as(self.content, self.terms, within)))
     }
 
     /// Sends the message as the reply to `request`. Its destination is the sender of `request`, regardless of
@@ -406,7 +406,7 @@ impl<C: Content> MessageBuilder<'_, Endpoint, C> {
     /// # Errors
     /// The request does not ask for a reply, or the reply was not sent.
     pub fn reply_to(self, request: &Received) -> Result<(), ApiError> {
-        block_ready(self.endpoint.reply_as(request, self.content, self.terms))
+        block_ready(pin!(self.endpoint.reply_as(request, self.content, self.terms)))
     }
 }
 

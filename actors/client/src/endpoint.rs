@@ -4,7 +4,7 @@ mod groups;
 mod names;
 mod unregister;
 
-use std::{path::Path, time::Duration};
+use std::{path::Path, pin::pin, time::Duration};
 
 use sinew_protocol::payload::{self, Registered};
 use sinew_runtime::{
@@ -214,7 +214,7 @@ impl Endpoint {
         to: impl Into<Destination<'a>>,
         value: &'a P,
     ) -> Result<(), ApiError> {
-        block_ready(self.send_as(Value::new(to, value), SendTerms::PLAIN))
+        block_ready(pin!(self.send_as(Value::new(to, value), SendTerms::PLAIN)))
     }
 
     /// Returns a builder for a value with other settings than those of its type: confirmed, as a request, or
@@ -271,7 +271,7 @@ impl Endpoint {
     /// }
     /// ```
     pub fn reply<R: Payload>(&mut self, request: &Received, value: &R) -> Result<(), ApiError> {
-        block_ready(self.reply_as(request, Value::new(request.source(), value), SendTerms::PLAIN))
+        block_ready(pin!(self.reply_as(request, Value::new(request.source(), value), SendTerms::PLAIN)))
     }
 
     /// Waits for a message, at most `within` this time; `None` if none arrived (the paper's ReceiveMessage).

@@ -6,7 +6,7 @@
 
 use std::{
     future::Future,
-    pin::pin,
+    pin::Pin,
     task::{Context, Poll, Waker},
 };
 
@@ -20,9 +20,10 @@ pub(super) enum WaitMode {
     Async(Box<Reactor>),
 }
 
-/// Returns the value of a future of an endpoint with [`WaitMode::Blocking`].
-pub(super) fn block_ready<T>(future: impl Future<Output = T>) -> T {
-    match pin!(future).poll(&mut Context::from_waker(Waker::noop())) {
+/// Returns the value of a future of an endpoint with [`WaitMode::Blocking`]. The caller pins the future where it is
+/// made: it has some kilobytes, and to move it costs more than a send.
+pub(super) fn block_ready<T>(future: Pin<&mut impl Future<Output = T>>) -> T {
+    match future.poll(&mut Context::from_waker(Waker::noop())) {
         Poll::Ready(value) => value,
         Poll::Pending => unreachable!("a blocking endpoint has waited when the future returns"),
     }

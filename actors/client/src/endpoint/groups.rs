@@ -1,5 +1,7 @@
 //! The groups of an endpoint.
 
+use std::pin::pin;
+
 use sinew_protocol::payload::{self, Group};
 use sinew_runtime::{
     name::{NAME_BYTES_MAX, check_name},
@@ -37,7 +39,7 @@ impl Endpoint {
     /// }
     /// ```
     pub fn join(&mut self, name: &str) -> Result<(), ApiError> {
-        block_ready(self.set_member(group_named(name)?, true))
+        block_ready(pin!(self.set_member(group_named(name)?, true)))
     }
 
     /// Leaves the group called `name`.
@@ -45,7 +47,7 @@ impl Endpoint {
     /// # Errors
     /// The node did not answer.
     pub fn leave(&mut self, name: &str) -> Result<(), ApiError> {
-        block_ready(self.set_member(AppAddress::group(name), false))
+        block_ready(pin!(self.set_member(AppAddress::group(name), false)))
     }
 
     pub(crate) async fn set_member(&mut self, group: AppAddress, member: bool) -> Result<(), ApiError> {

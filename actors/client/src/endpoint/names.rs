@@ -1,6 +1,6 @@
 //! Looks up applications by name at the node.
 
-use std::time::Duration;
+use std::{pin::pin, time::Duration};
 
 use sinew_protocol::payload::{self, Resolve};
 use sinew_runtime::{
@@ -37,7 +37,7 @@ impl Endpoint {
     /// }
     /// ```
     pub fn resolve(&mut self, name: &str, within: Duration) -> Result<Option<Tid>, ApiError> {
-        block_ready(self.look_up(name, within))
+        block_ready(pin!(self.look_up(name, within)))
     }
 
     pub(crate) async fn look_up(&mut self, name: &str, within: Duration) -> Result<Option<Tid>, ApiError> {

@@ -1,6 +1,6 @@
 //! The end of an endpoint: it releases its address, with a confirmation of the node or without.
 
-use std::time::Duration;
+use std::{pin::pin, time::Duration};
 
 use sinew_runtime::{
     time::Time,
@@ -25,7 +25,7 @@ impl Endpoint {
     /// The node did not answer, or a message is lent ([`ApiError::LoanActive`]). The address is released in
     /// any case.
     pub fn unregister(mut self) -> Result<(), ApiError> {
-        block_ready(self.take_leave())
+        block_ready(pin!(self.take_leave()))
     }
 
     pub(crate) async fn take_leave(&mut self) -> Result<(), ApiError> {
@@ -63,7 +63,7 @@ impl Drop for Endpoint {
         let _ = self.poll_incoming(None, WhenFull::Refuse, Time::now());
         self.inbox.close();
         if matches!(self.wait_mode, WaitMode::Blocking) {
-            block_ready(self.flush_before_close(UNREGISTER_FLUSH_TIMEOUT));
+            block_ready(pin!(self.flush_before_close(UNREGISTER_FLUSH_TIMEOUT)));
         }
         self.direct.flush();
         self.direct.log_unsent();
