@@ -5,7 +5,11 @@
 //! and is read at once; a longer one is sent in pieces. A record without bytes withdraws the frame that
 //! started before it.
 
+#[cfg(all(test, target_os = "linux"))]
+mod tests;
+
 use std::{
+    collections::VecDeque,
     io::{self, IoSlice},
     os::fd::{AsFd, BorrowedFd},
 };
@@ -14,7 +18,7 @@ use bytes::BytesMut;
 use sinew_runtime::wire::{FrameCodec, FrameError, HEADER_LEN, Header, Message};
 use sinew_shm::{
     Accepted, Bell, Capacity, Consumer, Corrupt, CreateError, LoanError, Offer, PassError, Producer,
-    Received, RefusedOffer, Region, Terms,
+    Received, ReceivedMessage, RefusedOffer, Region, Terms,
 };
 use tokio_util::codec::Decoder;
 
@@ -198,6 +202,9 @@ pub enum Taken {
 #[derive(Debug)]
 pub struct RingFrames {
     codec: FrameCodec,
+    /// Messages that were taken from records of one frame each. They are older than all of `buffer`.
+    messages: VecDeque<Message>,
+    /// Frames that span records, and what follows them.
     buffer: BytesMut,
     /// Bytes of `buffer` that are known to be complete frames: determined at a record without bytes.
     whole: usize,
@@ -212,6 +219,7 @@ impl RingFrames {
     pub fn new(payload_max: usize) -> Self {
         Self {
             codec: FrameCodec::in_memory(payload_max),
+            messages: VecDeque::new(),
             buffer: BytesMut::new(),
             whole: 0,
             copied: 0,
@@ -221,6 +229,12 @@ impl RingFrames {
 
     /// Returns the next frame of the taken bytes.
     pub fn next_message(&mut self) -> Result<Option<Message>, FrameError> {
+        if let Some(message) = self.messages.pop_front() {
+            return Ok(Some(message));
+        }
+        if self.buffer.is_empty() {
+            return Ok(None);
+        }
         let before = self.buffer.len();
         let next = self.codec.decode(&mut self.buffer);
         self.whole = self.whole.saturating_sub(before - self.buffer.len());
@@ -229,8 +243,17 @@ impl RingFrames {
 
     /// Returns whether [`next_message`](Self::next_message) has a result: a frame, or an error.
     pub fn has_frame(&self) -> bool {
+        !self.messages.is_empty() || self.has_frame_in_buffer()
+    }
+
+    fn has_frame_in_buffer(&self) -> bool {
         let Some(head) = self.buffer.first_chunk() else { return false };
         Header::payload_len(head).map_or(true, |length| self.buffer.len() >= HEADER_LEN + length as usize)
+    }
+
+    /// Returns whether bytes were taken that [`next_message`](Self::next_message) has not returned.
+    pub fn has_bytes(&self) -> bool {
+        !self.messages.is_empty() || !self.buffer.is_empty()
     }
 
     /// Takes records, without waiting, until there are about `enough` bytes, or half a ring's, or the long
@@ -246,9 +269,14 @@ impl RingFrames {
             if record.is_empty() {
                 self.forget_part();
             }
-            let start = self.buffer.len();
-            self.buffer.resize(start + record.len(), 0);
-            record.copy_to(&mut self.buffer[start..]);
+            match self.message_of(&record) {
+                Some(message) => self.messages.push_back(message),
+                None => {
+                    let start = self.buffer.len();
+                    self.buffer.resize(start + record.len(), 0);
+                    record.copy_to(&mut self.buffer[start..]);
+                }
+            }
             // Copied bytes count, not those that remain: a part may be withdrawn repeatedly.
             self.copied += record.len();
             // Only a node uses this, and only for its guests.
@@ -261,6 +289,16 @@ impl RingFrames {
         }
         consumer.give_back();
         Ok(taken)
+    }
+
+    /// Returns the message of a record that is exactly one frame, the usual case: its payload is copied once, to where
+    /// it stays. All other records, and invalid ones, are read as parts of a stream.
+    fn message_of(&self, record: &ReceivedMessage<'_>) -> Option<Message> {
+        let following = record.len().checked_sub(HEADER_LEN).filter(|_| self.buffer.is_empty())?;
+        let mut head = [0; HEADER_LEN];
+        record.copy_to(&mut head);
+        let copy = |payload: &mut [u8]| _ = record.copy_at(HEADER_LEN, payload);
+        self.codec.decode_record(&head, following, copy).ok().flatten()
     }
 
     /// Returns the number of bytes that the last poll copied.
@@ -276,7 +314,7 @@ impl RingFrames {
     /// Returns whether a complete frame has a buffer of its own. With later bytes that buffer would grow, and
     /// each payload in it would keep all of it alive.
     fn has_filled(&self) -> bool {
-        self.buffer.capacity() > FrameCodec::BUFFER_KEPT && self.has_frame()
+        self.buffer.capacity() > FrameCodec::BUFFER_KEPT && self.has_frame_in_buffer()
     }
 
     /// Drops the incomplete frame.
@@ -292,141 +330,5 @@ impl RingFrames {
         }
         self.idle = self.idle.saturating_add(self.buffer.len().saturating_sub(self.whole));
         self.buffer.truncate(self.whole);
-    }
-}
-
-#[cfg(all(test, target_os = "linux"))]
-mod tests {
-    use sinew_runtime::{tid::Tid, wire::Kind};
-    use sinew_shm::BellKind;
-
-    use super::*;
-
-    fn ring() -> (Producer, Consumer) {
-        let make = || Region::create(Capacity::MIN, BellKind::Futex).expect("a region");
-        let ((left, left_offer), (right, right_offer)) = (make(), make());
-        let (producer, _) = left.connect(right_offer, &Terms::default()).expect("an honest offer");
-        let (_, consumer) = right.connect(left_offer, &Terms::default()).expect("an honest offer");
-        (producer, consumer)
-    }
-
-    fn frame(length: usize) -> Vec<u8> {
-        let header = Header::new(Kind::named("test"), Tid::NONE, Tid::BROADCAST);
-        [&header.encode_in_memory(length)[..], &vec![7; length]].concat()
-    }
-
-    #[test]
-    fn one_poll_reads_half_of_four_pieces() {
-        // given
-        let ((mut producer, mut consumer), mut frames) = (ring(), RingFrames::new(100_000));
-        let long = frame(50_000);
-        let mut left = &long[..];
-        // when
-        for piece in 1..=4 {
-            let written = write(&mut producer, &[IoSlice::new(left)]).expect("there is room");
-            assert_eq!(written + MARK_BYTES, Capacity::MIN.bytes() as usize / 4, "piece {piece}");
-            left = &left[written..];
-        }
-        // then
-        assert!(matches!(write(&mut producer, &[IoSlice::new(left)]), Err(LoanError::Full { .. })));
-        assert_eq!(frames.take(&mut consumer, 1).expect("an honest peer"), Taken::Some);
-        let taken = Capacity::MIN.bytes() - producer.unread().expect("an honest peer");
-        assert_eq!(taken, Capacity::MIN.bytes() / 2);
-    }
-
-    #[test]
-    fn repeatedly_withdrawn_frames_bound_each_poll() {
-        // Given: a ring full of starts of a long frame, each with the record that withdraws it
-        let ((mut producer, mut consumer), mut frames) = (ring(), RingFrames::new(1 << 20));
-        let (begins, mut written) = (&frame(1 << 20)[..64], 0);
-        while write(&mut producer, &[IoSlice::new(begins)]).is_ok() && withdraw(&mut producer).is_ok() {
-            written += 1;
-        }
-        assert!(written > 20, "{written} starts");
-        // When: it is read, for as little as may be
-        let (mut polls, mut copied, mut idle) = (0, 0, 0);
-        while frames.take(&mut consumer, 1).expect("an honest peer") == Taken::Some {
-            assert!(frames.next_message().expect("no frame is wrong").is_none());
-            (polls, copied) = (polls + 1, copied + frames.copied());
-            assert!(frames.copied() <= RECORDS_PER_POLL * begins.len());
-            idle += frames.take_idle();
-        }
-        // Then: every copied byte, and every record, is accounted for
-        assert!(polls * RECORDS_PER_POLL >= 2 * written, "{polls} polls of {written} starts");
-        assert!(copied >= written * begins.len());
-        assert!(idle >= 2 * written * RECORD_WORK + written * begins.len(), "{idle}");
-        assert_eq!(frames.take_idle(), 0);
-    }
-
-    #[test]
-    fn withdrawn_parts_do_not_extend_a_poll() {
-        // Given: starts of frames of half a poll each, all of them withdrawn
-        let terms = Terms { capacity_max: Capacity::MAX, ..Terms::default() };
-        let make = || Region::create(capacity(2 << 20), BellKind::Futex).expect("a region");
-        let ((left, left_offer), (right, right_offer)) = (make(), make());
-        let (mut producer, _) = left.connect(right_offer, &terms).expect("an honest offer");
-        let (_, mut consumer) = right.connect(left_offer, &terms).expect("an honest offer");
-        let begins = &frame(1 << 20)[..ENOUGH_MIN / 2];
-        for _ in 0..8 {
-            write(&mut producer, &[IoSlice::new(begins)]).expect("there is room");
-            withdraw(&mut producer).expect("there is room");
-        }
-        // When, then
-        let mut frames = RingFrames::new(1 << 20);
-        for poll in 0..4 {
-            assert_eq!(frames.take(&mut consumer, 1).expect("an honest peer"), Taken::Some);
-            assert_eq!(frames.copied(), ENOUGH_MIN, "poll {poll}");
-        }
-    }
-
-    #[test]
-    fn consecutive_long_frames_keep_their_lengths() {
-        // Given: a writer that is ahead as far as there is room.
-        const LENGTH: usize = 1_500_000;
-        let ((mut producer, mut consumer), mut frames) = (ring(), RingFrames::new(LENGTH));
-        let long = frame(LENGTH);
-        let (mut left, mut written, mut received) = (&long[..], 0, Vec::new());
-        while received.len() < 4 {
-            while let Ok(count) = write(&mut producer, &[IoSlice::new(left)]) {
-                left = &left[count..];
-                if left.is_empty() {
-                    written += 1;
-                    left = if written < 4 { &long } else { break };
-                }
-            }
-            // When: it is read.
-            assert_eq!(frames.take(&mut consumer, usize::MAX).expect("an honest peer"), Taken::Some);
-            while let Some(message) = frames.next_message().expect("a frame") {
-                received.push(message.payload);
-            }
-        }
-        // Then:
-        for payload in received {
-            let mut memory = payload.try_into_mut().expect("no other holder exists");
-            memory.clear();
-            assert!(!memory.try_reclaim(2 * LENGTH), "it keeps twice its length");
-        }
-    }
-
-    #[test]
-    fn empty_record_withdraws_only_the_started_frame() {
-        let (whole, begun) = (frame(100), frame(1_000));
-        for part in [1, 7, 8, HEADER_LEN, HEADER_LEN + 999] {
-            // given
-            let ((mut producer, mut consumer), mut frames) = (ring(), RingFrames::new(4_096));
-            for bytes in [&whole, &whole, &begun[..part].to_vec()] {
-                producer.send(bytes).expect("there is room");
-            }
-            // when
-            withdraw(&mut producer).expect("there is room");
-            withdraw(&mut producer).expect("there is room");
-            producer.send(&whole).expect("there is room");
-            // then
-            assert_eq!(frames.take(&mut consumer, usize::MAX).expect("an honest peer"), Taken::Some);
-            for _ in 0..3 {
-                assert_eq!(frames.next_message().expect("a frame").expect("a frame").payload.len(), 100);
-            }
-            assert!(frames.next_message().expect("nothing wrong").is_none(), "{part} bytes had been written");
-        }
     }
 }

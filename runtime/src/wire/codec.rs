@@ -97,6 +97,29 @@ impl FrameCodec {
     pub const fn in_memory(payload_max: usize) -> Self {
         Self { payload_max, checksum: Checksum::None, end: 0, largest: 0 }
     }
+
+    /// Returns the message of a frame that stays in memory and lies outside this process's own: its header, the
+    /// number of bytes that follow it, and a function that copies these. `None` if they are not exactly its payload.
+    ///
+    /// # Errors
+    /// The header is invalid, or the payload is too long.
+    pub fn decode_record(
+        &self,
+        head: &[u8; HEADER_LEN],
+        following: usize,
+        copy: impl FnOnce(&mut [u8]),
+    ) -> Result<Option<Message>, FrameError> {
+        let start = head.first_chunk().ok_or(HeaderError::NotAFrame)?;
+        let length = Header::payload_len(start)? as usize;
+        if length > self.payload_max {
+            return Err(FrameError::TooLong { length, limit: self.payload_max });
+        }
+        if length != following {
+            return Ok(None);
+        }
+        let header = Header::decode_in_memory(head)?;
+        Ok(Some(Message::new(header, memory::filled(length, copy))))
+    }
 }
 
 impl Decoder for FrameCodec {
@@ -376,6 +399,22 @@ mod tests {
         let capacity = buffer.capacity();
         assert!(matches!(FrameCodec::new(1024).decode(&mut buffer), Err(FrameError::TooLong { .. })));
         assert_eq!(buffer.capacity(), capacity);
+    }
+
+    #[test]
+    fn record_is_a_message_only_with_exactly_its_payload() {
+        let codec = FrameCodec::in_memory(8);
+        let head = Header::new(Kind::named("test"), Tid::NONE, Tid::NONE).encode_in_memory(4);
+        let copy = |payload: &mut [u8]| payload.copy_from_slice(b"four");
+        let message = codec.decode_record(&head, 4, copy).unwrap().expect("it is whole");
+        assert_eq!(message.payload[..], b"four"[..]);
+        for following in [0, 3, 5] {
+            let never = |_: &mut [u8]| unreachable!("no memory is taken for it");
+            assert!(codec.decode_record(&head, following, never).unwrap().is_none());
+        }
+        let long = Header::new(Kind::named("test"), Tid::NONE, Tid::NONE).encode_in_memory(9);
+        let refused = codec.decode_record(&long, 9, |_| unreachable!("as above"));
+        assert!(matches!(refused, Err(FrameError::TooLong { length: 9, limit: 8 })));
     }
 
     /// The example at the end of `docs/protocol/frame.md`.

@@ -282,7 +282,7 @@ impl Header {
     /// # Errors
     /// The bytes are not the start of a frame, or of a frame of another version.
     pub fn payload_len(bytes: &[u8; 8]) -> Result<u32, HeaderError> {
-        if bytes[0..2] != MAGIC {
+        if [bytes[0], bytes[1]] != MAGIC {
             return Err(HeaderError::NotAFrame);
         }
         if bytes[2] != VERSION {

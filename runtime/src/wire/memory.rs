@@ -58,6 +58,13 @@ pub(super) fn zeroed(length: usize) -> BytesMut {
     buffer.cut()
 }
 
+/// Returns a payload of `length` bytes, which are zeros that `fill` replaces.
+pub(super) fn filled(length: usize, fill: impl FnOnce(&mut [u8])) -> Bytes {
+    let mut payload = zeroed(length);
+    fill(&mut payload);
+    payload.freeze()
+}
+
 /// A writer that appends to a buffer.
 pub(super) struct Writer(Buffer);
 
