@@ -299,6 +299,10 @@ impl Words {
     }
 
     pub(crate) fn sleep(&self, ends: &impl Ends, word_of: WordOf, left: Duration) -> Result<Woken, AnyError> {
+        if ends.count() == 1 {
+            let word = word_of(ends.consumer(0)).ok_or_else(no_word)?;
+            return platform::sleep_at(word, self.0[0], left).map_err(AnyError::System);
+        }
         let mut futexes = platform::FutexSet::new();
         for (index, seen) in self.0.iter().enumerate().take(ends.count()) {
             futexes.add(word_of(ends.consumer(index)).ok_or_else(no_word)?, *seen);

@@ -40,9 +40,6 @@ impl Waiter {
         ends: &mut impl Ends,
         left: Duration,
     ) -> Result<Any, AnyError> {
-        if set.look() {
-            return Ok(Any::Ready);
-        }
         let wake_place = self.trust.wake_place(Instant::now);
         let woken = if left.is_zero() {
             Woken::TimedOut
@@ -80,19 +77,18 @@ impl Waiter {
 }
 
 /// Where a sleeper for a set sleeps, and the values there.
-#[expect(clippy::large_enum_variant, reason = "it lies on the stack for one sleep, and is not moved")]
 enum SetWords {
     /// At the bell of the set.
     Bell(BellState),
     /// At the words of the peers' own regions.
-    Own(Words),
+    Own(Box<Words>),
 }
 
 impl SetWords {
     fn read(set: &WaitSet, ends: &impl Ends, wake_place: WakePlace) -> Result<Self, AnyError> {
         match wake_place {
             WakePlace::Bell => Ok(Self::Bell(set.listen())),
-            WakePlace::Own => Words::read(ends, own_word).map(Self::Own),
+            WakePlace::Own => Words::read(ends, own_word).map(Box::new).map(Self::Own),
         }
     }
 

@@ -124,6 +124,11 @@ impl WaitSet {
         let mut any = self.0.is_woken.load(Ordering::Relaxed);
         let words = self.0.ready.iter().zip(&self.0.open).zip(self.0.page.reports());
         for ((ready, open), reported) in words {
+            let open = open.load(Ordering::Relaxed);
+            if open == 0 {
+                // What is reported here stays reported until a ring is open.
+                continue;
+            }
             let mut own = ready.load(Ordering::Relaxed);
             if reported.load(Ordering::Relaxed) != 0 {
                 // SYNC: the tails of the peers that have set these bits are visible: `report`.
@@ -132,7 +137,7 @@ impl WaitSet {
                 // SYNC: a peer that has found its bit set before the swap fenced before that: its tail is visible, too.
                 fence(Ordering::SeqCst);
             }
-            any |= own & open.load(Ordering::Relaxed) != 0;
+            any |= own & open != 0;
         }
         any
     }
@@ -175,9 +180,10 @@ impl WaitSet {
             && self.0.page.reports()[word].load(Ordering::Relaxed) & bit == 0
     }
 
-    /// Whether any ring has reported a message since the last look.
+    /// Whether any open ring has reported a message since the last look.
     pub(crate) fn has_reports(&self) -> bool {
-        self.0.page.reports().iter().any(|word| word.load(Ordering::Relaxed) != 0)
+        let mut words = self.0.page.reports().iter().zip(&self.0.open);
+        words.any(|(reported, open)| reported.load(Ordering::Relaxed) & open.load(Ordering::Relaxed) != 0)
     }
 
     /// Takes a place, and creates the bells of its region. `None` if all places are taken.

@@ -75,6 +75,7 @@ impl Ends {
         }
     }
 
+    #[inline]
     pub(super) fn iter(&self) -> impl ExactSizeIterator<Item = &Message> {
         self.messages.iter().map(|(_, message)| message)
     }
@@ -84,6 +85,7 @@ impl Ends {
         self.of_lanes[class]
     }
 
+    #[inline]
     pub(super) fn bytes(&self) -> usize {
         self.behind.bytes + self.of_lanes.iter().map(|held| held.bytes).sum::<usize>()
     }
@@ -177,6 +179,7 @@ impl ClassQueue {
     }
 
     /// Same as [`queue_behind`](Self::queue_behind), for an event with bytes that are already counted.
+    #[inline]
     pub(super) fn place_behind(&mut self, event: Message, place: Place) -> Option<Message> {
         let Some(about) = About::of(&event.header) else { return Some(event) };
         if let About::End(node) = about {

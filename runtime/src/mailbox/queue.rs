@@ -315,6 +315,7 @@ impl ClassQueue {
 
     /// Returns the number of queued messages.
     #[must_use]
+    #[inline]
     pub fn len(&self) -> usize {
         self.ends.iter().len() + self.lanes.iter().map(VecDeque::len).sum::<usize>()
     }
@@ -328,6 +329,7 @@ impl ClassQueue {
 
     /// Returns the bytes of the queued payloads.
     #[must_use]
+    #[inline]
     pub fn bytes(&self) -> usize {
         self.ends.bytes() + self.bytes.iter().sum::<usize>()
     }
