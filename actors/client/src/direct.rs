@@ -283,7 +283,8 @@ impl Direct {
     }
 
     fn established(&mut self, number: LinkNumber) -> Option<&mut EstablishedLink> {
-        self.open.iter_mut().chain(&mut self.held).find(|link| link.number == number)
+        let is_it = |link: &&mut EstablishedLink| link.number == number;
+        self.open.iter_mut().find(is_it).or_else(|| self.held.iter_mut().find(is_it))
     }
 
     /// Returns whether this link is still established.
@@ -312,6 +313,16 @@ impl Direct {
     pub(super) fn take_wake(&self) {
         // The results are found by their number.
         let _ = self.terms.options.set().is_some_and(WaitSet::take_wake);
+    }
+
+    /// Returns whether no check is due, and no message waits outside the rings.
+    pub(super) fn is_quiet(&self, now: Time) -> bool {
+        let has_links = !self.open.is_empty() || !self.held.is_empty();
+        self.setups.is_empty()
+            && self.tasks.is_empty()
+            && self.reordered.is_empty()
+            && self.unsent.is_empty()
+            && (!has_links || now < self.next_flush && now < self.next_check)
     }
 
     /// Continues the setup of links. Checks periodically for closed links and for messages to repeat. Returns whether

@@ -305,7 +305,7 @@ impl Endpoint {
     /// ```
     pub fn receive(&mut self, within: Duration) -> Result<Option<Received>, ApiError> {
         let now = Time::now();
-        block_ready(self.receive_until(now + within, now))
+        block_ready(pin!(self.receive_until(now + within, now)))
     }
 
     /// The clock is read once per poll: it costs as much as a poll.
@@ -323,7 +323,7 @@ impl Endpoint {
             if self.leaves.has_pending() {
                 self.send_leaves();
             }
-            let echo_due = self.echo(now).await;
+            let echo_due = if self.ends.is_guarding() { self.echo(now).await } else { Time::MAX };
             let left = left.get_or_insert(self.inbox.len());
             if let Some(message) = self.inbox.pop(now) {
                 if let Some(received) = self.received(message) {

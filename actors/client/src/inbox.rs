@@ -110,16 +110,17 @@ impl Inbox {
     pub(super) fn sort_from(
         &mut self,
         sink: &Arc<dyn ReceiptSink>,
-        message: Message,
+        mut message: Message,
         awaited: Option<(u64, Awaited)>,
     ) -> Sorted {
         let header = &message.header;
         let awaited = awaited.filter(|(number, _)| *number == header.correlation).map(|(_, what)| what);
         if header.kind.is_user() {
-            return if header.flags.has(Flags::REPLY) {
-                sort_reply(self.with_receipt(sink, message), awaited)
+            self.add_receipt(sink, &mut message);
+            return if message.header.flags.has(Flags::REPLY) {
+                sort_reply(message, awaited)
             } else {
-                self.push(self.with_receipt(sink, message));
+                self.push(message);
                 Sorted::Message
             };
         }
@@ -140,8 +141,8 @@ impl Inbox {
     }
 
     /// Refuses a message of the node for which there is no room elsewhere.
-    pub(super) fn refuse(&mut self, message: Message) {
-        let message = self.with_receipt(&self.sink, message);
+    pub(super) fn refuse(&mut self, mut message: Message) {
+        self.add_receipt(&self.sink, &mut message);
         self.reject(message, Rejection::QueueFull);
     }
 
@@ -164,13 +165,12 @@ impl Inbox {
     }
 
     /// Attaches a receipt. The outcome is reported with this endpoint as its source, even for a message to many.
-    fn with_receipt(&self, sink: &Arc<dyn ReceiptSink>, mut message: Message) -> Message {
+    fn add_receipt(&self, sink: &Arc<dyn ReceiptSink>, message: &mut Message) {
         if message.header.flags.has(Flags::CONFIRM) {
             let Ticket { source, destination, correlation } = message.ticket();
             let destination = if destination.is_single() { destination } else { self.own };
             message.receipt = Some(Receipt::new(sink.clone(), Ticket { source, destination, correlation }));
         }
-        message
     }
 
     fn push(&mut self, message: Message) {

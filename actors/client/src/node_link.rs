@@ -101,6 +101,11 @@ impl NodeLink {
         Ok(())
     }
 
+    /// Returns whether a poll would find nothing to read, here and on direct links, and has nothing to write here.
+    pub(super) fn is_quiet(&self, now: Time) -> bool {
+        self.ended.is_none() && self.rest.is_none() && !self.writer.has_pending() && self.reader.is_quiet(now)
+    }
+
     /// Writes a message if there is room. Returns whether it need not be tried again.
     pub(super) fn try_write(&mut self, message: Message) -> bool {
         if let Some(message) = self.writer.send_in_place(message.into()) {

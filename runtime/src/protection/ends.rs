@@ -190,7 +190,15 @@ impl Ends {
         self.guards.iter().for_each(|entry| entry.guard.trip());
     }
 
+    /// Returns whether there are guards, of which echoes may be due.
+    #[must_use]
+    #[inline]
+    pub const fn is_guarding(&self) -> bool {
+        !self.guards.is_empty()
+    }
+
     /// Checks a received message.
+    #[inline]
     pub fn take(&mut self, mut message: Message) -> Came {
         let Header { source, kind, .. } = message.header;
         match self.judge((source, kind), &message.payload) {

@@ -82,9 +82,9 @@ impl Direct {
         links.into_iter().for_each(|(peer, number)| self.end(peer, number, now));
     }
 
-    /// Returns the number of Stream values that were waiting for room in links that have ended since the last
-    /// call, per destination.
-    pub(crate) fn take_unsent(&mut self) -> BTreeMap<Tid, u64> {
-        std::mem::take(&mut self.unsent)
+    /// Removes and returns a destination of links that have ended, and the number of Stream values that were waiting
+    /// for room in them.
+    pub(crate) fn next_unsent(&mut self) -> Option<(Tid, u64)> {
+        self.unsent.pop_first()
     }
 }

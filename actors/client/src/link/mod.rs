@@ -374,6 +374,23 @@ impl Reader {
         }
     }
 
+    /// Returns whether a read would find nothing, if one look shows that: neither on this ring nor on those of direct
+    /// links.
+    pub(super) fn is_quiet(&self, now: Time) -> bool {
+        match self {
+            Self::Socket(_) => false,
+            Self::Ring(reader) => reader.is_quiet(now),
+        }
+    }
+
+    /// Returns whether a read would find nothing, if one look shows that.
+    pub(super) fn is_empty(&self, now: Time) -> bool {
+        match self {
+            Self::Socket(_) => false,
+            Self::Ring(reader) => reader.is_empty(now),
+        }
+    }
+
     /// Reads the data that has arrived, without waiting.
     pub(super) fn read(&mut self, now: Time) -> Read {
         match self {

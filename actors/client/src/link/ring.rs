@@ -1,5 +1,6 @@
 //! A ring in each direction in shared memory, and a socket that signals the other end's close.
 
+mod reading;
 mod writing;
 
 use std::{
@@ -20,23 +21,20 @@ use bytes::BytesMut;
 use rustix::net::{RecvFlags, Shutdown, recv};
 use sinew_protocol::{
     payload::{self, Refusal},
-    ring::{self, RingFrames, Taken},
+    ring,
 };
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Ticket},
-    time::Time,
     wire::{FrameCodec, Kind, Message},
 };
-use sinew_shm::{
-    Any, AnyError, Armed, BellKind, Capacity, Consumer, Corrupt, Counters, Ends, HangUp, LoanError,
-    PollResult, Polling, Producer, Region, RoomError, Wait, WaitSet, Waiter,
-};
+use sinew_shm::{Armed, BellKind, Capacity, Counters, HangUp, LoanError, Producer, Region, RoomError, Wait};
 use tokio::sync::Notify;
 use tokio_util::codec::Decoder;
 
-use super::{Ended, LinkOptions, Read, socket};
+use super::{Ended, LinkOptions};
 use crate::ApiError;
 
+pub(crate) use reading::{End, Reader, waiter};
 pub(crate) use writing::{Begun, Rest};
 
 /// Maximum bytes taken from a ring at once.
@@ -280,220 +278,4 @@ pub(super) fn received_refusal(socket: &UnixStream) -> Option<Ended> {
     let refusal = FrameCodec::new(REFUSAL_BYTES_MAX).decode(&mut buffer).ok().flatten();
     let refusal = refusal.filter(|message| message.header.kind == Kind::LNCL_REFUSAL);
     refusal.and_then(|message| payload::read::<Refusal>(&message.payload).ok()).map(Ended::from)
-}
-
-/// The reading half.
-pub(crate) struct Reader {
-    end: End,
-    /// The set of all rings of the endpoint, if it has one.
-    set: Option<WaitSet>,
-    frames: RingFrames,
-    waiter: Waiter,
-    /// When the socket is checked next.
-    next_check: Time,
-    /// Why no more data will arrive, after the data that has arrived was taken.
-    ended: Option<Ended>,
-    /// Data that has arrived is not taken either.
-    is_stopped: bool,
-}
-
-/// Returns what a thread waits with.
-pub(crate) fn waiter(options: &LinkOptions) -> Waiter {
-    let waiter = Waiter::new(options.spin);
-    match options.set() {
-        Some(set) => waiter.of_set(set.clone()),
-        None => waiter,
-    }
-}
-
-/// The ring and the socket to wait for.
-pub(crate) struct End {
-    socket: Arc<UnixStream>,
-    consumer: Consumer,
-}
-
-impl Ends for End {
-    fn count(&self) -> usize {
-        1
-    }
-
-    fn consumer(&self, _: usize) -> &Consumer {
-        &self.consumer
-    }
-
-    fn consumer_mut(&mut self, _: usize) -> &mut Consumer {
-        &mut self.consumer
-    }
-
-    fn hang_up(&self, _: usize) -> Option<HangUp<'_>> {
-        Some(HangUp::Socket(self.socket.as_fd()))
-    }
-}
-
-impl Reader {
-    pub(super) fn new(
-        socket: Arc<UnixStream>,
-        consumer: Consumer,
-        payload_max: usize,
-        options: &LinkOptions,
-    ) -> Self {
-        let (end, frames) = (End { socket, consumer }, RingFrames::new(payload_max));
-        let (waiter, set) = (waiter(options), options.set().cloned());
-        if let Some(set) = &set {
-            set.set_open(&end.consumer, true);
-        }
-        Self { end, set, frames, waiter, next_check: Time::ZERO, ended: None, is_stopped: false }
-    }
-
-    /// Returns the next frame of those that were taken.
-    pub(super) fn next(&mut self) -> Result<Option<Message>, ApiError> {
-        Ok(self.frames.next_message()?)
-    }
-
-    /// Stops taking data.
-    pub(super) fn stop_reading(&mut self) {
-        self.leave_set();
-        self.is_stopped = true;
-        self.ended = Some(Ended::without_reason());
-    }
-
-    /// Takes the data that has arrived, without waiting.
-    pub(super) fn read(&mut self, now: Time) -> Read {
-        if let (true, Some(why)) = (self.is_stopped, &self.ended) {
-            return Read::Ended(why.clone());
-        }
-        match self.take() {
-            Err(corrupt) => {
-                self.leave_set();
-                Read::Ended(Ended::permanent(format!("shared memory holds what it cannot: {corrupt}")))
-            }
-            Ok(Taken::Some) => Read::Some,
-            Ok(Taken::Nothing) => match self.ended.clone() {
-                Some(why) => {
-                    self.leave_set();
-                    Read::Ended(why)
-                }
-                // Data published before the end is taken by the next poll.
-                None if self.has_ended(now) => Read::Some,
-                None => Read::Nothing,
-            },
-        }
-    }
-
-    /// Takes the content of the ring, if it reports any or has ended.
-    fn take(&mut self) -> Result<Taken, Corrupt> {
-        let Some(set) = &self.set else { return self.frames.take(&mut self.end.consumer, ENOUGH) };
-        set.look();
-        if !set.is_ready(&self.end.consumer) && self.ended.is_none() {
-            return Ok(Taken::Nothing);
-        }
-        let taken = self.frames.take(&mut self.end.consumer, ENOUGH)?;
-        if taken == Taken::Nothing {
-            set.was_emptied(&self.end.consumer);
-        }
-        Ok(taken)
-    }
-
-    /// Ends no wait any more: this ring is not read any longer.
-    fn leave_set(&self) {
-        if let Some(set) = &self.set {
-            set.set_open(&self.end.consumer, false);
-        }
-    }
-
-    /// Checks all rings of the set, including those without a report.
-    pub(crate) fn check_all<'a, E: Ends>(
-        &'a mut self,
-        all: impl FnOnce(&'a mut End) -> E,
-    ) -> Result<Any, AnyError> {
-        self.waiter.check_all(&mut all(&mut self.end)).map(|()| Any::Ready)
-    }
-
-    /// Returns whether the node's end was observed. A ring accepts messages even after that end, and a caller
-    /// that never waits must detect it, too; so the socket is checked periodically.
-    pub(super) fn has_ended(&mut self, now: Time) -> bool {
-        if self.ended.is_none() && now >= self.next_check {
-            self.next_check = now + CHECK_INTERVAL;
-            self.ended = socket::has_hung_up(&self.end.socket).then(|| end_reason(&self.end.socket));
-        }
-        self.ended.is_some()
-    }
-
-    /// Waits for a message, the node's end, or `CHECK_INTERVAL`.
-    pub(super) fn wait(&mut self, left: Duration) {
-        if self.ended.is_some() {
-            return;
-        }
-        let ended = self.waiter.wait_within(&mut self.end, left.min(CHECK_INTERVAL));
-        self.note(&ended);
-    }
-
-    /// Like [`wait`](Self::wait), for all ends that `all` returns: the node's, which is the first, and others.
-    pub(crate) fn wait_for_all<'a, E: Ends>(
-        &'a mut self,
-        left: Duration,
-        all: impl FnOnce(&'a mut End) -> E,
-    ) -> Result<Any, AnyError> {
-        self.waiter.wait_within(&mut all(&mut self.end), left.min(CHECK_INTERVAL))
-    }
-
-    /// Starts a task's check before it sleeps. Returns `None` if it must sleep at once.
-    pub(crate) fn begin_spin(&mut self) -> Option<Polling> {
-        self.waiter.begin()
-    }
-
-    /// Checks the ends that `all` returns: the node's and others.
-    pub(crate) fn look<'a, E: Ends>(
-        &'a mut self,
-        looking: &Polling,
-        all: impl FnOnce(&'a mut End) -> E,
-    ) -> PollResult {
-        looking.poll(&mut all(&mut self.end))
-    }
-
-    /// Ends the wait that started with this check.
-    pub(crate) fn end_spin(&mut self, looking: &Polling) {
-        self.waiter.end(looking);
-    }
-
-    /// Records the result of a wait for the node.
-    pub(crate) fn note(&mut self, ended: &Result<Any, AnyError>) {
-        match ended {
-            Ok(Any::HungUp(0)) => self.ended = Some(end_reason(&self.end.socket)),
-            Ok(Any::Message(_) | Any::Ready | Any::TimedOut | Any::HungUp(_))
-            | Err(AnyError::Corrupt { index: 1.., .. }) => {}
-            Err(error @ (AnyError::Corrupt { .. } | AnyError::System(_))) => {
-                self.ended = Some(Ended::permanent(error.to_string()))
-            }
-        }
-    }
-
-    /// Announces that a task waits for a message. [`Armed::Ready`]: there is something to do.
-    pub(crate) fn arm(&mut self) -> Armed {
-        if self.ended.is_some() {
-            return Armed::Ready;
-        }
-        // Corrupt memory is detected when it is read.
-        self.end.consumer.arm().unwrap_or(Armed::Ready)
-    }
-
-    /// Records that the task is awake.
-    pub(crate) fn disarm(&mut self) {
-        self.end.consumer.disarm();
-    }
-
-    /// Makes the next poll of the ring check the socket, too.
-    pub(crate) fn check_at_once(&mut self) {
-        self.next_check = Time::ZERO;
-    }
-
-    /// Returns the descriptor that signals messages.
-    pub(crate) fn bell(&self) -> Option<BorrowedFd<'_>> {
-        self.end.consumer.fd()
-    }
-
-    /// Returns the socket in addition to the ring.
-    pub(crate) fn socket(&self) -> Arc<UnixStream> {
-        self.end.socket.clone()
-    }
 }
