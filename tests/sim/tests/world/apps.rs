@@ -178,6 +178,7 @@ impl World {
         match answer {
             BarrierAnswer::Opened { generation } => {
                 self.coverage.count("openings");
+                self.forget_unknown_openings(process, *generation);
                 let words = self.judge.opened(now, process, &app, *generation);
                 self.judge.violations.extend(words);
             }
@@ -188,6 +189,18 @@ impl World {
             BarrierAnswer::Lost { .. } | BarrierAnswer::TimedOut { .. } | BarrierAnswer::Refused { .. } => {
                 self.judge.violate(format!("{} is answered {answer:?}", app.name));
             }
+        }
+    }
+
+    /// Forgets passings of a generation by nodes that have ended, unless another node knows of it: nobody can repeat
+    /// what has ended with the only node that knew.
+    fn forget_unknown_openings(&mut self, process: usize, generation: u64) {
+        let knows = |other: &usize| {
+            let barriers = self.processes[*other].sync.barriers(self.local(*other));
+            barriers.iter().any(|barrier| barrier.generation >= generation)
+        };
+        if !self.running().iter().filter(|other| **other != process).any(knows) {
+            self.judge.forget_openings_of_ended(generation);
         }
     }
 

@@ -44,6 +44,8 @@ struct Arrival {
 enum Wait {
     Pending,
     Passed(u64),
+    /// It has passed a generation of which only its node knew, and that has ended.
+    Forgotten,
     Over(Time),
 }
 
@@ -339,6 +341,16 @@ impl Judge {
         self.arrivals.iter_mut().filter(is_its).for_each(|arrival| arrival.outcome = Wait::Over(now));
     }
 
+    /// No node that runs knows this generation.
+    pub(crate) fn forget_openings_of_ended(&mut self, generation: u64) {
+        let ended = self.incarnations.values().filter(|state| state.has_ended || state.has_left);
+        let ended: BTreeSet<_> = ended.map(|state| state.process).collect();
+        let is_it = |arrival: &&mut Arrival| {
+            arrival.outcome == Wait::Passed(generation) && ended.contains(&arrival.process)
+        };
+        self.arrivals.iter_mut().filter(is_it).for_each(|arrival| arrival.outcome = Wait::Forgotten);
+    }
+
     /// The barrier opens for an application: each party has arrived for this generation, and each passes it
     /// once.
     pub(crate) fn opened(&mut self, now: Time, process: usize, app: &App, generation: u64) -> Option<String> {
@@ -358,6 +370,7 @@ impl Judge {
             Wait::Pending => true,
             Wait::Passed(passed) => passed == generation,
             Wait::Over(at) => at + COUNTED_MAX > now,
+            Wait::Forgotten => false,
         };
         let here: BTreeSet<_> =
             self.arrivals.iter().filter(|arrival| counts(arrival)).map(|arrival| &arrival.party).collect();
@@ -369,7 +382,7 @@ impl Judge {
     pub(crate) fn last_generation(&self, name: &str) -> Option<u64> {
         let passed = |arrival: &Arrival| match arrival.outcome {
             Wait::Passed(generation) => Some(generation),
-            Wait::Pending | Wait::Over(_) => None,
+            Wait::Pending | Wait::Forgotten | Wait::Over(_) => None,
         };
         self.arrivals.iter().filter(|arrival| arrival.party == name).filter_map(passed).max()
     }
