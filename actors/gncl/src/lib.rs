@@ -48,7 +48,6 @@
 //! | `datagrams/` | values of class Stream by UDP, if they get through |
 //! | `interfaces.rs` | which of this host's addresses are lost, as the kernel reports |
 //! | `spin.rs` | how long the IO thread polls before it sleeps |
-//! | `ticks.rs` | periodic checks, only while there is something to check |
 //! | `qos.rs` | the network marks of each class |
 //! | `listener.rs` | the accepting socket |
 //! | `shared_socket.rs` | sockets that outlive this layer's instances |
@@ -99,7 +98,6 @@ mod stream_transport;
 mod task;
 #[cfg(test)]
 mod tests;
-mod ticks;
 mod transport;
 mod yield_policy;
 

@@ -12,7 +12,7 @@ use std::{
 };
 
 use bytes::Bytes;
-use sinew_model::undelivered::Report;
+use sinew_model::{periodic_checks::PeriodicChecks, undelivered::Report};
 use sinew_runtime::{
     lock,
     outcome::{MemberReport, Outcome, ReceiptSink, Rejection, Ticket},
@@ -32,7 +32,6 @@ use super::{
     datagrams::{Channel, Position},
     outstanding::OutstandingDestinations,
     peer_session::{PeerSession, SessionAccount, SessionNotifiers, SessionParameters},
-    ticks::PeriodicChecks,
 };
 use crate::State;
 pub use store::Store;

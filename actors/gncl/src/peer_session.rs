@@ -28,11 +28,10 @@ use super::{
     outstanding::OutstandingDestinations,
     peer::frame,
     receive_counters::{Disposition, ReceiveCounters},
-    ticks::PeriodicChecks,
     transport::Transport,
 };
 pub(super) use processing_guard::ProcessingGuard;
-use sinew_model::{config::NodeConfig, refusals::Refusals};
+use sinew_model::{config::NodeConfig, periodic_checks::PeriodicChecks, refusals::Refusals};
 
 /// Bytes of unacknowledged frames for one peer at which further messages wait.
 const WINDOW_BYTES: usize = 4 << 20;

@@ -15,9 +15,9 @@ mod links;
 mod messages;
 mod node_down_events;
 mod outcomes;
+mod periodic_checks;
 mod restarts;
 mod secured;
 #[cfg(target_os = "linux")]
 mod starved;
 mod threads;
-mod ticks;

@@ -12,6 +12,7 @@
 //! | [`address`] | addresses of this host and of others |
 //! | [`barrier`] | the payloads of run-time barriers |
 //! | [`guest_quotas`] | quotas of guests in the queues of the layers |
+//! | [`periodic_checks`] | periodic checks, only while there is something to check |
 //! | [`notifications`] | makes a restarted layer the only waiter for its notifications |
 //! | [`bounded`] | lists from outside, with a limit |
 //! | [`cause`] | how an application ended |
@@ -45,6 +46,7 @@ pub mod limits;
 pub mod log_quotas;
 pub mod nearest;
 pub mod notifications;
+pub mod periodic_checks;
 pub mod ports;
 pub mod progress;
 pub mod rate_limiter;

@@ -8,7 +8,7 @@ use std::{
     time::Duration,
 };
 
-use sinew_model::{notifications::claim_notifications, refusals::Refusals};
+use sinew_model::{notifications::claim_notifications, periodic_checks::PeriodicChecks, refusals::Refusals};
 use sinew_runtime::{
     lock,
     remedy::{Wanted, remedy},
@@ -29,7 +29,6 @@ use super::{
         peer_session::{Offered, PeerSession},
         segments::Segments,
         task::{Relocation, TaskThread},
-        ticks::PeriodicChecks,
         transport::Transport,
         yield_policy::YieldPolicy,
     },

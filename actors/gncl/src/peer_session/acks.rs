@@ -55,7 +55,7 @@ impl PeerSession {
     /// The bound is sufficient: the thread that created the newer one sends it, or an even newer one. If that
     /// was sent before this one, this one has replaced it, and the peer misses the rest. The acknowledgement
     /// is then marked as due, and the single checking task sends it within a period (1 s) of
-    /// [`PeriodicChecks`](super::super::ticks::PeriodicChecks).
+    /// [`PeriodicChecks`](sinew_model::periodic_checks::PeriodicChecks).
     fn send_acks(&self, mut ack: Acknowledgement, mut next: impl FnMut() -> Acknowledgement) {
         for _ in 0..ROUNDS_MAX {
             let is_of_now = self.outlet.acknowledge(ack.message, ack.link, ack.epoch);

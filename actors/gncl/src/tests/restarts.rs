@@ -3,14 +3,14 @@
 
 use std::{cell::Cell, pin::pin, time::Duration};
 
-use sinew_model::{config::NodeConfig, notifications::testing::waits};
+use sinew_model::{config::NodeConfig, notifications::testing::waits, periodic_checks::PeriodicChecks};
 use sinew_runtime::{tid::Incarnation, time::Time};
 
 use super::{
     bench::{ByHand, NINE, Node, next, run, within},
     node_down_events::{incarnation_of, notify_of_the_end},
 };
-use crate::{State, node_down_events, peer::Store, ticks::PeriodicChecks};
+use crate::{State, node_down_events, peer::Store};
 
 #[test]
 fn present_end_notifier_is_woken_despite_a_former_waiter() {

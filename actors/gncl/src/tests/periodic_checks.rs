@@ -2,10 +2,10 @@
 
 use std::{cell::Cell, rc::Rc, time::Duration};
 
+use sinew_model::periodic_checks::PeriodicChecks;
 use tokio::time::timeout;
 
 use super::bench::{run, within};
-use crate::ticks::PeriodicChecks;
 
 const PERIOD: Duration = Duration::from_millis(1);
 

@@ -7,18 +7,18 @@ use std::{
 
 use tokio::{sync::Notify, time::sleep};
 
-use sinew_model::notifications::claim_notifications;
+use crate::notifications::claim_notifications;
 
 /// Whether the checking task runs, and the notification that starts it.
 #[derive(Debug, Default)]
-pub(super) struct PeriodicChecks {
+pub struct PeriodicChecks {
     run: AtomicBool,
     wanted: Notify,
 }
 
 impl PeriodicChecks {
     /// Requests checks. The caller has added the item before, and has released the lock that protects it.
-    pub(super) fn request(&self) {
+    pub fn request(&self) {
         // SYNC: a task that finds nothing clears the flag before it checks again under that lock. It has seen
         // items added before, or this call sees the cleared flag.
         if !self.run.load(Ordering::Relaxed) && !self.run.swap(true, Ordering::AcqRel) {
@@ -27,7 +27,7 @@ impl PeriodicChecks {
     }
 
     /// Checks every `period` while `check` returns that there is something, and starts again when it is requested.
-    pub(super) async fn run(&self, period: Duration, mut check: impl FnMut() -> bool) {
+    pub async fn run(&self, period: Duration, mut check: impl FnMut() -> bool) {
         claim_notifications(&self.wanted);
         // A former instance of the layer may have been about to check.
         self.run.store(true, Ordering::Release);
