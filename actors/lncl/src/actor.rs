@@ -18,7 +18,8 @@ use super::{
 };
 use crate::{State, undelivered};
 
-/// Interval of the check for expired messages of clients that do not read, and for due reports of rejections.
+/// Interval of the checks for expired messages of clients that do not read, and for due reports of rejections. Without
+/// such items there are no checks: a node at rest is not woken.
 const TICK: Duration = Duration::from_millis(100);
 
 /// The LNCL of a node. A new one starts after each fault, on the same registry. Connections end with it.
@@ -57,7 +58,9 @@ impl Actor for Lncl {
         registrar::remove_former_clients(&self.server.state);
         self.server.state.client_socket.hang_up();
         ctx.add_stream(self.server.state.ctx.posts.lncl.attach());
-        ctx.run_interval(TICK, |lncl, _| lncl.server.tick(Time::now()));
+        let server = self.server.clone();
+        let checks = async move { server.state.ctx.checks.run(TICK, || server.tick(Time::now())).await };
+        ctx.spawn(checks.into_actor(self));
         self.open_client_socket(ctx);
         if let Some(ready) = self.ready.take() {
             ready.reached();
@@ -77,7 +80,11 @@ impl StreamHandler<Event> for Lncl {
     fn handle(&mut self, event: Event, _: &mut Self::Context) {
         match event {
             Event::Released { app } => self.server.release(app),
-            Event::Undelivered => undelivered::report(&self.server.state, Time::now()),
+            Event::Undelivered => {
+                if undelivered::report(&self.server.state, Time::now()) {
+                    self.server.state.ctx.checks.request();
+                }
+            }
         }
     }
 }

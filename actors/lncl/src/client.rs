@@ -7,6 +7,7 @@ pub(super) mod liveness;
 mod memberships;
 mod orders;
 mod outcomes;
+mod sink;
 
 use std::{io::ErrorKind, ops::ControlFlow, rc::Rc, sync::Arc, time::Duration};
 
@@ -35,6 +36,7 @@ use self::{
     liveness::ProcessWatch,
     memberships::Orders,
     outcomes::Outcomes,
+    sink::ClientSink,
 };
 use super::{
     core::{Address, Owner, Request},
@@ -274,7 +276,9 @@ impl Client {
         if self.wants_links && self.ring == Ring::Supported {
             self.server.link_broker.expect(self.tid, self.pid());
         }
-        let route = LocalRoute { sink: self.outlet.clone(), events: self.events.clone() };
+        let checks = self.server.state.ctx.checks.clone();
+        let sink = Arc::new(ClientSink::new(self.outlet.clone(), checks));
+        let route = LocalRoute { sink, events: self.events.clone() };
         registrar::open(&self.server.state, self.tid.app, route);
         let (mut reader, link) = match self.open_link(reader).await {
             Ok(opened) => opened,
@@ -340,7 +344,9 @@ impl Client {
             let peer = LinkPeer::new(self.tid, self.pid(), self.outlet.clone(), self.peer.stream.clone());
             self.server.link_broker.add(peer);
             let state = &self.server.state;
-            state.observed_links.add(&state.ctx.router, self.tid);
+            if state.observed_links.add(&state.ctx.router, self.tid) {
+                state.ctx.checks.request();
+            }
         }
     }
 

@@ -191,13 +191,15 @@ impl LinkBroker {
         Ok(())
     }
 
-    /// Abandons requests that were not answered in time, and rejects them to their requesters.
-    pub(super) fn expire(&self, now: Time) {
+    /// Abandons requests that were not answered in time, and rejects them to their requesters. Returns whether requests
+    /// are left.
+    pub(super) fn expire(&self, now: Time) -> bool {
         let late = lock(&self.open).expire(now);
         for asked in late {
             asked.answer(Outcome::Rejected(Rejection::QueueFull));
         }
-        self.pending.expire(now);
+        let are_pending = self.pending.expire(now);
+        are_pending || !lock(&self.open).is_empty()
     }
 
     /// Notifies `to` that `source` continues on their link. It queues one mark per class, behind all waiting messages,

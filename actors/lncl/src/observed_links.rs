@@ -24,31 +24,35 @@ struct Observation {
 }
 
 impl ObservedLinks {
-    /// Adds a client.
-    pub(super) fn add(&self, router: &Router, client: Tid) {
+    /// Adds a client. Returns whether [`retry`](Self::retry) must tell it later.
+    pub(super) fn add(&self, router: &Router, client: Tid) -> bool {
         let mut clients = self.lock();
         let observation = clients.entry(client).or_default();
         *observation = Observation { is_wanted: router.is_observed(client), is_told: false };
-        observation.tell(router, client);
+        !observation.tell(router, client)
     }
 
     pub(super) fn remove(&self, client: Tid) {
         self.lock().remove(&client);
     }
 
-    /// Observes the links of these applications, and of no others.
-    pub fn observe(&self, router: &Router, apps: &BTreeSet<AppAddress>) {
+    /// Observes the links of these applications, and of no others. Returns whether a client must be told later.
+    pub fn observe(&self, router: &Router, apps: &BTreeSet<AppAddress>) -> bool {
+        let mut is_left = false;
         for (client, observation) in self.lock().iter_mut() {
             observation.is_wanted = apps.contains(&client.app);
-            observation.tell(router, *client);
+            is_left |= !observation.tell(router, *client);
         }
+        is_left
     }
 
-    /// Notifies the clients that had no room in their queues.
-    pub(super) fn retry(&self, router: &Router) {
+    /// Notifies the clients that had no room in their queues. Returns whether some still have none.
+    pub(super) fn retry(&self, router: &Router) -> bool {
+        let mut is_left = false;
         for (client, observation) in self.lock().iter_mut() {
-            observation.tell(router, *client);
+            is_left |= !observation.tell(router, *client);
         }
+        is_left
     }
 
     fn lock(&self) -> MutexGuard<'_, BTreeMap<Tid, Observation>> {
@@ -57,15 +61,16 @@ impl ObservedLinks {
 }
 
 impl Observation {
-    /// Tells the client, unless it knows. Without room in its queue it is told later.
-    fn tell(&mut self, router: &Router, client: Tid) {
+    /// Tells the client, unless it knows. Returns whether it knows; without room in its queue it is told later.
+    fn tell(&mut self, router: &Router, client: Tid) -> bool {
         if self.is_wanted == self.is_told {
-            return;
+            return true;
         }
         let observe = Observe { on: self.is_wanted };
         let frame = payload::frame(Kind::LNCL_OBSERVE, payload::lncl_of(client.node), client, &observe);
         if router.notify_app(client.app, frame).is_ok() {
             self.is_told = self.is_wanted;
         }
+        self.is_told == self.is_wanted
     }
 }

@@ -21,7 +21,9 @@ impl Applications for State {
     }
 
     fn observe_links(&self, apps: &BTreeSet<AppAddress>) {
-        self.observed_links.observe(&self.ctx.router, apps);
+        if self.observed_links.observe(&self.ctx.router, apps) {
+            self.ctx.checks.request();
+        }
     }
 
     fn undelivered_elsewhere(&self, node: NodeAddress, report: Report, refuse: &mut dyn FnMut(&dyn Display)) {

@@ -173,6 +173,7 @@ impl Server {
     pub(super) fn add_client(&self, id: ClientId, outlet: Arc<ClientOutlet>) {
         self.state.client_socket.add_outlet(id, &outlet);
         self.clients.borrow_mut().insert(id, outlet);
+        self.state.ctx.checks.request();
     }
 
     pub(super) fn remove_client(&self, id: ClientId) {
@@ -180,15 +181,16 @@ impl Server {
     }
 
     /// Expires messages of clients that do not read, abandons unanswered link requests, and reports rejected messages
-    /// to their senders.
-    pub(super) fn tick(&self, now: Time) {
-        self.link_broker.expire(now);
-        self.state.ctx.log_quotas.tick(now);
+    /// to their senders. Returns whether anything is left that a later call must do.
+    pub(super) fn tick(&self, now: Time) -> bool {
+        // All are called, without a short circuit.
+        let mut is_left = self.link_broker.expire(now);
+        is_left |= self.state.ctx.log_quotas.tick(now);
         for outlet in self.clients.borrow().values() {
-            outlet.expire(now);
+            is_left |= outlet.expire(now);
         }
-        self.state.observed_links.retry(&self.state.ctx.router);
-        undelivered::report(&self.state, now);
+        is_left |= self.state.observed_links.retry(&self.state.ctx.router);
+        is_left | undelivered::report(&self.state, now)
     }
 }
 

@@ -13,6 +13,7 @@ use std::{
     sync::{Arc, Mutex},
 };
 
+use sinew_model::periodic_checks::PeriodicChecks;
 use sinew_runtime::{
     event_queue::EventQueue,
     lock,
@@ -139,6 +140,11 @@ impl Core {
         });
         due
     }
+
+    /// Returns whether a report or a line of the log may become due without a further rejection.
+    fn is_left(&self) -> bool {
+        !self.readers.is_empty() || self.unhandled.has_unlogged() || self.warned.has_unlogged()
+    }
 }
 
 /// The node's table of rejections. It outlives the layers.
@@ -147,12 +153,14 @@ pub struct Undelivered {
     node: NodeAddress,
     core: Mutex<Core>,
     lncl: EventQueue<crate::Event>,
+    checks: Arc<PeriodicChecks>,
 }
 
 impl Undelivered {
-    /// Creates an empty table of the node at `node`, which notifies LNCL through `lncl`.
-    pub fn new(node: NodeAddress, lncl: EventQueue<crate::Event>) -> Arc<Self> {
-        Arc::new(Self { node, core: Mutex::default(), lncl })
+    /// Creates an empty table of the node at `node`. It notifies LNCL through `lncl` of reports that are due, and by
+    /// `checks` of those that will be.
+    pub fn new(node: NodeAddress, lncl: EventQueue<crate::Event>, checks: Arc<PeriodicChecks>) -> Arc<Self> {
+        Arc::new(Self { node, core: Mutex::default(), lncl, checks })
     }
 
     /// Counts rejected messages of the application of this node that `entry` names.
@@ -167,9 +175,10 @@ impl Undelivered {
 
     fn wake_lncl(&self, is_due: bool) {
         if is_due {
-            // If the event queue is full, the report is sent at LNCL's next tick.
+            // If the event queue is full, the report is sent at LNCL's next check.
             let _ = self.lncl.post(crate::Event::Undelivered);
         }
+        self.checks.request();
     }
 
     /// Returns the types that applications of this node did not handle or could not read, the latest first.
@@ -266,10 +275,29 @@ mod tests {
     #[test]
     fn reader_without_pending_reports_is_removed() {
         let mut core = Core::default();
+        assert!(!core.is_left());
         refuse(&mut core, tid(HERE, 0x1002), Time::ZERO);
         core.take(Time::ZERO, 8);
+        assert!(core.is_left(), "the line of the log, and the pause of the reader");
+        core.unhandled.take_due(Time::ZERO);
+        assert!(core.is_left(), "the pause of the reader");
         core.take(Time::ZERO + report_table::PAUSE, 8);
-        assert!(core.readers.is_empty());
+        assert!(core.readers.is_empty() && !core.is_left());
+    }
+
+    #[test]
+    fn unlogged_refusal_is_left_until_its_line() {
+        let mut core = Core::default();
+        for _ in 0..2 {
+            refuse(&mut core, tid(HERE, 0x1002), Time::ZERO);
+            core.unhandled.take_due(Time::ZERO);
+        }
+        let later = Time::ZERO + report_table::PAUSE;
+        core.take(later, 8);
+        core.take(later + report_table::PAUSE, 8);
+        assert!(core.readers.is_empty() && core.is_left());
+        core.unhandled.take_due(Time::ZERO + log_lines::LOG_INTERVAL);
+        assert!(!core.is_left());
     }
 
     #[test]

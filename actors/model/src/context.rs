@@ -27,6 +27,7 @@ use crate::{
     events::{LayerReport, Posts, Root},
     leave_reason::LeaveReason,
     log_quotas::LogQuotas,
+    periodic_checks::PeriodicChecks,
     ports::Ports,
     refusals::Refusals,
     room_notifier::RoomNotifier,
@@ -72,6 +73,8 @@ pub struct NodeContext {
     groups_notified: AtomicBool,
     /// Limits the log lines that other nodes and clients can cause.
     pub log_quotas: LogQuotas,
+    /// LNCL's checks for all that is due later. Any thread that adds such an item requests them.
+    pub checks: Arc<PeriodicChecks>,
     /// Points at which tests inject faults.
     #[cfg(feature = "fault-points")]
     pub faults: sinew_runtime::supervision::fault::FaultPoints,
@@ -92,7 +95,7 @@ impl NodeContext {
     /// Creates the shared state of a node that has not started yet. The node's address is that of `config`.
     #[must_use]
     pub fn new(config: NodeConfig, incarnation: Incarnation, root: Arc<dyn Root>) -> Arc<Self> {
-        let node = config.node_address();
+        let (node, checks) = (config.node_address(), Arc::<PeriodicChecks>::default());
         Arc::new(Self {
             node,
             incarnation,
@@ -110,7 +113,8 @@ impl NodeContext {
             room_notifier: Arc::default(),
             directory_changes: watch::Sender::default(),
             groups_notified: AtomicBool::new(false),
-            log_quotas: LogQuotas::default(),
+            log_quotas: LogQuotas::new(&checks),
+            checks,
             config,
             #[cfg(feature = "fault-points")]
             faults: sinew_runtime::supervision::fault::FaultPoints::default(),

@@ -123,6 +123,8 @@ impl Client {
         {
             self.send_outcome(to, correlation, Outcome::Rejected(why));
         }
+        // For its deadline.
+        self.server.state.ctx.checks.request();
     }
 
     // spec: LNCL-11

@@ -76,11 +76,12 @@ impl PendingRings {
         self.remove(tid);
     }
 
-    /// Rejects the requests that have waited too long at `now`.
-    pub(super) fn expire(&self, now: Time) {
+    /// Rejects the requests that have waited too long at `now`. Returns whether requests are left.
+    pub(super) fn expire(&self, now: Time) -> bool {
         let late = self.asked.borrow_mut().expire(now);
         for PendingRequest { requester, to, request } in late {
             notify_rejected(&requester, to, request, Rejection::QueueFull);
         }
+        !self.asked.borrow().is_empty()
     }
 }

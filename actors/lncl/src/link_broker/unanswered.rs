@@ -66,6 +66,11 @@ impl<T> Unanswered<T> {
         found.map(|(_, waiting)| (waiting.what, waiting.since)).collect()
     }
 
+    /// Returns whether no request waits.
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
     /// Removes and returns the requests with a deadline that has expired at `now`.
     pub(super) fn expire(&mut self, now: Time) -> Vec<T> {
         let late = self.0.extract_if(.., |_, waiting| now.since(waiting.since) >= ANSWERED_WITHIN);

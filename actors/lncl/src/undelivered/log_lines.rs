@@ -58,6 +58,11 @@ impl<K: Ord + Copy, V: Clone> LogLines<K, V> {
         due.map(take).collect()
     }
 
+    /// Returns whether notes are left that no line has shown.
+    pub(super) fn has_unlogged(&self) -> bool {
+        self.0.values().any(|line| line.unlogged > 0)
+    }
+
     /// Returns all lines, the latest first.
     pub(super) fn latest(&self) -> Vec<(K, LogLine<V>)> {
         let mut all: Vec<_> = self.0.iter().map(|(key, line)| (*key, line.clone())).collect();
@@ -94,7 +99,9 @@ mod tests {
         }
         assert!(lines.note(at(9), 2, 1, ()), "another key has a line of its own");
         assert_eq!(shown(&mut lines, at(9)), [(2, 1)]);
+        assert!(lines.has_unlogged());
         assert_eq!(shown(&mut lines, at(10)), [(1, 900)]);
+        assert!(!lines.has_unlogged());
         assert_eq!(shown(&mut lines, at(100)), [], "nothing was noted since");
     }
 

@@ -73,8 +73,9 @@ pub fn note(
     }
 }
 
-/// Sends all reports that are due at `now`. Runs on LNCL's thread, without holding a lock.
-pub fn report(state: &State, now: Time) {
+/// Sends all reports that are due at `now`. Returns whether others will be due without a further rejection. Runs on
+/// LNCL's thread, without holding a lock.
+pub fn report(state: &State, now: Time) -> bool {
     let payload_max = state.ctx.config.payload_max;
     let whole = payload_max.saturating_sub(FRAME_BYTES) / ENTRY_BYTES;
     let short = (payload_max.saturating_sub(FRAME_BYTES) / SHORT_ENTRY_BYTES).max(1);
@@ -100,6 +101,7 @@ pub fn report(state: &State, now: Time) {
     };
     unhandled.iter().for_each(|(key, line)| warn_receiver(state, key, line));
     warned.iter().for_each(|(key, line)| warn_sender(state, key, line));
+    lock(&state.undelivered.core).is_left()
 }
 
 /// The form of the entries in a client's report.
