@@ -19,7 +19,10 @@ mod tests;
 
 use std::{
     collections::VecDeque,
-    sync::{Arc, Mutex, OnceLock, TryLockError},
+    sync::{
+        Arc, Mutex, OnceLock, TryLockError,
+        atomic::{AtomicBool, Ordering},
+    },
     task::Waker,
 };
 
@@ -50,6 +53,19 @@ pub struct Mailbox {
     source: Option<Arc<dyn Source>>,
     /// The sink for rejections of accepted messages, and the TID of this mailbox.
     refusals: OnceLock<(Tid, Arc<dyn RefusalSink>)>,
+    /// Whether it is recorded since when messages wait.
+    records_waits: AtomicBool,
+}
+
+/// The messages that wait for the reader of a mailbox.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Backlog {
+    /// Number of messages that it can take.
+    pub(crate) waiting: usize,
+    /// Number of messages that were taken so far.
+    pub(crate) taken: u64,
+    /// When a message was last added to none that waited, if that is recorded.
+    pub(crate) since: Option<Time>,
 }
 
 #[derive(Debug)]
@@ -70,6 +86,8 @@ struct Shared {
     current: Option<Class>,
     /// The number of messages taken out so far.
     taken_out: u64,
+    /// See [`Backlog::since`].
+    waiting_since: Option<Time>,
     /// The number of messages of each class that are in flight to a [`RemoteReader`].
     in_flight: [u64; 3],
     /// Whether the current reader is a [`RemoteReader`].
@@ -114,6 +132,11 @@ impl Shared {
 
     fn waiting(&self) -> usize {
         self.events.len() + self.queue.len()
+    }
+
+    /// Returns the number of queued messages that the reader can take: during a pause only the layers' events.
+    fn takeable(&self) -> usize {
+        if self.paused { self.events.len() } else { self.waiting() }
     }
 
     /// Reserves half of the positions for events that do not wait behind messages. The end of a pause is an
@@ -213,6 +236,7 @@ impl Mailbox {
             epoch: 0,
             current: None,
             taken_out: 0,
+            waiting_since: None,
             in_flight: [0; 3],
             is_remote: false,
             closed: false,
@@ -220,7 +244,8 @@ impl Mailbox {
             tallies: [Tally::default(); 3],
             high_water: 0,
         };
-        Self { shared: Mutex::new(shared), source, refusals: OnceLock::new() }
+        let records_waits = AtomicBool::new(false);
+        Self { shared: Mutex::new(shared), source, refusals: OnceLock::new(), records_waits }
     }
 
     /// Sets the sink for rejections of unconfirmed messages that were accepted here, reported for `owner`. Set once.
@@ -262,19 +287,37 @@ impl Mailbox {
         }
     }
 
-    /// Returns the number of queued messages, and of those taken out so far. Returns `None` if the mailbox is locked.
-    pub(crate) fn backlog(&self) -> Option<(usize, u64)> {
+    /// Returns the messages that wait. Returns `None` if the mailbox is locked.
+    pub(crate) fn backlog(&self) -> Option<Backlog> {
         if let Some(source) = &self.source {
-            return source.backlog();
+            let (waiting, taken) = source.backlog()?;
+            return Some(Backlog { waiting, taken, since: None });
         }
         let shared = match self.shared.try_lock() {
             Ok(shared) => shared,
             Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
             Err(TryLockError::WouldBlock) => return None,
         };
-        // During a pause only the layers' events can be taken.
-        let waiting = if shared.paused { shared.events.len() } else { shared.waiting() };
-        Some((waiting, shared.taken_out))
+        let (waiting, taken, since) = (shared.takeable(), shared.taken_out, shared.waiting_since);
+        Some(Backlog { waiting, taken, since })
+    }
+
+    /// Returns whether it can be recorded since when messages wait: they are queued here.
+    pub(crate) const fn can_record_waits(&self) -> bool {
+        self.source.is_none()
+    }
+
+    /// Sets whether it is recorded since when messages wait.
+    pub(crate) fn set_records_waits(&self, records: bool) {
+        // SYNC: Relaxed; see `Liveness::set_records`.
+        self.records_waits.store(records, Ordering::Relaxed);
+    }
+
+    /// Records that messages wait from now on, if none waits yet. Before a message is added.
+    fn record_wait(&self, shared: &mut Shared) {
+        if self.records_waits.load(Ordering::Relaxed) && shared.takeable() == 0 {
+            shared.waiting_since = Some(Time::now());
+        }
     }
 
     /// Rejects all queued and all new messages.
@@ -364,6 +407,7 @@ impl Mailbox {
             shared.tallies[event.header.class as usize].refused += 1;
             return Err(Refused::new(event, Rejection::Closed));
         }
+        self.record_wait(&mut shared);
         let waker = shared.submit_event(event).inspect_err(|_| is_full(&mut shared))?;
         drop(shared);
         waker.into_iter().for_each(wakes::wake);
@@ -400,6 +444,7 @@ impl MessageSink for Mailbox {
                     event_waits = shared.event_waits.take();
                 }
             }
+            self.record_wait(&mut shared);
             match shared.queue.push(message) {
                 Ok(superseded) => {
                     shared.tallies[class].taken += 1;

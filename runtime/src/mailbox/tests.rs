@@ -36,6 +36,31 @@ fn messages_behind_a_panic_reach_the_next_incarnation() {
 }
 
 #[test]
+fn start_of_a_wait_is_recorded_on_request() {
+    let mailbox = Mailbox::new(8);
+    let mut reader = mailbox.attach();
+    let since = |mailbox: &Mailbox| mailbox.backlog().unwrap().since;
+    let mut take_one = || {
+        assert!(matches!(take(&mut reader), Poll::Ready(Some(_))));
+        reader.finish(Outcome::Delivered);
+    };
+    mailbox.submit(message()).unwrap();
+    assert_eq!(since(&mailbox), None);
+    take_one();
+    mailbox.set_records_waits(true);
+    mailbox.submit(message()).unwrap();
+    let first = since(&mailbox);
+    assert!(first.is_some());
+    mailbox.submit(message()).unwrap();
+    assert_eq!(since(&mailbox), first, "one waited already");
+    take_one();
+    take_one();
+    let before = Time::now();
+    mailbox.submit(message()).unwrap();
+    assert!(since(&mailbox).is_some_and(|since| since >= before));
+}
+
+#[test]
 fn fenced_reader_receives_nothing() {
     let mailbox = Mailbox::new(8);
     let mut zombie = mailbox.attach();

@@ -1,7 +1,7 @@
 //! The liveness state of one incarnation of an actor, written by its thread and read by others, and its fence.
 //!
-//! The thread writes plain atomics and reads no clock for them: a turn costs three stores. An observer reads
-//! the state twice to measure the duration of a turn.
+//! The thread writes plain atomics: a turn costs three stores. It reads a clock for them only while the watchdog
+//! checks rarely. An observer reads the state twice to measure the duration of a turn.
 
 use std::{
     cell::RefCell,
@@ -14,7 +14,7 @@ use std::{
 
 use crate::{
     lock,
-    mailbox::Mailbox,
+    mailbox::{Backlog, Mailbox},
     outcome::{Outcome, Receipt},
     tid::Tid,
     time::Time,
@@ -110,6 +110,8 @@ pub(crate) struct Liveness {
     activity: AtomicU64,
     /// When the turn began, in nanoseconds; 0: unknown.
     begun: AtomicU64,
+    /// Whether the start of each turn is recorded. Written by the watchdog only.
+    records_begin: AtomicBool,
     /// Whether this incarnation is fenced: it must do nothing any more.
     fenced: AtomicBool,
     ready: AtomicBool,
@@ -152,6 +154,7 @@ impl Liveness {
             turn: AtomicU64::new(0),
             activity: AtomicU64::new(Activity::Start.code()),
             begun: AtomicU64::new(0),
+            records_begin: AtomicBool::new(false),
             fenced: AtomicBool::new(false),
             ready: AtomicBool::new(false),
             stopping: AtomicBool::new(false),
@@ -210,7 +213,13 @@ impl Liveness {
         self.begun.store(0, Ordering::Relaxed);
         self.turn.store(next, Ordering::Release);
         self.activity.store(activity.code(), Ordering::Release);
-        self.begun.store(now.map_or(0, Time::as_nanos), Ordering::Release);
+        let begun = match now {
+            Some(now) => now.as_nanos(),
+            // SYNC: Relaxed; see `set_records`.
+            None if self.records_begin.load(Ordering::Relaxed) => Time::now().as_nanos(),
+            None => 0,
+        };
+        self.begun.store(begun, Ordering::Release);
     }
 
     /// Records that the actor stops itself. The end of its own future is not visible here, so the rest of
@@ -269,10 +278,24 @@ impl Liveness {
         let _ = self.inbox.set(Inbox { mailbox, epoch, kinds });
     }
 
-    /// Returns the number of queued messages, and of messages taken so far. Returns `None` without a mailbox,
-    /// or if it is locked.
-    pub(super) fn backlog(&self) -> Option<(usize, u64)> {
+    /// Returns the messages that wait. Returns `None` without a mailbox, or if it is locked.
+    pub(super) fn backlog(&self) -> Option<Backlog> {
         self.inbox.get()?.mailbox.backlog()
+    }
+
+    /// Sets whether the start of each turn is recorded, and since when messages wait. Called by the watchdog.
+    pub(super) fn set_records(&self, records: bool) {
+        // SYNC: Relaxed; the watchdog checks once more, some milliseconds later, before it relies on records. By then
+        // the flag is visible, and so is a turn that began without seeing it.
+        self.records_begin.store(records, Ordering::Relaxed);
+        if let Some(inbox) = self.inbox.get() {
+            inbox.mailbox.set_records_waits(records);
+        }
+    }
+
+    /// Returns whether it can be recorded since when messages wait.
+    pub(super) fn can_record(&self) -> bool {
+        self.inbox.get().is_none_or(|inbox| inbox.mailbox.can_record_waits())
     }
 
     pub(super) fn set_ready(&self) {
@@ -404,6 +427,19 @@ mod tests {
         assert!(first.turn < second.turn && second.turn < third.turn && third.is_busy());
         assert_eq!(third.activity, Activity::Message(Kind::named("test")));
         assert_eq!((second.begun, third.begun), (None, Some(Time::from_nanos(7))));
+    }
+
+    #[test]
+    fn start_of_each_turn_is_recorded_on_request() {
+        let liveness = Liveness::new("test");
+        let mut own = Some(liveness.clone());
+        let mut begun = || Liveness::turn(&mut own, Activity::Task, || liveness.snapshot().begun);
+        assert_eq!(begun(), None);
+        liveness.set_records(true);
+        let before = Time::now();
+        assert!(begun().is_some_and(|begun| begun >= before));
+        liveness.set_records(false);
+        assert_eq!(begun(), None);
     }
 
     #[test]

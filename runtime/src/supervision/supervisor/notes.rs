@@ -46,7 +46,7 @@ impl Supervisor {
     /// Returns the number of queued messages; `None` if it is unknown here, or the mailbox is locked.
     fn waiting(&self, id: ChildId) -> Option<usize> {
         let handle = self.children.get(&id)?.handle.as_ref()?;
-        handle.liveness().backlog().map(|(waiting, _)| waiting)
+        handle.liveness().backlog().map(|backlog| backlog.waiting)
     }
 
     pub(super) fn tid_of(&self, id: ChildId) -> Option<String> {

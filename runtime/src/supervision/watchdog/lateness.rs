@@ -63,7 +63,9 @@ impl Lateness {
     /// Registers a reader. The watchdog must be woken after this: its check is due.
     pub(super) fn add_reader(&self, now: Time) {
         self.readers.fetch_add(1, Ordering::Relaxed);
-        lock(&self.state).due.get_or_insert(now + PERIOD_MAX);
+        let mut state = lock(&self.state);
+        let at_latest = now + PERIOD_MAX;
+        state.due = Some(state.due.map_or(at_latest, |due| due.min(at_latest)));
     }
 
     pub(super) fn remove_reader(&self) {
@@ -91,5 +93,8 @@ mod tests {
         assert_eq!(lateness.sum(ms(9_999)), Duration::from_millis(400), "it sleeps until it is needed");
         lateness.add_reader(ms(9_995));
         assert_eq!(lateness.sum(ms(10_100)), Duration::from_millis(500), "it does not come when it is");
+        lateness.set_due(Some(ms(10_350)));
+        lateness.add_reader(ms(10_095));
+        assert_eq!(lateness.sum(ms(10_200)), Duration::from_millis(500), "woken for the reader, it is late");
     }
 }

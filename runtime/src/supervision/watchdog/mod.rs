@@ -8,6 +8,7 @@ mod account;
 mod deadline_extension;
 mod lateness;
 mod processor;
+mod rest;
 mod suspect;
 
 use std::{
@@ -23,7 +24,8 @@ use std::{
 
 pub(super) use deadline_extension::DeadlineExtension;
 use lateness::Lateness;
-use processor::sample;
+use processor::{Sample, sample};
+use rest::{Pace, Rest};
 use suspect::{Check, Hang, Stall, StallSuspect, TurnSuspect};
 
 use super::{
@@ -43,6 +45,11 @@ use crate::{
 const PERIOD_MAX: Duration = Duration::from_millis(5);
 /// The same if no turn is in progress and no messages wait: each check wakes a CPU.
 const IDLE_PERIOD_MAX: Duration = Duration::from_millis(40);
+/// The same if the whole node [rests](rest).
+const REST_PERIOD_MAX: Duration = Duration::from_millis(250);
+/// Fraction of a budget that may pass between two checks at rest. A turn is seen long before its end, and messages
+/// that wait before the probe at half of the budget.
+const REST_BUDGET_DIVISOR: u32 = 4;
 /// Fraction of a budget that may pass until a turn in progress is seen. CPU time that the actor did not get
 /// before that is not excused.
 const IDLE_BUDGET_DIVISOR: u32 = 25;
@@ -66,9 +73,16 @@ pub(super) struct Watchdog {
 struct Shared {
     arrivals: Mutex<Vec<Watched>>,
     /// Locked by the thread during a check; outlives the thread.
-    table: Mutex<Vec<Watched>>,
+    table: Mutex<Table>,
     count: AtomicUsize,
     lateness: Arc<Lateness>,
+}
+
+/// The watched incarnations, and how often they are checked.
+#[derive(Default)]
+struct Table {
+    watched: Vec<Watched>,
+    rest: Rest,
 }
 
 impl std::fmt::Debug for Shared {
@@ -184,13 +198,23 @@ impl Shared {
         let now = Time::now();
         let late = self.lateness.record_check(now);
         let mut table = lock(&self.table);
+        let Table { watched: table, rest } = &mut *table;
+        let former = table.len();
         table.append(&mut lock(&self.arrivals));
         let reading = self.lateness.has_readers().then_some(PERIOD_MAX);
         let period = table.iter().map(|watched| watched.period).chain(reading).min()?;
         let before = table.len();
-        table.retain_mut(|watched| check_one(watched, now, late, period));
+        let mut round = Round { now, late, period, pace: rest.pace(), samples: Vec::new() };
+        table.retain_mut(|watched| check_one(watched, &mut round));
         self.count.fetch_sub(before - table.len(), Ordering::Relaxed);
-        let check_interval = table.iter().map(Watched::check_interval).chain(reading).min()?;
+        let is_same = former == before && before == table.len();
+        let may_rest = is_same && reading.is_none() && table.iter().all(Watched::may_rest);
+        let turns = table.iter().fold(0_u64, |sum, watched| sum.wrapping_add(watched.turns()));
+        let pace = rest.check(now, turns, may_rest);
+        if pace.is_marked() || round.pace.is_marked() {
+            table.iter().for_each(|watched| watched.handle.liveness().set_records(pace.is_marked()));
+        }
+        let check_interval = table.iter().map(|watched| watched.check_interval(pace)).chain(reading).min()?;
         let deadline = table.iter().filter_map(Watched::deadline).min();
         // A late actor waits for a CPU, or was just checked: the next check is after a period.
         let deadline = deadline.filter(|deadline| *deadline > now);
@@ -198,13 +222,41 @@ impl Shared {
     }
 }
 
-/// Checks one incarnation. Returns whether it must be watched further.
-fn check_one(watched: &mut Watched, now: Time, late: Duration, period: Duration) -> bool {
-    let liveness = watched.handle.liveness();
-    if liveness.has_ended() || liveness.is_fenced() {
-        return false;
+/// One check of all incarnations.
+struct Round {
+    now: Time,
+    late: Duration,
+    period: Duration,
+    pace: Pace,
+    /// The threads whose accounts were read in this round, for the accounts of actors at rest.
+    samples: Vec<(i32, Option<Sample>)>,
+}
+
+impl Round {
+    fn sample(&mut self, tid: i32) -> Option<Sample> {
+        if let Some((_, known)) = self.samples.iter().find(|(of, _)| *of == tid) {
+            return *known;
+        }
+        let new = sample(tid);
+        self.samples.push((tid, new));
+        new
     }
-    match catch_unwind(AssertUnwindSafe(|| watched.check(now, late, period))) {
+}
+
+/// Checks one incarnation. Returns whether it must be watched further.
+fn check_one(watched: &mut Watched, round: &mut Round) -> bool {
+    let liveness = watched.handle.liveness();
+    let has_ended = liveness.has_ended() || liveness.is_fenced();
+    let goes_on = !has_ended && check_living(watched, round);
+    if !goes_on {
+        // The next incarnation has the same mailbox, and is not watched yet.
+        watched.handle.liveness().set_records(false);
+    }
+    goes_on
+}
+
+fn check_living(watched: &mut Watched, round: &mut Round) -> bool {
+    match catch_unwind(AssertUnwindSafe(|| watched.check(round))) {
         Ok(goes_on) => goes_on,
         Err(panic) => {
             let name = watched.handle.liveness().name();
@@ -225,37 +277,78 @@ struct Watched {
     period: Duration,
     turn: TurnSuspect,
     stall: StallSuspect,
+    /// At rest: the sum of the turn numbers of the thread's actors, and a sample of the thread at that moment.
+    rested: Option<(u64, Sample)>,
 }
 
 impl Watched {
     fn new(handle: ActorHandle, budget: Duration) -> Self {
         let period = (budget / 10).clamp(PERIOD_MIN, PERIOD_MAX);
-        Self { handle, budget, period, turn: TurnSuspect::new(budget), stall: StallSuspect::new(budget) }
+        let (turn, stall) = (TurnSuspect::new(budget), StallSuspect::new(budget));
+        Self { handle, budget, period, turn, stall, rested: None }
+    }
+
+    /// Returns whether nothing is in progress or waits, and all that begins at rest can be recorded.
+    fn may_rest(&self) -> bool {
+        let is_open = self.turn.is_open() || self.stall.is_open() || self.stall.has_waiting();
+        !is_open && self.handle.liveness().can_record()
+    }
+
+    /// Returns the number of its present or last turn.
+    fn turns(&self) -> u64 {
+        self.handle.liveness().snapshot().turn
     }
 
     /// Returns the time until the next check, unless a deadline is earlier.
-    fn check_interval(&self) -> Duration {
+    fn check_interval(&self, pace: Pace) -> Duration {
         if self.turn.is_open() || self.stall.is_open() {
             return self.period;
         }
-        (self.budget / IDLE_BUDGET_DIVISOR).clamp(self.period, IDLE_PERIOD_MAX)
+        let (divisor, most) = match pace {
+            Pace::Alert | Pace::Marking => (IDLE_BUDGET_DIVISOR, IDLE_PERIOD_MAX),
+            Pace::Resting => (REST_BUDGET_DIVISOR, REST_PERIOD_MAX),
+        };
+        (self.budget / divisor).clamp(self.period, most)
     }
 
     fn deadline(&self) -> Option<Time> {
         self.turn.deadline(self.handle.liveness().snapshot())
     }
 
-    fn check(&mut self, now: Time, late: Duration, period: Duration) -> bool {
+    fn check(&mut self, round: &mut Round) -> bool {
         let liveness = self.handle.liveness();
-        let check = Check { now, late, snapshot: liveness.snapshot() };
+        let check = Check { now: round.now, late: round.late, snapshot: liveness.snapshot() };
         let slot = self.handle.slot().cloned();
         let cpu = || sample(slot.as_ref()?.tid()?);
-        if let Some(hang) = self.turn.check(check, period, cpu) {
+        if let Some(hang) = self.turn.check(check, round.period, cpu) {
             let what = format!("{} has not come back", liveness.describe(check.snapshot.activity));
             self.report_hang(hang, &what, true);
             return false;
         }
+        if round.pace.is_marked() {
+            self.account_at_rest(check, round);
+        } else {
+            self.rested = None;
+        }
         self.check_for_stall(check, cpu)
+    }
+
+    /// Keeps an account of the thread of an idle actor. So the time in which it gets no CPU is known also for the
+    /// beginning of a turn that a rare check sees late.
+    fn account_at_rest(&mut self, check: Check, round: &mut Round) {
+        let Some(slot) = self.handle.slot() else { return };
+        let Some(tid) = slot.tid() else { return };
+        if check.snapshot.is_busy() {
+            if let Some((_, rested)) = self.rested.take() {
+                self.turn.excuse_start(check, rested, round.sample(tid));
+            }
+            return;
+        }
+        let turns = check.snapshot.turn.wrapping_add(slot.neighbours_of(&self.handle).turns);
+        // A thread without turns has waited for no CPU.
+        if self.rested.is_none_or(|(former, _)| former != turns) {
+            self.rested = round.sample(tid).map(|sample| (turns, sample));
+        }
     }
 
     fn check_for_stall(&mut self, check: Check, cpu: impl FnOnce() -> Option<processor::Sample>) -> bool {
@@ -265,10 +358,11 @@ impl Watched {
             return true;
         }
         // No judgement while the mailbox is locked: then it is in use.
-        let Some((waiting, taken)) = liveness.backlog() else { return true };
+        let Some(backlog) = liveness.backlog() else { return true };
+        let waiting = backlog.waiting;
         let neighbours =
             || self.handle.slot().map_or_else(Neighbours::default, |slot| slot.neighbours_of(&self.handle));
-        match self.stall.check(check, (waiting, taken), neighbours, cpu) {
+        match self.stall.check(check, backlog, neighbours, cpu) {
             Stall::None => true,
             Stall::Probe => {
                 self.handle.wake();
@@ -339,27 +433,30 @@ mod tests {
     }
 
     /// Time until the next check of an incarnation with this budget.
-    fn check_interval(liveness: &Arc<Liveness>, budget: Duration) -> Duration {
+    fn check_interval(liveness: &Arc<Liveness>, budget: Duration, pace: Pace) -> Duration {
         let handle =
             ActorHandle::new(liveness.clone(), None, Some(budget), Box::new(|event| panic!("{event:?}")));
         let mut watched = Watched::new(handle, budget);
-        assert!(watched.check(Time::from_nanos(2), Duration::ZERO, PERIOD_MAX));
-        watched.check_interval()
+        let (now, late, period) = (Time::from_nanos(2), Duration::ZERO, PERIOD_MAX);
+        assert!(watched.check(&mut Round { now, late, period, pace, samples: Vec::new() }));
+        watched.check_interval(pace)
     }
 
     #[test]
     fn idle_incarnation_is_checked_rarely() {
         let liveness = Liveness::new("idle");
-        let rests = [20, 100, 500, 1_000, 60_000]
-            .map(|ms| check_interval(&liveness, Duration::from_millis(ms)).as_millis());
+        let interval = |ms, pace| check_interval(&liveness, Duration::from_millis(ms), pace).as_millis();
+        let rests = [20, 100, 500, 1_000, 60_000].map(|ms| interval(ms, Pace::Alert));
+        assert_eq!(rests, [20, 100, 500, 1_000, 60_000].map(|ms| interval(ms, Pace::Marking)));
         assert_eq!(
             rests,
             [2, 5, 20, 40, 40],
             "a 25th of its budget, 40 ms at most, and not less than a period"
         );
+        let rests = [8, 20, 100, 1_000, 60_000].map(|ms| interval(ms, Pace::Resting));
+        assert_eq!(rests, [2, 5, 25, 250, 250], "a quarter of its budget, 250 ms at most");
         liveness.begin(Activity::Timer, Some(Time::from_nanos(1)));
-        let rests =
-            [20, 100, 1_000].map(|ms| check_interval(&liveness, Duration::from_millis(ms)).as_millis());
+        let rests = [20, 100, 1_000].map(|ms| interval(ms, Pace::Resting));
         assert_eq!(
             rests,
             [2, 5, 5],

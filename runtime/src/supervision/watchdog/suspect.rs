@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use super::{account::Account, processor::Sample};
 use crate::{
+    mailbox::Backlog,
     supervision::liveness::{Activity, ActivitySnapshot, Neighbours},
     time::Time,
 };
@@ -87,6 +88,20 @@ impl TurnSuspect {
         hangs.then_some(Hang { since, lasted, excused })
     }
 
+    /// Excuses time without a CPU between the start of a turn and the check that saw it first. `rested` is a sample of the
+    /// thread from before the turn, `sample` one of now. The thread may have waited before the turn, too; no more than the
+    /// time since the start is excused.
+    pub(super) fn excuse_start(&mut self, check: Check, rested: Sample, sample: Option<Sample>) {
+        let (Some(begun), Some(sample)) = (check.snapshot.begun, sample) else { return };
+        if !self.is_busy || self.checks > 0 {
+            return;
+        }
+        let waited = Duration::from_nanos(sample.waited.saturating_sub(rested.waited));
+        let late = self.account.late;
+        self.account.late = (late + waited).min(check.now.since(begun)).max(late);
+        self.account.enter(Some(sample));
+    }
+
     /// Returns whether a turn was in progress at the last check.
     pub(super) const fn is_open(&self) -> bool {
         self.is_busy
@@ -127,6 +142,8 @@ pub(super) struct StallSuspect {
     since: Time,
     /// Whether messages were queued at the last check, and none had been taken since the one before.
     is_open: bool,
+    /// Whether messages were queued at the last check.
+    has_waiting: bool,
     /// The actor's turn number at the probe, and the activity of the other actors on its thread.
     probed: Option<(u64, Neighbours)>,
     account: Account,
@@ -139,27 +156,33 @@ impl StallSuspect {
             taken: None,
             since: Time::ZERO,
             is_open: false,
+            has_waiting: false,
             probed: None,
             account: Account::default(),
         }
     }
 
-    /// Handles a check of an actor that should take messages. `waiting` messages are queued, and `taken` were
-    /// taken so far. If it matters, `neighbours` reads the activity of the other actors on its thread.
+    /// Handles a check of an actor that should take messages, and has this `backlog`. If it matters, `neighbours` reads
+    /// the activity of the other actors on its thread.
     pub(super) fn check(
         &mut self,
         check: Check,
-        (waiting, taken): (usize, u64),
+        backlog: Backlog,
         neighbours: impl FnOnce() -> Neighbours,
         sample: impl FnOnce() -> Option<Sample>,
     ) -> Stall {
         let Check { now, late, snapshot, .. } = check;
+        let Backlog { waiting, taken, since } = backlog;
+        self.has_waiting = waiting > 0;
         if waiting == 0 || self.taken != Some(taken) {
             self.taken = Some(taken);
             self.reset(now);
             return Stall::None;
         }
-        self.is_open = true;
+        if !std::mem::replace(&mut self.is_open, true) {
+            // None was taken since the last check. The messages may have begun to wait later.
+            self.since = since.map_or(self.since, |since| since.max(self.since));
+        }
         self.account.late += late;
         let lasted = now.since(self.since);
         let Some((turn, before)) = self.probed else {
@@ -201,6 +224,11 @@ impl StallSuspect {
     /// Returns whether messages were left queued at the last check.
     pub(super) const fn is_open(&self) -> bool {
         self.is_open
+    }
+
+    /// Returns whether messages were queued at the last check.
+    pub(super) const fn has_waiting(&self) -> bool {
+        self.has_waiting
     }
 }
 

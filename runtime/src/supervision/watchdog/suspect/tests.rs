@@ -1,5 +1,7 @@
 //! Accusations of hung actors, and their exceptions.
 
+use proptest::prelude::*;
+
 use super::*;
 use crate::supervision::{liveness::Activity, watchdog::processor::Condition};
 
@@ -136,7 +138,8 @@ fn stall_beside(
     let mut probed = None;
     for now in (0..400).map(|check| check * 5) {
         let check = on_time(now, busy(turn(now), None));
-        match suspect.check(check, (waiting, taken(now)), || neighbours(now), || sample(now)) {
+        let backlog = Backlog { waiting, taken: taken(now), since: None };
+        match suspect.check(check, backlog, || neighbours(now), || sample(now)) {
             Stall::None => {}
             Stall::Probe => probed = Some(now),
             other @ (Stall::Waits(_) | Stall::ThreadIsAway(_)) => return (probed, Some((now, other))),
@@ -166,7 +169,8 @@ fn blocked_thread_is_distinguished() {
 fn actor_with_waiting_messages_is_checked_more_often() {
     let mut suspect = StallSuspect::new(BUDGET);
     let mut is_open = |now, waiting, taken| {
-        suspect.check(on_time(now, busy(2, None)), (waiting, taken), Neighbours::default, || None);
+        let backlog = Backlog { waiting, taken, since: None };
+        suspect.check(on_time(now, busy(2, None)), backlog, Neighbours::default, || None);
         suspect.is_open()
     };
     assert!(!is_open(0, 3, 7), "the first check");
@@ -215,4 +219,68 @@ fn panic_has_limited_time_for_a_user_hook() {
         suspect.check(check, PERIOD, || cpu(0, 0, Condition::Blocked)).is_some()
     });
     assert_eq!(accused, Some(1_000));
+}
+
+/// Longest time between two checks at rest, of this budget.
+const RESTING: u64 = 25;
+
+proptest! {
+    /// The turn begins between two rare checks, and its thread waits for a CPU before that and after.
+    #[test]
+    fn turn_that_begins_at_rest_is_accused_at_its_time(
+        begun in 0..RESTING,
+        waited_before in 0_u64..10,
+        waited_after in 0_u64..30,
+    ) {
+        let mut suspect = TurnSuspect::new(BUDGET);
+        let thread = |waited| cpu(1, 1_000 + waited, Condition::Blocked);
+        let idle = on_time(0, busy(2, Some(ms(0))));
+        prop_assert_eq!(suspect.check(idle, PERIOD, || thread(0)), None);
+        let (snapshot, waited) = (busy(3, Some(ms(begun))), waited_before + waited_after);
+        let first = on_time(RESTING, snapshot);
+        prop_assert_eq!(suspect.check(first, PERIOD, || thread(waited)), None);
+        suspect.excuse_start(first, thread(0).expect("a sample"), thread(waited));
+        prop_assert!(suspect.is_open());
+        let accused = (RESTING..400).find(|now| {
+            suspect.check(on_time(*now, snapshot), PERIOD, || thread(waited)).is_some()
+        });
+        // No more is excused than the time from the start to the first check.
+        let excused = waited.min(RESTING - begun);
+        prop_assert_eq!(accused, Some(begun + 100 + excused));
+        prop_assert_eq!(suspect.deadline(snapshot), Some(ms(begun + 100 + excused)));
+    }
+
+    /// Messages begin to wait between two rare checks; the mailbox has recorded when.
+    #[test]
+    fn messages_that_begin_to_wait_at_rest_are_missed_at_their_time(since in 0..RESTING) {
+        let mut suspect = StallSuspect::new(BUDGET);
+        let mut check = |now: u64, waiting, since| {
+            let backlog = Backlog { waiting, taken: 7, since };
+            suspect.check(on_time(now, busy(2, None)), backlog, Neighbours::default, || None)
+        };
+        prop_assert_eq!(check(0, 0, None), Stall::None);
+        let (mut probed, mut accused) = (None, None);
+        for now in RESTING..400 {
+            match check(now, 3, Some(ms(since))) {
+                Stall::None => {}
+                Stall::Probe => probed = Some(now),
+                Stall::Waits(_) | Stall::ThreadIsAway(_) => {
+                    accused = accused.or(Some(now));
+                }
+            }
+        }
+        prop_assert_eq!((probed, accused), (Some(since + 50), Some(since + 100)));
+    }
+}
+
+#[test]
+fn former_record_of_waiting_messages_is_ignored() {
+    let mut suspect = StallSuspect::new(BUDGET);
+    let backlog = |waiting| Backlog { waiting, taken: 7, since: Some(ms(1)) };
+    let mut check = |now: u64, waiting| {
+        suspect.check(on_time(now, busy(2, None)), backlog(waiting), Neighbours::default, || None)
+    };
+    assert_eq!(check(0, 0), Stall::None);
+    assert_eq!(check(40, 0), Stall::None);
+    assert_eq!([check(80, 3), check(89, 3), check(90, 3)], [Stall::None, Stall::None, Stall::Probe]);
 }
