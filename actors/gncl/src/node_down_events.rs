@@ -24,6 +24,7 @@ use sinew_runtime::{
     time::Time,
     wire::Message,
 };
+use tokio::sync::Notify;
 
 use crate::State;
 
@@ -33,13 +34,17 @@ pub(crate) const LEAVE_MAX: Duration = Duration::from_secs(5);
 const HELD_MAX: usize = 4_096;
 /// Pause between two checks: messages end one after the other, and one check covers all that ended meanwhile.
 const CHECK_PAUSE: Duration = Duration::from_millis(1);
-/// Interval after which a check is made without a notification.
+/// Interval after which a check of held events is made without a notification.
 pub(crate) const CHECK_PERIOD: Duration = Duration::from_secs(1);
+/// The same without held events. A node at rest is not woken more often for that.
+const IDLE_CHECK_PERIOD: Duration = LEAVE_MAX;
 
 /// The held events, in order.
 #[derive(Debug, Default)]
 pub struct NodeDownEvents {
     held: Mutex<VecDeque<HeldEvent>>,
+    /// Notified when an event is held.
+    added: Notify,
 }
 
 #[derive(Debug)]
@@ -77,25 +82,29 @@ pub(crate) fn notify(state: &State, about: About, mut event: Message) -> Result<
     all.push_back(held);
     drop(all);
     state.store.fewer_outstanding.notify_one();
+    state.node_down_events.added.notify_one();
     Ok(())
 }
 
 /// Delivers the held events, each in its turn. GNCL notifies when that may be, and the application's queue if that was
-/// full. Once per [`CHECK_PERIOD`] a check is made even without held events, because another waiter may have consumed
-/// GNCL's notification.
+/// full. Once per [`CHECK_PERIOD`] a check of held events is made in any case, because another waiter may have consumed
+/// GNCL's notification. Nobody else waits for the notification of the first held event.
 ///
 /// A check costs a search among the applications with pending messages for each held event, and short locks
 /// of the sessions of the nodes concerned. There is at most one check per millisecond.
 pub(crate) async fn run_retries(state: Arc<State>) {
     let (fewer_outstanding, has_room) = (&state.store.fewer_outstanding, &state.ctx.room_notifier.ends);
+    let added = &state.node_down_events.added;
     claim_notifications(fewer_outstanding);
     claim_notifications(has_room);
+    claim_notifications(added);
     loop {
         let pause = deliver_due(&state, Time::now());
         tokio::select! {
             () = fewer_outstanding.notified() => {}
             () = has_room.notified() => {}
-            () = tokio::time::sleep(pause.unwrap_or(CHECK_PERIOD)) => {}
+            () = added.notified() => {}
+            () = tokio::time::sleep(pause.unwrap_or(IDLE_CHECK_PERIOD)) => {}
         }
         if pause.is_some() {
             tokio::time::sleep(CHECK_PAUSE).await;
