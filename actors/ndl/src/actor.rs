@@ -5,6 +5,7 @@ mod delivery;
 mod leave;
 mod mdns_presence;
 mod paths;
+mod progress;
 mod receiving;
 mod remembered_peers;
 
@@ -18,7 +19,6 @@ use std::{
     rc::Rc,
     sync::{Arc, MutexGuard, PoisonError, atomic::Ordering},
     task::Poll,
-    time::Duration,
 };
 
 use actix::{Actor, ActorContext, AsyncContext, Context, StreamHandler, WrapFuture};
@@ -31,12 +31,12 @@ use sinew_runtime::{
     tid::{Incarnation, NodeAddress},
     time::Time,
 };
-use tokio::sync::{Notify, mpsc, oneshot};
+use tokio::sync::{Notify, mpsc};
 
 pub use self::leave::send_leaves;
 use sinew_model::{
     address::LocalAddress, config::NodeConfig, events::LayerReport, ports::NodeIncarnation,
-    progress::Progress, refusals::Refusals,
+    refusals::Refusals,
 };
 
 use self::{
@@ -45,12 +45,11 @@ use self::{
     receiving::ReadLimiter,
 };
 use super::{
-    Event, check_period,
+    Event,
     core::{Core, Epoch, Input, Output, Place},
     datagram::{Answer, Body, Datagram, Leave, encode},
     interfaces::{self, Usable},
     probe::{PROBES_MAX, Probe},
-    progress::RootWatch,
 };
 use crate::State;
 
@@ -113,7 +112,7 @@ impl NdlActor {
             ctx.spawn(probe_hosts(shell.clone(), probes).into_actor(self));
         }
         ctx.spawn(remembered_peers::keep(shell.clone()).into_actor(self));
-        ctx.spawn(watch_progress(shell.clone()).into_actor(self));
+        ctx.spawn(progress::watch(shell.clone()).into_actor(self));
         if let Some(links) = self.state.ctx.ports.links() {
             ctx.spawn(links.deliver_held_events().into_actor(self));
         }
@@ -384,64 +383,6 @@ fn seeds(state: &State, usable: Option<&Usable>) -> Vec<SocketAddr> {
         Some(SocketAddrV6::new(*at.ip(), at.port(), 0, number).into())
     });
     seeds.collect()
-}
-
-/// Requests this node's stalled parts from the root every period. Neither waits for the other. A missing
-/// answer is reported, and no further request is sent before the answer.
-async fn watch_progress(shell: Rc<Shell>) {
-    let period = check_period(&shell.state.ctx.config.ndl);
-    let (mut root, mut question) = (RootWatch::new(Time::now()), None);
-    loop {
-        // A pending request is checked each period.
-        if question.is_none() {
-            tokio::time::sleep(period).await;
-        }
-        // A layer that reads its event queue gets these events by itself. No event may follow if a replaced
-        // instance of LNCL left some.
-        shell.state.ctx.app_backlogs.offer_to_sync(&shell.state.ctx.posts);
-        shell.state.ctx.app_backlogs.offer_to_ndl(&shell.state.ctx.posts);
-        let report = request_progress(&shell.state, &mut root, &mut question, period).await;
-        let is_current = shell.feed(|core, now| {
-            if let Some(report) = report {
-                core.handle(now, Input::ProgressSeen(report));
-            }
-        });
-        if !is_current {
-            return;
-        }
-    }
-}
-
-/// Returns the new report of this node, or `None` if the last one still applies. An unanswered request is kept.
-async fn request_progress(
-    state: &State,
-    root: &mut RootWatch,
-    question: &mut Option<oneshot::Receiver<Progress>>,
-    period: Duration,
-) -> Option<Progress> {
-    if state.ctx.root.has_ended() {
-        // The node is shutting down.
-        return None;
-    }
-    root.requested(Time::now());
-    if question.is_none() {
-        let (answer, answered) = oneshot::channel();
-        // If the root's event queue is full, the request is sent later.
-        *question = state.ctx.root.report(LayerReport::RequestProgress(answer)).ok().map(|()| answered);
-    }
-    let answer = async {
-        match question {
-            Some(answered) => answered.await,
-            None => std::future::pending().await,
-        }
-    };
-    let Ok(answer) = tokio::time::timeout(period, answer).await else {
-        return root.not_answered(Time::now());
-    };
-    *question = None;
-    let report = answer.ok()?;
-    root.answered(Time::now(), report.clone());
-    Some(report)
 }
 
 /// Probes many hosts at once.
