@@ -42,10 +42,11 @@ use sinew_model::{
 use self::{
     announcing::announced,
     paths::{Paths, Reader},
+    progress::NextRequest,
     receiving::ReadLimiter,
 };
 use super::{
-    Event,
+    Event, check_period,
     core::{Core, Epoch, Input, Output, Place},
     datagram::{Answer, Body, Datagram, Leave, encode},
     interfaces::{self, Usable},
@@ -191,6 +192,8 @@ struct Shell {
     probes: RefCell<Option<mpsc::Receiver<Probe>>>,
     /// Rate limit for the reads of all sockets together.
     reads: RefCell<ReadLimiter>,
+    /// When the root is asked next.
+    next_request: NextRequest,
 }
 
 impl Shell {
@@ -222,7 +225,20 @@ impl Shell {
         let (rewind, has_pending, refusals) = (Notify::new(), Notify::new(), state.ctx.refusals.clone());
         let (to_probe, probes) = mpsc::channel(PROBES_MAX);
         let (probes, reads) = (RefCell::new(Some(probes)), RefCell::new(ReadLimiter::new()));
-        Ok((Self { state, epoch, paths, rewind, has_pending, refusals, to_probe, probes, reads }, readers))
+        let next_request = NextRequest::new(check_period(&state.ctx.config.ndl));
+        let shell = Self {
+            state,
+            epoch,
+            paths,
+            rewind,
+            has_pending,
+            refusals,
+            to_probe,
+            probes,
+            reads,
+            next_request,
+        };
+        Ok((shell, readers))
     }
 
     /// Gives the core an input and executes its outputs. Returns `false` if a later instance has taken over.
@@ -405,10 +421,15 @@ async fn probe_hosts(shell: Rc<Shell>, mut requests: mpsc::Receiver<Probe>) {
 async fn keep_time(shell: Rc<Shell>, mut alarm: Alarm) {
     loop {
         let wake = lock_core(&shell.state).next_wake();
-        let Some(wake) = wake else { return };
+        let next = [wake, shell.next_request.due()].into_iter().flatten().min();
         tokio::select! {
-            () = reached(&mut alarm, wake) => {}
+            () = reached(&mut alarm, next) => {}
             () = shell.rewind.notified() => continue,
+        }
+        let now = Time::now();
+        shell.next_request.time_passed(now);
+        if wake.is_none_or(|wake| now < wake) {
+            continue;
         }
         let hints = liveness_hints(&shell.state);
         let time_passed = |core: &mut Core, now| {
@@ -421,13 +442,13 @@ async fn keep_time(shell: Rc<Shell>, mut alarm: Alarm) {
     }
 }
 
-/// Waits until this time.
-async fn reached(alarm: &mut Alarm, at: Time) {
+/// Waits until this time; `None`: for ever.
+async fn reached(alarm: &mut Alarm, at: Option<Time>) {
     poll_fn(|context| {
-        if Time::now() >= at {
+        if at.is_some_and(|at| Time::now() >= at) {
             return Poll::Ready(());
         }
-        alarm.wake_at(Some(at), context).expect("a timer that was made takes a time");
+        alarm.wake_at(at, context).expect("a timer that was made takes a time");
         Poll::Pending
     })
     .await;

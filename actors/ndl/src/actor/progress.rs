@@ -1,13 +1,52 @@
-//! Asks this node's root for the stalled parts of the node.
+//! Asks this node's root for the stalled parts of the node, mostly with a wake that the core's timer needs anyway.
 
-use std::{rc::Rc, time::Duration};
+use std::{cell::Cell, rc::Rc, time::Duration};
 
 use sinew_model::{events::LayerReport, progress::Progress};
 use sinew_runtime::time::Time;
-use tokio::sync::oneshot;
+use tokio::sync::{Notify, oneshot};
 
 use super::Shell;
 use crate::{State, check_period, core::Input, progress::RootWatch};
+
+/// Fraction of a period by which a request may be early, to share a wake. It is never late.
+const EARLY_DIVISOR: u32 = 8;
+
+/// The time of the next request, which [`keep_time`](super::keep_time) watches. The reactor's own sleeps would wake the
+/// thread up to three times for one of half a second.
+#[derive(Debug)]
+pub(super) struct NextRequest {
+    due: Cell<Option<Time>>,
+    /// How much earlier a request is made if the thread is awake for the core.
+    early: Duration,
+    reached: Notify,
+}
+
+impl NextRequest {
+    pub(super) fn new(period: Duration) -> Self {
+        Self { due: Cell::new(None), early: period / EARLY_DIVISOR, reached: Notify::new() }
+    }
+
+    /// Returns when the timer must fire for the request.
+    pub(super) fn due(&self) -> Option<Time> {
+        self.due.get()
+    }
+
+    /// Notifies the waiter if its request is due at `now`, or nearly.
+    pub(super) fn time_passed(&self, now: Time) {
+        if self.due.get().is_some_and(|due| due <= now + self.early) {
+            self.due.set(None);
+            self.reached.notify_one();
+        }
+    }
+
+    /// Waits until `due`, or until the timer fires for the core shortly before.
+    async fn wait_until(&self, due: Time, rewind: &Notify) {
+        self.due.set(Some(due));
+        rewind.notify_one();
+        self.reached.notified().await;
+    }
+}
 
 /// Requests this node's stalled parts from the root every period. Neither waits for the other. A missing
 /// answer is reported, and no further request is sent before the answer.
@@ -17,7 +56,7 @@ pub(super) async fn watch(shell: Rc<Shell>) {
     loop {
         // A pending request is checked each period.
         if question.is_none() {
-            tokio::time::sleep(period).await;
+            shell.next_request.wait_until(Time::now() + period, &shell.rewind).await;
         }
         // A layer that reads its event queue gets these events by itself. No event may follow if a replaced
         // instance of LNCL left some.
@@ -65,4 +104,39 @@ async fn request_progress(
     let report = answer.ok()?;
     root.answered(Time::now(), report.clone());
     Some(report)
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew_model::notifications::testing::waits;
+
+    use super::*;
+
+    const PERIOD: Duration = Duration::from_millis(500);
+
+    const fn at(ms: u64) -> Time {
+        Time::from_nanos(1_000_000_000 + ms * 1_000_000)
+    }
+
+    #[test]
+    fn request_shares_a_wake_shortly_before_it_is_due() {
+        for (woken_at, is_made) in [(0, false), (437, false), (438, true), (500, true), (900, true)] {
+            let (request, rewind) = (NextRequest::new(PERIOD), Notify::new());
+            let mut waiting = std::pin::pin!(request.wait_until(at(500), &rewind));
+            let woken = waits(waiting.as_mut());
+            assert_eq!(request.due(), Some(at(500)), "the timer fires then at the latest");
+            request.time_passed(at(woken_at));
+            assert_eq!((woken.is(), request.due().is_none()), (is_made, is_made), "at {woken_at} ms");
+        }
+    }
+
+    #[test]
+    fn timer_is_set_anew_for_each_request() {
+        let (request, rewind) = (NextRequest::new(PERIOD), Notify::new());
+        let mut rewound = std::pin::pin!(rewind.notified());
+        let woken = waits(rewound.as_mut());
+        let mut waiting = std::pin::pin!(request.wait_until(at(500), &rewind));
+        waits(waiting.as_mut());
+        assert!(woken.is());
+    }
 }
