@@ -183,6 +183,8 @@ struct Shell {
     paths: Paths,
     /// Notifies the timer that the core's next wake has changed.
     rewind: Notify,
+    /// Notified when the remembered peers have changed.
+    remembered_changed: Notify,
     /// Notified when a layer had no room for an event.
     has_pending: Notify,
     refusals: Arc<Refusals>,
@@ -225,12 +227,14 @@ impl Shell {
         let (rewind, has_pending, refusals) = (Notify::new(), Notify::new(), state.ctx.refusals.clone());
         let (to_probe, probes) = mpsc::channel(PROBES_MAX);
         let (probes, reads) = (RefCell::new(Some(probes)), RefCell::new(ReadLimiter::new()));
-        let next_request = NextRequest::new(check_period(&state.ctx.config.ndl));
+        let (remembered_changed, next_request) =
+            (Notify::new(), NextRequest::new(check_period(&state.ctx.config.ndl)));
         let shell = Self {
             state,
             epoch,
             paths,
             rewind,
+            remembered_changed,
             has_pending,
             refusals,
             to_probe,
@@ -243,18 +247,21 @@ impl Shell {
 
     /// Gives the core an input and executes its outputs. Returns `false` if a later instance has taken over.
     fn feed(&self, input: impl FnOnce(&mut Core, Time)) -> bool {
-        let wake_moved = {
+        let (wake_moved, remembered_changed) = {
             let mut core = lock_core(&self.state);
             if !core.is_current(self.epoch) {
                 return false;
             }
-            let before = core.next_wake();
+            let (wake, changes) = (core.next_wake(), core.remembered_changes());
             input(&mut core, Time::now());
-            core.next_wake() != before
+            (core.next_wake() != wake, core.remembered_changes() != changes)
         };
         self.execute_outputs();
         if wake_moved {
             self.rewind.notify_one();
+        }
+        if remembered_changed {
+            self.remembered_changed.notify_one();
         }
         true
     }

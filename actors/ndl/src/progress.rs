@@ -6,7 +6,7 @@ use sinew_model::{config::NdlConfig, progress::Progress};
 use sinew_runtime::time::Time;
 
 /// Minimum time between two checks of a node by itself.
-const CHECK_MIN: Duration = Duration::from_millis(100);
+pub(crate) const CHECK_MIN: Duration = Duration::from_millis(100);
 /// Returns the time between two checks of a node for its stalled parts.
 pub fn check_period(config: &NdlConfig) -> Duration {
     config.period.max(CHECK_MIN)

@@ -7,7 +7,11 @@ use sinew_runtime::time::Time;
 use tokio::sync::{Notify, oneshot};
 
 use super::Shell;
-use crate::{State, check_period, core::Input, progress::RootWatch};
+use crate::{
+    State, check_period,
+    core::Input,
+    progress::{CHECK_MIN, RootWatch},
+};
 
 /// Fraction of a period by which a request may be early, to share a wake. It is never late.
 const EARLY_DIVISOR: u32 = 8;
@@ -24,7 +28,11 @@ pub(super) struct NextRequest {
 
 impl NextRequest {
     pub(super) fn new(period: Duration) -> Self {
-        Self { due: Cell::new(None), early: period / EARLY_DIVISOR, reached: Notify::new() }
+        Self {
+            due: Cell::new(None),
+            early: (period / EARLY_DIVISOR).min(period.saturating_sub(CHECK_MIN)),
+            reached: Notify::new(),
+        }
     }
 
     /// Returns when the timer must fire for the request.
@@ -127,6 +135,21 @@ mod tests {
             assert_eq!(request.due(), Some(at(500)), "the timer fires then at the latest");
             request.time_passed(at(woken_at));
             assert_eq!((woken.is(), request.due().is_none()), (is_made, is_made), "at {woken_at} ms");
+        }
+    }
+
+    // spec: NDL-9.2
+    #[test]
+    fn requests_are_no_more_frequent_than_the_minimum() {
+        for (period_ms, earliest) in [(100, 100), (110, 100), (112, 100), (200, 175)] {
+            let (request, rewind) = (NextRequest::new(Duration::from_millis(period_ms)), Notify::new());
+            let mut waiting = std::pin::pin!(request.wait_until(at(period_ms), &rewind));
+            let woken = waits(waiting.as_mut());
+            let reached = (0..=period_ms).find(|ms| {
+                request.time_passed(at(*ms));
+                woken.is()
+            });
+            assert_eq!(reached, Some(earliest), "of a period of {period_ms} ms");
         }
     }
 

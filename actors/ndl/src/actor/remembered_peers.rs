@@ -17,8 +17,7 @@ use crate::{
     peers_file::{Kept, PeersFile},
 };
 
-/// Time between two checks for changes to write. It is the minimum interval between writes, and the maximum
-/// loss in a power failure.
+/// Time from a change to its write, or from one write to the next one. It is the maximum loss in a power failure.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 /// Retry interval after a failed write, and the maximum one after a failed read.
 const RETRY: Duration = Duration::from_secs(60);
@@ -38,6 +37,9 @@ pub(super) async fn keep(shell: Rc<Shell>) {
     }
     let (mut written, mut has_failed) = (0, false);
     loop {
+        if lock_core(&shell.state).remembered_changes() == written {
+            shell.remembered_changed.notified().await;
+        }
         tokio::time::sleep(if has_failed { RETRY } else { CHECK_INTERVAL }).await;
         let (changes, peers) = {
             // Done here and not in the writing thread: a low-priority thread must not hold up NDL with this lock.
