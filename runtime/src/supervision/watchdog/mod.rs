@@ -24,7 +24,7 @@ use std::{
 
 pub(super) use deadline_extension::DeadlineExtension;
 use lateness::Lateness;
-use processor::{Sample, sample};
+use processor::sample;
 use rest::{Pace, Rest};
 use suspect::{Check, Hang, Stall, StallSuspect, TurnSuspect};
 
@@ -204,7 +204,7 @@ impl Shared {
         let reading = self.lateness.has_readers().then_some(PERIOD_MAX);
         let period = table.iter().map(|watched| watched.period).chain(reading).min()?;
         let before = table.len();
-        let mut round = Round { now, late, period, pace: rest.pace(), samples: Vec::new() };
+        let mut round = Round { now, late, period, pace: rest.pace(), waited: Vec::new() };
         table.retain_mut(|watched| check_one(watched, &mut round));
         self.count.fetch_sub(before - table.len(), Ordering::Relaxed);
         let is_same = former == before && before == table.len();
@@ -228,17 +228,17 @@ struct Round {
     late: Duration,
     period: Duration,
     pace: Pace,
-    /// The threads whose accounts were read in this round, for the accounts of actors at rest.
-    samples: Vec<(i32, Option<Sample>)>,
+    /// The threads of actors at rest whose accounts were read in this round, and how long each has waited for a CPU.
+    waited: Vec<(i32, Option<u64>)>,
 }
 
 impl Round {
-    fn sample(&mut self, tid: i32) -> Option<Sample> {
-        if let Some((_, known)) = self.samples.iter().find(|(of, _)| *of == tid) {
+    fn waited(&mut self, tid: i32) -> Option<u64> {
+        if let Some((_, known)) = self.waited.iter().find(|(of, _)| *of == tid) {
             return *known;
         }
-        let new = sample(tid);
-        self.samples.push((tid, new));
+        let new = processor::waited(tid);
+        self.waited.push((tid, new));
         new
     }
 }
@@ -277,8 +277,9 @@ struct Watched {
     period: Duration,
     turn: TurnSuspect,
     stall: StallSuspect,
-    /// At rest: the sum of the turn numbers of the thread's actors, and a sample of the thread at that moment.
-    rested: Option<(u64, Sample)>,
+    /// At rest: the sum of the turn numbers of the thread's actors, and how long the thread had waited for a CPU then,
+    /// in nanoseconds.
+    rested: Option<(u64, u64)>,
 }
 
 impl Watched {
@@ -340,14 +341,14 @@ impl Watched {
         let Some(tid) = slot.tid() else { return };
         if check.snapshot.is_busy() {
             if let Some((_, rested)) = self.rested.take() {
-                self.turn.excuse_start(check, rested, round.sample(tid));
+                self.turn.excuse_start(check, rested, sample(tid));
             }
             return;
         }
         let turns = check.snapshot.turn.wrapping_add(slot.neighbours_of(&self.handle).turns);
         // A thread without turns has waited for no CPU.
         if self.rested.is_none_or(|(former, _)| former != turns) {
-            self.rested = round.sample(tid).map(|sample| (turns, sample));
+            self.rested = round.waited(tid).map(|waited| (turns, waited));
         }
     }
 
@@ -438,7 +439,7 @@ mod tests {
             ActorHandle::new(liveness.clone(), None, Some(budget), Box::new(|event| panic!("{event:?}")));
         let mut watched = Watched::new(handle, budget);
         let (now, late, period) = (Time::from_nanos(2), Duration::ZERO, PERIOD_MAX);
-        assert!(watched.check(&mut Round { now, late, period, pace, samples: Vec::new() }));
+        assert!(watched.check(&mut Round { now, late, period, pace, waited: Vec::new() }));
         watched.check_interval(pace)
     }
 

@@ -24,13 +24,25 @@ pub(super) struct Sample {
 /// Returns the CPU use of the thread `tid` of this process; `None` if it has ended, or the kernel keeps no
 /// account of it.
 pub(super) fn sample(tid: i32) -> Option<Sample> {
-    let read = |file: &str| std::fs::read_to_string(format!("/proc/self/task/{tid}/{file}")).ok();
-    parse(&read("schedstat")?, &read("stat")?)
+    parse(&read(tid, "schedstat")?, &read(tid, "stat")?)
+}
+
+/// Returns the [time of waiting](Sample::waited) of the thread `tid` alone, which costs one file.
+pub(super) fn waited(tid: i32) -> Option<u64> {
+    parse_times(&read(tid, "schedstat")?).map(|(_, waited)| waited)
+}
+
+fn read(tid: i32, file: &str) -> Option<String> {
+    std::fs::read_to_string(format!("/proc/self/task/{tid}/{file}")).ok()
+}
+
+fn parse_times(schedstat: &str) -> Option<(u64, u64)> {
+    let mut numbers = schedstat.split_ascii_whitespace().map_while(|word| word.parse().ok());
+    Some((numbers.next()?, numbers.next()?))
 }
 
 fn parse(schedstat: &str, stat: &str) -> Option<Sample> {
-    let mut numbers = schedstat.split_ascii_whitespace().map_while(|word| word.parse().ok());
-    let (ran, waited) = (numbers.next()?, numbers.next()?);
+    let (ran, waited) = parse_times(schedstat)?;
     // The name before it is in brackets and may itself have brackets and spaces.
     let (_, after_name) = stat.rsplit_once(')')?;
     let condition = match after_name.trim_start().bytes().next()? {
@@ -62,6 +74,9 @@ mod tests {
     #[test]
     fn calling_thread_is_runnable() {
         let tid = rustix::thread::gettid().as_raw_nonzero().get();
-        assert_eq!(sample(tid).map(|sample| sample.condition), Some(Condition::Runnable));
+        let known = waited(tid);
+        let sample = sample(tid);
+        assert_eq!(sample.map(|sample| sample.condition), Some(Condition::Runnable));
+        assert!(known.is_some() && known <= sample.map(|sample| sample.waited));
     }
 }

@@ -88,15 +88,15 @@ impl TurnSuspect {
         hangs.then_some(Hang { since, lasted, excused })
     }
 
-    /// Excuses time without a CPU between the start of a turn and the check that saw it first. `rested` is a sample of the
-    /// thread from before the turn, `sample` one of now. The thread may have waited before the turn, too; no more than the
-    /// time since the start is excused.
-    pub(super) fn excuse_start(&mut self, check: Check, rested: Sample, sample: Option<Sample>) {
+    /// Excuses time without a CPU between the start of a turn and the check that saw it first. `rested` is the time for
+    /// which the thread had waited before the turn, in nanoseconds, `sample` is of now. The thread may have waited
+    /// between `rested` and the turn, too; no more than the time since the start is excused.
+    pub(super) fn excuse_start(&mut self, check: Check, rested: u64, sample: Option<Sample>) {
         let (Some(begun), Some(sample)) = (check.snapshot.begun, sample) else { return };
         if !self.is_busy || self.checks > 0 {
             return;
         }
-        let waited = Duration::from_nanos(sample.waited.saturating_sub(rested.waited));
+        let waited = Duration::from_nanos(sample.waited.saturating_sub(rested));
         let late = self.account.late;
         self.account.late = (late + waited).min(check.now.since(begun)).max(late);
         self.account.enter(Some(sample));

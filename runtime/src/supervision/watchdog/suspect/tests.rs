@@ -239,7 +239,7 @@ proptest! {
         let (snapshot, waited) = (busy(3, Some(ms(begun))), waited_before + waited_after);
         let first = on_time(RESTING, snapshot);
         prop_assert_eq!(suspect.check(first, PERIOD, || thread(waited)), None);
-        suspect.excuse_start(first, thread(0).expect("a sample"), thread(waited));
+        suspect.excuse_start(first, 1_000_000_000, thread(waited));
         prop_assert!(suspect.is_open());
         let accused = (RESTING..400).find(|now| {
             suspect.check(on_time(*now, snapshot), PERIOD, || thread(waited)).is_some()
