@@ -10,6 +10,7 @@ mod link_notifications;
 mod long_segments;
 mod lost_addresses;
 mod membership;
+mod timer;
 mod wire;
 
 use std::{
@@ -22,7 +23,7 @@ use std::{
     time::Duration,
 };
 
-use actix::{Actor, AsyncContext, Context, Running, SpawnHandle, StreamHandler, fut};
+use actix::{Actor, AsyncContext, Context, Running, StreamHandler, fut};
 use futures_util::stream;
 use sinew_model::{accept_limiter::AcceptLimiter, config::NodeConfig, leave_reason::LeaveReason};
 use sinew_runtime::{
@@ -53,6 +54,7 @@ use super::{
 use crate::State;
 use authentication::NOT_AUTHENTICATED;
 pub use leaving::LINGER;
+use timer::CoreTimer;
 use wire::{Linked, Wire};
 
 /// GNCL's actor.
@@ -66,7 +68,7 @@ pub struct Gncl {
     spin: Arc<Spin>,
     /// Authentication of peers; `None` if it is disabled.
     authenticator: Option<Arc<Authenticator>>,
-    alarm: Option<(Time, SpawnHandle)>,
+    timer: Rc<CoreTimer>,
     /// Time at which the layer ends even if peers are still connected; set once the node is being stopped.
     leave_deadline: Option<Time>,
     /// Reasons given by linked peers that sent GOODBYE and are not yet reported as having left; at most one per peer.
@@ -89,7 +91,7 @@ impl Gncl {
             connection_events: ConnectionEvents::default(),
             spin,
             authenticator: None,
-            alarm: None,
+            timer: Rc::default(),
             leave_deadline: None,
             leave_reasons: BTreeMap::new(),
         }
@@ -107,7 +109,9 @@ impl Gncl {
         while let Some(output) = self.core.poll() {
             self.execute(output, ctx);
         }
-        self.set_alarm(ctx);
+        if let Some(at) = self.core.next_wake() {
+            self.timer.set(at);
+        }
     }
 
     /// Reports to the core when messages were last received, before an input that depends on it: the passing
@@ -126,20 +130,6 @@ impl Gncl {
         {
             report(*connection, wire);
         }
-    }
-
-    fn set_alarm(&mut self, ctx: &mut Context<Self>) {
-        let Some(at) = self.core.next_wake() else { return };
-        match self.alarm {
-            Some((set, _)) if set <= at => return,
-            Some((_, handle)) => drop(ctx.cancel_future(handle)),
-            None => {}
-        }
-        let handle = ctx.run_later(at.since(Time::now()), |actor, ctx| {
-            actor.alarm = None;
-            actor.input(Input::TimePassed, ctx);
-        });
-        self.alarm = Some((at, handle));
     }
 
     fn execute(&mut self, output: Output, ctx: &mut Context<Self>) {
@@ -333,6 +323,7 @@ impl Actor for Gncl {
         self.watch_certificate_times(ctx);
         self.cut_all();
         ctx.add_stream(self.connection_events.stream());
+        ctx.add_stream(self.timer.clone().events());
         self.report_cut_links();
         self.catch_up(ctx);
         let limiter = Rc::new(RefCell::new(AcceptLimiter::new(Time::now())));
