@@ -69,6 +69,7 @@ pub mod core;
 pub mod datagram;
 #[cfg(feature = "fuzzing")]
 pub mod fuzzing;
+mod grid;
 mod interfaces;
 mod mdns;
 mod member_events;

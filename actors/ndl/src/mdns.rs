@@ -22,7 +22,7 @@ use sinew_runtime::{time::Time, wire::fnv1a};
 use socket2::{Domain, Socket, Type};
 use tokio::sync::oneshot;
 
-use super::datagram::Announcement;
+use super::{datagram::Announcement, grid::until_next};
 
 /// Type of Sinew's service.
 pub(super) const SERVICE: &str = "_sinew._udp.local.";
@@ -33,7 +33,7 @@ const NAME_MAX: usize = 38;
 /// Time after which a slow start is logged.
 const SLOW: Duration = Duration::from_secs(10);
 
-/// Time between two checks of the memory use of mdns-sd.
+/// Maximum time between two checks of the memory use of mdns-sd.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// The memory use of mdns-sd for data received from other hosts. mdns-sd sets no bound itself, and any host
@@ -135,7 +135,7 @@ impl Mdns {
     /// A daemon that is flooded continuously or not scheduled answers late.
     pub(super) async fn keeps_more_than(&self, most: Kept) -> Kept {
         loop {
-            tokio::time::sleep(CHECK_INTERVAL).await;
+            tokio::time::sleep(until_next(Time::now(), CHECK_INTERVAL)).await;
             let Ok(answer) = self.daemon.get_metrics() else { continue };
             let Ok(metrics) = answer.recv_async().await else { continue };
             let kept = Kept::of(&metrics);

@@ -30,9 +30,9 @@ use sinew_runtime::{
 use tokio::sync::watch;
 
 use super::{Shell, lock_core, mdns_presence::keep_mdns, receiving::receive};
-use crate::{State, core::Cast, interfaces::Usable, socket};
+use crate::{State, core::Cast, grid::until_next, interfaces::Usable, socket};
 
-/// Time after which a failed opening is retried, and the open sockets are bound to their interfaces again.
+/// Maximum time after which a failed opening is retried, and the open sockets are bound to their interfaces again.
 const RETRY: Duration = Duration::from_secs(1);
 /// Time between two warnings about the same missing address.
 const REMINDER: Duration = Duration::from_secs(60);
@@ -403,7 +403,7 @@ pub(super) async fn keep_paths(shell: Rc<Shell>, mut news: Option<watch::Receive
             return;
         }
         mdns.update(&shell, &tasks);
-        let retry = tokio::time::sleep(RETRY);
+        let retry = tokio::time::sleep(until_next(Time::now(), RETRY));
         tokio::pin!(retry);
         loop {
             let changed = async {
