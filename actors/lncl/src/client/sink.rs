@@ -64,11 +64,11 @@ mod tests {
     use super::*;
 
     /// An outlet that accepts all messages, or none.
-    struct Outlet {
+    struct PlayedOutlet {
         accepts: bool,
     }
 
-    impl MessageSink for Outlet {
+    impl MessageSink for PlayedOutlet {
         fn submit(&self, message: Message) -> Result<(), Refused> {
             if self.accepts { Ok(()) } else { Err(Refused::new(message, Rejection::QueueFull)) }
         }
@@ -90,7 +90,7 @@ mod tests {
             let waited = tokio::time::timeout(Duration::from_millis(20), run.as_mut()).await;
             waited.expect_err("it never ends");
             let woken = waits(run.as_mut());
-            let sink = ClientSink::new(Arc::new(Outlet { accepts }), checks.clone());
+            let sink = ClientSink::new(Arc::new(PlayedOutlet { accepts }), checks.clone());
             let message = message(time_to_live_us);
             let result = if is_offered { sink.offer(message, None) } else { sink.submit(message) };
             assert_eq!(result.is_ok(), accepts);

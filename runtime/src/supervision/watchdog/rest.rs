@@ -21,7 +21,7 @@ const TURNS_AT_ONCE: u64 = 8;
 const QUIET: Duration = Duration::from_secs(1);
 /// Minimum time between the order to record and the first long sleep. A turn that began without a record is then
 /// visible to a check before that sleep.
-pub(super) const SETTLE: Duration = Duration::from_millis(5);
+const SETTLE: Duration = Duration::from_millis(5);
 
 /// How the watchdog checks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -61,8 +61,8 @@ impl Rest {
         self.pace
     }
 
-    /// Handles a check, and returns the pace from now on. `turns` is the sum of all turn numbers, which rise by two with
-    /// each turn. `may_rest`: nothing was open, no message waited, and no incarnation began or ended.
+    /// Handles a check, and returns the pace from now on. `turns` is the sum of all turn numbers, which rise by
+    /// two with each turn. `may_rest`: nothing was open, no message waited, and no incarnation began or ended.
     pub(super) fn check(&mut self, now: Time, turns: u64, may_rest: bool) -> Pace {
         let most = now.since(self.checked).saturating_mul(TURNS_PER_S_MAX).as_secs() + TURNS_AT_ONCE;
         let is_quiet = may_rest && turns.wrapping_sub(self.turns) / 2 <= most;
