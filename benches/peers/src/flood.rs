@@ -9,6 +9,7 @@ use std::{
 use sinew_figures::{
     Alone, Figures, Pinning,
     process::{Process, await_end, command, print_ready},
+    results::{self, CaseResult, Recorder},
 };
 use zenoh::Wait;
 
@@ -40,20 +41,23 @@ const CARRIERS: [&str; 5] = [
 ];
 
 /// Runs every case that has every one of these words in its name.
-pub(crate) fn run(is_short: bool, words: &[String]) {
+pub(crate) fn run(is_short: bool, words: &[String], recorder: &mut Recorder) {
     let packets = if is_short { 100_000 } else { 1_000_000 };
     sinew_figures::head();
     for pinning in [Pinning::Anywhere, Pinning::OneCpuEach] {
         for carrier in CARRIERS {
             let name = format!("flood-{carrier}-{}", pinning.name());
             if words.iter().all(|word| name.contains(word.as_str())) {
-                run_one(&name, carrier, pinning, packets);
+                let Some((figures, rates)) = rates(&name, carrier, pinning, packets) else { continue };
+                report(&name, packets, &figures, &rates);
+                recorder.add(result(carrier, pinning, packets, &rates));
             }
         }
     }
 }
 
-fn run_one(name: &str, carrier: &str, pinning: Pinning, packets: u64) {
+/// Returns the time for each packet, and the messages a second, sorted, of all runs that succeed.
+fn rates(name: &str, carrier: &str, pinning: Pinning, packets: u64) -> Option<(Figures, Vec<u64>)> {
     let (mut figures, mut rates) = (Figures::new(), Vec::new());
     for _ in 0..RUNS {
         let role = format!("flood {carrier} {} {packets}", pinning.name());
@@ -67,15 +71,32 @@ fn run_one(name: &str, carrier: &str, pinning: Pinning, packets: u64) {
         rates.push(packets * 1_000_000_000 / nanos.max(1));
     }
     rates.sort_unstable();
-    let Some(median) = rates.get(rates.len() / 2) else { return };
+    (!rates.is_empty()).then_some((figures, rates))
+}
+
+fn report(name: &str, packets: u64, seen: &Figures, rates: &[u64]) {
     let counts = [
-        ("messages_per_second", *median),
+        ("messages_per_second", rates[rates.len() / 2]),
         ("least", rates[0]),
         ("most", rates[rates.len() - 1]),
         ("packets", packets),
     ];
-    Alone { bench: "peers", case: name, figure: "time for each packet", seen: &figures, counts: &counts }
-        .report();
+    Alone { bench: "peers", case: name, figure: "time for each packet", seen, counts: &counts }.report();
+}
+
+fn result(carrier: &str, pinning: Pinning, packets: u64, rates: &[u64]) -> CaseResult {
+    CaseResult {
+        case: carrier.to_owned(),
+        pace: results::FLOOD.to_owned(),
+        cpus: pinning.name().to_owned(),
+        bytes: PACKET,
+        runs: rates.len(),
+        rounds: Some(packets),
+        per_second: Some(rates[rates.len() / 2]),
+        least_per_second: rates.first().copied(),
+        most_per_second: rates.last().copied(),
+        ..CaseResult::default()
+    }
 }
 
 /// Sends them, and prints the total time.

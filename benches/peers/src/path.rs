@@ -2,7 +2,12 @@
 
 use std::process::Stdio;
 
-use sinew_figures::{Beside, End, Figures, Pace, Pinning, Rounds, process::command, stream};
+use sinew_figures::{
+    Beside, End, Figures, Pace, Pinning, Rounds,
+    process::command,
+    results::{CaseResult, Recorder},
+    stream,
+};
 
 use crate::{
     applications, flood, iceoryx2, raw,
@@ -123,15 +128,15 @@ impl Case {
         format!("{}-{}B-{}-{}", self.group, self.bytes, self.pace.name(), self.pinning.name())
     }
 
-    /// Measures each path and prints its row. Returns whether all went well.
-    pub(crate) fn run(&self, is_short: bool) -> bool {
+    /// Measures each path, and prints and records its figures. Returns whether all went well.
+    pub(crate) fn run(&self, is_short: bool, recorder: &mut Recorder) -> bool {
         let Some(raw) = self.measure(self.paths[0], is_short) else { return false };
         let mut is_well = true;
         for path in self.paths {
             let seen = if *path == self.paths[0] { None } else { Some(self.measure(*path, is_short)) };
             match seen {
-                None => self.report(*path, &raw, &raw),
-                Some(Some(seen)) => self.report(*path, &seen, &raw),
+                None => self.report(*path, &raw, &raw, recorder),
+                Some(Some(seen)) => self.report(*path, &seen, &raw, recorder),
                 Some(None) => is_well = false,
             }
         }
@@ -150,13 +155,15 @@ impl Case {
         figures
     }
 
-    fn report(&self, path: Path, seen: &Figures, raw: &Figures) {
+    fn report(&self, path: Path, seen: &Figures, raw: &Figures, recorder: &mut Recorder) {
+        let (pace, cpus) = (self.pace.name(), self.pinning.name());
+        recorder.add(CaseResult::of_times(path.name(), pace, cpus, self.bytes, seen));
         Beside {
             bench: "peers",
             case: path.name(),
             payload_bytes: self.bytes,
-            pinning: self.pinning.name(),
-            pace: self.pace.name(),
+            pinning: cpus,
+            pace,
             seen,
             reference: self.paths[0].name(),
             raw,

@@ -4,7 +4,8 @@
 //!
 //! The crate also holds the parts that all benches share: command-line arguments ([`Asked`]), child processes
 //! ([`process`]), number and pace of round trips ([`Rounds`]), stalls of the host ([`stalls`]),
-//! operating-system streams used as references ([`stream`]), and pictures of measured runs ([`canvas`]).
+//! operating-system streams used as references ([`stream`]), files of results ([`results`]), and pictures of
+//! measured runs ([`canvas`]).
 
 mod alone;
 mod asked;
@@ -13,6 +14,7 @@ pub mod canvas;
 pub mod documentation;
 mod pinning;
 pub mod process;
+pub mod results;
 mod rounds;
 pub mod stalls;
 pub mod stream;
@@ -108,15 +110,21 @@ fn round(value: f64, digits: i32) -> f64 {
     (value * unit).round() / unit
 }
 
-/// The machine and its current load, in one line.
+/// The CPUs and the kernel of this machine, in one line.
 #[must_use]
-pub fn machine() -> String {
+pub fn hardware() -> String {
     let cpus = std::thread::available_parallelism().map_or(0, usize::from);
     let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let model = info.lines().find_map(|line| line.strip_prefix("model name")).unwrap_or(": unknown");
     let model = model.trim_start_matches([':', ' ', '\t']);
     let kernel = std::fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
+    format!("{cpus} CPUs, {model}, Linux {}", kernel.trim())
+}
+
+/// The machine and its current load, in one line.
+#[must_use]
+pub fn machine() -> String {
     let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
     let load = load.split(' ').next().unwrap_or("unknown");
-    format!("{cpus} CPUs, {model}, Linux {}, load {load}", kernel.trim())
+    format!("{}, load {load}", hardware())
 }
