@@ -128,9 +128,21 @@ impl Canvas {
 
     /// Draws a sample of an area with its meaning; returns the x at which the next one may begin.
     pub fn legend_area(&mut self, (x, y): (f64, f64), color: &str, text: &str) -> f64 {
-        self.add(&format!(r#"<rect x="{x:.1}" y="{:.1}" width="26" height="11" fill="{color}"/>"#, y - 10.0));
+        self.bar((x, y - 10.0, 26.0, 11.0), color);
         self.label((x + 33.0, y), 12.5, Anchor::Start, text);
         x + 33.0 + 6.9 * text.chars().count() as f64 + 8.0
+    }
+
+    /// Fills an area: left, top, width and height.
+    pub fn bar(&mut self, (left, top, width, height): (f64, f64, f64, f64), color: &str) {
+        self.add(&format!(
+            r#"<rect x="{left:.1}" y="{top:.1}" width="{width:.1}" height="{height:.1}" fill="{color}"/>"#
+        ));
+    }
+
+    /// Draws a faint vertical line of a grid.
+    pub fn grid_line(&mut self, (x, top): (f64, f64), height: f64) {
+        self.path(&format!("M{x:.1} {top:.1}v{height:.1}"), Stroke::solid(FAINT, 1.0));
     }
 
     /// Draws the axes, ticks and texts of a panel.
@@ -139,7 +151,7 @@ impl Canvas {
         self.heading((left, top - 10.0), 14.0, panel.title);
         for x in ticks(panel.x.low, panel.x.high) {
             let at = panel.x_px(x);
-            self.path(&format!("M{at:.1} {top:.1}v{height:.1}"), Stroke::solid(FAINT, 1.0));
+            self.grid_line((at, top), height);
             self.label((at, top + height + 17.0), 12.0, Anchor::Middle, &tick_text(x));
         }
         for y in ticks(panel.y.low, panel.y.high) {
@@ -243,8 +255,9 @@ fn share(value: f64, axis: Axis<'_>) -> f64 {
     ((value - axis.low) / (axis.high - axis.low)).clamp(0.0, 1.0)
 }
 
-/// Round values of the axis, four to eight of them.
-fn ticks(low: f64, high: f64) -> Vec<f64> {
+/// Returns round values of an axis, four to eight of them.
+#[must_use]
+pub fn ticks(low: f64, high: f64) -> Vec<f64> {
     let rough = (high - low) / 6.0;
     let power = 10_f64.powf(rough.log10().floor());
     let step =
