@@ -128,6 +128,7 @@ fn run(wanted: &[Path], counting: &Counting) -> Result<bool, String> {
     }
     if stores {
         stored::write(&key, &counted)?;
+        println!("stored: draw them with `cargo run -p sinew-charts`");
         return Ok(true);
     }
     Ok(is_well)
