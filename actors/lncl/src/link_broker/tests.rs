@@ -407,7 +407,7 @@ fn waiting_requester_is_notified_when_no_link_is_possible() {
     let ends: [(&dyn Fn(Tid), _); 3] = [
         (&|it| link_broker.expect_no_more(it), Rejection::Unsupported),
         (&|it| link_broker.remove(it, Departure::ProcessEnded), Rejection::Unsupported),
-        (&|_| link_broker.expire(late), Rejection::QueueFull),
+        (&|_| _ = link_broker.expire(late), Rejection::QueueFull),
     ];
     for ((end, why), number) in ends.into_iter().zip(1..) {
         link_broker.expect(tid(2), 2);

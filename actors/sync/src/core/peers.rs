@@ -169,7 +169,7 @@ impl Peers {
             (peer.linked, peer.has_reported) = (None, false);
             // A link to a lost incarnation may still come up, and says no more than that it ran then.
             let gone = peer.gone.filter(|(gone, _)| *gone == incarnation);
-            peer.lost = peer.lost.or(gone.map(|(_, why)| why));
+            peer.lost = peer.lost.or_else(|| gone.map(|(_, why)| why));
             // Another incarnation was found while this one was linked.
             peer.found.into_iter().for_each(|found| peer.expect(found));
         }
