@@ -114,7 +114,7 @@ mod tests {
                     disturbed = at(now);
                     prop_assert_eq!(pace, Pace::Alert);
                 }
-                marked = if pace.is_marked() { marked.or(Some(at(now))) } else { None };
+                marked = if pace.is_marked() { marked.or_else(|| Some(at(now))) } else { None };
                 if pace == Pace::Resting {
                     prop_assert!(former.is_marked(), "a check with records comes first");
                     prop_assert!(marked.is_some_and(|marked| at(now).since(marked) >= SETTLE));
