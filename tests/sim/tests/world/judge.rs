@@ -45,7 +45,7 @@ enum Wait {
     Pending,
     Passed(u64),
     /// It has passed a generation of which only its node knew, and that has ended.
-    Forgotten,
+    Forgotten(u64),
     Over(Time),
 }
 
@@ -348,7 +348,10 @@ impl Judge {
         let is_it = |arrival: &&mut Arrival| {
             arrival.outcome == Wait::Passed(generation) && ended.contains(&arrival.process)
         };
-        self.arrivals.iter_mut().filter(is_it).for_each(|arrival| arrival.outcome = Wait::Forgotten);
+        self.arrivals
+            .iter_mut()
+            .filter(is_it)
+            .for_each(|arrival| arrival.outcome = Wait::Forgotten(generation));
     }
 
     /// The barrier opens for an application: each party has arrived for this generation, and each passes it
@@ -368,9 +371,8 @@ impl Judge {
         }
         let counts = |arrival: &Arrival| match arrival.outcome {
             Wait::Pending => true,
-            Wait::Passed(passed) => passed == generation,
+            Wait::Passed(passed) | Wait::Forgotten(passed) => passed == generation,
             Wait::Over(at) => at + COUNTED_MAX > now,
-            Wait::Forgotten => false,
         };
         let here: BTreeSet<_> =
             self.arrivals.iter().filter(|arrival| counts(arrival)).map(|arrival| &arrival.party).collect();
@@ -382,7 +384,7 @@ impl Judge {
     pub(crate) fn last_generation(&self, name: &str) -> Option<u64> {
         let passed = |arrival: &Arrival| match arrival.outcome {
             Wait::Passed(generation) => Some(generation),
-            Wait::Pending | Wait::Forgotten | Wait::Over(_) => None,
+            Wait::Pending | Wait::Forgotten(_) | Wait::Over(_) => None,
         };
         self.arrivals.iter().filter(|arrival| arrival.party == name).filter_map(passed).max()
     }
