@@ -11,7 +11,7 @@ use std::{fmt, sync::Arc};
 use serde::{Deserialize, Serialize};
 
 pub use self::members::{MEMBERS_MAX, MemberOutcome, MemberReport, MemberState, MemberTable, REPORTS_MAX};
-use crate::tid::Tid;
+use crate::tid::{AppAddress, NodeAddress, Tid};
 
 /// The outcome of a confirmed message.
 ///
@@ -189,32 +189,44 @@ pub trait ReceiptSink: Send + Sync {
     }
 }
 
+/// The source of a settled receipt's ticket. No message has it: a source is an application of one node.
+const SETTLED: Tid = Tid::new(NodeAddress::ALL, AppAddress::NONE);
+
 /// The right and the duty to settle one confirmed message.
+///
+/// An `Option` of it is no longer than itself, because the pointer to the sink is never null.
 #[must_use = "a dropped receipt says Failed"]
 pub struct Receipt {
-    sink: Option<Arc<dyn ReceiptSink>>,
+    sink: Arc<dyn ReceiptSink>,
+    /// The message of this receipt; its source is [`SETTLED`] after the settlement.
     ticket: Ticket,
 }
 
 impl Receipt {
     /// Creates a receipt for the message of `ticket`, to be settled at `sink`.
     pub fn new(sink: Arc<dyn ReceiptSink>, ticket: Ticket) -> Self {
-        Self { sink: Some(sink), ticket }
+        Self { sink, ticket }
     }
 
     /// Settles the message with its outcome.
     pub fn settle(mut self, outcome: Outcome) {
-        if let Some(sink) = self.sink.take() {
-            sink.settle(self.ticket, outcome);
+        self.settle_once(outcome);
+    }
+
+    /// Settles the message, unless it is settled. It counts as settled before its sink is called, which may
+    /// panic.
+    fn settle_once(&mut self, outcome: Outcome) {
+        let ticket = self.ticket;
+        self.ticket.source = SETTLED;
+        if ticket.source != SETTLED {
+            self.sink.settle(ticket, outcome);
         }
     }
 
     /// Reports members of the message, which must be one to many.
     pub fn report(&self, reports: &[MemberReport]) {
-        if let Some(sink) = &self.sink
-            && !reports.is_empty()
-        {
-            sink.members(self.ticket, reports);
+        if !reports.is_empty() {
+            self.sink.members(self.ticket, reports);
         }
     }
 
@@ -227,9 +239,7 @@ impl Receipt {
 
 impl Drop for Receipt {
     fn drop(&mut self) {
-        if let Some(sink) = self.sink.take() {
-            sink.settle(self.ticket, Outcome::Failed);
-        }
+        self.settle_once(Outcome::Failed);
     }
 }
 
@@ -241,7 +251,10 @@ impl fmt::Debug for Receipt {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Mutex;
+    use std::{
+        panic::{AssertUnwindSafe, catch_unwind},
+        sync::{Mutex, PoisonError},
+    };
 
     use super::*;
 
@@ -262,6 +275,23 @@ mod tests {
         Receipt::new(ledger.clone(), TICKET).settle(Outcome::Delivered);
         drop(Receipt::new(ledger.clone(), TICKET));
         assert_eq!(*ledger.0.lock().unwrap(), [Outcome::Delivered, Outcome::Failed]);
+    }
+
+    #[test]
+    fn receipt_is_settled_once_by_a_sink_that_panics() {
+        struct Panics(Mutex<usize>);
+
+        impl ReceiptSink for Panics {
+            fn settle(&self, _: Ticket, _: Outcome) {
+                *self.0.lock().unwrap() += 1;
+                panic!("a fault of the sink's");
+            }
+        }
+
+        let sink = Arc::new(Panics(Mutex::new(0)));
+        let receipt = Receipt::new(sink.clone(), TICKET);
+        assert!(catch_unwind(AssertUnwindSafe(|| receipt.settle(Outcome::Delivered))).is_err());
+        assert_eq!(*sink.0.lock().unwrap_or_else(PoisonError::into_inner), 1);
     }
 
     #[test]

@@ -63,6 +63,9 @@ impl DecodeError {
 }
 
 /// A message, sent or to be sent.
+///
+/// It has 128 bytes on 64-bit systems. Up to this length x86-64 compilers copy a value in place: a move from
+/// function to function costs half as much as a call of `memcpy`. A message is moved some thirty times.
 #[derive(Debug)]
 pub struct Message {
     /// Source, destination, type and times of the message.
@@ -284,6 +287,12 @@ mod tests {
 
     impl Payload for Point {
         const NAME: &'static str = "test.point";
+    }
+
+    #[test]
+    #[cfg(target_pointer_width = "64")]
+    fn message_is_short_enough_to_be_moved_in_place() {
+        assert_eq!(size_of::<Message>(), 128);
     }
 
     #[test]
