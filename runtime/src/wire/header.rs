@@ -23,6 +23,7 @@
 //! Bytes 0 to 8 keep their meaning in every later version, so that any two versions can reject each other
 //! with a clear error.
 
+mod length_guard;
 #[cfg(test)]
 mod tests;
 
@@ -30,6 +31,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use self::length_guard::guard_of;
 use crate::{tid::Tid, time::Time, wire::Kind};
 
 /// First two bytes of every frame.
@@ -252,7 +254,7 @@ impl Header {
     #[must_use]
     pub fn encode_guarded(&self, payload: &[u8]) -> [u8; HEADER_LEN] {
         let mut bytes = self.encode_in_memory(payload.len());
-        let guard = guard_of(&bytes);
+        let guard = guard_of(u32::from_le_bytes(field(&bytes, 4)));
         bytes[GUARD_AT..GUARD_AT + 2].copy_from_slice(&guard);
         let crc = checksum(&bytes, payload);
         bytes[60..64].copy_from_slice(&crc.to_le_bytes());
@@ -262,9 +264,10 @@ impl Header {
     /// Checks the guard of a length, before the length is used.
     ///
     /// # Errors
-    /// The bytes were corrupted.
+    /// The bytes were corrupted, or are not the start of a frame.
     pub fn check_guard(bytes: &[u8; HEADER_LEN]) -> Result<(), HeaderError> {
-        if field::<2>(bytes, GUARD_AT) == guard_of(bytes) { Ok(()) } else { Err(HeaderError::Guard) }
+        let length = Self::payload_len(&field(bytes, 0))?;
+        if field::<2>(bytes, GUARD_AT) == guard_of(length) { Ok(()) } else { Err(HeaderError::Guard) }
     }
 
     /// Reads a header that [`encode_guarded`](Self::encode_guarded) wrote, and checks it against its payload.
@@ -338,11 +341,6 @@ fn field<const N: usize>(bytes: &[u8; HEADER_LEN], at: usize) -> [u8; N] {
     let mut out = [0; N];
     out.copy_from_slice(&bytes[at..at + N]);
     out
-}
-
-/// Returns the lower 16 bits of the CRC-32 of magic, version and lengths.
-fn guard_of(header: &[u8; HEADER_LEN]) -> [u8; 2] {
-    (crc32fast::hash(&header[..8]) as u16).to_le_bytes()
 }
 
 fn checksum(header: &[u8; HEADER_LEN], payload: &[u8]) -> u32 {
