@@ -27,7 +27,7 @@ mod length_guard;
 #[cfg(test)]
 mod tests;
 
-use std::time::Duration;
+use std::{sync::LazyLock, time::Duration};
 
 use serde::{Deserialize, Serialize};
 
@@ -343,8 +343,11 @@ fn field<const N: usize>(bytes: &[u8; HEADER_LEN], at: usize) -> [u8; N] {
     out
 }
 
+/// An empty hasher. A new one detects the CPU's features again, which costs as much as 60 bytes.
+static EMPTY_HASHER: LazyLock<crc32fast::Hasher> = LazyLock::new(crc32fast::Hasher::new);
+
 fn checksum(header: &[u8; HEADER_LEN], payload: &[u8]) -> u32 {
-    let mut crc = crc32fast::Hasher::new();
+    let mut crc = EMPTY_HASHER.clone();
     crc.update(&header[..60]);
     crc.update(payload);
     crc.finalize()

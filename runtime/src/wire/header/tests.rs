@@ -28,6 +28,13 @@ proptest! {
     }
 
     #[test]
+    fn checksum_is_the_crc_of_header_and_payload(header in any_header(), payload: Vec<u8>) {
+        let bytes = header.encode(&payload);
+        let crc = crc32fast::hash(&[&bytes[..60], &payload[..]].concat());
+        prop_assert_eq!(u32::from_le_bytes(field(&bytes, 60)), crc);
+    }
+
+    #[test]
     fn one_flipped_bit_is_noticed(header in any_header(), payload: Vec<u8>, bit in 0usize..512) {
         let mut bytes = header.encode(&payload);
         bytes[bit / 8] ^= 1 << (bit % 8);
