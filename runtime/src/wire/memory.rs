@@ -24,11 +24,14 @@ const FIRST: usize = 4;
 /// of their creation: two checks are enough for those that end one by one. When bursts end out of order, runs
 /// of used buffers lie between free ones.
 const IN_TURN: usize = 8;
+/// Number of payloads for which the next buffer in turn is checked before the first few, after a payload that
+/// found these used. A session keeps each payload until it is acknowledged, so they are used nearly always.
+const CROWDED: u8 = 16;
 /// Initial bytes of an allocation for one payload.
 const SHORT: usize = 128;
 
 thread_local! {
-    static BUFFERS: RefCell<Buffers> = const { RefCell::new(Buffers { all: Vec::new(), next: FIRST }) };
+    static BUFFERS: RefCell<Buffers> = const { RefCell::new(Buffers { all: Vec::new(), next: FIRST, crowded: 0 }) };
 }
 
 /// Returns the bytes that `write` writes.
@@ -137,6 +140,8 @@ struct Buffers {
     all: Vec<BytesMut>,
     /// The buffer to check next when the first few are all in use.
     next: usize,
+    /// The number of payloads for which that one is checked before the first few.
+    crowded: u8,
 }
 
 impl Buffers {
@@ -147,8 +152,18 @@ impl Buffers {
     }
 
     fn free(&mut self) -> Option<usize> {
+        if self.crowded > 0 {
+            self.crowded -= 1;
+            if let Some(place) = self.in_turn() {
+                return Some(place);
+            }
+        }
         let first = (0..self.all.len().min(FIRST)).find(|place| self.is_free(*place));
-        first.or_else(|| (0..IN_TURN).find_map(|_| self.in_turn()))
+        first.or_else(|| {
+            let found = (0..IN_TURN).find_map(|_| self.in_turn());
+            self.crowded = if found.is_some() { CROWDED } else { 0 };
+            found
+        })
     }
 
     /// Returns the index of the next buffer to check, if it is free. Advances in any case.
@@ -173,7 +188,7 @@ impl Buffers {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::HashSet;
+    use std::collections::{HashSet, VecDeque};
 
     use super::*;
 
@@ -222,6 +237,22 @@ mod tests {
             in_hand = payload(n, in_hand.len());
         }
         assert_eq!(buffers(), 2);
+    }
+
+    #[test]
+    fn first_buffers_are_used_again_after_a_crowd() {
+        let mut live: VecDeque<_> = (0..10).map(|_| payload(1, 1000)).collect();
+        let first: Vec<_> = live.iter().take(FIRST).map(|payload| payload.as_ptr()).collect();
+        for _ in 0..100 {
+            live.push_back(payload(2, 1000));
+            live.pop_front();
+        }
+        assert_eq!(buffers(), 11, "a free one was not found");
+        live.clear();
+        for _ in 0..CROWDED {
+            let _ = payload(3, 1000);
+        }
+        assert!(first.contains(&payload(4, 1000).as_ptr()));
     }
 
     #[test]
