@@ -11,6 +11,7 @@
 //! sends more records without data is refused.
 
 use std::{
+    future::poll_fn,
     io::{self, IoSlice, Read, Write},
     net::Shutdown,
     sync::{Arc, Mutex},
@@ -127,7 +128,7 @@ impl Transport {
         loop {
             let read = match &self.records {
                 None => {
-                    self.socket.readable().await?;
+                    self.readable().await?;
                     self.read_plain(buffer, room).map(|count| ReadResult { count, work: count })
                 }
                 Some(records) => {
@@ -136,7 +137,7 @@ impl Transport {
                     if !matches!(&opened, Err(error) if error.kind() == io::ErrorKind::WouldBlock) {
                         return opened;
                     }
-                    self.socket.readable().await?;
+                    self.readable().await?;
                     lock(records).decrypt(&self.socket, true, buffer, room)
                 }
             };
@@ -145,6 +146,12 @@ impl Transport {
                 read => return read,
             }
         }
+    }
+
+    /// Waits until the socket may have bytes. One task reads at a time, so that the reactor's place for one
+    /// reader is enough: unlike its list of waiters, it takes no lock when the bytes are there.
+    async fn readable(&self) -> io::Result<()> {
+        poll_fn(|cx| self.socket.poll_read_ready(cx)).await
     }
 
     /// Same as [`receive`](Self::receive), without the work: returns the number of bytes.
