@@ -459,11 +459,12 @@ impl MessageSink for Mailbox {
             }
         };
         // Settled and woken without the lock, so that a notified thread does not wait for it.
-        for mut message in expired {
-            message.settle(Outcome::Expired);
-        }
+        expired.iter_mut().for_each(|message| message.settle(Outcome::Expired));
         event_waits.into_iter().for_each(Waker::wake);
-        taken.map(|waker| waker.into_iter().for_each(wakes::wake))
+        if let Some(waker) = taken? {
+            wakes::wake(waker);
+        }
+        Ok(())
     }
 
     fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
@@ -475,17 +476,17 @@ impl MessageSink for Mailbox {
                 shared.event_waits = room.cloned();
             });
         }
-        let result = self.submit(message);
-        if let Err(Refused { message, why: Rejection::QueueFull }) = &result {
+        let Err(refused) = self.submit(message) else { return Ok(()) };
+        if refused.why == Rejection::QueueFull {
             let waker = {
                 let mut shared = lock(&self.shared);
                 // The message is offered again.
-                shared.tallies[message.header.class as usize].refused -= 1;
-                room.and_then(|room| shared.queue.offered(message, room))
+                shared.tallies[refused.message.header.class as usize].refused -= 1;
+                room.and_then(|room| shared.queue.offered(&refused.message, room))
             };
             waker.into_iter().for_each(Waker::wake);
         }
-        result
+        Err(refused)
     }
 
     fn cancel(&self, ticket: Ticket) -> bool {

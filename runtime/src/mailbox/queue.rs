@@ -6,7 +6,7 @@ mod tests;
 use std::{collections::VecDeque, sync::Arc, task::Waker};
 
 use super::{
-    Budget,
+    About, Budget,
     ends::{Ends, Place, Usage, is_end},
     room::Awaited,
 };
@@ -128,9 +128,13 @@ impl ClassQueue {
             return Err(Refused::new(message, Rejection::QueueFull));
         }
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
+        if About::of(&message.header).is_none() {
+            // Nearly every message: it is not moved through the check for others that it must follow.
+            self.append(message);
+            return Ok(None);
+        }
         if let Some(message) = self.place_behind(message, Place::Lane) {
-            self.enters_lane(&message);
-            self.lanes[class as usize].push_back(message);
+            self.append(message);
         }
         Ok(None)
     }
@@ -140,6 +144,12 @@ impl ClassQueue {
     pub fn push_beyond(&mut self, message: Message) {
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
         self.add(message.payload.len());
+        self.append(message);
+    }
+
+    /// Adds a message to the end of the lane of its class.
+    #[inline]
+    fn append(&mut self, message: Message) {
         self.enters_lane(&message);
         self.lanes[message.header.class as usize].push_back(message);
     }
@@ -226,9 +236,13 @@ impl ClassQueue {
                 self.passed_over[lane] += 1;
             }
         }
-        let next = self.lanes[chosen].pop_front()?;
-        self.left_lane(&next);
-        Some(next)
+        // It is accounted for before it is taken, so that it is moved once: to the caller.
+        let next = self.lanes[chosen].front()?;
+        let (length, is_end) = (next.payload.len(), is_end(&next.header));
+        self.bytes[chosen] -= length;
+        self.ends_in_lanes -= usize::from(is_end);
+        self.release(length);
+        self.lanes[chosen].pop_front()
     }
 
     /// Removes and returns the next message of a class, if it belongs to one that was [popped](Self::pop).

@@ -37,12 +37,13 @@ impl MailboxReader {
         }
         shared.count(self.finished.take());
         shared.paused = false;
-        if let Some(message) = shared.next() {
-            self.current = shared.begin_handling(&message);
+        let next = shared.next();
+        if let Some(message) = &next {
+            self.current = shared.begin_handling(message);
             let room = shared.room_made();
             drop(shared);
             room.into_iter().flatten().for_each(Waker::wake);
-            return Poll::Ready(Some(message));
+            return Poll::Ready(next);
         }
         if shared.closed {
             return Poll::Ready(None);
