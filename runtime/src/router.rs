@@ -237,15 +237,11 @@ impl Router {
     /// The message, and the reason of the rejection.
     pub fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
         let table = &self.snapshot.load().table;
-        match table.local.get(&message.header.destination.app) {
-            Some(route) => tap::hand_over(table.tap.as_ref(), message, true, |message| {
-                if guard::refuses(table.guard.as_ref(), message.header.destination.app, &message.header) {
-                    return Err(Refused::new(message, Rejection::NotAllowed));
-                }
-                route.sink.offer(message, room)
-            }),
-            None => Err(Refused::new(message, Rejection::NoSuchApplication)),
-        }
+        let Some(route) = table.local.get(&message.header.destination.app) else {
+            return Err(Refused::new(message, Rejection::NoSuchApplication));
+        };
+        let Some(tap) = &table.tap else { return offer_to(route, table.guard.as_ref(), message, room) };
+        tap::hand_over(&**tap, message, true, |message| offer_to(route, table.guard.as_ref(), message, room))
     }
 
     /// Cancels this request, from here or from another node, as its reply is no longer awaited; see
@@ -342,13 +338,12 @@ impl Router {
     fn send_to_one(table: &Table, here: NodeAddress, message: Message) -> Result<(), Refused> {
         let Tid { node, .. } = message.header.destination;
         if node == here {
-            submit_here(table, table.guard.as_ref(), message)
-        } else {
-            tap::hand_over(table.tap.as_ref(), message, false, |message| match table.peers.get(&node) {
-                Some(peer) => peer.submit(message),
-                None => Err(Refused::new(message, Rejection::NoSuchNode)),
-            })
+            return submit_here(table, table.guard.as_ref(), message);
         }
+        let peer = table.peers.get(&node);
+        // Without an observer the message is passed on directly: a closure would move it twice more.
+        let Some(tap) = &table.tap else { return submit_to(peer, message) };
+        tap::hand_over(&**tap, message, false, |message| submit_to(peer, message))
     }
 
     /// Sends one copy to each node that has a member, and one to each member here.
@@ -432,17 +427,45 @@ fn for_each_here(
 }
 
 /// Submits a message to its one application of this node, if the guard allows it.
+#[inline]
 fn submit_here(table: &Table, guard: Judge<'_>, message: Message) -> Result<(), Refused> {
-    tap::hand_over(table.tap.as_ref(), message, false, |message| {
-        let target = message.header.destination.app;
-        match table.local.get(&target) {
-            Some(_) if guard::refuses(guard, target, &message.header) => {
-                Err(Refused::new(message, Rejection::NotAllowed))
-            }
-            Some(route) => route.sink.submit(message),
-            None => Err(Refused::new(message, Rejection::NoSuchApplication)),
+    let route = table.local.get(&message.header.destination.app);
+    let Some(tap) = &table.tap else { return submit_by(route, guard, message) };
+    tap::hand_over(&**tap, message, false, |message| submit_by(route, guard, message))
+}
+
+#[inline]
+fn submit_by(route: Option<&LocalRoute>, guard: Judge<'_>, message: Message) -> Result<(), Refused> {
+    match route {
+        Some(_) if guard::refuses(guard, message.header.destination.app, &message.header) => {
+            Err(Refused::new(message, Rejection::NotAllowed))
         }
-    })
+        Some(route) => route.sink.submit(message),
+        None => Err(Refused::new(message, Rejection::NoSuchApplication)),
+    }
+}
+
+/// Offers a message to an application of this node, if the guard allows it.
+#[inline]
+fn offer_to(
+    route: &LocalRoute,
+    guard: Judge<'_>,
+    message: Message,
+    room: Option<&Waker>,
+) -> Result<(), Refused> {
+    if guard::refuses(guard, message.header.destination.app, &message.header) {
+        return Err(Refused::new(message, Rejection::NotAllowed));
+    }
+    route.sink.offer(message, room)
+}
+
+/// Submits a message to another node.
+#[inline]
+fn submit_to(peer: Option<&Arc<dyn MessageSink>>, message: Message) -> Result<(), Refused> {
+    match peer {
+        Some(peer) => peer.submit(message),
+        None => Err(Refused::new(message, Rejection::NoSuchNode)),
+    }
 }
 
 /// Returns a copy that shares the payload, without the receipt.

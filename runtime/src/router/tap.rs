@@ -90,19 +90,8 @@ impl ObservedMessage {
 
 /// Hands a message to one sink, and reports it to the observer. A message that is rejected for lack of room
 /// and will be offered again is reported at that later time.
-#[inline]
-pub(super) fn hand_over(
-    tap: Option<&Arc<dyn Tap>>,
-    message: Message,
-    is_offer: bool,
-    take: impl FnOnce(Message) -> Result<(), Refused>,
-) -> Result<(), Refused> {
-    let Some(tap) = tap else { return take(message) };
-    hand_over_observed(&**tap, message, is_offer, take)
-}
-
 #[cold]
-fn hand_over_observed(
+pub(super) fn hand_over(
     tap: &dyn Tap,
     message: Message,
     is_offer: bool,
