@@ -47,8 +47,8 @@ impl<S: Socket> WriterState<S> {
             self.numbering.link_ended();
             self.unsent.link_ended();
             // The frame that was being written is kept, like all before it.
-            if let Some(partial) = partial {
-                self.sent(partial);
+            if let Some(mut partial) = partial {
+                self.sent(&mut partial);
             }
         } else {
             self.settle_unknown(deferred);

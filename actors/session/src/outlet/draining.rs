@@ -135,9 +135,9 @@ impl<S: Socket> WriterState<S> {
     }
 
     /// Gathers a frame that has not been started, if there is room.
-    fn gather(&mut self, frame: Partial) -> Result<(), Partial> {
+    fn gather(&mut self, mut frame: Partial) -> Result<(), Partial> {
         if self.connection.gather(&frame) {
-            self.sent(frame);
+            self.sent(&mut frame);
             return Ok(());
         }
         Err(frame)
@@ -153,7 +153,7 @@ impl<S: Socket> WriterState<S> {
         let result = self.write(&mut frame);
         let taken = frame.written - before;
         match result {
-            Written::Whole => self.sent(frame),
+            Written::Whole => self.sent(&mut frame),
             Written::Piece | Written::InPart | Written::Broken => self.connection.partial = Some(frame),
         }
         taken
@@ -193,7 +193,7 @@ impl<S: Socket> WriterState<S> {
     pub(super) fn write_on(&mut self, deferred: &mut DeferredActions) -> Step {
         let Some(mut frame) = self.connection.partial.take() else { return Step::Done };
         match self.write(&mut frame) {
-            Written::Whole => self.sent(frame),
+            Written::Whole => self.sent(&mut frame),
             Written::Piece => {
                 self.connection.partial = Some(frame);
                 return Step::More;

@@ -37,6 +37,7 @@ pub(super) enum Written {
 }
 
 impl Partial {
+    #[inline]
     pub(super) fn new(message: Message, checksum: Checksum, origin: FrameOrigin) -> Self {
         let head = checksum.encode(&message.header, &message.payload);
         Self { message, head, written: 0, origin }

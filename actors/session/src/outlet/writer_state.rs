@@ -117,7 +117,7 @@ impl<S: Socket> WriterState<S> {
         self.receipts.add_waiting(confirming_destination(&frame.message));
         match self.write(&mut frame) {
             Written::Whole => {
-                self.sent(frame);
+                self.sent(&mut frame);
                 // The clock is read only if the rate matters.
                 if self.connection.gathers() {
                     self.bursts.written(Time::now());
@@ -247,6 +247,7 @@ impl<S: Socket> WriterState<S> {
     }
 
     /// Encodes a message as a frame of the current connection.
+    #[inline]
     pub(super) fn frame(&mut self, mut message: Message) -> Partial {
         self.counters.numbered += u64::from(self.numbering.number(&mut message));
         Partial::new(message, self.connection.checksum(), FrameOrigin::Sender)
@@ -272,13 +273,14 @@ impl<S: Socket> WriterState<S> {
         written
     }
 
-    pub(super) fn sent(&mut self, frame: Partial) {
+    /// Processes a frame that was written whole: takes its receipt.
+    pub(super) fn sent(&mut self, frame: &mut Partial) {
         if frame.origin == FrameOrigin::Sender {
             self.counters.counts.sent += messages_in(&frame.message);
             self.connection.note_sent(&frame.message.header);
         }
         let expiry = frame.message.header.expiry();
-        if let Some(receipt) = frame.message.receipt {
+        if let Some(receipt) = frame.message.receipt.take() {
             let written = self.connection.written();
             self.early_outcomes.extend(self.receipts.sent(SentMessage { receipt, expiry, written }));
         }
