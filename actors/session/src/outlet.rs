@@ -421,6 +421,13 @@ impl<S: Socket> SocketWriter<S> {
     ) -> R {
         let mut deferred = DeferredActions::default();
         let result = step(&mut state, &mut deferred);
+        self.end_step(state, deferred);
+        result
+    }
+
+    /// Releases the lock after a step, and runs its deferred actions.
+    #[inline]
+    fn end_step(&self, mut state: MutexGuard<'_, WriterState<S>>, mut deferred: DeferredActions) {
         if !state.early_outcomes.is_empty() {
             deferred.settle(state.early_outcomes.drain(..));
             state.receipts.wake_if_fewer_open(&mut deferred);
@@ -429,7 +436,6 @@ impl<S: Socket> SocketWriter<S> {
         self.next_expiry.store(state.unsent.next_expiry().as_nanos(), Ordering::Relaxed);
         drop(state);
         deferred.run();
-        result
     }
 
     /// Locks the state. No section under this lock can panic halfway, so the state is always consistent.
@@ -440,7 +446,11 @@ impl<S: Socket> SocketWriter<S> {
 
 impl<S: Socket> MessageSink for SocketWriter<S> {
     fn submit(&self, message: Message) -> Result<(), Refused> {
-        let mut step = self.with(|state, deferred| state.submit(message, Bound::Kept, deferred))?;
+        // Not by a closure, which would move the message twice more.
+        let (mut state, mut deferred) = (self.lock(), DeferredActions::default());
+        let submitted = state.submit(message, Bound::Kept, &mut deferred);
+        self.end_step(state, deferred);
+        let mut step = submitted?;
         while step == Step::More {
             step = self.with(|state, deferred| state.write_on(deferred));
         }
@@ -448,11 +458,11 @@ impl<S: Socket> MessageSink for SocketWriter<S> {
     }
 
     fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
-        let result = self.submit(message);
-        if let Err(Refused { message, why: Rejection::QueueFull }) = &result {
-            self.with(|state, deferred| state.undo_refusal(message, room, deferred));
+        let Err(refused) = self.submit(message) else { return Ok(()) };
+        if refused.why == Rejection::QueueFull {
+            self.with(|state, deferred| state.undo_refusal(&refused.message, room, deferred));
         }
-        result
+        Err(refused)
     }
 
     fn cancel(&self, ticket: Ticket) -> bool {

@@ -38,7 +38,15 @@ impl DeferredActions {
         }
     }
 
-    pub(super) fn run(mut self) {
+    /// Runs the actions; most steps have none.
+    #[inline]
+    pub(super) fn run(self) {
+        if !self.settle.is_empty() || self.wake.is_some() || !self.room.is_empty() {
+            self.run_all();
+        }
+    }
+
+    fn run_all(mut self) {
         for (receipt, outcome) in self.settle.drain(..) {
             receipt.settle(outcome);
         }
