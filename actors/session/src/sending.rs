@@ -227,13 +227,15 @@ impl<M> Sending<M> {
 
     /// Removes all messages before `next`, which the peer has received. spec: SESSION-2, SESSION-3
     fn arrived(&mut self, next: u64) -> AckEffect<M> {
-        while self.base < next {
-            let kept = self.kept.pop_front().expect("a number between base and end is kept");
+        let count = next.saturating_sub(self.base) as usize;
+        for kept in self.kept.range(..count) {
             self.bytes -= kept.bytes;
             self.voids -= usize::from(kept.message.is_none());
             self.arrived += kept.bytes as u64;
-            self.base += 1;
         }
+        // They are dropped where they are: none is moved. A number between base and end is kept.
+        self.kept.drain(..count);
+        self.base += count as u64;
         match self.cursor {
             Some(cursor) => {
                 self.cursor = Some(cursor.max(next));
