@@ -201,7 +201,12 @@ impl FrameCodec {
             return frame;
         }
         let payload = memory::copied(&source[HEADER_LEN..whole]);
-        source.advance(whole);
+        if whole == source.len() {
+            // Most frames are the whole buffer: it keeps its front, which an advance would have to reclaim.
+            source.clear();
+        } else {
+            source.advance(whole);
+        }
         self.tidy(source);
         payload
     }
