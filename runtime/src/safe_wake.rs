@@ -31,7 +31,9 @@ pub struct SafeWaker {
 impl SafeWaker {
     /// Returns a waker that wakes the task of `task` from any thread.
     pub fn of(&mut self, task: &Waker) -> &Waker {
-        let cached = self.cached.take().filter(|(cached, _)| cached.will_wake(task));
+        if !self.cached.as_ref().is_some_and(|(cached, _)| cached.will_wake(task)) {
+            self.cached = None;
+        }
         let make = || {
             start();
             // On the task's own thread, where its thread-local variables exist: a wake at the end of this
@@ -39,7 +41,7 @@ impl SafeWaker {
             let _ = are_thread_locals_alive();
             (task.clone(), Waker::from(Arc::new(Forward(task.clone()))))
         };
-        &self.cached.insert(cached.unwrap_or_else(make)).1
+        &self.cached.get_or_insert_with(make).1
     }
 }
 
