@@ -361,31 +361,32 @@ impl Reader {
         let now = Time::now();
         let _batch = if let Mode::Linked(inbound) = &*mode { Some(inbound.batch(now)) } else { None };
         for _ in 0..FRAMES_PER_WAKE {
-            match (self.codec.decode(&mut self.buffer), &*mode) {
-                (Ok(Some(message)), Mode::Linked(_)) if message.payload.len() > self.longest(&message) => {
-                    let (length, limit) = (message.payload.len(), self.longest(&message));
-                    let error = FrameError::TooLong { length, limit };
-                    return Decoded::Event(EventKind::Violated(decline(&error)));
-                }
-                (Ok(Some(message)), Mode::Linked(inbound)) if !is_for_the_shell(&message) => {
-                    self.reading.last_received.record(now);
-                    let is_link_frame =
-                        matches!(message.header.kind, Kind::GNCL_DATAGRAMS | Kind::GNCL_UNDELIVERED);
-                    if let Err(decline) = inbound.receive(now, message) {
-                        return Decoded::Event(EventKind::Violated(decline));
-                    }
-                    // The first frame is always an ACK. A later one shows that local messages arrive.
-                    if !is_link_frame
-                        && !self.traffic_seen
-                        && std::mem::replace(&mut self.first_frame_seen, true)
-                    {
-                        self.traffic_seen = true;
-                        return Decoded::Event(EventKind::TrafficSeen);
-                    }
-                }
-                (Ok(Some(message)), _) => return Decoded::Event(EventKind::Frame(message)),
-                (Ok(None), _) => return Decoded::Empty,
-                (Err(error), _) => return Decoded::Event(EventKind::Violated(decline(&error))),
+            let message = match self.codec.decode(&mut self.buffer) {
+                Ok(Some(message)) => message,
+                Ok(None) => return Decoded::Empty,
+                Err(error) => return Decoded::Event(EventKind::Violated(decline(&error))),
+            };
+            let Mode::Linked(inbound) = &*mode else { return Decoded::Event(EventKind::Frame(message)) };
+            let (length, limit) = (message.payload.len(), self.longest(&message));
+            if length > limit {
+                let error = FrameError::TooLong { length, limit };
+                return Decoded::Event(EventKind::Violated(decline(&error)));
+            }
+            if is_for_the_shell(&message) {
+                return Decoded::Event(EventKind::Frame(message));
+            }
+            self.reading.last_received.record(now);
+            let is_link_frame = matches!(message.header.kind, Kind::GNCL_DATAGRAMS | Kind::GNCL_UNDELIVERED);
+            if let Err(decline) = inbound.receive(now, message) {
+                return Decoded::Event(EventKind::Violated(decline));
+            }
+            // The first frame is always an ACK. A later one shows that local messages arrive.
+            if !is_link_frame && !self.traffic_seen && std::mem::replace(&mut self.first_frame_seen, true) {
+                self.traffic_seen = true;
+                return Decoded::Event(EventKind::TrafficSeen);
+            }
+            if self.buffer.is_empty() {
+                return Decoded::Empty;
             }
         }
         Decoded::Again
