@@ -352,6 +352,9 @@ impl Inbound {
 
     /// Settles the received outcomes. The notified code finds nothing borrowed here.
     fn settle_outcomes(&self) {
+        if self.outcomes.borrow().is_empty() {
+            return;
+        }
         let mut outcomes = self.outcomes.take();
         self.peer.confirm(&mut outcomes);
         outcomes.clear();
