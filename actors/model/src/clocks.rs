@@ -111,33 +111,42 @@ impl ClockOffset {
     /// error bound grows. // spec: NDL-6.1
     #[must_use]
     pub const fn at(self, now: Time) -> Self {
-        let (since, until) = (self.at.as_nanos(), now.as_nanos());
-        let apart = until.abs_diff(since);
-        let moved = (apart / 1_000).saturating_mul(self.drift.ppb.unsigned_abs()) / 1_000_000;
-        let moved = if moved > i64::MAX.unsigned_abs() { i64::MAX } else { moved.cast_signed() };
-        let moved = if (until < since) == (self.drift.ppb < 0) { moved } else { -moved };
+        let apart = now.as_nanos().abs_diff(self.at.as_nanos());
         let error = Duration::from_nanos(self.drift.error_ns(apart));
         Self {
-            theirs_minus_ours_ns: self.theirs_minus_ours_ns.saturating_add(moved),
+            theirs_minus_ours_ns: self.offset_at(now),
             bound: self.bound.saturating_add(error),
             at: now,
             drift: self.drift.apart(apart),
         }
     }
 
+    /// Returns the offset at another time.
+    const fn offset_at(self, now: Time) -> i64 {
+        let (since, until) = (self.at.as_nanos(), now.as_nanos());
+        let apart = until.abs_diff(since);
+        let moved = (apart / 1_000).saturating_mul(self.drift.ppb.unsigned_abs()) / 1_000_000;
+        let moved = if moved > i64::MAX.unsigned_abs() { i64::MAX } else { moved.cast_signed() };
+        let moved = if (until < since) == (self.drift.ppb < 0) { moved } else { -moved };
+        self.theirs_minus_ours_ns.saturating_add(moved)
+    }
+
     /// Converts a past time of the peer's clock to the local clock, with its maximum error. Returns `None` if
     /// by this offset the time is after `now`: then the offset has changed, for example because this host was
     /// suspended.
     pub fn in_our_clock(self, now: Time, theirs: Time) -> Option<(Time, Duration)> {
-        let present = self.at(now);
-        let ours = theirs.shifted(present.theirs_minus_ours_ns.saturating_neg());
-        if ours > now + present.bound {
+        // In whole nanoseconds: a `Duration` is divided into seconds at each step, and this runs for each message.
+        let bound_ns = u64::try_from(self.bound.as_nanos()).unwrap_or(u64::MAX);
+        let apart = now.as_nanos().abs_diff(self.at.as_nanos());
+        let bound_ns = bound_ns.saturating_add(self.drift.error_ns(apart));
+        let ours = theirs.shifted(self.offset_at(now).saturating_neg());
+        if ours.as_nanos() > now.as_nanos().saturating_add(bound_ns) {
             return None;
         }
         let ours = ours.min(now);
         // The offset was slightly different then.
         let drifted = drift_ns_max(now.as_nanos() - ours.as_nanos());
-        Some((ours, present.bound.saturating_add(Duration::from_nanos(drifted))))
+        Some((ours, Duration::from_nanos(bound_ns.saturating_add(drifted))))
     }
 }
 
@@ -170,6 +179,8 @@ impl ClockOffsets {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
 
     const SECOND: u64 = 1_000_000_000;
@@ -215,6 +226,24 @@ mod tests {
                 let times = far.in_our_clock(at, theirs);
                 assert!(times.is_none_or(|(ours, _)| ours <= at), "{times:?}");
             }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn time_is_converted_by_the_extrapolated_offset(
+            ppb in -200_000_i64..200_000, bound_ppb in 0..200_000_u64,
+            at in 0..100_000 * SECOND, theirs in 0..100_000 * SECOND,
+        ) {
+            let (clock, at, theirs) = (offset(ppb, bound_ppb), Time::from_nanos(at), Time::from_nanos(theirs));
+            let present = clock.at(at);
+            let ours = theirs.shifted(-present.theirs_minus_ours_ns);
+            let converted = (ours <= at + present.bound).then(|| {
+                let ours = ours.min(at);
+                let drifted = Duration::from_nanos(drift_ns_max(at.as_nanos() - ours.as_nanos()));
+                (ours, present.bound + drifted)
+            });
+            prop_assert_eq!(clock.in_our_clock(at, theirs), converted);
         }
     }
 
