@@ -31,6 +31,7 @@ pub use budget::Budget;
 pub use queue::{Bounds, ClassQueue, is_same_stream};
 pub use reader::MailboxReader;
 pub use remote_reader::RemoteReader;
+use room::RoomWakers;
 pub use source::Source;
 pub use tally::Tally;
 
@@ -102,8 +103,8 @@ struct Shared {
 impl Shared {
     /// Returns the wakers of the senders that wait for room, after a removal. An event is offered again after each
     /// removal, as its place may depend on each message.
-    fn room_made(&mut self) -> [Option<Waker>; 2] {
-        [self.queue.room_made(), self.event_waits.take()]
+    fn room_made(&mut self) -> RoomWakers {
+        RoomWakers { of_messages: self.queue.room_made(), of_events: self.event_waits.take() }
     }
 
     /// Removes all queued messages, to be rejected.
@@ -413,14 +414,10 @@ impl Mailbox {
         waker.into_iter().for_each(wakes::wake);
         Ok(())
     }
-}
 
-impl MessageSink for Mailbox {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    /// Accepts a message that is no event.
+    fn take_message(&self, message: Message) -> Result<(), Refused> {
         let class = message.header.class as usize;
-        if is_event(&message.header) {
-            return self.take_event(message, |_| {});
-        }
         let (mut expired, mut event_waits) = (Vec::new(), None);
         let taken = {
             let mut shared = lock(&self.shared);
@@ -466,6 +463,15 @@ impl MessageSink for Mailbox {
         }
         Ok(())
     }
+}
+
+impl MessageSink for Mailbox {
+    fn submit(&self, message: Message) -> Result<(), Refused> {
+        if is_event(&message.header) {
+            return self.take_event(message, |_| {});
+        }
+        self.take_message(message)
+    }
 
     fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
         if is_event(&message.header) {
@@ -476,7 +482,7 @@ impl MessageSink for Mailbox {
                 shared.event_waits = room.cloned();
             });
         }
-        let Err(refused) = self.submit(message) else { return Ok(()) };
+        let Err(refused) = self.take_message(message) else { return Ok(()) };
         if refused.why == Rejection::QueueFull {
             let waker = {
                 let mut shared = lock(&self.shared);

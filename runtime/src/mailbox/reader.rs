@@ -42,7 +42,7 @@ impl MailboxReader {
             self.current = shared.begin_handling(message);
             let room = shared.room_made();
             drop(shared);
-            room.into_iter().flatten().for_each(Waker::wake);
+            room.wake();
             return Poll::Ready(next);
         }
         if shared.closed {

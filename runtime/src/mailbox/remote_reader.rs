@@ -53,7 +53,7 @@ impl RemoteReader {
         let room = next.as_ref().map(|_| shared.room_made());
         shared.count_in_flight(next.as_ref());
         drop(shared);
-        room.into_iter().flatten().flatten().for_each(Waker::wake);
+        room.unwrap_or_default().wake();
         next
     }
 

@@ -1,7 +1,5 @@
 //! The removal of queued requests that were cancelled.
 
-use std::task::Waker;
-
 use super::Mailbox;
 use crate::{
     lock,
@@ -19,7 +17,7 @@ impl Mailbox {
         };
         // Settled and woken without the lock, so that a notified thread does not wait for it.
         request.settle(Outcome::Expired);
-        room.into_iter().flatten().for_each(Waker::wake);
+        room.wake();
         true
     }
 }

@@ -1,4 +1,4 @@
-//! The registration of a waiter for room in a queue.
+//! The registration of a waiter for room in a queue, and the wakers of senders that waited.
 
 use std::task::Waker;
 
@@ -35,6 +35,26 @@ impl Awaited {
 
     pub(super) fn into_waker(self) -> Waker {
         self.waker
+    }
+}
+
+/// The wakers of the senders that a removal has made room for: usually none.
+#[derive(Default)]
+pub(super) struct RoomWakers {
+    pub(super) of_messages: Option<Waker>,
+    pub(super) of_events: Option<Waker>,
+}
+
+impl RoomWakers {
+    /// Wakes them. The caller holds no lock.
+    #[inline]
+    pub(super) fn wake(self) {
+        if let Some(waker) = self.of_messages {
+            waker.wake();
+        }
+        if let Some(waker) = self.of_events {
+            waker.wake();
+        }
     }
 }
 
