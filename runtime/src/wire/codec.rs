@@ -58,6 +58,7 @@ pub enum Checksum {
 impl Checksum {
     /// Returns the first 64 bytes of a frame.
     #[must_use]
+    #[inline]
     pub fn encode(self, header: &Header, payload: &[u8]) -> [u8; HEADER_LEN] {
         match self {
             Self::Crc => header.encode(payload),
@@ -66,6 +67,7 @@ impl Checksum {
         }
     }
 
+    #[inline]
     fn decode(self, bytes: &[u8; HEADER_LEN], payload: &[u8]) -> Result<Header, HeaderError> {
         match self {
             Self::Crc => Header::decode(bytes, payload),

@@ -252,6 +252,7 @@ impl Header {
     /// # Panics
     /// Never for payloads below 4 GiB, which every configured limit is.
     #[must_use]
+    #[inline]
     pub fn encode_guarded(&self, payload: &[u8]) -> [u8; HEADER_LEN] {
         let mut bytes = self.encode_in_memory(payload.len());
         let guard = guard_of(u32::from_le_bytes(field(&bytes, 4)));
@@ -274,6 +275,7 @@ impl Header {
     ///
     /// # Errors
     /// As [`decode`](Self::decode).
+    #[inline]
     pub fn decode_guarded(bytes: &[u8; HEADER_LEN], payload: &[u8]) -> Result<Self, HeaderError> {
         let mut header = Self::decode(bytes, payload)?;
         header.sequence &= SEQUENCE_MAX;
@@ -301,6 +303,7 @@ impl Header {
     ///
     /// # Errors
     /// The fault in the bytes; the peer or the network caused it.
+    #[inline]
     pub fn decode(bytes: &[u8; HEADER_LEN], payload: &[u8]) -> Result<Self, HeaderError> {
         let length = Self::payload_len(&field(bytes, 0))?;
         if length as usize != payload.len() {
@@ -316,6 +319,7 @@ impl Header {
     ///
     /// # Errors
     /// The fault in the bytes; the peer caused it.
+    #[inline]
     pub fn decode_in_memory(bytes: &[u8; HEADER_LEN]) -> Result<Self, HeaderError> {
         Self::payload_len(&field(bytes, 0))?;
         if bytes[13] & !Flags::KNOWN != 0 {
