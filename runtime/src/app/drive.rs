@@ -166,6 +166,15 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
 
     /// Runs one step. `Ready(true)`: more work may be ready; `Ready(false)`: the application must end.
     fn step(&mut self, actor: &mut A, context: &mut AppContext<A>, task: &mut Context<'_>) -> Poll<bool> {
+        // Without timers, an empty mailbox needs no look at the clock.
+        if !self.requirements.is_paused()
+            && context.schedule.next_due().is_none()
+            && self.reader.poll_idle(task).is_pending()
+        {
+            self.timer_was_last = false;
+            self.sleep(context, task);
+            return Poll::Pending;
+        }
         let now = Time::now();
         if now.since(*self.turn_began.get_or_insert(now)) >= TURN_LONGEST {
             task.waker().wake_by_ref();

@@ -19,6 +19,8 @@ pub struct MailboxReader {
     epoch: u64,
     current: Option<Class>,
     finished: Option<(Class, Outcome)>,
+    /// Whether the last taken message left none behind. A hint, which is checked under the lock.
+    seems_empty: bool,
 }
 
 impl MailboxReader {
@@ -40,6 +42,7 @@ impl MailboxReader {
         let next = shared.next();
         if let Some(message) = &next {
             self.current = shared.begin_handling(message);
+            self.seems_empty = shared.waiting() == 0;
             let room = shared.room_made();
             drop(shared);
             room.wake();
@@ -48,6 +51,22 @@ impl MailboxReader {
         if shared.closed {
             return Poll::Ready(None);
         }
+        shared.waker = Some(cx.waker().clone());
+        Poll::Pending
+    }
+
+    /// Waits for the next message, if none is queued after the last one that was taken; as
+    /// [`poll_take`](Self::poll_take) then does. Otherwise returns `Ready`, and `poll_take` is to be called.
+    pub(crate) fn poll_idle(&mut self, cx: &mut Context<'_>) -> Poll<()> {
+        if !self.seems_empty {
+            return Poll::Ready(());
+        }
+        let mut shared = lock(&self.mailbox.shared);
+        if shared.epoch != self.epoch || shared.closed || shared.waiting() > 0 {
+            return Poll::Ready(());
+        }
+        shared.count(self.finished.take());
+        shared.paused = false;
         shared.waker = Some(cx.waker().clone());
         Poll::Pending
     }
@@ -95,7 +114,7 @@ impl MailboxReader {
 impl MailboxReader {
     /// Creates the reader of `mailbox` with this number; it is the only one from now on.
     pub(super) const fn new(mailbox: Arc<Mailbox>, epoch: u64) -> Self {
-        Self { mailbox, epoch, current: None, finished: None }
+        Self { mailbox, epoch, current: None, finished: None, seems_empty: false }
     }
 
     /// Counts the ended message now, before code runs that may not return: a reader that is fenced during

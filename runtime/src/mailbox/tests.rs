@@ -61,6 +61,36 @@ fn start_of_a_wait_is_recorded_on_request() {
 }
 
 #[test]
+fn idle_reader_counts_its_last_message_and_is_woken() {
+    let mailbox = Mailbox::new(8);
+    let mut reader = mailbox.attach();
+    let waker = noop_waker();
+    let task = &mut Context::from_waker(&waker);
+    assert!(reader.poll_idle(task).is_ready(), "it has not looked yet");
+    for left in [true, false] {
+        mailbox.submit(message()).unwrap();
+        if left {
+            mailbox.submit(message()).unwrap();
+        }
+        assert!(matches!(take(&mut reader), Poll::Ready(Some(_))));
+        reader.finish(Outcome::Delivered);
+        assert!(reader.poll_idle(task).is_ready(), "another one waits");
+    }
+    assert!(matches!(take(&mut reader), Poll::Ready(Some(_))));
+    reader.finish(Outcome::Delivered);
+    assert!(reader.poll_idle(task).is_pending());
+    assert!(lock(&mailbox.shared).waker.is_some());
+    assert_eq!(mailbox.tally(Class::Control).delivered, 3);
+    mailbox.submit(message()).unwrap();
+    assert!(lock(&mailbox.shared).waker.is_none(), "it was woken");
+    assert!(reader.poll_idle(task).is_ready());
+    assert!(matches!(take(&mut reader), Poll::Ready(Some(_))));
+    mailbox.close();
+    assert!(reader.poll_idle(task).is_ready(), "the mailbox is closed");
+    assert!(matches!(take(&mut reader), Poll::Ready(None)));
+}
+
+#[test]
 fn fenced_reader_receives_nothing() {
     let mailbox = Mailbox::new(8);
     let mut zombie = mailbox.attach();
