@@ -46,9 +46,9 @@ pub(super) fn copied(bytes: &[u8]) -> Bytes {
     if bytes.is_empty() || bytes.len() > BUFFER_BYTES {
         return Bytes::copy_from_slice(bytes);
     }
-    let Some(mut buffer) = Buffer::of_thread() else { return Bytes::copy_from_slice(bytes) };
-    buffer.memory.extend_from_slice(bytes);
-    buffer.cut().freeze()
+    // A thread at its end may have destroyed this variable.
+    let copy = BUFFERS.try_with(|buffers| buffers.borrow_mut().copied(bytes)).ok().flatten();
+    copy.unwrap_or_else(|| Bytes::copy_from_slice(bytes))
 }
 
 /// Returns zeroed memory of `length` bytes.
@@ -145,10 +145,23 @@ struct Buffers {
 }
 
 impl Buffers {
-    /// Returns a free buffer, or a new one below the maximum.
+    /// Takes a buffer, while code of the payload's type writes to it.
     fn take(&mut self) -> Option<Buffer> {
-        let found = self.free().or_else(|| self.added());
-        found.map(|place| Buffer { memory: std::mem::take(&mut self.all[place]), place: Some(place) })
+        let place = self.place()?;
+        Some(Buffer { memory: std::mem::take(&mut self.all[place]), place: Some(place) })
+    }
+
+    /// Returns a copy of these bytes, at most [`BUFFER_BYTES`]. The buffer stays at its place.
+    fn copied(&mut self, bytes: &[u8]) -> Option<Bytes> {
+        let place = self.place()?;
+        let memory = &mut self.all[place];
+        memory.extend_from_slice(bytes);
+        Some(memory.split().freeze())
+    }
+
+    /// Returns the index of a free buffer, or of a new one below the maximum.
+    fn place(&mut self) -> Option<usize> {
+        self.free().or_else(|| self.added())
     }
 
     fn free(&mut self) -> Option<usize> {
