@@ -347,12 +347,21 @@ fn field<const N: usize>(bytes: &[u8; HEADER_LEN], at: usize) -> [u8; N] {
     out
 }
 
-/// An empty hasher. A new one detects the CPU's features again, which costs as much as 60 bytes.
-static EMPTY_HASHER: LazyLock<crc32fast::Hasher> = LazyLock::new(crc32fast::Hasher::new);
+/// The CRC-32 that four bytes of zeros turn into that of no bytes.
+const CRC_BEFORE_ZEROS: u32 = 0x6dd9_0a9d;
 
+/// A hasher that is to read four bytes of zeros first. A new one detects the CPU's features again, which costs as
+/// much as 60 bytes.
+static HASHER_BEFORE_ZEROS: LazyLock<crc32fast::Hasher> =
+    LazyLock::new(|| crc32fast::Hasher::new_with_initial(CRC_BEFORE_ZEROS));
+
+/// Returns the CRC-32 of the header's first 60 bytes and the payload. With four zeros before them they are whole
+/// blocks of 16 bytes, which are read faster than a rest of twelve bytes.
 fn checksum(header: &[u8; HEADER_LEN], payload: &[u8]) -> u32 {
-    let mut crc = EMPTY_HASHER.clone();
-    crc.update(&header[..60]);
+    let mut blocks = [0; HEADER_LEN];
+    blocks[4..].copy_from_slice(&header[..60]);
+    let mut crc = HASHER_BEFORE_ZEROS.clone();
+    crc.update(&blocks);
     crc.update(payload);
     crc.finalize()
 }
