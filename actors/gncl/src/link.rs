@@ -275,7 +275,17 @@ enum Decoded {
     Event(EventKind),
     Again,
     Relocate,
-    Empty,
+    /// More bytes are needed.
+    Empty(NextRead),
+}
+
+/// The next read of a connection, by its mode.
+#[derive(Clone, Copy)]
+struct NextRead {
+    /// Bytes requested from the kernel.
+    length: usize,
+    /// Whether the peer was refused.
+    is_refused: bool,
 }
 
 impl Reader {
@@ -303,7 +313,7 @@ impl Reader {
                 Decoded::Event(kind) => return Some(kind),
                 Decoded::Again => self.yield_turn().await,
                 Decoded::Relocate => return None,
-                Decoded::Empty => match self.fill().await {
+                Decoded::Empty(next) => match self.fill(next).await {
                     Ok(()) => {}
                     // The bytes were not encrypted by the peer, or report that it does not accept this node.
                     Err(error) if error.kind() == io::ErrorKind::InvalidData => {
@@ -337,19 +347,23 @@ impl Reader {
 
     fn decode_buffer(&mut self) -> Decoded {
         let mode = lock(&self.reading.mode);
-        let (payload_max, checksum) = match &*mode {
-            Mode::Handshake => (HANDSHAKE_PAYLOAD_MAX, Checksum::Crc),
+        let (payload_max, checksum, length) = match &*mode {
+            Mode::Handshake => (HANDSHAKE_PAYLOAD_MAX, Checksum::Crc, HANDSHAKE_PAYLOAD_MAX),
             // GNCL's own frames are never longer than in a handshake, and independent of the limit for
             // messages: see `longest`.
-            Mode::Linked(inbound) => (self.reading.payload_max.max(HANDSHAKE_PAYLOAD_MAX), inbound.checksum),
+            Mode::Linked(inbound) => {
+                let payload_max = self.reading.payload_max.max(HANDSHAKE_PAYLOAD_MAX);
+                (payload_max, inbound.checksum, self.next_read_len)
+            }
             Mode::Relocate(..) => return Decoded::Relocate,
             Mode::Discard => {
                 self.buffer.clear();
-                return Decoded::Empty;
+                return Decoded::Empty(NextRead { length: HANDSHAKE_PAYLOAD_MAX, is_refused: true });
             }
         };
+        let next = NextRead { length, is_refused: false };
         if self.buffer.is_empty() {
-            return Decoded::Empty;
+            return Decoded::Empty(next);
         }
         if matches!(&*mode, Mode::Handshake) && authenticator::is_tls(&self.buffer) {
             return Decoded::Event(EventKind::Violated(RefusalError::Security(
@@ -363,7 +377,7 @@ impl Reader {
         for _ in 0..FRAMES_PER_WAKE {
             let message = match self.codec.decode(&mut self.buffer) {
                 Ok(Some(message)) => message,
-                Ok(None) => return Decoded::Empty,
+                Ok(None) => return Decoded::Empty(next),
                 Err(error) => return Decoded::Event(EventKind::Violated(decline(&error))),
             };
             let Mode::Linked(inbound) = &*mode else { return Decoded::Event(EventKind::Frame(message)) };
@@ -386,7 +400,7 @@ impl Reader {
                 return Decoded::Event(EventKind::TrafficSeen);
             }
             if self.buffer.is_empty() {
-                return Decoded::Empty;
+                return Decoded::Empty(next);
             }
         }
         Decoded::Again
@@ -406,17 +420,13 @@ impl Reader {
         tokio::task::yield_now().await;
     }
 
-    async fn fill(&mut self) -> io::Result<()> {
-        let (room, is_refused) = match *lock(&self.reading.mode) {
-            Mode::Linked(_) => (self.next_read_len, false),
-            Mode::Handshake | Mode::Relocate(..) => (HANDSHAKE_PAYLOAD_MAX, false),
-            Mode::Discard => (HANDSHAKE_PAYLOAD_MAX, true),
-        };
+    async fn fill(&mut self, next: NextRead) -> io::Result<()> {
+        let NextRead { length, is_refused } = next;
         let left = self.buffer.capacity() - self.buffer.len();
-        // A quarter of the room is enough: copying the rest of a frame for each read would cost more. A
+        // A quarter of the length is enough: copying the rest of a frame for each read would cost more. A
         // larger buffer is one that the codec has created for the current frame, and is filled completely.
-        if left == 0 || left < room / 4 && self.buffer.capacity() <= FrameCodec::BUFFER_KEPT {
-            self.buffer.reserve(room);
+        if left == 0 || left < length / 4 && self.buffer.capacity() <= FrameCodec::BUFFER_KEPT {
+            self.buffer.reserve(length);
         }
         if self.turn >= BYTES_PER_TURN && is_refused {
             self.turn = 0;

@@ -24,11 +24,12 @@ async fn other_tasks_run_between_few_records_of_any_size() {
     peer.seal_each(&[0; 2 * FRAMES_PER_WAKE]);
     let sending = peer.send();
     let mut reader = Reader::new(transport, reading(Mode::Handshake));
-    reader.fill().await.unwrap();
+    let next = NextRead { length: HANDSHAKE_PAYLOAD_MAX, is_refused: false };
+    reader.fill(next).await.unwrap();
     assert_eq!(reader.buffer.len(), 2 * FRAMES_PER_WAKE);
     assert!(reader.turn >= BYTES_PER_TURN, "a turn of {}", reader.turn);
     // When: the reader continues
-    let is_pending = poll!(pin!(reader.fill())).is_pending();
+    let is_pending = poll!(pin!(reader.fill(next))).is_pending();
     // Then: others have their turn first
     assert!(is_pending);
     assert_eq!(reader.turn, 0);
