@@ -4,7 +4,10 @@ mod acks;
 mod destination_queues;
 mod processing_guard;
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{
+    Arc, Mutex, MutexGuard, PoisonError,
+    atomic::{AtomicBool, Ordering},
+};
 
 use bytes::Bytes;
 use sinew_runtime::{
@@ -97,8 +100,6 @@ struct Inbox {
     receiving: Receiving,
     backlog: ReceiveBacklog<u64, Message>,
     counters: ReceiveCounters,
-    /// Whether an ACK must be sent, as soon as the frames read together have been processed.
-    ack_is_due: bool,
     /// Number of acknowledgements created so far.
     acks_made: u64,
     /// Whether the peer's incarnation has ended: no further message of it is accepted.
@@ -183,6 +184,9 @@ pub struct PeerSession {
     pub outlet: SocketWriter<Gathering<Transport>>,
     /// Locked only briefly, never while another lock is held.
     inbox: Mutex<Inbox>,
+    /// Whether an ACK must be sent, as soon as the frames read together have been processed. Written with the
+    /// inbox locked. SYNC: Relaxed; a reader without that lock asks for the marks of its own thread.
+    ack_is_due: AtomicBool,
     /// The window granted to the peer while applications accept messages.
     window: Window,
     /// Bytes of the longest frame.
@@ -234,13 +238,13 @@ impl PeerSession {
             receiving: Receiving::new(receiver_id),
             backlog,
             counters: ReceiveCounters::default(),
-            ack_is_due: false,
             acks_made: 0,
             is_fenced: false,
             is_abandoned: false,
         });
         let outcomes_max = outcomes_max(parameters.sessions, config.gncl.queue_capacity);
-        Self { outlet, inbox, window, longest, outcomes_max, parameters, notifiers: notifiers.clone() }
+        let (ack_is_due, notifiers) = (AtomicBool::new(false), notifiers.clone());
+        Self { outlet, inbox, ack_is_due, window, longest, outcomes_max, parameters, notifiers }
     }
 
     /// Accepts messages on `link` from now on, and on no other connection.
@@ -264,7 +268,9 @@ impl PeerSession {
             let arrival = inbox.receiving.arrive(link.number(), number, message.size());
             if let Arrival::Take { ack_is_due } = arrival {
                 inbox.counters.start();
-                inbox.ack_is_due |= ack_is_due;
+                if ack_is_due {
+                    self.ack_is_due.store(true, Ordering::Relaxed);
+                }
             }
             (arrival, inbox.queue_for(message))
         };

@@ -1,5 +1,7 @@
 //! The acknowledgements sent to a peer.
 
+use std::sync::atomic::Ordering;
+
 use sinew_runtime::wire::{Kind, Message};
 use sinew_session::Ack;
 
@@ -24,8 +26,9 @@ struct Acknowledgement {
 impl PeerSession {
     /// Sends an acknowledgement, if one is due after the frames read together were processed.
     pub(crate) fn acknowledge_if_due(&self) {
-        let is_due = self.inbox().ack_is_due;
-        if is_due {
+        // SYNC: Relaxed; this thread has processed the frames. The mark of another thread may be missed here: it
+        // has requested a check.
+        if self.ack_is_due.load(Ordering::Relaxed) {
             self.acknowledge();
         }
     }
@@ -34,7 +37,7 @@ impl PeerSession {
     pub(crate) fn acknowledge_pending(&self) -> bool {
         let is_pending = {
             let inbox = self.inbox();
-            inbox.ack_is_due || inbox.receiving.has_unacknowledged()
+            self.ack_is_due.load(Ordering::Relaxed) || inbox.receiving.has_unacknowledged()
         };
         if is_pending {
             self.acknowledge();
@@ -67,15 +70,18 @@ impl PeerSession {
             ack = next();
         }
         // The acknowledgement at hand is not sent, because it may be older than one sent meanwhile.
-        self.inbox().ack_is_due = true;
+        {
+            let _inbox = self.inbox();
+            self.ack_is_due.store(true, Ordering::Relaxed);
+        }
         self.notifiers.acks.request();
     }
 
     fn next_ack(&self) -> Acknowledgement {
         let epoch = self.outlet.epoch();
         let (ack, number, link) = {
-            let Inbox { receiving, backlog, ack_is_due, acks_made, .. } = &mut *self.inbox();
-            *ack_is_due = false;
+            let Inbox { receiving, backlog, acks_made, .. } = &mut *self.inbox();
+            self.ack_is_due.store(false, Ordering::Relaxed);
             *acks_made += 1;
             let room = backlog.room(self.window, self.longest);
             let ack = receiving.ack(epoch, Some(room));
