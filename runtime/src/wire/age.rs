@@ -27,13 +27,11 @@ impl Header {
     /// Sets the error of `sent`; an error above 32 s counts as unknown.
     pub fn set_sent_error(&mut self, error: Option<Duration>) {
         self.number = error.map_or(UNKNOWN, |error| {
-            let in_micros =
-                u16::try_from(error.as_nanos().div_ceil(1_000)).ok().filter(|micros| *micros < MILLIS);
-            let in_millis = || {
-                u16::try_from(error.as_nanos().div_ceil(1_000_000))
-                    .ok()
-                    .filter(|millis| *millis < UNKNOWN - MILLIS)
-            };
+            // In 64 bits: the division of 128 bits is slow, and this runs for each message between nodes.
+            let nanos = u64::try_from(error.as_nanos()).unwrap_or(u64::MAX);
+            let in_micros = u16::try_from(nanos.div_ceil(1_000)).ok().filter(|micros| *micros < MILLIS);
+            let in_millis =
+                || u16::try_from(nanos.div_ceil(1_000_000)).ok().filter(|millis| *millis < UNKNOWN - MILLIS);
             in_micros.or_else(|| Some(MILLIS + in_millis()?)).unwrap_or(UNKNOWN)
         });
     }
