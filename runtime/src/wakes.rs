@@ -36,33 +36,32 @@ impl Batch {
 
 impl Drop for Batch {
     fn drop(&mut self) {
-        let wakers = DELAYED.try_with(|delayed| {
+        let first = DELAYED.try_with(|delayed| {
             let delayed = &mut *delayed.borrow_mut();
             delayed.batches = delayed.batches.saturating_sub(1);
-            // Without wakers the memory is kept for the next batch.
-            let is_due = delayed.batches == 0 && !delayed.wakers.is_empty();
-            is_due.then(|| std::mem::take(&mut delayed.wakers))
+            delayed.next_due()
         });
-        let Ok(Some(wakers)) = wakers else { return };
-        let mut remaining = RemainingWakes(wakers);
-        remaining.wake();
-        // The memory is reused, unless a woken task has started a new batch.
-        let _ = DELAYED.try_with(|delayed| {
-            let wakers = &mut delayed.borrow_mut().wakers;
-            if wakers.capacity() == 0 {
-                *wakers = std::mem::take(&mut remaining.0);
-            }
-        });
+        if let Ok(Some(first)) = first {
+            let mut remaining = RemainingWakes { are_woken: false };
+            first.wake();
+            remaining.wake();
+        }
     }
 }
 
-/// The remaining wakers, which are woken even if one of them panics.
-struct RemainingWakes(Vec<Waker>);
+/// The remaining wakers, which are woken even if one of them panics. They stay in the thread's list until
+/// then. If a woken task starts a batch, its end may wake them.
+struct RemainingWakes {
+    are_woken: bool,
+}
 
 impl RemainingWakes {
     fn wake(&mut self) {
-        while let Some(waker) = self.0.pop() {
-            waker.wake();
+        while !self.are_woken {
+            match DELAYED.try_with(|delayed| delayed.borrow_mut().next_due()) {
+                Ok(Some(waker)) => waker.wake(),
+                Ok(None) | Err(_) => self.are_woken = true,
+            }
         }
     }
 }
@@ -83,6 +82,11 @@ pub fn wake(waker: Waker) {
 }
 
 impl DelayedWakes {
+    /// Takes a waker, if no batch is left that delays it.
+    fn next_due(&mut self) -> Option<Waker> {
+        if self.batches == 0 { self.wakers.pop() } else { None }
+    }
+
     /// Returns whether the task of `waker` will be woken at the end of a batch. The waker may be left in its
     /// place then, to be dropped by the caller, because its drop is foreign code.
     fn delay(&mut self, waker: &mut Option<Waker>) -> bool {
