@@ -30,6 +30,7 @@ pub struct SafeWaker {
 
 impl SafeWaker {
     /// Returns a waker that wakes the task of `task` from any thread.
+    #[inline]
     pub fn of(&mut self, task: &Waker) -> &Waker {
         if !self.cached.as_ref().is_some_and(|(cached, _)| cached.will_wake(task)) {
             self.cached = None;

@@ -46,6 +46,7 @@ impl Time {
     /// println!("the turn took {:?}", Time::now().since(begin));
     /// ```
     #[must_use]
+    #[inline]
     pub fn now() -> Self {
         Self::of(ClockId::Monotonic)
     }
@@ -66,6 +67,7 @@ impl Time {
         return (now, Duration::ZERO);
     }
 
+    #[inline]
     fn of(clock: ClockId) -> Self {
         let now = clock_gettime(clock);
         // These clocks start at zero and cannot be negative.

@@ -27,6 +27,7 @@ pub struct Batch(PhantomData<*const ()>);
 
 impl Batch {
     /// Starts to delay the wakes of this thread.
+    #[inline]
     pub fn begin() -> Self {
         // A thread at its end may have destroyed this variable; it then wakes at once.
         let _ = DELAYED.try_with(|delayed| delayed.borrow_mut().batches += 1);

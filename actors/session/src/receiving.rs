@@ -83,6 +83,7 @@ impl Receiving {
     }
 
     /// Processes a frame of `bytes` received on `link`, with the lower 16 bits of its number. spec: SESSION-4
+    #[inline]
     pub fn arrive(&mut self, link: u64, number: u16, bytes: usize) -> Arrival {
         if link != self.link {
             return Arrival::Fenced;

@@ -58,8 +58,10 @@ pub struct Delivery<P> {
 
 impl<P> Delivery<P> {
     pub(crate) fn new(payload: P, header: &Header, now: Time) -> Self {
-        let Header { source, correlation, sent, .. } = *header;
-        let reply_to = ReplyTo { source, correlation, sent, until: header.expiry() };
+        let reply_to = || {
+            let Header { source, correlation, sent, .. } = *header;
+            ReplyTo { source, correlation, sent, until: header.expiry() }
+        };
         Self {
             payload,
             source: header.source,
@@ -69,7 +71,7 @@ impl<P> Delivery<P> {
             age: header.age(now),
             kind: header.kind,
             age_error: header.sent_error(),
-            reply_to: header.flags.has(Flags::ASK).then_some(reply_to),
+            reply_to: header.flags.has(Flags::ASK).then(reply_to),
         }
     }
 

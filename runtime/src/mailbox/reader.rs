@@ -102,6 +102,7 @@ impl MailboxReader {
 
     /// Records the outcome of the current message. It is counted with the next
     /// [`poll_take`](Self::poll_take), under its lock, or when this reader is dropped.
+    #[inline]
     pub fn finish(&mut self, outcome: Outcome) {
         let Some(class) = self.current.take() else { return };
         match &self.mailbox.source {
@@ -119,6 +120,7 @@ impl MailboxReader {
 
     /// Counts the ended message now, before code runs that may not return: a reader that is fenced during
     /// that code has no current message.
+    #[inline]
     pub(crate) fn count(&mut self) {
         if self.finished.is_some() {
             let mut shared = lock(&self.mailbox.shared);

@@ -205,6 +205,7 @@ impl Liveness {
     }
 
     /// Records the start of a turn, or of the next step in it. On the actor's thread only.
+    #[inline]
     pub(crate) fn begin(&self, activity: Activity, now: Option<Time>) {
         let next = (self.turn.load(Ordering::Relaxed) + 1) | 1;
         // SYNC: the previous `begun` is cleared before the new number is stored, and the number before the

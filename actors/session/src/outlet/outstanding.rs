@@ -88,6 +88,7 @@ impl Open {
     }
 
     /// Calls the method of this name of [`Outstanding`], as do the following methods.
+    #[inline]
     pub(super) fn add_waiting(&self, confirming_destination: Option<Tid>) {
         if confirming_destination.is_some() {
             self.with(|all| all.add_waiting(confirming_destination));

@@ -49,6 +49,7 @@ fn room_of(left: usize, bound: usize, least: usize) -> usize {
 
 /// Returns the key of a destination that may be held, by class: an application's mailbox. Stream has none,
 /// because only its newest value is queued.
+#[inline]
 pub fn backlog_key(header: &Header) -> Option<u64> {
     let is_for_a_mailbox = header.destination.is_single()
         && !header.destination.app.is_layer()
