@@ -5,6 +5,7 @@
 //! next incarnation. Queue and waker are under one mutex, see [`event_queue`](crate::event_queue).
 
 mod about;
+mod backlog;
 mod budget;
 mod ends;
 mod queue;
@@ -19,14 +20,12 @@ mod tests;
 
 use std::{
     collections::VecDeque,
-    sync::{
-        Arc, Mutex, OnceLock, TryLockError,
-        atomic::{AtomicBool, Ordering},
-    },
+    sync::{Arc, Mutex, OnceLock, atomic::AtomicBool},
     task::Waker,
 };
 
 pub use about::About;
+pub(crate) use backlog::Backlog;
 pub use budget::Budget;
 pub use queue::{Bounds, ClassQueue, is_same_stream};
 pub use reader::MailboxReader;
@@ -56,17 +55,6 @@ pub struct Mailbox {
     refusals: OnceLock<(Tid, Arc<dyn RefusalSink>)>,
     /// Whether it is recorded since when messages wait.
     records_waits: AtomicBool,
-}
-
-/// The messages that wait for the reader of a mailbox.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Backlog {
-    /// Number of messages that it can take.
-    pub(crate) waiting: usize,
-    /// Number of messages that were taken so far.
-    pub(crate) taken: u64,
-    /// When a message was last added to none that waited, if that is recorded.
-    pub(crate) since: Option<Time>,
 }
 
 #[derive(Debug)]
@@ -285,39 +273,6 @@ impl Mailbox {
         let mut shared = lock(&self.shared);
         if shared.epoch == epoch {
             shared.next_reader();
-        }
-    }
-
-    /// Returns the messages that wait. Returns `None` if the mailbox is locked.
-    pub(crate) fn backlog(&self) -> Option<Backlog> {
-        if let Some(source) = &self.source {
-            let (waiting, taken) = source.backlog()?;
-            return Some(Backlog { waiting, taken, since: None });
-        }
-        let shared = match self.shared.try_lock() {
-            Ok(shared) => shared,
-            Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
-            Err(TryLockError::WouldBlock) => return None,
-        };
-        let (waiting, taken, since) = (shared.takeable(), shared.taken_out, shared.waiting_since);
-        Some(Backlog { waiting, taken, since })
-    }
-
-    /// Returns whether it can be recorded since when messages wait: they are queued here.
-    pub(crate) const fn can_record_waits(&self) -> bool {
-        self.source.is_none()
-    }
-
-    /// Sets whether it is recorded since when messages wait.
-    pub(crate) fn set_records_waits(&self, records: bool) {
-        // SYNC: Relaxed; see `Liveness::set_records`.
-        self.records_waits.store(records, Ordering::Relaxed);
-    }
-
-    /// Records that messages wait from now on, if none waits yet. Before a message is added.
-    fn record_wait(&self, shared: &mut Shared) {
-        if self.records_waits.load(Ordering::Relaxed) && shared.takeable() == 0 {
-            shared.waiting_since = Some(Time::now());
         }
     }
 
