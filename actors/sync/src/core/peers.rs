@@ -83,6 +83,9 @@ impl Peers {
                     | LossReason::Duplicate => Reason::NodeLost,
                 };
                 self.lost(node, incarnation, reason);
+                if why.is_announced() {
+                    self.left(node, incarnation, reason);
+                }
                 self.route_groups(node, outputs);
                 Some(node)
             }
@@ -109,6 +112,7 @@ impl Peers {
             LinkFact::PeerLeft { node, incarnation, gave_up } => {
                 let reason = if gave_up.is_some() { Reason::NodeLost } else { Reason::NodeLeft };
                 self.lost(node, incarnation, reason);
+                self.left(node, incarnation, reason);
                 self.link_broken(node, incarnation);
                 self.route_groups(node, outputs);
                 Some(node)
@@ -167,9 +171,9 @@ impl Peers {
             && !peer.is_former(incarnation)
         {
             (peer.linked, peer.has_reported) = (None, false);
-            // A link to a lost incarnation may still come up, and says no more than that it ran then.
-            let gone = peer.gone.filter(|(gone, _)| *gone == incarnation);
-            peer.lost = peer.lost.or_else(|| gone.map(|(_, why)| why));
+            // A link to a leaving incarnation may still come up, and says no more than that it ran then.
+            let left = peer.left.filter(|(left, _)| *left == incarnation);
+            peer.lost = peer.lost.or_else(|| left.map(|(_, why)| why));
             // Another incarnation was found while this one was linked.
             peer.found.into_iter().for_each(|found| peer.expect(found));
         }
@@ -190,8 +194,16 @@ impl Peers {
             && !peer.is_former(incarnation)
         {
             // A node is unreachable after its goodbye: the first reason stays.
-            let why = peer.lost.unwrap_or(why);
-            (peer.lost, peer.gone, peer.has_reported) = (Some(why), Some((incarnation, why)), false);
+            (peer.lost, peer.has_reported) = (peer.lost.or(Some(why)), false);
+        }
+    }
+
+    /// Records that this incarnation of `node` has announced its end.
+    fn left(&mut self, node: NodeAddress, incarnation: Incarnation, why: Reason) {
+        if let Some(peer) = self.nodes.get_mut(&node)
+            && !peer.is_former(incarnation)
+        {
+            peer.left = Some((incarnation, why));
         }
     }
 
@@ -203,7 +215,7 @@ impl Peers {
             && !peer.is_former(incarnation)
         {
             peer.found = Some(incarnation);
-            peer.gone = None;
+            peer.left = None;
             if peer.lost.is_some() || peer.linked.is_none_or(|linked| linked == incarnation) {
                 peer.expect(incarnation);
             }
