@@ -205,6 +205,7 @@ pub struct Receipt {
 impl Receipt {
     /// Creates a receipt for the message of `ticket`, to be settled at `sink`.
     pub fn new(sink: Arc<dyn ReceiptSink>, ticket: Ticket) -> Self {
+        debug_assert_ne!(ticket.source, SETTLED, "a message has an application of one node as its source");
         Self { sink, ticket }
     }
 

@@ -12,7 +12,7 @@ use sinew_runtime::{
 
 use super::{
     ApiError, Endpoint,
-    direct::{AllEnds, LinkRead, NodeWriter, ReorderDecision, Room},
+    direct::{AllEnds, EstablishedLink, LinkRead, NodeWriter, ReorderDecision, Room},
     endpoint::LNCL,
     inbox::{Answer, Awaited, Sorted},
     link::{Read, Reader, ring::CHECK_INTERVAL},
@@ -266,6 +266,12 @@ impl Endpoint {
 
     /// Waits until a message arrives, from the node or a link, or until there is something to do.
     pub(super) async fn wait(&mut self, deadline: Time, now: Time) {
+        if self.has_unsorted() {
+            return match self.wait_mode {
+                WaitMode::Blocking => {}
+                WaitMode::Async(_) => tokio::task::yield_now().await,
+            };
+        }
         let deadline = self.wake_by(deadline, now, None);
         match &mut self.wait_mode {
             WaitMode::Blocking => self.block(deadline.since(now)),
@@ -280,6 +286,12 @@ impl Endpoint {
                 .await;
             }
         }
+    }
+
+    /// Returns whether frames were read that are not sorted in yet: the inbox was full then, and all that it held has
+    /// expired. No ring reports them again.
+    fn has_unsorted(&self) -> bool {
+        self.node.reader.has_frame() || self.direct.open.iter().any(EstablishedLink::has_frame)
     }
 
     /// The same for a task, and until there may be room on a direct link. Without a node it waits for the

@@ -178,6 +178,12 @@ pub fn gather(parts: &[IoSlice<'_>], mut target: &mut [u8]) {
     }
 }
 
+/// Returns whether bytes begin with a complete frame, or with an error.
+pub fn begins_with_frame(bytes: &[u8]) -> bool {
+    let Some(head) = bytes.first_chunk() else { return false };
+    Header::payload_len(head).map_or(true, |length| bytes.len() >= HEADER_LEN + length as usize)
+}
+
 /// Why a ring cannot be read any more. The peer is at fault.
 #[derive(Debug, thiserror::Error)]
 pub enum RingError {
@@ -247,8 +253,7 @@ impl RingFrames {
     }
 
     fn has_frame_in_buffer(&self) -> bool {
-        let Some(head) = self.buffer.first_chunk() else { return false };
-        Header::payload_len(head).map_or(true, |length| self.buffer.len() >= HEADER_LEN + length as usize)
+        begins_with_frame(&self.buffer)
     }
 
     /// Returns whether bytes were taken that [`next_message`](Self::next_message) has not returned.
@@ -257,7 +262,7 @@ impl RingFrames {
     }
 
     /// Takes records, without waiting, until there are about `enough` bytes, or half a ring's, or the long
-    /// frame in progress is complete. Each byte is read once. The peer gets their room back together: a
+    /// frame in progress is complete. Each byte that is used was read once. The peer gets their room back together: a
     /// waiting peer is woken once, and not per record.
     pub fn take(&mut self, consumer: &mut Consumer, enough: usize) -> Result<Taken, Corrupt> {
         let half = consumer.payload_max() - MARK_BYTES;

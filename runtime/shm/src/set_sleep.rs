@@ -50,6 +50,8 @@ impl Waiter {
             fence_before_recheck();
             let found = match wake_place {
                 WakePlace::Bell => Ok(set.look()),
+                // Work of another thread, and messages that were taken but not handled, are in no ring.
+                WakePlace::Own if set.look() => Ok(true),
                 WakePlace::Own => self.find_unreported(set, ends),
             };
             let slept = match found {

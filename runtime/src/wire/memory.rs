@@ -56,7 +56,10 @@ pub(super) fn zeroed(length: usize) -> BytesMut {
     if length > BUFFER_BYTES {
         return long::zeroed(length);
     }
-    let mut buffer = Buffer::take();
+    if length == 0 {
+        return BytesMut::new();
+    }
+    let Some(mut buffer) = Buffer::of_thread() else { return BytesMut::zeroed(length) };
     buffer.memory.resize(length, 0);
     buffer.cut()
 }

@@ -24,6 +24,7 @@ use sinew_lncl::testing::{TestNode, WATCHDOG};
 use sinew_runtime::{
     outcome::{Outcome, Rejection},
     tid::Tid,
+    time::Time,
     wire::{Class, Header, Kind, Message, Payload},
 };
 use sinew_shm::Spin;
@@ -111,6 +112,30 @@ fn many_endpoints_share_one_thread() {
             tokio::join!(echo, ask);
         }
     });
+}
+
+#[test]
+fn message_behind_expired_ones_is_received_at_once() {
+    for transport in BOTH {
+        // Given: an inbox is filled with messages that have expired, and one more was read with them
+        let node = TestNode::start();
+        runtime().block_on(async {
+            let registration = Registration::new().transport(transport).inbox_capacity(4);
+            let api = NodeApi::connect(node.path()).unwrap();
+            let mut endpoint = api.register_transport_address_async(registration).await.unwrap();
+            let sent = Time::now();
+            for number in 1..=5 {
+                let mut message = numbered(number, 8, node.local(1).tid, endpoint.tid());
+                message.header.sent = sent;
+                message.header.time_to_live_us = if number < 5 { 50_000 } else { 0 };
+                node.router().send(message).unwrap();
+            }
+            tokio::time::sleep(Duration::from_millis(60)).await;
+            // When, then
+            let received = timeout(WATCHDOG, endpoint.receive()).await.expect("it waits already").unwrap();
+            assert_eq!(number_of(received.bytes()), 5);
+        });
+    }
 }
 
 #[test]

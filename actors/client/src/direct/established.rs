@@ -373,6 +373,11 @@ impl EstablishedLink {
         self.consumer.slot()
     }
 
+    /// Returns whether a frame was taken that [`next`](Self::next) has not returned.
+    pub(crate) fn has_frame(&self) -> bool {
+        self.frames.has_frame()
+    }
+
     /// Returns whether the ring holds data, or data taken from it is not sorted in yet.
     pub(super) fn has_unsorted(&mut self) -> bool {
         // Corrupt memory is detected when it is read.

@@ -42,8 +42,7 @@ pub(super) const CONNECT: Duration = Duration::from_secs(2);
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Transport {
     /// A ring in shared memory for each direction: at most one wake per message. The reader copies each
-    /// message out of the ring. A message below 8 KiB, or one read together with many others, is copied a
-    /// second time into its own memory. If the system or the node has no rings, the socket is used, which is
+    /// message out of the ring, to its own memory; one that came in pieces may be copied a second time. If the system or the node has no rings, the socket is used, which is
     /// logged.
     #[default]
     Ring,
@@ -363,6 +362,14 @@ impl Reader {
         match self {
             Self::Socket(reader) => reader.next(),
             Self::Ring(reader) => reader.next(),
+        }
+    }
+
+    /// Returns whether a frame was read that [`next`](Self::next) has not returned.
+    pub(super) fn has_frame(&self) -> bool {
+        match self {
+            Self::Socket(reader) => reader.has_frame(),
+            Self::Ring(reader) => reader.has_frame(),
         }
     }
 

@@ -16,6 +16,7 @@ use rustix::{
     io::Errno,
     net::{RecvFlags, SendAncillaryBuffer, SendFlags, Shutdown, recv, sendmsg},
 };
+use sinew_protocol::ring::begins_with_frame;
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Ticket},
     time::Time,
@@ -232,6 +233,10 @@ impl Reader {
     /// Returns the next frame of those that were read.
     pub(crate) fn next(&mut self) -> Result<Option<Message>, ApiError> {
         Ok(self.codec.decode(&mut self.buffer)?)
+    }
+
+    pub(crate) fn has_frame(&self) -> bool {
+        begins_with_frame(&self.buffer)
     }
 
     /// Stops taking data.

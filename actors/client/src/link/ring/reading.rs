@@ -89,6 +89,10 @@ impl Reader {
         Ok(self.frames.next_message()?)
     }
 
+    pub(in crate::link) fn has_frame(&self) -> bool {
+        self.frames.has_frame()
+    }
+
     /// Stops taking data.
     pub(in crate::link) fn stop_reading(&mut self) {
         self.leave_set();
