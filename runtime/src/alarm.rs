@@ -36,8 +36,12 @@ impl Alarm {
     pub fn wake_at(&mut self, at: Option<Time>, cx: &mut Context<'_>) -> io::Result<()> {
         if at != self.set_for {
             self.set(at)?;
+            // The kernel has discarded the expiry of the former setting, so there is nothing to read. What expires
+            // from now on is an edge of its own, and survives that the former readiness is cleared.
+            if let Poll::Ready(guard) = self.timer.poll_read_ready(cx) {
+                guard?.clear_ready();
+            }
         }
-        // A readiness of an earlier setting is cleared, so that the next expiry is an edge.
         while let Poll::Ready(guard) = self.timer.poll_read_ready(cx) {
             let mut guard = guard?;
             let mut expirations = [0; 8];
