@@ -5,6 +5,14 @@ use std::sync::{TryLockError, atomic::Ordering};
 use super::{Mailbox, Shared};
 use crate::time::Time;
 
+/// The record of a moment from which messages wait.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct WaitRecord {
+    since: Time,
+    /// Number of messages that were taken by then.
+    taken: u64,
+}
+
 /// The messages that wait for the reader of a mailbox.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Backlog {
@@ -12,8 +20,14 @@ pub(crate) struct Backlog {
     pub(crate) waiting: usize,
     /// Number of messages that were taken so far.
     pub(crate) taken: u64,
-    /// When a message was last added to none that waited, if that is recorded.
+    /// Since when messages wait and none was taken, if that is recorded.
     pub(crate) since: Option<Time>,
+}
+
+impl WaitRecord {
+    fn now(shared: &Shared) -> Self {
+        Self { since: Time::now(), taken: shared.taken_out }
+    }
 }
 
 impl Mailbox {
@@ -28,8 +42,10 @@ impl Mailbox {
             Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
             Err(TryLockError::WouldBlock) => return None,
         };
-        let (waiting, taken, since) = (shared.takeable(), shared.taken_out, shared.waiting_since);
-        Some(Backlog { waiting, taken, since })
+        let (waiting, taken) = (shared.takeable(), shared.taken_out);
+        // An older record says nothing about the messages that were left when one was taken.
+        let record = shared.waiting_since.filter(|record| record.taken == taken);
+        Some(Backlog { waiting, taken, since: record.map(|record| record.since) })
     }
 
     /// Returns whether it can be recorded since when messages wait: they are queued here.
@@ -46,7 +62,14 @@ impl Mailbox {
     /// Records that messages wait from now on, if none waits yet. Before a message is added.
     pub(super) fn record_wait(&self, shared: &mut Shared) {
         if self.records_waits.load(Ordering::Relaxed) && shared.takeable() == 0 {
-            shared.waiting_since = Some(Time::now());
+            shared.waiting_since = Some(WaitRecord::now(shared));
+        }
+    }
+
+    /// Records that the messages left in the queue wait from now on. After a message is taken.
+    pub(super) fn record_rest(&self, shared: &mut Shared) {
+        if self.records_waits.load(Ordering::Relaxed) && shared.takeable() > 0 {
+            shared.waiting_since = Some(WaitRecord::now(shared));
         }
     }
 }

@@ -26,6 +26,7 @@ use std::{
 
 pub use about::About;
 pub(crate) use backlog::Backlog;
+use backlog::WaitRecord;
 pub use budget::Budget;
 pub use queue::{Bounds, ClassQueue, is_same_stream};
 pub use reader::MailboxReader;
@@ -76,7 +77,7 @@ struct Shared {
     /// The number of messages taken out so far.
     taken_out: u64,
     /// See [`Backlog::since`].
-    waiting_since: Option<Time>,
+    waiting_since: Option<WaitRecord>,
     /// The number of messages of each class that are in flight to a [`RemoteReader`].
     in_flight: [u64; 3],
     /// Whether the current reader is a [`RemoteReader`].

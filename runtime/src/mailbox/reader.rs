@@ -43,6 +43,9 @@ impl MailboxReader {
         if let Some(message) = &next {
             self.current = shared.begin_handling(message);
             self.seems_empty = shared.waiting() == 0;
+            if !self.seems_empty {
+                self.mailbox.record_rest(&mut shared);
+            }
             let room = shared.room_made();
             drop(shared);
             room.wake();
@@ -87,6 +90,7 @@ impl MailboxReader {
         shared.count(self.finished.take());
         if let Some(event) = shared.events.pop_front() {
             self.current = shared.begin_handling(&event);
+            self.mailbox.record_rest(&mut shared);
             let room = shared.event_waits.take();
             drop(shared);
             room.into_iter().for_each(Waker::wake);

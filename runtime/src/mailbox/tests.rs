@@ -53,11 +53,17 @@ fn start_of_a_wait_is_recorded_on_request() {
     assert!(first.is_some());
     mailbox.submit(message()).unwrap();
     assert_eq!(since(&mailbox), first, "one waited already");
+    let before = Time::now();
     take_one();
+    assert!(since(&mailbox).is_some_and(|since| since >= before), "the other one waits on");
     take_one();
     let before = Time::now();
     mailbox.submit(message()).unwrap();
     assert!(since(&mailbox).is_some_and(|since| since >= before));
+    mailbox.submit(message()).unwrap();
+    mailbox.set_records_waits(false);
+    take_one();
+    assert_eq!(since(&mailbox), None, "one was taken after the record");
 }
 
 #[test]

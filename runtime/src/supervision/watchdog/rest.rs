@@ -5,8 +5,8 @@
 //!    ▲ ────────────────────── anything else ─────────────────────┘
 //! ```
 //!
-//! While the watchdog rests, actors record when their turns begin, and mailboxes when messages begin to wait. So a
-//! hang is found at the same time as by frequent checks.
+//! While the watchdog rests, actors record when their turns begin. Mailboxes record when messages begin to wait, and
+//! when one is taken and others are left. So a hang is found at the same time as by frequent checks.
 
 use std::time::Duration;
 

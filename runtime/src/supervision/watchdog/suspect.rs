@@ -175,8 +175,11 @@ impl StallSuspect {
         let Backlog { waiting, taken, since } = backlog;
         self.has_waiting = waiting > 0;
         if waiting == 0 || self.taken != Some(taken) {
+            // At the first check a record may be of a former incarnation.
+            let recorded = since.filter(|_| waiting > 0 && self.taken.is_some());
+            let (since, late) = recorded.map_or((now, Duration::ZERO), |since| (since.max(self.since), late));
             self.taken = Some(taken);
-            self.reset(now);
+            self.count_from(since, late);
             return Stall::None;
         }
         if !std::mem::replace(&mut self.is_open, true) {
@@ -210,7 +213,7 @@ impl StallSuspect {
         let after = neighbours();
         if after.are_busy || after != before {
             // One of them has the thread, or has just had it: they are judged themselves.
-            self.reset(now);
+            self.count_from(now, Duration::ZERO);
             return Stall::None;
         }
         Stall::ThreadIsAway(hang(excused))
@@ -218,7 +221,12 @@ impl StallSuspect {
 
     /// Resets the detection: the time so far is excused.
     pub(super) fn reset(&mut self, now: Time) {
-        (self.since, self.is_open, self.probed, self.account) = (now, false, None, Account::default());
+        self.count_from(now, Duration::ZERO);
+    }
+
+    /// Counts the time from `since`. For `late` of it the watchdog was late.
+    fn count_from(&mut self, since: Time, late: Duration) {
+        (self.since, self.is_open, self.probed, self.account) = (since, false, None, Account::opened(late));
     }
 
     /// Returns whether messages were left queued at the last check.

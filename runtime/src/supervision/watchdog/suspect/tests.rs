@@ -250,12 +250,17 @@ proptest! {
         prop_assert_eq!(suspect.deadline(snapshot), Some(ms(begun + 100 + excused)));
     }
 
-    /// Messages begin to wait between two rare checks; the mailbox has recorded when.
+    /// Messages begin to wait between two rare checks; the mailbox has recorded when. Others may have been taken
+    /// between the first check and that time.
     #[test]
-    fn messages_that_begin_to_wait_at_rest_are_missed_at_their_time(since in 0..RESTING) {
+    fn messages_that_begin_to_wait_at_rest_are_missed_at_their_time(
+        since in 0..RESTING,
+        taken_before in 0_u64..3,
+    ) {
         let mut suspect = StallSuspect::new(BUDGET);
         let mut check = |now: u64, waiting, since| {
-            let backlog = Backlog { waiting, taken: 7, since };
+            let taken = if now == 0 { 7 } else { 7 + taken_before };
+            let backlog = Backlog { waiting, taken, since };
             suspect.check(on_time(now, busy(2, None)), backlog, Neighbours::default, || None)
         };
         prop_assert_eq!(check(0, 0, None), Stall::None);
@@ -271,6 +276,32 @@ proptest! {
         }
         prop_assert_eq!((probed, accused), (Some(since + 50), Some(since + 100)));
     }
+}
+
+#[test]
+fn lateness_before_the_first_look_at_waiting_messages_is_excused() {
+    // The process is stopped from 10 to 910 ms; the messages wait since 5 ms.
+    let mut suspect = StallSuspect::new(BUDGET);
+    let mut check = |now, late: u64, waiting, taken| {
+        let check = Check { late: Duration::from_millis(late), ..on_time(now, busy(2, None)) };
+        let backlog = Backlog { waiting, taken, since: Some(ms(5)).filter(|_| waiting > 0) };
+        suspect.check(check, backlog, Neighbours::default, || None)
+    };
+    assert_eq!(check(0, 0, 0, 7), Stall::None);
+    assert_eq!([check(910, 900, 3, 8), check(915, 0, 3, 8)], [Stall::None, Stall::Probe]);
+    assert_eq!(check(1_004, 0, 3, 8), Stall::None);
+    assert!(matches!(check(1_005, 0, 3, 8), Stall::ThreadIsAway(_)));
+}
+
+#[test]
+fn record_of_a_former_incarnation_is_ignored() {
+    let mut suspect = StallSuspect::new(BUDGET);
+    let mut check = |now| {
+        let backlog = Backlog { waiting: 3, taken: 7, since: Some(ms(1)) };
+        suspect.check(on_time(now, busy(2, None)), backlog, Neighbours::default, || None)
+    };
+    assert_eq!(check(200), Stall::None);
+    assert_eq!([check(249), check(250)], [Stall::None, Stall::Probe]);
 }
 
 #[test]
