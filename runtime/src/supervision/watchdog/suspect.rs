@@ -142,7 +142,7 @@ pub(super) struct StallSuspect {
     since: Time,
     /// Whether messages were queued at the last check, and none had been taken since the one before.
     is_open: bool,
-    /// Whether messages were queued at the last check.
+    /// Whether messages were queued at the last check that the actor should take.
     has_waiting: bool,
     /// The actor's turn number at the probe, and the activity of the other actors on its thread.
     probed: Option<(u64, Neighbours)>,
@@ -219,8 +219,9 @@ impl StallSuspect {
         Stall::ThreadIsAway(hang(excused))
     }
 
-    /// Resets the detection: the time so far is excused.
+    /// Handles a check of an actor that takes no messages yet, or no more: the time so far is excused.
     pub(super) fn reset(&mut self, now: Time) {
+        self.has_waiting = false;
         self.count_from(now, Duration::ZERO);
     }
 
@@ -234,7 +235,7 @@ impl StallSuspect {
         self.is_open
     }
 
-    /// Returns whether messages were queued at the last check.
+    /// Returns whether messages were queued at the last check that the actor should take.
     pub(super) const fn has_waiting(&self) -> bool {
         self.has_waiting
     }

@@ -181,6 +181,16 @@ fn actor_with_waiting_messages_is_checked_more_often() {
 }
 
 #[test]
+fn messages_of_a_stopping_actor_do_not_count_as_waiting() {
+    let mut suspect = StallSuspect::new(BUDGET);
+    let backlog = Backlog { waiting: 3, taken: 7, since: None };
+    suspect.check(on_time(0, busy(2, None)), backlog, Neighbours::default, || None);
+    assert!(suspect.has_waiting());
+    suspect.reset(ms(5));
+    assert!(!suspect.has_waiting());
+}
+
+#[test]
 fn active_or_idle_actor_is_left_alone() {
     assert_eq!(stall(|_| 2, |now| now / 90, 3, |_| None).1, None);
     assert_eq!(stall(|_| 2, |_| 7, 0, |_| None), (None, None));
