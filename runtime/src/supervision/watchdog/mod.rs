@@ -9,6 +9,7 @@ mod deadline_extension;
 mod lateness;
 mod processor;
 mod rest;
+mod round;
 mod suspect;
 
 use std::{
@@ -26,6 +27,7 @@ pub(super) use deadline_extension::DeadlineExtension;
 use lateness::Lateness;
 use processor::sample;
 use rest::{Pace, Rest};
+use round::Round;
 use suspect::{Check, Hang, Stall, StallSuspect, TurnSuspect};
 
 use super::{
@@ -204,7 +206,7 @@ impl Shared {
         let reading = self.lateness.has_readers().then_some(PERIOD_MAX);
         let period = table.iter().map(|watched| watched.period).chain(reading).min()?;
         let before = table.len();
-        let mut round = Round { now, late, period, pace: rest.pace(), waited: Vec::new() };
+        let mut round = Round::new(now, late, period, rest.pace());
         table.retain_mut(|watched| check_one(watched, &mut round));
         self.count.fetch_sub(before - table.len(), Ordering::Relaxed);
         let is_same = former == before && before == table.len();
@@ -219,27 +221,6 @@ impl Shared {
         // A late actor waits for a CPU, or was just checked: the next check is after a period.
         let deadline = deadline.filter(|deadline| *deadline > now);
         Some(deadline.map_or(now + check_interval, |deadline| deadline.min(now + check_interval)))
-    }
-}
-
-/// One check of all incarnations.
-struct Round {
-    now: Time,
-    late: Duration,
-    period: Duration,
-    pace: Pace,
-    /// The threads of actors at rest whose accounts were read in this round, and how long each has waited for a CPU.
-    waited: Vec<(i32, Option<u64>)>,
-}
-
-impl Round {
-    fn waited(&mut self, tid: i32) -> Option<u64> {
-        if let Some((_, known)) = self.waited.iter().find(|(of, _)| *of == tid) {
-            return *known;
-        }
-        let new = processor::waited(tid);
-        self.waited.push((tid, new));
-        new
     }
 }
 
@@ -439,7 +420,7 @@ mod tests {
             ActorHandle::new(liveness.clone(), None, Some(budget), Box::new(|event| panic!("{event:?}")));
         let mut watched = Watched::new(handle, budget);
         let (now, late, period) = (Time::from_nanos(2), Duration::ZERO, PERIOD_MAX);
-        assert!(watched.check(&mut Round { now, late, period, pace, waited: Vec::new() }));
+        assert!(watched.check(&mut Round::new(now, late, period, pace)));
         watched.check_interval(pace)
     }
 
