@@ -157,8 +157,9 @@ impl ActorHandle {
 pub(super) struct WeakActorHandle(Weak<Inner>);
 
 impl WeakActorHandle {
-    /// Returns the incarnation, if it has not ended.
-    pub(super) fn living(&self) -> Option<ActorHandle> {
-        self.0.upgrade().map(ActorHandle).filter(|handle| !handle.has_ended())
+    /// Returns the incarnation, if it exists. It may have ended. The result may become its last owner, and must not be
+    /// dropped under a lock.
+    pub(super) fn upgrade(&self) -> Option<ActorHandle> {
+        self.0.upgrade().map(ActorHandle)
     }
 }

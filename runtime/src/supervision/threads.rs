@@ -89,7 +89,7 @@ impl ThreadSlot {
     /// Returns the activity of the thread's actors except this one.
     pub(super) fn neighbours_of(&self, handle: &ActorHandle) -> Neighbours {
         let mut neighbours = Neighbours::default();
-        for other in lock(&self.actors).iter().filter_map(WeakActorHandle::living) {
+        for other in self.living() {
             if !Arc::ptr_eq(other.liveness(), handle.liveness()) {
                 let snapshot = other.liveness().snapshot();
                 neighbours.are_busy |= snapshot.is_busy();
@@ -99,10 +99,32 @@ impl ThreadSlot {
         neighbours
     }
 
-    fn add(&self, handle: &ActorHandle) {
+    /// Returns the sum of the turn numbers of the thread's actors.
+    pub(super) fn turn_sum(&self) -> u64 {
+        let add = |sum: u64, handle: &ActorHandle| sum.wrapping_add(handle.liveness().snapshot().turn);
+        self.living().iter().fold(0, add)
+    }
+
+    /// Returns the incarnations on the thread that have not ended.
+    fn living(&self) -> Vec<ActorHandle> {
+        // The result may become the last owner of an incarnation, so none is dropped under the lock.
+        let mut handles: Vec<_> = lock(&self.actors).iter().filter_map(WeakActorHandle::upgrade).collect();
+        handles.retain(|handle| !handle.has_ended());
+        handles
+    }
+
+    pub(super) fn add(&self, handle: &ActorHandle) {
+        let mut former = Vec::new();
         let mut actors = lock(&self.actors);
-        actors.retain(|handle| handle.living().is_some());
+        actors.retain(|actor| {
+            let actor = actor.upgrade();
+            let is_living = actor.as_ref().is_some_and(|actor| !actor.has_ended());
+            former.extend(actor);
+            is_living
+        });
         actors.push(handle.downgrade());
+        // Those in `former` are dropped after the lock; see `living`.
+        drop(actors);
     }
 
     /// Registers the calling thread in this entry.
@@ -211,8 +233,7 @@ impl Threads {
 
     /// Removes an actor of `place`: its thread ends, unless it has other actors.
     pub(super) fn leave(&mut self, place: &Place) {
-        let is_empty = |slot: &ThreadSlot| lock(&slot.actors).iter().all(|handle| handle.living().is_none());
-        if self.arbiters.get(&place.key()).is_some_and(|(_, slot)| is_empty(slot)) {
+        if self.arbiters.get(&place.key()).is_some_and(|(_, slot)| slot.living().is_empty()) {
             self.end(&place.key());
         }
     }
@@ -228,9 +249,7 @@ impl Threads {
     #[must_use]
     pub fn turns(&self) -> Vec<Turn> {
         let slots = self.arbiters.values().map(|(_, slot)| slot);
-        let actors = slots.flat_map(|slot| {
-            lock(&slot.actors).iter().filter_map(WeakActorHandle::living).collect::<Vec<_>>()
-        });
+        let actors = slots.flat_map(|slot| slot.living());
         actors.map(|handle| Turn::of(&handle)).collect()
     }
 
@@ -253,11 +272,8 @@ impl Threads {
         let Some(slot) = hung.slot() else { return };
         let Some(abandoned) = slot.mark_abandoned() else { return };
         slot.demote();
-        let neighbours: Vec<_> = lock(&slot.actors)
-            .iter()
-            .filter_map(WeakActorHandle::living)
-            .filter(|other| !Arc::ptr_eq(other.liveness(), hung.liveness()))
-            .collect();
+        let mut neighbours = slot.living();
+        neighbours.retain(|other| !Arc::ptr_eq(other.liveness(), hung.liveness()));
         let (thread, child) = (&slot.place.thread, hung.liveness().name());
         crate::log::error!(
             child,

@@ -258,8 +258,8 @@ struct Watched {
     period: Duration,
     turn: TurnSuspect,
     stall: StallSuspect,
-    /// At rest: the sum of the turn numbers of the thread's actors, and how long the thread had waited for a CPU then,
-    /// in nanoseconds.
+    /// At rest: a number that changes with each turn of the thread's actors, and how long the thread had waited for a
+    /// CPU then, in nanoseconds.
     rested: Option<(u64, u64)>,
 }
 
@@ -326,10 +326,13 @@ impl Watched {
             }
             return;
         }
-        let turns = check.snapshot.turn.wrapping_add(slot.neighbours_of(&self.handle).turns);
+        let thread = round.thread(tid, slot);
+        // An actor without a supervisor is not among the thread's actors, so its own turns are added. Those of others
+        // count twice then, which changes nothing: only a difference from the former number counts.
+        let turns = thread.turns.wrapping_add(check.snapshot.turn);
         // A thread without turns has waited for no CPU.
         if self.rested.is_none_or(|(former, _)| former != turns) {
-            self.rested = round.waited(tid).map(|waited| (turns, waited));
+            self.rested = thread.waited().map(|waited| (turns, waited));
         }
     }
 
