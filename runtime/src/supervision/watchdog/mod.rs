@@ -9,6 +9,8 @@ mod deadline_extension;
 mod lateness;
 mod processor;
 mod rest;
+#[cfg(test)]
+mod rest_tests;
 mod round;
 mod suspect;
 
