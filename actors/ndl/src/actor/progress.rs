@@ -90,7 +90,8 @@ async fn request_progress(
     period: Duration,
 ) -> Option<Progress> {
     if state.ctx.root.has_ended() {
-        // The node is shutting down.
+        // The node is shutting down. Without a pending request the caller waits for a period.
+        *question = None;
         return None;
     }
     root.requested(Time::now());
@@ -116,7 +117,11 @@ async fn request_progress(
 
 #[cfg(test)]
 mod tests {
-    use sinew_model::notifications::testing::waits;
+    use std::sync::Arc;
+
+    use futures_util::FutureExt;
+    use sinew_model::{config::NodeConfig, context::NodeContext, notifications::testing::waits};
+    use sinew_runtime::tid::Incarnation;
 
     use super::*;
 
@@ -151,6 +156,18 @@ mod tests {
             });
             assert_eq!(reached, Some(earliest), "of a period of {period_ms} ms");
         }
+    }
+
+    #[test]
+    fn request_to_a_root_that_ends_is_not_kept() {
+        let (ctx, root) = NodeContext::for_test(NodeConfig::new("test"), Incarnation(1));
+        let state = State::new(ctx, Arc::default());
+        let (_answer, answered) = oneshot::channel();
+        let (mut watch, mut question) = (RootWatch::new(at(0)), Some(answered));
+        assert!(root.close().is_empty());
+        let report = request_progress(&state, &mut watch, &mut question, PERIOD).now_or_never();
+        assert_eq!(report, Some(None));
+        assert!(question.is_none(), "the next request waits for its time");
     }
 
     #[test]
