@@ -12,10 +12,10 @@ use std::time::Duration;
 
 use crate::time::Time;
 
-/// Turns per second of all actors up to which a node counts as at rest. Discovery and the pings of 15 other nodes
-/// take some 80. Beyond, the checks cost little beside the turns.
+/// Turns of all actors that are allowed for each second between two checks of a node at rest. Discovery and the pings
+/// of 15 other nodes take some 80. Beyond, the checks cost little beside the turns.
 const TURNS_PER_S_MAX: u32 = 200;
-/// Turns that are allowed between any two checks.
+/// Turns that are allowed besides, between any two checks: with checks every 40 ms they are half of all.
 const TURNS_AT_ONCE: u64 = 8;
 /// Time without anything open after which the checks become rare.
 const QUIET: Duration = Duration::from_secs(1);
