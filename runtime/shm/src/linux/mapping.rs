@@ -320,17 +320,11 @@ impl PeerMemory {
             &words[1..]
         };
         let (whole, tail) = target.as_chunks_mut::<8>();
-        let (words, last) = words.split_at(whole.len());
-        let (fours, rest) = whole.as_chunks_mut::<4>();
-        let (words_of_fours, words_of_rest) = words.as_chunks::<4>();
-        for (bytes, words) in fours.iter_mut().zip(words_of_fours) {
-            *bytes = words.each_ref().map(|word| word.load(Ordering::Relaxed).to_ne_bytes());
-        }
-        for (bytes, word) in rest.iter_mut().zip(words_of_rest) {
+        for (bytes, word) in whole.iter_mut().zip(words) {
             *bytes = word.load(Ordering::Relaxed).to_ne_bytes();
         }
         if !tail.is_empty() {
-            let word = last[0].load(Ordering::Relaxed).to_ne_bytes();
+            let word = words[whole.len()].load(Ordering::Relaxed).to_ne_bytes();
             tail.copy_from_slice(&word[..tail.len()]);
         }
     }
