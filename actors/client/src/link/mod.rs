@@ -41,9 +41,9 @@ pub(super) const CONNECT: Duration = Duration::from_secs(2);
 /// The transport of an endpoint's messages to its node and back.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Transport {
-    /// A ring in shared memory for each direction: at most one wake per message. The reader copies each
-    /// message out of the ring, to its own memory; one that came in pieces may be copied a second time. If the system or the node has no rings, the socket is used, which is
-    /// logged.
+    /// A ring in shared memory for each direction: at most one wake per message. The reader copies each message
+    /// out of the ring, to its own memory; one that came in pieces may be copied a second time. If the system or
+    /// the node has no rings, the socket is used, which is logged.
     #[default]
     Ring,
     /// The unix socket alone.
