@@ -449,7 +449,7 @@ async fn keep_time(shell: Rc<Shell>, mut alarm: Alarm) {
     }
 }
 
-/// Waits until this time; `None`: for ever.
+/// Waits until this time. With `None` it never ends.
 async fn reached(alarm: &mut Alarm, at: Option<Time>) {
     poll_fn(|context| {
         if at.is_some_and(|at| Time::now() >= at) {

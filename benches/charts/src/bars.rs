@@ -30,7 +30,7 @@ pub(crate) struct Bar {
     pub(crate) owner: Owner,
 }
 
-/// Whose figure a bar shows.
+/// The program that a bar is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Owner {
     Sinew,

@@ -52,7 +52,7 @@ impl CoreTimer {
     }
 }
 
-/// Waits until this time; `None`: for ever.
+/// Waits until this time. With `None` it never ends.
 async fn reached(alarm: &mut Option<Alarm>, due: Option<Time>) {
     match (alarm, due) {
         (_, None) => std::future::pending().await,
