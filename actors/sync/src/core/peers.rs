@@ -83,9 +83,6 @@ impl Peers {
                     | LossReason::Duplicate => Reason::NodeLost,
                 };
                 self.lost(node, incarnation, reason);
-                if why.is_announced() {
-                    self.left(node, incarnation, reason);
-                }
                 self.route_groups(node, outputs);
                 Some(node)
             }
@@ -112,7 +109,6 @@ impl Peers {
             LinkFact::PeerLeft { node, incarnation, gave_up } => {
                 let reason = if gave_up.is_some() { Reason::NodeLost } else { Reason::NodeLeft };
                 self.lost(node, incarnation, reason);
-                self.left(node, incarnation, reason);
                 self.link_broken(node, incarnation);
                 self.route_groups(node, outputs);
                 Some(node)
@@ -171,9 +167,9 @@ impl Peers {
             && !peer.is_former(incarnation)
         {
             (peer.linked, peer.has_reported) = (None, false);
-            // A link to a leaving incarnation may still come up, and says no more than that it ran then.
-            let left = peer.left.filter(|(left, _)| *left == incarnation);
-            peer.lost = peer.lost.or_else(|| left.map(|(_, why)| why));
+            // A link to a lost incarnation may still come up, and says no more than that it ran then.
+            let gone = peer.gone.filter(|(gone, _)| *gone == incarnation);
+            peer.lost = peer.lost.or_else(|| gone.map(|(_, why)| why));
             // Another incarnation was found while this one was linked.
             peer.found.into_iter().for_each(|found| peer.expect(found));
         }
@@ -194,16 +190,8 @@ impl Peers {
             && !peer.is_former(incarnation)
         {
             // A node is unreachable after its goodbye: the first reason stays.
-            (peer.lost, peer.has_reported) = (peer.lost.or(Some(why)), false);
-        }
-    }
-
-    /// Records that this incarnation of `node` has announced its end.
-    fn left(&mut self, node: NodeAddress, incarnation: Incarnation, why: Reason) {
-        if let Some(peer) = self.nodes.get_mut(&node)
-            && !peer.is_former(incarnation)
-        {
-            peer.left = Some((incarnation, why));
+            let why = peer.lost.unwrap_or(why);
+            (peer.lost, peer.gone, peer.has_reported) = (Some(why), Some((incarnation, why)), false);
         }
     }
 
@@ -215,7 +203,7 @@ impl Peers {
             && !peer.is_former(incarnation)
         {
             peer.found = Some(incarnation);
-            peer.left = None;
+            peer.gone = None;
             if peer.lost.is_some() || peer.linked.is_none_or(|linked| linked == incarnation) {
                 peer.expect(incarnation);
             }

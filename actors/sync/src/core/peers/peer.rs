@@ -18,8 +18,8 @@ pub(super) struct Peer {
     pub(super) found: Option<Incarnation>,
     /// Why the node is absent, if it is.
     pub(super) lost: Option<Reason>,
-    /// The incarnation that has announced its end, and why it is absent, unless it is found again.
-    pub(super) left: Option<(Incarnation, Reason)>,
+    /// The incarnation that was lost last, and why, until it is found again.
+    pub(super) gone: Option<(Incarnation, Reason)>,
     /// Whether the node sent a list since the link came up or the node was lost.
     pub(super) has_reported: bool,
     /// Whether the list is about an incarnation that has ended.

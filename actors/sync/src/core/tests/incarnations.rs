@@ -117,19 +117,21 @@ fn lost_incarnation_is_over_despite_a_late_link_down() {
 
 // spec: SYNC-3
 #[test]
-fn incarnation_that_left_stays_lost_after_a_late_link() {
-    let mut bench = Bench::new();
-    bench.links(KNEE, INCARNATION);
-    bench.list(KNEE, list(1, &[("drive", true, &[])]));
-    bench.breaks(KNEE);
-    bench.lost(KNEE, LossReason::Left);
-    bench.links(KNEE, INCARNATION);
-    bench.breaks(KNEE);
-    assert!(bench.core.called("drive").is_empty());
-    found(&mut bench, INCARNATION);
-    bench.links(KNEE, INCARNATION);
-    bench.breaks(KNEE);
-    assert_eq!(bench.core.called("drive"), [Tid::new(KNEE, app(0))]);
+fn lost_incarnation_stays_lost_after_a_late_link() {
+    for why in [LossReason::Left, LossReason::Crashed, LossReason::LinkDown] {
+        let mut bench = Bench::new();
+        bench.links(KNEE, INCARNATION);
+        bench.list(KNEE, list(1, &[("drive", true, &[])]));
+        bench.breaks(KNEE);
+        bench.lost(KNEE, why);
+        bench.links(KNEE, INCARNATION);
+        bench.breaks(KNEE);
+        assert!(bench.core.called("drive").is_empty(), "{why:?}");
+        found(&mut bench, INCARNATION);
+        bench.links(KNEE, INCARNATION);
+        bench.breaks(KNEE);
+        assert_eq!(bench.core.called("drive"), [Tid::new(KNEE, app(0))], "{why:?}");
+    }
 }
 
 // spec: SYNC-13

@@ -31,6 +31,8 @@ struct PeerView {
     present: Option<Incarnation>,
     /// The reason that it is absent, if it is.
     lost: Option<Reason>,
+    /// The incarnation that was lost last and the reason, until it is found again.
+    gone: Option<(Incarnation, Reason)>,
     /// The last list: its incarnation, and the state of each application in it.
     list: Option<(Incarnation, BTreeMap<String, AppState>)>,
     /// Whether a list arrived since the link came up.
@@ -48,13 +50,16 @@ impl PeerView {
     fn link_broken(&mut self, incarnation: Incarnation) {
         if self.linked == Some(incarnation) {
             self.linked = None;
+            // A link to a lost incarnation may come up late. It does not mean that the node is back.
+            let gone = self.gone.filter(|(gone, _)| *gone == incarnation);
+            self.lost = self.lost.or_else(|| gone.map(|(_, why)| why));
             self.becomes_unreachable();
         }
     }
 
     /// Records a loss. The first reason is kept.
-    fn is_lost(&mut self, why: Reason) {
-        self.lost.get_or_insert(why);
+    fn is_lost(&mut self, incarnation: Incarnation, why: Reason) {
+        self.gone = Some((incarnation, *self.lost.get_or_insert(why)));
         self.becomes_unreachable();
     }
 
@@ -66,7 +71,7 @@ impl PeerView {
         if self.linked.or(listed).is_some_and(|known| incarnation < known) {
             return;
         }
-        (self.lost, self.present) = (None, Some(incarnation));
+        (self.lost, self.gone, self.present) = (None, None, Some(incarnation));
     }
 
     fn becomes_unreachable(&mut self) {
@@ -145,13 +150,13 @@ impl ProcessInputs {
                 let is_another = peer.linked.is_some_and(|linked| linked != *incarnation);
                 match why {
                     LossReason::Duplicate if is_another => {}
-                    LossReason::Left => peer.is_lost(Reason::NodeLeft),
+                    LossReason::Left => peer.is_lost(*incarnation, Reason::NodeLeft),
                     LossReason::GaveUp(_)
                     | LossReason::Crashed
                     | LossReason::Hung
                     | LossReason::LinkDown
                     | LossReason::Restarted
-                    | LossReason::Duplicate => peer.is_lost(Reason::NodeLost),
+                    | LossReason::Duplicate => peer.is_lost(*incarnation, Reason::NodeLost),
                 }
             }
             Input::ListReceived { from, payload } => self.at(from).lists(&List::parse(payload).unwrap()),
@@ -216,7 +221,7 @@ impl ProcessInputs {
             LinkFact::LinkBroken { node, incarnation } => self.at(node).link_broken(*incarnation),
             LinkFact::PeerLeft { node, incarnation, gave_up } => {
                 let reason = if gave_up.is_some() { Reason::NodeLost } else { Reason::NodeLeft };
-                self.at(node).is_lost(reason);
+                self.at(node).is_lost(*incarnation, reason);
                 self.at(node).link_broken(*incarnation);
             }
             LinkFact::DialRefused { .. } => {}
