@@ -1,6 +1,7 @@
 //! A full mesh: 64 addresses in eight processes, each of which sends to all others.
 
 use std::{
+    collections::HashMap,
     thread,
     time::{Duration, Instant},
 };
@@ -22,6 +23,9 @@ const PROCESSES: usize = 8;
 const ADDRESSES: usize = 64;
 /// Messages from each address to each other one before the time is taken, so that links are made.
 const WARM_UP: usize = 32;
+/// Rounds by which an address may be ahead of the slowest other one. At most `2 * AHEAD * 63` messages wait for an
+/// address, and its queue at the node has room for 256.
+const AHEAD: usize = 2;
 
 const BLOCK: Kind = Kind::named("lncl.block");
 const READY: Kind = Kind::named("lncl.ready");
@@ -79,8 +83,10 @@ struct Member {
     endpoint: Endpoint,
     leader: Tid,
     others: Vec<Tid>,
-    /// Blocks received so far.
-    blocks: usize,
+    /// Blocks received from each other address so far.
+    blocks: HashMap<Tid, usize>,
+    /// Rounds sent so far.
+    rounds: usize,
     /// Words to begin so far.
     begun: usize,
 }
@@ -101,7 +107,8 @@ fn member(way: Way, socket: &str, number: usize, rounds: usize) {
         };
         others.push(found);
     }
-    let mut member = Member { endpoint, leader, others, blocks: 0, begun: 0 };
+    let blocks = others.iter().map(|other| (*other, 0)).collect();
+    let mut member = Member { endpoint, leader, others, blocks, rounds: 0, begun: 0 };
     member.play(1, WARM_UP);
     member.play(2, rounds);
     say(&mut member.endpoint, leader, DONE);
@@ -117,11 +124,12 @@ impl Member {
     /// Sends to all others and receives from all others, each this often, after the word to begin.
     fn play(&mut self, word: usize, rounds: usize) {
         say(&mut self.endpoint, self.leader, READY);
-        let until = if word == 1 { 0 } else { self.blocks } + self.others.len() * rounds;
         while self.begun < word {
             assert!(self.takes(DEADLINE), "waited for the word to begin");
         }
         for _ in 0..rounds {
+            self.rounds += 1;
+            self.takes_rounds(self.rounds.saturating_sub(AHEAD));
             for index in 0..self.others.len() {
                 let mut block =
                     self.endpoint.create_message(self.others[index], BLOCK, PACKET).expect("not too long");
@@ -130,7 +138,12 @@ impl Member {
                 while self.takes(Duration::ZERO) {}
             }
         }
-        while self.blocks < until {
+        self.takes_rounds(self.rounds);
+    }
+
+    /// Receives until each other address has sent this number of rounds.
+    fn takes_rounds(&mut self, rounds: usize) {
+        while self.blocks.values().any(|blocks| *blocks < rounds) {
             assert!(self.takes(DEADLINE), "waited for the blocks of the others");
         }
     }
@@ -138,7 +151,9 @@ impl Member {
     /// Receives one message. Returns whether there was one.
     fn takes(&mut self, within: Duration) -> bool {
         let Some(received) = self.endpoint.receive(within).expect("the node lives") else { return false };
-        self.blocks += usize::from(received.kind() == BLOCK);
+        if received.kind() == BLOCK {
+            *self.blocks.get_mut(&received.source()).expect("it comes from one of the others") += 1;
+        }
         self.begun += usize::from(received.kind() == BEGIN);
         true
     }
