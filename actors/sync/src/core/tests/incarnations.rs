@@ -123,7 +123,7 @@ fn lost_incarnation_stays_lost_after_a_late_link() {
         bench.links(KNEE, INCARNATION);
         bench.list(KNEE, list(1, &[("drive", true, &[])]));
         bench.breaks(KNEE);
-        bench.lost(KNEE, why);
+        bench.lost(KNEE, why.clone());
         bench.links(KNEE, INCARNATION);
         bench.breaks(KNEE);
         assert!(bench.core.called("drive").is_empty(), "{why:?}");
