@@ -12,8 +12,10 @@ use super::packet::{Acknowledgement, RANGES_MAX, Range};
 /// Maximum number of flows of one peer with a kept last number. For a further flow, the flow with the smallest last
 /// number is dropped.
 pub const FLOWS_MAX: usize = 4_096;
-/// Shortest period of acknowledgements, unless many values are pending.
-const ACK_PERIOD: Duration = Duration::from_millis(1);
+/// Time that a received value waits for a datagram to the peer that can carry its acknowledgement; then the
+/// acknowledgement is sent alone. A loop of 1 kHz on this side sends one in time, also if it is half a
+/// millisecond late. The reactor's timer adds a millisecond, and the peer repeats its value after 4 ms.
+const ACK_DELAY: Duration = Duration::from_micros(1_500);
 /// Number of values that are acknowledged at once.
 const ACK_AT: usize = 32;
 
@@ -35,7 +37,8 @@ pub struct Incoming<K> {
     unacknowledged_values: usize,
     /// The stamp of the last datagram to acknowledge, and its receive time.
     echo: Option<(u32, Time)>,
-    acknowledged: Time,
+    /// The receive time of the first datagram since the last acknowledgement.
+    waits_since: Time,
     #[cfg(feature = "testing")]
     pub(super) planted: Option<super::Fault>,
 }
@@ -51,7 +54,7 @@ impl<K: Ord + Copy> Incoming<K> {
             unacknowledged: Vec::with_capacity(RANGES_MAX),
             unacknowledged_values: 0,
             echo: None,
-            acknowledged: Time::ZERO,
+            waits_since: Time::ZERO,
             #[cfg(feature = "testing")]
             planted: None,
         }
@@ -59,7 +62,7 @@ impl<K: Ord + Copy> Incoming<K> {
 
     /// Processes a value received by datagram at `now`. Returns whether to forward it.
     pub fn on_value(&mut self, now: Time, stamp: u32, key: K, number: u64) -> bool {
-        self.echo = Some((stamp, now));
+        self.arrived(now, stamp);
         self.add_unacknowledged(number);
         let is_new = self.is_new(key, number);
         self.taken += u64::from(is_new);
@@ -73,9 +76,15 @@ impl<K: Ord + Copy> Incoming<K> {
 
     /// Processes a probe, which must be acknowledged at once.
     pub(super) fn on_probe(&mut self, now: Time, stamp: u32, number: u64) {
-        self.echo = Some((stamp, now));
+        self.arrived(now, stamp);
         self.add_unacknowledged(number);
         self.unacknowledged_values = ACK_AT;
+    }
+
+    fn arrived(&mut self, now: Time, stamp: u32) {
+        if self.echo.replace((stamp, now)).is_none() {
+            self.waits_since = now;
+        }
     }
 
     /// Resets the acknowledgement state for a peer that has lost its send state.
@@ -145,7 +154,7 @@ impl<K: Ord + Copy> Incoming<K> {
     /// Returns when the next acknowledgement is due.
     pub(super) fn due(&self) -> Option<Time> {
         let is_much = self.unacknowledged_values >= ACK_AT || self.unacknowledged.len() >= RANGES_MAX;
-        self.echo.map(|_| if is_much { Time::ZERO } else { self.acknowledged + ACK_PERIOD })
+        self.echo.map(|_| if is_much { Time::ZERO } else { self.waits_since + ACK_DELAY })
     }
 
     /// Takes the pending acknowledgement, with at most `ranges_max` ranges; `None` if there is none.
@@ -161,7 +170,6 @@ impl<K: Ord + Copy> Incoming<K> {
             self.echo = None;
             self.unacknowledged_values = 0;
         }
-        self.acknowledged = now;
         Some(Acknowledgement { echo, held_us, taken: self.taken, ranges, count })
     }
 

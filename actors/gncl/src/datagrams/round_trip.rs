@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-/// Shortest time-out: twice the delay of an acknowledgement by a receiver that acknowledges a thousand times
-/// a second, and a timer's millisecond. TCP's minimum is 200 ms.
+/// Shortest time-out: twice the wait of an acknowledgement for a value that carries it, and a timer's
+/// millisecond. TCP's minimum is 200 ms.
 pub(super) const TIME_OUT_MIN: Duration = Duration::from_millis(4);
 /// Longest time-out, also of a value that was repeated often: a recovered network gets the value within this time.
 pub(super) const TIME_OUT_MAX: Duration = Duration::from_millis(250);

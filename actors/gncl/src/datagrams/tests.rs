@@ -314,18 +314,29 @@ fn evicted_flow_never_goes_back_in_time() {
 }
 
 #[test]
-fn arrivals_are_acknowledged_once_a_millisecond_or_when_many() {
+fn arrivals_wait_for_a_datagram_that_acknowledges_them() {
+    let at = |micros| NOW + Duration::from_micros(micros);
     let mut incoming = Incoming::new(3);
     assert_eq!(incoming.due(), None);
-    incoming.on_value(NOW, 7, 1, 1);
-    assert!(incoming.is_due(NOW));
-    let first = incoming.take(NOW + Duration::from_micros(30), 32).unwrap();
-    assert_eq!((first.echo, first.held_us, first.taken, first.ranges()), (7, 30, 1, &[Range::of(1)][..]));
-    incoming.on_value(NOW, 8, 1, 2);
-    assert!(!incoming.is_due(NOW) && incoming.is_due(NOW + Duration::from_micros(1_030)));
-    for number in 3..34 {
+    incoming.on_value(at(0), 7, 1, 1);
+    incoming.on_value(at(1_000), 8, 1, 2);
+    assert!(!incoming.is_due(at(1_499)) && incoming.is_due(at(1_500)), "the first one has waited");
+    let first = incoming.take(at(1_030), 32).unwrap();
+    let ranges = [Range { first: 1, more: 1 }];
+    assert_eq!((first.echo, first.held_us, first.taken, first.ranges()), (8, 30, 2, &ranges[..]));
+    assert_eq!((incoming.due(), incoming.take(at(1_030), 32)), (None, None));
+    incoming.on_value(at(2_000), 9, 1, 3);
+    assert_eq!(incoming.due(), Some(at(3_500)), "a value carried the last acknowledgement");
+}
+
+#[test]
+fn many_arrivals_are_acknowledged_at_once() {
+    let mut incoming = Incoming::new(3);
+    for number in 2..33 {
         incoming.on_value(NOW, 9, 1, number);
     }
+    assert!(!incoming.is_due(NOW));
+    incoming.on_value(NOW, 9, 1, 33);
     assert!(incoming.is_due(NOW));
     assert_eq!(incoming.take(NOW, 32).unwrap().ranges(), [Range { first: 2, more: 31 }]);
     assert_eq!((incoming.due(), incoming.take(NOW, 32)), (None, None));

@@ -154,6 +154,21 @@ fn datagram_loss_delays_values_by_milliseconds_only() {
 }
 
 #[test]
+fn acknowledgement_that_waits_causes_no_repetition() {
+    let mut world = World::new(9, quality(0, 300, 100), Planted::Nothing);
+    world.steps(100);
+    // The values of the later pauses are not superseded before their time-out.
+    for pause in [1, 2, 5, 10] {
+        for _ in 0..100 {
+            world.send(0);
+            world.steps(pause);
+        }
+    }
+    assert_eq!((world.by_datagram, world.transmissions), (400, 400));
+    world.verdict().unwrap();
+}
+
+#[test]
 fn blocked_path_is_detected_without_loss_and_retried() {
     let network = quality(0, 300, 0);
     let mut world = World::new(1, network, Planted::Nothing);

@@ -55,6 +55,8 @@ pub(super) struct World {
     sent_at: BTreeMap<Value, Time>,
     pub(super) by_datagram: u64,
     pub(super) by_connection: u64,
+    /// Datagrams with a value, repetitions included.
+    pub(super) transmissions: u64,
     pub(super) warnings: usize,
 }
 
@@ -99,6 +101,7 @@ impl World {
             sent_at: BTreeMap::new(),
             by_datagram: 0,
             by_connection: 0,
+            transmissions: 0,
             warnings: 0,
         }
     }
@@ -173,6 +176,7 @@ impl World {
             let (datagram, length) = match order {
                 Order::Probe(number, length) => (Datagram::Probe(stamp, number), length),
                 Order::Value(number, value) => {
+                    self.transmissions += 1;
                     (Datagram::Value(stamp, number, *value), (self.lengths)(value.0))
                 }
                 Order::Acknowledgement => {
