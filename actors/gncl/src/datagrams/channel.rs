@@ -406,12 +406,12 @@ impl Channel {
         let State { core, target, .. } = state;
         let Some(target) = target else { return };
         loop {
+            let Some(order) = core.poll(now) else { return };
             let mut packet = Packet::new(self.here, target.key, stamp(now));
-            match core.poll(now) {
-                None => return,
-                Some(Order::Probe(number, length)) => packet.probe(number, length),
-                Some(Order::Acknowledgement) => acknowledge(&mut packet, core, now, 0),
-                Some(Order::Value(number, message)) => {
+            match order {
+                Order::Probe(number, length) => packet.probe(number, length),
+                Order::Acknowledgement => acknowledge(&mut packet, core, now, 0),
+                Order::Value(number, message) => {
                     let mut header = message.header;
                     header.correlation = number;
                     header.flags = header.flags.without(Flags::CONFIRM);

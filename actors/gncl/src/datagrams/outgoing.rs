@@ -324,9 +324,8 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
             longest = longest.max(flight.bytes);
             false
         });
-        if flight.is_empty() {
-            self.next_due = Time::MAX;
-        }
+        // An alarm for a value that has arrived would find nothing to do.
+        self.next_due = flight.iter().map(|flight| flight.due).min().unwrap_or(Time::MAX);
         longest
     }
 

@@ -2,12 +2,15 @@
 
 use std::{
     cell::RefCell,
+    future::poll_fn,
     io,
     net::UdpSocket,
+    pin::pin,
     sync::{
         Arc,
         atomic::{AtomicU64, Ordering},
     },
+    task::Poll,
     time::Duration,
 };
 
@@ -24,6 +27,9 @@ use crate::{State, core::Lane, inbound::Inbound, peer::Peer, shared_socket::Shar
 
 /// Datagrams read before other tasks of the thread run.
 const DATAGRAMS_PER_WAKE: usize = 64;
+/// An alarm within this time of a turn of the reader is set anew. The alarm of an acknowledgement, 1.5 ms after
+/// a value, is so at the next value of a 1 kHz loop, and not at values of other peers shortly before.
+const SOON: Duration = Duration::from_micros(750);
 /// Delay before a failed socket is read again.
 const BACK_OFF: Duration = Duration::from_millis(100);
 
@@ -45,6 +51,28 @@ impl Alarm {
             self.earlier.notify_one();
         }
     }
+
+    /// Has an alarm that is near set anew, after a turn of the IO thread. Its reason may have gone meanwhile:
+    /// an acknowledgement went with a value, or one came. This costs no system call; a wake of the thread that
+    /// finds nothing due does.
+    fn review(&self, now: Time) {
+        // SYNC: Relaxed; only this thread stores a later time.
+        if self.set.load(Ordering::Relaxed) < (now + SOON).as_nanos() {
+            self.earlier.notify_one();
+        }
+    }
+
+    /// Waits until this time, or for [`set`](Self::set) or [`review`](Self::review).
+    async fn reached(&self, due: Option<Time>) {
+        match due {
+            None => self.earlier.notified().await,
+            Some(due) => {
+                self.set.fetch_min(due.as_nanos(), Ordering::AcqRel);
+                // The check runs after an earlier due time as well as after the timeout.
+                drop(timeout(due.since(Time::now()), self.earlier.notified()).await);
+            }
+        }
+    }
 }
 
 /// Runs the due actions of all peers.
@@ -58,16 +86,15 @@ pub(crate) async fn keep_time(state: Arc<State>) {
         store.list_peers(&mut peers);
         // No reference to a peer is kept while this task waits.
         let due = peers.drain(..).filter_map(|peer| peer.tick(now)).min();
-        match due {
-            None => alarm.earlier.notified().await,
-            Some(due) => {
-                alarm.set.fetch_min(due.as_nanos(), Ordering::AcqRel);
-                // The check runs after an earlier due time as well as after the timeout.
-                drop(timeout(due.since(Time::now()), alarm.earlier.notified()).await);
-            }
+        let mut reached = pin!(alarm.reached(due));
+        let is_pending = poll_fn(|cx| Poll::Ready(reached.as_mut().poll(cx).is_pending())).await;
+        if is_pending {
+            reached.await;
+        } else {
+            // Repeated notifications must not block other tasks. After a wait they have had their turn; another
+            // one would cost a look at the reactor each time.
+            tokio::task::yield_now().await;
         }
-        // Repeated notifications must not block other tasks.
-        tokio::task::yield_now().await;
     }
 }
 
@@ -82,6 +109,14 @@ pub(crate) async fn read_all(state: Arc<State>, spin: Arc<Spin>) {
 
 fn refuse(state: &State, error: &io::Error) {
     state.store.refusals.count(Time::now(), "datagrams are not read", error);
+}
+
+/// What a turn has left in its socket.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum SocketState {
+    Empty,
+    /// Datagrams may be left.
+    Readable,
 }
 
 struct Reader {
@@ -110,25 +145,32 @@ impl Reader {
                 Ok(()) => self.turn(&mut buffer),
                 Err(error) => Err(error),
             };
-            if let Err(error) = read {
-                refuse(&self.state, &error);
-                tokio::time::sleep(BACK_OFF).await;
+            match read {
+                // The next wait lets other tasks run: the socket is empty.
+                Ok(SocketState::Empty) => {}
+                Ok(SocketState::Readable) => tokio::task::yield_now().await,
+                Err(error) => {
+                    refuse(&self.state, &error);
+                    tokio::time::sleep(BACK_OFF).await;
+                }
             }
-            tokio::task::yield_now().await;
         }
     }
 
     /// Reads the received datagrams, up to a bound. Then wakes the receivers of their messages, and sends
     /// acknowledgements.
-    fn turn(&mut self, buffer: &mut [u8]) -> io::Result<()> {
+    fn turn(&mut self, buffer: &mut [u8]) -> io::Result<SocketState> {
         let batch = wakes::Batch::begin();
         let now = Time::now();
-        let mut result = Ok(());
+        let mut result = Ok(SocketState::Readable);
         for _ in 0..DATAGRAMS_PER_WAKE {
             match self.socket.try_io(|socket| socket.recv_from(buffer)) {
                 // A datagram that fills the buffer was truncated, and is not of this protocol.
                 Ok((length, _)) => self.on_datagram(now, &buffer[..length]),
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => break,
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                    result = Ok(SocketState::Empty);
+                    break;
+                }
                 // The error is about a sent datagram: no socket listens there. The datagram is sent again.
                 Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => {}
                 Err(error) => {
@@ -142,6 +184,7 @@ impl Reader {
         for peer in self.met.drain(..) {
             peer.channel().iter().for_each(|channel| channel.flush(now));
         }
+        self.state.store.alarm.review(now);
         result
     }
 
@@ -220,6 +263,18 @@ mod tests {
         let mut present = pin!(keep_time(state.clone()));
         let woken = waits(present.as_mut());
         state.store.alarm.set(Some(Time::now()));
+        assert!(woken.is());
+    }
+
+    #[test]
+    fn turn_of_the_reader_reviews_only_a_near_alarm() {
+        let (alarm, now) = (Alarm::default(), Time::now());
+        alarm.set.store((now + 2 * SOON).as_nanos(), Ordering::Relaxed);
+        let mut earlier = pin!(alarm.earlier.notified());
+        let woken = waits(earlier.as_mut());
+        alarm.review(now);
+        assert!(!woken.is(), "its reason is still to come");
+        alarm.review(now + SOON + Duration::from_nanos(1));
         assert!(woken.is());
     }
 }
