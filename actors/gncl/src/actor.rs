@@ -49,7 +49,7 @@ use super::{
     peer_session::answers_max,
     qos,
     spin::Spin,
-    task::{self, Relocation},
+    task::{self, Relocation, TaskThread},
 };
 use crate::State;
 use authentication::NOT_AUTHENTICATED;
@@ -309,6 +309,14 @@ pub fn settings(
     }
 }
 
+/// Runs a task of the IO thread until the actor ends. If the task panics, the actor fails with it.
+fn run_beside(ctx: &mut Context<Gncl>, task: impl Future<Output = ()> + Send + 'static) {
+    let task = TaskThread::Io.begin(task);
+    ctx.spawn(fut::wrap_future(async move {
+        task::end_of(task).await;
+    }));
+}
+
 impl Actor for Gncl {
     type Context = Context<Self>;
 
@@ -338,8 +346,10 @@ impl Actor for Gncl {
         ctx.spawn(fut::wrap_future(link_notifications::offer_later(self.state.clone())));
         let spin = self.spin.clone();
         ctx.spawn(fut::wrap_future(async move { spin.keep_awake().await }));
-        ctx.spawn(fut::wrap_future(datagrams::read_all(self.state.clone(), self.spin.clone())));
-        ctx.spawn(fut::wrap_future(datagrams::keep_time(self.state.clone())));
+        // Tasks of their own: a datagram, or the time of one, wakes one of them, and not the other futures of
+        // this actor.
+        run_beside(ctx, datagrams::read_all(self.state.clone(), self.spin.clone()));
+        run_beside(ctx, datagrams::keep_time(self.state.clone()));
         ctx.spawn(fut::wrap_future(Store::run_expiry_checks(self.state.clone())));
         ctx.spawn(fut::wrap_future(Store::run_late_acknowledgements(self.state.clone())));
         if let Some(ready) = self.ready.take() {
