@@ -28,6 +28,9 @@ const GRAIN: usize = 16;
 const LOSSES_MAX: usize = 4;
 /// Number of losses after which the shortest probe is sent, to get a shorter datagram that arrives.
 const LOSSES_ASKED: usize = 2;
+/// Time after which a lost length is probed. Until one as long arrives, values carry no acknowledgement,
+/// because that would make them longer; each acknowledgement is then a datagram of its own.
+const RECHECK: Duration = Duration::from_secs(1);
 /// Shortest wait for the answer to a probe.
 const ANSWER_MIN: Duration = Duration::from_millis(20);
 /// First delay before longer lengths are tried again; it doubles.
@@ -89,6 +92,8 @@ pub(super) struct Lengths {
     unanswered: VecDeque<(u64, usize)>,
     /// Lengths of lost datagrams that are longer than all that arrived since.
     lost: Vec<usize>,
+    /// When the longest of these is probed, if no datagram as long arrives before.
+    recheck: Time,
     /// The longest length that arrived since the first of these was lost; 0: none.
     arrived: usize,
     again_after: Duration,
@@ -111,6 +116,7 @@ impl Lengths {
             orders: VecDeque::new(),
             unanswered: VecDeque::new(),
             lost: Vec::new(),
+            recheck: Time::ZERO,
             arrived: 0,
             again_after: AGAIN_MIN,
             confirmations: 0,
@@ -228,6 +234,9 @@ impl Lengths {
         if length > self.passes || length <= SHORTEST {
             return;
         }
+        if self.lost.is_empty() {
+            self.recheck = now + RECHECK;
+        }
         if self.lost.len() < LOSSES_MAX {
             self.lost.push(length);
         }
@@ -288,6 +297,10 @@ impl Lengths {
     /// Handles the passing of time while datagrams get through; `time_out` is the time after which a datagram
     /// counts as lost.
     pub(super) fn tick(&mut self, now: Time, time_out: Duration) {
+        if let Some(length) = self.lost.iter().copied().max().filter(|_| self.recheck <= now) {
+            self.recheck = now + RECHECK;
+            self.orders.push_back(length);
+        }
         if matches!(self.stage, Stage::Settled { again } if again <= now) {
             self.stage = Stage::TopAgain;
             self.begin_trial(now);
@@ -333,7 +346,8 @@ impl Lengths {
         let again = if let Stage::Settled { again } = self.stage { Some(again) } else { None };
         let next = self.trial.map(|trial| trial.next);
         let order = (!self.orders.is_empty()).then_some(Time::ZERO);
-        [again, next, order].into_iter().flatten().min()
+        let recheck = (!self.lost.is_empty()).then_some(self.recheck);
+        [again, next, order, recheck].into_iter().flatten().min()
     }
 }
 
@@ -415,6 +429,20 @@ mod tests {
             lengths.arrived(at(now), 1_100);
         }
         assert_eq!((lengths.limit(), lengths.room()), (DATAGRAM_MAX, DATAGRAM_MAX));
+    }
+
+    #[test]
+    fn lost_length_is_probed_and_used_again_if_it_arrives() {
+        let mut lengths = Lengths::new();
+        lengths.probe_both();
+        pass(&mut lengths, 0, 1, DATAGRAM_MAX);
+        lengths.lost(at(10), 300);
+        lengths.arrived(at(11), 200);
+        assert_eq!((lengths.room(), lengths.next_wake()), (SHORTEST, Some(at(1_010))));
+        pass(&mut lengths, 1_010, 1, 250);
+        assert_eq!((lengths.room(), lengths.next_wake()), (SHORTEST, Some(at(2_010))));
+        pass(&mut lengths, 2_010, 1, DATAGRAM_MAX);
+        assert_eq!((lengths.room(), lengths.next_wake()), (DATAGRAM_MAX, None));
     }
 
     #[test]

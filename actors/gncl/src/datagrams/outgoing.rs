@@ -320,8 +320,9 @@ impl<K: Ord + Copy, V> Outgoing<K, V> {
                 (flow.value, flow.state) = (None, State::Idle);
             }
             *flight_bytes -= flight.bytes;
-            // The value may have been sent several times, with or without an acknowledgement.
-            longest = longest.max(flight.bytes);
+            // A value that was sent several times may have come in a datagram without an acknowledgement.
+            let length = if flight.repeats == 0 { flight.length } else { flight.bytes };
+            longest = longest.max(length);
             false
         });
         // An alarm for a value that has arrived would find nothing to do.

@@ -257,6 +257,22 @@ fn answer_to_a_former_address_is_ignored() {
     assert!(answered(&mut core, later, at(100 * 60 * 1_000 - 1)));
 }
 
+// spec: DATAGRAM-7
+#[test]
+fn acknowledged_value_proves_the_length_of_its_datagram_if_sent_once() {
+    let mut outgoing = outgoing(9, 1_000, 8);
+    outgoing.submit(1, 1, 100, Time::MAX).unwrap();
+    assert_eq!(sent(&mut outgoing, NOW), [100]);
+    outgoing.record_length(100, 132);
+    assert_eq!(outgoing.acknowledged(&acknowledging(&[100], 1), 500), 132);
+    outgoing.submit(1, 2, 100, Time::MAX).unwrap();
+    for (sent_at, length) in [(NOW, 132), (NOW + Duration::from_secs(1), 112)] {
+        assert_eq!(sent(&mut outgoing, sent_at), [101]);
+        outgoing.record_length(101, length);
+    }
+    assert_eq!(outgoing.acknowledged(&acknowledging(&[101], 2), 500), 100, "either one may have come");
+}
+
 #[test]
 fn full_table_drops_an_idle_flow() {
     let mut outgoing = outgoing(9, 1_000, 2);
