@@ -37,7 +37,6 @@ use sinew::supervision::ReadyGate;
 use self::command::{Armed, CentralCommands, Output};
 use self::damping_repeater::{DampingRepeater, RepeaterHandle};
 use self::order::Order;
-use super::PERIOD;
 use super::device::{Damper, DriveCommand, JointDevice};
 use super::edges::{
     AS_LONG_AS_IT_TAKES, Addressee, Arm, EmergencyStop, GAIT, Reset, STATUS, STOP, Shut, drive_name,
@@ -46,6 +45,7 @@ use super::edges::{
 use super::figures::LoopFigures;
 use super::sensor::DeviceMaker;
 use super::trace::{DriveRow, EventRow, Trace};
+use super::{PERIOD, slots};
 
 pub use self::burden::Burden;
 
@@ -362,7 +362,7 @@ impl Actor for Drive {
     fn started(&mut self, context: &mut Self::Context) {
         self.ready = context.hold_ready();
         context.join(STOP);
-        context.every(PERIOD, Self::tick);
+        context.every_from(slots::next(Time::now(), slots::DRIVE), PERIOD, Self::tick);
     }
 
     fn stopping(&mut self, _: &mut Self::Context) -> Running {

@@ -13,13 +13,13 @@ use exoskeleton_model::message::{DriveStatus, FootLoad, GaitMode, GaitState, Joi
 use sinew::prelude::*;
 use sinew::{NodeAddress, events::Down, supervision::ReadyGate};
 
-use super::PERIOD;
 use super::drive::micros;
 use super::edges::{
     AS_LONG_AS_IT_TAKES, Addressee, Arm, EmergencyStop, GAIT, GaitStatus, Release, Reset, STATUS, STOP, Shut,
     drive_name, joint_of_sensor, sensor_name, sent,
 };
 use super::trace::{EventRow, GaitRow, Trace};
+use super::{PERIOD, slots};
 
 /// Ticks between two statuses: 20 a second.
 const STATUS_TICKS: u64 = 50;
@@ -186,7 +186,8 @@ impl Actor for Gait {
         tracing::info!("the barrier is open: central's gait starts");
         self.ready = context.hold_ready();
         context.join(STOP);
-        context.every(PERIOD, |this, tick, context| this.tick(tick, context));
+        let first = slots::next(Time::now(), slots::GAIT);
+        context.every_from(first, PERIOD, |this, tick, context| this.tick(tick, context));
     }
 }
 

@@ -22,7 +22,8 @@
 //! Reading order: [`topology`] (the places of all parts), [`device`] (the hardware
 //! interface), [`sensor`], [`drive`], [`gait`], [`coordinator`], [`watch`] (the applications: thin shells
 //! around the cores), [`node`] (a process with some of them), [`plant`] (the process that simulates hardware
-//! and person), [`launch`] (all five on this host). [`trace`] is the record of each.
+//! and person), [`launch`] (all five on this host). [`trace`] is the record of each. `slots` has the place of each
+//! loop in the millisecond.
 
 pub mod coordinator;
 pub mod device;
@@ -35,6 +36,7 @@ pub mod node;
 pub mod plant;
 pub mod role;
 pub mod sensor;
+mod slots;
 pub mod topology;
 pub mod trace;
 pub mod watch;

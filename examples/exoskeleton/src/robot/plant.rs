@@ -19,9 +19,9 @@ use sinew::Time;
 use sinew_figures::stalls::sleep_until;
 use thiserror::Error;
 
-use super::PERIOD;
 use super::topology::PlantPlace;
 use super::trace::{PlantRow, Recording, Trace};
+use super::{PERIOD, slots};
 use crate::output;
 
 const PERIOD_NS: u64 = PERIOD.as_nanos() as u64;
@@ -115,7 +115,7 @@ struct Plant {
 
 impl Plant {
     fn run(&mut self, stop: &AtomicBool) -> Result<(), PlantError> {
-        let mut due = Time::now() + PERIOD;
+        let mut due = slots::next(Time::now(), slots::PLANT);
         // SYNC: Relaxed, no other data depends on the flag.
         while !stop.load(Ordering::Relaxed) {
             sleep_until(due.as_nanos()).map_err(PlantError::Clock)?;

@@ -12,10 +12,10 @@ use exoskeleton_model::sensor::{SensorConfig, SensorCore};
 use sinew::prelude::*;
 use sinew::supervision::ReadyGate;
 
-use super::PERIOD;
 use super::device::JointDevice;
 use super::edges::{AS_LONG_AS_IT_TAKES, Addressee, GAIT, drive_name, sensor_name};
 use super::trace::{EventRow, Trace};
+use super::{PERIOD, slots};
 
 /// Silence of the device that is logged.
 const SILENCE_MAX: Duration = Duration::from_millis(10);
@@ -116,6 +116,7 @@ impl Actor for Sensor {
 
     fn started(&mut self, context: &mut Self::Context) {
         self.ready = context.hold_ready();
-        context.every(PERIOD, |this, tick, context| this.tick(tick, context));
+        let first = slots::next(Time::now(), slots::SENSOR);
+        context.every_from(first, PERIOD, |this, tick, context| this.tick(tick, context));
     }
 }
