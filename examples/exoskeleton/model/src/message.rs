@@ -138,7 +138,7 @@ pub enum DriveState {
     EStop,
 }
 
-/// From each drive to central and the recorder, 200 times a second.
+/// From each drive to central, 200 times a second, and to its watchers, 20 times a second.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DriveStatus {
     /// Counts up by one with each message, wraps.

@@ -51,8 +51,11 @@ pub use self::burden::Burden;
 
 /// Silence of an input that is detected, and the maximum age of a request to open the guard.
 const SILENCE_MAX: Duration = Duration::from_millis(10);
-/// Ticks between two statuses: 200 statuses a second.
+/// Ticks between two statuses for central: 200 a second, for its watch over the drives.
 const STATUS_TICKS: u64 = 5;
+/// Ticks between two statuses for the group `exo.status`: 20 a second, for people. Each wakes a thread of
+/// each receiver.
+const SHOWN_TICKS: u64 = 50;
 
 /// The constructor arguments of a drive, the same for each incarnation.
 #[derive(Clone)]
@@ -162,8 +165,10 @@ impl Drive {
         self.note(now, tick, &output);
         if tick.number.is_multiple_of(STATUS_TICKS) {
             let status = self.core.status(now.as_nanos());
-            // There may be no receiver.
-            let _ = context.send(Tid::group(STATUS), &status);
+            if tick.number.is_multiple_of(SHOWN_TICKS) {
+                // There may be no receiver.
+                let _ = context.send(Tid::group(STATUS), &status);
+            }
             if let Some(central) = self.central.at(now, context) {
                 let _ = context.send(central, &status);
             }
