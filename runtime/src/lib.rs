@@ -5,7 +5,7 @@
 //! | module | content |
 //! | --- | --- |
 //! | [`tid`] | the 64-bit transport ID |
-//! | [`time`] | nanoseconds of the monotonic clock |
+//! | [`time`], [`clock`] | nanoseconds of the monotonic clock; the clock of an application, which a test may move |
 //! | [`wire`] | header, payload, frames |
 //! | [`outcome`] | outcomes of confirmed messages |
 //! | [`undelivered`] | unconfirmed messages that were rejected |
@@ -28,6 +28,7 @@
 #[cfg_attr(not(target_os = "linux"), path = "alarm_elsewhere.rs")]
 pub mod alarm;
 pub mod app;
+pub mod clock;
 pub mod event_queue;
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]

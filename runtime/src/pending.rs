@@ -8,6 +8,7 @@ use std::{
 };
 
 use crate::{
+    clock::Clock,
     lock,
     outcome::{MemberOutcome, MemberReport, MemberTable, Outcome, ReceiptSink, Ticket},
     router::{MessageSink, Refused},
@@ -26,6 +27,8 @@ const CANCELLED_MAX: usize = 1_024;
 pub struct Pending {
     inner: Mutex<Inner>,
     capacity: usize,
+    /// The clock of the application.
+    clock: Clock,
 }
 
 #[derive(Debug)]
@@ -101,8 +104,14 @@ impl Pending {
     /// late answers to the former one do not match its own requests.
     #[must_use]
     pub fn numbered_from(first: u64, capacity: usize) -> Arc<Self> {
+        Self::on_clock(Clock::WALL, first, capacity)
+    }
+
+    /// Same as [`numbered_from`](Self::numbered_from), for an application with this clock.
+    #[must_use]
+    pub fn on_clock(clock: Clock, first: u64, capacity: usize) -> Arc<Self> {
         let inner = Inner { next: first, slots: HashMap::default(), late: 0, cancelled: VecDeque::new() };
-        Arc::new(Self { inner: Mutex::new(inner), capacity })
+        Arc::new(Self { inner: Mutex::new(inner), capacity, clock })
     }
 
     /// Opens a wait for an answer of `from`; its number is the message's correlation. Returns `None` if too
@@ -159,11 +168,12 @@ impl Pending {
 
     /// Records the cancellation of this request, which is not in the mailbox any more.
     fn record_cancellation(&self, ticket: Ticket) {
+        let now = self.clock.now();
         let cancelled = &mut lock(&self.inner).cancelled;
         if cancelled.len() >= CANCELLED_MAX {
             cancelled.pop_front();
         }
-        cancelled.push_back((ticket.source, ticket.correlation, Time::now()));
+        cancelled.push_back((ticket.source, ticket.correlation, now));
     }
 
     /// Returns whether `source` is known to have cancelled its request of this number, which it sent at `sent`.

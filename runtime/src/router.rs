@@ -30,6 +30,7 @@ use self::{
     tap::Tap,
 };
 use crate::{
+    clock::Clock,
     outcome::{Rejection, Ticket},
     tid::{AppAddress, NodeAddress, Tid},
     undelivered::{RefusalSink, is_noted},
@@ -106,6 +107,8 @@ pub struct Router {
     group_sends: Arc<OpenSends>,
     /// The sink for all messages, in a process that has no routes itself.
     uplink: Option<Arc<dyn MessageSink>>,
+    /// The clock of the applications that send with this table.
+    clock: Clock,
 }
 
 impl Router {
@@ -120,6 +123,7 @@ impl Router {
             refusals: OnceLock::new(),
             group_sends: Arc::default(),
             uplink: None,
+            clock: Clock::WALL,
         }
     }
 
@@ -128,6 +132,19 @@ impl Router {
     #[must_use]
     pub fn through(node: NodeAddress, uplink: Arc<dyn MessageSink>) -> Self {
         Self { uplink: Some(uplink), ..Self::new(node) }
+    }
+
+    /// Sets the clock of the applications that send with this table; without it they read the host's.
+    #[must_use]
+    pub fn on_clock(self, clock: Clock) -> Self {
+        Self { clock, ..self }
+    }
+
+    /// Returns the clock of the applications that send with this table.
+    #[must_use]
+    #[inline]
+    pub const fn clock(&self) -> &Clock {
+        &self.clock
     }
 
     /// Returns the node of this table.

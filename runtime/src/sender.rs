@@ -2,7 +2,6 @@
 
 mod awaiting;
 mod builder;
-mod clock;
 mod destination;
 mod directory;
 mod expecting;
@@ -29,6 +28,7 @@ pub use self::{
     unknown_name::UnknownNameError,
 };
 use crate::{
+    clock::Clock,
     monitor::{MonitorError, MonitorId},
     outcome::{Outcome, Rejection},
     pending::Pending,
@@ -168,8 +168,9 @@ impl Sender {
         payload_max: usize,
     ) -> Self {
         let sequence = AtomicU64::new(0);
+        let flows = Arc::new(Flows::new(router.clock().now()));
         let shared = Arc::new(Shared { tid, router, directory, pending, sequence, payload_max });
-        Self { shared, incarnation: None, flows: Arc::new(Flows::new(Time::now())) }
+        Self { shared, incarnation: None, flows }
     }
 
     /// Returns the same sending side bound to one incarnation of its application: it stops sending when the
@@ -179,7 +180,7 @@ impl Sender {
         Self {
             shared: self.shared.clone(),
             incarnation: Some(incarnation),
-            flows: Arc::new(Flows::new(Time::now())),
+            flows: Arc::new(Flows::new(self.now())),
         }
     }
 
@@ -202,6 +203,31 @@ impl Sender {
             self.shared.sequence.fetch_max(last, Ordering::Relaxed);
         }
         is_plausible
+    }
+
+    /// Returns the clock of this sender's application: the host's, or a virtual one in a replay.
+    #[must_use]
+    #[inline]
+    pub fn clock(&self) -> &Clock {
+        self.shared.router.clock()
+    }
+
+    /// Returns the current time of [the application's clock](Self::clock).
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{Time, message::Sender};
+    ///
+    /// /// How long a driver has been silent, on the clock that its application reads.
+    /// fn silence(sender: &Sender, last: Time) -> std::time::Duration {
+    ///     sender.now().since(last)
+    /// }
+    /// ```
+    #[must_use]
+    #[inline]
+    pub fn now(&self) -> Time {
+        self.clock().now()
     }
 
     /// Returns the TID that this sender sends from.
@@ -386,7 +412,7 @@ impl Sender {
             // Each receiver has its own echo and its own data ID.
             return Err(Rejection::Unsupported.into());
         }
-        let payload = self.flows.seal(self.shared.tid, receiver, value, Time::now());
+        let payload = self.flows.seal(self.shared.tid, receiver, value, self.now());
         let payload = payload.ok_or(SendError::TooManyProtectedFlows)?;
         Ok(Message::of_type::<P>(self.shared.tid, destination, payload))
     }
@@ -434,7 +460,7 @@ impl Sender {
             return Err(Rejection::TooLong.into());
         }
         message.header.sequence = self.shared.sequence.fetch_add(1, Ordering::Relaxed).wrapping_add(1);
-        let sent = Time::now();
+        let sent = self.now();
         message.header.sent = sent;
         self.shared.router.send(message)?;
         Ok(sent)

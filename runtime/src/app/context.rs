@@ -17,6 +17,7 @@ pub use self::watches::WatchId;
 use self::{guards::GuardEntry, watches::Watch};
 use crate::{
     app::requirement::EndReason,
+    clock::Clock,
     monitor::{MonitorError, MonitorId},
     outcome::{Outcome, Rejection},
     protection::Echo,
@@ -53,6 +54,8 @@ pub struct AppContext<A: Actor<Context = Self>> {
     parts: ContextParts<A>,
     mailbox: Option<actix::dev::Mailbox<A>>,
     sender: Sender,
+    /// The clock of the sender, one step nearer.
+    pub(super) clock: Clock,
     pub(super) schedule: Schedule<Action<A>>,
     pub(super) watches: Vec<Watch<A>>,
     pub(super) ready: Option<ReadyGate>,
@@ -81,6 +84,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         let mut context = Self {
             parts: ContextParts::new(mailbox.sender_producer()),
             mailbox: Some(mailbox),
+            clock: sender.clock().clone(),
             sender,
             schedule: Schedule::default(),
             watches: Vec::new(),
@@ -94,6 +98,35 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         };
         let mailbox = context.mailbox.take().expect("it was put there three lines above");
         ContextFut::new(context, actor, mailbox)
+    }
+
+    /// Returns the current time of the application's clock. Use it instead of [`Time::now`], so that the same
+    /// actor runs on the wall clock and in virtual time.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// struct Hip { began: Option<Time> }
+    ///
+    /// impl Actor for Hip {
+    ///     type Context = AppContext<Self>;
+    ///     fn started(&mut self, ctx: &mut Self::Context) {
+    ///         self.began = Some(ctx.now());
+    ///     }
+    /// }
+    /// ```
+    #[must_use]
+    #[inline]
+    pub fn now(&self) -> Time {
+        self.clock.now()
+    }
+
+    /// Returns the application's clock, for a wait in a future: [`Clock::sleep`].
+    #[must_use]
+    pub const fn clock(&self) -> &Clock {
+        &self.clock
     }
 
     /// Returns the TID of this application.

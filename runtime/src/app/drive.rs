@@ -15,13 +15,13 @@ use actix::{Actor, ActorContext, ActorFuture, ActorState, Handler};
 use bytes::Bytes;
 
 use crate::{
-    alarm::Alarm,
     app::{
         AppContext, Delivery, Raw, WatchId,
         context::Action,
         input_watch::WatchCheck,
         requirement::{Requirements, event_in},
     },
+    clock::ClockAlarm,
     mailbox::MailboxReader,
     outcome::{Outcome, Rejection},
     protection::{Echo, ProtectionError, Verdict},
@@ -116,7 +116,7 @@ pub(super) struct Drive<A: Actor<Context = AppContext<A>>> {
     requirements: Requirements<A>,
     /// The liveness state of this incarnation, read by other threads.
     liveness: Arc<Liveness>,
-    alarm: Option<Alarm>,
+    alarm: Option<ClockAlarm>,
     /// Whether the last step was a timer. Then a queued message has the next step, so that a handler that
     /// overruns its period does not starve the mailbox.
     timer_was_last: bool,
@@ -175,7 +175,7 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
             self.sleep(context, task);
             return Poll::Pending;
         }
-        let now = Time::now();
+        let now = context.now();
         if now.since(*self.turn_began.get_or_insert(now)) >= TURN_LONGEST {
             task.waker().wake_by_ref();
             return Poll::Pending;
@@ -188,7 +188,7 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
         {
             self.timer_was_last = true;
             self.reader.count();
-            self.liveness.begin(Activity::Timer, Some(now));
+            self.liveness.begin(Activity::Timer, watched(context, now));
             fire(actor, context, due, now);
             self.leave_if_over();
             return Poll::Ready(true);
@@ -230,7 +230,7 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
             message.settle(Outcome::Expired);
             return;
         }
-        self.liveness.begin(Activity::Message(message.header.kind), Some(now));
+        self.liveness.begin(Activity::Message(message.header.kind), watched(context, now));
         let is_confirmed =
             message.receipt.take().map(|receipt| self.liveness.hold_receipt(receipt)).is_some();
         // An incarnation that was fenced while it took this message must not handle it.
@@ -298,13 +298,13 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
     fn sleep(&mut self, context: &AppContext<A>, task: &mut Context<'_>) {
         let next = context.schedule.next_due();
         if self.alarm.is_none() && next.is_some() {
-            let no_timer = |error: std::io::Error| -> Alarm {
+            let no_timer = |error: std::io::Error| -> ClockAlarm {
                 panic!(
                     "no timer for its deadlines (timerfd): {error}; {}",
                     remedy(Wanted::Descriptor, &error)
                 )
             };
-            self.alarm = Some(Alarm::new().unwrap_or_else(no_timer));
+            self.alarm = Some(context.clock().alarm().unwrap_or_else(no_timer));
         }
         if let Some(alarm) = &mut self.alarm {
             alarm.wake_at(next, task).expect("a timerfd that was made takes a time");
@@ -336,6 +336,15 @@ impl<A: Actor<Context = AppContext<A>>> ActorFuture<A> for Drive<A> {
         this.liveness.begin(next, None);
         polled
     }
+}
+
+/// Returns the begin of a step for the watchdog, if it is known without another look at a clock. The watchdog
+/// judges hung actors by the host's clock, also in virtual time.
+fn watched<A>(context: &AppContext<A>, now: Time) -> Option<Time>
+where
+    A: Actor<Context = AppContext<A>>,
+{
+    (!context.clock.is_virtual()).then_some(now)
 }
 
 fn fire<A>(actor: &mut A, context: &mut AppContext<A>, mut due: Due<Action<A>>, now: Time)

@@ -36,6 +36,7 @@ pub use source::Source;
 pub use tally::Tally;
 
 use crate::{
+    clock::Clock,
     lock,
     outcome::{Outcome, Rejection, Ticket},
     router::{MessageSink, Refused},
@@ -56,6 +57,8 @@ pub struct Mailbox {
     refusals: OnceLock<(Tid, Arc<dyn RefusalSink>)>,
     /// Whether it is recorded since when messages wait.
     records_waits: AtomicBool,
+    /// The clock on which its messages expire.
+    clock: Clock,
 }
 
 #[derive(Debug)]
@@ -206,7 +209,13 @@ impl Mailbox {
     /// Creates an empty mailbox with these bounds for each class.
     #[must_use]
     pub fn new(bounds: impl Into<Bounds>) -> Arc<Self> {
-        Arc::new(Self::with_source(bounds.into(), None))
+        Self::on_clock(Clock::WALL, bounds)
+    }
+
+    /// Same as [`new`](Self::new), for an application with this clock.
+    #[must_use]
+    pub fn on_clock(clock: Clock, bounds: impl Into<Bounds>) -> Arc<Self> {
+        Arc::new(Self { clock, ..Self::with_source(bounds.into(), None) })
     }
 
     /// Creates the mailbox of a process that hosts one application: its reader takes messages from `source`.
@@ -235,7 +244,13 @@ impl Mailbox {
             high_water: 0,
         };
         let records_waits = AtomicBool::new(false);
-        Self { shared: Mutex::new(shared), source, refusals: OnceLock::new(), records_waits }
+        Self {
+            shared: Mutex::new(shared),
+            source,
+            refusals: OnceLock::new(),
+            records_waits,
+            clock: Clock::WALL,
+        }
     }
 
     /// Sets the sink for rejections of unconfirmed messages that were accepted here, reported for `owner`. Set once.
@@ -392,7 +407,7 @@ impl Mailbox {
             if !shared.queue.has_room_for(&message) {
                 // An application that waits for its start takes no messages, so expired ones are removed here
                 // to make room.
-                expired = shared.expire(Time::now());
+                expired = shared.expire(self.clock.now());
                 if !expired.is_empty() {
                     event_waits = shared.event_waits.take();
                 }

@@ -3,6 +3,7 @@
 mod guarded;
 #[cfg(test)]
 mod tests;
+mod virtual_deadline;
 
 use std::{
     io,
@@ -19,12 +20,18 @@ use super::{
     receiver::{Opened, Receiver, Verdict},
     safe_output::{self, CheckResult, WatchState, WatchedOutput, wake},
 };
-use crate::{tid::Tid, time::Time, wire::Payload};
+use crate::{
+    clock::{Clock, WakeUp},
+    tid::Tid,
+    time::Time,
+    wire::Payload,
+};
 
 /// Time after which a failed safe function is called again.
 const SAFE_RETRY: Duration = Duration::from_millis(1);
 
-/// The only access to an output of type `O`: commands pass while it is live, and it is made safe as soon as it is not.
+/// The only access to an output of type `O`: commands pass while it is live, and it is made safe as soon as
+/// it is not.
 ///
 /// Clones share the output. When the last one is dropped (its application has ended) the output is made safe.
 ///
@@ -60,6 +67,9 @@ struct Shared<O> {
     data_id: DataId,
     inner: Mutex<Inner<O>>,
     watch: Arc<WatchState>,
+    clock: Clock,
+    /// Makes the output safe at its deadline on a virtual clock; `None`: the thread `safe-output` does.
+    wake_up: Option<WakeUp>,
 }
 
 struct Inner<O> {
@@ -141,9 +151,31 @@ impl<O: Send + 'static> Guard<O> {
     /// failed; then it is called again, as after a panic.
     ///
     /// # Errors
-    /// The errors of [`new`](Self::new). Also if the protection requires no good message before the output is armed.
+    /// The errors of [`new`](Self::new). Also if the protection requires no good message before the output is
+    /// armed.
     #[doc(hidden)]
     pub fn of(
+        (source, destination): (Tid, Tid),
+        protected: Protected,
+        output: O,
+        safe: impl FnMut(&mut O, Cause) -> Result<(), NotSafe> + Send + 'static,
+    ) -> io::Result<Self> {
+        Self::of_on(&Clock::WALL, (source, destination), protected, output, safe)
+    }
+
+    /// Same as [`new`](Self::new), on the clock of an application. On a virtual one the thread `safe-output`
+    /// is not used: `safe` is called when that clock reaches the deadline.
+    pub(crate) fn new_on<P: Payload>(
+        clock: &Clock,
+        ends: (Tid, Tid),
+        output: O,
+        safe: impl FnMut(&mut O, Cause) + Send + 'static,
+    ) -> io::Result<Self> {
+        Self::of_on(clock, ends, Protected::of::<P>(), output, or_panics(safe))
+    }
+
+    fn of_on(
+        clock: &Clock,
         (source, destination): (Tid, Tid),
         protected: Protected,
         output: O,
@@ -157,12 +189,23 @@ impl<O: Send + 'static> Guard<O> {
         let receiver = Receiver::new(protected.protection);
         let mut inner =
             Inner { data_id, receiver, output, safe: Box::new(safe), retry: None, log_entry: None };
-        inner.make_safe(Cause::NotArmed, Time::now());
+        inner.make_safe(Cause::NotArmed, clock.now());
         inner.log_entry.take().into_iter().for_each(LogEntry::log);
-        let watch = WatchState::new(inner.deadline(), inner.retry.is_some());
-        let shared = Arc::new(Shared { data_id, inner: Mutex::new(inner), watch: Arc::new(watch) });
-        let output: Arc<dyn WatchedOutput> = shared.clone();
-        safe_output::started()?.watch(shared.watch.clone(), Arc::downgrade(&output));
+        let deadline = inner.deadline();
+        let watch = Arc::new(WatchState::new(deadline, inner.retry.is_some()));
+        let shared = Arc::new_cyclic(|output| Shared {
+            data_id,
+            inner: Mutex::new(inner),
+            watch,
+            clock: clock.clone(),
+            wake_up: clock.wake_up(|| virtual_deadline::waker(output.clone())),
+        });
+        if shared.wake_up.is_some() {
+            shared.set_deadline(deadline);
+        } else {
+            let output: Arc<dyn WatchedOutput> = shared.clone();
+            safe_output::started()?.watch(shared.watch.clone(), Arc::downgrade(&output));
+        }
         Ok(Self { owners: Arc::new(Owners(shared)) })
     }
 
@@ -205,7 +248,7 @@ impl<O: Send + 'static> Guard<O> {
     /// Too few good messages have arrived, or the output could not be made safe.
     pub fn arm(&self) -> Result<(), ArmError> {
         self.shared().with(|inner| {
-            self.shared().retry_safe(inner, Time::now());
+            self.shared().retry_safe(inner, self.shared().clock.now());
             if inner.retry.is_some() {
                 return Err(ArmError::SafeFails);
             }
@@ -282,7 +325,7 @@ impl<O: Send + 'static> Guard<O> {
                 return Released::Before;
             }
             shared.watch.is_releasing.store(true, Ordering::Release);
-            shared.retry_safe(inner, Time::now());
+            shared.retry_safe(inner, shared.clock.now());
             shared.decide_locked(inner, |receiver, _| receiver.trip(Cause::Dropped));
             if self.is_released() { Released::Now } else { Released::NotSafe }
         })
@@ -341,7 +384,7 @@ impl<O: Send + 'static> Drop for Owners<O> {
         }
         self.0.decide(|receiver, _| receiver.trip(Cause::Dropped));
         self.0.watch.is_orphan.store(true, Ordering::Release);
-        if self.0.watch.needs_retry.load(Ordering::Acquire) {
+        if self.0.watch.needs_retry.load(Ordering::Acquire) && self.0.wake_up.is_none() {
             // The guard has no other owner, and the output is not safe yet.
             safe_output::retry_orphan(self.0.clone());
         }
@@ -384,7 +427,7 @@ impl<O> Shared<O> {
     }
 
     fn decide_locked<R>(&self, inner: &mut Inner<O>, decide: impl FnOnce(&mut Receiver, Time) -> R) -> R {
-        let (now, asleep) = Time::now_and_asleep();
+        let (now, asleep) = self.clock.now_and_asleep();
         let (is_tripped, had_retry) =
             (self.watch.is_tripped.swap(false, Ordering::AcqRel), inner.retry.is_some());
         let decided = inner.let_decide(now, |receiver| {
@@ -394,7 +437,7 @@ impl<O> Shared<O> {
             }
             decide(receiver, now)
         });
-        self.watch.deadline.store(inner.deadline(), Ordering::Release);
+        self.set_deadline(inner.deadline());
         self.watch.needs_retry.store(inner.retry.is_some(), Ordering::Release);
         if inner.retry.is_some() && !had_retry {
             // The thread sleeps until the previous deadline, if there was one.
@@ -417,7 +460,7 @@ impl<O: Send + 'static> Guarded for Shared<O> {
     fn trip(&self) {
         self.watch.is_tripped.store(true, Ordering::Release);
         match self.try_expire() {
-            CheckResult::Locked => wake(),
+            CheckResult::Locked => self.check_soon(),
             CheckResult::Done(log_entry) => log_entry.into_iter().for_each(LogEntry::log),
         }
     }
@@ -446,7 +489,7 @@ impl<O: Send + 'static> WatchedOutput for Shared<O> {
             Err(TryLockError::Poisoned(poisoned)) => poisoned.into_inner(),
             Err(TryLockError::WouldBlock) => return CheckResult::Locked,
         };
-        self.retry_safe(&mut inner, Time::now());
+        self.retry_safe(&mut inner, self.clock.now());
         self.decide_locked(&mut inner, |receiver, now| receiver.expire(now));
         CheckResult::Done(inner.log_entry.take())
     }

@@ -116,7 +116,7 @@ impl Router {
         let Some(receipt) = message.receipt.take_if(|_| is_bounded) else {
             return Err(Refused::new(message, Rejection::TooManyMembers));
         };
-        let times = (Time::now(), message.header.expiry());
+        let times = (self.clock().now(), message.header.expiry());
         match self.group_sends.open((self.node, nodes), receipt, times) {
             Ok(send) => {
                 send.begin(here);

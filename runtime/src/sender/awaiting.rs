@@ -8,12 +8,12 @@ use std::{
     time::Duration,
 };
 
-use super::{AskError, clock};
+use super::AskError;
 use crate::{
+    clock::Sleep,
     outcome::{MemberOutcome, Outcome, Ticket},
     pending::{Settlement, Wait},
     router::Router,
-    time::Time,
     wire::Payload,
 };
 
@@ -29,18 +29,18 @@ impl std::fmt::Debug for Request {
     }
 }
 
-/// A wait with its deadline, which counts from the send. The timer is created at the first poll, by the
-/// runtime of the polling thread. On a thread without a runtime it is created by a shared runtime for timers.
+/// A wait with its deadline, which counts from the send, on the sender's clock. The timer is created at the
+/// first poll, by the runtime of the polling thread. On a thread without a runtime it is created by a shared
+/// runtime for timers.
 #[derive(Debug)]
 pub(super) struct Deadline {
     wait: Wait,
-    until: Time,
-    timer: Option<Pin<Box<tokio::time::Sleep>>>,
+    until: Sleep,
 }
 
 impl Deadline {
-    pub(super) const fn new(wait: Wait, until: Time) -> Self {
-        Self { wait, until, timer: None }
+    pub(super) const fn new(wait: Wait, until: Sleep) -> Self {
+        Self { wait, until }
     }
 
     /// Polls the wait. Returns its result, or `None` at the deadline.
@@ -48,17 +48,8 @@ impl Deadline {
         if let Poll::Ready(settlement) = self.wait.poll_settled(cx) {
             return Poll::Ready(Some(settlement));
         }
-        if self.timer.is_none() {
-            let now = Time::now();
-            if self.until <= now {
-                return Poll::Ready(None);
-            }
-            self.timer = clock::sleep(self.until.since(now));
-        }
         // Without a timer the deadline cannot be detected, so the wait ends now.
-        if let Some(timer) = &mut self.timer {
-            ready!(timer.as_mut().poll(cx));
-        }
+        ready!(Pin::new(&mut self.until).poll(cx));
         Poll::Ready(None)
     }
 }

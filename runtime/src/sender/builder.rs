@@ -171,16 +171,18 @@ impl<V: Via, C: Content> MessageBuilder<V, C> {
             return Err(SendError::ToMany(destination));
         }
         let (wait, within) = sender.expect_answer(&mut message, Awaited::Outcome, within)?;
-        let sent = sender.dispatch(message)?;
-        Ok((via, Confirmation::new(Deadline::new(wait, sent + within))))
+        let until = sender.dispatch(message)? + within;
+        let deadline = Deadline::new(wait, sender.clock().sleep_until(until));
+        Ok((via, Confirmation::new(deadline)))
     }
 
     pub(crate) fn confirm_by_each(self, within: Duration) -> Result<(V, GroupConfirmation), SendError> {
         let (via, mut message) = self.confirmable()?;
         let sender = via.sender();
         let (wait, within) = sender.expect_each(&mut message, within)?;
-        let sent = sender.dispatch(message)?;
-        Ok((via, GroupConfirmation::new(Deadline::new(wait, sent + within))))
+        let until = sender.dispatch(message)? + within;
+        let deadline = Deadline::new(wait, sender.clock().sleep_until(until));
+        Ok((via, GroupConfirmation::new(deadline)))
     }
 
     fn confirmable(self) -> Result<(V, Message), SendError> {
@@ -228,9 +230,9 @@ impl<V: Via, C: Content> MessageBuilder<V, C> {
         let (wait, within) = sender.expect_answer(&mut message, Awaited::Reply, within)?;
         let destination = sender.absolute(message.header.destination);
         let ticket = Ticket { source: sender.tid(), destination, correlation: wait.correlation() };
-        let sent = sender.dispatch(message)?;
+        let until = sender.dispatch(message)? + within;
         let request = Request { router: sender.shared.router.clone(), ticket };
-        Ok(Reply::new(Deadline::new(wait, sent + within), within, request))
+        Ok(Reply::new(Deadline::new(wait, sender.clock().sleep_until(until)), within, request))
     }
 }
 

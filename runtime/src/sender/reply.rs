@@ -42,7 +42,7 @@ impl Sender {
     #[must_use]
     pub fn is_wanted(&self, request: &ReplyTo) -> bool {
         let ReplyTo { source, correlation, sent, until } = *request;
-        Time::now() <= until && !self.shared.pending.is_cancelled(source, correlation, sent)
+        self.now() <= until && !self.shared.pending.is_cancelled(source, correlation, sent)
     }
 
     /// Number of replies to requests of this application that arrived too late and were dropped.

@@ -57,6 +57,8 @@ pub use self::{
     supervisor::{ChildSpec, Launch, PlannedChild, Supervisor, SupervisorFact, SupervisorPlan},
     supervisor_handle::{ChildInfo, SupervisorHandle},
     threads::{Threads, Turn},
-    unsupervised::{Unsupervised, UnsupervisedHandle, WatchdogHandle, overseen, run_unsupervised},
+    unsupervised::{
+        PolledActor, Unsupervised, UnsupervisedHandle, WatchdogHandle, overseen, run_unsupervised,
+    },
 };
 pub use crate::thread::set_normal_schedule;

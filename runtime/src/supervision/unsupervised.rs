@@ -2,11 +2,13 @@
 //! supervisor itself.
 
 use std::{
+    pin::Pin,
     sync::{Arc, Mutex},
+    task::{Context, Poll, ready},
     time::Duration,
 };
 
-use actix::{Actor, Context};
+use actix::Actor;
 use tokio::sync::oneshot;
 
 use super::{
@@ -62,7 +64,8 @@ impl std::fmt::Debug for Unsupervised {
     }
 }
 
-/// A handle to stop an actor that was started by [`run_unsupervised`]. The actor is watched while the handle exists.
+/// A handle to stop an actor that was started by [`run_unsupervised`]. The actor is watched while the handle
+/// exists.
 #[derive(Clone)]
 pub struct UnsupervisedHandle {
     handle: ActorHandle,
@@ -122,14 +125,48 @@ pub fn run_unsupervised(
 /// actor, and returns the reason, so that a panic is not lost.
 pub fn overseen<A>(name: &str, actor: A) -> impl Future<Output = Reason> + use<A>
 where
-    A: Actor<Context = Context<A>>,
+    A: Actor<Context = actix::Context<A>>,
 {
     // This actor has no watchdog, so it must never block, not even on its own log.
     mark_runtime_thread();
     let (report, ended) = report(Box::new(|_| {}));
     let handle = ActorHandle::new(Liveness::new(name), None, None, report);
-    actix_rt::spawn(Guard::around_overseer(running_actor(Context::new().into_future(actor)), handle));
+    actix_rt::spawn(Guard::around_overseer(running_actor(actix::Context::new().into_future(actor)), handle));
     ended
+}
+
+/// An actor without a supervisor that its owner polls: it is no task, so its owner knows when it has no work.
+pub struct PolledActor {
+    /// `None` after its end.
+    guard: Option<Guard>,
+    ended: Pin<Box<dyn Future<Output = Reason>>>,
+}
+
+impl std::fmt::Debug for PolledActor {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "PolledActor({})", if self.guard.is_some() { "running" } else { "ended" })
+    }
+}
+
+impl PolledActor {
+    /// Creates the actor called `name` on the calling thread, which must be that of an actix system. No watchdog
+    /// watches it.
+    #[must_use]
+    pub fn start(launch: &Launch, ready: ReadyGate, name: &str, tid: Tid) -> Self {
+        let (report, ended) = report(Box::new(|_| {}));
+        let handle = ActorHandle::new(Liveness::of(name, Some(tid)), None, None, report);
+        let guard = Guard::make(launch, ready, handle, DropQueue::default());
+        Self { guard, ended: Box::pin(ended) }
+    }
+
+    /// Polls the actor. Ready when it has ended, with the reason; it must not be polled again then.
+    pub fn poll(&mut self, task: &mut Context<'_>) -> Poll<Reason> {
+        if let Some(guard) = &mut self.guard {
+            ready!(Pin::new(guard).poll(task));
+            self.guard = None;
+        }
+        self.ended.as_mut().poll(task)
+    }
 }
 
 /// Creates the report function of an incarnation; the future ends with that incarnation.

@@ -80,7 +80,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
             );
             return Err(io::Error::new(io::ErrorKind::AlreadyExists, words));
         }
-        let guard = Guard::new::<P>(source, self.tid(), output, safe)?;
+        let guard = Guard::new_on::<P>(self.clock(), (source, self.tid()), output, safe)?;
         let guarded = guard.guarded();
         let protection =
             P::PROTECTION.expect("a guard is for a protected type: that was asserted when this was compiled");

@@ -5,10 +5,7 @@ use std::time::Duration;
 use actix::Actor;
 
 use super::{AppContext, WatchId};
-use crate::{
-    schedule::{Tick, TimerId},
-    time::Time,
-};
+use crate::schedule::{Tick, TimerId};
 
 type Timer<A> = Box<dyn FnMut(&mut A, Tick, &mut <A as Actor>::Context)>;
 
@@ -47,7 +44,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         period: Duration,
         action: impl FnMut(&mut A, Tick, &mut Self) + 'static,
     ) -> TimerId {
-        self.every_from(Time::now() + period, period, action)
+        self.every_from(self.now() + period, period, action)
     }
 
     /// Calls `action` once per period, on a grid that begins at `first`. Otherwise the same as
@@ -99,7 +96,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         delay: Duration,
         action: impl FnMut(&mut A, Tick, &mut Self) + 'static,
     ) -> TimerId {
-        self.schedule.once(Time::now() + delay, Action::Call(Box::new(action)))
+        self.schedule.once(self.now() + delay, Action::Call(Box::new(action)))
     }
 
     /// Cancels a timer from outside its own action.

@@ -8,7 +8,6 @@ use super::{Action, AppContext};
 use crate::{
     app::{InputCriterion, InputTimeout, input_watch::InputWatch},
     tid::Tid,
-    time::Time,
     wire::{Kind, Payload},
 };
 
@@ -122,7 +121,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         (criterion, limit): (InputCriterion, Duration),
         action: Alert<A>,
     ) -> WatchId {
-        let (id, now) = (WatchId(self.watches.len()), Time::now());
+        let (id, now) = (WatchId(self.watches.len()), self.now());
         let input = InputWatch::new(source, kind, (criterion, limit), now);
         self.watches.push(Watch { input, action: Some(action) });
         self.schedule.once(now + limit, Action::CheckWatch(id));

@@ -1,4 +1,4 @@
-//! Timers for the futures of this crate: tokio timers, with or without a tokio runtime on the polling thread.
+//! Tokio timers for futures on the host's clock, with or without a tokio runtime on the polling thread.
 
 use std::{
     future::pending,
