@@ -367,7 +367,7 @@ impl Actor for Drive {
     fn started(&mut self, context: &mut Self::Context) {
         self.ready = context.hold_ready();
         context.join(STOP);
-        context.every_from(slots::next(Time::now(), slots::DRIVE), PERIOD, Self::tick);
+        context.every_from(slots::next(context.now(), slots::DRIVE), PERIOD, Self::tick);
     }
 
     fn stopping(&mut self, _: &mut Self::Context) -> Running {

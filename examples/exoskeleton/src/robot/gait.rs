@@ -186,7 +186,7 @@ impl Actor for Gait {
         tracing::info!("the barrier is open: central's gait starts");
         self.ready = context.hold_ready();
         context.join(STOP);
-        let first = slots::next(Time::now(), slots::GAIT);
+        let first = slots::next(context.now(), slots::GAIT);
         context.every_from(first, PERIOD, |this, tick, context| this.tick(tick, context));
     }
 }

@@ -116,7 +116,7 @@ impl Actor for Sensor {
 
     fn started(&mut self, context: &mut Self::Context) {
         self.ready = context.hold_ready();
-        let first = slots::next(Time::now(), slots::SENSOR);
+        let first = slots::next(context.now(), slots::SENSOR);
         context.every_from(first, PERIOD, |this, tick, context| this.tick(tick, context));
     }
 }

@@ -5,7 +5,10 @@ use std::time::Duration;
 use actix::Actor;
 
 use super::{AppContext, WatchId};
-use crate::schedule::{Tick, TimerId};
+use crate::{
+    schedule::{Tick, TimerId},
+    time::Time,
+};
 
 type Timer<A> = Box<dyn FnMut(&mut A, Tick, &mut <A as Actor>::Context)>;
 
