@@ -1,8 +1,11 @@
 //! Checks of a peer's frame before it becomes a message of this node. spec: GNCL-11
 
-use std::{cell::RefCell, sync::Arc};
+use std::{
+    cell::{Cell, RefCell},
+    sync::Arc,
+};
 
-use sinew_model::undelivered::Report;
+use sinew_model::{clocks::ClockConversion, undelivered::Report};
 use sinew_runtime::{
     outcome::{MemberReport, Outcome, Receipt, Rejection, Ticket},
     router::Refused,
@@ -43,7 +46,13 @@ pub(super) struct Inbound {
     /// Outcomes that the peer reported in this [`Batch`] and that are not settled yet: at most
     /// [`OUTCOMES_BATCH_MAX`] and those of one frame.
     pub(super) outcomes: RefCell<Vec<(Ticket, Outcome)>>,
+    /// The conversion of the peer's times, once a message of this [`Batch`] has needed it.
+    pub(super) conversion: Cell<Option<Conversion>>,
 }
+
+/// A conversion of the peer's times, for messages that are received at this time. `None` if the peer's clock is not
+/// measured.
+pub(super) type Conversion = (Time, Option<ClockConversion>);
 
 /// Frames that were read together. At its end, or at a panic, the received outcomes are settled and an ACK is
 /// sent if that is due. Then the receivers of messages are woken.
@@ -65,6 +74,7 @@ impl Inbound {
     /// Starts a batch: frames that were read together at `now` are [received](Self::receive) while it exists.
     pub(super) fn batch(&self, now: Time) -> Batch<'_> {
         self.peer.mark_alive(now);
+        self.conversion.set(None);
         Batch { inbound: self, _wakes: wakes::Batch::begin() }
     }
 
@@ -153,6 +163,7 @@ impl Inbound {
         guard: ProcessingGuard<'_>,
     ) {
         self.spin.on_message(now);
+        self.conversion.set(None);
         match self.process(now, message, session, Admission::Deliver) {
             Some(disposition) => guard.finish(disposition),
             None => guard.release(),
@@ -278,10 +289,22 @@ impl Inbound {
     /// the time to live counts from `now`, and the receiver is notified that the age is unknown. The clock of
     /// another incarnation is not used, because it may have been on another host.
     fn convert_to_local_clock(&self, now: Time, header: &mut Header) {
-        let measured = self.state.ctx.clocks.get(self.peer.node, self.peer.incarnation);
-        let times = measured.and_then(|clock| clock.in_our_clock(now, header.sent));
+        let times = self.conversion_at(now).and_then(|clock| clock.in_our_clock(header.sent));
         header.sent = times.map_or(now, |(sent, _)| sent);
         header.set_sent_error(times.map(|(_, error)| error));
+    }
+
+    /// Returns the conversion of the peer's times, looked up once for all messages of a batch.
+    fn conversion_at(&self, now: Time) -> Option<ClockConversion> {
+        if let Some((at, conversion)) = self.conversion.get()
+            && at == now
+        {
+            return conversion;
+        }
+        let measured = self.state.ctx.clocks.get(self.peer.node, self.peer.incarnation);
+        let conversion = measured.map(|clock| clock.conversion_at(now));
+        self.conversion.set(Some((now, conversion)));
+        conversion
     }
 
     /// Attaches a receipt. The outcome of a message to all nodes is reported as from this node. spec: GNCL-12

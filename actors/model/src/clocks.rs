@@ -135,11 +135,34 @@ impl ClockOffset {
     /// by this offset the time is after `now`: then the offset has changed, for example because this host was
     /// suspended.
     pub fn in_our_clock(self, now: Time, theirs: Time) -> Option<(Time, Duration)> {
-        // In whole nanoseconds: a `Duration` is divided into seconds at each step, and this runs for each message.
+        self.conversion_at(now).in_our_clock(theirs)
+    }
+
+    /// Returns the conversion of times at `now`: the part that is the same for all messages that arrive together.
+    pub fn conversion_at(self, now: Time) -> ClockConversion {
+        // In whole nanoseconds: a `Duration` is divided into seconds at each step.
         let bound_ns = u64::try_from(self.bound.as_nanos()).unwrap_or(u64::MAX);
         let apart = now.as_nanos().abs_diff(self.at.as_nanos());
         let bound_ns = bound_ns.saturating_add(self.drift.error_ns(apart));
-        let ours = theirs.shifted(self.offset_at(now).saturating_neg());
+        ClockConversion { now, offset_ns: self.offset_at(now), bound_ns }
+    }
+}
+
+/// A [`ClockOffset`] at one moment, which converts the times of messages that arrive then.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ClockConversion {
+    now: Time,
+    /// The peer's clock minus the local clock at `now`.
+    offset_ns: i64,
+    /// Maximum error of `offset_ns`.
+    bound_ns: u64,
+}
+
+impl ClockConversion {
+    /// Converts a time as [`ClockOffset::in_our_clock`] does. This runs for each message.
+    pub fn in_our_clock(self, theirs: Time) -> Option<(Time, Duration)> {
+        let Self { now, offset_ns, bound_ns } = self;
+        let ours = theirs.shifted(offset_ns.saturating_neg());
         if ours.as_nanos() > now.as_nanos().saturating_add(bound_ns) {
             return None;
         }

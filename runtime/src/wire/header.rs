@@ -347,22 +347,53 @@ fn field<const N: usize>(bytes: &[u8; HEADER_LEN], at: usize) -> [u8; N] {
     out
 }
 
-/// The CRC-32 that four bytes of zeros turn into that of no bytes.
-const CRC_BEFORE_ZEROS: u32 = 0x6dd9_0a9d;
+/// Returns the CRC-32 that this number of zeros turns into that of no bytes.
+const fn crc_before_zeros(zeros: usize) -> u32 {
+    /// The polynomial, lowest bit first.
+    const POLYNOMIAL: u32 = 0xedb8_8320;
+    let (mut register, mut bits) = (u32::MAX, 8 * zeros);
+    while bits > 0 {
+        let was_reduced = register >> 31 == 1;
+        register = if was_reduced { (register ^ POLYNOMIAL) << 1 | 1 } else { register << 1 };
+        bits -= 1;
+    }
+    !register
+}
 
-/// A hasher that is to read four bytes of zeros first. A new one detects the CPU's features again, which costs as
-/// much as 60 bytes.
-static HASHER_BEFORE_ZEROS: LazyLock<crc32fast::Hasher> =
-    LazyLock::new(|| crc32fast::Hasher::new_with_initial(CRC_BEFORE_ZEROS));
+/// Minimum number of zeros before a header: its first 60 bytes are whole blocks of 16 bytes with them.
+const ZEROS_MIN: usize = 4;
+/// Length of the block that starts a long frame: the shortest that is read by the CPU's carry-less multiplication.
+const FIRST_BLOCK: usize = 128;
+/// Maximum number of bytes of the payload in that block.
+const FIRST_OF_PAYLOAD: usize = FIRST_BLOCK - 60 - ZEROS_MIN;
 
-/// Returns the CRC-32 of the header's first 60 bytes and the payload. With four zeros before them they are whole
-/// blocks of 16 bytes, which are read faster than a rest of twelve bytes.
+/// Hashers that are to read 4 to 19 zeros first. A new one detects the CPU's features again, which costs as much
+/// as 60 bytes.
+static HASHERS_BEFORE_ZEROS: LazyLock<[crc32fast::Hasher; 16]> = LazyLock::new(|| {
+    std::array::from_fn(|more| crc32fast::Hasher::new_with_initial(crc_before_zeros(ZEROS_MIN + more)))
+});
+
+/// Returns the CRC-32 of the header's first 60 bytes and the payload. With zeros before them, and with the first
+/// bytes of a longer payload, they are whole blocks of 16 bytes. The rest of the payload is whole blocks too. A
+/// rest of a block is read byte by byte, which costs as much as 16 times as many bytes.
 fn checksum(header: &[u8; HEADER_LEN], payload: &[u8]) -> u32 {
-    let mut blocks = [0; HEADER_LEN];
-    blocks[4..].copy_from_slice(&header[..60]);
-    let mut crc = HASHER_BEFORE_ZEROS.clone();
-    crc.update(&blocks);
-    crc.update(payload);
+    let Some(first) = payload.first_chunk::<FIRST_OF_PAYLOAD>() else {
+        let mut blocks = [0; ZEROS_MIN + 60];
+        blocks[ZEROS_MIN..].copy_from_slice(&header[..60]);
+        let mut crc = HASHERS_BEFORE_ZEROS[0].clone();
+        crc.update(&blocks);
+        crc.update(payload);
+        return crc.finalize();
+    };
+    let more_zeros = (FIRST_OF_PAYLOAD - payload.len() % 16) % 16;
+    let start = ZEROS_MIN + more_zeros;
+    // The bytes of `first` that do not belong to the block lie behind it: copies of a fixed length are fast.
+    let mut block = [0; FIRST_BLOCK + 16];
+    block[start..start + 60].copy_from_slice(&header[..60]);
+    block[start + 60..start + 60 + FIRST_OF_PAYLOAD].copy_from_slice(first);
+    let mut crc = HASHERS_BEFORE_ZEROS[more_zeros].clone();
+    crc.update(&block[..FIRST_BLOCK]);
+    crc.update(&payload[FIRST_OF_PAYLOAD - more_zeros..]);
     crc.finalize()
 }
 

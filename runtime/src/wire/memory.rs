@@ -2,7 +2,8 @@
 //!
 //! A payload is shared by reference count, so dropping its last reference on any thread frees its buffer:
 //! nothing is sent back. A payload that is kept for long keeps its buffer. The thread then creates others, up
-//! to a bound; after that, memory is allocated for each payload.
+//! to a bound; after that, memory is allocated for each payload. Copies of a burst share a buffer, which is reused
+//! when all of them have ended.
 
 use std::{
     cell::RefCell,
@@ -31,7 +32,9 @@ const CROWDED: u8 = 16;
 const SHORT: usize = 128;
 
 thread_local! {
-    static BUFFERS: RefCell<Buffers> = const { RefCell::new(Buffers { all: Vec::new(), next: FIRST, crowded: 0 }) };
+    static BUFFERS: RefCell<Buffers> = const {
+        RefCell::new(Buffers { all: Vec::new(), next: FIRST, crowded: 0, last_copied: 0 })
+    };
 }
 
 /// Returns the bytes that `write` writes.
@@ -145,6 +148,8 @@ struct Buffers {
     next: usize,
     /// The number of payloads for which that one is checked before the first few.
     crowded: u8,
+    /// The buffer of the last copied payload.
+    last_copied: usize,
 }
 
 impl Buffers {
@@ -156,10 +161,26 @@ impl Buffers {
 
     /// Returns a copy of these bytes, at most [`BUFFER_BYTES`]. The buffer stays at its place.
     fn copied(&mut self, bytes: &[u8]) -> Option<Bytes> {
-        let place = self.place()?;
+        let place = self.place_of_copy(bytes.len())?;
+        self.last_copied = place;
         let memory = &mut self.all[place];
         memory.extend_from_slice(bytes);
         Some(memory.split().freeze())
+    }
+
+    /// Returns the index of a buffer with room for `length` bytes. While the first few are used, the buffer of the
+    /// last copy is filled to its end, because the copies of a burst mostly end together.
+    fn place_of_copy(&mut self, length: usize) -> Option<usize> {
+        if self.crowded == 0
+            && let Some(first) = self.first_free()
+        {
+            return Some(first);
+        }
+        if self.all.get(self.last_copied).is_some_and(|memory| memory.capacity() >= length) {
+            self.crowded = self.crowded.checked_sub(1).unwrap_or(CROWDED);
+            return Some(self.last_copied);
+        }
+        self.place()
     }
 
     /// Returns the index of a free buffer, or of a new one below the maximum.
@@ -174,12 +195,16 @@ impl Buffers {
                 return Some(place);
             }
         }
-        let first = (0..self.all.len().min(FIRST)).find(|place| self.is_free(*place));
-        first.or_else(|| {
+        self.first_free().or_else(|| {
             let found = (0..IN_TURN).find_map(|_| self.in_turn());
             self.crowded = if found.is_some() { CROWDED } else { 0 };
             found
         })
+    }
+
+    /// Returns the index of a free buffer of the first few.
+    fn first_free(&mut self) -> Option<usize> {
+        (0..self.all.len().min(FIRST)).find(|place| self.is_free(*place))
     }
 
     /// Returns the index of the next buffer to check, if it is free. Advances in any case.
@@ -269,6 +294,25 @@ mod tests {
             let _ = payload(3, 1000);
         }
         assert!(first.contains(&payload(4, 1000).as_ptr()));
+    }
+
+    #[test]
+    fn copies_of_a_burst_share_buffers() {
+        let copies: Vec<_> = (0..200).map(|n| copied(&[n; 1000])).collect();
+        assert!(copies.iter().zip(0..).all(|(copy, n)| copy[..] == [n; 1000]));
+        assert!(buffers() < 60, "{} buffers for 200 copies, of which four fit in each", buffers());
+        // A buffer is free only after its last copy.
+        let (places, all) = (copies.iter().map(|copy| copy.as_ptr()).collect::<HashSet<_>>(), buffers());
+        let kept: Vec<_> = copies.into_iter().skip(3).step_by(4).collect();
+        let later: Vec<_> = (0..100).map(|_| copied(&[9; 1000])).collect();
+        assert!(kept.iter().zip((3..).step_by(4)).all(|(copy, n)| copy[..] == [n; 1000]));
+        assert!(places.len() == 200 && later.iter().all(|copy| copy[..] == [9; 1000]) && buffers() >= all);
+        drop((kept, later));
+        for _ in 0..=CROWDED {
+            let _ = copied(&[1; 1000]);
+        }
+        let place = copied(&[1; 1000]).as_ptr();
+        assert_eq!(copied(&[1; 1000]).as_ptr(), place, "a single copy uses the first buffer again");
     }
 
     #[test]

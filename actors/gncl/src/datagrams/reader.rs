@@ -1,7 +1,7 @@
 //! The receiving of datagrams, and the timer of all peers' channels. Both are tasks of the IO thread.
 
 use std::{
-    cell::RefCell,
+    cell::{Cell, RefCell},
     future::poll_fn,
     io,
     net::UdpSocket,
@@ -238,6 +238,7 @@ impl Reader {
             link: LinkNumber::default(),
             checksum: Checksum::Crc,
             outcomes: RefCell::default(),
+            conversion: Cell::default(),
         }
     }
 

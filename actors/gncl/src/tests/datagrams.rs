@@ -2,7 +2,12 @@
 
 mod by_hand;
 
-use std::{cell::RefCell, net::SocketAddr, sync::Arc, time::Duration};
+use std::{
+    cell::{Cell, RefCell},
+    net::SocketAddr,
+    sync::Arc,
+    time::Duration,
+};
 
 use by_hand::{ACK, DatagramPeer, KEY, PROBE, VALUE, nines_app, opened};
 use sinew_model::facts::LinkFact;
@@ -357,7 +362,8 @@ fn datagram_state_of_a_former_connection_is_ignored() {
         let say_on = |lane, link| {
             let (state, peer) = (node.state.clone(), peer.clone());
             let (spin, checksum, outcomes) = (Arc::default(), Checksum::Crc, RefCell::default());
-            let inbound = Inbound { state, peer, spin, lane, link, checksum, outcomes };
+            let conversion = Cell::default();
+            let inbound = Inbound { state, peer, spin, lane, link, checksum, outcomes, conversion };
             let said = Announcement { port: 1, key: KEY, address: 0 };
             inbound.receive(Time::now(), frame(NINE, node.address(), Kind::GNCL_DATAGRAMS, write(&said)))
         };

@@ -78,6 +78,17 @@ proptest! {
 }
 
 #[test]
+fn checksum_of_any_length_is_the_crc() {
+    let payload: Vec<u8> = (0..600_u32).map(|n| (n * 7 + n / 256) as u8).collect();
+    for length in 0..payload.len() {
+        let (header, payload) = (Header::new(Kind::OUTCOME, Tid::BROADCAST, Tid::NONE), &payload[..length]);
+        let bytes = header.encode(payload);
+        let crc = crc32fast::hash(&[&bytes[..60], payload].concat());
+        assert_eq!(u32::from_le_bytes(field(&bytes, 60)), crc, "{length} bytes");
+    }
+}
+
+#[test]
 fn other_version_is_reported_before_other_fields() {
     let mut bytes = Header::new(Kind::OUTCOME, Tid::NONE, Tid::NONE).encode(&[]);
     bytes[2] = 9;
