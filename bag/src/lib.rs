@@ -1,0 +1,24 @@
+//! The files of recordings.
+//!
+//! A recording is one or more MCAP files, each of one node. [`BagWriter`] writes them: for each channel the payload as
+//! it was sent (`msgpack`), and a view with a schema (`protobuf`) for Foxglove, PlotJuggler, Rerun and other tools.
+//! `docs/protocol/recording.md` specifies the topics, the metadata and the fields.
+//!
+//! This package knows MCAP and [`sinew_schema::Schema`]. It knows no node, no socket and no clock: all times are
+//! arguments.
+
+mod error;
+mod messagepack;
+mod protobuf;
+mod terms;
+#[cfg(test)]
+mod testing;
+mod view;
+mod writer;
+
+pub use error::BagError;
+pub use terms::{
+    ChannelId, ChannelInfo, Class, ClockReading, Compression, Direction, Event, EventTopic, Level, Options,
+    Origin, Party, Record, Totals,
+};
+pub use writer::BagWriter;

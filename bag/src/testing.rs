@@ -1,0 +1,74 @@
+//! Parts of this package's tests.
+
+use std::{
+    fs,
+    path::PathBuf,
+    sync::atomic::{AtomicU32, Ordering},
+};
+
+use crate::{BagWriter, ChannelId, ChannelInfo, Class, Direction, Party, Record};
+
+/// A folder of one test, which is removed at its end.
+pub(crate) struct TestFolder(PathBuf);
+
+impl TestFolder {
+    pub(crate) fn new() -> Self {
+        static NUMBER: AtomicU32 = AtomicU32::new(0);
+        let number = NUMBER.fetch_add(1, Ordering::Relaxed);
+        let folder = std::env::temp_dir().join(format!("sinew-bag-{}-{number}", std::process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        Self(folder)
+    }
+
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
+        self.0.join(name)
+    }
+}
+
+impl Drop for TestFolder {
+    fn drop(&mut self) {
+        // The folder of temporary files is cleared by the system, too.
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// A channel of angles from node 127.0.0.2 to node 127.0.0.3.
+pub(crate) fn channel(bag: &mut BagWriter, class: Class, direction: Direction) -> ChannelId {
+    let party = |tid: u64, node: &str, name: Option<&str>| Party {
+        tid,
+        text: format!("{node}/1"),
+        name: name.map(str::to_owned),
+        node: Some(node.to_owned()),
+    };
+    bag.channel(&ChannelInfo {
+        source: &party(1, "127.0.0.2", Some("knee.sensor")),
+        destination: &party(2, "127.0.0.3", None),
+        type_name: "exo.angle",
+        kind: 7,
+        class,
+        direction,
+        is_protected: false,
+        schema: None,
+        refused: None,
+        seen_before: 0,
+    })
+    .unwrap()
+}
+
+/// Same as [`channel`], of class Stream.
+pub(crate) fn angle(bag: &mut BagWriter, direction: Direction) -> ChannelId {
+    channel(bag, Class::Stream, direction)
+}
+
+/// A message `{"x": 5}`.
+pub(crate) fn record(number: u64, at_ns: u64) -> Record<'static> {
+    let (sent_ns, handed_over_ns) = (at_ns, at_ns);
+    Record {
+        number,
+        sequence: number,
+        sent_ns,
+        handed_over_ns,
+        payload: b"\x81\xa1x\x05",
+        ..Record::default()
+    }
+}

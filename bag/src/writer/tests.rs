@@ -1,0 +1,182 @@
+use std::{
+    fs,
+    path::PathBuf,
+    sync::atomic::{AtomicU32, Ordering},
+    time::Duration,
+};
+
+use super::*;
+use crate::terms::{Class, Compression, Direction, EventTopic, Level, Party};
+
+fn origin() -> Origin {
+    Origin { node: "knee".into(), address: "127.0.0.2".into(), wall_offset_ns: 1_000, ..Origin::default() }
+}
+
+const SECOND: u64 = 1_000_000_000;
+
+fn messages(path: &std::path::Path) -> Vec<(String, u64, u32)> {
+    let bytes = fs::read(path).unwrap();
+    let all = mcap::MessageStream::new(&bytes).unwrap();
+    all.map_while(Result::ok)
+        .map(|message| (message.channel.topic.clone(), message.log_time, message.sequence))
+        .collect()
+}
+
+fn on<'m>(all: &'m [(String, u64, u32)], topic: &str) -> Vec<&'m (String, u64, u32)> {
+    all.iter().filter(|(other, ..)| other == topic).collect()
+}
+
+#[test]
+fn official_reader_has_all_messages() {
+    for compression in [Compression::None, Compression::Lz4, Compression::Zstd] {
+        let folder = TestFolder::new();
+        let file = folder.path("walk.mcap");
+        let options = Options { compression, ..Options::default() };
+        let mut bag = BagWriter::create(&file, options, origin()).unwrap();
+        let channel = angle(&mut bag, Direction::Sent);
+        for number in 1..=100 {
+            bag.message(channel, &record(number, number * 10_000_000)).unwrap();
+        }
+        let totals = bag.finish(SECOND).unwrap();
+        assert_eq!((totals.seen, totals.written, totals.parts), (100, 100, 1));
+        assert_eq!(totals.bytes, fs::metadata(&file).unwrap().len());
+        let all = messages(&file);
+        let raw = on(&all, "/knee.sensor/exo.angle");
+        assert_eq!((raw.len(), on(&all, "/knee.sensor/exo.angle/view").len()), (100, 100));
+        assert_eq!(*raw[0], ("/knee.sensor/exo.angle".into(), 10_001_000, 1));
+    }
+}
+
+#[test]
+fn second_destination_has_a_topic_of_its_own() {
+    let folder = TestFolder::new();
+    let file = folder.path("walk.mcap");
+    let mut bag = BagWriter::create(&file, Options::default(), origin()).unwrap();
+    let channels = [(); 3].map(|()| angle(&mut bag, Direction::Sent));
+    let topics = channels.map(|channel| bag.of(channel).topic.clone());
+    let all = [
+        "/knee.sensor/exo.angle",
+        "/knee.sensor/exo.angle/to/127.0.0.3/1",
+        "/knee.sensor/exo.angle/to/127.0.0.3/1/sent",
+    ];
+    assert_eq!(topics, all);
+}
+
+#[test]
+fn killed_recorder_leaves_all_but_the_last_second() {
+    let folder = TestFolder::new();
+    let file = folder.path("walk.mcap");
+    let mut bag = BagWriter::create(&file, Options::default(), origin()).unwrap();
+    let channel = angle(&mut bag, Direction::Sent);
+    for number in 1..=25 {
+        bag.message(channel, &record(number, number * SECOND / 10)).unwrap();
+    }
+    // As by SIGKILL: nothing runs.
+    std::mem::forget(bag);
+    assert_eq!(on(&messages(&file), "/knee.sensor/exo.angle").len(), 20);
+}
+
+#[test]
+fn each_part_is_a_file_of_its_own() {
+    let folder = TestFolder::new();
+    let file = folder.path("walk.mcap");
+    let options = Options { split_time: Some(Duration::from_secs(2)), ..Options::default() };
+    let mut bag = BagWriter::create(&file, options, origin()).unwrap();
+    let channel = angle(&mut bag, Direction::Sent);
+    for second in 1..=6 {
+        bag.message(channel, &record(second, second * SECOND)).unwrap();
+        bag.tally(second * SECOND).unwrap();
+    }
+    let totals = bag.finish(7 * SECOND).unwrap();
+    assert_eq!((totals.written, totals.parts), (6, 4));
+    let parts = [0, 1, 2, 3].map(|number| part::path(&file, number));
+    let counts = parts.map(|path| {
+        assert!(mcap::Summary::read(&fs::read(&path).unwrap()).unwrap().is_some(), "{}", path.display());
+        on(&messages(&path), "/knee.sensor/exo.angle").len()
+    });
+    assert_eq!(counts, [2, 2, 2, 0]);
+}
+
+#[test]
+fn size_is_limited_and_said_once() {
+    let folder = TestFolder::new();
+    let file = folder.path("walk.mcap");
+    let options = Options { size_max: Some(64 << 10), compression: Compression::None, ..Options::default() };
+    let mut bag = BagWriter::create(&file, options, origin()).unwrap();
+    let channel = angle(&mut bag, Direction::Sent);
+    let faults: Vec<_> =
+        (1..=2_000).filter_map(|number| bag.message(channel, &record(number, number)).err()).collect();
+    assert!(matches!(faults[..], [BagError::Full { .. }]), "{faults:?}");
+    let totals = bag.finish(SECOND).unwrap();
+    assert!(fs::metadata(&file).unwrap().len() <= 64 << 10);
+    assert!(
+        totals.written > 100 && totals.dropped > 100 && totals.seen == totals.written + totals.dropped,
+        "{totals:?}"
+    );
+    assert_eq!(on(&messages(&file), "/knee.sensor/exo.angle").len() as u64, totals.written);
+}
+
+#[test]
+fn failed_write_is_said_once_and_a_new_part_follows() {
+    let folder = TestFolder::new();
+    let file = folder.path("walk.mcap");
+    let mut bag = BagWriter::create(&file, Options::default(), origin()).unwrap();
+    let channel = angle(&mut bag, Direction::Sent);
+    bag.message(channel, &record(1, 1)).unwrap();
+    bag.tally(2).unwrap();
+    // The next part cannot be made, and the current one fails.
+    let next = part::path(&file, 1);
+    fs::create_dir(&next).unwrap();
+    bag.message(channel, &record(2, 3)).unwrap();
+    let fault = bag.fail(std::io::Error::from(std::io::ErrorKind::StorageFull), 4);
+    assert!(fault.to_string().contains("free space on this disk"), "{fault}");
+    bag.message(channel, &record(3, 5)).unwrap();
+    bag.message(channel, &record(4, 5 + 2 * SECOND)).unwrap();
+    assert!(!bag.is_writing());
+    fs::remove_dir(&next).unwrap();
+    bag.message(channel, &record(5, 5 + 4 * SECOND)).unwrap();
+    assert!(bag.is_writing());
+    let totals = bag.finish(6 * SECOND).unwrap();
+    assert_eq!((totals.seen, totals.written, totals.dropped), (5, 2, 3));
+    assert_eq!(on(&messages(&file), "/knee.sensor/exo.angle").len(), 1);
+    assert_eq!(on(&messages(&next), "/knee.sensor/exo.angle").len(), 1);
+}
+
+#[test]
+fn existing_file_is_kept() {
+    let folder = TestFolder::new();
+    let file = folder.path("walk.mcap");
+    fs::write(&file, "kept").unwrap();
+    let fault = BagWriter::create(&file, Options::default(), origin()).unwrap_err();
+    assert!(fault.to_string().contains("choose another name"), "{fault}");
+    assert_eq!(fs::read(&file).unwrap(), b"kept");
+}
+
+#[test]
+fn event_has_the_schema_of_log_lines() {
+    let folder = TestFolder::new();
+    let file = folder.path("walk.mcap");
+    let mut bag = BagWriter::create(&file, Options::default(), origin()).unwrap();
+    let data = serde_json::json!({ "node": "hip" });
+    for topic in EventTopic::ALL {
+        bag.event(&Event {
+            topic,
+            at_ns: SECOND,
+            level: Level::Warning,
+            name: "ndl",
+            text: "hip is lost",
+            data: &data,
+        })
+        .unwrap();
+    }
+    bag.finish(2 * SECOND).unwrap();
+    let bytes = fs::read(&file).unwrap();
+    let message = mcap::MessageStream::new(&bytes)
+        .unwrap()
+        .map(Result::unwrap)
+        .find(|message| message.channel.topic == "/sinew/events")
+        .unwrap();
+    assert_eq!(message.channel.schema.as_ref().unwrap().name, "foxglove.Log");
+    let value: serde_json::Value = serde_json::from_slice(&message.data).unwrap();
+    assert_eq!((&value["timestamp"]["nsec"], &value["data"]["node"]), (&1_000.into(), &"hip".into()));
+}
