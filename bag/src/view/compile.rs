@@ -8,7 +8,7 @@ use sinew_schema::{Field, Schema, Shape, Variant};
 
 use super::{
     EnumPlan, FieldPlan, Form, HEADER_FIELD, Kind, MessagePlan, View,
-    names::{Scope, camel, identifier, of_type},
+    names::{Fields, Types, camel, identifier, of_type},
 };
 
 /// Maximum nesting of shapes. A deeper one is JSON text.
@@ -24,7 +24,7 @@ pub(super) fn compile(type_name: &str, schema: &Schema) -> Option<View> {
         named: BTreeMap::new(),
         messages: Vec::new(),
         enums: Vec::new(),
-        names: Scope::default(),
+        names: Types::default(),
         unit: None,
     };
     let root = compiler.root(&schema.root);
@@ -63,7 +63,7 @@ struct Compiler<'s> {
     messages: Vec<MessagePlan>,
     enums: Vec<EnumPlan>,
     /// The names in the outermost message: its fields, and all nested types.
-    names: Scope,
+    names: Types,
     /// The message without fields.
     unit: Option<usize>,
 }
@@ -82,8 +82,10 @@ impl<'s> Compiler<'s> {
     }
 
     fn reserve_fields(&mut self, fields: &[Field]) {
+        let mut scope = Fields::default();
+        scope.unique(super::descriptor::HEADER_NAME);
         for field in fields {
-            self.names.unique(&identifier(&field.name));
+            self.names.unique(&scope.unique(&identifier(&field.name)));
         }
     }
 
@@ -99,7 +101,7 @@ impl<'s> Compiler<'s> {
     /// Adds the fields of a struct. Their numbers are their places.
     fn structure(&mut self, name: String, fields: &'s [Field], depth: usize) -> usize {
         let at = self.message(name, Form::Struct, Vec::new());
-        let mut scope = Scope::default();
+        let mut scope = Fields::default();
         if at == 0 {
             scope.unique(super::descriptor::HEADER_NAME);
         }
@@ -125,7 +127,7 @@ impl<'s> Compiler<'s> {
 
     fn variants(&mut self, name: String, variants: &'s [Variant], depth: usize) -> usize {
         let at = self.message(name, Form::Variants, Vec::new());
-        let mut scope = Scope::default();
+        let mut scope = Fields::default();
         scope.unique(super::descriptor::ONE_OF);
         for Variant { name, shape } in variants {
             let kind = self.kind(shape, name, depth);
@@ -212,7 +214,7 @@ impl<'s> Compiler<'s> {
         let name = self.names.unique(&camel(context));
         match shape {
             Shape::Enum(variants) if is_plain(variants) => {
-                let mut scope = Scope::default();
+                let mut scope = Fields::default();
                 let value =
                     |variant: &Variant| (variant.name.clone(), scope.unique(&identifier(&variant.name)));
                 let values = variants.iter().map(value).collect();

@@ -36,22 +36,39 @@ fn snake(text: &str) -> String {
     identifier(&text.to_ascii_lowercase())
 }
 
-/// The names of one scope. Two names that differ in case or underscores alone count as the same, as in the rules of
-/// protocol buffers for JSON.
+/// The names of fields, or of an enum's values. Two names that differ in case or underscores alone count as the same, as
+/// in the rules of protocol buffers for JSON.
 #[derive(Debug, Default)]
-pub(super) struct Scope(BTreeSet<String>);
+pub(super) struct Fields(BTreeSet<String>);
 
-impl Scope {
+impl Fields {
     /// Returns this name, or with a number behind it, where it is taken.
     pub(super) fn unique(&mut self, name: &str) -> String {
-        let mut found = name.to_owned();
-        for number in 2_u32.. {
-            let key: String = found.chars().filter(|character| *character != '_').collect();
-            if self.0.insert(key.to_ascii_lowercase()) {
-                break;
-            }
-            found = format!("{name}_v{number}");
-        }
-        found
+        unique(name, |name| {
+            let key: String = name.chars().filter(|character| *character != '_').collect();
+            self.0.insert(key.to_ascii_lowercase())
+        })
     }
+}
+
+/// The names of types. They share their scope with fields, but not with the names that fields have in JSON.
+#[derive(Debug, Default)]
+pub(super) struct Types(BTreeSet<String>);
+
+impl Types {
+    /// Returns this name, or with a number behind it, where it is taken.
+    pub(super) fn unique(&mut self, name: &str) -> String {
+        unique(name, |name| self.0.insert(name.to_owned()))
+    }
+}
+
+fn unique(name: &str, mut is_free: impl FnMut(&str) -> bool) -> String {
+    let mut found = name.to_owned();
+    for number in 2_u32.. {
+        if is_free(&found) {
+            break;
+        }
+        found = format!("{name}_v{number}");
+    }
+    found
 }

@@ -12,6 +12,7 @@ use crate::{messagepack::Misfit, protobuf::Output, terms::Record};
 
 #[derive(Clone, Serialize)]
 enum Mode {
+    #[expect(dead_code, reason = "the value 0 of the enum")]
     Idle,
     Walk,
 }

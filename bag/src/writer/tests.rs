@@ -1,12 +1,10 @@
-use std::{
-    fs,
-    path::PathBuf,
-    sync::atomic::{AtomicU32, Ordering},
-    time::Duration,
-};
+use std::{fs, time::Duration};
 
 use super::*;
-use crate::terms::{Class, Compression, Direction, EventTopic, Level, Party};
+use crate::{
+    terms::{Compression, Direction, EventTopic, Level},
+    testing::{TestFolder, angle, record},
+};
 
 fn origin() -> Origin {
     Origin { node: "knee".into(), address: "127.0.0.2".into(), wall_offset_ns: 1_000, ..Origin::default() }
