@@ -4,8 +4,12 @@
 //! it was sent (`msgpack`), and a view with a schema (`protobuf`) for Foxglove, PlotJuggler, Rerun and other tools.
 //! `docs/protocol/recording.md` specifies the topics, the metadata and the fields.
 //!
+//! [`read`] opens finished and unfinished files.
+//!
 //! This package knows MCAP and [`sinew_schema::Schema`]. It knows no node, no socket and no clock: all times are
 //! arguments.
+
+pub mod read;
 
 mod error;
 mod messagepack;
