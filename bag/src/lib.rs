@@ -9,17 +9,20 @@
 //! This package knows MCAP and [`sinew_schema::Schema`]. It knows no node, no socket and no clock: all times are
 //! arguments.
 
+pub mod check;
 pub mod read;
 
 mod error;
 mod messagepack;
 mod protobuf;
+mod sequences;
 mod terms;
 #[cfg(test)]
 mod testing;
 mod view;
 mod writer;
 
+pub use check::check;
 pub use error::BagError;
 pub use terms::{
     ChannelId, ChannelInfo, Class, ClockReading, Compression, Direction, Event, EventTopic, Level, Options,

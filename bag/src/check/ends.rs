@@ -1,0 +1,153 @@
+//! Both ends of each channel between two nodes.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::{EndReport, Finding, Kind, Report, file::Checked};
+use crate::{
+    read::Channel,
+    sequences::{Sequences, ranges},
+    terms::Direction,
+};
+
+/// Maximum spans of sequence numbers that a finding names.
+const SPANS_MAX: usize = 8;
+
+/// Source, destination, type and class: the same at both ends.
+type Key = [String; 4];
+
+/// One end of a channel, of all parts together.
+#[derive(Default)]
+struct End {
+    file: String,
+    topic: String,
+    /// The address of the node at the other end.
+    other: String,
+    labels: [String; 2],
+    sequences: Sequences,
+    dropped: u64,
+}
+
+/// Compares the ends, and names nodes whose files are not given.
+pub(super) fn compare(files: &mut [Checked], report: &mut Report) {
+    let given: BTreeSet<_> = files.iter().map(|file| file.report.address.clone()).collect();
+    let [mut sent, mut received] = [BTreeMap::new(), BTreeMap::new()];
+    for file in files.iter_mut() {
+        collect(file, &mut sent, &mut received);
+    }
+    let mut absent: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    for end in sent.values().chain(received.values()).filter(|end| !given.contains(&end.other)) {
+        absent.entry(end.other.clone()).or_default().push(end.topic.clone());
+    }
+    for (node, topics) in absent {
+        let text = format!(
+            "no file of this node is given, so {} channels with it are checked at one end only",
+            topics.len()
+        );
+        report.findings.push(Finding {
+            kind: Kind::NoFile,
+            file: String::new(),
+            topic: node,
+            text,
+            from_ns: 0,
+            to_ns: 0,
+        });
+    }
+    for (key, mut end) in sent {
+        end.sequences.settle();
+        if given.contains(&end.other) {
+            let mut other = received.remove(&key).unwrap_or_default();
+            other.sequences.settle();
+            both(&key, &end, &other, report);
+        }
+    }
+}
+
+fn collect(file: &mut Checked, sent: &mut BTreeMap<Key, End>, received: &mut BTreeMap<Key, End>) {
+    let own = file.report.address.clone();
+    for (topic, counted) in &mut file.channels {
+        let Some(channel) = counted.channel.clone().filter(|channel| channel.value("refused").is_empty())
+        else {
+            continue;
+        };
+        let (ends, other) = match channel.direction() {
+            Some(Direction::Sent) => (&mut *sent, channel.value("destination_node")),
+            Some(Direction::Received) => (&mut *received, channel.value("source_node")),
+            None => continue,
+        };
+        // Groups and broadcasts have no node, and messages within a node have one end.
+        if other.is_empty() || other == own {
+            continue;
+        }
+        let end = ends.entry(key(&channel)).or_default();
+        (end.file, end.topic, end.other) = (file.report.file.clone(), topic.clone(), other.to_owned());
+        end.labels = ["source", "destination"].map(|role| label(&channel, role));
+        end.sequences.absorb(std::mem::take(&mut counted.sequences));
+        end.dropped = end.dropped.max(counted.last.dropped);
+    }
+}
+
+fn key(channel: &Channel) -> Key {
+    ["source_tid", "destination_tid", "type", "class"].map(|key| channel.value(key).to_owned())
+}
+
+fn label(channel: &Channel, role: &str) -> String {
+    let name = channel.value(&format!("{role}_name"));
+    if name.is_empty() { channel.value(role).to_owned() } else { name.to_owned() }
+}
+
+fn both(key: &Key, sent: &End, received: &End, report: &mut Report) {
+    let [source, destination] = sent.labels.clone();
+    let [_, _, type_name, class] = key.clone();
+    let is_stream = class == "Stream";
+    let mut end = EndReport { source, destination, type_name, class, ..EndReport::default() };
+    (end.sent, end.received) = (sent.sequences.len(), received.sequences.len());
+    let mut find = |kind, end: &End, text: String| {
+        let (file, topic) = (end.file.clone(), end.topic.clone());
+        report.findings.push(Finding { kind, file, topic, text, from_ns: 0, to_ns: 0 });
+    };
+    let (Some(first), Some(last)) = (received.sequences.first(), received.sequences.last()) else {
+        if end.sent > 0 {
+            let text = format!(
+                "{} messages were sent to a node whose file has none of them: not recorded there, or lost",
+                end.sent
+            );
+            find(Kind::Lost, sent, text);
+        }
+        report.ends.push(end);
+        return;
+    };
+    let missing = || sent.sequences.without(&received.sequences);
+    end.before = missing().filter(|number| *number < first).count() as u64;
+    end.after = missing().filter(|number| *number > last).count() as u64;
+    let within = missing().filter(|number| (first..=last).contains(number)).count() as u64;
+    end.not_recorded = within.min(received.dropped);
+    let lost = within - end.not_recorded;
+    if is_stream {
+        end.superseded_or_lost = lost;
+    } else if lost > 0 {
+        end.lost = lost;
+        let numbers = ranges(missing().filter(|number| (first..=last).contains(number)), SPANS_MAX);
+        find(
+            Kind::Lost,
+            sent,
+            format!("{lost} messages were sent and not received; their sequence numbers: {numbers}"),
+        );
+    }
+    let known = sent.sequences.first().zip(sent.sequences.last());
+    let unsent = || {
+        let all = received.sequences.without(&sent.sequences);
+        all.filter(|number| known.is_some_and(|(first, last)| (first..=last).contains(number)))
+    };
+    let count = unsent().count() as u64;
+    if count > sent.dropped {
+        let numbers = ranges(unsent(), SPANS_MAX);
+        find(
+            Kind::Unsent,
+            received,
+            format!(
+                "{count} messages were received that their source did not record; sequence numbers: {numbers}"
+            ),
+        );
+    }
+    report.ends.push(end);
+}

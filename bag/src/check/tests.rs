@@ -1,0 +1,260 @@
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
+
+use super::*;
+use crate::{
+    BagWriter, Class, Direction, Options, Origin,
+    read::{Item, Reader},
+    testing::{TestFolder, channel, record},
+};
+
+const SECOND: u64 = 1_000_000_000;
+const RAW: &str = "/knee.sensor/exo.angle";
+const VIEW: &str = "/knee.sensor/exo.angle/view";
+
+fn origin(address: &str) -> Origin {
+    Origin { node: format!("node {address}"), address: address.into(), incarnation: 1, ..Origin::default() }
+}
+
+/// A recording of four seconds with ten messages each; those of `numbers` are written.
+fn recording(path: &Path, address: &str, class: Class, direction: Direction, is_there: impl Fn(u64) -> bool) {
+    let mut bag = BagWriter::create(path, Options::default(), origin(address)).unwrap();
+    let channel = channel(&mut bag, class, direction);
+    let mut number = 0;
+    for sequence in 1..=40 {
+        if is_there(sequence) {
+            number += 1;
+            let message = crate::Record { sequence, ..record(number, sequence * SECOND / 10) };
+            bag.message(channel, &message).unwrap();
+        }
+        if sequence % 10 == 0 {
+            bag.tally(sequence * SECOND / 10).unwrap();
+        }
+    }
+    bag.finish(5 * SECOND).unwrap();
+}
+
+fn sent(path: &Path) {
+    recording(path, "127.0.0.2", Class::Control, Direction::Sent, |_| true);
+}
+
+/// Writes a file again: each message passes through `change`, which returns its new bytes, or nothing to cut it out.
+fn forge(path: &Path, change: impl Fn(&str, u32, &[u8]) -> Option<Vec<u8>>) -> PathBuf {
+    let out = path.with_extension("forged.mcap");
+    let mut writer = mcap::Writer::new(fs::File::create(&out).unwrap()).unwrap();
+    let mut reader = Reader::open(path).unwrap();
+    let mut tallies = 0;
+    while let Some(item) = reader.next_item().unwrap() {
+        match item {
+            Item::Metadata(name, metadata) => {
+                writer.write_metadata(&mcap::records::Metadata { name, metadata }).unwrap()
+            }
+            Item::Message(message) => {
+                let channel = &message.channel;
+                let is_tally = channel.topic == "/sinew/tally";
+                let number = if is_tally { tallies } else { message.sequence };
+                tallies += u32::from(is_tally);
+                let Some(data) = change(&channel.topic, number, message.data) else { continue };
+                let id = writer.add_channel(0, &channel.topic, &channel.encoding, &channel.metadata).unwrap();
+                let header = mcap::records::MessageHeader {
+                    channel_id: id,
+                    sequence: message.sequence,
+                    log_time: message.log_ns,
+                    publish_time: message.publish_ns,
+                };
+                writer.write_to_known_channel(&header, &data).unwrap();
+            }
+        }
+    }
+    writer.finish().unwrap();
+    out
+}
+
+/// Returns kinds and texts, without those of nodes whose files are not given.
+fn findings<P: AsRef<Path>>(files: &[P]) -> Vec<(Kind, String)> {
+    let all = check(files).unwrap().findings.into_iter();
+    all.filter(|finding| finding.kind != Kind::NoFile).map(|finding| (finding.kind, finding.text)).collect()
+}
+
+#[test]
+fn whole_recording_is_fine() {
+    let folder = TestFolder::new();
+    let [one, other] = ["one.mcap", "other.mcap"].map(|name| folder.path(name));
+    sent(&one);
+    recording(&other, "127.0.0.3", Class::Control, Direction::Received, |_| true);
+    let report = check(&[&one, &other]).unwrap();
+    assert!(report.is_fine(), "{:#?}", report.findings);
+    assert_eq!((report.ends[0].sent, report.ends[0].received), (40, 40));
+    let counts = &report.files[0].channels[0];
+    assert_eq!((counts.seen, counts.written, counts.dropped, counts.in_file), (40, 40, 0, 40));
+}
+
+#[test]
+fn cut_message_is_found_exactly() {
+    let folder = TestFolder::new();
+    let path = folder.path("walk.mcap");
+    sent(&path);
+    let forged =
+        forge(&path, |topic, sequence, data| (topic != RAW || sequence != 17).then(|| data.to_vec()));
+    assert_eq!(
+        findings(&[forged]),
+        [(Kind::Missing, "message 17 (sequence 17) is missing; its view is there".to_owned())]
+    );
+    let forged =
+        forge(&path, |topic, sequence, data| (topic != VIEW || sequence != 17).then(|| data.to_vec()));
+    let found = findings(&[forged]);
+    assert!(matches!(&found[..], [(Kind::Missing, text)] if text.contains("sequence 17")), "{found:?}");
+}
+
+#[test]
+fn message_cut_with_its_view_lies_between_two_tallies() {
+    let folder = TestFolder::new();
+    let path = folder.path("walk.mcap");
+    sent(&path);
+    let forged = forge(&path, |topic, sequence, data| {
+        (![RAW, VIEW].contains(&topic) || sequence != 17).then(|| data.to_vec())
+    });
+    let report = check(&[forged]).unwrap();
+    let found: Vec<_> = report.findings.iter().filter(|finding| finding.kind == Kind::Missing).collect();
+    assert_eq!(found.len(), 1, "{found:?}");
+    assert_eq!((found[0].from_ns, found[0].to_ns, found[0].topic.as_str()), (SECOND, 2 * SECOND, RAW));
+    assert!(
+        found[0].text.contains("1 messages") && found[0].text.contains("the numbers 17"),
+        "{}",
+        found[0].text
+    );
+}
+
+#[test]
+fn falsified_counter_is_named() {
+    let folder = TestFolder::new();
+    let path = folder.path("walk.mcap");
+    sent(&path);
+    // The tally at 2 s. The first one is at the beginning of the file.
+    let forge = |counters: [&'static str; 2]| {
+        forge(&path, move |topic, number, data| {
+            let text = String::from_utf8_lossy(data).into_owned();
+            let is_changed = topic == "/sinew/tally" && number == 2;
+            Some(
+                if is_changed {
+                    counters.iter().fold(text, |text, name| {
+                        text.replace(&format!("\"{name}\":20"), &format!("\"{name}\":21"))
+                    })
+                } else {
+                    text
+                }
+                .into_bytes(),
+            )
+        })
+    };
+    // Views are JSON here, so all messages are text.
+    let found = findings(&[forge(["seen", "seen"])]);
+    assert!(
+        matches!(&found[..], [(Kind::Counter, text)] if text.contains("21 seen are not 20 written")),
+        "{found:?}"
+    );
+    let found = findings(&[forge(["seen", "written"])]);
+    assert!(
+        matches!(&found[..], [(Kind::Counter, text)] if text.contains("wrong by 1 in this tally alone")),
+        "{found:?}"
+    );
+}
+
+#[test]
+fn parts_continue_each_other() {
+    let folder = TestFolder::new();
+    let path = folder.path("walk.mcap");
+    let options = Options { split_time: Some(std::time::Duration::from_secs(1)), ..Options::default() };
+    let mut bag = BagWriter::create(&path, options, origin("127.0.0.2")).unwrap();
+    let channel = channel(&mut bag, Class::Control, Direction::Sent);
+    for number in 1..=30 {
+        bag.message(channel, &record(number, number * SECOND / 10)).unwrap();
+    }
+    let parts = bag.finish(3 * SECOND).unwrap().parts;
+    let files: Vec<_> = (0..parts)
+        .map(|part| if part == 0 { path.clone() } else { folder.path(&format!("walk.{part}.mcap")) })
+        .collect();
+    assert_eq!(findings(&files), []);
+    let found = findings(&[&files[0], &files[2]]);
+    assert_eq!(found, [(Kind::Part, "part 1 is absent: give this file, too".to_owned())]);
+}
+
+#[test]
+fn killed_recorder_is_no_fault() {
+    let folder = TestFolder::new();
+    let path = folder.path("walk.mcap");
+    let mut bag = BagWriter::create(&path, Options::default(), origin("127.0.0.2")).unwrap();
+    let channel = channel(&mut bag, Class::Control, Direction::Sent);
+    for number in 1..=15 {
+        bag.message(channel, &record(number, number * SECOND / 10)).unwrap();
+    }
+    bag.tally(15 * SECOND / 10).unwrap();
+    bag.message(channel, &record(16, 16 * SECOND / 10)).unwrap();
+    std::mem::forget(bag);
+    let report = check(&[&path]).unwrap();
+    let found: Vec<_> = report.findings.iter().filter(|finding| finding.kind != Kind::NoFile).collect();
+    assert!(found.is_empty(), "{found:?}");
+    assert!(!report.files[0].is_finished);
+    assert_eq!(report.files[0].channels[0].in_file, 15);
+}
+
+#[test]
+fn lost_message_is_named_by_its_sequence() {
+    let folder = TestFolder::new();
+    for (class, expected) in [(Class::Control, 3), (Class::Stream, 0)] {
+        let [one, other] = ["one", "other"].map(|name| folder.path(&format!("{name} {class}.mcap")));
+        recording(&one, "127.0.0.2", class, Direction::Sent, |_| true);
+        recording(&other, "127.0.0.3", class, Direction::Received, |sequence| {
+            !(21..=23).contains(&sequence) && sequence > 2
+        });
+        let report = check(&[&one, &other]).unwrap();
+        let end = &report.ends[0];
+        assert_eq!((end.lost, end.lost + end.superseded_or_lost, end.before), (expected, 3, 2));
+        assert_eq!(report.is_fine(), class == Class::Stream, "{:?}", report.findings);
+        let is_named = report.findings.iter().any(|finding| finding.text.contains("sequence numbers: 21-23"));
+        assert_eq!(is_named, class == Class::Control);
+    }
+}
+
+#[test]
+fn node_without_a_file_is_named() {
+    let folder = TestFolder::new();
+    let path = folder.path("walk.mcap");
+    sent(&path);
+    let found = check(&[&path]).unwrap().findings;
+    assert!(
+        matches!(&found[..], [Finding { kind: Kind::NoFile, topic, .. }] if topic == "127.0.0.3"),
+        "{found:?}"
+    );
+}
+
+#[test]
+fn damaged_chunk_is_named_and_the_rest_is_read() {
+    let folder = TestFolder::new();
+    let path = folder.path("walk.mcap");
+    sent(&path);
+    let bytes = fs::read(&path).unwrap();
+    // The places of all records, without the magic bytes at both ends.
+    let (mut at, mut chunks) = (8, Vec::new());
+    while at < bytes.len() - 8 {
+        let length = u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap()) as usize;
+        if bytes[at] == 0x06 {
+            chunks.push((at, length));
+        }
+        at += 9 + length;
+    }
+    let (at, length) = chunks[2];
+    let found = |changed: usize| {
+        let mut bytes = bytes.clone();
+        bytes[changed] ^= 0x40;
+        fs::write(&path, bytes).unwrap();
+        let all = check(&[&path]).unwrap().findings;
+        let damage: Vec<_> = all.iter().filter(|finding| finding.kind == Kind::Damaged).collect();
+        assert_eq!(damage.len(), 1, "{all:?}");
+        damage[0].text.clone()
+    };
+    assert!(found(at + 9 + length / 2).contains("a chunk is damaged"));
+    assert!(found(at + 3).contains("the length of a record is damaged"));
+}
