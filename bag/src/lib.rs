@@ -10,6 +10,8 @@
 //! arguments.
 
 pub mod check;
+pub mod info;
+pub mod merge;
 pub mod read;
 
 mod error;
@@ -24,6 +26,8 @@ mod writer;
 
 pub use check::check;
 pub use error::BagError;
+pub use info::info;
+pub use merge::merge;
 pub use terms::{
     ChannelId, ChannelInfo, Class, ClockReading, Compression, Direction, Event, EventTopic, Level, Options,
     Origin, Party, Record, Totals,

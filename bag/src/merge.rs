@@ -1,0 +1,183 @@
+//! The files of several nodes as one file, on the clock of one of them.
+
+mod clocks;
+#[cfg(test)]
+mod tests;
+
+use std::{
+    cmp::Reverse,
+    collections::{BTreeMap, BinaryHeap},
+    fs::OpenOptions,
+    io::{self, BufWriter, Write as _},
+    path::Path,
+    sync::Arc,
+};
+
+use mcap::{WriteOptions, records::MessageHeader};
+use serde::Serialize;
+
+use crate::{
+    error::BagError,
+    read::{Channel, Ordered, OwnedMessage},
+    writer::METADATA,
+};
+use clocks::{Clocks, Way};
+
+/// The name of the metadata record that states the clocks of a merged file.
+const MERGED: &str = "sinew.merged";
+
+/// A node of a merged file.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct MergedNode {
+    /// Its address.
+    pub address: String,
+    /// Its name.
+    pub node: String,
+    /// How wrong its times may be against those of the reference, in nanoseconds.
+    pub bound_ns: u64,
+    /// Its messages.
+    pub messages: u64,
+}
+
+/// The result of [`merge()`].
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Merged {
+    /// The address of the node whose clock the file has.
+    pub reference: String,
+    /// The nodes.
+    pub nodes: Vec<MergedNode>,
+    /// Damaged records, which were skipped.
+    pub damage: Vec<String>,
+}
+
+/// A file that is being merged.
+struct Source {
+    ordered: Ordered,
+    /// The node, as a place in [`Merged::nodes`].
+    node: usize,
+    way: Way,
+    /// Its channels in the merged file.
+    ids: BTreeMap<u16, u16>,
+    next: Option<OwnedMessage>,
+}
+
+/// Merges files into one, in the order of their times. Each topic gets the name of its node in front.
+///
+/// The clock is that of the first file's node. The times of others are converted by the clock readings in the files,
+/// also across a third node; the metadata record `sinew.merged` states how wrong they may be.
+///
+/// # Errors
+/// A file cannot be read, `out` exists or cannot be written, or no clock reading connects a node with the reference.
+pub fn merge<P: AsRef<Path>>(files: &[P], out: impl AsRef<Path>) -> Result<Merged, BagError> {
+    let out = out.as_ref();
+    let clocks = Clocks::read(files)?;
+    let mut merged = Merged::default();
+    let mut sources = Vec::new();
+    for path in files {
+        let source = open(path.as_ref(), &clocks, &mut merged)?;
+        sources.push(source);
+    }
+    let file = OpenOptions::new().write(true).create_new(true).open(out);
+    let file = file.map_err(|cause| BagError::write(out, cause))?;
+    let written = write(BufWriter::new(file), &mut sources, &mut merged);
+    written.map_err(|fault| match fault {
+        Fault::Read(error) => error,
+        Fault::Write(cause) => BagError::write(out, cause),
+    })?;
+    Ok(merged)
+}
+
+fn open(path: &Path, clocks: &Clocks, merged: &mut Merged) -> Result<Source, BagError> {
+    let mut ordered = Ordered::open(path)?;
+    merged.damage.extend_from_slice(ordered.damage());
+    let text = |key: &str| {
+        ordered.metadata(METADATA).and_then(|fields| fields.get(key)).cloned().unwrap_or_default()
+    };
+    let (address, node) = (text("address"), text("node"));
+    let way = clocks.way(path)?;
+    if merged.reference.is_empty() {
+        merged.reference.clone_from(&address);
+    }
+    let place = merged.nodes.iter().position(|known| known.address == address);
+    let place = place.unwrap_or_else(|| {
+        merged.nodes.push(MergedNode { address, node, bound_ns: 0, messages: 0 });
+        merged.nodes.len() - 1
+    });
+    let next = ordered.next_message()?;
+    Ok(Source { ordered, node: place, way, ids: BTreeMap::new(), next })
+}
+
+enum Fault {
+    Read(BagError),
+    Write(io::Error),
+}
+
+impl From<mcap::McapError> for Fault {
+    fn from(error: mcap::McapError) -> Self {
+        match error {
+            mcap::McapError::Io(cause) => Self::Write(cause),
+            other => Self::Write(io::Error::other(other)),
+        }
+    }
+}
+
+fn write(file: BufWriter<std::fs::File>, sources: &mut [Source], merged: &mut Merged) -> Result<(), Fault> {
+    let options = WriteOptions::new().compression(Some(mcap::Compression::Zstd)).compression_threads(0);
+    let mut writer = options.library(concat!("sinew-bag/", env!("CARGO_PKG_VERSION"))).create(file)?;
+    let mut next = BinaryHeap::new();
+    for (at, source) in sources.iter_mut().enumerate() {
+        if let Some(message) = &source.next {
+            next.push(Reverse((source.way.convert(message.log_ns).0, at)));
+        }
+    }
+    let mut sequence = 0_u64;
+    while let Some(Reverse((log_time, at))) = next.pop() {
+        let source = &mut sources[at];
+        let Some(message) = source.next.take() else { continue };
+        let (publish_time, bound_ns) = source.way.convert(message.publish_ns);
+        let node = &mut merged.nodes[source.node];
+        node.bound_ns = node.bound_ns.max(bound_ns);
+        node.messages += 1;
+        let channel_id = match source.ids.get(&message.channel.id) {
+            Some(id) => *id,
+            None => {
+                let id = declare(&mut writer, &message.channel, node)?;
+                source.ids.insert(message.channel.id, id);
+                id
+            }
+        };
+        let header = MessageHeader { channel_id, sequence: message.sequence, log_time, publish_time };
+        writer.write_to_known_channel(&header, &message.data)?;
+        sequence += 1;
+        source.next = source.ordered.next_message().map_err(Fault::Read)?;
+        if let Some(message) = &source.next {
+            next.push(Reverse((source.way.convert(message.log_ns).0, at)));
+        }
+    }
+    let mut metadata = BTreeMap::from([
+        ("reference".to_owned(), merged.reference.clone()),
+        ("messages".to_owned(), sequence.to_string()),
+    ]);
+    for MergedNode { address, bound_ns, .. } in &merged.nodes {
+        metadata.insert(format!("bound_ns {address}"), bound_ns.to_string());
+    }
+    writer.write_metadata(&mcap::records::Metadata { name: MERGED.to_owned(), metadata })?;
+    writer.finish()?;
+    writer.into_inner().flush().map_err(Fault::Write)
+}
+
+/// Adds a channel under the name of its node.
+fn declare<W: io::Write + io::Seek>(
+    writer: &mut mcap::Writer<W>,
+    channel: &Arc<Channel>,
+    node: &MergedNode,
+) -> Result<u16, mcap::McapError> {
+    let schema = match &channel.schema {
+        Some(schema) => writer.add_schema(&schema.name, &schema.encoding, &schema.data)?,
+        None => 0,
+    };
+    let name = if node.node.is_empty() { &node.address } else { &node.node };
+    let mut metadata = channel.metadata.clone();
+    metadata.insert("sinew.node".to_owned(), node.address.clone());
+    writer.add_channel(schema, &format!("/{name}{}", channel.topic), &channel.encoding, &metadata)
+}

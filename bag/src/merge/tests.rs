@@ -1,0 +1,73 @@
+use super::*;
+use crate::{
+    BagWriter, ClockReading, Options, Origin,
+    testing::{TestFolder, angle, record},
+};
+
+const SECOND: u64 = 1_000_000_000;
+
+/// A node with a clock that is `ahead_ns` ahead of that of the first node, and a wall clock that is wrong.
+fn write(
+    folder: &TestFolder,
+    name: &str,
+    ahead_ns: i64,
+    wall_offset_ns: i64,
+    peer: Option<(&str, i64)>,
+) -> std::path::PathBuf {
+    let path = folder.path(&format!("{name}.mcap"));
+    let address = name.to_owned();
+    let origin = Origin { node: name.into(), address, incarnation: 1, wall_offset_ns, ..Origin::default() };
+    let mut bag = BagWriter::create(&path, Options::default(), origin).unwrap();
+    let channel = angle(&mut bag, crate::Direction::Sent);
+    for number in 1..=20_u64 {
+        // Each message of this node was at this time of the first node's clock.
+        let at_ns = (number * SECOND).saturating_add_signed(ahead_ns);
+        bag.message(channel, &record(number, at_ns)).unwrap();
+        if let Some((peer, offset_ns)) = peer {
+            let reading = ClockReading {
+                peer: peer.into(),
+                incarnation: 1,
+                offset_ns,
+                bound_ns: 500,
+                ..ClockReading::default()
+            };
+            bag.clock(at_ns, &reading).unwrap();
+        }
+    }
+    bag.finish((21 * SECOND).saturating_add_signed(ahead_ns)).unwrap();
+    path
+}
+
+#[test]
+fn times_are_those_of_the_first_node() {
+    let folder = TestFolder::new();
+    // Wall clocks are 5 s apart, monotonic clocks by minutes. The third one knows only the second one.
+    let files = [
+        write(&folder, "a", 0, 1_000_000 * SECOND as i64, Some(("b", 60 * SECOND as i64))),
+        write(&folder, "b", 60 * SECOND as i64, 1_000_005 * SECOND as i64, None),
+        write(&folder, "c", 7 * SECOND as i64 + 123, -5, Some(("b", 53 * SECOND as i64 - 123))),
+    ];
+    let out = folder.path("all.mcap");
+    let merged = merge(&files, &out).unwrap();
+    assert_eq!(merged.reference, "a");
+    let bounds: Vec<_> = merged.nodes.iter().map(|node| node.bound_ns).collect();
+    assert_eq!(bounds, [0, 500, 1_000]);
+    let mut all = Ordered::open(&out).unwrap();
+    let mut raw = Vec::new();
+    while let Some(message) = all.next_message().unwrap() {
+        if message.channel.encoding == "msgpack" {
+            raw.push((message.log_ns, message.sequence));
+        }
+    }
+    let expected = |at: usize| ((1_000_000 + at as u64 / 3 + 1) * SECOND, at as u32 / 3 + 1);
+    assert_eq!(raw, (0..60).map(expected).collect::<Vec<_>>());
+    assert_eq!(all.metadata("sinew.merged").unwrap()["bound_ns c"], "1000");
+}
+
+#[test]
+fn node_without_a_clock_reading_is_named() {
+    let folder = TestFolder::new();
+    let files = [write(&folder, "a", 0, 0, None), write(&folder, "b", 0, 0, None)];
+    let fault = merge(&files, folder.path("all.mcap")).unwrap_err().to_string();
+    assert!(fault.contains("connects its node b with a"), "{fault}");
+}
