@@ -4,12 +4,14 @@
 //! it was sent (`msgpack`), and a view with a schema (`protobuf`) for Foxglove, PlotJuggler, Rerun and other tools.
 //! `docs/protocol/recording.md` specifies the topics, the metadata and the fields.
 //!
-//! [`read`] opens finished and unfinished files.
+//! [`read`] opens finished and unfinished files, [`check()`] proves that nothing is missing, [`info()`] sums a file up,
+//! [`merge()`] puts the files of several nodes on one time line, and [`export()`] writes CSV and Parquet.
 //!
 //! This package knows MCAP and [`sinew_schema::Schema`]. It knows no node, no socket and no clock: all times are
 //! arguments.
 
 pub mod check;
+pub mod export;
 pub mod info;
 pub mod merge;
 pub mod read;
@@ -26,6 +28,7 @@ mod writer;
 
 pub use check::check;
 pub use error::BagError;
+pub use export::export;
 pub use info::info;
 pub use merge::merge;
 pub use terms::{

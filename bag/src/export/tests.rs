@@ -1,0 +1,79 @@
+use parquet::{
+    file::reader::{FileReader as _, SerializedFileReader},
+    record::Field,
+};
+
+use super::*;
+use crate::{
+    BagWriter, Direction, Options, Origin, Record,
+    testing::{TestFolder, angle},
+};
+
+/// A recording with these payloads.
+fn recording(folder: &TestFolder, payloads: &[serde_json::Value]) -> PathBuf {
+    let path = folder.path("walk.mcap");
+    let mut bag = BagWriter::create(&path, Options::default(), Origin::default()).unwrap();
+    let channel = angle(&mut bag, Direction::Sent);
+    for (number, payload) in (1..).zip(payloads) {
+        let payload = rmp_serde::to_vec_named(payload).unwrap();
+        let record = Record {
+            number,
+            sequence: number,
+            sent_ns: 5,
+            handed_over_ns: 9,
+            payload: &payload,
+            ..Record::default()
+        };
+        bag.message(channel, &record).unwrap();
+    }
+    bag.finish(10).unwrap();
+    path
+}
+
+#[test]
+fn text_has_a_column_for_each_value() {
+    let folder = TestFolder::new();
+    let path = recording(
+        &folder,
+        &[
+            serde_json::json!({ "degrees": 1.5, "joint": { "name": "knee, left", "limits": [-1, 2] }, "log_ns": null }),
+            serde_json::json!({ "degrees": -3, "log_ns": 7, "big": u64::MAX }),
+        ],
+    );
+    let exported = export(&path, folder.path("out"), Format::Csv).unwrap();
+    assert_eq!((exported[0].rows, exported[0].columns), (2, 14));
+    assert!(exported[0].file.ends_with("knee.sensor__exo.angle.csv"));
+    let text = fs::read_to_string(&exported[0].file).unwrap();
+    let lines: Vec<_> = text.lines().collect();
+    assert_eq!(
+        lines[0],
+        "log_ns,publish_ns,sequence,number,correlation,age_ns,error_ns,flags,degrees,joint.limits.0,joint.limits.1,joint.name,big,payload.log_ns"
+    );
+    assert_eq!(lines[1], r#"9,5,1,1,0,4,0,0,1.5,-1,2,"knee, left",,"#);
+    assert_eq!(lines[2], "9,5,2,2,0,4,0,0,-3,,,,18446744073709551615,7");
+    assert!(export(&path, folder.path("out"), Format::Csv).is_err(), "no file is overwritten");
+}
+
+#[test]
+fn parquet_keeps_types() {
+    let folder = TestFolder::new();
+    let path = recording(
+        &folder,
+        &[
+            serde_json::json!({ "big": u64::MAX, "low": i64::MIN, "on": true, "text": "é", "mixed": 1, "odd": 1 }),
+            serde_json::json!({ "big": 0, "low": 1, "mixed": 0.5, "odd": "one" }),
+        ],
+    );
+    let exported = export(&path, folder.path("out"), Format::Parquet).unwrap();
+    let reader = SerializedFileReader::new(fs::File::open(&exported[0].file).unwrap()).unwrap();
+    let rows: Vec<Vec<(String, Field)>> =
+        reader.get_row_iter(None).unwrap().map(|row| row.unwrap().into_columns()).collect();
+    let get = |row: usize, name: &str| rows[row].iter().find(|(column, _)| column == name).unwrap().1.clone();
+    assert_eq!([get(0, "big"), get(1, "big")], [Field::ULong(u64::MAX), Field::ULong(0)]);
+    assert_eq!([get(0, "low"), get(1, "low")], [Field::Long(i64::MIN), Field::Long(1)]);
+    assert_eq!([get(0, "on"), get(1, "on")], [Field::Bool(true), Field::Null]);
+    assert_eq!([get(0, "mixed"), get(1, "mixed")], [Field::Double(1.0), Field::Double(0.5)]);
+    assert_eq!([get(0, "odd"), get(1, "odd")], [Field::Str("1".into()), Field::Str("one".into())]);
+    assert_eq!(get(0, "text"), Field::Str("é".into()));
+    assert_eq!(get(1, "age_ns"), Field::Long(4));
+}
