@@ -10,6 +10,7 @@
 mod files;
 mod frames;
 mod mutation;
+mod recordings;
 
 use std::{io, path::Path};
 
@@ -28,7 +29,7 @@ pub struct Format {
 }
 
 /// All formats.
-pub const FORMATS: [Format; 18] = [
+pub const FORMATS: [Format; 19] = [
     Format {
         name: "header",
         from: "a peer, by TCP or UDP",
@@ -116,6 +117,12 @@ pub const FORMATS: [Format; 18] = [
         seeds: files::some_certificates,
     },
     Format { name: "trial", from: "a person, in a file", play: files::trial, seeds: files::some_trials },
+    Format {
+        name: "recording",
+        from: "a person, in a file",
+        play: recordings::recording,
+        seeds: recordings::some_recordings,
+    },
     Format {
         name: "topology",
         from: "a person, in a file",
