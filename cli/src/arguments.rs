@@ -4,10 +4,10 @@ use std::{path::PathBuf, time::Duration};
 
 use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
-use crate::{keys, send, watch, why};
+use crate::{bag, keys, send, watch, why};
 
 /// Shows a running Sinew system, from any one node of it. It changes nothing, except that `send` sends
-/// messages and `keys` writes files.
+/// messages, and `keys` and `bag` write files.
 ///
 /// It connects to the socket of a node on this machine (`lncl.socket` in the node's configuration) and asks
 /// that node, and through it all others.
@@ -148,6 +148,18 @@ pub(crate) enum Command {
   sinew keys revoke knee"#
     )]
     Keys(keys::Order),
+    /// Checks, sums up, merges and exports recordings
+    ///
+    /// It asks no node. `sinew bag check` proves that the files of all nodes are complete.
+    #[command(
+        subcommand,
+        after_help = r#"Examples:
+  sinew bag info walk.mcap
+  sinew bag check hip.mcap knee.mcap
+  sinew bag merge hip.mcap knee.mcap --out leg.mcap
+  sinew bag export leg.mcap --out leg --format parquet"#
+    )]
+    Bag(bag::Order),
     /// Prints a completion script for a shell
     #[command(after_help = r#"Examples:
   sinew completions bash > ~/.local/share/bash-completion/completions/sinew"#)]
@@ -158,7 +170,7 @@ pub(crate) enum Command {
 }
 
 /// Commands that send no request to a node: the options that select a node and its time limit do not apply to them.
-const ASK_NO_NODE: [&str; 2] = ["keys", "completions"];
+const ASK_NO_NODE: [&str; 3] = ["keys", "bag", "completions"];
 
 /// The command, as its help shows it.
 pub(crate) fn command() -> clap::Command {
@@ -191,7 +203,7 @@ const AFTER: &str = "\
 Exit codes:
   0  no problem was found
   1  a problem was found: a node or an application does not answer, is not ready or refuses, a message was not delivered, a name is
-     unknown, a list cannot be used, keys cannot be made or are valid for less than 30 days
+     unknown, a list cannot be used, keys cannot be made or are valid for less than 30 days, a recording is incomplete or cannot be read
   2  the command line is wrong
   3  no node on this machine accepts this command, or that node does not answer
   4  all is fine, but standard output did not take all of it (a full disk); a reader that closes its pipe, as `head`, is no error

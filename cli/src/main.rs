@@ -2,13 +2,15 @@
 //!
 //! It connects through a node's socket like any other program, and asks each node's inspection (`sinew::inspect`)
 //! through ordinary messages. It changes nothing, except that `send` sends messages and `reload` makes a node read its
-//! access list again. `keys` asks no node: it creates the files by which nodes authenticate each other.
+//! access list again. `keys` asks no node: it creates the files by which nodes authenticate each other. `bag` reads the
+//! files of recordings.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)] // `output` prints: the macros panic where a pipe is closed or a disk is full.
 
 mod apps;
 mod arguments;
 mod audit;
+mod bag;
 mod doctor;
 mod keys;
 mod messagepack;
@@ -126,6 +128,7 @@ fn run(arguments: &Arguments) -> Result<Report, SystemError> {
         Command::Reload => inside(&reload::show),
         Command::Doctor { interface } => Ok(doctor::show(interface.clone(), arguments)),
         Command::Keys(order) => keys::show(order, arguments.wide),
+        Command::Bag(order) => bag::show(order, arguments.wide),
         Command::Completions { shell } => Ok(completions(*shell)),
     }
 }

@@ -50,6 +50,9 @@ pub(crate) enum SystemError {
     /// Keys cannot be created or read.
     #[error("{0}")]
     Keys(String),
+    /// A recording cannot be read or written.
+    #[error("{0}")]
+    Bag(String),
     /// The command line is invalid.
     #[error("{0}")]
     Usage(String),
@@ -67,7 +70,7 @@ impl SystemError {
     /// Returns the exit code: see [`Arguments`](crate::arguments::Arguments).
     pub(crate) const fn code(&self) -> u8 {
         match self {
-            Self::ItsNode(..) | Self::Unknown(_) | Self::Keys(_) => EXIT_FINDING,
+            Self::ItsNode(..) | Self::Unknown(_) | Self::Keys(_) | Self::Bag(_) => EXIT_FINDING,
             Self::Usage(_) => EXIT_USAGE,
             Self::NoSocket(_) | Self::NotRegistered(..) | Self::NoAnswer(..) => EXIT_NO_NODE,
         }

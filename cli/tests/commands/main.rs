@@ -1,6 +1,7 @@
 //! The command itself, against real node processes: its view of two nodes from one of them, and its failures.
 
 mod access;
+mod bag;
 mod doctor;
 mod keys;
 mod mistakes;
