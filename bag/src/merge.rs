@@ -19,7 +19,7 @@ use serde::Serialize;
 use crate::{
     error::BagError,
     read::{Channel, Ordered, OwnedMessage},
-    writer::METADATA,
+    writer::{METADATA, cause},
 };
 use clocks::{Clocks, Way};
 
@@ -78,11 +78,11 @@ pub fn merge<P: AsRef<Path>>(files: &[P], out: impl AsRef<Path>) -> Result<Merge
         sources.push(source);
     }
     let file = OpenOptions::new().write(true).create_new(true).open(out);
-    let file = file.map_err(|cause| BagError::write(out, cause))?;
+    let file = file.map_err(|error| BagError::write(out, error))?;
     let written = write(BufWriter::new(file), &mut sources, &mut merged);
     written.map_err(|fault| match fault {
         Fault::Read(error) => error,
-        Fault::Write(cause) => BagError::write(out, cause),
+        Fault::Write(error) => BagError::write(out, error),
     })?;
     Ok(merged)
 }
@@ -114,10 +114,7 @@ enum Fault {
 
 impl From<mcap::McapError> for Fault {
     fn from(error: mcap::McapError) -> Self {
-        match error {
-            mcap::McapError::Io(cause) => Self::Write(cause),
-            other => Self::Write(io::Error::other(other)),
-        }
+        Self::Write(cause(error))
     }
 }
 

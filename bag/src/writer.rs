@@ -17,7 +17,7 @@ use crate::{
 use channel::{Channel, Companion, View};
 use part::Part;
 
-pub(crate) use part::METADATA;
+pub(crate) use part::{METADATA, cause};
 pub(crate) use records::{CLOCK_TOPIC, TALLY_TOPIC};
 
 /// Maximum channels of a recording. Each has two in the file, and MCAP has room for 65,535.
@@ -26,6 +26,9 @@ const CHANNELS_MAX: usize = 16_384;
 const CHUNK_AGE_NS: u64 = 1_000_000_000;
 /// How long after a failure the next file is tried.
 const RETRY_NS: u64 = 1_000_000_000;
+
+/// After a failure a new part needs room for so many chunks.
+const CHUNKS_FREE: u64 = 8;
 
 /// Whether messages are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,8 +48,8 @@ enum State {
 /// chunk, what follows is counted as dropped, and a new part is tried once a second. An error is returned once for each
 /// failure.
 ///
-/// A file without [`finish`](Self::finish) is unfinished: it can be read up to its last chunk, which is at most a second
-/// old.
+/// A file without [`finish`](Self::finish) is unfinished: it can be read up to its last chunk, which is at most a
+/// second old.
 ///
 /// # Examples
 ///
@@ -376,7 +379,13 @@ impl BagWriter {
     /// Tries a new part after a failure, once a second. It stays silent if that fails, too.
     fn resume(&mut self, now_ns: u64) {
         let State::Failed { retry_ns } = self.state else { return };
-        if now_ns >= retry_ns && self.open_part(now_ns).is_err() {
+        if now_ns < retry_ns {
+            return;
+        }
+        // Otherwise a full disk would get a new file with a few messages each second.
+        let needed = self.options.chunk_bytes.saturating_mul(CHUNKS_FREE);
+        let has_room = part::free_bytes(&self.path).is_none_or(|free| free >= needed);
+        if !has_room || self.open_part(now_ns).is_err() {
             self.state = State::Failed { retry_ns: now_ns.saturating_add(RETRY_NS) };
         }
     }

@@ -56,9 +56,10 @@ pub(super) struct Channel {
 impl Channel {
     pub(super) fn new(info: &ChannelInfo<'_>, raw_only: bool, topics: &mut BTreeSet<String>) -> Self {
         let typed = || info.schema.and_then(|schema| view::View::new(info.type_name, schema));
-        let view = match () {
-            () if raw_only => View::Header,
-            () => typed().map_or(View::Json, |view| View::Typed(Box::new(view))),
+        let view = if raw_only {
+            View::Header
+        } else {
+            typed().map_or(View::Json, |view| View::Typed(Box::new(view)))
         };
         let role = match view {
             View::Typed(_) => "view",

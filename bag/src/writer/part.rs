@@ -88,6 +88,13 @@ pub(super) fn path(recording: &Path, number: u32) -> PathBuf {
     recording.with_file_name(format!("{stem}.{number}.{ending}"))
 }
 
+/// Returns the bytes that are free on the disk of a recording; `None` if it does not say.
+pub(super) fn free_bytes(recording: &Path) -> Option<u64> {
+    let folder = recording.parent().filter(|folder| !folder.as_os_str().is_empty());
+    let disk = rustix::fs::statvfs(folder.unwrap_or_else(|| Path::new("."))).ok()?;
+    Some(disk.f_bavail.saturating_mul(disk.f_frsize))
+}
+
 impl Part {
     pub(super) fn create(
         recording: &Path,
@@ -241,16 +248,16 @@ impl Part {
 
     /// Removes the file: nothing of use is in it.
     pub(super) fn discard(self) {
-        // It is empty, and stays so if it cannot be removed.
-        let _ = fs::remove_file(&self.path);
+        // A device or a pipe is left alone. A file that cannot be removed stays, without content.
+        if fs::symlink_metadata(&self.path).is_ok_and(|found| found.is_file()) {
+            let _ = fs::remove_file(&self.path);
+        }
     }
 }
 
-fn cause(error: McapError) -> io::Error {
-    match error {
-        McapError::Io(error) => error,
-        other => io::Error::other(other),
-    }
+/// Returns the cause of a failed write.
+pub(crate) fn cause(error: McapError) -> io::Error {
+    if let McapError::Io(error) = error { error } else { io::Error::other(error) }
 }
 
 fn metadata(origin: &Origin, number: u32, options: &Options) -> mcap::records::Metadata {

@@ -178,3 +178,10 @@ fn event_has_the_schema_of_log_lines() {
     let value: serde_json::Value = serde_json::from_slice(&message.data).unwrap();
     assert_eq!((&value["timestamp"]["nsec"], &value["data"]["node"]), (&1_000.into(), &"hip".into()));
 }
+
+#[test]
+fn thread_of_a_recorder_can_have_it() {
+    fn is_send<T: Send>(_: &T) {}
+    let folder = TestFolder::new();
+    is_send(&BagWriter::create(folder.path("walk.mcap"), Options::default(), origin()).unwrap());
+}
