@@ -28,8 +28,7 @@ pub(crate) fn recording(bytes: &[u8]) -> bool {
         match reader.next_item() {
             Ok(Some(Item::Message(message))) => {
                 messages += 1;
-                assert!(message.data.len() <= bytes.len() || !message.channel.topic.is_empty());
-                Header::of(&message);
+                std::hint::black_box(Header::of(&message));
             }
             // Damage is skipped.
             Ok(Some(Item::Metadata(..))) | Err(_) => {}
