@@ -71,16 +71,18 @@ impl BagError {
     }
 }
 
+/// What a user does about a cause.
+const REMEDIES: [(io::ErrorKind, &str); 7] = [
+    (io::ErrorKind::StorageFull, "free space on this disk, or record to another one"),
+    (io::ErrorKind::QuotaExceeded, "free space within this user's quota, or record to another disk"),
+    (io::ErrorKind::FileTooLarge, "split the recording into parts"),
+    (io::ErrorKind::ReadOnlyFilesystem, "record to a folder in which this user may write"),
+    (io::ErrorKind::PermissionDenied, "record to a folder in which this user may write"),
+    (io::ErrorKind::AlreadyExists, "choose another name, or move this file: none is overwritten"),
+    (io::ErrorKind::NotFound, "make the folder first"),
+];
+
 fn remedy(cause: &io::Error) -> &'static str {
-    match cause.kind() {
-        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded | io::ErrorKind::FileTooLarge => {
-            "free space on this disk, or record to another one"
-        }
-        io::ErrorKind::ReadOnlyFilesystem | io::ErrorKind::PermissionDenied => {
-            "record to a folder in which this user may write"
-        }
-        io::ErrorKind::AlreadyExists => "choose another name, or move this file: none is overwritten",
-        io::ErrorKind::NotFound => "make the folder first",
-        _ => "check the disk, or record to another one",
-    }
+    let known = REMEDIES.iter().find(|(kind, _)| *kind == cause.kind());
+    known.map_or("check the disk, or record to another one", |(_, remedy)| remedy)
 }

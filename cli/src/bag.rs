@@ -156,6 +156,10 @@ fn checked(report: &check::Report, is_wide: bool) -> Report {
         );
         text += &paragraph(0, &line, is_wide);
     }
+    for FileReport { file, events_lost, .. } in report.files.iter().filter(|file| file.events_lost > 0) {
+        let line = format!("{}: events and clock readings that are in no file: {events_lost}", clean(file));
+        text += &paragraph(0, &line, is_wide);
+    }
     text += "\n";
     for Finding { file, topic, text: found, from_ns, to_ns, .. } in &report.findings {
         let when = match (from_ns, to_ns) {
@@ -172,7 +176,7 @@ fn checked(report: &check::Report, is_wide: bool) -> Report {
     }
     let _ = match report.findings.len() {
         0 => writeln!(text, "complete: every message is written, or counted as dropped"),
-        count => writeln!(text, "{count} findings"),
+        count => writeln!(text, "findings: {count}"),
     };
     Report { text, json: json!(report), is_fine: report.is_fine() }
 }

@@ -130,7 +130,7 @@ fn both(key: &Key, sent: &End, received: &End, report: &mut Report) {
         find(
             Kind::Lost,
             sent,
-            format!("{lost} messages were sent and not received; their sequence numbers: {numbers}"),
+            format!("messages sent and not received: {lost}; their sequence numbers: {numbers}"),
         );
     }
     let known = sent.sequences.first().zip(sent.sequences.last());
@@ -145,7 +145,7 @@ fn both(key: &Key, sent: &End, received: &End, report: &mut Report) {
             Kind::Unsent,
             received,
             format!(
-                "{count} messages were received that their source did not record; sequence numbers: {numbers}"
+                "messages received that their source did not record: {count}; their sequence numbers: {numbers}"
             ),
         );
     }

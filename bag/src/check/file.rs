@@ -266,8 +266,8 @@ impl Checked {
 
     fn differs(&mut self, topic: &str, Doubt { difference, span_ns, gaps }: &Doubt) {
         let (kind, mut text) = match difference {
-            0.. => (Kind::Missing, format!("{difference} messages are missing between two tallies")),
-            _ => (Kind::Uncounted, format!("{} messages more than its recorder wrote", -difference)),
+            0.. => (Kind::Missing, format!("messages missing between two tallies: {difference}")),
+            _ => (Kind::Uncounted, format!("messages that its recorder did not count: {}", -difference)),
         };
         if !gaps.is_empty() {
             text += &format!("; no message has the numbers {}", crate::sequences::spans(gaps));

@@ -121,7 +121,7 @@ fn message_cut_with_its_view_lies_between_two_tallies() {
     assert_eq!(found.len(), 1, "{found:?}");
     assert_eq!((found[0].from_ns, found[0].to_ns, found[0].topic.as_str()), (SECOND, 2 * SECOND, RAW));
     assert!(
-        found[0].text.contains("1 messages") && found[0].text.contains("the numbers 17"),
+        found[0].text.contains("two tallies: 1;") && found[0].text.contains("the numbers 17"),
         "{}",
         found[0].text
     );

@@ -36,8 +36,8 @@ fn snake(text: &str) -> String {
     identifier(&text.to_ascii_lowercase())
 }
 
-/// The names of fields, or of an enum's values. Two names that differ in case or underscores alone count as the same, as
-/// in the rules of protocol buffers for JSON.
+/// The names of fields, or of an enum's values. Two names that differ in case or underscores alone count as the same,
+/// as in the rules of protocol buffers for JSON.
 #[derive(Debug, Default)]
 pub(super) struct Fields(BTreeSet<String>);
 

@@ -234,7 +234,7 @@ fn type_that_contains_itself_has_a_view() {
     #[derive(Serialize)]
     struct Node {
         id: u32,
-        below: Vec<Node>,
+        below: Vec<Self>,
     }
     let below = Shape::List(boxed(Shape::Named("Node".into())));
     let node = Shape::Struct(vec![field("id", Shape::U32), field("below", below)]);
