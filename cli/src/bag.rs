@@ -174,8 +174,10 @@ fn checked(report: &check::Report, is_wide: bool) -> Report {
             .collect::<Vec<_>>();
         text += &paragraph(0, &format!("{}: {}{when}", place.join(" "), clean(found)), is_wide);
     }
+    let is_finished = report.files.iter().all(|file| file.is_finished);
     let _ = match report.findings.len() {
-        0 => writeln!(text, "complete: every message is written, or counted as dropped"),
+        0 if is_finished => writeln!(text, "complete: every message is written, or counted as dropped"),
+        0 => writeln!(text, "nothing is missing up to the last chunk of each file"),
         count => writeln!(text, "findings: {count}"),
     };
     Report { text, json: json!(report), is_fine: report.is_fine() }
