@@ -41,9 +41,8 @@ fn recorded(directory: &TestDirectory, node: &str, direction: Direction, lost: O
         seen_before: 0,
     });
     let channel = channel.expect("it is the first one");
-    let mut number = 0;
-    for sequence in (1..=30).filter(|sequence| Some(*sequence) != lost) {
-        number += 1;
+    let sequences = (1..=30).filter(|sequence| Some(*sequence) != lost);
+    for (number, sequence) in (1..).zip(sequences) {
         let at_ns = sequence * SECOND / 10;
         // The payload is {"degrees": 5}.
         let payload = b"\x81\xa7degrees\x05";
