@@ -65,7 +65,10 @@ impl<'a, P> Value<'a, P> {
 
 /// The content to send: a [`Value`], or a [`LoanedMessage`].
 #[expect(private_interfaces, private_bounds, reason = "sealed: only this module implements or calls it")]
-pub trait Content {
+pub trait Content: Sized {
+    /// Returns the message, or the content itself if its destination must be looked up.
+    fn at_once(self, endpoint: &mut Endpoint, limit: Limit) -> Result<Result<Draft, ApiError>, Self>;
+
     /// Returns the message, once its destination is known.
     fn into_draft(
         self,
@@ -83,6 +86,13 @@ pub trait Content {
 
 #[expect(private_interfaces, reason = "sealed: only this module implements or calls it")]
 impl<P: Payload> Content for Value<'_, P> {
+    fn at_once(self, endpoint: &mut Endpoint, limit: Limit) -> Result<Result<Draft, ApiError>, Self> {
+        match self.destination {
+            Destination::Tid(to) => Ok(endpoint.typed(to, self.value, limit).map(Draft::from)),
+            Destination::Name(_) => Err(self),
+        }
+    }
+
     async fn into_draft(self, endpoint: &mut Endpoint, limit: Limit) -> Result<Draft, ApiError> {
         let to = endpoint.find(self.destination, limit).await?;
         Ok(endpoint.typed(to, self.value, limit)?.into())
@@ -97,6 +107,11 @@ impl<P: Payload> Content for Value<'_, P> {
 
 #[expect(private_interfaces, reason = "sealed: only this module implements or calls it")]
 impl Content for LoanedMessage {
+    #[inline]
+    fn at_once(self, _: &mut Endpoint, _: Limit) -> Result<Result<Draft, ApiError>, Self> {
+        Ok(Ok(self.into()))
+    }
+
     async fn into_draft(self, _: &mut Endpoint, _: Limit) -> Result<Draft, ApiError> {
         Ok(self.into())
     }
@@ -111,11 +126,11 @@ impl SendTerms {
     pub(super) const PLAIN: Self = Self { room_within: None, expires_after: None, class: None };
 
     /// Returns how long a send waits for room.
-    fn limit(&self, endpoint: &Endpoint) -> Limit {
+    pub(super) fn limit(&self, endpoint: &Endpoint) -> Limit {
         self.room_within.map_or_else(|| endpoint.stall_timeout(), Limit::in_all)
     }
 
-    fn apply(&self, header: &mut Header) {
+    pub(super) fn apply(&self, header: &mut Header) {
         if let Some(class) = self.class {
             header.class = class;
         }
@@ -291,7 +306,7 @@ impl<C: Content> MessageBuilder<'_, Endpoint, C> {
     /// The message was not sent, and loaned memory is returned. [`ApiError::Stalled`]: there was no room in
     /// time.
     pub fn send(self) -> Result<(), ApiError> {
-        block_ready(pin!(self.endpoint.send_as(self.content, self.terms)))
+        self.endpoint.send_blocking(self.content, self.terms)
     }
 
     /// Sends the message and waits for its outcome: [`Outcome::Unknown`] if none arrives `within` this time.

@@ -18,6 +18,7 @@ mod room;
 #[cfg(test)]
 mod tests;
 mod turns;
+mod wait_ends;
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -48,10 +49,9 @@ use super::{
     loan::Draft,
     routes::{LinkNumber, Route, Routes},
 };
-pub(super) use established::{AllEnds, EstablishedLink, LinkRead};
-use established::{LinkEnds, Pair, Put};
-use in_flight::InFlightRequest;
-pub(super) use in_flight::{PEER_END_TIMEOUT, Resolution};
+pub(super) use established::{EstablishedLink, LinkRead};
+use established::{Pair, Put};
+pub(super) use in_flight::{InFlightRequest, PEER_END_TIMEOUT, Resolution};
 use link_maker::LinkTasks;
 use link_setup::LinkSetup;
 use observer::Observer;
@@ -59,6 +59,8 @@ use peer_fd::{DEFERRED_CLOSE, DeferredClose};
 pub(super) use reorder::ReorderDecision;
 pub(super) use room::Room;
 use turns::Turns;
+pub(super) use wait_ends::AllEnds;
+use wait_ends::LinkEnds;
 
 /// Bytes of a direct link's ring, if the configuration sets no other size.
 pub(super) const RING_BYTES: usize = 64 * 1024;
@@ -97,8 +99,8 @@ pub(super) struct Direct {
     held: Vec<EstablishedLink>,
     /// Links that are written to and read.
     pub(super) open: Vec<EstablishedLink>,
-    /// The index in `open` of each place in the set of all rings.
-    by_slot: BTreeMap<u8, usize>,
+    /// The places in the set of all rings, each with its index in `open`.
+    by_slot: Vec<(u8, usize)>,
     turns: Turns,
     /// Messages that arrived through the node but were sent after messages that are still in that link's
     /// ring.
@@ -194,7 +196,7 @@ impl Direct {
             tasks: LinkTasks::default(),
             held: Vec::new(),
             open: Vec::new(),
-            by_slot: BTreeMap::new(),
+            by_slot: Vec::new(),
             turns: Turns::default(),
             reordered: BTreeMap::new(),
             next_check: Time::ZERO,
@@ -260,6 +262,12 @@ impl Direct {
         self.established(number)?.writer.lend(length)
     }
 
+    /// Sends on a link if nothing waits before the message and there is room at once for all of it. Returns whether it
+    /// was sent.
+    pub(super) fn send_at_once(&mut self, number: LinkNumber, draft: &mut Draft) -> bool {
+        self.established(number).is_some_and(|link| link.send_at_once(&draft.header, &mut draft.payload))
+    }
+
     /// Sends on a link, as far as there is room.
     ///
     /// # Errors
@@ -302,11 +310,13 @@ impl Direct {
     fn index_slots(&mut self) {
         let slots = self.open.iter().enumerate();
         self.by_slot = slots.filter_map(|(index, link)| Some((link.slot()?, index))).collect();
+        self.by_slot.sort_unstable();
     }
 
     /// Returns the index of the open link at this place.
     pub(super) fn at_slot(&self, slot: u8) -> Option<usize> {
-        self.by_slot.get(&slot).copied()
+        let found = self.by_slot.binary_search_by_key(&slot, |(slot, _)| *slot).ok()?;
+        Some(self.by_slot[found].1)
     }
 
     /// Records that the endpoint looks for what another thread has woken it for.

@@ -27,6 +27,7 @@ use super::{
     link::Link,
     loan::{Lender, LoanedMessage},
     node_link::NodeLink,
+    only_message::Only,
     reconnect::Reconnect,
     requests::Requests,
     undelivered::Refusals,
@@ -214,7 +215,7 @@ impl Endpoint {
         to: impl Into<Destination<'a>>,
         value: &'a P,
     ) -> Result<(), ApiError> {
-        block_ready(pin!(self.send_as(Value::new(to, value), SendTerms::PLAIN)))
+        self.send_blocking(Value::new(to, value), SendTerms::PLAIN)
     }
 
     /// Returns a builder for a value with other settings than those of its type: confirmed, as a request, or
@@ -305,7 +306,11 @@ impl Endpoint {
     /// ```
     pub fn receive(&mut self, within: Duration) -> Result<Option<Received>, ApiError> {
         let now = Time::now();
-        block_ready(pin!(self.receive_until(now + within, now)))
+        let deadline = now + within;
+        match self.receive_only(deadline, now) {
+            Ok(received) => Ok(received),
+            Err(now) => block_ready(pin!(self.receive_until(deadline, now))),
+        }
     }
 
     /// The clock is read once per poll: it costs as much as a poll.
@@ -318,6 +323,18 @@ impl Endpoint {
         // never waits would always be late because of frames that are not for the program.
         let mut left = None;
         loop {
+            if let WaitMode::Async(_) = self.wait_mode {
+                let arrived = self.look(now);
+                match self.take_only(arrived, now) {
+                    Only::Received(received) => return Ok(Some(received)),
+                    Only::Nothing if now < deadline => {
+                        self.wait(deadline, now).await;
+                        now = Time::now();
+                        continue;
+                    }
+                    Only::Nothing | Only::Other => {}
+                }
+            }
             // The socket first: newly arrived messages may be more urgent or newer than the waiting ones.
             self.poll_incoming(None, WhenFull::Leave, now)?;
             if self.leaves.has_pending() {

@@ -94,6 +94,11 @@ impl Inbox {
         self.queue.len() < self.capacity && self.queue.bytes() < BYTES_ENOUGH
     }
 
+    /// Returns whether no message waits, and one more would leave room.
+    pub(super) fn is_idle(&self) -> bool {
+        self.queue.is_empty() && self.capacity > 1
+    }
+
     /// Returns the number of waiting messages.
     pub(super) fn len(&self) -> usize {
         self.queue.len()
@@ -138,6 +143,23 @@ impl Inbox {
             // A node of a later version may send frames unknown to this version.
             _ => Sorted::Nothing,
         }
+    }
+
+    /// Returns a frame that nothing waits before and nothing has followed, if it is a message that can be received at
+    /// once. Otherwise sorts it in as [`sort_from`](Self::sort_from) does while no answer is awaited.
+    pub(super) fn pass(
+        &mut self,
+        sink: &Arc<dyn ReceiptSink>,
+        mut message: Message,
+        now: Time,
+    ) -> Option<Message> {
+        let header = &message.header;
+        if !header.kind.is_user() || header.flags.has(Flags::REPLY) || header.is_expired(now) {
+            self.sort_from(sink, message, None);
+            return None;
+        }
+        self.add_receipt(sink, &mut message);
+        Some(message)
     }
 
     /// Refuses a message of the node for which there is no room elsewhere.

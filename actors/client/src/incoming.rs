@@ -9,6 +9,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Header, Kind, Message},
 };
+use sinew_shm::Any;
 
 use super::{
     ApiError, Endpoint,
@@ -274,7 +275,7 @@ impl Endpoint {
         }
         let deadline = self.wake_by(deadline, now, None);
         match &mut self.wait_mode {
-            WaitMode::Blocking => self.block(deadline.since(now)),
+            WaitMode::Blocking => _ = self.block(deadline.since(now)),
             WaitMode::Async(reactor) => {
                 let until = Until { deadline, room: None };
                 yield_if_ready(reactor.wait(
@@ -311,7 +312,7 @@ impl Endpoint {
     }
 
     /// Returns the latest time of the next check, if no event occurs before.
-    fn wake_by(&mut self, deadline: Time, now: Time, rings: Option<LinkNumber>) -> Time {
+    pub(super) fn wake_by(&mut self, deadline: Time, now: Time, rings: Option<LinkNumber>) -> Time {
         let deadline = self.node.wake_by(deadline, now);
         // There is no notification of room for pending requests to the node.
         let deadline = if self.leaves.has_pending() { deadline.min(now + CHECK_INTERVAL) } else { deadline };
@@ -326,11 +327,16 @@ impl Endpoint {
         }
     }
 
-    fn block(&mut self, left: Duration) {
+    /// Blocks until a message arrives, or until there is something to do. Returns whether a look at the set of rings
+    /// has shown that.
+    pub(super) fn block(&mut self, left: Duration) -> bool {
         match &mut self.node.reader {
             Reader::Ring(reader) if !self.direct.open.is_empty() => {
                 let links = &mut self.direct.open[..];
                 let ended = reader.wait_for_all(left, |node| AllEnds { node, links });
+                if matches!(ended, Ok(Any::Ready)) {
+                    return true;
+                }
                 reader.note(&ended);
                 self.direct.note(&ended);
             }
@@ -338,6 +344,7 @@ impl Endpoint {
             // There is no notification here when another thread leaves a pending outcome.
             Reader::Socket(_) => self.node.reader.wait(left.min(CHECK_INTERVAL)),
         }
+        false
     }
 }
 

@@ -9,8 +9,8 @@ use std::{
     time::Duration,
 };
 
-use bytes::Bytes;
-use sinew_runtime::wire::{Class, Header, Message, MessageBuffer};
+use bytes::{Bytes, BytesMut};
+use sinew_runtime::wire::{Class, Header, Message, zeroed};
 
 use super::{ApiError, link::loan::InRing};
 
@@ -75,14 +75,14 @@ impl Lender {
 
 #[derive(Debug)]
 enum Memory {
-    Own(MessageBuffer),
+    Own(BytesMut),
     InRing(InRing),
 }
 
 impl LoanedMessage {
     /// Returns a message in a ring if there is room, else in its own memory.
     pub(super) fn new(loan: Loan, header: Header, room: Option<InRing>, length: usize) -> Self {
-        let own = || Memory::Own(MessageBuffer::new(header, length));
+        let own = || Memory::Own(zeroed(length));
         Self { header, memory: room.map_or_else(own, Memory::InRing), _loan: loan }
     }
 
@@ -178,11 +178,12 @@ impl From<Message> for Draft {
 }
 
 impl From<LoanedMessage> for Draft {
+    #[inline]
     fn from(loaned: LoanedMessage) -> Self {
         // Its own send must not wait for the loan.
         let LoanedMessage { header, memory, _loan: _ } = loaned;
         let payload = match memory {
-            Memory::Own(buffer) => Content::Bytes(buffer.freeze().payload),
+            Memory::Own(buffer) => Content::Bytes(buffer.freeze()),
             Memory::InRing(room) => Content::InRing(room),
         };
         Self { header, payload }

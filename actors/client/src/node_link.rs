@@ -11,7 +11,7 @@ use sinew_runtime::{time::Time, wire::Message};
 use super::{
     ApiError,
     link::{
-        Ended, Progress, Reader, Writer,
+        Arrived, Ended, Progress, Reader, Writer,
         ring::{CHECK_INTERVAL, Rest},
     },
     loan::Draft,
@@ -103,7 +103,12 @@ impl NodeLink {
 
     /// Returns whether a poll would find nothing to read, here and on direct links, and has nothing to write here.
     pub(super) fn is_quiet(&self, now: Time) -> bool {
-        self.ended.is_none() && self.rest.is_none() && !self.writer.has_pending() && self.reader.is_quiet(now)
+        self.is_idle() && self.reader.look(now) == Some(Arrived::Nothing)
+    }
+
+    /// Returns whether the connection has not ended and nothing is to be written.
+    pub(super) fn is_idle(&self) -> bool {
+        self.ended.is_none() && self.rest.is_none() && !self.writer.has_pending()
     }
 
     /// Writes a message if there is room. Returns whether it need not be tried again.

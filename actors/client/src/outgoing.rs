@@ -1,4 +1,4 @@
-//! Outgoing messages: the current path of each, and the wait that it needs.
+//! Outgoing messages that wait for an answer.
 
 use std::time::Duration;
 
@@ -6,27 +6,24 @@ use sinew_runtime::{
     outcome::{MemberOutcome, MemberTable, Outcome, Rejection},
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
-    wire::{Class, Flags, HEADER_LEN, Header, Message},
+    wire::{Class, Flags, Header, Message},
 };
 
 use super::{
     ApiError, Endpoint, Received,
-    direct::{NodeWriter, PEER_END_TIMEOUT, Resolution, Room, Sent, Writing},
+    direct::{PEER_END_TIMEOUT, Resolution},
+    dispatch::ROOM_PAUSE,
     inbox::{Answer, Awaited},
     incoming::{Wanted, WhenFull},
-    link::ring::CHECK_INTERVAL,
     loan::{Draft, LoanedMessage},
     reconnect::ANSWER_TIMEOUT,
     routes::LinkNumber,
-    stall_timeout::{Limit, Waiting},
+    stall_timeout::Limit,
     wait_mode::WaitMode,
 };
 
 /// Number of polls for the final frames of a node after the end of its connection.
 const FINAL_POLLS: usize = 64;
-/// First pause of a thread between two polls of incoming messages while a direct link has no room; doubled up
-/// to `CHECK_INTERVAL`. Room ends the pause.
-const ROOM_PAUSE: Duration = Duration::from_millis(1);
 
 /// A call that waits for an answer. If it is dropped before the answer arrives, the endpoint forgets the
 /// link.
@@ -253,126 +250,6 @@ impl Endpoint {
         Ok(())
     }
 
-    /// Sends `message` on the current path, and waits for room as long as `limit` allows. Returns the link,
-    /// unless the message went through the node.
-    pub(super) async fn dispatch(
-        &mut self,
-        mut draft: Draft,
-        limit: Limit,
-    ) -> Result<Option<LinkNumber>, ApiError> {
-        self.prepare_send(limit)?;
-        if self.leaves.has_pending() {
-            self.send_leaves();
-        }
-        self.check_length(draft.payload.len())?;
-        // A new connection may have another address.
-        draft.header.source = self.tid;
-        draft.header.sequence = self.requests.next_message();
-        let now = Time::now();
-        draft.header.sent = now;
-        let destination = self.absolute(draft.header.destination);
-        if !self.reconnect.rejoining.is_empty() {
-            // The node continues to read once its answers about groups are read. An endpoint that only sends
-            // reads them here, before the path is chosen.
-            let _ = self.poll_node(None, WhenFull::Leave, now);
-        }
-        if let Some(link) = self.route(destination, now) {
-            draft.header.destination = destination;
-            let is_awaited = draft.header.flags.has(Flags::CONFIRM);
-            let request = if is_awaited { self.direct.begin_request(link) } else { None };
-            let report = self.direct.report_of(&draft);
-            match self.send_on(link, draft, limit, now).await? {
-                None => {
-                    self.direct.report_sent(report, &self.node.writer);
-                    self.direct.set_in_flight(request);
-                    return Ok(Some(link));
-                }
-                Some(returned) => draft = returned,
-            }
-        }
-        self.ensure_connected()?;
-        if self.node.reader.has_ended(now) {
-            return Err(self.explain(ApiError::Closed("the node has gone".to_owned())));
-        }
-        let written = self.node.write(draft, limit, &mut self.wait_mode).await;
-        written.map_err(|error| self.explain(error))?;
-        self.direct.sent_through_node(destination, now);
-        Ok(None)
-    }
-
-    /// Returns the link for a message to `destination` now, or `None` for the path through the node.
-    fn route(&mut self, destination: Tid, now: Time) -> Option<LinkNumber> {
-        let mut node = NodeWriter { writer: &self.node.writer, correlation: &mut self.requests.correlation };
-        self.direct.check(now, &mut node);
-        if self.direct.must_poll_node(now) {
-            // An endpoint that only sends reads here what the node says about links. A read failure is reported
-            // when it receives.
-            let _ = self.poll_node(None, WhenFull::Leave, now);
-        }
-        let mut node = NodeWriter { writer: &self.node.writer, correlation: &mut self.requests.correlation };
-        self.direct.route(destination, now, &mut node)
-    }
-
-    /// Sends on a direct link, and returns the message if the peer has gone. While there is no room, this
-    /// endpoint reads its incoming messages: two endpoints that wait for room in each other's rings would
-    /// otherwise deadlock.
-    ///
-    /// # Errors
-    /// [`ApiError::Stalled`]: the peer receives nothing of it. The written part of a long message is
-    /// withdrawn.
-    async fn send_on(
-        &mut self,
-        link: LinkNumber,
-        draft: Draft,
-        limit: Limit,
-        mut now: Time,
-    ) -> Result<Option<Draft>, ApiError> {
-        let room = Room { link, length: HEADER_LEN + draft.payload.len(), class: draft.header.class };
-        // A peer that does not read costs one stall timeout, not one per message.
-        let has_stalled = self.direct.is_stalled(link);
-        let mut waiting = if has_stalled { Waiting::after_stall(limit) } else { Waiting::new(limit) };
-        // `None`: the message is partly written.
-        let (mut left, mut pause) = (Some(draft), ROOM_PAUSE);
-        loop {
-            left = match left {
-                None => match self.direct.write_on(link) {
-                    Writing::Whole => return Ok(None),
-                    Writing::Part => None,
-                    Writing::Cut(returned) => return Ok(Some(returned)),
-                },
-                Some(draft) => match self.direct.send(link, draft, now)? {
-                    Sent::Taken => return Ok(None),
-                    Sent::Gone(returned) => return Ok(Some(returned)),
-                    Sent::Full(returned) => Some(returned),
-                    Sent::Begun => {
-                        if has_stalled && !limit.is_in_all() {
-                            // The peer reads again.
-                            waiting = Waiting::new(limit);
-                        }
-                        None
-                    }
-                },
-            };
-            now = Time::now();
-            let Some(until) = waiting.until(self.direct.taken(link), now) else {
-                if waiting.has_stalled(now) {
-                    self.direct.mark_stalled(link);
-                }
-                if left.is_none() {
-                    self.direct.withdraw(link);
-                }
-                return Err(waiting.error());
-            };
-            self.poll_while_writing(link, now);
-            match self.wait_mode {
-                WaitMode::Blocking => self.direct.await_room(room, pause.min(until.since(now))),
-                // Woken for room and for incoming messages.
-                WaitMode::Async(_) => self.wait_for_room(room, until, now).await,
-            }
-            pause = (pause * 2).min(CHECK_INTERVAL);
-        }
-    }
-
     /// Gives peers that read up to `within` to read the waiting messages, before this endpoint closes.
     /// Messages that arrive meanwhile are refused.
     pub(super) async fn flush_before_close(&mut self, within: Duration) {
@@ -390,13 +267,6 @@ impl Endpoint {
         }
     }
 
-    fn poll_while_writing(&mut self, link: LinkNumber, now: Time) {
-        self.direct.is_writing_on(Some(link));
-        // A read failure is reported when the endpoint receives.
-        let _ = self.poll_incoming(None, WhenFull::Leave, now);
-        self.direct.is_writing_on(None);
-    }
-
     pub(super) const fn absolute(&self, destination: Tid) -> Tid {
         if matches!(destination.node, NodeAddress::HERE) {
             Tid::new(self.tid.node, destination.app)
@@ -407,7 +277,7 @@ impl Endpoint {
 
     /// Replaces the error by the node's reason for closing the connection, which is more specific than a
     /// broken pipe.
-    fn explain(&mut self, error: ApiError) -> ApiError {
+    pub(super) fn explain(&mut self, error: ApiError) -> ApiError {
         if !matches!(error, ApiError::Closed(_)) {
             return error;
         }

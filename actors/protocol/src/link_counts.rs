@@ -59,6 +59,7 @@ impl LinkCounters {
     }
 
     /// Sets the counts.
+    #[inline]
     pub fn set(&self, counts: LinkCounts) {
         for (index, value) in counts.words().into_iter().enumerate() {
             self.counters.set(self.place * WIDTH + 1 + index, value);

@@ -17,7 +17,7 @@ use std::{
 use bytes::BytesMut;
 use sinew_runtime::wire::{FrameCodec, FrameError, HEADER_LEN, Header, Message};
 use sinew_shm::{
-    Accepted, Bell, Capacity, Consumer, Corrupt, CreateError, LoanError, Offer, PassError, Producer,
+    Accepted, Bell, Capacity, Consumer, Corrupt, CreateError, LoanError, Offer, Only, PassError, Producer,
     Received, ReceivedMessage, RefusedOffer, Region, Terms,
 };
 use tokio_util::codec::Decoder;
@@ -160,6 +160,16 @@ pub fn write(producer: &mut Producer, parts: &[IoSlice<'_>]) -> Result<usize, Lo
     Ok(length)
 }
 
+/// Writes a frame as one record. Returns whether it was written: it fits into one, and there is room for it now.
+pub fn write_frame(producer: &mut Producer, header: &Header, payload: &[u8]) -> bool {
+    let Ok(mut loan) = producer.loan(HEADER_LEN + payload.len()) else { return false };
+    let memory = &mut loan[..];
+    memory[..HEADER_LEN].copy_from_slice(&header.encode_in_memory(payload.len()));
+    memory[HEADER_LEN..].copy_from_slice(payload);
+    loan.publish();
+    true
+}
+
 /// Withdraws a partly written frame: the reader drops that part.
 ///
 /// # Errors
@@ -202,6 +212,17 @@ pub enum Taken {
     Some,
     /// Nothing.
     Nothing,
+}
+
+/// The result of a look for the only message of a ring.
+#[derive(Debug)]
+pub enum TakenOnly {
+    /// A message, and nothing else.
+    Message(Message),
+    /// Nothing.
+    Nothing,
+    /// Something else, which is still there: [`RingFrames::take`] takes it, or says what is wrong.
+    Other,
 }
 
 /// Reads frames out of a ring.
@@ -294,6 +315,25 @@ impl RingFrames {
         }
         consumer.give_back();
         Ok(taken)
+    }
+
+    /// Takes the only message of a ring, if it is one whole frame and nothing was taken before it.
+    pub fn take_only(&self, consumer: &mut Consumer) -> TakenOnly {
+        if self.has_bytes() {
+            return TakenOnly::Other;
+        }
+        let record = match consumer.receive_only() {
+            Only::Message(record) => record,
+            Only::Nothing => return TakenOnly::Nothing,
+            Only::Other => return TakenOnly::Other,
+        };
+        match self.message_of(&record) {
+            Some(message) => TakenOnly::Message(message),
+            None => {
+                record.leave();
+                TakenOnly::Other
+            }
+        }
     }
 
     /// Returns the message of a record that is exactly one frame, the usual case: its payload is copied once, to where

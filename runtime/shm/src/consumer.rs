@@ -21,6 +21,17 @@ pub struct Consumer {
     slot: Option<Slot>,
 }
 
+/// The result of [`Consumer::receive_only`].
+#[derive(Debug)]
+pub enum Only<'a> {
+    /// One message, which no other one follows.
+    Message(ReceivedMessage<'a>),
+    /// No message.
+    Nothing,
+    /// Several messages, or the peer is [`Corrupt`], which the other calls report.
+    Other,
+}
+
 impl Consumer {
     pub(crate) fn new(
         core: ConsumerCore<OwnHeaderMemory, PeerMemory>,
@@ -33,6 +44,7 @@ impl Consumer {
 
     /// Returns its place in a [`WaitSet`](crate::WaitSet), below 128.
     #[must_use]
+    #[inline]
     pub fn slot(&self) -> Option<u8> {
         self.slot.as_ref().map(Slot::number)
     }
@@ -55,6 +67,18 @@ impl Consumer {
     /// [`Corrupt`] when the peer wrote values that no valid peer writes; every later call returns it too.
     pub fn receive(&mut self) -> Result<Option<ReceivedMessage<'_>>, Corrupt> {
         Ok(self.core.next()?.map(|record| ReceivedMessage { consumer: self, record }))
+    }
+
+    /// Returns the oldest message if no other one follows it.
+    #[inline]
+    pub fn receive_only(&mut self) -> Only<'_> {
+        match self.core.next() {
+            Ok(None) => Only::Nothing,
+            Ok(Some(record)) if self.core.is_last(record) => {
+                Only::Message(ReceivedMessage { consumer: self, record })
+            }
+            Ok(Some(_)) | Err(_) => Only::Other,
+        }
     }
 
     /// Waits for the oldest message and returns it.
@@ -208,6 +232,7 @@ pub struct ReceivedMessage<'a> {
 impl ReceivedMessage<'_> {
     /// Returns the length in bytes: at most [`Consumer::payload_max`].
     #[must_use]
+    #[inline]
     pub const fn len(&self) -> usize {
         self.record.length as usize
     }
@@ -219,6 +244,7 @@ impl ReceivedMessage<'_> {
     }
 
     /// Copies from byte `from` on, as much as there is and the target holds. Returns the number of bytes.
+    #[inline]
     pub fn copy_at(&self, from: usize, target: &mut [u8]) -> usize {
         let count = self.len().saturating_sub(from).min(target.len());
         if count > 0 {
@@ -228,6 +254,7 @@ impl ReceivedMessage<'_> {
     }
 
     /// Copies from the beginning, as much as there is and the target holds. Returns the number of bytes.
+    #[inline]
     pub fn copy_to(&self, target: &mut [u8]) -> usize {
         self.copy_at(0, target)
     }
@@ -254,6 +281,12 @@ impl ReceivedMessage<'_> {
         let mut message = std::mem::ManuallyDrop::new(self);
         let record = message.record;
         message.consumer.core.keep(record);
+    }
+
+    /// Ends the loan and leaves the message in the ring: the next call returns it again.
+    pub fn leave(self) {
+        // Its drop would release the message. It contains only a borrow.
+        std::mem::forget(self);
     }
 
     /// Returns a reader for a decoder. Each byte is read once; a decoder that reads a length twice may see

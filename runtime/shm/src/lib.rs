@@ -67,7 +67,7 @@ mod platform;
 
 pub use any::{Any, ENDS_MAX, Ends, PollResult, Polling, Waiter};
 pub use bell::{Bell, BellKind};
-pub use consumer::{Consumer, MessageReader, ReceivedMessage};
+pub use consumer::{Consumer, MessageReader, Only, ReceivedMessage};
 pub use error::{
     AnyError, Corrupt, CreateError, LoanError, PassError, ReceiveError, RefusedOffer, RoomError,
 };

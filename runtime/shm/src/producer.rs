@@ -52,6 +52,7 @@ impl Producer {
 
     /// Returns the longest message, in bytes: half the ring, less 8.
     #[must_use]
+    #[inline]
     pub const fn payload_max(&self) -> usize {
         self.core.capacity().payload_max() as usize
     }
@@ -61,6 +62,7 @@ impl Producer {
     ///
     /// # Errors
     /// [`LoanError::Full`] when the peer has not consumed enough yet: nothing changed.
+    #[inline]
     pub fn loan(&mut self, length: usize) -> Result<Loan<'_>, LoanError> {
         let reserved = self.core.reserve(length)?;
         Ok(Loan { producer: self, reserved })
@@ -76,6 +78,7 @@ impl Producer {
     }
 
     /// Resumes the loan that [`Loan::set_aside`] left.
+    #[inline]
     pub const fn resume(&mut self) -> Option<Loan<'_>> {
         match self.core.reserved() {
             Some(reserved) => Some(Loan { producer: self, reserved }),
@@ -85,6 +88,7 @@ impl Producer {
 
     /// Returns the memory that [`Loan::set_aside`] left; empty if there is none.
     #[must_use]
+    #[inline]
     pub fn aside(&self) -> &[u8] {
         let reserved = self.core.reserved();
         reserved.map_or(&[], |reserved| {
@@ -93,6 +97,7 @@ impl Producer {
     }
 
     /// Returns the same memory, to be written.
+    #[inline]
     pub fn aside_mut(&mut self) -> &mut [u8] {
         match self.core.reserved() {
             Some(reserved) => {
@@ -259,6 +264,7 @@ pub struct Loan<'a> {
 
 impl Loan<'_> {
     /// Publishes it as a message. The peer is woken if it sleeps: then, and only then, this is a system call.
+    #[inline]
     pub fn publish(self) {
         let producer = &mut *self.producer;
         if producer.core.publish() {
@@ -275,6 +281,7 @@ impl Loan<'_> {
 
     /// Keeps the memory without the borrow, until [`Producer::resume`] continues it or another loan replaces
     /// it.
+    #[inline]
     pub fn set_aside(self) {
         // Its drop would return the memory. It contains only a borrow.
         std::mem::forget(self);
@@ -284,6 +291,7 @@ impl Loan<'_> {
 impl Deref for Loan<'_> {
     type Target = [u8];
 
+    #[inline]
     fn deref(&self) -> &[u8] {
         let position = self.producer.core.payload_position(self.reserved);
         self.producer.core.own.bytes(position, self.reserved.length)
@@ -291,6 +299,7 @@ impl Deref for Loan<'_> {
 }
 
 impl DerefMut for Loan<'_> {
+    #[inline]
     fn deref_mut(&mut self) -> &mut [u8] {
         let position = self.producer.core.payload_position(self.reserved);
         self.producer.core.own.bytes_mut(position, self.reserved.length)

@@ -25,7 +25,7 @@ use std::{
     fmt, io,
     sync::{
         Arc, Mutex, PoisonError,
-        atomic::{AtomicBool, AtomicU32, Ordering},
+        atomic::{AtomicBool, AtomicU32, AtomicUsize, Ordering},
     },
 };
 
@@ -62,6 +62,8 @@ struct Shared {
     ready: [AtomicU32; READY_WORDS],
     /// Rings that the owner reads.
     open: [AtomicU32; READY_WORDS],
+    /// Words of bits up to the last one that ever had an open ring: mostly one.
+    words: AtomicUsize,
     /// Whether another thread of this process has work for the owner.
     is_woken: AtomicBool,
     /// The places that are taken.
@@ -88,8 +90,8 @@ impl WaitSet {
         let (page, announcement) = (platform::SharedPage::create()?, platform::Announcement::create()?);
         let (sleep, slots) = (AtomicU32::new(0), Mutex::default());
         let (ready, open) = (Default::default(), Default::default());
-        let is_woken = AtomicBool::new(false);
-        Ok(Self(Arc::new(Shared { page, announcement, sleep, ready, open, is_woken, slots })))
+        let (words, is_woken) = (AtomicUsize::new(0), AtomicBool::new(false));
+        Ok(Self(Arc::new(Shared { page, announcement, sleep, ready, open, words, is_woken, slots })))
     }
 
     /// Ends the owner's wait, or its next one, from another thread of this process: the owner has something to do
@@ -113,6 +115,7 @@ impl WaitSet {
         let (word, bit) = bit_of(slot);
         if is_open {
             self.0.open[word].fetch_or(bit, Ordering::Relaxed);
+            self.0.words.fetch_max(word + 1, Ordering::Relaxed);
         } else {
             self.0.open[word].fetch_and(!bit, Ordering::Relaxed);
         }
@@ -123,7 +126,7 @@ impl WaitSet {
     pub fn look(&self) -> bool {
         let mut any = self.0.is_woken.load(Ordering::Relaxed);
         let words = self.0.ready.iter().zip(&self.0.open).zip(self.0.page.reports());
-        for ((ready, open), reported) in words {
+        for ((ready, open), reported) in words.take(self.0.words.load(Ordering::Relaxed)) {
             let open = open.load(Ordering::Relaxed);
             if open == 0 {
                 // What is reported here stays reported until a ring is open.
@@ -159,7 +162,27 @@ impl WaitSet {
         Ready(std::array::from_fn(bits))
     }
 
+    /// Returns the place of the open ring that is to be read, by the last look, if it is the only one and the owner was
+    /// not woken.
+    #[must_use]
+    pub fn only_ready(&self) -> Option<u8> {
+        let Shared { ready, open, words, is_woken, .. } = &*self.0;
+        let mut only = None;
+        for index in 0..words.load(Ordering::Relaxed) {
+            let bits = ready[index].load(Ordering::Relaxed) & open[index].load(Ordering::Relaxed);
+            if bits == 0 {
+                continue;
+            }
+            if only.is_some() || !bits.is_power_of_two() {
+                return None;
+            }
+            only = Some(index as u8 * 32 + bits.trailing_zeros() as u8);
+        }
+        only.filter(|_| !is_woken.load(Ordering::Relaxed))
+    }
+
     /// Records that a ring was read until it was empty.
+    #[inline]
     pub fn was_emptied(&self, consumer: &Consumer) {
         if let Some(slot) = consumer.slot() {
             let (word, bit) = bit_of(slot);
@@ -182,8 +205,10 @@ impl WaitSet {
 
     /// Whether any open ring has reported a message since the last look.
     pub(crate) fn has_reports(&self) -> bool {
-        let mut words = self.0.page.reports().iter().zip(&self.0.open);
-        words.any(|(reported, open)| reported.load(Ordering::Relaxed) & open.load(Ordering::Relaxed) != 0)
+        let words = self.0.page.reports().iter().zip(&self.0.open);
+        words
+            .take(self.0.words.load(Ordering::Relaxed))
+            .any(|(reported, open)| reported.load(Ordering::Relaxed) & open.load(Ordering::Relaxed) != 0)
     }
 
     /// Takes a place, and creates the bells of its region. `None` if all places are taken.

@@ -13,7 +13,7 @@ use std::{
 };
 
 use sinew_shm::{
-    Armed, BellKind, Capacity, Consumer, HangUp, LoanError, Offer, PassError, Producer, ReceiveError,
+    Armed, BellKind, Capacity, Consumer, HangUp, LoanError, Offer, Only, PassError, Producer, ReceiveError,
     RefusedOffer, Region, RoomError, Spin, Terms, Wait,
 };
 
@@ -366,4 +366,26 @@ fn full_eventfd_blocks_its_ringer_but_a_socket_never() {
         producer.send(b"!").expect("room");
         drop(consumer.receive().expect("honest").expect("published"));
     }
+}
+
+#[test]
+fn only_message_is_received_and_others_are_left() {
+    let (mut producer, mut consumer, _rest) = pair(4096, BellKind::Futex);
+    assert!(matches!(consumer.receive_only(), Only::Nothing));
+    producer.send(&[1]).expect("room");
+    match consumer.receive_only() {
+        Only::Message(message) => message.leave(),
+        other @ (Only::Nothing | Only::Other) => panic!("one message is there, not {other:?}"),
+    }
+    match consumer.receive_only() {
+        Only::Message(message) => assert_eq!(message.to_vec(), [1], "it was left"),
+        other @ (Only::Nothing | Only::Other) => panic!("one message is there, not {other:?}"),
+    }
+    assert!(matches!(consumer.receive_only(), Only::Nothing), "it was taken");
+    for number in [2, 3] {
+        producer.send(&[number]).expect("room");
+    }
+    assert!(matches!(consumer.receive_only(), Only::Other), "there are two");
+    assert_eq!(consumer.receive().expect("an honest peer").expect("a message").to_vec(), [2]);
+    assert!(matches!(consumer.receive_only(), Only::Message(message) if message.to_vec() == [3]));
 }

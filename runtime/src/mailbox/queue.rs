@@ -350,6 +350,7 @@ impl ClassQueue {
 
     /// Returns whether the queue is empty.
     #[must_use]
+    #[inline]
     pub fn is_empty(&self) -> bool {
         self.ends.iter().len() == 0 && self.lanes.iter().all(VecDeque::is_empty)
     }

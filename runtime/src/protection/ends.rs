@@ -217,6 +217,7 @@ impl Ends {
 
     /// Same as [`take`](Self::take), for a caller that has the payload and the source of a message.
     #[doc(hidden)]
+    #[inline]
     pub fn judge<'message>(
         &mut self,
         (source, kind): (Tid, Kind),

@@ -105,6 +105,7 @@ impl FrameCodec {
     ///
     /// # Errors
     /// The header is invalid, or the payload is too long.
+    #[inline]
     pub fn decode_record(
         &self,
         head: &[u8; HEADER_LEN],

@@ -194,12 +194,14 @@ impl Header {
 
     /// Returns whether the time to live has ended at `now`.
     #[must_use]
+    #[inline]
     pub fn is_expired(&self, now: Time) -> bool {
         now > self.expiry()
     }
 
     /// Returns when the time to live ends; [`Time::MAX`] if it never does.
     #[must_use]
+    #[inline]
     pub fn expiry(&self) -> Time {
         match self.time_to_live_us {
             0 => Time::MAX,
@@ -225,6 +227,7 @@ impl Header {
     /// # Panics
     /// Never for payloads below 4 GiB, which every configured limit is.
     #[must_use]
+    #[inline]
     pub fn encode_in_memory(&self, length: usize) -> [u8; HEADER_LEN] {
         let length = u32::try_from(length).expect("the frame limit is below 4 GiB");
         let mut bytes = [0; HEADER_LEN];

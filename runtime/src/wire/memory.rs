@@ -54,8 +54,9 @@ pub(super) fn copied(bytes: &[u8]) -> Bytes {
     copy.unwrap_or_else(|| Bytes::copy_from_slice(bytes))
 }
 
-/// Returns zeroed memory of `length` bytes.
-pub(super) fn zeroed(length: usize) -> BytesMut {
+/// Returns zeroed memory for a payload of `length` bytes: a buffer of this thread, if one is free.
+#[must_use]
+pub fn zeroed(length: usize) -> BytesMut {
     if length > BUFFER_BYTES {
         return long::zeroed(length);
     }

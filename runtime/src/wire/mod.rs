@@ -20,6 +20,7 @@ pub use age::may_be_older;
 pub use codec::{Checksum, FrameCodec, FrameError, decode_datagram, encode_frame};
 pub use header::{Class, Flags, HEADER_LEN, Header, HeaderError, MAGIC, TIME_TO_LIVE_MAX, VERSION};
 pub use kind::{Kind, fnv1a};
+pub use memory::zeroed;
 pub(crate) use message::decode_as;
 pub use message::{DecodeError, Message, MessageBuffer, Payload, encode};
 pub use protection::Protection;

@@ -1,21 +1,18 @@
 //! One established direct link: a ring in each direction, and a socket that is closed when the peer ends.
 
 use std::{
-    os::{
-        fd::{AsFd, BorrowedFd},
-        unix::net::UnixStream,
-    },
+    os::{fd::BorrowedFd, unix::net::UnixStream},
     sync::Arc,
     time::Duration,
 };
 
-use sinew_protocol::ring::{RingError, RingFrames, Taken};
+use sinew_protocol::ring::{RingError, RingFrames, Taken, TakenOnly};
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Rejection, Ticket},
     tid::Tid,
     wire::{Class, Flags, HEADER_LEN, Header, Kind, Message},
 };
-use sinew_shm::{Armed, Consumer, Ends, HangUp, WaitSet};
+use sinew_shm::{Armed, Consumer, WaitSet};
 
 use super::{
     Terms,
@@ -26,7 +23,7 @@ use super::{
 };
 use crate::{
     ApiError,
-    link::ring::{self, Begun, ENOUGH, End, Rest},
+    link::ring::{self, Begun, ENOUGH, Rest},
     loan::{Content, Draft},
     routes::LinkNumber,
 };
@@ -44,7 +41,7 @@ pub(crate) struct EstablishedLink {
     pub(super) writer: Arc<ring::Writer>,
     /// The receipts of messages that arrive on this link are settled on it.
     pub(crate) sink: Arc<dyn ReceiptSink>,
-    consumer: Consumer,
+    pub(super) consumer: Consumer,
     /// The set of all rings of the endpoint, if it has one.
     set: Option<WaitSet>,
     /// The share of this link's rings in the budget of the process.
@@ -142,11 +139,31 @@ impl EstablishedLink {
         self.consumer.disarm();
     }
 
+    /// Sends a message if nothing waits before it and there is room at once for all of it. Returns whether it was sent:
+    /// then its memory in the ring is used up.
+    pub(super) fn send_at_once(&mut self, header: &Header, payload: &mut Content) -> bool {
+        if !self.parked.is_empty() || self.rest.is_some() {
+            return false;
+        }
+        match payload {
+            Content::InRing(loan) if loan.is_of(&self.writer) => loan.publish(header),
+            Content::InRing(_) => return false,
+            Content::Bytes(payload) => {
+                if !self.writer.write_at_once(header, payload) {
+                    return false;
+                }
+                self.is_stalled = false;
+            }
+        }
+        self.account.sent(header);
+        true
+    }
+
     /// Sends a message: in place if it lies in this link's ring, else as [`send`](Self::send) does.
     pub(super) fn send_draft(&mut self, draft: Draft) -> Result<Put, (ApiError, Draft)> {
         let Draft { header, payload } = draft;
         match payload {
-            Content::InRing(loan)
+            Content::InRing(mut loan)
                 if loan.is_of(&self.writer) && (header.class != Class::Stream || self.parked.is_empty()) =>
             {
                 loan.publish(&header);
@@ -340,25 +357,47 @@ impl EstablishedLink {
 
     /// Returns the next message of those that were taken from the ring.
     pub(crate) fn next(&mut self) -> Result<LinkRead, RingError> {
-        let Some(message) = self.frames.next_message()? else { return Ok(LinkRead::Nothing) };
+        Ok(self.frames.next_message()?.map_or(LinkRead::Nothing, |message| self.check(message)))
+    }
+
+    /// Takes the only message of the ring. Returns `None` if there are several, or something else, which
+    /// [`take`](Self::take) and [`next`](Self::next) find out about.
+    pub(crate) fn take_only(&mut self) -> Option<LinkRead> {
+        let read = match self.frames.take_only(&mut self.consumer) {
+            TakenOnly::Message(message) => self.check(message),
+            TakenOnly::Nothing => LinkRead::Nothing,
+            TakenOnly::Other => return None,
+        };
+        self.was_emptied();
+        Some(read)
+    }
+
+    /// Checks who sent a message, and for whom.
+    fn check(&mut self, message: Message) -> LinkRead {
         let header = &message.header;
         let is_for_us =
             header.destination == self.own && (header.kind.is_user() || header.kind == Kind::OUTCOME);
         if header.source == self.peer && is_for_us {
             self.account.took(header);
-            return Ok(LinkRead::Message(message));
+            return LinkRead::Message(message);
         }
         self.refuse(&message);
-        Ok(LinkRead::Refused)
+        LinkRead::Refused
     }
 
     /// Takes the content of the ring, without waiting.
     pub(crate) fn take(&mut self) -> Result<Taken, RingError> {
         let taken = self.frames.take(&mut self.consumer, ENOUGH)?;
-        if let (Taken::Nothing, Some(set)) = (taken, &self.set) {
-            set.was_emptied(&self.consumer);
+        if taken == Taken::Nothing {
+            self.was_emptied();
         }
         Ok(taken)
+    }
+
+    fn was_emptied(&self) {
+        if let Some(set) = &self.set {
+            set.was_emptied(&self.consumer);
+        }
     }
 
     /// Ends waits with its messages from now on: it is read.
@@ -379,7 +418,7 @@ impl EstablishedLink {
     }
 
     /// Returns whether the ring holds data, or data taken from it is not sorted in yet.
-    pub(super) fn has_unsorted(&mut self) -> bool {
+    pub(crate) fn has_unsorted(&mut self) -> bool {
         // Corrupt memory is detected when it is read.
         self.frames.has_frame() || self.consumer.is_ready().unwrap_or(true)
     }
@@ -410,60 +449,6 @@ impl Drop for EstablishedLink {
         match &self.rest {
             Some(rest) => rest.wake_peer(),
             None => self.writer.wake_peer(),
-        }
-    }
-}
-
-/// The open links, for a wait while there is no node.
-pub(super) struct LinkEnds<'a>(pub(super) &'a mut [EstablishedLink]);
-
-impl Ends for LinkEnds<'_> {
-    fn count(&self) -> usize {
-        self.0.len()
-    }
-
-    fn consumer(&self, index: usize) -> &Consumer {
-        &self.0[index].consumer
-    }
-
-    fn consumer_mut(&mut self, index: usize) -> &mut Consumer {
-        &mut self.0[index].consumer
-    }
-
-    fn hang_up(&self, index: usize) -> Option<HangUp<'_>> {
-        Some(HangUp::Socket(self.0[index].socket.as_fd()))
-    }
-}
-
-/// The node's ring and those of the open links, for one wait on all of them.
-pub(crate) struct AllEnds<'a> {
-    pub(crate) node: &'a mut End,
-    pub(crate) links: &'a mut [EstablishedLink],
-}
-
-impl Ends for AllEnds<'_> {
-    fn count(&self) -> usize {
-        1 + self.links.len()
-    }
-
-    fn consumer(&self, index: usize) -> &Consumer {
-        match index.checked_sub(1) {
-            None => self.node.consumer(0),
-            Some(index) => &self.links[index].consumer,
-        }
-    }
-
-    fn consumer_mut(&mut self, index: usize) -> &mut Consumer {
-        match index.checked_sub(1) {
-            None => self.node.consumer_mut(0),
-            Some(index) => &mut self.links[index].consumer,
-        }
-    }
-
-    fn hang_up(&self, index: usize) -> Option<HangUp<'_>> {
-        match index.checked_sub(1) {
-            None => self.node.hang_up(0),
-            Some(index) => Some(HangUp::Socket(self.links[index].socket.as_fd())),
         }
     }
 }

@@ -253,3 +253,51 @@ fn endpoint_without_links_gets_none() {
     }
     assert!(one.direct.is_empty() && other.direct.is_empty());
 }
+
+/// The kind and the number of the next message that has arrived.
+fn next_number(endpoint: &mut Endpoint) -> Option<(Kind, u64)> {
+    let received = endpoint.receive(Duration::ZERO).unwrap()?;
+    let number = match received.kind() {
+        Urgent::KIND => received.decode::<Urgent>().unwrap().0,
+        Setpoint::KIND => received.decode::<Setpoint>().unwrap().0,
+        _ => received.decode::<Counted>().unwrap().0,
+    };
+    Some((received.kind(), number))
+}
+
+#[test]
+fn messages_that_wait_in_a_ring_are_sorted() {
+    let node = TestNode::start();
+    let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+    link(&mut one, &mut other);
+    while next_number(&mut other).is_some() {}
+    let to = other.tid();
+    // One message alone is received past the inbox.
+    one.send(to, &Counted(1)).unwrap();
+    assert_eq!(next_number(&mut other), Some((Counted::KIND, 1)));
+    assert_eq!(next_number(&mut other), None);
+    // Several are not: a newer value supersedes, and the more urgent class is first.
+    one.message(to, &Counted(2)).class(Class::Bulk).send().unwrap();
+    one.send(to, &Setpoint(3)).unwrap();
+    one.send(to, &Setpoint(4)).unwrap();
+    one.send(to, &Urgent(5)).unwrap();
+    for expected in [(Urgent::KIND, 5), (Setpoint::KIND, 4), (Counted::KIND, 2)] {
+        assert_eq!(next_number(&mut other), Some(expected));
+    }
+    assert_eq!(next_number(&mut other), None);
+}
+
+#[test]
+fn only_message_that_has_expired_is_not_received() {
+    let node = TestNode::start();
+    let (mut one, mut other) = (endpoint(&node), endpoint(&node));
+    link(&mut one, &mut other);
+    while next_number(&mut other).is_some() {}
+    let age = Duration::from_micros(1);
+    one.message(other.tid(), &Counted(1)).expires_after(age).send().unwrap();
+    let sent = Time::now();
+    while Time::now().since(sent) <= age {}
+    assert_eq!(next_number(&mut other), None);
+    one.send(other.tid(), &Counted(2)).unwrap();
+    assert_eq!(next_number(&mut other), Some((Counted::KIND, 2)));
+}

@@ -44,11 +44,12 @@ impl InRing {
     }
 
     /// Publishes the frame as a message, and wakes the peer if it sleeps.
-    pub(crate) fn publish(mut self, header: &Header) {
-        let head = header.encode_in_memory(self.payload().len());
+    pub(crate) fn publish(&mut self, header: &Header) {
         let Some(mut producer) = self.producer.take() else { return };
         if let Some(mut loan) = producer.resume() {
-            loan[..HEADER_LEN].copy_from_slice(&head);
+            let memory = &mut loan[..];
+            let length = memory.len().saturating_sub(HEADER_LEN);
+            memory[..HEADER_LEN].copy_from_slice(&header.encode_in_memory(length));
             loan.publish();
         }
         self.writer.put_back(producer);

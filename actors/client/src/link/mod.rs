@@ -32,6 +32,7 @@ use super::{
 
 pub(super) use handshake::RegistrationHandshake;
 use loan::InRing;
+pub(super) use ring::Arrived;
 use ring::{Begun, Rest};
 pub(super) use server_trust::{ServerTrust, UntrustedServerError};
 
@@ -189,7 +190,7 @@ impl Writer {
     /// Sends a draft in place if its payload is in this very ring; otherwise returns it as a message.
     pub(super) fn send_in_place(&self, draft: Draft) -> Option<Message> {
         match (self, draft.payload) {
-            (Self::Ring(writer), Content::InRing(loan)) if loan.is_of(writer) => {
+            (Self::Ring(writer), Content::InRing(mut loan)) if loan.is_of(writer) => {
                 loan.publish(&draft.header);
                 None
             }
@@ -381,12 +382,19 @@ impl Reader {
         }
     }
 
-    /// Returns whether a read would find nothing, if one look shows that: neither on this ring nor on those of direct
-    /// links.
-    pub(super) fn is_quiet(&self, now: Time) -> bool {
+    /// Looks what has arrived on this ring and on those of direct links. Returns `None` if one look does not show that.
+    pub(super) fn look(&self, now: Time) -> Option<Arrived> {
         match self {
-            Self::Socket(_) => false,
-            Self::Ring(reader) => reader.is_quiet(now),
+            Self::Socket(_) => None,
+            Self::Ring(reader) => reader.look_at_set(now),
+        }
+    }
+
+    /// Returns what the last look has found.
+    pub(super) fn found(&self, now: Time) -> Option<Arrived> {
+        match self {
+            Self::Socket(_) => None,
+            Self::Ring(reader) => reader.found(now),
         }
     }
 

@@ -25,7 +25,7 @@ use sinew_protocol::{
 };
 use sinew_runtime::{
     outcome::{Outcome, ReceiptSink, Ticket},
-    wire::{FrameCodec, Kind, Message},
+    wire::{FrameCodec, Header, Kind, Message},
 };
 use sinew_shm::{Armed, BellKind, Capacity, Counters, HangUp, LoanError, Producer, Region, RoomError, Wait};
 use tokio::sync::Notify;
@@ -34,7 +34,7 @@ use tokio_util::codec::Decoder;
 use super::{Ended, LinkOptions};
 use crate::ApiError;
 
-pub(crate) use reading::{End, Reader, waiter};
+pub(crate) use reading::{Arrived, End, Reader, waiter};
 pub(crate) use writing::{Begun, Rest};
 
 /// Maximum bytes taken from a ring at once.
@@ -110,6 +110,18 @@ impl Writer {
     pub(crate) fn counters(&self) -> Option<Counters> {
         let producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
         producer.as_deref().map(Producer::counters)
+    }
+
+    /// Writes one frame if it can be one record and there is room for it now. Returns whether it was written. An
+    /// error of the ring appears again in [`begin`](Self::begin).
+    pub(crate) fn write_at_once(&self, header: &Header, payload: &[u8]) -> bool {
+        self.flush_pending();
+        let mut producer = self.producer.lock().unwrap_or_else(PoisonError::into_inner);
+        let written =
+            producer.as_deref_mut().is_some_and(|producer| ring::write_frame(producer, header, payload));
+        drop(producer);
+        self.flush_pending();
+        written
     }
 
     /// Writes one frame if there is contiguous room for all of it now. Returns whether there was.

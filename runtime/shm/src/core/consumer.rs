@@ -94,6 +94,11 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
         self.waking.needs_ring(&self.peer)
     }
 
+    /// Whether no other message follows this one now. Bytes of a hostile peer are validated when they are read.
+    pub(crate) fn is_last(&self, record: Record) -> bool {
+        record.end == self.tail_seen && !self.has_moved()
+    }
+
     /// Announces sleep until there is a message.
     pub(crate) fn arm(&mut self) -> Result<Armed, Corrupt> {
         self.sleep.announce(&self.own);

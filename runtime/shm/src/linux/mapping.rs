@@ -211,6 +211,7 @@ impl Counters {
     ///
     /// # Panics
     /// If `index` is not below [`LEN`](Self::LEN).
+    #[inline]
     pub fn set(&self, index: usize, value: u64) {
         // SYNC: Relaxed: no other data depends on it.
         self.0.counters()[index].store(value, Ordering::Relaxed);

@@ -36,6 +36,22 @@ pub(crate) struct Reader {
     is_stopped: bool,
 }
 
+/// What has arrived in the rings of a set.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Arrived {
+    Nothing,
+    /// Something in the ring at this place of the set, or with this index of those without a set, and nothing else.
+    Only(u8),
+    /// Something in several rings, or another thread has woken the endpoint.
+    Several,
+}
+
+impl Arrived {
+    fn of(set: &WaitSet) -> Self {
+        set.only_ready().map_or(Self::Several, Self::Only)
+    }
+}
+
 /// Returns what a thread waits with.
 pub(crate) fn waiter(options: &LinkOptions) -> Waiter {
     let waiter = Waiter::new(options.spin);
@@ -100,22 +116,34 @@ impl Reader {
         self.ended = Some(Ended::without_reason());
     }
 
-    /// Returns whether a read would find nothing, here and in the other rings of the set. Without a set it cannot be
-    /// told in one look.
-    pub(in crate::link) fn is_quiet(&self, now: Time) -> bool {
-        self.ended.is_none()
-            && now < self.next_check
-            && !self.frames.has_bytes()
-            && self.set.as_ref().is_some_and(|set| !set.look())
+    /// Looks what has arrived in the rings of the set. Returns `None` if this ring has more to do, or if there is no
+    /// set: one look does not show it then.
+    #[inline]
+    pub(in crate::link) fn look_at_set(&self, now: Time) -> Option<Arrived> {
+        let set = self.set.as_ref().filter(|_| self.is_idle(now))?;
+        Some(if set.look() { Arrived::of(set) } else { Arrived::Nothing })
+    }
+
+    /// Returns what the last look has found.
+    #[inline]
+    pub(in crate::link) fn found(&self, now: Time) -> Option<Arrived> {
+        self.set.as_ref().filter(|_| self.is_idle(now)).map(Arrived::of)
+    }
+
+    /// Returns whether a read would find nothing in this ring.
+    pub(crate) fn is_ring_empty(&mut self, now: Time) -> bool {
+        // Corrupt memory is detected when it is read.
+        self.is_idle(now) && !self.end.consumer.is_ready().unwrap_or(true)
+    }
+
+    fn is_idle(&self, now: Time) -> bool {
+        self.ended.is_none() && now < self.next_check && !self.frames.has_bytes()
     }
 
     /// The same for this ring alone.
     pub(in crate::link) fn is_empty(&self, now: Time) -> bool {
         let is_reported = |set: &WaitSet| set.look() && set.is_ready(&self.end.consumer);
-        self.ended.is_none()
-            && now < self.next_check
-            && !self.frames.has_bytes()
-            && self.set.as_ref().is_some_and(|set| !is_reported(set))
+        self.is_idle(now) && self.set.as_ref().is_some_and(|set| !is_reported(set))
     }
 
     /// Takes the data that has arrived, without waiting.
