@@ -107,7 +107,13 @@ fn each_message_of_each_peer_wakes_the_sleeper() {
                 None => assert_eq!(woken, Any::Message(index)),
                 Some(set) => {
                     assert_eq!(woken, Any::Ready);
-                    assert_eq!(set.ready().map(Some).collect::<Vec<_>>(), [ends.consumer(index).slot()]);
+                    // A thread that spins may take a message before its report, which it finds later.
+                    while spin != Spin::Off && !ends.consumer_mut(index).is_ready().expect("honest") {
+                        (0..count).for_each(|ring| set.was_emptied(ends.consumer(ring)));
+                        assert_eq!(waiter.wait(&mut ends, in_time()).expect("honest peers"), Any::Ready);
+                    }
+                    let ready: Vec<_> = set.ready().map(Some).collect();
+                    assert!(spin != Spin::Off || ready == [ends.consumer(index).slot()], "{ready:?}");
                 }
             }
             let lent = ends.consumer_mut(index).receive().expect("honest").expect("it is ready");
