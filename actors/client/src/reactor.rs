@@ -13,7 +13,9 @@ use std::{
         fd::{AsFd, BorrowedFd},
         unix::net,
     },
+    pin::{Pin, pin},
     sync::Arc,
+    task::{Context, Poll, ready},
 };
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -24,6 +26,7 @@ use tokio::{
     net::UnixStream,
     sync::oneshot,
     task::{spawn_blocking, yield_now},
+    time::{Instant, Sleep, sleep_until},
 };
 
 use links::{LinkEvent, Links, forget};
@@ -33,6 +36,7 @@ use super::{
     link::{
         Link, Reader, Writer,
         ring::{self, CHECK_INTERVAL, Rest},
+        socket as link_socket,
     },
     reconnect::{Reconnect, reconnect_blocking},
 };
@@ -41,6 +45,7 @@ use super::{
 pub(super) struct Reactor {
     watches: Watches,
     links: Links,
+    timer: Timer,
     /// The reconnection in progress.
     reconnect: Option<oneshot::Receiver<Link>>,
     /// The reconnecting thread stops when this is dropped.
@@ -69,7 +74,8 @@ impl Reactor {
     /// Watches a link, for the runtime of the calling task.
     pub(super) fn new(reader: &Reader, writer: &Writer) -> io::Result<Self> {
         let (watches, links) = (Watches::of(reader, writer)?, Links::default());
-        Ok(Self { watches, links, reconnect: None, wanted: Arc::new(()) })
+        let (timer, wanted) = (Timer::default(), Arc::new(()));
+        Ok(Self { watches, links, timer, reconnect: None, wanted })
     }
 
     /// Waits until there may be something to read or to do, or the requested room, until `deadline` at most.
@@ -82,7 +88,7 @@ impl Reactor {
     ) {
         match (&self.watches, reader) {
             (Watches::Socket(socket), _) => tokio::select! {
-                () = ready(socket, Interest::READABLE, PollFlags::IN) => {}
+                () = is_ready(socket, Interest::READABLE, PollFlags::IN) => {}
                 () = writer.pending_added() => {}
                 () = at(until.deadline) => {}
             },
@@ -117,17 +123,30 @@ impl Reactor {
         let Watches::Ring { message, socket, .. } = &self.watches else { return };
         self.links.follow(direct, room);
         let Some(mut listening) = Listening::begin(Some(reader), direct, room) else { return };
-        let links = &mut self.links;
-        let event = tokio::select! {
-            () = rung(message) => LinkEvent::Bell,
-            () = ready(socket, Interest::READABLE, PollFlags::RDHUP) => {
+        let (links, timer) = (&mut self.links, &mut self.timer);
+        timer.end_by(deadline);
+        // One future, whose parts keep no list of waiters but the last: a wait of each in a `select` costs as much as
+        // the message.
+        let mut pending_added = pin!(writer.pending_added());
+        let event = poll_fn(|cx| {
+            // First: a node that has gone has closed its bell, too, which is always ready then.
+            if poll_hung_up(socket, cx).is_ready() {
                 listening.check_at_once();
-                LinkEvent::Bell
+                return Poll::Ready(LinkEvent::Bell);
             }
-            event = poll_fn(|cx| links.poll(cx)) => event,
-            () = writer.pending_added() => LinkEvent::Bell,
-            () = at(deadline) => LinkEvent::Bell,
-        };
+            if poll_rung(message, cx).is_ready() {
+                listening.is_node_rung = true;
+                return Poll::Ready(LinkEvent::Bell);
+            }
+            match links.poll(cx) {
+                Poll::Pending if pending_added.as_mut().poll(cx).is_ready() || timer.poll(cx).is_ready() => {
+                    Poll::Ready(LinkEvent::Bell)
+                }
+                event @ (Poll::Ready(_) | Poll::Pending) => event,
+            }
+        })
+        .await;
+        links.note_rung(&mut *listening.direct);
         drop(listening);
         direct.on_wake(event == LinkEvent::HungUp);
     }
@@ -141,6 +160,7 @@ impl Reactor {
             event = poll_fn(|cx| links.poll(cx)) => event,
             () = at(deadline) => LinkEvent::Bell,
         };
+        links.note_rung(&mut *listening.direct);
         drop(listening);
         direct.on_wake(event == LinkEvent::HungUp);
     }
@@ -165,7 +185,7 @@ impl Reactor {
     pub(super) async fn room(&self, writer: &Writer, rest: &mut Option<Rest>, length: usize, deadline: Time) {
         match &self.watches {
             Watches::Socket(socket) => tokio::select! {
-                () = ready(socket, Interest::WRITABLE, PollFlags::OUT) => {}
+                () = is_ready(socket, Interest::WRITABLE, PollFlags::OUT) => {}
                 () = at(deadline) => {}
             },
             Watches::Ring { room, socket, .. } => {
@@ -179,7 +199,7 @@ impl Reactor {
                 // Not disarmed if this is dropped: the node may cause one needless wake.
                 tokio::select! {
                     () = rung(room) => {}
-                    () = ready(socket, Interest::READABLE, PollFlags::RDHUP) => {}
+                    () = is_ready(socket, Interest::READABLE, PollFlags::RDHUP) => {}
                     () = at(deadline) => {}
                 }
                 match rest {
@@ -280,13 +300,15 @@ struct Listening<'a> {
     node: Option<&'a mut ring::Reader>,
     direct: &'a mut Direct,
     room: Option<Room>,
+    /// Whether the node has rung.
+    is_node_rung: bool,
 }
 
 impl<'a> Listening<'a> {
     /// Announces the sleep. Returns `None` if there is something to do already.
     fn begin(node: Option<&'a mut ring::Reader>, direct: &'a mut Direct, room: Option<Room>) -> Option<Self> {
-        let mut listening = Self { node, direct, room };
-        let Self { node, direct, room } = &mut listening;
+        let mut listening = Self { node, direct, room, is_node_rung: false };
+        let Self { node, direct, room, .. } = &mut listening;
         let is_silent = node.as_mut().is_none_or(|node| node.arm() == Armed::Sleep)
             && direct.open.iter_mut().all(|link| link.arm() == Armed::Sleep)
             && room.is_none_or(|room| direct.arm_room(room) == Armed::Sleep);
@@ -304,7 +326,7 @@ impl<'a> Listening<'a> {
 impl Drop for Listening<'_> {
     fn drop(&mut self) {
         if let Some(node) = &mut self.node {
-            node.disarm();
+            node.disarm(self.is_node_rung);
         }
         self.direct.open.iter_mut().for_each(EstablishedLink::disarm);
         if let Some(room) = self.room {
@@ -329,8 +351,63 @@ async fn rung(bell: &UnixStream) {
     }
 }
 
+/// The same, as a poll of the endpoint's only task.
+fn poll_rung(bell: &UnixStream, cx: &mut Context<'_>) -> Poll<()> {
+    // An error is an end, which is detected elsewhere.
+    if ready!(bell.poll_read_ready(cx)).is_ok() {
+        forget(bell);
+    }
+    Poll::Ready(())
+}
+
+/// Ready when the other end of a socket has closed it.
+fn poll_hung_up(socket: &UnixStream, cx: &mut Context<'_>) -> Poll<()> {
+    loop {
+        let _ = ready!(socket.poll_read_ready(cx));
+        if link_socket::hangs_up(socket) {
+            return Poll::Ready(());
+        }
+        forget(socket);
+    }
+}
+
+/// The timer of a task's waits. Each of them ends long before its deadline, and the next one has a later deadline. So
+/// the timer is set again only when it has ended, or for an earlier end: mostly it ends one wait in twenty early.
+#[derive(Default)]
+struct Timer {
+    sleep: Option<Pin<Box<Sleep>>>,
+    /// When it ends; `None` if it does not, or has.
+    end: Option<Time>,
+}
+
+impl Timer {
+    /// Ends at `deadline`, or before. Never, if that is never.
+    fn end_by(&mut self, deadline: Time) {
+        if deadline == Time::MAX {
+            self.end = None;
+            return;
+        }
+        if self.end.is_some_and(|end| end <= deadline) {
+            return;
+        }
+        self.end = Some(deadline);
+        let at = Instant::now() + deadline.since(Time::now());
+        match &mut self.sleep {
+            Some(sleep) => sleep.as_mut().reset(at),
+            None => self.sleep = Some(Box::pin(sleep_until(at))),
+        }
+    }
+
+    fn poll(&mut self, cx: &mut Context<'_>) -> Poll<()> {
+        let Some(sleep) = self.sleep.as_mut().filter(|_| self.end.is_some()) else { return Poll::Pending };
+        ready!(sleep.as_mut().poll(cx));
+        self.end = None;
+        Poll::Ready(())
+    }
+}
+
 /// Resolves when the system reports this readiness of the socket now, despite reads or writes in between.
-async fn ready(socket: &UnixStream, interest: Interest, what: PollFlags) {
+async fn is_ready(socket: &UnixStream, interest: Interest, what: PollFlags) {
     let now = || {
         let nothing = Timespec { tv_sec: 0, tv_nsec: 0 };
         match poll(&mut [PollFd::new(socket, what)], Some(&nothing)) {

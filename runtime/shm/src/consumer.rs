@@ -19,7 +19,12 @@ pub struct Consumer {
     room_button: Box<dyn Doorbell>,
     spinner: Spinner,
     slot: Option<Slot>,
+    /// Rings that were reported and are still in the descriptor.
+    rings: u32,
 }
+
+/// The most rings that stay in a descriptor. A socket holds some 270, and a drain takes 64 of them.
+const RINGS_KEPT: u32 = 32;
 
 /// The result of [`Consumer::receive_only`].
 #[derive(Debug)]
@@ -39,7 +44,7 @@ impl Consumer {
         room_button: Box<dyn Doorbell>,
         slot: Option<Slot>,
     ) -> Self {
-        Self { core, message, room_button, spinner: Spinner::new(Spin::Off), slot }
+        Self { core, message, room_button, spinner: Spinner::new(Spin::Off), slot, rings: 0 }
     }
 
     /// Returns its place in a [`WaitSet`](crate::WaitSet), below 128.
@@ -156,6 +161,17 @@ impl Consumer {
     pub fn disarm(&mut self) {
         self.core.disarm();
         self.message.drain();
+    }
+
+    /// Announces that the reactor is awake, for one that reports each ring once, such as an edge-triggered `epoll`.
+    /// `is_rung`: it has reported one. The rings stay in the descriptor, and are discarded long before they fill it.
+    pub fn disarm_reported(&mut self, is_rung: bool) {
+        self.core.disarm();
+        self.rings += u32::from(is_rung);
+        if self.rings >= RINGS_KEPT {
+            self.rings = 0;
+            self.message.drain();
+        }
     }
 
     /// Returns the descriptor that a reactor waits for (readable) while armed; `None` for a futex.

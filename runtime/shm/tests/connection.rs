@@ -389,3 +389,18 @@ fn only_message_is_received_and_others_are_left() {
     assert_eq!(consumer.receive().expect("an honest peer").expect("a message").to_vec(), [2]);
     assert!(matches!(consumer.receive_only(), Only::Message(message) if message.to_vec() == [3]));
 }
+
+/// A reactor that is edge-triggered reads no ring, and the rings must not fill the socket.
+#[test]
+fn reported_rings_never_fill_a_bell() {
+    let (mut producer, mut consumer, _rest) = pair(4096, BellKind::Socket);
+    for round in 0..1_000 {
+        assert_eq!(consumer.arm().expect("an honest peer"), Armed::Sleep);
+        producer.send(&[0]).expect("room");
+        consumer.disarm_reported(true);
+        drop(consumer.receive().expect("an honest peer").expect("a message"));
+        let fd = consumer.fd().expect("a socket");
+        let rings = rustix::io::ioctl_fionread(fd).expect("a count");
+        assert!(rings <= 32, "{rings} after round {round}");
+    }
+}

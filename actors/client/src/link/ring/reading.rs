@@ -266,9 +266,9 @@ impl Reader {
         self.end.consumer.arm().unwrap_or(Armed::Ready)
     }
 
-    /// Records that the task is awake.
-    pub(crate) fn disarm(&mut self) {
-        self.end.consumer.disarm();
+    /// Records that the task is awake, and whether this ring has woken it.
+    pub(crate) fn disarm(&mut self, is_rung: bool) {
+        self.end.consumer.disarm_reported(is_rung);
     }
 
     /// Makes the next poll of the ring check the socket, too.
