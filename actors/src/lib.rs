@@ -26,6 +26,7 @@
 //! | reports for tools | [`inspect`] |
 //! | signals | [`signals`] |
 //! | clocks, timers | [`Time`], [`time`] |
+//! | applications in virtual time, on recorded inputs | [`replay`] |
 //!
 //! `docs/book/src/reference/guarantees.md` lists the guarantees, and the explicit non-guarantees.
 //!
@@ -77,6 +78,7 @@ pub use node::{Node, NodeBuilder, NodeHandle, StartError};
 pub use serde;
 #[doc(no_inline)]
 pub use sinew_client::{self as client, AsyncEndpoint, Endpoint, NodeApi, Registration};
+pub use sinew_replay as replay;
 pub use sinew_runtime::protection;
 #[doc(no_inline)]
 pub use time::Time;
@@ -180,6 +182,7 @@ pub mod supervision {
 /// Time, timers, and the clocks of other nodes.
 pub mod time {
     pub use sinew_runtime::{
+        clock::{Clock, Sleep},
         schedule::{Tick, TimerId},
         time::Time,
     };

@@ -21,7 +21,7 @@ const LIBRARIES: [&str; 11] = [
 ];
 
 /// The packages of Sinew, and the folders of their sources.
-const SINEW: [(&str, &str); 14] = [
+const SINEW: [(&str, &str); 15] = [
     ("sinew", "actors/src/"),
     ("sinew_c", "bindings/c/src/"),
     ("sinew_client", "actors/client/src/"),
@@ -31,6 +31,7 @@ const SINEW: [(&str, &str); 14] = [
     ("sinew_ndl", "actors/ndl/src/"),
     ("sinew_node", "actors/node/src/"),
     ("sinew_protocol", "actors/protocol/src/"),
+    ("sinew_replay", "actors/replay/src/"),
     ("sinew_runtime", "runtime/src/"),
     ("sinew_security", "actors/security/src/"),
     ("sinew_session", "actors/session/src/"),

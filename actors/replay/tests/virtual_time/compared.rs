@@ -1,0 +1,85 @@
+//! The same inputs give the same outputs; another gain gives a first difference with a name.
+
+use sinew::replay::{CheckError, Comparison, compare};
+
+use super::*;
+
+fn run(gain: f64, seed: u64) -> Vec<TimedMessage> {
+    replay().app(Controller::spec("knee", gain)).run(angles(seed, 2_000)).unwrap()
+}
+
+#[test]
+fn only_the_same_seed_gives_the_same_outputs() {
+    let (first, again) = (run(0.5, 1), run(0.5, 1));
+    assert!(first.len() > 2_000, "gaps are longer than a turn");
+    assert_eq!(first, again);
+    assert_ne!(first, run(0.5, 2));
+    let torques: std::collections::BTreeSet<_> = first.iter().map(|output| output.payload.clone()).collect();
+    assert!(torques.len() > 1_000);
+}
+
+#[test]
+fn changed_gain_is_named_at_its_first_torque() {
+    let (recorded, replayed) = (run(0.5, 1), run(0.25, 1));
+    let difference = compare(&recorded, &replayed).expect_err("the gain differs");
+    // The first turn after the first angle: before it both give none.
+    let first = angles(1, 1)[0].at;
+    assert_eq!(difference.at, ms(first.since(START).as_millis() as u64 + 1));
+    let words = difference.to_string();
+    assert!(words.contains("replay.torque to 10.0.0.1/"), "{words}");
+    assert!(words.contains("`newton_metres` was "), "{words}");
+    assert_eq!(difference.recorded.as_ref().map(|message| message.at), Some(difference.at));
+}
+
+#[test]
+fn missing_and_added_messages_are_named() {
+    let recorded = run(0.5, 1);
+    let shorter = &recorded[..recorded.len() - 1];
+    let words = compare(&recorded, shorter).expect_err("one is missing").to_string();
+    assert!(words.contains(&format!("message {} of", recorded.len())), "{words}");
+    assert!(words.ends_with("it was sent in the recording, and is not in the replay"), "{words}");
+    let words = compare(shorter, &recorded).expect_err("one is added").to_string();
+    assert!(words.ends_with("it was not sent in the recording, and is in the replay"), "{words}");
+}
+
+#[test]
+fn times_and_fields_are_compared_as_wanted() {
+    let recorded = run(0.5, 1);
+    let late: Vec<_> = recorded
+        .iter()
+        .map(|message| TimedMessage { at: message.at + Duration::from_micros(30), ..message.clone() })
+        .collect();
+    compare(&recorded, &late).expect("times are not compared");
+    let within = |micros| Comparison::default().times_within(Duration::from_micros(micros));
+    within(30).compare(&recorded, &late).expect("they are 30 us apart");
+    let words = within(29).compare(&recorded, &late).expect_err("they are 30 us apart").to_string();
+    assert!(words.contains("its time was 5.001000000s and is 5.001030000s"), "{words}");
+    let torque = |t_ns| TimedMessage::of(ms(1), tid(KNEE), tid(MOTOR), &Torque { newton_metres: 1.0, t_ns });
+    let words = compare(&[torque(1)], &[torque(2)]).expect_err("a field differs").to_string();
+    assert!(words.ends_with("`t_ns` was 1 and is 2"), "{words}");
+    Comparison::default().ignoring("t_ns").compare(&[torque(1)], &[torque(2)]).expect("it is ignored");
+}
+
+#[test]
+fn bytes_that_are_no_messagepack_differ_by_place() {
+    let raw = |bytes: &'static [u8]| TimedMessage {
+        payload: bytes.into(),
+        ..TimedMessage::of(ms(1), tid(KNEE), tid(MOTOR), &Note { text: String::new() })
+    };
+    let words = compare(&[raw(b"\xc1ab")], &[raw(b"\xc1ac")]).expect_err("they differ").to_string();
+    assert!(words.ends_with("byte 2 of its payload was 0x62 and is 0x63"), "{words}");
+    let words = compare(&[raw(b"\xc1ab")], &[raw(b"\xc1a")]).expect_err("they differ").to_string();
+    assert!(words.ends_with("its payload had 3 bytes and has 2"), "{words}");
+}
+
+#[test]
+fn recording_is_checked_against_its_own_replay() {
+    let inputs = angles(3, 300);
+    let tested = |gain| replay().app(Controller::spec("knee", gain));
+    let mut recorded = tested(0.5).run(inputs.clone()).unwrap();
+    recorded.extend(inputs);
+    recorded.sort_by_key(|message| message.at);
+    tested(0.5).check(recorded.clone()).expect("it is its own recording");
+    let error = tested(0.25).check(recorded).expect_err("the gain differs");
+    assert!(matches!(error, CheckError::Differs(_)), "{error}");
+}
