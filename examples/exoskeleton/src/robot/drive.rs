@@ -33,6 +33,7 @@ use exoskeleton_model::message::{DriveState, GaitMode, GaitState, JointSample, T
 use sinew::prelude::*;
 use sinew::protection::Guard;
 use sinew::supervision::ReadyGate;
+use sinew::time::Clock;
 
 use self::command::{Armed, CentralCommands, Output};
 use self::damping_repeater::{DampingRepeater, RepeaterHandle};
@@ -144,7 +145,7 @@ impl Drive {
     }
 
     fn tick(&mut self, tick: Tick, context: &mut AppContext<Self>) {
-        let now = Time::now();
+        let now = context.now();
         let gait = self.newest_command(now, context);
         let is_shut = self.is_shut();
         if is_shut {
@@ -154,7 +155,7 @@ impl Drive {
             self.report_unguarded(&error);
         }
         let mut output = self.core.tick(now.as_nanos(), self.sample.as_ref(), gait.as_ref());
-        output.command_nm = self.command(now, &output, gait.as_ref());
+        output.command_nm = self.command(context.clock(), now, &output, gait.as_ref());
         self.carry_burden(now, gait.as_ref());
         if output.state != DriveState::Init
             && let Some(gate) = self.ready.take()
@@ -223,7 +224,7 @@ impl Drive {
             None => DampingRepeater::start(self.device.damper())?,
         };
         let again = self.repeater.insert(repeater).handle().clone();
-        let output = Output::new(self.device.damper(), again);
+        let output = Output::new(self.device.damper(), again, context.clock().clone());
         context.guard::<GaitState, _>(central, output, |output, _| output.make_safe())
     }
 
@@ -238,7 +239,13 @@ impl Drive {
     /// Torques that may assist go through the open guard, so that none follows the order to damp, even if
     /// this thread was delayed before. With a shut guard the device is ordered to damp by itself; a torque
     /// that is being ramped to zero continues while it is young.
-    fn command(&mut self, now: Time, output: &DriveOutput, gait: Option<&GaitState>) -> Option<f64> {
+    fn command(
+        &mut self,
+        clock: &Clock,
+        now: Time,
+        output: &DriveOutput,
+        gait: Option<&GaitState>,
+    ) -> Option<f64> {
         let released = gait.is_some_and(|gait| !matches!(gait.mode, GaitMode::Hold | GaitMode::Stop));
         let (saturated, state, command_nm) = (output.saturated, output.state, output.command_nm);
         let was_giving = self.gives;
@@ -268,16 +275,16 @@ impl Drive {
         if let Some(Ok((given, order))) = through {
             if order == Order::Damp {
                 // The order was sent now, not when this tick began.
-                core.let_device_damp(Time::now().as_nanos());
+                core.let_device_damp(clock.now().as_nanos());
             }
             return given;
         }
-        let order = Order::past_shut(state, command_nm, was_giving, Time::now().since(now));
+        let order = Order::past_shut(state, command_nm, was_giving, clock.now().since(now));
         let again = repeater.as_ref().map(DampingRepeater::handle);
         match order {
             Order::Damp => {
                 let given = send_order(order);
-                core.let_device_damp(Time::now().as_nanos());
+                core.let_device_damp(clock.now().as_nanos());
                 return given;
             }
             Order::Torque(0.0) => again.into_iter().for_each(RepeaterHandle::rests),
@@ -389,7 +396,7 @@ impl Handler<Delivery<JointSample>> for Drive {
     type Result = ();
 
     fn handle(&mut self, sample: Delivery<JointSample>, context: &mut Self::Context) {
-        if self.sensor.at(Time::now(), context) != Some(sample.source) {
+        if self.sensor.at(context.now(), context) != Some(sample.source) {
             context.reject();
             return;
         }
@@ -431,7 +438,7 @@ impl Handler<Delivery<TorqueSet>> for Drive {
     type Result = ();
 
     fn handle(&mut self, command: Delivery<TorqueSet>, context: &mut Self::Context) {
-        let now = Time::now();
+        let now = context.now();
         let central = self.central.at(now, context);
         if central.map(|central| central.node) != Some(command.source.node) {
             context.reject();
@@ -481,7 +488,7 @@ impl Handler<Delivery<Reset>> for Drive {
     type Result = ();
 
     fn handle(&mut self, reset: Delivery<Reset>, context: &mut Self::Context) {
-        let now = Time::now();
+        let now = context.now();
         if self.central.at(now, context).map(|central| central.node) != Some(reset.source.node) {
             context.reject();
             return;

@@ -107,7 +107,7 @@ impl Gait {
     }
 
     fn tick(&mut self, tick: Tick, context: &AppContext<Self>) {
-        let now = Time::now();
+        let now = context.now();
         let input =
             CentralInput { samples: self.samples.each_ref().map(Option::as_ref), load: self.load.as_ref() };
         let state = self.core.tick(now.as_nanos(), &input);
@@ -275,7 +275,7 @@ impl Handler<Delivery<DriveStatus>> for Gait {
                 *monitored = *monitored || context.monitor(status.source).is_ok();
                 let (t_ns, t_error_ns) = sent(&status, status.t_ns);
                 let status = DriveStatus { t_ns, t_error_ns, ..status.payload };
-                self.core.on_drive_status(Time::now().as_nanos(), joint, &status);
+                self.core.on_drive_status(context.now().as_nanos(), joint, &status);
             }
             None => context.reject(),
         }
@@ -303,7 +303,7 @@ impl Handler<Delivery<Shut>> for Gait {
             context.reject();
             return;
         };
-        if self.drives[joint.index()].at(Time::now(), context) != Some(shut.source) {
+        if self.drives[joint.index()].at(context.now(), context) != Some(shut.source) {
             context.reject();
         } else if may_arm(self.mode, shut.suspect) {
             // A drive that cannot be reached asks again.
@@ -315,12 +315,12 @@ impl Handler<Delivery<Shut>> for Gait {
 impl Handler<Delivery<Down>> for Gait {
     type Result = ();
 
-    fn handle(&mut self, down: Delivery<Down>, _: &mut Self::Context) {
+    fn handle(&mut self, down: Delivery<Down>, context: &mut Self::Context) {
         let Some(joint) = self.joint_at(down.payload.tid.node) else { return };
         tracing::warn!(%joint, why = %down.payload, "a drive has ended");
         // The next incarnation is monitored from its first message on.
         self.monitored[joint.index()] = false;
-        self.core.drive_ended(joint, Time::now().as_nanos());
+        self.core.drive_ended(joint, context.now().as_nanos());
     }
 }
 

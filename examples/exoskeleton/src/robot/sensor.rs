@@ -65,7 +65,7 @@ impl Sensor {
     }
 
     fn tick(&mut self, tick: Tick, context: &AppContext<Self>) {
-        let now = Time::now();
+        let now = context.now();
         if tick.lateness > LATE_MAX {
             self.events.event(SENSOR_LATE, self.joint.name(), format!("{:?}", tick.lateness));
         }

@@ -3,8 +3,9 @@
 use std::io;
 
 use exoskeleton_model::message::{DriveState, GaitState};
-use sinew::prelude::{AppContext, Delivery, Tid, Time};
+use sinew::prelude::{AppContext, Delivery, Tid};
 use sinew::protection::{Guard, State};
+use sinew::time::Clock;
 
 use super::anomaly::Anomaly;
 use super::damping_repeater::RepeaterHandle;
@@ -30,6 +31,7 @@ pub(super) struct Output {
     /// Whether the device was ordered to apply a torque: a device without torque is left unchanged.
     pub(super) gives: bool,
     pub(super) again: RepeaterHandle,
+    clock: Clock,
 }
 
 /// The result of an [`Arm`].
@@ -43,14 +45,14 @@ pub(super) enum Armed {
 }
 
 impl Output {
-    pub(super) fn new(device: Box<dyn Damper>, again: RepeaterHandle) -> Self {
-        Self { command: None, device, gives: false, again }
+    pub(super) fn new(device: Box<dyn Damper>, again: RepeaterHandle, clock: Clock) -> Self {
+        Self { command: None, device, gives: false, again, clock }
     }
 
     pub(super) fn make_safe(&mut self) {
         self.command = None;
         if std::mem::take(&mut self.gives) {
-            self.device.damp(Time::now(), DriveState::Safe);
+            self.device.damp(self.clock.now(), DriveState::Safe);
             // The order may be lost, and the drive's thread may hang.
             self.again.damps();
         }
