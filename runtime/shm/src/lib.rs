@@ -47,6 +47,7 @@ mod core;
 mod error;
 #[cfg(all(target_os = "linux", any(test, feature = "hostile-peer"), not(any(loom, miri))))]
 pub mod hostile;
+pub mod journal;
 mod layout;
 mod memory;
 mod offer;

@@ -1,5 +1,5 @@
 //! Mapped regions as typed memory. **All of Sinew's unsafe code about shared memory is in this file**, in
-//! five blocks.
+//! five blocks, but for one block about the files of journals (`journal/file.rs`).
 //!
 //! They rest on these facts:
 //!

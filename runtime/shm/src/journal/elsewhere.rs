@@ -1,0 +1,47 @@
+//! Platforms without journals: creating one returns an error.
+
+use std::{convert::Infallible, io, path::Path, sync::atomic::AtomicU64};
+
+use super::{core::Memory, error::CreateJournalError};
+
+/// Cannot exist on this platform.
+#[derive(Debug)]
+pub(crate) struct Map(Infallible);
+
+impl Map {
+    pub(crate) fn header_word(&self, _: usize) -> &AtomicU64 {
+        match self.0 {}
+    }
+}
+
+impl Memory for Map {
+    fn reserved(&self) -> &AtomicU64 {
+        match self.0 {}
+    }
+
+    fn table(&self) -> &[AtomicU64] {
+        match self.0 {}
+    }
+
+    fn ring(&self) -> &[AtomicU64] {
+        match self.0 {}
+    }
+}
+
+/// Cannot exist on this platform.
+pub(crate) struct NewFile(Infallible);
+
+impl NewFile {
+    pub(crate) fn put(&self, _: usize, _: &[u8]) -> io::Result<()> {
+        match self.0 {}
+    }
+}
+
+pub(crate) fn create(
+    _: &Path,
+    _: u64,
+    _: bool,
+    _: impl FnOnce(&NewFile) -> io::Result<()>,
+) -> Result<Map, CreateJournalError> {
+    Err(CreateJournalError::Unsupported)
+}
