@@ -27,7 +27,7 @@ use self::{
     each::OpenSends,
     groups::{Groups, Joined},
     guard::Guard,
-    tap::Tap,
+    tap::{TAPS, Tap},
 };
 use crate::{
     clock::Clock,
@@ -48,7 +48,7 @@ pub struct LocalRoute {
 
 #[derive(Clone, Default)]
 struct Table {
-    /// The observer of messages, usually none.
+    /// The observer of messages, usually none. One pointer also for several: [`tap::joined`].
     tap: Option<Arc<dyn Tap>>,
     /// The access check for this node's applications; `None`: no restriction.
     guard: Option<Arc<dyn Guard>>,
@@ -79,6 +79,8 @@ struct Snapshot {
 struct Writing {
     here: Joined<AppAddress>,
     elsewhere: Joined<NodeAddress>,
+    /// The observers, of which the table has one.
+    taps: [Option<Arc<dyn Tap>>; TAPS],
 }
 
 /// The number of destinations of a message.

@@ -1,16 +1,12 @@
 //! Observation of direct links: their messages bypass the node, so the watched client reports them. spec: LNCL-20
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::BTreeMap,
     sync::{Mutex, MutexGuard, PoisonError},
 };
 
 use sinew_protocol::payload::{self, Observe};
-use sinew_runtime::{
-    router::Router,
-    tid::{AppAddress, Tid},
-    wire::Kind,
-};
+use sinew_runtime::{router::Router, tid::Tid, wire::Kind};
 
 /// The clients that can have direct links.
 #[derive(Debug, Default)]
@@ -36,11 +32,12 @@ impl ObservedLinks {
         self.lock().remove(&client);
     }
 
-    /// Observes the links of these applications, and of no others. Returns whether a client must be told later.
-    pub fn observe(&self, router: &Router, apps: &BTreeSet<AppAddress>) -> bool {
+    /// Observes the links of the applications that a tap watches, and of no others. Returns whether a client must be
+    /// told later.
+    pub fn observe(&self, router: &Router) -> bool {
         let mut is_left = false;
         for (client, observation) in self.lock().iter_mut() {
-            observation.is_wanted = apps.contains(&client.app);
+            observation.is_wanted = router.is_observed(*client);
             is_left |= !observation.tell(router, *client);
         }
         is_left

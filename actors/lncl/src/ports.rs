@@ -1,6 +1,6 @@
 //! What other layers ask LNCL.
 
-use std::{collections::BTreeSet, fmt::Display};
+use std::fmt::Display;
 
 use sinew_model::{ports::Applications, undelivered::Report};
 use sinew_runtime::{
@@ -20,8 +20,8 @@ impl Applications for State {
         lock(&self.registry).resolve(name)
     }
 
-    fn observe_links(&self, apps: &BTreeSet<AppAddress>) {
-        if self.observed_links.observe(&self.ctx.router, apps) {
+    fn observe_links(&self) {
+        if self.observed_links.observe(&self.ctx.router) {
             self.ctx.checks.request();
         }
     }

@@ -152,9 +152,9 @@ pub trait Applications: Send + Sync {
     /// Returns the application of this node called `name`.
     fn resolve(&self, name: &str) -> Option<AppAddress>;
 
-    /// Observes the direct links of these applications of this node, and of no others: their processes report the
-    /// messages to the routing table's tap.
-    fn observe_links(&self, apps: &BTreeSet<AppAddress>);
+    /// Observes the direct links of the applications that the routing table's taps watch now, and of no others: their
+    /// processes report the messages to the taps. Called after each change of a tap.
+    fn observe_links(&self);
 
     /// Adds the rejections that `node` reports. Calls `refuse` for each that `node` cannot have caused.
     fn undelivered_elsewhere(&self, node: NodeAddress, report: Report, refuse: &mut dyn FnMut(&dyn Display));

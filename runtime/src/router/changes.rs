@@ -5,7 +5,7 @@ use std::{collections::BTreeSet, sync::Arc};
 use super::{
     LocalRoute, Members, MessageSink, Router, Snapshot, Table, Writing, for_each_here,
     guard::Guard,
-    tap::{Passage, Tap},
+    tap::{self, Passage, Tap, TapOf},
 };
 use crate::{
     lock,
@@ -80,9 +80,13 @@ impl Router {
         lock(&self.writing).here.memberships()
     }
 
-    /// Sets the tap that observes messages from now on; `None` removes it.
-    pub fn set_tap(&self, tap: Option<Arc<dyn Tap>>) {
-        self.change(|table| table.tap = tap);
+    /// Sets the tap that observes messages from now on for this purpose; `None` removes it.
+    pub fn set_tap(&self, of: TapOf, tap: Option<Arc<dyn Tap>>) {
+        let mut writing = lock(&self.writing);
+        writing.taps[of as usize] = tap;
+        let mut snapshot = Snapshot::clone(&self.snapshot.load());
+        Arc::make_mut(&mut snapshot.table).tap = tap::joined(&writing.taps);
+        self.snapshot.store(Arc::new(snapshot));
     }
 
     /// Returns whether a tap observes messages from or to this application.

@@ -28,6 +28,43 @@ pub trait Tap: Send + Sync {
     fn missed(&self, app: Tid, messages: u64);
 }
 
+/// The purpose of a tap: a table has at most one for each.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TapOf {
+    /// The watches of the inspection.
+    Watches,
+    /// The recording.
+    Recording,
+}
+
+/// The number of purposes.
+pub(super) const TAPS: usize = 2;
+
+/// Returns one tap in place of all of them.
+pub(super) fn joined(taps: &[Option<Arc<dyn Tap>>; TAPS]) -> Option<Arc<dyn Tap>> {
+    match taps {
+        [Some(one), Some(other)] => Some(Arc::new(Both([one.clone(), other.clone()]))),
+        [one, other] => one.as_ref().or(other.as_ref()).cloned(),
+    }
+}
+
+/// Several taps, of which each sees the messages of its own applications.
+struct Both([Arc<dyn Tap>; TAPS]);
+
+impl Tap for Both {
+    fn watches(&self, app: Tid) -> bool {
+        self.0.iter().any(|tap| tap.watches(app))
+    }
+
+    fn saw(&self, app: Tid, passage: &Passage<'_>) {
+        self.0.iter().filter(|tap| tap.watches(app)).for_each(|tap| tap.saw(app, passage));
+    }
+
+    fn missed(&self, app: Tid, messages: u64) {
+        self.0.iter().filter(|tap| tap.watches(app)).for_each(|tap| tap.missed(app, messages));
+    }
+}
+
 /// A message that was accepted or rejected.
 #[derive(Clone, Copy, Debug)]
 pub struct Passage<'a> {
@@ -186,7 +223,7 @@ mod tests {
             router.set_local(app, LocalRoute { sink: Arc::new(Picky), events: Arc::new([]) });
         }
         let notes = Arc::new(Notes::default());
-        router.set_tap(Some(notes.clone()));
+        router.set_tap(TapOf::Watches, Some(notes.clone()));
         (router, notes)
     }
 
@@ -216,9 +253,31 @@ mod tests {
                 (Way::In, any, None),
             ]
         );
-        router.set_tap(None);
+        router.set_tap(TapOf::Watches, None);
         router.send(message(any, OTHER, WATCHED)).expect("it is taken");
         assert!(lock(&notes.0).is_empty(), "nobody watches any more");
+    }
+
+    #[test]
+    fn two_taps_see_the_messages_side_by_side() {
+        let (router, watch) = router();
+        let recording = Arc::new(Notes::default());
+        router.set_tap(TapOf::Recording, Some(recording.clone()));
+        let any = Kind::named("test.any");
+        let send = || router.send(message(any, OTHER, WATCHED)).expect("it is taken");
+        let counts = || [lock(&watch.0).len(), lock(&recording.0).len()];
+        send();
+        assert_eq!(counts(), [1, 1]);
+        router.set_tap(TapOf::Watches, None);
+        send();
+        assert_eq!(counts(), [1, 2]);
+        router.set_tap(TapOf::Watches, Some(watch.clone()));
+        router.set_tap(TapOf::Recording, None);
+        send();
+        assert_eq!(counts(), [2, 2]);
+        router.set_tap(TapOf::Watches, None);
+        send();
+        assert_eq!(counts(), [2, 2]);
     }
 
     #[test]

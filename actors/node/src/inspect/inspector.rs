@@ -13,7 +13,7 @@ use std::{
 use sinew_runtime::{
     log,
     outcome::{Outcome, Rejection},
-    router::{LocalRoute, MessageSink, Refused},
+    router::{LocalRoute, MessageSink, Refused, tap::TapOf},
     tid::{AppAddress, Tid},
     time::Time,
     wire::{Flags, Kind, Message, Payload},
@@ -95,15 +95,15 @@ fn next(questions: &Receiver<Message>, answers: &Answers, watches: &mut Watches)
             Err(RecvTimeoutError::Timeout) => {}
         }
         let tap = watches.expire(Time::now());
-        install_tap(&*answers.state()?, watches, tap);
+        install_tap(&*answers.state()?, tap);
     }
 }
 
-fn install_tap(state: &NodeState, watches: &Watches, tap: NewTap) {
+fn install_tap(state: &NodeState, tap: NewTap) {
     if let Some(tap) = tap {
-        state.ctx.router.set_tap(tap);
+        state.ctx.router.set_tap(TapOf::Watches, tap);
         if let Some(applications) = state.ctx.ports.applications() {
-            applications.observe_links(&watches.apps());
+            applications.observe_links();
         }
     }
 }
@@ -151,7 +151,7 @@ fn watch(
     let now = Time::now();
     // An ended watch frees its place for another one.
     let tap = watches.expire(now);
-    install_tap(state, watches, tap);
+    install_tap(state, tap);
     let watched = Tid::new(state.ctx.node, app.app);
     let bytes_max = WATCH_BYTES.min(state.ctx.config.payload_max / 2);
     let directions = Directions { received, sent };
@@ -163,7 +163,7 @@ fn watch(
         )));
     }
     let (fetched, tap) = watches.fetch(now, key, directions, bytes_max);
-    install_tap(state, watches, tap);
+    install_tap(state, tap);
     let Some(fetched) = fetched else {
         return Ok(refused(format!(
             "this node shows {WATCHES_MAX} watches at once, and so many are there; end another one"

@@ -83,7 +83,7 @@ mod tests {
     use std::sync::mpsc::{Receiver, sync_channel};
 
     use sinew_runtime::{
-        router::LocalRoute,
+        router::{LocalRoute, tap::TapOf},
         tid::{Incarnation, NodeAddress},
         time::Time,
         wire::Payload,
@@ -154,7 +154,7 @@ mod tests {
         let watched = (HIP, bench.tid(1));
         let directions = Directions { received: true, sent: true };
         let (_, tap) = watches.fetch(Time::ZERO, watched, directions, 1_024);
-        bench.state.ctx.router.set_tap(tap.expect("a new one"));
+        bench.state.ctx.router.set_tap(TapOf::Watches, tap.expect("a new one"));
         // When, then
         let deciders = |to| bench.reached(HIP, to).reached.iter().map(by).collect::<Vec<_>>();
         let [first, second] = [bench.tid(1), bench.tid(2)];

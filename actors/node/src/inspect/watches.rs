@@ -8,7 +8,7 @@
 //! [`WatchTap`] in the routing table.
 
 use std::{
-    collections::{BTreeMap, BTreeSet, VecDeque},
+    collections::{BTreeMap, VecDeque},
     sync::{
         Arc, Mutex, MutexGuard, TryLockError,
         atomic::{AtomicU64, Ordering},
@@ -18,7 +18,7 @@ use std::{
 
 use sinew_runtime::{
     router::tap::{Passage, Tap, Way},
-    tid::{AppAddress, Tid},
+    tid::Tid,
     time::Time,
     wire::Header,
 };
@@ -220,11 +220,6 @@ impl Watches {
         self.0.values().map(|(_, until)| *until).min()
     }
 
-    /// Returns the watched applications.
-    pub(super) fn apps(&self) -> BTreeSet<AppAddress> {
-        self.0.values().map(|(watch, _)| watch.app.app).collect()
-    }
-
     fn tap(&self) -> Option<Arc<dyn Tap>> {
         let watches: Vec<_> = self.0.values().map(|(watch, _)| watch.clone()).collect();
         (!watches.is_empty()).then(|| Arc::new(WatchTap(watches)) as Arc<dyn Tap>)
@@ -234,7 +229,10 @@ impl Watches {
 #[cfg(test)]
 mod tests {
     use bytes::Bytes;
-    use sinew_runtime::{tid::NodeAddress, wire::Kind};
+    use sinew_runtime::{
+        tid::{AppAddress, NodeAddress},
+        wire::Kind,
+    };
 
     use super::*;
 

@@ -1,10 +1,10 @@
 //! A watched endpoint reports the messages on its links.
 
-use std::{collections::BTreeSet, sync::Arc};
+use std::sync::Arc;
 
 use sinew_runtime::{
     lock,
-    router::tap::{Passage, Tap, Way},
+    router::tap::{Passage, Tap, TapOf, Way},
     tid::Tid,
     wire::{Header, Kind},
 };
@@ -56,8 +56,8 @@ fn watched_endpoint_reports_messages_on_its_links() {
     link(&mut one, &mut other);
     let notes = Arc::new(Notes { app: one.tid(), seen: std::sync::Mutex::default() });
     let links = &node.state.observed_links;
-    node.router().set_tap(Some(notes.clone()));
-    links.observe(node.router(), &BTreeSet::from([one.tid().app]));
+    node.router().set_tap(TapOf::Watches, Some(notes.clone()));
+    links.observe(node.router());
     // When: messages flow until the first is reported
     let deadline = Time::now() + WATCHDOG;
     let mut last = 0;
@@ -77,8 +77,8 @@ fn watched_endpoint_reports_messages_on_its_links() {
         assert!(numbers.windows(2).all(|pair| pair[0] + 1 == pair[1]), "{numbers:?}");
     }
     // When: the watcher has gone, and the endpoint has learned it
-    node.router().set_tap(None);
-    links.observe(node.router(), &BTreeSet::new());
+    node.router().set_tap(TapOf::Watches, None);
+    links.observe(node.router());
     let seen = lock(&notes.seen).len();
     while one.direct.is_observed() {
         assert!(Time::now() < deadline, "waited for the end of the reports");
@@ -94,7 +94,7 @@ fn report_of_another_application_is_dropped() {
     let node = TestNode::start();
     let (mut one, other) = (endpoint(&node), endpoint(&node));
     let notes = Arc::new(Notes { app: other.tid(), seen: std::sync::Mutex::default() });
-    node.router().set_tap(Some(notes.clone()));
+    node.router().set_tap(TapOf::Watches, Some(notes.clone()));
     let header = Header::new(Kind::named("test.forged"), one.tid(), other.tid());
     for (claimed, is_sent) in [(one.tid(), false), (other.tid(), true)] {
         let header = Header { source: claimed, ..header };
