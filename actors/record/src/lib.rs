@@ -1,0 +1,22 @@
+//! The records in a node's journal ([`sinew_shm::journal`]), for the node that writes them and for programs that read
+//! them; and the selection of the messages to record.
+//!
+//! | module | content |
+//! | --- | --- |
+//! | [`channel`] | the key of a channel: source, destination, payload type, class, form, rejection |
+//! | [`entry`] | a record: a message, or one of the facts below |
+//! | [`facts`] | events of nodes and applications, clock offsets, log lines |
+//! | [`tap`] | writes the selected messages of a routing table |
+//! | [`selection`] | applications, payload types and groups, by names and patterns |
+
+pub mod channel;
+pub mod entry;
+pub mod facts;
+pub mod selection;
+pub mod tap;
+
+pub use channel::{Channel, Form};
+pub use entry::{Entry, EntryError, MESSAGE_HEAD, MessageEntry, fact, message_head};
+pub use facts::{ClockFact, Fact, LogFact, NodeFact, PeerClock};
+pub use selection::{Chosen, Selection, SelectionError};
+pub use tap::{RecordTap, lost_channel};
