@@ -90,7 +90,8 @@ pub(crate) fn create(
         |step| move |cause: io::Error| CreateJournalError::System { path: path.to_owned(), step, cause };
     let refused = |why| CreateJournalError::Folder { path: path.to_owned(), why };
     let name = path.file_name().ok_or_else(|| refused("the path ends without a file name"))?;
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder =
+        path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
     let flags = OFlags::DIRECTORY | OFlags::RDONLY | OFlags::CLOEXEC;
     let folder = rustix::fs::open(folder, flags, Mode::empty())
         .map_err(io::Error::from)

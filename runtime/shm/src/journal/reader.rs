@@ -253,11 +253,11 @@ struct JournalFile {
 
 impl JournalFile {
     fn read_at(&self, at: u64, into: &mut [u8]) -> Result<(), ReadJournalError> {
-        self.file.read_exact_at(into, at).map_err(|cause| match cause.kind() {
-            io::ErrorKind::UnexpectedEof => {
-                self.cut(self.file.metadata().map_or(0, |metadata| metadata.len()))
+        self.file.read_exact_at(into, at).map_err(|cause| {
+            if cause.kind() == io::ErrorKind::UnexpectedEof {
+                return self.cut(self.file.metadata().map_or(0, |metadata| metadata.len()));
             }
-            _ => ReadJournalError::System { path: self.path.clone(), cause },
+            ReadJournalError::System { path: self.path.clone(), cause }
         })
     }
 

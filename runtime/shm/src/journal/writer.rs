@@ -12,7 +12,7 @@ use super::{
         writer::{begin, finish, reserve},
     },
     error::CreateJournalError,
-    layout::{Head, Header, IDENTITY_MAX, RING_MAX, RING_MIN, payload_max, salt_of},
+    layout::{Head, Header, RING_MAX, RING_MIN, payload_max, salt_of},
     platform::{self, Map},
 };
 
@@ -21,7 +21,7 @@ use super::{
 pub struct Options<'a> {
     /// Bytes of the ring: 64 KiB to 4 GiB, rounded up to a power of two. The file has 260 KiB more. Default: 64 MiB.
     pub ring_bytes: u64,
-    /// The creator's own description, for readers: at most [`IDENTITY_MAX`] bytes.
+    /// The creator's own description, for readers: at most [`IDENTITY_MAX`](super::IDENTITY_MAX) bytes.
     pub identity: &'a [u8],
     /// The time of creation, in nanoseconds of the monotonic clock.
     pub now: u64,
@@ -82,7 +82,6 @@ impl Journal {
             writer: std::process::id(),
             identity: options.identity.to_vec(),
         };
-        debug_assert!(IDENTITY_MAX < 4096, "it is in the first page");
         let page = header.encode().ok_or(CreateJournalError::Identity(options.identity.len()))?;
         let map = platform::create(path, header.file_bytes(), options.keeps_previous, |file| {
             file.put(0, &page)?;

@@ -15,8 +15,8 @@ use super::{
     writer::{begin, finish, reserve},
 };
 
-/// Bytes of a ring with two records of 8 bytes.
-const RING: u64 = 128;
+/// Bytes of a ring with four records of 8 bytes: the shortest in which such a payload is allowed.
+const RING: u64 = 256;
 
 fn payload(number: u64) -> [u8; 8] {
     [number as u8; 8]
@@ -70,10 +70,9 @@ fn two_writers_have_a_place_each() {
 fn overwritten_bytes_are_noticed() {
     loom::model(|| {
         let model = Arc::new(Model::new(1, RING));
-        model.write(1, &payload(1));
-        model.write(2, &payload(2));
+        (1..=4).for_each(|number| model.write(number, &payload(number)));
         let writing = Arc::clone(&model);
-        let writer = thread::spawn(move || writing.write(3, &payload(3)));
+        let writer = thread::spawn(move || writing.write(5, &payload(5)));
         let (first, reserved) = (model.ring()[5].load(Ordering::Relaxed), model.reserved());
         // As in `ReaderCore::refill`.
         crate::memory::fence(Ordering::Acquire);
