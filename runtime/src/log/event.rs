@@ -17,6 +17,7 @@ use tracing::{
 };
 
 use super::{
+    observer,
     stderr::{self, Line},
     writer::enqueue,
 };
@@ -49,9 +50,15 @@ pub fn apart(log_event: impl FnOnce()) {
     // A thread at its end may have destroyed this variable.
     let Some(recorded) = RECORDED.try_with(RefCell::take).ok().flatten() else { return };
     if is_default {
-        enqueue(Box::new(move || recorded.write()));
+        enqueue(Box::new(move || {
+            recorded.observe();
+            recorded.write();
+        }));
     } else {
-        enqueue(Box::new(move || recorded.dispatch_to(&reader)));
+        enqueue(Box::new(move || {
+            recorded.observe();
+            recorded.dispatch_to(&reader);
+        }));
     }
 }
 
@@ -200,6 +207,17 @@ impl RecordedEvent {
             line.field(field.name(), &value.shown());
         }
         line.write();
+    }
+
+    /// Shows the event to the observers of the log.
+    fn observe(&self) {
+        observer::show(*self.metadata.level(), self.metadata.target(), || {
+            let (message, fields): (Vec<_>, Vec<_>) =
+                self.fields.iter().partition(|(field, _)| field.name() == "message");
+            let message = message.iter().map(|(_, value)| value.shown());
+            let fields = fields.iter().map(|(field, value)| format!("{}={}", field.name(), value.shown()));
+            message.chain(fields).collect::<Vec<_>>().join(" ")
+        });
     }
 
     fn push_field(&mut self, field: &Field, value: FieldValue) {
