@@ -28,6 +28,7 @@ mod log_tests;
 mod node;
 mod process;
 mod progress;
+mod recording;
 mod reply_waiters;
 mod root;
 mod security_setup;

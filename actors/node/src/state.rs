@@ -10,6 +10,7 @@ use sinew_runtime::{
 };
 use sinew_security::SecurityState;
 
+use super::recording::Recording;
 use super::root::{RootEvent, RootQueue};
 use crate::audit;
 
@@ -31,6 +32,8 @@ pub(crate) struct NodeState {
     pub(crate) sync: Arc<sinew_sync::State>,
     /// The audit questions that this node has sent, and those that it has received.
     pub(crate) questions: audit::Questions,
+    /// The recording of its messages.
+    pub(crate) recording: Recording,
 }
 
 impl NodeState {
@@ -52,6 +55,7 @@ impl NodeState {
             ndl,
             sync,
             questions: audit::Questions::default(),
+            recording: Recording::default(),
         });
         state.connect();
         state
@@ -73,6 +77,7 @@ impl NodeState {
     /// Releases the node's socket and its address for inspection, so that another node can use them even if a
     /// hung thread still holds the state.
     pub(crate) fn close(&self) {
+        self.recording.close(self);
         self.lncl.client_socket.close();
         self.ctx.router.remove_local(AppAddress::INSPECT);
         self.gncl.store.close();

@@ -75,6 +75,12 @@ pub(super) const LAYER_RESTARTS_MAX: Range =
 pub(super) const LAYER_WINDOW: Range = range("supervision.layer_window_ms", 1, 3_600_000, "ms");
 pub(super) const APP_RESTARTS_MAX: Range = range("supervision.app_restarts_max", 0, 1_000_000, "restarts");
 pub(super) const APP_WINDOW: Range = range("supervision.app_window_ms", 1, 3_600_000, "ms");
+pub(super) const KEEP_BYTES: Range = range("record.keep_bytes", 64 << 10, 4 << 30, "bytes");
+/// Maximum number of names in `record.apps` and `record.types`, and maximum bytes of one.
+const RECORDED_MAX: usize = 64;
+const RECORDED_BYTES_MAX: usize = 255;
+/// The legal values of these lists.
+pub(super) const RECORDED_LEGAL: &str = "at most 64 names of 1 to 255 bytes, in which `*` matches any text";
 
 impl Range {
     /// Returns the fault for the value `found` outside of this range.
@@ -137,6 +143,7 @@ impl NodeConfig {
         APP_RESTARTS_MAX.count(&mut faults, self.supervision.app_restarts_max);
         APP_WINDOW.time(&mut faults, self.supervision.app_window);
         self.check_security(&mut faults);
+        self.check_record(&mut faults);
         ConfigError::check(faults)
     }
 
@@ -193,6 +200,33 @@ impl NodeConfig {
             let legal = format!("the path of a file, 1 to {DIRECTORY_BYTES_MAX} bytes, or false");
             let remedy = "name the file that has the access list, as in /etc/sinew/access.toml";
             faults.push(fault("security.access", quoted(&access.to_string_lossy()), legal, remedy));
+        }
+    }
+
+    fn check_record(&self, faults: &mut Vec<ConfigFault>) {
+        let record = &self.record;
+        if let Some(folder) = record.folder.as_deref().filter(|folder| !is_path(folder)) {
+            let legal = format!("the path of a folder, 1 to {DIRECTORY_BYTES_MAX} bytes, or false");
+            let remedy = "name a folder in memory, as in /dev/shm";
+            faults.push(fault("record.folder", quoted(&folder.to_string_lossy()), legal, remedy));
+        }
+        KEEP_BYTES.count(faults, record.keep_bytes);
+        for (key, names) in [("record.apps", &record.apps), ("record.types", &record.types)] {
+            if names.len() > RECORDED_MAX {
+                let remedy = "write a `*` in place of several";
+                faults.push(fault(key, format!("{} names", names.len()), RECORDED_LEGAL, remedy));
+            }
+            let is_name = |name: &&String| {
+                (1..=RECORDED_BYTES_MAX).contains(&name.len()) && !name.contains(char::is_control)
+            };
+            for name in names.iter().take(RECORDED_MAX).filter(|name| !is_name(name)) {
+                faults.push(fault(
+                    key,
+                    quoted(name),
+                    RECORDED_LEGAL,
+                    "write a name, or a part of it and `*`",
+                ));
+            }
         }
     }
 

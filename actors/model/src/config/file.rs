@@ -23,10 +23,11 @@ use super::{
 /// Longest configuration file in bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-const SECTIONS: [&str; 9] = ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security", "log", "app"];
+const SECTIONS: [&str; 10] =
+    ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security", "log", "record", "app"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 49] = [
+pub(super) const KEYS: [&str; 53] = [
     "node.name",
     "node.project",
     "node.address",
@@ -76,6 +77,10 @@ pub(super) const KEYS: [&str; 49] = [
     "security.times",
     "security.access",
     "log.level",
+    "record.folder",
+    "record.keep_bytes",
+    "record.apps",
+    "record.types",
 ];
 
 impl NodeConfig {
@@ -122,6 +127,7 @@ impl NodeConfig {
             "\"off\", \"error\", \"warn\", \"info\", \"debug\" or \"trace\"",
             &mut config.log.level,
         );
+        reader.read_record(&mut config);
         config.app_settings = reader.app_settings.take().unwrap_or_default();
         let faults = reader.finish(&config).err().map(ConfigError::into_vec).unwrap_or_default();
         Ok((config, faults))
@@ -309,6 +315,15 @@ impl Reader<'_> {
         let example = "\"until-set\", \"strict\" or \"ignored\"";
         self.text("security.times", example, &mut security.times);
         self.text_or_off("security.access", "\"/etc/sinew/access.toml\" or false", &mut security.access);
+    }
+
+    fn read_record(&mut self, config: &mut NodeConfig) {
+        let record = &mut config.record;
+        self.text_or_off("record.folder", "\"/dev/shm\" or false", &mut record.folder);
+        self.number(&check::KEEP_BYTES, &mut record.keep_bytes);
+        let remedy = "set it as in [\"leg.*\"], or leave it out for all";
+        self.read_list("record.apps", check::RECORDED_LEGAL, remedy, &mut record.apps);
+        self.read_list("record.types", check::RECORDED_LEGAL, remedy, &mut record.types);
     }
 }
 

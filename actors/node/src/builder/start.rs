@@ -125,6 +125,7 @@ impl NodeBuilder {
         }
         open_client_socket(&state)?;
         inspect::begin(&state)?;
+        state.recording.begin_configured(&state).map_err(|why| StartError::Record(why.to_string()))?;
         let (tree, heed_signals) = (self.tree, self.heed_signals);
         if heed_signals && handle.root.post(RootEvent::HeedSignals).is_err() {
             return Err(StartError::Layers("the root's event queue was full before it was read".to_owned()));

@@ -66,6 +66,9 @@ pub enum StartError {
         /// All faults of the list.
         faults: ConfigError,
     },
+    /// `record.folder` is set, and the file of the recording cannot be made there.
+    #[error("record.folder is set, and the node does not start without its recording: {0}")]
+    Record(String),
     /// A layer did not become ready.
     #[error("the layers did not start: {0}")]
     Layers(String),

@@ -6,6 +6,7 @@ mod audit;
 mod node;
 mod peers;
 mod reach;
+mod record;
 mod refused;
 mod security;
 mod tree;
@@ -20,6 +21,7 @@ pub use peers::{
     StallReport, StreamReport, TroubleReport,
 };
 pub use reach::{AskGroups, AskReach, GroupReport, REACHED_MAX, ReachReport, Reached};
+pub use record::{AskRecord, RECORDED_MAX, RecordReport, RecordedApp, RecordedType};
 pub use refused::{LostEchoReport, RefusalReport, UnguardedReport, UnhandledReport};
 pub use security::{CertificateReport, SecurityReport};
 pub use tree::{AskTree, TREE_MAX, TreeLine, TreeReport};

@@ -53,12 +53,14 @@ enum Kind {
     Addresses(usize),
     /// At most this many addresses with ports.
     Seeds(usize),
+    /// At most this many names, in which `*` matches any text.
+    Names(usize),
     /// Groups of nodes.
     Watch,
 }
 
 /// Sections, in the order of the file, with a heading.
-const SECTIONS: [(&str, &str); 8] = [
+const SECTIONS: [(&str, &str); 9] = [
     ("node", "The node"),
     ("lncl", "Applications of this host"),
     ("gncl", "Connections between nodes"),
@@ -67,6 +69,7 @@ const SECTIONS: [(&str, &str); 8] = [
     ("supervision", "Restarts"),
     ("security", "Keys and the access list"),
     ("log", "The default log"),
+    ("record", "The recording"),
 ];
 
 /// Longest cell of a table, and longest line of the complete file.
@@ -113,7 +116,7 @@ impl Kind {
             Self::OneOf(_) | Self::Name | Self::NodeAddress => "text",
             Self::PathOrFalse(_) | Self::EndpointOrFalse { .. } => "text, or `false`",
             Self::Interfaces => "text, or list of texts",
-            Self::Addresses(_) | Self::Seeds(_) => "list of texts",
+            Self::Addresses(_) | Self::Seeds(_) | Self::Names(_) => "list of texts",
             Self::Watch => "list of tables",
         }
     }
@@ -133,6 +136,7 @@ impl Kind {
             Self::Interfaces => format!("1 to {PATHS_MAX}, each once"),
             Self::Addresses(max) => format!("at most {max} IPv4 addresses"),
             Self::Seeds(max) => format!("at most {max}, each `address:port`"),
+            Self::Names(max) => format!("at most {max} names of 1 to {RECORDED_BYTES_MAX} bytes"),
             Self::Watch => format!("at most {WATCH_MAX} groups of 1 to {WATCHED_NAMES_MAX} names"),
         }
     }
@@ -165,6 +169,7 @@ impl Kind {
                 addresses
             }
             Self::Seeds(max) => texts(*max, json!({ "type": "string", "pattern": SEED })),
+            Self::Names(max) => texts(*max, text(RECORDED_BYTES_MAX)),
             Self::Watch => {
                 let mut names = texts(WATCHED_NAMES_MAX, text(NAME_BYTES_MAX));
                 names["minItems"] = 1.into();

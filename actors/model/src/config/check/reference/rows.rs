@@ -363,6 +363,34 @@ pub(super) const ROWS: &[Row] = &[
         effect: "Most detailed level of the default log on standard error, in a program without a `tracing` subscriber.",
         note: "The environment variables `SINEW_LOG` and `RUST_LOG` override it.",
     },
+    Row {
+        key: "record.folder",
+        kind: Kind::PathOrFalse(DIRECTORY_BYTES_MAX),
+        value: |config| path(config.record.folder.as_deref()),
+        effect: "Folder of the file with the newest messages, which outlives the node; `false` records only while a program asks.",
+        note: "In memory (`/dev/shm`): on a disk the system may stop a sender while it stores a page.",
+    },
+    Row {
+        key: "record.keep_bytes",
+        kind: Kind::Number(KEEP_BYTES),
+        value: |config| json!(config.record.keep_bytes),
+        effect: "Bytes of the newest records that are kept, rounded up to a power of two; also while a program records.",
+        note: "Memory, allocated when the recording begins.",
+    },
+    Row {
+        key: "record.apps",
+        kind: Kind::Names(RECORDED_MAX),
+        value: |config| json!(config.record.apps),
+        effect: "Applications of the node of which messages are recorded; `*` matches any text; none: all.",
+        note: "A name gets its address when its application registers; messages of the next 100 ms may be missing.",
+    },
+    Row {
+        key: "record.types",
+        kind: Kind::Names(RECORDED_MAX),
+        value: |config| json!(config.record.types),
+        effect: "Payload types that are recorded; `*` matches any text; none: all.",
+        note: "A `*` matches types that applications of the project handle.",
+    },
 ];
 
 fn millis(duration: Duration) -> Value {

@@ -55,6 +55,7 @@ fn legal(kind: &Kind) -> Vec<Value> {
         Kind::Addresses(_) => vec![json!(["10.0.0.7", "10.0.0.8"])],
         Kind::Seeds(_) => vec![json!(["10.0.0.7:7", "[fe80::7%eth0]:7"])],
         // TOML encodes tables differently than JSON.
+        Kind::Names(_) => vec![json!([]), json!(["leg.*", "knee"])],
         Kind::Watch => vec![json!([])],
     }
 }

@@ -1,0 +1,307 @@
+//! The recording: messages and facts in the node's journal, while its configuration or a program asks for it.
+//!
+//! ```text
+//!  a sender's thread ── router ── RecordTap ──► journal (a file in memory; the newest bytes win) ──► any reader
+//!  thread `record` ── compares nodes, names, barriers, clocks every 100 ms ──┘
+//! ```
+//!
+//! Without a recording there is no tap in the routing table, no thread and no file.
+
+mod facts;
+#[cfg(test)]
+mod tests;
+
+use std::{
+    collections::BTreeMap,
+    io,
+    path::{Path, PathBuf},
+    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, Weak},
+    time::Duration,
+};
+
+use rustix::time::{ClockId, clock_gettime};
+use sinew_record::{NodeFact, RecordTap, Selection};
+use sinew_runtime::{
+    log::{self, LogObserver},
+    router::tap::{Tap, TapOf},
+    tid::Tid,
+    time::Time,
+};
+use sinew_shm::journal::{CreateJournalError, Journal, Options};
+
+pub(crate) use facts::clocks;
+use facts::{KnownFacts, LogWriter};
+
+use crate::NodeState;
+
+/// Time without a question after which a recording ends that a program asked for.
+pub(crate) const LEASE: Duration = Duration::from_secs(5);
+/// Maximum number of programs that record at once.
+pub(crate) const PROGRAMS_MAX: usize = 8;
+/// Time between two looks at the node's state, and at the selected names.
+const PERIOD: Duration = Duration::from_millis(100);
+/// The folder of files in memory: on a disk the system would stop a sender while it stores a page.
+const MEMORY: &str = "/dev/shm";
+
+/// The recording of a node.
+#[derive(Default)]
+pub(crate) struct Recording {
+    state: Mutex<State>,
+    /// Notified when the last selection has gone.
+    ended: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    active: Option<Active>,
+    /// That of the configuration.
+    configured: Option<Selection>,
+    /// Those of programs, each until its lease ends.
+    programs: BTreeMap<Tid, (Selection, Time)>,
+}
+
+/// A recording that runs.
+struct Active {
+    journal: Arc<Journal>,
+    /// The sum of all selections.
+    selection: Selection,
+    /// The names and addresses of the tap.
+    chosen: Option<sinew_record::Chosen>,
+    /// Writes the log, as long as it is here.
+    _log: Arc<dyn LogObserver>,
+}
+
+/// Why there is no recording.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum RecordError {
+    /// The journal cannot be made.
+    #[error(transparent)]
+    Journal(#[from] CreateJournalError),
+    /// The system has no thread for it.
+    #[error("the system gives no thread for the recording: {0}")]
+    Thread(#[from] io::Error),
+    /// As many programs record as may.
+    #[error("{PROGRAMS_MAX} programs record on this node at once, and so many do; end another one")]
+    Programs,
+}
+
+impl Recording {
+    /// Begins the recording that the configuration asks for, if it does.
+    pub(crate) fn begin_configured(&self, node: &Arc<NodeState>) -> Result<(), RecordError> {
+        let config = &node.ctx.config.record;
+        if config.folder.is_none() {
+            return Ok(());
+        }
+        let selection =
+            Selection { apps: config.apps.clone(), types: config.types.clone(), groups: Vec::new() };
+        let mut state = self.lock();
+        state.configured = Some(selection);
+        self.start(node, &mut state)
+    }
+
+    /// Starts or renews the recording for a program. Returns the journal's path.
+    pub(crate) fn ask(
+        &self,
+        node: &Arc<NodeState>,
+        program: Tid,
+        selection: Selection,
+        now: Time,
+    ) -> Result<PathBuf, RecordError> {
+        let mut state = self.lock();
+        if state.programs.len() >= PROGRAMS_MAX && !state.programs.contains_key(&program) {
+            return Err(RecordError::Programs);
+        }
+        state.programs.insert(program, (selection, now + LEASE));
+        if let Err(why) = self.start(node, &mut state) {
+            state.programs.remove(&program);
+            return Err(why);
+        }
+        let active = state.active.as_ref().expect("it has started, and this program keeps it");
+        Ok(active.journal.path().to_owned())
+    }
+
+    /// Ends the recording for a program.
+    pub(crate) fn leave(&self, node: &NodeState, program: Tid) {
+        let mut state = self.lock();
+        if state.programs.remove(&program).is_some() {
+            self.settle(node, &mut state);
+        }
+    }
+
+    /// Returns the path of the journal, if there is one.
+    #[cfg(test)]
+    pub(crate) fn path(&self) -> Option<PathBuf> {
+        self.lock().active.as_ref().map(|active| active.journal.path().to_owned())
+    }
+
+    /// Ends the recording with the node. The file of a configured one stays.
+    pub(crate) fn close(&self, node: &NodeState) {
+        let mut state = self.lock();
+        state.programs.clear();
+        let is_kept = state.configured.take().is_some();
+        if let Some(active) = state.active.take() {
+            self.remove(node, &active, is_kept);
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Makes the journal and the thread, if there are none, and updates the tap.
+    fn start(&self, node: &Arc<NodeState>, state: &mut State) -> Result<(), RecordError> {
+        if state.active.is_none() {
+            let now = Time::now();
+            let journal = Arc::new(create(node, now)?);
+            let began = NodeFact::Began {
+                node: node.ctx.node,
+                name: node.ctx.config.name.clone(),
+                project: node.ctx.config.project.clone(),
+                incarnation: node.ctx.incarnation,
+            };
+            facts::write(&journal, node.ctx.node, now, &began);
+            let (weak, of) = (Arc::downgrade(node), journal.clone());
+            std::thread::Builder::new().name("record".to_owned()).spawn(move || run(&weak, &of))?;
+            let log: Arc<dyn LogObserver> =
+                Arc::new(LogWriter { node: node.ctx.node, journal: journal.clone() });
+            // More nodes of one process than have room record without the log.
+            log::observe(&log);
+            state.active = Some(Active { journal, selection: Selection::default(), chosen: None, _log: log });
+        }
+        self.settle(node, state);
+        Ok(())
+    }
+
+    /// Fits the tap to the selections, or ends the recording without any.
+    fn settle(&self, node: &NodeState, state: &mut State) {
+        let State { active: Some(active), configured, programs } = state else { return };
+        let mut all = configured.iter().chain(programs.values().map(|(selection, _)| selection));
+        let Some(mut sum) = all.next().cloned() else {
+            if let Some(active) = state.active.take() {
+                self.remove(node, &active, false);
+            }
+            return;
+        };
+        all.for_each(|selection| sum.add(selection));
+        active.selection = sum;
+        active.refresh(node);
+    }
+
+    fn remove(&self, node: &NodeState, active: &Active, is_kept: bool) {
+        install(node, None);
+        if !is_kept {
+            // A reader that has it open reads it to its end.
+            let _ = std::fs::remove_file(active.journal.path());
+        }
+        self.ended.notify_all();
+    }
+
+    /// Looks at the selected names, and ends expired leases. Returns whether this journal is still written.
+    fn refresh(&self, node: &NodeState, journal: &Arc<Journal>, now: Time) -> bool {
+        let mut state = self.lock();
+        let before = state.programs.len();
+        state.programs.retain(|_, (_, until)| *until > now);
+        if state.programs.len() < before {
+            self.settle(node, &mut state);
+        }
+        let Some(active) = state.active.as_mut().filter(|active| Arc::ptr_eq(&active.journal, journal))
+        else {
+            return false;
+        };
+        active.refresh(node);
+        true
+    }
+
+    /// Waits for the next look, or for the end.
+    fn rest(&self) {
+        let state = self.lock();
+        // A poisoned lock is that of a panic elsewhere; the next look decides.
+        drop(self.ended.wait_timeout(state, PERIOD));
+    }
+}
+
+impl Active {
+    /// Replaces the tap if the selected names have other addresses now.
+    fn refresh(&mut self, node: &NodeState) {
+        let chosen = if self.selection.is_all() {
+            self.selection.chosen([], [])
+        } else {
+            let directory = node.ctx.ports.names().map(|names| names.directory()).unwrap_or_default();
+            let kinds = directory.iter().flat_map(|entry| entry.kinds.iter().copied());
+            let kinds: BTreeMap<_, _> = kinds
+                .filter_map(|kind| Some((kind, sinew_lncl::undelivered::kind_name(&node.lncl, kind)?)))
+                .collect();
+            let apps = directory.iter().filter(|entry| entry.tid.node == node.ctx.node);
+            self.selection.chosen(
+                apps.map(|entry| (&*entry.name, entry.tid)),
+                kinds.iter().map(|(kind, name)| (&**name, *kind)),
+            )
+        };
+        if self.chosen.as_ref() != Some(&chosen) {
+            let tap = RecordTap::new(node.ctx.node, self.journal.clone(), chosen.clone());
+            install(node, Some(Arc::new(tap)));
+            self.chosen = Some(chosen);
+        }
+    }
+}
+
+fn install(node: &NodeState, tap: Option<Arc<dyn Tap>>) {
+    node.ctx.router.set_tap(TapOf::Recording, tap);
+    if let Some(applications) = node.ctx.ports.applications() {
+        applications.observe_links();
+    }
+}
+
+/// Writes facts until the recording or the node ends.
+fn run(node: &Weak<NodeState>, journal: &Arc<Journal>) {
+    let mut known = KnownFacts::default();
+    while let Some(state) = node.upgrade() {
+        let now = Time::now();
+        if !state.recording.refresh(&state, journal, now) {
+            return;
+        }
+        known.look(&state, journal, now);
+        state.recording.rest();
+    }
+}
+
+fn create(node: &NodeState, now: Time) -> Result<Journal, RecordError> {
+    let config = &node.ctx.config.record;
+    let memory = Path::new(MEMORY);
+    let folder = match &config.folder {
+        Some(folder) => folder.clone(),
+        None if memory.is_dir() => memory.to_owned(),
+        None => std::env::temp_dir(),
+    };
+    let identity = format!("{}\n{}\n{}", node.ctx.config.name, node.ctx.node, node.ctx.config.project);
+    let options = Options {
+        ring_bytes: config.keep_bytes as u64,
+        identity: identity.as_bytes(),
+        now: now.as_nanos(),
+        wall_offset: wall_offset(),
+        keeps_previous: config.folder.is_some(),
+        ..Options::default()
+    };
+    let path = folder.join(file_name(&node.ctx.config.project, &node.ctx.node.to_string()));
+    let journal = Journal::create(&path, &options)?;
+    log::info!(path = %path.display(), bytes = config.keep_bytes, "the node records");
+    Ok(journal)
+}
+
+/// Returns the name of the journal: that of one project's node.
+fn file_name(project: &str, node: &str) -> String {
+    let letter = |c: char| if c.is_ascii_alphanumeric() || c == '-' { c } else { '_' };
+    format!("sinew-{}-{node}.journal", project.chars().map(letter).collect::<String>())
+}
+
+/// Returns the nanoseconds from the monotonic clock to the wall clock.
+pub(crate) fn wall_offset() -> i64 {
+    let nanoseconds = |clock| {
+        let now = clock_gettime(clock);
+        i128::from(now.tv_sec) * 1_000_000_000 + i128::from(now.tv_nsec)
+    };
+    // The wall clock is read between two looks at the other one.
+    let (before, wall, after) =
+        (nanoseconds(ClockId::Monotonic), nanoseconds(ClockId::Realtime), nanoseconds(ClockId::Monotonic));
+    i64::try_from(wall - (before + after) / 2).unwrap_or(i64::MAX)
+}

@@ -1,0 +1,205 @@
+//! A node that records: from its start, and while a program asks for it.
+
+use std::{path::Path, sync::mpsc::sync_channel};
+
+use sinew_lncl::{LocalApp, register_local};
+use sinew_model::config::NodeConfig;
+use sinew_record::{Channel, ClockFact, Entry, Fact as _, Form};
+use sinew_runtime::{
+    router::{LocalRoute, MessageSink, Refused},
+    tid::{AppAddress, Incarnation},
+    wire::{Header, Kind, Message},
+};
+use sinew_shm::journal::{JournalReader, Start};
+
+use super::*;
+use crate::inspect::{AskRecord, recorded};
+
+/// The watchdog of a test that waits.
+const WATCHDOG: Duration = Duration::from_secs(60);
+
+/// Takes every message.
+struct Sink;
+
+impl MessageSink for Sink {
+    fn submit(&self, _: Message) -> Result<(), Refused> {
+        Ok(())
+    }
+}
+
+/// A node without layers, of a project of its own.
+fn node(name: &str, edit: impl FnOnce(&mut NodeConfig)) -> Arc<NodeState> {
+    let mut config = NodeConfig::new("knee");
+    config.project = format!("test {name} {}", std::process::id());
+    config.record.keep_bytes = 256 * 1024;
+    edit(&mut config);
+    NodeState::for_test(config, Incarnation(1))
+}
+
+/// Registers an application of the node.
+fn app(node: &NodeState, name: &str) -> Tid {
+    let sink: Arc<dyn MessageSink> = Arc::new(Sink);
+    let own = LocalApp {
+        name: Some(name.to_owned()),
+        address: None,
+        requires: Vec::new(),
+        kinds: Vec::new(),
+        sink: sink.clone(),
+        events: Arc::new([]),
+    };
+    let tid = register_local(&node.lncl, own).expect("the name is free");
+    node.ctx.router.set_local(tid.app, LocalRoute { sink, events: Arc::new([]) });
+    tid
+}
+
+fn send(node: &NodeState, source: Tid, destination: Tid, payload: &'static [u8]) {
+    let header = Header::new(Kind::named("test.any"), source, destination);
+    node.ctx.router.send(Message::new(header, bytes::Bytes::from_static(payload))).expect("it is taken");
+}
+
+/// Returns the payloads of all messages in the journal, and the forms of the facts before them.
+fn read(path: &Path) -> (Vec<Vec<u8>>, Vec<Form>) {
+    let mut reader = JournalReader::open(path, Start::Oldest).expect("it is there");
+    let (mut bytes, mut messages, mut facts) = (Vec::new(), Vec::new(), Vec::new());
+    while let Some(record) = reader.next(0, &mut bytes).expect("it is whole") {
+        let channels = reader.channels().expect("it is there");
+        let channel = channels.iter().find(|channel| channel.place == record.place).expect("its place");
+        let form = Channel::of(channel.key.expect("its key")).expect("a channel").form;
+        match Entry::read(&bytes).expect("a record") {
+            Entry::Message(message) => messages.push(message.payload.expect("it is there").to_vec()),
+            Entry::Node(_) | Entry::Clock(_) | Entry::Log(_) => facts.push(form),
+        }
+    }
+    (messages, facts)
+}
+
+#[test]
+fn program_has_its_messages_recorded_until_it_leaves() {
+    let node = node("asked", |_| {});
+    let (hip, knee) = (app(&node, "hip"), app(&node, "knee"));
+    send(&node, hip, knee, b"before");
+    let path = node.recording.ask(&node, hip, Selection::default(), Time::now()).expect("it begins");
+    send(&node, hip, knee, b"first");
+    send(&node, knee, hip, b"second");
+    let reader = JournalReader::open(&path, Start::Oldest).expect("it is there");
+    assert!(reader.is_writer_alive());
+    let (messages, facts) = read(&path);
+    assert_eq!(messages, [b"first".to_vec(), b"second".to_vec()]);
+    assert_eq!(facts[0], Form::Node, "the beginning");
+    node.recording.leave(&node, hip);
+    assert!(!path.exists() && node.recording.path().is_none());
+    assert!(!node.ctx.router.is_observed(hip), "no tap is left");
+    let deadline = Time::now() + WATCHDOG;
+    // The thread lets the journal go.
+    while reader.is_writer_alive() {
+        assert!(Time::now() < deadline, "waited for the end of the thread");
+        std::thread::yield_now();
+    }
+}
+
+// spec: INSPECT-9
+#[test]
+fn only_programs_of_the_node_have_it_record() {
+    let node = node("question", |_| {});
+    let knee = app(&node, "knee");
+    let ask = |source: Tid, question: &AskRecord| {
+        recorded(&node, &Message::typed(source, Tid::NONE, question)).expect("it is a question")
+    };
+    let elsewhere = Tid::new(sinew_runtime::tid::NodeAddress::new(9), knee.app);
+    assert!(ask(elsewhere, &AskRecord::default()).refused.is_some() && node.recording.path().is_none());
+    let wrong = Selection { groups: vec!["all*".to_owned()], ..Selection::default() };
+    assert!(ask(knee, &AskRecord { selection: wrong, ends: false }).refused.is_some());
+    let report = ask(knee, &AskRecord::default());
+    assert_eq!((report.refused, report.node), (None, Some(node.ctx.node)));
+    assert_eq!(report.path.map(PathBuf::from), node.recording.path());
+    assert_eq!(ask(knee, &AskRecord { ends: true, ..AskRecord::default() }).path, None);
+    assert!(node.recording.path().is_none());
+}
+
+#[test]
+fn program_that_asks_no_more_is_forgotten() {
+    let node = node("lease", |_| {});
+    let knee = app(&node, "knee");
+    let begin = Time::now();
+    node.recording.ask(&node, knee, Selection::default(), begin).expect("it begins");
+    let journal = lock_journal(&node);
+    assert!(node.recording.refresh(&node, &journal, begin + LEASE / 2));
+    assert!(!node.recording.refresh(&node, &journal, begin + LEASE));
+    assert!(node.recording.path().is_none());
+}
+
+fn lock_journal(node: &NodeState) -> Arc<Journal> {
+    node.recording.lock().active.as_ref().expect("it records").journal.clone()
+}
+
+#[test]
+fn programs_are_bounded() {
+    let node = node("bounded", |_| {});
+    let now = Time::now();
+    let ask = |number| {
+        let program = Tid::new(node.ctx.node, AppAddress::new(0x8000_0000 + number));
+        node.recording.ask(&node, program, Selection::default(), now)
+    };
+    (0..PROGRAMS_MAX as u32).for_each(|number| drop(ask(number).expect("there is room")));
+    assert!(matches!(ask(PROGRAMS_MAX as u32), Err(RecordError::Programs)));
+    ask(0).expect("it is renewed");
+    node.recording.close(&node);
+    assert!(node.recording.path().is_none());
+}
+
+#[test]
+fn configured_recording_outlives_the_node() {
+    let folder = std::env::temp_dir().join(format!("sinew-recording-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    // Whatever the user's mask is.
+    std::fs::set_permissions(&folder, std::os::unix::fs::PermissionsExt::from_mode(0o700)).unwrap();
+    let node = node("configured", |config| config.record.folder = Some(folder.clone()));
+    node.recording.begin_configured(&node).expect("it begins");
+    let path = node.recording.path().expect("it records");
+    let (hip, knee) = (app(&node, "hip"), app(&node, "knee"));
+    send(&node, hip, knee, b"kept");
+    // A program comes and goes.
+    node.recording.ask(&node, hip, Selection::default(), Time::now()).expect("it joins");
+    node.recording.leave(&node, hip);
+    send(&node, hip, knee, b"last");
+    node.recording.close(&node);
+    drop(node);
+    assert_eq!(read(&path).0, [b"kept".to_vec(), b"last".to_vec()]);
+    std::fs::remove_dir_all(folder).unwrap();
+}
+
+#[test]
+fn log_of_the_process_is_recorded() {
+    let node = node("log", |_| {});
+    let knee = app(&node, "knee");
+    let path = node.recording.ask(&node, knee, Selection::default(), Time::now()).expect("it begins");
+    log::error!(word = "lost", "the knee has no torque");
+    log::flush(WATCHDOG);
+    let mut reader = JournalReader::open(&path, Start::Oldest).expect("it is there");
+    let (mut bytes, mut lines) = (Vec::new(), Vec::new());
+    while reader.next(0, &mut bytes).expect("it is whole").is_some() {
+        if let Entry::Log(line) = Entry::read(&bytes).expect("a record") {
+            lines.push((line.level, line.text));
+        }
+    }
+    let line = ("error".to_owned(), "the knee has no torque word=\"lost\"".to_owned());
+    assert!(lines.contains(&line), "{lines:?}");
+    node.recording.close(&node);
+}
+
+#[test]
+fn clocks_are_written_each_second() {
+    let node = node("clocks", |_| {});
+    let knee = app(&node, "knee");
+    let path = node.recording.ask(&node, knee, Selection::default(), Time::now()).expect("it begins");
+    let (done, finished) = sync_channel(1);
+    let of = path.clone();
+    std::thread::spawn(move || {
+        while !read(&of).1.contains(&ClockFact::FORM) {
+            std::thread::yield_now();
+        }
+        done.send(()).expect("the test waits");
+    });
+    finished.recv_timeout(WATCHDOG).expect("the clocks are there");
+    node.recording.close(&node);
+}
