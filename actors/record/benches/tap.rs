@@ -56,7 +56,7 @@ fn main() {
     }
     let header = Header::new(Kind::named("bench.message"), source, destination);
     println!("{}", sinew_figures::machine());
-    measure("reading the clock", || drop(black_box(Time::now())));
+    measure("reading the clock", || _ = black_box(Time::now()));
     for bytes in [100, 1_000] {
         let whole = vec![7_u8; bytes];
         let head = sinew_record::message_head(sinew_record::Form::Sent, &header, bytes, None);
