@@ -6,6 +6,15 @@
 //!
 //! This package knows no message, no node and no clock.
 
+mod compare;
+mod encoding;
+mod listing;
 mod shape;
+mod trace;
 
+pub use compare::{Comparison, DIFFERENCES_MAX, Difference, compare};
+pub use encoding::{
+    NAME_BYTES_MAX, PARTS_MAX, SCHEMA_BYTES_MAX, SHAPE_DEPTH_MAX, SchemaError, SchemaHash, TYPES_MAX,
+};
 pub use shape::{Field, Schema, Shape, Variant};
+pub use trace::{Untraced, Wire};

@@ -15,6 +15,15 @@ pub struct Schema {
     pub types: BTreeMap<String, Shape>,
 }
 
+impl Schema {
+    /// Returns the shape that a name stands for, or the shape itself if it is no name. `None`: the schema does not have
+    /// the name, which a parsed schema always has.
+    #[must_use]
+    pub fn resolve<'s>(&'s self, shape: &'s Shape) -> Option<&'s Shape> {
+        if let Shape::Named(name) = shape { self.types.get(name) } else { Some(shape) }
+    }
+}
+
 /// The structure of one value.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Shape {

@@ -1,0 +1,242 @@
+//! What two ends with different versions of a type are told, and properties of bytes and comparisons.
+
+use std::collections::BTreeMap;
+
+use proptest::prelude::*;
+use serde::{Deserialize, Serialize};
+use sinew_schema::{Comparison, Field, Schema, SchemaError, Shape, Variant, compare};
+
+#[derive(Serialize, Deserialize)]
+struct Degrees(f32);
+#[derive(Serialize, Deserialize)]
+struct Radians(f32);
+
+/// Declares a type and returns its schema.
+macro_rules! schema {
+    ($($item:tt)*) => {{
+        #[derive(Serialize, Deserialize)]
+        $($item)*
+        Schema::of::<Payload>().expect("it is traced")
+    }};
+}
+
+fn words(differences: &[sinew_schema::Difference]) -> Vec<String> {
+    differences.iter().map(ToString::to_string).collect()
+}
+
+fn conflict(sent: &Schema, handled: &Schema) -> Vec<String> {
+    let compared = compare(sent, handled);
+    assert!(matches!(compared, Comparison::Conflict(_)), "{compared:?}");
+    words(compared.differences())
+}
+
+fn addition(sent: &Schema, handled: &Schema) -> Vec<String> {
+    let compared = compare(sent, handled);
+    assert!(matches!(compared, Comparison::Addition(_)), "{compared:?}");
+    words(compared.differences())
+}
+
+#[test]
+fn added_fields_pass_where_the_receiver_accepts_them() {
+    let old = schema! { struct Payload { kp: f32 } };
+    let new = schema! { struct Payload { kp: f32, kd: f32 } };
+    let tolerant = schema! { struct Payload { kp: f32, #[serde(default)] kd: f32 } };
+    assert_eq!(addition(&new, &old), ["field `kd` is missing at the receiver"]);
+    assert_eq!(conflict(&old, &new), ["field `kd` is missing at the sender"]);
+    assert_eq!(
+        addition(&old, &tolerant),
+        ["field `kd` is missing at the sender, which the receiver accepts"]
+    );
+    // Whether a field may be absent is no difference where it is there.
+    assert_eq!(compare(&new, &tolerant), Comparison::Same);
+    let both = schema! { struct Payload { kp: f32, ki: u8 } };
+    assert_eq!(
+        conflict(&both, &tolerant),
+        [
+            "field `kd` is missing at the sender, which the receiver accepts",
+            "field `ki` is missing at the receiver"
+        ]
+    );
+}
+
+#[test]
+fn renamed_field_is_named_at_both_ends() {
+    let sent = schema! { struct Payload { angle: f32, limit: f64 } };
+    let handled = schema! { struct Payload { degrees: f32, limit: f64 } };
+    let said = ["field `angle` (f32) at the sender seems to be `degrees` (f32) at the receiver"];
+    assert_eq!(conflict(&sent, &handled), said);
+    // Also where the receiver would accept a message without it.
+    let tolerant = schema! { struct Payload { #[serde(default)] degrees: f32, limit: f64 } };
+    assert_eq!(conflict(&sent, &tolerant), said);
+}
+
+#[test]
+fn other_numbers_and_units_are_conflicts() {
+    let sent = schema! { struct Payload { limits: Vec<f64>, angle: Degrees, turn: f32 } };
+    let handled = schema! { struct Payload { limits: Vec<f32>, angle: Radians, turn: Degrees } };
+    assert_eq!(
+        conflict(&sent, &handled),
+        [
+            "`limits[]` is f64 at the sender and f32 at the receiver",
+            "`angle` is in Degrees at the sender and Radians at the receiver",
+            "`turn` is f32 at the sender and Degrees (f32) at the receiver",
+        ]
+    );
+}
+
+#[test]
+fn nested_types_are_compared_by_their_parts() {
+    let sent = {
+        #[derive(Serialize, Deserialize)]
+        enum Mode {
+            Stand,
+            Walk { speed: f32 },
+            Run,
+        }
+        schema! { struct Payload { mode: Option<Mode> } }
+    };
+    let handled = {
+        #[derive(Serialize, Deserialize)]
+        enum Gait {
+            Stand,
+            Walk { speed: f32 },
+        }
+        schema! { struct Payload { mode: Option<Gait> } }
+    };
+    let other = {
+        #[derive(Serialize, Deserialize)]
+        enum Mode {
+            Stand,
+            Walk { speed: i32 },
+        }
+        schema! { struct Payload { mode: Option<Mode> } }
+    };
+    assert_eq!(addition(&sent, &handled), ["variant `mode.Run` is missing at the receiver"]);
+    assert_eq!(addition(&handled, &sent), ["variant `mode.Run` is missing at the sender"]);
+    assert_eq!(
+        conflict(&other, &handled),
+        ["`mode.Walk.speed` is i32 at the sender and f32 at the receiver"]
+    );
+}
+
+#[test]
+fn payloads_without_fields_are_the_same() {
+    let unit = schema! { struct Payload; };
+    let braces = schema! { struct Payload {} };
+    let one = schema! { struct Payload { x: u8 } };
+    assert_eq!(compare(&unit, &braces), Comparison::Same);
+    assert_eq!(conflict(&one, &unit), ["the payload is { x: u8 } at the sender and nothing at the receiver"]);
+}
+
+#[test]
+fn hostile_bytes_are_refused() {
+    let endless = Schema {
+        root: Shape::Named("A".into()),
+        types: BTreeMap::from([
+            ("A".into(), Shape::Option(Box::new(Shape::Named("B".into())))),
+            ("B".into(), Shape::Newtype(Box::new(Shape::Named("A".into())))),
+        ]),
+    };
+    let dangling = Schema { root: Shape::Named("A".into()), types: BTreeMap::new() };
+    let unused = Schema { root: Shape::U8, types: BTreeMap::from([("A".into(), Shape::U8)]) };
+    let mut deep = Shape::U8;
+    for _ in 0..100 {
+        deep = Shape::List(Box::new(deep));
+    }
+    let deep = Schema { root: deep, types: BTreeMap::new() };
+    for (schema, error) in [
+        (endless, SchemaError::Endless),
+        (dangling, SchemaError::Dangling),
+        (unused, SchemaError::Dangling),
+        (deep, SchemaError::TooMuch),
+    ] {
+        assert_eq!(Schema::parse(&schema.encode()), Err(error));
+    }
+    for (bytes, error) in [
+        (&[][..], SchemaError::Short),
+        (&[2, 0, 0], SchemaError::Unknown),
+        (&[1, 99, 0], SchemaError::Unknown),
+        (&[1, 0, 0, 0], SchemaError::Rest),
+        // A number in a longer form than needed.
+        (&[1, 0, 0x80, 0], SchemaError::NotCanonical),
+        // A million parts that do not follow.
+        (&[1, 20, 0x80, 0x08], SchemaError::Short),
+        (&[0; 9_000], SchemaError::TooLong),
+    ] {
+        assert_eq!(Schema::parse(bytes), Err(error), "{} bytes", bytes.len());
+    }
+}
+
+fn name() -> impl Strategy<Value = String> {
+    "[a-c]{1,2}"
+}
+
+fn shape() -> impl Strategy<Value = Shape> {
+    let leaf =
+        prop::sample::select(vec![Shape::Unit, Shape::Bool, Shape::U8, Shape::F32, Shape::F64, Shape::Text]);
+    leaf.prop_recursive(4, 24, 4, |inner| {
+        let boxed = || inner.clone().prop_map(Box::new);
+        let fields = prop::collection::btree_map(name(), (inner.clone(), any::<bool>()), 0..4)
+            .prop_map(|fields| {
+                let field = |(name, (shape, optional))| Field { name, shape, optional };
+                Shape::Struct(fields.into_iter().map(field).collect())
+            })
+            .boxed();
+        let variants = prop::collection::btree_map(name(), fields.clone(), 1..4).prop_map(|variants| {
+            Shape::Enum(variants.into_iter().map(|(name, shape)| Variant { name, shape }).collect())
+        });
+        prop_oneof![
+            boxed().prop_map(Shape::Option),
+            boxed().prop_map(Shape::List),
+            (boxed(), 0..300_usize).prop_map(|(inner, length)| Shape::Array(inner, length)),
+            prop::collection::vec(inner.clone(), 0..4).prop_map(Shape::Tuple),
+            (boxed(), boxed()).prop_map(|(key, value)| Shape::Map(key, value)),
+            fields,
+            variants,
+        ]
+    })
+}
+
+/// A schema with up to three types, of which the root names all.
+fn schema() -> impl Strategy<Value = Schema> {
+    (shape(), prop::collection::btree_map("[A-C]", (shape(), any::<bool>()), 0..3)).prop_map(
+        |(root, types)| {
+            let named = types.keys().map(|name| Shape::Named(name.clone()));
+            let root = Shape::Tuple(named.chain([root]).collect());
+            let typed = |(name, (shape, is_unit)): (String, (Shape, bool))| {
+                (name, if is_unit { Shape::Newtype(Box::new(shape)) } else { shape })
+            };
+            Schema { root, types: types.into_iter().map(typed).collect() }
+        },
+    )
+}
+
+proptest! {
+    #[test]
+    fn bytes_are_read_back_and_equal_schemas_have_equal_hashes(one in schema(), other in schema()) {
+        prop_assert_eq!(Schema::parse(&one.encode()), Ok(one.clone()));
+        prop_assert_eq!(one == other, one.hash() == other.hash());
+    }
+
+    #[test]
+    fn changed_bytes_are_refused_or_canonical(one in schema(), at in any::<prop::sample::Index>(), byte in any::<u8>()) {
+        let mut bytes = one.encode();
+        let at = at.index(bytes.len());
+        bytes[at] = byte;
+        if let Ok(read) = Schema::parse(&bytes) {
+            prop_assert_eq!(read.encode(), bytes);
+            let _ = (read.to_string(), compare(&one, &read), compare(&read, &one));
+        }
+    }
+
+    #[test]
+    fn comparison_with_itself_is_the_same_and_sides_agree(one in schema(), other in schema()) {
+        prop_assert_eq!(compare(&one, &one), Comparison::Same);
+        let is_same = |one, other| compare(one, other) == Comparison::Same;
+        prop_assert_eq!(is_same(&one, &other), is_same(&other, &one));
+        prop_assert_eq!(
+            compare(&one, &other).differences().is_empty(),
+            compare(&other, &one).differences().is_empty()
+        );
+    }
+}
