@@ -1,13 +1,15 @@
-//! Where in each period of the host's clock the loops tick, so that each finds the newest input, and the thread
-//! of a joint wakes once for its sensor and its drive.
+//! Where in each period of the host's clock the loops tick, so that each finds young inputs.
 //!
 //! ```text
-//!  0        150      200                500                            1000 us
-//!  plant    sensors  drives             central's gait                 plant
-//!   readings ──►  samples ──►────────────►  commands ──► drives, in the next period
+//!  0          150         300          400                       1000 us
+//!  plant      sensors     gait         drives                    plant
+//!   readings ──► samples ──► commands ──► torques ─────────────────►
 //! ```
 //!
-//! On hosts with clocks of their own the slots of one joint keep their order; those of different nodes do not.
+//! With phases by chance each input is up to a period old. Timers that are due fire before messages, so each
+//! slot is later than the one before it by more than a usual wake (60 us) and a tick.
+//!
+//! On hosts with clocks of their own, only the slots of one node keep their distance.
 
 use std::time::Duration;
 
@@ -19,10 +21,10 @@ use super::PERIOD;
 pub(super) const PLANT: Duration = Duration::ZERO;
 /// A sensor's tick: the reading has come.
 pub(super) const SENSOR: Duration = Duration::from_micros(150);
-/// A drive's tick: the thread has just handled the sample, and has not slept since.
-pub(super) const DRIVE: Duration = Duration::from_micros(200);
 /// The tick of central's gait: the samples of all joints have come.
-pub(super) const GAIT: Duration = Duration::from_micros(500);
+pub(super) const GAIT: Duration = Duration::from_micros(300);
+/// A drive's tick: the sample and central's command have come.
+pub(super) const DRIVE: Duration = Duration::from_micros(400);
 
 /// Returns the first time after `now` in this slot.
 pub(super) fn next(now: Time, slot: Duration) -> Time {

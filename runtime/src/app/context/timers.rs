@@ -51,10 +51,10 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     }
 
     /// Calls `action` once per period, on a grid that begins at `first`. Otherwise the same as
-    /// [`every`](Self::every).
+    /// [`every`](Self::every). If `first` has passed, the first call comes at once, and is late.
     ///
-    /// Loops of one thread that are due within some 0.1 ms of each other share one wake of that thread, which
-    /// costs more than the rest of a short tick.
+    /// A loop that uses the value of another one finds it young if it ticks shortly after it. The distance must
+    /// cover a late wake and the other loop's tick: timers that are due fire before messages.
     ///
     /// # Examples
     ///
@@ -64,10 +64,10 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     /// struct Knee { reference: f32 }
     /// # impl Actor for Knee { type Context = AppContext<Self>; }
     ///
-    /// /// Ticks 50 us after each sample: it has come by then, and is young.
+    /// /// Ticks 250 us after each sample is due.
     /// fn follow(sampled: Time, ctx: &mut AppContext<Knee>) {
-    ///     let period = Duration::from_millis(1);
-    ///     ctx.every_from(sampled + period + Duration::from_micros(50), period, |knee, _, _| knee.reference = 0.0);
+    ///     let (period, distance) = (Duration::from_millis(1), Duration::from_micros(250));
+    ///     ctx.every_from(sampled + distance, period, |knee, _, _| knee.reference = 0.0);
     /// }
     /// ```
     pub fn every_from(
