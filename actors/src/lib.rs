@@ -24,6 +24,7 @@
 //! | protected commands and safe outputs | [`protection`] |
 //! | counts of every message | [`audit`] |
 //! | reports for tools | [`inspect`] |
+//! | the structure of payload types | [`schema`] |
 //! | signals | [`signals`] |
 //! | clocks, timers | [`Time`], [`time`] |
 //! | applications in virtual time, on recorded inputs | [`replay`] |
@@ -156,6 +157,16 @@ pub mod message {
             UnknownNameError,
         },
         wire::{Class, Kind, MessageBuffer, Payload, TIME_TO_LIVE_MAX},
+    };
+}
+
+/// The structure of payload types: which fields, variants and numbers they have on the wire, and the differences
+/// between two versions of a type.
+pub mod schema {
+    pub use sinew_runtime::wire::{TypeSchema, schema_of};
+    pub use sinew_schema::{
+        Comparison, Difference, Field, SCHEMA_BYTES_MAX, Schema, SchemaError, SchemaHash, Shape, Untraced,
+        Variant, compare,
     };
 }
 

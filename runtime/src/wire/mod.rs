@@ -15,6 +15,7 @@ mod protection;
 mod read;
 mod strict;
 mod type_names;
+mod type_schema;
 
 pub use age::may_be_older;
 pub use codec::{Checksum, FrameCodec, FrameError, decode_datagram, encode_frame};
@@ -26,3 +27,4 @@ pub use message::{DecodeError, Message, MessageBuffer, Payload, encode};
 pub use protection::Protection;
 pub use read::decode;
 pub(crate) use type_names::remember;
+pub use type_schema::{TypeSchema, schema_of};

@@ -1,5 +1,7 @@
 //! Files written by users and their tools: configurations, keys, recorded trials, topologies.
 
+use std::collections::BTreeMap;
+
 use exoskeleton::robot::topology::Topology;
 use exoskeleton_model::{
     datagram::{CommandFrame, Reading},
@@ -12,6 +14,7 @@ use sinew::{
     fault::Fault,
     security::{Certificate, DenyList, DiscoveryKey, Serial, rustls::pki_types::CertificateDer},
 };
+use sinew_schema::{Comparison, Field, SCHEMA_BYTES_MAX, Schema, Shape, Variant, compare};
 
 /// Maximum length of a text, in bytes. Longer texts only repeat the same structures.
 const TEXT_MAX: usize = 16 * 1024;
@@ -70,6 +73,51 @@ pub(crate) fn configuration(bytes: &[u8]) -> bool {
         text.parse::<Fault>().is_ok(),
     ];
     is_key || others.contains(&true)
+}
+
+pub(crate) fn some_schemas() -> Vec<Vec<u8>> {
+    let field = |name: &str, shape, optional| Field { name: name.to_owned(), shape, optional };
+    let named = |name: &str| Shape::Named(name.to_owned());
+    let walk = Shape::Struct(vec![field("speed", Shape::F32, false)]);
+    let variants =
+        [("Stand", Shape::Unit), ("Walk", walk), ("Hold", Shape::Newtype(Box::new(named("Degrees"))))];
+    let mode = variants.map(|(name, shape)| Variant { name: name.to_owned(), shape });
+    let pose = Shape::Struct(vec![
+        field("mode", Shape::Option(Box::new(named("Mode"))), true),
+        field("legs", Shape::List(Box::new(Shape::Array(Box::new(Shape::F64), 300))), false),
+        field(
+            "by_joint",
+            Shape::Map(Box::new(Shape::Text), Box::new(Shape::Tuple(vec![Shape::U8, Shape::Bytes]))),
+            false,
+        ),
+    ]);
+    let types = BTreeMap::from([
+        ("Degrees".to_owned(), Shape::Newtype(Box::new(Shape::F32))),
+        ("Mode".to_owned(), Shape::Enum(mode.into())),
+    ]);
+    [Schema { root: pose, types }, Schema { root: Shape::Unit, types: BTreeMap::new() }]
+        .map(|schema| schema.encode())
+        .into()
+}
+
+/// The structure of a payload type: canonical, compared with another one, and listed.
+pub(crate) fn schema(bytes: &[u8]) -> bool {
+    let schema = match Schema::parse(bytes) {
+        Ok(schema) => schema,
+        Err(error) => {
+            assert!(!error.to_string().is_empty(), "a refusal has words");
+            return false;
+        }
+    };
+    assert!(bytes.len() <= SCHEMA_BYTES_MAX && schema.encode() == bytes);
+    assert_eq!(compare(&schema, &schema), Comparison::Same);
+    assert!(!schema.to_string().is_empty());
+    for other in some_schemas() {
+        let other = Schema::parse(&other).expect("it was just written");
+        let sides = [compare(&schema, &other), compare(&other, &schema)].map(|side| side == Comparison::Same);
+        assert_eq!(sides[0], sides[1]);
+    }
+    true
 }
 
 /// A node certificate made by `sinew keys issue`. The copy in the corpus is the same.

@@ -29,7 +29,7 @@ pub struct Format {
 }
 
 /// All formats.
-pub const FORMATS: [Format; 19] = [
+pub const FORMATS: [Format; 20] = [
     Format {
         name: "header",
         from: "a peer, by TCP or UDP",
@@ -96,6 +96,12 @@ pub const FORMATS: [Format; 19] = [
         from: "layers of other nodes, child processes",
         play: sinew::fuzzing::words,
         seeds: || sinew::fuzzing::seeds("words"),
+    },
+    Format {
+        name: "schemas",
+        from: "a node, a client, or a recording",
+        play: files::schema,
+        seeds: files::some_schemas,
     },
     Format { name: "ring", from: "a client, in shared memory", play: ring, seeds: some_scripts },
     Format {
