@@ -23,9 +23,9 @@ impl Folder {
         let path = std::env::temp_dir().join(format!("sinew-journal-{name}-{}", std::process::id()));
         // An earlier process of this number may have left it.
         let _ = fs::remove_dir_all(&path);
-        fs::create_dir_all(&path).unwrap();
+        fs::create_dir_all(&path).expect("the folder can be made");
         // Whatever the user's mask is.
-        fs::set_permissions(&path, fs::Permissions::from_mode(0o700)).unwrap();
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o700)).expect("the folder is its own");
         Self(path)
     }
 
