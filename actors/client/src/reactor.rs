@@ -135,7 +135,6 @@ impl Reactor {
                 return Poll::Ready(LinkEvent::Bell);
             }
             if poll_rung(message, cx).is_ready() {
-                listening.is_node_rung = true;
                 return Poll::Ready(LinkEvent::Bell);
             }
             match links.poll(cx) {
@@ -146,7 +145,6 @@ impl Reactor {
             }
         })
         .await;
-        links.note_rung(&mut *listening.direct);
         drop(listening);
         direct.on_wake(event == LinkEvent::HungUp);
     }
@@ -160,7 +158,6 @@ impl Reactor {
             event = poll_fn(|cx| links.poll(cx)) => event,
             () = at(deadline) => LinkEvent::Bell,
         };
-        links.note_rung(&mut *listening.direct);
         drop(listening);
         direct.on_wake(event == LinkEvent::HungUp);
     }
@@ -300,15 +297,13 @@ struct Listening<'a> {
     node: Option<&'a mut ring::Reader>,
     direct: &'a mut Direct,
     room: Option<Room>,
-    /// Whether the node has rung.
-    is_node_rung: bool,
 }
 
 impl<'a> Listening<'a> {
     /// Announces the sleep. Returns `None` if there is something to do already.
     fn begin(node: Option<&'a mut ring::Reader>, direct: &'a mut Direct, room: Option<Room>) -> Option<Self> {
-        let mut listening = Self { node, direct, room, is_node_rung: false };
-        let Self { node, direct, room, .. } = &mut listening;
+        let mut listening = Self { node, direct, room };
+        let Self { node, direct, room } = &mut listening;
         let is_silent = node.as_mut().is_none_or(|node| node.arm() == Armed::Sleep)
             && direct.open.iter_mut().all(|link| link.arm() == Armed::Sleep)
             && room.is_none_or(|room| direct.arm_room(room) == Armed::Sleep);
@@ -326,7 +321,7 @@ impl<'a> Listening<'a> {
 impl Drop for Listening<'_> {
     fn drop(&mut self) {
         if let Some(node) = &mut self.node {
-            node.disarm(self.is_node_rung);
+            node.disarm();
         }
         self.direct.open.iter_mut().for_each(EstablishedLink::disarm);
         if let Some(room) = self.room {
@@ -363,8 +358,8 @@ fn poll_rung(bell: &UnixStream, cx: &mut Context<'_>) -> Poll<()> {
 /// Ready when the other end of a socket has closed it.
 fn poll_hung_up(socket: &UnixStream, cx: &mut Context<'_>) -> Poll<()> {
     loop {
-        let _ = ready!(socket.poll_read_ready(cx));
-        if link_socket::hangs_up(socket) {
+        // An error is the end of the reactor, and stays.
+        if ready!(socket.poll_read_ready(cx)).is_err() || link_socket::hangs_up(socket) {
             return Poll::Ready(());
         }
         forget(socket);

@@ -19,7 +19,7 @@ pub struct Consumer {
     room_button: Box<dyn Doorbell>,
     spinner: Spinner,
     slot: Option<Slot>,
-    /// Rings that were reported and are still in the descriptor.
+    /// Sleeps since the descriptor was emptied. A peer rings once at most for each, reported or not.
     rings: u32,
 }
 
@@ -164,10 +164,10 @@ impl Consumer {
     }
 
     /// Announces that the reactor is awake, for one that reports each ring once, such as an edge-triggered `epoll`.
-    /// `is_rung`: it has reported one. The rings stay in the descriptor, and are discarded long before they fill it.
-    pub fn disarm_reported(&mut self, is_rung: bool) {
+    /// The rings stay in the descriptor, and are discarded long before they fill it.
+    pub fn disarm_reported(&mut self) {
         self.core.disarm();
-        self.rings += u32::from(is_rung);
+        self.rings += 1;
         if self.rings >= RINGS_KEPT {
             self.rings = 0;
             self.message.drain();

@@ -52,8 +52,6 @@ pub(crate) struct EstablishedLink {
     /// The rest of a long frame. Nothing else is written before it.
     rest: Option<Rest>,
     has_forged: bool,
-    /// Whether the reactor has reported a ring of the peer.
-    pub(crate) is_rung: bool,
     /// Whether a sender has reached its stall timeout on this link.
     pub(super) is_stalled: bool,
     /// Counts its messages for the node.
@@ -114,7 +112,6 @@ impl EstablishedLink {
             parked: Vec::new(),
             rest: None,
             has_forged: false,
-            is_rung: false,
             is_stalled: false,
             account: LinkAccount::default(),
             begun: None,
@@ -139,7 +136,7 @@ impl EstablishedLink {
 
     /// Records that the task is awake.
     pub(crate) fn disarm(&mut self) {
-        self.consumer.disarm_reported(std::mem::take(&mut self.is_rung));
+        self.consumer.disarm_reported();
     }
 
     /// Sends a message if nothing waits before it and there is room at once for all of it. Returns whether it was sent:

@@ -33,8 +33,6 @@ struct Bell(Option<UnixStream>);
 struct Watched {
     number: LinkNumber,
     message: Bell,
-    /// Whether it was rung.
-    is_rung: bool,
     socket: UnixStream,
     /// Reported once; the remaining messages are read before the link ends.
     has_hung_up: bool,
@@ -69,11 +67,13 @@ impl Links {
         let mut event = self.poll_room(cx).map(|()| LinkEvent::Bell);
         for link in &mut self.open {
             if link.message.poll(cx).is_ready() {
-                link.is_rung = true;
                 event = Poll::Ready(LinkEvent::Bell);
             }
-            while !link.has_hung_up && link.socket.poll_read_ready(cx).is_ready() {
-                link.has_hung_up = socket::hangs_up(&link.socket);
+            while !link.has_hung_up
+                && let Poll::Ready(state) = link.socket.poll_read_ready(cx)
+            {
+                // An error is the end of the reactor, and stays.
+                link.has_hung_up = state.is_err() || socket::hangs_up(&link.socket);
                 if link.has_hung_up {
                     return Poll::Ready(LinkEvent::HungUp);
                 }
@@ -81,16 +81,6 @@ impl Links {
             }
         }
         event
-    }
-
-    /// Tells the links which of them were rung.
-    pub(super) fn note_rung(&mut self, direct: &mut Direct) {
-        for watched in self.open.iter_mut().filter(|watched| watched.is_rung) {
-            watched.is_rung = false;
-            if let Some(link) = direct.open.iter_mut().find(|link| link.number == watched.number) {
-                link.is_rung = true;
-            }
-        }
     }
 
     /// Ready when the peer for which a sender waits has read something.
@@ -128,7 +118,7 @@ impl Watched {
     fn of(link: &EstablishedLink) -> io::Result<Self> {
         let bell = link.bell().ok_or(io::ErrorKind::Unsupported)?;
         let (message, socket) = (Bell::of(bell)?, watch(link.socket().as_fd())?);
-        Ok(Self { number: link.number, message, is_rung: false, socket, has_hung_up: false })
+        Ok(Self { number: link.number, message, socket, has_hung_up: false })
     }
 }
 
@@ -154,8 +144,7 @@ mod tests {
             let pair = || net::UnixStream::pair().unwrap();
             let ((listening, mut button), (socket, _peer)) = (pair(), pair());
             let (message, socket) = (Bell::of(listening.as_fd()).unwrap(), watch(socket.as_fd()).unwrap());
-            let open =
-                vec![Watched { number: LinkNumber(1), message, is_rung: false, socket, has_hung_up: false }];
+            let open = vec![Watched { number: LinkNumber(1), message, socket, has_hung_up: false }];
             let mut links = Links { open, room: None };
             // given: a wake-up is received, and then there is none
             button.write_all(&[1]).unwrap();

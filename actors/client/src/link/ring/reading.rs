@@ -267,8 +267,8 @@ impl Reader {
     }
 
     /// Records that the task is awake, and whether this ring has woken it.
-    pub(crate) fn disarm(&mut self, is_rung: bool) {
-        self.end.consumer.disarm_reported(is_rung);
+    pub(crate) fn disarm(&mut self) {
+        self.end.consumer.disarm_reported();
     }
 
     /// Makes the next poll of the ring check the socket, too.
