@@ -417,7 +417,8 @@ impl Direct {
         if !others.any(EstablishedLink::has_pending) {
             return deadline;
         }
-        self.next_flush = now + FLUSH_INTERVAL;
+        // Never later: messages that end each wait must not put it off.
+        self.next_flush = self.next_flush.min(now + FLUSH_INTERVAL);
         deadline.min(self.next_flush)
     }
 
