@@ -14,7 +14,10 @@ impl<O> Shared<O> {
     pub(super) fn set_deadline(&self, deadline: u64) {
         self.watch.deadline.store(deadline, Ordering::Release);
         if let Some(wake_up) = &self.wake_up {
-            wake_up.set((deadline != u64::MAX).then(|| Time::from_nanos(deadline)));
+            // A trip meanwhile is not replaced by the former deadline.
+            let is_tripped = self.watch.is_tripped.load(Ordering::Acquire);
+            let deadline = (deadline != u64::MAX).then(|| Time::from_nanos(deadline));
+            wake_up.set(if is_tripped { Some(Time::ZERO) } else { deadline });
         }
     }
 
