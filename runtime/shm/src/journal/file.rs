@@ -13,7 +13,7 @@ use std::{
     ffi::{OsStr, OsString},
     fs::File,
     io,
-    os::unix::fs::FileExt,
+    os::unix::fs::{FileExt, MetadataExt},
     path::Path,
     slice,
     sync::atomic::{AtomicU32, AtomicU64, Ordering},
@@ -40,7 +40,7 @@ use super::{
 pub(crate) struct Map {
     raw: MmapRaw,
     /// Open as long as the journal: its lock tells readers that the writer lives.
-    _lock: File,
+    lock: File,
 }
 
 impl Map {
@@ -48,6 +48,14 @@ impl Map {
         // SAFETY: J1: this many bytes are mapped there, aligned to a page; J2: all access to them is atomic and of this
         // size; J3.
         unsafe { slice::from_raw_parts(self.raw.as_ptr().cast::<AtomicU64>(), self.raw.len() / 8) }
+    }
+
+    /// Returns whether the file still has this name.
+    pub(crate) fn is_at(&self, path: &Path) -> bool {
+        match (self.lock.metadata(), path.symlink_metadata()) {
+            (Ok(own), Ok(there)) => (own.dev(), own.ino()) == (there.dev(), there.ino()),
+            _ => false,
+        }
     }
 
     /// A word of the first page.
@@ -117,7 +125,7 @@ pub(crate) fn create(
         Ok(raw)
     };
     match finish() {
-        Ok(raw) => Ok(Map { raw, _lock: file }),
+        Ok(raw) => Ok(Map { raw, lock: file }),
         Err(error) => {
             // The first error is the one to report.
             let _ = unlinkat(&folder, &temporary, AtFlags::empty());

@@ -11,7 +11,10 @@ use std::{
     time::Duration,
 };
 
-use rustix::fs::{FlockOperation, Mode, OFlags, flock};
+use rustix::{
+    fs::{FlockOperation, Mode, OFlags, flock},
+    io::Errno,
+};
 
 use super::{
     core::{
@@ -198,7 +201,7 @@ impl JournalReader {
                 let _ = flock(&self.file.file, FlockOperation::Unlock);
                 false
             }
-            Err(_) => true,
+            Err(error) => error == Errno::WOULDBLOCK,
         }
     }
 

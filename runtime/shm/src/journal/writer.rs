@@ -90,6 +90,14 @@ impl Journal {
         Ok(Self { map, salt: header.salt, payload_max: payload_max(ring_bytes), path: path.to_owned() })
     }
 
+    /// Removes the file, unless another one has its name now. Readers that have it open read it to its end.
+    pub fn remove(&self) {
+        if self.map.is_at(&self.path) {
+            // It stays if its folder refuses that.
+            let _ = std::fs::remove_file(&self.path);
+        }
+    }
+
     /// Returns the path at which the file was created.
     #[must_use]
     pub fn path(&self) -> &Path {

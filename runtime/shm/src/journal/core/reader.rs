@@ -156,7 +156,9 @@ impl ReaderCore {
                     }
                     self.failed_bytes = self.failed_bytes.saturating_add(bytes);
                     if self.failed_bytes > self.ring_bytes * 2 + (self.at - self.began) {
-                        return Ok(Next::Damaged(self.at));
+                        let at = self.at;
+                        self.search();
+                        return Ok(Next::Damaged(at));
                     }
                     self.counts.damaged += 1;
                     self.search();
@@ -185,7 +187,7 @@ impl ReaderCore {
     }
 
     fn move_by(&mut self, bytes: u64) {
-        self.at += bytes;
+        self.at = self.at.saturating_add(bytes);
         self.stalled = None;
     }
 
