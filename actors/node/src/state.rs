@@ -77,9 +77,9 @@ impl NodeState {
     /// Releases the node's socket and its address for inspection, so that another node can use them even if a
     /// hung thread still holds the state.
     pub(crate) fn close(&self) {
-        self.recording.close(self);
         self.lncl.client_socket.close();
         self.ctx.router.remove_local(AppAddress::INSPECT);
+        self.recording.close(self);
         self.gncl.store.close();
         self.gncl.store.end_threads();
         lock(&self.ndl.sockets).close_all();

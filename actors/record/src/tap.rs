@@ -6,7 +6,7 @@ use sinew_runtime::{
     router::tap::{Passage, Tap, Way},
     tid::{NodeAddress, Tid},
     time::Time,
-    wire::{Class, Kind},
+    wire::{Class, Header, Kind},
 };
 use sinew_shm::journal::Journal;
 
@@ -26,12 +26,19 @@ impl RecordTap {
         Self { node, journal, chosen }
     }
 
+    /// Returns whether the message has a record at its sender.
+    fn has_sender(&self, header: &Header) -> bool {
+        let Header { source, destination, kind, .. } = *header;
+        self.watches(source)
+            && (self.chosen.has(source, destination, kind) || self.chosen.has(source, source, kind))
+    }
+
     /// Returns the form of the record, or `None` if the message has one already: a message between two applications of
     /// this node passes once for each of them.
     fn form(&self, passage: &Passage<'_>) -> Option<Form> {
         match passage.way {
             Way::Out => Some(Form::Sent),
-            Way::In if !self.watches(passage.header.source) => Some(Form::Received),
+            Way::In if !self.has_sender(passage.header) => Some(Form::Received),
             // The record of the sender has no result of each member of a group.
             Way::In if passage.refused.is_some() && !passage.header.destination.is_single() => {
                 Some(Form::Received)
@@ -84,7 +91,7 @@ mod tests {
     use std::path::PathBuf;
 
     use bytes::Bytes;
-    use sinew_runtime::{outcome::Rejection, tid::AppAddress, wire::Header};
+    use sinew_runtime::{outcome::Rejection, tid::AppAddress};
     use sinew_shm::journal::{JournalReader, Options, Start};
 
     use super::*;

@@ -26,6 +26,7 @@ use sinew_runtime::{
     router::tap::{Tap, TapOf},
     tid::Tid,
     time::Time,
+    wire::Kind,
 };
 use sinew_shm::journal::{CreateJournalError, Journal, Options};
 
@@ -58,6 +59,8 @@ struct State {
     configured: Option<Selection>,
     /// Those of programs, each until its lease ends.
     programs: BTreeMap<Tid, (Selection, Time)>,
+    /// Whether the node ends, and records no more.
+    is_closed: bool,
 }
 
 /// A recording that runs.
@@ -80,6 +83,9 @@ pub(crate) enum RecordError {
     /// The system has no thread for it.
     #[error("the system gives no thread for the recording: {0}")]
     Thread(#[from] io::Error),
+    /// The node ends.
+    #[error("this node is ending")]
+    Closed,
     /// As many programs record as may.
     #[error("{PROGRAMS_MAX} programs record on this node at once, and so many do; end another one")]
     Programs,
@@ -94,9 +100,10 @@ impl Recording {
         }
         let selection =
             Selection { apps: config.apps.clone(), types: config.types.clone(), groups: Vec::new() };
+        let names = KnownNames::of(node);
         let mut state = self.lock();
         state.configured = Some(selection);
-        self.start(node, &mut state)
+        self.start(node, &names, &mut state)
     }
 
     /// Starts or renews the recording for a program. Returns the journal's path.
@@ -107,12 +114,16 @@ impl Recording {
         selection: Selection,
         now: Time,
     ) -> Result<PathBuf, RecordError> {
+        let names = KnownNames::of(node);
         let mut state = self.lock();
+        if state.is_closed {
+            return Err(RecordError::Closed);
+        }
         if state.programs.len() >= PROGRAMS_MAX && !state.programs.contains_key(&program) {
             return Err(RecordError::Programs);
         }
         state.programs.insert(program, (selection, now + LEASE));
-        if let Err(why) = self.start(node, &mut state) {
+        if let Err(why) = self.start(node, &names, &mut state) {
             state.programs.remove(&program);
             return Err(why);
         }
@@ -122,9 +133,10 @@ impl Recording {
 
     /// Ends the recording for a program.
     pub(crate) fn leave(&self, node: &NodeState, program: Tid) {
+        let names = KnownNames::of(node);
         let mut state = self.lock();
         if state.programs.remove(&program).is_some() {
-            self.settle(node, &mut state);
+            self.settle(node, &names, &mut state);
         }
     }
 
@@ -137,6 +149,7 @@ impl Recording {
     /// Ends the recording with the node. The file of a configured one stays.
     pub(crate) fn close(&self, node: &NodeState) {
         let mut state = self.lock();
+        state.is_closed = true;
         state.programs.clear();
         let is_kept = state.configured.take().is_some();
         if let Some(active) = state.active.take() {
@@ -149,7 +162,7 @@ impl Recording {
     }
 
     /// Makes the journal and the thread, if there are none, and updates the tap.
-    fn start(&self, node: &Arc<NodeState>, state: &mut State) -> Result<(), RecordError> {
+    fn start(&self, node: &Arc<NodeState>, names: &KnownNames, state: &mut State) -> Result<(), RecordError> {
         if state.active.is_none() {
             let now = Time::now();
             let journal = Arc::new(create(node, now)?);
@@ -161,19 +174,23 @@ impl Recording {
             };
             facts::write(&journal, node.ctx.node, now, &began);
             let (weak, of) = (Arc::downgrade(node), journal.clone());
-            std::thread::Builder::new().name("record".to_owned()).spawn(move || run(&weak, &of))?;
+            let thread = std::thread::Builder::new().name("record".to_owned());
+            if let Err(why) = thread.spawn(move || run(&weak, &of)) {
+                journal.remove();
+                return Err(why.into());
+            }
             let log: Arc<dyn LogObserver> =
                 Arc::new(LogWriter { node: node.ctx.node, journal: journal.clone() });
             // More nodes of one process than have room record without the log.
             log::observe(&log);
             state.active = Some(Active { journal, selection: Selection::default(), chosen: None, _log: log });
         }
-        self.settle(node, state);
+        self.settle(node, names, state);
         Ok(())
     }
 
     /// Fits the tap to the selections, or ends the recording without any.
-    fn settle(&self, node: &NodeState, state: &mut State) {
+    fn settle(&self, node: &NodeState, names: &KnownNames, state: &mut State) {
         let State { active: Some(active), configured, programs } = state else { return };
         let mut all = configured.iter().chain(programs.values().map(|(selection, _)| selection));
         let Some(mut sum) = all.next().cloned() else {
@@ -184,31 +201,31 @@ impl Recording {
         };
         all.for_each(|selection| sum.add(selection));
         active.selection = sum;
-        active.refresh(node);
+        active.refresh(node, names);
     }
 
     fn remove(&self, node: &NodeState, active: &Active, is_kept: bool) {
         install(node, None);
         if !is_kept {
-            // A reader that has it open reads it to its end.
-            let _ = std::fs::remove_file(active.journal.path());
+            active.journal.remove();
         }
         self.ended.notify_all();
     }
 
     /// Looks at the selected names, and ends expired leases. Returns whether this journal is still written.
     fn refresh(&self, node: &NodeState, journal: &Arc<Journal>, now: Time) -> bool {
+        let names = KnownNames::of(node);
         let mut state = self.lock();
         let before = state.programs.len();
         state.programs.retain(|_, (_, until)| *until > now);
         if state.programs.len() < before {
-            self.settle(node, &mut state);
+            self.settle(node, &names, &mut state);
         }
         let Some(active) = state.active.as_mut().filter(|active| Arc::ptr_eq(&active.journal, journal))
         else {
             return false;
         };
-        active.refresh(node);
+        active.refresh(node, &names);
         true
     }
 
@@ -220,21 +237,34 @@ impl Recording {
     }
 }
 
+/// The names of the node's applications and of payload types. They are read without the lock of the recording: a layer
+/// that hangs must not stop the end of the node.
+struct KnownNames {
+    apps: Vec<(String, Tid)>,
+    kinds: BTreeMap<Kind, String>,
+}
+
+impl KnownNames {
+    fn of(node: &NodeState) -> Self {
+        let directory = node.ctx.ports.names().map(|names| names.directory()).unwrap_or_default();
+        let kinds = directory.iter().flat_map(|entry| entry.kinds.iter().copied());
+        let kinds = kinds
+            .filter_map(|kind| Some((kind, sinew_lncl::undelivered::kind_name(&node.lncl, kind)?)))
+            .collect();
+        let apps = directory.into_iter().filter(|entry| entry.tid.node == node.ctx.node);
+        Self { apps: apps.map(|entry| (entry.name, entry.tid)).collect(), kinds }
+    }
+}
+
 impl Active {
     /// Replaces the tap if the selected names have other addresses now.
-    fn refresh(&mut self, node: &NodeState) {
+    fn refresh(&mut self, node: &NodeState, names: &KnownNames) {
         let chosen = if self.selection.is_all() {
             self.selection.chosen([], [])
         } else {
-            let directory = node.ctx.ports.names().map(|names| names.directory()).unwrap_or_default();
-            let kinds = directory.iter().flat_map(|entry| entry.kinds.iter().copied());
-            let kinds: BTreeMap<_, _> = kinds
-                .filter_map(|kind| Some((kind, sinew_lncl::undelivered::kind_name(&node.lncl, kind)?)))
-                .collect();
-            let apps = directory.iter().filter(|entry| entry.tid.node == node.ctx.node);
             self.selection.chosen(
-                apps.map(|entry| (&*entry.name, entry.tid)),
-                kinds.iter().map(|(kind, name)| (&**name, *kind)),
+                names.apps.iter().map(|(name, tid)| (&**name, *tid)),
+                names.kinds.iter().map(|(kind, name)| (&**name, *kind)),
             )
         };
         if self.chosen.as_ref() != Some(&chosen) {
