@@ -216,6 +216,7 @@ fn joint_node(host: u8, device: &Device, will: &Arc<Will>) -> (NodeBuilder, Reco
     let parts = DriveParts {
         joint: JOINT,
         device: Arc::new(move || Box::new(own.clone())),
+        slot: Duration::ZERO,
         trace: rows.trace(),
         events: events.trace(),
         figures: None,

@@ -22,6 +22,8 @@ use sinew::prelude::*;
 use sinew::replay::{Replay, TimedMessage};
 
 const PERIOD: Duration = Duration::from_nanos(PERIOD_NS);
+/// The slot of all applications: they tick together, as in the loop.
+const TOGETHER: Duration = Duration::ZERO;
 /// A message that is sent in one turn arrives before the next one, as in the loop.
 const LATENCY: Duration = Duration::from_micros(500);
 /// The plant steps after the turns of all applications, and after the messages.
@@ -149,6 +151,7 @@ fn replay(config: &LockStepConfig, bench: &SharedBench, released_at: Time) -> Re
     let gait = GaitParts {
         joints: [node(0), node(1), node(2)],
         epoch: Arc::new(AtomicU32::new(config.central.epoch)),
+        slot: TOGETHER,
         trace: Recording::begin(None, "gait").expect("no file").trace(),
         events: Recording::begin(None, "events").expect("no file").trace(),
         resume: Resume::ByItself,
@@ -166,6 +169,7 @@ fn replay(config: &LockStepConfig, bench: &SharedBench, released_at: Time) -> Re
         let parts = DriveParts {
             joint,
             device: device.clone(),
+            slot: TOGETHER,
             trace: Recording::begin(None, "drive").expect("no file").trace(),
             events: events.clone(),
             figures: None,
@@ -174,7 +178,7 @@ fn replay(config: &LockStepConfig, bench: &SharedBench, released_at: Time) -> Re
         replay = replay
             .name(sensor_name(joint), tid(joint.index(), 1))
             .name(drive_name(joint), tid(joint.index(), 2))
-            .app(sensor::spec(joint, device, events, place.clone()))
+            .app(sensor::spec(joint, device, TOGETHER, events, place.clone()))
             .app(drive::spec(parts, place.clone()));
     }
     let (config, bench) = (config.clone(), bench.clone());

@@ -65,6 +65,8 @@ pub struct DriveParts {
     pub joint: Joint,
     /// Creates the connection to its device.
     pub device: DeviceMaker,
+    /// Its slot in each period: see [`slots`].
+    pub slot: Duration,
     /// Trace of its ticks.
     pub trace: Trace<DriveRow>,
     /// Trace of single events.
@@ -374,7 +376,7 @@ impl Actor for Drive {
     fn started(&mut self, context: &mut Self::Context) {
         self.ready = context.hold_ready();
         context.join(STOP);
-        context.every_from(slots::next(context.now(), slots::DRIVE), PERIOD, Self::tick);
+        context.every_from(slots::next(context.now(), self.parts.slot), PERIOD, Self::tick);
     }
 
     fn stopping(&mut self, _: &mut Self::Context) -> Running {

@@ -32,6 +32,8 @@ pub struct GaitParts {
     /// Epoch of the next incarnation: begins at the node's incarnation in seconds, so that it grows over
     /// restarts of the node and of the application.
     pub epoch: Arc<AtomicU32>,
+    /// Its slot in each period: see [`slots`].
+    pub slot: Duration,
     /// Trace of its ticks.
     pub trace: Trace<GaitRow>,
     /// Trace of single events.
@@ -186,7 +188,7 @@ impl Actor for Gait {
         tracing::info!("the barrier is open: central's gait starts");
         self.ready = context.hold_ready();
         context.join(STOP);
-        let first = slots::next(context.now(), slots::GAIT);
+        let first = slots::next(context.now(), self.parts.slot);
         context.every_from(first, PERIOD, |this, tick, context| this.tick(tick, context));
     }
 }

@@ -36,7 +36,7 @@ pub mod node;
 pub mod plant;
 pub mod role;
 pub mod sensor;
-mod slots;
+pub mod slots;
 pub mod topology;
 pub mod trace;
 pub mod watch;

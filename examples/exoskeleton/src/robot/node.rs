@@ -24,7 +24,7 @@ use super::sensor::DeviceMaker;
 use super::topology::{ControlThread, DrivePlace, ReleaseBy, Topology, TopologyFaults};
 use super::trace::{EventRow, Recording, TraceRow};
 use super::watch::WatchParts;
-use super::{coordinator, drive, gait, sensor, watch};
+use super::{coordinator, drive, gait, sensor, slots, watch};
 
 /// The command line of a process.
 #[derive(Debug, Clone, clap::Args)]
@@ -118,7 +118,8 @@ fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<Ex
                 ReleaseBy::Itself => Resume::ByItself,
                 ReleaseBy::Operator => Resume::ByOperator,
             };
-            let parts = GaitParts { joints, epoch, trace: trace.trace(), events: events.trace(), resume };
+            let (trace_of, events_of, slot) = (trace.trace(), events.trace(), slots::GAIT);
+            let parts = GaitParts { joints, epoch, slot, trace: trace_of, events: events_of, resume };
             let builder = builder.app(gait::spec(parts, place(topology)));
             let builder = match release {
                 ReleaseBy::Itself => builder.app(coordinator::spec()),
@@ -134,13 +135,14 @@ fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<Ex
             let parts = DriveParts {
                 joint,
                 device: device.clone(),
+                slot: slots::DRIVE,
                 trace: trace.trace(),
                 events: events.trace(),
                 figures: options.run_dir.as_ref().map(|folder| folder.join(format!("{joint}-figures.json"))),
                 burden: Burden::planted(joint),
             };
             let builder = builder
-                .app(sensor::spec(joint, device, events.trace(), place(topology)))
+                .app(sensor::spec(joint, device, slots::SENSOR, events.trace(), place(topology)))
                 .app(drive::spec(parts, drive_place(joint, topology)));
             let code = start_and_run(builder, &watched, options)?;
             report_lost_rows(trace.finish());

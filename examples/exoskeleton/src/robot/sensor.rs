@@ -31,6 +31,7 @@ pub const SENSOR_LATE: &str = "sensor_late";
 /// The sensor of one joint.
 pub struct Sensor {
     joint: Joint,
+    slot: Duration,
     core: SensorCore,
     device: Box<dyn JointDevice>,
     drive: Addressee,
@@ -41,18 +42,25 @@ pub struct Sensor {
     events: Trace<EventRow>,
 }
 
-/// Declares the sensor of `joint`.
+/// Declares the sensor of `joint`, with its slot in each period: see [`slots`].
 #[must_use]
-pub fn spec(joint: Joint, device: DeviceMaker, events: Trace<EventRow>, place: Place) -> AppSpec<Sensor> {
-    AppSpec::new(sensor_name(joint), move || Sensor::new(joint, device(), events.clone()))
+pub fn spec(
+    joint: Joint,
+    device: DeviceMaker,
+    slot: Duration,
+    events: Trace<EventRow>,
+    place: Place,
+) -> AppSpec<Sensor> {
+    AppSpec::new(sensor_name(joint), move || Sensor::new(joint, device(), slot, events.clone()))
         .start_within(AS_LONG_AS_IT_TAKES)
         .place(place)
 }
 
 impl Sensor {
-    fn new(joint: Joint, device: Box<dyn JointDevice>, events: Trace<EventRow>) -> Self {
+    fn new(joint: Joint, device: Box<dyn JointDevice>, slot: Duration, events: Trace<EventRow>) -> Self {
         Self {
             joint,
+            slot,
             core: SensorCore::new(SensorConfig::default()),
             device,
             drive: Addressee::new(drive_name(joint)),
@@ -116,7 +124,7 @@ impl Actor for Sensor {
 
     fn started(&mut self, context: &mut Self::Context) {
         self.ready = context.hold_ready();
-        let first = slots::next(context.now(), slots::SENSOR);
+        let first = slots::next(context.now(), self.slot);
         context.every_from(first, PERIOD, |this, tick, context| this.tick(tick, context));
     }
 }

@@ -18,13 +18,13 @@ use sinew::Time;
 use super::PERIOD;
 
 /// The plant's step, after which it sends the readings.
-pub(super) const PLANT: Duration = Duration::ZERO;
+pub const PLANT: Duration = Duration::ZERO;
 /// A sensor's tick: the reading has come.
-pub(super) const SENSOR: Duration = Duration::from_micros(150);
+pub const SENSOR: Duration = Duration::from_micros(150);
 /// The tick of central's gait: the samples of all joints have come.
-pub(super) const GAIT: Duration = Duration::from_micros(300);
+pub const GAIT: Duration = Duration::from_micros(300);
 /// A drive's tick: the sample and central's command have come.
-pub(super) const DRIVE: Duration = Duration::from_micros(400);
+pub const DRIVE: Duration = Duration::from_micros(400);
 
 /// Returns the first time after `now` in this slot.
 pub(super) fn next(now: Time, slot: Duration) -> Time {
