@@ -12,8 +12,9 @@ use sinew::{
     Payload,
     events::{DirectoryEvent, Down, NodeEvent, RequirementEvent, Undelivered},
     inspect::{
-        AccessReport, AppsReport, AskAccess, AskApps, AskAudit, AskGroups, AskNode, AskReach, AskReload,
-        AskTree, AskWatch, AuditReport, NodeReport, Ping, ReachReport, ReloadReport, TreeReport, WatchReport,
+        AccessReport, AppsReport, AskAccess, AskApps, AskAudit, AskGroups, AskNode, AskReach, AskRecord,
+        AskReload, AskTree, AskWatch, AuditReport, NodeReport, Ping, ReachReport, RecordReport, ReloadReport,
+        TreeReport, WatchReport,
     },
     schema::{Schema, schema_of},
 };
@@ -97,8 +98,8 @@ fn every_payload_type_of_this_tree_is_traced() {
         Arm BarrierStatus EmergencyStop GaitStatus Release Reset Shut
         DriveStatus FootLoad GaitState JointSample TorqueSet
         DirectoryEvent Down NodeEvent RequirementEvent Undelivered
-        AccessReport AppsReport AskAccess AskApps AskAudit AskGroups AskNode AskReach AskReload AskTree
-        AskWatch AuditReport NodeReport Ping ReachReport ReloadReport TreeReport WatchReport
+        AccessReport AppsReport AskAccess AskApps AskAudit AskGroups AskNode AskReach AskRecord AskReload AskTree
+        AskWatch AuditReport NodeReport Ping ReachReport RecordReport ReloadReport TreeReport WatchReport
         ArriveAtBarrier BarrierAnswer LeaveBarrier
     };
     let mut names = BTreeSet::new();
