@@ -145,7 +145,7 @@ impl<'p> Reader<'p> {
 }
 
 /// Writes the next value as JSON. Numbers without a JSON form become text (`"NaN"`), bytes become base64, and keys that
-/// are no text become text.
+/// are no text become text. A list or a map in a key has neither lists nor maps.
 pub(crate) fn json(reader: &mut Reader<'_>, depth: usize, out: &mut String) -> Result<(), Misfit> {
     let token = reader.next()?;
     match token {
@@ -191,7 +191,8 @@ pub(crate) fn json_members(
             }
             _ => {
                 let mut key = String::new();
-                json(reader, depth, &mut key)?;
+                // Each level of nested keys would double the backslashes.
+                json(reader, depth.min(1), &mut key)?;
                 json_text(&key, out);
             }
         }
@@ -293,6 +294,13 @@ mod tests {
     fn nesting_is_limited() {
         assert!(shown(&[0x91; 100_000]).is_err());
         assert!(shown(&[0xdd, 0xff, 0xff, 0xff, 0xff]).is_err());
+    }
+
+    #[test]
+    fn nesting_of_keys_is_limited() {
+        let nested = |levels| [vec![0x81; levels], vec![0x01; levels + 1]].concat();
+        assert_eq!(shown(&nested(2)).unwrap(), r#"{"{\"1\":1}":1}"#);
+        assert!(shown(&nested(60)).is_err());
     }
 
     proptest! {

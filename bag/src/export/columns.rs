@@ -13,6 +13,8 @@ use crate::{
 const COLUMNS_MAX: usize = 4_096;
 /// Maximum values of a list that have columns of their own. A longer list is JSON text.
 const LIST_MAX: u32 = 64;
+/// Maximum bytes of a path. A payload with a longer one is one value.
+const PATH_MAX: usize = 1_024;
 
 /// A message.
 #[derive(Clone, Debug)]
@@ -72,7 +74,7 @@ impl Cell {
     }
 }
 
-/// What is known of a column.
+/// The place and the type of a column.
 #[derive(Clone, Copy, Debug)]
 struct Column {
     place: usize,
@@ -172,19 +174,18 @@ fn common(one: Type, other: Type, is_large: bool) -> Type {
     }
 }
 
-/// Calls `each` for every value with its path. Bytes are in base64; a payload that is no MessagePack is one value.
+/// Calls `each` for every value with its path. Bytes are in base64; a payload that is no MessagePack, or has a path that
+/// is too long, is one value.
 fn visit(payload: &[u8], mut each: impl FnMut(&str, Cell)) {
     let mut path = String::new();
     let mut reader = Reader::new(payload);
-    let mut found = Vec::new();
-    let is_read =
-        value(&mut reader, &mut path, DEPTH_MAX, &mut |path, cell| found.push((path.to_owned(), cell)));
+    let is_read = value(&mut reader, &mut path, DEPTH_MAX, &mut |_, _| {});
     if is_read.is_err() || !reader.is_empty() {
         return each("bytes", Cell::Text(base64(payload)));
     }
-    for (path, cell) in found {
-        each(if path.is_empty() { "value" } else { &path }, cell);
-    }
+    // A second pass instead of a list: a payload can have very many values, and each has its path. It cannot fail.
+    let mut each = |path: &str, cell| each(if path.is_empty() { "value" } else { path }, cell);
+    let _ = value(&mut Reader::new(payload), &mut path, DEPTH_MAX, &mut each);
 }
 
 fn value(
@@ -215,7 +216,7 @@ fn value(
                     *reader = ahead;
                     key.push_str(text);
                 } else {
-                    json(reader, depth, &mut key)?;
+                    json(reader, depth.min(1), &mut key)?;
                 }
                 below(reader, path, &key, depth, each)?;
             }
@@ -243,7 +244,11 @@ fn below(
         path.push('.');
     }
     path.push_str(name);
-    let read = value(reader, path, depth, each);
+    let read = if path.len() > PATH_MAX {
+        Err(Misfit::new("shorter names"))
+    } else {
+        value(reader, path, depth, each)
+    };
     path.truncate(length);
     read
 }

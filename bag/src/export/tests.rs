@@ -77,3 +77,18 @@ fn parquet_keeps_types() {
     assert_eq!(get(0, "text"), Field::Str("é".into()));
     assert_eq!(get(1, "age_ns"), Field::Long(4));
 }
+
+#[test]
+fn payload_with_nested_keys_or_long_paths_is_one_value() {
+    let long = "a".repeat(600);
+    let long = long.as_str();
+    let long_path = rmp_serde::to_vec_named(&serde_json::json!({ long: { long: 1 } })).unwrap();
+    let nested_keys = [vec![0x81; 60], vec![0x01; 61]].concat();
+    for payload in [long_path, nested_keys] {
+        let mut columns = Columns::default();
+        columns.add(&Row { log_ns: 0, publish_ns: 0, header: None, payload });
+        let described = columns.described();
+        assert_eq!(described.len(), columns::FIXED.len() + 1);
+        assert_eq!(described[columns::FIXED.len()].0, "bytes");
+    }
+}
