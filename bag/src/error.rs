@@ -71,7 +71,7 @@ impl BagError {
     }
 }
 
-/// What a user does about a cause.
+/// The remedy for each kind of cause.
 const REMEDIES: [(io::ErrorKind, &str); 7] = [
     (io::ErrorKind::StorageFull, "free space on this disk, or record to another one"),
     (io::ErrorKind::QuotaExceeded, "free space within this user's quota, or record to another disk"),
@@ -85,4 +85,48 @@ const REMEDIES: [(io::ErrorKind, &str); 7] = [
 fn remedy(cause: &io::Error) -> &'static str {
     let known = REMEDIES.iter().find(|(kind, _)| *kind == cause.kind());
     known.map_or("check the disk, or record to another one", |(_, remedy)| remedy)
+}
+
+/// Maximum damaged records of one file that are named.
+const DAMAGE_MAX: usize = 1_000;
+
+/// The damaged records of a file: the first ones are named, the others are counted.
+#[derive(Debug, Default)]
+pub(crate) struct DamageList {
+    named: Vec<String>,
+    further: u64,
+}
+
+impl DamageList {
+    pub(crate) fn add(&mut self, damage: &BagError) {
+        if self.named.len() < DAMAGE_MAX {
+            self.named.push(damage.to_string());
+        } else {
+            self.further += 1;
+        }
+    }
+
+    /// Returns a line for each named record, and one with the number of the others.
+    pub(crate) fn into_lines(mut self, path: &Path) -> Vec<String> {
+        if self.further > 0 {
+            self.named.push(format!("{}: {} further records are damaged", path.display(), self.further));
+        }
+        self.named
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn damage_beyond_the_limit_is_counted() {
+        let (mut damage, path) = (DamageList::default(), Path::new("walk.mcap"));
+        for _ in 0..DAMAGE_MAX + 500 {
+            damage.add(&BagError::Unfit("damaged".to_owned()));
+        }
+        let lines = damage.into_lines(path);
+        assert_eq!(lines.len(), DAMAGE_MAX + 1);
+        assert_eq!(lines[DAMAGE_MAX], "walk.mcap: 500 further records are damaged");
+    }
 }

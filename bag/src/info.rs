@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, path::Path};
 use serde::Serialize;
 
 use crate::{
-    error::BagError,
+    error::{BagError, DamageList},
     read::{End, Item, Reader, Role},
 };
 
@@ -51,7 +51,7 @@ pub struct Info {
     pub last_ns: u64,
     /// The channels of payloads and those of the recorder. The views are left out.
     pub channels: Vec<ChannelSummary>,
-    /// Damaged records, which were skipped.
+    /// Damaged records, which were skipped: the first 1,000, and the number of the others.
     pub damage: Vec<String>,
 }
 
@@ -64,6 +64,7 @@ pub fn info(path: impl AsRef<Path>) -> Result<Info, BagError> {
     let mut reader = Reader::open(path)?;
     let mut info = Info { file: path.display().to_string(), first_ns: u64::MAX, ..Info::default() };
     let mut channels: BTreeMap<u16, ChannelSummary> = BTreeMap::new();
+    let mut damage = DamageList::default();
     loop {
         match reader.next_item() {
             Ok(Some(Item::Metadata(_, fields))) => info.origin.extend(fields),
@@ -81,7 +82,7 @@ pub fn info(path: impl AsRef<Path>) -> Result<Info, BagError> {
                 summary.last_ns = summary.last_ns.max(log_ns);
             }
             Ok(None) => break,
-            Err(error @ BagError::Damaged { .. }) => info.damage.push(error.to_string()),
+            Err(error @ BagError::Damaged { .. }) => damage.add(&error),
             Err(error) => return Err(error),
         }
     }
@@ -89,6 +90,7 @@ pub fn info(path: impl AsRef<Path>) -> Result<Info, BagError> {
     info.is_finished = matches!(reader.end(), End::Finished { .. });
     info.bytes = std::fs::metadata(path).map_err(|cause| BagError::read(path, cause))?.len();
     info.channels = channels.into_values().collect();
+    info.damage = damage.into_lines(path);
     Ok(info)
 }
 

@@ -10,7 +10,7 @@ use std::{
 };
 
 use super::{Channel, End, Item, Reader, chunk, frames};
-use crate::error::BagError;
+use crate::error::{BagError, DamageList};
 
 /// Maximum bytes of chunks that overlap in time and so are in memory together.
 const OVERLAP_MAX: u64 = 1 << 30;
@@ -71,14 +71,14 @@ impl Ordered {
         let path = path.as_ref();
         let mut reader = Reader::open(path)?;
         let (mut spans, mut metadata, mut damage) =
-            (BTreeMap::<u64, u64>::new(), BTreeMap::new(), Vec::new());
+            (BTreeMap::<u64, u64>::new(), BTreeMap::new(), DamageList::default());
         let mut outside = 0_u64;
         loop {
             let item = match reader.next_item() {
                 Ok(Some(item)) => item,
                 Ok(None) => break,
                 Err(error @ BagError::Damaged { .. }) => {
-                    damage.push(error.to_string());
+                    damage.add(&error);
                     continue;
                 }
                 Err(error) => return Err(error),
@@ -98,6 +98,7 @@ impl Ordered {
                 }
             }
         }
+        let mut damage = damage.into_lines(path);
         if outside > 0 {
             damage.push(format!("{}: {outside} messages outside of chunks are left out", path.display()));
         }
@@ -135,7 +136,7 @@ impl Ordered {
         self.end
     }
 
-    /// Returns the damage that was found, and skipped.
+    /// Returns the damage that was found, and skipped: the first 1,000 records, and the number of the others.
     #[must_use]
     pub fn damage(&self) -> &[String] {
         &self.damage
