@@ -1,7 +1,7 @@
 //! The reader of recordings, and of other MCAP files.
 //!
 //! Files can be hostile. Nothing is reserved by a length that the file states: memory grows with the bytes that are
-//! there, up to [`RECORD_MAX`] for a record and [`CHUNK_MAX`] for a chunk.
+//! there, up to [`RECORD_MAX`] for a record, [`CHUNK_MAX`] for a chunk, and 64 MiB for all channels and schemas.
 
 mod chunk;
 mod describe;
@@ -119,6 +119,8 @@ pub struct Reader<R> {
     chunk_start: Option<u64>,
     schemas: BTreeMap<u16, Arc<MessageSchema>>,
     channels: BTreeMap<u16, Arc<Channel>>,
+    /// Bytes of the schemas and channels.
+    declared: u64,
     /// Whether the data is over and the summary has begun.
     is_summary: bool,
     messages: Option<u64>,
@@ -152,6 +154,7 @@ impl<R: Read> Reader<R> {
             chunk_start: None,
             schemas: BTreeMap::new(),
             channels: BTreeMap::new(),
+            declared: 0,
             is_summary: false,
             messages: None,
             end: End::Open,
@@ -255,9 +258,11 @@ impl<R: Read> Reader<R> {
                 }
             }
             frames::SCHEMA | frames::CHANNEL if !self.is_summary => {
-                let (channels, schemas) = (&mut self.channels, &mut self.schemas);
-                if frames::declare(frame.opcode, Body(self.frames.body()), channels, schemas).is_none() {
-                    return Err(self.frames.damaged("a channel or a schema is damaged"));
+                let (channels, schemas, declared) =
+                    (&mut self.channels, &mut self.schemas, &mut self.declared);
+                let body = Body(self.frames.body());
+                if frames::declare(frame.opcode, body, channels, schemas, declared).is_none() {
+                    return Err(self.frames.damaged(frames::DECLARED_FAULT));
                 }
             }
             frames::MESSAGE if !self.is_summary => {
@@ -285,7 +290,10 @@ impl<R: Read> Reader<R> {
         let read = match opcode {
             frames::MESSAGE => Found::read(body, start, &self.channels, true).map(Some),
             frames::SCHEMA | frames::CHANNEL => {
-                frames::declare(opcode, Body(body), &mut self.channels, &mut self.schemas).map(|()| None)
+                let (channels, schemas, declared) =
+                    (&mut self.channels, &mut self.schemas, &mut self.declared);
+                let read = frames::declare(opcode, Body(body), channels, schemas, declared);
+                return read.map(|()| None).ok_or_else(|| self.frames.damaged(frames::DECLARED_FAULT));
             }
             _ => Some(None),
         };

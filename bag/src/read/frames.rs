@@ -1,7 +1,7 @@
 //! The records of an MCAP file: each has an opcode, a length and a body.
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, btree_map::Entry},
     io::{self, Read},
     path::{Path, PathBuf},
     sync::Arc,
@@ -14,6 +14,11 @@ use crate::error::BagError;
 pub const RECORD_MAX: u64 = 256 << 20;
 /// Maximum bytes of a chunk after decompression.
 pub const CHUNK_MAX: u64 = 256 << 20;
+/// Maximum bytes of all schemas and channels of a file.
+pub(super) const DECLARED_MAX: u64 = 64 << 20;
+/// The fault of a schema or a channel that is not kept.
+pub(super) const DECLARED_FAULT: &str =
+    "a channel or a schema is damaged, or all of them are larger than 64 MiB together";
 
 /// Bytes of opcode and length.
 pub(super) const HEAD: usize = 9;
@@ -77,12 +82,7 @@ impl<R: Read> Frames<R> {
 
     pub(super) fn damaged(&self, fault: &str) -> BagError {
         let (path, at) = (self.path.clone(), self.whole);
-        BagError::Damaged {
-            path,
-            fault: fault.to_owned(),
-            at,
-            remedy: "what lies behind it is read all the same",
-        }
+        BagError::Damaged { path, fault: fault.to_owned(), at, remedy: "the reader skips the damaged bytes" }
     }
 
     /// Reads so many bytes; `false` at the end of the file. The buffer grows with the bytes that are there.
@@ -130,23 +130,32 @@ pub(super) fn split(records: &[u8]) -> Option<(u8, &[u8])> {
     Some((opcode, body.0.get(..usize::try_from(length).ok()?)?))
 }
 
-/// Reads a schema or a channel. The first one of a number counts.
+/// Reads a schema or a channel. The first one of a number counts. `declared` is the bytes of all that are kept.
 pub(super) fn declare(
     opcode: u8,
     mut body: Body<'_>,
     channels: &mut BTreeMap<u16, Arc<Channel>>,
     schemas: &mut BTreeMap<u16, Arc<MessageSchema>>,
+    declared: &mut u64,
 ) -> Option<()> {
     let id = body.u16()?;
+    let grown = declared.saturating_add(body.0.len() as u64);
+    let fits = grown <= DECLARED_MAX;
     if opcode == SCHEMA {
         let (name, encoding) = (body.text()?, body.text()?);
         let data = body.bytes()?.to_vec();
-        schemas.entry(id).or_insert_with(|| Arc::new(MessageSchema { name, encoding, data }));
+        if let Entry::Vacant(place) = schemas.entry(id) {
+            fits.then(|| place.insert(Arc::new(MessageSchema { name, encoding, data })))?;
+            *declared = grown;
+        }
         return Some(());
     }
     let schema = schemas.get(&body.u16()?).cloned();
     let (topic, encoding, metadata) = (body.text()?, body.text()?, body.map()?);
-    channels.entry(id).or_insert_with(|| Arc::new(Channel { id, topic, encoding, schema, metadata }));
+    if let Entry::Vacant(place) = channels.entry(id) {
+        fits.then(|| place.insert(Arc::new(Channel { id, topic, encoding, schema, metadata })))?;
+        *declared = grown;
+    }
     Some(())
 }
 

@@ -113,6 +113,21 @@ fn stated_lengths_reserve_nothing() {
     assert_eq!(read(&endless).1, 1);
 }
 
+#[test]
+fn schemas_and_channels_are_limited_together() {
+    let (mut channels, mut schemas) = (BTreeMap::new(), BTreeMap::new());
+    // Number, name, encoding, and data of one byte.
+    let schema = |id: u8| [id, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 7];
+    let length = schema(1).len() as u64 - 2;
+    let mut declared = frames::DECLARED_MAX - length;
+    let mut declare =
+        |id| frames::declare(frames::SCHEMA, Body(&schema(id)), &mut channels, &mut schemas, &mut declared);
+    assert_eq!(declare(1), Some(()));
+    assert_eq!(declare(1), Some(()), "it is kept already");
+    assert_eq!(declare(2), None);
+    assert_eq!((schemas.len(), declared), (1, frames::DECLARED_MAX));
+}
+
 proptest! {
     #[test]
     fn any_bytes_are_read_to_an_end(bytes: Vec<u8>) {
