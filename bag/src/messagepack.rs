@@ -298,7 +298,7 @@ mod tests {
 
     #[test]
     fn nesting_of_keys_is_limited() {
-        let nested = |levels| [vec![0x81; levels], vec![0x01; levels + 1]].concat();
+        let nested = |levels| [vec![0x81_u8; levels], vec![0x01_u8; levels + 1]].concat();
         assert_eq!(shown(&nested(2)).unwrap(), r#"{"{\"1\":1}":1}"#);
         assert!(shown(&nested(60)).is_err());
     }

@@ -83,7 +83,7 @@ fn payload_with_nested_keys_or_long_paths_is_one_value() {
     let long = "a".repeat(600);
     let long = long.as_str();
     let long_path = rmp_serde::to_vec_named(&serde_json::json!({ long: { long: 1 } })).unwrap();
-    let nested_keys = [vec![0x81; 60], vec![0x01; 61]].concat();
+    let nested_keys = [vec![0x81_u8; 60], vec![0x01_u8; 61]].concat();
     for payload in [long_path, nested_keys] {
         let mut columns = Columns::default();
         columns.add(&Row { log_ns: 0, publish_ns: 0, header: None, payload });

@@ -145,7 +145,10 @@ pub(super) fn declare(
         let (name, encoding) = (body.text()?, body.text()?);
         let data = body.bytes()?.to_vec();
         if let Entry::Vacant(place) = schemas.entry(id) {
-            fits.then(|| place.insert(Arc::new(MessageSchema { name, encoding, data })))?;
+            if !fits {
+                return None;
+            }
+            place.insert(Arc::new(MessageSchema { name, encoding, data }));
             *declared = grown;
         }
         return Some(());
@@ -153,7 +156,10 @@ pub(super) fn declare(
     let schema = schemas.get(&body.u16()?).cloned();
     let (topic, encoding, metadata) = (body.text()?, body.text()?, body.map()?);
     if let Entry::Vacant(place) = channels.entry(id) {
-        fits.then(|| place.insert(Arc::new(Channel { id, topic, encoding, schema, metadata })))?;
+        if !fits {
+            return None;
+        }
+        place.insert(Arc::new(Channel { id, topic, encoding, schema, metadata }));
         *declared = grown;
     }
     Some(())
