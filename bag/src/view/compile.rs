@@ -15,6 +15,8 @@ use super::{
 const DEPTH_MAX: usize = 32;
 /// Maximum messages and enums of a view, against schemas that were made to be large.
 const TYPES_MAX: usize = 4_096;
+/// Maximum fields of all messages of a view, and values of all enums.
+const FIELDS_MAX: usize = 32_768;
 
 /// Makes the plan. `None` where the schema has more types or fields than a view can.
 pub(super) fn compile(type_name: &str, schema: &Schema) -> Option<View> {
@@ -24,6 +26,7 @@ pub(super) fn compile(type_name: &str, schema: &Schema) -> Option<View> {
         named: BTreeMap::new(),
         messages: Vec::new(),
         enums: Vec::new(),
+        fields: 0,
         names: Types::default(),
         unit: None,
     };
@@ -42,13 +45,13 @@ pub(super) fn compile(type_name: &str, schema: &Schema) -> Option<View> {
             compiler.names.unique("value");
             let at = compiler.message(name, Form::Single, Vec::new());
             let kind = compiler.kind(other, "Value", DEPTH_MAX);
-            compiler.messages[at].fields.push(field("value", kind, false));
+            compiler.add_field(at, field("value", kind, false));
         }
     }
+    let is_full = compiler.is_full();
     let Compiler { messages, enums, .. } = compiler;
     let fields_max = HEADER_FIELD as usize - 1;
-    let is_small = messages.len() + enums.len() <= TYPES_MAX
-        && messages.iter().all(|message| message.fields.len() <= fields_max);
+    let is_small = !is_full && messages.iter().all(|message| message.fields.len() <= fields_max);
     is_small.then_some(View { package, messages, enums })
 }
 
@@ -62,6 +65,8 @@ struct Compiler<'s> {
     named: BTreeMap<&'s str, Kind>,
     messages: Vec<MessagePlan>,
     enums: Vec<EnumPlan>,
+    /// Fields of all messages, and values of all enums.
+    fields: usize,
     /// The names in the outermost message: its fields, and all nested types.
     names: Types,
     /// The message without fields.
@@ -90,10 +95,16 @@ impl<'s> Compiler<'s> {
     }
 
     fn is_full(&self) -> bool {
-        self.messages.len() + self.enums.len() > TYPES_MAX
+        self.messages.len() + self.enums.len() > TYPES_MAX || self.fields > FIELDS_MAX
+    }
+
+    fn add_field(&mut self, message: usize, plan: FieldPlan) {
+        self.messages[message].fields.push(plan);
+        self.fields += 1;
     }
 
     fn message(&mut self, name: String, form: Form, fields: Vec<FieldPlan>) -> usize {
+        self.fields += fields.len();
         self.messages.push(MessagePlan { name, form, fields });
         self.messages.len() - 1
     }
@@ -106,11 +117,14 @@ impl<'s> Compiler<'s> {
             scope.unique(super::descriptor::HEADER_NAME);
         }
         for Field { name, shape, optional } in fields {
+            if self.is_full() {
+                break;
+            }
             let kind = self.kind(shape, name, depth);
             let unique = scope.unique(&identifier(name));
             let is_optional = *optional || matches!(kind, Kind::Optional(_));
             let plan = FieldPlan { wire: name.clone(), name: unique, kind, is_optional };
-            self.messages[at].fields.push(plan);
+            self.add_field(at, plan);
         }
         at
     }
@@ -118,9 +132,12 @@ impl<'s> Compiler<'s> {
     fn tuple(&mut self, name: String, shapes: &'s [Shape], depth: usize) -> usize {
         let at = self.message(name, Form::Tuple, Vec::new());
         for (place, shape) in shapes.iter().enumerate() {
+            if self.is_full() {
+                break;
+            }
             let name = format!("item_{place}");
             let kind = self.kind(shape, &name, depth);
-            self.messages[at].fields.push(field(&name, kind, false));
+            self.add_field(at, field(&name, kind, false));
         }
         at
     }
@@ -130,6 +147,9 @@ impl<'s> Compiler<'s> {
         let mut scope = Fields::default();
         scope.unique(super::descriptor::ONE_OF);
         for Variant { name, shape } in variants {
+            if self.is_full() {
+                break;
+            }
             let kind = self.kind(shape, name, depth);
             // One of several fields can be neither a list nor absent.
             let kind = self.wrapped(kind, name);
@@ -139,7 +159,7 @@ impl<'s> Compiler<'s> {
                 kind,
                 is_optional: true,
             };
-            self.messages[at].fields.push(plan);
+            self.add_field(at, plan);
         }
         at
     }
@@ -218,6 +238,7 @@ impl<'s> Compiler<'s> {
                 let value =
                     |variant: &Variant| (variant.name.clone(), scope.unique(&identifier(&variant.name)));
                 let values = variants.iter().map(value).collect();
+                self.fields += variants.len();
                 self.enums.push(EnumPlan { name, values });
                 Kind::Enum(self.enums.len() - 1)
             }

@@ -277,3 +277,16 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn fields_of_all_messages_are_limited() {
+    // A list is not a type of its own, so each use of it is a message with 1,000 fields.
+    let list = Shape::List(Box::new(Shape::Tuple(vec![Shape::U8; 1_000])));
+    let view = |uses| {
+        let root = Shape::Tuple(vec![Shape::Named("list".to_owned()); uses]);
+        let types = BTreeMap::from([("list".to_owned(), list.clone())]);
+        View::new("demo.wide", &Schema { root, types })
+    };
+    assert!(view(30).is_some());
+    assert!(view(100).is_none());
+}
