@@ -6,6 +6,8 @@ use crate::shape::{Field, Schema, Shape, Variant};
 
 /// Maximum number of differences that are reported.
 pub const DIFFERENCES_MAX: usize = 16;
+/// Maximum depth of a comparison: two types that contain themselves have up to 65,280 pairs below each other.
+const DEPTH_MAX: usize = 128;
 
 /// How a sender's structure of a type relates to that of a receiver.
 ///
@@ -62,10 +64,12 @@ impl fmt::Display for Difference {
 
 /// Compares the structure of a sender with that of a receiver.
 ///
-/// Names of structs and enums do not travel and may differ. Names of newtypes may not: they are units.
+/// Names of structs and enums do not travel and may differ. Names of newtypes may not: they are units. Types that are
+/// nested in more than 128 levels are not compared: that is a conflict.
 #[must_use]
 pub fn compare(sent: &Schema, handled: &Schema) -> Comparison {
-    let mut comparing = Comparing { sent, handled, seen: BTreeSet::new(), found: Found::default() };
+    let (seen, found) = (BTreeSet::new(), Found::default());
+    let mut comparing = Comparing { sent, handled, seen, depth: 0, found };
     comparing.shapes(&sent.root, &handled.root, &Path::default());
     let Found { differences, sender_has_more, receiver_has_more, is_conflict } = comparing.found;
     if is_conflict || (sender_has_more && receiver_has_more) {
@@ -90,6 +94,8 @@ struct Comparing<'s> {
     handled: &'s Schema,
     /// Pairs of types that were compared: a type that occurs in itself is compared once.
     seen: BTreeSet<(&'s str, &'s str)>,
+    /// Shapes around the current ones.
+    depth: usize,
     found: Found,
 }
 
@@ -135,6 +141,16 @@ impl<'s> Comparing<'s> {
     }
 
     fn shapes(&mut self, sent: &'s Shape, handled: &'s Shape, path: &Path) {
+        if self.depth == DEPTH_MAX {
+            let words = format!("{path} is nested too deep to be compared");
+            return self.add(path, Meaning::Conflict, words);
+        }
+        self.depth += 1;
+        self.shapes_at_depth(sent, handled, path);
+        self.depth -= 1;
+    }
+
+    fn shapes_at_depth(&mut self, sent: &'s Shape, handled: &'s Shape, path: &Path) {
         let (schema_sent, schema_handled) = (self.sent, self.handled);
         if let (Shape::Named(name_sent), Shape::Named(name_handled)) = (sent, handled)
             && !self.seen.insert((name_sent.as_str(), name_handled.as_str()))

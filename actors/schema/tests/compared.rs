@@ -240,3 +240,21 @@ proptest! {
         );
     }
 }
+
+/// A struct in a struct, in so many levels.
+fn nested(levels: usize) -> Schema {
+    let name = |level: usize| format!("Level{level}");
+    let level = |at: usize| {
+        let shape = if at + 1 == levels { Shape::U8 } else { Shape::Named(name(at + 1)) };
+        (name(at), Shape::Struct(vec![Field { name: "a".into(), shape, optional: false }]))
+    };
+    Schema { root: Shape::Named(name(0)), types: (0..levels).map(level).collect() }
+}
+
+#[test]
+fn depth_of_a_comparison_is_limited() {
+    assert_eq!(compare(&nested(100), &nested(100)), Comparison::Same);
+    let differences = conflict(&nested(200), &nested(200));
+    assert_eq!(differences.len(), 1);
+    assert!(differences[0].ends_with("is nested too deep to be compared"), "{differences:?}");
+}
