@@ -6,7 +6,7 @@ mod records;
 #[cfg(test)]
 mod tests;
 
-use std::{collections::BTreeSet, path::PathBuf};
+use std::{collections::BTreeSet, io::ErrorKind, path::PathBuf};
 
 use crate::{
     error::BagError,
@@ -27,6 +27,8 @@ const CHUNK_AGE_NS: u64 = 1_000_000_000;
 /// How long after a failure the next file is tried.
 const RETRY_NS: u64 = 1_000_000_000;
 
+/// Maximum names of existing files that are skipped when a part begins.
+const NAMES_SKIPPED_MAX: u32 = 1_000;
 /// After a failure a new part needs room for so many chunks.
 const CHUNKS_FREE: u64 = 8;
 
@@ -84,6 +86,8 @@ enum State {
 #[derive(Debug)]
 pub struct BagWriter {
     path: PathBuf,
+    /// The file of the last part that was begun.
+    current: PathBuf,
     options: Options,
     origin: Origin,
     channels: Vec<Channel>,
@@ -93,6 +97,8 @@ pub struct BagWriter {
     state: State,
     /// The number of the next part.
     parts: u32,
+    /// The number in the name of the next part. It is higher than that of the part where a file existed.
+    next_name: u32,
     /// Bytes of the parts before.
     bytes_before: u64,
     /// When the current chunk began, or the last one ended.
@@ -104,7 +110,8 @@ pub struct BagWriter {
 }
 
 impl BagWriter {
-    /// Creates the file of a recording. Further parts have a number before the ending: `walk.mcap`, `walk.1.mcap`.
+    /// Creates the file of a recording. Further parts have a number before the ending: `walk.mcap`, `walk.1.mcap`. They
+    /// skip the numbers of existing files, unless [`Options::replace`] is set.
     ///
     /// # Errors
     /// The file cannot be made, or exists and [`Options::replace`] is not set.
@@ -112,9 +119,10 @@ impl BagWriter {
         // Some chunks fit also into a small recording.
         let chunk_max = options.size_max.map_or(u64::MAX, |all| all / 8);
         options.chunk_bytes = options.chunk_bytes.min(chunk_max).max(1_024);
-        let began_ns = origin.began_ns;
+        let (path, began_ns) = (path.into(), origin.began_ns);
         let mut writer = Self {
-            path: path.into(),
+            current: path.clone(),
+            path,
             options,
             origin,
             channels: Vec::new(),
@@ -122,6 +130,7 @@ impl BagWriter {
             part: None,
             state: State::Writing,
             parts: 0,
+            next_name: 0,
             bytes_before: 0,
             chunk_since_ns: began_ns,
             events_lost: 0,
@@ -135,7 +144,7 @@ impl BagWriter {
     /// Returns the file of the current part; after a failure, of the one before.
     #[must_use]
     pub fn path(&self) -> PathBuf {
-        part::path(&self.path, self.parts.saturating_sub(1))
+        self.current.clone()
     }
 
     /// Returns whether messages are written. Otherwise they are counted as dropped.
@@ -358,10 +367,27 @@ impl BagWriter {
         Ok(())
     }
 
+    /// Creates the file of the next part. Only the first part fails where its file exists.
+    fn create_part(&mut self, now_ns: u64) -> Result<Part, BagError> {
+        let last = self.next_name.saturating_add(NAMES_SKIPPED_MAX);
+        loop {
+            let path = part::path(&self.path, self.next_name);
+            let created = Part::create(path, self.parts, &self.options, &self.origin, now_ns);
+            let exists = matches!(
+                &created,
+                Err(BagError::Write { cause, .. }) if cause.kind() == ErrorKind::AlreadyExists
+            );
+            if !exists || self.parts == 0 || self.next_name >= last {
+                return created;
+            }
+            self.next_name += 1;
+        }
+    }
+
     /// Begins the next part with the counters as they are.
     fn open_part(&mut self, now_ns: u64) -> Result<(), BagError> {
         let number = self.parts;
-        let mut part = Part::create(&self.path, number, &self.options, &self.origin, now_ns)?;
+        let mut part = self.create_part(now_ns)?;
         let text = records::tally(&mut self.channels, number, self.events_lost, true);
         let log_time = self.origin.wall_ns(now_ns);
         let begun = part.record(&records::TALLY, log_time, text.as_bytes()).and_then(|()| part.save());
@@ -370,8 +396,10 @@ impl BagWriter {
             part.discard();
             return Err(error);
         }
+        self.current.clone_from(&part.path);
         (self.part, self.state) = (Some(part), State::Writing);
         self.parts += 1;
+        self.next_name = self.next_name.saturating_add(1);
         self.chunk_since_ns = now_ns;
         Ok(())
     }

@@ -78,7 +78,7 @@ impl fmt::Debug for Part {
     }
 }
 
-/// Returns the path of a part: that of the recording, with the number of the part before the ending.
+/// Returns a path for a part: that of the recording, with a number before the ending.
 pub(super) fn path(recording: &Path, number: u32) -> PathBuf {
     if number == 0 {
         return recording.to_owned();
@@ -97,13 +97,12 @@ pub(super) fn free_bytes(recording: &Path) -> Option<u64> {
 
 impl Part {
     pub(super) fn create(
-        recording: &Path,
+        path: PathBuf,
         number: u32,
         options: &Options,
         origin: &Origin,
         began_ns: u64,
     ) -> Result<Self, crate::BagError> {
-        let path = path(recording, number);
         let mut open = OpenOptions::new();
         if options.replace {
             open.create(true).truncate(true);

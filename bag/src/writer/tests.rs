@@ -96,7 +96,7 @@ fn each_part_is_a_file_of_its_own() {
 }
 
 #[test]
-fn size_is_limited_and_said_once() {
+fn size_is_limited_and_reported_once() {
     let folder = TestFolder::new();
     let file = folder.path("walk.mcap");
     let options = Options { size_max: Some(64 << 10), compression: Compression::None, ..Options::default() };
@@ -115,10 +115,12 @@ fn size_is_limited_and_said_once() {
 }
 
 #[test]
-fn failed_write_is_said_once_and_a_new_part_follows() {
+fn failed_write_is_reported_once_and_a_new_part_follows() {
     let folder = TestFolder::new();
     let file = folder.path("walk.mcap");
-    let mut bag = BagWriter::create(&file, Options::default(), origin()).unwrap();
+    // Without `replace` the name of the folder below would be skipped.
+    let options = Options { replace: true, ..Options::default() };
+    let mut bag = BagWriter::create(&file, options, origin()).unwrap();
     let channel = angle(&mut bag, Direction::Sent);
     bag.message(channel, &record(1, 1)).unwrap();
     bag.tally(2).unwrap();
@@ -148,6 +150,24 @@ fn existing_file_is_kept() {
     let fault = BagWriter::create(&file, Options::default(), origin()).unwrap_err();
     assert!(fault.to_string().contains("choose another name"), "{fault}");
     assert_eq!(fs::read(&file).unwrap(), b"kept");
+}
+
+#[test]
+fn later_part_skips_the_name_of_an_existing_file() {
+    let folder = TestFolder::new();
+    let file = folder.path("walk.mcap");
+    let [existing, next] = [1, 2].map(|number| part::path(&file, number));
+    fs::write(&existing, "kept").unwrap();
+    let options = Options { split_time: Some(Duration::from_secs(1)), ..Options::default() };
+    let mut bag = BagWriter::create(&file, options, origin()).unwrap();
+    let channel = angle(&mut bag, Direction::Sent);
+    bag.message(channel, &record(1, SECOND)).unwrap();
+    assert_eq!(bag.path(), next);
+    bag.message(channel, &record(2, SECOND + 1)).unwrap();
+    assert_eq!(bag.finish(SECOND + 2).unwrap().parts, 2);
+    assert_eq!(fs::read(&existing).unwrap(), b"kept");
+    let ordered = crate::read::Ordered::open(&next).unwrap();
+    assert_eq!(ordered.metadata(METADATA).unwrap()["part"], "1", "parts are numbered without a gap");
 }
 
 #[test]
