@@ -10,6 +10,7 @@ mod tests;
 use std::{
     collections::{BTreeMap, BTreeSet},
     fs, io,
+    os::unix::fs::OpenOptionsExt as _,
     path::{Path, PathBuf},
     sync::Arc,
 };
@@ -107,7 +108,7 @@ pub fn export(
 }
 
 fn table(file: &Path, columns: &Columns, format: Format) -> io::Result<Box<dyn Table>> {
-    let opened = fs::OpenOptions::new().write(true).create_new(true).open(file)?;
+    let opened = fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(file)?;
     Ok(match format {
         Format::Csv => Box::new(comma::Comma::new(opened, columns)?),
         Format::Parquet => Box::new(columnar::Parquet::new(opened, columns)?),
@@ -140,7 +141,7 @@ fn read(path: &Path, mut each: impl FnMut(&str, Row) -> Result<(), BagError>) ->
         let item = match reader.next_item() {
             Ok(Some(item)) => item,
             Ok(None) => break,
-            // What lies behind the damage is exported all the same; `check` names it.
+            // Later records are still exported; `check` reports the damage.
             Err(BagError::Damaged { .. }) => continue,
             Err(error) => return Err(error),
         };

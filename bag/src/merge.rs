@@ -7,8 +7,9 @@ mod tests;
 use std::{
     cmp::Reverse,
     collections::{BTreeMap, BinaryHeap},
-    fs::OpenOptions,
+    fs::{self, OpenOptions},
     io::{self, BufWriter, Write as _},
+    os::unix::fs::OpenOptionsExt as _,
     path::Path,
     sync::Arc,
 };
@@ -67,7 +68,8 @@ struct Source {
 /// also across a third node; the metadata record `sinew.merged` states how wrong they may be.
 ///
 /// # Errors
-/// A file cannot be read, `out` exists or cannot be written, or no clock reading connects a node with the reference.
+/// A file cannot be read, `out` exists or cannot be written, or no clock reading connects a node with the reference. A
+/// file that cannot be completed is removed.
 pub fn merge<P: AsRef<Path>>(files: &[P], out: impl AsRef<Path>) -> Result<Merged, BagError> {
     let out = out.as_ref();
     let clocks = Clocks::read(files)?;
@@ -77,12 +79,16 @@ pub fn merge<P: AsRef<Path>>(files: &[P], out: impl AsRef<Path>) -> Result<Merge
         let source = open(path.as_ref(), &clocks, &mut merged)?;
         sources.push(source);
     }
-    let file = OpenOptions::new().write(true).create_new(true).open(out);
+    let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(out);
     let file = file.map_err(|error| BagError::write(out, error))?;
     let written = write(BufWriter::new(file), &mut sources, &mut merged);
-    written.map_err(|fault| match fault {
-        Fault::Read(error) => error,
-        Fault::Write(error) => BagError::write(out, error),
+    written.map_err(|fault| {
+        // The file was created above, and a part of it is useless. If this fails, too, the first failure counts.
+        let _ = fs::remove_file(out);
+        match fault {
+            Fault::Read(error) => error,
+            Fault::Write(error) => BagError::write(out, error),
+        }
     })?;
     Ok(merged)
 }
@@ -118,7 +124,7 @@ impl From<mcap::McapError> for Fault {
     }
 }
 
-fn write(file: BufWriter<std::fs::File>, sources: &mut [Source], merged: &mut Merged) -> Result<(), Fault> {
+fn write(file: BufWriter<fs::File>, sources: &mut [Source], merged: &mut Merged) -> Result<(), Fault> {
     let options = WriteOptions::new().compression(Some(mcap::Compression::Zstd)).compression_threads(0);
     let mut writer = options.library(concat!("sinew-bag/", env!("CARGO_PKG_VERSION"))).create(file)?;
     let mut next = BinaryHeap::new();

@@ -7,6 +7,7 @@ use std::{
     fmt, fs,
     fs::{File, OpenOptions},
     io::{self, Write},
+    os::unix::fs::OpenOptionsExt as _,
     path::{Path, PathBuf},
     sync::{Arc, Mutex, PoisonError},
 };
@@ -109,7 +110,8 @@ impl Part {
         } else {
             open.create_new(true);
         }
-        let file = open.write(true).open(&path).map_err(|cause| crate::BagError::write(&path, cause))?;
+        let file = open.write(true).mode(0o600).open(&path);
+        let file = file.map_err(|cause| crate::BagError::write(&path, cause))?;
         let pending = Pending::default();
         let compression = match options.compression {
             Compression::None => None,

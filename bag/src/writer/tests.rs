@@ -1,4 +1,4 @@
-use std::{fs, time::Duration};
+use std::{fs, os::unix::fs::PermissionsExt as _, time::Duration};
 
 use super::*;
 use crate::{
@@ -150,6 +150,15 @@ fn existing_file_is_kept() {
     let fault = BagWriter::create(&file, Options::default(), origin()).unwrap_err();
     assert!(fault.to_string().contains("choose another name"), "{fault}");
     assert_eq!(fs::read(&file).unwrap(), b"kept");
+}
+
+#[test]
+fn only_the_owner_may_read_a_new_file() {
+    let folder = TestFolder::new();
+    let file = folder.path("walk.mcap");
+    let bag = BagWriter::create(&file, Options::default(), origin()).unwrap();
+    bag.finish(SECOND).unwrap();
+    assert_eq!(fs::metadata(&file).unwrap().permissions().mode() & 0o777, 0o600);
 }
 
 #[test]
