@@ -112,7 +112,7 @@ pub struct EndReport {
     pub received: u64,
     /// Sent and not received, between the first and the last one that was received.
     pub lost: u64,
-    /// The same of class Stream: a newer value may have replaced them.
+    /// Messages of class Stream that were sent and not received. A newer value may have replaced them.
     pub superseded_or_lost: u64,
     /// Sent and not received, which the recorder of the destination's node counted as dropped.
     pub not_recorded: u64,

@@ -20,8 +20,8 @@ use crate::{ReplayFault, TimedMessage, world::World};
 
 /// Maximum number of turns of all applications at one virtual time.
 const ROUNDS_MAX: usize = 2_000;
-/// No application has a turn.
-const NOBODY: usize = usize::MAX;
+/// The index in [`Progress`] while no application has its turn.
+const NO_APP: usize = usize::MAX;
 
 /// An application that is ready to be started.
 pub(crate) struct Prepared {
@@ -41,7 +41,7 @@ pub(crate) struct Progress {
 
 impl Default for Progress {
     fn default() -> Self {
-        Self { turns: AtomicU64::new(0), app: AtomicUsize::new(NOBODY) }
+        Self { turns: AtomicU64::new(0), app: AtomicUsize::new(NO_APP) }
     }
 }
 
@@ -51,14 +51,14 @@ impl Progress {
     }
 
     fn end(&self) {
-        self.app.store(NOBODY, Ordering::Relaxed);
+        self.app.store(NO_APP, Ordering::Relaxed);
         self.turns.fetch_add(1, Ordering::Relaxed);
     }
 
     /// Returns the number of turns that have ended, and the application that has its turn.
     pub(crate) fn read(&self) -> (u64, Option<usize>) {
         let app = self.app.load(Ordering::Relaxed);
-        (self.turns.load(Ordering::Relaxed), (app != NOBODY).then_some(app))
+        (self.turns.load(Ordering::Relaxed), (app != NO_APP).then_some(app))
     }
 }
 

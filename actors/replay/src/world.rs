@@ -103,7 +103,7 @@ impl World {
             let (to, message) = first.remove();
             (state.apps.get(&to).cloned(), message)
         };
-        // Its sender is told of a refusal by the receipt.
+        // The receipt reports a refusal to the sender.
         if let Some(Err(refused)) = sink.map(|sink| sink.submit(message)) {
             refused.message.reject(refused.why);
         }

@@ -32,7 +32,7 @@ struct Reading {
 struct Knot {
     /// In nanoseconds of the clock that is converted.
     at_ns: i128,
-    /// What is added to its time.
+    /// The nanoseconds to add to a time of the clock that is converted.
     add_ns: i128,
     bound_ns: u64,
 }
