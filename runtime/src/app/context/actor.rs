@@ -64,7 +64,8 @@ impl<A: Actor<Context = Self>> AsyncContext<A> for AppContext<A> {
         self.parts.cancel_future(handle)
     }
 
-    // actix's own timers run on the clock of tokio. They are replaced in virtual time only.
+    // actix's own timers run on the clock of tokio. They are replaced in virtual time only. `notify_later` uses
+    // `run_later` on both clocks.
 
     fn notify_later<M>(&mut self, message: M, after: Duration) -> SpawnHandle
     where
