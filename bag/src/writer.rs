@@ -119,7 +119,8 @@ impl BagWriter {
         // Some chunks fit also into a small recording.
         let chunk_max = options.size_max.map_or(u64::MAX, |all| all / 8);
         options.chunk_bytes = options.chunk_bytes.min(chunk_max).max(1_024);
-        let (path, began_ns) = (path.into(), origin.began_ns);
+        let path: PathBuf = path.into();
+        let began_ns = origin.began_ns;
         let mut writer = Self {
             current: path.clone(),
             path,

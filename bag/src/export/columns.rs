@@ -174,8 +174,8 @@ fn common(one: Type, other: Type, is_large: bool) -> Type {
     }
 }
 
-/// Calls `each` for every value with its path. Bytes are in base64; a payload that is no MessagePack, or has a path that
-/// is too long, is one value.
+/// Calls `each` for every value with its path. Bytes are in base64. A payload is one value if it is no MessagePack or
+/// has a path that is too long.
 fn visit(payload: &[u8], mut each: impl FnMut(&str, Cell)) {
     let mut path = String::new();
     let mut reader = Reader::new(payload);
