@@ -2,7 +2,8 @@
 //!
 //! Any application that can send a message can ask, from any node. The questions go to `node/inspect`
 //! ([`AppAddress::INSPECT`]) by `ask`, as to any application. Inspection only
-//! reads; the exceptions are that it can make the node read its access list again, and that it starts and ends recordings.
+//! reads; the exceptions are that it can make the node read its access list again, and that it starts and ends
+//! recordings.
 //!
 //! | rule | |
 //! | --- | --- |

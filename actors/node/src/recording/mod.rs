@@ -191,7 +191,7 @@ impl Recording {
 
     /// Fits the tap to the selections, or ends the recording without any.
     fn settle(&self, node: &NodeState, names: &KnownNames, state: &mut State) {
-        let State { active: Some(active), configured, programs } = state else { return };
+        let State { active: Some(active), configured, programs, .. } = state else { return };
         let mut all = configured.iter().chain(programs.values().map(|(selection, _)| selection));
         let Some(mut sum) = all.next().cloned() else {
             if let Some(active) = state.active.take() {

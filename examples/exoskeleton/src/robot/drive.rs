@@ -22,6 +22,7 @@ mod anomaly;
 mod burden;
 mod command;
 mod damping_repeater;
+mod e_stop;
 mod order;
 
 use std::io;
@@ -472,35 +473,5 @@ impl Handler<Delivery<Arm>> for Drive {
             }
         }
         self.parts.events.event("armed", &arm.source.to_string(), String::new());
-    }
-}
-
-impl Handler<Delivery<EmergencyStop>> for Drive {
-    type Result = ();
-
-    fn handle(&mut self, stop: Delivery<EmergencyStop>, _: &mut Self::Context) {
-        // Accepted from any sender: stopping needs no permission.
-        tracing::warn!(joint = %self.parts.joint, by = %stop.source, "the e-stop was pressed");
-        self.core.emergency_stop();
-        self.parts.events.event("e_stop", &stop.source.to_string(), String::new());
-    }
-}
-
-impl Handler<Delivery<Reset>> for Drive {
-    type Result = ();
-
-    fn handle(&mut self, reset: Delivery<Reset>, context: &mut Self::Context) {
-        let now = context.now();
-        if self.central.at(now, context).map(|central| central.node) != Some(reset.source.node) {
-            context.reject();
-            return;
-        }
-        match self.core.reset(now.as_nanos()) {
-            Ok(()) => self.parts.events.event("reset", &reset.source.to_string(), String::new()),
-            Err(refusal) => {
-                tracing::warn!(joint = %self.parts.joint, %refusal, "the e-stop stays");
-                context.reject();
-            }
-        }
     }
 }

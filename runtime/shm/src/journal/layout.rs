@@ -8,7 +8,8 @@
 //! byte 266240   the ring                               a power of two
 //! ```
 //!
-//! Numbers have the byte order of the host: a host of another order finds no magic. A record begins at a multiple of [`ALIGN`]:
+//! Numbers have the byte order of the host: a host of another order finds no magic. A record begins at a multiple of
+//! [`ALIGN`]:
 //!
 //! ```text
 //! bytes 0  8 stamp: position since the start of the journal, exclusive-or the file's salt, or the state (1 or 2)
