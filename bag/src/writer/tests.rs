@@ -128,7 +128,7 @@ fn failed_write_is_reported_once_and_a_new_part_follows() {
     let next = part::path(&file, 1);
     fs::create_dir(&next).unwrap();
     bag.message(channel, &record(2, 3)).unwrap();
-    let fault = bag.fail(io::Error::from(io::ErrorKind::StorageFull), 4);
+    let fault = bag.fail(io::Error::from(ErrorKind::StorageFull), 4);
     assert!(fault.to_string().contains("free space on this disk"), "{fault}");
     bag.message(channel, &record(3, 5)).unwrap();
     bag.message(channel, &record(4, 5 + 2 * SECOND)).unwrap();

@@ -1,9 +1,9 @@
 //! The e-stop of a drive, and its reset.
 
-use exoskeleton_model::message::{EmergencyStop, Reset};
 use sinew::prelude::*;
 
 use super::Drive;
+use crate::robot::edges::{EmergencyStop, Reset};
 
 impl Handler<Delivery<EmergencyStop>> for Drive {
     type Result = ();
