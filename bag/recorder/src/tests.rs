@@ -1,0 +1,207 @@
+//! The recorder, with journals that the tests write.
+
+use std::{fs, path::PathBuf};
+
+use sinew_bag::{BagWriter, Options, Origin, Totals};
+use sinew_record::{
+    Channel, Entry, Fact, Form, LogFact, MessageEntry, NodeFact, Selection, fact, lost_channel, message_head,
+};
+use sinew_runtime::{
+    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    wire::{Class, Header, Kind},
+};
+use sinew_shm::journal::{self, Journal, JournalReader, Start};
+
+use crate::{Names, Recorder, Setup};
+
+const NODE: NodeAddress = NodeAddress::new(0x7f00_0002);
+const SECOND: u64 = 1_000_000_000;
+const RING: u64 = 64 * 1024;
+
+fn tid(app: u32) -> Tid {
+    Tid::new(NODE, AppAddress::new(app))
+}
+
+/// A channel from the hip to the knee.
+fn angles() -> Channel {
+    Channel {
+        source: tid(0x1001),
+        destination: tid(0x1002),
+        kind: Kind::named("test.angle"),
+        class: Class::Stream,
+        form: Form::Sent,
+        refused: None,
+    }
+}
+
+fn header(channel: &Channel, sequence: u64) -> Header {
+    Header {
+        class: channel.class,
+        sequence,
+        ..Header::new(channel.kind, channel.source, channel.destination)
+    }
+}
+
+/// A journal and the file of its recording.
+struct Bench {
+    folder: PathBuf,
+    journal: Journal,
+    recorder: Recorder,
+}
+
+impl Bench {
+    fn new(name: &str, selection: Selection) -> Self {
+        let folder = std::env::temp_dir().join(format!("sinew-recorder-{name}-{}", std::process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let path = folder.join("node.journal");
+        let journal =
+            Journal::create(&path, &journal::Options { ring_bytes: RING, ..journal::Options::default() })
+                .unwrap();
+        // Messages before the beginning are in no counter.
+        write(&journal, &angles(), 1, SECOND);
+        let reader = JournalReader::open(&path, Start::Oldest).unwrap();
+        let origin = Origin { node: "leg".into(), address: NODE.to_string(), ..Origin::default() };
+        let bag = BagWriter::create(folder.join("leg.mcap"), Options::default(), origin).unwrap();
+        let mut names = Names::default();
+        for (app, name) in [(0x1001, "hip"), (0x1002, "knee")] {
+            names.add_app(tid(app), name);
+        }
+        names.add_type(Kind::named("test.angle"), "test.angle");
+        let setup = Setup { node: NODE, selection, names, left_out: vec![tid(0x1009)] };
+        let recorder = Recorder::begin(reader, bag, setup).unwrap();
+        Self { folder, journal, recorder }
+    }
+
+    /// Ends the recording, and checks the file. Returns the topics with messages, too.
+    fn finish(mut self) -> (Totals, Vec<String>) {
+        self.recorder.stop().unwrap();
+        while !self.recorder.pump(8 * SECOND).unwrap() {}
+        let totals = self.recorder.finish(9 * SECOND).unwrap();
+        assert_eq!(totals.seen, totals.written + totals.dropped);
+        let file = self.folder.join("leg.mcap");
+        let report = sinew_bag::check(&[&file]).unwrap();
+        assert!(report.is_fine(), "{:?}", report.findings);
+        let info = sinew_bag::info(&file).unwrap();
+        fs::remove_dir_all(&self.folder).unwrap();
+        (totals, info.channels.into_iter().map(|channel| channel.topic).collect())
+    }
+}
+
+fn write(journal: &Journal, channel: &Channel, sequence: u64, at_ns: u64) {
+    // The payload is {"x": 5}.
+    let payload = b"\x81\xa1x\x05";
+    let head = message_head(channel.form, &header(channel, sequence), payload.len(), channel.refused);
+    assert!(journal.write(channel.key(), at_ns, &[&head, payload]));
+}
+
+fn write_fact<F: Fact>(journal: &Journal, of: &F) {
+    let (source, destination) = (Tid::new(NODE, AppAddress::NONE), Tid::NONE);
+    let (kind, class) = (Kind::from_bits(0), Class::Control);
+    let channel = Channel { source, destination, kind, class, form: F::FORM, refused: None };
+    assert!(journal.write(channel.key(), SECOND, &[&fact(of)]));
+}
+
+#[test]
+fn gap_is_counted_and_named() {
+    let mut bench = Bench::new("gap", Selection::default());
+    for sequence in 2..=10 {
+        write(&bench.journal, &angles(), sequence, SECOND + sequence);
+    }
+    // Three messages that were too long for the ring, say.
+    bench.journal.count(angles().key(), 3);
+    write(&bench.journal, &angles(), 14, 2 * SECOND);
+    assert!(bench.recorder.pump(2 * SECOND).unwrap());
+    let Totals { seen, written, .. } = bench.recorder.totals();
+    assert_eq!((seen, written), (9, 9), "the last one waits for those before");
+    assert!(bench.recorder.pump(3 * SECOND).unwrap());
+    assert_eq!(bench.recorder.totals().seen, 13);
+    // These are at the end, and after it.
+    bench.journal.count(angles().key(), 2);
+    bench.recorder.stop().unwrap();
+    assert!(!bench.recorder.is_drained());
+    write(&bench.journal, &angles(), 17, 3 * SECOND);
+    let (totals, topics) = bench.finish();
+    assert_eq!((totals.seen, totals.written, totals.dropped), (15, 10, 5));
+    assert!(topics.iter().any(|topic| topic == "/hip/test.angle"), "{topics:?}");
+}
+
+#[test]
+fn overtaken_reader_counts_the_overwritten_messages() {
+    let mut bench = Bench::new("overtaken", Selection::default());
+    let count = 3 * RING / 64;
+    for sequence in 2..=count {
+        write(&bench.journal, &angles(), sequence, SECOND);
+    }
+    bench.recorder.pump(SECOND).unwrap();
+    let (totals, _) = bench.finish();
+    assert_eq!(totals.seen, count - 1);
+    assert!(totals.dropped > 0 && totals.written > 0, "{totals:?}");
+}
+
+#[test]
+fn numbers_in_another_order_are_not_missing() {
+    let mut bench = Bench::new("order", Selection::default());
+    bench.journal.count(angles().key(), 5);
+    let table = JournalReader::open(bench.journal.path(), Start::Newest).unwrap().channels().unwrap();
+    let place = table.iter().find(|channel| channel.key == Some(angles().key())).unwrap().place;
+    for number in [3, 2, 6, 4, 5, 5] {
+        let found = journal::Record { place, number, time: SECOND, position: 0 };
+        let message = MessageEntry {
+            form: Form::Sent,
+            header: header(&angles(), number),
+            length: 1,
+            payload: Some(&[5]),
+            refused: None,
+        };
+        bench.recorder.take(&found, &Entry::Message(message)).unwrap();
+    }
+    let (totals, _) = bench.finish();
+    assert_eq!((totals.seen, totals.written, totals.dropped), (5, 5, 0));
+}
+
+#[test]
+fn messages_of_others_and_of_the_recorder_are_left_out() {
+    let selection = Selection { apps: vec!["hip".to_owned()], ..Selection::default() };
+    let mut bench = Bench::new("selected", selection);
+    let arm = Channel { source: tid(0x1003), destination: tid(0x1004), ..angles() };
+    let own = Channel { source: tid(0x1009), ..angles() };
+    write(&bench.journal, &angles(), 2, SECOND);
+    write(&bench.journal, &arm, 1, SECOND);
+    write(&bench.journal, &own, 1, SECOND);
+    bench.journal.count(lost_channel(tid(0x1001)).key(), 4);
+    bench.journal.count(lost_channel(tid(0x1003)).key(), 4);
+    assert!(bench.recorder.pump(SECOND).unwrap());
+    let (totals, _) = bench.finish();
+    assert_eq!((totals.seen, totals.written, totals.dropped), (5, 1, 4));
+}
+
+#[test]
+fn name_that_comes_later_chooses_the_messages_after_it() {
+    let selection = Selection { apps: vec!["arm".to_owned()], ..Selection::default() };
+    let mut bench = Bench::new("later", selection);
+    let arm = Channel { source: tid(0x1003), destination: tid(0x1004), ..angles() };
+    write(&bench.journal, &arm, 1, SECOND);
+    let (node, app, name) = (NODE, AppAddress::new(0x1003), "arm".to_owned());
+    write_fact(&bench.journal, &NodeFact::AppNamed { node, app, name, is_ready: true });
+    write(&bench.journal, &arm, 2, SECOND);
+    assert!(bench.recorder.pump(SECOND).unwrap());
+    let (totals, topics) = bench.finish();
+    assert_eq!((totals.seen, totals.written), (1, 1));
+    assert!(topics.iter().any(|topic| topic == "/arm/test.angle"), "{topics:?}");
+}
+
+#[test]
+fn facts_are_events_and_log_lines() {
+    let mut bench = Bench::new("facts", Selection::default());
+    let (node, name, incarnation) = (NodeAddress::new(9), "hip".to_owned(), Incarnation(1));
+    write_fact(&bench.journal, &NodeFact::NodeFound { node, name, incarnation });
+    let (waiting, missing) = (vec!["hip".to_owned()], vec!["knee".to_owned()]);
+    write_fact(&bench.journal, &NodeFact::Barrier { name: "go".to_owned(), generation: 1, waiting, missing });
+    let line = LogFact { level: "warn".to_owned(), target: "test".to_owned(), text: "slow".to_owned() };
+    write_fact(&bench.journal, &line);
+    assert!(bench.recorder.pump(SECOND).unwrap());
+    let (_, topics) = bench.finish();
+    for topic in ["/sinew/events", "/sinew/barriers", "/sinew/log"] {
+        assert!(topics.iter().any(|found| found == topic), "{topic}: {topics:?}");
+    }
+}
