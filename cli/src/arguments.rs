@@ -4,10 +4,10 @@ use std::{path::PathBuf, time::Duration};
 
 use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
-use crate::{bag, keys, send, watch, why};
+use crate::{bag, keys, record, send, watch, why};
 
 /// Shows a running Sinew system, from any one node of it. It changes nothing, except that `send` sends
-/// messages, and `keys` and `bag` write files.
+/// messages, and `keys`, `record` and `bag` write files.
 ///
 /// It connects to the socket of a node on this machine (`lncl.socket` in the node's configuration) and asks
 /// that node, and through it all others.
@@ -94,6 +94,17 @@ pub(crate) enum Command {
   sinew watch knee.drive --wait               also where nothing has this name yet
   sinew watch knee.drive --json | jq .payload"#)]
     Watch(watch::Order),
+    /// Records the messages of the node's applications into an MCAP file, until Ctrl-C
+    ///
+    /// The node writes its messages into memory, and this command writes them to the file: no sender waits for it.
+    /// Messages that it was too slow for are counted, and the file states them: `sinew bag check` proves it.
+    /// Only the node's user and root may record.
+    #[command(after_help = r#"Examples:
+  sinew record walk.mcap
+  sinew record --for 30s --app 'knee.*' --type demo.angle
+  sinew record --split 5m --max-size 10G
+  sinew record walk.mcap --json | jq .dropped"#)]
+    Record(record::Order),
     /// Finds out why two nodes or applications cannot communicate: each step, from both ends, with a suggested fix
     ///
     /// All nodes are asked that can be reached through any socket of this host, so that two nodes that do not
@@ -213,6 +224,7 @@ Examples:
   sinew ping knee.drive --count 1000
   sinew send knee.drive demo.angle '{\"degrees\": 5}'
   sinew watch knee.drive --received
+  sinew record walk.mcap --for 30s
   sinew why hip knee.drive
   sinew reload
   sinew apps --json | jq '.apps[] | select(.ready | not)'

@@ -1,0 +1,139 @@
+//! `sinew record`: from a node to a file that `sinew bag check` finds complete.
+
+use std::{
+    path::Path,
+    process::Command,
+    sync::atomic::{AtomicBool, Ordering},
+    time::Duration,
+};
+
+use rustix::process::Signal;
+use sinew::{NodeApi, Registration, Tid, payload};
+use sinew_testkit::{NodeProcess, until};
+
+use crate::scenario::{Answer, Scenario};
+
+payload!("scenario.count", Bulk => struct Count { number: u64 });
+
+/// Ends the traffic when it is dropped.
+struct End<'a>(&'a AtomicBool);
+
+impl Drop for End<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Calls `record` while the application `sensor` sends counts to the application `knee`, each after the outcome of the
+/// one before.
+fn with_traffic<R>(scenario: &Scenario, knee: &mut NodeProcess, record: impl FnOnce() -> R) -> R {
+    let line = knee.wait_for(&["started"]);
+    let tid: Tid = line.split_once(' ').expect("it says its TID").1.parse().expect("a TID");
+    let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
+    let mut sensor =
+        api.register_transport_address(Registration::new().name("sensor")).expect("it is registered");
+    let is_over = AtomicBool::new(false);
+    let ends = End(&is_over);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            for number in 0_u64.. {
+                let sent = sensor.message(tid, &Count { number }).confirmed(Duration::from_secs(10));
+                // The node may have been killed.
+                if is_over.load(Ordering::Relaxed) || sent.is_err() {
+                    break;
+                }
+            }
+        });
+        // Also where it panics: the scope waits for the sender.
+        let _ends = ends;
+        record()
+    })
+}
+
+/// Starts `sinew record`. Returns when it records.
+fn start(scenario: &Scenario, file: &Path) -> NodeProcess {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
+    command.arg("--socket").arg(scenario.socket("knee")).arg("record").arg(file).arg("--json");
+    let recorder = NodeProcess::start("sinew record", command);
+    until("the file is there", || file.exists().then_some(()));
+    recorder
+}
+
+fn bag(order: &str, file: &Path) -> Answer {
+    Answer::of(Command::new(env!("CARGO_BIN_EXE_sinew")).args(["bag", order]).arg(file))
+}
+
+fn assert_complete(file: &Path) {
+    let answer = bag("check", file);
+    assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
+    assert!(answer.out.contains("complete"), "{}", answer.out);
+}
+
+#[test]
+fn recorded_traffic_is_complete() {
+    let scenario = Scenario::new();
+    let mut knee = scenario.start("knee", 2, &[]);
+    let file = scenario.directory.join("walk.mcap");
+    let name = file.to_str().expect("a path of text").to_owned();
+    let answer = with_traffic(&scenario, &mut knee, || {
+        scenario.sinew("knee", &["record", &name, "--for", "1s", "--json"])
+    });
+    assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
+    let json = answer.json();
+    let count = |key: &str| json[key].as_u64().expect("a number");
+    assert!(count("written") > 0 && count("seen") == count("written") + count("dropped"), "{json}");
+    assert_eq!((&json["end"], &json["node"]), (&"time".into(), &"knee".into()), "{json}");
+    assert_complete(&file);
+    let info = bag("info", &file);
+    assert_eq!(info.code, Some(0), "{}{}", info.out, info.err);
+    for words in ["node knee at 127.0.0.2", "/sensor/scenario.count", "finished"] {
+        assert!(info.out.contains(words), "{words}: {}", info.out);
+    }
+    assert!(!info.out.contains("sinew.inspect.record"), "its own questions are left out: {}", info.out);
+    // And: the file is not replaced
+    let answer = scenario.sinew("knee", &["record", &name, "--for", "1s"]);
+    assert!(answer.code == Some(1) && answer.err.contains("choose another name"), "{}", answer.err);
+    let answer = scenario.sinew("knee", &["record", &name, "--for", "1s", "--force"]);
+    assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
+}
+
+#[test]
+fn request_to_stop_finishes_the_file() {
+    let scenario = Scenario::new();
+    let mut knee = scenario.start("knee", 2, &[]);
+    let file = scenario.directory.join("walk.mcap");
+    let code = with_traffic(&scenario, &mut knee, || {
+        let mut recorder = start(&scenario, &file);
+        recorder.signal(Signal::TERM);
+        recorder.wait_for_exit()
+    });
+    assert_eq!(code, Some(0));
+    assert_complete(&file);
+}
+
+#[test]
+fn killed_node_leaves_a_finished_file() {
+    let scenario = Scenario::new();
+    let mut knee = scenario.start("knee", 2, &[]);
+    let file = scenario.directory.join("walk.mcap");
+    let mut recorder = with_traffic(&scenario, &mut knee, || start(&scenario, &file));
+    assert!(knee.kill());
+    assert_eq!(recorder.wait_for_exit(), Some(0));
+    assert!(recorder.output().iter().any(|line| line.contains("node_died")), "{:?}", recorder.output());
+    assert_complete(&file);
+}
+
+#[test]
+fn wrong_words_are_refused_with_an_example() {
+    let scenario = Scenario::new();
+    let _knee = scenario.start("knee", 2, &[]);
+    for (words, part) in [
+        (["--for", "soon"], "30s"),
+        (["--max-size", "1"], "500M"),
+        (["--split", "5 bytes"], "30s"),
+        (["--group", "leg*"], "without `*`"),
+    ] {
+        let answer = scenario.sinew("knee", &[&["record", "never.mcap"][..], &words].concat());
+        assert!(answer.code == Some(2) && answer.err.contains(part), "{words:?}: {}", answer.err);
+    }
+}
