@@ -331,8 +331,8 @@ impl Session<'_> {
         }
         let json = json!({
             "file": file, "node": first.name, "end": end.word(), "seen": seen, "written": written,
-            "dropped": dropped, "misfits": misfits, "events_lost": events_lost, "bytes": bytes, "parts": parts,
-            "faults": self.faults,
+            "dropped": dropped, "misfits": misfits, "events_lost": events_lost, "bytes": bytes,
+            "parts": parts, "faults": self.faults,
         });
         Report { text, json, is_fine: self.faults.is_empty() && !matches!(end, End::Unreadable(_)) }
     }
