@@ -62,7 +62,7 @@ impl Recorded {
         Self { id, order: Order::after(seen_before), last_ns: now_ns }
     }
 
-    /// Writes the message whose number was passed just now.
+    /// Writes the message of the number that was passed just now.
     pub(crate) fn write(&mut self, sink: &mut Sink, record: &Record<'static>, payload: Option<&[u8]>) {
         match payload {
             Some(payload) => sink.message(self.id, &Record { payload, ..*record }),
@@ -72,7 +72,7 @@ impl Recorded {
         self.last_ns = record.handed_over_ns;
     }
 
-    /// Writes held messages whose turn it is; with `gives_up` all of them. Returns how many bytes are held less.
+    /// Writes the held messages that are next; with `gives_up` all of them. Returns how many bytes are held less.
     pub(crate) fn release(&mut self, sink: &mut Sink, gives_up: bool) -> usize {
         let mut bytes = 0;
         while let Some(step) = self.order.step(gives_up) {

@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 
-/// A number is missing once a record is there whose number is higher by this.
+/// A number is missing once there is a record with a number that is higher by this.
 pub const WINDOW: u64 = 64;
 
 /// The next step of a channel.

@@ -34,7 +34,7 @@ pub struct Setup {
     pub selection: Selection,
     /// The names that are known at the start.
     pub names: Names,
-    /// Applications whose messages are not recorded, such as the recorder itself.
+    /// Applications without a record of their messages, such as the recorder itself.
     pub left_out: Vec<Tid>,
 }
 

@@ -130,7 +130,7 @@ fn each_planted_fault_of_the_datagrams_is_found() {
         Planted::DroppedTooEarly,
         Planted::NewKeyDrops,
     ];
-    let hunt = Hunt { seeds: &SEEDS, faults: &faults, within: 60, found_last: &[] };
+    let hunt = Hunt { seeds: &SEEDS, faults: &faults, within: 120, found_last: &[] };
     hunt.run(|seed, planted, _| play(seed, planted.unwrap_or_default()).map(drop));
 }
 
