@@ -127,7 +127,7 @@ pub struct EndReport {
 pub struct Report {
     /// The files, in the order of nodes and parts.
     pub files: Vec<FileReport>,
-    /// The channels between two nodes whose files are given.
+    /// The channels between two nodes with given files.
     pub ends: Vec<EndReport>,
     /// The findings.
     pub findings: Vec<Finding>,

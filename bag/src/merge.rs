@@ -43,7 +43,7 @@ pub struct MergedNode {
 /// The result of [`merge()`].
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Merged {
-    /// The address of the node whose clock the file has.
+    /// The address of the node with the clock of the file.
     pub reference: String,
     /// The nodes.
     pub nodes: Vec<MergedNode>,

@@ -57,7 +57,7 @@ impl Output {
         self.0[start..].rotate_right(prefix);
     }
 
-    /// Writes a field whose content is a message.
+    /// Writes a field that contains a message.
     pub(crate) fn message(&mut self, number: u32, write: impl FnOnce(&mut Self)) {
         let start = self.begin(number);
         write(self);

@@ -296,7 +296,7 @@ pub struct Totals {
     pub written: u64,
     /// Messages that are in no file.
     pub dropped: u64,
-    /// Messages whose payload does not fit its schema. They are written without a view.
+    /// Messages with a payload that does not fit its schema. They are written without a view.
     pub misfits: u64,
     /// Events and clock readings that are in no file.
     pub events_lost: u64,

@@ -125,8 +125,8 @@ impl Reactor {
         let Some(mut listening) = Listening::begin(Some(reader), direct, room) else { return };
         let (links, timer) = (&mut self.links, &mut self.timer);
         timer.end_by(deadline);
-        // One future, whose parts keep no list of waiters but the last: a wait of each in a `select` costs as much as
-        // the message.
+        // One future. Only its last part has a list of waiters: a wait for each part in a `select` costs as much as the
+        // message.
         let mut pending_added = pin!(writer.pending_added());
         let event = poll_fn(|cx| {
             // First: a node that has gone has closed its bell, too, which is always ready then.

@@ -62,7 +62,7 @@ const NAMED: u8 = 25;
 /// The identity of a structure: equal for equal schemas, in every build and on every platform.
 ///
 /// It is FNV-1a of 64 bits over the canonical encoding. It tells versions of a type apart and is no protection against
-/// somebody who wants two schemas to have one hash.
+/// an attacker: two schemas with one hash can be constructed.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(transparent)]
 pub struct SchemaHash(pub u64);

@@ -2,7 +2,7 @@
 //!
 //! A [`Schema`] names the fields, the variants and the number types of a payload, as they are on the wire. Two programs
 //! that were built with different versions of a type can so be told what differs, and tools can decode a payload
-//! whose type they were not built with.
+//! of a type that they were not built with.
 //!
 //! This package knows no message, no node and no clock.
 

@@ -27,7 +27,7 @@ struct End {
     dropped: u64,
 }
 
-/// Compares the ends, and names nodes whose files are not given.
+/// Compares the ends, and names nodes without a given file.
 pub(super) fn compare(files: &mut [Checked], report: &mut Report) {
     let given: BTreeSet<_> = files.iter().map(|file| file.report.address.clone()).collect();
     let [mut sent, mut received] = [BTreeMap::new(), BTreeMap::new()];

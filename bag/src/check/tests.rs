@@ -72,7 +72,7 @@ fn forge(path: &Path, change: impl Fn(&str, u32, &[u8]) -> Option<Vec<u8>>) -> P
     out
 }
 
-/// Returns kinds and texts, without those of nodes whose files are not given.
+/// Returns kinds and texts, without those of nodes without a given file.
 fn findings<P: AsRef<Path>>(files: &[P]) -> Vec<(Kind, String)> {
     let all = check(files).unwrap().findings.into_iter();
     all.filter(|finding| finding.kind != Kind::NoFile).map(|finding| (finding.kind, finding.text)).collect()

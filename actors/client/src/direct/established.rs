@@ -372,7 +372,7 @@ impl EstablishedLink {
         Some(read)
     }
 
-    /// Checks who sent a message, and for whom.
+    /// Checks the source and the destination of a message.
     fn check(&mut self, message: Message) -> LinkRead {
         let header = &message.header;
         let is_for_us =
