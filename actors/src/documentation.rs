@@ -26,7 +26,7 @@ fn the_page_on_errors_names_each_one() {
         ("BarrierError", include_str!("../client/src/barrier.rs")),
         ("SealError", include_str!("../../runtime/src/protection/ends.rs")),
         ("ArmError", include_str!("../../runtime/src/protection/mod.rs")),
-        ("ReplayFault", include_str!("../replay/src/error.rs")),
+        ("RunError", include_str!("../replay/src/error.rs")),
         ("CommandError", commands),
         ("AuditError", include_str!("../node/src/audits.rs")),
         ("AccessError", include_str!("../security/src/access/guard.rs")),

@@ -165,7 +165,7 @@ pub mod message {
 pub mod schema {
     pub use sinew_runtime::wire::{TypeSchema, schema_of};
     pub use sinew_schema::{
-        Comparison, Difference, Field, SCHEMA_BYTES_MAX, Schema, SchemaError, SchemaHash, Shape, Untraced,
+        Comparison, Difference, Field, SCHEMA_BYTES_MAX, Schema, SchemaError, SchemaHash, Shape, TraceError,
         Variant, compare,
     };
 }
@@ -174,7 +174,7 @@ pub mod schema {
 pub mod security {
     #[doc(inline)]
     pub use sinew_security::{
-        Certificate, Checker, CredentialError, CredentialFaults, Credentials, DenyList, DenyListEntryError,
+        Certificate, Checker, CredentialError, Credentials, CredentialsError, DenyList, DenyListEntryError,
         DiscoveryKey, Identity, Judged, MalformedCertificateError, PROTOCOL, Peer, PeerError, Sealer, Serial,
         Stamp, Tag, TimePolicy, Tls, UnixTime, Validity, ValidityError, Verdict, date, files, project_of,
         project_uri, rustls, words,

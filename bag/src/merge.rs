@@ -86,8 +86,8 @@ pub fn merge<P: AsRef<Path>>(files: &[P], out: impl AsRef<Path>) -> Result<Merge
         // The file was created above, and a part of it is useless. If this fails, too, the first failure counts.
         let _ = fs::remove_file(out);
         match fault {
-            Fault::Read(error) => error,
-            Fault::Write(error) => BagError::write(out, error),
+            MergeError::Read(error) => error,
+            MergeError::Write(error) => BagError::write(out, error),
         }
     })?;
     Ok(merged)
@@ -113,18 +113,18 @@ fn open(path: &Path, clocks: &Clocks, merged: &mut Merged) -> Result<Source, Bag
     Ok(Source { ordered, node: place, way, ids: BTreeMap::new(), next })
 }
 
-enum Fault {
+enum MergeError {
     Read(BagError),
     Write(io::Error),
 }
 
-impl From<mcap::McapError> for Fault {
+impl From<mcap::McapError> for MergeError {
     fn from(error: mcap::McapError) -> Self {
         Self::Write(cause(error))
     }
 }
 
-fn write(file: BufWriter<fs::File>, sources: &mut [Source], merged: &mut Merged) -> Result<(), Fault> {
+fn write(file: BufWriter<fs::File>, sources: &mut [Source], merged: &mut Merged) -> Result<(), MergeError> {
     let options = WriteOptions::new().compression(Some(mcap::Compression::Zstd)).compression_threads(0);
     let mut writer = options.library(concat!("sinew-bag/", env!("CARGO_PKG_VERSION"))).create(file)?;
     let mut next = BinaryHeap::new();
@@ -152,7 +152,7 @@ fn write(file: BufWriter<fs::File>, sources: &mut [Source], merged: &mut Merged)
         let header = MessageHeader { channel_id, sequence: message.sequence, log_time, publish_time };
         writer.write_to_known_channel(&header, &message.data)?;
         sequence += 1;
-        source.next = source.ordered.next_message().map_err(Fault::Read)?;
+        source.next = source.ordered.next_message().map_err(MergeError::Read)?;
         if let Some(message) = &source.next {
             next.push(Reverse((source.way.convert(message.log_ns).0, at)));
         }
@@ -166,7 +166,7 @@ fn write(file: BufWriter<fs::File>, sources: &mut [Source], merged: &mut Merged)
     }
     writer.write_metadata(&mcap::records::Metadata { name: MERGED.to_owned(), metadata })?;
     writer.finish()?;
-    writer.into_inner().flush().map_err(Fault::Write)
+    writer.into_inner().flush().map_err(MergeError::Write)
 }
 
 /// Adds a channel under the name of its node.

@@ -9,12 +9,12 @@ pub(crate) const DEPTH_MAX: usize = 64;
 
 /// A payload that is no MessagePack value, or another one than its schema says.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Misfit {
+pub(crate) struct MisfitError {
     /// The expectation that was not met.
     pub(crate) expected: &'static str,
 }
 
-impl Misfit {
+impl MisfitError {
     pub(crate) const fn new(expected: &'static str) -> Self {
         Self { expected }
     }
@@ -61,41 +61,41 @@ impl<'p> Reader<'p> {
         is_nil
     }
 
-    fn take(&mut self, length: u32) -> Result<&'p [u8], Misfit> {
+    fn take(&mut self, length: u32) -> Result<&'p [u8], MisfitError> {
         let parts = self.rest.split_at_checked(length as usize);
-        let (bytes, rest) = parts.ok_or(Misfit::new("more bytes"))?;
+        let (bytes, rest) = parts.ok_or(MisfitError::new("more bytes"))?;
         self.rest = rest;
         Ok(bytes)
     }
 
     /// Returns an unsigned number of `size` bytes, at most 8.
-    fn number(&mut self, size: u32) -> Result<u64, Misfit> {
+    fn number(&mut self, size: u32) -> Result<u64, MisfitError> {
         Ok(self.take(size)?.iter().fold(0, |all, byte| all << 8 | u64::from(*byte)))
     }
 
-    fn length(&mut self, size: u32) -> Result<u32, Misfit> {
+    fn length(&mut self, size: u32) -> Result<u32, MisfitError> {
         // At most 4 bytes are asked for.
         Ok(self.number(size)? as u32)
     }
 
-    fn signed(&mut self, size: u32) -> Result<Token<'p>, Misfit> {
+    fn signed(&mut self, size: u32) -> Result<Token<'p>, MisfitError> {
         let unused = 64 - 8 * size;
         let value = (self.number(size)? << unused) as i64 >> unused;
         Ok(u64::try_from(value).map_or(Token::Negative(value), Token::Unsigned))
     }
 
-    fn text(&mut self, length: u32) -> Result<Token<'p>, Misfit> {
-        let text = std::str::from_utf8(self.take(length)?).map_err(|_| Misfit::new("text in UTF-8"))?;
+    fn text(&mut self, length: u32) -> Result<Token<'p>, MisfitError> {
+        let text = std::str::from_utf8(self.take(length)?).map_err(|_| MisfitError::new("text in UTF-8"))?;
         Ok(Token::Text(text))
     }
 
-    fn extension(&mut self, length: u32) -> Result<Token<'p>, Misfit> {
+    fn extension(&mut self, length: u32) -> Result<Token<'p>, MisfitError> {
         let kind = self.number(1)? as i8;
         Ok(Token::Extension(kind, self.take(length)?))
     }
 
     /// Reads the next value, or the head of a list or map.
-    pub(crate) fn next(&mut self) -> Result<Token<'p>, Misfit> {
+    pub(crate) fn next(&mut self) -> Result<Token<'p>, MisfitError> {
         let marker = self.number(1)? as u8;
         Ok(match marker {
             0x00..=0x7f => Token::Unsigned(marker.into()),
@@ -103,7 +103,7 @@ impl<'p> Reader<'p> {
             0x90..=0x9f => Token::List(u32::from(marker & 0x0f)),
             0xa0..=0xbf => self.text(u32::from(marker & 0x1f))?,
             0xc0 => Token::Nil,
-            0xc1 => return Err(Misfit::new("a value of MessagePack")),
+            0xc1 => return Err(MisfitError::new("a value of MessagePack")),
             0xc2 => Token::Bool(false),
             0xc3 => Token::Bool(true),
             0xc4..=0xc6 => {
@@ -130,7 +130,7 @@ impl<'p> Reader<'p> {
     }
 
     /// Skips the next value with all that is in it.
-    pub(crate) fn skip(&mut self) -> Result<(), Misfit> {
+    pub(crate) fn skip(&mut self) -> Result<(), MisfitError> {
         let mut open = 1_u64;
         while open > 0 {
             open -= 1;
@@ -146,10 +146,10 @@ impl<'p> Reader<'p> {
 
 /// Writes the next value as JSON. Numbers without a JSON form become text (`"NaN"`), bytes become base64, and keys that
 /// are no text become text. A list or a map in a key has neither lists nor maps.
-pub(crate) fn json(reader: &mut Reader<'_>, depth: usize, out: &mut String) -> Result<(), Misfit> {
+pub(crate) fn json(reader: &mut Reader<'_>, depth: usize, out: &mut String) -> Result<(), MisfitError> {
     let token = reader.next()?;
     match token {
-        Token::List(_) | Token::Map(_) if depth == 0 => return Err(Misfit::new("less nesting")),
+        Token::List(_) | Token::Map(_) if depth == 0 => return Err(MisfitError::new("less nesting")),
         Token::List(count) => {
             out.push('[');
             for at in 0..count {
@@ -180,7 +180,7 @@ pub(crate) fn json_members(
     count: u32,
     depth: usize,
     out: &mut String,
-) -> Result<(), Misfit> {
+) -> Result<(), MisfitError> {
     for at in 0..count {
         separate(at, out);
         let mut ahead = *reader;
@@ -267,7 +267,7 @@ mod tests {
 
     use super::*;
 
-    fn shown(bytes: &[u8]) -> Result<String, Misfit> {
+    fn shown(bytes: &[u8]) -> Result<String, MisfitError> {
         let mut text = String::new();
         json(&mut Reader::new(bytes), DEPTH_MAX, &mut text).map(|()| text)
     }

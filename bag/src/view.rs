@@ -12,7 +12,7 @@ mod tests;
 
 use sinew_schema::Schema;
 
-use crate::{messagepack::Misfit, protobuf::Output, terms::Record};
+use crate::{messagepack::MisfitError, protobuf::Output, terms::Record};
 
 /// The number of the field with Sinew's own header, above all fields of payloads.
 pub(crate) const HEADER_FIELD: u32 = 15_000;
@@ -119,7 +119,7 @@ impl View {
     ///
     /// # Errors
     /// The payload does not fit the schema. `out` then has a part of it.
-    pub(crate) fn encode(&self, payload: &[u8], out: &mut Output) -> Result<(), Misfit> {
+    pub(crate) fn encode(&self, payload: &[u8], out: &mut Output) -> Result<(), MisfitError> {
         encode::payload(self, payload, out)
     }
 }
@@ -143,7 +143,7 @@ pub(crate) const HEADER_FIELDS: [(u32, &str); 8] = [
 ];
 
 /// Writes the fields of the header.
-pub(crate) fn header(record: &Record<'_>, misfit: Option<Misfit>, out: &mut Output) {
+pub(crate) fn header(record: &Record<'_>, misfit: Option<MisfitError>, out: &mut Output) {
     out.unsigned(1, record.sequence);
     out.unsigned(2, record.correlation);
     out.unsigned(3, record.number);
@@ -151,7 +151,7 @@ pub(crate) fn header(record: &Record<'_>, misfit: Option<Misfit>, out: &mut Outp
     out.unsigned(5, record.sent_error_ns);
     out.unsigned(6, record.flags.into());
     out.unsigned(7, record.time_to_live_us.into());
-    if let Some(Misfit { expected }) = misfit {
+    if let Some(MisfitError { expected }) = misfit {
         out.text(8, expected);
     }
 }

@@ -254,16 +254,16 @@ fn is_name(target: &str) -> bool {
     target.parse::<Tid>().is_err()
 }
 
-fn ask(system: &mut System, question: &AskWatch) -> Result<WatchReport, FailedWatch> {
+fn ask(system: &mut System, question: &AskWatch) -> Result<WatchReport, WatchError> {
     let to = Tid::new(question.app.node, AppAddress::INSPECT);
     let report: WatchReport =
-        system.endpoint.message(to, question).ask(system.within).map_err(|error| FailedWatch::of(&error))?;
-    report.refused.clone().map_or(Ok(report), |why| Err(FailedWatch::Refused(why)))
+        system.endpoint.message(to, question).ask(system.within).map_err(|error| WatchError::of(&error))?;
+    report.refused.clone().map_or(Ok(report), |why| Err(WatchError::Refused(why)))
 }
 
 /// Why a question had no result.
 #[derive(Debug)]
-enum FailedWatch {
+enum WatchError {
     /// It did not leave this program, or did not reach the entry node.
     NotAsked(String),
     /// The application's node did not answer it, or cannot.
@@ -272,7 +272,7 @@ enum FailedWatch {
     Refused(String),
 }
 
-impl FailedWatch {
+impl WatchError {
     fn of(error: &ApiError) -> Self {
         let why = in_words(error);
         let is_of_the_other =
@@ -304,7 +304,7 @@ mod tests {
     const KNEE: NodeAddress = NodeAddress::new(0x0a00_0002);
 
     /// Returns the text and the exit code if the hip accepted the command.
-    fn blamed(vain: FailedWatch, there: NodeAddress, names: &Names) -> (String, u8) {
+    fn blamed(vain: WatchError, there: NodeAddress, names: &Names) -> (String, u8) {
         let fault = vain.blamed((HIP, "/run/hip.sock"), there, names);
         (fault.to_string(), fault.code())
     }
@@ -321,11 +321,11 @@ mod tests {
             ApiError::NoReply(Duration::from_secs(2)),
             ApiError::Ended(Outcome::Rejected(Rejection::NoSuchNode)),
         ] {
-            let (text, code) = blamed(FailedWatch::of(&error), KNEE, &names());
+            let (text, code) = blamed(WatchError::of(&error), KNEE, &names());
             assert_eq!(text, format!("the application's node knee at 10.0.0.2: {}", in_words(&error)));
             assert_eq!(code, EXIT_FINDING);
         }
-        let refused = || FailedWatch::Refused("this node shows 8 watches at once".to_owned());
+        let refused = || WatchError::Refused("this node shows 8 watches at once".to_owned());
         let words = "the application's node knee at 10.0.0.2: this node shows 8 watches at once";
         assert_eq!(blamed(refused(), KNEE, &names()), (words.to_owned(), EXIT_FINDING));
         // A node that answers is not reported as silent, wherever it is.
@@ -338,7 +338,7 @@ mod tests {
         let silent = ApiError::NoReply(Duration::from_secs(2));
         let ended = ApiError::Closed("it was closed".to_owned());
         for (error, there) in [(silent, HIP), (ended, KNEE)] {
-            let (text, code) = blamed(FailedWatch::of(&error), there, &names());
+            let (text, code) = blamed(WatchError::of(&error), there, &names());
             assert_eq!(
                 (text, code),
                 (format!("the node at /run/hip.sock: {}", in_words(&error)), EXIT_NO_NODE)

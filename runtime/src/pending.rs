@@ -11,7 +11,7 @@ use crate::{
     clock::Clock,
     lock,
     outcome::{MemberOutcome, MemberReport, MemberTable, Outcome, ReceiptSink, Ticket},
-    router::{MessageSink, Refused},
+    router::{MessageSink, SubmitError},
     tid::{NodeAddress, Tid},
     time::Time,
     wakes,
@@ -288,7 +288,7 @@ pub struct AppSink<O> {
 }
 
 impl<O: MessageSink> MessageSink for AppSink<O> {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         if !is_answer(&message.header) {
             return self.inbox.submit(message);
         }
@@ -298,7 +298,7 @@ impl<O: MessageSink> MessageSink for AppSink<O> {
         }
     }
 
-    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
         if is_answer(&message.header) { self.submit(message) } else { self.inbox.offer(message, room) }
     }
 

@@ -21,7 +21,7 @@ use std::{
 
 use arc_swap::ArcSwap;
 
-pub use self::sink::{MessageSink, Refused};
+pub use self::sink::{MessageSink, SubmitError};
 use self::{
     copies::Copies,
     each::OpenSends,
@@ -183,9 +183,9 @@ impl Router {
         let result = if destination.is_single() {
             Self::send_to_one(table, self.node, message)
         } else if destination.app == AppAddress::NONE {
-            Err(Refused::new(message, Rejection::NoSuchApplication))
+            Err(SubmitError::new(message, Rejection::NoSuchApplication))
         } else if message.header.flags.has(Flags::ASK) {
-            Err(Refused::new(message, Rejection::Unsupported))
+            Err(SubmitError::new(message, Rejection::Unsupported))
         } else if message.receipt.is_some() {
             self.send_to_each(&snapshot, message)
         } else {
@@ -254,10 +254,10 @@ impl Router {
     ///
     /// # Errors
     /// The message, and the reason of the rejection.
-    pub fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
+    pub fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
         let table = &self.snapshot.load().table;
         let Some(route) = table.local.get(&message.header.destination.app) else {
-            return Err(Refused::new(message, Rejection::NoSuchApplication));
+            return Err(SubmitError::new(message, Rejection::NoSuchApplication));
         };
         let Some(tap) = &table.tap else { return offer_to(route, table.guard.as_ref(), message, room) };
         tap::hand_over(&**tap, message, true, |message| offer_to(route, table.guard.as_ref(), message, room))
@@ -280,17 +280,17 @@ impl Router {
     }
 
     /// Counts a rejected message, and settles it as rejected.
-    pub fn refuse(&self, refused: Refused) {
+    pub fn refuse(&self, refused: SubmitError) {
         // The owner of the receipt is notified of the reason.
         let _ = self.account(Err(refused));
     }
 
     /// Same as [`refuse`](Self::refuse), for a message from another node: its sender is notified, also of an
     /// unconfirmed message.
-    pub fn refuse_arrived(&self, refused: Refused) -> Rejection {
-        let Refused { message, why } = refused;
+    pub fn refuse_arrived(&self, refused: SubmitError) -> Rejection {
+        let SubmitError { message, why } = refused;
         self.report(message.header.destination, &message.header, why, 1);
-        self.refuse(Refused::new(message, why));
+        self.refuse(SubmitError::new(message, why));
         why
     }
 
@@ -313,10 +313,10 @@ impl Router {
     ///
     /// # Errors
     /// The message, and the reason of the rejection.
-    pub fn notify_app(&self, app: AppAddress, message: Message) -> Result<(), Refused> {
+    pub fn notify_app(&self, app: AppAddress, message: Message) -> Result<(), SubmitError> {
         match self.snapshot.load().table.local.get(&app) {
             Some(route) => route.sink.submit(message),
-            None => Err(Refused::new(message, Rejection::NoSuchApplication)),
+            None => Err(SubmitError::new(message, Rejection::NoSuchApplication)),
         }
     }
 
@@ -339,7 +339,7 @@ impl Router {
         Rejection::ALL.into_iter().zip(counts).filter(|(_, count)| *count > 0).collect()
     }
 
-    fn account(&self, result: Result<(), Refused>) -> Result<(), Rejection> {
+    fn account(&self, result: Result<(), SubmitError>) -> Result<(), Rejection> {
         result.map_err(|refused| {
             self.refused[refused.why as usize].fetch_add(1, Ordering::Relaxed);
             refused.message.reject(refused.why);
@@ -347,14 +347,14 @@ impl Router {
         })
     }
 
-    fn send_up(uplink: &dyn MessageSink, message: Message) -> Result<(), Refused> {
+    fn send_up(uplink: &dyn MessageSink, message: Message) -> Result<(), SubmitError> {
         if !message.header.destination.is_single() && message.header.flags.has(Flags::ASK) {
-            return Err(Refused::new(message, Rejection::Unsupported));
+            return Err(SubmitError::new(message, Rejection::Unsupported));
         }
         uplink.submit(message)
     }
 
-    fn send_to_one(table: &Table, here: NodeAddress, message: Message) -> Result<(), Refused> {
+    fn send_to_one(table: &Table, here: NodeAddress, message: Message) -> Result<(), SubmitError> {
         let Tid { node, .. } = message.header.destination;
         if node == here {
             return submit_here(table, table.guard.as_ref(), message);
@@ -366,7 +366,7 @@ impl Router {
     }
 
     /// Sends one copy to each node that has a member, and one to each member here.
-    fn multicast(&self, snapshot: &Snapshot, message: Message) -> Result<(), Refused> {
+    fn multicast(&self, snapshot: &Snapshot, message: Message) -> Result<(), SubmitError> {
         let Tid { node, app } = message.header.destination;
         let mut copies = Copies::default();
         let Snapshot { table, members } = snapshot;
@@ -385,10 +385,10 @@ impl Router {
         } else if let Some(peer) = table.peers.get(&node) {
             submit(peer);
         } else if node != self.node {
-            return Err(Refused::new(message, Rejection::NoSuchNode));
+            return Err(SubmitError::new(message, Rejection::NoSuchNode));
         }
         match copies.why_none() {
-            Some(why) if !copies.is_taken() => Err(Refused::new(message, why)),
+            Some(why) if !copies.is_taken() => Err(SubmitError::new(message, why)),
             Some(_) | None => {
                 self.count(&copies, &message.header);
                 Ok(())
@@ -447,20 +447,20 @@ fn for_each_here(
 
 /// Submits a message to its one application of this node, if the guard allows it.
 #[inline]
-fn submit_here(table: &Table, guard: Judge<'_>, message: Message) -> Result<(), Refused> {
+fn submit_here(table: &Table, guard: Judge<'_>, message: Message) -> Result<(), SubmitError> {
     let route = table.local.get(&message.header.destination.app);
     let Some(tap) = &table.tap else { return submit_by(route, guard, message) };
     tap::hand_over(&**tap, message, false, |message| submit_by(route, guard, message))
 }
 
 #[inline]
-fn submit_by(route: Option<&LocalRoute>, guard: Judge<'_>, message: Message) -> Result<(), Refused> {
+fn submit_by(route: Option<&LocalRoute>, guard: Judge<'_>, message: Message) -> Result<(), SubmitError> {
     match route {
         Some(_) if guard::refuses(guard, message.header.destination.app, &message.header) => {
-            Err(Refused::new(message, Rejection::NotAllowed))
+            Err(SubmitError::new(message, Rejection::NotAllowed))
         }
         Some(route) => route.sink.submit(message),
-        None => Err(Refused::new(message, Rejection::NoSuchApplication)),
+        None => Err(SubmitError::new(message, Rejection::NoSuchApplication)),
     }
 }
 
@@ -471,19 +471,19 @@ fn offer_to(
     guard: Judge<'_>,
     message: Message,
     room: Option<&Waker>,
-) -> Result<(), Refused> {
+) -> Result<(), SubmitError> {
     if guard::refuses(guard, message.header.destination.app, &message.header) {
-        return Err(Refused::new(message, Rejection::NotAllowed));
+        return Err(SubmitError::new(message, Rejection::NotAllowed));
     }
     route.sink.offer(message, room)
 }
 
 /// Submits a message to another node.
 #[inline]
-fn submit_to(peer: Option<&Arc<dyn MessageSink>>, message: Message) -> Result<(), Refused> {
+fn submit_to(peer: Option<&Arc<dyn MessageSink>>, message: Message) -> Result<(), SubmitError> {
     match peer {
         Some(peer) => peer.submit(message),
-        None => Err(Refused::new(message, Rejection::NoSuchNode)),
+        None => Err(SubmitError::new(message, Rejection::NoSuchNode)),
     }
 }
 

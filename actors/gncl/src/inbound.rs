@@ -8,7 +8,7 @@ use std::{
 use sinew_model::{clocks::ClockConversion, undelivered::Report};
 use sinew_runtime::{
     outcome::{MemberReport, Outcome, Receipt, Rejection, Ticket},
-    router::Refused,
+    router::SubmitError,
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wakes,
@@ -258,7 +258,7 @@ impl Inbound {
     fn offer(&self, session: &PeerSession, queue: u64, message: Message) -> Option<Disposition> {
         match self.state.ctx.router.offer(message, None) {
             Ok(()) => Some(Disposition::Forwarded),
-            Err(Refused { message, why: Rejection::QueueFull }) => self.enqueue(session, queue, message),
+            Err(SubmitError { message, why: Rejection::QueueFull }) => self.enqueue(session, queue, message),
             Err(refused) => {
                 self.state.ctx.router.refuse_arrived(refused);
                 Some(Disposition::Refused)
@@ -276,7 +276,7 @@ impl Inbound {
                 None
             }
             Err(message) => {
-                self.state.ctx.router.refuse_arrived(Refused::new(message, Rejection::QueueFull));
+                self.state.ctx.router.refuse_arrived(SubmitError::new(message, Rejection::QueueFull));
                 Some(Disposition::Refused)
             }
         }

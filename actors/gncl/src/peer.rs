@@ -16,7 +16,7 @@ use sinew_model::{periodic_checks::PeriodicChecks, undelivered::Report};
 use sinew_runtime::{
     lock,
     outcome::{MemberReport, Outcome, ReceiptSink, Rejection, Ticket},
-    router::{MessageSink, Refused},
+    router::{MessageSink, SubmitError},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
     wire::{Class, Header, Kind, Message},
@@ -280,11 +280,11 @@ impl Peer {
 }
 
 impl MessageSink for Peer {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         // A sender that was notified of the loss must not have a message accepted without any report of its
         // fate. GNCL is notified at the same time, and may act later. SYNC: Acquire, see `fence`.
         if self.is_over.load(Ordering::Acquire) {
-            return Err(Refused::new(message, Rejection::NoSuchNode));
+            return Err(SubmitError::new(message, Rejection::NoSuchNode));
         }
         let has_a_time = message.header.time_to_live_us != 0 || message.receipt.is_some();
         let session = self.session_for(message.header.class);

@@ -31,7 +31,7 @@ use rustix::{
 };
 use sinew_runtime::{
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
-    router::{MessageSink, Refused},
+    router::{MessageSink, SubmitError},
     tid::{AppAddress, Tid},
     time::Time,
     wire::{Class, Flags, Kind, Message},
@@ -58,11 +58,11 @@ const SWITCHES_MAX: usize = 1_024;
 pub(super) trait Listener: MessageSink {
     /// Queues a mark behind all earlier frames, without a bound. A later mark could follow frames of its sender's next
     /// incarnation.
-    fn submit_mark(&self, mark: Message) -> Result<(), Refused>;
+    fn submit_mark(&self, mark: Message) -> Result<(), SubmitError>;
 }
 
 impl<S: Socket> Listener for SocketWriter<S> {
-    fn submit_mark(&self, mark: Message) -> Result<(), Refused> {
+    fn submit_mark(&self, mark: Message) -> Result<(), SubmitError> {
         self.submit_beyond(mark)
     }
 }

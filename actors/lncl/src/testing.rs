@@ -35,7 +35,7 @@ use sinew_runtime::{
     event_queue::EventStream,
     lock,
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
-    router::{LocalRoute, MessageSink, Refused, Router},
+    router::{LocalRoute, MessageSink, Router, SubmitError},
     supervision::ReadyGate,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     wire::{FrameCodec, Kind, Message, Payload, encode_frame},
@@ -257,10 +257,12 @@ impl ReceiptSink for Outcomes {
 struct Channel(SyncSender<Message>);
 
 impl MessageSink for Channel {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         self.0.try_send(message).map_err(|error| match error {
-            std::sync::mpsc::TrySendError::Full(message) => Refused::new(message, Rejection::QueueFull),
-            std::sync::mpsc::TrySendError::Disconnected(message) => Refused::new(message, Rejection::Closed),
+            std::sync::mpsc::TrySendError::Full(message) => SubmitError::new(message, Rejection::QueueFull),
+            std::sync::mpsc::TrySendError::Disconnected(message) => {
+                SubmitError::new(message, Rejection::Closed)
+            }
         })
     }
 }

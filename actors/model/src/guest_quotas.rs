@@ -14,7 +14,7 @@ use std::{
 use sinew_runtime::{
     lock,
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
-    router::Refused,
+    router::SubmitError,
     tid::{AppAddress, NodeAddress, Tid},
     wire::{Message, Payload},
 };
@@ -54,17 +54,17 @@ impl GuestQuotas {
     /// The rejected message: `QueueFull` if the quota of the guest, or of all guests, is used up. Messages that layers
     /// accept from no one are rejected, too, since they would bypass the quota. These are messages to a remote sync
     /// manager (`ForgedSource`, as that one would report), and to a layer of all nodes (`Unsupported`).
-    pub fn admit(&self, here: NodeAddress, uid: u32, mut message: Message) -> Result<Message, Refused> {
+    pub fn admit(&self, here: NodeAddress, uid: u32, mut message: Message) -> Result<Message, SubmitError> {
         let Tid { node, app } = message.header.destination;
         if !app.is_layer() {
             return Ok(message);
         }
         if node == NodeAddress::ALL {
-            return Err(Refused::new(message, Rejection::Unsupported));
+            return Err(SubmitError::new(message, Rejection::Unsupported));
         }
         let is_here = node == here || node == NodeAddress::HERE;
         let (quota, of_all, of_user) = match app {
-            AppAddress::SYNC if !is_here => return Err(Refused::new(message, Rejection::ForgedSource)),
+            AppAddress::SYNC if !is_here => return Err(SubmitError::new(message, Rejection::ForgedSource)),
             AppAddress::SYNC if message.header.kind == LeaveBarrier::KIND => {
                 (&self.leaves, LEAVES_MAX, LEAVES_OF_USER)
             }
@@ -75,7 +75,7 @@ impl GuestQuotas {
             _ => return Ok(message),
         };
         let Some(slot) = quota.take(uid, of_all, of_user) else {
-            return Err(Refused::new(message, Rejection::QueueFull));
+            return Err(SubmitError::new(message, Rejection::QueueFull));
         };
         let original = message.receipt.take();
         let ticket = original.as_ref().map_or_else(|| message.ticket(), Receipt::ticket);

@@ -17,8 +17,8 @@ use std::{
 use bytes::BytesMut;
 use sinew_runtime::wire::{FrameCodec, FrameError, HEADER_LEN, Header, Message};
 use sinew_shm::{
-    Accepted, Bell, Capacity, Consumer, Corrupt, CreateError, LoanError, Offer, Only, PassError, Producer,
-    Received, ReceivedMessage, RefusedOffer, Region, Terms,
+    Accepted, Bell, Capacity, Consumer, CorruptError, CreateError, LoanError, Offer, OfferError, Only,
+    PassError, Producer, Received, ReceivedMessage, Region, Terms,
 };
 use tokio_util::codec::Decoder;
 
@@ -43,7 +43,7 @@ pub enum ExchangeError {
     Pass(#[from] PassError),
     /// The peer is at fault.
     #[error("the peer's offer of shared memory is refused: {0}")]
-    Refused(#[from] RefusedOffer),
+    Refused(#[from] OfferError),
     /// The peer is at fault: it claims to have sent an offer.
     #[error("the peer has offered no shared memory")]
     Missing,
@@ -66,7 +66,7 @@ impl ExchangeError {
         match self {
             Self::Create(_)
             | Self::Pass(PassError::System(_))
-            | Self::Refused(RefusedOffer::System { .. })
+            | Self::Refused(OfferError::System { .. })
             | Self::Fault
             | Self::Budget => true,
             Self::Pass(PassError::Closed | PassError::Broken { .. })
@@ -199,7 +199,7 @@ pub fn begins_with_frame(bytes: &[u8]) -> bool {
 pub enum RingError {
     #[error("shared memory holds what it cannot: {0}")]
     /// The other process has damaged the ring.
-    Corrupt(#[from] Corrupt),
+    Corrupt(#[from] CorruptError),
     #[error(transparent)]
     /// A frame in it is damaged.
     Frame(#[from] FrameError),
@@ -285,7 +285,7 @@ impl RingFrames {
     /// Takes records, without waiting, until there are about `enough` bytes, or half a ring's, or the long
     /// frame in progress is complete. Each byte that is used was read once. The peer gets their room back together: a
     /// waiting peer is woken once, and not per record.
-    pub fn take(&mut self, consumer: &mut Consumer, enough: usize) -> Result<Taken, Corrupt> {
+    pub fn take(&mut self, consumer: &mut Consumer, enough: usize) -> Result<Taken, CorruptError> {
         let half = consumer.payload_max() - MARK_BYTES;
         let enough = enough.max(half.min(ENOUGH_MIN));
         let mut taken = Taken::Nothing;

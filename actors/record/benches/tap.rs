@@ -9,7 +9,7 @@ use bytes::Bytes;
 use sinew_record::{RecordTap, Selection};
 use sinew_runtime::{
     outcome::Rejection,
-    router::{LocalRoute, MessageSink, Refused, Router, tap::TapOf},
+    router::{LocalRoute, MessageSink, Router, SubmitError, tap::TapOf},
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wire::{Header, Kind, Message},
@@ -24,9 +24,9 @@ const MESSAGES: u32 = 20_000;
 struct Nowhere;
 
 impl MessageSink for Nowhere {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         if black_box(&message).payload.is_empty() {
-            return Err(Refused::new(message, Rejection::Closed));
+            return Err(SubmitError::new(message, Rejection::Closed));
         }
         Ok(())
     }

@@ -11,11 +11,11 @@ use crate::{FirstDifference, TimedMessage};
 /// # Examples
 ///
 /// ```
-/// use sinew::replay::{ReplayError, ReplayFault};
+/// use sinew::replay::{ReplayError, RunError};
 ///
 /// fn report(error: &ReplayError) {
 ///     eprintln!("{error}; {} messages were sent before", error.outputs.len());
-///     if let ReplayFault::Panicked { app, .. } = &error.fault {
+///     if let RunError::Panicked { app, .. } = &error.fault {
 ///         eprintln!("see the log for where {app} panicked");
 ///     }
 /// }
@@ -26,14 +26,14 @@ pub struct ReplayError {
     /// The virtual time.
     pub at: Time,
     /// The cause.
-    pub fault: ReplayFault,
+    pub fault: RunError,
     /// The outputs until then.
     pub outputs: Vec<TimedMessage>,
 }
 
 /// The cause for which a replay did not reach its end.
 #[derive(Debug, thiserror::Error)]
-pub enum ReplayFault {
+pub enum RunError {
     /// An application panicked. A node would restart it; a replay ends, as no recording has the same restart.
     #[error("{app} panicked: {message}; the log has the place")]
     Panicked {

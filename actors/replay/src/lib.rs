@@ -82,7 +82,7 @@ mod world;
 
 pub use self::{
     compare::{Comparison, FirstDifference, compare},
-    error::{CheckError, ReplayError, ReplayFault},
+    error::{CheckError, ReplayError, RunError},
     message::TimedMessage,
     replay::Replay,
 };

@@ -23,7 +23,7 @@ use sinew_runtime::{
 };
 
 use crate::{
-    CheckError, Comparison, ReplayError, ReplayFault, TimedMessage,
+    CheckError, Comparison, ReplayError, RunError, TimedMessage,
     directory::Names,
     run::{Prepared, Progress, Run},
     world::World,
@@ -200,7 +200,7 @@ impl Replay {
             let _ = finish.send(result);
         };
         let thread = thread::Builder::new().name("replay".to_owned()).spawn(replay);
-        let thread = thread.map_err(|error| fault(ReplayFault::NoThread(error)))?;
+        let thread = thread.map_err(|error| fault(RunError::NoThread(error)))?;
         let mut seen = None;
         loop {
             match finished.recv_timeout(self.turn_within) {
@@ -209,7 +209,7 @@ impl Replay {
                     let now = progress.read();
                     if let (true, Some(app)) = (seen == Some(now), now.1) {
                         let app = names.get(app).cloned().unwrap_or_default();
-                        return Err(fault(ReplayFault::Blocked { app, within: self.turn_within }));
+                        return Err(fault(RunError::Blocked { app, within: self.turn_within }));
                     }
                     seen = Some(now);
                 }
@@ -263,7 +263,7 @@ impl Replay {
     }
 
     /// Connects the applications with the world, ready to be started.
-    fn prepare(&self, world: &Arc<World>) -> Result<Vec<Prepared>, ReplayFault> {
+    fn prepare(&self, world: &Arc<World>) -> Result<Vec<Prepared>, RunError> {
         let tids = self.addresses();
         let mut names = self.names.clone();
         for (app, tid) in self.apps.iter().zip(&tids) {
@@ -274,14 +274,14 @@ impl Replay {
         for (app, tid) in self.apps.iter().zip(tids) {
             let name = app.name().to_owned();
             if let Some(why) = app.fault() {
-                return Err(ReplayFault::Ended { app: name, why });
+                return Err(RunError::Ended { app: name, why });
             }
             let clock = world.clock();
             let mailbox = Mailbox::on_clock(clock.clone(), MAILBOX);
             let pending = Pending::on_clock(clock.clone(), self.first_wait, WAITS_MAX);
             let sink = Arc::new(AppSink { pending: pending.clone(), inbox: mailbox.clone() });
             if !world.add(tid, sink) || prepared.iter().any(|other| other.name == name) {
-                return Err(ReplayFault::Twice(name));
+                return Err(RunError::Twice(name));
             }
             let uplink: Arc<dyn MessageSink> = world.clone();
             let router = Arc::new(Router::through(tid.node, uplink).on_clock(clock.clone()));

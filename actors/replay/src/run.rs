@@ -16,7 +16,7 @@ use sinew_runtime::{
     time::Time,
 };
 
-use crate::{ReplayFault, TimedMessage, world::World};
+use crate::{RunError, TimedMessage, world::World};
 
 /// Maximum number of turns of all applications at one virtual time.
 const ROUNDS_MAX: usize = 2_000;
@@ -94,7 +94,7 @@ pub(crate) struct Run {
 
 impl Run {
     /// Runs the applications on these inputs, to the end.
-    pub(crate) async fn all<I>(self, prepared: Vec<Prepared>, inputs: Peekable<I>) -> Result<(), ReplayFault>
+    pub(crate) async fn all<I>(self, prepared: Vec<Prepared>, inputs: Peekable<I>) -> Result<(), RunError>
     where
         I: Iterator<Item = TimedMessage>,
     {
@@ -112,7 +112,7 @@ impl Run {
         result
     }
 
-    async fn replay<I>(&self, apps: &mut [App], mut inputs: Peekable<I>) -> Result<(), ReplayFault>
+    async fn replay<I>(&self, apps: &mut [App], mut inputs: Peekable<I>) -> Result<(), RunError>
     where
         I: Iterator<Item = TimedMessage>,
     {
@@ -140,7 +140,7 @@ impl Run {
             while let Some(input) = inputs.next_if(|input| input.at <= self.time.now()) {
                 number += 1;
                 if input.at < before {
-                    return Err(ReplayFault::Unordered { number, at: input.at, before });
+                    return Err(RunError::Unordered { number, at: input.at, before });
                 }
                 before = input.at;
                 self.world.deliver(input);
@@ -150,7 +150,7 @@ impl Run {
     }
 
     /// Runs the applications, in their order, until none has work.
-    async fn settle(&self, apps: &mut [App]) -> Result<(), ReplayFault> {
+    async fn settle(&self, apps: &mut [App]) -> Result<(), RunError> {
         let mut last = None;
         for _ in 0..ROUNDS_MAX {
             let mut has_run = false;
@@ -177,15 +177,15 @@ impl Run {
     }
 }
 
-fn never_idle(app: Option<&App>) -> ReplayFault {
+fn never_idle(app: Option<&App>) -> RunError {
     let app = app.map_or_else(|| "an application".to_owned(), |app| app.name.clone());
-    ReplayFault::NeverIdle { app, rounds: ROUNDS_MAX }
+    RunError::NeverIdle { app, rounds: ROUNDS_MAX }
 }
 
-fn ended(app: &str, reason: Reason) -> ReplayFault {
+fn ended(app: &str, reason: Reason) -> RunError {
     let app = app.to_owned();
     if let Reason::Panic(message) = reason {
-        return ReplayFault::Panicked { app, message };
+        return RunError::Panicked { app, message };
     }
-    ReplayFault::Ended { app, why: reason.to_string() }
+    RunError::Ended { app, why: reason.to_string() }
 }

@@ -12,7 +12,7 @@ use sinew_runtime::{
     mailbox::Mailbox,
     outcome::{Outcome, Receipt, Ticket},
     pending::AppSink,
-    router::{MessageSink, Refused},
+    router::{MessageSink, SubmitError},
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wire::{Flags, Message},
@@ -140,7 +140,7 @@ impl World {
     }
 
     /// Hands a message over to an application under test, now or after the latency.
-    fn hand_over(&self, to: Tid, sink: &AppSink<Mailbox>, message: Message) -> Result<(), Refused> {
+    fn hand_over(&self, to: Tid, sink: &AppSink<Mailbox>, message: Message) -> Result<(), SubmitError> {
         if self.latency.is_zero() {
             return sink.submit(message);
         }
@@ -154,7 +154,7 @@ impl World {
 
 impl MessageSink for World {
     /// Accepts a message of an application under test.
-    fn submit(&self, mut message: Message) -> Result<(), Refused> {
+    fn submit(&self, mut message: Message) -> Result<(), SubmitError> {
         let (header, now) = (message.header, self.clock.now());
         let destination = header.destination;
         let (receivers, late) = {

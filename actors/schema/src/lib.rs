@@ -17,4 +17,4 @@ pub use encoding::{
     NAME_BYTES_MAX, PARTS_MAX, SCHEMA_BYTES_MAX, SHAPE_DEPTH_MAX, SchemaError, SchemaHash, TYPES_MAX,
 };
 pub use shape::{Field, Schema, Shape, Variant};
-pub use trace::{Untraced, Wire};
+pub use trace::{TraceError, Wire};

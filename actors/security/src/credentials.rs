@@ -35,7 +35,7 @@ pub struct Credentials {
 
 /// All faults of a node's files, one per line. Nothing was changed.
 #[derive(Debug)]
-pub struct CredentialFaults(Vec<CredentialError>);
+pub struct CredentialsError(Vec<CredentialError>);
 
 /// One fault of a node's files.
 #[derive(Debug, thiserror::Error)]
@@ -135,7 +135,7 @@ impl Credentials {
         configured: &Identity,
         policy: TimePolicy,
         now: UnixTime,
-    ) -> Result<Self, CredentialFaults> {
+    ) -> Result<Self, CredentialsError> {
         let mut faults = Vec::new();
         let path = |name: &str| directory.join(name);
         let parts = (
@@ -148,10 +148,10 @@ impl Credentials {
         );
         let (Some(()), Some(certificate), Some(key), Some(authority), Some(discovery), Some(denied)) = parts
         else {
-            return Err(CredentialFaults(faults));
+            return Err(CredentialsError(faults));
         };
         let Some(anchor) = keep(&mut faults, anchor(&path(files::AUTHORITY), &authority, configured)) else {
-            return Err(CredentialFaults(faults));
+            return Err(CredentialsError(faults));
         };
         let floor = certificate.validity().from;
         let denied = Arc::new(ArcSwap::from_pointee(denied));
@@ -167,7 +167,7 @@ impl Credentials {
         };
         credentials.check(directory, now, &mut faults);
         if !faults.is_empty() {
-            return Err(CredentialFaults(faults));
+            return Err(CredentialsError(faults));
         }
         credentials.warnings =
             credentials.certificate.validity().warning(credentials.policy(), now).into_iter().collect();
@@ -218,7 +218,7 @@ impl Credentials {
     ///
     /// # Errors
     /// Returns an error if the list does not exist, cannot be read, or can be changed by other users.
-    pub fn deny_list(directory: &Path) -> Result<DenyList, CredentialFaults> {
+    pub fn deny_list(directory: &Path) -> Result<DenyList, CredentialsError> {
         let mut faults = Vec::new();
         let parts = (
             keep(&mut faults, files::directory(directory).map_err(CredentialError::from)),
@@ -226,7 +226,7 @@ impl Credentials {
         );
         match parts {
             (Some(()), Some(denied)) => Ok(denied),
-            (None, _) | (_, None) => Err(CredentialFaults(faults)),
+            (None, _) | (_, None) => Err(CredentialsError(faults)),
         }
     }
 
@@ -337,7 +337,7 @@ fn anchor(
     verifier::anchor(authority).ok_or_else(none)
 }
 
-impl CredentialFaults {
+impl CredentialsError {
     /// Returns all faults, at least one.
     #[must_use]
     pub fn faults(&self) -> &[CredentialError] {
@@ -345,9 +345,9 @@ impl CredentialFaults {
     }
 }
 
-impl std::error::Error for CredentialFaults {}
+impl std::error::Error for CredentialsError {}
 
-impl fmt::Display for CredentialFaults {
+impl fmt::Display for CredentialsError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (at, fault) in self.0.iter().enumerate() {
             write!(f, "{}{fault}", if at == 0 { "" } else { "\n" })?;

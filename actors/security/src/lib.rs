@@ -45,7 +45,7 @@ mod tls;
 mod verifier;
 
 pub use certificate::{Certificate, MalformedCertificateError, Serial};
-pub use credentials::{CredentialError, CredentialFaults, Credentials};
+pub use credentials::{CredentialError, Credentials, CredentialsError};
 #[cfg(feature = "fuzzing")]
 pub use datagrams::SPAN;
 pub use datagrams::{Checker, DiscoveryKey, Sealer, Stamp, Tag, Verdict};

@@ -24,7 +24,7 @@ use sinew_runtime::{
 
 use self::reminder::{Expiry, Reminder};
 use crate::{
-    Checker, CredentialFaults, Credentials, DiscoveryKey, Identity, Sealer, Serial, Stamp, Tag, Tls,
+    Checker, Credentials, CredentialsError, DiscoveryKey, Identity, Sealer, Serial, Stamp, Tag, Tls,
     Validity, Verdict,
 };
 
@@ -59,7 +59,7 @@ pub enum DenyListError {
     None,
     /// The file cannot be used; all faults are listed. The list that was in force still is.
     #[error("the deny list cannot be used, and the one in force stays:\n{0}")]
-    Faults(#[from] CredentialFaults),
+    Faults(#[from] CredentialsError),
     /// The list is in force for new connections, but existing ones were not checked: the node is stopping, or
     /// a layer hangs. Retry.
     #[error(
@@ -151,7 +151,7 @@ impl NodeSecurity {
     ///
     /// # Errors
     /// The list cannot be used; the one in force stays.
-    pub fn reload_deny_list(&self) -> Result<Denied, CredentialFaults> {
+    pub fn reload_deny_list(&self) -> Result<Denied, CredentialsError> {
         let _turn = lock(&self.reading);
         let list = Credentials::deny_list(&self.directory)?;
         let own = list.has(&self.serial).then(|| self.serial.clone());
@@ -258,7 +258,7 @@ impl Seals {
 pub enum KeyError {
     /// The files have faults.
     #[error(transparent)]
-    Files(#[from] CredentialFaults),
+    Files(#[from] CredentialsError),
     /// rustls does not accept the key.
     #[error("the key cannot be used ({0}); make a new one with `sinew keys issue`")]
     Key(#[from] rustls::Error),

@@ -54,7 +54,7 @@ use std::{
 use sinew_runtime::{
     mailbox::Budget,
     outcome::{Outcome, Rejection, Ticket},
-    router::{MessageSink, Refused},
+    router::{MessageSink, SubmitError},
     time::Time,
     wire::Message,
 };
@@ -263,7 +263,7 @@ impl<S: Socket> SocketWriter<S> {
     ///
     /// # Errors
     /// Returns the frame if there will be no further connection.
-    pub fn submit_beyond(&self, message: Message) -> Result<(), Refused> {
+    pub fn submit_beyond(&self, message: Message) -> Result<(), SubmitError> {
         self.submit_outcome(message, usize::MAX)
     }
 
@@ -271,7 +271,7 @@ impl<S: Socket> SocketWriter<S> {
     ///
     /// # Errors
     /// Returns the frame if too many are queued, or if there will be no further connection.
-    pub fn submit_outcome(&self, message: Message, waiting_max: usize) -> Result<(), Refused> {
+    pub fn submit_outcome(&self, message: Message, waiting_max: usize) -> Result<(), SubmitError> {
         let step = self.with(|state, deferred| {
             let is_waived = state.unsent.queue.outcomes() < waiting_max;
             state.submit(message, if is_waived { Bound::Waived } else { Bound::Kept }, deferred)
@@ -286,7 +286,7 @@ impl<S: Socket> SocketWriter<S> {
     ///
     /// # Errors
     /// Returns the frame if there is no connection, or if too many are pending.
-    pub fn submit_urgent(&self, message: Message, waiting_max: usize) -> Result<(), Refused> {
+    pub fn submit_urgent(&self, message: Message, waiting_max: usize) -> Result<(), SubmitError> {
         self.with(|state, deferred| state.submit_urgent(message, waiting_max, deferred))
     }
 
@@ -300,13 +300,13 @@ impl<S: Socket> SocketWriter<S> {
         link: LinkNumber,
         message: Message,
         waiting_max: usize,
-    ) -> Result<(), Refused> {
+    ) -> Result<(), SubmitError> {
         self.with(|state, deferred| {
             // The check runs under the lock, so that no other connection can replace this one in between.
             if state.connection.is_present(link) {
                 state.submit_urgent(message, waiting_max, deferred)
             } else {
-                Err(Refused::new(message, Rejection::Closed))
+                Err(SubmitError::new(message, Rejection::Closed))
             }
         })
     }
@@ -445,7 +445,7 @@ impl<S: Socket> SocketWriter<S> {
 }
 
 impl<S: Socket> MessageSink for SocketWriter<S> {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         // Not by a closure, which would move the message twice more.
         let (mut state, mut deferred) = (self.lock(), DeferredActions::default());
         let submitted = state.submit(message, Bound::Kept, &mut deferred);
@@ -457,7 +457,7 @@ impl<S: Socket> MessageSink for SocketWriter<S> {
         Ok(())
     }
 
-    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
         let Err(refused) = self.submit(message) else { return Ok(()) };
         if refused.why == Rejection::QueueFull {
             self.with(|state, deferred| state.undo_refusal(&refused.message, room, deferred));

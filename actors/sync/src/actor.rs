@@ -16,7 +16,7 @@ use sinew_model::{
 use sinew_runtime::{
     event_queue::EventQueue,
     outcome::{Outcome, Rejection},
-    router::{LocalRoute, MessageSink, Refused},
+    router::{LocalRoute, MessageSink, SubmitError},
     supervision::ReadyGate,
     tid::{AppAddress, Tid},
     time::Time,
@@ -325,11 +325,11 @@ const LEAVES_MAX: usize = EVENT_QUEUE_CAPACITY / 4 * 3;
 struct QueueSink(EventQueue<Event>);
 
 impl MessageSink for QueueSink {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         let is_leave = message.header.kind == LeaveBarrier::KIND;
         let most = if is_leave { LEAVES_MAX } else { MESSAGES_MAX };
         match self.0.post_below(most, Event::Message(message)) {
-            Err(Event::Message(message)) => Err(Refused::new(message, Rejection::QueueFull)),
+            Err(Event::Message(message)) => Err(SubmitError::new(message, Rejection::QueueFull)),
             // A full event queue returns the rejected event, which is a message.
             Ok(()) | Err(Event::App(_) | Event::Membership(_) | Event::Link(_) | Event::Monitors) => Ok(()),
         }

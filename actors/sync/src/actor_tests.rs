@@ -29,7 +29,7 @@ use sinew_runtime::{
     event_queue::{EventQueue, EventStream},
     monitor::{Down, DownClass},
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
-    router::{LocalRoute, MessageSink, Refused},
+    router::{LocalRoute, MessageSink, SubmitError},
     supervision::ReadyGate,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
@@ -51,11 +51,11 @@ const GAIT: AppAddress = AppAddress::new(0x1000);
 struct Mailbox(EventQueue<Message>);
 
 impl MessageSink for Mailbox {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
-        self.0.post(message).map_err(|message| Refused::new(message, Rejection::QueueFull))
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
+        self.0.post(message).map_err(|message| SubmitError::new(message, Rejection::QueueFull))
     }
 
-    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
         let result = self.submit(message);
         if result.is_err()
             && let Some(room) = room
@@ -344,7 +344,7 @@ fn restarted_sync_manager_continues_the_previous_ones_state() {
 struct Mine;
 
 impl MessageSink for Mine {
-    fn submit(&self, _: Message) -> Result<(), Refused> {
+    fn submit(&self, _: Message) -> Result<(), SubmitError> {
         panic!("the planned fault of this test")
     }
 }

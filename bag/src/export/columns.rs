@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 
 use crate::{
-    messagepack::{DEPTH_MAX, Misfit, Reader, Token, base64, json, non_finite},
+    messagepack::{DEPTH_MAX, MisfitError, Reader, Token, base64, json, non_finite},
     read::Header,
 };
 
@@ -193,8 +193,8 @@ fn value(
     path: &mut String,
     depth: usize,
     each: &mut dyn FnMut(&str, Cell),
-) -> Result<(), Misfit> {
-    let depth = depth.checked_sub(1).ok_or(Misfit::new("less nesting"))?;
+) -> Result<(), MisfitError> {
+    let depth = depth.checked_sub(1).ok_or(MisfitError::new("less nesting"))?;
     let mut ahead = *reader;
     match ahead.next()? {
         Token::List(count) if count <= LIST_MAX => {
@@ -238,14 +238,14 @@ fn below(
     name: &str,
     depth: usize,
     each: &mut dyn FnMut(&str, Cell),
-) -> Result<(), Misfit> {
+) -> Result<(), MisfitError> {
     let length = path.len();
     if length > 0 {
         path.push('.');
     }
     path.push_str(name);
     let read = if path.len() > PATH_MAX {
-        Err(Misfit::new("shorter names"))
+        Err(MisfitError::new("shorter names"))
     } else {
         value(reader, path, depth, each)
     };

@@ -7,7 +7,7 @@
 
 use super::{FieldPlan, Form, Kind, MessagePlan, View};
 use crate::{
-    messagepack::{DEPTH_MAX, Misfit, Reader, Token, json},
+    messagepack::{DEPTH_MAX, MisfitError, Reader, Token, json},
     protobuf::{FIXED32, FIXED64, LENGTH, Output, VARINT, zigzag},
 };
 
@@ -15,10 +15,10 @@ use crate::{
 const CHECKED_MAX: usize = 256;
 
 /// Writes a payload as the first message of `view`.
-pub(super) fn payload(view: &View, payload: &[u8], out: &mut Output) -> Result<(), Misfit> {
+pub(super) fn payload(view: &View, payload: &[u8], out: &mut Output) -> Result<(), MisfitError> {
     let mut encoder = Encoder { view, reader: Reader::new(payload), out };
     encoder.message(0, DEPTH_MAX)?;
-    if encoder.reader.is_empty() { Ok(()) } else { Err(Misfit::new("one value only")) }
+    if encoder.reader.is_empty() { Ok(()) } else { Err(MisfitError::new("one value only")) }
 }
 
 struct Encoder<'e, 'p> {
@@ -46,15 +46,15 @@ impl Found {
 }
 
 impl<'e> Encoder<'e, '_> {
-    fn message(&mut self, at: usize, depth: usize) -> Result<(), Misfit> {
-        let depth = depth.checked_sub(1).ok_or(Misfit::new("less nesting"))?;
+    fn message(&mut self, at: usize, depth: usize) -> Result<(), MisfitError> {
+        let depth = depth.checked_sub(1).ok_or(MisfitError::new("less nesting"))?;
         let view: &'e View = self.view;
         let plan = &view.messages[at];
         match plan.form {
             Form::Struct => self.structure(plan, depth),
             Form::Tuple => match self.reader.next()? {
                 Token::List(count) => self.in_order(plan, count, depth),
-                _ => Err(Misfit::new("a list for a tuple")),
+                _ => Err(MisfitError::new("a list for a tuple")),
             },
             Form::Single => plan.fields.iter().try_for_each(|field| self.field(1, field, depth)),
             Form::Variants => self.variant(plan, depth),
@@ -63,23 +63,25 @@ impl<'e> Encoder<'e, '_> {
     }
 
     /// A unit is nil, or an empty list where it is a struct.
-    fn unit(&mut self) -> Result<(), Misfit> {
+    fn unit(&mut self) -> Result<(), MisfitError> {
         match self.reader.next()? {
             Token::Nil | Token::List(0) | Token::Map(0) => Ok(()),
-            _ => Err(Misfit::new("nil for a unit")),
+            _ => Err(MisfitError::new("nil for a unit")),
         }
     }
 
-    fn structure(&mut self, plan: &MessagePlan, depth: usize) -> Result<(), Misfit> {
+    fn structure(&mut self, plan: &MessagePlan, depth: usize) -> Result<(), MisfitError> {
         let count = match self.reader.next()? {
             Token::Map(count) => count,
             Token::List(count) => return self.in_order(plan, count, depth),
-            _ => return Err(Misfit::new("a map for a struct")),
+            _ => return Err(MisfitError::new("a map for a struct")),
         };
         let mut found = Found([0; CHECKED_MAX / 64]);
         let mut next = 0;
         for _ in 0..count {
-            let Token::Text(name) = self.reader.next()? else { return Err(Misfit::new("names of fields")) };
+            let Token::Text(name) = self.reader.next()? else {
+                return Err(MisfitError::new("names of fields"));
+            };
             // Fields mostly are in their order.
             let is_next = plan.fields.get(next).is_some_and(|field| field.wire == name);
             let at =
@@ -90,23 +92,23 @@ impl<'e> Encoder<'e, '_> {
                 continue;
             };
             if !found.insert(at) {
-                return Err(Misfit::new("each field once"));
+                return Err(MisfitError::new("each field once"));
             }
             next = at + 1;
             self.field(number(at), &plan.fields[at], depth)?;
         }
         let is_missing = |(at, field): (usize, &FieldPlan)| !field.is_optional && !found.has(at);
         if plan.fields.iter().enumerate().any(is_missing) {
-            Err(Misfit::new("all fields of a struct"))
+            Err(MisfitError::new("all fields of a struct"))
         } else {
             Ok(())
         }
     }
 
-    fn in_order(&mut self, plan: &MessagePlan, count: u32, depth: usize) -> Result<(), Misfit> {
+    fn in_order(&mut self, plan: &MessagePlan, count: u32, depth: usize) -> Result<(), MisfitError> {
         let count = count as usize;
         if count > plan.fields.len() || plan.fields[count..].iter().any(|field| !field.is_optional) {
-            return Err(Misfit::new("as many values as fields"));
+            return Err(MisfitError::new("as many values as fields"));
         }
         let fields = plan.fields[..count].iter().enumerate();
         fields
@@ -114,17 +116,20 @@ impl<'e> Encoder<'e, '_> {
             .try_for_each(|(number, field)| self.field(number, field, depth))
     }
 
-    fn variant(&mut self, plan: &MessagePlan, depth: usize) -> Result<(), Misfit> {
+    fn variant(&mut self, plan: &MessagePlan, depth: usize) -> Result<(), MisfitError> {
         let (name, has_data) = match self.reader.next()? {
             Token::Text(name) => (name, false),
             Token::Map(1) => match self.reader.next()? {
                 Token::Text(name) => (name, true),
-                _ => return Err(Misfit::new("the name of a variant")),
+                _ => return Err(MisfitError::new("the name of a variant")),
             },
-            _ => return Err(Misfit::new("a variant")),
+            _ => return Err(MisfitError::new("a variant")),
         };
-        let at =
-            plan.fields.iter().position(|field| field.wire == name).ok_or(Misfit::new("a known variant"))?;
+        let at = plan
+            .fields
+            .iter()
+            .position(|field| field.wire == name)
+            .ok_or(MisfitError::new("a known variant"))?;
         let field = &plan.fields[at];
         if has_data {
             return self.field(number(at), field, depth);
@@ -132,14 +137,14 @@ impl<'e> Encoder<'e, '_> {
         let is_unit =
             matches!(field.kind, Kind::Message(inner) if self.view.messages[inner].form == Form::Unit);
         if !is_unit {
-            return Err(Misfit::new("the data of a variant"));
+            return Err(MisfitError::new("the data of a variant"));
         }
         self.out.bytes(number(at), &[]);
         Ok(())
     }
 
     /// Writes one field with its tag; nothing if it is absent.
-    fn field(&mut self, number: u32, field: &FieldPlan, depth: usize) -> Result<(), Misfit> {
+    fn field(&mut self, number: u32, field: &FieldPlan, depth: usize) -> Result<(), MisfitError> {
         match &field.kind {
             Kind::Optional(_) if self.reader.skip_nil() => Ok(()),
             Kind::Optional(inner) => self.tagged(number, inner, depth),
@@ -148,7 +153,7 @@ impl<'e> Encoder<'e, '_> {
         }
     }
 
-    fn tagged(&mut self, number: u32, kind: &Kind, depth: usize) -> Result<(), Misfit> {
+    fn tagged(&mut self, number: u32, kind: &Kind, depth: usize) -> Result<(), MisfitError> {
         self.out.tag(number, wire(kind));
         match kind {
             Kind::Message(at) => {
@@ -161,14 +166,14 @@ impl<'e> Encoder<'e, '_> {
         }
     }
 
-    fn list(&mut self, number: u32, kind: &Kind, depth: usize) -> Result<(), Misfit> {
+    fn list(&mut self, number: u32, kind: &Kind, depth: usize) -> Result<(), MisfitError> {
         let count = match self.reader.next()? {
             Token::List(count) => count,
             Token::Bytes(bytes) if *kind == Kind::Unsigned(8) => {
                 self.out.message(number, |out| bytes.iter().for_each(|byte| out.varint(u64::from(*byte))));
                 return Ok(());
             }
-            _ => return Err(Misfit::new("a list")),
+            _ => return Err(MisfitError::new("a list")),
         };
         if wire(kind) == LENGTH {
             return (0..count).try_for_each(|_| self.tagged(number, kind, depth));
@@ -180,7 +185,7 @@ impl<'e> Encoder<'e, '_> {
     }
 
     /// Writes a value without its tag.
-    fn value(&mut self, kind: &Kind, depth: usize) -> Result<(), Misfit> {
+    fn value(&mut self, kind: &Kind, depth: usize) -> Result<(), MisfitError> {
         let token = match kind {
             Kind::Json => {
                 let mut text = String::new();
@@ -210,11 +215,11 @@ impl<'e> Encoder<'e, '_> {
             }
             (Kind::Enum(at), _) => {
                 let values = &self.view.enums[*at].values;
-                let Token::Text(name) = token else { return Err(Misfit::new("the name of a variant")) };
+                let Token::Text(name) = token else { return Err(MisfitError::new("the name of a variant")) };
                 let at = values.iter().position(|(wire, _)| wire == name);
-                self.out.varint(at.ok_or(Misfit::new("a known variant"))? as u64);
+                self.out.varint(at.ok_or(MisfitError::new("a known variant"))? as u64);
             }
-            _ => return Err(Misfit::new(expected(kind))),
+            _ => return Err(MisfitError::new(expected(kind))),
         }
         Ok(())
     }
@@ -225,11 +230,11 @@ impl<'e> Encoder<'e, '_> {
     }
 
     /// Bytes that were written as a list of numbers.
-    fn listed_bytes(&mut self, count: u32) -> Result<(), Misfit> {
+    fn listed_bytes(&mut self, count: u32) -> Result<(), MisfitError> {
         let start = self.out.0.len();
         for _ in 0..count {
             let Token::Unsigned(byte @ 0..=255) = self.reader.next()? else {
-                return Err(Misfit::new("bytes"));
+                return Err(MisfitError::new("bytes"));
             };
             self.out.0.push(byte as u8);
         }
@@ -258,7 +263,7 @@ fn wire(kind: &Kind) -> u32 {
     }
 }
 
-fn signed(token: Token<'_>, bits: u32) -> Result<i64, Misfit> {
+fn signed(token: Token<'_>, bits: u32) -> Result<i64, MisfitError> {
     let value = match token {
         Token::Unsigned(value) => i64::try_from(value).ok(),
         Token::Negative(value) => Some(value),
@@ -267,21 +272,22 @@ fn signed(token: Token<'_>, bits: u32) -> Result<i64, Misfit> {
     let unused = 64 - bits;
     value
         .filter(|value| value << unused >> unused == *value)
-        .ok_or(Misfit::new("a signed number of this size"))
+        .ok_or(MisfitError::new("a signed number of this size"))
 }
 
-fn double(token: Token<'_>) -> Result<f64, Misfit> {
+fn double(token: Token<'_>) -> Result<f64, MisfitError> {
     match token {
         Token::Double(value) => Ok(value),
         // As receivers accept it, and exact.
         Token::Float(value) => Ok(value.into()),
-        _ => Err(Misfit::new("f64")),
+        _ => Err(MisfitError::new("f64")),
     }
 }
 
 /// Returns a number of 128 bits as text. MessagePack has it as 16 bytes, the highest first.
-fn wide(bytes: &[u8], is_signed: bool) -> Result<String, Misfit> {
-    let bytes: [u8; 16] = bytes.try_into().map_err(|_| Misfit::new("16 bytes for a number of 128 bits"))?;
+fn wide(bytes: &[u8], is_signed: bool) -> Result<String, MisfitError> {
+    let bytes: [u8; 16] =
+        bytes.try_into().map_err(|_| MisfitError::new("16 bytes for a number of 128 bits"))?;
     Ok(if is_signed {
         i128::from_be_bytes(bytes).to_string()
     } else {

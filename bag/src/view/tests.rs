@@ -8,7 +8,7 @@ use serde::Serialize;
 use sinew_schema::{Field, Schema, Shape, Variant};
 
 use super::{View, header};
-use crate::{messagepack::Misfit, protobuf::Output, terms::Record};
+use crate::{messagepack::MisfitError, protobuf::Output, terms::Record};
 
 #[derive(Clone, Serialize)]
 enum Mode {
@@ -200,7 +200,7 @@ fn header_stands_beside_the_payload() {
     let mut out = Output::default();
     let record =
         Record { number: 3, sequence: u64::MAX, sent_ns: 50, handed_over_ns: 40, ..Record::default() };
-    out.message(super::HEADER_FIELD, |out| header(&record, Some(Misfit::new("f32")), out));
+    out.message(super::HEADER_FIELD, |out| header(&record, Some(MisfitError::new("f32")), out));
     let message = read(&view, &out.0);
     let header = get(&message, "sinew");
     let get = |name: &str| get(header.as_message().unwrap(), name);

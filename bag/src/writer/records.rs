@@ -6,7 +6,7 @@ use serde_json::json;
 
 use super::channel::Channel;
 use crate::{
-    messagepack::{DEPTH_MAX, Misfit, Reader, Token, base64, json, json_members},
+    messagepack::{DEPTH_MAX, MisfitError, Reader, Token, base64, json, json_members},
     terms::{ClockReading, Event, EventTopic, Level, Origin, Record},
 };
 
@@ -118,7 +118,7 @@ pub(super) fn json_view(record: &Record<'_>) -> String {
     text
 }
 
-fn members(payload: &[u8], text: &mut String) -> Result<(), Misfit> {
+fn members(payload: &[u8], text: &mut String) -> Result<(), MisfitError> {
     let mut reader = Reader::new(payload);
     let mut ahead = reader;
     if let Token::Map(count) = ahead.next()? {
@@ -128,5 +128,5 @@ fn members(payload: &[u8], text: &mut String) -> Result<(), Misfit> {
         text.push_str("\"value\":");
         json(&mut reader, DEPTH_MAX, text)?;
     }
-    if reader.is_empty() { Ok(()) } else { Err(Misfit::new("one value only")) }
+    if reader.is_empty() { Ok(()) } else { Err(MisfitError::new("one value only")) }
 }

@@ -44,7 +44,7 @@ use crate::{
 
 /// The result of a C function other than `SINEW_OK`.
 #[derive(Clone, Debug)]
-pub struct Told {
+pub struct StatusError {
     /// The returned status.
     pub status: Status,
     /// The text of `sinew_last_error`.
@@ -103,14 +103,14 @@ impl<T> fmt::Debug for Given<T> {
 }
 
 /// Returns `Ok` for `SINEW_OK`, else the error.
-fn done(status: Status) -> Result<(), Told> {
+fn done(status: Status) -> Result<(), StatusError> {
     if status == Status::SinewOk { Ok(()) } else { Err(told(status)) }
 }
 
-fn told(status: Status) -> Told {
+fn told(status: Status) -> StatusError {
     // SAFETY: it is a C string that stays until this thread's next error.
     let sentence = unsafe { CStr::from_ptr(sinew_last_error()) };
-    Told { status, sentence: sentence.to_string_lossy().into_owned(), ended: None }
+    StatusError { status, sentence: sentence.to_string_lossy().into_owned(), ended: None }
 }
 
 fn text(text: &[u8]) -> Text {
@@ -126,7 +126,7 @@ impl Endpoint {
     ///
     /// # Errors
     /// Those of the C function.
-    pub fn register(socket: &Path, asked: &Asked) -> Result<Self, Told> {
+    pub fn register(socket: &Path, asked: &Asked) -> Result<Self, StatusError> {
         let (required, handled) = (texts(&asked.required), texts(&asked.handled));
         let options = Options {
             size: size_of::<Options>(),
@@ -189,7 +189,7 @@ impl Endpoint {
         kind: u32,
         message_class: i32,
         length: usize,
-    ) -> Result<Made, Told> {
+    ) -> Result<Made, StatusError> {
         let mut message = MaybeUninit::new(Message::GONE);
         done(sinew_create_message(
             self.pointer(),
@@ -222,13 +222,13 @@ impl Endpoint {
     ///
     /// # Errors
     /// Those of the C functions.
-    pub fn send(&mut self, mut made: Made, within_ns: Option<u64>) -> Result<(), Told> {
+    pub fn send(&mut self, mut made: Made, within_ns: Option<u64>) -> Result<(), StatusError> {
         self.fill(&mut made);
         self.set_room_within(&made, within_ns)?;
         done(sinew_send_message(self.pointer(), Some(&mut made.message.0)))
     }
 
-    fn set_room_within(&self, made: &Made, within_ns: Option<u64>) -> Result<(), Told> {
+    fn set_room_within(&self, made: &Made, within_ns: Option<u64>) -> Result<(), StatusError> {
         within_ns.map_or(Ok(()), |time| done(sinew_room_within(self.pointer(), Some(&made.message.0), time)))
     }
 
@@ -241,7 +241,7 @@ impl Endpoint {
         destination: u64,
         (kind, message_class): (u32, i32),
         bytes: &[u8],
-    ) -> Result<(), Told> {
+    ) -> Result<(), StatusError> {
         let (endpoint, first, length) = (self.pointer(), bytes.as_ptr().cast(), bytes.len());
         done(sinew_send_bytes(endpoint, destination, kind, message_class, first, length))
     }
@@ -250,7 +250,7 @@ impl Endpoint {
     ///
     /// # Errors
     /// Those of the C function.
-    pub fn send_confirmed(&mut self, mut made: Made, within_ns: u64) -> Result<Outcome, Told> {
+    pub fn send_confirmed(&mut self, mut made: Made, within_ns: u64) -> Result<Outcome, StatusError> {
         self.fill(&mut made);
         let mut outcome = MaybeUninit::new(Outcome::SinewUnknown);
         let message = Some(&mut made.message.0);
@@ -267,7 +267,7 @@ impl Endpoint {
         &mut self,
         mut made: Made,
         within_ns: u64,
-    ) -> Result<Vec<(u64, i32)>, Told> {
+    ) -> Result<Vec<(u64, i32)>, StatusError> {
         self.fill(&mut made);
         const NONE: message::MemberOutcome = message::MemberOutcome { tid: 0, outcome: -1, reserved: 0 };
         let mut members = [NONE; 8];
@@ -292,7 +292,7 @@ impl Endpoint {
     ///
     /// # Errors
     /// Those of the C function.
-    pub fn ask(&mut self, mut made: Made, within_ns: u64) -> Result<InHand, Told> {
+    pub fn ask(&mut self, mut made: Made, within_ns: u64) -> Result<InHand, StatusError> {
         self.fill(&mut made);
         let mut reply = MaybeUninit::new(message::Received::GONE);
         let mut ended = MaybeUninit::new(Outcome::SinewUnknown);
@@ -300,7 +300,7 @@ impl Endpoint {
         let status = sinew_ask(self.pointer(), message, within_ns, Some(&mut reply), Some(&mut ended));
         // SAFETY: it was initialized with a value.
         let ended = unsafe { ended.assume_init() };
-        done(status).map_err(|told| Told {
+        done(status).map_err(|told| StatusError {
             ended: (status == Status::SinewErrorNotHandled).then_some(ended),
             ..told
         })?;
@@ -311,7 +311,12 @@ impl Endpoint {
     ///
     /// # Errors
     /// Those of the C functions.
-    pub fn reply(&mut self, request: &InHand, mut made: Made, within_ns: Option<u64>) -> Result<(), Told> {
+    pub fn reply(
+        &mut self,
+        request: &InHand,
+        mut made: Made,
+        within_ns: Option<u64>,
+    ) -> Result<(), StatusError> {
         self.fill(&mut made);
         self.set_room_within(&made, within_ns)?;
         let (request, message) = (Some(&request.message.0), Some(&mut made.message.0));
@@ -322,7 +327,7 @@ impl Endpoint {
     ///
     /// # Errors
     /// Those of the C function.
-    pub fn receive(&mut self, within_ns: u64) -> Result<Option<InHand>, Told> {
+    pub fn receive(&mut self, within_ns: u64) -> Result<Option<InHand>, StatusError> {
         let mut received = MaybeUninit::new(message::Received::GONE);
         let status = sinew_receive_message(self.pointer(), within_ns, Some(&mut received));
         if status == Status::SinewNothing {
@@ -343,7 +348,7 @@ impl Endpoint {
     ///
     /// # Errors
     /// Those of the C function.
-    pub fn next_undelivered(&mut self) -> Result<Option<Undelivered>, Told> {
+    pub fn next_undelivered(&mut self) -> Result<Option<Undelivered>, StatusError> {
         let mut undelivered = MaybeUninit::<Undelivered>::zeroed();
         let status = sinew_next_undelivered(self.pointer(), Some(&mut undelivered));
         if status == Status::SinewNothing {
@@ -357,7 +362,7 @@ impl Endpoint {
     ///
     /// # Errors
     /// Those of the C function.
-    pub fn resolve(&mut self, name: &str, within_ns: u64) -> Result<Option<u64>, Told> {
+    pub fn resolve(&mut self, name: &str, within_ns: u64) -> Result<Option<u64>, StatusError> {
         let mut tid = MaybeUninit::new(u64::MAX);
         let status = sinew_resolve(self.pointer(), text(name.as_bytes()), within_ns, Some(&mut tid));
         // SAFETY: it was initialized with a value.
@@ -373,7 +378,7 @@ impl Endpoint {
     ///
     /// # Errors
     /// Those of the C function.
-    pub fn join(&mut self, name: &str) -> Result<(), Told> {
+    pub fn join(&mut self, name: &str) -> Result<(), StatusError> {
         done(sinew_join_group(self.pointer(), text(name.as_bytes())))
     }
 
@@ -381,7 +386,7 @@ impl Endpoint {
     ///
     /// # Errors
     /// Those of the C function.
-    pub fn leave(&mut self, name: &str) -> Result<(), Told> {
+    pub fn leave(&mut self, name: &str) -> Result<(), StatusError> {
         done(sinew_leave_group(self.pointer(), text(name.as_bytes())))
     }
 
@@ -389,7 +394,7 @@ impl Endpoint {
     ///
     /// # Errors
     /// Those of the C function.
-    pub fn unregister(self) -> Result<(), Told> {
+    pub fn unregister(self) -> Result<(), StatusError> {
         let mut endpoint = self.pointer();
         mem::forget(self);
         done(sinew_unregister(Some(&mut endpoint)))
@@ -444,11 +449,11 @@ impl InHand {
     ///
     /// # Errors
     /// Those of the C function.
-    pub fn settle(mut self, outcome: i32) -> Result<(), Told> {
+    pub fn settle(mut self, outcome: i32) -> Result<(), StatusError> {
         self.settle_as(outcome)
     }
 
-    fn settle_as(&mut self, outcome: i32) -> Result<(), Told> {
+    fn settle_as(&mut self, outcome: i32) -> Result<(), StatusError> {
         let owner = ptr::without_provenance_mut(self.owner);
         done(sinew_settle_message(owner, Some(&mut self.message.0), outcome))
     }

@@ -353,7 +353,7 @@ mod tests {
 
     use super::*;
     use crate::core::sleep::WakePlace;
-    use crate::{Bell, BellKind, Capacity, Corrupt, Producer, Region, Terms, layout::Word};
+    use crate::{Bell, BellKind, Capacity, CorruptError, Producer, Region, Terms, layout::Word};
 
     struct One(Consumer);
 
@@ -387,7 +387,7 @@ mod tests {
         let ended = Waiter::new(Spin::Off).wait(&mut One(consumer), Instant::now() + Duration::from_secs(20));
         assert!(matches!(
             ended,
-            Err(AnyError::Corrupt { index: 0, cause: Corrupt::Tail { tail: 3, seen: 0 } })
+            Err(AnyError::Corrupt { index: 0, cause: CorruptError::Tail { tail: 3, seen: 0 } })
         ));
     }
 

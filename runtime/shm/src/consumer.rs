@@ -5,7 +5,7 @@ use std::{fmt, io, os::fd::BorrowedFd, sync::atomic::AtomicU32, time::Instant};
 use crate::{
     bell::{BellState, Doorbell, Woken},
     core::{ConsumerCore, Record},
-    error::{Corrupt, ReceiveError},
+    error::{CorruptError, ReceiveError},
     platform::{OwnHeaderMemory, PeerMemory},
     spin::{Spin, Spinner},
     wait::{Armed, Wait, Waiting, spin},
@@ -33,7 +33,7 @@ pub enum Only<'a> {
     Message(ReceivedMessage<'a>),
     /// No message.
     Nothing,
-    /// Several messages, or the peer is [`Corrupt`], which the other calls report.
+    /// Several messages, or a [`CorruptError`] of the peer, which the other calls report.
     Other,
 }
 
@@ -69,8 +69,8 @@ impl Consumer {
     /// order.
     ///
     /// # Errors
-    /// [`Corrupt`] when the peer wrote values that no valid peer writes; every later call returns it too.
-    pub fn receive(&mut self) -> Result<Option<ReceivedMessage<'_>>, Corrupt> {
+    /// [`CorruptError`] when the peer wrote values that no valid peer writes; every later call returns it too.
+    pub fn receive(&mut self) -> Result<Option<ReceivedMessage<'_>>, CorruptError> {
         Ok(self.core.next()?.map(|record| ReceivedMessage { consumer: self, record }))
     }
 
@@ -109,7 +109,7 @@ impl Consumer {
     ///
     /// # Errors
     /// As [`Consumer::receive`].
-    pub fn is_ready(&mut self) -> Result<bool, Corrupt> {
+    pub fn is_ready(&mut self) -> Result<bool, CorruptError> {
         Ok(self.core.next()?.is_some())
     }
 
@@ -153,7 +153,7 @@ impl Consumer {
     ///
     /// # Errors
     /// As [`Consumer::receive`].
-    pub fn arm(&mut self) -> Result<Armed, Corrupt> {
+    pub fn arm(&mut self) -> Result<Armed, CorruptError> {
         self.core.arm()
     }
 

@@ -11,7 +11,7 @@ use std::{
 
 use crate::{
     bell::{Bell, BellKind, BellState, Bells, Doorbell, Woken},
-    error::{CreateError, PassError, RefusedOffer},
+    error::{CreateError, OfferError, PassError},
     layout::{COUNTERS, Capacity, Word},
     memory::{OwnHeader, OwnRing, Peer},
     offer::{Descriptors, Offer, Received},
@@ -43,8 +43,8 @@ pub(crate) fn create(_: Capacity) -> Result<(OwnMemory, OwnedFd), CreateError> {
     Err(CreateError::Unsupported)
 }
 
-pub(crate) fn adopt(_: OwnedFd, _: Capacity) -> Result<PeerMemory, RefusedOffer> {
-    Err(RefusedOffer::Unsupported)
+pub(crate) fn adopt(_: OwnedFd, _: Capacity) -> Result<PeerMemory, OfferError> {
+    Err(OfferError::Unsupported)
 }
 
 /// Cannot exist on this platform.
@@ -108,8 +108,8 @@ pub(crate) struct Buttons {
 #[derive(Clone, Debug)]
 pub(crate) struct PeerPlace(Infallible);
 
-pub(crate) fn buttons(_: BellKind, _: u8, _: Vec<OwnedFd>) -> Result<Buttons, RefusedOffer> {
-    Err(RefusedOffer::Unsupported)
+pub(crate) fn buttons(_: BellKind, _: u8, _: Vec<OwnedFd>) -> Result<Buttons, OfferError> {
+    Err(OfferError::Unsupported)
 }
 
 pub(crate) fn which_ended<'a>(_: impl Iterator<Item = HangUp<'a>>) -> io::Result<Option<usize>> {

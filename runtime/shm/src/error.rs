@@ -9,7 +9,7 @@ use crate::{bell::BellKind, layout::Capacity};
 /// The peer's fault: its shared memory holds values that no valid peer writes. The connection is unusable;
 /// both its halves repeat this error from now on. Nothing was read or written outside the ring.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
-pub enum Corrupt {
+pub enum CorruptError {
     /// The peer's count of published bytes went back, or beyond the ring's capacity, or is not a multiple of
     /// 8.
     #[error("the peer's tail of {tail} does not follow {seen}")]
@@ -73,7 +73,7 @@ pub enum LoanError {
     },
     /// The peer's fault.
     #[error(transparent)]
-    Corrupt(#[from] Corrupt),
+    Corrupt(#[from] CorruptError),
 }
 
 /// Why a wait for a message ended without one.
@@ -87,7 +87,7 @@ pub enum ReceiveError {
     HungUp,
     /// The peer's fault.
     #[error(transparent)]
-    Corrupt(#[from] Corrupt),
+    Corrupt(#[from] CorruptError),
     /// The environment's fault: the system refused to wait.
     #[error("waiting for a message: {0}")]
     System(#[source] io::Error),
@@ -103,7 +103,7 @@ pub enum AnyError {
         index: usize,
         /// The error in the peer's memory.
         #[source]
-        cause: Corrupt,
+        cause: CorruptError,
     },
     /// The environment's fault: the system refused to wait.
     #[error("waiting for messages: {0}")]
@@ -129,7 +129,7 @@ pub enum RoomError {
     HungUp,
     /// The peer's fault.
     #[error(transparent)]
-    Corrupt(#[from] Corrupt),
+    Corrupt(#[from] CorruptError),
     /// The environment's fault: the system refused to wait.
     #[error("waiting for room: {0}")]
     System(#[source] io::Error),
@@ -157,7 +157,7 @@ pub enum CreateError {
 
 /// Why the peer's offer was rejected. Nothing of it is mapped or kept.
 #[derive(Debug, Error)]
-pub enum RefusedOffer {
+pub enum OfferError {
     /// This platform has no sealed shared memory.
     #[error("this platform has no sealed shared memory; use sockets")]
     Unsupported,

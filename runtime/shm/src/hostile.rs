@@ -12,7 +12,7 @@ use std::{
 use rustix::fs::{FallocateFlags, fallocate, ftruncate};
 
 use crate::{
-    BellKind, Capacity, Consumer, Corrupt, LoanError, Offer, Producer, ReceiveError, Region, RoomError,
+    BellKind, Capacity, Consumer, CorruptError, LoanError, Offer, Producer, ReceiveError, Region, RoomError,
     Terms, Wait,
     layout::{HEADER_BYTES, Mark, Word},
     memory::Peer,
@@ -37,13 +37,13 @@ pub struct Tally {
 }
 
 impl Tally {
-    fn catch(&mut self, corrupt: Corrupt) {
+    fn catch(&mut self, corrupt: CorruptError) {
         let name = match corrupt {
-            Corrupt::Tail { .. } => "tail",
-            Corrupt::Head { .. } => "head",
-            Corrupt::Mark(_) => "mark",
-            Corrupt::Length { .. } => "length",
-            Corrupt::Skip { .. } => "skip",
+            CorruptError::Tail { .. } => "tail",
+            CorruptError::Head { .. } => "head",
+            CorruptError::Mark(_) => "mark",
+            CorruptError::Length { .. } => "length",
+            CorruptError::Skip { .. } => "skip",
         };
         *self.caught.entry(name).or_default() += 1;
     }

@@ -26,7 +26,7 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! A hostile peer can at worst send wrong bytes, be silent, consume no messages, or cause [`Corrupt`] on this
+//! A hostile peer can at worst send wrong bytes, be silent, consume no messages, or cause [`CorruptError`] on this
 //! side. It cannot make this side read or write outside the ring, crash, hang or grow. The reasons are in
 //! `docs/decisions/0010-shared-memory.md`.
 //!
@@ -70,7 +70,7 @@ pub use any::{Any, ENDS_MAX, Ends, PollResult, Polling, Waiter};
 pub use bell::{Bell, BellKind};
 pub use consumer::{Consumer, MessageReader, Only, ReceivedMessage};
 pub use error::{
-    AnyError, Corrupt, CreateError, LoanError, PassError, ReceiveError, RefusedOffer, RoomError,
+    AnyError, CorruptError, CreateError, LoanError, OfferError, PassError, ReceiveError, RoomError,
 };
 pub use layout::{Capacity, CapacityError};
 pub use offer::{

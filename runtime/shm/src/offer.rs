@@ -7,7 +7,7 @@ use std::{
 
 use crate::{
     bell::BellKind,
-    error::{PassError, RefusedOffer},
+    error::{OfferError, PassError},
     layout::{Capacity, MAGIC, VERSION},
     platform,
     wait_set::SLOTS_MAX,
@@ -81,7 +81,7 @@ impl Offer {
     ///
     /// # Errors
     /// The outer one as of [`Received::receive`]; the inner one when it is not an offer.
-    pub fn receive(socket: impl AsFd) -> Result<Result<Self, RefusedOffer>, PassError> {
+    pub fn receive(socket: impl AsFd) -> Result<Result<Self, OfferError>, PassError> {
         Ok(Received::receive(socket)?.into_offer())
     }
 
@@ -89,24 +89,24 @@ impl Offer {
     ///
     /// # Errors
     /// When the bytes are not an offer, or the number of descriptors is not the one that they require.
-    pub fn from_parts(bytes: &[u8; OFFER_BYTES], descriptors: Vec<OwnedFd>) -> Result<Self, RefusedOffer> {
+    pub fn from_parts(bytes: &[u8; OFFER_BYTES], descriptors: Vec<OwnedFd>) -> Result<Self, OfferError> {
         let (magic, version) = (u64::from_le_bytes(take(bytes, 0)), u32::from_le_bytes(take(bytes, 8)));
         if magic != MAGIC {
-            return Err(RefusedOffer::Magic);
+            return Err(OfferError::Magic);
         }
         if version != VERSION {
-            return Err(RefusedOffer::Version { theirs: version, ours: VERSION });
+            return Err(OfferError::Version { theirs: version, ours: VERSION });
         }
-        let bell = BellKind::numbered(bytes[12]).ok_or(RefusedOffer::UnknownBell(bytes[12]))?;
+        let bell = BellKind::numbered(bytes[12]).ok_or(OfferError::UnknownBell(bytes[12]))?;
         let slot = bytes[13];
         if usize::from(slot) >= SLOTS_MAX {
-            return Err(RefusedOffer::Slot(slot));
+            return Err(OfferError::Slot(slot));
         }
         let capacity = Capacity::new(u64::from_le_bytes(take(bytes, 16)))
-            .map_err(|error| RefusedOffer::Capacity(error.0))?;
+            .map_err(|error| OfferError::Capacity(error.0))?;
         let expected = 1 + bell.descriptors();
         if descriptors.len() != expected {
-            return Err(RefusedOffer::Descriptors { got: descriptors.len(), expected });
+            return Err(OfferError::Descriptors { got: descriptors.len(), expected });
         }
         Ok(Self { capacity, bell, slot, descriptors })
     }
@@ -143,7 +143,7 @@ impl Received {
     ///
     /// # Errors
     /// As [`Offer::from_parts`].
-    pub fn into_offer(self) -> Result<Offer, RefusedOffer> {
+    pub fn into_offer(self) -> Result<Offer, OfferError> {
         Offer::from_parts(&self.bytes, self.descriptors)
     }
 }

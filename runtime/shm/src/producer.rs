@@ -10,7 +10,7 @@ use std::{
 use crate::{
     bell::{BellState, Doorbell, Woken},
     core::{ProducerCore, producer::Reserved, sleep::WakePlace},
-    error::{Corrupt, LoanError, RoomError},
+    error::{CorruptError, LoanError, RoomError},
     platform::{Counters, OwnRingMemory, PeerCounters, PeerMemory},
     spin::{Spin, Spinner},
     wait::{Armed, Wait, Waiting, spin},
@@ -152,7 +152,7 @@ impl Producer {
     ///
     /// # Errors
     /// The peer's fault: its count is impossible.
-    pub fn unread(&mut self) -> Result<u32, Corrupt> {
+    pub fn unread(&mut self) -> Result<u32, CorruptError> {
         self.core.unread()
     }
 
@@ -244,7 +244,7 @@ impl Producer {
 
     /// Returns the error that this end detected in the peer's memory, if any.
     #[must_use]
-    pub const fn corrupt(&self) -> Option<Corrupt> {
+    pub const fn corrupt(&self) -> Option<CorruptError> {
         self.core.corrupt()
     }
 }

@@ -6,7 +6,7 @@ use crate::{
     bell::{Bell, BellKind, Bells, Doorbell},
     consumer::Consumer,
     core::{ConsumerCore, ProducerCore},
-    error::{CreateError, RefusedOffer},
+    error::{CreateError, OfferError},
     layout::Capacity,
     offer::Offer,
     platform,
@@ -66,7 +66,7 @@ impl Region {
     ///
     /// # Errors
     /// The fault and its party; then nothing of the offer is kept.
-    pub fn connect(self, peer: Offer, terms: &Terms) -> Result<(Producer, Consumer), RefusedOffer> {
+    pub fn connect(self, peer: Offer, terms: &Terms) -> Result<(Producer, Consumer), OfferError> {
         let accepted = self.accept(peer, terms)?;
         Ok(self.join(accepted))
     }
@@ -77,16 +77,16 @@ impl Region {
     ///
     /// # Errors
     /// As of [`connect`](Self::connect).
-    pub fn accept(&self, peer: Offer, terms: &Terms) -> Result<Accepted, RefusedOffer> {
+    pub fn accept(&self, peer: Offer, terms: &Terms) -> Result<Accepted, OfferError> {
         let Offer { capacity: theirs, bell, slot, descriptors } = peer;
         if theirs > terms.capacity_max {
-            return Err(RefusedOffer::TooLarge { offered: theirs, allowed: terms.capacity_max });
+            return Err(OfferError::TooLarge { offered: theirs, allowed: terms.capacity_max });
         }
         if !terms.bells.contains(&bell) {
-            return Err(RefusedOffer::Bell(bell));
+            return Err(OfferError::Bell(bell));
         }
         let mut descriptors = descriptors.into_iter();
-        let memory = descriptors.next().ok_or(RefusedOffer::Descriptors { got: 0, expected: 1 })?;
+        let memory = descriptors.next().ok_or(OfferError::Descriptors { got: 0, expected: 1 })?;
         let peer = platform::adopt(memory, theirs)?;
         let platform::Buttons { message, room, place } =
             platform::buttons(bell, slot, descriptors.collect())?;

@@ -13,8 +13,8 @@ use std::{
 };
 
 use sinew_shm::{
-    Armed, BellKind, Capacity, Consumer, HangUp, LoanError, Offer, Only, PassError, Producer, ReceiveError,
-    RefusedOffer, Region, RoomError, Spin, Terms, Wait,
+    Armed, BellKind, Capacity, Consumer, HangUp, LoanError, Offer, OfferError, Only, PassError, Producer,
+    ReceiveError, Region, RoomError, Spin, Terms, Wait,
 };
 
 const BELLS: [BellKind; 3] = [BellKind::Futex, BellKind::EventFd, BellKind::Socket];
@@ -264,14 +264,11 @@ fn incomplete_offer_is_rejected() {
     ));
     // It was left there, and has an offer's length with the bytes that arrive now.
     left.write_all(&[0; 16]).expect("room");
-    assert!(matches!(
-        Offer::receive(&right),
-        Ok(Err(RefusedOffer::Capacity(0) | RefusedOffer::Version { .. }))
-    ));
+    assert!(matches!(Offer::receive(&right), Ok(Err(OfferError::Capacity(0) | OfferError::Version { .. }))));
     let (_region, offer) = Region::create(Capacity::MIN, BellKind::Socket).expect("a region");
     left.write_all(&offer.to_bytes()).expect("room");
     let refused = Offer::receive(&right).expect("whole").expect_err("without its descriptors");
-    assert!(matches!(refused, RefusedOffer::Descriptors { got: 0, expected: 3 }), "{refused}");
+    assert!(matches!(refused, OfferError::Descriptors { got: 0, expected: 3 }), "{refused}");
     drop(left);
     assert!(matches!(Offer::receive(&right), Err(PassError::Closed)));
 }
@@ -319,10 +316,10 @@ fn terms_bound_a_peers_offers() {
     let larger = Capacity::new(8192).expect("a power of two");
     // when, then
     let refused = region().connect(offer(larger, BellKind::Futex), &small).expect_err("too large");
-    assert!(matches!(refused, RefusedOffer::TooLarge { offered, .. } if offered == larger));
+    assert!(matches!(refused, OfferError::TooLarge { offered, .. } if offered == larger));
     let refused =
         region().connect(offer(Capacity::MIN, BellKind::EventFd), &small).expect_err("it could block");
-    assert!(matches!(refused, RefusedOffer::Bell(BellKind::EventFd)));
+    assert!(matches!(refused, OfferError::Bell(BellKind::EventFd)));
 }
 
 #[test]
@@ -335,7 +332,7 @@ fn descriptor_that_is_no_bell_is_rejected() {
             Offer::from_parts(&offer.to_bytes(), vec![memory, null(), null()]).expect("it looks like one");
         let (region, _) = Region::create(Capacity::MIN, bell).expect("a region");
         let refused = region.connect(forged, &terms()).expect_err("no bell");
-        assert!(matches!(refused, RefusedOffer::NotABell(kind) if kind == bell), "{refused}");
+        assert!(matches!(refused, OfferError::NotABell(kind) if kind == bell), "{refused}");
     }
 }
 

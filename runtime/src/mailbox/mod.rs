@@ -39,7 +39,7 @@ use crate::{
     clock::Clock,
     lock,
     outcome::{Outcome, Rejection, Ticket},
-    router::{MessageSink, Refused},
+    router::{MessageSink, SubmitError},
     tid::Tid,
     time::Time,
     undelivered::{RefusalSink, is_reported},
@@ -149,12 +149,12 @@ impl Shared {
         !stays || stay < self.events_max / 2
     }
 
-    fn submit_event(&mut self, event: Message) -> Result<Option<Waker>, Refused> {
+    fn submit_event(&mut self, event: Message) -> Result<Option<Waker>, SubmitError> {
         let has_room = self.has_room_for_event(&event.header);
         let tally = &mut self.tallies[event.header.class as usize];
         if !has_room {
             tally.refused += 1;
-            return Err(Refused::new(event, Rejection::QueueFull));
+            return Err(SubmitError::new(event, Rejection::QueueFull));
         }
         tally.taken += 1;
         let Some(event) = self.queue.queue_behind(event) else {
@@ -373,11 +373,11 @@ impl Mailbox {
 
 impl Mailbox {
     /// Accepts an event, or calls `is_full` with the lock held.
-    fn take_event(&self, event: Message, is_full: impl FnOnce(&mut Shared)) -> Result<(), Refused> {
+    fn take_event(&self, event: Message, is_full: impl FnOnce(&mut Shared)) -> Result<(), SubmitError> {
         let mut shared = lock(&self.shared);
         if shared.closed {
             shared.tallies[event.header.class as usize].refused += 1;
-            return Err(Refused::new(event, Rejection::Closed));
+            return Err(SubmitError::new(event, Rejection::Closed));
         }
         self.record_wait(&mut shared);
         let waker = shared.submit_event(event).inspect_err(|_| is_full(&mut shared))?;
@@ -387,22 +387,22 @@ impl Mailbox {
     }
 
     /// Accepts a message that is no event.
-    fn take_message(&self, message: Message) -> Result<(), Refused> {
+    fn take_message(&self, message: Message) -> Result<(), SubmitError> {
         let class = message.header.class as usize;
         let (mut expired, mut event_waits) = (Vec::new(), None);
         let taken = {
             let mut shared = lock(&self.shared);
             if shared.closed {
                 shared.tallies[class].refused += 1;
-                return Err(Refused::new(message, Rejection::Closed));
+                return Err(SubmitError::new(message, Rejection::Closed));
             }
             if shared.refuses {
                 shared.tallies[class].refused += 1;
-                return Err(Refused::new(message, Rejection::Down));
+                return Err(SubmitError::new(message, Rejection::Down));
             }
             if message.receipt.is_some() && message.header.class == Class::Stream {
                 shared.tallies[class].refused += 1;
-                return Err(Refused::new(message, Rejection::Unsupported));
+                return Err(SubmitError::new(message, Rejection::Unsupported));
             }
             if !shared.queue.has_room_for(&message) {
                 // An application that waits for its start takes no messages, so expired ones are removed here
@@ -437,14 +437,14 @@ impl Mailbox {
 }
 
 impl MessageSink for Mailbox {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         if is_event(&message.header) {
             return self.take_event(message, |_| {});
         }
         self.take_message(message)
     }
 
-    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
         if is_event(&message.header) {
             let class = message.header.class as usize;
             return self.take_event(message, |shared| {

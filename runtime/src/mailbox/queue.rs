@@ -12,7 +12,7 @@ use super::{
 };
 use crate::{
     outcome::{Rejection, Ticket},
-    router::Refused,
+    router::SubmitError,
     time::Time,
     wire::{Class, Header, Message},
 };
@@ -105,7 +105,7 @@ impl ClassQueue {
     ///
     /// # Errors
     /// The message itself, if the lane of its class is full. An older queued value then stays.
-    pub fn push(&mut self, message: Message) -> Result<Option<Message>, Refused> {
+    pub fn push(&mut self, message: Message) -> Result<Option<Message>, SubmitError> {
         let (class, length) = (message.header.class, message.payload.len());
         let held = self.held(class as usize);
         if class == Class::Stream
@@ -115,7 +115,7 @@ impl ClassQueue {
             if !self.bounds.has_bytes_for(length, held.bytes - former)
                 || !swap_budget(self.budget.as_deref(), length, former)
             {
-                return Err(Refused::new(message, Rejection::QueueFull));
+                return Err(SubmitError::new(message, Rejection::QueueFull));
             }
             let in_lane = &mut self.bytes[class as usize];
             *in_lane = *in_lane - former + length;
@@ -125,7 +125,7 @@ impl ClassQueue {
             return Ok(Some(std::mem::replace(older, message)));
         }
         if !self.bounds.has_room_for(length, held) || !swap_budget(self.budget.as_deref(), length, 0) {
-            return Err(Refused::new(message, Rejection::QueueFull));
+            return Err(SubmitError::new(message, Rejection::QueueFull));
         }
         self.earliest_expiry = self.earliest_expiry.min(message.header.expiry());
         if About::of(&message.header).is_none() {

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use super::{
     Cause, Echo, Flows, Guard, Guarded, ProtectionError, Verdict,
     envelope::payload_of,
-    raw::{NotSafe, Protected, Reads, or_panics},
+    raw::{NotSafeError, Protected, Reads, or_panics},
 };
 use crate::{
     outcome::{Outcome, Rejection},
@@ -149,7 +149,7 @@ impl Ends {
         (source, receiver): (Tid, Tid),
         protected: Protected,
         now: Time,
-        (output, safe): (O, impl FnMut(&mut O, Cause) -> Result<(), NotSafe> + Send + 'static),
+        (output, safe): (O, impl FnMut(&mut O, Cause) -> Result<(), NotSafeError> + Send + 'static),
     ) -> io::Result<Guard<O>> {
         let Protected { name, kind, protection, reads } = protected;
         if protection.echo_period().is_zero() {

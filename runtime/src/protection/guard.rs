@@ -16,7 +16,7 @@ pub(crate) use self::guarded::Guarded;
 use super::{
     ArmError, Cause, DataId, State, Tally,
     log_queue::{LogEntry, OutputEvent},
-    raw::{NotSafe, Protected, Reads, Released, or_panics},
+    raw::{NotSafeError, Protected, Reads, Released, or_panics},
     receiver::{Opened, Receiver, Verdict},
     safe_output::{self, CheckResult, WatchState, WatchedOutput, wake},
 };
@@ -90,7 +90,7 @@ struct SafeRetry {
     at: Time,
 }
 
-type MakeSafe<O> = Box<dyn FnMut(&mut O, Cause) -> Result<(), NotSafe> + Send>;
+type MakeSafe<O> = Box<dyn FnMut(&mut O, Cause) -> Result<(), NotSafeError> + Send>;
 
 impl<O> Inner<O> {
     /// Lets the receiver change its state, and makes the output safe if it is no longer live.
@@ -158,7 +158,7 @@ impl<O: Send + 'static> Guard<O> {
         (source, destination): (Tid, Tid),
         protected: Protected,
         output: O,
-        safe: impl FnMut(&mut O, Cause) -> Result<(), NotSafe> + Send + 'static,
+        safe: impl FnMut(&mut O, Cause) -> Result<(), NotSafeError> + Send + 'static,
     ) -> io::Result<Self> {
         Self::of_on(&Clock::WALL, (source, destination), protected, output, safe)
     }
@@ -179,7 +179,7 @@ impl<O: Send + 'static> Guard<O> {
         (source, destination): (Tid, Tid),
         protected: Protected,
         output: O,
-        safe: impl FnMut(&mut O, Cause) -> Result<(), NotSafe> + Send + 'static,
+        safe: impl FnMut(&mut O, Cause) -> Result<(), NotSafeError> + Send + 'static,
     ) -> io::Result<Self> {
         if protected.protection.good_min == 0 {
             let words = "an output is armed by good messages: `good_min` is at least 1";

@@ -44,7 +44,7 @@ pub enum Reads {
 
 /// The error of a safe function. It is called again, as after a panic.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct NotSafe;
+pub struct NotSafeError;
 
 /// The result of a release.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -71,7 +71,7 @@ pub fn begin() -> io::Result<()> {
 /// Wraps a safe function that can fail only by a panic.
 pub(super) fn or_panics<O: 'static>(
     mut safe: impl FnMut(&mut O, Cause) + Send + 'static,
-) -> impl FnMut(&mut O, Cause) -> Result<(), NotSafe> + Send + 'static {
+) -> impl FnMut(&mut O, Cause) -> Result<(), NotSafeError> + Send + 'static {
     move |output: &mut O, cause: Cause| {
         safe(output, cause);
         Ok(())
@@ -201,7 +201,7 @@ mod tests {
         let does_fail = fails.clone();
         let safe = move |(): &mut (), _: Cause| {
             if does_fail.load(Ordering::Acquire) {
-                return Err(NotSafe);
+                return Err(NotSafeError);
             }
             let _ = done.try_send(());
             Ok(())
@@ -223,7 +223,7 @@ mod tests {
         let mut tries = 0;
         let safe = move |(): &mut (), _: Cause| {
             tries += 1;
-            if tries == 1 { Err(NotSafe) } else { Ok(()) }
+            if tries == 1 { Err(NotSafeError) } else { Ok(()) }
         };
         let guard = Guard::of((tid(1), tid(6)), angle(), (), safe).expect("a thread");
         assert_eq!(guard.release(), Released::Now, "it is tried by then, or now");

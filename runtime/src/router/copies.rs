@@ -44,7 +44,7 @@ mod tests {
 
     use crate::{
         outcome::Rejection,
-        router::{LocalRoute, MessageSink, Refused, Router},
+        router::{LocalRoute, MessageSink, Router, SubmitError},
         tid::{AppAddress, NodeAddress, Tid},
         wire::{Header, Kind, Message},
     };
@@ -57,8 +57,8 @@ mod tests {
     struct Sink(Option<Rejection>);
 
     impl MessageSink for Sink {
-        fn submit(&self, message: Message) -> Result<(), Refused> {
-            self.0.map_or(Ok(()), |why| Err(Refused::new(message, why)))
+        fn submit(&self, message: Message) -> Result<(), SubmitError> {
+            self.0.map_or(Ok(()), |why| Err(SubmitError::new(message, why)))
         }
     }
 

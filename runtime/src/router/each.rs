@@ -19,7 +19,7 @@ use std::{
     sync::{Arc, Mutex, Weak},
 };
 
-use super::{Judge, MessageSink, Refused, Router, Snapshot, copy_of, for_each_here, guard, tap};
+use super::{Judge, MessageSink, Router, Snapshot, SubmitError, copy_of, for_each_here, guard, tap};
 use crate::{
     lock,
     outcome::{MemberReport, MemberState, Outcome, Receipt, ReceiptSink, Rejection, Ticket},
@@ -50,7 +50,7 @@ impl Router {
     }
 
     /// Sends one confirmed copy to each node that has a member, and one to each member here. spec: FRAME-7
-    pub(super) fn send_to_each(&self, snapshot: &Snapshot, message: Message) -> Result<(), Refused> {
+    pub(super) fn send_to_each(&self, snapshot: &Snapshot, message: Message) -> Result<(), SubmitError> {
         let Tid { node, app } = message.header.destination;
         let Snapshot { table, members } = snapshot;
         let peers: Vec<(NodeAddress, &Arc<dyn MessageSink>)> = if node == NodeAddress::ALL && app.is_group() {
@@ -62,7 +62,7 @@ impl Router {
             table.peers.get(&node).map(|peer| (node, peer)).into_iter().collect()
         };
         if node != self.node && node != NodeAddress::ALL && peers.is_empty() {
-            return Err(Refused::new(message, Rejection::NoSuchNode));
+            return Err(SubmitError::new(message, Rejection::NoSuchNode));
         }
         let is_here = node == self.node || node == NodeAddress::ALL;
         let here = if is_here { self.members_but(snapshot, &message.header) } else { Vec::new() };
@@ -84,7 +84,7 @@ impl Router {
         snapshot: &Snapshot,
         guard: Judge<'_>,
         message: Message,
-    ) -> Result<(), Refused> {
+    ) -> Result<(), SubmitError> {
         let here = self.members_but(snapshot, &message.header);
         let (message, send) = self.open_send(message, &here, Vec::new())?;
         self.submit_to_each(snapshot, guard, &message, &send);
@@ -111,10 +111,10 @@ impl Router {
         mut message: Message,
         here: &[AppAddress],
         nodes: Vec<NodeAddress>,
-    ) -> Result<(Message, Arc<GroupSend>), Refused> {
+    ) -> Result<(Message, Arc<GroupSend>), SubmitError> {
         let is_bounded = here.len() <= MEMBERS_HERE_MAX && nodes.len() <= NODES_MAX;
         let Some(receipt) = message.receipt.take_if(|_| is_bounded) else {
-            return Err(Refused::new(message, Rejection::TooManyMembers));
+            return Err(SubmitError::new(message, Rejection::TooManyMembers));
         };
         let times = (self.clock().now(), message.header.expiry());
         match self.group_sends.open((self.node, nodes), receipt, times) {
@@ -124,7 +124,7 @@ impl Router {
             }
             Err(receipt) => {
                 message.receipt = Some(receipt);
-                Err(Refused::new(message, Rejection::TooManyMembers))
+                Err(SubmitError::new(message, Rejection::TooManyMembers))
             }
         }
     }
@@ -144,7 +144,7 @@ impl Router {
             }
             let refused = self.submit_copy(message, send, member, |copy| {
                 if guard::refuses(guard, app, &message.header) {
-                    return Err(Refused::new(copy, Rejection::NotAllowed));
+                    return Err(SubmitError::new(copy, Rejection::NotAllowed));
                 }
                 sink.submit(copy)
             });
@@ -158,7 +158,7 @@ impl Router {
         message: &Message,
         send: &Arc<GroupSend>,
         of: Tid,
-        submit: impl FnOnce(Message) -> Result<(), Refused>,
+        submit: impl FnOnce(Message) -> Result<(), SubmitError>,
     ) -> Option<Rejection> {
         let mut copy = copy_of(message);
         copy.receipt = Some(send.receipt(of));

@@ -56,7 +56,7 @@ mod tests {
     use super::*;
     use crate::{
         outcome::Rejection,
-        router::{LocalRoute, MessageSink, Refused, Router},
+        router::{LocalRoute, MessageSink, Router, SubmitError},
         tid::{NodeAddress, Tid},
         wire::{Kind, Message},
     };
@@ -67,7 +67,7 @@ mod tests {
     struct Sink;
 
     impl MessageSink for Sink {
-        fn submit(&self, _: Message) -> Result<(), Refused> {
+        fn submit(&self, _: Message) -> Result<(), SubmitError> {
             Ok(())
         }
     }

@@ -13,7 +13,7 @@ pub trait MessageSink: Send + Sync {
     ///
     /// # Errors
     /// The message, unchanged, and the reason of the rejection.
-    fn submit(&self, message: Message) -> Result<(), Refused>;
+    fn submit(&self, message: Message) -> Result<(), SubmitError>;
 
     /// Same as [`submit`](Self::submit), for a caller that keeps a message after a full queue and offers it
     /// again: this does not count as a rejection. `room` is woken, once, when a full queue has room again; of
@@ -21,7 +21,7 @@ pub trait MessageSink: Send + Sync {
     ///
     /// # Errors
     /// Those of `submit`.
-    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
         let _ = room;
         self.submit(message)
     }
@@ -37,14 +37,14 @@ pub trait MessageSink: Send + Sync {
 
 /// A message that a [`MessageSink`] rejected.
 #[derive(Debug)]
-pub struct Refused {
+pub struct SubmitError {
     /// The message, untouched.
     pub message: Message,
     /// The reason of the rejection.
     pub why: Rejection,
 }
 
-impl Refused {
+impl SubmitError {
     /// Creates the rejection of `message` for `why`.
     #[must_use]
     pub const fn new(message: Message, why: Rejection) -> Self {

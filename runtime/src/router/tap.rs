@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 
-use super::Refused;
+use super::SubmitError;
 use crate::{
     outcome::Rejection,
     tid::Tid,
@@ -132,8 +132,8 @@ pub(super) fn hand_over(
     tap: &dyn Tap,
     message: Message,
     is_offer: bool,
-    take: impl FnOnce(Message) -> Result<(), Refused>,
-) -> Result<(), Refused> {
+    take: impl FnOnce(Message) -> Result<(), SubmitError>,
+) -> Result<(), SubmitError> {
     let observed = ObservedMessage::at(tap, &message);
     let result = take(message);
     let refused = result.as_ref().err().map(|refused| refused.why);
@@ -192,9 +192,9 @@ mod tests {
     const FULL: Kind = Kind::named("test.full");
 
     impl MessageSink for Picky {
-        fn submit(&self, message: Message) -> Result<(), Refused> {
+        fn submit(&self, message: Message) -> Result<(), SubmitError> {
             if message.header.kind == FULL {
-                Err(Refused::new(message, Rejection::QueueFull))
+                Err(SubmitError::new(message, Rejection::QueueFull))
             } else {
                 Ok(())
             }

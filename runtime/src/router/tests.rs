@@ -16,7 +16,7 @@ const LEGS: AppAddress = AppAddress::group("legs");
 struct Sink(AtomicU64);
 
 impl MessageSink for Sink {
-    fn submit(&self, _: Message) -> Result<(), Refused> {
+    fn submit(&self, _: Message) -> Result<(), SubmitError> {
         self.0.fetch_add(1, Ordering::Relaxed);
         Ok(())
     }

@@ -3,7 +3,7 @@
 
 use std::sync::OnceLock;
 
-use sinew_schema::Untraced;
+use sinew_schema::TraceError;
 
 use super::{
     Kind, Payload,
@@ -19,9 +19,9 @@ struct Names {
     kind: Kind,
     name: &'static str,
     rust: &'static str,
-    trace: fn() -> Result<TypeSchema, Untraced>,
+    trace: fn() -> Result<TypeSchema, TraceError>,
     /// Traced at the first question, on the thread that asks. In a box, so that senders read one cache line.
-    schema: OnceLock<Box<Result<TypeSchema, Untraced>>>,
+    schema: OnceLock<Box<Result<TypeSchema, TraceError>>>,
 }
 
 /// Each entry is written once and never removed, so that a lookup is one load without a lock.
@@ -69,10 +69,10 @@ impl Kind {
     /// it. The first call for a type takes up to some milliseconds: it is not for a thread with deadlines.
     ///
     /// # Errors
-    /// [`Untraced`] says why the structure of the type is not known, as for a type with a hand-written `Deserialize`.
+    /// [`TraceError`] says why the structure of the type is not known, as for a type with a hand-written `Deserialize`.
     /// The first call logs it once.
     #[must_use]
-    pub fn schema(self) -> Option<Result<&'static TypeSchema, &'static Untraced>> {
+    pub fn schema(self) -> Option<Result<&'static TypeSchema, &'static TraceError>> {
         let names = find(self)?;
         let traced = names.schema.get_or_init(|| {
             let traced = (names.trace)();
@@ -86,7 +86,7 @@ impl Kind {
 }
 
 /// Logs a type without a known structure. No user can change Sinew's own types.
-fn log_untraced(name: &str, error: &Untraced) {
+fn log_untraced(name: &str, error: &TraceError) {
     if name.starts_with("sinew.") {
         crate::log::debug!("the structure of {name} is not known: {error}");
     } else {

@@ -1,6 +1,6 @@
 //! The structure of a payload type, as the decoder of messages reads it.
 
-use sinew_schema::{Schema, SchemaHash, Untraced, Wire};
+use sinew_schema::{Schema, SchemaHash, TraceError, Wire};
 
 use super::{Kind, Payload, decode_as, memory, remember};
 
@@ -43,13 +43,13 @@ impl TypeSchema {
 /// assert_eq!(angle.schema().to_string(), "{\n    degrees: f32,\n}\n");
 /// ```
 #[must_use]
-pub fn schema_of<P: Payload>() -> Option<Result<&'static TypeSchema, &'static Untraced>> {
+pub fn schema_of<P: Payload>() -> Option<Result<&'static TypeSchema, &'static TraceError>> {
     remember::<P>();
     Kind::schema(P::KIND)
 }
 
 /// Traces `P` with the decoder and the encoder of messages.
-pub(super) fn trace<P: Payload>() -> Result<TypeSchema, Untraced> {
+pub(super) fn trace<P: Payload>() -> Result<TypeSchema, TraceError> {
     let accepts = |bytes: &[u8]| decode_as::<P>(bytes).is_ok();
     let writes = |value: &P| {
         let written = memory::written(|writer| rmp_serde::encode::write_named(writer, value));

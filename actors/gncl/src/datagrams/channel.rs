@@ -11,7 +11,7 @@ use std::{
 use sinew_model::refusals::Refusals;
 use sinew_runtime::{
     outcome::Rejection,
-    router::{MessageSink as _, Refused},
+    router::{MessageSink as _, SubmitError},
     tid::{NodeAddress, Tid},
     time::Time,
     wire::{Checksum, Class, Flags, HEADER_LEN, Header, Kind, Message},
@@ -174,7 +174,7 @@ impl Channel {
     ///
     /// # Errors
     /// Returns the message if the connection's outlet does not accept it.
-    pub(crate) fn submit(&self, message: Message, session: &PeerSession) -> Result<(), Refused> {
+    pub(crate) fn submit(&self, message: Message, session: &PeerSession) -> Result<(), SubmitError> {
         match self.by_datagram(message) {
             None => Ok(()),
             // The lock is released here, because a long message is written in pieces.
@@ -211,7 +211,7 @@ impl Channel {
 
     /// Submits the message to the connection. The flow's datagram value is kept until the connection has
     /// accepted the newer one.
-    fn by_connection(&self, message: Message, session: &PeerSession) -> Result<(), Refused> {
+    fn by_connection(&self, message: Message, session: &PeerSession) -> Result<(), SubmitError> {
         let (flow, number) = (flow_of(&message.header), message.header.correlation);
         let taken = session.outlet.submit(message);
         let outgoing = &mut self.lock().core.outgoing;
@@ -241,7 +241,7 @@ impl Channel {
             };
             match offered {
                 Ok(()) => Offered::Taken,
-                Err(Refused { message, why: Rejection::QueueFull }) => Offered::Full(message),
+                Err(SubmitError { message, why: Rejection::QueueFull }) => Offered::Full(message),
                 Err(refused) => {
                     let detail = format!("a value for node {}: {}", self.node, refused.why);
                     self.refusals.count(now, "value not sent", &detail);

@@ -4,7 +4,7 @@ use std::task::Waker;
 
 use sinew_runtime::{
     outcome::{Outcome, Rejection, Ticket},
-    router::{Refused, Router},
+    router::{Router, SubmitError},
     time::Time,
     wire::Message,
 };
@@ -160,12 +160,12 @@ impl PeerSession {
             } else {
                 match router.offer(message, Some(room)) {
                     Ok(()) => guard.finish(Disposition::Forwarded),
-                    Err(Refused { message, why: Rejection::QueueFull }) => {
+                    Err(SubmitError { message, why: Rejection::QueueFull }) => {
                         let Some(message) = self.inbox().put_back(key, message, bytes) else {
                             guard.release();
                             return Offered::Full;
                         };
-                        router.refuse_arrived(Refused::new(message, Rejection::QueueFull));
+                        router.refuse_arrived(SubmitError::new(message, Rejection::QueueFull));
                         guard.finish(Disposition::Refused);
                         return Offered::All;
                     }

@@ -20,7 +20,7 @@ use sinew_model::{
 use sinew_runtime::{
     event_queue::{EventQueue, EventStream},
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
-    router::{LocalRoute, MessageSink, Refused},
+    router::{LocalRoute, MessageSink, SubmitError},
     supervision::ReadyGate,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
@@ -55,8 +55,8 @@ pub(super) async fn next<T>(what: &str, stream: &mut (impl Stream<Item = T> + Un
 struct Inbox(EventQueue<Message>);
 
 impl MessageSink for Inbox {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
-        self.0.post(message).map_err(|message| Refused::new(message, Rejection::QueueFull))
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
+        self.0.post(message).map_err(|message| SubmitError::new(message, Rejection::QueueFull))
     }
 }
 

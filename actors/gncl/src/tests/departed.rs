@@ -7,7 +7,7 @@ use futures_util::FutureExt as _;
 use sinew_runtime::{
     event_queue::EventStream,
     outcome::{Receipt, Rejection},
-    router::Refused,
+    router::SubmitError,
     tid::{AppAddress, Incarnation},
     time::Time,
     wire::Message,
@@ -135,7 +135,7 @@ fn evicted_incarnations_message_in_hand_is_rejected() {
         node.state.store.forget(NINE);
         create_and_end(&node, 2..=GONE_MAX + 1);
         let message = waits(&node, &first, message).expect_err("nothing waits there any more");
-        node.state.ctx.router.refuse(Refused::new(message, Rejection::QueueFull));
+        node.state.ctx.router.refuse(SubmitError::new(message, Rejection::QueueFull));
         session(&first).processing_guard().finish(Disposition::Refused);
         drop(first);
         for _ in 0..=GONE_MAX {

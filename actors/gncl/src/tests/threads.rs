@@ -5,7 +5,7 @@ use std::{sync::Arc, thread};
 use sinew_runtime::{
     event_queue::EventQueue,
     outcome::Outcome,
-    router::{LocalRoute, MessageSink, Refused},
+    router::{LocalRoute, MessageSink, SubmitError},
     tid::AppAddress,
     wire::{Class, Message},
 };
@@ -19,7 +19,7 @@ struct Witness {
 }
 
 impl MessageSink for Witness {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         let (class, name) = (message.header.class, thread::current().name().unwrap_or_default().to_owned());
         self.threads.post((class, name)).expect("the test has room for all of them");
         assert!(!self.breaks || class != Class::Bulk, "it breaks with Bulk");
@@ -80,7 +80,7 @@ struct Niceness(EventQueue<i32>);
 
 #[cfg(target_os = "linux")]
 impl MessageSink for Niceness {
-    fn submit(&self, _: Message) -> Result<(), Refused> {
+    fn submit(&self, _: Message) -> Result<(), SubmitError> {
         let nice = rustix::process::getpriority_process(None).expect("a thread has one");
         self.0.post(nice).expect("the test has room for all of them");
         Ok(())

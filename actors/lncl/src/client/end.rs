@@ -224,7 +224,7 @@ impl Drop for Client {
 #[cfg(test)]
 mod tests {
     use rustix::io::Errno;
-    use sinew_shm::RefusedOffer;
+    use sinew_shm::OfferError;
 
     use super::*;
 
@@ -239,7 +239,7 @@ mod tests {
             assert!(matches!(ended(errno), ConnectionEnd::Late(_)), "{errno}");
         }
         assert!(matches!(
-            ConnectionEnd::from(ExchangeError::Refused(RefusedOffer::Kind)),
+            ConnectionEnd::from(ExchangeError::Refused(OfferError::Kind)),
             ConnectionEnd::Refused(_)
         ));
     }

@@ -5,7 +5,7 @@ use std::{sync::Arc, task::Waker};
 use sinew_model::periodic_checks::PeriodicChecks;
 use sinew_runtime::{
     outcome::Ticket,
-    router::{MessageSink, Refused},
+    router::{MessageSink, SubmitError},
     wire::Message,
 };
 
@@ -25,8 +25,8 @@ impl<S: MessageSink> ClientSink<S> {
     fn pass(
         &self,
         message: Message,
-        submit: impl FnOnce(&S, Message) -> Result<(), Refused>,
-    ) -> Result<(), Refused> {
+        submit: impl FnOnce(&S, Message) -> Result<(), SubmitError>,
+    ) -> Result<(), SubmitError> {
         let has_a_time = message.header.time_to_live_us != 0 || message.receipt.is_some();
         submit(&self.outlet, message)?;
         if has_a_time {
@@ -37,11 +37,11 @@ impl<S: MessageSink> ClientSink<S> {
 }
 
 impl<S: MessageSink> MessageSink for ClientSink<S> {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         self.pass(message, S::submit)
     }
 
-    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
         self.pass(message, |outlet, message| outlet.offer(message, room))
     }
 
@@ -69,8 +69,8 @@ mod tests {
     }
 
     impl MessageSink for PlayedOutlet {
-        fn submit(&self, message: Message) -> Result<(), Refused> {
-            if self.accepts { Ok(()) } else { Err(Refused::new(message, Rejection::QueueFull)) }
+        fn submit(&self, message: Message) -> Result<(), SubmitError> {
+            if self.accepts { Ok(()) } else { Err(SubmitError::new(message, Rejection::QueueFull)) }
         }
     }
 

@@ -26,16 +26,16 @@ struct Queue {
 }
 
 impl Listener for Queue {
-    fn submit_mark(&self, mark: Message) -> Result<(), Refused> {
-        self.marks.send(mark).map_err(|error| Refused::new(error.0, Rejection::Closed))
+    fn submit_mark(&self, mark: Message) -> Result<(), SubmitError> {
+        self.marks.send(mark).map_err(|error| SubmitError::new(error.0, Rejection::Closed))
     }
 }
 
 impl MessageSink for Queue {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         self.frames.try_send(message).map_err(|error| match error {
-            TrySendError::Full(message) => Refused::new(message, Rejection::QueueFull),
-            TrySendError::Disconnected(message) => Refused::new(message, Rejection::Closed),
+            TrySendError::Full(message) => SubmitError::new(message, Rejection::QueueFull),
+            TrySendError::Disconnected(message) => SubmitError::new(message, Rejection::Closed),
         })
     }
 }

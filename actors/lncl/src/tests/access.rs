@@ -20,7 +20,7 @@ use sinew_protocol::payload::{self, Group, Register, Switch};
 use sinew_runtime::{
     lock,
     outcome::{Outcome, Rejection},
-    router::{LocalRoute, MessageSink, Refused},
+    router::{LocalRoute, MessageSink, SubmitError},
     tid::{AppAddress, Tid},
     wire::{Flags, Kind, Message},
 };
@@ -390,7 +390,7 @@ fn other_user_has_one_share_of_memberships() {
 struct Slow(Mutex<VecDeque<Message>>);
 
 impl MessageSink for Slow {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         lock(&self.0).push_back(message);
         Ok(())
     }

@@ -10,7 +10,7 @@ use sinew_protocol::payload;
 use sinew_runtime::{
     lock,
     outcome::{Outcome, Rejection},
-    router::Refused,
+    router::SubmitError,
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     undelivered::Undelivered as Event,
@@ -166,10 +166,10 @@ fn notify_client(state: &State, now: Time, app: AppAddress, entries: Vec<Entry>,
 fn again_if_full(
     state: &State,
     now: Time,
-    result: Result<(), Refused>,
+    result: Result<(), SubmitError>,
     entries: impl IntoIterator<Item = Entry>,
 ) {
-    if matches!(result, Err(Refused { why: Rejection::QueueFull, .. })) {
+    if matches!(result, Err(SubmitError { why: Rejection::QueueFull, .. })) {
         let mut core = lock(&state.undelivered.core);
         for entry in entries {
             core.add(now, Recipient::App(entry.source), entry);

@@ -18,7 +18,7 @@ use sinew_model::{
 use sinew_runtime::{
     event_queue::{EventQueue, EventStream},
     outcome::Rejection,
-    router::{LocalRoute, MessageSink, Refused},
+    router::{LocalRoute, MessageSink, SubmitError},
     supervision::ReadyGate,
     tid::{AppAddress, Incarnation, NodeAddress},
     time::Time,
@@ -31,11 +31,11 @@ use crate::{NdlActor, Source, State, actor::lock_core};
 pub(super) struct Inbox(pub(super) EventQueue<Message>);
 
 impl MessageSink for Inbox {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
-        self.0.post(message).map_err(|message| Refused::new(message, Rejection::QueueFull))
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
+        self.0.post(message).map_err(|message| SubmitError::new(message, Rejection::QueueFull))
     }
 
-    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
         let result = self.submit(message);
         if result.is_err()
             && let Some(room) = room

@@ -109,13 +109,13 @@ impl Drop for NodeAnswer {
 
 /// Too many questions are open, or were sent within the last period, for one more in its time.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct TooManyQuestions;
+pub(crate) struct TooManyQuestionsError;
 
 impl Questions {
-    fn open(&self, awaited: BTreeSet<NodeAddress>) -> Result<(u64, Receiver<Answer>), TooManyQuestions> {
+    fn open(&self, awaited: BTreeSet<NodeAddress>) -> Result<(u64, Receiver<Answer>), TooManyQuestionsError> {
         let mut questions = lock(&self.open);
         if questions.open.len() >= OPEN_MAX {
-            return Err(TooManyQuestions);
+            return Err(TooManyQuestionsError);
         }
         questions.last += 1;
         let number = questions.last;
@@ -192,7 +192,7 @@ pub(crate) fn audit(
     state: &NodeState,
     others: &BTreeSet<NodeAddress>,
     within: Duration,
-) -> Result<Audit, TooManyQuestions> {
+) -> Result<Audit, TooManyQuestionsError> {
     let began = Time::now();
     let mut before = ask(state, others, within / 2)?;
     before.push(reading::read(state));
@@ -208,14 +208,14 @@ fn ask(
     state: &NodeState,
     others: &BTreeSet<NodeAddress>,
     within: Duration,
-) -> Result<Vec<NodeAudit>, TooManyQuestions> {
+) -> Result<Vec<NodeAudit>, TooManyQuestionsError> {
     if others.is_empty() {
         return Ok(Vec::new());
     }
     let began = Time::now();
     while let Err(at) = state.questions.turn(Time::now()) {
         if at.since(began) >= within {
-            return Err(TooManyQuestions);
+            return Err(TooManyQuestionsError);
         }
         thread::sleep(at.since(Time::now()));
     }
@@ -328,7 +328,7 @@ mod tests {
     use super::*;
     use sinew_model::config::NodeConfig;
     use sinew_runtime::{
-        router::{MessageSink, Refused},
+        router::{MessageSink, SubmitError},
         tid::Incarnation,
     };
 
@@ -394,7 +394,7 @@ mod tests {
         for _ in 1..OPEN_MAX {
             questions.open(BTreeSet::new()).unwrap();
         }
-        assert_eq!(questions.open(BTreeSet::new()).err(), Some(TooManyQuestions));
+        assert_eq!(questions.open(BTreeSet::new()).err(), Some(TooManyQuestionsError));
         questions.close(number);
         assert!(questions.open(BTreeSet::new()).is_ok());
     }
@@ -423,7 +423,7 @@ mod tests {
     }
 
     impl MessageSink for Refusing {
-        fn submit(&self, message: Message) -> Result<(), Refused> {
+        fn submit(&self, message: Message) -> Result<(), SubmitError> {
             let Header { kind, correlation, .. } = message.header;
             if kind == Kind::SYNC_AUDIT_ASK {
                 self.state.questions.answered(correlation, OTHER, &Bytes::new()).unwrap();
@@ -473,7 +473,7 @@ mod tests {
     struct NoAnswer;
 
     impl MessageSink for NoAnswer {
-        fn submit(&self, _: Message) -> Result<(), Refused> {
+        fn submit(&self, _: Message) -> Result<(), SubmitError> {
             Ok(())
         }
     }

@@ -13,7 +13,7 @@ use std::{
 use sinew_runtime::{
     log,
     outcome::{Outcome, Rejection},
-    router::{LocalRoute, MessageSink, Refused, tap::TapOf},
+    router::{LocalRoute, MessageSink, SubmitError, tap::TapOf},
     tid::{AppAddress, Tid},
     time::Time,
     wire::{Flags, Kind, Message, Payload},
@@ -44,11 +44,11 @@ pub(super) const WAITING_MAX: usize = 32;
 pub(super) struct Inbox(pub(super) SyncSender<Message>);
 
 impl MessageSink for Inbox {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         // spec: INSPECT-2
         self.0.try_send(message).map_err(|refused| match refused {
-            TrySendError::Full(message) => Refused::new(message, Rejection::QueueFull),
-            TrySendError::Disconnected(message) => Refused::new(message, Rejection::Closed),
+            TrySendError::Full(message) => SubmitError::new(message, Rejection::QueueFull),
+            TrySendError::Disconnected(message) => SubmitError::new(message, Rejection::Closed),
         })
     }
 }

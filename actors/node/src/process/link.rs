@@ -16,7 +16,7 @@ use sinew_runtime::{
     lock,
     mailbox::{Mailbox, RemoteReader},
     outcome::{MemberReport, Outcome, Receipt, ReceiptSink, Rejection, Ticket},
-    router::{MessageSink, Refused},
+    router::{MessageSink, SubmitError},
     sender::Sender,
     supervision::Launch,
     time::Time,
@@ -320,12 +320,12 @@ impl Link {
     ///
     /// # Errors
     /// The message, if the child is gone or does not read.
-    pub(super) fn send_to(&self, number: LinkNumber, message: Message) -> Result<(), Refused> {
+    pub(super) fn send_to(&self, number: LinkNumber, message: Message) -> Result<(), SubmitError> {
         self.outlet.submit_urgent_on(number, message, CONTROL_QUEUE_MAX)
     }
 
     /// Sends a frame to the current child, ahead of all messages.
-    fn send(&self, message: Message) -> Result<(), Refused> {
+    fn send(&self, message: Message) -> Result<(), SubmitError> {
         self.outlet.submit_urgent(message, CONTROL_QUEUE_MAX)
     }
 
@@ -366,7 +366,7 @@ impl Link {
     fn hand_over(&self, present: &mut CurrentChild, message: Message) {
         let copy = Message::new(message.header, message.payload.clone());
         match self.outlet.submit_urgent(copy, CONTROL_QUEUE_MAX) {
-            Err(Refused { why: Rejection::QueueFull, .. }) => present.hold(message),
+            Err(SubmitError { why: Rejection::QueueFull, .. }) => present.hold(message),
             // If the connection is broken, the message goes to the next process.
             Ok(()) | Err(_) => present.window.push(message),
         }
@@ -374,11 +374,11 @@ impl Link {
 }
 
 impl MessageSink for Link {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         self.deliver(message, |mailbox, message| mailbox.submit(message))
     }
 
-    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), Refused> {
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
         self.deliver(message, |mailbox, message| mailbox.offer(message, room))
     }
 
@@ -393,19 +393,19 @@ impl Link {
     fn deliver(
         &self,
         message: Message,
-        put: impl FnOnce(&Mailbox, Message) -> Result<(), Refused>,
-    ) -> Result<(), Refused> {
+        put: impl FnOnce(&Mailbox, Message) -> Result<(), SubmitError>,
+    ) -> Result<(), SubmitError> {
         let Header { flags, kind, .. } = message.header;
         if flags.has(Flags::REPLY) || (flags.has(Flags::OUTCOME) && kind == Kind::OUTCOME) {
             return match self.send(message) {
                 // Its receiver no longer waits for it.
-                Err(Refused { why: Rejection::Closed, .. }) => Ok(()),
+                Err(SubmitError { why: Rejection::Closed, .. }) => Ok(()),
                 result => result,
             };
         }
         if kind.is_host() || matches!(kind, Kind::OUTCOME | Kind::MEMBERS) {
             // The child would take these for frames of the node.
-            return Err(Refused::new(message, Rejection::UnknownKind));
+            return Err(SubmitError::new(message, Rejection::UnknownKind));
         }
         put(&self.mailbox, message)?;
         self.hand_over_queued();

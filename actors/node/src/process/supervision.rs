@@ -457,7 +457,7 @@ impl Child {
     fn send(&mut self, message: Message) -> bool {
         match self.hosted.link.send_to(self.number, message) {
             // Closed: the child is about to end.
-            Ok(()) | Err(sinew_runtime::router::Refused { why: Rejection::Closed, .. }) => {
+            Ok(()) | Err(sinew_runtime::router::SubmitError { why: Rejection::Closed, .. }) => {
                 self.is_queue_full = false;
                 true
             }

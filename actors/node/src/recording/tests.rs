@@ -6,7 +6,7 @@ use sinew_lncl::{LocalApp, register_local};
 use sinew_model::config::NodeConfig;
 use sinew_record::{Channel, ClockFact, Entry, Fact as _, Form};
 use sinew_runtime::{
-    router::{LocalRoute, MessageSink, Refused},
+    router::{LocalRoute, MessageSink, SubmitError},
     tid::{AppAddress, Incarnation},
     wire::{Header, Kind, Message},
 };
@@ -22,7 +22,7 @@ const WATCHDOG: Duration = Duration::from_secs(60);
 struct Sink;
 
 impl MessageSink for Sink {
-    fn submit(&self, _: Message) -> Result<(), Refused> {
+    fn submit(&self, _: Message) -> Result<(), SubmitError> {
         Ok(())
     }
 }

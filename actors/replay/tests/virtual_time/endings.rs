@@ -1,6 +1,6 @@
 //! Errors that end a replay before its end: a panic, an end, a block, a loop, inputs in disorder.
 
-use sinew::replay::{ReplayError, ReplayFault};
+use sinew::replay::{ReplayError, RunError};
 
 use super::*;
 
@@ -39,7 +39,7 @@ fn failure(how: fn(&mut AppContext<Fails>)) -> ReplayError {
 fn panic_is_reported_with_its_time_and_the_outputs_before() {
     let error = failure(|_| panic!("the encoder is upside down"));
     assert_eq!((error.at, error.outputs.len()), (ms(2), 2));
-    assert!(matches!(&error.fault, ReplayFault::Panicked { app, .. } if app == "hip"), "{error}");
+    assert!(matches!(&error.fault, RunError::Panicked { app, .. } if app == "hip"), "{error}");
     let words = error.to_string();
     assert!(words.starts_with("at 5.002000000s of virtual time: hip panicked: "), "{words}");
     assert!(words.contains("the encoder is upside down"), "{words}");
@@ -48,7 +48,7 @@ fn panic_is_reported_with_its_time_and_the_outputs_before() {
 #[test]
 fn end_of_an_application_is_reported() {
     let error = failure(|ctx| ctx.stop());
-    assert!(matches!(&error.fault, ReplayFault::Ended { app, .. } if app == "hip"), "{error}");
+    assert!(matches!(&error.fault, RunError::Ended { app, .. } if app == "hip"), "{error}");
     let error = failure(|ctx| ctx.fail_start("no encoder"));
     assert!(error.to_string().contains("no encoder"), "{error}");
 }
@@ -61,7 +61,7 @@ fn turn_that_does_not_end_is_reported() {
         }
     });
     assert_eq!(error.outputs.len(), 2);
-    assert!(matches!(&error.fault, ReplayFault::Blocked { app, .. } if app == "hip"), "{error}");
+    assert!(matches!(&error.fault, RunError::Blocked { app, .. } if app == "hip"), "{error}");
 }
 
 #[test]
@@ -70,7 +70,7 @@ fn messages_without_an_end_are_reported() {
         let own = ctx.tid();
         ctx.send(own, &Note { text: String::new() }).unwrap();
     });
-    assert!(matches!(&error.fault, ReplayFault::NeverIdle { app, .. } if app == "hip"), "{error}");
+    assert!(matches!(&error.fault, RunError::NeverIdle { app, .. } if app == "hip"), "{error}");
     assert_eq!(error.at, ms(2));
 }
 
@@ -79,12 +79,12 @@ fn inputs_in_disorder_are_refused() {
     let angle = |at| TimedMessage::of(ms(at), tid(HIP), tid(KNEE), &Angle { degrees: 1.0 });
     let replay = replay().app(Controller::spec("knee", 1.0));
     let error = replay.run([angle(1), angle(3), angle(2)]).expect_err("the third is too early");
-    assert!(matches!(error.fault, ReplayFault::Unordered { number: 3, .. }), "{error}");
+    assert!(matches!(error.fault, RunError::Unordered { number: 3, .. }), "{error}");
 }
 
 #[test]
 fn two_applications_of_one_name_are_refused() {
     let twice = replay().app(Controller::spec("knee", 1.0)).app(Controller::spec("knee", 2.0));
     let error = twice.run([]).expect_err("they have one address");
-    assert!(matches!(&error.fault, ReplayFault::Twice(name) if name == "knee"), "{error}");
+    assert!(matches!(&error.fault, RunError::Twice(name) if name == "knee"), "{error}");
 }

@@ -5,7 +5,7 @@ use serde::de::{
 };
 
 use super::{
-    Tracer, Trouble,
+    ReadError, Tracer,
     de::{Reading, two_of},
     graph::{At, Content, Def, content_parts},
     sample::Sample,
@@ -19,7 +19,7 @@ pub(super) struct Elements<'t, 'p> {
 }
 
 impl Elements<'_, '_> {
-    fn next<'de, S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<Option<S::Value>, Trouble> {
+    fn next<'de, S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<Option<S::Value>, ReadError> {
         let Some((at, rest)) = self.parts.split_first() else { return Ok(None) };
         self.parts = rest;
         seed.deserialize(Reading { tracer: &mut *self.tracer, at: *at, depth: self.depth }).map(Some)
@@ -27,9 +27,9 @@ impl Elements<'_, '_> {
 }
 
 impl<'de> SeqAccess<'de> for Elements<'_, '_> {
-    type Error = Trouble;
+    type Error = ReadError;
 
-    fn next_element_seed<S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<Option<S::Value>, Trouble> {
+    fn next_element_seed<S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<Option<S::Value>, ReadError> {
         self.next(seed)
     }
 
@@ -39,14 +39,14 @@ impl<'de> SeqAccess<'de> for Elements<'_, '_> {
 }
 
 impl<'de> MapAccess<'de> for Elements<'_, '_> {
-    type Error = Trouble;
+    type Error = ReadError;
 
-    fn next_key_seed<S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<Option<S::Value>, Trouble> {
+    fn next_key_seed<S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<Option<S::Value>, ReadError> {
         self.next(seed)
     }
 
-    fn next_value_seed<S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<S::Value, Trouble> {
-        self.next(seed)?.ok_or_else(|| Trouble::words("it reads a value without a key".to_owned()))
+    fn next_value_seed<S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<S::Value, ReadError> {
+        self.next(seed)?.ok_or_else(|| ReadError::words("it reads a value without a key".to_owned()))
     }
 }
 
@@ -61,17 +61,17 @@ pub(super) struct Fields<'t, 'f> {
 }
 
 impl<'de> MapAccess<'de> for Fields<'_, '_> {
-    type Error = Trouble;
+    type Error = ReadError;
 
-    fn next_key_seed<S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<Option<S::Value>, Trouble> {
+    fn next_key_seed<S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<Option<S::Value>, ReadError> {
         let Some(&(name, _)) = self.fields.get(self.next) else { return Ok(None) };
         *self.last = Some(name);
         seed.deserialize(BorrowedStrDeserializer::new(name)).map(Some)
     }
 
-    fn next_value_seed<S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<S::Value, Trouble> {
+    fn next_value_seed<S: DeserializeSeed<'de>>(&mut self, seed: S) -> Result<S::Value, ReadError> {
         let Some((_, at)) = self.fields.get(self.next) else {
-            return Err(Trouble::words("it reads a value without a key".to_owned()));
+            return Err(ReadError::words("it reads a value without a key".to_owned()));
         };
         self.next += 1;
         seed.deserialize(Reading { tracer: &mut *self.tracer, at: *at, depth: self.depth })
@@ -89,7 +89,7 @@ pub(super) struct Variants<'t> {
 
 impl Variants<'_> {
     /// Notes the parts of the variant, or checks that they are those from before.
-    fn content(&mut self, count: usize, make: impl FnOnce(&[At]) -> Content) -> Result<Content, Trouble> {
+    fn content(&mut self, count: usize, make: impl FnOnce(&[At]) -> Content) -> Result<Content, ReadError> {
         let (name, index) = self.owner;
         let case = |def: &Def| match def {
             Def::Enum(cases) => cases.get(index).and_then(|case| case.content.clone()),
@@ -124,25 +124,25 @@ impl Variants<'_> {
 }
 
 impl<'de> EnumAccess<'de> for Variants<'_> {
-    type Error = Trouble;
+    type Error = ReadError;
     type Variant = Self;
 
-    fn variant_seed<S: DeserializeSeed<'de>>(self, seed: S) -> Result<(S::Value, Self), Trouble> {
+    fn variant_seed<S: DeserializeSeed<'de>>(self, seed: S) -> Result<(S::Value, Self), ReadError> {
         let value = seed.deserialize(BorrowedStrDeserializer::new(self.case))?;
         Ok((value, self))
     }
 }
 
 impl<'de> VariantAccess<'de> for Variants<'_> {
-    type Error = Trouble;
+    type Error = ReadError;
 
-    fn unit_variant(mut self) -> Result<(), Trouble> {
+    fn unit_variant(mut self) -> Result<(), ReadError> {
         self.content(0, |_| Content::Unit)?;
         self.tracer.samples.push(Sample::Text(self.case));
         Ok(())
     }
 
-    fn newtype_variant_seed<S: DeserializeSeed<'de>>(mut self, seed: S) -> Result<S::Value, Trouble> {
+    fn newtype_variant_seed<S: DeserializeSeed<'de>>(mut self, seed: S) -> Result<S::Value, ReadError> {
         let Content::Newtype(at) = self.content(1, |parts| Content::Newtype(parts[0]))? else {
             return Err(two_of(self.owner.0));
         };
@@ -152,7 +152,7 @@ impl<'de> VariantAccess<'de> for Variants<'_> {
         Ok(value)
     }
 
-    fn tuple_variant<V: Visitor<'de>>(mut self, length: usize, visitor: V) -> Result<V::Value, Trouble> {
+    fn tuple_variant<V: Visitor<'de>>(mut self, length: usize, visitor: V) -> Result<V::Value, ReadError> {
         let Content::Tuple(parts) = self.content(length, |parts| Content::Tuple(parts.to_vec()))? else {
             return Err(two_of(self.owner.0));
         };
@@ -166,7 +166,7 @@ impl<'de> VariantAccess<'de> for Variants<'_> {
         mut self,
         fields: &'static [&'static str],
         visitor: V,
-    ) -> Result<V::Value, Trouble> {
+    ) -> Result<V::Value, ReadError> {
         let owner = (self.owner.0, Some(self.owner.1));
         let names = self.tracer.aliases.own_fields(owner, fields);
         let content =

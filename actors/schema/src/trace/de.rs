@@ -9,7 +9,7 @@ use std::{
 use serde::de::{Deserializer, Visitor};
 
 use super::{
-    Tracer, Trouble,
+    ReadError, Tracer,
     access::{Elements, Fields, Variants},
     graph::{At, Case, Content, Def, Node, Owner, content_parts, parts},
     sample::Sample,
@@ -34,16 +34,16 @@ impl<'t> Reading<'t> {
     }
 
     /// Notes a value without parts, and the value that it was given.
-    fn leaf(&mut self, shape: Shape, sample: Sample) -> Result<(), Trouble> {
+    fn leaf(&mut self, shape: Shape, sample: Sample) -> Result<(), ReadError> {
         self.note(Node::Leaf(shape))?;
         self.tracer.samples.push(sample);
         Ok(())
     }
 
-    fn note(&mut self, node: Node) -> Result<(), Trouble> {
+    fn note(&mut self, node: Node) -> Result<(), ReadError> {
         self.tracer.step()?;
         if self.depth > DEPTH_MAX {
-            return Err(Trouble::words(format!("its values are nested deeper than {DEPTH_MAX} levels")));
+            return Err(ReadError::words(format!("its values are nested deeper than {DEPTH_MAX} levels")));
         }
         self.tracer.graph.set(self.at, node)
     }
@@ -54,7 +54,7 @@ impl<'t> Reading<'t> {
         count: usize,
         make: impl FnOnce(&[At]) -> Node,
         known: impl FnOnce(&Node) -> Option<Vec<At>>,
-    ) -> Result<Vec<At>, Trouble> {
+    ) -> Result<Vec<At>, ReadError> {
         let node = self.tracer.graph.node(self.at);
         let parts = if *node == Node::Unknown {
             self.tracer.graph.add(count)?
@@ -72,7 +72,7 @@ impl<'t> Reading<'t> {
         name: &'static str,
         content: impl FnOnce(&[At]) -> Content,
         count: usize,
-    ) -> Result<Content, Trouble> {
+    ) -> Result<Content, ReadError> {
         self.note(Node::Named(name))?;
         if !self.tracer.graph.defs.contains_key(name) {
             let parts = self.tracer.graph.add(count)?;
@@ -87,7 +87,7 @@ impl<'t> Reading<'t> {
         Ok(found)
     }
 
-    fn known(&self, name: &'static str) -> Result<Content, Trouble> {
+    fn known(&self, name: &'static str) -> Result<Content, ReadError> {
         match self.tracer.graph.defs.get(name) {
             Some(Def::Plain(content)) => Ok(content.clone()),
             Some(Def::Enum(_)) | None => Err(two_of(name)),
@@ -99,7 +99,7 @@ impl<'t> Reading<'t> {
         self,
         parts: &[At],
         visitor: V,
-    ) -> Result<V::Value, Trouble> {
+    ) -> Result<V::Value, ReadError> {
         let Self { tracer, depth, .. } = self;
         let first = tracer.samples.len();
         let value = visitor.visit_seq(Elements { tracer: &mut *tracer, parts, depth: depth + 1 })?;
@@ -114,21 +114,21 @@ impl<'t> Reading<'t> {
         owner: Owner,
         fields: &[(&'static str, At)],
         visitor: V,
-    ) -> Result<V::Value, Trouble> {
+    ) -> Result<V::Value, ReadError> {
         let Self { tracer, depth, .. } = self;
         let mut last = None;
         let first = tracer.samples.len();
         let access = Fields { tracer: &mut *tracer, fields, next: 0, last: &mut last, depth: depth + 1 };
         let read = visitor.visit_map(access);
         let value = read.map_err(|trouble| match (trouble, last) {
-            (Trouble::Twice { owner: None, name, .. }, Some(given)) => {
-                Trouble::Twice { owner: Some(owner), name, given }
+            (ReadError::Twice { owner: None, name, .. }, Some(given)) => {
+                ReadError::Twice { owner: Some(owner), name, given }
             }
             (trouble, _) => trouble,
         })?;
         let values = take(tracer, first);
         if values.len() != fields.len() {
-            return Err(Trouble::words(format!("its part {} does not read all its fields", owner.0)));
+            return Err(ReadError::words(format!("its part {} does not read all its fields", owner.0)));
         }
         let values = values.into_iter().zip(fields).enumerate();
         let values = values.map(|(index, (value, (name, _)))| (index, *name, value)).collect();
@@ -144,8 +144,8 @@ impl<'t> Reading<'t> {
 }
 
 /// Returns the error for two types of one name.
-pub(super) fn two_of(name: &str) -> Trouble {
-    Trouble::words(format!("two types inside it have the name {name}"))
+pub(super) fn two_of(name: &str) -> ReadError {
+    ReadError::words(format!("two types inside it have the name {name}"))
 }
 
 fn take(tracer: &mut Tracer, first: usize) -> Vec<Sample> {
@@ -155,7 +155,7 @@ fn take(tracer: &mut Tracer, first: usize) -> Vec<Sample> {
 /// Numbers: the type's name, the value that it is given, and its form in the sample.
 macro_rules! numbers {
     ($($method:ident $visit:ident $shape:ident $sample:ident)*) => {$(
-        fn $method<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, Trouble> {
+        fn $method<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, ReadError> {
             let number = self.tracer.filler.number;
             self.leaf(Shape::$shape, Sample::$sample(number))?;
             visitor.$visit(number.into())
@@ -164,7 +164,7 @@ macro_rules! numbers {
 }
 
 impl<'de> Deserializer<'de> for Reading<'_> {
-    type Error = Trouble;
+    type Error = ReadError;
 
     numbers! {
         deserialize_u8 visit_u8 U8 Int
@@ -180,48 +180,48 @@ impl<'de> Deserializer<'de> for Reading<'_> {
         deserialize_f64 visit_f64 F64 F64
     }
 
-    fn deserialize_any<V: Visitor<'de>>(self, _: V) -> Result<V::Value, Trouble> {
-        Err(Trouble::words(
+    fn deserialize_any<V: Visitor<'de>>(self, _: V) -> Result<V::Value, ReadError> {
+        Err(ReadError::words(
             "it has no fixed structure (flatten, untagged, tag, or its own Deserialize)".to_owned(),
         ))
     }
 
-    fn deserialize_bool<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, Trouble> {
+    fn deserialize_bool<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, ReadError> {
         self.leaf(Shape::Bool, Sample::Bool)?;
         visitor.visit_bool(false)
     }
 
-    fn deserialize_i8<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, Trouble> {
+    fn deserialize_i8<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, ReadError> {
         let number = self.tracer.filler.number;
         self.leaf(Shape::I8, Sample::Int(number))?;
         visitor.visit_i8(number.cast_signed())
     }
 
-    fn deserialize_char<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, Trouble> {
+    fn deserialize_char<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, ReadError> {
         self.leaf(Shape::Char, Sample::Text("a"))?;
         visitor.visit_char('a')
     }
 
-    fn deserialize_str<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, Trouble> {
+    fn deserialize_str<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, ReadError> {
         let text = self.tracer.filler.text;
         self.leaf(Shape::Text, Sample::Text(text))?;
         visitor.visit_borrowed_str(text)
     }
 
-    fn deserialize_string<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Trouble> {
+    fn deserialize_string<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, ReadError> {
         self.deserialize_str(visitor)
     }
 
-    fn deserialize_bytes<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, Trouble> {
+    fn deserialize_bytes<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, ReadError> {
         self.leaf(Shape::Bytes, Sample::Bytes)?;
         visitor.visit_borrowed_bytes(&[])
     }
 
-    fn deserialize_byte_buf<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, Trouble> {
+    fn deserialize_byte_buf<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, ReadError> {
         self.deserialize_bytes(visitor)
     }
 
-    fn deserialize_option<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, Trouble> {
+    fn deserialize_option<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, ReadError> {
         let known = |node: &Node| matches!(node, Node::Option(_)).then(|| parts(node));
         let parts = self.node_with(1, |parts| Node::Option(parts[0]), known)?;
         if !self.is_to_be_read(&parts) {
@@ -235,7 +235,7 @@ impl<'de> Deserializer<'de> for Reading<'_> {
         Ok(value)
     }
 
-    fn deserialize_unit<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, Trouble> {
+    fn deserialize_unit<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, ReadError> {
         self.leaf(Shape::Unit, Sample::Nil)?;
         visitor.visit_unit()
     }
@@ -244,7 +244,7 @@ impl<'de> Deserializer<'de> for Reading<'_> {
         mut self,
         name: &'static str,
         visitor: V,
-    ) -> Result<V::Value, Trouble> {
+    ) -> Result<V::Value, ReadError> {
         self.named(name, |_| Content::Unit, 0)?;
         self.tracer.samples.push(Sample::List(Vec::new()));
         visitor.visit_unit()
@@ -254,14 +254,14 @@ impl<'de> Deserializer<'de> for Reading<'_> {
         mut self,
         name: &'static str,
         visitor: V,
-    ) -> Result<V::Value, Trouble> {
+    ) -> Result<V::Value, ReadError> {
         let Content::Newtype(at) = self.named(name, |parts| Content::Newtype(parts[0]), 1)? else {
             return Err(two_of(name));
         };
         visitor.visit_newtype_struct(Reading { tracer: self.tracer, at, depth: self.depth + 1 })
     }
 
-    fn deserialize_seq<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, Trouble> {
+    fn deserialize_seq<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, ReadError> {
         let known = |node: &Node| matches!(node, Node::List(_)).then(|| parts(node));
         let parts = self.node_with(1, |parts| Node::List(parts[0]), known)?;
         let given: &[At] = if self.is_to_be_read(&parts) { &parts } else { &[] };
@@ -272,12 +272,16 @@ impl<'de> Deserializer<'de> for Reading<'_> {
         Ok(value)
     }
 
-    fn deserialize_tuple<V: Visitor<'de>>(mut self, length: usize, visitor: V) -> Result<V::Value, Trouble> {
+    fn deserialize_tuple<V: Visitor<'de>>(
+        mut self,
+        length: usize,
+        visitor: V,
+    ) -> Result<V::Value, ReadError> {
         if length > TUPLE_MAX {
             let known = |node: &Node| matches!(node, Node::Array(..)).then(|| parts(node));
             let parts = self.node_with(1, |parts| Node::Array(parts[0], length), known)?;
             if length > super::STEPS_MAX {
-                return Err(Trouble::words("it has an array that is too long".to_owned()));
+                return Err(ReadError::words("it has an array that is too long".to_owned()));
             }
             return self.sequence(&vec![parts[0]; length], visitor);
         }
@@ -291,14 +295,14 @@ impl<'de> Deserializer<'de> for Reading<'_> {
         name: &'static str,
         length: usize,
         visitor: V,
-    ) -> Result<V::Value, Trouble> {
+    ) -> Result<V::Value, ReadError> {
         let Content::Tuple(parts) = self.named(name, |parts| Content::Tuple(parts.to_vec()), length)? else {
             return Err(two_of(name));
         };
         self.sequence(&parts, visitor)
     }
 
-    fn deserialize_map<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, Trouble> {
+    fn deserialize_map<V: Visitor<'de>>(mut self, visitor: V) -> Result<V::Value, ReadError> {
         let known = |node: &Node| matches!(node, Node::Map(..)).then(|| parts(node));
         let parts = self.node_with(2, |parts| Node::Map(parts[0], parts[1]), known)?;
         let given: &[At] = if self.is_to_be_read(&parts) { &parts } else { &[] };
@@ -317,7 +321,7 @@ impl<'de> Deserializer<'de> for Reading<'_> {
         name: &'static str,
         fields: &'static [&'static str],
         visitor: V,
-    ) -> Result<V::Value, Trouble> {
+    ) -> Result<V::Value, ReadError> {
         let owner = (name, None);
         let names = self.tracer.aliases.own_fields(owner, fields);
         let content =
@@ -333,7 +337,7 @@ impl<'de> Deserializer<'de> for Reading<'_> {
         name: &'static str,
         variants: &'static [&'static str],
         visitor: V,
-    ) -> Result<V::Value, Trouble> {
+    ) -> Result<V::Value, ReadError> {
         self.note(Node::Named(name))?;
         let unread = |&name: &&'static str| Case { name, content: None, read: None, is_written: false };
         let def = self.tracer.graph.defs.entry(name);
@@ -344,7 +348,7 @@ impl<'de> Deserializer<'de> for Reading<'_> {
         }
         let index = self.tracer.choose(name);
         let Some(&case) = variants.get(index) else {
-            return Err(Trouble::words(format!("the enum {name} has no variants")));
+            return Err(ReadError::words(format!("the enum {name} has no variants")));
         };
         let (tracer, depth) = (self.tracer, self.depth);
         let before = tracer.steps;
@@ -368,12 +372,12 @@ impl<'de> Deserializer<'de> for Reading<'_> {
         Ok(value)
     }
 
-    fn deserialize_identifier<V: Visitor<'de>>(self, _: V) -> Result<V::Value, Trouble> {
-        Err(Trouble::words("it has no fixed structure (flatten, or its own Deserialize)".to_owned()))
+    fn deserialize_identifier<V: Visitor<'de>>(self, _: V) -> Result<V::Value, ReadError> {
+        Err(ReadError::words("it has no fixed structure (flatten, or its own Deserialize)".to_owned()))
     }
 
-    fn deserialize_ignored_any<V: Visitor<'de>>(self, _: V) -> Result<V::Value, Trouble> {
-        Err(Trouble::words("it skips a value (its own Deserialize)".to_owned()))
+    fn deserialize_ignored_any<V: Visitor<'de>>(self, _: V) -> Result<V::Value, ReadError> {
+        Err(ReadError::words("it skips a value (its own Deserialize)".to_owned()))
     }
 
     fn is_human_readable(&self) -> bool {

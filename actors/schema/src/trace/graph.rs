@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::Trouble;
+use super::ReadError;
 use crate::shape::{Field, Schema, Shape, Variant};
 
 /// Maximum number of nodes of one type.
@@ -77,23 +77,23 @@ impl Graph {
     }
 
     /// Adds `count` unknown nodes.
-    pub(super) fn add(&mut self, count: usize) -> Result<Vec<At>, Trouble> {
+    pub(super) fn add(&mut self, count: usize) -> Result<Vec<At>, ReadError> {
         let first = self.nodes.len();
         if count > NODES_MAX - first.min(NODES_MAX) {
-            return Err(Trouble::words(format!("it has more than {NODES_MAX} parts")));
+            return Err(ReadError::words(format!("it has more than {NODES_MAX} parts")));
         }
         self.nodes.resize(first + count, Node::Unknown);
         Ok((first..first + count).collect())
     }
 
     /// Sets an unknown node, or checks that it is the same as before.
-    pub(super) fn set(&mut self, at: At, node: Node) -> Result<(), Trouble> {
+    pub(super) fn set(&mut self, at: At, node: Node) -> Result<(), ReadError> {
         if self.nodes[at] == Node::Unknown {
             self.nodes[at] = node;
         } else if self.nodes[at] != node {
             let words =
                 "two types inside it have the same name, or a type is not always read in the same way";
-            return Err(Trouble::words(words.to_owned()));
+            return Err(ReadError::words(words.to_owned()));
         }
         Ok(())
     }

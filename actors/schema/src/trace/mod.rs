@@ -47,7 +47,7 @@ struct Filler {
 /// The reason why the structure of a type could not be found.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{words}")]
-pub struct Untraced {
+pub struct TraceError {
     words: String,
 }
 
@@ -69,7 +69,7 @@ impl Schema {
     /// Finds the structure of `T`, as rmp-serde writes it with field names.
     ///
     /// # Errors
-    /// [`Untraced`] if `T` has no fixed structure (`flatten`, `untagged`, `tag`), has a hand-written `Deserialize` that
+    /// [`TraceError`] if `T` has no fixed structure (`flatten`, `untagged`, `tag`), has a hand-written `Deserialize` that
     /// refuses each sample, contains two types of one name, is too large, or panics.
     ///
     /// # Examples
@@ -87,7 +87,7 @@ impl Schema {
     /// let schema = Schema::of::<Gains>().expect("it has a fixed structure");
     /// assert_eq!(schema.to_string(), "{\n    kp: f32,\n    kd: optional f32, may be absent,\n}\n");
     /// ```
-    pub fn of<T: Serialize + DeserializeOwned>() -> Result<Self, Untraced> {
+    pub fn of<T: Serialize + DeserializeOwned>() -> Result<Self, TraceError> {
         let accepts = |bytes: &[u8]| rmp_serde::from_slice::<T>(bytes).is_ok();
         let writes = |value: &T| rmp_serde::to_vec_named(value).ok();
         Self::traced(&Wire { accepts: &accepts, writes: &writes })
@@ -97,27 +97,27 @@ impl Schema {
     ///
     /// # Errors
     /// As of [`of`](Self::of).
-    pub fn traced<T: DeserializeOwned>(wire: &Wire<'_, T>) -> Result<Self, Untraced> {
+    pub fn traced<T: DeserializeOwned>(wire: &Wire<'_, T>) -> Result<Self, TraceError> {
         let attempt = |filler| {
             catch_unwind(AssertUnwindSafe(|| trace(wire, filler)))
-                .unwrap_or_else(|_| Err(Trouble::words("its code panics with a sample".to_owned())))
+                .unwrap_or_else(|_| Err(ReadError::words("its code panics with a sample".to_owned())))
         };
         let [first, second] = FILLERS;
         // The first error is the one that a reader understands: the second value is a guess.
         attempt(first)
             .or_else(|trouble| attempt(second).map_err(|_| trouble))
-            .map_err(|trouble| Untraced { words: trouble.to_string() })
+            .map_err(|trouble| TraceError { words: trouble.to_string() })
     }
 }
 
-fn trace<T: DeserializeOwned>(wire: &Wire<'_, T>, filler: Filler) -> Result<Schema, Trouble> {
+fn trace<T: DeserializeOwned>(wire: &Wire<'_, T>, filler: Filler) -> Result<Schema, ReadError> {
     let mut tracer = Tracer::new(filler, Aliases::default());
     for _ in 0..READS_MAX {
         let known = tracer.graph.known();
         tracer.begin();
         let value = match T::deserialize(Reading::of_root(&mut tracer)) {
             Ok(value) => value,
-            Err(Trouble::Twice { owner: Some(owner), name, given }) => {
+            Err(ReadError::Twice { owner: Some(owner), name, given }) => {
                 let mut aliases = tracer.aliases;
                 aliases.found(owner, name, given);
                 tracer = Tracer::new(filler, aliases);
@@ -126,11 +126,11 @@ fn trace<T: DeserializeOwned>(wire: &Wire<'_, T>, filler: Filler) -> Result<Sche
             Err(trouble) => return Err(trouble),
         };
         let Some(sample) = tracer.samples.pop() else {
-            return Err(Trouble::words("it reads no value".to_owned()));
+            return Err(ReadError::words("it reads no value".to_owned()));
         };
         tracer.try_absent_fields(&sample, wire)?;
         let written =
-            (wire.writes)(&value).ok_or_else(|| Trouble::words("it cannot be written".to_owned()))?;
+            (wire.writes)(&value).ok_or_else(|| ReadError::words("it cannot be written".to_owned()))?;
         written::check(&mut tracer.graph, &written)?;
         if !tracer.graph.has_unknown(0) {
             return tracer.finish();
@@ -139,7 +139,7 @@ fn trace<T: DeserializeOwned>(wire: &Wire<'_, T>, filler: Filler) -> Result<Sche
             break;
         }
     }
-    Err(Trouble::words(tracer.graph.unknown_type()))
+    Err(ReadError::words(tracer.graph.unknown_type()))
 }
 
 /// Names that serde lists as fields and that are other names of one: `#[serde(alias)]`.
@@ -208,18 +208,18 @@ impl Tracer {
     }
 
     /// Counts one value that the type reads.
-    fn step(&mut self) -> Result<(), Trouble> {
+    fn step(&mut self) -> Result<(), ReadError> {
         self.steps += 1;
         if self.steps > STEPS_MAX {
-            return Err(Trouble::words("it reads too many values".to_owned()));
+            return Err(ReadError::words("it reads too many values".to_owned()));
         }
         Ok(())
     }
 
     /// Decodes the sample as it is, and without each field that was not tried before.
-    fn try_absent_fields<T>(&mut self, sample: &Sample, wire: &Wire<'_, T>) -> Result<(), Trouble> {
+    fn try_absent_fields<T>(&mut self, sample: &Sample, wire: &Wire<'_, T>) -> Result<(), ReadError> {
         if !(wire.accepts)(&sample.encode(None)) {
-            return Err(Trouble::words("it reads another form of its value from MessagePack".to_owned()));
+            return Err(ReadError::words("it reads another form of its value from MessagePack".to_owned()));
         }
         let mut fields: Vec<Place> = Vec::new();
         sample.collect_fields(&mut fields);
@@ -230,7 +230,7 @@ impl Tracer {
             let bytes = sample.encode(Some(place));
             self.tried_bytes += bytes.len();
             if self.tried_bytes > TRIED_BYTES_MAX {
-                return Err(Trouble::words("it has too many fields".to_owned()));
+                return Err(ReadError::words("it has too many fields".to_owned()));
             }
             let accepts = (wire.accepts)(&bytes);
             self.graph.optional.insert(place, accepts);
@@ -254,18 +254,18 @@ impl Tracer {
         shortest.or_else(|| (0..cases.len()).find(|index| !is_open(*index))).unwrap_or(0)
     }
 
-    fn finish(self) -> Result<Schema, Trouble> {
+    fn finish(self) -> Result<Schema, ReadError> {
         let schema = self.graph.schema();
         match Schema::parse(&schema.encode()) {
             Ok(_) => Ok(schema),
-            Err(error) => Err(Trouble::words(error.to_string())),
+            Err(error) => Err(ReadError::words(error.to_string())),
         }
     }
 }
 
 /// The reason why a read of the type ended.
 #[derive(Debug)]
-enum Trouble {
+enum ReadError {
     Words(String),
     /// A field was given twice: the name `given` is another one of the field `name`.
     Twice {
@@ -275,13 +275,13 @@ enum Trouble {
     },
 }
 
-impl Trouble {
+impl ReadError {
     const fn words(words: String) -> Self {
         Self::Words(words)
     }
 }
 
-impl fmt::Display for Trouble {
+impl fmt::Display for ReadError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Words(words) => f.write_str(words),
@@ -290,9 +290,9 @@ impl fmt::Display for Trouble {
     }
 }
 
-impl std::error::Error for Trouble {}
+impl std::error::Error for ReadError {}
 
-impl serde::de::Error for Trouble {
+impl serde::de::Error for ReadError {
     fn custom<T: fmt::Display>(words: T) -> Self {
         let words = words.to_string();
         Self::Words(format!("it refuses the sample that it was given: {words}"))

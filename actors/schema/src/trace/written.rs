@@ -5,7 +5,7 @@ use std::fmt;
 use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
 
 use super::{
-    Trouble,
+    ReadError,
     graph::{At, Content, Def, Graph, Node},
 };
 use crate::shape::Shape;
@@ -24,14 +24,14 @@ enum Value {
 }
 
 /// Checks the bytes of a value that was read along `graph`, and notes the names of variants in them.
-pub(super) fn check(graph: &mut Graph, bytes: &[u8]) -> Result<(), Trouble> {
+pub(super) fn check(graph: &mut Graph, bytes: &[u8]) -> Result<(), ReadError> {
     let mut reader = rmp_serde::Deserializer::from_read_ref(bytes);
     reader.set_max_depth(256);
-    let value = Value::deserialize(&mut reader).map_err(|error| Trouble::words(error.to_string()))?;
+    let value = Value::deserialize(&mut reader).map_err(|error| ReadError::words(error.to_string()))?;
     fits(graph, 0, &value)
 }
 
-fn fits(graph: &mut Graph, at: At, value: &Value) -> Result<(), Trouble> {
+fn fits(graph: &mut Graph, at: At, value: &Value) -> Result<(), ReadError> {
     let node = graph.node(at).clone();
     let is_one = match (&node, value) {
         (Node::Unknown, _) | (Node::Option(_), Value::Nil) => true,
@@ -56,14 +56,14 @@ fn fits(graph: &mut Graph, at: At, value: &Value) -> Result<(), Trouble> {
     if is_one { Ok(()) } else { Err(other("a part of it")) }
 }
 
-fn all_fit(graph: &mut Graph, parts: &[At], values: &[Value]) -> Result<(), Trouble> {
+fn all_fit(graph: &mut Graph, parts: &[At], values: &[Value]) -> Result<(), ReadError> {
     if parts.len() != values.len() {
         return Err(other("a tuple inside it"));
     }
     parts.iter().zip(values).try_for_each(|(part, value)| fits(graph, *part, value))
 }
 
-fn named_fits(graph: &mut Graph, name: &'static str, value: &Value) -> Result<(), Trouble> {
+fn named_fits(graph: &mut Graph, name: &'static str, value: &Value) -> Result<(), ReadError> {
     let nil = Value::Nil;
     let (case, inner) = match value {
         Value::Text(case) => (case, &nil),
@@ -94,7 +94,7 @@ fn named_fits(graph: &mut Graph, name: &'static str, value: &Value) -> Result<()
     content.map_or(Ok(()), |content| content_fits(graph, name, &content, inner))
 }
 
-fn plain_fits(graph: &mut Graph, name: &'static str, value: &Value) -> Result<(), Trouble> {
+fn plain_fits(graph: &mut Graph, name: &'static str, value: &Value) -> Result<(), ReadError> {
     match graph.defs.get(name) {
         Some(Def::Plain(content)) => {
             let content = content.clone();
@@ -104,7 +104,7 @@ fn plain_fits(graph: &mut Graph, name: &'static str, value: &Value) -> Result<()
     }
 }
 
-fn content_fits(graph: &mut Graph, name: &str, content: &Content, value: &Value) -> Result<(), Trouble> {
+fn content_fits(graph: &mut Graph, name: &str, content: &Content, value: &Value) -> Result<(), ReadError> {
     match (content, value) {
         (Content::Newtype(at), value) => fits(graph, *at, value),
         (Content::Unit, Value::Nil) => Ok(()),
@@ -138,8 +138,8 @@ const fn is_integer(shape: &Shape) -> bool {
     signed || matches!(shape, Shape::U8 | Shape::U16 | Shape::U32 | Shape::U64 | Shape::U128)
 }
 
-fn other(name: &str) -> Trouble {
-    Trouble::words(format!("{name} is written in another form than it is read"))
+fn other(name: &str) -> ReadError {
+    ReadError::words(format!("{name} is written in another form than it is read"))
 }
 
 macro_rules! forms {

@@ -7,11 +7,11 @@ use std::{
 };
 
 use crate::{
-    CredentialFaults, Credentials, TimePolicy, files as names,
+    Credentials, CredentialsError, TimePolicy, files as names,
     testing::{Authority, CertificateContent, DAY, Directory, NOW, at, identity},
 };
 
-fn load(directory: &Directory, policy: TimePolicy, now: u64) -> Result<Credentials, CredentialFaults> {
+fn load(directory: &Directory, policy: TimePolicy, now: u64) -> Result<Credentials, CredentialsError> {
     Credentials::load(directory.path(), &identity("hip", 11), policy, at(now))
 }
 

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use sinew_runtime::{
     outcome::Rejection,
-    router::Refused,
+    router::SubmitError,
     wire::{Kind, Message},
 };
 
@@ -48,11 +48,11 @@ impl LinkFrames {
         frame: Message,
         waiting_max: usize,
         has_session: bool,
-    ) -> Result<Pushed, Refused> {
+    ) -> Result<Pushed, SubmitError> {
         let is_ack = frame.header.kind == Kind::GNCL_ACK;
         self.has_sent_ack |= is_ack || !has_session;
         if !self.has_sent_ack {
-            return Err(Refused::new(frame, Rejection::Closed));
+            return Err(SubmitError::new(frame, Rejection::Closed));
         }
         if is_ack
             && let Some(older) = self.urgent.iter_mut().find(|older| older.header.kind == Kind::GNCL_ACK)
@@ -65,7 +65,7 @@ impl LinkFrames {
         }
         // At most one ACK is pending.
         if self.urgent.len() >= waiting_max && !is_ack {
-            return Err(Refused::new(frame, Rejection::QueueFull));
+            return Err(SubmitError::new(frame, Rejection::QueueFull));
         }
         self.urgent.push_back(frame);
         Ok(Pushed::Queued)

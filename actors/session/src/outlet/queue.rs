@@ -6,7 +6,7 @@ use std::{ops::Deref, task::Waker};
 use sinew_runtime::{
     mailbox::ClassQueue,
     outcome::Ticket,
-    router::Refused,
+    router::SubmitError,
     time::Time,
     wire::{Class, Kind, Message},
 };
@@ -54,7 +54,7 @@ impl SendQueue {
         self.outcomes -= outcomes;
     }
 
-    pub(super) fn push(&mut self, message: Message) -> Result<Option<Message>, Refused> {
+    pub(super) fn push(&mut self, message: Message) -> Result<Option<Message>, SubmitError> {
         let share = share_of(&message);
         // The superseded message is of class Stream, as is `message`. Stream messages never move to the
         // backlog.

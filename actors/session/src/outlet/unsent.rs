@@ -11,7 +11,7 @@ use std::sync::Arc;
 use sinew_runtime::{
     mailbox::{Bounds, Budget, ClassQueue},
     outcome::{Rejection, Ticket},
-    router::Refused,
+    router::SubmitError,
     tid::AppAddress,
     time::Time,
     wire::{Class, Flags, Header, Kind, Message},
@@ -136,7 +136,7 @@ impl Unsent {
     }
 
     /// Queues a message. Returns whether it supersedes an older one.
-    pub(super) fn enqueue(&mut self, message: Message, bound: Bound) -> Result<bool, Refused> {
+    pub(super) fn enqueue(&mut self, message: Message, bound: Bound) -> Result<bool, SubmitError> {
         let expiry = message.header.expiry();
         let supersedes = match bound {
             Bound::Waived => {
@@ -144,7 +144,7 @@ impl Unsent {
                 false
             }
             Bound::Kept if !self.has_room_beside_backlog(&message) => {
-                return Err(Refused::new(message, Rejection::QueueFull));
+                return Err(SubmitError::new(message, Rejection::QueueFull));
             }
             Bound::Kept => self.queue.push(message)?.is_some(),
         };
@@ -194,13 +194,15 @@ impl Unsent {
     }
 
     /// Puts a message for a held destination into the backlog.
-    pub(super) fn hold(&mut self, key: u64, message: Message) -> Result<(), Refused> {
+    pub(super) fn hold(&mut self, key: u64, message: Message) -> Result<(), SubmitError> {
         let has_room = self.is_within_bounds();
         let Some(backlog) = self.backlog.as_mut().filter(|_| has_room) else {
-            return Err(Refused::new(message, Rejection::QueueFull));
+            return Err(SubmitError::new(message, Rejection::QueueFull));
         };
         let (expiry, bytes) = (message.header.expiry(), message.size());
-        backlog.put(key, message, bytes).map_err(|message| Refused::new(message, Rejection::QueueFull))?;
+        backlog
+            .put(key, message, bytes)
+            .map_err(|message| SubmitError::new(message, Rejection::QueueFull))?;
         self.next_expiry = self.next_expiry.min(expiry);
         Ok(())
     }

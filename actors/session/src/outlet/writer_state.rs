@@ -6,7 +6,7 @@ use std::{sync::Arc, task::Waker};
 use sinew_runtime::{
     mailbox::Budget,
     outcome::{Outcome, Receipt, Rejection, Ticket},
-    router::Refused,
+    router::SubmitError,
     time::Time,
     wire::{Class, Flags, Message},
 };
@@ -73,7 +73,7 @@ impl<S: Socket> WriterState<S> {
         message: Message,
         bound: Bound,
         deferred: &mut DeferredActions,
-    ) -> Result<Step, Refused> {
+    ) -> Result<Step, SubmitError> {
         let is_own = !message.header.kind.is_user();
         let step = self.take(message, bound, deferred)?;
         self.counters.accept(is_own);
@@ -85,10 +85,10 @@ impl<S: Socket> WriterState<S> {
         mut message: Message,
         bound: Bound,
         deferred: &mut DeferredActions,
-    ) -> Result<Step, Refused> {
+    ) -> Result<Step, SubmitError> {
         if let Err(why) = self.admit(&message, bound) {
             self.counters.counts.refused += 1;
-            return Err(Refused::new(message, why));
+            return Err(SubmitError::new(message, why));
         }
         message.header.flags = match message.receipt {
             Some(_) => message.header.flags.with(Flags::CONFIRM),
@@ -159,14 +159,14 @@ impl<S: Socket> WriterState<S> {
         }
     }
 
-    fn hold(&mut self, key: u64, message: Message) -> Result<(), Refused> {
+    fn hold(&mut self, key: u64, message: Message) -> Result<(), SubmitError> {
         let confirming_destination = confirming_destination(&message);
         self.unsent.hold(key, message).inspect_err(|_| self.counters.counts.refused += 1)?;
         self.receipts.add_waiting(confirming_destination);
         Ok(())
     }
 
-    fn enqueue(&mut self, message: Message, bound: Bound) -> Result<(), Refused> {
+    fn enqueue(&mut self, message: Message, bound: Bound) -> Result<(), SubmitError> {
         let confirming_destination = confirming_destination(&message);
         let supersedes =
             self.unsent.enqueue(message, bound).inspect_err(|_| self.counters.counts.refused += 1)?;
@@ -181,7 +181,7 @@ impl<S: Socket> WriterState<S> {
         frame: Partial,
         bound: Bound,
         deferred: &mut DeferredActions,
-    ) -> Result<(), Refused> {
+    ) -> Result<(), SubmitError> {
         self.receipts.remove_waiting(confirming_destination(&frame.message));
         self.counters.numbered -= u64::from(self.numbering.take_back());
         self.enqueue(frame.message, bound)?;
@@ -209,9 +209,9 @@ impl<S: Socket> WriterState<S> {
         message: Message,
         waiting_max: usize,
         deferred: &mut DeferredActions,
-    ) -> Result<(), Refused> {
+    ) -> Result<(), SubmitError> {
         if !self.connection.is_up() {
-            return Err(Refused::new(message, Rejection::Closed));
+            return Err(SubmitError::new(message, Rejection::Closed));
         }
         if self.link_frames.push(message, waiting_max, self.numbering.has_session())? == Pushed::ReplacedAck {
             return Ok(());

@@ -192,7 +192,7 @@ mod tests {
     };
 
     use sinew_runtime::{
-        router::{LocalRoute, MessageSink, Refused},
+        router::{LocalRoute, MessageSink, SubmitError},
         tid::Incarnation,
     };
 
@@ -211,14 +211,14 @@ mod tests {
     }
 
     impl MessageSink for Full {
-        fn submit(&self, message: Message) -> Result<(), Refused> {
+        fn submit(&self, message: Message) -> Result<(), SubmitError> {
             let mark = 0_u8;
             let at = std::ptr::from_ref(&mark).addr();
             self.refused.fetch_add(1, Ordering::Relaxed);
             self.highest.fetch_max(at, Ordering::Relaxed);
             // So that the least value is the first: the stack grows downwards.
             self.deepest.fetch_max(usize::MAX - at, Ordering::Relaxed);
-            Err(Refused::new(message, Rejection::QueueFull))
+            Err(SubmitError::new(message, Rejection::QueueFull))
         }
     }
 

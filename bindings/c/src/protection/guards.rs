@@ -21,7 +21,7 @@ use arc_swap::ArcSwapOption;
 use sinew_runtime::{
     protection::{
         ArmError, Cause, Guard, State, Tally,
-        raw::{NotSafe, Protected, Reads, Released, Verdict},
+        raw::{NotSafeError, Protected, Reads, Released, Verdict},
     },
     tid::Tid,
     time::Time,
@@ -209,14 +209,14 @@ impl Found {
 
 impl Output {
     /// Converts to the runtime's type.
-    fn make_safe(self) -> impl FnMut(&mut Pointer, Cause) -> Result<(), NotSafe> + Send + 'static {
+    fn make_safe(self) -> impl FnMut(&mut Pointer, Cause) -> Result<(), NotSafeError> + Send + 'static {
         let safe = self.safe;
         move |pointer: &mut Pointer, cause: Cause| {
             let (output, why) = (*pointer.get_mut(), code_of(State::Safe(cause)));
             // SAFETY: the header requires that any thread may call this with this output until the guard is
             // released.
             let failed = in_callback(|| unsafe { safe(output, why) });
-            if failed == 0 { Ok(()) } else { Err(NotSafe) }
+            if failed == 0 { Ok(()) } else { Err(NotSafeError) }
         }
     }
 }

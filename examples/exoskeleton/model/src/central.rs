@@ -65,7 +65,7 @@ pub enum Resume {
 /// A release that was rejected; nothing has changed. The e-stop was pressed and not yet reset.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("the e-stop is latched: reset it first, central and then the drives")]
-pub struct StillStopped;
+pub struct EStopLatchedError;
 
 /// Parameters of the central unit.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -221,9 +221,9 @@ impl CentralCore {
     ///
     /// # Errors
     /// The e-stop was pressed and not reset, here or at a drive.
-    pub fn release(&mut self) -> Result<(), StillStopped> {
+    pub fn release(&mut self) -> Result<(), EStopLatchedError> {
         if self.stage == Stage::Stopped || self.drives.any_stopped() {
-            return Err(StillStopped);
+            return Err(EStopLatchedError);
         }
         self.released = true;
         Ok(())

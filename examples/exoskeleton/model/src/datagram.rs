@@ -77,7 +77,7 @@ pub struct Reading {
 /// The reason why bytes are not one of these datagrams. Their sender is at fault; they are counted and
 /// dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
-pub enum DatagramFault {
+pub enum DatagramError {
     /// Not of the fixed size, or its check sum is wrong.
     #[error("it is damaged")]
     Damaged,
@@ -127,13 +127,13 @@ impl CommandFrame {
     ///
     /// # Errors
     /// They are no command.
-    pub fn decode(bytes: &[u8]) -> Result<Self, DatagramFault> {
+    pub fn decode(bytes: &[u8]) -> Result<Self, DatagramError> {
         let (head, [torque_nm]) = read::<COMMAND_BYTES, 1>(bytes, Self::KIND)?;
         let order = match (head.flags & Self::TORQUE != 0, head.flags & Self::DAMP != 0) {
             (false, false) => None,
             (true, false) => Some(Order::Torque(torque_nm)),
             (false, true) => Some(Order::Damp),
-            (true, true) => return Err(DatagramFault::Unknown),
+            (true, true) => return Err(DatagramError::Unknown),
         };
         Ok(Self {
             joint: head.joint,
@@ -142,7 +142,7 @@ impl CommandFrame {
             order,
             released: head.flags & Self::RELEASED != 0,
             saturated: head.flags & Self::SATURATED != 0,
-            state: DriveState::try_from(head.state).map_err(|_| DatagramFault::Unknown)?,
+            state: DriveState::try_from(head.state).map_err(|_| DatagramError::Unknown)?,
         })
     }
 }
@@ -167,7 +167,7 @@ impl Reading {
     ///
     /// # Errors
     /// They are no reading.
-    pub fn decode(bytes: &[u8]) -> Result<Self, DatagramFault> {
+    pub fn decode(bytes: &[u8]) -> Result<Self, DatagramError> {
         let (head, [angle_rad, velocity_rad_s, torque_nm, heel_n, toe_n]) =
             read::<READING_BYTES, 5>(bytes, Self::KIND)?;
         let watchdog_active = head.flags & Self::WATCHDOG != 0;
@@ -206,21 +206,21 @@ fn write<const BYTES: usize>(head: &Head, numbers: &[f64]) -> [u8; BYTES] {
 fn read<const BYTES: usize, const NUMBERS: usize>(
     bytes: &[u8],
     kind: u8,
-) -> Result<(Head, [f64; NUMBERS]), DatagramFault> {
-    let bytes: &[u8; BYTES] = bytes.try_into().map_err(|_| DatagramFault::Damaged)?;
+) -> Result<(Head, [f64; NUMBERS]), DatagramError> {
+    let bytes: &[u8; BYTES] = bytes.try_into().map_err(|_| DatagramError::Damaged)?;
     if bytes[..3] != MAGIC || bytes[3] != kind || bytes[4] != VERSION {
-        return Err(DatagramFault::Kind);
+        return Err(DatagramError::Kind);
     }
     let (checked, crc) = bytes.split_at(BYTES - CRC_BYTES);
     if crc32fast::hash(checked).to_le_bytes() != *crc {
-        return Err(DatagramFault::Damaged);
+        return Err(DatagramError::Damaged);
     }
-    let joint = *Joint::ALL.get(usize::from(bytes[5])).ok_or(DatagramFault::Unknown)?;
+    let joint = *Joint::ALL.get(usize::from(bytes[5])).ok_or(DatagramError::Unknown)?;
     let numbers: [f64; NUMBERS] = std::array::from_fn(|i| {
         f64::from_le_bytes(eight(&bytes[NUMBERS_AT + 8 * i..NUMBERS_AT + 8 * i + 8]))
     });
     if !numbers.iter().all(|number| number.is_finite()) {
-        return Err(DatagramFault::NotFinite);
+        return Err(DatagramError::NotFinite);
     }
     let seq = u32::from_le_bytes([bytes[8], bytes[9], bytes[10], bytes[11]]);
     let t_ns = u64::from_le_bytes(eight(&bytes[12..NUMBERS_AT]));
@@ -296,13 +296,13 @@ mod tests {
     #[test]
     fn nan_torque_is_rejected() {
         let bytes = command(1, 2, Some(Order::Torque(f64::NAN)), 1).encode();
-        assert_eq!(CommandFrame::decode(&bytes), Err(DatagramFault::NotFinite));
+        assert_eq!(CommandFrame::decode(&bytes), Err(DatagramError::NotFinite));
     }
 
     #[test]
     fn reading_is_not_decoded_as_command() {
         let reading =
             Reading { joint: Joint::Hip, seq: 1, t_ns: 2, device: DeviceReading::default(), foot: None };
-        assert_eq!(CommandFrame::decode(&reading.encode()[..COMMAND_BYTES]), Err(DatagramFault::Kind));
+        assert_eq!(CommandFrame::decode(&reading.encode()[..COMMAND_BYTES]), Err(DatagramError::Kind));
     }
 }

@@ -1,6 +1,6 @@
 //! The drive: its invariants under every input, and its state machine.
 
-use exoskeleton_model::control::drive::{DriveConfig, DriveCore, DriveOutput, ResetRefusal};
+use exoskeleton_model::control::drive::{DriveConfig, DriveCore, DriveOutput, ResetError};
 use exoskeleton_model::control::faults::FaultBits;
 use exoskeleton_model::control::torque_law::TorqueLaw;
 use exoskeleton_model::joint::Joint;
@@ -283,7 +283,7 @@ fn stop_of_central_latches_while_central_commands_it() {
     let output = feed(&mut drive, 1000..1050, GaitMode::Stop);
     assert_eq!((output.state, output.command_nm), (DriveState::EStop, Some(0.0)));
     assert!(drive.faults().contains(FaultBits::STOPPED));
-    assert_eq!(drive.reset(1050 * MS), Err(ResetRefusal::CentralStopped));
+    assert_eq!(drive.reset(1050 * MS), Err(ResetError::CentralStopped));
     assert_eq!(feed(&mut drive, 1050..1100, GaitMode::Walk).state, DriveState::EStop);
     assert_eq!(drive.reset(1100 * MS), Ok(()));
     assert_eq!(drive.faults(), FaultBits(0));
@@ -302,7 +302,7 @@ fn reset_before_the_torque_is_zero_is_rejected() {
     let mut drive = walking();
     drive.emergency_stop();
     feed(&mut drive, 1000..1003, GaitMode::Hold);
-    assert_eq!(drive.reset(1003 * MS), Err(ResetRefusal::NotAtRest));
+    assert_eq!(drive.reset(1003 * MS), Err(ResetError::NotAtRest));
     assert_eq!(drive.state(), DriveState::EStop);
 }
 

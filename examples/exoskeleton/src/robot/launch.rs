@@ -36,7 +36,7 @@ use plan::Plan;
 use screen::Screen;
 
 pub use collect::Traces;
-pub use keys::KeyFaults;
+pub use keys::KeysError;
 
 /// Time between two readings of the CPU times of all processes.
 const SAMPLE_PERIOD: Duration = Duration::from_millis(200);
@@ -137,7 +137,7 @@ pub enum LaunchError {
     Node(#[from] NodeError),
     /// Keys were requested, and those given are not the robot's.
     #[error(transparent)]
-    Keys(#[from] KeyFaults),
+    Keys(#[from] KeysError),
 }
 
 /// Starts all five processes, walks, stops them, and reports.

@@ -21,7 +21,7 @@ use super::gait::GaitParts;
 use super::plant::{self, PlantError};
 use super::role::Role;
 use super::sensor::DeviceMaker;
-use super::topology::{ControlThread, DrivePlace, ReleaseBy, Topology, TopologyFaults};
+use super::topology::{ControlThread, DrivePlace, ReleaseBy, Topology, TopologyError};
 use super::trace::{EventRow, Recording, TraceRow};
 use super::watch::WatchParts;
 use super::{coordinator, drive, gait, sensor, slots, watch};
@@ -51,7 +51,7 @@ pub enum NodeError {
         /// The file.
         path: String,
         /// Its faults.
-        faults: TopologyFaults,
+        faults: TopologyError,
     },
     /// A trace cannot be started.
     #[error("no trace can be written: {0}")]

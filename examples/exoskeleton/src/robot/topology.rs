@@ -132,9 +132,9 @@ pub struct PlantPlace {
 
 /// All faults of a topology. The user is at fault; nothing was started.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
-pub struct TopologyFaults(pub Vec<String>);
+pub struct TopologyError(pub Vec<String>);
 
-impl fmt::Display for TopologyFaults {
+impl fmt::Display for TopologyError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let faults = if self.0.len() == 1 { "fault" } else { "faults" };
         write!(f, "the topology has {} {faults}:", self.0.len())?;
@@ -147,9 +147,9 @@ impl Topology {
     ///
     /// # Errors
     /// All its faults, each with its place and a remedy.
-    pub fn read(path: &Path) -> Result<Self, TopologyFaults> {
+    pub fn read(path: &Path) -> Result<Self, TopologyError> {
         let text = std::fs::read_to_string(path)
-            .map_err(|e| TopologyFaults(vec![format!("{} cannot be read: {e}", path.display())]))?;
+            .map_err(|e| TopologyError(vec![format!("{} cannot be read: {e}", path.display())]))?;
         Self::parse(&text)
     }
 
@@ -157,7 +157,7 @@ impl Topology {
     ///
     /// # Errors
     /// All its faults, each with its place and a remedy.
-    pub fn parse(text: &str) -> Result<Self, TopologyFaults> {
+    pub fn parse(text: &str) -> Result<Self, TopologyError> {
         file::parse(text)
     }
 

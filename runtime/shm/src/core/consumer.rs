@@ -4,7 +4,7 @@ use std::sync::atomic::Ordering;
 
 use super::sleep::{Sleep, Waking};
 use crate::{
-    error::Corrupt,
+    error::CorruptError,
     layout::{Capacity, MARK_BYTES, Mark, Word, record_bytes},
     memory::{OwnHeader, Peer, fence},
     wait::Armed,
@@ -35,7 +35,7 @@ pub(crate) struct ConsumerCore<O, P> {
     tail_seen: u32,
     sleep: Sleep,
     waking: Waking,
-    corrupt: Option<Corrupt>,
+    corrupt: Option<CorruptError>,
 }
 
 impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
@@ -58,7 +58,7 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
     }
 
     /// Returns the oldest message that was not released, if there is any.
-    pub(crate) fn next(&mut self) -> Result<Option<Record>, Corrupt> {
+    pub(crate) fn next(&mut self) -> Result<Option<Record>, CorruptError> {
         if let Some(corrupt) = self.corrupt {
             return Err(corrupt);
         }
@@ -100,7 +100,7 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
     }
 
     /// Announces sleep until there is a message.
-    pub(crate) fn arm(&mut self) -> Result<Armed, Corrupt> {
+    pub(crate) fn arm(&mut self) -> Result<Armed, CorruptError> {
         self.sleep.announce(&self.own);
         match self.next() {
             Ok(None) => Ok(Armed::Sleep),
@@ -150,7 +150,7 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
         self.own.store(Word::Head, count, Ordering::Relaxed);
     }
 
-    fn find(&mut self) -> Result<Option<Record>, Corrupt> {
+    fn find(&mut self) -> Result<Option<Record>, CorruptError> {
         if self.tail_seen == self.head {
             self.refresh()?;
             if self.tail_seen == self.head {
@@ -164,9 +164,9 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
     }
 
     /// Reads the message at the ring's beginning after a skip: a producer publishes both at once.
-    fn message_after_skip(&self) -> Result<Record, Corrupt> {
+    fn message_after_skip(&self) -> Result<Record, CorruptError> {
         let (skipped, published) = (self.capacity.rest(self.head), self.published(self.head));
-        let corrupt = Corrupt::Skip { skipped, published };
+        let corrupt = CorruptError::Skip { skipped, published };
         // Not less: at least a mark follows. And no skip of the whole ring, which no message can need.
         if skipped >= published || skipped == self.capacity.bytes() {
             return Err(corrupt);
@@ -178,7 +178,7 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
         }
     }
 
-    fn message(&self, start: u32, length: u32) -> Result<Record, Corrupt> {
+    fn message(&self, start: u32, length: u32) -> Result<Record, CorruptError> {
         let most = self.capacity.payload_max() + MARK_BYTES;
         let room = self.published(start).min(self.capacity.rest(start)).min(most);
         match record_bytes(length) {
@@ -187,7 +187,7 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
                 length,
                 end: start.wrapping_add(record),
             }),
-            _ => Err(Corrupt::Length { length, room }),
+            _ => Err(CorruptError::Length { length, room }),
         }
     }
 
@@ -197,20 +197,20 @@ impl<O: OwnHeader, P: Peer> ConsumerCore<O, P> {
     }
 
     /// Reads a mark once. Counts are multiples of 8, and so are positions.
-    fn mark_at(&self, count: u32) -> Result<Mark, Corrupt> {
+    fn mark_at(&self, count: u32) -> Result<Mark, CorruptError> {
         let bits = self.peer.mark(self.capacity.position(count));
-        Mark::from_bits(bits).ok_or(Corrupt::Mark(bits))
+        Mark::from_bits(bits).ok_or(CorruptError::Mark(bits))
     }
 
     /// Reads the producer's tail once, and accepts it only if it lies between the last one and the ring's
     /// capacity.
-    fn refresh(&mut self) -> Result<(), Corrupt> {
+    fn refresh(&mut self) -> Result<(), CorruptError> {
         let tail = self.peer.load(Word::Tail);
         // SYNC: the bytes of all records before this tail are visible: the store of tail in `ProducerCore::publish`.
         fence(Ordering::Acquire);
         let (moved, known) = (tail.wrapping_sub(self.tail_seen), self.tail_seen.wrapping_sub(self.head));
         if moved > self.capacity.bytes() - known || !tail.is_multiple_of(MARK_BYTES) {
-            return Err(Corrupt::Tail { tail, seen: self.tail_seen });
+            return Err(CorruptError::Tail { tail, seen: self.tail_seen });
         }
         self.tail_seen = tail;
         Ok(())

@@ -4,7 +4,7 @@ use std::sync::atomic::Ordering;
 
 use super::sleep::{Sleep, WakePlace, Waking};
 use crate::{
-    error::{Corrupt, LoanError},
+    error::{CorruptError, LoanError},
     layout::{Capacity, MARK_BYTES, Mark, Word, record_bytes},
     memory::{OwnRing, Peer, fence},
     wait::Armed,
@@ -32,7 +32,7 @@ pub(crate) struct ProducerCore<O, P> {
     reserved: Option<Reserved>,
     sleep: Sleep,
     waking: Waking,
-    corrupt: Option<Corrupt>,
+    corrupt: Option<CorruptError>,
 }
 
 impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
@@ -55,7 +55,7 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
     }
 
     /// The error of the peer, if one was detected.
-    pub(crate) const fn corrupt(&self) -> Option<Corrupt> {
+    pub(crate) const fn corrupt(&self) -> Option<CorruptError> {
         self.corrupt
     }
 
@@ -171,7 +171,7 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
     }
 
     /// Bytes that are published and not consumed.
-    pub(crate) fn unread(&mut self) -> Result<u32, Corrupt> {
+    pub(crate) fn unread(&mut self) -> Result<u32, CorruptError> {
         self.refresh()?;
         Ok(self.tail.wrapping_sub(self.head_seen))
     }
@@ -216,14 +216,14 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
     }
 
     /// Reads the consumer's head once, and accepts it only if it lies between the last one and the tail.
-    fn refresh(&mut self) -> Result<(), Corrupt> {
+    fn refresh(&mut self) -> Result<(), CorruptError> {
         let head = self.peer.load(Word::Head);
         // SYNC: the consumer's reads of the consumed messages are over: its store of head in
         // `ConsumerCore::release`.
         fence(Ordering::Acquire);
         let (moved, most) = (head.wrapping_sub(self.head_seen), self.tail.wrapping_sub(self.head_seen));
         if moved > most || !head.is_multiple_of(MARK_BYTES) {
-            let corrupt = Corrupt::Head { head, seen: self.head_seen, tail: self.tail };
+            let corrupt = CorruptError::Head { head, seen: self.head_seen, tail: self.tail };
             self.corrupt = Some(corrupt);
             return Err(corrupt);
         }
@@ -231,7 +231,7 @@ impl<O: OwnRing, P: Peer> ProducerCore<O, P> {
         Ok(())
     }
 
-    fn intact(&self) -> Result<(), Corrupt> {
+    fn intact(&self) -> Result<(), CorruptError> {
         self.corrupt.map_or(Ok(()), Err)
     }
 }

@@ -10,7 +10,7 @@ use proptest::prelude::*;
 use super::model::{Side, fill, read, ring};
 use super::{ConsumerCore, ProducerCore};
 use crate::{
-    error::{Corrupt, LoanError},
+    error::{CorruptError, LoanError},
     layout::{Capacity, Mark, Word},
     wait::Armed,
 };
@@ -215,7 +215,7 @@ fn error_persists_after_the_peer_repairs_its_memory() {
     // given
     let (sender, mut receiver) = ring(Capacity::tiny(64));
     sender.own.word(Word::Tail).store(4, Ordering::Relaxed);
-    let corrupt = Corrupt::Tail { tail: 4, seen: 0 };
+    let corrupt = CorruptError::Tail { tail: 4, seen: 0 };
     assert_eq!(receiver.next(), Err(corrupt));
     // when
     sender.own.word(Word::Tail).store(0, Ordering::Relaxed);
@@ -228,7 +228,7 @@ fn invalid_tail_or_head_is_corrupt() {
     for tail in [72, 0_u32.wrapping_sub(8), u32::MAX, 1] {
         let (sender, mut receiver) = ring(Capacity::tiny(64));
         sender.own.word(Word::Tail).store(tail, Ordering::Relaxed);
-        assert_eq!(receiver.next(), Err(Corrupt::Tail { tail, seen: 0 }));
+        assert_eq!(receiver.next(), Err(CorruptError::Tail { tail, seen: 0 }));
     }
     for head in [72, 0_u32.wrapping_sub(8), 3] {
         // given: 32 of 64 bytes published
@@ -241,7 +241,7 @@ fn invalid_tail_or_head_is_corrupt() {
         // when: there is room without a new check, then there is not
         sender.reserve(24).expect("the other half");
         sender.publish();
-        let error = Corrupt::Head { head, seen: 0, tail: 64 };
+        let error = CorruptError::Head { head, seen: 0, tail: 64 };
         // then
         let refused = sender.reserve(8);
         assert_eq!(refused, Err(LoanError::Corrupt(error)), "{head}");
@@ -256,7 +256,7 @@ fn message_longer_than_half_the_ring_is_corrupt() {
     let (sender, mut receiver) = ring(Capacity::tiny(64));
     sender.own.cell(0).store(Mark::Message(32).to_bits(), Ordering::Relaxed);
     sender.own.word(Word::Tail).store(40, Ordering::Relaxed);
-    assert_eq!(receiver.next(), Err(Corrupt::Length { length: 32, room: 32 }));
+    assert_eq!(receiver.next(), Err(CorruptError::Length { length: 32, room: 32 }));
 }
 
 #[test]
@@ -265,7 +265,7 @@ fn skip_after_skip_or_to_nothing_is_corrupt() {
         let (sender, mut receiver) = ring(Capacity::tiny(64));
         sender.own.cell(0).store(Mark::Skip.to_bits(), Ordering::Relaxed);
         sender.own.word(Word::Tail).store(published, Ordering::Relaxed);
-        assert_eq!(receiver.next(), Err(Corrupt::Skip { skipped: 64, published }));
+        assert_eq!(receiver.next(), Err(CorruptError::Skip { skipped: 64, published }));
     }
 }
 

@@ -40,7 +40,7 @@ pub enum CreateJournalError {
 
 /// Why a file's first page is that of no journal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
-pub enum DamagedHeader {
+pub enum JournalHeaderError {
     /// The first bytes are others.
     #[error("it is not a journal of Sinew")]
     Magic,
@@ -75,7 +75,7 @@ pub enum ReadJournalError {
         /// The path of the journal.
         path: PathBuf,
         /// The fault of its first page.
-        why: DamagedHeader,
+        why: JournalHeaderError,
     },
     /// The file is shorter than its first page says.
     #[error("the journal {} has {found} bytes where its first page says {stated}: it was cut", path.display())]

@@ -28,7 +28,7 @@
 
 use std::sync::LazyLock;
 
-use super::error::DamagedHeader;
+use super::error::JournalHeaderError;
 
 /// "SINEWJRN", read as little-endian.
 pub(crate) const MAGIC: u64 = u64::from_le_bytes(*b"SINEWJRN");
@@ -173,16 +173,16 @@ impl Header {
     }
 
     /// Reads a page. Every number in it is checked.
-    pub(crate) fn decode(page: &[u8; HEADER_BYTES]) -> Result<Self, DamagedHeader> {
+    pub(crate) fn decode(page: &[u8; HEADER_BYTES]) -> Result<Self, JournalHeaderError> {
         if u64::from_ne_bytes(field(page, 0)) != MAGIC {
-            return Err(DamagedHeader::Magic);
+            return Err(JournalHeaderError::Magic);
         }
         let version = u32::from_ne_bytes(field(page, 8));
         if version != VERSION {
-            return Err(DamagedHeader::Version(version));
+            return Err(JournalHeaderError::Version(version));
         }
         if u32::from_ne_bytes(field(page, CRC_AT)) != checksum(page) {
-            return Err(DamagedHeader::Checksum);
+            return Err(JournalHeaderError::Checksum);
         }
         let ring_bytes = u64::from_ne_bytes(field(page, 16));
         let is_ring = ring_bytes.is_power_of_two() && (RING_MIN..=RING_MAX).contains(&ring_bytes);
@@ -193,7 +193,7 @@ impl Header {
             || salt_of(salt) != salt
             || identity > IDENTITY_MAX
         {
-            return Err(DamagedHeader::Sizes);
+            return Err(JournalHeaderError::Sizes);
         }
         Ok(Self {
             ring_bytes,

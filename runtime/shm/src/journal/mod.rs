@@ -45,7 +45,7 @@ mod writer;
 
 pub use self::{
     core::{channels::ChannelKey, reader::ReaderCounts},
-    error::{CreateJournalError, DamagedHeader, ReadJournalError},
+    error::{CreateJournalError, JournalHeaderError, ReadJournalError},
     layout::IDENTITY_MAX,
 };
 #[cfg(not(loom))]

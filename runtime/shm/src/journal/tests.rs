@@ -9,7 +9,8 @@ use std::{
 use proptest::prelude::*;
 
 use super::{
-    ChannelKey, CreateJournalError, DamagedHeader, Journal, JournalReader, Options, ReadJournalError, Start,
+    ChannelKey, CreateJournalError, Journal, JournalHeaderError, JournalReader, Options, ReadJournalError,
+    Start,
     layout::{HEADER_BYTES, RING_AT, TABLE_AT, TABLE_BYTES},
 };
 
@@ -178,10 +179,10 @@ fn changed_first_page_is_refused() {
     drop(Journal::create(&folder.path(), &small()).unwrap());
     let file = OpenOptions::new().read(true).write(true).open(folder.path()).unwrap();
     for (at, why) in [
-        (0, DamagedHeader::Magic),
-        (8, DamagedHeader::Version(0)),
-        (16, DamagedHeader::Checksum),
-        (130, DamagedHeader::Checksum),
+        (0, JournalHeaderError::Magic),
+        (8, JournalHeaderError::Version(0)),
+        (16, JournalHeaderError::Checksum),
+        (130, JournalHeaderError::Checksum),
     ] {
         let mut before = [0];
         file.read_exact_at(&mut before, at).unwrap();

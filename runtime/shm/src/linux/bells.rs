@@ -28,7 +28,7 @@ use super::{
 };
 use crate::{
     bell::{Bell, BellKind, BellState, Bells, Doorbell, Woken},
-    error::{CreateError, RefusedOffer},
+    error::{CreateError, OfferError},
     layout::Word,
     memory::OwnHeader,
     offer::Descriptors,
@@ -156,14 +156,14 @@ impl From<Both> for Buttons {
 }
 
 /// Creates this side's ends of the peer's bells, if the descriptors are valid. `slot` is the place in the peer's set.
-pub(crate) fn buttons(kind: BellKind, slot: u8, fds: Vec<OwnedFd>) -> Result<Buttons, RefusedOffer> {
-    let system = |cause| RefusedOffer::System { step: "mapping the offered page of bells", cause };
+pub(crate) fn buttons(kind: BellKind, slot: u8, fds: Vec<OwnedFd>) -> Result<Buttons, OfferError> {
+    let system = |cause| OfferError::System { step: "mapping the offered page of bells", cause };
     let mut fds = fds.into_iter();
     let both: Both = match (kind, fds.next(), fds.next()) {
         (BellKind::Set, Some(shared), Some(announcement)) => {
-            let shared = adopt_page(&shared).map_err(system)?.ok_or(RefusedOffer::NotABell(kind))?;
+            let shared = adopt_page(&shared).map_err(system)?.ok_or(OfferError::NotABell(kind))?;
             let announcement = adopt_own_page(&announcement).map_err(system)?;
-            let announcement = announcement.ok_or(RefusedOffer::NotABell(kind))?;
+            let announcement = announcement.ok_or(OfferError::NotABell(kind))?;
             let shared = Arc::new(shared);
             let (message, room) = on_page(Arc::clone(&shared));
             let place = Some(PeerPlace::new(shared, Arc::new(announcement), slot));
@@ -171,7 +171,7 @@ pub(crate) fn buttons(kind: BellKind, slot: u8, fds: Vec<OwnedFd>) -> Result<But
         }
         (BellKind::Futex, Some(fd), None) => {
             let page = adopt_page(&fd).map_err(system)?;
-            page.map(Arc::new).map(on_page).ok_or(RefusedOffer::NotABell(kind))?
+            page.map(Arc::new).map(on_page).ok_or(OfferError::NotABell(kind))?
         }
         (BellKind::EventFd, Some(message), Some(room)) if is_eventfd(&message)? && is_eventfd(&room)? => {
             (Box::new(EventBell(message)), Box::new(EventBell(room)))
@@ -180,7 +180,7 @@ pub(crate) fn buttons(kind: BellKind, slot: u8, fds: Vec<OwnedFd>) -> Result<But
             (Box::new(button(message)), Box::new(button(room)))
         }
         (BellKind::Futex | BellKind::EventFd | BellKind::Socket | BellKind::Set, _, _) => {
-            return Err(RefusedOffer::NotABell(kind));
+            return Err(OfferError::NotABell(kind));
         }
     };
     Ok(both.into())
@@ -205,9 +205,9 @@ fn is_button(fd: &OwnedFd) -> bool {
     ioctl_fionread(fd) == Ok(0)
 }
 
-fn is_eventfd(fd: &OwnedFd) -> Result<bool, RefusedOffer> {
+fn is_eventfd(fd: &OwnedFd) -> Result<bool, OfferError> {
     let name = readlink(format!("/proc/self/fd/{}", fd.as_raw_fd()), Vec::new());
-    let name = name.map_err(|errno| RefusedOffer::System {
+    let name = name.map_err(|errno| OfferError::System {
         step: "asking what the offered bell is (/proc/self/fd)",
         cause: errno.into(),
     })?;

@@ -13,7 +13,7 @@ use rustix::{
 
 use super::mapping::{Mapping, OwnHeaderMemory, OwnMemory, PeerMemory};
 use crate::{
-    error::{CreateError, RefusedOffer},
+    error::{CreateError, OfferError},
     layout::{Capacity, HEADER_BYTES, MAGIC, VERSION},
 };
 
@@ -54,30 +54,30 @@ fn unnamed() -> Result<OwnedFd, Errno> {
 ///
 /// The order matters: the kernel itself returns the seals for every kind of file, while a request for the
 /// size to the peer's own file system could block forever.
-pub(crate) fn adopt(memory: OwnedFd, capacity: Capacity) -> Result<PeerMemory, RefusedOffer> {
-    let step = |step| move |errno: Errno| RefusedOffer::System { step, cause: errno.into() };
-    let seals = fcntl_get_seals(&memory).map_err(|_| RefusedOffer::Kind)?;
+pub(crate) fn adopt(memory: OwnedFd, capacity: Capacity) -> Result<PeerMemory, OfferError> {
+    let step = |step| move |errno: Errno| OfferError::System { step, cause: errno.into() };
+    let seals = fcntl_get_seals(&memory).map_err(|_| OfferError::Kind)?;
     if !seals.contains(NEEDED) {
-        return Err(RefusedOffer::Seals(format!("{:?}", NEEDED.difference(seals))));
+        return Err(OfferError::Seals(format!("{:?}", NEEDED.difference(seals))));
     }
     let kind = fstatfs(&memory).map_err(step("asking for the kind of the offered memory (fstatfs)"))?.f_type;
     if kind != TMPFS_MAGIC {
-        return Err(RefusedOffer::Kind);
+        return Err(OfferError::Kind);
     }
     let stat = fstat(&memory).map_err(step("asking for the size of the offered memory (fstat)"))?;
     let (expected, got) = (capacity.region_bytes(), u64::try_from(stat.st_size).unwrap_or(0));
     if got != expected {
-        return Err(RefusedOffer::Size { got, expected });
+        return Err(OfferError::Size { got, expected });
     }
     let allocated = u64::try_from(stat.st_blocks).unwrap_or(0).saturating_mul(512);
     if allocated < expected {
-        return Err(RefusedOffer::Holes { allocated, expected });
+        return Err(OfferError::Holes { allocated, expected });
     }
-    let mapped = |cause| RefusedOffer::System { step: "mapping the offered memory (mmap)", cause };
+    let mapped = |cause| OfferError::System { step: "mapping the offered memory (mmap)", cause };
     let raw = options(capacity).and_then(|options| options.map_raw_read_only(&memory)).map_err(mapped)?;
     let mapping = Mapping::new(raw, capacity).ok_or_else(|| mapped(io::ErrorKind::InvalidData.into()))?;
     if mapping.identity() != (MAGIC, VERSION, capacity.bytes()) {
-        return Err(RefusedOffer::Identity);
+        return Err(OfferError::Identity);
     }
     Ok(PeerMemory::new(mapping))
 }

@@ -73,7 +73,7 @@ mod memory {
 
     use super::*;
     use crate::{
-        error::RefusedOffer,
+        error::OfferError,
         platform::{PeerMemory, adopt, create},
     };
 
@@ -92,7 +92,7 @@ mod memory {
         memory
     }
 
-    fn refused(memory: OwnedFd) -> RefusedOffer {
+    fn refused(memory: OwnedFd) -> OfferError {
         adopt(memory, Capacity::MIN).expect_err("it is no region")
     }
 
@@ -141,21 +141,21 @@ mod memory {
             let memory = filled();
             fcntl_add_seals(&memory, SEALS.difference(missing)).expect("a new memfd takes seals");
             let refused = refused(memory);
-            assert!(matches!(refused, RefusedOffer::Seals(_)), "{missing:?}: {refused}");
+            assert!(matches!(refused, OfferError::Seals(_)), "{missing:?}: {refused}");
         }
     }
 
     #[test]
     fn file_that_is_no_memfd_is_rejected_unread() {
         let (pipe, _other) = rustix::pipe::pipe().expect("a pipe");
-        assert!(matches!(refused(pipe), RefusedOffer::Kind));
+        assert!(matches!(refused(pipe), OfferError::Kind));
         let null = File::open("/dev/null").expect("it is there");
-        assert!(matches!(refused(null.into()), RefusedOffer::Kind));
+        assert!(matches!(refused(null.into()), OfferError::Kind));
         // Huge pages can be sealed too, and a hole in them causes a bus error.
         let huge = memfd_create("sinew-test", MemfdFlags::ALLOW_SEALING | MemfdFlags::HUGETLB);
         if let Ok(huge) = huge {
             fcntl_add_seals(&huge, SEALS).expect("huge pages take seals");
-            assert!(matches!(refused(huge), RefusedOffer::Kind));
+            assert!(matches!(refused(huge), OfferError::Kind));
         }
     }
 
@@ -164,13 +164,13 @@ mod memory {
         for bytes in [0, 4096, 8191, 8193, 1 << 20] {
             let memory = memory(bytes, MemfdFlags::CLOEXEC);
             fcntl_add_seals(&memory, SEALS).expect("a new memfd takes seals");
-            assert!(matches!(refused(memory), RefusedOffer::Size { got, expected: 8192 } if got == bytes));
+            assert!(matches!(refused(memory), OfferError::Size { got, expected: 8192 } if got == bytes));
         }
         let sparse = memory(8192, MemfdFlags::CLOEXEC);
         fcntl_add_seals(&sparse, SEALS).expect("a new memfd takes seals");
-        assert!(matches!(refused(sparse), RefusedOffer::Holes { allocated: 0, expected: 8192 }));
+        assert!(matches!(refused(sparse), OfferError::Holes { allocated: 0, expected: 8192 }));
         let blank = filled();
         fcntl_add_seals(&blank, SEALS).expect("a new memfd takes seals");
-        assert!(matches!(refused(blank), RefusedOffer::Identity));
+        assert!(matches!(refused(blank), OfferError::Identity));
     }
 }

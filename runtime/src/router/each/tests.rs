@@ -12,7 +12,7 @@ use super::*;
 use crate::{
     outcome::{MemberOutcome, Rejection},
     pending::{Pending, Settlement, Wait},
-    router::{LocalRoute, MessageSink, Refused, Router},
+    router::{LocalRoute, MessageSink, Router, SubmitError},
     wire::{Flags, Header, Kind, Message},
 };
 
@@ -42,7 +42,7 @@ impl Random {
 struct Mailbox(Mutex<VecDeque<Message>>);
 
 impl MessageSink for Mailbox {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         lock(&self.0).push_back(message);
         Ok(())
     }
@@ -69,7 +69,7 @@ struct Link {
 struct Wire(Arc<Mutex<Link>>);
 
 impl MessageSink for Wire {
-    fn submit(&self, mut message: Message) -> Result<(), Refused> {
+    fn submit(&self, mut message: Message) -> Result<(), SubmitError> {
         let mut link = lock(&self.0);
         let receipt = message.receipt.take().expect("each copy is confirmed");
         assert_eq!(receipt.ticket().destination, Tid::new(link.to, GROUP.app));

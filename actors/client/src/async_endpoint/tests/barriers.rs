@@ -4,7 +4,7 @@ use std::sync::{Mutex, PoisonError, mpsc::SyncSender};
 
 use sinew_model::barrier::{ArriveAtBarrier, LeaveBarrier};
 use sinew_runtime::{
-    router::{LocalRoute, MessageSink, Refused},
+    router::{LocalRoute, MessageSink, SubmitError},
     tid::AppAddress,
 };
 
@@ -15,9 +15,9 @@ use crate::Barrier;
 struct Manager(Mutex<SyncSender<Message>>);
 
 impl MessageSink for Manager {
-    fn submit(&self, message: Message) -> Result<(), Refused> {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
         let requests = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        requests.send(message).map_err(|refused| Refused::new(refused.0, Rejection::Closed))
+        requests.send(message).map_err(|refused| SubmitError::new(refused.0, Rejection::Closed))
     }
 }
 

@@ -12,7 +12,7 @@ use std::{
 use sinew_protocol::ring::{RingFrames, Taken};
 use sinew_runtime::{time::Time, wire::Message};
 use sinew_shm::{
-    Any, AnyError, Armed, Consumer, Corrupt, Ends, HangUp, PollResult, Polling, WaitSet, Waiter,
+    Any, AnyError, Armed, Consumer, CorruptError, Ends, HangUp, PollResult, Polling, WaitSet, Waiter,
 };
 
 use super::{CHECK_INTERVAL, ENOUGH, end_reason};
@@ -170,7 +170,7 @@ impl Reader {
     }
 
     /// Takes the content of the ring, if it reports any or has ended.
-    fn take(&mut self) -> Result<Taken, Corrupt> {
+    fn take(&mut self) -> Result<Taken, CorruptError> {
         let Some(set) = &self.set else { return self.frames.take(&mut self.end.consumer, ENOUGH) };
         set.look();
         if !set.is_ready(&self.end.consumer) && self.ended.is_none() {

@@ -23,7 +23,7 @@ use std::{path::Path, time::Duration};
 
 use sinew_c::conformance::{
     Asked, Endpoint, InHand, Made, Outcome as Code, SINEW_DIRECT_ALWAYS, SINEW_DIRECT_AUTOMATIC,
-    SINEW_DIRECT_NEVER, SINEW_SOCKET_ONLY, SINEW_WITHOUT_RECONNECT, Status, Told,
+    SINEW_DIRECT_NEVER, SINEW_SOCKET_ONLY, SINEW_WITHOUT_RECONNECT, Status, StatusError,
 };
 use sinew_runtime::{
     outcome::{MemberOutcome, Outcome},
@@ -46,11 +46,11 @@ pub(in crate::tests) struct Client {
 }
 
 /// Converts the result of a call in C into that of Rust.
-fn converted<T>(result: Result<T, Told>) -> Result<T, ApiError> {
+fn converted<T>(result: Result<T, StatusError>) -> Result<T, ApiError> {
     result.map_err(|failure| error_of(&failure))
 }
 
-fn error_of(failure: &Told) -> ApiError {
+fn error_of(failure: &StatusError) -> ApiError {
     let sentence = failure.sentence.as_str();
     let error = match failure.status {
         Status::SinewErrorRefused => ApiError::Refused(between("the node refused: ", sentence, "")),
@@ -181,7 +181,7 @@ impl Client {
     }
 
     /// Returns the result of a call, and remembers whether the endpoint is away.
-    fn record<T>(&mut self, result: Result<T, Told>) -> Result<T, ApiError> {
+    fn record<T>(&mut self, result: Result<T, StatusError>) -> Result<T, ApiError> {
         let result = converted(result);
         self.is_disconnected |= matches!(result, Err(ApiError::Disconnected(_)));
         result

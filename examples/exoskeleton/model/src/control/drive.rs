@@ -98,7 +98,7 @@ pub struct DriveOutput {
 
 /// The reason why a drive stays stopped. The reset came too early; nothing has changed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
-pub enum ResetRefusal {
+pub enum ResetError {
     /// The torque is still being ramped to zero.
     #[error("the torque is not zero yet; wait 50 ms")]
     NotAtRest,
@@ -214,13 +214,13 @@ impl DriveCore {
     ///
     /// # Errors
     /// The drive is not at rest, or central still commands stop.
-    pub fn reset(&mut self, now_ns: u64) -> Result<(), ResetRefusal> {
+    pub fn reset(&mut self, now_ns: u64) -> Result<(), ResetError> {
         if self.state == DriveState::EStop {
             if self.limiter.torque_nm() != 0.0 {
-                return Err(ResetRefusal::NotAtRest);
+                return Err(ResetError::NotAtRest);
             }
             if self.gait.fresh(now_ns).is_some_and(|gait| gait.mode == GaitMode::Stop) {
-                return Err(ResetRefusal::CentralStopped);
+                return Err(ResetError::CentralStopped);
             }
             self.state = DriveState::Init;
         }

@@ -1,6 +1,6 @@
 //! Central's reaction to an e-stop, a loss, and a drive that does not assist.
 
-use exoskeleton_model::central::{Resume, StillStopped, bit};
+use exoskeleton_model::central::{EStopLatchedError, Resume, bit};
 use exoskeleton_model::control::faults::FaultBits;
 use exoskeleton_model::joint::Joint;
 use exoskeleton_model::message::{DriveState, GaitMode};
@@ -12,7 +12,7 @@ fn e_stop_is_latched_until_reset_and_new_release() {
     let mut walk = Walk::begun(Resume::ByItself);
     walk.central.stop();
     assert_eq!(walk.receive(1).mode, GaitMode::Stop);
-    assert_eq!(walk.central.release(), Err(StillStopped));
+    assert_eq!(walk.central.release(), Err(EStopLatchedError));
     assert_eq!(walk.receive(3_000).mode, GaitMode::Stop);
     walk.central.reset();
     assert_eq!(walk.receive(3_000).mode, GaitMode::Hold);
@@ -53,7 +53,7 @@ fn restarted_central_does_not_release_a_stopped_drive() {
     assert_eq!(walk.receive(500).mode, GaitMode::Stop);
     walk.central.reset();
     assert_eq!(walk.receive(500).mode, GaitMode::Hold);
-    assert_eq!(walk.central.release(), Err(StillStopped));
+    assert_eq!(walk.central.release(), Err(EStopLatchedError));
     walk.reports[Joint::Ankle.index()] = Some((DriveState::Ready, FaultBits(0)));
     assert_eq!(walk.receive(500).mode, GaitMode::Hold);
     walk.central.release().expect("the drive was reset");
@@ -161,7 +161,7 @@ fn status_older_than_the_stop_does_not_clear_it() {
         [(t_ns - MS, Some(0)), (t_ns + 3 * MS, Some(3 * MS)), (t_ns + 3 * MS, None), (0, None)]
     {
         walk.receive_late(Joint::Hip, ready, (of_ns, error_ns));
-        assert_eq!(walk.central.release(), Err(StillStopped), "{of_ns} {error_ns:?}");
+        assert_eq!(walk.central.release(), Err(EStopLatchedError), "{of_ns} {error_ns:?}");
     }
     // then: a report that was certainly sent later releases it
     walk.receive_late(Joint::Hip, ready, (t_ns + 4 * MS, Some(3 * MS)));

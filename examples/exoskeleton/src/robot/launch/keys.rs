@@ -15,7 +15,7 @@ const NAMES_MAX: u32 = 1_000;
 /// Keys that are not those of this robot's nodes. The user is at fault; nothing was started.
 #[derive(Debug, Error)]
 #[error("the keys in {directory} are not good for this robot's nodes:\n{faults}\n{remedy}")]
-pub struct KeyFaults {
+pub struct KeysError {
     directory: String,
     /// The first fault of each node, one per line.
     faults: String,
@@ -23,7 +23,7 @@ pub struct KeyFaults {
 }
 
 /// Checks the keys of each node, which are in the directory that the user calls `given`.
-pub(super) fn check(topology: &Topology, given: &Path) -> Result<(), KeyFaults> {
+pub(super) fn check(topology: &Topology, given: &Path) -> Result<(), KeysError> {
     let mut faults: Vec<Fault> = Part::ALL.into_iter().filter_map(|part| fault(topology, part)).collect();
     if faults.is_empty() {
         faults.extend(strangers(topology));
@@ -51,7 +51,7 @@ pub(super) fn check(topology: &Topology, given: &Path) -> Result<(), KeyFaults> 
             "This makes them all, with the addresses that the nodes have:\n  {command}\nThen walk with --keys {out}"
         )
     };
-    Err(KeyFaults { directory, faults: lines, remedy })
+    Err(KeysError { directory, faults: lines, remedy })
 }
 
 /// A fault in the keys of a node.

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use sinew::NodeAddress;
 use sinew::config::{Interface, Interfaces, Seed};
 
-use super::{Control, ControlThread, Discovery, DrivePlace, NodePlace, PlantPlace, Topology, TopologyFaults};
+use super::{Control, ControlThread, Discovery, DrivePlace, NodePlace, PlantPlace, Topology, TopologyError};
 
 const OFF: &str = "off";
 /// The path of a unix socket has at most 107 bytes; Sinew accepts 100.
@@ -97,8 +97,8 @@ impl Faults {
     }
 }
 
-pub(super) fn parse(text: &str) -> Result<Topology, TopologyFaults> {
-    let file: File = toml::from_str(text).map_err(|e| TopologyFaults(vec![e.to_string()]))?;
+pub(super) fn parse(text: &str) -> Result<Topology, TopologyError> {
+    let file: File = toml::from_str(text).map_err(|e| TopologyError(vec![e.to_string()]))?;
     let mut faults = Faults::default();
     let project = file.project;
     faults.note((1..=63).contains(&project.len()), || {
@@ -126,7 +126,7 @@ pub(super) fn parse(text: &str) -> Result<Topology, TopologyFaults> {
                 plant,
             })
         }
-        (Some(_) | None, Some(_) | None, Some(_) | None) => Err(TopologyFaults(faults.0)),
+        (Some(_) | None, Some(_) | None, Some(_) | None) => Err(TopologyError(faults.0)),
     }
 }
 
