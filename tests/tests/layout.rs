@@ -20,16 +20,22 @@ fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ is in the root")
 }
 
-/// Returns the packages of this workspace, and the others of them that each needs outside of tests.
-fn packages() -> BTreeMap<String, BTreeSet<String>> {
+/// Returns cargo's description of each package of this workspace.
+fn metadata() -> Vec<Value> {
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let output = Command::new(cargo)
         .args(["metadata", "--no-deps", "--offline", "--format-version", "1"])
         .current_dir(root())
         .output()
         .expect("cargo runs");
-    let metadata: Value = serde_json::from_slice(&output.stdout).expect("cargo writes JSON");
-    let all = metadata["packages"].as_array().expect("a list of packages");
+    let mut metadata: Value = serde_json::from_slice(&output.stdout).expect("cargo writes JSON");
+    let Value::Array(packages) = metadata["packages"].take() else { panic!("no list of packages") };
+    packages
+}
+
+/// Returns the packages of this workspace, and the others of them that each needs outside of tests.
+fn packages() -> BTreeMap<String, BTreeSet<String>> {
+    let all = metadata();
     let name = |of: &Value| of["name"].as_str().expect("it has a name").to_owned();
     let own: BTreeSet<_> = all.iter().map(name).collect();
     let needs = |package: &Value| {
@@ -99,12 +105,25 @@ fn picture_of_the_packages_is_true() {
     }
 }
 
-/// Returns the sources of a package, without tests.
-fn sources(package: &Path) -> Vec<PathBuf> {
-    let (mut folders, mut found) = (vec![package.join("src")], Vec::new());
+/// Returns the folders of all crates with a folder of their own: libraries, programs, tests and benches.
+fn crate_folders() -> BTreeSet<PathBuf> {
+    let mut folders = BTreeSet::new();
+    for package in metadata() {
+        for target in package["targets"].as_array().expect("a list of targets") {
+            let source = Path::new(target["src_path"].as_str().expect("it has a source"));
+            if source.ends_with("lib.rs") || source.ends_with("main.rs") {
+                folders.extend(source.parent().map(Path::to_owned));
+            }
+        }
+    }
+    folders
+}
+
+/// Returns the sources of a crate, without unit tests.
+fn sources(crate_folder: &Path) -> Vec<PathBuf> {
+    let (mut folders, mut found) = (vec![crate_folder.to_owned()], Vec::new());
     while let Some(folder) = folders.pop() {
-        let Ok(entries) = fs::read_dir(&folder) else { continue };
-        for entry in entries {
+        for entry in fs::read_dir(&folder).expect("the folder is readable") {
             let path = entry.expect("the folder is readable").path();
             let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
             let is_test = name.ends_with("tests") || ["testing", "model"].contains(&&*name);
@@ -118,46 +137,50 @@ fn sources(package: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// Returns the modules at the top of a package that each of them imports by `crate::`.
-fn imports(package: &Path) -> BTreeMap<String, BTreeSet<String>> {
-    let src = package.join("src");
-    let top = |path: &Path| {
-        let first = path.strip_prefix(&src).ok()?.components().next()?;
-        Some(Path::new(first.as_os_str()).file_stem()?.to_string_lossy().into_owned())
-    };
-    let files = sources(package);
-    let folders: BTreeSet<_> = fs::read_dir(&src)
-        .into_iter()
-        .flatten()
+/// Returns the folders at the top of a crate, each with those that it imports.
+fn imports(crate_folder: &Path) -> BTreeMap<String, BTreeSet<String>> {
+    let folders: BTreeSet<_> = fs::read_dir(crate_folder)
+        .expect("the folder is readable")
         .filter_map(|entry| Some(entry.ok()?.path()))
         .filter(|path| path.is_dir())
         .filter_map(|path| Some(path.file_name()?.to_string_lossy().into_owned()))
         .collect();
     let mut arrows: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
-    for file in files {
-        let Some(from) = top(&file).filter(|from| folders.contains(from)) else { continue };
+    for file in sources(crate_folder) {
+        let path = file.strip_prefix(crate_folder).expect("it is in the folder");
+        let first = path.components().next().expect("it has a name");
+        let from =
+            Path::new(first.as_os_str()).file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        if !folders.contains(&from) {
+            continue;
+        }
+        let depth = path.components().count() - usize::from(path.ends_with("mod.rs"));
         let text = fs::read_to_string(&file).expect("a source is text");
-        let code = text.split("#[cfg(test)]\nmod ").next().unwrap_or_default();
-        for (at, _) in code.match_indices("crate::") {
+        let named = top_modules(&text, depth).into_iter();
+        let others = named.filter(|name| folders.contains(name) && *name != from);
+        arrows.entry(from.clone()).or_default().extend(others);
+    }
+    arrows
+}
+
+/// Returns the modules at the top of a crate that a file names outside of its unit tests, by `crate::`, or by
+/// `super::` for each of the `depth` modules that it is in.
+fn top_modules(text: &str, depth: usize) -> BTreeSet<String> {
+    let code = text.split("#[cfg(test)]\nmod ").next().unwrap_or_default();
+    let mut found = BTreeSet::new();
+    for prefix in ["crate::".to_owned(), "super::".repeat(depth)] {
+        for (at, _) in code.match_indices(&prefix) {
             let line_start = code[..at].rfind('\n').map_or(0, |end| end + 1);
             if code[line_start..at].trim_start().starts_with("//") {
                 continue;
             }
-            let rest = &code[at + "crate::".len()..];
-            let names: Vec<&str> = match rest.strip_prefix('{') {
-                Some(group) => members(group),
-                None => vec![rest],
-            };
-            for name in names {
-                let name: String =
-                    name.chars().take_while(|letter| letter.is_alphanumeric() || *letter == '_').collect();
-                if folders.contains(&name) && name != from {
-                    arrows.entry(from.clone()).or_default().insert(name);
-                }
-            }
+            let rest = &code[at + prefix.len()..];
+            let names = rest.strip_prefix('{').map_or_else(|| vec![rest], members);
+            let is_letter = |letter: &char| letter.is_alphanumeric() || *letter == '_';
+            found.extend(names.into_iter().map(|name| name.chars().take_while(is_letter).collect()));
         }
     }
-    arrows
+    found
 }
 
 /// Returns the members of an import's group, which follows the opening brace.
@@ -190,26 +213,15 @@ fn circle(arrows: &BTreeMap<String, BTreeSet<String>>) -> Option<(String, String
 
 #[test]
 fn sibling_folders_import_in_one_direction() {
-    let metadata = [
-        "runtime",
-        "runtime/shm",
-        "cli",
-        "bindings/c",
-        "actors",
-        "examples/exoskeleton",
-        "examples/exoskeleton/model",
-        "tests",
-        "tests/testkit",
-    ];
-    let layers = fs::read_dir(root().join("actors")).expect("the folder is there");
-    let layers = layers.filter_map(|entry| Some(entry.ok()?.path()));
-    let packages = metadata.iter().map(|folder| root().join(folder)).chain(layers);
-    for package in packages.filter(|folder| folder.join("Cargo.toml").is_file()) {
-        if let Some((one, other)) = circle(&imports(&package)) {
-            panic!(
-                "{}: src/{one} and src/{other} import each other, directly or by others",
-                package.display()
-            );
+    let folders = crate_folders();
+    for nested in ["bag/recorder/src", "tests/robot/src", "benches/charts/src", "actors/ndl/tests/simulation"]
+    {
+        assert!(folders.contains(&root().join(nested)), "{nested} is not among the folders of crates");
+    }
+    for folder in folders {
+        if let Some((one, other)) = circle(&imports(&folder)) {
+            let folder = folder.display();
+            panic!("{folder}: {one} and {other} import each other, directly or by others");
         }
     }
 }
@@ -217,6 +229,9 @@ fn sibling_folders_import_in_one_direction() {
 #[test]
 fn rules_find_planted_circles() {
     assert_eq!(members("one::Thing, two::{A, B}, three}; more, of"), ["one::Thing", "two::{A, B}", "three"]);
+    let text = "use crate::{one::A, two};\nuse super::super::three::B;\n// crate::four\nuse super::five;\n";
+    assert_eq!(top_modules(text, 2).into_iter().collect::<Vec<_>>(), ["one", "three", "two"]);
+    assert!(top_modules("use super::five;\n", 1).contains("five"));
     let arrow = |from: &str, to: &str| (from.to_owned(), BTreeSet::from([to.to_owned()]));
     let straight = BTreeMap::from([arrow("one", "two"), arrow("two", "three")]);
     assert_eq!(circle(&straight), None);

@@ -41,11 +41,12 @@ use super::{
         Attach, CANCEL, CLASSES, ConnectionId, Core, DATAGRAMS, GUARD, Input, Introduction, Lane, OUTCOMES,
         Output, Settings, UNDELIVERED, write,
     },
-    datagrams,
+    datagram_reader,
+    frame::frame,
     inbound::Inbound,
     link::{self, ConnectionEvent, DialAddresses, EventKind, LastReceived, Mode, ReaderConfig, SharedMode},
     listener,
-    peer::{Store, frame},
+    peer::Store,
     peer_session::answers_max,
     qos,
     spin::Spin,
@@ -348,8 +349,8 @@ impl Actor for Gncl {
         ctx.spawn(fut::wrap_future(async move { spin.keep_awake().await }));
         // Tasks of their own: a datagram, or the time of one, wakes one of them, and not the other futures of
         // this actor.
-        run_beside(ctx, datagrams::read_all(self.state.clone(), self.spin.clone()));
-        run_beside(ctx, datagrams::keep_time(self.state.clone()));
+        run_beside(ctx, datagram_reader::read_all(self.state.clone(), self.spin.clone()));
+        run_beside(ctx, datagram_reader::keep_time(self.state.clone()));
         ctx.spawn(fut::wrap_future(Store::run_expiry_checks(self.state.clone())));
         ctx.spawn(fut::wrap_future(Store::run_late_acknowledgements(self.state.clone())));
         if let Some(ready) = self.ready.take() {

@@ -46,6 +46,8 @@
 //! | `authenticated.rs` | the certificate with which each node was last linked |
 //! | `stream_transport.rs` | how much of class Stream is sent by datagram, for queries |
 //! | `datagrams/` | values of class Stream by UDP, if they get through |
+//! | `datagram_reader.rs` | the receiving of these datagrams, and the timer of all peers |
+//! | `frame.rs` | frames from GNCL itself to that of a peer |
 //! | `interfaces.rs` | which of this host's addresses are lost, as the kernel reports |
 //! | `spin.rs` | how long the IO thread polls before it sleeps |
 //! | `qos.rs` | the network marks of each class |
@@ -71,9 +73,11 @@ mod connection_events;
 /// The core alone, for simulations of several layers.
 #[doc(hidden)]
 pub mod core;
+mod datagram_reader;
 /// The core of the values by datagram, for its simulation.
 #[doc(hidden)]
 pub mod datagrams;
+mod frame;
 #[cfg(feature = "fuzzing")]
 pub mod fuzzing;
 mod inbound;

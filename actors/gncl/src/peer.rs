@@ -11,15 +11,14 @@ use std::{
     },
 };
 
-use bytes::Bytes;
 use sinew_model::{periodic_checks::PeriodicChecks, undelivered::Report};
 use sinew_runtime::{
     lock,
     outcome::{MemberReport, Outcome, ReceiptSink, Rejection, Ticket},
     router::{MessageSink, SubmitError},
-    tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    tid::{Incarnation, NodeAddress},
     time::Time,
-    wire::{Class, Header, Kind, Message},
+    wire::{Class, Kind, Message},
 };
 use sinew_session::{
     counts::Account,
@@ -30,6 +29,7 @@ use tokio::sync::Notify;
 use super::{
     core::{Attach, Lane, write},
     datagrams::{Channel, Position},
+    frame::frame,
     outstanding::OutstandingDestinations,
     peer_session::{PeerSession, SessionAccount, SessionNotifiers, SessionParameters},
 };
@@ -106,7 +106,8 @@ impl Peer {
             let key = RandomState::new().hash_one(());
             let ends = (state.ctx.node, attach.node);
             let former = state.store.forwarded_numbers(attach.node, attach.incarnation);
-            Channel::new(now, ends, key, former, &state.store)
+            let Store { alarm, segments, refusals, .. } = &state.store;
+            Channel::new(now, ends, key, former, (alarm.clone(), segments.clone(), refusals.clone()))
         });
         let (ended_accounts, expiring) = (state.store.ended_accounts.clone(), state.store.expiring.clone());
         let fewer_outstanding = fewer_outstanding.clone();
@@ -342,11 +343,4 @@ fn with_datagrams(session: OutletAccount, datagrams: &Position) -> OutletAccount
         unacknowledged: session.unacknowledged + datagrams.unacknowledged,
         ..session
     }
-}
-
-/// Creates a frame from this node's GNCL to that of `node`.
-pub(super) fn frame(here: NodeAddress, node: NodeAddress, kind: Kind, payload: Bytes) -> Message {
-    let mut header = Header::new(kind, Tid::new(here, AppAddress::GNCL), Tid::new(node, AppAddress::GNCL));
-    header.sent = Time::now();
-    Message::new(header, payload)
 }

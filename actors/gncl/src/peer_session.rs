@@ -28,8 +28,8 @@ use tokio::sync::Notify;
 
 use super::{
     core::RefusalError,
+    frame::frame,
     outstanding::OutstandingDestinations,
-    peer::frame,
     receive_counters::{Disposition, ReceiveCounters},
     transport::Transport,
 };

@@ -3,7 +3,6 @@
 mod barrier;
 mod end;
 mod introduction;
-pub(super) mod liveness;
 mod memberships;
 mod orders;
 mod outcomes;
@@ -33,7 +32,6 @@ use tokio::net::{UnixStream, unix::UCred};
 
 use self::{
     end::{ConnectionEnd, REFUSAL_TIMEOUT},
-    liveness::ProcessWatch,
     memberships::Orders,
     outcomes::Outcomes,
     sink::ClientSink,
@@ -43,6 +41,7 @@ use super::{
     guest_reads::Sent,
     link::{self, ClientReader, ClientSocket, RingHalf},
     link_broker::{Departure, LinkPeer},
+    process_watch::ProcessWatch,
     reader::{Reader, Received},
     registrar,
     server::{Server, refuse, send_refusal},

@@ -44,6 +44,7 @@ mod link_broker;
 mod listener;
 mod observed_links;
 mod ports;
+mod process_watch;
 mod reader;
 mod registrar;
 mod rings;

@@ -16,12 +16,10 @@ pub(super) use self::clients::IdleClients;
 
 use sinew_model::{
     facts::Trouble,
-    progress::{IdleClient, Part, Progress, TroubleCode},
+    progress::{Part, TroubleCode},
 };
-use sinew_ndl::check_period;
-use sinew_session::book::ClientTaking;
 
-use super::{layers::LAYERS, root::Root};
+use super::layers::LAYERS;
 
 /// A longer turn is reported. Below the watchdog's default of 1 s, after which the actor is replaced, and
 /// above the delay that a loaded machine adds to a short turn.
@@ -29,34 +27,8 @@ const STALLED_AFTER: Duration = Duration::from_millis(250);
 /// The layers' addresses, in the order of their names.
 const ADDRESSES: [AppAddress; 4] = [AppAddress::LNCL, AppAddress::SYNC, AppAddress::GNCL, AppAddress::NDL];
 
-impl Root {
-    pub(super) fn progress(&mut self) -> Progress {
-        let now = Time::now();
-        let turns = self.threads.borrow().turns();
-        let mut stalled = self.turns.check(now, turns);
-        self.hosted.retain(|_, link| link.strong_count() > 0);
-        let links = self.hosted.iter().filter_map(|(name, link)| Some((name, link.upgrade()?)));
-        stalled.extend(links.filter_map(|(name, link)| Some((name.clone(), link.stalled_since()?))));
-        let mut parts = Vec::new();
-        for supervisor in [&self.layer_supervisor, &self.app_supervisor].into_iter().flatten() {
-            collect(now, supervisor, supervisor.view(now), &stalled, &mut parts);
-        }
-        Progress::of(parts).with_clients(self.idle_clients(now))
-    }
-
-    /// Returns the clients that do not read their queued messages.
-    fn idle_clients(&mut self, now: Time) -> Vec<IdleClient> {
-        let (clients, every) = (self.state.lncl.book.takings(), check_period(&self.state.ctx.config.ndl));
-        let idle = self.clients.check(now, every, clients.iter().map(|client| (client.id, client.taking)));
-        let report = |ClientTaking { id, app, name, .. }: ClientTaking| {
-            let since_ms = millis_since(now, *idle.get(&id)?);
-            Some(IdleClient { app, name: name.to_string(), since_ms })
-        };
-        clients.into_iter().filter_map(report).collect()
-    }
-}
-
-fn millis_since(now: Time, since: Time) -> u32 {
+/// Returns the milliseconds since `since`, at most what a `u32` holds.
+pub(crate) fn millis_since(now: Time, since: Time) -> u32 {
     u32::try_from(now.since(since).as_millis()).unwrap_or(u32::MAX)
 }
 
@@ -82,7 +54,8 @@ impl Stalls {
     }
 }
 
-fn collect(
+/// Adds the parts below a supervisor that are in trouble.
+pub(crate) fn collect(
     now: Time,
     supervisor: &SupervisorHandle,
     view: BranchView,

@@ -1,6 +1,7 @@
 //! The root actor: forwards events between the supervisors, the sync manager and the node's owner.
 
 mod events;
+mod progress;
 mod registration;
 
 use std::{

@@ -7,7 +7,8 @@ use sinew_runtime::{tid::NodeAddress, time::Time, wire::Kind};
 use super::{
     super::{
         core::{Attach, write},
-        peer::{Store, frame},
+        frame::frame,
+        peer::Store,
     },
     Gncl,
 };

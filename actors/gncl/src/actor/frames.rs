@@ -13,8 +13,8 @@ use sinew_runtime::{
 use super::{
     super::{
         core::{ConnectionId, Input, Introduction, Lane, Refusal, RefusalError, read, write},
+        frame::frame,
         link::{self, Mode},
-        peer::frame,
     },
     Gncl,
 };

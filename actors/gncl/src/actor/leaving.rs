@@ -10,8 +10,8 @@ use sinew_runtime::{lock, tid::NodeAddress, time::Time, wire::Kind};
 use super::{
     super::{
         core::{ConnectionId, Input, RefusalError, read, write},
+        frame::frame,
         link::Mode,
-        peer::frame,
     },
     Gncl, Linked,
 };

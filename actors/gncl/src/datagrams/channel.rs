@@ -18,15 +18,15 @@ use sinew_runtime::{
 };
 
 use super::{
+    alarm::Alarm,
     core::{Core, Order, stamp},
     incoming::Incoming,
     lengths::Report,
     outgoing::{Offered, Position},
     packet::{ACK_LEN, Content, DATAGRAM_MAX, PREFIX_LEN, Packet, Prefix, RANGE_LEN, RANGES_MAX},
-    reader::Alarm,
     sockets::{Announcement, BoundSocket},
 };
-use crate::{peer::Store, peer_session::PeerSession, segments::Segments};
+use crate::{peer_session::PeerSession, segments::Segments};
 
 /// Maximum payload bytes of a value sent by datagram.
 pub(super) const PAYLOAD_MAX: usize = DATAGRAM_MAX - PREFIX_LEN - HEADER_LEN;
@@ -114,7 +114,7 @@ impl Channel {
         (here, node): (NodeAddress, NodeAddress),
         key: u64,
         former: Option<ForwardedNumbers>,
-        store: &Store,
+        (alarm, segments, refusals): (Arc<Alarm>, Arc<Segments>, Arc<Refusals>),
     ) -> Self {
         let mut core = Core::new(now.as_nanos());
         if let Some(ForwardedNumbers(incoming)) = former {
@@ -123,8 +123,6 @@ impl Channel {
         let state =
             State { core, connection: None, target: None, payload_max: 0, is_retired: false, narrow: None };
         let (state, last_frame) = (Mutex::new(state), AtomicU64::new(0));
-        let Store { alarm, segments, refusals, .. } = store;
-        let (alarm, segments, refusals) = (alarm.clone(), segments.clone(), refusals.clone());
         Self { here, node, key, state, last_frame, alarm, segments, refusals }
     }
 
@@ -252,13 +250,13 @@ impl Channel {
     }
 
     /// Returns whether a datagram is from the peer. spec: DATAGRAM-1
-    pub(super) const fn has_key(&self, prefix: Prefix) -> bool {
+    pub(crate) const fn has_key(&self, prefix: Prefix) -> bool {
         prefix.key == self.key
     }
 
     /// Processes a datagram of the peer. Returns its value if it must be forwarded. The caller calls
     /// [`flush`](Self::flush) next.
-    pub(super) fn on_datagram(
+    pub(crate) fn on_datagram(
         &self,
         now: Time,
         prefix: Prefix,
@@ -296,7 +294,7 @@ impl Channel {
     }
 
     /// Sends all datagrams that are due.
-    pub(super) fn flush(&self, now: Time) {
+    pub(crate) fn flush(&self, now: Time) {
         let wake = {
             let state = &mut *self.lock();
             self.write(state, now);
@@ -444,7 +442,7 @@ fn acknowledge(packet: &mut Packet, core: &mut Core<Flow, Message>, now: Time, l
 }
 
 /// Decodes the frame in a datagram, if it is a value.
-pub(super) fn value(bytes: &[u8]) -> Option<Message> {
+pub(crate) fn read_value(bytes: &[u8]) -> Option<Message> {
     let message = sinew_runtime::wire::decode_datagram(bytes).ok()?;
     let Header { class, flags, .. } = message.header;
     (class == Class::Stream && flags == Flags::NONE).then_some(message)

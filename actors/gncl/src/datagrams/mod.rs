@@ -27,10 +27,11 @@
 //! | `round_trip.rs` | when a datagram counts as lost |
 //! | `packet.rs` | the encoding |
 //! | `channel.rs` | the core of one peer, its lock, and the sending |
-//! | `reader.rs` | the receiving of datagrams, and the timer of all peers |
+//! | `alarm.rs` | the alarm of all channels |
 //! | `faults.rs` | faults that the simulation plants |
 //! | `sockets.rs` | the node's sockets, and their announcement to peers |
 
+mod alarm;
 mod channel;
 mod core;
 #[cfg(feature = "testing")]
@@ -42,7 +43,6 @@ mod lengths;
 mod outgoing;
 mod packet;
 mod path;
-mod reader;
 mod round_trip;
 mod sockets;
 #[cfg(test)]
@@ -58,6 +58,7 @@ pub use self::{
     packet::{Acknowledgement, DATAGRAM_MAX},
 };
 
-pub(super) use channel::{Channel, ForwardedNumbers, Freshness};
-pub(super) use reader::{Alarm, keep_time, read_all};
+pub(super) use alarm::Alarm;
+pub(super) use channel::{Channel, ForwardedNumbers, Freshness, read_value};
+pub(super) use packet::Prefix;
 pub(super) use sockets::{Announcement, Sockets};

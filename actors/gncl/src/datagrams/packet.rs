@@ -94,8 +94,8 @@ impl Acknowledgement {
 
 /// The prefix of a datagram.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Prefix {
-    pub(super) node: NodeAddress,
+pub(crate) struct Prefix {
+    pub(crate) node: NodeAddress,
     pub(super) key: u64,
     pub(super) stamp: u32,
     what: u8,
@@ -103,11 +103,11 @@ pub(super) struct Prefix {
 
 /// The content of a datagram.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Content<'a> {
+pub(crate) struct Content<'a> {
     pub(super) acknowledgement: Option<Acknowledgement>,
     /// The number of a probe, which must be acknowledged at once.
     pub(super) probe: Option<u64>,
-    pub(super) value: Option<&'a [u8]>,
+    pub(crate) value: Option<&'a [u8]>,
 }
 
 /// A datagram that is being encoded.
@@ -200,14 +200,14 @@ fn u64_at(bytes: &[u8], at: usize) -> Option<u64> {
 
 impl Prefix {
     /// Decodes the prefix. `None`: this is no datagram of this protocol, or of another version.
-    pub(super) fn read(bytes: &[u8]) -> Option<Self> {
+    pub(crate) fn read(bytes: &[u8]) -> Option<Self> {
         let [VERSION, what, 0, 0, ..] = *bytes else { return None };
         let node = NodeAddress::new(u32_at(bytes, 4)?);
         Some(Self { node, key: u64_at(bytes, 8)?, stamp: u32_at(bytes, 16)?, what })
     }
 
     /// Decodes the content behind the prefix; `None` if it is malformed.
-    pub(super) fn content(self, bytes: &[u8]) -> Option<Content<'_>> {
+    pub(crate) fn content(self, bytes: &[u8]) -> Option<Content<'_>> {
         let rest = bytes.get(PREFIX_LEN..)?;
         let (acknowledgement, rest) = if self.what & ACK == 0 { (None, rest) } else { read_ack(rest)? };
         let (probe, rest) =

@@ -16,10 +16,10 @@ use sinew_runtime::{
 
 use super::{
     super::{
-        core::Attach, datagrams::ForwardedNumbers, outstanding::OutstandingDestinations,
+        core::Attach, datagrams::ForwardedNumbers, frame::frame, outstanding::OutstandingDestinations,
         peer_session::PeerSession,
     },
-    Peer, Store, frame,
+    Peer, Store,
 };
 use crate::State;
 

@@ -6,7 +6,7 @@ use sinew_runtime::wire::{Kind, Message};
 use sinew_session::Ack;
 
 use super::{Inbox, PeerSession};
-use crate::{core::write, peer::frame};
+use crate::{core::write, frame::frame};
 
 /// Maximum number of further acknowledgements that one thread sends because a newer one was created
 /// meanwhile. Each round requires another thread that created one at that very moment: more than two rounds

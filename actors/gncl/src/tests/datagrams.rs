@@ -25,8 +25,8 @@ use super::{
 use crate::{
     core::{Introduction, Lane, write},
     datagrams::Announcement,
+    frame::frame,
     inbound::Inbound,
-    peer::frame,
 };
 
 fn value(node: &Node, to: Tid, number: u64) -> Message {

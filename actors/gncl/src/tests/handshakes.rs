@@ -10,7 +10,7 @@ use tokio::net::TcpListener;
 use super::bench::{ByHand, KIND, NINE, Node, introduction, run, within};
 use crate::{
     core::{Introduction, read, write},
-    peer::frame,
+    frame::frame,
 };
 
 #[test]

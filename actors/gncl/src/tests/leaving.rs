@@ -21,7 +21,7 @@ use super::{
 };
 use crate::{
     core::{CLASSES, Introduction, Lane, read, write},
-    peer::frame,
+    frame::frame,
 };
 
 /// Opens a connection for Bulk of a peer that has kept its receive state, and expects the first message next.

@@ -19,7 +19,7 @@ use sinew_session::Ack;
 use socket2::SockRef;
 
 use super::bench::{ByHand, Cable, NINE, Node, next, pair, run, within};
-use crate::{core::write, link, listener, peer::frame, shared_socket::SharedSocket};
+use crate::{core::write, frame::frame, link, listener, shared_socket::SharedSocket};
 
 #[test]
 fn simultaneous_discovery_makes_one_link_for_both_directions() {

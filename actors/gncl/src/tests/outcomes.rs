@@ -13,7 +13,7 @@ use super::{
 };
 use crate::{
     core::{Introduction, Lane},
-    peer::frame,
+    frame::frame,
     peer_session::answers_max,
 };
 

@@ -23,7 +23,7 @@ use sinew_security::{
 use tokio::net::TcpListener;
 
 use super::bench::{ByHand, Cable, NINE, Node, introduction, next, run, within};
-use crate::{Event, State, authenticator::is_tls, core::write, peer::frame};
+use crate::{Event, State, authenticator::is_tls, core::write, frame::frame};
 
 impl Node {
     /// Starts a node with keys of this project, made for a node of this number.

@@ -28,7 +28,7 @@ use super::{
 use crate::{
     Gncl, State,
     core::{CLASSES, Introduction, Lane, write},
-    peer::frame,
+    frame::frame,
     transport::Transport,
 };
 

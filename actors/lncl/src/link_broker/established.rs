@@ -14,7 +14,7 @@ use sinew_runtime::{
 };
 
 use super::{LinkBroker, LinkPeer};
-use crate::client::liveness::ProcessWatch;
+use crate::process_watch::ProcessWatch;
 
 /// Maximum number of links per client, equal to the maximum number of clients. Further links get no notification; their
 /// own end shows it.

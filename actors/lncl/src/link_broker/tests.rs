@@ -11,7 +11,7 @@ use sinew_protocol::payload::Gone;
 use sinew_runtime::tid::{Incarnation, NodeAddress};
 
 use super::*;
-use crate::{State, client::liveness::ProcessWatch, server::Server};
+use crate::{State, process_watch::ProcessWatch, server::Server};
 
 const NOW: Time = Time::from_nanos(1);
 

@@ -98,7 +98,7 @@ impl Judge {
             missed_max: plan.missed_max,
             watched: plan
                 .watched
-                .map(|(node, period, missed)| (super::world::node_address(node), period, missed)),
+                .map(|(node, period, missed)| (super::network::node_address(node), period, missed)),
             plan: plan.clone(),
             processes: Vec::new(),
             numbers: BTreeMap::new(),

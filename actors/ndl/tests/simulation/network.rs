@@ -3,7 +3,13 @@
 use std::{collections::BTreeSet, net::SocketAddr, rc::Rc, time::Duration};
 
 use sinew_ndl::core::Cast;
+use sinew_runtime::tid::NodeAddress;
 use sinew_sim::{Chance, Network, Quality};
+
+/// Returns the address of a node.
+pub(super) fn node_address(node: usize) -> NodeAddress {
+    NodeAddress::new(0x0a00_0001 + u32::try_from(node).expect("few nodes"))
+}
 
 /// The kind of a datagram, for the judge.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -31,7 +31,7 @@ use super::{
     faults::{Fault, TestedCore},
     judge::Judge,
     listeners::{Listeners, Truth},
-    network::{Flight, Kind, Networks},
+    network::{Flight, Kind, Networks, node_address},
     plan::{Finding, Plan, Step},
 };
 
@@ -115,10 +115,6 @@ pub(super) struct World {
     is_measured: bool,
     /// Host time used by the cores, including reading datagrams.
     pub(super) in_cores: Duration,
-}
-
-pub(super) fn node_address(node: usize) -> NodeAddress {
-    NodeAddress::new(0x0a00_0001 + u32::try_from(node).expect("few nodes"))
 }
 
 /// Returns the node with this address, if there is one.

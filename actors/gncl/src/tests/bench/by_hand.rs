@@ -14,7 +14,7 @@ use tokio_util::codec::Decoder;
 use super::{LONGEST, Node, within};
 use crate::{
     core::{Introduction, Lane, Refusal, read, write},
-    peer::frame,
+    frame::frame,
 };
 
 /// A handwritten peer.

@@ -14,7 +14,7 @@ use super::super::bench::{ByHand, KIND, NINE, Node, introduction, within};
 use crate::{
     core::{CLASSES, DATAGRAMS, Introduction, Lane, read, write},
     datagrams::Announcement,
-    peer::frame,
+    frame::frame,
 };
 
 pub(super) const ACK: u8 = 1;

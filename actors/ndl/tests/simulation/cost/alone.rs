@@ -20,7 +20,7 @@ use sinew_runtime::{
     time::Time,
 };
 
-use super::super::world::{node_address, on_the_cpu};
+use super::super::{network::node_address, world::on_the_cpu};
 
 const PORT: u16 = 7_400;
 /// Puppets that send queries at about the same time.

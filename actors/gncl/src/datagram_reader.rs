@@ -6,82 +6,36 @@ use std::{
     io,
     net::UdpSocket,
     pin::pin,
-    sync::{
-        Arc,
-        atomic::{AtomicU64, Ordering},
-    },
+    sync::Arc,
     task::Poll,
     time::Duration,
 };
 
-use sinew_model::notifications::claim_notifications;
 use sinew_runtime::{time::Time, wakes, wire::Checksum};
 use sinew_session::outlet::LinkNumber;
-use tokio::{sync::Notify, time::timeout};
 
-use super::{
-    channel,
-    packet::{DATAGRAM_MAX, Prefix},
+use crate::{
+    State,
+    core::Lane,
+    datagrams::{DATAGRAM_MAX, Prefix, read_value},
+    inbound::Inbound,
+    peer::Peer,
+    shared_socket::SharedSocket,
+    spin::Spin,
 };
-use crate::{State, core::Lane, inbound::Inbound, peer::Peer, shared_socket::SharedSocket, spin::Spin};
 
 /// Datagrams read before other tasks of the thread run.
 const DATAGRAMS_PER_WAKE: usize = 64;
-/// An alarm within this time of a turn of the reader is set anew. The alarm of an acknowledgement, 1.5 ms after
-/// a value, is so at the next value of a 1 kHz loop, and not at values of other peers shortly before.
-const SOON: Duration = Duration::from_micros(750);
 /// Delay before a failed socket is read again.
 const BACK_OFF: Duration = Duration::from_millis(100);
-
-/// Wakes [`keep_time`] for an action that is due earlier than its timer.
-#[derive(Debug, Default)]
-pub(crate) struct Alarm {
-    /// Time of the next check, in nanoseconds.
-    set: AtomicU64,
-    earlier: Notify,
-}
-
-impl Alarm {
-    /// Registers an action that is due at this time.
-    pub(super) fn set(&self, due: Option<Time>) {
-        let Some(due) = due.map(Time::as_nanos) else { return };
-        // SYNC: the checking task first stores the maximum, and only then checks. A due time registered
-        // meanwhile is earlier than that.
-        if due < self.set.load(Ordering::Acquire) && due < self.set.fetch_min(due, Ordering::AcqRel) {
-            self.earlier.notify_one();
-        }
-    }
-
-    /// Has an alarm that is near set anew, after a turn of the IO thread. Its reason may have gone meanwhile:
-    /// an acknowledgement went with a value, or one came. This costs no system call; a wake of the thread that
-    /// finds nothing due does.
-    fn review(&self, now: Time) {
-        // SYNC: Relaxed; only this thread stores a later time.
-        if self.set.load(Ordering::Relaxed) < (now + SOON).as_nanos() {
-            self.earlier.notify_one();
-        }
-    }
-
-    /// Waits until this time, or for [`set`](Self::set) or [`review`](Self::review).
-    async fn reached(&self, due: Option<Time>) {
-        match due {
-            None => self.earlier.notified().await,
-            Some(due) => {
-                self.set.fetch_min(due.as_nanos(), Ordering::AcqRel);
-                // The check runs after an earlier due time as well as after the timeout.
-                drop(timeout(due.since(Time::now()), self.earlier.notified()).await);
-            }
-        }
-    }
-}
 
 /// Runs the due actions of all peers.
 pub(crate) async fn keep_time(state: Arc<State>) {
     let (store, alarm) = (&state.store, &state.store.alarm);
-    claim_notifications(&alarm.earlier);
+    alarm.claim();
     let mut peers = Vec::new();
     loop {
-        alarm.set.store(u64::MAX, Ordering::Release);
+        alarm.clear();
         let now = Time::now();
         store.list_peers(&mut peers);
         // No reference to a peer is kept while this task waits.
@@ -201,7 +155,7 @@ impl Reader {
         let Some(content) = prefix.content(bytes).filter(|_| bytes.len() <= DATAGRAM_MAX) else {
             return self.count(now, "datagram malformed");
         };
-        let value = match content.value.map(channel::value) {
+        let value = match content.value.map(read_value) {
             Some(None) => return self.count(now, "datagram malformed"),
             Some(value) => value,
             None => None,
@@ -264,18 +218,6 @@ mod tests {
         let mut present = pin!(keep_time(state.clone()));
         let woken = waits(present.as_mut());
         state.store.alarm.set(Some(Time::now()));
-        assert!(woken.is());
-    }
-
-    #[test]
-    fn turn_of_the_reader_reviews_only_a_near_alarm() {
-        let (alarm, now) = (Alarm::default(), Time::now());
-        alarm.set.store((now + 2 * SOON).as_nanos(), Ordering::Relaxed);
-        let mut earlier = pin!(alarm.earlier.notified());
-        let woken = waits(earlier.as_mut());
-        alarm.review(now);
-        assert!(!woken.is(), "its reason is still to come");
-        alarm.review(now + SOON + Duration::from_nanos(1));
         assert!(woken.is());
     }
 }
