@@ -21,7 +21,7 @@ const LINES_MAX: usize = 500;
 const SKIPPED: [&str; 4] = ["target", ".git", "corpus", "docs"];
 
 /// Names in a private dialect that this code once had, and the field's term for each.
-const BANNED: [(&str, &str); 48] = [
+const BANNED: [(&str, &str); 50] = [
     ("Absences", "DownPolicies"),
     ("Acquaintance", "PeerState"),
     ("Aftermath", "NodeDownEvents"),
@@ -45,9 +45,11 @@ const BANNED: [(&str, &str); 48] = [
     ("Openers", "SocketAccess"),
     ("Outlet", "MessageSink"),
     ("Post", "EventQueue"),
+    ("Posts", "EventQueues"),
     ("ProcessLife", "ProcessSupervision"),
     ("Roster", "SupervisorHandle"),
     ("Shelf", "ReceiveBacklog"),
+    ("Strangers", "UnknownAddressLimits"),
     ("Tenant", "ActorHandle"),
     ("Unproven", "AuthError"),
     ("Untaken", "Undelivered"),

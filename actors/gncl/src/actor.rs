@@ -342,7 +342,7 @@ impl Actor for Gncl {
         #[cfg(target_os = "linux")]
         self.watch_interfaces(ctx);
         self.watch_limits(ctx);
-        ctx.add_stream(self.state.ctx.posts.gncl.attach_keeping(Clone::clone));
+        ctx.add_stream(self.state.ctx.event_queues.gncl.attach_keeping(Clone::clone));
         ctx.spawn(fut::wrap_future(Store::serve_queues(self.state.clone())));
         ctx.spawn(fut::wrap_future(link_notifications::offer_later(self.state.clone())));
         let spin = self.spin.clone();

@@ -7,7 +7,7 @@ use std::sync::Mutex;
 
 use sinew_model::{
     event_backlog::{CoalescingRules, EventBacklog, Role},
-    events::{FullQueues, NdlEvent, Posts, SyncEvent},
+    events::{EventQueues, FullQueues, NdlEvent, SyncEvent},
     facts::LinkFact,
 };
 use sinew_runtime::{lock, tid::NodeAddress};
@@ -76,9 +76,10 @@ impl LinkEvents {
     }
 
     /// Notifies both layers, as far as their queues have room.
-    pub(super) fn offer(&self, posts: &Posts) -> FullQueues {
-        let ndl = lock(&self.ndl).offer(|fact| posts.ndl.post(NdlEvent::Link(fact.clone())).is_ok());
-        let sync = lock(&self.sync).offer(|fact| posts.sync.post(SyncEvent::Link(fact.clone())).is_ok());
+    pub(super) fn offer(&self, event_queues: &EventQueues) -> FullQueues {
+        let ndl = lock(&self.ndl).offer(|fact| event_queues.ndl.post(NdlEvent::Link(fact.clone())).is_ok());
+        let sync =
+            lock(&self.sync).offer(|fact| event_queues.sync.post(SyncEvent::Link(fact.clone())).is_ok());
         FullQueues { ndl: !ndl, sync: !sync, ..FullQueues::default() }
     }
 }

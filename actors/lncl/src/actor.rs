@@ -57,7 +57,7 @@ impl Actor for Lncl {
     fn started(&mut self, ctx: &mut Self::Context) {
         registrar::remove_former_clients(&self.server.state);
         self.server.state.client_socket.hang_up();
-        ctx.add_stream(self.server.state.ctx.posts.lncl.attach());
+        ctx.add_stream(self.server.state.ctx.event_queues.lncl.attach());
         let server = self.server.clone();
         let checks = async move { server.state.ctx.checks.run(TICK, || server.tick(Time::now())).await };
         ctx.spawn(checks.into_actor(self));

@@ -139,7 +139,7 @@ const REGISTRATIONS_BELOW: usize = EVENT_QUEUE_CAPACITY / 2;
 
 /// Registers an application of another process. No message reaches it before [`open`].
 pub(super) fn register_client(state: &State, request: Request) -> Result<AppAddress, RegisterError> {
-    let waiting = state.ctx.posts.sync.len();
+    let waiting = state.ctx.event_queues.sync.len();
     if waiting >= REGISTRATIONS_BELOW {
         return Err(RegisterError::Busy { waiting });
     }
@@ -230,7 +230,7 @@ fn notify(state: &State, fact: AppFact) {
     | AppFact::Stopped { app }
     | AppFact::Unregistered { app } = fact
         && state.ctx.router.subscribes(app, NodeEvent::KIND)
-        && !state.ctx.app_backlogs.queue_for_ndl(&state.ctx.posts, fact.clone())
+        && !state.ctx.app_backlogs.queue_for_ndl(&state.ctx.event_queues, fact.clone())
     {
         does_not_read(state, "NDL");
     }
@@ -239,7 +239,7 @@ fn notify(state: &State, fact: AppFact) {
 
 fn notify_sync(state: &State, fact: AppFact) {
     state.ctx.directory_has_changed();
-    if !state.ctx.app_backlogs.queue_for_sync(&state.ctx.posts, fact) {
+    if !state.ctx.app_backlogs.queue_for_sync(&state.ctx.event_queues, fact) {
         does_not_read(state, "the sync manager");
     }
 }
@@ -300,17 +300,17 @@ mod tests {
         // given: a sync manager that reads nothing for now
         let state = State::for_test(NodeConfig::new("test"), Incarnation(1));
         let (app, group) = (registers(&state, None, None), AppAddress::group("drives"));
-        let before = state.ctx.posts.sync.len();
+        let before = state.ctx.event_queues.sync.len();
         // when: there are more changes than its event queue has room for
         for turn in 0..=EVENT_QUEUE_CAPACITY {
             set_member(&state, app, group, turn % 2 == 0);
         }
         // then
-        assert_eq!(state.ctx.posts.sync.len(), before + 1);
+        assert_eq!(state.ctx.event_queues.sync.len(), before + 1);
         // and: after it has checked, the next change is reported
         state.ctx.mark_groups_read();
         set_member(&state, app, group, false);
-        assert_eq!(state.ctx.posts.sync.len(), before + 2);
+        assert_eq!(state.ctx.event_queues.sync.len(), before + 2);
     }
 
     #[test]
@@ -322,11 +322,11 @@ mod tests {
         assert!(state.ctx.router.is_member(group, app));
         unregister_local(&state, app);
         state.ctx.mark_groups_read();
-        let before = state.ctx.posts.sync.len();
+        let before = state.ctx.event_queues.sync.len();
         // when
         set_member(&state, app, group, true);
         // then: and the sync manager has nothing to check
-        assert_eq!((state.ctx.router.memberships(), state.ctx.posts.sync.len()), (0, before));
+        assert_eq!((state.ctx.router.memberships(), state.ctx.event_queues.sync.len()), (0, before));
     }
 
     #[test]
@@ -377,7 +377,7 @@ mod tests {
         // then
         assert!(matches!(refused, RegisterError::Busy { .. }), "{refused}");
         assert_eq!(
-            state.ctx.posts.sync.len(),
+            state.ctx.event_queues.sync.len(),
             usize::try_from(3 * registered).unwrap(),
             "each change was reported"
         );
@@ -390,7 +390,7 @@ mod tests {
         let users = [User::Own, User::Guest(1_001)];
         let apps = users.map(|user| client_registers(&state, Address::Dynamic, user));
         // then
-        let mut queue = state.ctx.posts.sync.attach();
+        let mut queue = state.ctx.event_queues.sync.attach();
         let events: Vec<_> = std::iter::from_fn(|| queue.next().now_or_never().flatten()).collect();
         let facts = events.iter().filter_map(|event| match event {
             SyncEvent::App(fact) => Some(fact.clone()),
@@ -429,13 +429,13 @@ mod tests {
         // given: a full event queue
         let state = State::for_test(NodeConfig::new("test"), Incarnation(1));
         let (app, group) = (registers(&state, None, None), AppAddress::group("drives"));
-        while state.ctx.posts.sync.post(SyncEvent::Monitors).is_ok() {}
+        while state.ctx.event_queues.sync.post(SyncEvent::Monitors).is_ok() {}
         set_member(&state, app, group, true);
         // when
-        let mut events = state.ctx.posts.sync.attach();
+        let mut events = state.ctx.event_queues.sync.attach();
         let mut next = || events.next().now_or_never().flatten();
         assert!(matches!(next(), Some(SyncEvent::App(AppFact::Registered { .. }))));
-        assert!(state.ctx.app_backlogs.offer_to_sync(&state.ctx.posts));
+        assert!(state.ctx.app_backlogs.offer_to_sync(&state.ctx.event_queues));
         // then
         let events = std::iter::from_fn(next).filter(|event| !matches!(event, SyncEvent::Monitors));
         let events: Vec<_> = events.collect();

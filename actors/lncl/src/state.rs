@@ -43,7 +43,7 @@ pub struct State {
 impl State {
     /// Returns the state of a node that has not started yet.
     pub fn new(ctx: Arc<NodeContext>, security: Arc<SecurityState>) -> Arc<Self> {
-        let undelivered = Undelivered::new(ctx.node, ctx.posts.lncl.clone(), ctx.checks.clone());
+        let undelivered = Undelivered::new(ctx.node, ctx.event_queues.lncl.clone(), ctx.checks.clone());
         ctx.router.set_refusal_sink(undelivered.clone());
         Arc::new(Self {
             ctx,

@@ -128,7 +128,7 @@ impl TestNode {
     }
 
     fn begin(state: Arc<State>, directory: TestDirectory) -> Self {
-        let facts = state.ctx.posts.sync.attach();
+        let facts = state.ctx.event_queues.sync.attach();
         let (stop, thread) = live(&state);
         Self { state, facts, stop: Some(stop), thread: Some(thread), _directory: directory }
     }
@@ -138,7 +138,7 @@ impl TestNode {
         let (config, incarnation) = (self.state.ctx.config.clone(), self.state.ctx.incarnation.0);
         self.stop();
         self.state = State::for_test(config, Incarnation(incarnation + 1));
-        self.facts = self.state.ctx.posts.sync.attach();
+        self.facts = self.state.ctx.event_queues.sync.attach();
         let (stop, thread) = live(&self.state);
         (self.stop, self.thread) = (Some(stop), Some(thread));
     }
@@ -208,7 +208,7 @@ impl TestNode {
 
     /// Opens the barrier for an application, as the root does.
     pub fn release(&self, app: AppAddress) {
-        self.state.ctx.posts.lncl.post(Event::Released { app }).unwrap();
+        self.state.ctx.event_queues.lncl.post(Event::Released { app }).unwrap();
     }
 
     /// Returns the number of rejections for `cause`.

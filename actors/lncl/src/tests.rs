@@ -352,7 +352,7 @@ fn client_outcome_reaches_the_sender() {
 #[test]
 fn node_event_subscribers_are_reported_to_ndl() {
     let mut node = TestNode::start();
-    let mut events = node.state.ctx.posts.ndl.attach();
+    let mut events = node.state.ctx.event_queues.ndl.attach();
     let (_other, _) = RawClient::register(&node, &Register::default());
     let (subscriber, tid) =
         RawClient::register(&node, &Register { events: vec![NodeEvent::KIND], ..Register::default() });

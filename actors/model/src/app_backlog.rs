@@ -10,7 +10,7 @@ use sinew_runtime::{lock, tid::AppAddress};
 
 use crate::{
     event_backlog::{CoalescingRules, EventBacklog, Role},
-    events::{NdlEvent, Posts, SyncEvent},
+    events::{EventQueues, NdlEvent, SyncEvent},
     facts::AppFact,
 };
 
@@ -95,29 +95,29 @@ impl AppBacklogs {
 
     /// Queues a fact for the sync manager behind its backlog. Returns whether the event queue took all of it. The
     /// caller holds the registry's lock, so that facts are queued in the order in which they occur.
-    pub fn queue_for_sync(&self, posts: &Posts, fact: AppFact) -> bool {
+    pub fn queue_for_sync(&self, event_queues: &EventQueues, fact: AppFact) -> bool {
         let mut backlog = lock(&self.sync);
         backlog.push(fact);
-        offer_to_sync(&mut backlog, posts)
+        offer_to_sync(&mut backlog, event_queues)
     }
 
     /// Same as [`Self::queue_for_sync`], for NDL.
-    pub fn queue_for_ndl(&self, posts: &Posts, fact: AppFact) -> bool {
+    pub fn queue_for_ndl(&self, event_queues: &EventQueues, fact: AppFact) -> bool {
         let mut backlog = lock(&self.ndl);
         backlog.push(fact);
-        offer_to_ndl(&mut backlog, posts)
+        offer_to_ndl(&mut backlog, event_queues)
     }
 
     /// Moves as much of the backlog into the sync manager's event queue as fits. The sync manager calls it after each
     /// event. No fact is missed: a producer that finds the queue full stores its fact under the same lock, before the
     /// next read.
-    pub fn offer_to_sync(&self, posts: &Posts) -> bool {
-        offer_to_sync(&mut lock(&self.sync), posts)
+    pub fn offer_to_sync(&self, event_queues: &EventQueues) -> bool {
+        offer_to_sync(&mut lock(&self.sync), event_queues)
     }
 
     /// Same as [`Self::offer_to_sync`], for NDL.
-    pub fn offer_to_ndl(&self, posts: &Posts) -> bool {
-        offer_to_ndl(&mut lock(&self.ndl), posts)
+    pub fn offer_to_ndl(&self, event_queues: &EventQueues) -> bool {
+        offer_to_ndl(&mut lock(&self.ndl), event_queues)
     }
 
     /// Returns the length of the longer backlog.
@@ -126,12 +126,12 @@ impl AppBacklogs {
     }
 }
 
-fn offer_to_sync(backlog: &mut EventBacklog<Reader>, posts: &Posts) -> bool {
-    backlog.offer(|fact| posts.sync.post(SyncEvent::App(fact.clone())).is_ok())
+fn offer_to_sync(backlog: &mut EventBacklog<Reader>, event_queues: &EventQueues) -> bool {
+    backlog.offer(|fact| event_queues.sync.post(SyncEvent::App(fact.clone())).is_ok())
 }
 
-fn offer_to_ndl(backlog: &mut EventBacklog<Reader>, posts: &Posts) -> bool {
-    backlog.offer(|fact| posts.ndl.post(NdlEvent::App(fact.clone())).is_ok())
+fn offer_to_ndl(backlog: &mut EventBacklog<Reader>, event_queues: &EventQueues) -> bool {
+    backlog.offer(|fact| event_queues.ndl.post(NdlEvent::App(fact.clone())).is_ok())
 }
 
 #[cfg(test)]

@@ -24,7 +24,7 @@ use crate::{
     app_backlog::AppBacklogs,
     clocks::ClockOffsets,
     config::NodeConfig,
-    events::{LayerReport, Posts, Root},
+    events::{EventQueues, LayerReport, Root},
     leave_reason::LeaveReason,
     log_quotas::LogQuotas,
     periodic_checks::PeriodicChecks,
@@ -52,7 +52,7 @@ pub struct NodeContext {
     /// Routes messages to applications, groups and other nodes.
     pub router: Arc<Router>,
     /// The event queues of the layers.
-    pub posts: Posts,
+    pub event_queues: EventQueues,
     /// The root of the node.
     pub root: Arc<dyn Root>,
     /// The traits by which layers call each other.
@@ -103,7 +103,7 @@ impl NodeContext {
             stopping: AtomicBool::new(false),
             gave_up: OnceLock::new(),
             router: Arc::new(Router::new(node)),
-            posts: Posts::default(),
+            event_queues: EventQueues::default(),
             root,
             ports: Ports::default(),
             clocks: ClockOffsets::default(),

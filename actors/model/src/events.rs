@@ -145,12 +145,12 @@ impl FullQueues {
     }
 
     /// Waits until one of these queues has room.
-    pub async fn room(self, posts: &Posts) {
+    pub async fn room(self, event_queues: &EventQueues) {
         poll_fn(|cx| {
             let has_room = [
-                self.gncl && posts.gncl.poll_room(cx).is_ready(),
-                self.ndl && posts.ndl.poll_room(cx).is_ready(),
-                self.sync && posts.sync.poll_room(cx).is_ready(),
+                self.gncl && event_queues.gncl.poll_room(cx).is_ready(),
+                self.ndl && event_queues.ndl.poll_room(cx).is_ready(),
+                self.sync && event_queues.sync.poll_room(cx).is_ready(),
             ];
             if has_room.contains(&true) { Poll::Ready(()) } else { Poll::Pending }
         })
@@ -160,13 +160,17 @@ impl FullQueues {
 
 /// Calls `offer` when a producer found a queue full, which `has_pending` notifies, and when one of the full
 /// queues has room again. It runs for as long as its layer.
-pub async fn offer_when_room(posts: &Posts, has_pending: &Notify, mut offer: impl FnMut() -> FullQueues) {
+pub async fn offer_when_room(
+    event_queues: &EventQueues,
+    has_pending: &Notify,
+    mut offer: impl FnMut() -> FullQueues,
+) {
     loop {
         // A former instance may have left pending events, too.
         let full = offer();
         tokio::select! {
             () = has_pending.notified() => {}
-            () = full.room(posts) => {}
+            () = full.room(event_queues) => {}
         }
     }
 }
@@ -174,14 +178,14 @@ pub async fn offer_when_room(posts: &Posts, has_pending: &Notify, mut offer: imp
 /// The event queues of the layers.
 #[derive(Debug)]
 #[expect(missing_docs, reason = "each field is the queue of the layer of its name")]
-pub struct Posts {
+pub struct EventQueues {
     pub lncl: EventQueue<LnclEvent>,
     pub sync: EventQueue<SyncEvent>,
     pub gncl: EventQueue<GnclEvent>,
     pub ndl: EventQueue<NdlEvent>,
 }
 
-impl Default for Posts {
+impl Default for EventQueues {
     fn default() -> Self {
         Self {
             lncl: EventQueue::new(EVENT_QUEUE_CAPACITY),

@@ -138,7 +138,7 @@ impl Actor for NdlActor {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        ctx.add_stream(self.state.ctx.posts.ndl.attach_keeping(Clone::clone));
+        ctx.add_stream(self.state.ctx.event_queues.ndl.attach_keeping(Clone::clone));
         if let Err(why) = self.begin(ctx) {
             self.state.ctx.cannot_start(why);
         }
@@ -167,7 +167,7 @@ impl StreamHandler<Event> for NdlActor {
         if let Some(shell) = &self.shell {
             shell.feed(|core, now| core.handle(now, input));
         }
-        self.state.ctx.app_backlogs.offer_to_ndl(&self.state.ctx.posts);
+        self.state.ctx.app_backlogs.offer_to_ndl(&self.state.ctx.event_queues);
     }
 
     fn finished(&mut self, ctx: &mut Self::Context) {

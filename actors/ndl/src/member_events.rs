@@ -7,7 +7,7 @@ use std::{net::SocketAddr, sync::Mutex};
 
 use sinew_model::{
     event_backlog::{CoalescingRules, EventBacklog, Role},
-    events::{FullQueues, GnclEvent, Posts, SyncEvent},
+    events::{EventQueues, FullQueues, GnclEvent, SyncEvent},
     facts::MembershipFact,
 };
 use sinew_runtime::{
@@ -126,15 +126,15 @@ impl MemberEvents {
 
     /// Offers the pending events to both layers. Each loss is fenced with `fence` first, in case an instance
     /// of NDL ended between the loss and its fence.
-    pub(super) fn offer(&self, posts: &Posts, fence: impl Fn(&MembershipFact)) -> FullQueues {
+    pub(super) fn offer(&self, event_queues: &EventQueues, fence: impl Fn(&MembershipFact)) -> FullQueues {
         let gncl = lock(&self.gncl).offer(|event| {
             event.fence(&fence);
-            posts.gncl.post(event.clone().into()).is_ok()
+            event_queues.gncl.post(event.clone().into()).is_ok()
         });
         let sync = lock(&self.sync).offer(|event| {
             event.fence(&fence);
             let MemberEvent::Fact { fact, .. } = event else { return true };
-            posts.sync.post(SyncEvent::Membership(fact.clone())).is_ok()
+            event_queues.sync.post(SyncEvent::Membership(fact.clone())).is_ok()
         });
         FullQueues { gncl: !gncl, sync: !sync, ..FullQueues::default() }
     }

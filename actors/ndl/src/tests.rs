@@ -211,10 +211,10 @@ fn layers_with_full_queues_receive_changes_later() {
     run(async {
         // given
         let mut first = Node::start(1, |ndl| ndl.period = Duration::from_millis(200)).await;
-        let posts = &first.state.ctx.posts;
-        while posts.gncl.post(GnclEvent::DenyListChanged).is_ok() {}
-        while posts.sync.post(SyncEvent::Monitors).is_ok() {}
-        let mut told = posts.sync.attach();
+        let event_queues = &first.state.ctx.event_queues;
+        while event_queues.gncl.post(GnclEvent::DenyListChanged).is_ok() {}
+        while event_queues.sync.post(SyncEvent::Monitors).is_ok() {}
+        let mut told = event_queues.sync.attach();
         let seed = first.udp();
         let mut second = Node::start(2, |ndl| ndl.seeds = vec![seed.into()]).await;
         let mut third = Node::start(3, |ndl| ndl.seeds = vec![seed.into()]).await;
@@ -295,7 +295,7 @@ fn refused_dial_after_restarts_is_a_crash() {
         let refuses = async {
             loop {
                 let refused = Event::Link(LinkFact::DialRefused { node, incarnation });
-                state.ctx.posts.ndl.post(refused).unwrap();
+                state.ctx.event_queues.ndl.post(refused).unwrap();
                 tokio::time::sleep(Duration::from_millis(10)).await;
             }
         };

@@ -243,7 +243,7 @@ impl Root {
             (Some(id), Some(supervisor)) => order(supervisor, Input::Released(id)),
             // Not an application of this process: LNCL knows its client.
             (None, _) => {
-                if self.state.ctx.posts.lncl.post(sinew_lncl::Event::Released { app }).is_err() {
+                if self.state.ctx.event_queues.lncl.post(sinew_lncl::Event::Released { app }).is_err() {
                     sinew_runtime::log::error!(%app, "LNCL's event queue is full: a client's registration ends at its deadline");
                 }
             }

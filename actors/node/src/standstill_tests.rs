@@ -86,7 +86,7 @@ impl Standstill {
 
     /// Both layers read on, as their shells do, until nothing is left.
     fn read_all(&mut self) {
-        let mut events = self.state.ctx.posts.sync.attach();
+        let mut events = self.state.ctx.event_queues.sync.attach();
         while let Some(event) = events.next().now_or_never().flatten() {
             if let sinew_sync::Event::App(fact) = event {
                 self.core.handle(Time::ZERO, sinew_sync::Input::AppChanged(fact));
@@ -96,9 +96,9 @@ impl Standstill {
                     self.notified.push((app, event));
                 }
             }
-            self.state.ctx.app_backlogs.offer_to_sync(&self.state.ctx.posts);
+            self.state.ctx.app_backlogs.offer_to_sync(&self.state.ctx.event_queues);
         }
-        let mut events = self.state.ctx.posts.ndl.attach();
+        let mut events = self.state.ctx.event_queues.ndl.attach();
         while let Some(event) = events.next().now_or_never().flatten() {
             match event {
                 sinew_ndl::Event::App(AppFact::Ready { app }) => {
@@ -111,14 +111,14 @@ impl Standstill {
                 }
                 sinew_ndl::Event::App(_) | sinew_ndl::Event::Link(_) => {}
             }
-            self.state.ctx.app_backlogs.offer_to_ndl(&self.state.ctx.posts);
+            self.state.ctx.app_backlogs.offer_to_ndl(&self.state.ctx.event_queues);
         }
     }
 
     fn fill_posts(&self) {
         let fact = LinkFact::LinkUp { node: self.state.ctx.node, incarnation: Incarnation(1) };
-        while self.state.ctx.posts.sync.post(sinew_sync::Event::Monitors).is_ok() {}
-        while self.state.ctx.posts.ndl.post(sinew_ndl::Event::Link(fact.clone())).is_ok() {}
+        while self.state.ctx.event_queues.sync.post(sinew_sync::Event::Monitors).is_ok() {}
+        while self.state.ctx.event_queues.ndl.post(sinew_ndl::Event::Link(fact.clone())).is_ok() {}
     }
 }
 

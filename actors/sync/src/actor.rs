@@ -54,8 +54,8 @@ impl Actor for SyncManager {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        ctx.add_stream(self.state.ctx.posts.sync.attach_keeping(Event::copy).numbered());
-        let sink = Arc::new(QueueSink(self.state.ctx.posts.sync.clone()));
+        ctx.add_stream(self.state.ctx.event_queues.sync.attach_keeping(Event::copy).numbered());
+        let sink = Arc::new(QueueSink(self.state.ctx.event_queues.sync.clone()));
         self.state.ctx.router.set_local(AppAddress::SYNC, LocalRoute { sink, events: Arc::new([]) });
         // A predecessor may have failed between two outputs of the core, or before it processed the groups.
         self.core().replaced(Time::now());
@@ -146,7 +146,7 @@ impl SyncManager {
 
     /// Sends the events that were rejected by a full event queue, as far as there is room now.
     fn offer_backlog(&self) {
-        self.state.ctx.app_backlogs.offer_to_sync(&self.state.ctx.posts);
+        self.state.ctx.app_backlogs.offer_to_sync(&self.state.ctx.event_queues);
         if monitors::has_outputs(&self.state) {
             monitors::drain(&self.state);
         }
@@ -165,7 +165,7 @@ impl SyncManager {
             self.refuse("directory full", &left_out);
         }
         let (mut core, now) = (self.core(), Time::now());
-        core.woken(now, self.state.ctx.posts.sync.len());
+        core.woken(now, self.state.ctx.event_queues.sync.len());
         core.handle(now, Input::GroupsChanged(published));
     }
 
@@ -175,7 +175,7 @@ impl SyncManager {
         {
             let mut core = self.core();
             let (changed, now) = (input.names_changed(), Time::now());
-            core.woken(now, self.state.ctx.posts.sync.len());
+            core.woken(now, self.state.ctx.event_queues.sync.len());
             match position {
                 Some(position) => core.handle_once(now, position, input),
                 None => core.handle(now, input),

@@ -93,7 +93,7 @@ impl Bench {
     }
 
     fn post_event(&self, event: Event) {
-        self.state.ctx.posts.sync.post(event).unwrap();
+        self.state.ctx.event_queues.sync.post(event).unwrap();
     }
 
     fn registers_gait(&self) {
@@ -473,7 +473,7 @@ fn monitored_end_is_reported_despite_a_full_queue() {
         monitors::feed(&bench.state, monitors::Input::Started { app: drive });
         let set = |core: &mut monitors::Core| core.monitor(Time::now(), GAIT, Tid::new(HERE, drive));
         monitors::change(&bench.state, set).unwrap();
-        while bench.state.ctx.posts.sync.post(Event::App(AppFact::Ready { app: GAIT })).is_ok() {}
+        while bench.state.ctx.event_queues.sync.post(Event::App(AppFact::Ready { app: GAIT })).is_ok() {}
         // when: another task, which holds a lock, records that the drive has ended
         let cause = Cause::new(DownClass::Killed, "its end");
         monitors::feed_deferred(&bench.state, monitors::Input::Ended { app: drive, cause, is_gone: true });

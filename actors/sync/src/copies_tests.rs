@@ -51,14 +51,14 @@ fn unchanged_directory_wakes_no_holder_of_a_copy() {
         bench.knee_publishes(1, true);
         bench.state.ctx.router.deliver(arrival(GAIT, 7)).unwrap();
         bench.post_event(Event::Monitors);
-        while !bench.state.ctx.posts.sync.is_empty() {
+        while !bench.state.ctx.event_queues.sync.is_empty() {
             tokio::task::yield_now().await;
         }
         // Then
         assert_eq!(*changes.borrow() - before, 0);
         // And: when the list has changed
         bench.knee_publishes(2, false);
-        while !bench.state.ctx.posts.sync.is_empty() {
+        while !bench.state.ctx.event_queues.sync.is_empty() {
             tokio::task::yield_now().await;
         }
         assert!(*changes.borrow() > before);

@@ -22,7 +22,7 @@ impl Bench {
     /// Waits until the manager has read all that is queued.
     async fn reads_all(&self) {
         let read = async {
-            while !self.state.ctx.posts.sync.is_empty() {
+            while !self.state.ctx.event_queues.sync.is_empty() {
                 tokio::task::yield_now().await;
             }
         };
@@ -39,7 +39,7 @@ fn own_arrivals_are_accepted_with_guests_at_their_limit() {
         assert_eq!(USERS.map(|uid| bench.guest_fills(uid)), [OF_USER_AT_SYNC; 2]);
         assert_eq!(bench.guest_fills(1_003), 0, "two have all that guests may have");
         // Then: as many as ever are accepted from the robot's own applications, and as many from other nodes
-        assert_eq!(bench.state.ctx.posts.sync.len(), 2 * OF_USER_AT_SYNC);
+        assert_eq!(bench.state.ctx.event_queues.sync.len(), 2 * OF_USER_AT_SYNC);
         let knee = || directory(Tid::new(KNEE, AppAddress::SYNC), Bytes::new());
         for correlation in (2 * OF_USER_AT_SYNC..EVENT_QUEUE_CAPACITY / 2).step_by(2) {
             bench.state.ctx.router.send(arrival(GAIT, correlation as u64)).unwrap();
@@ -68,13 +68,13 @@ fn failing_manager_costs_the_guest_no_room() {
         bench.state.ctx.router.set_local(GUEST, route);
         assert_eq!(bench.guest_fills(USERS[0]), OF_USER_AT_SYNC);
         let fails = async {
-            while bench.state.ctx.posts.sync.len() == OF_USER_AT_SYNC {
+            while bench.state.ctx.event_queues.sync.len() == OF_USER_AT_SYNC {
                 tokio::task::yield_now().await;
             }
         };
         within("the first message is read", fails).await;
         assert_eq!(
-            bench.state.ctx.posts.sync.len(),
+            bench.state.ctx.event_queues.sync.len(),
             OF_USER_AT_SYNC - 1,
             "the others wait for the next manager"
         );
@@ -95,7 +95,7 @@ fn rejected_and_discarded_messages_leave_the_guest_its_room() {
         let bench = Bench::new().await;
         assert_eq!(bench.guest_fills(USERS[0]), OF_USER_AT_SYNC);
         // When
-        drop(bench.state.ctx.posts.sync.close());
+        drop(bench.state.ctx.event_queues.sync.close());
         // Then: all that was queued there is gone, and rejected messages take no room
         assert_eq!([(); 2].map(|()| bench.guest_fills(USERS[0])), [0; 2]);
         let admit = |number| bench.guest_quotas.admit(HERE, USERS[0], arrival(GUEST, number)).ok();

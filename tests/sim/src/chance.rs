@@ -43,6 +43,14 @@ impl Chance {
         self.below(1_000) < per_mille
     }
 
+    /// Returns `true` in one of `cases` cases.
+    ///
+    /// # Panics
+    /// If `cases` is 0.
+    pub const fn once_in(&mut self, cases: u64) -> bool {
+        self.below(cases) == 0
+    }
+
     /// Returns one of the choices.
     ///
     /// # Panics

@@ -49,7 +49,7 @@ impl Gncl {
 
 /// Offers pending events to the other layers, until their queues are full.
 fn offer(state: &State) -> FullQueues {
-    let full = state.link_events.offer(&state.ctx.posts);
+    let full = state.link_events.offer(&state.ctx.event_queues);
     if let Some(layer) = full.layer() {
         let what = format_args!("{layer} does not read its events: its link events are delivered later");
         state.store.refusals.count(Time::now(), "a layer's event queue is full", &what);
@@ -60,5 +60,5 @@ fn offer(state: &State) -> FullQueues {
 /// Offers pending events as soon as the other layers have room for them.
 pub(super) async fn offer_later(state: Arc<State>) {
     claim_notifications(&state.link_events.has_pending);
-    offer_when_room(&state.ctx.posts, &state.link_events.has_pending, || offer(&state)).await;
+    offer_when_room(&state.ctx.event_queues, &state.link_events.has_pending, || offer(&state)).await;
 }

@@ -95,7 +95,7 @@ impl Node {
     pub(super) async fn begin(state: Arc<State>) -> Self {
         let outcomes = EventQueue::new(10_000);
         let settled = outcomes.attach();
-        let facts = state.ctx.posts.ndl.attach();
+        let facts = state.ctx.event_queues.ndl.attach();
         let mut node = Self { state, arbiter: None, layer: None, facts, outcomes, settled };
         node.start_layer().await;
         node
@@ -174,7 +174,7 @@ impl Node {
     }
 
     pub(super) fn notify(&self, event: Event) {
-        self.state.ctx.posts.gncl.post(event).expect("GNCL reads its queue");
+        self.state.ctx.event_queues.gncl.post(event).expect("GNCL reads its queue");
     }
 
     pub(super) fn find(&self, node: NodeAddress, gncl: SocketAddr) {

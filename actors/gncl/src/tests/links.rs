@@ -302,7 +302,7 @@ fn sync_manager_is_notified_of_a_former_layers_links() {
         let (mut a, b) = pair().await;
         a.stop_layer();
         // The events of its first instance are read; `b` does not return.
-        let mut events = Box::pin(a.state.ctx.posts.sync.attach());
+        let mut events = Box::pin(a.state.ctx.event_queues.sync.attach());
         while !matches!(
             next("the link to be reported", &mut events).await,
             SyncEvent::Link(LinkFact::LinkUp { .. })
@@ -319,13 +319,13 @@ fn full_event_queue_receives_the_link_up_later() {
     run(async {
         // given: a sync manager that reads nothing
         let (mut a, b) = (Node::start(1).await, Node::start(2).await);
-        while a.state.ctx.posts.sync.post(SyncEvent::Monitors).is_ok() {}
+        while a.state.ctx.event_queues.sync.post(SyncEvent::Monitors).is_ok() {}
         // when
         a.find(b.address(), b.listens_at());
         a.up().await;
         a.counted("a layer's event queue is full").await;
         // then
-        let mut events = Box::pin(a.state.ctx.posts.sync.attach());
+        let mut events = Box::pin(a.state.ctx.event_queues.sync.attach());
         let fact = loop {
             if let SyncEvent::Link(fact) = next("an event for the sync manager", &mut events).await {
                 break fact;

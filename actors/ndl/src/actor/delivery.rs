@@ -102,7 +102,7 @@ impl Shell {
     }
 
     fn offer_member_events(&self) -> FullQueues {
-        let full = self.state.member_events.offer(&self.state.ctx.posts, |fact| self.fence(fact));
+        let full = self.state.member_events.offer(&self.state.ctx.event_queues, |fact| self.fence(fact));
         if let Some(layer) = full.layer() {
             let what = format_args!("{layer} does not read its events: it is told later who is there");
             self.refusals.count(Time::now(), "a layer's event queue is full", &what);
@@ -160,7 +160,7 @@ pub(super) async fn deliver_node_events(shell: Rc<Shell>) {
 
 /// Offers pending events to other layers as soon as they have room for them.
 pub(super) async fn offer_later(shell: Rc<Shell>) {
-    offer_when_room(&shell.state.ctx.posts, &shell.has_pending, || shell.offer_member_events()).await;
+    offer_when_room(&shell.state.ctx.event_queues, &shell.has_pending, || shell.offer_member_events()).await;
 }
 
 /// Returns the subject of an event, which determines its order among the node's messages.

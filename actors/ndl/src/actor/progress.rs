@@ -68,8 +68,8 @@ pub(super) async fn watch(shell: Rc<Shell>) {
         }
         // A layer that reads its event queue gets these events by itself. No event may follow if a replaced
         // instance of LNCL left some.
-        shell.state.ctx.app_backlogs.offer_to_sync(&shell.state.ctx.posts);
-        shell.state.ctx.app_backlogs.offer_to_ndl(&shell.state.ctx.posts);
+        shell.state.ctx.app_backlogs.offer_to_sync(&shell.state.ctx.event_queues);
+        shell.state.ctx.app_backlogs.offer_to_ndl(&shell.state.ctx.event_queues);
         let report = request_progress(&shell.state, &mut root, &mut question, period).await;
         let is_current = shell.feed(|core, now| {
             if let Some(report) = report {

@@ -6,27 +6,27 @@ use sinew_model::rate_limiter::{KeyedRateLimiter, Rate, RateLimiter, WhenFull};
 use sinew_runtime::time::Time;
 
 /// Rate of one unknown address: 50 datagrams per second, 100 at once.
-pub(super) const STRANGER: Rate = Rate::new(Duration::from_millis(20), 100);
+pub(super) const UNKNOWN_EACH: Rate = Rate::new(Duration::from_millis(20), 100);
 /// Rate of all unknown addresses together: 1,000 datagrams per second, 1,000 at once.
-pub(super) const STRANGERS: Rate = Rate::new(Duration::from_millis(1), 1_000);
+pub(super) const UNKNOWN_ALL: Rate = Rate::new(Duration::from_millis(1), 1_000);
 /// Rate of a member or a seed: 500 datagrams per second, 500 at once. A node with the shortest period, 10 ms,
 /// sends 300 a second.
 pub(super) const KNOWN: Rate = Rate::new(Duration::from_millis(2), 500);
 
 /// Maximum number of unknown addresses with a limiter of their own.
-const STRANGERS_MAX: usize = 1_024;
+const UNKNOWN_MAX: usize = 1_024;
 
-/// The budget of unknown addresses.
+/// The limits of unknown addresses.
 #[derive(Debug)]
-pub(super) struct Strangers {
+pub(super) struct UnknownAddressLimits {
     all: RateLimiter,
     each: KeyedRateLimiter<IpAddr>,
 }
 
-impl Strangers {
+impl UnknownAddressLimits {
     pub(super) const fn new() -> Self {
-        let each = KeyedRateLimiter::new(STRANGER, STRANGERS_MAX, WhenFull::EvictLeastUsed);
-        Self { all: RateLimiter::new(STRANGERS), each }
+        let each = KeyedRateLimiter::new(UNKNOWN_EACH, UNKNOWN_MAX, WhenFull::EvictLeastUsed);
+        Self { all: RateLimiter::new(UNKNOWN_ALL), each }
     }
 
     /// Returns whether a datagram from `ip` is processed. // spec: NDL-7.2
@@ -57,28 +57,28 @@ mod tests {
 
     #[test]
     fn loud_address_gets_its_burst_then_its_rate() {
-        let mut strangers = Strangers::new();
-        let admitted = (0..10_000).filter(|_| strangers.admit(Time::ZERO, ip(1))).count();
+        let mut limits = UnknownAddressLimits::new();
+        let admitted = (0..10_000).filter(|_| limits.admit(Time::ZERO, ip(1))).count();
         assert_eq!(admitted, 100);
         let second = Time::ZERO + Duration::from_secs(1);
-        let admitted = (0..10_000).filter(|_| strangers.admit(second, ip(1))).count();
+        let admitted = (0..10_000).filter(|_| limits.admit(second, ip(1))).count();
         assert_eq!(admitted, 50);
     }
 
     #[test]
     fn loud_address_leaves_room_for_others() {
-        let mut strangers = Strangers::new();
-        let _ = (0..1_000_000).filter(|_| strangers.admit(Time::ZERO, ip(1))).count();
-        assert!(strangers.admit(Time::ZERO, ip(2)));
+        let mut limits = UnknownAddressLimits::new();
+        let _ = (0..1_000_000).filter(|_| limits.admit(Time::ZERO, ip(1))).count();
+        assert!(limits.admit(Time::ZERO, ip(2)));
     }
 
     #[test]
     fn forged_addresses_share_one_budget_and_a_bounded_table() {
-        let mut strangers = Strangers::new();
-        let admitted = (0..100_000).filter(|bits| strangers.admit(Time::ZERO, ip(*bits))).count();
+        let mut limits = UnknownAddressLimits::new();
+        let admitted = (0..100_000).filter(|bits| limits.admit(Time::ZERO, ip(*bits))).count();
         assert_eq!(admitted, 1_000);
         let later = Time::ZERO + Duration::from_secs(1);
-        let _ = (0..100_000).filter(|bits| strangers.admit(later, ip(1 << 20 | bits))).count();
-        assert!(strangers.each.len() <= STRANGERS_MAX);
+        let _ = (0..100_000).filter(|bits| limits.admit(later, ip(1 << 20 | bits))).count();
+        assert!(limits.each.len() <= UNKNOWN_MAX);
     }
 }

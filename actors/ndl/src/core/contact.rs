@@ -106,7 +106,7 @@ impl Contact {
         matches!(self.role, Role::Candidate { .. }) && !self.is_seed && self.sources.is_empty()
     }
 
-    /// Returns whether its datagrams count against its own budget, not the strangers'.
+    /// Returns whether its datagrams count against its own budget, not that of unknown addresses.
     pub(super) const fn has_own_budget(&self) -> bool {
         matches!(self.role, Role::Member(_)) || self.is_seed
     }

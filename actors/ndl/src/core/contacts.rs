@@ -16,7 +16,7 @@ use sinew_runtime::{tid::NodeAddress, time::Time};
 
 use super::{
     Output, Place, Source,
-    budget::Strangers,
+    budget::UnknownAddressLimits,
     contact::{Contact, Role},
     departed::DepartedNode,
     queries::{Correlations, SentQueries, SentQuery},
@@ -36,8 +36,8 @@ pub(super) struct Contacts {
     /// Number of candidates among the contacts.
     candidates: usize,
     candidates_max: usize,
-    /// Budget of datagrams from other addresses.
-    strangers: Strangers,
+    /// Limits of datagrams from other addresses.
+    unknown_limits: UnknownAddressLimits,
     correlations: Correlations,
     /// The queries to the multicast group. `None` if the group is not used.
     group: Option<SentQueries>,
@@ -59,7 +59,7 @@ impl Contacts {
             all: BTreeMap::new(),
             candidates: 0,
             candidates_max: config.nodes_max,
-            strangers: Strangers::new(),
+            unknown_limits: UnknownAddressLimits::new(),
             correlations: Correlations::new(secret),
             group: config.multicast.map(|_| SentQueries::default()),
         }
@@ -146,12 +146,12 @@ impl Contacts {
                 return contact.budget.try_take(now);
             }
         }
-        self.strangers.admit(now, from.there.ip())
+        self.unknown_limits.admit(now, from.there.ip())
     }
 
     /// Returns whether the budget of unknown addresses allows an input other than a datagram.
     pub(super) fn admit_any(&mut self, now: Time) -> bool {
-        self.strangers.admit_any(now)
+        self.unknown_limits.admit_any(now)
     }
 
     /// Returns the order to query `to`, if there is a contact. `answerable` is the number of its last queries

@@ -65,7 +65,8 @@ fn rejected_facts_are_retried_before_later_ones() {
 #[test]
 fn loss_is_fenced_once_before_its_delivery_only() {
     // given: the queue of GNCL has room for one event
-    let (events, posts) = (MemberEvents::new(4), Posts { gncl: EventQueue::new(1), ..Posts::default() });
+    let (events, event_queues) =
+        (MemberEvents::new(4), EventQueues { gncl: EventQueue::new(1), ..EventQueues::default() });
     let incarnation = Incarnation(1);
     for node in [NODE, OTHER] {
         events.push(&Output::Fact(MembershipFact::NodeLost { node, incarnation, why: LossReason::Hung }));
@@ -74,17 +75,17 @@ fn loss_is_fenced_once_before_its_delivery_only() {
     let fenced = RefCell::new(Vec::new());
     let fence = |fact: &MembershipFact| fenced.borrow_mut().push(fact.clone());
     // when
-    let full = events.offer(&posts, fence);
+    let full = events.offer(&event_queues, fence);
     // then
     let of_other = MembershipFact::NodeLost { node: OTHER, incarnation, why: LossReason::Hung };
     assert_eq!(full, FullQueues { gncl: true, ..FullQueues::default() });
     assert_eq!(fenced.take(), [of_other.clone(), of_other], "once for each layer");
     // when
-    assert!(posts.gncl.attach().next().now_or_never().is_some());
-    let full = events.offer(&posts, fence);
+    assert!(event_queues.gncl.attach().next().now_or_never().is_some());
+    let full = events.offer(&event_queues, fence);
     // then
     assert_eq!((full, fenced.take()), (FullQueues::default(), Vec::new()));
-    assert_eq!((posts.gncl.len(), posts.sync.len()), (1, 2));
+    assert_eq!((event_queues.gncl.len(), event_queues.sync.len()), (1, 2));
 }
 
 #[test]

@@ -90,14 +90,14 @@ impl Node {
         let (ctx, root) = NodeContext::for_test(config, Incarnation(incarnation));
         let state = State::new(ctx, Arc::default());
         state.ctx.listens.first.set(gncl_of(number)).unwrap();
-        let (inbox, facts) = (EventQueue::new(1_000), state.ctx.posts.gncl.attach());
+        let (inbox, facts) = (EventQueue::new(1_000), state.ctx.event_queues.gncl.attach());
         let events = inbox.attach();
         let route = LocalRoute { sink: Arc::new(Inbox(inbox)), events: Arc::new([NodeEvent::KIND]) };
         state.ctx.router.set_local(AppAddress::new(0x1000), route);
         state
             .ctx
             .app_backlogs
-            .queue_for_ndl(&state.ctx.posts, AppFact::Ready { app: AppAddress::new(0x1000) });
+            .queue_for_ndl(&state.ctx.event_queues, AppFact::Ready { app: AppAddress::new(0x1000) });
         Self { state, root, layer: None, facts, events, has_root: true }
     }
 

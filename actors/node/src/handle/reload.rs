@@ -63,7 +63,7 @@ impl NodeHandle {
         let read =
             secured.reload_deny_list().map_err(DenyListError::from).and_then(|Denied { summary, own }| {
                 // After the list is in force: it applies to nodes that connect meanwhile.
-                let posted = self.state.ctx.posts.gncl.post(sinew_gncl::Event::DenyListChanged);
+                let posted = self.state.ctx.event_queues.gncl.post(sinew_gncl::Event::DenyListChanged);
                 posted.map_err(|_| DenyListError::NotTold { summary })?;
                 own.map_or(Ok(summary), |serial| Err(DenyListError::Own { serial, summary }))
             });

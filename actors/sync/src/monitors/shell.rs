@@ -137,7 +137,7 @@ pub fn receive(state: &State, from: NodeAddress, message: &Message) -> Result<()
 }
 
 fn schedule_drain(state: &State) {
-    if state.ctx.posts.sync.post(crate::Event::Monitors).is_err() {
+    if state.ctx.event_queues.sync.post(crate::Event::Monitors).is_err() {
         sinew_runtime::log::error!(
             "the sync manager's event queue is full; monitors are evaluated late: does it hang?"
         );

@@ -80,7 +80,7 @@ pub fn feed(state: &State, input: Input) {
             Output::Execute { node, incarnation, will } => execute(state, (node, incarnation), &will),
         }
     }
-    if is_earlier && state.ctx.posts.sync.post(crate::Event::Monitors).is_err() {
+    if is_earlier && state.ctx.event_queues.sync.post(crate::Event::Monitors).is_err() {
         sinew_runtime::log::error!(
             "the sync manager's event queue is full; wills are sent late: does it hang?"
         );

@@ -55,7 +55,7 @@ use sinew_runtime::{
     tid::{AppAddress, Incarnation, NodeAddress},
     time::Time,
 };
-use sinew_sim::{History, Hunt, Pipe, Seeds, number};
+use sinew_sim::{Chance, History, Hunt, Pipe, Seeds, number};
 use sinew_sync::{
     arrivals::{Arrivals, Member},
     core::{BarrierKey, BarrierState, Core, Input, Output, Reason, Rendezvous},
@@ -94,23 +94,6 @@ const BARRIERS: [(&str, &[&str]); 3] =
 
 /// The phases: by names, and by a count. Each in the order of their texts.
 const PHASES: [(&str, &[&str]); 2] = [("homed", &["0.0", "1.0", "2.0"]), ("armed", &["2 of *.1"])];
-
-/// Random numbers from a seed.
-struct Chance(fastrand::Rng);
-
-impl Chance {
-    fn new(seed: u64) -> Self {
-        Self(fastrand::Rng::with_seed(seed))
-    }
-
-    fn below(&mut self, limit: usize) -> usize {
-        self.0.usize(..limit)
-    }
-
-    fn once_in(&mut self, cases: usize) -> bool {
-        self.below(cases) == 0
-    }
-}
 
 /// Nodes are the first processes; a duplicate of a node is a process with a higher index.
 struct World {
@@ -341,13 +324,13 @@ impl World {
     }
 
     fn step(&mut self) {
-        let (node, other) = (self.any_process(None), self.chance.below(APPS));
+        let (node, other) = (self.any_process(None), self.chance.index(APPS));
         let (app, other) = (other, self.any_process(Some(node)));
         let more = if self.nodes() > FEW_NODES { 8 } else { 0 };
         if self.has_phases && self.chance.once_in(3) {
             self.come_up();
         }
-        match self.chance.below(48 + more) {
+        match self.chance.index(48 + more) {
             0..=13 => self.arrive(node, app),
             14 if !self.is_calm => self.leave(node, app),
             15 if !self.is_calm => self.die(node, app),
@@ -357,7 +340,7 @@ impl World {
             21 if !self.is_calm => self.restart(node),
             22..=23 => self.report_breaks(),
             24..=36 => {
-                for _ in 0..=self.chance.below(4) {
+                for _ in 0..=self.chance.index(4) {
                     self.deliver(node, other);
                 }
             }
@@ -368,7 +351,7 @@ impl World {
             48..=51 => self.join(node),
             52..=55 => self.deliver_all(node),
             _ => {
-                let time = Duration::from_millis([1, 3, 10, 60, 700][self.chance.below(5)]);
+                let time = Duration::from_millis([1, 3, 10, 60, 700][self.chance.index(5)]);
                 if self.chance.once_in(8) { self.stand_still(time) } else { self.pass(time) }
             }
         }
@@ -377,7 +360,7 @@ impl World {
     /// Returns a living process other than `but`.
     fn any_process(&mut self, but: Option<usize>) -> usize {
         let living: Vec<usize> = self.living().filter(|process| Some(*process) != but).collect();
-        living[self.chance.below(living.len())]
+        living[self.chance.index(living.len())]
     }
 
     fn living(&self) -> impl Iterator<Item = usize> {

@@ -28,7 +28,7 @@ use crate::{
 
 /// The event queues of the layers. An event is read some time after it was posted, in order.
 #[derive(Default)]
-pub(crate) struct Posts {
+pub(crate) struct EventQueues {
     pub(crate) ndl: Pipe<NdlEvent>,
     pub(crate) gncl: Pipe<GnclEvent>,
     pub(crate) sync: Pipe<SyncEvent>,
@@ -46,7 +46,7 @@ pub(crate) struct Process {
     pub(crate) ndl: sinew_ndl::Core,
     pub(crate) gncl: sinew_gncl::core::Core,
     pub(crate) sync: sinew_sync::Core,
-    pub(crate) posts: Posts,
+    pub(crate) event_queues: EventQueues,
     pub(crate) timers: [Timer; 3],
     pub(crate) store: Store,
     pub(crate) wires: BTreeMap<ConnectionId, Wire>,
@@ -90,7 +90,7 @@ impl Process {
             gncl: new_gncl(&config, address, incarnation, chance.draw()),
             sync: sinew_sync::Core::new(&config, address, incarnation),
             config,
-            posts: Posts::default(),
+            event_queues: EventQueues::default(),
             timers: [Timer::default(); 3],
             store: Store::default(),
             wires: BTreeMap::new(),

@@ -67,7 +67,7 @@ impl World {
         }
         let now = self.local(process);
         let p = &mut self.processes[process];
-        let unread = p.posts.sync.len();
+        let unread = p.event_queues.sync.len();
         p.sync.woken(now, unread);
         if matches!(input, Input::TimePassed | Input::RoomMade) {
             p.sync.handle(now, input);

@@ -228,17 +228,17 @@ impl World {
         let now = self.queue.now();
         match layer {
             Layer::Ndl => {
-                while let Some(event) = self.processes[process].posts.ndl.receive(now) {
+                while let Some(event) = self.processes[process].event_queues.ndl.receive(now) {
                     self.take_ndl_event(process, event);
                 }
             }
             Layer::Gncl => {
-                while let Some(event) = self.processes[process].posts.gncl.receive(now) {
+                while let Some(event) = self.processes[process].event_queues.gncl.receive(now) {
                     self.take_gncl_event(process, event);
                 }
             }
             Layer::Sync => {
-                while let Some(event) = self.processes[process].posts.sync.receive(now) {
+                while let Some(event) = self.processes[process].event_queues.sync.receive(now) {
                     self.take_sync_event(process, event);
                 }
             }
@@ -251,19 +251,19 @@ impl World {
 
     pub(crate) fn post_ndl(&mut self, process: usize, event: NdlEvent) {
         let at = self.read_at();
-        let at = self.processes[process].posts.ndl.send(at, event);
+        let at = self.processes[process].event_queues.ndl.send(at, event);
         self.queue.push(at, Event::Posted { process, layer: Layer::Ndl });
     }
 
     pub(crate) fn post_gncl(&mut self, process: usize, event: GnclEvent) {
         let at = self.read_at();
-        let at = self.processes[process].posts.gncl.send(at, event);
+        let at = self.processes[process].event_queues.gncl.send(at, event);
         self.queue.push(at, Event::Posted { process, layer: Layer::Gncl });
     }
 
     pub(crate) fn post_sync(&mut self, process: usize, event: SyncEvent) {
         let at = self.read_at();
-        let at = self.processes[process].posts.sync.send(at, event);
+        let at = self.processes[process].event_queues.sync.send(at, event);
         self.queue.push(at, Event::Posted { process, layer: Layer::Sync });
     }
 

@@ -40,7 +40,7 @@ impl World {
         if down.is_empty() {
             return;
         }
-        let (node, app) = down[self.chance.below(down.len())];
+        let (node, app) = down[self.chance.index(down.len())];
         let is_unregistered = self.stages[&(node, app)] == Stage::Unregistered;
         self.note(|| format!("{} of process {node} is started", name(self.homes[node], app)));
         if is_unregistered {
@@ -58,7 +58,7 @@ impl World {
         }
         self.judge.dies((node, app), &self.generations(node));
         let address = app_address(app);
-        let fact = match self.chance.below(6) {
+        let fact = match self.chance.index(6) {
             0 => AppFact::Unregistered { app: address },
             1 => AppFact::Stopped { app: address },
             _ => AppFact::Down { app: address },
@@ -93,7 +93,7 @@ impl World {
 
     /// Lets an application wait at a barrier that never opens.
     pub(super) fn arrive_elsewhere(&mut self, node: usize, app: usize) {
-        let barrier = other(self.chance.below(OTHERS));
+        let barrier = other(self.chance.index(OTHERS));
         let parties = vec!["9 of *".to_owned()];
         let key = BarrierKey { name: Name::try_from(barrier.clone()).unwrap(), parties: parties.clone() };
         let waits = |known: &BarrierState| known.waiting.contains_key(&app_address(app));
@@ -117,7 +117,7 @@ impl World {
     }
 
     pub(super) fn arrive(&mut self, node: usize, app: usize) {
-        let (barrier, home) = (self.chance.below(BARRIERS.len()), self.homes[node]);
+        let (barrier, home) = (self.chance.index(BARRIERS.len()), self.homes[node]);
         let is_party = match barrier {
             0 => home < 3 && app == 0,
             1 => true,
@@ -126,7 +126,7 @@ impl World {
         if !is_party || !self.can_arrive(node, app) || self.judge.is_waiting((node, app), barrier) {
             return;
         }
-        let within_ms = match self.chance.below(30) {
+        let within_ms = match self.chance.index(30) {
             short @ 0..3 if !self.is_calm => [5, 80, 400][short],
             _ => FOR_EVER_MS,
         };
@@ -160,7 +160,7 @@ impl World {
     /// Lets an application reach a phase, or stop waiting at it.
     pub(super) fn come_up(&mut self) {
         let (node, app, phase) =
-            (self.any_process(None), self.chance.below(APPS), self.chance.below(PHASES.len()));
+            (self.any_process(None), self.chance.index(APPS), self.chance.index(PHASES.len()));
         let home = self.homes[node];
         let is_party = if phase == 0 { home < 3 && app == 0 } else { app == 1 };
         if self.judge.waits.is_at_phase((node, phase, app)) {
@@ -174,7 +174,7 @@ impl World {
 
     fn reach(&mut self, node: usize, app: usize, phase: usize) {
         let (text, parties) = PHASES[phase];
-        let within_ms = [5, 80, 400, FOR_EVER_MS, FOR_EVER_MS][self.chance.below(5)];
+        let within_ms = [5, 80, 400, FOR_EVER_MS, FOR_EVER_MS][self.chance.index(5)];
         let on_loss = if self.chance.once_in(2) { OnPartyLoss::Fail } else { OnPartyLoss::Wait };
         let (name, within) = (name(self.homes[node], app), Duration::from_millis(within_ms.into()));
         self.note(|| format!("{name} of process {node} reaches {text}, {within_ms} ms, {on_loss:?}"));
@@ -195,7 +195,7 @@ impl World {
     }
 
     pub(super) fn leave(&mut self, node: usize, app: usize) {
-        let barrier = self.chance.below(BARRIERS.len());
+        let barrier = self.chance.index(BARRIERS.len());
         if !self.judge.is_waiting((node, app), barrier) {
             return;
         }

@@ -25,10 +25,10 @@ impl Clocks {
     /// Starts an incarnation of a process: its host has booted, or it is another host, or its clock
     /// continues.
     pub(super) fn begin(&mut self, process: usize, now: Time) {
-        let reading = match self.chance.below(3) {
-            0 => self.chance.0.u64(1..BOOTED_MAX),
+        let reading = match self.chance.index(3) {
+            0 => 1 + self.chance.below(BOOTED_MAX - 1),
             1 if self.clocks.contains_key(&process) => return,
-            _ => self.chance.0.u64(1..UPTIME_MAX),
+            _ => 1 + self.chance.below(UPTIME_MAX - 1),
         };
         let signed = |nanos: u64| i64::try_from(nanos).expect("a month, or the time of one seed");
         let ahead = signed(reading) - signed(now.as_nanos());

@@ -6,10 +6,10 @@ use sinew_sync::arrivals::Arrival;
 /// Returns the set number of nodes, if any. Otherwise mostly three or four, in an eighth of the seeds more,
 /// and in one of a hundred many.
 pub(super) fn nodes(chance: &mut Chance) -> usize {
-    let own = match chance.below(96) {
-        0 => 9 + chance.below(16),
-        1..=12 => 5 + chance.below(4),
-        _ => 3 + chance.below(2),
+    let own = match chance.index(96) {
+        0 => 9 + chance.index(16),
+        1..=12 => 5 + chance.index(4),
+        _ => 3 + chance.index(2),
     };
     let asked_for = number(NODES_VARIABLE).map(|nodes| usize::try_from(nodes).expect("a small number"));
     asked_for.inspect(|nodes| assert!(*nodes >= 3, "{NODES_VARIABLE}: three and more")).unwrap_or(own)
@@ -198,7 +198,7 @@ impl World {
     /// Notifies a formerly linked process of the restart in one of three ways: not before the next link; that
     /// the old incarnation is over; or of the new incarnation, too.
     fn report_restart(&mut self, peer: usize, node: usize, former: Incarnation) {
-        let (address, reports) = (address(node), self.chance.below(3));
+        let (address, reports) = (address(node), self.chance.index(3));
         if reports > 0 {
             let why = if reports == 1 { LossReason::Crashed } else { LossReason::Restarted };
             let lost = MembershipFact::NodeLost { node: address, incarnation: former, why };
