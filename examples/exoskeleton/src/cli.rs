@@ -2,7 +2,6 @@
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::sync::Arc;
 use std::time::Duration;
 
 use clap::{Parser, Subcommand};
@@ -10,10 +9,9 @@ use exoskeleton::output;
 use exoskeleton::report::{self, Report, RunDescription, RunMode, Verdict};
 use exoskeleton::robot::launch::{self, LaunchError, LaunchOptions};
 use exoskeleton::robot::node::{self, NodeError, NodeOptions};
+use exoskeleton::robot::plant::{self, PlantError};
 use exoskeleton::robot::topology::{Control, ControlThread, ReleaseBy};
 use exoskeleton::run_folder;
-use exoskeleton_model::gait::trial::{Trial, TrialError};
-use exoskeleton_model::intention::Intention;
 use exoskeleton_model::lockstep::{self, LockStepConfig, LockStepError};
 use exoskeleton_model::part::Kill;
 use thiserror::Error;
@@ -48,7 +46,7 @@ pub(crate) struct Arguments {
     device_watchdog: Option<u64>,
     /// Thread of the control loops: `io`, which reads the sockets too, or `own`. Real time only.
     #[arg(long, value_name = "THREAD", default_value = "io", conflicts_with = "lock_step")]
-    control_thread: ThreadArgument,
+    control_thread: ControlThread,
     /// `SCHED_FIFO` priority of the control loops, 1 to 89; wants `--control-thread own`. Real time only.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=89), conflicts_with = "lock_step")]
     realtime_priority: Option<u8>,
@@ -59,15 +57,6 @@ pub(crate) struct Arguments {
     /// Folder for the run folders.
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
-}
-
-/// Where the control loops run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-enum ThreadArgument {
-    /// On the thread that reads the node's sockets.
-    Io,
-    /// On a thread of their own.
-    Own,
 }
 
 #[derive(Debug, Subcommand)]
@@ -111,13 +100,8 @@ pub(crate) enum RunError {
         least: u32,
     },
     /// The trial is not usable.
-    #[error("--trial {path}: {reason}")]
-    Trial {
-        /// The path as given.
-        path: String,
-        /// Place and remedy.
-        reason: TrialError,
-    },
+    #[error(transparent)]
+    Trial(#[from] PlantError),
     /// The run could not be done.
     #[error(transparent)]
     LockStep(#[from] LockStepError),
@@ -161,13 +145,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode, RunError> {
 
 /// Walks in virtual time, prints the table, writes the folder.
 fn lock_step(arguments: &Arguments) -> Result<Verdict, RunError> {
-    let intention = match &arguments.trial {
-        Some(path) => Intention::from_trial(Arc::new(Trial::read(path).map_err(|reason| {
-            let path = path.display().to_string();
-            RunError::Trial { path, reason }
-        })?)),
-        None => Intention::from_curves(arguments.seed),
-    };
+    let intention = plant::intention(arguments.trial.as_deref(), arguments.seed)?;
     intention.notes().iter().for_each(|note| output::print(&format!("--trial: {note}\n")));
     let mut config = LockStepConfig::standard(arguments.strides, arguments.seed, intention);
     config.kill = arguments.kill;
@@ -203,8 +181,8 @@ fn options(arguments: &Arguments) -> Result<LaunchOptions, RunError> {
     };
     let thread = match arguments.control_thread {
         // The network must not run at a real-time priority.
-        ThreadArgument::Io if arguments.realtime_priority.is_none() => ControlThread::Io,
-        ThreadArgument::Io | ThreadArgument::Own => ControlThread::Own,
+        ControlThread::Io if arguments.realtime_priority.is_none() => ControlThread::Io,
+        ControlThread::Io | ControlThread::Own => ControlThread::Own,
     };
     Ok(LaunchOptions {
         run: description(arguments),
@@ -222,10 +200,8 @@ fn options(arguments: &Arguments) -> Result<LaunchOptions, RunError> {
 }
 
 fn description(arguments: &Arguments) -> RunDescription {
-    let file_name = |path: &PathBuf| {
-        path.file_name()
-            .map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned())
-    };
+    let file_name =
+        |path: &PathBuf| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
     RunDescription {
         mode: if arguments.lock_step { RunMode::LockStep } else { RunMode::RealTime },
         strides: arguments.strides,
@@ -237,13 +213,14 @@ fn description(arguments: &Arguments) -> RunDescription {
 
 /// Describes the security of the links between nodes.
 fn links(keys: Option<&Path>) -> String {
-    keys.map_or_else(
-        || "links between nodes: open to every program of this host; `--keys DIR` closes them".to_owned(),
+    let security = keys.map(|keys| keys.join("nodes")).map_or_else(
+        || "open to every program of this host; `--keys DIR` closes them".to_owned(),
         |keys| {
             format!(
-                "links between nodes: TLS 1.3, each node proven by its key in {}; those to the plant's devices are open",
-                keys.join("nodes").display()
+                "TLS 1.3, each node proven by its key in {}; those to the plant's devices are open",
+                keys.display()
             )
         },
-    )
+    );
+    format!("links between nodes: {security}")
 }

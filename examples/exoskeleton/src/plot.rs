@@ -176,8 +176,8 @@ fn phase_panel(canvas: &mut Canvas, record: &Record) {
     let true_phase =
         shown.iter().map(|row| (row.t_s - start_s, 100.0 * row.strides_true.rem_euclid(1.0))).collect();
     let estimated = shown.iter().map(|row| (row.t_s - start_s, 100.0 * row.phase_estimated)).collect();
-    canvas.line(&panel, &broken(true_phase, 50.0), TRUE_PHASE);
-    canvas.line(&panel, &broken(estimated, 50.0), ESTIMATED_PHASE);
+    canvas.line(&panel, &broken(true_phase, 50.0, f64::INFINITY), TRUE_PHASE);
+    canvas.line(&panel, &broken(estimated, 50.0, f64::INFINITY), ESTIMATED_PHASE);
     let x = canvas.legend_line((COLUMN_LEFT[0] + 250.0, PHASE_TOP - 10.0), TRUE_PHASE, "true");
     canvas.legend_line((x, PHASE_TOP - 10.0), ESTIMATED_PHASE, "estimated");
 }
@@ -205,7 +205,7 @@ fn error_panel(canvas: &mut Canvas, record: &Record) {
         .step_by(5)
         .map(|row| (row.strides_true, 100.0 * wrapped(row.phase_estimated - row.strides_true)))
         .collect();
-    canvas.line(&panel, &broken_at_jumps(errors), ESTIMATED_PHASE);
+    canvas.line(&panel, &broken(errors, 20.0, STRIDES_UNKNOWN_MIN), ESTIMATED_PHASE);
 }
 
 /// Strides with an event, its name, and the distance of its text below the panel's top.
@@ -241,24 +241,12 @@ fn lateness_panel(canvas: &mut Canvas, lateness: &Lateness) {
     }
 }
 
-/// Breaks the line where an error jumps around half a stride, and where there is no estimate for a while.
-fn broken_at_jumps(points: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
-    let mut out: Vec<(f64, f64)> = Vec::with_capacity(points.len());
-    for point in broken(points, 20.0) {
-        if out.last().is_some_and(|last| point.0 - last.0 > STRIDES_UNKNOWN_MIN) {
-            // A line across the gap would show an error that was not measured.
-            out.push((point.0, f64::NAN));
-        }
-        out.push(point);
-    }
-    out
-}
-
-/// Breaks the line where it jumps by more than this, as where the phase goes from 100 to 0 %.
-fn broken(points: Vec<(f64, f64)>, jump: f64) -> Vec<(f64, f64)> {
+/// Breaks the line where it jumps by more than `jump`, as where the phase goes from 100 to 0 %, and where it has
+/// no point for more than `gap`: a line across it would show values that were not measured.
+fn broken(points: Vec<(f64, f64)>, jump: f64, gap: f64) -> Vec<(f64, f64)> {
     let mut out: Vec<(f64, f64)> = Vec::with_capacity(points.len());
     for point in points {
-        if out.last().is_some_and(|last| (last.1 - point.1).abs() > jump) {
+        if out.last().is_some_and(|last| (last.1 - point.1).abs() > jump || point.0 - last.0 > gap) {
             out.push((point.0, f64::NAN));
         }
         out.push(point);

@@ -45,7 +45,7 @@ pub fn write_text(path: &Path, text: &str) -> io::Result<()> {
     fs::write(path, text).map_err(|error| at(path, &error))
 }
 
-/// An error of the system, with the path of its file.
+/// An error of the system, with the path of its file or folder.
 fn at(path: &Path, error: &io::Error) -> io::Error {
     io::Error::new(error.kind(), format!("cannot write {}: {error}", path.display()))
 }
@@ -70,9 +70,6 @@ pub fn name(run: &RunDescription) -> String {
 pub fn create(runs: &Path, name: &str) -> io::Result<PathBuf> {
     /// Runs of the same kind in one folder.
     const RUNS_MAX: u32 = 10_000;
-    let at = |path: &Path, error: &io::Error| {
-        io::Error::new(error.kind(), format!("cannot make {}: {error}", path.display()))
-    };
     fs::create_dir_all(runs).map_err(|error| at(runs, &error))?;
     for number in 1..=RUNS_MAX {
         let folder = runs.join(format!("{name}-{number}"));

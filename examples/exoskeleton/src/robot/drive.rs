@@ -26,7 +26,7 @@ mod e_stop;
 mod order;
 
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use exoskeleton_model::control::drive::{DriveConfig, DriveCore, DriveOutput};
 use exoskeleton_model::joint::Joint;
@@ -150,8 +150,8 @@ impl Drive {
     fn tick(&mut self, tick: Tick, context: &mut AppContext<Self>) {
         let now = context.now();
         let gait = self.newest_command(now, context);
-        let is_shut = self.is_shut();
-        if is_shut {
+        // Central is known, but its commands do not count.
+        if self.commands.as_ref().is_some_and(CentralCommands::is_shut) {
             self.core.distrust_gait();
         }
         if let Some(Err(error)) = self.commands.as_mut().map(|commands| commands.poll(context)) {
@@ -178,7 +178,7 @@ impl Drive {
             }
             self.ask_to_be_armed(context);
         }
-        if self.stopping && self.at_rest(&output) {
+        if self.stopping && output.command_nm.is_none_or(|torque_nm| torque_nm == 0.0) {
             if output.command_nm.is_none() {
                 // No reading has arrived: the device may still hold a torque, from an earlier incarnation of
                 // this drive.
@@ -229,11 +229,6 @@ impl Drive {
         let again = self.repeater.insert(repeater).handle().clone();
         let output = Output::new(self.device.damper(), again, context.clock().clone());
         context.guard::<GaitState, _>(central, output, |output, _| output.make_safe())
-    }
-
-    /// Whether central is known, but its commands do not count.
-    fn is_shut(&self) -> bool {
-        self.commands.as_ref().is_some_and(CentralCommands::is_shut)
     }
 
     /// Sends the device its order, and returns the torque, Nm; `None` if the device gets no order, or the one
@@ -305,10 +300,6 @@ impl Drive {
         let _ = context.send(commands.central, &Shut { suspect: commands.is_suspect() });
     }
 
-    fn at_rest(&self, output: &DriveOutput) -> bool {
-        output.command_nm.is_none_or(|torque_nm| torque_nm == 0.0)
-    }
-
     fn note(&mut self, now: Time, tick: Tick, output: &DriveOutput) {
         let counters = self.core.counters();
         let refused = counters.commands_refused;
@@ -354,16 +345,12 @@ impl Drive {
             pauses = counters.pauses,
             "the drive ends"
         );
-        if let Some(path) = &self.parts.figures
-            && let Err(error) = write_json(path, &summary)
-        {
+        let Some(path) = &self.parts.figures else { return };
+        let json = serde_json::to_vec_pretty(&summary).map_err(io::Error::other);
+        if let Err(error) = json.and_then(|json| std::fs::write(path, json)) {
             tracing::error!(path = %path.display(), %error, "the figures cannot be written");
         }
     }
-}
-
-fn write_json(path: &Path, value: &impl serde::Serialize) -> io::Result<()> {
-    std::fs::write(path, serde_json::to_string_pretty(value).map_err(io::Error::other)?)
 }
 
 /// Whole microseconds; saturates at about 71 minutes.

@@ -330,19 +330,14 @@ impl Handler<Delivery<NodeEvent>> for Gait {
     type Result = ();
 
     fn handle(&mut self, event: Delivery<NodeEvent>, _: &mut Self::Context) {
-        match event.payload {
-            NodeEvent::NodeLost { node, .. } => {
-                if let Some(joint) = self.joint_at(node) {
-                    self.learn(joint, |gone| gone.node = true);
-                }
-            }
+        let (node, is_gone) = match event.payload {
+            NodeEvent::NodeLost { node, .. } => (node, true),
+            NodeEvent::NodeFound { node, .. } | NodeEvent::NodeRestarted { node, .. } => (node, false),
             // Its drives' own watchdogs, and the requirements, report the effect on the gait sooner.
-            NodeEvent::AppStalled { .. } | NodeEvent::AppResumed { .. } => {}
-            NodeEvent::NodeFound { node, .. } | NodeEvent::NodeRestarted { node, .. } => {
-                if let Some(joint) = self.joint_at(node) {
-                    self.learn(joint, |gone| gone.node = false);
-                }
-            }
+            NodeEvent::AppStalled { .. } | NodeEvent::AppResumed { .. } => return,
+        };
+        if let Some(joint) = self.joint_at(node) {
+            self.learn(joint, |gone| gone.node = is_gone);
         }
     }
 }
@@ -352,12 +347,11 @@ impl Handler<Delivery<RequirementEvent>> for Gait {
 
     fn handle(&mut self, event: Delivery<RequirementEvent>, _: &mut Self::Context) {
         let Some(joint) = joint_of_sensor(event.name()) else { return };
-        match event.payload {
-            RequirementEvent::Lost { .. } | RequirementEvent::Without { .. } => {
-                self.learn(joint, |gone| gone.sensor = true)
-            }
-            RequirementEvent::Met { .. } => self.learn(joint, |gone| gone.sensor = false),
-        }
+        let is_gone = match event.payload {
+            RequirementEvent::Lost { .. } | RequirementEvent::Without { .. } => true,
+            RequirementEvent::Met { .. } => false,
+        };
+        self.learn(joint, |gone| gone.sensor = is_gone);
     }
 }
 

@@ -150,7 +150,7 @@ pub fn run(options: &LaunchOptions) -> Result<Walk, LaunchError> {
     if let Some(directory) = &options.keys {
         keys::check(&topology, directory)?;
     }
-    let intention = plant::intention(&topology.plant)?;
+    let intention = plant::intention(topology.plant.trial.as_deref(), topology.plant.seed)?;
     intention.notes().iter().for_each(|note| output::print(&format!("--trial: {note}\n")));
     intention.check_strides(strides)?;
     let folder = run_folder::create(&options.runs, &run_folder::name(&options.run))?;
@@ -173,10 +173,7 @@ fn topology(options: &LaunchOptions) -> Result<Topology, LaunchError> {
         PROJECT_WITH_KEYS.clone_into(&mut topology.project);
         topology.keys = Some(std::path::absolute(keys)?);
     }
-    topology.plant.trial = match &options.trial {
-        Some(path) => Some(std::path::absolute(path)?),
-        None => None,
-    };
+    topology.plant.trial = options.trial.as_deref().map(std::path::absolute).transpose()?;
     Ok(topology)
 }
 

@@ -108,7 +108,7 @@ fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<Ex
     let watch = watch::spec(part, WatchParts { node: watched.clone(), events: events.trace() });
     let builder =
         Node::builder(part.name()).config(topology.node_config(part)).incarnation(incarnation).app(watch);
-    let code = match part {
+    let (builder, finish_trace): (NodeBuilder, Box<dyn FnOnce() -> u64>) = match part {
         Part::Central => {
             let trace = record(options, part.name())?;
             let epoch = Arc::new(AtomicU32::new((incarnation.0 / 1_000_000) as u32));
@@ -125,9 +125,7 @@ fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<Ex
                 ReleaseBy::Itself => builder.app(coordinator::spec()),
                 ReleaseBy::Operator => builder,
             };
-            let code = start_and_run(builder, &watched, options)?;
-            report_lost_rows(trace.finish());
-            code
+            (builder, Box::new(move || trace.finish()))
         }
         Part::Joint(joint) => {
             let trace = record(options, part.name())?;
@@ -144,20 +142,9 @@ fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<Ex
             let builder = builder
                 .app(sensor::spec(joint, device, slots::SENSOR, events.trace(), place(topology)))
                 .app(drive::spec(parts, drive_place(joint, topology)));
-            let code = start_and_run(builder, &watched, options)?;
-            report_lost_rows(trace.finish());
-            code
+            (builder, Box::new(move || trace.finish()))
         }
     };
-    report_lost_rows(events.finish());
-    Ok(code)
-}
-
-fn start_and_run(
-    builder: NodeBuilder,
-    watched: &OnceLock<sinew::NodeHandle>,
-    options: &NodeOptions,
-) -> Result<ExitCode, NodeError> {
     let node = builder.start()?;
     let handle = node.handle();
     // Nothing else sets it.
@@ -165,17 +152,15 @@ fn start_and_run(
     if options.stop_with_stdin {
         when_stdin_ends(move || handle.stop())?;
     }
-    Ok(node.run())
+    let code = node.run();
+    for lost in [finish_trace(), events.finish()].into_iter().filter(|lost| *lost > 0) {
+        tracing::warn!(lost, "rows of a trace were lost: the disk was too slow");
+    }
+    Ok(code)
 }
 
 fn record<R: TraceRow>(options: &NodeOptions, name: &str) -> Result<Recording<R>, NodeError> {
     Recording::begin(options.run_dir.as_deref(), name).map_err(NodeError::Trace)
-}
-
-fn report_lost_rows(lost: u64) {
-    if lost > 0 {
-        tracing::warn!(lost, "rows of a trace were lost: the disk was too slow");
-    }
 }
 
 fn place(topology: &Topology) -> Place {
@@ -184,19 +169,15 @@ fn place(topology: &Topology) -> Place {
         ControlThread::Io => Place::io(),
         ControlThread::Own => Place::thread("control"),
     };
-    match control.realtime_priority {
-        Some(priority) => place.realtime(priority),
-        None => place,
-    }
+    control.realtime_priority.into_iter().fold(place, Place::realtime)
 }
 
 fn drive_place(joint: Joint, topology: &Topology) -> Place {
     match topology.joints[joint.index()].drive {
         DrivePlace::Node => place(topology),
-        DrivePlace::Process => match topology.control.realtime_priority {
-            Some(priority) => Place::process().realtime(priority),
-            None => Place::process(),
-        },
+        DrivePlace::Process => {
+            topology.control.realtime_priority.into_iter().fold(Place::process(), Place::realtime)
+        }
     }
 }
 

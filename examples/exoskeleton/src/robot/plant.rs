@@ -48,7 +48,7 @@ pub enum PlantError {
         cause: io::Error,
     },
     /// The trial is not usable.
-    #[error("plant.trial {path}: {reason}")]
+    #[error("the trial {path}: {reason}")]
     Trial {
         /// The path.
         path: String,
@@ -63,12 +63,12 @@ pub enum PlantError {
     Clock(rustix::io::Errno),
 }
 
-/// The intention of the person of `place`.
+/// The intention of the person: a recorded trial, or the built-in curves with variation from `seed`.
 ///
 /// # Errors
 /// The trial is not usable.
-pub fn intention(place: &PlantPlace) -> Result<Intention, PlantError> {
-    let Some(path) = &place.trial else { return Ok(Intention::from_curves(place.seed)) };
+pub fn intention(trial: Option<&Path>, seed: u64) -> Result<Intention, PlantError> {
+    let Some(path) = trial else { return Ok(Intention::from_curves(seed)) };
     let trial =
         Trial::read(path).map_err(|reason| PlantError::Trial { path: path.display().to_string(), reason })?;
     Ok(Intention::from_trial(Arc::new(trial)))
@@ -87,7 +87,7 @@ pub fn run(place: &PlantPlace, folder: Option<&Path>, stop: &AtomicBool) -> Resu
     let watchdog_ns = place.device_watchdog.map(|limit| limit.as_nanos() as u64);
     let config = PlantConfig { watchdog_ns, ..PlantConfig::default() };
     let mut plant = Plant {
-        core: PlantCore::new(config, intention(place)?, place.seed),
+        core: PlantCore::new(config, intention(place.trial.as_deref(), place.seed)?, place.seed),
         devices: Devices::new(socket),
         trace: recording.trace(),
         walking: false,
@@ -95,7 +95,7 @@ pub fn run(place: &PlantPlace, folder: Option<&Path>, stop: &AtomicBool) -> Resu
         skipped: 0,
         seq: 0,
     };
-    print_line("ready");
+    output::print("ready\n");
     let outcome = plant.run(stop);
     let (refused, skipped) = (plant.devices.refused, plant.skipped);
     let lost_rows = recording.finish();
@@ -187,15 +187,10 @@ impl Plant {
         let stride = self.core.truth().intended.strides as u64;
         if self.printed_stride != Some(stride) {
             self.printed_stride = Some(stride);
-            print_line(&format!("stride {stride}"));
+            // Once a stride, so that a write may take its microseconds.
+            output::print(&format!("stride {stride}\n"));
         }
     }
-}
-
-/// Prints a line for the program that started the plant. Once a stride, so that a write may take its
-/// microseconds.
-fn print_line(line: &str) {
-    output::print(&format!("{line}\n"));
 }
 
 /// The last command of a drive.

@@ -53,14 +53,16 @@ pub struct Discovery {
 }
 
 /// The thread that a node's control loops run on.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum ControlThread {
     /// The thread that reads the node's sockets: no thread wake between the network and the loop. The
     /// default.
     #[default]
+    #[value(help = "On the thread that reads the node's sockets")]
     Io,
     /// A thread of its own: the network cannot delay the loop, for one more wake per message.
+    #[value(help = "On a thread of their own")]
     Own,
 }
 

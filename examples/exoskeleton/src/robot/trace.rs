@@ -28,7 +28,7 @@ const INCARNATIONS_MAX: u32 = 100;
 const WRITER_NICENESS: i32 = 10;
 
 /// A row of a trace.
-pub trait TraceRow: Serialize + DeserializeOwned + Send + 'static {
+pub trait TraceRow: Clone + Serialize + DeserializeOwned + Send + 'static {
     /// The first line of the file.
     const HEADER: &'static str;
 }
@@ -147,18 +147,11 @@ impl TraceRow for EventRow {
 }
 
 /// The input for a loop's rows. Never waits.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Trace<R> {
     /// `None`: the rows are not recorded.
     rows: Option<SyncSender<R>>,
     lost: Arc<AtomicU64>,
-}
-
-// A derived implementation would require rows that can be cloned.
-impl<R> Clone for Trace<R> {
-    fn clone(&self) -> Self {
-        Self { rows: self.rows.clone(), lost: self.lost.clone() }
-    }
 }
 
 impl<R> Trace<R> {

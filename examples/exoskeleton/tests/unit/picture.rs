@@ -7,7 +7,7 @@ use super::*;
 
 #[test]
 fn phase_error_is_not_drawn_without_an_estimate() {
-    let drawn = broken_at_jumps(vec![(6.99, 1.0), (7.0, 1.2), (9.0, 0.1), (9.01, 0.1)]);
+    let drawn = broken(vec![(6.99, 1.0), (7.0, 1.2), (9.0, 0.1), (9.01, 0.1)], 20.0, STRIDES_UNKNOWN_MIN);
     assert_eq!(drawn.len(), 5);
     assert!(drawn[2].1.is_nan());
 }

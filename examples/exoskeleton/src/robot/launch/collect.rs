@@ -80,28 +80,19 @@ impl Traces {
     /// A trace cannot be read.
     pub fn read(folder: &Path, stop: Time) -> io::Result<Self> {
         let until = stop.as_nanos();
+        let mut plant = read_incarnations::<PlantRow>(folder, "plant")?.concat();
+        plant.retain(|row| row.t_ns <= until);
+        let mut gait = read_incarnations::<GaitRow>(folder, Part::Central.name())?.concat();
+        gait.retain(|row| row.t_ns <= until);
         let [hip, knee, ankle] = Joint::ALL.map(|joint| read_incarnations::<DriveRow>(folder, joint.name()));
         let mut drives = [hip?, knee?, ankle?];
         drives.iter_mut().flatten().for_each(|incarnation| incarnation.retain(|row| row.t_ns <= until));
-        let mut events = BTreeMap::new();
-        for part in Part::ALL {
-            events.insert(
-                part,
-                read_incarnations(folder, &format!("{part}-events"))?.into_iter().flatten().collect(),
-            );
-        }
-        Ok(Self {
-            plant: up_to(read_incarnations(folder, "plant")?, |row: &PlantRow| row.t_ns <= until),
-            gait: up_to(read_incarnations(folder, Part::Central.name())?, |row: &GaitRow| row.t_ns <= until),
-            drives,
-            events,
-        })
+        let of_part = |part: Part| {
+            read_incarnations::<EventRow>(folder, &format!("{part}-events")).map(|all| (part, all.concat()))
+        };
+        let events = Part::ALL.into_iter().map(of_part).collect::<io::Result<_>>()?;
+        Ok(Self { plant, gait, drives, events })
     }
-}
-
-/// All incarnations in one, without the rows after the stop order.
-fn up_to<R>(incarnations: Vec<Vec<R>>, holds: impl Fn(&R) -> bool) -> Vec<R> {
-    incarnations.into_iter().flatten().filter(|row| holds(row)).collect()
 }
 
 /// Reads the traces of a run; returns its report, its record, and the lateness of the drives' ticks.

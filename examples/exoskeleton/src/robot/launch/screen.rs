@@ -1,5 +1,6 @@
 //! The status screen: a picture ten times a second on a terminal, a line for each change elsewhere.
 
+use std::fmt::Debug;
 use std::io::{self, IsTerminal};
 
 use exoskeleton_model::joint::Joint;
@@ -96,7 +97,7 @@ impl Screen {
             None => "  central  -".to_owned(),
             Some(gait) => format!(
                 "  central  {:5}  phase [{}] {:3.0} %  trust {:.2}  loop late {:.1} ms at most",
-                gait.mode.map_or_else(|| "-".to_owned(), |mode| format!("{mode:?}")),
+                shown(gait.mode),
                 bar(gait.phase),
                 100.0 * gait.phase,
                 gait.confidence,
@@ -125,13 +126,14 @@ impl Screen {
 }
 
 fn states(view: &View) -> String {
-    let central =
-        view.gait().and_then(|gait| gait.mode).map_or_else(|| "-".to_owned(), |mode| format!("{mode:?}"));
-    let drives = Joint::ALL.map(|joint| {
-        let state = view.drive(joint).map_or_else(|| "-".to_owned(), |drive| format!("{:?}", drive.state));
-        format!("{joint} {state}")
-    });
+    let central = shown(view.gait().and_then(|gait| gait.mode));
+    let drives =
+        Joint::ALL.map(|joint| format!("{joint} {}", shown(view.drive(joint).map(|drive| drive.state))));
     format!("central {central}, {}", drives.join(", "))
+}
+
+fn shown(state: Option<impl Debug>) -> String {
+    state.map_or_else(|| "-".to_owned(), |state| format!("{state:?}"))
 }
 
 /// "X has waited 1.3 s for Y" without the time.
