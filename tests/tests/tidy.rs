@@ -4,7 +4,7 @@
 //! `what was sent`), and persons in place of programs (`he`), so these are limited: CONTRIBUTING, section "Style".
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     fs,
     path::{Path, PathBuf},
 };
@@ -72,6 +72,13 @@ const BANNED: [(&str, &str); 50] = [
     ("rouse_later", "wake_later"),
     ("send_told", "send_with_tag"),
     ("while_away", "while_down"),
+];
+
+/// Types that implement `Error` and are none: a `Result` or a `Display` needs it. The glossary has them, too.
+const NO_ERRORS: [(&str, &str); 3] = [
+    ("Cause", "a state of an output, which is shown; `protection` of the runtime"),
+    ("FirstDifference", "the result of a comparison of two runs"),
+    ("Rejection", "the protocol's word for the reason of an outcome"),
 ];
 
 const WHO: [&str; 5] = ["who", "whom", "whose", "whoever", "whomever"];
@@ -225,6 +232,45 @@ fn names_are_terms_of_the_field() {
     assert!(found.is_empty(), "use the field's terms:\n{}", found.join("\n"));
 }
 
+/// Returns the types of a file that implement `Error` by a derive or by hand, without the comments' ones.
+fn error_types(text: &str) -> Vec<String> {
+    let code: Vec<_> = text.lines().filter(|line| comment(line).is_none()).collect();
+    let code = code.join("\n");
+    let mut found: Vec<_> = code.split("Error for ").skip(1).map(first_word).collect();
+    for derived in code.split("#[derive(").skip(1) {
+        let (traits, rest) = derived.split_once(")]").unwrap_or_default();
+        if traits.split([',', ':']).any(|name| name.trim() == "Error") {
+            found.extend(rest.lines().find_map(declared_type));
+        }
+    }
+    found
+}
+
+/// Returns the name of the type that a line declares.
+fn declared_type(line: &str) -> Option<String> {
+    let is_visibility = |word: &&str| word.starts_with("pub") || word.ends_with(')');
+    let mut words = line.split_whitespace().skip_while(is_visibility);
+    let is_type = ["enum", "struct"].contains(&words.next()?);
+    is_type.then(|| words.next().map(first_word)).flatten()
+}
+
+fn first_word(text: &str) -> String {
+    text.chars().take_while(|character| character.is_alphanumeric() || *character == '_').collect()
+}
+
+#[test]
+fn names_of_errors_end_in_error() {
+    let mut excepted = BTreeSet::new();
+    for Source { path, text } in sources().iter().filter(|source| !source.path.ends_with("tests/tidy.rs")) {
+        for name in error_types(text).into_iter().filter(|name| !name.ends_with("Error")) {
+            let reason = NO_ERRORS.iter().find(|(exception, _)| *exception == name);
+            assert!(reason.is_some(), "{}: {name} is an error: let its name end in Error", path.display());
+            excepted.insert(name);
+        }
+    }
+    assert_eq!(excepted.len(), NO_ERRORS.len(), "an exception has gone: take it out of the list");
+}
+
 #[test]
 fn rules_find_planted_violations() {
     let text = "/// Tells who asked.\nfn ask() {}\n// What he sent, and `whom` it names.\n";
@@ -235,4 +281,10 @@ fn rules_find_planted_violations() {
     assert_eq!(wide_lines(&planted(&wide)), ["tests/planted.rs:1"]);
     let named = banned_names(&planted("// a Roster\nlet x: Roster = is_rostered();\n"));
     assert_eq!(named, ["tests/planted.rs:2: Roster: say SupervisorHandle"]);
+    let derived = "#[derive(Debug, thiserror::Error)]\n#[error(\"a struct\")]\npub(crate) enum Trouble {\n";
+    assert_eq!(error_types(derived), ["Trouble"]);
+    assert_eq!(error_types("impl fmt::Error for One {}\n// impl Error for Two {}\n"), ["One"]);
+    assert!(
+        error_types("#[derive(Debug, Clone)]\nstruct Plain;\nimpl From<IoError> for Plain {}\n").is_empty()
+    );
 }
