@@ -177,7 +177,8 @@ fn top_modules(text: &str, depth: usize) -> BTreeSet<String> {
             let rest = &code[at + prefix.len()..];
             let names = rest.strip_prefix('{').map_or_else(|| vec![rest], members);
             let is_letter = |letter: &char| letter.is_alphanumeric() || *letter == '_';
-            found.extend(names.into_iter().map(|name| name.chars().take_while(is_letter).collect()));
+            found
+                .extend(names.into_iter().map(|name| name.chars().take_while(is_letter).collect::<String>()));
         }
     }
     found

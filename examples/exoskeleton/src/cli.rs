@@ -179,9 +179,10 @@ fn options(arguments: &Arguments) -> Result<LaunchOptions, RunError> {
         Some(ms) if !(1..=10_000).contains(&ms) => return Err(RunError::Watchdog(ms)),
         limit => limit.map(Duration::from_millis),
     };
+    let (realtime_priority, release) = (arguments.realtime_priority, ReleaseBy::Itself);
     let thread = match arguments.control_thread {
         // The network must not run at a real-time priority.
-        ControlThread::Io if arguments.realtime_priority.is_none() => ControlThread::Io,
+        ControlThread::Io if realtime_priority.is_none() => ControlThread::Io,
         ControlThread::Io | ControlThread::Own => ControlThread::Own,
     };
     Ok(LaunchOptions {
@@ -189,19 +190,16 @@ fn options(arguments: &Arguments) -> Result<LaunchOptions, RunError> {
         trial: arguments.trial.clone(),
         kill: arguments.kill,
         device_watchdog,
-        control: Control {
-            thread,
-            realtime_priority: arguments.realtime_priority,
-            release: ReleaseBy::Itself,
-        },
+        control: Control { thread, realtime_priority, release },
         keys: arguments.keys.clone(),
         runs: arguments.runs.clone(),
     })
 }
 
 fn description(arguments: &Arguments) -> RunDescription {
-    let file_name =
-        |path: &PathBuf| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+    let file_name = |path: &PathBuf| {
+        path.file_name().map_or_else(|| path.to_string_lossy(), |name| name.to_string_lossy()).into_owned()
+    };
     RunDescription {
         mode: if arguments.lock_step { RunMode::LockStep } else { RunMode::RealTime },
         strides: arguments.strides,

@@ -69,8 +69,8 @@ impl Schema {
     /// Finds the structure of `T`, as rmp-serde writes it with field names.
     ///
     /// # Errors
-    /// [`TraceError`] if `T` has no fixed structure (`flatten`, `untagged`, `tag`), has a hand-written `Deserialize` that
-    /// refuses each sample, contains two types of one name, is too large, or panics.
+    /// [`TraceError`] if `T` has no fixed structure (`flatten`, `untagged`, `tag`), has a hand-written `Deserialize`
+    /// that refuses each sample, contains two types of one name, is too large, or panics.
     ///
     /// # Examples
     ///

@@ -92,10 +92,10 @@ impl Gait {
     fn new(parts: GaitParts) -> Self {
         // Only its growth matters.
         let epoch = parts.epoch.fetch_add(1, Ordering::Relaxed);
-        let resume = parts.resume;
+        let config = CentralConfig { epoch, resume: parts.resume, ..CentralConfig::default() };
         Self {
+            core: CentralCore::new(config),
             parts,
-            core: CentralCore::new(CentralConfig { epoch, resume, ..CentralConfig::default() }),
             drives: Joint::ALL.map(|joint| Addressee::new(drive_name(joint))),
             mode: None,
             samples: [None; 3],
