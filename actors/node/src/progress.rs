@@ -27,7 +27,7 @@ const STALLED_AFTER: Duration = Duration::from_millis(250);
 /// The layers' addresses, in the order of their names.
 const ADDRESSES: [AppAddress; 4] = [AppAddress::LNCL, AppAddress::SYNC, AppAddress::GNCL, AppAddress::NDL];
 
-/// Returns the milliseconds since `since`, at most what a `u32` holds.
+/// Returns the milliseconds since `since`, at most the largest number.
 pub(crate) fn millis_since(now: Time, since: Time) -> u32 {
     u32::try_from(now.since(since).as_millis()).unwrap_or(u32::MAX)
 }
