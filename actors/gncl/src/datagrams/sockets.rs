@@ -32,7 +32,7 @@ pub(crate) struct Announcement {
 /// One of this node's sockets, as its peers address it.
 #[derive(Clone, Debug)]
 pub(crate) struct BoundSocket {
-    pub(super) socket: Arc<UdpSocket>,
+    pub(crate) socket: Arc<UdpSocket>,
     at: SocketAddr,
     /// The address at which peers reach it, if it differs from `at`.
     outer: Option<SocketAddrV4>,
@@ -64,7 +64,7 @@ impl Sockets {
         }
     }
 
-    pub(super) fn all(&self) -> Vec<BoundSocket> {
+    pub(crate) fn all(&self) -> Vec<BoundSocket> {
         lock(&self.0).clone()
     }
 
