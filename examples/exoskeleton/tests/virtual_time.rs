@@ -174,6 +174,7 @@ fn replay(config: &LockStepConfig, bench: &SharedBench, released_at: Time) -> Re
             events: events.clone(),
             figures: None,
             burden: None,
+            sends_ticks: true,
         };
         replay = replay
             .name(sensor_name(joint), tid(joint.index(), 1))

@@ -16,6 +16,8 @@ pub const GAIT: &str = "central.gait";
 pub const STOP: &str = "exo.stop";
 /// Group of the receivers of statuses.
 pub const STATUS: &str = "exo.status";
+/// Group of the drives' ticks. It has no members: recordings have its messages.
+pub const TICKS: &str = "exo.ticks";
 
 /// Time between two lookups in the directory, ns.
 const LOOK_PERIOD_NS: u128 = 100_000_000;
