@@ -10,6 +10,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use sinew::message::Kind;
+
 use session::{NodeFile, Session};
 
 /// Name of the file with the messages of all nodes.
@@ -29,6 +31,18 @@ pub struct WalkRecorder {
     folder: PathBuf,
     orders: Arc<Orders>,
     threads: Vec<JoinHandle<NodeRecords>>,
+}
+
+/// The names that the topics of a recording have.
+#[derive(Debug, Clone, Default)]
+pub struct KnownNames {
+    /// Applications of all nodes. A recorder writes nothing before its node knows them, for 5 s at most: meanwhile the
+    /// node keeps the messages.
+    pub apps: Vec<String>,
+    /// Groups.
+    pub groups: Vec<&'static str>,
+    /// Payload types.
+    pub types: Vec<(Kind, &'static str)>,
 }
 
 /// The orders to all threads.
@@ -70,14 +84,14 @@ impl WalkRecorder {
     ///
     /// # Errors
     /// The system provides no thread.
-    pub fn start(nodes: &[(String, PathBuf)], folder: &Path) -> io::Result<Self> {
-        let orders = Arc::<Orders>::default();
+    pub fn start(nodes: &[(String, PathBuf)], names: KnownNames, folder: &Path) -> io::Result<Self> {
+        let (orders, names) = (Arc::<Orders>::default(), Arc::new(names));
         // Those that run already end if a later one cannot be started.
         let mut recorder = Self { folder: folder.to_owned(), orders: orders.clone(), threads: Vec::new() };
         for (name, socket) in nodes {
             let (name, socket, folder) = (name.clone(), socket.clone(), folder.to_owned());
-            let orders = orders.clone();
-            let record = move || record_node(&name, &socket, &folder, &orders);
+            let (orders, names) = (orders.clone(), names.clone());
+            let record = move || record_node(&name, &socket, &folder, (&names, &orders));
             let thread = std::thread::Builder::new().name("recorder".to_owned()).spawn(record)?;
             recorder.threads.push(thread);
         }
@@ -138,7 +152,12 @@ impl Drop for WalkRecorder {
 }
 
 /// Records a node, incarnation by incarnation.
-fn record_node(name: &str, socket: &Path, folder: &Path, orders: &Orders) -> NodeRecords {
+fn record_node(
+    name: &str,
+    socket: &Path,
+    folder: &Path,
+    (names, orders): (&KnownNames, &Orders),
+) -> NodeRecords {
     // A higher priority than requested is no reason to record nothing.
     let _ = rustix::process::setpriority_process(None, NICENESS);
     let mut records = NodeRecords::default();
@@ -151,7 +170,7 @@ fn record_node(name: &str, socket: &Path, folder: &Path, orders: &Orders) -> Nod
                 records.faults.push(fault);
             }
         };
-        match Session::begin(socket, &path) {
+        match Session::begin(socket, &path, names) {
             Ok(Some(session)) => {
                 number += 1;
                 records.files.push(session.run(&orders.stop, &mut fault));

@@ -43,13 +43,13 @@ pub struct Replayed {
 pub struct JointResult {
     /// Recorded ticks.
     pub ticks: u64,
-    /// Ticks that were computed again.
+    /// Ticks that were computed again. Ticks at rest are left out where the recording lacks their inputs.
     pub compared: u64,
     /// Ticks with the same torque, gain of assistance and state, bit by bit.
     pub identical: u64,
     /// The first tick that differs.
     pub first_difference: Option<Difference>,
-    /// The reason why the ticks from there on cannot be computed again, until the drive starts anew.
+    /// The reason why ticks cannot be computed again, from some tick on until the drive is at rest.
     pub gap: Option<String>,
 }
 
@@ -132,10 +132,11 @@ pub fn replay(path: &Path, config: impl Fn(Joint) -> DriveConfig) -> Result<Repl
 }
 
 impl Replayed {
-    /// Whether every recorded tick was computed again, with the same result.
+    /// Whether the recorded ticks were computed again, each with the same result.
     #[must_use]
     pub fn is_same(&self) -> bool {
-        self.joints.iter().all(|joint| joint.identical == joint.ticks)
+        let is_whole = |joint: &JointResult| joint.identical == joint.compared && joint.gap.is_none();
+        self.joints.iter().all(is_whole) && self.joints.iter().any(|joint| joint.compared > 0)
     }
 }
 
@@ -177,7 +178,7 @@ impl fmt::Display for Replayed {
         }
         self.damage.iter().try_for_each(|damage| writeln!(f, "{damage}"))?;
         if self.is_same() {
-            return writeln!(f, "SAME: every recorded torque was computed again, bit by bit");
+            return writeln!(f, "SAME: each torque was computed again, with the same bits");
         }
         if self.joints.iter().any(|joint| joint.first_difference.is_some()) {
             return writeln!(f, "DIFFERENT: see the first difference above");

@@ -22,6 +22,7 @@ use sinew::Time;
 use sinew_figures::stalls::{HostCpu, Witness};
 use thiserror::Error;
 
+use super::edges;
 use super::node::NodeError;
 use super::plant::{self, PlantError};
 use super::role::Role;
@@ -321,5 +322,5 @@ impl<'a> Launch<'a> {
 fn record(topology: &Topology, folder: &Path) -> io::Result<WalkRecorder> {
     let socket = |part: Part| Some((part.name().to_owned(), topology.place(part).socket.clone()?));
     let nodes: Vec<_> = Part::ALL.into_iter().filter_map(socket).collect();
-    WalkRecorder::start(&nodes, folder)
+    WalkRecorder::start(&nodes, edges::names(), folder)
 }

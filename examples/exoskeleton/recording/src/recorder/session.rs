@@ -11,10 +11,17 @@ use sinew_bag::{BagError, BagWriter, Compression, Options, Origin, Totals};
 use sinew_recorder::{JournalReader, Names, ReadJournalError, Recorder, Setup, Start};
 use thiserror::Error;
 
+use super::KnownNames;
+
 /// Time limit for the registration, and for the first answer.
 const BEGUN_WITHIN: Duration = Duration::from_secs(2);
 /// Pause after the journal was read to its end: it keeps seconds.
 const PAUSE: Duration = Duration::from_millis(5);
+/// Time for the node to know the names of all applications. The journal keeps the messages meanwhile: they are few
+/// before the walk.
+const NAMED_WITHIN: Duration = Duration::from_secs(5);
+/// Interval at which the node is asked for them.
+const NAMED_PERIOD: Duration = Duration::from_millis(50);
 /// Interval at which the recording is renewed at the node: its lease is 5 s.
 const RENEWAL: Duration = Duration::from_secs(1);
 /// Time limit of a renewal: meanwhile the journal is not read.
@@ -49,15 +56,20 @@ pub(super) enum SessionError {
 }
 
 /// A running recording.
-pub(super) struct Session {
+pub(super) struct Session<'n> {
     endpoint: Endpoint,
     recorder: Recorder,
     path: PathBuf,
+    names: &'n KnownNames,
 }
 
-impl Session {
+impl<'n> Session<'n> {
     /// Starts the recording of the node at this socket; `None`: no node is there.
-    pub(super) fn begin(socket: &Path, path: &Path) -> Result<Option<Self>, SessionError> {
+    pub(super) fn begin(
+        socket: &Path,
+        path: &Path,
+        known: &'n KnownNames,
+    ) -> Result<Option<Self>, SessionError> {
         let Ok(node) = NodeApi::connect(socket) else { return Ok(None) };
         let registration = Registration::new().deadline(BEGUN_WITHIN).without_reconnect();
         let mut endpoint = node.register_transport_address(registration)?;
@@ -81,15 +93,18 @@ impl Session {
         let options = Options { compression: Compression::Lz4, replace: true, ..Options::default() };
         let bag = BagWriter::create(path, options, origin)?;
         let mut names = Names::default();
+        known.groups.iter().for_each(|group| names.add_app(Tid::group(group), group));
+        known.types.iter().for_each(|(kind, name)| names.add_type(*kind, name));
         learn(&mut names, &first);
         let setup = Setup { node, selection: Selection::default(), names, left_out: vec![endpoint.tid()] };
         let mut recorder = Recorder::begin(reader, bag, setup)?;
         recorder.clocks(now_ns, &first.clocks);
-        Ok(Some(Self { endpoint, recorder, path: path.to_owned() }))
+        Ok(Some(Self { endpoint, recorder, path: path.to_owned(), names: known }))
     }
 
     /// Records until the node ends or `stop` is set, and finishes the file.
     pub(super) fn run(mut self, stop: &AtomicBool, fault: &mut impl FnMut(String)) -> NodeFile {
+        self.await_names(stop);
         let mut renewal = Time::now() + RENEWAL;
         while !stop.load(Ordering::Relaxed) && self.recorder.is_writer_alive() {
             let now = Time::now();
@@ -106,6 +121,21 @@ impl Session {
             }
         }
         self.finish(fault)
+    }
+
+    /// Asks for names until the node knows all applications. A channel keeps the names of its first message.
+    fn await_names(&mut self, stop: &AtomicBool) {
+        let until = Time::now() + NAMED_WITHIN;
+        while Time::now() < until && !stop.load(Ordering::Relaxed) && self.recorder.is_writer_alive() {
+            if let Ok(report) = ask(&mut self.endpoint, RENEWED_WITHIN) {
+                learn(self.recorder.names_mut(), &report);
+                let is_known = |name: &String| report.apps.iter().any(|app| app.name == *name);
+                if self.names.apps.iter().all(is_known) {
+                    return;
+                }
+            }
+            std::thread::sleep(NAMED_PERIOD);
+        }
     }
 
     /// Returns whether the journal was read to its end; `None`: it cannot be read any more.

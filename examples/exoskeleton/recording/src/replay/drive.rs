@@ -43,16 +43,19 @@ impl DriveReplay {
         self.result.ticks += 1;
         self.began_ns.get_or_insert(tick.t_ns);
         let last = self.last.replace(tick.seq);
-        if last.is_none_or(|last| tick.seq <= last) {
+        // A number that does not grow is that of another incarnation.
+        let is_next = last.is_some_and(|last| tick.seq > last);
+        if is_next && last.is_some_and(|last| tick.seq - last > 1) && self.core.is_some() {
+            self.lose(tick, format!("the ticks before tick {} are not in the recording", tick.seq));
+        }
+        if !is_next || self.core.is_none() {
             self.begin(tick);
-        } else if last.is_some_and(|last| tick.seq - last > 1) && self.core.is_some() {
-            self.lose(format!("the ticks before tick {} are not in the recording", tick.seq));
         }
         let Some(core) = self.core.as_mut() else { return };
         let computed = match compute(core, tick, inputs) {
             Ok(computed) => computed,
             Err(missing) => {
-                self.lose(missing);
+                self.lose(tick, missing);
                 return;
             }
         };
@@ -71,22 +74,28 @@ impl DriveReplay {
 
     /// Begins with the first tick of a drive, or with a later one in which the drive is at rest.
     fn begin(&mut self, tick: &DriveTick) {
-        let is_at_rest = matches!(tick.before, DriveState::Init | DriveState::Ready)
-            && tick.torque_nm.is_none_or(|torque_nm| torque_nm == 0.0);
-        self.core = (tick.seq == 1 || is_at_rest).then(|| DriveCore::new(self.config));
+        self.core = (tick.seq == 1 || is_at_rest(tick)).then(|| DriveCore::new(self.config));
         if self.core.is_none() {
-            self.lose(format!(
-                "the recording begins with tick {}, in which the drive is not at rest",
-                tick.seq
-            ));
+            self.lose(
+                tick,
+                format!("before tick {} the recording has no tick of the drive at rest", tick.seq),
+            );
         }
     }
 
-    /// Gives up the drive until it starts anew. The first reason is kept.
-    fn lose(&mut self, why: String) {
+    /// Gives up the drive until it is at rest. A drive at rest lost nothing. The first reason is kept.
+    fn lose(&mut self, tick: &DriveTick, why: String) {
         self.core = None;
-        self.result.gap.get_or_insert(why);
+        if !is_at_rest(tick) {
+            self.result.gap.get_or_insert(why);
+        }
     }
+}
+
+/// Whether the state of the drive is that of a new one: it gives no torque, and has none to ramp to zero.
+fn is_at_rest(tick: &DriveTick) -> bool {
+    matches!(tick.before, DriveState::Init | DriveState::Ready)
+        && tick.torque_nm.is_none_or(|torque_nm| torque_nm == 0.0)
 }
 
 /// Computes a tick; an error names the input that the recording lacks.
