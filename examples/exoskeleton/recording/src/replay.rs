@@ -183,6 +183,6 @@ impl fmt::Display for Replayed {
         if self.joints.iter().any(|joint| joint.first_difference.is_some()) {
             return writeln!(f, "DIFFERENT: see the first difference above");
         }
-        writeln!(f, "INCOMPLETE: what was compared is the same; the recording lacks the rest")
+        writeln!(f, "INCOMPLETE: no compared torque differs; the recording lacks inputs of the others")
     }
 }

@@ -19,7 +19,7 @@ struct TestFolder(PathBuf);
 impl TestFolder {
     fn new(name: &str) -> Self {
         let folder = std::env::temp_dir().join(format!("exoskeleton-{name}-{}", std::process::id()));
-        std::fs::create_dir_all(&folder).unwrap();
+        std::fs::create_dir_all(&folder).expect("a folder of this test");
         Self(folder)
     }
 }

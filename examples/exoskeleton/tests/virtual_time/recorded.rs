@@ -45,7 +45,7 @@ fn party(tid: Tid) -> Party {
 /// Writes a recording of these messages.
 fn write<'m>(path: &Path, messages: impl IntoIterator<Item = &'m TimedMessage>) {
     let options = Options { replace: true, ..Options::default() };
-    let mut bag = BagWriter::create(path, options, Origin::default()).unwrap();
+    let mut bag = BagWriter::create(path, options, Origin::default()).expect("a file of this test");
     let (mut channels, mut end_ns) = (BTreeMap::new(), 0);
     for message in messages {
         let TimedMessage { source, destination, kind, .. } = *message;
@@ -62,7 +62,7 @@ fn write<'m>(path: &Path, messages: impl IntoIterator<Item = &'m TimedMessage>) 
                 refused: None,
                 seen_before: 0,
             });
-            (channel.unwrap(), 0)
+            (channel.expect("there is room for all channels"), 0)
         });
         *number += 1;
         end_ns = message.at.as_nanos();
@@ -74,9 +74,9 @@ fn write<'m>(path: &Path, messages: impl IntoIterator<Item = &'m TimedMessage>) 
             payload: &message.payload,
             ..BagRecord::default()
         };
-        bag.message(*channel, &record).unwrap();
+        bag.message(*channel, &record).expect("there is room on the disk");
     }
-    bag.finish(end_ns).unwrap();
+    bag.finish(end_ns).expect("there is room on the disk");
 }
 
 fn replayed(name: &str, messages: &[&TimedMessage], gain: f64) -> Replayed {
@@ -87,7 +87,7 @@ fn replayed(name: &str, messages: &[&TimedMessage], gain: f64) -> Replayed {
         config.law.assist *= gain;
         config
     };
-    replay(&file.0, config).unwrap()
+    replay(&file.0, config).expect("it has ticks")
 }
 
 #[test]
