@@ -13,6 +13,8 @@ use thiserror::Error;
 
 use super::KnownNames;
 
+/// Maximum bytes of one file: a long walk must not fill the disk. Messages beyond it are counted as dropped.
+const SIZE_MAX: u64 = 2 << 30;
 /// Time limit for the registration, and for the first answer.
 const BEGUN_WITHIN: Duration = Duration::from_secs(2);
 /// Pause after the journal was read to its end: it keeps seconds.
@@ -90,7 +92,12 @@ impl<'n> Session<'n> {
         };
         // The robot walks on the same CPUs: the least work counts, not the smallest file. A file of this name is
         // that of an attempt which failed below.
-        let options = Options { compression: Compression::Lz4, replace: true, ..Options::default() };
+        let options = Options {
+            compression: Compression::Lz4,
+            size_max: Some(SIZE_MAX),
+            replace: true,
+            ..Options::default()
+        };
         let bag = BagWriter::create(path, options, origin)?;
         let mut names = Names::default();
         known.groups.iter().for_each(|group| names.add_app(Tid::group(group), group));
