@@ -12,8 +12,10 @@ use exoskeleton::robot::node::{self, NodeError, NodeOptions};
 use exoskeleton::robot::plant::{self, PlantError};
 use exoskeleton::robot::topology::{Control, ControlThread, ReleaseBy};
 use exoskeleton::run_folder;
+use exoskeleton_model::control::drive::DriveConfig;
 use exoskeleton_model::lockstep::{self, LockStepConfig, LockStepError};
 use exoskeleton_model::part::Kill;
+use exoskeleton_recording::replay::{self, ReplayError};
 use thiserror::Error;
 
 /// A powered leg of four nodes and a simulated person.
@@ -57,6 +59,16 @@ pub(crate) struct Arguments {
     /// Folder for the run folders.
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
+    /// Do not record the messages of the nodes. Real time only; in virtual time nothing is recorded.
+    #[arg(long, conflicts_with = "lock_step")]
+    no_record: bool,
+    /// Compute the drives of a recorded walk again, from `walk.mcap` or the file of a joint's node, and compare their
+    /// torques bit by bit. No walk.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["lock_step", "trial", "report", "kill", "keys", "no_record"])]
+    replay: Option<PathBuf>,
+    /// Multiply assistance, stiffness and damping of the replayed drives, to see a difference.
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, requires = "replay")]
+    gain_factor: f64,
 }
 
 #[derive(Debug, Subcommand)]
@@ -68,7 +80,7 @@ enum SubCommand {
 const EXIT_CODES: &str = "\
 Exit codes:
   0  all limits held
-  1  it did not walk, or a result could not be written; the error says why
+  1  it did not walk, or a result could not be written; the error says why. With --replay: not every torque is the same
   2  the command line is wrong
   3  it walked, and a limit did not hold (FAILED); the table says which
   4  it walked, but other load on this host disturbed too many strides to judge them (INCONCLUSIVE); use an idle host, more strides,
@@ -117,6 +129,9 @@ pub(crate) enum RunError {
     /// A part of the robot did not run.
     #[error(transparent)]
     Node(#[from] NodeError),
+    /// The recording cannot be replayed.
+    #[error("--replay: {0}")]
+    Replay(#[from] ReplayError),
     /// A device watchdog without effect.
     #[error("--device-watchdog {0}: give 1 to 10000 ms, or leave it out for none")]
     Watchdog(u64),
@@ -138,9 +153,26 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode, RunError> {
     if let Some(SubCommand::Node(options)) = &arguments.command {
         return Ok(node::run(options)?);
     }
+    if let Some(file) = &arguments.replay {
+        return replay_drives(file, arguments.gain_factor);
+    }
     check_kill(arguments)?;
     let verdict = if arguments.lock_step { lock_step(arguments) } else { real_time(arguments) };
     verdict.map(code)
+}
+
+/// Computes the drives of a recorded walk again, and prints the comparison.
+fn replay_drives(file: &Path, gain_factor: f64) -> Result<ExitCode, RunError> {
+    let replayed = replay::replay(file, |joint| {
+        let mut config = DriveConfig::standard(joint);
+        let law = &mut config.law;
+        for gain in [&mut law.assist, &mut law.stiffness_nm_rad, &mut law.damping_nms_rad] {
+            *gain *= gain_factor;
+        }
+        config
+    })?;
+    output::print(&replayed.to_string());
+    Ok(if replayed.is_same() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
 /// Walks in virtual time, prints the table, writes the folder.
@@ -171,6 +203,9 @@ fn real_time(arguments: &Arguments) -> Result<Verdict, RunError> {
         "written: {}/ gait.svg, run.csv, report.json, and each process's trace and log\n",
         walk.folder.display()
     ));
+    if let Some(recorded) = &walk.recorded {
+        output::print(&recorded.to_string());
+    }
     Ok(walk.report.verdict)
 }
 
@@ -190,7 +225,7 @@ fn options(arguments: &Arguments) -> Result<LaunchOptions, RunError> {
         trial: arguments.trial.clone(),
         kill: arguments.kill,
         device_watchdog,
-        control: Control { thread, realtime_priority, release },
+        control: Control { thread, realtime_priority, release, record: !arguments.no_record },
         keys: arguments.keys.clone(),
         runs: arguments.runs.clone(),
     })

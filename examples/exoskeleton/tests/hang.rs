@@ -221,6 +221,7 @@ fn joint_node(host: u8, device: &Device, will: &Arc<Will>) -> (NodeBuilder, Reco
         events: events.trace(),
         figures: None,
         burden: None,
+        sends_ticks: false,
     };
     let gait = AppSpec::new(GAIT, move || Gait { will: of_will.clone(), seq: 0 }).handles::<Shut>();
     let node = Node::builder("ankle")

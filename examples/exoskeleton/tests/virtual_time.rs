@@ -1,6 +1,9 @@
 //! The applications of the robot in virtual time: the torques of its actors are those of the lock-step loop,
 //! bit by bit.
 
+#[path = "virtual_time/recorded.rs"]
+mod recorded;
+
 use std::sync::atomic::AtomicU32;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -174,6 +177,7 @@ fn replay(config: &LockStepConfig, bench: &SharedBench, released_at: Time) -> Re
             events: events.clone(),
             figures: None,
             burden: None,
+            sends_ticks: true,
         };
         replay = replay
             .name(sensor_name(joint), tid(joint.index(), 1))
@@ -191,17 +195,25 @@ fn replay(config: &LockStepConfig, bench: &SharedBench, released_at: Time) -> Re
     replay.app(gait::spec(gait, place)).app(plant)
 }
 
+/// A walk in the loop, and one of the robot's applications.
+struct Walks {
+    record: Record,
+    rows: Vec<Row>,
+    /// All messages of the applications.
+    outputs: Vec<TimedMessage>,
+}
+
 /// Walks this many strides in the loop, and as long with the robot's applications.
-fn both(config: &LockStepConfig) -> (Record, Vec<Row>) {
+fn both(config: &LockStepConfig) -> Walks {
     let record = run(config).expect("the loop walks");
     let released = Time::ZERO + Duration::from_secs_f64(record.released_s.expect("it was released"));
     let bench = SharedBench::default();
     let ends_at = Time::ZERO + PERIOD * u32::try_from(record.rows.len()).expect("minutes");
     let replay = replay(config, &bench, released).ends_at(ends_at);
     let release = TimedMessage::of(released - LATENCY, tid(CENTRAL, 2), tid(CENTRAL, 1), &Release {});
-    replay.run([release]).expect("nothing panics");
+    let outputs = replay.run([release]).expect("nothing panics");
     let rows = with(&bench, |bench| std::mem::take(&mut bench.rows));
-    (record, rows)
+    Walks { record, rows, outputs }
 }
 
 #[test]
@@ -209,7 +221,7 @@ fn actors_in_virtual_time_give_the_torques_of_the_loop() {
     let mut config = LockStepConfig::standard(6, 3, Intention::from_curves(3));
     // An application's first turn is one period after its start.
     config.start_ms = [1, 1, 1];
-    let (record, rows) = both(&config);
+    let Walks { record, rows, .. } = both(&config);
     assert_eq!(rows.len(), record.rows.len());
     let mut has_torque = false;
     for (row, expected) in rows.iter().zip(&record.rows) {
@@ -223,5 +235,5 @@ fn actors_in_virtual_time_give_the_torques_of_the_loop() {
         has_torque |= row.applied.iter().any(|bits| f64::from_bits(*bits).abs() > 5.0);
     }
     assert!(has_torque, "the leg walks");
-    assert_eq!(both(&config).1, rows, "the same seed gives the same bits");
+    assert_eq!(both(&config).rows, rows, "the same seed gives the same bits");
 }

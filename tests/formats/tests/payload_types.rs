@@ -7,7 +7,7 @@ use std::{
 };
 
 use exoskeleton::robot::edges::{Arm, BarrierStatus, EmergencyStop, GaitStatus, Release, Reset, Shut};
-use exoskeleton_model::message::{DriveStatus, FootLoad, GaitState, JointSample, TorqueSet};
+use exoskeleton_model::message::{DriveStatus, DriveTick, FootLoad, GaitState, JointSample, TorqueSet};
 use sinew::{
     Payload,
     events::{DirectoryEvent, Down, NodeEvent, RequirementEvent, Undelivered},
@@ -96,7 +96,7 @@ fn declared(folder: &Path, names: &mut BTreeSet<String>) {
 fn every_payload_type_of_this_tree_is_traced() {
     let traced = traced! {
         Arm BarrierStatus EmergencyStop GaitStatus Release Reset Shut
-        DriveStatus FootLoad GaitState JointSample TorqueSet
+        DriveStatus DriveTick FootLoad GaitState JointSample TorqueSet
         DirectoryEvent Down NodeEvent RequirementEvent Undelivered
         AccessReport AppsReport AskAccess AskApps AskAudit AskGroups AskNode AskReach AskRecord AskReload AskTree
         AskWatch AuditReport NodeReport Ping ReachReport RecordReport ReloadReport TreeReport WatchReport

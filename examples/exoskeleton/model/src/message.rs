@@ -165,6 +165,64 @@ pub struct DriveStatus {
     pub commands_refused: u32,
 }
 
+/// An input that a drive has used in a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct UsedInput {
+    /// Its sequence number.
+    pub seq: u32,
+    /// The epoch of central; 0 for a sample.
+    pub epoch: u32,
+    /// When it was sent, ns of this drive's clock: the time that the drive has computed with.
+    pub t_ns: u64,
+    /// Maximum error of `t_ns` toward earlier, ns; `None`: not known.
+    pub t_error_ns: Option<u64>,
+}
+
+impl From<&JointSample> for UsedInput {
+    fn from(sample: &JointSample) -> Self {
+        let JointSample { seq, t_ns, t_error_ns, .. } = *sample;
+        Self { seq, epoch: 0, t_ns, t_error_ns }
+    }
+}
+
+impl From<&GaitState> for UsedInput {
+    fn from(gait: &GaitState) -> Self {
+        let GaitState { seq, epoch, t_ns, t_error_ns, .. } = *gait;
+        Self { seq, epoch, t_ns, t_error_ns }
+    }
+}
+
+/// From each drive to the group `exo.ticks`, each millisecond of a run that is recorded: the inputs of a tick and its
+/// result. With it, and with the inputs themselves, the tick can be computed again.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct DriveTick {
+    /// The joint: 0 hip, 1 knee, 2 ankle.
+    pub joint: u8,
+    /// The number of the tick since the drive's start, from 1.
+    pub seq: u32,
+    /// Time of the tick, ns of this host's monotonic clock.
+    pub t_ns: u64,
+    /// Its lateness, us.
+    pub late_us: u32,
+    /// State of the drive before the tick.
+    pub before: DriveState,
+    /// Whether central's commands did not count.
+    pub is_shut: bool,
+    /// The joint sample that was used.
+    pub sample: Option<UsedInput>,
+    /// The gait state that was used.
+    pub gait: Option<UsedInput>,
+    /// Computed torque, Nm; `None` while the drive does not know its device's torque. It reaches the device while
+    /// central's commands count, or on its way to zero.
+    pub torque_nm: Option<f64>,
+    /// Gain of assistance, 0..1.
+    pub assist_gain: f64,
+    /// State of the drive after the tick.
+    pub state: DriveState,
+    /// When the device was ordered to damp by itself in this tick, ns; `None`: it was not.
+    pub damped_at_ns: Option<u64>,
+}
+
 impl Payload for JointSample {
     const NAME: &'static str = "exo.joint_sample";
     const CLASS: Class = Class::Stream;
@@ -210,6 +268,11 @@ impl Payload for TorqueSet {
 
 impl Payload for DriveStatus {
     const NAME: &'static str = "exo.drive_status";
+    const CLASS: Class = Class::Stream;
+}
+
+impl Payload for DriveTick {
+    const NAME: &'static str = "exo.drive_tick";
     const CLASS: Class = Class::Stream;
 }
 

@@ -24,6 +24,7 @@ mod command;
 mod damping_repeater;
 mod e_stop;
 mod order;
+mod tick_record;
 
 use std::io;
 use std::path::PathBuf;
@@ -76,6 +77,8 @@ pub struct DriveParts {
     pub figures: Option<PathBuf>,
     /// CPU time that it wastes in each tick once the person walks: an injected fault, see [`Burden`].
     pub burden: Option<Burden>,
+    /// Whether it sends each tick to the group `exo.ticks`, for a recording that can be replayed.
+    pub sends_ticks: bool,
 }
 
 /// The drive of one joint.
@@ -89,6 +92,8 @@ pub struct Drive {
     commands: Option<CentralCommands>,
     /// Whether this drive's last order was a torque: the device may hold it until the next order.
     gives: bool,
+    /// When the device was ordered to damp in this tick, ns.
+    damped_at_ns: Option<u64>,
     /// Repeats the order to damp when this thread does not; created before any torque of central's commands.
     repeater: Option<DampingRepeater>,
     /// Whether it was reported that central's commands cannot be guarded.
@@ -137,6 +142,7 @@ impl Drive {
             sample: None,
             commands: None,
             gives: false,
+            damped_at_ns: None,
             repeater: None,
             unguarded: false,
             has_central_input: false,
@@ -157,8 +163,14 @@ impl Drive {
         if let Some(Err(error)) = self.commands.as_mut().map(|commands| commands.poll(context)) {
             self.report_unguarded(&error);
         }
-        let mut output = self.core.tick(now.as_nanos(), self.sample.as_ref(), gait.as_ref());
-        output.command_nm = self.command(context.clock(), now, &output, gait.as_ref());
+        let record = self.tick_record(now, tick, gait.as_ref(), is_shut);
+        let computed = self.core.tick(now.as_nanos(), self.sample.as_ref(), gait.as_ref());
+        self.damped_at_ns = None;
+        let command_nm = self.command(context.clock(), now, &computed, gait.as_ref());
+        let output = DriveOutput { command_nm, ..computed };
+        if let Some(record) = record {
+            self.send_record(&record, &computed, context);
+        }
         self.carry_burden(now, gait.as_ref());
         if output.state != DriveState::Init
             && let Some(gate) = self.ready.take()
@@ -247,7 +259,7 @@ impl Drive {
         let released = gait.is_some_and(|gait| !matches!(gait.mode, GaitMode::Hold | GaitMode::Stop));
         let (saturated, state, command_nm) = (output.saturated, output.state, output.command_nm);
         let was_giving = self.gives;
-        let Self { commands, device, damper, gives, core, repeater, .. } = self;
+        let Self { commands, device, damper, gives, core, repeater, damped_at_ns, .. } = self;
         let mut send_order = |order| match order {
             Order::Torque(torque_nm) => {
                 device.command(now, &DriveCommand { torque_nm, released, saturated, state });
@@ -273,7 +285,7 @@ impl Drive {
         if let Some(Ok((given, order))) = through {
             if order == Order::Damp {
                 // The order was sent now, not when this tick began.
-                core.let_device_damp(clock.now().as_nanos());
+                core.let_device_damp(*damped_at_ns.insert(clock.now().as_nanos()));
             }
             return given;
         }
@@ -282,7 +294,7 @@ impl Drive {
         match order {
             Order::Damp => {
                 let given = send_order(order);
-                core.let_device_damp(clock.now().as_nanos());
+                core.let_device_damp(*damped_at_ns.insert(clock.now().as_nanos()));
                 return given;
             }
             Order::Torque(0.0) => again.into_iter().for_each(RepeaterHandle::rests),

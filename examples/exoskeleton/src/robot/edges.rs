@@ -2,8 +2,10 @@
 //! messages between the cores are in [`exoskeleton_model::message`].
 
 use exoskeleton_model::joint::Joint;
-use exoskeleton_model::message::GaitMode;
+use exoskeleton_model::message::{DriveStatus, DriveTick, FootLoad, GaitMode, GaitState, JointSample};
+use exoskeleton_recording::recorder::KnownNames;
 use serde::{Deserialize, Serialize};
+use sinew::message::Kind;
 use sinew::prelude::{Actor, AppContext, Class, Delivery, Duration, Payload, Tid, Time, payload};
 use sinew::protection::Protection;
 
@@ -16,6 +18,8 @@ pub const GAIT: &str = "central.gait";
 pub const STOP: &str = "exo.stop";
 /// Group of the receivers of statuses.
 pub const STATUS: &str = "exo.status";
+/// Group of the drives' ticks. It has no members: recordings have its messages.
+pub const TICKS: &str = "exo.ticks";
 
 /// Time between two lookups in the directory, ns.
 const LOOK_PERIOD_NS: u128 = 100_000_000;
@@ -101,6 +105,29 @@ payload!("exo.barrier_status", Stream =>
         pub waiting: Vec<String>,
     }
 );
+
+/// Returns the names that the topics of a recording have.
+#[must_use]
+pub fn names() -> KnownNames {
+    let apps = Joint::ALL.into_iter().flat_map(|joint| [sensor_name(joint), drive_name(joint)]);
+    let types = vec![
+        named::<Arm>(),
+        named::<BarrierStatus>(),
+        named::<DriveStatus>(),
+        named::<DriveTick>(),
+        named::<FootLoad>(),
+        named::<GaitState>(),
+        named::<GaitStatus>(),
+        named::<JointSample>(),
+        named::<Release>(),
+        named::<Shut>(),
+    ];
+    KnownNames { apps: apps.chain([GAIT.to_owned()]).collect(), groups: vec![STATUS, STOP, TICKS], types }
+}
+
+const fn named<P: Payload>() -> (Kind, &'static str) {
+    (P::KIND, P::NAME)
+}
 
 /// Returns the time of sending, ns of this host's clock, and its maximum error toward earlier. If that is not
 /// known: `t_ns`, in the clock of its sender, and `None`.

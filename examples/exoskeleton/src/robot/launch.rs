@@ -15,12 +15,14 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::Duration;
 
 use exoskeleton_model::intention::IntentionError;
-use exoskeleton_model::part::Kill;
+use exoskeleton_model::part::{Kill, Part};
 use exoskeleton_model::record::Record;
+use exoskeleton_recording::recorder::{Recorded, WalkRecorder};
 use sinew::Time;
 use sinew_figures::stalls::{HostCpu, Witness};
 use thiserror::Error;
 
+use super::edges;
 use super::node::NodeError;
 use super::plant::{self, PlantError};
 use super::role::Role;
@@ -81,6 +83,8 @@ pub struct Walk {
     pub lateness: Lateness,
     /// The folder with the traces and logs.
     pub folder: PathBuf,
+    /// The recording of all messages; `None`: it was not requested.
+    pub recorded: Option<Recorded>,
 }
 
 /// The reason why there was no walk.
@@ -156,10 +160,10 @@ pub fn run(options: &LaunchOptions) -> Result<Walk, LaunchError> {
     let folder = run_folder::create(&options.runs, &run_folder::name(&options.run))?;
     let mut launch = Launch::new(options, &topology, &folder)?;
     let walked = launch.walk();
-    let times = launch.end();
+    let (times, recorded) = launch.end();
     walked?;
     let (report, record, lateness) = collect::read(&folder, &times, options.run.clone())?;
-    Ok(Walk { report, record, lateness, folder })
+    Ok(Walk { report, record, lateness, folder, recorded })
 }
 
 /// The project of a robot with keys, which name it. Its multicast group separates the runs.
@@ -189,6 +193,7 @@ struct Launch<'a> {
     times: RunTimes,
     strides: Option<u32>,
     witness: Witness,
+    recorder: Option<WalkRecorder>,
 }
 
 impl<'a> Launch<'a> {
@@ -208,6 +213,7 @@ impl<'a> Launch<'a> {
             times: RunTimes { strides: options.run.strides, ..RunTimes::default() },
             strides: None,
             witness: Witness::start(options.control.realtime_priority)?,
+            recorder: options.control.record.then(|| record(topology, folder)).transpose()?,
         })
     }
 
@@ -294,8 +300,8 @@ impl<'a> Launch<'a> {
         }
     }
 
-    /// Stops all processes, the plant last: it records the drives' ramps to zero.
-    fn end(mut self) -> RunTimes {
+    /// Stops all processes, the plant last: it records the drives' ramps to zero. Then completes the recording.
+    fn end(mut self) -> (RunTimes, Option<Recorded>) {
         self.times.stop = Time::now();
         self.times.cpu_to = Some(self.children.cpu_times());
         self.times.samples.extend(self.times.cpu_to.clone());
@@ -303,7 +309,15 @@ impl<'a> Launch<'a> {
         self.times.testimonies = self.witness.end();
         self.screen.close();
         self.console.stop();
+        self.recorder.iter().for_each(WalkRecorder::close);
         self.children.stop();
-        self.times
+        (self.times, self.recorder.map(WalkRecorder::finish))
     }
+}
+
+/// Starts the recorders of all nodes, before these start.
+fn record(topology: &Topology, folder: &Path) -> io::Result<WalkRecorder> {
+    let socket = |part: Part| Some((part.name().to_owned(), topology.place(part).socket.clone()?));
+    let nodes: Vec<_> = Part::ALL.into_iter().filter_map(socket).collect();
+    WalkRecorder::start(&nodes, edges::names(), folder)
 }

@@ -38,10 +38,11 @@ pub mod role;
 pub mod sensor;
 pub mod slots;
 pub mod topology;
-pub mod trace;
 pub mod watch;
 
 use std::time::Duration;
+
+pub use exoskeleton_recording::trace;
 
 /// Period of every control loop.
 pub const PERIOD: Duration = Duration::from_millis(1);

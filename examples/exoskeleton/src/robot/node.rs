@@ -138,6 +138,7 @@ fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<Ex
                 events: events.trace(),
                 figures: options.run_dir.as_ref().map(|folder| folder.join(format!("{joint}-figures.json"))),
                 burden: Burden::planted(joint),
+                sends_ticks: topology.control.record,
             };
             let builder = builder
                 .app(sensor::spec(joint, device, slots::SENSOR, events.trace(), place(topology)))

@@ -17,6 +17,8 @@ use thiserror::Error;
 
 pub use free::for_this_host;
 
+/// Bytes of the newest messages that a node keeps while it is recorded: some seconds, and little of `/dev/shm`.
+const RECORD_KEEP_BYTES: usize = 8 << 20;
 /// Port of multicast DNS (RFC 6762).
 const MDNS_PORT: u16 = 5353;
 
@@ -76,6 +78,8 @@ pub struct Control {
     pub realtime_priority: Option<u8>,
     /// The source of the release to walk.
     pub release: ReleaseBy,
+    /// Whether each drive also sends its ticks, for a recording that can be replayed. Default: no.
+    pub record: bool,
 }
 
 /// The source of the release to walk, at the start and after the loss of a part.
@@ -194,6 +198,7 @@ impl Topology {
         config.ndl.missed_max = self.discovery.missed_max;
         config.security.keys = self.keys.as_ref().map(|keys| keys.join("nodes").join(part.name()));
         config.lncl.socket.clone_from(&place.socket);
+        config.record.keep_bytes = RECORD_KEEP_BYTES;
         config
     }
 }

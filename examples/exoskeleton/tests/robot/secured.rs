@@ -18,7 +18,7 @@ fn robot_walks_only_with_the_keys_of_the_readme() {
     let folder = folder("secured");
     let init = words_behind("cargo run --release -p sinew-cli -- keys init ");
     let robot = words_behind("cargo run --release -p exoskeleton -- --keys ");
-    let robot = [&["--strides", "8", "--keys"], &robot[..]].concat();
+    let robot = [&["--strides", "8", "--no-record", "--keys"], &robot[..]].concat();
 
     // given: no keys yet
     let refused = end(start(&folder, &robot), "the robot is refused");

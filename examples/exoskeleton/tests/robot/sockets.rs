@@ -48,7 +48,7 @@ fn killed_launcher_leaves_no_socket() {
     let _alone = alone();
     let folder = folder("sockets");
     // given: a robot without configured sockets
-    let mut child = start(&folder, &["--strides", "1000", "--runs", "runs"]);
+    let mut child = start(&folder, &["--strides", "1000", "--no-record", "--runs", "runs"]);
     let id = child.id();
 
     // when, then

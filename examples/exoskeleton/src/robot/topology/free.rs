@@ -39,7 +39,12 @@ pub fn for_this_host(seed: u64) -> io::Result<Topology> {
             period: Duration::from_millis(500),
             missed_max: 3,
         },
-        control: Control { thread: ControlThread::Io, realtime_priority: None, release: ReleaseBy::Itself },
+        control: Control {
+            thread: ControlThread::Io,
+            realtime_priority: None,
+            release: ReleaseBy::Itself,
+            record: false,
+        },
         central: node(Part::Central, 1),
         joints: [(Joint::Hip, 2), (Joint::Knee, 3), (Joint::Ankle, 4)]
             .map(|(joint, last)| node(Part::Joint(joint), last)),

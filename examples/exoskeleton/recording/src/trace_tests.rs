@@ -1,4 +1,4 @@
-//! Tests of `src/robot/trace.rs`.
+//! Tests of the traces.
 
 use super::*;
 

@@ -281,5 +281,5 @@ pub fn read_incarnations<R: TraceRow>(folder: &Path, name: &str) -> io::Result<V
 }
 
 #[cfg(test)]
-#[path = "../../tests/unit/trace.rs"]
+#[path = "trace_tests.rs"]
 mod tests;

@@ -1,0 +1,9 @@
+//! The records of a walk: traces of each process, recordings of all messages, and the replay of the drives.
+//!
+//! - [`trace`]: rows in CSV files, written by each process itself.
+//! - [`recorder`]: the messages of each node as MCAP, and all of them in one file.
+//! - [`replay`]: the drives computed again from a recording, torque by torque.
+
+pub mod recorder;
+pub mod replay;
+pub mod trace;

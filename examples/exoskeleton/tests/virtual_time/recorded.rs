@@ -1,0 +1,183 @@
+//! A recorded walk is computed again: each torque of the drives is the same, and a changed gain is found.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+use exoskeleton::robot::edges::GaitStatus;
+use exoskeleton_model::control::drive::DriveConfig;
+use exoskeleton_model::message::{DriveTick, JointSample};
+use exoskeleton_recording::replay::{Replayed, replay};
+use sinew_bag::{BagWriter, ChannelInfo, Class, Direction, Options, Origin, Party, Record as BagRecord};
+
+use super::*;
+
+/// A file of one test, which is removed at its end.
+struct TestFile(PathBuf);
+
+impl TestFile {
+    fn new(name: &str) -> Self {
+        Self(std::env::temp_dir().join(format!("exoskeleton-replay-{name}-{}.mcap", std::process::id())))
+    }
+}
+
+impl Drop for TestFile {
+    fn drop(&mut self) {
+        // The folder of temporary files is cleared by the system, too.
+        let _ = std::fs::remove_file(&self.0);
+    }
+}
+
+/// All messages of a walk in virtual time.
+fn walk() -> &'static [TimedMessage] {
+    static WALK: OnceLock<Vec<TimedMessage>> = OnceLock::new();
+    WALK.get_or_init(|| {
+        let mut config = LockStepConfig::standard(6, 3, Intention::from_curves(3));
+        config.start_ms = [1, 1, 1];
+        both(&config).outputs
+    })
+}
+
+fn party(tid: Tid) -> Party {
+    Party { tid: tid.bits(), text: tid.to_string(), name: None, node: Some(tid.node.to_string()) }
+}
+
+/// Writes a recording of these messages.
+fn write<'m>(path: &Path, messages: impl IntoIterator<Item = &'m TimedMessage>) {
+    let options = Options { replace: true, ..Options::default() };
+    let mut bag = BagWriter::create(path, options, Origin::default()).expect("a file of this test");
+    let (mut channels, mut end_ns) = (BTreeMap::new(), 0);
+    for message in messages {
+        let TimedMessage { source, destination, kind, .. } = *message;
+        let (channel, number) = channels.entry((source, destination, kind.bits())).or_insert_with(|| {
+            let channel = bag.channel(&ChannelInfo {
+                source: &party(source),
+                destination: &party(destination),
+                type_name: kind.type_name().unwrap_or("unknown"),
+                kind: kind.bits(),
+                class: Class::Stream,
+                direction: Direction::Sent,
+                is_protected: false,
+                schema: None,
+                refused: None,
+                seen_before: 0,
+            });
+            (channel.expect("there is room for all channels"), 0)
+        });
+        *number += 1;
+        end_ns = message.at.as_nanos();
+        let record = BagRecord {
+            number: *number,
+            sequence: message.sequence,
+            sent_ns: message.sent.as_nanos(),
+            handed_over_ns: end_ns,
+            payload: &message.payload,
+            ..BagRecord::default()
+        };
+        bag.message(*channel, &record).expect("there is room on the disk");
+    }
+    bag.finish(end_ns).expect("there is room on the disk");
+}
+
+fn replayed(name: &str, messages: &[&TimedMessage], gain: f64) -> Replayed {
+    let file = TestFile::new(name);
+    write(&file.0, messages.iter().copied());
+    let config = |joint| {
+        let mut config = DriveConfig::standard(joint);
+        config.law.assist *= gain;
+        config
+    };
+    replay(&file.0, config).expect("it has ticks")
+}
+
+#[test]
+fn recorded_walk_gives_the_same_torques() {
+    let all: Vec<_> = walk().iter().collect();
+    let replayed = replayed("same", &all, 1.0);
+    assert!(replayed.is_same() && replayed.damage.is_empty(), "{replayed}");
+    for joint in &replayed.joints {
+        assert!(joint.ticks > 5_000 && joint.identical == joint.ticks, "{joint:?}");
+    }
+}
+
+#[test]
+fn one_changed_gain_is_named_at_its_first_tick() {
+    let all: Vec<_> = walk().iter().collect();
+    let replayed = replayed("gain", &all, 1.001);
+    assert!(!replayed.is_same());
+    for joint in &replayed.joints {
+        let first = joint.first_difference.expect("it assists otherwise");
+        let (was, is) = (first.recorded.torque_nm.unwrap(), first.now.torque_nm.unwrap());
+        assert!(was != is && (was - is).abs() < 0.1, "{first:?}");
+        assert_eq!((first.recorded.state, first.now.state), (DriveState::Walk, DriveState::Walk));
+        // Before assistance begins the gain has no effect.
+        assert!(joint.identical + 1 >= u64::from(first.tick) && joint.compared == joint.ticks, "{joint:?}");
+    }
+    let words = replayed.to_string();
+    assert!(words.contains("hip") && words.contains(" Nm (Walk") && words.contains("DIFFERENT"), "{words}");
+}
+
+#[test]
+fn missing_sample_is_a_gap_and_no_difference() {
+    let drive = tid(0, 2);
+    let is_sample =
+        |message: &TimedMessage| message.kind == JointSample::KIND && message.destination == drive;
+    let lost =
+        walk().iter().rev().filter(|message| is_sample(message)).nth(300).expect("it walks for longer");
+    let kept: Vec<_> = walk().iter().filter(|message| !std::ptr::eq(*message, lost)).collect();
+    let replayed = replayed("gap", &kept, 1.0);
+    let [hip, knee, _] = &replayed.joints;
+    assert!(hip.gap.as_ref().is_some_and(|gap| gap.contains("sample")), "{replayed}");
+    assert!(hip.first_difference.is_none() && hip.compared < hip.ticks);
+    assert!(knee.identical == knee.ticks && knee.gap.is_none());
+    assert!(!replayed.is_same() && replayed.to_string().contains("INCOMPLETE"), "{replayed}");
+}
+
+#[test]
+fn recording_of_one_node_replays_its_drive() {
+    let here: Vec<_> =
+        walk().iter().filter(|one| one.source.node == node(1) || one.destination.node == node(1)).collect();
+    let replayed = replayed("node", &here, 1.0);
+    assert!(replayed.is_same(), "{replayed}");
+    assert_eq!(replayed.joints.each_ref().map(|joint| joint.ticks > 0), [false, true, false]);
+}
+
+#[test]
+fn recording_that_begins_late_is_no_difference() {
+    let from = |at: Time| walk().iter().filter(|message| message.at >= at).collect::<Vec<_>>();
+    // At rest: it is replayed from there on.
+    let early = replayed("early", &from(Time::ZERO + Duration::from_millis(300)), 1.0);
+    assert!(early.is_same(), "{early}");
+    assert!(early.joints.iter().all(|joint| joint.identical + 2 >= joint.ticks), "{early}");
+    // In the middle of the walk the state of the drives is unknown.
+    let end = walk().last().expect("it walks").at;
+    let late = replayed("late", &from(end - Duration::from_millis(500)), 1.0);
+    assert!(!late.is_same() && late.joints.iter().all(|joint| joint.compared == 0), "{late}");
+    assert!(late.joints.iter().all(|joint| joint.gap.is_some()), "{late}");
+}
+
+#[test]
+fn recording_without_ticks_is_an_error_with_a_remedy() {
+    let file = TestFile::new("none");
+    let is_tick = |message: &&TimedMessage| message.kind == DriveTick::KIND;
+    write(&file.0, walk().iter().filter(|message| !is_tick(message)).take(100));
+    let error = replay(&file.0, DriveConfig::standard).expect_err("there is nothing to compare");
+    assert!(error.to_string().contains("walk.mcap"), "{error}");
+}
+
+#[test]
+fn plotted_messages_have_one_channel_each() {
+    // The topic of a second one would have its destination, and the layout for Foxglove names none.
+    let central = node(CENTRAL);
+    let mut channels: BTreeMap<(Tid, u32), Vec<Tid>> = BTreeMap::new();
+    for message in walk() {
+        let is_plotted = [DriveTick::KIND, GaitStatus::KIND].contains(&message.kind)
+            || (message.kind == JointSample::KIND && message.destination.node == central);
+        let receivers = channels.entry((message.source, message.kind.bits())).or_default();
+        if is_plotted && !receivers.contains(&message.destination) {
+            receivers.push(message.destination);
+        }
+    }
+    assert!(channels.values().all(|receivers| receivers.len() <= 1), "{channels:?}");
+    assert_eq!(channels.values().filter(|receivers| receivers.len() == 1).count(), 7);
+}
