@@ -26,7 +26,7 @@ use sinew_runtime::{
     router::tap::{Tap, TapOf},
     tid::Tid,
     time::Time,
-    wire::Kind,
+    wire::{Kind, known_types},
 };
 use sinew_shm::journal::{CreateJournalError, Journal, Options};
 
@@ -248,9 +248,13 @@ impl KnownNames {
     fn of(node: &NodeState) -> Self {
         let directory = node.ctx.ports.names().map(|names| names.directory()).unwrap_or_default();
         let kinds = directory.iter().flat_map(|entry| entry.kinds.iter().copied());
-        let kinds = kinds
+        let mut kinds: BTreeMap<_, _> = kinds
             .filter_map(|kind| Some((kind, sinew_lncl::undelivered::kind_name(&node.lncl, kind)?)))
             .collect();
+        // Applications send types that none of them handles.
+        for (kind, name) in known_types() {
+            kinds.entry(kind).or_insert_with(|| name.to_owned());
+        }
         let apps = directory.into_iter().filter(|entry| entry.tid.node == node.ctx.node);
         Self { apps: apps.map(|entry| (entry.name, entry.tid)).collect(), kinds }
     }
