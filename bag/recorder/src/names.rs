@@ -72,15 +72,6 @@ impl Names {
         self.schemas.get(&kind)?.as_ref()
     }
 
-    /// Returns at most `count` of the named payload types of which the structure is neither known nor known to be
-    /// missing.
-    #[must_use]
-    pub fn without_schema(&self, count: usize) -> Vec<Kind> {
-        let room = SCHEMAS_MAX.saturating_sub(self.schemas.len());
-        let open = self.types.keys().copied().filter(|kind| !self.schemas.contains_key(kind));
-        open.take(count.min(room)).collect()
-    }
-
     /// Returns whether the node need not be asked for the structure of a payload type any more.
     pub(crate) fn is_settled(&self, kind: Kind) -> bool {
         self.schemas.contains_key(&kind) || self.schemas.len() >= SCHEMAS_MAX
@@ -130,8 +121,7 @@ mod tests {
     fn known_structure_stays() {
         let kind = Kind::named("test.angle");
         let mut names = Names::default();
-        names.add_type(kind, "test.angle");
-        assert_eq!((names.without_schema(8), names.is_settled(kind)), (vec![kind], false));
+        assert!(!names.is_settled(kind));
         // These bytes are no schema.
         names.add_schema(kind, Some(&[0xff; 9]));
         assert!(names.schema(kind).is_none() && names.is_settled(kind));
@@ -139,17 +129,15 @@ mod tests {
         names.add_schema(kind, Some(&schema.encode()));
         names.add_schema(kind, None);
         assert_eq!(names.schema(kind).map(|known| &**known), Some(&schema));
-        assert!(names.without_schema(8).is_empty());
     }
 
     #[test]
     fn structures_are_bounded() {
         let mut names = Names::default();
         for kind in 0..=SCHEMAS_MAX as u32 {
-            names.add_type(Kind::from_bits(kind), "test");
             names.add_schema(Kind::from_bits(kind), None);
         }
         assert_eq!(names.schemas.len(), SCHEMAS_MAX);
-        assert!(names.without_schema(8).is_empty() && names.is_settled(Kind::from_bits(u32::MAX)));
+        assert!(names.is_settled(Kind::from_bits(u32::MAX)), "none is asked for any more");
     }
 }

@@ -194,12 +194,20 @@ impl Recorder {
         self.sink.finish(now_ns)
     }
 
-    /// Returns the payload type of the next message, if nothing is known of its structure. Its channel begins with this
-    /// message, and has the name and the structure that are known at the next call of [`pump`](Self::pump), which writes
-    /// it in any case. So the owner can ask the node before it. Each type is returned once.
+    /// Returns the payload type of the next message, if nothing is known of its structure; and then further such types of
+    /// the journal, at most `count` in all. The next call of [`pump`](Self::pump) writes the message in any case. Its
+    /// channel has the name and the structure that are known by then, so the owner can ask the node before. No message
+    /// waits twice for a type.
     #[must_use]
-    pub fn wanted(&self) -> Option<Kind> {
-        self.waiting.as_ref().map(|(_, kind)| *kind)
+    pub fn wanted(&self, count: usize) -> Vec<Kind> {
+        let Some((_, first)) = self.waiting else { return Vec::new() };
+        let names = &self.setup.names;
+        let messages = self.channels.values().filter(|channel| channel.form.is_message());
+        let others: BTreeSet<_> = messages
+            .map(|channel| channel.kind)
+            .filter(|kind| *kind != first && !names.is_settled(*kind))
+            .collect();
+        [first].into_iter().chain(others).take(count).collect()
     }
 
     /// Returns the names, to which the owner adds. A channel keeps the names that it has at its first message.
@@ -283,7 +291,7 @@ impl Recorder {
             let Some(found) = self.reader.next(now_ns, bytes)? else { return Ok(true) };
             // A record that cannot be read is missing by its number.
             let Ok(entry) = Entry::read(bytes) else { continue };
-            if let Some(kind) = self.awaited(&found, &entry) {
+            if let Some(kind) = self.awaited(&found, &entry)? {
                 self.waiting = Some((found, kind));
                 return Ok(false);
             }
@@ -293,14 +301,23 @@ impl Recorder {
     }
 
     /// Returns the type of the first message of a channel, if its structure should be asked for before.
-    fn awaited(&mut self, found: &journal::Record, entry: &Entry<'_>) -> Option<Kind> {
-        let Entry::Message(message) = entry else { return None };
+    fn awaited(
+        &mut self,
+        found: &journal::Record,
+        entry: &Entry<'_>,
+    ) -> Result<Option<Kind>, ReadJournalError> {
+        let Entry::Message(message) = entry else { return Ok(None) };
         if self.places.contains_key(&found.place) || !self.is_within(found.place, found.number) {
-            return None;
+            return Ok(None);
         }
         let kind = message.header.kind;
         let is_open = !self.setup.names.is_settled(kind) && self.waited.len() < WAITED_MAX;
-        (is_open && self.waited.insert(kind)).then_some(kind)
+        if !is_open || !self.waited.insert(kind) {
+            return Ok(None);
+        }
+        // Other types of the table are asked for at once.
+        self.read_table()?;
+        Ok(Some(kind))
     }
 
     pub(crate) fn take(
