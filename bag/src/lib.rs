@@ -5,12 +5,14 @@
 //! `docs/protocol/recording.md` specifies the topics, the metadata and the fields.
 //!
 //! [`read`] opens finished and unfinished files, [`check()`] proves that nothing is missing, [`info()`] sums a file up,
-//! [`merge()`] puts the files of several nodes on one time line, and [`export()`] writes CSV and Parquet.
+//! [`merge()`] puts the files of several nodes on one time line, and `export` writes CSV and Parquet, unless the
+//! feature of this name is off.
 //!
 //! This package knows MCAP and [`sinew_schema::Schema`]. It knows no node, no socket and no clock: all times are
 //! arguments.
 
 pub mod check;
+#[cfg(feature = "export")]
 pub mod export;
 pub mod info;
 pub mod merge;
@@ -28,6 +30,7 @@ mod writer;
 
 pub use check::check;
 pub use error::BagError;
+#[cfg(feature = "export")]
 pub use export::export;
 pub use info::info;
 pub use merge::merge;

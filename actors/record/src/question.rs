@@ -105,8 +105,8 @@ pub struct RecordedType {
     pub kind: Kind,
     /// Its name.
     pub name: String,
-    /// Its structure, in the canonical bytes of a schema. `None` without a question for it, or if the node does not know
-    /// it.
+    /// Its structure, in the canonical bytes of a schema. `None` without a question for it, or if the node does
+    /// not know it.
     #[serde(default, with = "serde_bytes")]
     pub schema: Option<Vec<u8>>,
 }

@@ -1,12 +1,13 @@
 //! The name of a recording's file.
 
 use std::{
+    ffi::OsStr,
     path::{Path, PathBuf},
     time::{Duration, UNIX_EPOCH},
 };
 
-/// Returns the path with the name of the node in place of `{node}`, and with the time in UTC in place of `{time}`, as in
-/// `knee-2026-01-31-093000.mcap`. Without a path this is the file in the current folder.
+/// Returns the path with the name of the node in place of `{node}`, and with the time in UTC in place of `{time}`, as
+/// in `knee-2026-01-31-093000.mcap`. Without a path this is the file in the current folder.
 pub(crate) fn filled(path: Option<&Path>, node: &str, wall_ns: u64) -> PathBuf {
     let path = path.unwrap_or_else(|| Path::new("{node}-{time}.mcap"));
     // A path that is no text has no placeholders.
@@ -14,6 +15,17 @@ pub(crate) fn filled(path: Option<&Path>, node: &str, wall_ns: u64) -> PathBuf {
     let letter = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' };
     let node: String = node.trim_start_matches('.').chars().map(letter).collect();
     PathBuf::from(text.replace("{node}", &node).replace("{time}", &time(wall_ns)))
+}
+
+/// Returns the path with `-{time}` before its ending, unless `{time}` is in it.
+pub(crate) fn timed(path: &Path) -> PathBuf {
+    if path.to_string_lossy().contains("{time}") {
+        return path.to_owned();
+    }
+    let mut name = path.file_stem().unwrap_or_default().to_owned();
+    name.push("-{time}.");
+    name.push(path.extension().unwrap_or_else(|| OsStr::new("mcap")));
+    path.with_file_name(name)
 }
 
 fn time(wall_ns: u64) -> String {
@@ -33,6 +45,13 @@ mod tests {
         assert_eq!(filled(None, "leg/knee", AT_NS), Path::new("leg_knee-2026-01-31-094400.mcap"));
         let path = Path::new("/var/log/{node}/{time}.mcap");
         assert_eq!(filled(Some(path), "knee", AT_NS), Path::new("/var/log/knee/2026-01-31-094400.mcap"));
+    }
+
+    #[test]
+    fn each_start_has_a_file_of_its_own() {
+        assert_eq!(timed(Path::new("/var/log/{node}.mcap")), Path::new("/var/log/{node}-{time}.mcap"));
+        assert_eq!(timed(Path::new("walk")), Path::new("walk-{time}.mcap"));
+        assert_eq!(timed(Path::new("{time}/walk.mcap")), Path::new("{time}/walk.mcap"));
     }
 
     #[test]

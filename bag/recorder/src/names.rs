@@ -54,8 +54,8 @@ impl Names {
         self.changes += u64::from(add(&mut self.types, kind, name));
     }
 
-    /// Adds the structure of a payload type, in its canonical bytes; `None` if its node does not know it. Bytes that are
-    /// no schema leave the type without a known structure. A structure that is known stays.
+    /// Adds the structure of a payload type, in its canonical bytes; `None` if its node does not know it. Bytes that
+    /// are no schema leave the type without a known structure. A structure that is known stays.
     pub fn add_schema(&mut self, kind: Kind, schema: Option<&[u8]>) {
         let schema = schema.and_then(|bytes| Schema::parse(bytes).ok()).map(Arc::new);
         let has_room = self.schemas.len() < SCHEMAS_MAX;

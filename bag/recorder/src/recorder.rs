@@ -194,8 +194,8 @@ impl Recorder {
         self.sink.finish(now_ns)
     }
 
-    /// Returns the payload type of the next message, if nothing is known of its structure; and then further such types of
-    /// the journal, at most `count` in all. The next call of [`pump`](Self::pump) writes the message in any case. Its
+    /// Returns the payload type of the next message, if nothing is known of its structure; and then further such types
+    /// of the journal, at most `count` in all. The next call of [`pump`](Self::pump) writes the message in any case. Its
     /// channel has the name and the structure that are known by then, so the owner can ask the node before. No message
     /// waits twice for a type.
     #[must_use]

@@ -11,6 +11,7 @@ use std::{
 };
 
 use sinew_client::{NodeApi, Registration};
+use sinew_model::config::NodeConfig;
 
 use crate::{
     RecordingError,
@@ -19,6 +20,8 @@ use crate::{
 
 /// Time limit for the end of a recording: 10 s for the rest of the journal, the rest for the file.
 const FINISHED_WITHIN: Duration = Duration::from_secs(15);
+/// Time limit for the connection to a node that has started.
+const CONNECTED_WITHIN: Duration = Duration::from_secs(2);
 
 /// A recording of a node, on a thread of its own. Dropping it ends it, without waiting for the end.
 ///
@@ -55,6 +58,40 @@ impl Recording {
             .register_transport_address(Registration::new())
             .map_err(|why| RecordingError::NoAnswer(why.to_string()))?;
         Self::through(endpoint, options)
+    }
+
+    /// Starts the recording that the configuration of a running node asks for, through its socket; `None` without
+    /// `record.file`. The program states it to its node before: `NodeBuilder::writes_recording`.
+    ///
+    /// # Errors
+    /// `lncl.socket` is not set, the node does not record, or the file cannot be made.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use sinew_model::config::NodeConfig;
+    /// use sinew_recorder::Recording;
+    ///
+    /// /// Runs in the program of the node, from its start to its end.
+    /// fn record(config: &NodeConfig, wait_for_end: impl FnOnce()) -> Result<(), Box<dyn std::error::Error>> {
+    ///     let recording = Recording::configured(config)?;
+    ///     wait_for_end();
+    ///     if let Some(recording) = recording {
+    ///         println!("{} messages", recording.finish()?.totals.written);
+    ///     }
+    ///     Ok(())
+    /// }
+    /// ```
+    pub fn configured(config: &NodeConfig) -> Result<Option<Self>, RecordingError> {
+        let Some(mut options) = RecordingOptions::configured(&config.record) else { return Ok(None) };
+        options.program = concat!("sinew-recorder ", env!("CARGO_PKG_VERSION")).to_owned();
+        let Some(socket) = &config.lncl.socket else {
+            let why = "record.file is set, and lncl.socket is not: set it, the recorder connects through it";
+            return Err(RecordingError::NoAnswer(why.to_owned()));
+        };
+        let node = NodeApi::connect_trusted(socket, CONNECTED_WITHIN)
+            .map_err(|why| RecordingError::NoAnswer(why.to_string()))?;
+        Self::begin(&node, options).map(Some)
     }
 
     /// Starts a recording through this connection to a node.

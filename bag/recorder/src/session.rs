@@ -9,8 +9,9 @@ use std::{
     time::Duration,
 };
 
-use sinew_bag::{BagWriter, Origin, Totals};
+use sinew_bag::{BagWriter, Compression, Origin, Totals};
 use sinew_client::Endpoint;
+use sinew_model::config::{RecordCompression, RecordConfig};
 use sinew_record::{AskRecord, RecordReport, SCHEMAS_MAX, Selection};
 use sinew_runtime::{
     tid::{AppAddress, NodeAddress, Tid},
@@ -67,6 +68,30 @@ pub struct RecordingOptions {
     pub file: sinew_bag::Options,
     /// The program and its version, for the metadata of the file. Default: none.
     pub program: String,
+}
+
+impl RecordingOptions {
+    /// Returns the options of a node's configuration; `None` without `record.file`.
+    #[must_use]
+    pub fn configured(config: &RecordConfig) -> Option<Self> {
+        let path = file_name::timed(config.file.as_deref()?);
+        let compression = match config.compression {
+            RecordCompression::Zstd => Compression::Zstd,
+            RecordCompression::Lz4 => Compression::Lz4,
+            RecordCompression::None => Compression::None,
+        };
+        let RecordConfig { split_bytes, split_time, max_bytes, .. } = *config;
+        let file = sinew_bag::Options {
+            compression,
+            size_max: max_bytes,
+            split_bytes,
+            split_time,
+            ..Default::default()
+        };
+        let (apps, types) = (config.apps.clone(), config.types.clone());
+        let selection = Selection { apps, types, groups: Vec::new() };
+        Some(Self { path: Some(path), selection, file, ..Self::default() })
+    }
 }
 
 /// The connection to the node that records: an [`Endpoint`], or a program's own one.
@@ -165,8 +190,8 @@ pub struct Summary {
     pub faults: Vec<String>,
 }
 
-/// A recording on the thread of its owner, which calls [`step`](Self::step) in a loop and [`finish`](Self::finish) at the
-/// end. [`Recording`](crate::Recording) does it on a thread of its own.
+/// A recording on the thread of its owner, which calls [`step`](Self::step) in a loop and [`finish`](Self::finish) at
+/// the end. [`Recording`](crate::Recording) does it on a thread of its own.
 #[derive(Debug)]
 pub struct Session<C> {
     connection: C,

@@ -106,9 +106,9 @@ pub struct Unsealed<'bytes> {
 
 /// Parses an envelope without its data ID, for display and for recordings; `None` if these bytes are none.
 ///
-/// The checksum is not verified: it includes the data ID, which is not sent. Only the receiver can verify that the bytes
-/// are authentic and not too old. No MessagePack value is mistaken for an envelope: its first byte would be a complete
-/// value.
+/// The checksum is not verified: it includes the data ID, which is not sent. Only the receiver can verify that the
+/// bytes are authentic and not too old. No MessagePack value is mistaken for an envelope: its first byte would be a
+/// complete value.
 ///
 /// # Examples
 ///

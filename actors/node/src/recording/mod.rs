@@ -95,7 +95,7 @@ impl Recording {
     /// Begins the recording that the configuration asks for, if it does.
     pub(crate) fn begin_configured(&self, node: &Arc<NodeState>) -> Result<(), RecordError> {
         let config = &node.ctx.config.record;
-        if config.folder.is_none() {
+        if config.folder.is_none() && config.file.is_none() {
             return Ok(());
         }
         let selection =
@@ -151,7 +151,7 @@ impl Recording {
         let mut state = self.lock();
         state.is_closed = true;
         state.programs.clear();
-        let is_kept = state.configured.take().is_some();
+        let is_kept = state.configured.take().is_some() && node.ctx.config.record.folder.is_some();
         if let Some(active) = state.active.take() {
             self.remove(node, &active, is_kept);
         }

@@ -200,6 +200,16 @@ fn configured_recording_outlives_the_node() {
 }
 
 #[test]
+fn journal_of_a_configured_file_ends_with_the_node() {
+    let node = node("file", |config| config.record.file = Some("/nowhere/{node}.mcap".into()));
+    node.recording.begin_configured(&node).expect("it begins");
+    let path = node.recording.path().expect("it records, for the program that writes the file");
+    assert!(path.starts_with(MEMORY) || path.starts_with(std::env::temp_dir()), "{path:?}");
+    node.recording.close(&node);
+    assert!(!path.exists());
+}
+
+#[test]
 fn log_of_the_process_is_recorded() {
     let node = node("log", |_| {});
     let knee = app(&node, "knee");
