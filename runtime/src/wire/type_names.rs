@@ -53,18 +53,6 @@ fn find(kind: Kind) -> Option<&'static Names> {
 }
 
 /// Returns the payload types that this process has sent or declared, with their names; at most 512.
-///
-/// # Examples
-///
-/// ```
-/// use sinew::{Tid, payload, prelude::*};
-/// use sinew_runtime::wire::{Message, known_types};
-///
-/// payload!("demo.angle", Stream => struct Angle { degrees: f32 });
-///
-/// let _sent = Message::typed(Tid::NONE, Tid::NONE, &Angle { degrees: 5.0 });
-/// assert!(known_types().any(|known| known == (Angle::KIND, "demo.angle")));
-/// ```
 pub fn known_types() -> impl Iterator<Item = (Kind, &'static str)> {
     NAMES.iter().filter_map(|place| place.get().map(|names| (names.kind, names.name)))
 }
