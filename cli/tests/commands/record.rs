@@ -8,7 +8,7 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::{AppAddress, NodeApi, Outcome, Registration, Tid, inspect::Ping, payload};
+use sinew::{AppAddress, NodeApi, Outcome, Registration, Tid, payload};
 use sinew_recorder::{Recording, RecordingOptions};
 use sinew_testkit::{NodeProcess, program, until};
 
@@ -124,14 +124,14 @@ fn killed_node_leaves_a_finished_file() {
     assert_complete(&file);
 }
 
-/// Registers an application that pings its node.
-fn ping(scenario: &Scenario) {
+/// Registers an application that sends one count to the node's inspection. That does not handle counts, and says so.
+fn send_one(scenario: &Scenario) {
     let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
-    let mut sensor =
-        api.register_transport_address(Registration::new().name("sensor")).expect("it is registered");
+    let registration = Registration::new().name("sensor").handles::<Count>();
+    let mut sensor = api.register_transport_address(registration).expect("it is registered");
     let inspect = Tid::new(sensor.tid().node, AppAddress::INSPECT);
-    let outcome = sensor.message(inspect, &Ping {}).confirmed(Duration::from_secs(10));
-    assert_eq!(outcome.expect("an outcome"), Outcome::Delivered);
+    let outcome = sensor.message(inspect, &Count { number: 1 }).confirmed(Duration::from_secs(10));
+    assert_ne!(outcome.expect("an outcome"), Outcome::Delivered);
 }
 
 #[test]
@@ -144,7 +144,7 @@ fn node_finishes_the_file_of_its_configuration() {
     command.arg(&path);
     let mut knee = NodeProcess::start("sinew-node", command);
     knee.wait_for(&["up"]);
-    ping(&scenario);
+    send_one(&scenario);
     knee.signal(Signal::TERM);
     assert_eq!(knee.wait_for_exit(), Some(0));
     let folder = std::fs::read_dir(file.parent().expect("a folder")).expect("it is there");
@@ -155,7 +155,7 @@ fn node_finishes_the_file_of_its_configuration() {
     assert!(files.len() == 1 && files[0].display().to_string().contains("/knee-20"), "{files:?}");
     assert_complete(&files[0]);
     let info = bag("info", &files[0]);
-    assert!(info.out.contains("/sensor/sinew.ping") && info.out.contains("finished"), "{}", info.out);
+    assert!(info.out.contains("/sensor/scenario.count") && info.out.contains("finished"), "{}", info.out);
 }
 
 #[test]
@@ -166,12 +166,12 @@ fn program_records_its_node() {
     let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
     let options = RecordingOptions { path: Some(file.clone()), ..RecordingOptions::default() };
     let recording = Recording::begin(&api, options).expect("it begins");
-    ping(&scenario);
+    send_one(&scenario);
     let summary = recording.finish_within(Duration::from_secs(60)).expect("it ends");
     assert!(summary.totals.written > 0 && summary.totals.dropped == 0, "{summary:?}");
     assert_complete(&file);
     let info = bag("info", &file);
-    assert!(info.out.contains("/sensor/sinew.ping"), "{}", info.out);
+    assert!(info.out.contains("/sensor/scenario.count"), "{}", info.out);
 }
 
 #[test]
