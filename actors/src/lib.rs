@@ -114,8 +114,8 @@ pub mod config {
     #[doc(inline)]
     pub use sinew_model::config::{
         AppSettings, ConfigError, ConfigFault, Families, GnclConfig, Interface, InterfaceError, Interfaces,
-        LnclConfig, LogConfig, LogLevel, NdlConfig, NodeConfig, RecordConfig, SecurityConfig, Seed,
-        SeedError, SupervisionConfig, SyncConfig, TimePolicy, WatchGroup,
+        LnclConfig, LogConfig, LogLevel, NdlConfig, NodeConfig, RecordCompression, RecordConfig,
+        SecurityConfig, Seed, SeedError, SupervisionConfig, SyncConfig, TimePolicy, WatchGroup,
     };
 }
 

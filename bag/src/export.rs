@@ -171,6 +171,6 @@ fn row(message: &Message<'_>) -> Row {
         log_ns: message.log_ns,
         publish_ns: message.publish_ns,
         header: None,
-        payload: message.data.to_vec(),
+        payload: message.channel.unsealed(message.data).to_vec(),
     }
 }

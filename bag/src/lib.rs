@@ -5,8 +5,8 @@
 //! `docs/protocol/recording.md` specifies the topics, the metadata and the fields.
 //!
 //! [`read`] opens finished and unfinished files, [`check()`] proves that nothing is missing, [`info()`] sums a file up,
-//! [`merge()`] puts the files of several nodes on one time line, and with the feature `export`, `export()`
-//! writes CSV and Parquet.
+//! [`merge()`] puts the files of several nodes on one time line, and `export` writes CSV and Parquet, unless the
+//! feature of this name is off.
 //!
 //! This package knows MCAP and [`sinew_schema::Schema`]. It knows no node, no socket and no clock: all times are
 //! arguments.

@@ -197,6 +197,15 @@ pub struct Record<'p> {
     pub time_to_live_us: u32,
     /// The payload, as it was sent.
     pub payload: &'p [u8],
+    /// The value inside the envelope of a protected payload, for the view. `None`: the payload is the value.
+    pub inner: Option<&'p [u8]>,
+}
+
+impl<'p> Record<'p> {
+    /// Returns the bytes of the value that the view shows.
+    pub(crate) fn value(&self) -> &'p [u8] {
+        self.inner.unwrap_or(self.payload)
+    }
 }
 
 /// The clock of another node, as this node measured it.

@@ -450,7 +450,7 @@ impl Channel {
                 true
             }
             View::Typed(plan) => {
-                let misfit = plan.encode(record.payload, out).err();
+                let misfit = plan.encode(record.value(), out).err();
                 if misfit.is_some() {
                     out.0.clear();
                 }

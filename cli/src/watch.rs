@@ -1,6 +1,5 @@
 //! `sinew watch`: the messages that an application receives and sends, live.
 
-mod envelope;
 mod rates;
 mod screen;
 

@@ -42,6 +42,7 @@ pub struct NodeBuilder {
     incarnation: Option<Incarnation>,
     heed_signals: bool,
     accept_abort_on_panic: bool,
+    writes_recording: bool,
     /// Applications that are created from settings when the node starts.
     configured: Vec<Configured>,
     /// The faults of the configuration file.
@@ -64,6 +65,7 @@ impl NodeBuilder {
             incarnation: None,
             heed_signals: false,
             accept_abort_on_panic: false,
+            writes_recording: false,
             configured: Vec::new(),
             file_faults: Vec::new(),
             #[cfg(feature = "fault-points")]
@@ -202,6 +204,24 @@ impl NodeBuilder {
     #[must_use]
     pub fn supervisor(mut self, spec: SupervisorSpec) -> Self {
         self.tree = self.tree.supervisor(spec);
+        self
+    }
+
+    /// States that this program writes the file of `record.file`, by `sinew_recorder::Recording::configured` after the
+    /// start. Otherwise a node with this key does not start: it would record into no file.
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use sinew::Node;
+    ///
+    /// let node = Node::from_file("/etc/sinew/knee.toml").writes_recording().start()?;
+    /// // let recording = sinew_recorder::Recording::configured(&config)?;
+    /// # Ok::<(), sinew::StartError>(())
+    /// ```
+    #[must_use]
+    pub const fn writes_recording(mut self) -> Self {
+        self.writes_recording = true;
         self
     }
 

@@ -5,6 +5,8 @@
 //! standard error; `SINEW_LOG` sets the level (`SINEW_LOG=warn`). `--help` and `--version` print, and start
 //! nothing. A node that cannot print `up`, as on a full disk, runs all the same, and exits with code 1 at the
 //! end. A reader that has closed its pipe is no error.
+//!
+//! With `record.file` in its configuration it writes a recording, and finishes it at its end, within 10 s.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)] // The macros panic where a pipe is closed or a disk is full.
 
@@ -12,10 +14,15 @@ use std::{
     fmt::Display,
     io::{self, Write as _},
     process::ExitCode,
+    time::Duration,
 };
 
 use sinew_model::config::NodeConfig;
 use sinew_node::Node;
+use sinew_recorder::Recording;
+
+/// Time limit for the end of the recording, after the node has ended.
+const RECORDING_ENDS_WITHIN: Duration = Duration::from_secs(10);
 
 const HELP: &str = "\
 A node with no application of its own, for programs that come in through its socket
@@ -76,10 +83,12 @@ fn printed(text: &str) -> ExitCode {
 
 fn run(path: &str) -> ExitCode {
     match start(path) {
-        Ok(node) => {
+        Ok((node, recording)) => {
             let is_printed = print_up();
             let code = node.run();
-            if is_printed || code != ExitCode::SUCCESS { code } else { ExitCode::FAILURE }
+            let is_recorded = recording.is_none_or(finish);
+            let is_fine = is_printed && is_recorded;
+            if is_fine || code != ExitCode::SUCCESS { code } else { ExitCode::FAILURE }
         }
         Err(why) => {
             note(why);
@@ -106,10 +115,30 @@ fn note(text: impl Display) {
     let _ = writeln!(io::stderr(), "sinew-node: {text}");
 }
 
-fn start(path: &str) -> Result<Node, Box<dyn std::error::Error>> {
+/// Finishes the file of the recording. Returns whether it is whole.
+fn finish(recording: Recording) -> bool {
+    let file = recording.file().display().to_string();
+    match recording.finish_within(RECORDING_ENDS_WITHIN) {
+        Ok(summary) => {
+            summary.faults.iter().for_each(|fault| note(format_args!("the recording {file}: {fault}")));
+            summary.faults.is_empty()
+        }
+        Err(why) => {
+            note(format_args!("the recording {file}: {why}"));
+            false
+        }
+    }
+}
+
+/// Starts the node, and the recording that its configuration asks for.
+fn start(path: &str) -> Result<(Node, Option<Recording>), Box<dyn std::error::Error>> {
     let config = NodeConfig::from_file(path)?;
     if config.lncl.socket.is_none() {
         return Err(format!("{path} sets no lncl.socket: no program could come in").into());
     }
-    Ok(Node::builder(config.name.clone()).config(config).heed_signals().start()?)
+    let builder = Node::builder(config.name.clone()).config(config.clone()).heed_signals();
+    let node = builder.writes_recording().start()?;
+    // Without it the node stops again.
+    let recording = Recording::configured(&config)?;
+    Ok((node, recording))
 }

@@ -6,17 +6,22 @@
 //! | [`channel`] | the key of a channel: source, destination, payload type, class, form, rejection |
 //! | [`entry`] | a record: a message, or one of the facts below |
 //! | [`facts`] | events of nodes and applications, clock offsets, log lines |
+//! | [`question`] | the question that has a node record, and its answer |
 //! | [`tap`] | writes the selected messages of a routing table |
 //! | [`selection`] | applications, payload types and groups, by names and patterns |
 
 pub mod channel;
 pub mod entry;
 pub mod facts;
+pub mod question;
 pub mod selection;
 pub mod tap;
 
 pub use channel::{Channel, Form};
 pub use entry::{Entry, EntryError, MESSAGE_HEAD, MessageEntry, fact, message_head};
 pub use facts::{ClockFact, Fact, LogFact, NodeFact, PeerClock};
+pub use question::{
+    AskRecord, CLOCKS_MAX, RECORDED_MAX, RecordReport, RecordedApp, RecordedType, SCHEMAS_MAX,
+};
 pub use selection::{Chosen, Selection, SelectionError};
 pub use tap::{RecordTap, lost_channel};

@@ -1,11 +1,15 @@
 //! A channel of the journal, and its description in the file.
 
+use std::sync::Arc;
+
 use sinew_bag::{ChannelId, ChannelInfo, Class, Direction, Party, Record};
 use sinew_record::{Channel, MessageEntry, lost_channel};
 use sinew_runtime::{
+    protection::unsealed,
     tid::{NodeAddress, Tid},
     wire::{self, Flags},
 };
+use sinew_schema::Schema;
 
 use crate::{
     names::Names,
@@ -65,7 +69,11 @@ impl Recorded {
     /// Writes the message of the number that was passed just now.
     pub(crate) fn write(&mut self, sink: &mut Sink, record: &Record<'static>, payload: Option<&[u8]>) {
         match payload {
-            Some(payload) => sink.message(self.id, &Record { payload, ..*record }),
+            Some(payload) => {
+                // The envelope of a protected payload stays as it was sent; the view is of the value in it.
+                let inner = unsealed(payload).map(|unsealed| unsealed.payload);
+                sink.message(self.id, &Record { payload, inner, ..*record });
+            }
             // It is known that it was there, and no more.
             None => sink.dropped(self.id, 1, (self.last_ns, record.handed_over_ns)),
         }
@@ -114,6 +122,7 @@ pub(crate) fn record(number: u64, time: u64, message: &MessageEntry<'_>) -> Reco
         handed_over_ns: time,
         time_to_live_us: header.time_to_live_us,
         payload: &[],
+        inner: None,
     }
 }
 
@@ -131,11 +140,15 @@ pub(crate) struct Description {
     kind: u32,
     class: Class,
     direction: Direction,
+    is_protected: bool,
+    schema: Option<Arc<Schema>>,
     refused: Option<String>,
 }
 
 impl Description {
-    pub(crate) fn of(channel: &Channel, node: NodeAddress, names: &Names) -> Self {
+    /// Describes a channel. `first` is the payload of its first message, if the journal has it: an envelope says that
+    /// the payloads are protected.
+    pub(crate) fn of(channel: &Channel, first: Option<&[u8]>, node: NodeAddress, names: &Names) -> Self {
         let unnamed = || channel.kind.to_string();
         let type_name = if is_unreported(channel) {
             "unreported".to_owned()
@@ -153,6 +166,8 @@ impl Description {
                 wire::Class::Bulk => Class::Bulk,
             },
             direction: if channel.source.node == node { Direction::Sent } else { Direction::Received },
+            is_protected: first.is_some_and(|first| unsealed(first).is_some()),
+            schema: names.schema(channel.kind).cloned(),
             refused: channel.refused.map(|why| format!("{why:?}")),
         }
     }
@@ -167,6 +182,8 @@ impl Description {
             kind: 0,
             class: Class::Control,
             direction: Direction::Sent,
+            is_protected: false,
+            schema: None,
             refused: None,
         }
     }
@@ -179,8 +196,8 @@ impl Description {
             kind: self.kind,
             class: self.class,
             direction: self.direction,
-            is_protected: false,
-            schema: None,
+            is_protected: self.is_protected,
+            schema: self.schema.as_deref(),
             refused: self.refused.as_deref(),
             seen_before,
         }

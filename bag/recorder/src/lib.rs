@@ -2,22 +2,35 @@
 //!
 //! ```text
 //! journal (sinew-shm) ──► Recorder: order, names, counters ──► BagWriter (sinew-bag) ──► walk.mcap
+//!                            ▲
+//! node ◄── Connection ── Session: renewals, structures of payload types, the end
 //! ```
 //!
-//! [`Recorder`] takes a reader of the journal and a writer of the file. Its owner calls [`Recorder::pump`] every few
-//! milliseconds. It knows no node, no socket and no clock: names and times are arguments. So the command `sinew record`
-//! and a program use the same code.
+//! - [`Recording`] is a recording of a program, on a thread of its own.
+//! - [`Session`] is the same on the thread of its owner, as `sinew record` uses it. It asks the node through a
+//!   [`Connection`], such as an endpoint of NodeAPI.
+//! - [`Recorder`] takes a reader of the journal and a writer of the file. Its owner calls [`Recorder::pump`] every few
+//!   milliseconds. It knows no node, no socket and no clock: names and times are arguments.
 
 mod channels;
+mod error;
 mod facts;
+mod file_name;
 mod names;
 mod order;
 mod recorder;
+mod recording;
+mod session;
 mod sink;
 #[cfg(test)]
 mod tests;
 
+pub use error::RecordingError;
 pub use names::Names;
 pub use order::WINDOW;
 pub use recorder::{Recorder, Setup};
+pub use recording::Recording;
+pub use session::{Connection, End, RecordingOptions, Session, Summary};
+pub use sinew_bag::{BagError, Compression, Options as FileOptions, Totals};
+pub use sinew_record::Selection;
 pub use sinew_shm::journal::{JournalReader, ReadJournalError, Start};

@@ -1,16 +1,19 @@
-//! The names of applications, nodes and payload types.
+//! The names of applications, nodes and payload types, and the structures of these types.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, sync::Arc};
 
 use sinew_runtime::{
     tid::{NodeAddress, Tid},
     wire::Kind,
 };
+use sinew_schema::Schema;
 
 /// Maximum names of each sort. Further ones are not stored: then the address is shown.
 const NAMES_MAX: usize = 65_536;
+/// Maximum types with a known structure, or with a note that there is none. Further ones have views as JSON.
+const SCHEMAS_MAX: usize = 4_096;
 
-/// The names of applications, nodes and payload types, as far as they are known.
+/// The names of applications, nodes and payload types, and the structures of these types, as far as they are known.
 ///
 /// # Examples
 ///
@@ -30,6 +33,8 @@ pub struct Names {
     apps: BTreeMap<Tid, String>,
     nodes: BTreeMap<NodeAddress, String>,
     types: BTreeMap<Kind, String>,
+    /// `None` for a type without a known structure.
+    schemas: BTreeMap<Kind, Option<Arc<Schema>>>,
     changes: u64,
 }
 
@@ -47,6 +52,29 @@ impl Names {
     /// Adds the name of a payload type.
     pub fn add_type(&mut self, kind: Kind, name: &str) {
         self.changes += u64::from(add(&mut self.types, kind, name));
+    }
+
+    /// Adds the structure of a payload type, in its canonical bytes; `None` if its node does not know it. Bytes that
+    /// are no schema leave the type without a known structure. A structure that is known stays.
+    pub fn add_schema(&mut self, kind: Kind, schema: Option<&[u8]>) {
+        let schema = schema.and_then(|bytes| Schema::parse(bytes).ok()).map(Arc::new);
+        let has_room = self.schemas.len() < SCHEMAS_MAX;
+        match self.schemas.get_mut(&kind) {
+            Some(known) => *known = known.take().or(schema),
+            None if has_room => drop(self.schemas.insert(kind, schema)),
+            None => {}
+        }
+    }
+
+    /// Returns the structure of a payload type.
+    #[must_use]
+    pub fn schema(&self, kind: Kind) -> Option<&Arc<Schema>> {
+        self.schemas.get(&kind)?.as_ref()
+    }
+
+    /// Returns whether the node need not be asked for the structure of a payload type any more.
+    pub(crate) fn is_settled(&self, kind: Kind) -> bool {
+        self.schemas.contains_key(&kind) || self.schemas.len() >= SCHEMAS_MAX
     }
 
     /// Returns the name of an application or of a group.
@@ -81,4 +109,35 @@ fn add<K: Ord>(all: &mut BTreeMap<K, String>, key: K, name: &str) -> bool {
     }
     all.insert(key, name.to_owned());
     true
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew_schema::Shape;
+
+    use super::*;
+
+    #[test]
+    fn known_structure_stays() {
+        let kind = Kind::named("test.angle");
+        let mut names = Names::default();
+        assert!(!names.is_settled(kind));
+        // These bytes are no schema.
+        names.add_schema(kind, Some(&[0xff; 9]));
+        assert!(names.schema(kind).is_none() && names.is_settled(kind));
+        let schema = Schema { root: Shape::F32, types: BTreeMap::new() };
+        names.add_schema(kind, Some(&schema.encode()));
+        names.add_schema(kind, None);
+        assert_eq!(names.schema(kind).map(|known| &**known), Some(&schema));
+    }
+
+    #[test]
+    fn structures_are_bounded() {
+        let mut names = Names::default();
+        for kind in 0..=SCHEMAS_MAX as u32 {
+            names.add_schema(Kind::from_bits(kind), None);
+        }
+        assert_eq!(names.schemas.len(), SCHEMAS_MAX);
+        assert!(names.is_settled(Kind::from_bits(u32::MAX)), "none is asked for any more");
+    }
 }

@@ -1,10 +1,16 @@
 //! Reads the journal, and writes the file.
 
-use std::{collections::BTreeMap, time::Duration};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::Duration,
+};
 
 use sinew_bag::{BagError, BagWriter, Totals};
 use sinew_record::{Channel, Entry, MessageEntry, PeerClock, Selection};
-use sinew_runtime::tid::{AppAddress, NodeAddress, Tid};
+use sinew_runtime::{
+    tid::{AppAddress, NodeAddress, Tid},
+    wire::Kind,
+};
 use sinew_shm::journal::{self, JournalReader, ReadJournalError, ReaderCounts};
 
 use crate::{
@@ -22,6 +28,8 @@ const HELD_NS: u64 = 100_000_000;
 const HELD_BYTES_MAX: usize = 16 << 20;
 /// Maximum records of one call.
 const RECORDS_MAX: usize = 4_096;
+/// Maximum payload types for which the first message waits. Further ones have the name that is known by then.
+const WAITED_MAX: usize = 4_096;
 /// Time between two tallies.
 const TALLY_NS: u64 = 1_000_000_000;
 
@@ -89,7 +97,12 @@ pub struct Recorder {
     /// Facts that were read, by place.
     facts: BTreeMap<u16, u64>,
     held_bytes: usize,
+    /// The last record that was read.
     buffer: Vec<u8>,
+    /// The record in the buffer, if it waits for the structure of its payload type.
+    waiting: Option<(journal::Record, Kind)>,
+    /// The types for which a record has waited.
+    waited: BTreeSet<Kind>,
     tally_due_ns: u64,
 }
 
@@ -113,12 +126,15 @@ impl Recorder {
             facts: BTreeMap::new(),
             held_bytes: 0,
             buffer: Vec::new(),
+            waiting: None,
+            waited: BTreeSet::new(),
             tally_due_ns: 0,
         })
     }
 
     /// Writes the records that are there, at most 4,096, and each second the counters. Returns whether there are no
-    /// more for now. To be called every few milliseconds: the journal keeps only the newest bytes.
+    /// more for now. To be called every few milliseconds: the journal keeps only the newest bytes. It returns early at
+    /// the first message of a type without a known structure: see [`wanted`](Self::wanted).
     ///
     /// # Errors
     /// The journal cannot be read. After [`ReadJournalError::Damaged`] the next call continues.
@@ -176,6 +192,22 @@ impl Recorder {
             facts::lost(&mut self.sink, now_ns, lost);
         }
         self.sink.finish(now_ns)
+    }
+
+    /// Returns the payload type of the next message, if nothing is known of its structure; and then further such types
+    /// of the journal, at most `count` in all. The next call of [`pump`](Self::pump) writes the message in any case. Its
+    /// channel has the name and the structure that are known by then, so the owner can ask the node before. No message
+    /// waits twice for a type.
+    #[must_use]
+    pub fn wanted(&self, count: usize) -> Vec<Kind> {
+        let Some((_, first)) = self.waiting else { return Vec::new() };
+        let names = &self.setup.names;
+        let messages = self.channels.values().filter(|channel| channel.form.is_message());
+        let others: BTreeSet<_> = messages
+            .map(|channel| channel.kind)
+            .filter(|kind| *kind != first && !names.is_settled(*kind))
+            .collect();
+        [first].into_iter().chain(others).take(count).collect()
     }
 
     /// Returns the names, to which the owner adds. A channel keeps the names that it has at its first message.
@@ -250,13 +282,42 @@ impl Recorder {
     }
 
     fn read(&mut self, now_ns: u64, bytes: &mut Vec<u8>) -> Result<bool, ReadJournalError> {
+        if let Some((found, _)) = self.waiting.take()
+            && let Ok(entry) = Entry::read(bytes)
+        {
+            self.take(&found, &entry)?;
+        }
         for _ in 0..RECORDS_MAX {
             let Some(found) = self.reader.next(now_ns, bytes)? else { return Ok(true) };
             // A record that cannot be read is missing by its number.
             let Ok(entry) = Entry::read(bytes) else { continue };
+            if let Some(kind) = self.awaited(&found, &entry)? {
+                self.waiting = Some((found, kind));
+                return Ok(false);
+            }
             self.take(&found, &entry)?;
         }
         Ok(false)
+    }
+
+    /// Returns the type of the first message of a channel, if its structure should be asked for before.
+    fn awaited(
+        &mut self,
+        found: &journal::Record,
+        entry: &Entry<'_>,
+    ) -> Result<Option<Kind>, ReadJournalError> {
+        let Entry::Message(message) = entry else { return Ok(None) };
+        if self.places.contains_key(&found.place) || !self.is_within(found.place, found.number) {
+            return Ok(None);
+        }
+        let kind = message.header.kind;
+        let is_open = !self.setup.names.is_settled(kind) && self.waited.len() < WAITED_MAX;
+        if !is_open || !self.waited.insert(kind) {
+            return Ok(None);
+        }
+        // Other types of the table are asked for at once.
+        self.read_table()?;
+        Ok(Some(kind))
     }
 
     pub(crate) fn take(
@@ -291,7 +352,7 @@ impl Recorder {
         found: &journal::Record,
         message: &MessageEntry<'_>,
     ) -> Result<(), ReadJournalError> {
-        self.know(found, message.header.destination)?;
+        self.know(found, message)?;
         let Some(Place::Recorded(recorded)) = self.places.get_mut(&found.place) else { return Ok(()) };
         let record = record(found.number, found.time, message);
         if recorded.order.pass(found.number) {
@@ -310,7 +371,7 @@ impl Recorder {
     }
 
     /// Decides about a channel at its first message, and once more after names have changed.
-    fn know(&mut self, found: &journal::Record, to: Tid) -> Result<(), ReadJournalError> {
+    fn know(&mut self, found: &journal::Record, message: &MessageEntry<'_>) -> Result<(), ReadJournalError> {
         let before = match self.places.get(&found.place) {
             Some(Place::Recorded(_)) => return Ok(()),
             Some(Place::Unchosen { changes }) if *changes == self.setup.names.changes() => return Ok(()),
@@ -321,14 +382,15 @@ impl Recorder {
         if !self.channels.contains_key(&found.place) {
             self.read_table()?;
         }
-        self.add(found.place, to, before, found.time);
+        self.add(found.place, (message.header.destination, message.payload), before, found.time);
         Ok(())
     }
 
-    fn add(&mut self, place: u16, to: Tid, before: u64, now_ns: u64) {
+    /// Adds a channel: with the destination and the payload of its first message, if there is one.
+    fn add(&mut self, place: u16, (to, first): (Tid, Option<&[u8]>), before: u64, now_ns: u64) {
         let Setup { node, names, .. } = &self.setup;
         let (is_chosen, description) = match self.channels.get(&place) {
-            Some(channel) => (self.is_chosen(channel, to), Description::of(channel, *node, names)),
+            Some(channel) => (self.is_chosen(channel, to), Description::of(channel, first, *node, names)),
             None => (true, Description::shared()),
         };
         let changes = names.changes();
@@ -393,7 +455,7 @@ impl Recorder {
         }
         if !self.places.contains_key(&place) {
             let to = self.channels.get(&place).map_or(Tid::NONE, |channel| channel.destination);
-            self.add(place, to, before, now_ns);
+            self.add(place, (to, None), before, now_ns);
         }
         if let Some(Place::Recorded(recorded)) = self.places.get_mut(&place) {
             recorded.skip_to(&mut self.sink, seen, now_ns);

@@ -1,15 +1,22 @@
 //! The recorder, with journals that the tests write.
 
-use std::{fs, path::PathBuf};
+use std::{
+    collections::BTreeMap,
+    fs,
+    path::{Path, PathBuf},
+};
 
 use sinew_bag::{BagWriter, Options, Origin, Totals};
 use sinew_record::{
     Channel, Entry, Fact, Form, LogFact, MessageEntry, NodeFact, Selection, fact, lost_channel, message_head,
 };
 use sinew_runtime::{
+    protection::{DataId, Stamp, seal},
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
+    time::Time,
     wire::{Class, Header, Kind},
 };
+use sinew_schema::{Field, Schema, Shape};
 use sinew_shm::journal::{self, Journal, JournalReader, Start};
 
 use crate::{Names, Recorder, Setup};
@@ -17,6 +24,8 @@ use crate::{Names, Recorder, Setup};
 const NODE: NodeAddress = NodeAddress::new(0x7f00_0002);
 const SECOND: u64 = 1_000_000_000;
 const RING: u64 = 64 * 1024;
+/// The payload `{"x": 5}`.
+const PAYLOAD: &[u8] = b"\x81\xa1x\x05";
 
 fn tid(app: u32) -> Tid {
     Tid::new(NODE, AppAddress::new(app))
@@ -67,6 +76,8 @@ impl Bench {
             names.add_app(tid(app), name);
         }
         names.add_type(Kind::named("test.angle"), "test.angle");
+        // Its structure is not known, and the recorder does not wait for it.
+        names.add_schema(Kind::named("test.angle"), None);
         let setup = Setup { node: NODE, selection, names, left_out: vec![tid(0x1009)] };
         let recorder = Recorder::begin(reader, bag, setup).unwrap();
         Self { folder, journal, recorder }
@@ -88,8 +99,10 @@ impl Bench {
 }
 
 fn write(journal: &Journal, channel: &Channel, sequence: u64, at_ns: u64) {
-    // The payload is {"x": 5}.
-    let payload = b"\x81\xa1x\x05";
+    write_payload(journal, channel, PAYLOAD, (sequence, at_ns));
+}
+
+fn write_payload(journal: &Journal, channel: &Channel, payload: &[u8], (sequence, at_ns): (u64, u64)) {
     let head = message_head(channel.form, &header(channel, sequence), payload.len(), channel.refused);
     assert!(journal.write(channel.key(), at_ns, &[&head, payload]));
 }
@@ -204,4 +217,83 @@ fn facts_are_events_and_log_lines() {
     for topic in ["/sinew/events", "/sinew/barriers", "/sinew/log"] {
         assert!(topics.iter().any(|found| found == topic), "{topic}: {topics:?}");
     }
+}
+
+/// Returns the metadata of the channels with this topic, and the data of their messages.
+fn read_file(file: &Path, topic: &str) -> Vec<(BTreeMap<String, String>, Vec<u8>)> {
+    let mut reader = sinew_bag::read::Reader::open(file).unwrap();
+    let mut found = Vec::new();
+    while let Some(item) = reader.next_item().unwrap() {
+        if let sinew_bag::read::Item::Message(message) = item
+            && message.channel.topic == topic
+        {
+            found.push((message.channel.metadata.clone(), message.data.to_vec()));
+        }
+    }
+    found
+}
+
+#[test]
+fn first_message_waits_for_the_structure_of_its_type() {
+    let mut bench = Bench::new("waits", Selection::default());
+    let torque = Channel { kind: Kind::named("test.torque"), ..angles() };
+    write(&bench.journal, &torque, 1, SECOND);
+    write(&bench.journal, &torque, 2, SECOND);
+    assert!(!bench.recorder.pump(SECOND).unwrap());
+    assert_eq!((bench.recorder.wanted(8), bench.recorder.totals().seen), (vec![torque.kind], 0));
+    // When: the node has answered.
+    let field = Field { name: "x".to_owned(), shape: Shape::U8, optional: false };
+    let schema = Schema { root: Shape::Struct(vec![field]), types: BTreeMap::new() };
+    bench.recorder.names_mut().add_type(torque.kind, "test.torque");
+    bench.recorder.names_mut().add_schema(torque.kind, Some(&schema.encode()));
+    assert!(bench.recorder.pump(SECOND).unwrap());
+    assert_eq!((bench.recorder.wanted(8), bench.recorder.totals().written), (vec![], 2));
+    // Then: the view has the name and the structure from the first message on.
+    let file = bench.folder.join("leg.mcap");
+    bench.recorder.pump(3 * SECOND).unwrap();
+    let views = read_file(&file, "/hip/test.torque/view");
+    assert_eq!(views.len(), 2);
+    assert_eq!(views[0].0["sinew.role"], "view");
+    // Field 1, a varint: 5.
+    assert_eq!(views[0].1[..2], [8, 5]);
+    let (totals, _) = bench.finish();
+    assert_eq!((totals.seen, totals.written, totals.misfits), (2, 2, 0));
+}
+
+#[test]
+fn message_of_an_unknown_type_is_written_without_an_answer() {
+    let mut bench = Bench::new("unanswered", Selection::default());
+    let torque = Channel { kind: Kind::named("test.torque"), ..angles() };
+    let other = Channel { destination: tid(0x1003), ..torque };
+    write(&bench.journal, &torque, 1, SECOND);
+    write(&bench.journal, &other, 1, SECOND);
+    assert!(!bench.recorder.pump(SECOND).unwrap());
+    // A type is waited for once.
+    assert!(bench.recorder.pump(SECOND).unwrap());
+    let (totals, topics) = bench.finish();
+    assert_eq!((totals.seen, totals.written), (2, 2));
+    let topic = format!("/hip/{}", torque.kind);
+    assert!(topics.contains(&topic), "{topics:?}");
+}
+
+#[test]
+fn protected_payload_is_shown_without_its_envelope() {
+    let mut bench = Bench::new("protected", Selection::default());
+    let command = Channel { destination: tid(0x1003), ..angles() };
+    let data_id = DataId { source: command.source, destination: command.destination, name: "test.angle" };
+    let stamp = Stamp { counter: 103, incarnation: 7, echo: Time::ZERO };
+    let sealed = seal(&data_id, stamp, PAYLOAD);
+    write_payload(&bench.journal, &command, &sealed, (1, SECOND));
+    write(&bench.journal, &angles(), 2, SECOND);
+    assert!(bench.recorder.pump(2 * SECOND).unwrap());
+    let file = bench.folder.join("leg.mcap");
+    bench.recorder.pump(4 * SECOND).unwrap();
+    let raw = read_file(&file, "/hip/test.angle");
+    assert_eq!((raw[0].0["sinew.protected"].as_str(), &raw[0].1[..]), ("true", &sealed[..]));
+    let view = read_file(&file, "/hip/test.angle/view");
+    let view: serde_json::Value = serde_json::from_slice(&view[0].1).unwrap();
+    assert_eq!(view["x"], 5);
+    let open = read_file(&file, "/hip/test.angle/to/knee");
+    assert_eq!((open[0].0["sinew.protected"].as_str(), &open[0].1[..]), ("false", PAYLOAD));
+    bench.finish();
 }

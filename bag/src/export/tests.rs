@@ -5,7 +5,7 @@ use parquet::{
 
 use super::*;
 use crate::{
-    BagWriter, Direction, Options, Origin, Record,
+    BagWriter, ChannelInfo, Class, Direction, Options, Origin, Party, Record,
     testing::{TestFolder, angle},
 };
 
@@ -28,6 +28,35 @@ fn recording(folder: &TestFolder, payloads: &[serde_json::Value]) -> PathBuf {
     }
     bag.finish(10).unwrap();
     path
+}
+
+#[test]
+fn protected_payload_has_the_columns_of_its_value() {
+    let folder = TestFolder::new();
+    let path = folder.path("walk.mcap");
+    let mut bag = BagWriter::create(&path, Options::default(), Origin::default()).unwrap();
+    let party = Party { text: "127.0.0.2/1".to_owned(), ..Party::default() };
+    let info = ChannelInfo {
+        source: &party,
+        destination: &party,
+        type_name: "exo.torque",
+        kind: 7,
+        class: Class::Stream,
+        direction: Direction::Sent,
+        is_protected: true,
+        schema: None,
+        refused: None,
+        seen_before: 0,
+    };
+    let channel = bag.channel(&info).unwrap();
+    let sealed = [&[1; 32][..], b"\x81\xa1x\x05", &[9; 8]].concat();
+    bag.message(channel, &Record { number: 1, sequence: 1, payload: &sealed, ..Record::default() }).unwrap();
+    bag.finish(10).unwrap();
+    let exported = export(&path, folder.path("out"), Format::Csv).unwrap();
+    let text = fs::read_to_string(&exported[0].file).unwrap();
+    let heading = text.lines().next().unwrap();
+    assert!(heading.split(',').any(|column| column == "x"), "{text}");
+    assert!(text.lines().nth(1).unwrap().split(',').any(|cell| cell == "5"), "{text}");
 }
 
 #[test]

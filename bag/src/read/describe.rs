@@ -9,6 +9,9 @@ use crate::{
     view::HEADER_FIELD,
 };
 
+/// Bytes of the envelope of a protected payload: before the value, and behind it (docs/protocol/protected.md).
+const ENVELOPE: [usize; 2] = [32, 8];
+
 /// The part that a channel has in a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role<'c> {
@@ -35,6 +38,17 @@ impl Channel {
     #[must_use]
     pub fn value(&self, key: &str) -> &str {
         self.metadata.get(&format!("sinew.{key}")).map_or("", String::as_str)
+    }
+
+    /// Returns the value in a payload of this channel: the bytes in the envelope, if the payloads are protected. Nothing
+    /// of the envelope is verified.
+    #[must_use]
+    pub fn unsealed<'d>(&self, payload: &'d [u8]) -> &'d [u8] {
+        if self.value("protected") != "true" {
+            return payload;
+        }
+        let end = payload.len().saturating_sub(ENVELOPE[1]);
+        payload.get(ENVELOPE[0]..end).unwrap_or(payload)
     }
 
     /// Returns the class of its messages.

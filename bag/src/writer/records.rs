@@ -101,9 +101,9 @@ pub(super) fn event(origin: &Origin, event: &Event<'_>) -> String {
 /// no MessagePack are in base64, as `bytes`.
 pub(super) fn json_view(record: &Record<'_>) -> String {
     let mut text = String::from("{");
-    if members(record.payload, &mut text).is_err() {
+    if members(record.value(), &mut text).is_err() {
         text.truncate(1);
-        let _ = write!(text, "\"bytes\":\"{}\"", base64(record.payload));
+        let _ = write!(text, "\"bytes\":\"{}\"", base64(record.value()));
     }
     if text.len() > 1 {
         text.push(',');

@@ -214,3 +214,22 @@ fn thread_of_a_recorder_can_have_it() {
     let folder = TestFolder::new();
     is_send(&BagWriter::create(folder.path("walk.mcap"), Options::default(), origin()).unwrap());
 }
+
+#[test]
+fn view_of_a_protected_payload_shows_the_value_inside() {
+    let folder = TestFolder::new();
+    let file = folder.path("walk.mcap");
+    let mut bag = BagWriter::create(&file, Options::default(), origin()).unwrap();
+    let channel = angle(&mut bag, Direction::Sent);
+    // The bytes before and behind the value stand for an envelope.
+    let sealed = [&[1; 32][..], b"\x81\xa1x\x05", &[9; 8]].concat();
+    let sent = Record { payload: &sealed, inner: Some(&sealed[32..36]), ..record(1, SECOND) };
+    bag.message(channel, &sent).unwrap();
+    assert_eq!(bag.finish(2 * SECOND).unwrap().misfits, 0);
+    let bytes = fs::read(&file).unwrap();
+    let all = mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap);
+    let found: Vec<_> = all.filter(|message| message.channel.topic.starts_with("/knee.sensor")).collect();
+    assert_eq!(&*found[0].data, &*sealed, "the payload stays as it was sent");
+    let view: serde_json::Value = serde_json::from_slice(&found[1].data).unwrap();
+    assert_eq!(view["x"], 5);
+}

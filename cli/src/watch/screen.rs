@@ -9,9 +9,10 @@ use serde_json::{Value, json};
 use sinew::{
     NodeAddress, Tid,
     inspect::{AppsReport, AskApps, SeenMessage},
+    protection::unsealed,
 };
 
-use super::{envelope, rates::Rated};
+use super::rates::Rated;
 use crate::{
     messagepack, output,
     system::{Answer, System, SystemError},
@@ -161,7 +162,7 @@ fn payload(message: &SeenMessage) -> String {
 
 /// Returns the value of a payload, and the counter of a protected one.
 fn value(payload: &[u8]) -> (Option<u64>, Value) {
-    let unsealed = envelope::unsealed(payload);
+    let unsealed = unsealed(payload);
     let inner = unsealed.map_or(payload, |unsealed| unsealed.payload);
     (unsealed.map(|unsealed| unsealed.counter), messagepack::shown_or_raw(inner))
 }

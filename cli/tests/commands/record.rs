@@ -8,8 +8,9 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::{NodeApi, Registration, Tid, payload};
-use sinew_testkit::{NodeProcess, until};
+use sinew::{AppAddress, NodeApi, Outcome, Registration, Tid, payload};
+use sinew_recorder::{Recording, RecordingOptions};
+use sinew_testkit::{NodeProcess, program, until};
 
 use crate::scenario::{Answer, Scenario};
 
@@ -121,6 +122,56 @@ fn killed_node_leaves_a_finished_file() {
     assert_eq!(recorder.wait_for_exit(), Some(0));
     assert!(recorder.output().iter().any(|line| line.contains("node_died")), "{:?}", recorder.output());
     assert_complete(&file);
+}
+
+/// Registers an application that sends one count to the node's inspection. That does not handle counts, and says so.
+fn send_one(scenario: &Scenario) {
+    let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
+    let registration = Registration::new().name("sensor").handles::<Count>();
+    let mut sensor = api.register_transport_address(registration).expect("it is registered");
+    let inspect = Tid::new(sensor.tid().node, AppAddress::INSPECT);
+    let outcome = sensor.message(inspect, &Count { number: 1 }).confirmed(Duration::from_secs(10));
+    assert_ne!(outcome.expect("an outcome"), Outcome::Delivered);
+}
+
+#[test]
+fn node_finishes_the_file_of_its_configuration() {
+    let scenario = Scenario::new();
+    let file = scenario.directory.join("{node}.mcap");
+    let section = format!("[record]\nfile = \"{}\"\nkeep_bytes = 1048576\n[ndl]", file.display());
+    let path = scenario.configure("knee", 2, &[("[ndl]", &section)]);
+    let mut command = Command::new(program("sinew-node"));
+    command.arg(&path);
+    let mut knee = NodeProcess::start("sinew-node", command);
+    knee.wait_for(&["up"]);
+    send_one(&scenario);
+    knee.signal(Signal::TERM);
+    assert_eq!(knee.wait_for_exit(), Some(0));
+    let folder = std::fs::read_dir(file.parent().expect("a folder")).expect("it is there");
+    let files: Vec<_> = folder
+        .map(|entry| entry.expect("it can be read").path())
+        .filter(|path| path.extension().is_some_and(|ending| ending == "mcap"))
+        .collect();
+    assert!(files.len() == 1 && files[0].display().to_string().contains("/knee-20"), "{files:?}");
+    assert_complete(&files[0]);
+    let info = bag("info", &files[0]);
+    assert!(info.out.contains("/sensor/scenario.count") && info.out.contains("finished"), "{}", info.out);
+}
+
+#[test]
+fn program_records_its_node() {
+    let scenario = Scenario::new();
+    let _knee = scenario.start("knee", 2, &[]);
+    let file = scenario.directory.join("walk.mcap");
+    let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
+    let options = RecordingOptions { path: Some(file.clone()), ..RecordingOptions::default() };
+    let recording = Recording::begin(&api, options).expect("it begins");
+    send_one(&scenario);
+    let summary = recording.finish_within(Duration::from_secs(60)).expect("it ends");
+    assert!(summary.totals.written > 0 && summary.totals.dropped == 0, "{summary:?}");
+    assert_complete(&file);
+    let info = bag("info", &file);
+    assert!(info.out.contains("/sensor/scenario.count"), "{}", info.out);
 }
 
 #[test]

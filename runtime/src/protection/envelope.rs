@@ -92,6 +92,46 @@ pub fn look<'bytes>(data_id: &DataId, bytes: &'bytes [u8]) -> Option<(Stamp, &'b
     if digest.sum64() != u64::from_le_bytes(*sum) {
         return None;
     }
+    parse(sealed)
+}
+
+/// The content of an envelope that was not verified; see [`unsealed`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Unsealed<'bytes> {
+    /// The number of the message in its flow, as claimed, from 1.
+    pub counter: u64,
+    /// The payload.
+    pub payload: &'bytes [u8],
+}
+
+/// Parses an envelope without its data ID, for display and for recordings; `None` if these bytes are none.
+///
+/// The checksum is not verified: it includes the data ID, which is not sent. Only the receiver can verify that the
+/// bytes are authentic and not too old. No MessagePack value is mistaken for an envelope: its first byte would be a
+/// complete value.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::{Tid, Time, protection::{DataId, Stamp, seal, unsealed}};
+///
+/// let (hip, knee): (Tid, Tid) = ("10.0.0.1/1001".parse()?, "10.0.0.2/1001".parse()?);
+/// let data_id = DataId { source: hip, destination: knee, name: "demo.angle" };
+/// let sealed = seal(&data_id, Stamp { counter: 103, incarnation: 7, echo: Time::ZERO }, &[5]);
+/// let shown = unsealed(&sealed).expect("it is an envelope");
+/// assert_eq!((shown.counter, shown.payload), (103, &[5][..]));
+/// assert_eq!(unsealed(&[5]), None);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[must_use]
+pub fn unsealed(bytes: &[u8]) -> Option<Unsealed<'_>> {
+    let (sealed, _checksum) = bytes.split_last_chunk::<TAIL>()?;
+    let (stamp, payload) = parse(sealed)?;
+    Some(Unsealed { counter: stamp.counter, payload })
+}
+
+/// Parses an envelope without its checksum.
+fn parse(sealed: &[u8]) -> Option<(Stamp, &[u8])> {
     let (head, payload) = sealed.split_first_chunk::<HEAD>()?;
     let word = |at: usize| head.get(at..at + 8).and_then(|word| word.try_into().ok()).map(u64::from_le_bytes);
     let (first, counter, incarnation, echo) = (word(0)?, word(8)?, word(16)?, word(24)?);
@@ -105,4 +145,43 @@ pub fn look<'bytes>(data_id: &DataId, bytes: &'bytes [u8]) -> Option<(Stamp, &'b
 /// Returns the payload of a message that was checked and was good.
 pub(super) fn payload_of(sealed: &[u8]) -> &[u8] {
     sealed.get(HEAD..sealed.len().saturating_sub(TAIL)).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tid::{AppAddress, NodeAddress};
+
+    /// The envelope of the message 103 of its flow.
+    fn sealed(payload: &[u8]) -> Vec<u8> {
+        let tid = |app| Tid::new(NodeAddress::from([10, 0, 0, 1]), AppAddress::new(app));
+        let data_id = DataId { source: tid(0x1001), destination: tid(0x1002), name: "demo.angle" };
+        let stamp = Stamp { counter: 103, incarnation: 7, echo: Time::from_nanos(5) };
+        seal(&data_id, stamp, payload).to_vec()
+    }
+
+    #[test]
+    fn sealed_payload_is_shown_with_its_counter() {
+        for payload in [&b""[..], &[0x81, 0xa1, b'a', 1], &[7; 4_000]] {
+            assert_eq!(unsealed(&sealed(payload)), Some(Unsealed { counter: 103, payload }));
+        }
+    }
+
+    #[test]
+    fn truncated_or_foreign_bytes_are_no_envelope() {
+        let good = sealed(&[1, 2, 3]);
+        for length in 0..good.len() {
+            assert_eq!(unsealed(&good[..length]), None, "{length} bytes");
+        }
+        assert_eq!(unsealed(&[&good[..], &[0]].concat()), None);
+        // Version, flags, zeros and length.
+        for at in 0..8 {
+            let mut other = good.clone();
+            other[at] ^= 0x80;
+            assert_eq!(unsealed(&other), None, "byte {at}");
+        }
+        for foreign in [vec![0; 100], vec![0xff; 100], vec![1; 100]] {
+            assert_eq!(unsealed(&foreign), None);
+        }
+    }
 }

@@ -56,7 +56,7 @@ use serde::{Deserialize, Serialize};
 
 pub use self::{
     ends::{Came, Ends, SealError},
-    envelope::{DataId, OVERHEAD, Stamp, open, seal},
+    envelope::{DataId, OVERHEAD, Stamp, Unsealed, open, seal, unsealed},
     guard::Guard,
 };
 pub(crate) use self::{guard::Guarded, receiver::Verdict, sender::Flows};

@@ -26,5 +26,6 @@ pub(crate) use message::decode_as;
 pub use message::{DecodeError, Message, MessageBuffer, Payload, encode};
 pub use protection::Protection;
 pub use read::decode;
+pub use type_names::known_types;
 pub(crate) use type_names::remember;
 pub use type_schema::{TypeSchema, schema_of};

@@ -52,6 +52,11 @@ fn find(kind: Kind) -> Option<&'static Names> {
     places(kind).map_while(OnceLock::get).find(|names| names.kind == kind)
 }
 
+/// Returns the payload types that this process has sent or declared, with their names; at most 512.
+pub fn known_types() -> impl Iterator<Item = (Kind, &'static str)> {
+    NAMES.iter().filter_map(|place| place.get().map(|names| (names.kind, names.name)))
+}
+
 impl Kind {
     /// Returns the name of the payload type with this ID, if this process has sent it or declared that it handles it.
     #[must_use]
@@ -110,8 +115,10 @@ mod tests {
     #[test]
     fn sent_type_has_its_names() {
         assert_eq!(Kind::named("test.type_names.never").type_name(), None);
+        assert!(known_types().all(|(kind, _)| kind != Angle::KIND));
         remember::<Angle>();
         remember::<Angle>();
+        assert_eq!(known_types().filter(|(kind, _)| *kind == Angle::KIND).count(), 1);
         assert_eq!(Angle::KIND.type_name(), Some("test.type_names.angle"));
         assert_eq!(Angle::KIND.rust_name(), Some("Angle"));
     }

@@ -76,6 +76,9 @@ pub(super) const LAYER_WINDOW: Range = range("supervision.layer_window_ms", 1, 3
 pub(super) const APP_RESTARTS_MAX: Range = range("supervision.app_restarts_max", 0, 1_000_000, "restarts");
 pub(super) const APP_WINDOW: Range = range("supervision.app_window_ms", 1, 3_600_000, "ms");
 pub(super) const KEEP_BYTES: Range = range("record.keep_bytes", 64 << 10, 4 << 30, "bytes");
+pub(super) const SPLIT_BYTES: Range = range("record.split_bytes", 64 << 10, 1 << 50, "bytes, or false");
+pub(super) const SPLIT_TIME: Range = range("record.split_ms", 1_000, 604_800_000, "ms, or false");
+pub(super) const MAX_BYTES: Range = range("record.max_bytes", 64 << 10, 1 << 50, "bytes, or false");
 /// Maximum number of names in `record.apps` and `record.types`, and maximum bytes of one.
 const RECORDED_MAX: usize = 64;
 const RECORDED_BYTES_MAX: usize = 255;
@@ -211,6 +214,19 @@ impl NodeConfig {
             faults.push(fault("record.folder", quoted(&folder.to_string_lossy()), legal, remedy));
         }
         KEEP_BYTES.count(faults, record.keep_bytes);
+        if let Some(file) = record.file.as_deref().filter(|file| !is_path(file)) {
+            let legal = format!("the path of a file, 1 to {DIRECTORY_BYTES_MAX} bytes, or false");
+            let remedy = "name a file, as in /var/log/{node}-{time}.mcap";
+            faults.push(fault("record.file", quoted(&file.to_string_lossy()), legal, remedy));
+        }
+        for (range, bytes) in [(&SPLIT_BYTES, record.split_bytes), (&MAX_BYTES, record.max_bytes)] {
+            if let Some(bytes) = bytes.filter(|bytes| !(range.low..=range.high).contains(bytes)) {
+                faults.push(range.fault(bytes.to_string()));
+            }
+        }
+        if let Some(time) = record.split_time {
+            SPLIT_TIME.time(faults, time);
+        }
         for (key, names) in [("record.apps", &record.apps), ("record.types", &record.types)] {
             if names.len() > RECORDED_MAX {
                 let remedy = "write a `*` in place of several";

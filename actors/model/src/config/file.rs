@@ -27,7 +27,7 @@ const SECTIONS: [&str; 10] =
     ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security", "log", "record", "app"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 53] = [
+pub(super) const KEYS: [&str; 58] = [
     "node.name",
     "node.project",
     "node.address",
@@ -81,6 +81,11 @@ pub(super) const KEYS: [&str; 53] = [
     "record.keep_bytes",
     "record.apps",
     "record.types",
+    "record.file",
+    "record.split_bytes",
+    "record.split_ms",
+    "record.max_bytes",
+    "record.compression",
 ];
 
 impl NodeConfig {
@@ -324,6 +329,14 @@ impl Reader<'_> {
         let remedy = "set it as in [\"leg.*\"], or leave it out for all";
         self.read_list("record.apps", check::RECORDED_LEGAL, remedy, &mut record.apps);
         self.read_list("record.types", check::RECORDED_LEGAL, remedy, &mut record.types);
+        self.text_or_off("record.file", "\"/var/log/{node}-{time}.mcap\" or false", &mut record.file);
+        self.number_or_off(&check::SPLIT_BYTES, &mut record.split_bytes);
+        let mut split_ms = record.split_time.map(|time| time.as_millis() as u64);
+        self.number_or_off(&check::SPLIT_TIME, &mut split_ms);
+        record.split_time = split_ms.map(Duration::from_millis);
+        self.number_or_off(&check::MAX_BYTES, &mut record.max_bytes);
+        let example = "\"zstd\", \"lz4\" or \"none\"";
+        self.text("record.compression", example, &mut record.compression);
     }
 }
 

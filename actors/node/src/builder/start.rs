@@ -2,7 +2,10 @@
 
 use std::{
     process::ExitCode,
-    sync::mpsc::{RecvTimeoutError, sync_channel},
+    sync::{
+        Arc,
+        mpsc::{RecvTimeoutError, sync_channel},
+    },
     time::SystemTime,
 };
 
@@ -125,7 +128,7 @@ impl NodeBuilder {
         }
         open_client_socket(&state)?;
         inspect::begin(&state)?;
-        state.recording.begin_configured(&state).map_err(|why| StartError::Record(why.to_string()))?;
+        begin_recording(&state, self.writes_recording)?;
         let (tree, heed_signals) = (self.tree, self.heed_signals);
         if heed_signals && handle.root.post(RootEvent::HeedSignals).is_err() {
             return Err(StartError::Layers("the root's event queue was full before it was read".to_owned()));
@@ -202,6 +205,16 @@ const fn level(level: LogLevel) -> LevelFilter {
 fn open_client_socket(state: &NodeState) -> Result<(), StartError> {
     let Some(path) = &state.ctx.config.lncl.socket else { return Ok(()) };
     state.lncl.open_client_socket(path).map(drop).map_err(|why| StartError::Socket(why.to_string()))
+}
+
+/// Begins the recording that the configuration asks for. The program has to write its file, if there is one.
+fn begin_recording(state: &Arc<NodeState>, writes_recording: bool) -> Result<(), StartError> {
+    if state.ctx.config.record.file.is_some() && !writes_recording {
+        let why = "this program does not write record.file; run sinew-node, or call NodeBuilder::writes_recording and \
+                   sinew_recorder::Recording::configured in the program, or remove the key";
+        return Err(StartError::Record(why.to_owned()));
+    }
+    state.recording.begin_configured(state).map_err(|why| StartError::Record(why.to_string()))
 }
 
 /// Returns a number that grows from one start of a host's node to the next, as long as the host's clock does

@@ -66,8 +66,8 @@ pub enum StartError {
         /// All faults of the list.
         faults: ConfigError,
     },
-    /// `record.folder` is set, and the file of the recording cannot be made there.
-    #[error("record.folder is set, and the node does not start without its recording: {0}")]
+    /// `record.folder` or `record.file` is set, and the recording cannot begin.
+    #[error("the section record asks for a recording, and the node does not start without it: {0}")]
     Record(String),
     /// A layer did not become ready.
     #[error("the layers did not start: {0}")]

@@ -15,7 +15,7 @@
 //! | INSPECT-6 | A watch records the messages that the routing table delivers: all that an application of this node sends and gets, except on direct links between processes. There are at most 8 watches, 4 of guests of the node. Each keeps 2,048 messages and 1 MiB of payloads until the next question; further ones are counted as dropped. No sender waits for it. It ends 3 s after the last question, and without a watch it costs a sender one pointer check. Its answers have class Bulk. |
 //! | INSPECT-7 | The node's access list does not apply to questions. Only a program on the node's own host can request that its file is read again; a file with faults changes nothing. |
 //! | INSPECT-8 | The applications that a message to many reaches are computed from the routing table by the same code that delivers such a message. Nothing is sent, so no application gets a message, nothing is counted, and no watch shows it. |
-//! | INSPECT-9 | A recording is started by a program of the node's own host and user, or of root, for at most 8 of them, and ends 5 s after its last question. It writes the selected messages into a journal. The answer has its path. No sender waits for it. |
+//! | INSPECT-9 | A recording is started by a program of the node's own host and user, or of root, for at most 8 of them, and ends 5 s after its last question. It writes the selected messages into a journal. The answer has its path, and the structure of at most 32 payload types that the question names. No sender waits for it. |
 //!
 //! `docs/protocol/inspect.md` lists the fields.
 
@@ -39,8 +39,9 @@ pub use reports::{
     CertificateReport, DialReport, ForeignReport, GroupReport, IdleReport, KindReport, LinkReport,
     LostEchoReport, LostReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, REACHED_MAX, RECORDED_MAX,
     ReachReport, Reached, RecordReport, RecordedApp, RecordedType, RefusalReport, ReloadReport, RouteReport,
-    SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage, SourceReport, StallReport, StreamReport, TREE_MAX,
-    TreeLine, TreeReport, TroubleReport, UnguardedReport, UnhandledReport, WaitReport, WatchReport,
+    SCHEMAS_MAX, SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage, SourceReport, StallReport,
+    StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport, UnguardedReport, UnhandledReport,
+    WaitReport, WatchReport,
 };
 pub use sinew_record::{PeerClock, Selection};
 

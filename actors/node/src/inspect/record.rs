@@ -1,21 +1,25 @@
 //! Starts, renews and ends the recording of a program, and names what is in the journal. spec: INSPECT-9
 
-use std::{collections::BTreeMap, path::Path, sync::Arc};
+use std::{collections::BTreeSet, path::Path, sync::Arc};
 
 use sinew_lncl::undelivered::kind_name;
 use sinew_record::Channel;
-use sinew_runtime::{outcome::Rejection, time::Time, wire::Message};
+use sinew_runtime::{
+    outcome::Rejection,
+    time::Time,
+    wire::{Kind, Message, known_types},
+};
 use sinew_shm::journal::{JournalReader, Start};
 
 use super::{
     access,
-    reports::{AskRecord, RecordReport, RecordedApp, RecordedType},
+    reports::{AskRecord, RecordReport, RecordedApp, RecordedType, bounded},
 };
 use crate::{NodeState, recording};
 
 /// Answers the question of a program that records.
 pub(crate) fn recorded(state: &Arc<NodeState>, question: &Message) -> Result<RecordReport, Rejection> {
-    let AskRecord { selection, ends } = question.decode().map_err(|_| Rejection::Malformed)?;
+    let AskRecord { selection, ends, schemas } = question.decode().map_err(|_| Rejection::Malformed)?;
     let program = question.header.source;
     if program.node != state.ctx.node || !access::is_of_the_nodes_user(state, program.app) {
         let why = "a node records for programs of its own host and user, and of root, only: run `sinew record` there";
@@ -29,7 +33,7 @@ pub(crate) fn recorded(state: &Arc<NodeState>, question: &Message) -> Result<Rec
         return Ok(refused(why.to_string()));
     }
     match state.recording.ask(state, program, selection, Time::now()) {
-        Ok(path) => Ok(report(state, &path)),
+        Ok(path) => Ok(report(state, &path, &schemas)),
         Err(why) => Ok(refused(why.to_string())),
     }
 }
@@ -38,28 +42,41 @@ fn refused(why: String) -> RecordReport {
     RecordReport { refused: Some(why), ..RecordReport::default() }
 }
 
-fn report(state: &NodeState, path: &Path) -> RecordReport {
+fn report(state: &NodeState, path: &Path, schemas: &[Kind]) -> RecordReport {
     let directory = state.ctx.ports.names().map(|names| names.directory()).unwrap_or_default();
-    let mut kinds: BTreeMap<_, _> = BTreeMap::new();
     let handled = directory.iter().flat_map(|entry| entry.kinds.iter().copied());
     // The table of the journal has the types that were sent to applications that do not declare them.
     let channels = JournalReader::open(path, Start::Newest).and_then(|reader| reader.channels());
     let channels = channels.unwrap_or_default().into_iter().filter_map(|channel| Channel::of(channel.key?));
-    for kind in handled.chain(channels.map(|channel| channel.kind)) {
-        kinds.entry(kind).or_insert_with(|| kind_name(&state.lncl, kind));
+    let others =
+        handled.chain(channels.map(|channel| channel.kind)).chain(known_types().map(|(kind, _)| kind));
+    let (mut listed, mut types) = (BTreeSet::new(), Vec::new());
+    // Entries that do not fit are left out from the end: the structures stand first.
+    let asked = schemas.iter().map(|kind| (*kind, true));
+    for (kind, is_asked) in asked.chain(others.map(|kind| (kind, false))) {
+        if listed.insert(kind)
+            && let Some(name) = kind_name(&state.lncl, kind)
+        {
+            types.push(RecordedType { kind, name, schema: is_asked.then(|| schema(kind)).flatten() });
+        }
     }
-    let named = |(kind, name): (_, Option<String>)| Some(RecordedType { kind, name: name? });
     let now = Time::now();
-    RecordReport {
+    bounded(RecordReport {
         path: Some(path.display().to_string()),
         node: Some(state.ctx.node),
         name: state.ctx.config.name.clone(),
         incarnation: Some(state.ctx.incarnation),
         wall_offset_ns: recording::wall_offset(),
         apps: directory.into_iter().map(|entry| RecordedApp { tid: entry.tid, name: entry.name }).collect(),
-        types: kinds.into_iter().filter_map(named).collect(),
+        types,
         clocks: recording::clocks(state, now),
         ..RecordReport::default()
-    }
-    .bounded()
+    })
+}
+
+/// Returns the structure of a type that this process sends or handles. The first call for a type takes up to some
+/// milliseconds.
+fn schema(kind: Kind) -> Option<Vec<u8>> {
+    let traced = kind.schema()?.ok()?;
+    Some(traced.schema().encode())
 }

@@ -21,13 +21,14 @@ pub use peers::{
     StallReport, StreamReport, TroubleReport,
 };
 pub use reach::{AskGroups, AskReach, GroupReport, REACHED_MAX, ReachReport, Reached};
-pub use record::{AskRecord, RECORDED_MAX, RecordReport, RecordedApp, RecordedType};
+pub(super) use record::bounded;
 pub use refused::{LostEchoReport, RefusalReport, UnguardedReport, UnhandledReport};
 pub use security::{CertificateReport, SecurityReport};
 pub use tree::{AskTree, TREE_MAX, TreeLine, TreeReport};
 pub use watch::{AskWatch, SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, WatchReport};
 
 use serde::{Deserialize, Serialize};
+pub use sinew_record::{AskRecord, RECORDED_MAX, RecordReport, RecordedApp, RecordedType, SCHEMAS_MAX};
 use sinew_runtime::wire::{Class, Payload, encode};
 
 /// Maximum number of lost nodes, causes of refusals, or barriers in one answer.

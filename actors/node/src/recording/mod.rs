@@ -26,7 +26,7 @@ use sinew_runtime::{
     router::tap::{Tap, TapOf},
     tid::Tid,
     time::Time,
-    wire::Kind,
+    wire::{Kind, known_types},
 };
 use sinew_shm::journal::{CreateJournalError, Journal, Options};
 
@@ -95,7 +95,7 @@ impl Recording {
     /// Begins the recording that the configuration asks for, if it does.
     pub(crate) fn begin_configured(&self, node: &Arc<NodeState>) -> Result<(), RecordError> {
         let config = &node.ctx.config.record;
-        if config.folder.is_none() {
+        if config.folder.is_none() && config.file.is_none() {
             return Ok(());
         }
         let selection =
@@ -151,7 +151,7 @@ impl Recording {
         let mut state = self.lock();
         state.is_closed = true;
         state.programs.clear();
-        let is_kept = state.configured.take().is_some();
+        let is_kept = state.configured.take().is_some() && node.ctx.config.record.folder.is_some();
         if let Some(active) = state.active.take() {
             self.remove(node, &active, is_kept);
         }
@@ -248,9 +248,13 @@ impl KnownNames {
     fn of(node: &NodeState) -> Self {
         let directory = node.ctx.ports.names().map(|names| names.directory()).unwrap_or_default();
         let kinds = directory.iter().flat_map(|entry| entry.kinds.iter().copied());
-        let kinds = kinds
+        let mut kinds: BTreeMap<_, _> = kinds
             .filter_map(|kind| Some((kind, sinew_lncl::undelivered::kind_name(&node.lncl, kind)?)))
             .collect();
+        // Applications send types that none of them handles.
+        for (kind, name) in known_types() {
+            kinds.entry(kind).or_insert_with(|| name.to_owned());
+        }
         let apps = directory.into_iter().filter(|entry| entry.tid.node == node.ctx.node);
         Self { apps: apps.map(|entry| (entry.name, entry.tid)).collect(), kinds }
     }

@@ -8,12 +8,12 @@ use sinew_record::{Channel, ClockFact, Entry, Fact as _, Form};
 use sinew_runtime::{
     router::{LocalRoute, MessageSink, SubmitError},
     tid::{AppAddress, Incarnation},
-    wire::{Header, Kind, Message},
+    wire::{Header, Message, Payload},
 };
 use sinew_shm::journal::{JournalReader, Start};
 
 use super::*;
-use crate::inspect::{AskRecord, recorded};
+use crate::inspect::{AskRecord, RecordedType, recorded};
 
 /// The watchdog of a test that waits.
 const WATCHDOG: Duration = Duration::from_secs(60);
@@ -108,12 +108,43 @@ fn only_programs_of_the_node_have_it_record() {
     let elsewhere = Tid::new(sinew_runtime::tid::NodeAddress::new(9), knee.app);
     assert!(ask(elsewhere, &AskRecord::default()).refused.is_some() && node.recording.path().is_none());
     let wrong = Selection { groups: vec!["all*".to_owned()], ..Selection::default() };
-    assert!(ask(knee, &AskRecord { selection: wrong, ends: false }).refused.is_some());
+    assert!(ask(knee, &AskRecord { selection: wrong, ..AskRecord::default() }).refused.is_some());
     let report = ask(knee, &AskRecord::default());
     assert_eq!((report.refused, report.node), (None, Some(node.ctx.node)));
     assert_eq!(report.path.map(PathBuf::from), node.recording.path());
     assert_eq!(ask(knee, &AskRecord { ends: true, ..AskRecord::default() }).path, None);
     assert!(node.recording.path().is_none());
+}
+
+// spec: INSPECT-9
+#[test]
+fn type_that_is_only_sent_has_its_name_and_structure() {
+    #[derive(serde::Serialize, serde::Deserialize)]
+    struct Torque {
+        newton_metres: f32,
+    }
+    impl Payload for Torque {
+        const NAME: &'static str = "test.recording.torque";
+    }
+    let node = node("types", |_| {});
+    let (hip, knee) = (app(&node, "hip"), app(&node, "knee"));
+    let ask = |schemas: Vec<Kind>| -> Vec<RecordedType> {
+        let question = AskRecord { schemas, ..AskRecord::default() };
+        recorded(&node, &Message::typed(hip, Tid::NONE, &question)).expect("it is a question").types
+    };
+    let named = |types: &[RecordedType]| types.iter().find(|one| one.kind == Torque::KIND).cloned();
+    assert_eq!(named(&ask(Vec::new())), None, "no application has sent it yet");
+    let torque = Message::typed(hip, knee, &Torque { newton_metres: 1.5 });
+    node.ctx.router.send(torque).expect("it is taken");
+    let known = named(&ask(Vec::new())).expect("it was sent");
+    assert_eq!((&*known.name, known.schema), (Torque::NAME, None));
+    let types = ask(vec![Kind::named("test.recording.never"), Torque::KIND]);
+    assert_eq!(types[0].kind, Torque::KIND, "those of the question stand first");
+    let structure = Torque::KIND.schema().expect("it is known").expect("it has a structure");
+    assert_eq!(types[0].schema, Some(structure.schema().encode()));
+    // And: its name can be selected.
+    assert_eq!(KnownNames::of(&node).kinds.get(&Torque::KIND).map(String::as_str), Some(Torque::NAME));
+    node.recording.close(&node);
 }
 
 #[test]
@@ -166,6 +197,16 @@ fn configured_recording_outlives_the_node() {
     drop(node);
     assert_eq!(read(&path).0, [b"kept".to_vec(), b"last".to_vec()]);
     std::fs::remove_dir_all(folder).unwrap();
+}
+
+#[test]
+fn journal_of_a_configured_file_ends_with_the_node() {
+    let node = node("file", |config| config.record.file = Some("/nowhere/{node}.mcap".into()));
+    node.recording.begin_configured(&node).expect("it begins");
+    let path = node.recording.path().expect("it records, for the program that writes the file");
+    assert!(path.starts_with(MEMORY) || path.starts_with(std::env::temp_dir()), "{path:?}");
+    node.recording.close(&node);
+    assert!(!path.exists());
 }
 
 #[test]

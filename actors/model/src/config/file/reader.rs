@@ -131,6 +131,15 @@ impl<'t> Reader<'t> {
         }
     }
 
+    /// Reads a number, or `false` for none.
+    pub(super) fn number_or_off(&mut self, range: &Range, target: &mut Option<u64>) {
+        if self.is_off(range.key) {
+            *target = None;
+        } else if let Some(integer) = self.integer(range) {
+            *target = Some(integer);
+        }
+    }
+
     pub(super) fn time(&mut self, range: &Range, target: &mut Duration) {
         if let Some(millis) = self.integer(range) {
             *target = Duration::from_millis(millis);

@@ -1,119 +1,19 @@
-//! The question that has a node record, and its answer.
+//! The lists of the answer to a program that records, within their limits. Its types are those of `sinew-record`.
 
-use serde::{Deserialize, Serialize};
-use sinew_model::bounded::at_most;
-use sinew_record::{PeerClock, Selection};
-use sinew_runtime::{
-    tid::{Incarnation, NodeAddress, Tid},
-    wire::{Kind, Payload},
-};
+use sinew_record::{CLOCKS_MAX, RECORDED_MAX, RecordReport};
 
 use super::{Report, Shortened};
 
-/// Maximum number of applications, and of payload types, in one answer.
-pub const RECORDED_MAX: usize = 1_024;
-/// Maximum number of clocks in one answer.
-const CLOCKS_MAX: usize = 256;
-
-/// Has the node record the selected messages into its journal, or ends that. [`RecordReport`] answers.
-///
-/// The first question starts the recording, and each further one renews it: it ends 5 s after the last one. Only a
-/// program on the node's own host, of the node's user or of root, may ask.
-///
-/// # Examples
-///
-/// ```
-/// use sinew::{AppAddress, Endpoint, Tid, client::ApiError, inspect::{AskRecord, RecordReport}, prelude::*};
-///
-/// /// Returns the path of the journal. To be called again within 5 s for as long as it is read.
-/// fn record(endpoint: &mut Endpoint, app: &str) -> Result<Option<String>, ApiError> {
-///     let inspect = Tid::new(endpoint.tid().node, AppAddress::INSPECT);
-///     let mut question = AskRecord::default();
-///     question.selection.apps.push(app.to_owned());
-///     let report: RecordReport = endpoint.message(inspect, &question).ask(Duration::from_secs(1))?;
-///     Ok(report.path)
-/// }
-/// ```
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct AskRecord {
-    /// The messages to record.
-    #[serde(default)]
-    pub selection: Selection,
-    /// Whether the recording of this program ends now.
-    #[serde(default)]
-    pub ends: bool,
-}
-
-impl Payload for AskRecord {
-    const NAME: &'static str = "sinew.inspect.record";
-}
-
-/// The journal of a node, and the names that its reader needs.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RecordReport {
-    /// The path of the journal on the node's host; `None` if nothing is recorded.
-    pub path: Option<String>,
-    /// The node.
-    pub node: Option<NodeAddress>,
-    /// The name of the node.
-    pub name: String,
-    /// The incarnation of the node.
-    pub incarnation: Option<Incarnation>,
-    /// Nanoseconds from the host's monotonic clock to its wall clock.
-    pub wall_offset_ns: i64,
-    /// The named applications of all nodes.
-    #[serde(deserialize_with = "at_most::<_, _, RECORDED_MAX>")]
-    pub apps: Vec<RecordedApp>,
-    /// The payload types that applications handle or that are in the journal, with the names that the node knows.
-    #[serde(deserialize_with = "at_most::<_, _, RECORDED_MAX>")]
-    pub types: Vec<RecordedType>,
-    /// The clocks of other nodes.
-    #[serde(deserialize_with = "at_most::<_, _, CLOCKS_MAX>")]
-    pub clocks: Vec<PeerClock>,
-    /// Further applications.
-    pub apps_left_out: u64,
-    /// Further types.
-    pub types_left_out: u64,
-    /// Further clocks.
-    pub clocks_left_out: u64,
-    /// Why nothing is recorded, as text.
-    pub refused: Option<String>,
-}
-
-impl Payload for RecordReport {
-    const NAME: &'static str = "sinew.inspect.record_report";
-}
-
-/// A named application.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RecordedApp {
-    /// Its address.
-    pub tid: Tid,
-    /// Its name.
-    pub name: String,
-}
-
-/// A payload type.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RecordedType {
-    /// Its number.
-    pub kind: Kind,
-    /// Its name.
-    pub name: String,
-}
-
-impl RecordReport {
-    /// Limits the lists to those of an answer.
-    pub(in super::super) fn bounded(mut self) -> Self {
-        let cut = |length: usize, max: usize| length.saturating_sub(max) as u64;
-        self.apps_left_out = cut(self.apps.len(), RECORDED_MAX);
-        self.types_left_out = cut(self.types.len(), RECORDED_MAX);
-        self.clocks_left_out = cut(self.clocks.len(), CLOCKS_MAX);
-        self.apps.truncate(RECORDED_MAX);
-        self.types.truncate(RECORDED_MAX);
-        self.clocks.truncate(CLOCKS_MAX);
-        self
-    }
+/// Limits the lists to those of an answer.
+pub(in super::super) fn bounded(mut report: RecordReport) -> RecordReport {
+    let cut = |length: usize, max: usize| length.saturating_sub(max) as u64;
+    report.apps_left_out = cut(report.apps.len(), RECORDED_MAX);
+    report.types_left_out = cut(report.types.len(), RECORDED_MAX);
+    report.clocks_left_out = cut(report.clocks.len(), CLOCKS_MAX);
+    report.apps.truncate(RECORDED_MAX);
+    report.types.truncate(RECORDED_MAX);
+    report.clocks.truncate(CLOCKS_MAX);
+    report
 }
 
 /// The longest list is halved.

@@ -389,7 +389,42 @@ pub(super) const ROWS: &[Row] = &[
         kind: Kind::Names(RECORDED_MAX),
         value: |config| json!(config.record.types),
         effect: "Payload types that are recorded; `*` matches any text; none: all.",
-        note: "A `*` matches types that applications of the project handle.",
+        note: "A `*` matches types that applications of the project handle, or that the node's process sends.",
+    },
+    Row {
+        key: "record.file",
+        kind: Kind::PathOrFalse(DIRECTORY_BYTES_MAX),
+        value: |config| path(config.record.file.as_deref()),
+        effect: "File (MCAP) into which `sinew-node` writes the recorded messages; `{node}` and `{time}` in it are replaced.",
+        note: "A path without `{time}` has it before its ending. It needs `lncl.socket`. Other programs: see below.",
+    },
+    Row {
+        key: "record.split_bytes",
+        kind: Kind::NumberOrFalse(SPLIT_BYTES),
+        value: |config| config.record.split_bytes.map_or(Value::Bool(false), Value::from),
+        effect: "Bytes of such a file, after which the next part begins.",
+        note: "",
+    },
+    Row {
+        key: "record.split_ms",
+        kind: Kind::NumberOrFalse(SPLIT_TIME),
+        value: |config| config.record.split_time.map_or(Value::Bool(false), millis),
+        effect: "Time span of such a file, after which the next part begins.",
+        note: "",
+    },
+    Row {
+        key: "record.max_bytes",
+        kind: Kind::NumberOrFalse(MAX_BYTES),
+        value: |config| config.record.max_bytes.map_or(Value::Bool(false), Value::from),
+        effect: "Maximum bytes of all parts since the node's start; further messages are counted as dropped.",
+        note: "The files of earlier starts are not removed.",
+    },
+    Row {
+        key: "record.compression",
+        kind: Kind::OneOf(&["zstd", "lz4", "none"]),
+        value: |config| json!(config.record.compression.word()),
+        effect: "Compression of these files.",
+        note: "`zstd` makes the smallest files, and `lz4` is less work.",
     },
 ];
 

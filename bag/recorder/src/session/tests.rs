@@ -1,0 +1,208 @@
+use std::{
+    collections::BTreeMap,
+    fs,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+};
+
+use sinew_record::{Channel, Form, RecordedType, message_head};
+use sinew_runtime::wire::{Class, Header};
+use sinew_schema::{Field, Schema, Shape};
+use sinew_shm::journal::{Journal, Options};
+
+use super::*;
+use crate::Recording;
+
+const NODE: NodeAddress = NodeAddress::new(0x7f00_0002);
+/// The watchdog of a test that waits.
+const WATCHDOG: Duration = Duration::from_secs(60);
+
+fn tid(app: u32) -> Tid {
+    Tid::new(NODE, AppAddress::new(app))
+}
+
+/// A node with a journal, and with two payload types: it knows the structure of the first one.
+struct Node {
+    folder: PathBuf,
+    journal: Journal,
+    asked: Arc<Mutex<Vec<AskRecord>>>,
+}
+
+/// The connection to it.
+struct Link {
+    journal: PathBuf,
+    asked: Arc<Mutex<Vec<AskRecord>>>,
+}
+
+fn kinds() -> [Kind; 2] {
+    ["test.angle", "test.torque"].map(Kind::named)
+}
+
+fn structure() -> Vec<u8> {
+    let field = Field { name: "x".to_owned(), shape: Shape::U8, optional: false };
+    Schema { root: Shape::Struct(vec![field]), types: BTreeMap::new() }.encode()
+}
+
+fn lock(asked: &Mutex<Vec<AskRecord>>) -> MutexGuard<'_, Vec<AskRecord>> {
+    asked.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Connection for Link {
+    fn ask(&mut self, question: &AskRecord, _: Duration) -> Result<RecordReport, String> {
+        lock(&self.asked).push(question.clone());
+        if question.ends {
+            return Ok(RecordReport::default());
+        }
+        let schema = |kind| question.schemas.contains(&kind).then(structure);
+        let [angle, torque] = kinds();
+        Ok(RecordReport {
+            path: Some(self.journal.display().to_string()),
+            node: Some(NODE),
+            name: "leg".to_owned(),
+            types: vec![
+                RecordedType { kind: angle, name: "test.angle".to_owned(), schema: schema(angle) },
+                RecordedType { kind: torque, name: "test.torque".to_owned(), schema: None },
+            ],
+            ..RecordReport::default()
+        })
+    }
+
+    fn node(&self) -> NodeAddress {
+        NODE
+    }
+
+    fn own(&self) -> Vec<Tid> {
+        vec![tid(0x1009)]
+    }
+}
+
+impl Node {
+    fn new(name: &str) -> Self {
+        let folder = std::env::temp_dir().join(format!("sinew-session-{name}-{}", std::process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let options = Options { ring_bytes: 64 * 1024, ..Options::default() };
+        let journal = Journal::create(&folder.join("node.journal"), &options).unwrap();
+        Self { folder, journal, asked: Arc::default() }
+    }
+
+    fn link(&self) -> Link {
+        Link { journal: self.folder.join("node.journal"), asked: self.asked.clone() }
+    }
+
+    fn options(&self) -> RecordingOptions {
+        RecordingOptions { path: Some(self.folder.join("{node}.mcap")), ..RecordingOptions::default() }
+    }
+
+    /// Writes the message `{"x": 5}`.
+    fn write(&self, kind: Kind, sequence: u64) {
+        let (source, destination, class) = (tid(0x1001), tid(0x1002), Class::Stream);
+        let channel = Channel { source, destination, kind, class, form: Form::Sent, refused: None };
+        let header = Header { class, sequence, ..Header::new(kind, source, destination) };
+        let payload = b"\x81\xa1x\x05";
+        let head = message_head(channel.form, &header, payload.len(), None);
+        assert!(self.journal.write(channel.key(), Time::now().as_nanos(), &[&head, payload]));
+    }
+}
+
+impl Drop for Node {
+    fn drop(&mut self) {
+        // The system clears the folder of temporary files, too.
+        let _ = fs::remove_dir_all(&self.folder);
+    }
+}
+
+/// Returns the roles of the channels beside payloads, by topic.
+fn roles(file: &Path) -> BTreeMap<String, String> {
+    let mut reader = sinew_bag::read::Reader::open(file).unwrap();
+    let mut found = BTreeMap::new();
+    while let Some(item) = reader.next_item().unwrap() {
+        if let sinew_bag::read::Item::Message(message) = item
+            && message.channel.topic.ends_with("/view")
+        {
+            found.insert(message.channel.topic.clone(), message.channel.value("role").to_owned());
+        }
+    }
+    found
+}
+
+// spec: BAG-6
+#[test]
+fn structures_are_asked_for_before_the_first_message() {
+    let node = Node::new("structures");
+    let mut session = Session::begin(node.link(), node.options()).unwrap();
+    let [angle, torque] = kinds();
+    node.write(angle, 1);
+    node.write(torque, 1);
+    node.write(angle, 2);
+    let deadline = Time::now() + WATCHDOG;
+    while session.totals().written < 3 {
+        assert!(Time::now() < deadline, "waited for three messages");
+        assert_eq!(session.step(), None);
+    }
+    let summary = session.finish(End::Asked);
+    assert_eq!((summary.totals.seen, summary.totals.dropped), (3, 0));
+    assert!(summary.faults.is_empty(), "{:?}", summary.faults);
+    assert_eq!((&*summary.node, summary.file), ("leg", node.folder.join("leg.mcap")));
+    let roles = roles(&node.folder.join("leg.mcap"));
+    let own: Vec<_> = roles.iter().map(|(topic, role)| (&**topic, &**role)).collect();
+    let source = tid(0x1001);
+    let topics = [format!("/{source}/test.angle/view"), format!("/{source}/test.torque/view")];
+    assert_eq!(own, [(&*topics[0], "view"), (&*topics[1], "json")]);
+    let asked = lock(&node.asked);
+    let structures: Vec<_> = asked.iter().filter(|question| !question.schemas.is_empty()).collect();
+    assert_eq!(structures.len(), 1, "both types with one question: {asked:?}");
+    assert!(asked.last().is_some_and(|question| question.ends), "the node ends it at once");
+}
+
+#[test]
+fn recording_of_a_program_ends_with_its_file() {
+    let node = Node::new("thread");
+    let recording = Recording::through(node.link(), node.options()).unwrap();
+    node.write(kinds()[0], 1);
+    let file = recording.file().to_owned();
+    let summary = recording.finish_within(WATCHDOG).unwrap();
+    assert_eq!((summary.totals.seen, summary.totals.written, summary.end), (1, 1, End::Asked));
+    assert!(sinew_bag::check(&[&file]).unwrap().is_fine());
+}
+
+#[test]
+fn node_that_refuses_leaves_no_file() {
+    struct Refusing;
+    impl Connection for Refusing {
+        fn ask(&mut self, _: &AskRecord, _: Duration) -> Result<RecordReport, String> {
+            Ok(RecordReport { refused: Some("8 programs record".to_owned()), ..RecordReport::default() })
+        }
+        fn node(&self) -> NodeAddress {
+            NODE
+        }
+        fn own(&self) -> Vec<Tid> {
+            Vec::new()
+        }
+    }
+    let node = Node::new("refused");
+    let refused = Session::begin(Refusing, node.options()).map(drop).unwrap_err();
+    assert_eq!(refused.to_string(), "the node does not record: 8 programs record");
+    assert!(!node.folder.join("leg.mcap").exists());
+    // And: a file that cannot be made ends the recording at the node.
+    let path = Some(node.folder.join("absent/leg.mcap"));
+    let failed = Session::begin(node.link(), RecordingOptions { path, ..RecordingOptions::default() });
+    assert!(matches!(failed.map(drop), Err(RecordingError::File(_))));
+    assert!(lock(&node.asked).last().is_some_and(|question| question.ends));
+}
+
+#[test]
+fn journal_that_ends_with_its_node_ends_the_recording() {
+    let mut node = Node::new("closed");
+    let mut session = Session::begin(node.link(), node.options()).unwrap();
+    node.write(kinds()[0], 1);
+    let other = Journal::create(&node.folder.join("other.journal"), &Options::default()).unwrap();
+    drop(std::mem::replace(&mut node.journal, other));
+    let deadline = Time::now() + WATCHDOG;
+    let end = loop {
+        assert!(Time::now() < deadline, "waited for the end");
+        if let Some(end) = session.step() {
+            break end;
+        }
+    };
+    assert_eq!(end, End::Closed);
+    assert_eq!(session.finish(end).totals.written, 1);
+}
