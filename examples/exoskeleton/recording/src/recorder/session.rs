@@ -80,7 +80,7 @@ impl<'n> Session<'n> {
             return Err(SessionError::Refused("it names no journal".to_owned()));
         };
         let reader = JournalReader::open(Path::new(journal), Start::Newest)?;
-        let node = first.node.unwrap_or(endpoint.tid().node);
+        let node = first.node.unwrap_or_else(|| endpoint.tid().node);
         let now_ns = Time::now().as_nanos();
         let origin = Origin {
             node: first.name.clone(),
