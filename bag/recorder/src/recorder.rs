@@ -198,17 +198,17 @@ impl Recorder {
         self.sink.finish(now_ns)
     }
 
-    /// Returns whether the next message is the first one of a channel of which the structure of the type, or a name of an
-    /// application, is not known. The next call of [`pump`](Self::pump) writes it in any case. Its channel has the names
-    /// and the structure that are known by then, so the owner can ask the node before. No message waits twice for a type
-    /// or for an application.
+    /// Returns whether the next message is the first one of a channel, and names of it or the structure of its type are
+    /// not known. The next call of [`pump`](Self::pump) writes it in any case. Its channel has the names and the
+    /// structure that are known by then, so the owner can ask the node before. No message waits twice for a type or for
+    /// an application.
     #[must_use]
     pub const fn is_waiting(&self) -> bool {
         self.waiting.is_some()
     }
 
-    /// Returns at most `count` payload types of the journal of which nothing is known of the structure: first that of the
-    /// message that waits.
+    /// Returns at most `count` payload types of the journal without a known structure: first that of the message that
+    /// waits.
     #[must_use]
     pub fn wanted(&self, count: usize) -> Vec<Kind> {
         let first = self.waiting.map(|(_, kind)| kind);

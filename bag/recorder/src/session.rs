@@ -32,8 +32,8 @@ const PAUSE: Duration = Duration::from_millis(5);
 const RENEWAL: Duration = Duration::from_secs(1);
 /// Time limit of a further question: meanwhile the journal is not read.
 const RENEWED_WITHIN: Duration = Duration::from_millis(300);
-/// Maximum questions for names and structures between two renewals. Further channels have addresses in their topics, and
-/// views as JSON.
+/// Maximum questions for names and structures between two renewals. Further channels have addresses in their topics,
+/// and views as JSON.
 const QUESTIONS_MAX: u32 = 64;
 /// Time at the end for messages that are on their way into the journal.
 const ARRIVAL: Duration = Duration::from_millis(200);
