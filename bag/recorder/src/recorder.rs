@@ -28,7 +28,8 @@ const HELD_NS: u64 = 100_000_000;
 const HELD_BYTES_MAX: usize = 16 << 20;
 /// Maximum records of one call.
 const RECORDS_MAX: usize = 4_096;
-/// Maximum payload types for which the first message waits. Further ones have the name that is known by then.
+/// Maximum payload types, and maximum applications, for which a message waits. Further ones have the name that is known
+/// by then.
 const WAITED_MAX: usize = 4_096;
 /// Time between two tallies.
 const TALLY_NS: u64 = 1_000_000_000;
@@ -99,10 +100,12 @@ pub struct Recorder {
     held_bytes: usize,
     /// The last record that was read.
     buffer: Vec<u8>,
-    /// The record in the buffer, if it waits for the structure of its payload type.
+    /// The record in the buffer, if it waits for names or for the structure of its payload type.
     waiting: Option<(journal::Record, Kind)>,
     /// The types for which a record has waited.
-    waited: BTreeSet<Kind>,
+    waited_types: BTreeSet<Kind>,
+    /// The applications for which a record has waited.
+    waited_apps: BTreeSet<Tid>,
     tally_due_ns: u64,
 }
 
@@ -127,14 +130,15 @@ impl Recorder {
             held_bytes: 0,
             buffer: Vec::new(),
             waiting: None,
-            waited: BTreeSet::new(),
+            waited_types: BTreeSet::new(),
+            waited_apps: BTreeSet::new(),
             tally_due_ns: 0,
         })
     }
 
     /// Writes the records that are there, at most 4,096, and each second the counters. Returns whether there are no
     /// more for now. To be called every few milliseconds: the journal keeps only the newest bytes. It returns early at
-    /// the first message of a type without a known structure: see [`wanted`](Self::wanted).
+    /// the first message of a channel, if something is not known of it: see [`is_waiting`](Self::is_waiting).
     ///
     /// # Errors
     /// The journal cannot be read. After [`ReadJournalError::Damaged`] the next call continues.
@@ -194,20 +198,25 @@ impl Recorder {
         self.sink.finish(now_ns)
     }
 
-    /// Returns the payload type of the next message, if nothing is known of its structure; and then further such types
-    /// of the journal, at most `count` in all. The next call of [`pump`](Self::pump) writes the message in any case. Its
-    /// channel has the name and the structure that are known by then, so the owner can ask the node before. No message
-    /// waits twice for a type.
+    /// Returns whether the next message is the first one of a channel, and names of it or the structure of its type are
+    /// not known. The next call of [`pump`](Self::pump) writes it in any case. Its channel has the names and the
+    /// structure that are known by then, so the owner can ask the node before. No message waits twice for a type or for
+    /// an application.
+    #[must_use]
+    pub const fn is_waiting(&self) -> bool {
+        self.waiting.is_some()
+    }
+
+    /// Returns at most `count` payload types of the journal without a known structure: first that of the message that
+    /// waits.
     #[must_use]
     pub fn wanted(&self, count: usize) -> Vec<Kind> {
-        let Some((_, first)) = self.waiting else { return Vec::new() };
-        let names = &self.setup.names;
+        let first = self.waiting.map(|(_, kind)| kind);
         let messages = self.channels.values().filter(|channel| channel.form.is_message());
-        let others: BTreeSet<_> = messages
-            .map(|channel| channel.kind)
-            .filter(|kind| *kind != first && !names.is_settled(*kind))
-            .collect();
-        [first].into_iter().chain(others).take(count).collect()
+        let others: BTreeSet<_> = messages.map(|channel| channel.kind).collect();
+        let others = others.into_iter().filter(|kind| Some(*kind) != first);
+        let all = first.into_iter().chain(others);
+        all.filter(|kind| !self.setup.names.is_settled(*kind)).take(count).collect()
     }
 
     /// Returns the names, to which the owner adds. A channel keeps the names that it has at its first message.
@@ -291,8 +300,10 @@ impl Recorder {
             let Some(found) = self.reader.next(now_ns, bytes)? else { return Ok(true) };
             // A record that cannot be read is missing by its number.
             let Ok(entry) = Entry::read(bytes) else { continue };
-            if let Some(kind) = self.awaited(&found, &entry)? {
-                self.waiting = Some((found, kind));
+            if let Entry::Message(message) = &entry
+                && self.awaits(&found, message.header.kind)?
+            {
+                self.waiting = Some((found, message.header.kind));
                 return Ok(false);
             }
             self.take(&found, &entry)?;
@@ -300,24 +311,25 @@ impl Recorder {
         Ok(false)
     }
 
-    /// Returns the type of the first message of a channel, if its structure should be asked for before.
-    fn awaited(
-        &mut self,
-        found: &journal::Record,
-        entry: &Entry<'_>,
-    ) -> Result<Option<Kind>, ReadJournalError> {
-        let Entry::Message(message) = entry else { return Ok(None) };
+    /// Whether the first message of a channel waits for names, or for the structure of its type.
+    fn awaits(&mut self, found: &journal::Record, kind: Kind) -> Result<bool, ReadJournalError> {
         if self.places.contains_key(&found.place) || !self.is_within(found.place, found.number) {
-            return Ok(None);
+            return Ok(false);
         }
-        let kind = message.header.kind;
-        let is_open = !self.setup.names.is_settled(kind) && self.waited.len() < WAITED_MAX;
-        if !is_open || !self.waited.insert(kind) {
-            return Ok(None);
-        }
-        // Other types of the table are asked for at once.
         self.read_table()?;
-        Ok(Some(kind))
+        let Setup { names, left_out, .. } = &self.setup;
+        let ends = self.channels.get(&found.place).map(|channel| [channel.source, channel.destination]);
+        let ends = ends.unwrap_or([Tid::NONE; 2]);
+        if ends.iter().any(|app| left_out.contains(app)) {
+            return Ok(false);
+        }
+        let mut awaits =
+            self.waited_types.len() < WAITED_MAX && !names.is_settled(kind) && self.waited_types.insert(kind);
+        for app in ends {
+            let is_named = !app.is_single() || app.app.is_layer() || names.app(app).is_some();
+            awaits |= !is_named && self.waited_apps.len() < WAITED_MAX && self.waited_apps.insert(app);
+        }
+        Ok(awaits)
     }
 
     pub(crate) fn take(

@@ -32,7 +32,8 @@ const PAUSE: Duration = Duration::from_millis(5);
 const RENEWAL: Duration = Duration::from_secs(1);
 /// Time limit of a further question: meanwhile the journal is not read.
 const RENEWED_WITHIN: Duration = Duration::from_millis(300);
-/// Maximum questions for structures between two renewals. Further types have views as JSON.
+/// Maximum questions for names and structures between two renewals. Further channels have addresses in their topics,
+/// and views as JSON.
 const QUESTIONS_MAX: u32 = 64;
 /// Time at the end for messages that are on their way into the journal.
 const ARRIVAL: Duration = Duration::from_millis(200);
@@ -205,7 +206,7 @@ pub struct Session<C> {
     renewal: Time,
     /// Whether the node has answered the last question.
     answers: bool,
-    /// Questions for structures since the last renewal.
+    /// Questions for names and structures since the last renewal.
     questions: u32,
     faults: Vec<String>,
 }
@@ -323,7 +324,7 @@ impl<C: Connection> Session<C> {
         if let Some(fault) = self.recorder.take_fault() {
             note(&mut self.faults, fault.to_string());
         }
-        self.ask_for_structures();
+        self.ask_for_names();
         match pumped {
             Ok(is_empty) => Ok(is_empty),
             Err(fault @ ReadJournalError::Damaged { .. }) => {
@@ -347,11 +348,11 @@ impl<C: Connection> Session<C> {
         Some(if self.recorder.is_closed().unwrap_or(false) { End::Closed } else { End::NodeDied })
     }
 
-    /// Asks for the structure of a type, if the first message of it waits. spec: BAG-6
-    fn ask_for_structures(&mut self) {
-        let wanted = self.recorder.wanted(SCHEMAS_MAX);
-        if !wanted.is_empty() && self.answers && self.questions < QUESTIONS_MAX {
+    /// Asks for names and structures, if the first message of a channel waits for them. spec: BAG-6
+    fn ask_for_names(&mut self) {
+        if self.recorder.is_waiting() && self.answers && self.questions < QUESTIONS_MAX {
             self.questions += 1;
+            let wanted = self.recorder.wanted(SCHEMAS_MAX);
             self.renew(wanted);
         }
     }

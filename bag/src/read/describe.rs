@@ -40,8 +40,8 @@ impl Channel {
         self.metadata.get(&format!("sinew.{key}")).map_or("", String::as_str)
     }
 
-    /// Returns the value in a payload of this channel: the bytes in the envelope, if the payloads are protected. Nothing
-    /// of the envelope is verified.
+    /// Returns the value in a payload of this channel: the bytes in the envelope, if the payloads are protected.
+    /// Nothing of the envelope is verified.
     #[must_use]
     pub fn unsealed<'d>(&self, payload: &'d [u8]) -> &'d [u8] {
         if self.value("protected") != "true" {
