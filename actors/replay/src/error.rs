@@ -100,7 +100,9 @@ pub enum CheckError {
     #[error(transparent)]
     Differs(#[from] FirstDifference),
     /// The replay differs, and an application under test could not decode recorded messages.
-    #[error("{0}. The first difference after that: {1}. Give new fields `#[serde(default)]`, or record again")]
+    #[error(
+        "{0}. The first difference after that: {1}. Give new fields `#[serde(default)]`, or record again"
+    )]
     Misfit(Box<Misfit>, Box<FirstDifference>),
 }
 

@@ -39,6 +39,10 @@ pub const ORDER_BYTES_MAX: u64 = 2 << 30;
 /// Maximum bytes of the report.
 pub const REPORT_BYTES_MAX: u64 = 16 << 20;
 
+/// A recording may end between a message and the answer to it. So messages that arrived in this time before its end, in
+/// nanoseconds, are no inputs if no application under test sent anything after them.
+const END_NS: u64 = 100_000_000;
+
 /// Each flag, at the place of its bit in a recording.
 const FLAGS: [Flags; 4] = [Flags::CONFIRM, Flags::ASK, Flags::REPLY, Flags::OUTCOME];
 
@@ -175,23 +179,26 @@ impl CheckOrder {
     /// and those that arrived at them or at a group.
     #[must_use]
     pub fn messages_of(&self, tested: &BTreeSet<Tid>) -> Vec<TimedMessage> {
-        let mut messages = Vec::new();
+        let (mut expected, mut inputs) = (Vec::new(), Vec::new());
         for message in &self.messages {
-            let (source, destination) =
-                (Tid::from_bits(message.source), Tid::from_bits(message.destination));
+            let (source, destination) = (Tid::from_bits(message.source), Tid::from_bits(message.destination));
             if tested.contains(&source) {
                 // A node reports outcomes, not an application. A group's member that rejects has a record of its own.
                 let is_copy = message.is_refused && !destination.is_single();
                 if !message.has(Flags::OUTCOME) && !is_copy {
-                    messages.push(message.sent());
+                    expected.push(message.sent());
                 }
             } else if !message.is_refused && (tested.contains(&destination) || !destination.is_single()) {
-                messages.push(message.arrived());
+                inputs.push(message.arrived());
             }
         }
-        // Stable: messages of one time keep the order of the recording.
-        messages.sort_by_key(|message| message.at);
-        messages
+        let last = expected.iter().map(|message| message.at).max().unwrap_or(Time::ZERO);
+        let end_ns = self.messages.iter().map(|message| message.arrived_ns).max().unwrap_or(0);
+        inputs.retain(|input| input.at <= last || input.at.as_nanos().saturating_add(END_NS) <= end_ns);
+        expected.append(&mut inputs);
+        // Stable: messages of one time and one sort keep the order of the recording.
+        expected.sort_by_key(|message| message.at);
+        expected
     }
 
     /// Returns when the applications start, if a message is from or to one of them.
@@ -232,9 +239,9 @@ impl CheckOrder {
     #[must_use]
     pub fn run(&self, apps: Vec<DynApp>) -> CheckReport {
         match self.check(apps) {
-            Ok(Checked { messages: 0, .. }) => {
-                CheckReport::Failed("the recording has no message that an application under test sent".to_owned())
-            }
+            Ok(Checked { messages: 0, .. }) => CheckReport::Failed(
+                "the recording has no message that an application under test sent".to_owned(),
+            ),
             Ok(checked) => CheckReport::Identical {
                 messages: checked.messages as u64,
                 sources: checked.sources as u64,
@@ -283,7 +290,10 @@ pub fn read<T: DeserializeOwned>(path: &Path, bytes_max: u64) -> io::Result<T> {
     let mut bytes = Vec::new();
     File::open(path)?.take(bytes_max.saturating_add(1)).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > bytes_max {
-        return Err(io::Error::new(io::ErrorKind::InvalidData, format!("it is longer than {bytes_max} bytes")));
+        return Err(io::Error::new(
+            io::ErrorKind::InvalidData,
+            format!("it is longer than {bytes_max} bytes"),
+        ));
     }
     rmp_serde::from_slice(&bytes).map_err(|why| io::Error::new(io::ErrorKind::InvalidData, why))
 }
@@ -348,10 +358,15 @@ mod tests {
         let refused = RecordedMessage { is_refused: true, ..input.clone() };
         let foreign = RecordedMessage { destination: 0x0a00_0001_0000_1009, ..input.clone() };
         let outcome = message(0b1000);
-        let messages = vec![tested, input, refused, foreign, outcome];
+        let later = RecordedMessage { arrived_ns: 9 + END_NS, ..foreign.clone() };
+        let messages = vec![tested, input, refused, foreign, outcome, later];
         let order = CheckOrder { messages, ..CheckOrder::default() };
         let chosen = order.messages_of(&BTreeSet::from([own]));
         let sources: Vec<_> = chosen.iter().map(|message| message.source.bits()).collect();
         assert_eq!(sources, [own.bits(), message(0).destination]);
+        // And: without the later message its input is at the end of the recording
+        let messages = order.messages[..5].to_vec();
+        let order = CheckOrder { messages, ..CheckOrder::default() };
+        assert_eq!(order.messages_of(&BTreeSet::from([own])).len(), 1);
     }
 }

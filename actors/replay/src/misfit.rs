@@ -59,7 +59,10 @@ impl fmt::Display for Misfit {
             Some(name) => write!(f, "{count} recorded {messages} of type {name}")?,
             None => write!(f, "{count} recorded {messages} of kind {kind}")?,
         }
-        write!(f, " from {sender}, the first at {first:?}, {were} refused by {receiver}, which has another version of")?;
+        write!(
+            f,
+            " from {sender}, the first at {first:?}, {were} refused by {receiver}, which has another version of"
+        )?;
         if differences.is_empty() {
             return write!(f, " this type; the log names the field");
         }

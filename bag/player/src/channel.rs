@@ -84,9 +84,12 @@ impl RecordedChannel {
     /// class.
     fn is_copy_of(&self, other: &Self, order: Order) -> bool {
         let is_of_many = !other.destination.is_single();
+        if other.is_refused {
+            return false;
+        }
         if self.is_refused {
             // A member of a group that rejects a message has a record of its own.
-            return !other.is_refused && is_of_many;
+            return is_of_many;
         }
         let is_same = other.destination == self.destination;
         match order {
@@ -114,8 +117,8 @@ pub(crate) fn without_copies<'c>(
         groups.entry(group(channel)).or_default().push(channel);
     }
     let is_wanted = |channel: &RecordedChannel| {
-        let others = groups.get(&group(channel)).into_iter().flatten();
-        others.into_iter().all(|other| !channel.is_copy_of(other, order))
+        let mut others = groups.get(&group(channel)).into_iter().flatten();
+        others.all(|other| !channel.is_copy_of(other, order))
     };
     channels.map(is_wanted).collect()
 }

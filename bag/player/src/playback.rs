@@ -201,8 +201,8 @@ impl Playback {
             let is_due = |sent_ns: u64| {
                 is_full || self.read_to_ns.is_none_or(|read_to| read_to >= sent_ns.saturating_add(WINDOW_NS))
             };
-            match self.held.first_key_value() {
-                Some(((sent_ns, _), _)) if is_due(*sent_ns) => {
+            match self.held.first_key_value().map(|((sent_ns, _), _)| *sent_ns) {
+                Some(sent_ns) if is_due(sent_ns) => {
                     let first = self.held.pop_first().map(|(_, message)| message);
                     self.held_bytes -= first.as_ref().map_or(0, |message| message.payload.len());
                     return Ok(first);
