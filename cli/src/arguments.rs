@@ -107,12 +107,12 @@ pub(crate) enum Command {
     Record(record::Order),
     /// Sends the messages of a recording again, or checks a program against them
     ///
-    /// Each recorded application is registered under its name, and its messages go to the destinations with the recorded
-    /// names, at the times at which they were sent. Without --live that is in a project of its own on loopback, `replay`.
-    /// Protected commands are never sent into a live system.
+    /// Each recorded application is registered under its name, and its messages go to the destinations with the
+    /// recorded names, at the times at which they were sent. Without --live that is in a project of its own on
+    /// loopback, `replay`. Protected commands are never sent into a live system.
     ///
-    /// With --check it sends nothing: it runs PROGRAM in virtual time on the messages that it received, and compares all
-    /// that it sends. Exit code 1 if a message differs: the first one is named with its field and both values.
+    /// With --check it sends nothing: it runs PROGRAM in virtual time on the messages that it received, and compares
+    /// all that it sends. Exit code 1 if a message differs: the first one is named with its field and both values.
     #[command(after_help = r#"Examples:
   sinew play walk.mcap
   sinew play walk.mcap --rate 0.5 --from 10s --to 20s --loop

@@ -101,16 +101,13 @@ impl RefusalSink for Misfits {
         }
         let mut found = lock(&self.found);
         let (kind, sender) = (header.kind, header.source);
-        let known = found
-            .iter_mut()
-            .find(|misfit| (misfit.kind, misfit.sender, misfit.receiver) == (kind, sender, receiver));
-        match known {
-            Some(misfit) => misfit.count += count,
-            None if found.len() < MISFITS_MAX => {
-                let (first, differences) = (header.sent, Vec::new());
-                found.push(Misfit { kind, sender, receiver, first, count, differences });
-            }
-            None => {}
+        let is_it =
+            |misfit: &&mut Misfit| (misfit.kind, misfit.sender, misfit.receiver) == (kind, sender, receiver);
+        if let Some(misfit) = found.iter_mut().find(is_it) {
+            misfit.count += count;
+        } else if found.len() < MISFITS_MAX {
+            let (first, differences) = (header.sent, Vec::new());
+            found.push(Misfit { kind, sender, receiver, first, count, differences });
         }
     }
 }

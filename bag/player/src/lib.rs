@@ -1,7 +1,7 @@
 //! Recordings as messages.
 //!
-//! [`Playback`] reads the files of a recording, and of a merged one, as messages in the order in which they were sent or
-//! arrived. The command `sinew play` sends them again. [`Recording`] has all of them in memory, and checks
+//! [`Playback`] reads the files of a recording, and of a merged one, as messages in the order in which they were sent
+//! or arrived. The command `sinew play` sends them again. [`Recording`] has all of them in memory, and checks
 //! applications in virtual time: they must send the same messages again, bit by bit. A test of a controller is a
 //! recording and three lines:
 //!

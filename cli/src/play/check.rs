@@ -1,11 +1,12 @@
-//! `sinew play --check`: runs a program in virtual time on a recording, and compares its messages with the recorded ones.
+//! `sinew play --check`: runs a program in virtual time on a recording, and compares its messages with the recorded
+//! ones.
 //!
 //! The program is started with the path of a folder in an environment variable. Its first node with an application of
 //! the recording runs these applications there, and writes a report instead of starting.
 
 use std::{
     collections::BTreeMap,
-    fs,
+    fs, io,
     os::{fd::AsFd as _, unix::fs::DirBuilderExt as _},
     path::{Path, PathBuf},
     process::{Child, Command, ExitStatus, Stdio},
@@ -46,15 +47,12 @@ pub(crate) fn show(order: &Order) -> Result<Report, SystemError> {
     let request = recording.into_order(&order.apps)?;
     let names: BTreeMap<u64, String> = request.names.iter().map(|(name, tid)| (*tid, name.clone())).collect();
     let folder = Folder::new()?;
-    exchange::write(&folder.0.join(exchange::ORDER), &request).map_err(|why| folder.fault(&why))?;
+    exchange::write(&folder.0.join(exchange::ORDER), &request).map_err(|why| unwritable(&folder.0, &why))?;
     // It may have a gigabyte.
     drop(request);
     let status = run(order, &folder)?;
-    let report =
-        match exchange::read::<CheckReport>(&folder.0.join(exchange::REPORT), exchange::REPORT_BYTES_MAX) {
-            Ok(report) => report,
-            Err(_) => return Err(SystemError::Bag(unreported(order, &folder, status))),
-        };
+    let report = exchange::read::<CheckReport>(&folder.0.join(exchange::REPORT), exchange::REPORT_BYTES_MAX);
+    let Ok(report) = report else { return Err(SystemError::Bag(unreported(order, &folder, status))) };
     match report {
         CheckReport::Identical { messages, sources, misfits } => Ok(identical(messages, sources, &misfits)),
         CheckReport::Differs(difference) => Ok(differs(&difference, &names)),
@@ -70,10 +68,9 @@ fn run(order: &Order, folder: &Folder) -> Result<ExitStatus, SystemError> {
         return Err(SystemError::Usage("no program to check; write it behind `--`".to_owned()));
     };
     let shown = clean(&program.to_string_lossy());
-    let refused = |why: std::io::Error| {
-        SystemError::Bag(format!("{shown} cannot be run: {why}; check its path and rights"))
-    };
-    let output = std::io::stderr().as_fd().try_clone_to_owned().map_err(refused)?;
+    let refused =
+        |why: io::Error| SystemError::Bag(format!("{shown} cannot be run: {why}; check its path and rights"));
+    let output = io::stderr().as_fd().try_clone_to_owned().map_err(refused)?;
     let mut command = Command::new(program);
     command.args(arguments).env(exchange::VARIABLE, &folder.0).stdin(Stdio::null()).stdout(output);
     let mut child = Running(command.spawn().map_err(refused)?);
@@ -111,15 +108,16 @@ impl Folder {
     fn new() -> Result<Self, SystemError> {
         let (process, now) = (std::process::id(), Time::now().as_nanos());
         let path = std::env::temp_dir().join(format!("sinew-check-{process}-{now}"));
-        let folder = Self(path);
-        let made = fs::DirBuilder::new().mode(0o700).create(&folder.0);
-        made.map_err(|why| folder.fault(&why)).map(|()| folder)
+        match fs::DirBuilder::new().mode(0o700).create(&path) {
+            Ok(()) => Ok(Self(path)),
+            Err(why) => Err(unwritable(&path, &why)),
+        }
     }
+}
 
-    fn fault(&self, why: &dyn std::fmt::Display) -> SystemError {
-        let path = self.0.display();
-        SystemError::Bag(format!("{path} cannot be written: {why}; set TMPDIR to a folder with room"))
-    }
+fn unwritable(folder: &Path, why: &io::Error) -> SystemError {
+    let folder = folder.display();
+    SystemError::Bag(format!("{folder} cannot be written: {why}; set TMPDIR to a folder with room"))
 }
 
 impl Drop for Folder {
@@ -165,7 +163,8 @@ fn differs(difference: &ReportedDifference, names: &BTreeMap<u64, String>) -> Re
     let (source, destination) = (shown(*source), shown(*destination));
     let seconds = *at_ns as f64 / 1e9;
     let line = format!(
-        "the first difference: message {number} of {source}, {type_name} to {destination} at {seconds:.6} s: {difference}"
+        "the first difference: message {number} of {source}, {type_name} to {destination} at {seconds:.6} s: \
+         {difference}"
     );
     let mut text = format!("{}\n", clean(&line));
     if let Some(misfit) = misfit {

@@ -40,7 +40,8 @@ pub(crate) fn of(played: &Played, is_wide: bool) -> Report {
     let (project, sources) = (clean(&played.project), played.sources);
     let _ = writeln!(
         text,
-        "{} messages of {sources} sources sent, {} rejected, {} late, {} without a receiver; in the project {project}, by a node {place}",
+        "{} messages of {sources} sources sent, {} rejected, {} late, {} without a receiver; in the project {project}, \
+         by a node {place}",
         total.sent, total.rejected, total.late, total.absent
     );
     let is_lost = matches!(played.end, End::Lost(_));

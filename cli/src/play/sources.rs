@@ -40,7 +40,8 @@ impl Sources {
     pub(crate) fn register(api: &NodeApi, senders: BTreeSet<&Sender>) -> Result<Self, SystemError> {
         if senders.len() > SOURCES_MAX {
             return Err(SystemError::Bag(format!(
-                "{} applications send in this recording, and {SOURCES_MAX} can be played at once; choose some: --source NAME",
+                "{} applications send in this recording, and {SOURCES_MAX} can be played at once; choose some: \
+                 --source NAME",
                 senders.len()
             )));
         }
