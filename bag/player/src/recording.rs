@@ -17,7 +17,7 @@ const BYTES_MAX: u64 = 1 << 30;
 /// Bytes of a message beside its payload, about.
 const MESSAGE_BYTES: u64 = 100;
 
-/// Why a check cannot begin, or what it found.
+/// Why a check cannot begin, or its finding.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordingError {
     /// A file cannot be read.

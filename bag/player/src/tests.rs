@@ -213,7 +213,7 @@ fn end_of_a_check_is_that_of_its_messages() {
 }
 
 #[test]
-fn messages_are_in_the_order_in_which_they_were_sent() {
+fn messages_are_in_the_order_of_sending() {
     let folder = TestFolder::new();
     let (mut bag, path) = bag(&folder, "walk.mcap", 2);
     let (hip, knee) = (party(tid(1, 1), "hip"), party(tid(2, 1), "knee"));

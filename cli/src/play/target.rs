@@ -21,6 +21,8 @@ use crate::{
 const ADDRESS: [u8; 4] = [127, 0, 83, 119];
 /// Connections to the own node: one for each source, and some for the command itself and for others.
 const CLIENTS_MAX: usize = SOURCES_MAX + 56;
+/// Longest payload at the own node: the longest one that any node accepts.
+const PAYLOAD_MAX: usize = 64 << 20;
 
 /// The node, and the connection of the command to it.
 pub(crate) struct Target {
@@ -44,6 +46,7 @@ impl Target {
         let configure = |config: &mut NodeConfig| {
             config.project.clone_from(&project);
             config.log.level = LogLevel::Off;
+            config.payload_max = PAYLOAD_MAX;
             config.lncl.clients_max = CLIENTS_MAX;
             config.lncl.clients_per_process_max = CLIENTS_MAX;
             config.lncl.socket = Some(socket.clone());
