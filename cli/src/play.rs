@@ -80,8 +80,10 @@ pub(crate) struct Order {
 
 /// Plays the recording, or checks the program.
 pub(crate) fn show(order: &Order, arguments: &Arguments) -> Result<Report, SystemError> {
+    let stop = StopRequest::listen()
+        .map_err(|why| SystemError::Bag(format!("Ctrl-C cannot be handled: {why}; free descriptors")))?;
     if order.check {
-        return check::show(order);
+        return check::show(order, &stop);
     }
     if order.to.is_some_and(|to| to <= order.from.unwrap_or_default()) {
         return Err(SystemError::Usage(
@@ -90,8 +92,6 @@ pub(crate) fn show(order: &Order, arguments: &Arguments) -> Result<Report, Syste
     }
     // Opened first: a file that cannot be read needs no node.
     let playback = order.open()?;
-    let stop = StopRequest::listen()
-        .map_err(|why| SystemError::Bag(format!("Ctrl-C cannot be handled: {why}; free descriptors")))?;
     let mut target = Target::open(order, arguments)?;
     let played = session::play(order, playback, &mut target, &stop);
     target.close();

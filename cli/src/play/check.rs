@@ -23,6 +23,7 @@ use sinew_player::{Recording, RecordingError};
 use super::Order;
 use crate::{
     Report,
+    record::stop::StopRequest,
     system::SystemError,
     table::{clean, clean_lines},
 };
@@ -39,7 +40,7 @@ impl From<RecordingError> for SystemError {
 }
 
 /// Checks the program.
-pub(crate) fn show(order: &Order) -> Result<Report, SystemError> {
+pub(crate) fn show(order: &Order, stop: &StopRequest) -> Result<Report, SystemError> {
     let mut recording = Recording::read_until(&order.files, order.to)?.starts_before(order.start_before);
     for field in &order.ignored {
         recording = recording.ignoring(field.as_str());
@@ -50,7 +51,7 @@ pub(crate) fn show(order: &Order) -> Result<Report, SystemError> {
     exchange::write(&folder.0.join(exchange::ORDER), &request).map_err(|why| unwritable(&folder.0, &why))?;
     // It may have a gigabyte.
     drop(request);
-    let status = run(order, &folder)?;
+    let status = run(order, &folder, stop)?;
     let report = exchange::read::<CheckReport>(&folder.0.join(exchange::REPORT), exchange::REPORT_BYTES_MAX);
     let Ok(report) = report else { return Err(SystemError::Bag(unreported(order, &folder, status))) };
     match report {
@@ -63,7 +64,7 @@ pub(crate) fn show(order: &Order) -> Result<Report, SystemError> {
 }
 
 /// Runs the program to its end. Its standard output is this command's standard error.
-fn run(order: &Order, folder: &Folder) -> Result<ExitStatus, SystemError> {
+fn run(order: &Order, folder: &Folder, stop: &StopRequest) -> Result<ExitStatus, SystemError> {
     let Some((program, arguments)) = order.program.split_first() else {
         return Err(SystemError::Usage("no program to check; write it behind `--`".to_owned()));
     };
@@ -78,6 +79,9 @@ fn run(order: &Order, folder: &Folder) -> Result<ExitStatus, SystemError> {
     loop {
         if let Some(status) = child.0.try_wait().map_err(refused)? {
             return Ok(status);
+        }
+        if stop.is_there() {
+            return Err(SystemError::Bag("the check was stopped before its end".to_owned()));
         }
         if Time::now() >= until {
             let within = order.within;
