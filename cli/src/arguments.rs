@@ -4,9 +4,9 @@ use std::{path::PathBuf, time::Duration};
 
 use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
-use crate::{bag, keys, record, send, watch, why};
+use crate::{bag, keys, play, record, send, watch, why};
 
-/// Shows a running Sinew system, from any one node of it. It changes nothing, except that `send` sends
+/// Shows a running Sinew system, from any one node of it. It changes nothing, except that `send` and `play` send
 /// messages, and `keys`, `record` and `bag` write files.
 ///
 /// It connects to the socket of a node on this machine (`lncl.socket` in the node's configuration) and asks
@@ -105,6 +105,21 @@ pub(crate) enum Command {
   sinew record --split 5m --max-size 10G
   sinew record walk.mcap --json | jq .dropped"#)]
     Record(record::Order),
+    /// Sends the messages of a recording again, or checks a program against them
+    ///
+    /// Each recorded application is registered under its name, and its messages go to the destinations with the
+    /// recorded names, at the times at which they were sent. Without --live that is in a project of its own on
+    /// loopback, `replay`. Protected commands are never sent into a live system.
+    ///
+    /// With --check it sends nothing: it runs PROGRAM in virtual time on the messages that it received, and compares
+    /// all that it sends. Exit code 1 if a message differs: the first one is named with its field and both values.
+    #[command(after_help = r#"Examples:
+  sinew play walk.mcap
+  sinew play walk.mcap --rate 0.5 --from 10s --to 20s --loop
+  sinew play walk.mcap --source 'knee.*' --live
+  sinew play --check walk.mcap -- target/release/knee knee.toml
+  sinew play --check walk.mcap --app knee.drive --ignore t_ns --start-before 1ms -- target/release/knee knee.toml"#)]
+    Play(play::Order),
     /// Finds out why two nodes or applications cannot communicate: each step, from both ends, with a suggested fix
     ///
     /// All nodes are asked that can be reached through any socket of this host, so that two nodes that do not
@@ -214,7 +229,8 @@ const AFTER: &str = "\
 Exit codes:
   0  no problem was found
   1  a problem was found: a node or an application does not answer, is not ready or refuses, a message was not delivered, a name is
-     unknown, a list cannot be used, keys cannot be made or are valid for less than 30 days, a recording is incomplete or cannot be read
+     unknown, a list cannot be used, keys cannot be made or are valid for less than 30 days, a recording is incomplete or cannot be read,
+     a program sends other messages than those of a recording
   2  the command line is wrong
   3  no node on this machine accepts this command, or that node does not answer
   4  all is fine, but standard output did not take all of it (a full disk); a reader that closes its pipe, as `head`, is no error
@@ -225,6 +241,7 @@ Examples:
   sinew send knee.drive demo.angle '{\"degrees\": 5}'
   sinew watch knee.drive --received
   sinew record walk.mcap --for 30s
+  sinew play walk.mcap --rate 0.5
   sinew why hip knee.drive
   sinew reload
   sinew apps --json | jq '.apps[] | select(.ready | not)'

@@ -2,7 +2,8 @@
 //!
 //! It connects through a node's socket like any other program, and asks each node's inspection (`sinew::inspect`)
 //! through ordinary messages. It changes nothing, except that `send` sends messages and `reload` makes a node read its
-//! access list again. `record` has the node record its messages, and writes them to a file. `keys` asks no node: it
+//! access list again. `record` has the node record its messages, and writes them to a file. `play` sends them again, by a
+//! node of its own unless told otherwise. `keys` asks no node: it
 //! creates the files by which nodes authenticate each other. `bag` reads the files of recordings.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)] // `output` prints: the macros panic where a pipe is closed or a disk is full.
@@ -17,6 +18,7 @@ mod messagepack;
 mod nodes;
 mod output;
 mod ping;
+mod play;
 mod record;
 mod reload;
 mod security;
@@ -123,6 +125,7 @@ fn run(arguments: &Arguments) -> Result<Report, SystemError> {
         Command::Watch(order) => {
             inside(&|system| watch::show(system, order, (arguments.json, arguments.wide)))
         }
+        Command::Play(order) => play::show(order, arguments),
         Command::Record(order) => inside(&|system| record::show(system, order)),
         Command::Why(order) => inside(&|system| why::show(system, order, arguments.wide)),
         Command::Barriers => inside(&|system| apps::barriers(system, arguments.wide)),

@@ -1,7 +1,7 @@
 //! `sinew record`: writes the messages of the node into a file.
 
 mod sizes;
-mod stop;
+pub(crate) mod stop;
 
 use std::{
     io::{self, IsTerminal as _},

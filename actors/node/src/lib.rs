@@ -26,6 +26,7 @@ mod layers;
 #[cfg(test)]
 mod log_tests;
 mod node;
+mod play_check;
 mod process;
 mod progress;
 mod recording;

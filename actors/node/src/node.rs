@@ -4,7 +4,7 @@ use std::{path::Path, process::ExitCode, sync::mpsc::Receiver, time::Duration};
 
 use sinew_runtime::{log, tid::NodeAddress};
 
-use super::{NodeBuilder, NodeHandle, RootEvent};
+use super::{NodeBuilder, NodeHandle, RootEvent, play_check};
 
 /// Time limit at the node's end for writing its log.
 pub(super) const LAST_WORDS: Duration = Duration::from_millis(500);
@@ -128,6 +128,10 @@ impl Node {
     /// stops in order. Returns the exit code for `main`: 0 after an orderly stop, 1 after giving up.
     pub fn run(mut self) -> ExitCode {
         if self.handle.hosts_other_node {
+            if play_check::is_asked() {
+                // The recording has no application of this program, which the command reports.
+                return ExitCode::FAILURE;
+            }
             wait_for_ever();
         }
         let _ = self.handle.send_to_root(RootEvent::HeedSignals);

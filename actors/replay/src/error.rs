@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use sinew_runtime::time::Time;
 
-use crate::{FirstDifference, TimedMessage};
+use crate::{FirstDifference, Misfit, TimedMessage};
 
 /// A replay that did not reach its end.
 ///
@@ -99,4 +99,31 @@ pub enum CheckError {
     /// The replay differs.
     #[error(transparent)]
     Differs(#[from] FirstDifference),
+    /// The replay differs, and an application under test could not decode recorded messages.
+    #[error(
+        "{0}. The first difference after that: {1}. Give new fields `#[serde(default)]`, or record again"
+    )]
+    Misfit(Box<Misfit>, Box<FirstDifference>),
+}
+
+/// The result of a check that found no difference.
+///
+/// # Examples
+///
+/// ```
+/// use sinew::replay::Checked;
+///
+/// fn report(checked: &Checked) {
+///     println!("identical: {} messages of {} sources", checked.messages, checked.sources);
+///     checked.misfits.iter().for_each(|misfit| println!("{misfit}"));
+/// }
+/// ```
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Checked {
+    /// The messages that were compared.
+    pub messages: usize,
+    /// The applications that sent them.
+    pub sources: usize,
+    /// Recorded messages that an application under test could not decode.
+    pub misfits: Vec<Misfit>,
 }

@@ -74,7 +74,10 @@
 mod compare;
 mod directory;
 mod error;
+#[doc(hidden)]
+pub mod exchange;
 mod message;
+mod misfit;
 mod replay;
 mod run;
 mod value;
@@ -82,8 +85,9 @@ mod world;
 
 pub use self::{
     compare::{Comparison, FirstDifference, compare},
-    error::{CheckError, ReplayError, RunError},
+    error::{CheckError, Checked, ReplayError, RunError},
     message::TimedMessage,
+    misfit::Misfit,
     replay::Replay,
 };
 pub use sinew_runtime::wire::Flags;

@@ -1,7 +1,7 @@
 //! The declaration of a replay: the applications under test, names, and the end.
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     sync::{
         Arc,
         atomic::AtomicU64,
@@ -20,11 +20,14 @@ use sinew_runtime::{
     sender::Sender,
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
+    wire::Kind,
 };
+use sinew_schema::Schema;
 
 use crate::{
-    CheckError, Comparison, ReplayError, RunError, TimedMessage,
+    CheckError, Checked, Comparison, Misfit, ReplayError, RunError, TimedMessage,
     directory::Names,
+    misfit,
     run::{Prepared, Progress, Run},
     world::World,
 };
@@ -78,6 +81,7 @@ pub struct Replay {
     latency: Duration,
     turn_within: Duration,
     first_wait: u64,
+    schemas: BTreeMap<Kind, Schema>,
 }
 
 impl std::fmt::Debug for Replay {
@@ -105,6 +109,7 @@ impl Replay {
             latency: Duration::ZERO,
             turn_within: TURN_WITHIN,
             first_wait: 1,
+            schemas: BTreeMap::new(),
         }
     }
 
@@ -161,6 +166,14 @@ impl Replay {
         self
     }
 
+    /// Sets the structure that a type had when it was recorded. It explains messages that an application under test
+    /// cannot decode: [`Misfit::differences`].
+    #[must_use]
+    pub fn recorded_type(mut self, kind: Kind, schema: Schema) -> Self {
+        self.schemas.insert(kind, schema);
+        self
+    }
+
     /// Runs the applications on these inputs, which must be in the order of their times. Returns everything
     /// that the applications sent, in order.
     ///
@@ -177,10 +190,14 @@ impl Replay {
     where
         I: IntoIterator<Item = TimedMessage, IntoIter: Send + 'static>,
     {
-        self.run_until(self.ends_at, inputs)
+        self.run_until(self.ends_at, inputs).map(|(outputs, _)| outputs)
     }
 
-    fn run_until<I>(&self, ends_at: Option<Time>, inputs: I) -> Result<Vec<TimedMessage>, ReplayError>
+    fn run_until<I>(
+        &self,
+        ends_at: Option<Time>,
+        inputs: I,
+    ) -> Result<(Vec<TimedMessage>, Vec<Misfit>), ReplayError>
     where
         I: IntoIterator<Item = TimedMessage, IntoIter: Send + 'static>,
     {
@@ -204,7 +221,8 @@ impl Replay {
         let mut seen = None;
         loop {
             match finished.recv_timeout(self.turn_within) {
-                Ok(result) => return result.map(|()| world.take_outputs()).map_err(fault),
+                Ok(Ok(())) => return Ok((world.take_outputs(), world.misfits().take(&self.schemas))),
+                Ok(Err(why)) => return Err(fault(why)),
                 Err(RecvTimeoutError::Timeout) => {
                     let now = progress.read();
                     if let (true, Some(app)) = (seen == Some(now), now.1) {
@@ -241,15 +259,50 @@ impl Replay {
     /// }
     /// ```
     pub fn check(&self, recorded: Vec<TimedMessage>) -> Result<(), CheckError> {
+        self.check_by(&Comparison::default(), recorded).map(drop)
+    }
+
+    /// Same as [`check`](Self::check), by these terms. Returns how much was compared.
+    ///
+    /// # Errors
+    /// The replay did not reach its end, or differs from the recording. If it differs, and an application under test
+    /// could not decode recorded messages, these are the error: [`CheckError::Misfit`].
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{prelude::*, replay::{CheckError, Comparison, Replay, TimedMessage}};
+    ///
+    /// struct Hip;
+    /// # impl Actor for Hip { type Context = AppContext<Self>; }
+    ///
+    /// fn check(recorded: Vec<TimedMessage>, hip: Tid) -> Result<(), CheckError> {
+    ///     let replay = Replay::new().app(AppSpec::new("hip", || Hip)).name("hip", hip);
+    ///     let checked = replay.check_by(&Comparison::default().ignoring("t_ns"), recorded)?;
+    ///     println!("identical: {} messages", checked.messages);
+    ///     Ok(())
+    /// }
+    /// ```
+    pub fn check_by(
+        &self,
+        comparison: &Comparison,
+        recorded: Vec<TimedMessage>,
+    ) -> Result<Checked, CheckError> {
         let tested = self.addresses();
         let (expected, inputs): (Vec<_>, Vec<_>) =
             recorded.into_iter().partition(|message| tested.contains(&message.source));
         // Timers between the last input and the last output still fire.
         let end = expected.iter().chain(&inputs).map(|message| message.at).max();
         let ends_at = self.ends_at.or(end);
-        let replayed = self.run_until(ends_at, inputs)?;
-        Comparison::default().compare(&expected, &replayed)?;
-        Ok(())
+        let (replayed, misfits) = self.run_until(ends_at, inputs)?;
+        if let Err(difference) = comparison.compare(&expected, &replayed) {
+            return Err(match misfits.into_iter().next() {
+                Some(misfit) => CheckError::Misfit(Box::new(misfit), Box::new(difference)),
+                None => CheckError::Differs(difference),
+            });
+        }
+        let sources: BTreeSet<_> = expected.iter().map(|message| message.source).collect();
+        Ok(Checked { messages: expected.len(), sources: sources.len(), misfits })
     }
 
     /// Returns the address of each application under test.
@@ -285,6 +338,7 @@ impl Replay {
             }
             let uplink: Arc<dyn MessageSink> = world.clone();
             let router = Arc::new(Router::through(tid.node, uplink).on_clock(clock.clone()));
+            router.set_refusal_sink(misfit::sink(world.misfits()));
             let directory = Arc::new(Names {
                 node: tid.node,
                 names: names.clone(),

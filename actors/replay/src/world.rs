@@ -18,7 +18,7 @@ use sinew_runtime::{
     wire::{Flags, Message},
 };
 
-use crate::TimedMessage;
+use crate::{TimedMessage, misfit::Misfits};
 
 /// Maximum number of requests and confirmed messages that wait for an answer from outside. Beyond it the
 /// oldest ends as `Unknown`.
@@ -28,6 +28,7 @@ const OPEN_MAX: usize = 65_536;
 pub(crate) struct World {
     clock: Clock,
     latency: Duration,
+    misfits: Arc<Misfits>,
     state: Mutex<State>,
 }
 
@@ -54,7 +55,12 @@ struct Open {
 
 impl World {
     pub(crate) fn new(clock: Clock, latency: Duration) -> Self {
-        Self { clock, latency, state: Mutex::default() }
+        Self { clock, latency, misfits: Arc::default(), state: Mutex::default() }
+    }
+
+    /// Returns the inputs that the applications could not decode.
+    pub(crate) const fn misfits(&self) -> &Arc<Misfits> {
+        &self.misfits
     }
 
     pub(crate) fn clock(&self) -> &Clock {

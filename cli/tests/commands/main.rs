@@ -6,6 +6,7 @@ mod doctor;
 mod keys;
 mod mistakes;
 mod output;
+mod play;
 mod record;
 mod reference;
 mod scenario;

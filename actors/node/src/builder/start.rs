@@ -22,7 +22,7 @@ use super::{NodeBuilder, StartError};
 use crate::{
     Node, NodeHandle, NodeState, SupervisorSpec, inspect,
     node::LAST_WORDS,
-    process,
+    play_check, process,
     root::{self, RootEvent},
     security_setup,
 };
@@ -66,6 +66,9 @@ impl NodeBuilder {
     /// runs the application, and the builders of other nodes start nothing. Code before this line runs in
     /// that process too, so keep it short, and do not read the standard input.
     ///
+    /// In a process that `sinew play --check` has started this function runs the applications in virtual time,
+    /// reports to the command, and does not return.
+    ///
     /// Signals are not handled: SIGINT and SIGTERM end the process at once, without an ordered stop. Call
     /// [`heed_signals`](Self::heed_signals) before, or [`run`](Self::run) instead.
     ///
@@ -96,7 +99,8 @@ impl NodeBuilder {
         check_panics(UNWINDS, self.accept_abort_on_panic)?;
         #[cfg(feature = "fault-points")]
         let planned = crate::faults::read(&self.faults, &mut self.tree)?;
-        let hosts_other_node = process::hosts_other_node(&self.config, &mut self.tree);
+        let hosts_other_node = play_check::takes_over(&self.config, &mut self.tree)
+            || process::hosts_other_node(&self.config, &mut self.tree);
         let auto_shutdown = self.tree.flags.auto_shutdown;
         self.tree.flags = Flags { auto_shutdown, ..self.config.supervision.apps() };
         self.tree.check()?;

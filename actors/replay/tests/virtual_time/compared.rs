@@ -1,6 +1,9 @@
 //! The same inputs give the same outputs; another gain gives a first difference with a name.
 
-use sinew::replay::{CheckError, Comparison, compare};
+use sinew::{
+    replay::{CheckError, Comparison, compare},
+    schema::schema_of,
+};
 
 use super::*;
 
@@ -82,4 +85,41 @@ fn recording_is_checked_against_its_own_replay() {
     tested(0.5).check(recorded.clone()).expect("it is its own recording");
     let error = tested(0.25).check(recorded).expect_err("the gain differs");
     assert!(matches!(error, CheckError::Differs(_)), "{error}");
+}
+
+payload!("replay.later", Stream => struct Later { degrees: f64, velocity: f64 });
+
+/// Handles a version of the angles that has one more field.
+struct Follower;
+
+impl Actor for Follower {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Later>> for Follower {
+    type Result = ();
+
+    fn handle(&mut self, angle: Delivery<Later>, ctx: &mut Self::Context) {
+        let newton_metres = angle.degrees + angle.velocity;
+        ctx.send("motor", &Torque { newton_metres, t_ns: 0 }).unwrap();
+    }
+}
+
+#[test]
+fn recorded_type_explains_a_message_that_is_refused() {
+    let older = TimedMessage {
+        kind: Later::KIND,
+        ..TimedMessage::of(ms(1), tid(HIP), tid(KNEE), &Angle { degrees: 1.0 })
+    };
+    let torque = TimedMessage::of(ms(1), tid(KNEE), tid(MOTOR), &Torque { newton_metres: 1.0, t_ns: 0 });
+    let tested = || replay().app(AppSpec::new("knee", || Follower).handles::<Later>());
+    let error = tested().check(vec![older.clone(), torque.clone()]).expect_err("it is not decoded");
+    let CheckError::Misfit(misfit, difference) = &error else { panic!("{error}") };
+    assert_eq!((misfit.count, misfit.sender, misfit.receiver), (1, tid(HIP), tid(KNEE)));
+    assert!(misfit.differences.is_empty() && difference.number == 1, "{error}");
+    // And: the recorded structure of the type names the field
+    let angle = schema_of::<Angle>().unwrap().unwrap().schema().clone();
+    let error =
+        tested().recorded_type(Later::KIND, angle).check(vec![older, torque]).expect_err("it is not decoded");
+    assert!(error.to_string().contains("velocity"), "{error}");
 }

@@ -1,0 +1,216 @@
+//! `sinew play --check`: runs a program in virtual time on a recording, and compares its messages with the recorded
+//! ones.
+//!
+//! The program is started with the path of a folder in an environment variable. Its first node with an application of
+//! the recording runs these applications there, and writes a report instead of starting.
+
+use std::{
+    collections::BTreeMap,
+    fs, io,
+    os::{fd::AsFd as _, unix::fs::DirBuilderExt as _},
+    path::{Path, PathBuf},
+    process::{Child, Command, ExitStatus, Stdio},
+    time::Duration,
+};
+
+use serde_json::json;
+use sinew::{
+    Tid, Time,
+    replay::exchange::{self, CheckReport, ReportedDifference},
+};
+use sinew_player::{Recording, RecordingError};
+
+use super::Order;
+use crate::{
+    Report,
+    record::stop::StopRequest,
+    system::SystemError,
+    table::{clean, clean_lines},
+};
+
+/// Time between two looks at the program.
+const LOOK: Duration = Duration::from_millis(5);
+/// Maximum bytes of the lines about applications that the recording does not have.
+const DECLARED_BYTES_MAX: usize = 64 << 10;
+
+impl From<RecordingError> for SystemError {
+    fn from(error: RecordingError) -> Self {
+        Self::Bag(error.to_string())
+    }
+}
+
+/// Checks the program.
+pub(crate) fn show(order: &Order, stop: &StopRequest) -> Result<Report, SystemError> {
+    let mut recording = Recording::read_until(&order.files, order.to)?.starts_before(order.start_before);
+    for field in &order.ignored {
+        recording = recording.ignoring(field.as_str());
+    }
+    let request = recording.into_order(&order.apps)?;
+    let names: BTreeMap<u64, String> = request.names.iter().map(|(name, tid)| (*tid, name.clone())).collect();
+    let folder = Folder::new()?;
+    exchange::write(&folder.0.join(exchange::ORDER), &request).map_err(|why| unwritable(&folder.0, &why))?;
+    // It may have a gigabyte.
+    drop(request);
+    let status = run(order, &folder, stop)?;
+    let report = exchange::read::<CheckReport>(&folder.0.join(exchange::REPORT), exchange::REPORT_BYTES_MAX);
+    let Ok(report) = report else { return Err(SystemError::Bag(unreported(order, &folder, status))) };
+    match report {
+        CheckReport::Identical { messages, sources, misfits } => Ok(identical(messages, sources, &misfits)),
+        CheckReport::Differs(difference) => Ok(differs(&difference, &names)),
+        CheckReport::Failed(why) => {
+            Err(SystemError::Bag(format!("the check did not reach its end: {}", clean(&why))))
+        }
+    }
+}
+
+/// Runs the program to its end. Its standard output is this command's standard error.
+fn run(order: &Order, folder: &Folder, stop: &StopRequest) -> Result<ExitStatus, SystemError> {
+    let Some((program, arguments)) = order.program.split_first() else {
+        return Err(SystemError::Usage("no program to check; write it behind `--`".to_owned()));
+    };
+    let shown = clean(&program.to_string_lossy());
+    let refused =
+        |why: io::Error| SystemError::Bag(format!("{shown} cannot be run: {why}; check its path and rights"));
+    let output = io::stderr().as_fd().try_clone_to_owned().map_err(refused)?;
+    let mut command = Command::new(program);
+    command.args(arguments).env(exchange::VARIABLE, &folder.0).stdin(Stdio::null()).stdout(output);
+    let mut child = Running(command.spawn().map_err(refused)?);
+    let until = Time::now() + order.within;
+    loop {
+        if let Some(status) = child.0.try_wait().map_err(refused)? {
+            return Ok(status);
+        }
+        if stop.is_there() {
+            return Err(SystemError::Bag("the check was stopped before its end".to_owned()));
+        }
+        if Time::now() >= until {
+            let within = order.within;
+            return Err(SystemError::Bag(format!(
+                "{shown} has not ended within {within:?}; give it more time: --within. {}",
+                declared(&folder.0)
+            )));
+        }
+        std::thread::sleep(LOOK);
+    }
+}
+
+/// A program that is ended with the command.
+struct Running(Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        // Both fail only if it has ended and was waited for.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// The folder of order and report, which is removed at the end.
+struct Folder(PathBuf);
+
+impl Folder {
+    fn new() -> Result<Self, SystemError> {
+        let (process, now) = (std::process::id(), Time::now().as_nanos());
+        let path = std::env::temp_dir().join(format!("sinew-check-{process}-{now}"));
+        match fs::DirBuilder::new().mode(0o700).create(&path) {
+            Ok(()) => Ok(Self(path)),
+            Err(why) => Err(unwritable(&path, &why)),
+        }
+    }
+}
+
+fn unwritable(folder: &Path, why: &io::Error) -> SystemError {
+    let folder = folder.display();
+    SystemError::Bag(format!("{folder} cannot be written: {why}; set TMPDIR to a folder with room"))
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        // The system clears the folder of temporary files, too.
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// Returns why there is no report.
+fn unreported(order: &Order, folder: &Folder, status: ExitStatus) -> String {
+    let program = order.program.first().map(|program| clean(&program.to_string_lossy())).unwrap_or_default();
+    format!(
+        "{program} has ended without a report ({status}). It must start its node with `Node::builder` or \
+         `Node::from_file`, on a version of Sinew with this check. {}",
+        declared(&folder.0)
+    )
+}
+
+/// Returns the nodes of the program that have no application of the recording, in words.
+fn declared(folder: &Path) -> String {
+    let text = fs::read(folder.join(exchange::DECLARED)).unwrap_or_default();
+    let text = String::from_utf8_lossy(text.get(..DECLARED_BYTES_MAX).unwrap_or(&text)).into_owned();
+    if text.is_empty() {
+        return "No node of it has asked for the recording".to_owned();
+    }
+    let lines = clean_lines(&text).replace('\n', "; ");
+    format!("No application of it is in the recording under this name, or was chosen by --app: {lines}")
+}
+
+fn identical(messages: u64, sources: u64, misfits: &[String]) -> Report {
+    let mut text = format!("identical: {messages} messages of {sources} sources\n");
+    for misfit in misfits {
+        text += &format!("{}\n", clean(misfit));
+    }
+    let json = json!({ "result": "identical", "messages": messages, "sources": sources, "misfits": misfits });
+    Report { text, json, is_fine: true }
+}
+
+fn differs(difference: &ReportedDifference, names: &BTreeMap<u64, String>) -> Report {
+    let ReportedDifference { source, number, at_ns, type_name, destination, difference, misfit } = difference;
+    let shown = |tid: u64| names.get(&tid).cloned().unwrap_or_else(|| Tid::from_bits(tid).to_string());
+    let (source, destination) = (shown(*source), shown(*destination));
+    let seconds = *at_ns as f64 / 1e9;
+    let line = format!(
+        "the first difference: message {number} of {source}, {type_name} to {destination} at {seconds:.6} s: \
+         {difference}"
+    );
+    let mut text = format!("{}\n", clean(&line));
+    if let Some(misfit) = misfit {
+        text += &format!("{}\n", clean(misfit));
+    }
+    let json = json!({
+        "result": "differs", "source": source, "number": number, "at_ns": at_ns, "type": type_name,
+        "destination": destination, "difference": difference, "misfit": misfit,
+    });
+    Report { text, json, is_fine: false }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn difference_is_named_by_source_number_time_and_field() {
+        let difference = ReportedDifference {
+            source: 5,
+            number: 7,
+            at_ns: 1_500_000_000,
+            type_name: "demo.torque".to_owned(),
+            destination: Tid::from_bits(0x0a00_0002_0000_1001).bits(),
+            difference: "`newton_metres` was 5.0 and is 2.5".to_owned(),
+            misfit: None,
+        };
+        let report = differs(&difference, &BTreeMap::from([(5, "knee".to_owned())]));
+        let expected = "the first difference: message 7 of knee, demo.torque to 10.0.0.2/1001 at 1.500000 s: \
+                        `newton_metres` was 5.0 and is 2.5\n";
+        assert_eq!((report.text.as_str(), report.is_fine), (expected, false));
+        assert_eq!(report.json["source"], "knee");
+    }
+
+    #[test]
+    fn folder_is_removed_at_the_end() {
+        let folder = Folder::new().expect("there is room");
+        let path = folder.0.clone();
+        fs::write(path.join(exchange::DECLARED), "node knee: drive\nnode hip: gait\n")
+            .expect("there is room");
+        assert!(declared(&path).contains("node knee: drive; node hip: gait"), "{}", declared(&path));
+        drop(folder);
+        assert!(!path.exists());
+    }
+}

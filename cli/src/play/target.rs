@@ -1,0 +1,101 @@
+//! The node that a recording is played into: one of the command's own, or a running one.
+
+use std::{
+    fs,
+    os::unix::fs::DirBuilderExt as _,
+    path::{Path, PathBuf},
+};
+
+use sinew::{
+    Node, NodeApi,
+    config::{LogLevel, NodeConfig},
+};
+
+use super::{Order, sources::SOURCES_MAX};
+use crate::{
+    arguments::Arguments,
+    system::{System, SystemError},
+};
+
+/// The address of the own node. Nodes of users on loopback have those that begin with 127.0.0.
+const ADDRESS: [u8; 4] = [127, 0, 83, 119];
+/// Connections to the own node: one for each source, and some for the command itself and for others.
+const CLIENTS_MAX: usize = SOURCES_MAX + 56;
+/// Longest payload at the own node: the longest one that any node accepts.
+const PAYLOAD_MAX: usize = 64 << 20;
+
+/// The node, and the connection of the command to it.
+pub(crate) struct Target {
+    pub(crate) system: System,
+    /// The project of the node.
+    pub(crate) project: String,
+    /// The node, if it is the command's own.
+    own: Option<Node>,
+}
+
+impl Target {
+    /// Starts the own node, or connects to the running one.
+    pub(crate) fn open(order: &Order, arguments: &Arguments) -> Result<Self, SystemError> {
+        if order.live {
+            let mut system = System::enter(arguments.socket.as_deref(), arguments.within())?;
+            let project = system.here()?.project;
+            return Ok(Self { system, project, own: None });
+        }
+        let socket = socket()?;
+        let project = order.project.clone();
+        let configure = |config: &mut NodeConfig| {
+            config.project.clone_from(&project);
+            config.log.level = LogLevel::Off;
+            config.payload_max = PAYLOAD_MAX;
+            config.lncl.clients_max = CLIENTS_MAX;
+            config.lncl.clients_per_process_max = CLIENTS_MAX;
+            config.lncl.socket = Some(socket.clone());
+        };
+        let node = Node::builder("sinew-play").address(ADDRESS).configure(configure).start();
+        let node = node.map_err(|why| {
+            let project = &order.project;
+            SystemError::Bag(format!(
+                "the node for the recording did not start: {why}. If another `sinew play` runs in the project \
+                 {project}, choose another one: --project {project}-2"
+            ))
+        })?;
+        let system = System::enter(Some(&socket), arguments.within())?;
+        Ok(Self { system, project, own: Some(node) })
+    }
+
+    /// Returns whether the node is the command's own.
+    pub(crate) const fn is_own(&self) -> bool {
+        self.own.is_some()
+    }
+
+    /// Returns another way to the node.
+    pub(crate) fn api(&self) -> Result<NodeApi, SystemError> {
+        let path = &self.system.path;
+        NodeApi::connect(Path::new(path)).map_err(|why| SystemError::NotRegistered(path.clone(), why))
+    }
+
+    /// Disconnects, and stops the own node.
+    pub(crate) fn close(self) {
+        self.system.leave();
+        if let Some(node) = self.own {
+            node.stop();
+        }
+    }
+}
+
+/// Returns the path of the own node's socket, where other commands find it.
+fn socket() -> Result<PathBuf, SystemError> {
+    let name = format!("play-{}.sock", std::process::id());
+    let Some(runtime) = std::env::var_os("XDG_RUNTIME_DIR").filter(|path| !path.is_empty()) else {
+        return Ok(std::env::temp_dir().join(format!("sinew-{name}")));
+    };
+    let folder = PathBuf::from(runtime).join("sinew");
+    let made = fs::DirBuilder::new().recursive(true).mode(0o700).create(&folder);
+    made.map_err(|why| {
+        let folder = folder.display();
+        SystemError::Bag(format!(
+            "{folder}, the folder for the socket, cannot be made: {why}; set XDG_RUNTIME_DIR to another one"
+        ))
+    })?;
+    Ok(folder.join(name))
+}
