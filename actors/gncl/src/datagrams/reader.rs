@@ -1,7 +1,6 @@
 //! The receiving of datagrams, and the timer of all peers' channels. Both are tasks of the IO thread.
 
 use std::{
-    cell::{Cell, RefCell},
     future::poll_fn,
     io,
     net::UdpSocket,
@@ -23,7 +22,14 @@ use super::{
     channel,
     packet::{DATAGRAM_MAX, Prefix},
 };
-use crate::{State, core::Lane, inbound::Inbound, peer::Peer, shared_socket::SharedSocket, spin::Spin};
+use crate::{
+    State,
+    core::Lane,
+    inbound::{Collected, Inbound},
+    peer::Peer,
+    shared_socket::SharedSocket,
+    spin::Spin,
+};
 
 /// Datagrams read before other tasks of the thread run.
 const DATAGRAMS_PER_WAKE: usize = 64;
@@ -237,8 +243,7 @@ impl Reader {
             lane: Lane::Stream,
             link: LinkNumber::default(),
             checksum: Checksum::Crc,
-            outcomes: RefCell::default(),
-            conversion: Cell::default(),
+            collected: Collected::default(),
         }
     }
 
