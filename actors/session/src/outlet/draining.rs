@@ -5,13 +5,16 @@ use std::{
     task::{Context, Poll},
 };
 
-use sinew_runtime::{time::Time, wire::HEADER_LEN};
+use sinew_runtime::{
+    time::Time,
+    wire::{HEADER_LEN, Kind, Message},
+};
 
 use super::{
     LinkNumber, Socket,
     batch::SHORT,
     deferred::DeferredActions,
-    outcomes::with_outcomes_behind,
+    outcomes::{self, with_outcomes_behind},
     outstanding::confirming_destination,
     partial::{Partial, Written},
     writer_state::{Step, WriterState},
@@ -89,7 +92,8 @@ impl<S: Socket> WriterState<S> {
     /// Whether the number of queued messages is so high that the sender should write them itself.
     fn has_much(&self) -> bool {
         let queue = &self.unsent.queue;
-        let messages = queue.len();
+        // Outcomes that were added to others count, too: as many messages are about to wait for them.
+        let messages = queue.len().max(queue.outcomes());
         let bytes = messages * HEADER_LEN + queue.bytes();
         if bytes <= messages * SHORT {
             bytes >= HELP_AT_BYTES || messages >= HELP_AT
@@ -183,10 +187,23 @@ impl<S: Socket> WriterState<S> {
             self.expired(message, deferred);
             return None;
         }
+        Some(if message.header.kind == Kind::OUTCOME {
+            self.outcome_frame(message)
+        } else {
+            self.frame(message)
+        })
+    }
+
+    /// Encodes an outcome, and those behind it, as a frame.
+    fn outcome_frame(&mut self, first: Message) -> Partial {
+        if outcomes::count(&first) > 1 && self.connection.gathers() {
+            // An outcome that is added to another is not recorded as part of the burst, which saves a look at the clock.
+            self.bursts.written(Time::now());
+        }
         let link = self.numbering.outcomes_header();
         let message =
-            with_outcomes_behind(message, link, self.payload_max, &mut self.unsent.queue, &mut self.counters);
-        Some(self.frame(message))
+            with_outcomes_behind(first, link, self.payload_max, &mut self.unsent.queue, &mut self.counters);
+        self.frame(message)
     }
 
     /// Writes the next piece of the started frame.

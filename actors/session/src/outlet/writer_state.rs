@@ -8,7 +8,7 @@ use sinew_runtime::{
     outcome::{Outcome, Receipt, Rejection, Ticket},
     router::Refused,
     time::Time,
-    wire::{Class, Flags, Message},
+    wire::{Class, Flags, Kind, Message},
 };
 
 use super::{
@@ -19,7 +19,7 @@ use super::{
     deferred::DeferredActions,
     link_frames::{LinkFrames, Pushed},
     numbering::{Numbering, Session},
-    outcomes::messages_in,
+    outcomes::{self, messages_in},
     outstanding::{Open, SentMessage, Shares, confirming_destination},
     partial::{FrameOrigin, Partial, Written},
     unsent::{Bound, Unsent},
@@ -80,6 +80,17 @@ impl<S: Socket> WriterState<S> {
         Ok(step)
     }
 
+    /// Submits an outcome: the bounds do not apply while fewer than `waiting_max` are queued.
+    pub(super) fn submit_outcome(
+        &mut self,
+        message: Message,
+        waiting_max: usize,
+        deferred: &mut DeferredActions,
+    ) -> Result<Step, Refused> {
+        let is_waived = self.unsent.queue.outcomes() < waiting_max;
+        self.submit(message, if is_waived { Bound::Waived } else { Bound::Kept }, deferred)
+    }
+
     fn take(
         &mut self,
         mut message: Message,
@@ -89,6 +100,10 @@ impl<S: Socket> WriterState<S> {
         if let Err(why) = self.admit(&message, bound) {
             self.counters.counts.refused += 1;
             return Err(Refused::new(message, why));
+        }
+        if message.header.kind == Kind::OUTCOME {
+            // In the queue it is the number of further outcomes.
+            message.header.sequence = 0;
         }
         message.header.flags = match message.receipt {
             Some(_) => message.header.flags.with(Flags::CONFIRM),
@@ -157,6 +172,23 @@ impl<S: Socket> WriterState<S> {
         } else {
             Ok(())
         }
+    }
+
+    /// Adds an outcome to the queued one of the message before, if the peer accepts both in one frame. Returns whether
+    /// it does. The drain task is awake or will be woken for that one.
+    pub(super) fn extend_outcome(
+        &mut self,
+        ticket: Ticket,
+        outcome: Outcome,
+        deferred: &mut DeferredActions,
+    ) -> bool {
+        let is_added = self.numbering.combines_outcomes()
+            && !self.link_frames.is_finishing()
+            && self.unsent.queue.extend_outcome(ticket, outcome, outcomes::frame_max(self.payload_max));
+        if is_added {
+            self.help(deferred);
+        }
+        is_added
     }
 
     fn hold(&mut self, key: u64, message: Message) -> Result<(), Refused> {
