@@ -49,6 +49,7 @@ impl<S: Socket> WriterState<S> {
         deferred: &mut DeferredActions,
     ) -> Poll<Drained> {
         self.connection.poll_delayed_wake(cx);
+        self.checked_at = None;
         let mut bytes = 0;
         for _ in 0..WRITES_PER_WAKE {
             if let Some(end) = self.connection.end_of(link) {
@@ -78,6 +79,7 @@ impl<S: Socket> WriterState<S> {
         if !self.connection.gathers() || self.connection.is_within_frame() || !self.has_much() {
             return;
         }
+        self.checked_at = None;
         let mut bytes = 0;
         for _ in 0..HELP_AT {
             if bytes >= BYTES_PER_WAKE || !self.has_frame() {
@@ -149,6 +151,7 @@ impl<S: Socket> WriterState<S> {
 
     /// Writes the next frame, or its next piece. Returns how many bytes the socket has accepted.
     pub(super) fn write_next(&mut self, deferred: &mut DeferredActions) -> usize {
+        self.checked_at = None;
         self.next_frame(deferred).map_or(0, |frame| self.write_frame(frame))
     }
 
@@ -182,7 +185,10 @@ impl<S: Socket> WriterState<S> {
         }
         let message = self.unsent.pop()?;
         deferred.room.extend(self.unsent.queue.room_made());
-        if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
+        // One look at the clock serves all frames of a turn. The receiver checks the time to live again.
+        if message.header.time_to_live_us != 0
+            && message.header.is_expired(*self.checked_at.get_or_insert_with(Time::now))
+        {
             self.receipts.remove_waiting(confirming_destination(&message));
             self.expired(message, deferred);
             return None;

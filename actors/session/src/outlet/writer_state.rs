@@ -49,6 +49,8 @@ pub(super) struct WriterState<S> {
     pub(super) early_outcomes: Vec<(Receipt, Outcome)>,
     pub(super) bursts: BurstDetector,
     pub(super) counters: Counters,
+    /// The time at which expiry was first checked in the present turn of writing.
+    pub(super) checked_at: Option<Time>,
 }
 
 impl<S: Socket> WriterState<S> {
@@ -65,6 +67,7 @@ impl<S: Socket> WriterState<S> {
             early_outcomes: Vec::new(),
             bursts: BurstDetector::new(),
             counters: Counters::default(),
+            checked_at: None,
         }
     }
 
@@ -109,15 +112,17 @@ impl<S: Socket> WriterState<S> {
             Some(_) => message.header.flags.with(Flags::CONFIRM),
             None => message.header.flags.without(Flags::CONFIRM),
         };
-        if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
+        let held = self.unsent.held_key(&message.header);
+        // The check runs in any case, because messages that arrive while others are queued count, too.
+        let is_burst = held.is_none() && self.connection.gathers() && self.bursts.is_burst(&message);
+        // A message of a burst is queued. It is checked when it is taken out, mostly within microseconds.
+        if !is_burst && message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
             self.expired(message, deferred);
             return Ok(Step::Done);
         }
-        if let Some(key) = self.unsent.held_key(&message.header) {
+        if let Some(key) = held {
             return self.hold(key, message).map(|()| Step::Done);
         }
-        // The check runs in any case, because messages that arrive while others are queued count, too.
-        let is_burst = self.connection.gathers() && self.bursts.is_burst(&message);
         let is_left = is_for_drainer(&message);
         if self.waiting() > 0 || !self.takes_new() || is_burst || is_left {
             let is_delayable = is_delayable(&message);
