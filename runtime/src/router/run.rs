@@ -160,7 +160,7 @@ mod tests {
     fn each_message_of_a_run_is_judged_and_observed() {
         let router = Router::new(NODE);
         let (mailbox, watcher) = (register(&router, 8), Arc::new(Watcher::default()));
-        router.set_guard(Some(watcher.clone()));
+        router.set_guard(watcher.clone());
         router.set_tap(TapOf::Watches, Some(watcher.clone()));
         let (mut run, mut refused) = (run(0..4), Vec::new());
         while let Err(rejected) = router.offer_run(APP, &mut run) {
