@@ -60,6 +60,16 @@ pub(super) struct Collected {
     conversion: Cell<Option<Conversion>>,
     /// Messages for one application that are not handed over yet.
     run: RefCell<Run>,
+    /// Whether more was read with the present frame.
+    behind: Cell<Behind>,
+}
+
+/// Whether bytes were read behind a frame, together with it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) enum Behind {
+    #[default]
+    Nothing,
+    More,
 }
 
 /// A conversion of the peer's times, for messages that are received at this time. `None` if the peer's clock is not
@@ -111,8 +121,9 @@ impl Inbound {
     ///
     /// # Errors
     /// The peer violates the protocol: the frame does not have the next number, or is an invalid acknowledgement.
-    pub(super) fn receive(&self, now: Time, message: Message) -> Result<(), RefusalError> {
+    pub(super) fn receive(&self, now: Time, message: Message, behind: Behind) -> Result<(), RefusalError> {
         let Some(session) = self.peer.session(self.lane) else { return Ok(()) };
+        self.collected.behind.set(behind);
         if let Some(channel) = self.peer.channel() {
             channel.on_frame(now);
         }
@@ -192,12 +203,12 @@ impl Inbound {
     ) {
         self.spin.on_message(now);
         self.collected.conversion.set(None);
+        // No batch ends after a datagram, so that nothing is collected.
+        self.collected.behind.set(Behind::Nothing);
         match self.process(now, message, session, Admission::Deliver) {
             Some(disposition) => guard.finish(disposition),
             None => guard.release(),
         }
-        // No batch ends after a datagram.
-        self.hand_over(session);
     }
 
     /// Sends an ACK, if received messages are not acknowledged yet.
@@ -269,10 +280,11 @@ impl Inbound {
                 self.hand_over(session);
                 self.enqueue(session, queue, message)
             }
-            (_, Some(queue)) => {
+            (_, Some(queue)) if self.must_collect() => {
                 self.collect(session, queue, message);
                 None
             }
+            (_, Some(queue)) => self.offer(session, queue, message),
             (_, None) => {
                 self.hand_over(session);
                 Some(self.deliver(message))
@@ -291,6 +303,21 @@ impl Inbound {
             Ok(()) => Disposition::Forwarded,
             // The router counts and settles a message that has no receiver.
             Err(_) => Disposition::Refused,
+        }
+    }
+
+    /// Offers a message that arrived alone.
+    fn offer(&self, session: &PeerSession, queue: u64, message: Message) -> Option<Disposition> {
+        if self.state.store.has_earlier_messages(&self.peer, queue) {
+            return self.enqueue(session, queue, message);
+        }
+        match self.state.ctx.router.offer(message, None) {
+            Ok(()) => Some(Disposition::Forwarded),
+            Err(Refused { message, why: Rejection::QueueFull }) => self.enqueue(session, queue, message),
+            Err(refused) => {
+                self.state.ctx.router.refuse_arrived(refused);
+                Some(Disposition::Refused)
+            }
         }
     }
 

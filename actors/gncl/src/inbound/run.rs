@@ -6,7 +6,7 @@ use std::{collections::VecDeque, thread};
 use sinew_runtime::{outcome::Rejection, router::Refused, wire::Message};
 use sinew_session::outlet::destination_of;
 
-use super::Inbound;
+use super::{Behind, Inbound};
 use crate::{peer_session::PeerSession, receive_counters::Disposition};
 
 /// Maximum number of messages that are handed over together. More would hardly cost less each, and an application that
@@ -23,6 +23,11 @@ pub(super) struct Run {
 }
 
 impl Inbound {
+    /// Whether a message is [collected](Self::collect): not one that arrived alone, which goes its way at once.
+    pub(super) fn must_collect(&self) -> bool {
+        self.collected.behind.get() == Behind::More || !self.collected.run.borrow().messages.is_empty()
+    }
+
     /// Keeps a message until it is [handed over](Self::hand_over) with others for the same application.
     pub(super) fn collect(&self, session: &PeerSession, queue: u64, message: Message) {
         let must_go = {

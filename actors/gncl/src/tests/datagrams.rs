@@ -20,7 +20,7 @@ use super::{
 use crate::{
     core::{Introduction, Lane, write},
     datagrams::Announcement,
-    inbound::{Collected, Inbound},
+    inbound::{Behind, Collected, Inbound},
     peer::frame,
 };
 
@@ -359,7 +359,8 @@ fn datagram_state_of_a_former_connection_is_ignored() {
             let (spin, checksum, collected) = (Arc::default(), Checksum::Crc, Collected::default());
             let inbound = Inbound { state, peer, spin, lane, link, checksum, collected };
             let said = Announcement { port: 1, key: KEY, address: 0 };
-            inbound.receive(Time::now(), frame(NINE, node.address(), Kind::GNCL_DATAGRAMS, write(&said)))
+            let said = frame(NINE, node.address(), Kind::GNCL_DATAGRAMS, write(&said));
+            inbound.receive(Time::now(), said, Behind::Nothing)
         };
         assert_eq!(say_on(Lane::Stream, LinkNumber::default()), Ok(()));
         assert!(peer.channel().expect("both can").is_open(), "nothing goes elsewhere");

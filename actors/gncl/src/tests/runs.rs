@@ -23,7 +23,7 @@ use sinew_session::{Ack, outlet::LinkNumber};
 use super::bench::{ByHand, NINE, Node, next, run, within};
 use crate::{
     core::Lane,
-    inbound::{Collected, Inbound},
+    inbound::{Behind, Collected, Inbound},
 };
 
 /// Returns a node, its handwritten peer, and a connection of that peer from which messages are accepted from now on.
@@ -41,12 +41,12 @@ async fn receiving() -> (Node, ByHand, Inbound) {
     (node, by_hand, Inbound { state, peer, spin, lane, link, checksum, collected })
 }
 
-/// Receives a message with this number for an application.
+/// Receives a message with this number for an application, with others behind it.
 fn receive(node: &Node, inbound: &Inbound, app: u32, number: u16) {
     let mut message = node.message(node.tid(app), &number.to_le_bytes());
     message.header.source.node = NINE;
     message.header.number = number;
-    inbound.receive(message.header.sent, message).expect("it has the next number");
+    inbound.receive(message.header.sent, message, Behind::More).expect("it has the next number");
 }
 
 /// Passes on the numbers of its messages, and panics once, at this one.
