@@ -1,5 +1,6 @@
-//! Messages of one batch for one application: they are handed over together, in their order, with one look at the
-//! routing table, one lock of the mailbox and one of the session's counters.
+//! Messages of one batch for one application, which are handed over together, in their order.
+//!
+//! They share one look at the routing table, one lock of the mailbox and one of the session's counters.
 
 use std::{collections::VecDeque, thread};
 
@@ -9,7 +10,7 @@ use sinew_session::outlet::destination_of;
 use super::{Behind, Inbound};
 use crate::{peer_session::PeerSession, receive_counters::Disposition};
 
-/// Maximum number of messages that are handed over together. More would hardly cost less each, and an application that
+/// Maximum number of messages that are handed over together. With more, each would hardly cost less. An application that
 /// runs on another CPU would get its first one later.
 const RUN_MAX: usize = 32;
 

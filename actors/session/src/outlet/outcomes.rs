@@ -12,7 +12,7 @@
 //! The nodes are those of the link, so a peer cannot report the outcome of a message to another node.
 //!
 //! In the queue a range of outcomes is one message: equal ones of messages with consecutive correlations from one
-//! application to another, as a flood has them. So most of its outcomes cost two comparisons each, and no message.
+//! application to another. In a flood nearly all outcomes are added to such a range, and are no messages of their own.
 
 use sinew_runtime::{
     outcome::{Outcome, Ticket},
@@ -77,9 +77,10 @@ pub(super) fn frame_max(payload_max: usize) -> usize {
     OUTCOMES_MAX.min(payload_max / EACH)
 }
 
-/// Adds the outcome of the message of `ticket` to a queued message, if that is an outcome of the messages right before it,
-/// of fewer than `max`: same source, destination and outcome, and the next correlation. Their number is the sequence
-/// of the message, which an OUTCOME on a connection does not use. Returns whether it was added.
+/// Adds the outcome of the message of `ticket` to a queued message, and returns whether it did. The queued message must
+/// be the same outcome of fewer than `max` messages, with the same ends, and `ticket` must have the next correlation.
+///
+/// The sequence of the queued message is the number of added ones. An OUTCOME on a connection does not use it.
 pub(super) fn extend(queued: &mut Message, ticket: Ticket, outcome: Outcome, max: usize) -> bool {
     let Header { kind, source, destination, correlation, sequence, .. } = queued.header;
     let continues = kind == Kind::OUTCOME
