@@ -115,8 +115,11 @@ impl<S: Socket> WriterState<S> {
         let held = self.unsent.held_key(&message.header);
         // The check runs in any case, because messages that arrive while others are queued count, too.
         let is_burst = held.is_none() && self.connection.gathers() && self.bursts.is_burst(&message);
-        // A message of a burst is queued. It is checked when it is taken out, mostly within microseconds.
-        if !is_burst && message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
+        // A message of a burst is queued. It is checked when it is taken out, mostly within microseconds. A value is
+        // checked here, because an expired one must not take the place of an older one that has not expired.
+        let is_checked_later = is_burst && message.header.class != Class::Stream;
+        if !is_checked_later && message.header.time_to_live_us != 0 && message.header.is_expired(Time::now())
+        {
             self.expired(message, deferred);
             return Ok(Step::Done);
         }

@@ -96,6 +96,24 @@ fn expired_message_of_a_burst_is_not_sent() {
 }
 
 #[test]
+fn expired_value_of_a_burst_supersedes_none() {
+    let burst = Burst::new(PLENTY);
+    burst.submit(0..8);
+    let value = |value, time_to_live_us| {
+        let mut message = message(Class::Stream, value);
+        (message.header.sent, message.header.time_to_live_us) =
+            (Time::from_nanos(1_000_000), time_to_live_us);
+        message
+    };
+    burst.outlet.submit(value(41, 0)).unwrap();
+    burst.outlet.submit(value(42, 1)).unwrap();
+    burst.drain();
+    let OutletCounts { sent, superseded, expired, .. } = burst.outlet.counts();
+    assert_eq!((sent, superseded, expired), (9, 0, 1));
+    assert!(burst.seen().contains(&41));
+}
+
+#[test]
 fn bursting_sender_writes_if_drainer_falls_behind() {
     let burst = Burst::new(PLENTY);
     burst.submit(0..132);
