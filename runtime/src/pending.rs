@@ -1,9 +1,12 @@
 //! The pending waits of an application: outcomes of its confirmed messages and replies to its requests.
 
 use std::{
-    collections::{HashMap, VecDeque},
+    collections::{HashMap, VecDeque, hash_map::Entry},
     hash::{BuildHasherDefault, Hasher},
-    sync::{Arc, Mutex},
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicBool, Ordering},
+    },
     task::{Context, Poll, Waker},
 };
 
@@ -137,7 +140,7 @@ impl Pending {
         let id = inner.next;
         inner.next += 1;
         inner.slots.insert(id, slot);
-        Some(Wait { pending: self.clone(), id })
+        Some(Wait { pending: self.clone(), id, is_over: AtomicBool::new(false) })
     }
 
     /// Consumes a message that answers a wait; returns any other.
@@ -228,6 +231,8 @@ impl ReceiptSink for Pending {
 pub struct Wait {
     pending: Arc<Pending>,
     id: u64,
+    /// Whether its slot was removed with its result. SYNC: Relaxed; the slots have a lock of their own.
+    is_over: AtomicBool,
 }
 
 impl Wait {
@@ -237,18 +242,25 @@ impl Wait {
         self.id
     }
 
-    /// Returns the result, or `Pending` after storing the waker.
+    /// Returns the result, or `Pending` after storing the waker. The result ends the wait, except one for the members
+    /// of a message to many.
     pub fn poll_settled(&self, cx: &Context<'_>) -> Poll<Settlement> {
         let mut inner = lock(&self.pending.inner);
-        let Some(slot) = inner.slots.get_mut(&self.id) else {
+        let Entry::Occupied(mut entry) = inner.slots.entry(self.id) else {
             // The slot exists as long as this wait; an earlier poll took it.
             return Poll::Ready(Settlement::Outcome(Outcome::Unknown));
         };
-        if let Some(settlement) = slot.settled.take() {
-            return Poll::Ready(settlement);
+        let slot = entry.get_mut();
+        let Some(settlement) = slot.settled.take() else {
+            slot.waker = Some(cx.waker().clone());
+            return Poll::Pending;
+        };
+        if slot.members.is_none() {
+            // Removed here, so that the drop need not look for it again.
+            entry.remove();
+            self.is_over.store(true, Ordering::Relaxed);
         }
-        slot.waker = Some(cx.waker().clone());
-        Poll::Pending
+        Poll::Ready(settlement)
     }
 
     /// Returns the outcome of each member, for a wait of this kind; `last` is the outcome of the message as a
@@ -270,7 +282,9 @@ impl Wait {
 
 impl Drop for Wait {
     fn drop(&mut self) {
-        lock(&self.pending.inner).slots.remove(&self.id);
+        if !*self.is_over.get_mut() {
+            lock(&self.pending.inner).slots.remove(&self.id);
+        }
     }
 }
 
@@ -300,6 +314,16 @@ impl<O: MessageSink> MessageSink for AppSink<O> {
 
     fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
         if is_answer(&message.header) { self.submit(message) } else { self.inbox.offer(message, room) }
+    }
+
+    fn offer_run(&self, run: &mut VecDeque<Message>) -> Result<(), SubmitError> {
+        if !run.iter().any(|message| is_answer(&message.header)) {
+            return self.inbox.offer_run(run);
+        }
+        while let Some(message) = run.pop_front() {
+            self.offer(message, None)?;
+        }
+        Ok(())
     }
 
     fn cancel(&self, ticket: Ticket) -> bool {
@@ -357,6 +381,20 @@ mod tests {
         assert!(pending.open(Awaited::Outcome, Tid::NONE).is_none());
         drop(wait);
         assert!(pending.open(Awaited::Outcome, Tid::NONE).is_some());
+    }
+
+    #[test]
+    fn read_result_ends_its_wait() {
+        let pending = Pending::new(1);
+        let wait = pending.open(Awaited::Outcome, Tid::NONE).unwrap();
+        pending.settle(ticket(&wait), Outcome::Delivered);
+        assert!(pending.open(Awaited::Outcome, Tid::NONE).is_none(), "it was not read");
+        assert!(matches!(poll(&wait), Poll::Ready(Settlement::Outcome(Outcome::Delivered))));
+        let next = pending.open(Awaited::Outcome, Tid::NONE).unwrap();
+        assert!(matches!(poll(&wait), Poll::Ready(Settlement::Outcome(Outcome::Unknown))), "it is over");
+        drop(wait);
+        assert!(poll(&next).is_pending(), "another one has its room, not its number");
+        assert!(pending.open(Awaited::Outcome, Tid::NONE).is_none());
     }
 
     #[test]

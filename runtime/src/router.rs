@@ -5,6 +5,7 @@ mod copies;
 mod each;
 mod groups;
 pub mod guard;
+mod run;
 mod sink;
 pub mod tap;
 #[cfg(test)]

@@ -1,15 +1,6 @@
 //! The receiving of datagrams, and the timer of all peers' channels. Both are tasks of the IO thread.
 
-use std::{
-    cell::{Cell, RefCell},
-    future::poll_fn,
-    io,
-    net::UdpSocket,
-    pin::pin,
-    sync::Arc,
-    task::Poll,
-    time::Duration,
-};
+use std::{future::poll_fn, io, net::UdpSocket, pin::pin, sync::Arc, task::Poll, time::Duration};
 
 use sinew_runtime::{time::Time, wakes, wire::Checksum};
 use sinew_session::outlet::LinkNumber;
@@ -18,7 +9,7 @@ use crate::{
     State,
     core::Lane,
     datagrams::{DATAGRAM_MAX, Prefix, read_value},
-    inbound::Inbound,
+    inbound::{Collected, Inbound},
     peer::Peer,
     shared_socket::SharedSocket,
     spin::Spin,
@@ -191,8 +182,7 @@ impl Reader {
             lane: Lane::Stream,
             link: LinkNumber::default(),
             checksum: Checksum::Crc,
-            outcomes: RefCell::default(),
-            conversion: Cell::default(),
+            collected: Collected::default(),
         }
     }
 

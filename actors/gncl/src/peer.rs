@@ -315,9 +315,7 @@ impl MessageSink for Peer {
 /// Sends the outcome of a message from this peer back to it. spec: GNCL-12
 impl ReceiptSink for Peer {
     fn settle(&self, ticket: Ticket, outcome: Outcome) {
-        let mut message = Message::outcome(ticket, outcome);
-        message.header.sent = Time::now();
-        self.session_for(message.header.class).send_outcome(message);
+        self.session_for(Class::Control).report_outcome(ticket, outcome);
     }
 
     /// Sends reports about members of this node back to it. spec: FRAME-7
@@ -325,7 +323,7 @@ impl ReceiptSink for Peer {
         let session = self.session_for(Class::Control);
         for mut frame in Message::members(ticket, reports, session.payload_max()) {
             frame.header.sent = Time::now();
-            session.send_outcome(frame);
+            session.send_reports(frame);
         }
     }
 }

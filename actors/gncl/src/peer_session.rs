@@ -11,7 +11,8 @@ use std::sync::{
 
 use bytes::Bytes;
 use sinew_runtime::{
-    outcome::Rejection,
+    outcome::{Outcome, Rejection, Ticket},
+    router::SubmitError,
     tid::NodeAddress,
     time::Time,
     wire::{HEADER_LEN, Kind, Message},
@@ -333,6 +334,11 @@ impl PeerSession {
         self.update_counters(|counters| counters.finish(disposition));
     }
 
+    /// Records the disposition of this number of messages in process, under one lock.
+    pub(super) fn finish_all(&self, disposition: Disposition, count: usize) {
+        self.update_counters(|counters| counters.finish_all(disposition, count as u64));
+    }
+
     /// Processes the peer's ACK.
     pub(super) fn on_ack(&self, link: LinkNumber, ack: &Ack, now: Time) {
         let counts = self.inbox().receiving.on_epoch(link.number(), ack.epoch);
@@ -423,11 +429,20 @@ impl PeerSession {
         self.parameters.peer_payload_max.min(self.longest - HEADER_LEN)
     }
 
-    /// Sends an outcome, or reports about members. More of these may wait than other messages, because a lost
+    /// Sends the outcome of a message of the peer. More of these may wait than other messages, because a lost
     /// one leaves its sender waiting. The peer has no more messages open than the announced room allows; if
     /// it has, further outcomes are counted and dropped.
-    pub(super) fn send_outcome(&self, message: Message) {
-        if let Err(refused) = self.outlet.submit_outcome(message, self.outcomes_max) {
+    pub(super) fn report_outcome(&self, ticket: Ticket, outcome: Outcome) {
+        self.count_unsent(self.outlet.report_outcome(ticket, outcome, self.outcomes_max));
+    }
+
+    /// Sends reports about members, with the same bound.
+    pub(super) fn send_reports(&self, reports: Message) {
+        self.count_unsent(self.outlet.submit_outcome(reports, self.outcomes_max));
+    }
+
+    fn count_unsent(&self, submitted: Result<(), SubmitError>) {
+        if let Err(refused) = submitted {
             let kind = refused.message.header.kind;
             let detail = format!("a frame of kind {kind} for node {}: {}", self.parameters.node, refused.why);
             self.notifiers.refusals.count(Time::now(), "own frame not sent", &detail);

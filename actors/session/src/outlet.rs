@@ -272,11 +272,36 @@ impl<S: Socket> SocketWriter<S> {
     /// # Errors
     /// Returns the frame if too many are queued, or if there will be no further connection.
     pub fn submit_outcome(&self, message: Message, waiting_max: usize) -> Result<(), SubmitError> {
-        let step = self.with(|state, deferred| {
-            let is_waived = state.unsent.queue.outcomes() < waiting_max;
-            state.submit(message, if is_waived { Bound::Waived } else { Bound::Kept }, deferred)
-        })?;
-        if step == Step::More {
+        self.report(|state, deferred| state.submit_outcome(message, waiting_max, deferred))
+    }
+
+    /// Reports the outcome of the peer's message of `ticket`. Same as [`submit_outcome`](Self::submit_outcome) of an
+    /// outcome sent now. An outcome that continues the last one of the queue is added to that: no message is made for it,
+    /// and no clock is read.
+    ///
+    /// # Errors
+    /// Those of `submit_outcome`.
+    pub fn report_outcome(
+        &self,
+        ticket: Ticket,
+        outcome: Outcome,
+        waiting_max: usize,
+    ) -> Result<(), SubmitError> {
+        self.report(|state, deferred| {
+            if state.extend_outcome(ticket, outcome, deferred) {
+                return Ok(Step::Done);
+            }
+            let mut message = Message::outcome(ticket, outcome);
+            message.header.sent = Time::now();
+            state.submit_outcome(message, waiting_max, deferred)
+        })
+    }
+
+    fn report(
+        &self,
+        submit: impl FnOnce(&mut WriterState<S>, &mut DeferredActions) -> Result<Step, SubmitError>,
+    ) -> Result<(), SubmitError> {
+        if self.with(submit)? == Step::More {
             self.with(WriterState::hand_to_drainer);
         }
         Ok(())

@@ -252,6 +252,11 @@ impl ClassQueue {
         Some(next)
     }
 
+    /// Returns the last queued message of a class, to add something to it. Its class, times and length stay.
+    pub fn last_mut(&mut self, class: Class) -> Option<&mut Message> {
+        self.lanes[class as usize].back_mut()
+    }
+
     /// Accounts for a message that enters the lane of its class.
     fn enters_lane(&mut self, message: &Message) {
         self.bytes[message.header.class as usize] += message.payload.len();

@@ -7,6 +7,7 @@ use futures_util::task::noop_waker;
 
 use super::*;
 use crate::{
+    router::MessageSink as _,
     tid::Tid,
     wire::{Header, Kind},
 };

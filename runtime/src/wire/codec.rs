@@ -131,14 +131,15 @@ impl Decoder for FrameCodec {
 
     fn decode(&mut self, source: &mut BytesMut) -> Result<Option<Message>, FrameError> {
         let Some(start) = source.first_chunk::<8>() else { return Ok(None) };
-        let length = Header::payload_len(start)? as usize;
+        let declared = Header::payload_len(start)?;
+        let length = declared as usize;
         if length > self.payload_max {
             return Err(FrameError::TooLong { length, limit: self.payload_max });
         }
         self.watch(source);
         if self.checksum == Checksum::Guarded {
             match source.first_chunk::<HEADER_LEN>() {
-                Some(head) => Header::check_guard(head)?,
+                Some(head) => Header::check_guard_of(head, declared)?,
                 None => {
                     // The length is not trusted yet.
                     self.make_room(source, HEADER_LEN);

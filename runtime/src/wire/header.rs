@@ -270,7 +270,12 @@ impl Header {
     /// # Errors
     /// The bytes were corrupted, or are not the start of a frame.
     pub fn check_guard(bytes: &[u8; HEADER_LEN]) -> Result<(), HeaderError> {
-        let length = Self::payload_len(&field(bytes, 0))?;
+        Self::check_guard_of(bytes, Self::payload_len(&field(bytes, 0))?)
+    }
+
+    /// Same as [`check_guard`](Self::check_guard), for a length that was read from these bytes.
+    #[inline]
+    pub(super) fn check_guard_of(bytes: &[u8; HEADER_LEN], length: u32) -> Result<(), HeaderError> {
         if field::<2>(bytes, GUARD_AT) == guard_of(length) { Ok(()) } else { Err(HeaderError::Guard) }
     }
 
@@ -315,7 +320,7 @@ impl Header {
         if u32::from_le_bytes(field(bytes, 60)) != checksum(bytes, payload) {
             return Err(HeaderError::Checksum);
         }
-        Self::decode_in_memory(bytes)
+        Self::decode_fields(bytes)
     }
 
     /// Reads a header that [`encode_in_memory`](Self::encode_in_memory) wrote. The caller must check its length.
@@ -325,6 +330,12 @@ impl Header {
     #[inline]
     pub fn decode_in_memory(bytes: &[u8; HEADER_LEN]) -> Result<Self, HeaderError> {
         Self::payload_len(&field(bytes, 0))?;
+        Self::decode_fields(bytes)
+    }
+
+    /// Reads all fields but the length, which the caller has read.
+    #[inline]
+    fn decode_fields(bytes: &[u8; HEADER_LEN]) -> Result<Self, HeaderError> {
         if bytes[13] & !Flags::KNOWN != 0 {
             return Err(HeaderError::Reserved);
         }

@@ -61,6 +61,12 @@ impl Counters {
         self.own -= count;
     }
 
+    /// Counts a frame of the layers as two from now on.
+    pub(super) const fn split(&mut self) {
+        self.taken += 1;
+        self.own += 1;
+    }
+
     /// Counts numbered messages that are lost, and that may have arrived.
     pub(super) const fn lose_numbered(&mut self, count: u64) {
         self.counts.lost += count;

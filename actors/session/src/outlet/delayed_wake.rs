@@ -16,6 +16,11 @@ use tokio::{io::unix::AsyncFd, runtime::Handle};
 /// half of it, and so does a write of 32 KiB.
 const WAKE_DELAY_NS: i64 = 50_000;
 
+thread_local! {
+    /// The calling thread: the standard library counts a reference for each question.
+    static THREAD: ThreadId = thread::current().id();
+}
+
 /// The delayed wake of a connection's drain task.
 #[derive(Debug, Default)]
 pub(super) struct DelayedWake {
@@ -59,11 +64,11 @@ impl DelayedWake {
 
 impl Timer {
     fn new() -> io::Result<Self> {
-        Ok(Self { timer: kernel_timer()?, is_set: false, drainer: thread::current().id() })
+        Ok(Self { timer: kernel_timer()?, is_set: false, drainer: THREAD.with(|thread| *thread) })
     }
 
     fn wake_later(&mut self) -> bool {
-        if thread::current().id() == self.drainer {
+        if THREAD.with(|thread| *thread == self.drainer) {
             return false;
         }
         if !self.is_set {

@@ -5,13 +5,16 @@ use std::{
     task::{Context, Poll},
 };
 
-use sinew_runtime::{time::Time, wire::HEADER_LEN};
+use sinew_runtime::{
+    time::Time,
+    wire::{HEADER_LEN, Kind, Message},
+};
 
 use super::{
     LinkNumber, Socket,
     batch::SHORT,
     deferred::DeferredActions,
-    outcomes::with_outcomes_behind,
+    outcomes::{self, with_outcomes_behind},
     outstanding::confirming_destination,
     partial::{Partial, Written},
     writer_state::{Step, WriterState},
@@ -46,6 +49,7 @@ impl<S: Socket> WriterState<S> {
         deferred: &mut DeferredActions,
     ) -> Poll<Drained> {
         self.connection.poll_delayed_wake(cx);
+        self.checked_at = None;
         let mut bytes = 0;
         for _ in 0..WRITES_PER_WAKE {
             if let Some(end) = self.connection.end_of(link) {
@@ -75,6 +79,7 @@ impl<S: Socket> WriterState<S> {
         if !self.connection.gathers() || self.connection.is_within_frame() || !self.has_much() {
             return;
         }
+        self.checked_at = None;
         let mut bytes = 0;
         for _ in 0..HELP_AT {
             if bytes >= BYTES_PER_WAKE || !self.has_frame() {
@@ -89,7 +94,8 @@ impl<S: Socket> WriterState<S> {
     /// Whether the number of queued messages is so high that the sender should write them itself.
     fn has_much(&self) -> bool {
         let queue = &self.unsent.queue;
-        let messages = queue.len();
+        // Outcomes that were added to others count, too: as many messages are about to wait for them.
+        let messages = queue.len().max(queue.outcomes());
         let bytes = messages * HEADER_LEN + queue.bytes();
         if bytes <= messages * SHORT {
             bytes >= HELP_AT_BYTES || messages >= HELP_AT
@@ -145,6 +151,7 @@ impl<S: Socket> WriterState<S> {
 
     /// Writes the next frame, or its next piece. Returns how many bytes the socket has accepted.
     pub(super) fn write_next(&mut self, deferred: &mut DeferredActions) -> usize {
+        self.checked_at = None;
         self.next_frame(deferred).map_or(0, |frame| self.write_frame(frame))
     }
 
@@ -178,15 +185,31 @@ impl<S: Socket> WriterState<S> {
         }
         let message = self.unsent.pop()?;
         deferred.room.extend(self.unsent.queue.room_made());
-        if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
+        // One look at the clock serves all frames of a turn. The receiver checks the time to live again.
+        if message.header.time_to_live_us != 0
+            && message.header.is_expired(*self.checked_at.get_or_insert_with(Time::now))
+        {
             self.receipts.remove_waiting(confirming_destination(&message));
             self.expired(message, deferred);
             return None;
         }
+        Some(if message.header.kind == Kind::OUTCOME {
+            self.outcome_frame(message)
+        } else {
+            self.frame(message)
+        })
+    }
+
+    /// Encodes an outcome, and those behind it, as a frame.
+    fn outcome_frame(&mut self, first: Message) -> Partial {
+        if outcomes::count(&first) > 1 && self.connection.gathers() {
+            // An outcome that is added to another is not recorded as part of the burst, which saves a look at the clock.
+            self.bursts.written(Time::now());
+        }
         let link = self.numbering.outcomes_header();
         let message =
-            with_outcomes_behind(message, link, self.payload_max, &mut self.unsent.queue, &mut self.counters);
-        Some(self.frame(message))
+            with_outcomes_behind(first, link, self.payload_max, &mut self.unsent.queue, &mut self.counters);
+        self.frame(message)
     }
 
     /// Writes the next piece of the started frame.

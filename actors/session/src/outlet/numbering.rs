@@ -96,6 +96,12 @@ impl Numbering {
         self.0.as_ref().map_or(0, |session| session.sending.epoch())
     }
 
+    /// Whether the peer accepts several outcomes in one frame.
+    #[inline]
+    pub(super) fn combines_outcomes(&self) -> bool {
+        self.0.as_ref().is_some_and(|session| session.outcomes.is_some())
+    }
+
     /// Returns the header of a frame with several outcomes, if the peer supports it.
     #[inline]
     pub(super) fn outcomes_header(&self) -> Option<Header> {

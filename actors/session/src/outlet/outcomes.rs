@@ -10,6 +10,9 @@
 //! ```
 //!
 //! The nodes are those of the link, so a peer cannot report the outcome of a message to another node.
+//!
+//! In the queue a range of outcomes is one message: equal ones of messages with consecutive correlations from one
+//! application to another. In a flood nearly all outcomes are added to such a range, and are no messages of their own.
 
 use sinew_runtime::{
     outcome::{Outcome, Ticket},
@@ -64,13 +67,55 @@ fn read_one(bytes: &[u8; EACH]) -> ReportedOutcome {
     }
 }
 
-/// Appends the content of an OUTCOME message to `payload`.
+/// Returns the number of outcomes of a queued OUTCOME message: its own, and those that were [added](extend).
+pub(super) fn count(queued: &Message) -> usize {
+    1 + queued.header.sequence as usize
+}
+
+/// Returns the maximum number of outcomes in a frame with a payload of at most `payload_max` bytes.
+pub(super) fn frame_max(payload_max: usize) -> usize {
+    OUTCOMES_MAX.min(payload_max / EACH)
+}
+
+/// Adds the outcome of the message of `ticket` to a queued message, and returns whether it did. The queued message must
+/// be the same outcome of fewer than `max` messages, with the same ends, and `ticket` must have the next correlation.
+///
+/// The sequence of the queued message is the number of added ones. An OUTCOME on a connection does not use it.
+pub(super) fn extend(queued: &mut Message, ticket: Ticket, outcome: Outcome, max: usize) -> bool {
+    let Header { kind, source, destination, correlation, sequence, .. } = queued.header;
+    let continues = kind == Kind::OUTCOME
+        && correlation.checked_add(sequence + 1) == Some(ticket.correlation)
+        && (source, destination) == (ticket.destination, ticket.source)
+        && queued.payload[..] == [outcome.code()]
+        && count(queued) < max;
+    queued.header.sequence += u64::from(continues);
+    continues
+}
+
+/// Leaves at most `most` outcomes in a message, and puts the others back into the queue.
+fn shorten(message: &mut Message, most: usize, queue: &mut SendQueue, counters: &mut Counters) {
+    let more = count(message).saturating_sub(most) as u64;
+    if more == 0 {
+        return;
+    }
+    let mut rest = Message::new(message.header, message.payload.clone());
+    message.header.sequence -= more;
+    rest.header.correlation += message.header.sequence + 1;
+    rest.header.sequence = more - 1;
+    // An outcome is of class Control, so that it is not returned.
+    let _ = queue.put_back(rest);
+    counters.split();
+}
+
+/// Appends the outcomes of a queued OUTCOME message to `payload`.
 fn write(outcome: &Message, payload: &mut Vec<u8>) {
-    let Header { source, destination, correlation, .. } = outcome.header;
-    payload.extend_from_slice(&source.app.bits().to_le_bytes());
-    payload.extend_from_slice(&destination.app.bits().to_le_bytes());
-    payload.extend_from_slice(&correlation.to_le_bytes());
-    payload.extend_from_slice(&outcome.payload);
+    let Header { source, destination, correlation, sequence, .. } = outcome.header;
+    for correlation in correlation..=correlation + sequence {
+        payload.extend_from_slice(&source.app.bits().to_le_bytes());
+        payload.extend_from_slice(&destination.app.bits().to_le_bytes());
+        payload.extend_from_slice(&correlation.to_le_bytes());
+        payload.extend_from_slice(&outcome.payload);
+    }
 }
 
 /// Returns the number of submitted messages that this frame contains.
@@ -89,30 +134,37 @@ fn is_of(outcome: &Message, link: &Header) -> bool {
 
 /// Combines a queued outcome with the outcomes right behind it, if `link` is the header of such a frame.
 pub(super) fn with_outcomes_behind(
-    first: Message,
+    mut first: Message,
     link: Option<Header>,
     payload_max: usize,
     queue: &mut SendQueue,
     counters: &mut Counters,
 ) -> Message {
-    let Some(link) = link else { return first };
-    let max = OUTCOMES_MAX.min(payload_max / EACH);
-    if max < 2 || !is_of(&first, &link) {
+    let max = frame_max(payload_max);
+    let Some(link) = link.filter(|link| max > 1 && is_of(&first, link)) else {
+        shorten(&mut first, 1, queue, counters);
+        return first;
+    };
+    shorten(&mut first, max, queue, counters);
+    let (mut room, waiting) = (max - count(&first), count(&first) + queue.outcomes());
+    let mut next = |room: usize| {
+        let fits = |next: &Message| is_of(next, &link) && count(next) <= room;
+        if room > 0 { queue.pop_if(Class::Control, fits) } else { None }
+    };
+    let mut second = next(room);
+    if second.is_none() && count(&first) == 1 {
         return first;
     }
-    let Some(second) = queue.pop_if(Class::Control, |next| is_of(next, &link)) else { return first };
-    let mut payload = Vec::with_capacity(EACH * max.min(2 + queue.len()));
+    let mut payload = Vec::with_capacity(EACH * max.min(waiting));
     write(&first, &mut payload);
-    write(&second, &mut payload);
-    while payload.len() < EACH * max
-        && let Some(next) = queue.pop_if(Class::Control, |next| is_of(next, &link))
-    {
-        write(&next, &mut payload);
+    while let Some(behind) = second {
+        room -= count(&behind);
+        write(&behind, &mut payload);
+        // From here on an audit counts them as one message, as the receiver does.
+        counters.combine(1);
+        second = next(room);
     }
-    let message = Message::new(Header { sent: first.header.sent, ..link }, payload.into());
-    // From here on an audit counts them as one message, as the receiver does.
-    counters.combine(messages_in(&message) - 1);
-    message
+    Message::new(Header { sent: first.header.sent, ..link }, payload.into())
 }
 
 #[cfg(test)]

@@ -128,7 +128,7 @@ impl Open {
     /// Settles the outcomes that were pending, and leaves the others in `outcomes`.
     pub(super) fn confirm_all(&self, outcomes: &mut Vec<(Ticket, Outcome)>, deferred: &mut DeferredActions) {
         if self.len() > 0 {
-            self.with(|all| outcomes.retain(|(ticket, outcome)| !all.confirm(*ticket, *outcome, deferred)));
+            self.with(|all| all.confirm_all(outcomes, deferred));
         }
     }
 
@@ -301,6 +301,51 @@ impl Outstanding {
         all.into_iter()
     }
 
+    /// Settles the messages whose outcomes were reported, and leaves the other outcomes. Those of a flood come in the
+    /// order of its messages: one look-up of the destination serves all that follow each other.
+    fn confirm_all(&mut self, outcomes: &mut Vec<(Ticket, Outcome)>, deferred: &mut DeferredActions) {
+        let (mut at, mut left) = (0, 0);
+        while let Some((ticket, outcome)) = outcomes.get(at).copied() {
+            let in_order = self.confirm_oldest(ticket.destination, &outcomes[at..], deferred);
+            at += in_order;
+            if in_order == 0 {
+                at += 1;
+                if !self.confirm(ticket, outcome, deferred) {
+                    outcomes[left] = (ticket, outcome);
+                    left += 1;
+                }
+            }
+        }
+        outcomes.truncate(left);
+    }
+
+    /// Settles the oldest sent messages of a destination for as long as the first outcomes are theirs, each the next.
+    /// Returns their number.
+    fn confirm_oldest(
+        &mut self,
+        destination: Tid,
+        outcomes: &[(Ticket, Outcome)],
+        deferred: &mut DeferredActions,
+    ) -> usize {
+        let Some(pending) = self.destinations.get_mut(&destination) else { return 0 };
+        let mut settled = 0;
+        for (ticket, outcome) in outcomes {
+            let Some(sent) = pending.sent.pop_front_if(|sent| sent.receipt.ticket() == *ticket) else {
+                break;
+            };
+            deferred.settle([(sent.receipt, *outcome)]);
+            settled += 1;
+        }
+        self.sent -= settled;
+        if pending.is_empty() && settled > 0 && self.destinations.len() > EMPTY_DESTINATIONS_MAX {
+            self.destinations.remove(&destination);
+        }
+        if settled > 0 {
+            self.wake_if_fewer_open(deferred);
+        }
+        settled
+    }
+
     /// Settles the message that `ticket` names. Returns whether it was pending.
     fn confirm(&mut self, ticket: Ticket, outcome: Outcome, deferred: &mut DeferredActions) -> bool {
         if let Some(receipt) = self.take(ticket) {
@@ -364,81 +409,4 @@ impl Outstanding {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::sync::{Arc, Mutex};
-
-    use proptest::prelude::*;
-    use sinew_runtime::{
-        outcome::ReceiptSink,
-        tid::{AppAddress, NodeAddress},
-    };
-
-    use super::*;
-
-    const GRACE: Duration = Duration::from_nanos(10);
-
-    /// A sink for outcomes that only records the tickets.
-    #[derive(Default)]
-    struct NullSink(Mutex<Vec<Ticket>>);
-
-    impl ReceiptSink for NullSink {
-        fn settle(&self, ticket: Ticket, _: Outcome) {
-            self.0.lock().unwrap().push(ticket);
-        }
-    }
-
-    fn tid(app: u32) -> Tid {
-        Tid::new(NodeAddress::new(2), AppAddress::new(0x1000 + app))
-    }
-
-    /// Messages numbered from 0, each to one of the destinations; `None` as expiry: never.
-    fn outstanding(sent: &[(u32, Option<u64>)]) -> Outstanding {
-        let shares = Shares { unconfirmed_max: usize::MAX / UNCONFIRMED_DESTINATIONS, outcome_room: None };
-        let (mut outstanding, sink) = (Outstanding::new(shares), Arc::new(NullSink::default()));
-        for (correlation, (to, expiry)) in (0..).zip(sent) {
-            let ticket = Ticket { source: tid(0), destination: tid(*to), correlation };
-            let expiry = expiry.map_or(Time::MAX, Time::from_nanos);
-            outstanding.add_waiting(Some(ticket.destination));
-            let sent = SentMessage { receipt: Receipt::new(sink.clone(), ticket), expiry, written: 0 };
-            assert!(outstanding.sent(sent).is_none(), "no outcome was reported");
-        }
-        outstanding
-    }
-
-    fn correlations(receipts: &[Receipt]) -> Vec<u64> {
-        receipts.iter().map(|receipt| receipt.ticket().correlation).collect()
-    }
-
-    proptest! {
-        #[test]
-        fn overdue_messages_are_removed_in_order(
-            sent in proptest::collection::vec((0..4_u32, proptest::option::of(0..100_u64)), 0..60),
-            now in 0..130_u64,
-        ) {
-            let mut outstanding = outstanding(&sent);
-            let is_over = |expiry: Option<u64>| expiry.is_some_and(|expiry| now > expiry + 10);
-            // By destination, and of each the oldest first.
-            let mut all: Vec<(u32, u64, bool)> =
-                (0..).zip(&sent).map(|(number, (to, expiry))| (*to, number, is_over(*expiry))).collect();
-            all.sort_unstable();
-            let those = |over: bool| all.iter().filter(|(.., is)| *is == over).map(|(_, number, _)| *number).collect::<Vec<_>>();
-            let overdue = outstanding.take_overdue(Time::from_nanos(now), GRACE);
-            prop_assert_eq!(correlations(&overdue), those(true));
-            prop_assert_eq!(outstanding.open(), those(false).len());
-            let left: Vec<Receipt> = outstanding.take_all().map(|sent| sent.receipt).collect();
-            prop_assert_eq!(correlations(&left), those(false));
-        }
-    }
-
-    #[test]
-    fn silent_destinations_leave_no_state() {
-        let sent: Vec<_> = (0..10_000).map(|to| (to, Some(1))).collect();
-        let mut outstanding = outstanding(&sent);
-        assert_eq!(outstanding.take_overdue(Time::MAX, GRACE).len(), sent.len());
-        assert!(
-            outstanding.destinations.len() <= EMPTY_DESTINATIONS_MAX,
-            "{} destinations",
-            outstanding.destinations.len()
-        );
-    }
-}
+mod tests;

@@ -5,13 +5,13 @@ use std::{ops::Deref, task::Waker};
 
 use sinew_runtime::{
     mailbox::ClassQueue,
-    outcome::Ticket,
+    outcome::{Outcome, Ticket},
     router::SubmitError,
     time::Time,
     wire::{Class, Kind, Message},
 };
 
-use super::unsent::backlog_key;
+use super::{outcomes, unsent::backlog_key};
 use crate::Window;
 
 /// An empty amount.
@@ -39,6 +39,15 @@ impl SendQueue {
     /// Returns the number of queued outcomes.
     pub(super) const fn outcomes(&self) -> usize {
         self.outcomes
+    }
+
+    /// Adds an outcome to the last queued message of Control, if [`extend`](outcomes::extend) does. Returns whether it
+    /// was added.
+    pub(super) fn extend_outcome(&mut self, ticket: Ticket, outcome: Outcome, max: usize) -> bool {
+        let last = self.queue.last_mut(Class::Control);
+        let is_added = last.is_some_and(|last| outcomes::extend(last, ticket, outcome, max));
+        self.outcomes += usize::from(is_added);
+        is_added
     }
 
     fn add(&mut self, Share { holdable: Window { messages, bytes }, outcomes }: Share) {
@@ -131,6 +140,9 @@ fn share_of(message: &Message) -> Share {
     let window = Window { messages: 1, bytes: message.payload.len() };
     Share {
         holdable: backlog_key(&message.header).map_or(NONE, |_| window),
-        outcomes: usize::from(matches!(message.header.kind, Kind::OUTCOME | Kind::MEMBERS)),
+        outcomes: match message.header.kind {
+            Kind::OUTCOME => outcomes::count(message),
+            kind => usize::from(kind == Kind::MEMBERS),
+        },
     }
 }

@@ -311,6 +311,28 @@ fn message_expired_before_submit_is_not_sent() {
     assert_eq!((bench.seen(), bench.outcome_log.take()), (vec![], vec![(1, Outcome::Expired)]));
 }
 
+#[test]
+fn each_turn_of_writing_checks_expiry_anew() {
+    // Given: a turn has looked at the clock.
+    let bench = Bench::new(0);
+    bench.submit(expiring(Class::Control, 1));
+    bench.make_room(PLENTY);
+    assert_eq!(bench.seen(), [1]);
+    // When: the time of a message ends while it waits.
+    bench.wire.room.store(0, Ordering::Relaxed);
+    let mut short = expiring(Class::Control, 2);
+    short.header.time_to_live_us = 20_000;
+    let expiry = short.header.expiry();
+    bench.submit(short);
+    while Time::now() <= expiry {
+        std::thread::yield_now();
+    }
+    bench.make_room(PLENTY);
+    // Then
+    assert_eq!(bench.seen(), [1]);
+    assert_eq!(bench.outlet.counts(), OutletCounts { sent: 1, expired: 1, ..OutletCounts::default() });
+}
+
 /// A receiver of an outcome that sends on the same outlet.
 struct ReentrantSink(Arc<SocketWriter<Arc<Wire>>>);
 

@@ -8,7 +8,7 @@ use sinew_runtime::{
     outcome::{Outcome, Receipt, Rejection, Ticket},
     router::SubmitError,
     time::Time,
-    wire::{Class, Flags, Message},
+    wire::{Class, Flags, Kind, Message},
 };
 
 use super::{
@@ -19,7 +19,7 @@ use super::{
     deferred::DeferredActions,
     link_frames::{LinkFrames, Pushed},
     numbering::{Numbering, Session},
-    outcomes::messages_in,
+    outcomes::{self, messages_in},
     outstanding::{Open, SentMessage, Shares, confirming_destination},
     partial::{FrameOrigin, Partial, Written},
     unsent::{Bound, Unsent},
@@ -49,6 +49,8 @@ pub(super) struct WriterState<S> {
     pub(super) early_outcomes: Vec<(Receipt, Outcome)>,
     pub(super) bursts: BurstDetector,
     pub(super) counters: Counters,
+    /// The time at which expiry was first checked in the present turn of writing.
+    pub(super) checked_at: Option<Time>,
 }
 
 impl<S: Socket> WriterState<S> {
@@ -65,6 +67,7 @@ impl<S: Socket> WriterState<S> {
             early_outcomes: Vec::new(),
             bursts: BurstDetector::new(),
             counters: Counters::default(),
+            checked_at: None,
         }
     }
 
@@ -80,6 +83,17 @@ impl<S: Socket> WriterState<S> {
         Ok(step)
     }
 
+    /// Submits an outcome: the bounds do not apply while fewer than `waiting_max` are queued.
+    pub(super) fn submit_outcome(
+        &mut self,
+        message: Message,
+        waiting_max: usize,
+        deferred: &mut DeferredActions,
+    ) -> Result<Step, SubmitError> {
+        let is_waived = self.unsent.queue.outcomes() < waiting_max;
+        self.submit(message, if is_waived { Bound::Waived } else { Bound::Kept }, deferred)
+    }
+
     fn take(
         &mut self,
         mut message: Message,
@@ -90,19 +104,28 @@ impl<S: Socket> WriterState<S> {
             self.counters.counts.refused += 1;
             return Err(SubmitError::new(message, why));
         }
+        if message.header.kind == Kind::OUTCOME {
+            // In the queue it is the number of further outcomes.
+            message.header.sequence = 0;
+        }
         message.header.flags = match message.receipt {
             Some(_) => message.header.flags.with(Flags::CONFIRM),
             None => message.header.flags.without(Flags::CONFIRM),
         };
-        if message.header.time_to_live_us != 0 && message.header.is_expired(Time::now()) {
+        let held = self.unsent.held_key(&message.header);
+        // The check runs in any case, because messages that arrive while others are queued count, too.
+        let is_burst = held.is_none() && self.connection.gathers() && self.bursts.is_burst(&message);
+        // A message of a burst is queued. It is checked when it is taken out, mostly within microseconds. A value is
+        // checked here, because an expired one must not take the place of an older one that has not expired.
+        let is_checked_later = is_burst && message.header.class != Class::Stream;
+        if !is_checked_later && message.header.time_to_live_us != 0 && message.header.is_expired(Time::now())
+        {
             self.expired(message, deferred);
             return Ok(Step::Done);
         }
-        if let Some(key) = self.unsent.held_key(&message.header) {
+        if let Some(key) = held {
             return self.hold(key, message).map(|()| Step::Done);
         }
-        // The check runs in any case, because messages that arrive while others are queued count, too.
-        let is_burst = self.connection.gathers() && self.bursts.is_burst(&message);
         let is_left = is_for_drainer(&message);
         if self.waiting() > 0 || !self.takes_new() || is_burst || is_left {
             let is_delayable = is_delayable(&message);
@@ -157,6 +180,23 @@ impl<S: Socket> WriterState<S> {
         } else {
             Ok(())
         }
+    }
+
+    /// Adds an outcome to the queued one of the message before, if the peer accepts both in one frame. Returns whether
+    /// it does. The drain task is awake or will be woken for that one.
+    pub(super) fn extend_outcome(
+        &mut self,
+        ticket: Ticket,
+        outcome: Outcome,
+        deferred: &mut DeferredActions,
+    ) -> bool {
+        let is_added = self.numbering.combines_outcomes()
+            && !self.link_frames.is_finishing()
+            && self.unsent.queue.extend_outcome(ticket, outcome, outcomes::frame_max(self.payload_max));
+        if is_added {
+            self.help(deferred);
+        }
+        is_added
     }
 
     fn hold(&mut self, key: u64, message: Message) -> Result<(), SubmitError> {

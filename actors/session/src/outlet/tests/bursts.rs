@@ -82,6 +82,38 @@ fn burst_is_batched_after_its_first_messages() {
 }
 
 #[test]
+fn expired_message_of_a_burst_is_not_sent() {
+    let burst = Burst::new(PLENTY);
+    burst.submit(0..8);
+    let mut late = message(Class::Bulk, 42);
+    (late.header.sent, late.header.time_to_live_us) = (Time::from_nanos(1_000_000), 1);
+    burst.outlet.submit(late).unwrap();
+    assert_eq!(burst.outlet.waiting(), 5, "it is checked when it is taken out");
+    burst.submit(8..12);
+    burst.drain();
+    assert_eq!(burst.seen(), (0..12).collect::<Vec<u8>>());
+    assert_eq!(burst.outlet.counts(), OutletCounts { sent: 12, expired: 1, ..OutletCounts::default() });
+}
+
+#[test]
+fn expired_value_of_a_burst_supersedes_none() {
+    let burst = Burst::new(PLENTY);
+    burst.submit(0..8);
+    let value = |value, time_to_live_us| {
+        let mut message = message(Class::Stream, value);
+        (message.header.sent, message.header.time_to_live_us) =
+            (Time::from_nanos(1_000_000), time_to_live_us);
+        message
+    };
+    burst.outlet.submit(value(41, 0)).unwrap();
+    burst.outlet.submit(value(42, 1)).unwrap();
+    burst.drain();
+    let OutletCounts { sent, superseded, expired, .. } = burst.outlet.counts();
+    assert_eq!((sent, superseded, expired), (9, 0, 1));
+    assert!(burst.seen().contains(&41));
+}
+
+#[test]
 fn bursting_sender_writes_if_drainer_falls_behind() {
     let burst = Burst::new(PLENTY);
     burst.submit(0..132);

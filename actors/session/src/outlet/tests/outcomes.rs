@@ -1,14 +1,20 @@
 //! Outcomes that wait for the socket: together in one frame if the peer supports it. spec: GNCL-17
 
+use proptest::prelude::*;
+
 use super::*;
 use crate::{Window, outlet::outcomes::read};
 
 const FAR: NodeAddress = NodeAddress::new(2);
 
-/// The outcome of the message with this correlation from a remote application to a local one.
+/// The message with this correlation from a remote application to a local one.
+fn ticket(correlation: u64) -> Ticket {
+    Ticket { source: Tid::new(FAR, AppAddress::new(0x1002)), destination: tid(1), correlation }
+}
+
+/// The outcome of that message.
 fn outcome(correlation: u64) -> Message {
-    let source = Tid::new(FAR, AppAddress::new(0x1002));
-    Message::outcome(Ticket { source, destination: tid(1), correlation }, Outcome::Delivered)
+    Message::outcome(ticket(correlation), Outcome::Delivered)
 }
 
 /// An outlet with a peer that supports several in one frame, or does not; its wire accepts nothing yet.
@@ -124,4 +130,148 @@ fn combined_outcomes_are_resent_unchanged() {
     receive_ack(&bench, 1);
     bench.drain();
     assert_eq!(seen(&bench), [(1, Kind::GNCL_OUTCOMES, vec![1, 2, 3]), (2, Kind::OUTCOME, vec![4])]);
+}
+
+fn report(bench: &Bench, ticket: Ticket, outcome: Outcome) {
+    bench.outlet.report_outcome(ticket, outcome, usize::MAX).unwrap();
+}
+
+#[test]
+fn outcomes_of_consecutive_messages_wait_as_one() {
+    let bench = bench(true, usize::MAX);
+    (1..=300).for_each(|correlation| report(&bench, ticket(correlation), Outcome::Delivered));
+    assert_eq!(bench.outlet.waiting(), 3);
+    bench.make_room(PLENTY);
+    let expected = [1..=128, 129..=256, 257..=300].map(Iterator::collect::<Vec<u64>>);
+    assert_eq!(seen(&bench).into_iter().map(|(_, _, of)| of).collect::<Vec<_>>(), expected);
+    receive_ack(&bench, 4);
+    let (account, _) = bench.outlet.account();
+    assert_eq!((account.taken, account.arrived, account.own), (3, 3, 3), "as the receiver counts them");
+}
+
+#[test]
+fn unsupporting_peer_gets_each_reported_outcome_alone() {
+    let bench = bench(false, usize::MAX);
+    (1..=3).for_each(|correlation| report(&bench, ticket(correlation), Outcome::Delivered));
+    assert_eq!(bench.outlet.waiting(), 3);
+    bench.make_room(PLENTY);
+    assert_eq!(seen(&bench), [1, 2, 3].map(|n| (n as u16, Kind::OUTCOME, vec![n])));
+}
+
+#[test]
+fn waiting_outcomes_are_divided_for_a_shorter_frame() {
+    for (payload_max, at_once) in [(17 * 3, 3), (17, 1)] {
+        let mut bench = bench(true, usize::MAX);
+        (1..=10).for_each(|correlation| report(&bench, ticket(correlation), Outcome::Delivered));
+        bench.outlet.disconnect(bench.link);
+        bench.wire = Arc::default();
+        bench.link = bench.outlet.connect(bench.wire.clone(), payload_max, None);
+        receive_ack(&bench, 1);
+        bench.make_room(PLENTY);
+        let all: Vec<u64> = (1..=10).collect();
+        let expected: Vec<_> = all.chunks(at_once).map(<[u64]>::to_vec).collect();
+        assert_eq!(seen(&bench).into_iter().map(|(_, _, of)| of).collect::<Vec<_>>(), expected);
+        let frames = expected.len() as u64;
+        receive_ack(&bench, frames + 1);
+        let (account, _) = bench.outlet.account();
+        assert_eq!((account.taken, account.arrived), (frames, frames), "as the receiver counts them");
+    }
+}
+
+#[test]
+fn ending_outlet_takes_no_further_outcome() {
+    let bench = bench(true, usize::MAX);
+    report(&bench, ticket(1), Outcome::Delivered);
+    bench.outlet.finish(message(Class::Control, 9));
+    let refused = bench.outlet.report_outcome(ticket(2), Outcome::Delivered, usize::MAX).unwrap_err();
+    assert_eq!(refused.why, Rejection::Closed);
+}
+
+/// A step of an outlet.
+#[derive(Clone, Copy, Debug)]
+enum Step {
+    /// The outcome of the next message to this application, after some that have none.
+    Report { app: u32, skips: u64, outcome: Outcome },
+    /// Another message of class Control.
+    Message,
+    /// The wire accepts this number of bytes more.
+    Write(usize),
+}
+
+fn steps() -> impl Strategy<Value = Vec<Step>> {
+    let app = prop_oneof![19 => Just(1_u32), 1 => Just(2)];
+    let skips = prop_oneof![19 => Just(0_u64), 1 => Just(1)];
+    let outcome = prop_oneof![19 => Just(Outcome::Delivered), 1 => Just(Outcome::Failed)];
+    let report = (app, skips, outcome).prop_map(|(app, skips, outcome)| Step::Report { app, skips, outcome });
+    let step = prop_oneof![40 => report, 1 => Just(Step::Message), 1 => (0..700_usize).prop_map(Step::Write)];
+    proptest::collection::vec(step, 0..500)
+}
+
+/// Returns all outcomes on the wire: the application, the correlation and the byte of each; 0 for another message. Tells
+/// the outlet that all of them have arrived.
+fn arrived(bench: &Bench) -> Vec<(u32, u64, u8)> {
+    let mut arrived = Vec::new();
+    let frames = frames(&bench.wire.bytes.lock().unwrap());
+    for frame in &frames {
+        let header = &frame.header;
+        match header.kind {
+            Kind::GNCL_OUTCOMES => {
+                let all = read(&frame.payload).expect("whole outcomes");
+                arrived.extend(all.map(|one| {
+                    let code = one.outcome.expect("a known outcome").code();
+                    (one.destination.bits(), one.correlation, code)
+                }));
+            }
+            Kind::OUTCOME => {
+                assert_eq!((header.sequence, frame.payload.len()), (0, 1), "the form on a connection");
+                arrived.push((header.source.app.bits(), header.correlation, frame.payload[0]));
+            }
+            _ => arrived.push((0, 0, 0)),
+        }
+    }
+    receive_ack(bench, frames.len() as u64 + 1);
+    arrived
+}
+
+proptest! {
+    #[test]
+    fn each_outcome_arrives_once_in_its_place(
+        steps in steps(),
+        payload_max in prop_oneof![Just(usize::MAX), Just(17 * 5 + 1), Just(17 * 2), Just(17)],
+    ) {
+        let (bench, mut expected, mut correlations) = (bench(true, payload_max), Vec::new(), [0; 2]);
+        for step in steps {
+            match step {
+                Step::Report { app, skips, outcome } => {
+                    let correlation = &mut correlations[app as usize - 1];
+                    *correlation += 1 + skips;
+                    let ticket = Ticket { destination: tid(app), ..ticket(*correlation) };
+                    report(&bench, ticket, outcome);
+                    expected.push((tid(app).app.bits(), *correlation, outcome.code()));
+                }
+                Step::Message => {
+                    bench.outlet.submit_beyond(message(Class::Control, 7)).unwrap();
+                    expected.push((0, 0, 0));
+                }
+                Step::Write(room) => {
+                    bench.make_room(room);
+                    arrived(&bench);
+                }
+            }
+        }
+        for _ in 0..=windows(expected.len()) {
+            bench.make_room(PLENTY);
+            arrived(&bench);
+        }
+        prop_assert_eq!(arrived(&bench), expected);
+        let frames = frames(&bench.wire.bytes.lock().unwrap()).len() as u64;
+        let (account, _) = bench.outlet.account();
+        prop_assert_eq!((account.taken, account.arrived, account.waiting), (frames, frames, 0));
+        prop_assert_eq!(bench.outlet.lock().unsent.queue.outcomes(), 0);
+    }
+}
+
+/// Returns how often a window of 64 messages is needed for this number of frames.
+const fn windows(frames: usize) -> usize {
+    frames / 64 + 1
 }
