@@ -10,6 +10,7 @@ mod faults;
 mod file;
 mod interfaces;
 mod log_level;
+mod record;
 mod seeds;
 #[cfg(test)]
 mod tests;
@@ -35,7 +36,8 @@ use sinew_runtime::{
 };
 
 pub use self::{
-    app_settings::AppSettings, log_level::LogLevel, time_policy::TimePolicy, watch_group::WatchGroup,
+    app_settings::AppSettings, log_level::LogLevel, record::RecordConfig, time_policy::TimePolicy,
+    watch_group::WatchGroup,
 };
 
 /// All settings of a node.
@@ -102,41 +104,6 @@ pub struct LogConfig {
     /// it. The nodes of one process share a log: the last one to start sets its level. Default
     /// [`LogLevel::Info`].
     pub level: LogLevel,
-}
-
-/// The recording that a node makes from its start: the newest messages in a file that outlives the node's process.
-/// Programs of the node's user can record without it, too.
-///
-/// # Examples
-///
-/// ```
-/// use sinew::NodeConfig;
-///
-/// let mut config = NodeConfig::new("knee");
-/// config.record.folder = Some("/dev/shm".into());
-/// config.record.apps = vec!["knee.*".into()];
-/// config.validate()?;
-/// # Ok::<(), sinew::config::ConfigError>(())
-/// ```
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct RecordConfig {
-    /// Folder of the file; 1 to 4,096 bytes. It should lie in memory, as `/dev/shm`: on a disk the system may stop a
-    /// sender while it stores a page. Default: none, the node records only while a program asks for it.
-    pub folder: Option<PathBuf>,
-    /// Bytes of the newest records that are kept, rounded up to a power of two; also for the recording of a program. 64
-    /// KiB to 4 GiB; default 64 MiB.
-    pub keep_bytes: usize,
-    /// Names of the node's applications of which messages are recorded; `*` matches any text. At most 64 names of 1
-    /// to 255 bytes; default none, all applications.
-    pub apps: Vec<String>,
-    /// Names of the payload types that are recorded, in the same way. Default none, all types.
-    pub types: Vec<String>,
-}
-
-impl Default for RecordConfig {
-    fn default() -> Self {
-        Self { folder: None, keep_bytes: 64 << 20, apps: Vec::new(), types: Vec::new() }
-    }
 }
 
 /// Local Node Communication Layer: the applications of this host.
