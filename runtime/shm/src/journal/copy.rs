@@ -28,7 +28,7 @@ pub struct Copied {
 /// Copies the records with times within `span` from the journal at `source` to a new journal at `target`, for this user
 /// alone. They keep their times, places and numbers, and the table of channels is copied whole.
 ///
-/// The source is read twice, up to its end at the begin of each time: for the size of the copy, and for its records. It
+/// The source is read twice, up to its end at that moment: for the size of the copy, and for its records. It
 /// may be written meanwhile: overwritten records are missing in the copy, and their numbers show it.
 ///
 /// # Errors
@@ -84,10 +84,12 @@ pub fn copy_span(
         }
     });
     // Last: each record that was copied has its place in the table.
-    let table = read.and_then(|()| Ok(journal.copy_table(&reader.table()?)));
-    if let Err(why) = table {
-        journal.remove();
-        return Err(why.into());
+    match read.and_then(|()| reader.table()) {
+        Ok(table) => journal.copy_table(&table),
+        Err(why) => {
+            journal.remove();
+            return Err(why.into());
+        }
     }
     Ok(copied)
 }
