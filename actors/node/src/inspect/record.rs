@@ -38,7 +38,8 @@ fn refused(why: String) -> RecordReport {
     RecordReport { refused: Some(why), ..RecordReport::default() }
 }
 
-fn report(state: &NodeState, path: &Path) -> RecordReport {
+/// Returns the names for the reader of the journal at this path.
+pub(crate) fn report(state: &NodeState, path: &Path) -> RecordReport {
     let directory = state.ctx.ports.names().map(|names| names.directory()).unwrap_or_default();
     let mut kinds: BTreeMap<_, _> = BTreeMap::new();
     let handled = directory.iter().flat_map(|entry| entry.kinds.iter().copied());

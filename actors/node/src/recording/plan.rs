@@ -210,6 +210,12 @@ impl FreezePlan {
         self.refused
     }
 
+    /// Returns the known triggers.
+    #[cfg(test)]
+    pub(crate) fn known(&self) -> Vec<Trigger> {
+        self.known.values().cloned().collect()
+    }
+
     fn add(&mut self, trigger: Trigger) -> bool {
         if self.known.len() >= TRIGGERS_MAX {
             self.refused += 1;
@@ -347,8 +353,14 @@ mod tests {
         }
         assert_eq!(plan.refused(), 4);
         assert!((1..=300).map(|number| plan.received(now, trigger(1, number, now))).any(|is_new| !is_new));
-        assert!(plan.known.len() == TRIGGERS_MAX && plan.happened(now + 9 * SECOND, now + 9 * SECOND, "x").is_none());
-        assert!(plan.happened(now + 100 * SECOND, now + 100 * SECOND, "later").is_some(), "old ones are forgotten");
+        assert!(
+            plan.known.len() == TRIGGERS_MAX
+                && plan.happened(now + 9 * SECOND, now + 9 * SECOND, "x").is_none()
+        );
+        assert!(
+            plan.happened(now + 100 * SECOND, now + 100 * SECOND, "later").is_some(),
+            "old ones are forgotten"
+        );
     }
 
     proptest! {
