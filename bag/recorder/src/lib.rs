@@ -14,10 +14,12 @@ mod names;
 mod order;
 mod recorder;
 mod sink;
+mod span;
 #[cfg(test)]
 mod tests;
 
 pub use names::Names;
 pub use order::WINDOW;
 pub use recorder::{Recorder, Setup};
+pub use span::Span;
 pub use sinew_shm::journal::{JournalReader, ReadJournalError, Start};
