@@ -1,5 +1,7 @@
 //! `sinew record`: writes the messages of the node into a file.
 
+mod fetch;
+mod freeze;
 mod sizes;
 mod stop;
 
@@ -9,7 +11,7 @@ use std::{
     time::{Duration, UNIX_EPOCH},
 };
 
-use clap::{Args, ValueEnum};
+use clap::{Args, Subcommand, ValueEnum};
 use serde_json::json;
 use sinew::{
     AppAddress, Tid, Time,
@@ -41,7 +43,10 @@ const FAULTS_MAX: usize = 16;
 
 /// The arguments of `sinew record`.
 #[derive(Debug, Args)]
+#[command(args_conflicts_with_subcommands = true)]
 pub(crate) struct Order {
+    #[command(subcommand)]
+    spans: Option<Spans>,
     /// The file. Without it: NODE-DATE-TIME.mcap in the current folder, in UTC
     file: Option<PathBuf>,
     /// Only messages of this application of the node, by its name; `*` matches any text. May be given several times
@@ -71,6 +76,27 @@ pub(crate) struct Order {
     /// Replace a file of this name
     #[arg(long)]
     force: bool,
+}
+
+/// The spans that nodes keep around faults.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Spans {
+    /// Has all nodes freeze the messages around this moment: those that record from their start
+    ///
+    /// They freeze the same span, some seconds before and after (`record.keep_ms`, `record.after_ms`). The command
+    /// prints the ID of the span, and waits until the nodes have it.
+    #[command(after_help = r#"Examples:
+  sinew record freeze --reason 'the knee jerked'"#)]
+    Freeze(freeze::Order),
+    /// Lists the frozen spans of all nodes, or writes those of one ID: a file for each node
+    ///
+    /// The ring of a node that has died is written, too, if it lies on this host. A span that was fetched may be
+    /// replaced by a later one.
+    #[command(after_help = r#"Examples:
+  sinew record fetch                          a list
+  sinew record fetch 10.0.0.2-6431f2a9c0b1d-1 --out fault
+  sinew record fetch --out faults             all of them"#)]
+    Fetch(fetch::Order),
 }
 
 /// The compression of a recording.
@@ -103,6 +129,11 @@ enum End {
 
 /// Records until the requested end, or until the user or the node ends it.
 pub(crate) fn show(system: &mut System, order: &Order) -> Result<Report, SystemError> {
+    match &order.spans {
+        Some(Spans::Freeze(order)) => return freeze::show(system, order),
+        Some(Spans::Fetch(order)) => return fetch::show(system, order),
+        None => {}
+    }
     let question = order.question()?;
     let stop = StopRequest::listen()
         .map_err(|why| SystemError::Bag(format!("Ctrl-C cannot be handled: {why}; free descriptors")))?;

@@ -21,5 +21,5 @@ mod tests;
 pub use names::Names;
 pub use order::WINDOW;
 pub use recorder::{Recorder, Setup};
-pub use span::Span;
 pub use sinew_shm::journal::{JournalReader, ReadJournalError, Start};
+pub use span::Span;
