@@ -84,7 +84,7 @@ fn shown(id: &str, states: &[(NodeAddress, String, State)]) -> Report {
         table.row([
             node.to_string(),
             name.clone(),
-            detail.map_or(word.to_owned(), |why| format!("{word}: {why}")),
+            detail.map_or_else(|| word.to_owned(), |why| format!("{word}: {why}")),
         ]);
         nodes.push(json!({ "node": node.to_string(), "name": name, "state": word, "why": detail }));
     }

@@ -34,9 +34,10 @@ pub(super) struct Converted {
     /// The times of its first and its last record, in nanoseconds of the monotonic clock of the node's host.
     pub(super) first_ns: u64,
     pub(super) last_ns: u64,
-    times: RangeInclusive<u64>,
+    /// The times that were asked for.
+    pub(super) times: RangeInclusive<u64>,
     /// The time of the trigger and its error, if the node had it.
-    trigger: Option<(u64, u64)>,
+    pub(super) trigger: Option<(u64, u64)>,
     pub(super) has_died: bool,
 }
 

@@ -54,7 +54,10 @@ fn ring(path: PathBuf, project: &str) -> Option<DeadRing> {
     let identity = String::from_utf8(reader.identity().to_vec()).ok()?;
     let mut lines = identity.lines();
     let (name, address) = (lines.next()?.to_owned(), lines.next()?.parse().ok()?);
-    if lines.next() != Some(project) || reader.is_writer_alive() || reader.is_closed().ok()? {
+    // A kept ring may be a copy, which was closed.
+    let is_kept = path.extension().is_some_and(|ending| ending == "frozen");
+    let has_ended_in_order = !is_kept && reader.is_closed().ok()?;
+    if lines.next() != Some(project) || reader.is_writer_alive() || has_ended_in_order {
         return None;
     }
     let mut facts = read_facts(&path.with_extension("facts")).unwrap_or_default();
