@@ -27,7 +27,7 @@ const SECTIONS: [&str; 10] =
     ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security", "log", "record", "app"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 53] = [
+pub(super) const KEYS: [&str; 57] = [
     "node.name",
     "node.project",
     "node.address",

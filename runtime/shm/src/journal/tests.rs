@@ -181,7 +181,7 @@ fn copied_span_keeps_times_and_numbers() {
     assert_eq!(found, expected);
     let keys: Vec<_> = reader.channels().unwrap().into_iter().filter_map(|channel| channel.key).collect();
     assert!(keys.contains(&KEY) && keys.contains(&other), "{keys:?}");
-    // And: what was overwritten is left out
+    // And: overwritten records are left out
     let records: u64 = (0..1_000).map(|_| u64::from(journal.write(KEY, 200, &[&[9; 300]]))).sum();
     assert_eq!(copy_span(&folder.path(), &target, &(1..=100)).unwrap().records, 0);
     assert_eq!(records, 1_000);

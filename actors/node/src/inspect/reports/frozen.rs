@@ -45,7 +45,7 @@ impl Payload for AskFreeze {
 /// The trigger that has the span of an [`AskFreeze`].
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FreezeReport {
-    /// The ID of the trigger: a new one, or that of an earlier one whose span has this moment.
+    /// The ID of the trigger: a new one, or an earlier one with this moment in its span.
     pub id: Option<String>,
     /// Milliseconds after which the span is complete.
     pub after_ms: u64,
