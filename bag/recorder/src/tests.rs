@@ -194,7 +194,7 @@ fn name_that_comes_later_chooses_the_messages_after_it() {
 fn span_of_a_dead_journal_is_complete_in_itself() {
     let Bench { folder, journal, recorder } = Bench::new("span", Selection::default());
     drop(recorder);
-    std::fs::remove_file(folder.join("leg.mcap")).unwrap();
+    fs::remove_file(folder.join("leg.mcap")).unwrap();
     for sequence in 2..=20 {
         write(&journal, &angles(), sequence, sequence * SECOND);
     }

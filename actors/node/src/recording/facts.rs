@@ -97,7 +97,8 @@ impl KnownFacts {
                 let has_left = why.is_some_and(|lost| matches!(lost.why, LossReason::Left));
                 let why = why.map_or_else(String::new, |lost| lost.why.to_string());
                 if !has_left {
-                    losses.push(format!("the node {name} at {node} is lost: {why}"));
+                    let detail = if why.is_empty() { "it is there again" } else { &why };
+                    losses.push(format!("the node {name} at {node} is lost: {detail}"));
                 }
                 let (node, name, incarnation) = (*node, name.clone(), *incarnation);
                 facts.push(NodeFact::NodeLost { node, name, incarnation, why });
