@@ -394,5 +394,54 @@ mod tests {
             let results: BTreeSet<_> = results.collect();
             prop_assert_eq!(results.len(), 1, "{:?}", results);
         }
+
+        /// Three nodes see causes of their own, and forward their triggers with any delay below a second. All have the
+        /// same spans in the end, and each cause is within one of them.
+        #[test]
+        fn nodes_that_forward_their_triggers_have_the_same_spans(
+            causes in proptest::collection::vec((0_u64..750, 0_usize..3), 1..12),
+            delays in proptest::collection::vec(1_u64..50, 64),
+        ) {
+            const STEP: u64 = 20_000_000;
+            let base = 100 * SECOND;
+            let mut plans = [1, 2, 3].map(plan);
+            let mut outputs: [Vec<Output>; 3] = Default::default();
+            let mut all = BTreeMap::new();
+            let mut delays = delays.into_iter().cycle();
+            // Triggers on their way: the time of arrival, a number, the receiver, and the trigger.
+            let mut on_the_way: Vec<(u64, usize, Trigger)> = Vec::new();
+            for step in 0..1_500 {
+                let now_ns = base + step * STEP;
+                for (_, node) in causes.iter().filter(|(at, _)| *at == step) {
+                    prop_assert!(plans[*node].happened(now_ns, now_ns, "test").is_some());
+                }
+                let (arrived, others) = on_the_way.into_iter().partition(|(at, ..)| *at <= now_ns);
+                on_the_way = others;
+                let arrived: Vec<(u64, usize, Trigger)> = arrived;
+                for (_, node, trigger) in arrived {
+                    plans[node].received(now_ns, trigger);
+                }
+                for node in 0..3 {
+                    for output in drain(&mut plans[node], now_ns) {
+                        if let Output::Forward(trigger) = &output {
+                            all.insert(trigger.id, trigger.clone());
+                            for other in (0..3).filter(|other| *other != node) {
+                                let delay = delays.next().expect("it has no end") * STEP;
+                                on_the_way.push((now_ns + delay, other, trigger.clone()));
+                            }
+                        }
+                        outputs[node].push(output);
+                    }
+                }
+            }
+            let spans = outputs.map(|outputs| kept(&outputs));
+            prop_assert_eq!(&spans[0], &spans[1]);
+            prop_assert_eq!(&spans[0], &spans[2]);
+            for (at, _) in causes {
+                let at_ns = base + at * STEP;
+                let has = |id: &TriggerId| (all[id].begin_ns()..=all[id].end_ns()).contains(&at_ns);
+                prop_assert!(spans[0].iter().any(has), "{at_ns}: {spans:?}");
+            }
+        }
     }
 }
