@@ -19,6 +19,7 @@ use sinew::{
     inspect::{AskFrozen, FrozenFacts, FrozenPart, FrozenReport, FrozenSpan},
 };
 
+use super::freeze::present;
 use crate::{
     Report,
     system::{System, SystemError, in_words},
@@ -92,7 +93,7 @@ pub(super) fn show(system: &mut System, order: &Order) -> Result<Report, SystemE
 fn find(system: &mut System) -> Result<Found, SystemError> {
     let here = system.here()?;
     let mut found = Found::default();
-    for answer in system.ask_all::<AskFrozen, FrozenReport>(&here) {
+    for answer in system.ask_these::<AskFrozen, FrozenReport>(present(&here)) {
         let node = answer.node;
         match answer.result {
             Err(why) => found.faults.push(format!("{node} {}: {why}", answer.name)),

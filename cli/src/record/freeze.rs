@@ -73,7 +73,15 @@ fn states(system: &mut System, here: &NodeReport, id: &str) -> Vec<(NodeAddress,
         };
         (node, name, state)
     };
-    system.ask_all::<AskFrozen, FrozenReport>(here).into_iter().map(state).collect()
+    system.ask_these::<AskFrozen, FrozenReport>(present(here)).into_iter().map(state).collect()
+}
+
+/// Returns this node and all nodes that it knows and that answer. A lost one has nothing to hand out.
+pub(super) fn present(here: &NodeReport) -> Vec<(NodeAddress, String)> {
+    let mut nodes = vec![(here.node, here.name.clone())];
+    let peers = here.peers.iter().filter(|peer| peer.is_there);
+    nodes.extend(peers.map(|peer| (peer.node, peer.name.clone().unwrap_or_default())));
+    nodes
 }
 
 fn shown(id: &str, states: &[(NodeAddress, String, State)]) -> Report {
