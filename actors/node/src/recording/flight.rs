@@ -50,6 +50,8 @@ pub(crate) struct Flight {
     names: Mutex<KnownReport>,
     /// The folder of the journal.
     folder: PathBuf,
+    /// Whether spans are kept at all.
+    keeps_spans: bool,
 }
 
 /// Causes that were reported by any thread of the process.
@@ -121,6 +123,7 @@ impl Flight {
             is_working: AtomicBool::new(false),
             names: Mutex::default(),
             folder,
+            keeps_spans: config.frozen_max > 0,
         })
     }
 
@@ -175,7 +178,7 @@ impl Flight {
                     forward(state, &trigger);
                 }
                 // The node has a recording, and keeps no spans.
-                Some(Output::Freeze(_)) if state.ctx.config.record.frozen_max == 0 => {}
+                Some(Output::Freeze(_)) if !self.keeps_spans => {}
                 Some(Output::Freeze(trigger)) => lock(&self.work).push_back(Work::Freeze(trigger)),
                 Some(Output::Discard(id)) => lock(&self.work).push_back(Work::Discard(id)),
             }
@@ -221,7 +224,9 @@ impl Flight {
         loop {
             let next = lock(&self.work).pop_front();
             match (next, state.upgrade()) {
-                (Some(Work::Freeze(trigger)), Some(state)) => self.freeze(&state, journal, &trigger),
+                (Some(Work::Freeze(trigger)), Some(state)) => {
+                    self.freeze(journal, &trigger, names_for_reader(&state, journal));
+                }
                 (Some(Work::Discard(id)), _) => self.store().discard(&id.to_string()),
                 (Some(Work::Freeze(_)), None) | (None, _) => break,
             }
@@ -230,7 +235,33 @@ impl Flight {
         self.is_working.store(false, Ordering::Release);
     }
 
-    fn freeze(&self, state: &NodeState, journal: &Path, trigger: &Trigger) {
+    /// Freezes all spans that are not complete yet, up to this moment: the node ends. It waits for no layer.
+    pub(super) fn finish(&self, journal: &Path) {
+        if !self.keeps_spans {
+            return;
+        }
+        // The thread `record` may hang in a layer, with the names locked.
+        let names = self.names.try_lock().ok().and_then(|names| names.written.clone());
+        let report = names.unwrap_or_default();
+        loop {
+            let Some(output) = lock(&self.plan).poll(u64::MAX) else { break };
+            match output {
+                Output::Freeze(trigger) => lock(&self.work).push_back(Work::Freeze(trigger)),
+                Output::Discard(id) => lock(&self.work).push_back(Work::Discard(id)),
+                // Its links have ended.
+                Output::Forward(_) => {}
+            }
+        }
+        loop {
+            let Some(next) = lock(&self.work).pop_front() else { break };
+            match next {
+                Work::Freeze(trigger) => self.freeze(journal, &trigger, report.clone()),
+                Work::Discard(id) => self.store().discard(&id.to_string()),
+            }
+        }
+    }
+
+    fn freeze(&self, journal: &Path, trigger: &Trigger, report: RecordReport) {
         let id = trigger.id.to_string();
         let cause = trigger.cause.as_str();
         let span = FrozenSpan {
@@ -242,7 +273,7 @@ impl Flight {
             end_ns: trigger.end_ns(),
             ..FrozenSpan::default()
         };
-        let facts = FrozenFacts { span: Some(span.clone()), report: names_for_reader(state, journal) };
+        let facts = FrozenFacts { span: Some(span.clone()), report };
         // Questions wait for this lock, and no sender does.
         let mut store = self.store();
         match store.make_room(&id).and_then(|()| store.freeze(journal, &span, &facts)) {

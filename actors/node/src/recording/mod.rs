@@ -169,6 +169,9 @@ impl Recording {
         state.programs.clear();
         let is_kept = state.configured.take().is_some();
         if let Some(active) = state.active.take() {
+            if let Some(flight) = self.flight() {
+                flight.finish(active.journal.path());
+            }
             self.remove(node, &active, is_kept);
         }
     }

@@ -240,3 +240,24 @@ fn cause_freezes_the_messages_around_it() {
     node.recording.close(&node);
     std::fs::remove_dir_all(folder).unwrap();
 }
+
+#[test]
+fn node_that_ends_freezes_an_incomplete_span() {
+    let folder = std::env::temp_dir().join(format!("sinew-ending-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::set_permissions(&folder, std::os::unix::fs::PermissionsExt::from_mode(0o700)).unwrap();
+    let node = node("ending", |config| {
+        config.record.folder = Some(folder.clone());
+        config.record.after = Duration::from_secs(30);
+    });
+    node.recording.begin_configured(&node).expect("it begins");
+    let (hip, knee) = (app(&node, "hip"), app(&node, "knee"));
+    send(&node, hip, knee, b"last");
+    let flight = node.recording.flight().expect("it records from its start").clone();
+    let id = flight.happened(Time::now(), "the knee slips").expect("there is room").to_string();
+    assert!(flight.store().spans().is_empty());
+    node.recording.close(&node);
+    let spans = flight.store().spans();
+    assert!(spans.len() == 1 && spans[0].id == id, "{spans:?}");
+    std::fs::remove_dir_all(folder).unwrap();
+}
