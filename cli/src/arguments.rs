@@ -103,6 +103,7 @@ pub(crate) enum Command {
   sinew record walk.mcap
   sinew record --for 30s --app 'knee.*' --type demo.angle
   sinew record --split 5m --max-size 10G
+  sinew record freeze                         keeps the messages around this moment, on all nodes
   sinew record walk.mcap --json | jq .dropped"#)]
     Record(record::Order),
     /// Sends the messages of a recording again, or checks a program against them

@@ -1,5 +1,7 @@
 //! `sinew record`: writes the messages of the node into a file.
 
+mod fetch;
+mod freeze;
 mod sizes;
 pub(crate) mod stop;
 
@@ -9,7 +11,7 @@ use std::{
     time::Duration,
 };
 
-use clap::{Args, ValueEnum};
+use clap::{Args, Subcommand, ValueEnum};
 use serde_json::json;
 use sinew::{
     AppAddress, NodeAddress, Tid,
@@ -32,7 +34,10 @@ const SHOWN: Duration = Duration::from_secs(1);
 
 /// The arguments of `sinew record`.
 #[derive(Debug, Args)]
+#[command(args_conflicts_with_subcommands = true)]
 pub(crate) struct Order {
+    #[command(subcommand)]
+    spans: Option<Spans>,
     /// The file; {node} and {time} in it are replaced. Without it: {node}-{time}.mcap in the current folder, in UTC
     file: Option<PathBuf>,
     /// Only messages of this application of the node, by its name; `*` matches any text. May be given several times
@@ -64,6 +69,27 @@ pub(crate) struct Order {
     force: bool,
 }
 
+/// The spans that nodes keep around faults.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Spans {
+    /// Has all nodes freeze the messages around this moment: those that record from their start
+    ///
+    /// They freeze the same span, some seconds before and after (`record.keep_ms`, `record.after_ms`). The command
+    /// prints the ID of the span, and waits until the nodes have it.
+    #[command(after_help = r#"Examples:
+  sinew record freeze --reason 'the knee jerked'"#)]
+    Freeze(freeze::Order),
+    /// Lists the frozen spans of all nodes, or writes those of one ID: a file for each node
+    ///
+    /// The ring of a node that has died is written, too, if it lies on this host. A span that was fetched may be
+    /// replaced by a later one.
+    #[command(after_help = r#"Examples:
+  sinew record fetch                          a list
+  sinew record fetch 10.0.0.2-6431f2a9c0b1d-1 --out fault
+  sinew record fetch --out faults             all of them"#)]
+    Fetch(fetch::Order),
+}
+
 /// The compression of a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Compression {
@@ -77,6 +103,11 @@ pub(crate) enum Compression {
 
 /// Records until the requested end, or until the user or the node ends it.
 pub(crate) fn show(system: &mut System, order: &Order) -> Result<Report, SystemError> {
+    match &order.spans {
+        Some(Spans::Freeze(order)) => return freeze::show(system, order),
+        Some(Spans::Fetch(order)) => return fetch::show(system, order),
+        None => {}
+    }
     let stop = StopRequest::listen()
         .map_err(|why| SystemError::Bag(format!("Ctrl-C cannot be handled: {why}; free descriptors")))?;
     let path = system.path.clone();

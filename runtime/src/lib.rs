@@ -24,6 +24,7 @@
 //! | [`supervision`] | starts, restarts and failures of actors |
 //! | [`lock`] | locks that survive the panic of their holder |
 //! | [`log`] | the log of the runtime, which never waits for its reader |
+//! | [`incident`] | faults around which nodes freeze their recordings |
 
 #[cfg_attr(not(target_os = "linux"), path = "alarm_elsewhere.rs")]
 pub mod alarm;
@@ -33,6 +34,7 @@ pub mod event_queue;
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
 pub mod fuzzing;
+pub mod incident;
 mod locking;
 pub mod log;
 pub mod mailbox;

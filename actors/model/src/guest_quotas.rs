@@ -16,7 +16,7 @@ use sinew_runtime::{
     outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
     router::SubmitError,
     tid::{AppAddress, NodeAddress, Tid},
-    wire::{Message, Payload},
+    wire::{Kind, Message, Payload},
 };
 
 use crate::barrier::LeaveBarrier;
@@ -34,6 +34,11 @@ const USERS: usize = 2;
 /// hundreds.
 const LEAVES_MAX: usize = 1_024;
 const LEAVES_OF_USER: usize = LEAVES_MAX / 4;
+
+/// Questions that a node sends to the inspection of another node for its own user's applications only: payloads of
+/// recordings are in the answers.
+pub const OF_OWN_USERS: [Kind; 2] =
+    [Kind::named("sinew.inspect.frozen"), Kind::named("sinew.inspect.freeze")];
 
 /// Maximum number of one user's messages, except leaves, that wait for the sync manager.
 pub const OF_USER_AT_SYNC: usize = AT_SYNC_MAX / USERS;
@@ -69,6 +74,10 @@ impl GuestQuotas {
                 (&self.leaves, LEAVES_MAX, LEAVES_OF_USER)
             }
             AppAddress::SYNC => (&self.sync, AT_SYNC_MAX, OF_USER_AT_SYNC),
+            // The other node does not know the user: this one does.
+            AppAddress::INSPECT if !is_here && OF_OWN_USERS.contains(&message.header.kind) => {
+                return Err(Refused::new(message, Rejection::Unsupported));
+            }
             AppAddress::INSPECT if is_here => {
                 (&self.inspection, AT_INSPECTION_MAX, AT_INSPECTION_MAX / USERS)
             }
@@ -258,6 +267,11 @@ mod tests {
         assert_eq!(why(&quotas, elsewhere), Rejection::ForgedSource);
         for app in [AppAddress::SYNC, AppAddress::INSPECT] {
             assert_eq!(why(&quotas, message(NodeAddress::ALL, app)), Rejection::Unsupported);
+        }
+        for kind in OF_OWN_USERS {
+            let mut frozen = message(THERE, AppAddress::INSPECT);
+            frozen.header.kind = kind;
+            assert_eq!(why(&quotas, frozen), Rejection::Unsupported);
         }
         let _full = fill(&quotas, USER, AppAddress::SYNC);
         let knee = AppAddress::new(0x1001);

@@ -10,7 +10,7 @@ use sinew_runtime::{
 };
 use sinew_security::SecurityState;
 
-use super::recording::Recording;
+use super::recording::{Recording, Triggers};
 use super::root::{RootEvent, RootQueue};
 use crate::audit;
 
@@ -70,8 +70,9 @@ impl NodeState {
         ports.connect_names(&(self.sync.clone() as Arc<_>));
         ports.connect_app_lifecycle(&(self.sync.clone() as Arc<_>));
         let audits = Arc::new(audit::Frames(Arc::downgrade(self)));
-        // It is set once, here.
+        // They are set once, here.
         let _ = self.sync.audits.set(audits);
+        let _ = self.sync.triggers.set(Arc::new(Triggers(Arc::downgrade(self))));
     }
 
     /// Releases the node's socket and its address for inspection, so that another node can use them even if a

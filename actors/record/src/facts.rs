@@ -29,6 +29,8 @@ pub enum NodeFact {
     Barrier { name: String, generation: u64, waiting: Vec<String>, missing: Vec<String> },
     /// The name of a payload type.
     TypeNamed { kind: u32, name: String },
+    /// A trigger to freeze the span around the time of this record, which may be wrong by `bound_ns`.
+    Triggered { id: String, cause: String, bound_ns: u64 },
 }
 
 impl Fact for NodeFact {

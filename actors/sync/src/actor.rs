@@ -216,9 +216,11 @@ impl SyncManager {
         let is_monitor_or_will =
             matches!(message.header.kind, Kind::SYNC_WATCH | Kind::SYNC_LIVES | Kind::SYNC_WILLS);
         let is_audit = matches!(message.header.kind, Kind::SYNC_AUDIT_ASK | Kind::SYNC_AUDIT);
+        let is_trigger = message.header.kind == Kind::SYNC_FREEZE;
         if !matches!(message.header.kind, Kind::SYNC_DIRECTORY | Kind::SYNC_ARRIVALS)
             && !is_monitor_or_will
             && !is_audit
+            && !is_trigger
         {
             let kind = message.header.kind;
             self.refuse(
@@ -229,10 +231,11 @@ impl SyncManager {
         } else if app != AppAddress::SYNC || node == self.state.ctx.node {
             self.refuse("source", &format_args!("{node}/{app} is not the sync manager of another node"));
             message.reject(Rejection::ForgedSource);
-        } else if is_audit {
-            let received = self.state.audits.get().map_or(Ok(()), |audits| audits.receive(node, &message));
-            if let Err(fault) = received {
-                self.refuse("audit", &fault);
+        } else if is_audit || is_trigger {
+            let (handler, cause) =
+                if is_audit { (&self.state.audits, "audit") } else { (&self.state.triggers, "trigger") };
+            if let Some(Err(fault)) = handler.get().map(|handler| handler.receive(node, &message)) {
+                self.refuse(cause, &fault);
             }
             message.settle(Outcome::Delivered);
         } else if is_monitor_or_will {

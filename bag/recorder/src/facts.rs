@@ -34,6 +34,10 @@ pub(crate) fn node(sink: &mut Sink, at_ns: u64, fact: &NodeFact) {
             let (waiting, missing) = (list(waiting), list(missing));
             (name, format!("{name}, generation {generation}: waiting: {waiting}; missing: {missing}"))
         }
+        NodeFact::Triggered { id, cause, .. } => {
+            level = Level::Warning;
+            (id, format!("the messages around this moment are frozen: {cause}"))
+        }
         // It is a name, no event.
         NodeFact::TypeNamed { .. } => return,
     };
@@ -51,7 +55,10 @@ pub(crate) fn learn(names: &mut Names, fact: &NodeFact) {
             names.add_type(Kind::from_bits(*kind), name);
         }
         // Messages of it may still be in the journal.
-        NodeFact::NodeLost { .. } | NodeFact::AppGone { .. } | NodeFact::Barrier { .. } => {}
+        NodeFact::NodeLost { .. }
+        | NodeFact::AppGone { .. }
+        | NodeFact::Barrier { .. }
+        | NodeFact::Triggered { .. } => {}
     }
 }
 

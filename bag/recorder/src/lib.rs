@@ -22,6 +22,7 @@ mod recorder;
 mod recording;
 mod session;
 mod sink;
+mod span;
 #[cfg(test)]
 mod tests;
 
@@ -34,3 +35,4 @@ pub use session::{Connection, End, RecordingOptions, Session, Summary};
 pub use sinew_bag::{BagError, Compression, Options as FileOptions, Totals};
 pub use sinew_record::Selection;
 pub use sinew_shm::journal::{JournalReader, ReadJournalError, Start};
+pub use span::Span;

@@ -2,6 +2,7 @@
 
 use std::{collections::BTreeMap, sync::Arc};
 
+use sinew_record::RecordReport;
 use sinew_runtime::{
     tid::{NodeAddress, Tid},
     wire::Kind,
@@ -42,6 +43,23 @@ impl Names {
     /// Adds the name of an application or of a group, in place of a former one.
     pub fn add_app(&mut self, app: Tid, name: &str) {
         self.changes += u64::from(add(&mut self.apps, app, name));
+    }
+
+    /// Adds the names that a node has reported, and the structures of those types for which it was asked.
+    pub fn learn(&mut self, report: &RecordReport, asked: &[Kind]) {
+        report.apps.iter().for_each(|app| self.add_app(app.tid, &app.name));
+        for one in &report.types {
+            self.add_type(one.kind, &one.name);
+            if asked.contains(&one.kind) {
+                self.add_schema(one.kind, one.schema.as_deref());
+            }
+        }
+        // The structures stand first in the answer. The first one is in it, or is not known to the node.
+        let answered = if report.types_left_out == 0 { asked.len() } else { 1 };
+        asked.iter().take(answered).for_each(|kind| self.add_schema(*kind, None));
+        if let Some(node) = report.node {
+            self.add_node(node, &report.name);
+        }
     }
 
     /// Adds the name of a node.

@@ -18,6 +18,7 @@ use crate::{
     facts,
     names::Names,
     sink::Sink,
+    span::Span,
 };
 
 /// Time that a record may stay unfinished: its writer may have been preempted.
@@ -118,7 +119,11 @@ impl Recorder {
         reader.set_patience(PATIENCE);
         // A message with a higher number is written to the ring later than this, and so is read.
         let before = seen(&reader.channels()?);
-        Ok(Self {
+        Ok(Self::new(reader, bag, setup, before))
+    }
+
+    const fn new(reader: JournalReader, bag: BagWriter, setup: Setup, before: BTreeMap<u16, u64>) -> Self {
+        Self {
             reader,
             sink: Sink::new(bag),
             setup,
@@ -133,7 +138,38 @@ impl Recorder {
             waited_types: BTreeSet::new(),
             waited_apps: BTreeSet::new(),
             tally_due_ns: 0,
-        })
+        }
+    }
+
+    /// Begins with the records of a span, of a journal without a living writer. `reader` was opened with
+    /// [`Start::Oldest`](crate::Start::Oldest). Call [`pump`](Self::pump) until it has no more, then
+    /// [`finish`](Self::finish).
+    ///
+    /// # Examples
+    ///
+    /// ```no_run
+    /// use std::path::Path;
+    ///
+    /// use sinew_bag::{BagWriter, Options, Origin};
+    /// use sinew_record::Selection;
+    /// use sinew_recorder::{JournalReader, Names, Recorder, Setup, Span, Start};
+    /// use sinew_runtime::tid::NodeAddress;
+    ///
+    /// let path = Path::new("/dev/shm/sinew-walker-10.0.0.2.journal");
+    /// let span = Span::scan(path, &(0..=u64::MAX))?;
+    /// let bag = BagWriter::create("knee.mcap", Options::default(), Origin::default())?;
+    /// let node = NodeAddress::from([10, 0, 0, 2]);
+    /// let setup = Setup { node, selection: Selection::default(), names: Names::default(), left_out: vec![] };
+    /// let mut recorder = Recorder::of_span(JournalReader::open(path, Start::Oldest)?, bag, setup, &span);
+    /// while !recorder.pump(span.last_ns)? {}
+    /// recorder.finish(span.last_ns)?;
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    #[must_use]
+    pub fn of_span(mut reader: JournalReader, bag: BagWriter, setup: Setup, span: &Span) -> Self {
+        // No writer finishes a record any more.
+        reader.set_patience(Duration::ZERO);
+        Self { until: Some(span.until()), ..Self::new(reader, bag, setup, span.before()) }
     }
 
     /// Writes the records that are there, at most 4,096, and each second the counters. Returns whether there are no

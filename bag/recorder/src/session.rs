@@ -365,7 +365,7 @@ impl<C: Connection> Session<C> {
         let answer = ask(&mut self.connection, &self.question, within);
         self.answers = answer.is_ok();
         if let Ok(report) = answer {
-            learn(self.recorder.names_mut(), &report, &self.question.schemas);
+            self.recorder.names_mut().learn(&report, &self.question.schemas);
         }
     }
 }
@@ -417,28 +417,11 @@ fn open<C: Connection>(
     for group in &selection.groups {
         names.add_app(Tid::group(group), group);
     }
-    learn(&mut names, first, &[]);
+    names.learn(first, &[]);
     let setup = Setup { node, selection, names, left_out: connection.own() };
     let mut recorder = Recorder::begin(reader, bag, setup)?;
     recorder.clocks(now, &first.clocks);
     Ok((recorder, file))
-}
-
-/// Adds the names and the structures that the node has reported.
-fn learn(names: &mut Names, report: &RecordReport, asked: &[Kind]) {
-    report.apps.iter().for_each(|app| names.add_app(app.tid, &app.name));
-    for one in &report.types {
-        names.add_type(one.kind, &one.name);
-        if asked.contains(&one.kind) {
-            names.add_schema(one.kind, one.schema.as_deref());
-        }
-    }
-    // The structures stand first in the answer. The first one is in it, or is not known to the node.
-    let answered = if report.types_left_out == 0 { asked.len() } else { 1 };
-    asked.iter().take(answered).for_each(|kind| names.add_schema(*kind, None));
-    if let Some(node) = report.node {
-        names.add_node(node, &report.name);
-    }
 }
 
 fn note(faults: &mut Vec<String>, fault: String) {

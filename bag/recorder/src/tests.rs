@@ -209,6 +209,36 @@ fn name_that_comes_later_chooses_the_messages_after_it() {
 }
 
 #[test]
+fn span_of_a_dead_journal_is_complete_in_itself() {
+    let Bench { folder, journal, recorder } = Bench::new("span", Selection::default());
+    drop(recorder);
+    fs::remove_file(folder.join("leg.mcap")).unwrap();
+    for sequence in 2..=20 {
+        write(&journal, &angles(), sequence, sequence * SECOND);
+    }
+    // Two messages that were too long for the ring, say.
+    journal.count(angles().key(), 2);
+    for sequence in 23..=40 {
+        write(&journal, &angles(), sequence, sequence * SECOND);
+    }
+    let span = crate::Span::scan(journal.path(), &(5 * SECOND..=30 * SECOND)).unwrap();
+    assert_eq!((span.records, span.first_ns, span.last_ns), (24, 5 * SECOND, 30 * SECOND));
+    let reader = JournalReader::open(journal.path(), Start::Oldest).unwrap();
+    let origin = Origin { node: "leg".into(), address: NODE.to_string(), ..Origin::default() };
+    let file = folder.join("leg.mcap");
+    let bag = BagWriter::create(file.clone(), Options::default(), origin).unwrap();
+    let (selection, names) = (Selection::default(), Names::default());
+    let setup = Setup { node: NODE, selection, names, left_out: Vec::new() };
+    let mut recorder = Recorder::of_span(reader, bag, setup, &span);
+    while !recorder.pump(span.last_ns).unwrap() {}
+    let totals = recorder.finish(span.last_ns).unwrap();
+    assert_eq!((totals.seen, totals.written, totals.dropped), (26, 24, 2));
+    let report = sinew_bag::check(&[&file]).unwrap();
+    assert!(report.is_fine(), "{:?}", report.findings);
+    fs::remove_dir_all(&folder).unwrap();
+}
+
+#[test]
 fn facts_are_events_and_log_lines() {
     let mut bench = Bench::new("facts", Selection::default());
     let (node, name, incarnation) = (NodeAddress::new(9), "hip".to_owned(), Incarnation(1));

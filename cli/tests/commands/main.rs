@@ -3,6 +3,7 @@
 mod access;
 mod bag;
 mod doctor;
+mod fault;
 mod keys;
 mod mistakes;
 mod output;

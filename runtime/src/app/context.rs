@@ -3,6 +3,7 @@
 mod actor;
 mod guards;
 mod messages;
+mod recording;
 mod refusals;
 mod timers;
 mod watches;

@@ -22,6 +22,7 @@ use crate::{
         requirement::{Requirements, event_in},
     },
     clock::ClockAlarm,
+    incident,
     mailbox::MailboxReader,
     outcome::{Outcome, Rejection},
     protection::{Echo, ProtectionError, Verdict},
@@ -383,8 +384,12 @@ where
         }
         WatchCheck::TimedOut(timeout) => timeout,
     };
+    // On the wall clock, also where the application has another one.
+    let at = Time::now();
     if let Some(mut action) = watch.action.take() {
         action(actor, timeout, context);
         context.watches[id.0].action = Some(action);
     }
+    // Behind the action, which may bring an output into its safe state.
+    incident::report(at, format_args!("an input of {} is late: {timeout}", context.tid()));
 }

@@ -13,7 +13,7 @@ use std::{
 };
 
 use super::{Cause, safe_output::Discarded};
-use crate::{thread::reset_schedule, tid::Tid};
+use crate::{incident, thread::reset_schedule, tid::Tid, time::Time};
 
 /// Maximum number of pending log entries. Further ones are counted.
 const PENDING_MAX: usize = 256;
@@ -38,12 +38,17 @@ pub(super) enum OutputEvent {
 impl LogEntry {
     /// Logs the entry. This may wait for the lock of the log's queue.
     pub(super) fn log(self) {
-        let Self { source, name, cause, event } = self;
+        let (Self { source, name, cause, event }, now) = (self, Time::now());
         match event {
             OutputEvent::MadeSafe => {
+                incident::report(now, format_args!("the guard of {name} from {source} is shut: {cause}"));
                 crate::log::warn!(%source, of = name, %cause, "a guard is shut; its output, if it has one, is safe");
             }
             OutputEvent::SafeFailed => {
+                incident::report(
+                    now,
+                    format_args!("an output of {name} from {source} cannot be made safe: {cause}"),
+                );
                 crate::log::error!(%source, of = name, %cause, "the safe function of an output panicked or failed; it is retried each millisecond");
             }
         }

@@ -84,6 +84,8 @@ impl Kind {
     pub const SYNC_AUDIT: Self = Self(0x35);
     /// The waiters at run-time barriers on a node, and the open generation of each barrier.
     pub const SYNC_ARRIVALS: Self = Self(0x36);
+    /// A trigger: all nodes freeze their recordings around it.
+    pub const SYNC_FREEZE: Self = Self(0x37);
     /// A process requests a transport address.
     pub const LNCL_REGISTER: Self = Self(0x40);
     /// The assigned address.

@@ -79,6 +79,9 @@ pub(super) const KEEP_BYTES: Range = range("record.keep_bytes", 64 << 10, 4 << 3
 pub(super) const SPLIT_BYTES: Range = range("record.split_bytes", 64 << 10, 1 << 50, "bytes, or false");
 pub(super) const SPLIT_TIME: Range = range("record.split_ms", 1_000, 604_800_000, "ms, or false");
 pub(super) const MAX_BYTES: Range = range("record.max_bytes", 64 << 10, 1 << 50, "bytes, or false");
+pub(super) const KEEP: Range = range("record.keep_ms", 1_000, 600_000, "ms");
+pub(super) const AFTER: Range = range("record.after_ms", 1_000, 60_000, "ms");
+pub(super) const FROZEN_MAX: Range = range("record.frozen_max", 0, 64, "spans");
 /// Maximum number of names in `record.apps` and `record.types`, and maximum bytes of one.
 const RECORDED_MAX: usize = 64;
 const RECORDED_BYTES_MAX: usize = 255;
@@ -208,10 +211,18 @@ impl NodeConfig {
 
     fn check_record(&self, faults: &mut Vec<ConfigFault>) {
         let record = &self.record;
-        if let Some(folder) = record.folder.as_deref().filter(|folder| !is_path(folder)) {
-            let legal = format!("the path of a folder, 1 to {DIRECTORY_BYTES_MAX} bytes, or false");
-            let remedy = "name a folder in memory, as in /dev/shm";
-            faults.push(fault("record.folder", quoted(&folder.to_string_lossy()), legal, remedy));
+        for (key, folder, remedy) in [
+            ("record.folder", &record.folder, "name a folder in memory, as in /dev/shm"),
+            (
+                "record.frozen_folder",
+                &record.frozen_folder,
+                "name a folder of this user, as in /var/lib/sinew",
+            ),
+        ] {
+            if let Some(folder) = folder.as_deref().filter(|folder| !is_path(folder)) {
+                let legal = format!("the path of a folder, 1 to {DIRECTORY_BYTES_MAX} bytes, or false");
+                faults.push(fault(key, quoted(&folder.to_string_lossy()), legal, remedy));
+            }
         }
         KEEP_BYTES.count(faults, record.keep_bytes);
         if let Some(file) = record.file.as_deref().filter(|file| !is_path(file)) {
@@ -226,6 +237,19 @@ impl NodeConfig {
         }
         if let Some(time) = record.split_time {
             SPLIT_TIME.time(faults, time);
+        }
+        FROZEN_MAX.count(faults, record.frozen_max);
+        AFTER.time(faults, record.after);
+        let before = faults.len();
+        KEEP.time(faults, record.keep);
+        // A value outside its own range is one fault, not two.
+        if faults.len() == before
+            && record.keep < record.after
+            && record.after.as_millis() <= u128::from(AFTER.high)
+        {
+            let legal = format!("record.after_ms ({:?}) to {} ms", record.after, KEEP.high);
+            let remedy = "raise record.keep_ms or lower record.after_ms";
+            faults.push(fault(KEEP.key, format!("{:?}", record.keep), legal, remedy));
         }
         for (key, names) in [("record.apps", &record.apps), ("record.types", &record.types)] {
             if names.len() > RECORDED_MAX {

@@ -27,7 +27,7 @@ const SECTIONS: [&str; 10] =
     ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security", "log", "record", "app"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 58] = [
+pub(super) const KEYS: [&str; 62] = [
     "node.name",
     "node.project",
     "node.address",
@@ -79,6 +79,10 @@ pub(super) const KEYS: [&str; 58] = [
     "log.level",
     "record.folder",
     "record.keep_bytes",
+    "record.keep_ms",
+    "record.after_ms",
+    "record.frozen_max",
+    "record.frozen_folder",
     "record.apps",
     "record.types",
     "record.file",
@@ -326,6 +330,11 @@ impl Reader<'_> {
         let record = &mut config.record;
         self.text_or_off("record.folder", "\"/dev/shm\" or false", &mut record.folder);
         self.number(&check::KEEP_BYTES, &mut record.keep_bytes);
+        self.time(&check::KEEP, &mut record.keep);
+        self.time(&check::AFTER, &mut record.after);
+        self.number(&check::FROZEN_MAX, &mut record.frozen_max);
+        let example = "\"/var/lib/sinew\" or false";
+        self.text_or_off("record.frozen_folder", example, &mut record.frozen_folder);
         let remedy = "set it as in [\"leg.*\"], or leave it out for all";
         self.read_list("record.apps", check::RECORDED_LEGAL, remedy, &mut record.apps);
         self.read_list("record.types", check::RECORDED_LEGAL, remedy, &mut record.types);

@@ -89,6 +89,9 @@ fn numbers_are_legal_up_to_both_ends() {
         (check::LAYER_WINDOW, ""),
         (check::APP_RESTARTS_MAX, ""),
         (check::APP_WINDOW, ""),
+        (check::KEEP, "after_ms = 1_000"),
+        (check::AFTER, "keep_ms = 600_000"),
+        (check::FROZEN_MAX, ""),
     ];
     for (Range { key, low, high, .. }, more) in ranges {
         assert!(KEYS.contains(&key), "{key}");

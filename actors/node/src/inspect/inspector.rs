@@ -22,10 +22,10 @@ use sinew_runtime::{
 use super::{
     access::{self, Readings},
     answers::Answers,
-    reach, record,
+    frozen, reach, record,
     reports::{
-        AskAccess, AskApps, AskAudit, AskGroups, AskNode, AskReach, AskRecord, AskReload, AskTree, AskWatch,
-        Report, WatchReport,
+        AskAccess, AskApps, AskAudit, AskFreeze, AskFrozen, AskGroups, AskNode, AskReach, AskRecord,
+        AskReload, AskTree, AskWatch, Report, WatchReport,
     },
     watches::{Directions, GUESTS_WATCHES_MAX, NewTap, WATCHES_MAX, Watches},
 };
@@ -133,6 +133,8 @@ fn answer(
         AskReload::KIND => {
             reply(answers, number, &question, |_, state| access::reloaded(state, readings, &question))
         }
+        AskFreeze::KIND => reply(answers, number, &question, |_, state| frozen::triggered(state, &question)),
+        AskFrozen::KIND => reply(answers, number, &question, |_, state| frozen::fetched(state, &question)),
         AskRecord::KIND => reply(answers, number, &question, |_, state| record::recorded(state, &question)),
         // spec: INSPECT-4
         _ => Err(Rejection::UnknownKind),

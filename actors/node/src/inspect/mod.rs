@@ -2,8 +2,8 @@
 //!
 //! Any application that can send a message can ask, from any node. The questions go to `node/inspect`
 //! ([`AppAddress::INSPECT`]) by `ask`, as to any application. Inspection only
-//! reads; the exceptions are that it can make the node read its access list again, and that it starts and ends
-//! recordings.
+//! reads; the exceptions are that it can make the node read its access list again, that it starts and ends recordings,
+//! and that it freezes the messages around a moment.
 //!
 //! | rule | |
 //! | --- | --- |
@@ -16,11 +16,13 @@
 //! | INSPECT-7 | The node's access list does not apply to questions. Only a program on the node's own host can request that its file is read again; a file with faults changes nothing. |
 //! | INSPECT-8 | The applications that a message to many reaches are computed from the routing table by the same code that delivers such a message. Nothing is sent, so no application gets a message, nothing is counted, and no watch shows it. |
 //! | INSPECT-9 | A recording is started by a program of the node's own host and user, or of root, for at most 8 of them, and ends 5 s after its last question. It writes the selected messages into a journal. The answer has its path, and the structure of at most 32 payload types that the question names. No sender waits for it. |
+//! | INSPECT-10 | A span is frozen for a program of the node's own host and user, or of root. Frozen spans are read by such programs, and by programs of other nodes. A node sends such a question of a guest to no other node. |
 //!
 //! `docs/protocol/inspect.md` lists the fields.
 
 mod access;
 mod answers;
+mod frozen;
 mod inspector;
 mod reach;
 mod record;
@@ -31,17 +33,19 @@ mod tests;
 mod watches;
 
 pub(crate) use inspector::begin;
+pub(crate) use record::names_for_reader;
 #[cfg(test)]
 pub(crate) use record::recorded;
 pub use reports::{
-    APPS_MAX, AccessReport, AccessVerdict, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskGroups,
-    AskNode, AskReach, AskRecord, AskReload, AskTree, AskWatch, AuditReport, BarrierReport,
-    CertificateReport, DialReport, ForeignReport, GroupReport, IdleReport, KindReport, LinkReport,
-    LostEchoReport, LostReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, REACHED_MAX, RECORDED_MAX,
-    ReachReport, Reached, RecordReport, RecordedApp, RecordedType, RefusalReport, ReloadReport, RouteReport,
-    SCHEMAS_MAX, SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage, SourceReport, StallReport,
-    StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport, UnguardedReport, UnhandledReport,
-    WaitReport, WatchReport,
+    APPS_MAX, AccessReport, AccessVerdict, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskFreeze,
+    AskFrozen, AskGroups, AskNode, AskReach, AskRecord, AskReload, AskTree, AskWatch, AuditReport,
+    BarrierReport, CertificateReport, DialReport, FROZEN_BYTES_MAX, FROZEN_SPANS_MAX, ForeignReport,
+    FreezeReport, FrozenFacts, FrozenPart, FrozenReport, FrozenSpan, GroupReport, IdleReport, KindReport,
+    LinkReport, LostEchoReport, LostReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, REACHED_MAX,
+    RECORDED_MAX, ReachReport, Reached, RecordReport, RecordedApp, RecordedType, RefusalReport, ReloadReport,
+    RouteReport, SCHEMAS_MAX, SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage, SourceReport,
+    StallReport, StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport, UnguardedReport,
+    UnhandledReport, WaitReport, WatchReport,
 };
 pub use sinew_record::{PeerClock, Selection};
 

@@ -13,7 +13,7 @@ use sinew_shm::journal::{JournalReader, Start};
 
 use super::{
     access,
-    reports::{AskRecord, RecordReport, RecordedApp, RecordedType, bounded},
+    reports::{AskRecord, RecordReport, RecordedApp, RecordedType, SCHEMAS_MAX, bounded},
 };
 use crate::{NodeState, recording};
 
@@ -33,7 +33,7 @@ pub(crate) fn recorded(state: &Arc<NodeState>, question: &Message) -> Result<Rec
         return Ok(refused(why.to_string()));
     }
     match state.recording.ask(state, program, selection, Time::now()) {
-        Ok(path) => Ok(report(state, &path, &schemas)),
+        Ok(path) => Ok(report(state, &path, &journal_kinds(&path), &schemas)),
         Err(why) => Ok(refused(why.to_string())),
     }
 }
@@ -42,14 +42,16 @@ fn refused(why: String) -> RecordReport {
     RecordReport { refused: Some(why), ..RecordReport::default() }
 }
 
-fn report(state: &NodeState, path: &Path, schemas: &[Kind]) -> RecordReport {
+/// Returns the names and structures for a reader of the journal at this path, which may have no node to ask.
+pub(crate) fn names_for_reader(state: &NodeState, path: &Path) -> RecordReport {
+    let kinds = journal_kinds(path);
+    report(state, path, &kinds, &kinds[..kinds.len().min(SCHEMAS_MAX)])
+}
+
+fn report(state: &NodeState, path: &Path, journal: &[Kind], schemas: &[Kind]) -> RecordReport {
     let directory = state.ctx.ports.names().map(|names| names.directory()).unwrap_or_default();
     let handled = directory.iter().flat_map(|entry| entry.kinds.iter().copied());
-    // The table of the journal has the types that were sent to applications that do not declare them.
-    let channels = JournalReader::open(path, Start::Newest).and_then(|reader| reader.channels());
-    let channels = channels.unwrap_or_default().into_iter().filter_map(|channel| Channel::of(channel.key?));
-    let others =
-        handled.chain(channels.map(|channel| channel.kind)).chain(known_types().map(|(kind, _)| kind));
+    let others = handled.chain(journal.iter().copied()).chain(known_types().map(|(kind, _)| kind));
     let (mut listed, mut types) = (BTreeSet::new(), Vec::new());
     // Entries that do not fit are left out from the end: the structures stand first.
     let asked = schemas.iter().map(|kind| (*kind, true));
@@ -72,6 +74,14 @@ fn report(state: &NodeState, path: &Path, schemas: &[Kind]) -> RecordReport {
         clocks: recording::clocks(state, now),
         ..RecordReport::default()
     })
+}
+
+/// Returns the types of the channels in a journal, among them those that their receivers do not declare.
+fn journal_kinds(path: &Path) -> Vec<Kind> {
+    let channels = JournalReader::open(path, Start::Newest).and_then(|reader| reader.channels());
+    let kinds =
+        channels.unwrap_or_default().into_iter().filter_map(|channel| Some(Channel::of(channel.key?)?.kind));
+    kinds.collect::<BTreeSet<_>>().into_iter().collect()
 }
 
 /// Returns the structure of a type that this process sends or handles. The first call for a type takes up to some

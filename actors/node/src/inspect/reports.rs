@@ -3,6 +3,7 @@
 mod access;
 mod apps;
 mod audit;
+mod frozen;
 mod node;
 mod peers;
 mod reach;
@@ -15,6 +16,10 @@ mod watch;
 pub use access::{AccessReport, AccessVerdict, AskAccess, AskReload, ReloadReport};
 pub use apps::{APPS_MAX, AppReport, AppsReport, AskApps, BarrierReport, KindReport, Missing, WaitReport};
 pub use audit::{AskAudit, AuditReport};
+pub use frozen::{
+    AskFreeze, AskFrozen, FROZEN_BYTES_MAX, FROZEN_SPANS_MAX, FreezeReport, FrozenFacts, FrozenPart,
+    FrozenReport, FrozenSpan,
+};
 pub use node::{AskNode, NodeReport, PEERS_MAX};
 pub use peers::{
     DialReport, ForeignReport, IdleReport, LinkReport, LostReport, PeerReport, RouteReport, SourceReport,

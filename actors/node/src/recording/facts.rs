@@ -6,6 +6,7 @@ use std::{
     time::Duration,
 };
 
+use sinew_model::facts::LossReason;
 use sinew_record::{Channel, ClockFact, Fact, Form, LogFact, NodeFact, PeerClock, fact};
 use sinew_runtime::{
     lock,
@@ -61,10 +62,11 @@ impl LogObserver for LogWriter {
 }
 
 impl KnownFacts {
-    /// Writes the changes since the last look, and once a second the clocks.
-    pub(super) fn look(&mut self, state: &NodeState, journal: &Journal, now: Time) {
+    /// Writes the changes since the last look, and once a second the clocks. Returns the nodes that were lost without an
+    /// announcement, as text.
+    pub(super) fn look(&mut self, state: &NodeState, journal: &Journal, now: Time) -> Vec<String> {
         let mut facts = Vec::new();
-        self.look_at_nodes(state, &mut facts);
+        let losses = self.look_at_nodes(state, &mut facts);
         self.look_at_apps(state, &mut facts);
         self.look_at_barriers(state, now, &mut facts);
         for of in &facts {
@@ -76,10 +78,12 @@ impl KnownFacts {
             journal.set_wall_offset(wall_offset_ns);
             write(journal, state.ctx.node, now, &ClockFact { wall_offset_ns, peers: clocks(state, now) });
         }
+        losses
     }
 
-    fn look_at_nodes(&mut self, state: &NodeState, facts: &mut Vec<NodeFact>) {
-        let Some(members) = state.ctx.ports.members() else { return };
+    fn look_at_nodes(&mut self, state: &NodeState, facts: &mut Vec<NodeFact>) -> Vec<String> {
+        let mut losses = Vec::new();
+        let Some(members) = state.ctx.ports.members() else { return losses };
         let present: BTreeMap<_, _> = members
             .present()
             .into_iter()
@@ -90,7 +94,12 @@ impl KnownFacts {
             if !present.contains_key(&(*node, *incarnation)) {
                 let lost = lost.get_or_insert_with(|| members.lost());
                 let why = lost.iter().find(|lost| (lost.node, lost.incarnation) == (*node, *incarnation));
+                let has_left = why.is_some_and(|lost| matches!(lost.why, LossReason::Left));
                 let why = why.map_or_else(String::new, |lost| lost.why.to_string());
+                if !has_left {
+                    let detail = if why.is_empty() { "it is there again" } else { &why };
+                    losses.push(format!("the node {name} at {node} is lost: {detail}"));
+                }
                 let (node, name, incarnation) = (*node, name.clone(), *incarnation);
                 facts.push(NodeFact::NodeLost { node, name, incarnation, why });
             }
@@ -102,6 +111,7 @@ impl KnownFacts {
             }
         }
         self.nodes = present;
+        losses
     }
 
     fn look_at_apps(&mut self, state: &NodeState, facts: &mut Vec<NodeFact>) {

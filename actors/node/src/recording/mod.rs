@@ -8,18 +8,23 @@
 //! Without a recording there is no tap in the routing table, no thread and no file.
 
 mod facts;
+mod flight;
+mod plan;
+mod store;
 #[cfg(test)]
 mod tests;
+mod triggers;
 
 use std::{
     collections::BTreeMap,
     io,
     path::{Path, PathBuf},
-    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, Weak},
+    sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, Weak},
     time::Duration,
 };
 
 use rustix::time::{ClockId, clock_gettime};
+use sinew_model::context::NodeContext;
 use sinew_record::{NodeFact, RecordTap, Selection};
 use sinew_runtime::{
     log::{self, LogObserver},
@@ -32,6 +37,8 @@ use sinew_shm::journal::{CreateJournalError, Journal, Options};
 
 pub(crate) use facts::clocks;
 use facts::{KnownFacts, LogWriter};
+pub(crate) use flight::Flight;
+pub(crate) use triggers::Triggers;
 
 use crate::NodeState;
 
@@ -50,6 +57,8 @@ pub(crate) struct Recording {
     state: Mutex<State>,
     /// Notified when the last selection has gone.
     ended: Condvar,
+    /// Freezes spans, if the configuration asks for a recording.
+    flight: OnceLock<Arc<Flight>>,
 }
 
 #[derive(Default)]
@@ -101,6 +110,8 @@ impl Recording {
         let selection =
             Selection { apps: config.apps.clone(), types: config.types.clone(), groups: Vec::new() };
         let names = KnownNames::of(node);
+        // Before the ring of a former incarnation is replaced.
+        self.flight.get_or_init(|| Flight::begin(node, &journal_path(&node.ctx)));
         let mut state = self.lock();
         state.configured = Some(selection);
         self.start(node, &names, &mut state)
@@ -140,6 +151,11 @@ impl Recording {
         }
     }
 
+    /// Returns the part that freezes spans, if the configuration asks for a recording.
+    pub(crate) fn flight(&self) -> Option<&Arc<Flight>> {
+        self.flight.get()
+    }
+
     /// Returns the path of the journal, if there is one.
     #[cfg(test)]
     pub(crate) fn path(&self) -> Option<PathBuf> {
@@ -153,6 +169,9 @@ impl Recording {
         state.programs.clear();
         let is_kept = state.configured.take().is_some() && node.ctx.config.record.folder.is_some();
         if let Some(active) = state.active.take() {
+            if let Some(flight) = self.flight() {
+                flight.finish(active.journal.path());
+            }
             self.remove(node, &active, is_kept);
         }
     }
@@ -294,19 +313,16 @@ fn run(node: &Weak<NodeState>, journal: &Arc<Journal>) {
         if !state.recording.refresh(&state, journal, now) {
             return;
         }
-        known.look(&state, journal, now);
+        let losses = known.look(&state, journal, now);
+        if let Some(flight) = state.recording.flight() {
+            flight.turn(&state, journal, now, &losses);
+        }
         state.recording.rest();
     }
 }
 
 fn create(node: &NodeState, now: Time) -> Result<Journal, RecordError> {
     let config = &node.ctx.config.record;
-    let memory = Path::new(MEMORY);
-    let folder = match &config.folder {
-        Some(folder) => folder.clone(),
-        None if memory.is_dir() => memory.to_owned(),
-        None => std::env::temp_dir(),
-    };
     let identity = format!("{}\n{}\n{}", node.ctx.config.name, node.ctx.node, node.ctx.config.project);
     let options = Options {
         ring_bytes: config.keep_bytes as u64,
@@ -316,10 +332,21 @@ fn create(node: &NodeState, now: Time) -> Result<Journal, RecordError> {
         keeps_previous: config.folder.is_some(),
         ..Options::default()
     };
-    let path = folder.join(file_name(&node.ctx.config.project, &node.ctx.node.to_string()));
+    let path = journal_path(&node.ctx);
     let journal = Journal::create(&path, &options)?;
     log::info!(path = %path.display(), bytes = config.keep_bytes, "the node records");
     Ok(journal)
+}
+
+/// Returns the path of the journal.
+fn journal_path(ctx: &NodeContext) -> PathBuf {
+    let memory = Path::new(MEMORY);
+    let folder = match &ctx.config.record.folder {
+        Some(folder) => folder.clone(),
+        None if memory.is_dir() => memory.to_owned(),
+        None => std::env::temp_dir(),
+    };
+    folder.join(file_name(&ctx.config.project, &ctx.node.to_string()))
 }
 
 /// Returns the name of the journal: that of one project's node.

@@ -157,7 +157,8 @@ impl Drive {
         let now = context.now();
         let gait = self.newest_command(now, context);
         // Central is known, but its commands do not count.
-        if self.commands.as_ref().is_some_and(CentralCommands::is_shut) {
+        let is_shut = self.is_shut();
+        if is_shut {
             self.core.distrust_gait();
         }
         if let Some(Err(error)) = self.commands.as_mut().map(|commands| commands.poll(context)) {

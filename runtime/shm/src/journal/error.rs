@@ -96,3 +96,14 @@ pub enum ReadJournalError {
         position: u64,
     },
 }
+
+/// Why a span of a journal was not copied. There is no new file.
+#[derive(Debug, Error)]
+pub enum CopyJournalError {
+    /// The source cannot be read.
+    #[error(transparent)]
+    Read(#[from] ReadJournalError),
+    /// The copy cannot be created.
+    #[error(transparent)]
+    Create(#[from] CreateJournalError),
+}

@@ -27,6 +27,8 @@
 //! The file must lie in memory (`/dev/shm`, `/run`) where real-time threads write: on a disk the system may stop a
 //! writer while it stores a page. The reasons are in `docs/decisions/0041-recording.md`.
 
+#[cfg(not(loom))]
+mod copy;
 mod core;
 mod error;
 mod layout;
@@ -43,13 +45,14 @@ mod tests;
 #[cfg(not(loom))]
 mod writer;
 
-pub use self::{
-    core::{channels::ChannelKey, reader::ReaderCounts},
-    error::{CreateJournalError, JournalHeaderError, ReadJournalError},
-    layout::IDENTITY_MAX,
-};
 #[cfg(not(loom))]
 pub use self::{
+    copy::{Copied, copy_span},
     reader::{Channel, JournalReader, Record, Start, Tally},
     writer::{Journal, Options},
+};
+pub use self::{
+    core::{channels::ChannelKey, reader::ReaderCounts},
+    error::{CopyJournalError, CreateJournalError, JournalHeaderError, ReadJournalError},
+    layout::IDENTITY_MAX,
 };

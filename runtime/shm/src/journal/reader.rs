@@ -179,6 +179,18 @@ impl JournalReader {
         Ok(channels)
     }
 
+    /// Returns the words of the table of channels.
+    pub(super) fn table(&self) -> Result<Vec<u64>, ReadJournalError> {
+        let mut table = vec![0; TABLE_BYTES];
+        self.file.read_at(TABLE_AT as u64, &mut table)?;
+        Ok(table.as_chunks::<8>().0.iter().map(|word| u64::from_ne_bytes(*word)).collect())
+    }
+
+    /// Returns the bytes ever reserved in the ring.
+    pub(super) fn reserved(&self) -> Result<u64, ReadJournalError> {
+        self.file.reserved()
+    }
+
     /// Returns the records that this reader had of a channel.
     #[must_use]
     pub fn tally(&self, place: u16) -> Tally {

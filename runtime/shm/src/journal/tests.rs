@@ -9,8 +9,8 @@ use std::{
 use proptest::prelude::*;
 
 use super::{
-    ChannelKey, CreateJournalError, Journal, JournalHeaderError, JournalReader, Options, ReadJournalError,
-    Start,
+    ChannelKey, Copied, CreateJournalError, Journal, JournalHeaderError, JournalReader, Options,
+    ReadJournalError, Start, copy_span,
     layout::{HEADER_BYTES, RING_AT, TABLE_AT, TABLE_BYTES},
 };
 
@@ -154,6 +154,48 @@ fn parts_of_every_length_are_joined() {
         reader.next(0, &mut payload).unwrap().unwrap();
         assert_eq!(payload, bytes);
     }
+}
+
+#[test]
+fn copied_span_keeps_times_and_numbers() {
+    let folder = Folder::new("copy");
+    let target = folder.0.join("knee.frozen");
+    let journal = Journal::create(&folder.path(), &small()).unwrap();
+    let other = ChannelKey([1, 1, 1]);
+    for time in 1..=100 {
+        journal.write(KEY, time, &[&[7; 10]]);
+        journal.write(other, time, &[&[8; 300]]);
+    }
+    let copied = copy_span(&folder.path(), &target, &(40..=59)).unwrap();
+    assert_eq!(copied, Copied { records: 40, ring_bytes: 64 * 1024, first: 40, last: 59 });
+    assert_eq!(fs::metadata(&target).unwrap().permissions().mode() & 0o777, 0o600);
+    let mut reader = JournalReader::open(&target, Start::Oldest).unwrap();
+    assert_eq!((reader.identity(), reader.wall_offset().unwrap()), (&b"the knee"[..], -3));
+    assert!(!reader.is_writer_alive() && reader.is_closed().unwrap());
+    let (mut payload, mut found) = (Vec::new(), Vec::new());
+    while let Some(record) = reader.next(0, &mut payload).unwrap() {
+        assert_eq!(record.number, record.time);
+        found.push((record.time, payload.len()));
+    }
+    let expected: Vec<_> = (40..=59).flat_map(|time| [(time, 10), (time, 300)]).collect();
+    assert_eq!(found, expected);
+    let keys: Vec<_> = reader.channels().unwrap().into_iter().filter_map(|channel| channel.key).collect();
+    assert!(keys.contains(&KEY) && keys.contains(&other), "{keys:?}");
+    // And: overwritten records are left out
+    let records: u64 = (0..1_000).map(|_| u64::from(journal.write(KEY, 200, &[&[9; 300]]))).sum();
+    assert_eq!(copy_span(&folder.path(), &target, &(1..=100)).unwrap().records, 0);
+    assert_eq!(records, 1_000);
+}
+
+#[test]
+fn longest_record_has_room_in_a_copy() {
+    let folder = Folder::new("long");
+    let target = folder.0.join("knee.frozen");
+    let options = Options { ring_bytes: 1 << 20, ..small() };
+    let journal = Journal::create(&folder.path(), &options).unwrap();
+    assert!(journal.write(KEY, 1, &[&vec![7; journal.payload_max()]]));
+    assert_eq!(copy_span(&folder.path(), &target, &(0..=1)).unwrap().records, 1);
+    assert!(copy_span(&target.with_extension("absent"), &target, &(0..=1)).is_err());
 }
 
 #[test]

@@ -1,7 +1,11 @@
 //! The log of a supervisor: one entry for each change of a child.
 
 use super::Supervisor;
-use crate::supervision::{Reason, core::ChildId, supervisor_handle::ChildRecord};
+use crate::{
+    incident,
+    supervision::{Reason, core::ChildId, supervisor_handle::ChildRecord},
+    time::Time,
+};
 
 impl Supervisor {
     /// Logs one event for each change.
@@ -40,6 +44,7 @@ impl Supervisor {
         // The panic hook has already logged the message.
         let place = if let Reason::Panic(words) = reason { words.rsplit_once(" at ") } else { None };
         let reason = place.map_or_else(|| reason.to_string(), |(_, place)| format!("a panic at {place}"));
+        incident::report(Time::now(), format_args!("{child} failed: {reason}"));
         crate::log::error!(supervisor, child, tid, generation, restarts, waiting, reason, "a child failed");
     }
 

@@ -31,6 +31,8 @@ fn file_with(key: &str, value: &Value) -> String {
     let neighbour = match key {
         "gncl.redial_min_ms" => "redial_max_ms = 60000\n",
         "gncl.redial_max_ms" => "redial_min_ms = 1\n",
+        "record.keep_ms" => "after_ms = 1000\n",
+        "record.after_ms" => "keep_ms = 600000\n",
         _ => "",
     };
     let section = if section == "node" { String::new() } else { format!("[{section}]\n") };

@@ -1,0 +1,300 @@
+//! `sinew record fetch`: lists frozen spans, and writes a file for each node that has one.
+
+mod convert;
+mod dead;
+
+use std::{
+    collections::BTreeSet,
+    fs::{self, OpenOptions},
+    io::Write,
+    ops::RangeInclusive,
+    os::unix::fs::OpenOptionsExt as _,
+    path::{Path, PathBuf},
+};
+
+use clap::Args;
+use serde_json::json;
+use sinew::{
+    AppAddress, NodeAddress, Tid,
+    inspect::{AskFrozen, FrozenFacts, FrozenPart, FrozenReport, FrozenSpan},
+};
+
+use super::freeze::present;
+use crate::{
+    Report,
+    system::{System, SystemError, in_words},
+    table::{Table, clean, time},
+};
+use convert::{Converted, Source, convert, file_name};
+use dead::DeadRing;
+
+/// Maximum bytes of a frozen journal: the largest ring, and its table.
+const RING_BYTES_MAX: u64 = (4 << 30) + (1 << 20);
+/// Maximum bytes of the facts beside it.
+const FACTS_BYTES_MAX: u64 = 4 << 20;
+
+/// The arguments of `sinew record fetch`.
+#[derive(Debug, Args)]
+pub(crate) struct Order {
+    /// The ID of a span. Without it, and without --out: a list of all
+    id: Option<String>,
+    /// The folder for the files, by default the current one. Without an ID all spans are gathered
+    #[arg(long, short, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Replace files of these names
+    #[arg(long)]
+    force: bool,
+}
+
+/// A frozen span of a node.
+struct Frozen {
+    node: NodeAddress,
+    name: String,
+    span: FrozenSpan,
+}
+
+/// All that was found.
+#[derive(Default)]
+struct Found {
+    frozen: Vec<Frozen>,
+    dead: Vec<DeadRing>,
+    /// Nodes that have nothing to hand out, with the reason.
+    refused: Vec<String>,
+    /// Nodes that do not answer, and rings that cannot be read.
+    faults: Vec<String>,
+}
+
+/// Lists or gathers.
+pub(super) fn show(system: &mut System, order: &Order) -> Result<Report, SystemError> {
+    let mut found = find(system)?;
+    if order.id.is_none() && order.out.is_none() {
+        return Ok(listed(&found));
+    }
+    let ids: BTreeSet<String> = match &order.id {
+        Some(id) => BTreeSet::from([id.clone()]),
+        None => found.frozen.iter().map(|frozen| frozen.span.id.clone()).collect(),
+    };
+    if !found.frozen.iter().any(|frozen| ids.contains(&frozen.span.id)) {
+        let id = order.id.as_deref().unwrap_or("at all");
+        let why = format!("no node has a frozen span {id}; `sinew record fetch` lists them");
+        return Err(SystemError::Unknown(clean(&why)));
+    }
+    let out = order.out.clone().unwrap_or_else(|| PathBuf::from("."));
+    fs::create_dir_all(&out)
+        .map_err(|why| SystemError::Bag(format!("the folder {} cannot be made: {why}", out.display())))?;
+    let mut files = Vec::new();
+    for id in ids {
+        gather(system, &mut found, &id, (&out, order.force), &mut files);
+    }
+    Ok(gathered(&found, &files))
+}
+
+/// Asks all nodes, and looks for rings of dead nodes on this host.
+fn find(system: &mut System) -> Result<Found, SystemError> {
+    let here = system.here()?;
+    let mut found = Found::default();
+    for answer in system.ask_these::<AskFrozen, FrozenReport>(present(&here)) {
+        let node = answer.node;
+        match answer.result {
+            Err(why) => found.faults.push(format!("{node} {}: {why}", answer.name)),
+            Ok(FrozenReport { refused: Some(why), name, .. }) => {
+                found.refused.push(format!("{node} {name}: {why}"));
+            }
+            Ok(report) => {
+                if let Some(folder) = report.folder.as_deref().filter(|_| node == here.node) {
+                    found.dead = dead::rings(Path::new(folder), &here.project);
+                }
+                let frozen = |span| Frozen { node, name: report.name.clone(), span };
+                found.frozen.extend(report.spans.into_iter().map(frozen));
+            }
+        }
+    }
+    Ok(found)
+}
+
+/// Writes the files of one span.
+fn gather(
+    system: &mut System,
+    found: &mut Found,
+    id: &str,
+    (out, is_forced): (&Path, bool),
+    files: &mut Vec<Converted>,
+) {
+    let own = system.endpoint.tid().node;
+    let mut faults = Vec::new();
+    let mut times = None;
+    for Frozen { node, name, span } in found.frozen.iter().filter(|frozen| frozen.span.id == id) {
+        if *node == own && !span.has_died {
+            times = Some(span.begin_ns..=span.end_ns);
+        }
+        match fetch(system, *node, span, (out, is_forced)) {
+            Ok(file) => files.push(file),
+            Err(why) => faults.push(format!("{node} {name}: {why}")),
+        }
+    }
+    for ring in &found.dead {
+        match of_dead(ring, id, times.as_ref(), (out, is_forced)) {
+            Ok(file) => files.extend(file),
+            Err(why) => faults.push(format!("{}: {why}", ring.path.display())),
+        }
+    }
+    found.faults.extend(faults);
+}
+
+/// Fetches the span of a node.
+fn fetch(
+    system: &mut System,
+    node: NodeAddress,
+    span: &FrozenSpan,
+    (out, is_forced): (&Path, bool),
+) -> Result<Converted, SystemError> {
+    let mut bytes = Vec::new();
+    pull(system, node, (&span.id, FrozenPart::Facts), FACTS_BYTES_MAX, &mut bytes)?;
+    let facts: FrozenFacts = rmp_serde::from_slice(&bytes)
+        .map_err(|why| SystemError::Bag(format!("its names cannot be read: {why}")))?;
+    let part = out.join(format!(".{}", file_name(&node.to_string(), &span.id, "part")));
+    let converted = pull_ring(system, node, &span.id, &part).and_then(|()| {
+        let source = Source { ring: &part, facts, times: span.begin_ns..=span.end_ns, address: node };
+        let times = (!span.has_died).then_some((span.at_ns, span.bound_ns));
+        let file = out.join(file_name(&source.facts.report.name, &span.id, "mcap"));
+        convert(&source, times, file, is_forced)
+    });
+    // It is not needed any more.
+    let _ = fs::remove_file(&part);
+    let converted = converted?;
+    // Else its place is not given to another one.
+    let done = AskFrozen { id: Some(span.id.clone()), is_fetched: true, ..AskFrozen::default() };
+    let _ = ask(system, node, &done);
+    Ok(converted)
+}
+
+/// Writes the part of a dead node's ring that is within the span. `None` if it has no record of it.
+fn of_dead(
+    ring: &DeadRing,
+    id: &str,
+    times: Option<&RangeInclusive<u64>>,
+    (out, is_forced): (&Path, bool),
+) -> Result<Option<Converted>, SystemError> {
+    let Some(times) = times else { return Ok(None) };
+    let span =
+        sinew_recorder::Span::scan(&ring.path, times).map_err(|why| SystemError::Bag(why.to_string()))?;
+    if span.records == 0 {
+        return Ok(None);
+    }
+    let facts = ring.facts.clone();
+    let source = Source { ring: &ring.path, facts, times: times.clone(), address: ring.address };
+    let file = out.join(file_name(&ring.name, id, "mcap"));
+    convert(&source, None, file, is_forced).map(|file| Some(Converted { has_died: true, ..file }))
+}
+
+fn pull_ring(system: &mut System, node: NodeAddress, id: &str, to: &Path) -> Result<(), SystemError> {
+    let failed = |why| SystemError::Bag(format!("the file {} cannot be written: {why}", to.display()));
+    // One of a killed command may be there.
+    let _ = fs::remove_file(to);
+    let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(to);
+    pull(system, node, (id, FrozenPart::Ring), RING_BYTES_MAX, &mut file.map_err(failed)?)
+}
+
+/// Fetches a file in parts.
+fn pull(
+    system: &mut System,
+    node: NodeAddress,
+    (id, part): (&str, FrozenPart),
+    bytes_max: u64,
+    into: &mut impl Write,
+) -> Result<(), SystemError> {
+    let mut offset = 0;
+    loop {
+        let question = AskFrozen { id: Some(id.to_owned()), part, offset, is_fetched: false };
+        let report = ask(system, node, &question)?;
+        if report.length > bytes_max {
+            return Err(SystemError::Bag(format!("it names a file of {} bytes", report.length)));
+        }
+        if report.bytes.is_empty() {
+            return Ok(());
+        }
+        into.write_all(&report.bytes)
+            .map_err(|why| SystemError::Bag(format!("the file cannot be written: {why}")))?;
+        offset += report.bytes.len() as u64;
+        if offset >= report.length {
+            return Ok(());
+        }
+    }
+}
+
+fn ask(system: &mut System, node: NodeAddress, question: &AskFrozen) -> Result<FrozenReport, SystemError> {
+    let (to, within) = (Tid::new(node, AppAddress::INSPECT), system.within);
+    let answer: Result<FrozenReport, _> = system.endpoint.message(to, question).ask(within);
+    let report = answer.map_err(|error| SystemError::Bag(in_words(&error)))?;
+    match report.refused {
+        Some(why) => Err(SystemError::Bag(clean(&why))),
+        None => Ok(report),
+    }
+}
+
+fn listed(found: &Found) -> Report {
+    let mut table = Table::new(["ID", "NODE", "NAME", "SPAN", "BYTES", "FETCHED", "CAUSE"]).whole(&["ID"]);
+    let mut spans = Vec::new();
+    for Frozen { node, name, span } in &found.frozen {
+        let lasts = if span.has_died {
+            "the whole ring".to_owned()
+        } else {
+            time(span.end_ns.saturating_sub(span.begin_ns) / 1_000)
+        };
+        let fetched = if span.is_fetched { "yes" } else { "no" };
+        let cells = [
+            span.id.clone(),
+            node.to_string(),
+            name.clone(),
+            lasts,
+            span.bytes.to_string(),
+            fetched.to_owned(),
+            span.cause.clone(),
+        ];
+        table.row(cells);
+        spans.push(json!({
+            "id": span.id, "node": node.to_string(), "name": name, "cause": span.cause, "at_ns": span.at_ns,
+            "bound_ns": span.bound_ns, "begin_ns": span.begin_ns, "end_ns": span.end_ns, "bytes": span.bytes,
+            "has_died": span.has_died, "is_fetched": span.is_fetched,
+        }));
+    }
+    let mut text = if spans.is_empty() { "No node has a frozen span.\n".to_owned() } else { table.text() };
+    for ring in &found.dead {
+        text += &format!(
+            "{} at {} has died: {}; it is gathered with the spans of its time.\n",
+            clean(&ring.name),
+            ring.address,
+            ring.path.display()
+        );
+    }
+    text += &notes(found);
+    let dead: Vec<_> =
+        found.dead.iter().map(|ring| json!({ "name": ring.name, "path": ring.path })).collect();
+    let json = json!({ "spans": spans, "dead": dead, "refused": found.refused, "faults": found.faults });
+    Report { text, json, is_fine: found.faults.is_empty() }
+}
+
+fn gathered(found: &Found, files: &[Converted]) -> Report {
+    let mut text = String::new();
+    let mut json_files = Vec::new();
+    for file in files {
+        let died = if file.has_died { "; the node has died" } else { "" };
+        let name = clean(&file.file.display().to_string());
+        text += &format!(
+            "{name}: {} messages, {} dropped; {} of {}{died}\n",
+            file.written,
+            file.dropped,
+            time(file.last_ns.saturating_sub(file.first_ns) / 1_000),
+            clean(&file.node)
+        );
+        json_files.push(file.json());
+    }
+    text += &notes(found);
+    let json = json!({ "files": json_files, "refused": found.refused, "faults": found.faults });
+    Report { text, json, is_fine: found.faults.is_empty() && !files.is_empty() }
+}
+
+/// Returns a line for each node that has given nothing.
+fn notes(found: &Found) -> String {
+    found.refused.iter().chain(&found.faults).map(|line| clean(line) + "\n").collect()
+}
