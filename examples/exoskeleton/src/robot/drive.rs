@@ -157,7 +157,7 @@ impl Drive {
         let now = context.now();
         let gait = self.newest_command(now, context);
         // Central is known, but its commands do not count.
-        let is_shut = self.is_shut();
+        let is_shut = self.commands.as_ref().is_some_and(CentralCommands::is_shut);
         if is_shut {
             self.core.distrust_gait();
         }
