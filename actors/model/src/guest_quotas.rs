@@ -76,7 +76,7 @@ impl GuestQuotas {
             AppAddress::SYNC => (&self.sync, AT_SYNC_MAX, OF_USER_AT_SYNC),
             // The other node does not know the user: this one does.
             AppAddress::INSPECT if !is_here && OF_OWN_USERS.contains(&message.header.kind) => {
-                return Err(Refused::new(message, Rejection::Unsupported));
+                return Err(SubmitError::new(message, Rejection::Unsupported));
             }
             AppAddress::INSPECT if is_here => {
                 (&self.inspection, AT_INSPECTION_MAX, AT_INSPECTION_MAX / USERS)
