@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use sinew_model::{
     cause::Cause,
-    facts::{AppFact, NodeEvent, User},
+    facts::{AppFact, DeclaredTypes, NodeEvent, User},
     limits::EVENT_QUEUE_CAPACITY,
 };
 use sinew_runtime::{
@@ -116,6 +116,17 @@ pub fn set_member(state: &State, app: AppAddress, group: AppAddress, member: boo
     if registry.owner_of(app) == Some(Owner::Node) {
         set_registered_member(state, &registry, app, group, member);
     }
+}
+
+/// Publishes the structures of the types of `app`, one of the node's own. Returns whether one of these has the address,
+/// as in [`set_member`].
+pub fn types_known(state: &State, app: AppAddress, types: DeclaredTypes) -> bool {
+    let registry = lock(&state.registry);
+    let is_own = registry.owner_of(app) == Some(Owner::Node);
+    if is_own {
+        notify_sync(state, AppFact::Types { app, types });
+    }
+    is_own
 }
 
 /// Same as [`set_member`], for any application. The caller holds the registry's lock, and has checked that the

@@ -215,10 +215,16 @@ impl SyncManager {
         }
         let is_monitor_or_will =
             matches!(message.header.kind, Kind::SYNC_WATCH | Kind::SYNC_LIVES | Kind::SYNC_WILLS);
-        let is_audit = matches!(message.header.kind, Kind::SYNC_AUDIT_ASK | Kind::SYNC_AUDIT);
+        let handler = match message.header.kind {
+            Kind::SYNC_AUDIT_ASK | Kind::SYNC_AUDIT => Some(("audit", &self.state.audits)),
+            Kind::SYNC_SCHEMA_ASK | Kind::SYNC_SCHEMA | Kind::SYNC_MISMATCH => {
+                Some(("types", &self.state.types))
+            }
+            _ => None,
+        };
         if !matches!(message.header.kind, Kind::SYNC_DIRECTORY | Kind::SYNC_ARRIVALS)
             && !is_monitor_or_will
-            && !is_audit
+            && handler.is_none()
         {
             let kind = message.header.kind;
             self.refuse(
@@ -229,10 +235,10 @@ impl SyncManager {
         } else if app != AppAddress::SYNC || node == self.state.ctx.node {
             self.refuse("source", &format_args!("{node}/{app} is not the sync manager of another node"));
             message.reject(Rejection::ForgedSource);
-        } else if is_audit {
-            let received = self.state.audits.get().map_or(Ok(()), |audits| audits.receive(node, &message));
+        } else if let Some((cause, handler)) = handler {
+            let received = handler.get().map_or(Ok(()), |handler| handler.receive(node, &message));
             if let Err(fault) = received {
-                self.refuse("audit", &fault);
+                self.refuse(cause, &fault);
             }
             message.settle(Outcome::Delivered);
         } else if is_monitor_or_will {

@@ -35,6 +35,8 @@ pub struct State {
     pub wills: Mutex<wills::Core>,
     /// Handles audits, which travel to the sync manager's TID.
     pub audits: OnceLock<Arc<dyn FrameHandler>>,
+    /// Handles frames about the structures of types, which travel to the sync manager's TID.
+    pub types: OnceLock<Arc<dyn FrameHandler>>,
 }
 
 impl State {
@@ -47,6 +49,7 @@ impl State {
             monitors: Mutex::new(monitors::Core::new(node, incarnation, nodes_max, payload_max)),
             wills: Mutex::new(wills::Core::new(incarnation, nodes_max, payload_max)),
             audits: OnceLock::new(),
+            types: OnceLock::new(),
             ctx,
             security,
         })

@@ -84,6 +84,12 @@ impl Kind {
     pub const SYNC_AUDIT: Self = Self(0x35);
     /// The waiters at run-time barriers on a node, and the open generation of each barrier.
     pub const SYNC_ARRIVALS: Self = Self(0x36);
+    /// Requests the structure of a payload type.
+    pub const SYNC_SCHEMA_ASK: Self = Self(0x37);
+    /// The structure of a payload type.
+    pub const SYNC_SCHEMA: Self = Self(0x38);
+    /// A message was of a type that its receiver declared differently.
+    pub const SYNC_MISMATCH: Self = Self(0x39);
     /// A process requests a transport address.
     pub const LNCL_REGISTER: Self = Self(0x40);
     /// The assigned address.
