@@ -41,6 +41,7 @@ mod supervisor_spec;
 mod thread_placement;
 mod traffic;
 mod tree;
+mod types;
 
 /// Doors for fuzzers.
 #[cfg(feature = "fuzzing")]

@@ -21,7 +21,7 @@ use crate::{
     node::LAST_WORDS,
     process,
     root::{self, RootEvent},
-    security_setup,
+    security_setup, types,
 };
 
 /// Maximum number of waiting applications in the log line of the start.
@@ -125,6 +125,7 @@ impl NodeBuilder {
         }
         open_client_socket(&state)?;
         inspect::begin(&state)?;
+        types::begin(&state)?;
         state.recording.begin_configured(&state).map_err(|why| StartError::Record(why.to_string()))?;
         let (tree, heed_signals) = (self.tree, self.heed_signals);
         if heed_signals && handle.root.post(RootEvent::HeedSignals).is_err() {
