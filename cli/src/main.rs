@@ -19,6 +19,7 @@ mod output;
 mod ping;
 mod record;
 mod reload;
+mod schema;
 mod security;
 mod send;
 mod sockets;
@@ -125,6 +126,7 @@ fn run(arguments: &Arguments) -> Result<Report, SystemError> {
         }
         Command::Record(order) => inside(&|system| record::show(system, order)),
         Command::Why(order) => inside(&|system| why::show(system, order, arguments.wide)),
+        Command::Schema { name } => inside(&|system| schema::show(system, name)),
         Command::Barriers => inside(&|system| apps::barriers(system, arguments.wide)),
         Command::Audit => inside(&|system| audit::show(system, arguments.wide)),
         Command::Reload => inside(&reload::show),

@@ -24,9 +24,10 @@ use super::{
     answers::Answers,
     reach, record,
     reports::{
-        AskAccess, AskApps, AskAudit, AskGroups, AskNode, AskReach, AskRecord, AskReload, AskTree, AskWatch,
-        Report, WatchReport,
+        AskAccess, AskApps, AskAudit, AskGroups, AskMismatches, AskNode, AskReach, AskRecord, AskReload,
+        AskSchemas, AskTree, AskWatch, Report, WatchReport,
     },
+    types,
     watches::{Directions, GUESTS_WATCHES_MAX, NewTap, WATCHES_MAX, Watches},
 };
 use crate::NodeState;
@@ -133,6 +134,8 @@ fn answer(
         AskReload::KIND => {
             reply(answers, number, &question, |_, state| access::reloaded(state, readings, &question))
         }
+        AskSchemas::KIND => reply(answers, number, &question, |_, state| types::schemas(state, &question)),
+        AskMismatches::KIND => reply(answers, number, &question, |_, state| types::mismatches(state)),
         AskRecord::KIND => reply(answers, number, &question, |_, state| record::recorded(state, &question)),
         // spec: INSPECT-4
         _ => Err(Rejection::UnknownKind),

@@ -28,6 +28,7 @@ mod refused;
 mod reports;
 #[cfg(test)]
 mod tests;
+mod types;
 mod watches;
 
 pub(crate) use inspector::begin;
@@ -35,12 +36,13 @@ pub(crate) use inspector::begin;
 pub(crate) use record::recorded;
 pub use reports::{
     APPS_MAX, AccessReport, AccessVerdict, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskGroups,
-    AskNode, AskReach, AskRecord, AskReload, AskTree, AskWatch, AuditReport, BarrierReport,
-    CertificateReport, DialReport, ForeignReport, GroupReport, IdleReport, KindReport, LinkReport,
-    LostEchoReport, LostReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, REACHED_MAX, RECORDED_MAX,
-    ReachReport, Reached, RecordReport, RecordedApp, RecordedType, RefusalReport, ReloadReport, RouteReport,
-    SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage, SourceReport, StallReport, StreamReport, TREE_MAX,
-    TreeLine, TreeReport, TroubleReport, UnguardedReport, UnhandledReport, WaitReport, WatchReport,
+    AskMismatches, AskNode, AskReach, AskRecord, AskReload, AskSchemas, AskTree, AskWatch, AuditReport,
+    BarrierReport, CertificateReport, DialReport, ForeignReport, GroupReport, IdleReport, KindReport,
+    LinkReport, LostEchoReport, LostReport, MismatchReport, MismatchesReport, Missing, NodeReport, PEERS_MAX,
+    PeerReport, Ping, REACHED_MAX, RECORDED_MAX, ReachReport, Reached, RecordReport, RecordedApp,
+    RecordedType, RefusalReport, ReloadReport, RouteReport, SEEN_BYTES_MAX, SEEN_MAX, SchemaReport,
+    SchemasReport, SecurityReport, SeenMessage, SourceReport, StallReport, StreamReport, TREE_MAX, TreeLine,
+    TreeReport, TroubleReport, TypeUser, UnguardedReport, UnhandledReport, WaitReport, WatchReport,
 };
 pub use sinew_record::{PeerClock, Selection};
 

@@ -10,6 +10,7 @@ mod record;
 mod refused;
 mod security;
 mod tree;
+mod types;
 mod watch;
 
 pub use access::{AccessReport, AccessVerdict, AskAccess, AskReload, ReloadReport};
@@ -25,6 +26,9 @@ pub use record::{AskRecord, RECORDED_MAX, RecordReport, RecordedApp, RecordedTyp
 pub use refused::{LostEchoReport, RefusalReport, UnguardedReport, UnhandledReport};
 pub use security::{CertificateReport, SecurityReport};
 pub use tree::{AskTree, TREE_MAX, TreeLine, TreeReport};
+pub use types::{
+    AskMismatches, AskSchemas, MismatchReport, MismatchesReport, SchemaReport, SchemasReport, TypeUser,
+};
 pub use watch::{AskWatch, SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, WatchReport};
 
 use serde::{Deserialize, Serialize};

@@ -41,7 +41,7 @@ use tokio::sync::Notify;
 
 use self::{declared::Declared, frames::Frame};
 pub(crate) use self::{
-    reported::Reported,
+    reported::{Report, Reported},
     thread::begin,
     verdicts::{Disagreement, Verdicts},
 };
