@@ -105,7 +105,8 @@ fn text(name: &str, structures: &Structures, differences: &[Difference]) -> Stri
     let name = clean(name);
     let mut text = match structures.known.len() {
         0 if structures.unknown.is_empty() => format!(
-            "No application handles or has sent a type called `{name}`. `sinew apps --json` lists the types of each application.\n"
+            "No application handles or has sent a type called `{name}`. `sinew apps --json` lists the types of each \
+             application.\n"
         ),
         0 => format!("The structure of {name} is not known.\n"),
         1 => format!("{name} has one structure:\n"),

@@ -47,7 +47,7 @@ mod types;
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
 pub mod fuzzing {
-    pub use crate::{audit::fuzzing as audit, process::fuzzing as process};
+    pub use crate::{audit::fuzzing as audit, process::fuzzing as process, types::fuzzing as types};
 }
 
 pub use audits::AuditError;

@@ -69,7 +69,7 @@ impl Mismatch {
     }
 }
 
-/// The paths whose types differ.
+/// The paths with types that differ.
 pub struct Mismatches {
     paths: BTreeMap<TypedPath, Arc<Mismatch>>,
     /// Called on the sending thread at the first message of a path after [`Mismatch::take_notified`].

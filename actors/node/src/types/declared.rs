@@ -18,8 +18,8 @@ const TYPES_MAX: usize = 64;
 /// Prefix of the names of Sinew's own types. Layers send and handle them, and keep them compatible.
 const OWN_PREFIX: &str = "sinew.";
 
-/// The types of all applications, and those whose types the directory does not have yet. An entry is removed when its
-/// application is found to be unregistered.
+/// The types of all applications, and the applications with types that the directory does not have yet. An entry is
+/// removed when its application is found to be unregistered.
 #[derive(Debug, Default)]
 pub(super) struct Declared(Mutex<Table>);
 

@@ -59,7 +59,7 @@ impl Judgement {
     }
 }
 
-/// Returns the line of the log about messages of a type that differs: the reason, what happens to them, the remedy.
+/// Returns the line of the log about messages of a type that differs: their treatment, the reason, the remedy.
 /// Both ends are named with their nodes.
 pub(super) fn sentence(
     (source, target): (&str, &str),

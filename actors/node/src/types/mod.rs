@@ -11,13 +11,16 @@
 //! | --- | --- |
 //! | `declared.rs` | the types of this node's applications |
 //! | `judgement.rs` | the comparison of two structures, the policy, and the words for both |
-//! | `verdicts.rs` | all types that differ: what is missing, refused and logged |
-//! | `reported.rs` | what other nodes report of the messages of this node |
+//! | `verdicts.rs` | all types that differ: which are missing, refused and logged |
+//! | `reported.rs` | reports of other nodes on the messages of this node |
 //! | `frames.rs` | the frames between nodes |
 //! | `thread.rs` | the thread that does it |
 
 mod declared;
 mod frames;
+#[cfg(feature = "fuzzing")]
+#[doc(hidden)]
+pub mod fuzzing;
 mod judgement;
 mod reported;
 mod thread;

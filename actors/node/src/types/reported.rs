@@ -17,7 +17,7 @@ use super::{
 
 /// Maximum number of reports that are kept. The oldest one is removed for a further one.
 const REPORTS_MAX: usize = 256;
-/// Minimum time between two reports on one path. Other nodes send one a minute; their clocks and the way differ a little.
+/// Minimum time between two reports on one path. Other nodes send one a minute, and the way takes more or less time.
 const LOG_AGAIN: Duration = Duration::from_secs(50);
 
 /// The last report on each path.

@@ -79,8 +79,8 @@ impl Comparing {
         }
     }
 
-    /// Waits for a change of the directory, for new types or frames, or until `until`. Returns `false` when the node has
-    /// ended.
+    /// Waits for a change of the directory, for new types or frames, or until `until`. Returns `false` when the node
+    /// has ended.
     async fn wait(&mut self, until: Option<Time>) -> bool {
         let timer = async {
             match until {

@@ -48,7 +48,7 @@ pub(super) struct Sent {
 /// A structure to be requested from the node that has it.
 pub(super) type Wanted = (NodeAddress, TypeHash);
 
-/// The verdicts on all paths whose types differ: at most [`MISMATCHES_MAX`], and as many structures.
+/// The verdicts on all paths with types that differ: at most [`MISMATCHES_MAX`], and as many structures.
 #[derive(Debug, Default)]
 pub(crate) struct Verdicts {
     pairs: BTreeMap<TypedPath, Pair>,

@@ -49,7 +49,7 @@ const fn at(seconds: u64) -> Time {
     Time::from_nanos((1_000 + seconds) * 1_000_000_000)
 }
 
-/// A node whose routing table has the verdicts.
+/// A node that has the verdicts in its routing table.
 struct Bench {
     verdicts: Verdicts,
     router: Router,
@@ -64,7 +64,7 @@ impl MessageSink for Taken {
 }
 
 impl Bench {
-    /// Returns a node whose application handles `H`, after it has the structure `S` of the sender.
+    /// Returns a node with an application that handles `H`. The node has the structure `S` of the sender.
     fn of<S: Serialize + DeserializeOwned, H: Serialize + DeserializeOwned>() -> Self {
         let (mut verdicts, router) = (Verdicts::default(), Router::new(HERE));
         router.set_local(KNEE, LocalRoute { sink: Arc::new(Taken), events: Arc::new([]) });
