@@ -118,15 +118,13 @@ pub fn set_member(state: &State, app: AppAddress, group: AppAddress, member: boo
     }
 }
 
-/// Publishes the structures of the types of `app`, one of the node's own. Returns whether one of these has the address,
+/// Publishes the structures of the types of `app`, one of the node's own. Has no effect if none of these has the address,
 /// as in [`set_member`].
-pub fn types_known(state: &State, app: AppAddress, types: DeclaredTypes) -> bool {
+pub fn types_known(state: &State, app: AppAddress, types: DeclaredTypes) {
     let registry = lock(&state.registry);
-    let is_own = registry.owner_of(app) == Some(Owner::Node);
-    if is_own {
+    if registry.owner_of(app) == Some(Owner::Node) {
         notify_sync(state, AppFact::Types { app, types });
     }
-    is_own
 }
 
 /// Same as [`set_member`], for any application. The caller holds the registry's lock, and has checked that the

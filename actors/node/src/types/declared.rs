@@ -18,8 +18,7 @@ const TYPES_MAX: usize = 64;
 /// Prefix of the names of Sinew's own types. Layers send and handle them, and keep them compatible.
 const OWN_PREFIX: &str = "sinew.";
 
-/// The types of all applications, and the applications with types that the directory does not have yet. An entry is
-/// removed when its application is found to be unregistered.
+/// The types of all applications, and the applications with types that the directory does not have yet.
 #[derive(Debug, Default)]
 pub(super) struct Declared(Mutex<Table>);
 
@@ -65,12 +64,11 @@ impl Declared {
         changed.into_iter().filter_map(|app| Some((app, table.apps.get(&app)?.clone()))).collect()
     }
 
-    /// Removes an application that is not registered, unless a later one has its address and was not published yet.
+    /// Removes an application that is not registered.
     pub(super) fn forget(&self, app: AppAddress) {
         let mut table = lock(&self.0);
-        if !table.changed.contains(&app) {
-            table.apps.remove(&app);
-        }
+        table.apps.remove(&app);
+        table.changed.remove(&app);
     }
 
     /// Returns the type of this kind that the application handles.

@@ -76,6 +76,11 @@ impl Types {
         }
     }
 
+    /// Removes the types of an application that is not registered any more.
+    pub(crate) fn unregister(&self, app: AppAddress) {
+        self.declared.forget(app);
+    }
+
     /// Records that an application sends a type. It is called on the sending thread, once for each type.
     pub(crate) fn sends(&self, app: AppAddress, sent: PayloadType) {
         if self.declared.sends(app, sent) {

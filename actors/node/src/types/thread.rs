@@ -6,6 +6,7 @@
 
 use std::{
     io,
+    panic::{AssertUnwindSafe, catch_unwind},
     sync::{Arc, Weak, atomic::Ordering},
     thread,
     time::Duration,
@@ -73,7 +74,11 @@ impl Comparing {
             if state.types.is_closed.load(Ordering::Acquire) {
                 return;
             }
-            next = self.step(&state);
+            let step = AssertUnwindSafe(|| self.step(&state));
+            next = catch_unwind(step).unwrap_or_else(|_| {
+                log::error!("the comparison of types panicked; it continues with the next change");
+                None
+            });
             drop(state);
             thread::sleep(PAUSE);
         }
@@ -140,8 +145,9 @@ impl Comparing {
 fn publish(state: &NodeState) {
     for (app, types) in state.types.declared.take_changed() {
         let types = types.hashes();
-        if !types.is_empty() && !sinew_lncl::types_known(&state.lncl, app, types) {
-            state.types.declared.forget(app);
+        if !types.is_empty() {
+            // An application that has ended meanwhile has no entry in the directory.
+            sinew_lncl::types_known(&state.lncl, app, types);
         }
     }
 }
