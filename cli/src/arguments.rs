@@ -116,8 +116,7 @@ pub(crate) enum Command {
     Why(why::Order),
     /// Shows the structure of a payload type, for each version of it with the applications that have it
     ///
-    /// All nodes are asked. Where an application sends a version that another one handles in another version, the
-    /// differences are shown in words.
+    /// All nodes are asked. Differences between a version that is sent and one that is handled are shown in words.
     #[command(after_help = r#"Examples:
   sinew schema demo.angle
   sinew schema demo.angle --json | jq '.structures[].hash'"#)]
