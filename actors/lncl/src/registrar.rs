@@ -118,8 +118,8 @@ pub fn set_member(state: &State, app: AppAddress, group: AppAddress, member: boo
     }
 }
 
-/// Publishes the structures of the types of `app`, one of the node's own. Has no effect if none of these has the address,
-/// as in [`set_member`].
+/// Publishes the structures of the types of `app`, one of the node's own. Has no effect if none of these has the
+/// address, as in [`set_member`].
 pub fn types_known(state: &State, app: AppAddress, types: DeclaredTypes) {
     let registry = lock(&state.registry);
     if registry.owner_of(app) == Some(Owner::Node) {

@@ -70,10 +70,8 @@ pub(crate) struct Types {
 impl Types {
     /// Records the types of an application that was registered.
     pub(crate) fn register(&self, app: AppAddress, handles: &[PayloadType], sends: &[PayloadType]) {
-        if !(handles.is_empty() && sends.is_empty()) {
-            self.declared.register(app, handles, sends);
-            self.wake.notify_one();
-        }
+        self.declared.register(app, handles, sends);
+        self.wake.notify_one();
     }
 
     /// Removes the types of an application that is not registered any more.

@@ -274,3 +274,6 @@ fn send<T: Serialize>(state: &NodeState, to: NodeAddress, kind: Kind, frame: &T)
     header.sent = Time::now();
     state.ctx.router.send(Message::new(header, encode(frame)))
 }
+
+#[cfg(test)]
+mod tests;
