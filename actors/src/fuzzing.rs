@@ -69,13 +69,14 @@ pub fn control(bytes: &[u8]) -> bool {
 #[must_use]
 pub fn words(bytes: &[u8]) -> bool {
     let Some((which, bytes)) = bytes.split_first() else { return false };
-    let readers: [fn(&[u8]) -> bool; 6] = [
+    let readers: [fn(&[u8]) -> bool; 7] = [
         sinew_sync::fuzzing::frames,
         sinew_sync::monitors::fuzzing::frames,
         sinew_sync::wills::fuzzing::frames,
         sinew_node::fuzzing::audit::frames,
         sinew_node::fuzzing::process::frames,
         sinew_session::outlet::fuzzing::words,
+        sinew_node::fuzzing::types::frames,
     ];
     readers[usize::from(*which) % readers.len()](bytes)
 }
@@ -102,6 +103,7 @@ pub fn seeds(format: &str) -> Vec<Vec<u8>> {
                 sinew_node::fuzzing::audit::sent_frames(),
                 sinew_node::fuzzing::process::sent_frames(),
                 sinew_session::outlet::fuzzing::said(),
+                sinew_node::fuzzing::types::sent_frames(),
             ];
             let numbered = samples.into_iter().zip(0_u8..);
             numbered

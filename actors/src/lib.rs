@@ -73,7 +73,7 @@ pub use app::{AppContext, AppSpec, Delivery};
 #[doc(no_inline)]
 pub use config::NodeConfig;
 #[doc(no_inline)]
-pub use message::{Class, Outcome, Payload};
+pub use message::{Class, MismatchPolicy, Outcome, Payload};
 #[doc(no_inline)]
 pub use node::{Node, NodeBuilder, NodeHandle, StartError};
 pub use serde;
@@ -156,7 +156,7 @@ pub mod message {
             AskError, Confirmation, Destination, GroupConfirmation, Reply, SendError, Sender,
             UnknownNameError,
         },
-        wire::{Class, Kind, MessageBuffer, Payload, TIME_TO_LIVE_MAX},
+        wire::{Class, Kind, MessageBuffer, MismatchPolicy, Payload, TIME_TO_LIVE_MAX},
     };
 }
 

@@ -130,6 +130,16 @@ pub(crate) enum Command {
   sinew why gait knee.drive
   sinew why gait drives                       each member of a group"#)]
     Why(why::Order),
+    /// Shows the structure of a payload type, for each version of it with the applications that have it
+    ///
+    /// All nodes are asked. Differences between a version that is sent and one that is handled are shown in words.
+    #[command(after_help = r#"Examples:
+  sinew schema demo.angle
+  sinew schema demo.angle --json | jq '.structures[].hash'"#)]
+    Schema {
+        /// The name of the type, as in `payload!`
+        name: String,
+    },
     /// Shows which applications wait at barriers, and which ones they wait for
     #[command(after_help = r#"Examples:
   sinew barriers

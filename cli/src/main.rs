@@ -21,6 +21,7 @@ mod ping;
 mod play;
 mod record;
 mod reload;
+mod schema;
 mod security;
 mod send;
 mod sockets;
@@ -128,6 +129,7 @@ fn run(arguments: &Arguments) -> Result<Report, SystemError> {
         Command::Play(order) => play::show(order, arguments),
         Command::Record(order) => inside(&|system| record::show(system, order)),
         Command::Why(order) => inside(&|system| why::show(system, order, arguments.wide)),
+        Command::Schema { name } => inside(&|system| schema::show(system, name)),
         Command::Barriers => inside(&|system| apps::barriers(system, arguments.wide)),
         Command::Audit => inside(&|system| audit::show(system, arguments.wide)),
         Command::Reload => inside(&reload::show),

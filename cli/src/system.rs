@@ -247,6 +247,20 @@ impl System {
         self.ask_these::<Q, R>(all(here))
     }
 
+    /// Asks this node and all nodes that it knows the same question, one after the other.
+    pub(crate) fn ask_one_by_one<Q: Payload, R: Payload>(
+        &mut self,
+        here: &NodeReport,
+        question: &Q,
+    ) -> Vec<Answer<R>> {
+        let within = self.within;
+        let mut ask_one = |node| {
+            let to = Tid::new(node, AppAddress::INSPECT);
+            self.endpoint.message(to, question).ask::<R>(within).map_err(|error| in_words(&error))
+        };
+        all(here).into_iter().map(|(node, name)| Answer { node, name, result: ask_one(node) }).collect()
+    }
+
     /// Asks these nodes; the answers are in the order of their addresses.
     pub(crate) fn ask_these<Q, R>(&mut self, nodes: Vec<(NodeAddress, String)>) -> Vec<Answer<R>>
     where

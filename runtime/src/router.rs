@@ -5,6 +5,7 @@ mod copies;
 mod each;
 mod groups;
 pub mod guard;
+pub mod mismatches;
 mod run;
 mod sink;
 pub mod tap;
@@ -27,7 +28,8 @@ use self::{
     copies::Copies,
     each::OpenSends,
     groups::{Groups, Joined},
-    guard::Guard,
+    guard::{Guard, why_refused},
+    mismatches::Mismatches,
     tap::{TAPS, Tap},
 };
 use crate::{
@@ -53,6 +55,8 @@ struct Table {
     tap: Option<Arc<dyn Tap>>,
     /// The access check for this node's applications; `None`: no restriction.
     guard: Option<Arc<dyn Guard>>,
+    /// The types that their senders and receivers declared differently, usually none.
+    mismatches: Option<Arc<Mismatches>>,
     local: BTreeMap<AppAddress, LocalRoute>,
     peers: BTreeMap<NodeAddress, Arc<dyn MessageSink>>,
 }
@@ -260,8 +264,8 @@ impl Router {
         let Some(route) = table.local.get(&message.header.destination.app) else {
             return Err(SubmitError::new(message, Rejection::NoSuchApplication));
         };
-        let Some(tap) = &table.tap else { return offer_to(route, table.guard.as_ref(), message, room) };
-        tap::hand_over(&**tap, message, true, |message| offer_to(route, table.guard.as_ref(), message, room))
+        let Some(tap) = &table.tap else { return offer_to(table, route, message, room) };
+        tap::hand_over(&**tap, message, true, |message| offer_to(table, route, message, room))
     }
 
     /// Cancels this request, from here or from another node, as its reply is no longer awaited; see
@@ -415,11 +419,8 @@ impl Router {
             if is_sender {
                 return;
             }
-            let refused = if guard::refuses(guard, member, &message.header) {
-                Some(Rejection::NotAllowed)
-            } else {
-                sink.submit(copy_of(message)).err().map(|refused| refused.why)
-            };
+            let refused = why_refused(&snapshot.table, guard, member, &message.header)
+                .or_else(|| sink.submit(copy_of(message)).err().map(|refused| refused.why));
             tap::saw_one_of_many(snapshot.table.tap.as_ref(), Tid::new(here, member), message, refused);
             copies.note(refused);
         });
@@ -450,33 +451,36 @@ fn for_each_here(
 #[inline]
 fn submit_here(table: &Table, guard: Judge<'_>, message: Message) -> Result<(), SubmitError> {
     let route = table.local.get(&message.header.destination.app);
-    let Some(tap) = &table.tap else { return submit_by(route, guard, message) };
-    tap::hand_over(&**tap, message, false, |message| submit_by(route, guard, message))
+    let Some(tap) = &table.tap else { return submit_by(table, route, guard, message) };
+    tap::hand_over(&**tap, message, false, |message| submit_by(table, route, guard, message))
 }
 
 #[inline]
-fn submit_by(route: Option<&LocalRoute>, guard: Judge<'_>, message: Message) -> Result<(), SubmitError> {
-    match route {
-        Some(_) if guard::refuses(guard, message.header.destination.app, &message.header) => {
-            Err(SubmitError::new(message, Rejection::NotAllowed))
-        }
-        Some(route) => route.sink.submit(message),
-        None => Err(SubmitError::new(message, Rejection::NoSuchApplication)),
+fn submit_by(
+    table: &Table,
+    route: Option<&LocalRoute>,
+    guard: Judge<'_>,
+    message: Message,
+) -> Result<(), SubmitError> {
+    let Some(route) = route else { return Err(SubmitError::new(message, Rejection::NoSuchApplication)) };
+    match why_refused(table, guard, message.header.destination.app, &message.header) {
+        Some(why) => Err(SubmitError::new(message, why)),
+        None => route.sink.submit(message),
     }
 }
 
 /// Offers a message to an application of this node, if the guard allows it.
 #[inline]
 fn offer_to(
+    table: &Table,
     route: &LocalRoute,
-    guard: Judge<'_>,
     message: Message,
     room: Option<&Waker>,
 ) -> Result<(), SubmitError> {
-    if guard::refuses(guard, message.header.destination.app, &message.header) {
-        return Err(SubmitError::new(message, Rejection::NotAllowed));
+    match why_refused(table, table.guard.as_ref(), message.header.destination.app, &message.header) {
+        Some(why) => Err(SubmitError::new(message, why)),
+        None => route.sink.offer(message, room),
     }
-    route.sink.offer(message, room)
 }
 
 /// Submits a message to another node.

@@ -6,6 +6,7 @@ mod destination;
 mod directory;
 mod expecting;
 mod reply;
+mod sent_types;
 mod unknown_name;
 
 use std::{
@@ -19,6 +20,7 @@ use std::{
 use bytes::Bytes;
 
 pub(crate) use self::builder::{Content, Via};
+use self::sent_types::SentTypes;
 pub use self::{
     awaiting::{Confirmation, GroupConfirmation, Reply},
     builder::{MessageBuilder, Value},
@@ -37,7 +39,9 @@ use crate::{
     supervision::liveness::Liveness,
     tid::{AppAddress, Tid},
     time::Time,
-    wire::{Class, DecodeError, Header, Kind, Message, MessageBuffer, Payload, encode},
+    wire::{
+        Class, DecodeError, Header, Kind, Message, MessageBuffer, Payload, PayloadType, encode, remember,
+    },
 };
 
 /// Maximum number of messages that one process can send in its lifetime: twelve days at a million a second.
@@ -149,6 +153,8 @@ struct Shared {
     pending: Arc<Pending>,
     sequence: AtomicU64,
     payload_max: usize,
+    /// The types that the directory knows as sent.
+    sent_types: SentTypes,
 }
 
 impl std::fmt::Debug for Sender {
@@ -169,7 +175,15 @@ impl Sender {
     ) -> Self {
         let sequence = AtomicU64::new(0);
         let flows = Arc::new(Flows::new(router.clock().now()));
-        let shared = Arc::new(Shared { tid, router, directory, pending, sequence, payload_max });
+        let shared = Arc::new(Shared {
+            tid,
+            router,
+            directory,
+            pending,
+            sequence,
+            payload_max,
+            sent_types: SentTypes::default(),
+        });
         Self { shared, incarnation: None, flows }
     }
 
@@ -404,8 +418,9 @@ impl Sender {
     /// Builds a message of the value, in its envelope if its type is protected.
     fn typed<P: Payload>(&self, destination: Destination<'_>, value: &P) -> Result<Message, SendError> {
         let destination = self.find(destination)?;
+        self.note_type::<P>();
         if P::PROTECTION.is_none() {
-            return Ok(Message::of_type::<P>(self.shared.tid, destination, encode(value)));
+            return Ok(Message::of_remembered::<P>(self.shared.tid, destination, encode(value)));
         }
         let receiver = self.shared.router.absolute(destination);
         if !receiver.is_single() {
@@ -414,7 +429,24 @@ impl Sender {
         }
         let payload = self.flows.seal(self.shared.tid, receiver, value, self.now());
         let payload = payload.ok_or(SendError::TooManyProtectedFlows)?;
-        Ok(Message::of_type::<P>(self.shared.tid, destination, payload))
+        Ok(Message::of_remembered::<P>(self.shared.tid, destination, payload))
+    }
+
+    /// Reports the type to the directory before the first message of it. Later it costs one load and a branch.
+    #[inline]
+    fn note_type<P: Payload>(&self) {
+        if let Some(sent) = remember::<P>()
+            && !self.shared.sent_types.contains(sent)
+        {
+            self.report_type(sent);
+        }
+    }
+
+    #[cold]
+    fn report_type(&self, sent: PayloadType) {
+        if self.shared.sent_types.insert(sent) {
+            self.shared.directory.sends(self.shared.tid.app, sent);
+        }
     }
 
     /// Returns the TID with the address of its node filled in.

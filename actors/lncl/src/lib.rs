@@ -70,7 +70,7 @@ pub use core::{Owner, Registry};
 pub use listener::{ListenError, SocketAccess};
 pub use reader::Reader;
 pub use registrar::{
-    LocalApp, app_down, app_ready, app_stopped, nearest, register_local, resolve, set_member,
+    LocalApp, app_down, app_ready, app_stopped, nearest, register_local, resolve, set_member, types_known,
     unregister_local,
 };
 pub use state::State;

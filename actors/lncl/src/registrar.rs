@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use sinew_model::{
     cause::Cause,
-    facts::{AppFact, NodeEvent, User},
+    facts::{AppFact, DeclaredTypes, NodeEvent, User},
     limits::EVENT_QUEUE_CAPACITY,
 };
 use sinew_runtime::{
@@ -115,6 +115,15 @@ pub fn set_member(state: &State, app: AppAddress, group: AppAddress, member: boo
     let registry = lock(&state.registry);
     if registry.owner_of(app) == Some(Owner::Node) {
         set_registered_member(state, &registry, app, group, member);
+    }
+}
+
+/// Publishes the structures of the types of `app`, one of the node's own. Has no effect if none of these has the
+/// address, as in [`set_member`].
+pub fn types_known(state: &State, app: AppAddress, types: DeclaredTypes) {
+    let registry = lock(&state.registry);
+    if registry.owner_of(app) == Some(Owner::Node) {
+        notify_sync(state, AppFact::Types { app, types });
     }
 }
 

@@ -15,8 +15,8 @@ use crate::{
 };
 
 /// Maximum number of pending facts per application: the end of the former incarnation, the start of the
-/// present one, its kinds, and its last failure and readiness.
-const PER_APP_MAX: usize = 5;
+/// present one, its kinds, the structures of its types, and its last failure and readiness.
+const PER_APP_MAX: usize = 6;
 
 /// The backlogs of both layers. They outlive the layers.
 #[derive(Debug)]
@@ -45,6 +45,7 @@ impl CoalescingRules for Reader {
         match fact {
             AppFact::Registered { app, .. }
             | AppFact::Handles { app, .. }
+            | AppFact::Types { app, .. }
             | AppFact::Ready { app }
             | AppFact::Down { app }
             | AppFact::Stopped { app }
@@ -59,7 +60,7 @@ impl CoalescingRules for Reader {
             (_, AppFact::Unregistered { .. })
             | (Self::Ndl, AppFact::Down { .. } | AppFact::Stopped { .. }) => Role::Ends(()),
             (Self::Sync, AppFact::Ready { .. } | AppFact::Down { .. } | AppFact::Stopped { .. })
-            | (_, AppFact::Handles { .. })
+            | (_, AppFact::Handles { .. } | AppFact::Types { .. })
             | (Self::Ndl, AppFact::Registered { .. }) => Role::Changes,
             (_, AppFact::GroupsChanged) => Role::Standalone,
         }
@@ -75,6 +76,7 @@ impl CoalescingRules for Reader {
             }
             AppFact::Ready { .. } => matches!(former, AppFact::Ready { .. }),
             AppFact::Handles { .. } => matches!(former, AppFact::Handles { .. }),
+            AppFact::Types { .. } => matches!(former, AppFact::Types { .. }),
             AppFact::GroupsChanged => matches!(former, AppFact::GroupsChanged),
             AppFact::Registered { .. } | AppFact::Unregistered { .. } => false,
         }

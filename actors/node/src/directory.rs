@@ -8,6 +8,7 @@ use sinew_runtime::{
     sender::Directory,
     tid::{AppAddress, Tid},
     time::Time,
+    wire::PayloadType,
 };
 use sinew_sync::monitors;
 
@@ -34,6 +35,10 @@ impl Directory for NodeDirectory {
 
     fn demonitor(&self, watcher: AppAddress, monitor: MonitorId) -> bool {
         monitors::change(&self.0.sync, |core| core.demonitor(Time::now(), watcher, monitor))
+    }
+
+    fn sends(&self, app: AppAddress, sent: PayloadType) {
+        self.0.types.sends(app, sent);
     }
 
     fn set_member(&self, app: AppAddress, group: AppAddress, member: bool) {

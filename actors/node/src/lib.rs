@@ -42,12 +42,13 @@ mod supervisor_spec;
 mod thread_placement;
 mod traffic;
 mod tree;
+mod types;
 
 /// Doors for fuzzers.
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
 pub mod fuzzing {
-    pub use crate::{audit::fuzzing as audit, process::fuzzing as process};
+    pub use crate::{audit::fuzzing as audit, process::fuzzing as process, types::fuzzing as types};
 }
 
 pub use audits::AuditError;

@@ -12,7 +12,10 @@ use sinew_security::SecurityState;
 
 use super::recording::{Recording, Triggers};
 use super::root::{RootEvent, RootQueue};
-use crate::audit;
+use crate::{
+    audit,
+    types::{self, Types},
+};
 
 /// The state of a node. The root owns it, and lends its parts to each new instance of a layer.
 pub(crate) struct NodeState {
@@ -32,6 +35,8 @@ pub(crate) struct NodeState {
     pub(crate) sync: Arc<sinew_sync::State>,
     /// The audit questions that this node has sent, and those that it has received.
     pub(crate) questions: audit::Questions,
+    /// The payload types of its applications, and the comparison with those of other nodes.
+    pub(crate) types: Types,
     /// The recording of its messages.
     pub(crate) recording: Recording,
 }
@@ -55,6 +60,7 @@ impl NodeState {
             ndl,
             sync,
             questions: audit::Questions::default(),
+            types: Types::default(),
             recording: Recording::default(),
         });
         state.connect();
@@ -73,6 +79,8 @@ impl NodeState {
         // They are set once, here.
         let _ = self.sync.audits.set(audits);
         let _ = self.sync.triggers.set(Arc::new(Triggers(Arc::downgrade(self))));
+        let types = Arc::new(types::Frames(Arc::downgrade(self)));
+        let _ = self.sync.types.set(types);
     }
 
     /// Releases the node's socket and its address for inspection, so that another node can use them even if a
@@ -81,6 +89,7 @@ impl NodeState {
         self.lncl.client_socket.close();
         self.ctx.router.remove_local(AppAddress::INSPECT);
         self.recording.close(self);
+        self.types.close();
         self.gncl.store.close();
         self.gncl.store.end_threads();
         lock(&self.ndl.sockets).close_all();

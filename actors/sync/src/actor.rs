@@ -215,12 +215,17 @@ impl SyncManager {
         }
         let is_monitor_or_will =
             matches!(message.header.kind, Kind::SYNC_WATCH | Kind::SYNC_LIVES | Kind::SYNC_WILLS);
-        let is_audit = matches!(message.header.kind, Kind::SYNC_AUDIT_ASK | Kind::SYNC_AUDIT);
-        let is_trigger = message.header.kind == Kind::SYNC_FREEZE;
+        let handler = match message.header.kind {
+            Kind::SYNC_AUDIT_ASK | Kind::SYNC_AUDIT => Some(("audit", &self.state.audits)),
+            Kind::SYNC_FREEZE => Some(("trigger", &self.state.triggers)),
+            Kind::SYNC_SCHEMA_ASK | Kind::SYNC_SCHEMA | Kind::SYNC_MISMATCH => {
+                Some(("types", &self.state.types))
+            }
+            _ => None,
+        };
         if !matches!(message.header.kind, Kind::SYNC_DIRECTORY | Kind::SYNC_ARRIVALS)
             && !is_monitor_or_will
-            && !is_audit
-            && !is_trigger
+            && handler.is_none()
         {
             let kind = message.header.kind;
             self.refuse(
@@ -231,10 +236,9 @@ impl SyncManager {
         } else if app != AppAddress::SYNC || node == self.state.ctx.node {
             self.refuse("source", &format_args!("{node}/{app} is not the sync manager of another node"));
             message.reject(Rejection::ForgedSource);
-        } else if is_audit || is_trigger {
-            let (handler, cause) =
-                if is_audit { (&self.state.audits, "audit") } else { (&self.state.triggers, "trigger") };
-            if let Some(Err(fault)) = handler.get().map(|handler| handler.receive(node, &message)) {
+        } else if let Some((cause, handler)) = handler {
+            let received = handler.get().map_or(Ok(()), |handler| handler.receive(node, &message));
+            if let Err(fault) = received {
                 self.refuse(cause, &fault);
             }
             message.settle(Outcome::Delivered);

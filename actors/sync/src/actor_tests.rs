@@ -120,6 +120,8 @@ impl Bench {
             phases: Vec::new(),
             requires: Vec::new(),
             kinds: Vec::new(),
+            handles: Vec::new(),
+            sends: Vec::new(),
         };
         let list = List { incarnation: INCARNATION, version, entries: vec![entry], groups: Vec::new() };
         let from = Tid::new(KNEE, AppAddress::SYNC);

@@ -20,6 +20,8 @@ pub fn sent_frames() -> Vec<Vec<u8>> {
         phases: vec![name("calibrated")],
         requires: Vec::new(),
         kinds: Vec::new(),
+        handles: Vec::new(),
+        sends: Vec::new(),
     };
     let list = List { incarnation: Incarnation(1), version: 2, entries: vec![entry], groups: Vec::new() };
     let arrivals = Arrivals { incarnation: Incarnation(1), version: 2, barriers: Vec::new() };

@@ -1,9 +1,12 @@
-//! An application of this node, as a tool displays it.
+//! Applications, as tools and the comparison of types read them.
 
 use std::time::Duration;
 
-use sinew_model::directory::Absence;
-use sinew_runtime::{tid::AppAddress, wire::Kind};
+use sinew_model::{directory::Absence, facts::DeclaredTypes};
+use sinew_runtime::{
+    tid::{AppAddress, Tid},
+    wire::Kind,
+};
 
 /// An application of this node, as a tool displays it.
 pub struct OwnApp {
@@ -21,4 +24,15 @@ pub struct OwnApp {
     pub ended: Option<&'static str>,
     /// The payloads that the application handles, as far as it reports them.
     pub kinds: Vec<Kind>,
+}
+
+/// The declared types of an application of any node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct AppTypes {
+    /// The application's address.
+    pub tid: Tid,
+    /// The application's name, or its address if it has none.
+    pub name: String,
+    /// The types.
+    pub types: DeclaredTypes,
 }

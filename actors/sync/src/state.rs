@@ -37,6 +37,8 @@ pub struct State {
     pub audits: OnceLock<Arc<dyn FrameHandler>>,
     /// Handles the triggers of recordings, which travel to the sync manager's TID.
     pub triggers: OnceLock<Arc<dyn FrameHandler>>,
+    /// Handles frames about the structures of types, which travel to the sync manager's TID.
+    pub types: OnceLock<Arc<dyn FrameHandler>>,
 }
 
 impl State {
@@ -50,6 +52,7 @@ impl State {
             wills: Mutex::new(wills::Core::new(incarnation, nodes_max, payload_max)),
             audits: OnceLock::new(),
             triggers: OnceLock::new(),
+            types: OnceLock::new(),
             ctx,
             security,
         })

@@ -1,6 +1,7 @@
 //! Collects the reports of all nodes that can be asked, through every accessible socket of this host.
 
 mod many;
+mod mismatches;
 
 use std::{collections::BTreeMap, time::Duration};
 
@@ -170,6 +171,7 @@ impl<'a> Collected<'a> {
         let apps = self.nodes.iter().flat_map(Queried::named_apps).filter_map(|app| app.name.clone());
         let names = apps.chain(self.nodes.iter().map(|asked| asked.name.clone())).collect();
         let streams = [self.stream(found[0].at, found[1].node), self.stream(found[1].at, found[0].node)];
+        let mismatches = self.mismatches(&found);
         let many = self.many(wanted, &found);
         let by_groups = [
             self.by_groups(access[0].as_ref(), (&found[0], &found[1])),
@@ -181,6 +183,7 @@ impl<'a> Collected<'a> {
             streams,
             access,
             by_groups,
+            mismatches,
             many,
             waits,
             lacked,

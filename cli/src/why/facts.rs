@@ -6,7 +6,8 @@ use sinew::{
     AppAddress, NodeAddress, Tid,
     audit::Account,
     inspect::{
-        AccessReport, AccessVerdict, AppReport, Missing, NodeReport, PeerReport, StreamReport, TreeLine,
+        AccessReport, AccessVerdict, AppReport, MismatchReport, Missing, NodeReport, PeerReport,
+        StreamReport, TreeLine,
     },
 };
 
@@ -28,6 +29,8 @@ pub(super) struct Facts {
     /// The groups for which the verdict of the second's node differs from that on direct messages of the first, and
     /// back; each as written.
     pub(super) by_groups: [Vec<Member>; 2],
+    /// The types that one of the two sends and the other handles in another version.
+    pub(super) mismatches: Vec<MismatchReport>,
     /// Set if one of the two is many.
     pub(super) many: Option<Many>,
     /// Sockets of this host that accept no connection, with the reason.

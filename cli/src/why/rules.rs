@@ -15,6 +15,7 @@ mod types;
 mod unfound;
 mod unnamed;
 mod version;
+mod versions;
 
 use std::collections::BTreeSet;
 
@@ -86,6 +87,8 @@ pub(super) fn judge(facts: &Facts) -> Vec<Step> {
     steps.direct(b, a);
     steps.handled((a, b), true);
     steps.handled((b, a), false);
+    steps.versions((a, b), &facts.mismatches, true);
+    steps.versions((b, a), &facts.mismatches, false);
     steps.guarded(a, b);
     steps.access(a, b, facts);
     steps.by_groups(a, b, facts);

@@ -8,7 +8,7 @@ use std::{
 use crate::scenario::{Answer, Scenario};
 
 /// One invocation of each command that ends by itself, for a node called `hip`.
-const COMMANDS: [&[&str]; 17] = [
+const COMMANDS: [&[&str]; 18] = [
     &["--help"],
     &["--version"],
     &["watch", "--help"],
@@ -23,6 +23,7 @@ const COMMANDS: [&[&str]; 17] = [
     &["send", "hip", "demo.nothing", "{}"],
     &["watch", "hip", "--json"],
     &["why", "hip", "hip"],
+    &["schema", "demo.nothing"],
     &["barriers"],
     &["audit"],
     &["doctor"],

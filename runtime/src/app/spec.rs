@@ -1,13 +1,14 @@
 //! The declaration of an application, which a node needs to start it.
 
+mod dyn_app;
+
 use std::{sync::Arc, time::Duration};
 
 use actix::{Actor, AsyncContext, Handler};
 
 use crate::{
     app::{
-        AppContext, Delivery, DownPolicy, DownState, Raw, RequirementEvent, RequirementPolicy, WILLS_MAX,
-        Will,
+        AppContext, Delivery, DownPolicy, Raw, RequirementEvent, RequirementPolicy, Will,
         drive::{Dispatch, Drive, dispatch_raw, dispatch_typed},
         requirement::{EndReason, FailedStart, Requirements, SafeState, WithEndReason},
     },
@@ -17,7 +18,7 @@ use crate::{
         Launch, Place, Policy, Restart, RunningActor, StartRetry, liveness::Liveness, running_actor,
     },
     tid::AppAddress,
-    wire::{Kind, Payload, remember},
+    wire::{Kind, Payload, PayloadType, remember},
 };
 
 /// Declares an application: its factory, its name, the payloads that it handles, its requirements and its place.
@@ -56,6 +57,10 @@ pub(super) struct Common {
     address: Option<AppAddress>,
     requires: Vec<String>,
     kinds: Vec<(Kind, &'static str)>,
+    /// The types of `kinds`, as far as they are not raw.
+    types: Vec<PayloadType>,
+    /// The types that it declared to send.
+    sends: Vec<PayloadType>,
     policy: Policy,
     place: Place,
     pub(super) down_policy: DownPolicy,
@@ -100,6 +105,8 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
             address: None,
             requires: Vec::new(),
             kinds: Vec::new(),
+            types: Vec::new(),
+            sends: Vec::new(),
             policy: Policy { held: true, ..Policy::default() },
             place: Place::thread("apps"),
             down_policy: DownPolicy::default(),
@@ -138,7 +145,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     where
         A: Handler<Delivery<P>, Result = ()>,
     {
-        remember::<P>();
+        self.common.types.extend(remember::<P>());
         self.handlers.push((P::KIND, dispatch_typed::<A, P>));
         self.common.kinds.push((P::KIND, P::NAME));
         self
@@ -152,6 +159,27 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     {
         self.handlers.push((kind, dispatch_raw::<A>));
         self.common.kinds.push((kind, "raw"));
+        self
+    }
+
+    /// Declares that the application sends payloads of type `P`. Then other nodes compare the type with that of their
+    /// applications before its first message; without it they compare at the first one.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// payload!("demo.angle", Stream => struct Angle { degrees: f32 });
+    ///
+    /// struct Gait;
+    /// # impl Actor for Gait { type Context = AppContext<Self>; }
+    ///
+    /// let gait = AppSpec::new("gait", || Gait).sends::<Angle>();
+    /// ```
+    #[must_use]
+    pub fn sends<P: Payload>(mut self) -> Self {
+        self.common.sends.extend(remember::<P>());
         self
     }
 
@@ -399,99 +427,5 @@ impl<A: Actor<Context = AppContext<A>>> From<AppSpec<A>> for DynApp {
             launch
         };
         Self { common, wire: Box::new(wire) }
-    }
-}
-
-impl DynApp {
-    /// Returns the name of the application.
-    #[must_use]
-    pub fn name(&self) -> &str {
-        &self.common.name
-    }
-
-    /// Returns the fixed address that the application requests.
-    #[must_use]
-    pub const fn address(&self) -> Option<AppAddress> {
-        self.common.address
-    }
-
-    /// Returns the requirements of the application.
-    #[must_use]
-    pub fn requires(&self) -> &[String] {
-        &self.common.requires
-    }
-
-    /// Returns the kinds that the application handles, with the names of their types.
-    #[must_use]
-    pub fn kinds(&self) -> &[(Kind, &'static str)] {
-        &self.common.kinds
-    }
-
-    /// Returns the supervision policy of the application.
-    #[must_use]
-    pub const fn policy(&self) -> &Policy {
-        &self.common.policy
-    }
-
-    /// Returns the place of the application.
-    #[must_use]
-    pub const fn place(&self) -> &Place {
-        &self.common.place
-    }
-
-    /// Adds one more injected fault.
-    #[cfg(feature = "fault-points")]
-    pub fn plan_fault(&mut self, fault: crate::supervision::fault::Fault) {
-        self.common.faults.push(fault);
-    }
-
-    /// Returns the injected faults.
-    #[cfg(feature = "fault-points")]
-    #[must_use]
-    pub fn faults(&self) -> &[crate::supervision::fault::Fault] {
-        &self.common.faults
-    }
-
-    /// Returns the policy for the loss of a requirement.
-    #[must_use]
-    pub const fn requirement_policy(&self) -> RequirementPolicy {
-        self.common.on_lost
-    }
-
-    /// Returns the last wills of the application.
-    #[must_use]
-    pub fn wills(&self) -> &[Will] {
-        &self.common.wills
-    }
-
-    /// Returns the error in the declaration, as a text, if it has one.
-    #[must_use]
-    pub fn fault(&self) -> Option<String> {
-        let Common { wills, on_lost, has_safe_state, .. } = &self.common;
-        if wills.len() > WILLS_MAX {
-            let wills = wills.len();
-            return Some(format!("{wills} last wills are more than the {WILLS_MAX} that it may have"));
-        }
-        match on_lost {
-            RequirementPolicy::SafeState if !has_safe_state => {
-                Some("it goes to its safe state and has none; declare it with `safe_state`".to_owned())
-            }
-            RequirementPolicy::CarryOn
-            | RequirementPolicy::Pause
-            | RequirementPolicy::SafeState
-            | RequirementPolicy::Restart => None,
-        }
-    }
-
-    /// Creates the state that the node keeps for the time when the application is down.
-    #[must_use]
-    pub fn down_state(&self, wiring: AppWiring) -> DownState {
-        DownState::new(wiring, self.common.down_policy, self.common.wills.clone())
-    }
-
-    /// Creates the launch function, which starts the application on the thread of its place.
-    #[must_use]
-    pub fn launch(&self, wiring: AppWiring) -> Launch {
-        (self.wire)(wiring)
     }
 }

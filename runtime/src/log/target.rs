@@ -2,7 +2,7 @@
 
 /// The packages of the layers, and parts of them, with their targets; a part is before its package. `sinew::gncl`
 /// stays the target of GNCL wherever its code is.
-const TARGETS: [(&str, &str); 21] = [
+const TARGETS: [(&str, &str); 22] = [
     ("sinew_client", "sinew::client"),
     ("sinew_gncl::node_down_events", "sinew::aftermath"),
     ("sinew_gncl", "sinew::gncl"),
@@ -15,6 +15,7 @@ const TARGETS: [(&str, &str); 21] = [
     ("sinew_node::inspect", "sinew::inspect"),
     ("sinew_node::process", "sinew::process"),
     ("sinew_node::signals", "sinew::signals"),
+    ("sinew_node::types", "sinew::types"),
     ("sinew_node", "sinew::node"),
     ("sinew_protocol", "sinew::protocol"),
     ("sinew_security::access", "sinew::access"),

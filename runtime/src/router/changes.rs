@@ -5,6 +5,7 @@ use std::{collections::BTreeSet, sync::Arc};
 use super::{
     LocalRoute, Members, MessageSink, Router, Snapshot, Table, Writing, for_each_here,
     guard::Guard,
+    mismatches::Mismatches,
     tap::{self, Passage, Tap, TapOf},
 };
 use crate::{
@@ -78,6 +79,12 @@ impl Router {
     #[must_use]
     pub fn memberships(&self) -> usize {
         lock(&self.writing).here.memberships()
+    }
+
+    /// Sets the types that their senders and the applications of this node declared differently; `None`: none.
+    pub fn set_mismatches(&self, mismatches: Option<Mismatches>) {
+        let mismatches = mismatches.map(Arc::new);
+        self.change(|table| table.mismatches = mismatches);
     }
 
     /// Sets the tap that observes messages from now on for this purpose; `None` removes it.

@@ -19,7 +19,9 @@ use std::{
     sync::{Arc, Mutex, Weak},
 };
 
-use super::{Judge, MessageSink, Router, Snapshot, SubmitError, copy_of, for_each_here, guard, tap};
+use super::{
+    Judge, MessageSink, Router, Snapshot, SubmitError, copy_of, for_each_here, guard::why_refused, tap,
+};
 use crate::{
     lock,
     outcome::{MemberReport, MemberState, Outcome, Receipt, ReceiptSink, Rejection, Ticket},
@@ -143,10 +145,10 @@ impl Router {
                 return;
             }
             let refused = self.submit_copy(message, send, member, |copy| {
-                if guard::refuses(guard, app, &message.header) {
-                    return Err(SubmitError::new(copy, Rejection::NotAllowed));
+                match why_refused(&snapshot.table, guard, app, &message.header) {
+                    Some(why) => Err(SubmitError::new(copy, why)),
+                    None => sink.submit(copy),
                 }
-                sink.submit(copy)
             });
             tap::saw_one_of_many(snapshot.table.tap.as_ref(), member, message, refused);
         });

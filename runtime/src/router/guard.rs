@@ -6,7 +6,9 @@
 
 use std::sync::Arc;
 
+use super::{Table, mismatches};
 use crate::{
+    outcome::Rejection,
     tid::AppAddress,
     wire::{Flags, Header},
 };
@@ -28,8 +30,23 @@ pub trait Guard: Send + Sync {
 ///
 /// Messages from and to layers are checked by their protocols.
 #[inline]
-pub(super) fn refuses(guard: Option<&Arc<dyn Guard>>, target: AppAddress, header: &Header) -> bool {
+fn refuses(guard: Option<&Arc<dyn Guard>>, target: AppAddress, header: &Header) -> bool {
     guard.is_some_and(|guard| is_guarded(header, target) && !guard.allows(header, target))
+}
+
+/// Returns why the message of this header must not reach `target`: the guard, or a type that its sender declared
+/// differently. `None`: it may.
+#[inline]
+pub(super) fn why_refused(
+    table: &Table,
+    guard: Option<&Arc<dyn Guard>>,
+    target: AppAddress,
+    header: &Header,
+) -> Option<Rejection> {
+    if refuses(guard, target, header) {
+        return Some(Rejection::NotAllowed);
+    }
+    mismatches::refuses(table.mismatches.as_ref(), target, header).then_some(Rejection::Malformed)
 }
 
 /// Returns whether the message is subject to a guard.
@@ -55,7 +72,6 @@ mod tests {
 
     use super::*;
     use crate::{
-        outcome::Rejection,
         router::{LocalRoute, MessageSink, Router, SubmitError},
         tid::{NodeAddress, Tid},
         wire::{Kind, Message},

@@ -18,6 +18,7 @@ impl Router {
         if let Some(route) = table.local.get(&app)
             && table.tap.is_none()
             && table.guard.is_none()
+            && table.mismatches.is_none()
         {
             return route.sink.offer_run(run);
         }

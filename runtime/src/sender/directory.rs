@@ -3,6 +3,7 @@
 use crate::{
     monitor::{MonitorError, MonitorId},
     tid::{AppAddress, Tid},
+    wire::PayloadType,
 };
 
 /// The names and groups that a node knows.
@@ -26,6 +27,12 @@ pub trait Directory: Send + Sync {
 
     /// Adds the application at `app` of this node to `group`, or removes it.
     fn set_member(&self, app: AppAddress, group: AppAddress, member: bool);
+
+    /// Records that the application at `app` of this node sends payloads of this type. It is called on the sending
+    /// thread at the first message of the type, so it must not block.
+    fn sends(&self, app: AppAddress, sent: PayloadType) {
+        let _ = (app, sent);
+    }
 
     /// Sets a monitor of the current incarnation of `target` for the application at `watcher` of this node.
     ///

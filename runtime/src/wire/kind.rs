@@ -86,6 +86,12 @@ impl Kind {
     pub const SYNC_ARRIVALS: Self = Self(0x36);
     /// A trigger: all nodes freeze their recordings around it.
     pub const SYNC_FREEZE: Self = Self(0x37);
+    /// Requests the structure of a payload type.
+    pub const SYNC_SCHEMA_ASK: Self = Self(0x38);
+    /// The structure of a payload type.
+    pub const SYNC_SCHEMA: Self = Self(0x39);
+    /// A message was of a type that its receiver declared differently.
+    pub const SYNC_MISMATCH: Self = Self(0x3A);
     /// A process requests a transport address.
     pub const LNCL_REGISTER: Self = Self(0x40);
     /// The assigned address.

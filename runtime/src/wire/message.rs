@@ -11,7 +11,7 @@ use serde::{Serialize, de::DeserializeOwned};
 use crate::{
     outcome::{MemberReport, Outcome, Receipt, Rejection, Ticket},
     tid::Tid,
-    wire::{Class, Flags, Header, Kind, Protection, memory, read::decode_payload, remember},
+    wire::{Class, Flags, Header, Kind, MismatchPolicy, Protection, memory, read::decode_payload, remember},
 };
 
 /// A type that is sent as MessagePack (a map with field names, so that any language can read it).
@@ -43,6 +43,9 @@ pub trait Payload: Serialize + DeserializeOwned + Send + 'static {
     const TIME_TO_LIVE: Option<Duration> = None;
     /// The limits of a receiver, for a type with end-to-end protection: see [`protection`](crate::protection).
     const PROTECTION: Option<Protection> = None;
+    /// The treatment of messages from a sender on another node with another version of this type. The receiver's type
+    /// decides.
+    const MISMATCH: MismatchPolicy = MismatchPolicy::AcceptAdditions;
 }
 
 /// The reason why a payload could not be decoded. This is an error of the peer: its type of this name differs.
@@ -130,7 +133,12 @@ impl Message {
 
     /// Same as [`typed`](Self::typed), for the encoded bytes of a `P`.
     pub(crate) fn of_type<P: Payload>(source: Tid, destination: Tid, payload: Bytes) -> Self {
-        remember::<P>();
+        let _ = remember::<P>();
+        Self::of_remembered::<P>(source, destination, payload)
+    }
+
+    /// Same as [`of_type`](Self::of_type), for a type that the caller has recorded.
+    pub(crate) fn of_remembered<P: Payload>(source: Tid, destination: Tid, payload: Bytes) -> Self {
         let mut header = Header::new(P::KIND, source, destination);
         header.class = P::CLASS;
         if let Some(time) = P::TIME_TO_LIVE {

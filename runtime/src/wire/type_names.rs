@@ -1,73 +1,149 @@
-//! The names of payload types by their IDs, for types that this process sends or handles: for logs, which
-//! show names and not numbers. Their structure is found when somebody asks for it.
+//! The payload types that this process sends or handles, by their IDs: for logs, which show names and not numbers, and
+//! for comparisons with other nodes. The structure of a type is found when somebody asks for it.
 
-use std::sync::OnceLock;
+use std::{any::TypeId, fmt, sync::OnceLock};
 
-use sinew_schema::TraceError;
+use sinew_schema::{SchemaHash, TraceError};
 
 use super::{
-    Kind, Payload,
+    Kind, MismatchPolicy, Payload,
     type_schema::{TypeSchema, trace},
 };
 
 /// Number of entries in the table. A program with more types shows the IDs of the others.
-const PLACES: usize = 512;
-/// Number of entries that are searched for a name, starting at that of its ID.
+pub(crate) const PLACES: usize = 512;
+/// Number of entries that are searched for a type, starting at that of its ID.
 const PROBES: usize = 8;
 
-struct Names {
+struct Entry {
+    id: TypeId,
     kind: Kind,
+    /// In a box, so that senders read one cache line.
+    declared: Box<Declared>,
+}
+
+struct Declared {
     name: &'static str,
     rust: &'static str,
+    mismatch: MismatchPolicy,
     trace: fn() -> Result<TypeSchema, TraceError>,
-    /// Traced at the first question, on the thread that asks. In a box, so that senders read one cache line.
-    schema: OnceLock<Box<Result<TypeSchema, TraceError>>>,
+    /// Traced at the first question, on the thread that asks.
+    schema: OnceLock<Result<TypeSchema, TraceError>>,
 }
 
 /// Each entry is written once and never removed, so that a lookup is one load without a lock.
-static NAMES: [OnceLock<Names>; PLACES] = [const { OnceLock::new() }; PLACES];
+static TYPES: [OnceLock<Entry>; PLACES] = [const { OnceLock::new() }; PLACES];
 
-fn places(kind: Kind) -> impl Iterator<Item = &'static OnceLock<Names>> {
+/// A payload type that this process sends or handles. Two Rust types with one [name](Payload::NAME) are two of them.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct PayloadType(u16);
+
+fn places(kind: Kind) -> impl Iterator<Item = usize> {
     let first = kind.bits() as usize;
-    (0..PROBES).filter_map(move |probe| NAMES.get((first + probe) % PLACES))
+    (0..PROBES).map(move |probe| (first + probe) % PLACES)
 }
 
-/// Records the names of `P`. After its first call for a type it compares one number.
-pub(crate) fn remember<P: Payload>() {
+/// Records `P`. After its first call for a type it compares one number. Returns `None` if the table is full there.
+pub(crate) fn remember<P: Payload>() -> Option<PayloadType> {
+    let id = TypeId::of::<P>();
     for place in places(P::KIND) {
-        let names = place.get_or_init(|| Names {
+        let entry = TYPES[place].get_or_init(|| Entry {
+            id,
             kind: P::KIND,
-            name: P::NAME,
-            rust: std::any::type_name::<P>(),
-            trace: trace::<P>,
-            schema: OnceLock::new(),
+            declared: Box::new(Declared {
+                name: P::NAME,
+                rust: std::any::type_name::<P>(),
+                mismatch: P::MISMATCH,
+                trace: trace::<P>,
+                schema: OnceLock::new(),
+            }),
         });
-        if names.kind == P::KIND {
-            return;
+        if entry.id == id {
+            return u16::try_from(place).ok().map(PayloadType);
         }
+    }
+    None
+}
+
+/// Returns the entries of a kind, in the order in which they were recorded.
+fn entries(kind: Kind) -> impl Iterator<Item = &'static Entry> {
+    places(kind).map_while(|place| TYPES[place].get()).filter(move |entry| entry.kind == kind)
+}
+
+impl Declared {
+    fn schema(&self) -> Result<&TypeSchema, &TraceError> {
+        let traced = self.schema.get_or_init(|| {
+            let traced = (self.trace)();
+            if let Err(error) = &traced {
+                log_untraced(self.name, error);
+            }
+            traced
+        });
+        traced.as_ref()
     }
 }
 
-fn find(kind: Kind) -> Option<&'static Names> {
-    places(kind).map_while(OnceLock::get).find(|names| names.kind == kind)
+impl PayloadType {
+    /// Returns the number of its place in the table of types, below [`PLACES`].
+    #[inline]
+    pub(crate) const fn place(self) -> usize {
+        self.0 as usize
+    }
+
+    fn entry(self) -> &'static Entry {
+        TYPES[self.place()].get().expect("only `remember` makes one, after it has written the entry")
+    }
+
+    /// Returns the ID of the type.
+    #[must_use]
+    pub fn kind(self) -> Kind {
+        self.entry().kind
+    }
+
+    /// Returns the name of the type.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        self.entry().declared.name
+    }
+
+    /// Returns the treatment of messages from a sender with another version of the type.
+    #[must_use]
+    pub fn mismatch(self) -> MismatchPolicy {
+        self.entry().declared.mismatch
+    }
+
+    /// Returns the structure of the type. The first call takes up to some milliseconds, as [`Kind::schema`].
+    ///
+    /// # Errors
+    /// As of [`Kind::schema`].
+    pub fn schema(self) -> Result<&'static TypeSchema, &'static TraceError> {
+        self.entry().declared.schema()
+    }
+}
+
+impl fmt::Debug for PayloadType {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "PayloadType({})", self.name())
+    }
 }
 
 /// Returns the payload types that this process has sent or declared, with their names; at most 512.
 pub fn known_types() -> impl Iterator<Item = (Kind, &'static str)> {
-    NAMES.iter().filter_map(|place| place.get().map(|names| (names.kind, names.name)))
+    TYPES.iter().filter_map(|place| place.get().map(|entry| (entry.kind, entry.declared.name)))
 }
 
 impl Kind {
     /// Returns the name of the payload type with this ID, if this process has sent it or declared that it handles it.
     #[must_use]
     pub fn type_name(self) -> Option<&'static str> {
-        find(self).map(|names| names.name)
+        entries(self).next().map(|entry| entry.declared.name)
     }
 
     /// Returns the type's name in Rust, without its module.
     #[must_use]
     pub fn rust_name(self) -> Option<&'static str> {
-        find(self).map(|names| names.rust.rsplit("::").next().unwrap_or(names.rust))
+        let rust = entries(self).next()?.declared.rust;
+        Some(rust.rsplit("::").next().unwrap_or(rust))
     }
 
     /// Returns the structure of the payload type with this ID, if this process has sent it or declared that it handles
@@ -78,15 +154,15 @@ impl Kind {
     /// The first call logs it once.
     #[must_use]
     pub fn schema(self) -> Option<Result<&'static TypeSchema, &'static TraceError>> {
-        let names = find(self)?;
-        let traced = names.schema.get_or_init(|| {
-            let traced = (names.trace)();
-            if let Err(error) = &traced {
-                log_untraced(names.name, error);
-            }
-            Box::new(traced)
-        });
-        Some(Result::as_ref(traced))
+        entries(self).next().map(|entry| entry.declared.schema())
+    }
+
+    /// Returns the structure with this hash that a payload type of this ID has in this process. Like
+    /// [`schema`](Self::schema) it is not for a thread with deadlines.
+    #[must_use]
+    pub fn schema_of_hash(self, hash: SchemaHash) -> Option<&'static TypeSchema> {
+        let mut traced = entries(self).filter_map(|entry| entry.declared.schema().ok());
+        traced.find(|schema| schema.hash() == hash)
     }
 }
 
@@ -116,8 +192,9 @@ mod tests {
     fn sent_type_has_its_names() {
         assert_eq!(Kind::named("test.type_names.never").type_name(), None);
         assert!(known_types().all(|(kind, _)| kind != Angle::KIND));
-        remember::<Angle>();
-        remember::<Angle>();
+        let angle = remember::<Angle>();
+        assert_eq!(remember::<Angle>(), angle);
+        assert_eq!(angle.map(PayloadType::name), Some("test.type_names.angle"));
         assert_eq!(known_types().filter(|(kind, _)| *kind == Angle::KIND).count(), 1);
         assert_eq!(Angle::KIND.type_name(), Some("test.type_names.angle"));
         assert_eq!(Angle::KIND.rust_name(), Some("Angle"));
@@ -125,7 +202,7 @@ mod tests {
 
     #[test]
     fn types_that_no_other_package_names_are_traced() {
-        remember::<crate::protection::Echo>();
+        let _ = remember::<crate::protection::Echo>();
         let echo =
             crate::protection::Echo::KIND.schema().expect("it is declared").expect("it has a structure");
         assert!(echo.schema().to_string().contains("at_ns: u64"), "{}", echo.schema());
@@ -141,9 +218,36 @@ mod tests {
             const NAME: &'static str = "test.type_names.speed";
         }
         assert!(Speed::KIND.schema().is_none());
-        remember::<Speed>();
+        let _ = remember::<Speed>();
         let traced = Speed::KIND.schema().expect("it is declared").expect("it has a structure");
         assert_eq!(traced.schema().to_string(), "{\n    value: f32,\n}\n");
         assert_eq!(traced.hash(), traced.schema().hash());
+    }
+
+    #[test]
+    fn two_types_of_one_name_keep_their_structures() {
+        #[derive(Serialize, Deserialize)]
+        struct Old {
+            kp: f32,
+        }
+        impl Payload for Old {
+            const NAME: &'static str = "test.type_names.gains";
+        }
+        #[derive(Serialize, Deserialize)]
+        struct New {
+            kp: f32,
+            kd: f32,
+        }
+        impl Payload for New {
+            const NAME: &'static str = "test.type_names.gains";
+            const MISMATCH: MismatchPolicy = MismatchPolicy::Warn;
+        }
+        let [old, new] = [remember::<Old>(), remember::<New>()].map(|one| one.expect("there is room"));
+        assert_eq!(old.kind(), new.kind());
+        assert_eq!([old.mismatch(), new.mismatch()], [MismatchPolicy::AcceptAdditions, MismatchPolicy::Warn]);
+        let [old, new] = [old, new].map(|one| one.schema().expect("it has a structure"));
+        assert_ne!(old.hash(), new.hash());
+        assert_eq!(Old::KIND.schema_of_hash(new.hash()).map(TypeSchema::hash), Some(new.hash()));
+        assert_eq!(Old::KIND.schema_of_hash(SchemaHash(1)).map(TypeSchema::hash), None);
     }
 }

@@ -2,7 +2,9 @@
 
 use sinew_schema::{Schema, SchemaHash, TraceError, Wire};
 
-use super::{Kind, Payload, decode_as, memory, remember};
+#[cfg(doc)]
+use super::Kind;
+use super::{Payload, PayloadType, decode_as, memory, remember};
 
 /// The structure of a payload type and its hash.
 #[derive(Debug)]
@@ -44,8 +46,7 @@ impl TypeSchema {
 /// ```
 #[must_use]
 pub fn schema_of<P: Payload>() -> Option<Result<&'static TypeSchema, &'static TraceError>> {
-    remember::<P>();
-    Kind::schema(P::KIND)
+    remember::<P>().map(PayloadType::schema)
 }
 
 /// Traces `P` with the decoder and the encoder of messages.

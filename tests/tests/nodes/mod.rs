@@ -14,4 +14,5 @@ mod root;
 mod slow;
 mod start_up;
 mod trees;
+mod types;
 mod undelivered;

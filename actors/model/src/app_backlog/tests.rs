@@ -98,6 +98,19 @@ fn handled_kinds_are_kept_until_their_application_ends() {
     assert_eq!(kept(Reader::Sync, &[], &[AppFact::GroupsChanged, AppFact::GroupsChanged]).len(), 1);
 }
 
+#[test]
+fn last_declared_types_replace_the_former() {
+    use crate::facts::DeclaredTypes;
+    use sinew_runtime::wire::{Kind, SchemaHash};
+    let types = |hash| {
+        let sends = vec![(Kind::named("a"), SchemaHash(hash))];
+        AppFact::Types { app: APP, types: DeclaredTypes { sends, ..DeclaredTypes::default() } }
+    };
+    let known = [registered(APP, "drive")];
+    assert_eq!(kept(Reader::Sync, &known, &[types(1), ready(APP), types(2)]), [ready(APP), types(2)]);
+    assert_eq!(kept(Reader::Sync, &known, &[types(1), gone(APP)]), [gone(APP)]);
+}
+
 /// What a reader knows of each application: whether it is ready.
 #[derive(Debug, Default, PartialEq, Eq)]
 struct Known(BTreeMap<AppAddress, bool>);

@@ -1,6 +1,28 @@
 //! The facts that LNCL reports to the sync manager.
 
-use sinew_runtime::{tid::AppAddress, wire::Kind};
+use sinew_runtime::{
+    tid::AppAddress,
+    wire::{Kind, SchemaHash},
+};
+
+/// A payload type and the hash of its structure.
+pub type TypeHash = (Kind, SchemaHash);
+
+/// The payload types of an application, as far as their structures are known.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct DeclaredTypes {
+    /// The types that it handles.
+    pub handles: Vec<TypeHash>,
+    /// The types that it has sent, or declared to send.
+    pub sends: Vec<TypeHash>,
+}
+
+impl DeclaredTypes {
+    /// Returns whether there is none.
+    pub const fn is_empty(&self) -> bool {
+        self.handles.is_empty() && self.sends.is_empty()
+    }
+}
 
 /// The user that an application runs as.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,6 +49,8 @@ pub enum AppFact {
     Registered { app: AppAddress, name: Option<String>, requires: Vec<String>, user: User },
     /// The payloads that a registered application handles, if it reports them.
     Handles { app: AppAddress, kinds: Vec<Kind> },
+    /// The structures of the types of a registered application: all that are known, each time.
+    Types { app: AppAddress, types: DeclaredTypes },
     /// It has started, and receives messages.
     Ready { app: AppAddress },
     /// It receives no messages: it has failed, and is not restarted yet.

@@ -26,7 +26,10 @@ impl Subscribers {
             AppFact::Down { app } | AppFact::Stopped { app } | AppFact::Unregistered { app } => {
                 self.remove(app);
             }
-            AppFact::Registered { .. } | AppFact::Handles { .. } | AppFact::GroupsChanged => {}
+            AppFact::Registered { .. }
+            | AppFact::Handles { .. }
+            | AppFact::Types { .. }
+            | AppFact::GroupsChanged => {}
         }
     }
 

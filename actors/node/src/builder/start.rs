@@ -24,7 +24,7 @@ use crate::{
     node::LAST_WORDS,
     play_check, process,
     root::{self, RootEvent},
-    security_setup,
+    security_setup, types,
 };
 
 /// Maximum number of waiting applications in the log line of the start.
@@ -132,6 +132,7 @@ impl NodeBuilder {
         }
         open_client_socket(&state)?;
         inspect::begin(&state)?;
+        types::begin(&state)?;
         begin_recording(&state, self.writes_recording)?;
         let (tree, heed_signals) = (self.tree, self.heed_signals);
         if heed_signals && handle.root.post(RootEvent::HeedSignals).is_err() {

@@ -24,9 +24,10 @@ use super::{
     answers::Answers,
     frozen, reach, record,
     reports::{
-        AskAccess, AskApps, AskAudit, AskFreeze, AskFrozen, AskGroups, AskNode, AskReach, AskRecord,
-        AskReload, AskTree, AskWatch, Report, WatchReport,
+        AskAccess, AskApps, AskAudit, AskFreeze, AskFrozen, AskGroups, AskMismatches, AskNode, AskReach,
+        AskRecord, AskReload, AskSchemas, AskTree, AskWatch, Report, WatchReport,
     },
+    types,
     watches::{Directions, GUESTS_WATCHES_MAX, NewTap, WATCHES_MAX, Watches},
 };
 use crate::NodeState;
@@ -135,6 +136,8 @@ fn answer(
         }
         AskFreeze::KIND => reply(answers, number, &question, |_, state| frozen::triggered(state, &question)),
         AskFrozen::KIND => reply(answers, number, &question, |_, state| frozen::fetched(state, &question)),
+        AskSchemas::KIND => reply(answers, number, &question, |_, state| types::schemas(state, &question)),
+        AskMismatches::KIND => reply(answers, number, &question, |_, state| types::mismatches(state)),
         AskRecord::KIND => reply(answers, number, &question, |_, state| record::recorded(state, &question)),
         // spec: INSPECT-4
         _ => Err(Rejection::UnknownKind),

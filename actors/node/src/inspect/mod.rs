@@ -30,6 +30,7 @@ mod refused;
 mod reports;
 #[cfg(test)]
 mod tests;
+mod types;
 mod watches;
 
 pub(crate) use inspector::begin;
@@ -38,14 +39,15 @@ pub(crate) use record::names_for_reader;
 pub(crate) use record::recorded;
 pub use reports::{
     APPS_MAX, AccessReport, AccessVerdict, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskFreeze,
-    AskFrozen, AskGroups, AskNode, AskReach, AskRecord, AskReload, AskTree, AskWatch, AuditReport,
-    BarrierReport, CertificateReport, DialReport, FROZEN_BYTES_MAX, FROZEN_SPANS_MAX, ForeignReport,
-    FreezeReport, FrozenFacts, FrozenPart, FrozenReport, FrozenSpan, GroupReport, IdleReport, KindReport,
-    LinkReport, LostEchoReport, LostReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, REACHED_MAX,
-    RECORDED_MAX, ReachReport, Reached, RecordReport, RecordedApp, RecordedType, RefusalReport, ReloadReport,
-    RouteReport, SCHEMAS_MAX, SEEN_BYTES_MAX, SEEN_MAX, SecurityReport, SeenMessage, SourceReport,
-    StallReport, StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport, UnguardedReport,
-    UnhandledReport, WaitReport, WatchReport,
+    AskFrozen, AskGroups, AskMismatches, AskNode, AskReach, AskRecord, AskReload, AskSchemas, AskTree,
+    AskWatch, AuditReport, BarrierReport, CertificateReport, DialReport, FROZEN_BYTES_MAX, FROZEN_SPANS_MAX,
+    ForeignReport, FreezeReport, FrozenFacts, FrozenPart, FrozenReport, FrozenSpan, GroupReport, IdleReport,
+    KindReport, LinkReport, LostEchoReport, LostReport, MismatchReport, MismatchesReport, Missing,
+    NodeReport, PEERS_MAX, PeerReport, Ping, REACHED_MAX, RECORDED_MAX, ReachReport, Reached, RecordReport,
+    RecordedApp, RecordedType, RefusalReport, ReloadReport, RouteReport, SCHEMAS_MAX, SEEN_BYTES_MAX,
+    SEEN_MAX, SchemaReport, SchemasReport, SecurityReport, SeenMessage, SourceReport, StallReport,
+    StreamReport, TREE_MAX, TreeLine, TreeReport, TroubleReport, TypeUser, UnguardedReport, UnhandledReport,
+    WaitReport, WatchReport,
 };
 pub use sinew_record::{PeerClock, Selection};
 

@@ -11,6 +11,7 @@ mod record;
 mod refused;
 mod security;
 mod tree;
+mod types;
 mod watch;
 
 pub use access::{AccessReport, AccessVerdict, AskAccess, AskReload, ReloadReport};
@@ -30,6 +31,9 @@ pub(super) use record::bounded;
 pub use refused::{LostEchoReport, RefusalReport, UnguardedReport, UnhandledReport};
 pub use security::{CertificateReport, SecurityReport};
 pub use tree::{AskTree, TREE_MAX, TreeLine, TreeReport};
+pub use types::{
+    AskMismatches, AskSchemas, MismatchReport, MismatchesReport, SchemaReport, SchemasReport, TypeUser,
+};
 pub use watch::{AskWatch, SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, WatchReport};
 
 use serde::{Deserialize, Serialize};

@@ -101,6 +101,7 @@ impl Root {
         let tid = sinew_lncl::register_local(&self.state.lncl, local).map_err(|error| {
             StartError::Application { name: app.name().to_owned(), why: error.to_string() }
         })?;
+        self.state.types.register(tid.app, app.types(), app.sends());
         let directory = Arc::new(NodeDirectory(self.state.clone()));
         let sender = Sender::new(tid, self.state.ctx.router.clone(), directory, pending, config.payload_max);
         let id = self.child_ids.next();

@@ -5,7 +5,7 @@ use std::{
     time::Duration,
 };
 
-use sinew_model::facts::{AppFact, User};
+use sinew_model::facts::{AppFact, DeclaredTypes, User};
 use sinew_runtime::{app::Requirement, tid::AppAddress, time::Time, wire::Kind};
 
 use super::{Reason, grace_period::Moment, outputs::Outputs};
@@ -31,6 +31,8 @@ pub(super) struct App {
     pub(super) phases: Vec<Name>,
     /// The payloads that the application handles, as far as it reports them.
     pub(super) kinds: Vec<Kind>,
+    /// The structures of its types, as far as they are known.
+    pub(super) types: DeclaredTypes,
     pub(super) state: State,
     /// How the previous life ended, while this one is not ready yet.
     pub(super) ended: Option<Ended>,
@@ -183,6 +185,7 @@ impl Apps {
                 AppChange::Registered(app, name)
             }
             AppFact::Handles { app, kinds } => self.handles(app, kinds),
+            AppFact::Types { app, types } => self.types_known(app, types),
             AppFact::Ready { app } => self.ready(app),
             AppFact::Down { app } => self.ended(now, app, Ended::Failed),
             AppFact::Stopped { app } => self.ended(now, app, Ended::Stopped),
@@ -200,6 +203,18 @@ impl Apps {
         match self.apps.get_mut(&app) {
             Some(app) if app.kinds != kinds => {
                 app.kinds = kinds;
+                AppChange::Entry
+            }
+            Some(_) | None => AppChange::Nothing,
+        }
+    }
+
+    fn types_known(&mut self, app: AppAddress, mut types: DeclaredTypes) -> AppChange {
+        types.handles.truncate(KINDS_MAX);
+        types.sends.truncate(KINDS_MAX);
+        match self.apps.get_mut(&app) {
+            Some(app) if app.types != types => {
+                app.types = types;
                 AppChange::Entry
             }
             Some(_) | None => AppChange::Nothing,
@@ -295,6 +310,7 @@ impl Apps {
             requires,
             phases: Vec::new(),
             kinds: Vec::new(),
+            types: DeclaredTypes::default(),
             state: State::Waiting(wait),
             ended: None,
             lost: BTreeSet::new(),
@@ -379,6 +395,8 @@ impl Apps {
                 phases: app.phases.clone(),
                 requires: app.requires.iter().take(REQUIRES_MAX).cloned().collect(),
                 kinds: app.kinds.clone(),
+                handles: app.types.handles.clone(),
+                sends: app.types.sends.clone(),
             })
             .collect()
     }

@@ -17,7 +17,7 @@ use super::{
     outputs::Outputs,
     peers::Peers,
 };
-use crate::list::Name;
+use crate::{list::Name, own_app::AppTypes};
 
 /// Maximum number of duplicate names that are reported.
 const DUPLICATES_MAX: usize = 1_024;
@@ -56,6 +56,17 @@ impl<'core> Directory<'core> {
             .collect();
         entries.sort_by(|a, b| (&a.name, a.tid).cmp(&(&b.name, b.tid)));
         entries
+    }
+
+    /// Returns every application with declared types, on this node and on all known nodes that are not lost.
+    pub(super) fn declared_types(self) -> Vec<AppTypes> {
+        let declared = self.apps.iter().filter(|(_, app)| !app.types.is_empty());
+        let here = declared.map(|(address, app)| AppTypes {
+            tid: Tid::new(self.peers.here(), address),
+            name: app.title(address),
+            types: app.types.clone(),
+        });
+        here.chain(self.peers.declared_types()).collect()
     }
 
     /// Returns the names of applications, on this node and on all known nodes that are not lost. The result

@@ -4,7 +4,7 @@ mod peer;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use sinew_model::facts::{LinkFact, LossReason, MembershipFact};
+use sinew_model::facts::{DeclaredTypes, LinkFact, LossReason, MembershipFact};
 use sinew_runtime::{
     app::Requirement,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
@@ -14,7 +14,10 @@ use sinew_security::access::ReportedNames;
 
 use self::peer::{Listed, Peer};
 use super::{Output, Reason, outputs::Outputs};
-use crate::list::{Entry, List, Name};
+use crate::{
+    list::{Entry, List, Name},
+    own_app::AppTypes,
+};
 
 /// The other nodes.
 #[derive(Debug)]
@@ -340,6 +343,20 @@ impl Peers {
             entries.map(|entry| {
                 let is_ready = peer.why_not(entry, None).is_none();
                 (&entry.name, Tid::new(*node, entry.app), is_ready, &entry.kinds)
+            })
+        })
+    }
+
+    /// Returns every application with declared types of every node that is not lost.
+    pub(super) fn declared_types(&self) -> impl Iterator<Item = AppTypes> {
+        let there = self.nodes.iter().filter(|(_, peer)| peer.lost.is_none() && !peer.stale);
+        there.flat_map(|(node, peer)| {
+            let entries = peer.list.iter().flat_map(|list| list.entries.values());
+            let declared = entries.filter(|entry| !(entry.handles.is_empty() && entry.sends.is_empty()));
+            declared.map(|entry| AppTypes {
+                tid: Tid::new(*node, entry.app),
+                name: entry.name.to_string(),
+                types: DeclaredTypes { handles: entry.handles.clone(), sends: entry.sends.clone() },
             })
         })
     }

@@ -16,7 +16,10 @@ use super::{
     directory::Directory,
     readiness::Readiness,
 };
-use crate::{list::Name, own_app::OwnApp};
+use crate::{
+    list::Name,
+    own_app::{AppTypes, OwnApp},
+};
 
 impl Core {
     const fn all(&self) -> Directory<'_> {
@@ -38,6 +41,11 @@ impl Core {
     /// and address.
     pub fn directory(&self) -> Vec<DirectoryEntry> {
         self.all().entries()
+    }
+
+    /// Returns every application with declared types, on this node and on all known nodes that are not lost.
+    pub fn declared_types(&self) -> Vec<AppTypes> {
+        self.all().declared_types()
     }
 
     /// Returns the names of applications, on this node and on all known nodes that are not lost. The result

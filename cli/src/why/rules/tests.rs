@@ -10,6 +10,7 @@ mod many;
 mod silent;
 mod stream;
 mod unnamed;
+mod versions;
 
 use sinew::{
     AppAddress, Class, NodeAddress, Tid,

@@ -1,8 +1,10 @@
 //! The directory, as its subscribers see it.
 
-use sinew_runtime::wire::Kind;
+use sinew_model::facts::DeclaredTypes;
+use sinew_runtime::wire::{Kind, SchemaHash};
 
 use super::*;
+use crate::own_app::AppTypes;
 
 fn is(name: &str, node: NodeAddress, index: u32, ready: bool) -> Output {
     let entry =
@@ -34,6 +36,31 @@ fn subscriber_receives_all_entries_then_each_change_once() {
     assert_eq!(bench.lost(KNEE, LossReason::LinkDown), [gone("knee", KNEE, 0)]);
     assert_eq!(bench.down(9), [release(9)]);
     assert_eq!(bench.handle(Input::AppChanged(AppFact::Unregistered { app: app(0) })), [], "it is over");
+}
+
+#[test]
+fn declared_types_are_published_and_end_with_their_node() {
+    let types = |hash| DeclaredTypes {
+        handles: vec![(Kind::named("demo.angle"), SchemaHash(hash))],
+        sends: vec![(Kind::named("demo.speed"), SchemaHash(hash + 1))],
+    };
+    let mut bench = watched();
+    bench.links(KNEE, INCARNATION);
+    bench.handle(Input::AppChanged(AppFact::Types { app: app(0), types: types(1) }));
+    let lists = published(&bench.passes(REPEAT));
+    let hip = lists[0].entries.iter().find(|entry| &*entry.name == "hip").unwrap();
+    assert_eq!((&hip.handles, &hip.sends), (&types(1).handles, &types(1).sends));
+    let mut knee = list(1, &[("knee", true, &[])]);
+    (knee.entries[0].handles, knee.entries[0].sends) = (types(5).handles, types(5).sends);
+    bench.list(KNEE, knee);
+    let of = |name: &str, node, hash| AppTypes {
+        tid: Tid::new(node, app(0)),
+        name: name.to_owned(),
+        types: types(hash),
+    };
+    assert_eq!(bench.core.declared_types(), [of("hip", HERE, 1), of("knee", KNEE, 5)]);
+    bench.lost(KNEE, LossReason::LinkDown);
+    assert_eq!(bench.core.declared_types(), [of("hip", HERE, 1)]);
 }
 
 #[test]

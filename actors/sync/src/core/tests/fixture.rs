@@ -95,6 +95,8 @@ pub(super) fn list(version: u64, entries: &[(&str, bool, &[&str])]) -> List {
         phases: Vec::new(),
         requires: requires.iter().map(|text| text.parse().unwrap()).collect(),
         kinds: Vec::new(),
+        handles: Vec::new(),
+        sends: Vec::new(),
     });
     List { incarnation: INCARNATION, version, entries: entries.collect(), groups: Vec::new() }
 }

@@ -198,7 +198,7 @@ impl ProcessInputs {
             AppFact::Ready { app } => (app, None),
             AppFact::Down { app } => (app, Some(Reason::Failed)),
             AppFact::Stopped { app } => (app, Some(Reason::Stopped)),
-            AppFact::Handles { .. } | AppFact::GroupsChanged => return,
+            AppFact::Handles { .. } | AppFact::Types { .. } | AppFact::GroupsChanged => return,
         };
         let state = &mut self.own.get_mut(app).expect("it is registered").1;
         state.unready = unready;

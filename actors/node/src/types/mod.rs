@@ -1,0 +1,117 @@
+//! The comparison of payload types between nodes.
+//!
+//! Each application's types are published in the directory by the hashes of their structures. A node compares the types
+//! that applications of other nodes send with those that its own applications handle. It fetches a structure only where
+//! two hashes of one type differ. The verdicts are in the routing table, which refuses messages, or counts them. The
+//! first message of a type that differs is logged on both nodes, in words.
+//!
+//! All of it runs on one thread of low priority. A message that arrives before the verdict is decoded as usual.
+//!
+//! | file | content |
+//! | --- | --- |
+//! | `declared.rs` | the types of this node's applications |
+//! | `judgement.rs` | the comparison of two structures, the policy, and the words for both |
+//! | `verdicts.rs` | all types that differ: which are missing, refused and logged |
+//! | `reported.rs` | reports of other nodes on the messages of this node |
+//! | `frames.rs` | the frames between nodes |
+//! | `thread.rs` | the thread that does it |
+
+mod declared;
+mod frames;
+#[cfg(feature = "fuzzing")]
+#[doc(hidden)]
+pub mod fuzzing;
+mod judgement;
+mod reported;
+mod thread;
+mod verdicts;
+
+use std::{
+    collections::VecDeque,
+    sync::{
+        Arc, Mutex, Weak,
+        atomic::{AtomicBool, Ordering},
+    },
+};
+
+use sinew_runtime::{
+    lock,
+    tid::{AppAddress, NodeAddress},
+    wire::{Message, PayloadType},
+};
+use sinew_sync::FrameHandler;
+use tokio::sync::Notify;
+
+use self::{declared::Declared, frames::Frame};
+pub(crate) use self::{
+    reported::{Report, Reported},
+    thread::begin,
+    verdicts::{Disagreement, Verdicts},
+};
+use crate::NodeState;
+
+/// Maximum number of frames of other nodes that wait for the thread. A further one is refused, and counted.
+const FRAMES_MAX: usize = 64;
+
+/// The payload types of the node's applications, and the verdicts on those of other nodes.
+#[derive(Default)]
+pub(crate) struct Types {
+    declared: Declared,
+    frames: Mutex<VecDeque<(NodeAddress, Frame)>>,
+    /// The verdicts on messages to this node.
+    pub(crate) verdicts: Mutex<Verdicts>,
+    /// The reports of other nodes on messages from this one.
+    pub(crate) reported: Mutex<Reported>,
+    /// Wakes the thread.
+    wake: Arc<Notify>,
+    is_closed: AtomicBool,
+}
+
+impl Types {
+    /// Records the types of an application that was registered.
+    pub(crate) fn register(&self, app: AppAddress, handles: &[PayloadType], sends: &[PayloadType]) {
+        self.declared.register(app, handles, sends);
+        self.wake.notify_one();
+    }
+
+    /// Removes the types of an application that is not registered any more.
+    pub(crate) fn unregister(&self, app: AppAddress) {
+        self.declared.forget(app);
+    }
+
+    /// Records that an application sends a type. It is called on the sending thread, once for each type.
+    pub(crate) fn sends(&self, app: AppAddress, sent: PayloadType) {
+        if self.declared.sends(app, sent) {
+            self.wake.notify_one();
+        }
+    }
+
+    /// Ends the thread.
+    pub(crate) fn close(&self) {
+        // SYNC: Release, and Acquire in the thread, although no other data depends on it.
+        self.is_closed.store(true, Ordering::Release);
+        self.wake.notify_one();
+    }
+
+    fn take_frames(&self) -> VecDeque<(NodeAddress, Frame)> {
+        std::mem::take(&mut *lock(&self.frames))
+    }
+}
+
+/// The frames about types, which travel to the sync manager's TID.
+pub(crate) struct Frames(pub(crate) Weak<NodeState>);
+
+impl FrameHandler for Frames {
+    fn receive(&self, from: NodeAddress, message: &Message) -> Result<(), String> {
+        let Some(state) = self.0.upgrade() else { return Ok(()) };
+        let frame = Frame::parse(from, message)?;
+        let mut frames = lock(&state.types.frames);
+        if frames.len() >= FRAMES_MAX {
+            return Err(format!("from {from}, a frame about types behind {FRAMES_MAX} that wait"));
+        }
+        frames.push_back((from, frame));
+        drop(frames);
+        state.types.wake.notify_one();
+        Ok(())
+    }
+}

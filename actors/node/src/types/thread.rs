@@ -1,0 +1,279 @@
+//! The thread `types`: it traces and publishes the types of this node's applications, fetches structures, compares them
+//! and logs the differences.
+//!
+//! Tracing a type takes up to some milliseconds, so no thread with deadlines does it. The thread has a low priority and
+//! holds each lock only for a copy of bounded length.
+
+use std::{
+    io,
+    panic::{AssertUnwindSafe, catch_unwind},
+    sync::{Arc, Weak, atomic::Ordering},
+    thread,
+    time::Duration,
+};
+
+use serde::Serialize;
+use sinew_lncl::undelivered::kind_name;
+use sinew_model::thread_priority::lower_priority;
+use sinew_runtime::{
+    lock, log,
+    outcome::Rejection,
+    router::mismatches::{Mismatch, Mismatches, TypedPath},
+    tid::{AppAddress, NodeAddress, Tid},
+    time::Time,
+    wire::{Class, Header, Kind, Message, encode},
+};
+use sinew_sync::AppTypes;
+use tokio::{
+    runtime::{Builder, Runtime},
+    sync::{Notify, watch},
+};
+
+use super::{
+    frames::{Frame, MismatchReport, SchemaAnswer, SchemaQuestion},
+    judgement::{Judgement, Treatment, sentence},
+    verdicts::{Disagreement, Handled, Sent},
+};
+use crate::NodeState;
+
+/// Minimum time between two steps: a start of many applications is one step, not one for each.
+const PAUSE: Duration = Duration::from_millis(10);
+
+/// Starts the thread. It ends with the node.
+///
+/// # Errors
+/// The thread cannot be started, or has no timer.
+pub(crate) fn begin(state: &Arc<NodeState>) -> io::Result<()> {
+    let runtime = Builder::new_current_thread().enable_time().build()?;
+    let comparing = Comparing {
+        state: Arc::downgrade(state),
+        wake: state.types.wake.clone(),
+        changes: state.ctx.directory_changes.subscribe(),
+        installed: Vec::new(),
+    };
+    thread::Builder::new().name("types".to_owned()).spawn(move || comparing.run(&runtime))?;
+    Ok(())
+}
+
+struct Comparing {
+    /// Weak: the thread does not keep the state alive.
+    state: Weak<NodeState>,
+    wake: Arc<Notify>,
+    changes: watch::Receiver<u64>,
+    /// The entries of the routing table.
+    installed: Vec<(TypedPath, Arc<Mismatch>)>,
+}
+
+impl Comparing {
+    fn run(mut self, runtime: &Runtime) {
+        lower_priority();
+        let mut next = None;
+        while runtime.block_on(self.wait(next)) {
+            let Some(state) = self.state.upgrade() else { return };
+            // SYNC: see `Types::close`.
+            if state.types.is_closed.load(Ordering::Acquire) {
+                return;
+            }
+            let step = AssertUnwindSafe(|| self.step(&state));
+            next = catch_unwind(step).unwrap_or_else(|_| {
+                log::error!("the comparison of types panicked; it continues with the next change");
+                None
+            });
+            drop(state);
+            thread::sleep(PAUSE);
+        }
+    }
+
+    /// Waits for a change of the directory, for new types or frames, or until `until`. Returns `false` when the node
+    /// has ended.
+    async fn wait(&mut self, until: Option<Time>) -> bool {
+        let timer = async {
+            match until {
+                Some(at) => tokio::time::sleep(at.since(Time::now())).await,
+                None => std::future::pending::<()>().await,
+            }
+        };
+        tokio::select! {
+            changed = self.changes.changed() => changed.is_ok(),
+            () = self.wake.notified() => true,
+            () = timer => true,
+        }
+    }
+
+    /// Handles all that is new. Returns the time of the next step.
+    fn step(&mut self, state: &NodeState) -> Option<Time> {
+        publish(state);
+        for (from, frame) in state.types.take_frames() {
+            if let Err(fault) = handle(state, from, frame) {
+                state.ctx.refusals.count(Time::now(), "types", &fault);
+            }
+        }
+        let (handled, sent) = declared(state);
+        let now = Time::now();
+        let (wanted, due, table, next) = {
+            let mut verdicts = lock(&state.types.verdicts);
+            let wanted = verdicts.declare(now, &handled, &sent);
+            let due = verdicts.take_due(now);
+            (wanted, due, verdicts.table(), verdicts.next_wake())
+        };
+        self.install(state, table);
+        for (node, (kind, hash)) in wanted {
+            // It is requested again.
+            let _ = send(state, node, Kind::SYNC_SCHEMA_ASK, &SchemaQuestion { kind, hash });
+        }
+        due.iter().for_each(|disagreement| tell(state, disagreement));
+        next
+    }
+
+    /// Puts the entries into the routing table, if they are others than before.
+    fn install(&mut self, state: &NodeState, table: Vec<(TypedPath, Arc<Mismatch>)>) {
+        let is_same = |(one, other): (&(TypedPath, Arc<Mismatch>), &(TypedPath, Arc<Mismatch>))| {
+            one.0 == other.0 && Arc::ptr_eq(&one.1, &other.1)
+        };
+        if table.len() == self.installed.len() && table.iter().zip(&self.installed).all(is_same) {
+            return;
+        }
+        self.installed.clone_from(&table);
+        let wake = self.wake.clone();
+        let mismatches =
+            (!table.is_empty()).then(|| Mismatches::new(table, Arc::new(move || wake.notify_one())));
+        state.ctx.router.set_mismatches(mismatches);
+    }
+}
+
+/// Publishes the types of the applications that have new ones.
+fn publish(state: &NodeState) {
+    for (app, types) in state.types.declared.take_changed() {
+        let types = types.hashes();
+        if !types.is_empty() {
+            // An application that has ended meanwhile has no entry in the directory.
+            sinew_lncl::types_known(&state.lncl, app, types);
+        }
+    }
+}
+
+/// Returns the published types that applications of this node handle, and those that others send.
+fn declared(state: &NodeState) -> (Vec<Handled>, Vec<Sent>) {
+    let all = lock(&state.sync.core).declared_types();
+    let (mut handled, mut sent) = (Vec::new(), Vec::new());
+    for AppTypes { tid, name, types } in all {
+        if tid.node != state.ctx.node {
+            let of_it = types.sends.into_iter();
+            sent.extend(of_it.map(|(kind, hash)| Sent { tid, name: name.clone(), kind, hash }));
+            continue;
+        }
+        for (kind, hash) in types.handles {
+            let own = state.types.declared.handled(tid.app, kind);
+            if let Some(own) = own
+                && let Ok(schema) = own.schema()
+            {
+                let (name, policy, schema) = (name.clone(), own.mismatch(), schema.schema());
+                handled.push(Handled { app: tid.app, name, kind, hash, policy, schema });
+            }
+        }
+    }
+    (handled, sent)
+}
+
+/// Handles a frame of another node.
+///
+/// # Errors
+/// Returns the fault of the frame.
+fn handle(state: &NodeState, from: NodeAddress, frame: Frame) -> Result<(), String> {
+    match frame {
+        Frame::Question(SchemaQuestion { kind, hash }) => {
+            let schema = kind.schema_of_hash(hash).ok_or_else(|| {
+                format!("from {from}, a question for a structure of kind {kind} that this node does not have")
+            })?;
+            let answer = SchemaAnswer { kind, hash, schema: schema.schema().encode() };
+            let sent = send(state, from, Kind::SYNC_SCHEMA, &answer);
+            sent.map_err(|why| format!("a structure was not sent to {from}: {why}"))
+        }
+        Frame::Answer(SchemaAnswer { kind, hash, schema }) => {
+            lock(&state.types.verdicts).received(from, (kind, hash), &schema)
+        }
+        Frame::Report(report) => reported(state, from, &report),
+    }
+}
+
+/// Logs the report of another node that messages of this node are of a type that differs.
+///
+/// # Errors
+/// Returns the fault of the report.
+fn reported(state: &NodeState, from: NodeAddress, report: &MismatchReport) -> Result<(), String> {
+    let own = state.types.declared.sent(report.source, report.kind);
+    let own = own.and_then(|own| own.schema().ok()).ok_or_else(|| {
+        format!("from {from}, a report on kind {}, which {} does not send", report.kind, report.source)
+    })?;
+    let report = {
+        let mut reported = lock(&state.types.reported);
+        reported.add(Time::now(), from, report, own.schema())?.cloned()
+    };
+    if let Some(report) = report {
+        let source = title(state, Tid::new(state.ctx.node, report.source));
+        let ends = (format!("{source} of this node"), title(state, report.target));
+        write(state, report.kind, (&ends.0, &ends.1), &report.judgement, report.seen);
+    }
+    Ok(())
+}
+
+/// Logs a disagreement, and reports it to the node of the sender.
+fn tell(state: &NodeState, disagreement: &Disagreement) {
+    let Disagreement { path, source, target, judgement, handled: (hash, schema), seen } = disagreement;
+    let TypedPath { source: sender, target: app, kind } = *path;
+    let ends = (
+        format!("{source} ({sender})"),
+        format!("{target} ({}) of this node", Tid::new(state.ctx.node, app)),
+    );
+    write(state, kind, (&ends.0, &ends.1), judgement, *seen);
+    let report = MismatchReport {
+        source: sender.app,
+        target: app,
+        kind,
+        hash: *hash,
+        policy: judgement.policy.word().to_owned(),
+        refused: judgement.treatment == Treatment::Refused,
+        seen: *seen,
+        schema: schema.encode(),
+    };
+    if let Err(why) = send(state, sender.node, Kind::SYNC_MISMATCH, &report) {
+        let detail = format!("a report on the type of a message was not sent to {}: {why}", sender.node);
+        state.ctx.refusals.count(Time::now(), "types", &detail);
+    }
+}
+
+/// Writes the line of the log about a type that differs.
+fn write(state: &NodeState, kind: Kind, ends: (&str, &str), judgement: &Judgement, seen: u64) {
+    let name = type_name(state, kind);
+    let words = sentence(ends, &name, judgement, seen);
+    match judgement.treatment {
+        Treatment::Refused | Treatment::Warned => log::warn!(%kind, "{words}"),
+        Treatment::Accepted | Treatment::Same => log::info!(%kind, "{words}"),
+    }
+}
+
+/// Returns the name of a type, or its number.
+fn type_name(state: &NodeState, kind: Kind) -> String {
+    kind_name(&state.lncl, kind).unwrap_or_else(|| format!("kind {kind}"))
+}
+
+/// Returns the name of an application with its TID, or its TID alone.
+fn title(state: &NodeState, tid: Tid) -> String {
+    let all = lock(&state.sync.core).declared_types();
+    let found = all.into_iter().find(|app| app.tid == tid).map(|app| app.name);
+    found.map_or_else(|| tid.to_string(), |name| format!("{name} ({tid})"))
+}
+
+/// Sends a frame to the sync manager of another node.
+fn send<T: Serialize>(state: &NodeState, to: NodeAddress, kind: Kind, frame: &T) -> Result<(), Rejection> {
+    let source = Tid::new(state.ctx.node, AppAddress::SYNC);
+    let mut header = Header::new(kind, source, Tid::new(to, AppAddress::SYNC));
+    // A structure is not urgent.
+    header.class = Class::Bulk;
+    header.sequence = lock(&state.sync.core).next_sequence();
+    header.sent = Time::now();
+    state.ctx.router.send(Message::new(header, encode(frame)))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,232 @@
+//! A node with a peer that sends or handles a type in another version, step by step, without the thread.
+
+use std::sync::Mutex;
+
+use bytes::Bytes;
+use serde::{Deserialize, Serialize};
+use sinew_model::{
+    config::NodeConfig,
+    facts::{AppFact, DeclaredTypes, LinkFact},
+};
+use sinew_runtime::{
+    app::{AppContext, AppSpec, Delivery, DynApp},
+    router::{LocalRoute, MessageSink, SubmitError},
+    tid::Incarnation,
+    wire::{Payload, PayloadType, decode},
+};
+use sinew_sync::{
+    FrameHandler, Input, Name,
+    list::{Entry, List},
+};
+
+use super::*;
+use crate::types::Frames;
+
+const PEER: NodeAddress = NodeAddress::new(0x7f00_0009);
+const INCARNATION: Incarnation = Incarnation(5);
+const KNEE: AppAddress = AppAddress::new(0x1001);
+const GAIT: AppAddress = AppAddress::new(0x1002);
+
+#[derive(Serialize, Deserialize)]
+struct Gains {
+    kp: f32,
+}
+
+impl Payload for Gains {
+    const NAME: &'static str = "test.thread.gains";
+}
+
+/// The same type in another program.
+#[derive(Serialize, Deserialize)]
+struct Renamed {
+    gain: f32,
+}
+
+impl Payload for Renamed {
+    const NAME: &'static str = "test.thread.gains";
+}
+
+struct Knee;
+
+impl actix::Actor for Knee {
+    type Context = AppContext<Self>;
+}
+
+impl actix::Handler<Delivery<Gains>> for Knee {
+    type Result = ();
+    fn handle(&mut self, _: Delivery<Gains>, _: &mut Self::Context) {}
+}
+
+/// Keeps the frames for the peer.
+#[derive(Default)]
+struct Sink(Mutex<Vec<(Kind, Bytes)>>);
+
+impl MessageSink for Sink {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
+        lock(&self.0).push((message.header.kind, message.payload));
+        Ok(())
+    }
+}
+
+struct Bench {
+    state: Arc<NodeState>,
+    comparing: Comparing,
+    peer: Arc<Sink>,
+}
+
+impl Bench {
+    /// Returns a node with a linked peer.
+    fn new() -> Self {
+        let state = NodeState::for_test(NodeConfig::new("test"), Incarnation(1));
+        let (peer, local) = (Arc::new(Sink::default()), Arc::new(Sink::default()));
+        state.ctx.router.set_peer(PEER, peer.clone());
+        state.ctx.router.set_local(KNEE, LocalRoute { sink: local, events: Arc::new([]) });
+        let comparing = Comparing {
+            state: Arc::downgrade(&state),
+            wake: state.types.wake.clone(),
+            changes: state.ctx.directory_changes.subscribe(),
+            installed: Vec::new(),
+        };
+        let bench = Self { state, comparing, peer };
+        bench.input(Input::LinkChanged(LinkFact::LinkUp { node: PEER, incarnation: INCARNATION }));
+        bench
+    }
+
+    fn input(&self, input: Input) {
+        lock(&self.state.sync.core).handle(Time::now(), input);
+    }
+
+    /// Registers an application of this node with these types, in the table of types and in the directory.
+    fn registers(&self, app: AppAddress, name: &str, handles: &[PayloadType], sends: &[PayloadType]) {
+        self.state.types.register(app, handles, sends);
+        self.input(Input::AppChanged(AppFact::own_registered(app, Some(name.to_owned()), Vec::new())));
+        let hash = |one: &PayloadType| (one.kind(), one.schema().unwrap().hash());
+        let types = DeclaredTypes {
+            handles: handles.iter().map(hash).collect(),
+            sends: sends.iter().map(hash).collect(),
+        };
+        self.input(Input::AppChanged(AppFact::Types { app, types }));
+    }
+
+    /// The peer lists an application called `gait` with these types.
+    fn peer_lists(&self, types: DeclaredTypes) {
+        let entry = Entry {
+            name: Name::try_from("gait".to_owned()).unwrap(),
+            app: GAIT,
+            ready: true,
+            ended: None,
+            phases: Vec::new(),
+            requires: Vec::new(),
+            kinds: Vec::new(),
+            handles: types.handles,
+            sends: types.sends,
+        };
+        let list = List { incarnation: INCARNATION, version: 1, entries: vec![entry], groups: Vec::new() };
+        self.input(Input::ListReceived { from: PEER, payload: list.encode_within(usize::MAX, 0).0 });
+    }
+
+    fn peer_sends<T: Serialize>(&self, kind: Kind, frame: &T) -> Result<(), String> {
+        let (source, to) =
+            (Tid::new(PEER, AppAddress::SYNC), Tid::new(self.state.ctx.node, AppAddress::SYNC));
+        let message = Message::new(Header::new(kind, source, to), encode(frame));
+        Frames(Arc::downgrade(&self.state)).receive(PEER, &message)
+    }
+
+    /// Runs a step. Returns the frames that it has sent to the peer.
+    fn steps(&mut self) -> Vec<(Kind, Bytes)> {
+        let state = self.state.clone();
+        self.comparing.step(&state);
+        std::mem::take(&mut *lock(&self.peer.0))
+    }
+
+    fn delivers(&self) -> Result<(), Rejection> {
+        let to = Tid::new(self.state.ctx.node, KNEE);
+        self.state
+            .ctx
+            .router
+            .deliver(Message::new(Header::new(Gains::KIND, Tid::new(PEER, GAIT), to), Bytes::new()))
+    }
+
+    fn faults(&self) -> u64 {
+        let by_cause = self.state.ctx.refusals.by_cause();
+        by_cause.into_iter().find(|(cause, _)| *cause == "types").map_or(0, |(_, count)| count)
+    }
+}
+
+/// Returns both versions of the type.
+fn versions() -> (PayloadType, PayloadType) {
+    let app: DynApp = AppSpec::new("knee", || Knee).handles::<Gains>().sends::<Renamed>().into();
+    (app.types()[0], app.sends()[0])
+}
+
+fn declared(sends: PayloadType) -> DeclaredTypes {
+    let sends = vec![(sends.kind(), sends.schema().unwrap().hash())];
+    DeclaredTypes { sends, ..DeclaredTypes::default() }
+}
+
+#[test]
+fn differing_type_is_fetched_refused_and_reported() {
+    let (gains, renamed) = versions();
+    let mut bench = Bench::new();
+    bench.registers(KNEE, "knee", &[gains], &[]);
+    bench.peer_lists(declared(renamed));
+    // The structure is requested, and messages pass until it is there.
+    let sent = bench.steps();
+    let [(Kind::SYNC_SCHEMA_ASK, question)] = &sent[..] else { panic!("{sent:?}") };
+    let hash = renamed.schema().unwrap().hash();
+    assert_eq!(decode::<SchemaQuestion>(question).unwrap(), SchemaQuestion { kind: Gains::KIND, hash });
+    assert_eq!(bench.delivers(), Ok(()));
+    // With the structure they are refused, and the peer is told once.
+    let schema = renamed.schema().unwrap().schema().encode();
+    bench.peer_sends(Kind::SYNC_SCHEMA, &SchemaAnswer { kind: Gains::KIND, hash, schema }).unwrap();
+    assert_eq!(bench.steps(), []);
+    assert_eq!(bench.delivers(), Err(Rejection::Malformed));
+    let sent = bench.steps();
+    let [(Kind::SYNC_MISMATCH, report)] = &sent[..] else { panic!("{sent:?}") };
+    let report: MismatchReport = decode(report).unwrap();
+    assert_eq!((report.source, report.target, report.seen, report.refused), (GAIT, KNEE, 1, true));
+    assert_eq!(report.schema, gains.schema().unwrap().schema().encode());
+    assert_eq!(bench.delivers(), Err(Rejection::Malformed));
+    assert_eq!((bench.steps(), bench.faults()), (Vec::new(), 0));
+    // The peer's next incarnation has declared nothing yet.
+    bench.input(Input::LinkChanged(LinkFact::LinkBroken { node: PEER, incarnation: INCARNATION }));
+    bench.input(Input::LinkChanged(LinkFact::LinkUp { node: PEER, incarnation: Incarnation(6) }));
+    assert_eq!((bench.steps(), bench.delivers()), (Vec::new(), Ok(())));
+}
+
+#[test]
+fn question_and_report_of_the_peer_are_answered() {
+    let (gains, renamed) = versions();
+    let mut bench = Bench::new();
+    bench.registers(GAIT, "gait", &[], &[renamed]);
+    let hash = renamed.schema().unwrap().hash();
+    let question = SchemaQuestion { kind: Gains::KIND, hash };
+    bench.peer_sends(Kind::SYNC_SCHEMA_ASK, &question).unwrap();
+    let sent = bench.steps();
+    let [(Kind::SYNC_SCHEMA, answer)] = &sent[..] else { panic!("{sent:?}") };
+    let schema = renamed.schema().unwrap().schema().encode();
+    assert_eq!(decode::<SchemaAnswer>(answer).unwrap(), SchemaAnswer { kind: Gains::KIND, hash, schema });
+    let report = MismatchReport {
+        source: GAIT,
+        target: KNEE,
+        kind: Gains::KIND,
+        hash: gains.schema().unwrap().hash(),
+        policy: "accept-additions".to_owned(),
+        refused: true,
+        seen: 1,
+        schema: gains.schema().unwrap().schema().encode(),
+    };
+    bench.peer_sends(Kind::SYNC_MISMATCH, &report).unwrap();
+    assert_eq!((bench.steps(), bench.faults()), (Vec::new(), 0));
+    let reports = lock(&bench.state.types.reported).reports();
+    assert_eq!((reports.len(), reports[0].judgement.treatment), (1, Treatment::Refused));
+    // An unknown structure, and a report on an application that does not send the type, are faults of the peer.
+    bench
+        .peer_sends(
+            Kind::SYNC_SCHEMA_ASK,
+            &SchemaQuestion { hash: sinew_runtime::wire::SchemaHash(1), ..question },
+        )
+        .unwrap();
+    bench.peer_sends(Kind::SYNC_MISMATCH, &MismatchReport { source: KNEE, ..report }).unwrap();
+    assert_eq!((bench.steps(), bench.faults()), (Vec::new(), 2));
+}

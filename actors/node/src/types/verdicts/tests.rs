@@ -1,0 +1,180 @@
+//! Claims about verdicts, one per test.
+
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use sinew_runtime::{
+    outcome::Rejection,
+    router::{LocalRoute, MessageSink, Router, SubmitError, mismatches::Mismatches},
+    wire::{Header, Message},
+};
+
+use super::*;
+
+const HERE: NodeAddress = NodeAddress::new(1);
+const HIP: NodeAddress = NodeAddress::new(2);
+const SOURCE: Tid = Tid::new(HIP, AppAddress::new(0x1000));
+const KNEE: AppAddress = AppAddress::new(0x1001);
+const KIND: Kind = Kind::named("demo.gains");
+
+#[derive(Serialize, Deserialize)]
+struct Gains {
+    kp: f32,
+}
+
+#[derive(Serialize, Deserialize)]
+struct WithDamping {
+    kp: f32,
+    kd: f32,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Renamed {
+    gain: f32,
+}
+
+fn schema<T: Serialize + DeserializeOwned>() -> Schema {
+    Schema::of::<T>().unwrap()
+}
+
+fn handled<T: Serialize + DeserializeOwned>() -> Handled {
+    let schema: &'static Schema = Box::leak(Box::new(schema::<T>()));
+    let (hash, policy) = (schema.hash(), MismatchPolicy::default());
+    Handled { app: KNEE, name: "knee.drive".to_owned(), kind: KIND, hash, policy, schema }
+}
+
+fn sent<T: Serialize + DeserializeOwned>() -> Sent {
+    Sent { tid: SOURCE, name: "gait".to_owned(), kind: KIND, hash: schema::<T>().hash() }
+}
+
+const fn at(seconds: u64) -> Time {
+    Time::from_nanos((1_000 + seconds) * 1_000_000_000)
+}
+
+/// A node that has the verdicts in its routing table.
+struct Bench {
+    verdicts: Verdicts,
+    router: Router,
+}
+
+struct Taken;
+
+impl MessageSink for Taken {
+    fn submit(&self, _: Message) -> Result<(), SubmitError> {
+        Ok(())
+    }
+}
+
+impl Bench {
+    /// Returns a node with an application that handles `H`. The node has the structure `S` of the sender.
+    fn of<S: Serialize + DeserializeOwned, H: Serialize + DeserializeOwned>() -> Self {
+        let (mut verdicts, router) = (Verdicts::default(), Router::new(HERE));
+        router.set_local(KNEE, LocalRoute { sink: Arc::new(Taken), events: Arc::new([]) });
+        let of = (KIND, schema::<S>().hash());
+        assert_eq!(verdicts.declare(at(0), &[handled::<H>()], &[sent::<S>()]), [(HIP, of)]);
+        verdicts.received(HIP, of, &schema::<S>().encode()).unwrap();
+        let bench = Self { verdicts, router };
+        bench.install();
+        bench
+    }
+
+    fn install(&self) {
+        let table = self.verdicts.table();
+        let table = (!table.is_empty()).then(|| Mismatches::new(table, Arc::new(|| {})));
+        self.router.set_mismatches(table);
+    }
+
+    fn delivers(&self) -> Result<(), Rejection> {
+        self.router
+            .deliver(Message::new(Header::new(KIND, SOURCE, Tid::new(HERE, KNEE)), bytes::Bytes::new()))
+    }
+
+    fn told(&mut self, now: Time) -> Vec<(Treatment, u64)> {
+        let due = self.verdicts.take_due(now);
+        self.install();
+        due.into_iter().map(|one| (one.judgement.treatment, one.seen)).collect()
+    }
+}
+
+#[test]
+fn equal_or_unknown_types_are_not_compared() {
+    let mut verdicts = Verdicts::default();
+    assert_eq!(verdicts.declare(at(0), &[handled::<Gains>()], &[sent::<Gains>()]), []);
+    assert_eq!(verdicts.declare(at(0), &[], &[sent::<Renamed>()]), []);
+    assert_eq!(verdicts.declare(at(0), &[handled::<Gains>()], &[]), []);
+    assert!(verdicts.table().is_empty() && verdicts.next_wake().is_none());
+}
+
+#[test]
+fn conflict_is_refused_and_reported_once_a_minute() {
+    let mut bench = Bench::of::<Renamed, Gains>();
+    assert_eq!(bench.told(at(1)), [], "no message has arrived");
+    for _ in 0..3 {
+        assert_eq!(bench.delivers(), Err(Rejection::Malformed));
+    }
+    assert_eq!(bench.told(at(1)), [(Treatment::Refused, 3)]);
+    assert_eq!(bench.delivers(), Err(Rejection::Malformed));
+    assert_eq!(bench.told(at(60)), [], "it is within a minute");
+    assert_eq!(bench.verdicts.next_wake(), Some(at(61)));
+    assert_eq!(bench.told(at(61)), [(Treatment::Refused, 4)]);
+    assert_eq!(bench.told(at(200)), [], "no further message has arrived");
+}
+
+#[test]
+fn accepted_addition_is_reported_once_and_then_costs_nothing() {
+    let mut bench = Bench::of::<WithDamping, Gains>();
+    assert_eq!(bench.delivers(), Ok(()));
+    assert_eq!(bench.told(at(1)), [(Treatment::Accepted, 1)]);
+    assert!(bench.verdicts.table().is_empty());
+    assert_eq!((bench.delivers(), bench.told(at(100))), (Ok(()), Vec::new()));
+    assert_eq!(bench.verdicts.disagreements().len(), 1);
+}
+
+#[test]
+fn verdict_ends_with_the_declaration() {
+    let mut bench = Bench::of::<Renamed, Gains>();
+    assert_eq!(bench.delivers(), Err(Rejection::Malformed));
+    assert_eq!(bench.verdicts.declare(at(1), &[handled::<Gains>()], &[]), []);
+    bench.install();
+    assert_eq!(bench.delivers(), Ok(()));
+    assert!(bench.verdicts.fetched((KIND, schema::<Renamed>().hash())).is_none());
+}
+
+#[test]
+fn missing_structure_is_requested_again_after_two_seconds() {
+    let mut verdicts = Verdicts::default();
+    let mut declare = |now| verdicts.declare(now, &[handled::<Gains>()], &[sent::<Renamed>()]);
+    let wanted = [(HIP, (KIND, schema::<Renamed>().hash()))];
+    assert_eq!(declare(at(0)), wanted);
+    assert_eq!(declare(at(1)), []);
+    assert_eq!(declare(at(2)), wanted);
+}
+
+#[test]
+fn only_the_requested_structure_of_its_node_counts() {
+    let mut verdicts = Verdicts::default();
+    let of = (KIND, schema::<Renamed>().hash());
+    let bytes = schema::<Renamed>().encode();
+    verdicts.received(HIP, of, &bytes).unwrap();
+    assert!(verdicts.fetched(of).is_none(), "nobody asked");
+    verdicts.declare(at(0), &[handled::<Gains>()], &[sent::<Renamed>()]);
+    verdicts.received(NodeAddress::new(9), of, &bytes).unwrap();
+    assert!(verdicts.table().is_empty(), "another node was asked");
+    assert!(verdicts.received(HIP, of, &schema::<WithDamping>().encode()).is_err());
+    assert!(verdicts.received(HIP, of, &[0xff; 9]).is_err());
+    assert!(verdicts.table().is_empty());
+    verdicts.received(HIP, of, &bytes).unwrap();
+    assert_eq!(verdicts.table().len(), 1);
+}
+
+#[test]
+fn pairs_and_structures_are_bounded() {
+    let mut verdicts = Verdicts::default();
+    let many: Vec<_> = (0..MISMATCHES_MAX as u32 + 50)
+        .map(|n| Sent {
+            tid: Tid::new(HIP, AppAddress::new(0x1000 + n)),
+            hash: SchemaHash(n.into()),
+            ..sent::<Renamed>()
+        })
+        .collect();
+    assert_eq!(verdicts.declare(at(0), &[handled::<Gains>()], &many).len(), MISMATCHES_MAX);
+    assert_eq!(verdicts.pairs.len(), MISMATCHES_MAX);
+}

@@ -1,0 +1,195 @@
+//! Types that two nodes have in different versions: which messages pass, and the words in the log of each node.
+
+use std::sync::{
+    Arc, Mutex,
+    atomic::{AtomicU64, Ordering},
+};
+
+use sinew::{
+    inspect::{AskMismatches, AskSchemas, MismatchReport, MismatchesReport, SchemasReport},
+    message::{Kind, Rejection, Sender},
+    prelude::*,
+};
+use sinew_runtime::log::{LogObserver, observe, tracing::Level};
+use sinew_testkit::{
+    DEADLINE, Loopback, all_run,
+    scripted::{sender_app, wait},
+    until,
+};
+
+/// The types of the hip's program.
+mod sent {
+    use super::*;
+    payload!("types.gains" => pub(super) struct Gains { pub kp: f32, pub kd: f32 });
+    payload!("types.limit" => pub(super) struct Limit { pub torque: f32 });
+    payload!("types.counter" => pub(super) struct Counter { pub value: u32 });
+    payload!("types.declared" => pub(super) struct Declared { pub torque: f32 });
+}
+
+/// The same types in the knee's program: one has a field less, one has a renamed field, one has a text for a number.
+mod handled {
+    use super::*;
+    payload!("types.gains" => pub(super) struct Gains { pub kp: f32 });
+    payload!("types.limit" => pub(super) struct Limit { pub newton_metres: f32 });
+    payload!("types.counter" => pub(super) struct Counter { pub value: String });
+    payload!("types.declared" => pub(super) struct Declared { pub newton_metres: f32 });
+}
+
+/// Counts the messages that its handlers get.
+struct Knee(Arc<AtomicU64>);
+
+impl Actor for Knee {
+    type Context = AppContext<Self>;
+}
+
+macro_rules! counted {
+    ($($payload:ident)*) => {
+        $(impl Handler<Delivery<handled::$payload>> for Knee {
+            type Result = ();
+            fn handle(&mut self, _: Delivery<handled::$payload>, _: &mut Self::Context) {
+                self.0.fetch_add(1, Ordering::Relaxed);
+            }
+        })*
+    };
+}
+
+counted!(Gains Limit Counter Declared);
+
+fn knee(handled: &Arc<AtomicU64>) -> AppSpec<Knee> {
+    let handled = handled.clone();
+    AppSpec::new("knee", move || Knee(handled.clone()))
+        .handles::<handled::Gains>()
+        .handles::<handled::Limit>()
+        .handles::<handled::Counter>()
+        .handles::<handled::Declared>()
+}
+
+/// The lines of the log about types, of all nodes of this process.
+#[derive(Default)]
+struct Lines(Mutex<Vec<String>>);
+
+impl LogObserver for Lines {
+    fn wrote(&self, _: Level, target: &str, text: &str) {
+        if target == "sinew::types" {
+            self.0.lock().expect("no writer panics").push(text.to_owned());
+        }
+    }
+}
+
+impl Lines {
+    /// Returns the line of the receiver's node about a type, or that of the sender's node.
+    fn of(&self, name: &str, is_receiver: bool) -> Option<String> {
+        let lines = self.0.lock().expect("no writer panics");
+        let is_it = |line: &&String| {
+            let (target, source) = line.split_once(&format!(" messages of {name} from "))?;
+            let own = if is_receiver { target } else { source };
+            own.contains("of this node").then_some(())
+        };
+        lines.iter().find(|line| is_it(line).is_some()).cloned()
+    }
+}
+
+fn outcome<P: Payload>(sender: &Sender, value: &P) -> Outcome {
+    wait(sender.message("knee", value).confirmed(DEADLINE).expect("its node takes it"))
+}
+
+/// Asks the inspection of a node.
+fn ask<Q: Payload, R: Payload>(sender: &Sender, node: NodeAddress, question: &Q) -> R {
+    let inspection = Tid::new(node, AppAddress::INSPECT);
+    let reply = sender.message(inspection, question).ask::<R>(DEADLINE).expect("the node takes it");
+    wait(reply).expect("the node answers")
+}
+
+fn mismatches(sender: &Sender, node: NodeAddress) -> Vec<MismatchReport> {
+    ask::<AskMismatches, MismatchesReport>(sender, node, &AskMismatches {}).mismatches
+}
+
+#[test]
+fn both_nodes_say_in_words_what_differs() {
+    // Given: two nodes, and three types that differ
+    let lines = Arc::new(Lines::default());
+    let observer: Arc<dyn LogObserver> = lines.clone();
+    assert!(observe(&observer), "there is room for one observer");
+    let (loopback, handled, (gait, probe)) = (Loopback::new(), Arc::default(), sender_app("gait"));
+    let hip = loopback.node("hip").app(gait).start().expect("a node");
+    let other = loopback.node("knee").app(knee(&handled)).start().expect("a node");
+    all_run(&[&hip, &other]);
+    let sender = probe.sender();
+    until("the knee is known", || sender.resolve("knee"));
+    // When: messages come until both sides have logged all three
+    let names = ["types.gains", "types.limit", "types.counter"];
+    let mut sent = 0;
+    until("each side has logged each type", || {
+        let outcomes = [
+            outcome(&sender, &sent::Gains { kp: 1.0, kd: 0.1 }),
+            outcome(&sender, &sent::Limit { torque: 9.0 }),
+            outcome(&sender, &sent::Counter { value: 7 }),
+        ];
+        let malformed = Outcome::Rejected(Rejection::Malformed);
+        assert_eq!(outcomes, [Outcome::Delivered, malformed, malformed]);
+        sent += 1;
+        let is_logged = |name: &&str| lines.of(name, true).is_some() && lines.of(name, false).is_some();
+        names.iter().all(is_logged).then_some(())
+    });
+    // Then: the words of both sides
+    assert_eq!(handled.load(Ordering::Relaxed), sent, "only the messages with one more field are handled");
+    let differences = [
+        ("types.gains", "accepts", "field `kd` is missing at the receiver"),
+        (
+            "types.limit",
+            "refuses",
+            "field `torque` (f32) at the sender seems to be `newton_metres` (f32) at the receiver",
+        ),
+        ("types.counter", "refuses", "`value` is u32 at the sender and text at the receiver"),
+    ];
+    for (name, verb, difference) in differences {
+        for is_receiver in [true, false] {
+            let line = lines.of(name, is_receiver).expect("it was logged");
+            for part in ["knee (", "gait (", verb, difference, "accept-additions"] {
+                assert!(line.contains(part), "{part} in {line}");
+            }
+        }
+    }
+    // And: the answers of both nodes to `sinew why` and `sinew schema`
+    for node in [hip.handle().address(), other.handle().address()] {
+        let of_both = mismatches(&sender, node);
+        for (name, verb, difference) in differences {
+            let found = of_both.iter().find(|one| one.kind == Kind::named(name));
+            let found = found.unwrap_or_else(|| panic!("{name} of {node}: {of_both:#?}"));
+            assert_eq!((found.source.name.as_str(), found.target.name.as_str()), ("gait", "knee"));
+            let treatment = if verb == "accepts" { "accepted" } else { "refused" };
+            assert_eq!(
+                (found.treatment.as_str(), &found.differences[..]),
+                (treatment, &[difference.to_owned()][..])
+            );
+        }
+        let question = AskSchemas { kind: Kind::named("types.limit") };
+        let report: SchemasReport = ask(&sender, node, &question);
+        assert_eq!(report.schemas.len(), 2, "{report:#?}");
+    }
+}
+
+#[test]
+fn declared_type_is_compared_before_its_first_message() {
+    let (loopback, handled) = (Loopback::new(), Arc::default());
+    let (desk, probe) = sender_app("desk");
+    let gait = AppSpec::new("gait", || Gait).sends::<sent::Declared>();
+    let hip = loopback.node("hip").app(gait).app(desk).start().expect("a node");
+    let other = loopback.node("knee").app(knee(&handled)).start().expect("a node");
+    all_run(&[&hip, &other]);
+    let sender = probe.sender();
+    let there = other.handle().address();
+    let refused = until("the knee's node knows that the types differ", || {
+        mismatches(&sender, there).into_iter().find(|one| one.source.name == "gait")
+    });
+    assert_eq!((refused.treatment.as_str(), refused.seen), ("refused", 0));
+    assert_eq!(refused.name.as_deref(), Some("types.declared"));
+    assert_eq!(handled.load(Ordering::Relaxed), 0);
+}
+
+/// Declares a type, and sends nothing.
+struct Gait;
+
+impl Actor for Gait {
+    type Context = AppContext<Self>;
+}
