@@ -69,7 +69,7 @@ impl Structures {
             let known = self.known.entry(one.hash).or_default();
             let schema = one.schema.and_then(|bytes| Schema::parse(&bytes).ok());
             // A node cannot give another structure than that of the hash.
-            known.schema = known.schema.take().or(schema.filter(|schema| schema.hash() == one.hash));
+            known.schema = known.schema.take().or_else(|| schema.filter(|schema| schema.hash() == one.hash));
             known.handled_by.extend(one.handled_by);
             known.sent_by.extend(one.sent_by);
         }

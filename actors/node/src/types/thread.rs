@@ -127,10 +127,11 @@ impl Comparing {
 
     /// Puts the entries into the routing table, if they are others than before.
     fn install(&mut self, state: &NodeState, table: Vec<(TypedPath, Arc<Mismatch>)>) {
-        let is_same = |(one, other): (&(TypedPath, Arc<Mismatch>), &(TypedPath, Arc<Mismatch>))| {
-            one.0 == other.0 && Arc::ptr_eq(&one.1, &other.1)
-        };
-        if table.len() == self.installed.len() && table.iter().zip(&self.installed).all(is_same) {
+        let mut pairs = table.iter().zip(&self.installed);
+        let are_same = pairs.all(|((path, entry), (former_path, former_entry))| {
+            path == former_path && Arc::ptr_eq(entry, former_entry)
+        });
+        if are_same && table.len() == self.installed.len() {
             return;
         }
         self.installed.clone_from(&table);
