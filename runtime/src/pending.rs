@@ -316,16 +316,6 @@ impl<O: MessageSink> MessageSink for AppSink<O> {
         if is_answer(&message.header) { self.submit(message) } else { self.inbox.offer(message, room) }
     }
 
-    fn offer_run(&self, run: &mut VecDeque<Message>) -> Result<(), SubmitError> {
-        if !run.iter().any(|message| is_answer(&message.header)) {
-            return self.inbox.offer_run(run);
-        }
-        while let Some(message) = run.pop_front() {
-            self.offer(message, None)?;
-        }
-        Ok(())
-    }
-
     fn cancel(&self, ticket: Ticket) -> bool {
         if !self.inbox.cancel(ticket) {
             // The handler has or had the request, and may still reply.

@@ -6,7 +6,6 @@ mod each;
 mod groups;
 pub mod guard;
 pub mod mismatches;
-mod run;
 mod sink;
 pub mod tap;
 #[cfg(test)]

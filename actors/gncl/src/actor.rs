@@ -14,7 +14,7 @@ mod timer;
 mod wire;
 
 use std::{
-    cell::RefCell,
+    cell::{Cell, RefCell},
     collections::BTreeMap,
     io,
     net::{Shutdown, SocketAddr},
@@ -43,7 +43,7 @@ use super::{
     },
     datagram_reader,
     frame::frame,
-    inbound::{Collected, Inbound},
+    inbound::Inbound,
     link::{self, ConnectionEvent, DialAddresses, EventKind, LastReceived, Mode, ReaderConfig, SharedMode},
     listener,
     peer::Store,
@@ -212,8 +212,8 @@ impl Gncl {
         session.attach(link);
         let spin = if thread.is_io() { self.spin.clone() } else { Arc::default() };
         let (state, peer_there, met) = (self.state.clone(), peer.clone(), peer.clone());
-        let collected = Collected::default();
-        let inbound = Inbound { state, peer: peer_there, spin, lane, link, checksum, collected };
+        let (outcomes, conversion) = (RefCell::default(), Cell::default());
+        let inbound = Inbound { state, peer: peer_there, spin, lane, link, checksum, outcomes, conversion };
         wire.set_mode(Mode::Relocate(inbound, Relocation { thread: thread.clone(), transport }));
         self.state.ctx.router.set_peer(node, peer.clone());
         let drain_thread = thread.clone();

@@ -1,6 +1,15 @@
 //! The receiving of datagrams, and the timer of all peers' channels. Both are tasks of the IO thread.
 
-use std::{future::poll_fn, io, net::UdpSocket, pin::pin, sync::Arc, task::Poll, time::Duration};
+use std::{
+    cell::{Cell, RefCell},
+    future::poll_fn,
+    io,
+    net::UdpSocket,
+    pin::pin,
+    sync::Arc,
+    task::Poll,
+    time::Duration,
+};
 
 use sinew_runtime::{time::Time, wakes, wire::Checksum};
 use sinew_session::outlet::LinkNumber;
@@ -9,7 +18,7 @@ use crate::{
     State,
     core::Lane,
     datagrams::{DATAGRAM_MAX, Prefix, read_value},
-    inbound::{Collected, Inbound},
+    inbound::Inbound,
     peer::Peer,
     shared_socket::SharedSocket,
     spin::Spin,
@@ -182,7 +191,8 @@ impl Reader {
             lane: Lane::Stream,
             link: LinkNumber::default(),
             checksum: Checksum::Crc,
-            collected: Collected::default(),
+            outcomes: RefCell::default(),
+            conversion: Cell::default(),
         }
     }
 

@@ -1,7 +1,5 @@
 //! Checks of a peer's frame before it becomes a message of this node. spec: GNCL-11
 
-mod run;
-
 use std::{
     cell::{Cell, RefCell},
     sync::Arc,
@@ -30,7 +28,6 @@ use super::{
     spin::Spin,
 };
 use crate::State;
-use run::Run;
 
 /// Maximum number of outcomes that are settled together, not counting those of one frame.
 const OUTCOMES_BATCH_MAX: usize = 1_024;
@@ -46,63 +43,28 @@ pub(super) struct Inbound {
     pub(super) link: LinkNumber,
     /// The checksum of the frames.
     pub(super) checksum: Checksum,
-    /// The state of the present [`Batch`].
-    pub(super) collected: Collected,
-}
-
-/// State that the frames of one [`Batch`] share, and their results that are processed together.
-#[derive(Default)]
-pub(super) struct Collected {
-    /// Outcomes that the peer reported and that are not settled yet: at most [`OUTCOMES_BATCH_MAX`] and those of one
-    /// frame.
-    outcomes: RefCell<Vec<(Ticket, Outcome)>>,
-    /// The conversion of the peer's times, once a message has needed it.
-    conversion: Cell<Option<Conversion>>,
-    /// Messages for one application that are not handed over yet.
-    run: RefCell<Run>,
-    /// Whether more was read with the present frame.
-    behind: Cell<Behind>,
-}
-
-/// Whether bytes were read behind a frame, together with it.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) enum Behind {
-    #[default]
-    Nothing,
-    More,
+    /// Outcomes that the peer reported in this [`Batch`] and that are not settled yet: at most
+    /// [`OUTCOMES_BATCH_MAX`] and those of one frame.
+    pub(super) outcomes: RefCell<Vec<(Ticket, Outcome)>>,
+    /// The conversion of the peer's times, once a message of this [`Batch`] has needed it.
+    pub(super) conversion: Cell<Option<Conversion>>,
 }
 
 /// A conversion of the peer's times, for messages that are received at this time. `None` if the peer's clock is not
 /// measured.
-type Conversion = (Time, Option<ClockConversion>);
+pub(super) type Conversion = (Time, Option<ClockConversion>);
 
-/// Frames that were read together. At its end, or at a panic, the collected messages are handed over, the received
-/// outcomes are settled, and an ACK is sent if that is due. Then the receivers of messages are woken.
+/// Frames that were read together. At its end, or at a panic, the received outcomes are settled and an ACK is
+/// sent if that is due. Then the receivers of messages are woken.
 pub(super) struct Batch<'a> {
-    // Dropped in this order, each also after a panic of the one before.
-    _messages: MessagesEnd<'a>,
-    _outcomes: OutcomesEnd<'a>,
+    inbound: &'a Inbound,
     _wakes: wakes::Batch,
 }
 
-/// Hands over the collected messages when it is dropped.
-struct MessagesEnd<'a>(&'a Inbound);
-
-impl Drop for MessagesEnd<'_> {
+impl Drop for Batch<'_> {
     fn drop(&mut self) {
-        if let Some(session) = self.0.peer.session(self.0.lane) {
-            self.0.hand_over(session);
-        }
-    }
-}
-
-/// Settles the received outcomes when it is dropped, and acknowledges the messages if that is due.
-struct OutcomesEnd<'a>(&'a Inbound);
-
-impl Drop for OutcomesEnd<'_> {
-    fn drop(&mut self) {
-        self.0.settle_outcomes();
-        if let Some(session) = self.0.peer.session(self.0.lane) {
+        self.inbound.settle_outcomes();
+        if let Some(session) = self.inbound.peer.session(self.inbound.lane) {
             session.acknowledge_if_due();
         }
     }
@@ -112,8 +74,8 @@ impl Inbound {
     /// Starts a batch: frames that were read together at `now` are [received](Self::receive) while it exists.
     pub(super) fn batch(&self, now: Time) -> Batch<'_> {
         self.peer.mark_alive(now);
-        self.collected.conversion.set(None);
-        Batch { _messages: MessagesEnd(self), _outcomes: OutcomesEnd(self), _wakes: wakes::Batch::begin() }
+        self.conversion.set(None);
+        Batch { inbound: self, _wakes: wakes::Batch::begin() }
     }
 
     /// Processes a frame received at `now`, if it has the next number: delivers it, settles it, or refuses
@@ -121,9 +83,8 @@ impl Inbound {
     ///
     /// # Errors
     /// The peer violates the protocol: the frame does not have the next number, or is an invalid acknowledgement.
-    pub(super) fn receive(&self, now: Time, message: Message, behind: Behind) -> Result<(), RefusalError> {
+    pub(super) fn receive(&self, now: Time, message: Message) -> Result<(), RefusalError> {
         let Some(session) = self.peer.session(self.lane) else { return Ok(()) };
-        self.collected.behind.set(behind);
         if let Some(channel) = self.peer.channel() {
             channel.on_frame(now);
         }
@@ -160,7 +121,7 @@ impl Inbound {
         let disposition = if is_for_the_link(&message, Kind::GNCL_VOID) {
             Some(Disposition::Void)
         } else if is_for_the_link(&message, Kind::GNCL_OUTCOMES) {
-            self.on_outcomes(now, &message, session)?;
+            self.on_outcomes(now, &message)?;
             Some(Disposition::Consumed)
         } else {
             self.process(now, message, session, admission)
@@ -202,9 +163,7 @@ impl Inbound {
         guard: ProcessingGuard<'_>,
     ) {
         self.spin.on_message(now);
-        self.collected.conversion.set(None);
-        // No batch ends after a datagram, so that nothing is collected.
-        self.collected.behind.set(Behind::Nothing);
+        self.conversion.set(None);
         match self.process(now, message, session, Admission::Deliver) {
             Some(disposition) => guard.finish(disposition),
             None => guard.release(),
@@ -218,8 +177,7 @@ impl Inbound {
         }
     }
 
-    /// Processes a message. Returns its disposition; `None`: it waits for its application, or it is
-    /// [collected](Self::collect), and counted when it is handed over.
+    /// Processes a message. Returns its disposition; `None`: it waits for its application.
     fn process(
         &self,
         now: Time,
@@ -248,8 +206,6 @@ impl Inbound {
             return Some(Disposition::Consumed);
         }
         if header.kind == Kind::CANCEL {
-            // The request may be among the collected messages.
-            self.hand_over(session);
             self.cancel(session, message.ticket());
             return Some(Disposition::Consumed);
         }
@@ -276,19 +232,12 @@ impl Inbound {
             return Some(Disposition::Expired);
         }
         match (admission, backlog_key(&message.header)) {
-            (Admission::Enqueue(queue), _) => {
-                self.hand_over(session);
+            (Admission::Enqueue(queue), _) => self.enqueue(session, queue, message),
+            (_, Some(queue)) if self.state.store.has_earlier_messages(&self.peer, queue) => {
                 self.enqueue(session, queue, message)
             }
-            (_, Some(queue)) if self.must_collect() => {
-                self.collect(session, queue, message);
-                None
-            }
             (_, Some(queue)) => self.offer(session, queue, message),
-            (_, None) => {
-                self.hand_over(session);
-                Some(self.deliver(message))
-            }
+            (_, None) => Some(self.deliver(message)),
         }
     }
 
@@ -306,11 +255,7 @@ impl Inbound {
         }
     }
 
-    /// Offers a message that arrived alone.
     fn offer(&self, session: &PeerSession, queue: u64, message: Message) -> Option<Disposition> {
-        if self.state.store.has_earlier_messages(&self.peer, queue) {
-            return self.enqueue(session, queue, message);
-        }
         match self.state.ctx.router.offer(message, None) {
             Ok(()) => Some(Disposition::Forwarded),
             Err(SubmitError { message, why: Rejection::QueueFull }) => self.enqueue(session, queue, message),
@@ -351,14 +296,14 @@ impl Inbound {
 
     /// Returns the conversion of the peer's times, looked up once for all messages of a batch.
     fn conversion_at(&self, now: Time) -> Option<ClockConversion> {
-        if let Some((at, conversion)) = self.collected.conversion.get()
+        if let Some((at, conversion)) = self.conversion.get()
             && at == now
         {
             return conversion;
         }
         let measured = self.state.ctx.clocks.get(self.peer.node, self.peer.incarnation);
         let conversion = measured.map(|clock| clock.conversion_at(now));
-        self.collected.conversion.set(Some((now, conversion)));
+        self.conversion.set(Some((now, conversion)));
         conversion
     }
 
@@ -400,13 +345,13 @@ impl Inbound {
         };
         match outcome {
             // An outcome that is not pending any more was settled as Unknown when an earlier connection ended.
-            Some(outcome) => self.collected.outcomes.borrow_mut().push((about(&message.header), outcome)),
+            Some(outcome) => self.outcomes.borrow_mut().push((about(&message.header), outcome)),
             None => self.count(now, "no such outcome", message),
         }
     }
 
     /// Processes several outcomes in one frame; an unknown code affects only its own entry. spec: GNCL-17
-    fn on_outcomes(&self, now: Time, message: &Message, session: &PeerSession) -> Result<(), RefusalError> {
+    fn on_outcomes(&self, now: Time, message: &Message) -> Result<(), RefusalError> {
         let Some(all) = read_outcomes(&message.payload) else {
             let length = message.payload.len();
             return Err(RefusalError::Violation(format!(
@@ -417,13 +362,12 @@ impl Inbound {
             match reported.outcome {
                 Some(outcome) => {
                     let ticket = reported.ticket(self.state.ctx.node, self.peer.node);
-                    self.collected.outcomes.borrow_mut().push((ticket, outcome));
+                    self.outcomes.borrow_mut().push((ticket, outcome));
                 }
                 None => self.count(now, "no such outcome", message),
             }
         }
-        if self.collected.outcomes.borrow().len() >= OUTCOMES_BATCH_MAX {
-            self.hand_over(session);
+        if self.outcomes.borrow().len() >= OUTCOMES_BATCH_MAX {
             self.settle_outcomes();
         }
         Ok(())
@@ -431,13 +375,13 @@ impl Inbound {
 
     /// Settles the received outcomes. The notified code finds nothing borrowed here.
     fn settle_outcomes(&self) {
-        if self.collected.outcomes.borrow().is_empty() {
+        if self.outcomes.borrow().is_empty() {
             return;
         }
-        let mut outcomes = self.collected.outcomes.take();
+        let mut outcomes = self.outcomes.take();
         self.peer.confirm(&mut outcomes);
         outcomes.clear();
-        self.collected.outcomes.replace(outcomes);
+        self.outcomes.replace(outcomes);
     }
 
     fn count(&self, now: Time, cause: &'static str, message: &Message) {

@@ -27,7 +27,7 @@ use tokio_util::codec::Decoder;
 use super::{
     authenticator::{self, AuthError, Authenticator, TlsRole},
     core::{ConnectionId, HANDSHAKE_PAYLOAD_MAX, RefusalError},
-    inbound::{Behind, Inbound},
+    inbound::Inbound,
     task::{ReadingTask, Relocation, TaskThread},
     transport::{ReadResult, Transport},
 };
@@ -391,8 +391,7 @@ impl Reader {
             }
             self.reading.last_received.record(now);
             let is_link_frame = matches!(message.header.kind, Kind::GNCL_DATAGRAMS | Kind::GNCL_UNDELIVERED);
-            let behind = if self.buffer.is_empty() { Behind::Nothing } else { Behind::More };
-            if let Err(decline) = inbound.receive(now, message, behind) {
+            if let Err(decline) = inbound.receive(now, message) {
                 return Decoded::Event(EventKind::Violated(decline));
             }
             // The first frame is always an ACK. A later one shows that local messages arrive.

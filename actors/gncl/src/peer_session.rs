@@ -334,11 +334,6 @@ impl PeerSession {
         self.update_counters(|counters| counters.finish(disposition));
     }
 
-    /// Records the disposition of this number of messages in process, under one lock.
-    pub(super) fn finish_all(&self, disposition: Disposition, count: usize) {
-        self.update_counters(|counters| counters.finish_all(disposition, count as u64));
-    }
-
     /// Processes the peer's ACK.
     pub(super) fn on_ack(&self, link: LinkNumber, ack: &Ack, now: Time) {
         let counts = self.inbox().receiving.on_epoch(link.number(), ack.epoch);

@@ -54,13 +54,8 @@ impl ReceiveCounters {
 
     /// Counts a message in process as ended.
     pub(super) const fn finish(&mut self, disposition: Disposition) {
-        self.finish_all(disposition, 1);
-    }
-
-    /// Counts this number of messages in process as ended.
-    pub(super) const fn finish_all(&mut self, disposition: Disposition, count: u64) {
-        self.in_process = self.in_process.saturating_sub(count);
-        self.dispositions[disposition as usize] += count;
+        self.suspend();
+        self.dispositions[disposition as usize] += 1;
     }
 
     /// Returns the number of received messages, without voids.

@@ -17,7 +17,6 @@ mod node_down_events;
 mod outcomes;
 mod periodic_checks;
 mod restarts;
-mod runs;
 mod secured;
 #[cfg(target_os = "linux")]
 mod starved;

@@ -13,7 +13,6 @@ mod reader;
 mod remote_reader;
 mod request;
 mod room;
-mod sink;
 mod source;
 mod tally;
 #[cfg(test)]
@@ -39,11 +38,12 @@ pub use tally::Tally;
 use crate::{
     clock::Clock,
     lock,
-    outcome::{Outcome, Rejection},
-    router::SubmitError,
+    outcome::{Outcome, Rejection, Ticket},
+    router::{MessageSink, SubmitError},
     tid::Tid,
     time::Time,
     undelivered::{RefusalSink, is_reported},
+    wakes,
     wire::{Class, Header, Message},
 };
 
@@ -368,6 +368,106 @@ impl Mailbox {
     #[must_use]
     pub fn tally(&self, class: Class) -> Tally {
         lock(&self.shared).tallies[class as usize]
+    }
+}
+
+impl Mailbox {
+    /// Accepts an event, or calls `is_full` with the lock held.
+    fn take_event(&self, event: Message, is_full: impl FnOnce(&mut Shared)) -> Result<(), SubmitError> {
+        let mut shared = lock(&self.shared);
+        if shared.closed {
+            shared.tallies[event.header.class as usize].refused += 1;
+            return Err(SubmitError::new(event, Rejection::Closed));
+        }
+        self.record_wait(&mut shared);
+        let waker = shared.submit_event(event).inspect_err(|_| is_full(&mut shared))?;
+        drop(shared);
+        waker.into_iter().for_each(wakes::wake);
+        Ok(())
+    }
+
+    /// Accepts a message that is no event.
+    fn take_message(&self, message: Message) -> Result<(), SubmitError> {
+        let class = message.header.class as usize;
+        let (mut expired, mut event_waits) = (Vec::new(), None);
+        let taken = {
+            let mut shared = lock(&self.shared);
+            if shared.closed {
+                shared.tallies[class].refused += 1;
+                return Err(SubmitError::new(message, Rejection::Closed));
+            }
+            if shared.refuses {
+                shared.tallies[class].refused += 1;
+                return Err(SubmitError::new(message, Rejection::Down));
+            }
+            if message.receipt.is_some() && message.header.class == Class::Stream {
+                shared.tallies[class].refused += 1;
+                return Err(SubmitError::new(message, Rejection::Unsupported));
+            }
+            if !shared.queue.has_room_for(&message) {
+                // An application that waits for its start takes no messages, so expired ones are removed here
+                // to make room.
+                expired = shared.expire(self.clock.now());
+                if !expired.is_empty() {
+                    event_waits = shared.event_waits.take();
+                }
+            }
+            self.record_wait(&mut shared);
+            match shared.queue.push(message) {
+                Ok(superseded) => {
+                    shared.tallies[class].taken += 1;
+                    shared.tallies[class].superseded += u64::from(superseded.is_some());
+                    shared.high_water = shared.high_water.max(shared.waiting());
+                    Ok(if shared.paused { None } else { shared.waker.take() })
+                }
+                Err(refused) => {
+                    shared.tallies[class].refused += 1;
+                    Err(refused)
+                }
+            }
+        };
+        // Settled and woken without the lock, so that a notified thread does not wait for it.
+        expired.iter_mut().for_each(|message| message.settle(Outcome::Expired));
+        event_waits.into_iter().for_each(Waker::wake);
+        if let Some(waker) = taken? {
+            wakes::wake(waker);
+        }
+        Ok(())
+    }
+}
+
+impl MessageSink for Mailbox {
+    fn submit(&self, message: Message) -> Result<(), SubmitError> {
+        if is_event(&message.header) {
+            return self.take_event(message, |_| {});
+        }
+        self.take_message(message)
+    }
+
+    fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
+        if is_event(&message.header) {
+            let class = message.header.class as usize;
+            return self.take_event(message, |shared| {
+                // The event is offered again.
+                shared.tallies[class].refused -= 1;
+                shared.event_waits = room.cloned();
+            });
+        }
+        let Err(refused) = self.take_message(message) else { return Ok(()) };
+        if refused.why == Rejection::QueueFull {
+            let waker = {
+                let mut shared = lock(&self.shared);
+                // The message is offered again.
+                shared.tallies[refused.message.header.class as usize].refused -= 1;
+                room.and_then(|room| shared.queue.offered(&refused.message, room))
+            };
+            waker.into_iter().for_each(Waker::wake);
+        }
+        Err(refused)
+    }
+
+    fn cancel(&self, ticket: Ticket) -> bool {
+        self.cancel_request(ticket)
     }
 }
 

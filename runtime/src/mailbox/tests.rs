@@ -7,7 +7,6 @@ use futures_util::task::noop_waker;
 
 use super::*;
 use crate::{
-    router::MessageSink as _,
     tid::Tid,
     wire::{Header, Kind},
 };

@@ -1,6 +1,6 @@
 //! A destination of messages, and the rejection of a message by it.
 
-use std::{collections::VecDeque, task::Waker};
+use std::task::Waker;
 
 use crate::{
     outcome::{Rejection, Ticket},
@@ -24,18 +24,6 @@ pub trait MessageSink: Send + Sync {
     fn offer(&self, message: Message, room: Option<&Waker>) -> Result<(), SubmitError> {
         let _ = room;
         self.submit(message)
-    }
-
-    /// Offers messages from the front of `run`, each as [`offer`](Self::offer) does without a waker, until one is rejected.
-    /// The messages behind that one stay in `run`; without an error none stays. A sink with a lock takes it once.
-    ///
-    /// # Errors
-    /// Those of `submit`, for the first message that is rejected.
-    fn offer_run(&self, run: &mut VecDeque<Message>) -> Result<(), SubmitError> {
-        while let Some(message) = run.pop_front() {
-            self.offer(message, None)?;
-        }
-        Ok(())
     }
 
     /// Cancels the request of `ticket`; its reply is no longer awaited. If the request is queued here, it is

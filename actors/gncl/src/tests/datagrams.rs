@@ -2,7 +2,12 @@
 
 mod by_hand;
 
-use std::{net::SocketAddr, sync::Arc, time::Duration};
+use std::{
+    cell::{Cell, RefCell},
+    net::SocketAddr,
+    sync::Arc,
+    time::Duration,
+};
 
 use by_hand::{ACK, DatagramPeer, KEY, PROBE, VALUE, nines_app, opened};
 use sinew_model::facts::LinkFact;
@@ -21,7 +26,7 @@ use crate::{
     core::{Introduction, Lane, write},
     datagrams::Announcement,
     frame::frame,
-    inbound::{Behind, Collected, Inbound},
+    inbound::Inbound,
 };
 
 fn value(node: &Node, to: Tid, number: u64) -> Message {
@@ -356,11 +361,11 @@ fn datagram_state_of_a_former_connection_is_ignored() {
         let peer = node.state.store.peer(NINE).expect("it is linked");
         let say_on = |lane, link| {
             let (state, peer) = (node.state.clone(), peer.clone());
-            let (spin, checksum, collected) = (Arc::default(), Checksum::Crc, Collected::default());
-            let inbound = Inbound { state, peer, spin, lane, link, checksum, collected };
+            let (spin, checksum, outcomes) = (Arc::default(), Checksum::Crc, RefCell::default());
+            let conversion = Cell::default();
+            let inbound = Inbound { state, peer, spin, lane, link, checksum, outcomes, conversion };
             let said = Announcement { port: 1, key: KEY, address: 0 };
-            let said = frame(NINE, node.address(), Kind::GNCL_DATAGRAMS, write(&said));
-            inbound.receive(Time::now(), said, Behind::Nothing)
+            inbound.receive(Time::now(), frame(NINE, node.address(), Kind::GNCL_DATAGRAMS, write(&said)))
         };
         assert_eq!(say_on(Lane::Stream, LinkNumber::default()), Ok(()));
         assert!(peer.channel().expect("both can").is_open(), "nothing goes elsewhere");
