@@ -135,7 +135,8 @@ impl Recorded {
         Self { directory, node }
     }
 
-    /// Has each source send. A node that is too slow stops after twice the time that the rate needs, and a second.
+    /// Has each source send. A node that is too slow stops after one and a half times the time
+    /// that the rate needs, and 10 s.
     ///
     /// # Panics
     /// If the node does not answer.

@@ -17,6 +17,9 @@ const PACE: Duration = Duration::from_millis(1);
 /// Messages that are due for longer than this are not caught up on at once.
 const DEBT: Duration = Duration::from_millis(20);
 
+/// Further time for the messages, beyond one and a half times that of their rate.
+const RESERVE: Duration = Duration::from_secs(10);
+
 payload!("recorded.load", Bulk => #[derive(Debug)] struct Value {
     number: u64,
     #[serde(with = "serde_bytes")]
@@ -67,7 +70,8 @@ fn send(senders: &[Sender], load: Load) -> Sent {
     let began = Instant::now();
     let (mut due, mut looked) = (0.0, began);
     // A node that cannot keep the rate ends all the same.
-    let lasts = Duration::from_secs_f64(2.0 * load.count as f64 / rate.max(1.0)) + Duration::from_secs(1);
+    let needed = Duration::from_secs_f64(load.count as f64 / rate.max(1.0));
+    let lasts = needed.mul_f64(1.5) + RESERVE;
     while value.number < load.count && began.elapsed() < lasts {
         let now = Instant::now();
         let most = (rate * DEBT.as_secs_f64()).max(1.0);

@@ -40,10 +40,11 @@ fn full_disk_counts_what_it_drops() {
     let Some(disk) = SmallDisk::mount("size=1m") else { return };
     let mut node = Recorded::start(2, None);
     let file = disk.folder.join("walk.mcap");
-    let recorder = node.recorder(&file, &["--compression", "none"]);
+    // With a maximum size the chunks are an eighth of it, so that some fit.
+    let recorder = node.recorder(&file, &["--compression", "none", "--max-size", "2M"]);
     let mut recorder = Recorder::start(recorder, &file);
-    // When: far more is sent than there is room for, 2 s of it before
-    let sent = node.send(Load { rate: 50, length: 2_000, count: 250 });
+    // When: more is sent than there is room for
+    let sent = node.send(Load { rate: 500, length: 2_000, count: 500 });
     let (code, summary) = recorder.finish();
     // Then: the command names the disk
     let faults = summary["faults"].to_string();
