@@ -61,7 +61,10 @@ impl Report {
     /// Machine-readable output in one line.
     #[must_use]
     pub fn json(&self) -> Value {
-        let ns = |[p50, p99]: [Duration; 2]| json!({ "p50_ns": p50.as_nanos() as u64, "p99_ns": p99.as_nanos() as u64 });
+        let ns = |times: [Duration; 2]| {
+            let [p50, p99] = times.map(|time| u64::try_from(time.as_nanos()).unwrap_or(u64::MAX));
+            json!({ "p50_ns": p50, "p99_ns": p99 })
+        };
         let [without, with] = self.medians();
         let [p50, p99] = self.ratios();
         let sum = |of: fn(&Round) -> u64| self.rounds.iter().map(of).sum::<u64>();

@@ -1,6 +1,6 @@
-/* Slow writes: each call that writes to a recording (a file with the ending .mcap), or moves it to the disk, sleeps first, for
- * SINEW_SLOW_MS milliseconds. The number of these calls is in the file named by SINEW_SLOW_COUNT. Loaded before the C library
- * (LD_PRELOAD). */
+/* Slow writes: each call that writes to a recording (a file with the ending .mcap), or moves it to the disk, sleeps
+ * first, for SINEW_SLOW_MS milliseconds. The number of these calls is in the file named by SINEW_SLOW_COUNT. Loaded
+ * before the C library (LD_PRELOAD). */
 #define _GNU_SOURCE
 #include <fcntl.h>
 #include <stdint.h>

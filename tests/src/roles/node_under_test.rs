@@ -3,15 +3,17 @@
 //! ```text
 //! node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--floods NAME]... [--will NAME]...
 //! [--meets NAME]... [--incarnation NUMBER] [--says-directory] [--streams-to NAME [--stream BYTES]...]
-//! [--stamps-to NAME] [--logs | --logs-info | --default-log] [--held] [--forgets-a-handler] [--sends-text-to NAME] [--panics]
+//! [--stamps-to NAME] [--logs | --logs-info | --default-log] [--held] [--forgets-a-handler]
+//! [--sends-text-to NAME] [--panics]
 //! ```
 //!
 //! With `--held` a thread-local variable of the main thread holds the node, and `main` returns 3 once the
 //! node runs. The destructor of the variable stops the node.
 //!
 //! For each `--stream` length it runs another application, which sends a Stream value of this length every 20
-//! ms. With `--stamps-to` a further application sends its own monotonic time every 20 ms. To each `--floods` destination it sends the same counts, as many as are accepted. A will is a count of
-//! 1,000,000. The default incarnation is the clock of its host.
+//! ms. With `--stamps-to` a further application sends its own monotonic time every 20 ms. To each `--floods`
+//! destination it sends the same counts, as many as are accepted. A will is a count of 1,000,000. The default
+//! incarnation is the clock of its host.
 //!
 //! By default its log goes to standard error. With `--logs` warnings go to standard output, with
 //! `--logs-info` more than these. With `--default-log` it installs no subscriber, as a first program does:

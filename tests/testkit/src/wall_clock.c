@@ -1,6 +1,6 @@
-/* A wall clock that is ahead by SINEW_WALL_AHEAD_S seconds, for a process that loads this before the C library (LD_PRELOAD).
- * It replaces the function of the kernel's vDSO, so it holds for callers that pass the C library by, too. All other clocks
- * stay unchanged. Where the kernel does not let a process do that, the process ends with exit code 97. */
+/* A wall clock that is ahead by SINEW_WALL_AHEAD_S seconds, for a process that loads this before the C library
+ * (LD_PRELOAD). It replaces the function of the kernel's vDSO, so it holds for callers that pass the C library by, too.
+ * All other clocks stay unchanged. Where the kernel does not let a process do that, it ends with exit code 97. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <elf.h>
@@ -19,7 +19,8 @@ static long ahead_s;
 static int read_clock(clockid_t clock, struct timespec *now)
 {
     long result = syscall(SYS_clock_gettime, clock, now);
-    if (!result && (clock == CLOCK_REALTIME || clock == CLOCK_REALTIME_COARSE || clock == CLOCK_TAI)) now->tv_sec += ahead_s;
+    int is_wall = clock == CLOCK_REALTIME || clock == CLOCK_REALTIME_COARSE || clock == CLOCK_TAI;
+    if (!result && is_wall) now->tv_sec += ahead_s;
     return (int)result;
 }
 
