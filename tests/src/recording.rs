@@ -21,7 +21,9 @@ use std::{
 
 use rustix::process::Signal;
 use serde_json::Value;
-use sinew_testkit::{NodeProcess, TestDirectory, numbers, own_group, preload::Preload, program, until};
+use sinew_testkit::{
+    NodeProcess, TestDirectory, numbers, own_group, preload::Preload, program, unique, until,
+};
 
 pub use self::{
     accounts::{Account, Accounts, messages_in, tallies_in},
@@ -121,9 +123,11 @@ impl Recorded {
     pub fn start(sources: u64, keep_bytes: Option<u64>) -> Self {
         let directory = TestDirectory::new();
         let ring = keep_bytes.map(|bytes| format!("[record]\nkeep_bytes = {bytes}\n")).unwrap_or_default();
+        // The journal of a node is named by its project and its address.
         let text = format!(
-            "[node]\nname = \"knee\"\naddress = \"127.0.0.1\"\nproject = \"recording\"\n\
+            "[node]\nname = \"knee\"\naddress = \"127.0.0.1\"\nproject = \"recording-{}\"\n\
              [lncl]\nsocket = \"{}\"\n{ring}[ndl]\nmulticast = \"{}\"\nmdns_port = false\n",
+            unique(),
             directory.join("knee.sock").display(),
             own_group()
         );

@@ -13,7 +13,8 @@ use sinew_bag::{
     read::{Item, Reader, Role},
 };
 use sinew_testkit::{
-    Hosts, NodeProcess, TestDirectory, own_group, preload::Preload, sandbox::in_own_time_namespace, until,
+    Hosts, NodeProcess, TestDirectory, own_group, preload::Preload, sandbox::in_own_time_namespace, unique,
+    until,
 };
 use sinew_tests::{recording::sinew, role};
 
@@ -86,11 +87,11 @@ impl Robot {
 
     /// Starts the nodes. Each sends stamps to the next one.
     fn start(&self) -> Vec<NodeProcess> {
-        let group = own_group();
+        let (group, project) = (own_group(), unique());
         let start = |host: usize| {
             let (name, address) = (NAMES[host], host + 1);
             let text = format!(
-                "[node]\nname = \"{name}\"\nproject = \"clocks\"\n[lncl]\nsocket = \"{}\"\n\
+                "[node]\nname = \"{name}\"\nproject = \"clocks-{project}\"\n[lncl]\nsocket = \"{}\"\n\
                  [ndl]\ninterface = \"10.77.0.{address}\"\nmulticast = \"{group}\"\n",
                 self.directory.join(&format!("{name}.sock")).display()
             );
