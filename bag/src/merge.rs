@@ -60,6 +60,20 @@ struct Source {
     /// Its channels in the merged file.
     ids: BTreeMap<u16, u16>,
     next: Option<OwnedMessage>,
+    /// The time of the last message in the merged file.
+    last_ns: u64,
+}
+
+impl Source {
+    /// Returns the time of the next message in the merged file.
+    ///
+    /// Where two readings of a clock are near each other and differ, the converted time runs backwards for less than
+    /// their bounds. The merged file has the earlier time then, which is within the bound, too.
+    fn next_ns(&mut self) -> Option<u64> {
+        let message = self.next.as_ref()?;
+        self.last_ns = self.last_ns.max(self.way.convert(message.log_ns).0);
+        Some(self.last_ns)
+    }
 }
 
 /// Merges files into one, in the order of their times. Each topic gets the name of its node in front.
@@ -110,7 +124,7 @@ fn open(path: &Path, clocks: &Clocks, merged: &mut Merged) -> Result<Source, Bag
         merged.nodes.len() - 1
     });
     let next = ordered.next_message()?;
-    Ok(Source { ordered, node: place, way, ids: BTreeMap::new(), next })
+    Ok(Source { ordered, node: place, way, ids: BTreeMap::new(), next, last_ns: 0 })
 }
 
 enum MergeError {
@@ -129,8 +143,8 @@ fn write(file: BufWriter<fs::File>, sources: &mut [Source], merged: &mut Merged)
     let mut writer = options.library(concat!("sinew-bag/", env!("CARGO_PKG_VERSION"))).create(file)?;
     let mut next = BinaryHeap::new();
     for (at, source) in sources.iter_mut().enumerate() {
-        if let Some(message) = &source.next {
-            next.push(Reverse((source.way.convert(message.log_ns).0, at)));
+        if let Some(log_ns) = source.next_ns() {
+            next.push(Reverse((log_ns, at)));
         }
     }
     let mut sequence = 0_u64;
@@ -153,8 +167,8 @@ fn write(file: BufWriter<fs::File>, sources: &mut [Source], merged: &mut Merged)
         writer.write_to_known_channel(&header, &message.data)?;
         sequence += 1;
         source.next = source.ordered.next_message().map_err(MergeError::Read)?;
-        if let Some(message) = &source.next {
-            next.push(Reverse((source.way.convert(message.log_ns).0, at)));
+        if let Some(log_ns) = source.next_ns() {
+            next.push(Reverse((log_ns, at)));
         }
     }
     let mut metadata = BTreeMap::from([

@@ -6,7 +6,7 @@ mod unread_log;
 
 use std::process::ExitCode;
 
-use crate::{attacks, barriers, clients, link_faults, slow_consumer};
+use crate::{attacks, barriers, clients, link_faults, recording, slow_consumer};
 
 /// The options of a role, after its configuration.
 struct Options<'a>(&'a [String]);
@@ -43,6 +43,7 @@ pub fn run() -> Option<ExitCode> {
         "decoy" => attacks::run_decoy(arguments),
         "party" => barriers::run_party(arguments),
         "link-node" => link_faults::run_node(arguments),
+        "recorded" => recording::run_node(arguments),
         "sender" => slow_consumer::run_sender(arguments),
         "receiver" => slow_consumer::run_receiver(arguments),
         client => clients::run_role(client, arguments),

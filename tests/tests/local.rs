@@ -4,3 +4,4 @@ mod away;
 mod black_channel;
 mod nodes;
 mod processes;
+mod recordings;

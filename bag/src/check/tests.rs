@@ -78,6 +78,12 @@ fn findings<P: AsRef<Path>>(files: &[P]) -> Vec<(Kind, String)> {
     all.filter(|finding| finding.kind != Kind::NoFile).map(|finding| (finding.kind, finding.text)).collect()
 }
 
+/// Returns the topics of the findings.
+fn topics(file: &Path) -> Vec<String> {
+    let all = check(&[file]).unwrap().findings.into_iter();
+    all.filter(|finding| finding.kind != Kind::NoFile).map(|finding| finding.topic).collect()
+}
+
 #[test]
 fn whole_recording_is_fine() {
     let folder = TestFolder::new();
@@ -98,6 +104,7 @@ fn cut_message_is_found_exactly() {
     sent(&path);
     let forged =
         forge(&path, |topic, sequence, data| (topic != RAW || sequence != 17).then(|| data.to_vec()));
+    assert_eq!(topics(&forged), [RAW]);
     assert_eq!(
         findings(&[forged]),
         [(Kind::Missing, "message 17 (sequence 17) is missing; its view is there".to_owned())]
@@ -155,7 +162,9 @@ fn falsified_counter_is_named() {
         matches!(&found[..], [(Kind::Counter, text)] if text.contains("21 seen are not 20 written")),
         "{found:?}"
     );
-    let found = findings(&[forge(["seen", "written"])]);
+    let forged = forge(["seen", "written"]);
+    assert_eq!(topics(&forged), [RAW]);
+    let found = findings(&[forged]);
     assert!(
         matches!(&found[..], [(Kind::Counter, text)] if text.contains("wrong by 1 in this tally alone")),
         "{found:?}"

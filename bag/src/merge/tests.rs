@@ -65,6 +65,46 @@ fn times_are_those_of_the_first_node() {
 }
 
 #[test]
+fn readings_that_differ_turn_no_time_back() {
+    // Given: two readings within 100 us. Each is wrong by its bound, in the other direction
+    const BOUND_NS: i64 = 1_000_000;
+    let folder = TestFolder::new();
+    let reference = write(&folder, "a", 0, 0, None);
+    let path = folder.path("b.mcap");
+    let origin = Origin { node: "b".into(), address: "b".into(), incarnation: 1, ..Origin::default() };
+    let mut bag = BagWriter::create(&path, Options::default(), origin).unwrap();
+    let channel = angle(&mut bag, crate::Direction::Sent);
+    let truth = |number: u64| 10 * SECOND + number * 10_000;
+    for number in 1..=20 {
+        bag.message(channel, &record(number, truth(number))).unwrap();
+    }
+    for (number, offset_ns) in [(5, BOUND_NS), (15, -BOUND_NS)] {
+        let bound_ns = BOUND_NS.unsigned_abs();
+        let reading =
+            ClockReading { peer: "a".into(), incarnation: 1, offset_ns, bound_ns, ..ClockReading::default() };
+        bag.clock(truth(number), &reading).unwrap();
+    }
+    bag.finish(11 * SECOND).unwrap();
+    // When
+    let out = folder.path("all.mcap");
+    merge(&[reference, path], &out).unwrap();
+    // Then: the file is in the order of its times, and all are within the bound
+    let mut reader = crate::read::Reader::open(&out).unwrap();
+    let (mut last_ns, mut count) = (0, 0);
+    while let Some(item) = reader.next_item().unwrap() {
+        let crate::read::Item::Message(message) = item else { continue };
+        assert!(message.log_ns >= last_ns, "{} after {last_ns}", message.log_ns);
+        last_ns = message.log_ns;
+        if message.channel.encoding == "msgpack" && message.channel.value("node") == "b" {
+            let wrong_ns = message.log_ns.abs_diff(truth(message.sequence.into()));
+            assert!(wrong_ns <= BOUND_NS.unsigned_abs(), "{wrong_ns}");
+            count += 1;
+        }
+    }
+    assert_eq!(count, 20);
+}
+
+#[test]
 fn node_without_a_clock_reading_is_named() {
     let folder = TestFolder::new();
     let files = [write(&folder, "a", 0, 0, None), write(&folder, "b", 0, 0, None)];

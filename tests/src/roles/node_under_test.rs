@@ -3,15 +3,17 @@
 //! ```text
 //! node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--floods NAME]... [--will NAME]...
 //! [--meets NAME]... [--incarnation NUMBER] [--says-directory] [--streams-to NAME [--stream BYTES]...]
-//! [--logs | --logs-info | --default-log] [--held] [--forgets-a-handler] [--sends-text-to NAME] [--panics]
+//! [--stamps-to NAME] [--logs | --logs-info | --default-log] [--held] [--forgets-a-handler]
+//! [--sends-text-to NAME] [--panics]
 //! ```
 //!
 //! With `--held` a thread-local variable of the main thread holds the node, and `main` returns 3 once the
 //! node runs. The destructor of the variable stops the node.
 //!
 //! For each `--stream` length it runs another application, which sends a Stream value of this length every 20
-//! ms. To each `--floods` destination it sends the same counts, as many as are accepted. A will is a count of
-//! 1,000,000. The default incarnation is the clock of its host.
+//! ms. With `--stamps-to` a further application sends its own monotonic time every 20 ms. To each `--floods`
+//! destination it sends the same counts, as many as are accepted. A will is a count of 1,000,000. The default
+//! incarnation is the clock of its host.
 //!
 //! By default its log goes to standard error. With `--logs` warnings go to standard output, with
 //! `--logs-info` more than these. With `--default-log` it installs no subscriber, as a first program does:
@@ -44,6 +46,31 @@ payload!("scenario.sized", Stream => struct Sized { number: u64, filler: Vec<u8>
 
 /// Maximum number of bytes of a value beside its filler.
 const FRAME_OF_FILLER: usize = 12;
+
+// The time of the sender: before this message was sent, and after the one before was.
+payload!("scenario.stamp", Bulk => struct Stamp { number: u64, before_ns: u64, last_after_ns: u64 });
+
+/// Sends stamps.
+struct Stamper {
+    to: String,
+    number: u64,
+    after_ns: u64,
+}
+
+impl Actor for Stamper {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        context.every(Duration::from_millis(20), |this, _, context| {
+            this.number += 1;
+            let before_ns = Time::now().as_nanos();
+            let stamp = Stamp { number: this.number, before_ns, last_after_ns: this.after_ns };
+            // A refused one is not compared.
+            let _ = context.send(&*this.to, &stamp);
+            this.after_ns = Time::now().as_nanos();
+        });
+    }
+}
 
 /// Sends values of one length.
 struct Streamer {
@@ -129,6 +156,12 @@ impl Handler<Delivery<Count>> for Probe {
         println!("count {} from {} after {}", count.number, count.source, self.last);
         self.last = count.number;
     }
+}
+
+impl Handler<Delivery<Stamp>> for Probe {
+    type Result = ();
+
+    fn handle(&mut self, _: Delivery<Stamp>, _: &mut Self::Context) {}
 }
 
 impl Handler<Delivery<Sized>> for Probe {
@@ -223,6 +256,7 @@ pub(super) fn run(arguments: &[String]) -> ExitCode {
     }
     probe = probe
         .handles::<Sized>()
+        .handles::<Stamp>()
         .handles::<NodeEvent>()
         .handles::<RequirementEvent>()
         .requires(after("--requires"))
@@ -233,6 +267,11 @@ pub(super) fn run(arguments: &[String]) -> ExitCode {
     let mut builder = Node::builder(name.clone()).config(config).app(probe).heed_signals();
     for streamer in streamers(&name, &after("--streams-to"), &after("--stream")) {
         builder = builder.app(streamer);
+    }
+    for to in after("--stamps-to") {
+        let (app, receiver) = (format!("{name}.stamps"), to.clone());
+        let make = move || Stamper { to: receiver.clone(), number: 0, after_ns: 0 };
+        builder = builder.app(AppSpec::new(app, make).requires([to]));
     }
     for number in after("--incarnation") {
         let Ok(number) = number.parse() else {

@@ -1,4 +1,4 @@
-//! Programs in a restricted environment: a missing system call, or a PID or user namespace of their own.
+//! Programs in a restricted environment: a missing system call, or a PID, time or user namespace of their own.
 
 use std::process::{Command, Stdio};
 
@@ -49,6 +49,14 @@ pub fn without_system_call(number: u32, command: &Command) -> Option<Command> {
 #[must_use]
 pub fn in_own_pid_namespace(command: &Command) -> Option<Command> {
     unshared(&["--pid", "--fork", "--kill-child", "--mount-proc"], command)
+}
+
+/// The same command in a time namespace of its own: its monotonic clocks are ahead of the host's by these seconds.
+/// `None`, with a printed reason, if none can be created.
+#[must_use]
+pub fn in_own_time_namespace(command: &Command, ahead_s: u64) -> Option<Command> {
+    let clocks = [format!("--monotonic={ahead_s}"), format!("--boottime={ahead_s}")];
+    unshared(&["--time", "--fork", "--kill-child", &clocks[0], &clocks[1]], command)
 }
 
 /// The same command as the user `user` of a user namespace that maps no other user. `None`, with a printed

@@ -6,4 +6,5 @@ mod hosts;
 mod ipv6;
 mod lengths;
 mod lossy;
+mod recordings;
 mod seeds;
