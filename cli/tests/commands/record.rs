@@ -10,7 +10,7 @@ use std::{
 use rustix::process::Signal;
 use sinew::{AppAddress, Endpoint, NodeApi, Outcome, Registration, Tid, payload};
 use sinew_recorder::{Recording, RecordingOptions};
-use sinew_testkit::{NodeProcess, program, until};
+use sinew_testkit::{NodeProcess, TestDirectory, program, until};
 
 use crate::scenario::{Answer, Scenario};
 
@@ -136,9 +136,9 @@ fn send_one(scenario: &Scenario) -> Endpoint {
     sensor
 }
 
-/// Returns the recordings in a folder.
-fn recordings(folder: &Path) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(folder).expect("it is there");
+/// Returns the recordings in the folder of a test.
+fn recordings(folder: &TestDirectory) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder.join("")).expect("it is there");
     entries
         .map(|entry| entry.expect("it can be read").path())
         .filter(|path| path.extension().is_some_and(|ending| ending == "mcap"))
@@ -170,6 +170,21 @@ fn node_finishes_the_file_of_its_configuration() {
     assert_complete(&files[0]);
     let info = bag("info", &files[0]);
     assert!(info.out.contains("/sensor/scenario.count") && info.out.contains("finished"), "{}", info.out);
+}
+
+#[test]
+fn node_without_a_place_for_its_file_serves_and_fails_at_its_end() {
+    let scenario = Scenario::new();
+    let file = scenario.directory.join("absent/{node}.mcap");
+    let section = format!("[record]\nfile = \"{}\"\nkeep_bytes = 1048576\n[ndl]", file.display());
+    let path = scenario.configure("knee", 2, &[("[ndl]", &section)]);
+    let mut command = Command::new(program("sinew-node"));
+    command.arg(&path);
+    let mut knee = NodeProcess::start("sinew-node", command);
+    knee.wait_for(&["up"]);
+    drop(send_one(&scenario));
+    knee.signal(Signal::TERM);
+    assert_eq!(knee.wait_for_exit(), Some(1));
 }
 
 #[test]
