@@ -153,6 +153,17 @@ fn protected_commands_are_left_out_of_a_live_node() {
 }
 
 #[test]
+fn loop_without_any_message_to_send_ends() {
+    let scenario = Scenario::new();
+    let file = written(&scenario.directory, &[], &[7, 8]);
+    let _knee = scenario.start("knee", 2, &[]);
+    let answer =
+        scenario.sinew("knee", &["play", text(&file), "--live", "--loop", "--rate", "max", "--json"]);
+    assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
+    assert_eq!(answer.json()["left_out"]["protected"], 2, "{}", answer.out);
+}
+
+#[test]
 fn name_of_a_living_application_is_refused() {
     let scenario = Scenario::new();
     let file = recorded(&scenario.directory, &[1]);
