@@ -283,6 +283,20 @@ impl<C: Connection> Session<C> {
         None
     }
 
+    /// Asks the node for names now, for at most 300 ms, and returns whether it has answered. Messages wait for names by
+    /// themselves, but only once for each application. Call this before the first [`step`](Self::step) until
+    /// [`names_mut`](Self::names_mut) has those that the topics must have; the journal keeps the messages meanwhile.
+    pub fn refresh_names(&mut self) -> bool {
+        self.renewal = Time::now() + RENEWAL;
+        self.renew(Vec::new());
+        self.answers
+    }
+
+    /// Returns the names, to which the owner adds those that the node does not know, such as those of groups.
+    pub const fn names_mut(&mut self) -> &mut Names {
+        self.recorder.names_mut()
+    }
+
     /// Reads the rest of the journal, finishes the file, and ends the recording at the node: within 10.5 s, unless a
     /// write to the file hangs.
     pub fn finish(mut self, end: End) -> Summary {

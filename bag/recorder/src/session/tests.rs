@@ -154,6 +154,19 @@ fn structures_are_asked_for_before_the_first_message() {
 }
 
 #[test]
+fn names_are_learned_before_the_first_step() {
+    let node = Node::new("names");
+    let mut session = Session::begin(node.link(), node.options()).unwrap();
+    session.names_mut().add_app(tid(0x1001), "knee.sensor");
+    assert!(session.names_mut().has_app("knee.sensor") && session.refresh_names());
+    assert_eq!(lock(&node.asked).len(), 2, "the begin, and one more");
+    node.write(kinds()[1], 1);
+    let file = session.finish(End::Asked).file;
+    let topics: Vec<_> = roles(&file).into_keys().collect();
+    assert_eq!(topics, ["/knee.sensor/test.torque/view"]);
+}
+
+#[test]
 fn recording_of_a_program_ends_with_its_file() {
     let node = Node::new("thread");
     let recording = Recording::through(node.link(), node.options()).unwrap();
