@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn only_children_of_a_running_check_obey_it() {
+    fn only_children_of_a_running_command_are_checked() {
         let folder = TestFolder::new("owner");
         assert!(refused(&folder.0, 15, &[7]).is_some_and(|why| why.contains("names no command")));
         let owner = CheckOwner { process: 7, from_ns: 10_000_000_000, until_ns: 20_000_000_000 };

@@ -1,8 +1,8 @@
 //! `sinew play --check`: the order to a program, and its report.
 //!
 //! The command starts the program with the path of a folder in [`VARIABLE`]. The folder names the command itself
-//! ([`CheckOwner`]), so that a variable that was left behind has no effect. The builder of the program's first node that
-//! has an application of the recording reads the order there, runs its applications in virtual time, writes the report,
+//! ([`CheckOwner`]), so that a variable that was left behind has no effect. The builder of the program's first node
+//! that has an application of the recording reads the order there, runs its applications in virtual time, writes the report,
 //! and ends the process. Both files are MessagePack. So a node needs no code for recordings.
 
 use std::{
@@ -51,7 +51,7 @@ const END_NS: u64 = 100_000_000;
 /// Each flag, at the place of its bit in a recording.
 const FLAGS: [Flags; 4] = [Flags::CONFIRM, Flags::ASK, Flags::REPLY, Flags::OUTCOME];
 
-/// The command that runs the check. Only processes that it has started obey the order, and only in its time.
+/// The command that runs the check. Only processes that it has started run it, and only in its time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CheckOwner {
     /// Its process.

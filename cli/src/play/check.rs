@@ -65,7 +65,7 @@ pub(crate) fn show(order: &Order, stop: &StopRequest) -> Result<Report, SystemEr
     }
 }
 
-/// Names this command in the folder: only its children obey the order, and only until the time that is returned.
+/// Names this command in the folder: only its children run the check, and only until the time that is returned.
 fn name_owner(order: &Order, folder: &Folder) -> Result<Time, SystemError> {
     let from = Time::now();
     let until = from + order.within;

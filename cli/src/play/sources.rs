@@ -165,8 +165,8 @@ fn check_answer(
 fn unlisted(why: &str) -> SystemError {
     let why = clean(why);
     SystemError::Bag(format!(
-        "{why}: an application of the recording may run there. Wait until each node answers (`sinew nodes`), or give it \
-         more time: --deadline-ms"
+        "{why}: an application of the recording may run there. Wait until each node answers (`sinew nodes`), or give \
+         it more time: --deadline-ms"
     ))
 }
 
