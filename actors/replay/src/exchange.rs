@@ -2,8 +2,8 @@
 //!
 //! The command starts the program with the path of a folder in [`VARIABLE`]. The folder names the command itself
 //! ([`CheckOwner`]), so that a variable that was left behind has no effect. The builder of the program's first node
-//! that has an application of the recording reads the order there, runs its applications in virtual time, writes the report,
-//! and ends the process. Both files are MessagePack. So a node needs no code for recordings.
+//! that has an application of the recording reads the order there, runs its applications in virtual time, writes the
+//! report, and ends the process. These files are MessagePack. So a node needs no code for recordings.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
