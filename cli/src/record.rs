@@ -143,6 +143,7 @@ impl Order {
             selection: Selection { apps: apps.clone(), types: types.clone(), groups: groups.clone() },
             lasts: self.lasts,
             file,
+            goes_on_when_full: false,
             program: concat!("sinew record ", env!("CARGO_PKG_VERSION")).to_owned(),
         }
     }

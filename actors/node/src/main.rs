@@ -6,7 +6,8 @@
 //! nothing. A node that cannot print `up`, as on a full disk, runs all the same, and exits with code 1 at the
 //! end. A reader that has closed its pipe is no error.
 //!
-//! With `record.file` in its configuration it writes a recording, and finishes it at its end, within 10 s.
+//! With `record.file` in its configuration it writes a recording, and finishes it at its end, within 10 s. A recording
+//! that does not begin, or is not whole, stops no node: the exit code at the end is 1.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)] // The macros panic where a pipe is closed or a disk is full.
 
@@ -19,7 +20,8 @@ use std::{
 
 use sinew_model::config::NodeConfig;
 use sinew_node::Node;
-use sinew_recorder::Recording;
+use sinew_recorder::{End, Recording, RecordingError};
+use sinew_runtime::log;
 
 /// Time limit for the end of the recording, after the node has ended.
 const RECORDING_ENDS_WITHIN: Duration = Duration::from_secs(10);
@@ -40,7 +42,7 @@ It prints `up` when programs can connect, and stops in order at SIGINT, SIGTERM 
 
 Exit codes:
   0  it was stopped in order
-  1  it could not start, or gave up
+  1  it could not start, or gave up; or its recording is not whole
   2  the command line is wrong
 
 Example:
@@ -83,10 +85,11 @@ fn printed(text: &str) -> ExitCode {
 
 fn run(path: &str) -> ExitCode {
     match start(path) {
-        Ok((node, recording)) => {
+        Ok((node, config)) => {
+            let recording = record(&config);
             let is_printed = print_up();
             let code = node.run();
-            let is_recorded = recording.is_none_or(finish);
+            let is_recorded = recording.is_ok_and(|recording| recording.is_none_or(finish));
             let is_fine = is_printed && is_recorded;
             if is_fine || code != ExitCode::SUCCESS { code } else { ExitCode::FAILURE }
         }
@@ -115,13 +118,16 @@ fn note(text: impl Display) {
     let _ = writeln!(io::stderr(), "sinew-node: {text}");
 }
 
-/// Finishes the file of the recording. Returns whether it is whole.
+/// Finishes the file of the recording. Returns whether it has all messages.
 fn finish(recording: Recording) -> bool {
     let file = recording.file().display().to_string();
     match recording.finish_within(RECORDING_ENDS_WITHIN) {
         Ok(summary) => {
             summary.faults.iter().for_each(|fault| note(format_args!("the recording {file}: {fault}")));
-            summary.faults.is_empty()
+            if let End::Full | End::Unreadable(_) = &summary.end {
+                note(format_args!("the recording {file}: {}", summary.end));
+            }
+            summary.is_whole()
         }
         Err(why) => {
             note(format_args!("the recording {file}: {why}"));
@@ -130,15 +136,21 @@ fn finish(recording: Recording) -> bool {
     }
 }
 
-/// Starts the node, and the recording that its configuration asks for.
-fn start(path: &str) -> Result<(Node, Option<Recording>), Box<dyn std::error::Error>> {
+/// Starts the node of a configuration.
+fn start(path: &str) -> Result<(Node, NodeConfig), Box<dyn std::error::Error>> {
     let config = NodeConfig::from_file(path)?;
     if config.lncl.socket.is_none() {
         return Err(format!("{path} sets no lncl.socket: no program could come in").into());
     }
     let builder = Node::builder(config.name.clone()).config(config.clone()).heed_signals();
-    let node = builder.writes_recording().start()?;
-    // Without it the node stops again.
-    let recording = Recording::configured(&config)?;
-    Ok((node, recording))
+    Ok((builder.writes_recording().start()?, config))
+}
+
+/// Begins the recording that the configuration asks for. Applications may run already, so that a failure does not stop
+/// the node.
+fn record(config: &NodeConfig) -> Result<Option<Recording>, RecordingError> {
+    Recording::configured(config).inspect_err(|why| {
+        log::error!(%why, "record.file is not written");
+        log::print(format!("sinew-node: record.file is not written: {why}"));
+    })
 }

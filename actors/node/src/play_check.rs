@@ -1,20 +1,24 @@
 //! The role of this process under `sinew play --check`: its applications run in virtual time, and no node starts.
 
 use std::{
-    fs::OpenOptions,
+    fmt::Display,
+    fs::{self, OpenOptions},
     io::{self, Write as _},
-    os::unix::fs::OpenOptionsExt as _,
+    iter,
+    os::unix::fs::{MetadataExt as _, OpenOptionsExt as _},
     path::{Path, PathBuf},
-    sync::{Arc, Mutex},
+    sync::{Arc, Mutex, OnceLock},
     time::Duration,
 };
 
+use rustix::process::{Pid, geteuid, getppid};
 use sinew_model::config::NodeConfig;
-use sinew_replay::exchange::{self, CheckOrder, CheckReport};
+use sinew_replay::exchange::{self, CheckOrder, CheckOwner, CheckReport};
 use sinew_runtime::{
     app::DynApp,
     lock,
     log::{self, LogObserver, tracing::Level},
+    time::Time,
 };
 
 use crate::SupervisorSpec;
@@ -24,9 +28,58 @@ const LOG_FLUSH_TIMEOUT: Duration = Duration::from_millis(500);
 /// Maximum number of warnings that are kept, the first ones.
 const WARNINGS_MAX: usize = 8;
 
-/// Returns the folder of the check, if `sinew play --check` has started this process.
-fn folder() -> Option<PathBuf> {
-    std::env::var_os(exchange::VARIABLE).filter(|path| !path.is_empty()).map(PathBuf::from)
+/// Maximum number of processes between the command and this one, such as shells and `cargo run`.
+const ANCESTORS_MAX: usize = 16;
+
+/// Returns the folder of the check, if `sinew play --check` has started this process. A variable that was left behind
+/// has no effect: a warning in the log names it once.
+fn folder() -> Option<&'static Path> {
+    static FOLDER: OnceLock<Option<PathBuf>> = OnceLock::new();
+    let found = FOLDER.get_or_init(|| {
+        let path = PathBuf::from(std::env::var_os(exchange::VARIABLE).filter(|path| !path.is_empty())?);
+        match check_owner(&path, Time::now(), ancestors()) {
+            Ok(()) => Some(path),
+            Err(why) => {
+                let (name, path) = (exchange::VARIABLE, path.display());
+                log::warn!("the environment variable {name}={path} is ignored: {why}; unset it");
+                None
+            }
+        }
+    });
+    found.as_deref()
+}
+
+/// Checks that the folder is that of a command that runs now and has started this process.
+fn check_owner(folder: &Path, now: Time, mut ancestors: impl Iterator<Item = u32>) -> Result<(), String> {
+    let found = fs::symlink_metadata(folder).map_err(|why| format!("it names no folder: {why}"))?;
+    if !found.is_dir() || found.uid() != geteuid().as_raw() || found.mode() & 0o777 != 0o700 {
+        return Err("it names no folder of this user with the mode 0700".to_owned());
+    }
+    let owner = exchange::read::<CheckOwner>(&folder.join(exchange::OWNER), exchange::OWNER_BYTES_MAX);
+    let CheckOwner { process, from_ns, until_ns } =
+        owner.map_err(|why| format!("the folder names no command: {why}"))?;
+    if !(from_ns..=until_ns).contains(&now.as_nanos()) {
+        return Err("the check of this folder is over".to_owned());
+    }
+    if !ancestors.any(|ancestor| ancestor == process) {
+        return Err(format!("the command of this folder, process {process}, has not started this process"));
+    }
+    Ok(())
+}
+
+/// Returns the parent of this process, its parent, and so on.
+fn ancestors() -> impl Iterator<Item = u32> {
+    let parent = u32::try_from(Pid::as_raw(getppid())).ok();
+    iter::successors(parent, |process| parent_of(*process)).take(ANCESTORS_MAX)
+}
+
+/// Returns the parent of a process; `None` if it has none, or has ended.
+fn parent_of(process: u32) -> Option<u32> {
+    let stat = fs::read(format!("/proc/{process}/stat")).ok()?;
+    let stat = String::from_utf8_lossy(&stat);
+    // The name of the process, in parentheses, may have any characters.
+    let (_, behind_name) = stat.rsplit_once(") ")?;
+    behind_name.split(' ').nth(1)?.parse().ok()
 }
 
 /// Returns whether `sinew play --check` has started this process.
@@ -38,17 +91,24 @@ pub(crate) fn is_asked() -> bool {
 /// Does not return if the recording has one of its applications.
 pub(crate) fn takes_over(config: &NodeConfig, tree: &mut SupervisorSpec) -> bool {
     let Some(folder) = folder() else { return false };
+    let name = &config.name;
+    note(format_args!("`sinew play --check` has started this program: the node {name} does not start"));
     let order = exchange::read::<CheckOrder>(&folder.join(exchange::ORDER), exchange::ORDER_BYTES_MAX);
     let order = match order {
         Ok(order) => order,
-        Err(why) => end(&folder, &CheckReport::Failed(format!("the program cannot read its order: {why}"))),
+        Err(why) => end(folder, &CheckReport::Failed(format!("the program cannot read its order: {why}"))),
     };
     if tree.apps().iter().any(|app| order.tests(app.name())) {
         let tree = std::mem::replace(tree, SupervisorSpec::new(""));
-        check(&folder, &order, tree.into_apps());
+        check(folder, &order, tree.into_apps());
     }
-    declare(&folder, config, &tree.apps());
+    declare(folder, config, &tree.apps());
     true
+}
+
+/// Prints a line to standard error. If that has no reader, the exit code remains.
+fn note(text: impl Display) {
+    let _ = writeln!(io::stderr(), "sinew: {text}");
 }
 
 /// Runs the check, then ends this process.
@@ -68,14 +128,15 @@ fn check(folder: &Path, order: &CheckOrder, apps: Vec<DynApp>) -> ! {
     end(folder, &report)
 }
 
+/// Writes the report, and ends the process: with code 0 only if all messages were those of the recording.
 fn end(folder: &Path, report: &CheckReport) -> ! {
     let written = exchange::write(&folder.join(exchange::REPORT), report);
     if let Err(why) = &written {
-        // If standard error has no reader, only the exit code remains.
-        let _ = writeln!(io::stderr(), "the report of the check cannot be written: {why}");
+        note(format_args!("the report of the check cannot be written: {why}; free space on its device"));
     }
     log::flush(LOG_FLUSH_TIMEOUT);
-    std::process::exit(i32::from(written.is_err()))
+    let is_fine = written.is_ok() && matches!(report, CheckReport::Identical { .. });
+    std::process::exit(i32::from(!is_fine))
 }
 
 /// Reports the applications of a builder that the recording does not have.
@@ -114,6 +175,8 @@ impl LogObserver for Warnings {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::{DirBuilderExt as _, PermissionsExt as _};
+
     use super::*;
 
     #[test]
@@ -125,6 +188,56 @@ mod tests {
         }
         assert_eq!(warnings.first_refused().as_deref(), Some("0: this is not a demo.angle"));
         assert_eq!(lock(&warnings.0).len(), WARNINGS_MAX);
+    }
+
+    /// A folder of one test, which is removed at its end.
+    struct TestFolder(PathBuf);
+
+    impl TestFolder {
+        fn new(name: &str) -> Self {
+            let path = std::env::temp_dir().join(format!("sinew-check-{name}-{}", std::process::id()));
+            let _ = fs::remove_dir_all(&path);
+            fs::DirBuilder::new().mode(0o700).create(&path).unwrap();
+            Self(path)
+        }
+    }
+
+    impl Drop for TestFolder {
+        fn drop(&mut self) {
+            // The system clears the folder of temporary files, too.
+            let _ = fs::remove_dir_all(&self.0);
+        }
+    }
+
+    /// Returns why the folder of a check by the process 7, from 10 s to 20 s, is not accepted.
+    fn refused(folder: &Path, at_s: u64, ancestors: &[u32]) -> Option<String> {
+        let now = Time::ZERO + Duration::from_secs(at_s);
+        check_owner(folder, now, ancestors.iter().copied()).err()
+    }
+
+    #[test]
+    fn only_children_of_a_running_command_are_checked() {
+        let folder = TestFolder::new("owner");
+        assert!(refused(&folder.0, 15, &[7]).is_some_and(|why| why.contains("names no command")));
+        let owner = CheckOwner { process: 7, from_ns: 10_000_000_000, until_ns: 20_000_000_000 };
+        exchange::write(&folder.0.join(exchange::OWNER), &owner).unwrap();
+        assert_eq!(refused(&folder.0, 15, &[7]), None);
+        assert_eq!(refused(&folder.0, 15, &[9, 7, 1]), None, "a script has started it");
+        assert!(refused(&folder.0, 15, &[9, 1]).is_some_and(|why| why.contains("process 7")));
+        for at_s in [9, 21] {
+            assert!(refused(&folder.0, at_s, &[7]).is_some_and(|why| why.contains("is over")), "{at_s}");
+        }
+        fs::set_permissions(&folder.0, fs::Permissions::from_mode(0o755)).unwrap();
+        assert!(refused(&folder.0, 15, &[7]).is_some_and(|why| why.contains("0700")));
+        assert!(refused(Path::new("/dev/null"), 15, &[7]).is_some_and(|why| why.contains("0700")));
+        assert!(refused(&folder.0.join("absent"), 15, &[7]).is_some_and(|why| why.contains("no folder")));
+    }
+
+    #[test]
+    fn parents_are_found_up_to_the_first_process() {
+        let found: Vec<_> = ancestors().collect();
+        assert!(!found.is_empty() && found.len() <= ANCESTORS_MAX, "{found:?}");
+        assert_eq!(parent_of(std::process::id()), found.first().copied());
     }
 
     #[test]

@@ -1,8 +1,9 @@
 //! `sinew play --check`: the order to a program, and its report.
 //!
-//! The command starts the program with the path of a folder in [`VARIABLE`]. The builder of its first node that has
-//! an application of the recording reads the order there, runs its applications in virtual time, writes the report,
-//! and ends the process. Both files are MessagePack. So a node needs no code for recordings.
+//! The command starts the program with the path of a folder in [`VARIABLE`]. The folder names the command itself
+//! ([`CheckOwner`]), so that a variable that was left behind has no effect. The builder of the program's first node
+//! that has an application of the recording reads the order there, runs its applications in virtual time, writes the
+//! report, and ends the process. These files are MessagePack. So a node needs no code for recordings.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -28,6 +29,10 @@ use crate::{CheckError, Checked, Comparison, FirstDifference, Replay, TimedMessa
 
 /// The environment variable with the path of the folder.
 pub const VARIABLE: &str = "SINEW_PLAY_CHECK";
+/// The command that runs the check, in the folder.
+pub const OWNER: &str = "owner";
+/// Maximum bytes of the file with it.
+pub const OWNER_BYTES_MAX: u64 = 256;
 /// The order, in the folder.
 pub const ORDER: &str = "order";
 /// The report, in the folder.
@@ -45,6 +50,17 @@ const END_NS: u64 = 100_000_000;
 
 /// Each flag, at the place of its bit in a recording.
 const FLAGS: [Flags; 4] = [Flags::CONFIRM, Flags::ASK, Flags::REPLY, Flags::OUTCOME];
+
+/// The command that runs the check. Only processes that it has started run it, and only in its time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CheckOwner {
+    /// Its process.
+    pub process: u32,
+    /// The begin of the check, in nanoseconds of the host's monotonic clock.
+    pub from_ns: u64,
+    /// The end of the check, on the same clock: the command then ends the program.
+    pub until_ns: u64,
+}
 
 /// The order: a recording, and the terms of its comparison.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]

@@ -27,6 +27,7 @@ const SCHEMAS_MAX: usize = 4_096;
 /// names.add_app(knee, "knee.drive");
 /// names.add_type(Kind::named("demo.angle"), "demo.angle");
 /// assert_eq!(names.app(knee), Some("knee.drive"));
+/// assert!(names.has_app("knee.drive") && !names.has_app("hip.drive"));
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Clone, Debug, Default)]
@@ -99,6 +100,12 @@ impl Names {
     #[must_use]
     pub fn app(&self, app: Tid) -> Option<&str> {
         self.apps.get(&app).map(String::as_str)
+    }
+
+    /// Returns whether an application or a group has this name. It looks at all of them.
+    #[must_use]
+    pub fn has_app(&self, name: &str) -> bool {
+        self.apps.values().any(|known| known == name)
     }
 
     /// Returns the name of a node.

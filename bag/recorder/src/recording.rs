@@ -12,6 +12,7 @@ use std::{
 
 use sinew_client::{NodeApi, Registration};
 use sinew_model::config::NodeConfig;
+use sinew_runtime::log;
 
 use crate::{
     RecordingError,
@@ -153,11 +154,19 @@ impl Drop for Recording {
 }
 
 fn run<C: Connection>(mut session: Session<C>, is_over: &AtomicBool) -> Summary {
+    let file = session.file().display().to_string();
+    let mut logged = 0;
     let end = loop {
         if is_over.load(Ordering::Relaxed) {
             break End::Asked;
         }
-        if let Some(end) = session.step() {
+        let end = session.step();
+        for fault in &session.faults()[logged..] {
+            log::warn!(file, "recording: {fault}");
+        }
+        logged = session.faults().len();
+        if let Some(end) = end {
+            log::info!(file, "the recording has ended: {end}");
             break end;
         }
     };

@@ -4,12 +4,12 @@
 mod tests;
 
 use std::{
-    fmt,
+    fmt, io,
     path::{Path, PathBuf},
     time::Duration,
 };
 
-use sinew_bag::{BagWriter, Compression, Origin, Totals};
+use sinew_bag::{BagError, BagWriter, Compression, Origin, Totals};
 use sinew_client::Endpoint;
 use sinew_model::config::{RecordCompression, RecordConfig};
 use sinew_record::{AskRecord, RecordReport, SCHEMAS_MAX, Selection};
@@ -39,6 +39,8 @@ const QUESTIONS_MAX: u32 = 64;
 const ARRIVAL: Duration = Duration::from_millis(200);
 /// Time limit for the rest of the journal at the end.
 const DRAINED_WITHIN: Duration = Duration::from_secs(10);
+/// Maximum number of files with the same name and time: those of starts within one second.
+const NUMBERS_MAX: u32 = 100;
 /// Maximum number of faults that are kept.
 const FAULTS_MAX: usize = 16;
 
@@ -67,6 +69,9 @@ pub struct RecordingOptions {
     pub lasts: Option<Duration>,
     /// How the file is written: compression, sizes, parts, views.
     pub file: sinew_bag::Options,
+    /// Whether messages are counted as dropped once the file has its maximum size. Otherwise the recording ends there.
+    /// Default: it ends.
+    pub goes_on_when_full: bool,
     /// The program and its version, for the metadata of the file. Default: none.
     pub program: String,
 }
@@ -91,7 +96,7 @@ impl RecordingOptions {
         };
         let (apps, types) = (config.apps.clone(), config.types.clone());
         let selection = Selection { apps, types, groups: Vec::new() };
-        Some(Self { path: Some(path), selection, file, ..Self::default() })
+        Some(Self { path: Some(path), selection, file, goes_on_when_full: true, ..Self::default() })
     }
 }
 
@@ -191,6 +196,14 @@ pub struct Summary {
     pub faults: Vec<String>,
 }
 
+impl Summary {
+    /// Returns whether the recording was ended by its owner, its time or its node, without a fault.
+    #[must_use]
+    pub fn is_whole(&self) -> bool {
+        self.faults.is_empty() && !matches!(self.end, End::Full | End::Unreadable(_))
+    }
+}
+
 /// A recording on the thread of its owner, which calls [`step`](Self::step) in a loop and [`finish`](Self::finish) at
 /// the end. [`Recording`](crate::Recording) does it on a thread of its own.
 #[derive(Debug)]
@@ -208,6 +221,8 @@ pub struct Session<C> {
     answers: bool,
     /// Questions for names and structures since the last renewal.
     questions: u32,
+    goes_on_when_full: bool,
+    was_full: bool,
     faults: Vec<String>,
 }
 
@@ -235,6 +250,8 @@ impl<C: Connection> Session<C> {
                     renewal: began + RENEWAL,
                     answers: true,
                     questions: 0,
+                    goes_on_when_full: options.goes_on_when_full,
+                    was_full: false,
                     faults: Vec::new(),
                 })
             }
@@ -264,6 +281,20 @@ impl<C: Connection> Session<C> {
             std::thread::sleep(PAUSE);
         }
         None
+    }
+
+    /// Asks the node for names now, for at most 300 ms, and returns whether it has answered. Messages wait for names by
+    /// themselves, but only once for each application. Call this before the first [`step`](Self::step) until
+    /// [`names_mut`](Self::names_mut) has those that the topics must have; the journal keeps the messages meanwhile.
+    pub fn refresh_names(&mut self) -> bool {
+        self.renewal = Time::now() + RENEWAL;
+        self.renew(Vec::new());
+        self.answers
+    }
+
+    /// Returns the names, to which the owner adds those that the node does not know, such as those of groups.
+    pub const fn names_mut(&mut self) -> &mut Names {
+        self.recorder.names_mut()
     }
 
     /// Reads the rest of the journal, finishes the file, and ends the recording at the node: within 10.5 s, unless a
@@ -324,6 +355,10 @@ impl<C: Connection> Session<C> {
         if let Some(fault) = self.recorder.take_fault() {
             note(&mut self.faults, fault.to_string());
         }
+        if self.goes_on_when_full && self.recorder.is_full() && !std::mem::replace(&mut self.was_full, true) {
+            let text = format!("{}: further messages are counted as dropped; raise its limit", End::Full);
+            note(&mut self.faults, text);
+        }
         self.ask_for_names();
         match pumped {
             Ok(is_empty) => Ok(is_empty),
@@ -339,7 +374,7 @@ impl<C: Connection> Session<C> {
         if self.lasts.is_some_and(|lasts| now.since(self.began) >= lasts) {
             return Some(End::Time);
         }
-        if self.recorder.is_full() {
+        if self.recorder.is_full() && !self.goes_on_when_full {
             return Some(End::Full);
         }
         if self.recorder.is_writer_alive() {
@@ -410,8 +445,8 @@ fn open<C: Connection>(
         wall_offset_ns: first.wall_offset_ns,
         began_ns: now,
     };
-    let file = file_name::filled(options.path.as_deref(), &first.name, origin.wall_ns(now));
-    let bag = BagWriter::create(file.clone(), options.file.clone(), origin)?;
+    let bag = create(options, &origin)?;
+    let file = bag.path();
     let selection = options.selection.clone();
     let mut names = Names::default();
     for group in &selection.groups {
@@ -422,6 +457,27 @@ fn open<C: Connection>(
     let mut recorder = Recorder::begin(reader, bag, setup)?;
     recorder.clocks(now, &first.clocks);
     Ok((recorder, file))
+}
+
+/// Creates the file. If its name has the time and exists, the file gets the first free number: another recording began
+/// in the same second.
+fn create(options: &RecordingOptions, origin: &Origin) -> Result<BagWriter, BagError> {
+    let path = options.path.as_deref();
+    let file = file_name::filled(path, &origin.node, origin.wall_ns(origin.began_ns));
+    let numbers = if file_name::has_time(path) { NUMBERS_MAX } else { 1 };
+    let mut number = 1;
+    loop {
+        let name = file_name::numbered(&file, number);
+        let created = BagWriter::create(name, options.file.clone(), origin.clone());
+        let exists = matches!(
+            &created,
+            Err(BagError::Write { cause, .. }) if cause.kind() == io::ErrorKind::AlreadyExists
+        );
+        if !exists || number >= numbers {
+            return created;
+        }
+        number += 1;
+    }
 }
 
 fn note(faults: &mut Vec<String>, fault: String) {

@@ -1,8 +1,9 @@
 //! `sinew play --check`: runs a program in virtual time on a recording, and compares its messages with the recorded
 //! ones.
 //!
-//! The program is started with the path of a folder in an environment variable. Its first node with an application of
-//! the recording runs these applications there, and writes a report instead of starting.
+//! The program is started with the path of a folder in an environment variable. The folder names this command, so that
+//! a variable that was left behind has no effect. The program's first node with an application of the recording runs
+//! these applications there, and writes a report instead of starting.
 
 use std::{
     collections::BTreeMap,
@@ -16,7 +17,7 @@ use std::{
 use serde_json::json;
 use sinew::{
     Tid, Time,
-    replay::exchange::{self, CheckReport, ReportedDifference},
+    replay::exchange::{self, CheckOwner, CheckReport, ReportedDifference},
 };
 use sinew_player::{Recording, RecordingError};
 
@@ -51,7 +52,8 @@ pub(crate) fn show(order: &Order, stop: &StopRequest) -> Result<Report, SystemEr
     exchange::write(&folder.0.join(exchange::ORDER), &request).map_err(|why| unwritable(&folder.0, &why))?;
     // It may have a gigabyte.
     drop(request);
-    let status = run(order, &folder, stop)?;
+    let until = name_owner(order, &folder)?;
+    let status = run(order, &folder, until, stop)?;
     let report = exchange::read::<CheckReport>(&folder.0.join(exchange::REPORT), exchange::REPORT_BYTES_MAX);
     let Ok(report) = report else { return Err(SystemError::Bag(unreported(order, &folder, status))) };
     match report {
@@ -63,8 +65,19 @@ pub(crate) fn show(order: &Order, stop: &StopRequest) -> Result<Report, SystemEr
     }
 }
 
+/// Names this command in the folder: only its children run the check, and only until the time that is returned.
+fn name_owner(order: &Order, folder: &Folder) -> Result<Time, SystemError> {
+    let from = Time::now();
+    let until = from + order.within;
+    let owner =
+        CheckOwner { process: std::process::id(), from_ns: from.as_nanos(), until_ns: until.as_nanos() };
+    let written = exchange::write(&folder.0.join(exchange::OWNER), &owner);
+    written.map_err(|why| unwritable(&folder.0, &why))?;
+    Ok(until)
+}
+
 /// Runs the program to its end. Its standard output is this command's standard error.
-fn run(order: &Order, folder: &Folder, stop: &StopRequest) -> Result<ExitStatus, SystemError> {
+fn run(order: &Order, folder: &Folder, until: Time, stop: &StopRequest) -> Result<ExitStatus, SystemError> {
     let Some((program, arguments)) = order.program.split_first() else {
         return Err(SystemError::Usage("no program to check; write it behind `--`".to_owned()));
     };
@@ -75,7 +88,6 @@ fn run(order: &Order, folder: &Folder, stop: &StopRequest) -> Result<ExitStatus,
     let mut command = Command::new(program);
     command.args(arguments).env(exchange::VARIABLE, &folder.0).stdin(Stdio::null()).stdout(output);
     let mut child = Running(command.spawn().map_err(refused)?);
-    let until = Time::now() + order.within;
     loop {
         if let Some(status) = child.0.try_wait().map_err(refused)? {
             return Ok(status);

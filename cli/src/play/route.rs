@@ -1,6 +1,6 @@
 //! How the messages of a channel are sent again, or why they are left out.
 
-use sinew::{NodeAddress, Tid};
+use sinew::{NodeAddress, Tid, protection::unsealed};
 use sinew_player::{Recorded, RecordedChannel};
 
 /// The bits of replies and outcomes in a recorded header.
@@ -91,15 +91,25 @@ pub(crate) fn of(channel: &RecordedChannel, is_own: bool) -> Result<Route, LeftO
     Ok(Route { sender, to })
 }
 
-/// Returns whether a message answers another one.
-pub(crate) const fn is_answer(message: &Recorded) -> bool {
-    message.header.flags & ANSWERS != 0
+/// Returns why this message is left out, though others of its channel are sent.
+pub(crate) fn left_out(message: &Recorded, is_own: bool) -> Option<LeftOut> {
+    if message.header.flags & ANSWERS != 0 {
+        return Some(LeftOut::Answer);
+    }
+    // The first message of a channel says whether it is protected. A later one may be so all the same.
+    (!is_own && unsealed(&message.payload).is_some()).then_some(LeftOut::Protected)
 }
 
 #[cfg(test)]
 mod tests {
-    use sinew::{AppAddress, Class, message::Kind};
-    use sinew_bag::Direction;
+    use std::sync::Arc;
+
+    use sinew::{
+        AppAddress, Class, Time,
+        message::Kind,
+        protection::{DataId, Stamp, seal},
+    };
+    use sinew_bag::{Direction, read::Header};
 
     use super::*;
 
@@ -147,6 +157,25 @@ mod tests {
         let protect = |channel: &mut RecordedChannel| channel.is_protected = true;
         assert_eq!(to(protect, false), Err(LeftOut::Protected));
         assert_eq!(to(protect, true), Ok(To::Name("knee".to_owned())));
+    }
+
+    #[test]
+    fn sealed_message_of_any_channel_stays_in_the_own_project() {
+        let channel = channel();
+        let data_id = DataId { source: channel.source, destination: channel.destination, name: "demo.angle" };
+        let sealed = seal(&data_id, Stamp { counter: 1, incarnation: 7, echo: Time::ZERO }, &[5]);
+        let message = |flags, payload: &[u8]| Recorded {
+            channel: Arc::new(channel.clone()),
+            index: 0,
+            header: Header { flags, ..Header::default() },
+            sent_ns: 0,
+            arrived_ns: 0,
+            payload: payload.to_vec(),
+        };
+        assert_eq!(left_out(&message(0, &sealed), false), Some(LeftOut::Protected));
+        assert_eq!(left_out(&message(0, &sealed), true), None);
+        assert_eq!(left_out(&message(0, &[5]), false), None);
+        assert_eq!(left_out(&message(0b0100, &[5]), true), Some(LeftOut::Answer));
     }
 
     #[test]

@@ -82,7 +82,7 @@ pub(crate) fn play(
     let senders: BTreeSet<_> =
         chosen.clone().filter_map(|(_, route)| Some(&route.as_ref().ok()?.sender)).collect();
     let wanted: BTreeSet<_> = chosen.filter_map(|(_, route)| wanted(route, &senders)).collect();
-    sources::check_names(&mut target.system, &senders, &BTreeSet::new())?;
+    sources::check_names(target, &senders, &BTreeSet::new())?;
     let mut sources = Sources::register(&target.api()?, senders.clone())?;
     let topics =
         playback.channels().iter().map(|channel| Row { topic: channel.topic.clone(), ..Row::default() });
@@ -101,13 +101,13 @@ pub(crate) fn play(
             reasons: BTreeMap::new(),
             damage: playback.damage().to_vec(),
         },
-        read: 0,
+        due: 0,
         destinations: Destinations::default(),
         sent: BTreeMap::new(),
         drained: Time::now(),
     };
     let result = session.wait_for(target, &mut sources, &wanted).and_then(|()| {
-        sources::check_names(&mut target.system, &senders, &sources.addresses())?;
+        sources::check_names(target, &senders, &sources.addresses())?;
         session.all(playback, &routes, (target, &mut sources))
     });
     session.settle(&mut sources);
@@ -126,8 +126,8 @@ struct Session<'s> {
     order: &'s Order,
     stop: &'s StopRequest,
     played: Played,
-    /// Messages that were read from the part that is played.
-    read: u64,
+    /// Messages that were due, whether their destinations were there or not.
+    due: u64,
     destinations: Destinations,
     /// The channels of sent messages, for reports about them.
     sent: BTreeMap<(Sender, Tid, Kind), usize>,
@@ -177,16 +177,26 @@ impl Session<'_> {
         let mut playback = first;
         loop {
             self.played.passes += 1;
-            let before = self.read;
-            let end = self.pass(&mut playback, routes, (&mut target.system.endpoint, &mut *sources))?;
+            let (due, accepted) = (self.due, self.accepted());
+            let mut end = self.pass(&mut playback, routes, (&mut target.system.endpoint, &mut *sources))?;
             // A pass without any message would be repeated without a pause.
-            let is_over = end != End::Complete || !self.order.is_looped || self.read == before;
+            let is_over = end != End::Complete || !self.order.is_looped || self.due == due;
+            if !is_over && self.accepted() == accepted {
+                // No destination is there. With `--rate max` the pass has taken no time.
+                end = self.wait_until(Some(Time::now() + ABSENT_FOR), sources).err().unwrap_or(end);
+            }
+            let is_over = is_over || end != End::Complete;
             self.played.end = end;
             if is_over {
                 return Ok(());
             }
             playback = self.order.open()?;
         }
+    }
+
+    /// Returns how many messages the node has accepted.
+    fn accepted(&self) -> u64 {
+        self.played.rows.iter().map(|row| row.sent).sum()
     }
 
     fn pass(
@@ -198,6 +208,10 @@ impl Session<'_> {
         let from = self.order.from.unwrap_or_default();
         let pace = Pace::new(Time::now(), from, self.order.rate);
         while let Some(message) = playback.next_message()? {
+            // Also where messages are left out for a long time.
+            if self.stop.is_there() {
+                return Ok(End::Asked);
+            }
             let offset = Duration::from_nanos(playback.offset_ns(message.sent_ns));
             if self.order.to.is_some_and(|to| offset > to) {
                 break;
@@ -207,10 +221,8 @@ impl Session<'_> {
             if offset < from {
                 continue;
             }
-            self.read += 1;
             let route = match route {
-                Ok(_) if route::is_answer(&message) => Err(LeftOut::Answer),
-                Ok(route) => Ok(route),
+                Ok(route) => route::left_out(&message, self.played.is_own).map_or(Ok(route), Err),
                 Err(why) => Err(*why),
             };
             let route = match route {
@@ -220,6 +232,7 @@ impl Session<'_> {
                     continue;
                 }
             };
+            self.due += 1;
             let due = pace.due(offset);
             if let Err(end) = self.wait_until(due, sources) {
                 return Ok(end);

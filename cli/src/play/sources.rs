@@ -13,9 +13,9 @@ use sinew::{
 };
 use sinew_player::Recorded;
 
-use super::route::Sender;
+use super::{route::Sender, target::Target};
 use crate::{
-    system::{System, SystemError},
+    system::{Answer, SystemError},
     table::clean,
 };
 
@@ -111,28 +111,96 @@ impl Sources {
     }
 }
 
-/// Refuses to play in the name of an application that is there, on any node.
+/// Refuses to play in the name of an application that is there, on any node. A live system must list all of them: a
+/// controller that is not listed would send beside its recording.
 ///
 /// # Errors
-/// There is one, at an address that is not among `own`.
+/// There is one, at an address that is not among `own`; or a live system does not list all applications.
 pub(crate) fn check_names(
-    system: &mut System,
+    target: &mut Target,
     senders: &BTreeSet<&Sender>,
     own: &BTreeSet<Tid>,
 ) -> Result<(), SystemError> {
-    let here = system.here()?;
-    for answer in system.ask_all::<AskApps, AppsReport>(&here) {
-        let apps = answer.result.map(|report| report.apps).unwrap_or_default();
-        for app in apps.into_iter().filter(|app| !own.contains(&app.tid)) {
-            let Some(name) = app.name else { continue };
-            if senders.contains(&Sender::Named(name.clone())) {
-                let (name, node, tid) = (clean(&name), clean(&answer.name), app.tid);
-                return Err(SystemError::Bag(format!(
-                    "an application called {name} is there, at {tid} on node {node}: two would send under one name. \
-                     Stop it, or leave it out: --source with the names of the others"
-                )));
-            }
+    let is_live = !target.is_own();
+    let here = target.system.here()?;
+    if is_live && here.left_out > 0 {
+        return Err(unlisted(&format!("{} nodes are not listed by the node of the socket", here.left_out)));
+    }
+    let answers = target.system.ask_all::<AskApps, AppsReport>(&here);
+    answers.into_iter().try_for_each(|answer| check_answer(answer, is_live, senders, own))
+}
+
+/// Checks the applications of one node.
+fn check_answer(
+    answer: Answer<AppsReport>,
+    is_live: bool,
+    senders: &BTreeSet<&Sender>,
+    own: &BTreeSet<Tid>,
+) -> Result<(), SystemError> {
+    let (name, node) = (clean(&answer.name), answer.node);
+    let apps = match answer.result {
+        Ok(AppsReport { left_out: 1.., .. }) if is_live => {
+            return Err(unlisted(&format!("node {name} at {node} has more applications than it lists")));
+        }
+        Err(why) if is_live => {
+            return Err(unlisted(&format!("node {name} at {node} does not list its applications: {why}")));
+        }
+        Ok(report) => report.apps,
+        Err(_) => return Ok(()),
+    };
+    for app in apps.into_iter().filter(|app| !own.contains(&app.tid)) {
+        let Some(taken) = app.name else { continue };
+        if senders.contains(&Sender::Named(taken.clone())) {
+            let (taken, tid) = (clean(&taken), app.tid);
+            return Err(SystemError::Bag(format!(
+                "an application called {taken} is there, at {tid} on node {name}: two would send under one name. Stop \
+                 it, or leave it out: --source with the names of the others"
+            )));
         }
     }
     Ok(())
+}
+
+/// A live system that may have an application with the name of a source.
+fn unlisted(why: &str) -> SystemError {
+    let why = clean(why);
+    SystemError::Bag(format!(
+        "{why}: an application of the recording may run there. Wait until each node answers (`sinew nodes`), or give \
+         it more time: --deadline-ms"
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew::NodeAddress;
+
+    use super::*;
+
+    fn report(left_out: u64) -> AppsReport {
+        AppsReport {
+            name: "knee".to_owned(),
+            apps: Vec::new(),
+            left_out,
+            barriers: Vec::new(),
+            barriers_left_out: 0,
+            groups: Vec::new(),
+            groups_left_out: 0,
+        }
+    }
+
+    #[test]
+    fn live_system_with_unlisted_applications_is_refused() {
+        let check = |result, is_live| {
+            let answer = Answer { node: NodeAddress::from([10, 0, 0, 2]), name: "knee".to_owned(), result };
+            check_answer(answer, is_live, &BTreeSet::new(), &BTreeSet::new())
+        };
+        assert!(check(Ok(report(0)), true).is_ok());
+        let silent = || Err("no answer within 1 s".to_owned());
+        for (result, words) in [(silent(), "no answer within 1 s"), (Ok(report(3)), "more applications")] {
+            let refused = check(result, true).unwrap_err().to_string();
+            assert!(refused.contains("node knee at 10.0.0.2") && refused.contains(words), "{refused}");
+        }
+        // And: no robot is in the own project
+        assert!(check(silent(), false).is_ok() && check(Ok(report(3)), false).is_ok());
+    }
 }

@@ -5,9 +5,10 @@ use std::{
     process::Command,
 };
 
+use rustix::process::Signal;
 use sinew::{AppAddress, NodeAddress, NodeApi, Registration, Tid, message::Kind};
 use sinew_bag::{BagWriter, ChannelInfo, Class, Direction, Options, Origin, Party, Record};
-use sinew_testkit::{NodeProcess, TestDirectory};
+use sinew_testkit::{NodeProcess, TestDirectory, program};
 
 use crate::scenario::{Answer, Scenario, named, node_command, sinew};
 
@@ -152,6 +153,17 @@ fn protected_commands_are_left_out_of_a_live_node() {
 }
 
 #[test]
+fn loop_without_any_message_to_send_ends() {
+    let scenario = Scenario::new();
+    let file = written(&scenario.directory, &[], &[7, 8]);
+    let _knee = scenario.start("knee", 2, &[]);
+    let answer =
+        scenario.sinew("knee", &["play", text(&file), "--live", "--loop", "--rate", "max", "--json"]);
+    assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
+    assert_eq!(answer.json()["left_out"]["protected"], 2, "{}", answer.out);
+}
+
+#[test]
 fn name_of_a_living_application_is_refused() {
     let scenario = Scenario::new();
     let file = recorded(&scenario.directory, &[1]);
@@ -224,6 +236,17 @@ fn check_without_a_common_application_names_both_sides() {
     command.args(["play", "--check"]).arg(&file).arg("--").arg(scenario.directory.join("none"));
     let answer = Answer::of(&mut command);
     assert!(answer.code == Some(1) && answer.err.contains("cannot be run"), "{}", answer.err);
+}
+
+#[test]
+fn variable_that_was_left_behind_stops_no_node() {
+    let scenario = Scenario::new();
+    let mut command = Command::new(program("sinew-node"));
+    command.arg(scenario.configure("knee", 2, &[])).env("SINEW_PLAY_CHECK", scenario.directory.join("gone"));
+    let mut knee = NodeProcess::start("sinew-node", command);
+    knee.wait_for(&["up"]);
+    knee.signal(Signal::TERM);
+    assert_eq!(knee.wait_for_exit(), Some(0));
 }
 
 #[test]

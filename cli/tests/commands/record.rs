@@ -1,16 +1,16 @@
 //! `sinew record`: from a node to a file that `sinew bag check` finds complete.
 
 use std::{
-    path::Path,
+    path::{Path, PathBuf},
     process::Command,
     sync::atomic::{AtomicBool, Ordering},
     time::Duration,
 };
 
 use rustix::process::Signal;
-use sinew::{AppAddress, NodeApi, Outcome, Registration, Tid, payload};
+use sinew::{AppAddress, Endpoint, NodeApi, Outcome, Registration, Tid, payload};
 use sinew_recorder::{Recording, RecordingOptions};
-use sinew_testkit::{NodeProcess, program, until};
+use sinew_testkit::{NodeProcess, TestDirectory, program, until};
 
 use crate::scenario::{Answer, Scenario};
 
@@ -125,13 +125,24 @@ fn killed_node_leaves_a_finished_file() {
 }
 
 /// Registers an application that sends one count to the node's inspection. That does not handle counts, and says so.
-fn send_one(scenario: &Scenario) {
+/// The application has its name for as long as the endpoint lives: a recorder asks for it after the message.
+fn send_one(scenario: &Scenario) -> Endpoint {
     let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
     let registration = Registration::new().name("sensor").handles::<Count>();
     let mut sensor = api.register_transport_address(registration).expect("it is registered");
     let inspect = Tid::new(sensor.tid().node, AppAddress::INSPECT);
     let outcome = sensor.message(inspect, &Count { number: 1 }).confirmed(Duration::from_secs(10));
     assert_ne!(outcome.expect("an outcome"), Outcome::Delivered);
+    sensor
+}
+
+/// Returns the recordings in the folder of a test.
+fn recordings(folder: &TestDirectory) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder.join("")).expect("it is there");
+    entries
+        .map(|entry| entry.expect("it can be read").path())
+        .filter(|path| path.extension().is_some_and(|ending| ending == "mcap"))
+        .collect()
 }
 
 #[test]
@@ -144,18 +155,36 @@ fn node_finishes_the_file_of_its_configuration() {
     command.arg(&path);
     let mut knee = NodeProcess::start("sinew-node", command);
     knee.wait_for(&["up"]);
-    send_one(&scenario);
+    let sensor = send_one(&scenario);
+    // The recorder asks the node for the name. The file has its chunk a second later.
+    until("the message is in the file with its name", || {
+        let files = recordings(&scenario.directory);
+        let info = bag("info", files.first()?);
+        info.out.contains("/sensor/scenario.count").then_some(())
+    });
+    drop(sensor);
     knee.signal(Signal::TERM);
     assert_eq!(knee.wait_for_exit(), Some(0));
-    let folder = std::fs::read_dir(file.parent().expect("a folder")).expect("it is there");
-    let files: Vec<_> = folder
-        .map(|entry| entry.expect("it can be read").path())
-        .filter(|path| path.extension().is_some_and(|ending| ending == "mcap"))
-        .collect();
+    let files = recordings(&scenario.directory);
     assert!(files.len() == 1 && files[0].display().to_string().contains("/knee-20"), "{files:?}");
     assert_complete(&files[0]);
     let info = bag("info", &files[0]);
     assert!(info.out.contains("/sensor/scenario.count") && info.out.contains("finished"), "{}", info.out);
+}
+
+#[test]
+fn node_without_a_place_for_its_file_serves_and_fails_at_its_end() {
+    let scenario = Scenario::new();
+    let file = scenario.directory.join("absent/{node}.mcap");
+    let section = format!("[record]\nfile = \"{}\"\nkeep_bytes = 1048576\n[ndl]", file.display());
+    let path = scenario.configure("knee", 2, &[("[ndl]", &section)]);
+    let mut command = Command::new(program("sinew-node"));
+    command.arg(&path);
+    let mut knee = NodeProcess::start("sinew-node", command);
+    knee.wait_for(&["up"]);
+    drop(send_one(&scenario));
+    knee.signal(Signal::TERM);
+    assert_eq!(knee.wait_for_exit(), Some(1));
 }
 
 #[test]
@@ -166,8 +195,9 @@ fn program_records_its_node() {
     let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
     let options = RecordingOptions { path: Some(file.clone()), ..RecordingOptions::default() };
     let recording = Recording::begin(&api, options).expect("it begins");
-    send_one(&scenario);
+    let sensor = send_one(&scenario);
     let summary = recording.finish_within(Duration::from_secs(60)).expect("it ends");
+    drop(sensor);
     assert!(summary.totals.written > 0 && summary.totals.dropped == 0, "{summary:?}");
     assert_complete(&file);
     let info = bag("info", &file);

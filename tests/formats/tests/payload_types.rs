@@ -12,9 +12,10 @@ use sinew::{
     Payload,
     events::{DirectoryEvent, Down, NodeEvent, RequirementEvent, Undelivered},
     inspect::{
-        AccessReport, AppsReport, AskAccess, AskApps, AskAudit, AskGroups, AskMismatches, AskNode, AskReach,
-        AskRecord, AskReload, AskSchemas, AskTree, AskWatch, AuditReport, MismatchesReport, NodeReport, Ping,
-        ReachReport, RecordReport, ReloadReport, SchemasReport, TreeReport, WatchReport,
+        AccessReport, AppsReport, AskAccess, AskApps, AskAudit, AskFreeze, AskFrozen, AskGroups,
+        AskMismatches, AskNode, AskReach, AskRecord, AskReload, AskSchemas, AskTree, AskWatch, AuditReport,
+        FreezeReport, FrozenReport, MismatchesReport, NodeReport, Ping, ReachReport, RecordReport,
+        ReloadReport, SchemasReport, TreeReport, WatchReport,
     },
     schema::{Schema, schema_of},
 };
@@ -98,9 +99,9 @@ fn every_payload_type_of_this_tree_is_traced() {
         Arm BarrierStatus EmergencyStop GaitStatus Release Reset Shut
         DriveStatus DriveTick FootLoad GaitState JointSample TorqueSet
         DirectoryEvent Down NodeEvent RequirementEvent Undelivered
-        AccessReport AppsReport AskAccess AskApps AskAudit AskGroups AskMismatches AskNode AskReach AskRecord
-        AskReload AskSchemas AskTree AskWatch AuditReport MismatchesReport NodeReport Ping ReachReport RecordReport
-        ReloadReport SchemasReport TreeReport WatchReport
+        AccessReport AppsReport AskAccess AskApps AskAudit AskFreeze AskFrozen AskGroups AskMismatches AskNode AskReach
+        AskRecord AskReload AskSchemas AskTree AskWatch AuditReport FreezeReport FrozenReport MismatchesReport
+        NodeReport Ping ReachReport RecordReport ReloadReport SchemasReport TreeReport WatchReport
         ArriveAtBarrier BarrierAnswer LeaveBarrier
     };
     let mut names = BTreeSet::new();

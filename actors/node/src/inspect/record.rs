@@ -13,9 +13,14 @@ use sinew_shm::journal::{JournalReader, Start};
 
 use super::{
     access,
-    reports::{AskRecord, RecordReport, RecordedApp, RecordedType, SCHEMAS_MAX, bounded},
+    reports::{AskRecord, RecordReport, RecordedApp, RecordedType, bounded},
 };
 use crate::{NodeState, recording};
+
+/// Maximum number of payload types with a structure beside a journal. A reader without a node cannot ask for more.
+const READER_SCHEMAS_MAX: usize = 256;
+/// Maximum bytes of these structures: the names have room in the same file, of 4 MiB.
+const READER_SCHEMA_BYTES_MAX: usize = 1 << 20;
 
 /// Answers the question of a program that records.
 pub(crate) fn recorded(state: &Arc<NodeState>, question: &Message) -> Result<RecordReport, Rejection> {
@@ -45,7 +50,20 @@ fn refused(why: String) -> RecordReport {
 /// Returns the names and structures for a reader of the journal at this path, which may have no node to ask.
 pub(crate) fn names_for_reader(state: &NodeState, path: &Path) -> RecordReport {
     let kinds = journal_kinds(path);
-    report(state, path, &kinds, &kinds[..kinds.len().min(SCHEMAS_MAX)])
+    let mut report = report(state, path, &kinds, &kinds[..kinds.len().min(READER_SCHEMAS_MAX)]);
+    bound_schemas(&mut report.types, READER_SCHEMA_BYTES_MAX);
+    report
+}
+
+/// Leaves out each structure that has no room behind those before it.
+fn bound_schemas(types: &mut [RecordedType], bytes_max: usize) {
+    let mut left = bytes_max;
+    for RecordedType { schema, .. } in types {
+        match left.checked_sub(schema.as_ref().map_or(0, Vec::len)) {
+            Some(rest) => left = rest,
+            None => *schema = None,
+        }
+    }
 }
 
 fn report(state: &NodeState, path: &Path, journal: &[Kind], schemas: &[Kind]) -> RecordReport {
@@ -89,4 +107,22 @@ fn journal_kinds(path: &Path) -> Vec<Kind> {
 fn schema(kind: Kind) -> Option<Vec<u8>> {
     let traced = kind.schema()?.ok()?;
     Some(traced.schema().encode())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn structures_beside_a_journal_are_bounded_in_bytes() {
+        let one = |bytes: Option<usize>| RecordedType {
+            kind: Kind::from_bits(7),
+            name: "test.angle".to_owned(),
+            schema: bytes.map(|bytes| vec![7; bytes]),
+        };
+        let mut types = [Some(60), None, Some(50), Some(40)].map(one);
+        bound_schemas(&mut types, 100);
+        let lengths = types.map(|one| one.schema.map(|schema| schema.len()));
+        assert_eq!(lengths, [Some(60), None, None, Some(40)]);
+    }
 }

@@ -154,6 +154,19 @@ fn structures_are_asked_for_before_the_first_message() {
 }
 
 #[test]
+fn names_are_learned_before_the_first_step() {
+    let node = Node::new("names");
+    let mut session = Session::begin(node.link(), node.options()).unwrap();
+    session.names_mut().add_app(tid(0x1001), "knee.sensor");
+    assert!(session.names_mut().has_app("knee.sensor") && session.refresh_names());
+    assert_eq!(lock(&node.asked).len(), 2, "the begin, and one more");
+    node.write(kinds()[1], 1);
+    let file = session.finish(End::Asked).file;
+    let topics: Vec<_> = roles(&file).into_keys().collect();
+    assert_eq!(topics, ["/knee.sensor/test.torque/view"]);
+}
+
+#[test]
 fn recording_of_a_program_ends_with_its_file() {
     let node = Node::new("thread");
     let recording = Recording::through(node.link(), node.options()).unwrap();
@@ -205,4 +218,45 @@ fn journal_that_ends_with_its_node_ends_the_recording() {
     };
     assert_eq!(end, End::Closed);
     assert_eq!(session.finish(end).totals.written, 1);
+}
+
+#[test]
+fn messages_beyond_the_maximum_size_are_counted() {
+    let node = Node::new("full");
+    let file = sinew_bag::Options {
+        compression: Compression::None,
+        size_max: Some(64 * 1024),
+        ..sinew_bag::Options::default()
+    };
+    let options = RecordingOptions { file, goes_on_when_full: true, ..node.options() };
+    let mut session = Session::begin(node.link(), options).unwrap();
+    let deadline = Time::now() + WATCHDOG;
+    for sequence in 1..=2_000 {
+        node.write(kinds()[0], sequence);
+        // The journal keeps some hundred messages.
+        while sequence % 100 == 0 && session.totals().seen < sequence {
+            assert!(Time::now() < deadline, "waited for all messages");
+            assert_eq!(session.step(), None);
+        }
+    }
+    let summary = session.finish(End::Asked);
+    let Totals { seen, written, dropped, .. } = summary.totals;
+    assert!(seen == 2_000 && written > 0 && dropped > 0 && seen == written + dropped, "{summary:?}");
+    assert!(summary.faults.len() == 1 && summary.faults[0].contains("maximum size"), "{summary:?}");
+    assert!(!summary.is_whole());
+}
+
+#[test]
+fn recordings_of_one_second_have_numbers() {
+    let node = Node::new("second");
+    let origin = Origin { node: "leg".to_owned(), ..Origin::default() };
+    let create_at = |name: &str| {
+        let path = Some(node.folder.join(name));
+        create(&RecordingOptions { path, ..RecordingOptions::default() }, &origin).map(|bag| bag.path())
+    };
+    let names = [(); 2].map(|()| create_at("{node}-{time}.mcap").unwrap());
+    assert!(names[0].display().to_string().ends_with("/leg-1970-01-01-000000.mcap"), "{names:?}");
+    assert!(names[1].display().to_string().ends_with("/leg-1970-01-01-000000-2.mcap"), "{names:?}");
+    // And: a name without the time is not changed
+    assert!(create_at("leg.mcap").is_ok() && create_at("leg.mcap").is_err());
 }

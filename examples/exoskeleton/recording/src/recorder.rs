@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use sinew::message::Kind;
 
-use session::{NodeFile, Session};
+use session::NodeFile;
 
 /// Name of the file with the messages of all nodes.
 pub const MERGED: &str = "walk.mcap";
@@ -170,10 +170,10 @@ fn record_node(
                 records.faults.push(fault);
             }
         };
-        match Session::begin(socket, &path, names) {
+        match session::begin(socket, &path, names) {
             Ok(Some(session)) => {
                 number += 1;
-                records.files.push(session.run(&orders.stop, &mut fault));
+                records.files.push(session::run(session, names, &orders.stop, &mut fault));
             }
             Ok(None) => {}
             Err(error) => fault(error.to_string()),

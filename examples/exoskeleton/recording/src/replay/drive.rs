@@ -1,7 +1,7 @@
 //! The core of one drive, on recorded ticks.
 
 use exoskeleton_model::control::drive::{DriveConfig, DriveCore};
-use exoskeleton_model::message::{DriveState, DriveTick};
+use exoskeleton_model::message::{DriveState, DriveTick, GaitMode};
 
 use super::inputs::DriveInputs;
 use super::{Difference, JointResult, TickResult};
@@ -48,8 +48,9 @@ impl DriveReplay {
         if is_next && last.is_some_and(|last| tick.seq - last > 1) && self.core.is_some() {
             self.lose(tick, format!("the ticks before tick {} are not in the recording", tick.seq));
         }
-        if !is_next || self.core.is_none() {
-            self.begin(tick);
+        let begins = !is_next || self.core.is_none();
+        if begins {
+            self.begin(tick, inputs);
         }
         let Some(core) = self.core.as_mut() else { return };
         let computed = match compute(core, tick, inputs) {
@@ -61,8 +62,14 @@ impl DriveReplay {
         };
         let recorded =
             TickResult { torque_nm: tick.torque_nm, assist_gain: tick.assist_gain, state: tick.state };
+        let is_same = computed.is(&recorded);
+        if begins && tick.seq != 1 && !is_same {
+            // The drive was not in the state of a new one. The next tick at rest is tried.
+            self.core = None;
+            return;
+        }
         self.result.compared += 1;
-        if computed.is(&recorded) {
+        if is_same {
             self.result.identical += 1;
         } else if self.result.first_difference.is_none() {
             self.differs_ns = tick.t_ns;
@@ -72,9 +79,9 @@ impl DriveReplay {
         }
     }
 
-    /// Begins with the first tick of a drive, or with a later one in which the drive is at rest.
-    fn begin(&mut self, tick: &DriveTick) {
-        self.core = (tick.seq == 1 || is_at_rest(tick)).then(|| DriveCore::new(self.config));
+    /// Begins with the first tick of a drive, or with a later one in which the drive is in the state of a new one.
+    fn begin(&mut self, tick: &DriveTick, inputs: Option<&DriveInputs>) {
+        self.core = (tick.seq == 1 || is_as_new(tick, inputs)).then(|| DriveCore::new(self.config));
         if self.core.is_none() {
             self.lose(
                 tick,
@@ -92,7 +99,14 @@ impl DriveReplay {
     }
 }
 
-/// Whether the state of the drive is that of a new one: it gives no torque, and has none to ramp to zero.
+/// Whether a new drive continues as this one. It is at rest and knows its device: before that, a pause decides which
+/// samples count. Central does not let it walk: so assistance rises as after any interruption.
+fn is_as_new(tick: &DriveTick, inputs: Option<&DriveInputs>) -> bool {
+    let gait = tick.gait.and_then(|used| inputs?.gait(&used));
+    is_at_rest(tick) && tick.torque_nm.is_some() && gait.is_some_and(|gait| gait.mode != GaitMode::Walk)
+}
+
+/// Whether the drive gives no torque, and has none to ramp to zero.
 fn is_at_rest(tick: &DriveTick) -> bool {
     matches!(tick.before, DriveState::Init | DriveState::Ready)
         && tick.torque_nm.is_none_or(|torque_nm| torque_nm == 0.0)
@@ -133,4 +147,100 @@ fn compute(
     }
     let (torque_nm, assist_gain, state) = (output.command_nm, output.assist_gain, output.state);
     Ok(TickResult { torque_nm, assist_gain, state })
+}
+
+#[cfg(test)]
+mod tests {
+    use exoskeleton_model::joint::Joint;
+    use exoskeleton_model::message::{GaitState, JointSample, Stance};
+
+    use super::*;
+
+    const MS: u64 = 1_000_000;
+
+    fn sample(seq: u32, t_ns: u64) -> JointSample {
+        JointSample {
+            seq,
+            t_ns,
+            t_error_ns: Some(0),
+            angle_rad: 0.1,
+            velocity_rad_s: 0.0,
+            torque_nm: 0.0,
+            temperature_c: 30,
+            flags: 0,
+        }
+    }
+
+    fn gait(mode: GaitMode, t_ns: u64) -> GaitState {
+        GaitState {
+            seq: u32::try_from(t_ns / MS).unwrap(),
+            t_ns,
+            t_error_ns: Some(0),
+            phase: 0.0,
+            phase_rate_hz: 0.0,
+            stance: Stance::Stance,
+            mode,
+            confidence: 1.0,
+            epoch: 1,
+            degraded: 0,
+        }
+    }
+
+    /// Runs the drive of a robot on these inputs, and replays its ticks without the first one.
+    fn replayed_from_the_second(inputs: &[(u64, JointSample, GaitState)]) -> JointResult {
+        let config = DriveConfig::standard(Joint::Hip);
+        let (mut robot, mut replay) = (DriveCore::new(config), DriveReplay::new(config));
+        let mut recorded = DriveInputs::default();
+        for ((t_ns, sample, gait), seq) in inputs.iter().zip(1..) {
+            recorded.samples.push_back(*sample);
+            recorded.gaits.push_back(*gait);
+            let before = robot.state();
+            let output = robot.tick(*t_ns, Some(sample), Some(gait));
+            let tick = DriveTick {
+                joint: 0,
+                seq,
+                t_ns: *t_ns,
+                late_us: 0,
+                before,
+                is_shut: false,
+                sample: Some(sample.into()),
+                gait: Some(gait.into()),
+                torque_nm: output.command_nm,
+                assist_gain: output.assist_gain,
+                state: output.state,
+                damped_at_ns: None,
+            };
+            if seq > 1 {
+                replay.run(&tick, Some(&recorded));
+            }
+        }
+        replay.result(0)
+    }
+
+    #[test]
+    fn recording_that_begins_with_a_pause_is_no_difference() {
+        let hold = |t_ns| gait(GaitMode::Hold, t_ns);
+        // The drive was not scheduled for 19 ms. The sample of that time does not show the torque of its device.
+        let result = replayed_from_the_second(&[
+            (MS, sample(1, MS / 2), hold(MS / 2)),
+            (20 * MS, sample(2, 19 * MS), hold(19 * MS)),
+            (21 * MS, sample(2, 19 * MS), hold(19 * MS)),
+            (22 * MS, sample(3, 21 * MS + MS / 2), hold(21 * MS)),
+            (23 * MS, sample(4, 22 * MS + MS / 2), hold(22 * MS)),
+        ]);
+        assert_eq!(result, JointResult { ticks: 4, compared: 2, identical: 2, ..JointResult::default() });
+    }
+
+    #[test]
+    fn walk_without_its_begin_is_not_compared() {
+        let walk = |t_ns| gait(GaitMode::Walk, t_ns);
+        let result = replayed_from_the_second(&[
+            (MS, sample(1, MS / 2), gait(GaitMode::Hold, MS / 2)),
+            // It is ready, and the recording does not say whether assistance was interrupted before.
+            (2 * MS, sample(2, MS + MS / 2), walk(MS + MS / 2)),
+            (3 * MS, sample(3, 2 * MS + MS / 2), walk(2 * MS + MS / 2)),
+        ]);
+        assert_eq!((result.compared, result.first_difference), (0, None));
+        assert!(result.gap.is_some(), "{result:?}");
+    }
 }

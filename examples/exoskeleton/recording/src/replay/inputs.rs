@@ -25,8 +25,8 @@ pub(super) struct Inputs {
 /// The newest inputs of one drive.
 #[derive(Debug, Default)]
 pub(super) struct DriveInputs {
-    samples: VecDeque<JointSample>,
-    gaits: VecDeque<GaitState>,
+    pub(super) samples: VecDeque<JointSample>,
+    pub(super) gaits: VecDeque<GaitState>,
 }
 
 /// The messages of a channel.
