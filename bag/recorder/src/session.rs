@@ -14,6 +14,7 @@ use sinew_client::Endpoint;
 use sinew_model::config::{RecordCompression, RecordConfig};
 use sinew_record::{AskRecord, RecordReport, SCHEMAS_MAX, Selection};
 use sinew_runtime::{
+    log,
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wire::Kind,
@@ -356,8 +357,8 @@ impl<C: Connection> Session<C> {
             note(&mut self.faults, fault.to_string());
         }
         if self.goes_on_when_full && self.recorder.is_full() && !std::mem::replace(&mut self.was_full, true) {
-            let text = format!("{}: further messages are counted as dropped; raise its limit", End::Full);
-            note(&mut self.faults, text);
+            // The user has set this limit: it is no fault.
+            log::warn!("{}: further messages are counted as dropped; raise its limit", End::Full);
         }
         self.ask_for_names();
         match pumped {
