@@ -4,7 +4,7 @@ use std::{collections::BTreeMap, path::Path, process::Command};
 
 use serde_json::Value;
 use sinew::Time;
-use sinew_testkit::NodeProcess;
+use sinew_testkit::{NodeProcess, until};
 
 use crate::scenario::{Answer, Scenario};
 
@@ -36,6 +36,18 @@ fn spans(json: &Value) -> BTreeMap<String, Vec<String>> {
     spans
 }
 
+/// Returns whether the names beside a node's ring have that of this application: a MessagePack text.
+fn has_name(scenario: &Scenario, address: &str, name: &str) -> bool {
+    let text = [&[0xa0 | name.len() as u8], name.as_bytes()].concat();
+    let files = std::fs::read_dir(scenario.directory.join("")).expect("it is a folder");
+    files
+        .map(|file| file.expect("a file").path())
+        .filter(|path| path.to_string_lossy().ends_with(&format!("-{address}.facts")))
+        // It may just be replaced.
+        .filter_map(|path| std::fs::read(path).ok())
+        .any(|bytes| bytes.windows(text.len()).any(|part| part == text))
+}
+
 /// Checks that seen = written + dropped holds in the file. The other ends of its channels are in other files.
 fn assert_complete(file: &Path) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_sinew"));
@@ -62,6 +74,10 @@ fn all_nodes_keep_the_span_around_a_killed_one() {
         let nodes = json["nodes"].as_array().map_or(&[][..], Vec::as_slice);
         let is_measured = |node: &Value| node["clock_offset_ns"].is_i64();
         nodes.len() == 4 && nodes.iter().filter(|node| is_measured(node)).count() == 3
+    });
+    // And: the knee knows the hip's application, of which the ring has addresses only
+    until("the hip's name lies beside the knee's ring", || {
+        has_name(&scenario, "127.0.0.2", "hip").then_some(())
     });
     // When
     let killed_ns = Time::now().as_nanos();

@@ -24,7 +24,7 @@ use sinew_runtime::{
 use sinew_shm::journal::Journal;
 
 use super::{
-    facts,
+    facts::{self, Changes},
     plan::{FreezePlan, Output, Trigger, TriggerId},
     store::{FrozenStore, write_facts},
     triggers::forward,
@@ -36,7 +36,7 @@ use crate::{
 
 /// Maximum number of causes between two looks. Further ones belong to the same span, or are lost in a flood.
 const CAUSES_MAX: usize = 16;
-/// Time between two looks at the names beside the journal.
+/// Time between two looks at the names beside the journal, if no application has a new name.
 const NAMES_PERIOD: Duration = Duration::from_secs(1);
 
 /// The flight recorder of a node.
@@ -156,19 +156,19 @@ impl Flight {
         state: &Arc<NodeState>,
         journal: &Arc<Journal>,
         now: Time,
-        losses: &[String],
+        changes: &Changes,
     ) {
         // A node that stops loses the others in order.
         if !state.ctx.stopping.load(Ordering::Relaxed) {
             let reported = std::mem::take(&mut *lock(&self.causes.reported));
             reported.iter().for_each(|(at, cause)| _ = self.happened(*at, cause));
-            losses.iter().for_each(|cause| _ = self.happened(now, cause));
+            changes.losses.iter().for_each(|cause| _ = self.happened(now, cause));
         }
         let lost = self.causes.lost.swap(0, Ordering::Relaxed);
         if lost > 0 {
             log::debug!(lost, "causes to freeze a span were not looked at: others came at the same moment");
         }
-        self.write_names(state, journal, now);
+        self.write_names(state, journal, now, changes.has_new_names);
         loop {
             let output = lock(&self.plan).poll(now.as_nanos());
             match output {
@@ -195,10 +195,11 @@ impl Flight {
         }
     }
 
-    /// Writes the names beside the journal, if they have changed: a dead node cannot tell them.
-    fn write_names(&self, state: &NodeState, journal: &Journal, now: Time) {
+    /// Writes the names beside the journal, if they have changed: a dead node cannot tell them. A new name of an
+    /// application is written at once: the node may die within its first second.
+    fn write_names(&self, state: &NodeState, journal: &Journal, now: Time, is_due: bool) {
         let mut names = lock(&self.names);
-        if now < names.due {
+        if now < names.due && !is_due {
             return;
         }
         names.due = now + NAMES_PERIOD;

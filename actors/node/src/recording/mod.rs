@@ -313,9 +313,9 @@ fn run(node: &Weak<NodeState>, journal: &Arc<Journal>) {
         if !state.recording.refresh(&state, journal, now) {
             return;
         }
-        let losses = known.look(&state, journal, now);
+        let changes = known.look(&state, journal, now);
         if let Some(flight) = state.recording.flight() {
-            flight.turn(&state, journal, now, &losses);
+            flight.turn(&state, journal, now, &changes);
         }
         state.recording.rest();
     }
