@@ -56,8 +56,12 @@ impl FrozenStore {
         Self { folder, base, spans_max, fetched: BTreeSet::new() }
     }
 
-    /// Removes journals without facts: their node was killed while it made them.
+    /// Removes journals without facts, and files without their name: their node was killed while it made them.
     pub(crate) fn clean(&self) {
+        for name in self.names_after(&format!(".{}-", self.base), "") {
+            // It stays if the folder refuses that.
+            let _ = fs::remove_file(self.folder.join(name));
+        }
         for name in self.names(".frozen") {
             let ring = self.folder.join(&name);
             if !ring.with_extension("facts").exists() {
@@ -191,12 +195,15 @@ impl FrozenStore {
 
     /// Returns the names of this node's files with such an end.
     fn names(&self, end: &str) -> BTreeSet<String> {
+        self.names_after(&format!("{}-", self.base), end)
+    }
+
+    fn names_after(&self, begin: &str, end: &str) -> BTreeSet<String> {
         let Ok(files) = fs::read_dir(&self.folder) else { return BTreeSet::new() };
-        let prefix = format!("{}-", self.base);
         files
             .take(FILES_MAX)
             .filter_map(|file| file.ok()?.file_name().into_string().ok())
-            .filter(|name| name.starts_with(&prefix) && name.ends_with(end))
+            .filter(|name| name.starts_with(begin) && name.ends_with(end))
             .collect()
     }
 
@@ -370,7 +377,10 @@ mod tests {
         freeze(&mut store, &folder.journal(), &span("a-1", 2)).unwrap();
         fs::write(store.path("a-2", "frozen"), b"half").unwrap();
         fs::write(store.path("a-3", "facts"), b"\xc1").unwrap();
+        let without_name = folder.0.join(".sinew-leg-10.0.0.2-a-4.frozen.77.0");
+        fs::write(&without_name, b"half").unwrap();
         store.clean();
+        assert!(!without_name.exists());
         assert!(!store.path("a-2", "frozen").exists() && store.path("a-1", "frozen").exists());
         assert_eq!(store.spans().len(), 1);
     }
