@@ -10,19 +10,20 @@ use std::{
     ops::RangeInclusive,
     os::unix::fs::OpenOptionsExt as _,
     path::{Path, PathBuf},
+    time::Duration,
 };
 
 use clap::Args;
 use serde_json::json;
 use sinew::{
-    AppAddress, NodeAddress, Tid,
-    inspect::{AskFrozen, FrozenFacts, FrozenPart, FrozenReport, FrozenSpan},
+    AppAddress, NodeAddress, Tid, Time,
+    inspect::{AskFrozen, FROZEN_BUSY, FrozenFacts, FrozenPart, FrozenReport, FrozenSpan},
 };
 
 use super::freeze::present;
 use crate::{
     Report,
-    system::{System, SystemError, in_words},
+    system::{Answer, System, SystemError, in_words},
     table::{Table, clean, time},
 };
 use convert::{Converted, Source, convert, file_name};
@@ -32,6 +33,10 @@ use dead::DeadRing;
 const RING_BYTES_MAX: u64 = (4 << 30) + (1 << 20);
 /// Maximum bytes of the facts beside it.
 const FACTS_BYTES_MAX: u64 = 4 << 20;
+
+/// Time for which a node is asked again while it writes to the folder of its spans, and the pause before.
+const BUSY_WITHIN: Duration = Duration::from_secs(5);
+const BUSY_PAUSE: Duration = Duration::from_millis(20);
 
 /// The arguments of `sinew record fetch`.
 #[derive(Debug, Args)]
@@ -93,7 +98,7 @@ pub(super) fn show(system: &mut System, order: &Order) -> Result<Report, SystemE
 fn find(system: &mut System) -> Result<Found, SystemError> {
     let here = system.here()?;
     let mut found = Found::default();
-    for answer in system.ask_these::<AskFrozen, FrozenReport>(present(&here)) {
+    for answer in ask_spans(system, present(&here)) {
         let node = answer.node;
         match answer.result {
             Err(why) => found.faults.push(format!("{node} {}: {why}", answer.name)),
@@ -224,12 +229,27 @@ fn pull(
 
 fn ask(system: &mut System, node: NodeAddress, question: &AskFrozen) -> Result<FrozenReport, SystemError> {
     let (to, within) = (Tid::new(node, AppAddress::INSPECT), system.within);
-    let answer: Result<FrozenReport, _> = system.endpoint.message(to, question).ask(within);
-    let report = answer.map_err(|error| SystemError::Bag(in_words(&error)))?;
-    match report.refused {
-        Some(why) => Err(SystemError::Bag(clean(&why))),
-        None => Ok(report),
+    let until = Time::now() + BUSY_WITHIN;
+    loop {
+        let answer: Result<FrozenReport, _> = system.endpoint.message(to, question).ask(within);
+        let report = answer.map_err(|error| SystemError::Bag(in_words(&error)))?;
+        match report.refused {
+            Some(why) if why == FROZEN_BUSY && Time::now() < until => std::thread::sleep(BUSY_PAUSE),
+            Some(why) => return Err(SystemError::Bag(clean(&why))),
+            None => return Ok(report),
+        }
     }
+}
+
+/// Asks nodes for their spans. One that is busy is asked again.
+pub(super) fn ask_spans(system: &mut System, nodes: Vec<(NodeAddress, String)>) -> Vec<Answer<FrozenReport>> {
+    let mut answers = system.ask_these::<AskFrozen, FrozenReport>(nodes);
+    for answer in &mut answers {
+        if answer.result.as_ref().is_ok_and(|report| report.refused.as_deref() == Some(FROZEN_BUSY)) {
+            answer.result = ask(system, answer.node, &AskFrozen::default()).map_err(|why| why.to_string());
+        }
+    }
+    answers
 }
 
 fn listed(found: &Found) -> Report {

@@ -6,7 +6,7 @@ use sinew_runtime::{outcome::Rejection, time::Time, wire::Message};
 
 use super::{
     access,
-    reports::{AskFreeze, AskFrozen, FROZEN_BYTES_MAX, FreezeReport, FrozenReport},
+    reports::{AskFreeze, AskFrozen, FROZEN_BUSY, FROZEN_BYTES_MAX, FreezeReport, FrozenReport},
 };
 use crate::NodeState;
 
@@ -49,7 +49,10 @@ pub(super) fn fetched(state: &Arc<NodeState>, question: &Message) -> Result<Froz
         return Ok(FrozenReport { refused: Some(NOT_RECORDED.to_owned()), ..own });
     };
     let own = FrozenReport { folder: Some(flight.folder().display().to_string()), ..own };
-    let mut store = flight.store();
+    // A disk may be slow, and this thread answers other questions.
+    let Some(mut store) = flight.try_store() else {
+        return Ok(FrozenReport { refused: Some(FROZEN_BUSY.to_owned()), ..own });
+    };
     let Some(id) = id else { return Ok(FrozenReport { spans: store.spans(), ..own }) };
     let answer = if is_fetched {
         store.set_fetched(&id).map(|()| (Vec::new(), 0))

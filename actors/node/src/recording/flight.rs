@@ -9,7 +9,7 @@ use std::{
     collections::VecDeque,
     path::{Path, PathBuf},
     sync::{
-        Arc, Mutex, MutexGuard, Weak,
+        Arc, Mutex, MutexGuard, TryLockError, Weak,
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
     time::Duration,
@@ -25,8 +25,8 @@ use sinew_shm::journal::Journal;
 
 use super::{
     facts::{self, Changes},
-    plan::{FreezePlan, Output, Trigger, TriggerId},
-    store::{FrozenStore, write_facts},
+    plan::{FreezePlan, Output, SpanOrder, Trigger, TriggerId},
+    store::{FrozenError, FrozenStore, write_facts},
     triggers::forward,
 };
 use crate::{
@@ -44,8 +44,8 @@ pub(crate) struct Flight {
     plan: Mutex<FreezePlan>,
     store: Mutex<FrozenStore>,
     causes: Arc<Causes>,
-    /// Spans to freeze or to discard: at most one for each known trigger, and one more.
-    work: Mutex<VecDeque<Work>>,
+    /// Spans to freeze: at most one for each known trigger.
+    work: Mutex<VecDeque<SpanOrder>>,
     is_working: AtomicBool,
     names: Mutex<KnownReport>,
     /// The folder of the journal.
@@ -74,12 +74,6 @@ impl IncidentObserver for Causes {
             self.lost.fetch_add(1, Ordering::Relaxed);
         }
     }
-}
-
-/// An order to the thread `freeze`.
-enum Work {
-    Freeze(Trigger),
-    Discard(TriggerId),
 }
 
 /// The names that were written beside the journal.
@@ -140,9 +134,18 @@ impl Flight {
         plan.refused() == before
     }
 
-    /// Returns the frozen spans. No layer waits for this lock.
+    /// Returns the frozen spans. It waits while a file is renamed or removed, but not for a copy.
     pub(crate) fn store(&self) -> MutexGuard<'_, FrozenStore> {
         lock(&self.store)
+    }
+
+    /// Returns the frozen spans, if no other thread has them.
+    pub(crate) fn try_store(&self) -> Option<MutexGuard<'_, FrozenStore>> {
+        match self.store.try_lock() {
+            Ok(store) => Some(store),
+            Err(TryLockError::Poisoned(poisoned)) => Some(poisoned.into_inner()),
+            Err(TryLockError::WouldBlock) => None,
+        }
     }
 
     /// Returns the folder of the journal.
@@ -179,8 +182,7 @@ impl Flight {
                 }
                 // The node has a recording, and keeps no spans.
                 Some(Output::Freeze(_)) if !self.keeps_spans => {}
-                Some(Output::Freeze(trigger)) => lock(&self.work).push_back(Work::Freeze(trigger)),
-                Some(Output::Discard(id)) => lock(&self.work).push_back(Work::Discard(id)),
+                Some(Output::Freeze(order)) => lock(&self.work).push_back(order),
             }
         }
         // SYNC: with the end of `work`: a thread that has ended has carried out its orders.
@@ -225,11 +227,10 @@ impl Flight {
         loop {
             let next = lock(&self.work).pop_front();
             match (next, state.upgrade()) {
-                (Some(Work::Freeze(trigger)), Some(state)) => {
-                    self.freeze(journal, &trigger, names_for_reader(&state, journal));
+                (Some(order), Some(state)) => {
+                    self.freeze(journal, &order, names_for_reader(&state, journal));
                 }
-                (Some(Work::Discard(id)), _) => self.store().discard(&id.to_string()),
-                (Some(Work::Freeze(_)), None) | (None, _) => break,
+                (Some(_), None) | (None, _) => break,
             }
         }
         // SYNC: with `turn`.
@@ -247,37 +248,39 @@ impl Flight {
         loop {
             let Some(output) = lock(&self.plan).poll(u64::MAX) else { break };
             match output {
-                Output::Freeze(trigger) => lock(&self.work).push_back(Work::Freeze(trigger)),
-                Output::Discard(id) => lock(&self.work).push_back(Work::Discard(id)),
+                Output::Freeze(order) => lock(&self.work).push_back(order),
                 // Its links have ended.
                 Output::Forward(_) => {}
             }
         }
         loop {
             let Some(next) = lock(&self.work).pop_front() else { break };
-            match next {
-                Work::Freeze(trigger) => self.freeze(journal, &trigger, report.clone()),
-                Work::Discard(id) => self.store().discard(&id.to_string()),
-            }
+            self.freeze(journal, &next, report.clone());
         }
     }
 
-    fn freeze(&self, journal: &Path, trigger: &Trigger, report: RecordReport) {
-        let id = trigger.id.to_string();
-        let cause = trigger.cause.as_str();
+    fn freeze(&self, journal: &Path, order: &SpanOrder, report: RecordReport) {
+        let SpanOrder { trigger, begin_ns, end_ns, replaces } = order;
+        let (id, cause) = (trigger.id.to_string(), trigger.cause.as_str());
         let span = FrozenSpan {
             id: id.clone(),
             cause: cause.to_owned(),
             at_ns: trigger.at_ns,
             bound_ns: trigger.bound_ns,
-            begin_ns: trigger.begin_ns(),
-            end_ns: trigger.end_ns(),
+            begin_ns: *begin_ns,
+            end_ns: *end_ns,
             ..FrozenSpan::default()
         };
         let facts = FrozenFacts { span: Some(span.clone()), report };
-        // Questions wait for this lock, and no sender does.
-        let mut store = self.store();
-        match store.make_room(&id).and_then(|()| store.freeze(journal, &span, &facts)) {
+        let replaces: Vec<_> = replaces.iter().map(TriggerId::to_string).collect();
+        let freeze = || -> Result<u64, FrozenError> {
+            let draft = self.store().draft(&id, &replaces)?;
+            // Without the lock: the copy takes as long as the disk does, and questions need the lock.
+            let drafted = draft.copy(journal, &span)?;
+            self.store().keep(&drafted, &facts, &replaces)?;
+            Ok(drafted.records)
+        };
+        match freeze() {
             Ok(records) => log::warn!(id, cause, records, "the messages around a fault are frozen"),
             Err(error) => log::error!(cause, %error, "the messages around a fault are not frozen"),
         }

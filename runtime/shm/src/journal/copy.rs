@@ -116,6 +116,19 @@ pub fn copy_span(
     Ok(copied)
 }
 
+/// Returns the number of records with times within `span` in the journal at `path`.
+///
+/// # Errors
+/// The journal cannot be read.
+pub fn count_span(path: &Path, span: &RangeInclusive<u64>) -> Result<u64, CopyJournalError> {
+    let mut records = 0;
+    each_record(path, span, |_, _| {
+        records += 1;
+        Ok(())
+    })?;
+    Ok(records)
+}
+
 /// The ring of a copy. Its records lie one after the other, from its start.
 struct Ring<'a> {
     file: &'a NewFile<'a>,
