@@ -443,6 +443,7 @@ impl Root {
         }
         sinew_runtime::log::info!(node = self.state.ctx.config.name, "the node stops");
         self.phase = Phase::StoppingApps;
+        self.state.recording.stop_ordered();
         self.notify_if_running();
         match &self.app_supervisor {
             Some(supervisor) => order(supervisor, Input::StopOrdered),

@@ -9,7 +9,7 @@ use std::{
     collections::VecDeque,
     path::{Path, PathBuf},
     sync::{
-        Arc, Mutex, MutexGuard, TryLockError, Weak,
+        Arc, Condvar, Mutex, MutexGuard, PoisonError, TryLockError, Weak,
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
     time::Duration,
@@ -17,7 +17,7 @@ use std::{
 
 use sinew_record::NodeFact;
 use sinew_runtime::{
-    incident::{self, IncidentObserver},
+    incident::{self, IncidentKind, IncidentObserver},
     lock, log,
     time::Time,
 };
@@ -26,7 +26,7 @@ use sinew_shm::journal::Journal;
 use super::{
     facts::{self, Changes},
     plan::{FreezePlan, Output, SpanOrder, Trigger, TriggerId},
-    store::{FrozenError, FrozenStore, write_facts},
+    store::{FrozenError, FrozenStore, read_facts, write_facts},
     triggers::forward,
 };
 use crate::{
@@ -44,9 +44,13 @@ pub(crate) struct Flight {
     plan: Mutex<FreezePlan>,
     store: Mutex<FrozenStore>,
     causes: Arc<Causes>,
-    /// Spans to freeze: at most one for each known trigger.
-    work: Mutex<VecDeque<SpanOrder>>,
-    is_working: AtomicBool,
+    work: Mutex<Work>,
+    /// Notified when the thread `freeze` ends.
+    idle: Condvar,
+    /// The time of the first order to stop the node, in nanoseconds; `u64::MAX` before.
+    stop_ns: AtomicU64,
+    /// Whether the layers have ended: names are those that were written last.
+    is_ending: AtomicBool,
     names: Mutex<KnownReport>,
     /// The folder of the journal.
     folder: PathBuf,
@@ -57,23 +61,32 @@ pub(crate) struct Flight {
 /// Causes that were reported by any thread of the process.
 #[derive(Default)]
 struct Causes {
-    reported: Mutex<VecDeque<(Time, String)>>,
+    reported: Mutex<VecDeque<(Time, IncidentKind, String)>>,
+    /// Those of which the words are lost.
     lost: AtomicU64,
 }
 
 impl IncidentObserver for Causes {
-    fn happened(&self, at: Time, cause: &str) {
-        // The thread may be a real-time one. Another cause is just being stored or read: that one is a trigger.
+    fn happened(&self, at: Time, kind: IncidentKind, cause: &str) {
+        // The thread may be a real-time one. Another cause is just being stored or read: this one has no words then.
         let Ok(mut reported) = self.reported.try_lock() else {
             self.lost.fetch_add(1, Ordering::Relaxed);
             return;
         };
         if reported.len() < CAUSES_MAX {
-            reported.push_back((at, cause.to_owned()));
+            reported.push_back((at, kind, cause.to_owned()));
         } else {
             self.lost.fetch_add(1, Ordering::Relaxed);
         }
     }
+}
+
+/// The orders of the thread `freeze`.
+#[derive(Default)]
+struct Work {
+    /// Spans to freeze: at most one for each known trigger.
+    orders: VecDeque<SpanOrder>,
+    is_running: bool,
 }
 
 /// The names that were written beside the journal.
@@ -114,7 +127,9 @@ impl Flight {
             store: Mutex::new(store),
             causes,
             work: Mutex::default(),
-            is_working: AtomicBool::new(false),
+            idle: Condvar::new(),
+            stop_ns: AtomicU64::new(u64::MAX),
+            is_ending: AtomicBool::new(false),
             names: Mutex::default(),
             folder,
             keeps_spans: config.frozen_max > 0,
@@ -161,16 +176,7 @@ impl Flight {
         now: Time,
         changes: &Changes,
     ) {
-        // A node that stops loses the others in order.
-        if !state.ctx.stopping.load(Ordering::Relaxed) {
-            let reported = std::mem::take(&mut *lock(&self.causes.reported));
-            reported.iter().for_each(|(at, cause)| _ = self.happened(*at, cause));
-            changes.losses.iter().for_each(|cause| _ = self.happened(now, cause));
-        }
-        let lost = self.causes.lost.swap(0, Ordering::Relaxed);
-        if lost > 0 {
-            log::debug!(lost, "causes to freeze a span were not looked at: others came at the same moment");
-        }
+        self.take_causes(now, &changes.losses);
         self.write_names(state, journal, now, changes.has_new_names);
         loop {
             let output = lock(&self.plan).poll(now.as_nanos());
@@ -182,18 +188,50 @@ impl Flight {
                 }
                 // The node has a recording, and keeps no spans.
                 Some(Output::Freeze(_)) if !self.keeps_spans => {}
-                Some(Output::Freeze(order)) => lock(&self.work).push_back(order),
+                Some(Output::Freeze(order)) => lock(&self.work).orders.push_back(order),
             }
         }
-        // SYNC: with the end of `work`: a thread that has ended has carried out its orders.
-        if !lock(&self.work).is_empty() && !self.is_working.swap(true, Ordering::AcqRel) {
-            let (flight, weak, path) = (self.clone(), Arc::downgrade(state), journal.path().to_owned());
-            let thread = std::thread::Builder::new().name("freeze".to_owned());
-            if let Err(error) = thread.spawn(move || flight.work(&weak, &path)) {
-                // The next turn tries again.
-                self.is_working.store(false, Ordering::Release);
-                log::error!(%error, "the system gives no thread to freeze a span");
+        self.start_work(&Arc::downgrade(state), journal.path());
+    }
+
+    /// Notes the order to stop the node. From now on only failed actors are causes: guards and watchdogs are expected
+    /// to see the end of peers, and nodes leave.
+    pub(super) fn stop_ordered(&self, now: Time) {
+        self.stop_ns.fetch_min(now.as_nanos(), Ordering::Relaxed);
+    }
+
+    /// Makes triggers of all causes since the last call.
+    fn take_causes(&self, now: Time, losses: &[String]) {
+        let stop_ns = self.stop_ns.load(Ordering::Relaxed);
+        let reported = std::mem::take(&mut *lock(&self.causes.reported));
+        for (at, kind, cause) in &reported {
+            if *kind == IncidentKind::Failure || at.as_nanos() < stop_ns {
+                self.happened(*at, cause);
             }
+        }
+        let lost = self.causes.lost.swap(0, Ordering::Relaxed);
+        if now.as_nanos() >= stop_ns {
+            return;
+        }
+        losses.iter().for_each(|cause| _ = self.happened(now, cause));
+        if lost > 0 {
+            // Those of a flood are in the span of the first one.
+            self.happened(now, &format!("{lost} incidents at the moment of another one"));
+        }
+    }
+
+    /// Starts the thread `freeze`, if it has orders and does not run.
+    fn start_work(self: &Arc<Self>, state: &Weak<NodeState>, journal: &Path) {
+        let mut work = lock(&self.work);
+        if work.orders.is_empty() || work.is_running {
+            return;
+        }
+        let (flight, state, path) = (self.clone(), state.clone(), journal.to_owned());
+        let thread = std::thread::Builder::new().name("freeze".to_owned());
+        match thread.spawn(move || flight.work(&state, &path)) {
+            Ok(_) => work.is_running = true,
+            // The next turn tries again.
+            Err(error) => log::error!(%error, "the system gives no thread to freeze a span"),
         }
     }
 
@@ -224,39 +262,61 @@ impl Flight {
 
     /// Carries out the orders of the thread `freeze`.
     fn work(&self, state: &Weak<NodeState>, journal: &Path) {
-        loop {
-            let next = lock(&self.work).pop_front();
-            match (next, state.upgrade()) {
-                (Some(order), Some(state)) => {
-                    self.freeze(journal, &order, names_for_reader(&state, journal));
-                }
-                (Some(_), None) | (None, _) => break,
-            }
+        while let Some(order) = self.next_order() {
+            let is_ending = self.is_ending.load(Ordering::Relaxed);
+            let report = match state.upgrade().filter(|_| !is_ending) {
+                Some(state) => names_for_reader(&state, journal),
+                None => self.written_names(journal),
+            };
+            self.freeze(journal, &order, report);
         }
-        // SYNC: with `turn`.
-        self.is_working.store(false, Ordering::Release);
     }
 
-    /// Freezes all spans that are not complete yet, up to this moment: the node ends. It waits for no layer.
-    pub(super) fn finish(&self, journal: &Path) {
+    /// Returns the next order of the thread. `None`: the thread ends.
+    fn next_order(&self) -> Option<SpanOrder> {
+        let mut work = lock(&self.work);
+        let next = work.orders.pop_front();
+        if next.is_none() {
+            work.is_running = false;
+            self.idle.notify_all();
+        }
+        next
+    }
+
+    /// Returns the names that were written last. It waits for no layer.
+    fn written_names(&self, journal: &Path) -> RecordReport {
+        // The thread `record` may hang in a layer, with the names locked.
+        let names = self.names.try_lock().ok().and_then(|names| names.written.clone());
+        let read = || read_facts(&journal.with_extension("facts")).ok().map(|facts| facts.report);
+        names.or_else(read).unwrap_or_default()
+    }
+
+    /// Has all spans frozen that are not complete yet, up to this moment: the node ends. [`wait`](Self::wait) waits for
+    /// the copies.
+    pub(super) fn finish(self: &Arc<Self>, node: &NodeState, journal: &Journal) {
+        self.is_ending.store(true, Ordering::Relaxed);
+        // The failure of an actor may be why the node ends.
+        self.take_causes(Time::now(), &[]);
         if !self.keeps_spans {
             return;
         }
-        // The thread `record` may hang in a layer, with the names locked.
-        let names = self.names.try_lock().ok().and_then(|names| names.written.clone());
-        let report = names.unwrap_or_default();
         loop {
-            let Some(output) = lock(&self.plan).poll(u64::MAX) else { break };
+            let output = lock(&self.plan).poll(u64::MAX);
             match output {
-                Output::Freeze(order) => lock(&self.work).push_back(order),
+                None => break,
                 // Its links have ended.
-                Output::Forward(_) => {}
+                Some(Output::Forward(trigger)) => note(node, journal, &trigger),
+                Some(Output::Freeze(order)) => lock(&self.work).orders.push_back(order),
             }
         }
-        loop {
-            let Some(next) = lock(&self.work).pop_front() else { break };
-            self.freeze(journal, &next, report.clone());
-        }
+        self.start_work(&Weak::new(), journal.path());
+    }
+
+    /// Waits until the thread `freeze` has carried out its orders. Returns `false` if the time is over before.
+    pub(super) fn wait(&self, within: Duration) -> bool {
+        let work = self.idle.wait_timeout_while(lock(&self.work), within, |work| work.is_running);
+        let (work, _) = work.unwrap_or_else(PoisonError::into_inner);
+        !work.is_running && work.orders.is_empty()
     }
 
     fn freeze(&self, journal: &Path, order: &SpanOrder, report: RecordReport) {
