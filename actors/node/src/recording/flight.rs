@@ -15,6 +15,7 @@ use std::{
     time::Duration,
 };
 
+use rustix::fs::{Access, access};
 use sinew_record::NodeFact;
 use sinew_runtime::{
     incident::{self, IncidentKind, IncidentObserver},
@@ -26,7 +27,7 @@ use sinew_shm::journal::Journal;
 use super::{
     facts::{self, Changes},
     plan::{FreezePlan, Output, SpanOrder, Trigger, TriggerId},
-    store::{FrozenError, FrozenStore, read_facts, write_facts},
+    store::{FrozenError, FrozenStore, move_ring, read_facts, write_facts},
     triggers::forward,
 };
 use crate::{
@@ -43,6 +44,8 @@ const NAMES_PERIOD: Duration = Duration::from_secs(1);
 pub(crate) struct Flight {
     plan: Mutex<FreezePlan>,
     store: Mutex<FrozenStore>,
+    /// The folder of the journal as a store: rings of dead incarnations are moved out of it.
+    beside: FrozenStore,
     causes: Arc<Causes>,
     work: Mutex<Work>,
     /// Notified when the thread `freeze` ends.
@@ -81,11 +84,19 @@ impl IncidentObserver for Causes {
     }
 }
 
+/// An order to the thread `freeze`.
+enum Order {
+    Freeze(SpanOrder),
+    /// The ring of a dead incarnation, beside the journal.
+    Move(String),
+}
+
 /// The orders of the thread `freeze`.
 #[derive(Default)]
 struct Work {
-    /// Spans to freeze: at most one for each known trigger.
-    orders: VecDeque<SpanOrder>,
+    /// Spans to freeze, at most one for each known trigger, and before them rings to move, at most as many as a store
+    /// has.
+    orders: VecDeque<Order>,
     is_running: bool,
 }
 
@@ -104,6 +115,14 @@ impl Flight {
         let folder = journal.parent().unwrap_or_else(|| Path::new(".")).to_owned();
         let base = journal.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let frozen_folder = config.frozen_folder.clone().unwrap_or_else(|| folder.clone());
+        if config.frozen_max > 0
+            && let Err(error) = access(&frozen_folder, Access::WRITE_OK | Access::EXEC_OK)
+        {
+            log::warn!(
+                folder = %frozen_folder.display(), %error,
+                "no span can be frozen: create the folder of record.frozen_folder, or permit this user to write there"
+            );
+        }
         let mut store = FrozenStore::new(frozen_folder, base, config.frozen_max);
         store.clean();
         if config.frozen_max > 0 {
@@ -117,6 +136,11 @@ impl Flight {
                 None => {}
             }
         }
+        let (beside, dead) = store.beside(journal);
+        let mut work = Work::default();
+        if config.frozen_max > 0 {
+            work.orders.extend(dead.into_iter().map(Order::Move));
+        }
         let plan = FreezePlan::new((state.ctx.node, state.ctx.incarnation), config.keep, config.after);
         let causes = Arc::new(Causes::default());
         let observer: Arc<dyn IncidentObserver> = causes.clone();
@@ -125,8 +149,9 @@ impl Flight {
         Arc::new(Self {
             plan: Mutex::new(plan),
             store: Mutex::new(store),
+            beside,
             causes,
-            work: Mutex::default(),
+            work: Mutex::new(work),
             idle: Condvar::new(),
             stop_ns: AtomicU64::new(u64::MAX),
             is_ending: AtomicBool::new(false),
@@ -188,7 +213,7 @@ impl Flight {
                 }
                 // The node has a recording, and keeps no spans.
                 Some(Output::Freeze(_)) if !self.keeps_spans => {}
-                Some(Output::Freeze(order)) => lock(&self.work).orders.push_back(order),
+                Some(Output::Freeze(order)) => lock(&self.work).orders.push_back(Order::Freeze(order)),
             }
         }
         self.start_work(&Arc::downgrade(state), journal.path());
@@ -263,6 +288,20 @@ impl Flight {
     /// Carries out the orders of the thread `freeze`.
     fn work(&self, state: &Weak<NodeState>, journal: &Path) {
         while let Some(order) = self.next_order() {
+            let order = match order {
+                Order::Freeze(order) => order,
+                Order::Move(id) => {
+                    match move_ring(&self.beside, &self.store, &id) {
+                        Ok(()) => {
+                            log::info!(id, "the ring of a dead incarnation is moved to record.frozen_folder")
+                        }
+                        Err(error) => {
+                            log::warn!(id, %error, "the ring of a dead incarnation stays in record.folder")
+                        }
+                    }
+                    continue;
+                }
+            };
             let is_ending = self.is_ending.load(Ordering::Relaxed);
             let report = match state.upgrade().filter(|_| !is_ending) {
                 Some(state) => names_for_reader(&state, journal),
@@ -273,7 +312,7 @@ impl Flight {
     }
 
     /// Returns the next order of the thread. `None`: the thread ends.
-    fn next_order(&self) -> Option<SpanOrder> {
+    fn next_order(&self) -> Option<Order> {
         let mut work = lock(&self.work);
         let next = work.orders.pop_front();
         if next.is_none() {
@@ -306,7 +345,7 @@ impl Flight {
                 None => break,
                 // Its links have ended.
                 Some(Output::Forward(trigger)) => note(node, journal, &trigger),
-                Some(Output::Freeze(order)) => lock(&self.work).orders.push_back(order),
+                Some(Output::Freeze(order)) => lock(&self.work).orders.push_back(Order::Freeze(order)),
             }
         }
         self.start_work(&Weak::new(), journal.path());

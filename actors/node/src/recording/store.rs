@@ -6,9 +6,10 @@ use std::{
     io::{self, Read as _, Write as _},
     os::unix::fs::{FileExt as _, MetadataExt as _, OpenOptionsExt as _},
     path::{Path, PathBuf},
+    sync::Mutex,
 };
 
-use sinew_runtime::wire;
+use sinew_runtime::{lock, wire};
 use sinew_shm::journal::{CopyJournalError, JournalReader, Start, copy_span, count_span};
 
 use crate::inspect::{FROZEN_SPANS_MAX, FrozenFacts, FrozenPart, FrozenSpan};
@@ -144,6 +145,9 @@ impl FrozenStore {
     }
 
     /// Keeps the ring of a former incarnation that has died, if there is one at `journal`. Returns its ID.
+    ///
+    /// It copies nothing, because the node waits. Where the folder is of another file system, the ring gets its new name
+    /// beside the journal: [`beside`](Self::beside).
     pub(crate) fn keep_dead_ring(&mut self, journal: &Path) -> Option<Result<String, FrozenError>> {
         let reader = JournalReader::open(journal, Start::Newest).ok()?;
         if !is_own(journal) || reader.is_writer_alive() || reader.is_closed().unwrap_or(true) {
@@ -165,12 +169,38 @@ impl FrozenStore {
             return Some(Err(why));
         }
         facts.span = Some(span);
-        let ring = self.path(&id, "frozen");
-        // Another file system refuses the new name.
-        let kept =
-            fs::rename(journal, &ring).or_else(|_| copy_span(journal, &ring, &(0..=u64::MAX)).map(drop));
-        let kept = kept.map_err(|cause| FrozenError::Copy { id: id.clone(), cause });
-        Some(kept.and_then(|()| self.announce(&id, &facts)).map(|()| id))
+        let beside = Self { folder: folder_of(journal), base: self.base.clone(), ..*self };
+        let kept = self.adopt(journal, &id, &facts).or_else(|_| beside.adopt(journal, &id, &facts));
+        Some(kept.map(|()| id))
+    }
+
+    /// Renames a ring to that of a span.
+    fn adopt(&self, ring: &Path, id: &str, facts: &FrozenFacts) -> Result<(), FrozenError> {
+        self.announce(id, facts)?;
+        fs::rename(ring, self.path(id, "frozen")).map_err(|cause| {
+            // The first error is the one to report.
+            let _ = fs::remove_file(self.path(id, "facts"));
+            FrozenError::Files { id: id.to_owned(), cause }
+        })
+    }
+
+    /// Returns the store of the folder with the journal, and the rings of dead incarnations in it that have to be moved
+    /// to this one.
+    pub(crate) fn beside(&self, journal: &Path) -> (Self, Vec<String>) {
+        let beside = Self { folder: folder_of(journal), base: self.base.clone(), ..*self };
+        let mut dead = Vec::new();
+        if beside.folder != self.folder {
+            dead.extend(beside.spans().into_iter().filter(|span| span.has_died).map(|span| span.id));
+        }
+        (beside, dead)
+    }
+
+    /// Returns the ring of a span, and its facts.
+    pub(crate) fn files(&self, id: &str) -> Result<(PathBuf, FrozenFacts), FrozenError> {
+        self.check(id)?;
+        let facts = read_facts(&self.path(id, "facts"));
+        let facts = facts.map_err(|cause| FrozenError::Read { id: id.to_owned(), cause })?;
+        Ok((self.path(id, "frozen"), facts))
     }
 
     /// Makes room for one more span, in addition to those that it replaces: the oldest fetched ones are removed.
@@ -187,7 +217,7 @@ impl FrozenStore {
     }
 
     /// Removes a span.
-    fn discard(&self, id: &str) {
+    pub(crate) fn discard(&self, id: &str) {
         for extension in ["facts", "frozen"] {
             // It stays if the folder refuses that, or there is none.
             let _ = fs::remove_file(self.path(id, extension));
@@ -276,6 +306,20 @@ impl FrozenStore {
         }
         Some(FrozenSpan { bytes: ring.symlink_metadata().ok()?.len(), ..span })
     }
+}
+
+/// Moves the ring of a dead incarnation to the store. It is copied without the store's lock.
+pub(crate) fn move_ring(from: &FrozenStore, to: &Mutex<FrozenStore>, id: &str) -> Result<(), FrozenError> {
+    let (ring, facts) = from.files(id)?;
+    let draft = lock(to).draft(id, &[])?;
+    let drafted = draft.copy(&ring, facts.span.as_ref().unwrap_or(&FrozenSpan::default()))?;
+    lock(to).keep(&drafted, &facts, &[])?;
+    from.discard(id);
+    Ok(())
+}
+
+fn folder_of(journal: &Path) -> PathBuf {
+    journal.parent().unwrap_or_else(|| Path::new(".")).to_owned()
 }
 
 /// Returns whether it is an ordinary file of this user: another one may write into `/dev/shm`, too.

@@ -183,3 +183,28 @@ fn half_made_files_are_removed() {
     assert!(!store.path("a-2", "frozen").exists() && store.path("a-1", "frozen").exists());
     assert_eq!(store.spans().len(), 1);
 }
+
+#[test]
+fn ring_of_a_dead_node_waits_beside_the_journal() {
+    let folder = Folder::new("beside");
+    let disk = folder.0.join("disk");
+    let journal = folder.journal();
+    let (path, bytes) = (journal.path().to_owned(), fs::read(journal.path()).unwrap());
+    drop(journal);
+    fs::write(&path, bytes).unwrap();
+    // The folder refuses the new name, as one of another file system does.
+    let mut store = FrozenStore::new(disk.clone(), "sinew-leg-10.0.0.2".to_owned(), 1);
+    let id = store.keep_dead_ring(&path).expect("it is there").unwrap();
+    assert!(!path.exists() && store.spans().is_empty());
+    let (beside, dead) = store.beside(&path);
+    assert_eq!(dead, [id.clone()]);
+    // And: another thread moves it
+    fs::create_dir(&disk).unwrap();
+    fs::set_permissions(&disk, fs::Permissions::from_mode(0o700)).unwrap();
+    let store = Mutex::new(store);
+    move_ring(&beside, &store, &id).unwrap();
+    let spans = store.lock().unwrap().spans();
+    assert!(spans.len() == 1 && spans[0].has_died && spans[0].id == id, "{spans:?}");
+    assert!(store.lock().unwrap().beside(&path).1.is_empty());
+    assert_eq!(count_span(&disk.join(format!("sinew-leg-10.0.0.2-{id}.frozen")), &(0..=9)).unwrap(), 9);
+}
