@@ -163,7 +163,14 @@ impl Flight {
 
     /// Handles a cause at this node. Returns the trigger that stands for it.
     pub(crate) fn happened(&self, at: Time, cause: &str) -> Option<TriggerId> {
-        lock(&self.plan).happened(Time::now().as_nanos(), at.as_nanos(), cause)
+        let id = lock(&self.plan).happened(Time::now().as_nanos(), at.as_nanos(), cause);
+        if id.is_none() {
+            log::warn!(
+                cause,
+                "the messages around a fault are not frozen: this node knows too many triggers"
+            );
+        }
+        id
     }
 
     /// Handles the trigger of another node. Returns `false` if it is refused.

@@ -88,7 +88,7 @@ fn nanos(time: Duration) -> u64 {
 /// An order to the caller.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Output {
-    /// Send the trigger to all other nodes, once.
+    /// Send the trigger to all other nodes, once: it is one of this node, or changes a span.
     Forward(Trigger),
     /// Freeze a span.
     Freeze(SpanOrder),
@@ -198,9 +198,11 @@ impl FreezePlan {
         let number = self.last.checked_add(1)?;
         let id = TriggerId { node: self.node, incarnation: self.incarnation, number };
         let (keep, after, cause) = (self.keep, self.after, LeaveReason::of(cause));
-        if !self.add(Trigger { id, at_ns, bound_ns: 0, keep, after, cause }) {
+        let trigger = Trigger { id, at_ns, bound_ns: 0, keep, after, cause };
+        if !self.add(&trigger) {
             return None;
         }
+        self.outbox.push_back(trigger);
         self.last = number;
         Some(id)
     }
@@ -218,7 +220,15 @@ impl FreezePlan {
             self.refused += 1;
             return false;
         }
-        self.add(trigger)
+        let before = self.spans();
+        if !self.add(&trigger) {
+            return false;
+        }
+        // Else the others do without it, and a lost node would cost n³ messages: each of n nodes has a trigger of its own.
+        if self.spans() != before {
+            self.outbox.push_back(trigger);
+        }
+        true
     }
 
     /// Returns the next order, if one is due.
@@ -246,14 +256,18 @@ impl FreezePlan {
         self.known.values().cloned().collect()
     }
 
-    fn add(&mut self, trigger: Trigger) -> bool {
+    fn add(&mut self, trigger: &Trigger) -> bool {
         if self.known.len() >= TRIGGERS_MAX {
             self.refused += 1;
             return false;
         }
-        self.outbox.push_back(trigger.clone());
-        self.known.insert(trigger.id, trigger);
+        self.known.insert(trigger.id, trigger.clone());
         true
+    }
+
+    /// Returns the spans of all known triggers: the trigger that decides, the begin and the end.
+    fn spans(&self) -> Vec<(TriggerId, (u64, u64))> {
+        self.groups().iter().map(|group| (group.winner.id, group.span())).collect()
     }
 
     /// Returns the groups, by time.

@@ -98,6 +98,44 @@ fn span_has_the_times_of_all_its_triggers() {
 }
 
 #[test]
+fn trigger_without_effect_is_not_forwarded() {
+    let mut plan = plan(1);
+    plan.happened(100 * SECOND, 100 * SECOND, "late").unwrap();
+    assert_eq!(drain(&mut plan, 100 * SECOND).len(), 1, "its own one");
+    let within = |trigger: Trigger| Trigger { keep: AFTER, after: Duration::from_secs(1), ..trigger };
+    assert!(plan.received(101 * SECOND, within(trigger(2, 1, 100 * SECOND + 1))));
+    assert_eq!(drain(&mut plan, 101 * SECOND), [], "the span is the same with it");
+    assert!(plan.received(101 * SECOND, trigger(3, 1, 99 * SECOND)));
+    assert_eq!(drain(&mut plan, 101 * SECOND).len(), 1, "the span begins earlier");
+    assert_eq!(plan.known().len(), 3);
+}
+
+#[test]
+fn lost_node_costs_few_messages() {
+    const NODES: u32 = 32;
+    let mut plans: Vec<_> = (1..=NODES).map(plan).collect();
+    let base = 100 * SECOND;
+    let mut messages = 0;
+    // Each node sees the loss, at another moment, and has the triggers of the others in an order of its own.
+    let at_ns = |node: u32| base + u64::from(node.wrapping_mul(0x9e37_79b9) >> 12);
+    for (plan, node) in plans.iter_mut().zip(1..) {
+        plan.happened(base, at_ns(node), "the knee is lost").unwrap();
+        for step in 1..NODES {
+            let other = (node - 1 + step * 7) % NODES + 1;
+            plan.received(base, trigger(other, 1, at_ns(other)));
+        }
+        messages += drain(plan, base).len() as u32 * (NODES - 1);
+    }
+    assert!(
+        messages < NODES * NODES * 12,
+        "{messages}, and each trigger from each node were {}",
+        NODES.pow(3)
+    );
+    let spans: BTreeSet<_> = plans.iter_mut().map(|plan| kept(&drain(plan, base + 9 * SECOND))).collect();
+    assert_eq!(spans.len(), 1);
+}
+
+#[test]
 fn wrong_and_old_triggers_are_refused() {
     let mut plan = plan(2);
     let now = 1_000 * SECOND;
