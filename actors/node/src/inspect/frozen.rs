@@ -1,6 +1,6 @@
 //! Freezes a span for a program, and hands out frozen spans. spec: INSPECT-10
 
-use std::sync::Arc;
+use std::{path::Path, sync::Arc};
 
 use sinew_runtime::{outcome::Rejection, time::Time, wire::Message};
 
@@ -48,7 +48,9 @@ pub(super) fn fetched(state: &Arc<NodeState>, question: &Message) -> Result<Froz
     let Some(flight) = state.recording.flight() else {
         return Ok(FrozenReport { refused: Some(NOT_RECORDED.to_owned()), ..own });
     };
-    let own = FrozenReport { folder: Some(flight.folder().display().to_string()), ..own };
+    let text = |folder: &Path| Some(folder.display().to_string());
+    let frozen_folder = state.ctx.config.record.frozen_folder.as_deref().unwrap_or_else(|| flight.folder());
+    let own = FrozenReport { folder: text(flight.folder()), frozen_folder: text(frozen_folder), ..own };
     // A disk may be slow, and this thread answers other questions.
     let Some(mut store) = flight.try_store() else {
         return Ok(FrozenReport { refused: Some(FROZEN_BUSY.to_owned()), ..own });

@@ -374,7 +374,8 @@ impl Flight {
             at_ns: trigger.at_ns,
             bound_ns: trigger.bound_ns,
             begin_ns: *begin_ns,
-            end_ns: *end_ns,
+            // A node that ends freezes it before.
+            end_ns: (*end_ns).min(Time::now().as_nanos()),
             ..FrozenSpan::default()
         };
         let facts = FrozenFacts { span: Some(span.clone()), report };

@@ -224,7 +224,7 @@ impl FreezePlan {
         if !self.add(&trigger) {
             return false;
         }
-        // Else the others do without it, and a lost node would cost n³ messages: each of n nodes has a trigger of its own.
+        // Else the others do without it. If a node is lost, each of the n others has a trigger of its own: n³ messages.
         if self.spans() != before {
             self.outbox.push_back(trigger);
         }

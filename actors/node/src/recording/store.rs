@@ -146,8 +146,8 @@ impl FrozenStore {
 
     /// Keeps the ring of a former incarnation that has died, if there is one at `journal`. Returns its ID.
     ///
-    /// It copies nothing, because the node waits. Where the folder is of another file system, the ring gets its new name
-    /// beside the journal: [`beside`](Self::beside).
+    /// It copies nothing, because the node waits. Where the folder is of another file system, the ring gets its new
+    /// name beside the journal: [`beside`](Self::beside).
     pub(crate) fn keep_dead_ring(&mut self, journal: &Path) -> Option<Result<String, FrozenError>> {
         let reader = JournalReader::open(journal, Start::Newest).ok()?;
         if !is_own(journal) || reader.is_writer_alive() || reader.is_closed().unwrap_or(true) {

@@ -301,6 +301,7 @@ fn node_that_ends_freezes_an_incomplete_span() {
     node.recording.close(&node);
     let spans = flight.store().spans();
     assert!(spans.len() == 1 && spans[0].id == id, "{spans:?}");
+    assert!(spans[0].end_ns <= Time::now().as_nanos(), "it ends with the node: {spans:?}");
     std::fs::remove_dir_all(folder).unwrap();
 }
 

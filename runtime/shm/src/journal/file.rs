@@ -1,4 +1,5 @@
-//! The file of a journal: made safely, and mapped; or written by calls, as a copy is. **The one unsafe block of journals is here.**
+//! The file of a journal: made safely, and mapped; or written by calls, as a copy is. **The one unsafe block of
+//! journals is here.**
 //!
 //! It rests on these facts:
 //!

@@ -104,6 +104,9 @@ pub struct FrozenReport {
     pub name: String,
     /// The folder of the journal on the node's host; `None` without `record.folder`.
     pub folder: Option<String>,
+    /// The folder of the frozen spans on the node's host, which may hold rings of dead nodes, too.
+    #[serde(default)]
+    pub frozen_folder: Option<String>,
     /// The frozen spans, if no one was asked for.
     #[serde(deserialize_with = "at_most::<_, _, FROZEN_SPANS_MAX>")]
     pub spans: Vec<FrozenSpan>,
