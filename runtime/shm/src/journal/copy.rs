@@ -70,7 +70,7 @@ pub fn copy_span(
     span: &RangeInclusive<u64>,
 ) -> Result<Copied, CopyJournalError> {
     let (mut bytes, mut longest) = (0_u64, 0_u64);
-    each_record(source, span, |_, payload| {
+    each_record::<ReadJournalError>(source, span, |_, payload| {
         let length = record_bytes(payload.len());
         bytes = bytes.saturating_add(length);
         longest = longest.max(length);
@@ -98,8 +98,8 @@ pub fn copy_span(
         file.reserve(RING_AT as u64 + bytes, header.file_bytes()).map_err(failed)?;
         file.put(0, &page).map_err(failed)?;
         file.put(WALL_OFFSET_AT, &wall_offset.to_ne_bytes()).map_err(failed)?;
-        let mut ring = Ring { file, salt: header.salt, room: bytes, position: 0, waiting: Vec::new() };
-        each_record(source, span, |record, payload| {
+        let mut ring = Ring { file, salt: header.salt, room: ring_bytes, position: 0, waiting: Vec::new() };
+        each_record::<CopyJournalError>(source, span, |record, payload| {
             if ring.push(record, payload).map_err(failed)? {
                 copied.add(record.time);
             }
@@ -120,9 +120,9 @@ pub fn copy_span(
 ///
 /// # Errors
 /// The journal cannot be read.
-pub fn count_span(path: &Path, span: &RangeInclusive<u64>) -> Result<u64, CopyJournalError> {
+pub fn count_span(path: &Path, span: &RangeInclusive<u64>) -> Result<u64, ReadJournalError> {
     let mut records = 0;
-    each_record(path, span, |_, _| {
+    each_record::<ReadJournalError>(path, span, |_, _| {
         records += 1;
         Ok(())
     })?;
@@ -133,7 +133,7 @@ pub fn count_span(path: &Path, span: &RangeInclusive<u64>) -> Result<u64, CopyJo
 struct Ring<'a> {
     file: &'a NewFile<'a>,
     salt: u64,
-    /// Bytes for all records: those of the first reading.
+    /// Bytes of the ring. The second reading may find some more records than the first one.
     room: u64,
     /// Bytes of the records so far.
     position: u64,
@@ -142,8 +142,7 @@ struct Ring<'a> {
 }
 
 impl Ring<'_> {
-    /// Adds a record with its place and its number. Returns `false` if there is no room: it was written after the
-    /// first reading.
+    /// Adds a record with its place and its number. Returns `false` if there is no room.
     fn push(&mut self, record: &Record, payload: &[u8]) -> io::Result<bool> {
         let bytes = record_bytes(payload.len());
         let Ok(length) = u32::try_from(payload.len()) else { return Ok(false) };
@@ -176,12 +175,16 @@ impl Ring<'_> {
     }
 }
 
-/// Calls `each` with the records within the span that were written before this call.
-fn each_record(
+/// Calls `each` with the records with times within `span` that were written before this call. Damaged parts are left
+/// out.
+///
+/// # Errors
+/// The journal cannot be read, or has over 1,024 damaged parts; or the error of `each`, which is not called again.
+pub fn each_record<E: From<ReadJournalError>>(
     source: &Path,
     span: &RangeInclusive<u64>,
-    mut each: impl FnMut(&Record, &[u8]) -> Result<(), CopyJournalError>,
-) -> Result<(), CopyJournalError> {
+    mut each: impl FnMut(&Record, &[u8]) -> Result<(), E>,
+) -> Result<(), E> {
     let mut reader = JournalReader::open(source, Start::Oldest)?;
     let (end, mut payload, mut damaged) = (reader.reserved()?, Vec::new(), 0);
     loop {
