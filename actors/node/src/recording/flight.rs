@@ -57,6 +57,8 @@ pub(crate) struct Flight {
     names: Mutex<KnownReport>,
     /// The folder of the journal.
     folder: PathBuf,
+    /// Whether the last cause made no trigger. The first one of several is in the log.
+    is_refusing: AtomicBool,
     /// Whether spans are kept at all.
     keeps_spans: bool,
 }
@@ -137,6 +139,7 @@ impl Flight {
             }
         }
         let (beside, dead) = store.beside(journal);
+        beside.clean();
         let mut work = Work::default();
         if config.frozen_max > 0 {
             work.orders.extend(dead.into_iter().map(Order::Move));
@@ -157,6 +160,7 @@ impl Flight {
             is_ending: AtomicBool::new(false),
             names: Mutex::default(),
             folder,
+            is_refusing: AtomicBool::new(false),
             keeps_spans: config.frozen_max > 0,
         })
     }
@@ -164,7 +168,8 @@ impl Flight {
     /// Handles a cause at this node. Returns the trigger that stands for it.
     pub(crate) fn happened(&self, at: Time, cause: &str) -> Option<TriggerId> {
         let id = lock(&self.plan).happened(Time::now().as_nanos(), at.as_nanos(), cause);
-        if id.is_none() {
+        let was_refusing = self.is_refusing.swap(id.is_none(), Ordering::Relaxed);
+        if id.is_none() && !was_refusing {
             log::warn!(
                 cause,
                 "the messages around a fault are not frozen: this node knows too many triggers"

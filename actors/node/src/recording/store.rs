@@ -91,8 +91,8 @@ impl FrozenStore {
         Self { folder, base, spans_max }
     }
 
-    /// Removes journals without facts, copies that no span has, and files without their name: their node was killed
-    /// while it made them.
+    /// Removes journals without facts, facts without a journal, copies that no span has, and files without their name:
+    /// their node was killed while it made them.
     pub(crate) fn clean(&self) {
         let drafts = self.names(".draft");
         for name in drafts.into_iter().chain(self.names_after(&format!(".{}-", self.base), "")) {
@@ -104,6 +104,13 @@ impl FrozenStore {
             if !ring.with_extension("facts").exists() {
                 // It stays if the folder refuses that.
                 let _ = fs::remove_file(ring);
+            }
+        }
+        for name in self.names(".facts") {
+            let facts = self.folder.join(&name);
+            if !facts.with_extension("frozen").exists() {
+                // It stays if the folder refuses that.
+                let _ = fs::remove_file(facts);
             }
         }
     }
