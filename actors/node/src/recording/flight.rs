@@ -411,3 +411,25 @@ fn note(state: &NodeState, journal: &Journal, trigger: &Trigger) {
     let fact = NodeFact::Triggered { id, cause, bound_ns: trigger.bound_ns };
     facts::write(journal, state.ctx.node, Time::from_nanos(trigger.at_ns), &fact);
 }
+
+#[cfg(test)]
+mod tests {
+    use sinew_model::config::NodeConfig;
+    use sinew_runtime::tid::Incarnation;
+
+    use super::*;
+
+    #[test]
+    fn incident_at_a_held_lock_is_a_cause() {
+        let mut config = NodeConfig::new("knee");
+        config.project = format!("held {}", std::process::id());
+        let state = NodeState::for_test(config, Incarnation(1));
+        let flight = Flight::begin(&state, &std::env::temp_dir().join("sinew-held-10.0.0.2.journal"));
+        let held = lock(&flight.causes.reported);
+        flight.causes.happened(Time::now(), IncidentKind::Symptom, "the knee slips");
+        drop(held);
+        flight.take_causes(Time::now(), &[]);
+        // Of another test's incident at this moment it has the words.
+        assert!(!flight.known().is_empty());
+    }
+}
