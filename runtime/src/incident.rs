@@ -14,11 +14,20 @@ use crate::{lock, time::Time};
 /// Maximum number of observers in a process: each node of it that records is one.
 const OBSERVERS_MAX: usize = 64;
 
+/// The kind of an incident.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum IncidentKind {
+    /// An actor has failed. That is a fault at any time.
+    Failure,
+    /// A guard is shut, an input is late, or an application asks. While a node stops in order, these follow from that.
+    Symptom,
+}
+
 /// An observer of incidents. It is called on the thread of the incident, which may be a real-time thread, so it must
 /// not wait.
 pub trait IncidentObserver: Send + Sync {
     /// Receives an incident.
-    fn happened(&self, at: Time, cause: &str);
+    fn happened(&self, at: Time, kind: IncidentKind, cause: &str);
 }
 
 static OBSERVERS: Mutex<Vec<Weak<dyn IncidentObserver>>> = Mutex::new(Vec::new());
@@ -40,7 +49,7 @@ pub fn observe(observer: &Arc<dyn IncidentObserver>) -> bool {
 
 /// Reports an incident to all observers. It never waits: an incident that meets another one, or the begin of a
 /// recording, is not reported. The other one is a trigger for the same span.
-pub fn report(at: Time, cause: fmt::Arguments<'_>) {
+pub fn report(at: Time, kind: IncidentKind, cause: fmt::Arguments<'_>) {
     if COUNT.load(Ordering::Relaxed) == 0 {
         return;
     }
@@ -55,7 +64,7 @@ pub fn report(at: Time, cause: fmt::Arguments<'_>) {
         return;
     }
     let cause = cause.to_string();
-    observers.iter().for_each(|observer| observer.happened(at, &cause));
+    observers.iter().for_each(|observer| observer.happened(at, kind, &cause));
 }
 
 #[cfg(test)]
@@ -66,9 +75,9 @@ mod tests {
     struct Notes(Mutex<Vec<(Time, String)>>);
 
     impl IncidentObserver for Notes {
-        fn happened(&self, at: Time, cause: &str) {
+        fn happened(&self, at: Time, kind: IncidentKind, cause: &str) {
             // Other tests of this process have incidents, too.
-            if cause.starts_with("test of incidents") {
+            if kind == IncidentKind::Failure && cause.starts_with("test of incidents") {
                 lock(&self.0).push((at, cause.to_owned()));
             }
         }
@@ -82,12 +91,12 @@ mod tests {
         let at = Time::from_nanos(7);
         // Another test's incident may be reported at the same moment.
         while lock(&notes.0).is_empty() {
-            report(at, format_args!("test of incidents {}", 1));
+            report(at, IncidentKind::Failure, format_args!("test of incidents {}", 1));
         }
         assert_eq!(lock(&notes.0)[0], (at, "test of incidents 1".to_owned()));
         let weak = Arc::downgrade(&notes);
         drop((observer, notes));
-        report(at, format_args!("test of incidents 2"));
+        report(at, IncidentKind::Failure, format_args!("test of incidents 2"));
         assert_eq!(weak.strong_count(), 0);
     }
 }

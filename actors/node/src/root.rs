@@ -443,6 +443,7 @@ impl Root {
         }
         sinew_runtime::log::info!(node = self.state.ctx.config.name, "the node stops");
         self.phase = Phase::StoppingApps;
+        self.state.recording.stop_ordered();
         self.notify_if_running();
         match &self.app_supervisor {
             Some(supervisor) => order(supervisor, Input::StopOrdered),
@@ -479,8 +480,7 @@ impl Root {
         let mut signals = match StopSignals::listen() {
             Ok(signals) => signals,
             Err(error) => {
-                let remedy = "stop this node by its handle";
-                sinew_runtime::log::error!(%error, remedy, "SIGINT, SIGTERM and SIGHUP cannot be handled and end this process at once");
+                sinew_runtime::log::error!(%error, remedy = "stop this node by its handle", "SIGINT, SIGTERM and SIGHUP cannot be handled and end this process at once");
                 return;
             }
         };

@@ -88,6 +88,7 @@ pub(super) async fn oversee(
         return;
     }
     sinew_runtime::log::error!(%reason, "the root failed: the node ends in order");
+    state.recording.stop_ordered();
     let mut events = state.root.attach();
     supervisors.stop(Branch::Apps);
     wait(&mut events, Branch::Apps, &supervisors).await;

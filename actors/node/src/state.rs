@@ -88,11 +88,13 @@ impl NodeState {
     pub(crate) fn close(&self) {
         self.lncl.client_socket.close();
         self.ctx.router.remove_local(AppAddress::INSPECT);
-        self.recording.close(self);
+        let recording = self.recording.end(self);
         self.types.close();
         self.gncl.store.close();
         self.gncl.store.end_threads();
         lock(&self.ndl.sockets).close_all();
+        // Last: the disk of frozen spans may be slow.
+        recording.wait();
     }
 
     /// Returns the state of a node that has only the layers that a test starts.

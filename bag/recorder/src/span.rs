@@ -2,10 +2,7 @@
 
 use std::{collections::BTreeMap, ops::RangeInclusive, path::Path};
 
-use sinew_shm::journal::{JournalReader, ReadJournalError, Start};
-
-/// Maximum number of damaged parts that are left out.
-const DAMAGED_MAX: u32 = 1_024;
+use sinew_shm::journal::{ReadJournalError, each_record};
 
 /// The records of a span, by their numbers in each channel.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -26,20 +23,12 @@ impl Span {
     /// # Errors
     /// The journal cannot be read.
     pub fn scan(path: &Path, times: &RangeInclusive<u64>) -> Result<Self, ReadJournalError> {
-        let mut reader = JournalReader::open(path, Start::Oldest)?;
-        let (mut span, mut payload, mut damaged) = (Self::default(), Vec::new(), 0);
-        loop {
-            match reader.next(0, &mut payload) {
-                Ok(Some(record)) => {
-                    if times.contains(&record.time) {
-                        span.add(record.place, record.number, record.time);
-                    }
-                }
-                Ok(None) => return Ok(span),
-                Err(ReadJournalError::Damaged { .. }) if damaged < DAMAGED_MAX => damaged += 1,
-                Err(why) => return Err(why),
-            }
-        }
+        let mut span = Self::default();
+        each_record::<ReadJournalError>(path, times, |record, _| {
+            span.add(record.place, record.number, record.time);
+            Ok(())
+        })?;
+        Ok(span)
     }
 
     /// Returns the number of the last record before the span, by place.

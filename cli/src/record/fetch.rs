@@ -10,19 +10,20 @@ use std::{
     ops::RangeInclusive,
     os::unix::fs::OpenOptionsExt as _,
     path::{Path, PathBuf},
+    time::Duration,
 };
 
 use clap::Args;
 use serde_json::json;
 use sinew::{
-    AppAddress, NodeAddress, Tid,
-    inspect::{AskFrozen, FrozenFacts, FrozenPart, FrozenReport, FrozenSpan},
+    AppAddress, NodeAddress, Tid, Time,
+    inspect::{AskFrozen, FROZEN_BUSY, FrozenFacts, FrozenPart, FrozenReport, FrozenSpan},
 };
 
 use super::freeze::present;
 use crate::{
     Report,
-    system::{System, SystemError, in_words},
+    system::{Answer, System, SystemError, in_words},
     table::{Table, clean, time},
 };
 use convert::{Converted, Source, convert, file_name};
@@ -32,6 +33,10 @@ use dead::DeadRing;
 const RING_BYTES_MAX: u64 = (4 << 30) + (1 << 20);
 /// Maximum bytes of the facts beside it.
 const FACTS_BYTES_MAX: u64 = 4 << 20;
+
+/// Time for which a node is asked again while it writes to the folder of its spans, and the pause before.
+const BUSY_WITHIN: Duration = Duration::from_secs(5);
+const BUSY_PAUSE: Duration = Duration::from_millis(20);
 
 /// The arguments of `sinew record fetch`.
 #[derive(Debug, Args)]
@@ -60,6 +65,8 @@ struct Found {
     dead: Vec<DeadRing>,
     /// Nodes that have nothing to hand out, with the reason.
     refused: Vec<String>,
+    /// Rings that are not gathered, with the remedy.
+    skipped: BTreeSet<String>,
     /// Nodes that do not answer, and rings that cannot be read.
     faults: Vec<String>,
 }
@@ -93,7 +100,7 @@ pub(super) fn show(system: &mut System, order: &Order) -> Result<Report, SystemE
 fn find(system: &mut System) -> Result<Found, SystemError> {
     let here = system.here()?;
     let mut found = Found::default();
-    for answer in system.ask_these::<AskFrozen, FrozenReport>(present(&here)) {
+    for answer in ask_spans(system, present(&here)) {
         let node = answer.node;
         match answer.result {
             Err(why) => found.faults.push(format!("{node} {}: {why}", answer.name)),
@@ -101,8 +108,9 @@ fn find(system: &mut System) -> Result<Found, SystemError> {
                 found.refused.push(format!("{node} {name}: {why}"));
             }
             Ok(report) => {
-                if let Some(folder) = report.folder.as_deref().filter(|_| node == here.node) {
-                    found.dead = dead::rings(Path::new(folder), &here.project);
+                if node == here.node {
+                    let folders = [&report.folder, &report.frozen_folder].into_iter().flatten();
+                    found.dead = dead::rings(folders.map(Path::new).collect(), &here.project);
                 }
                 let frozen = |span| Frozen { node, name: report.name.clone(), span };
                 found.frozen.extend(report.spans.into_iter().map(frozen));
@@ -127,13 +135,19 @@ fn gather(
         if *node == own && !span.has_died {
             times = Some(span.begin_ns..=span.end_ns);
         }
-        match fetch(system, *node, span, (out, is_forced)) {
+        match fetch(system, *node, span, (out, is_forced), files) {
             Ok(file) => files.push(file),
             Err(why) => faults.push(format!("{node} {name}: {why}")),
         }
     }
-    for ring in &found.dead {
-        match of_dead(ring, id, times.as_ref(), (out, is_forced)) {
+    // A node that has started again hands out the whole ring by such an ID.
+    let dead = if id.starts_with("died-") { &[][..] } else { &found.dead[..] };
+    for ring in dead {
+        let Some(times) = times.as_ref().filter(|_| ring.is_of_this_boot) else {
+            found.skipped.insert(ring.remedy());
+            continue;
+        };
+        match of_dead(ring, id, times, (out, is_forced), files) {
             Ok(file) => files.extend(file),
             Err(why) => faults.push(format!("{}: {why}", ring.path.display())),
         }
@@ -147,6 +161,7 @@ fn fetch(
     node: NodeAddress,
     span: &FrozenSpan,
     (out, is_forced): (&Path, bool),
+    files: &[Converted],
 ) -> Result<Converted, SystemError> {
     let mut bytes = Vec::new();
     pull(system, node, (&span.id, FrozenPart::Facts), FACTS_BYTES_MAX, &mut bytes)?;
@@ -156,8 +171,8 @@ fn fetch(
     let converted = pull_ring(system, node, &span.id, &part).and_then(|()| {
         let source = Source { ring: &part, facts, times: span.begin_ns..=span.end_ns, address: node };
         let times = (!span.has_died).then_some((span.at_ns, span.bound_ns));
-        let file = out.join(file_name(&source.facts.report.name, &span.id, "mcap"));
-        convert(&source, times, file, is_forced)
+        let (file, is_new) = path_of(files, out, (&source.facts.report.name, node), &span.id);
+        convert(&source, times, file, is_forced && is_new)
     });
     // It is not needed any more.
     let _ = fs::remove_file(&part);
@@ -172,10 +187,10 @@ fn fetch(
 fn of_dead(
     ring: &DeadRing,
     id: &str,
-    times: Option<&RangeInclusive<u64>>,
+    times: &RangeInclusive<u64>,
     (out, is_forced): (&Path, bool),
+    files: &[Converted],
 ) -> Result<Option<Converted>, SystemError> {
-    let Some(times) = times else { return Ok(None) };
     let span =
         sinew_recorder::Span::scan(&ring.path, times).map_err(|why| SystemError::Bag(why.to_string()))?;
     if span.records == 0 {
@@ -183,8 +198,28 @@ fn of_dead(
     }
     let facts = ring.facts.clone();
     let source = Source { ring: &ring.path, facts, times: times.clone(), address: ring.address };
-    let file = out.join(file_name(&ring.name, id, "mcap"));
-    convert(&source, None, file, is_forced).map(|file| Some(Converted { has_died: true, ..file }))
+    // The node may have started again, and have the same span.
+    let id = format!("{id}-{}", ring.id());
+    let (file, is_new) = path_of(files, out, (&ring.name, ring.address), &id);
+    convert(&source, None, file, is_forced && is_new).map(|file| Some(Converted { has_died: true, ..file }))
+}
+
+/// Returns the path of a file, and whether this run has not written it yet: then it may replace a former file. A second
+/// node of one name has its address in the file's name.
+fn path_of(
+    files: &[Converted],
+    out: &Path,
+    (name, address): (&str, NodeAddress),
+    id: &str,
+) -> (PathBuf, bool) {
+    let is_new = |path: &PathBuf| files.iter().all(|file| file.file != *path);
+    let short = out.join(file_name(name, id, "mcap"));
+    if is_new(&short) {
+        return (short, true);
+    }
+    let long = out.join(file_name(&format!("{name}-{address}"), id, "mcap"));
+    let is_new = is_new(&long);
+    (long, is_new)
 }
 
 fn pull_ring(system: &mut System, node: NodeAddress, id: &str, to: &Path) -> Result<(), SystemError> {
@@ -224,12 +259,27 @@ fn pull(
 
 fn ask(system: &mut System, node: NodeAddress, question: &AskFrozen) -> Result<FrozenReport, SystemError> {
     let (to, within) = (Tid::new(node, AppAddress::INSPECT), system.within);
-    let answer: Result<FrozenReport, _> = system.endpoint.message(to, question).ask(within);
-    let report = answer.map_err(|error| SystemError::Bag(in_words(&error)))?;
-    match report.refused {
-        Some(why) => Err(SystemError::Bag(clean(&why))),
-        None => Ok(report),
+    let until = Time::now() + BUSY_WITHIN;
+    loop {
+        let answer: Result<FrozenReport, _> = system.endpoint.message(to, question).ask(within);
+        let report = answer.map_err(|error| SystemError::Bag(in_words(&error)))?;
+        match report.refused {
+            Some(why) if why == FROZEN_BUSY && Time::now() < until => std::thread::sleep(BUSY_PAUSE),
+            Some(why) => return Err(SystemError::Bag(clean(&why))),
+            None => return Ok(report),
+        }
     }
+}
+
+/// Asks nodes for their spans. One that is busy is asked again.
+pub(super) fn ask_spans(system: &mut System, nodes: Vec<(NodeAddress, String)>) -> Vec<Answer<FrozenReport>> {
+    let mut answers = system.ask_these::<AskFrozen, FrozenReport>(nodes);
+    for answer in &mut answers {
+        if answer.result.as_ref().is_ok_and(|report| report.refused.as_deref() == Some(FROZEN_BUSY)) {
+            answer.result = ask(system, answer.node, &AskFrozen::default()).map_err(|why| why.to_string());
+        }
+    }
+    answers
 }
 
 fn listed(found: &Found) -> Report {
@@ -281,20 +331,65 @@ fn gathered(found: &Found, files: &[Converted]) -> Report {
         let died = if file.has_died { "; the node has died" } else { "" };
         let name = clean(&file.file.display().to_string());
         text += &format!(
-            "{name}: {} messages, {} dropped; {} of {}{died}\n",
+            "{name}: {} messages, {} dropped; covers {} of {}; {}{died}\n",
             file.written,
             file.dropped,
-            time(file.last_ns.saturating_sub(file.first_ns) / 1_000),
+            time(file.covered_ns() / 1_000),
+            file.span_ns().map_or_else(|| "the whole ring".to_owned(), |span_ns| time(span_ns / 1_000)),
             clean(&file.node)
         );
         json_files.push(file.json());
     }
     text += &notes(found);
-    let json = json!({ "files": json_files, "refused": found.refused, "faults": found.faults });
+    let json = json!({
+        "files": json_files, "refused": found.refused, "skipped": found.skipped, "faults": found.faults,
+    });
     Report { text, json, is_fine: found.faults.is_empty() && !files.is_empty() }
 }
 
-/// Returns a line for each node that has given nothing.
+/// Returns a line for each node that has given nothing, and for each ring that was skipped.
 fn notes(found: &Found) -> String {
-    found.refused.iter().chain(&found.faults).map(|line| clean(line) + "\n").collect()
+    found.refused.iter().chain(&found.skipped).chain(&found.faults).map(|line| clean(line) + "\n").collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn written(file: &Path) -> Converted {
+        Converted {
+            file: file.to_owned(),
+            node: "knee".to_owned(),
+            written: 1,
+            dropped: 0,
+            first_ns: 5,
+            last_ns: 9,
+            times: 3..=10,
+            trigger: None,
+            has_died: false,
+        }
+    }
+
+    #[test]
+    fn no_file_of_one_run_replaces_another() {
+        let (out, first, second) = (Path::new("out"), NodeAddress::new(1), NodeAddress::new(2));
+        let (path, is_new) = path_of(&[], out, ("knee", first), "a-1");
+        assert!(is_new && path == Path::new("out/knee-a-1.mcap"), "{path:?}");
+        let files = [written(&path)];
+        let (other, is_new) = path_of(&files, out, ("knee", second), "a-1");
+        assert!(is_new && other == Path::new("out/knee-0.0.0.2-a-1.mcap"), "{other:?}");
+        let files = [written(&path), written(&other)];
+        assert!(!path_of(&files, out, ("knee", second), "a-1").1);
+    }
+
+    #[test]
+    fn missing_edges_of_a_span_are_stated() {
+        let found = Found::default();
+        let report = gathered(&found, &[written(Path::new("knee.mcap"))]);
+        assert!(report.text.contains("covers 0 us of 0 us"), "{}", report.text);
+        let file = &report.json["files"][0];
+        assert_eq!((file["covered_ns"].as_u64(), file["span_ns"].as_u64()), (Some(4), Some(7)));
+        let whole = Converted { times: 0..=u64::MAX, ..written(Path::new("knee.mcap")) };
+        assert_eq!(whole.json()["span_ns"].as_u64(), None);
+    }
 }

@@ -6,9 +6,10 @@ use clap::Args;
 use serde_json::json;
 use sinew::{
     AppAddress, NodeAddress, Tid, Time,
-    inspect::{AskFreeze, AskFrozen, FreezeReport, FrozenReport, NodeReport},
+    inspect::{AskFreeze, FreezeReport, FrozenReport, NodeReport},
 };
 
+use super::fetch::ask_spans;
 use crate::{
     Report,
     system::{Answer, System, SystemError, in_words},
@@ -73,7 +74,7 @@ fn states(system: &mut System, here: &NodeReport, id: &str) -> Vec<(NodeAddress,
         };
         (node, name, state)
     };
-    system.ask_these::<AskFrozen, FrozenReport>(present(here)).into_iter().map(state).collect()
+    ask_spans(system, present(here)).into_iter().map(state).collect()
 }
 
 /// Returns this node and all nodes that it knows and that answer. A lost one has nothing to hand out.

@@ -22,7 +22,7 @@ use crate::{
         requirement::{Requirements, event_in},
     },
     clock::ClockAlarm,
-    incident,
+    incident::{self, IncidentKind},
     mailbox::MailboxReader,
     outcome::{Outcome, Rejection},
     protection::{Echo, ProtectionError, Verdict},
@@ -391,5 +391,9 @@ where
         context.watches[id.0].action = Some(action);
     }
     // Behind the action, which may bring an output into its safe state.
-    incident::report(at, format_args!("an input of {} is late: {timeout}", context.tid()));
+    incident::report(
+        at,
+        IncidentKind::Symptom,
+        format_args!("an input of {} is late: {timeout}", context.tid()),
+    );
 }

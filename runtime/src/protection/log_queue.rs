@@ -13,7 +13,12 @@ use std::{
 };
 
 use super::{Cause, safe_output::Discarded};
-use crate::{incident, thread::reset_schedule, tid::Tid, time::Time};
+use crate::{
+    incident::{self, IncidentKind},
+    thread::reset_schedule,
+    tid::Tid,
+    time::Time,
+};
 
 /// Maximum number of pending log entries. Further ones are counted.
 const PENDING_MAX: usize = 256;
@@ -41,12 +46,17 @@ impl LogEntry {
         let (Self { source, name, cause, event }, now) = (self, Time::now());
         match event {
             OutputEvent::MadeSafe => {
-                incident::report(now, format_args!("the guard of {name} from {source} is shut: {cause}"));
+                incident::report(
+                    now,
+                    IncidentKind::Symptom,
+                    format_args!("the guard of {name} from {source} is shut: {cause}"),
+                );
                 crate::log::warn!(%source, of = name, %cause, "a guard is shut; its output, if it has one, is safe");
             }
             OutputEvent::SafeFailed => {
                 incident::report(
                     now,
+                    IncidentKind::Symptom,
                     format_args!("an output of {name} from {source} cannot be made safe: {cause}"),
                 );
                 crate::log::error!(%source, of = name, %cause, "the safe function of an output panicked or failed; it is retried each millisecond");

@@ -1,12 +1,12 @@
 //! Freezes a span for a program, and hands out frozen spans. spec: INSPECT-10
 
-use std::sync::Arc;
+use std::{path::Path, sync::Arc};
 
 use sinew_runtime::{outcome::Rejection, time::Time, wire::Message};
 
 use super::{
     access,
-    reports::{AskFreeze, AskFrozen, FROZEN_BYTES_MAX, FreezeReport, FrozenReport},
+    reports::{AskFreeze, AskFrozen, FROZEN_BUSY, FROZEN_BYTES_MAX, FreezeReport, FrozenReport},
 };
 use crate::NodeState;
 
@@ -48,8 +48,13 @@ pub(super) fn fetched(state: &Arc<NodeState>, question: &Message) -> Result<Froz
     let Some(flight) = state.recording.flight() else {
         return Ok(FrozenReport { refused: Some(NOT_RECORDED.to_owned()), ..own });
     };
-    let own = FrozenReport { folder: Some(flight.folder().display().to_string()), ..own };
-    let mut store = flight.store();
+    let text = |folder: &Path| Some(folder.display().to_string());
+    let frozen_folder = state.ctx.config.record.frozen_folder.as_deref().unwrap_or_else(|| flight.folder());
+    let own = FrozenReport { folder: text(flight.folder()), frozen_folder: text(frozen_folder), ..own };
+    // A disk may be slow, and this thread answers other questions.
+    let Some(mut store) = flight.try_store() else {
+        return Ok(FrozenReport { refused: Some(FROZEN_BUSY.to_owned()), ..own });
+    };
     let Some(id) = id else { return Ok(FrozenReport { spans: store.spans(), ..own }) };
     let answer = if is_fetched {
         store.set_fetched(&id).map(|()| (Vec::new(), 0))

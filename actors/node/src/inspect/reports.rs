@@ -18,8 +18,8 @@ pub use access::{AccessReport, AccessVerdict, AskAccess, AskReload, ReloadReport
 pub use apps::{APPS_MAX, AppReport, AppsReport, AskApps, BarrierReport, KindReport, Missing, WaitReport};
 pub use audit::{AskAudit, AuditReport};
 pub use frozen::{
-    AskFreeze, AskFrozen, FROZEN_BYTES_MAX, FROZEN_SPANS_MAX, FreezeReport, FrozenFacts, FrozenPart,
-    FrozenReport, FrozenSpan,
+    AskFreeze, AskFrozen, FROZEN_BUSY, FROZEN_BYTES_MAX, FROZEN_SPANS_MAX, FreezeReport, FrozenFacts,
+    FrozenPart, FrozenReport, FrozenSpan,
 };
 pub use node::{AskNode, NodeReport, PEERS_MAX};
 pub use peers::{

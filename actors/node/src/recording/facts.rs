@@ -61,10 +61,18 @@ impl LogObserver for LogWriter {
     }
 }
 
+/// The changes that a look found.
+#[derive(Debug, Default)]
+pub(super) struct Changes {
+    /// The nodes that were lost without an announcement, as text.
+    pub(super) losses: Vec<String>,
+    /// Whether an application has a new name, or has lost one.
+    pub(super) has_new_names: bool,
+}
+
 impl KnownFacts {
-    /// Writes the changes since the last look, and once a second the clocks. Returns the nodes that were lost without an
-    /// announcement, as text.
-    pub(super) fn look(&mut self, state: &NodeState, journal: &Journal, now: Time) -> Vec<String> {
+    /// Writes the changes since the last look, and once a second the clocks.
+    pub(super) fn look(&mut self, state: &NodeState, journal: &Journal, now: Time) -> Changes {
         let mut facts = Vec::new();
         let losses = self.look_at_nodes(state, &mut facts);
         self.look_at_apps(state, &mut facts);
@@ -78,7 +86,8 @@ impl KnownFacts {
             journal.set_wall_offset(wall_offset_ns);
             write(journal, state.ctx.node, now, &ClockFact { wall_offset_ns, peers: clocks(state, now) });
         }
-        losses
+        let is_name = |of: &NodeFact| matches!(of, NodeFact::AppNamed { .. } | NodeFact::AppGone { .. });
+        Changes { losses, has_new_names: facts.iter().any(is_name) }
     }
 
     fn look_at_nodes(&mut self, state: &NodeState, facts: &mut Vec<NodeFact>) -> Vec<String> {

@@ -9,24 +9,25 @@ use std::{
     collections::VecDeque,
     path::{Path, PathBuf},
     sync::{
-        Arc, Mutex, MutexGuard, Weak,
+        Arc, Condvar, Mutex, MutexGuard, PoisonError, TryLockError, Weak,
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
     time::Duration,
 };
 
+use rustix::fs::{Access, access};
 use sinew_record::NodeFact;
 use sinew_runtime::{
-    incident::{self, IncidentObserver},
+    incident::{self, IncidentKind, IncidentObserver},
     lock, log,
     time::Time,
 };
 use sinew_shm::journal::Journal;
 
 use super::{
-    facts,
-    plan::{FreezePlan, Output, Trigger, TriggerId},
-    store::{FrozenStore, write_facts},
+    facts::{self, Changes},
+    plan::{FreezePlan, Output, SpanOrder, Trigger, TriggerId},
+    store::{FrozenError, FrozenStore, move_ring, read_facts, write_facts},
     triggers::forward,
 };
 use crate::{
@@ -36,20 +37,28 @@ use crate::{
 
 /// Maximum number of causes between two looks. Further ones belong to the same span, or are lost in a flood.
 const CAUSES_MAX: usize = 16;
-/// Time between two looks at the names beside the journal.
+/// Time between two looks at the names beside the journal, if no application has a new name.
 const NAMES_PERIOD: Duration = Duration::from_secs(1);
 
 /// The flight recorder of a node.
 pub(crate) struct Flight {
     plan: Mutex<FreezePlan>,
     store: Mutex<FrozenStore>,
+    /// The folder of the journal as a store: rings of dead incarnations are moved out of it.
+    beside: FrozenStore,
     causes: Arc<Causes>,
-    /// Spans to freeze or to discard: at most one for each known trigger, and one more.
-    work: Mutex<VecDeque<Work>>,
-    is_working: AtomicBool,
+    work: Mutex<Work>,
+    /// Notified when the thread `freeze` ends.
+    idle: Condvar,
+    /// The time of the first order to stop the node, in nanoseconds; `u64::MAX` before.
+    stop_ns: AtomicU64,
+    /// Whether the layers have ended: names are those that were written last.
+    is_ending: AtomicBool,
     names: Mutex<KnownReport>,
     /// The folder of the journal.
     folder: PathBuf,
+    /// Whether the last cause made no trigger. The first one of several is in the log.
+    is_refusing: AtomicBool,
     /// Whether spans are kept at all.
     keeps_spans: bool,
 }
@@ -57,19 +66,20 @@ pub(crate) struct Flight {
 /// Causes that were reported by any thread of the process.
 #[derive(Default)]
 struct Causes {
-    reported: Mutex<VecDeque<(Time, String)>>,
+    reported: Mutex<VecDeque<(Time, IncidentKind, String)>>,
+    /// Those of which the words are lost.
     lost: AtomicU64,
 }
 
 impl IncidentObserver for Causes {
-    fn happened(&self, at: Time, cause: &str) {
-        // The thread may be a real-time one. Another cause is just being stored or read: that one is a trigger.
+    fn happened(&self, at: Time, kind: IncidentKind, cause: &str) {
+        // The thread may be a real-time one. Another cause is just being stored or read: this one has no words then.
         let Ok(mut reported) = self.reported.try_lock() else {
             self.lost.fetch_add(1, Ordering::Relaxed);
             return;
         };
         if reported.len() < CAUSES_MAX {
-            reported.push_back((at, cause.to_owned()));
+            reported.push_back((at, kind, cause.to_owned()));
         } else {
             self.lost.fetch_add(1, Ordering::Relaxed);
         }
@@ -77,9 +87,19 @@ impl IncidentObserver for Causes {
 }
 
 /// An order to the thread `freeze`.
-enum Work {
-    Freeze(Trigger),
-    Discard(TriggerId),
+enum Order {
+    Freeze(SpanOrder),
+    /// The ring of a dead incarnation, beside the journal.
+    Move(String),
+}
+
+/// The orders of the thread `freeze`.
+#[derive(Default)]
+struct Work {
+    /// Spans to freeze, at most one for each known trigger, and before them rings to move, at most as many as a store
+    /// has.
+    orders: VecDeque<Order>,
+    is_running: bool,
 }
 
 /// The names that were written beside the journal.
@@ -97,6 +117,14 @@ impl Flight {
         let folder = journal.parent().unwrap_or_else(|| Path::new(".")).to_owned();
         let base = journal.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let frozen_folder = config.frozen_folder.clone().unwrap_or_else(|| folder.clone());
+        if config.frozen_max > 0
+            && let Err(error) = access(&frozen_folder, Access::WRITE_OK | Access::EXEC_OK)
+        {
+            log::warn!(
+                folder = %frozen_folder.display(), %error,
+                "no span can be frozen: create the folder of record.frozen_folder, or permit this user to write there"
+            );
+        }
         let mut store = FrozenStore::new(frozen_folder, base, config.frozen_max);
         store.clean();
         if config.frozen_max > 0 {
@@ -110,6 +138,12 @@ impl Flight {
                 None => {}
             }
         }
+        let (beside, dead) = store.beside(journal);
+        beside.clean();
+        let mut work = Work::default();
+        if config.frozen_max > 0 {
+            work.orders.extend(dead.into_iter().map(Order::Move));
+        }
         let plan = FreezePlan::new((state.ctx.node, state.ctx.incarnation), config.keep, config.after);
         let causes = Arc::new(Causes::default());
         let observer: Arc<dyn IncidentObserver> = causes.clone();
@@ -118,18 +152,30 @@ impl Flight {
         Arc::new(Self {
             plan: Mutex::new(plan),
             store: Mutex::new(store),
+            beside,
             causes,
-            work: Mutex::default(),
-            is_working: AtomicBool::new(false),
+            work: Mutex::new(work),
+            idle: Condvar::new(),
+            stop_ns: AtomicU64::new(u64::MAX),
+            is_ending: AtomicBool::new(false),
             names: Mutex::default(),
             folder,
+            is_refusing: AtomicBool::new(false),
             keeps_spans: config.frozen_max > 0,
         })
     }
 
     /// Handles a cause at this node. Returns the trigger that stands for it.
     pub(crate) fn happened(&self, at: Time, cause: &str) -> Option<TriggerId> {
-        lock(&self.plan).happened(Time::now().as_nanos(), at.as_nanos(), cause)
+        let id = lock(&self.plan).happened(Time::now().as_nanos(), at.as_nanos(), cause);
+        let was_refusing = self.is_refusing.swap(id.is_none(), Ordering::Relaxed);
+        if id.is_none() && !was_refusing {
+            log::warn!(
+                cause,
+                "the messages around a fault are not frozen: this node knows too many triggers"
+            );
+        }
+        id
     }
 
     /// Handles the trigger of another node. Returns `false` if it is refused.
@@ -140,9 +186,18 @@ impl Flight {
         plan.refused() == before
     }
 
-    /// Returns the frozen spans. No layer waits for this lock.
+    /// Returns the frozen spans. It waits while a file is renamed or removed, but not for a copy.
     pub(crate) fn store(&self) -> MutexGuard<'_, FrozenStore> {
         lock(&self.store)
+    }
+
+    /// Returns the frozen spans, if no other thread has them.
+    pub(crate) fn try_store(&self) -> Option<MutexGuard<'_, FrozenStore>> {
+        match self.store.try_lock() {
+            Ok(store) => Some(store),
+            Err(TryLockError::Poisoned(poisoned)) => Some(poisoned.into_inner()),
+            Err(TryLockError::WouldBlock) => None,
+        }
     }
 
     /// Returns the folder of the journal.
@@ -156,19 +211,10 @@ impl Flight {
         state: &Arc<NodeState>,
         journal: &Arc<Journal>,
         now: Time,
-        losses: &[String],
+        changes: &Changes,
     ) {
-        // A node that stops loses the others in order.
-        if !state.ctx.stopping.load(Ordering::Relaxed) {
-            let reported = std::mem::take(&mut *lock(&self.causes.reported));
-            reported.iter().for_each(|(at, cause)| _ = self.happened(*at, cause));
-            losses.iter().for_each(|cause| _ = self.happened(now, cause));
-        }
-        let lost = self.causes.lost.swap(0, Ordering::Relaxed);
-        if lost > 0 {
-            log::debug!(lost, "causes to freeze a span were not looked at: others came at the same moment");
-        }
-        self.write_names(state, journal, now);
+        self.take_causes(now, &changes.losses);
+        self.write_names(state, journal, now, changes.has_new_names);
         loop {
             let output = lock(&self.plan).poll(now.as_nanos());
             match output {
@@ -179,26 +225,58 @@ impl Flight {
                 }
                 // The node has a recording, and keeps no spans.
                 Some(Output::Freeze(_)) if !self.keeps_spans => {}
-                Some(Output::Freeze(trigger)) => lock(&self.work).push_back(Work::Freeze(trigger)),
-                Some(Output::Discard(id)) => lock(&self.work).push_back(Work::Discard(id)),
+                Some(Output::Freeze(order)) => lock(&self.work).orders.push_back(Order::Freeze(order)),
             }
         }
-        // SYNC: with the end of `work`: a thread that has ended has carried out its orders.
-        if !lock(&self.work).is_empty() && !self.is_working.swap(true, Ordering::AcqRel) {
-            let (flight, weak, path) = (self.clone(), Arc::downgrade(state), journal.path().to_owned());
-            let thread = std::thread::Builder::new().name("freeze".to_owned());
-            if let Err(error) = thread.spawn(move || flight.work(&weak, &path)) {
-                // The next turn tries again.
-                self.is_working.store(false, Ordering::Release);
-                log::error!(%error, "the system gives no thread to freeze a span");
+        self.start_work(&Arc::downgrade(state), journal.path());
+    }
+
+    /// Notes the order to stop the node. From now on only failed actors are causes: guards and watchdogs are expected
+    /// to see the end of peers, and nodes leave.
+    pub(super) fn stop_ordered(&self, now: Time) {
+        self.stop_ns.fetch_min(now.as_nanos(), Ordering::Relaxed);
+    }
+
+    /// Makes triggers of all causes since the last call.
+    fn take_causes(&self, now: Time, losses: &[String]) {
+        let stop_ns = self.stop_ns.load(Ordering::Relaxed);
+        let reported = std::mem::take(&mut *lock(&self.causes.reported));
+        for (at, kind, cause) in &reported {
+            if *kind == IncidentKind::Failure || at.as_nanos() < stop_ns {
+                self.happened(*at, cause);
             }
+        }
+        let lost = self.causes.lost.swap(0, Ordering::Relaxed);
+        if now.as_nanos() >= stop_ns {
+            return;
+        }
+        losses.iter().for_each(|cause| _ = self.happened(now, cause));
+        if lost > 0 {
+            // Those of a flood are in the span of the first one.
+            self.happened(now, &format!("{lost} incidents at the moment of another one"));
         }
     }
 
-    /// Writes the names beside the journal, if they have changed: a dead node cannot tell them.
-    fn write_names(&self, state: &NodeState, journal: &Journal, now: Time) {
+    /// Starts the thread `freeze`, if it has orders and does not run.
+    fn start_work(self: &Arc<Self>, state: &Weak<NodeState>, journal: &Path) {
+        let mut work = lock(&self.work);
+        if work.orders.is_empty() || work.is_running {
+            return;
+        }
+        let (flight, state, path) = (self.clone(), state.clone(), journal.to_owned());
+        let thread = std::thread::Builder::new().name("freeze".to_owned());
+        match thread.spawn(move || flight.work(&state, &path)) {
+            Ok(_) => work.is_running = true,
+            // The next turn tries again.
+            Err(error) => log::error!(%error, "the system gives no thread to freeze a span"),
+        }
+    }
+
+    /// Writes the names beside the journal, if they have changed: a dead node cannot tell them. A new name of an
+    /// application is written at once: the node may die within its first second.
+    fn write_names(&self, state: &NodeState, journal: &Journal, now: Time, is_due: bool) {
         let mut names = lock(&self.names);
-        if now < names.due {
+        if now < names.due && !is_due {
             return;
         }
         names.due = now + NAMES_PERIOD;
@@ -221,62 +299,100 @@ impl Flight {
 
     /// Carries out the orders of the thread `freeze`.
     fn work(&self, state: &Weak<NodeState>, journal: &Path) {
-        loop {
-            let next = lock(&self.work).pop_front();
-            match (next, state.upgrade()) {
-                (Some(Work::Freeze(trigger)), Some(state)) => {
-                    self.freeze(journal, &trigger, names_for_reader(&state, journal));
+        while let Some(order) = self.next_order() {
+            let order = match order {
+                Order::Freeze(order) => order,
+                Order::Move(id) => {
+                    match move_ring(&self.beside, &self.store, &id) {
+                        Ok(()) => {
+                            log::info!(id, "the ring of a dead incarnation is moved to record.frozen_folder")
+                        }
+                        Err(error) => {
+                            log::warn!(id, %error, "the ring of a dead incarnation stays in record.folder")
+                        }
+                    }
+                    continue;
                 }
-                (Some(Work::Discard(id)), _) => self.store().discard(&id.to_string()),
-                (Some(Work::Freeze(_)), None) | (None, _) => break,
-            }
+            };
+            let is_ending = self.is_ending.load(Ordering::Relaxed);
+            let report = match state.upgrade().filter(|_| !is_ending) {
+                Some(state) => names_for_reader(&state, journal),
+                None => self.written_names(journal),
+            };
+            self.freeze(journal, &order, report);
         }
-        // SYNC: with `turn`.
-        self.is_working.store(false, Ordering::Release);
     }
 
-    /// Freezes all spans that are not complete yet, up to this moment: the node ends. It waits for no layer.
-    pub(super) fn finish(&self, journal: &Path) {
+    /// Returns the next order of the thread. `None`: the thread ends.
+    fn next_order(&self) -> Option<Order> {
+        let mut work = lock(&self.work);
+        let next = work.orders.pop_front();
+        if next.is_none() {
+            work.is_running = false;
+            self.idle.notify_all();
+        }
+        next
+    }
+
+    /// Returns the names that were written last. It waits for no layer.
+    fn written_names(&self, journal: &Path) -> RecordReport {
+        // The thread `record` may hang in a layer, with the names locked.
+        let names = self.names.try_lock().ok().and_then(|names| names.written.clone());
+        let read = || read_facts(&journal.with_extension("facts")).ok().map(|facts| facts.report);
+        names.or_else(read).unwrap_or_default()
+    }
+
+    /// Has all spans frozen that are not complete yet, up to this moment: the node ends. [`wait`](Self::wait) waits for
+    /// the copies.
+    pub(super) fn finish(self: &Arc<Self>, node: &NodeState, journal: &Journal) {
+        self.is_ending.store(true, Ordering::Relaxed);
+        // The failure of an actor may be why the node ends.
+        self.take_causes(Time::now(), &[]);
         if !self.keeps_spans {
             return;
         }
-        // The thread `record` may hang in a layer, with the names locked.
-        let names = self.names.try_lock().ok().and_then(|names| names.written.clone());
-        let report = names.unwrap_or_default();
         loop {
-            let Some(output) = lock(&self.plan).poll(u64::MAX) else { break };
+            let output = lock(&self.plan).poll(u64::MAX);
             match output {
-                Output::Freeze(trigger) => lock(&self.work).push_back(Work::Freeze(trigger)),
-                Output::Discard(id) => lock(&self.work).push_back(Work::Discard(id)),
+                None => break,
                 // Its links have ended.
-                Output::Forward(_) => {}
+                Some(Output::Forward(trigger)) => note(node, journal, &trigger),
+                Some(Output::Freeze(order)) => lock(&self.work).orders.push_back(Order::Freeze(order)),
             }
         }
-        loop {
-            let Some(next) = lock(&self.work).pop_front() else { break };
-            match next {
-                Work::Freeze(trigger) => self.freeze(journal, &trigger, report.clone()),
-                Work::Discard(id) => self.store().discard(&id.to_string()),
-            }
-        }
+        self.start_work(&Weak::new(), journal.path());
     }
 
-    fn freeze(&self, journal: &Path, trigger: &Trigger, report: RecordReport) {
-        let id = trigger.id.to_string();
-        let cause = trigger.cause.as_str();
+    /// Waits until the thread `freeze` has carried out its orders. Returns `false` if the time is over before.
+    pub(super) fn wait(&self, within: Duration) -> bool {
+        let work = self.idle.wait_timeout_while(lock(&self.work), within, |work| work.is_running);
+        let (work, _) = work.unwrap_or_else(PoisonError::into_inner);
+        !work.is_running && work.orders.is_empty()
+    }
+
+    fn freeze(&self, journal: &Path, order: &SpanOrder, report: RecordReport) {
+        let SpanOrder { trigger, begin_ns, end_ns, replaces } = order;
+        let (id, cause) = (trigger.id.to_string(), trigger.cause.as_str());
         let span = FrozenSpan {
             id: id.clone(),
             cause: cause.to_owned(),
             at_ns: trigger.at_ns,
             bound_ns: trigger.bound_ns,
-            begin_ns: trigger.begin_ns(),
-            end_ns: trigger.end_ns(),
+            begin_ns: *begin_ns,
+            // A node that ends freezes it before.
+            end_ns: (*end_ns).min(Time::now().as_nanos()),
             ..FrozenSpan::default()
         };
         let facts = FrozenFacts { span: Some(span.clone()), report };
-        // Questions wait for this lock, and no sender does.
-        let mut store = self.store();
-        match store.make_room(&id).and_then(|()| store.freeze(journal, &span, &facts)) {
+        let replaces: Vec<_> = replaces.iter().map(TriggerId::to_string).collect();
+        let freeze = || -> Result<u64, FrozenError> {
+            let draft = self.store().draft(&id, &replaces)?;
+            // Without the lock: the copy takes as long as the disk does, and questions need the lock.
+            let drafted = draft.copy(journal, &span)?;
+            self.store().keep(&drafted, &facts, &replaces)?;
+            Ok(drafted.records)
+        };
+        match freeze() {
             Ok(records) => log::warn!(id, cause, records, "the messages around a fault are frozen"),
             Err(error) => log::error!(cause, %error, "the messages around a fault are not frozen"),
         }
@@ -294,4 +410,26 @@ fn note(state: &NodeState, journal: &Journal, trigger: &Trigger) {
     let (id, cause) = (trigger.id.to_string(), trigger.cause.as_str().to_owned());
     let fact = NodeFact::Triggered { id, cause, bound_ns: trigger.bound_ns };
     facts::write(journal, state.ctx.node, Time::from_nanos(trigger.at_ns), &fact);
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew_model::config::NodeConfig;
+    use sinew_runtime::tid::Incarnation;
+
+    use super::*;
+
+    #[test]
+    fn incident_at_a_held_lock_is_a_cause() {
+        let mut config = NodeConfig::new("knee");
+        config.project = format!("held {}", std::process::id());
+        let state = NodeState::for_test(config, Incarnation(1));
+        let flight = Flight::begin(&state, &std::env::temp_dir().join("sinew-held-10.0.0.2.journal"));
+        let held = lock(&flight.causes.reported);
+        flight.causes.happened(Time::now(), IncidentKind::Symptom, "the knee slips");
+        drop(held);
+        flight.take_causes(Time::now(), &[]);
+        // Of another test's incident at this moment it has the words.
+        assert!(!flight.known().is_empty());
+    }
 }

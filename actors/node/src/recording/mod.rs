@@ -48,6 +48,8 @@ pub(crate) const LEASE: Duration = Duration::from_secs(5);
 pub(crate) const PROGRAMS_MAX: usize = 8;
 /// Time between two looks at the node's state, and at the selected names.
 const PERIOD: Duration = Duration::from_millis(100);
+/// Time limit for the copies of spans at the end of the node.
+const COPIES_WITHIN: Duration = Duration::from_secs(5);
 /// The folder of files in memory: on a disk the system would stop a sender while it stores a page.
 const MEMORY: &str = "/dev/shm";
 
@@ -81,6 +83,34 @@ struct Active {
     chosen: Option<sinew_record::Chosen>,
     /// Writes the log, as long as it is here.
     _log: Arc<dyn LogObserver>,
+}
+
+/// A recording that has ended. Its journal may still be copied.
+#[derive(Default)]
+#[must_use = "spans are lost if the process ends before they are copied"]
+pub(crate) struct Ending {
+    active: Option<Active>,
+    is_kept: bool,
+    flight: Option<Arc<Flight>>,
+}
+
+impl Ending {
+    /// Waits for the copies, up to a limit. Then the journal is closed.
+    pub(crate) fn wait(self) {
+        if let Some(flight) = &self.flight
+            && !flight.wait(COPIES_WITHIN)
+        {
+            log::error!(
+                within = ?COPIES_WITHIN,
+                "spans are not frozen in time; the folder of record.frozen_folder may be too slow"
+            );
+        }
+        if let Some(active) = &self.active
+            && !self.is_kept
+        {
+            active.journal.remove();
+        }
+    }
 }
 
 /// Why there is no recording.
@@ -162,18 +192,37 @@ impl Recording {
         self.lock().active.as_ref().map(|active| active.journal.path().to_owned())
     }
 
-    /// Ends the recording with the node. The file of a configured one stays.
-    pub(crate) fn close(&self, node: &NodeState) {
-        let mut state = self.lock();
-        state.is_closed = true;
-        state.programs.clear();
-        let is_kept = state.configured.take().is_some() && node.ctx.config.record.folder.is_some();
-        if let Some(active) = state.active.take() {
-            if let Some(flight) = self.flight() {
-                flight.finish(active.journal.path());
-            }
-            self.remove(node, &active, is_kept);
+    /// Notes the order to stop the node.
+    pub(crate) fn stop_ordered(&self) {
+        if let Some(flight) = self.flight() {
+            flight.stop_ordered(Time::now());
         }
+    }
+
+    /// Ends the recording with the node. The file of a configured one stays. Spans are copied by a thread of their own,
+    /// for which [`Ending::wait`] waits.
+    pub(crate) fn end(&self, node: &NodeState) -> Ending {
+        let (active, was_configured) = {
+            let mut state = self.lock();
+            state.is_closed = true;
+            state.programs.clear();
+            (state.active.take(), state.configured.take().is_some())
+        };
+        let Some(active) = active else { return Ending::default() };
+        install(node, None);
+        let flight = self.flight().cloned();
+        if let Some(flight) = &flight {
+            flight.finish(node, &active.journal);
+        }
+        self.ended.notify_all();
+        let is_kept = was_configured && node.ctx.config.record.folder.is_some();
+        Ending { active: Some(active), is_kept, flight }
+    }
+
+    /// Ends the recording, and waits for its copies.
+    #[cfg(test)]
+    pub(crate) fn close(&self, node: &NodeState) {
+        self.end(node).wait();
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
@@ -214,7 +263,7 @@ impl Recording {
         let mut all = configured.iter().chain(programs.values().map(|(selection, _)| selection));
         let Some(mut sum) = all.next().cloned() else {
             if let Some(active) = state.active.take() {
-                self.remove(node, &active, false);
+                self.remove(node, &active);
             }
             return;
         };
@@ -223,11 +272,9 @@ impl Recording {
         active.refresh(node, names);
     }
 
-    fn remove(&self, node: &NodeState, active: &Active, is_kept: bool) {
+    fn remove(&self, node: &NodeState, active: &Active) {
         install(node, None);
-        if !is_kept {
-            active.journal.remove();
-        }
+        active.journal.remove();
         self.ended.notify_all();
     }
 
@@ -313,9 +360,9 @@ fn run(node: &Weak<NodeState>, journal: &Arc<Journal>) {
         if !state.recording.refresh(&state, journal, now) {
             return;
         }
-        let losses = known.look(&state, journal, now);
+        let changes = known.look(&state, journal, now);
         if let Some(flight) = state.recording.flight() {
-            flight.turn(&state, journal, now, &losses);
+            flight.turn(&state, journal, now, &changes);
         }
         state.recording.rest();
     }

@@ -6,10 +6,11 @@ use std::{
     io::{self, Read as _, Write as _},
     os::unix::fs::{FileExt as _, MetadataExt as _, OpenOptionsExt as _},
     path::{Path, PathBuf},
+    sync::Mutex,
 };
 
-use sinew_runtime::wire;
-use sinew_shm::journal::{CopyJournalError, JournalReader, Start, copy_span};
+use sinew_runtime::{lock, wire};
+use sinew_shm::journal::{CopyJournalError, JournalReader, Start, copy_span, count_span};
 
 use crate::inspect::{FROZEN_SPANS_MAX, FrozenFacts, FrozenPart, FrozenSpan};
 
@@ -25,8 +26,42 @@ pub(crate) struct FrozenStore {
     /// Begin of the names of its files, without the last `-`.
     base: String,
     spans_max: usize,
-    /// The spans that were fetched since the node's start.
-    fetched: BTreeSet<String>,
+}
+
+/// The copy of a span, until the store has it. It is made without the store: that takes as long as the disk does.
+#[derive(Debug)]
+pub(crate) struct Draft {
+    /// The ring of the copy.
+    target: PathBuf,
+    /// The rings of the spans that it replaces.
+    former: Vec<PathBuf>,
+}
+
+/// A finished copy.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Drafted {
+    /// The ring with the most records of the span: the copy, or that of a replaced span.
+    ring: PathBuf,
+    /// Its records of the span.
+    pub(crate) records: u64,
+}
+
+impl Draft {
+    /// Copies the span of the journal.
+    pub(crate) fn copy(&self, journal: &Path, span: &FrozenSpan) -> Result<Drafted, FrozenError> {
+        let times = span.begin_ns..=span.end_ns;
+        let failed = |cause| FrozenError::Copy { id: span.id.clone(), cause };
+        let copied = copy_span(journal, &self.target, &times).map_err(failed)?;
+        let mut best = Drafted { ring: self.target.clone(), records: copied.records };
+        for ring in &self.former {
+            // One that cannot be read has no records to keep.
+            let records = count_span(ring, &times).unwrap_or(0);
+            if records > best.records {
+                best = Drafted { ring: ring.clone(), records };
+            }
+        }
+        Ok(best)
+    }
 }
 
 /// Why a span was not frozen, or cannot be read.
@@ -40,9 +75,9 @@ pub(crate) enum FrozenError {
     /// The span cannot be copied.
     #[error("the span {id} cannot be frozen: {cause}")]
     Copy { id: String, cause: CopyJournalError },
-    /// The file with facts cannot be written.
-    #[error("the span {id} cannot be frozen: its facts cannot be written: {cause}")]
-    Facts { id: String, cause: io::Error },
+    /// The files of the span cannot be written or renamed.
+    #[error("the span {id} cannot be frozen: its files cannot be written: {cause}")]
+    Files { id: String, cause: io::Error },
     /// There is no such span.
     #[error("there is no frozen span {0}; `sinew record fetch` lists them")]
     Unknown(String),
@@ -53,16 +88,29 @@ pub(crate) enum FrozenError {
 
 impl FrozenStore {
     pub(crate) const fn new(folder: PathBuf, base: String, spans_max: usize) -> Self {
-        Self { folder, base, spans_max, fetched: BTreeSet::new() }
+        Self { folder, base, spans_max }
     }
 
-    /// Removes journals without facts: their node was killed while it made them.
+    /// Removes journals without facts, facts without a journal, copies that no span has, and files without their name:
+    /// their node was killed while it made them.
     pub(crate) fn clean(&self) {
+        let drafts = self.names(".draft");
+        for name in drafts.into_iter().chain(self.names_after(&format!(".{}-", self.base), "")) {
+            // It stays if the folder refuses that.
+            let _ = fs::remove_file(self.folder.join(name));
+        }
         for name in self.names(".frozen") {
             let ring = self.folder.join(&name);
             if !ring.with_extension("facts").exists() {
                 // It stays if the folder refuses that.
                 let _ = fs::remove_file(ring);
+            }
+        }
+        for name in self.names(".facts") {
+            let facts = self.folder.join(&name);
+            if !facts.with_extension("frozen").exists() {
+                // It stays if the folder refuses that.
+                let _ = fs::remove_file(facts);
             }
         }
     }
@@ -75,22 +123,38 @@ impl FrozenStore {
         spans
     }
 
-    /// Copies a span of the journal.
-    pub(crate) fn freeze(
-        &self,
-        journal: &Path,
-        span: &FrozenSpan,
+    /// Makes room for the copy of a span, which replaces others. Those stay until the copy is there.
+    pub(crate) fn draft(&mut self, id: &str, replaces: &[String]) -> Result<Draft, FrozenError> {
+        self.make_room(id, replaces)?;
+        let former = replaces.iter().map(|id| self.path(id, "frozen")).filter(|ring| is_own(ring)).collect();
+        Ok(Draft { target: self.path(id, "draft"), former })
+    }
+
+    /// Takes the copy of a span, and removes the spans that it replaces.
+    ///
+    /// A replaced span that has more records of this one stays, under the ID of this one: the journal has lost them.
+    pub(crate) fn keep(
+        &mut self,
+        drafted: &Drafted,
         facts: &FrozenFacts,
-    ) -> Result<u64, FrozenError> {
-        let id = || span.id.clone();
-        let ring = self.path(&span.id, "frozen");
-        let copied = copy_span(journal, &ring, &(span.begin_ns..=span.end_ns))
-            .map_err(|cause| FrozenError::Copy { id: id(), cause })?;
-        self.announce(&span.id, facts)?;
-        Ok(copied.records)
+        replaces: &[String],
+    ) -> Result<(), FrozenError> {
+        let id = facts.span.as_ref().map(|span| span.id.clone()).unwrap_or_default();
+        let ring = self.path(&id, "frozen");
+        let failed = |cause| FrozenError::Files { id: id.clone(), cause };
+        // The facts first: without its ring a span does not count, and a ring without facts is removed.
+        self.announce(&id, facts)?;
+        fs::rename(&drafted.ring, &ring).map_err(failed)?;
+        // It is there only if a replaced ring was better.
+        let _ = fs::remove_file(self.path(&id, "draft"));
+        replaces.iter().filter(|former| **former != id).for_each(|former| self.discard(former));
+        Ok(())
     }
 
     /// Keeps the ring of a former incarnation that has died, if there is one at `journal`. Returns its ID.
+    ///
+    /// It copies nothing, because the node waits. Where the folder is of another file system, the ring gets its new
+    /// name beside the journal: [`beside`](Self::beside).
     pub(crate) fn keep_dead_ring(&mut self, journal: &Path) -> Option<Result<String, FrozenError>> {
         let reader = JournalReader::open(journal, Start::Newest).ok()?;
         if !is_own(journal) || reader.is_writer_alive() || reader.is_closed().unwrap_or(true) {
@@ -108,49 +172,88 @@ impl FrozenStore {
             has_died: true,
             ..FrozenSpan::default()
         };
-        if let Err(why) = self.make_room(&id) {
+        if let Err(why) = self.make_room(&id, &[]) {
             return Some(Err(why));
         }
         facts.span = Some(span);
-        let ring = self.path(&id, "frozen");
-        // Another file system refuses the new name.
-        let kept =
-            fs::rename(journal, &ring).or_else(|_| copy_span(journal, &ring, &(0..=u64::MAX)).map(drop));
-        let kept = kept.map_err(|cause| FrozenError::Copy { id: id.clone(), cause });
-        Some(kept.and_then(|()| self.announce(&id, &facts)).map(|()| id))
+        let beside = Self { folder: folder_of(journal), base: self.base.clone(), ..*self };
+        let kept = self.adopt(journal, &id, &facts).or_else(|_| beside.adopt(journal, &id, &facts));
+        Some(kept.map(|()| id))
     }
 
-    /// Makes room for one more span: the oldest fetched one is removed if there are as many as may.
-    pub(crate) fn make_room(&mut self, id: &str) -> Result<(), FrozenError> {
-        let spans = self.spans();
-        if spans.len() < self.spans_max {
-            return Ok(());
+    /// Renames a ring to that of a span.
+    fn adopt(&self, ring: &Path, id: &str, facts: &FrozenFacts) -> Result<(), FrozenError> {
+        self.announce(id, facts)?;
+        fs::rename(ring, self.path(id, "frozen")).map_err(|cause| {
+            // The first error is the one to report.
+            let _ = fs::remove_file(self.path(id, "facts"));
+            FrozenError::Files { id: id.to_owned(), cause }
+        })
+    }
+
+    /// Returns the store of the folder with the journal, and the rings of dead incarnations in it that have to be moved
+    /// to this one.
+    pub(crate) fn beside(&self, journal: &Path) -> (Self, Vec<String>) {
+        let beside = Self { folder: folder_of(journal), base: self.base.clone(), ..*self };
+        let mut dead = Vec::new();
+        if beside.folder != self.folder {
+            dead.extend(beside.spans().into_iter().filter(|span| span.has_died).map(|span| span.id));
         }
-        match spans.iter().find(|span| span.is_fetched) {
-            Some(span) if spans.len() == self.spans_max && self.spans_max > 0 => {
-                self.discard(&span.id);
-                Ok(())
-            }
-            Some(_) | None => Err(FrozenError::Full { id: id.to_owned(), max: self.spans_max }),
+        (beside, dead)
+    }
+
+    /// Returns the ring of a span, and its facts.
+    pub(crate) fn files(&self, id: &str) -> Result<(PathBuf, FrozenFacts), FrozenError> {
+        self.check(id)?;
+        let facts = read_facts(&self.path(id, "facts"));
+        let facts = facts.map_err(|cause| FrozenError::Read { id: id.to_owned(), cause })?;
+        Ok((self.path(id, "frozen"), facts))
+    }
+
+    /// Makes room for one more span, in addition to those that it replaces: the oldest fetched ones are removed.
+    fn make_room(&self, id: &str, replaces: &[String]) -> Result<(), FrozenError> {
+        let mut spans = self.spans();
+        spans.retain(|span| span.id != id && !replaces.contains(&span.id));
+        let surplus = (spans.len() + 1).saturating_sub(self.spans_max);
+        let fetched: Vec<_> = spans.iter().filter(|span| span.is_fetched).take(surplus).collect();
+        fetched.iter().for_each(|span| self.discard(&span.id));
+        if fetched.len() < surplus {
+            return Err(FrozenError::Full { id: id.to_owned(), max: self.spans_max });
         }
+        Ok(())
     }
 
     /// Removes a span.
-    pub(crate) fn discard(&mut self, id: &str) {
-        self.fetched.remove(id);
+    pub(crate) fn discard(&self, id: &str) {
         for extension in ["facts", "frozen"] {
             // It stays if the folder refuses that, or there is none.
             let _ = fs::remove_file(self.path(id, extension));
         }
     }
 
-    /// Notes that a span was fetched.
+    /// Notes that a span was fetched, beside its ring: the next incarnation of the node has to know it.
     pub(crate) fn set_fetched(&mut self, id: &str) -> Result<(), FrozenError> {
-        if !self.spans().iter().any(|span| span.id == id) {
-            return Err(FrozenError::Unknown(id.to_owned()));
+        self.check(id)?;
+        let path = self.path(id, "facts");
+        let mut facts = read_facts(&path).map_err(|cause| FrozenError::Read { id: id.to_owned(), cause })?;
+        match &mut facts.span {
+            Some(span) if !span.is_fetched => {
+                span.is_fetched = true;
+                self.announce(id, &facts)
+            }
+            Some(_) | None => Ok(()),
         }
-        self.fetched.insert(id.to_owned());
-        Ok(())
+    }
+
+    /// Checks that there is such a span. An ID from outside may be any text.
+    fn check(&self, id: &str) -> Result<(), FrozenError> {
+        // Then it has no path in it, and names no other file.
+        let is_id = !id.is_empty() && id.chars().all(|c| c.is_ascii_alphanumeric() || c == '.' || c == '-');
+        if is_id && is_own(&self.path(id, "facts")) && is_own(&self.path(id, "frozen")) {
+            Ok(())
+        } else {
+            Err(FrozenError::Unknown(id.to_owned()))
+        }
     }
 
     /// Returns bytes of a file from this offset, and the length of the file.
@@ -161,10 +264,7 @@ impl FrozenStore {
         offset: u64,
         bytes_max: usize,
     ) -> Result<(Vec<u8>, u64), FrozenError> {
-        // The ID is one of a name in the folder, and so has no path in it.
-        if !self.names(".facts").contains(&format!("{}-{id}.facts", self.base)) {
-            return Err(FrozenError::Unknown(id.to_owned()));
-        }
+        self.check(id)?;
         let extension = match part {
             FrozenPart::Facts => "facts",
             FrozenPart::Ring => "frozen",
@@ -182,7 +282,7 @@ impl FrozenStore {
 
     fn announce(&self, id: &str, facts: &FrozenFacts) -> Result<(), FrozenError> {
         write_facts(&self.path(id, "facts"), facts)
-            .map_err(|cause| FrozenError::Facts { id: id.to_owned(), cause })
+            .map_err(|cause| FrozenError::Files { id: id.to_owned(), cause })
     }
 
     fn path(&self, id: &str, extension: &str) -> PathBuf {
@@ -191,12 +291,15 @@ impl FrozenStore {
 
     /// Returns the names of this node's files with such an end.
     fn names(&self, end: &str) -> BTreeSet<String> {
+        self.names_after(&format!("{}-", self.base), end)
+    }
+
+    fn names_after(&self, begin: &str, end: &str) -> BTreeSet<String> {
         let Ok(files) = fs::read_dir(&self.folder) else { return BTreeSet::new() };
-        let prefix = format!("{}-", self.base);
         files
             .take(FILES_MAX)
             .filter_map(|file| file.ok()?.file_name().into_string().ok())
-            .filter(|name| name.starts_with(&prefix) && name.ends_with(end))
+            .filter(|name| name.starts_with(begin) && name.ends_with(end))
             .collect()
     }
 
@@ -208,9 +311,22 @@ impl FrozenStore {
         if name != format!("{}-{}.facts", self.base, span.id) || !is_own(&ring) {
             return None;
         }
-        let (bytes, is_fetched) = (ring.symlink_metadata().ok()?.len(), self.fetched.contains(&span.id));
-        Some(FrozenSpan { bytes, is_fetched, ..span })
+        Some(FrozenSpan { bytes: ring.symlink_metadata().ok()?.len(), ..span })
     }
+}
+
+/// Moves the ring of a dead incarnation to the store. It is copied without the store's lock.
+pub(crate) fn move_ring(from: &FrozenStore, to: &Mutex<FrozenStore>, id: &str) -> Result<(), FrozenError> {
+    let (ring, facts) = from.files(id)?;
+    let draft = lock(to).draft(id, &[])?;
+    let drafted = draft.copy(&ring, facts.span.as_ref().unwrap_or(&FrozenSpan::default()))?;
+    lock(to).keep(&drafted, &facts, &[])?;
+    from.discard(id);
+    Ok(())
+}
+
+fn folder_of(journal: &Path) -> PathBuf {
+    journal.parent().unwrap_or_else(|| Path::new(".")).to_owned()
 }
 
 /// Returns whether it is an ordinary file of this user: another one may write into `/dev/shm`, too.
@@ -253,125 +369,4 @@ pub(crate) fn read_facts(path: &Path) -> io::Result<FrozenFacts> {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::os::unix::fs::PermissionsExt as _;
-
-    use sinew_shm::journal::{ChannelKey, Journal, Options};
-
-    use super::*;
-
-    struct Folder(PathBuf);
-
-    impl Folder {
-        fn new(name: &str) -> Self {
-            let path = std::env::temp_dir().join(format!("sinew-store-{name}-{}", std::process::id()));
-            let _ = fs::remove_dir_all(&path);
-            fs::create_dir_all(&path).unwrap();
-            fs::set_permissions(&path, fs::Permissions::from_mode(0o700)).unwrap();
-            Self(path)
-        }
-
-        fn store(&self, spans_max: usize) -> FrozenStore {
-            FrozenStore::new(self.0.clone(), "sinew-leg-10.0.0.2".to_owned(), spans_max)
-        }
-
-        fn journal(&self) -> Journal {
-            let path = self.0.join("sinew-leg-10.0.0.2.journal");
-            let options = Options { ring_bytes: 64 * 1024, ..Options::default() };
-            let journal = Journal::create(&path, &options).unwrap();
-            (1..=9).for_each(|time| assert!(journal.write(ChannelKey([1, 2, 3]), time, &[b"torque"])));
-            journal
-        }
-    }
-
-    impl Drop for Folder {
-        fn drop(&mut self) {
-            let _ = fs::remove_dir_all(&self.0);
-        }
-    }
-
-    fn span(id: &str, begin_ns: u64) -> FrozenSpan {
-        FrozenSpan {
-            id: id.to_owned(),
-            at_ns: begin_ns,
-            begin_ns,
-            end_ns: begin_ns + 2,
-            ..FrozenSpan::default()
-        }
-    }
-
-    fn freeze(store: &mut FrozenStore, journal: &Journal, of: &FrozenSpan) -> Result<u64, FrozenError> {
-        store.make_room(&of.id)?;
-        let facts = FrozenFacts { span: Some(of.clone()), ..FrozenFacts::default() };
-        store.freeze(journal.path(), of, &facts)
-    }
-
-    #[test]
-    fn oldest_spans_stay_until_they_are_fetched() {
-        let folder = Folder::new("oldest");
-        let (mut store, journal) = (folder.store(2), folder.journal());
-        assert_eq!(freeze(&mut store, &journal, &span("a-1", 2)).unwrap(), 3);
-        assert_eq!(freeze(&mut store, &journal, &span("a-2", 4)).unwrap(), 3);
-        let full = freeze(&mut store, &journal, &span("a-3", 6)).unwrap_err();
-        assert!(full.to_string().contains("sinew record fetch"), "{full}");
-        store.set_fetched("a-1").unwrap();
-        freeze(&mut store, &journal, &span("a-3", 6)).unwrap();
-        let ids: Vec<_> = store.spans().into_iter().map(|span| (span.id, span.is_fetched)).collect();
-        assert_eq!(ids, [("a-2".to_owned(), false), ("a-3".to_owned(), false)]);
-        assert!(matches!(store.set_fetched("a-1"), Err(FrozenError::Unknown(_))));
-    }
-
-    #[test]
-    fn file_is_read_in_parts_of_any_size() {
-        let folder = Folder::new("parts");
-        let (mut store, journal) = (folder.store(2), folder.journal());
-        freeze(&mut store, &journal, &span("a-1", 2)).unwrap();
-        let ring = fs::read(store.path("a-1", "frozen")).unwrap();
-        let (mut bytes, mut offset) = (Vec::new(), 0);
-        loop {
-            let (part, length) = store.read("a-1", FrozenPart::Ring, offset, 10_000).unwrap();
-            assert_eq!(length, ring.len() as u64);
-            if part.is_empty() {
-                break;
-            }
-            offset += part.len() as u64;
-            bytes.extend(part);
-        }
-        assert!(bytes == ring);
-        for wrong in ["a-2", "../a-1", "", "a-1.facts"] {
-            let refused = store.read(wrong, FrozenPart::Ring, 0, 10);
-            assert!(matches!(refused, Err(FrozenError::Unknown(_))), "{wrong}");
-        }
-        assert!(store.read("a-1", FrozenPart::Ring, u64::MAX, 10).unwrap().0.is_empty());
-    }
-
-    #[test]
-    fn ring_of_a_dead_node_is_kept_and_a_closed_one_is_not() {
-        let folder = Folder::new("dead");
-        let mut store = folder.store(2);
-        let journal = folder.journal();
-        assert!(store.keep_dead_ring(journal.path()).is_none(), "its writer lives");
-        let path = journal.path().to_owned();
-        let bytes = fs::read(&path).unwrap();
-        drop(journal);
-        assert!(store.keep_dead_ring(&path).is_none(), "it was closed");
-        // As SIGKILL leaves it: without the mark of the end.
-        fs::write(&path, bytes).unwrap();
-        let id = store.keep_dead_ring(&path).expect("it is there").unwrap();
-        let spans = store.spans();
-        assert!(spans.len() == 1 && spans[0].has_died && spans[0].id == id, "{spans:?}");
-        assert!(!path.exists() && store.keep_dead_ring(&path).is_none());
-    }
-
-    #[test]
-    fn half_made_files_are_removed() {
-        let folder = Folder::new("half");
-        let mut store = folder.store(2);
-        freeze(&mut store, &folder.journal(), &span("a-1", 2)).unwrap();
-        fs::write(store.path("a-2", "frozen"), b"half").unwrap();
-        fs::write(store.path("a-3", "facts"), b"\xc1").unwrap();
-        store.clean();
-        assert!(!store.path("a-2", "frozen").exists() && store.path("a-1", "frozen").exists());
-        assert_eq!(store.spans().len(), 1);
-    }
-}
+mod tests;

@@ -6,6 +6,7 @@ use sinew_lncl::{LocalApp, register_local};
 use sinew_model::config::NodeConfig;
 use sinew_record::{Channel, ClockFact, Entry, Fact as _, Form};
 use sinew_runtime::{
+    incident::{self, IncidentKind},
     router::{LocalRoute, MessageSink, SubmitError},
     tid::{AppAddress, Incarnation},
     wire::{Header, Message, Payload},
@@ -300,5 +301,68 @@ fn node_that_ends_freezes_an_incomplete_span() {
     node.recording.close(&node);
     let spans = flight.store().spans();
     assert!(spans.len() == 1 && spans[0].id == id, "{spans:?}");
+    assert!(spans[0].end_ns <= Time::now().as_nanos(), "it ends with the node: {spans:?}");
+    std::fs::remove_dir_all(folder).unwrap();
+}
+
+/// Returns a node that records in this folder, which is its own.
+fn flying(name: &str, folder: &Path) -> Arc<NodeState> {
+    std::fs::create_dir_all(folder).unwrap();
+    std::fs::set_permissions(folder, std::os::unix::fs::PermissionsExt::from_mode(0o700)).unwrap();
+    let node = node(name, |config| {
+        config.record.folder = Some(folder.to_owned());
+        config.record.after = Duration::from_secs(30);
+        config.record.frozen_max = 1;
+    });
+    node.recording.begin_configured(&node).expect("it begins");
+    node
+}
+
+#[test]
+fn failure_at_the_end_of_the_node_has_a_span() {
+    let folder = std::env::temp_dir().join(format!("sinew-failing-{}", std::process::id()));
+    let node = flying("failing", &folder);
+    let flight = node.recording.flight().expect("it records from its start").clone();
+    node.recording.stop_ordered();
+    // The thread `record` takes it before the end, or the end does.
+    for _ in 0..100 {
+        // One that meets the begin of another test's recording is not reported.
+        incident::report(Time::now(), IncidentKind::Failure, format_args!("test: the knee failed"));
+    }
+    node.recording.close(&node);
+    let spans = flight.store().spans();
+    assert_eq!(spans.len(), 1, "{spans:?}");
+    std::fs::remove_dir_all(folder).unwrap();
+}
+
+#[test]
+fn symptoms_of_an_ordered_stop_make_no_trigger() {
+    let folder = std::env::temp_dir().join(format!("sinew-stopping-{}", std::process::id()));
+    let node = flying("stopping", &folder);
+    let flight = node.recording.flight().expect("it records from its start").clone();
+    node.recording.stop_ordered();
+    incident::report(Time::now(), IncidentKind::Symptom, format_args!("test of stopping: an input is late"));
+    node.recording.close(&node);
+    // Failures of other tests of this process are causes, too.
+    let known = flight.known();
+    assert!(known.iter().all(|trigger| !trigger.cause.as_str().contains("test of stopping")), "{known:?}");
+    std::fs::remove_dir_all(folder).unwrap();
+}
+
+#[test]
+fn slow_copy_does_not_hold_the_recording() {
+    let folder = std::env::temp_dir().join(format!("sinew-slow-{}", std::process::id()));
+    let node = flying("slow", &folder);
+    let (flight, knee) = (node.recording.flight().expect("it records").clone(), app(&node, "knee"));
+    flight.happened(Time::now(), "the knee slips").expect("there is room");
+    // As a disk that takes its time: the copy waits for this lock.
+    let store = flight.store();
+    let ending = node.recording.end(&node);
+    let ask = node.recording.ask(&node, knee, Selection::default(), Time::now());
+    assert!(matches!(ask, Err(RecordError::Closed)) && !flight.wait(Duration::ZERO));
+    assert!(flight.try_store().is_none());
+    drop(store);
+    ending.wait();
+    assert_eq!(flight.store().spans().len(), 1);
     std::fs::remove_dir_all(folder).unwrap();
 }

@@ -22,6 +22,9 @@ use crate::NodeState;
 /// Maximum bytes of a frame: its numbers, and a cause of 200 bytes.
 const BYTES_MAX: usize = 1_024;
 
+/// Time to live of a frame. A node that has no connection for longer has lost the records, or is lost.
+const LIVES: Duration = Duration::from_secs(30);
+
 /// A trigger, with its time on the clock of the node that sends it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 struct Frame {
@@ -83,6 +86,8 @@ pub(super) fn forward(state: &NodeState, trigger: &Trigger) {
         let mut header = Header::new(Kind::SYNC_FREEZE, source, Tid::new(member.node, AppAddress::SYNC));
         header.sequence = lock(&state.sync.core).next_sequence();
         header.sent = Time::now();
+        // The frame has no outcome.
+        let _ = header.set_time_to_live(LIVES);
         let _ = state.ctx.router.send(Message::new(header, payload.clone()));
     }
 }

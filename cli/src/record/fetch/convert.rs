@@ -41,8 +41,20 @@ pub(super) struct Converted {
 }
 
 impl Converted {
+    /// Returns the time from its first to its last record, in nanoseconds. A ring has a record each second at least, so
+    /// a longer part that is missing was overwritten, or was not recorded.
+    pub(super) const fn covered_ns(&self) -> u64 {
+        self.last_ns.saturating_sub(self.first_ns)
+    }
+
+    /// Returns the time that was asked for, in nanoseconds. `None`: the whole ring.
+    pub(super) fn span_ns(&self) -> Option<u64> {
+        (*self.times.end() < u64::MAX).then(|| self.times.end().saturating_sub(*self.times.start()))
+    }
+
     pub(super) fn json(&self) -> Value {
         json!({
+            "covered_ns": self.covered_ns(), "span_ns": self.span_ns(),
             "file": self.file, "node": self.node, "written": self.written, "dropped": self.dropped,
             "first_ns": self.first_ns, "last_ns": self.last_ns, "begin_ns": self.times.start(),
             "end_ns": self.times.end(), "at_ns": self.trigger.map(|(at_ns, _)| at_ns),

@@ -1,18 +1,22 @@
 //! The rings of dead nodes on this host: files of this user that were not closed, and that nothing writes.
 
 use std::{
+    collections::BTreeSet,
     fs::{self, File},
     io::Read as _,
     os::unix::fs::MetadataExt as _,
     path::{Path, PathBuf},
 };
 
+use rustix::time::{ClockId, clock_gettime};
 use sinew::{NodeAddress, inspect::FrozenFacts};
 use sinew_recorder::{JournalReader, Start};
 
 /// Maximum number of files of the folder that are looked at, and of rings that are returned.
 const FILES_MAX: usize = 65_536;
 const RINGS_MAX: usize = 256;
+/// Largest change of the wall clock since the node has died, in nanoseconds. A host needs longer to start again.
+const OFFSET_STEP_MAX: u64 = 5_000_000_000;
 /// Maximum bytes of the facts beside a ring.
 const FACTS_BYTES_MAX: u64 = 4 << 20;
 
@@ -22,14 +26,58 @@ pub(super) struct DeadRing {
     pub(super) name: String,
     pub(super) address: NodeAddress,
     pub(super) facts: FrozenFacts,
+    /// The number of the incarnation, or the time of the ring's creation where that is unknown, as in the node.
+    incarnation: u64,
+    /// Whether its times are of the clock that counts now.
+    pub(super) is_of_this_boot: bool,
+}
+
+impl DeadRing {
+    /// Returns the ID by which the node hands out the whole ring, after its next start.
+    pub(super) fn id(&self) -> String {
+        format!("died-{:x}", self.incarnation)
+    }
+
+    /// Returns why it was not gathered with a span, and the remedy.
+    pub(super) fn remedy(&self) -> String {
+        let why = if self.is_of_this_boot {
+            "no other node of this host has the span"
+        } else {
+            "it is of an earlier start of the host, or the wall clock was set since"
+        };
+        format!(
+            "{} at {} has died, and {} is not gathered: {why}; start the node again, and run `sinew record fetch {}`",
+            self.name,
+            self.address,
+            self.path.display(),
+            self.id()
+        )
+    }
+}
+
+/// Returns whether a ring with this time of creation and this offset to the wall clock was written since the host has
+/// started: the monotonic clock begins anew with it. All times are nanoseconds.
+fn is_of_this_boot(created: u64, wall_offset: i64, now: u64, present_offset: i64) -> bool {
+    created <= now && wall_offset.abs_diff(present_offset) <= OFFSET_STEP_MAX
+}
+
+/// Returns the monotonic clock, and the nanoseconds from it to the wall clock.
+fn clocks() -> (u64, i64) {
+    let nanoseconds = |clock| {
+        let now = clock_gettime(clock);
+        i128::from(now.tv_sec) * 1_000_000_000 + i128::from(now.tv_nsec)
+    };
+    let (now, wall) = (nanoseconds(ClockId::Monotonic), nanoseconds(ClockId::Realtime));
+    (u64::try_from(now).unwrap_or(u64::MAX), i64::try_from(wall - now).unwrap_or(i64::MAX))
 }
 
 /// Returns the rings of dead nodes of this project: those that still have their name, and those that a later
 /// incarnation has kept.
-pub(super) fn rings(folder: &Path, project: &str) -> Vec<DeadRing> {
-    let Ok(files) = fs::read_dir(folder) else { return Vec::new() };
-    let mut paths: Vec<_> = files
-        .take(FILES_MAX)
+pub(super) fn rings(folders: BTreeSet<&Path>, project: &str) -> Vec<DeadRing> {
+    let mut paths: Vec<_> = folders
+        .into_iter()
+        .filter_map(|folder| fs::read_dir(folder).ok())
+        .flat_map(|files| files.take(FILES_MAX))
         .filter_map(|file| Some(file.ok()?.path()))
         .filter(|path| is_ring(path) && is_own(path))
         .collect();
@@ -62,7 +110,10 @@ fn ring(path: PathBuf, project: &str) -> Option<DeadRing> {
     }
     let mut facts = read_facts(&path.with_extension("facts")).unwrap_or_default();
     facts.report.name.clone_from(&name);
-    Some(DeadRing { path, name, address, facts })
+    let incarnation = facts.report.incarnation.map_or_else(|| reader.created(), |number| number.0);
+    let (now, present_offset) = clocks();
+    let is_of_this_boot = is_of_this_boot(reader.created(), reader.wall_offset().ok()?, now, present_offset);
+    Some(DeadRing { path, name, address, facts, incarnation, is_of_this_boot })
 }
 
 fn read_facts(path: &Path) -> Option<FrozenFacts> {
@@ -72,4 +123,33 @@ fn read_facts(path: &Path) -> Option<FrozenFacts> {
     }
     File::open(path).ok()?.take(FACTS_BYTES_MAX).read_to_end(&mut bytes).ok()?;
     rmp_serde::from_slice(&bytes).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SECOND: u64 = 1_000_000_000;
+
+    #[test]
+    fn ring_of_an_earlier_boot_is_known() {
+        let (now, offset) = (500 * SECOND, 1_700_000_000_000_000_000);
+        assert!(is_of_this_boot(400 * SECOND, offset, now, offset + 1_000));
+        assert!(!is_of_this_boot(501 * SECOND, offset, now, offset), "it is of a later time");
+        assert!(!is_of_this_boot(400 * SECOND, offset, now, offset + 60_000_000_000));
+        assert!(!is_of_this_boot(400 * SECOND, i64::MIN, now, i64::MAX));
+    }
+
+    #[test]
+    fn skipped_ring_has_a_remedy() {
+        let ring = DeadRing {
+            path: "/dev/shm/sinew-leg-10.0.0.2.journal".into(),
+            name: "knee".to_owned(),
+            address: NodeAddress::new(0x0a00_0002),
+            facts: FrozenFacts::default(),
+            incarnation: 0x1f,
+            is_of_this_boot: true,
+        };
+        assert!(ring.remedy().contains("`sinew record fetch died-1f`"), "{}", ring.remedy());
+    }
 }

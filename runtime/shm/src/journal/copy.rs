@@ -1,16 +1,22 @@
 //! Copies a span of a journal into a smaller journal, while the writers continue.
 
-use std::{ops::RangeInclusive, path::Path};
+use std::{io, ops::RangeInclusive, path::Path};
 
 use super::{
-    error::{CopyJournalError, ReadJournalError},
-    layout::{RING_MAX, RING_MIN, record_bytes},
+    error::{CopyJournalError, CreateJournalError, ReadJournalError},
+    layout::{
+        CLOSED_AT, Head, Header, RESERVED_AT, RING_AT, RING_MAX, RING_MIN, State, TABLE_AT, WALL_OFFSET_AT,
+        hasher, record_bytes, salt_of, stamp,
+    },
+    platform::{self, NewFile},
     reader::{JournalReader, Record, Start},
-    writer::{Journal, Options},
+    writer::Options,
 };
 
 /// Maximum number of damaged parts that a copy leaves out. A journal with more of them is given up there.
 const DAMAGED_MAX: u32 = 1_024;
+/// Bytes of records that are written by one call.
+const WAITING_BYTES: usize = 256 * 1024;
 
 /// The records of a copy.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -31,8 +37,11 @@ pub struct Copied {
 /// The source is read twice, up to its end at that moment: for the size of the copy, and for its records. It
 /// may be written meanwhile: overwritten records are missing in the copy, and their numbers show it.
 ///
+/// The target is written by calls and is never mapped, so it may lie on a disk: a fault of the disk is an error. It has
+/// its name when it is whole.
+///
 /// # Errors
-/// The source cannot be read, or the target cannot be created. Then there is no new file.
+/// The source cannot be read, or the target cannot be created or written. Then there is no new file.
 ///
 /// # Examples
 ///
@@ -61,45 +70,121 @@ pub fn copy_span(
     span: &RangeInclusive<u64>,
 ) -> Result<Copied, CopyJournalError> {
     let (mut bytes, mut longest) = (0_u64, 0_u64);
-    each_record(source, span, |_, payload| {
+    each_record::<ReadJournalError>(source, span, |_, payload| {
         let length = record_bytes(payload.len());
         bytes = bytes.saturating_add(length);
         longest = longest.max(length);
+        Ok(())
     })?;
     // The longest record fits into a quarter of the ring.
-    let ring_bytes = bytes.max(longest.saturating_mul(4)).clamp(RING_MIN, RING_MAX);
+    let ring_bytes = bytes.max(longest.saturating_mul(4)).clamp(RING_MIN, RING_MAX).next_power_of_two();
     let reader = JournalReader::open(source, Start::Newest)?;
-    let options = Options {
+    let header = Header {
         ring_bytes,
-        identity: reader.identity(),
-        now: reader.created(),
-        wall_offset: reader.wall_offset()?,
-        ..Options::default()
+        salt: salt_of(Options::default().random),
+        created: reader.created(),
+        writer: std::process::id(),
+        identity: reader.identity().to_vec(),
     };
-    let journal = Journal::create(target, &options)?;
-    let mut copied = Copied { ring_bytes: ring_bytes.next_power_of_two(), ..Copied::default() };
-    let read = each_record(source, span, |record, payload| {
-        if journal.copy_record(record, payload) {
-            copied.add(record.time);
-        }
-    });
-    // Last: each record that was copied has its place in the table.
-    match read.and_then(|()| reader.table()) {
-        Ok(table) => journal.copy_table(&table),
-        Err(why) => {
-            journal.remove();
-            return Err(why.into());
-        }
-    }
+    let page = header.encode().ok_or(CreateJournalError::Identity(header.identity.len()))?;
+    let wall_offset = reader.wall_offset()?;
+    let mut copied = Copied { ring_bytes, ..Copied::default() };
+    platform::write_file(target, |file| {
+        let failed = |cause| CreateJournalError::System {
+            path: target.to_owned(),
+            step: "its bytes cannot be written",
+            cause,
+        };
+        file.reserve(RING_AT as u64 + bytes, header.file_bytes()).map_err(failed)?;
+        file.put(0, &page).map_err(failed)?;
+        file.put(WALL_OFFSET_AT, &wall_offset.to_ne_bytes()).map_err(failed)?;
+        let mut ring = Ring { file, salt: header.salt, room: ring_bytes, position: 0, waiting: Vec::new() };
+        each_record::<CopyJournalError>(source, span, |record, payload| {
+            if ring.push(record, payload).map_err(failed)? {
+                copied.add(record.time);
+            }
+            Ok(())
+        })?;
+        ring.flush().map_err(failed)?;
+        // Last: each record that was copied has its place in the table.
+        let table: Vec<u8> = reader.table()?.into_iter().flat_map(u64::to_ne_bytes).collect();
+        file.put(TABLE_AT, &table).map_err(failed)?;
+        file.put(RESERVED_AT, &ring.position.to_ne_bytes()).map_err(failed)?;
+        file.put(CLOSED_AT, &1_u64.to_ne_bytes()).map_err(failed)?;
+        Ok(())
+    })?;
     Ok(copied)
 }
 
-/// Calls `each` with the records within the span that were written before this call.
-fn each_record(
+/// Returns the number of records with times within `span` in the journal at `path`.
+///
+/// # Errors
+/// The journal cannot be read.
+pub fn count_span(path: &Path, span: &RangeInclusive<u64>) -> Result<u64, ReadJournalError> {
+    let mut records = 0;
+    each_record::<ReadJournalError>(path, span, |_, _| {
+        records += 1;
+        Ok(())
+    })?;
+    Ok(records)
+}
+
+/// The ring of a copy. Its records lie one after the other, from its start.
+struct Ring<'a> {
+    file: &'a NewFile<'a>,
+    salt: u64,
+    /// Bytes of the ring. The second reading may find some more records than the first one.
+    room: u64,
+    /// Bytes of the records so far.
+    position: u64,
+    /// The last of them, which are not in the file yet.
+    waiting: Vec<u8>,
+}
+
+impl Ring<'_> {
+    /// Adds a record with its place and its number. Returns `false` if there is no room.
+    fn push(&mut self, record: &Record, payload: &[u8]) -> io::Result<bool> {
+        let bytes = record_bytes(payload.len());
+        let Ok(length) = u32::try_from(payload.len()) else { return Ok(false) };
+        if self.position + bytes > self.room {
+            return Ok(false);
+        }
+        let Record { place, number, time, .. } = *record;
+        let head = Head { length, place, number, time };
+        let mut crc = hasher(self.position, &head);
+        crc.update(payload);
+        let begin = self.waiting.len();
+        let [first, second, third] = head.words();
+        let words =
+            [stamp(self.position, State::Written, self.salt), first, second, third, crc.finalize().into()];
+        words.iter().for_each(|word| self.waiting.extend(word.to_ne_bytes()));
+        self.waiting.extend(payload);
+        self.waiting.resize(begin + bytes as usize, 0);
+        self.position += bytes;
+        if self.waiting.len() >= WAITING_BYTES {
+            self.flush()?;
+        }
+        Ok(true)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        let begin = RING_AT + self.position as usize - self.waiting.len();
+        self.file.put(begin, &self.waiting)?;
+        self.waiting.clear();
+        Ok(())
+    }
+}
+
+/// Calls `each` with the records with times within `span` that were written before this call. Damaged parts are left
+/// out.
+///
+/// # Errors
+/// The journal cannot be read, or has over 1,024 damaged parts; or the error of `each`, which is not called again.
+pub fn each_record<E: From<ReadJournalError>>(
     source: &Path,
     span: &RangeInclusive<u64>,
-    mut each: impl FnMut(&Record, &[u8]),
-) -> Result<(), ReadJournalError> {
+    mut each: impl FnMut(&Record, &[u8]) -> Result<(), E>,
+) -> Result<(), E> {
     let mut reader = JournalReader::open(source, Start::Oldest)?;
     let (end, mut payload, mut damaged) = (reader.reserved()?, Vec::new(), 0);
     loop {
@@ -107,12 +192,12 @@ fn each_record(
             Ok(Some(record)) if record.position >= end => return Ok(()),
             Ok(Some(record)) => {
                 if span.contains(&record.time) {
-                    each(&record, &payload);
+                    each(&record, &payload)?;
                 }
             }
             Ok(None) => return Ok(()),
             Err(ReadJournalError::Damaged { .. }) if damaged < DAMAGED_MAX => damaged += 1,
-            Err(why) => return Err(why),
+            Err(why) => return Err(why.into()),
         }
     }
 }

@@ -2,7 +2,10 @@
 
 use std::{convert::Infallible, io, path::Path, sync::atomic::AtomicU64};
 
-use super::{core::Memory, error::CreateJournalError};
+use super::{
+    core::Memory,
+    error::{CopyJournalError, CreateJournalError},
+};
 
 /// Cannot exist on this platform.
 #[derive(Debug)]
@@ -39,6 +42,17 @@ impl NewFile {
     pub(crate) fn put(&self, _: usize, _: &[u8]) -> io::Result<()> {
         match self.0 {}
     }
+
+    pub(crate) fn reserve(&self, _: u64, _: u64) -> io::Result<()> {
+        match self.0 {}
+    }
+}
+
+pub(crate) fn write_file(
+    _: &Path,
+    _: impl FnOnce(&NewFile) -> Result<(), CopyJournalError>,
+) -> Result<(), CopyJournalError> {
+    Err(CreateJournalError::Unsupported.into())
 }
 
 pub(crate) fn create(

@@ -103,7 +103,7 @@ pub enum CopyJournalError {
     /// The source cannot be read.
     #[error(transparent)]
     Read(#[from] ReadJournalError),
-    /// The copy cannot be created.
+    /// The copy cannot be created or written.
     #[error(transparent)]
     Create(#[from] CreateJournalError),
 }

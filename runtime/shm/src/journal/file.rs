@@ -1,4 +1,5 @@
-//! The file of a journal: made safely, and mapped. **The one unsafe block of journals is here.**
+//! The file of a journal: made safely, and mapped; or written by calls, as a copy is. **The one unsafe block of
+//! journals is here.**
 //!
 //! It rests on these facts:
 //!
@@ -31,7 +32,7 @@ use rustix::{
 
 use super::{
     core::Memory,
-    error::CreateJournalError,
+    error::{CopyJournalError, CreateJournalError},
     layout::{HEADER_BYTES, PLACE_WORDS, PLACES, RESERVED_AT, RING_AT, TABLE_AT},
 };
 
@@ -85,6 +86,12 @@ impl NewFile<'_> {
     pub(crate) fn put(&self, at: usize, bytes: &[u8]) -> io::Result<()> {
         self.0.write_all_at(bytes, at as u64)
     }
+
+    /// Allocates the first bytes, so that a full disk is an error here, and sets the length of the file.
+    pub(crate) fn reserve(&self, allocated: u64, length: u64) -> io::Result<()> {
+        allocate(self.0, allocated)?;
+        self.0.set_len(length)
+    }
 }
 
 /// Creates a file of so many bytes, has `fill` write its first ones, and then gives it its name.
@@ -96,15 +103,7 @@ pub(crate) fn create(
 ) -> Result<Map, CreateJournalError> {
     let failed =
         |step| move |cause: io::Error| CreateJournalError::System { path: path.to_owned(), step, cause };
-    let refused = |why| CreateJournalError::Folder { path: path.to_owned(), why };
-    let name = path.file_name().ok_or_else(|| refused("the path ends without a file name"))?;
-    let folder =
-        path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
-    let flags = OFlags::DIRECTORY | OFlags::RDONLY | OFlags::CLOEXEC;
-    let folder = rustix::fs::open(folder, flags, Mode::empty())
-        .map_err(io::Error::from)
-        .map_err(failed("its folder cannot be opened"))?;
-    check_folder(&folder).map_err(failed("its folder cannot be looked at"))?.map_err(refused)?;
+    let (folder, name) = open_folder(path)?;
     let (temporary, file) = new_file(&folder, name).map_err(failed("a file cannot be made"))?;
     let finish = || {
         flock(&file, FlockOperation::NonBlockingLockExclusive)
@@ -132,6 +131,47 @@ pub(crate) fn create(
             Err(error)
         }
     }
+}
+
+/// Creates a file, has `fill` write it, and then gives it its name.
+///
+/// It is never mapped: on a disk that fails, a write through a mapping ends the process.
+pub(crate) fn write_file(
+    path: &Path,
+    fill: impl FnOnce(&NewFile<'_>) -> Result<(), CopyJournalError>,
+) -> Result<(), CopyJournalError> {
+    let failed =
+        |step| move |cause: io::Error| CreateJournalError::System { path: path.to_owned(), step, cause };
+    let (folder, name) = open_folder(path)?;
+    let (temporary, file) = new_file(&folder, name).map_err(failed("a file cannot be made"))?;
+    let finish = || {
+        fill(&NewFile(&file))?;
+        file.sync_data().map_err(failed("its bytes cannot be stored"))?;
+        renameat(&folder, &temporary, &folder, name)
+            .map_err(io::Error::from)
+            .map_err(failed("the file cannot be given its name"))?;
+        Ok(())
+    };
+    finish().inspect_err(|_| {
+        // The first error is the one to report.
+        let _ = unlinkat(&folder, &temporary, AtFlags::empty());
+    })
+}
+
+/// Opens the folder of a path, if no other user can replace its files. Returns the file's name, too.
+fn open_folder(path: &Path) -> Result<(OwnedFd, &OsStr), CreateJournalError> {
+    let failed =
+        |step| move |cause: io::Error| CreateJournalError::System { path: path.to_owned(), step, cause };
+    let refused = |why| CreateJournalError::Folder { path: path.to_owned(), why };
+    let name = path.file_name().ok_or_else(|| refused("the path ends without a file name"))?;
+    let folder =
+        path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
+    let flags = OFlags::DIRECTORY | OFlags::RDONLY | OFlags::CLOEXEC;
+    let folder = rustix::fs::open(folder, flags, Mode::empty())
+        .map_err(io::Error::from)
+        .map_err(failed("its folder cannot be opened"))?;
+    check_folder(&folder).map_err(failed("its folder cannot be looked at"))?.map_err(refused)?;
+    Ok((folder, name))
 }
 
 /// Returns why other users could replace files of this folder.

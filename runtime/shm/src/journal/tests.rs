@@ -4,6 +4,7 @@ use std::{
     fs::{self, OpenOptions},
     os::unix::fs::{FileExt, PermissionsExt, symlink},
     path::PathBuf,
+    sync::atomic::{AtomicBool, Ordering},
 };
 
 use proptest::prelude::*;
@@ -12,6 +13,7 @@ use super::{
     ChannelKey, Copied, CreateJournalError, Journal, JournalHeaderError, JournalReader, Options,
     ReadJournalError, Start, copy_span,
     layout::{HEADER_BYTES, RING_AT, TABLE_AT, TABLE_BYTES},
+    platform,
 };
 
 const KEY: ChannelKey = ChannelKey([7, 8, 9]);
@@ -270,4 +272,41 @@ proptest! {
             reader.channels().unwrap();
         }
     }
+}
+
+#[test]
+fn copy_survives_a_target_that_is_cut() {
+    let folder = Folder::new("cut-copy");
+    let target = folder.0.join("knee.frozen");
+    let options = Options { ring_bytes: 1 << 20, ..small() };
+    let journal = Journal::create(&folder.path(), &options).unwrap();
+    (0..1_000).for_each(|time| assert!(journal.write(KEY, time, &[&[7; 900]])));
+    let is_over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !is_over.load(Ordering::Relaxed) {
+                for file in fs::read_dir(&folder.0).unwrap() {
+                    let path = file.unwrap().path();
+                    // As a disk that loses its blocks: an access through a mapping ends the process.
+                    if path.to_string_lossy().contains("knee.frozen")
+                        && let Ok(file) = OpenOptions::new().write(true).open(path)
+                    {
+                        file.set_len(0).unwrap();
+                    }
+                }
+            }
+        });
+        let copied: Vec<_> = (0..30).map(|_| copy_span(&folder.path(), &target, &(0..=1_000))).collect();
+        is_over.store(true, Ordering::Relaxed);
+        assert!(copied.iter().all(Result::is_ok), "{copied:?}");
+    });
+}
+
+#[test]
+fn failed_copy_leaves_no_file() {
+    let folder = Folder::new("failed-copy");
+    let target = folder.0.join("knee.frozen");
+    let fails = |_: &platform::NewFile<'_>| Err(CreateJournalError::Size(0).into());
+    assert!(platform::write_file(&target, fails).is_err());
+    assert_eq!(fs::read_dir(&folder.0).unwrap().count(), 0);
 }

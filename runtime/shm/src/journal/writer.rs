@@ -14,7 +14,6 @@ use super::{
     error::CreateJournalError,
     layout::{Head, Header, RING_MAX, RING_MIN, payload_max, salt_of},
     platform::{self, Map},
-    reader::Record,
 };
 
 /// The properties of a new journal.
@@ -126,27 +125,6 @@ impl Journal {
         begin(&self.map, reserved, self.salt);
         finish(&self.map, reserved, parts, self.salt);
         true
-    }
-
-    /// Writes a record of another journal, with its place and its number. Returns `false` if it is too long.
-    pub(super) fn copy_record(&self, record: &Record, payload: &[u8]) -> bool {
-        let Ok(length) = u32::try_from(payload.len()) else { return false };
-        if payload.len() > self.payload_max {
-            return false;
-        }
-        let Record { place, number, time, .. } = *record;
-        let reserved = reserve(&self.map, Head { length, place, number, time });
-        begin(&self.map, reserved, self.salt);
-        finish(&self.map, reserved, &[payload], self.salt);
-        true
-    }
-
-    /// Writes the table of channels of another journal.
-    pub(super) fn copy_table(&self, words: &[u64]) {
-        for (target, word) in self.map.table().iter().zip(words) {
-            // SYNC: Relaxed: the file has its name before, and its readers see the table when the copy is announced.
-            target.store(*word, Ordering::Relaxed);
-        }
     }
 
     /// Counts messages of a channel that are not written.

@@ -3,7 +3,10 @@
 use actix::Actor;
 
 use super::AppContext;
-use crate::{incident, time::Time};
+use crate::{
+    incident::{self, IncidentKind},
+    time::Time,
+};
 
 impl<A: Actor<Context = Self>> AppContext<A> {
     /// Has all nodes that record freeze the messages around this moment, as after a fault. `sinew record fetch` gathers
@@ -36,6 +39,6 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     /// }
     /// ```
     pub fn freeze_recording(&self, reason: &str) {
-        incident::report(Time::now(), format_args!("{}: {reason}", self.tid()));
+        incident::report(Time::now(), IncidentKind::Symptom, format_args!("{}: {reason}", self.tid()));
     }
 }

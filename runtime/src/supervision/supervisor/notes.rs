@@ -2,7 +2,7 @@
 
 use super::Supervisor;
 use crate::{
-    incident,
+    incident::{self, IncidentKind},
     supervision::{Reason, core::ChildId, supervisor_handle::ChildRecord},
     time::Time,
 };
@@ -44,7 +44,7 @@ impl Supervisor {
         // The panic hook has already logged the message.
         let place = if let Reason::Panic(words) = reason { words.rsplit_once(" at ") } else { None };
         let reason = place.map_or_else(|| reason.to_string(), |(_, place)| format!("a panic at {place}"));
-        incident::report(Time::now(), format_args!("{child} failed: {reason}"));
+        incident::report(Time::now(), IncidentKind::Failure, format_args!("{child} failed: {reason}"));
         crate::log::error!(supervisor, child, tid, generation, restarts, waiting, reason, "a child failed");
     }
 

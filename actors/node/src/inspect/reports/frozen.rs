@@ -14,6 +14,10 @@ pub const FROZEN_SPANS_MAX: usize = 128;
 /// Maximum bytes of a frozen file in one answer.
 pub const FROZEN_BYTES_MAX: usize = 32 * 1024;
 
+/// The refusal of a question about frozen spans while the node writes to their folder. The same question succeeds some
+/// milliseconds later.
+pub const FROZEN_BUSY: &str = "a span is being frozen; ask again";
+
 /// Has all nodes that record freeze the messages around this moment. [`FreezeReport`] answers.
 ///
 /// Only a program on the node's own host, of the node's user or of root, may ask.
@@ -100,6 +104,9 @@ pub struct FrozenReport {
     pub name: String,
     /// The folder of the journal on the node's host; `None` without `record.folder`.
     pub folder: Option<String>,
+    /// The folder of the frozen spans on the node's host, which may hold rings of dead nodes, too.
+    #[serde(default)]
+    pub frozen_folder: Option<String>,
     /// The frozen spans, if no one was asked for.
     #[serde(deserialize_with = "at_most::<_, _, FROZEN_SPANS_MAX>")]
     pub spans: Vec<FrozenSpan>,
@@ -137,7 +144,7 @@ pub struct FrozenSpan {
     pub bytes: u64,
     /// Whether it is the whole ring of a former incarnation of the node, which has died.
     pub has_died: bool,
-    /// Whether it was fetched since the node's start.
+    /// Whether it was fetched.
     pub is_fetched: bool,
 }
 
