@@ -6,6 +6,7 @@
 //! | [`channel`] | the key of a channel: source, destination, payload type, class, form, rejection |
 //! | [`entry`] | a record: a message, or one of the facts below |
 //! | [`facts`] | events of nodes and applications, clock offsets, log lines |
+//! | [`frozen`] | the questions that freeze a span of the recordings and that fetch one, and their answers |
 //! | [`question`] | the question that has a node record, and its answer |
 //! | [`tap`] | writes the selected messages of a routing table |
 //! | [`selection`] | applications, payload types and groups, by names and patterns |
@@ -13,6 +14,7 @@
 pub mod channel;
 pub mod entry;
 pub mod facts;
+pub mod frozen;
 pub mod question;
 pub mod selection;
 pub mod tap;
@@ -20,6 +22,10 @@ pub mod tap;
 pub use channel::{Channel, Form};
 pub use entry::{Entry, EntryError, MESSAGE_HEAD, MessageEntry, fact, message_head};
 pub use facts::{ClockFact, Fact, LogFact, NodeFact, PeerClock};
+pub use frozen::{
+    AskFreeze, AskFrozen, FROZEN_BUSY, FROZEN_BYTES_MAX, FROZEN_SPANS_MAX, FreezeReport, FrozenFacts,
+    FrozenPart, FrozenReport, FrozenSpan,
+};
 pub use question::{
     AskRecord, CLOCKS_MAX, RECORDED_MAX, RecordReport, RecordedApp, RecordedType, SCHEMAS_MAX,
 };

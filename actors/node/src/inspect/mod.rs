@@ -34,7 +34,6 @@ mod types;
 mod watches;
 
 pub(crate) use inspector::begin;
-pub(crate) use record::names_for_reader;
 #[cfg(test)]
 pub(crate) use record::recorded;
 pub use reports::{

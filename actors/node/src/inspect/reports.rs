@@ -17,10 +17,6 @@ mod watch;
 pub use access::{AccessReport, AccessVerdict, AskAccess, AskReload, ReloadReport};
 pub use apps::{APPS_MAX, AppReport, AppsReport, AskApps, BarrierReport, KindReport, Missing, WaitReport};
 pub use audit::{AskAudit, AuditReport};
-pub use frozen::{
-    AskFreeze, AskFrozen, FROZEN_BUSY, FROZEN_BYTES_MAX, FROZEN_SPANS_MAX, FreezeReport, FrozenFacts,
-    FrozenPart, FrozenReport, FrozenSpan,
-};
 pub use node::{AskNode, NodeReport, PEERS_MAX};
 pub use peers::{
     DialReport, ForeignReport, IdleReport, LinkReport, LostReport, PeerReport, RouteReport, SourceReport,
@@ -37,7 +33,11 @@ pub use types::{
 pub use watch::{AskWatch, SEEN_BYTES_MAX, SEEN_MAX, SeenMessage, WatchReport};
 
 use serde::{Deserialize, Serialize};
-pub use sinew_record::{AskRecord, RECORDED_MAX, RecordReport, RecordedApp, RecordedType, SCHEMAS_MAX};
+pub use sinew_record::{
+    AskFreeze, AskFrozen, AskRecord, FROZEN_BUSY, FROZEN_BYTES_MAX, FROZEN_SPANS_MAX, FreezeReport,
+    FrozenFacts, FrozenPart, FrozenReport, FrozenSpan, RECORDED_MAX, RecordReport, RecordedApp, RecordedType,
+    SCHEMAS_MAX,
+};
 use sinew_runtime::wire::{Class, Payload, encode};
 
 /// Maximum number of lost nodes, causes of refusals, or barriers in one answer.

@@ -16,7 +16,7 @@ use std::{
 };
 
 use rustix::fs::{Access, access};
-use sinew_record::NodeFact;
+use sinew_record::{FrozenFacts, FrozenSpan, NodeFact, RecordReport};
 use sinew_runtime::{
     incident::{self, IncidentKind, IncidentObserver},
     lock, log,
@@ -26,14 +26,12 @@ use sinew_shm::journal::Journal;
 
 use super::{
     facts::{self, Changes},
+    names::names_for_reader,
     plan::{FreezePlan, Output, SpanOrder, Trigger, TriggerId},
     store::{FrozenError, FrozenStore, move_ring, read_facts, write_facts},
     triggers::forward,
 };
-use crate::{
-    NodeState,
-    inspect::{FrozenFacts, FrozenSpan, RecordReport, names_for_reader},
-};
+use crate::NodeState;
 
 /// Maximum number of causes between two looks. Further ones belong to the same span, or are lost in a flood.
 const CAUSES_MAX: usize = 16;

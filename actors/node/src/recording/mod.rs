@@ -9,6 +9,7 @@
 
 mod facts;
 mod flight;
+mod names;
 mod plan;
 mod store;
 #[cfg(test)]
@@ -35,9 +36,9 @@ use sinew_runtime::{
 };
 use sinew_shm::journal::{CreateJournalError, Journal, Options};
 
-pub(crate) use facts::clocks;
 use facts::{KnownFacts, LogWriter};
 pub(crate) use flight::Flight;
+pub(crate) use names::{journal_kinds, report};
 pub(crate) use triggers::Triggers;
 
 use crate::NodeState;

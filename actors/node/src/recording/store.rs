@@ -12,7 +12,7 @@ use std::{
 use sinew_runtime::{lock, wire};
 use sinew_shm::journal::{CopyJournalError, JournalReader, Start, copy_span, count_span};
 
-use crate::inspect::{FROZEN_SPANS_MAX, FrozenFacts, FrozenPart, FrozenSpan};
+use sinew_record::{FROZEN_SPANS_MAX, FrozenFacts, FrozenPart, FrozenSpan};
 
 /// Maximum bytes of a file with facts. A longer one is not read.
 const FACTS_BYTES_MAX: u64 = 4 << 20;
