@@ -52,8 +52,9 @@ pub(super) type Wanted = (NodeAddress, TypeHash);
 #[derive(Debug, Default)]
 pub(crate) struct Verdicts {
     pairs: BTreeMap<TypedPath, Pair>,
-    /// The structures of other nodes that a pair needs.
-    fetched: BTreeMap<TypeHash, Schema>,
+    /// The structures that a pair needs, by the node that sent them. A hash is no proof: a node can construct a second
+    /// structure of the same hash. So the structure of one node says nothing about the messages of another one.
+    fetched: BTreeMap<Wanted, Schema>,
     /// When each missing structure was requested last.
     asked: BTreeMap<Wanted, Time>,
     /// When each path was logged last, for those within [`TELL_AGAIN`].
@@ -111,6 +112,11 @@ impl Pair {
             && (self.source.as_str(), self.target.as_str()) == (sent.name.as_str(), handled.name.as_str())
     }
 
+    /// Returns the sender's structure and its node.
+    const fn wanted(&self, path: &TypedPath) -> Wanted {
+        (path.source.node, (path.kind, self.sent))
+    }
+
     fn judge(&mut self, sent: &Schema) {
         let judgement = Judgement::of(sent, self.schema, self.policy);
         let mismatch = Mismatch::new(judgement.treatment == Treatment::Refused);
@@ -159,7 +165,7 @@ impl Verdicts {
                 let former = self.pairs.remove(&path).filter(|pair| pair.is_of(sent, handled));
                 let mut pair = former.unwrap_or_else(|| Pair::new(sent, handled));
                 if pair.verdict.is_none()
-                    && let Some(schema) = self.fetched.get(&(sent.kind, sent.hash))
+                    && let Some(schema) = self.fetched.get(&(sent.tid.node, (sent.kind, sent.hash)))
                 {
                     pair.judge(schema);
                 }
@@ -171,7 +177,7 @@ impl Verdicts {
     }
 
     fn wanted(&mut self, now: Time) -> Vec<Wanted> {
-        let used: BTreeSet<TypeHash> = self.pairs.iter().map(|(path, pair)| (path.kind, pair.sent)).collect();
+        let used: BTreeSet<Wanted> = self.pairs.iter().map(|(path, pair)| pair.wanted(path)).collect();
         self.fetched.retain(|of, _| used.contains(of));
         let open = self.open();
         self.asked.retain(|asked, _| open.contains(asked));
@@ -186,15 +192,16 @@ impl Verdicts {
     /// Returns the missing structures.
     fn open(&self) -> BTreeSet<Wanted> {
         let open = self.pairs.iter().filter(|(_, pair)| pair.verdict.is_none());
-        open.map(|(path, pair)| (path.source.node, (path.kind, pair.sent))).collect()
+        open.map(|(path, pair)| pair.wanted(path)).collect()
     }
 
-    /// Handles the structure that `from` sent. One that is not missing is ignored.
+    /// Handles the structure that `from` sent, for the messages of `from` alone. One that is not missing is ignored.
     ///
     /// # Errors
     /// Returns the fault if the bytes are not the structure of this hash.
     pub(super) fn received(&mut self, from: NodeAddress, of: TypeHash, bytes: &[u8]) -> Result<(), String> {
-        if !self.open().contains(&(from, of)) {
+        let wanted = (from, of);
+        if !self.open().contains(&wanted) {
             return Ok(());
         }
         let schema =
@@ -203,12 +210,12 @@ impl Verdicts {
             return Err(format!("from {from}, of kind {}: it has another hash than requested", of.0));
         }
         for (path, pair) in &mut self.pairs {
-            if (path.kind, pair.sent) == of && pair.verdict.is_none() {
+            if pair.wanted(path) == wanted && pair.verdict.is_none() {
                 pair.judge(&schema);
             }
         }
-        self.asked.retain(|(_, asked), _| *asked != of);
-        self.fetched.insert(of, schema);
+        self.asked.remove(&wanted);
+        self.fetched.insert(wanted, schema);
         Ok(())
     }
 
@@ -254,9 +261,9 @@ impl Verdicts {
         self.pairs.iter().filter_map(|(path, pair)| pair.disagreement(*path)).collect()
     }
 
-    /// Returns a structure that another node has sent.
-    pub(crate) fn fetched(&self, of: TypeHash) -> Option<&Schema> {
-        self.fetched.get(&of)
+    /// Returns the structure that this node has sent.
+    pub(crate) fn fetched(&self, from: NodeAddress, of: TypeHash) -> Option<&Schema> {
+        self.fetched.get(&(from, of))
     }
 }
 

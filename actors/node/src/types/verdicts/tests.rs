@@ -135,7 +135,7 @@ fn verdict_ends_with_the_declaration() {
     assert_eq!(bench.verdicts.declare(at(1), &[handled::<Gains>()], &[]), []);
     bench.install();
     assert_eq!(bench.delivers(), Ok(()));
-    assert!(bench.verdicts.fetched((KIND, schema::<Renamed>().hash())).is_none());
+    assert!(bench.verdicts.fetched(HIP, (KIND, schema::<Renamed>().hash())).is_none());
 }
 
 #[test]
@@ -154,7 +154,7 @@ fn only_the_requested_structure_of_its_node_counts() {
     let of = (KIND, schema::<Renamed>().hash());
     let bytes = schema::<Renamed>().encode();
     verdicts.received(HIP, of, &bytes).unwrap();
-    assert!(verdicts.fetched(of).is_none(), "nobody asked");
+    assert!(verdicts.fetched(HIP, of).is_none(), "nobody asked");
     verdicts.declare(at(0), &[handled::<Gains>()], &[sent::<Renamed>()]);
     verdicts.received(NodeAddress::new(9), of, &bytes).unwrap();
     assert!(verdicts.table().is_empty(), "another node was asked");
@@ -163,6 +163,24 @@ fn only_the_requested_structure_of_its_node_counts() {
     assert!(verdicts.table().is_empty());
     verdicts.received(HIP, of, &bytes).unwrap();
     assert_eq!(verdicts.table().len(), 1);
+}
+
+#[test]
+fn structure_of_a_node_judges_its_own_messages_only() {
+    let mut verdicts = Verdicts::default();
+    let of = (KIND, schema::<Renamed>().hash());
+    let foot = NodeAddress::new(3);
+    let of_foot = Sent { tid: Tid::new(foot, AppAddress::new(0x1000)), ..sent::<Renamed>() };
+    let both = [sent::<Renamed>(), of_foot.clone()];
+    assert_eq!(verdicts.declare(at(0), &[handled::<Gains>()], &both), [(HIP, of), (foot, of)]);
+    verdicts.received(HIP, of, &schema::<Renamed>().encode()).unwrap();
+    let judged: Vec<_> = verdicts.table().into_iter().map(|(path, _)| path.source.node).collect();
+    assert_eq!(judged, [HIP]);
+    // The structure of the one does not serve for the other at the next declaration either.
+    assert_eq!(verdicts.declare(at(2), &[handled::<Gains>()], &both), [(foot, of)]);
+    assert!(verdicts.fetched(foot, of).is_none() && verdicts.table().len() == 1);
+    verdicts.received(foot, of, &schema::<Renamed>().encode()).unwrap();
+    assert_eq!(verdicts.table().len(), 2);
 }
 
 #[test]
