@@ -135,7 +135,8 @@ fn text(name: &str, structures: &Structures, differences: &[Difference]) -> Stri
         text += &format!("\n{hash}\n");
         text += &users("handled by", &structure.handled_by);
         text += &users("sent by", &structure.sent_by);
-        text += &structure.words().lines().map(|line| format!("    {}\n", clean_lines(line))).collect::<String>();
+        text +=
+            &structure.words().lines().map(|line| format!("    {}\n", clean_lines(line))).collect::<String>();
     }
     if !structures.unknown.is_empty() {
         text += &format!("\nwith an unknown structure\n{}", users("handled by", &structures.unknown));

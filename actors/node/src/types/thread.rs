@@ -5,6 +5,7 @@
 //! holds each lock only for a copy of bounded length.
 
 use std::{
+    collections::BTreeMap,
     io,
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{Arc, Weak, atomic::Ordering},
@@ -23,7 +24,7 @@ use sinew_runtime::{
     time::Time,
     wire::{Class, Header, Kind, Message, encode},
 };
-use sinew_sync::AppTypes;
+use sinew_sync::{AppTypes, ListVersion};
 use tokio::{
     runtime::{Builder, Runtime},
     sync::{Notify, watch},
@@ -49,7 +50,8 @@ pub(crate) fn begin(state: &Arc<NodeState>) -> io::Result<()> {
         state: Arc::downgrade(state),
         wake: state.types.wake.clone(),
         changes: state.ctx.directory_changes.subscribe(),
-        installed: Vec::new(),
+        lists: BTreeMap::new(),
+        installed: (Vec::new(), 0),
     };
     thread::Builder::new().name("types".to_owned()).spawn(move || comparing.run(&runtime))?;
     Ok(())
@@ -60,8 +62,16 @@ struct Comparing {
     state: Weak<NodeState>,
     wake: Arc<Notify>,
     changes: watch::Receiver<u64>,
-    /// The entries of the routing table.
-    installed: Vec<(TypedPath, Arc<Mismatch>)>,
+    /// The types that other nodes list, as of the last step.
+    lists: BTreeMap<NodeAddress, SentTypes>,
+    /// The entries of the routing table, and the number of changes of routes before them.
+    installed: (Vec<(TypedPath, Arc<Mismatch>)>, u64),
+}
+
+/// The types that the applications of another node send.
+struct SentTypes {
+    of: ListVersion,
+    sent: Vec<Sent>,
 }
 
 impl Comparing {
@@ -102,43 +112,76 @@ impl Comparing {
 
     /// Handles all that is new. Returns the time of the next step.
     fn step(&mut self, state: &NodeState) -> Option<Time> {
+        // Before the directory is read: a node that is linked anew since then may have other types.
+        let peer_changes = state.ctx.router.peer_changes();
         publish(state);
         for (from, frame) in state.types.take_frames() {
             if let Err(fault) = handle(state, from, frame) {
                 state.ctx.refusals.count(Time::now(), "types", &fault);
             }
         }
-        let (handled, sent) = declared(state);
+        let handled = handled(state);
+        self.read_lists(state);
         let now = Time::now();
-        let (wanted, due, table, next) = {
+        let (wanted, due, mut table, next) = {
             let mut verdicts = lock(&state.types.verdicts);
-            let wanted = verdicts.declare(now, &handled, &sent);
+            let wanted = verdicts.declare(now, &handled, self.lists.values().flat_map(|list| &list.sent));
             let due = verdicts.take_due(now);
             (wanted, due, verdicts.table(), verdicts.next_wake())
         };
-        self.install(state, table);
+        table.retain(|(path, _)| self.is_linked(state, path.source.node));
+        let is_set = self.install(state, table, peer_changes);
         for (node, (kind, hash)) in wanted {
             // It is requested again.
             let _ = send(state, node, Kind::SYNC_SCHEMA_ASK, &SchemaQuestion { kind, hash });
         }
         due.iter().for_each(|disagreement| tell(state, disagreement));
-        next
+        if is_set { next } else { Some(now) }
     }
 
-    /// Puts the entries into the routing table, if they are others than before.
-    fn install(&mut self, state: &NodeState, table: Vec<(TypedPath, Arc<Mismatch>)>) {
-        let mut pairs = table.iter().zip(&self.installed);
+    /// Reads the lists that have changed. The lock of the directory is held for the types of one node at a time.
+    fn read_lists(&mut self, state: &NodeState) {
+        let versions: BTreeMap<_, _> = lock(&state.sync.core).list_versions().into_iter().collect();
+        self.lists.retain(|node, list| versions.get(node) == Some(&list.of));
+        for (node, of) in versions {
+            self.lists.entry(node).or_insert_with(|| {
+                let apps = lock(&state.sync.core).declared_types_of(node);
+                // If the list has changed meanwhile, its version differs at the next step, which follows.
+                SentTypes { of, sent: apps.into_iter().flat_map(sent_by).collect() }
+            });
+        }
+    }
+
+    /// Returns whether the list of `node` is of its linked incarnation. The directory learns of another one later than
+    /// the routing table.
+    fn is_linked(&self, state: &NodeState, node: NodeAddress) -> bool {
+        let linked = state.ctx.ports.links().and_then(|links| links.incarnation(node));
+        linked.is_none_or(|linked| self.lists.get(&node).is_some_and(|list| list.of.0 == linked))
+    }
+
+    /// Puts the entries into the routing table, if they are others than before. Returns whether they are there.
+    fn install(
+        &mut self,
+        state: &NodeState,
+        table: Vec<(TypedPath, Arc<Mismatch>)>,
+        peer_changes: u64,
+    ) -> bool {
+        let (installed, at) = &self.installed;
+        let mut pairs = table.iter().zip(installed);
         let are_same = pairs.all(|((path, entry), (former_path, former_entry))| {
             path == former_path && Arc::ptr_eq(entry, former_entry)
         });
-        if are_same && table.len() == self.installed.len() {
-            return;
+        if are_same && table.len() == installed.len() && *at == peer_changes {
+            return true;
         }
-        self.installed.clone_from(&table);
         let wake = self.wake.clone();
-        let mismatches =
-            (!table.is_empty()).then(|| Mismatches::new(table, Arc::new(move || wake.notify_one())));
-        state.ctx.router.set_mismatches(mismatches);
+        let mismatches = (!table.is_empty())
+            .then(|| Mismatches::new(table.iter().cloned(), Arc::new(move || wake.notify_one())));
+        let is_set = state.ctx.router.set_mismatches(mismatches, peer_changes);
+        if is_set {
+            self.installed = (table, peer_changes);
+        }
+        is_set
     }
 }
 
@@ -153,27 +196,30 @@ fn publish(state: &NodeState) {
     }
 }
 
-/// Returns the published types that applications of this node handle, and those that others send.
-fn declared(state: &NodeState) -> (Vec<Handled>, Vec<Sent>) {
-    let all = lock(&state.sync.core).declared_types();
-    let (mut handled, mut sent) = (Vec::new(), Vec::new());
+/// Returns the published types that applications of this node handle.
+fn handled(state: &NodeState) -> Vec<Handled> {
+    let all = lock(&state.sync.core).own_declared_types();
+    let mut handled = Vec::new();
     for AppTypes { tid, name, types } in all {
-        if tid.node != state.ctx.node {
-            let of_it = types.sends.into_iter();
-            sent.extend(of_it.map(|(kind, hash)| Sent { tid, name: name.clone(), kind, hash }));
-            continue;
-        }
         for (kind, hash) in types.handles {
             let own = state.types.declared.handled(tid.app, kind);
             if let Some(own) = own
                 && let Ok(schema) = own.schema()
             {
-                let (name, policy, schema) = (name.clone(), own.mismatch(), schema.schema());
-                handled.push(Handled { app: tid.app, name, kind, hash, policy, schema });
+                let (name, policy, is_protected) = (name.clone(), own.mismatch(), own.is_protected());
+                let schema = schema.schema();
+                handled.push(Handled { app: tid.app, name, kind, hash, policy, is_protected, schema });
             }
         }
     }
-    (handled, sent)
+    handled
+}
+
+/// Returns the types that an application of another node sends.
+fn sent_by(app: AppTypes) -> impl Iterator<Item = Sent> {
+    let AppTypes { tid, name, types } = app;
+    let name: Arc<str> = name.into();
+    types.sends.into_iter().map(move |(kind, hash)| Sent { tid, name: name.clone(), kind, hash })
 }
 
 /// Handles a frame of another node.
@@ -260,9 +306,8 @@ fn type_name(state: &NodeState, kind: Kind) -> String {
 
 /// Returns the name of an application with its TID, or its TID alone.
 fn title(state: &NodeState, tid: Tid) -> String {
-    let all = lock(&state.sync.core).declared_types();
-    let found = all.into_iter().find(|app| app.tid == tid).map(|app| app.name);
-    found.map_or_else(|| tid.to_string(), |name| format!("{name} ({tid})"))
+    let name = lock(&state.sync.core).name_of(tid);
+    name.map_or_else(|| tid.to_string(), |name| format!("{name} ({tid})"))
 }
 
 /// Sends a frame to the sync manager of another node.

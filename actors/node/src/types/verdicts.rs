@@ -9,7 +9,7 @@ use std::{
 
 use sinew_model::facts::TypeHash;
 use sinew_runtime::{
-    router::mismatches::{MISMATCHES_MAX, Mismatch, TypedPath},
+    router::mismatches::{Effect, MISMATCHES_MAX, Mismatch, TypedPath},
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wire::{Kind, MismatchPolicy, SchemaHash},
@@ -32,6 +32,8 @@ pub(super) struct Handled {
     pub(super) kind: Kind,
     pub(super) hash: SchemaHash,
     pub(super) policy: MismatchPolicy,
+    /// Whether messages of the type have end-to-end protection.
+    pub(super) is_protected: bool,
     pub(super) schema: &'static Schema,
 }
 
@@ -40,7 +42,7 @@ pub(super) struct Handled {
 pub(super) struct Sent {
     pub(super) tid: Tid,
     /// The name of the application.
-    pub(super) name: String,
+    pub(super) name: Arc<str>,
     pub(super) kind: Kind,
     pub(super) hash: SchemaHash,
 }
@@ -63,11 +65,12 @@ pub(crate) struct Verdicts {
 
 #[derive(Clone, Debug)]
 struct Pair {
-    source: String,
+    source: Arc<str>,
     target: String,
     sent: SchemaHash,
     handled: SchemaHash,
     policy: MismatchPolicy,
+    is_protected: bool,
     schema: &'static Schema,
     verdict: Option<Verdict>,
 }
@@ -102,6 +105,7 @@ impl Pair {
             sent: sent.hash,
             handled: handled.hash,
             policy: handled.policy,
+            is_protected: handled.is_protected,
             schema: handled.schema,
             verdict: None,
         }
@@ -109,7 +113,7 @@ impl Pair {
 
     fn is_of(&self, sent: &Sent, handled: &Handled) -> bool {
         (self.sent, self.handled, self.policy) == (sent.hash, handled.hash, handled.policy)
-            && (self.source.as_str(), self.target.as_str()) == (sent.name.as_str(), handled.name.as_str())
+            && (&*self.source, self.target.as_str()) == (&*sent.name, handled.name.as_str())
     }
 
     /// Returns the sender's structure and its node.
@@ -119,7 +123,12 @@ impl Pair {
 
     fn judge(&mut self, sent: &Schema) {
         let judgement = Judgement::of(sent, self.schema, self.policy);
-        let mismatch = Mismatch::new(judgement.treatment == Treatment::Refused);
+        let mismatch = Mismatch::new(match judgement.treatment {
+            Treatment::Same | Treatment::Accepted | Treatment::Warned => Effect::Counted,
+            // The guard of the receiver notices it at once, as a payload that cannot be decoded.
+            Treatment::Refused if self.is_protected => Effect::Spoiled,
+            Treatment::Refused => Effect::Refused,
+        });
         self.verdict = Some(Verdict { judgement, mismatch, is_told: false });
     }
 
@@ -127,7 +136,7 @@ impl Pair {
         let Verdict { judgement, mismatch, .. } = self.verdict.as_ref()?;
         (judgement.treatment != Treatment::Same).then(|| Disagreement {
             path,
-            source: self.source.clone(),
+            source: self.source.to_string(),
             target: self.target.clone(),
             judgement: judgement.clone(),
             handled: (self.handled, self.schema),
@@ -149,7 +158,12 @@ impl Verdict {
 
 impl Verdicts {
     /// Replaces the declared types. Returns the structures to be requested now.
-    pub(super) fn declare(&mut self, now: Time, handled: &[Handled], sent: &[Sent]) -> Vec<Wanted> {
+    pub(super) fn declare<'a>(
+        &mut self,
+        now: Time,
+        handled: &[Handled],
+        sent: impl IntoIterator<Item = &'a Sent>,
+    ) -> Vec<Wanted> {
         let mut by_kind: BTreeMap<Kind, Vec<&Handled>> = BTreeMap::new();
         for handled in handled {
             by_kind.entry(handled.kind).or_default().push(handled);

@@ -38,11 +38,12 @@ fn schema<T: Serialize + DeserializeOwned>() -> Schema {
 fn handled<T: Serialize + DeserializeOwned>() -> Handled {
     let schema: &'static Schema = Box::leak(Box::new(schema::<T>()));
     let (hash, policy) = (schema.hash(), MismatchPolicy::default());
-    Handled { app: KNEE, name: "knee.drive".to_owned(), kind: KIND, hash, policy, schema }
+    let name = "knee.drive".to_owned();
+    Handled { app: KNEE, name, kind: KIND, hash, policy, is_protected: false, schema }
 }
 
 fn sent<T: Serialize + DeserializeOwned>() -> Sent {
-    Sent { tid: SOURCE, name: "gait".to_owned(), kind: KIND, hash: schema::<T>().hash() }
+    Sent { tid: SOURCE, name: "gait".into(), kind: KIND, hash: schema::<T>().hash() }
 }
 
 const fn at(seconds: u64) -> Time {
@@ -79,7 +80,7 @@ impl Bench {
     fn install(&self) {
         let table = self.verdicts.table();
         let table = (!table.is_empty()).then(|| Mismatches::new(table, Arc::new(|| {})));
-        self.router.set_mismatches(table);
+        assert!(self.router.set_mismatches(table, self.router.peer_changes()));
     }
 
     fn delivers(&self) -> Result<(), Rejection> {
