@@ -295,6 +295,7 @@ fn write(state: &NodeState, kind: Kind, ends: (&str, &str), judgement: &Judgemen
     let words = sentence(ends, &name, judgement, seen);
     match judgement.treatment {
         Treatment::Refused | Treatment::Warned => log::warn!(%kind, "{words}"),
+        Treatment::Accepted if judgement.is_doubtful => log::warn!(%kind, "{words}"),
         Treatment::Accepted | Treatment::Same => log::info!(%kind, "{words}"),
     }
 }
