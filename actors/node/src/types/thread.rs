@@ -188,8 +188,9 @@ impl Comparing {
 /// Publishes the types of the applications that have new ones.
 fn publish(state: &NodeState) {
     for (app, types) in state.types.declared.take_changed() {
+        let may_have_fewer = types.has_two_of_a_kind();
         let types = types.hashes();
-        if !types.is_empty() {
+        if !types.is_empty() || may_have_fewer {
             // An application that has ended meanwhile has no entry in the directory.
             sinew_lncl::types_known(&state.lncl, app, types);
         }
