@@ -72,6 +72,8 @@ struct Pair {
     policy: MismatchPolicy,
     is_protected: bool,
     schema: &'static Schema,
+    /// Refuses the messages until there is a verdict, for [`MismatchPolicy::Refuse`].
+    pending: Option<Arc<Mismatch>>,
     verdict: Option<Verdict>,
 }
 
@@ -97,6 +99,11 @@ pub(crate) struct Disagreement {
     pub(crate) seen: u64,
 }
 
+/// Returns the effect of a refusal. The guard of a protected type notices it at once, as a payload that cannot be decoded.
+const fn refusal(is_protected: bool) -> Effect {
+    if is_protected { Effect::Spoiled } else { Effect::Refused }
+}
+
 impl Pair {
     fn new(sent: &Sent, handled: &Handled) -> Self {
         Self {
@@ -107,6 +114,8 @@ impl Pair {
             policy: handled.policy,
             is_protected: handled.is_protected,
             schema: handled.schema,
+            pending: (handled.policy == MismatchPolicy::Refuse)
+                .then(|| Mismatch::new(refusal(handled.is_protected))),
             verdict: None,
         }
     }
@@ -125,9 +134,7 @@ impl Pair {
         let judgement = Judgement::of(sent, self.schema, self.policy);
         let mismatch = Mismatch::new(match judgement.treatment {
             Treatment::Same | Treatment::Accepted | Treatment::Warned => Effect::Counted,
-            // The guard of the receiver notices it at once, as a payload that cannot be decoded.
-            Treatment::Refused if self.is_protected => Effect::Spoiled,
-            Treatment::Refused => Effect::Refused,
+            Treatment::Refused => refusal(self.is_protected),
         });
         self.verdict = Some(Verdict { judgement, mismatch, is_told: false });
     }
@@ -257,8 +264,11 @@ impl Verdicts {
     /// Returns the entries of the routing table.
     pub(super) fn table(&self) -> Vec<(TypedPath, Arc<Mismatch>)> {
         let entry = |(path, pair): (&TypedPath, &Pair)| {
-            let verdict = pair.verdict.as_ref().filter(|verdict| verdict.is_watched())?;
-            Some((*path, verdict.mismatch.clone()))
+            let mismatch = match &pair.verdict {
+                Some(verdict) => Some(&verdict.mismatch).filter(|_| verdict.is_watched()),
+                None => pair.pending.as_ref(),
+            };
+            Some((*path, mismatch?.clone()))
         };
         self.pairs.iter().filter_map(entry).collect()
     }

@@ -167,6 +167,29 @@ fn only_the_requested_structure_of_its_node_counts() {
 }
 
 #[test]
+fn strict_type_is_refused_until_the_structure_is_there() {
+    let mut verdicts = Verdicts::default();
+    let strict = Handled { policy: MismatchPolicy::Refuse, ..handled::<Gains>() };
+    verdicts.declare(at(0), &[strict.clone()], &[sent::<WithDamping>()]);
+    assert_eq!(verdicts.table().len(), 1, "it is refused at once");
+    let router = Router::new(HERE);
+    router.set_local(KNEE, LocalRoute { sink: Arc::new(Taken), events: Arc::new([]) });
+    let mut bench = Bench { verdicts, router };
+    bench.install();
+    assert_eq!((bench.delivers(), bench.told(at(1))), (Err(Rejection::Malformed), Vec::new()));
+    // An addition is refused too, and is logged.
+    let of = (KIND, schema::<WithDamping>().hash());
+    bench.verdicts.received(HIP, of, &schema::<WithDamping>().encode()).unwrap();
+    bench.install();
+    assert_eq!(bench.delivers(), Err(Rejection::Malformed));
+    assert_eq!(bench.told(at(1)), [(Treatment::Refused, 1)]);
+    // The declaration of the structure that the receiver has ends it.
+    bench.verdicts.declare(at(2), &[strict], &[sent::<Gains>()]);
+    bench.install();
+    assert_eq!(bench.delivers(), Ok(()));
+}
+
+#[test]
 fn structure_of_a_node_judges_its_own_messages_only() {
     let mut verdicts = Verdicts::default();
     let of = (KIND, schema::<Renamed>().hash());
