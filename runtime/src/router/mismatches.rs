@@ -72,8 +72,14 @@ impl Mismatch {
         self.seen.load(Ordering::Relaxed)
     }
 
-    /// Returns whether there was a message since the last call. The next message notifies the owner again.
+    /// Returns whether there was a message since the last call of [`take_notified`](Self::take_notified).
     #[must_use]
+    pub fn is_notified(&self) -> bool {
+        // SYNC: Relaxed; no other data depends on it.
+        self.is_notified.load(Ordering::Relaxed)
+    }
+
+    /// Returns whether there was a message since the last call. The next message notifies the owner again.
     pub fn take_notified(&self) -> bool {
         // SYNC: Relaxed; no other data depends on it.
         self.is_notified.swap(false, Ordering::Relaxed)

@@ -57,11 +57,15 @@ impl Declared {
         is_new
     }
 
-    /// Returns the applications with changes since the last call.
-    pub(super) fn take_changed(&self) -> Vec<(AppAddress, AppTypes)> {
+    /// Removes one application from those with changes, and returns it.
+    pub(super) fn pop_changed(&self) -> Option<(AppAddress, AppTypes)> {
         let mut table = lock(&self.0);
-        let changed = std::mem::take(&mut table.changed);
-        changed.into_iter().filter_map(|app| Some((app, table.apps.get(&app)?.clone()))).collect()
+        while let Some(app) = table.changed.pop_first() {
+            if let Some(types) = table.apps.get(&app) {
+                return Some((app, types.clone()));
+            }
+        }
+        None
     }
 
     /// Removes an application that is not registered.
@@ -195,18 +199,17 @@ mod tests {
         assert!(!declared.sends(APP, *angle), "nothing has this address");
         declared.register(APP, &[], &[*angle]);
         assert!(!declared.sends(APP, *angle) && declared.sends(APP, *speed));
-        let changed = declared.take_changed();
-        let [(app, types)] = &changed[..] else { panic!("one has changed") };
+        let (app, types) = declared.pop_changed().expect("one has changed");
         let sends = types.hashes().sends;
-        assert_eq!((*app, sends.len()), (APP, 2));
+        assert_eq!((app, sends.len()), (APP, 2));
         assert_eq!(sends[0], (Angle::KIND, angle.schema().unwrap().hash()));
-        assert!(declared.take_changed().is_empty());
+        assert!(declared.pop_changed().is_none());
         assert_eq!(declared.sent(APP, Speed::KIND), Some(*speed));
         declared.register(APP, &[*angle], gait.sends());
         assert_eq!(declared.sent(APP, Own::KIND), None);
         assert_eq!(declared.handled(APP, Angle::KIND), Some(*angle));
         declared.forget(APP);
-        assert_eq!((declared.sent(APP, Speed::KIND), declared.take_changed().len()), (None, 0));
+        assert!(declared.sent(APP, Speed::KIND).is_none() && declared.pop_changed().is_none());
     }
 
     #[test]
@@ -216,10 +219,9 @@ mod tests {
             AppSpec::new("gait", || Gait).sends::<Angle>().sends::<Speed>().sends::<OtherAngle>().into();
         let [angle, speed, other] = app.sends() else { panic!("it sends three") };
         declared.register(APP, &[], &[*angle, *speed]);
-        assert_eq!(declared.take_changed()[0].1.hashes().sends.len(), 2);
+        assert_eq!(declared.pop_changed().map(|(_, types)| types.hashes().sends.len()), Some(2));
         assert!(declared.sends(APP, *other), "it is another type");
-        let changed = declared.take_changed();
-        let types = &changed[0].1;
+        let (_, types) = declared.pop_changed().expect("it has changed");
         assert!(types.has_two_of_a_kind());
         let kinds: Vec<_> = types.hashes().sends.into_iter().map(|(kind, _)| kind).collect();
         assert_eq!(kinds, [Speed::KIND]);

@@ -15,7 +15,7 @@ use std::{
 
 use serde::Serialize;
 use sinew_lncl::undelivered::kind_name;
-use sinew_model::thread_priority::lower_priority;
+use sinew_model::{facts::TypeHash, thread_priority::lower_priority};
 use sinew_runtime::{
     lock, log,
     outcome::Rejection,
@@ -31,6 +31,7 @@ use tokio::{
 };
 
 use super::{
+    FRAMES_MAX,
     frames::{Frame, MismatchReport, SchemaAnswer, SchemaQuestion},
     judgement::{Judgement, Treatment, sentence},
     verdicts::{Disagreement, Handled, Sent},
@@ -39,6 +40,12 @@ use crate::NodeState;
 
 /// Minimum time between two steps: a start of many applications is one step, not one for each.
 const PAUSE: Duration = Duration::from_millis(10);
+/// Time to the next step after a panic.
+const AFTER_PANIC: Duration = Duration::from_secs(2);
+/// Minimum time between two answers to one node with one structure; a node asks again after 2 s.
+const ANSWER_AGAIN: Duration = Duration::from_secs(1);
+/// Maximum number of answers within [`ANSWER_AGAIN`].
+const ANSWERS_MAX: usize = 1_024;
 
 /// Starts the thread. It ends with the node.
 ///
@@ -52,6 +59,7 @@ pub(crate) fn begin(state: &Arc<NodeState>) -> io::Result<()> {
         changes: state.ctx.directory_changes.subscribe(),
         lists: BTreeMap::new(),
         installed: (Vec::new(), 0),
+        answered: BTreeMap::new(),
     };
     thread::Builder::new().name("types".to_owned()).spawn(move || comparing.run(&runtime))?;
     Ok(())
@@ -66,6 +74,8 @@ struct Comparing {
     lists: BTreeMap<NodeAddress, SentTypes>,
     /// The entries of the routing table, and the number of changes of routes before them.
     installed: (Vec<(TypedPath, Arc<Mismatch>)>, u64),
+    /// When each structure was sent to each node, for those within [`ANSWER_AGAIN`].
+    answered: BTreeMap<(NodeAddress, TypeHash), Time>,
 }
 
 /// The types that the applications of another node send.
@@ -86,8 +96,10 @@ impl Comparing {
             }
             let step = AssertUnwindSafe(|| self.step(&state));
             next = catch_unwind(step).unwrap_or_else(|_| {
-                log::error!("the comparison of types panicked; it continues with the next change");
-                None
+                log::error!(
+                    "the comparison of types panicked; it continues behind the type or frame that it treated"
+                );
+                Some(Time::now() + AFTER_PANIC)
             });
             drop(state);
             thread::sleep(PAUSE);
@@ -115,20 +127,35 @@ impl Comparing {
         // Before the directory is read: a node that is linked anew since then may have other types.
         let peer_changes = state.ctx.router.peer_changes();
         publish(state);
-        for (from, frame) in state.types.take_frames() {
-            if let Err(fault) = handle(state, from, frame) {
+        for _ in 0..FRAMES_MAX {
+            let Some((from, frame)) = state.types.pop_frame() else { break };
+            if let Err(fault) = self.handle(state, from, frame) {
                 state.ctx.refusals.count(Time::now(), "types", &fault);
             }
         }
         let handled = handled(state);
         self.read_lists(state);
         let now = Time::now();
-        let (wanted, due, mut table, next) = {
+        let (wanted, cases) = {
+            let sent = self.lists.values().flat_map(|list| &list.sent);
             let mut verdicts = lock(&state.types.verdicts);
-            let wanted = verdicts.declare(now, &handled, self.lists.values().flat_map(|list| &list.sent));
-            let due = verdicts.take_due(now);
-            (wanted, due, verdicts.table(), verdicts.next_wake())
+            (verdicts.declare(now, &handled, sent), verdicts.cases())
         };
+        for case in cases {
+            let judgement = case.judge();
+            lock(&state.types.verdicts).decide(&case, judgement);
+        }
+        let (due, left_out, mut table, next) = {
+            let mut verdicts = lock(&state.types.verdicts);
+            let due = verdicts.take_due(now);
+            (due, verdicts.take_left_out(), verdicts.table(), verdicts.next_wake())
+        };
+        if let Some(count) = left_out {
+            log::warn!(
+                "{count} pairs of applications and types are not compared, for want of room: their messages are decoded \
+                 as usual; build the programs with one version of their types"
+            );
+        }
         table.retain(|(path, _)| self.is_linked(state, path.source.node));
         let is_set = self.install(state, table, peer_changes);
         for (node, (kind, hash)) in wanted {
@@ -137,6 +164,46 @@ impl Comparing {
         }
         due.iter().for_each(|disagreement| tell(state, disagreement));
         if is_set { next } else { Some(now) }
+    }
+
+    /// Handles a frame of another node.
+    ///
+    /// # Errors
+    /// Returns the fault of the frame.
+    fn handle(&mut self, state: &NodeState, from: NodeAddress, frame: Frame) -> Result<(), String> {
+        match frame {
+            Frame::Question(question) => self.answer(state, from, question),
+            Frame::Answer(SchemaAnswer { kind, hash, schema }) => {
+                lock(&state.types.verdicts).received(from, (kind, hash), &schema)
+            }
+            Frame::Report(report) => reported(state, from, &report),
+        }
+    }
+
+    /// Sends a structure to the node that asks for it.
+    ///
+    /// # Errors
+    /// Returns the fault of the question, or why the answer was not sent.
+    fn answer(
+        &mut self,
+        state: &NodeState,
+        from: NodeAddress,
+        question: SchemaQuestion,
+    ) -> Result<(), String> {
+        let SchemaQuestion { kind, hash } = question;
+        let schema = kind.schema_of_hash(hash).ok_or_else(|| {
+            format!("from {from}, a question for a structure of kind {kind} that this node does not have")
+        })?;
+        let now = Time::now();
+        self.answered.retain(|_, at| now.since(*at) < ANSWER_AGAIN);
+        let is_again = self.answered.contains_key(&(from, (kind, hash)));
+        if is_again || self.answered.len() >= ANSWERS_MAX {
+            return Err(format!("from {from}, a question for the structure of kind {kind} too early"));
+        }
+        self.answered.insert((from, (kind, hash)), now);
+        let answer = SchemaAnswer { kind, hash, schema: schema.schema().encode() };
+        let sent = send(state, from, Kind::SYNC_SCHEMA, &answer);
+        sent.map_err(|why| format!("a structure was not sent to {from}: {why}"))
     }
 
     /// Reads the lists that have changed. The lock of the directory is held for the types of one node at a time.
@@ -187,7 +254,8 @@ impl Comparing {
 
 /// Publishes the types of the applications that have new ones.
 fn publish(state: &NodeState) {
-    for (app, types) in state.types.declared.take_changed() {
+    // One by one: a type whose tracing panics takes no other one with it.
+    while let Some((app, types)) = state.types.declared.pop_changed() {
         let may_have_fewer = types.has_two_of_a_kind();
         let types = types.hashes();
         if !types.is_empty() || may_have_fewer {
@@ -223,27 +291,6 @@ fn sent_by(app: AppTypes) -> impl Iterator<Item = Sent> {
     types.sends.into_iter().map(move |(kind, hash)| Sent { tid, name: name.clone(), kind, hash })
 }
 
-/// Handles a frame of another node.
-///
-/// # Errors
-/// Returns the fault of the frame.
-fn handle(state: &NodeState, from: NodeAddress, frame: Frame) -> Result<(), String> {
-    match frame {
-        Frame::Question(SchemaQuestion { kind, hash }) => {
-            let schema = kind.schema_of_hash(hash).ok_or_else(|| {
-                format!("from {from}, a question for a structure of kind {kind} that this node does not have")
-            })?;
-            let answer = SchemaAnswer { kind, hash, schema: schema.schema().encode() };
-            let sent = send(state, from, Kind::SYNC_SCHEMA, &answer);
-            sent.map_err(|why| format!("a structure was not sent to {from}: {why}"))
-        }
-        Frame::Answer(SchemaAnswer { kind, hash, schema }) => {
-            lock(&state.types.verdicts).received(from, (kind, hash), &schema)
-        }
-        Frame::Report(report) => reported(state, from, &report),
-    }
-}
-
 /// Logs the report of another node that messages of this node are of a type that differs.
 ///
 /// # Errors
@@ -253,6 +300,10 @@ fn reported(state: &NodeState, from: NodeAddress, report: &MismatchReport) -> Re
     let own = own.and_then(|own| own.schema().ok()).ok_or_else(|| {
         format!("from {from}, a report on kind {}, which {} does not send", report.kind, report.source)
     })?;
+    let target = Tid::new(from, report.target);
+    if !lock(&state.sync.core).lists_handled(target, (report.kind, report.hash)) {
+        return Err(format!("from {from}, a report on kind {}, which {target} does not handle", report.kind));
+    }
     let report = {
         let mut reported = lock(&state.types.reported);
         reported.add(Time::now(), from, report, own.schema())?.cloned()

@@ -22,6 +22,16 @@ use super::judgement::{Judgement, Treatment};
 pub(super) const ASK_AGAIN: Duration = Duration::from_secs(2);
 /// Minimum time between two log lines about one path.
 pub(super) const TELL_AGAIN: Duration = Duration::from_secs(60);
+/// Maximum number of paths from one node with types that differ, so that no node takes the room of the others.
+const PATHS_OF_NODE_MAX: usize = 64;
+/// Maximum number of paths from one node, and from all, that have other hashes and no difference on the wire. They take
+/// no room in the routing table.
+const SAME_OF_NODE_MAX: usize = 512;
+const SAME_MAX: usize = 4_096;
+/// Maximum number of structures that are requested from one node at once. It refuses more than that.
+pub(super) const ASKED_OF_NODE_MAX: usize = 8;
+/// Maximum number of reports to one node in one step.
+const TOLD_AT_ONCE_MAX: usize = 4;
 
 /// A type that an application of this node handles.
 #[derive(Clone, Debug)]
@@ -50,17 +60,68 @@ pub(super) struct Sent {
 /// A structure to be requested from the node that has it.
 pub(super) type Wanted = (NodeAddress, TypeHash);
 
-/// The verdicts on all paths with types that differ: at most [`MISMATCHES_MAX`], and as many structures.
+/// The verdicts on all paths with types that differ: at most [`MISMATCHES_MAX`], and [`SAME_MAX`] without a difference on
+/// the wire. There is at most one structure for each.
 #[derive(Debug, Default)]
 pub(crate) struct Verdicts {
     pairs: BTreeMap<TypedPath, Pair>,
     /// The structures that a pair needs, by the node that sent them. A hash is no proof: a node can construct a second
     /// structure of the same hash. So the structure of one node says nothing about the messages of another one.
-    fetched: BTreeMap<Wanted, Schema>,
+    fetched: BTreeMap<Wanted, Arc<Schema>>,
     /// When each missing structure was requested last.
     asked: BTreeMap<Wanted, Time>,
     /// When each path was logged last, for those within [`TELL_AGAIN`].
     told: BTreeMap<TypedPath, Time>,
+    /// When the next disagreements are due, if there were too many for one step.
+    more_due: Option<Time>,
+    /// The number of paths without room.
+    left_out: usize,
+    is_left_out_told: bool,
+}
+
+/// The number of paths so far, of all nodes and of each.
+#[derive(Debug, Default)]
+struct Room {
+    all: Places,
+    of_node: BTreeMap<NodeAddress, Places>,
+}
+
+#[derive(Clone, Copy, Debug, Default)]
+struct Places {
+    differing: usize,
+    same: usize,
+}
+
+impl Room {
+    /// Takes a place for a path from `node`. Returns whether there was one.
+    fn take(&mut self, node: NodeAddress, is_same: bool) -> bool {
+        let (all, of_node) = (&mut self.all, self.of_node.entry(node).or_default());
+        let (taken, of_all, max) = if is_same {
+            (&mut of_node.same, &mut all.same, (SAME_OF_NODE_MAX, SAME_MAX))
+        } else {
+            (&mut of_node.differing, &mut all.differing, (PATHS_OF_NODE_MAX, MISMATCHES_MAX))
+        };
+        let has_room = *taken < max.0 && *of_all < max.1;
+        *taken += usize::from(has_room);
+        *of_all += usize::from(has_room);
+        has_room
+    }
+}
+
+/// Two structures to be compared. That may take some milliseconds, so it is done without the lock of the verdicts.
+#[derive(Clone, Debug)]
+pub(super) struct Case {
+    path: TypedPath,
+    sent: (SchemaHash, Arc<Schema>),
+    handled: (SchemaHash, &'static Schema),
+    policy: MismatchPolicy,
+}
+
+impl Case {
+    /// Compares them.
+    pub(super) fn judge(&self) -> Judgement {
+        Judgement::of(&self.sent.1, self.handled.1, self.policy)
+    }
 }
 
 #[derive(Clone, Debug)]
@@ -130,8 +191,11 @@ impl Pair {
         (path.source.node, (path.kind, self.sent))
     }
 
-    fn judge(&mut self, sent: &Schema) {
-        let judgement = Judgement::of(sent, self.schema, self.policy);
+    fn is_same(&self) -> bool {
+        self.verdict.as_ref().is_some_and(|verdict| verdict.judgement.treatment == Treatment::Same)
+    }
+
+    fn decide(&mut self, judgement: Judgement) {
         let mismatch = Mismatch::new(match judgement.treatment {
             Treatment::Same | Treatment::Accepted | Treatment::Warned => Effect::Counted,
             Treatment::Refused => refusal(self.is_protected),
@@ -175,25 +239,21 @@ impl Verdicts {
         for handled in handled {
             by_kind.entry(handled.kind).or_default().push(handled);
         }
-        let mut pairs = BTreeMap::new();
+        let (mut pairs, mut room, mut left_out) = (BTreeMap::new(), Room::default(), 0);
         for sent in sent {
             let handled = by_kind.get(&sent.kind).into_iter().flatten();
             for handled in handled.filter(|handled| handled.hash != sent.hash) {
-                if pairs.len() >= MISMATCHES_MAX {
-                    break;
-                }
                 let path = TypedPath { source: sent.tid, target: handled.app, kind: sent.kind };
                 let former = self.pairs.remove(&path).filter(|pair| pair.is_of(sent, handled));
-                let mut pair = former.unwrap_or_else(|| Pair::new(sent, handled));
-                if pair.verdict.is_none()
-                    && let Some(schema) = self.fetched.get(&(sent.tid.node, (sent.kind, sent.hash)))
-                {
-                    pair.judge(schema);
+                let pair = former.unwrap_or_else(|| Pair::new(sent, handled));
+                if room.take(sent.tid.node, pair.is_same()) {
+                    pairs.insert(path, pair);
+                } else {
+                    left_out += 1;
                 }
-                pairs.insert(path, pair);
             }
         }
-        self.pairs = pairs;
+        (self.pairs, self.left_out) = (pairs, left_out);
         self.wanted(now)
     }
 
@@ -202,18 +262,47 @@ impl Verdicts {
         self.fetched.retain(|of, _| used.contains(of));
         let open = self.open();
         self.asked.retain(|asked, _| open.contains(asked));
-        let is_due = |wanted: &Wanted, asked: &BTreeMap<Wanted, Time>| {
-            asked.get(wanted).is_none_or(|at| now.since(*at) >= ASK_AGAIN)
-        };
-        let due: Vec<_> = open.into_iter().filter(|wanted| is_due(wanted, &self.asked)).collect();
+        let mut waiting: BTreeMap<NodeAddress, usize> = BTreeMap::new();
+        for ((node, _), at) in &self.asked {
+            *waiting.entry(*node).or_default() += usize::from(now.since(*at) < ASK_AGAIN);
+        }
+        // Those that were never requested come first: an answer that does not come holds no other one up.
+        let is_due = |wanted: &Wanted| self.asked.get(wanted).is_none_or(|at| now.since(*at) >= ASK_AGAIN);
+        let mut due: Vec<_> = open.into_iter().filter(is_due).collect();
+        due.sort_by_key(|wanted| self.asked.get(wanted).copied());
+        due.retain(|(node, _)| {
+            let waiting = waiting.entry(*node).or_default();
+            *waiting += 1;
+            *waiting <= ASKED_OF_NODE_MAX
+        });
         self.asked.extend(due.iter().map(|wanted| (*wanted, now)));
         due
     }
 
     /// Returns the missing structures.
     fn open(&self) -> BTreeSet<Wanted> {
-        let open = self.pairs.iter().filter(|(_, pair)| pair.verdict.is_none());
-        open.map(|(path, pair)| pair.wanted(path)).collect()
+        let unjudged = self.pairs.iter().filter(|(_, pair)| pair.verdict.is_none());
+        let wanted = unjudged.map(|(path, pair)| pair.wanted(path));
+        wanted.filter(|wanted| !self.fetched.contains_key(wanted)).collect()
+    }
+
+    /// Returns the paths without a verdict of which both structures are there.
+    pub(super) fn cases(&self) -> Vec<Case> {
+        let unjudged = self.pairs.iter().filter(|(_, pair)| pair.verdict.is_none());
+        let case = |(path, pair): (&TypedPath, &Pair)| {
+            let sent = self.fetched.get(&pair.wanted(path))?.clone();
+            let (sent, handled) = ((pair.sent, sent), (pair.handled, pair.schema));
+            Some(Case { path: *path, sent, handled, policy: pair.policy })
+        };
+        unjudged.filter_map(case).collect()
+    }
+
+    /// Sets the verdict on a case, unless the types were declared anew since.
+    pub(super) fn decide(&mut self, case: &Case, judgement: Judgement) {
+        let Some(pair) = self.pairs.get_mut(&case.path) else { return };
+        if (pair.sent, pair.handled, pair.policy) == (case.sent.0, case.handled.0, case.policy) {
+            pair.decide(judgement);
+        }
     }
 
     /// Handles the structure that `from` sent, for the messages of `from` alone. One that is not missing is ignored.
@@ -230,35 +319,47 @@ impl Verdicts {
         if schema.hash() != of.1 {
             return Err(format!("from {from}, of kind {}: it has another hash than requested", of.0));
         }
-        for (path, pair) in &mut self.pairs {
-            if pair.wanted(path) == wanted && pair.verdict.is_none() {
-                pair.judge(&schema);
-            }
-        }
         self.asked.remove(&wanted);
-        self.fetched.insert(wanted, schema);
+        self.fetched.insert(wanted, Arc::new(schema));
         Ok(())
     }
 
     /// Returns the disagreements of which messages have arrived and that were not logged within [`TELL_AGAIN`].
     pub(super) fn take_due(&mut self, now: Time) -> Vec<Disagreement> {
         self.told.retain(|_, at| now.since(*at) < TELL_AGAIN);
-        let mut due = Vec::new();
+        self.more_due = None;
+        let (mut due, mut of_node) = (Vec::new(), BTreeMap::new());
         for (path, pair) in &mut self.pairs {
             let is_full = self.told.len() >= MISMATCHES_MAX;
             if is_full || self.told.contains_key(path) {
                 continue;
             }
+            let of_node = of_node.entry(path.source.node).or_insert(0);
             if let Some(verdict) = &mut pair.verdict
                 && verdict.is_watched()
-                && verdict.mismatch.take_notified()
+                && verdict.mismatch.is_notified()
             {
+                if *of_node == TOLD_AT_ONCE_MAX {
+                    self.more_due = Some(now);
+                    continue;
+                }
+                *of_node += 1;
+                verdict.mismatch.take_notified();
                 verdict.is_told = true;
                 self.told.insert(*path, now);
                 due.extend(pair.disagreement(*path));
             }
         }
         due
+    }
+
+    /// Returns the number of paths without room, once.
+    pub(super) fn take_left_out(&mut self) -> Option<usize> {
+        if self.left_out == 0 || self.is_left_out_told {
+            return None;
+        }
+        self.is_left_out_told = true;
+        Some(self.left_out)
     }
 
     /// Returns the entries of the routing table.
@@ -277,7 +378,7 @@ impl Verdicts {
     pub(super) fn next_wake(&self) -> Option<Time> {
         let asked = self.asked.values().map(|at| *at + ASK_AGAIN);
         let told = self.told.values().map(|at| *at + TELL_AGAIN);
-        asked.chain(told).min()
+        asked.chain(told).chain(self.more_due).min()
     }
 
     /// Returns all disagreements, in the order of their senders.
@@ -287,7 +388,7 @@ impl Verdicts {
 
     /// Returns the structure that this node has sent.
     pub(crate) fn fetched(&self, from: NodeAddress, of: TypeHash) -> Option<&Schema> {
-        self.fetched.get(&(from, of))
+        self.fetched.get(&(from, of)).map(|schema| &**schema)
     }
 }
 
