@@ -9,6 +9,7 @@ use std::{
     },
 };
 
+use futures_util::{FutureExt, StreamExt};
 use sinew_runtime::{
     event_queue::EventQueue,
     mailbox::Mailbox,
@@ -16,7 +17,7 @@ use sinew_runtime::{
     router::{LocalRoute, MessageSink, SubmitError},
     tid::AppAddress,
     time::Time,
-    wire::{Checksum, Message},
+    wire::{Checksum, Class, Flags, Header, Kind, Message},
 };
 use sinew_session::{Ack, outlet::LinkNumber};
 
@@ -43,9 +44,15 @@ async fn receiving() -> (Node, ByHand, Inbound) {
 
 /// Receives a message with this number for an application, with others behind it.
 fn receive(node: &Node, inbound: &Inbound, app: u32, number: u16) {
+    receive_set(node, inbound, (app, number), |_| {});
+}
+
+/// The same with a header that `set` changes.
+fn receive_set(node: &Node, inbound: &Inbound, (app, number): (u32, u16), set: impl FnOnce(&mut Header)) {
     let mut message = node.message(node.tid(app), &number.to_le_bytes());
     message.header.source.node = NINE;
     message.header.number = number;
+    set(&mut message.header);
     inbound.receive(message.header.sent, message, Behind::More).expect("it has the next number");
 }
 
@@ -150,5 +157,59 @@ fn application_that_ends_in_a_batch_gets_nothing_more() {
         }
         let arrived = inbound.peer.accounts()[Lane::Control as usize].arrived;
         assert_eq!((arrived.taken, arrived.forwarded, arrived.refused), (5, 4, 1), "{arrived:?}");
+    });
+}
+
+#[test]
+fn cancel_finds_a_collected_request() {
+    run(async {
+        // Given
+        let (node, _by_hand, inbound) = receiving().await;
+        let mailbox = Mailbox::new(8);
+        let route = LocalRoute { sink: mailbox.clone(), events: Arc::new([]) };
+        node.state.ctx.router.set_local(AppAddress::new(0x1001), route);
+        // When: the request is behind a message, and its cancellation behind both.
+        let batch = inbound.batch(Time::now());
+        receive(&node, &inbound, 1, 1);
+        let ask = |header: &mut Header| (header.flags, header.correlation) = (Flags::ASK, 7);
+        receive_set(&node, &inbound, (1, 2), ask);
+        let cancel = |header: &mut Header| (header.kind, header.correlation) = (Kind::CANCEL, 7);
+        receive_set(&node, &inbound, (1, 3), cancel);
+        receive(&node, &inbound, 1, 4);
+        drop(batch);
+        // Then
+        let mut reader = mailbox.attach();
+        for number in [1_u16, 4] {
+            let taken = within("a message", poll_fn(|cx| reader.poll_take(cx))).await;
+            reader.finish(Outcome::Delivered);
+            assert_eq!(taken.expect("nobody else reads it").payload[..], number.to_le_bytes());
+        }
+        assert_eq!(mailbox.tally(Class::Control).expired, 1);
+    });
+}
+
+#[test]
+fn reply_and_report_do_not_overtake_collected_messages() {
+    run(async {
+        // Given
+        let (node, _by_hand, inbound) = receiving().await;
+        let taken = EventQueue::new(100);
+        let never = AtomicBool::new(true);
+        let sink = Arc::new(Breaking { taken: taken.clone(), breaks_at: 0, has_broken: never });
+        node.state.ctx.router.set_local(AppAddress::new(0x1001), LocalRoute { sink, events: Arc::new([]) });
+        let mut taken = taken.attach();
+        // When
+        let batch = inbound.batch(Time::now());
+        (1..=2).for_each(|number| receive(&node, &inbound, 1, number));
+        receive_set(&node, &inbound, (1, 3), |header| header.flags = Flags::REPLY);
+        (4..=5).for_each(|number| receive(&node, &inbound, 1, number));
+        let members = |header: &mut Header| (header.kind, header.flags) = (Kind::MEMBERS, Flags::OUTCOME);
+        receive_set(&node, &inbound, (1, 6), members);
+        // Then: the application has all of them while the batch goes on.
+        for number in 1..=5 {
+            let next = taken.next().now_or_never().flatten();
+            assert_eq!(next, Some(number), "before the end of the batch");
+        }
+        drop(batch);
     });
 }
