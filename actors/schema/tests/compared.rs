@@ -341,3 +341,33 @@ fn pairs_of_a_comparison_are_limited() {
     assert!(matches!(beyond, Comparison::Conflict(_)));
     assert!(words(beyond.differences())[0].ends_with("is behind 4096 pairs of types, and is not compared"));
 }
+
+#[test]
+fn names_of_another_node_cannot_forge_lines() {
+    let forged = "a\n\u{1b}[31mERROR\u{202e}";
+    let field = |shape| Field { name: forged.into(), shape, optional: false };
+    let variant = Variant { name: forged.into(), shape: Shape::Struct(vec![field(Shape::U8)]) };
+    let inside = Shape::Struct(vec![
+        field(Shape::Enum(vec![variant])),
+        Field { name: "b".into(), ..field(Shape::U8) },
+    ]);
+    let types = BTreeMap::from([(forged.to_owned(), Shape::Newtype(Box::new(inside.clone())))]);
+    let sent = Schema {
+        root: Shape::Struct(vec![
+            Field { name: "list".into(), ..field(Shape::List(Box::new(inside))) },
+            Field { name: "unit".into(), ..field(Shape::Named(forged.into())) },
+            field(Shape::U8),
+        ]),
+        types,
+    };
+    let handled = schema! { struct Payload { list: u8, unit: Degrees, other: u8 } };
+    let mut lines: Vec<_> = [compare(&sent, &handled), compare(&handled, &sent)]
+        .iter()
+        .flat_map(|compared| words(compared.differences()))
+        .collect();
+    assert!(lines.len() >= 6, "{lines:?}");
+    lines.extend(sent.to_string().lines().map(str::to_owned));
+    for line in lines {
+        assert!(!line.contains(|one: char| one.is_control() || one == '\u{202e}'), "{line:?}");
+    }
+}
