@@ -99,13 +99,6 @@ pub struct Reach {
     pub elsewhere: usize,
 }
 
-impl Table {
-    /// Returns the checks of a message to an application of this node.
-    fn judge(&self) -> Judge<'_> {
-        Judge { guard: self.guard.as_ref(), mismatches: self.mismatches.as_ref() }
-    }
-}
-
 /// The routing table of a node. It is owned by the node, so that it outlives every layer.
 pub struct Router {
     node: NodeAddress,

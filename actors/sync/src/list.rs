@@ -247,7 +247,8 @@ impl List {
         Ok(list)
     }
 
-    /// Returns the encoded list, and the number of elements that were left out. All its groups count as the robot's own.
+    /// Returns the encoded list, and the number of elements that were left out. All its groups count as the robot's
+    /// own.
     #[cfg(any(test, feature = "fuzzing"))]
     pub fn encode(self, bytes_max: usize) -> (Bytes, usize) {
         let own_groups = self.groups.len();
@@ -287,8 +288,8 @@ impl List {
         }
     }
 
-    /// Removes the structures of types from the end until they amount to `bytes`. Returns the number of entries that had
-    /// any. Without them the types of an application are not compared.
+    /// Removes the structures of types from the end until they amount to `bytes`. Returns the number of entries that
+    /// had any. Without them the types of an application are not compared.
     fn drop_structures_worth(&mut self, bytes: usize) -> usize {
         let (mut freed, mut count) = (0, 0);
         for entry in self.entries.iter_mut().rev() {

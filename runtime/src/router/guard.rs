@@ -8,7 +8,10 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 
-use super::mismatches::{self, Mismatches, SPOILED};
+use super::{
+    Table,
+    mismatches::{self, Mismatches, SPOILED},
+};
 use crate::{
     outcome::Rejection,
     tid::AppAddress,
@@ -54,6 +57,14 @@ pub(super) struct Judge<'a> {
     pub(super) guard: Option<&'a Arc<dyn Guard>>,
     /// `None`: no types differ, or they do not matter.
     pub(super) mismatches: Option<&'a Arc<Mismatches>>,
+}
+
+impl Table {
+    /// Returns the checks of a message to an application of this node.
+    #[inline]
+    pub(super) fn judge(&self) -> Judge<'_> {
+        Judge { guard: self.guard.as_ref(), mismatches: self.mismatches.as_ref() }
+    }
 }
 
 impl Judge<'_> {

@@ -152,8 +152,8 @@ impl Comparing {
         };
         if let Some(count) = left_out {
             log::warn!(
-                "{count} pairs of applications and types are not compared, for want of room: their messages are decoded \
-                 as usual; build the programs with one version of their types"
+                "{count} pairs of applications and types are not compared, for want of room: their messages are \
+                 decoded as usual; build the programs with one version of their types"
             );
         }
         table.retain(|(path, _)| self.is_linked(state, path.source.node));

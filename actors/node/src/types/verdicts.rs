@@ -60,8 +60,8 @@ pub(super) struct Sent {
 /// A structure to be requested from the node that has it.
 pub(super) type Wanted = (NodeAddress, TypeHash);
 
-/// The verdicts on all paths with types that differ: at most [`MISMATCHES_MAX`], and [`SAME_MAX`] without a difference on
-/// the wire. There is at most one structure for each.
+/// The verdicts on all paths with types that differ: at most [`MISMATCHES_MAX`], and [`SAME_MAX`] without a difference
+/// on the wire. There is at most one structure for each.
 #[derive(Debug, Default)]
 pub(crate) struct Verdicts {
     pairs: BTreeMap<TypedPath, Pair>,
@@ -160,7 +160,8 @@ pub(crate) struct Disagreement {
     pub(crate) seen: u64,
 }
 
-/// Returns the effect of a refusal. The guard of a protected type notices it at once, as a payload that cannot be decoded.
+/// Returns the effect of a refusal. The guard of a protected type notices it at once, as a payload that cannot be
+/// decoded.
 const fn refusal(is_protected: bool) -> Effect {
     if is_protected { Effect::Spoiled } else { Effect::Refused }
 }

@@ -138,8 +138,8 @@ impl OwnList {
         let limit = self.bytes_max;
         if types_of > 0 {
             let detail = format!(
-                "the payload types of {types_of} applications are not in this node's directory, which has at most {limit} \
-                 bytes: other nodes do not compare them; raise `node.payload_max` or use more nodes"
+                "the payload types of {types_of} applications are not in this node's directory, which has at most \
+                 {limit} bytes: other nodes do not compare them; raise `node.payload_max` or use more nodes"
             );
             outputs.refuse("directory full", detail);
         }
