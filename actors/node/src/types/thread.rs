@@ -148,7 +148,7 @@ impl Comparing {
         let (due, left_out, mut table, next) = {
             let mut verdicts = lock(&state.types.verdicts);
             let due = verdicts.take_due(now);
-            (due, verdicts.take_left_out(), verdicts.table(), verdicts.next_wake())
+            (due, verdicts.take_left_out(now), verdicts.table(), verdicts.next_wake())
         };
         if let Some(count) = left_out {
             log::warn!(

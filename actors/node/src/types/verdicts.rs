@@ -30,6 +30,8 @@ const SAME_OF_NODE_MAX: usize = 512;
 const SAME_MAX: usize = 4_096;
 /// Maximum number of structures that are requested from one node at once. It refuses more than that.
 pub(super) const ASKED_OF_NODE_MAX: usize = 8;
+/// Time after which paths that have no room are told. Verdicts without a difference on the wire may make room before.
+const LEFT_OUT_AFTER: Duration = Duration::from_secs(10);
 /// Maximum number of reports to one node in one step.
 const TOLD_AT_ONCE_MAX: usize = 4;
 
@@ -72,11 +74,15 @@ pub(crate) struct Verdicts {
     asked: BTreeMap<Wanted, Time>,
     /// When each path was logged last, for those within [`TELL_AGAIN`].
     told: BTreeMap<TypedPath, Time>,
+    /// When the missing structures were looked at last.
+    looked_at: Time,
     /// When the next disagreements are due, if there were too many for one step.
     more_due: Option<Time>,
-    /// The number of paths without room.
-    left_out: usize,
+    /// The number of paths without room, and since when there were any.
+    left_out: (usize, Option<Time>),
     is_left_out_told: bool,
+    /// Whether a verdict has made room for one of them.
+    has_made_room: bool,
 }
 
 /// The number of paths so far, of all nodes and of each.
@@ -254,7 +260,8 @@ impl Verdicts {
                 }
             }
         }
-        (self.pairs, self.left_out) = (pairs, left_out);
+        let since = (left_out > 0).then(|| self.left_out.1.unwrap_or(now));
+        (self.pairs, self.left_out, self.has_made_room) = (pairs, (left_out, since), false);
         self.wanted(now)
     }
 
@@ -277,6 +284,7 @@ impl Verdicts {
             *waiting <= ASKED_OF_NODE_MAX
         });
         self.asked.extend(due.iter().map(|wanted| (*wanted, now)));
+        self.looked_at = now;
         due
     }
 
@@ -303,6 +311,7 @@ impl Verdicts {
         let Some(pair) = self.pairs.get_mut(&case.path) else { return };
         if (pair.sent, pair.handled, pair.policy) == (case.sent.0, case.handled.0, case.policy) {
             pair.decide(judgement);
+            self.has_made_room |= pair.is_same() && self.left_out.0 > 0;
         }
     }
 
@@ -354,13 +363,15 @@ impl Verdicts {
         due
     }
 
-    /// Returns the number of paths without room, once.
-    pub(super) fn take_left_out(&mut self) -> Option<usize> {
-        if self.left_out == 0 || self.is_left_out_told {
-            return None;
-        }
-        self.is_left_out_told = true;
-        Some(self.left_out)
+    /// Returns the number of paths without room, once, when there were some for [`LEFT_OUT_AFTER`].
+    pub(super) fn take_left_out(&mut self, now: Time) -> Option<usize> {
+        let is_due = self.left_out_due().is_some_and(|at| now >= at);
+        self.is_left_out_told |= is_due;
+        is_due.then_some(self.left_out.0)
+    }
+
+    fn left_out_due(&self) -> Option<Time> {
+        self.left_out.1.filter(|_| !self.is_left_out_told).map(|since| since + LEFT_OUT_AFTER)
     }
 
     /// Returns the entries of the routing table.
@@ -377,9 +388,11 @@ impl Verdicts {
 
     /// Returns the time of the next request, or of the next log line that may be due.
     pub(super) fn next_wake(&self) -> Option<Time> {
-        let asked = self.asked.values().map(|at| *at + ASK_AGAIN);
+        // A request that is overdue waits until another one is answered or overdue.
+        let asked = self.asked.values().map(|at| *at + ASK_AGAIN).filter(|at| *at > self.looked_at);
         let told = self.told.values().map(|at| *at + TELL_AGAIN);
-        asked.chain(told).chain(self.more_due).min()
+        let room = self.has_made_room.then_some(self.looked_at);
+        asked.chain(told).chain(self.more_due).chain(self.left_out_due()).chain(room).min()
     }
 
     /// Returns all disagreements, in the order of their senders.

@@ -239,40 +239,63 @@ fn no_node_takes_the_room_of_others() {
     assert_eq!(verdicts.pairs.len(), PATHS_OF_NODE_MAX + 1);
     assert_eq!(wanted.iter().filter(|(node, _)| *node == HIP).count(), ASKED_OF_NODE_MAX);
     assert!(wanted.contains(&(late.tid.node, (KIND, late.hash))));
-    assert_eq!(verdicts.take_left_out(), Some(1_000 - PATHS_OF_NODE_MAX));
+    assert_eq!(verdicts.take_left_out(at(9)), None, "verdicts may make room");
+    assert_eq!(verdicts.take_left_out(at(10)), Some(1_000 - PATHS_OF_NODE_MAX));
     verdicts.declare(at(1), &[handled::<Gains>()], &all);
-    assert_eq!(verdicts.take_left_out(), None, "it is told once");
+    assert_eq!(verdicts.take_left_out(at(20)), None, "it is told once");
     // Structures that do not come hold up no other ones.
     let again = verdicts.declare(at(2), &[handled::<Gains>()], &all);
     let of_hip: BTreeSet<_> = again.iter().filter(|(node, _)| *node == HIP).collect();
     assert!(of_hip.len() == ASKED_OF_NODE_MAX && wanted.iter().all(|one| !of_hip.contains(one)));
+    assert_eq!(verdicts.next_wake(), Some(at(4)), "those that wait for their turn wake nobody");
     // All nodes together.
     let of_many = (0..10).flat_map(|node| (0..60).map(move |n| one_of_many(NodeAddress::new(10 + node), n)));
     verdicts.declare(at(3), &[handled::<Gains>()], &of_many.collect::<Vec<_>>());
     assert_eq!(verdicts.pairs.len(), MISMATCHES_MAX);
 }
 
-#[test]
-fn paths_without_a_difference_take_no_room() {
-    /// The same on the wire, with another name of a part.
-    fn named(part: &str) -> Schema {
+/// Returns two structures that are the same on the wire: a part of them has another name.
+fn same_on_the_wire() -> (&'static Schema, Schema) {
+    let named = |part: &str| {
         let parts = [(part.to_owned(), Shape::Struct(Vec::new()))];
         Schema { root: Shape::List(Box::new(Shape::Named(part.to_owned()))), types: parts.into() }
-    }
-    let schema: &'static Schema = Box::leak(Box::new(named("Here")));
+    };
+    (Box::leak(Box::new(named("Here"))), named("There"))
+}
+
+#[test]
+fn paths_without_a_difference_take_no_room() {
+    let (schema, there) = same_on_the_wire();
     let handled = Handled { hash: schema.hash(), schema, ..handled::<Gains>() };
-    let of = (KIND, named("There").hash());
+    let of = (KIND, there.hash());
     let count = PATHS_OF_NODE_MAX as u32;
     let same: Vec<_> = (0..count).map(|n| Sent { hash: of.1, ..one_of_many(HIP, n) }).collect();
     let mut verdicts = Verdicts::default();
     assert_eq!(verdicts.declare(at(0), &[handled.clone()], &same), [(HIP, of)]);
-    verdicts.received(HIP, of, &named("There").encode()).unwrap();
+    verdicts.received(HIP, of, &there.encode()).unwrap();
     judge(&mut verdicts);
     assert!(verdicts.table().is_empty() && verdicts.disagreements().is_empty());
     let others = (0..count).map(|n| one_of_many(HIP, 0x1000 + n));
     let all: Vec<_> = same.into_iter().chain(others).collect();
     verdicts.declare(at(1), &[handled], &all);
-    assert_eq!((verdicts.pairs.len(), verdicts.take_left_out()), (2 * PATHS_OF_NODE_MAX, None));
+    assert_eq!((verdicts.pairs.len(), verdicts.take_left_out(at(20))), (2 * PATHS_OF_NODE_MAX, None));
+}
+
+#[test]
+fn verdict_without_a_difference_makes_room() {
+    let (schema, of) = same_on_the_wire();
+    let handled = Handled { hash: schema.hash(), schema, ..handled::<Gains>() };
+    let count = PATHS_OF_NODE_MAX as u32 + 1;
+    let same: Vec<_> = (0..count).map(|n| Sent { hash: of.hash(), ..one_of_many(HIP, n) }).collect();
+    let mut verdicts = Verdicts::default();
+    verdicts.declare(at(0), &[handled.clone()], &same);
+    verdicts.received(HIP, (KIND, of.hash()), &of.encode()).unwrap();
+    assert_ne!(verdicts.next_wake(), Some(at(0)));
+    judge(&mut verdicts);
+    assert_eq!((verdicts.pairs.len(), verdicts.next_wake()), (PATHS_OF_NODE_MAX, Some(at(0))));
+    verdicts.declare(at(1), &[handled], &same);
+    judge(&mut verdicts);
+    assert_eq!((verdicts.pairs.len(), verdicts.next_wake()), (count as usize, None));
 }
 
 #[test]
