@@ -6,8 +6,8 @@ use crate::shape::{Field, Schema, Shape, Variant};
 
 /// Maximum number of differences that are reported.
 pub const DIFFERENCES_MAX: usize = 16;
-/// Maximum number of lists and options around the number of a unit that are looked into.
-const LEVELS_MAX: usize = 8;
+/// Maximum number of shapes that are looked into for the number of a unit. A newtype around more counts as a unit.
+const UNIT_SHAPES_MAX: usize = 64;
 /// Maximum number of pairs of types that one comparison compares; the types of real programs have some tens.
 const PAIRS_MAX: usize = 4_096;
 /// Maximum depth of a comparison: two types that contain themselves have up to 65,280 pairs below each other.
@@ -227,8 +227,8 @@ impl<'s> Comparing<'s> {
         if one == other {
             return;
         }
-        let is_measure =
-            is_measure(self.sent, inner[0], LEVELS_MAX) || is_measure(self.handled, inner[1], LEVELS_MAX);
+        let is_measure = |schema, inner| is_measure(schema, inner, &mut { UNIT_SHAPES_MAX });
+        let is_measure = is_measure(self.sent, inner[0]) || is_measure(self.handled, inner[1]);
         let (one, other) = (one.escape_debug(), other.escape_debug());
         let (meaning, verb) = if is_measure { (Meaning::Conflict, "in") } else { (Meaning::Doubt, "called") };
         let words = format!("{path} is {verb} {one} at the sender and {other} at the receiver");
@@ -380,12 +380,13 @@ fn bare<'s>(schema: &'s Schema, mut shape: &'s Shape) -> Option<&'s Shape> {
 }
 
 /// Returns whether a newtype around this shape can be a unit: it is a number, or consists of numbers.
-fn is_measure(schema: &Schema, shape: &Shape, levels: usize) -> bool {
-    let (Some(shape), Some(levels)) = (bare(schema, shape), levels.checked_sub(1)) else { return true };
+fn is_measure(schema: &Schema, shape: &Shape, left: &mut usize) -> bool {
+    let (Some(shape), Some(rest)) = (bare(schema, shape), left.checked_sub(1)) else { return true };
+    *left = rest;
     if let Shape::Option(inner) | Shape::List(inner) | Shape::Array(inner, _) | Shape::Map(_, inner) = shape {
-        is_measure(schema, inner, levels)
+        is_measure(schema, inner, left)
     } else if let Shape::Tuple(parts) = shape {
-        parts.iter().any(|part| is_measure(schema, part, levels))
+        parts.iter().any(|part| is_measure(schema, part, left))
     } else {
         number(shape).is_some()
     }

@@ -371,3 +371,19 @@ fn names_of_another_node_cannot_forge_lines() {
         assert!(!line.contains(|one: char| one.is_control() || one == '\u{202e}'), "{line:?}");
     }
 }
+
+/// Newtypes in levels of 100 parts each, with texts in the innermost: 10,000,000,000,000,000 in all.
+fn wide_units(name: &str) -> Schema {
+    let named = |level: usize| Shape::Named(format!("{name}{level}"));
+    let level = |at: usize| {
+        let part = if at == 7 { Shape::Text } else { named(at + 1) };
+        (format!("{name}{at}"), Shape::Newtype(Box::new(Shape::Tuple(vec![part; 100]))))
+    };
+    Schema { root: named(0), types: (0..8).map(level).collect() }
+}
+
+#[test]
+fn search_for_a_unit_is_limited() {
+    let compared = compare(&wide_units("A"), &wide_units("B"));
+    assert_eq!(words(compared.differences())[0], "the payload is in A0 at the sender and B0 at the receiver");
+}

@@ -5,7 +5,8 @@
 //! two hashes of one type differ. The verdicts are in the routing table, which refuses messages, or counts them. The
 //! first message of a type that differs is logged on both nodes, in words.
 //!
-//! All of it runs on one thread of low priority. A message that arrives before the verdict is decoded as usual.
+//! All of it runs on one thread of low priority. A message that arrives before the verdict is decoded as usual, unless
+//! the policy of its type is `Refuse`. The routing table drops the verdicts on a node when its route changes.
 //!
 //! | file | content |
 //! | --- | --- |
