@@ -36,8 +36,10 @@ struct Structures {
 
 #[derive(Debug, Default)]
 struct Structure {
-    /// `None`: no answering node has it.
+    /// `None`: no answering node has it, or two nodes have different ones.
     schema: Option<Schema>,
+    /// Whether two nodes gave different structures of this hash. One of both is constructed: nothing is compared.
+    is_contested: bool,
     handled_by: BTreeSet<TypeUser>,
     sent_by: BTreeSet<TypeUser>,
 }
@@ -68,8 +70,7 @@ impl Structures {
         for one in report.schemas {
             let known = self.known.entry(one.hash).or_default();
             let schema = one.schema.and_then(|bytes| Schema::parse(&bytes).ok());
-            // A node cannot give another structure than that of the hash.
-            known.schema = known.schema.take().or_else(|| schema.filter(|schema| schema.hash() == one.hash));
+            known.add(schema.filter(|schema| schema.hash() == one.hash));
             known.handled_by.extend(one.handled_by);
             known.sent_by.extend(one.sent_by);
         }
@@ -94,6 +95,24 @@ impl Structures {
     }
 }
 
+impl Structure {
+    /// Adds the structure that a node gave. A hash of 64 bits is no proof that it is the structure of another node.
+    fn add(&mut self, given: Option<Schema>) {
+        let Some(given) = given.filter(|_| !self.is_contested) else { return };
+        self.is_contested = self.schema.as_ref().is_some_and(|former| *former != given);
+        self.schema = (!self.is_contested).then_some(given);
+    }
+
+    /// Returns the structure for a person.
+    fn words(&self) -> String {
+        match &self.schema {
+            Some(schema) => schema.to_string(),
+            None if self.is_contested => "two nodes give different structures of this hash\n".to_owned(),
+            None => "no node that answers has it\n".to_owned(),
+        }
+    }
+}
+
 fn report(name: &str, structures: &Structures) -> Report {
     let is_found = !structures.known.is_empty() || !structures.unknown.is_empty();
     let differences = structures.differences();
@@ -112,13 +131,12 @@ fn text(name: &str, structures: &Structures, differences: &[Difference]) -> Stri
         1 => format!("{name} has one structure:\n"),
         count => format!("{name} has {count} structures:\n"),
     };
-    for (hash, Structure { schema, handled_by, sent_by }) in &structures.known {
+    for (hash, structure) in &structures.known {
         text += &format!("\n{hash}\n");
-        text += &users("handled by", handled_by);
-        text += &users("sent by", sent_by);
-        let words =
-            schema.as_ref().map_or_else(|| "no node that answers has it\n".to_owned(), Schema::to_string);
-        text += &words.lines().map(|line| format!("    {}\n", clean_lines(line))).collect::<String>();
+        text += &users("handled by", &structure.handled_by);
+        text += &users("sent by", &structure.sent_by);
+        text +=
+            &structure.words().lines().map(|line| format!("    {}\n", clean_lines(line))).collect::<String>();
     }
     if !structures.unknown.is_empty() {
         text += &format!("\nwith an unknown structure\n{}", users("handled by", &structures.unknown));
@@ -159,9 +177,10 @@ fn json(name: &str, structures: &Structures, differences: &[Difference]) -> Valu
     let users = |users: &BTreeSet<TypeUser>| -> Vec<Value> {
         users.iter().map(|user| json!({ "tid": user.tid.to_string(), "name": user.name })).collect()
     };
-    let known = structures.known.iter().map(|(hash, Structure { schema, handled_by, sent_by })| {
+    let known = structures.known.iter().map(|(hash, one)| {
         json!({
-            "hash": hash.to_string(), "schema": schema, "handled_by": users(handled_by), "sent_by": users(sent_by),
+            "hash": hash.to_string(), "schema": one.schema, "is_contested": one.is_contested,
+            "handled_by": users(&one.handled_by), "sent_by": users(&one.sent_by),
         })
     });
     let differences = differences.iter().map(|Difference { sent, handled, comparison }| {
@@ -256,5 +275,19 @@ mod tests {
         let structures = Structures::of(vec![answer(1, Ok(forged))]);
         assert!(structures.known[&schema::<Old>().hash()].schema.is_none());
         assert!(structures.differences().is_empty());
+    }
+
+    #[test]
+    fn two_structures_of_one_hash_are_not_compared() {
+        let mut one = Structure::default();
+        one.add(None);
+        one.add(Some(schema::<Old>()));
+        one.add(Some(schema::<Old>()));
+        assert!(one.schema.is_some() && !one.is_contested);
+        // Another structure stands for a constructed one: this type does not look at hashes.
+        one.add(Some(schema::<New>()));
+        one.add(Some(schema::<Old>()));
+        assert!(one.schema.is_none() && one.is_contested);
+        assert!(one.words().contains("two nodes give different structures"));
     }
 }

@@ -27,7 +27,7 @@ use self::{
     copies::Copies,
     each::OpenSends,
     groups::{Groups, Joined},
-    guard::{Guard, why_refused},
+    guard::{Guard, Judge},
     mismatches::Mismatches,
     tap::{TAPS, Tap},
 };
@@ -85,6 +85,8 @@ struct Writing {
     elsewhere: Joined<NodeAddress>,
     /// The observers, of which the table has one.
     taps: [Option<Arc<dyn Tap>>; TAPS],
+    /// The number of changes of the routes to other nodes.
+    peer_changes: u64,
 }
 
 /// The number of destinations of a message.
@@ -95,9 +97,6 @@ pub struct Reach {
     /// Number of other nodes.
     pub elsewhere: usize,
 }
-
-/// The guard for one message; `None`: no restriction.
-type Judge<'a> = Option<&'a Arc<dyn Guard>>;
 
 /// The routing table of a node. It is owned by the node, so that it outlives every layer.
 pub struct Router {
@@ -227,25 +226,28 @@ impl Router {
     /// The reason of the rejection.
     pub fn deliver(&self, message: Message) -> Result<(), Rejection> {
         let snapshot = self.snapshot.load();
-        self.deliver_by(&snapshot, snapshot.table.guard.as_ref(), message)
+        self.deliver_by(&snapshot, snapshot.table.judge(), message)
     }
 
-    /// Same as [`deliver`](Self::deliver), with another guard than the table's own. It copies no table, for
+    /// Same as [`deliver`](Self::deliver), for the last will of a node that is lost: `guard` replaces the table's own.
+    /// Types are not compared: those in the directory may be of the next incarnation already. It copies no table, for
     /// any number of applications.
     ///
     /// # Errors
     /// The reason of the rejection.
-    pub fn deliver_judged_by(&self, message: Message, guard: &Arc<dyn Guard>) -> Result<(), Rejection> {
-        self.deliver_by(&self.snapshot.load(), Some(guard), message)
+    pub fn deliver_will(&self, message: Message, guard: Option<&Arc<dyn Guard>>) -> Result<(), Rejection> {
+        let snapshot = self.snapshot.load();
+        let judge = Judge { guard: guard.or(snapshot.table.guard.as_ref()), mismatches: None };
+        self.deliver_by(&snapshot, judge, message)
     }
 
-    fn deliver_by(&self, snapshot: &Snapshot, guard: Judge<'_>, message: Message) -> Result<(), Rejection> {
+    fn deliver_by(&self, snapshot: &Snapshot, judge: Judge<'_>, message: Message) -> Result<(), Rejection> {
         let result = if message.header.destination.is_single() {
-            submit_here(&snapshot.table, guard, message)
+            submit_here(&snapshot.table, judge, message)
         } else if message.receipt.is_some() {
-            self.deliver_to_each(snapshot, guard, message)
+            self.deliver_to_each(snapshot, judge, message)
         } else {
-            let copies = self.fan_out(snapshot, guard, &message);
+            let copies = self.fan_out(snapshot, judge, &message);
             self.count(&copies, &message.header);
             Ok(())
         };
@@ -361,7 +363,7 @@ impl Router {
     fn send_to_one(table: &Table, here: NodeAddress, message: Message) -> Result<(), SubmitError> {
         let Tid { node, .. } = message.header.destination;
         if node == here {
-            return submit_here(table, table.guard.as_ref(), message);
+            return submit_here(table, table.judge(), message);
         }
         let peer = table.peers.get(&node);
         // Without an observer the message is passed on directly: a closure would move it twice more.
@@ -376,7 +378,7 @@ impl Router {
         let Snapshot { table, members } = snapshot;
         tap::saw_sent_to_many(table.tap.as_ref(), &message);
         if node == self.node || node == NodeAddress::ALL {
-            copies = self.fan_out(snapshot, table.guard.as_ref(), &message);
+            copies = self.fan_out(snapshot, table.judge(), &message);
         }
         let mut submit = |peer: &Arc<dyn MessageSink>| {
             copies.note(peer.submit(copy_of(&message)).err().map(|refused| refused.why));
@@ -410,7 +412,7 @@ impl Router {
     }
 
     /// Submits copies to the members on this node, except the sender itself.
-    fn fan_out(&self, snapshot: &Snapshot, guard: Judge<'_>, message: &Message) -> Copies {
+    fn fan_out(&self, snapshot: &Snapshot, judge: Judge<'_>, message: &Message) -> Copies {
         let mut copies = Copies::default();
         let here = self.node;
         for_each_here(snapshot, message.header.destination.app, |member, sink| {
@@ -418,7 +420,8 @@ impl Router {
             if is_sender {
                 return;
             }
-            let refused = why_refused(&snapshot.table, guard, member, &message.header)
+            let refused = judge
+                .why_refused(member, &message.header)
                 .or_else(|| sink.submit(copy_of(message)).err().map(|refused| refused.why));
             tap::saw_one_of_many(snapshot.table.tap.as_ref(), Tid::new(here, member), message, refused);
             copies.note(refused);
@@ -448,21 +451,16 @@ fn for_each_here(
 
 /// Submits a message to its one application of this node, if the guard allows it.
 #[inline]
-fn submit_here(table: &Table, guard: Judge<'_>, message: Message) -> Result<(), SubmitError> {
+fn submit_here(table: &Table, judge: Judge<'_>, message: Message) -> Result<(), SubmitError> {
     let route = table.local.get(&message.header.destination.app);
-    let Some(tap) = &table.tap else { return submit_by(table, route, guard, message) };
-    tap::hand_over(&**tap, message, false, |message| submit_by(table, route, guard, message))
+    let Some(tap) = &table.tap else { return submit_by(route, judge, message) };
+    tap::hand_over(&**tap, message, false, |message| submit_by(route, judge, message))
 }
 
 #[inline]
-fn submit_by(
-    table: &Table,
-    route: Option<&LocalRoute>,
-    guard: Judge<'_>,
-    message: Message,
-) -> Result<(), SubmitError> {
+fn submit_by(route: Option<&LocalRoute>, judge: Judge<'_>, mut message: Message) -> Result<(), SubmitError> {
     let Some(route) = route else { return Err(SubmitError::new(message, Rejection::NoSuchApplication)) };
-    match why_refused(table, guard, message.header.destination.app, &message.header) {
+    match judge.check(&mut message) {
         Some(why) => Err(SubmitError::new(message, why)),
         None => route.sink.submit(message),
     }
@@ -473,10 +471,10 @@ fn submit_by(
 fn offer_to(
     table: &Table,
     route: &LocalRoute,
-    message: Message,
+    mut message: Message,
     room: Option<&Waker>,
 ) -> Result<(), SubmitError> {
-    match why_refused(table, table.guard.as_ref(), message.header.destination.app, &message.header) {
+    match table.judge().check(&mut message) {
         Some(why) => Err(SubmitError::new(message, why)),
         None => route.sink.offer(message, room),
     }

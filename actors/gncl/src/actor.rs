@@ -214,8 +214,9 @@ impl Gncl {
         let (state, peer_there, met) = (self.state.clone(), peer.clone(), peer.clone());
         let (outcomes, conversion) = (RefCell::default(), Cell::default());
         let inbound = Inbound { state, peer: peer_there, spin, lane, link, checksum, outcomes, conversion };
-        wire.set_mode(Mode::Relocate(inbound, Relocation { thread: thread.clone(), transport }));
+        // Before the first message is read: the types of a former incarnation do not count for this one.
         self.state.ctx.router.set_peer(node, peer.clone());
+        wire.set_mode(Mode::Relocate(inbound, Relocation { thread: thread.clone(), transport }));
         let drain_thread = thread.clone();
         let drainer = thread.begin(async move {
             if let Some(session) = peer.session(lane) {

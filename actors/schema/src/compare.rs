@@ -6,6 +6,10 @@ use crate::shape::{Field, Schema, Shape, Variant};
 
 /// Maximum number of differences that are reported.
 pub const DIFFERENCES_MAX: usize = 16;
+/// Maximum number of shapes that are looked into for the number of a unit. A newtype around more counts as a unit.
+const UNIT_SHAPES_MAX: usize = 64;
+/// Maximum number of pairs of types that one comparison compares; the types of real programs have some tens.
+const PAIRS_MAX: usize = 4_096;
 /// Maximum depth of a comparison: two types that contain themselves have up to 65,280 pairs below each other.
 const DEPTH_MAX: usize = 128;
 
@@ -31,7 +35,8 @@ const DEPTH_MAX: usize = 128;
 pub enum Comparison {
     /// There is no difference in messages.
     Same,
-    /// One of them has more fields or variants, and the receiver accepts the messages of the sender.
+    /// The receiver accepts the messages of the sender, apart from variants of an enum that it does not have. The
+    /// differences are additional fields or variants, wider types, and names that do not travel.
     Addition(Vec<Difference>),
     /// The receiver cannot rely on the messages of the sender.
     Conflict(Vec<Difference>),
@@ -53,6 +58,8 @@ impl Comparison {
 pub struct Difference {
     /// The path of the field: `legs[].gains.kp`. Empty for the payload itself.
     pub path: String,
+    /// Whether a person should check that both ends mean the same, although the receiver accepts the messages.
+    pub is_doubtful: bool,
     words: String,
 }
 
@@ -64,29 +71,28 @@ impl fmt::Display for Difference {
 
 /// Compares the structure of a sender with that of a receiver.
 ///
-/// Names of structs and enums do not travel and may differ. Names of newtypes may not: they are units. Types that are
-/// nested in more than 128 levels are not compared: that is a conflict.
+/// Names of structs and enums do not travel and may differ. The names of two newtypes around numbers may not: they are
+/// units. A number is accepted in a wider type that holds each of its values. Types that are nested in more than 128
+/// levels, or have more than 4,096 pairs, are not compared: that is a conflict.
 #[must_use]
 pub fn compare(sent: &Schema, handled: &Schema) -> Comparison {
     let (seen, found) = (BTreeSet::new(), Found::default());
     let mut comparing = Comparing { sent, handled, seen, depth: 0, found };
     comparing.shapes(&sent.root, &handled.root, &Path::default());
-    let Found { differences, sender_has_more, receiver_has_more, is_conflict } = comparing.found;
-    if is_conflict || (sender_has_more && receiver_has_more) {
+    let Found { differences, conflicts } = comparing.found;
+    if conflicts > 0 {
         Comparison::Conflict(differences)
-    } else if sender_has_more || receiver_has_more {
-        Comparison::Addition(differences)
-    } else {
+    } else if differences.is_empty() {
         Comparison::Same
+    } else {
+        Comparison::Addition(differences)
     }
 }
 
 #[derive(Default)]
 struct Found {
     differences: Vec<Difference>,
-    sender_has_more: bool,
-    receiver_has_more: bool,
-    is_conflict: bool,
+    conflicts: usize,
 }
 
 struct Comparing<'s> {
@@ -121,22 +127,21 @@ impl fmt::Display for Path {
 }
 
 /// The effect of a difference on the verdict.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, PartialEq, Eq)]
 enum Meaning {
-    SenderHasMore,
-    ReceiverHasMore,
+    /// The receiver accepts it.
+    Addition,
+    /// The receiver accepts it, and perhaps means something else.
+    Doubt,
     Conflict,
 }
 
 impl<'s> Comparing<'s> {
     fn add(&mut self, path: &Path, meaning: Meaning, words: String) {
-        match meaning {
-            Meaning::SenderHasMore => self.found.sender_has_more = true,
-            Meaning::ReceiverHasMore => self.found.receiver_has_more = true,
-            Meaning::Conflict => self.found.is_conflict = true,
-        }
+        self.found.conflicts += usize::from(meaning == Meaning::Conflict);
         if self.found.differences.len() < DIFFERENCES_MAX {
-            self.found.differences.push(Difference { path: path.0.clone(), words });
+            let is_doubtful = meaning == Meaning::Doubt;
+            self.found.differences.push(Difference { path: path.0.clone(), is_doubtful, words });
         }
     }
 
@@ -151,29 +156,83 @@ impl<'s> Comparing<'s> {
     }
 
     fn shapes_at_depth(&mut self, sent: &'s Shape, handled: &'s Shape, path: &Path) {
-        let (schema_sent, schema_handled) = (self.sent, self.handled);
-        if let (Shape::Named(name_sent), Shape::Named(name_handled)) = (sent, handled)
-            && !self.seen.insert((name_sent.as_str(), name_handled.as_str()))
-        {
-            return;
-        }
-        match (unit(schema_sent, sent), unit(schema_handled, handled)) {
-            (None, None) => {}
-            (Some((one, sent)), Some((other, handled))) if one == other => {
-                return self.shapes(sent, handled, path);
+        if let (Shape::Named(name_sent), Shape::Named(name_handled)) = (sent, handled) {
+            let pair = (name_sent.as_str(), name_handled.as_str());
+            if self.seen.contains(&pair) {
+                return;
             }
-            (Some((one, inner_sent)), Some((other, inner_handled)))
-                if shown(schema_sent, inner_sent) == shown(schema_handled, inner_handled) =>
-            {
-                let words = format!("{path} is in {one} at the sender and {other} at the receiver");
+            if self.seen.len() == PAIRS_MAX {
+                let words = format!("{path} is behind {PAIRS_MAX} pairs of types, and is not compared");
                 return self.add(path, Meaning::Conflict, words);
             }
-            _ => return self.differ(sent, handled, path),
+            self.seen.insert(pair);
         }
-        let (Some(one), Some(other)) = (schema_sent.resolve(sent), schema_handled.resolve(handled)) else {
+        if let Shape::Option(inner) = handled
+            && !matches!(bare(self.sent, sent), Some(Shape::Option(_) | Shape::Unit) | None)
+        {
+            return self.wider(
+                path,
+                |this| this.shapes(sent, inner, path),
+                || format!("{path} is always there at the sender, and may be absent at the receiver"),
+            );
+        }
+        let words = || {
+            let (one, other) = (shown(self.sent, sent), shown(self.handled, handled));
+            format!(
+                "{path} is {one} at the sender and {other} at the receiver, which is the same on the wire"
+            )
+        };
+        match (unit(self.sent, sent), unit(self.handled, handled)) {
+            (None, None) => {}
+            (Some((one, inner)), Some((other, inner_handled))) => {
+                self.units(&[one, other], [inner, inner_handled], path);
+                return self.shapes(inner, inner_handled, path);
+            }
+            (Some((_, inner)), None) => {
+                let words = words();
+                return self.renamed(path, words, |this| this.shapes(inner, handled, path));
+            }
+            (None, Some((_, inner))) => {
+                let words = words();
+                return self.renamed(path, words, |this| this.shapes(sent, inner, path));
+            }
+        }
+        let (Some(one), Some(other)) = (self.sent.resolve(sent), self.handled.resolve(handled)) else {
             return self.differ(sent, handled, path);
         };
         self.resolved((sent, one), (handled, other), path);
+    }
+
+    /// Adds an addition, unless `compare` finds a conflict.
+    fn wider(&mut self, path: &Path, compare: impl FnOnce(&mut Self), words: impl FnOnce() -> String) {
+        let conflicts = self.found.conflicts;
+        compare(self);
+        if self.found.conflicts == conflicts {
+            self.add(path, Meaning::Addition, words());
+        }
+    }
+
+    /// Adds a doubt about a name that only one end has, unless `compare` finds a conflict.
+    fn renamed(&mut self, path: &Path, words: String, compare: impl FnOnce(&mut Self)) {
+        let conflicts = self.found.conflicts;
+        compare(self);
+        if self.found.conflicts == conflicts {
+            self.add(path, Meaning::Doubt, words);
+        }
+    }
+
+    /// Compares the names of two newtypes. Around numbers they are units.
+    fn units(&mut self, names: &[&str; 2], inner: [&'s Shape; 2], path: &Path) {
+        let [one, other] = names;
+        if one == other {
+            return;
+        }
+        let is_measure = |schema, inner| is_measure(schema, inner, &mut { UNIT_SHAPES_MAX });
+        let is_measure = is_measure(self.sent, inner[0]) || is_measure(self.handled, inner[1]);
+        let (one, other) = (one.escape_debug(), other.escape_debug());
+        let (meaning, verb) = if is_measure { (Meaning::Conflict, "in") } else { (Meaning::Doubt, "called") };
+        let words = format!("{path} is {verb} {one} at the sender and {other} at the receiver");
+        self.add(path, meaning, words);
     }
 
     /// Compares the shapes that two names stand for; the first of each pair is for words.
@@ -182,9 +241,29 @@ impl<'s> Comparing<'s> {
             (Shape::Option(one), Shape::Option(other)) | (Shape::Newtype(one), Shape::Newtype(other)) => {
                 self.shapes(one, other, path);
             }
+            // The payload itself, or a variant: its name does not show a unit.
+            (Shape::Newtype(one), _) => self.shapes(one, handled.0, path),
+            (_, Shape::Newtype(other)) => self.shapes(sent.0, other, path),
             (Shape::List(one), Shape::List(other)) => self.shapes(one, other, &path.element("")),
             (Shape::Array(one, length), Shape::Array(other, of)) if length == of => {
                 self.shapes(one, other, &path.element(""));
+            }
+            (Shape::Array(one, length), Shape::List(other)) => {
+                self.wider(
+                    path,
+                    |this| this.shapes(one, other, &path.element("")),
+                    || format!("{path} has {length} values at the sender, and any number at the receiver"),
+                );
+            }
+            (Shape::Array(one, length), Shape::Tuple(others)) if *length == others.len() => {
+                for (index, other) in others.iter().enumerate() {
+                    self.shapes(one, other, &path.element(&index.to_string()));
+                }
+            }
+            (Shape::Tuple(parts), Shape::Array(other, length)) if *length == parts.len() => {
+                for (index, one) in parts.iter().enumerate() {
+                    self.shapes(one, other, &path.element(&index.to_string()));
+                }
             }
             (Shape::Map(key, value), Shape::Map(other_key, other_value)) => {
                 self.shapes(key, other_key, &path.element("key"));
@@ -200,6 +279,12 @@ impl<'s> Comparing<'s> {
             // A type without fields is read from each form of an empty value.
             (one, other) if path.0.is_empty() && is_empty(one) && is_empty(other) => {}
             (one, other) if one == other && is_leaf(one) => {}
+            (one, other) if holds_each(other, one) => {
+                let words = format!(
+                    "{path} is {one} at the sender and {other} at the receiver, which holds each value"
+                );
+                self.add(path, Meaning::Addition, words);
+            }
             _ => self.differ(sent.0, handled.0, path),
         }
     }
@@ -217,12 +302,15 @@ impl<'s> Comparing<'s> {
                 self.shapes(&field.shape, &other.shape, &path.field(&field.name));
             }
         }
-        let mut extra: Vec<_> = sent.iter().filter(|field| lacks(handled, &field.name)).collect();
+        let extra = sent.iter().filter(|field| lacks(handled, &field.name));
+        let mut extra: Vec<_> = extra.map(|field| (field, shown(self.sent, &field.shape))).collect();
         for missing in handled.iter().filter(|field| lacks(sent, &field.name)) {
             let shape = shown(self.handled, &missing.shape);
-            let twin = extra.iter().position(|field| shown(self.sent, &field.shape) == shape);
-            if let Some(twin) = twin {
-                let (one, other) = (path.field(&extra.remove(twin).name), path.field(&missing.name));
+            // A field that both ends regard as optional may be a new one at each.
+            let is_twin =
+                |(field, of): &(&Field, String)| *of == shape && !(field.optional && missing.optional);
+            if let Some(twin) = extra.iter().position(is_twin) {
+                let (one, other) = (path.field(&extra.remove(twin).0.name), path.field(&missing.name));
                 let words = format!(
                     "field {one} ({shape}) at the sender seems to be {other} ({shape}) at the receiver"
                 );
@@ -232,14 +320,14 @@ impl<'s> Comparing<'s> {
             let path = path.field(&missing.name);
             if missing.optional {
                 let words = format!("field {path} is missing at the sender, which the receiver accepts");
-                self.add(&path, Meaning::ReceiverHasMore, words);
+                self.add(&path, Meaning::Addition, words);
             } else {
                 self.add(&path, Meaning::Conflict, format!("field {path} is missing at the sender"));
             }
         }
-        for field in extra {
+        for (field, _) in extra {
             let path = path.field(&field.name);
-            self.add(&path, Meaning::SenderHasMore, format!("field {path} is missing at the receiver"));
+            self.add(&path, Meaning::Addition, format!("field {path} is missing at the receiver"));
         }
     }
 
@@ -247,12 +335,18 @@ impl<'s> Comparing<'s> {
         for variant in sent {
             let inner = path.field(&variant.name);
             match handled.iter().find(|other| other.name == variant.name) {
+                // A variant without a value is a text, and each other one a map.
+                Some(other) if (variant.shape == Shape::Unit) != (other.shape == Shape::Unit) => {
+                    self.differ(&variant.shape, &other.shape, &inner);
+                }
                 Some(other) => {
                     self.resolved((&variant.shape, &variant.shape), (&other.shape, &other.shape), &inner);
                 }
                 None => {
-                    let words = format!("variant {inner} is missing at the receiver");
-                    self.add(&inner, Meaning::SenderHasMore, words);
+                    let words = format!(
+                        "variant {inner} is missing at the receiver, whose decoder refuses messages with it"
+                    );
+                    self.add(&inner, Meaning::Doubt, words);
                 }
             }
         }
@@ -260,7 +354,7 @@ impl<'s> Comparing<'s> {
             if !sent.iter().any(|variant| variant.name == other.name) {
                 let inner = path.field(&other.name);
                 let words = format!("variant {inner} is missing at the sender");
-                self.add(&inner, Meaning::ReceiverHasMore, words);
+                self.add(&inner, Meaning::Addition, words);
             }
         }
     }
@@ -272,6 +366,76 @@ fn unit<'s>(schema: &'s Schema, shape: &'s Shape) -> Option<(&'s str, &'s Shape)
     match schema.types.get(name) {
         Some(Shape::Newtype(inner)) => Some((name.as_str(), &**inner)),
         Some(_) | None => None,
+    }
+}
+
+/// Returns the shape inside all newtypes: the shape on the wire. `None`: the schema does not have one.
+fn bare<'s>(schema: &'s Schema, mut shape: &'s Shape) -> Option<&'s Shape> {
+    for _ in 0..DEPTH_MAX {
+        let resolved = schema.resolve(shape)?;
+        let Shape::Newtype(inner) = resolved else { return Some(resolved) };
+        shape = inner;
+    }
+    None
+}
+
+/// Returns whether a newtype around this shape can be a unit: it is a number, or consists of numbers.
+fn is_measure(schema: &Schema, shape: &Shape, left: &mut usize) -> bool {
+    let (Some(shape), Some(rest)) = (bare(schema, shape), left.checked_sub(1)) else { return true };
+    *left = rest;
+    if let Shape::Option(inner) | Shape::List(inner) | Shape::Array(inner, _) | Shape::Map(_, inner) = shape {
+        is_measure(schema, inner, left)
+    } else if let Shape::Tuple(parts) = shape {
+        parts.iter().any(|part| is_measure(schema, part, left))
+    } else {
+        number(shape).is_some()
+    }
+}
+
+/// A type of numbers.
+#[derive(Clone, Copy)]
+struct Number {
+    is_signed: bool,
+    is_float: bool,
+    /// It holds each integer of so many bits.
+    bits: u32,
+}
+
+const fn whole(is_signed: bool, bits: u32) -> Number {
+    Number { is_signed, is_float: false, bits }
+}
+
+const fn float(bits: u32) -> Number {
+    Number { is_signed: true, is_float: true, bits }
+}
+
+const NUMBERS: [(Shape, Number); 12] = [
+    (Shape::I8, whole(true, 7)),
+    (Shape::I16, whole(true, 15)),
+    (Shape::I32, whole(true, 31)),
+    (Shape::I64, whole(true, 63)),
+    (Shape::I128, whole(true, 127)),
+    (Shape::U8, whole(false, 8)),
+    (Shape::U16, whole(false, 16)),
+    (Shape::U32, whole(false, 32)),
+    (Shape::U64, whole(false, 64)),
+    (Shape::U128, whole(false, 128)),
+    (Shape::F32, float(24)),
+    (Shape::F64, float(53)),
+];
+
+fn number(shape: &Shape) -> Option<Number> {
+    NUMBERS.iter().find(|(of, _)| of == shape).map(|(_, number)| *number)
+}
+
+/// Returns whether a value of the type `wide` is read from each value of the type `narrow`, without a loss. MessagePack
+/// writes a number in its shortest form, with its type.
+fn holds_each(wide: &Shape, narrow: &Shape) -> bool {
+    match (number(wide), number(narrow)) {
+        (Some(wide), Some(narrow)) => {
+            wide.bits >= narrow.bits && wide.is_signed >= narrow.is_signed && wide.is_float >= narrow.is_float
+        }
+        _ => (wide, narrow) == (&Shape::Text, &Shape::Char),
     }
 }
 

@@ -9,7 +9,7 @@ impl fmt::Display for Schema {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write_top(&self.root, f)?;
         for (name, shape) in &self.types {
-            write!(f, "{name} = ")?;
+            write!(f, "{} = ", name.escape_debug())?;
             write_top(shape, f)?;
         }
         Ok(())
@@ -84,8 +84,8 @@ impl fmt::Display for Shape {
             }
             Self::Map(key, value) => write!(f, "map from {key} to {value}"),
             Self::Struct(fields) => {
-                let parts: Vec<_> =
-                    fields.iter().map(|field| format!("{}: {}", field.name, field.shape)).collect();
+                let part = |field: &Field| format!("{}: {}", field.name.escape_debug(), field.shape);
+                let parts: Vec<_> = fields.iter().map(part).collect();
                 if parts.is_empty() { f.write_str("{}") } else { write!(f, "{{ {} }}", parts.join(", ")) }
             }
             Self::Newtype(inner) => inner.fmt(f),

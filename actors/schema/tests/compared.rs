@@ -49,14 +49,15 @@ fn added_fields_pass_where_the_receiver_accepts_them() {
     );
     // Whether a field may be absent is no difference where it is there.
     assert_eq!(compare(&new, &tolerant), Comparison::Same);
+    // One more at each end: the receiver skips the one, and accepts to be without the other.
     let both = schema! { struct Payload { kp: f32, ki: u8 } };
-    assert_eq!(
-        conflict(&both, &tolerant),
-        [
-            "field `kd` is missing at the sender, which the receiver accepts",
-            "field `ki` is missing at the receiver"
-        ]
-    );
+    let of_both = [
+        "field `kd` is missing at the sender, which the receiver accepts",
+        "field `ki` is missing at the receiver",
+    ];
+    assert_eq!(addition(&both, &tolerant), of_both);
+    let optional = schema! { struct Payload { kp: f32, #[serde(default)] ki: f32 } };
+    assert_eq!(addition(&optional, &tolerant), of_both);
 }
 
 #[test]
@@ -72,16 +73,73 @@ fn renamed_field_is_named_at_both_ends() {
 
 #[test]
 fn other_numbers_and_units_are_conflicts() {
-    let sent = schema! { struct Payload { limits: Vec<f64>, angle: Degrees, turn: f32 } };
-    let handled = schema! { struct Payload { limits: Vec<f32>, angle: Radians, turn: Degrees } };
+    let sent = schema! { struct Payload { limits: Vec<f64>, angle: Degrees, ids: u32, pair: [u8; 2] } };
+    let handled = schema! { struct Payload { limits: Vec<f32>, angle: Radians, ids: String, pair: [u8; 3] } };
     assert_eq!(
         conflict(&sent, &handled),
         [
             "`limits[]` is f64 at the sender and f32 at the receiver",
             "`angle` is in Degrees at the sender and Radians at the receiver",
-            "`turn` is f32 at the sender and Degrees (f32) at the receiver",
+            "`ids` is u32 at the sender and text at the receiver",
+            "`pair` is 2 x u8 at the sender and 3 x u8 at the receiver",
         ]
     );
+}
+
+#[test]
+fn unit_that_only_one_end_names_is_doubtful() {
+    let bare = schema! { struct Payload { turn: f32 } };
+    let unit = schema! { struct Payload { turn: Degrees } };
+    for (sent, handled, one, other) in
+        [(&bare, &unit, "f32", "Degrees (f32)"), (&unit, &bare, "Degrees (f32)", "f32")]
+    {
+        let words = format!(
+            "`turn` is {one} at the sender and {other} at the receiver, which is the same on the wire"
+        );
+        assert_eq!(addition(sent, handled), [words]);
+        assert!(compare(sent, handled).differences()[0].is_doubtful);
+    }
+    // The unit of a list is one too, and the name of a text is none.
+    #[derive(Serialize, Deserialize)]
+    struct InDegrees(Vec<f32>);
+    #[derive(Serialize, Deserialize)]
+    struct InRadians(Vec<f32>);
+    #[derive(Serialize, Deserialize)]
+    struct JointName(String);
+    #[derive(Serialize, Deserialize)]
+    struct LinkName(String);
+    let sent = schema! { struct Payload { all: InDegrees } };
+    let handled = schema! { struct Payload { all: InRadians } };
+    assert_eq!(
+        conflict(&sent, &handled),
+        ["`all` is in InDegrees at the sender and InRadians at the receiver"]
+    );
+    let sent = schema! { struct Payload { of: JointName } };
+    let handled = schema! { struct Payload { of: LinkName } };
+    assert_eq!(
+        addition(&sent, &handled),
+        ["`of` is called JointName at the sender and LinkName at the receiver"]
+    );
+}
+
+#[test]
+fn wider_types_are_accepted() {
+    let narrow = schema! { struct Payload {
+        a: u8, b: u8, c: i32, d: f32, e: u16, f: [u8; 2], g: u8, h: char,
+    } };
+    let wide = schema! { struct Payload {
+        a: u16, b: i16, c: i64, d: f64, e: f32, f: Vec<u8>, g: Option<u8>, h: String,
+    } };
+    let words = addition(&narrow, &wide);
+    assert_eq!(words[0], "`a` is u8 at the sender and u16 at the receiver, which holds each value");
+    assert_eq!(words[5], "`f` has 2 values at the sender, and any number at the receiver");
+    assert_eq!(words[6], "`g` is always there at the sender, and may be absent at the receiver");
+    assert_eq!(words.len(), 8);
+    assert_eq!(conflict(&wide, &narrow).len(), 8);
+    // A number that does not hold each value: the sign, the size, the exact integers of a float.
+    let sent = schema! { struct Payload { a: u8, b: i8, c: u32, d: i64, e: f32 } };
+    let handled = schema! { struct Payload { a: i8, b: u64, c: f32, d: f64, e: i64 } };
+    assert_eq!(conflict(&sent, &handled).len(), 5);
 }
 
 #[test]
@@ -111,7 +169,9 @@ fn nested_types_are_compared_by_their_parts() {
         }
         schema! { struct Payload { mode: Option<Mode> } }
     };
-    assert_eq!(addition(&sent, &handled), ["variant `mode.Run` is missing at the receiver"]);
+    let words = "variant `mode.Run` is missing at the receiver, whose decoder refuses messages with it";
+    assert_eq!(addition(&sent, &handled), [words]);
+    assert!(compare(&sent, &handled).differences()[0].is_doubtful);
     assert_eq!(addition(&handled, &sent), ["variant `mode.Run` is missing at the sender"]);
     assert_eq!(
         conflict(&other, &handled),
@@ -257,4 +317,73 @@ fn depth_of_a_comparison_is_limited() {
     let differences = conflict(&nested(200), &nested(200));
     assert_eq!(differences.len(), 1);
     assert!(differences[0].ends_with("is nested too deep to be compared"), "{differences:?}");
+}
+
+/// A struct with a field for each pair of `count` types. `of` selects the type of a field.
+fn paired(count: usize, of: impl Fn(usize, usize) -> usize) -> Schema {
+    let name = |type_number: usize| format!("Part{type_number}");
+    let pairs = (0..count).flat_map(|one| (0..count).map(move |other| (one, other)));
+    let fields = pairs.map(|(one, other)| Field {
+        name: format!("f{one}_{other}"),
+        shape: Shape::Named(name(of(one, other))),
+        optional: false,
+    });
+    let root = Shape::Struct(fields.collect());
+    let part = Shape::Struct(vec![Field { name: "a".into(), shape: Shape::U8, optional: false }]);
+    Schema { root, types: (0..count).map(|at| (name(at), part.clone())).collect() }
+}
+
+#[test]
+fn pairs_of_a_comparison_are_limited() {
+    let of = |count| compare(&paired(count, |one, _| one), &paired(count, |_, other| other));
+    assert_eq!(of(64), Comparison::Same);
+    let beyond = of(65);
+    assert!(matches!(beyond, Comparison::Conflict(_)));
+    assert!(words(beyond.differences())[0].ends_with("is behind 4096 pairs of types, and is not compared"));
+}
+
+#[test]
+fn names_of_another_node_cannot_forge_lines() {
+    let forged = "a\n\u{1b}[31mERROR\u{202e}";
+    let field = |shape| Field { name: forged.into(), shape, optional: false };
+    let variant = Variant { name: forged.into(), shape: Shape::Struct(vec![field(Shape::U8)]) };
+    let inside = Shape::Struct(vec![
+        field(Shape::Enum(vec![variant])),
+        Field { name: "b".into(), ..field(Shape::U8) },
+    ]);
+    let types = BTreeMap::from([(forged.to_owned(), Shape::Newtype(Box::new(inside.clone())))]);
+    let sent = Schema {
+        root: Shape::Struct(vec![
+            Field { name: "list".into(), ..field(Shape::List(Box::new(inside))) },
+            Field { name: "unit".into(), ..field(Shape::Named(forged.into())) },
+            field(Shape::U8),
+        ]),
+        types,
+    };
+    let handled = schema! { struct Payload { list: u8, unit: Degrees, other: u8 } };
+    let mut lines: Vec<_> = [compare(&sent, &handled), compare(&handled, &sent)]
+        .iter()
+        .flat_map(|compared| words(compared.differences()))
+        .collect();
+    assert!(lines.len() >= 6, "{lines:?}");
+    lines.extend(sent.to_string().lines().map(str::to_owned));
+    for line in lines {
+        assert!(!line.contains(|one: char| one.is_control() || one == '\u{202e}'), "{line:?}");
+    }
+}
+
+/// Newtypes in levels of 100 parts each, with texts in the innermost: 10,000,000,000,000,000 in all.
+fn wide_units(name: &str) -> Schema {
+    let named = |level: usize| Shape::Named(format!("{name}{level}"));
+    let level = |at: usize| {
+        let part = if at == 7 { Shape::Text } else { named(at + 1) };
+        (format!("{name}{at}"), Shape::Newtype(Box::new(Shape::Tuple(vec![part; 100]))))
+    };
+    Schema { root: named(0), types: (0..8).map(level).collect() }
+}
+
+#[test]
+fn search_for_a_unit_is_limited() {
+    let compared = compare(&wide_units("A"), &wide_units("B"));
+    assert_eq!(words(compared.differences())[0], "the payload is in A0 at the sender and B0 at the receiver");
 }

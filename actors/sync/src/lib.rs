@@ -51,7 +51,7 @@ pub mod wills;
 pub use actor::SyncManager;
 pub use core::{Core, Input, Output, Reason, cycle_of};
 pub use list::Name;
-pub use own_app::{AppTypes, OwnApp};
+pub use own_app::{AppTypes, ListVersion, OwnApp};
 pub use state::{FrameHandler, State};
 
 pub use sinew_model::events::SyncEvent as Event;

@@ -209,11 +209,24 @@ pub enum ListError {
     Twice(String),
 }
 
+/// The parts of a list that did not fit.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Omitted {
+    /// The number of entries and groups.
+    pub elements: usize,
+    /// The number of entries without the structures of their types.
+    pub types_of: usize,
+}
+
 impl List {
     /// Parses the list of a peer. Allocates at most the legal bounds, even if the bytes claim larger lengths.
     pub fn parse(bytes: &[u8]) -> Result<Self, ListError> {
         // spec: SYNC-4
-        let list: Self = sinew_runtime::wire::decode(bytes)?;
+        let mut list: Self = sinew_runtime::wire::decode(bytes)?;
+        for Entry { handles, sends, .. } in &mut list.entries {
+            keep_first_of_each_kind(handles);
+            keep_first_of_each_kind(sends);
+        }
         let (mut names, mut apps, mut groups) = (BTreeSet::new(), BTreeSet::new(), BTreeSet::new());
         for Entry { name, app, .. } in &list.entries {
             if !(app.is_fixed() || app.is_dynamic()) {
@@ -234,30 +247,36 @@ impl List {
         Ok(list)
     }
 
-    /// Returns the encoded list. All its groups count as the robot's own.
+    /// Returns the encoded list, and the number of elements that were left out. All its groups count as the robot's
+    /// own.
     #[cfg(any(test, feature = "fuzzing"))]
     pub fn encode(self, bytes_max: usize) -> (Bytes, usize) {
         let own_groups = self.groups.len();
-        self.encode_within(bytes_max, own_groups)
+        let (bytes, omitted) = self.encode_within(bytes_max, own_groups);
+        (bytes, omitted.elements)
     }
 
     /// Returns the encoded list, at most `bytes_max` bytes (64 for an empty list). Elements that do not fit
-    /// are left out, the last ones first. The order is: the structures of types of all entries, which are not
-    /// counted, groups behind the first `own_groups`, which have only guests, then entries, of which the robot's
-    /// own are first, then the remaining groups. Also returns how many elements were left out.
-    pub fn encode_within(mut self, bytes_max: usize, own_groups: usize) -> (Bytes, usize) {
+    /// are left out, the last ones first. The order is: the structures of the types of entries, of which the robot's
+    /// own are first, groups behind the first `own_groups`, which have only guests, then entries, then the remaining
+    /// groups.
+    pub fn encode_within(mut self, bytes_max: usize, own_groups: usize) -> (Bytes, Omitted) {
         let whole = self.entries.len() + self.groups.len();
+        let mut omitted = Omitted::default();
         self.groups.truncate(GROUPS_MAX);
         self.entries.truncate(ENTRIES_MAX);
         loop {
             let bytes = encode(&self);
             if bytes.len() <= bytes_max || (self.entries.is_empty() && self.groups.is_empty()) {
-                return (bytes.into(), whole - self.entries.len() - self.groups.len());
-            }
-            if self.drop_structures() {
-                continue;
+                omitted.elements = whole - self.entries.len() - self.groups.len();
+                return (bytes.into(), omitted);
             }
             let excess = bytes.len() - bytes_max;
+            let without_types = self.drop_structures_worth(excess);
+            if without_types > 0 {
+                omitted.types_of += without_types;
+                continue;
+            }
             let has_guests_groups = self.groups.len() > own_groups;
             if has_guests_groups || self.entries.is_empty() {
                 let kept = if has_guests_groups { own_groups } else { 0 };
@@ -269,15 +288,24 @@ impl List {
         }
     }
 
-    /// Removes the structures of types. Returns whether there were any. Without them no types are compared.
-    fn drop_structures(&mut self) -> bool {
-        let mut had_any = false;
-        for Entry { handles, sends, .. } in &mut self.entries {
-            had_any |= !(handles.is_empty() && sends.is_empty());
-            handles.clear();
-            sends.clear();
+    /// Removes the structures of types from the end until they amount to `bytes`. Returns the number of entries that
+    /// had any. Without them the types of an application are not compared.
+    fn drop_structures_worth(&mut self, bytes: usize) -> usize {
+        let (mut freed, mut count) = (0, 0);
+        for entry in self.entries.iter_mut().rev() {
+            if freed >= bytes {
+                break;
+            }
+            if entry.handles.is_empty() && entry.sends.is_empty() {
+                continue;
+            }
+            let before = encode(entry).len();
+            entry.handles.clear();
+            entry.sends.clear();
+            freed += before - encode(entry).len();
+            count += 1;
         }
-        had_any
+        count
     }
 
     /// Removes entries from the end until they amount to `bytes`.
@@ -289,6 +317,12 @@ impl List {
             freed += encode(&entry).len();
         }
     }
+}
+
+/// Removes the types of a kind behind the first one. An application has one of each kind.
+fn keep_first_of_each_kind(types: &mut Vec<TypeHash>) {
+    let mut kinds = BTreeSet::new();
+    types.retain(|(kind, _)| kinds.insert(*kind));
 }
 
 fn encode<T: Serialize>(value: &T) -> Vec<u8> {

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use sinew_model::{directory::Absence, facts::DeclaredTypes};
 use sinew_runtime::{
-    tid::{AppAddress, Tid},
+    tid::{AppAddress, Incarnation, Tid},
     wire::Kind,
 };
 
@@ -25,6 +25,9 @@ pub struct OwnApp {
     /// The payloads that the application handles, as far as it reports them.
     pub kinds: Vec<Kind>,
 }
+
+/// The version of a node's list: its incarnation, and the counter of its changes. Lists of one version are the same.
+pub type ListVersion = (Incarnation, u64);
 
 /// The declared types of an application of any node.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -27,6 +27,7 @@ use crate::{
     outcome::{Outcome, Rejection},
     protection::{Echo, ProtectionError, Verdict},
     remedy::{Wanted, remedy},
+    router::mismatches::SPOILED,
     schedule::Due,
     supervision::liveness::{Activity, Liveness},
     time::Time,
@@ -86,6 +87,14 @@ where
         (Verdict::Hold, _) => Err(Rejection::ByHandler),
         (Verdict::Refused(ProtectionError::Unreadable), Some(error)) => {
             context.warn_of_payload(source, &error, now);
+            Err(Rejection::Malformed)
+        }
+        (Verdict::Refused(ProtectionError::Corrupt), _) if message.payload == SPOILED => {
+            let (why, remedy) = (
+                "its sender has another version of the type",
+                "build both programs with one version of the type; `sinew schema` shows the difference",
+            );
+            context.warn_of_refusal(source, &why, remedy, now);
             Err(Rejection::Malformed)
         }
         (Verdict::Refused(fault), _) => {

@@ -20,7 +20,10 @@ use super::{
     sender::Flows,
     *,
 };
-use crate::tid::{AppAddress, NodeAddress, Tid};
+use crate::{
+    router::mismatches::SPOILED,
+    tid::{AppAddress, NodeAddress, Tid},
+};
 
 const MS: Duration = Duration::from_millis(1);
 const PROTECTION: Protection = Protection::of_period(MS);
@@ -247,7 +250,9 @@ fn one_of_64_bad_messages_is_tolerated() {
         let message = bench.next();
         assert!(matches!(bench.take(&message), Verdict::Apply(_)));
     }
-    assert_eq!(bench.take(&bad), Verdict::Refused(ProtectionError::Corrupt));
+    // Also one that the node has refused for its type.
+    let spoiled = Bytes::from_static(SPOILED);
+    assert_eq!(bench.take(&spoiled), Verdict::Refused(ProtectionError::Corrupt));
     assert_eq!(bench.receiver.state(), State::Safe(Cause::TooManyBad));
 
     let mut bench = Bench::live();

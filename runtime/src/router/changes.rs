@@ -81,10 +81,26 @@ impl Router {
         lock(&self.writing).here.memberships()
     }
 
-    /// Sets the types that their senders and the applications of this node declared differently; `None`: none.
-    pub fn set_mismatches(&self, mismatches: Option<Mismatches>) {
+    /// Returns the number of changes of the routes to other nodes, for [`set_mismatches`](Self::set_mismatches).
+    #[must_use]
+    pub fn peer_changes(&self) -> u64 {
+        lock(&self.writing).peer_changes
+    }
+
+    /// Sets the types that their senders and the applications of this node declared differently; `None`: none. Returns
+    /// whether they are set: not if a route to another node has changed since the caller read `peer_changes`. Then a
+    /// sender may be another incarnation, with other types.
+    #[must_use]
+    pub fn set_mismatches(&self, mismatches: Option<Mismatches>, peer_changes: u64) -> bool {
         let mismatches = mismatches.map(Arc::new);
-        self.change(|table| table.mismatches = mismatches);
+        let writing = lock(&self.writing);
+        if writing.peer_changes != peer_changes {
+            return false;
+        }
+        let mut snapshot = Snapshot::clone(&self.snapshot.load());
+        Arc::make_mut(&mut snapshot.table).mismatches = mismatches;
+        self.snapshot.store(Arc::new(snapshot));
+        true
     }
 
     /// Sets the tap that observes messages from now on for this purpose; `None` removes it.
@@ -130,18 +146,45 @@ impl Router {
         self.snapshot.load().members.here.all()
     }
 
-    /// Adds or replaces the route to another node.
+    /// Adds or replaces the route to another node. Another sink is another incarnation: the types that the former one
+    /// declared differently are forgotten.
     pub fn set_peer(&self, node: NodeAddress, sink: Arc<dyn MessageSink>) {
-        self.change(|table| {
-            table.peers.insert(node, sink);
-        });
+        self.change_peer(node, Some(sink));
     }
 
-    /// Removes the route to another node.
+    /// Removes the route to another node, and the types that it declared differently.
     pub fn remove_peer(&self, node: NodeAddress) {
-        self.change(|table| {
-            table.peers.remove(&node);
-        });
+        self.change_peer(node, None);
+    }
+
+    fn change_peer(&self, node: NodeAddress, sink: Option<Arc<dyn MessageSink>>) {
+        let mut writing = lock(&self.writing);
+        let mut snapshot = Snapshot::clone(&self.snapshot.load());
+        let is_same = match (snapshot.table.peers.get(&node), &sink) {
+            (Some(former), Some(sink)) => Arc::ptr_eq(former, sink),
+            (None, None) => true,
+            (Some(_), None) | (None, Some(_)) => false,
+        };
+        if is_same {
+            return;
+        }
+        writing.peer_changes += 1;
+        let table = Arc::make_mut(&mut snapshot.table);
+        match sink {
+            Some(sink) => table.peers.insert(node, sink),
+            None => table.peers.remove(&node),
+        };
+        let former = table.mismatches.clone();
+        let others = former.as_ref().and_then(|former| former.without(node));
+        let has_dropped = others.is_some();
+        if let Some(others) = others {
+            table.mismatches = Some(others).filter(|others| !others.is_empty()).map(Arc::new);
+        }
+        self.snapshot.store(Arc::new(snapshot));
+        drop(writing);
+        if let Some(former) = former.filter(|_| has_dropped) {
+            former.notify();
+        }
     }
 
     /// Sets the groups that have members on another node. Only the paths to the groups that changed are copied.

@@ -19,9 +19,7 @@ use std::{
     sync::{Arc, Mutex, Weak},
 };
 
-use super::{
-    Judge, MessageSink, Router, Snapshot, SubmitError, copy_of, for_each_here, guard::why_refused, tap,
-};
+use super::{Judge, MessageSink, Router, Snapshot, SubmitError, copy_of, for_each_here, tap};
 use crate::{
     lock,
     outcome::{MemberReport, MemberState, Outcome, Receipt, ReceiptSink, Rejection, Ticket},
@@ -72,7 +70,7 @@ impl Router {
             self.open_send(message, &here, peers.iter().map(|(node, _)| *node).collect())?;
         tap::saw_sent_to_many(table.tap.as_ref(), &message);
         if is_here {
-            self.submit_to_each(snapshot, table.guard.as_ref(), &message, &send);
+            self.submit_to_each(snapshot, table.judge(), &message, &send);
         }
         for (node, peer) in peers {
             self.submit_copy(&message, &send, Tid::new(node, app), |copy| peer.submit(copy));
@@ -84,12 +82,12 @@ impl Router {
     pub(super) fn deliver_to_each(
         &self,
         snapshot: &Snapshot,
-        guard: Judge<'_>,
+        judge: Judge<'_>,
         message: Message,
     ) -> Result<(), SubmitError> {
         let here = self.members_but(snapshot, &message.header);
         let (message, send) = self.open_send(message, &here, Vec::new())?;
-        self.submit_to_each(snapshot, guard, &message, &send);
+        self.submit_to_each(snapshot, judge, &message, &send);
         Ok(())
     }
 
@@ -135,7 +133,7 @@ impl Router {
     fn submit_to_each(
         &self,
         snapshot: &Snapshot,
-        guard: Judge<'_>,
+        judge: Judge<'_>,
         message: &Message,
         send: &Arc<GroupSend>,
     ) {
@@ -145,7 +143,7 @@ impl Router {
                 return;
             }
             let refused = self.submit_copy(message, send, member, |copy| {
-                match why_refused(&snapshot.table, guard, app, &message.header) {
+                match judge.why_refused(app, &message.header) {
                     Some(why) => Err(SubmitError::new(copy, why)),
                     None => sink.submit(copy),
                 }

@@ -6,11 +6,16 @@
 
 use std::sync::Arc;
 
-use super::{Table, mismatches};
+use bytes::Bytes;
+
+use super::{
+    Table,
+    mismatches::{self, Mismatches, SPOILED},
+};
 use crate::{
     outcome::Rejection,
     tid::AppAddress,
-    wire::{Flags, Header},
+    wire::{Flags, Header, Message},
 };
 
 /// The access check. It is called on the sending thread, for every message, so it must not block or hold a
@@ -34,19 +39,66 @@ fn refuses(guard: Option<&Arc<dyn Guard>>, target: AppAddress, header: &Header) 
     guard.is_some_and(|guard| is_guarded(header, target) && !guard.allows(header, target))
 }
 
-/// Returns why the message of this header must not reach `target`: the guard, or a type that its sender declared
-/// differently. `None`: it may.
-#[inline]
-pub(super) fn why_refused(
-    table: &Table,
-    guard: Option<&Arc<dyn Guard>>,
-    target: AppAddress,
-    header: &Header,
-) -> Option<Rejection> {
-    if refuses(guard, target, header) {
-        return Some(Rejection::NotAllowed);
+/// The result of the checks of a message for one application.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Verdict {
+    /// It may reach the application.
+    Allowed,
+    /// It must not.
+    Refused(Rejection),
+    /// It may, without its value: it is protected, and its sender declared its type differently.
+    Spoiled,
+}
+
+/// The checks of one message.
+#[derive(Clone, Copy)]
+pub(super) struct Judge<'a> {
+    /// `None`: no restriction.
+    pub(super) guard: Option<&'a Arc<dyn Guard>>,
+    /// `None`: no types differ, or they do not matter.
+    pub(super) mismatches: Option<&'a Arc<Mismatches>>,
+}
+
+impl Table {
+    /// Returns the checks of a message to an application of this node.
+    #[inline]
+    pub(super) fn judge(&self) -> Judge<'_> {
+        Judge { guard: self.guard.as_ref(), mismatches: self.mismatches.as_ref() }
     }
-    mismatches::refuses(table.mismatches.as_ref(), target, header).then_some(Rejection::Malformed)
+}
+
+impl Judge<'_> {
+    #[inline]
+    fn of(self, target: AppAddress, header: &Header) -> Verdict {
+        if refuses(self.guard, target, header) {
+            return Verdict::Refused(Rejection::NotAllowed);
+        }
+        mismatches::judge(self.mismatches, target, header)
+    }
+
+    /// Returns why the message of this header to many must not reach `target`: the guard, or a type that its sender
+    /// declared differently. `None`: it may. A message to many is not protected.
+    #[inline]
+    pub(super) fn why_refused(self, target: AppAddress, header: &Header) -> Option<Rejection> {
+        match self.of(target, header) {
+            Verdict::Allowed => None,
+            Verdict::Refused(why) => Some(why),
+            Verdict::Spoiled => Some(Rejection::Malformed),
+        }
+    }
+
+    /// Returns why this message must not reach its one application. `None`: it may, perhaps without its value.
+    #[inline]
+    pub(super) fn check(self, message: &mut Message) -> Option<Rejection> {
+        match self.of(message.header.destination.app, &message.header) {
+            Verdict::Allowed => None,
+            Verdict::Refused(why) => Some(why),
+            Verdict::Spoiled => {
+                message.payload = Bytes::from_static(SPOILED);
+                None
+            }
+        }
+    }
 }
 
 /// Returns whether the message is subject to a guard.
@@ -68,13 +120,11 @@ pub(super) fn note(guard: Option<&Arc<dyn Guard>>, header: &Header) {
 
 #[cfg(test)]
 mod tests {
-    use bytes::Bytes;
-
     use super::*;
     use crate::{
         router::{LocalRoute, MessageSink, Router, SubmitError},
         tid::{NodeAddress, Tid},
-        wire::{Kind, Message},
+        wire::Kind,
     };
 
     const NODE: NodeAddress = NodeAddress::new(0x7f00_0001);
@@ -117,11 +167,11 @@ mod tests {
         };
         let everybody = Tid::new(NodeAddress::ALL, AppAddress::ALL);
         for allows in [true, false] {
-            let judged = router.deliver_judged_by(to(HEIR), &guard(allows));
+            let judged = router.deliver_will(to(HEIR), Some(&guard(allows)));
             assert_eq!(judged, if allows { Ok(()) } else { Err(Rejection::NotAllowed) });
             let mut to_all = to(HEIR);
             to_all.header.destination = everybody;
-            assert_eq!(router.deliver_judged_by(to_all, &guard(allows)), Ok(()));
+            assert_eq!(router.deliver_will(to_all, Some(&guard(allows))), Ok(()));
         }
         assert_eq!(router.deliver(to(HEIR)), Ok(()), "the table itself has no guard");
     }

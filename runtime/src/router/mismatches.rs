@@ -13,10 +13,16 @@ use std::{
     },
 };
 
+use super::guard::Verdict;
 use crate::{
-    tid::{AppAddress, Tid},
+    outcome::Rejection,
+    tid::{AppAddress, NodeAddress, Tid},
     wire::{Header, Kind},
 };
+
+/// The payload of a protected message that is refused because of its type. It is no envelope, so the guard counts a bad
+/// message, as for one that cannot be decoded. A refusal on the way would be silence for the guard.
+pub(crate) const SPOILED: &[u8] = b"sinew: the sender declared this type differently";
 
 /// Maximum number of entries. The node leaves further ones out: then the decoder decides on their messages.
 pub const MISMATCHES_MAX: usize = 256;
@@ -32,26 +38,31 @@ pub struct TypedPath {
     pub kind: Kind,
 }
 
+/// The effect of an entry on the messages of its path.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Effect {
+    /// They are delivered and counted.
+    Counted,
+    /// They are refused as `Malformed`.
+    Refused,
+    /// They reach the receiver without their value, so that its guard counts a bad message. For protected types.
+    Spoiled,
+}
+
 /// The treatment of the messages of a path, and their number.
 #[derive(Debug)]
 pub struct Mismatch {
-    is_refused: bool,
+    effect: Effect,
     seen: AtomicU64,
     /// Whether the owner of the table was notified of a message and has not read the number since.
     is_notified: AtomicBool,
 }
 
 impl Mismatch {
-    /// Creates an entry for messages that are refused, or that are only counted.
+    /// Creates an entry with this effect.
     #[must_use]
-    pub fn new(is_refused: bool) -> Arc<Self> {
-        Arc::new(Self { is_refused, seen: AtomicU64::new(0), is_notified: AtomicBool::new(false) })
-    }
-
-    /// Returns whether the messages are refused.
-    #[must_use]
-    pub const fn is_refused(&self) -> bool {
-        self.is_refused
+    pub fn new(effect: Effect) -> Arc<Self> {
+        Arc::new(Self { effect, seen: AtomicU64::new(0), is_notified: AtomicBool::new(false) })
     }
 
     /// Returns the number of messages so far.
@@ -61,8 +72,14 @@ impl Mismatch {
         self.seen.load(Ordering::Relaxed)
     }
 
-    /// Returns whether there was a message since the last call. The next message notifies the owner again.
+    /// Returns whether there was a message since the last call of [`take_notified`](Self::take_notified).
     #[must_use]
+    pub fn is_notified(&self) -> bool {
+        // SYNC: Relaxed; no other data depends on it.
+        self.is_notified.load(Ordering::Relaxed)
+    }
+
+    /// Returns whether there was a message since the last call. The next message notifies the owner again.
     pub fn take_notified(&self) -> bool {
         // SYNC: Relaxed; no other data depends on it.
         self.is_notified.swap(false, Ordering::Relaxed)
@@ -92,23 +109,48 @@ impl Mismatches {
         Self { paths: paths.into_iter().take(MISMATCHES_MAX).collect(), notify }
     }
 
-    /// Returns whether the message of this header is refused at `target`, and counts it.
-    fn refuses(&self, target: AppAddress, header: &Header) -> bool {
+    /// Returns the table without the paths from `node`. `None`: there are none.
+    pub(super) fn without(&self, node: NodeAddress) -> Option<Self> {
+        let is_of = |path: &TypedPath| path.source.node == node;
+        if !self.paths.keys().any(is_of) {
+            return None;
+        }
+        let others = self.paths.iter().filter(|(path, _)| !is_of(path));
+        let paths = others.map(|(path, mismatch)| (*path, mismatch.clone())).collect();
+        Some(Self { paths, notify: self.notify.clone() })
+    }
+
+    /// Returns whether there is no path.
+    pub(super) fn is_empty(&self) -> bool {
+        self.paths.is_empty()
+    }
+
+    /// Notifies the owner of the table.
+    pub(super) fn notify(&self) {
+        (self.notify)();
+    }
+
+    /// Judges the message of this header for `target`, and counts it.
+    fn judge(&self, target: AppAddress, header: &Header) -> Verdict {
         let path = TypedPath { source: header.source, target, kind: header.kind };
-        let Some(found) = self.paths.get(&path) else { return false };
+        let Some(found) = self.paths.get(&path) else { return Verdict::Allowed };
         // SYNC: Relaxed; no other data depends on these two.
         found.seen.fetch_add(1, Ordering::Relaxed);
         if !found.is_notified.load(Ordering::Relaxed) && !found.is_notified.swap(true, Ordering::Relaxed) {
-            (self.notify)();
+            self.notify();
         }
-        found.is_refused
+        match found.effect {
+            Effect::Counted => Verdict::Allowed,
+            Effect::Refused => Verdict::Refused(Rejection::Malformed),
+            Effect::Spoiled => Verdict::Spoiled,
+        }
     }
 }
 
-/// Returns whether the message of this header must not reach `target`, because their types differ.
+/// Judges the message of this header by the types that its sender and `target` declared.
 #[inline]
-pub(super) fn refuses(table: Option<&Arc<Mismatches>>, target: AppAddress, header: &Header) -> bool {
-    table.is_some_and(|table| table.refuses(target, header))
+pub(super) fn judge(table: Option<&Arc<Mismatches>>, target: AppAddress, header: &Header) -> Verdict {
+    table.map_or(Verdict::Allowed, |table| table.judge(target, header))
 }
 
 #[cfg(test)]
@@ -120,9 +162,8 @@ mod tests {
     use super::*;
     use crate::{
         lock,
-        outcome::{Outcome, Receipt, ReceiptSink, Rejection, Ticket},
+        outcome::{Outcome, Receipt, ReceiptSink, Ticket},
         router::{LocalRoute, MessageSink, Router, SubmitError},
-        tid::NodeAddress,
         wire::Message,
     };
 
@@ -134,6 +175,17 @@ mod tests {
 
     #[derive(Default)]
     struct Taken(Mutex<Vec<Kind>>);
+
+    /// Keeps the payloads.
+    #[derive(Default)]
+    struct Payloads(Mutex<Vec<Bytes>>);
+
+    impl MessageSink for Payloads {
+        fn submit(&self, message: Message) -> Result<(), SubmitError> {
+            lock(&self.0).push(message.payload);
+            Ok(())
+        }
+    }
 
     impl MessageSink for Taken {
         fn submit(&self, message: Message) -> Result<(), SubmitError> {
@@ -163,19 +215,20 @@ mod tests {
         Message::new(Header::new(kind, SOURCE, Tid::new(HERE, target)), Bytes::new())
     }
 
-    fn set(router: &Router, is_refused: bool) -> (Arc<Mismatch>, Arc<AtomicU64>) {
-        let (mismatch, notified) = (Mismatch::new(is_refused), Arc::new(AtomicU64::new(0)));
+    fn set(router: &Router, effect: Effect) -> (Arc<Mismatch>, Arc<AtomicU64>) {
+        let (mismatch, notified) = (Mismatch::new(effect), Arc::new(AtomicU64::new(0)));
         let path = TypedPath { source: SOURCE, target: TARGET, kind: KIND };
         let count = notified.clone();
         let notify = Arc::new(move || _ = count.fetch_add(1, Ordering::Relaxed));
-        router.set_mismatches(Some(Mismatches::new([(path, mismatch.clone())], notify)));
+        let table = Mismatches::new([(path, mismatch.clone())], notify);
+        assert!(router.set_mismatches(Some(table), router.peer_changes()));
         (mismatch, notified)
     }
 
     #[test]
     fn only_the_differing_type_of_the_pair_is_refused() {
         let (router, taken) = router(&[TARGET, OTHER]);
-        let (mismatch, _) = set(&router, true);
+        let (mismatch, _) = set(&router, Effect::Refused);
         assert_eq!(router.deliver(message(KIND, TARGET)), Err(Rejection::Malformed));
         assert_eq!(router.deliver(message(KIND, OTHER)), Ok(()));
         let of_other_type = Kind::named("test.other");
@@ -184,14 +237,14 @@ mod tests {
         assert_eq!(offered, Err(Rejection::Malformed));
         assert_eq!(mismatch.seen(), 2);
         assert_eq!(*lock(&taken.0), [KIND, of_other_type]);
-        router.set_mismatches(None);
+        assert!(router.set_mismatches(None, router.peer_changes()));
         assert_eq!(router.deliver(message(KIND, TARGET)), Ok(()));
     }
 
     #[test]
     fn refused_confirmed_message_has_its_outcome() {
         let ((router, _), ledger) = (router(&[TARGET]), Arc::new(Ledger::default()));
-        let _ = set(&router, true);
+        let _ = set(&router, Effect::Refused);
         let mut confirmed = message(KIND, TARGET);
         confirmed.receipt = Some(Receipt::new(ledger.clone(), confirmed.ticket()));
         assert_eq!(router.deliver(confirmed), Err(Rejection::Malformed));
@@ -201,7 +254,7 @@ mod tests {
     #[test]
     fn group_reaches_the_members_with_the_same_type() {
         let (router, taken) = router(&[TARGET, OTHER]);
-        let (mismatch, _) = set(&router, true);
+        let (mismatch, _) = set(&router, Effect::Refused);
         let group = AppAddress::group("drives");
         for app in [TARGET, OTHER] {
             assert!(router.set_member(group, app, true));
@@ -214,7 +267,7 @@ mod tests {
     #[test]
     fn owner_is_notified_once_until_it_reads() {
         let (router, taken) = router(&[TARGET]);
-        let (mismatch, notified) = set(&router, false);
+        let (mismatch, notified) = set(&router, Effect::Counted);
         for _ in 0..3 {
             assert_eq!(router.deliver(message(KIND, TARGET)), Ok(()));
         }
@@ -222,5 +275,65 @@ mod tests {
         assert!(mismatch.take_notified() && !mismatch.take_notified());
         assert_eq!(router.deliver(message(KIND, TARGET)), Ok(()));
         assert_eq!((notified.load(Ordering::Relaxed), lock(&taken.0).len()), (2, 4));
+    }
+
+    #[test]
+    fn protected_message_arrives_without_its_value() {
+        let (router, payloads) = (Router::new(HERE), Arc::new(Payloads::default()));
+        router.set_local(TARGET, LocalRoute { sink: payloads.clone(), events: Arc::new([]) });
+        let (mismatch, _) = set(&router, Effect::Spoiled);
+        let sealed = || Message::new(message(KIND, TARGET).header, Bytes::from_static(b"sealed"));
+        assert_eq!(router.deliver(sealed()), Ok(()));
+        assert!(router.offer(sealed(), None).is_ok());
+        assert_eq!(
+            (mismatch.seen(), lock(&payloads.0).as_slice()),
+            (2, &[SPOILED, SPOILED].map(Bytes::from_static)[..])
+        );
+        // Nothing guarded is sent to a group.
+        let group = AppAddress::group("drives");
+        assert!(router.set_member(group, TARGET, true));
+        let to_group = Header::new(KIND, SOURCE, Tid::new(NodeAddress::ALL, group));
+        assert_eq!(router.deliver(Message::new(to_group, Bytes::new())), Ok(()));
+        assert_eq!((mismatch.seen(), lock(&payloads.0).len()), (3, 2));
+    }
+
+    #[test]
+    fn will_of_a_lost_node_is_not_compared() {
+        let (router, taken) = router(&[TARGET]);
+        let _ = set(&router, Effect::Refused);
+        assert_eq!(router.deliver_will(message(KIND, TARGET), None), Ok(()));
+        assert_eq!(*lock(&taken.0), [KIND]);
+    }
+
+    #[test]
+    fn next_incarnation_of_a_node_is_not_refused() {
+        let (router, taken) = router(&[TARGET]);
+        let peer = |sink: &Arc<Taken>| router.set_peer(SOURCE.node, sink.clone());
+        peer(&taken);
+        let (_, notified) = set(&router, Effect::Refused);
+        // A further connection of the same incarnation has the same sink.
+        peer(&taken);
+        assert_eq!(router.deliver(message(KIND, TARGET)), Err(Rejection::Malformed));
+        let before = notified.load(Ordering::Relaxed);
+        let changes = router.peer_changes();
+        peer(&Arc::default());
+        assert_eq!(router.deliver(message(KIND, TARGET)), Ok(()));
+        assert_eq!(notified.load(Ordering::Relaxed), before + 1, "the owner of the table is to compare anew");
+        // A table from before the change is not set.
+        let path = TypedPath { source: SOURCE, target: TARGET, kind: KIND };
+        let stale = || Mismatches::new([(path, Mismatch::new(Effect::Refused))], Arc::new(|| {}));
+        assert!(!router.set_mismatches(Some(stale()), changes));
+        assert_eq!(router.deliver(message(KIND, TARGET)), Ok(()));
+        assert!(router.set_mismatches(Some(stale()), router.peer_changes()));
+        router.remove_peer(SOURCE.node);
+        assert_eq!(router.deliver(message(KIND, TARGET)), Ok(()));
+    }
+
+    #[test]
+    fn change_of_a_node_keeps_the_paths_of_others() {
+        let (router, taken) = router(&[TARGET]);
+        let _ = set(&router, Effect::Refused);
+        router.set_peer(NodeAddress::new(3), taken);
+        assert_eq!(router.deliver(message(KIND, TARGET)), Err(Rejection::Malformed));
     }
 }

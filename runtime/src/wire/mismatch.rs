@@ -10,7 +10,7 @@
 /// ```
 /// use sinew::{MismatchPolicy, Payload, serde::{Deserialize, Serialize}};
 ///
-/// /// A limit of force. A message of another version of it is never applied.
+/// /// A limit of force. A message of another declared version of it is refused.
 /// #[derive(Serialize, Deserialize)]
 /// #[serde(crate = "sinew::serde")]
 /// struct ForceLimit { newtons: f32 }
@@ -22,7 +22,8 @@
 /// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum MismatchPolicy {
-    /// Any difference is refused.
+    /// Any difference is refused, also before the node has the sender's structure. A message that comes before the
+    /// sender's node has declared its type is decoded as usual.
     Refuse,
     /// Each difference is logged, and the decoder decides on each message.
     Warn,

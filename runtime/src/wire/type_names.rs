@@ -26,6 +26,7 @@ struct Declared {
     name: &'static str,
     rust: &'static str,
     mismatch: MismatchPolicy,
+    is_protected: bool,
     trace: fn() -> Result<TypeSchema, TraceError>,
     /// Traced at the first question, on the thread that asks.
     schema: OnceLock<Result<TypeSchema, TraceError>>,
@@ -54,6 +55,7 @@ pub(crate) fn remember<P: Payload>() -> Option<PayloadType> {
                 name: P::NAME,
                 rust: std::any::type_name::<P>(),
                 mismatch: P::MISMATCH,
+                is_protected: P::PROTECTION.is_some(),
                 trace: trace::<P>,
                 schema: OnceLock::new(),
             }),
@@ -110,6 +112,12 @@ impl PayloadType {
     #[must_use]
     pub fn mismatch(self) -> MismatchPolicy {
         self.entry().declared.mismatch
+    }
+
+    /// Returns whether the type has end-to-end protection.
+    #[must_use]
+    pub fn is_protected(self) -> bool {
+        self.entry().declared.is_protected
     }
 
     /// Returns the structure of the type. The first call takes up to some milliseconds, as [`Kind::schema`].

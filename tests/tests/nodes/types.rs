@@ -6,9 +6,11 @@ use std::sync::{
 };
 
 use sinew::{
+    MismatchPolicy,
     inspect::{AskMismatches, AskSchemas, MismatchReport, MismatchesReport, SchemasReport},
     message::{Kind, Rejection, Sender},
     prelude::*,
+    serde::{Deserialize, Serialize},
 };
 use sinew_runtime::log::{LogObserver, observe, tracing::Level};
 use sinew_testkit::{
@@ -24,6 +26,7 @@ mod sent {
     payload!("types.limit" => pub(super) struct Limit { pub torque: f32 });
     payload!("types.counter" => pub(super) struct Counter { pub value: u32 });
     payload!("types.declared" => pub(super) struct Declared { pub torque: f32 });
+    payload!("types.strict" => pub(super) struct Strict { pub torque: f32, pub until: u32 });
 }
 
 /// The same types in the knee's program: one has a field less, one has a renamed field, one has a text for a number.
@@ -33,6 +36,18 @@ mod handled {
     payload!("types.limit" => pub(super) struct Limit { pub newton_metres: f32 });
     payload!("types.counter" => pub(super) struct Counter { pub value: String });
     payload!("types.declared" => pub(super) struct Declared { pub newton_metres: f32 });
+
+    /// The decoder accepts a message with one more field, and the policy does not.
+    #[derive(Serialize, Deserialize)]
+    #[serde(crate = "sinew::serde")]
+    pub(super) struct Strict {
+        pub torque: f32,
+    }
+
+    impl Payload for Strict {
+        const NAME: &'static str = "types.strict";
+        const MISMATCH: MismatchPolicy = MismatchPolicy::Refuse;
+    }
 }
 
 /// Counts the messages that its handlers get.
@@ -53,7 +68,7 @@ macro_rules! counted {
     };
 }
 
-counted!(Gains Limit Counter Declared);
+counted!(Gains Limit Counter Declared Strict);
 
 fn knee(handled: &Arc<AtomicU64>) -> AppSpec<Knee> {
     let handled = handled.clone();
@@ -62,6 +77,7 @@ fn knee(handled: &Arc<AtomicU64>) -> AppSpec<Knee> {
         .handles::<handled::Limit>()
         .handles::<handled::Counter>()
         .handles::<handled::Declared>()
+        .handles::<handled::Strict>()
 }
 
 /// The lines of the log about types, of all nodes of this process.
@@ -185,6 +201,32 @@ fn declared_type_is_compared_before_its_first_message() {
     assert_eq!((refused.treatment.as_str(), refused.seen), ("refused", 0));
     assert_eq!(refused.name.as_deref(), Some("types.declared"));
     assert_eq!(handled.load(Ordering::Relaxed), 0);
+}
+
+#[test]
+fn addition_is_refused_where_the_policy_says_so() {
+    let (loopback, handled) = (Loopback::new(), Arc::<AtomicU64>::default());
+    let (gait, probe) = sender_app("strict.gait");
+    let hip = loopback.node("hip").app(gait).start().expect("a node");
+    let other = loopback.node("knee").app(knee(&handled)).start().expect("a node");
+    all_run(&[&hip, &other]);
+    let sender = probe.sender();
+    until("the knee is known", || sender.resolve("knee"));
+    let send = || outcome(&sender, &sent::Strict { torque: 9.0, until: 3 });
+    // The first messages declare the type: the decoder reads them.
+    let malformed = Outcome::Rejected(Rejection::Malformed);
+    until("the node refuses the type", || (send() == malformed).then_some(()));
+    let so_far = handled.load(Ordering::Relaxed);
+    for _ in 0..10 {
+        assert_eq!(send(), malformed);
+    }
+    assert_eq!(handled.load(Ordering::Relaxed), so_far, "no refused message is handled");
+    let there = other.handle().address();
+    let refused = until("the difference is known", || {
+        mismatches(&sender, there).into_iter().find(|one| one.kind == Kind::named("types.strict"))
+    });
+    assert_eq!((refused.treatment.as_str(), refused.policy.as_str()), ("refused", "refuse"));
+    assert_eq!(refused.differences, ["field `until` is missing at the receiver"]);
 }
 
 /// Declares a type, and sends nothing.

@@ -9,6 +9,7 @@ use sinew_runtime::{
     tid::Tid,
     wire::{Kind, Message, SchemaHash},
 };
+use sinew_schema::Schema;
 use sinew_sync::AppTypes;
 
 use super::reports::{AskSchemas, MismatchReport, MismatchesReport, SchemaReport, SchemasReport, TypeUser};
@@ -35,7 +36,7 @@ pub(super) fn schemas(state: &Arc<NodeState>, question: &Message) -> Result<Sche
         }
     }
     for (hash, report) in &mut by_hash {
-        report.schema = encoded(state, kind, *hash);
+        report.schema = encoded(state, kind, *hash, report);
     }
     let is_known =
         |tid: Tid| declared.iter().any(|app| app.tid == tid && hash_of(&app.types.handles, kind).is_some());
@@ -58,13 +59,13 @@ fn entry(by_hash: &mut BTreeMap<SchemaHash, SchemaReport>, hash: SchemaHash) -> 
     by_hash.entry(hash).or_insert_with(empty)
 }
 
-/// Returns the bytes of a structure that this process has, or that another node has sent.
-fn encoded(state: &NodeState, kind: Kind, hash: SchemaHash) -> Option<Vec<u8>> {
+/// Returns the bytes of a structure that this process has, or that the node of one of its users has sent.
+fn encoded(state: &NodeState, kind: Kind, hash: SchemaHash, users: &SchemaReport) -> Option<Vec<u8>> {
     if let Some(own) = kind.schema_of_hash(hash) {
         return Some(own.schema().encode());
     }
     let verdicts = lock(&state.types.verdicts);
-    verdicts.fetched((kind, hash)).map(|schema| schema.encode())
+    users.sent_by.iter().find_map(|user| verdicts.fetched(user.tid.node, (kind, hash))).map(Schema::encode)
 }
 
 /// Returns the types that applications of this node and of others have in different versions.

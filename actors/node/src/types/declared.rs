@@ -5,11 +5,11 @@ use std::{
     sync::Mutex,
 };
 
-use sinew_model::facts::{DeclaredTypes, TypeHash};
+use sinew_model::facts::DeclaredTypes;
 use sinew_runtime::{
     lock,
     tid::AppAddress,
-    wire::{Kind, PayloadType},
+    wire::{Kind, PayloadType, SchemaHash},
 };
 
 /// Maximum number of types that one application handles, and of those that it sends; the directory has as many.
@@ -57,11 +57,15 @@ impl Declared {
         is_new
     }
 
-    /// Returns the applications with changes since the last call.
-    pub(super) fn take_changed(&self) -> Vec<(AppAddress, AppTypes)> {
+    /// Removes one application from those with changes, and returns it.
+    pub(super) fn pop_changed(&self) -> Option<(AppAddress, AppTypes)> {
         let mut table = lock(&self.0);
-        let changed = std::mem::take(&mut table.changed);
-        changed.into_iter().filter_map(|app| Some((app, table.apps.get(&app)?.clone()))).collect()
+        while let Some(app) = table.changed.pop_first() {
+            if let Some(types) = table.apps.get(&app) {
+                return Some((app, types.clone()));
+            }
+        }
+        None
     }
 
     /// Removes an application that is not registered.
@@ -71,40 +75,64 @@ impl Declared {
         table.changed.remove(&app);
     }
 
-    /// Returns the type of this kind that the application handles.
+    /// Returns the type of this kind that the application handles. `None`: none, or several with different structures.
     pub(super) fn handled(&self, app: AppAddress, kind: Kind) -> Option<PayloadType> {
-        of_kind(&lock(&self.0).apps.get(&app)?.handles, kind)
+        let of = of_kind(&lock(&self.0).apps.get(&app)?.handles, kind);
+        // Without the lock: each type may be traced.
+        is_one(&of).then(|| of.first().copied())?
     }
 
-    /// Returns the type of this kind that the application sends.
+    /// Returns the type of this kind that the application sends. `None`: none, or several with different structures.
     pub(super) fn sent(&self, app: AppAddress, kind: Kind) -> Option<PayloadType> {
-        of_kind(&lock(&self.0).apps.get(&app)?.sends, kind)
+        let of = of_kind(&lock(&self.0).apps.get(&app)?.sends, kind);
+        is_one(&of).then(|| of.first().copied())?
     }
 }
 
 impl AppTypes {
-    /// Traces the types. It may take milliseconds for each, at the first time.
+    /// Traces the types. It may take milliseconds for each, at the first time. Two Rust types of one name and different
+    /// structures are left out: nobody knows which of them a message is of.
     pub(super) fn hashes(&self) -> DeclaredTypes {
-        let hash = |one: &PayloadType| -> Option<TypeHash> { Some((one.kind(), one.schema().ok()?.hash())) };
-        DeclaredTypes {
-            handles: self.handles.iter().filter_map(hash).collect(),
-            sends: self.sends.iter().filter_map(hash).collect(),
-        }
+        let known = |types: &[PayloadType]| {
+            let firsts =
+                types.iter().enumerate().filter(|(at, one)| of_kind(&types[..*at], one.kind()).is_empty());
+            let alone = firsts.filter(|(_, one)| is_one(&of_kind(types, one.kind())));
+            alone.filter_map(|(_, one)| Some((one.kind(), hash(*one)?))).collect()
+        };
+        DeclaredTypes { handles: known(&self.handles), sends: known(&self.sends) }
+    }
+
+    /// Returns whether the application has two types of one name. Its published types may become fewer by that.
+    pub(super) fn has_two_of_a_kind(&self) -> bool {
+        let has_two = |types: &[PayloadType]| types.iter().any(|one| of_kind(types, one.kind()).len() > 1);
+        has_two(&self.handles) || has_two(&self.sends)
     }
 }
 
-/// Adds a type unless one of its kind is there. Returns whether it was added.
+/// Adds a type unless it is there. Returns whether it was added.
 fn add(types: &mut Vec<PayloadType>, one: PayloadType) -> bool {
     let is_compared = !one.name().starts_with(OWN_PREFIX);
-    let is_new = is_compared && types.len() < TYPES_MAX && of_kind(types, one.kind()).is_none();
+    let is_new = is_compared && types.len() < TYPES_MAX && !types.contains(&one);
     if is_new {
         types.push(one);
     }
     is_new
 }
 
-fn of_kind(types: &[PayloadType], kind: Kind) -> Option<PayloadType> {
-    types.iter().copied().find(|one| one.kind() == kind)
+fn of_kind(types: &[PayloadType], kind: Kind) -> Vec<PayloadType> {
+    types.iter().copied().filter(|one| one.kind() == kind).collect()
+}
+
+/// Returns whether all these types have one structure.
+fn is_one(types: &[PayloadType]) -> bool {
+    match types {
+        [] | [_] => true,
+        [first, others @ ..] => others.iter().all(|other| hash(*other) == hash(*first)),
+    }
+}
+
+fn hash(one: PayloadType) -> Option<SchemaHash> {
+    Some(one.schema().ok()?.hash())
 }
 
 #[cfg(test)]
@@ -144,6 +172,16 @@ mod tests {
         const NAME: &'static str = "sinew.test.declared";
     }
 
+    /// Another Rust type with the name of the first.
+    #[derive(Serialize, Deserialize)]
+    struct OtherAngle {
+        radians: f32,
+    }
+
+    impl Payload for OtherAngle {
+        const NAME: &'static str = Angle::NAME;
+    }
+
     struct Gait;
 
     impl actix::Actor for Gait {
@@ -161,17 +199,32 @@ mod tests {
         assert!(!declared.sends(APP, *angle), "nothing has this address");
         declared.register(APP, &[], &[*angle]);
         assert!(!declared.sends(APP, *angle) && declared.sends(APP, *speed));
-        let changed = declared.take_changed();
-        let [(app, types)] = &changed[..] else { panic!("one has changed") };
+        let (app, types) = declared.pop_changed().expect("one has changed");
         let sends = types.hashes().sends;
-        assert_eq!((*app, sends.len()), (APP, 2));
+        assert_eq!((app, sends.len()), (APP, 2));
         assert_eq!(sends[0], (Angle::KIND, angle.schema().unwrap().hash()));
-        assert!(declared.take_changed().is_empty());
+        assert!(declared.pop_changed().is_none());
         assert_eq!(declared.sent(APP, Speed::KIND), Some(*speed));
         declared.register(APP, &[*angle], gait.sends());
         assert_eq!(declared.sent(APP, Own::KIND), None);
         assert_eq!(declared.handled(APP, Angle::KIND), Some(*angle));
         declared.forget(APP);
-        assert_eq!((declared.sent(APP, Speed::KIND), declared.take_changed().len()), (None, 0));
+        assert!(declared.sent(APP, Speed::KIND).is_none() && declared.pop_changed().is_none());
+    }
+
+    #[test]
+    fn two_structures_of_one_name_are_not_published() {
+        let declared = Declared::default();
+        let app: DynApp =
+            AppSpec::new("gait", || Gait).sends::<Angle>().sends::<Speed>().sends::<OtherAngle>().into();
+        let [angle, speed, other] = app.sends() else { panic!("it sends three") };
+        declared.register(APP, &[], &[*angle, *speed]);
+        assert_eq!(declared.pop_changed().map(|(_, types)| types.hashes().sends.len()), Some(2));
+        assert!(declared.sends(APP, *other), "it is another type");
+        let (_, types) = declared.pop_changed().expect("it has changed");
+        assert!(types.has_two_of_a_kind());
+        let kinds: Vec<_> = types.hashes().sends.into_iter().map(|(kind, _)| kind).collect();
+        assert_eq!(kinds, [Speed::KIND]);
+        assert_eq!((declared.sent(APP, Angle::KIND), declared.sent(APP, Speed::KIND)), (None, Some(*speed)));
     }
 }

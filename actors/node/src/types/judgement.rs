@@ -38,6 +38,8 @@ pub(crate) struct Judgement {
     pub(crate) policy: MismatchPolicy,
     /// The differences in words, each a sentence without its end.
     pub(crate) differences: Vec<String>,
+    /// Whether a person should check that both ends mean the same.
+    pub(crate) is_doubtful: bool,
 }
 
 impl Judgement {
@@ -55,7 +57,8 @@ impl Judgement {
         };
         let words = comparison.differences().iter().map(ToString::to_string);
         let differences = words.map(|words| words.chars().take(WORDS_MAX).collect()).collect();
-        Self { treatment, policy, differences }
+        let is_doubtful = comparison.differences().iter().any(|one| one.is_doubtful);
+        Self { treatment, policy, differences, is_doubtful }
     }
 }
 
@@ -67,7 +70,7 @@ pub(super) fn sentence(
     judgement: &Judgement,
     seen: u64,
 ) -> String {
-    let Judgement { treatment, policy, differences } = judgement;
+    let Judgement { treatment, policy, differences, is_doubtful } = judgement;
     let differences = differences.join("; ");
     let (done, remedy) = match treatment {
         Treatment::Refused => (
@@ -76,6 +79,9 @@ pub(super) fn sentence(
              receiver would leave the decision to the decoder",
         ),
         Treatment::Warned => ("decodes", "build both programs with one version of the type"),
+        Treatment::Accepted if *is_doubtful => {
+            ("accepts", "check that both programs mean the same, or build both with one version of the type")
+        }
         Treatment::Accepted | Treatment::Same => ("accepts", "both programs can stay as they are"),
     };
     let policy = policy.word();
@@ -137,6 +143,21 @@ mod tests {
         let as_text = judged::<Gains, AsText>(default);
         assert_eq!(as_text.treatment, Treatment::Refused);
         assert_eq!(as_text.differences, ["`kp` is f32 at the sender and text at the receiver"]);
+    }
+
+    #[test]
+    fn doubtful_addition_is_accepted_with_a_warning() {
+        #[derive(Serialize, Deserialize)]
+        struct Newtons(f32);
+        #[derive(Serialize, Deserialize)]
+        struct InNewtons {
+            kp: Newtons,
+        }
+        let judgement = judged::<Gains, InNewtons>(MismatchPolicy::default());
+        assert_eq!((judgement.treatment, judgement.is_doubtful), (Treatment::Accepted, true));
+        let words = sentence(("gait", "knee"), "demo.gains", &judgement, 1);
+        assert!(words.contains("check that both programs mean the same"), "{words}");
+        assert!(!judged::<WithDamping, Gains>(MismatchPolicy::default()).is_doubtful);
     }
 
     #[test]

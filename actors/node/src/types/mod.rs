@@ -5,7 +5,8 @@
 //! two hashes of one type differ. The verdicts are in the routing table, which refuses messages, or counts them. The
 //! first message of a type that differs is logged on both nodes, in words.
 //!
-//! All of it runs on one thread of low priority. A message that arrives before the verdict is decoded as usual.
+//! All of it runs on one thread of low priority. A message that arrives before the verdict is decoded as usual, unless
+//! the policy of its type is `Refuse`. The routing table drops the verdicts on a node when its route changes.
 //!
 //! | file | content |
 //! | --- | --- |
@@ -52,6 +53,8 @@ use crate::NodeState;
 
 /// Maximum number of frames of other nodes that wait for the thread. A further one is refused, and counted.
 const FRAMES_MAX: usize = 64;
+/// Maximum number of them of one node.
+const FRAMES_OF_NODE_MAX: usize = 8;
 
 /// The payload types of the node's applications, and the verdicts on those of other nodes.
 #[derive(Default)]
@@ -93,8 +96,8 @@ impl Types {
         self.wake.notify_one();
     }
 
-    fn take_frames(&self) -> VecDeque<(NodeAddress, Frame)> {
-        std::mem::take(&mut *lock(&self.frames))
+    fn pop_frame(&self) -> Option<(NodeAddress, Frame)> {
+        lock(&self.frames).pop_front()
     }
 }
 
@@ -108,6 +111,11 @@ impl FrameHandler for Frames {
         let mut frames = lock(&state.types.frames);
         if frames.len() >= FRAMES_MAX {
             return Err(format!("from {from}, a frame about types behind {FRAMES_MAX} that wait"));
+        }
+        if frames.iter().filter(|(of, _)| *of == from).count() >= FRAMES_OF_NODE_MAX {
+            return Err(format!(
+                "from {from}, a frame about types behind {FRAMES_OF_NODE_MAX} of it that wait"
+            ));
         }
         frames.push_back((from, frame));
         drop(frames);

@@ -20,9 +20,17 @@ const REPORTS_MAX: usize = 256;
 /// Minimum time between two reports on one path. Other nodes send one a minute, and the way takes more or less time.
 const LOG_AGAIN: Duration = Duration::from_secs(50);
 
+/// Maximum number of reports on further paths that one node sends in [`WINDOW`].
+const OF_NODE_MAX: u32 = 16;
+const WINDOW: Duration = Duration::from_secs(60);
+
 /// The last report on each path.
 #[derive(Debug, Default)]
-pub(crate) struct Reported(BTreeMap<(AppAddress, Tid, Kind), Report>);
+pub(crate) struct Reported {
+    reports: BTreeMap<(AppAddress, Tid, Kind), Report>,
+    /// The begin of the window of each node, and the number of its reports on further paths since.
+    further: BTreeMap<NodeAddress, (Time, u32)>,
+}
 
 /// A report of another node.
 #[derive(Clone, Debug)]
@@ -43,7 +51,7 @@ impl Reported {
     /// logged now.
     ///
     /// # Errors
-    /// Returns the fault if the report has no valid structure.
+    /// Returns the fault if the report has no valid structure, or the node has reported too many paths.
     pub(super) fn add(
         &mut self,
         now: Time,
@@ -53,8 +61,11 @@ impl Reported {
     ) -> Result<Option<&Report>, String> {
         let target = Tid::new(from, report.target);
         let path = (report.source, target, report.kind);
-        if self.0.get(&path).is_some_and(|former| now.since(former.at) < LOG_AGAIN) {
+        if self.reports.get(&path).is_some_and(|former| now.since(former.at) < LOG_AGAIN) {
             return Ok(None);
+        }
+        if !self.reports.contains_key(&path) {
+            self.admit(now, from)?;
         }
         let handled = Schema::parse(&report.schema)
             .map_err(|fault| format!("from {from}, of kind {}: {fault}", report.kind))?;
@@ -66,9 +77,9 @@ impl Reported {
             // The receiver's node decides: it may have compared by other rules.
             judgement.treatment = Treatment::Refused;
         }
-        if !self.0.contains_key(&path) && self.0.len() >= REPORTS_MAX {
-            let oldest = self.0.iter().min_by_key(|(_, report)| report.at).map(|(path, _)| *path);
-            oldest.into_iter().for_each(|path| _ = self.0.remove(&path));
+        if !self.reports.contains_key(&path) && self.reports.len() >= REPORTS_MAX {
+            let oldest = self.reports.iter().min_by_key(|(_, report)| report.at).map(|(path, _)| *path);
+            oldest.into_iter().for_each(|path| _ = self.reports.remove(&path));
         }
         let report = Report {
             source: report.source,
@@ -78,13 +89,24 @@ impl Reported {
             seen: report.seen,
             at: now,
         };
-        self.0.insert(path, report);
-        Ok(self.0.get(&path))
+        self.reports.insert(path, report);
+        Ok(self.reports.get(&path))
+    }
+
+    /// Counts a report of `from` on a further path.
+    fn admit(&mut self, now: Time, from: NodeAddress) -> Result<(), String> {
+        self.further.retain(|_, (begin, _)| now.since(*begin) < WINDOW);
+        let (_, count) = self.further.entry(from).or_insert((now, 0));
+        if *count >= OF_NODE_MAX {
+            return Err(format!("from {from}, a report on a further type behind {OF_NODE_MAX} in a minute"));
+        }
+        *count += 1;
+        Ok(())
     }
 
     /// Returns all reports.
     pub(crate) fn reports(&self) -> Vec<Report> {
-        self.0.values().cloned().collect()
+        self.reports.values().cloned().collect()
     }
 }
 
@@ -144,11 +166,23 @@ mod tests {
         let (own, mut reported) = (Schema::of::<Renamed>().unwrap(), Reported::default());
         for n in 0..REPORTS_MAX as u32 + 5 {
             reported
-                .add(at(100 + u64::from(n)), KNEE, &report(0x1000 + n), &own)
+                .add(at(100 + 4 * u64::from(n)), KNEE, &report(0x1000 + n), &own)
                 .unwrap()
                 .expect("it is new");
         }
         let reports = reported.reports();
         assert_eq!((reports.len(), reports[0].source), (REPORTS_MAX, AppAddress::new(0x1005)));
+    }
+
+    #[test]
+    fn further_paths_of_one_node_are_limited() {
+        let (own, mut reported) = (Schema::of::<Renamed>().unwrap(), Reported::default());
+        for n in 0..OF_NODE_MAX {
+            assert!(reported.add(at(100), KNEE, &report(0x1000 + n), &own).is_ok());
+        }
+        assert!(reported.add(at(159), KNEE, &report(0x2000), &own).is_err());
+        assert!(reported.add(at(159), NodeAddress::new(3), &report(0x2000), &own).is_ok());
+        assert!(reported.add(at(159), KNEE, &report(0x1000), &own).is_ok(), "it is a known path");
+        assert!(reported.add(at(160), KNEE, &report(0x2000), &own).is_ok());
     }
 }

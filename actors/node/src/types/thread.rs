@@ -5,6 +5,7 @@
 //! holds each lock only for a copy of bounded length.
 
 use std::{
+    collections::BTreeMap,
     io,
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{Arc, Weak, atomic::Ordering},
@@ -14,7 +15,7 @@ use std::{
 
 use serde::Serialize;
 use sinew_lncl::undelivered::kind_name;
-use sinew_model::thread_priority::lower_priority;
+use sinew_model::{facts::TypeHash, thread_priority::lower_priority};
 use sinew_runtime::{
     lock, log,
     outcome::Rejection,
@@ -23,13 +24,14 @@ use sinew_runtime::{
     time::Time,
     wire::{Class, Header, Kind, Message, encode},
 };
-use sinew_sync::AppTypes;
+use sinew_sync::{AppTypes, ListVersion};
 use tokio::{
     runtime::{Builder, Runtime},
     sync::{Notify, watch},
 };
 
 use super::{
+    FRAMES_MAX,
     frames::{Frame, MismatchReport, SchemaAnswer, SchemaQuestion},
     judgement::{Judgement, Treatment, sentence},
     verdicts::{Disagreement, Handled, Sent},
@@ -38,6 +40,12 @@ use crate::NodeState;
 
 /// Minimum time between two steps: a start of many applications is one step, not one for each.
 const PAUSE: Duration = Duration::from_millis(10);
+/// Time to the next step after a panic.
+const AFTER_PANIC: Duration = Duration::from_secs(2);
+/// Minimum time between two answers to one node with one structure; a node asks again after 2 s.
+const ANSWER_AGAIN: Duration = Duration::from_secs(1);
+/// Maximum number of answers within [`ANSWER_AGAIN`].
+const ANSWERS_MAX: usize = 1_024;
 
 /// Starts the thread. It ends with the node.
 ///
@@ -49,7 +57,9 @@ pub(crate) fn begin(state: &Arc<NodeState>) -> io::Result<()> {
         state: Arc::downgrade(state),
         wake: state.types.wake.clone(),
         changes: state.ctx.directory_changes.subscribe(),
-        installed: Vec::new(),
+        lists: BTreeMap::new(),
+        installed: (Vec::new(), 0),
+        answered: BTreeMap::new(),
     };
     thread::Builder::new().name("types".to_owned()).spawn(move || comparing.run(&runtime))?;
     Ok(())
@@ -60,8 +70,18 @@ struct Comparing {
     state: Weak<NodeState>,
     wake: Arc<Notify>,
     changes: watch::Receiver<u64>,
-    /// The entries of the routing table.
-    installed: Vec<(TypedPath, Arc<Mismatch>)>,
+    /// The types that other nodes list, as of the last step.
+    lists: BTreeMap<NodeAddress, SentTypes>,
+    /// The entries of the routing table, and the number of changes of routes before them.
+    installed: (Vec<(TypedPath, Arc<Mismatch>)>, u64),
+    /// When each structure was sent to each node, for those within [`ANSWER_AGAIN`].
+    answered: BTreeMap<(NodeAddress, TypeHash), Time>,
+}
+
+/// The types that the applications of another node send.
+struct SentTypes {
+    of: ListVersion,
+    sent: Vec<Sent>,
 }
 
 impl Comparing {
@@ -76,8 +96,10 @@ impl Comparing {
             }
             let step = AssertUnwindSafe(|| self.step(&state));
             next = catch_unwind(step).unwrap_or_else(|_| {
-                log::error!("the comparison of types panicked; it continues with the next change");
-                None
+                log::error!(
+                    "the comparison of types panicked; it continues behind the type or frame that it treated"
+                );
+                Some(Time::now() + AFTER_PANIC)
             });
             drop(state);
             thread::sleep(PAUSE);
@@ -102,99 +124,171 @@ impl Comparing {
 
     /// Handles all that is new. Returns the time of the next step.
     fn step(&mut self, state: &NodeState) -> Option<Time> {
+        // Before the directory is read: a node that is linked anew since then may have other types.
+        let peer_changes = state.ctx.router.peer_changes();
         publish(state);
-        for (from, frame) in state.types.take_frames() {
-            if let Err(fault) = handle(state, from, frame) {
+        for _ in 0..FRAMES_MAX {
+            let Some((from, frame)) = state.types.pop_frame() else { break };
+            if let Err(fault) = self.handle(state, from, frame) {
                 state.ctx.refusals.count(Time::now(), "types", &fault);
             }
         }
-        let (handled, sent) = declared(state);
+        let handled = handled(state);
+        self.read_lists(state);
         let now = Time::now();
-        let (wanted, due, table, next) = {
+        let (wanted, cases) = {
+            let sent = self.lists.values().flat_map(|list| &list.sent);
             let mut verdicts = lock(&state.types.verdicts);
-            let wanted = verdicts.declare(now, &handled, &sent);
-            let due = verdicts.take_due(now);
-            (wanted, due, verdicts.table(), verdicts.next_wake())
+            (verdicts.declare(now, &handled, sent), verdicts.cases())
         };
-        self.install(state, table);
+        for case in cases {
+            let judgement = case.judge();
+            lock(&state.types.verdicts).decide(&case, judgement);
+        }
+        let (due, left_out, mut table, next) = {
+            let mut verdicts = lock(&state.types.verdicts);
+            let due = verdicts.take_due(now);
+            (due, verdicts.take_left_out(now), verdicts.table(), verdicts.next_wake())
+        };
+        if let Some(count) = left_out {
+            log::warn!(
+                "{count} pairs of applications and types are not compared, for want of room: their messages are \
+                 decoded as usual; build the programs with one version of their types"
+            );
+        }
+        table.retain(|(path, _)| self.is_linked(state, path.source.node));
+        let is_set = self.install(state, table, peer_changes);
         for (node, (kind, hash)) in wanted {
             // It is requested again.
             let _ = send(state, node, Kind::SYNC_SCHEMA_ASK, &SchemaQuestion { kind, hash });
         }
         due.iter().for_each(|disagreement| tell(state, disagreement));
-        next
+        if is_set { next } else { Some(now) }
     }
 
-    /// Puts the entries into the routing table, if they are others than before.
-    fn install(&mut self, state: &NodeState, table: Vec<(TypedPath, Arc<Mismatch>)>) {
-        let mut pairs = table.iter().zip(&self.installed);
+    /// Handles a frame of another node.
+    ///
+    /// # Errors
+    /// Returns the fault of the frame.
+    fn handle(&mut self, state: &NodeState, from: NodeAddress, frame: Frame) -> Result<(), String> {
+        match frame {
+            Frame::Question(question) => self.answer(state, from, question),
+            Frame::Answer(SchemaAnswer { kind, hash, schema }) => {
+                lock(&state.types.verdicts).received(from, (kind, hash), &schema)
+            }
+            Frame::Report(report) => reported(state, from, &report),
+        }
+    }
+
+    /// Sends a structure to the node that asks for it.
+    ///
+    /// # Errors
+    /// Returns the fault of the question, or why the answer was not sent.
+    fn answer(
+        &mut self,
+        state: &NodeState,
+        from: NodeAddress,
+        question: SchemaQuestion,
+    ) -> Result<(), String> {
+        let SchemaQuestion { kind, hash } = question;
+        let schema = kind.schema_of_hash(hash).ok_or_else(|| {
+            format!("from {from}, a question for a structure of kind {kind} that this node does not have")
+        })?;
+        let now = Time::now();
+        self.answered.retain(|_, at| now.since(*at) < ANSWER_AGAIN);
+        let is_again = self.answered.contains_key(&(from, (kind, hash)));
+        if is_again || self.answered.len() >= ANSWERS_MAX {
+            return Err(format!("from {from}, a question for the structure of kind {kind} too early"));
+        }
+        self.answered.insert((from, (kind, hash)), now);
+        let answer = SchemaAnswer { kind, hash, schema: schema.schema().encode() };
+        let sent = send(state, from, Kind::SYNC_SCHEMA, &answer);
+        sent.map_err(|why| format!("a structure was not sent to {from}: {why}"))
+    }
+
+    /// Reads the lists that have changed. The lock of the directory is held for the types of one node at a time.
+    fn read_lists(&mut self, state: &NodeState) {
+        let versions: BTreeMap<_, _> = lock(&state.sync.core).list_versions().into_iter().collect();
+        self.lists.retain(|node, list| versions.get(node) == Some(&list.of));
+        for (node, of) in versions {
+            self.lists.entry(node).or_insert_with(|| {
+                let apps = lock(&state.sync.core).declared_types_of(node);
+                // If the list has changed meanwhile, its version differs at the next step, which follows.
+                SentTypes { of, sent: apps.into_iter().flat_map(sent_by).collect() }
+            });
+        }
+    }
+
+    /// Returns whether the list of `node` is of its linked incarnation. The directory learns of another one later than
+    /// the routing table.
+    fn is_linked(&self, state: &NodeState, node: NodeAddress) -> bool {
+        let linked = state.ctx.ports.links().and_then(|links| links.incarnation(node));
+        linked.is_none_or(|linked| self.lists.get(&node).is_some_and(|list| list.of.0 == linked))
+    }
+
+    /// Puts the entries into the routing table, if they are others than before. Returns whether they are there.
+    fn install(
+        &mut self,
+        state: &NodeState,
+        table: Vec<(TypedPath, Arc<Mismatch>)>,
+        peer_changes: u64,
+    ) -> bool {
+        let (installed, at) = &self.installed;
+        let mut pairs = table.iter().zip(installed);
         let are_same = pairs.all(|((path, entry), (former_path, former_entry))| {
             path == former_path && Arc::ptr_eq(entry, former_entry)
         });
-        if are_same && table.len() == self.installed.len() {
-            return;
+        if are_same && table.len() == installed.len() && *at == peer_changes {
+            return true;
         }
-        self.installed.clone_from(&table);
         let wake = self.wake.clone();
-        let mismatches =
-            (!table.is_empty()).then(|| Mismatches::new(table, Arc::new(move || wake.notify_one())));
-        state.ctx.router.set_mismatches(mismatches);
+        let mismatches = (!table.is_empty())
+            .then(|| Mismatches::new(table.iter().cloned(), Arc::new(move || wake.notify_one())));
+        let is_set = state.ctx.router.set_mismatches(mismatches, peer_changes);
+        if is_set {
+            self.installed = (table, peer_changes);
+        }
+        is_set
     }
 }
 
 /// Publishes the types of the applications that have new ones.
 fn publish(state: &NodeState) {
-    for (app, types) in state.types.declared.take_changed() {
+    // One by one: a type whose tracing panics takes no other one with it.
+    while let Some((app, types)) = state.types.declared.pop_changed() {
+        let may_have_fewer = types.has_two_of_a_kind();
         let types = types.hashes();
-        if !types.is_empty() {
+        if !types.is_empty() || may_have_fewer {
             // An application that has ended meanwhile has no entry in the directory.
             sinew_lncl::types_known(&state.lncl, app, types);
         }
     }
 }
 
-/// Returns the published types that applications of this node handle, and those that others send.
-fn declared(state: &NodeState) -> (Vec<Handled>, Vec<Sent>) {
-    let all = lock(&state.sync.core).declared_types();
-    let (mut handled, mut sent) = (Vec::new(), Vec::new());
+/// Returns the published types that applications of this node handle.
+fn handled(state: &NodeState) -> Vec<Handled> {
+    let all = lock(&state.sync.core).own_declared_types();
+    let mut handled = Vec::new();
     for AppTypes { tid, name, types } in all {
-        if tid.node != state.ctx.node {
-            let of_it = types.sends.into_iter();
-            sent.extend(of_it.map(|(kind, hash)| Sent { tid, name: name.clone(), kind, hash }));
-            continue;
-        }
         for (kind, hash) in types.handles {
             let own = state.types.declared.handled(tid.app, kind);
             if let Some(own) = own
                 && let Ok(schema) = own.schema()
             {
-                let (name, policy, schema) = (name.clone(), own.mismatch(), schema.schema());
-                handled.push(Handled { app: tid.app, name, kind, hash, policy, schema });
+                let (name, policy, is_protected) = (name.clone(), own.mismatch(), own.is_protected());
+                let schema = schema.schema();
+                handled.push(Handled { app: tid.app, name, kind, hash, policy, is_protected, schema });
             }
         }
     }
-    (handled, sent)
+    handled
 }
 
-/// Handles a frame of another node.
-///
-/// # Errors
-/// Returns the fault of the frame.
-fn handle(state: &NodeState, from: NodeAddress, frame: Frame) -> Result<(), String> {
-    match frame {
-        Frame::Question(SchemaQuestion { kind, hash }) => {
-            let schema = kind.schema_of_hash(hash).ok_or_else(|| {
-                format!("from {from}, a question for a structure of kind {kind} that this node does not have")
-            })?;
-            let answer = SchemaAnswer { kind, hash, schema: schema.schema().encode() };
-            let sent = send(state, from, Kind::SYNC_SCHEMA, &answer);
-            sent.map_err(|why| format!("a structure was not sent to {from}: {why}"))
-        }
-        Frame::Answer(SchemaAnswer { kind, hash, schema }) => {
-            lock(&state.types.verdicts).received(from, (kind, hash), &schema)
-        }
-        Frame::Report(report) => reported(state, from, &report),
-    }
+/// Returns the types that an application of another node sends.
+fn sent_by(app: AppTypes) -> impl Iterator<Item = Sent> {
+    let AppTypes { tid, name, types } = app;
+    let name: Arc<str> = name.into();
+    types.sends.into_iter().map(move |(kind, hash)| Sent { tid, name: name.clone(), kind, hash })
 }
 
 /// Logs the report of another node that messages of this node are of a type that differs.
@@ -206,6 +300,10 @@ fn reported(state: &NodeState, from: NodeAddress, report: &MismatchReport) -> Re
     let own = own.and_then(|own| own.schema().ok()).ok_or_else(|| {
         format!("from {from}, a report on kind {}, which {} does not send", report.kind, report.source)
     })?;
+    let target = Tid::new(from, report.target);
+    if !lock(&state.sync.core).lists_handled(target, (report.kind, report.hash)) {
+        return Err(format!("from {from}, a report on kind {}, which {target} does not handle", report.kind));
+    }
     let report = {
         let mut reported = lock(&state.types.reported);
         reported.add(Time::now(), from, report, own.schema())?.cloned()
@@ -249,6 +347,7 @@ fn write(state: &NodeState, kind: Kind, ends: (&str, &str), judgement: &Judgemen
     let words = sentence(ends, &name, judgement, seen);
     match judgement.treatment {
         Treatment::Refused | Treatment::Warned => log::warn!(%kind, "{words}"),
+        Treatment::Accepted if judgement.is_doubtful => log::warn!(%kind, "{words}"),
         Treatment::Accepted | Treatment::Same => log::info!(%kind, "{words}"),
     }
 }
@@ -260,9 +359,8 @@ fn type_name(state: &NodeState, kind: Kind) -> String {
 
 /// Returns the name of an application with its TID, or its TID alone.
 fn title(state: &NodeState, tid: Tid) -> String {
-    let all = lock(&state.sync.core).declared_types();
-    let found = all.into_iter().find(|app| app.tid == tid).map(|app| app.name);
-    found.map_or_else(|| tid.to_string(), |name| format!("{name} ({tid})"))
+    let name = lock(&state.sync.core).name_of(tid);
+    name.map_or_else(|| tid.to_string(), |name| format!("{name} ({tid})"))
 }
 
 /// Sends a frame to the sync manager of another node.

@@ -58,15 +58,27 @@ impl<'core> Directory<'core> {
         entries
     }
 
-    /// Returns every application with declared types, on this node and on all known nodes that are not lost.
-    pub(super) fn declared_types(self) -> Vec<AppTypes> {
+    /// Returns every application of this node with declared types.
+    pub(super) fn own_declared_types(self) -> impl Iterator<Item = AppTypes> {
         let declared = self.apps.iter().filter(|(_, app)| !app.types.is_empty());
-        let here = declared.map(|(address, app)| AppTypes {
+        declared.map(move |(address, app)| AppTypes {
             tid: Tid::new(self.peers.here(), address),
             name: app.title(address),
             types: app.types.clone(),
-        });
-        here.chain(self.peers.declared_types()).collect()
+        })
+    }
+
+    /// Returns every application with declared types, on this node and on all known nodes that are not lost.
+    pub(super) fn declared_types(self) -> Vec<AppTypes> {
+        self.own_declared_types().chain(self.peers.declared_types(None)).collect()
+    }
+
+    /// Returns the name of an application of this node, or of another one that is not lost.
+    pub(super) fn name_of(self, tid: Tid) -> Option<String> {
+        if tid.node == self.peers.here() {
+            return self.apps.get(tid.app).map(|app| app.title(tid.app));
+        }
+        self.peers.listed(tid).map(|entry| entry.name.to_string())
     }
 
     /// Returns the names of applications, on this node and on all known nodes that are not lost. The result

@@ -9,7 +9,7 @@ use sinew_runtime::{
 };
 
 use super::{Output, apps::Apps, outputs::Outputs, peers::Peers, retry::RETRY};
-use crate::list::{ENTRIES_MAX, List, Published};
+use crate::list::{ENTRIES_MAX, List, Omitted, Published};
 
 /// Time between two lists to a peer when nothing changed. The repetition replaces a lost list.
 pub const REPEAT: Duration = Duration::from_secs(2);
@@ -133,9 +133,17 @@ impl OwnList {
             entries: apps.entries(),
             groups: self.groups.clone(),
         };
-        let (bytes, left_out) = list.encode_within(self.bytes_max, self.own_groups);
+        let (bytes, Omitted { elements: left_out, types_of }) =
+            list.encode_within(self.bytes_max, self.own_groups);
+        let limit = self.bytes_max;
+        if types_of > 0 {
+            let detail = format!(
+                "the payload types of {types_of} applications are not in this node's directory, which has at most \
+                 {limit} bytes: other nodes do not compare them; raise `node.payload_max` or use more nodes"
+            );
+            outputs.refuse("directory full", detail);
+        }
         if left_out > 0 {
-            let limit = self.bytes_max;
             let detail = format!(
                 "{left_out} applications and groups are not in this node's directory, which has at most {ENTRIES_MAX} \
                  applications and {limit} bytes: other nodes cannot find them; raise `node.payload_max` or use more nodes"

@@ -16,7 +16,7 @@ use self::peer::{Listed, Peer};
 use super::{Output, Reason, outputs::Outputs};
 use crate::{
     list::{Entry, List, Name},
-    own_app::AppTypes,
+    own_app::{AppTypes, ListVersion},
 };
 
 /// The other nodes.
@@ -347,18 +347,35 @@ impl Peers {
         })
     }
 
-    /// Returns every application with declared types of every node that is not lost.
-    pub(super) fn declared_types(&self) -> impl Iterator<Item = AppTypes> {
-        let there = self.nodes.iter().filter(|(_, peer)| peer.lost.is_none() && !peer.stale);
-        there.flat_map(|(node, peer)| {
-            let entries = peer.list.iter().flat_map(|list| list.entries.values());
+    /// Returns the list of each node, or of one, that is not lost.
+    fn valid_lists(&self, of: Option<NodeAddress>) -> impl Iterator<Item = (NodeAddress, &Listed)> {
+        let range = of.map_or(NodeAddress::HERE..=NodeAddress::ALL, |node| node..=node);
+        let there = self.nodes.range(range).filter(|(_, peer)| peer.lost.is_none() && !peer.stale);
+        there.filter_map(|(node, peer)| Some((*node, peer.list.as_ref()?)))
+    }
+
+    /// Returns the version of the list of every node that is not lost.
+    pub(super) fn list_versions(&self) -> impl Iterator<Item = (NodeAddress, ListVersion)> {
+        self.valid_lists(None).map(|(node, list)| (node, (list.incarnation, list.version)))
+    }
+
+    /// Returns every application with declared types of every node, or of one, that is not lost.
+    pub(super) fn declared_types(&self, of: Option<NodeAddress>) -> impl Iterator<Item = AppTypes> {
+        self.valid_lists(of).flat_map(|(node, list)| {
+            let entries = list.entries.values();
             let declared = entries.filter(|entry| !(entry.handles.is_empty() && entry.sends.is_empty()));
-            declared.map(|entry| AppTypes {
-                tid: Tid::new(*node, entry.app),
+            declared.map(move |entry| AppTypes {
+                tid: Tid::new(node, entry.app),
                 name: entry.name.to_string(),
                 types: DeclaredTypes { handles: entry.handles.clone(), sends: entry.sends.clone() },
             })
         })
+    }
+
+    /// Returns the entry of an application of a node that is not lost.
+    pub(super) fn listed(&self, tid: Tid) -> Option<&Entry> {
+        let (_, list) = self.valid_lists(Some(tid.node)).next()?;
+        list.entries.values().find(|entry| entry.app == tid.app)
     }
 
     /// Returns every published name of all nodes, or of one. Nodes that are lost, or have not sent a list in

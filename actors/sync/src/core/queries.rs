@@ -3,6 +3,7 @@
 use sinew_model::{
     barrier::BarrierStatus,
     directory::{Absence, DirectoryEntry, Waiting},
+    facts::TypeHash,
 };
 use sinew_runtime::{
     tid::{AppAddress, NodeAddress, Tid},
@@ -18,7 +19,7 @@ use super::{
 };
 use crate::{
     list::Name,
-    own_app::{AppTypes, OwnApp},
+    own_app::{AppTypes, ListVersion, OwnApp},
 };
 
 impl Core {
@@ -46,6 +47,31 @@ impl Core {
     /// Returns every application with declared types, on this node and on all known nodes that are not lost.
     pub fn declared_types(&self) -> Vec<AppTypes> {
         self.all().declared_types()
+    }
+
+    /// Returns every application of this node with declared types.
+    pub fn own_declared_types(&self) -> Vec<AppTypes> {
+        self.all().own_declared_types().collect()
+    }
+
+    /// Returns the version of the list of each known node that is not lost.
+    pub fn list_versions(&self) -> Vec<(NodeAddress, ListVersion)> {
+        self.peers.list_versions().collect()
+    }
+
+    /// Returns every application with declared types of another node, unless that is lost.
+    pub fn declared_types_of(&self, node: NodeAddress) -> Vec<AppTypes> {
+        self.peers.declared_types(Some(node)).collect()
+    }
+
+    /// Returns the name of an application of this node, or of another one that is not lost.
+    pub fn name_of(&self, tid: Tid) -> Option<String> {
+        self.all().name_of(tid)
+    }
+
+    /// Returns whether another node lists that its application handles the type of this structure.
+    pub fn lists_handled(&self, tid: Tid, of: TypeHash) -> bool {
+        self.peers.listed(tid).is_some_and(|entry| entry.handles.contains(&of))
     }
 
     /// Returns the names of applications, on this node and on all known nodes that are not lost. The result

@@ -179,13 +179,32 @@ fn group_of_the_robot_stays_own_with_guests() {
 
 #[test]
 fn structures_of_types_go_before_any_name() {
-    let types = || (0..64).map(|n| (Kind::named("demo.angle"), SchemaHash(n))).collect::<Vec<_>>();
+    let kind = |n: u64| Kind::named(&format!("demo.angle{n}"));
+    let types = || (0..64).map(|n| (kind(n), SchemaHash(n))).collect::<Vec<_>>();
     let with_types = |n| Entry { handles: types(), sends: types(), ..entry(n, &format!("app{n}")) };
-    let with_types = list((0..10).map(with_types).collect());
-    let (bytes, left_out) = with_types.clone().encode(usize::MAX);
-    assert_eq!((List::parse(&bytes).unwrap(), left_out), (with_types.clone(), 0));
-    let (bytes, left_out) = with_types.encode(bytes.len() - 1);
-    assert_eq!((List::parse(&bytes).unwrap(), left_out), (list(many(10)), 0));
+    let all = list((0..10).map(with_types).collect());
+    let (bytes, omitted) = all.clone().encode_within(usize::MAX, 1);
+    assert_eq!((List::parse(&bytes).unwrap(), omitted), (all.clone(), Omitted::default()));
+    // The last entry has no room for its types, and all others have.
+    let (bytes, omitted) = all.clone().encode_within(bytes.len() - 1, 1);
+    let mut expected = all.clone();
+    (expected.entries[9].handles, expected.entries[9].sends) = (Vec::new(), Vec::new());
+    assert_eq!(List::parse(&bytes).unwrap(), expected);
+    assert_eq!(omitted, Omitted { elements: 0, types_of: 1 });
+    // Without room for any types the names stay.
+    let names = list(many(10));
+    let (bytes, omitted) = all.encode_within(encode(&names).len(), 1);
+    assert_eq!((List::parse(&bytes).unwrap(), omitted), (names, Omitted { elements: 0, types_of: 10 }));
+}
+
+#[test]
+fn second_type_of_a_kind_is_ignored() {
+    let kind = Kind::named("demo.angle");
+    let twice =
+        vec![(kind, SchemaHash(1)), (Kind::named("demo.speed"), SchemaHash(2)), (kind, SchemaHash(3))];
+    let sent = list(vec![Entry { handles: twice.clone(), sends: twice.clone(), ..entry(0, "a") }]);
+    let read = List::parse(&encode(&sent)).unwrap();
+    assert_eq!((&read.entries[0].handles[..], &read.entries[0].sends[..]), (&twice[..2], &twice[..2]));
 }
 
 #[test]

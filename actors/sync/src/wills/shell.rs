@@ -176,11 +176,8 @@ fn execute(state: &State, (node, incarnation): (NodeAddress, Incarnation), will:
     }
     let message = Message::new(header, will.payload());
     // The next incarnation of the node may be here already, and may use other names.
-    let delivered = match state.security.access.get().and_then(|access| access.guard_for(node, incarnation)) {
-        Some(guard) => state.ctx.router.deliver_judged_by(message, &guard),
-        None => state.ctx.router.deliver(message),
-    };
-    if let Err(why) = delivered
+    let guard = state.security.access.get().and_then(|access| access.guard_for(node, incarnation));
+    if let Err(why) = state.ctx.router.deliver_will(message, guard.as_ref())
         && let Some(suppressed) = state.ctx.log_quotas.wills_not_taken.take(&node, header.sent)
     {
         sinew_runtime::log::error!(source = %header.source, %destination, %why, suppressed, "a last will was rejected");

@@ -59,8 +59,16 @@ fn declared_types_are_published_and_end_with_their_node() {
         types: types(hash),
     };
     assert_eq!(bench.core.declared_types(), [of("hip", HERE, 1), of("knee", KNEE, 5)]);
+    assert_eq!(bench.core.own_declared_types(), [of("hip", HERE, 1)]);
+    assert_eq!(bench.core.declared_types_of(KNEE), [of("knee", KNEE, 5)]);
+    assert_eq!(bench.core.list_versions(), [(KNEE, (INCARNATION, 1))]);
+    let knee = Tid::new(KNEE, app(0));
+    assert_eq!(bench.core.name_of(knee).as_deref(), Some("knee"));
+    let angle = |hash| (Kind::named("demo.angle"), SchemaHash(hash));
+    assert!(bench.core.lists_handled(knee, angle(5)) && !bench.core.lists_handled(knee, angle(6)));
     bench.lost(KNEE, LossReason::LinkDown);
     assert_eq!(bench.core.declared_types(), [of("hip", HERE, 1)]);
+    assert!(bench.core.list_versions().is_empty() && bench.core.name_of(knee).is_none());
 }
 
 #[test]
