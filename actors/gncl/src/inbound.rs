@@ -198,8 +198,6 @@ impl Inbound {
             return Some(Disposition::Superseded);
         }
         if header.flags.has(Flags::OUTCOME) && header.kind == Kind::MEMBERS {
-            // The report does not overtake the messages that arrived before it.
-            self.hand_over(session);
             self.members(now, &message);
             return Some(Disposition::Consumed);
         }

@@ -319,7 +319,8 @@ impl FrozenStore {
 pub(crate) fn move_ring(from: &FrozenStore, to: &Mutex<FrozenStore>, id: &str) -> Result<(), FrozenError> {
     let (ring, facts) = from.files(id)?;
     let draft = lock(to).draft(id, &[])?;
-    let drafted = draft.copy(&ring, facts.span.as_ref().unwrap_or(&FrozenSpan::default()))?;
+    let span = facts.span.clone().unwrap_or_default();
+    let drafted = draft.copy(&ring, &span)?;
     lock(to).keep(&drafted, &facts, &[])?;
     from.discard(id);
     Ok(())

@@ -197,7 +197,7 @@ fn ring_of_a_dead_node_waits_beside_the_journal() {
     let id = store.keep_dead_ring(&path).expect("it is there").unwrap();
     assert!(!path.exists() && store.spans().is_empty());
     let (beside, dead) = store.beside(&path);
-    assert_eq!(dead, [id.clone()]);
+    assert_eq!(dead, std::slice::from_ref(&id));
     // And: another thread moves it
     fs::create_dir(&disk).unwrap();
     fs::set_permissions(&disk, fs::Permissions::from_mode(0o700)).unwrap();

@@ -183,7 +183,7 @@ fn only_the_requested_structure_of_its_node_counts() {
 fn strict_type_is_refused_until_the_structure_is_there() {
     let mut verdicts = Verdicts::default();
     let strict = Handled { policy: MismatchPolicy::Refuse, ..handled::<Gains>() };
-    verdicts.declare(at(0), &[strict.clone()], &[sent::<WithDamping>()]);
+    verdicts.declare(at(0), std::slice::from_ref(&strict), &[sent::<WithDamping>()]);
     assert_eq!(verdicts.table().len(), 1, "it is refused at once");
     let router = Router::new(HERE);
     router.set_local(KNEE, LocalRoute { sink: Arc::new(Taken), events: Arc::new([]) });
@@ -271,7 +271,7 @@ fn paths_without_a_difference_take_no_room() {
     let count = PATHS_OF_NODE_MAX as u32;
     let same: Vec<_> = (0..count).map(|n| Sent { hash: of.1, ..one_of_many(HIP, n) }).collect();
     let mut verdicts = Verdicts::default();
-    assert_eq!(verdicts.declare(at(0), &[handled.clone()], &same), [(HIP, of)]);
+    assert_eq!(verdicts.declare(at(0), std::slice::from_ref(&handled), &same), [(HIP, of)]);
     verdicts.received(HIP, of, &there.encode()).unwrap();
     judge(&mut verdicts);
     assert!(verdicts.table().is_empty() && verdicts.disagreements().is_empty());
@@ -288,7 +288,7 @@ fn verdict_without_a_difference_makes_room() {
     let count = PATHS_OF_NODE_MAX as u32 + 1;
     let same: Vec<_> = (0..count).map(|n| Sent { hash: of.hash(), ..one_of_many(HIP, n) }).collect();
     let mut verdicts = Verdicts::default();
-    verdicts.declare(at(0), &[handled.clone()], &same);
+    verdicts.declare(at(0), std::slice::from_ref(&handled), &same);
     verdicts.received(HIP, (KIND, of.hash()), &of.encode()).unwrap();
     assert_ne!(verdicts.next_wake(), Some(at(0)));
     judge(&mut verdicts);
