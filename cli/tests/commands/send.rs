@@ -46,7 +46,7 @@ fn undelivered_message_is_a_finding_with_the_reason() {
         (
             &[&*tid, "scenario.counted"][..],
             1,
-            "; it handles scenario.count, scenario.sized; nearest: scenario.count",
+            "; it handles scenario.count, scenario.sized, scenario.stamp; nearest: scenario.count",
         ),
         (
             &[&*tid, "scenario.count", r#"{"nummer":1}"#],
