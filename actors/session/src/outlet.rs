@@ -276,8 +276,8 @@ impl<S: Socket> SocketWriter<S> {
     }
 
     /// Reports the outcome of the peer's message of `ticket`. Same as [`submit_outcome`](Self::submit_outcome) of an
-    /// outcome sent now. An outcome that continues the last one of the queue is added to that: no message is made for it,
-    /// and no clock is read.
+    /// outcome sent now. An outcome that continues the last one of the queue is added to that: no message is made
+    /// for it, and no clock is read.
     ///
     /// # Errors
     /// Those of `submit_outcome`.

@@ -6,7 +6,7 @@ use std::{
 };
 
 use sinew_bag::{BagError, BagWriter, Totals};
-use sinew_record::{Channel, Entry, MessageEntry, PeerClock, Selection};
+use sinew_record::{Channel, Entry, MessageEntry, PeerClock};
 use sinew_runtime::{
     tid::{AppAddress, NodeAddress, Tid},
     wire::Kind,
@@ -17,6 +17,7 @@ use crate::{
     channels::{Description, Held, Place, Recorded, is_unreported, record},
     facts,
     names::Names,
+    setup::Setup,
     sink::Sink,
     span::Span,
 };
@@ -34,19 +35,6 @@ const RECORDS_MAX: usize = 4_096;
 const WAITED_MAX: usize = 4_096;
 /// Time between two tallies.
 const TALLY_NS: u64 = 1_000_000_000;
-
-/// The node of a recording, and the messages to record.
-#[derive(Clone, Debug)]
-pub struct Setup {
-    /// The node that writes the journal.
-    pub node: NodeAddress,
-    /// The messages to record, of those in the journal: it has also those that other programs asked for.
-    pub selection: Selection,
-    /// The names that are known at the start.
-    pub names: Names,
-    /// Applications without a record of their messages, such as the recorder itself.
-    pub left_out: Vec<Tid>,
-}
 
 /// Records a node: reads its journal, and writes the file.
 ///
@@ -438,33 +426,13 @@ impl Recorder {
     fn add(&mut self, place: u16, (to, first): (Tid, Option<&[u8]>), before: u64, now_ns: u64) {
         let Setup { node, names, .. } = &self.setup;
         let (is_chosen, description) = match self.channels.get(&place) {
-            Some(channel) => (self.is_chosen(channel, to), Description::of(channel, first, *node, names)),
+            Some(channel) => (self.setup.chooses(channel, to), Description::of(channel, first, *node, names)),
             None => (true, Description::shared()),
         };
         let changes = names.changes();
         let id = if is_chosen { self.sink.channel(&description.info(before)) } else { None };
         let recorded = id.map(|id| Place::Recorded(Recorded::new(id, before, now_ns)));
         self.places.insert(place, recorded.unwrap_or(Place::Unchosen { changes }));
-    }
-
-    fn is_chosen(&self, channel: &Channel, to: Tid) -> bool {
-        let Setup { selection, names, left_out, .. } = &self.setup;
-        let (source, destination, kind) = (channel.source, channel.destination, channel.kind);
-        let ends = [source, destination];
-        if left_out.iter().any(|app| ends.contains(app)) {
-            return false;
-        }
-        if is_unreported(channel) {
-            // Their types are not known.
-            return selection.has_all_apps() || names.app(source).is_some_and(|name| selection.has_app(name));
-        }
-        if selection.is_all() {
-            return true;
-        }
-        let apps = ends.into_iter().filter_map(|app| Some((names.app(app)?, app)));
-        let kinds = names.type_name(kind).map(|name| (name, kind));
-        let chosen = selection.chosen(apps, kinds);
-        chosen.has(source, destination, kind) || chosen.has(source, to, kind)
     }
 
     /// Reads the table of channels.

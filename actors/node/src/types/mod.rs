@@ -52,9 +52,9 @@ pub(crate) use self::{
 use crate::NodeState;
 
 /// Maximum number of frames of other nodes that wait for the thread. A further one is refused, and counted.
-const FRAMES_MAX: usize = 64;
-/// Maximum number of them of one node.
-const FRAMES_OF_NODE_MAX: usize = 8;
+const FRAMES_MAX: usize = 96;
+/// Maximum number of them of one node: its questions, answers and reports of two steps.
+const FRAMES_OF_NODE_MAX: usize = 24;
 
 /// The payload types of the node's applications, and the verdicts on those of other nodes.
 #[derive(Default)]

@@ -182,8 +182,9 @@ impl Pair {
             policy: handled.policy,
             is_protected: handled.is_protected,
             schema: handled.schema,
-            pending: (handled.policy == MismatchPolicy::Refuse)
-                .then(|| Mismatch::new(refusal(handled.is_protected))),
+            // The guard of a protected type would trip for a difference that may turn out to be none.
+            pending: (handled.policy == MismatchPolicy::Refuse && !handled.is_protected)
+                .then(|| Mismatch::new(Effect::Refused)),
             verdict: None,
         }
     }

@@ -203,7 +203,7 @@ impl<S: Socket> WriterState<S> {
     /// Encodes an outcome, and those behind it, as a frame.
     fn outcome_frame(&mut self, first: Message) -> Partial {
         if outcomes::count(&first) > 1 && self.connection.gathers() {
-            // An outcome that is added to another is not recorded as part of the burst, which saves a look at the clock.
+            // An outcome that is added to another is no part of the burst, which saves a look at the clock.
             self.bursts.written(Time::now());
         }
         let link = self.numbering.outcomes_header();

@@ -207,8 +207,8 @@ fn steps() -> impl Strategy<Value = Vec<Step>> {
     proptest::collection::vec(step, 0..500)
 }
 
-/// Returns all outcomes on the wire: the application, the correlation and the byte of each; 0 for another message. Tells
-/// the outlet that all of them have arrived.
+/// Returns all outcomes on the wire: the application, the correlation and the byte of each; 0 for another message.
+/// Tells the outlet that all of them have arrived.
 fn arrived(bench: &Bench) -> Vec<(u32, u64, u8)> {
     let mut arrived = Vec::new();
     let frames = frames(&bench.wire.bytes.lock().unwrap());
