@@ -12,7 +12,7 @@ use crate::{
 /// Maximum spans of sequence numbers that a finding names.
 const SPANS_MAX: usize = 8;
 
-/// Source, destination, type and class: the same at both ends.
+/// Source, destination, ID of the type, and class: the same at both ends. Not each node knows the name of the type.
 type Key = [String; 4];
 
 /// One end of a channel, of all parts together.
@@ -23,6 +23,8 @@ struct End {
     /// The address of the node at the other end.
     other: String,
     labels: [String; 2],
+    /// The name of the type, or its ID where this end does not know the name.
+    type_name: String,
     sequences: Sequences,
     dropped: u64,
 }
@@ -81,13 +83,22 @@ fn collect(file: &mut Checked, sent: &mut BTreeMap<Key, End>, received: &mut BTr
         let end = ends.entry(key(&channel)).or_default();
         (end.file, end.topic, end.other) = (file.report.file.clone(), topic.clone(), other.to_owned());
         end.labels = ["source", "destination"].map(|role| label(&channel, role));
+        let type_name = channel.value("type");
+        if end.type_name.is_empty() || type_name != nameless(channel.value("kind")) {
+            type_name.clone_into(&mut end.type_name);
+        }
         end.sequences.absorb(std::mem::take(&mut counted.sequences));
         end.dropped = end.dropped.max(counted.last.dropped);
     }
 }
 
 fn key(channel: &Channel) -> Key {
-    ["source_tid", "destination_tid", "type", "class"].map(|key| channel.value(key).to_owned())
+    ["source_tid", "destination_tid", "kind", "class"].map(|key| channel.value(key).to_owned())
+}
+
+/// Returns the text that stands for the name of the type with this ID, where a node does not know the name.
+fn nameless(kind: &str) -> String {
+    kind.parse::<u32>().map_or_else(|_| kind.to_owned(), |kind| format!("{kind:08x}"))
 }
 
 fn label(channel: &Channel, role: &str) -> String {
@@ -97,7 +108,11 @@ fn label(channel: &Channel, role: &str) -> String {
 
 fn both(key: &Key, sent: &End, received: &End, report: &mut Report) {
     let [source, destination] = sent.labels.clone();
-    let [_, _, type_name, class] = key.clone();
+    let [_, _, kind, class] = key.clone();
+    let id = nameless(&kind);
+    let mut names = [&sent.type_name, &received.type_name].into_iter();
+    let type_name = names.find(|name| !name.is_empty() && **name != id);
+    let type_name = type_name.unwrap_or(&sent.type_name).clone();
     let is_stream = class == "Stream";
     let mut end = EndReport { source, destination, type_name, class, ..EndReport::default() };
     (end.sent, end.received) = (sent.sequences.len(), received.sequences.len());

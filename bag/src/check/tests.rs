@@ -7,7 +7,7 @@ use super::*;
 use crate::{
     BagWriter, Class, Direction, Options, Origin,
     read::{Item, Reader},
-    testing::{TestFolder, channel, record},
+    testing::{TestFolder, channel, record, typed_channel},
 };
 
 const SECOND: u64 = 1_000_000_000;
@@ -95,6 +95,27 @@ fn whole_recording_is_fine() {
     assert_eq!((report.ends[0].sent, report.ends[0].received), (40, 40));
     let counts = &report.files[0].channels[0];
     assert_eq!((counts.seen, counts.written, counts.dropped, counts.in_file), (40, 40, 0, 40));
+}
+
+#[test]
+fn type_without_a_name_is_joined_by_its_id() {
+    let folder = TestFolder::new();
+    let ends = [
+        ("one.mcap", "127.0.0.2", Direction::Sent, "exo.angle"),
+        ("other.mcap", "127.0.0.3", Direction::Received, "00000007"),
+    ];
+    let files = ends.map(|(name, address, direction, type_name)| {
+        let path = folder.path(name);
+        let mut bag = BagWriter::create(&path, Options::default(), origin(address)).unwrap();
+        let channel = typed_channel(&mut bag, Class::Control, direction, type_name);
+        (1..=5).for_each(|number| bag.message(channel, &record(number, number * SECOND)).unwrap());
+        bag.finish(6 * SECOND).unwrap();
+        path
+    });
+    let report = check(&files).unwrap();
+    assert!(report.is_fine(), "{:#?}", report.findings);
+    let [end] = &report.ends[..] else { panic!("{:#?}", report.ends) };
+    assert_eq!((end.sent, end.received, end.type_name.as_str()), (5, 5, "exo.angle"));
 }
 
 #[test]
