@@ -248,6 +248,57 @@ fn lost_message_is_named_by_its_sequence() {
     }
 }
 
+/// Writes a recording of an incarnation with these sequence numbers, in this order.
+fn incarnation(
+    path: &Path,
+    (address, incarnation): (&str, u64),
+    direction: Direction,
+    all: impl Iterator<Item = u64>,
+) {
+    let origin = Origin { incarnation, ..origin(address) };
+    let options = Options { replace: true, ..Options::default() };
+    let mut bag = BagWriter::create(path, options, origin).unwrap();
+    let channel = channel(&mut bag, Class::Control, direction);
+    for (number, sequence) in (1..).zip(all) {
+        let message = crate::Record { sequence, ..record(number, number * SECOND / 10) };
+        bag.message(channel, &message).unwrap();
+    }
+    bag.finish(60 * SECOND).unwrap();
+}
+
+#[test]
+fn incarnation_that_is_recorded_later_is_no_finding() {
+    let folder = TestFolder::new();
+    let files = ["first.mcap", "second.mcap", "other.mcap"].map(|name| folder.path(name));
+    // The numbers of both incarnations begin at 1, with other messages of the source between them.
+    let (evens, odds) = ((2..=80).step_by(2), (1..=79).step_by(2));
+    incarnation(&files[0], ("127.0.0.2", 1), Direction::Sent, evens.clone());
+    incarnation(&files[1], ("127.0.0.2", 2), Direction::Sent, odds.clone().filter(|number| *number > 20));
+    incarnation(&files[2], ("127.0.0.3", 1), Direction::Received, evens.chain(odds.clone()));
+    assert_eq!(findings(&files), []);
+    // And: a message behind the begin is a finding
+    let later = odds.filter(|number| *number > 20 && *number != 31);
+    incarnation(&files[1], ("127.0.0.2", 3), Direction::Sent, later);
+    let found = findings(&files);
+    assert!(
+        matches!(&found[..], [(Kind::Unsent, text)] if text.ends_with("sequence numbers: 31")),
+        "{found:?}"
+    );
+}
+
+#[test]
+fn messages_between_two_recordings_of_a_node_are_no_finding() {
+    let folder = TestFolder::new();
+    let files = ["one.mcap", "first.mcap", "second.mcap"].map(|name| folder.path(name));
+    incarnation(&files[0], ("127.0.0.2", 1), Direction::Sent, 1..=80);
+    incarnation(&files[1], ("127.0.0.3", 1), Direction::Received, 1..=30);
+    incarnation(&files[2], ("127.0.0.3", 2), Direction::Received, (41..=80).filter(|number| *number != 50));
+    let report = check(&files).unwrap();
+    let end = &report.ends[0];
+    assert_eq!((end.before, end.lost, end.after), (10, 1, 0));
+    assert!(report.findings.iter().any(|finding| finding.text.ends_with("sequence numbers: 50")));
+}
+
 #[test]
 fn node_without_a_file_is_named() {
     let folder = TestFolder::new();
