@@ -21,8 +21,8 @@ use crate::{RunError, TimedMessage, world::World};
 
 /// Maximum number of turns of all applications at one virtual time.
 const ROUNDS_MAX: usize = 2_000;
-/// Maximum virtual time for which a check runs on behind its end while messages are missing. The timers of a recorded run
-/// were late by some microseconds each, those of a replay are not. So its last message may come after the recorded one.
+/// Maximum virtual time for which a check runs on behind its end while messages are missing. The timers of a recorded
+/// run were late by some microseconds each, those of a replay are not. So its last message may come after the end.
 const BEHIND_END: Duration = Duration::from_secs(1);
 /// The index in [`Progress`] while no application has its turn.
 const NO_APP: usize = usize::MAX;

@@ -132,7 +132,8 @@ pub fn replay(path: &Path, config: impl Fn(Joint) -> DriveConfig) -> Result<Repl
 }
 
 impl Replayed {
-    /// Returns how many ticks of drives were left out, of all joints: their inputs or the state before them are not known.
+    /// Returns the number of ticks, of all joints, that were left out: the recording lacks their inputs or the state
+    /// before them.
     #[must_use]
     pub fn left_out(&self) -> u64 {
         self.joints.iter().map(|joint| joint.ticks.saturating_sub(joint.compared)).sum()
