@@ -116,7 +116,8 @@ pub struct EndReport {
     pub superseded_or_lost: u64,
     /// Sent and not received, which the recorder of the destination's node counted as dropped.
     pub not_recorded: u64,
-    /// Sent before the first one that was received: the other recording began later.
+    /// Sent before the first one that was received: the other recording began later. Also those between two recordings
+    /// of the other node.
     pub before: u64,
     /// Sent after the last one that was received: on their way, or the other recording ended earlier.
     pub after: u64,

@@ -34,6 +34,16 @@ impl Drop for TestFolder {
 
 /// A channel of angles from node 127.0.0.2 to node 127.0.0.3.
 pub(crate) fn channel(bag: &mut BagWriter, class: Class, direction: Direction) -> ChannelId {
+    typed_channel(bag, class, direction, "exo.angle")
+}
+
+/// Same as [`channel`], with this name of the type.
+pub(crate) fn typed_channel(
+    bag: &mut BagWriter,
+    class: Class,
+    direction: Direction,
+    type_name: &str,
+) -> ChannelId {
     let party = |tid: u64, node: &str, name: Option<&str>| Party {
         tid,
         text: format!("{node}/1"),
@@ -43,7 +53,7 @@ pub(crate) fn channel(bag: &mut BagWriter, class: Class, direction: Direction) -
     bag.channel(&ChannelInfo {
         source: &party(1, "127.0.0.2", Some("knee.sensor")),
         destination: &party(2, "127.0.0.3", None),
-        type_name: "exo.angle",
+        type_name,
         kind: 7,
         class,
         direction,

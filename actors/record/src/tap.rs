@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use sinew_runtime::{
     router::tap::{Passage, Tap, Way},
-    tid::{NodeAddress, Tid},
+    tid::{AppAddress, NodeAddress, Tid},
     time::Time,
     wire::{Class, Header, Kind},
 };
@@ -56,6 +56,10 @@ impl Tap for RecordTap {
     fn saw(&self, app: Tid, passage: &Passage<'_>) {
         let Passage { header, payload, length, refused, .. } = *passage;
         let (source, destination) = (header.source, header.destination);
+        // A program that reads a recording must not fill the ring with its own questions.
+        if [source, destination].iter().any(|party| party.app == AppAddress::INSPECT) {
+            return;
+        }
         if !self.chosen.has(source, destination, header.kind) && !self.chosen.has(app, app, header.kind) {
             return;
         }
@@ -91,7 +95,7 @@ mod tests {
     use std::path::PathBuf;
 
     use bytes::Bytes;
-    use sinew_runtime::{outcome::Rejection, tid::AppAddress};
+    use sinew_runtime::outcome::Rejection;
     use sinew_shm::journal::{JournalReader, Options, Start};
 
     use super::*;
@@ -184,6 +188,18 @@ mod tests {
             (Form::Received, tid(0x1003), Some(Rejection::QueueFull)),
         ];
         assert_eq!(bench.records(), expected);
+    }
+
+    #[test]
+    fn inspection_has_no_records() {
+        let bench = Bench::new("inspection", &Selection::default(), &[]);
+        let (app, inspection) = (tid(0x1001), Tid::new(NODE, AppAddress::INSPECT));
+        let elsewhere = Tid::new(NodeAddress::new(9), AppAddress::INSPECT);
+        bench.show(app, Way::Out, &header(app, inspection), None);
+        bench.show(app, Way::In, &header(inspection, app), None);
+        bench.show(app, Way::Out, &header(app, elsewhere), None);
+        bench.show(app, Way::Out, &header(app, tid(0x1002)), None);
+        assert_eq!(bench.records(), [(Form::Sent, tid(0x1002), None)]);
     }
 
     #[test]

@@ -7,6 +7,7 @@ use std::{
         atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering},
     },
     task::{Context, Poll, Wake, Waker},
+    time::Duration,
 };
 
 use sinew_runtime::{
@@ -20,6 +21,9 @@ use crate::{RunError, TimedMessage, world::World};
 
 /// Maximum number of turns of all applications at one virtual time.
 const ROUNDS_MAX: usize = 2_000;
+/// Maximum virtual time for which a check runs on behind its end while messages are missing. The timers of a recorded
+/// run were late by some microseconds each, those of a replay are not. So its last message may come after the end.
+const BEHIND_END: Duration = Duration::from_secs(1);
 /// The index in [`Progress`] while no application has its turn.
 const NO_APP: usize = usize::MAX;
 
@@ -125,7 +129,7 @@ impl Run {
             }
             let next =
                 [self.time.next_wake(), self.world.next_arrival(), input_at].into_iter().flatten().min();
-            let Some(next) = next.filter(|next| self.ends_at.is_none_or(|end| *next <= end)) else {
+            let Some(next) = next.filter(|next| self.is_before_end(*next)) else {
                 return Ok(());
             };
             stuck = if next > self.time.now() || input_at == Some(next) { 0 } else { stuck + 1 };
@@ -147,6 +151,11 @@ impl Run {
                 self.settle(apps).await?;
             }
         }
+    }
+
+    /// Returns whether something at this time is part of the run.
+    fn is_before_end(&self, at: Time) -> bool {
+        self.ends_at.is_none_or(|end| at <= end || (at <= end + BEHIND_END && self.world.lacks_messages()))
     }
 
     /// Runs the applications, in their order, until none has work.

@@ -37,6 +37,8 @@ struct State {
     /// Whether the replay has ended: nothing is noted or delivered any more.
     is_over: bool,
     outputs: Vec<TimedMessage>,
+    /// Messages of each source that a check expects and that were not sent yet.
+    expected: BTreeMap<Tid, usize>,
     apps: BTreeMap<Tid, Arc<AppSink<Mailbox>>>,
     groups: BTreeMap<AppAddress, BTreeSet<Tid>>,
     open: VecDeque<Open>,
@@ -80,6 +82,16 @@ impl World {
         } else {
             members.remove(&app);
         }
+    }
+
+    /// Sets how many messages a check expects of each source.
+    pub(crate) fn expect(&self, messages: BTreeMap<Tid, usize>) {
+        lock(&self.state).expected = messages;
+    }
+
+    /// Returns whether a source has sent fewer messages than a check expects.
+    pub(crate) fn lacks_messages(&self) -> bool {
+        lock(&self.state).expected.values().any(|rest| *rest > 0)
     }
 
     /// Returns the outputs so far, and forgets them.
@@ -167,6 +179,9 @@ impl MessageSink for World {
             let mut state = lock(&self.state);
             if state.is_over {
                 return Ok(());
+            }
+            if let Some(rest) = state.expected.get_mut(&header.source) {
+                *rest = rest.saturating_sub(1);
             }
             state.outputs.push(TimedMessage::new(now, &header, message.payload.clone()));
             let receivers = state.named_receivers(destination, header.source);

@@ -7,7 +7,7 @@ use super::*;
 use crate::{
     BagWriter, Class, Direction, Options, Origin,
     read::{Item, Reader},
-    testing::{TestFolder, channel, record},
+    testing::{TestFolder, channel, record, typed_channel},
 };
 
 const SECOND: u64 = 1_000_000_000;
@@ -95,6 +95,27 @@ fn whole_recording_is_fine() {
     assert_eq!((report.ends[0].sent, report.ends[0].received), (40, 40));
     let counts = &report.files[0].channels[0];
     assert_eq!((counts.seen, counts.written, counts.dropped, counts.in_file), (40, 40, 0, 40));
+}
+
+#[test]
+fn type_without_a_name_is_joined_by_its_id() {
+    let folder = TestFolder::new();
+    let ends = [
+        ("one.mcap", "127.0.0.2", Direction::Sent, "exo.angle"),
+        ("other.mcap", "127.0.0.3", Direction::Received, "00000007"),
+    ];
+    let files = ends.map(|(name, address, direction, type_name)| {
+        let path = folder.path(name);
+        let mut bag = BagWriter::create(&path, Options::default(), origin(address)).unwrap();
+        let channel = typed_channel(&mut bag, Class::Control, direction, type_name);
+        (1..=5).for_each(|number| bag.message(channel, &record(number, number * SECOND)).unwrap());
+        bag.finish(6 * SECOND).unwrap();
+        path
+    });
+    let report = check(&files).unwrap();
+    assert!(report.is_fine(), "{:#?}", report.findings);
+    let [end] = &report.ends[..] else { panic!("{:#?}", report.ends) };
+    assert_eq!((end.sent, end.received, end.type_name.as_str()), (5, 5, "exo.angle"));
 }
 
 #[test]
@@ -225,6 +246,57 @@ fn lost_message_is_named_by_its_sequence() {
         let is_named = report.findings.iter().any(|finding| finding.text.contains("sequence numbers: 21-23"));
         assert_eq!(is_named, class == Class::Control);
     }
+}
+
+/// Writes a recording of an incarnation with these sequence numbers, in this order.
+fn incarnation(
+    path: &Path,
+    (address, incarnation): (&str, u64),
+    direction: Direction,
+    all: impl Iterator<Item = u64>,
+) {
+    let origin = Origin { incarnation, ..origin(address) };
+    let options = Options { replace: true, ..Options::default() };
+    let mut bag = BagWriter::create(path, options, origin).unwrap();
+    let channel = channel(&mut bag, Class::Control, direction);
+    for (number, sequence) in (1..).zip(all) {
+        let message = crate::Record { sequence, ..record(number, number * SECOND / 10) };
+        bag.message(channel, &message).unwrap();
+    }
+    bag.finish(60 * SECOND).unwrap();
+}
+
+#[test]
+fn incarnation_that_is_recorded_later_is_no_finding() {
+    let folder = TestFolder::new();
+    let files = ["first.mcap", "second.mcap", "other.mcap"].map(|name| folder.path(name));
+    // The numbers of both incarnations begin at 1, with other messages of the source between them.
+    let (evens, odds) = ((2..=80).step_by(2), (1..=79).step_by(2));
+    incarnation(&files[0], ("127.0.0.2", 1), Direction::Sent, evens.clone());
+    incarnation(&files[1], ("127.0.0.2", 2), Direction::Sent, odds.clone().filter(|number| *number > 20));
+    incarnation(&files[2], ("127.0.0.3", 1), Direction::Received, evens.chain(odds.clone()));
+    assert_eq!(findings(&files), []);
+    // And: a message behind the begin is a finding
+    let later = odds.filter(|number| *number > 20 && *number != 31);
+    incarnation(&files[1], ("127.0.0.2", 3), Direction::Sent, later);
+    let found = findings(&files);
+    assert!(
+        matches!(&found[..], [(Kind::Unsent, text)] if text.ends_with("sequence numbers: 31")),
+        "{found:?}"
+    );
+}
+
+#[test]
+fn messages_between_two_recordings_of_a_node_are_no_finding() {
+    let folder = TestFolder::new();
+    let files = ["one.mcap", "first.mcap", "second.mcap"].map(|name| folder.path(name));
+    incarnation(&files[0], ("127.0.0.2", 1), Direction::Sent, 1..=80);
+    incarnation(&files[1], ("127.0.0.3", 1), Direction::Received, 1..=30);
+    incarnation(&files[2], ("127.0.0.3", 2), Direction::Received, (41..=80).filter(|number| *number != 50));
+    let report = check(&files).unwrap();
+    let end = &report.ends[0];
+    assert_eq!((end.before, end.lost, end.after), (10, 1, 0));
+    assert!(report.findings.iter().any(|finding| finding.text.ends_with("sequence numbers: 50")));
 }
 
 #[test]

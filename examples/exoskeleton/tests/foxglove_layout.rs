@@ -11,8 +11,9 @@ use sinew::Payload;
 use sinew::schema::{Schema, Shape, schema_of};
 
 const LAYOUT: &str = include_str!("../foxglove-layout.json");
-/// The topics of each node that are no messages, of the schema `foxglove.Log`.
-const EVENTS: [&str; 4] = ["/sinew/events", "/sinew/barriers", "/sinew/outcomes", "/sinew/log"];
+/// The topics of each node that are no messages, of the schema `foxglove.Log`. A walk has no run-time barrier, so none
+/// has `/sinew/barriers`.
+const EVENTS: [&str; 3] = ["/sinew/events", "/sinew/outcomes", "/sinew/log"];
 
 /// The view of messages from `source` in the file of `node`, after the merge. It holds for messages that `source` sends
 /// to one receiver of that node only: otherwise a topic also has its destination.

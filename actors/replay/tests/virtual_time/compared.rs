@@ -87,6 +87,41 @@ fn recording_is_checked_against_its_own_replay() {
     assert!(matches!(error, CheckError::Differs(_)), "{error}");
 }
 
+/// Sends a note every 500 ms.
+struct Beat;
+
+impl Actor for Beat {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        ctx.every(Duration::from_millis(500), |_, tick, ctx| note(ctx, format!("beat {}", tick.number)));
+    }
+}
+
+#[test]
+fn drift_of_recorded_timers_is_no_difference() {
+    let tested = || replay().app(AppSpec::new("hip", || Beat)).app(AppSpec::new("knee", || Beat));
+    let exact = tested().ends_at(ms(10_000)).run([]).unwrap();
+    assert_eq!(exact.len(), 40);
+    let drifted = |by: fn(Time, Duration) -> Time| -> Vec<_> {
+        let at = |message: &TimedMessage| {
+            let beats = (message.at.since(START).as_millis() / 500) as u32;
+            by(message.at, Duration::from_micros(100) * beats)
+        };
+        exact.iter().map(|message| TimedMessage { at: at(message), ..message.clone() }).collect()
+    };
+    let early = drifted(|at, drift| Time::from_nanos(at.as_nanos() - drift.as_nanos() as u64));
+    tested().check(early.clone()).expect("only the times differ");
+    tested().check(drifted(|at, drift| at + drift)).expect("only the times differ");
+    // And: an end that is set is exact
+    let error = tested().ends_at(early[39].at).check(early.clone()).expect_err("the last beats are later");
+    assert!(matches!(error, CheckError::Differs(_)), "{error}");
+    // And: a message that never comes is a difference
+    let more = TimedMessage { at: early[39].at, ..early[0].clone() };
+    let error = tested().check([early, vec![more]].concat()).expect_err("no beat has these bytes");
+    assert!(matches!(error, CheckError::Differs(_)), "{error}");
+}
+
 payload!("replay.later", Stream => struct Later { degrees: f64, velocity: f64 });
 
 /// Handles a version of the angles that has one more field.

@@ -132,6 +132,22 @@ pub fn replay(path: &Path, config: impl Fn(Joint) -> DriveConfig) -> Result<Repl
 }
 
 impl Replayed {
+    /// Returns the number of ticks, of all joints, that were left out: the recording lacks their inputs or the state
+    /// before them.
+    #[must_use]
+    pub fn left_out(&self) -> u64 {
+        self.joints.iter().map(|joint| joint.ticks.saturating_sub(joint.compared)).sum()
+    }
+
+    /// Returns the reason why ticks were left out, for the line under the table.
+    fn why_left_out(&self) -> &'static str {
+        if self.joints.iter().all(|joint| joint.gap.is_none()) {
+            "of drives at rest: the recording lacks their inputs or the state before them"
+        } else {
+            "of drives at rest, or for the reasons above"
+        }
+    }
+
     /// Whether the recorded ticks were computed again, each with the same result.
     #[must_use]
     pub fn is_same(&self) -> bool {
@@ -176,13 +192,42 @@ impl fmt::Display for Replayed {
                 writeln!(f, "{:6} not compared: {gap}", "")?;
             }
         }
+        let left_out = self.left_out();
+        if left_out > 0 {
+            writeln!(f, "left out: {left_out} ticks {}", self.why_left_out())?;
+        }
         self.damage.iter().try_for_each(|damage| writeln!(f, "{damage}"))?;
         if self.is_same() {
-            return writeln!(f, "SAME: each torque was computed again, with the same bits");
+            return writeln!(f, "SAME: each compared torque was computed again, with the same bits");
         }
         if self.joints.iter().any(|joint| joint.first_difference.is_some()) {
             return writeln!(f, "DIFFERENT: see the first difference above");
         }
         writeln!(f, "INCOMPLETE: no compared torque differs; the recording lacks inputs of the others")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn words(gap: Option<String>) -> String {
+        let joint =
+            |compared| JointResult { ticks: 10, compared, identical: compared, ..JointResult::default() };
+        let joints = [JointResult { gap, ..joint(7) }, joint(10), joint(8)];
+        Replayed { joints, damage: Vec::new() }.to_string()
+    }
+
+    #[test]
+    fn ticks_that_are_left_out_are_stated() {
+        let same = words(None);
+        assert!(same.contains("left out: 5 ticks of drives at rest: the recording lacks"), "{same}");
+        assert!(same.contains("SAME"), "{same}");
+        let incomplete = words(Some("sample 3 is not in the recording".to_owned()));
+        assert!(
+            incomplete.contains("left out: 5 ticks of drives at rest, or for the reasons above"),
+            "{incomplete}"
+        );
+        assert!(incomplete.contains("INCOMPLETE"), "{incomplete}");
     }
 }
