@@ -65,21 +65,34 @@ pub(crate) struct Flight {
 #[derive(Default)]
 struct Causes {
     reported: Mutex<VecDeque<(Time, IncidentKind, String)>>,
-    /// Those of which the words are lost.
-    lost: AtomicU64,
+    /// Symptoms of which the words are lost.
+    lost_symptoms: AtomicU64,
+    /// Failures of which the words are lost.
+    lost_failures: AtomicU64,
+}
+
+impl Causes {
+    /// Counts a cause without its words.
+    fn lose(&self, kind: IncidentKind) {
+        let lost = match kind {
+            IncidentKind::Failure => &self.lost_failures,
+            IncidentKind::Symptom => &self.lost_symptoms,
+        };
+        lost.fetch_add(1, Ordering::Relaxed);
+    }
 }
 
 impl IncidentObserver for Causes {
     fn happened(&self, at: Time, kind: IncidentKind, cause: &str) {
         // The thread may be a real-time one. Another cause is just being stored or read: this one has no words then.
         let Ok(mut reported) = self.reported.try_lock() else {
-            self.lost.fetch_add(1, Ordering::Relaxed);
+            self.lose(kind);
             return;
         };
         if reported.len() < CAUSES_MAX {
             reported.push_back((at, kind, cause.to_owned()));
         } else {
-            self.lost.fetch_add(1, Ordering::Relaxed);
+            self.lose(kind);
         }
     }
 }
@@ -229,8 +242,8 @@ impl Flight {
         self.start_work(&Arc::downgrade(state), journal.path());
     }
 
-    /// Notes the order to stop the node. From now on only failed actors are causes: guards and watchdogs are expected
-    /// to see the end of peers, and nodes leave.
+    /// Notes the order to stop the node. From now on only failures are causes: guards and watchdogs are expected to see
+    /// the end of peers, and nodes leave.
     pub(super) fn stop_ordered(&self, now: Time) {
         self.stop_ns.fetch_min(now.as_nanos(), Ordering::Relaxed);
     }
@@ -244,7 +257,11 @@ impl Flight {
                 self.happened(*at, cause);
             }
         }
-        let lost = self.causes.lost.swap(0, Ordering::Relaxed);
+        let lost_failures = self.causes.lost_failures.swap(0, Ordering::Relaxed);
+        if lost_failures > 0 {
+            self.happened(now, &format!("{lost_failures} failures at the moment of another incident"));
+        }
+        let lost = self.causes.lost_symptoms.swap(0, Ordering::Relaxed);
         if now.as_nanos() >= stop_ns {
             return;
         }
@@ -429,5 +446,21 @@ mod tests {
         flight.take_causes(Time::now(), &[]);
         // Of another test's incident at this moment it has the words.
         assert!(!flight.known().is_empty());
+    }
+
+    #[test]
+    fn failure_without_words_counts_after_a_stop_order() {
+        let mut config = NodeConfig::new("knee");
+        config.project = format!("wordless {}", std::process::id());
+        let state = NodeState::for_test(config, Incarnation(1));
+        let flight = Flight::begin(&state, &std::env::temp_dir().join("sinew-wordless-10.0.0.2.journal"));
+        flight.stop_ordered(Time::now());
+        let held = lock(&flight.causes.reported);
+        flight.causes.happened(Time::now(), IncidentKind::Failure, "the knee is lost");
+        drop(held);
+        flight.take_causes(Time::now(), &[]);
+        // Failures of other tests of this process are causes, too: they may be first.
+        assert!(!flight.known().is_empty());
+        assert_eq!(flight.causes.lost_failures.load(Ordering::Relaxed), 0);
     }
 }
