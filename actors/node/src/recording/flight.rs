@@ -107,10 +107,17 @@ enum Order {
 /// The orders of the thread `freeze`.
 #[derive(Default)]
 struct Work {
-    /// Spans to freeze, at most one for each known trigger, and before them rings to move, at most as many as a store
-    /// has.
+    /// Spans to freeze, at most one for each known trigger, and rings to move, at most as many as a store has.
     orders: VecDeque<Order>,
     is_running: bool,
+}
+
+impl Work {
+    /// Takes the first span to freeze, which the journal loses with time, or else the first order.
+    fn next(&mut self) -> Option<Order> {
+        let first = self.orders.iter().position(|order| matches!(order, Order::Freeze(_)));
+        self.orders.remove(first.unwrap_or(0))
+    }
 }
 
 /// The names that were written beside the journal.
@@ -341,7 +348,11 @@ impl Flight {
     /// Returns the next order of the thread. `None`: the thread ends.
     fn next_order(&self) -> Option<Order> {
         let mut work = lock(&self.work);
-        let next = work.orders.pop_front();
+        if self.is_ending.load(Ordering::Relaxed) {
+            // The node waits. The next start finds these rings again.
+            work.orders.retain(|order| matches!(order, Order::Freeze(_)));
+        }
+        let next = work.next();
         if next.is_none() {
             work.is_running = false;
             self.idle.notify_all();
@@ -446,6 +457,26 @@ mod tests {
         flight.take_causes(Time::now(), &[]);
         // Of another test's incident at this moment it has the words.
         assert!(!flight.known().is_empty());
+    }
+
+    #[test]
+    fn spans_are_frozen_before_rings_are_moved() {
+        let mut config = NodeConfig::new("knee");
+        config.project = format!("orders {}", std::process::id());
+        let state = NodeState::for_test(config, Incarnation(1));
+        let flight = Flight::begin(&state, &std::env::temp_dir().join("sinew-orders-10.0.0.2.journal"));
+        flight.happened(Time::now(), "the knee slips").expect("there is room");
+        let mut outputs = std::iter::from_fn(|| lock(&flight.plan).poll(u64::MAX));
+        let order = outputs.find_map(|output| match output {
+            Output::Freeze(order) => Some(order),
+            Output::Forward(_) => None,
+        });
+        let dead = |id: &str| Order::Move(id.to_owned());
+        lock(&flight.work).orders.extend([dead("died-1"), Order::Freeze(order.unwrap()), dead("died-2")]);
+        assert!(matches!(flight.next_order(), Some(Order::Freeze(_))));
+        assert!(matches!(flight.next_order(), Some(Order::Move(id)) if id == "died-1"));
+        flight.is_ending.store(true, Ordering::Relaxed);
+        assert!(flight.next_order().is_none(), "the next start moves it");
     }
 
     #[test]
