@@ -7,6 +7,8 @@
 
 use std::{
     collections::VecDeque,
+    io,
+    panic::{AssertUnwindSafe, catch_unwind},
     path::{Path, PathBuf},
     sync::{
         Arc, Condvar, Mutex, MutexGuard, PoisonError, TryLockError, Weak,
@@ -233,20 +235,31 @@ impl Flight {
     ) {
         self.take_causes(now, &changes.losses);
         self.write_names(state, journal, now, changes.has_new_names);
-        loop {
-            let output = lock(&self.plan).poll(now.as_nanos());
-            match output {
-                None => break,
-                Some(Output::Forward(trigger)) => {
-                    note(state, journal, &trigger);
-                    forward(state, &trigger);
-                }
-                // The node has a recording, and keeps no spans.
-                Some(Output::Freeze(_)) if !self.keeps_spans => {}
-                Some(Output::Freeze(order)) => lock(&self.work).orders.push_back(Order::Freeze(order)),
-            }
+        while self.poll(now.as_nanos(), |trigger| {
+            note(state, journal, trigger);
+            forward(state, trigger);
+        }) {}
+        if let Err(error) = self.start_work(&Arc::downgrade(state), journal.path()) {
+            log::error!(%error, "the system gives no thread to freeze a span; it is asked again");
         }
-        self.start_work(&Arc::downgrade(state), journal.path());
+    }
+
+    /// Takes one output of the plan. Returns `false` if there is none.
+    fn poll(&self, now_ns: u64, forward: impl FnOnce(&Trigger)) -> bool {
+        // Until the order is among the others: the end of the node must not miss it.
+        let mut work = lock(&self.work);
+        let output = lock(&self.plan).poll(now_ns);
+        match output {
+            None => return false,
+            Some(Output::Forward(trigger)) => {
+                drop(work);
+                forward(&trigger);
+            }
+            // The node has a recording, and keeps no spans.
+            Some(Output::Freeze(_)) if !self.keeps_spans => {}
+            Some(Output::Freeze(order)) => work.orders.push_back(Order::Freeze(order)),
+        }
+        true
     }
 
     /// Notes the order to stop the node. From now on only failures are causes: guards and watchdogs are expected to see
@@ -280,18 +293,16 @@ impl Flight {
     }
 
     /// Starts the thread `freeze`, if it has orders and does not run.
-    fn start_work(self: &Arc<Self>, state: &Weak<NodeState>, journal: &Path) {
+    fn start_work(self: &Arc<Self>, state: &Weak<NodeState>, journal: &Path) -> io::Result<()> {
         let mut work = lock(&self.work);
         if work.orders.is_empty() || work.is_running {
-            return;
+            return Ok(());
         }
         let (flight, state, path) = (self.clone(), state.clone(), journal.to_owned());
         let thread = std::thread::Builder::new().name("freeze".to_owned());
-        match thread.spawn(move || flight.work(&state, &path)) {
-            Ok(_) => work.is_running = true,
-            // The next turn tries again.
-            Err(error) => log::error!(%error, "the system gives no thread to freeze a span"),
-        }
+        thread.spawn(move || flight.work(&state, &path))?;
+        work.is_running = true;
+        Ok(())
     }
 
     /// Writes the names beside the journal, if they have changed: a dead node cannot tell them. A new name of an
@@ -321,28 +332,36 @@ impl Flight {
 
     /// Carries out the orders of the thread `freeze`.
     fn work(&self, state: &Weak<NodeState>, journal: &Path) {
+        let _running = Running(self);
         while let Some(order) = self.next_order() {
-            let order = match order {
-                Order::Freeze(order) => order,
-                Order::Move(id) => {
-                    match move_ring(&self.beside, &self.store, &id) {
-                        Ok(()) => {
-                            log::info!(id, "the ring of a dead incarnation is moved to record.frozen_folder")
-                        }
-                        Err(error) => {
-                            log::warn!(id, %error, "the ring of a dead incarnation stays in record.folder")
-                        }
-                    }
-                    continue;
-                }
-            };
-            let is_ending = self.is_ending.load(Ordering::Relaxed);
-            let report = match state.upgrade().filter(|_| !is_ending) {
-                Some(state) => names_for_reader(&state, journal),
-                None => self.written_names(journal),
-            };
-            self.freeze(journal, &order, report);
+            // The others are carried out nevertheless.
+            if catch_unwind(AssertUnwindSafe(|| self.carry_out(order, state, journal))).is_err() {
+                log::error!("the thread `freeze` panicked: a span is not frozen, or a ring is not moved");
+            }
         }
+    }
+
+    fn carry_out(&self, order: Order, state: &Weak<NodeState>, journal: &Path) {
+        let order = match order {
+            Order::Freeze(order) => order,
+            Order::Move(id) => {
+                match move_ring(&self.beside, &self.store, &id) {
+                    Ok(()) => {
+                        log::info!(id, "the ring of a dead incarnation is moved to record.frozen_folder")
+                    }
+                    Err(error) => {
+                        log::warn!(id, %error, "the ring of a dead incarnation stays in record.folder");
+                    }
+                }
+                return;
+            }
+        };
+        let is_ending = self.is_ending.load(Ordering::Relaxed);
+        let report = match state.upgrade().filter(|_| !is_ending) {
+            Some(state) => names_for_reader(&state, journal),
+            None => self.written_names(journal),
+        };
+        self.freeze(journal, &order, report);
     }
 
     /// Returns the next order of the thread. `None`: the thread ends.
@@ -377,16 +396,13 @@ impl Flight {
         if !self.keeps_spans {
             return;
         }
-        loop {
-            let output = lock(&self.plan).poll(u64::MAX);
-            match output {
-                None => break,
-                // Its links have ended.
-                Some(Output::Forward(trigger)) => note(node, journal, &trigger),
-                Some(Output::Freeze(order)) => lock(&self.work).orders.push_back(Order::Freeze(order)),
-            }
+        // Its links have ended.
+        while self.poll(u64::MAX, |trigger| note(node, journal, trigger)) {}
+        if let Err(error) = self.start_work(&Weak::new(), journal.path()) {
+            // There is no further turn: nothing waits for these spans.
+            let lost = std::mem::take(&mut lock(&self.work).orders).len();
+            log::error!(%error, lost, "the system gives no thread: the node ends without the last spans and moves");
         }
-        self.start_work(&Weak::new(), journal.path());
     }
 
     /// Waits until the thread `freeze` has carried out its orders. Returns `false` if the time is over before.
@@ -431,6 +447,19 @@ impl Flight {
     }
 }
 
+/// The thread `freeze`. If it panics between two orders, the next turn starts another one.
+struct Running<'a>(&'a Flight);
+
+impl Drop for Running<'_> {
+    fn drop(&mut self) {
+        // Else the last look at the orders has noted the end, and another thread may run already.
+        if std::thread::panicking() {
+            lock(&self.0.work).is_running = false;
+            self.0.idle.notify_all();
+        }
+    }
+}
+
 /// Writes the trigger into the journal, so that it is an event of the span.
 fn note(state: &NodeState, journal: &Journal, trigger: &Trigger) {
     let (id, cause) = (trigger.id.to_string(), trigger.cause.as_str().to_owned());
@@ -439,59 +468,4 @@ fn note(state: &NodeState, journal: &Journal, trigger: &Trigger) {
 }
 
 #[cfg(test)]
-mod tests {
-    use sinew_model::config::NodeConfig;
-    use sinew_runtime::tid::Incarnation;
-
-    use super::*;
-
-    #[test]
-    fn incident_at_a_held_lock_is_a_cause() {
-        let mut config = NodeConfig::new("knee");
-        config.project = format!("held {}", std::process::id());
-        let state = NodeState::for_test(config, Incarnation(1));
-        let flight = Flight::begin(&state, &std::env::temp_dir().join("sinew-held-10.0.0.2.journal"));
-        let held = lock(&flight.causes.reported);
-        flight.causes.happened(Time::now(), IncidentKind::Symptom, "the knee slips");
-        drop(held);
-        flight.take_causes(Time::now(), &[]);
-        // Of another test's incident at this moment it has the words.
-        assert!(!flight.known().is_empty());
-    }
-
-    #[test]
-    fn spans_are_frozen_before_rings_are_moved() {
-        let mut config = NodeConfig::new("knee");
-        config.project = format!("orders {}", std::process::id());
-        let state = NodeState::for_test(config, Incarnation(1));
-        let flight = Flight::begin(&state, &std::env::temp_dir().join("sinew-orders-10.0.0.2.journal"));
-        flight.happened(Time::now(), "the knee slips").expect("there is room");
-        let mut outputs = std::iter::from_fn(|| lock(&flight.plan).poll(u64::MAX));
-        let order = outputs.find_map(|output| match output {
-            Output::Freeze(order) => Some(order),
-            Output::Forward(_) => None,
-        });
-        let dead = |id: &str| Order::Move(id.to_owned());
-        lock(&flight.work).orders.extend([dead("died-1"), Order::Freeze(order.unwrap()), dead("died-2")]);
-        assert!(matches!(flight.next_order(), Some(Order::Freeze(_))));
-        assert!(matches!(flight.next_order(), Some(Order::Move(id)) if id == "died-1"));
-        flight.is_ending.store(true, Ordering::Relaxed);
-        assert!(flight.next_order().is_none(), "the next start moves it");
-    }
-
-    #[test]
-    fn failure_without_words_counts_after_a_stop_order() {
-        let mut config = NodeConfig::new("knee");
-        config.project = format!("wordless {}", std::process::id());
-        let state = NodeState::for_test(config, Incarnation(1));
-        let flight = Flight::begin(&state, &std::env::temp_dir().join("sinew-wordless-10.0.0.2.journal"));
-        flight.stop_ordered(Time::now());
-        let held = lock(&flight.causes.reported);
-        flight.causes.happened(Time::now(), IncidentKind::Failure, "the knee is lost");
-        drop(held);
-        flight.take_causes(Time::now(), &[]);
-        // Failures of other tests of this process are causes, too: they may be first.
-        assert!(!flight.known().is_empty());
-        assert_eq!(flight.causes.lost_failures.load(Ordering::Relaxed), 0);
-    }
-}
+mod tests;

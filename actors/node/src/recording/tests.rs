@@ -343,7 +343,11 @@ fn symptoms_of_an_ordered_stop_make_no_trigger() {
     node.recording.stop_ordered();
     for _ in 0..100 {
         // One that meets the begin of another test's recording is not reported.
-        incident::report(Time::now(), IncidentKind::Symptom, format_args!("test of stopping: an input is late"));
+        incident::report(
+            Time::now(),
+            IncidentKind::Symptom,
+            format_args!("test of stopping: an input is late"),
+        );
     }
     node.recording.close(&node);
     // Failures of other tests of this process are causes, too.
