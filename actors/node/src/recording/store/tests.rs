@@ -208,3 +208,28 @@ fn ring_of_a_dead_node_waits_beside_the_journal() {
     assert!(store.lock().unwrap().beside(&path).1.is_empty());
     assert_eq!(count_span(&disk.join(format!("sinew-leg-10.0.0.2-{id}.frozen")), &(0..=9)).unwrap(), 9);
 }
+
+#[test]
+fn fetched_span_gives_its_place_without_a_written_mark() {
+    let folder = Folder::new("unwritten");
+    let (mut store, journal) = (folder.store(1), folder.journal());
+    freeze(&mut store, &journal, &span("a-1", 2)).unwrap();
+    // A folder in place of the temporary file, as a full disk: the facts cannot be written.
+    let temporary = folder.0.join(format!(".sinew-leg-10.0.0.2-a-1.facts.{}", std::process::id()));
+    fs::create_dir(&temporary).unwrap();
+    assert!(store.set_fetched("a-1").is_err());
+    assert!(store.spans()[0].is_fetched);
+    fs::remove_dir(&temporary).unwrap();
+    freeze(&mut store, &journal, &span("a-2", 4)).unwrap();
+    assert_eq!(ids(&store), ["a-2"]);
+}
+
+#[test]
+fn failed_facts_leave_no_draft() {
+    let folder = Folder::new("no-draft");
+    let (mut store, journal) = (folder.store(1), folder.journal());
+    let temporary = folder.0.join(format!(".sinew-leg-10.0.0.2-a-1.facts.{}", std::process::id()));
+    fs::create_dir(temporary).unwrap();
+    assert!(freeze(&mut store, &journal, &span("a-1", 2)).is_err());
+    assert!(store.names(".draft").is_empty() && ids(&store).is_empty());
+}
