@@ -9,7 +9,7 @@ use std::{
     sync::Mutex,
 };
 
-use sinew_runtime::{lock, wire};
+use sinew_runtime::{lock, log, wire};
 use sinew_shm::journal::{CopyJournalError, JournalReader, Start, copy_span, count_span};
 
 use sinew_record::{FROZEN_SPANS_MAX, FrozenFacts, FrozenPart, FrozenSpan};
@@ -181,8 +181,37 @@ impl FrozenStore {
         }
         facts.span = Some(span);
         let beside = Self::new(folder_of(journal), self.base.clone(), self.spans_max);
-        let kept = self.adopt(journal, &id, &facts).or_else(|_| beside.adopt(journal, &id, &facts));
+        let kept = self.adopt(journal, &id, &facts).or_else(|why| {
+            if beside.folder == self.folder {
+                return Err(why);
+            }
+            // This folder may be absent or full for long, and that of the journal is memory.
+            beside.discard_dead(&id, self.spans_max.saturating_sub(self.spans().len()).max(1));
+            beside.adopt(journal, &id, &facts)
+        });
         Some(kept.map(|()| id))
+    }
+
+    /// Removes the oldest rings of dead incarnations, so that there are at most `rings_max` with that of `id`.
+    fn discard_dead(&self, id: &str, rings_max: usize) {
+        let mut dead: Vec<_> = self
+            .spans()
+            .into_iter()
+            .filter(|span| span.has_died && span.id != id)
+            .map(|span| span.id)
+            .collect();
+        // Their facts were written last when their next incarnation started.
+        let written =
+            |id: &String| fs::metadata(self.path(id, "facts")).and_then(|file| file.modified()).ok();
+        dead.sort_by_cached_key(written);
+        let surplus = (dead.len() + 1).saturating_sub(rings_max);
+        for id in &dead[..surplus.min(dead.len())] {
+            log::warn!(
+                id,
+                "the ring of a former dead incarnation is removed from record.folder: record.frozen_folder has not taken it"
+            );
+            self.discard(id);
+        }
     }
 
     /// Renames a ring to that of a span.

@@ -1,7 +1,12 @@
 //! Frozen spans in a folder: their room, their replacement, and files of other nodes.
 
-use std::os::unix::fs::PermissionsExt as _;
+use std::{
+    os::unix::fs::PermissionsExt as _,
+    time::{Duration, SystemTime},
+};
 
+use sinew_record::RecordReport;
+use sinew_runtime::tid::Incarnation;
 use sinew_shm::journal::{ChannelKey, Journal, Options};
 
 use super::*;
@@ -232,4 +237,29 @@ fn failed_facts_leave_no_draft() {
     fs::create_dir(temporary).unwrap();
     assert!(freeze(&mut store, &journal, &span("a-1", 2)).is_err());
     assert!(store.names(".draft").is_empty() && ids(&store).is_empty());
+}
+
+#[test]
+fn rings_beside_the_journal_are_bounded() {
+    let folder = Folder::new("bounded");
+    let mut store = FrozenStore::new(folder.0.join("absent"), "sinew-leg-10.0.0.2".to_owned(), 2);
+    let mut kept = Vec::new();
+    let mut path = PathBuf::new();
+    for incarnation in 1..=4 {
+        let journal = folder.journal();
+        path = journal.path().to_owned();
+        let bytes = fs::read(&path).unwrap();
+        drop(journal);
+        fs::write(&path, bytes).unwrap();
+        let report = RecordReport { incarnation: Some(Incarnation(incarnation)), ..RecordReport::default() };
+        write_facts(&path.with_extension("facts"), &FrozenFacts { span: None, report }).unwrap();
+        let id = store.keep_dead_ring(&path).expect("it is there").unwrap();
+        // The times of files are coarse.
+        let age = Duration::from_secs(10 - incarnation);
+        let facts = File::options().write(true).open(folder.store(2).path(&id, "facts")).unwrap();
+        facts.set_modified(SystemTime::now() - age).unwrap();
+        kept.push(id);
+    }
+    let (_, dead) = store.beside(&path);
+    assert_eq!(dead, kept[2..]);
 }
