@@ -20,10 +20,9 @@ use sinew::{
     inspect::{AskFrozen, FROZEN_BUSY, FrozenFacts, FrozenPart, FrozenReport, FrozenSpan},
 };
 
-use super::freeze::present;
 use crate::{
     Report,
-    system::{Answer, System, SystemError, in_words},
+    system::{Answer, System, SystemError, in_words, present},
     table::{Table, clean, time},
 };
 use convert::{Converted, Source, convert, file_name};
