@@ -299,6 +299,14 @@ fn all(here: &NodeReport) -> Vec<(NodeAddress, String)> {
     nodes
 }
 
+/// Returns this node and all nodes that it knows and that answer.
+pub(crate) fn present(here: &NodeReport) -> Vec<(NodeAddress, String)> {
+    let mut nodes = vec![(here.node, here.name.clone())];
+    let peers = here.peers.iter().filter(|peer| peer.is_there);
+    nodes.extend(peers.map(|peer| (peer.node, peer.name.clone().unwrap_or_default())));
+    nodes
+}
+
 /// Returns the nodes with this address or name; all of them if none is wanted; `None` if no node has it.
 pub(crate) fn chosen(here: &NodeReport, wanted: Option<&str>) -> Option<Vec<(NodeAddress, String)>> {
     let mut nodes = all(here);

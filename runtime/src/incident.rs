@@ -17,7 +17,7 @@ const OBSERVERS_MAX: usize = 64;
 /// The kind of an incident.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum IncidentKind {
-    /// An actor has failed. That is a fault at any time.
+    /// An actor has failed, or an output cannot be made safe. That is a fault at any time.
     Failure,
     /// A guard is shut, an input is late, or an application asks. While a node stops in order, these follow from that.
     Symptom,

@@ -21,7 +21,7 @@ use sinew_runtime::{
     time::Time,
 };
 
-use crate::SupervisorSpec;
+use crate::{StartError, SupervisorSpec};
 
 /// Time limit at the end for writing this process's log.
 const LOG_FLUSH_TIMEOUT: Duration = Duration::from_millis(500);
@@ -31,38 +31,64 @@ const WARNINGS_MAX: usize = 8;
 /// Maximum number of processes between the command and this one, such as shells and `cargo run`.
 const ANCESTORS_MAX: usize = 16;
 
+/// Why this process is not checked, although the variable is set.
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum OwnerError {
+    /// The variable was left behind: its node starts.
+    LeftBehind(String),
+    /// The check may run: its node must not start, because a check would become a robot that moves.
+    Unproved(String),
+}
+
 /// Returns the folder of the check, if `sinew play --check` has started this process. A variable that was left behind
 /// has no effect: a warning in the log names it once.
-fn folder() -> Option<&'static Path> {
-    static FOLDER: OnceLock<Option<PathBuf>> = OnceLock::new();
+///
+/// # Errors
+/// The check may run, and this process cannot be proved to belong to it.
+fn folder() -> Result<Option<&'static Path>, String> {
+    static FOLDER: OnceLock<Result<Option<PathBuf>, String>> = OnceLock::new();
     let found = FOLDER.get_or_init(|| {
-        let path = PathBuf::from(std::env::var_os(exchange::VARIABLE).filter(|path| !path.is_empty())?);
+        let path = std::env::var_os(exchange::VARIABLE).filter(|path| !path.is_empty());
+        let Some(path) = path.map(PathBuf::from) else { return Ok(None) };
+        let (name, shown) = (exchange::VARIABLE, path.display());
         match check_owner(&path, Time::now(), ancestors()) {
-            Ok(()) => Some(path),
-            Err(why) => {
-                let (name, path) = (exchange::VARIABLE, path.display());
-                log::warn!("the environment variable {name}={path} is ignored: {why}; unset it");
-                None
+            Ok(()) => Ok(Some(path)),
+            Err(OwnerError::LeftBehind(why)) => {
+                log::warn!("the environment variable {name}={shown} is ignored: {why}; unset it");
+                Ok(None)
             }
+            Err(OwnerError::Unproved(why)) => Err(format!(
+                "the environment variable {name}={shown} names a check, and {why}; let `sinew play --check` start this \
+                 program, directly or by a script, as the same user, or unset the variable"
+            )),
         }
     });
-    found.as_deref()
+    found.as_ref().map(Option::as_deref).map_err(Clone::clone)
 }
 
 /// Checks that the folder is that of a command that runs now and has started this process.
-fn check_owner(folder: &Path, now: Time, mut ancestors: impl Iterator<Item = u32>) -> Result<(), String> {
-    let found = fs::symlink_metadata(folder).map_err(|why| format!("it names no folder: {why}"))?;
+fn check_owner(folder: &Path, now: Time, mut ancestors: impl Iterator<Item = u32>) -> Result<(), OwnerError> {
+    let unproved = |why: &str| Err(OwnerError::Unproved(why.to_owned()));
+    let found = match fs::symlink_metadata(folder) {
+        Ok(found) => found,
+        Err(why) if why.kind() == io::ErrorKind::NotFound => {
+            return Err(OwnerError::LeftBehind(format!("it names no folder: {why}")));
+        }
+        Err(why) => return unproved(&format!("its folder cannot be looked at: {why}")),
+    };
     if !found.is_dir() || found.uid() != geteuid().as_raw() || found.mode() & 0o777 != 0o700 {
-        return Err("it names no folder of this user with the mode 0700".to_owned());
+        return unproved("this is no folder of this user with the mode 0700");
     }
     let owner = exchange::read::<CheckOwner>(&folder.join(exchange::OWNER), exchange::OWNER_BYTES_MAX);
-    let CheckOwner { process, from_ns, until_ns } =
-        owner.map_err(|why| format!("the folder names no command: {why}"))?;
+    let CheckOwner { process, from_ns, until_ns } = match owner {
+        Ok(owner) => owner,
+        Err(why) => return unproved(&format!("its folder names no command: {why}")),
+    };
     if !(from_ns..=until_ns).contains(&now.as_nanos()) {
-        return Err("the check of this folder is over".to_owned());
+        return Err(OwnerError::LeftBehind("the check of this folder is over".to_owned()));
     }
     if !ancestors.any(|ancestor| ancestor == process) {
-        return Err(format!("the command of this folder, process {process}, has not started this process"));
+        return unproved(&format!("its command, process {process}, has not started this process"));
     }
     Ok(())
 }
@@ -84,13 +110,16 @@ fn parent_of(process: u32) -> Option<u32> {
 
 /// Returns whether `sinew play --check` has started this process.
 pub(crate) fn is_asked() -> bool {
-    folder().is_some()
+    folder().is_ok_and(|folder| folder.is_some())
 }
 
 /// Handles the builder of a node in a process that is checked. Returns whether the builder must not start the node.
 /// Does not return if the recording has one of its applications.
-pub(crate) fn takes_over(config: &NodeConfig, tree: &mut SupervisorSpec) -> bool {
-    let Some(folder) = folder() else { return false };
+///
+/// # Errors
+/// A check may run, and this process cannot be proved to belong to it.
+pub(crate) fn takes_over(config: &NodeConfig, tree: &mut SupervisorSpec) -> Result<bool, StartError> {
+    let Some(folder) = folder().map_err(StartError::Check)? else { return Ok(false) };
     let name = &config.name;
     note(format_args!("`sinew play --check` has started this program: the node {name} does not start"));
     let order = exchange::read::<CheckOrder>(&folder.join(exchange::ORDER), exchange::ORDER_BYTES_MAX);
@@ -103,7 +132,7 @@ pub(crate) fn takes_over(config: &NodeConfig, tree: &mut SupervisorSpec) -> bool
         check(folder, &order, tree.into_apps());
     }
     declare(folder, config, &tree.apps());
-    true
+    Ok(true)
 }
 
 /// Prints a line to standard error. If that has no reader, the exit code remains.
@@ -209,28 +238,36 @@ mod tests {
         }
     }
 
-    /// Returns why the folder of a check by the process 7, from 10 s to 20 s, is not accepted.
-    fn refused(folder: &Path, at_s: u64, ancestors: &[u32]) -> Option<String> {
-        let now = Time::ZERO + Duration::from_secs(at_s);
-        check_owner(folder, now, ancestors.iter().copied()).err()
+    fn check(folder: &Path, at_s: u64, ancestors: &[u32]) -> Result<(), OwnerError> {
+        check_owner(folder, Time::ZERO + Duration::from_secs(at_s), ancestors.iter().copied())
+    }
+
+    /// Returns whether the node must not start, for a reason with these words.
+    fn refuses(folder: &Path, at_s: u64, ancestors: &[u32], words: &str) -> bool {
+        matches!(check(folder, at_s, ancestors), Err(OwnerError::Unproved(why)) if why.contains(words))
+    }
+
+    /// Returns whether the variable has no effect, for a reason with these words.
+    fn ignores(folder: &Path, at_s: u64, ancestors: &[u32], words: &str) -> bool {
+        matches!(check(folder, at_s, ancestors), Err(OwnerError::LeftBehind(why)) if why.contains(words))
     }
 
     #[test]
     fn only_children_of_a_running_command_are_checked() {
         let folder = TestFolder::new("owner");
-        assert!(refused(&folder.0, 15, &[7]).is_some_and(|why| why.contains("names no command")));
+        assert!(refuses(&folder.0, 15, &[7], "names no command"));
         let owner = CheckOwner { process: 7, from_ns: 10_000_000_000, until_ns: 20_000_000_000 };
         exchange::write(&folder.0.join(exchange::OWNER), &owner).unwrap();
-        assert_eq!(refused(&folder.0, 15, &[7]), None);
-        assert_eq!(refused(&folder.0, 15, &[9, 7, 1]), None, "a script has started it");
-        assert!(refused(&folder.0, 15, &[9, 1]).is_some_and(|why| why.contains("process 7")));
+        assert_eq!(check(&folder.0, 15, &[7]), Ok(()));
+        assert_eq!(check(&folder.0, 15, &[9, 7, 1]), Ok(()), "a script has started it");
+        assert!(refuses(&folder.0, 15, &[9, 1], "process 7"), "a robot would start during the check");
         for at_s in [9, 21] {
-            assert!(refused(&folder.0, at_s, &[7]).is_some_and(|why| why.contains("is over")), "{at_s}");
+            assert!(ignores(&folder.0, at_s, &[7], "is over") && ignores(&folder.0, at_s, &[1], "is over"));
         }
         fs::set_permissions(&folder.0, fs::Permissions::from_mode(0o755)).unwrap();
-        assert!(refused(&folder.0, 15, &[7]).is_some_and(|why| why.contains("0700")));
-        assert!(refused(Path::new("/dev/null"), 15, &[7]).is_some_and(|why| why.contains("0700")));
-        assert!(refused(&folder.0.join("absent"), 15, &[7]).is_some_and(|why| why.contains("no folder")));
+        assert!(refuses(&folder.0, 15, &[7], "0700"));
+        assert!(refuses(Path::new("/dev/null"), 15, &[7], "0700"));
+        assert!(ignores(&folder.0.join("absent"), 15, &[7], "no folder"));
     }
 
     #[test]
@@ -243,6 +280,7 @@ mod tests {
     #[test]
     fn ordinary_process_starts_its_node() {
         assert!(!is_asked(), "the tests run without the variable");
-        assert!(!takes_over(&NodeConfig::new("knee"), &mut SupervisorSpec::new("applications")));
+        let takes_over = takes_over(&NodeConfig::new("knee"), &mut SupervisorSpec::new("applications"));
+        assert!(matches!(takes_over, Ok(false)));
     }
 }

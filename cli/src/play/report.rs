@@ -28,6 +28,13 @@ pub(crate) fn of(played: &Played, is_wide: bool) -> Report {
             names.join(", ")
         ));
     }
+    if !played.lost.is_empty() {
+        let nodes: Vec<_> = played.lost.iter().take(SHOWN_MAX).map(ToString::to_string).collect();
+        let nodes = nodes.join(", ");
+        line(&format!(
+            "lost nodes: {nodes}; their applications are not known, and may have the names of sources"
+        ));
+    }
     for (why, count) in played.reasons.iter().take(SHOWN_MAX) {
         line(&format!("rejected: {count}: {why}"));
     }
@@ -86,12 +93,15 @@ fn json_of(played: &Played, total: &Row) -> serde_json::Value {
         "sources": played.sources, "sent": total.sent, "rejected": total.rejected, "late": total.late,
         "absent": total.absent, "not_there": played.absent, "left_out": left_out, "reasons": played.reasons,
         "channels": channels.collect::<Vec<_>>(), "damage": played.damage,
+        "lost_nodes": played.lost.iter().map(ToString::to_string).collect::<Vec<_>>(),
     })
 }
 
 #[cfg(test)]
 mod tests {
     use std::collections::{BTreeMap, BTreeSet};
+
+    use sinew::NodeAddress;
 
     use super::{super::route::LeftOut, *};
 
@@ -109,6 +119,7 @@ mod tests {
             absent: BTreeSet::from(["knee".to_owned()]),
             reasons: BTreeMap::new(),
             damage: Vec::new(),
+            lost: BTreeSet::new(),
         }
     }
 
@@ -121,6 +132,14 @@ mod tests {
         }
         assert!(!report.text.contains("demo.never"), "{}", report.text);
         assert_eq!((&report.json["left_out"]["protected"], &report.json["late"]), (&json!(3), &json!(2)));
+    }
+
+    #[test]
+    fn lost_nodes_are_named() {
+        let lost = BTreeSet::from([NodeAddress::from([10, 0, 0, 2])]);
+        let report = of(&Played { lost, ..played() }, false);
+        assert!(report.is_fine && report.text.contains("lost nodes: 10.0.0.2"), "{}", report.text);
+        assert_eq!(report.json["lost_nodes"], json!(["10.0.0.2"]));
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::{
     time::Duration,
 };
 
-use sinew::{Endpoint, Tid, Time, client::ApiError, message::Kind};
+use sinew::{Endpoint, NodeAddress, Tid, Time, client::ApiError, message::Kind};
 use sinew_player::{Playback, Recorded};
 
 use super::{
@@ -67,6 +67,8 @@ pub(crate) struct Played {
     /// Reasons of rejections, each with its number. A reason is one of a few.
     pub(crate) reasons: BTreeMap<String, u64>,
     pub(crate) damage: Vec<String>,
+    /// Nodes that were lost when the names were compared, at most as many as a node reports.
+    pub(crate) lost: BTreeSet<NodeAddress>,
 }
 
 /// Plays the recording to its end.
@@ -82,7 +84,7 @@ pub(crate) fn play(
     let senders: BTreeSet<_> =
         chosen.clone().filter_map(|(_, route)| Some(&route.as_ref().ok()?.sender)).collect();
     let wanted: BTreeSet<_> = chosen.filter_map(|(_, route)| wanted(route, &senders)).collect();
-    sources::check_names(target, &senders, &BTreeSet::new())?;
+    let lost = sources::check_names(target, &senders, &BTreeSet::new())?;
     let mut sources = Sources::register(&target.api()?, senders.clone())?;
     let topics =
         playback.channels().iter().map(|channel| Row { topic: channel.topic.clone(), ..Row::default() });
@@ -100,6 +102,7 @@ pub(crate) fn play(
             absent: BTreeSet::new(),
             reasons: BTreeMap::new(),
             damage: playback.damage().to_vec(),
+            lost: lost.into_iter().collect(),
         },
         due: 0,
         destinations: Destinations::default(),
@@ -107,7 +110,7 @@ pub(crate) fn play(
         drained: Time::now(),
     };
     let result = session.wait_for(target, &mut sources, &wanted).and_then(|()| {
-        sources::check_names(target, &senders, &sources.addresses())?;
+        session.played.lost.extend(sources::check_names(target, &senders, &sources.addresses())?);
         session.all(playback, &routes, (target, &mut sources))
     });
     session.settle(&mut sources);

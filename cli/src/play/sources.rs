@@ -6,7 +6,7 @@ use std::{
 };
 
 use sinew::{
-    Endpoint, NodeApi, Registration, Tid,
+    Endpoint, NodeAddress, NodeApi, Registration, Tid,
     client::{ApiError, DirectLinks},
     events::Undelivered,
     inspect::{AppsReport, AskApps},
@@ -15,7 +15,7 @@ use sinew_player::Recorded;
 
 use super::{route::Sender, target::Target};
 use crate::{
-    system::{Answer, SystemError},
+    system::{Answer, SystemError, present},
     table::clean,
 };
 
@@ -111,23 +111,26 @@ impl Sources {
     }
 }
 
-/// Refuses to play in the name of an application that is there, on any node. A live system must list all of them: a
-/// controller that is not listed would send beside its recording.
+/// Refuses to play in the name of an application that is there, on any node. The present nodes of a live system must
+/// list all of them: a controller that is not listed would send beside its recording. Returns the lost nodes, which
+/// cannot list theirs.
 ///
 /// # Errors
-/// There is one, at an address that is not among `own`; or a live system does not list all applications.
+/// There is one, at an address that is not among `own`; or a present node of a live system does not list all
+/// applications.
 pub(crate) fn check_names(
     target: &mut Target,
     senders: &BTreeSet<&Sender>,
     own: &BTreeSet<Tid>,
-) -> Result<(), SystemError> {
+) -> Result<Vec<NodeAddress>, SystemError> {
     let is_live = !target.is_own();
     let here = target.system.here()?;
     if is_live && here.left_out > 0 {
         return Err(unlisted(&format!("{} nodes are not listed by the node of the socket", here.left_out)));
     }
-    let answers = target.system.ask_all::<AskApps, AppsReport>(&here);
-    answers.into_iter().try_for_each(|answer| check_answer(answer, is_live, senders, own))
+    let answers = target.system.ask_these::<AskApps, AppsReport>(present(&here));
+    answers.into_iter().try_for_each(|answer| check_answer(answer, is_live, senders, own))?;
+    Ok(here.peers.iter().filter(|peer| !peer.is_there).map(|peer| peer.node).collect())
 }
 
 /// Checks the applications of one node.
@@ -172,8 +175,6 @@ fn unlisted(why: &str) -> SystemError {
 
 #[cfg(test)]
 mod tests {
-    use sinew::NodeAddress;
-
     use super::*;
 
     fn report(left_out: u64) -> AppsReport {

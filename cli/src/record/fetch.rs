@@ -20,10 +20,9 @@ use sinew::{
     inspect::{AskFrozen, FROZEN_BUSY, FrozenFacts, FrozenPart, FrozenReport, FrozenSpan},
 };
 
-use super::freeze::present;
 use crate::{
     Report,
-    system::{Answer, System, SystemError, in_words},
+    system::{Answer, System, SystemError, in_words, present},
     table::{Table, clean, time},
 };
 use convert::{Converted, Source, convert, file_name};
@@ -33,6 +32,9 @@ use dead::DeadRing;
 const RING_BYTES_MAX: u64 = (4 << 30) + (1 << 20);
 /// Maximum bytes of the facts beside it.
 const FACTS_BYTES_MAX: u64 = 4 << 20;
+
+/// Maximum number of times that one ring is fetched.
+const PULLS_MAX: usize = 3;
 
 /// Time for which a node is asked again while it writes to the folder of its spans, and the pause before.
 const BUSY_WITHIN: Duration = Duration::from_secs(5);
@@ -155,7 +157,7 @@ fn gather(
     found.faults.extend(faults);
 }
 
-/// Fetches the span of a node.
+/// Fetches the span of a node. It starts over if the node replaces the span meanwhile: a late trigger does.
 fn fetch(
     system: &mut System,
     node: NodeAddress,
@@ -163,12 +165,10 @@ fn fetch(
     (out, is_forced): (&Path, bool),
     files: &[Converted],
 ) -> Result<Converted, SystemError> {
-    let mut bytes = Vec::new();
-    pull(system, node, (&span.id, FrozenPart::Facts), FACTS_BYTES_MAX, &mut bytes)?;
-    let facts: FrozenFacts = rmp_serde::from_slice(&bytes)
-        .map_err(|why| SystemError::Bag(format!("its names cannot be read: {why}")))?;
     let part = out.join(format!(".{}", file_name(&node.to_string(), &span.id, "part")));
-    let converted = pull_ring(system, node, &span.id, &part).and_then(|()| {
+    let converted = pull_unchanged(system, node, &span.id, &part).and_then(|facts| {
+        // It may have other times than the list had.
+        let span = facts.span.clone().unwrap_or_else(|| span.clone());
         let source = Source { ring: &part, facts, times: span.begin_ns..=span.end_ns, address: node };
         let times = (!span.has_died).then_some((span.at_ns, span.bound_ns));
         let (file, is_new) = path_of(files, out, (&source.facts.report.name, node), &span.id);
@@ -177,10 +177,54 @@ fn fetch(
     // It is not needed any more.
     let _ = fs::remove_file(&part);
     let converted = converted?;
-    // Else its place is not given to another one.
-    let done = AskFrozen { id: Some(span.id.clone()), is_fetched: true, ..AskFrozen::default() };
-    let _ = ask(system, node, &done);
+    // One that was replaced since then has to be fetched again.
+    let after = pull_facts(system, node, &span.id);
+    if after
+        .is_ok_and(|facts| facts.span.is_some_and(|after| converted.times == (after.begin_ns..=after.end_ns)))
+    {
+        // Else its place is not given to another one.
+        let done = AskFrozen { id: Some(span.id.clone()), is_fetched: true, ..AskFrozen::default() };
+        let _ = ask(system, node, &done);
+    }
     Ok(converted)
+}
+
+/// Fetches the ring and the facts of a span, until both are of one and the same span.
+fn pull_unchanged(
+    system: &mut System,
+    node: NodeAddress,
+    id: &str,
+    part: &Path,
+) -> Result<FrozenFacts, SystemError> {
+    let mut before = pull_facts(system, node, id)?;
+    for _ in 0..PULLS_MAX {
+        let pulled = pull_ring(system, node, id, part);
+        let after = pull_facts(system, node, id)?;
+        match pulled {
+            Ok(()) if is_same(&before, &after) => return Ok(after),
+            // A ring that is replaced while it is read may have an end before the offset.
+            Err(why) if is_same(&before, &after) => return Err(why),
+            _ => before = after,
+        }
+    }
+    Err(SystemError::Bag(format!(
+        "the span {} has changed {PULLS_MAX} times while it was fetched; fetch it again when no trigger follows",
+        clean(id)
+    )))
+}
+
+/// Returns whether both are of the same frozen span.
+fn is_same(before: &FrozenFacts, after: &FrozenFacts) -> bool {
+    let mark = |facts: &FrozenFacts| {
+        facts.span.as_ref().map(|span| (span.begin_ns, span.end_ns, span.at_ns, span.bound_ns))
+    };
+    mark(before) == mark(after) && before.report == after.report
+}
+
+fn pull_facts(system: &mut System, node: NodeAddress, id: &str) -> Result<FrozenFacts, SystemError> {
+    let mut bytes = Vec::new();
+    pull(system, node, (id, FrozenPart::Facts), FACTS_BYTES_MAX, &mut bytes)?;
+    rmp_serde::from_slice(&bytes).map_err(|why| SystemError::Bag(format!("its names cannot be read: {why}")))
 }
 
 /// Writes the part of a dead node's ring that is within the span. `None` if it has no record of it.
@@ -239,11 +283,17 @@ fn pull(
     into: &mut impl Write,
 ) -> Result<(), SystemError> {
     let mut offset = 0;
+    let mut length = None;
     loop {
         let question = AskFrozen { id: Some(id.to_owned()), part, offset, is_fetched: false };
         let report = ask(system, node, &question)?;
         if report.length > bytes_max {
             return Err(SystemError::Bag(format!("it names a file of {} bytes", report.length)));
+        }
+        if *length.get_or_insert(report.length) != report.length {
+            return Err(SystemError::Bag(
+                "its file was replaced while it was read; fetch it again".to_owned(),
+            ));
         }
         if report.bytes.is_empty() {
             return Ok(());
@@ -380,6 +430,17 @@ mod tests {
         assert!(is_new && other == Path::new("out/knee-0.0.0.2-a-1.mcap"), "{other:?}");
         let files = [written(&path), written(&other)];
         assert!(!path_of(&files, out, ("knee", second), "a-1").1);
+    }
+
+    #[test]
+    fn replaced_span_is_another_one() {
+        let span = FrozenSpan { begin_ns: 3, end_ns: 9, ..FrozenSpan::default() };
+        let facts = |span: &FrozenSpan| FrozenFacts { span: Some(span.clone()), ..FrozenFacts::default() };
+        let fetched = FrozenSpan { is_fetched: true, ..span.clone() };
+        assert!(is_same(&facts(&span), &facts(&fetched)), "another command has fetched it");
+        for other in [FrozenSpan { begin_ns: 2, ..span.clone() }, FrozenSpan { end_ns: 10, ..span.clone() }] {
+            assert!(!is_same(&facts(&span), &facts(&other)), "{other:?}");
+        }
     }
 
     #[test]

@@ -12,7 +12,7 @@ use sinew::{
 use super::fetch::ask_spans;
 use crate::{
     Report,
-    system::{Answer, System, SystemError, in_words},
+    system::{Answer, System, SystemError, in_words, present},
     table::{Table, clean},
 };
 
@@ -75,14 +75,6 @@ fn states(system: &mut System, here: &NodeReport, id: &str) -> Vec<(NodeAddress,
         (node, name, state)
     };
     ask_spans(system, present(here)).into_iter().map(state).collect()
-}
-
-/// Returns this node and all nodes that it knows and that answer. A lost one has nothing to hand out.
-pub(super) fn present(here: &NodeReport) -> Vec<(NodeAddress, String)> {
-    let mut nodes = vec![(here.node, here.name.clone())];
-    let peers = here.peers.iter().filter(|peer| peer.is_there);
-    nodes.extend(peers.map(|peer| (peer.node, peer.name.clone().unwrap_or_default())));
-    nodes
 }
 
 fn shown(id: &str, states: &[(NodeAddress, String, State)]) -> Report {

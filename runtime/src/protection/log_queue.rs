@@ -56,7 +56,7 @@ impl LogEntry {
             OutputEvent::SafeFailed => {
                 incident::report(
                     now,
-                    IncidentKind::Symptom,
+                    IncidentKind::Failure,
                     format_args!("an output of {name} from {source} cannot be made safe: {cause}"),
                 );
                 crate::log::error!(%source, of = name, %cause, "the safe function of an output panicked or failed; it is retried each millisecond");

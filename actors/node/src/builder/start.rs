@@ -99,7 +99,7 @@ impl NodeBuilder {
         check_panics(UNWINDS, self.accept_abort_on_panic)?;
         #[cfg(feature = "fault-points")]
         let planned = crate::faults::read(&self.faults, &mut self.tree)?;
-        let hosts_other_node = play_check::takes_over(&self.config, &mut self.tree)
+        let hosts_other_node = play_check::takes_over(&self.config, &mut self.tree)?
             || process::hosts_other_node(&self.config, &mut self.tree);
         let auto_shutdown = self.tree.flags.auto_shutdown;
         self.tree.flags = Flags { auto_shutdown, ..self.config.supervision.apps() };

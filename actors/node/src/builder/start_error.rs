@@ -69,6 +69,9 @@ pub enum StartError {
     /// `record.folder` or `record.file` is set, and the recording cannot begin.
     #[error("the section record asks for a recording, and the node does not start without it: {0}")]
     Record(String),
+    /// `sinew play --check` may run, and has not started this process. Nothing was started.
+    #[error("{0}")]
+    Check(String),
     /// A layer did not become ready.
     #[error("the layers did not start: {0}")]
     Layers(String),

@@ -7,6 +7,8 @@
 
 use std::{
     collections::VecDeque,
+    io,
+    panic::{AssertUnwindSafe, catch_unwind},
     path::{Path, PathBuf},
     sync::{
         Arc, Condvar, Mutex, MutexGuard, PoisonError, TryLockError, Weak,
@@ -65,21 +67,34 @@ pub(crate) struct Flight {
 #[derive(Default)]
 struct Causes {
     reported: Mutex<VecDeque<(Time, IncidentKind, String)>>,
-    /// Those of which the words are lost.
-    lost: AtomicU64,
+    /// Symptoms of which the words are lost.
+    lost_symptoms: AtomicU64,
+    /// Failures of which the words are lost.
+    lost_failures: AtomicU64,
+}
+
+impl Causes {
+    /// Counts a cause without its words.
+    fn lose(&self, kind: IncidentKind) {
+        let lost = match kind {
+            IncidentKind::Failure => &self.lost_failures,
+            IncidentKind::Symptom => &self.lost_symptoms,
+        };
+        lost.fetch_add(1, Ordering::Relaxed);
+    }
 }
 
 impl IncidentObserver for Causes {
     fn happened(&self, at: Time, kind: IncidentKind, cause: &str) {
         // The thread may be a real-time one. Another cause is just being stored or read: this one has no words then.
         let Ok(mut reported) = self.reported.try_lock() else {
-            self.lost.fetch_add(1, Ordering::Relaxed);
+            self.lose(kind);
             return;
         };
         if reported.len() < CAUSES_MAX {
             reported.push_back((at, kind, cause.to_owned()));
         } else {
-            self.lost.fetch_add(1, Ordering::Relaxed);
+            self.lose(kind);
         }
     }
 }
@@ -94,10 +109,17 @@ enum Order {
 /// The orders of the thread `freeze`.
 #[derive(Default)]
 struct Work {
-    /// Spans to freeze, at most one for each known trigger, and before them rings to move, at most as many as a store
-    /// has.
+    /// Spans to freeze, at most one for each known trigger, and rings to move, at most as many as a store has.
     orders: VecDeque<Order>,
     is_running: bool,
+}
+
+impl Work {
+    /// Takes the first span to freeze, which the journal loses with time, or else the first order.
+    fn next(&mut self) -> Option<Order> {
+        let first = self.orders.iter().position(|order| matches!(order, Order::Freeze(_)));
+        self.orders.remove(first.unwrap_or(0))
+    }
 }
 
 /// The names that were written beside the journal.
@@ -213,24 +235,35 @@ impl Flight {
     ) {
         self.take_causes(now, &changes.losses);
         self.write_names(state, journal, now, changes.has_new_names);
-        loop {
-            let output = lock(&self.plan).poll(now.as_nanos());
-            match output {
-                None => break,
-                Some(Output::Forward(trigger)) => {
-                    note(state, journal, &trigger);
-                    forward(state, &trigger);
-                }
-                // The node has a recording, and keeps no spans.
-                Some(Output::Freeze(_)) if !self.keeps_spans => {}
-                Some(Output::Freeze(order)) => lock(&self.work).orders.push_back(Order::Freeze(order)),
-            }
+        while self.poll(now.as_nanos(), |trigger| {
+            note(state, journal, trigger);
+            forward(state, trigger);
+        }) {}
+        if let Err(error) = self.start_work(&Arc::downgrade(state), journal.path()) {
+            log::error!(%error, "the system gives no thread to freeze a span; it is asked again");
         }
-        self.start_work(&Arc::downgrade(state), journal.path());
     }
 
-    /// Notes the order to stop the node. From now on only failed actors are causes: guards and watchdogs are expected
-    /// to see the end of peers, and nodes leave.
+    /// Takes one output of the plan. Returns `false` if there is none.
+    fn poll(&self, now_ns: u64, forward: impl FnOnce(&Trigger)) -> bool {
+        // Until the order is among the others: the end of the node must not miss it.
+        let mut work = lock(&self.work);
+        let output = lock(&self.plan).poll(now_ns);
+        match output {
+            None => return false,
+            Some(Output::Forward(trigger)) => {
+                drop(work);
+                forward(&trigger);
+            }
+            // The node has a recording, and keeps no spans.
+            Some(Output::Freeze(_)) if !self.keeps_spans => {}
+            Some(Output::Freeze(order)) => work.orders.push_back(Order::Freeze(order)),
+        }
+        true
+    }
+
+    /// Notes the order to stop the node. From now on only failures are causes: guards and watchdogs are expected to see
+    /// the end of peers, and nodes leave.
     pub(super) fn stop_ordered(&self, now: Time) {
         self.stop_ns.fetch_min(now.as_nanos(), Ordering::Relaxed);
     }
@@ -244,7 +277,11 @@ impl Flight {
                 self.happened(*at, cause);
             }
         }
-        let lost = self.causes.lost.swap(0, Ordering::Relaxed);
+        let lost_failures = self.causes.lost_failures.swap(0, Ordering::Relaxed);
+        if lost_failures > 0 {
+            self.happened(now, &format!("{lost_failures} failures at the moment of another incident"));
+        }
+        let lost = self.causes.lost_symptoms.swap(0, Ordering::Relaxed);
         if now.as_nanos() >= stop_ns {
             return;
         }
@@ -256,18 +293,16 @@ impl Flight {
     }
 
     /// Starts the thread `freeze`, if it has orders and does not run.
-    fn start_work(self: &Arc<Self>, state: &Weak<NodeState>, journal: &Path) {
+    fn start_work(self: &Arc<Self>, state: &Weak<NodeState>, journal: &Path) -> io::Result<()> {
         let mut work = lock(&self.work);
         if work.orders.is_empty() || work.is_running {
-            return;
+            return Ok(());
         }
         let (flight, state, path) = (self.clone(), state.clone(), journal.to_owned());
         let thread = std::thread::Builder::new().name("freeze".to_owned());
-        match thread.spawn(move || flight.work(&state, &path)) {
-            Ok(_) => work.is_running = true,
-            // The next turn tries again.
-            Err(error) => log::error!(%error, "the system gives no thread to freeze a span"),
-        }
+        thread.spawn(move || flight.work(&state, &path))?;
+        work.is_running = true;
+        Ok(())
     }
 
     /// Writes the names beside the journal, if they have changed: a dead node cannot tell them. A new name of an
@@ -297,34 +332,46 @@ impl Flight {
 
     /// Carries out the orders of the thread `freeze`.
     fn work(&self, state: &Weak<NodeState>, journal: &Path) {
+        let _running = Running(self);
         while let Some(order) = self.next_order() {
-            let order = match order {
-                Order::Freeze(order) => order,
-                Order::Move(id) => {
-                    match move_ring(&self.beside, &self.store, &id) {
-                        Ok(()) => {
-                            log::info!(id, "the ring of a dead incarnation is moved to record.frozen_folder")
-                        }
-                        Err(error) => {
-                            log::warn!(id, %error, "the ring of a dead incarnation stays in record.folder")
-                        }
-                    }
-                    continue;
-                }
-            };
-            let is_ending = self.is_ending.load(Ordering::Relaxed);
-            let report = match state.upgrade().filter(|_| !is_ending) {
-                Some(state) => names_for_reader(&state, journal),
-                None => self.written_names(journal),
-            };
-            self.freeze(journal, &order, report);
+            // The others are carried out nevertheless.
+            if catch_unwind(AssertUnwindSafe(|| self.carry_out(order, state, journal))).is_err() {
+                log::error!("the thread `freeze` panicked: a span is not frozen, or a ring is not moved");
+            }
         }
+    }
+
+    fn carry_out(&self, order: Order, state: &Weak<NodeState>, journal: &Path) {
+        let order = match order {
+            Order::Freeze(order) => order,
+            Order::Move(id) => {
+                match move_ring(&self.beside, &self.store, &id) {
+                    Ok(()) => {
+                        log::info!(id, "the ring of a dead incarnation is moved to record.frozen_folder")
+                    }
+                    Err(error) => {
+                        log::warn!(id, %error, "the ring of a dead incarnation stays in record.folder");
+                    }
+                }
+                return;
+            }
+        };
+        let is_ending = self.is_ending.load(Ordering::Relaxed);
+        let report = match state.upgrade().filter(|_| !is_ending) {
+            Some(state) => names_for_reader(&state, journal),
+            None => self.written_names(journal),
+        };
+        self.freeze(journal, &order, report);
     }
 
     /// Returns the next order of the thread. `None`: the thread ends.
     fn next_order(&self) -> Option<Order> {
         let mut work = lock(&self.work);
-        let next = work.orders.pop_front();
+        if self.is_ending.load(Ordering::Relaxed) {
+            // The node waits. The next start finds these rings again.
+            work.orders.retain(|order| matches!(order, Order::Freeze(_)));
+        }
+        let next = work.next();
         if next.is_none() {
             work.is_running = false;
             self.idle.notify_all();
@@ -349,16 +396,13 @@ impl Flight {
         if !self.keeps_spans {
             return;
         }
-        loop {
-            let output = lock(&self.plan).poll(u64::MAX);
-            match output {
-                None => break,
-                // Its links have ended.
-                Some(Output::Forward(trigger)) => note(node, journal, &trigger),
-                Some(Output::Freeze(order)) => lock(&self.work).orders.push_back(Order::Freeze(order)),
-            }
+        // Its links have ended.
+        while self.poll(u64::MAX, |trigger| note(node, journal, trigger)) {}
+        if let Err(error) = self.start_work(&Weak::new(), journal.path()) {
+            // There is no further turn: nothing waits for these spans.
+            let lost = std::mem::take(&mut lock(&self.work).orders).len();
+            log::error!(%error, lost, "the system gives no thread: the node ends without the last spans and moves");
         }
-        self.start_work(&Weak::new(), journal.path());
     }
 
     /// Waits until the thread `freeze` has carried out its orders. Returns `false` if the time is over before.
@@ -403,6 +447,19 @@ impl Flight {
     }
 }
 
+/// The thread `freeze`. If it panics between two orders, the next turn starts another one.
+struct Running<'a>(&'a Flight);
+
+impl Drop for Running<'_> {
+    fn drop(&mut self) {
+        // Else the last look at the orders has noted the end, and another thread may run already.
+        if std::thread::panicking() {
+            lock(&self.0.work).is_running = false;
+            self.0.idle.notify_all();
+        }
+    }
+}
+
 /// Writes the trigger into the journal, so that it is an event of the span.
 fn note(state: &NodeState, journal: &Journal, trigger: &Trigger) {
     let (id, cause) = (trigger.id.to_string(), trigger.cause.as_str().to_owned());
@@ -411,23 +468,4 @@ fn note(state: &NodeState, journal: &Journal, trigger: &Trigger) {
 }
 
 #[cfg(test)]
-mod tests {
-    use sinew_model::config::NodeConfig;
-    use sinew_runtime::tid::Incarnation;
-
-    use super::*;
-
-    #[test]
-    fn incident_at_a_held_lock_is_a_cause() {
-        let mut config = NodeConfig::new("knee");
-        config.project = format!("held {}", std::process::id());
-        let state = NodeState::for_test(config, Incarnation(1));
-        let flight = Flight::begin(&state, &std::env::temp_dir().join("sinew-held-10.0.0.2.journal"));
-        let held = lock(&flight.causes.reported);
-        flight.causes.happened(Time::now(), IncidentKind::Symptom, "the knee slips");
-        drop(held);
-        flight.take_causes(Time::now(), &[]);
-        // Of another test's incident at this moment it has the words.
-        assert!(!flight.known().is_empty());
-    }
-}
+mod tests;

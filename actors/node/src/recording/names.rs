@@ -11,7 +11,7 @@ use sinew_runtime::{
 use sinew_shm::journal::{JournalReader, Start};
 
 use super::{facts::clocks, wall_offset};
-use crate::NodeState;
+use crate::{NodeState, inspect::bounded};
 
 /// Maximum number of payload types with a structure beside a journal. A reader without a node cannot ask for more.
 const READER_SCHEMAS_MAX: usize = 256;
@@ -23,7 +23,8 @@ pub(super) fn names_for_reader(state: &NodeState, path: &Path) -> RecordReport {
     let kinds = journal_kinds(path);
     let mut report = report(state, path, &kinds, &kinds[..kinds.len().min(READER_SCHEMAS_MAX)]);
     bound_schemas(&mut report.types, READER_SCHEMA_BYTES_MAX);
-    report
+    // A reader accepts no longer lists.
+    bounded(report)
 }
 
 /// Leaves out each structure that has no room behind those before it.
@@ -83,7 +84,23 @@ fn schema(kind: Kind) -> Option<Vec<u8>> {
 
 #[cfg(test)]
 mod tests {
+    use sinew_record::{FrozenFacts, RECORDED_MAX};
+    use sinew_runtime::{tid::Tid, wire};
+
     use super::*;
+
+    #[test]
+    fn facts_of_many_applications_can_be_read() {
+        let app = |number: usize| RecordedApp {
+            tid: Tid::from_bits(number as u64),
+            name: format!("finger-{number}"),
+        };
+        let report = RecordReport { apps: (0..=RECORDED_MAX).map(app).collect(), ..RecordReport::default() };
+        let read = |report| wire::decode::<FrozenFacts>(&wire::encode(&FrozenFacts { span: None, report }));
+        assert!(read(report.clone()).is_err(), "a reader refuses a longer list");
+        let facts = read(bounded(report)).unwrap();
+        assert_eq!((facts.report.apps.len(), facts.report.apps_left_out), (RECORDED_MAX, 1));
+    }
 
     #[test]
     fn structures_beside_a_journal_are_bounded_in_bytes() {

@@ -9,7 +9,7 @@ use std::{
     sync::Mutex,
 };
 
-use sinew_runtime::{lock, wire};
+use sinew_runtime::{lock, log, wire};
 use sinew_shm::journal::{CopyJournalError, JournalReader, Start, copy_span, count_span};
 
 use sinew_record::{FROZEN_SPANS_MAX, FrozenFacts, FrozenPart, FrozenSpan};
@@ -26,6 +26,8 @@ pub(crate) struct FrozenStore {
     /// Begin of the names of its files, without the last `-`.
     base: String,
     spans_max: usize,
+    /// The fetched spans with facts that could not be written: a full disk must get room again.
+    fetched: BTreeSet<String>,
 }
 
 /// The copy of a span, until the store has it. It is made without the store: that takes as long as the disk does.
@@ -88,7 +90,7 @@ pub(crate) enum FrozenError {
 
 impl FrozenStore {
     pub(crate) const fn new(folder: PathBuf, base: String, spans_max: usize) -> Self {
-        Self { folder, base, spans_max }
+        Self { folder, base, spans_max, fetched: BTreeSet::new() }
     }
 
     /// Removes journals without facts, facts without a journal, copies that no span has, and files without their name:
@@ -143,10 +145,12 @@ impl FrozenStore {
         let ring = self.path(&id, "frozen");
         let failed = |cause| FrozenError::Files { id: id.clone(), cause };
         // The facts first: without its ring a span does not count, and a ring without facts is removed.
-        self.announce(&id, facts)?;
-        fs::rename(&drafted.ring, &ring).map_err(failed)?;
-        // It is there only if a replaced ring was better.
+        let renamed = || fs::rename(&drafted.ring, &ring).map_err(failed);
+        let kept = self.announce(&id, facts).and_then(|()| renamed());
+        // It is there only after an error, or if a replaced ring was better.
         let _ = fs::remove_file(self.path(&id, "draft"));
+        kept?;
+        self.fetched.remove(&id);
         replaces.iter().filter(|former| **former != id).for_each(|former| self.discard(former));
         Ok(())
     }
@@ -176,9 +180,38 @@ impl FrozenStore {
             return Some(Err(why));
         }
         facts.span = Some(span);
-        let beside = Self { folder: folder_of(journal), base: self.base.clone(), ..*self };
-        let kept = self.adopt(journal, &id, &facts).or_else(|_| beside.adopt(journal, &id, &facts));
+        let beside = Self::new(folder_of(journal), self.base.clone(), self.spans_max);
+        let kept = self.adopt(journal, &id, &facts).or_else(|why| {
+            if beside.folder == self.folder {
+                return Err(why);
+            }
+            // This folder may be absent or full for long, and that of the journal is memory.
+            beside.discard_dead(&id, self.spans_max.saturating_sub(self.spans().len()).max(1));
+            beside.adopt(journal, &id, &facts)
+        });
         Some(kept.map(|()| id))
+    }
+
+    /// Removes the oldest rings of dead incarnations, so that there are at most `rings_max` with that of `id`.
+    fn discard_dead(&self, id: &str, rings_max: usize) {
+        let mut dead: Vec<_> = self
+            .spans()
+            .into_iter()
+            .filter(|span| span.has_died && span.id != id)
+            .map(|span| span.id)
+            .collect();
+        // Their facts were written last when their next incarnation started.
+        let written =
+            |id: &String| fs::metadata(self.path(id, "facts")).and_then(|file| file.modified()).ok();
+        dead.sort_by_cached_key(written);
+        let surplus = (dead.len() + 1).saturating_sub(rings_max);
+        for id in &dead[..surplus.min(dead.len())] {
+            log::warn!(
+                id,
+                "the ring of a former dead incarnation is removed from record.folder: record.frozen_folder has not taken it"
+            );
+            self.discard(id);
+        }
     }
 
     /// Renames a ring to that of a span.
@@ -194,7 +227,7 @@ impl FrozenStore {
     /// Returns the store of the folder with the journal, and the rings of dead incarnations in it that have to be moved
     /// to this one.
     pub(crate) fn beside(&self, journal: &Path) -> (Self, Vec<String>) {
-        let beside = Self { folder: folder_of(journal), base: self.base.clone(), ..*self };
+        let beside = Self::new(folder_of(journal), self.base.clone(), self.spans_max);
         let mut dead = Vec::new();
         if beside.folder != self.folder {
             dead.extend(beside.spans().into_iter().filter(|span| span.has_died).map(|span| span.id));
@@ -231,7 +264,8 @@ impl FrozenStore {
         }
     }
 
-    /// Notes that a span was fetched, beside its ring: the next incarnation of the node has to know it.
+    /// Notes that a span was fetched, beside its ring: the next incarnation of the node has to know it. If that cannot
+    /// be written, this incarnation knows it nevertheless.
     pub(crate) fn set_fetched(&mut self, id: &str) -> Result<(), FrozenError> {
         self.check(id)?;
         let path = self.path(id, "facts");
@@ -239,7 +273,13 @@ impl FrozenStore {
         match &mut facts.span {
             Some(span) if !span.is_fetched => {
                 span.is_fetched = true;
-                self.announce(id, &facts)
+                let written = self.announce(id, &facts);
+                if written.is_err() {
+                    let present: BTreeSet<_> = self.spans().into_iter().map(|span| span.id).collect();
+                    self.fetched.retain(|other| present.contains(other));
+                    self.fetched.insert(id.to_owned());
+                }
+                written
             }
             Some(_) | None => Ok(()),
         }
@@ -311,7 +351,8 @@ impl FrozenStore {
         if name != format!("{}-{}.facts", self.base, span.id) || !is_own(&ring) {
             return None;
         }
-        Some(FrozenSpan { bytes: ring.symlink_metadata().ok()?.len(), ..span })
+        let is_fetched = span.is_fetched || self.fetched.contains(&span.id);
+        Some(FrozenSpan { bytes: ring.symlink_metadata().ok()?.len(), is_fetched, ..span })
     }
 }
 

@@ -1,6 +1,7 @@
 //! Writes a frozen journal, or the ring of a dead node, as an MCAP file.
 
 use std::{
+    io,
     ops::RangeInclusive,
     path::{Path, PathBuf},
 };
@@ -10,7 +11,7 @@ use sinew::{
     NodeAddress,
     inspect::{FrozenFacts, Selection},
 };
-use sinew_bag::{BagWriter, Options, Origin};
+use sinew_bag::{BagError, BagWriter, Options, Origin};
 use sinew_recorder::{JournalReader, Names, ReadJournalError, Recorder, Setup, Span, Start};
 
 use crate::system::SystemError;
@@ -83,7 +84,8 @@ pub(super) fn convert(
         wall_offset_ns: reader.wall_offset().map_err(fault)?,
         began_ns: if span.records == 0 { *times.start() } else { span.first_ns },
     };
-    let bag = BagWriter::create(file.clone(), Options { replace, ..Options::default() }, origin)?;
+    let bag = BagWriter::create(file.clone(), Options { replace, ..Options::default() }, origin)
+        .map_err(creation_error)?;
     let mut names = Names::default();
     // All that the node knew of its types is in the report.
     let kinds: Vec<_> = report.types.iter().map(|one| one.kind).collect();
@@ -120,6 +122,19 @@ pub(super) fn convert(
     })
 }
 
+/// Names the option that replaces a file, if there is one.
+fn creation_error(why: BagError) -> SystemError {
+    match why {
+        BagError::Write { path, cause } if cause.kind() == io::ErrorKind::AlreadyExists => {
+            let path = path.display();
+            SystemError::Bag(format!(
+                "{path}: this file exists; replace a file of a former run with --force, or name another folder with --out"
+            ))
+        }
+        why => why.into(),
+    }
+}
+
 /// Returns the name of a file: `knee-ID.mcap`.
 pub(super) fn file_name(node: &str, id: &str, ending: &str) -> String {
     let letter = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' };
@@ -130,6 +145,15 @@ pub(super) fn file_name(node: &str, id: &str, ending: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn existing_file_has_the_option_as_remedy() {
+        let of = |kind: io::ErrorKind| {
+            creation_error(BagError::Write { path: "knee.mcap".into(), cause: kind.into() }).to_string()
+        };
+        assert!(of(io::ErrorKind::AlreadyExists).contains("--force"));
+        assert!(!of(io::ErrorKind::PermissionDenied).contains("--force"));
+    }
 
     #[test]
     fn names_of_files_have_no_path_in_them() {

@@ -5,7 +5,7 @@ use sinew_record::{CLOCKS_MAX, RECORDED_MAX, RecordReport};
 use super::{Report, Shortened};
 
 /// Limits the lists to those of an answer.
-pub(in super::super) fn bounded(mut report: RecordReport) -> RecordReport {
+pub(crate) fn bounded(mut report: RecordReport) -> RecordReport {
     let cut = |length: usize, max: usize| length.saturating_sub(max) as u64;
     report.apps_left_out = cut(report.apps.len(), RECORDED_MAX);
     report.types_left_out = cut(report.types.len(), RECORDED_MAX);

@@ -1,7 +1,12 @@
 //! Frozen spans in a folder: their room, their replacement, and files of other nodes.
 
-use std::os::unix::fs::PermissionsExt as _;
+use std::{
+    os::unix::fs::PermissionsExt as _,
+    time::{Duration, SystemTime},
+};
 
+use sinew_record::RecordReport;
+use sinew_runtime::tid::Incarnation;
 use sinew_shm::journal::{ChannelKey, Journal, Options};
 
 use super::*;
@@ -207,4 +212,54 @@ fn ring_of_a_dead_node_waits_beside_the_journal() {
     assert!(spans.len() == 1 && spans[0].has_died && spans[0].id == id, "{spans:?}");
     assert!(store.lock().unwrap().beside(&path).1.is_empty());
     assert_eq!(count_span(&disk.join(format!("sinew-leg-10.0.0.2-{id}.frozen")), &(0..=9)).unwrap(), 9);
+}
+
+#[test]
+fn fetched_span_gives_its_place_without_a_written_mark() {
+    let folder = Folder::new("unwritten");
+    let (mut store, journal) = (folder.store(1), folder.journal());
+    freeze(&mut store, &journal, &span("a-1", 2)).unwrap();
+    // A folder in place of the temporary file, as a full disk: the facts cannot be written.
+    let temporary = folder.0.join(format!(".sinew-leg-10.0.0.2-a-1.facts.{}", std::process::id()));
+    fs::create_dir(&temporary).unwrap();
+    assert!(store.set_fetched("a-1").is_err());
+    assert!(store.spans()[0].is_fetched);
+    fs::remove_dir(&temporary).unwrap();
+    freeze(&mut store, &journal, &span("a-2", 4)).unwrap();
+    assert_eq!(ids(&store), ["a-2"]);
+}
+
+#[test]
+fn failed_facts_leave_no_draft() {
+    let folder = Folder::new("no-draft");
+    let (mut store, journal) = (folder.store(1), folder.journal());
+    let temporary = folder.0.join(format!(".sinew-leg-10.0.0.2-a-1.facts.{}", std::process::id()));
+    fs::create_dir(temporary).unwrap();
+    assert!(freeze(&mut store, &journal, &span("a-1", 2)).is_err());
+    assert!(store.names(".draft").is_empty() && ids(&store).is_empty());
+}
+
+#[test]
+fn rings_beside_the_journal_are_bounded() {
+    let folder = Folder::new("bounded");
+    let mut store = FrozenStore::new(folder.0.join("absent"), "sinew-leg-10.0.0.2".to_owned(), 2);
+    let mut kept = Vec::new();
+    let mut path = PathBuf::new();
+    for incarnation in 1..=4 {
+        let journal = folder.journal();
+        path = journal.path().to_owned();
+        let bytes = fs::read(&path).unwrap();
+        drop(journal);
+        fs::write(&path, bytes).unwrap();
+        let report = RecordReport { incarnation: Some(Incarnation(incarnation)), ..RecordReport::default() };
+        write_facts(&path.with_extension("facts"), &FrozenFacts { span: None, report }).unwrap();
+        let id = store.keep_dead_ring(&path).expect("it is there").unwrap();
+        // The times of files are coarse.
+        let age = Duration::from_secs(10 - incarnation);
+        let facts = File::options().write(true).open(folder.store(2).path(&id, "facts")).unwrap();
+        facts.set_modified(SystemTime::now() - age).unwrap();
+        kept.push(id);
+    }
+    let (_, dead) = store.beside(&path);
+    assert_eq!(dead, kept[2..]);
 }
