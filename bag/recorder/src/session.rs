@@ -21,11 +21,7 @@ use sinew_runtime::{
 };
 use sinew_shm::journal::{JournalReader, ReadJournalError, Start};
 
-use crate::{
-    RecordingError, file_name,
-    names::Names,
-    recorder::{Recorder, Setup},
-};
+use crate::{RecordingError, file_name, names::Names, recorder::Recorder, setup::Setup};
 
 /// Pause after the journal was read to its end. Its 64 MiB, unless configured otherwise, last for far longer.
 const PAUSE: Duration = Duration::from_millis(5);
