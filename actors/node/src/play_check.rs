@@ -32,11 +32,13 @@ const WARNINGS_MAX: usize = 8;
 const ANCESTORS_MAX: usize = 16;
 
 /// Why this process is not checked, although the variable is set.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 enum OwnerError {
-    /// The variable was left behind: its node starts.
+    /// The variable was left behind: the node starts.
+    #[error("{0}")]
     LeftBehind(String),
     /// The check may run: its node must not start, because a check would become a robot that moves.
+    #[error("{0}")]
     Unproved(String),
 }
 

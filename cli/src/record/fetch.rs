@@ -83,7 +83,8 @@ pub(super) fn show(system: &mut System, order: &Order) -> Result<Report, SystemE
         Some(id) => BTreeSet::from([id.clone()]),
         None => found.frozen.iter().map(|frozen| frozen.span.id.clone()).collect(),
     };
-    if !found.frozen.iter().any(|frozen| ids.contains(&frozen.span.id)) {
+    let is_handed_out = found.frozen.iter().any(|frozen| ids.contains(&frozen.span.id));
+    if !is_handed_out && !found.dead.iter().any(|ring| ids.contains(&ring.id())) {
         let id = order.id.as_deref().unwrap_or("at all");
         let why = format!("no node has a frozen span {id}; `sinew record fetch` lists them");
         return Err(SystemError::Unknown(clean(&why)));
@@ -142,14 +143,18 @@ fn gather(
             Err(why) => faults.push(format!("{node} {name}: {why}")),
         }
     }
-    // A node that has started again hands out the whole ring by such an ID.
-    let dead = if id.starts_with("died-") { &[][..] } else { &found.dead[..] };
-    for ring in dead {
-        let Some(times) = times.as_ref().filter(|_| ring.is_of_this_boot) else {
+    let is_handed_out = found.frozen.iter().any(|frozen| frozen.span.id == id);
+    for ring in &found.dead {
+        let part = match part_of(id, &ring.id(), is_handed_out) {
+            Part::None => continue,
+            Part::Whole => Some(0..=u64::MAX),
+            Part::Span => times.clone().filter(|_| ring.is_of_this_boot),
+        };
+        let Some(times) = part else {
             found.skipped.insert(ring.remedy());
             continue;
         };
-        match of_dead(ring, id, times, (out, is_forced), files) {
+        match of_dead(ring, id, &times, (out, is_forced), files) {
             Ok(file) => files.extend(file),
             Err(why) => faults.push(format!("{}: {why}", ring.path.display())),
         }
@@ -227,6 +232,24 @@ fn pull_facts(system: &mut System, node: NodeAddress, id: &str) -> Result<Frozen
     rmp_serde::from_slice(&bytes).map_err(|why| SystemError::Bag(format!("its names cannot be read: {why}")))
 }
 
+/// The part of a dead node's ring that is gathered.
+#[derive(Debug, PartialEq, Eq)]
+enum Part {
+    None,
+    /// The times of the span.
+    Span,
+    Whole,
+}
+
+/// Returns the part of a dead node's ring, with its own ID, that belongs to the span of this ID.
+fn part_of(id: &str, ring: &str, is_handed_out: bool) -> Part {
+    if !id.starts_with("died-") {
+        return Part::Span;
+    }
+    // A node that has started again hands out the whole ring by such an ID.
+    if id == ring && !is_handed_out { Part::Whole } else { Part::None }
+}
+
 /// Writes the part of a dead node's ring that is within the span. `None` if it has no record of it.
 fn of_dead(
     ring: &DeadRing,
@@ -243,7 +266,7 @@ fn of_dead(
     let facts = ring.facts.clone();
     let source = Source { ring: &ring.path, facts, times: times.clone(), address: ring.address };
     // The node may have started again, and have the same span.
-    let id = format!("{id}-{}", ring.id());
+    let id = if id == ring.id() { id.to_owned() } else { format!("{id}-{}", ring.id()) };
     let (file, is_new) = path_of(files, out, (&ring.name, ring.address), &id);
     convert(&source, None, file, is_forced && is_new).map(|file| Some(Converted { has_died: true, ..file }))
 }
@@ -361,10 +384,11 @@ fn listed(found: &Found) -> Report {
     let mut text = if spans.is_empty() { "No node has a frozen span.\n".to_owned() } else { table.text() };
     for ring in &found.dead {
         text += &format!(
-            "{} at {} has died: {}; it is gathered with the spans of its time.\n",
+            "{} at {} has died: {}; it is gathered with the spans of its time, and as a whole by the ID {}.\n",
             clean(&ring.name),
             ring.address,
-            ring.path.display()
+            ring.path.display(),
+            ring.id()
         );
     }
     text += &notes(found);
@@ -430,6 +454,14 @@ mod tests {
         assert!(is_new && other == Path::new("out/knee-0.0.0.2-a-1.mcap"), "{other:?}");
         let files = [written(&path), written(&other)];
         assert!(!path_of(&files, out, ("knee", second), "a-1").1);
+    }
+
+    #[test]
+    fn ring_that_no_node_hands_out_is_gathered_whole() {
+        assert_eq!(part_of("died-1f", "died-1f", false), Part::Whole);
+        assert_eq!(part_of("died-1f", "died-1f", true), Part::None, "its node has started again");
+        assert_eq!(part_of("died-1f", "died-20", false), Part::None);
+        assert_eq!(part_of("10.0.0.2-1-1", "died-1f", true), Part::Span);
     }
 
     #[test]

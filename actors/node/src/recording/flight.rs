@@ -235,10 +235,11 @@ impl Flight {
     ) {
         self.take_causes(now, &changes.losses);
         self.write_names(state, journal, now, changes.has_new_names);
-        while self.poll(now.as_nanos(), |trigger| {
+        let send = |trigger: &Trigger| {
             note(state, journal, trigger);
             forward(state, trigger);
-        }) {}
+        };
+        while self.poll(now.as_nanos(), send) {}
         if let Err(error) = self.start_work(&Arc::downgrade(state), journal.path()) {
             log::error!(%error, "the system gives no thread to freeze a span; it is asked again");
         }

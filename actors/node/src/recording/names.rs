@@ -21,7 +21,11 @@ const READER_SCHEMA_BYTES_MAX: usize = 1 << 20;
 /// Returns the names and structures for a reader of the journal at this path, which may have no node to ask.
 pub(super) fn names_for_reader(state: &NodeState, path: &Path) -> RecordReport {
     let kinds = journal_kinds(path);
-    let mut report = report(state, path, &kinds, &kinds[..kinds.len().min(READER_SCHEMAS_MAX)]);
+    for_reader(report(state, path, &kinds, &kinds[..kinds.len().min(READER_SCHEMAS_MAX)]))
+}
+
+/// Leaves out all for which a reader has no room.
+fn for_reader(mut report: RecordReport) -> RecordReport {
     bound_schemas(&mut report.types, READER_SCHEMA_BYTES_MAX);
     // A reader accepts no longer lists.
     bounded(report)
@@ -98,7 +102,7 @@ mod tests {
         let report = RecordReport { apps: (0..=RECORDED_MAX).map(app).collect(), ..RecordReport::default() };
         let read = |report| wire::decode::<FrozenFacts>(&wire::encode(&FrozenFacts { span: None, report }));
         assert!(read(report.clone()).is_err(), "a reader refuses a longer list");
-        let facts = read(bounded(report)).unwrap();
+        let facts = read(for_reader(report)).unwrap();
         assert_eq!((facts.report.apps.len(), facts.report.apps_left_out), (RECORDED_MAX, 1));
     }
 

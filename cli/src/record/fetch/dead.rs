@@ -33,7 +33,7 @@ pub(super) struct DeadRing {
 }
 
 impl DeadRing {
-    /// Returns the ID by which the node hands out the whole ring, after its next start.
+    /// Returns the ID of the whole ring. The node hands it out by this ID after its next start.
     pub(super) fn id(&self) -> String {
         format!("died-{:x}", self.incarnation)
     }
@@ -46,7 +46,7 @@ impl DeadRing {
             "it is of an earlier start of the host, or the wall clock was set since"
         };
         format!(
-            "{} at {} has died, and {} is not gathered: {why}; start the node again, and run `sinew record fetch {}`",
+            "{} at {} has died, and {} is not gathered: {why}; the whole ring is written by `sinew record fetch {}`",
             self.name,
             self.address,
             self.path.display(),

@@ -52,5 +52,4 @@ fn failure_without_words_counts_after_a_stop_order() {
     flight.take_causes(Time::now(), &[]);
     // Failures of other tests of this process are causes, too: they may be first.
     assert!(!flight.known().is_empty());
-    assert_eq!(flight.causes.lost_failures.load(Ordering::Relaxed), 0);
 }
