@@ -124,15 +124,14 @@ pub(super) fn convert(
 
 /// Names the option that replaces a file, if there is one.
 fn creation_error(why: BagError) -> SystemError {
-    match why {
-        BagError::Write { path, cause } if cause.kind() == io::ErrorKind::AlreadyExists => {
-            let path = path.display();
-            SystemError::Bag(format!(
-                "{path}: this file exists; replace a file of a former run with --force, or name another folder with --out"
-            ))
-        }
-        why => why.into(),
+    let BagError::Write { path, cause } = &why else { return why.into() };
+    if cause.kind() != io::ErrorKind::AlreadyExists {
+        return why.into();
     }
+    let path = path.display();
+    SystemError::Bag(format!(
+        "{path}: this file exists; replace a file of a former run with --force, or name another folder with --out"
+    ))
 }
 
 /// Returns the name of a file: `knee-ID.mcap`.

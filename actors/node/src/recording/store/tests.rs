@@ -255,9 +255,9 @@ fn rings_beside_the_journal_are_bounded() {
         write_facts(&path.with_extension("facts"), &FrozenFacts { span: None, report }).unwrap();
         let id = store.keep_dead_ring(&path).expect("it is there").unwrap();
         // The times of files are coarse.
-        let age = Duration::from_secs(10 - incarnation);
+        let written = SystemTime::UNIX_EPOCH + Duration::from_secs(1_000 + incarnation);
         let facts = File::options().write(true).open(folder.store(2).path(&id, "facts")).unwrap();
-        facts.set_modified(SystemTime::now() - age).unwrap();
+        facts.set_modified(written).unwrap();
         kept.push(id);
     }
     let (_, dead) = store.beside(&path);
