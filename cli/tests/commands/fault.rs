@@ -157,7 +157,7 @@ fn engineer_freezes_and_fetches_without_a_fault() {
     // And: nothing is replaced, and a node without a recording says so
     let answer = scenario.sinew("knee", &words);
     assert!(
-        answer.code == Some(1) && answer.out.contains("choose another name"),
+        answer.code == Some(1) && answer.out.contains("--force"),
         "{}{}",
         answer.out,
         answer.err
