@@ -156,12 +156,7 @@ fn engineer_freezes_and_fetches_without_a_fault() {
     assert_complete(&out.join(format!("knee-{id}.mcap")));
     // And: nothing is replaced, and a node without a recording says so
     let answer = scenario.sinew("knee", &words);
-    assert!(
-        answer.code == Some(1) && answer.out.contains("--force"),
-        "{}{}",
-        answer.out,
-        answer.err
-    );
+    assert!(answer.code == Some(1) && answer.out.contains("--force"), "{}{}", answer.out, answer.err);
     let answer = scenario.sinew("hip", &["record", "freeze"]);
     assert!(answer.code == Some(1) && answer.err.contains("record.folder"), "{}", answer.err);
     let answer = scenario.sinew("knee", &["record", "fetch", "never"]);

@@ -20,7 +20,7 @@ use sinew_sync::{
 };
 
 use super::*;
-use crate::types::Frames;
+use crate::types::{FRAMES_OF_NODE_MAX, Frames};
 
 const PEER: NodeAddress = NodeAddress::new(0x7f00_0009);
 const INCARNATION: Incarnation = Incarnation(5);
@@ -247,11 +247,11 @@ fn question_and_report_of_the_peer_are_answered() {
 fn frames_of_one_node_leave_room_for_others() {
     let bench = Bench::new();
     let question = SchemaQuestion { kind: Gains::KIND, hash: sinew_runtime::wire::SchemaHash(1) };
-    for _ in 0..8 {
+    for _ in 0..FRAMES_OF_NODE_MAX {
         bench.peer_sends(Kind::SYNC_SCHEMA_ASK, &question).unwrap();
     }
     let refused = bench.peer_sends(Kind::SYNC_SCHEMA_ASK, &question);
-    assert!(refused.is_err_and(|why| why.contains("behind 8 of it")));
+    assert!(refused.is_err_and(|why| why.contains("of it that wait")));
     let mut header = Header::new(Kind::SYNC_SCHEMA_ASK, Tid::NONE, Tid::NONE);
     header.class = Class::Bulk;
     let message = Message::new(header, encode(&question));
