@@ -85,6 +85,21 @@ pub struct RecordReport {
     pub refused: Option<String>,
 }
 
+impl RecordReport {
+    /// Limits the lists to those of an answer, and counts the entries that are left out.
+    #[must_use]
+    pub fn bounded(mut self) -> Self {
+        let cut = |length: usize, max: usize| length.saturating_sub(max) as u64;
+        self.apps_left_out = cut(self.apps.len(), RECORDED_MAX);
+        self.types_left_out = cut(self.types.len(), RECORDED_MAX);
+        self.clocks_left_out = cut(self.clocks.len(), CLOCKS_MAX);
+        self.apps.truncate(RECORDED_MAX);
+        self.types.truncate(RECORDED_MAX);
+        self.clocks.truncate(CLOCKS_MAX);
+        self
+    }
+}
+
 impl Payload for RecordReport {
     const NAME: &'static str = "sinew.inspect.record_report";
 }

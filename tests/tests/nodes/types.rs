@@ -194,6 +194,7 @@ fn declared_type_is_compared_before_its_first_message() {
     let other = loopback.node("knee").app(knee(&handled)).start().expect("a node");
     all_run(&[&hip, &other]);
     let sender = probe.sender();
+    until("the knee is known", || sender.resolve("knee"));
     let there = other.handle().address();
     let refused = until("the knee's node knows that the types differ", || {
         mismatches(&sender, there).into_iter().find(|one| one.source.name == "gait")

@@ -36,7 +36,6 @@ mod watches;
 pub(crate) use inspector::begin;
 #[cfg(test)]
 pub(crate) use record::recorded;
-pub(crate) use reports::bounded;
 pub use reports::{
     APPS_MAX, AccessReport, AccessVerdict, AppReport, AppsReport, AskAccess, AskApps, AskAudit, AskFreeze,
     AskFrozen, AskGroups, AskMismatches, AskNode, AskReach, AskRecord, AskReload, AskSchemas, AskTree,

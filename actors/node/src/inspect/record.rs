@@ -6,7 +6,7 @@ use sinew_runtime::{outcome::Rejection, time::Time, wire::Message};
 
 use super::{
     access,
-    reports::{AskRecord, RecordReport, bounded},
+    reports::{AskRecord, RecordReport},
 };
 use crate::{NodeState, recording};
 
@@ -28,7 +28,7 @@ pub(crate) fn recorded(state: &Arc<NodeState>, question: &Message) -> Result<Rec
     match state.recording.ask(state, program, selection, Time::now()) {
         Ok(path) => {
             let journal = recording::journal_kinds(&path);
-            Ok(bounded(recording::report(state, &path, &journal, &schemas)))
+            Ok(recording::report(state, &path, &journal, &schemas).bounded())
         }
         Err(why) => Ok(refused(why.to_string())),
     }

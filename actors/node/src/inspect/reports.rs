@@ -23,7 +23,6 @@ pub use peers::{
     StallReport, StreamReport, TroubleReport,
 };
 pub use reach::{AskGroups, AskReach, GroupReport, REACHED_MAX, ReachReport, Reached};
-pub(crate) use record::bounded;
 pub use refused::{LostEchoReport, RefusalReport, UnguardedReport, UnhandledReport};
 pub use security::{CertificateReport, SecurityReport};
 pub use tree::{AskTree, TREE_MAX, TreeLine, TreeReport};

@@ -11,7 +11,7 @@ use sinew_runtime::{
 use sinew_shm::journal::{JournalReader, Start};
 
 use super::{facts::clocks, wall_offset};
-use crate::{NodeState, inspect::bounded};
+use crate::NodeState;
 
 /// Maximum number of payload types with a structure beside a journal. A reader without a node cannot ask for more.
 const READER_SCHEMAS_MAX: usize = 256;
@@ -28,7 +28,7 @@ pub(super) fn names_for_reader(state: &NodeState, path: &Path) -> RecordReport {
 fn for_reader(mut report: RecordReport) -> RecordReport {
     bound_schemas(&mut report.types, READER_SCHEMA_BYTES_MAX);
     // A reader accepts no longer lists.
-    bounded(report)
+    report.bounded()
 }
 
 /// Leaves out each structure that has no room behind those before it.

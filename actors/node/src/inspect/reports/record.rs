@@ -1,20 +1,8 @@
 //! The lists of the answer to a program that records, within their limits. Its types are those of `sinew-record`.
 
-use sinew_record::{CLOCKS_MAX, RECORDED_MAX, RecordReport};
+use sinew_record::RecordReport;
 
 use super::{Report, Shortened};
-
-/// Limits the lists to those of an answer.
-pub(crate) fn bounded(mut report: RecordReport) -> RecordReport {
-    let cut = |length: usize, max: usize| length.saturating_sub(max) as u64;
-    report.apps_left_out = cut(report.apps.len(), RECORDED_MAX);
-    report.types_left_out = cut(report.types.len(), RECORDED_MAX);
-    report.clocks_left_out = cut(report.clocks.len(), CLOCKS_MAX);
-    report.apps.truncate(RECORDED_MAX);
-    report.types.truncate(RECORDED_MAX);
-    report.clocks.truncate(CLOCKS_MAX);
-    report
-}
 
 /// The longest list is halved.
 impl Report for RecordReport {
