@@ -1,6 +1,6 @@
 //! Platforms without journals: creating one returns an error.
 
-use std::{convert::Infallible, io, path::Path, sync::atomic::AtomicU64};
+use std::{convert::Infallible, fs::File, io, path::Path, sync::atomic::AtomicU64};
 
 use super::{
     core::Memory,
@@ -36,9 +36,9 @@ impl Memory for Map {
 }
 
 /// Cannot exist on this platform.
-pub(crate) struct NewFile(Infallible);
+pub(crate) struct NewFile<'a>(Infallible, &'a File);
 
-impl NewFile {
+impl NewFile<'_> {
     pub(crate) fn put(&self, _: usize, _: &[u8]) -> io::Result<()> {
         match self.0 {}
     }
@@ -50,7 +50,7 @@ impl NewFile {
 
 pub(crate) fn write_file(
     _: &Path,
-    _: impl FnOnce(&NewFile) -> Result<(), CopyJournalError>,
+    _: impl FnOnce(&NewFile<'_>) -> Result<(), CopyJournalError>,
 ) -> Result<(), CopyJournalError> {
     Err(CreateJournalError::Unsupported.into())
 }
@@ -59,7 +59,7 @@ pub(crate) fn create(
     _: &Path,
     _: u64,
     _: bool,
-    _: impl FnOnce(&NewFile) -> io::Result<()>,
+    _: impl FnOnce(&NewFile<'_>) -> io::Result<()>,
 ) -> Result<Map, CreateJournalError> {
     Err(CreateJournalError::Unsupported)
 }
