@@ -84,7 +84,7 @@ fn text(path: &Path) -> &str {
     path.to_str().expect("a path of text")
 }
 
-/// Runs `sinew play --check` on a program whose application `hip` sends counts from 1 to the knee, one each period.
+/// Runs `sinew play --check` on a program. Its application `hip` sends a count to the knee in each period, from 1 on.
 fn check(scenario: &Scenario, file: &Path, words: &[&str]) -> Answer {
     let config = scenario.configure("hip", 1, &[]);
     let program = node_command();

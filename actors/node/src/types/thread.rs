@@ -254,7 +254,7 @@ impl Comparing {
 
 /// Publishes the types of the applications that have new ones.
 fn publish(state: &NodeState) {
-    // One by one: a type whose tracing panics takes no other one with it.
+    // Each type is traced by itself: a panic in one does not affect the others.
     while let Some((app, types)) = state.types.declared.pop_changed() {
         let may_have_fewer = types.has_two_of_a_kind();
         let types = types.hashes();

@@ -301,7 +301,7 @@ impl Outstanding {
         all.into_iter()
     }
 
-    /// Settles the messages whose outcomes were reported, and leaves the other outcomes. Those of a flood come in the
+    /// Settles the messages with a reported outcome, and keeps all other outcomes. Those of a flood come in the
     /// order of its messages: one look-up of the destination serves all that follow each other.
     fn confirm_all(&mut self, outcomes: &mut Vec<(Ticket, Outcome)>, deferred: &mut DeferredActions) {
         let (mut at, mut left) = (0, 0);

@@ -305,7 +305,7 @@ fn copy_survives_a_target_that_is_cut() {
                 }
             }
         });
-        // Also after a panic, else the scope waits for ever.
+        // Also after a panic: otherwise the scope would never end.
         let over = SetOnDrop(&is_over);
         let copied: Vec<_> = (0..30).map(|_| copy_span(&folder.path(), &target, &(0..=1_000))).collect();
         drop(over);
