@@ -306,6 +306,11 @@ impl Registry {
         self.names.keys().cloned()
     }
 
+    /// Returns the applications of this node that have a name.
+    pub fn named(&self) -> impl Iterator<Item = (&str, AppAddress)> {
+        self.names.iter().map(|(name, app)| (&**name, *app))
+    }
+
     /// Returns the owner of `app`, if it is registered.
     pub fn owner_of(&self, app: AppAddress) -> Option<Owner> {
         self.apps.get(&app).map(|entry| entry.owner)

@@ -313,7 +313,7 @@ struct KnownNames {
 
 impl KnownNames {
     fn of(node: &NodeState) -> Self {
-        let directory = node.ctx.ports.names().map(|names| names.directory()).unwrap_or_default();
+        let directory = names::directory(node);
         let kinds = directory.iter().flat_map(|entry| entry.kinds.iter().copied());
         let mut kinds: BTreeMap<_, _> = kinds
             .filter_map(|kind| Some((kind, sinew_lncl::undelivered::kind_name(&node.lncl, kind)?)))
@@ -322,8 +322,8 @@ impl KnownNames {
         for (kind, name) in known_types() {
             kinds.entry(kind).or_insert_with(|| name.to_owned());
         }
-        let apps = directory.into_iter().filter(|entry| entry.tid.node == node.ctx.node);
-        Self { apps: apps.map(|entry| (entry.name, entry.tid)).collect(), kinds }
+        let apps = names::named_apps(node, Vec::new()).collect();
+        Self { apps, kinds }
     }
 }
 

@@ -3,8 +3,11 @@
 use std::{collections::BTreeSet, path::Path};
 
 use sinew_lncl::undelivered::kind_name;
+use sinew_model::directory::DirectoryEntry;
 use sinew_record::{Channel, RecordReport, RecordedApp, RecordedType};
 use sinew_runtime::{
+    lock,
+    tid::Tid,
     time::Time,
     wire::{Kind, known_types},
 };
@@ -44,7 +47,7 @@ fn bound_schemas(types: &mut [RecordedType], bytes_max: usize) {
 
 /// Returns the names for a reader of the journal at this path, and the structures of these types.
 pub(crate) fn report(state: &NodeState, path: &Path, journal: &[Kind], schemas: &[Kind]) -> RecordReport {
-    let directory = state.ctx.ports.names().map(|names| names.directory()).unwrap_or_default();
+    let directory = directory(state);
     let handled = directory.iter().flat_map(|entry| entry.kinds.iter().copied());
     let others = handled.chain(journal.iter().copied()).chain(known_types().map(|(kind, _)| kind));
     let (mut listed, mut types) = (BTreeSet::new(), Vec::new());
@@ -64,11 +67,31 @@ pub(crate) fn report(state: &NodeState, path: &Path, journal: &[Kind], schemas: 
         name: state.ctx.config.name.clone(),
         incarnation: Some(state.ctx.incarnation),
         wall_offset_ns: wall_offset(),
-        apps: directory.into_iter().map(|entry| RecordedApp { tid: entry.tid, name: entry.name }).collect(),
+        apps: named_apps(state, directory).map(|(name, tid)| RecordedApp { tid, name }).collect(),
         types,
         clocks: clocks(state, now),
         ..RecordReport::default()
     }
+}
+
+/// Returns the named applications of all nodes.
+pub(super) fn directory(state: &NodeState) -> Vec<DirectoryEntry> {
+    state.ctx.ports.names().map(|names| names.directory()).unwrap_or_default()
+}
+
+/// Returns the named applications of this node and those of other nodes in the directory. The directory learns of a new
+/// application of this node a moment later than LNCL, and the application may have sent a message by then.
+pub(super) fn named_apps(
+    state: &NodeState,
+    directory: Vec<DirectoryEntry>,
+) -> impl Iterator<Item = (String, Tid)> + use<> {
+    let node = state.ctx.node;
+    let own: Vec<_> = lock(&state.lncl.registry)
+        .named()
+        .map(|(name, app)| (name.to_owned(), Tid::new(node, app)))
+        .collect();
+    let others = directory.into_iter().filter(move |entry| entry.tid.node != node);
+    own.into_iter().chain(others.map(|entry| (entry.name, entry.tid)))
 }
 
 /// Returns the types of the channels in a journal, among them those that their receivers do not declare.

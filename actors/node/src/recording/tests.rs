@@ -148,6 +148,18 @@ fn type_that_is_only_sent_has_its_name_and_structure() {
     node.recording.close(&node);
 }
 
+// The directory of this node is empty: its sync manager has not heard of the applications.
+#[test]
+fn application_has_its_name_from_its_registration_on() {
+    let node = node("names", |_| {});
+    let (hip, knee) = (app(&node, "hip"), app(&node, "knee"));
+    let report = recorded(&node, &Message::typed(hip, Tid::NONE, &AskRecord::default())).expect("a question");
+    let named: Vec<_> = report.apps.iter().map(|app| (&*app.name, app.tid)).collect();
+    assert_eq!(named, [("hip", hip), ("knee", knee)]);
+    assert_eq!(KnownNames::of(&node).apps, [("hip".to_owned(), hip), ("knee".to_owned(), knee)]);
+    node.recording.close(&node);
+}
+
 #[test]
 fn program_that_asks_no_more_is_forgotten() {
     let node = node("lease", |_| {});
