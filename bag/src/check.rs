@@ -6,12 +6,13 @@ mod file;
 mod parts;
 #[cfg(test)]
 mod tests;
+mod times;
 
 use std::{io::Read, path::Path};
 
 use serde::Serialize;
 
-use crate::{error::BagError, read::Reader};
+use crate::{clocks::Offsets, error::BagError, read::Reader};
 
 /// Maximum findings of one file: a file that is wrong throughout needs no more.
 const FINDINGS_MAX: usize = 1_000;
@@ -117,7 +118,7 @@ pub struct EndReport {
     /// Sent and not received, which the recorder of the destination's node counted as dropped.
     pub not_recorded: u64,
     /// Sent before the first one that was received: the other recording began later. Also those between two recordings
-    /// of the other node.
+    /// of the other node. If none was received: sent before the other recording began, by the clock readings.
     pub before: u64,
     /// Sent after the last one that was received: on their way, or the other recording ended earlier.
     pub after: u64,
@@ -145,7 +146,7 @@ impl Report {
 /// Checks files: all parts of one node's recording, or of several nodes.
 ///
 /// # Errors
-/// A file cannot be read, or is no recording of one node.
+/// A file cannot be read, or is no recording of one node: a merged file is none.
 pub fn check<P: AsRef<Path>>(files: &[P]) -> Result<Report, BagError> {
     let readers = files.iter().map(Reader::open).collect::<Result<Vec<_>, _>>()?;
     check_readers(readers)
@@ -156,14 +157,17 @@ pub fn check<P: AsRef<Path>>(files: &[P]) -> Result<Report, BagError> {
 /// # Errors
 /// As [`check()`].
 pub fn check_readers<R: Read>(readers: Vec<Reader<R>>) -> Result<Report, BagError> {
-    let mut read = readers.into_iter().map(file::read).collect::<Result<Vec<_>, _>>()?;
+    let mut offsets = Offsets::default();
+    let mut read =
+        readers.into_iter().map(|reader| file::read(reader, &mut offsets)).collect::<Result<Vec<_>, _>>()?;
+    offsets.settle();
     read.sort_by(|one, other| one.order().cmp(&other.order()));
     let mut report = Report::default();
     for file in &mut read {
         report.findings.append(&mut file.findings);
     }
     parts::compare(&read, &mut report.findings);
-    ends::compare(&mut read, &mut report);
+    ends::compare(&mut read, &offsets, &mut report);
     report.files = read.into_iter().map(|file| file.report).collect();
     Ok(report)
 }

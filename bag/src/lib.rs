@@ -18,6 +18,7 @@ pub mod info;
 pub mod merge;
 pub mod read;
 
+mod clocks;
 mod error;
 mod messagepack;
 mod protobuf;

@@ -1,6 +1,5 @@
 //! The files of several nodes as one file, on the clock of one of them.
 
-mod clocks;
 #[cfg(test)]
 mod tests;
 
@@ -18,14 +17,18 @@ use mcap::{WriteOptions, records::MessageHeader};
 use serde::Serialize;
 
 use crate::{
+    clocks::{Clocks, Way},
     error::BagError,
     read::{Channel, Ordered, OwnedMessage},
     writer::{METADATA, cause},
 };
-use clocks::{Clocks, Way};
 
-/// The name of the metadata record that states the clocks of a merged file.
-const MERGED: &str = "sinew.merged";
+/// The name of the metadata record that states the clocks and the former files of a merged file.
+pub(crate) const MERGED: &str = "sinew.merged";
+/// Its field with the names of the former files.
+pub(crate) const MERGED_FILES: &str = "files";
+/// Maximum names in it.
+const FILES_MAX: usize = 64;
 
 /// A node of a merged file.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -79,7 +82,10 @@ impl Source {
 /// Merges files into one, in the order of their times. Each topic gets the name of its node in front.
 ///
 /// The clock is that of the first file's node. The times of others are converted by the clock readings in the files,
-/// also across a third node; the metadata record `sinew.merged` states how wrong they may be.
+/// also across a third node; the metadata record `sinew.merged` states how wrong they may be, and the names of `files`.
+///
+/// The order of a merged file is that of its times, so its tallies do not prove it complete: [`check()`](crate::check())
+/// refuses it. Check `files` before.
 ///
 /// # Errors
 /// A file cannot be read, `out` exists or cannot be written, or no clock reading connects a node with the reference. A
@@ -95,7 +101,7 @@ pub fn merge<P: AsRef<Path>>(files: &[P], out: impl AsRef<Path>) -> Result<Merge
     }
     let file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(out);
     let file = file.map_err(|error| BagError::write(out, error))?;
-    let written = write(BufWriter::new(file), &mut sources, &mut merged);
+    let written = write(BufWriter::new(file), &mut sources, &mut merged, names(files));
     written.map_err(|fault| {
         // The file was created above, and a part of it is useless. If this fails, too, the first failure counts.
         let _ = fs::remove_file(out);
@@ -105,6 +111,16 @@ pub fn merge<P: AsRef<Path>>(files: &[P], out: impl AsRef<Path>) -> Result<Merge
         }
     })?;
     Ok(merged)
+}
+
+/// Returns the names of the first files, without their folders.
+fn names<P: AsRef<Path>>(files: &[P]) -> String {
+    let name = |path: &P| path.as_ref().file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let mut names: Vec<_> = files.iter().take(FILES_MAX).map(name).collect();
+    if files.len() > FILES_MAX {
+        names.push("...".to_owned());
+    }
+    names.join(" ")
 }
 
 fn open(path: &Path, clocks: &Clocks, merged: &mut Merged) -> Result<Source, BagError> {
@@ -138,7 +154,12 @@ impl From<mcap::McapError> for MergeError {
     }
 }
 
-fn write(file: BufWriter<fs::File>, sources: &mut [Source], merged: &mut Merged) -> Result<(), MergeError> {
+fn write(
+    file: BufWriter<fs::File>,
+    sources: &mut [Source],
+    merged: &mut Merged,
+    files: String,
+) -> Result<(), MergeError> {
     let options = WriteOptions::new().compression(Some(mcap::Compression::Zstd)).compression_threads(0);
     let mut writer = options.library(concat!("sinew-bag/", env!("CARGO_PKG_VERSION"))).create(file)?;
     let mut next = BinaryHeap::new();
@@ -174,6 +195,7 @@ fn write(file: BufWriter<fs::File>, sources: &mut [Source], merged: &mut Merged)
     let mut metadata = BTreeMap::from([
         ("reference".to_owned(), merged.reference.clone()),
         ("messages".to_owned(), sequence.to_string()),
+        (MERGED_FILES.to_owned(), files),
     ]);
     for MergedNode { address, bound_ns, .. } in &merged.nodes {
         metadata.insert(format!("bound_ns {address}"), bound_ns.to_string());

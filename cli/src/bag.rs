@@ -29,6 +29,8 @@ pub(crate) enum Order {
     /// Give the files of all nodes, and all parts of each: both ends of a channel are compared where the files of both
     /// nodes are given. A missing message is named, or the second in which it is missing. Exit code 1 if there is a
     /// finding.
+    ///
+    /// Check the files before they are merged: a merged file is sorted by time, so its tallies prove nothing.
     #[command(after_help = r#"Examples:
   sinew bag check walk.mcap
   sinew bag check hip.mcap knee.mcap ankle.mcap

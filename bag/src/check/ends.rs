@@ -1,9 +1,14 @@
 //! Both ends of each channel between two nodes.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
-use super::{EndReport, Finding, Kind, Report, file::Checked};
+use super::{
+    EndReport, Finding, Kind, Report,
+    file::Checked,
+    times::{Placed, Recordings, SendTimes},
+};
 use crate::{
+    clocks::{Node, Offsets},
     read::Channel,
     sequences::{Sequences, ranges},
     terms::Direction,
@@ -31,18 +36,35 @@ struct End {
     sequences: Sequences,
     /// The recordings of each incarnation of the node. Between two of them it recorded nothing.
     incarnations: BTreeMap<u64, Spans>,
-    dropped: u64,
+    /// The counter of each recording, by its incarnation and its begin. Each recording counts from zero, and its parts
+    /// continue each other.
+    dropped: BTreeMap<(u64, u64), u64>,
+    /// The send times of each file, with its clock.
+    sent: Vec<((Node, i64), SendTimes)>,
+}
+
+impl End {
+    /// Returns the messages that no file of this end has, of all recordings together.
+    fn dropped(&self) -> u64 {
+        self.dropped.values().fold(0, |sum, dropped| sum.saturating_add(*dropped))
+    }
 }
 
 /// Compares the ends, and names nodes without a given file.
-pub(super) fn compare(files: &mut [Checked], report: &mut Report) {
-    let given: BTreeSet<_> = files.iter().map(|file| file.report.address.clone()).collect();
+pub(super) fn compare(files: &mut [Checked], offsets: &Offsets, report: &mut Report) {
+    let mut given: BTreeMap<String, Recordings> = BTreeMap::new();
+    for file in files.iter() {
+        let recordings = given.entry(file.report.address.clone()).or_default();
+        if let Some(span_ns) = file.span_ns() {
+            recordings.add((file.report.incarnation, file.report.began_ns), span_ns);
+        }
+    }
     let [mut sent, mut received] = [BTreeMap::new(), BTreeMap::new()];
     for file in files.iter_mut() {
         collect(file, &mut sent, &mut received);
     }
     let mut absent: BTreeMap<String, Vec<String>> = BTreeMap::new();
-    for end in sent.values().chain(received.values()).filter(|end| !given.contains(&end.other)) {
+    for end in sent.values().chain(received.values()).filter(|end| !given.contains_key(&end.other)) {
         absent.entry(end.other.clone()).or_default().push(end.topic.clone());
     }
     for (node, topics) in absent {
@@ -61,9 +83,12 @@ pub(super) fn compare(files: &mut [Checked], report: &mut Report) {
     }
     for (key, mut end) in sent {
         end.sequences.settle();
-        if given.contains(&end.other) {
-            let mut other = received.remove(&key).unwrap_or_default();
-            other.sequences.settle();
+        let Some(recordings) = given.get(&end.other) else { continue };
+        let mut other = received.remove(&key).unwrap_or_default();
+        other.sequences.settle();
+        if other.sequences.len() == 0 {
+            none_received(&key, &end, &other, &place(&end, recordings, offsets), report);
+        } else {
             both(&key, &end, &other, report);
         }
     }
@@ -71,6 +96,7 @@ pub(super) fn compare(files: &mut [Checked], report: &mut Report) {
 
 fn collect(file: &mut Checked, sent: &mut BTreeMap<Key, End>, received: &mut BTreeMap<Key, End>) {
     let own = file.report.address.clone();
+    let clock = file.clock();
     for (topic, counted) in &mut file.channels {
         let Some(channel) = counted.channel.clone().filter(|channel| channel.value("refused").is_empty())
         else {
@@ -99,8 +125,26 @@ fn collect(file: &mut Checked, sent: &mut BTreeMap<Key, End>, received: &mut BTr
             *span = (span.0.min(first), span.1.max(last));
         }
         end.sequences.absorb(std::mem::take(&mut counted.sequences));
-        end.dropped = end.dropped.max(counted.last.dropped);
+        let dropped = end.dropped.entry((file.report.incarnation, file.report.began_ns)).or_default();
+        *dropped = counted.last.dropped.max(*dropped);
+        end.sent.push((clock.clone(), std::mem::take(&mut counted.sent)));
     }
+}
+
+/// Compares the send times of all files with the recordings of the receiver.
+fn place(sent: &End, recordings: &Recordings, offsets: &Offsets) -> Placed {
+    let mut sum = Placed::default();
+    for ((node, offset_ns), times) in &sent.sent {
+        let placed = recordings.place((node, *offset_ns), times, &sent.other, offsets);
+        sum.within += placed.within;
+        sum.after += placed.after;
+        sum.has_no_clock |= placed.has_no_clock;
+    }
+    // Two files of one node may have the same message.
+    let count = sent.sequences.len();
+    sum.within = sum.within.min(count);
+    sum.after = sum.after.min(count - sum.within);
+    sum
 }
 
 /// Returns whether the number lies within a recording.
@@ -122,37 +166,55 @@ fn label(channel: &Channel, role: &str) -> String {
     if name.is_empty() { channel.value(role).to_owned() } else { name.to_owned() }
 }
 
-fn both(key: &Key, sent: &End, received: &End, report: &mut Report) {
+/// Returns the report of a channel, without its comparison.
+fn describe(key: &Key, sent: &End, received: &End) -> EndReport {
     let [source, destination] = sent.labels.clone();
     let [_, _, kind, class] = key.clone();
     let id = nameless(&kind);
     let mut names = [&sent.type_name, &received.type_name].into_iter();
     let type_name = names.find(|name| !name.is_empty() && **name != id);
     let type_name = type_name.unwrap_or(&sent.type_name).clone();
-    let is_stream = class == "Stream";
-    let mut end = EndReport { source, destination, type_name, class, ..EndReport::default() };
-    (end.sent, end.received) = (sent.sequences.len(), received.sequences.len());
-    let mut find = |kind, end: &End, text: String| {
-        let (file, topic) = (end.file.clone(), end.topic.clone());
-        report.findings.push(Finding { kind, file, topic, text, from_ns: 0, to_ns: 0 });
-    };
-    let Some(last) = received.sequences.last() else {
-        if end.sent > 0 {
-            let text = format!(
-                "{} messages were sent to a node whose file has none of them: not recorded there, or lost",
-                end.sent
-            );
-            find(Kind::Lost, sent, text);
-        }
-        report.ends.push(end);
-        return;
-    };
+    let (sent, received) = (sent.sequences.len(), received.sequences.len());
+    EndReport { source, destination, type_name, class, sent, received, ..EndReport::default() }
+}
+
+fn find(kind: Kind, end: &End, text: String, report: &mut Report) {
+    let (file, topic) = (end.file.clone(), end.topic.clone());
+    report.findings.push(Finding { kind, file, topic, text, from_ns: 0, to_ns: 0 });
+}
+
+/// Reports a channel of which the receiver's files have no message: only those are lost that were sent while it
+/// recorded.
+fn none_received(key: &Key, sent: &End, received: &End, placed: &Placed, report: &mut Report) {
+    let mut end = describe(key, sent, received);
+    end.after = placed.after;
+    end.before = end.sent - placed.within - placed.after;
+    end.not_recorded = placed.within.min(received.dropped());
+    let lost = placed.within - end.not_recorded;
+    if lost > 0 {
+        let when = if placed.has_no_clock {
+            "it is unknown whether they were sent before its recording began, as no clock reading connects the two nodes"
+        } else {
+            "they were sent while it recorded"
+        };
+        let text = format!(
+            "{lost} messages were sent to a node whose file has none of them: not recorded there, or lost; {when}"
+        );
+        find(Kind::Lost, sent, text, report);
+    }
+    report.ends.push(end);
+}
+
+fn both(key: &Key, sent: &End, received: &End, report: &mut Report) {
+    let Some(last) = received.sequences.last() else { return };
+    let mut end = describe(key, sent, received);
+    let is_stream = end.class == "Stream";
     let missing = || sent.sequences.without(&received.sequences);
     let was_recorded = |number: &u64| received.incarnations.values().any(|spans| lies_within(spans, *number));
     end.after = missing().filter(|number| *number > last).count() as u64;
     let within = missing().filter(was_recorded).count() as u64;
     end.before = missing().count() as u64 - end.after - within;
-    end.not_recorded = within.min(received.dropped);
+    end.not_recorded = within.min(received.dropped());
     let lost = within - end.not_recorded;
     if is_stream {
         end.superseded_or_lost = lost;
@@ -163,6 +225,7 @@ fn both(key: &Key, sent: &End, received: &End, report: &mut Report) {
             Kind::Lost,
             sent,
             format!("messages sent and not received: {lost}; their sequence numbers: {numbers}"),
+            report,
         );
     }
     // Each incarnation of the source counts anew, and the other end does not know of which one a number is. So only a
@@ -172,7 +235,7 @@ fn both(key: &Key, sent: &End, received: &End, report: &mut Report) {
         |number: &u64| has_any && sent.incarnations.values().all(|spans| lies_within(spans, *number));
     let unsent = || received.sequences.without(&sent.sequences).filter(is_known);
     let count = unsent().count() as u64;
-    if count > sent.dropped {
+    if count > sent.dropped() {
         let numbers = ranges(unsent(), SPANS_MAX);
         find(
             Kind::Unsent,
@@ -180,6 +243,7 @@ fn both(key: &Key, sent: &End, received: &End, report: &mut Report) {
             format!(
                 "messages received that their source did not record: {count}; their sequence numbers: {numbers}"
             ),
+            report,
         );
     }
     report.ends.push(end);

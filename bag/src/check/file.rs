@@ -4,12 +4,15 @@ use std::{collections::BTreeMap, io::Read, sync::Arc};
 
 use serde::Deserialize;
 
-use super::{ChannelCounts, FINDINGS_MAX, FileReport, Finding, Kind};
+use super::{ChannelCounts, FINDINGS_MAX, FileReport, Finding, Kind, times::SendTimes};
 use crate::{
+    clocks::{Node, Offsets, Reading},
     error::BagError,
+    merge::{MERGED, MERGED_FILES},
     read::{Channel, End, Header, Item, Message, Reader, Role},
     sequences::Sequences,
-    writer::{METADATA, TALLY_TOPIC},
+    terms::Direction,
+    writer::{CLOCK_TOPIC, METADATA, TALLY_TOPIC},
 };
 
 /// Maximum gaps between two tallies that are named.
@@ -73,15 +76,21 @@ pub(super) struct Counted {
     gaps: Vec<(u64, u64)>,
     waiting: Option<Waiting>,
     pub(super) sequences: Sequences,
+    /// The send times of messages that this node sent.
+    pub(super) sent: SendTimes,
 }
 
 /// A file that was read.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Checked {
     pub(super) report: FileReport,
     pub(super) channels: BTreeMap<String, Counted>,
     pub(super) findings: Vec<Finding>,
     last_tally_ns: u64,
+    /// The times of the first and the last tally, in nanoseconds of the file's wall clock.
+    tallied_ns: Option<(u64, u64)>,
+    /// Wall clock minus monotonic clock, in nanoseconds.
+    wall_offset_ns: i64,
 }
 
 impl Checked {
@@ -89,6 +98,17 @@ impl Checked {
     pub(super) fn order(&self) -> (&str, u64, u64, u32) {
         let FileReport { address, incarnation, began_ns, part, .. } = &self.report;
         (address, *incarnation, *began_ns, *part)
+    }
+
+    /// Returns the clock of the file: its node, and the nanoseconds from the monotonic clock to the wall clock.
+    pub(super) fn clock(&self) -> (Node, i64) {
+        ((self.report.address.clone(), self.report.incarnation), self.wall_offset_ns)
+    }
+
+    /// Returns the times of the first and the last tally, in nanoseconds of the monotonic clock.
+    pub(super) fn span_ns(&self) -> Option<(i128, i128)> {
+        let monotonic = |wall_ns: u64| i128::from(wall_ns) - i128::from(self.wall_offset_ns);
+        self.tallied_ns.map(|(first_ns, last_ns)| (monotonic(first_ns), monotonic(last_ns)))
     }
 
     fn find(&mut self, kind: Kind, topic: &str, text: String, span_ns: (u64, u64)) {
@@ -99,11 +119,10 @@ impl Checked {
     }
 }
 
-/// Reads a file to its end.
-pub(super) fn read<R: Read>(mut reader: Reader<R>) -> Result<Checked, BagError> {
+/// Reads a file to its end, and notes its clock readings in `offsets`.
+pub(super) fn read<R: Read>(mut reader: Reader<R>, offsets: &mut Offsets) -> Result<Checked, BagError> {
     let file = reader.path().display().to_string();
-    let report = FileReport { file, ..FileReport::default() };
-    let mut checked = Checked { report, channels: BTreeMap::new(), findings: Vec::new(), last_tally_ns: 0 };
+    let mut checked = Checked { report: FileReport { file, ..FileReport::default() }, ..Checked::default() };
     let (mut has_origin, mut messages) = (false, 0);
     loop {
         match reader.next_item() {
@@ -111,10 +130,16 @@ pub(super) fn read<R: Read>(mut reader: Reader<R>) -> Result<Checked, BagError> 
                 checked.origin(&fields);
                 has_origin = true;
             }
+            Ok(Some(Item::Metadata(name, fields))) if name == MERGED => {
+                return Err(merged(&checked.report.file, fields.get(MERGED_FILES)));
+            }
             Ok(Some(Item::Metadata(..))) => {}
             Ok(Some(Item::Message(message))) => {
                 messages += 1;
                 checked.message(&message);
+                if has_origin && message.channel.topic == CLOCK_TOPIC {
+                    checked.reading(&message, offsets);
+                }
             }
             Ok(None) => break,
             Err(error @ BagError::Damaged { .. }) => {
@@ -124,12 +149,20 @@ pub(super) fn read<R: Read>(mut reader: Reader<R>) -> Result<Checked, BagError> 
         }
     }
     if !has_origin {
-        let text =
-            "it is no recording of one node; give the files that `sinew record` wrote, not a merged one";
-        return Err(BagError::Unfit(format!("{}: {text}", reader.path().display())));
+        let text = "it does not name the node that recorded it; give the files that `sinew record` wrote";
+        return Err(BagError::Unfit(format!("{}: {text}", checked.report.file)));
     }
     checked.end(reader.end(), messages);
     Ok(checked)
+}
+
+/// Returns why a merged file is refused: a merged file has the order of its times, and a tally is true only in the order
+/// in which its file was written.
+fn merged(file: &str, former: Option<&String>) -> BagError {
+    let former = former.map_or("FILE...", String::as_str);
+    BagError::Unfit(format!(
+        "{file}: it is a merged file: its messages are sorted by time, so its tallies do not prove that none is missing; check the files before the merge: sinew bag check {former}"
+    ))
 }
 
 impl Checked {
@@ -140,6 +173,14 @@ impl Checked {
         report.incarnation = text("incarnation").parse().unwrap_or(0);
         report.began_ns = text("began_ns").parse().unwrap_or(0);
         report.part = text("part").parse().unwrap_or(0);
+        self.wall_offset_ns = text("wall_offset_ns").parse().unwrap_or(0);
+    }
+
+    fn reading(&self, message: &Message<'_>, offsets: &mut Offsets) {
+        // Without a reading the two clocks are compared by the others.
+        let Ok(reading) = serde_json::from_slice::<Reading>(message.data) else { return };
+        let (node, offset_ns) = self.clock();
+        offsets.note(&node, offset_ns, &reading);
     }
 
     fn message(&mut self, message: &Message<'_>) {
@@ -157,6 +198,9 @@ impl Checked {
         let counted = self.channels.entry(topic.clone()).or_default();
         counted.channel = Some(Arc::clone(&message.channel));
         counted.in_file += 1;
+        if message.channel.direction() == Some(Direction::Sent) {
+            counted.sent.insert(message.publish_ns);
+        }
         let waiting = Waiting { sequence: message.sequence, log_ns: message.log_ns };
         if let Some(alone) = counted.waiting.replace(waiting) {
             self.without_view(&topic, alone);
@@ -203,6 +247,8 @@ impl Checked {
                 return self.find(Kind::Counter, TALLY_TOPIC, text, (now_ns, now_ns));
             }
         };
+        let (first_ns, last_ns) = self.tallied_ns.unwrap_or((now_ns, now_ns));
+        self.tallied_ns = Some((first_ns.min(now_ns), last_ns.max(now_ns)));
         let is_first = before_ns == 0 && self.channels.is_empty();
         self.report.events_lost = tally.events_lost;
         for tallied in tally.channels {

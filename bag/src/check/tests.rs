@@ -299,6 +299,103 @@ fn messages_between_two_recordings_of_a_node_are_no_finding() {
     assert!(report.findings.iter().any(|finding| finding.text.ends_with("sequence numbers: 50")));
 }
 
+/// Writes the file of a node that sent messages at these times to another one, which began its recording at 20 s of the
+/// same clock and has none of them. The clocks differ by 1 s, and the reading of them may be wrong by 100 ms.
+fn joined_late(folder: &TestFolder, sent_ms: &[u64], has_reading: bool) -> [PathBuf; 2] {
+    let files = ["one.mcap", "late.mcap"].map(|name| folder.path(name));
+    let options = || Options { replace: true, ..Options::default() };
+    let mut one = BagWriter::create(&files[0], options(), origin("127.0.0.2")).unwrap();
+    let sent = channel(&mut one, Class::Control, Direction::Sent);
+    for (number, at_ms) in (1..).zip(sent_ms) {
+        one.message(sent, &record(number, at_ms * 1_000_000)).unwrap();
+    }
+    if has_reading {
+        let reading = crate::ClockReading {
+            peer: "127.0.0.3".into(),
+            incarnation: 1,
+            offset_ns: SECOND as i64,
+            bound_ns: SECOND / 10,
+            ..crate::ClockReading::default()
+        };
+        one.clock(25 * SECOND, &reading).unwrap();
+    }
+    one.finish(40 * SECOND).unwrap();
+    // 20 s of the first clock are 21 s of this one. Its wall clock is another one.
+    let late = Origin { began_ns: 21 * SECOND, wall_offset_ns: 7 * SECOND as i64, ..origin("127.0.0.3") };
+    let mut late = BagWriter::create(&files[1], options(), late).unwrap();
+    late.tally(22 * SECOND).unwrap();
+    late.finish(31 * SECOND).unwrap();
+    files
+}
+
+#[test]
+fn messages_before_the_receiver_recorded_are_no_finding() {
+    let folder = TestFolder::new();
+    // Given: four messages before its recording began, the last one less than the bound after it
+    let files = joined_late(&folder, &[5_000, 10_000, 19_999, 20_099], true);
+    // Then
+    let report = check(&files).unwrap();
+    assert!(report.is_fine(), "{:#?}", report.findings);
+    let end = &report.ends[0];
+    assert_eq!((end.sent, end.received, end.before, end.after), (4, 0, 4, 0));
+    // And: a message beyond the bound is a finding, and one that may be on its way at the end is none
+    let found = findings(&joined_late(&folder, &[5_000, 20_101, 29_500], true));
+    assert!(
+        matches!(&found[..], [(Kind::Lost, text)]
+            if text.starts_with("1 messages were sent") && text.contains("while it recorded")),
+        "{found:?}"
+    );
+    // And: without a clock in common, nothing is excused
+    let found = findings(&joined_late(&folder, &[5_000, 10_000], false));
+    assert!(
+        matches!(&found[..], [(Kind::Lost, text)]
+            if text.starts_with("2 messages were sent") && text.contains("no clock reading connects")),
+        "{found:?}"
+    );
+}
+
+#[test]
+fn dropped_messages_of_all_recordings_count_together() {
+    // Given: a receiver that was recorded twice, and dropped three messages each time
+    let folder = TestFolder::new();
+    let files = ["one.mcap", "first.mcap", "second.mcap"].map(|name| folder.path(name));
+    incarnation(&files[0], ("127.0.0.2", 1), Direction::Sent, 1..=80);
+    for (number, dropped) in [(1, 11..=13_u64), (2, 51..=53)] {
+        let origin = Origin { incarnation: number, ..origin("127.0.0.3") };
+        let mut bag = BagWriter::create(&files[number as usize], Options::default(), origin).unwrap();
+        let channel = channel(&mut bag, Class::Control, Direction::Received);
+        let all = (1 + 40 * (number - 1))..=(40 * number);
+        for (at, sequence) in (1..).zip(all) {
+            if dropped.contains(&sequence) {
+                bag.dropped(channel, 1, (at * SECOND / 10, at * SECOND / 10)).unwrap();
+            } else {
+                let message = crate::Record { sequence, ..record(at, at * SECOND / 10) };
+                bag.message(channel, &message).unwrap();
+            }
+        }
+        bag.finish(60 * SECOND).unwrap();
+    }
+    // Then
+    let report = check(&files).unwrap();
+    assert!(report.is_fine(), "{:#?}", report.findings);
+    assert_eq!((report.ends[0].not_recorded, report.ends[0].lost), (6, 0));
+}
+
+#[test]
+fn merged_file_is_refused_with_the_names_of_its_files() {
+    let folder = TestFolder::new();
+    let files = ["one.mcap", "again.mcap"].map(|name| folder.path(name));
+    files.iter().for_each(|path| sent(path));
+    let out = folder.path("all.mcap");
+    crate::merge(&files, &out).unwrap();
+    let fault = check(&[out]).unwrap_err().to_string();
+    assert!(fault.contains("all.mcap: it is a merged file"), "{fault}");
+    assert!(
+        fault.ends_with("check the files before the merge: sinew bag check one.mcap again.mcap"),
+        "{fault}"
+    );
+}
+
 #[test]
 fn node_without_a_file_is_named() {
     let folder = TestFolder::new();

@@ -14,11 +14,11 @@ use crate::{
 };
 
 /// A node of one incarnation: its monotonic clock is one clock.
-type Node = (String, u64);
+pub(crate) type Node = (String, u64);
 
 /// A clock reading, as it stands in a file.
 #[derive(Debug, Deserialize)]
-struct Reading {
+pub(crate) struct Reading {
     peer: String,
     #[serde(default)]
     incarnation: u64,
@@ -40,7 +40,7 @@ struct Knot {
 /// The difference of two clocks over time: straight between two readings, and constant before the first and after the
 /// last one.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-struct Step(Vec<Knot>);
+pub(crate) struct Step(Vec<Knot>);
 
 impl Step {
     /// Returns a time on the other clock, and how wrong it may be.
@@ -61,9 +61,66 @@ impl Step {
     }
 }
 
+/// Converts a time of a node's monotonic clock by these steps. Returns the time on the other clock, and how wrong it may
+/// be.
+pub(crate) fn convert(steps: &[Step], at_ns: i128) -> (i128, u64) {
+    steps.iter().fold((at_ns, 0_u64), |(at_ns, bound_ns), step| {
+        let (at_ns, further_ns) = step.convert(at_ns);
+        (at_ns, bound_ns.saturating_add(further_ns))
+    })
+}
+
+/// The differences of clocks that nodes measured, from a node to another one.
+#[derive(Debug, Default)]
+pub(crate) struct Offsets(BTreeMap<(Node, Node), Step>);
+
+impl Offsets {
+    /// Notes a reading of the node's file in both directions. `offset_ns` is its wall clock minus its monotonic clock.
+    pub(crate) fn note(&mut self, own: &Node, offset_ns: i64, reading: &Reading) {
+        let peer = (reading.peer.clone(), reading.incarnation);
+        let own_ns = i128::from(reading.at_ns) - i128::from(offset_ns);
+        let ahead_ns = i128::from(reading.offset_ns);
+        let bound_ns = reading.bound_ns;
+        let mut knot = |from: &Node, to: &Node, at_ns: i128, add_ns: i128| {
+            let step = self.0.entry((from.clone(), to.clone())).or_default();
+            step.0.push(Knot { at_ns, add_ns, bound_ns });
+        };
+        knot(own, &peer, own_ns, ahead_ns);
+        knot(&peer, own, own_ns + ahead_ns, -ahead_ns);
+    }
+
+    /// Sorts the readings. Before it, the other functions give no result.
+    pub(crate) fn settle(&mut self) {
+        for step in self.0.values_mut() {
+            step.0.sort_unstable();
+            step.0.dedup_by_key(|knot| knot.at_ns);
+        }
+    }
+
+    /// Returns the steps from the clock of one node to that of another one, over the fewest nodes; `None` if no reading
+    /// connects them.
+    pub(crate) fn between(&self, from: &Node, to: &Node) -> Option<Vec<Step>> {
+        let mut open = VecDeque::from([(from, Vec::new())]);
+        let mut seen = BTreeSet::from([from]);
+        while let Some((at, steps)) = open.pop_front() {
+            if at == to {
+                return Some(steps);
+            }
+            for ((_, next), step) in
+                self.0.range((at.clone(), Node::default())..).take_while(|((from, _), _)| from == at)
+            {
+                if seen.insert(next) {
+                    open.push_back((next, [&steps[..], std::slice::from_ref(step)].concat()));
+                }
+            }
+        }
+        None
+    }
+}
+
 /// The way of a file's times to the clock of the reference.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Way {
+pub(crate) struct Way {
     /// Wall clock minus monotonic clock of the file.
     own_offset_ns: i64,
     steps: Vec<Step>,
@@ -73,37 +130,30 @@ pub(super) struct Way {
 
 impl Way {
     /// Returns a time of the file on the wall clock of the reference, and how wrong it may be.
-    pub(super) fn convert(&self, wall_ns: u64) -> (u64, u64) {
-        let start = (i128::from(wall_ns) - i128::from(self.own_offset_ns), 0_u64);
-        let (monotonic_ns, bound_ns) = self.steps.iter().fold(start, |(at_ns, bound_ns), step| {
-            let (at_ns, further_ns) = step.convert(at_ns);
-            (at_ns, bound_ns.saturating_add(further_ns))
-        });
+    pub(crate) fn convert(&self, wall_ns: u64) -> (u64, u64) {
+        let own_ns = i128::from(wall_ns) - i128::from(self.own_offset_ns);
+        let (monotonic_ns, bound_ns) = convert(&self.steps, own_ns);
         let wall_ns = monotonic_ns + i128::from(self.reference_offset_ns);
         (u64::try_from(wall_ns.max(0)).unwrap_or(u64::MAX), bound_ns)
     }
 }
 
 /// The clocks of all files.
-pub(super) struct Clocks {
+pub(crate) struct Clocks {
     /// The node of each file, and the offset of its wall clock.
     files: BTreeMap<PathBuf, (Node, i64)>,
-    /// The differences that were measured, from a node to another one.
-    steps: BTreeMap<(Node, Node), Step>,
+    offsets: Offsets,
     reference: Option<(Node, i64)>,
 }
 
 impl Clocks {
     /// Reads the clock readings of all files. The first one has the reference.
-    pub(super) fn read<P: AsRef<Path>>(files: &[P]) -> Result<Self, BagError> {
-        let mut clocks = Self { files: BTreeMap::new(), steps: BTreeMap::new(), reference: None };
+    pub(crate) fn read<P: AsRef<Path>>(files: &[P]) -> Result<Self, BagError> {
+        let mut clocks = Self { files: BTreeMap::new(), offsets: Offsets::default(), reference: None };
         for path in files {
             clocks.file(path.as_ref())?;
         }
-        for step in clocks.steps.values_mut() {
-            step.0.sort_unstable();
-            step.0.dedup_by_key(|knot| knot.at_ns);
-        }
+        clocks.offsets.settle();
         Ok(clocks)
     }
 
@@ -121,7 +171,7 @@ impl Clocks {
                 Ok(Some(Item::Message(message))) if message.channel.topic == CLOCK_TOPIC => {
                     let reading: Option<Reading> = serde_json::from_slice(message.data).ok();
                     if let (Some((node, offset_ns)), Some(reading)) = (&own, reading) {
-                        self.reading(node, *offset_ns, &reading);
+                        self.offsets.note(node, *offset_ns, &reading);
                     }
                 }
                 Ok(Some(_)) | Err(BagError::Damaged { .. }) => {}
@@ -138,41 +188,16 @@ impl Clocks {
         Ok(())
     }
 
-    /// Notes a reading in both directions.
-    fn reading(&mut self, own: &Node, offset_ns: i64, reading: &Reading) {
-        let peer = (reading.peer.clone(), reading.incarnation);
-        let own_ns = i128::from(reading.at_ns) - i128::from(offset_ns);
-        let ahead_ns = i128::from(reading.offset_ns);
-        let bound_ns = reading.bound_ns;
-        let mut knot = |from: &Node, to: &Node, at_ns: i128, add_ns: i128| {
-            let step = self.steps.entry((from.clone(), to.clone())).or_default();
-            step.0.push(Knot { at_ns, add_ns, bound_ns });
-        };
-        knot(own, &peer, own_ns, ahead_ns);
-        knot(&peer, own, own_ns + ahead_ns, -ahead_ns);
-    }
-
     /// Returns the way of a file's times to the reference, over the fewest nodes.
-    pub(super) fn way(&self, path: &Path) -> Result<Way, BagError> {
+    pub(crate) fn way(&self, path: &Path) -> Result<Way, BagError> {
         let (Some((node, own_offset_ns)), Some((reference, reference_offset_ns))) =
             (self.files.get(path), &self.reference)
         else {
             return Ok(Way::default());
         };
-        let mut open = VecDeque::from([(node, Vec::new())]);
-        let mut seen = BTreeSet::from([node]);
-        while let Some((at, steps)) = open.pop_front() {
-            if at == reference {
-                let (own_offset_ns, reference_offset_ns) = (*own_offset_ns, *reference_offset_ns);
-                return Ok(Way { own_offset_ns, steps, reference_offset_ns });
-            }
-            for ((_, to), step) in
-                self.steps.range((at.clone(), Node::default())..).take_while(|((from, _), _)| from == at)
-            {
-                if seen.insert(to) {
-                    open.push_back((to, [&steps[..], std::slice::from_ref(step)].concat()));
-                }
-            }
+        if let Some(steps) = self.offsets.between(node, reference) {
+            let (own_offset_ns, reference_offset_ns) = (*own_offset_ns, *reference_offset_ns);
+            return Ok(Way { own_offset_ns, steps, reference_offset_ns });
         }
         let text = format!(
             "no clock reading connects its node {} with {}, the node of the first file",
