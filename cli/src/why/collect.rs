@@ -2,6 +2,7 @@
 
 mod many;
 mod mismatches;
+mod queried;
 
 use std::{collections::BTreeMap, time::Duration};
 
@@ -23,61 +24,13 @@ use crate::{
     ping,
     system::{System, SystemError},
 };
+use queried::{Queried, doubles, first};
 
 /// Every node that was asked.
 pub(super) struct Collected<'a> {
     first: &'a mut System,
     others: Vec<System>,
     nodes: Vec<Queried>,
-}
-
-/// A node that was asked, or could not be.
-struct Queried {
-    node: NodeAddress,
-    name: String,
-    result: Result<NodeReport, String>,
-    /// Asked only if the node's own report arrived.
-    apps: Result<AppsReport, String>,
-    /// The socket through which it was asked.
-    through: usize,
-    /// Whether that is its own socket.
-    is_own_socket: bool,
-}
-
-impl Queried {
-    fn new(through: usize, (node, name): (NodeAddress, String), result: Result<NodeReport, String>) -> Self {
-        let name = result.as_ref().map_or(name, |report| report.name.clone());
-        let apps = Err("it was not asked".to_owned());
-        Self { node, name, result, apps, through, is_own_socket: false }
-    }
-
-    fn at_its_socket(self) -> Self {
-        Self { is_own_socket: true, ..self }
-    }
-
-    fn label(&self) -> String {
-        if self.name.is_empty() { self.node.to_string() } else { self.name.clone() }
-    }
-
-    /// Returns the applications that it has listed.
-    fn named_apps(&self) -> &[AppReport] {
-        self.apps.as_ref().map_or(&[][..], |report| report.apps.as_slice())
-    }
-
-    /// Returns why it may have further ones.
-    fn unreported(&self) -> Option<Unreported> {
-        match self.result.as_ref().and(self.apps.as_ref()) {
-            Ok(report) => (report.left_out > 0).then_some(Unreported::LeftOut(report.left_out)),
-            Err(why) => Some(Unreported::Silent(why.clone())),
-        }
-    }
-
-    /// Returns its report about an application; or, without one, why the application may exist nevertheless.
-    fn app(&self, tid: Tid) -> (Option<AppReport>, Option<Unreported>) {
-        let report = self.named_apps().iter().find(|app| app.tid == tid).cloned();
-        let unreported = if report.is_none() { self.unreported() } else { None };
-        (report, unreported)
-    }
 }
 
 impl<'a> Collected<'a> {
@@ -90,19 +43,20 @@ impl<'a> Collected<'a> {
             heres.extend(other.here().ok().map(|here| (at + 1, here)));
         }
         for (through, here) in &heres {
-            collected.add(
-                Queried::new(*through, (here.node, here.name.clone()), Ok(here.clone())).at_its_socket(),
-            );
+            let own = (here.node, here.name.clone());
+            collected.add(Queried::new(*through, &here.project, own, Ok(here.clone())).at_its_socket());
         }
         for (through, here) in heres {
             let unknown = |node: NodeAddress| {
-                collected.nodes.iter().all(|asked| asked.node != node || asked.result.is_err())
+                let mut asked = collected.nodes.iter().filter(|asked| asked.result.is_ok());
+                !asked.any(|asked| asked.node == node && asked.project == here.project)
             };
             let peers = here.peers.iter().filter(|peer| unknown(peer.node));
             let peers: Vec<_> =
                 peers.map(|peer| (peer.node, peer.name.clone().unwrap_or_default())).collect();
             for answer in collected.system(through).ask_these::<AskNode, NodeReport>(peers) {
-                collected.add(Queried::new(through, (answer.node, answer.name), answer.result));
+                let peer = (answer.node, answer.name);
+                collected.add(Queried::new(through, &here.project, peer, answer.result));
             }
         }
         for at in 0..collected.nodes.len() {
@@ -125,7 +79,7 @@ impl<'a> Collected<'a> {
 
     /// Adds the answer of a node, unless it is known already.
     fn add(&mut self, new: Queried) {
-        let same = |other: &Queried| other.node == new.node;
+        let same = |other: &Queried| other.is_at_address_of(&new);
         let is_new = match &new.result {
             // Two incarnations with one address are two nodes.
             Ok(report) => self.nodes.iter().filter(|other| same(other)).all(|other| {
@@ -208,8 +162,8 @@ impl<'a> Collected<'a> {
     /// Resolves both words. A name of several applications means the one that the other end's messages reach. If that
     /// is ambiguous too, the first word is resolved from the entry node.
     fn find_both(&self, wanted: [&str; 2]) -> [Found; 2] {
-        let is_open = wanted.map(|wanted| self.resolved(wanted).len() > 1);
         let here = &self.nodes[0];
+        let is_open = wanted.map(|wanted| self.resolved(wanted, &here.project).len() > 1);
         if is_open == [true, false] {
             let second = self.find(wanted[1], here);
             return [self.find(wanted[0], self.seen_from(&second)), second];
@@ -225,21 +179,27 @@ impl<'a> Collected<'a> {
         asked.filter(|asked| asked.result.is_ok()).unwrap_or(&self.nodes[0])
     }
 
-    /// Returns the applications with this name.
-    fn resolved(&self, name: &str) -> Vec<Resolved> {
+    /// Returns the applications with this name: those in the project, if it has any.
+    fn resolved(&self, name: &str, project: &str) -> Vec<Resolved> {
         let all = self
             .nodes
             .iter()
             .enumerate()
             .flat_map(|(at, asked)| asked.named_apps().iter().map(move |app| (at, app)));
         let named = all.filter(|(_, app)| app.name.as_deref() == Some(name));
-        named.map(|(at, app)| Resolved { at, tid: app.tid, is_ready: app.ready }).collect()
+        let mut resolved: Vec<_> =
+            named.map(|(at, app)| Resolved { at, tid: app.tid, is_ready: app.ready }).collect();
+        let is_of_project = |one: &Resolved| self.nodes[one.at].project == project;
+        if resolved.iter().any(is_of_project) {
+            resolved.retain(is_of_project);
+        }
+        resolved
     }
 
     /// Resolves an application's TID, a node's address, an application's name as seen from a node, or a node's name:
     /// the first match.
     fn find(&self, wanted: &str, seen_from: &Queried) -> Found {
-        let at_address = |node| self.nodes.iter().position(|asked| asked.node == node);
+        let at_address = |node| first(&self.nodes, &seen_from.project, |asked| asked.node == node);
         if let Ok(tid) = wanted.parse::<Tid>() {
             if many::is_many(tid) {
                 return Found { many: Some(tid), ..Found::default() };
@@ -250,7 +210,7 @@ impl<'a> Collected<'a> {
         if let Ok(node) = wanted.parse::<NodeAddress>() {
             return Found { at: at_address(node), node: Some(node), ..Found::default() };
         }
-        let mut resolved = self.resolved(wanted);
+        let mut resolved = self.resolved(wanted, &seen_from.project);
         if let Ok(report) = &seen_from.result {
             sort_by_reachability(&mut resolved, report);
         }
@@ -261,7 +221,7 @@ impl<'a> Collected<'a> {
             let namesakes = Some(namesakes).filter(|namesakes| !namesakes.others.is_empty());
             return Found { at: Some(at), node: Some(tid.node), app: Some(tid), namesakes, many: None };
         }
-        if let Some(at) = self.nodes.iter().position(|asked| asked.name == wanted) {
+        if let Some(at) = first(&self.nodes, &seen_from.project, |asked| asked.name == wanted) {
             return Found { at: Some(at), node: Some(self.nodes[at].node), ..Found::default() };
         }
         // No answering node: a lost one, or one of another project.
@@ -284,12 +244,7 @@ impl<'a> Collected<'a> {
             Ok(report) => end.report = Some(report.clone()),
             Err(why) => end.silence = Some(why.clone()),
         }
-        let others = self.nodes.iter().enumerate().filter(|(other, _)| *other != at);
-        let others = others.filter(|(_, other)| other.node == asked.node);
-        end.doubles = others
-            .filter_map(|(_, other)| other.result.as_ref().ok())
-            .map(|other| format!("node {} (process {})", other.name, other.pid))
-            .collect();
+        end.doubles = doubles(&self.nodes, at);
         if let Some(tid) = found.app {
             let report = asked.app(tid);
             end.app = Some(self.application(at, tid, report));
@@ -424,34 +379,5 @@ impl Found {
     /// Returns the destination of a message for it.
     fn target(&self) -> Option<Tid> {
         Some(Tid::new(self.node?, self.app.map_or(AppAddress::INSPECT, |tid| tid.app)))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::security;
-
-    #[test]
-    fn application_is_absent_only_after_a_complete_report() {
-        let report = security::tests::node_report("knee", 2, None);
-        let destination = || (report.node, report.name.clone());
-        let tid = Tid::new(report.node, AppAddress::new(0x1001));
-        let apps = |left_out| AppsReport {
-            name: "knee".to_owned(),
-            apps: Vec::new(),
-            left_out,
-            barriers: Vec::new(),
-            barriers_left_out: 0,
-            groups: Vec::new(),
-            groups_left_out: 0,
-        };
-        let of = |apps| Queried { apps, ..Queried::new(0, destination(), Ok(report.clone())) }.app(tid);
-        assert_eq!(of(Ok(apps(0))), (None, None));
-        assert_eq!(of(Ok(apps(3))), (None, Some(Unreported::LeftOut(3))));
-        let full = || "its queue is full".to_owned();
-        assert_eq!(of(Err(full())), (None, Some(Unreported::Silent(full()))));
-        let silent = Queried::new(0, destination(), Err("no answer".to_owned()));
-        assert_eq!(silent.app(tid), (None, Some(Unreported::Silent("no answer".to_owned()))));
     }
 }

@@ -59,6 +59,28 @@ fn separate_projects_and_groups_are_named_as_the_cause() {
 }
 
 #[test]
+fn address_in_another_project_blocks_nothing() {
+    // Given: a node of another project on this host, with the knee's address and an application of the knee's name
+    let scenario = Scenario::new();
+    let project = [("project = \"cli\"", "project = \"arm\""), ("name = \"arm\"", "name = \"knee\"")];
+    let mut arm = scenario.start_changed("arm", 2, &project, &[]);
+    arm.wait_for(&["started"]);
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let _knee = scenario.start("knee", 2, &[]);
+    hip.wait_for(&["started"]);
+    for end in ["knee", "127.0.0.2"] {
+        // When
+        let json =
+            scenario.until("all links are up", "hip", &["why", "hip", end], |json| json["free"] == true);
+        // Then: the other one was asked, and is not meant
+        assert_eq!(blocked(&json), "", "{json}");
+        let steps = json["steps"].as_array().expect("a list");
+        let project = steps.iter().find(|step| step["step"] == "both are of one project");
+        assert_eq!(project.expect("it is a step")["detail"], "'cli'", "{json}");
+    }
+}
+
+#[test]
 fn killed_node_is_shown_as_lost_with_its_history() {
     let scenario = Scenario::new();
     let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);

@@ -73,6 +73,13 @@ impl Collected<'_> {
                 Err(why) => many.unreported.push((label, why)),
             }
         }
+        // Messages to many stay in their project.
+        let project = &self.nodes[sender.at.unwrap_or(0)].project;
+        let is_of_project =
+            |on: &MembersOn| on.node.report.as_ref().is_some_and(|report| report.project == *project);
+        if many.places.iter().any(is_of_project) {
+            many.places.retain(is_of_project);
+        }
         if !self.nodes.iter().any(|asked| is_meant(asked.node)) {
             let why = "no node that was asked knows it".to_owned();
             many.unreported.push((tid.node.to_string(), why));
