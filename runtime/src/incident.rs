@@ -3,11 +3,10 @@
 
 use std::{
     fmt,
-    sync::{
-        Arc, Mutex, TryLockError, Weak,
-        atomic::{AtomicUsize, Ordering},
-    },
+    sync::{Arc, Mutex, Weak},
 };
+
+use arc_swap::ArcSwapOption;
 
 use crate::{lock, time::Time};
 
@@ -30,46 +29,44 @@ pub trait IncidentObserver: Send + Sync {
     fn happened(&self, at: Time, kind: IncidentKind, cause: &str);
 }
 
-static OBSERVERS: Mutex<Vec<Weak<dyn IncidentObserver>>> = Mutex::new(Vec::new());
-/// Number of observers, some of which may have been dropped. Without any an incident costs one load.
-static COUNT: AtomicUsize = AtomicUsize::new(0);
+/// The observers, some of which may have been dropped. A thread that reports an incident reads the list without a lock.
+static OBSERVERS: ArcSwapOption<Vec<Weak<dyn IncidentObserver>>> = ArcSwapOption::const_empty();
+/// Held while the list is replaced.
+static CHANGE: Mutex<()> = Mutex::new(());
 
 /// Adds an observer, for as long as it lives. Returns `false` if there are too many.
 pub fn observe(observer: &Arc<dyn IncidentObserver>) -> bool {
-    let mut observers = lock(&OBSERVERS);
-    observers.retain(|other| other.strong_count() > 0);
+    let _change = lock(&CHANGE);
+    let before = OBSERVERS.load();
+    let living = before.iter().flat_map(|observers| observers.iter());
+    let mut observers: Vec<_> = living.filter(|other| other.strong_count() > 0).cloned().collect();
     let has_room = observers.len() < OBSERVERS_MAX;
     if has_room {
         observers.push(Arc::downgrade(observer));
     }
-    // SYNC: Relaxed: an incident at this moment may be missed.
-    COUNT.store(observers.len(), Ordering::Relaxed);
+    OBSERVERS.store(Some(Arc::new(observers)));
     has_room
 }
 
-/// Reports an incident to all observers. It never waits: an incident that meets another one, or the begin of a
-/// recording, is not reported. The other one is a trigger for the same span.
+/// Reports an incident to all observers. It never waits, also where other threads report incidents or add observers at
+/// this moment: an observer that is just being added may miss it. It may be called from a panic hook.
 pub fn report(at: Time, kind: IncidentKind, cause: fmt::Arguments<'_>) {
-    if COUNT.load(Ordering::Relaxed) == 0 {
-        return;
-    }
-    let observers: Vec<_> = match OBSERVERS.try_lock() {
-        Ok(observers) => observers.iter().filter_map(Weak::upgrade).collect(),
-        Err(TryLockError::Poisoned(poisoned)) => {
-            poisoned.into_inner().iter().filter_map(Weak::upgrade).collect()
-        }
-        Err(TryLockError::WouldBlock) => return,
-    };
-    if observers.is_empty() {
+    // Without any observer an incident costs one load.
+    let Some(observers) = OBSERVERS.load_full() else { return };
+    let mut living = observers.iter().filter_map(Weak::upgrade).peekable();
+    if living.peek().is_none() {
         return;
     }
     let cause = cause.to_string();
-    observers.iter().for_each(|observer| observer.happened(at, kind, &cause));
+    living.for_each(|observer| observer.happened(at, kind, &cause));
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Held by each test: an observer that a test drops is not in use by another one.
+    static ALONE: Mutex<()> = Mutex::new(());
 
     #[derive(Default)]
     struct Notes(Mutex<Vec<(Time, String)>>);
@@ -85,18 +82,58 @@ mod tests {
 
     #[test]
     fn observer_receives_incidents_until_it_is_dropped() {
+        let _alone = lock(&ALONE);
         let notes = Arc::new(Notes::default());
         let observer: Arc<dyn IncidentObserver> = notes.clone();
         assert!(observe(&observer));
         let at = Time::from_nanos(7);
-        // Another test's incident may be reported at the same moment.
-        while lock(&notes.0).is_empty() {
-            report(at, IncidentKind::Failure, format_args!("test of incidents {}", 1));
-        }
+        report(at, IncidentKind::Failure, format_args!("test of incidents {}", 1));
         assert_eq!(lock(&notes.0)[0], (at, "test of incidents 1".to_owned()));
         let weak = Arc::downgrade(&notes);
         drop((observer, notes));
         report(at, IncidentKind::Failure, format_args!("test of incidents 2"));
         assert_eq!(weak.strong_count(), 0);
+    }
+
+    #[test]
+    fn incident_while_an_observer_is_added_is_reported() {
+        let _alone = lock(&ALONE);
+        let notes = Arc::new(Notes::default());
+        let observer: Arc<dyn IncidentObserver> = notes.clone();
+        assert!(observe(&observer));
+        // Given: another observer is being added
+        let change = lock(&CHANGE);
+        // When
+        report(Time::from_nanos(8), IncidentKind::Failure, format_args!("test of incidents"));
+        // Then
+        assert_eq!(lock(&notes.0).len(), 1);
+        drop(change);
+    }
+
+    #[test]
+    fn incidents_of_several_threads_are_all_reported() {
+        const THREADS: usize = 4;
+        const INCIDENTS: usize = 1_000;
+        let _alone = lock(&ALONE);
+        let notes = Arc::new(Notes::default());
+        let observer: Arc<dyn IncidentObserver> = notes.clone();
+        assert!(observe(&observer));
+        let begin = std::sync::Barrier::new(THREADS);
+        std::thread::scope(|scope| {
+            for _ in 0..THREADS {
+                scope.spawn(|| {
+                    begin.wait();
+                    for _ in 0..INCIDENTS {
+                        report(
+                            Time::from_nanos(9),
+                            IncidentKind::Failure,
+                            format_args!("test of incidents 9"),
+                        );
+                    }
+                });
+            }
+        });
+        let received = lock(&notes.0).iter().filter(|(_, cause)| cause.ends_with(" 9")).count();
+        assert_eq!(received, THREADS * INCIDENTS);
     }
 }
