@@ -136,6 +136,14 @@ fn send_one(scenario: &Scenario) -> Endpoint {
     sensor
 }
 
+/// Asserts that the file is complete and finished, and has the message of [`send_one`].
+fn assert_has_the_count(file: &Path) {
+    assert_complete(file);
+    let info = bag("info", file);
+    let is_finished = info.out.contains("finished") && !info.out.contains("unfinished");
+    assert!(info.out.contains("/sensor/scenario.count") && is_finished, "{}", info.out);
+}
+
 /// Returns the recordings in the folder of a test.
 fn recordings(folder: &TestDirectory) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder.join("")).expect("it is there");
@@ -167,9 +175,7 @@ fn node_finishes_the_file_of_its_configuration() {
     assert_eq!(knee.wait_for_exit(), Some(0));
     let files = recordings(&scenario.directory);
     assert!(files.len() == 1 && files[0].display().to_string().contains("/knee-20"), "{files:?}");
-    assert_complete(&files[0]);
-    let info = bag("info", &files[0]);
-    assert!(info.out.contains("/sensor/scenario.count") && info.out.contains("finished"), "{}", info.out);
+    assert_has_the_count(&files[0]);
 }
 
 #[test]
@@ -199,9 +205,7 @@ fn program_records_its_node() {
     let summary = recording.finish_within(Duration::from_secs(60)).expect("it ends");
     drop(sensor);
     assert!(summary.totals.written > 0 && summary.totals.dropped == 0, "{summary:?}");
-    assert_complete(&file);
-    let info = bag("info", &file);
-    assert!(info.out.contains("/sensor/scenario.count"), "{}", info.out);
+    assert_has_the_count(&file);
 }
 
 #[test]
