@@ -6,6 +6,7 @@
 //! | [`channel`] | the key of a channel: source, destination, payload type, class, form, rejection |
 //! | [`entry`] | a record: a message, or one of the facts below |
 //! | [`facts`] | events of nodes and applications, clock offsets, log lines |
+//! | [`files`] | reads files in a folder that other users may write into |
 //! | [`frozen`] | the questions that freeze a span of the recordings and that fetch one, and their answers |
 //! | [`question`] | the question that has a node record, and its answer |
 //! | [`tap`] | writes the selected messages of a routing table |
@@ -14,6 +15,7 @@
 pub mod channel;
 pub mod entry;
 pub mod facts;
+pub mod files;
 pub mod frozen;
 pub mod question;
 pub mod selection;

@@ -35,6 +35,9 @@ pub use recording::Recording;
 pub use session::{Connection, End, RecordingOptions, Session, Summary};
 pub use setup::Setup;
 pub use sinew_bag::{BagError, Compression, Options as FileOptions, Totals};
-pub use sinew_record::Selection;
+pub use sinew_record::{
+    Selection,
+    files::{Owners, is_own, read_facts},
+};
 pub use sinew_shm::journal::{JournalReader, ReadJournalError, Start};
 pub use span::Span;

@@ -2,9 +2,9 @@
 
 use std::{
     collections::BTreeSet,
-    fs::{self, File, OpenOptions},
-    io::{self, Read as _, Write as _},
-    os::unix::fs::{FileExt as _, MetadataExt as _, OpenOptionsExt as _},
+    fs::{self, OpenOptions},
+    io::{self, Write as _},
+    os::unix::fs::{FileExt as _, OpenOptionsExt as _},
     path::{Path, PathBuf},
     sync::Mutex,
 };
@@ -12,10 +12,11 @@ use std::{
 use sinew_runtime::{lock, log, wire};
 use sinew_shm::journal::{CopyJournalError, JournalReader, Start, copy_span, count_span};
 
-use sinew_record::{FROZEN_SPANS_MAX, FrozenFacts, FrozenPart, FrozenSpan};
+use sinew_record::{
+    FROZEN_SPANS_MAX, FrozenFacts, FrozenPart, FrozenSpan,
+    files::{self, Owners, open_own},
+};
 
-/// Maximum bytes of a file with facts. A longer one is not read.
-const FACTS_BYTES_MAX: u64 = 4 << 20;
 /// Maximum number of files of a folder that are looked at.
 const FILES_MAX: usize = 65_536;
 
@@ -160,8 +161,9 @@ impl FrozenStore {
     /// It copies nothing, because the node waits. Where the folder is of another file system, the ring gets its new
     /// name beside the journal: [`beside`](Self::beside).
     pub(crate) fn keep_dead_ring(&mut self, journal: &Path) -> Option<Result<String, FrozenError>> {
-        let reader = JournalReader::open(journal, Start::Newest).ok()?;
-        if !is_own(journal) || reader.is_writer_alive() || reader.is_closed().unwrap_or(true) {
+        // Nothing of another user's file is read.
+        let reader = is_own(journal).then(|| JournalReader::open(journal, Start::Newest).ok())??;
+        if reader.is_writer_alive() || reader.is_closed().unwrap_or(true) {
             return None;
         }
         let facts = journal.with_extension("facts");
@@ -310,7 +312,7 @@ impl FrozenStore {
             FrozenPart::Ring => "frozen",
         };
         let read = || {
-            let file = open(&self.path(id, extension))?;
+            let file = open_own(&self.path(id, extension), Owners::ThisUser)?;
             let length = file.metadata()?.len();
             let rest = length.saturating_sub(offset).min(bytes_max as u64);
             let mut bytes = vec![0; usize::try_from(rest).unwrap_or(bytes_max)];
@@ -371,17 +373,8 @@ fn folder_of(journal: &Path) -> PathBuf {
     journal.parent().unwrap_or_else(|| Path::new(".")).to_owned()
 }
 
-/// Returns whether it is an ordinary file of this user: another one may write into `/dev/shm`, too.
 fn is_own(path: &Path) -> bool {
-    let own = rustix::process::geteuid().as_raw();
-    path.symlink_metadata().is_ok_and(|metadata| metadata.is_file() && metadata.uid() == own)
-}
-
-fn open(path: &Path) -> io::Result<File> {
-    if !is_own(path) {
-        return Err(io::Error::new(io::ErrorKind::PermissionDenied, "it is no file of this user"));
-    }
-    File::open(path)
+    files::is_own(path, Owners::ThisUser)
 }
 
 /// Writes facts beside a journal, for this user alone. A former file is replaced at once.
@@ -405,9 +398,7 @@ pub(crate) fn write_facts(path: &Path, facts: &FrozenFacts) -> io::Result<()> {
 
 /// Reads facts beside a journal.
 pub(crate) fn read_facts(path: &Path) -> io::Result<FrozenFacts> {
-    let mut bytes = Vec::new();
-    open(path)?.take(FACTS_BYTES_MAX).read_to_end(&mut bytes)?;
-    wire::decode(&bytes).map_err(|why| io::Error::new(io::ErrorKind::InvalidData, why.to_string()))
+    files::read_facts(path, Owners::ThisUser)
 }
 
 #[cfg(test)]

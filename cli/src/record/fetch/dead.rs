@@ -2,23 +2,19 @@
 
 use std::{
     collections::BTreeSet,
-    fs::{self, File},
-    io::Read as _,
-    os::unix::fs::MetadataExt as _,
+    fs,
     path::{Path, PathBuf},
 };
 
 use rustix::time::{ClockId, clock_gettime};
 use sinew::{NodeAddress, inspect::FrozenFacts};
-use sinew_recorder::{JournalReader, Start};
+use sinew_recorder::{JournalReader, Owners, Start, is_own, read_facts};
 
 /// Maximum number of files of the folder that are looked at, and of rings that are returned.
 const FILES_MAX: usize = 65_536;
 const RINGS_MAX: usize = 256;
 /// Largest change of the wall clock since the node has died, in nanoseconds. A host needs longer to start again.
 const OFFSET_STEP_MAX: u64 = 5_000_000_000;
-/// Maximum bytes of the facts beside a ring.
-const FACTS_BYTES_MAX: u64 = 4 << 20;
 
 /// The ring of a dead node.
 pub(super) struct DeadRing {
@@ -79,7 +75,7 @@ pub(super) fn rings(folders: BTreeSet<&Path>, project: &str) -> Vec<DeadRing> {
         .filter_map(|folder| fs::read_dir(folder).ok())
         .flat_map(|files| files.take(FILES_MAX))
         .filter_map(|file| Some(file.ok()?.path()))
-        .filter(|path| is_ring(path) && is_own(path))
+        .filter(|path| is_ring(path) && is_own(path, Owners::AllForRoot))
         .collect();
     paths.sort();
     paths.into_iter().filter_map(|path| ring(path, project)).take(RINGS_MAX).collect()
@@ -89,12 +85,6 @@ fn is_ring(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     name.starts_with("sinew-")
         && (name.ends_with(".journal") || (name.contains("-died-") && name.ends_with(".frozen")))
-}
-
-/// Whether it is a file of this user; root reads those of all users.
-fn is_own(path: &Path) -> bool {
-    let own = rustix::process::geteuid().as_raw();
-    path.symlink_metadata().is_ok_and(|metadata| metadata.is_file() && (own == 0 || metadata.uid() == own))
 }
 
 fn ring(path: PathBuf, project: &str) -> Option<DeadRing> {
@@ -108,21 +98,12 @@ fn ring(path: PathBuf, project: &str) -> Option<DeadRing> {
     if lines.next() != Some(project) || reader.is_writer_alive() || has_ended_in_order {
         return None;
     }
-    let mut facts = read_facts(&path.with_extension("facts")).unwrap_or_default();
+    let mut facts = read_facts(&path.with_extension("facts"), Owners::AllForRoot).unwrap_or_default();
     facts.report.name.clone_from(&name);
     let incarnation = facts.report.incarnation.map_or_else(|| reader.created(), |number| number.0);
     let (now, present_offset) = clocks();
     let is_of_this_boot = is_of_this_boot(reader.created(), reader.wall_offset().ok()?, now, present_offset);
     Some(DeadRing { path, name, address, facts, incarnation, is_of_this_boot })
-}
-
-fn read_facts(path: &Path) -> Option<FrozenFacts> {
-    let mut bytes = Vec::new();
-    if !is_own(path) {
-        return None;
-    }
-    File::open(path).ok()?.take(FACTS_BYTES_MAX).read_to_end(&mut bytes).ok()?;
-    rmp_serde::from_slice(&bytes).ok()
 }
 
 #[cfg(test)]

@@ -256,7 +256,7 @@ fn rings_beside_the_journal_are_bounded() {
         let id = store.keep_dead_ring(&path).expect("it is there").unwrap();
         // The times of files are coarse.
         let written = SystemTime::UNIX_EPOCH + Duration::from_secs(1_000 + incarnation);
-        let facts = File::options().write(true).open(folder.store(2).path(&id, "facts")).unwrap();
+        let facts = fs::File::options().write(true).open(folder.store(2).path(&id, "facts")).unwrap();
         facts.set_modified(written).unwrap();
         kept.push(id);
     }
