@@ -320,12 +320,16 @@ impl Flight {
             return;
         }
         let facts = FrozenFacts { span: None, report };
-        match write_facts(&journal.path().with_extension("facts"), &facts) {
+        let path = journal.path().with_extension("facts");
+        match write_facts(&path, &facts) {
             Ok(()) => names.written = Some(lasting),
             // It is tried again each second, and logged once.
             Err(error) if !names.has_failed => {
                 names.has_failed = true;
-                log::warn!(%error, "the names beside the journal cannot be written");
+                log::warn!(
+                    path = %path.display(), %error,
+                    "the names beside the journal cannot be written: if the file is another user's, set record.folder to a folder of this user alone"
+                );
             }
             Err(_) => {}
         }

@@ -118,7 +118,7 @@ impl Ending {
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum RecordError {
     /// The journal cannot be made.
-    #[error(transparent)]
+    #[error("{cause}{remedy}", cause = .0, remedy = remedy(.0))]
     Journal(#[from] CreateJournalError),
     /// The system has no thread for it.
     #[error("the system gives no thread for the recording: {0}")]
@@ -129,6 +129,19 @@ pub(crate) enum RecordError {
     /// As many programs record as may.
     #[error("{PROGRAMS_MAX} programs record on this node at once, and so many do; end another one")]
     Programs,
+}
+
+/// Returns the setting that mends it, if the text of the error does not name it.
+const fn remedy(error: &CreateJournalError) -> &'static str {
+    match error {
+        CreateJournalError::Taken { .. } | CreateJournalError::Folder { .. } => {
+            " (record.folder, such as one in $XDG_RUNTIME_DIR with the mode 0700)"
+        }
+        CreateJournalError::Size(_)
+        | CreateJournalError::Identity(_)
+        | CreateJournalError::System { .. }
+        | CreateJournalError::Unsupported => "",
+    }
 }
 
 impl Recording {

@@ -23,6 +23,19 @@ pub enum CreateJournalError {
         /// The reason.
         why: &'static str,
     },
+    /// Another user has a file of this name in a folder in which nobody else may replace it, such as `/dev/shm`.
+    #[error(
+        "a journal cannot be made: {} is a file of the user with the number {owner}, and this process has the number {own}; choose a folder of this user alone, or have that file removed",
+        path.display()
+    )]
+    Taken {
+        /// The file of the other user.
+        path: PathBuf,
+        /// The number of its user.
+        owner: u32,
+        /// The number of the user of this process.
+        own: u32,
+    },
     /// A call of the system failed: a full disk, missing permission, lack of memory.
     #[error("a journal cannot be made at {}: {step}: {cause}", path.display())]
     System {

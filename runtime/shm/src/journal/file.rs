@@ -25,7 +25,7 @@ use rustix::{
     fd::{AsFd, OwnedFd},
     fs::{
         AtFlags, FallocateFlags, FlockOperation, Mode, OFlags, fallocate, flock, fstat, openat, renameat,
-        unlinkat,
+        statat, unlinkat,
     },
     io::Errno,
 };
@@ -116,7 +116,10 @@ pub(crate) fn create(
         // With all its pages, so that no writer waits for one.
         let raw = MmapOptions::new().len(length).populate().map_raw(&file).map_err(failed("mmap"))?;
         if keeps_previous {
-            keep_previous(&folder, name).map_err(failed("the file that is there cannot be kept"))?;
+            keep_previous(&folder, name).map_err(|cause| {
+                let taken = check_name(&folder, &path.with_file_name(previous(name))).err();
+                taken.unwrap_or_else(|| failed("the file that is there cannot be kept")(cause))
+            })?;
         }
         renameat(&folder, &temporary, &folder, name)
             .map_err(io::Error::from)
@@ -171,7 +174,29 @@ fn open_folder(path: &Path) -> Result<(OwnedFd, &OsStr), CreateJournalError> {
         .map_err(io::Error::from)
         .map_err(failed("its folder cannot be opened"))?;
     check_folder(&folder).map_err(failed("its folder cannot be looked at"))?.map_err(refused)?;
+    check_name(&folder, path)?;
     Ok((folder, name))
+}
+
+/// Refuses a path of which the folder does not let this user replace the file.
+fn check_name(folder: &OwnedFd, path: &Path) -> Result<(), CreateJournalError> {
+    let own = rustix::process::geteuid().as_raw();
+    let name = path.file_name().unwrap_or_default();
+    // Without such a file there is nothing to replace. Another failure is reported by the step that needs the name.
+    let (Ok(there), Ok(around)) = (statat(folder, name, AtFlags::SYMLINK_NOFOLLOW), fstat(folder)) else {
+        return Ok(());
+    };
+    let is_sticky = Mode::from_raw_mode(around.st_mode).contains(Mode::SVTX);
+    if is_taken(own, there.st_uid, around.st_uid, is_sticky) {
+        return Err(CreateJournalError::Taken { path: path.to_owned(), owner: there.st_uid, own });
+    }
+    Ok(())
+}
+
+/// Returns whether a folder keeps the file of `owner` from the user `own`: a sticky one lets a file be replaced by its
+/// owner, by the owner of the folder, and by root.
+pub(crate) const fn is_taken(own: u32, owner: u32, owner_of_folder: u32, is_sticky: bool) -> bool {
+    is_sticky && own != 0 && own != owner && own != owner_of_folder
 }
 
 /// Returns why other users could replace files of this folder.
@@ -225,11 +250,16 @@ fn allocate(file: &File, bytes: u64) -> io::Result<()> {
     }
 }
 
-/// Renames the file that has the name.
-fn keep_previous(folder: &OwnedFd, name: &OsStr) -> io::Result<()> {
+/// Returns the name that the former file of this name is kept under.
+fn previous(name: &OsStr) -> OsString {
     let mut previous = name.to_owned();
     previous.push(".previous");
-    match renameat(folder, name, folder, &previous) {
+    previous
+}
+
+/// Renames the file that has the name.
+fn keep_previous(folder: &OwnedFd, name: &OsStr) -> io::Result<()> {
+    match renameat(folder, name, folder, previous(name)) {
         Ok(()) | Err(Errno::NOENT) => Ok(()),
         Err(other) => Err(other.into()),
     }

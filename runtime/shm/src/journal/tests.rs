@@ -56,6 +56,30 @@ fn numbers(reader: &mut JournalReader) -> Result<Vec<u64>, ReadJournalError> {
 }
 
 #[test]
+fn file_of_another_user_is_named_with_its_remedy() {
+    const OWN: u32 = 1_000;
+    const OTHER: u32 = 1_001;
+    let cases = [
+        // /dev/shm belongs to root.
+        (OWN, OTHER, 0, true, true),
+        (OWN, 0, 0, true, true),
+        (OWN, OWN, 0, true, false),
+        // In its own folder a user replaces the files of others, and root does so everywhere.
+        (OWN, OTHER, OWN, true, false),
+        (0, OTHER, OTHER, true, false),
+        (OWN, OTHER, 0, false, false),
+    ];
+    for (own, owner, folder, is_sticky, is_taken) in cases {
+        assert_eq!(platform::is_taken(own, owner, folder, is_sticky), is_taken, "{own} {owner} {folder}");
+    }
+    let path = PathBuf::from("/dev/shm/sinew-leg-10.0.0.2.journal");
+    let text = CreateJournalError::Taken { path, owner: OTHER, own: OWN }.to_string();
+    for part in ["/dev/shm/sinew-leg-10.0.0.2.journal", "number 1001", "number 1000", "choose a folder"] {
+        assert!(text.contains(part), "{part}: {text}");
+    }
+}
+
+#[test]
 fn journal_is_its_users_and_has_its_identity() {
     let folder = Folder::new("identity");
     let journal = Journal::create(&folder.path(), &small()).unwrap();
