@@ -80,7 +80,7 @@ pub use serde;
 #[doc(no_inline)]
 pub use sinew_client::{self as client, AsyncEndpoint, Endpoint, NodeApi, Registration};
 pub use sinew_replay as replay;
-pub use sinew_runtime::protection;
+pub use sinew_runtime::{protection, real_time};
 #[doc(no_inline)]
 pub use time::Time;
 
