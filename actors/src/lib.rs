@@ -114,7 +114,7 @@ pub mod config {
     #[doc(inline)]
     pub use sinew_model::config::{
         AppSettings, ConfigError, ConfigFault, Families, GnclConfig, Interface, InterfaceError, Interfaces,
-        LnclConfig, LogConfig, LogLevel, NdlConfig, NodeConfig, RecordCompression, RecordConfig,
+        LnclConfig, LogConfig, LogLevel, NdlConfig, NodeConfig, RecordCompression, RecordConfig, RtConfig,
         SecurityConfig, Seed, SeedError, SupervisionConfig, SyncConfig, TimePolicy, WatchGroup,
     };
 }
