@@ -18,8 +18,8 @@ use std::time::Duration;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RtConfig {
     /// How long a thread measures its lateness at 1 kHz after the start, with the priority of the thread that makes
-    /// outputs safe. It costs 2 to 4 % of a CPU for this time on a virtual machine. 0 to 60 s; default 2 s. 0: nothing is
-    /// measured, and the node reports no rights.
+    /// outputs safe. It costs 2 to 4 % of a CPU for this time on a virtual machine. 0 to 60 s; default 2 s. With 0
+    /// nothing is measured, and the node reports no rights.
     pub probe: Duration,
 }
 
