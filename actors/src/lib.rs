@@ -80,7 +80,7 @@ pub use serde;
 #[doc(no_inline)]
 pub use sinew_client::{self as client, AsyncEndpoint, Endpoint, NodeApi, Registration};
 pub use sinew_replay as replay;
-pub use sinew_runtime::protection;
+pub use sinew_runtime::{protection, real_time};
 #[doc(no_inline)]
 pub use time::Time;
 
@@ -114,7 +114,7 @@ pub mod config {
     #[doc(inline)]
     pub use sinew_model::config::{
         AppSettings, ConfigError, ConfigFault, Families, GnclConfig, Interface, InterfaceError, Interfaces,
-        LnclConfig, LogConfig, LogLevel, NdlConfig, NodeConfig, RecordCompression, RecordConfig,
+        LnclConfig, LogConfig, LogLevel, NdlConfig, NodeConfig, RecordCompression, RecordConfig, RtConfig,
         SecurityConfig, Seed, SeedError, SupervisionConfig, SyncConfig, TimePolicy, WatchGroup,
     };
 }

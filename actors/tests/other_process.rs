@@ -60,6 +60,7 @@ fn start_node(socket: &Path) -> (Node, Receiver<String>) {
             config.lncl.socket = Some(socket.to_owned());
             config.ndl.multicast = None;
             config.ndl.mdns_port = None;
+            config.rt.probe = Duration::ZERO;
         })
         .app(drive)
         .start()
@@ -90,6 +91,7 @@ fn misspelt_name_suggests_nearest_ones() {
             config.lncl.socket = Some(socket.clone());
             config.ndl.multicast = None;
             config.ndl.mdns_port = None;
+            config.rt.probe = Duration::ZERO;
         })
         .app(AppSpec::new("misspelt", move || Misspelt(say.clone())).requires(["sensor"]))
         .start()
@@ -314,6 +316,7 @@ fn lone_node() {
             config.lncl.socket = Some(socket.into());
             config.ndl.multicast = None;
             config.ndl.mdns_port = None;
+            config.rt.probe = Duration::ZERO;
         })
         .start()
         .unwrap();

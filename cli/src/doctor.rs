@@ -2,11 +2,12 @@
 //! It also checks whether other hosts can reach them, and whether those of one host stay connected without a network.
 //! Each finding has the command that fixes it.
 //!
-//! Every check tests the real operation if possible, and undoes it.
+//! Every check tests the real operation if possible, and undoes it. `sinew doctor --rt` measures how late threads wake.
 
 mod clock;
 mod network;
 mod reach;
+mod real_time;
 mod rights;
 mod security;
 mod sockets;
@@ -19,8 +20,10 @@ use sinew::{
     NodeAddress,
     config::{Interface, Interfaces},
     inspect::{AskNode, NodeReport},
+    real_time::HostRights,
 };
 
+pub(crate) use self::real_time::show as show_real_time;
 use crate::{
     Report,
     arguments::Arguments,
@@ -59,13 +62,14 @@ pub(crate) fn show(chosen: Vec<Interface>, arguments: &Arguments) -> Report {
     let chosen = Some(chosen).filter(|chosen| !chosen.is_empty()).map(Interfaces::from);
     let Nodes { reports: nodes, silent } = Nodes::asked(socket, within);
     let chosen = chosen.or_else(|| of_node(nodes.first()?)).unwrap_or_else(|| Ipv4Addr::LOCALHOST.into());
+    let host = HostRights::read(Path::new("/"));
     let mut checks = vec![network::interfaces(&interfaces)];
     checks.extend(network::multicast(&chosen, &interfaces));
     checks.extend([
         rights::open_files(),
-        rights::locked_memory(),
-        rights::real_time(),
-        rights::governor(),
+        rights::locked_memory(&host),
+        rights::real_time(&host),
+        rights::governor(&host),
         clock::clock(),
         rights::shared_memory(),
         rights::own_processes(),
@@ -77,9 +81,14 @@ pub(crate) fn show(chosen: Vec<Interface>, arguments: &Arguments) -> Report {
     checks.extend(security::checks(&nodes));
     checks.extend(reach::checks(&nodes, &interfaces));
     checks.extend(together::checks(&nodes));
+    summary(&checks, arguments.wide)
+}
+
+/// Returns the report of these checks: a table, and the suggested fixes.
+fn summary(checks: &[Check], is_wide: bool) -> Report {
     let is_fine = checks.iter().all(|check| check.fix.is_none());
     let json = json!({ "checks": checks.iter().map(check_json).collect::<Vec<_>>() });
-    let table = table(&checks, arguments.wide);
+    let table = table(checks, is_wide);
     let fixes = checks.iter().filter_map(|check| Some((check.name, check.fix.as_ref()?)));
     let fixes: String = fixes.map(|(name, fix)| format!("{name}: {}\n", clean_lines(fix))).collect();
     let text = if is_fine { table } else { format!("{table}\nSuggested fix\n{fixes}") };

@@ -1,5 +1,6 @@
 //! `sinew nodes`: every node, its incarnation, its connections, its clock.
 
+mod real_time;
 mod row;
 
 use std::{collections::BTreeSet, fmt::Display};
@@ -202,7 +203,8 @@ fn text(here: &NodeReport, rows: &[Row<'_>], lost: &[&LostReport], is_wide: bool
         text += &idle(row);
     }
     let reports = rows.iter().filter_map(|row| row.answer.result.as_ref().ok());
-    text.extend(reports.filter_map(own_stalls));
+    text.extend(reports.clone().filter_map(own_stalls));
+    text.extend(reports.filter_map(real_time::line));
     for (count, what) in [(here.left_out, "nodes"), (here.lost_left_out, "lost nodes")] {
         if count > 0 {
             text += &format!("{count} further {what} had no room in the answer of {}\n", here.node);

@@ -150,6 +150,7 @@ pub(crate) mod tests {
             unhandled: Vec::new(),
             unguarded: Vec::new(),
             lost_echoes: Vec::new(),
+            real_time: None,
             refusals_left_out: 0,
             peers: Vec::new(),
             own_stalls: None,

@@ -22,6 +22,7 @@
 //! | [`app`] | applications |
 //! | [`timer`], [`alarm`] | the kernel's timer, exact to microseconds; a task that it wakes |
 //! | [`supervision`] | starts, restarts and failures of actors |
+//! | [`real_time`] | the real-time rights of a process, and how late its threads wake |
 //! | [`lock`] | locks that survive the panic of their holder |
 //! | [`log`] | the log of the runtime, which never waits for its reader |
 //! | [`incident`] | faults around which nodes freeze their recordings |
@@ -43,6 +44,7 @@ pub mod name;
 pub mod outcome;
 pub mod pending;
 pub mod protection;
+pub mod real_time;
 pub mod remedy;
 pub mod router;
 pub mod safe_wake;

@@ -44,6 +44,7 @@ impl At {
             config.ndl.interface = self.address.into();
             config.ndl.multicast = Some(self.group);
             config.ndl.mdns_port = None;
+            config.rt.probe = Duration::ZERO;
         })
     }
 

@@ -36,6 +36,7 @@ fn node(name: &str, host: u8) -> NodeBuilder {
     Node::builder(name).address([127, 0, 0, host]).configure(|config| {
         config.ndl.multicast = Some(group);
         config.ndl.mdns_port = None;
+        config.rt.probe = Duration::ZERO;
     })
 }
 

@@ -69,6 +69,7 @@ pub(crate) fn node(socket: &str, ring_bytes: usize) {
         config.lncl.ring_bytes = ring_bytes;
         config.ndl.multicast = None;
         config.ndl.mdns_port = None;
+        config.rt.probe = Duration::ZERO;
     });
     let _node = node.start().expect("a node");
     print_ready();

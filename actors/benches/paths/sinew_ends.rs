@@ -18,6 +18,7 @@ fn alone(name: &str) -> NodeBuilder {
     Node::builder(name).configure(|config| {
         config.ndl.multicast = None;
         config.ndl.mdns_port = None;
+        config.rt.probe = Duration::ZERO;
     })
 }
 

@@ -29,6 +29,7 @@ mod node;
 mod play_check;
 mod process;
 mod progress;
+mod real_time;
 mod recording;
 mod reply_waiters;
 mod root;

@@ -10,6 +10,7 @@ use sinew_runtime::{
 };
 use sinew_security::SecurityState;
 
+use super::real_time::RealTime;
 use super::recording::{Recording, Triggers};
 use super::root::{RootEvent, RootQueue};
 use crate::{
@@ -39,6 +40,8 @@ pub(crate) struct NodeState {
     pub(crate) types: Types,
     /// The recording of its messages.
     pub(crate) recording: Recording,
+    /// The proof of real time.
+    pub(crate) real_time: Arc<RealTime>,
 }
 
 impl NodeState {
@@ -62,6 +65,7 @@ impl NodeState {
             questions: audit::Questions::default(),
             types: Types::default(),
             recording: Recording::default(),
+            real_time: Arc::default(),
         });
         state.connect();
         state
@@ -86,6 +90,7 @@ impl NodeState {
     /// Releases the node's socket and its address for inspection, so that another node can use them even if a
     /// hung thread still holds the state.
     pub(crate) fn close(&self) {
+        self.real_time.end();
         self.lncl.client_socket.close();
         self.ctx.router.remove_local(AppAddress::INSPECT);
         let recording = self.recording.end(self);

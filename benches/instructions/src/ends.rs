@@ -50,6 +50,7 @@ fn alone() -> NodeBuilder {
     Node::builder("instructions").configure(|config| {
         config.ndl.multicast = None;
         config.ndl.mdns_port = None;
+        config.rt.probe = Duration::ZERO;
     })
 }
 

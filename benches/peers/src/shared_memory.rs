@@ -102,6 +102,7 @@ pub(crate) fn node(socket: &str) {
         config.lncl.socket = Some(socket.into());
         config.ndl.multicast = None;
         config.ndl.mdns_port = None;
+        config.rt.probe = Duration::ZERO;
     });
     let _node = node.start().expect("a node");
     print_ready();

@@ -1,16 +1,15 @@
 //! Checks limits, real-time rights, and the power management of idle CPUs.
 
-use std::{collections::BTreeSet, fs};
+use std::time::Duration;
 
 use rustix::{
     fs::{MemfdFlags, SealFlags, fcntl_add_seals, ftruncate, memfd_create},
+    io::Errno,
     process::{PidfdFlags, Resource, getpid, getrlimit, pidfd_open},
-    thread::{CapabilitySet, capabilities},
 };
-use sinew::protection::SAFE_OUTPUT_PRIORITY;
-use thread_priority::{
-    RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy,
-    set_thread_priority_and_policy, thread_native_id,
+use sinew::{
+    protection::SAFE_OUTPUT_PRIORITY,
+    real_time::{Budget, HostRights, Plan, Refusal, probe},
 };
 
 use super::Check;
@@ -40,96 +39,125 @@ pub(super) fn open_files() -> Check {
 }
 
 /// Sinew itself locks no memory; a program with a control loop does.
-pub(super) fn locked_memory() -> Check {
-    const NAME: &str = "locked memory";
-    let limit = getrlimit(Resource::Memlock).current;
-    if limit.is_none_or(|limit| limit >= LOCKED_WANTED) || has(CapabilitySet::IPC_LOCK) {
-        let most = limit.map_or_else(|| "any".to_owned(), |limit| format!("{} KiB", limit >> 10));
-        return Check::fine(NAME, format!("a process may lock {most} (RLIMIT_MEMLOCK, or CAP_IPC_LOCK)"));
+pub(super) fn locked_memory(rights: &HostRights) -> Check {
+    let limit = rights.locked_limit;
+    if limit >= LOCKED_WANTED || rights.has_ipc_lock {
+        let most = if limit == u64::MAX { "any".to_owned() } else { format!("{} KiB", limit >> 10) };
+        return Check::fine(LOCKED, format!("a process may lock {most} (RLIMIT_MEMLOCK, or CAP_IPC_LOCK)"));
     }
+    unlockable(format!(
+        "a process may lock {} KiB (RLIMIT_MEMLOCK); a control loop that calls mlockall needs more, else it waits for the disk",
+        limit >> 10
+    ))
+}
+
+const LOCKED: &str = "locked memory";
+
+/// Judges the result of `mlockall`.
+pub(super) fn locked(result: Result<(), Errno>) -> Check {
+    match result {
+        Ok(()) => Check::fine(LOCKED, "mlockall works: the memory of this command is locked".to_owned()),
+        Err(error) => unlockable(format!("mlockall fails: {error}; a control loop may wait for the disk")),
+    }
+}
+
+fn unlockable(detail: String) -> Check {
     Check::finding(
-        NAME,
+        LOCKED,
+        detail,
         format!(
-            "a process may lock {} KiB (RLIMIT_MEMLOCK); a control loop that calls mlockall needs more, else it waits for the disk",
-            limit.unwrap_or(0) >> 10
-        ),
-        format!(
-            "echo \"$USER - memlock unlimited\" | sudo tee -a {LIMITS}, then log in again; or LimitMEMLOCK=infinity in the service's unit"
+            "echo \"$USER - memlock unlimited\" | sudo tee -a {LIMITS}, then log in again; or LimitMEMLOCK=infinity in the service's unit; in a \
+             container: --ulimit memlock=-1"
         ),
     )
 }
 
 /// Tested on a thread that ends with the test: the limits are not always effective (in containers). The threads that
 /// make outputs safe need the highest of the required priorities; the node's watchdog would use a slightly higher one.
-pub(super) fn real_time() -> Check {
-    const NAME: &str = "real-time rights";
-    let trial = |priority: u8| {
-        let level = ThreadPriorityValue::try_from(priority)
-            .map_err(|_| thread_priority::Error::Priority("1 to 99"))?;
-        let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
-        set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(level), policy)
-    };
-    let trials = move || (trial(1), trial(SAFE_OUTPUT_PRIORITY));
-    let limit =
-        getrlimit(Resource::Rtprio).current.map_or_else(|| "any".to_owned(), |limit| limit.to_string());
-    let capability = if has(CapabilitySet::SYS_NICE) { "with" } else { "without" };
-    let known = format!("RLIMIT_RTPRIO {limit}, {capability} CAP_SYS_NICE");
-    let detail = match std::thread::spawn(trials).join() {
-        Ok((_, Ok(()))) => {
-            return Check::fine(
-                NAME,
-                format!("a thread got SCHED_FIFO {SAFE_OUTPUT_PRIORITY} ({known}){}", throttled()),
-            );
-        }
-        Ok((Ok(()), Err(error))) => format!(
-            "a thread got SCHED_FIFO 1, and not the {SAFE_OUTPUT_PRIORITY} of what makes outputs safe: {error:?} ({known}); that takes the \
-             highest that it gets, and comes too late where what it guards has one as high or higher: that is refused a guard"
-        ),
-        Ok((Err(error), Err(_))) => format!("a thread did not get SCHED_FIFO: {error:?} ({known})"),
-        Err(_) => {
-            return Check::finding(NAME, "the trial panicked".to_owned(), "report it, please");
-        }
-    };
-    Check::finding(
-        NAME,
-        detail,
+pub(super) fn real_time(rights: &HostRights) -> Check {
+    let trial = Plan::new(Some(SAFE_OUTPUT_PRIORITY), Duration::ZERO);
+    match std::thread::spawn(move || probe(&trial, || false).granted).join() {
+        Ok(granted) => judged(rights, granted),
+        Err(_) => Check::finding(REAL_TIME, "the trial panicked".to_owned(), "report it, please"),
+    }
+}
+
+const REAL_TIME: &str = "real-time rights";
+
+/// Judges the priority that a thread got. Each reason of a refusal has its fix.
+pub(super) fn judged(rights: &HostRights, granted: u8) -> Check {
+    let refusals = rights.refusals(SAFE_OUTPUT_PRIORITY, granted);
+    if refusals.is_empty() {
+        let detail = format!("a thread got SCHED_FIFO {granted} ({}){}", known(rights), throttled(rights));
+        return Check::fine(REAL_TIME, detail);
+    }
+    let reasons: Vec<_> = refusals.iter().map(ToString::to_string).collect();
+    let reasons = reasons.join("; ");
+    let detail = if granted > 0 {
         format!(
+            "a thread got SCHED_FIFO {granted}, and not the {SAFE_OUTPUT_PRIORITY} of what makes outputs safe: {reasons}; that takes the \
+             highest that it gets, and comes too late where what it guards has one as high or higher: that is refused a guard"
+        )
+    } else {
+        format!("a thread did not get SCHED_FIFO: {reasons} ({})", known(rights))
+    };
+    Check::finding(REAL_TIME, detail, refusals.iter().map(fix).collect::<Vec<_>>().join("\n"))
+}
+
+fn known(rights: &HostRights) -> String {
+    let limit = match rights.priority_limit {
+        u64::MAX => "any".to_owned(),
+        limit => limit.to_string(),
+    };
+    let capability = if rights.has_sys_nice { "with" } else { "without" };
+    format!("RLIMIT_RTPRIO {limit}, {capability} CAP_SYS_NICE")
+}
+
+/// Returns the fix for one reason of a refusal.
+fn fix(refusal: &Refusal) -> String {
+    let no_limit = "sudo sysctl -w kernel.sched_rt_runtime_us=-1: no group needs a budget then, and no real-time thread that never sleeps is stopped any more";
+    match refusal {
+        Refusal::NoRight { .. } => format!(
             "echo \"$USER - rtprio 99\" | sudo tee -a {LIMITS}, then log in again; or LimitRTPRIO=99 in the service's unit; or sudo setcap \
-             cap_sys_nice+ep PROGRAM; in a container: --cap-add SYS_NICE --ulimit rtprio=99"
+             cap_sys_nice+ep PROGRAM; in a container: --cap-add=SYS_NICE --ulimit rtprio=99"
         ),
-    )
+        Refusal::NoBudget(Budget::NoneV1 { file, .. }) => format!(
+            "echo 950000 | sudo tee {}, after the same for each group above it; in a container: --cpu-rt-runtime=950000, with \
+             dockerd --cpu-rt-runtime=950000; or {no_limit}",
+            file.display()
+        ),
+        Refusal::NoBudget(Budget::NoneV2 { .. } | Budget::MaybeNoneV2 { .. }) => format!(
+            "{no_limit}; or rt_group_sched=0 on the kernel's command line (newer kernels), or a kernel without CONFIG_RT_GROUP_SCHED"
+        ),
+        Refusal::NoBudget(Budget::NotRestricted) | Refusal::Unknown => {
+            "in a container: --cap-add=SYS_NICE --ulimit rtprio=99, a seccomp profile that allows sched_setscheduler, and the host's user namespace \
+             (--userns=host)"
+                .to_owned()
+        }
+    }
 }
 
 /// Returns whether the kernel takes the CPU from real-time threads that never sleep: information, not a finding.
-fn throttled() -> String {
-    let read = |name| fs::read_to_string(format!("/proc/sys/kernel/{name}")).ok()?.trim().parse::<i64>().ok();
-    match (read("sched_rt_runtime_us"), read("sched_rt_period_us")) {
-        (Some(runtime), Some(period)) if 0 < runtime && runtime < period => {
+fn throttled(rights: &HostRights) -> String {
+    match (rights.runtime_us, rights.period_us) {
+        (Some(runtime), Some(period)) if 0 <= runtime && runtime < period => {
             format!("; all of them together have {runtime} us of each {period} us (sched_rt_runtime_us)")
         }
         _ => String::new(),
     }
 }
 
-fn has(capability: CapabilitySet) -> bool {
-    capabilities(None).is_ok_and(|sets| sets.effective.contains(capability))
-}
-
 /// Checks the CPU governor: a CPU with a reduced clock handles its first message late.
-pub(super) fn governor() -> Check {
+pub(super) fn governor(rights: &HostRights) -> Check {
     const NAME: &str = "CPU governor";
-    let cpus = fs::read_dir("/sys/devices/system/cpu").into_iter().flatten().flatten();
-    let governors =
-        cpus.filter_map(|cpu| fs::read_to_string(cpu.path().join("cpufreq/scaling_governor")).ok());
-    let governors: BTreeSet<_> = governors.map(|governor| governor.trim().to_owned()).collect();
-    let detail = governors.iter().cloned().collect::<Vec<_>>().join(", ");
-    if governors.is_empty() {
+    let detail = rights.governors.iter().cloned().collect::<Vec<_>>().join(", ");
+    if rights.governors.is_empty() {
         return Check::fine(
             NAME,
             "the kernel does not choose the clock here (a virtual machine, or it is fixed)".to_owned(),
         );
     }
-    if governors.iter().all(|governor| governor == "performance") {
+    if rights.governors.iter().all(|governor| governor == "performance") {
         return Check::fine(NAME, detail);
     }
     Check::finding(
@@ -172,5 +200,52 @@ pub(super) fn own_processes() -> Check {
             ),
             "Linux 5.4 or newer, and a seccomp profile of the container that allows pidfd_open and waitid",
         ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    #[test]
+    fn every_reason_of_a_refusal_has_a_fix() {
+        let rights = HostRights::read(Path::new("/nowhere"));
+        let none = Budget::NoneV1 {
+            group: "/robot".to_owned(),
+            file: "/sys/fs/cgroup/cpu/robot/cpu.rt_runtime_us".into(),
+        };
+        let both = judged(&HostRights { budget: none, ..rights.clone() }, 0);
+        assert!(
+            both.detail.contains("RLIMIT_RTPRIO is 0") && both.detail.contains("/robot"),
+            "{}",
+            both.detail
+        );
+        let fix = both.fix.expect("a finding");
+        let parts = [
+            "rtprio 99",
+            "LimitRTPRIO=99",
+            "--cap-add=SYS_NICE",
+            "tee /sys/fs/cgroup/cpu/robot/cpu.rt_runtime_us",
+        ];
+        assert!(parts.iter().all(|part| fix.contains(part)), "{fix}");
+        let budget = Budget::NoneV2 { group: "/robot".to_owned() };
+        let of_group = judged(&HostRights { budget, has_sys_nice: true, ..rights.clone() }, 0);
+        assert!(of_group.fix.is_some_and(|fix| fix.contains("rt_group_sched=0") && !fix.contains("rtprio")));
+        let unknown = judged(&HostRights { has_sys_nice: true, ..rights.clone() }, 0);
+        assert!(unknown.fix.is_some_and(|fix| fix.contains("seccomp")));
+        assert!(judged(&rights, SAFE_OUTPUT_PRIORITY).fix.is_none());
+        assert!(judged(&rights, 40).detail.contains("SCHED_FIFO 40, and not the 90"));
+    }
+
+    #[test]
+    fn memory_that_cannot_be_locked_is_a_finding() {
+        let fix = locked(Err(Errno::NOMEM)).fix.expect("a finding");
+        assert!(fix.contains("memlock unlimited") && fix.contains("--ulimit memlock=-1"), "{fix}");
+        assert!(locked(Ok(())).fix.is_none());
+        let rights = HostRights::read(Path::new("/nowhere"));
+        assert!(locked_memory(&rights).fix.is_some());
+        assert!(locked_memory(&HostRights { has_ipc_lock: true, ..rights }).fix.is_none());
     }
 }

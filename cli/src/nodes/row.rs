@@ -5,7 +5,7 @@ use sinew::inspect::{
     IdleReport, LinkReport, NodeReport, PeerReport, RouteReport, StallReport, TroubleReport,
 };
 
-use super::COLUMNS;
+use super::{COLUMNS, real_time};
 use crate::{
     security,
     system::Answer,
@@ -134,6 +134,7 @@ impl<'a> Row<'a> {
             "version": result.ok().map(|report| &report.version),
             "refused": result.ok().map(|report| report.refused),
             "own_stalls": result.ok().and_then(|report| report.own_stalls).map(|stalls| stalls_json(&stalls)),
+            "real_time": result.ok().and_then(|report| report.real_time.as_ref()).map(real_time::json),
             "found_us": seen.and_then(|seen| seen.found_us),
             "found_by": seen.map(|seen| &seen.found_by),
             "silent_us": seen.and_then(|seen| seen.silent_us),

@@ -41,7 +41,7 @@ mod threads;
 mod unsupervised;
 mod watchdog;
 
-pub(crate) use self::place::{realtime_priority, set_highest_priority};
+pub(crate) use self::place::{realtime_priority, request_priority, set_highest_priority};
 pub use self::{
     core::{
         AutoShutdown, BranchView, ChildCommandError, ChildId, ChildIds, ChildState, ChildView, Command,

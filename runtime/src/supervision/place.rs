@@ -222,17 +222,7 @@ pub(crate) fn set_highest_priority(thread: &str, wanted: u8) -> u8 {
     if let Err(error) = system::unpin() {
         crate::log::warn!(thread, %error, "the thread stays on the CPUs of the thread that created it");
     }
-    let (policy, inherited) = schedule();
-    let granted = priorities(wanted, system::realtime_limit(), inherited)
-        .into_iter()
-        .flatten()
-        .any(|priority| set_realtime_priority(priority).is_ok());
-    // The creating thread may have the idle schedule, which yields to all others.
-    let yields_to_others = matches!(policy, Some(ThreadSchedulePolicy::Normal(normal)) if normal != NormalThreadSchedulePolicy::Other);
-    if !granted && yields_to_others {
-        set_normal_schedule();
-    }
-    let (_, has) = schedule();
+    let has = request_priority(wanted);
     if has >= wanted {
         crate::log::debug!(thread, priority = has, "has its real-time priority, and may run on any CPU");
     } else {
@@ -245,6 +235,22 @@ pub(crate) fn set_highest_priority(thread: &str, wanted: u8) -> u8 {
         );
     }
     has
+}
+
+/// Requests SCHED_FIFO with the priority `wanted`, or the highest one that is granted, for the calling thread.
+/// Returns the priority that it has then, 0 for none.
+pub(crate) fn request_priority(wanted: u8) -> u8 {
+    let (policy, inherited) = schedule();
+    let granted = priorities(wanted, system::realtime_limit(), inherited)
+        .into_iter()
+        .flatten()
+        .any(|priority| set_realtime_priority(priority).is_ok());
+    // The creating thread may have the idle schedule, which yields to all others.
+    let yields_to_others = matches!(policy, Some(ThreadSchedulePolicy::Normal(normal)) if normal != NormalThreadSchedulePolicy::Other);
+    if !granted && yields_to_others {
+        set_normal_schedule();
+    }
+    realtime_priority()
 }
 
 /// Returns the calling thread's real-time priority, 0 for none.

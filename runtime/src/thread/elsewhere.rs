@@ -4,6 +4,8 @@ use std::{ffi::CStr, io};
 
 use thread_priority::{NormalThreadSchedulePolicy, ThreadSchedulePolicy};
 
+use crate::time::Time;
+
 /// The ordinary policy: there is no idle scheduling.
 pub(crate) const IDLE: ThreadSchedulePolicy = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Other);
 
@@ -33,4 +35,9 @@ pub(crate) fn restore_affinity() -> io::Result<()> {
 /// Returns no limit: a priority that was refused once stays refused.
 pub(crate) fn realtime_limit() -> u8 {
     0
+}
+
+/// Sleeps for the time until `at`: there is no API for a sleep to a deadline.
+pub(crate) fn sleep_until(at: Time) {
+    std::thread::sleep(at.since(Time::now()));
 }

@@ -4,9 +4,12 @@ use std::{ffi::CStr, sync::OnceLock};
 
 use rustix::{
     process::{Resource, getpid, getrlimit},
-    thread::{CpuSet, gettid, sched_getaffinity, sched_setaffinity, set_name},
+    thread::{CpuSet, clock_nanosleep_absolute, gettid, sched_getaffinity, sched_setaffinity, set_name},
+    time::{ClockId, Timespec},
 };
 use thread_priority::{NormalThreadSchedulePolicy, ThreadSchedulePolicy};
+
+use crate::time::Time;
 
 /// The scheduling policy under which a thread runs only when the CPU is idle.
 pub(crate) const IDLE: ThreadSchedulePolicy = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Idle);
@@ -59,4 +62,15 @@ fn process_affinity() -> Option<&'static CpuSet> {
 pub(crate) fn realtime_limit() -> u8 {
     let limit = getrlimit(Resource::Rtprio).current.unwrap_or(u64::MAX);
     u8::try_from(limit).unwrap_or(u8::MAX)
+}
+
+/// Sleeps until `at` on the monotonic clock. A signal may end the sleep early.
+pub(crate) fn sleep_until(at: Time) {
+    let nanos = at.as_nanos();
+    let at = Timespec {
+        tv_sec: (nanos / 1_000_000_000).cast_signed(),
+        tv_nsec: (nanos % 1_000_000_000).cast_signed(),
+    };
+    // The only error of a legal time is the interruption by a signal.
+    let _ = clock_nanosleep_absolute(ClockId::Monotonic, &at);
 }

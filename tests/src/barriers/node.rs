@@ -111,6 +111,7 @@ fn node(index: usize, group: std::net::SocketAddrV4, stays_away: &Arc<AtomicBool
         .configure(move |config| {
             config.ndl.multicast = Some(group);
             config.ndl.mdns_port = None;
+            config.rt.probe = Duration::ZERO;
         })
         .app(party)
 }

@@ -42,6 +42,7 @@ impl Loopback {
         Node::builder(name).address([127, 0, 0, address]).configure(|config| {
             config.ndl.multicast = Some(self.group);
             config.ndl.mdns_port = None;
+            config.rt.probe = Duration::ZERO;
         })
     }
 }

@@ -23,11 +23,11 @@ use super::{
 /// Longest configuration file in bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-const SECTIONS: [&str; 10] =
-    ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security", "log", "record", "app"];
+const SECTIONS: [&str; 11] =
+    ["node", "lncl", "gncl", "ndl", "sync", "supervision", "security", "log", "record", "rt", "app"];
 
 /// Every key of every section.
-pub(super) const KEYS: [&str; 62] = [
+pub(super) const KEYS: [&str; 63] = [
     "node.name",
     "node.project",
     "node.address",
@@ -90,6 +90,7 @@ pub(super) const KEYS: [&str; 62] = [
     "record.split_ms",
     "record.max_bytes",
     "record.compression",
+    "rt.probe_ms",
 ];
 
 impl NodeConfig {
@@ -137,6 +138,7 @@ impl NodeConfig {
             &mut config.log.level,
         );
         reader.read_record(&mut config);
+        reader.time(&check::PROBE, &mut config.rt.probe);
         config.app_settings = reader.app_settings.take().unwrap_or_default();
         let faults = reader.finish(&config).err().map(ConfigError::into_vec).unwrap_or_default();
         Ok((config, faults))

@@ -10,6 +10,7 @@ mod faults;
 mod file;
 mod interfaces;
 mod log_level;
+mod real_time;
 mod record;
 mod seeds;
 #[cfg(test)]
@@ -38,6 +39,7 @@ use sinew_runtime::{
 pub use self::{
     app_settings::AppSettings,
     log_level::LogLevel,
+    real_time::RtConfig,
     record::{RecordCompression, RecordConfig},
     time_policy::TimePolicy,
     watch_group::WatchGroup,
@@ -95,6 +97,8 @@ pub struct NodeConfig {
     pub log: LogConfig,
     /// The recording of messages.
     pub record: RecordConfig,
+    /// The measurement of the node's real-time behaviour.
+    pub rt: RtConfig,
     /// The settings of applications: the tables `[app.NAME]` of its file, which [`NodeConfig::app`] reads.
     /// Default: none.
     pub app_settings: AppSettings,
@@ -420,6 +424,7 @@ impl NodeConfig {
             security: SecurityConfig { keys: None, times: TimePolicy::UntilSet, access: None },
             log: LogConfig::default(),
             record: RecordConfig::default(),
+            rt: RtConfig::default(),
             app_settings: AppSettings::default(),
         }
     }

@@ -145,6 +145,7 @@ impl NodeBuilder {
         match started.recv_timeout(start_timeout) {
             Ok(Ok(())) => {
                 log_start(&node.handle);
+                begin_real_time(&node.handle.state);
                 Ok(node)
             }
             // Dropping the node stops all that was started.
@@ -220,6 +221,13 @@ fn begin_recording(state: &Arc<NodeState>, writes_recording: bool) -> Result<(),
         return Err(StartError::Record(why.to_owned()));
     }
     state.recording.begin_configured(state).map_err(|why| StartError::Record(why.to_string()))
+}
+
+/// Begins the proof of real time. A node runs without it, too.
+fn begin_real_time(state: &NodeState) {
+    if let Err(error) = state.real_time.begin(state.ctx.config.rt.probe) {
+        log::warn!(%error, "the node does not measure its lateness: the system starts no further thread; raise its limit of threads");
+    }
 }
 
 /// Returns a number that grows from one start of a host's node to the next, as long as the host's clock does

@@ -109,6 +109,7 @@ impl Answers {
             unhandled: refused::unhandled(state, now),
             unguarded: refused::unguarded(state, now),
             lost_echoes: refused::lost_echoes(state, now),
+            real_time: state.real_time.report(),
             peers,
             left_out,
         })

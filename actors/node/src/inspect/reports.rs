@@ -7,6 +7,7 @@ mod frozen;
 mod node;
 mod peers;
 mod reach;
+mod real_time;
 mod record;
 mod refused;
 mod security;
@@ -23,6 +24,7 @@ pub use peers::{
     StallReport, StreamReport, TroubleReport,
 };
 pub use reach::{AskGroups, AskReach, GroupReport, REACHED_MAX, ReachReport, Reached};
+pub use real_time::RealTimeReport;
 pub use refused::{LostEchoReport, RefusalReport, UnguardedReport, UnhandledReport};
 pub use security::{CertificateReport, SecurityReport};
 pub use tree::{AskTree, TREE_MAX, TreeLine, TreeReport};

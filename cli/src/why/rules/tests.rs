@@ -97,6 +97,7 @@ fn report(number: u8, name: &str, other: u8) -> NodeReport {
         unhandled: Vec::new(),
         unguarded: Vec::new(),
         lost_echoes: Vec::new(),
+        real_time: None,
         refusals_left_out: 0,
         peers: vec![peer(other)],
         left_out: 0,

@@ -60,7 +60,7 @@ enum Kind {
 }
 
 /// Sections, in the order of the file, with a heading.
-const SECTIONS: [(&str, &str); 9] = [
+const SECTIONS: [(&str, &str); 10] = [
     ("node", "The node"),
     ("lncl", "Applications of this host"),
     ("gncl", "Connections between nodes"),
@@ -70,6 +70,7 @@ const SECTIONS: [(&str, &str); 9] = [
     ("security", "Keys and the access list"),
     ("log", "The default log"),
     ("record", "The recording"),
+    ("rt", "The proof of real time"),
 ];
 
 /// Longest cell of a table, and longest line of the complete file.

@@ -8,8 +8,9 @@ use sinew_runtime::{
 };
 
 use super::{
-    ForeignReport, IdleReport, LISTED_MAX, LostEchoReport, LostReport, PeerReport, RefusalReport, Report,
-    SecurityReport, Shortened, SourceReport, StallReport, TroubleReport, UnguardedReport, UnhandledReport,
+    ForeignReport, IdleReport, LISTED_MAX, LostEchoReport, LostReport, PeerReport, RealTimeReport,
+    RefusalReport, Report, SecurityReport, Shortened, SourceReport, StallReport, TroubleReport,
+    UnguardedReport, UnhandledReport,
 };
 
 /// Maximum number of nodes in one answer.
@@ -139,6 +140,10 @@ pub struct NodeReport {
         deserialize_with = "at_most::<_, _, LISTED_MAX>"
     )]
     pub lost_echoes: Vec<LostEchoReport>,
+    /// Its real-time rights and its lateness after its start; `None`: not measured yet, switched off, or an older
+    /// version.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub real_time: Option<RealTimeReport>,
     /// The known nodes, in the order of their addresses.
     #[serde(deserialize_with = "at_most::<_, _, PEERS_MAX>")]
     pub peers: Vec<PeerReport>,
