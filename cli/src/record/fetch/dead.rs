@@ -2,8 +2,7 @@
 
 use std::{
     collections::BTreeSet,
-    fs::{self, File},
-    io::Read as _,
+    fs,
     os::unix::fs::MetadataExt as _,
     path::{Path, PathBuf},
 };
@@ -17,8 +16,6 @@ const FILES_MAX: usize = 65_536;
 const RINGS_MAX: usize = 256;
 /// Largest change of the wall clock since the node has died, in nanoseconds. A host needs longer to start again.
 const OFFSET_STEP_MAX: u64 = 5_000_000_000;
-/// Maximum bytes of the facts beside a ring.
-const FACTS_BYTES_MAX: u64 = 4 << 20;
 
 /// The ring of a dead node.
 pub(super) struct DeadRing {
@@ -108,7 +105,7 @@ fn ring(path: PathBuf, project: &str) -> Option<DeadRing> {
     if lines.next() != Some(project) || reader.is_writer_alive() || has_ended_in_order {
         return None;
     }
-    let mut facts = read_facts(&path.with_extension("facts")).unwrap_or_default();
+    let mut facts = facts_of(&path).unwrap_or_default();
     facts.report.name.clone_from(&name);
     let incarnation = facts.report.incarnation.map_or_else(|| reader.created(), |number| number.0);
     let (now, present_offset) = clocks();
@@ -116,13 +113,8 @@ fn ring(path: PathBuf, project: &str) -> Option<DeadRing> {
     Some(DeadRing { path, name, address, facts, incarnation, is_of_this_boot })
 }
 
-fn read_facts(path: &Path) -> Option<FrozenFacts> {
-    let mut bytes = Vec::new();
-    if !is_own(path) {
-        return None;
-    }
-    File::open(path).ok()?.take(FACTS_BYTES_MAX).read_to_end(&mut bytes).ok()?;
-    rmp_serde::from_slice(&bytes).ok()
+fn facts_of(ring: &Path) -> Option<FrozenFacts> {
+    if is_own(&ring.with_extension("facts")) { sinew_recorder::read_facts(ring).ok() } else { None }
 }
 
 #[cfg(test)]
