@@ -11,11 +11,13 @@
 //!   [`Connection`], such as an endpoint of NodeAPI.
 //! - [`Recorder`] takes a reader of the journal and a writer of the file. Its owner calls [`Recorder::pump`] every few
 //!   milliseconds. It knows no node, no socket and no clock: names and times are arguments.
+//! - [`FrozenRing`] is a journal that nothing writes any more: a frozen span, or the ring of a dead node.
 
 mod channels;
 mod error;
 mod facts;
 mod file_name;
+mod frozen;
 mod names;
 mod order;
 mod recorder;
@@ -28,6 +30,7 @@ mod span;
 mod tests;
 
 pub use error::RecordingError;
+pub use frozen::{FrozenFile, FrozenRing};
 pub use names::Names;
 pub use order::WINDOW;
 pub use recorder::Recorder;

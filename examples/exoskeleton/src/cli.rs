@@ -59,7 +59,8 @@ pub(crate) struct Arguments {
     /// Folder for the run folders.
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
-    /// Do not record the messages of the nodes. Real time only; in virtual time nothing is recorded.
+    /// Do not record the messages of the nodes, nor freeze those around faults. Real time only; in virtual time
+    /// nothing is recorded.
     #[arg(long, conflicts_with = "lock_step")]
     no_record: bool,
     /// Compute the drives of a recorded walk again, from `walk.mcap` or the file of a joint's node, and compare their
@@ -205,6 +206,9 @@ fn real_time(arguments: &Arguments) -> Result<Verdict, RunError> {
     ));
     if let Some(recorded) = &walk.recorded {
         output::print(&recorded.to_string());
+    }
+    if let Some(frozen) = &walk.frozen {
+        output::print(&frozen.to_string());
     }
     Ok(walk.report.verdict)
 }

@@ -41,6 +41,22 @@ fn topology_file_of_a_local_run_reads_back() {
 }
 
 #[test]
+fn every_node_has_a_journal_of_its_own() {
+    let text = EXAMPLE.replacen("# [record]", "[record]", 1).replacen("# folder =", "folder =", 1);
+    let topology = Topology::parse(&text.replacen("# frozen_folder =", "frozen_folder =", 1)).unwrap();
+    assert_eq!(Topology::parse(&topology.to_toml()).as_ref(), Ok(&topology));
+    let mut folders = BTreeSet::new();
+    for part in Part::ALL {
+        let config = topology.node_config(part);
+        assert!(config.validate().is_ok(), "{:?}", config.validate());
+        assert_eq!(config.record.frozen_folder.as_deref(), Some(Path::new("/var/log/my-leg")));
+        assert!(folders.insert(config.record.folder.expect("it records")), "{part} has another's");
+    }
+    assert!(faults(&text)[0].contains("frozen_folder"), "both folders are needed");
+    assert_eq!(for_this_host(7).unwrap().node_config(Part::Central).record.folder, None);
+}
+
+#[test]
 fn sinew_finds_the_socket_of_every_local_node() {
     let topology = for_this_host(7).unwrap();
     let id = std::process::id().to_string();

@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use exoskeleton::output;
 use exoskeleton::robot::launch::LaunchError;
+use exoskeleton::robot::launch::flight::FlightFolders;
 use exoskeleton::robot::role::Role;
 use exoskeleton::robot::topology::{self, DrivePlace, ReleaseBy, Topology};
 use exoskeleton::run_folder;
@@ -139,7 +140,12 @@ pub(crate) fn run(options: &FaultOptions) -> Result<FaultReport, FaultError> {
         }
         let folder = folder.join(format!("robot-{number}"));
         std::fs::create_dir(&folder)?;
-        let robot = Robot::start(&topology(options)?, None, &folder)?;
+        let mut topology = topology(options)?;
+        // A killed node is to be found in the records of all; the other steps save the time for that.
+        let is_recorded = left.contains(&Step::PullNode);
+        let flight = is_recorded.then(|| FlightFolders::create(&folder)).transpose()?;
+        topology.record = flight.as_ref().map(FlightFolders::places);
+        let robot = Robot::start(&topology, (None, flight), &folder)?;
         left = one_robot(options, robot, &folder, left, &mut report)?;
     }
     if options.link_down {
@@ -182,7 +188,7 @@ fn on_hosts(options: &FaultOptions, network: Network, folder: &Path, report: &mu
     };
     let folder = folder.join(name);
     let walked = std::fs::create_dir(&folder).map_err(FaultError::from).and_then(|()| {
-        let robot = Robot::start(&topology_on_hosts(options)?, Some(hosts), &folder)?;
+        let robot = Robot::start(&topology_on_hosts(options)?, (Some(hosts), None), &folder)?;
         one_robot(options, robot, &folder, steps, report)
     });
     if let Err(error) = walked {
@@ -221,8 +227,9 @@ fn one_robot<'a>(
     }
     robot.pass_until(Time::now() + SETTLE)?;
     let stop = Time::now();
-    robot.end();
-    let evidence = Evidence::read(folder, stop)?;
+    let frozen = robot.end();
+    output::print(&frozen.to_string());
+    let evidence = Evidence::read(folder, stop, frozen)?;
     for (injection, failure) in &mut injections {
         if failure.is_some() {
             injection.until = stop;

@@ -105,7 +105,7 @@ fn real_time(
 ) -> Result<(Vec<ContrastPoint>, Option<f64>), FaultError> {
     let folder = folder.join(if watchdog.is_some() { "contrast-on" } else { "contrast-off" });
     std::fs::create_dir(&folder)?;
-    let mut robot = Robot::start(&topology(options, watchdog)?, None, &folder)?;
+    let mut robot = Robot::start(&topology(options, watchdog)?, (None, None), &folder)?;
     script::walk_until_converged(&mut robot)?;
     let drive = robot.drive_process(JOINT)?;
     robot.walk_to_phase(PHASE)?;
@@ -120,8 +120,8 @@ fn real_time(
     let _ = kill_process(drive, Signal::CONT);
     robot.pass_until(at + AFTER)?;
     let stop = Time::now();
-    robot.end();
-    let evidence = Evidence::read(&folder, stop)?;
+    let frozen = robot.end();
+    let evidence = Evidence::read(&folder, stop, frozen)?;
     let from = Time::from_nanos(at.as_nanos().saturating_sub((BEFORE_S * 1e9) as u64));
     let seconds = |t_ns: u64| (t_ns as f64 - at.as_nanos() as f64) * 1e-9;
     let points =

@@ -1,5 +1,7 @@
 //! Queries of the traces of a run over a span of time.
 
+use std::cmp::Reverse;
+use std::collections::BTreeSet;
 use std::io;
 use std::ops::Range;
 use std::path::Path;
@@ -11,6 +13,7 @@ use exoskeleton_model::control::torque_law::TorqueLaw;
 use exoskeleton_model::joint::Joint;
 use exoskeleton_model::message::DriveState;
 use exoskeleton_model::part::Part;
+use exoskeleton_recording::flight::{Frozen, SpanFiles};
 use sinew::Time;
 
 /// Lateness of a loop above which its host delayed it, us.
@@ -38,6 +41,7 @@ pub(crate) struct Evidence {
     traces: Traces,
     /// Times at which the host delayed a loop, ns.
     stalls: Vec<u64>,
+    frozen: Frozen,
 }
 
 /// Milliseconds from `from` to `t_ns`.
@@ -81,7 +85,7 @@ impl Quantiles {
 }
 
 impl Evidence {
-    pub(crate) fn read(folder: &Path, stop: Time) -> io::Result<Self> {
+    pub(crate) fn read(folder: &Path, stop: Time, frozen: Frozen) -> io::Result<Self> {
         let traces = Traces::read(folder, stop)?;
         let late = |t_ns: u64, late_us: u32| (late_us > STALL_US).then_some(t_ns);
         let mut stalls: Vec<u64> =
@@ -91,7 +95,17 @@ impl Evidence {
         let events = traces.events.values().flatten();
         stalls.extend(events.filter(|event| event.what == SENSOR_LATE).map(|event| event.t_ns));
         stalls.sort_unstable();
-        Ok(Self { traces, stalls })
+        Ok(Self { traces, stalls, frozen })
+    }
+
+    /// The span around this moment that most nodes have frozen; the earliest one of several.
+    pub(crate) fn frozen_around(&self, at: Time) -> Option<&SpanFiles> {
+        let at_ns = at.as_nanos();
+        let spans = self.frozen.spans.iter().filter(|span| (span.begin_ns..=span.end_ns).contains(&at_ns));
+        let nodes = |span: &SpanFiles| {
+            span.files.iter().map(|file| file.node.as_str()).collect::<BTreeSet<_>>().len()
+        };
+        spans.max_by_key(|span| (nodes(span), Reverse(span.begin_ns)))
     }
 
     pub(crate) fn plant(&self, span: Span) -> &[PlantRow] {
@@ -413,6 +427,7 @@ mod tests {
         Evidence {
             traces: Traces { plant, gait: Vec::new(), drives, events: Default::default() },
             stalls: Vec::new(),
+            frozen: Frozen::default(),
         }
     }
 

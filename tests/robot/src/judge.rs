@@ -1,12 +1,16 @@
 //! Compares the injections with the observations: the claims of each step.
 
+use std::collections::BTreeSet;
+
 use exoskeleton::robot::trace::{DriveRow, GaitRow, PlantRow};
 use exoskeleton_model::central::bit;
 use exoskeleton_model::control::faults::FaultBits;
 use exoskeleton_model::joint::Joint;
 use exoskeleton_model::message::{DriveState, GaitMode};
 use exoskeleton_model::part::Part;
+use exoskeleton_recording::flight::SpanFile;
 use sinew::{Time, events::LossReason};
+use sinew_bag::check::{Finding, Kind};
 
 use crate::claim::{Claim, Claims, REPORTED};
 use crate::evidence::{Evidence, Loss, SAFE_AT_LATEST_NS, Span, ms_after, span};
@@ -59,6 +63,10 @@ const SETTLED_NS: u64 = 50_000_000;
 const STOPPED_NS: u64 = 200_000_000;
 /// Allowed growth of the leg's deviation from the person on a rough network, degrees.
 const ROUGH_GROWS_DEG: f64 = 0.3;
+/// Difference of the span between two nodes of one host: the error of their clocks, and a busy host.
+const SPANS_APART_MS: f64 = 50.0;
+/// From the last record of a killed node to its death, ms: it sends each millisecond.
+const LAST_RECORD_MS: f64 = 100.0;
 /// A stride and a bit, ns.
 const STRIDE_NS: u64 = 1_400_000_000;
 
@@ -185,6 +193,35 @@ fn pull_node(claims: &mut Claims<'_>, evidence: &Evidence, injection: &Injection
     claims.timing("the knee's device damps by itself after, ms", LOST_MS, damped);
     stay_safe(claims, evidence, &others, (&away, known_ms));
     claims.exactly("samples with more than that, knee", 0, evidence.undamped_device(Joint::Knee, away));
+    is_frozen(claims, evidence, injection.at, knee);
+}
+
+/// All nodes have the same span around the death of one, which has its last moments.
+fn is_frozen(claims: &mut Claims<'_>, evidence: &Evidence, at: Time, dead: Part) {
+    let span = evidence.frozen_around(at);
+    let files = span.map_or(&[][..], |span| span.files.as_slice());
+    let nodes: BTreeSet<&str> = files.iter().map(|file| file.node.as_str()).collect();
+    claims.exactly("nodes with a frozen file around it", Part::ALL.len(), nodes.len());
+    let apart_ns = span.map(|span| {
+        let apart = |file: &SpanFile| (file.begin_ns - span.begin_ns).max(span.end_ns - file.end_ns);
+        files.iter().map(apart).max().unwrap_or(0)
+    });
+    claims.at_most("difference of their spans, ms", SPANS_APART_MS, apart_ns.map(|ns| ns as f64 * 1e-6));
+    let paths: Vec<_> = files.iter().map(|file| &file.path).collect();
+    let report = sinew_bag::check(&paths).ok().filter(|report| report.files.len() >= Part::ALL.len());
+    let findings = |is_of_ends: bool| {
+        let of_ends = |finding: &&Finding| matches!(finding.kind, Kind::Lost | Kind::Unsent) == is_of_ends;
+        report.as_ref().map(|report| report.findings.iter().filter(of_ends).count() as f64)
+    };
+    claims.at_most("findings of `sinew bag check` in a file", 0.0, findings(false));
+    // A message that is sent at the end of the span arrives behind it.
+    claims.info("its findings between two files, as at the edges", findings(true));
+    let last = files.iter().find(|file| file.has_died && file.node == dead.name());
+    claims.at_most(
+        "from its last record to its death, ms",
+        LAST_RECORD_MS,
+        last.map(|file| -ms_after(at, file.last_ns)),
+    );
 }
 
 /// A node is lost: the nodes that detect it, their reasons, and the drives that damp. Returns the

@@ -7,6 +7,7 @@ use std::{fs, io};
 
 use exoskeleton::robot::launch::children::Children;
 use exoskeleton::robot::launch::console::{Console, View};
+use exoskeleton::robot::launch::flight::FlightFolders;
 use exoskeleton::robot::launch::{BARRIER_PATIENCE, LINES_MAX};
 use exoskeleton::robot::role::Role;
 use exoskeleton::robot::topology::Topology;
@@ -14,6 +15,7 @@ use exoskeleton::run_folder;
 use exoskeleton_model::joint::Joint;
 use exoskeleton_model::message::{DriveState, GaitMode};
 use exoskeleton_model::part::Part;
+use exoskeleton_recording::flight::Frozen;
 use rustix::process::Pid;
 use sinew::Time;
 use sinew_testkit::{Carried, Weather};
@@ -39,6 +41,8 @@ const RAMP: Duration = Duration::from_millis(600);
 /// A running robot.
 pub(crate) struct Robot {
     children: Children,
+    /// `None`: the nodes have no flight recorder. Behind the processes, which end first.
+    flight: Option<FlightFolders>,
     /// `None`: all processes run on this host. Behind the processes, which end first.
     hosts: Option<Hosts>,
     line_sender: SyncSender<String>,
@@ -59,10 +63,11 @@ struct Stride {
 }
 
 impl Robot {
-    /// Starts all five processes at once; without hosts of their own all on this one.
+    /// Starts all five processes at once; without hosts of their own all on this one. `flight` is the flight recorder
+    /// in the topology.
     pub(crate) fn start(
         topology: &Topology,
-        hosts: Option<Hosts>,
+        (hosts, flight): (Option<Hosts>, Option<FlightFolders>),
         folder: &Path,
     ) -> Result<Self, FaultError> {
         let file = folder.join("topology.toml");
@@ -71,6 +76,7 @@ impl Robot {
         let socket = topology.central.socket.clone().expect("a topology for this host has sockets");
         let mut robot = Self {
             children: Children::new(topology, file, folder.to_owned())?,
+            flight,
             hosts,
             line_sender,
             lines,
@@ -281,12 +287,13 @@ impl Robot {
         self.stride = Some(Stride { number, began, lasts });
     }
 
-    /// Stops all processes in order.
-    pub(crate) fn end(mut self) {
+    /// Stops all processes in order. Returns the spans that the nodes have frozen.
+    pub(crate) fn end(mut self) -> Frozen {
         print_line("the robot is stopped");
         self.operator = None;
         self.console.stop();
         self.children.stop();
+        self.flight.as_ref().map(FlightFolders::gather).unwrap_or_default()
     }
 }
 

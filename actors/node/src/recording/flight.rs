@@ -18,6 +18,7 @@ use std::{
 };
 
 use rustix::fs::{Access, access};
+use sinew_model::thread_priority::lower_priority;
 use sinew_record::{FrozenFacts, FrozenSpan, NodeFact, RecordReport};
 use sinew_runtime::{
     incident::{self, IncidentKind, IncidentObserver},
@@ -338,6 +339,8 @@ impl Flight {
     /// Carries out the orders of the thread `freeze`.
     fn work(&self, state: &Weak<NodeState>, journal: &Path) {
         let _running = Running(self);
+        // All nodes of a host copy at the same time: their control loops have the CPUs first.
+        lower_priority();
         while let Some(order) = self.next_order() {
             // The others are carried out nevertheless.
             if catch_unwind(AssertUnwindSafe(|| self.carry_out(order, state, journal))).is_err() {

@@ -7,12 +7,8 @@ use std::{
 };
 
 use serde_json::{Value, json};
-use sinew::{
-    NodeAddress,
-    inspect::{FrozenFacts, Selection},
-};
-use sinew_bag::{BagError, BagWriter, Options, Origin};
-use sinew_recorder::{JournalReader, Names, ReadJournalError, Recorder, Setup, Span, Start};
+use sinew::{NodeAddress, inspect::FrozenFacts};
+use sinew_recorder::{BagError, FileOptions, FrozenRing, RecordingError};
 
 use crate::system::SystemError;
 
@@ -71,51 +67,26 @@ pub(super) fn convert(
     file: PathBuf,
     replace: bool,
 ) -> Result<Converted, SystemError> {
-    let fault = |why: ReadJournalError| SystemError::Bag(why.to_string());
     let Source { ring, facts: FrozenFacts { report, .. }, times, address } = source;
-    let span = Span::scan(ring, times).map_err(fault)?;
-    let reader = JournalReader::open(ring, Start::Oldest).map_err(fault)?;
-    let node = report.node.unwrap_or(*address);
-    let origin = Origin {
-        node: report.name.clone(),
-        address: node.to_string(),
-        incarnation: report.incarnation.map_or(0, |incarnation| incarnation.0),
-        version: concat!("sinew record fetch ", env!("CARGO_PKG_VERSION")).to_owned(),
-        wall_offset_ns: reader.wall_offset().map_err(fault)?,
-        began_ns: if span.records == 0 { *times.start() } else { span.first_ns },
-    };
-    let bag = BagWriter::create(file.clone(), Options { replace, ..Options::default() }, origin)
-        .map_err(creation_error)?;
-    let mut names = Names::default();
-    // All that the node knew of its types is in the report.
-    let kinds: Vec<_> = report.types.iter().map(|one| one.kind).collect();
-    names.learn(report, &kinds);
-    let setup = Setup { node, selection: Selection::default(), names, left_out: Vec::new() };
-    let mut recorder = Recorder::of_span(reader, bag, setup, &span);
-    if trigger.is_some() {
-        // They were read when the span was frozen. A ring has its own, each second.
-        recorder.clocks(span.last_ns, &report.clocks);
-    }
-    loop {
-        match recorder.pump(span.last_ns) {
-            Ok(true) => break,
-            // Messages that are missing are counted by their numbers.
-            Ok(false) | Err(ReadJournalError::Damaged { .. }) => {}
-            Err(why) => return Err(fault(why)),
+    // They were read when the span was frozen. A ring has its own, each second.
+    let has_clocks = trigger.is_some();
+    let ring = FrozenRing { path: ring, report, address: *address, times: times.clone(), has_clocks };
+    let options = FileOptions { replace, ..FileOptions::default() };
+    let program = concat!("sinew record fetch ", env!("CARGO_PKG_VERSION"));
+    let written = ring.write(file.clone(), options, program).map_err(|why| {
+        if let RecordingError::File(why) = why {
+            creation_error(why)
+        } else {
+            SystemError::Bag(why.to_string())
         }
-    }
-    let written = recorder.take_fault();
-    let totals = recorder.finish(span.last_ns)?;
-    if let Some(why) = written {
-        return Err(why.into());
-    }
+    })?;
     Ok(Converted {
         file,
         node: report.name.clone(),
-        written: totals.written,
-        dropped: totals.dropped,
-        first_ns: span.first_ns,
-        last_ns: span.last_ns,
+        written: written.totals.written,
+        dropped: written.totals.dropped,
+        first_ns: written.first_ns,
+        last_ns: written.last_ns,
         times: times.clone(),
         trigger,
         has_died: false,

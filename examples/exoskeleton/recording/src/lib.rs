@@ -2,8 +2,10 @@
 //!
 //! - [`trace`]: rows in CSV files, written by each process itself.
 //! - [`recorder`]: the messages of each node as MCAP, and all of them in one file.
+//! - [`flight`]: the messages around faults, as the nodes have frozen them.
 //! - [`replay`]: the drives computed again from a recording, torque by torque.
 
+pub mod flight;
 pub mod recorder;
 pub mod replay;
 pub mod trace;

@@ -1,9 +1,13 @@
-//! A node is recorded through its client socket, from its start to its end.
+//! A node is recorded through its client socket, from its start to its end, and around a fault.
 
+use std::fs::DirBuilder;
+use std::os::unix::fs::DirBuilderExt as _;
 use std::path::PathBuf;
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::time::Instant;
 
 use exoskeleton_model::message::JointSample;
+use exoskeleton_recording::flight::{Frozen, gather, remove_own_journal};
 use exoskeleton_recording::recorder::{KnownNames, WalkRecorder};
 use sinew::prelude::*;
 use sinew_bag::read::Ordered;
@@ -35,6 +39,10 @@ impl Drop for TestFolder {
 #[derive(Default)]
 struct Sensor {
     seq: u32,
+    /// The sample at which it has the messages frozen; 0: none.
+    fault_at: u32,
+    /// Notified then.
+    noticed: Option<SyncSender<()>>,
 }
 
 impl Actor for Sensor {
@@ -54,6 +62,11 @@ impl Actor for Sensor {
                 flags: 0,
             };
             let _ = context.send(Tid::group(GROUP), &sample);
+            if sensor.seq == sensor.fault_at {
+                context.freeze_recording("the foot slips");
+                let noticed = sensor.noticed.as_ref().expect("the test waits for it");
+                noticed.try_send(()).expect("the test reads one");
+            }
         });
     }
 }
@@ -98,4 +111,48 @@ fn node_is_recorded_from_its_start_to_its_end() {
     let file = Ordered::open(merged).unwrap();
     let topics: Vec<&str> = file.channels().values().map(|channel| channel.topic.as_str()).collect();
     assert!(topics.contains(&"/hip/hip.sensor/exo.joint_sample/view"), "{topics:?}");
+}
+
+#[test]
+fn span_around_a_fault_becomes_a_file() {
+    let folder = TestFolder::new("flight");
+    let [journals, frozen] = ["journals", "frozen"].map(|name| folder.0.join(name));
+    let journal = journals.join("knee");
+    for folder in [&journal, &frozen] {
+        DirBuilder::new().recursive(true).mode(0o700).create(folder).unwrap();
+    }
+    // given: a node with a flight recorder, and a fault at its 50th sample
+    let (memory, disk) = (journal.clone(), frozen.clone());
+    let (noticed, fault) = sync_channel(1);
+    let sensor = move || Sensor { fault_at: 50, noticed: Some(noticed.clone()), ..Sensor::default() };
+    let node = Node::builder("knee")
+        .address([127, 0, 0, 2])
+        .configure(|config| {
+            (config.ndl.multicast, config.ndl.mdns_port) = (None, None);
+            (config.record.folder, config.record.frozen_folder) = (Some(memory), Some(disk));
+            config.record.keep_bytes = 1 << 20;
+        })
+        .app(AppSpec::new("knee.sensor", sensor))
+        .start()
+        .unwrap();
+    fault.recv_timeout(DEADLINE).expect("the sensor runs");
+    node.stop();
+
+    // when
+    remove_own_journal(&journal).expect("its folder has nothing else");
+    let found = gather(&frozen, &journals);
+
+    // then
+    assert!(found.faults.is_empty() && found.spans.len() == 1, "{found}");
+    let span = &found.spans[0];
+    assert!(span.cause.contains("the foot slips"), "{span:?}");
+    let [file] = span.files.as_slice() else { panic!("one node has frozen it: {span:?}") };
+    assert!(file.node == "knee" && !file.has_died && file.written >= 50, "{file:?}");
+    assert!(file.begin_ns <= file.first_ns && file.last_ns <= file.end_ns, "{file:?}");
+    let report = sinew_bag::check(&[&file.path]).unwrap();
+    assert!(report.is_fine(), "{:?}", report.findings);
+    assert!(found.to_string().starts_with("frozen: 1 file, span "), "{found}");
+    // And: the file is in place of the copy
+    assert_eq!(gather(&frozen, &journals), Frozen::default());
+    assert!(file.path.exists());
 }

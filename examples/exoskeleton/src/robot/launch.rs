@@ -4,6 +4,7 @@
 pub mod children;
 mod collect;
 pub mod console;
+pub mod flight;
 mod keys;
 mod plan;
 mod screen;
@@ -17,6 +18,7 @@ use std::time::Duration;
 use exoskeleton_model::intention::IntentionError;
 use exoskeleton_model::part::{Kill, Part};
 use exoskeleton_model::record::Record;
+use exoskeleton_recording::flight::Frozen;
 use exoskeleton_recording::recorder::{Recorded, WalkRecorder};
 use sinew::Time;
 use sinew_figures::stalls::{HostCpu, Witness};
@@ -34,6 +36,7 @@ use crate::run_folder;
 use children::Children;
 use collect::RunTimes;
 use console::Console;
+use flight::FlightFolders;
 use plan::Plan;
 use screen::Screen;
 
@@ -85,6 +88,8 @@ pub struct Walk {
     pub folder: PathBuf,
     /// The recording of all messages; `None`: it was not requested.
     pub recorded: Option<Recorded>,
+    /// The messages around faults, as all nodes have frozen them; `None`: it was not requested.
+    pub frozen: Option<Frozen>,
 }
 
 /// The reason why there was no walk.
@@ -150,7 +155,7 @@ pub enum LaunchError {
 /// The robot did not walk to the last stride. All processes have ended then.
 pub fn run(options: &LaunchOptions) -> Result<Walk, LaunchError> {
     let strides = options.run.strides;
-    let topology = topology(options)?;
+    let mut topology = topology(options)?;
     if let Some(directory) = &options.keys {
         keys::check(&topology, directory)?;
     }
@@ -158,12 +163,19 @@ pub fn run(options: &LaunchOptions) -> Result<Walk, LaunchError> {
     intention.notes().iter().for_each(|note| output::print(&format!("--trial: {note}\n")));
     intention.check_strides(strides)?;
     let folder = run_folder::create(&options.runs, &run_folder::name(&options.run))?;
+    let flight = options.control.record.then(|| FlightFolders::create(&folder)).transpose()?;
+    topology.record = flight.as_ref().map(FlightFolders::places);
     let mut launch = Launch::new(options, &topology, &folder)?;
     let walked = launch.walk();
     let (times, recorded) = launch.end();
+    let frozen = flight.map(|folders| folders.gather());
+    if let (Err(_), Some(frozen)) = (&walked, &frozen) {
+        // They may show why it did not walk.
+        output::print(&frozen.to_string());
+    }
     walked?;
     let (report, record, lateness) = collect::read(&folder, &times, options.run.clone())?;
-    Ok(Walk { report, record, lateness, folder, recorded })
+    Ok(Walk { report, record, lateness, folder, recorded, frozen })
 }
 
 /// The project of a robot with keys, which name it. Its multicast group separates the runs.

@@ -1,6 +1,8 @@
 //! One process of the robot, alone: `exoskeleton node ROLE --topology FILE`.
 
+use std::fs::DirBuilder;
 use std::io::{self, Read};
+use std::os::unix::fs::DirBuilderExt as _;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
@@ -10,7 +12,9 @@ use std::time::SystemTime;
 use exoskeleton_model::central::Resume;
 use exoskeleton_model::joint::Joint;
 use exoskeleton_model::part::Part;
+use exoskeleton_recording::flight::remove_own_journal;
 use sinew::address::Incarnation;
+use sinew::config::RecordConfig;
 use sinew::prelude::*;
 use sinew::signals::StopSignals;
 use thiserror::Error;
@@ -56,6 +60,16 @@ pub enum NodeError {
     /// A trace cannot be started.
     #[error("no trace can be written: {0}")]
     Trace(io::Error),
+    /// A folder of the flight recorder cannot be created.
+    #[error(
+        "the folder {path} of the flight recorder cannot be created: {cause}; name another one in [record] of the topology"
+    )]
+    Folder {
+        /// The folder.
+        path: String,
+        /// The cause.
+        cause: io::Error,
+    },
     /// The node does not start.
     #[error(transparent)]
     Start(#[from] StartError),
@@ -106,8 +120,10 @@ fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<Ex
     let events = record::<EventRow>(options, &format!("{part}-events"))?;
     let watched = Arc::new(OnceLock::new());
     let watch = watch::spec(part, WatchParts { node: watched.clone(), events: events.trace() });
-    let builder =
-        Node::builder(part.name()).config(topology.node_config(part)).incarnation(incarnation).app(watch);
+    let config = topology.node_config(part);
+    let record_config = config.record.clone();
+    create_folders(&record_config)?;
+    let builder = Node::builder(part.name()).config(config).incarnation(incarnation).app(watch);
     let (builder, finish_trace): (NodeBuilder, Box<dyn FnOnce() -> u64>) = match part {
         Part::Central => {
             let trace = record(options, part.name())?;
@@ -157,7 +173,30 @@ fn run_node(part: Part, topology: &Topology, options: &NodeOptions) -> Result<Ex
     for lost in [finish_trace(), events.finish()].into_iter().filter(|lost| *lost > 0) {
         tracing::warn!(lost, "rows of a trace were lost: the disk was too slow");
     }
+    remove_journal(&record_config);
     Ok(code)
+}
+
+/// Creates the folders of the flight recorder, for this user alone.
+fn create_folders(config: &RecordConfig) -> Result<(), NodeError> {
+    for folder in [&config.folder, &config.frozen_folder].into_iter().flatten() {
+        let created = DirBuilder::new().recursive(true).mode(0o700).create(folder);
+        created.map_err(|cause| NodeError::Folder { path: folder.display().to_string(), cause })?;
+    }
+    Ok(())
+}
+
+/// Removes the journal of the flight recorder after the node's end, also where the process that started it was killed.
+/// The last node removes the folder around those of all nodes.
+fn remove_journal(config: &RecordConfig) {
+    let Some(folder) = &config.folder else { return };
+    // It stays with the journal of an earlier incarnation that was killed, which is not moved yet.
+    if remove_own_journal(folder).is_ok()
+        && let Some(all) = folder.parent()
+    {
+        // It stays with the folders of other nodes.
+        let _ = std::fs::remove_dir(all);
+    }
 }
 
 fn record<R: TraceRow>(options: &NodeOptions, name: &str) -> Result<Recording<R>, NodeError> {

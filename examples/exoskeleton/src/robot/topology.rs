@@ -19,6 +19,13 @@ pub use free::for_this_host;
 
 /// Bytes of the newest messages that a node keeps while it is recorded: some seconds, and little of `/dev/shm`.
 const RECORD_KEEP_BYTES: usize = 8 << 20;
+/// Time before a fault that a node freezes, and time after it. A node writes up to 2 MB/s, so its journal has four
+/// seconds at least.
+const FROZEN_KEEP: Duration = Duration::from_secs(2);
+const FROZEN_AFTER: Duration = Duration::from_secs(1);
+/// Maximum number of spans that a node freezes in one run, of at most [`RECORD_KEEP_BYTES`] each. A host that stalls
+/// makes inputs late, which is a fault, too: these spans must not take the place of that of a killed node.
+const FROZEN_MAX: usize = 16;
 /// Port of multicast DNS (RFC 6762).
 const MDNS_PORT: u16 = 5353;
 
@@ -31,6 +38,8 @@ pub struct Topology {
     pub discovery: Discovery,
     /// How the control loops run.
     pub control: Control,
+    /// The flight recorder of the nodes; `None`: they freeze nothing.
+    pub record: Option<FlightRecorder>,
     /// The central node.
     pub central: NodePlace,
     /// The joint nodes.
@@ -80,6 +89,18 @@ pub struct Control {
     pub release: ReleaseBy,
     /// Whether each drive also sends its ticks, for a recording that can be replayed. Default: no.
     pub record: bool,
+}
+
+/// The flight recorder of the nodes: each one keeps its newest messages, and around a fault all freeze the same span.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FlightRecorder {
+    /// Folder in memory, as `/dev/shm/my-leg`. Each node creates a folder of its name there for its journal, of 8 MiB,
+    /// and removes it when it ends in order. That of a killed node stays for its next incarnation.
+    pub folder: PathBuf,
+    /// Folder of the frozen spans: at most 16 of each node, of at most 8 MiB. Each node creates it if needed. It may
+    /// lie on a disk.
+    pub frozen_folder: PathBuf,
 }
 
 /// The source of the release to walk, at the start and after the loss of a part.
@@ -199,6 +220,12 @@ impl Topology {
         config.security.keys = self.keys.as_ref().map(|keys| keys.join("nodes").join(part.name()));
         config.lncl.socket.clone_from(&place.socket);
         config.record.keep_bytes = RECORD_KEEP_BYTES;
+        if let Some(FlightRecorder { folder, frozen_folder }) = &self.record {
+            config.record.folder = Some(folder.join(part.name()));
+            config.record.frozen_folder = Some(frozen_folder.clone());
+            (config.record.keep, config.record.after) = (FROZEN_KEEP, FROZEN_AFTER);
+            config.record.frozen_max = FROZEN_MAX;
+        }
         config
     }
 }

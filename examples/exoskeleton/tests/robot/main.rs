@@ -18,6 +18,15 @@ fn start(folder: &Path, arguments: &[&str]) -> Child {
     process::start(PROGRAM, folder, arguments, &[])
 }
 
+/// The names of the folders in memory with the journals of the robot that this launcher has started.
+fn journals(launcher: u32) -> Vec<String> {
+    let prefix = format!("sinew-exoskeleton-{launcher}-");
+    // Without `/dev/shm` they are in the folder of the test, which is removed.
+    let entries = std::fs::read_dir("/dev/shm").into_iter().flatten().flatten();
+    let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
+    names.filter(|name| name.starts_with(&prefix)).collect()
+}
+
 /// Runs `sinew`, which another package builds into the same directory, in the folder of a test.
 fn sinew(folder: &Path, words: &[&str]) -> Output {
     let test = std::env::current_exe().expect("a test has a path");

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use exoskeleton::robot::topology::{Topology, for_this_host};
 
-use crate::{alone, end, folder, start};
+use crate::{alone, end, folder, journals, start};
 
 fn topology_file(folder: &Path, text: &str) -> String {
     let path = folder.join("topology.toml");
@@ -27,7 +27,9 @@ fn five_processes_wait_for_the_late_one() {
     let arguments =
         ["--strides", "8", "--runs", runs.to_str().unwrap(), "--report", report.to_str().unwrap()];
 
-    let output = end(start(&folder, &arguments), "the walk ends");
+    let child = start(&folder, &arguments);
+    let id = child.id();
+    let output = end(child, "the walk ends");
 
     let stdout = String::from_utf8_lossy(&output.stdout);
     let failed = String::from_utf8_lossy(&output.stderr);
@@ -39,6 +41,7 @@ fn five_processes_wait_for_the_late_one() {
     assert_eq!(report["barrier"]["torque_before_release_nm"], 0.0);
     assert!(report["barrier"]["held_s"].as_f64().unwrap() > 1.0, "{report}");
     assert!(report["timing_measured"].as_bool().unwrap());
+    assert_eq!(journals(id), Vec::<String>::new(), "they are removed with the robot");
     replay_finds_no_difference(&folder, &stdout);
     std::fs::remove_dir_all(&folder).unwrap();
 }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use crate::{DEADLINE, SOCKETS, alone, end, folder, sinew, start};
+use crate::{DEADLINE, SOCKETS, alone, end, folder, journals, sinew, start};
 
 const NODES: [&str; 4] = ["ankle", "central", "hip", "knee"];
 const LOOK_PERIOD: Duration = Duration::from_millis(100);
@@ -44,23 +44,24 @@ fn see_all_nodes(folder: &Path) -> Result<(), String> {
 }
 
 #[test]
-fn killed_launcher_leaves_no_socket() {
+fn killed_launcher_leaves_no_socket_and_no_journal() {
     let _alone = alone();
     let folder = folder("sockets");
     // given: a robot without configured sockets
-    let mut child = start(&folder, &["--strides", "1000", "--no-record", "--runs", "runs"]);
+    let mut child = start(&folder, &["--strides", "1000", "--runs", "runs"]);
     let id = child.id();
 
     // when, then
     until("all nodes are seen", || see_all_nodes(&folder));
     let expected = NODES.map(|node| format!("sinew-exoskeleton-{id}-{node}.sock"));
     assert_eq!(sockets(&folder), expected, "a socket for each node");
+    assert_eq!(journals(id).len(), 1, "a folder with the journals");
 
     // and: they are removed with the robot
     child.kill().expect("it is a child of this process");
     let _ = end(child, "it is killed");
-    until("the sockets are gone", || {
-        let left = sockets(&folder);
+    until("the sockets and the journals are gone", || {
+        let left = [sockets(&folder), journals(id)].concat();
         if left.is_empty() { Ok(()) } else { Err(left.join(", ")) }
     });
     // The nodes may still be writing their last rows there.

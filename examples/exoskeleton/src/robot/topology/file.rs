@@ -13,7 +13,10 @@ use serde::{Deserialize, Serialize};
 use sinew::NodeAddress;
 use sinew::config::{Interface, Interfaces, Seed};
 
-use super::{Control, ControlThread, Discovery, DrivePlace, NodePlace, PlantPlace, Topology, TopologyError};
+use super::{
+    Control, ControlThread, Discovery, DrivePlace, FlightRecorder, NodePlace, PlantPlace, Topology,
+    TopologyError,
+};
 
 const OFF: &str = "off";
 /// The path of a unix socket has at most 107 bytes; Sinew accepts 100.
@@ -30,6 +33,7 @@ struct File {
     discovery: DiscoveryTable,
     #[serde(default)]
     control: Control,
+    record: Option<FlightRecorder>,
     central: NodeTable,
     hip: NodeTable,
     knee: NodeTable,
@@ -121,6 +125,7 @@ pub(super) fn parse(text: &str) -> Result<Topology, TopologyError> {
                 keys: file.keys,
                 discovery,
                 control: file.control,
+                record: file.record,
                 central,
                 joints,
                 plant,
@@ -266,6 +271,7 @@ pub(super) fn write(topology: &Topology) -> String {
             missed_max: discovery.missed_max,
         },
         control: topology.control,
+        record: topology.record.clone(),
         central: node(Part::Central),
         hip: node(Part::Joint(Joint::Hip)),
         knee: node(Part::Joint(Joint::Knee)),

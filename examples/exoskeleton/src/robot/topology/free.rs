@@ -45,6 +45,7 @@ pub fn for_this_host(seed: u64) -> io::Result<Topology> {
             release: ReleaseBy::Itself,
             record: false,
         },
+        record: None,
         central: node(Part::Central, 1),
         joints: [(Joint::Hip, 2), (Joint::Knee, 3), (Joint::Ankle, 4)]
             .map(|(joint, last)| node(Part::Joint(joint), last)),
