@@ -77,6 +77,9 @@ pub struct CheckOrder {
     pub ignored: Vec<String>,
     /// The time from the start of the applications to the first message from or to one of them, in nanoseconds.
     pub starts_before_ns: u64,
+    /// The type by which the applications record their turns.
+    #[serde(default)]
+    pub turns: Option<Kind>,
 }
 
 /// A message of a recording. Times are in nanoseconds of one clock.
@@ -255,6 +258,9 @@ impl CheckOrder {
         if let Some(start) = start {
             replay = replay.starts_at(start);
         }
+        if let Some(kind) = self.turns {
+            replay = replay.turns(kind);
+        }
         for (kind, schema) in &self.types {
             replay = replay.recorded_type(*kind, schema.clone());
         }
@@ -268,7 +274,8 @@ impl CheckOrder {
     pub fn run(&self, apps: Vec<DynApp>) -> CheckReport {
         match self.check(apps) {
             Ok(Checked { messages: 0, .. }) => CheckReport::Failed(
-                "the recording has no message that an application under test sent".to_owned(),
+                "the recording has no message to compare: none that an application under test sent, or none of the type of its turns"
+                    .to_owned(),
             ),
             Ok(checked) => CheckReport::Identical {
                 messages: checked.messages as u64,
