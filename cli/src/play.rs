@@ -68,6 +68,9 @@ pub(crate) struct Order {
     /// Do not compare this field of payloads, such as one with a time: `t_ns`, `pose.t_ns`. May be given several times
     #[arg(long = "ignore", value_name = "FIELD", requires = "check")]
     ignored: Vec<String>,
+    /// The applications record their turns by this type: they get these messages back, and only these are compared
+    #[arg(long, value_name = "TYPE", requires = "check")]
+    turns: Option<String>,
     /// The applications start so long before their first message, as in 10ms for one with a timer of 10 ms
     #[arg(long, value_name = "TIME", default_value = "0s", value_parser = span)]
     start_before: Duration,

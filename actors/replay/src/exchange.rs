@@ -77,6 +77,9 @@ pub struct CheckOrder {
     pub ignored: Vec<String>,
     /// The time from the start of the applications to the first message from or to one of them, in nanoseconds.
     pub starts_before_ns: u64,
+    /// The type by which the applications record their turns.
+    #[serde(default)]
+    pub turns: Option<Kind>,
 }
 
 /// A message of a recording. Times are in nanoseconds of one clock.
@@ -217,10 +220,20 @@ impl CheckOrder {
         expected
     }
 
-    /// Returns when the applications start, if a message is from or to one of them.
-    fn start(&self, messages: &[TimedMessage]) -> Option<Time> {
-        let first = messages.first()?.at;
-        Some(Time::from_nanos(first.as_nanos().saturating_sub(self.starts_before_ns)))
+    /// Returns when the applications start; `None`: with the first message. Where the start is stated, messages to
+    /// groups before it are removed: they did not arrive at these applications, and would begin the grids of their
+    /// timers too early.
+    fn start(&self, tested: &BTreeSet<Tid>, messages: &mut Vec<TimedMessage>) -> Option<Time> {
+        if self.starts_before_ns == 0 {
+            return None;
+        }
+        let is_own = |message: &&TimedMessage| {
+            tested.contains(&message.source) || tested.contains(&message.destination)
+        };
+        let first = messages.iter().find(is_own)?.at;
+        let start = Time::from_nanos(first.as_nanos().saturating_sub(self.starts_before_ns));
+        messages.retain(|message| message.at >= start);
+        Some(start)
     }
 
     /// Runs the applications under test, and compares. Ignores all others.
@@ -239,9 +252,14 @@ impl CheckOrder {
                 replay = replay.app(app);
             }
         }
-        let messages = self.messages_of(&tested);
-        if let Some(start) = self.start(&messages) {
+        let mut messages = self.messages_of(&tested);
+        // An output may be the first message: without a start the first input would be it.
+        let start = self.start(&tested, &mut messages).or_else(|| Some(messages.first()?.at));
+        if let Some(start) = start {
             replay = replay.starts_at(start);
+        }
+        if let Some(kind) = self.turns {
+            replay = replay.turns(kind);
         }
         for (kind, schema) in &self.types {
             replay = replay.recorded_type(*kind, schema.clone());
@@ -256,7 +274,8 @@ impl CheckOrder {
     pub fn run(&self, apps: Vec<DynApp>) -> CheckReport {
         match self.check(apps) {
             Ok(Checked { messages: 0, .. }) => CheckReport::Failed(
-                "the recording has no message that an application under test sent".to_owned(),
+                "the recording has no message to compare: none that an application under test sent, or none of the type of its turns"
+                    .to_owned(),
             ),
             Ok(checked) => CheckReport::Identical {
                 messages: checked.messages as u64,
@@ -384,5 +403,25 @@ mod tests {
         let messages = order.messages[..5].to_vec();
         let order = CheckOrder { messages, ..CheckOrder::default() };
         assert_eq!(order.messages_of(&BTreeSet::from([own])).len(), 1);
+    }
+    #[test]
+    fn stated_start_counts_from_the_first_message_of_the_applications() {
+        let own = Tid::from_bits(message(0).source);
+        let at = |arrived_ns, destination: Tid| RecordedMessage {
+            source: message(0).destination,
+            destination: destination.bits(),
+            arrived_ns,
+            ..message(0)
+        };
+        let group = Tid::group("demo.status");
+        let messages = vec![at(100, group), at(450, group), at(500, own), at(END_NS, group)];
+        let starts = |starts_before_ns| {
+            let order = CheckOrder { messages: messages.clone(), starts_before_ns, ..CheckOrder::default() };
+            let (tested, mut chosen) = (BTreeSet::from([own]), Vec::new());
+            chosen.extend(messages.iter().map(RecordedMessage::arrived));
+            (order.start(&tested, &mut chosen), chosen.len())
+        };
+        assert_eq!(starts(60), (Some(Time::from_nanos(440)), 3));
+        assert_eq!(starts(0), (None, 4), "all messages to groups may be inputs");
     }
 }

@@ -81,6 +81,7 @@ pub struct Replay {
     latency: Duration,
     turn_within: Duration,
     first_wait: u64,
+    turns: Option<Kind>,
     schemas: BTreeMap<Kind, Schema>,
 }
 
@@ -109,6 +110,7 @@ impl Replay {
             latency: Duration::ZERO,
             turn_within: TURN_WITHIN,
             first_wait: 1,
+            turns: None,
             schemas: BTreeMap::new(),
         }
     }
@@ -166,6 +168,48 @@ impl Replay {
         self
     }
 
+    /// Sets the type by which the applications record their turns: the time, and the inputs that were used. Each gets its
+    /// recorded messages of this type back, at the times at which they were sent, and computes the turn again.
+    /// [`check`](Self::check) compares only messages of this type.
+    ///
+    /// For programs whose outputs depend on how late a timer was on the wall clock. No replay has these times.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{prelude::*, replay::{Replay, TimedMessage}};
+    ///
+    /// payload!("demo.turn", Stream => #[derive(Clone)] struct Turn { t_ns: u64, degrees: f64, newton_metres: f64 });
+    ///
+    /// /// Computes each turn of the knee again. The knee itself has a timer.
+    /// struct Again { gain: f64 }
+    /// # impl Actor for Again { type Context = AppContext<Self>; }
+    /// impl Handler<Delivery<Turn>> for Again {
+    ///     type Result = ();
+    ///     fn handle(&mut self, turn: Delivery<Turn>, ctx: &mut Self::Context) {
+    ///         let newton_metres = self.gain * turn.degrees;
+    ///         let _ = ctx.send(Tid::group("turns"), &Turn { newton_metres, ..turn.payload });
+    ///     }
+    /// }
+    ///
+    /// let knee: Tid = "10.0.0.2/1001".parse()?;
+    /// let turn = Turn { t_ns: 1_000_083, degrees: 10.0, newton_metres: 5.0 };
+    /// let recorded = vec![TimedMessage::of(Time::from_nanos(1_000_151), knee, Tid::group("turns"), &turn)];
+    /// let check = |gain| {
+    ///     let again = AppSpec::new("knee", move || Again { gain }).handles::<Turn>();
+    ///     Replay::new().app(again).name("knee", knee).turns(Turn::KIND).check(recorded.clone())
+    /// };
+    /// check(0.5)?;
+    /// let difference = check(0.25).expect_err("the gain differs").to_string();
+    /// assert!(difference.contains("`newton_metres` was 5.0 and is 2.5"), "{difference}");
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
+    #[must_use]
+    pub const fn turns(mut self, kind: Kind) -> Self {
+        self.turns = Some(kind);
+        self
+    }
+
     /// Sets the structure that a type had when it was recorded. It explains messages that an application under test
     /// cannot decode: [`Misfit::differences`].
     #[must_use]
@@ -177,8 +221,8 @@ impl Replay {
     /// Runs the applications on these inputs, which must be in the order of their times. Returns everything
     /// that the applications sent, in order.
     ///
-    /// Inputs from an application under test are ignored, as it sends them itself. Inputs for others are
-    /// ignored too.
+    /// Inputs from an application under test are ignored, as it sends them itself, except records of its
+    /// [turns](Self::turns). Inputs for others are ignored too.
     ///
     /// # Errors
     /// An application panicked, ended, blocked or never became idle; the inputs are not in order; or two
@@ -205,7 +249,7 @@ impl Replay {
         let mut inputs = inputs.into_iter().peekable();
         let start = self.starts_at.or_else(|| inputs.peek().map(|input| input.at)).unwrap_or(START);
         let time = VirtualTime::starting_at(start);
-        let world = Arc::new(World::new(time.clock(), self.latency));
+        let world = Arc::new(World::new(time.clock(), self.latency, self.turns));
         world.expect(expected);
         let progress = Arc::new(Progress::default());
         let fault = |fault| ReplayError { at: world.clock().now(), fault, outputs: world.take_outputs() };
@@ -295,8 +339,15 @@ impl Replay {
         recorded: Vec<TimedMessage>,
     ) -> Result<Checked, CheckError> {
         let tested = self.addresses();
-        let (expected, inputs): (Vec<_>, Vec<_>) =
+        let is_compared = |message: &TimedMessage| self.turns.is_none_or(|kind| message.kind == kind);
+        let (mut expected, mut inputs): (Vec<_>, Vec<_>) =
             recorded.into_iter().partition(|message| tested.contains(&message.source));
+        expected.retain(is_compared);
+        if self.turns.is_some() {
+            inputs.extend(expected.iter().cloned());
+            // Stable: at one time a turn comes after the inputs that it may have used.
+            inputs.sort_by_key(|input| input.at);
+        }
         // Timers between the last input and the last output still fire.
         let end = expected.iter().chain(&inputs).map(|message| message.at).max();
         let ends_at = self.ends_at.or(end);
@@ -309,6 +360,9 @@ impl Replay {
         let (mut replayed, misfits) = self.run_until(ends_at, missing, inputs)?;
         // While one source has too few messages, the others send more than the recording has.
         replayed.retain(|message| {
+            if !is_compared(message) {
+                return false;
+            }
             let rest = counts.entry(message.source).or_default();
             let is_expected = *rest > 0;
             *rest = rest.saturating_sub(1);

@@ -15,7 +15,7 @@ use sinew_runtime::{
     router::{MessageSink, SubmitError},
     tid::{AppAddress, NodeAddress, Tid},
     time::Time,
-    wire::{Flags, Message},
+    wire::{Flags, Kind, Message},
 };
 
 use crate::{TimedMessage, misfit::Misfits};
@@ -28,6 +28,8 @@ const OPEN_MAX: usize = 65_536;
 pub(crate) struct World {
     clock: Clock,
     latency: Duration,
+    /// The type by which the applications record their turns.
+    turns: Option<Kind>,
     misfits: Arc<Misfits>,
     state: Mutex<State>,
 }
@@ -56,8 +58,8 @@ struct Open {
 }
 
 impl World {
-    pub(crate) fn new(clock: Clock, latency: Duration) -> Self {
-        Self { clock, latency, misfits: Arc::default(), state: Mutex::default() }
+    pub(crate) fn new(clock: Clock, latency: Duration, turns: Option<Kind>) -> Self {
+        Self { clock, latency, turns, misfits: Arc::default(), state: Mutex::default() }
     }
 
     /// Returns the inputs that the applications could not decode.
@@ -128,9 +130,15 @@ impl World {
         true
     }
 
-    /// Delivers an input. Messages from an application under test are ignored: the replay makes them itself.
+    /// Delivers an input. Messages from an application under test are ignored, as the replay makes them itself: except
+    /// the records of its turns, which it gets back.
     pub(crate) fn deliver(&self, input: TimedMessage) {
-        if lock(&self.state).apps.contains_key(&input.source) {
+        let own = lock(&self.state).apps.get(&input.source).cloned();
+        if let Some(own) = own {
+            if self.turns == Some(input.kind) {
+                // A full mailbox refuses it, as it does other messages.
+                let _ = own.submit(input.into_message());
+            }
             return;
         }
         let is_answer = input.is_answer();
@@ -180,7 +188,8 @@ impl MessageSink for World {
             if state.is_over {
                 return Ok(());
             }
-            if let Some(rest) = state.expected.get_mut(&header.source) {
+            let is_expected = self.turns.is_none_or(|kind| kind == header.kind);
+            if let Some(rest) = state.expected.get_mut(&header.source).filter(|_| is_expected) {
                 *rest = rest.saturating_sub(1);
             }
             state.outputs.push(TimedMessage::new(now, &header, message.payload.clone()));

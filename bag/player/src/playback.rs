@@ -3,7 +3,10 @@
 use std::{
     collections::{BTreeMap, BTreeSet},
     path::Path,
-    sync::Arc,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
 };
 
 use sinew_bag::{
@@ -82,6 +85,8 @@ pub struct Playback {
     wall_offset_ns: i64,
     node: String,
     damage: Vec<String>,
+    /// The request to stop.
+    stop: Arc<AtomicBool>,
 }
 
 /// One file.
@@ -115,6 +120,7 @@ impl Playback {
             wall_offset_ns: 0,
             node: String::new(),
             damage: Vec::new(),
+            stop: Arc::default(),
         };
         let (mut known, mut parts, mut origin) = (BTreeMap::new(), BTreeSet::new(), None);
         for path in files {
@@ -181,6 +187,12 @@ impl Playback {
         }
     }
 
+    /// Ends the playback as soon as `stop` is true, also while messages are skipped that are not wanted: then
+    /// [`next_message`](Self::next_message) returns `None`.
+    pub fn stop_at(&mut self, stop: Arc<AtomicBool>) {
+        self.stop = stop;
+    }
+
     /// Returns the time from the first message of the recording, of any channel, to this one. Zero before a message was
     /// read.
     #[must_use]
@@ -188,7 +200,7 @@ impl Playback {
         self.start_ns.map_or(0, |start| at_ns.saturating_sub(start))
     }
 
-    /// Reads the next message; `None` at the end.
+    /// Reads the next message; `None` at the end, or when it was [stopped](Self::stop_at).
     ///
     /// # Errors
     /// A file cannot be read any more.
@@ -197,6 +209,9 @@ impl Playback {
             return self.read_next();
         }
         loop {
+            if self.stop.load(Ordering::Relaxed) {
+                return Ok(None);
+            }
             let is_full = self.held.len() >= HELD_MAX || self.held_bytes >= HELD_BYTES_MAX;
             let is_due = |sent_ns: u64| {
                 is_full || self.read_to_ns.is_none_or(|read_to| read_to >= sent_ns.saturating_add(WINDOW_NS))
@@ -231,6 +246,9 @@ impl Playback {
                 self.advance(at)?;
             }
         }
+        if self.stop.load(Ordering::Relaxed) {
+            return Ok(None);
+        }
         let heads = self.files.iter().enumerate();
         let heads = heads.filter_map(|(at, file)| Some((file.next.as_ref()?.arrived_ns, at)));
         let Some((_, at)) = heads.min() else { return Ok(None) };
@@ -243,6 +261,11 @@ impl Playback {
     fn advance(&mut self, at: usize) -> Result<(), BagError> {
         let Some(file) = self.files.get_mut(at) else { return Ok(()) };
         loop {
+            // The next wanted message may be gigabytes away.
+            // SYNC: Relaxed, no other data depends on the flag.
+            if self.stop.load(Ordering::Relaxed) {
+                return Ok(());
+            }
             let message = match file.ahead.take() {
                 Some(message) => message,
                 None => match file.ordered.next_message()? {

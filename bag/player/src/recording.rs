@@ -8,7 +8,7 @@ use sinew_replay::{
     CheckError, Checked,
     exchange::{CheckOrder, RecordedMessage},
 };
-use sinew_runtime::{app::DynApp, tid::Tid};
+use sinew_runtime::{app::DynApp, tid::Tid, wire::Kind};
 
 use crate::{Order, Playback, Recorded, RecordedChannel};
 
@@ -36,8 +36,10 @@ pub enum RecordingError {
         /// The names in the recording.
         known: String,
     },
-    /// The recording has no message that an application under test sent.
-    #[error("the recording has no message that an application under test sent; record them, too")]
+    /// The recording has no message that an application under test sent, or none of the type of its turns.
+    #[error(
+        "the recording has no message to compare: none that an application under test sent, or none of the type of its turns; record them, too"
+    )]
     NothingSent,
     /// The applications did not reach the end, or sent other messages.
     #[error(transparent)]
@@ -125,6 +127,14 @@ impl Recording {
     #[must_use]
     pub fn starts_before(mut self, time: Duration) -> Self {
         self.order.starts_before_ns = u64::try_from(time.as_nanos()).unwrap_or(u64::MAX);
+        self
+    }
+
+    /// Sets the type by which the applications record their turns, by its name: see
+    /// [`Replay::turns`](sinew_replay::Replay::turns). Only messages of this type are compared.
+    #[must_use]
+    pub fn turns(mut self, type_name: &str) -> Self {
+        self.order.turns = Some(Kind::named(type_name));
         self
     }
 

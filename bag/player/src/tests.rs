@@ -3,7 +3,10 @@
 use std::{
     fs,
     path::PathBuf,
-    sync::atomic::{AtomicU32, Ordering},
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicU32, Ordering},
+    },
 };
 
 use sinew::{prelude::*, schema::schema_of};
@@ -234,6 +237,27 @@ fn messages_are_in_the_order_of_sending() {
     };
     assert_eq!(read(Order::Sent), (vec![(3, 50), (1, 0), (2, 0)], MS));
     assert_eq!(read(Order::Arrived), (vec![(1, 0), (2, 0), (3, 50)], MS));
+}
+
+#[test]
+fn stopped_playback_skips_no_further_message() {
+    let folder = TestFolder::new();
+    let path = walk(&folder, 0.3);
+    for order in [Order::Sent, Order::Arrived] {
+        let stop = Arc::new(AtomicBool::new(false));
+        let mut playback = Playback::open(&[&path], order).unwrap();
+        playback.stop_at(stop.clone());
+        assert!(playback.next_message().unwrap().is_some());
+        // When
+        stop.store(true, Ordering::Relaxed);
+        assert_eq!(playback.next_message().unwrap(), None);
+    }
+    // And: not even to the first wanted one
+    let mut playback = Playback::open(&[&path], Order::Arrived).unwrap();
+    playback.retain(|_| false);
+    playback.stop_at(Arc::new(AtomicBool::new(true)));
+    assert_eq!(playback.next_message().unwrap(), None);
+    assert_eq!(playback.offset_ns(u64::MAX), 0, "no message was read");
 }
 
 #[test]

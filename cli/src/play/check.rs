@@ -46,6 +46,9 @@ pub(crate) fn show(order: &Order, stop: &StopRequest) -> Result<Report, SystemEr
     for field in &order.ignored {
         recording = recording.ignoring(field.as_str());
     }
+    if let Some(name) = &order.turns {
+        recording = recording.turns(name);
+    }
     let request = recording.into_order(&order.apps)?;
     let names: BTreeMap<u64, String> = request.names.iter().map(|(name, tid)| (*tid, name.clone())).collect();
     let folder = Folder::new()?;

@@ -178,6 +178,7 @@ impl Session<'_> {
         (target, sources): (&mut Target, &mut Sources),
     ) -> Result<(), SystemError> {
         let mut playback = first;
+        playback.stop_at(self.stop.flag());
         loop {
             self.played.passes += 1;
             let (due, accepted) = (self.due, self.accepted());
@@ -194,6 +195,7 @@ impl Session<'_> {
                 return Ok(());
             }
             playback = self.order.open()?;
+            playback.stop_at(self.stop.flag());
         }
     }
 
@@ -213,7 +215,7 @@ impl Session<'_> {
         while let Some(message) = playback.next_message()? {
             // Also where messages are left out for a long time.
             if self.stop.is_there() {
-                return Ok(End::Asked);
+                break;
             }
             let offset = Duration::from_nanos(playback.offset_ns(message.sent_ns));
             if self.order.to.is_some_and(|to| offset > to) {
@@ -244,7 +246,8 @@ impl Session<'_> {
                 return Ok(end);
             }
         }
-        Ok(End::Complete)
+        // The playback ends early when it is asked to.
+        Ok(if self.stop.is_there() { End::Asked } else { End::Complete })
     }
 
     /// Waits until a message is due. Returns the end if there is a reason for one.

@@ -31,6 +31,11 @@ impl StopRequest {
         Ok(Self(asked))
     }
 
+    /// Returns the flag that is true from the request on.
+    pub(crate) fn flag(&self) -> Arc<AtomicBool> {
+        Arc::clone(&self.0)
+    }
+
     pub(crate) fn is_there(&self) -> bool {
         self.0.load(Ordering::Relaxed)
     }

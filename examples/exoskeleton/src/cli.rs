@@ -7,12 +7,14 @@ use std::time::Duration;
 use clap::{Parser, Subcommand};
 use exoskeleton::output;
 use exoskeleton::report::{self, Report, RunDescription, RunMode, Verdict};
+use exoskeleton::robot::check_drive::{self, CheckDriveError};
 use exoskeleton::robot::launch::{self, LaunchError, LaunchOptions};
 use exoskeleton::robot::node::{self, NodeError, NodeOptions};
 use exoskeleton::robot::plant::{self, PlantError};
 use exoskeleton::robot::topology::{Control, ControlThread, ReleaseBy};
 use exoskeleton::run_folder;
 use exoskeleton_model::control::drive::DriveConfig;
+use exoskeleton_model::joint::Joint;
 use exoskeleton_model::lockstep::{self, LockStepConfig, LockStepError};
 use exoskeleton_model::part::Kill;
 use exoskeleton_recording::replay::{self, ReplayError};
@@ -76,6 +78,22 @@ pub(crate) struct Arguments {
 enum SubCommand {
     /// Runs one part of the robot until SIGINT, SIGTERM or SIGHUP, so that it can be spread over several hosts.
     Node(NodeOptions),
+    /// Computes the drive of one joint again, on a recorded walk: run `sinew play --check walk.mcap --turns
+    /// exo.drive_tick -- exoskeleton check-drive knee`.
+    CheckDrive {
+        /// hip, knee or ankle.
+        #[arg(value_parser = joint)]
+        joint: Joint,
+        /// Multiply assistance, stiffness and damping, to see a difference.
+        #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
+        gain_factor: f64,
+    },
+}
+
+/// Reads the name of a joint.
+fn joint(text: &str) -> Result<Joint, String> {
+    let found = Joint::ALL.into_iter().find(|joint| joint.name() == text);
+    found.ok_or_else(|| "choose hip, knee or ankle".to_owned())
 }
 
 const EXIT_CODES: &str = "\
@@ -130,6 +148,9 @@ pub(crate) enum RunError {
     /// A part of the robot did not run.
     #[error(transparent)]
     Node(#[from] NodeError),
+    /// A drive was not checked.
+    #[error(transparent)]
+    CheckDrive(#[from] CheckDriveError),
     /// The recording cannot be replayed.
     #[error("--replay: {0}")]
     Replay(#[from] ReplayError),
@@ -151,8 +172,12 @@ fn check_kill(arguments: &Arguments) -> Result<(), RunError> {
 
 /// Runs the command of the arguments.
 pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode, RunError> {
-    if let Some(SubCommand::Node(options)) = &arguments.command {
-        return Ok(node::run(options)?);
+    match &arguments.command {
+        Some(SubCommand::Node(options)) => return Ok(node::run(options)?),
+        Some(SubCommand::CheckDrive { joint, gain_factor }) => {
+            return Ok(check_drive::run(*joint, with_gain(*joint, *gain_factor))?);
+        }
+        None => {}
     }
     if let Some(file) = &arguments.replay {
         return replay_drives(file, arguments.gain_factor);
@@ -164,16 +189,19 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode, RunError> {
 
 /// Computes the drives of a recorded walk again, and prints the comparison.
 fn replay_drives(file: &Path, gain_factor: f64) -> Result<ExitCode, RunError> {
-    let replayed = replay::replay(file, |joint| {
-        let mut config = DriveConfig::standard(joint);
-        let law = &mut config.law;
-        for gain in [&mut law.assist, &mut law.stiffness_nm_rad, &mut law.damping_nms_rad] {
-            *gain *= gain_factor;
-        }
-        config
-    })?;
+    let replayed = replay::replay(file, |joint| with_gain(joint, gain_factor))?;
     output::print(&replayed.to_string());
     Ok(if replayed.is_same() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// Returns the parameters of a drive, with this factor for assistance, stiffness and damping.
+fn with_gain(joint: Joint, factor: f64) -> DriveConfig {
+    let mut config = DriveConfig::standard(joint);
+    let law = &mut config.law;
+    for gain in [&mut law.assist, &mut law.stiffness_nm_rad, &mut law.damping_nms_rad] {
+        *gain *= factor;
+    }
+    config
 }
 
 /// Walks in virtual time, prints the table, writes the folder.

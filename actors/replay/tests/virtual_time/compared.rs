@@ -158,3 +158,55 @@ fn recorded_type_explains_a_message_that_is_refused() {
         tested().recorded_type(Later::KIND, angle).check(vec![older, torque]).expect_err("it is not decoded");
     assert!(error.to_string().contains("velocity"), "{error}");
 }
+
+payload!("replay.turn", Stream => #[derive(Clone, Copy)] struct Turn { degrees: f64, newton_metres: f64 });
+
+/// Computes recorded turns again, each from the newest angle.
+struct Again {
+    gain: f64,
+    degrees: f64,
+}
+
+impl Actor for Again {
+    type Context = AppContext<Self>;
+}
+
+impl Handler<Delivery<Angle>> for Again {
+    type Result = ();
+
+    fn handle(&mut self, angle: Delivery<Angle>, ctx: &mut Self::Context) {
+        self.degrees = angle.degrees;
+        note(ctx, "an angle");
+    }
+}
+
+impl Handler<Delivery<Turn>> for Again {
+    type Result = ();
+
+    fn handle(&mut self, turn: Delivery<Turn>, ctx: &mut Self::Context) {
+        assert_eq!((turn.source, turn.degrees), (ctx.tid(), self.degrees));
+        ctx.send("motor", &Turn { newton_metres: self.gain * self.degrees, ..turn.payload }).unwrap();
+    }
+}
+
+#[test]
+fn recorded_turns_are_inputs_and_alone_are_compared() {
+    let turn = |at, degrees| {
+        let turn = Turn { degrees, newton_metres: 0.5 * degrees };
+        TimedMessage::of(ms(at), tid(KNEE), tid(MOTOR), &turn)
+    };
+    let angle = |at, degrees| TimedMessage::of(ms(at), tid(HIP), tid(KNEE), &Angle { degrees });
+    // The status is of the shell around the recorded controller. The second angle has the time of its turn.
+    let status = TimedMessage::of(ms(1), tid(KNEE), tid(LOG), &Note { text: "ready".to_owned() });
+    let recorded = vec![status, turn(2, 0.0), angle(3, 10.0), turn(4, 10.0), turn(6, 20.0), angle(6, 20.0)];
+    let tested = |gain| {
+        let again = move || Again { gain, degrees: 0.0 };
+        let spec = AppSpec::new("knee", again).handles::<Angle>().handles::<Turn>();
+        replay().app(spec).turns(Turn::KIND)
+    };
+    let checked = tested(0.5).check_by(&Comparison::default(), recorded.clone()).expect("it is the same");
+    assert_eq!((checked.messages, checked.sources), (3, 1));
+    let error = tested(0.25).check(recorded).expect_err("the gain differs");
+    let CheckError::Differs(difference) = &error else { panic!("{error}") };
+    assert_eq!((difference.number, difference.at), (2, ms(4)), "without an angle the gain has no effect");
+}

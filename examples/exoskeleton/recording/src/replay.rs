@@ -4,9 +4,13 @@
 //! tick can be computed again at its own time, on the recorded samples and gait states. No timer and no order of
 //! messages has an influence. The core of the drive ([`DriveCore`](exoskeleton_model::control::drive::DriveCore))
 //! runs, without the shell around it: guards accept only messages that quote their own clock, which no replay has.
+//!
+//! [`replay`] reads the file itself, and reports gaps in it. [`spec`] is the same core as an application, for
+//! `sinew play --check`.
 
 mod drive;
 mod inputs;
+mod program;
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -19,6 +23,8 @@ use sinew::Tid;
 use sinew_bag::BagError;
 use sinew_bag::read::Ordered;
 use thiserror::Error;
+
+pub use program::{ReplayedDrive, spec};
 
 use drive::DriveReplay;
 use inputs::Inputs;
@@ -157,6 +163,12 @@ impl Replayed {
 }
 
 impl TickResult {
+    /// Returns the recorded result.
+    const fn of(tick: &DriveTick) -> Self {
+        let DriveTick { torque_nm, assist_gain, state, .. } = *tick;
+        Self { torque_nm, assist_gain, state }
+    }
+
     /// Whether both have the same bits.
     fn is(&self, other: &Self) -> bool {
         let bits =

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use exoskeleton::robot::topology::{Topology, for_this_host};
 
-use crate::{alone, end, folder, journals, start};
+use crate::{PROGRAM, alone, end, folder, journals, sinew, start};
 
 fn topology_file(folder: &Path, text: &str) -> String {
     let path = folder.join("topology.toml");
@@ -62,6 +62,24 @@ fn replay_finds_no_difference(folder: &Path, walk: &str) {
     let words = String::from_utf8_lossy(&output.stdout);
     assert!(words.contains("DIFFERENT") && words.contains(", now "), "{words}");
     assert_eq!(output.status.code(), Some(1), "{words}");
+    let file = command.strip_prefix("--replay ").expect("the file is the only word behind it");
+    check_finds_no_difference(folder, &file.replace("walk.mcap", "knee-1.mcap"));
+}
+
+/// Checks the drive of the knee with `sinew play --check`, on the file of its node: a quarter of the messages.
+fn check_finds_no_difference(folder: &Path, file: &str) {
+    let check = |factor: &str| {
+        let drive = [PROGRAM, "check-drive", "knee", "--gain-factor", factor];
+        let words = ["play", "--check", file, "--turns", "exo.drive_tick", "--"];
+        let output = sinew(folder, &[&words[..], &drive].concat());
+        let all = String::from_utf8_lossy(&[&output.stdout[..], &output.stderr].concat()).into_owned();
+        (output.status.code(), String::from_utf8_lossy(&output.stdout).into_owned(), all)
+    };
+    let (code, words, all) = check("1");
+    assert!(code == Some(0) && words.starts_with("identical: "), "{code:?}: {all}");
+    let (code, words, all) = check("1.01");
+    assert!(code == Some(1) && words.contains("the first difference: message "), "{code:?}: {all}");
+    assert!(words.contains("of knee.drive, exo.drive_tick") && words.contains("`torque_nm` was "), "{all}");
 }
 
 #[test]

@@ -4,11 +4,14 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
+use exoskeleton::robot::check_drive;
 use exoskeleton::robot::edges::GaitStatus;
 use exoskeleton_model::control::drive::DriveConfig;
 use exoskeleton_model::message::{DriveTick, JointSample};
 use exoskeleton_recording::replay::{Replayed, replay};
+use sinew::replay::{CheckError, Checked};
 use sinew_bag::{BagWriter, ChannelInfo, Class, Direction, Options, Origin, Party, Record as BagRecord};
+use sinew_player::{Recording as Walked, RecordingError};
 
 use super::*;
 
@@ -38,8 +41,14 @@ fn walk() -> &'static [TimedMessage] {
     })
 }
 
-fn party(tid: Tid) -> Party {
-    Party { tid: tid.bits(), text: tid.to_string(), name: None, node: Some(tid.node.to_string()) }
+fn party(of: Tid) -> Party {
+    let drive = Joint::ALL.into_iter().find(|joint| tid(joint.index(), 2) == of);
+    Party {
+        tid: of.bits(),
+        text: of.to_string(),
+        name: drive.map(drive_name),
+        node: Some(of.node.to_string()),
+    }
 }
 
 /// Writes a recording of these messages.
@@ -79,15 +88,24 @@ fn write<'m>(path: &Path, messages: impl IntoIterator<Item = &'m TimedMessage>) 
     bag.finish(end_ns).expect("there is room on the disk");
 }
 
+fn config(joint: Joint, gain: f64) -> DriveConfig {
+    let mut config = DriveConfig::standard(joint);
+    config.law.assist *= gain;
+    config
+}
+
 fn replayed(name: &str, messages: &[&TimedMessage], gain: f64) -> Replayed {
     let file = TestFile::new(name);
     write(&file.0, messages.iter().copied());
-    let config = |joint| {
-        let mut config = DriveConfig::standard(joint);
-        config.law.assist *= gain;
-        config
-    };
-    replay(&file.0, config).expect("it has ticks")
+    replay(&file.0, |joint| config(joint, gain)).expect("it has ticks")
+}
+
+/// Checks the drive of the knee as `sinew play --check` does.
+fn checked(name: &str, messages: &[&TimedMessage], gain: f64) -> Result<Checked, RecordingError> {
+    let file = TestFile::new(name);
+    write(&file.0, messages.iter().copied());
+    let drive = check_drive::spec(Joint::Knee, config(Joint::Knee, gain));
+    Walked::read(&[&file.0])?.turns(DriveTick::NAME).check([drive.into()])
 }
 
 #[test]
@@ -115,6 +133,37 @@ fn one_changed_gain_is_named_at_its_first_tick() {
     }
     let words = replayed.to_string();
     assert!(words.contains("hip") && words.contains(" Nm (Walk") && words.contains("DIFFERENT"), "{words}");
+}
+
+#[test]
+fn check_of_a_drive_finds_the_recorded_ticks() {
+    let all: Vec<_> = walk().iter().collect();
+    let ticks = all.iter().filter(|one| one.source == tid(1, 2) && one.kind == DriveTick::KIND).count();
+    let checked = checked("check", &all, 1.0).expect("each tick is the same");
+    assert_eq!((checked.messages, checked.sources, checked.misfits.len()), (ticks, 1, 0));
+    assert!(ticks > 5_000, "{ticks}");
+}
+
+#[test]
+fn check_of_a_drive_names_the_first_tick_of_a_changed_gain() {
+    let all: Vec<_> = walk().iter().collect();
+    let error = checked("check-gain", &all, 1.1).expect_err("it assists otherwise");
+    let RecordingError::Check(CheckError::Differs(difference)) = &error else { panic!("{error}") };
+    assert_eq!((difference.sender, difference.kind), (tid(1, 2), DriveTick::KIND));
+    assert!(difference.what.starts_with("`torque_nm` was "), "{error}");
+    // And: the command of the robot itself names the same tick, its first one has the number 1
+    let replayed = replayed("check-gain-replay", &all, 1.1);
+    let first = replayed.joints[1].first_difference.expect("it assists otherwise");
+    assert_eq!(difference.number, usize::try_from(first.tick).expect("some thousand"));
+}
+
+#[test]
+fn check_of_a_drive_reports_a_tick_without_its_input() {
+    let is_sample = |one: &TimedMessage| one.kind == JointSample::KIND && one.destination == tid(1, 2);
+    let lost = walk().iter().rev().filter(|one| is_sample(one)).nth(300).expect("it walks for longer");
+    let kept: Vec<_> = walk().iter().filter(|one| !std::ptr::eq(*one, lost)).collect();
+    let error = checked("check-gap", &kept, 1.0).expect_err("a tick is missing");
+    assert!(matches!(&error, RecordingError::Check(CheckError::Differs(_))), "{error}");
 }
 
 #[test]

@@ -42,6 +42,21 @@ impl DriveReplay {
     pub(super) fn run(&mut self, tick: &DriveTick, inputs: Option<&DriveInputs>) {
         self.result.ticks += 1;
         self.began_ns.get_or_insert(tick.t_ns);
+        let Some(computed) = self.compute(tick, inputs) else { return };
+        let recorded = TickResult::of(tick);
+        self.result.compared += 1;
+        if computed.is(&recorded) {
+            self.result.identical += 1;
+        } else if self.result.first_difference.is_none() {
+            self.differs_ns = tick.t_ns;
+            // The beginning of the recording is known at its end.
+            self.result.first_difference =
+                Some(Difference { tick: tick.seq, at_s: 0.0, recorded, now: computed });
+        }
+    }
+
+    /// Computes a tick again; `None`: the recording lacks its inputs, or the state before it.
+    pub(super) fn compute(&mut self, tick: &DriveTick, inputs: Option<&DriveInputs>) -> Option<TickResult> {
         let last = self.last.replace(tick.seq);
         // A number that does not grow is that of another incarnation.
         let is_next = last.is_some_and(|last| tick.seq > last);
@@ -52,31 +67,25 @@ impl DriveReplay {
         if begins {
             self.begin(tick, inputs);
         }
-        let Some(core) = self.core.as_mut() else { return };
+        let core = self.core.as_mut()?;
         let computed = match compute(core, tick, inputs) {
             Ok(computed) => computed,
             Err(missing) => {
                 self.lose(tick, missing);
-                return;
+                return None;
             }
         };
-        let recorded =
-            TickResult { torque_nm: tick.torque_nm, assist_gain: tick.assist_gain, state: tick.state };
-        let is_same = computed.is(&recorded);
-        if begins && tick.seq != 1 && !is_same {
+        if begins && tick.seq != 1 && !computed.is(&TickResult::of(tick)) {
             // The drive was not in the state of a new one. The next tick at rest is tried.
             self.core = None;
-            return;
+            return None;
         }
-        self.result.compared += 1;
-        if is_same {
-            self.result.identical += 1;
-        } else if self.result.first_difference.is_none() {
-            self.differs_ns = tick.t_ns;
-            // The beginning of the recording is known at its end.
-            self.result.first_difference =
-                Some(Difference { tick: tick.seq, at_s: 0.0, recorded, now: computed });
-        }
+        Some(computed)
+    }
+
+    /// Returns the first reason why ticks cannot be computed again.
+    pub(super) const fn gap(&self) -> Option<&String> {
+        self.result.gap.as_ref()
     }
 
     /// Begins with the first tick of a drive, or with a later one in which the drive is in the state of a new one.
@@ -107,7 +116,7 @@ fn is_as_new(tick: &DriveTick, inputs: Option<&DriveInputs>) -> bool {
 }
 
 /// Whether the drive gives no torque, and has none to ramp to zero.
-fn is_at_rest(tick: &DriveTick) -> bool {
+pub(super) fn is_at_rest(tick: &DriveTick) -> bool {
     matches!(tick.before, DriveState::Init | DriveState::Ready)
         && tick.torque_nm.is_none_or(|torque_nm| torque_nm == 0.0)
 }

@@ -55,17 +55,12 @@ impl Inputs {
                 if let Some(sample) = decode(&message.data)
                     && let Some(inputs) = self.keep(destination)
                 {
-                    push(&mut inputs.samples, sample);
+                    inputs.keep_sample(sample);
                 }
             }
             RouteKind::Gait => {
-                // It is in the envelope of its protection.
-                let data_id = DataId::of::<GaitState>(source, destination);
-                let opened = open(&data_id, &Bytes::copy_from_slice(&message.data));
-                if let Some(gait) = opened.and_then(|(_, payload)| decode(&payload))
-                    && let Some(inputs) = self.keep(destination)
-                {
-                    push(&mut inputs.gaits, gait);
+                if let Some(inputs) = self.keep(destination) {
+                    inputs.keep_gait((source, destination), &Bytes::copy_from_slice(&message.data));
                 }
             }
         }
@@ -86,6 +81,20 @@ impl Inputs {
 }
 
 impl DriveInputs {
+    /// Keeps a joint sample.
+    pub(super) fn keep_sample(&mut self, sample: JointSample) {
+        push(&mut self.samples, sample);
+    }
+
+    /// Keeps a gait state, from its source to its destination in the envelope of its protection. One that cannot be read
+    /// is missing.
+    pub(super) fn keep_gait(&mut self, (source, destination): (Tid, Tid), sealed: &Bytes) {
+        let opened = open(&DataId::of::<GaitState>(source, destination), sealed);
+        if let Some(gait) = opened.and_then(|(_, payload)| decode(&payload)) {
+            push(&mut self.gaits, gait);
+        }
+    }
+
     /// Returns the sample that a tick has used, as the drive has judged its time.
     pub(super) fn sample(&self, used: &UsedInput) -> Option<JointSample> {
         let found = self.samples.iter().rev().find(|sample| sample.seq == used.seq)?;
