@@ -85,8 +85,8 @@ struct Writing {
     elsewhere: Joined<NodeAddress>,
     /// The observers, of which the table has one.
     taps: [Option<Arc<dyn Tap>>; TAPS],
-    /// The number of changes of the routes to other nodes.
-    peer_changes: u64,
+    /// The number of changes of the routes to other nodes, and of removals of applications.
+    route_changes: u64,
 }
 
 /// The number of destinations of a message.

@@ -106,7 +106,7 @@ impl Endpoint {
             registration;
         let Link { registered, writer, reader } = link;
         let terms = Terms::of(&registered, &options, &writer);
-        let Registered { node: address, app, node_name, payload_max, ring: _ } = registered;
+        let Registered { node: address, app, node_name, payload_max, ring: _, types: _ } = registered;
         let control = reader.control().filter(|_| options.direct_links.accepts());
         let inbox = Inbox::new(Tid::new(address, app), inbox_capacity, payload_max as usize, writer.clone());
         register.former = Some(app);

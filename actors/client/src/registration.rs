@@ -6,13 +6,13 @@ use sinew_protocol::payload::Register;
 use sinew_runtime::{
     tid::AppAddress,
     time::Time,
-    wire::{Kind, Payload},
+    wire::{Kind, Payload, PayloadType},
 };
 use sinew_shm::{BellKind, Spin};
 
 use super::{
     ApiError, DirectLinks, Transport, direct,
-    link::{Link, LinkOptions, RegistrationHandshake, ServerTrust},
+    link::{Link, LinkOptions, RegistrationHandshake, ServerTrust, Use, UsedTypes},
     reconnect::ReconnectPolicy,
 };
 
@@ -58,6 +58,7 @@ impl Default for Registration {
                 direct_links: DirectLinks::default(),
                 direct_ring_bytes: direct::RING_BYTES,
                 server_trust: ServerTrust::AnyUser,
+                types: UsedTypes::default(),
             },
             returning: ReconnectPolicy::Always,
         }
@@ -128,15 +129,48 @@ impl Registration {
         self.subscribe_kind(P::KIND)
     }
 
-    /// Names a payload type that the application sends or handles, so that a collision of its id with another
-    /// type's is found at registration; at most 64.
+    /// Declares a payload type that the application handles; at most 64 types, together with those that it
+    /// [sends](Self::sends).
+    ///
+    /// A collision of its id with another type's is found at registration. The node gets the structure of the
+    /// type, and compares it with that of each sender: see [`Payload::MISMATCH`]. The structure is found once in
+    /// a process, by a thread of low priority; until the node has it, messages are not compared.
     #[must_use]
-    pub fn handles<P: Payload>(mut self) -> Self {
-        self.register.kinds.push(P::NAME.to_owned());
+    pub fn handles<P: Payload>(self) -> Self {
+        self.uses::<P>(Use::Handled)
+    }
+
+    /// Declares a payload type that the application sends, in the same way. The nodes of its receivers compare
+    /// it with theirs, and a recording has the structure. At most 64 types, together with those that it
+    /// [handles](Self::handles).
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{Registration, payload};
+    ///
+    /// payload!("demo.angle", Stream => struct Angle { degrees: f32 });
+    ///
+    /// let sensor = Registration::new().name("knee.sensor").sends::<Angle>();
+    /// ```
+    #[must_use]
+    pub fn sends<P: Payload>(self) -> Self {
+        self.uses::<P>(Use::Sent)
+    }
+
+    fn uses<P: Payload>(mut self, as_what: Use) -> Self {
+        if !self.register.kinds.iter().any(|name| name == P::NAME) {
+            self.register.kinds.push(P::NAME.to_owned());
+        }
+        // Without an entry the structure is not declared, and messages of the type are not compared.
+        if let Some(of) = PayloadType::of::<P>() {
+            self.link.types.add(of, as_what);
+        }
         self
     }
 
-    /// The same for a type without a Rust definition, by its name.
+    /// Names a type without a Rust definition that the application sends or handles, so that a collision of its id
+    /// with another type's is found at registration. Its structure is not known, so its messages are not compared.
     #[must_use]
     pub fn handles_named(mut self, name: impl Into<String>) -> Self {
         self.register.kinds.push(name.into());

@@ -402,7 +402,8 @@ impl Client {
         let config = &self.server.state.ctx.config;
         let payload_max = u32::try_from(config.payload_max).unwrap_or(u32::MAX);
         let Tid { node, app } = self.tid;
-        let registered = Registered { node, app, node_name: config.name.clone(), payload_max, ring };
+        let types = self.server.state.ctx.ports.app_types().is_some();
+        let registered = Registered { node, app, node_name: config.name.clone(), payload_max, ring, types };
         payload::frame(Kind::LNCL_REGISTERED, payload::lncl_of(node), self.tid, &registered)
     }
 }

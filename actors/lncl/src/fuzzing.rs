@@ -1,7 +1,9 @@
 //! Fuzz target: any frames of a client, in any state of its connection, against the session's invariants.
 
 use bytes::BytesMut;
-use sinew_protocol::payload::{self, Group, Introduce, Introduction, Register, Resolve, Switch};
+use sinew_protocol::payload::{
+    self, Group, Introduce, Introduction, Register, Resolve, Switch, TypeDeclaration,
+};
 use sinew_runtime::{
     fuzzing::is_read_as_written,
     outcome::Outcome,
@@ -34,6 +36,7 @@ pub fn some_frames() -> Vec<Vec<u8>> {
         ),
         payload::frame(Kind::LNCL_INTRODUCE, CLIENT, CLIENT, &Introduce { to: CLIENT.bits() }),
         payload::frame(Kind::LNCL_SWITCH, CLIENT, CLIENT, &Switch { peer: CLIENT.bits(), number: 1 }),
+        payload::frame(Kind::LNCL_TYPE, CLIENT, CLIENT, &declaration()),
         Message::new(Header::new(Kind::OUTCOME, CLIENT, CLIENT), vec![Outcome::Delivered.code()].into()),
         Message::new(Header::new(Kind::named("torque"), CLIENT, CLIENT), vec![1; 8].into()),
         Message::new(Header::new(Kind::LNCL_UNREGISTER, CLIENT, CLIENT), bytes::Bytes::new()),
@@ -44,6 +47,12 @@ pub fn some_frames() -> Vec<Vec<u8>> {
         codec.encode(frame, &mut bytes).expect("it is short");
     }
     vec![[&[200][..], &bytes].concat()]
+}
+
+/// Returns the declaration of a struct without fields.
+fn declaration() -> TypeDeclaration {
+    let (kind, policy) = (Kind::named("torque"), "accept-additions".to_owned());
+    TypeDeclaration { kind, handles: true, sends: false, policy, protected: false, schema: vec![1, 0, 0] }
 }
 
 pub fn control(bytes: &[u8]) -> bool {
@@ -112,6 +121,7 @@ fn converse(bytes: &[u8], pieces: usize) -> bool {
                 | Order::Resolve { .. }
                 | Order::Introduce { .. }
                 | Order::Switch { .. }
+                | Order::DeclareType(_)
                 | Order::Observe(_) => assert!(is_registered && source == CLIENT),
             }
         }
@@ -130,4 +140,5 @@ fn payloads(bytes: &[u8]) {
     is_read_as_written::<payload::Undelivered>(bytes);
     is_read_as_written::<payload::Gone>(bytes);
     is_read_as_written::<Introduction>(bytes);
+    is_read_as_written::<TypeDeclaration>(bytes);
 }

@@ -23,6 +23,7 @@
 //! | LNCL-16 | Each confirmed message of a client has an outcome, even if its queue is full. A client that does not read its outcomes is not read. |
 //! | LNCL-17 | A client with a direct link to a process that has ended is notified, even while a child of that process holds the link's end. |
 //! | LNCL-20 | While an application with direct links is watched, its client reports the messages on them; a report never delays a message. |
+//! | LNCL-21 | A client may declare the structures of its types, for comparisons with those of other applications. A declaration without room, or of invalid bytes, is counted and ignored. |
 
 #![allow(
     missing_docs,

@@ -118,11 +118,12 @@ pub fn set_member(state: &State, app: AppAddress, group: AppAddress, member: boo
     }
 }
 
-/// Publishes the structures of the types of `app`, one of the node's own. Has no effect if none of these has the
-/// address, as in [`set_member`].
-pub fn types_known(state: &State, app: AppAddress, types: DeclaredTypes) {
+/// Publishes the structures of the types of `app`. Has no effect if no application has the address, or if another one
+/// has it by now: `is_current` returns whether the types are of the present one. It is called under the registry's
+/// lock.
+pub fn types_known(state: &State, app: AppAddress, types: DeclaredTypes, is_current: impl FnOnce() -> bool) {
     let registry = lock(&state.registry);
-    if registry.owner_of(app) == Some(Owner::Node) {
+    if registry.owner_of(app).is_some() && is_current() {
         notify_sync(state, AppFact::Types { app, types });
     }
 }
@@ -214,6 +215,10 @@ fn remove(state: &State, app: AppAddress, cause: Cause) {
     note_end(state, app, cause, true);
     // Reported before the route is removed, since the route holds its subscriptions.
     notify(state, AppFact::Unregistered { app });
+    if let Some(types) = state.ctx.ports.app_types() {
+        types.forget(app);
+    }
+    // After its types are forgotten: no refusal is set for the next owner of the address.
     state.ctx.router.remove_local(app);
     if let Some(access) = state.security.access.get() {
         access.remove(app);

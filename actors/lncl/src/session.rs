@@ -10,7 +10,7 @@ use sinew_runtime::{
 
 use sinew_protocol::{
     observed::Observed,
-    payload::{self, Group, Introduce, Register, Resolve, Switch},
+    payload::{self, Group, Introduce, Register, Resolve, Switch, TypeDeclaration},
 };
 
 /// Maximum number of groups of one client.
@@ -54,6 +54,8 @@ pub enum Order {
     Introduce { to: Tid, correlation: u64 },
     /// Notify `to`, behind all earlier messages of the client to it, that the client continues on their link `number`.
     Switch { to: Tid, number: u64, correlation: u64 },
+    /// Record the structure of a type of the client.
+    DeclareType(TypeDeclaration),
     /// Report a message on a direct link of the client to the tap.
     Observe(Box<Observed>),
     /// Count a rejected message, and send the outcome if the client requested it. The connection continues.
@@ -163,6 +165,7 @@ impl Session {
             Kind::LNCL_INTRODUCE => read_introduce(&message),
             Kind::LNCL_SWITCH => read_switch(&message),
             Kind::LNCL_OBSERVED => read_observed(&message),
+            Kind::LNCL_TYPE => read_payload(&message).map(Order::DeclareType),
             Kind::LNCL_UNREGISTER => Ok(Order::Unregister),
             Kind::LNCL_REGISTER => Err(ProtocolError::RegisteredTwice),
             // Not a Rust enum, but an open set of numbers.
@@ -360,7 +363,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_payload_of_any_kind_is_an_order(kind in 0u32..0x50, payload: Vec<u8>, step in 0..3) {
+        fn any_payload_of_any_kind_is_an_order(kind in 0u32..0x70, payload: Vec<u8>, step in 0..3) {
             let mut session = Session::default();
             if step > 0 { session.registered(TID); }
             if step > 1 { session.released(TID); }

@@ -28,7 +28,11 @@ use bytes::BytesMut;
 use futures_util::StreamExt;
 use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
 use sinew_model::{
-    config::NodeConfig, directory::DirectoryEntry, events::SyncEvent, facts::AppFact, ports::Names,
+    config::NodeConfig,
+    directory::DirectoryEntry,
+    events::SyncEvent,
+    facts::{AppFact, TypeDeclaration, User},
+    ports::{AppTypes, Names},
 };
 use sinew_protocol::payload::{self, Refusal, Register, Registered};
 use sinew_runtime::{
@@ -206,6 +210,14 @@ impl TestNode {
         names
     }
 
+    /// Lets the test receive the declarations of types.
+    pub fn with_types(&self) -> PlayedTypes {
+        let (declares, declared) = sync_channel(DECLARATIONS_MAX);
+        let port: Arc<dyn AppTypes> = Arc::new(TypesPort(declares));
+        self.state.ctx.ports.connect_app_types(&port);
+        PlayedTypes { _port: port, declared }
+    }
+
     /// Opens the barrier for an application, as the root does.
     pub fn release(&self, app: AppAddress) {
         self.state.ctx.event_queues.lncl.post(Event::Released { app }).unwrap();
@@ -290,6 +302,35 @@ impl Names for PlayedNames {
 
     fn missing_in_brief(&self, _: AppAddress) -> Option<Vec<(String, &'static str)>> {
         Some(lock(&self.missing).clone())
+    }
+}
+
+/// Maximum number of declarations that a test has not read.
+const DECLARATIONS_MAX: usize = 64;
+
+struct TypesPort(SyncSender<(AppAddress, TypeDeclaration)>);
+
+/// Receives the declarations of types in the place of the node. Those without a structure are refused.
+pub struct PlayedTypes {
+    _port: Arc<dyn AppTypes>,
+    declared: Receiver<(AppAddress, TypeDeclaration)>,
+}
+
+impl AppTypes for TypesPort {
+    fn declare(&self, app: AppAddress, _: User, declaration: TypeDeclaration) -> Result<(), String> {
+        if declaration.schema.is_empty() {
+            return Err("it has no structure".to_owned());
+        }
+        self.0.try_send((app, declaration)).map_err(|why| why.to_string())
+    }
+
+    fn forget(&self, _: AppAddress) {}
+}
+
+impl PlayedTypes {
+    /// Returns the next declaration.
+    pub fn next(&self) -> (AppAddress, TypeDeclaration) {
+        self.declared.recv_timeout(WATCHDOG).expect("a declaration")
     }
 }
 

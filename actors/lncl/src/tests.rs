@@ -5,6 +5,7 @@ mod documented;
 mod forks;
 mod pending_outcomes;
 mod slow_close;
+mod types;
 mod unread;
 mod waiting;
 

@@ -4,6 +4,6 @@ mod app;
 mod link;
 mod membership;
 
-pub use app::{AppFact, DeclaredTypes, TypeHash, User};
+pub use app::{AppFact, DeclaredTypes, TypeDeclaration, TypeHash, User};
 pub use link::LinkFact;
 pub use membership::{LossReason, MembershipFact, NodeEvent, Trouble};

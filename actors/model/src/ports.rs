@@ -20,7 +20,7 @@ use sinew_runtime::{
 use crate::{
     cause::Cause,
     directory::DirectoryEntry,
-    facts::{LossReason, User},
+    facts::{LossReason, TypeDeclaration, User},
     undelivered::Report,
 };
 
@@ -160,6 +160,19 @@ pub trait Applications: Send + Sync {
     fn undelivered_elsewhere(&self, node: NodeAddress, report: Report, refuse: &mut dyn FnMut(&dyn Display));
 }
 
+/// The payload types of this node's applications: a port of the node. The caller holds the lock of LNCL's registry, so
+/// that each call is about the current owner of the address.
+pub trait AppTypes: Send + Sync {
+    /// Records a type of an application in another process.
+    ///
+    /// # Errors
+    /// The declaration is no valid one, or there is no room for it. Messages of the type are not compared then.
+    fn declare(&self, app: AppAddress, user: User, declaration: TypeDeclaration) -> Result<(), String>;
+
+    /// Removes the types of an application that is not registered any more.
+    fn forget(&self, app: AppAddress);
+}
+
 /// The ports of one node. A layer that a test has not started is not connected.
 #[derive(Default)]
 pub struct Ports {
@@ -168,6 +181,7 @@ pub struct Ports {
     names: Port<dyn Names>,
     app_lifecycle: Port<dyn AppLifecycle>,
     applications: Port<dyn Applications>,
+    app_types: Port<dyn AppTypes>,
 }
 
 struct Port<T: ?Sized>(OnceLock<Weak<T>>);
@@ -213,6 +227,7 @@ ports! {
     names, connect_names: Names;
     app_lifecycle, connect_app_lifecycle: AppLifecycle;
     applications, connect_applications: Applications;
+    app_types, connect_app_types: AppTypes;
 }
 
 #[cfg(any(test, feature = "testing"))]

@@ -169,7 +169,6 @@ impl Apps {
             app.mailbox.close();
             state.lncl.book.remove_mailbox(app.tid.app);
             sinew_lncl::unregister_local(&state.lncl, app.tid.app);
-            state.types.unregister(app.tid.app);
         }
     }
 }

@@ -79,6 +79,7 @@ impl NodeState {
         ports.connect_members(&(self.ndl.clone() as Arc<_>));
         ports.connect_names(&(self.sync.clone() as Arc<_>));
         ports.connect_app_lifecycle(&(self.sync.clone() as Arc<_>));
+        ports.connect_app_types(&(self.clone() as Arc<_>));
         let audits = Arc::new(audit::Frames(Arc::downgrade(self)));
         // They are set once, here.
         let _ = self.sync.audits.set(audits);

@@ -2,6 +2,7 @@
 
 use bytes::Bytes;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
+pub use sinew_model::facts::TypeDeclaration;
 use sinew_model::{bounded::at_most, nearest::NEAREST_MAX};
 use sinew_runtime::{
     tid::{AppAddress, NodeAddress, Tid},
@@ -76,6 +77,9 @@ pub struct Registered {
     /// Size in bytes of the ring that each side offers next; none = all messages use the socket.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ring: Option<u32>,
+    /// Whether the node reads declarations of types. One of a former version does not.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub types: bool,
 }
 
 /// Reason for a refused registration or for the end of a connection.

@@ -8,7 +8,8 @@ use std::{
 };
 
 use rustix::process::Signal;
-use sinew::{AppAddress, Endpoint, NodeApi, Outcome, Registration, Tid, payload};
+use sinew::{AppAddress, Endpoint, NodeApi, Outcome, Payload, Registration, Tid, payload};
+use sinew_bag::read::{Item, Reader};
 use sinew_recorder::{Recording, RecordingOptions};
 use sinew_testkit::{NodeProcess, TestDirectory, program, until};
 
@@ -206,6 +207,47 @@ fn program_records_its_node() {
     drop(sensor);
     assert!(summary.totals.written > 0 && summary.totals.dropped == 0, "{summary:?}");
     assert_has_the_count(&file);
+}
+
+payload!("commands.client_only" => struct ClientOnly { milliamperes: u32 });
+
+#[test]
+fn type_of_a_client_alone_is_printed_and_has_a_view_by_its_schema() {
+    // Given: a node in another process, which knows the type by the client's declaration alone
+    let scenario = Scenario::new();
+    let _knee = scenario.start("knee", 2, &[]);
+    let file = scenario.directory.join("walk.mcap");
+    let api = NodeApi::connect(scenario.socket("knee")).expect("the knee's socket");
+    let registration = Registration::new().name("sensor").sends::<ClientOnly>();
+    let mut sensor = api.register_transport_address(registration).expect("it is registered");
+    // When
+    let json =
+        scenario.until("the node knows the structure", "knee", &["schema", ClientOnly::NAME], |json| {
+            !json["structures"][0]["schema"].is_null()
+        });
+    // Then
+    assert_eq!(json["structures"][0]["sent_by"][0]["name"], "sensor", "{json}");
+    let text = scenario.sinew("knee", &["schema", ClientOnly::NAME]);
+    assert!(text.out.contains("milliamperes: u32"), "{}{}", text.out, text.err);
+    // When: a message of it is recorded
+    let options = RecordingOptions { path: Some(file.clone()), ..RecordingOptions::default() };
+    let recording = Recording::begin(&api, options).expect("it begins");
+    let nobody = Tid::new(sensor.tid().node, AppAddress::new(0x1fff));
+    let outcome = sensor.message(nobody, &ClientOnly { milliamperes: 7 }).confirmed(Duration::from_secs(10));
+    assert_ne!(outcome.expect("an outcome"), Outcome::Delivered);
+    recording.finish_within(Duration::from_secs(60)).expect("it ends");
+    // Then: its view is protobuf
+    let mut reader = Reader::open(&file).expect("the file");
+    let mut views = Vec::new();
+    while let Some(item) = reader.next_item().expect("it can be read") {
+        if let Item::Message(message) = item
+            && message.channel.topic == "/sensor/commands.client_only/view"
+        {
+            let schema = message.channel.schema.as_ref().map(|schema| schema.encoding.clone());
+            views.push((message.channel.encoding.clone(), schema));
+        }
+    }
+    assert_eq!(views, [("protobuf".to_owned(), Some("protobuf".to_owned()))]);
 }
 
 #[test]

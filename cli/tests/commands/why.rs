@@ -9,7 +9,7 @@ use std::{
 };
 
 use serde_json::Value;
-use sinew::{NodeApi, Registration};
+use sinew::{NodeApi, Registration, payload};
 
 use crate::scenario::{Scenario, blocked, named};
 
@@ -131,6 +131,32 @@ fn circle_of_waiting_applications_is_shown() {
     // And: an absent application is reported as absent
     let answer = scenario.sinew("hip", &["why", "hip", "ankle"]);
     assert!(answer.code == Some(1) && answer.out.contains("'ankle'"), "{}", answer.out);
+}
+
+/// The count that the node's application handles, with a renamed field.
+mod renamed {
+    use super::*;
+    payload!("scenario.count", Bulk => pub(super) struct Count { amount: u64 });
+}
+
+#[test]
+fn client_with_a_renamed_field_is_named_by_its_own_node_and_by_another_one() {
+    let scenario = Scenario::new();
+    let _hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let _knee = scenario.start("knee", 2, &[]);
+    let api = NodeApi::connect(scenario.socket("hip")).expect("its socket");
+    let registration = Registration::new().name("gait").sends::<renamed::Count>().requires(["hip", "knee"]);
+    let _gait = api.register_transport_address(registration).expect("it is registered");
+    for receiver in ["hip", "knee"] {
+        let what = format!("the difference between the gait and the {receiver} is known");
+        let json = scenario.until(&what, receiver, &["why", "gait", receiver], |json| {
+            json["steps"].is_array() && blocked(json).contains("scenario.count")
+        });
+        let steps = blocked(&json);
+        for part in ["`amount` (u64)", "`number` (u64)", "build both programs"] {
+            assert!(steps.contains(part), "{part}: {steps}");
+        }
+    }
 }
 
 #[test]

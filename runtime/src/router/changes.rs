@@ -5,7 +5,7 @@ use std::{collections::BTreeSet, sync::Arc};
 use super::{
     LocalRoute, Members, MessageSink, Router, Snapshot, Table, Writing, for_each_here,
     guard::Guard,
-    mismatches::Mismatches,
+    mismatches::{Mismatches, TypedPath},
     tap::{self, Passage, Tap, TapOf},
 };
 use crate::{
@@ -38,13 +38,21 @@ impl Router {
         });
     }
 
-    /// Removes an application and its memberships.
+    /// Removes an application, its memberships, and the types that it declared differently.
     pub fn remove_local(&self, app: AppAddress) {
         let mut writing = lock(&self.writing);
         let mut snapshot = Snapshot::clone(&self.snapshot.load());
-        Arc::make_mut(&mut snapshot.table).local.remove(&app);
+        let table = Arc::make_mut(&mut snapshot.table);
+        table.local.remove(&app);
+        writing.route_changes += 1;
+        let own = Tid::new(self.node, app);
+        let dropped = drop_mismatches(table, |path| path.target == app || path.source == own);
         writing.here.set(app, BTreeSet::new(), &mut snapshot.members.here);
         self.snapshot.store(Arc::new(snapshot));
+        drop(writing);
+        if let Some(former) = dropped {
+            former.notify();
+        }
     }
 
     /// Adds `app` to `group`, or removes it. Returns whether anything changed. The cost depends on the number
@@ -81,20 +89,21 @@ impl Router {
         lock(&self.writing).here.memberships()
     }
 
-    /// Returns the number of changes of the routes to other nodes, for [`set_mismatches`](Self::set_mismatches).
+    /// Returns the number of changes of the routes to other nodes and of removals of applications, for
+    /// [`set_mismatches`](Self::set_mismatches).
     #[must_use]
-    pub fn peer_changes(&self) -> u64 {
-        lock(&self.writing).peer_changes
+    pub fn route_changes(&self) -> u64 {
+        lock(&self.writing).route_changes
     }
 
     /// Sets the types that their senders and the applications of this node declared differently; `None`: none. Returns
-    /// whether they are set: not if a route to another node has changed since the caller read `peer_changes`. Then a
-    /// sender may be another incarnation, with other types.
+    /// whether they are set: not if a route to another node has changed, or an application was removed, since the
+    /// caller read `route_changes`. Then a sender or receiver may be another incarnation, with other types.
     #[must_use]
-    pub fn set_mismatches(&self, mismatches: Option<Mismatches>, peer_changes: u64) -> bool {
+    pub fn set_mismatches(&self, mismatches: Option<Mismatches>, route_changes: u64) -> bool {
         let mismatches = mismatches.map(Arc::new);
         let writing = lock(&self.writing);
-        if writing.peer_changes != peer_changes {
+        if writing.route_changes != route_changes {
             return false;
         }
         let mut snapshot = Snapshot::clone(&self.snapshot.load());
@@ -168,21 +177,16 @@ impl Router {
         if is_same {
             return;
         }
-        writing.peer_changes += 1;
+        writing.route_changes += 1;
         let table = Arc::make_mut(&mut snapshot.table);
         match sink {
             Some(sink) => table.peers.insert(node, sink),
             None => table.peers.remove(&node),
         };
-        let former = table.mismatches.clone();
-        let others = former.as_ref().and_then(|former| former.without(node));
-        let has_dropped = others.is_some();
-        if let Some(others) = others {
-            table.mismatches = Some(others).filter(|others| !others.is_empty()).map(Arc::new);
-        }
+        let dropped = drop_mismatches(table, |path| path.source.node == node);
         self.snapshot.store(Arc::new(snapshot));
         drop(writing);
-        if let Some(former) = former.filter(|_| has_dropped) {
+        if let Some(former) = dropped {
             former.notify();
         }
     }
@@ -193,4 +197,12 @@ impl Router {
             writing.elsewhere.set(node, groups.iter().copied().collect(), &mut members.elsewhere)
         });
     }
+}
+
+/// Removes the paths that are over. Returns the former table if there were any: its owner is to compare anew.
+fn drop_mismatches(table: &mut Table, is_over: impl Fn(&TypedPath) -> bool) -> Option<Arc<Mismatches>> {
+    let former = table.mismatches.clone()?;
+    let others = former.without(is_over)?;
+    table.mismatches = Some(others).filter(|others| !others.is_empty()).map(Arc::new);
+    Some(former)
 }

@@ -16,7 +16,7 @@ use std::{
 use super::guard::Verdict;
 use crate::{
     outcome::Rejection,
-    tid::{AppAddress, NodeAddress, Tid},
+    tid::{AppAddress, Tid},
     wire::{Header, Kind},
 };
 
@@ -109,13 +109,12 @@ impl Mismatches {
         Self { paths: paths.into_iter().take(MISMATCHES_MAX).collect(), notify }
     }
 
-    /// Returns the table without the paths from `node`. `None`: there are none.
-    pub(super) fn without(&self, node: NodeAddress) -> Option<Self> {
-        let is_of = |path: &TypedPath| path.source.node == node;
-        if !self.paths.keys().any(is_of) {
+    /// Returns the table without the paths that are over. `None`: there are none of them.
+    pub(super) fn without(&self, is_over: impl Fn(&TypedPath) -> bool) -> Option<Self> {
+        if !self.paths.keys().any(&is_over) {
             return None;
         }
-        let others = self.paths.iter().filter(|(path, _)| !is_of(path));
+        let others = self.paths.iter().filter(|(path, _)| !is_over(path));
         let paths = others.map(|(path, mismatch)| (*path, mismatch.clone())).collect();
         Some(Self { paths, notify: self.notify.clone() })
     }
@@ -164,6 +163,7 @@ mod tests {
         lock,
         outcome::{Outcome, Receipt, ReceiptSink, Ticket},
         router::{LocalRoute, MessageSink, Router, SubmitError},
+        tid::NodeAddress,
         wire::Message,
     };
 
@@ -221,7 +221,7 @@ mod tests {
         let count = notified.clone();
         let notify = Arc::new(move || _ = count.fetch_add(1, Ordering::Relaxed));
         let table = Mismatches::new([(path, mismatch.clone())], notify);
-        assert!(router.set_mismatches(Some(table), router.peer_changes()));
+        assert!(router.set_mismatches(Some(table), router.route_changes()));
         (mismatch, notified)
     }
 
@@ -237,7 +237,7 @@ mod tests {
         assert_eq!(offered, Err(Rejection::Malformed));
         assert_eq!(mismatch.seen(), 2);
         assert_eq!(*lock(&taken.0), [KIND, of_other_type]);
-        assert!(router.set_mismatches(None, router.peer_changes()));
+        assert!(router.set_mismatches(None, router.route_changes()));
         assert_eq!(router.deliver(message(KIND, TARGET)), Ok(()));
     }
 
@@ -315,7 +315,7 @@ mod tests {
         peer(&taken);
         assert_eq!(router.deliver(message(KIND, TARGET)), Err(Rejection::Malformed));
         let before = notified.load(Ordering::Relaxed);
-        let changes = router.peer_changes();
+        let changes = router.route_changes();
         peer(&Arc::default());
         assert_eq!(router.deliver(message(KIND, TARGET)), Ok(()));
         assert_eq!(notified.load(Ordering::Relaxed), before + 1, "the owner of the table is to compare anew");
@@ -324,7 +324,7 @@ mod tests {
         let stale = || Mismatches::new([(path, Mismatch::new(Effect::Refused))], Arc::new(|| {}));
         assert!(!router.set_mismatches(Some(stale()), changes));
         assert_eq!(router.deliver(message(KIND, TARGET)), Ok(()));
-        assert!(router.set_mismatches(Some(stale()), router.peer_changes()));
+        assert!(router.set_mismatches(Some(stale()), router.route_changes()));
         router.remove_peer(SOURCE.node);
         assert_eq!(router.deliver(message(KIND, TARGET)), Ok(()));
     }
@@ -335,5 +335,26 @@ mod tests {
         let _ = set(&router, Effect::Refused);
         router.set_peer(NodeAddress::new(3), taken);
         assert_eq!(router.deliver(message(KIND, TARGET)), Err(Rejection::Malformed));
+    }
+
+    #[test]
+    fn next_owner_of_an_address_is_not_refused() {
+        for is_sender in [true, false] {
+            let (router, taken) = router(&[TARGET, OTHER]);
+            let source = Tid::new(HERE, OTHER);
+            let path = TypedPath { source, target: TARGET, kind: KIND };
+            let table = || Mismatches::new([(path, Mismatch::new(Effect::Refused))], Arc::new(|| {}));
+            assert!(router.set_mismatches(Some(table()), router.route_changes()));
+            let send = || {
+                let header = Header::new(KIND, source, Tid::new(HERE, TARGET));
+                router.send(Message::new(header, Bytes::new()))
+            };
+            assert_eq!(send(), Err(Rejection::Malformed));
+            let (ended, changes) = (if is_sender { OTHER } else { TARGET }, router.route_changes());
+            router.remove_local(ended);
+            router.set_local(ended, LocalRoute { sink: taken.clone(), events: Arc::new([]) });
+            assert_eq!(send(), Ok(()));
+            assert!(!router.set_mismatches(Some(table()), changes), "it is of the former owner");
+        }
     }
 }

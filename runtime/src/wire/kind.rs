@@ -144,6 +144,10 @@ impl Kind {
     /// The current TIDs of some names.
     pub const HOST_NAMES: Self = Self(0x58);
 
+    /// A client declares the structure of a payload type that it handles or sends. The range of the other frames of
+    /// LNCL is full.
+    pub const LNCL_TYPE: Self = Self(0x60);
+
     /// Requests a sign of life: confirmed, it ends as `Delivered` once its destination has handled it.
     pub const PING: Self = Self::named("sinew.ping");
 

@@ -43,8 +43,8 @@ pub trait Payload: Serialize + DeserializeOwned + Send + 'static {
     const TIME_TO_LIVE: Option<Duration> = None;
     /// The limits of a receiver, for a type with end-to-end protection: see [`protection`](crate::protection).
     const PROTECTION: Option<Protection> = None;
-    /// The treatment of messages from a sender on another node with another version of this type. The receiver's type
-    /// decides.
+    /// The treatment of messages from a sender with another version of this type, on another node or in another
+    /// process. The receiver's type decides.
     const MISMATCH: MismatchPolicy = MismatchPolicy::AcceptAdditions;
 }
 

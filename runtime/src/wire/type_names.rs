@@ -86,6 +86,13 @@ impl Declared {
 }
 
 impl PayloadType {
+    /// Returns the entry of `P`, and makes it at the first call. `None`: the process has more types than its table
+    /// holds.
+    #[must_use]
+    pub fn of<P: Payload>() -> Option<Self> {
+        remember::<P>()
+    }
+
     /// Returns the number of its place in the table of types, below [`PLACES`].
     #[inline]
     pub(crate) const fn place(self) -> usize {
@@ -126,6 +133,12 @@ impl PayloadType {
     /// As of [`Kind::schema`].
     pub fn schema(self) -> Result<&'static TypeSchema, &'static TraceError> {
         self.entry().declared.schema()
+    }
+
+    /// Returns whether [`schema`](Self::schema) was called before, so that it takes no time.
+    #[must_use]
+    pub fn is_traced(self) -> bool {
+        self.entry().declared.schema.get().is_some()
     }
 }
 

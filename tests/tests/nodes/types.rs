@@ -1,12 +1,15 @@
 //! Types that two nodes have in different versions: which messages pass, and the words in the log of each node.
 
-use std::sync::{
-    Arc, Mutex,
-    atomic::{AtomicU64, Ordering},
+use std::{
+    path::Path,
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicU64, Ordering},
+    },
 };
 
 use sinew::{
-    MismatchPolicy,
+    Endpoint, MismatchPolicy, NodeApi, Registration,
     inspect::{AskMismatches, AskSchemas, MismatchReport, MismatchesReport, SchemasReport},
     message::{Kind, Rejection, Sender},
     prelude::*,
@@ -14,7 +17,7 @@ use sinew::{
 };
 use sinew_runtime::log::{LogObserver, observe, tracing::Level};
 use sinew_testkit::{
-    DEADLINE, Loopback, all_run,
+    DEADLINE, Loopback, TestDirectory, all_run,
     scripted::{sender_app, wait},
     until,
 };
@@ -235,4 +238,93 @@ struct Gait;
 
 impl Actor for Gait {
     type Context = AppContext<Self>;
+}
+
+/// Registers a client of a node that sends one type, and handles one, each in another version than the node's
+/// applications.
+fn client(socket: &Path) -> Endpoint {
+    let api = NodeApi::connect(socket).expect("its socket");
+    let registration = Registration::new()
+        .name("client.gait")
+        .sends::<sent::Limit>()
+        .handles::<handled::Declared>()
+        .requires(["knee"])
+        .deadline(DEADLINE);
+    api.register_transport_address(registration).expect("the knee is there")
+}
+
+/// Asks the inspection of a node through a client.
+fn ask_as<Q: Payload, R: Payload>(client: &mut Endpoint, node: NodeAddress, question: &Q) -> R {
+    client.message(Tid::new(node, AppAddress::INSPECT), question).ask(DEADLINE).expect("the node answers")
+}
+
+#[test]
+fn client_is_refused_in_words_by_its_own_node_and_by_another_one() {
+    for is_of_same_node in [true, false] {
+        // Given: a client, and the application that handles its type with a renamed field
+        let (loopback, directory, handled) = (Loopback::new(), TestDirectory::new(), Arc::default());
+        let socket = directory.join("hip.sock");
+        let path = socket.clone();
+        let hip = loopback.node("hip").configure(move |config| config.lncl.socket = Some(path));
+        let (hip, other) = if is_of_same_node {
+            (hip.app(knee(&handled)).start().expect("a node"), None)
+        } else {
+            let other = loopback.node("knee").app(knee(&handled)).start().expect("a node");
+            (hip.start().expect("a node"), Some(other))
+        };
+        all_run(&[&hip]);
+        let mut client = client(&socket);
+        let knee = client.resolve("knee", DEADLINE).expect("the node answers").expect("it is required");
+        let nodes = [Some(hip.handle().address()), other.as_ref().map(|node| node.handle().address())];
+        for node in nodes.into_iter().flatten() {
+            // When: it sends. Then: the answers of both nodes to `sinew why` name the difference and both ends
+            let found = until("the node knows the difference", || {
+                // The decoder refuses the first messages, too.
+                let outcome = client.message(knee, &sent::Limit { torque: 9.0 }).confirmed(DEADLINE);
+                let malformed = Outcome::Rejected(Rejection::Malformed);
+                assert_eq!(outcome.expect("the node takes it"), malformed);
+                let report: MismatchesReport = ask_as(&mut client, node, &AskMismatches {});
+                let of_limit =
+                    |one: &MismatchReport| one.name.as_deref() == Some("types.limit") && one.seen > 0;
+                report.mismatches.into_iter().find(of_limit)
+            });
+            assert_eq!((&*found.source.name, &*found.target.name), ("client.gait", "knee"));
+            assert_eq!((&*found.treatment, &*found.policy), ("refused", "accept-additions"));
+            let words =
+                "field `torque` (f32) at the sender seems to be `newton_metres` (f32) at the receiver";
+            assert_eq!(found.differences, [words]);
+            // And: `sinew schema` has both structures
+            let question = AskSchemas { kind: Kind::named("types.limit") };
+            let report: SchemasReport = ask_as(&mut client, node, &question);
+            assert!(report.schemas.iter().filter(|one| one.schema.is_some()).count() == 2, "{report:#?}");
+        }
+        assert_eq!(handled.load(Ordering::Relaxed), 0, "no message is handled");
+    }
+}
+
+#[test]
+fn application_is_refused_by_the_declaration_of_a_client() {
+    let (loopback, directory, handled) = (Loopback::new(), TestDirectory::new(), Arc::default());
+    let socket = directory.join("hip.sock");
+    let path = socket.clone();
+    let (gait, probe) = sender_app("gait");
+    let hip = loopback.node("hip").configure(move |config| config.lncl.socket = Some(path));
+    let hip = hip.app(gait).app(knee(&handled)).start().expect("a node");
+    all_run(&[&hip]);
+    let client = client(&socket);
+    let sender = probe.sender();
+    let declared = sent::Declared { torque: 9.0 };
+    until("the message for the client is refused", || {
+        // The client takes no message: only the routing table answers.
+        let message = sender.message(client.tid(), &declared).confirmed(Duration::from_millis(50));
+        let outcome = wait(message.expect("its node takes it"));
+        (outcome == Outcome::Rejected(Rejection::Malformed)).then_some(())
+    });
+    // When: the client has ended. Then: nothing of it is left for the next owner of its address.
+    let (node, tid) = (hip.handle().address(), client.tid());
+    drop(client);
+    until("its types are forgotten", || {
+        let left = mismatches(&sender, node).into_iter().any(|one| one.target.tid == tid);
+        (!left).then_some(())
+    });
 }

@@ -93,7 +93,9 @@ impl RegistrationHandshake {
     pub(crate) fn wait(&mut self, deadline: Time) -> Result<Option<Link>, ApiError> {
         if self.offered.is_none() {
             let Some(registered) = self.read_answer(deadline)? else { return Ok(None) };
-            let Some(ring_bytes) = registered.ring else { return Ok(Some(self.plain(registered))) };
+            let Some(ring_bytes) = registered.ring else {
+                return Ok(Some(self.with_types(self.plain(registered))));
+            };
             let offered = self.offer(registered, ring_bytes);
             self.offered = Some(offered.map_err(|seen| self.reason_or(seen))?);
         }
@@ -191,7 +193,17 @@ impl RegistrationHandshake {
             (self.socket.clone(), &self.options, registered.payload_max as usize);
         let reader = ring::Reader::new(socket.clone(), consumer, payload_max, options);
         let writer = Writer::Ring(Arc::new(ring::Writer::new(socket, producer, options)));
-        Ok(Some(Link { registered, writer: Arc::new(writer), reader: Reader::Ring(Box::new(reader)) }))
+        let link = Link { registered, writer: Arc::new(writer), reader: Reader::Ring(Box::new(reader)) };
+        Ok(Some(self.with_types(link)))
+    }
+
+    /// Declares the types of the application on a new link. A node of a former version would refuse the declaration.
+    fn with_types(&self, link: Link) -> Link {
+        let Registered { node, app, payload_max, types, .. } = link.registered;
+        if types {
+            self.options.types.declare(Tid::new(node, app), payload_max as usize, &link.writer);
+        }
+        link
     }
 
     /// Returns whether all wanted bytes have arrived by the deadline.
@@ -259,7 +271,8 @@ mod tests {
         let (mut client, _) = listener.accept().unwrap();
         let (node, app) = (NodeAddress::new(1), AppAddress::new(0x8000_0001));
         let node_name = "played".to_owned();
-        let registered = Registered { node, app, node_name, payload_max: 4_096, ring: Some(4_096) };
+        let registered =
+            Registered { node, app, node_name, payload_max: 4_096, ring: Some(4_096), types: false };
         let tid = Tid::new(node, app);
         let frame = payload::frame(Kind::LNCL_REGISTERED, payload::lncl_of(node), tid, &registered);
         client.write_all(&bytes_of(&frame)).unwrap();

@@ -7,6 +7,7 @@ pub(super) mod loan;
 pub(super) mod ring;
 mod server_trust;
 pub(super) mod socket;
+mod types;
 
 use std::{
     io::{self, ErrorKind},
@@ -35,6 +36,7 @@ use loan::InRing;
 pub(super) use ring::Arrived;
 use ring::{Begun, Rest};
 pub(super) use server_trust::{ServerTrust, UntrustedServerError};
+pub(super) use types::{Use, UsedTypes};
 
 /// Maximum wait for a place in the accept queue of a node, if the caller has that long.
 pub(super) const CONNECT: Duration = Duration::from_secs(2);
@@ -67,6 +69,8 @@ pub(super) struct LinkOptions {
     pub(super) direct_ring_bytes: usize,
     /// The processes that each connection trusts as the node.
     pub(super) server_trust: ServerTrust,
+    /// The types that each connection declares to the node.
+    pub(super) types: UsedTypes,
 }
 
 impl LinkOptions {

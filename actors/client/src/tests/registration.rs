@@ -2,9 +2,11 @@
 
 use std::{thread, time::Duration};
 
+use sinew_runtime::wire::{Payload, PayloadType};
+
 use super::{
-    ApiError, AppAddress, AppFact, Flags, Kind, NodeApi, RawClient, Registration, TestDirectory, TestNode,
-    Tid, Transport, WATCHDOG,
+    ApiError, AppAddress, AppFact, Doubled, Flags, Kind, NodeApi, RawClient, Registration, TestDirectory,
+    TestNode, Tid, Torque, Transport, WATCHDOG,
     forms::{self, Api, Under},
     on, register,
 };
@@ -122,4 +124,32 @@ fn early_refusal_reports_its_reason() {
         }
     }
     assert!(node.refused("too many strangers") > 0);
+}
+
+/// The first registration of a process traces the types beside it; later ones need not.
+// spec: LNCL-21
+#[test]
+fn types_are_declared_at_each_registration() {
+    for transport in [Transport::Ring, Transport::Socket] {
+        let node = TestNode::start();
+        let types = node.with_types();
+        let api = NodeApi::connect(node.path()).unwrap();
+        let registration = Registration::new().transport(transport).handles::<Torque>().sends::<Doubled>();
+        assert_eq!(registration.register.kinds, [Torque::NAME, Doubled::NAME]);
+        for _ in 0..2 {
+            let endpoint = api.register_transport_address(registration.clone()).unwrap();
+            let mut declared = [types.next(), types.next()];
+            declared.sort_by_key(|(_, one)| one.sends);
+            for ((app, one), of) in
+                declared.iter().zip([PayloadType::of::<Torque>(), PayloadType::of::<Doubled>()])
+            {
+                let schema = of.expect("there is room").schema().unwrap().schema().encode();
+                assert_eq!((*app, one.kind, &one.schema), (endpoint.tid().app, of.unwrap().kind(), &schema));
+            }
+            let uses = declared.map(|(_, one)| (one.handles, one.sends));
+            assert_eq!(uses, [(true, false), (false, true)]);
+            endpoint.unregister().unwrap();
+        }
+        assert_eq!(node.refused("declaration of a type"), 0);
+    }
 }

@@ -52,6 +52,7 @@ impl Client {
                     | Order::Resolve { .. }
                     | Order::Introduce { .. }
                     | Order::Switch { .. }
+                    | Order::DeclareType(_)
                     | Order::Observe(_)
                     | Order::RefuseMessage { .. } => {
                         ConnectionEnd::Refused("wait for LNCL_REGISTERED".to_owned())

@@ -27,6 +27,7 @@ pub(super) async fn receive(
         | Order::Resolve { .. }
         | Order::Introduce { .. }
         | Order::Switch { .. }
+        | Order::DeclareType(_)
         | Order::Observe(_)
         | Order::RefuseMessage { .. }
         | Order::Unregister => Err("an unregistered connection can only register".to_owned()),

@@ -83,7 +83,7 @@ impl Client {
 
     /// Runs `act` if the client still has its address, under the registry's lock. A later incarnation of LNCL may have
     /// removed the registration, since this one hung; then the effects of `act` would never be undone.
-    fn while_registered<T>(&self, act: impl FnOnce(&State, &Registry) -> T) -> Option<T> {
+    pub(super) fn while_registered<T>(&self, act: impl FnOnce(&State, &Registry) -> T) -> Option<T> {
         let state = &self.server.state;
         let registry = lock(&state.registry);
         (registry.owner_of(self.tid.app) == Some(self.peer.owner())).then(|| act(state, &registry))

@@ -5,7 +5,7 @@ use std::ops::ControlFlow;
 use sinew_model::facts::User;
 use sinew_protocol::{
     observed::Observed,
-    payload::{self, Resolved},
+    payload::{self, Resolved, TypeDeclaration},
 };
 use sinew_runtime::{
     lock,
@@ -18,6 +18,7 @@ use sinew_runtime::{
 
 use super::{
     super::{
+        core::Registry,
         link_broker::LinkRequest,
         registrar,
         session::{MembershipError, Order},
@@ -25,7 +26,10 @@ use super::{
     Client,
     end::ConnectionEnd,
 };
-use crate::undelivered::{self, Entry};
+use crate::{
+    State,
+    undelivered::{self, Entry},
+};
 
 impl Client {
     /// Executes an order. Returns the end of the connection if the order ends it.
@@ -41,6 +45,7 @@ impl Client {
             Order::Resolve { name, nearest, correlation } => self.resolve(&name, nearest, correlation),
             Order::Introduce { to, correlation } => self.broker_link(to, correlation),
             Order::Switch { to, number, correlation } => self.switch(to, number, correlation),
+            Order::DeclareType(declaration) => self.declare_type(declaration),
             Order::Observe(observed) => self.observe(&observed),
             Order::RefuseMessage { message, why } => self.refuse_message(&message, why),
             Order::Unregister => return ControlFlow::Break(ConnectionEnd::Unregistered),
@@ -139,6 +144,19 @@ impl Client {
         }
         if let Err((receipt, why)) = self.server.link_broker.pass_marks(self.tid, to, number, receipt) {
             receipt.settle(Outcome::Rejected(why));
+        }
+    }
+
+    // spec: LNCL-21
+    fn declare_type(&self, declaration: TypeDeclaration) {
+        self.orders.count();
+        let declare = |state: &State, _: &Registry| {
+            let types = state.ctx.ports.app_types();
+            types.map_or(Ok(()), |types| types.declare(self.tid.app, self.user, declaration))
+        };
+        if let Some(Err(why)) = self.while_registered(declare) {
+            let detail = format!("of {} ({}): {why}", self.name, self.tid);
+            self.server.refusals.count(Time::now(), "declaration of a type", &detail);
         }
     }
 

@@ -1,5 +1,6 @@
 //! The facts that LNCL reports to the sync manager.
 
+use serde::{Deserialize, Serialize};
 use sinew_runtime::{
     tid::AppAddress,
     wire::{Kind, SchemaHash},
@@ -22,6 +23,30 @@ impl DeclaredTypes {
     pub const fn is_empty(&self) -> bool {
         self.handles.is_empty() && self.sends.is_empty()
     }
+}
+
+/// The structure of a payload type that an application in another process handles or sends. Its bytes come from that
+/// process and are not checked yet.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TypeDeclaration {
+    /// The type.
+    pub kind: Kind,
+    /// Whether the application handles it.
+    #[serde(default)]
+    pub handles: bool,
+    /// Whether the application sends it.
+    #[serde(default)]
+    pub sends: bool,
+    /// The word of the receiver's policy for messages of another version of the type. An unknown word stands for the
+    /// default.
+    #[serde(default)]
+    pub policy: String,
+    /// Whether messages of the type have end-to-end protection.
+    #[serde(default)]
+    pub protected: bool,
+    /// The canonical bytes of the structure.
+    #[serde(with = "serde_bytes")]
+    pub schema: Vec<u8>,
 }
 
 /// The user that an application runs as.

@@ -3,6 +3,7 @@
 use std::{collections::BTreeMap, sync::Arc};
 
 use sinew_lncl::undelivered::kind_name;
+use sinew_model::facts::DeclaredTypes;
 use sinew_runtime::{
     lock,
     outcome::Rejection,
@@ -38,8 +39,11 @@ pub(super) fn schemas(state: &Arc<NodeState>, question: &Message) -> Result<Sche
     for (hash, report) in &mut by_hash {
         report.schema = encoded(state, kind, *hash, report);
     }
-    let is_known =
-        |tid: Tid| declared.iter().any(|app| app.tid == tid && hash_of(&app.types.handles, kind).is_some());
+    // An application in another process names the types that it sends and those that it handles in one list.
+    let has = |types: &DeclaredTypes| {
+        hash_of(&types.handles, kind).or_else(|| hash_of(&types.sends, kind)).is_some()
+    };
+    let is_known = |tid: Tid| declared.iter().any(|app| app.tid == tid && has(&app.types));
     let handlers = directory.into_iter().filter(|app| app.kinds.contains(&kind) && !is_known(app.tid));
     let report = SchemasReport {
         name: kind_name(&state.lncl, kind),
@@ -59,10 +63,11 @@ fn entry(by_hash: &mut BTreeMap<SchemaHash, SchemaReport>, hash: SchemaHash) -> 
     by_hash.entry(hash).or_insert_with(empty)
 }
 
-/// Returns the bytes of a structure that this process has, or that the node of one of its users has sent.
+/// Returns the bytes of a structure that an application of this node has, or that the node of one of its users has
+/// sent.
 fn encoded(state: &NodeState, kind: Kind, hash: SchemaHash, users: &SchemaReport) -> Option<Vec<u8>> {
-    if let Some(own) = kind.schema_of_hash(hash) {
-        return Some(own.schema().encode());
+    if let Some(own) = state.types.schema_of_hash(kind, hash) {
+        return Some(own);
     }
     let verdicts = lock(&state.types.verdicts);
     users.sent_by.iter().find_map(|user| verdicts.fetched(user.tid.node, (kind, hash))).map(Schema::encode)

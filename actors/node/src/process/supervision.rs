@@ -391,6 +391,7 @@ impl Child {
             | Order::Resolve { .. }
             | Order::Introduce { .. }
             | Order::Switch { .. }
+            | Order::DeclareType(_)
             | Order::Observe(_)
             | Order::Unregister => {
                 return Err("it sent a frame that only a client of LNCL may send".to_owned());

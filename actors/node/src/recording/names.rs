@@ -57,7 +57,11 @@ pub(crate) fn report(state: &NodeState, path: &Path, journal: &[Kind], schemas: 
         if listed.insert(kind)
             && let Some(name) = kind_name(&state.lncl, kind)
         {
-            types.push(RecordedType { kind, name, schema: is_asked.then(|| schema(kind)).flatten() });
+            types.push(RecordedType {
+                kind,
+                name,
+                schema: is_asked.then(|| state.types.schema_of(kind)).flatten(),
+            });
         }
     }
     let now = Time::now();
@@ -100,13 +104,6 @@ pub(crate) fn journal_kinds(path: &Path) -> Vec<Kind> {
     let kinds =
         channels.unwrap_or_default().into_iter().filter_map(|channel| Some(Channel::of(channel.key?)?.kind));
     kinds.collect::<BTreeSet<_>>().into_iter().collect()
-}
-
-/// Returns the structure of a type that this process sends or handles. The first call for a type takes up to some
-/// milliseconds.
-fn schema(kind: Kind) -> Option<Vec<u8>> {
-    let traced = kind.schema()?.ok()?;
-    Some(traced.schema().encode())
 }
 
 #[cfg(test)]

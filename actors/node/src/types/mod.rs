@@ -2,14 +2,16 @@
 //!
 //! Each application's types are published in the directory by the hashes of their structures. A node compares the types
 //! that applications of other nodes send with those that its own applications handle. It fetches a structure only where
-//! two hashes of one type differ. The verdicts are in the routing table, which refuses messages, or counts them. The
-//! first message of a type that differs is logged on both nodes, in words.
+//! two hashes of one type differ. An application in another process of this node declares its structures, and they are
+//! compared with those of the node's other applications, too. The verdicts are in the routing table, which refuses
+//! messages, or counts them. The first message of a type that differs is logged on both nodes, in words.
 //!
 //! All of it runs on one thread of low priority. A message that arrives before the verdict is decoded as usual, unless
 //! the policy of its type is `Refuse`. The routing table drops the verdicts on a node when its route changes.
 //!
 //! | file | content |
 //! | --- | --- |
+//! | `app_type.rs` | one type of an application: a Rust type of this process, or a declaration |
 //! | `declared.rs` | the types of this node's applications |
 //! | `judgement.rs` | the comparison of two structures, the policy, and the words for both |
 //! | `verdicts.rs` | all types that differ: which are missing, refused and logged |
@@ -17,6 +19,7 @@
 //! | `frames.rs` | the frames between nodes |
 //! | `thread.rs` | the thread that does it |
 
+mod app_type;
 mod declared;
 mod frames;
 #[cfg(feature = "fuzzing")]
@@ -35,10 +38,14 @@ use std::{
     },
 };
 
+use sinew_model::{
+    facts::{TypeDeclaration, User},
+    ports::AppTypes,
+};
 use sinew_runtime::{
     lock,
     tid::{AppAddress, NodeAddress},
-    wire::{Message, PayloadType},
+    wire::{Kind, Message, PayloadType, SchemaHash},
 };
 use sinew_sync::FrameHandler;
 use tokio::sync::Notify;
@@ -77,16 +84,29 @@ impl Types {
         self.wake.notify_one();
     }
 
-    /// Removes the types of an application that is not registered any more.
-    pub(crate) fn unregister(&self, app: AppAddress) {
-        self.declared.forget(app);
-    }
-
     /// Records that an application sends a type. It is called on the sending thread, once for each type.
     pub(crate) fn sends(&self, app: AppAddress, sent: PayloadType) {
         if self.declared.sends(app, sent) {
             self.wake.notify_one();
         }
+    }
+
+    /// Returns the canonical bytes of the structure with this hash that an application of this node has. The first call
+    /// for a type takes up to some milliseconds.
+    pub(crate) fn schema_of_hash(&self, kind: Kind, hash: SchemaHash) -> Option<Vec<u8>> {
+        if let Some(own) = kind.schema_of_hash(hash) {
+            return Some(own.schema().encode());
+        }
+        self.declared.schema_of_hash(kind, hash).map(|structure| structure.encode())
+    }
+
+    /// Returns the canonical bytes of the structure that a type has in this process, or else in another process of this
+    /// node. The first call for a type takes up to some milliseconds.
+    pub(crate) fn schema_of(&self, kind: Kind) -> Option<Vec<u8>> {
+        if let Some(Ok(own)) = kind.schema() {
+            return Some(own.schema().encode());
+        }
+        self.declared.schema_of(kind).map(|structure| structure.encode())
     }
 
     /// Ends the thread.
@@ -98,6 +118,18 @@ impl Types {
 
     fn pop_frame(&self) -> Option<(NodeAddress, Frame)> {
         lock(&self.frames).pop_front()
+    }
+}
+
+impl AppTypes for NodeState {
+    fn declare(&self, app: AppAddress, user: User, declaration: TypeDeclaration) -> Result<(), String> {
+        self.types.declared.declare(app, user, declaration)?;
+        self.types.wake.notify_one();
+        Ok(())
+    }
+
+    fn forget(&self, app: AppAddress) {
+        self.types.declared.forget(app);
     }
 }
 

@@ -34,7 +34,7 @@ use super::{
     FRAMES_MAX,
     frames::{Frame, MismatchReport, SchemaAnswer, SchemaQuestion},
     judgement::{Judgement, Treatment, sentence},
-    verdicts::{Disagreement, Handled, Sent},
+    verdicts::{Disagreement, Handled, Program, Sent},
 };
 use crate::NodeState;
 
@@ -125,7 +125,7 @@ impl Comparing {
     /// Handles all that is new. Returns the time of the next step.
     fn step(&mut self, state: &NodeState) -> Option<Time> {
         // Before the directory is read: a node that is linked anew since then may have other types.
-        let peer_changes = state.ctx.router.peer_changes();
+        let route_changes = state.ctx.router.route_changes();
         publish(state);
         for _ in 0..FRAMES_MAX {
             let Some((from, frame)) = state.types.pop_frame() else { break };
@@ -133,11 +133,11 @@ impl Comparing {
                 state.ctx.refusals.count(Time::now(), "types", &fault);
             }
         }
-        let handled = handled(state);
+        let (handled, sent_here) = own_types(state);
         self.read_lists(state);
         let now = Time::now();
         let (wanted, cases) = {
-            let sent = self.lists.values().flat_map(|list| &list.sent);
+            let sent = self.lists.values().flat_map(|list| &list.sent).chain(&sent_here);
             let mut verdicts = lock(&state.types.verdicts);
             (verdicts.declare(now, &handled, sent), verdicts.cases())
         };
@@ -157,7 +157,7 @@ impl Comparing {
             );
         }
         table.retain(|(path, _)| self.is_linked(state, path.source.node));
-        let is_set = self.install(state, table, peer_changes);
+        let is_set = self.install(state, table, route_changes);
         for (node, (kind, hash)) in wanted {
             // It is requested again.
             let _ = send(state, node, Kind::SYNC_SCHEMA_ASK, &SchemaQuestion { kind, hash });
@@ -191,7 +191,7 @@ impl Comparing {
         question: SchemaQuestion,
     ) -> Result<(), String> {
         let SchemaQuestion { kind, hash } = question;
-        let schema = kind.schema_of_hash(hash).ok_or_else(|| {
+        let schema = state.types.schema_of_hash(kind, hash).ok_or_else(|| {
             format!("from {from}, a question for a structure of kind {kind} that this node does not have")
         })?;
         let now = Time::now();
@@ -201,7 +201,7 @@ impl Comparing {
             return Err(format!("from {from}, a question for the structure of kind {kind} too early"));
         }
         self.answered.insert((from, (kind, hash)), now);
-        let answer = SchemaAnswer { kind, hash, schema: schema.schema().encode() };
+        let answer = SchemaAnswer { kind, hash, schema };
         let sent = send(state, from, Kind::SYNC_SCHEMA, &answer);
         sent.map_err(|why| format!("a structure was not sent to {from}: {why}"))
     }
@@ -219,9 +219,12 @@ impl Comparing {
         }
     }
 
-    /// Returns whether the list of `node` is of its linked incarnation. The directory learns of another one later than
-    /// the routing table.
+    /// Returns whether the list of `node` is of its linked incarnation, or `node` is this one. The directory learns of
+    /// another incarnation later than the routing table.
     fn is_linked(&self, state: &NodeState, node: NodeAddress) -> bool {
+        if node == state.ctx.node {
+            return true;
+        }
         let linked = state.ctx.ports.links().and_then(|links| links.incarnation(node));
         linked.is_none_or(|linked| self.lists.get(&node).is_some_and(|list| list.of.0 == linked))
     }
@@ -231,22 +234,22 @@ impl Comparing {
         &mut self,
         state: &NodeState,
         table: Vec<(TypedPath, Arc<Mismatch>)>,
-        peer_changes: u64,
+        route_changes: u64,
     ) -> bool {
         let (installed, at) = &self.installed;
         let mut pairs = table.iter().zip(installed);
         let are_same = pairs.all(|((path, entry), (former_path, former_entry))| {
             path == former_path && Arc::ptr_eq(entry, former_entry)
         });
-        if are_same && table.len() == installed.len() && *at == peer_changes {
+        if are_same && table.len() == installed.len() && *at == route_changes {
             return true;
         }
         let wake = self.wake.clone();
         let mismatches = (!table.is_empty())
             .then(|| Mismatches::new(table.iter().cloned(), Arc::new(move || wake.notify_one())));
-        let is_set = state.ctx.router.set_mismatches(mismatches, peer_changes);
+        let is_set = state.ctx.router.set_mismatches(mismatches, route_changes);
         if is_set {
-            self.installed = (table, peer_changes);
+            self.installed = (table, route_changes);
         }
         is_set
     }
@@ -257,38 +260,65 @@ fn publish(state: &NodeState) {
     // Each type is traced by itself: a panic in one does not affect the others.
     while let Some((app, types)) = state.types.declared.pop_changed() {
         let may_have_fewer = types.has_two_of_a_kind();
-        let types = types.hashes();
-        if !types.is_empty() || may_have_fewer {
+        let hashes = types.hashes();
+        for kind in types.invalid() {
+            let detail = format!("of {app}, the declaration of kind {kind} is no valid structure");
+            state.ctx.refusals.count(Time::now(), "types", &detail);
+        }
+        if !hashes.is_empty() || may_have_fewer {
             // An application that has ended meanwhile has no entry in the directory.
-            sinew_lncl::types_known(&state.lncl, app, types);
+            let is_current = || state.types.declared.is_current(app, types.registration);
+            sinew_lncl::types_known(&state.lncl, app, hashes, is_current);
         }
     }
 }
 
-/// Returns the published types that applications of this node handle.
-fn handled(state: &NodeState) -> Vec<Handled> {
+/// Returns the published types that applications of this node handle, and those that they send if another process has
+/// declared types.
+fn own_types(state: &NodeState) -> (Vec<Handled>, Vec<Sent>) {
     let all = lock(&state.sync.core).own_declared_types();
-    let mut handled = Vec::new();
+    let declared = &state.types.declared;
+    let compares_senders = declared.has_declarations();
+    let (mut handled, mut sent) = (Vec::new(), Vec::new());
     for AppTypes { tid, name, types } in all {
+        let program = if declared.is_declared(tid.app) { Program::Other } else { Program::Node };
         for (kind, hash) in types.handles {
-            let own = state.types.declared.handled(tid.app, kind);
+            let own = declared.handled(tid.app, kind);
+            // The directory learns later than this table that the address has another owner.
             if let Some(own) = own
-                && let Ok(schema) = own.schema()
+                && let Some((schema, of_own)) = own.schema()
+                && of_own == hash
             {
-                let (name, policy, is_protected) = (name.clone(), own.mismatch(), own.is_protected());
-                let schema = schema.schema();
-                handled.push(Handled { app: tid.app, name, kind, hash, policy, is_protected, schema });
+                let (name, policy, is_protected) = (name.clone(), own.policy(), own.is_protected());
+                handled.push(Handled {
+                    app: tid.app,
+                    name,
+                    kind,
+                    hash,
+                    policy,
+                    is_protected,
+                    schema,
+                    program,
+                });
+            }
+        }
+        let name: Arc<str> = name.into();
+        for (kind, hash) in types.sends.into_iter().filter(|_| compares_senders) {
+            let own = declared.sent(tid.app, kind).and_then(|own| own.schema());
+            if let Some((structure, _)) = own.filter(|(_, of_own)| *of_own == hash) {
+                let here = Some((structure, program));
+                sent.push(Sent { tid, name: name.clone(), kind, hash, here });
             }
         }
     }
-    handled
+    (handled, sent)
 }
 
 /// Returns the types that an application of another node sends.
 fn sent_by(app: AppTypes) -> impl Iterator<Item = Sent> {
     let AppTypes { tid, name, types } = app;
     let name: Arc<str> = name.into();
-    types.sends.into_iter().map(move |(kind, hash)| Sent { tid, name: name.clone(), kind, hash })
+    types.sends.into_iter().map(move |(kind, hash)| Sent { tid, name: name.clone(), kind, hash, here: None })
 }
 
 /// Logs the report of another node that messages of this node are of a type that differs.
@@ -297,7 +327,7 @@ fn sent_by(app: AppTypes) -> impl Iterator<Item = Sent> {
 /// Returns the fault of the report.
 fn reported(state: &NodeState, from: NodeAddress, report: &MismatchReport) -> Result<(), String> {
     let own = state.types.declared.sent(report.source, report.kind);
-    let own = own.and_then(|own| own.schema().ok()).ok_or_else(|| {
+    let (own, _) = own.and_then(|own| own.schema()).ok_or_else(|| {
         format!("from {from}, a report on kind {}, which {} does not send", report.kind, report.source)
     })?;
     let target = Tid::new(from, report.target);
@@ -306,7 +336,7 @@ fn reported(state: &NodeState, from: NodeAddress, report: &MismatchReport) -> Re
     }
     let report = {
         let mut reported = lock(&state.types.reported);
-        reported.add(Time::now(), from, report, own.schema())?.cloned()
+        reported.add(Time::now(), from, report, &own)?.cloned()
     };
     if let Some(report) = report {
         let source = title(state, Tid::new(state.ctx.node, report.source));
@@ -316,7 +346,7 @@ fn reported(state: &NodeState, from: NodeAddress, report: &MismatchReport) -> Re
     Ok(())
 }
 
-/// Logs a disagreement, and reports it to the node of the sender.
+/// Logs a disagreement, and reports it to the node of the sender if that is another one.
 fn tell(state: &NodeState, disagreement: &Disagreement) {
     let Disagreement { path, source, target, judgement, handled: (hash, schema), seen } = disagreement;
     let TypedPath { source: sender, target: app, kind } = *path;
@@ -325,6 +355,9 @@ fn tell(state: &NodeState, disagreement: &Disagreement) {
         format!("{target} ({}) of this node", Tid::new(state.ctx.node, app)),
     );
     write(state, kind, (&ends.0, &ends.1), judgement, *seen);
+    if sender.node == state.ctx.node {
+        return;
+    }
     let report = MismatchReport {
         source: sender.app,
         target: app,

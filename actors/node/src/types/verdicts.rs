@@ -1,5 +1,5 @@
-//! The types that applications of other nodes send and applications of this node handle in different versions, and the
-//! verdicts on them. Pure: the caller passes the time.
+//! The types that applications of this node handle in another version than their senders, on other nodes and in other
+//! processes of this one, and the verdicts on them. Pure: the caller passes the time.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -16,7 +16,10 @@ use sinew_runtime::{
 };
 use sinew_schema::Schema;
 
-use super::judgement::{Judgement, Treatment};
+use super::{
+    app_type::Structure,
+    judgement::{Judgement, Treatment},
+};
 
 /// Time after which a structure that did not come is requested again.
 pub(super) const ASK_AGAIN: Duration = Duration::from_secs(2);
@@ -46,10 +49,20 @@ pub(super) struct Handled {
     pub(super) policy: MismatchPolicy,
     /// Whether messages of the type have end-to-end protection.
     pub(super) is_protected: bool,
-    pub(super) schema: &'static Schema,
+    pub(super) schema: Structure,
+    pub(super) program: Program,
 }
 
-/// A type that an application of another node sends.
+/// The program of an application of this node.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Program {
+    /// That of the node: its types are not compared with each other.
+    Node,
+    /// That of another process.
+    Other,
+}
+
+/// A type that an application sends.
 #[derive(Clone, Debug)]
 pub(super) struct Sent {
     pub(super) tid: Tid,
@@ -57,6 +70,16 @@ pub(super) struct Sent {
     pub(super) name: Arc<str>,
     pub(super) kind: Kind,
     pub(super) hash: SchemaHash,
+    /// The structure, if the application is one of this node.
+    pub(super) here: Option<(Structure, Program)>,
+}
+
+impl Sent {
+    /// Returns whether this type and one that is handled are those of two programs, and differ.
+    fn differs_from(&self, handled: &Handled) -> bool {
+        let is_own = matches!(self.here, Some((_, Program::Node)));
+        self.hash != handled.hash && !(is_own && handled.program == Program::Node)
+    }
 }
 
 /// A structure to be requested from the node that has it.
@@ -118,15 +141,15 @@ impl Room {
 #[derive(Clone, Debug)]
 pub(super) struct Case {
     path: TypedPath,
-    sent: (SchemaHash, Arc<Schema>),
-    handled: (SchemaHash, &'static Schema),
+    sent: (SchemaHash, Structure),
+    handled: (SchemaHash, Structure),
     policy: MismatchPolicy,
 }
 
 impl Case {
     /// Compares them.
     pub(super) fn judge(&self) -> Judgement {
-        Judgement::of(&self.sent.1, self.handled.1, self.policy)
+        Judgement::of(&self.sent.1, &self.handled.1, self.policy)
     }
 }
 
@@ -138,7 +161,9 @@ struct Pair {
     handled: SchemaHash,
     policy: MismatchPolicy,
     is_protected: bool,
-    schema: &'static Schema,
+    schema: Structure,
+    /// The sender's structure, if it is an application of this node.
+    sent_here: Option<Structure>,
     /// Refuses the messages until there is a verdict, for [`MismatchPolicy::Refuse`].
     pending: Option<Arc<Mismatch>>,
     verdict: Option<Verdict>,
@@ -161,7 +186,7 @@ pub(crate) struct Disagreement {
     pub(crate) target: String,
     pub(crate) judgement: Judgement,
     /// The structure of the receiver's type, and its hash.
-    pub(super) handled: (SchemaHash, &'static Schema),
+    pub(super) handled: (SchemaHash, Structure),
     /// The number of messages so far.
     pub(crate) seen: u64,
 }
@@ -181,7 +206,8 @@ impl Pair {
             handled: handled.hash,
             policy: handled.policy,
             is_protected: handled.is_protected,
-            schema: handled.schema,
+            schema: handled.schema.clone(),
+            sent_here: sent.here.as_ref().map(|(structure, _)| structure.clone()),
             // The guard of a protected type would trip for a difference that may turn out to be none.
             pending: (handled.policy == MismatchPolicy::Refuse && !handled.is_protected)
                 .then(|| Mismatch::new(Effect::Refused)),
@@ -194,9 +220,9 @@ impl Pair {
             && (&*self.source, self.target.as_str()) == (&*sent.name, handled.name.as_str())
     }
 
-    /// Returns the sender's structure and its node.
-    const fn wanted(&self, path: &TypedPath) -> Wanted {
-        (path.source.node, (path.kind, self.sent))
+    /// Returns the sender's structure and its node. `None`: the sender is an application of this node.
+    fn wanted(&self, path: &TypedPath) -> Option<Wanted> {
+        self.sent_here.is_none().then_some((path.source.node, (path.kind, self.sent)))
     }
 
     fn is_same(&self) -> bool {
@@ -218,7 +244,7 @@ impl Pair {
             source: self.source.to_string(),
             target: self.target.clone(),
             judgement: judgement.clone(),
-            handled: (self.handled, self.schema),
+            handled: (self.handled, self.schema.clone()),
             seen: mismatch.seen(),
         })
     }
@@ -250,7 +276,7 @@ impl Verdicts {
         let (mut pairs, mut room, mut left_out) = (BTreeMap::new(), Room::default(), 0);
         for sent in sent {
             let handled = by_kind.get(&sent.kind).into_iter().flatten();
-            for handled in handled.filter(|handled| handled.hash != sent.hash) {
+            for handled in handled.filter(|handled| sent.differs_from(handled)) {
                 let path = TypedPath { source: sent.tid, target: handled.app, kind: sent.kind };
                 let former = self.pairs.remove(&path).filter(|pair| pair.is_of(sent, handled));
                 let pair = former.unwrap_or_else(|| Pair::new(sent, handled));
@@ -267,7 +293,7 @@ impl Verdicts {
     }
 
     fn wanted(&mut self, now: Time) -> Vec<Wanted> {
-        let used: BTreeSet<Wanted> = self.pairs.iter().map(|(path, pair)| pair.wanted(path)).collect();
+        let used: BTreeSet<Wanted> = self.pairs.iter().filter_map(|(path, pair)| pair.wanted(path)).collect();
         self.fetched.retain(|of, _| used.contains(of));
         let open = self.open();
         self.asked.retain(|asked, _| open.contains(asked));
@@ -292,7 +318,7 @@ impl Verdicts {
     /// Returns the missing structures.
     fn open(&self) -> BTreeSet<Wanted> {
         let unjudged = self.pairs.iter().filter(|(_, pair)| pair.verdict.is_none());
-        let wanted = unjudged.map(|(path, pair)| pair.wanted(path));
+        let wanted = unjudged.filter_map(|(path, pair)| pair.wanted(path));
         wanted.filter(|wanted| !self.fetched.contains_key(wanted)).collect()
     }
 
@@ -300,8 +326,11 @@ impl Verdicts {
     pub(super) fn cases(&self) -> Vec<Case> {
         let unjudged = self.pairs.iter().filter(|(_, pair)| pair.verdict.is_none());
         let case = |(path, pair): (&TypedPath, &Pair)| {
-            let sent = self.fetched.get(&pair.wanted(path))?.clone();
-            let (sent, handled) = ((pair.sent, sent), (pair.handled, pair.schema));
+            let sent = match pair.wanted(path) {
+                Some(wanted) => Structure::Declared(self.fetched.get(&wanted)?.clone()),
+                None => pair.sent_here.clone()?,
+            };
+            let (sent, handled) = ((pair.sent, sent), (pair.handled, pair.schema.clone()));
             Some(Case { path: *path, sent, handled, policy: pair.policy })
         };
         unjudged.filter_map(case).collect()

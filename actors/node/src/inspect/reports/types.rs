@@ -89,8 +89,8 @@ pub struct TypeUser {
     pub name: String,
 }
 
-/// Asks for the types that a sender on another node and a receiver have in different versions, on both sides of the
-/// asked node. [`MismatchesReport`] answers.
+/// Asks for the types that a sender and a receiver have in different versions, if one of them is on the asked node and
+/// the other on another node or in another process. [`MismatchesReport`] answers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct AskMismatches {}
 

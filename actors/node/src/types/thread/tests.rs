@@ -6,7 +6,8 @@ use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 use sinew_model::{
     config::NodeConfig,
-    facts::{AppFact, DeclaredTypes, LinkFact},
+    facts::{AppFact, DeclaredTypes, LinkFact, TypeDeclaration, User},
+    ports::AppTypes as _,
 };
 use sinew_runtime::{
     app::{AppContext, AppSpec, Delivery, DynApp},
@@ -256,4 +257,61 @@ fn frames_of_one_node_leave_room_for_others() {
     header.class = Class::Bulk;
     let message = Message::new(header, encode(&question));
     Frames(Arc::downgrade(&bench.state)).receive(NodeAddress::new(0x7f00_000a), &message).unwrap();
+}
+
+/// Returns the declaration of a client that sends the type.
+fn declaration(sends: PayloadType) -> TypeDeclaration {
+    let (kind, policy) = (sends.kind(), sends.mismatch().word().to_owned());
+    let schema = sends.schema().unwrap().schema().encode();
+    TypeDeclaration { kind, handles: false, sends: true, policy, protected: false, schema }
+}
+
+#[test]
+fn type_of_a_client_is_compared_within_its_node_until_the_client_ends() {
+    let (gains, renamed) = versions();
+    let mut bench = Bench::new();
+    bench.registers(KNEE, "knee", &[gains], &[]);
+    bench.input(Input::AppChanged(AppFact::own_registered(GAIT, Some("gait".to_owned()), Vec::new())));
+    bench.state.declare(GAIT, User::Own, declaration(renamed)).unwrap();
+    bench.input(Input::AppChanged(AppFact::Types { app: GAIT, types: declared(renamed) }));
+    // Both structures are here: nothing is fetched, and no other node is told.
+    assert_eq!(bench.steps(), []);
+    let node = bench.state.ctx.node;
+    let state = bench.state.clone();
+    let send = || {
+        let header = Header::new(Gains::KIND, Tid::new(node, GAIT), Tid::new(node, KNEE));
+        state.ctx.router.send(Message::new(header, Bytes::new()))
+    };
+    assert_eq!(send(), Err(Rejection::Malformed));
+    assert_eq!(bench.steps(), []);
+    let [one] = &lock(&bench.state.types.verdicts).disagreements()[..] else { panic!("there is one") };
+    let words = "field `gain` (f32) at the sender seems to be `kp` (f32) at the receiver";
+    assert_eq!(
+        (&*one.source, &*one.target, &one.judgement.differences[..]),
+        ("gait", "knee", &[words.to_owned()][..])
+    );
+    // The directory learns later than the table of types that the client has ended.
+    bench.state.forget(GAIT);
+    bench.state.ctx.router.remove_local(GAIT);
+    assert_eq!(send(), Ok(()));
+    assert_eq!((bench.steps(), send(), bench.faults()), (Vec::new(), Ok(()), 0));
+}
+
+#[test]
+fn question_for_the_structure_of_a_client_is_answered() {
+    // No Rust type of this process has the name.
+    let (gains, _) = versions();
+    let (kind, traced) = (Kind::named("test.thread.of_client"), gains.schema().unwrap());
+    let (bytes, hash) = (traced.schema().encode(), traced.hash());
+    let mut bench = Bench::new();
+    let declaration = TypeDeclaration { kind, ..declaration(gains) };
+    bench.state.declare(GAIT, User::Guest(1_001), declaration).unwrap();
+    bench.peer_sends(Kind::SYNC_SCHEMA_ASK, &SchemaQuestion { kind, hash }).unwrap();
+    let sent = bench.steps();
+    let [(Kind::SYNC_SCHEMA, answer)] = &sent[..] else { panic!("{sent:?}") };
+    assert_eq!(decode::<SchemaAnswer>(answer).unwrap(), SchemaAnswer { kind, hash, schema: bytes.clone() });
+    // So has the report of the recorder.
+    assert_eq!(bench.state.types.schema_of(kind), Some(bytes));
+    bench.state.forget(GAIT);
+    assert_eq!(bench.state.types.schema_of(kind), None);
 }

@@ -38,14 +38,20 @@ fn schema<T: Serialize + DeserializeOwned>() -> Schema {
 }
 
 fn handled<T: Serialize + DeserializeOwned>() -> Handled {
-    let schema: &'static Schema = Box::leak(Box::new(schema::<T>()));
+    let schema = Structure::Declared(Arc::new(schema::<T>()));
     let (hash, policy) = (schema.hash(), MismatchPolicy::default());
-    let name = "knee.drive".to_owned();
-    Handled { app: KNEE, name, kind: KIND, hash, policy, is_protected: false, schema }
+    let (name, program) = ("knee.drive".to_owned(), Program::Node);
+    Handled { app: KNEE, name, kind: KIND, hash, policy, is_protected: false, schema, program }
 }
 
 fn sent<T: Serialize + DeserializeOwned>() -> Sent {
-    Sent { tid: SOURCE, name: "gait".into(), kind: KIND, hash: schema::<T>().hash() }
+    Sent { tid: SOURCE, name: "gait".into(), kind: KIND, hash: schema::<T>().hash(), here: None }
+}
+
+/// Returns the same type of an application of this node.
+fn sent_here<T: Serialize + DeserializeOwned>(program: Program) -> Sent {
+    let here = Some((Structure::Declared(Arc::new(schema::<T>())), program));
+    Sent { tid: Tid::new(HERE, AppAddress::new(0x1002)), here, ..sent::<T>() }
 }
 
 const fn at(seconds: u64) -> Time {
@@ -90,7 +96,7 @@ impl Bench {
     fn install(&self) {
         let table = self.verdicts.table();
         let table = (!table.is_empty()).then(|| Mismatches::new(table, Arc::new(|| {})));
-        assert!(self.router.set_mismatches(table, self.router.peer_changes()));
+        assert!(self.router.set_mismatches(table, self.router.route_changes()));
     }
 
     fn delivers(&self) -> Result<(), Rejection> {
@@ -255,12 +261,12 @@ fn no_node_takes_the_room_of_others() {
 }
 
 /// Returns two structures that are the same on the wire: a part of them has another name.
-fn same_on_the_wire() -> (&'static Schema, Schema) {
+fn same_on_the_wire() -> (Structure, Schema) {
     let named = |part: &str| {
         let parts = [(part.to_owned(), Shape::Struct(Vec::new()))];
         Schema { root: Shape::List(Box::new(Shape::Named(part.to_owned()))), types: parts.into() }
     };
-    (Box::leak(Box::new(named("Here"))), named("There"))
+    (Structure::Declared(Arc::new(named("Here"))), named("There"))
 }
 
 #[test]
@@ -319,4 +325,31 @@ fn reports_to_one_node_are_spread_over_steps() {
     assert_eq!(bench.verdicts.next_wake(), Some(at(1)));
     assert_eq!(bench.told(at(1)).len(), 1);
     assert_eq!(bench.verdicts.next_wake(), Some(at(61)));
+}
+
+#[test]
+fn types_of_two_programs_of_one_node_are_compared() {
+    let (knee, mut verdicts) = (handled::<Gains>(), Verdicts::default());
+    // Two applications of the node's own program, of which one has the type under another name.
+    assert!(
+        verdicts
+            .declare(at(0), std::slice::from_ref(&knee), &[sent_here::<Renamed>(Program::Node)])
+            .is_empty()
+    );
+    assert!(verdicts.pairs.is_empty());
+    let of_client = Handled { program: Program::Other, ..knee.clone() };
+    for (handled, sender) in
+        [(&knee, Program::Other), (&of_client, Program::Node), (&of_client, Program::Other)]
+    {
+        let mut verdicts = Verdicts::default();
+        let sent = [sent_here::<Renamed>(sender)];
+        // Nothing is fetched: both structures are there.
+        assert!(verdicts.declare(at(0), std::slice::from_ref(handled), &sent).is_empty());
+        judge(&mut verdicts);
+        let treatments: Vec<_> = verdicts.disagreements().iter().map(|one| one.judgement.treatment).collect();
+        assert_eq!((treatments, verdicts.table().len()), (vec![Treatment::Refused], 1));
+    }
+    let same = sent_here::<Gains>(Program::Other);
+    verdicts.declare(at(1), &[knee], &[same]);
+    assert!(verdicts.pairs.is_empty());
 }

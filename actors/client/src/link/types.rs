@@ -1,0 +1,206 @@
+//! The declaration of an endpoint's payload types to its node.
+//!
+//! Finding the structure of a type takes up to some milliseconds, once in a process. So a registration does not wait
+//! for it: types with a known structure are declared before the registration returns, the others by a thread of low
+//! priority.
+
+use std::{
+    sync::{Arc, Weak},
+    thread,
+    time::Duration,
+};
+
+use sinew_model::thread_priority::lower_priority;
+use sinew_protocol::payload::{self, TypeDeclaration};
+use sinew_runtime::{
+    log,
+    tid::Tid,
+    time::Time,
+    wire::{Kind, Message, PayloadType},
+};
+
+use super::{Progress, Writer};
+use crate::ApiError;
+
+/// Maximum number of declared types: the node keeps as many that an application handles, and as many that it sends.
+const TYPES_MAX: usize = 128;
+/// Time after which a declaration that finds no room is given up. A long loan or a stopped node takes the room.
+const WITHIN: Duration = Duration::from_secs(10);
+/// Time between two tries of one declaration.
+const PAUSE: Duration = Duration::from_millis(5);
+/// Prefix of the names of Sinew's own types, which layers keep compatible.
+const OWN_PREFIX: &str = "sinew.";
+
+/// The use of a type by an application.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Use {
+    Handled,
+    Sent,
+}
+
+/// The types that an application handles or sends, in the order of their registration.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct UsedTypes(Vec<UsedType>);
+
+#[derive(Clone, Copy, Debug)]
+struct UsedType {
+    of: PayloadType,
+    is_handled: bool,
+    is_sent: bool,
+}
+
+impl UsedTypes {
+    /// Adds a use of a type. One beyond the maximum is not declared, and so not compared.
+    pub(crate) fn add(&mut self, of: PayloadType, as_what: Use) {
+        if of.name().starts_with(OWN_PREFIX) {
+            return;
+        }
+        if !self.0.iter().any(|one| one.of == of) {
+            if self.0.len() == TYPES_MAX {
+                return;
+            }
+            self.0.push(UsedType { of, is_handled: false, is_sent: false });
+        }
+        for one in self.0.iter_mut().filter(|one| one.of == of) {
+            one.is_handled |= as_what == Use::Handled;
+            one.is_sent |= as_what == Use::Sent;
+        }
+    }
+
+    /// Declares the types to the node of a new connection. Never waits.
+    pub(super) fn declare(&self, own: Tid, payload_max: usize, writer: &Arc<Writer>) {
+        let is_declared = |one: &&UsedType| {
+            one.of.is_traced() && declaration(one, own, payload_max).is_none_or(|frame| write(writer, &frame))
+        };
+        let rest: Vec<UsedType> = self.0.iter().filter(|one| !is_declared(one)).copied().collect();
+        if rest.is_empty() {
+            return;
+        }
+        // Weak: the end of the endpoint closes its connection.
+        let writer = Arc::downgrade(writer);
+        let run = move || declare_later(&rest, own, payload_max, &writer);
+        if let Err(why) = thread::Builder::new().name("types".to_owned()).spawn(run) {
+            log::debug!("the types of {own} are not declared: {why}");
+        }
+    }
+}
+
+/// Declares types as soon as their structures are known.
+fn declare_later(types: &[UsedType], own: Tid, payload_max: usize, writer: &Weak<Writer>) {
+    lower_priority();
+    for one in types {
+        let Some(frame) = declaration(one, own, payload_max) else { continue };
+        let until = Time::now() + WITHIN;
+        loop {
+            let Some(writer) = writer.upgrade() else { return };
+            if write(&writer, &frame) {
+                break;
+            }
+            drop(writer);
+            if Time::now() >= until {
+                log::debug!("type {} of {own} is not declared: no room within {WITHIN:?}", one.of.name());
+                break;
+            }
+            thread::sleep(PAUSE);
+        }
+    }
+}
+
+/// Returns the frame that declares a type. `None`: its structure is not known, or too long for the node.
+fn declaration(one: &UsedType, own: Tid, payload_max: usize) -> Option<Message> {
+    let UsedType { of, is_handled, is_sent } = *one;
+    let declaration = TypeDeclaration {
+        kind: of.kind(),
+        handles: is_handled,
+        sends: is_sent,
+        policy: of.mismatch().word().to_owned(),
+        protected: of.is_protected(),
+        schema: of.schema().ok()?.schema().encode(),
+    };
+    let frame = payload::frame(Kind::LNCL_TYPE, own, payload::lncl_of(own.node), &declaration);
+    (frame.payload.len() <= payload_max).then_some(frame)
+}
+
+/// Writes the frame if there is room for it now. Returns whether it need not be tried again.
+fn write(writer: &Writer, frame: &Message) -> bool {
+    match writer.offer(frame) {
+        Ok(is_written) => is_written,
+        // A send in progress, or a loan, holds the ring.
+        Err(ApiError::LoanActive) => false,
+        // The endpoint finds the error at its next call.
+        Err(_) => true,
+    }
+}
+
+impl Writer {
+    /// Writes one frame if there is room for it now. Returns whether it was written.
+    ///
+    /// # Errors
+    /// The connection has ended, or the ring is lent.
+    fn offer(&self, message: &Message) -> Result<bool, ApiError> {
+        match self {
+            Self::Socket(writer) => {
+                match writer.begin(Message::new(message.header, message.payload.clone()))? {
+                    Progress::Whole | Progress::Part(_) => Ok(true),
+                    Progress::Full(_) => Ok(false),
+                }
+            }
+            Self::Ring(writer) => writer.try_write(message),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde::{Deserialize, Serialize};
+    use sinew_runtime::{
+        tid::{AppAddress, NodeAddress},
+        wire::{MismatchPolicy, Payload},
+    };
+
+    use super::*;
+
+    #[derive(Serialize, Deserialize)]
+    struct Angle {
+        degrees: f32,
+    }
+
+    impl Payload for Angle {
+        const NAME: &'static str = "test.client_types.angle";
+        const MISMATCH: MismatchPolicy = MismatchPolicy::Refuse;
+    }
+
+    #[derive(Serialize, Deserialize)]
+    struct Own {}
+
+    impl Payload for Own {
+        const NAME: &'static str = "sinew.test.client_types";
+    }
+
+    const TID: Tid = Tid::new(NodeAddress::new(1), AppAddress::new(0x1000));
+
+    #[test]
+    fn type_is_declared_once_with_its_uses_and_policy() {
+        let mut types = UsedTypes::default();
+        let [angle, own] = [PayloadType::of::<Angle>(), PayloadType::of::<Own>()].map(|one| one.unwrap());
+        types.add(angle, Use::Handled);
+        types.add(own, Use::Handled);
+        types.add(angle, Use::Sent);
+        let [one] = &types.0[..] else { panic!("{types:?}") };
+        let frame = declaration(one, TID, 4_096).expect("it has a structure");
+        let read: TypeDeclaration = payload::read(&frame.payload).unwrap();
+        let schema = angle.schema().unwrap().schema().encode();
+        let policy = "refuse".to_owned();
+        let expected = TypeDeclaration {
+            kind: Angle::KIND,
+            handles: true,
+            sends: true,
+            policy,
+            protected: false,
+            schema,
+        };
+        assert_eq!((frame.header.kind, read), (Kind::LNCL_TYPE, expected));
+        assert!(angle.is_traced(), "another registration of this process need not wait for it");
+        assert!(declaration(one, TID, frame.payload.len() - 1).is_none());
+    }
+}
