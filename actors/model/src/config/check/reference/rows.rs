@@ -459,7 +459,7 @@ pub(super) const ROWS: &[Row] = &[
         kind: Kind::Number(PROBE),
         value: |config| millis(config.rt.probe),
         effect: "Time for which a thread measures at 1 kHz, after the start, how late it wakes; `sinew nodes` shows the result; 0: off.",
-        note: "2 to 4 % of a CPU for this time on a virtual machine, with the priority 90 if it is granted. The node is ready before.",
+        note: "2 to 4 % of a CPU for this time, with priority 90 where it is granted. The node is ready before.",
     },
 ];
 
