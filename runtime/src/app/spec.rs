@@ -1,10 +1,12 @@
 //! The declaration of an application, which a node needs to start it.
 
 mod dyn_app;
+mod parameters;
 
 use std::{sync::Arc, time::Duration};
 
 use actix::{Actor, AsyncContext, Handler};
+use sinew_params::Parameters;
 
 use crate::{
     app::{
@@ -49,6 +51,7 @@ pub struct AppSpec<A: Actor<Context = AppContext<A>>> {
     handlers: Vec<(Kind, Dispatch<A>)>,
     pub(super) common: Common,
     pub(super) safe_state: Option<SafeState<A>>,
+    parameters: Option<Arc<dyn Parameters>>,
 }
 
 #[derive(Clone)]
@@ -67,6 +70,8 @@ pub(super) struct Common {
     pub(super) wills: Vec<Will>,
     pub(super) on_lost: RequirementPolicy,
     has_safe_state: bool,
+    /// Number of sets of parameters; an application has at most one.
+    parameter_sets: usize,
     #[cfg(feature = "fault-points")]
     faults: Vec<crate::supervision::fault::Fault>,
 }
@@ -113,10 +118,11 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
             wills: Vec::new(),
             on_lost: RequirementPolicy::default(),
             has_safe_state: false,
+            parameter_sets: 0,
             #[cfg(feature = "fault-points")]
             faults: Vec::new(),
         };
-        Self { factory, handlers: Vec::new(), common, safe_state: None }
+        Self { factory, handlers: Vec::new(), common, safe_state: None, parameters: None }
     }
 
     /// Declares that the application handles payloads of type `P`. The events of layers are payloads too: an
@@ -392,14 +398,14 @@ pub struct AppWiring {
 
 impl<A: Actor<Context = AppContext<A>>> From<AppSpec<A>> for DynApp {
     fn from(spec: AppSpec<A>) -> Self {
-        let AppSpec { factory, handlers, mut common, safe_state } = spec;
+        let AppSpec { factory, handlers, mut common, safe_state, parameters } = spec;
         let on_lost = common.on_lost;
         common.subscribe_to_requirements();
         common.has_safe_state = safe_state.is_some();
         let kinds: Arc<[_]> = common.kinds.clone().into();
         let wire = move |wiring: AppWiring| {
             let (factory, handlers, safe_state) = (factory.clone(), handlers.clone(), safe_state.clone());
-            let kinds = kinds.clone();
+            let (kinds, parameters) = (kinds.clone(), parameters.clone());
             let launch: Launch = Arc::new(move |ready| {
                 // A launch outside of a guard has no supervisor that could fence its incarnation.
                 let liveness = Liveness::current().unwrap_or_else(|| Liveness::new("unguarded"));
@@ -421,6 +427,9 @@ impl<A: Actor<Context = AppContext<A>>> From<AppSpec<A>> for DynApp {
                 let requirements = Requirements::new(on_lost, safe_state.clone(), end_reason.clone());
                 let drive = Drive::new(reader, handlers.clone(), requirements, liveness);
                 let mut running = AppContext::into_running(sender, ready, actor, end_reason.clone());
+                if let Some(parameters) = &parameters {
+                    running.ctx().tune(parameters.clone());
+                }
                 running.ctx().spawn(drive);
                 Box::new(WithEndReason { actor: running_actor(running), end_reason })
             });

@@ -113,6 +113,7 @@ impl NodeBuilder {
             security_setup::set_credentials(&state, secured);
             security_setup::warn_loopback_only(&state.ctx.config);
             security_setup::set_access_list(&state, list);
+            security_setup::set_parameter_right(&state);
         }
         #[cfg(feature = "fault-points")]
         crate::faults::keep(&state, &planned)?;

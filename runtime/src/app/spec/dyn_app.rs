@@ -85,10 +85,15 @@ impl DynApp {
     /// Returns the error in the declaration, as a text, if it has one.
     #[must_use]
     pub fn fault(&self) -> Option<String> {
-        let Common { wills, on_lost, has_safe_state, .. } = &self.common;
+        let Common { wills, on_lost, has_safe_state, parameter_sets, .. } = &self.common;
         if wills.len() > WILLS_MAX {
             let wills = wills.len();
             return Some(format!("{wills} last wills are more than the {WILLS_MAX} that it may have"));
+        }
+        if *parameter_sets > 1 {
+            return Some(format!(
+                "it has {parameter_sets} sets of parameters, and may have one: put all into one `params!`"
+            ));
         }
         match on_lost {
             RequirementPolicy::SafeState if !has_safe_state => {
