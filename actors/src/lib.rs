@@ -177,7 +177,7 @@ pub mod parameters {
     pub use sinew_params::{
         AskParameters, Cell, Descriptor, Domain, NAME_BYTES_MAX, NamedValue, PARAMETERS_MAX, Param,
         ParamType, ParameterError, ParameterList, ParameterOutcome, ParameterReport, Parameters, STAGED_MAX,
-        SetParameters, TICK_WITHIN, UNDO_MAX, Value, ValueError, check,
+        SetParameters, TICK_WITHIN, UNDO_MAX, Value, ValueError, check, file,
     };
 }
 

@@ -211,27 +211,32 @@ fn request<Q: Payload, R: Payload>(system: &mut System, to: Tid, question: &Q) -
 /// Returns why there is no reply, and the remedy.
 fn words(error: &ApiError, app: &str, is_set: bool) -> String {
     let app = clean(app);
-    match error {
-        ApiError::Ended(Outcome::Rejected(Rejection::UnknownKind)) => {
-            format!("{app} has no parameters: its `AppSpec` declares them by `params`")
-        }
-        ApiError::Ended(Outcome::Rejected(Rejection::NotAllowed)) if is_set => format!(
-            "the node of {app} takes parameters from operators only, and this command is none. Its access list names operators in [roles]. Without a list \
-             the programs of the node's own user at its own socket are operators, if the node is open and on loopback, else nobody is"
-        ),
-        ApiError::Ended(Outcome::Rejected(Rejection::NotAllowed)) => format!(
-            "the access list of the node of {app} does not let this command read parameters: name it in `observers` of [roles], or add a [[rule]]"
-        ),
-        ApiError::Ended(Outcome::Expired) => {
-            format!(
-                "{app} did not come to it in time, and nothing was set; look at `sinew apps` and `sinew tree`"
-            )
-        }
-        ApiError::NoReply(within) if is_set => format!(
-            "no answer within {within:?}; the values may have been set: `sinew param list {app}` shows them"
-        ),
-        error => in_words(error),
+    if let ApiError::Ended(Outcome::Rejected(Rejection::UnknownKind)) = error {
+        return format!("{app} has no parameters: its `AppSpec` declares them by `params`");
     }
+    if let ApiError::Ended(Outcome::Rejected(Rejection::NotAllowed)) = error {
+        return if is_set {
+            format!(
+                "the node of {app} takes parameters from operators only, and this command is none. Its access list names operators in [roles]. Without \
+                 a list the programs of the node's own user at its own socket are operators, if the node is open and on loopback, else nobody is"
+            )
+        } else {
+            format!(
+                "the access list of the node of {app} does not let this command read parameters: name it in `observers` of [roles], or add a [[rule]]"
+            )
+        };
+    }
+    if let ApiError::Ended(Outcome::Expired) = error {
+        return format!(
+            "{app} did not take it in time, and nothing was set; look at `sinew apps` and `sinew tree`"
+        );
+    }
+    if let (ApiError::NoReply(within), true) = (error, is_set) {
+        return format!(
+            "no answer within {within:?}; the values may have been set: `sinew param list {app}` shows them"
+        );
+    }
+    in_words(error)
 }
 
 /// Returns the values of a list, without those on their way: their targets.

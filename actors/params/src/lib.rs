@@ -13,9 +13,13 @@
 //! | `param` | a parameter that a loop reads without a lock |
 //! | `value` | a value of any of the three types |
 //! | `tuner` | staging, application at a tick, slopes, undo |
+//! | `kept` | values that survive a restart of the node |
+//! | [`file`] | values as TOML |
 //! | `messages` | the messages between tools and applications |
 
 mod descriptor;
+pub mod file;
+mod kept;
 mod messages;
 mod param;
 mod tuner;
@@ -23,6 +27,7 @@ mod value;
 
 pub use self::{
     descriptor::{Descriptor, Domain, NAME_BYTES_MAX, PARAMETERS_MAX, check},
+    kept::{kept_values, restore},
     messages::{AskParameters, NamedValue, ParameterList, ParameterOutcome, ParameterReport, SetParameters},
     param::{Cell, Param, ParamType, Parameters},
     tuner::{ParameterError, STAGED_MAX, TICK_WITHIN, Tuner, UNDO_MAX},

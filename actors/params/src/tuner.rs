@@ -106,6 +106,8 @@ pub struct Tuner<T> {
     moved: Duration,
     /// Whether a value has not reached its target.
     is_moving: bool,
+    /// Whether this tick has changed a kept parameter.
+    has_kept_change: bool,
 }
 
 impl<T> Tuner<T> {
@@ -118,8 +120,14 @@ impl<T> Tuner<T> {
                 cell.set_target(bits);
             }
         }
-        let mut tuner =
-            Self { set, staged: VecDeque::new(), former: VecDeque::new(), moved: now, is_moving: true };
+        let mut tuner = Self {
+            set,
+            staged: VecDeque::new(),
+            former: VecDeque::new(),
+            moved: now,
+            is_moving: true,
+            has_kept_change: false,
+        };
         // A kept value of the former incarnation may have been on its way.
         tuner.advance(Duration::ZERO);
         tuner
@@ -150,11 +158,12 @@ impl<T> Tuner<T> {
     }
 
     /// Applies the sets that wait, in the order of their arrival, and moves values with a slope by the time since the
-    /// last call. `done` gets the outcome of each set.
-    pub fn tick(&mut self, tick: u64, now: Duration, mut done: impl FnMut(T, ParameterOutcome)) {
+    /// last call. `done` gets the outcome of each set. Returns whether a kept parameter has a new value or target.
+    pub fn tick(&mut self, tick: u64, now: Duration, mut done: impl FnMut(T, ParameterOutcome)) -> bool {
         let since = now.saturating_sub(self.moved);
         self.moved = now;
         self.expire(now, &mut done);
+        self.has_kept_change = false;
         while let Some(Staged { ticket, values, .. }) = self.staged.pop_front() {
             let outcome = match self.apply(values) {
                 Ok(values) => ParameterOutcome::Applied { tick, at_ns: nanos(now), values },
@@ -165,6 +174,7 @@ impl<T> Tuner<T> {
         if self.is_moving {
             self.advance(since);
         }
+        self.has_kept_change
     }
 
     /// Refuses the sets that have waited too long.
@@ -254,6 +264,7 @@ impl<T> Tuner<T> {
             };
             former.push((index, cell.target()));
             cell.set_target(bits);
+            self.has_kept_change |= descriptor.keep;
             match descriptor.slope_per_s() {
                 Some(_) => self.is_moving = true,
                 None => cell.set_value(bits),
@@ -314,7 +325,7 @@ fn bits_of(value: Value) -> u64 {
 }
 
 /// Returns the bits of a value that its parameter may have.
-fn legal_bits(descriptor: &Descriptor, value: Value) -> Result<u64, ParameterError> {
+pub(crate) fn legal_bits(descriptor: &Descriptor, value: Value) -> Result<u64, ParameterError> {
     let name = descriptor.name;
     let unit =
         if ["", "1"].contains(&descriptor.unit) { String::new() } else { format!(" {}", descriptor.unit) };
@@ -347,7 +358,7 @@ fn legal_bits(descriptor: &Descriptor, value: Value) -> Result<u64, ParameterErr
 }
 
 /// Returns the error for a name that no parameter has.
-fn unknown(name: &str, descriptors: &[Descriptor]) -> ParameterError {
+pub(crate) fn unknown(name: &str, descriptors: &[Descriptor]) -> ParameterError {
     let name: String = name.chars().take(NAME_SHOWN).collect();
     let similarity = |other: &Descriptor| strsim::jaro_winkler(&name, other.name);
     let nearest = descriptors.iter().map(|other| (similarity(other), other.name));

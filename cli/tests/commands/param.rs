@@ -1,6 +1,7 @@
 //! `sinew param`: lists and sets parameters of a running application, from its own node and from another one.
 
 use serde_json::{Value, json};
+use sinew_testkit::until;
 
 use crate::scenario::{Scenario, named};
 
@@ -94,6 +95,33 @@ fn saved_values_are_loaded_again() {
     );
     let got = scenario.sinew("knee", &["param", "get", "knee.gains.assistance"]);
     assert_eq!(got.out, "0.7\n");
+}
+
+#[test]
+fn kept_value_survives_a_restart_of_the_node() {
+    // Given: a node with a state directory
+    let scenario = Scenario::new();
+    let state = format!("project = \"cli\"\nstate = \"{}\"", scenario.directory.join("state").display());
+    let changes = [("project = \"cli\"", &*state)];
+    let mut knee = scenario.start_changed("knee", 2, &changes, &["--tuned"]);
+    knee.wait_for(&["started"]);
+    let has_app = |json: &Value| json["apps"].as_array().is_some_and(|apps| apps.len() == 1);
+    scenario.until("its parameters are listed", "knee", &["param", "list"], has_app);
+    // When: two parameters are set, one of which is kept, and the node is killed when the file is there
+    let words = ["param", "set", "knee.gains.torque_max=30", "knee.gains.assistance=0.5"];
+    let answer = scenario.sinew("knee", &words);
+    assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
+    let file = scenario.directory.join("state/parameters-cli-127.0.0.2");
+    let text = until("the file is there", || std::fs::read_to_string(&file).ok());
+    assert_eq!(text, "[\"knee.gains\"]\ntorque_max = 30.0\n");
+    knee.kill();
+    drop(knee);
+    // Then
+    let mut knee = scenario.start_changed("knee", 2, &changes, &["--tuned"]);
+    knee.wait_for(&["started"]);
+    let json = scenario.until("its parameters are listed", "knee", &["param", "list"], has_app);
+    assert_eq!(parameter(&json, "torque_max")["value"], json!(30.0), "{json}");
+    assert_eq!(parameter(&json, "assistance")["value"], json!(0.3), "{json}");
 }
 
 #[test]

@@ -14,9 +14,9 @@ use actix::{
     dev::{ContextFut, ContextParts},
 };
 
-pub(super) use self::timers::Action;
 pub use self::watches::WatchId;
 use self::{guards::GuardEntry, parameters::Tuning, watches::Watch};
+pub(super) use self::{parameters::KeptHook, timers::Action};
 use crate::{
     app::requirement::EndReason,
     clock::Clock,

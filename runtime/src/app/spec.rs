@@ -11,6 +11,7 @@ use sinew_params::Parameters;
 use crate::{
     app::{
         AppContext, Delivery, DownPolicy, Raw, RequirementEvent, RequirementPolicy, Will,
+        context::KeptHook,
         drive::{Dispatch, Drive, dispatch_raw, dispatch_typed},
         requirement::{EndReason, FailedStart, Requirements, SafeState, WithEndReason},
     },
@@ -51,7 +52,6 @@ pub struct AppSpec<A: Actor<Context = AppContext<A>>> {
     handlers: Vec<(Kind, Dispatch<A>)>,
     pub(super) common: Common,
     pub(super) safe_state: Option<SafeState<A>>,
-    parameters: Option<Arc<dyn Parameters>>,
 }
 
 #[derive(Clone)]
@@ -72,6 +72,9 @@ pub(super) struct Common {
     has_safe_state: bool,
     /// Number of sets of parameters; an application has at most one.
     parameter_sets: usize,
+    /// The parameters; `None`: it has none.
+    parameters: Option<Arc<dyn Parameters>>,
+    on_kept: KeptHook,
     #[cfg(feature = "fault-points")]
     faults: Vec<crate::supervision::fault::Fault>,
 }
@@ -119,10 +122,12 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
             on_lost: RequirementPolicy::default(),
             has_safe_state: false,
             parameter_sets: 0,
+            parameters: None,
+            on_kept: KeptHook::default(),
             #[cfg(feature = "fault-points")]
             faults: Vec::new(),
         };
-        Self { factory, handlers: Vec::new(), common, safe_state: None, parameters: None }
+        Self { factory, handlers: Vec::new(), common, safe_state: None }
     }
 
     /// Declares that the application handles payloads of type `P`. The events of layers are payloads too: an
@@ -398,14 +403,15 @@ pub struct AppWiring {
 
 impl<A: Actor<Context = AppContext<A>>> From<AppSpec<A>> for DynApp {
     fn from(spec: AppSpec<A>) -> Self {
-        let AppSpec { factory, handlers, mut common, safe_state, parameters } = spec;
+        let AppSpec { factory, handlers, mut common, safe_state } = spec;
         let on_lost = common.on_lost;
         common.subscribe_to_requirements();
         common.has_safe_state = safe_state.is_some();
         let kinds: Arc<[_]> = common.kinds.clone().into();
+        let (parameters, on_kept) = (common.parameters.clone(), common.on_kept.clone());
         let wire = move |wiring: AppWiring| {
             let (factory, handlers, safe_state) = (factory.clone(), handlers.clone(), safe_state.clone());
-            let (kinds, parameters) = (kinds.clone(), parameters.clone());
+            let (kinds, parameters, on_kept) = (kinds.clone(), parameters.clone(), on_kept.clone());
             let launch: Launch = Arc::new(move |ready| {
                 // A launch outside of a guard has no supervisor that could fence its incarnation.
                 let liveness = Liveness::current().unwrap_or_else(|| Liveness::new("unguarded"));
@@ -428,7 +434,7 @@ impl<A: Actor<Context = AppContext<A>>> From<AppSpec<A>> for DynApp {
                 let drive = Drive::new(reader, handlers.clone(), requirements, liveness);
                 let mut running = AppContext::into_running(sender, ready, actor, end_reason.clone());
                 if let Some(parameters) = &parameters {
-                    running.ctx().tune(parameters.clone());
+                    running.ctx().tune(parameters.clone(), on_kept.clone());
                 }
                 running.ctx().spawn(drive);
                 Box::new(WithEndReason { actor: running_actor(running), end_reason })

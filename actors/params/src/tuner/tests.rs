@@ -244,6 +244,38 @@ fn kept_values_survive_a_new_incarnation() {
     assert!((gains.assistance.get() - 0.5).abs() < 1e-9, "and it moves on to its target");
 }
 
+#[test]
+fn tick_reports_changes_of_kept_parameters_alone() {
+    let mut tuner = Tuner::new(gains(), ms(0));
+    for (name, value, is_kept) in
+        [("torque_max", Value::Number(30.0), false), ("steps", Value::Integer(5), true)]
+    {
+        stage(&mut tuner, 0, &[(name, value)], ms(0));
+        assert_eq!(tuner.tick(1, ms(1), |_, _| {}), is_kept, "{name}");
+        assert!(!tuner.tick(2, ms(2), |_, _| {}));
+    }
+}
+
+#[test]
+fn kept_values_are_restored_and_illegal_ones_are_left_out() {
+    let named = |name: &str, value| NamedValue { name: name.to_owned(), value };
+    let former = gains();
+    let values = [named("assistance", Value::Number(0.9)), named("steps", Value::Integer(7))];
+    assert!(crate::restore(&*former, &values).is_empty());
+    assert_eq!(crate::kept_values(&*former), values);
+    let next = gains();
+    let left_out = crate::restore(
+        &*next,
+        &[
+            named("assistance", Value::Number(2.0)),
+            named("torque_max", Value::Number(30.0)),
+            named("steps", Value::Integer(7)),
+        ],
+    );
+    assert_eq!(left_out.len(), 2, "one is out of its range, one is not kept: {left_out:?}");
+    assert_eq!((next.assistance.get(), next.torque_max.get(), next.steps.get()), (0.3, 20.0, 7));
+}
+
 /// One step of a random history.
 #[derive(Clone, Debug)]
 enum Step {

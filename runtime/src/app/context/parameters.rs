@@ -3,7 +3,10 @@
 //! The framework handles these messages, before and beside the application's own handlers. A set waits for the next
 //! tick of the periodic timer with the shortest period, and is applied before that timer's action.
 
-use std::{sync::Arc, time::Duration};
+use std::{
+    sync::{Arc, OnceLock},
+    time::Duration,
+};
 
 use actix::Actor;
 use sinew_params::{
@@ -38,11 +41,15 @@ impl Payload for ParameterOutcome {
     const NAME: &'static str = "sinew.param.outcome";
 }
 
+/// Called on the application's thread after a kept parameter has changed; it must not wait.
+pub(in crate::app) type KeptHook = Arc<OnceLock<Box<dyn Fn() + Send + Sync>>>;
+
 /// The writer of an application's parameters, and the timers at whose ticks it may write.
 #[derive(Default)]
 pub(super) struct Tuning {
     /// `None`: the application has no parameters.
     tuner: Option<Tuner<Option<ReplyTo>>>,
+    on_kept: KeptHook,
     /// The application's periodic timers, in the order in which they were set.
     timers: Vec<(Duration, TimerId)>,
     /// Whether a timer is set that refuses sets without a tick. There is at most one, however many sets arrive.
@@ -74,7 +81,8 @@ impl Tuning {
 
 impl<A: Actor<Context = Self>> AppContext<A> {
     /// Takes over the parameters of the application, for this incarnation.
-    pub(in crate::app) fn tune(&mut self, set: Arc<dyn Parameters>) {
+    pub(in crate::app) fn tune(&mut self, set: Arc<dyn Parameters>, on_kept: KeptHook) {
+        self.tuning.on_kept = on_kept;
         self.tuning.tuner = Some(Tuner::new(set, since_origin(self.now())));
     }
 
@@ -116,18 +124,24 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         if has_ticks {
             self.watch_deadline();
         } else {
-            tuner.tick(0, since_origin(now), |to, outcome| reply(&self.sender, to, &outcome));
+            self.apply_parameters(0, now);
         }
         Outcome::Delivered
     }
 
     /// Applies the sets that wait, and moves values with a slope, before the action of this timer.
     pub(in crate::app) fn tick_parameters(&mut self, timer: TimerId, tick: Tick, now: Time) {
-        if self.tuning.tuner.is_none() || self.tuning.timer() != Some(timer) {
-            return;
+        if self.tuning.tuner.is_some() && self.tuning.timer() == Some(timer) {
+            self.apply_parameters(tick.number, now);
         }
-        if let Some(tuner) = &mut self.tuning.tuner {
-            tuner.tick(tick.number, since_origin(now), |to, outcome| reply(&self.sender, to, &outcome));
+    }
+
+    fn apply_parameters(&mut self, tick: u64, now: Time) {
+        let Some(tuner) = &mut self.tuning.tuner else { return };
+        let is_kept_changed =
+            tuner.tick(tick, since_origin(now), |to, outcome| reply(&self.sender, to, &outcome));
+        if let Some(on_kept) = self.tuning.on_kept.get().filter(|_| is_kept_changed) {
+            on_kept();
         }
     }
 

@@ -1,5 +1,9 @@
 //! The declaration of an application without its actor type.
 
+use std::sync::Arc;
+
+use sinew_params::Parameters;
+
 use super::{AppWiring, Common, DynApp};
 use crate::{
     app::{DownState, RequirementPolicy, WILLS_MAX, Will},
@@ -43,6 +47,18 @@ impl DynApp {
     #[must_use]
     pub fn sends(&self) -> &[PayloadType] {
         &self.common.sends
+    }
+
+    /// Returns the parameters of the application, if it has any.
+    #[must_use]
+    pub const fn parameters(&self) -> Option<&Arc<dyn Parameters>> {
+        self.common.parameters.as_ref()
+    }
+
+    /// Has `notify` called on the application's thread after each change of a kept parameter. It must not wait. Only the
+    /// first call has an effect.
+    pub fn on_kept_change(&self, notify: impl Fn() + Send + Sync + 'static) {
+        let _ = self.common.on_kept.set(Box::new(notify));
     }
 
     /// Returns the supervision policy of the application.

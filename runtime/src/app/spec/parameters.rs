@@ -21,7 +21,8 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     /// is not applied later.
     ///
     /// An application has one set of parameters. After a restart by its supervisor a parameter has its default again,
-    /// unless it is declared with `keep`. In a process of its own each restart begins with the defaults.
+    /// unless it is declared with `keep`. With `node.state` a kept value also survives a restart of the node. In a process
+    /// of its own each restart begins with the defaults.
     ///
     /// # Examples
     ///
@@ -64,7 +65,7 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
             self.common.kinds.push((kind, name));
         }
         self.common.parameter_sets += 1;
-        self.parameters = Some(parameters.clone());
+        self.common.parameters = Some(parameters.clone());
         self
     }
 }
