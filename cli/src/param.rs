@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use clap::Subcommand;
 use serde_json::{Value as Json, json};
 use sinew::{
-    Outcome, Payload, Tid,
+    NodeAddress, Outcome, Payload, Tid,
     client::ApiError,
     message::Rejection,
     parameters::{AskParameters, NamedValue, ParameterList, ParameterOutcome, SetParameters, Value},
@@ -187,15 +187,31 @@ fn send(system: &mut System, app: &str, to: Tid, set: &SetParameters) -> Result<
     if !is_refused || system.endpoint.tid().node == to.node {
         return sent.map_err(|error| words(&error, app, true));
     }
+    let Some(mut own) = enter_node(system, to.node) else {
+        return sent.map_err(|error| words(&error, app, true));
+    };
+    let sent = request::<_, ParameterOutcome>(&mut own, to, set);
+    own.leave();
+    sent.map_err(|error| words(&error, app, true))
+}
+
+/// Registers at the socket of this node, if this host has it.
+fn enter_node(system: &mut System, node: NodeAddress) -> Option<System> {
+    // A node of another robot on this host may have the same address.
+    let incarnation = system.here().ok()?.peers.iter().find(|peer| peer.node == node)?.incarnation;
     let (others, _) = System::beside(system, &[]);
-    let mut again = None;
+    let mut found = None;
     for mut other in others {
-        if again.is_none() && other.endpoint.tid().node == to.node {
-            again = Some(request::<_, ParameterOutcome>(&mut other, to, set));
+        let is_it = found.is_none()
+            && other.endpoint.tid().node == node
+            && other.here().is_ok_and(|here| here.incarnation == incarnation);
+        if is_it {
+            found = Some(other);
+        } else {
+            other.leave();
         }
-        other.leave();
     }
-    again.unwrap_or(sent).map_err(|error| words(&error, app, true))
+    found
 }
 
 /// Asks an application for its parameters.
@@ -246,7 +262,7 @@ fn targets(list: &ParameterList) -> Vec<NamedValue> {
 
 #[cfg(test)]
 mod tests {
-    use sinew::{AppAddress, NodeAddress};
+    use sinew::AppAddress;
 
     use super::*;
 

@@ -7,6 +7,11 @@ use crate::scenario::{Scenario, named};
 
 const APP: &str = "knee.gains";
 
+/// Whether the parameters of one application are listed.
+fn has_app(json: &Value) -> bool {
+    json["apps"].as_array().is_some_and(|apps| apps.len() == 1)
+}
+
 /// Returns the parameter of this name in the JSON of `sinew param list`.
 fn parameter<'a>(json: &'a Value, name: &str) -> &'a Value {
     named(&json["apps"][0]["parameters"], name).unwrap_or_else(|| panic!("no {name}: {json}"))
@@ -18,7 +23,6 @@ fn set_names_the_tick_at_which_the_application_has_it() {
     let scenario = Scenario::new();
     let mut knee = scenario.start("knee", 2, &["--tuned"]);
     knee.wait_for(&["started"]);
-    let has_app = |json: &Value| json["apps"].as_array().is_some_and(|apps| apps.len() == 1);
     let json = scenario.until("its parameters are listed", "knee", &["param", "list"], has_app);
     assert_eq!(parameter(&json, "assistance")["value"], json!(0.3), "{json}");
     assert_eq!(parameter(&json, "torque_max")["unit"], json!("Nm"), "{json}");
@@ -47,7 +51,6 @@ fn refused_set_is_a_finding_and_changes_nothing() {
     let scenario = Scenario::new();
     let mut knee = scenario.start("knee", 2, &["--tuned"]);
     knee.wait_for(&["started"]);
-    let has_app = |json: &Value| json["apps"].as_array().is_some_and(|apps| apps.len() == 1);
     scenario.until("its parameters are listed", "knee", &["param", "list"], has_app);
     for (words, code, part) in [
         (&["knee.gains.assistance=1.4"][..], 1, "assistance = 1.4 is outside 0.0 to 1.0"),
@@ -80,7 +83,6 @@ fn saved_values_are_loaded_again() {
         let answer = scenario.sinew("knee", &["param", "set", word]);
         assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
     };
-    let has_app = |json: &Value| json["apps"].as_array().is_some_and(|apps| apps.len() == 1);
     scenario.until("its parameters are listed", "knee", &["param", "list"], has_app);
     set("knee.gains.assistance=0.7");
     let answer = scenario.sinew("knee", &["param", "save", file]);
@@ -98,6 +100,40 @@ fn saved_values_are_loaded_again() {
 }
 
 #[test]
+fn set_from_another_node_goes_through_the_socket_of_the_application() {
+    // Given: an open robot of two nodes on one host, in one folder
+    let scenario = Scenario::new();
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let mut knee = scenario.start("knee", 2, &["--tuned"]);
+    hip.wait_for(&["started"]);
+    scenario.until("its parameters are read", "hip", &["param", "list"], has_app);
+    // When: the command connects to the other node
+    let answer = scenario.sinew("hip", &["param", "set", "knee.gains.assistance=0.5"]);
+    // Then
+    assert_eq!(answer.code, Some(0), "{}{}", answer.out, answer.err);
+    knee.wait_for(&["assistance 0.5 at tick "]);
+}
+
+#[test]
+fn set_from_another_node_is_refused() {
+    // Given: the same, with sockets in two folders
+    let scenario = Scenario::new();
+    std::fs::create_dir(scenario.directory.join("apart")).expect("the test's own directory");
+    let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);
+    let mut knee = scenario.start("apart/knee", 2, &["--tuned"]);
+    knee.wait_for(&["started"]);
+    hip.wait_for(&["started"]);
+    scenario.until("its parameters are read", "hip", &["param", "list"], has_app);
+    // When
+    let answer = scenario.sinew("hip", &["param", "set", "knee.gains.assistance=0.5"]);
+    // Then
+    let text = answer.out + &answer.err;
+    assert!(answer.code == Some(1) && text.contains("operators only"), "{text}");
+    let got = scenario.sinew("apart/knee", &["param", "get", "knee.gains.assistance"]);
+    assert_eq!(got.out, "0.3\n", "{}", got.err);
+}
+
+#[test]
 fn kept_value_survives_a_restart_of_the_node() {
     // Given: a node with a state directory
     let scenario = Scenario::new();
@@ -105,7 +141,6 @@ fn kept_value_survives_a_restart_of_the_node() {
     let changes = [("project = \"cli\"", &*state)];
     let mut knee = scenario.start_changed("knee", 2, &changes, &["--tuned"]);
     knee.wait_for(&["started"]);
-    let has_app = |json: &Value| json["apps"].as_array().is_some_and(|apps| apps.len() == 1);
     scenario.until("its parameters are listed", "knee", &["param", "list"], has_app);
     // When: two parameters are set, one of which is kept, and the node is killed when the file is there
     let words = ["param", "set", "knee.gains.torque_max=30", "knee.gains.assistance=0.5"];
@@ -134,7 +169,6 @@ fn access_list_names_the_operators() {
     let section = format!("[security]\naccess = \"{}\"\n[lncl]", path.display());
     let mut knee = scenario.start_changed("knee", 2, &[("[lncl]", &section)], &["--tuned"]);
     knee.wait_for(&["started"]);
-    let has_app = |json: &Value| json["apps"].as_array().is_some_and(|apps| apps.len() == 1);
     scenario.until("its parameters may be read", "knee", &["param", "list"], has_app);
     let set = || scenario.sinew("knee", &["param", "set", "knee.gains.assistance=0.5"]);
     let answer = set();
