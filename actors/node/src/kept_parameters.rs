@@ -111,3 +111,55 @@ impl KeptParameters {
         file::text(&self.others.clone().into_iter().chain(own).collect())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use sinew_runtime::parameters::{NamedValue, Value};
+    use sinew_security::testing::Directory;
+
+    use super::*;
+
+    sinew::params! {
+        struct Gains {
+            /// A gain.
+            gain: f64 = 0.5, unit "1", range 0.0..=1.0, keep;
+            /// A number of steps.
+            steps: i64 = 4, unit "1", range 1..=16, keep;
+        }
+    }
+
+    /// The knee's parameters, which are kept in this file.
+    fn kept(path: PathBuf) -> (Arc<Gains>, KeptParameters) {
+        let gains = Gains::new();
+        let apps: Vec<(String, Arc<dyn Parameters>)> = vec![("knee".to_owned(), gains.clone())];
+        (gains, KeptParameters { path, apps, others: file::ValuesOfApps::new() })
+    }
+
+    #[test]
+    fn legal_values_are_restored_and_those_of_other_applications_stay() {
+        let directory = Directory::new();
+        let text = "[hip]\ngain = 0.25\n\n[knee]\ngain = 7.0\nsteps = 9\n";
+        directory.put("parameters", 0o600, text);
+        let (gains, mut kept) = kept(directory.path().join("parameters"));
+        kept.restore();
+        assert_eq!((gains.gain.get(), gains.steps.get()), (0.5, 9));
+        let values = file::parse(&kept.text()).expect("it is its own text");
+        let named = |name: &str, value| NamedValue { name: name.to_owned(), value };
+        assert_eq!(values["hip"], [named("gain", Value::Number(0.25))]);
+        assert_eq!(values["knee"], [named("gain", Value::Number(0.5)), named("steps", Value::Integer(9))]);
+    }
+
+    #[test]
+    fn unusable_file_leaves_the_defaults() {
+        let directory = Directory::new();
+        for text in ["knee", "knee = 1", "[knee]\ngain = 'fast'\n", "\u{0}"] {
+            directory.put("parameters", 0o600, text);
+            let (gains, mut kept) = kept(directory.path().join("parameters"));
+            kept.restore();
+            assert_eq!((gains.gain.get(), gains.steps.get()), (0.5, 4), "{text:?}");
+        }
+        let (gains, mut kept) = kept(directory.path().join("absent"));
+        kept.restore();
+        assert_eq!(gains.gain.get(), 0.5);
+    }
+}

@@ -30,7 +30,7 @@ pub struct Cell {
 pub trait ParamType: Copy + fmt::Debug + sealed::Bits {}
 
 mod sealed {
-    pub trait Bits {
+    pub trait Bits: Copy {
         fn to_bits(self) -> u64;
         fn of_bits(bits: u64) -> Self;
     }
