@@ -51,7 +51,7 @@ pub enum ParameterOutcome {
 pub struct ParameterList {
     /// Each parameter, in the order of its declaration.
     pub parameters: Vec<ParameterReport>,
-    /// Whether the application has a periodic timer, at whose ticks sets are applied.
+    /// Whether the application has a periodic timer. Sets are applied at its ticks.
     pub has_ticks: bool,
     /// Number of sets that can be undone.
     pub undoable: u32,

@@ -79,7 +79,7 @@ pub enum ParameterError {
     NothingToUndo,
     /// A parameter with a slope moves at ticks, and the application has none.
     #[error(
-        "{0} moves with a slope, and the application has no periodic timer at whose ticks it could move: start one by `ctx.every`, or declare it without a slope"
+        "{0} moves with a slope at ticks, and the application has no periodic timer: start one by `ctx.every`, or declare it without a slope"
     )]
     SlopeWithoutTicks(&'static str),
 }

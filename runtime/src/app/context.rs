@@ -73,7 +73,7 @@ pub struct AppContext<A: Actor<Context = Self>> {
     pub(super) verdict: Option<Outcome>,
     /// The guards of outputs that protected messages control.
     guards: Vec<GuardEntry>,
-    /// The parameters, and the timers at whose ticks they change.
+    /// The parameters, and the timers of the ticks at which they change.
     tuning: Tuning,
 }
 

@@ -36,7 +36,7 @@ pub trait Guard: Send + Sync {
 /// The senders that may set parameters of this node's applications, in addition to a [`Guard`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ParameterRight {
-    /// Each sender whose message may reach the application: a guard decides, if there is one.
+    /// Each sender of a message that may reach the application: a guard decides, if there is one.
     #[default]
     Any,
     /// Applications and clients of this node.

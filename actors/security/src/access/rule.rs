@@ -27,7 +27,7 @@ pub struct List {
     pub(super) roles: Roles,
 }
 
-/// The applications that have a role, besides what rules allow them.
+/// The applications that have a role. Its rights are in addition to those by rules.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Roles {
     /// May set and read parameters.

@@ -44,7 +44,7 @@ impl Payload for ParameterOutcome {
 /// Called on the application's thread after a kept parameter has changed; it must not wait.
 pub(in crate::app) type KeptHook = Arc<OnceLock<Box<dyn Fn() + Send + Sync>>>;
 
-/// The writer of an application's parameters, and the timers at whose ticks it may write.
+/// The writer of an application's parameters, and the timers of the ticks at which it may write.
 #[derive(Default)]
 pub(super) struct Tuning {
     /// `None`: the application has no parameters.
@@ -66,7 +66,7 @@ impl Tuning {
         self.timers.retain(|(_, other)| *other != timer);
     }
 
-    /// Returns the timer at whose ticks sets are applied: the one with the shortest period, of several the first one.
+    /// Returns the timer of the ticks at which sets are applied: that of the shortest period, of several the first one.
     fn timer(&self) -> Option<TimerId> {
         self.timers.iter().min_by_key(|(period, _)| *period).map(|(_, timer)| *timer)
     }
@@ -176,7 +176,7 @@ fn refuse(sender: &Sender, to: Option<ReplyTo>, why: &ParameterError) -> Outcome
 
 fn reply<P: Payload>(sender: &Sender, to: Option<ReplyTo>, value: &P) {
     if let Some(to) = to {
-        // A requester that has gone, or whose queue is full, asks again.
+        // A requester that has ended gets no reply; one with a full queue asks again.
         let _ = sender.reply(to, value);
     }
 }
