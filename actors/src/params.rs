@@ -6,7 +6,8 @@
 /// default;`. Its doc comment is the description that `sinew param list` shows. Two words may follow:
 ///
 /// - `slope X`, for `f64`: the value moves to a new one by at most `X` of its unit per second, tick by tick.
-/// - `keep`: the value survives a restart of the application by its supervisor. Others begin at their defaults again.
+/// - `keep`: the value survives a restart of the application by its supervisor, and with `node.state` one of the node.
+///   Others begin at their defaults again.
 ///
 /// The macro declares a struct with a [`Param`](crate::parameters::Param) for each field, which begins at its default.
 /// A loop reads it by `get`, without a lock. [`AppSpec::params`](crate::AppSpec::params) connects it with its

@@ -108,7 +108,10 @@ impl<A: Actor<Context = Self>> AppContext<A> {
 
     /// Cancels a timer from outside its own action.
     pub fn cancel(&mut self, timer: TimerId) -> bool {
-        self.tuning.remove_timer(timer);
-        self.schedule.cancel(timer)
+        let is_cancelled = self.schedule.cancel(timer);
+        if is_cancelled {
+            self.tuning.remove_timer(timer);
+        }
+        is_cancelled
     }
 }
