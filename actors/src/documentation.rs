@@ -24,6 +24,7 @@ fn the_page_on_errors_names_each_one() {
         ("SendError", sender),
         ("AskError", sender),
         ("BarrierError", include_str!("../client/src/barrier.rs")),
+        ("ParameterError", include_str!("../params/src/tuner.rs")),
         ("SealError", include_str!("../../runtime/src/protection/ends.rs")),
         ("ArmError", include_str!("../../runtime/src/protection/mod.rs")),
         ("RunError", include_str!("../replay/src/error.rs")),

@@ -14,6 +14,7 @@
 //! | an application in the node's process | [`AppSpec`], [`AppContext`], [`Delivery`], [`payload!`], [`app`] |
 //! | the same in a process of its own, started and restarted by the node | [`AppSpec::own_process`], [`supervision::Place`] |
 //! | an application in a process that the node did not start | [`client`]: [`NodeApi`], [`Endpoint`] for a thread, [`AsyncEndpoint`] for a task |
+//! | values that are tuned while an application runs | [`params!`], [`parameters`] |
 //! | sending, and outcomes | [`message`], [`Outcome`] |
 //! | restarts, supervisors | [`supervision`] |
 //! | notifications of nodes, applications, requirements, ended actors, late inputs | [`events`] |
@@ -58,6 +59,7 @@ mod documentation;
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
 pub mod fuzzing;
+mod params;
 mod payload;
 
 #[doc(inline)]
@@ -170,6 +172,15 @@ pub mod schema {
     };
 }
 
+/// Parameters: values of an application that are tuned while it runs. [`params!`](crate::params!) declares them.
+pub mod parameters {
+    pub use sinew_params::{
+        AskParameters, Cell, Descriptor, Domain, NAME_BYTES_MAX, NamedValue, PARAMETERS_MAX, Param,
+        ParamType, ParameterError, ParameterList, ParameterOutcome, ParameterReport, Parameters, STAGED_MAX,
+        SetParameters, TICK_WITHIN, UNDO_MAX, Value, ValueError, check, file,
+    };
+}
+
 /// Security between nodes: identities, certificates and keys. `sinew keys` makes all of the files.
 pub mod security {
     #[doc(inline)]
@@ -212,7 +223,7 @@ pub mod prelude {
         Outcome, Payload, StartError, Tid, Time,
         app::{DownPolicy, LastWill, RequirementPolicy, SendOutcome},
         events::{Down, InputTimeout, NodeEvent, RequirementEvent, Undelivered},
-        payload,
+        params, payload,
         supervision::{AutoShutdown, Place, Restart, Strategy, SupervisorSpec},
         time::Tick,
     };

@@ -4,10 +4,10 @@ use std::{path::PathBuf, time::Duration};
 
 use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
-use crate::{bag, keys, play, record, send, watch, why};
+use crate::{bag, keys, param, play, record, send, watch, why};
 
 /// Shows a running Sinew system, from any one node of it. It changes nothing, except that `send` and `play` send
-/// messages, and `keys`, `record` and `bag` write files.
+/// messages, `param` sets parameters, and `keys`, `record` and `bag` write files.
 ///
 /// It connects to the socket of a node on this machine (`lncl.socket` in the node's configuration) and asks
 /// that node, and through it all others.
@@ -153,6 +153,21 @@ pub(crate) enum Command {
   sinew audit
   sinew audit --wide            a column for each counter"#)]
     Audit,
+    /// Shows and sets the parameters of applications while they run
+    ///
+    /// A set of values is checked as a whole by its application, and applied at a tick of its loop: the command prints
+    /// the tick, or the reason of the refusal. Only operators may set parameters, as the access list of the
+    /// application's node names them. Without a list these are the programs of the node's own user at its socket, if
+    /// the node is open and on loopback, else nobody.
+    #[command(
+        subcommand,
+        after_help = r#"Examples:
+  sinew param list
+  sinew param set knee.drive.assistance=0.5
+  sinew param undo knee.drive
+  sinew param save walk.toml && sinew param load walk.toml"#
+    )]
+    Param(param::Order),
     /// Reloads the access list and the deny list of the local node, without a restart
     ///
     /// A list with faults changes nothing: each is named with its line, and the list in force stays.
@@ -267,6 +282,7 @@ Examples:
   sinew record walk.mcap --for 30s
   sinew play walk.mcap --rate 0.5
   sinew why hip knee.drive
+  sinew param set knee.drive.assistance=0.5
   sinew reload
   sinew apps --json | jq '.apps[] | select(.ready | not)'
   sinew --socket /run/sinew/knee.sock barriers

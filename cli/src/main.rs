@@ -2,7 +2,7 @@
 //!
 //! It connects through a node's socket like any other program, and asks each node's inspection (`sinew::inspect`)
 //! through ordinary messages. It changes nothing, except that `send` sends messages and `reload` makes a node read its
-//! access list again. `record` has the node record its messages, and writes them to a file. `play` sends them
+//! access list again, and `param` sets parameters of applications. `record` has the node record its messages, and writes them to a file. `play` sends them
 //! again, by a node of its own unless told otherwise. `keys` asks no node: it creates the files by which nodes
 //! authenticate each other. `bag` reads the files of recordings.
 
@@ -17,6 +17,7 @@ mod keys;
 mod messagepack;
 mod nodes;
 mod output;
+mod param;
 mod ping;
 mod play;
 mod record;
@@ -132,6 +133,7 @@ fn run(arguments: &Arguments) -> Result<Report, SystemError> {
         Command::Schema { name } => inside(&|system| schema::show(system, name)),
         Command::Barriers => inside(&|system| apps::barriers(system, arguments.wide)),
         Command::Audit => inside(&|system| audit::show(system, arguments.wide)),
+        Command::Param(order) => inside(&|system| param::show(system, order, arguments.wide)),
         Command::Reload => inside(&reload::show),
         Command::Doctor { rt: Some(length), .. } => Ok(doctor::show_real_time(*length, arguments.wide)),
         Command::Doctor { interface, rt: None } => Ok(doctor::show(interface.clone(), arguments)),

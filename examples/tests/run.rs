@@ -157,6 +157,15 @@ fn guarded_motor_moves_once_armed_and_ends_safe() {
 }
 
 #[test]
+fn gains_are_refused_outside_their_range_and_move_to_a_legal_value() {
+    let printed = Scenario::new().run("gains");
+    let [refused, applied, reached] = &printed[..] else { panic!("{printed:?}") };
+    assert_eq!(refused, "refused: assistance = 1.4 is outside 0.0 to 1.0");
+    assert!(applied.starts_with("applied at tick "), "{applied}");
+    assert_eq!(reached, "the knee assists with 0.5");
+}
+
+#[test]
 fn client_thread_moves_the_knee_and_receives_its_angle() {
     let printed = [
         "gait: the move was Delivered",

@@ -20,6 +20,7 @@
 //! | [`protection`] | end-to-end protection of commands, and outputs that are safe without them |
 //! | [`schedule`] | the timers of an actor |
 //! | [`app`] | applications |
+//! | [`parameters`] | values of an application that are tuned while it runs |
 //! | [`timer`], [`alarm`] | the kernel's timer, exact to microseconds; a task that it wakes |
 //! | [`supervision`] | starts, restarts and failures of actors |
 //! | [`real_time`] | the real-time rights of a process, and how late its threads wake |
@@ -62,3 +63,4 @@ pub mod wakes;
 pub mod wire;
 
 pub use locking::lock;
+pub use sinew_params as parameters;

@@ -27,7 +27,7 @@ use self::{
     copies::Copies,
     each::OpenSends,
     groups::{Groups, Joined},
-    guard::{Guard, Judge},
+    guard::{Guard, Judge, ParameterRight},
     mismatches::Mismatches,
     tap::{TAPS, Tap},
 };
@@ -56,6 +56,8 @@ struct Table {
     guard: Option<Arc<dyn Guard>>,
     /// The types that their senders and receivers declared differently, usually none.
     mismatches: Option<Arc<Mismatches>>,
+    /// The senders that may set parameters.
+    parameters: ParameterRight,
     local: BTreeMap<AppAddress, LocalRoute>,
     peers: BTreeMap<NodeAddress, Arc<dyn MessageSink>>,
 }
@@ -237,7 +239,9 @@ impl Router {
     /// The reason of the rejection.
     pub fn deliver_will(&self, message: Message, guard: Option<&Arc<dyn Guard>>) -> Result<(), Rejection> {
         let snapshot = self.snapshot.load();
-        let judge = Judge { guard: guard.or(snapshot.table.guard.as_ref()), mismatches: None };
+        let table = &snapshot.table;
+        let judge =
+            Judge { guard: guard.or(table.guard.as_ref()), mismatches: None, parameters: table.parameters };
         self.deliver_by(&snapshot, judge, message)
     }
 

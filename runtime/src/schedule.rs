@@ -83,6 +83,14 @@ pub struct Due<T> {
     entry: (Time, Option<Duration>),
 }
 
+impl<T> Due<T> {
+    /// Returns the ID of the entry.
+    #[must_use]
+    pub const fn id(&self) -> TimerId {
+        self.id
+    }
+}
+
 impl<T> Default for Schedule<T> {
     fn default() -> Self {
         Self { entries: BTreeMap::new(), next_id: 0 }

@@ -8,16 +8,16 @@
 //! ```
 
 use std::{
-    fs::{DirBuilder, File, OpenOptions},
-    io::{self, Write as _},
     net::{IpAddr, SocketAddr},
-    os::unix::fs::{DirBuilderExt as _, OpenOptionsExt as _},
     path::{Path, PathBuf},
 };
 
 use sinew_model::address::unscoped;
 use sinew_runtime::tid::NodeAddress;
-use sinew_security::files::{self, KeyFileError};
+use sinew_security::{
+    files::{self, KeyFileError},
+    state_files,
+};
 
 use super::core::{REMEMBERED_MAX, RememberedPeer, UNANSWERED_MAX};
 
@@ -43,12 +43,7 @@ impl PeersFile {
     /// Returns the file of the project's node with this address. A node of another project may use the same
     /// address and directory.
     pub(super) fn of(directory: &Path, project: &str, node: NodeAddress) -> Self {
-        let letter = |byte: u8| match byte {
-            b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'_' => char::from(byte).to_string(),
-            other => format!("%{other:02x}"),
-        };
-        let project: String = project.bytes().map(letter).collect();
-        Self(directory.join(format!("peers-{project}-{node}")))
+        Self(state_files::path(directory, "peers", project, node))
     }
 
     pub(super) fn path(&self) -> &Path {
@@ -80,44 +75,8 @@ impl PeersFile {
     /// # Errors
     /// Returns why the file cannot be written, with the remedy.
     pub(super) fn write(&self, peers: &[RememberedPeer]) -> Result<(), String> {
-        let directory = self.0.parent().unwrap_or_else(|| Path::new("."));
-        match DirBuilder::new().mode(0o700).create(directory) {
-            Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
-                return Err(format!(
-                    "{}: {error}; make the directory, for the node's user, or set `node.state` to another one",
-                    directory.display()
-                ));
-            }
-            Ok(()) | Err(_) => {}
-        }
-        files::directory(directory).map_err(|why| why.to_string())?;
-        replace(&self.0, directory, text(peers).as_bytes()).map_err(|error| {
-            format!(
-                "{error}; let the node's user write in {}, and see that there is room",
-                directory.display()
-            )
-        })
+        state_files::replace(&self.0, text(peers).as_bytes())
     }
-}
-
-fn replace(path: &Path, directory: &Path, bytes: &[u8]) -> io::Result<()> {
-    let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let beside = directory.join(format!(".{name}.new"));
-    // A killed process may have left this file.
-    let _ = std::fs::remove_file(&beside);
-    let written = (|| {
-        let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&beside)?;
-        file.write_all(bytes)?;
-        file.sync_all()?;
-        std::fs::rename(&beside, path)
-    })();
-    if written.is_err() {
-        // Removes the incomplete file.
-        let _ = std::fs::remove_file(&beside);
-    }
-    written?;
-    // Makes the renamed directory entry durable, too.
-    File::open(directory)?.sync_all()
 }
 
 pub(super) fn text(peers: &[RememberedPeer]) -> String {
@@ -169,7 +128,10 @@ fn is_of_a_host(address: SocketAddr) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
+    use std::{
+        fs::DirBuilder,
+        os::unix::fs::{DirBuilderExt as _, MetadataExt as _, PermissionsExt as _},
+    };
 
     use proptest::prelude::*;
 

@@ -22,6 +22,7 @@ mod down_policies;
 mod faults;
 mod handle;
 pub mod inspect;
+mod kept_parameters;
 mod layers;
 #[cfg(test)]
 mod log_tests;

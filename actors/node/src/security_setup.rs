@@ -4,7 +4,7 @@
 use std::{net::Ipv4Addr, path::PathBuf, sync::Arc};
 
 use sinew_model::config::NodeConfig;
-use sinew_runtime::log;
+use sinew_runtime::{log, router::guard::ParameterRight};
 use sinew_security::{
     access::{self, Access, AccessSummary, Applicant, List},
     node_security::NodeSecurity,
@@ -80,6 +80,23 @@ pub(super) fn set_access_list(state: &NodeState, list: Option<(PathBuf, List)>) 
     }
     warn_without_groups(&access);
     state.security.guard(&state.ctx.router, Arc::new(access));
+}
+
+/// Sets the senders that may set parameters where no access list names operators: the node's own applications and
+/// clients, if the node is open and on loopback, else nobody. Without a list, only the node's own user and root can be
+/// clients.
+pub(super) fn set_parameter_right(state: &NodeState) {
+    state.ctx.router.set_parameter_right(parameter_right(state));
+}
+
+fn parameter_right(state: &NodeState) -> ParameterRight {
+    let has_list = state.security.access.get().is_some();
+    let is_private = state.security.secured.get().is_none() && !state.ctx.config.is_beyond_host();
+    match (has_list, is_private) {
+        (true, _) => ParameterRight::Any,
+        (false, true) => ParameterRight::OfNode(state.ctx.node),
+        (false, false) => ParameterRight::Nobody,
+    }
 }
 
 /// Logs a warning for lists without `groups`, from older versions: a client that joined a group under such a
@@ -173,6 +190,27 @@ mod tests {
             assert!(words.contains(who) && words.contains("sinew keys init"), "{words:?}");
             assert!(!warning(interface, true).contains("MISTAKES"), "{interface}");
         }
+    }
+
+    #[test]
+    fn parameters_are_set_on_an_open_node_on_loopback_or_by_the_list_alone() {
+        let state = |interface: Ipv4Addr| {
+            let mut config = NodeConfig::new("knee");
+            config.ndl.interface = interface.into();
+            NodeState::for_test(config, Incarnation(1))
+        };
+        let (network, loopback) = (Ipv4Addr::new(192, 0, 2, 7), Ipv4Addr::LOCALHOST);
+        let open = state(loopback);
+        assert_eq!(parameter_right(&open), ParameterRight::OfNode(open.ctx.node));
+        assert_eq!(parameter_right(&state(network)), ParameterRight::Nobody);
+        let secured = state(loopback);
+        let credentials = Authority::new("walker").credentials("knee", 7);
+        let own = NodeSecurity::new(testing::tls(&credentials), &credentials, 8, Incarnation(1));
+        assert!(secured.security.secured.set(own).is_ok(), "it had none");
+        assert_eq!(parameter_right(&secured), ParameterRight::Nobody);
+        let listed = state(network);
+        listed.security.access_in_test(&listed.ctx, "");
+        assert_eq!(parameter_right(&listed), ParameterRight::Any);
     }
 
     #[test]

@@ -21,7 +21,9 @@
 //! Besides: [`access`], the list that allows messages between applications, and [`node_security`], the keys in
 //! force of a node.
 //!
-//! Everything here is pure except the reading of files ([`files`]). The time is an argument, or comes from the
+//! [`state_files`] writes the files in which a node keeps its state.
+//!
+//! Everything here is pure except the reading and writing of files ([`files`], [`state_files`]). The time is an argument, or comes from the
 //! [`TimeProvider`](rustls::time_provider::TimeProvider) of the caller.
 
 pub mod access;
@@ -35,6 +37,7 @@ pub mod node_security;
 mod peer;
 mod replay;
 mod security_state;
+pub mod state_files;
 #[cfg(any(test, feature = "testing"))]
 #[doc(hidden)]
 pub mod testing;

@@ -3,6 +3,7 @@
 mod actor;
 mod guards;
 mod messages;
+mod parameters;
 mod recording;
 mod refusals;
 mod timers;
@@ -13,9 +14,9 @@ use actix::{
     dev::{ContextFut, ContextParts},
 };
 
-pub(super) use self::timers::Action;
 pub use self::watches::WatchId;
-use self::{guards::GuardEntry, watches::Watch};
+use self::{guards::GuardEntry, parameters::Tuning, watches::Watch};
+pub(super) use self::{parameters::KeptHook, timers::Action};
 use crate::{
     app::requirement::EndReason,
     clock::Clock,
@@ -72,6 +73,8 @@ pub struct AppContext<A: Actor<Context = Self>> {
     pub(super) verdict: Option<Outcome>,
     /// The guards of outputs that protected messages control.
     guards: Vec<GuardEntry>,
+    /// The parameters, and the timers of the ticks at which they change.
+    tuning: Tuning,
 }
 
 impl<A: Actor<Context = Self>> AppContext<A> {
@@ -96,6 +99,7 @@ impl<A: Actor<Context = Self>> AppContext<A> {
             old: None,
             verdict: None,
             guards: Vec::new(),
+            tuning: Tuning::default(),
         };
         let mailbox = context.mailbox.take().expect("it was put there three lines above");
         ContextFut::new(context, actor, mailbox)
@@ -253,9 +257,10 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     }
 
     /// Resumes after a pause from `since` until `now`: periodic timers keep their grid, and input watchdogs
-    /// do not count the pause.
+    /// and slopes of parameters do not count the pause.
     pub(super) fn resume(&mut self, since: Time, now: Time) {
         self.schedule.skip_to(now);
+        self.tuning.resume(now);
         for watch in &mut self.watches {
             watch.input.resume(now.since(since));
         }

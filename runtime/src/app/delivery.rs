@@ -58,10 +58,6 @@ pub struct Delivery<P> {
 
 impl<P> Delivery<P> {
     pub(crate) fn new(payload: P, header: &Header, now: Time) -> Self {
-        let reply_to = || {
-            let Header { source, correlation, sent, .. } = *header;
-            ReplyTo { source, correlation, sent, until: header.expiry() }
-        };
         Self {
             payload,
             source: header.source,
@@ -71,7 +67,7 @@ impl<P> Delivery<P> {
             age: header.age(now),
             kind: header.kind,
             age_error: header.sent_error(),
-            reply_to: header.flags.has(Flags::ASK).then(reply_to),
+            reply_to: header.flags.has(Flags::ASK).then(|| ReplyTo::of(header)),
         }
     }
 

@@ -285,6 +285,9 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
                 Err(_) => Outcome::Rejected(Rejection::Malformed),
             };
         }
+        if let Some(outcome) = context.serve_parameters(message, now) {
+            return outcome;
+        }
         let handler = self.handlers.iter().find(|(kind, _)| *kind == message.header.kind);
         let Some((_, dispatch)) = handler else {
             // An event without a handler is complete after its policy, and a liveness request is answered by
@@ -361,9 +364,14 @@ fn fire<A>(actor: &mut A, context: &mut AppContext<A>, mut due: Due<Action<A>>, 
 where
     A: Actor<Context = AppContext<A>>,
 {
+    let id = due.id();
     match &mut due.action {
-        Action::Call(call) => call(actor, due.tick, context),
+        Action::Call(call) => {
+            context.tick_parameters(id, due.tick, now);
+            call(actor, due.tick, context);
+        }
         Action::CheckWatch(id) => check_watch(actor, context, *id, now),
+        Action::ExpireParameters => context.expire_parameters(now),
     }
     context.schedule.put_back(due);
 }

@@ -1,14 +1,17 @@
 //! The declaration of an application, which a node needs to start it.
 
 mod dyn_app;
+mod parameters;
 
 use std::{sync::Arc, time::Duration};
 
 use actix::{Actor, AsyncContext, Handler};
+use sinew_params::Parameters;
 
 use crate::{
     app::{
         AppContext, Delivery, DownPolicy, Raw, RequirementEvent, RequirementPolicy, Will,
+        context::KeptHook,
         drive::{Dispatch, Drive, dispatch_raw, dispatch_typed},
         requirement::{EndReason, FailedStart, Requirements, SafeState, WithEndReason},
     },
@@ -67,6 +70,11 @@ pub(super) struct Common {
     pub(super) wills: Vec<Will>,
     pub(super) on_lost: RequirementPolicy,
     has_safe_state: bool,
+    /// Number of sets of parameters; an application has at most one.
+    parameter_sets: usize,
+    /// The parameters; `None`: it has none.
+    parameters: Option<Arc<dyn Parameters>>,
+    on_kept: KeptHook,
     #[cfg(feature = "fault-points")]
     faults: Vec<crate::supervision::fault::Fault>,
 }
@@ -113,6 +121,9 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
             wills: Vec::new(),
             on_lost: RequirementPolicy::default(),
             has_safe_state: false,
+            parameter_sets: 0,
+            parameters: None,
+            on_kept: KeptHook::default(),
             #[cfg(feature = "fault-points")]
             faults: Vec::new(),
         };
@@ -397,9 +408,10 @@ impl<A: Actor<Context = AppContext<A>>> From<AppSpec<A>> for DynApp {
         common.subscribe_to_requirements();
         common.has_safe_state = safe_state.is_some();
         let kinds: Arc<[_]> = common.kinds.clone().into();
+        let (parameters, on_kept) = (common.parameters.clone(), common.on_kept.clone());
         let wire = move |wiring: AppWiring| {
             let (factory, handlers, safe_state) = (factory.clone(), handlers.clone(), safe_state.clone());
-            let kinds = kinds.clone();
+            let (kinds, parameters, on_kept) = (kinds.clone(), parameters.clone(), on_kept.clone());
             let launch: Launch = Arc::new(move |ready| {
                 // A launch outside of a guard has no supervisor that could fence its incarnation.
                 let liveness = Liveness::current().unwrap_or_else(|| Liveness::new("unguarded"));
@@ -421,6 +433,9 @@ impl<A: Actor<Context = AppContext<A>>> From<AppSpec<A>> for DynApp {
                 let requirements = Requirements::new(on_lost, safe_state.clone(), end_reason.clone());
                 let drive = Drive::new(reader, handlers.clone(), requirements, liveness);
                 let mut running = AppContext::into_running(sender, ready, actor, end_reason.clone());
+                if let Some(parameters) = &parameters {
+                    running.ctx().tune(parameters.clone(), on_kept.clone());
+                }
                 running.ctx().spawn(drive);
                 Box::new(WithEndReason { actor: running_actor(running), end_reason })
             });

@@ -4,7 +4,7 @@ use std::{collections::BTreeSet, sync::Arc};
 
 use super::{
     LocalRoute, Members, MessageSink, Router, Snapshot, Table, Writing, for_each_here,
-    guard::Guard,
+    guard::{Guard, ParameterRight},
     mismatches::{Mismatches, TypedPath},
     tap::{self, Passage, Tap, TapOf},
 };
@@ -141,6 +141,11 @@ impl Router {
     /// Sets the guard that checks messages to the applications of this node from now on.
     pub fn set_guard(&self, guard: Arc<dyn Guard>) {
         self.change(|table| table.guard = Some(guard));
+    }
+
+    /// Sets the senders that may set parameters of the applications of this node from now on.
+    pub fn set_parameter_right(&self, right: ParameterRight) {
+        self.change(|table| table.parameters = right);
     }
 
     /// Returns the groups that have a member on this node, in the order of their addresses.

@@ -8,14 +8,16 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 
+use sinew_params::SetParameters;
+
 use super::{
     Table,
     mismatches::{self, Mismatches, SPOILED},
 };
 use crate::{
     outcome::Rejection,
-    tid::AppAddress,
-    wire::{Flags, Header, Message},
+    tid::{AppAddress, NodeAddress},
+    wire::{Flags, Header, Message, Payload},
 };
 
 /// The access check. It is called on the sending thread, for every message, so it must not block or hold a
@@ -29,6 +31,33 @@ pub trait Guard: Send + Sync {
     /// Reports that an application of this node sends a request to one application; called before the request
     /// can be answered.
     fn asks(&self, header: &Header);
+}
+
+/// The senders that may set parameters of this node's applications, in addition to a [`Guard`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ParameterRight {
+    /// Each sender of a message that may reach the application: a guard decides, if there is one.
+    #[default]
+    Any,
+    /// Applications and clients of this node.
+    OfNode(NodeAddress),
+    /// No sender.
+    Nobody,
+}
+
+impl ParameterRight {
+    /// Returns whether this right refuses the message of this header.
+    #[inline]
+    fn refuses(self, header: &Header) -> bool {
+        if header.kind != SetParameters::KIND {
+            return false;
+        }
+        match self {
+            Self::Any => false,
+            Self::OfNode(node) => header.source.node != node,
+            Self::Nobody => true,
+        }
+    }
 }
 
 /// Returns whether the message of this header must not reach `target`.
@@ -57,20 +86,25 @@ pub(super) struct Judge<'a> {
     pub(super) guard: Option<&'a Arc<dyn Guard>>,
     /// `None`: no types differ, or they do not matter.
     pub(super) mismatches: Option<&'a Arc<Mismatches>>,
+    pub(super) parameters: ParameterRight,
 }
 
 impl Table {
     /// Returns the checks of a message to an application of this node.
     #[inline]
     pub(super) fn judge(&self) -> Judge<'_> {
-        Judge { guard: self.guard.as_ref(), mismatches: self.mismatches.as_ref() }
+        Judge {
+            guard: self.guard.as_ref(),
+            mismatches: self.mismatches.as_ref(),
+            parameters: self.parameters,
+        }
     }
 }
 
 impl Judge<'_> {
     #[inline]
     fn of(self, target: AppAddress, header: &Header) -> Verdict {
-        if refuses(self.guard, target, header) {
+        if refuses(self.guard, target, header) || self.parameters.refuses(header) {
             return Verdict::Refused(Rejection::NotAllowed);
         }
         mismatches::judge(self.mismatches, target, header)
@@ -153,6 +187,28 @@ mod tests {
         }
 
         fn asks(&self, _: &Header) {}
+    }
+
+    #[test]
+    fn parameters_are_set_by_the_senders_with_the_right_alone() {
+        let (router, route) = (Router::new(NODE), Arc::new(Sink));
+        router.set_local(HEIR, LocalRoute { sink: route, events: Arc::new([]) });
+        let (here, elsewhere) = (NODE, NodeAddress::new(0x7f00_0002));
+        let send = |node, kind| {
+            let header = Header::new(kind, Tid::new(node, AppAddress::new(0x1002)), Tid::new(NODE, HEIR));
+            router.deliver(Message::new(header, Bytes::new()))
+        };
+        let other = Kind::named("test.other");
+        for (right, local, remote) in [
+            (ParameterRight::Any, Ok(()), Ok(())),
+            (ParameterRight::OfNode(NODE), Ok(()), Err(Rejection::NotAllowed)),
+            (ParameterRight::Nobody, Err(Rejection::NotAllowed), Err(Rejection::NotAllowed)),
+        ] {
+            router.set_parameter_right(right);
+            assert_eq!(send(here, SetParameters::KIND), local, "{right:?}");
+            assert_eq!(send(elsewhere, SetParameters::KIND), remote, "{right:?}");
+            assert_eq!((send(here, other), send(elsewhere, other)), (Ok(()), Ok(())), "{right:?}");
+        }
     }
 
     #[test]

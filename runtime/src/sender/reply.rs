@@ -4,7 +4,7 @@ use super::{SendError, Sender};
 use crate::{
     tid::Tid,
     time::Time,
-    wire::{Class, Flags, Message, Payload},
+    wire::{Class, Flags, Header, Message, Payload},
 };
 
 /// The destination of a reply, made from the request that it answers.
@@ -17,6 +17,12 @@ pub struct ReplyTo {
 }
 
 impl ReplyTo {
+    /// Returns the destination of the reply to the request of this header.
+    pub(crate) fn of(header: &Header) -> Self {
+        let Header { source, correlation, sent, .. } = *header;
+        Self { source, correlation, sent, until: header.expiry() }
+    }
+
     /// Returns when the sender of the request stops waiting, in this host's clock; [`Time::MAX`] if it never stops.
     #[must_use]
     pub const fn deadline(&self) -> Time {

@@ -17,6 +17,7 @@ use sinew::{
         FreezeReport, FrozenReport, MismatchesReport, NodeReport, Ping, ReachReport, RecordReport,
         ReloadReport, SchemasReport, TreeReport, WatchReport,
     },
+    parameters::{AskParameters, ParameterList, ParameterOutcome, SetParameters},
     schema::{Schema, schema_of},
 };
 use sinew_model::barrier::{ArriveAtBarrier, BarrierAnswer, LeaveBarrier};
@@ -103,6 +104,7 @@ fn every_payload_type_of_this_tree_is_traced() {
         AskRecord AskReload AskSchemas AskTree AskWatch AuditReport FreezeReport FrozenReport MismatchesReport
         NodeReport Ping ReachReport RecordReport ReloadReport SchemasReport TreeReport WatchReport
         ArriveAtBarrier BarrierAnswer LeaveBarrier
+        AskParameters ParameterList ParameterOutcome SetParameters
     };
     let mut names = BTreeSet::new();
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");

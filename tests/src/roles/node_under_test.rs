@@ -4,7 +4,7 @@
 //! node_under_test CONFIG.toml [--requires NAME]... [--sends-to NAME] [--floods NAME]... [--will NAME]...
 //! [--meets NAME]... [--incarnation NUMBER] [--says-directory] [--streams-to NAME [--stream BYTES]...]
 //! [--stamps-to NAME] [--logs | --logs-info | --default-log] [--held] [--forgets-a-handler]
-//! [--sends-text-to NAME] [--panics]
+//! [--sends-text-to NAME] [--panics] [--tuned]
 //! ```
 //!
 //! With `--held` a thread-local variable of the main thread holds the node, and `main` returns 3 once the
@@ -19,6 +19,9 @@
 //! `--logs-info` more than these. With `--default-log` it installs no subscriber, as a first program does:
 //! Sinew's own lines go to standard error.
 //!
+//! With `--tuned` it runs another application, called like the node with `.gains` behind it, which has parameters and
+//! prints one of them when it changes.
+//!
 //! Some options cause mistakes. With `--forgets-a-handler` counts are not declared as handled. With
 //! `--sends-text-to` it sends a type with the name of a count but a text in its field, every 20 ms. With
 //! `--panics` its application panics at the first count that it receives.
@@ -27,7 +30,7 @@
 //! start time in nanoseconds of the monotonic clock, which all hosts of one machine share. With
 //! `--says-directory` it prints the directory at each line `directory` of its standard input.
 
-use std::{cell::RefCell, process::ExitCode};
+use std::{cell::RefCell, process::ExitCode, sync::Arc};
 
 use sinew::{
     NodeHandle,
@@ -86,6 +89,38 @@ impl Actor for Streamer {
         context.every(Duration::from_millis(20), |this, _, context| {
             let filler = vec![7; this.length.saturating_sub(FRAME_OF_FILLER)];
             this.sent += u64::from(context.send(&*this.to, &Sized { number: this.sent + 1, filler }).is_ok());
+        });
+    }
+}
+
+params! {
+    /// The parameters of a node under test.
+    struct Gains {
+        /// Assistance, as a share of the model's torque.
+        assistance: f64 = 0.3, unit "1", range 0.0..=1.0;
+        /// Greatest torque, which moves to a new value.
+        torque_max: f64 = 20.0, unit "Nm", range 0.0..=60.0, slope 10.0, keep;
+        /// Whether the joint is damped.
+        damped: bool = false;
+    }
+}
+
+/// Has parameters, and prints the assistance when it changes.
+struct Tuned {
+    gains: Arc<Gains>,
+    printed: f64,
+}
+
+impl Actor for Tuned {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, context: &mut Self::Context) {
+        context.every(Duration::from_millis(5), |this, tick, _| {
+            let assistance = this.gains.assistance.get();
+            if assistance != this.printed {
+                println!("assistance {assistance} at tick {}", tick.number);
+                this.printed = assistance;
+            }
         });
     }
 }
@@ -272,6 +307,12 @@ pub(super) fn run(arguments: &[String]) -> ExitCode {
         let (app, receiver) = (format!("{name}.stamps"), to.clone());
         let make = move || Stamper { to: receiver.clone(), number: 0, after_ns: 0 };
         builder = builder.app(AppSpec::new(app, make).requires([to]));
+    }
+    if has("--tuned") {
+        let gains = Gains::new();
+        let shared = gains.clone();
+        let make = move || Tuned { printed: shared.assistance.get(), gains: shared.clone() };
+        builder = builder.app(AppSpec::new(format!("{name}.gains"), make).params(&gains));
     }
     for number in after("--incarnation") {
         let Ok(number) = number.parse() else {

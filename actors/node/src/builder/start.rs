@@ -20,7 +20,7 @@ use sinew_security::node_security::NodeSecurity;
 
 use super::{NodeBuilder, StartError};
 use crate::{
-    Node, NodeHandle, NodeState, SupervisorSpec, inspect,
+    Node, NodeHandle, NodeState, SupervisorSpec, inspect, kept_parameters,
     node::LAST_WORDS,
     play_check, process,
     root::{self, RootEvent},
@@ -113,6 +113,8 @@ impl NodeBuilder {
             security_setup::set_credentials(&state, secured);
             security_setup::warn_loopback_only(&state.ctx.config);
             security_setup::set_access_list(&state, list);
+            security_setup::set_parameter_right(&state);
+            kept_parameters::keep(&state.ctx, &self.tree.apps());
         }
         #[cfg(feature = "fault-points")]
         crate::faults::keep(&state, &planned)?;

@@ -6,6 +6,7 @@ mod answers;
 mod compared;
 mod endings;
 mod guarded;
+mod parameters;
 mod timers;
 mod wall;
 

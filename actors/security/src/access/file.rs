@@ -15,14 +15,16 @@ use toml::{
 
 use super::{
     client::{CLIENTS_MAX, ClientRule, Joinable},
-    rule::{Action, Classes, List, PATTERNS_MAX, RULES_MAX, Rule, TEXTS_MAX},
+    rule::{Action, Classes, List, PATTERNS_MAX, RULES_MAX, Roles, Rule, TEXTS_MAX},
     selector::{self, Selector},
 };
 use crate::files::{self, KeyFileError};
 
-/// Keys of a `[[rule]]` and of a `[[client]]`.
+/// Keys of a `[[rule]]`, and of a `[[client]]`.
 const RULE_KEYS: [&str; 6] = ["name", "from", "to", "groups", "classes", "action"];
 const CLIENT_KEYS: [&str; 5] = ["uid", "gid", "names", "addresses", "groups"];
+/// Keys of `[roles]`.
+const ROLE_KEYS: [&str; 2] = ["operators", "observers"];
 /// Maximum file size in bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 /// Maximum length of a rule name in bytes.
@@ -63,10 +65,11 @@ pub(super) fn parse(text: &str) -> Result<List, ConfigError> {
         match &**name.get_ref() {
             "rule" => list.rules = reader.tables(value, ("rule", RULES_MAX), Reader::rule),
             "client" => list.clients = reader.tables(value, ("client", CLIENTS_MAX), Reader::client),
+            "roles" => list.roles = reader.roles(value),
             other => {
                 let found = "a key that does not exist".to_owned();
-                let remedy = "write [[rule]] or [[client]] and their keys below";
-                reader.add(other, name, Some(found), ("[[rule]] and [[client]]", remedy));
+                let remedy = "write [[rule]], [[client]] or [roles] and their keys below";
+                reader.add(other, name, Some(found), ("[[rule]], [[client]] and [roles]", remedy));
             }
         }
     }
@@ -187,6 +190,17 @@ impl<'t> Reader<'t> {
         let addresses = self.texts(table, "client.addresses", legal, selector::range).unwrap_or_default();
         let groups = self.texts(table, "client.groups", JOINABLE_LEGAL, joinable);
         Some(ClientRule { line: line_of(self.text, &place.span()), uid, gid, names, addresses, groups })
+    }
+
+    fn roles(&mut self, value: &Value<'t>) -> Roles {
+        let Some(table) = value.get_ref().as_table() else {
+            let remedy = "write [roles] on a line of its own and its keys below";
+            self.add("roles", value, None, ("a table, [roles]", remedy));
+            return Roles::default();
+        };
+        self.check_keys(table, "roles", &ROLE_KEYS);
+        let mut of = |key| self.texts(table, key, selector::LEGAL, Selector::parse).unwrap_or_default();
+        Roles { operators: of("roles.operators"), observers: of("roles.observers") }
     }
 
     fn check_keys(&mut self, table: &Table<'t>, of: &str, keys: &[&str]) {

@@ -1,5 +1,7 @@
 //! The active access list as every sender reads it. It can be reloaded, and receives the names in the directory.
 
+mod roles;
+
 use std::{
     collections::{BTreeSet, VecDeque},
     fmt,
@@ -14,10 +16,11 @@ use sinew_model::{
 };
 use sinew_runtime::{
     lock,
+    parameters::SetParameters,
     router::guard::Guard,
     tid::{AppAddress, Incarnation, NodeAddress, Tid},
     time::Time,
-    wire::{Flags, Header},
+    wire::{Flags, Header, Payload},
 };
 
 use super::{
@@ -422,6 +425,10 @@ struct IncarnationGuard {
 
 impl Guard for IncarnationGuard {
     fn allows(&self, header: &Header, app: AppAddress) -> bool {
+        // The sender of a last will has ended, and nothing is tuned then.
+        if header.kind == SetParameters::KIND {
+            return false;
+        }
         judge(&self.index, &self.refusals, question(self.here, header, app), header.destination.is_single())
     }
 
@@ -440,6 +447,9 @@ impl Guard for Access {
             && self.pending.take(Time::now(), header, app)
         {
             return true;
+        }
+        if let Some(is_allowed) = self.decide_by_role(header, app) {
+            return is_allowed;
         }
         judge(
             &self.index.load(),

@@ -105,6 +105,11 @@ impl Memberships {
         }
     }
 
+    /// Returns whether the application at this address is a guest's.
+    pub(super) fn is_guest(&self, app: AppAddress) -> bool {
+        self.guests.contains_key(&app)
+    }
+
     /// Returns the applications of guests.
     pub(super) fn guests(&self) -> BTreeSet<AppAddress> {
         self.guests.keys().copied().collect()

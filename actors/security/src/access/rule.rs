@@ -23,6 +23,17 @@ pub struct List {
     pub(super) rules: Vec<Rule>,
     /// The rules for users of this host.
     pub(super) clients: Vec<ClientRule>,
+    /// The roles.
+    pub(super) roles: Roles,
+}
+
+/// The applications that have a role. Its rights are in addition to those by rules.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Roles {
+    /// May set and read parameters.
+    pub(super) operators: Vec<Selector>,
+    /// May read parameters.
+    pub(super) observers: Vec<Selector>,
 }
 
 /// Allows or refuses the messages of a set of sources to a set of targets.

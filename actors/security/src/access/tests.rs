@@ -1,6 +1,7 @@
 //! Verdicts of a list on messages and on clients, and faults of a list that cannot be read.
 
 mod properties;
+mod roles;
 
 use std::{collections::BTreeMap, sync::Arc};
 

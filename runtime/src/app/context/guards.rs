@@ -4,7 +4,7 @@ use std::{io, sync::Arc};
 
 use actix::Actor;
 
-use super::AppContext;
+use super::{Action, AppContext};
 use crate::{
     protection::{Cause, DataId, Echo, Guard, Guarded},
     schedule::TimerId,
@@ -97,7 +97,10 @@ impl<A: Actor<Context = Self>> AppContext<A> {
             }
         };
         echo(self);
-        let echoes = self.every(protection.echo_period(), move |_, _, context| echo(context));
+        // Not by `every`: parameters change at ticks of the application's own timers.
+        let (first, period) = (self.now() + protection.echo_period(), protection.echo_period());
+        let action = Action::Call(Box::new(move |_, _, context| echo(context)));
+        let echoes = self.schedule.every(first, period, action);
         self.guards.push(GuardEntry { guard: guarded, kind: P::KIND, echoes });
         Ok(guard)
     }

@@ -16,6 +16,8 @@ type Timer<A> = Box<dyn FnMut(&mut A, Tick, &mut <A as Actor>::Context)>;
 pub(in crate::app) enum Action<A: Actor> {
     Call(Timer<A>),
     CheckWatch(WatchId),
+    /// Refuses the sets of parameters that have waited too long.
+    ExpireParameters,
 }
 
 impl<A: Actor<Context = Self>> AppContext<A> {
@@ -76,7 +78,9 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         period: Duration,
         action: impl FnMut(&mut A, Tick, &mut Self) + 'static,
     ) -> TimerId {
-        self.schedule.every(first, period, Action::Call(Box::new(action)))
+        let timer = self.schedule.every(first, period, Action::Call(Box::new(action)));
+        self.tuning.add_timer(period, timer);
+        timer
     }
 
     /// Calls `action` once, after `delay`.
@@ -104,6 +108,10 @@ impl<A: Actor<Context = Self>> AppContext<A> {
 
     /// Cancels a timer from outside its own action.
     pub fn cancel(&mut self, timer: TimerId) -> bool {
-        self.schedule.cancel(timer)
+        let is_cancelled = self.schedule.cancel(timer);
+        if is_cancelled {
+            self.tuning.remove_timer(timer);
+        }
+        is_cancelled
     }
 }

@@ -1,5 +1,9 @@
 //! The declaration of an application without its actor type.
 
+use std::sync::Arc;
+
+use sinew_params::Parameters;
+
 use super::{AppWiring, Common, DynApp};
 use crate::{
     app::{DownState, RequirementPolicy, WILLS_MAX, Will},
@@ -45,6 +49,18 @@ impl DynApp {
         &self.common.sends
     }
 
+    /// Returns the parameters of the application, if it has any.
+    #[must_use]
+    pub const fn parameters(&self) -> Option<&Arc<dyn Parameters>> {
+        self.common.parameters.as_ref()
+    }
+
+    /// Has `notify` called on the application's thread after each change of a kept parameter. It must not wait. Only the
+    /// first call has an effect.
+    pub fn on_kept_change(&self, notify: impl Fn() + Send + Sync + 'static) {
+        let _ = self.common.on_kept.set(Box::new(notify));
+    }
+
     /// Returns the supervision policy of the application.
     #[must_use]
     pub const fn policy(&self) -> &Policy {
@@ -85,10 +101,15 @@ impl DynApp {
     /// Returns the error in the declaration, as a text, if it has one.
     #[must_use]
     pub fn fault(&self) -> Option<String> {
-        let Common { wills, on_lost, has_safe_state, .. } = &self.common;
+        let Common { wills, on_lost, has_safe_state, parameter_sets, .. } = &self.common;
         if wills.len() > WILLS_MAX {
             let wills = wills.len();
             return Some(format!("{wills} last wills are more than the {WILLS_MAX} that it may have"));
+        }
+        if *parameter_sets > 1 {
+            return Some(format!(
+                "it has {parameter_sets} sets of parameters, and may have one: put all into one `params!`"
+            ));
         }
         match on_lost {
             RequirementPolicy::SafeState if !has_safe_state => {

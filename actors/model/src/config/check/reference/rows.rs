@@ -30,7 +30,7 @@ pub(super) const ROWS: &[Row] = &[
         key: "node.state",
         kind: Kind::PathOrFalse(DIRECTORY_BYTES_MAX),
         value: |config| path(config.state.as_deref()),
-        effect: "Directory in which the node keeps the addresses of its peers between two starts; `false` keeps none.",
+        effect: "Directory in which the node keeps the addresses of its peers, and kept parameters, between two starts; `false` keeps none.",
         note: "The node creates the directory itself, with mode 0700, but not its parents.",
     },
     Row {

@@ -1,0 +1,35 @@
+//! The parameters of an application: values that are tuned while it runs.
+//!
+//! A set of parameters is a struct of [`Param`]s, which the macro `params!` of the package `sinew` declares. A control
+//! loop reads each one by [`Param::get`], a single load. A [`Tuner`] is the only writer: it takes sets of values,
+//! checks each as a whole, and applies it between two ticks of the loop.
+//!
+//! This crate knows no message, no actor and no clock: times are arguments, counted from the origin of the caller's
+//! clock. `sinew-runtime` connects it with the mailbox and the timers of an application.
+//!
+//! | module | content |
+//! | --- | --- |
+//! | `descriptor` | the declaration of a parameter: name, unit, default, range, slope |
+//! | `param` | a parameter that a loop reads without a lock |
+//! | `value` | a value of any of the three types |
+//! | `tuner` | staging, application at a tick, slopes, undo |
+//! | `kept` | values that survive a restart of the node |
+//! | [`file`] | values as TOML |
+//! | `messages` | the messages between tools and applications |
+
+mod descriptor;
+pub mod file;
+mod kept;
+mod messages;
+mod param;
+mod tuner;
+mod value;
+
+pub use self::{
+    descriptor::{Descriptor, Domain, NAME_BYTES_MAX, PARAMETERS_MAX, check},
+    kept::{kept_values, restore},
+    messages::{AskParameters, NamedValue, ParameterList, ParameterOutcome, ParameterReport, SetParameters},
+    param::{Cell, Param, ParamType, Parameters},
+    tuner::{ParameterError, STAGED_MAX, TICK_WITHIN, Tuner, UNDO_MAX},
+    value::{Value, ValueError},
+};

@@ -1,0 +1,193 @@
+//! Parameters in virtual time: applied at a tick, refused in words, moved with a slope.
+
+use std::sync::Arc;
+
+use sinew::parameters::{AskParameters, NamedValue, ParameterList, ParameterOutcome, SetParameters, Value};
+
+use super::*;
+
+params! {
+    /// The gains of the knee.
+    struct Gains {
+        /// Torque.
+        newton_metres: f64 = 3.0, unit "Nm", range 0.0..=60.0;
+        /// Assistance, which moves by 100 in a second.
+        assistance: f64 = 0.0, unit "1", range 0.0..=1.0, slope 100.0;
+    }
+}
+
+/// Sends its torque and its assistance to the motor at each tick.
+struct Knee {
+    gains: Arc<Gains>,
+    periods: &'static [Duration],
+}
+
+impl Actor for Knee {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        for period in self.periods {
+            ctx.every(*period, |this, _, ctx| {
+                let newton_metres = this.gains.newton_metres.get() + this.gains.assistance.get();
+                ctx.send("motor", &Torque { newton_metres, t_ns: 0 }).unwrap();
+            });
+        }
+    }
+}
+
+const TICK: Duration = Duration::from_millis(1);
+
+fn knee(periods: &'static [Duration]) -> AppSpec<Knee> {
+    let gains = Gains::new();
+    let shared = gains.clone();
+    AppSpec::new("knee", move || Knee { gains: shared.clone(), periods }).params(&gains)
+}
+
+fn set(values: &[(&str, f64)]) -> SetParameters {
+    let named =
+        |(name, value): &(&str, f64)| NamedValue { name: (*name).to_owned(), value: Value::Number(*value) };
+    SetParameters::Values(values.iter().map(named).collect())
+}
+
+/// Sends sets to the knee, each at its time, and notes their outcomes.
+struct Tuner {
+    sets: Vec<(Duration, SetParameters)>,
+}
+
+impl Tuner {
+    fn spec(sets: &[(Duration, SetParameters)]) -> AppSpec<Self> {
+        let sets = sets.to_vec();
+        AppSpec::new("hip", move || Self { sets: sets.clone() })
+    }
+}
+
+impl Actor for Tuner {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        for (at, set) in self.sets.clone() {
+            ctx.after(at, move |this, _, ctx| {
+                let within = Duration::from_secs(3);
+                let reply = ctx.message("knee", &set).ask::<ParameterOutcome>(within).unwrap();
+                ctx.spawn(reply.into_actor(this).map(|reply, _, ctx| match reply.unwrap() {
+                    ParameterOutcome::Applied { tick, at_ns, .. } => {
+                        let at = Time::from_nanos(at_ns).since(START);
+                        note(ctx, format!("tick {tick} after {at:?}"));
+                    }
+                    ParameterOutcome::Refused { why } => note(ctx, why),
+                }));
+            });
+        }
+    }
+}
+
+/// The torques, each with its time since the start.
+fn torques(outputs: &[TimedMessage]) -> Vec<(Duration, f64)> {
+    let torques = outputs.iter().filter(|output| output.kind == Torque::KIND);
+    // The payload is a map: its value of eight bytes is behind the name of its field.
+    let value = |payload: &[u8]| {
+        let name = b"newton_metres";
+        let at = payload.windows(name.len()).position(|window| window == name).unwrap() + name.len() + 1;
+        f64::from_be_bytes(payload[at..at + 8].try_into().unwrap())
+    };
+    torques.map(|output| (output.at.since(START), value(&output.payload))).collect()
+}
+
+const fn us(us: u64) -> Duration {
+    Duration::from_micros(us)
+}
+
+#[test]
+fn set_is_applied_at_the_next_tick_and_names_it() {
+    let sets = [(us(3_500), set(&[("newton_metres", 5.0)]))];
+    let outputs = replay().app(knee(&[TICK])).app(Tuner::spec(&sets)).ends_at(ms(5)).run([]).unwrap();
+    assert_eq!(notes(&outputs), [(us(4_000), "tick 4 after 4ms".to_owned())]);
+    let values: Vec<_> = torques(&outputs).into_iter().map(|(_, value)| value).collect();
+    assert_eq!(values, [3.0, 3.0, 3.0, 5.0, 5.0]);
+}
+
+#[test]
+fn value_outside_its_range_is_refused_at_once() {
+    let sets = [(us(3_500), set(&[("newton_metres", 90.0)]))];
+    let outputs = replay().app(knee(&[TICK])).app(Tuner::spec(&sets)).ends_at(ms(5)).run([]).unwrap();
+    let why = "newton_metres = 90.0 Nm is outside 0.0 to 60.0 Nm".to_owned();
+    assert_eq!(notes(&outputs), [(us(3_500), why)]);
+    assert!(torques(&outputs).iter().all(|(_, value)| *value == 3.0));
+}
+
+#[test]
+fn slope_moves_the_value_tick_by_tick() {
+    let sets = [(us(1_500), set(&[("assistance", 0.25)]))];
+    let outputs = replay().app(knee(&[TICK])).app(Tuner::spec(&sets)).ends_at(ms(6)).run([]).unwrap();
+    let values: Vec<_> = torques(&outputs).into_iter().map(|(_, value)| value).collect();
+    for (value, expected) in values.iter().zip([3.0, 3.1, 3.2, 3.25, 3.25, 3.25]) {
+        assert!((value - expected).abs() < 1e-9, "{values:?}");
+    }
+}
+
+#[test]
+fn ticks_are_those_of_the_timer_with_the_shortest_period() {
+    const PERIODS: &[Duration] = &[Duration::from_millis(10), TICK];
+    let sets = [(us(3_500), set(&[("newton_metres", 5.0)]))];
+    let outputs = replay().app(knee(PERIODS)).app(Tuner::spec(&sets)).ends_at(ms(5)).run([]).unwrap();
+    assert_eq!(notes(&outputs), [(us(4_000), "tick 4 after 4ms".to_owned())]);
+}
+
+#[test]
+fn set_without_a_tick_in_time_is_refused_and_never_applied() {
+    const SLOW: &[Duration] = &[Duration::from_secs(2)];
+    let sets = [(us(3_500), set(&[("newton_metres", 5.0)]))];
+    let outputs = replay().app(knee(SLOW)).app(Tuner::spec(&sets)).ends_at(ms(2_100)).run([]).unwrap();
+    let [(at, why)] = &notes(&outputs)[..] else { panic!("{:?}", notes(&outputs)) };
+    assert_eq!(*at, us(1_003_500));
+    assert!(why.starts_with("no tick came within 1 s"), "{why}");
+    assert_eq!(torques(&outputs), [(Duration::from_secs(2), 3.0)]);
+}
+
+#[test]
+fn application_without_a_timer_takes_a_set_between_two_messages() {
+    let sets = [
+        (us(3_500), set(&[("newton_metres", 5.0)])),
+        (us(3_600), set(&[("assistance", 0.5)])),
+        (us(3_700), SetParameters::Undo),
+    ];
+    let outputs = replay().app(knee(&[])).app(Tuner::spec(&sets)).ends_at(ms(5)).run([]).unwrap();
+    let notes = notes(&outputs);
+    assert_eq!(notes[0], (us(3_500), "tick 0 after 3.5ms".to_owned()));
+    assert!(notes[1].1.contains("assistance moves with a slope"), "{notes:?}");
+    assert_eq!(notes[2], (us(3_700), "tick 0 after 3.7ms".to_owned()));
+}
+
+#[test]
+fn recorded_set_is_applied_in_a_replay() {
+    let sets = [TimedMessage::of(ms(2) + us(500), tid(HIP), tid(KNEE), &set(&[("newton_metres", 7.0)]))];
+    let outputs = replay().app(knee(&[TICK])).ends_at(ms(4)).run(sets).unwrap();
+    let values: Vec<_> = torques(&outputs).into_iter().map(|(_, value)| value).collect();
+    assert_eq!(values, [3.0, 3.0, 7.0, 7.0]);
+}
+
+/// Asks the knee for its parameters, and notes the first one.
+struct Reader;
+
+impl Actor for Reader {
+    type Context = AppContext<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        ctx.after(us(500), |this, _, ctx| {
+            let question = AskParameters {};
+            let reply = ctx.message("knee", &question).ask::<ParameterList>(TICK * 10).unwrap();
+            ctx.spawn(reply.into_actor(this).map(|reply, _, ctx| {
+                let list = reply.unwrap();
+                let first = &list.parameters[0];
+                note(ctx, format!("{} {} {} {:?}", first.name, first.value, first.unit, list.has_ticks));
+            }));
+        });
+    }
+}
+
+#[test]
+fn parameters_are_listed_without_a_handler_of_the_application() {
+    let reader = AppSpec::new("hip", || Reader);
+    let outputs = replay().app(knee(&[TICK])).app(reader).ends_at(ms(2)).run([]).unwrap();
+    assert_eq!(notes(&outputs), [(us(500), "newton_metres 3.0 Nm true".to_owned())]);
+}
