@@ -150,6 +150,8 @@ pub(crate) mod tests {
             unhandled: Vec::new(),
             unguarded: Vec::new(),
             lost_echoes: Vec::new(),
+            guards: Vec::new(),
+            guards_left_out: 0,
             refusals_left_out: 0,
             peers: Vec::new(),
             own_stalls: None,

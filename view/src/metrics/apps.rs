@@ -4,15 +4,15 @@ use std::collections::BTreeSet;
 
 use sinew::{
     Tid,
-    inspect::{AppReport, AppsReport, Missing, TreeReport, WaitReport},
+    inspect::{AppReport, AppsReport, GuardReport, Missing, TreeReport, WaitReport},
 };
 
 use super::{
     samples::Samples,
     system::{micros, truth},
     table::{
-        APP_MISSING, APP_READY, APPS, BARRIER_BLOCKED, BARRIER_WAIT, MAILBOX_DEPTH, MAILBOX_DEPTH_MAX,
-        RESTARTS,
+        APP_MISSING, APP_READY, APPS, BARRIER_BLOCKED, BARRIER_WAIT, GUARD_CAUSE, GUARD_FAILED, GUARD_SAFE,
+        MAILBOX_DEPTH, MAILBOX_DEPTH_MAX, RESTARTS,
     },
 };
 use crate::{nodes::bounded, snapshot::Answers};
@@ -50,6 +50,7 @@ pub(super) fn add(samples: &mut Samples, answers: &Answers, node: &str, own: &BT
     }
     add_barriers(samples, &answers.apps, node, &mut names);
     add_tree(samples, &answers.tree, node, &mut names);
+    add_guards(samples, answers, node, &mut names);
     names
 }
 
@@ -84,6 +85,18 @@ fn add_tree(samples: &mut Samples, tree: &TreeReport, node: &str, names: &mut Ap
             if let Some(depth) = depth {
                 samples.level(metric, [node, &label], depth as f64);
             }
+        }
+    }
+}
+
+fn add_guards(samples: &mut Samples, answers: &Answers, node: &str, names: &mut AppNames) {
+    for GuardReport { receiver, safe, is_safe_failed, .. } in &answers.node.guards {
+        let app = answers.apps.apps.iter().find(|app| app.tid == *receiver);
+        let label = names.label(app.and_then(|app| app.name.as_deref()).unwrap_or_default());
+        samples.level(&GUARD_SAFE, [node, &label], truth(safe.is_some()));
+        samples.level(&GUARD_FAILED, [node, &label], truth(*is_safe_failed));
+        if let Some(cause) = safe {
+            samples.level(&GUARD_CAUSE, [node, &label, &bounded(cause)], 1.0);
         }
     }
 }

@@ -60,6 +60,7 @@ pub(super) fn add_node(samples: &mut Samples, answers: &Answers, label: &str) {
     }
     samples.level(&LEFT_OUT, [label, "applications"], apps.left_out as f64);
     samples.level(&LEFT_OUT, [label, "barriers"], apps.barriers_left_out as f64);
+    samples.level(&LEFT_OUT, [label, "guards"], node.guards_left_out as f64);
     samples.level(&LEFT_OUT, [label, "supervised"], tree.left_out as f64);
     for (number, (cause, count)) in audit.refused.iter().enumerate() {
         let cause = if number < CAUSES_MAX { bounded(cause) } else { "other".to_owned() };

@@ -142,6 +142,19 @@ pub(super) const MAILBOX_DEPTH: Metric = gauge("mailbox_depth", APP, "Messages i
 pub(super) const MAILBOX_DEPTH_MAX: Metric =
     gauge("mailbox_depth_max", APP, "The most messages that were ever in the mailbox at once.");
 
+pub(super) const GUARD_SAFE: Metric =
+    gauge("guard_safe", APP, "Whether an output that the application guards is safe: no command reaches it.");
+pub(super) const GUARD_CAUSE: Metric = gauge(
+    "guard_safe_cause",
+    &["node", "app", "why"],
+    "1 for each cause for which an output of the application is safe.",
+);
+pub(super) const GUARD_FAILED: Metric = gauge(
+    "guard_safe_failed",
+    APP,
+    "Whether the function that makes an output of the application safe has failed and is called again.",
+);
+
 pub(super) const APP_MESSAGES: Metric = counter(
     "app_messages",
     &["node", "app", "class", "outcome"],
@@ -202,6 +215,9 @@ pub const METRICS: &[Metric] = &[
     RESTARTS,
     MAILBOX_DEPTH,
     MAILBOX_DEPTH_MAX,
+    GUARD_SAFE,
+    GUARD_CAUSE,
+    GUARD_FAILED,
     APP_MESSAGES,
     APP_DIRECT,
     PEER_SENT,

@@ -10,8 +10,8 @@ use sinew::{
     address::Incarnation,
     audit::{Account, Entry, NodeAudit, Place},
     inspect::{
-        AppReport, AppsReport, BarrierReport, DialReport, LinkReport, LostReport, Missing, NodeReport,
-        PeerReport, StallReport, StreamReport, TreeLine, TreeReport, WaitReport,
+        AppReport, AppsReport, BarrierReport, DialReport, GuardReport, LinkReport, LostReport, Missing,
+        NodeReport, PeerReport, StallReport, StreamReport, TreeLine, TreeReport, WaitReport,
     },
     message::Class,
 };
@@ -57,6 +57,8 @@ pub(crate) fn node_report(node: NodeAddress, name: &str) -> NodeReport {
         unhandled: Vec::new(),
         unguarded: Vec::new(),
         lost_echoes: Vec::new(),
+        guards: Vec::new(),
+        guards_left_out: 0,
         refusals_left_out: 0,
         peers: Vec::new(),
         own_stalls: None,
@@ -89,6 +91,7 @@ pub(crate) fn snapshot() -> Snapshot {
     hip.lost = vec![lost(node(3), "ankle", "gave up: the address is in use")];
     hip.own_stalls = Some(StallReport { count: 2, longest_us: 300_000, last_us: Some(1) });
     hip.peers = vec![peer()];
+    hip.guards = [None, Some("Silent")].map(guard).to_vec();
     let knee = node_report(node(2), "knee");
     let answers = |node: NodeReport| {
         let (apps, tree) = (apps(&node), tree(&node));
@@ -104,6 +107,13 @@ pub(crate) fn snapshot() -> Snapshot {
         left_out: 0,
         own: BTreeSet::from([Tid::new(node(1), AppAddress::new(0x2000))]),
     }
+}
+
+/// Returns an output of the drive of the hip.
+fn guard(safe: Option<&str>) -> GuardReport {
+    let receiver = Tid::new(node(1), AppAddress::new(0x1000));
+    let (sender, kind_name) = (Tid::new(node(2), AppAddress::new(0x1000)), "leg.torque".to_owned());
+    GuardReport { receiver, sender, kind_name, safe: safe.map(str::to_owned), is_safe_failed: false }
 }
 
 /// Returns the knee, as the hip reports it.
@@ -277,6 +287,9 @@ fn samples_have_base_units_and_the_names_of_nodes() {
         ("sinew_barrier_wait_seconds{node=\"hip\",app=\"gait\"}", 31.0),
         ("sinew_barrier_wait_seconds{node=\"hip\",app=\"drive\"}", 7.0),
         ("sinew_barrier_blocked_seconds{node=\"hip\",app=\"toe\"}", 31.0),
+        ("sinew_guard_safe{node=\"hip\",app=\"drive\"}", 1.0),
+        ("sinew_guard_safe_cause{node=\"hip\",app=\"drive\",why=\"Silent\"}", 1.0),
+        ("sinew_guard_safe_failed{node=\"hip\",app=\"drive\"}", 0.0),
         ("sinew_refused_total{node=\"hip\",why=\"not taken: NoSuchApplication\"}", 6.0),
     ] {
         let is = value(&text, sample);
