@@ -348,7 +348,7 @@ where
 }
 
 /// Releases the address and waits for that, so that the next command does not see it.
-pub(crate) fn leave(endpoint: Endpoint) {
+fn leave(endpoint: Endpoint) {
     // It is released in any case when the connection ends.
     let _ = endpoint.unregister();
 }

@@ -1,7 +1,8 @@
 //! `sinew view`: serves the state of all nodes as metrics.
 //!
 //! Each snapshot has endpoints of its own: one that stayed would leave unread each broadcast between two snapshots, and
-//! its node would report a client that does not read.
+//! its node would report a client that does not read. They are dropped without a wait for the node, which may have died
+//! meanwhile.
 
 use std::{collections::BTreeSet, net::SocketAddr, time::Duration};
 
@@ -17,7 +18,7 @@ use crate::{
     Report,
     arguments::Arguments,
     output, sockets,
-    system::{REQUESTERS_MAX, SystemError, ask, leave, present, register},
+    system::{REQUESTERS_MAX, SystemError, ask, present, register},
     table::clean,
 };
 
@@ -88,13 +89,7 @@ impl Nodes {
     fn ask_all(&self, questions: Questions, taken: Time) -> Result<Snapshot, String> {
         let mut first = register(&self.api, questions.left()?).map_err(|why| why.to_string())?;
         let entry = first.tid().node;
-        let here = match questions.ask::<AskNode, NodeReport>(&mut first, entry) {
-            Ok(here) => here,
-            Err(why) => {
-                leave(first);
-                return Err(why);
-            }
-        };
+        let here = questions.ask::<AskNode, NodeReport>(&mut first, entry)?;
         let mut nodes = present(&here);
         let left_out = nodes.len().saturating_sub(NODES_MAX) as u64;
         nodes.truncate(NODES_MAX);
@@ -132,7 +127,6 @@ impl Nodes {
             let joined = parts.into_iter().map(|part| part.join().expect("a requester does not panic"));
             joined.flatten().collect::<Vec<_>>()
         });
-        endpoints.into_iter().for_each(leave);
         answers.sort_by_key(|answer| answer.node);
         (own, answers)
     }
