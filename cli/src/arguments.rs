@@ -4,7 +4,7 @@ use std::{path::PathBuf, time::Duration};
 
 use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
-use crate::{bag, keys, param, play, record, send, watch, why};
+use crate::{bag, keys, param, play, record, send, view, watch, why};
 
 /// Shows a running Sinew system, from any one node of it. It changes nothing, except that `send` and `play` send
 /// messages, `param` sets parameters, and `keys`, `record` and `bag` write files.
@@ -121,6 +121,16 @@ pub(crate) enum Command {
   sinew play --check walk.mcap -- target/release/knee knee.toml
   sinew play --check walk.mcap --app knee.drive --ignore t_ns --start-before 1ms -- target/release/knee knee.toml"#)]
     Play(play::Order),
+    /// Serves the state of all nodes as metrics for Prometheus, until Ctrl-C
+    ///
+    /// GET /metrics has the metrics, GET / a list of the nodes. All nodes are asked at most once a second, and only
+    /// while requests come. A node that does not answer is a metric. Requests for other hosts than localhost and the
+    /// address of --listen are refused. Dashboard and alert rules: view/grafana.json and view/alerts.yml of the source.
+    #[command(after_help = r#"Examples:
+  sinew view
+  curl http://127.0.0.1:9464/metrics
+  sinew view --listen 192.168.0.10:9464       for a Prometheus server on another machine; there is no encryption"#)]
+    View(view::Order),
     /// Finds out why two nodes or applications cannot communicate: each step, from both ends, with a suggested fix
     ///
     /// All nodes are asked that can be reached through any socket of this host, so that two nodes that do not
@@ -283,6 +293,7 @@ Examples:
   sinew play walk.mcap --rate 0.5
   sinew why hip knee.drive
   sinew param set knee.drive.assistance=0.5
+  sinew view
   sinew reload
   sinew apps --json | jq '.apps[] | select(.ready | not)'
   sinew --socket /run/sinew/knee.sock barriers

@@ -4,7 +4,8 @@
 //! through ordinary messages. It changes nothing, except that `send` sends messages and `reload` makes a node read its
 //! access list again, and `param` sets parameters of applications. `record` has the node record its messages, and writes them to a file. `play` sends them
 //! again, by a node of its own unless told otherwise. `keys` asks no node: it creates the files by which nodes
-//! authenticate each other. `bag` reads the files of recordings.
+//! authenticate each other. `bag` reads the files of recordings. `view` keeps asking all nodes, for programs that
+//! read their metrics.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)] // `output` prints: the macros panic where a pipe is closed or a disk is full.
 
@@ -30,6 +31,7 @@ mod system;
 mod table;
 mod tree;
 mod unknown;
+mod view;
 mod watch;
 mod why;
 
@@ -129,6 +131,7 @@ fn run(arguments: &Arguments) -> Result<Report, SystemError> {
         }
         Command::Play(order) => play::show(order, arguments),
         Command::Record(order) => inside(&|system| record::show(system, order)),
+        Command::View(order) => view::show(order, arguments),
         Command::Why(order) => inside(&|system| why::show(system, order, arguments.wide)),
         Command::Schema { name } => inside(&|system| schema::show(system, name)),
         Command::Barriers => inside(&|system| apps::barriers(system, arguments.wide)),

@@ -21,7 +21,7 @@ use crate::{
 };
 
 /// Maximum number of endpoints that ask at the same time: a node that does not answer delays only a part of the others.
-const REQUESTERS_MAX: usize = 8;
+pub(crate) const REQUESTERS_MAX: usize = 8;
 /// Time limit to ask the further nodes of this host for their projects. One answers within a few milliseconds.
 const PROJECTS_WITHIN: Duration = Duration::from_millis(300);
 /// Time limit for the registration.
@@ -53,6 +53,9 @@ pub(crate) enum SystemError {
     /// A recording cannot be read or written.
     #[error("{0}")]
     Bag(String),
+    /// The metrics cannot be served.
+    #[error("{0}")]
+    View(String),
     /// The command line is invalid.
     #[error("{0}")]
     Usage(String),
@@ -70,7 +73,9 @@ impl SystemError {
     /// Returns the exit code: see [`Arguments`](crate::arguments::Arguments).
     pub(crate) const fn code(&self) -> u8 {
         match self {
-            Self::ItsNode(..) | Self::Unknown(_) | Self::Keys(_) | Self::Bag(_) => EXIT_FINDING,
+            Self::ItsNode(..) | Self::Unknown(_) | Self::Keys(_) | Self::Bag(_) | Self::View(_) => {
+                EXIT_FINDING
+            }
             Self::Usage(_) => EXIT_USAGE,
             Self::NoSocket(_) | Self::NotRegistered(..) | Self::NoAnswer(..) => EXIT_NO_NODE,
         }
@@ -316,7 +321,7 @@ pub(crate) fn chosen(here: &NodeReport, wanted: Option<&str>) -> Option<Vec<(Nod
     (!nodes.is_empty()).then_some(nodes)
 }
 
-fn register(api: &NodeApi, within: Duration) -> Result<Endpoint, ApiError> {
+pub(crate) fn register(api: &NodeApi, within: Duration) -> Result<Endpoint, ApiError> {
     api.register_transport_address(Registration::new().deadline(within))
 }
 
@@ -348,7 +353,8 @@ fn leave(endpoint: Endpoint) {
     let _ = endpoint.unregister();
 }
 
-fn ask<Q, R>(endpoint: &mut Endpoint, node: NodeAddress, within: Duration) -> Result<R, String>
+/// Asks a node's inspection.
+pub(crate) fn ask<Q, R>(endpoint: &mut Endpoint, node: NodeAddress, within: Duration) -> Result<R, String>
 where
     Q: Payload + Default,
     R: Payload,

@@ -204,7 +204,7 @@ impl<O: Send + 'static> Guard<O> {
             shared.set_deadline(deadline);
         } else {
             let output: Arc<dyn WatchedOutput> = shared.clone();
-            safe_output::started()?.watch(shared.watch.clone(), Arc::downgrade(&output));
+            safe_output::started()?.watch(data_id, shared.watch.clone(), Arc::downgrade(&output));
         }
         Ok(Self { owners: Arc::new(Owners(shared)) })
     }
@@ -438,7 +438,7 @@ impl<O> Shared<O> {
             decide(receiver, now)
         });
         self.set_deadline(inner.deadline());
-        self.watch.needs_retry.store(inner.retry.is_some(), Ordering::Release);
+        self.watch.publish(inner.retry.is_some(), inner.receiver.state());
         if inner.retry.is_some() && !had_retry {
             // The thread sleeps until the previous deadline, if there was one.
             wake();

@@ -31,6 +31,7 @@
 //! | `receiver` | the checks of a message, and when the output must be safe |
 //! | `guard` | the output |
 //! | `safe_output` | the thread `safe-output`, which makes outputs safe |
+//! | `overview` | the states of all outputs, for reports |
 //! | `log_queue` | the log entries of that thread |
 //! | `ends` | both ends for an endpoint of NodeAPI |
 //! | `raw` | the same for types that are known at run time only |
@@ -42,6 +43,7 @@ mod envelope;
 pub mod fuzzing;
 mod guard;
 mod log_queue;
+mod overview;
 #[doc(hidden)]
 pub mod raw;
 mod receiver;
@@ -54,6 +56,8 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+#[doc(hidden)] // For the reports of a node.
+pub use self::overview::{OutputState, outputs};
 pub use self::{
     ends::{Came, Ends, SealError},
     envelope::{DataId, OVERHEAD, Stamp, Unsealed, open, seal, unsealed},

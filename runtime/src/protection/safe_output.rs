@@ -15,8 +15,9 @@ use std::{
 };
 
 use super::{
-    SAFE_OUTPUT_PRIORITY,
+    DataId, SAFE_OUTPUT_PRIORITY, State,
     log_queue::{self, LogEntry, PendingLog},
+    overview::{self, PublishedState},
 };
 use crate::{
     supervision::{realtime_priority, set_highest_priority},
@@ -46,6 +47,8 @@ pub(super) struct WatchState {
     pub(super) is_orphan: AtomicBool,
     /// The output must be made safe, and the last attempt failed.
     pub(super) needs_retry: AtomicBool,
+    /// The state of the output, for reports.
+    pub(super) published: PublishedState,
 }
 
 impl WatchState {
@@ -56,7 +59,14 @@ impl WatchState {
             is_releasing: AtomicBool::new(false),
             is_orphan: AtomicBool::new(false),
             needs_retry: AtomicBool::new(needs_retry),
+            published: PublishedState::not_armed(),
         }
+    }
+
+    /// Publishes the result of a decision: whether the output must be made safe again, and its state.
+    pub(super) fn publish(&self, needs_retry: bool, state: State) {
+        self.needs_retry.store(needs_retry, Ordering::Release);
+        self.published.set(state);
     }
 }
 
@@ -176,7 +186,8 @@ pub(super) fn retry_orphan(output: Arc<dyn WatchedOutput>) {
 }
 
 impl SafeOutputThread {
-    pub(super) fn watch(&self, watch: Arc<WatchState>, output: Weak<dyn WatchedOutput>) {
+    pub(super) fn watch(&self, data_id: DataId, watch: Arc<WatchState>, output: Weak<dyn WatchedOutput>) {
+        overview::add(data_id, &watch);
         self.push_arrival(Arrival::Watched(WatchEntry { watch, output }));
     }
 

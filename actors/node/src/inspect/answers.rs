@@ -18,6 +18,7 @@ use sinew_ndl::{IdleApp, TroubledApp};
 use sinew_runtime::{
     lock,
     outcome::Rejection,
+    protection::{OutputState, State, outputs},
     router::tap::Way,
     supervision::Strategy,
     tid::{NodeAddress, Tid},
@@ -29,9 +30,9 @@ use sinew_sync::OwnApp;
 
 use self::discovery::Discovery;
 use super::reports::{
-    APPS_MAX, AppReport, AppsReport, AuditReport, BarrierReport, CertificateReport, IdleReport, KindReport,
-    LISTED_MAX, MISSING_MAX, Missing, NodeReport, PEERS_MAX, SecurityReport, SeenMessage, TREE_MAX, TreeLine,
-    TreeReport, TroubleReport, WaitReport, WatchReport,
+    APPS_MAX, AppReport, AppsReport, AuditReport, BarrierReport, CertificateReport, GuardReport, IdleReport,
+    KindReport, LISTED_MAX, MISSING_MAX, Missing, NodeReport, PEERS_MAX, SecurityReport, SeenMessage,
+    TREE_MAX, TreeLine, TreeReport, TroubleReport, WaitReport, WatchReport,
 };
 use super::{
     reach, refused,
@@ -76,6 +77,7 @@ impl Answers {
         }
         let (ndl, groups) = (Discovery::of(state, now), state.ctx.config.ndl.asked_groups());
         let (refusals, refusals_left_out) = refused::refusals(state, now);
+        let (guards, guards_left_out) = guards(state.ctx.node);
         Ok(NodeReport {
             node: state.ctx.node,
             name: state.ctx.config.name.clone(),
@@ -110,6 +112,8 @@ impl Answers {
             unguarded: refused::unguarded(state, now),
             lost_echoes: refused::lost_echoes(state, now),
             real_time: state.real_time.report(),
+            guards,
+            guards_left_out,
             peers,
             left_out,
         })
@@ -244,6 +248,25 @@ fn seen_message(now: Time, message: Observed, name: Option<String>) -> SeenMessa
         payload,
         refused,
     }
+}
+
+/// Returns the outputs that applications of this node guard in this process, and the number of further ones. Other
+/// nodes may live in the same process.
+fn guards(node: NodeAddress) -> (Vec<GuardReport>, u64) {
+    let mut outputs = outputs();
+    outputs.retain(|output| output.data_id.destination.node == node);
+    let left_out = outputs.len().saturating_sub(LISTED_MAX) as u64;
+    let report = |OutputState { data_id, state, is_safe_failed }| GuardReport {
+        receiver: data_id.destination,
+        sender: data_id.source,
+        kind_name: data_id.name.to_owned(),
+        safe: match state {
+            State::Live => None,
+            State::Safe(cause) => Some(format!("{cause:?}")),
+        },
+        is_safe_failed,
+    };
+    (outputs.into_iter().take(LISTED_MAX).map(report).collect(), left_out)
 }
 
 fn app_report(node: NodeAddress, app: OwnApp, name_of: impl Fn(Kind) -> Option<String>) -> AppReport {

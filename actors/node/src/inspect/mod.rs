@@ -41,7 +41,7 @@ pub use reports::{
     AskFrozen, AskGroups, AskMismatches, AskNode, AskReach, AskRecord, AskReload, AskSchemas, AskTree,
     AskWatch, AuditReport, BarrierReport, CertificateReport, DialReport, FROZEN_BUSY, FROZEN_BYTES_MAX,
     FROZEN_SPANS_MAX, ForeignReport, FreezeReport, FrozenFacts, FrozenPart, FrozenReport, FrozenSpan,
-    GroupReport, IdleReport, KindReport, LinkReport, LostEchoReport, LostReport, MismatchReport,
+    GroupReport, GuardReport, IdleReport, KindReport, LinkReport, LostEchoReport, LostReport, MismatchReport,
     MismatchesReport, Missing, NodeReport, PEERS_MAX, PeerReport, Ping, REACHED_MAX, RECORDED_MAX,
     ReachReport, Reached, RealTimeReport, RecordReport, RecordedApp, RecordedType, RefusalReport,
     ReloadReport, RouteReport, SCHEMAS_MAX, SEEN_BYTES_MAX, SEEN_MAX, SchemaReport, SchemasReport,

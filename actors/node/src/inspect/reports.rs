@@ -4,6 +4,7 @@ mod access;
 mod apps;
 mod audit;
 mod frozen;
+mod guards;
 mod node;
 mod peers;
 mod reach;
@@ -18,6 +19,7 @@ mod watch;
 pub use access::{AccessReport, AccessVerdict, AskAccess, AskReload, ReloadReport};
 pub use apps::{APPS_MAX, AppReport, AppsReport, AskApps, BarrierReport, KindReport, Missing, WaitReport};
 pub use audit::{AskAudit, AuditReport};
+pub use guards::GuardReport;
 pub use node::{AskNode, NodeReport, PEERS_MAX};
 pub use peers::{
     DialReport, ForeignReport, IdleReport, LinkReport, LostReport, PeerReport, RouteReport, SourceReport,

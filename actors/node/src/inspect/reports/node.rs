@@ -8,9 +8,9 @@ use sinew_runtime::{
 };
 
 use super::{
-    ForeignReport, IdleReport, LISTED_MAX, LostEchoReport, LostReport, PeerReport, RealTimeReport,
-    RefusalReport, Report, SecurityReport, Shortened, SourceReport, StallReport, TroubleReport,
-    UnguardedReport, UnhandledReport,
+    ForeignReport, GuardReport, IdleReport, LISTED_MAX, LostEchoReport, LostReport, PeerReport,
+    RealTimeReport, RefusalReport, Report, SecurityReport, Shortened, SourceReport, StallReport,
+    TroubleReport, UnguardedReport, UnhandledReport,
 };
 
 /// Maximum number of nodes in one answer.
@@ -144,6 +144,16 @@ pub struct NodeReport {
     /// version.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub real_time: Option<RealTimeReport>,
+    /// The outputs that applications in the node's process guard, in the order of their creation.
+    #[serde(
+        default,
+        skip_serializing_if = "Vec::is_empty",
+        deserialize_with = "at_most::<_, _, LISTED_MAX>"
+    )]
+    pub guards: Vec<GuardReport>,
+    /// Number of further ones that did not fit.
+    #[serde(default)]
+    pub guards_left_out: u64,
     /// The known nodes, in the order of their addresses.
     #[serde(deserialize_with = "at_most::<_, _, PEERS_MAX>")]
     pub peers: Vec<PeerReport>,
@@ -161,7 +171,7 @@ impl Report for NodeReport {
         // `troubled` and `idle_clients` already count the entries of these two lists.
         let [mut troubles_left_out, mut idle_left_out, mut unhandled_left_out] = [0_u64; 3];
         let [mut unguarded_left_out, mut echoes_left_out] = [0_u64; 2];
-        let mut lists: [&mut dyn Shortened; 9] = [
+        let mut lists: [&mut dyn Shortened; 10] = [
             &mut (&mut self.peers, &mut self.left_out),
             &mut (&mut self.lost, &mut self.lost_left_out),
             &mut (&mut self.foreign, &mut self.foreign_left_out),
@@ -169,6 +179,7 @@ impl Report for NodeReport {
             &mut (&mut self.unhandled, &mut unhandled_left_out),
             &mut (&mut self.unguarded, &mut unguarded_left_out),
             &mut (&mut self.lost_echoes, &mut echoes_left_out),
+            &mut (&mut self.guards, &mut self.guards_left_out),
             &mut (&mut self.troubles, &mut troubles_left_out),
             &mut (&mut self.idle, &mut idle_left_out),
         ];

@@ -232,6 +232,8 @@ fn with_long_lists(shown: NodeReport) -> NodeReport {
         unhandled: Vec::new(),
         unguarded: Vec::new(),
         lost_echoes: Vec::new(),
+        guards: Vec::new(),
+        guards_left_out: 0,
         peers: (0..4).map(|number| PeerReport::lost(NodeAddress::new(number), incarnation)).collect(),
         troubled: 7,
         troubles: vec![trouble; 4],

@@ -1,0 +1,147 @@
+//! The states of the outputs of this process, for reports of a node.
+//!
+//! A report never takes the lock of an output. A thread of low priority that held it could keep the thread
+//! `safe-output` from making the output safe. So each output publishes its state as a number.
+
+use std::sync::{
+    Arc, Mutex, Weak,
+    atomic::{AtomicU8, Ordering},
+};
+
+use super::{Cause, DataId, State, safe_output::WatchState};
+use crate::lock;
+
+/// Maximum number of outputs in the list. Further ones work, and are in no report.
+const OUTPUTS_MAX: usize = 1_024;
+/// All causes. A published state is the place of its cause here, or their number.
+const CAUSES: [Cause; 8] = [
+    Cause::NotArmed,
+    Cause::Silent,
+    Cause::TooMuchLost,
+    Cause::TooManyBad,
+    Cause::Restarted,
+    Cause::Slept,
+    Cause::Tripped,
+    Cause::Dropped,
+];
+
+/// All outputs that are not dropped yet.
+static OUTPUTS: Mutex<Vec<(DataId, Weak<WatchState>)>> = Mutex::new(Vec::new());
+
+/// The state of an output, readable without its lock.
+pub(super) struct PublishedState(AtomicU8);
+
+impl PublishedState {
+    /// Returns the state of a new output.
+    pub(super) const fn not_armed() -> Self {
+        Self(AtomicU8::new(code(State::Safe(Cause::NotArmed))))
+    }
+
+    /// Publishes a state. Nothing is decided by it, so it orders nothing.
+    pub(super) fn set(&self, state: State) {
+        self.0.store(code(state), Ordering::Relaxed);
+    }
+
+    fn get(&self) -> State {
+        let code = self.0.load(Ordering::Relaxed);
+        CAUSES.get(usize::from(code)).map_or(State::Live, |cause| State::Safe(*cause))
+    }
+}
+
+const fn code(state: State) -> u8 {
+    match state {
+        State::Safe(Cause::NotArmed) => 0,
+        State::Safe(Cause::Silent) => 1,
+        State::Safe(Cause::TooMuchLost) => 2,
+        State::Safe(Cause::TooManyBad) => 3,
+        State::Safe(Cause::Restarted) => 4,
+        State::Safe(Cause::Slept) => 5,
+        State::Safe(Cause::Tripped) => 6,
+        State::Safe(Cause::Dropped) => 7,
+        State::Live => 8,
+    }
+}
+
+/// The state of an output at some moment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct OutputState {
+    /// The sender, the receiver and the type of its commands.
+    pub data_id: DataId,
+    /// Whether commands reach it, or why not.
+    pub state: State,
+    /// Whether its safe function has failed and is retried: it may still be live.
+    pub is_safe_failed: bool,
+}
+
+/// Adds an output. It leaves the list when it is dropped.
+pub(super) fn add(data_id: DataId, watch: &Arc<WatchState>) {
+    let mut outputs = lock(&OUTPUTS);
+    outputs.retain(|(_, watch)| watch.strong_count() > 0);
+    if outputs.len() < OUTPUTS_MAX {
+        outputs.push((data_id, Arc::downgrade(watch)));
+    }
+}
+
+/// Returns the states of this process's outputs on the host's clock, in the order of their creation. Outputs without an
+/// owner are left out once they are safe.
+#[must_use]
+pub fn outputs() -> Vec<OutputState> {
+    let outputs = lock(&OUTPUTS);
+    let living = outputs.iter().filter_map(|(data_id, watch)| Some((*data_id, watch.upgrade()?)));
+    let is_over = |watch: &WatchState| {
+        watch.is_orphan.load(Ordering::Acquire) && !watch.needs_retry.load(Ordering::Acquire)
+    };
+    let state = |(data_id, watch): (DataId, Arc<WatchState>)| OutputState {
+        data_id,
+        state: watch.published.get(),
+        is_safe_failed: watch.needs_retry.load(Ordering::Acquire),
+    };
+    living.filter(|(_, watch)| !is_over(watch)).map(state).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        protection::{Guard, Protection},
+        tid::{AppAddress, NodeAddress, Tid},
+        wire::Payload,
+    };
+
+    #[derive(serde::Serialize, serde::Deserialize)]
+    struct Torque;
+
+    impl Payload for Torque {
+        const NAME: &'static str = "test.overview.torque";
+        const PROTECTION: Option<Protection> =
+            Some(Protection::of_period(std::time::Duration::from_millis(20)));
+    }
+
+    fn states() -> Vec<OutputState> {
+        // Other tests of this process have outputs, too.
+        outputs().into_iter().filter(|output| output.data_id.name == Torque::NAME).collect()
+    }
+
+    #[test]
+    fn each_state_is_published_as_it_is() {
+        let published = PublishedState::not_armed();
+        assert_eq!(published.get(), State::Safe(Cause::NotArmed));
+        for state in CAUSES.map(State::Safe).into_iter().chain([State::Live]) {
+            published.set(state);
+            assert_eq!(published.get(), state);
+        }
+    }
+
+    #[test]
+    fn output_is_listed_until_its_guard_is_dropped() {
+        let tid = |app| Tid::new(NodeAddress::new(7), AppAddress::new(app));
+        let data_id = DataId::of::<Torque>(tid(1), tid(2));
+        let guard = Guard::new::<Torque>(tid(1), tid(2), (), |(), _| {}).expect("there is the thread");
+        let listed = |cause| vec![OutputState { data_id, state: State::Safe(cause), is_safe_failed: false }];
+        assert_eq!(states(), listed(Cause::NotArmed));
+        guard.trip();
+        assert_eq!(guard.state(), states()[0].state, "the list agrees with the guard");
+        drop(guard);
+        assert_eq!(states(), []);
+    }
+}
