@@ -5,8 +5,8 @@ use sinew::Time;
 use super::{
     samples::Samples,
     table::{
-        AGE, ENTRY_UP, LEFT_OUT, NODE_IDLE_CLIENTS, NODE_LOST, NODE_STALL_LONGEST, NODE_STALLS,
-        NODE_STOPPING, NODE_TROUBLED, NODE_UP, NODE_UPTIME, REFUSED, TOOK,
+        AGE, ENTRY_UP, LEFT_OUT, NODE_FIFO, NODE_IDLE_CLIENTS, NODE_LATENESS, NODE_LOST, NODE_STALL_LONGEST,
+        NODE_STALLS, NODE_STOPPING, NODE_TROUBLED, NODE_UP, NODE_UPTIME, REFUSED, TOOK,
     },
 };
 use crate::{
@@ -57,6 +57,18 @@ pub(super) fn add_node(samples: &mut Samples, answers: &Answers, label: &str) {
     if let Some(stalls) = node.own_stalls {
         samples.count(&NODE_STALLS, [label], stalls.count);
         samples.level(&NODE_STALL_LONGEST, [label], micros(stalls.longest_us));
+    }
+    if let Some(measured) = &node.real_time {
+        samples.level(&NODE_FIFO, [label], measured.granted.into());
+        let quantiles = [
+            ("0.5", measured.p50_ns),
+            ("0.99", measured.p99_ns),
+            ("0.999", measured.p999_ns),
+            ("1", measured.max_ns),
+        ];
+        for (quantile, nanos) in quantiles {
+            samples.level(&NODE_LATENESS, [label, quantile], nanos as f64 / 1e9);
+        }
     }
     samples.level(&LEFT_OUT, [label, "applications"], apps.left_out as f64);
     samples.level(&LEFT_OUT, [label, "barriers"], apps.barriers_left_out as f64);

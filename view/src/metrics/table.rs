@@ -88,6 +88,16 @@ pub(super) const NODE_STALL_LONGEST: Metric =
     seconds("node_stall_longest", NODE, "The longest of these times since the node started.");
 pub(super) const NODE_TROUBLED: Metric =
     gauge("node_troubled", NODE, "Layers and applications that are stalled, being restarted or given up.");
+pub(super) const NODE_FIFO: Metric = gauge(
+    "node_fifo_priority",
+    NODE,
+    "Priority of SCHED_FIFO that the node got when it measured after its start; 0 if it was refused.",
+);
+pub(super) const NODE_LATENESS: Metric = seconds(
+    "node_wake_lateness",
+    &["node", "quantile"],
+    "Time by which a thread woke late at 1 kHz after the start of the node.",
+);
 pub(super) const NODE_IDLE_CLIENTS: Metric =
     gauge("node_idle_clients", NODE, "Clients that do not read their queued messages.");
 pub(super) const REFUSED: Metric =
@@ -189,6 +199,8 @@ pub const METRICS: &[Metric] = &[
     NODE_UPTIME,
     NODE_STALLS,
     NODE_STALL_LONGEST,
+    NODE_FIFO,
+    NODE_LATENESS,
     NODE_TROUBLED,
     NODE_IDLE_CLIENTS,
     REFUSED,

@@ -11,7 +11,7 @@ use sinew::{
     audit::{Account, Entry, NodeAudit, Place},
     inspect::{
         AppReport, AppsReport, BarrierReport, DialReport, GuardReport, LinkReport, LostReport, Missing,
-        NodeReport, PeerReport, StallReport, StreamReport, TreeLine, TreeReport, WaitReport,
+        NodeReport, PeerReport, RealTimeReport, StallReport, StreamReport, TreeLine, TreeReport, WaitReport,
     },
     message::Class,
 };
@@ -57,6 +57,7 @@ pub(crate) fn node_report(node: NodeAddress, name: &str) -> NodeReport {
         unhandled: Vec::new(),
         unguarded: Vec::new(),
         lost_echoes: Vec::new(),
+        real_time: None,
         guards: Vec::new(),
         guards_left_out: 0,
         refusals_left_out: 0,
@@ -90,6 +91,7 @@ pub(crate) fn snapshot() -> Snapshot {
     let mut hip = node_report(node(1), "hip");
     hip.lost = vec![lost(node(3), "ankle", "gave up: the address is in use")];
     hip.own_stalls = Some(StallReport { count: 2, longest_us: 300_000, last_us: Some(1) });
+    hip.real_time = Some(real_time());
     hip.peers = vec![peer()];
     hip.guards = [None, Some("Silent")].map(guard).to_vec();
     let knee = node_report(node(2), "knee");
@@ -106,6 +108,23 @@ pub(crate) fn snapshot() -> Snapshot {
         nodes: vec![answers(hip), answers(knee)],
         left_out: 0,
         own: BTreeSet::from([Tid::new(node(1), AppAddress::new(0x2000))]),
+    }
+}
+
+/// Returns what the hip has measured after its start.
+fn real_time() -> RealTimeReport {
+    RealTimeReport {
+        wanted: 90,
+        granted: 60,
+        refusals: Vec::new(),
+        memory: "locked".to_owned(),
+        is_preempt_rt: false,
+        period_us: 1_000,
+        turns: 2_000,
+        p50_ns: 4_000,
+        p99_ns: 60_000,
+        p999_ns: 90_000,
+        max_ns: 210_000,
     }
 }
 
@@ -287,6 +306,8 @@ fn samples_have_base_units_and_the_names_of_nodes() {
         ("sinew_barrier_wait_seconds{node=\"hip\",app=\"gait\"}", 31.0),
         ("sinew_barrier_wait_seconds{node=\"hip\",app=\"drive\"}", 7.0),
         ("sinew_barrier_blocked_seconds{node=\"hip\",app=\"toe\"}", 31.0),
+        ("sinew_node_fifo_priority{node=\"hip\"}", 60.0),
+        ("sinew_node_wake_lateness_seconds{node=\"hip\",quantile=\"0.999\"}", 90e-6),
         ("sinew_guard_safe{node=\"hip\",app=\"drive\"}", 1.0),
         ("sinew_guard_safe_cause{node=\"hip\",app=\"drive\",why=\"Silent\"}", 1.0),
         ("sinew_guard_safe_failed{node=\"hip\",app=\"drive\"}", 0.0),
