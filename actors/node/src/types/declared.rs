@@ -13,7 +13,10 @@ use sinew_runtime::{
     wire::{Kind, PayloadType, SchemaHash},
 };
 
-use super::app_type::{AppType, DeclaredType, Structure};
+use super::{
+    app_type::{AppType, DeclaredType, Structure},
+    verdicts::Program,
+};
 
 /// Maximum number of types that one application handles, and of those that it sends; the directory has as many.
 /// Further ones are not compared.
@@ -168,9 +171,14 @@ impl Declared {
         lock(&self.0).apps.values().any(|types| types.declared_by.is_some())
     }
 
-    /// Returns whether the application is one in another process that has declared its types.
-    pub(super) fn is_declared(&self, app: AppAddress) -> bool {
-        lock(&self.0).apps.get(&app).is_some_and(|types| types.declared_by.is_some())
+    /// Returns the program of an application of this node.
+    pub(super) fn program(&self, app: AppAddress) -> Program {
+        let declared_by = lock(&self.0).apps.get(&app).and_then(|types| types.declared_by);
+        match declared_by {
+            None => Program::Node,
+            Some(User::Own) => Program::Other,
+            Some(User::Guest(_)) => Program::Guest,
+        }
     }
 
     /// Returns the type of this kind that the application handles. `None`: none, or several with different structures.
@@ -373,7 +381,9 @@ mod tests {
         assert_eq!(declared.declare(CLIENT, User::Own, declaration(Angle::KIND, angle_bytes())), Ok(()));
         let (app, types) = declared.pop_changed().expect("it has changed");
         assert_eq!((app, types.hashes().sends), (CLIENT, vec![(Angle::KIND, schema.hash())]));
-        assert!(declared.is_current(CLIENT, types.registration) && declared.is_declared(CLIENT));
+        assert!(
+            declared.is_current(CLIENT, types.registration) && declared.program(CLIENT) == Program::Other
+        );
         let found = declared.schema_of_hash(Angle::KIND, schema.hash()).expect("it was declared");
         assert_eq!((&*found, declared.schema_of(Speed::KIND).is_some()), (&schema, false));
         assert_eq!(declared.sent(CLIENT, Angle::KIND).map(|one| one.policy()), Some(MismatchPolicy::Warn));
