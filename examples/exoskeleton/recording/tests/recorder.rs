@@ -14,6 +14,10 @@ use sinew_bag::read::Ordered;
 
 const DEADLINE: Duration = Duration::from_secs(60);
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
+/// The sample at which a sensor has the messages frozen.
+const FAULT_AT: u32 = 50;
+/// A sample after the end of that span.
+const LATER: u32 = FAULT_AT + 2_000;
 /// A group without members: only the recorder sees its messages.
 const GROUP: &str = "test.samples";
 
@@ -39,9 +43,7 @@ impl Drop for TestFolder {
 #[derive(Default)]
 struct Sensor {
     seq: u32,
-    /// The sample at which it has the messages frozen; 0: none.
-    fault_at: u32,
-    /// Notified then.
+    /// Notified after the sample of its fault, and after one behind the span around it; `None`: it has no fault.
     noticed: Option<SyncSender<()>>,
 }
 
@@ -62,10 +64,12 @@ impl Actor for Sensor {
                 flags: 0,
             };
             let _ = context.send(Tid::group(GROUP), &sample);
-            if sensor.seq == sensor.fault_at {
+            let Some(noticed) = &sensor.noticed else { return };
+            if sensor.seq == FAULT_AT {
                 context.freeze_recording("the foot slips");
-                let noticed = sensor.noticed.as_ref().expect("the test waits for it");
-                noticed.try_send(()).expect("the test reads one");
+            }
+            if [FAULT_AT, LATER].contains(&sensor.seq) {
+                noticed.try_send(()).expect("there is room for both");
             }
         });
     }
@@ -121,21 +125,31 @@ fn span_around_a_fault_becomes_a_file() {
     for folder in [&journal, &frozen] {
         DirBuilder::new().recursive(true).mode(0o700).create(folder).unwrap();
     }
-    // given: a node with a flight recorder, and a fault at its 50th sample
+    // given: a node with a flight recorder, and a fault at one of its samples
     let (memory, disk) = (journal.clone(), frozen.clone());
-    let (noticed, fault) = sync_channel(1);
-    let sensor = move || Sensor { fault_at: 50, noticed: Some(noticed.clone()), ..Sensor::default() };
+    let (noticed, samples) = sync_channel(2);
+    let sensor = move || Sensor { noticed: Some(noticed.clone()), ..Sensor::default() };
     let node = Node::builder("knee")
         .address([127, 0, 0, 2])
         .configure(|config| {
             (config.ndl.multicast, config.ndl.mdns_port) = (None, None);
             (config.record.folder, config.record.frozen_folder) = (Some(memory), Some(disk));
-            config.record.keep_bytes = 1 << 20;
+            config.record.keep_bytes = 4 << 20;
+            config.record.after = Duration::from_secs(1);
         })
         .app(AppSpec::new("knee.sensor", sensor))
         .start()
         .unwrap();
-    fault.recv_timeout(DEADLINE).expect("the sensor runs");
+    for _ in [FAULT_AT, LATER] {
+        samples.recv_timeout(DEADLINE).expect("the sensor runs");
+    }
+    // And: the journal of a node that was killed later than the span, which no living node has frozen
+    let killed = journals.join("killed");
+    std::fs::create_dir(&killed).unwrap();
+    let is_journal = |path: &PathBuf| path.extension().is_some_and(|ending| ending == "journal");
+    let own =
+        std::fs::read_dir(&journal).unwrap().map(|entry| entry.unwrap().path()).find(is_journal).unwrap();
+    std::fs::copy(&own, killed.join("sinew-killed.journal")).unwrap();
     node.stop();
 
     // when
@@ -143,15 +157,19 @@ fn span_around_a_fault_becomes_a_file() {
     let found = gather(&frozen, &journals);
 
     // then
-    assert!(found.faults.is_empty() && found.spans.len() == 1, "{found}");
-    let span = &found.spans[0];
-    assert!(span.cause.contains("the foot slips"), "{span:?}");
-    let [file] = span.files.as_slice() else { panic!("one node has frozen it: {span:?}") };
-    assert!(file.node == "knee" && !file.has_died && file.written >= 50, "{file:?}");
+    assert!(found.faults.is_empty() && found.spans.len() == 2, "{found:?}");
+    let of_cause = |cause: &str| found.spans.iter().find(|span| span.cause.contains(cause)).unwrap();
+    let span = of_cause("the foot slips");
+    let [file, of_killed] = span.files.as_slice() else { panic!("two journals have it: {span:?}") };
+    assert!(file.node == "knee" && !file.has_died && file.written >= u64::from(FAULT_AT), "{file:?}");
     assert!(file.begin_ns <= file.first_ns && file.last_ns <= file.end_ns, "{file:?}");
     let report = sinew_bag::check(&[&file.path]).unwrap();
     assert!(report.is_fine(), "{:?}", report.findings);
-    assert!(found.to_string().starts_with("frozen: 1 file, span "), "{found}");
+    assert!(of_killed.has_died && of_killed.last_ns <= span.end_ns, "{of_killed:?}");
+    // And: the last messages of the killed node are in a file of its whole journal
+    let [whole] = of_cause("has died").files.as_slice() else { panic!("{found:?}") };
+    assert!(whole.last_ns > span.end_ns && whole.written > of_killed.written, "{whole:?}");
+    assert!(found.to_string().contains("frozen: 1 file, span "), "{found}");
     // And: the file is in place of the copy
     assert_eq!(gather(&frozen, &journals), Frozen::default());
     assert!(file.path.exists());
