@@ -274,7 +274,7 @@ fn type_of_a_client_is_compared_within_its_node_until_the_client_ends() {
     bench.input(Input::AppChanged(AppFact::own_registered(GAIT, Some("gait".to_owned()), Vec::new())));
     bench.state.declare(GAIT, User::Own, declaration(renamed)).unwrap();
     bench.input(Input::AppChanged(AppFact::Types { app: GAIT, types: declared(renamed) }));
-    // Both structures are here: nothing is fetched, and no other node is told.
+    // Both structures are here: nothing is fetched, and no frame is sent to another node.
     assert_eq!(bench.steps(), []);
     let node = bench.state.ctx.node;
     let state = bench.state.clone();
