@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use sinew::NodeAddress;
 use sinew::inspect::{FrozenFacts, FrozenSpan};
 use sinew_recorder::{
-    Compression, FileOptions, FrozenRing, JournalReader, Owners, RecordingError, Start, read_facts,
+    Compression, FileOptions, FrozenRing, JournalReader, Owners, RecordingError, RingOrigin, Start,
 };
 
 /// Maximum number of files of a folder that are looked at.
@@ -187,20 +187,12 @@ fn ring(path: &Path) -> Option<Ring> {
     if !is_journal && ending != "frozen" {
         return None;
     }
-    let reader = JournalReader::open(path, Start::Newest).ok()?;
-    let identity = String::from_utf8(reader.identity().to_vec()).ok()?;
-    let mut lines = identity.lines();
-    let (node, address) = (lines.next()?.to_owned(), lines.next()?.parse().ok()?);
-    if is_journal && (reader.is_writer_alive() || reader.is_closed().ok()?) {
-        return None;
-    }
-    let mut facts = read_facts(&path.with_extension("facts"), Owners::ThisUser).unwrap_or_default();
-    facts.report.name.clone_from(&node);
+    let origin = RingOrigin::read(path, Owners::ThisUser)?;
+    let id = origin.id();
+    let RingOrigin { node, address, mut facts, .. } = origin;
     let span = match facts.span.take() {
         Some(span) => span,
         None if is_journal => {
-            let incarnation = facts.report.incarnation.map_or_else(|| reader.created(), |number| number.0);
-            let id = format!("died-{incarnation:x}");
             FrozenSpan { id, cause: format!("{node} has died"), has_died: true, ..FrozenSpan::default() }
         }
         // It was not finished.
