@@ -16,8 +16,8 @@ const DEADLINE: Duration = Duration::from_secs(60);
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
 /// The sample at which a sensor has the messages frozen.
 const FAULT_AT: u32 = 50;
-/// A sample after the end of that span.
-const LATER: u32 = FAULT_AT + 2_000;
+/// Time after the fault that is frozen, too.
+const AFTER: Duration = Duration::from_secs(1);
 /// A group without members: only the recorder sees its messages.
 const GROUP: &str = "test.samples";
 
@@ -43,7 +43,9 @@ impl Drop for TestFolder {
 #[derive(Default)]
 struct Sensor {
     seq: u32,
-    /// Notified after the sample of its fault, and after one behind the span around it; `None`: it has no fault.
+    /// The end of the span around its fault, or later.
+    span_end: Option<Time>,
+    /// Notified after a sample behind that span; `None`: it has no fault.
     noticed: Option<SyncSender<()>>,
 }
 
@@ -53,6 +55,7 @@ impl Actor for Sensor {
     fn started(&mut self, context: &mut Self::Context) {
         context.every(Duration::from_millis(1), |sensor, _, context| {
             sensor.seq += 1;
+            let is_behind = sensor.span_end.is_some_and(|end| Time::now() > end);
             let sample = JointSample {
                 seq: sensor.seq,
                 t_ns: context.now().as_nanos(),
@@ -67,9 +70,11 @@ impl Actor for Sensor {
             let Some(noticed) = &sensor.noticed else { return };
             if sensor.seq == FAULT_AT {
                 context.freeze_recording("the foot slips");
+                sensor.span_end = Some(Time::now() + AFTER);
             }
-            if [FAULT_AT, LATER].contains(&sensor.seq) {
-                noticed.try_send(()).expect("there is room for both");
+            if is_behind {
+                noticed.try_send(()).expect("there is room for one");
+                sensor.span_end = None;
             }
         });
     }
@@ -127,7 +132,7 @@ fn span_around_a_fault_becomes_a_file() {
     }
     // given: a node with a flight recorder, and a fault at one of its samples
     let (memory, disk) = (journal.clone(), frozen.clone());
-    let (noticed, samples) = sync_channel(2);
+    let (noticed, samples) = sync_channel(1);
     let sensor = move || Sensor { noticed: Some(noticed.clone()), ..Sensor::default() };
     let node = Node::builder("knee")
         .address([127, 0, 0, 2])
@@ -135,14 +140,12 @@ fn span_around_a_fault_becomes_a_file() {
             (config.ndl.multicast, config.ndl.mdns_port) = (None, None);
             (config.record.folder, config.record.frozen_folder) = (Some(memory), Some(disk));
             config.record.keep_bytes = 4 << 20;
-            config.record.after = Duration::from_secs(1);
+            config.record.after = AFTER;
         })
         .app(AppSpec::new("knee.sensor", sensor))
         .start()
         .unwrap();
-    for _ in [FAULT_AT, LATER] {
-        samples.recv_timeout(DEADLINE).expect("the sensor runs");
-    }
+    samples.recv_timeout(DEADLINE).expect("the sensor runs");
     // And: the journal of a node that was killed later than the span, which no living node has frozen
     let killed = journals.join("killed");
     std::fs::create_dir(&killed).unwrap();
