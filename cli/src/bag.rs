@@ -87,7 +87,8 @@ pub(crate) enum Format {
 
 impl From<BagError> for SystemError {
     fn from(error: BagError) -> Self {
-        Self::Bag(error.to_string())
+        // Some errors quote a file.
+        Self::Bag(clean(&error.to_string()))
     }
 }
 

@@ -6,7 +6,10 @@ use std::{
 };
 
 use sinew_bag::{BagWriter, Options, Origin, Totals};
-use sinew_record::{RecordReport, Selection};
+use sinew_record::{
+    FrozenFacts, RecordReport, Selection,
+    files::{Owners, read_facts},
+};
 use sinew_runtime::tid::NodeAddress;
 use sinew_shm::journal::{JournalReader, ReadJournalError, Start};
 
@@ -109,5 +112,66 @@ impl FrozenRing<'_> {
             return Err(why.into());
         }
         Ok(FrozenFile { totals, first_ns: span.first_ns, last_ns: span.last_ns })
+    }
+}
+
+/// The node that wrote a journal, and the facts beside it. Nothing writes the journal any more.
+///
+/// # Examples
+///
+/// ```no_run
+/// use std::path::Path;
+///
+/// use sinew_recorder::{Owners, RingOrigin};
+///
+/// let path = Path::new("/dev/shm/sinew-walker-10.0.0.2.journal");
+/// if let Some(origin) = RingOrigin::read(path, Owners::ThisUser) {
+///     println!("{} at {} was killed", origin.node, origin.address);
+/// }
+/// ```
+#[derive(Clone, Debug)]
+pub struct RingOrigin {
+    /// The name of the node.
+    pub node: String,
+    /// Its address.
+    pub address: NodeAddress,
+    /// Its project.
+    pub project: String,
+    /// The facts; without a file of them, the name of the node alone.
+    pub facts: FrozenFacts,
+    /// The number of the incarnation; without facts, the time of the journal's creation.
+    pub incarnation: u64,
+    /// The time of the journal's creation, in nanoseconds of the monotonic clock of the node's host.
+    pub created_ns: u64,
+    /// Wall clock minus monotonic clock, in nanoseconds.
+    pub wall_offset_ns: i64,
+}
+
+impl RingOrigin {
+    /// Reads the origin of a frozen span, or of the journal of a killed node, and the facts of these users beside it.
+    /// `None`: it is no journal, a node writes it, or its node has ended in order.
+    #[must_use]
+    pub fn read(path: &Path, owners: Owners) -> Option<Self> {
+        let reader = JournalReader::open(path, Start::Newest).ok()?;
+        let identity = String::from_utf8(reader.identity().to_vec()).ok()?;
+        let mut lines = identity.lines();
+        let (node, address) = (lines.next()?.to_owned(), lines.next()?.parse().ok()?);
+        let project = lines.next()?.to_owned();
+        // A kept ring may be a copy, which was closed.
+        let is_kept = path.extension().is_some_and(|ending| ending == "frozen");
+        if reader.is_writer_alive() || (!is_kept && reader.is_closed().ok()?) {
+            return None;
+        }
+        let mut facts = read_facts(&path.with_extension("facts"), owners).unwrap_or_default();
+        facts.report.name.clone_from(&node);
+        let incarnation = facts.report.incarnation.map_or_else(|| reader.created(), |number| number.0);
+        let (created_ns, wall_offset_ns) = (reader.created(), reader.wall_offset().ok()?);
+        Some(Self { node, address, project, facts, incarnation, created_ns, wall_offset_ns })
+    }
+
+    /// Returns the ID of the whole journal of a killed node. The node hands it out by this ID after its next start.
+    #[must_use]
+    pub fn id(&self) -> String {
+        format!("died-{:x}", self.incarnation)
     }
 }

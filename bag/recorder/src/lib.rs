@@ -30,7 +30,7 @@ mod span;
 mod tests;
 
 pub use error::RecordingError;
-pub use frozen::{FrozenFile, FrozenRing};
+pub use frozen::{FrozenFile, FrozenRing, RingOrigin};
 pub use names::Names;
 pub use order::WINDOW;
 pub use recorder::Recorder;

@@ -159,9 +159,9 @@ pub(super) fn read<R: Read>(mut reader: Reader<R>, offsets: &mut Offsets) -> Res
 /// Returns why a merged file is refused: a merged file has the order of its times, and a tally is true only in the order
 /// in which its file was written.
 fn merged(file: &str, former: Option<&String>) -> BagError {
-    let former = former.map_or("FILE...", String::as_str);
+    let former = former.map_or_else(String::new, |former| format!(": {former}"));
     BagError::Unfit(format!(
-        "{file}: it is a merged file: its messages are sorted by time, so its tallies do not prove that none is missing; check the files before the merge: sinew bag check {former}"
+        "{file}: it is a merged file: its messages are sorted by time, so its tallies do not prove that none is missing; check the files that it was made of{former}"
     ))
 }
 

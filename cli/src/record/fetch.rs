@@ -84,7 +84,7 @@ pub(super) fn show(system: &mut System, order: &Order) -> Result<Report, SystemE
         None => found.frozen.iter().map(|frozen| frozen.span.id.clone()).collect(),
     };
     let is_handed_out = found.frozen.iter().any(|frozen| ids.contains(&frozen.span.id));
-    if !is_handed_out && !found.dead.iter().any(|ring| ids.contains(&ring.id())) {
+    if !is_handed_out && !found.dead.iter().any(|ring| ids.contains(&ring.id)) {
         let id = order.id.as_deref().unwrap_or("at all");
         let why = format!("no node has a frozen span {id}; `sinew record fetch` lists them");
         return Err(SystemError::Unknown(clean(&why)));
@@ -145,7 +145,7 @@ fn gather(
     }
     let is_handed_out = found.frozen.iter().any(|frozen| frozen.span.id == id);
     for ring in &found.dead {
-        let part = match part_of(id, &ring.id(), is_handed_out) {
+        let part = match part_of(id, &ring.id, is_handed_out) {
             Part::None => continue,
             Part::Whole => Some(0..=u64::MAX),
             Part::Span => times.clone().filter(|_| ring.is_of_this_boot),
@@ -266,7 +266,7 @@ fn of_dead(
     let facts = ring.facts.clone();
     let source = Source { ring: &ring.path, facts, times: times.clone(), address: ring.address };
     // The node may have started again, and have the same span.
-    let id = if id == ring.id() { id.to_owned() } else { format!("{id}-{}", ring.id()) };
+    let id = if id == ring.id { id.to_owned() } else { format!("{id}-{}", ring.id) };
     let (file, is_new) = path_of(files, out, (&ring.name, ring.address), &id);
     convert(&source, None, file, is_forced && is_new).map(|file| Some(Converted { has_died: true, ..file }))
 }
@@ -388,7 +388,7 @@ fn listed(found: &Found) -> Report {
             clean(&ring.name),
             ring.address,
             ring.path.display(),
-            ring.id()
+            ring.id
         );
     }
     text += &notes(found);

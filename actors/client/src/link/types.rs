@@ -141,7 +141,12 @@ impl Writer {
         match self {
             Self::Socket(writer) => {
                 match writer.begin(Message::new(message.header, message.payload.clone()))? {
-                    Progress::Whole | Progress::Part(_) => Ok(true),
+                    Progress::Whole => Ok(true),
+                    Progress::Part(_) => {
+                        // The task of the endpoint writes the rest. It may be asleep.
+                        writer.pending_notify.notify_one();
+                        Ok(true)
+                    }
                     Progress::Full(_) => Ok(false),
                 }
             }

@@ -13,7 +13,10 @@ use sinew_runtime::{
     wire::{Kind, PayloadType, SchemaHash},
 };
 
-use super::app_type::{AppType, DeclaredType, Structure};
+use super::{
+    app_type::{AppType, DeclaredType, Structure},
+    verdicts::Program,
+};
 
 /// Maximum number of types that one application handles, and of those that it sends; the directory has as many.
 /// Further ones are not compared.
@@ -168,9 +171,14 @@ impl Declared {
         lock(&self.0).apps.values().any(|types| types.declared_by.is_some())
     }
 
-    /// Returns whether the application is one in another process that has declared its types.
-    pub(super) fn is_declared(&self, app: AppAddress) -> bool {
-        lock(&self.0).apps.get(&app).is_some_and(|types| types.declared_by.is_some())
+    /// Returns the program of an application of this node.
+    pub(super) fn program(&self, app: AppAddress) -> Program {
+        let declared_by = lock(&self.0).apps.get(&app).and_then(|types| types.declared_by);
+        match declared_by {
+            None => Program::Node,
+            Some(User::Own) => Program::Other,
+            Some(User::Guest(_)) => Program::Guest,
+        }
     }
 
     /// Returns the type of this kind that the application handles. `None`: none, or several with different structures.
@@ -186,29 +194,26 @@ impl Declared {
         is_one(&of).then(|| of.first().cloned())?
     }
 
-    /// Returns the structure with this hash that a process has declared for a type.
+    /// Returns the structure with this hash that a process has declared for a type. Those of guests are last: a structure
+    /// with the hash of another one can be constructed.
     pub(super) fn schema_of_hash(&self, kind: Kind, hash: SchemaHash) -> Option<Structure> {
-        let mut structures = self.declared_of(kind).into_iter().filter_map(|one| one.schema());
+        let [own, guests] = [false, true].map(|of_guests| self.declared_of(kind, of_guests));
+        let mut structures = own.into_iter().chain(guests).filter_map(|one| one.schema());
         structures.find(|(_, other)| *other == hash).map(|(structure, _)| structure)
     }
 
-    /// Returns a structure that a process has declared for a type.
+    /// Returns a structure that a process of the node's own user has declared for a type. That of a guest is none: it
+    /// would be taken for messages of other applications, too.
     pub(super) fn schema_of(&self, kind: Kind) -> Option<Structure> {
-        self.declared_of(kind).into_iter().find_map(|one| one.schema()).map(|(structure, _)| structure)
+        self.declared_of(kind, false).into_iter().find_map(|one| one.schema()).map(|(structure, _)| structure)
     }
 
-    /// Returns the declarations of a type by other processes. Those of guests are last: a structure with the hash of
-    /// another one can be constructed.
-    fn declared_of(&self, kind: Kind) -> Vec<AppType> {
+    /// Returns the declarations of a type by other processes: of guests, or of the node's own user.
+    fn declared_of(&self, kind: Kind, of_guests: bool) -> Vec<AppType> {
+        let is_of = |user: User| matches!(user, User::Guest(_)) == of_guests;
         let table = lock(&self.0);
-        let of_user = |is_own: bool| {
-            let apps = table
-                .apps
-                .values()
-                .filter(move |types| types.declared_by.is_some_and(|user| (user == User::Own) == is_own));
-            apps.flat_map(|types| types.handles.iter().chain(&types.sends))
-        };
-        let all = of_user(true).chain(of_user(false));
+        let apps = table.apps.values().filter(|types| types.declared_by.is_some_and(is_of));
+        let all = apps.flat_map(|types| types.handles.iter().chain(&types.sends));
         all.filter(|one| one.kind() == kind).cloned().collect()
     }
 }
@@ -373,7 +378,9 @@ mod tests {
         assert_eq!(declared.declare(CLIENT, User::Own, declaration(Angle::KIND, angle_bytes())), Ok(()));
         let (app, types) = declared.pop_changed().expect("it has changed");
         assert_eq!((app, types.hashes().sends), (CLIENT, vec![(Angle::KIND, schema.hash())]));
-        assert!(declared.is_current(CLIENT, types.registration) && declared.is_declared(CLIENT));
+        assert!(
+            declared.is_current(CLIENT, types.registration) && declared.program(CLIENT) == Program::Other
+        );
         let found = declared.schema_of_hash(Angle::KIND, schema.hash()).expect("it was declared");
         assert_eq!((&*found, declared.schema_of(Speed::KIND).is_some()), (&schema, false));
         assert_eq!(declared.sent(CLIENT, Angle::KIND).map(|one| one.policy()), Some(MismatchPolicy::Warn));

@@ -101,7 +101,7 @@ impl Types {
     }
 
     /// Returns the canonical bytes of the structure that a type has in this process, or else in another process of this
-    /// node. The first call for a type takes up to some milliseconds.
+    /// node and its user. The first call for a type takes up to some milliseconds.
     pub(crate) fn schema_of(&self, kind: Kind) -> Option<Vec<u8>> {
         if let Some(Ok(own)) = kind.schema() {
             return Some(own.schema().encode());

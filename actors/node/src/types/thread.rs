@@ -34,7 +34,7 @@ use super::{
     FRAMES_MAX,
     frames::{Frame, MismatchReport, SchemaAnswer, SchemaQuestion},
     judgement::{Judgement, Treatment, sentence},
-    verdicts::{Disagreement, Handled, Program, Sent},
+    verdicts::{Disagreement, Handled, Sent},
 };
 use crate::NodeState;
 
@@ -281,7 +281,7 @@ fn own_types(state: &NodeState) -> (Vec<Handled>, Vec<Sent>) {
     let compares_senders = declared.has_declarations();
     let (mut handled, mut sent) = (Vec::new(), Vec::new());
     for AppTypes { tid, name, types } in all {
-        let program = if declared.is_declared(tid.app) { Program::Other } else { Program::Node };
+        let program = declared.program(tid.app);
         for (kind, hash) in types.handles {
             let own = declared.handled(tid.app, kind);
             // The directory learns later than this table that the address has another owner.

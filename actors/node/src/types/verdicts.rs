@@ -58,8 +58,10 @@ pub(super) struct Handled {
 pub(super) enum Program {
     /// That of the node: its types are not compared with each other.
     Node,
-    /// That of another process.
+    /// That of another process of the node's own user.
     Other,
+    /// That of a guest: its pairs get the room that others leave.
+    Guest,
 }
 
 /// A type that an application sends.
@@ -79,6 +81,11 @@ impl Sent {
     fn differs_from(&self, handled: &Handled) -> bool {
         let is_own = matches!(self.here, Some((_, Program::Node)));
         self.hash != handled.hash && !(is_own && handled.program == Program::Node)
+    }
+
+    /// Returns whether one end of the path to an application with this type is a guest of this node.
+    fn is_with_guest(&self, handled: &Handled) -> bool {
+        handled.program == Program::Guest || matches!(self.here, Some((_, Program::Guest)))
     }
 }
 
@@ -273,17 +280,21 @@ impl Verdicts {
         for handled in handled {
             by_kind.entry(handled.kind).or_default().push(handled);
         }
+        let sent: Vec<&Sent> = sent.into_iter().collect();
         let (mut pairs, mut room, mut left_out) = (BTreeMap::new(), Room::default(), 0);
-        for sent in sent {
-            let handled = by_kind.get(&sent.kind).into_iter().flatten();
-            for handled in handled.filter(|handled| sent.differs_from(handled)) {
-                let path = TypedPath { source: sent.tid, target: handled.app, kind: sent.kind };
-                let former = self.pairs.remove(&path).filter(|pair| pair.is_of(sent, handled));
-                let pair = former.unwrap_or_else(|| Pair::new(sent, handled));
-                if room.take(sent.tid.node, pair.is_same()) {
-                    pairs.insert(path, pair);
-                } else {
-                    left_out += 1;
+        for of_guests in [false, true] {
+            for sent in &sent {
+                let handled = by_kind.get(&sent.kind).into_iter().flatten();
+                let differing = handled.filter(|handled| sent.differs_from(handled));
+                for handled in differing.filter(|handled| sent.is_with_guest(handled) == of_guests) {
+                    let path = TypedPath { source: sent.tid, target: handled.app, kind: sent.kind };
+                    let former = self.pairs.remove(&path).filter(|pair| pair.is_of(sent, handled));
+                    let pair = former.unwrap_or_else(|| Pair::new(sent, handled));
+                    if room.take(sent.tid.node, pair.is_same()) {
+                        pairs.insert(path, pair);
+                    } else {
+                        left_out += 1;
+                    }
                 }
             }
         }

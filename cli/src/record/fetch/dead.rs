@@ -8,7 +8,7 @@ use std::{
 
 use rustix::time::{ClockId, clock_gettime};
 use sinew::{NodeAddress, inspect::FrozenFacts};
-use sinew_recorder::{JournalReader, Owners, Start, is_own, read_facts};
+use sinew_recorder::{Owners, RingOrigin, is_own};
 
 /// Maximum number of files of the folder that are looked at, and of rings that are returned.
 const FILES_MAX: usize = 65_536;
@@ -22,18 +22,13 @@ pub(super) struct DeadRing {
     pub(super) name: String,
     pub(super) address: NodeAddress,
     pub(super) facts: FrozenFacts,
-    /// The number of the incarnation, or the time of the ring's creation where that is unknown, as in the node.
-    incarnation: u64,
+    /// The ID of the whole ring. The node hands it out by this ID after its next start.
+    pub(super) id: String,
     /// Whether its times are of the clock that counts now.
     pub(super) is_of_this_boot: bool,
 }
 
 impl DeadRing {
-    /// Returns the ID of the whole ring. The node hands it out by this ID after its next start.
-    pub(super) fn id(&self) -> String {
-        format!("died-{:x}", self.incarnation)
-    }
-
     /// Returns why it was not gathered with a span, and the remedy.
     pub(super) fn remedy(&self) -> String {
         let why = if self.is_of_this_boot {
@@ -46,7 +41,7 @@ impl DeadRing {
             self.name,
             self.address,
             self.path.display(),
-            self.id()
+            self.id
         )
     }
 }
@@ -88,22 +83,12 @@ fn is_ring(path: &Path) -> bool {
 }
 
 fn ring(path: PathBuf, project: &str) -> Option<DeadRing> {
-    let reader = JournalReader::open(&path, Start::Newest).ok()?;
-    let identity = String::from_utf8(reader.identity().to_vec()).ok()?;
-    let mut lines = identity.lines();
-    let (name, address) = (lines.next()?.to_owned(), lines.next()?.parse().ok()?);
-    // A kept ring may be a copy, which was closed.
-    let is_kept = path.extension().is_some_and(|ending| ending == "frozen");
-    let has_ended_in_order = !is_kept && reader.is_closed().ok()?;
-    if lines.next() != Some(project) || reader.is_writer_alive() || has_ended_in_order {
-        return None;
-    }
-    let mut facts = read_facts(&path.with_extension("facts"), Owners::AllForRoot).unwrap_or_default();
-    facts.report.name.clone_from(&name);
-    let incarnation = facts.report.incarnation.map_or_else(|| reader.created(), |number| number.0);
+    let origin = RingOrigin::read(&path, Owners::AllForRoot).filter(|origin| origin.project == project)?;
     let (now, present_offset) = clocks();
-    let is_of_this_boot = is_of_this_boot(reader.created(), reader.wall_offset().ok()?, now, present_offset);
-    Some(DeadRing { path, name, address, facts, incarnation, is_of_this_boot })
+    let is_of_this_boot = is_of_this_boot(origin.created_ns, origin.wall_offset_ns, now, present_offset);
+    let id = origin.id();
+    let RingOrigin { node: name, address, facts, .. } = origin;
+    Some(DeadRing { path, name, address, facts, id, is_of_this_boot })
 }
 
 #[cfg(test)]
@@ -128,7 +113,7 @@ mod tests {
             name: "knee".to_owned(),
             address: NodeAddress::new(0x0a00_0002),
             facts: FrozenFacts::default(),
-            incarnation: 0x1f,
+            id: "died-1f".to_owned(),
             is_of_this_boot: true,
         };
         assert!(ring.remedy().contains("`sinew record fetch died-1f`"), "{}", ring.remedy());

@@ -56,6 +56,7 @@ impl Collected<'_> {
             to: tid.app,
         };
         let is_meant = |node: NodeAddress| tid.node == NodeAddress::ALL || tid.node == node;
+        let mut unreported = Vec::new();
         for at in 0..self.nodes.len() {
             let asked = &self.nodes[at];
             if !is_meant(asked.node) {
@@ -70,7 +71,7 @@ impl Collected<'_> {
                 // It has no receivers: only nodes with receivers are listed.
                 Ok(place) if place.members.is_empty() && place.left_out == 0 => {}
                 Ok(place) => many.places.push(place),
-                Err(why) => many.unreported.push((label, why)),
+                Err(why) => unreported.push((at, (label, why))),
             }
         }
         // Messages to many stay in their project.
@@ -79,7 +80,9 @@ impl Collected<'_> {
             |on: &MembersOn| on.node.report.as_ref().is_some_and(|report| report.project == *project);
         if many.places.iter().any(is_of_project) {
             many.places.retain(is_of_project);
+            unreported.retain(|(at, _)| self.nodes[*at].project == *project);
         }
+        many.unreported.extend(unreported.into_iter().map(|(_, of)| of));
         if !self.nodes.iter().any(|asked| is_meant(asked.node)) {
             let why = "no node that was asked knows it".to_owned();
             many.unreported.push((tid.node.to_string(), why));

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use sinew::NodeAddress;
 use sinew::inspect::{FrozenFacts, FrozenSpan};
 use sinew_recorder::{
-    Compression, FileOptions, FrozenRing, JournalReader, Owners, RecordingError, Start, read_facts,
+    Compression, FileOptions, FrozenRing, JournalReader, Owners, RecordingError, RingOrigin, Start,
 };
 
 /// Maximum number of files of a folder that are looked at.
@@ -98,7 +98,7 @@ pub fn gather(frozen: &Path, journals: &Path) -> Frozen {
             unread.remove(path.as_path());
         }
     }
-    // No living node has kept a span around its death.
+    // No living node has kept a span around its death: each may have had all spans that it keeps.
     for ring in dead.iter().filter(|ring| unread.contains(ring.path.as_path())) {
         let part = [(ring, 0, u64::MAX)];
         let _ = write(&frozen.join(&ring.span.id), &ring.span.cause, part.into_iter(), &mut found);
@@ -112,7 +112,7 @@ pub fn gather(frozen: &Path, journals: &Path) -> Frozen {
     found
 }
 
-/// Writes the files of one span. Returns the journals with records of it.
+/// Writes the files of one span. Returns the journals of killed nodes that end within it: how a node died is in them.
 fn write<'a>(
     folder: &Path,
     cause: &str,
@@ -124,7 +124,9 @@ fn write<'a>(
     for (ring, begin_ns, end_ns) in parts {
         match ring.write(folder, begin_ns, end_ns) {
             Ok(Some(file)) => {
-                read.push(ring.path.clone());
+                if ring.span.has_died && ring.ends_by(end_ns) {
+                    read.push(ring.path.clone());
+                }
                 files.push(file);
             }
             Ok(None) => {}
@@ -144,6 +146,12 @@ impl Ring {
     fn is_of_the_incarnation_of(&self, other: &Self) -> bool {
         let identity = |ring: &Self| (ring.address, ring.facts.report.incarnation);
         identity(self) == identity(other)
+    }
+
+    /// Returns whether the journal has no record after this time.
+    fn ends_by(&self, end_ns: u64) -> bool {
+        let all = sinew_recorder::Span::scan(&self.path, &(0..=u64::MAX));
+        all.is_ok_and(|all| all.last_ns <= end_ns)
     }
 
     /// Writes the records of these times; `None`: it has none.
@@ -179,20 +187,12 @@ fn ring(path: &Path) -> Option<Ring> {
     if !is_journal && ending != "frozen" {
         return None;
     }
-    let reader = JournalReader::open(path, Start::Newest).ok()?;
-    let identity = String::from_utf8(reader.identity().to_vec()).ok()?;
-    let mut lines = identity.lines();
-    let (node, address) = (lines.next()?.to_owned(), lines.next()?.parse().ok()?);
-    if is_journal && (reader.is_writer_alive() || reader.is_closed().ok()?) {
-        return None;
-    }
-    let mut facts = read_facts(&path.with_extension("facts"), Owners::ThisUser).unwrap_or_default();
-    facts.report.name.clone_from(&node);
+    let origin = RingOrigin::read(path, Owners::ThisUser)?;
+    let id = origin.id();
+    let RingOrigin { node, address, mut facts, .. } = origin;
     let span = match facts.span.take() {
         Some(span) => span,
         None if is_journal => {
-            let incarnation = facts.report.incarnation.map_or_else(|| reader.created(), |number| number.0);
-            let id = format!("died-{incarnation:x}");
             FrozenSpan { id, cause: format!("{node} has died"), has_died: true, ..FrozenSpan::default() }
         }
         // It was not finished.

@@ -14,6 +14,10 @@ use sinew_bag::read::Ordered;
 
 const DEADLINE: Duration = Duration::from_secs(60);
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
+/// The sample at which a sensor has the messages frozen.
+const FAULT_AT: u32 = 50;
+/// Time after the fault that is frozen, too.
+const AFTER: Duration = Duration::from_secs(1);
 /// A group without members: only the recorder sees its messages.
 const GROUP: &str = "test.samples";
 
@@ -39,9 +43,9 @@ impl Drop for TestFolder {
 #[derive(Default)]
 struct Sensor {
     seq: u32,
-    /// The sample at which it has the messages frozen; 0: none.
-    fault_at: u32,
-    /// Notified then.
+    /// The end of the span around its fault, or later.
+    span_end: Option<Time>,
+    /// Notified after a sample behind that span; `None`: it has no fault.
     noticed: Option<SyncSender<()>>,
 }
 
@@ -51,6 +55,7 @@ impl Actor for Sensor {
     fn started(&mut self, context: &mut Self::Context) {
         context.every(Duration::from_millis(1), |sensor, _, context| {
             sensor.seq += 1;
+            let is_behind = sensor.span_end.is_some_and(|end| Time::now() > end);
             let sample = JointSample {
                 seq: sensor.seq,
                 t_ns: context.now().as_nanos(),
@@ -62,10 +67,14 @@ impl Actor for Sensor {
                 flags: 0,
             };
             let _ = context.send(Tid::group(GROUP), &sample);
-            if sensor.seq == sensor.fault_at {
+            let Some(noticed) = &sensor.noticed else { return };
+            if sensor.seq == FAULT_AT {
                 context.freeze_recording("the foot slips");
-                let noticed = sensor.noticed.as_ref().expect("the test waits for it");
-                noticed.try_send(()).expect("the test reads one");
+                sensor.span_end = Some(Time::now() + AFTER);
+            }
+            if is_behind {
+                noticed.try_send(()).expect("there is room for one");
+                sensor.span_end = None;
             }
         });
     }
@@ -121,21 +130,29 @@ fn span_around_a_fault_becomes_a_file() {
     for folder in [&journal, &frozen] {
         DirBuilder::new().recursive(true).mode(0o700).create(folder).unwrap();
     }
-    // given: a node with a flight recorder, and a fault at its 50th sample
+    // given: a node with a flight recorder, and a fault at one of its samples
     let (memory, disk) = (journal.clone(), frozen.clone());
-    let (noticed, fault) = sync_channel(1);
-    let sensor = move || Sensor { fault_at: 50, noticed: Some(noticed.clone()), ..Sensor::default() };
+    let (noticed, samples) = sync_channel(1);
+    let sensor = move || Sensor { noticed: Some(noticed.clone()), ..Sensor::default() };
     let node = Node::builder("knee")
         .address([127, 0, 0, 2])
         .configure(|config| {
             (config.ndl.multicast, config.ndl.mdns_port) = (None, None);
             (config.record.folder, config.record.frozen_folder) = (Some(memory), Some(disk));
-            config.record.keep_bytes = 1 << 20;
+            config.record.keep_bytes = 4 << 20;
+            config.record.after = AFTER;
         })
         .app(AppSpec::new("knee.sensor", sensor))
         .start()
         .unwrap();
-    fault.recv_timeout(DEADLINE).expect("the sensor runs");
+    samples.recv_timeout(DEADLINE).expect("the sensor runs");
+    // And: the journal of a node that was killed later than the span, which no living node has frozen
+    let killed = journals.join("killed");
+    std::fs::create_dir(&killed).unwrap();
+    let is_journal = |path: &PathBuf| path.extension().is_some_and(|ending| ending == "journal");
+    let own =
+        std::fs::read_dir(&journal).unwrap().map(|entry| entry.unwrap().path()).find(is_journal).unwrap();
+    std::fs::copy(&own, killed.join("sinew-killed.journal")).unwrap();
     node.stop();
 
     // when
@@ -143,15 +160,19 @@ fn span_around_a_fault_becomes_a_file() {
     let found = gather(&frozen, &journals);
 
     // then
-    assert!(found.faults.is_empty() && found.spans.len() == 1, "{found}");
-    let span = &found.spans[0];
-    assert!(span.cause.contains("the foot slips"), "{span:?}");
-    let [file] = span.files.as_slice() else { panic!("one node has frozen it: {span:?}") };
-    assert!(file.node == "knee" && !file.has_died && file.written >= 50, "{file:?}");
+    assert!(found.faults.is_empty() && found.spans.len() == 2, "{found:?}");
+    let of_cause = |cause: &str| found.spans.iter().find(|span| span.cause.contains(cause)).unwrap();
+    let span = of_cause("the foot slips");
+    let [file, of_killed] = span.files.as_slice() else { panic!("two journals have it: {span:?}") };
+    assert!(file.node == "knee" && !file.has_died && file.written >= u64::from(FAULT_AT), "{file:?}");
     assert!(file.begin_ns <= file.first_ns && file.last_ns <= file.end_ns, "{file:?}");
     let report = sinew_bag::check(&[&file.path]).unwrap();
     assert!(report.is_fine(), "{:?}", report.findings);
-    assert!(found.to_string().starts_with("frozen: 1 file, span "), "{found}");
+    assert!(of_killed.has_died && of_killed.last_ns <= span.end_ns, "{of_killed:?}");
+    // And: the last messages of the killed node are in a file of its whole journal
+    let [whole] = of_cause("has died").files.as_slice() else { panic!("{found:?}") };
+    assert!(whole.last_ns > span.end_ns && whole.written > of_killed.written, "{whole:?}");
+    assert!(found.to_string().contains("frozen: 1 file, span "), "{found}");
     // And: the file is in place of the copy
     assert_eq!(gather(&frozen, &journals), Frozen::default());
     assert!(file.path.exists());

@@ -274,7 +274,7 @@ fn type_of_a_client_is_compared_within_its_node_until_the_client_ends() {
     bench.input(Input::AppChanged(AppFact::own_registered(GAIT, Some("gait".to_owned()), Vec::new())));
     bench.state.declare(GAIT, User::Own, declaration(renamed)).unwrap();
     bench.input(Input::AppChanged(AppFact::Types { app: GAIT, types: declared(renamed) }));
-    // Both structures are here: nothing is fetched, and no other node is told.
+    // Both structures are here: nothing is fetched, and no frame is sent to another node.
     assert_eq!(bench.steps(), []);
     let node = bench.state.ctx.node;
     let state = bench.state.clone();
@@ -305,12 +305,15 @@ fn question_for_the_structure_of_a_client_is_answered() {
     let (bytes, hash) = (traced.schema().encode(), traced.hash());
     let mut bench = Bench::new();
     let declaration = TypeDeclaration { kind, ..declaration(gains) };
-    bench.state.declare(GAIT, User::Guest(1_001), declaration).unwrap();
+    bench.state.declare(GAIT, User::Guest(1_001), declaration.clone()).unwrap();
     bench.peer_sends(Kind::SYNC_SCHEMA_ASK, &SchemaQuestion { kind, hash }).unwrap();
     let sent = bench.steps();
     let [(Kind::SYNC_SCHEMA, answer)] = &sent[..] else { panic!("{sent:?}") };
     assert_eq!(decode::<SchemaAnswer>(answer).unwrap(), SchemaAnswer { kind, hash, schema: bytes.clone() });
-    // So has the report of the recorder.
+    // A recorder gets no structure of a guest: it would apply to messages of other applications, too.
+    assert_eq!(bench.state.types.schema_of(kind), None);
+    bench.state.forget(GAIT);
+    bench.state.declare(GAIT, User::Own, declaration).unwrap();
     assert_eq!(bench.state.types.schema_of(kind), Some(bytes));
     bench.state.forget(GAIT);
     assert_eq!(bench.state.types.schema_of(kind), None);

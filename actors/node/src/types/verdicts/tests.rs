@@ -260,6 +260,26 @@ fn no_node_takes_the_room_of_others() {
     assert_eq!(verdicts.pairs.len(), MISMATCHES_MAX);
 }
 
+#[test]
+fn guests_take_no_room_of_others() {
+    let count = PATHS_OF_NODE_MAX as u32;
+    // Given: as many guests of this node as there is room, listed before another sender of it
+    let here = || Some((Structure::Declared(Arc::new(schema::<Renamed>())), Program::Guest));
+    let guests = (0..count).map(|n| Sent { here: here(), ..one_of_many(HERE, 0x100 + n) });
+    let other = sent_here::<Renamed>(Program::Other);
+    let senders: Vec<_> = guests.chain([other.clone()]).collect();
+    let mut verdicts = Verdicts::default();
+    verdicts.declare(at(0), &[handled::<Gains>()], &senders);
+    let path = |source| TypedPath { source, target: KNEE, kind: KIND };
+    assert!(verdicts.pairs.contains_key(&path(other.tid)) && verdicts.pairs.len() == PATHS_OF_NODE_MAX);
+    // And: receivers, for a sender on another node
+    let guest =
+        |n| Handled { app: AppAddress::new(0x2000 + n), program: Program::Guest, ..handled::<Gains>() };
+    let receivers: Vec<_> = (0..count).map(guest).chain([handled::<Gains>()]).collect();
+    verdicts.declare(at(1), &receivers, &[sent::<Renamed>()]);
+    assert!(verdicts.pairs.contains_key(&path(SOURCE)) && verdicts.pairs.len() == PATHS_OF_NODE_MAX);
+}
+
 /// Returns two structures that are the same on the wire: a part of them has another name.
 fn same_on_the_wire() -> (Structure, Schema) {
     let named = |part: &str| {
