@@ -80,7 +80,7 @@ impl KeptParameters {
         self.others = values;
     }
 
-    /// Renames a file that cannot be used: the next change would replace it, and with it the values of all applications.
+    /// Renames a file that cannot be used: the next change would replace it, and the values of all applications.
     fn set_aside(&self, why: &str) {
         let mut aside = self.path.clone().into_os_string();
         aside.push(".unusable");

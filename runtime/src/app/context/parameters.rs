@@ -66,7 +66,7 @@ impl Tuning {
         self.timers.retain(|(_, other)| *other != timer);
     }
 
-    /// Returns the timer of the ticks at which sets are applied, and its period: the shortest one, of several the first.
+    /// Returns the timer of the ticks at which sets are applied, and its period: the shortest, of several the first.
     fn timer(&self) -> Option<(Duration, TimerId)> {
         self.timers.iter().min_by_key(|(period, _)| *period).copied()
     }
