@@ -247,12 +247,32 @@ fn words(error: &ApiError, app: &str, is_set: bool) -> String {
             "{app} did not take it in time, and nothing was set; look at `sinew apps` and `sinew tree`"
         );
     }
-    if let (ApiError::NoReply(within), true) = (error, is_set) {
-        return format!(
-            "no answer within {within:?}; the values may have been set: `sinew param list {app}` shows them"
-        );
+    if let ApiError::Ended(Outcome::Rejected(
+        Rejection::NoSuchApplication | Rejection::Closed | Rejection::Down,
+    )) = error
+    {
+        return format!("{app} has ended, and nothing was set; `sinew tree` shows whether it starts again");
     }
-    in_words(error)
+    let why = if let ApiError::NoReply(within) = error {
+        format!("no answer within {within:?}")
+    } else {
+        in_words(error)
+    };
+    if is_set && may_be_set(error) {
+        return format!("{why}; the values may have been set: `sinew param list {app}` shows them");
+    }
+    why
+}
+
+/// Returns whether a set that ended so may have been applied, or will be.
+const fn may_be_set(error: &ApiError) -> bool {
+    matches!(
+        error,
+        ApiError::NoReply(_)
+            | ApiError::NoAnswer(_)
+            | ApiError::Closed(_)
+            | ApiError::Ended(Outcome::Unknown | Outcome::Failed)
+    )
 }
 
 /// Returns the values of a list, without those on their way: their targets.
@@ -298,5 +318,20 @@ mod tests {
         assert!(words(&refused, "knee", false).contains("observers"));
         let unknown = ApiError::Ended(Outcome::Rejected(Rejection::UnknownKind));
         assert!(words(&unknown, "knee", true).contains("knee has no parameters"));
+    }
+
+    #[test]
+    fn set_without_a_certain_end_may_have_been_applied() {
+        let ended = ApiError::Ended;
+        let lost = ApiError::Closed("the node has ended".to_owned());
+        let late = ApiError::NoReply(std::time::Duration::from_secs(1));
+        for error in [ended(Outcome::Unknown), ended(Outcome::Failed), lost, late] {
+            assert!(words(&error, "knee", true).contains("may have been set"), "{error}");
+            assert!(!words(&error, "knee", false).contains("may have been set"), "{error}");
+        }
+        let gone = [Rejection::NoSuchApplication, Rejection::Closed, Rejection::Down, Rejection::QueueFull];
+        for certain in gone.map(Outcome::Rejected).into_iter().chain([Outcome::Expired, Outcome::PeerLost]) {
+            assert!(!words(&ended(certain), "knee", true).contains("may have been set"), "{certain:?}");
+        }
     }
 }

@@ -1,5 +1,5 @@
-//! Which request is refused, and why. Any website can make a browser send requests to this host: only a request whose
-//! host is this one is answered, so that a name that such a website points here gets nothing.
+//! Checks requests. Any website can make a browser send requests to this host, by a name that it points here. So only
+//! a request with a `Host` of this host is answered.
 
 use std::net::IpAddr;
 

@@ -8,6 +8,7 @@ use std::{cell::RefCell, collections::BTreeMap, rc::Rc, sync::Arc};
 use sinew_runtime::{
     app::{DynApp, RequirementPolicy},
     mailbox::Mailbox,
+    parameters::Parameters,
     supervision::{ChildId, Place, Reason, SupervisorFact},
     tid::{AppAddress, Tid},
 };
@@ -34,6 +35,8 @@ struct App {
     tid: Tid,
     mailbox: Arc<Mailbox>,
     place: Place,
+    /// Its parameters, if they are in this process.
+    parameters: Option<Arc<dyn Parameters>>,
     on_lost: RequirementPolicy,
     progress: Progress,
 }
@@ -65,8 +68,9 @@ impl Apps {
         table.by_address.insert(tid.app, id);
         table.names.insert(app.name().to_owned(), id);
         let (name, place) = (app.name().to_owned(), app.place().clone());
-        let (on_lost, progress) = (app.requirement_policy(), Progress::Starting);
-        table.apps.insert(id, App { name, tid, mailbox, place, on_lost, progress });
+        let (parameters, on_lost) = (parameters_here(app).cloned(), app.requirement_policy());
+        let progress = Progress::Starting;
+        table.apps.insert(id, App { name, tid, mailbox, place, parameters, on_lost, progress });
     }
 
     /// Adds a supervisor of applications.
@@ -104,6 +108,13 @@ impl Apps {
         let table = self.0.borrow();
         let places = table.apps.values().map(|other| (&*other.name, &other.place));
         thread_placement::check(app.name(), app.place(), places)
+    }
+
+    /// Checks that the parameters of an application are not those of an existing one.
+    pub(super) fn check_parameters(&self, app: &DynApp) -> Result<(), StartError> {
+        let table = self.0.borrow();
+        let others = table.apps.values().filter_map(|other| Some((&*other.name, other.parameters.as_ref()?)));
+        check_parameters(app, others)
     }
 
     /// Returns whether every application runs that has not ended for good.
@@ -170,5 +181,59 @@ impl Apps {
             state.lncl.book.remove_mailbox(app.tid.app);
             sinew_lncl::unregister_local(&state.lncl, app.tid.app);
         }
+    }
+}
+
+/// Returns the parameters of an application. In a process of its own they are another copy.
+fn parameters_here(app: &DynApp) -> Option<&Arc<dyn Parameters>> {
+    app.parameters().filter(|_| !app.place().own_process)
+}
+
+/// Refuses parameters that one of `others` has, too. Two applications would write them, each at its own ticks.
+fn check_parameters<'a>(
+    app: &DynApp,
+    others: impl IntoIterator<Item = (&'a str, &'a Arc<dyn Parameters>)>,
+) -> Result<(), StartError> {
+    let Some(own) = parameters_here(app) else { return Ok(()) };
+    let is_own = |theirs: &Arc<dyn Parameters>| std::ptr::addr_eq(Arc::as_ptr(own), Arc::as_ptr(theirs));
+    let Some((other, _)) = others.into_iter().find(|(_, theirs)| is_own(theirs)) else { return Ok(()) };
+    let why = format!(
+        "its parameters are those of '{other}', too, which sets them at its own ticks; give each application a struct of its own, by `new`"
+    );
+    Err(StartError::Application { name: app.name().to_owned(), why })
+}
+
+#[cfg(test)]
+mod tests {
+    use sinew_runtime::app::{AppContext, AppSpec};
+
+    use super::*;
+
+    sinew::params! {
+        struct Gains {
+            /// A gain.
+            gain: f64 = 0.5, unit "1", range 0.0..=1.0;
+        }
+    }
+
+    struct Idle;
+
+    impl actix::Actor for Idle {
+        type Context = AppContext<Self>;
+    }
+
+    fn app(name: &str, gains: &Arc<Gains>, place: Place) -> DynApp {
+        AppSpec::new(name, || Idle).params(gains).place(place).into()
+    }
+
+    #[test]
+    fn parameters_belong_to_one_application() {
+        let (gains, other_gains) = (Gains::new(), Gains::new());
+        let shared: Arc<dyn Parameters> = gains.clone();
+        let check = |app: &DynApp| check_parameters(app, [("knee", &shared)]);
+        let words = check(&app("hip", &gains, Place::io())).expect_err("it is the knee's").to_string();
+        assert!(words.contains("'hip'") && words.contains("those of 'knee'"), "{words}");
+        assert!(check(&app("hip", &other_gains, Place::io())).is_ok());
+        assert!(check(&app("hip", &gains, Place::process())).is_ok(), "it has another copy");
     }
 }

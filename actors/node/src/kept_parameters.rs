@@ -67,11 +67,7 @@ impl KeptParameters {
     fn restore(&mut self) {
         let values = self.read().and_then(|text| file::parse(&text.unwrap_or_default()));
         let mut values = values.unwrap_or_else(|why| {
-            let (path, why) = (&self.path, shown(&why));
-            log::warn!(
-                ?path,
-                "kept parameters begin at their defaults: {why}; correct the file, or delete it"
-            );
+            self.set_aside(&why);
             file::ValuesOfApps::new()
         });
         for (application, set) in &self.apps {
@@ -82,6 +78,25 @@ impl KeptParameters {
             }
         }
         self.others = values;
+    }
+
+    /// Renames a file that cannot be used: the next change would replace it, and the values of all applications.
+    fn set_aside(&self, why: &str) {
+        let mut aside = self.path.clone().into_os_string();
+        aside.push(".unusable");
+        let aside = PathBuf::from(aside);
+        let (path, why) = (&self.path, shown(why));
+        match std::fs::rename(path, &aside) {
+            Ok(()) => log::warn!(
+                ?path,
+                "kept parameters begin at their defaults: {why}; the file is {} now: correct it, and rename it while the node is stopped",
+                aside.display()
+            ),
+            Err(error) => log::warn!(
+                ?path,
+                "kept parameters begin at their defaults: {why}; correct the file, or delete it: it cannot be renamed ({error})"
+            ),
+        }
     }
 
     /// Returns the text of the file; `None` if there is none yet.
@@ -157,6 +172,10 @@ mod tests {
             let (gains, mut kept) = kept(directory.path().join("parameters"));
             kept.restore();
             assert_eq!((gains.gain.get(), gains.steps.get()), (0.5, 4), "{text:?}");
+            // It is not lost by the next change.
+            let aside = std::fs::read_to_string(directory.path().join("parameters.unusable"));
+            assert_eq!(aside.expect("it was renamed"), text);
+            assert!(!directory.path().join("parameters").exists());
         }
         let (gains, mut kept) = kept(directory.path().join("absent"));
         kept.restore();

@@ -20,6 +20,9 @@ pub const STAGED_MAX: usize = 16;
 pub const UNDO_MAX: usize = 16;
 /// Time in which a tick must come. A set that waits longer is refused, and is not applied later.
 pub const TICK_WITHIN: Duration = Duration::from_secs(1);
+/// Maximum number of periods for which one tick moves a value with a slope: that tick and a missed one. After a longer
+/// stall the value would jump.
+const PERIODS_PER_TICK_MAX: u32 = 2;
 /// Minimum similarity of the name in a suggestion.
 const SIMILAR: f64 = 0.8;
 /// Maximum characters of a name that are compared or shown.
@@ -153,14 +156,26 @@ impl<T> Tuner<T> {
                 Err(why) => return Err((ticket, why)),
             },
         };
+        if values.is_none()
+            && !has_ticks
+            && let Some(name) = self.undone_slope()
+        {
+            return Err((ticket, ParameterError::SlopeWithoutTicks(name)));
+        }
         self.staged.push_back(Staged { ticket, values, until });
         Ok(())
     }
 
     /// Applies the sets that wait, in the order of their arrival, and moves values with a slope by the time since the
-    /// last call. `done` gets the outcome of each set. Returns whether a kept parameter has a new value or target.
-    pub fn tick(&mut self, tick: u64, now: Duration, mut done: impl FnMut(T, ParameterOutcome)) -> bool {
-        let since = now.saturating_sub(self.moved);
+    /// last call, at most two periods. Without a timer `period` is zero, and no value moves. `done` gets the outcome of
+    /// each set. Returns whether a kept parameter has a new value or target.
+    pub fn tick(
+        &mut self,
+        (tick, period): (u64, Duration),
+        now: Duration,
+        mut done: impl FnMut(T, ParameterOutcome),
+    ) -> bool {
+        let since = now.saturating_sub(self.moved).min(period.saturating_mul(PERIODS_PER_TICK_MAX));
         self.moved = now;
         self.expire(now, &mut done);
         self.has_kept_change = false;
@@ -227,6 +242,13 @@ impl<T> Tuner<T> {
         });
         let undoable = u32::try_from(self.former.len()).unwrap_or(u32::MAX);
         ParameterList { parameters: parameters.collect(), has_ticks, undoable }
+    }
+
+    /// Returns the first parameter with a slope of the set that an undo would take back.
+    fn undone_slope(&self) -> Option<&'static str> {
+        let descriptors = self.set.descriptors();
+        let mut last = self.former.back()?.iter().filter_map(|(index, _)| descriptors.get(*index));
+        last.find(|descriptor| descriptor.slope_per_s().is_some()).map(|descriptor| descriptor.name)
     }
 
     /// Checks all values of a set.

@@ -1,6 +1,6 @@
 //! How the messages of a channel are sent again, or why they are left out.
 
-use sinew::{NodeAddress, Tid, protection::unsealed};
+use sinew::{NodeAddress, Payload as _, Tid, parameters::SetParameters, protection::unsealed};
 use sinew_player::{Recorded, RecordedChannel};
 
 /// The bits of replies and outcomes in a recorded header.
@@ -70,7 +70,10 @@ impl LeftOut {
 pub(crate) fn of(channel: &RecordedChannel, is_own: bool) -> Result<Route, LeftOut> {
     let RecordedChannel { source, destination, kind, type_name, .. } = channel;
     let is_layer = |tid: &Tid| tid.is_single() && tid.app.is_layer();
-    if !kind.is_user() || type_name.starts_with("sinew.") || is_layer(source) || is_layer(destination) {
+    // By its kind: a recording may have no name of the type, or a wrong one.
+    let is_set = *kind == SetParameters::KIND;
+    let is_own_type = is_set || !kind.is_user() || type_name.starts_with("sinew.");
+    if is_own_type || is_layer(source) || is_layer(destination) {
         return Err(LeftOut::Layer);
     }
     if channel.is_protected && !is_own {
@@ -185,5 +188,10 @@ mod tests {
         assert_eq!(to(|channel| channel.source = inspection, true), Err(LeftOut::Layer));
         assert_eq!(to(|channel| channel.type_name = "sinew.echo".to_owned(), true), Err(LeftOut::Layer));
         assert_eq!(to(|channel| channel.kind = Kind::from_bits(0), true), Err(LeftOut::Layer));
+    }
+
+    #[test]
+    fn sets_of_parameters_are_left_out_under_any_name() {
+        assert_eq!(to(|channel| channel.kind = SetParameters::KIND, true), Err(LeftOut::Layer));
     }
 }

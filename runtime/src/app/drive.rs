@@ -199,6 +199,8 @@ impl<A: Actor<Context = AppContext<A>>> Drive<A> {
             self.timer_was_last = true;
             self.reader.count();
             self.liveness.begin(Activity::Timer, watched(context, now));
+            // The successor of a fenced incarnation may have begun: its parameters have one writer.
+            self.leave_if_over();
             fire(actor, context, due, now);
             self.leave_if_over();
             return Poll::Ready(true);

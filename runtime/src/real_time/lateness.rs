@@ -14,7 +14,7 @@ const BANDS_US: [u64; 25] = [
     500_000, 1_000_000, 2_000_000, 5_000_000, 10_000_000, 20_000_000, 50_000_000, 60_000_000,
 ];
 
-/// The lateness of many wake-ups: a histogram with some 30 KiB, whatever the number of wake-ups.
+/// The lateness of many wake-ups: a histogram with some 30 KiB for any number of wake-ups.
 ///
 /// # Examples
 ///

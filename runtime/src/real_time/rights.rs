@@ -93,7 +93,7 @@ pub enum Preemption {
 pub enum Budget {
     /// No control group refuses a real-time thread.
     NotRestricted,
-    /// A group of cgroup v1 whose `cpu.rt_runtime_us` is 0.
+    /// A group of cgroup v1 with a `cpu.rt_runtime_us` of 0.
     NoneV1 {
         /// The path of the group.
         group: String,

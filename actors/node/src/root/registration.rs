@@ -78,6 +78,7 @@ impl Root {
         if let Some(why) = app.fault() {
             return Err(StartError::Application { name: app.name().to_owned(), why });
         }
+        self.apps.check_parameters(app)?;
         let mailbox = Mailbox::new(Bounds { messages: config.mailbox_capacity, bytes: config.mailbox_bytes });
         let pending = Pending::new(WAITS_MAX);
         let hosted = app.place().own_process.then(|| process::Link::new(&self.state, mailbox.clone()));

@@ -75,10 +75,13 @@ fn stage(tuner: &mut Tuner<u32>, ticket: u32, values: &[(&str, Value)], now: Dur
     tuner.stage(&set(values), (ticket, now + TICK_WITHIN), true).expect("it is legal");
 }
 
+/// The period of the timer of the tests.
+const PERIOD: Duration = ms(100);
+
 /// Returns the outcomes of a tick at `now`.
 fn tick(tuner: &mut Tuner<u32>, number: u64, now: Duration) -> Vec<(u32, ParameterOutcome)> {
     let mut outcomes = Vec::new();
-    tuner.tick(number, now, |ticket, outcome| outcomes.push((ticket, outcome)));
+    tuner.tick((number, PERIOD), now, |ticket, outcome| outcomes.push((ticket, outcome)));
     outcomes
 }
 
@@ -156,6 +159,41 @@ fn slope_moves_the_value_by_the_time_between_ticks() {
     tick(&mut tuner, 4, ms(600));
     assert_eq!(gains.assistance.get(), 0.5);
     assert!(tuner.is_idle());
+}
+
+#[test]
+fn stalled_loop_makes_no_value_jump() {
+    let gains = gains();
+    // The loop begins late, and then hangs.
+    let mut tuner = Tuner::new(gains.clone(), ms(0));
+    stage(&mut tuner, 1, &[("assistance", Value::Number(1.0))], ms(9_500));
+    tick(&mut tuner, 1, ms(10_000));
+    assert!((gains.assistance.get() - 0.4).abs() < 1e-9, "{}", gains.assistance.get());
+    tick(&mut tuner, 2, ms(20_000));
+    assert!((gains.assistance.get() - 0.5).abs() < 1e-9, "{}", gains.assistance.get());
+}
+
+#[test]
+fn value_with_a_slope_does_not_move_without_ticks() {
+    // Given: a value on its way, and a loop that was cancelled
+    let gains = gains();
+    let mut tuner = Tuner::new(gains.clone(), ms(0));
+    stage(&mut tuner, 1, &[("assistance", Value::Number(1.0))], ms(0));
+    tick(&mut tuner, 1, ms(100));
+    let before = gains.assistance.get();
+    // When: another parameter is set between two messages
+    let steps = set(&[("steps", Value::Integer(5))]);
+    tuner.stage(&steps, (2, ms(9_000)), false).expect("it has no slope");
+    let mut outcomes = Vec::new();
+    tuner.tick((0, Duration::ZERO), ms(8_000), |ticket, outcome| outcomes.push((ticket, outcome)));
+    // Then
+    assert!(matches!(outcomes[..], [(2, ParameterOutcome::Applied { .. })]), "{outcomes:?}");
+    assert_eq!((gains.assistance.get(), gains.steps.get()), (before, 5));
+    // And: the set before it cannot be undone without ticks either
+    tuner.stage(&SetParameters::Undo, (3, ms(9_000)), false).expect("the last one has no slope");
+    tuner.tick((0, Duration::ZERO), ms(8_001), |_, _| {});
+    let (_, why) = tuner.stage(&SetParameters::Undo, (4, ms(9_000)), false).expect_err("it has a slope");
+    assert_eq!(why, ParameterError::SlopeWithoutTicks("assistance"));
 }
 
 #[test]
@@ -251,8 +289,8 @@ fn tick_reports_changes_of_kept_parameters_alone() {
         [("torque_max", Value::Number(30.0), false), ("steps", Value::Integer(5), true)]
     {
         stage(&mut tuner, 0, &[(name, value)], ms(0));
-        assert_eq!(tuner.tick(1, ms(1), |_, _| {}), is_kept, "{name}");
-        assert!(!tuner.tick(2, ms(2), |_, _| {}));
+        assert_eq!(tuner.tick((1, PERIOD), ms(1), |_, _| {}), is_kept, "{name}");
+        assert!(!tuner.tick((2, PERIOD), ms(2), |_, _| {}));
     }
 }
 
@@ -296,7 +334,7 @@ fn step() -> impl Strategy<Value = Step> {
 
 proptest! {
     /// For any history: values stay in their ranges, change at ticks only, move by at most slope times the time since
-    /// the last tick, and each set has exactly one outcome, which says truly whether it was applied.
+    /// the last tick and two periods, and each set has exactly one outcome, which says truly whether it was applied.
     #[test]
     fn history_keeps_ranges_slopes_and_outcomes(history in prop::collection::vec(step(), 1..80)) {
         let gains = gains();
@@ -348,7 +386,7 @@ proptest! {
                         prop_assert_eq!(values[0].value, Value::Number(gains.assistance.target()));
                         prop_assert_eq!(values[1].value, Value::Integer(gains.steps.get()));
                     }
-                    let step = 0.5 * (now - ticked).as_secs_f64();
+                    let step = 0.5 * (now - ticked).min(PERIOD * 2).as_secs_f64();
                     prop_assert!((gains.assistance.get() - before.0).abs() <= step + 1e-12);
                     ticked = now;
                     prop_assert!((0.0..=1.0).contains(&gains.assistance.get()));

@@ -442,14 +442,15 @@ impl Guard for Access {
         if header.source.node == self.here && header.source.app.is_layer() {
             return true;
         }
+        // Before replies: an application that was asked may set no parameters by its reply.
+        if let Some(is_allowed) = self.decide_by_role(header, app) {
+            return is_allowed;
+        }
         if header.flags.has(Flags::REPLY)
             && header.destination.is_single()
             && self.pending.take(Time::now(), header, app)
         {
             return true;
-        }
-        if let Some(is_allowed) = self.decide_by_role(header, app) {
-            return is_allowed;
         }
         judge(
             &self.index.load(),

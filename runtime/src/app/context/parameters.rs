@@ -66,9 +66,9 @@ impl Tuning {
         self.timers.retain(|(_, other)| *other != timer);
     }
 
-    /// Returns the timer of the ticks at which sets are applied: that of the shortest period, of several the first one.
-    fn timer(&self) -> Option<TimerId> {
-        self.timers.iter().min_by_key(|(period, _)| *period).map(|(_, timer)| *timer)
+    /// Returns the timer of the ticks at which sets are applied, and its period: the shortest, of several the first.
+    fn timer(&self) -> Option<(Duration, TimerId)> {
+        self.timers.iter().min_by_key(|(period, _)| *period).copied()
     }
 
     /// Resumes after a pause.
@@ -124,19 +124,21 @@ impl<A: Actor<Context = Self>> AppContext<A> {
         if has_ticks {
             self.watch_deadline();
         } else {
-            self.apply_parameters(0, now);
+            self.apply_parameters((0, Duration::ZERO), now);
         }
         Outcome::Delivered
     }
 
     /// Applies the sets that wait, and moves values with a slope, before the action of this timer.
     pub(in crate::app) fn tick_parameters(&mut self, timer: TimerId, tick: Tick, now: Time) {
-        if self.tuning.tuner.is_some() && self.tuning.timer() == Some(timer) {
-            self.apply_parameters(tick.number, now);
+        if self.tuning.tuner.is_some()
+            && let Some((period, _)) = self.tuning.timer().filter(|(_, first)| *first == timer)
+        {
+            self.apply_parameters((tick.number, period), now);
         }
     }
 
-    fn apply_parameters(&mut self, tick: u64, now: Time) {
+    fn apply_parameters(&mut self, tick: (u64, Duration), now: Time) {
         let Some(tuner) = &mut self.tuning.tuner else { return };
         let is_kept_changed =
             tuner.tick(tick, since_origin(now), |to, outcome| reply(&self.sender, to, &outcome));

@@ -20,9 +20,10 @@ impl<A: Actor<Context = AppContext<A>>> AppSpec<A> {
     /// Without a periodic timer it is applied between two messages. If no tick comes within 1 s the set is refused, and
     /// is not applied later.
     ///
-    /// An application has one set of parameters. After a restart by its supervisor a parameter has its default again,
-    /// unless it is declared with `keep`. With `node.state` a kept value also survives a restart of the node. In a process
-    /// of its own each restart begins with the defaults.
+    /// An application has one set of parameters, and no other application of its process may have the same one. After a
+    /// restart by its supervisor a parameter has its default again, unless it is declared with `keep`. With
+    /// `node.state` a kept value also survives a restart of the node. In a process of its own each restart begins with
+    /// the defaults.
     ///
     /// # Examples
     ///

@@ -52,6 +52,23 @@ fn rule_alone_allows_to_read_and_not_to_set() {
 }
 
 #[test]
+fn reply_sets_no_parameters_without_the_role() {
+    let place = place();
+    let access = place.access("");
+    let (knee, asked) = (Tid::new(HERE, AppAddress::new(0x1001)), app(THERE, 0x1005));
+    let may_reply = |kind, number| {
+        let mut request = Header::new(Kind::named("test.question"), knee, asked);
+        (request.correlation, request.flags) = (number, Flags::ASK);
+        access.asks(&request);
+        let mut reply = Header::new(kind, asked, knee);
+        (reply.correlation, reply.flags) = (number, Flags::REPLY);
+        access.allows(&reply, knee.app)
+    };
+    assert!(may_reply(Kind::named("test.answer"), 1));
+    assert!(!may_reply(SetParameters::KIND, 2));
+}
+
+#[test]
 fn observers_read_without_a_rule() {
     let place = place();
     let access = place.access("[roles]\nobservers = ['10.0.0.4']\n");
