@@ -13,7 +13,6 @@ use exoskeleton::robot::node::{self, NodeError, NodeOptions};
 use exoskeleton::robot::plant::{self, PlantError};
 use exoskeleton::robot::topology::{Control, ControlThread, ReleaseBy};
 use exoskeleton::run_folder;
-use exoskeleton_model::control::drive::DriveConfig;
 use exoskeleton_model::joint::Joint;
 use exoskeleton_model::lockstep::{self, LockStepConfig, LockStepError};
 use exoskeleton_model::part::Kill;
@@ -175,7 +174,7 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode, RunError> {
     match &arguments.command {
         Some(SubCommand::Node(options)) => return Ok(node::run(options)?),
         Some(SubCommand::CheckDrive { joint, gain_factor }) => {
-            return Ok(check_drive::run(*joint, with_gain(*joint, *gain_factor))?);
+            return Ok(check_drive::run(*joint, *gain_factor)?);
         }
         None => {}
     }
@@ -189,19 +188,9 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode, RunError> {
 
 /// Computes the drives of a recorded walk again, and prints the comparison.
 fn replay_drives(file: &Path, gain_factor: f64) -> Result<ExitCode, RunError> {
-    let replayed = replay::replay(file, |joint| with_gain(joint, gain_factor))?;
+    let replayed = replay::replay(file, gain_factor)?;
     output::print(&replayed.to_string());
     Ok(if replayed.is_same() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
-}
-
-/// Returns the parameters of a drive, with this factor for assistance, stiffness and damping.
-fn with_gain(joint: Joint, factor: f64) -> DriveConfig {
-    let mut config = DriveConfig::standard(joint);
-    let law = &mut config.law;
-    for gain in [&mut law.assist, &mut law.stiffness_nm_rad, &mut law.damping_nms_rad] {
-        *gain *= factor;
-    }
-    config
 }
 
 /// Walks in virtual time, prints the table, writes the folder.

@@ -126,7 +126,7 @@ fn torque_panel(canvas: &mut Canvas, record: &Record, joint: Joint) {
     let share: Vec<(f64, f64)> = (0..strides::POINTS)
         .map(|i| {
             let moment = curves::moment_nm_per_kg(joint, i as f64 / 100.0);
-            (i as f64, law.assist * law.body_mass_kg * moment)
+            (i as f64, law.gains.assistance * law.body_mass_kg * moment)
         })
         .collect();
     let all = strides.all().chain(share.iter().map(|(_, y)| *y));

@@ -1,6 +1,8 @@
 //! The applications of the robot in virtual time: the torques of its actors are those of the lock-step loop,
 //! bit by bit.
 
+#[path = "virtual_time/gains.rs"]
+mod gains;
 #[path = "virtual_time/recorded.rs"]
 mod recorded;
 
@@ -206,14 +208,23 @@ struct Walks {
 /// Walks this many strides in the loop, and as long with the robot's applications.
 fn both(config: &LockStepConfig) -> Walks {
     let record = run(config).expect("the loop walks");
+    let (rows, outputs) = walk_of_apps(config, &record, |replay| replay);
+    Walks { record, rows, outputs }
+}
+
+/// Walks with the robot's applications and what `more` adds, as long as the loop did.
+fn walk_of_apps(
+    config: &LockStepConfig,
+    record: &Record,
+    more: impl FnOnce(Replay) -> Replay,
+) -> (Vec<Row>, Vec<TimedMessage>) {
     let released = Time::ZERO + Duration::from_secs_f64(record.released_s.expect("it was released"));
     let bench = SharedBench::default();
     let ends_at = Time::ZERO + PERIOD * u32::try_from(record.rows.len()).expect("minutes");
-    let replay = replay(config, &bench, released).ends_at(ends_at);
+    let replay = more(replay(config, &bench, released)).ends_at(ends_at);
     let release = TimedMessage::of(released - LATENCY, tid(CENTRAL, 2), tid(CENTRAL, 1), &Release {});
     let outputs = replay.run([release]).expect("nothing panics");
-    let rows = with(&bench, |bench| std::mem::take(&mut bench.rows));
-    Walks { record, rows, outputs }
+    (with(&bench, |bench| std::mem::take(&mut bench.rows)), outputs)
 }
 
 #[test]

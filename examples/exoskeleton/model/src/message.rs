@@ -9,6 +9,8 @@ use serde::{Deserialize, Serialize};
 use sinew::protection::Protection;
 use sinew::{Class, Payload};
 
+use crate::control::torque_law::Gains;
+
 /// From a joint's sensor to its own drive and to central, each millisecond.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct JointSample {
@@ -212,6 +214,8 @@ pub struct DriveTick {
     pub sample: Option<UsedInput>,
     /// The gait state that was used.
     pub gait: Option<UsedInput>,
+    /// The gains that were used; `None`: the standard ones of the joint.
+    pub gains: Option<Gains>,
     /// Computed torque, Nm; `None` while the drive does not know its device's torque. It reaches the device while
     /// central's commands count, or on its way to zero.
     pub torque_nm: Option<f64>,

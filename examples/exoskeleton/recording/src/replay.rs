@@ -1,9 +1,10 @@
 //! The drives, computed again from a recording: the same inputs give the same torques, bit by bit.
 //!
-//! Each [`DriveTick`] names the inputs that a tick has used, with the times that the drive has computed with. So the
-//! tick can be computed again at its own time, on the recorded samples and gait states. No timer and no order of
-//! messages has an influence. The core of the drive ([`DriveCore`](exoskeleton_model::control::drive::DriveCore))
-//! runs, without the shell around it: guards accept only messages that quote their own clock, which no replay has.
+//! Each [`DriveTick`] names the inputs that a tick has used, with the times that the drive has computed with, and the
+//! gains. So the tick can be computed again at its own time, on the recorded samples and gait states. No timer and no
+//! order of messages has an influence. The core of the drive
+//! ([`DriveCore`](exoskeleton_model::control::drive::DriveCore)) runs, without the shell around it: guards accept only
+//! messages that quote their own clock, which no replay has.
 //!
 //! [`replay`] reads the file itself, and reports gaps in it. [`spec`] is the same core as an application, for
 //! `sinew play --check`.
@@ -16,7 +17,6 @@ use std::collections::VecDeque;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-use exoskeleton_model::control::drive::DriveConfig;
 use exoskeleton_model::joint::{Joint, PerJoint};
 use exoskeleton_model::message::{DriveState, DriveTick};
 use sinew::Tid;
@@ -105,14 +105,14 @@ struct WaitingTick {
     tick: DriveTick,
 }
 
-/// Computes the drives of a recording again, each with this configuration. The file is that of a whole walk or of one
-/// node.
+/// Computes the drives of a recording again, with the gains of each tick multiplied by `gain_factor`. The file is that
+/// of a whole walk or of one node.
 ///
 /// # Errors
 /// The file cannot be read, or has no ticks of drives.
-pub fn replay(path: &Path, config: impl Fn(Joint) -> DriveConfig) -> Result<Replayed, ReplayError> {
+pub fn replay(path: &Path, gain_factor: f64) -> Result<Replayed, ReplayError> {
     let mut file = Ordered::open(path)?;
-    let mut drives = Joint::ALL.map(|joint| DriveReplay::new(config(joint)));
+    let mut drives = Joint::ALL.map(|joint| DriveReplay::new(joint, gain_factor));
     let mut inputs = Inputs::default();
     let mut waiting: VecDeque<WaitingTick> = VecDeque::new();
     let mut run =

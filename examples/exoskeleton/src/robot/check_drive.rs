@@ -2,7 +2,6 @@
 
 use std::process::ExitCode;
 
-use exoskeleton_model::control::drive::DriveConfig;
 use exoskeleton_model::joint::Joint;
 use exoskeleton_model::message::DriveTick;
 use exoskeleton_recording::replay;
@@ -33,17 +32,17 @@ pub enum CheckDriveError {
     Start(#[from] StartError),
 }
 
-/// Declares the drive of a joint on a recorded walk. It has no device.
+/// Declares the drive of a joint on a recorded walk, with this factor for its gains. It has no device.
 #[must_use]
-pub fn spec(joint: Joint, config: DriveConfig) -> AppSpec<replay::ReplayedDrive> {
-    replay::spec(drive_name(joint), Tid::group(TICKS), config)
+pub fn spec(joint: Joint, gain_factor: f64) -> AppSpec<replay::ReplayedDrive> {
+    replay::spec(drive_name(joint), Tid::group(TICKS), joint, gain_factor)
 }
 
 /// Runs the check that has started this program, and ends the process with its result.
 ///
 /// # Errors
 /// No check has started this program, or the check cannot begin.
-pub fn run(joint: Joint, config: DriveConfig) -> Result<ExitCode, CheckDriveError> {
+pub fn run(joint: Joint, gain_factor: f64) -> Result<ExitCode, CheckDriveError> {
     if std::env::var_os(VARIABLE).is_none() {
         return Err(CheckDriveError::NotChecked { joint });
     }
@@ -51,5 +50,5 @@ pub fn run(joint: Joint, config: DriveConfig) -> Result<ExitCode, CheckDriveErro
     let builder = builder.configure(|config| PROJECT.clone_into(&mut config.project));
     // The check ends this process. Without a drive of this joint in the recording the command reports that. With a
     // variable that was left behind a node starts which has no device, in the project of no robot.
-    Ok(builder.app(spec(joint, config)).start()?.run())
+    Ok(builder.app(spec(joint, gain_factor)).start()?.run())
 }

@@ -17,17 +17,21 @@
 //! Torque goes to the device through the open guard, or is being ramped to zero. A shut guard stays shut
 //! until central's gait requests otherwise ([`Arm`]), in a state in which central's commands cause no torque.
 //! When the drive is ordered to stop, it ramps the torque to zero first.
+//!
+//! Its gains are parameters: `sinew param` sets them while the leg walks.
 
 mod anomaly;
 mod burden;
 mod command;
 mod damping_repeater;
 mod e_stop;
+mod gains;
 mod order;
 mod tick_record;
 
 use std::io;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use exoskeleton_model::control::drive::{DriveConfig, DriveCore, DriveOutput};
 use exoskeleton_model::joint::Joint;
@@ -39,6 +43,7 @@ use sinew::time::Clock;
 
 use self::command::{Armed, CentralCommands, Output};
 use self::damping_repeater::{DampingRepeater, RepeaterHandle};
+use self::gains::{AnkleGains, DriveGains, HipGains, KneeGains};
 use self::order::Order;
 use super::device::{Damper, DriveCommand, JointDevice};
 use super::edges::{
@@ -85,6 +90,8 @@ pub struct DriveParts {
 pub struct Drive {
     parts: DriveParts,
     core: DriveCore,
+    /// The parameters of the core.
+    gains: Arc<dyn DriveGains>,
     device: Box<dyn JointDevice>,
     damper: Box<dyn Damper>,
     sample: Option<JointSample>,
@@ -115,8 +122,17 @@ pub struct Drive {
 /// Declares the drive of a joint.
 #[must_use]
 pub fn spec(parts: DriveParts, place: Place) -> AppSpec<Drive> {
-    let sensor = sensor_name(parts.joint);
-    AppSpec::new(drive_name(parts.joint), move || Drive::new(parts.clone()))
+    match parts.joint {
+        Joint::Hip => spec_with(parts, place, &HipGains::new()),
+        Joint::Knee => spec_with(parts, place, &KneeGains::new()),
+        Joint::Ankle => spec_with(parts, place, &AnkleGains::new()),
+    }
+}
+
+fn spec_with<G: DriveGains>(parts: DriveParts, place: Place, gains: &Arc<G>) -> AppSpec<Drive> {
+    let (sensor, shared) = (sensor_name(parts.joint), gains.clone());
+    AppSpec::new(drive_name(parts.joint), move || Drive::new(parts.clone(), shared.clone()))
+        .params(gains)
         .handles::<JointSample>()
         .handles::<GaitState>()
         .handles::<TorqueSet>()
@@ -129,10 +145,11 @@ pub fn spec(parts: DriveParts, place: Place) -> AppSpec<Drive> {
 }
 
 impl Drive {
-    fn new(parts: DriveParts) -> Self {
+    fn new(parts: DriveParts, gains: Arc<dyn DriveGains>) -> Self {
         let device = (parts.device)();
         Self {
             core: DriveCore::new(DriveConfig::standard(parts.joint)),
+            gains,
             damper: device.damper(),
             device,
             sensor: Addressee::new(sensor_name(parts.joint)),
@@ -164,7 +181,9 @@ impl Drive {
         if let Some(Err(error)) = self.commands.as_mut().map(|commands| commands.poll(context)) {
             self.report_unguarded(&error);
         }
-        let record = self.tick_record(now, tick, gait.as_ref(), is_shut);
+        let gains = self.gains.get();
+        self.core.set_gains(gains);
+        let record = self.tick_record(now, tick, (gait.as_ref(), is_shut), gains);
         let computed = self.core.tick(now.as_nanos(), self.sample.as_ref(), gait.as_ref());
         self.damped_at_ns = None;
         let command_nm = self.command(context.clock(), now, &computed, gait.as_ref());

@@ -6,6 +6,7 @@ use exoskeleton_model::message::{DriveStatus, DriveTick, FootLoad, GaitMode, Gai
 use exoskeleton_recording::recorder::KnownNames;
 use serde::{Deserialize, Serialize};
 use sinew::message::Kind;
+use sinew::parameters::{ParameterOutcome, SetParameters};
 use sinew::prelude::{Actor, AppContext, Class, Delivery, Duration, Payload, Tid, Time, payload};
 use sinew::protection::Protection;
 
@@ -119,7 +120,9 @@ pub fn names() -> KnownNames {
         named::<GaitState>(),
         named::<GaitStatus>(),
         named::<JointSample>(),
+        named::<ParameterOutcome>(),
         named::<Release>(),
+        named::<SetParameters>(),
         named::<Shut>(),
     ];
     KnownNames { apps: apps.chain([GAIT.to_owned()]).collect(), groups: vec![STATUS, STOP, TICKS], types }

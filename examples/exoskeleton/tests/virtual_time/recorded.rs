@@ -6,7 +6,6 @@ use std::sync::OnceLock;
 
 use exoskeleton::robot::check_drive;
 use exoskeleton::robot::edges::GaitStatus;
-use exoskeleton_model::control::drive::DriveConfig;
 use exoskeleton_model::message::{DriveTick, JointSample};
 use exoskeleton_recording::replay::{Replayed, replay};
 use sinew::replay::{CheckError, Checked};
@@ -31,14 +30,22 @@ impl Drop for TestFile {
     }
 }
 
-/// All messages of a walk in virtual time.
+/// The walk of all tests here.
+pub(super) fn walk_config() -> LockStepConfig {
+    let mut config = LockStepConfig::standard(6, 3, Intention::from_curves(3));
+    config.start_ms = [1, 1, 1];
+    config
+}
+
+/// This walk in the loop and in virtual time.
+pub(super) fn walks() -> &'static Walks {
+    static WALKS: OnceLock<Walks> = OnceLock::new();
+    WALKS.get_or_init(|| both(&walk_config()))
+}
+
+/// All messages of the walk in virtual time.
 fn walk() -> &'static [TimedMessage] {
-    static WALK: OnceLock<Vec<TimedMessage>> = OnceLock::new();
-    WALK.get_or_init(|| {
-        let mut config = LockStepConfig::standard(6, 3, Intention::from_curves(3));
-        config.start_ms = [1, 1, 1];
-        both(&config).outputs
-    })
+    &walks().outputs
 }
 
 fn party(of: Tid) -> Party {
@@ -88,23 +95,17 @@ fn write<'m>(path: &Path, messages: impl IntoIterator<Item = &'m TimedMessage>) 
     bag.finish(end_ns).expect("there is room on the disk");
 }
 
-fn config(joint: Joint, gain: f64) -> DriveConfig {
-    let mut config = DriveConfig::standard(joint);
-    config.law.assist *= gain;
-    config
-}
-
-fn replayed(name: &str, messages: &[&TimedMessage], gain: f64) -> Replayed {
+pub(super) fn replayed(name: &str, messages: &[&TimedMessage], gain: f64) -> Replayed {
     let file = TestFile::new(name);
     write(&file.0, messages.iter().copied());
-    replay(&file.0, |joint| config(joint, gain)).expect("it has ticks")
+    replay(&file.0, gain).expect("it has ticks")
 }
 
 /// Checks the drive of the knee as `sinew play --check` does.
-fn checked(name: &str, messages: &[&TimedMessage], gain: f64) -> Result<Checked, RecordingError> {
+pub(super) fn checked(name: &str, messages: &[&TimedMessage], gain: f64) -> Result<Checked, RecordingError> {
     let file = TestFile::new(name);
     write(&file.0, messages.iter().copied());
-    let drive = check_drive::spec(Joint::Knee, config(Joint::Knee, gain));
+    let drive = check_drive::spec(Joint::Knee, gain);
     Walked::read(&[&file.0])?.turns(DriveTick::NAME).check([drive.into()])
 }
 
@@ -210,7 +211,7 @@ fn recording_without_ticks_is_an_error_with_a_remedy() {
     let file = TestFile::new("none");
     let is_tick = |message: &&TimedMessage| message.kind == DriveTick::KIND;
     write(&file.0, walk().iter().filter(|message| !is_tick(message)).take(100));
-    let error = replay(&file.0, DriveConfig::standard).expect_err("there is nothing to compare");
+    let error = replay(&file.0, 1.0).expect_err("there is nothing to compare");
     assert!(error.to_string().contains("walk.mcap"), "{error}");
 }
 

@@ -25,7 +25,7 @@ use thiserror::Error;
 use super::admission::{Admission, Stamped};
 use super::faults::{DriveCounters, FaultBits};
 use super::ramp::{AssistRamp, RateLimiter};
-use super::torque_law::{LawPhase, TorqueLaw};
+use super::torque_law::{Gains, LawPhase, TorqueLaw};
 use crate::joint::Joint;
 use crate::message::{DriveState, DriveStatus, GaitMode, GaitState, JointSample, TorqueSet};
 
@@ -195,6 +195,12 @@ impl DriveCore {
             sample_age_ns: self.samples.age_ns(now_ns),
             gait_age_ns: self.gait.age_ns(now_ns),
         }
+    }
+
+    /// Sets the gains for the next ticks. The caller changes them gradually; the rate limit of the torque holds in any
+    /// case.
+    pub const fn set_gains(&mut self, gains: Gains) {
+        self.config.law.gains = gains;
     }
 
     /// Stops: from the next tick on the torque ramps to zero, and stays zero until [`DriveCore::reset`].

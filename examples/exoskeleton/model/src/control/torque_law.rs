@@ -1,5 +1,7 @@
 //! The assistance of one joint: a share of the biological moment plus a soft spring and damper on the reference.
 
+use serde::{Deserialize, Serialize};
+
 use crate::gait::curves;
 use crate::joint::Joint;
 
@@ -8,16 +10,35 @@ use crate::joint::Joint;
 pub struct TorqueLaw {
     /// The joint that gives the curves.
     pub joint: Joint,
-    /// Share of the biological moment that the device provides, 0..1. Default 0.4.
-    pub assist: f64,
+    /// The gains, which may change while the leg walks.
+    pub gains: Gains,
     /// Mass of the person, kg; scales the moment curves.
     pub body_mass_kg: f64,
+    /// Largest torque, Nm. Default 45 / 45 / 60.
+    pub limit_nm: f64,
+}
+
+/// The gains of a torque law.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Gains {
+    /// Share of the biological moment that the device provides, 0..1. Default 0.4.
+    pub assistance: f64,
     /// Stiffness toward the reference angle, Nm/rad. Default 120 / 100 / 80.
     pub stiffness_nm_rad: f64,
     /// Damping toward the reference velocity, Nms/rad. Default 6 / 5 / 3.
     pub damping_nms_rad: f64,
-    /// Largest torque, Nm. Default 45 / 45 / 60.
-    pub limit_nm: f64,
+}
+
+impl Gains {
+    /// Returns these gains, all multiplied by this factor.
+    #[must_use]
+    pub const fn times(self, factor: f64) -> Self {
+        Self {
+            assistance: self.assistance * factor,
+            stiffness_nm_rad: self.stiffness_nm_rad * factor,
+            damping_nms_rad: self.damping_nms_rad * factor,
+        }
+    }
 }
 
 /// The phase for the law: its inputs are slightly old, and its torque acts slightly later.
@@ -51,10 +72,8 @@ impl TorqueLaw {
         };
         Self {
             joint,
-            assist: 0.4,
+            gains: Gains { assistance: 0.4, stiffness_nm_rad, damping_nms_rad },
             body_mass_kg: crate::leg::BODY_MASS_KG,
-            stiffness_nm_rad,
-            damping_nms_rad,
             limit_nm,
         }
     }
@@ -68,7 +87,7 @@ impl TorqueLaw {
     /// The share of the biological moment that is fed forward at a phase, Nm.
     #[must_use]
     pub fn feed_forward_nm(&self, phase: f64) -> f64 {
-        self.assist * self.body_mass_kg * curves::moment_nm_per_kg(self.joint, phase)
+        self.gains.assistance * self.body_mass_kg * curves::moment_nm_per_kg(self.joint, phase)
     }
 
     /// As [`TorqueLaw::torque`], around another fed-forward moment, Nm.
@@ -82,8 +101,8 @@ impl TorqueLaw {
     ) -> LimitedTorque {
         let reference = curves::angle_rad(self.joint, phase.at_sample);
         let wanted = feed_forward_nm
-            + self.stiffness_nm_rad * (reference.value - angle_rad)
-            + self.damping_nms_rad * (reference.slope * phase.rate_hz - velocity_rad_s);
+            + self.gains.stiffness_nm_rad * (reference.value - angle_rad)
+            + self.gains.damping_nms_rad * (reference.slope * phase.rate_hz - velocity_rad_s);
         LimitedTorque {
             torque_nm: wanted.clamp(-self.limit_nm, self.limit_nm),
             saturated: wanted.abs() >= self.limit_nm,

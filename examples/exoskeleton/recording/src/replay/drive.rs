@@ -1,6 +1,7 @@
 //! The core of one drive, on recorded ticks.
 
 use exoskeleton_model::control::drive::{DriveConfig, DriveCore};
+use exoskeleton_model::joint::Joint;
 use exoskeleton_model::message::{DriveState, DriveTick, GaitMode};
 
 use super::inputs::DriveInputs;
@@ -10,6 +11,8 @@ use super::{Difference, JointResult, TickResult};
 #[derive(Debug)]
 pub(super) struct DriveReplay {
     config: DriveConfig,
+    /// Factor for the recorded gains.
+    gain_factor: f64,
     /// The core; `None`: its state is not known, as nothing or not everything of it is in the recording.
     core: Option<DriveCore>,
     /// The number of the last tick.
@@ -21,9 +24,9 @@ pub(super) struct DriveReplay {
 }
 
 impl DriveReplay {
-    pub(super) fn new(config: DriveConfig) -> Self {
-        let result = JointResult::default();
-        Self { config, core: None, last: None, began_ns: None, result, differs_ns: 0 }
+    pub(super) fn new(joint: Joint, gain_factor: f64) -> Self {
+        let (config, result) = (DriveConfig::standard(joint), JointResult::default());
+        Self { config, gain_factor, core: None, last: None, began_ns: None, result, differs_ns: 0 }
     }
 
     /// Returns the time of the first tick, ns.
@@ -68,6 +71,7 @@ impl DriveReplay {
             self.begin(tick, inputs);
         }
         let core = self.core.as_mut()?;
+        core.set_gains(tick.gains.unwrap_or(self.config.law.gains).times(self.gain_factor));
         let computed = match compute(core, tick, inputs) {
             Ok(computed) => computed,
             Err(missing) => {
@@ -160,7 +164,6 @@ fn compute(
 
 #[cfg(test)]
 mod tests {
-    use exoskeleton_model::joint::Joint;
     use exoskeleton_model::message::{GaitState, JointSample, Stance};
 
     use super::*;
@@ -197,8 +200,8 @@ mod tests {
 
     /// Runs the drive of a robot on these inputs, and replays its ticks without the first one.
     fn replayed_from_the_second(inputs: &[(u64, JointSample, GaitState)]) -> JointResult {
-        let config = DriveConfig::standard(Joint::Hip);
-        let (mut robot, mut replay) = (DriveCore::new(config), DriveReplay::new(config));
+        let mut robot = DriveCore::new(DriveConfig::standard(Joint::Hip));
+        let mut replay = DriveReplay::new(Joint::Hip, 1.0);
         let mut recorded = DriveInputs::default();
         for ((t_ns, sample, gait), seq) in inputs.iter().zip(1..) {
             recorded.samples.push_back(*sample);
@@ -214,6 +217,7 @@ mod tests {
                 is_shut: false,
                 sample: Some(sample.into()),
                 gait: Some(gait.into()),
+                gains: None,
                 torque_nm: output.command_nm,
                 assist_gain: output.assist_gain,
                 state: output.state,

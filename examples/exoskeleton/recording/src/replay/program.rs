@@ -1,6 +1,6 @@
 //! The core of a drive as an application under test, for `sinew play --check`.
 
-use exoskeleton_model::control::drive::DriveConfig;
+use exoskeleton_model::joint::Joint;
 use exoskeleton_model::message::{DriveTick, GaitState, JointSample};
 use sinew::app::Raw;
 use sinew::prelude::*;
@@ -21,12 +21,13 @@ pub struct ReplayedDrive {
     is_gap_reported: bool,
 }
 
-/// Declares the drive of this name, which sends its ticks to the group `ticks`. The check must deliver its recorded
-/// ticks to it: `--turns exo.drive_tick`, or [`Replay::turns`](sinew::replay::Replay::turns).
+/// Declares the drive of this name and joint, which sends its ticks to the group `ticks`. It computes them with the
+/// recorded gains, multiplied by `gain_factor`. The check must deliver its recorded ticks to it: `--turns
+/// exo.drive_tick`, or [`Replay::turns`](sinew::replay::Replay::turns).
 #[must_use]
-pub fn spec(name: String, ticks: Tid, config: DriveConfig) -> AppSpec<ReplayedDrive> {
+pub fn spec(name: String, ticks: Tid, joint: Joint, gain_factor: f64) -> AppSpec<ReplayedDrive> {
     let drive = move || ReplayedDrive {
-        replay: DriveReplay::new(config),
+        replay: DriveReplay::new(joint, gain_factor),
         inputs: DriveInputs::default(),
         ticks,
         is_gap_reported: false,

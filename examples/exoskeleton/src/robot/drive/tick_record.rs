@@ -1,6 +1,7 @@
 //! The record of a tick, from which a recording computes it again.
 
 use exoskeleton_model::control::drive::DriveOutput;
+use exoskeleton_model::control::torque_law::{Gains, TorqueLaw};
 use exoskeleton_model::message::{DriveTick, GaitState};
 use sinew::prelude::*;
 
@@ -8,13 +9,13 @@ use super::{Drive, micros};
 use crate::robot::edges::TICKS;
 
 impl Drive {
-    /// Returns the inputs of a tick that is about to be computed, if ticks are recorded.
+    /// Returns the inputs and the gains of a tick that is about to be computed, if ticks are recorded.
     pub(super) fn tick_record(
         &self,
         now: Time,
         tick: Tick,
-        gait: Option<&GaitState>,
-        is_shut: bool,
+        (gait, is_shut): (Option<&GaitState>, bool),
+        gains: Gains,
     ) -> Option<DriveTick> {
         self.parts.sends_ticks.then(|| DriveTick {
             joint: self.parts.joint.index() as u8,
@@ -25,6 +26,7 @@ impl Drive {
             is_shut,
             sample: self.sample.as_ref().map(Into::into),
             gait: gait.map(Into::into),
+            gains: (gains != TorqueLaw::standard(self.parts.joint).gains).then_some(gains),
             torque_nm: None,
             assist_gain: 0.0,
             state: self.core.state(),
