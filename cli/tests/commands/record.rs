@@ -241,7 +241,8 @@ fn type_of_a_client_alone_is_printed_and_has_a_view_by_its_schema() {
     let mut views = Vec::new();
     while let Some(item) = reader.next_item().expect("it can be read") {
         if let Item::Message(message) = item
-            && message.channel.topic == "/sensor/commands.client_only/view"
+            && message.channel.topic.starts_with("/sensor/commands.client_only/")
+            && message.channel.topic.ends_with("/view")
         {
             let schema = message.channel.schema.as_ref().map(|schema| schema.encoding.clone());
             views.push((message.channel.encoding.clone(), schema));

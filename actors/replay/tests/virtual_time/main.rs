@@ -53,9 +53,7 @@ pub(crate) fn notes(outputs: &[TimedMessage]) -> Vec<(Duration, String)> {
 }
 
 pub(crate) fn text(output: &TimedMessage) -> String {
-    // A map of one field: its value is the rest.
-    let text = String::from_utf8_lossy(&output.payload).into_owned();
-    text.split_once("text").unwrap().1.chars().skip(1).collect()
+    rmp_serde::from_slice::<Note>(&output.payload).unwrap().text
 }
 
 /// A controller: a torque each millisecond, from the newest angle, and none without one for 20 ms.

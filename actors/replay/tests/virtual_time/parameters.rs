@@ -84,12 +84,7 @@ impl Actor for Tuner {
 /// The torques, each with its time since the start.
 fn torques(outputs: &[TimedMessage]) -> Vec<(Duration, f64)> {
     let torques = outputs.iter().filter(|output| output.kind == Torque::KIND);
-    // The payload is a map: its value of eight bytes is behind the name of its field.
-    let value = |payload: &[u8]| {
-        let name = b"newton_metres";
-        let at = payload.windows(name.len()).position(|window| window == name).unwrap() + name.len() + 1;
-        f64::from_be_bytes(payload[at..at + 8].try_into().unwrap())
-    };
+    let value = |payload: &[u8]| rmp_serde::from_slice::<Torque>(payload).unwrap().newton_metres;
     torques.map(|output| (output.at.since(START), value(&output.payload))).collect()
 }
 
