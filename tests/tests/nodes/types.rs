@@ -11,7 +11,7 @@ use std::{
 use sinew::{
     Endpoint, MismatchPolicy, NodeApi, Registration,
     inspect::{AskMismatches, AskSchemas, MismatchReport, MismatchesReport, SchemasReport},
-    message::{Kind, Rejection, Sender},
+    message::{Kind, Rejection, SendError, Sender},
     prelude::*,
     serde::{Deserialize, Serialize},
 };
@@ -315,10 +315,15 @@ fn application_is_refused_by_the_declaration_of_a_client() {
     let sender = probe.sender();
     let declared = sent::Declared { torque: 9.0 };
     until("the message for the client is refused", || {
-        // The client takes no message: only the routing table answers.
-        let message = sender.message(client.tid(), &declared).confirmed(Duration::from_millis(50));
-        let outcome = wait(message.expect("its node takes it"));
-        (outcome == Outcome::Rejected(Rejection::Malformed)).then_some(())
+        // The client takes no message: only the routing table answers, at once.
+        match sender.message(client.tid(), &declared).confirmed(Duration::from_millis(50)) {
+            Err(SendError::Rejected(Rejection::Malformed)) => Some(()),
+            Err(why) => panic!("another refusal: {why}"),
+            Ok(receipt) => {
+                wait(receipt);
+                None
+            }
+        }
     });
     // When: the client has ended. Then: nothing of it is left for the next owner of its address.
     let (node, tid) = (hip.handle().address(), client.tid());

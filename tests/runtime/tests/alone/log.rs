@@ -5,8 +5,8 @@ use std::{
     time::Duration,
 };
 
-use sinew_runtime::log;
-use tracing::{Level, Metadata, subscriber::with_default};
+use sinew_runtime::log::{self, LogObserver, observe};
+use tracing::{Level, Metadata, level_filters::LevelFilter, subscriber::with_default};
 
 use super::{alone, reader::Reader};
 
@@ -47,5 +47,32 @@ fn log_is_complete_and_ordered_and_never_blocks() {
         go_on.send(()).expect("it waits for this");
         log::flush(DEADLINE);
         assert_eq!(more.try_iter().count(), 1_024);
+    });
+}
+
+/// Keeps the texts of all events.
+#[derive(Default)]
+struct Texts(Mutex<Vec<String>>);
+
+impl LogObserver for Texts {
+    fn wrote(&self, _: Level, _: &str, text: &str) {
+        self.0.lock().unwrap().push(text.to_owned());
+    }
+}
+
+/// The start of a further node in a process sets the level.
+#[test]
+fn place_that_has_logged_logs_again_after_the_level_was_set() {
+    alone("log::place_that_has_logged_logs_again_after_the_level_was_set", || {
+        let texts = Arc::new(Texts::default());
+        let observer: Arc<dyn LogObserver> = texts.clone();
+        assert!(observe(&observer));
+        // One place of the code, and a target of Sinew: the default log has no others.
+        let warn = |text: &str| log::warn!(target: "sinew::test", "{text}");
+        warn("before");
+        log::set_level(LevelFilter::INFO);
+        warn("after");
+        log::flush(DEADLINE);
+        assert_eq!(*texts.0.lock().unwrap(), ["before", "after"]);
     });
 }
