@@ -61,8 +61,8 @@ impl Step {
     }
 }
 
-/// Converts a time of a node's monotonic clock by these steps. Returns the time on the other clock, and how wrong it may
-/// be.
+/// Converts a time of a node's monotonic clock by these steps. Returns the time on the other clock, and how wrong
+/// it may be.
 pub(crate) fn convert(steps: &[Step], at_ns: i128) -> (i128, u64) {
     steps.iter().fold((at_ns, 0_u64), |(at_ns, bound_ns), step| {
         let (at_ns, further_ns) = step.convert(at_ns);

@@ -84,8 +84,8 @@ impl Source {
 /// The clock is that of the first file's node. The times of others are converted by the clock readings in the files,
 /// also across a third node; the metadata record `sinew.merged` states how wrong they may be, and the names of `files`.
 ///
-/// The order of a merged file is that of its times, so its tallies do not prove it complete: [`check()`](crate::check())
-/// refuses it. Check `files` before.
+/// The order of a merged file is that of its times, so its tallies do not prove it complete:
+/// [`check()`](crate::check()) refuses it. Check `files` before.
 ///
 /// # Errors
 /// A file cannot be read, `out` exists or cannot be written, or no clock reading connects a node with the reference. A

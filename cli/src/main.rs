@@ -1,11 +1,11 @@
 //! `sinew`: shows a running system, from any one node of it.
 //!
 //! It connects through a node's socket like any other program, and asks each node's inspection (`sinew::inspect`)
-//! through ordinary messages. It changes nothing, except that `send` sends messages and `reload` makes a node read its
-//! access list again, and `param` sets parameters of applications. `record` has the node record its messages, and writes them to a file. `play` sends them
-//! again, by a node of its own unless told otherwise. `keys` asks no node: it creates the files by which nodes
-//! authenticate each other. `bag` reads the files of recordings. `view` keeps asking all nodes, for programs that
-//! read their metrics.
+//! through ordinary messages. It changes nothing, except that `send` sends messages, `reload` makes a node read
+//! its access list again, and `param` sets parameters of applications. `record` has the node record its messages,
+//! and writes them to a file. `play` sends them again, by a node of its own unless told otherwise. `keys` asks no
+//! node: it creates the files by which nodes authenticate each other. `bag` reads the files of recordings. `view`
+//! keeps asking all nodes, for programs that read their metrics.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)] // `output` prints: the macros panic where a pipe is closed or a disk is full.
 

@@ -44,6 +44,7 @@ impl NodeLabels {
                 *known = name;
             }
         };
+        snapshot.entry.iter().for_each(|entry| add(entry.node, &entry.name));
         snapshot.answers().for_each(|answers| add(answers.node.node, &answers.node.name));
         snapshot.nodes.iter().for_each(|one| add(one.node, &one.name));
         for report in snapshot.entry.iter().chain(snapshot.answers().map(|answers| &answers.node)) {

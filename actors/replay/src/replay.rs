@@ -168,9 +168,9 @@ impl Replay {
         self
     }
 
-    /// Sets the type by which the applications record their turns: the time, and the inputs that were used. Each gets its
-    /// recorded messages of this type back, at the times at which they were sent, and computes the turn again.
-    /// [`check`](Self::check) compares only messages of this type.
+    /// Sets the type by which the applications record their turns: the time, and the inputs that were used. Each
+    /// gets its recorded messages of this type back, at the times at which they were sent, and computes the turn
+    /// again. [`check`](Self::check) compares only messages of this type.
     ///
     /// For programs whose outputs depend on how late a timer was on the wall clock. No replay has these times.
     ///

@@ -23,8 +23,8 @@
 //!
 //! [`state_files`] writes the files in which a node keeps its state.
 //!
-//! Everything here is pure except the reading and writing of files ([`files`], [`state_files`]). The time is an argument, or comes from the
-//! [`TimeProvider`](rustls::time_provider::TimeProvider) of the caller.
+//! Everything here is pure except the reading and writing of files ([`files`], [`state_files`]). The time is an
+//! argument, or comes from the [`TimeProvider`](rustls::time_provider::TimeProvider) of the caller.
 
 pub mod access;
 mod certificate;

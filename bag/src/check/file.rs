@@ -156,8 +156,8 @@ pub(super) fn read<R: Read>(mut reader: Reader<R>, offsets: &mut Offsets) -> Res
     Ok(checked)
 }
 
-/// Returns why a merged file is refused: a merged file has the order of its times, and a tally is true only in the order
-/// in which its file was written.
+/// Returns why a merged file is refused: a merged file has the order of its times, and a tally is true only in the
+/// order in which its file was written.
 fn merged(file: &str, former: Option<&String>) -> BagError {
     let former = former.map_or_else(String::new, |former| format!(": {former}"));
     BagError::Unfit(format!(

@@ -37,8 +37,8 @@ pub fn is_on(level: Level) -> bool {
 /// Registers the default log as a reader of events. It is never a thread's default subscriber.
 fn begin_default() {
     static BEGUN: Once = Once::new();
-    // The calls of `tracing` to a new subscriber cause no event. While there is a single one, `tracing` asks the default
-    // of the calling thread in its place, and so would switch off all places of the code that log.
+    // The calls of `tracing` to a new subscriber cause no event. While there is a single one, `tracing` asks the
+    // default of the calling thread in its place, and so would switch off all places of the code that log.
     BEGUN.call_once(|| _ = [Reader::Default, Reader::Subscriber].map(recorder));
 }
 

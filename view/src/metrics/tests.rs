@@ -22,7 +22,7 @@ use crate::snapshot::{Answers, NodeAnswers, Snapshot};
 const TAKEN: Time = Time::from_nanos(5_000_000_000);
 const NOW: Time = Time::from_nanos(5_500_000_000);
 /// All names of labels.
-const LABELS: [&str; 6] = ["node", "peer", "class", "outcome", "why", "app"];
+const LABELS: [&str; 7] = ["node", "peer", "class", "outcome", "why", "app", "quantile"];
 
 fn node(last: u8) -> NodeAddress {
     NodeAddress::from([10, 0, 0, last])

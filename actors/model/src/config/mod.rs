@@ -69,9 +69,9 @@ pub struct NodeConfig {
     /// Default: the address of the first [`NdlConfig::interface`]. Set it if several nodes share a host, or
     /// if that interface is chosen by its name.
     pub address: Option<NodeAddress>,
-    /// Directory for the state that the node keeps from one start to the next: the addresses at which its
-    /// peers answered, and kept parameters; 1 to 4,096 bytes. It is created if only itself is missing, with mode 0700. Nodes of
-    /// one user may share one. Default: none, the node keeps nothing.
+    /// Directory for the state that the node keeps from one start to the next: the addresses at which its peers
+    /// answered, and kept parameters; 1 to 4,096 bytes. It is created if only itself is missing, with mode 0700.
+    /// Nodes of one user may share one. Default: none, the node keeps nothing.
     pub state: Option<PathBuf>,
     /// Maximum number of messages in an application's mailbox, per class. 1 to 65,536; default 256.
     pub mailbox_capacity: usize,

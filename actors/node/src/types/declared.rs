@@ -194,8 +194,8 @@ impl Declared {
         is_one(&of).then(|| of.first().cloned())?
     }
 
-    /// Returns the structure with this hash that a process has declared for a type. Those of guests are last: a structure
-    /// with the hash of another one can be constructed.
+    /// Returns the structure with this hash that a process has declared for a type. Those of guests are last: a
+    /// structure with the hash of another one can be constructed.
     pub(super) fn schema_of_hash(&self, kind: Kind, hash: SchemaHash) -> Option<Structure> {
         let [own, guests] = [false, true].map(|of_guests| self.declared_of(kind, of_guests));
         let mut structures = own.into_iter().chain(guests).filter_map(|one| one.schema());

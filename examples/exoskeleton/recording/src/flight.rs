@@ -75,8 +75,9 @@ struct Ring {
     span: FrozenSpan,
 }
 
-/// Writes the spans in `frozen` as files, each span into a folder of its ID there. `journals` has a folder for each node
-/// with its journal. To be called when all nodes of this host have ended. Copies that are files now are removed.
+/// Writes the spans in `frozen` as files, each span into a folder of its ID there. `journals` has a folder for each
+/// node with its journal. To be called when all nodes of this host have ended. Copies that are files now are
+/// removed.
 #[must_use]
 pub fn gather(frozen: &Path, journals: &Path) -> Frozen {
     let mut found = Frozen::default();
@@ -223,8 +224,8 @@ fn remove(journal: &Path) {
     }
 }
 
-/// Removes the journal that this process has written into `folder`, and the folder. To be called when its node has ended.
-/// The journal of an earlier process that was killed stays.
+/// Removes the journal that this process has written into `folder`, and the folder. To be called when its node has
+/// ended. The journal of an earlier process that was killed stays.
 ///
 /// # Errors
 /// The system's error. Then the folder stays.

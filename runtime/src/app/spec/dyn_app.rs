@@ -55,8 +55,8 @@ impl DynApp {
         self.common.parameters.as_ref()
     }
 
-    /// Has `notify` called on the application's thread after each change of a kept parameter. It must not wait. Only the
-    /// first call has an effect.
+    /// Has `notify` called on the application's thread after each change of a kept parameter. It must not wait.
+    /// Only the first call has an effect.
     pub fn on_kept_change(&self, notify: impl Fn() + Send + Sync + 'static) {
         let _ = self.common.on_kept.set(Box::new(notify));
     }

@@ -86,8 +86,8 @@ impl DriveInputs {
         push(&mut self.samples, sample);
     }
 
-    /// Keeps a gait state, from its source to its destination in the envelope of its protection. One that cannot be read
-    /// is missing.
+    /// Keeps a gait state, from its source to its destination in the envelope of its protection. One that cannot be
+    /// read is missing.
     pub(super) fn keep_gait(&mut self, (source, destination): (Tid, Tid), sealed: &Bytes) {
         let opened = open(&DataId::of::<GaitState>(source, destination), sealed);
         if let Some(gait) = opened.and_then(|(_, payload)| decode(&payload)) {
