@@ -11,15 +11,22 @@ use sinew_runtime::{
     time::Time,
 };
 
-use super::{
-    Reason,
-    apps::App,
-    directory::Directory,
-    start_barrier::{FIRST_AFTER, Findings},
-};
+use super::{Reason, apps::App, directory::Directory};
 
 /// Maximum number of names that are listed for a requirement with a pattern or alternatives.
 const NAMED_MAX: usize = 8;
+/// Time until a required name without an application is logged. At a normal start of a robot its nodes have
+/// found each other by then.
+pub(super) const FIRST_AFTER: Duration = Duration::from_secs(2);
+
+/// The results of the start-up barrier's last evaluation.
+#[derive(Debug, Default)]
+pub(super) struct Findings {
+    /// The names and patterns required here that an application has had at some time.
+    pub(super) former_names: BTreeSet<String>,
+    /// The existing cycles, each without its closing name.
+    pub(super) cycles: BTreeSet<Vec<String>>,
+}
 
 /// A view of the readiness of all known applications.
 #[derive(Clone, Copy, Debug)]

@@ -17,7 +17,6 @@ use sinew_runtime::{
 };
 
 pub use self::cycles::cycle_of;
-pub(super) use self::unknown_names::FIRST_AFTER;
 use self::{
     changes::{absence, changes, is_free},
     cycles::Graph,
@@ -31,7 +30,7 @@ use super::{
     grace_period::Moment,
     outputs::Outputs,
     peers::Peers,
-    readiness::Readiness,
+    readiness::{Findings, Readiness},
 };
 
 /// Time for which a requirement may be unreachable, its node not lost, before a running application is
@@ -45,15 +44,6 @@ pub(super) struct StartBarrier {
     findings: Findings,
     rejected: RejectedOutputs,
     unknown_names: UnknownNames,
-}
-
-/// The results of the last evaluation.
-#[derive(Debug, Default)]
-pub(super) struct Findings {
-    /// The names and patterns required here that an application has had at some time.
-    pub(super) former_names: BTreeSet<String>,
-    /// The existing cycles, each without its closing name.
-    pub(super) cycles: BTreeSet<Vec<String>>,
 }
 
 impl StartBarrier {

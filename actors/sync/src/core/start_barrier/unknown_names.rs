@@ -9,11 +9,13 @@ use sinew_runtime::{
     time::Time,
 };
 
-use crate::core::{Output, Reason, grace_period::Moment, outputs::Outputs, readiness::Readiness};
+use crate::core::{
+    Output, Reason,
+    grace_period::Moment,
+    outputs::Outputs,
+    readiness::{FIRST_AFTER, Readiness},
+};
 
-/// Time until a required name without an application is logged. At a normal start of a robot its nodes have
-/// found each other by then.
-pub(in crate::core) const FIRST_AFTER: Duration = Duration::from_secs(2);
 /// Time until the same requirement is logged again.
 const AGAIN_AFTER: Duration = Duration::from_secs(300);
 
