@@ -137,51 +137,66 @@ fn sources(crate_folder: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// Returns the folders at the top of a crate, each with those that it imports.
+/// Returns the folders of a crate, at every depth, each with those beside it that it imports.
 fn imports(crate_folder: &Path) -> BTreeMap<String, BTreeSet<String>> {
-    let folders: BTreeSet<_> = fs::read_dir(crate_folder)
-        .expect("the folder is readable")
-        .filter_map(|entry| Some(entry.ok()?.path()))
-        .filter(|path| path.is_dir())
-        .filter_map(|path| Some(path.file_name()?.to_string_lossy().into_owned()))
-        .collect();
-    let mut arrows: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+    let (mut files, mut folders) = (Vec::new(), BTreeSet::new());
     for file in sources(crate_folder) {
         let path = file.strip_prefix(crate_folder).expect("it is in the folder");
-        let first = path.components().next().expect("it has a name");
-        let from =
-            Path::new(first.as_os_str()).file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        if !folders.contains(&from) {
-            continue;
+        let parents = path.ancestors().skip(1).filter(|parent| *parent != Path::new(""));
+        folders.extend(parents.map(module));
+        files.push((module(path), fs::read_to_string(&file).expect("a source is text")));
+    }
+    let mut arrows: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+    for (module, text) in files {
+        for named in named(&text, &module) {
+            let shared = module.iter().zip(&named).take_while(|(one, other)| one == other).count();
+            let (Some(from), Some(to)) = (module.get(..=shared), named.get(..=shared)) else { continue };
+            if folders.contains(from) && folders.contains(to) {
+                arrows.entry(from.join("::")).or_default().insert(to.join("::"));
+            }
         }
-        let depth = path.components().count() - usize::from(path.ends_with("mod.rs"));
-        let text = fs::read_to_string(&file).expect("a source is text");
-        let named = top_modules(&text, depth).into_iter();
-        let others = named.filter(|name| folders.contains(name) && *name != from);
-        arrows.entry(from.clone()).or_default().extend(others);
     }
     arrows
 }
 
-/// Returns the modules at the top of a crate that a file names outside of its unit tests, by `crate::`, or by
-/// `super::` for each of the `depth` modules that it is in.
-fn top_modules(text: &str, depth: usize) -> BTreeSet<String> {
+/// Returns the module that a folder or a source of a crate is, by the names from the top.
+fn module(path: &Path) -> Vec<String> {
+    let path = if path.ends_with("mod.rs") { path.parent().unwrap_or(path) } else { path };
+    let path = path.with_extension("");
+    path.iter().map(|name| name.to_string_lossy().into_owned()).collect()
+}
+
+/// Returns the items that the file of a module names outside of its unit tests, by `crate::` or by `super::`, each by
+/// its names from the top of the crate.
+fn named(text: &str, module: &[String]) -> Vec<Vec<String>> {
     let code = text.split("#[cfg(test)]\nmod ").next().unwrap_or_default();
-    let mut found = BTreeSet::new();
-    for prefix in ["crate::".to_owned(), "super::".repeat(depth)] {
-        for (at, _) in code.match_indices(&prefix) {
-            let line_start = code[..at].rfind('\n').map_or(0, |end| end + 1);
-            if code[line_start..at].trim_start().starts_with("//") {
-                continue;
-            }
-            let rest = &code[at + prefix.len()..];
-            let names = rest.strip_prefix('{').map_or_else(|| vec![rest], members);
-            let is_letter = |letter: &char| letter.is_alphanumeric() || *letter == '_';
-            found
-                .extend(names.into_iter().map(|name| name.chars().take_while(is_letter).collect::<String>()));
-        }
+    let lines = code.lines().filter(|line| !line.trim_start().starts_with("//"));
+    let code = lines.collect::<Vec<_>>().join("\n");
+    let from_the_top = code.split("crate::").skip(1).map(|rest| (0, rest));
+    let supers = code.match_indices("super::").filter(|(at, _)| !code[..*at].ends_with("super::"));
+    let from_here = supers.filter_map(|(at, _)| {
+        let rest = code[at..].trim_start_matches("super::");
+        let above = (code[at..].len() - rest.len()) / "super::".len();
+        Some((module.len().checked_sub(above)?, rest))
+    });
+    from_the_top
+        .chain(from_here)
+        .flat_map(|(kept, rest)| paths(rest).into_iter().map(move |path| [&module[..kept], &path].concat()))
+        .collect()
+}
+
+/// Returns the paths at the start of a text: `one::two` is one, and `one::{two, three::four}` are two.
+fn paths(text: &str) -> Vec<Vec<String>> {
+    if let Some(group) = text.strip_prefix('{') {
+        return members(group).into_iter().flat_map(paths).collect();
     }
-    found
+    let is_letter = |letter: char| letter.is_alphanumeric() || letter == '_';
+    let rest = text.trim_start_matches(is_letter);
+    let name = text[..text.len() - rest.len()].to_owned();
+    match rest.strip_prefix("::") {
+        Some(rest) => paths(rest).into_iter().map(|path| [vec![name.clone()], path].concat()).collect(),
+        None => vec![vec![name]],
+    }
 }
 
 /// Returns the members of an import's group, which follows the opening brace.
@@ -230,9 +245,11 @@ fn sibling_folders_import_in_one_direction() {
 #[test]
 fn rules_find_planted_circles() {
     assert_eq!(members("one::Thing, two::{A, B}, three}; more, of"), ["one::Thing", "two::{A, B}", "three"]);
-    let text = "use crate::{one::A, two};\nuse super::super::three::B;\n// crate::four\nuse super::five;\n";
-    assert_eq!(top_modules(text, 2).into_iter().collect::<Vec<_>>(), ["one", "three", "two"]);
-    assert!(top_modules("use super::five;\n", 1).contains("five"));
+    let text = "use crate::{one::A, two};\nuse super::super::three::B;\n// crate::four\nuse super::{five};\n";
+    let named: Vec<_> =
+        named(text, &module(Path::new("six/seven.rs"))).iter().map(|path| path.join("::")).collect();
+    assert_eq!(named, ["one::A", "two", "three::B", "six::five"]);
+    assert_eq!(module(Path::new("six/seven/mod.rs")), ["six", "seven"]);
     let arrow = |from: &str, to: &str| (from.to_owned(), BTreeSet::from([to.to_owned()]));
     let straight = BTreeMap::from([arrow("one", "two"), arrow("two", "three")]);
     assert_eq!(circle(&straight), None);
