@@ -7,7 +7,7 @@ use std::time::Duration;
 use clap::{Parser, Subcommand};
 use exoskeleton::output;
 use exoskeleton::report::{self, Report, RunDescription, RunMode, Verdict};
-use exoskeleton::robot::check_drive::{self, CheckDriveError};
+use exoskeleton::robot::edges::{TICKS, drive_name};
 use exoskeleton::robot::launch::{self, LaunchError, LaunchOptions};
 use exoskeleton::robot::node::{self, NodeError, NodeOptions};
 use exoskeleton::robot::plant::{self, PlantError};
@@ -16,7 +16,9 @@ use exoskeleton::run_folder;
 use exoskeleton_model::joint::Joint;
 use exoskeleton_model::lockstep::{self, LockStepConfig, LockStepError};
 use exoskeleton_model::part::Kill;
+use exoskeleton_recording::replay::check_drive::{self, CheckDriveError};
 use exoskeleton_recording::replay::{self, ReplayError};
+use sinew::Tid;
 use thiserror::Error;
 
 /// A powered leg of four nodes and a simulated person.
@@ -174,7 +176,8 @@ pub(crate) fn run(arguments: &Arguments) -> Result<ExitCode, RunError> {
     match &arguments.command {
         Some(SubCommand::Node(options)) => return Ok(node::run(options)?),
         Some(SubCommand::CheckDrive { joint, gain_factor }) => {
-            return Ok(check_drive::run(*joint, *gain_factor)?);
+            let drive = replay::spec(drive_name(*joint), Tid::group(TICKS), *joint, *gain_factor);
+            return Ok(check_drive::run(*joint, drive)?);
         }
         None => {}
     }

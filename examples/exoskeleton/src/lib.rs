@@ -9,7 +9,6 @@
 #![warn(clippy::print_stdout, clippy::print_stderr)] // `output` prints: the macros panic if a pipe is closed or a disk is full.
 
 pub mod output;
-pub mod plot;
 pub mod report;
 pub mod robot;
 pub mod run_folder;

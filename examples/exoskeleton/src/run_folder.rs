@@ -5,8 +5,8 @@ use std::io::{self, BufWriter};
 use std::path::{Path, PathBuf};
 
 use exoskeleton_model::record::Record;
+use exoskeleton_recording::plot::{Figure, Lateness, figure};
 
-use crate::plot::{Figure, Lateness, figure};
 use crate::report::{Report, RunDescription, RunMode, Verdict};
 
 /// Writes the three files into `folder`, which is created if needed, and the report also to `report_too`.

@@ -11,13 +11,13 @@ use std::time::Duration;
 
 use exoskeleton::output;
 use exoskeleton::robot::launch::LaunchError;
-use exoskeleton::robot::launch::flight::FlightFolders;
 use exoskeleton::robot::role::Role;
-use exoskeleton::robot::topology::{self, DrivePlace, ReleaseBy, Topology};
+use exoskeleton::robot::topology::{self, DrivePlace, FlightRecorder, ReleaseBy, Topology};
 use exoskeleton::run_folder;
 use exoskeleton_model::joint::Joint;
 use exoskeleton_model::lockstep::LockStepError;
 use exoskeleton_model::part::Part;
+use exoskeleton_recording::flight::FlightFolders;
 use serde::Serialize;
 use sinew::{NodeAddress, Outcome, Time};
 use thiserror::Error;
@@ -144,7 +144,7 @@ pub(crate) fn run(options: &FaultOptions) -> Result<FaultReport, FaultError> {
         // A killed node is to be found in the records of all; the other steps save the time for that.
         let is_recorded = left.contains(&Step::PullNode);
         let flight = is_recorded.then(|| FlightFolders::create(&folder)).transpose()?;
-        topology.record = flight.as_ref().map(FlightFolders::places);
+        topology.record = flight.as_ref().map(FlightRecorder::from);
         let robot = Robot::start(&topology, (None, flight), &folder)?;
         left = one_robot(options, robot, &folder, left, &mut report)?;
     }

@@ -1,9 +1,9 @@
 //! The same fault with and without a device watchdog, side by side on the same scales: angle, torque, states.
 
-use exoskeleton::plot::{BAND_COLOR, FAULT_COLOR};
 use exoskeleton_model::gait::band::Band;
 use exoskeleton_model::joint::Joint;
 use exoskeleton_model::message::DriveState;
+use exoskeleton_recording::plot::{BAND_COLOR, FAULT_COLOR};
 use sinew_figures::canvas::{Anchor, Axis, Canvas, Panel, Stroke};
 
 const WIDTH: f64 = 1240.0;

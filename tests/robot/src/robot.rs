@@ -7,7 +7,6 @@ use std::{fs, io};
 
 use exoskeleton::robot::launch::children::Children;
 use exoskeleton::robot::launch::console::{Console, View};
-use exoskeleton::robot::launch::flight::FlightFolders;
 use exoskeleton::robot::launch::{BARRIER_PATIENCE, LINES_MAX};
 use exoskeleton::robot::role::Role;
 use exoskeleton::robot::topology::Topology;
@@ -15,7 +14,7 @@ use exoskeleton::run_folder;
 use exoskeleton_model::joint::Joint;
 use exoskeleton_model::message::{DriveState, GaitMode};
 use exoskeleton_model::part::Part;
-use exoskeleton_recording::flight::Frozen;
+use exoskeleton_recording::flight::{FlightFolders, Frozen};
 use rustix::process::Pid;
 use sinew::Time;
 use sinew_testkit::{Carried, Weather};

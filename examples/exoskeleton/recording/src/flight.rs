@@ -4,6 +4,8 @@
 //! copies become MCAP files, after the nodes have ended. A killed node has not copied anything: its span is written
 //! out of its journal, which its next incarnation has kept, or which still lies in memory.
 
+mod folders;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::fs;
@@ -15,6 +17,8 @@ use sinew::inspect::{FrozenFacts, FrozenSpan};
 use sinew_recorder::{
     Compression, FileOptions, FrozenRing, JournalReader, Owners, RecordingError, RingOrigin, Start,
 };
+
+pub use folders::FlightFolders;
 
 /// Maximum number of files of a folder that are looked at.
 const FILES_MAX: usize = 4_096;

@@ -7,8 +7,9 @@
 //! messages that quote their own clock, which no replay has.
 //!
 //! [`replay`] reads the file itself, and reports gaps in it. [`spec`] is the same core as an application, for
-//! `sinew play --check`.
+//! `sinew play --check`, and [`check_drive`] is its process.
 
+pub mod check_drive;
 mod drive;
 mod inputs;
 mod program;

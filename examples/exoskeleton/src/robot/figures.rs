@@ -1,12 +1,12 @@
 //! Timing figures of a control loop, with an error of at most a tenth of a per cent and bounded memory.
 
 use exoskeleton_model::message::DriveState;
+use exoskeleton_recording::plot::Lateness;
 use hdrhistogram::Histogram;
 use sinew_figures::stalls::LATE_MAX;
 
 use super::PERIOD;
 use super::trace::DriveRow;
-use crate::plot::Lateness;
 use crate::report::{LoopSummary, PercentilesUs};
 
 /// Maximum time that is resolved, us.

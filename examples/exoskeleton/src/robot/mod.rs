@@ -23,9 +23,8 @@
 //! interface), [`sensor`], [`drive`], [`gait`], [`coordinator`], [`watch`] (the applications: thin shells
 //! around the cores), [`node`] (a process with some of them), [`plant`] (the process that simulates hardware
 //! and person), [`launch`] (all five on this host). [`trace`] is the record of each. `slots` has the place of each
-//! loop in the millisecond. [`check_drive`] is a drive on a recorded walk.
+//! loop in the millisecond.
 
-pub mod check_drive;
 pub mod coordinator;
 pub mod device;
 pub mod drive;

@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use exoskeleton_model::joint::PerJoint;
 use exoskeleton_model::part::Part;
+use exoskeleton_recording::flight::FlightFolders;
 use serde::{Deserialize, Serialize};
 use sinew::config::{Interfaces, Seed};
 use sinew::{NodeAddress, NodeConfig};
@@ -101,6 +102,12 @@ pub struct FlightRecorder {
     /// Folder of the frozen spans: at most 16 of each node, of at most 8 MiB. Each node creates it if needed. It may
     /// lie on a disk.
     pub frozen_folder: PathBuf,
+}
+
+impl From<&FlightFolders> for FlightRecorder {
+    fn from(folders: &FlightFolders) -> Self {
+        Self { folder: folders.journals().to_owned(), frozen_folder: folders.frozen().to_owned() }
+    }
 }
 
 /// The source of the release to walk, at the start and after the loss of a part.

@@ -4,10 +4,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-use exoskeleton::robot::check_drive;
-use exoskeleton::robot::edges::GaitStatus;
+use exoskeleton::robot::edges::{GaitStatus, TICKS};
 use exoskeleton_model::message::{DriveTick, JointSample};
-use exoskeleton_recording::replay::{Replayed, replay};
+use exoskeleton_recording::replay::{Replayed, replay, spec};
 use sinew::replay::{CheckError, Checked};
 use sinew_bag::{BagWriter, ChannelInfo, Class, Direction, Options, Origin, Party, Record as BagRecord};
 use sinew_player::{Recording as Walked, RecordingError};
@@ -105,7 +104,7 @@ pub(super) fn replayed(name: &str, messages: &[&TimedMessage], gain: f64) -> Rep
 pub(super) fn checked(name: &str, messages: &[&TimedMessage], gain: f64) -> Result<Checked, RecordingError> {
     let file = TestFile::new(name);
     write(&file.0, messages.iter().copied());
-    let drive = check_drive::spec(Joint::Knee, gain);
+    let drive = spec(drive_name(Joint::Knee), Tid::group(TICKS), Joint::Knee, gain);
     Walked::read(&[&file.0])?.turns(DriveTick::NAME).check([drive.into()])
 }
 

@@ -9,11 +9,11 @@ use exoskeleton_model::message::DriveState;
 use exoskeleton_model::metrics::{Counting, Metrics};
 use exoskeleton_model::part::Part;
 use exoskeleton_model::record::{JointRow, Outage, Record, Row, Stall};
+use exoskeleton_recording::plot::Lateness;
 use sinew::Time;
 use sinew_figures::stalls::{CpuTimes, Evidence, HostCpu, HostStall, Testimony, merged};
 
 use super::LaunchError;
-use crate::plot::Lateness;
 use crate::report::{
     HostFigures, KillFigures, LoopSummary, RealTimeFigures, Report, RunDescription, Timing, UnstalledFigures,
 };

@@ -1,4 +1,4 @@
-//! Tests of `src/robot/launch/flight.rs`.
+//! Tests of the folders.
 
 use super::*;
 
@@ -10,9 +10,9 @@ fn journals_of_two_runs_are_apart_and_removed() {
     fs::create_dir_all(&second).unwrap();
     // given
     let (one, other) = (FlightFolders::create(&first).unwrap(), FlightFolders::create(&second).unwrap());
-    let (one_folder, other_folder) = (one.places().folder, other.places().folder);
+    let (one_folder, other_folder) = (one.journals().to_owned(), other.journals().to_owned());
     assert_ne!(one_folder, other_folder);
-    assert!(one_folder.is_dir() && one.places().frozen_folder.is_dir());
+    assert!(one_folder.is_dir() && one.frozen().is_dir());
     // when: a killed node has left its journal
     fs::create_dir(one_folder.join("knee")).unwrap();
     fs::write(one_folder.join("knee/sinew-leg-127.0.0.3.journal"), "cut off").unwrap();

@@ -255,5 +255,5 @@ fn broken(points: Vec<(f64, f64)>, jump: f64, gap: f64) -> Vec<(f64, f64)> {
 }
 
 #[cfg(test)]
-#[path = "../tests/unit/picture.rs"]
+#[path = "plot_tests.rs"]
 mod tests;

@@ -5,9 +5,7 @@ use std::io;
 use std::os::unix::fs::DirBuilderExt as _;
 use std::path::{Path, PathBuf};
 
-use exoskeleton_recording::flight::{Frozen, gather};
-
-use crate::robot::topology::FlightRecorder;
+use super::{Frozen, gather};
 
 /// The folder of files in memory: on a disk the system would stop a sender while it stores a page.
 const MEMORY: &str = "/dev/shm";
@@ -46,10 +44,16 @@ impl FlightFolders {
         Ok(folders)
     }
 
-    /// Returns the section of the topology.
+    /// Returns the folder in memory, for a journal of each node.
     #[must_use]
-    pub fn places(&self) -> FlightRecorder {
-        FlightRecorder { folder: self.journals.clone(), frozen_folder: self.frozen.clone() }
+    pub fn journals(&self) -> &Path {
+        &self.journals
+    }
+
+    /// Returns the folder of the frozen spans.
+    #[must_use]
+    pub fn frozen(&self) -> &Path {
+        &self.frozen
     }
 
     /// Writes the frozen spans as files. To be called when all nodes have ended.
@@ -77,5 +81,5 @@ fn create(folder: &Path) -> io::Result<()> {
 }
 
 #[cfg(test)]
-#[path = "../../../tests/unit/flight.rs"]
+#[path = "folders_tests.rs"]
 mod tests;

@@ -1,4 +1,4 @@
-//! Tests of `src/plot/figure.rs`.
+//! Tests of the picture.
 
 use exoskeleton_model::intention::Intention;
 use exoskeleton_model::lockstep::{LockStepConfig, run};
