@@ -14,7 +14,7 @@
 //! | `value` | a value of any of the three types |
 //! | `tuner` | staging, application at a tick, slopes, undo |
 //! | `kept` | values that survive a restart of the node |
-//! | [`file`] | values as TOML |
+//! | [`mod@file`] | values as TOML |
 //! | `messages` | the messages between tools and applications |
 
 mod descriptor;
