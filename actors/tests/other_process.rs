@@ -142,7 +142,7 @@ fn requirement_is_awaited_lost_and_met_again() {
     let (node, seen) = start_node(&socket);
     assert!(seen.try_recv().is_err(), "the drive does not start before the sensor is there");
 
-    let mut sensor = start_process("sensor", &socket);
+    let mut sensor = start_process("process_of_the_sensor", &socket);
     expect(&seen, "started");
     expect(&seen, "angle 12.5");
 
@@ -151,7 +151,7 @@ fn requirement_is_awaited_lost_and_met_again() {
     sensor.wait().unwrap();
     expect(&seen, "Lost { name: \"sensor\" }");
 
-    let mut sensor = start_process("sensor", &socket);
+    let mut sensor = start_process("process_of_the_sensor", &socket);
     // One report comes from the sync manager and the other from the sensor, in any order.
     let mut both = [seen.recv_timeout(WATCHDOG).unwrap(), seen.recv_timeout(WATCHDOG).unwrap()];
     both.sort();
@@ -198,7 +198,7 @@ fn comes_back_to_a_killed_node(transport: Transport) {
     let name = format!("sinew-returns-{transport:?}-{}", std::process::id());
     let directory = Directory(std::env::temp_dir().join(name));
     let socket = directory.0.join("knee.sock");
-    let mut node = start_process("lone_node", &socket);
+    let mut node = start_process("process_of_a_lone_node", &socket);
     let api = until("the node", || NodeApi::connect(&socket).ok());
     let registration = Registration::new().name("drive").transport(transport);
     let mut endpoint = api.register_transport_address(registration).unwrap();
@@ -214,7 +214,7 @@ fn comes_back_to_a_killed_node(transport: Transport) {
     assert!(endpoint.receive(Duration::from_millis(5)).unwrap().is_none(), "it waits for the node's return");
     assert_eq!(endpoint.registrations(), 1);
     // When
-    let mut node = start_process("lone_node", &socket);
+    let mut node = start_process("process_of_a_lone_node", &socket);
     // Then: it has reconnected with its name and address, and any sender reaches it
     until("the endpoint's return", || {
         endpoint.receive(Duration::from_millis(50)).unwrap();
@@ -255,7 +255,7 @@ async fn a_task_comes_back(transport: Transport) {
     let name = format!("sinew-task-returns-{transport:?}-{}", std::process::id());
     let directory = Directory(std::env::temp_dir().join(name));
     let socket = directory.0.join("knee.sock");
-    let mut node = start_process("lone_node", &socket);
+    let mut node = start_process("process_of_a_lone_node", &socket);
     let api = until("the node", || NodeApi::connect(&socket).ok());
     let registration = Registration::new().name("drive").transport(transport);
     let mut endpoint = api.register_transport_address_async(registration.clone()).await.unwrap();
@@ -271,7 +271,7 @@ async fn a_task_comes_back(transport: Transport) {
     let told = endpoint.send(tid, &Angle { degrees: 1.0 }).await.unwrap_err();
     assert!(matches!(told, ApiError::Disconnected(_)), "{told}");
     // When: the node returns while the endpoint waits
-    let mut node = start_process("lone_node", &socket);
+    let mut node = start_process("process_of_a_lone_node", &socket);
     // A fixed address is of another range: the first dynamic registration gets the former dynamic one.
     let fixed = Registration::new().fixed_address(AppAddress::fixed(9).unwrap());
     let other = tokio::task::spawn_blocking(move || {
@@ -309,7 +309,7 @@ async fn a_task_comes_back(transport: Transport) {
 
 #[test]
 #[ignore = "a process of the tests above, not a test"]
-fn lone_node() {
+fn process_of_a_lone_node() {
     let Some(socket) = std::env::var_os(SOCKET) else { return };
     let _node = Node::builder("knee")
         .configure(|config| {
@@ -326,7 +326,7 @@ fn lone_node() {
 
 #[test]
 #[ignore = "a process of the test above, not a test"]
-fn sensor() {
+fn process_of_the_sensor() {
     let Some(socket) = std::env::var_os(SOCKET) else { return };
     let api = NodeApi::connect(socket).unwrap();
     let mut sensor = api.register_transport_address(Registration::new().name("sensor")).unwrap();

@@ -55,7 +55,7 @@ fn payloads(path: &Path) -> (u64, bool) {
 }
 
 #[test]
-fn full_disk_is_reported_once_and_a_new_part_follows_when_there_is_room() {
+fn full_disk_is_reported_once_and_new_part_follows() {
     let disk = match SmallDisk::mount() {
         Ok(disk) => disk,
         Err(reason) => {

@@ -242,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn answers_of_all_nodes_give_each_structure_and_the_difference() {
+    fn answers_of_all_nodes_give_structures_and_their_difference() {
         let silent = answer(3, Err("no answer".to_owned()));
         let answers = vec![answer(1, Ok(of(true))), answer(2, Ok(of(false))), silent];
         let report = report("demo.gains", &Structures::of(answers));

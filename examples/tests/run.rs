@@ -157,7 +157,7 @@ fn guarded_motor_moves_once_armed_and_ends_safe() {
 }
 
 #[test]
-fn gains_are_refused_outside_their_range_and_move_to_a_legal_value() {
+fn illegal_gains_are_refused_and_legal_ones_reached() {
     let printed = Scenario::new().run("gains");
     let [refused, applied, reached] = &printed[..] else { panic!("{printed:?}") };
     assert_eq!(refused, "refused: assistance = 1.4 is outside 0.0 to 1.0");

@@ -136,7 +136,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn arithmetic_saturates() {
+    fn arithmetic_saturates_at_both_ends() {
         assert_eq!(Time::ZERO - Duration::from_secs(1), Time::ZERO);
         assert_eq!(Time::MAX + Duration::from_secs(1), Time::MAX);
         assert_eq!(Time::from_nanos(5).since(Time::from_nanos(9)), Duration::ZERO);

@@ -6,6 +6,7 @@
 use std::{
     collections::{BTreeMap, BTreeSet},
     fs,
+    ops::RangeInclusive,
     path::{Path, PathBuf},
 };
 
@@ -17,6 +18,8 @@ const WHAT_MAX: usize = 3;
 const WIDTH_MAX: usize = 120;
 /// Maximum lines of a source file: the parts of a longer one are files of their own.
 const LINES_MAX: usize = 500;
+/// Words of a test's name: enough for a claim, and few enough for a list of tests.
+const NAME_WORDS: RangeInclusive<usize> = 3..=9;
 /// Folders without sources of this project.
 const SKIPPED: [&str; 4] = ["target", ".git", "corpus", "docs"];
 
@@ -271,6 +274,39 @@ fn names_of_errors_end_in_error() {
     assert_eq!(excepted.len(), NO_ERRORS.len(), "an exception has gone: take it out of the list");
 }
 
+/// Returns the names of a file's tests, with their lines. A name that a macro receives is not in its text.
+fn test_names(text: &str) -> Vec<(usize, String)> {
+    let (mut is_test, mut names) = (false, Vec::new());
+    for (number, line) in (1..).zip(text.lines()) {
+        let line = line.trim_start();
+        is_test |= line.starts_with("#[test]") || line.starts_with("#[tokio::test");
+        let mut words = line.split_whitespace();
+        if is_test && !line.starts_with(['#', '/']) && words.any(|word| word == "fn") {
+            names.extend(words.next().map(|name| (number, first_word(name))));
+            is_test = false;
+        }
+    }
+    names.retain(|(_, name)| !name.is_empty());
+    names
+}
+
+/// Returns the tests of a file whose names have too few or too many words.
+fn unfit_test_names(Source { path, text }: &Source) -> Vec<String> {
+    let names = test_names(text).into_iter();
+    let unfit = names.filter(|(_, name)| !NAME_WORDS.contains(&name.split('_').count()));
+    unfit.map(|(line, name)| format!("{}:{line}: {name}", path.display())).collect()
+}
+
+#[test]
+fn names_of_tests_are_short_claims() {
+    let sources = sources();
+    let found: usize = sources.iter().map(|source| test_names(&source.text).len()).sum();
+    assert!(found > 1_000, "only {found} tests were found: are the attributes right?");
+    let unfit: Vec<_> = sources.iter().flat_map(unfit_test_names).collect();
+    let (least, most) = (NAME_WORDS.start(), NAME_WORDS.end());
+    assert!(unfit.is_empty(), "say the claim in {least} to {most} words:\n{}", unfit.join("\n"));
+}
+
 #[test]
 fn rules_find_planted_violations() {
     let text = "/// Tells who asked.\nfn ask() {}\n// What he sent, and `whom` it names.\n";
@@ -281,6 +317,14 @@ fn rules_find_planted_violations() {
     assert_eq!(wide_lines(&planted(&wide)), ["tests/planted.rs:1"]);
     let named = banned_names(&planted("// a Roster\nlet x: Roster = is_rostered();\n"));
     assert_eq!(named, ["tests/planted.rs:2: Roster: say SupervisorHandle"]);
+    let tests = [
+        "#[test]\nfn it_works() {}\nfn helper() {}",
+        "#[test]\n#[ignore = \"a fn of one\"]\nfn one_two_three() {}",
+        "#[tokio::test]\nasync fn a_b_c_d_e_f_g_h_i_j() {}",
+        "#[test]\nfn $claim() {}",
+    ];
+    let unfit = ["tests/planted.rs:2: it_works", "tests/planted.rs:8: a_b_c_d_e_f_g_h_i_j"];
+    assert_eq!(unfit_test_names(&planted(&tests.join("\n"))), unfit);
     let derived = "#[derive(Debug, thiserror::Error)]\n#[error(\"a struct\")]\npub(crate) enum Trouble {\n";
     assert_eq!(error_types(derived), ["Trouble"]);
     assert_eq!(error_types("impl fmt::Error for One {}\n// impl Error for Two {}\n"), ["One"]);

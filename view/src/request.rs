@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn host_is_required_once_and_holds_for_a_full_address_too() {
+    fn host_is_required_once_also_for_full_address() {
         assert_eq!(asked(Method::GET, "/", &[], LOOPBACK), Err(RequestError::NoHost));
         let two = [(HOST, "localhost"), (HOST, "evil.example")];
         assert_eq!(asked(Method::GET, "/", &two, LOOPBACK), Err(RequestError::NoHost));
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn each_page_has_its_path_and_all_else_is_refused() {
+    fn each_page_has_its_path_and_others_are_refused() {
         let own = [(HOST, "localhost")];
         let open = Ok(Document::Metrics(Format::OpenMetrics));
         assert_eq!(asked(Method::GET, "/metrics?x=1", &own, LOOPBACK), open);

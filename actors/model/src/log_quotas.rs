@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn suppressed_line_requests_checks_and_a_written_one_does_not() {
+    fn suppressed_line_requests_checks_but_written_line_does_not() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().expect("a runtime");
         let (checks, polled) = (Arc::<PeriodicChecks>::default(), Cell::new(0));
         let quotas = LogQuotas::new(&checks);

@@ -92,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn offered_event_is_notified_of_the_next_room_of_any_queue() {
+    fn offered_event_is_notified_of_room_in_any_queue() {
         let notifier = Arc::<RoomNotifier>::default();
         let of_messages = notifier.waker();
         let _full = notifier.event_waker();

@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn legal_values_are_restored_and_those_of_other_applications_stay() {
+    fn legal_values_are_restored_and_other_applications_keep_theirs() {
         let directory = Directory::new();
         let text = "[hip]\ngain = 0.25\n\n[knee]\ngain = 7.0\nsteps = 9\n";
         directory.put("parameters", 0o600, text);

@@ -193,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn parameters_are_set_on_an_open_node_on_loopback_or_by_the_list_alone() {
+    fn parameters_need_open_loopback_node_or_list() {
         let state = |interface: Ipv4Addr| {
             let mut config = NodeConfig::new("knee");
             config.ndl.interface = interface.into();

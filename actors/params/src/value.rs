@@ -87,13 +87,13 @@ mod tests {
     }
 
     #[test]
-    fn text_that_is_no_value_is_refused_with_the_legal_forms() {
+    fn invalid_text_is_refused_with_the_legal_forms() {
         let why = "fast".parse::<Value>().expect_err("it is a word");
         assert!(why.to_string().contains("'fast' is no value: write a number as in 0.4"), "{why}");
     }
 
     #[test]
-    fn whole_number_is_a_number_only_if_it_is_exact() {
+    fn whole_number_is_accepted_only_if_exact() {
         assert_eq!(Value::Integer(4).as_number(), Some(4.0));
         assert_eq!(Value::Integer(i64::MAX).as_number(), None);
         assert_eq!(Value::Flag(true).as_number(), None);

@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn long_payload_is_left_out_and_its_length_is_not() {
+    fn long_payload_is_left_out_but_its_length_stays() {
         for (bytes, shown) in [(0, 0), (OBSERVED_BYTES_MAX, OBSERVED_BYTES_MAX), (OBSERVED_BYTES_MAX + 1, 0)]
         {
             let observed = Observed { missed: 3, ..Observed::of(&header(), &vec![1; bytes], true) };

@@ -405,7 +405,7 @@ mod tests {
         assert_eq!(order.messages_of(&BTreeSet::from([own])).len(), 1);
     }
     #[test]
-    fn stated_start_counts_from_the_first_message_of_the_applications() {
+    fn stated_start_counts_from_the_first_application_message() {
         let own = Tid::from_bits(message(0).source);
         let at = |arrived_ns, destination: Tid| RecordedMessage {
             source: message(0).destination,

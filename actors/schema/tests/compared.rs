@@ -273,7 +273,7 @@ fn schema() -> impl Strategy<Value = Schema> {
 
 proptest! {
     #[test]
-    fn bytes_are_read_back_and_equal_schemas_have_equal_hashes(one in schema(), other in schema()) {
+    fn bytes_are_read_back_and_equal_schemas_hash_equally(one in schema(), other in schema()) {
         prop_assert_eq!(Schema::parse(&one.encode()), Ok(one.clone()));
         prop_assert_eq!(one == other, one.hash() == other.hash());
     }

@@ -62,7 +62,7 @@ enum Innermost {
 }
 
 #[test]
-fn enums_in_lists_maps_and_options_are_traced_to_the_end() {
+fn enums_in_lists_maps_and_options_are_traced_completely() {
     let words = "{
     legs: list of Gains,
     mode: optional Mode, may be absent,
@@ -102,7 +102,7 @@ PhantomData = nothing
 }
 
 #[test]
-fn fields_that_may_be_absent_are_found_in_variants_too() {
+fn optional_fields_are_found_in_variants_too() {
     let schema = Schema::of::<Mode>().unwrap();
     let Shape::Enum(variants) = &schema.root else { panic!("{schema}") };
     let Shape::Struct(fields) = &variants[2].shape else { panic!("{schema}") };
@@ -150,7 +150,7 @@ fn types_that_occur_in_themselves_have_a_name() {
 }
 
 #[test]
-fn other_names_of_a_field_or_variant_are_left_out() {
+fn aliases_of_fields_and_variants_are_left_out() {
     #[derive(Serialize, Deserialize)]
     struct Angle {
         #[serde(alias = "angle", alias = "a")]

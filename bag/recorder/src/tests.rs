@@ -178,7 +178,7 @@ fn numbers_in_another_order_are_not_missing() {
 }
 
 #[test]
-fn messages_of_others_and_of_the_recorder_are_left_out() {
+fn messages_of_others_and_recorder_are_left_out() {
     let selection = Selection { apps: vec!["hip".to_owned()], ..Selection::default() };
     let mut bench = Bench::new("selected", selection);
     let arm = Channel { source: tid(0x1003), destination: tid(0x1004), ..angles() };
@@ -296,7 +296,7 @@ fn first_message_waits_for_the_structure_of_its_type() {
 }
 
 #[test]
-fn message_of_an_unknown_type_is_written_without_an_answer() {
+fn message_of_unknown_type_is_written_without_an_answer() {
     let mut bench = Bench::new("unanswered", Selection::default());
     let torque = Channel { kind: Kind::named("test.torque"), ..angles() };
     let other = Channel { destination: tid(0x1003), ..torque };

@@ -287,7 +287,7 @@ fn incarnation_that_is_recorded_later_is_no_finding() {
 }
 
 #[test]
-fn messages_between_two_recordings_of_a_node_are_no_finding() {
+fn messages_between_two_recordings_give_no_finding() {
     let folder = TestFolder::new();
     let files = ["one.mcap", "first.mcap", "second.mcap"].map(|name| folder.path(name));
     incarnation(&files[0], ("127.0.0.2", 1), Direction::Sent, 1..=80);
@@ -382,7 +382,7 @@ fn dropped_messages_of_all_recordings_count_together() {
 }
 
 #[test]
-fn merged_file_is_refused_with_the_names_of_its_files() {
+fn merged_file_is_refused_with_names_of_its_files() {
     let folder = TestFolder::new();
     let files = ["one.mcap", "again.mcap"].map(|name| folder.path(name));
     files.iter().for_each(|path| sent(path));

@@ -108,7 +108,7 @@ fn parquet_keeps_types() {
 }
 
 #[test]
-fn payload_with_nested_keys_or_long_paths_is_one_value() {
+fn payload_with_nested_keys_or_long_paths_stays_whole() {
     let long = "a".repeat(600);
     let long = long.as_str();
     let long_path = rmp_serde::to_vec_named(&serde_json::json!({ long: { long: 1 } })).unwrap();

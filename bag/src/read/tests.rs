@@ -54,7 +54,7 @@ fn every_compression_is_read() {
 }
 
 #[test]
-fn file_that_is_cut_anywhere_is_read_up_to_there() {
+fn file_cut_anywhere_is_read_up_to_the_cut() {
     let folder = TestFolder::new();
     let bytes = fs::read(written(&folder, Options::default())).unwrap();
     let whole = read(&bytes).0;

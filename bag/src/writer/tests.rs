@@ -115,7 +115,7 @@ fn size_is_limited_and_reported_once() {
 }
 
 #[test]
-fn failed_write_is_reported_once_and_a_new_part_follows() {
+fn failed_write_is_reported_once_and_new_part_follows() {
     let folder = TestFolder::new();
     let file = folder.path("walk.mcap");
     // Without `replace` the name of the folder below would be skipped.

@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn bars_are_sorted_and_show_the_least_of_several_runs() {
+    fn bars_are_sorted_and_show_the_minimum_run() {
         let mut first = run("M", took("tcp", 30_000));
         first.results.push(took("sinew_nodes_io_thread", 21_000));
         let merged = Merged::new(vec![first, run("M", took("tcp", 20_000))]).unwrap();

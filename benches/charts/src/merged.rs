@@ -138,7 +138,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn figure_is_the_median_of_the_runs_with_the_least() {
+    fn figure_is_the_median_of_the_lowest_runs() {
         let of = |times: &[u64]| Merged::new(times.iter().copied().map(took).collect()).unwrap().p50(CASE);
         assert_eq!(of(&[30, 10, 20]), Some(Summary { least: 10, median: 20, runs: 3 }));
         assert_eq!(of(&[30, 10]), Some(Summary { least: 10, median: 20, runs: 2 }));

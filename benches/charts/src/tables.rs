@@ -78,7 +78,7 @@ mod tests {
     }
 
     #[test]
-    fn ratios_are_to_the_bare_path_and_to_the_peer() {
+    fn ratios_are_to_bare_path_and_to_peer() {
         let mut run = run("M", took("tcp", 10_000));
         run.results.extend([took("zenoh", 40_000), took("sinew_nodes_io_thread", 20_000)]);
         let table = peers(&Merged::new(vec![run]).unwrap());

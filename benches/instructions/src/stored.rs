@@ -85,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn count_is_judged_by_three_percent_of_its_stored_figure() {
+    fn count_may_differ_by_three_percent_from_stored_figure() {
         let of = |count| Verdict::of(count, Some(1_000));
         assert_eq!([of(1_029), of(1_030)], [Verdict::Same, Verdict::Grown]);
         assert_eq!([of(971), of(970)], [Verdict::Same, Verdict::Shrunk]);

@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn missed_turn_is_a_finding_with_the_fixes_that_are_left() {
+    fn missed_turn_is_reported_with_the_remaining_fixes() {
         let late = of(&[30, 1_000]).summary();
         let found = lateness_check(&host(), 0, &late);
         assert!(found.detail.starts_with("ordinary schedule: 2 turns, p50 30 us"), "{}", found.detail);

@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn sealed_message_of_any_channel_stays_in_the_own_project() {
+    fn sealed_message_of_any_channel_stays_in_its_project() {
         let channel = channel();
         let data_id = DataId { source: channel.source, destination: channel.destination, name: "demo.angle" };
         let sealed = seal(&data_id, Stamp { counter: 1, incarnation: 7, echo: Time::ZERO }, &[5]);

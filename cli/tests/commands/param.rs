@@ -18,7 +18,7 @@ fn parameter<'a>(json: &'a Value, name: &str) -> &'a Value {
 }
 
 #[test]
-fn set_names_the_tick_at_which_the_application_has_it() {
+fn set_names_the_tick_at_which_it_applies() {
     // Given
     let scenario = Scenario::new();
     let mut knee = scenario.start("knee", 2, &["--tuned"]);
@@ -100,7 +100,7 @@ fn saved_values_are_loaded_again() {
 }
 
 #[test]
-fn set_from_another_node_goes_through_the_socket_of_the_application() {
+fn set_from_another_node_uses_the_application_socket() {
     // Given: an open robot of two nodes on one host, in one folder
     let scenario = Scenario::new();
     let mut hip = scenario.start("hip", 1, &["--requires", "knee"]);

@@ -180,7 +180,7 @@ fn node_finishes_the_file_of_its_configuration() {
 }
 
 #[test]
-fn node_without_a_place_for_its_file_serves_and_fails_at_its_end() {
+fn node_without_recording_folder_serves_and_fails_at_end() {
     let scenario = Scenario::new();
     let file = scenario.directory.join("absent/{node}.mcap");
     let section = format!("[record]\nfile = \"{}\"\nkeep_bytes = 1048576\n[ndl]", file.display());
@@ -212,7 +212,7 @@ fn program_records_its_node() {
 payload!("commands.client_only" => struct ClientOnly { milliamperes: u32 });
 
 #[test]
-fn type_of_a_client_alone_is_printed_and_has_a_view_by_its_schema() {
+fn type_known_only_to_client_is_printed_and_viewed() {
     // Given: a node in another process, which knows the type by the client's declaration alone
     let scenario = Scenario::new();
     let _knee = scenario.start("knee", 2, &[]);

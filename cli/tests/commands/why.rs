@@ -140,7 +140,7 @@ mod renamed {
 }
 
 #[test]
-fn client_with_a_renamed_field_is_named_by_its_own_node_and_by_another_one() {
+fn client_with_renamed_field_is_named_by_each_node() {
     let scenario = Scenario::new();
     let _hip = scenario.start("hip", 1, &["--requires", "knee"]);
     let _knee = scenario.start("knee", 2, &[]);

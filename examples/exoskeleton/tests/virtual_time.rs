@@ -228,7 +228,7 @@ fn walk_of_apps(
 }
 
 #[test]
-fn actors_in_virtual_time_give_the_torques_of_the_loop() {
+fn actors_in_virtual_time_match_torques_of_the_loop() {
     let mut config = LockStepConfig::standard(6, 3, Intention::from_curves(3));
     // An application's first turn is one period after its start.
     config.start_ms = [1, 1, 1];

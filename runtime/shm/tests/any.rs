@@ -206,7 +206,7 @@ fn place_of_an_ended_ring_is_given_again() {
 }
 
 #[test]
-fn end_of_a_peer_of_a_set_is_reported_after_its_messages() {
+fn end_of_peer_in_set_is_reported_after_messages() {
     let set = WaitSet::create().expect("pages");
     let (mut ends, mut peers) = sides_of(&set, 3);
     let mut second = peers.remove(1);

@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn wakes_have_the_order_of_their_times_then_of_their_setting() {
+    fn wakes_are_ordered_by_time_then_by_setting() {
         let time = VirtualTime::starting_at(ms(1));
         let (woken, waker) = digits();
         let clock = time.clock();

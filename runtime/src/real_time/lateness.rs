@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn band_has_its_bound_and_what_is_later_has_the_next_one() {
+    fn each_lateness_is_counted_in_its_band() {
         let us = Duration::from_micros;
         let bands = of(&[1_500, 15_000, 30_000, 90_000]).bands();
         let expected = [(2, 1), (5, 0), (10, 0), (20, 1), (50, 1), (100, 1)];
@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn lateness_beyond_the_histogram_is_counted_and_its_maximum_is_exact() {
+    fn lateness_beyond_histogram_is_counted_with_exact_maximum() {
         let lateness = of(&[1, 3 * LATENESS_MAX_NS]);
         assert_eq!(lateness.summary().max, Duration::from_secs(180));
         assert_eq!(lateness.bands().last().map(|band| band.turns), Some(1));

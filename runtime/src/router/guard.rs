@@ -190,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn parameters_are_set_by_the_senders_with_the_right_alone() {
+    fn parameters_are_set_only_by_senders_with_right() {
         let (router, route) = (Router::new(NODE), Arc::new(Sink));
         router.set_local(HEIR, LocalRoute { sink: route, events: Arc::new([]) });
         let (here, elsewhere) = (NODE, NodeAddress::new(0x7f00_0002));

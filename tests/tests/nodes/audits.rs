@@ -148,7 +148,7 @@ fn client_messages_are_counted_until_after_its_end() {
 }
 
 #[test]
-fn messages_on_direct_links_are_counted_until_after_their_end() {
+fn messages_on_direct_links_stay_counted_after_their_end() {
     const MESSAGES: u64 = 20;
     // Given: two clients with a direct link
     let (directory, loopback) = (TestDirectory::new(), Loopback::new());

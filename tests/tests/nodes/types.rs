@@ -259,7 +259,7 @@ fn ask_as<Q: Payload, R: Payload>(client: &mut Endpoint, node: NodeAddress, ques
 }
 
 #[test]
-fn client_is_refused_in_words_by_its_own_node_and_by_another_one() {
+fn client_is_refused_in_words_by_each_node() {
     for is_of_same_node in [true, false] {
         // Given: a client, and the application that handles its type with a renamed field
         let (loopback, directory, handled) = (Loopback::new(), TestDirectory::new(), Arc::default());

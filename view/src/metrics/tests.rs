@@ -259,7 +259,7 @@ fn value(text: &str, sample: &str) -> f64 {
 }
 
 #[test]
-fn each_metric_has_samples_with_its_own_labels_in_both_formats() {
+fn each_metric_has_its_own_labels_in_both_formats() {
     for format in [Format::OpenMetrics, Format::PlainText] {
         let text = encode(&snapshot(), NOW, format).expect("it is written to memory");
         for metric in METRICS {

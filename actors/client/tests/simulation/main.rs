@@ -122,12 +122,12 @@ fn busy_peers_end_with_one_open_link(links: DirectLinks) {
 }
 
 #[test]
-fn busy_peers_that_always_have_links_end_with_one_open_link() {
+fn busy_peers_with_permanent_links_keep_one_open_link() {
     busy_peers_end_with_one_open_link(DirectLinks::Always);
 }
 
 #[test]
-fn busy_peers_with_automatic_links_end_with_one_open_link() {
+fn busy_peers_with_automatic_links_keep_one_open_link() {
     busy_peers_end_with_one_open_link(DirectLinks::Automatic);
 }
 

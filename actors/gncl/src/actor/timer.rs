@@ -98,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn timer_fires_at_the_earliest_time_and_is_set_again() {
+    fn timer_fires_at_earliest_time_and_is_set_again() {
         run(async |mut alarm| {
             let timer = CoreTimer::default();
             timer.set(Time::now() + LONG);

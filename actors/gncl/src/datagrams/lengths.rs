@@ -432,7 +432,7 @@ mod tests {
     }
 
     #[test]
-    fn lost_length_is_probed_and_used_again_if_it_arrives() {
+    fn lost_length_is_probed_and_reused_if_it_arrives() {
         let mut lengths = Lengths::new();
         lengths.probe_both();
         pass(&mut lengths, 0, 1, DATAGRAM_MAX);

@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn blocked_path_is_warned_of_once_for_a_living_peer() {
+    fn blocked_path_of_a_living_peer_is_logged_once() {
         let mut path = Path::new();
         path.announced(at(0));
         assert_eq!(probes(&mut path, 30_000, false).1, 0, "it is frozen: nothing is known of the network");

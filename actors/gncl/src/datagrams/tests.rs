@@ -259,7 +259,7 @@ fn answer_to_a_former_address_is_ignored() {
 
 // spec: DATAGRAM-7
 #[test]
-fn acknowledged_value_proves_the_length_of_its_datagram_if_sent_once() {
+fn acknowledged_value_proves_its_length_if_sent_once() {
     let mut outgoing = outgoing(9, 1_000, 8);
     outgoing.submit(1, 1, 100, Time::MAX).unwrap();
     assert_eq!(sent(&mut outgoing, NOW), [100]);

@@ -214,7 +214,7 @@ impl AppLifecycle for Revoked {
 
 // spec: WILL-5
 #[test]
-fn wills_of_a_revoked_node_are_dropped_before_its_loss() {
+fn wills_of_revoked_nodes_are_dropped_before_their_loss() {
     run(async {
         let (mut a, b, _cable) = two(&keys()).await;
         let (incarnation, revoked) = ((b.address(), Incarnation(1)), Arc::new(Revoked::default()));

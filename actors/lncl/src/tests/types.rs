@@ -11,7 +11,7 @@ fn declaration(schema: Vec<u8>) -> TypeDeclaration {
 
 // spec: LNCL-21
 #[test]
-fn declaration_reaches_the_node_and_a_refused_one_costs_nothing_else() {
+fn declaration_reaches_node_and_refusal_costs_nothing_else() {
     let node = TestNode::start();
     let types = node.with_types();
     let (mut client, tid) = RawClient::register(&node, &Register::default());

@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_note_is_shown_at_once_and_later_ones_together() {
+    fn first_note_is_shown_immediately_and_later_ones_together() {
         let mut lines = LogLines::default();
         assert!(lines.note(at(0), 1, 1, ()));
         assert_eq!(shown(&mut lines, at(0)), [(1, 1)]);
@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn so_many_keys_are_kept_and_the_oldest_is_forgotten() {
+    fn oldest_key_is_forgotten_beyond_the_limit() {
         let mut lines = LogLines::default();
         for key in 0..1_000 {
             lines.note(at(key), key, u64::MAX, ());

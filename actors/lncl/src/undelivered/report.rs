@@ -280,7 +280,7 @@ mod tests {
 
     // spec: GNCL-20
     #[test]
-    fn a_peer_reports_its_own_refusals_to_applications_that_are_there_and_no_others() {
+    fn peer_reports_refusals_only_to_applications_that_are_present() {
         let state = State::for_test(NodeConfig::new("test"), Incarnation(1));
         let app = LocalApp {
             name: Some("hip".to_owned()),

@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn first_refusal_is_reported_at_once_and_later_ones_together() {
+    fn first_refusal_is_reported_immediately_and_later_ones_together() {
         let mut table = ReportTable::default();
         count(&mut table, tid(1), at(0));
         assert_eq!(take_counts(&mut table, at(0)), [(tid(1), 1)]);
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_saturate() {
+    fn counts_saturate_at_their_maximum() {
         let mut table = ReportTable::default();
         for _ in 0..2 {
             table.add(Entry { count: u64::MAX, ..entry(tid(1), FULL, at(0), 1) });

@@ -79,16 +79,23 @@ fn measure(nodes: usize) {
     );
 }
 
-/// Measures one core, with nothing else in its processor's caches than on a host of its own.
+/// Counts the datagrams of one core, and measures its time. As on a host of its own, it has the processor's caches for
+/// itself.
+// spec: NDL-2.1, NDL-3
 #[test]
-fn cost_of_one_core_among_many() {
+fn core_among_many_handles_five_datagrams_per_peer() {
     const MEASURED: u32 = 20;
+    /// The core's query and its answer, the peer's query and its answer, and the peer's query to the group.
+    const OF_A_PEER: u64 = 5;
     let period = Duration::from_millis(500);
     let most = number(CROWD_VARIABLE).map_or(CROWD, |most| usize::try_from(most).expect("a small number"));
     let mut nodes = 10;
     while nodes <= most {
         let mut alone = Alone::among(nodes, period);
         (0..MEASURED).for_each(|_| alone.play_a_period());
+        // One more is the core's own query to the group.
+        let in_a_period = OF_A_PEER * (nodes as u64 - 1) + 1;
+        assert_eq!(alone.datagrams, u64::from(MEASURED) * in_a_period, "{nodes} nodes");
         let seconds = (period * MEASURED).as_secs_f64();
         println!(
             "{nodes} nodes at {period:?}, all but one of them puppets: its core reads and writes {:.0} datagrams/s and takes {:.3} ms/s \

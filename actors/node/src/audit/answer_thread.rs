@@ -96,17 +96,10 @@ impl Drop for AnswerThread {
 mod tests {
     use std::time::{Duration, Instant};
 
-    use bytes::Bytes;
-    use sinew_runtime::{
-        mailbox::Mailbox,
-        router::MessageSink,
-        tid::{AppAddress, Incarnation, Tid},
-        wire::{Class, Header, Kind, Message},
-    };
+    use sinew_model::config::NodeConfig;
+    use sinew_runtime::tid::Incarnation;
 
     use super::*;
-    use crate::audit::{protocol, reading};
-    use sinew_model::config::NodeConfig;
 
     const OTHER: NodeAddress = NodeAddress::new(2);
 
@@ -161,33 +154,5 @@ mod tests {
         queue_question(&state, OTHER, 100).expect("there is room for one, and a thread");
         wait(&state);
         assert_eq!(counted(&state), WAITING_MAX as u64);
-    }
-
-    #[test]
-    #[ignore = "it prints what an audit costs, and claims nothing"]
-    fn audit_cost_per_node() {
-        for apps in [10, 100, 1_000] {
-            let state = state();
-            for app in 0..apps {
-                let (mailbox, tid) =
-                    (Mailbox::new(8), Tid::new(state.ctx.node, AppAddress::new(0x1000 + app)));
-                state.lncl.book.add_mailbox(tid.app, &format!("left_leg.knee.controller_{app}"), &mailbox);
-                for class in Class::ALL {
-                    let mut header = Header::new(Kind::named("audit.cost"), tid, tid);
-                    header.class = class;
-                    mailbox.submit(Message::new(header, Bytes::new())).expect("there is room");
-                }
-            }
-            let (mut read, mut written, mut bytes) = (Duration::MAX, Duration::MAX, 0);
-            for _ in 0..20 {
-                let begin = Instant::now();
-                let audit = reading::read(&state);
-                read = read.min(begin.elapsed());
-                let begin = Instant::now();
-                bytes = protocol::write(&audit, usize::MAX).expect("it has room").len();
-                written = written.min(begin.elapsed());
-            }
-            println!("{apps} applications: read in {read:?}, written in {written:?} ({bytes} bytes)");
-        }
     }
 }

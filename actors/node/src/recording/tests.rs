@@ -119,7 +119,7 @@ fn only_programs_of_the_node_have_it_record() {
 
 // spec: INSPECT-9
 #[test]
-fn type_that_is_only_sent_has_its_name_and_structure() {
+fn type_only_sent_has_its_name_and_structure() {
     #[derive(serde::Serialize, serde::Deserialize)]
     struct Torque {
         newton_metres: f32,
@@ -177,7 +177,7 @@ fn lock_journal(node: &NodeState) -> Arc<Journal> {
 }
 
 #[test]
-fn file_of_another_user_has_the_setting_as_its_remedy() {
+fn file_of_another_user_names_setting_as_remedy() {
     let path = PathBuf::from("/dev/shm/sinew-leg-10.0.0.2.journal");
     let taken = CreateJournalError::Taken { path, owner: 1_001, own: 1_000 };
     let text = RecordError::from(taken).to_string();
@@ -340,7 +340,7 @@ fn flying(name: &str, folder: &Path) -> Arc<NodeState> {
 }
 
 #[test]
-fn failure_at_the_end_of_the_node_has_a_span() {
+fn failure_at_the_end_of_node_has_span() {
     let folder = std::env::temp_dir().join(format!("sinew-failing-{}", std::process::id()));
     let node = flying("failing", &folder);
     let flight = node.recording.flight().expect("it records from its start").clone();

@@ -215,7 +215,7 @@ fn slope_without_ticks_is_refused() {
 }
 
 #[test]
-fn set_without_a_tick_is_refused_and_not_applied_later() {
+fn set_without_tick_is_refused_and_not_applied_later() {
     let gains = gains();
     let mut tuner = Tuner::new(gains.clone(), ms(0));
     stage(&mut tuner, 1, &[("steps", Value::Integer(5))], ms(0));
@@ -295,7 +295,7 @@ fn tick_reports_changes_of_kept_parameters_alone() {
 }
 
 #[test]
-fn kept_values_are_restored_and_illegal_ones_are_left_out() {
+fn kept_values_are_restored_and_illegal_ones_skipped() {
     let named = |name: &str, value| NamedValue { name: name.to_owned(), value };
     let former = gains();
     let values = [named("assistance", Value::Number(0.9)), named("steps", Value::Integer(7))];

@@ -36,7 +36,7 @@ fn failure(how: fn(&mut AppContext<Fails>)) -> ReplayError {
 }
 
 #[test]
-fn panic_is_reported_with_its_time_and_the_outputs_before() {
+fn panic_is_reported_with_time_and_earlier_outputs() {
     let error = failure(|_| panic!("the encoder is upside down"));
     assert_eq!((error.at, error.outputs.len()), (ms(2), 2));
     assert!(matches!(&error.fault, RunError::Panicked { app, .. } if app == "hip"), "{error}");

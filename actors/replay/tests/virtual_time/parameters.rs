@@ -93,7 +93,7 @@ const fn us(us: u64) -> Duration {
 }
 
 #[test]
-fn set_is_applied_at_the_next_tick_and_names_it() {
+fn set_is_applied_at_next_tick_and_names_it() {
     let sets = [(us(3_500), set(&[("newton_metres", 5.0)]))];
     let outputs = replay().app(knee(&[TICK])).app(Tuner::spec(&sets)).ends_at(ms(5)).run([]).unwrap();
     assert_eq!(notes(&outputs), [(us(4_000), "tick 4 after 4ms".to_owned())]);
@@ -121,7 +121,7 @@ fn slope_moves_the_value_tick_by_tick() {
 }
 
 #[test]
-fn ticks_are_those_of_the_timer_with_the_shortest_period() {
+fn ticks_follow_the_timer_with_the_shortest_period() {
     const PERIODS: &[Duration] = &[Duration::from_millis(10), TICK];
     let sets = [(us(3_500), set(&[("newton_metres", 5.0)]))];
     let outputs = replay().app(knee(PERIODS)).app(Tuner::spec(&sets)).ends_at(ms(5)).run([]).unwrap();
@@ -129,7 +129,7 @@ fn ticks_are_those_of_the_timer_with_the_shortest_period() {
 }
 
 #[test]
-fn set_without_a_tick_in_time_is_refused_and_never_applied() {
+fn set_without_timely_tick_is_refused_and_never_applied() {
     const SLOW: &[Duration] = &[Duration::from_secs(2)];
     let sets = [(us(3_500), set(&[("newton_metres", 5.0)]))];
     let outputs = replay().app(knee(SLOW)).app(Tuner::spec(&sets)).ends_at(ms(2_100)).run([]).unwrap();
@@ -140,7 +140,7 @@ fn set_without_a_tick_in_time_is_refused_and_never_applied() {
 }
 
 #[test]
-fn application_without_a_timer_takes_a_set_between_two_messages() {
+fn application_without_timer_applies_set_between_two_messages() {
     let sets = [
         (us(3_500), set(&[("newton_metres", 5.0)])),
         (us(3_600), set(&[("assistance", 0.5)])),

@@ -33,7 +33,7 @@ fn turns() -> (AppSpec<Turns>, std::sync::mpsc::Receiver<(Duration, Time)>) {
 }
 
 #[test]
-fn same_actor_runs_on_the_wall_clock_and_in_virtual_time() {
+fn same_actor_runs_in_wall_time_and_virtual_time() {
     let (spec, seen) = turns();
     replay().app(spec).ends_at(ms(20)).run([]).unwrap();
     assert_eq!(seen.recv_timeout(DEADLINE).unwrap(), (Duration::from_millis(15), ms(15)));

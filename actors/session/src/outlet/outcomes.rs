@@ -184,7 +184,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_bytes_are_a_bounded_number_of_outcomes_or_none(bytes in proptest::collection::vec(any::<u8>(), 0..3_000)) {
+        fn any_bytes_give_a_bounded_number_of_outcomes(bytes in proptest::collection::vec(any::<u8>(), 0..3_000)) {
             match read(&bytes) {
                 Some(outcomes) => prop_assert_eq!(outcomes.count() * EACH, bytes.len()),
                 None => prop_assert!(bytes.is_empty() || bytes.len() % EACH != 0 || bytes.len() > OUTCOMES_MAX * EACH),

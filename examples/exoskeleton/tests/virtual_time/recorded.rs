@@ -145,7 +145,7 @@ fn check_of_a_drive_finds_the_recorded_ticks() {
 }
 
 #[test]
-fn check_of_a_drive_names_the_first_tick_of_a_changed_gain() {
+fn check_of_drive_names_first_tick_of_changed_gain() {
     let all: Vec<_> = walk().iter().collect();
     let error = checked("check-gain", &all, 1.1).expect_err("it assists otherwise");
     let RecordingError::Check(CheckError::Differs(difference)) = &error else { panic!("{error}") };
@@ -158,7 +158,7 @@ fn check_of_a_drive_names_the_first_tick_of_a_changed_gain() {
 }
 
 #[test]
-fn check_of_a_drive_reports_a_tick_without_its_input() {
+fn check_of_drive_reports_a_tick_without_input() {
     let is_sample = |one: &TimedMessage| one.kind == JointSample::KIND && one.destination == tid(1, 2);
     let lost = walk().iter().rev().filter(|one| is_sample(one)).nth(300).expect("it walks for longer");
     let kept: Vec<_> = walk().iter().filter(|one| !std::ptr::eq(*one, lost)).collect();

@@ -354,7 +354,7 @@ fn sleeper_for_two_rings_takes_both_messages(wake_places: [WakePlace; 2]) {
 }
 
 #[test]
-fn sleeper_at_the_bell_of_a_set_is_woken_by_either_ring() {
+fn sleeper_at_the_set_bell_wakes_by_either_ring() {
     sleeper_for_two_rings_takes_both_messages([WakePlace::Bell; 2]);
 }
 

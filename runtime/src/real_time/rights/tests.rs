@@ -61,7 +61,7 @@ fn limits_capabilities_and_memory_are_read() {
 }
 
 #[test]
-fn host_without_files_has_no_rights_and_no_budget_that_refuses() {
+fn host_without_files_has_neither_rights_nor_refusing_budget() {
     let rights = Root::new().rights();
     assert_eq!((rights.priority_limit, rights.locked_limit, rights.locked()), (0, 0, Locked::None));
     assert_eq!((rights.budget, rights.preemption), (Budget::NotRestricted, Preemption::Unknown));
@@ -122,7 +122,7 @@ fn group_of_v2_refuses_where_the_kernel_has_budgets() {
 }
 
 #[test]
-fn group_of_v2_without_the_controller_or_outside_of_its_namespace() {
+fn group_v2_without_controller_or_namespace_shares_root_budget() {
     let root = Root::new().with("proc/self/cgroup", "0::/robot/knee\n");
     assert_eq!(root.rights().budget, Budget::NotRestricted, "it shares the root's budget");
     let root = root.with("proc/self/cgroup", "0::/../../etc\n").with("sys/fs/cgroup/etc/cpu.max", "max\n");

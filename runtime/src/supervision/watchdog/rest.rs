@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn wake_soon_after_the_order_does_not_begin_the_rest() {
+    fn wake_soon_after_order_does_not_start_rest() {
         let mut rest = Rest::default();
         rest.check(at(0), 0, false);
         assert_eq!(rest.check(at(1_000), 0, true), Pace::Marking);

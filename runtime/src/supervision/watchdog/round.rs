@@ -62,7 +62,7 @@ mod tests {
     }
 
     #[test]
-    fn turns_of_a_thread_are_read_once_in_a_round() {
+    fn turns_of_each_thread_are_read_once_per_round() {
         let slot = ThreadSlot::of_this_thread(&Place::own_thread());
         let actors = ["one", "other"].map(|name| {
             let liveness = Liveness::new(name);

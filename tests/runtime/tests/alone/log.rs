@@ -62,8 +62,8 @@ impl LogObserver for Texts {
 
 /// The start of a further node in a process sets the level.
 #[test]
-fn place_that_has_logged_logs_again_after_the_level_was_set() {
-    alone("log::place_that_has_logged_logs_again_after_the_level_was_set", || {
+fn used_place_logs_again_after_level_was_set() {
+    alone("log::used_place_logs_again_after_level_was_set", || {
         let texts = Arc::new(Texts::default());
         let observer: Arc<dyn LogObserver> = texts.clone();
         assert!(observe(&observer));

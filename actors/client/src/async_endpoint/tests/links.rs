@@ -95,7 +95,7 @@ fn two_tasks_communicate_directly_without_the_node() {
 }
 
 #[test]
-fn a_task_and_a_thread_have_a_link_with_each_other() {
+fn tasks_and_threads_have_links_with_each_other() {
     let node = TestNode::start();
     let mut blocking =
         NodeApi::connect(node.path()).unwrap().register_transport_address(with_links()).unwrap();

@@ -244,7 +244,7 @@ fn exit_after_timed_out_message_keeps_accepted_ones() {
 }
 
 #[test]
-fn long_message_cut_by_link_end_goes_through_node_once() {
+fn long_message_cut_by_link_end_is_delivered_once() {
     // given
     let node = TestNode::start_with(|config| config.lncl.ring_bytes = 4_096);
     let mut one = register(&node, with_links().stall_timeout(WATCHDOG / 2));

@@ -50,7 +50,7 @@ fn order(trigger: &Trigger, replaces: &[TriggerId]) -> SpanOrder {
 }
 
 #[test]
-fn cause_is_forwarded_at_once_and_frozen_after_its_time() {
+fn cause_is_forwarded_immediately_and_frozen_after_its_time() {
     let mut plan = plan(1);
     let id = plan.happened(100 * SECOND, 100 * SECOND, "a guard is shut").unwrap();
     assert_eq!(id.to_string(), "0.0.0.1-1-1");

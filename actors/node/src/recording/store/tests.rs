@@ -157,7 +157,7 @@ fn file_is_read_in_parts_of_any_size() {
 }
 
 #[test]
-fn ring_of_a_dead_node_is_kept_and_a_closed_one_is_not() {
+fn ring_of_dead_node_is_kept_unless_closed() {
     let folder = Folder::new("dead");
     let mut store = folder.store(2);
     let journal = folder.journal();

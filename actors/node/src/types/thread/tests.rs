@@ -267,7 +267,7 @@ fn declaration(sends: PayloadType) -> TypeDeclaration {
 }
 
 #[test]
-fn type_of_a_client_is_compared_within_its_node_until_the_client_ends() {
+fn type_is_compared_within_node_until_its_client_ends() {
     let (gains, renamed) = versions();
     let mut bench = Bench::new();
     bench.registers(KNEE, "knee", &[gains], &[]);

@@ -181,7 +181,7 @@ fn actor_with_waiting_messages_is_checked_more_often() {
 }
 
 #[test]
-fn messages_of_a_stopping_actor_do_not_count_as_waiting() {
+fn messages_of_stopping_actor_do_not_count_as_waiting() {
     let mut suspect = StallSuspect::new(BUDGET);
     let backlog = Backlog { waiting: 3, taken: 7, since: None };
     suspect.check(on_time(0, busy(2, None)), backlog, Neighbours::default, || None);
@@ -237,7 +237,7 @@ const RESTING: u64 = 25;
 proptest! {
     /// The turn begins between two rare checks, and its thread waits for a CPU before that and after.
     #[test]
-    fn turn_that_begins_at_rest_is_accused_at_its_time(
+    fn turn_begun_at_rest_is_accused_in_time(
         begun in 0..RESTING,
         waited_before in 0_u64..10,
         waited_after in 0_u64..30,
@@ -263,7 +263,7 @@ proptest! {
     /// Messages begin to wait between two rare checks; the mailbox has recorded when. Others may have been taken
     /// between the first check and that time.
     #[test]
-    fn messages_that_begin_to_wait_at_rest_are_missed_at_their_time(
+    fn messages_waiting_since_rest_are_missed_in_time(
         since in 0..RESTING,
         taken_before in 0_u64..3,
     ) {
@@ -289,7 +289,7 @@ proptest! {
 }
 
 #[test]
-fn lateness_before_the_first_look_at_waiting_messages_is_excused() {
+fn lateness_before_first_check_of_waiting_messages_is_excused() {
     // The process is stopped from 10 to 910 ms; the messages wait since 5 ms.
     let mut suspect = StallSuspect::new(BUDGET);
     let mut check = |now, late: u64, waiting, taken| {
