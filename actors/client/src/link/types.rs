@@ -24,7 +24,7 @@ use crate::ApiError;
 
 /// Maximum number of declared types: the node keeps as many that an application handles, and as many that it sends.
 const TYPES_MAX: usize = 128;
-/// Time after which a declaration that finds no room is given up. A long loan or a stopped node takes the room.
+/// Time after which the declarations that find no room are given up. A long loan or a stopped node takes the room.
 const WITHIN: Duration = Duration::from_secs(10);
 /// Time between two tries of one declaration.
 const PAUSE: Duration = Duration::from_millis(5);
@@ -88,9 +88,10 @@ impl UsedTypes {
 /// Declares types as soon as their structures are known.
 fn declare_later(types: &[UsedType], own: Tid, payload_max: usize, writer: &Weak<Writer>) {
     lower_priority();
+    // One limit for all types. Behind it each of the others is tried once.
+    let until = Time::now() + WITHIN;
     for one in types {
         let Some(frame) = declaration(one, own, payload_max) else { continue };
-        let until = Time::now() + WITHIN;
         loop {
             let Some(writer) = writer.upgrade() else { return };
             if write(&writer, &frame) {
