@@ -290,7 +290,7 @@ fn test_names(text: &str) -> Vec<(usize, String)> {
     names
 }
 
-/// Returns the tests of a file whose names have too few or too many words.
+/// Returns the tests of a file with names of too few or too many words.
 fn unfit_test_names(Source { path, text }: &Source) -> Vec<String> {
     let names = test_names(text).into_iter();
     let unfit = names.filter(|(_, name)| !NAME_WORDS.contains(&name.split('_').count()));

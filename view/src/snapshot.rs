@@ -53,7 +53,7 @@ pub struct Answers {
 }
 
 impl Snapshot {
-    /// Returns the snapshot of a system whose entry node gives no answer.
+    /// Returns the snapshot of a system without an answer of its entry node.
     ///
     /// # Examples
     ///

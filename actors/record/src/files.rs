@@ -18,7 +18,7 @@ use crate::frozen::FrozenFacts;
 /// Maximum bytes of a file with facts. What follows is not read.
 const FACTS_BYTES_MAX: u64 = 4 << 20;
 
-/// The users whose files are read.
+/// The owners of files that are read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Owners {
     /// The user of this process alone.

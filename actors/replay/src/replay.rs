@@ -172,7 +172,7 @@ impl Replay {
     /// gets its recorded messages of this type back, at the times at which they were sent, and computes the turn
     /// again. [`check`](Self::check) compares only messages of this type.
     ///
-    /// For programs whose outputs depend on how late a timer was on the wall clock. No replay has these times.
+    /// For programs with outputs that depend on how late a timer was on the wall clock. No replay has these times.
     ///
     /// # Examples
     ///

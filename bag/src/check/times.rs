@@ -94,7 +94,7 @@ impl Recordings {
         let mut placed = Placed::default();
         let mut spans = Vec::new();
         for ((incarnation, _), span) in &self.0 {
-            // An incarnation whose clock the source never measured was not connected with it.
+            // The source measured no clock of this incarnation, so it was not connected with it.
             if let Some(steps) = offsets.between(from, &(address.to_owned(), *incarnation)) {
                 spans.push((steps, *span));
             }

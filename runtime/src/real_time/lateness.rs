@@ -110,7 +110,7 @@ impl Lateness {
         LatenessSummary { turns, p50: at(0.5), p99: at(0.99), p999: at(0.999), max: self.max }
     }
 
-    /// Returns the histogram in bands whose bounds grow by the steps 1, 2, 5, 10, from the first band with a wake-up to
+    /// Returns the histogram in bands with bounds in the steps 1, 2, 5, 10, from the first band with a wake-up to
     /// the last one. A wake-up within 1 % of a bound may be counted in the next band.
     #[must_use]
     pub fn bands(&self) -> Vec<Band> {

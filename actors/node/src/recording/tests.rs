@@ -148,7 +148,7 @@ fn type_only_sent_has_its_name_and_structure() {
     node.recording.close(&node);
 }
 
-// The directory of this node is empty: its sync manager has not heard of the applications.
+// The directory of this node is empty: its sync manager has received no registration.
 #[test]
 fn application_has_its_name_from_its_registration_on() {
     let node = node("names", |_| {});

@@ -93,7 +93,7 @@ fn set_gain_moves_the_torque_gradually_and_replays() {
     let is_step = |pair: &[f64]| (0.0..STEP + 1e-9).contains(&(pair[0] - pair[1]));
     assert!((0.4 - assistance[0] - STEP).abs() < 1e-9 && assistance.windows(2).all(is_step));
     assert_eq!(assistance.last(), Some(&0.2));
-    // and: so does the torque. It acts on the leg, whose feedback may double the difference.
+    // and: so does the torque. It acts on the leg, and feedback may double the difference.
     let apart: Vec<f64> =
         after.iter().zip(&before).map(|(after, before)| (torque(after) - torque(before)).abs()).collect();
     for (apart, ticks) in apart[at..at + 20].iter().zip(1..) {
