@@ -6,6 +6,7 @@ mod each;
 mod groups;
 pub mod guard;
 pub mod mismatches;
+mod reach;
 mod sink;
 pub mod tap;
 #[cfg(test)]
@@ -22,7 +23,6 @@ use std::{
 
 use arc_swap::ArcSwap;
 
-pub use self::sink::{MessageSink, SubmitError};
 use self::{
     copies::Copies,
     each::OpenSends,
@@ -30,6 +30,10 @@ use self::{
     guard::{Guard, Judge, ParameterRight},
     mismatches::Mismatches,
     tap::{TAPS, Tap},
+};
+pub use self::{
+    reach::Reach,
+    sink::{MessageSink, SubmitError},
 };
 use crate::{
     clock::Clock,
@@ -89,15 +93,6 @@ struct Writing {
     taps: [Option<Arc<dyn Tap>>; TAPS],
     /// The number of changes of the routes to other nodes, and of removals of applications.
     route_changes: u64,
-}
-
-/// The number of destinations of a message.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Reach {
-    /// Number of applications of this node.
-    pub here: usize,
-    /// Number of other nodes.
-    pub elsewhere: usize,
 }
 
 /// The routing table of a node. It is owned by the node, so that it outlives every layer.
@@ -197,29 +192,6 @@ impl Router {
             self.multicast(&snapshot, message)
         };
         self.account(result)
-    }
-
-    /// Returns the number of applications of this node that a message from here may reach, and of other nodes.
-    #[must_use]
-    pub fn reach(&self, destination: Tid) -> Reach {
-        let Tid { node, app } = self.absolute(destination);
-        if destination.is_single() {
-            let is_here = node == self.node;
-            return Reach { here: usize::from(is_here), elsewhere: usize::from(!is_here) };
-        }
-        let Snapshot { table, members } = &**self.snapshot.load();
-        let here = match (node == self.node || node == NodeAddress::ALL, app) {
-            (false, _) => 0,
-            (true, group) if group.is_group() => members.here.members(group).len(),
-            (true, AppAddress::ALL) => table.local.len(),
-            (true, _) => 1,
-        };
-        let elsewhere = match (node, app) {
-            (NodeAddress::ALL, group) if group.is_group() => members.elsewhere.members(group).len(),
-            (NodeAddress::ALL, _) => table.peers.len(),
-            (node, _) => usize::from(node != self.node),
-        };
-        Reach { here, elsewhere }
     }
 
     /// Delivers a message from another node to this node's applications: it is never forwarded to a node.
