@@ -62,6 +62,8 @@ impl Client {
     fn route(&self, mut message: Message) {
         let router = &self.server.state.ctx.router;
         let destination = router.absolute(message.header.destination);
+        // Only a node marks a value as handed over.
+        message.header.flags = message.header.flags.without(Flags::RETAINED);
         let is_confirmed = message.header.flags.has(Flags::CONFIRM);
         if is_confirmed {
             let correlation = message.header.correlation;
