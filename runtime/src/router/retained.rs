@@ -46,9 +46,9 @@ pub(super) struct Retained {
 /// The number of retained values of a node, and of those that did not fit.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RetainedCounts {
-    /// Number of values that are retained, at most 256.
+    /// Number of values that are retained, at most 256 of each node, and 2,048 of all other nodes.
     pub values: usize,
-    /// Bytes of these values, at most 1 MiB.
+    /// Bytes of these values, at most 1 MiB of each node, and 8 MiB of all other nodes.
     pub bytes: usize,
     /// Number of sent or received values that were beyond a bound.
     pub not_kept: u64,
@@ -58,8 +58,8 @@ pub struct RetainedCounts {
 
 impl Retained {
     /// Retains the value, or removes the former one. Returns whether it is retained.
-    fn keep(&mut self, now: Time, message: &Message) -> bool {
-        let Err(error) = self.store.keep(now, message) else { return true };
+    fn keep(&mut self, own: NodeAddress, now: Time, message: &Message) -> bool {
+        let Err(error) = self.store.keep(own, now, message) else { return true };
         self.not_kept += 1;
         if self.not_kept == 1 {
             let Header { kind, source, .. } = message.header;
@@ -120,7 +120,7 @@ impl Router {
             message.settle(Outcome::Delivered);
             return Ok(());
         }
-        if !is_retainable(&message.header) || !retained.keep(self.clock.now(), &message) {
+        if !is_retainable(&message.header) || !retained.keep(self.node, self.clock.now(), &message) {
             message.header.flags = message.header.flags.without(Flags::KEEP);
             if retained.store.remove(Key::of(&message.header)).is_some() {
                 self.clear_elsewhere(retained, snapshot, &message.header);
@@ -147,7 +147,9 @@ impl Router {
         }
         let has_members = !snapshot.members.here.members(key.group).is_empty();
         let is_wanted = has_members || retained.store.contains(key);
-        if is_wanted && !(is_retainable(&message.header) && retained.keep(self.clock.now(), &message)) {
+        if is_wanted
+            && !(is_retainable(&message.header) && retained.keep(self.node, self.clock.now(), &message))
+        {
             retained.store.remove(key);
         }
         self.deliver_to_many(snapshot, judge, message)
