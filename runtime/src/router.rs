@@ -195,16 +195,22 @@ impl Router {
         } else if message.header.flags.has_any(Flags::ASK.with(Flags::KEEP)) {
             self.send_flagged(message)
         } else {
-            self.send_to_many(&snapshot, message)
+            self.send_to_many(&snapshot, message, &mut Vec::new())
         };
         self.account(result)
     }
 
-    fn send_to_many(&self, snapshot: &Snapshot, message: Message) -> Result<(), SubmitError> {
+    /// Sends a message to many. Adds the nodes that had no room for one with KEEP to `behind`.
+    fn send_to_many(
+        &self,
+        snapshot: &Snapshot,
+        message: Message,
+        behind: &mut Vec<NodeAddress>,
+    ) -> Result<(), SubmitError> {
         if message.receipt.is_some() {
-            self.send_to_each(snapshot, message)
+            self.send_to_each(snapshot, message, behind)
         } else {
-            self.multicast(snapshot, message)
+            self.multicast(snapshot, message, behind)
         }
     }
 
@@ -374,7 +380,12 @@ impl Router {
     }
 
     /// Sends one copy to each node that has a member, and one to each member here.
-    fn multicast(&self, snapshot: &Snapshot, message: Message) -> Result<(), SubmitError> {
+    fn multicast(
+        &self,
+        snapshot: &Snapshot,
+        message: Message,
+        behind: &mut Vec<NodeAddress>,
+    ) -> Result<(), SubmitError> {
         let Tid { node, app } = message.header.destination;
         let mut copies = Copies::default();
         let Snapshot { table, members } = snapshot;
@@ -382,15 +393,19 @@ impl Router {
         if node == self.node || node == NodeAddress::ALL {
             copies = self.fan_out(snapshot, table.judge(), &message);
         }
-        let mut submit = |peer: &Arc<dyn MessageSink>| {
-            copies.note(peer.submit(copy_of(&message)).err().map(|refused| refused.why));
+        let mut submit = |(node, peer): (&NodeAddress, &Arc<dyn MessageSink>)| {
+            let refused = peer.submit(copy_of(&message)).err().map(|refused| refused.why);
+            copies.note(refused);
+            if retained::is_behind(&message.header, refused) {
+                behind.push(*node);
+            }
         };
         if node == NodeAddress::ALL && app.is_group() {
             let nodes = members.elsewhere.members(app);
-            nodes.iter().filter_map(|node| table.peers.get(node)).for_each(submit);
+            nodes.iter().filter_map(|node| table.peers.get_key_value(node)).for_each(submit);
         } else if node == NodeAddress::ALL {
-            table.peers.values().for_each(submit);
-        } else if let Some(peer) = table.peers.get(&node) {
+            table.peers.iter().for_each(submit);
+        } else if let Some(peer) = table.peers.get_key_value(&node) {
             submit(peer);
         } else if node != self.node {
             return Err(SubmitError::new(message, Rejection::NoSuchNode));

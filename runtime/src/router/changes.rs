@@ -44,7 +44,6 @@ impl Router {
 
     /// Removes an application, its memberships, its retained values, and the types that it declared differently.
     pub fn remove_local(&self, app: AppAddress) {
-        self.forget_retained(app);
         let mut writing = lock(&self.writing);
         let mut snapshot = Snapshot::clone(&self.snapshot.load());
         let table = Arc::make_mut(&mut snapshot.table);
@@ -55,6 +54,8 @@ impl Router {
         writing.here.set(app, BTreeSet::new(), &mut snapshot.members.here);
         self.snapshot.store(Arc::new(snapshot));
         drop(writing);
+        // After its route is removed: no later value of it is retained.
+        self.forget_retained(app);
         if let Some(former) = dropped {
             former.notify();
         }

@@ -16,7 +16,7 @@ mod store;
 #[cfg(test)]
 mod tests;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use bytes::Bytes;
 
@@ -39,6 +39,9 @@ pub(super) struct Retained {
     store: Store,
     /// The values, or their removals, that the queue to a node had no room for, with their classes.
     unsent: BTreeMap<(NodeAddress, Key), Class>,
+    /// The applications, with their groups, whose memberships are those of an incarnation that has ended. Their
+    /// next incarnation gets the values when it joins again. As many as there are memberships.
+    rejoining: BTreeSet<(AppAddress, AppAddress)>,
     not_kept: u64,
     not_handed_over: u64,
 }
@@ -114,19 +117,28 @@ impl Router {
         let snapshot = &*self.snapshot.load();
         // Only this node marks a value as handed over.
         message.header.flags = message.header.flags.without(Flags::RETAINED);
+        let header = message.header;
         if is_clear(&message) {
-            retained.store.remove(Key::of(&message.header));
-            self.clear_elsewhere(retained, snapshot, &message.header);
+            retained.store.remove(Key::of(&header));
+            self.clear_elsewhere(retained, snapshot, &header);
             message.settle(Outcome::Delivered);
             return Ok(());
         }
-        if !is_retainable(&message.header) || !retained.keep(self.node, self.clock.now(), &message) {
-            message.header.flags = message.header.flags.without(Flags::KEEP);
-            if retained.store.remove(Key::of(&message.header)).is_some() {
-                self.clear_elsewhere(retained, snapshot, &message.header);
+        // The value of an application that has ended meanwhile would stay.
+        let is_present = snapshot.table.local.contains_key(&header.source.app);
+        let is_kept =
+            is_present && is_retainable(&header) && retained.keep(self.node, self.clock.now(), &message);
+        if !is_kept {
+            message.header.flags = header.flags.without(Flags::KEEP);
+            if retained.store.remove(Key::of(&header)).is_some() {
+                self.clear_elsewhere(retained, snapshot, &header);
             }
         }
-        self.send_to_many(snapshot, message)
+        let mut behind = Vec::new();
+        let result = self.send_to_many(snapshot, message, &mut behind);
+        // Otherwise the former value there would be the latest one for later members.
+        behind.into_iter().for_each(|node| retained.is_behind(node, &header));
+        result
     }
 
     /// Delivers a message with KEEP from another node to the members here. spec: FRAME-8.1
@@ -147,9 +159,10 @@ impl Router {
         }
         let has_members = !snapshot.members.here.members(key.group).is_empty();
         let is_wanted = has_members || retained.store.contains(key);
-        if is_wanted
-            && !(is_retainable(&message.header) && retained.keep(self.node, self.clock.now(), &message))
-        {
+        // The value of a node that was lost meanwhile would stay.
+        let is_linked = snapshot.table.peers.contains_key(&key.source.node);
+        let is_retainable = is_linked && is_retainable(&message.header);
+        if is_wanted && !(is_retainable && retained.keep(self.node, self.clock.now(), &message)) {
             retained.store.remove(key);
         }
         self.deliver_to_many(snapshot, judge, message)
@@ -165,7 +178,8 @@ impl Router {
                 writing.here.leave(group, app, &mut members.here)
             }
         });
-        if is_changed && member {
+        let is_rejoining = retained.rejoining.remove(&(app, group));
+        if member && (is_changed || is_rejoining) {
             self.hand_over_here(retained, group, app);
         }
         is_changed
@@ -237,16 +251,23 @@ impl Router {
         let Some(peer) = snapshot.table.peers.get(&node) else { return };
         for (key, class) in unsent {
             retained.unsent.remove(&(node, key));
-            let value = retained.store.of_key(key, self.clock.now());
-            if has_member(&snapshot, key.group, node) {
-                update(retained, node, &**peer, value.unwrap_or_else(|| removal(key, class)));
+            match retained.store.of_key(key, self.clock.now()) {
+                Some(value) if has_member(&snapshot, key.group, node) => {
+                    update(retained, node, &**peer, value);
+                }
+                // It gets the value when it lists the group again.
+                Some(_) => {}
+                None => update(retained, node, &**peer, removal(key, class)),
             }
         }
     }
 
-    /// Removes the retained values of an application of this node, whose incarnation has ended.
+    /// Removes the retained values of an application of this node, whose incarnation has ended. If it is still a
+    /// member of groups, its next incarnation gets their values when it joins again.
     pub fn forget_retained(&self, app: AppAddress) {
         let retained = &mut *lock(&self.retained);
+        retained.rejoining.retain(|(of, _)| *of != app);
+        retained.rejoining.extend(lock(&self.writing).here.of(app).map(|group| (app, group)));
         let own = Tid::new(self.node, app);
         let over = retained.store.forget(|header| header.source == own);
         let snapshot = self.snapshot.load();
@@ -260,15 +281,18 @@ impl Router {
         retained.unsent.retain(|(behind, _), _| *behind != node);
     }
 
-    /// Removes a value at the nodes that may have retained it.
+    /// Removes a value at all other nodes: one that does not list the group may still have it, since an application
+    /// there may have left the group and joined it again.
     fn clear_elsewhere(&self, retained: &mut Retained, snapshot: &Snapshot, header: &Header) {
-        let key = Key::of(header);
-        for node in snapshot.members.elsewhere.members(key.group) {
-            if let Some(peer) = snapshot.table.peers.get(node) {
-                update(retained, *node, &**peer, removal(key, header.class));
-            }
+        for (node, peer) in &snapshot.table.peers {
+            update(retained, *node, &**peer, removal(Key::of(header), header.class));
         }
     }
+}
+
+/// Returns whether a node lacks the value with this header, as its queue had no room.
+pub(super) fn is_behind(header: &Header, refused: Option<Rejection>) -> bool {
+    refused == Some(Rejection::QueueFull) && header.flags.has(Flags::KEEP)
 }
 
 /// Submits a value or its removal to a node, and records if the node has no room for it.

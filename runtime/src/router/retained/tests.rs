@@ -63,6 +63,7 @@ impl Nodes {
     fn new() -> Self {
         let (sending, wire) = (Router::new(SENDING), Arc::<Sink>::default());
         sending.set_peer(RECEIVING, wire.clone());
+        Self::register(&sending, SENDER);
         let receiving = Router::new(RECEIVING);
         receiving.set_peer(SENDING, Arc::new(Sink::default()));
         Self { sending, receiving, wire, sequence: 0 }
@@ -94,10 +95,15 @@ impl Nodes {
         }
     }
 
-    fn member(router: &Router, number: u32) -> (AppAddress, Arc<Sink>) {
-        let (app, sink) = (AppAddress::new(0x2000 + number), Arc::<Sink>::default());
+    fn register(router: &Router, app: AppAddress) -> Arc<Sink> {
+        let sink = Arc::<Sink>::default();
         router.set_local(app, LocalRoute { sink: sink.clone(), events: Arc::new([]) });
-        (app, sink)
+        sink
+    }
+
+    fn member(router: &Router, number: u32) -> (AppAddress, Arc<Sink>) {
+        let app = AppAddress::new(0x2000 + number);
+        (app, Self::register(router, app))
     }
 
     /// Publishes the groups of the receiving node to the sending one.
@@ -134,8 +140,7 @@ fn late_member_of_the_same_node_gets_the_newest_value_once() {
 #[test]
 fn sender_that_joins_gets_no_value_of_its_own() {
     let mut nodes = Nodes::new();
-    let sink = Arc::<Sink>::default();
-    nodes.sending.set_local(SENDER, LocalRoute { sink: sink.clone(), events: Arc::new([]) });
+    let sink = Nodes::register(&nodes.sending, SENDER);
     nodes.send();
     assert!(nodes.sending.set_member(MODES, SENDER, true));
     assert_eq!(sink.seen(), []);
@@ -264,6 +269,78 @@ fn value_or_removal_without_room_is_sent_with_a_later_list() {
 }
 
 #[test]
+fn value_that_a_node_had_no_room_for_replaces_its_former_one_there() {
+    let mut nodes = Nodes::new();
+    let member = nodes.join(1);
+    nodes.publish();
+    let former = nodes.send();
+    nodes.deliver();
+    *lock(&nodes.wire.is_full) = true;
+    let newer = nodes.send();
+    *lock(&nodes.wire.is_full) = false;
+    nodes.sending.groups_listed(RECEIVING, &[]);
+    nodes.deliver();
+    assert_eq!(member.seen(), [(former, false), (newer, true)]);
+    assert_eq!(nodes.join(2).seen(), [(newer, true)]);
+    nodes.sending.groups_listed(RECEIVING, &[]);
+    assert_eq!(nodes.wire.seen(), [], "it is sent once");
+}
+
+#[test]
+fn next_incarnation_of_a_member_gets_the_value_when_it_joins_again() {
+    let mut nodes = Nodes::new();
+    let value = nodes.send();
+    let (app, sink) = Nodes::member(&nodes.sending, 1);
+    assert!(nodes.sending.set_member(MODES, app, true));
+    assert_eq!(sink.seen(), [(value, true)]);
+    // When: its incarnation ends, and the next one joins
+    nodes.sending.forget_retained(app);
+    assert!(!nodes.sending.set_member(MODES, app, true), "it has been a member all the time");
+    assert_eq!(sink.seen(), [(value, true)]);
+    // Then: once
+    assert!(!nodes.sending.set_member(MODES, app, true));
+    assert_eq!(sink.seen(), []);
+    // And: nothing remains of an application that is removed
+    nodes.sending.forget_retained(app);
+    nodes.sending.remove_local(app);
+    assert!(lock(&nodes.sending.retained).rejoining.is_empty());
+}
+
+#[test]
+fn removal_reaches_a_node_that_does_not_list_the_group() {
+    let mut nodes = Nodes::new();
+    let _first = nodes.join(1);
+    nodes.publish();
+    nodes.send();
+    nodes.deliver();
+    // Given: the list without the group, after which an application has joined it again
+    nodes.sending.set_remote_groups(RECEIVING, &[]);
+    // When
+    nodes.clear();
+    nodes.deliver();
+    // Then
+    assert_eq!(nodes.receiving.retained().values, 0);
+    assert_eq!(nodes.join(2).seen(), []);
+}
+
+#[test]
+fn late_message_of_an_ended_sender_or_lost_node_is_not_retained() {
+    let mut nodes = Nodes::new();
+    let member = nodes.join(1);
+    nodes.publish();
+    let value = nodes.send();
+    // When: its node is lost, and then the message is delivered
+    nodes.receiving.remove_peer(SENDING);
+    nodes.deliver();
+    assert_eq!((member.seen(), nodes.receiving.retained().values), (vec![(value, false)], 0));
+    // And: a thread of the sender sends after its end
+    nodes.sending.remove_local(SENDER);
+    nodes.wire.take();
+    let late = nodes.send();
+    assert_eq!((nodes.wire.seen(), nodes.sending.retained().values), (vec![(late, false)], 0));
+}
+
+#[test]
 fn full_member_misses_its_value_and_this_is_counted() {
     let mut nodes = Nodes::new();
     nodes.send();
@@ -352,6 +429,7 @@ fn no_order_of_sends_joins_and_lists_delivers_an_older_value_or_one_twice() {
 fn member_that_joins_beside_a_sending_thread_gets_each_value_once_in_order() {
     for seed in 0..50 {
         let router = Arc::new(Router::new(SENDING));
+        Nodes::register(&router, SENDER);
         let (app, sink) = Nodes::member(&router, 1);
         std::thread::scope(|scope| {
             scope.spawn(|| {
