@@ -41,6 +41,11 @@ fn send(endpoint: &mut Endpoint, number: u64) {
     endpoint.send(Tid::group(GROUP), &Mode { number }).expect("the node takes it");
 }
 
+/// Waits until the node of this endpoint has read its messages: it answers in their order.
+fn has_read(endpoint: &mut Endpoint) {
+    let _ = endpoint.resolve("sender", DEADLINE).expect("the node answers");
+}
+
 /// Two linked nodes, and the sockets of their clients.
 struct Scene {
     sockets: [std::path::PathBuf; 2],
@@ -68,6 +73,7 @@ fn late_member_of_another_node_gets_the_newest_value_once_and_before_newer_ones(
     let mut sender = client(hip, Registration::new());
     send(&mut sender, 1);
     send(&mut sender, 2);
+    has_read(&mut sender);
     // When: a first member joins. Then: it gets the newest one
     let mut first = member(knee);
     let received = next(&mut first);
@@ -113,8 +119,7 @@ fn late_member_gets_no_value_that_was_cleared_or_of_an_ended_sender() {
             });
         } else {
             sender.clear_retained::<Mode>(GROUP).expect("the node takes it");
-            // The node has read the message before it.
-            let _ = sender.resolve("sender", DEADLINE).expect("the node answers");
+            has_read(&mut sender);
         }
         // The removal is before the marker.
         let mut mark = || marking.send(Tid::group(GROUP), &Marker).expect("the node takes it");
