@@ -290,9 +290,9 @@ impl Router {
     }
 }
 
-/// Returns whether a node lacks the value with this header, as its queue had no room.
+/// Returns whether a node lacks the value with this header: its queue had no room, or it takes shorter ones only.
 pub(super) fn is_behind(header: &Header, refused: Option<Rejection>) -> bool {
-    refused == Some(Rejection::QueueFull) && header.flags.has(Flags::KEEP)
+    matches!(refused, Some(Rejection::QueueFull | Rejection::TooLong)) && header.flags.has(Flags::KEEP)
 }
 
 /// Submits a value or its removal to a node, and records if the node has no room for it.
@@ -300,7 +300,13 @@ fn update(retained: &mut Retained, node: NodeAddress, peer: &dyn MessageSink, me
     match peer.submit(message) {
         Ok(()) => {}
         Err(SubmitError { message, why: Rejection::QueueFull }) => retained.is_behind(node, &message.header),
-        Err(SubmitError { why: Rejection::TooLong, .. }) => retained.missed(),
+        Err(SubmitError { message, why: Rejection::TooLong }) => {
+            retained.missed();
+            if !message.payload.is_empty() {
+                // The node must not take the former value for the latest. A removal is never too long.
+                update(retained, node, peer, removal(Key::of(&message.header), message.header.class));
+            }
+        }
         // The node is not linked: it gets the values when it is linked again.
         Err(_) => {}
     }

@@ -27,6 +27,8 @@ type Seen = (u64, bool);
 struct Sink {
     messages: Mutex<VecDeque<Message>>,
     is_full: Mutex<bool>,
+    /// Whether it takes removals only.
+    is_short: Mutex<bool>,
 }
 
 impl Sink {
@@ -44,6 +46,9 @@ impl MessageSink for Sink {
     fn submit(&self, message: Message) -> Result<(), SubmitError> {
         if *lock(&self.is_full) {
             return Err(SubmitError::new(message, Rejection::QueueFull));
+        }
+        if *lock(&self.is_short) && !message.payload.is_empty() {
+            return Err(SubmitError::new(message, Rejection::TooLong));
         }
         lock(&self.messages).push_back(message);
         Ok(())
@@ -80,7 +85,7 @@ impl Nodes {
         let mut header = Self::header();
         (header.sequence, header.sent) = (self.sequence, Clock::WALL.now());
         let result = self.sending.send(Message::new(header, encode(&self.sequence)));
-        assert!(matches!(result, Ok(()) | Err(Rejection::QueueFull)), "{result:?}");
+        assert!(matches!(result, Ok(()) | Err(Rejection::QueueFull | Rejection::TooLong)), "{result:?}");
         self.sequence
     }
 
@@ -284,6 +289,21 @@ fn value_that_a_node_had_no_room_for_replaces_its_former_one_there() {
     assert_eq!(nodes.join(2).seen(), [(newer, true)]);
     nodes.sending.groups_listed(RECEIVING, &[]);
     assert_eq!(nodes.wire.seen(), [], "it is sent once");
+}
+
+#[test]
+fn value_that_is_too_long_for_a_node_leaves_no_former_one_there() {
+    let mut nodes = Nodes::new();
+    let member = nodes.join(1);
+    nodes.publish();
+    let former = nodes.send();
+    nodes.deliver();
+    *lock(&nodes.wire.is_short) = true;
+    nodes.send();
+    nodes.sending.groups_listed(RECEIVING, &[]);
+    nodes.deliver();
+    assert_eq!((member.seen(), nodes.join(2).seen()), (vec![(former, false)], vec![]));
+    assert_eq!(nodes.sending.retained().not_handed_over, 1);
 }
 
 #[test]
