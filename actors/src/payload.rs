@@ -15,6 +15,10 @@
 ///   [`Payload::TIME_TO_LIVE`](crate::Payload::TIME_TO_LIVE). A send may say another one (`expires_after` of
 ///   its builder).
 ///
+/// The word `retained` comes last, as in `payload!("exo.mode", retained => struct ...)`: a member that joins a group
+/// later gets the latest value of each sender ([`Payload::RETAINED`](crate::Payload::RETAINED)). Such a type is
+/// Control or Bulk.
+///
 /// # Examples
 ///
 /// ```
@@ -48,6 +52,12 @@
 /// sinew::payload!("demo.angle", Stream, expires_after = 4295 s => struct Angle { degrees: f32 });
 /// ```
 ///
+/// Nor does a retained type of class Stream:
+///
+/// ```compile_fail
+/// sinew::payload!("demo.angle", Stream, retained => struct Angle { degrees: f32 });
+/// ```
+///
 /// Types without fields, and tuple structs, with a semicolon or without:
 ///
 /// ```
@@ -61,6 +71,18 @@
 /// ```
 #[macro_export]
 macro_rules! payload {
+    ($name:literal, retained => $($item:tt)+) => {
+        $crate::payload!(@declare [$name Control; true] $($item)+);
+    };
+    ($name:literal, expires_after = $amount:literal $unit:ident, retained => $($item:tt)+) => {
+        $crate::payload!(@declare [$name Control $amount $unit; true] $($item)+);
+    };
+    ($name:literal, $class:ident, retained => $($item:tt)+) => {
+        $crate::payload!(@declare [$name $class; true] $($item)+);
+    };
+    ($name:literal, $class:ident, expires_after = $amount:literal $unit:ident, retained => $($item:tt)+) => {
+        $crate::payload!(@declare [$name $class $amount $unit; true] $($item)+);
+    };
     ($name:literal => $($item:tt)+) => {
         $crate::payload!(@declare [$name Control] $($item)+);
     };
@@ -74,7 +96,7 @@ macro_rules! payload {
         $crate::payload!(@declare [$name $class $amount $unit] $($item)+);
     };
     ($name:literal, $($class:ident,)? expires_after = $($wrong:tt)*) => {
-        ::core::compile_error!("expires_after is a number, a space and a unit, and `=>` after it: `expires_after = 20 ms => struct ...`");
+        ::core::compile_error!("expires_after is a number, a space and a unit, and `=>` or `, retained =>` after it: `expires_after = 20 ms => struct ...`");
     };
     (@declare $head:tt $(#[$meta:meta])* $visible:vis struct $type:ident $(($($fields:tt)*))?) => {
         $crate::payload!(@declare $head $(#[$meta])* $visible struct $type $(($($fields)*))?;);
@@ -92,13 +114,18 @@ macro_rules! payload {
         #[serde(crate = "::sinew::serde")]
         $($item)+
     };
-    (@impl [$name:literal $class:ident $($amount:literal $unit:ident)?] $type:ident) => {
+    (@impl [$name:literal $class:ident $($amount:literal $unit:ident)? $(; $retained:literal)?] $type:ident) => {
         impl $crate::Payload for $type {
             const NAME: &'static str = $name;
             const CLASS: $crate::Class = $crate::Class::$class;
             $(const TIME_TO_LIVE: ::core::option::Option<::core::time::Duration> =
                 ::core::option::Option::Some($crate::payload!(@time $amount $unit));)?
+            $(const RETAINED: bool = $retained;)?
         }
+        $(const _: () = ::core::assert!(
+            !($retained && ::core::matches!(<$type as $crate::Payload>::CLASS, $crate::Class::Stream)),
+            "a retained payload is of class Control or Bulk"
+        );)?
         // Outside of the implementation, because its constants are evaluated only if they are used.
         const _: () = match <$type as $crate::Payload>::TIME_TO_LIVE {
             ::core::option::Option::Some(time) => ::core::assert!(

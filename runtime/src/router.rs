@@ -3,9 +3,12 @@
 mod changes;
 mod copies;
 mod each;
+mod fan_out;
 mod groups;
 pub mod guard;
 pub mod mismatches;
+mod reach;
+mod retained;
 mod sink;
 pub mod tap;
 #[cfg(test)]
@@ -22,14 +25,20 @@ use std::{
 
 use arc_swap::ArcSwap;
 
-pub use self::sink::{MessageSink, SubmitError};
 use self::{
     copies::Copies,
     each::OpenSends,
+    fan_out::for_each_here,
     groups::{Groups, Joined},
     guard::{Guard, Judge, ParameterRight},
     mismatches::Mismatches,
+    retained::Retained,
     tap::{TAPS, Tap},
+};
+pub use self::{
+    reach::Reach,
+    retained::RetainedCounts,
+    sink::{MessageSink, SubmitError},
 };
 use crate::{
     clock::Clock,
@@ -91,15 +100,6 @@ struct Writing {
     route_changes: u64,
 }
 
-/// The number of destinations of a message.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Reach {
-    /// Number of applications of this node.
-    pub here: usize,
-    /// Number of other nodes.
-    pub elsewhere: usize,
-}
-
 /// The routing table of a node. It is owned by the node, so that it outlives every layer.
 pub struct Router {
     node: NodeAddress,
@@ -114,6 +114,8 @@ pub struct Router {
     group_sends: Arc<OpenSends>,
     /// The sink for all messages, in a process that has no routes itself.
     uplink: Option<Arc<dyn MessageSink>>,
+    /// The latest values of groups for later members. Its lock is taken before `writing`.
+    retained: Mutex<Retained>,
     /// The clock of the applications that send with this table.
     clock: Clock,
 }
@@ -130,6 +132,7 @@ impl Router {
             refusals: OnceLock::new(),
             group_sends: Arc::default(),
             uplink: None,
+            retained: Mutex::default(),
             clock: Clock::WALL,
         }
     }
@@ -189,37 +192,26 @@ impl Router {
             Self::send_to_one(table, self.node, message)
         } else if destination.app == AppAddress::NONE {
             Err(SubmitError::new(message, Rejection::NoSuchApplication))
-        } else if message.header.flags.has(Flags::ASK) {
-            Err(SubmitError::new(message, Rejection::Unsupported))
-        } else if message.receipt.is_some() {
-            self.send_to_each(&snapshot, message)
+        } else if message.header.flags.has_any(Flags::ASK.with(Flags::KEEP)) {
+            self.send_flagged(message)
         } else {
-            self.multicast(&snapshot, message)
+            self.send_to_many(&snapshot, message, &mut Vec::new())
         };
         self.account(result)
     }
 
-    /// Returns the number of applications of this node that a message from here may reach, and of other nodes.
-    #[must_use]
-    pub fn reach(&self, destination: Tid) -> Reach {
-        let Tid { node, app } = self.absolute(destination);
-        if destination.is_single() {
-            let is_here = node == self.node;
-            return Reach { here: usize::from(is_here), elsewhere: usize::from(!is_here) };
+    /// Sends a message to many. Adds the nodes that had no room for one with KEEP to `behind`.
+    fn send_to_many(
+        &self,
+        snapshot: &Snapshot,
+        message: Message,
+        behind: &mut Vec<NodeAddress>,
+    ) -> Result<(), SubmitError> {
+        if message.receipt.is_some() {
+            self.send_to_each(snapshot, message, behind)
+        } else {
+            self.multicast(snapshot, message, behind)
         }
-        let Snapshot { table, members } = &**self.snapshot.load();
-        let here = match (node == self.node || node == NodeAddress::ALL, app) {
-            (false, _) => 0,
-            (true, group) if group.is_group() => members.here.members(group).len(),
-            (true, AppAddress::ALL) => table.local.len(),
-            (true, _) => 1,
-        };
-        let elsewhere = match (node, app) {
-            (NodeAddress::ALL, group) if group.is_group() => members.elsewhere.members(group).len(),
-            (NodeAddress::ALL, _) => table.peers.len(),
-            (node, _) => usize::from(node != self.node),
-        };
-        Reach { here, elsewhere }
     }
 
     /// Delivers a message from another node to this node's applications: it is never forwarded to a node.
@@ -248,14 +240,26 @@ impl Router {
     fn deliver_by(&self, snapshot: &Snapshot, judge: Judge<'_>, message: Message) -> Result<(), Rejection> {
         let result = if message.header.destination.is_single() {
             submit_here(&snapshot.table, judge, message)
-        } else if message.receipt.is_some() {
-            self.deliver_to_each(snapshot, judge, message)
+        } else if message.header.flags.has(Flags::KEEP) {
+            self.deliver_kept(judge, message)
         } else {
-            let copies = self.fan_out(snapshot, judge, &message);
-            self.count(&copies, &message.header);
-            Ok(())
+            self.deliver_to_many(snapshot, judge, message)
         };
         result.map_err(|refused| self.refuse_arrived(refused))
+    }
+
+    fn deliver_to_many(
+        &self,
+        snapshot: &Snapshot,
+        judge: Judge<'_>,
+        message: Message,
+    ) -> Result<(), SubmitError> {
+        if message.receipt.is_some() {
+            return self.deliver_to_each(snapshot, judge, message);
+        }
+        let copies = self.fan_out(snapshot, judge, &message);
+        self.count(&copies, &message.header);
+        Ok(())
     }
 
     /// Offers a message from another node to its one application on this node. After a full queue the caller
@@ -376,7 +380,12 @@ impl Router {
     }
 
     /// Sends one copy to each node that has a member, and one to each member here.
-    fn multicast(&self, snapshot: &Snapshot, message: Message) -> Result<(), SubmitError> {
+    fn multicast(
+        &self,
+        snapshot: &Snapshot,
+        message: Message,
+        behind: &mut Vec<NodeAddress>,
+    ) -> Result<(), SubmitError> {
         let Tid { node, app } = message.header.destination;
         let mut copies = Copies::default();
         let Snapshot { table, members } = snapshot;
@@ -384,15 +393,19 @@ impl Router {
         if node == self.node || node == NodeAddress::ALL {
             copies = self.fan_out(snapshot, table.judge(), &message);
         }
-        let mut submit = |peer: &Arc<dyn MessageSink>| {
-            copies.note(peer.submit(copy_of(&message)).err().map(|refused| refused.why));
+        let mut submit = |(node, peer): (&NodeAddress, &Arc<dyn MessageSink>)| {
+            let refused = peer.submit(copy_of(&message)).err().map(|refused| refused.why);
+            copies.note(refused);
+            if retained::is_behind(&message.header, refused) {
+                behind.push(*node);
+            }
         };
         if node == NodeAddress::ALL && app.is_group() {
             let nodes = members.elsewhere.members(app);
-            nodes.iter().filter_map(|node| table.peers.get(node)).for_each(submit);
+            nodes.iter().filter_map(|node| table.peers.get_key_value(node)).for_each(submit);
         } else if node == NodeAddress::ALL {
-            table.peers.values().for_each(submit);
-        } else if let Some(peer) = table.peers.get(&node) {
+            table.peers.iter().for_each(submit);
+        } else if let Some(peer) = table.peers.get_key_value(&node) {
             submit(peer);
         } else if node != self.node {
             return Err(SubmitError::new(message, Rejection::NoSuchNode));
@@ -413,43 +426,6 @@ impl Router {
             self.refused[why as usize].fetch_add(count, Ordering::Relaxed);
             self.report(header.destination, header, why, count);
         }
-    }
-
-    /// Submits copies to the members on this node, except the sender itself.
-    fn fan_out(&self, snapshot: &Snapshot, judge: Judge<'_>, message: &Message) -> Copies {
-        let mut copies = Copies::default();
-        let here = self.node;
-        for_each_here(snapshot, message.header.destination.app, |member, sink| {
-            let is_sender = here == message.header.source.node && member == message.header.source.app;
-            if is_sender {
-                return;
-            }
-            let refused = judge
-                .why_refused(member, &message.header)
-                .or_else(|| sink.submit(copy_of(message)).err().map(|refused| refused.why));
-            tap::saw_one_of_many(snapshot.table.tap.as_ref(), Tid::new(here, member), message, refused);
-            copies.note(refused);
-        });
-        copies
-    }
-}
-
-/// Calls `each` for the applications of this node that a message to many reaches, in the order of their addresses.
-fn for_each_here(
-    snapshot: &Snapshot,
-    of: AppAddress,
-    mut each: impl FnMut(AppAddress, &Arc<dyn MessageSink>),
-) {
-    let Snapshot { table, members } = snapshot;
-    if of.is_group() {
-        let routes = members.here.members(of).iter().filter_map(|app| Some((*app, table.local.get(app)?)));
-        routes.for_each(|(app, route)| each(app, &route.sink));
-    } else if of == AppAddress::ALL {
-        let apps = table.local.iter().filter(|(app, _)| !app.is_layer());
-        apps.for_each(|(app, route)| each(*app, &route.sink));
-    } else if let Some(route) = table.local.get(&of) {
-        // A broadcast to the application that has this address on every node.
-        each(of, &route.sink);
     }
 }
 

@@ -5,6 +5,7 @@ mod builder;
 mod destination;
 mod directory;
 mod expecting;
+mod groups;
 mod reply;
 mod sent_types;
 mod unknown_name;
@@ -37,7 +38,7 @@ use crate::{
     protection::{Echo, Flows},
     router::Router,
     supervision::liveness::Liveness,
-    tid::{AppAddress, Tid},
+    tid::Tid,
     time::Time,
     wire::{
         Class, DecodeError, Header, Kind, Message, MessageBuffer, Payload, PayloadType, encode, remember,
@@ -265,28 +266,6 @@ impl Sender {
     #[must_use]
     pub fn resolve(&self, name: &str) -> Option<Tid> {
         self.shared.directory.resolve(name)
-    }
-
-    /// Adds this application to the group called `name`: it receives messages to [`Tid::group`]. A name that
-    /// breaks the grammar of [names](crate::name) is rejected with an error in the log.
-    pub fn join(&self, name: &str) {
-        if let Err(why) = crate::name::check_name(name) {
-            let group: String = name.escape_debug().take(crate::name::NAME_BYTES_MAX).collect();
-            crate::log::error!(%group, %why, "the group is not joined: its name cannot be used");
-            return;
-        }
-        self.set_member(name, true);
-    }
-
-    /// Removes this application from the group called `name`.
-    pub fn leave(&self, name: &str) {
-        self.set_member(name, false);
-    }
-
-    fn set_member(&self, name: &str, member: bool) {
-        if !self.is_over() {
-            self.shared.directory.set_member(self.shared.tid.app, AppAddress::group(name), member);
-        }
     }
 
     /// Monitors the current incarnation of the application at `tid`, on any node. This application receives

@@ -216,6 +216,14 @@ impl AsyncEndpoint {
         self.endpoint.set_member(AppAddress::group(name), false).await
     }
 
+    /// Removes a value that the node retains for later members of a group, like [`Endpoint::clear_retained`].
+    ///
+    /// # Errors
+    /// The node does not accept the message.
+    pub async fn clear_retained<P: Payload>(&mut self, name: &str) -> Result<(), ApiError> {
+        self.endpoint.send_clear::<P>(name).await
+    }
+
     /// Returns the TID of the application that has `name` now, on any node, or `None`.
     ///
     /// # Errors

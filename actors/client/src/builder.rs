@@ -132,7 +132,7 @@ impl SendTerms {
 
     pub(super) fn apply(&self, header: &mut Header) {
         if let Some(class) = self.class {
-            header.class = class;
+            header.override_class(class);
         }
         if let Some(time) = self.expires_after {
             // An unconfirmed message is not waited for.

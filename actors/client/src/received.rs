@@ -136,6 +136,13 @@ impl Received {
         may_be_older(self.age_at_most(now), limit)
     }
 
+    /// Returns whether this is a retained value, which was sent to the group before this endpoint joined it. `age`
+    /// counts from its sending. See [`Payload::RETAINED`].
+    #[must_use]
+    pub const fn is_retained(&self) -> bool {
+        self.message.header.flags.has(Flags::RETAINED)
+    }
+
     /// Returns whether the sender waits for a [`reply`](super::Endpoint::reply).
     #[must_use]
     pub const fn wants_reply(&self) -> bool {

@@ -75,12 +75,14 @@ pub fn app_ready(state: &State, app: AppAddress) {
 /// Reports that the application has failed and is not restarted yet. It keeps its address and its mailbox.
 pub fn app_down(state: &State, app: AppAddress) {
     let _registry = lock(&state.registry);
+    state.ctx.router.forget_retained(app);
     notify(state, AppFact::Down { app });
 }
 
 /// Reports that the application was stopped or has ended normally. It keeps its address.
 pub fn app_stopped(state: &State, app: AppAddress) {
     let _registry = lock(&state.registry);
+    state.ctx.router.forget_retained(app);
     notify(state, AppFact::Stopped { app });
 }
 

@@ -49,7 +49,8 @@ pub const REPORT_BYTES_MAX: u64 = 16 << 20;
 const END_NS: u64 = 100_000_000;
 
 /// Each flag, at the place of its bit in a recording.
-const FLAGS: [Flags; 4] = [Flags::CONFIRM, Flags::ASK, Flags::REPLY, Flags::OUTCOME];
+const FLAGS: [Flags; 6] =
+    [Flags::CONFIRM, Flags::ASK, Flags::REPLY, Flags::OUTCOME, Flags::KEEP, Flags::RETAINED];
 
 /// The command that runs the check. Only processes that it has started run it, and only in its time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -8,7 +8,7 @@ use actix::{Actor, ActorContext, ActorFutureExt, AsyncContext, Context, SpawnHan
 use sinew_model::{
     barrier::{ArriveAtBarrier, LeaveBarrier},
     directory::DirectoryEvent,
-    facts::{AppFact, MembershipFact},
+    facts::{AppFact, LinkFact, MembershipFact},
     limits::EVENT_QUEUE_CAPACITY,
     notifications::claim_notifications,
     refusals::Refusals,
@@ -123,6 +123,10 @@ impl SyncManager {
                 }
                 if let Some(input) = wills::Input::of_link(&fact) {
                     wills::feed(&self.state, input);
+                }
+                if let LinkFact::LinkUp { node, .. } = fact {
+                    // Before its groups are routed, which hands over the values of groups that are new.
+                    self.state.ctx.router.linked_again(node);
                 }
                 self.handle(Input::LinkChanged(fact), ctx);
             }

@@ -108,7 +108,7 @@ impl Recorded {
 /// Returns a message of the journal as one of the file, without its payload.
 pub(crate) fn record(number: u64, time: u64, message: &MessageEntry<'_>) -> Record<'static> {
     let header = &message.header;
-    let flags = [Flags::CONFIRM, Flags::ASK, Flags::REPLY, Flags::OUTCOME];
+    let flags = [Flags::CONFIRM, Flags::ASK, Flags::REPLY, Flags::OUTCOME, Flags::KEEP, Flags::RETAINED];
     let flags = (0_u8..).zip(flags).map(|(bit, flag)| u8::from(header.flags.has(flag)) << bit);
     let nanos = |time: std::time::Duration| u64::try_from(time.as_nanos()).unwrap_or(u64::MAX);
     Record {

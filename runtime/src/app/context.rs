@@ -24,11 +24,11 @@ use crate::{
     outcome::{Outcome, Rejection},
     protection::Echo,
     schedule::Schedule,
-    sender::Sender,
+    sender::{SendError, Sender},
     supervision::{ReadyGate, Reason},
     tid::Tid,
     time::Time,
-    wire::Header,
+    wire::{Header, Payload},
 };
 
 /// The context of an application's actor: the actix context plus the operations of Sinew.
@@ -244,6 +244,15 @@ impl<A: Actor<Context = Self>> AppContext<A> {
     /// Leaves the group called `name`.
     pub fn leave(&self, name: &str) {
         self.sender.leave(name);
+    }
+
+    /// Removes the value of type `P` that is retained for later members of the group called `name`; see
+    /// [`Sender::clear_retained`].
+    ///
+    /// # Errors
+    /// No queue and no socket accepted the message.
+    pub fn clear_retained<P: Payload>(&self, name: &str) -> Result<(), SendError> {
+        self.sender.clear_retained::<P>(name)
     }
 
     /// Reports an unconfirmed message that was rejected.

@@ -53,6 +53,7 @@ pub struct Delivery<P> {
     /// Type of the payload.
     pub kind: Kind,
     age_error: Option<Duration>,
+    is_retained: bool,
     reply_to: Option<ReplyTo>,
 }
 
@@ -67,8 +68,15 @@ impl<P> Delivery<P> {
             age: header.age(now),
             kind: header.kind,
             age_error: header.sent_error(),
+            is_retained: false,
             reply_to: header.flags.has(Flags::ASK).then(|| ReplyTo::of(header)),
         }
+    }
+
+    /// Reads from the header whether this is a retained value. Types that are not retained do not pay for it.
+    pub(crate) fn marked(mut self, header: &Header) -> Self {
+        self.is_retained = header.flags.has(Flags::RETAINED);
+        self
     }
 
     /// Returns the maximum error of `age` and of `sent`: zero for a message of this host. Returns `None` if
@@ -105,6 +113,26 @@ impl<P> Delivery<P> {
     #[must_use]
     pub fn is_older_than(&self, limit: Duration) -> bool {
         may_be_older(self.age_at_most(), limit)
+    }
+
+    /// Returns whether this is a retained value: it was sent to the group before this application joined it, or while
+    /// its node was not linked. See [`Payload::RETAINED`](crate::wire::Payload::RETAINED). `age` counts from its
+    /// sending, so [`is_older_than`](Self::is_older_than) shows a control loop that it is old.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::prelude::*;
+    ///
+    /// payload!("demo.mode", retained => struct Mode { is_walking: bool });
+    ///
+    /// fn is_a_change(mode: &Delivery<Mode>) -> bool {
+    ///     !mode.is_retained()
+    /// }
+    /// ```
+    #[must_use]
+    pub const fn is_retained(&self) -> bool {
+        self.is_retained
     }
 
     /// Returns the destination of the reply, or `None` if the sender does not wait for a reply.

@@ -62,8 +62,15 @@ where
         Some(_) => unseal::<A, P>(context, message, now)?,
     };
     // Only after decoding: bytes that are no valid `P` are no evidence that the sender is alive.
-    note_arrival(context, message, now);
-    actor.handle(Delivery::new(payload, &message.header, now), context);
+    let mut delivery = Delivery::new(payload, &message.header, now);
+    if P::RETAINED {
+        delivery = delivery.marked(&message.header);
+    }
+    // Nor is a value that was sent before this application joined its group.
+    if !(P::RETAINED && delivery.is_retained()) {
+        note_arrival(context, message, now);
+    }
+    actor.handle(delivery, context);
     Ok(())
 }
 
@@ -114,8 +121,11 @@ pub(super) fn dispatch_raw<A>(
 where
     A: Actor<Context = AppContext<A>> + Handler<Delivery<Raw>, Result = ()>,
 {
-    note_arrival(context, message, now);
-    actor.handle(Delivery::new(Raw(message.payload.clone()), &message.header, now), context);
+    let delivery = Delivery::new(Raw(message.payload.clone()), &message.header, now).marked(&message.header);
+    if !delivery.is_retained() {
+        note_arrival(context, message, now);
+    }
+    actor.handle(delivery, context);
     Ok(())
 }
 

@@ -22,7 +22,11 @@ impl Router {
     }
 
     /// Replaces the group members, if `edit` returns that anything changed; the caller holds the writers' lock.
-    fn regroup(&self, writing: &mut Writing, edit: impl FnOnce(&mut Writing, &mut Members) -> bool) -> bool {
+    pub(super) fn regroup(
+        &self,
+        writing: &mut Writing,
+        edit: impl FnOnce(&mut Writing, &mut Members) -> bool,
+    ) -> bool {
         let mut snapshot = Snapshot::clone(&self.snapshot.load());
         let changed = edit(writing, &mut snapshot.members);
         if changed {
@@ -38,7 +42,7 @@ impl Router {
         });
     }
 
-    /// Removes an application, its memberships, and the types that it declared differently.
+    /// Removes an application, its memberships, its retained values, and the types that it declared differently.
     pub fn remove_local(&self, app: AppAddress) {
         let mut writing = lock(&self.writing);
         let mut snapshot = Snapshot::clone(&self.snapshot.load());
@@ -50,21 +54,18 @@ impl Router {
         writing.here.set(app, BTreeSet::new(), &mut snapshot.members.here);
         self.snapshot.store(Arc::new(snapshot));
         drop(writing);
+        // After its route is removed: no later value of it is retained.
+        self.forget_retained(app);
         if let Some(former) = dropped {
             former.notify();
         }
     }
 
-    /// Adds `app` to `group`, or removes it. Returns whether anything changed. The cost depends on the number
-    /// of this group's members, and not on the number of applications and groups.
+    /// Adds `app` to `group`, or removes it. Returns whether anything changed. A new member gets the retained values
+    /// of the group. The cost depends on the number of these and of the group's members, and not on the number of
+    /// applications and groups.
     pub fn set_member(&self, group: AppAddress, app: AppAddress, member: bool) -> bool {
-        self.regroup(&mut lock(&self.writing), |writing, members| {
-            if member {
-                writing.here.join(group, app, &mut members.here)
-            } else {
-                writing.here.leave(group, app, &mut members.here)
-            }
-        })
+        self.set_member_here(group, app, member)
     }
 
     /// Returns whether `app` is a member of `group`.
@@ -191,16 +192,16 @@ impl Router {
         let dropped = drop_mismatches(table, |path| path.source.node == node);
         self.snapshot.store(Arc::new(snapshot));
         drop(writing);
+        self.forget_retained_of(node);
         if let Some(former) = dropped {
             former.notify();
         }
     }
 
     /// Sets the groups that have members on another node. Only the paths to the groups that changed are copied.
+    /// The node gets the retained values of this node's applications for the groups that are new.
     pub fn set_remote_groups(&self, node: NodeAddress, groups: &[AppAddress]) {
-        self.regroup(&mut lock(&self.writing), |writing, members| {
-            writing.elsewhere.set(node, groups.iter().copied().collect(), &mut members.elsewhere)
-        });
+        self.set_groups_of(node, groups);
     }
 }
 

@@ -19,7 +19,7 @@ use std::{
     sync::{Arc, Mutex, Weak},
 };
 
-use super::{Judge, MessageSink, Router, Snapshot, SubmitError, copy_of, for_each_here, tap};
+use super::{Judge, MessageSink, Router, Snapshot, SubmitError, copy_of, for_each_here, retained, tap};
 use crate::{
     lock,
     outcome::{MemberReport, MemberState, Outcome, Receipt, ReceiptSink, Rejection, Ticket},
@@ -50,7 +50,12 @@ impl Router {
     }
 
     /// Sends one confirmed copy to each node that has a member, and one to each member here. spec: FRAME-7
-    pub(super) fn send_to_each(&self, snapshot: &Snapshot, message: Message) -> Result<(), SubmitError> {
+    pub(super) fn send_to_each(
+        &self,
+        snapshot: &Snapshot,
+        message: Message,
+        behind: &mut Vec<NodeAddress>,
+    ) -> Result<(), SubmitError> {
         let Tid { node, app } = message.header.destination;
         let Snapshot { table, members } = snapshot;
         let peers: Vec<(NodeAddress, &Arc<dyn MessageSink>)> = if node == NodeAddress::ALL && app.is_group() {
@@ -73,7 +78,10 @@ impl Router {
             self.submit_to_each(snapshot, table.judge(), &message, &send);
         }
         for (node, peer) in peers {
-            self.submit_copy(&message, &send, Tid::new(node, app), |copy| peer.submit(copy));
+            let refused = self.submit_copy(&message, &send, Tid::new(node, app), |copy| peer.submit(copy));
+            if retained::is_behind(&message.header, refused) {
+                behind.push(node);
+            }
         }
         Ok(())
     }

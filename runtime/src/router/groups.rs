@@ -214,6 +214,11 @@ impl<M: Copy + Ord> Joined<M> {
         changed
     }
 
+    /// Returns the groups of `member`.
+    pub(super) fn of(&self, member: M) -> impl Iterator<Item = AppAddress> {
+        self.by_member.get(&member).into_iter().flatten().copied()
+    }
+
     /// Adds `member` to `group`. Returns whether anything changed.
     pub(super) fn join(&mut self, group: AppAddress, member: M, groups: &mut Groups<M>) -> bool {
         let joins = self.by_member.entry(member).or_default().insert(group);

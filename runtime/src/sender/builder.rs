@@ -93,7 +93,8 @@ impl<V, C> MessageBuilder<V, C> {
         Self { via, content, terms: Terms { class: None, expires_after: None } }
     }
 
-    /// Sets the class of the message, instead of its type's class.
+    /// Sets the class of the message, instead of its type's class. Has no effect on a
+    /// [retained](Payload::RETAINED) type that is sent to a group.
     ///
     /// # Examples
     ///
@@ -137,7 +138,7 @@ impl<V, C> MessageBuilder<V, C> {
 impl Terms {
     fn apply(self, message: &mut Message) {
         if let Some(class) = self.class {
-            message.header.class = class;
+            message.header.override_class(class);
         }
         if let Some(time) = self.expires_after {
             // No wait depends on the time to live of an unconfirmed message.

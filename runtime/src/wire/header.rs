@@ -8,7 +8,7 @@
 //!      4    4 length of the payload in bytes
 //!      8    4 kind of the payload
 //!     12    1 class: 0 Control, 1 Stream, 2 Bulk
-//!     13    1 flags
+//!     13    1 flags: see [`Flags`]
 //!     14    2 between two nodes: the lower 16 bits of its number in their session; from a node to its applications: how wrong the send
 //!             time may be; else zero
 //!     16    8 source TID
@@ -105,7 +105,12 @@ impl Flags {
     /// Bit 3: this is the outcome of the message with this `correlation`.
     pub const OUTCOME: Self = Self(8);
 
-    const KNOWN: u8 = 0x0f;
+    /// Bit 4: the sender's node retains this value for later members of the group.
+    pub const KEEP: Self = Self(16);
+    /// Bit 5: this is a retained value, handed over to a member that joined after it was sent.
+    pub const RETAINED: Self = Self(32);
+
+    const KNOWN: u8 = 0x3f;
 
     /// Returns the flags of both.
     #[must_use]
@@ -117,6 +122,12 @@ impl Flags {
     #[must_use]
     pub const fn without(self, other: Self) -> Self {
         Self(self.0 & !other.0)
+    }
+
+    /// Returns whether any flag of `other` is set.
+    #[must_use]
+    pub const fn has_any(self, other: Self) -> bool {
+        self.0 & other.0 != 0
     }
 
     /// Returns whether all flags of `other` are set.
@@ -168,6 +179,14 @@ impl Header {
             correlation: 0,
             sent: Time::ZERO,
             time_to_live_us: 0,
+        }
+    }
+
+    /// Sets another class than that of the type. The values of a retained type keep theirs, so that none overtakes
+    /// another one on its way to a group.
+    pub const fn override_class(&mut self, class: Class) {
+        if !self.flags.has(Flags::KEEP) {
+            self.class = class;
         }
     }
 

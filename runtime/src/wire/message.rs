@@ -10,7 +10,7 @@ use serde::{Serialize, de::DeserializeOwned};
 
 use crate::{
     outcome::{MemberReport, Outcome, Receipt, Rejection, Ticket},
-    tid::Tid,
+    tid::{AppAddress, NodeAddress, Tid},
     wire::{Class, Flags, Header, Kind, MismatchPolicy, Protection, memory, read::decode_payload, remember},
 };
 
@@ -43,6 +43,12 @@ pub trait Payload: Serialize + DeserializeOwned + Send + 'static {
     const TIME_TO_LIVE: Option<Duration> = None;
     /// The limits of a receiver, for a type with end-to-end protection: see [`protection`](crate::protection).
     const PROTECTION: Option<Protection> = None;
+    /// Whether the node retains the latest value that an application has sent to a group, and hands it over to a
+    /// member that joins later ([`Delivery::is_retained`](crate::app::Delivery::is_retained)). It is removed at the end
+    /// of its time to live and of its sender, and by
+    /// [`Sender::clear_retained`](crate::sender::Sender::clear_retained). Such a type is not of class Stream and has no
+    /// `PROTECTION`, or it does not compile where it is sent. It is always sent to a group in its own class.
+    const RETAINED: bool = false;
     /// The treatment of messages from a sender with another version of this type, on another node or in another
     /// process. The receiver's type decides.
     const MISMATCH: MismatchPolicy = MismatchPolicy::AcceptAdditions;
@@ -139,13 +145,36 @@ impl Message {
 
     /// Same as [`of_type`](Self::of_type), for a type that the caller has recorded.
     pub(crate) fn of_remembered<P: Payload>(source: Tid, destination: Tid, payload: Bytes) -> Self {
+        const {
+            assert!(
+                !P::RETAINED || P::PROTECTION.is_none(),
+                "a protected payload is not retained: it would be old"
+            );
+            assert!(
+                !P::RETAINED || !matches!(P::CLASS, Class::Stream),
+                "a retained payload is of class Control or Bulk: a newer value of class Stream comes soon anyway"
+            );
+        }
         let mut header = Header::new(P::KIND, source, destination);
         header.class = P::CLASS;
+        if P::RETAINED && destination.app.is_group() {
+            header.flags = Flags::KEEP;
+        }
         if let Some(time) = P::TIME_TO_LIVE {
             // No wait depends on it here.
             let _ = header.set_time_to_live(time);
         }
         Self::new(header, payload)
+    }
+
+    /// Creates the message that removes the retained value of this type from a group. spec: FRAME-8.3
+    #[must_use]
+    pub fn clear_retained<P: Payload>(source: Tid, group: AppAddress) -> Self {
+        const { assert!(P::RETAINED, "only a payload with `RETAINED` has a retained value") };
+        let destination = Tid::new(NodeAddress::ALL, group);
+        let mut message = Self::of_remembered::<P>(source, destination, Bytes::new());
+        message.header.time_to_live_us = 0;
+        message
     }
 
     /// Decodes the payload as a `P`.
@@ -301,6 +330,37 @@ mod tests {
     #[cfg(target_pointer_width = "64")]
     fn message_is_short_enough_to_be_moved_in_place() {
         assert_eq!(size_of::<Message>(), 128);
+    }
+
+    #[derive(Debug, Serialize, serde::Deserialize)]
+    struct Mode(u8);
+
+    impl Payload for Mode {
+        const NAME: &'static str = "test.retained_mode";
+        const CLASS: Class = Class::Bulk;
+        const TIME_TO_LIVE: Option<Duration> = Some(Duration::from_secs(1));
+        const RETAINED: bool = true;
+    }
+
+    #[test]
+    fn retained_type_is_kept_in_groups_alone_and_in_its_own_class() {
+        let group = Tid::group("modes");
+        let mut to_group = Message::typed(Tid::NONE, group, &Mode(1)).header;
+        let mut to_one = Message::typed(Tid::NONE, Tid::from_bits(0x1_0000_1000), &Mode(1)).header;
+        assert_eq!((to_group.flags, to_one.flags), (Flags::KEEP, Flags::NONE));
+        assert_eq!(Message::typed(Tid::NONE, group, &Point { x: 1.0 }).header.flags, Flags::NONE);
+        to_group.override_class(Class::Control);
+        to_one.override_class(Class::Control);
+        assert_eq!((to_group.class, to_one.class), (Class::Bulk, Class::Control));
+    }
+
+    #[test]
+    fn removal_of_a_retained_value_is_empty_and_does_not_expire() {
+        let Message { header, payload, .. } =
+            Message::clear_retained::<Mode>(Tid::NONE, AppAddress::group("modes"));
+        assert_eq!((header.destination, header.flags), (Tid::group("modes"), Flags::KEEP));
+        assert_eq!((header.kind, header.class), (Mode::KIND, Class::Bulk));
+        assert_eq!((payload.len(), header.expiry()), (0, crate::time::Time::MAX));
     }
 
     #[test]

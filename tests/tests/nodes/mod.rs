@@ -10,6 +10,7 @@ mod lives;
 mod messages;
 mod other_language;
 mod phases;
+mod retained;
 mod root;
 mod slow;
 mod start_up;

@@ -7,7 +7,7 @@ use sinew_runtime::{
     name::{NAME_BYTES_MAX, check_name},
     outcome::{Outcome, Rejection},
     tid::AppAddress,
-    wire::{Flags, Kind},
+    wire::{Flags, Kind, Message, Payload},
 };
 
 use super::{Endpoint, LNCL, PROMPT};
@@ -48,6 +48,32 @@ impl Endpoint {
     /// The node did not answer.
     pub fn leave(&mut self, name: &str) -> Result<(), ApiError> {
         block_ready(pin!(self.set_member(AppAddress::group(name), false)))
+    }
+
+    /// Removes the value of type `P` that the node retains for later members of the group called `name`. Has no effect
+    /// if there is none.
+    ///
+    /// # Errors
+    /// The node does not accept the message.
+    ///
+    /// # Examples
+    ///
+    /// ```
+    /// use sinew::{Endpoint, client::ApiError, payload};
+    ///
+    /// payload!("demo.mode", retained => struct Mode { is_walking: bool });
+    ///
+    /// fn forget_the_mode(endpoint: &mut Endpoint) -> Result<(), ApiError> {
+    ///     endpoint.clear_retained::<Mode>("mode")
+    /// }
+    /// ```
+    pub fn clear_retained<P: Payload>(&mut self, name: &str) -> Result<(), ApiError> {
+        block_ready(pin!(self.send_clear::<P>(name)))
+    }
+
+    pub(crate) async fn send_clear<P: Payload>(&mut self, name: &str) -> Result<(), ApiError> {
+        let message = Message::clear_retained::<P>(self.tid, group_named(name)?);
+        self.dispatch(message.into(), self.stall_timeout()).await.map(drop)
     }
 
     pub(crate) async fn set_member(&mut self, group: AppAddress, member: bool) -> Result<(), ApiError> {

@@ -62,12 +62,23 @@ impl Client {
     fn route(&self, mut message: Message) {
         let router = &self.server.state.ctx.router;
         let destination = router.absolute(message.header.destination);
+        // Only a node marks a value as handed over.
+        message.header.flags = message.header.flags.without(Flags::RETAINED);
+        let mut is_removal = false;
+        if matches!(self.user, User::Guest(_)) && message.header.flags.has(Flags::KEEP) {
+            // Guests take no room from the robot's own values. Without the flag a member would get the removal.
+            message.header.flags = message.header.flags.without(Flags::KEEP);
+            is_removal = message.payload.is_empty();
+        }
         let is_confirmed = message.header.flags.has(Flags::CONFIRM);
         if is_confirmed {
             let correlation = message.header.correlation;
             let ticket = Ticket { source: self.tid, destination, correlation };
             let Some(receipt) = self.outcomes.receipt(ticket) else { return };
             message.receipt = Some(receipt);
+        }
+        if is_removal {
+            return message.settle(Outcome::Delivered);
         }
         let header = Header { destination, ..message.header };
         let sent = self.within_share(message).and_then(|message| router.send(message));

@@ -259,6 +259,38 @@ fn other_user_has_at_most_a_quarter_of_slots() {
     let _own = [(); 4].map(|()| RawClient::register(&node, &Register::default()));
 }
 
+// spec: LNCL-13
+#[test]
+fn values_of_guests_are_not_retained() {
+    let list = format!("[[client]]\nuid = {OTHER_USER}\n[[rule]]\nfrom = ['*']\nto = ['*']\n");
+    let node = TestNode::start_guarded(&list);
+    let member = node.local(1);
+    assert!(node.router().set_member(AppAddress::group("modes"), member.tid.app, true));
+    let value = |tid: Tid| {
+        let mut message = Message::typed(tid, Tid::group("modes"), &Angle { degrees: 1.0 });
+        message.header.flags = Flags::KEEP;
+        message
+    };
+    // Given: one of the robot's own, whose value is retained
+    let (mut own, tid) = RawClient::register(&node, &named("gait"));
+    own.send(&value(tid));
+    assert_eq!(member.next().header.flags, Flags::KEEP);
+    assert_eq!(node.router().retained().values, 1);
+    // When: a guest sends a removal, and a value
+    let guest = as_other_user(|| {
+        let (mut guest, tid) = RawClient::register(&node, &Register::default());
+        let Message { header, .. } = value(tid);
+        guest.send(&Message::new(header, Vec::<u8>::new().into()));
+        guest.send(&value(tid));
+        guest
+    });
+    let Some(_guest) = guest else { return };
+    // Then: its value is delivered, the removal is not, and neither takes room
+    let received = member.next();
+    assert_eq!((received.header.flags, received.payload.is_empty()), (Flags::NONE, false));
+    assert_eq!(node.router().retained().values, 1);
+}
+
 // spec: LNCL-8
 #[test]
 fn guest_types_with_own_ids_bar_no_own_application() {

@@ -127,7 +127,12 @@ impl SyncManager {
     fn publish(&self, to: NodeAddress, list: Bytes) {
         let mut header = Header::new(Kind::SYNC_DIRECTORY, self.tid(), Tid::new(to, AppAddress::SYNC));
         self.stamp(&mut header);
-        if let Err(why) = self.state.ctx.router.send(Message::new(header, list)) {
+        let sent = self.state.ctx.router.send(Message::new(header, list));
+        if sent.is_ok() {
+            let listed = self.core().listed_groups();
+            self.state.ctx.router.groups_listed(to, &listed);
+        }
+        if let Err(why) = sent {
             self.refuse(
                 cause_of(why),
                 &format_args!("this node's directory was not sent to {to}, tried again: {why}"),

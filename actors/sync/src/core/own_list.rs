@@ -76,6 +76,11 @@ impl OwnList {
         is_changed
     }
 
+    /// Returns the groups of the list.
+    pub(super) fn groups(&self) -> &[AppAddress] {
+        &self.groups
+    }
+
     /// Schedules the list to `node`, which is linked now.
     pub(super) fn link_up(&mut self, now: Time, node: NodeAddress) {
         self.schedule.entry(node).or_insert(Schedule { sent: None, due: now }).due = now;

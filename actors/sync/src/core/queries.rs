@@ -80,6 +80,11 @@ impl Core {
         self.all().names()
     }
 
+    /// Returns the groups of this node's list.
+    pub fn listed_groups(&self) -> Vec<AppAddress> {
+        self.own_list.groups().to_vec()
+    }
+
     /// Returns the last published names of other nodes, or of `node` alone.
     pub fn names_elsewhere(&self, node: Option<NodeAddress>) -> impl Iterator<Item = ReportedNames<'_>> {
         self.peers.published_names(node)
