@@ -1,6 +1,6 @@
 //! A host that stalls for a while: no process is at fault, and a healthy process is not killed.
 
-use std::{net::UdpSocket, time::Duration};
+use std::{net::UdpSocket, thread, time::Duration};
 
 use rustix::process::Signal;
 use sinew::{NodeApi, Registration};
@@ -20,9 +20,19 @@ fn stall(node: &NodeProcess, process: Option<u32>) {
     process.into_iter().for_each(|id| signal(id, Signal::STOP));
     node.pause();
     process.into_iter().for_each(wait_until_paused);
-    std::thread::sleep(STALL);
+    thread::sleep(STALL);
     node.signal(Signal::CONT);
     process.into_iter().for_each(|id| signal(id, Signal::CONT));
+}
+
+/// Runs a claim for each case at the same time: the cases wait, each on a node of its own.
+fn at_once<C: Send>(cases: impl IntoIterator<Item = C>, claim: impl Fn(C) + Sync) {
+    let claim = &claim;
+    thread::scope(|scope| {
+        for case in cases {
+            scope.spawn(move || claim(case));
+        }
+    });
 }
 
 /// The ID of the process that reports its start.
@@ -43,7 +53,7 @@ fn stalled_host_kills_no_process_of_a_node() {
 
 #[test]
 fn process_that_starts_during_a_stall_is_not_killed() {
-    for with_process in [false, true] {
+    at_once([false, true], |with_process| {
         let directory = TestDirectory::new();
         let mut node = process_under_test(
             &configuration(&directory, ""),
@@ -58,12 +68,12 @@ fn process_that_starts_during_a_stall_is_not_killed() {
         let drive = endpoint.resolve("drive", DEADLINE).expect("the node answers").expect("it is ready");
         let me: Me = endpoint.message(drive, &Who {}).ask(DEADLINE).expect("it answers");
         assert_eq!(me.pid, pid, "with the process: {with_process}");
-    }
+    });
 }
 
 #[test]
 fn process_that_stops_during_a_stall_has_its_time() {
-    for with_process in [false, true] {
+    at_once([false, true], |with_process| {
         let mut scenario = Scenario::start(&["--ramps-for", "300", "--stops-within", "6000"]);
         let pid = scenario.who().pid;
         let process = Watched::new(pid);
@@ -80,27 +90,27 @@ fn process_that_stops_during_a_stall_has_its_time() {
         assert_eq!(scenario.node.wait_for_exit(), Some(0));
         let killed = scenario.node.output().iter().find(|line| line.contains("the incarnation is abandoned"));
         assert_eq!(killed, None);
-    }
+    });
 }
 
 #[test]
 fn hang_at_the_start_of_a_process_is_noticed() {
-    for place in ["started", "factory"] {
-        for lives_in in ["thread", "process"] {
-            let directory = TestDirectory::new();
-            let token = directory.join("token");
-            std::fs::write(&token, "").expect("the test's own directory");
-            let token = token.to_str().expect("it is text");
-            let arguments = ["--place", lives_in, "--hangs-in", place, token];
-            let mut node = process_under_test(&configuration(&directory, ""), &arguments);
-            node.wait_for(&[&format!("hangs in its {place}")]);
-            let line = node.wait_for(&["a child failed"]);
-            assert!(line.contains("hung: in its `started`"), "{place}, in a {lives_in}: {line}");
-            let api = NodeApi::connect(directory.join("robot.sock")).expect("the node is up");
-            let wanted = Registration::new().requires(["drive"]).deadline(DEADLINE);
-            api.register_transport_address(wanted).expect("its next incarnation becomes ready");
-        }
-    }
+    let places = ["started", "factory"];
+    let cases = places.into_iter().flat_map(|place| ["thread", "process"].map(|lives_in| (place, lives_in)));
+    at_once(cases, |(place, lives_in)| {
+        let directory = TestDirectory::new();
+        let token = directory.join("token");
+        std::fs::write(&token, "").expect("the test's own directory");
+        let token = token.to_str().expect("it is text");
+        let arguments = ["--place", lives_in, "--hangs-in", place, token];
+        let mut node = process_under_test(&configuration(&directory, ""), &arguments);
+        node.wait_for(&[&format!("hangs in its {place}")]);
+        let line = node.wait_for(&["a child failed"]);
+        assert!(line.contains("hung: in its `started`"), "{place}, in a {lives_in}: {line}");
+        let api = NodeApi::connect(directory.join("robot.sock")).expect("the node is up");
+        let wanted = Registration::new().requires(["drive"]).deadline(DEADLINE);
+        api.register_transport_address(wanted).expect("its next incarnation becomes ready");
+    });
 }
 
 #[test]
