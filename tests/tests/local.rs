@@ -2,6 +2,8 @@
 
 mod away;
 mod black_channel;
+mod clients;
+mod faults;
 mod nodes;
 mod processes;
 mod recordings;

@@ -8,7 +8,7 @@ use sinew_testkit::{
 };
 use sinew_tests::load::LAYERS;
 
-use crate::gets_through;
+use super::gets_through;
 
 /// Sockets that only one process can use: fixed ports at an interface of the scenario's own, and a socket
 /// file.

@@ -12,7 +12,7 @@ use sinew_testkit::{
     until,
 };
 
-use crate::{node_that_fails_at_each_job, perform};
+use super::{node_that_fails_at_each_job, perform};
 
 fn gave_up(node: Node) -> String {
     match node.wait_for_end() {

@@ -10,7 +10,7 @@ use sinew_testkit::{
     until,
 };
 
-use crate::node_that_fails_at_each_job;
+use super::node_that_fails_at_each_job;
 
 /// Three scripted applications under one supervisor, and their logs.
 fn leg(strategy: Strategy) -> (SupervisorSpec, [Log<Seen>; 3]) {

@@ -13,7 +13,7 @@ use sinew_testkit::{
 };
 use sinew_tests::load::LAYERS;
 
-use crate::gets_through;
+use super::gets_through;
 
 /// Far above the time of a healthy turn on a loaded machine, and short enough for a test.
 const BUDGET: Duration = Duration::from_millis(100);
@@ -51,12 +51,12 @@ impl Drop for Opener {
     }
 }
 
-/// Same as [`crate::perform`], with [`BUDGET`] for each turn.
+/// Same as [`super::perform`], with [`BUDGET`] for each turn.
 fn perform(
     script: Script,
     declare: impl FnOnce(AppSpec<ScriptedApp>) -> AppSpec<ScriptedApp>,
 ) -> (Node, Sender, Log<Seen>) {
-    crate::perform(script, |app| declare(app.progress_within(BUDGET)))
+    super::perform(script, |app| declare(app.progress_within(BUDGET)))
 }
 
 /// NDL has a thread of its own: a node with a blocked IO thread does not look lost, and the blocking

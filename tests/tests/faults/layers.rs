@@ -12,7 +12,7 @@ use sinew_testkit::{
 };
 use sinew_tests::load::LAYERS;
 
-use crate::{gets_through, perform};
+use super::{gets_through, perform};
 
 fn readies(node: &NodeHandle) -> [u64; 4] {
     LAYERS.map(|layer| node.lives(layer).expect("every node has it").readies)

@@ -13,7 +13,7 @@ use sinew_testkit::{
     until,
 };
 
-use crate::perform;
+use super::perform;
 
 /// A scripted application that is down: it panicked, and its requirement is gone until
 /// [`Away::let_it_come_back`].

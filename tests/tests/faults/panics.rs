@@ -20,7 +20,7 @@ use sinew_testkit::{
     until,
 };
 
-use crate::perform;
+use super::perform;
 
 #[test]
 fn poison_message_fails_once_and_is_not_redelivered() {

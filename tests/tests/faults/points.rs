@@ -9,7 +9,7 @@ use sinew_testkit::{
     until,
 };
 
-use crate::{fault, perform};
+use super::{fault, perform};
 
 #[test]
 fn planned_panic_strikes_the_nth_message() {

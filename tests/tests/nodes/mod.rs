@@ -14,6 +14,7 @@ mod retained;
 mod root;
 mod slow;
 mod start_up;
+mod threads;
 mod trees;
 mod types;
 mod undelivered;

@@ -1,4 +1,4 @@
-//! Faults on real nodes: their effects, and their limits. One binary, one module for each theme.
+//! Faults on real nodes: their effects, and their limits. One module for each theme.
 
 mod captured;
 mod doors;
