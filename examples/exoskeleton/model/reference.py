@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Reference model of the powered leg in Python, independent of the Rust code.
 
-Writes model/tests/golden/*.csv, which model/tests/golden.rs compares the Rust plant and drives with:
+Writes model/tests/model/golden/*.csv, which model/tests/model/golden.rs compares the Rust plant and drives with:
 
     python3 -m pip install numpy scipy
     python3 examples/exoskeleton/model/reference.py
@@ -152,7 +152,7 @@ def main():
     true_rate = 1.0 / np.diff(strikes)[np.clip(strides.astype(int), 0, len(strikes) - 2)]
     warm = start - 3.0 + DT * np.arange(len(tt) + 3000)
     found, found_rate = (x[3000:] for x in oscillator(np.interp(warm, time, hip), np.interp(warm, time, load)))
-    out = HERE / "model/tests/golden"
+    out = HERE / "model/tests/model/golden"
     out.mkdir(exist_ok=True)
     for name, phase, rate in [("true_phase", true, true_rate), ("estimated_phase", found, found_rate)]:
         q, tau = simulate(tt, splines, true, phase, rate, reference, slope, moment)

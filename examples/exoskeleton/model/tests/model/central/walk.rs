@@ -7,7 +7,7 @@ use exoskeleton_model::joint::Joint;
 use exoskeleton_model::message::{DriveState, DriveStatus, FootLoad, GaitMode, GaitState, JointSample};
 use exoskeleton_model::phase::wrapped;
 
-use crate::MS;
+use super::MS;
 
 /// A leg that walks as intended, with its central.
 pub(crate) struct Walk {

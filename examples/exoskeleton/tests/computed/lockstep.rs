@@ -17,7 +17,7 @@ fn curves(strides: u32, seed: u64) -> LockStepConfig {
 }
 
 fn trial() -> Intention {
-    let text = include_str!("../data/gait_trial_moore2015_s15_pre.csv");
+    let text = include_str!("../../data/gait_trial_moore2015_s15_pre.csv");
     Intention::from_trial(Arc::new(Trial::parse(text).expect("a valid file")))
 }
 

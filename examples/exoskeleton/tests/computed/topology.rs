@@ -9,7 +9,7 @@ use exoskeleton_model::joint::Joint;
 use exoskeleton_model::part::Part;
 use proptest::prelude::*;
 
-const EXAMPLE: &str = include_str!("../topology.toml");
+const EXAMPLE: &str = include_str!("../../topology.toml");
 
 /// The example with one text replaced, which must be in it.
 fn with(old: &str, new: &str) -> String {

@@ -51,7 +51,9 @@ fn oscillator_phase_matches_the_reference_model() {
 }
 
 fn trial() -> Arc<Trial> {
-    Arc::new(Trial::parse(include_str!("../../data/gait_trial_moore2015_s15_pre.csv")).expect("a valid file"))
+    Arc::new(
+        Trial::parse(include_str!("../../../data/gait_trial_moore2015_s15_pre.csv")).expect("a valid file"),
+    )
 }
 
 fn compare(name: &str, trial: &Arc<Trial>, phases: &Phases, golden: &str) {

@@ -1,9 +1,7 @@
 //! The applications of the robot in virtual time: the torques of its actors are those of the lock-step loop,
 //! bit by bit.
 
-#[path = "virtual_time/gains.rs"]
 mod gains;
-#[path = "virtual_time/recorded.rs"]
 mod recorded;
 
 use std::sync::atomic::AtomicU32;

@@ -6,7 +6,7 @@ use exoskeleton_model::control::drive::{DriveConfig, DriveCore};
 use exoskeleton_model::joint::Joint;
 use exoskeleton_model::message::{DriveState, GaitMode, GaitState, JointSample, Stance};
 
-use crate::{MS, walk::Walk};
+use super::{MS, walk::Walk};
 
 /// A central that was released before it received any input.
 fn standing() -> Walk {

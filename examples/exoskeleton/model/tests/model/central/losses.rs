@@ -5,7 +5,7 @@ use exoskeleton_model::control::faults::FaultBits;
 use exoskeleton_model::joint::Joint;
 use exoskeleton_model::message::{DriveState, GaitMode};
 
-use crate::{MS, walk::Walk};
+use super::{MS, walk::Walk};
 
 #[test]
 fn e_stop_is_latched_until_reset_and_new_release() {

@@ -10,7 +10,7 @@ use serde_json::Value;
 use sinew::Payload;
 use sinew::schema::{Schema, Shape, schema_of};
 
-const LAYOUT: &str = include_str!("../foxglove-layout.json");
+const LAYOUT: &str = include_str!("../../foxglove-layout.json");
 /// The topics of each node that are no messages, of the schema `foxglove.Log`. A walk has no run-time barrier, so none
 /// has `/sinew/barriers`.
 const EVENTS: [&str; 3] = ["/sinew/events", "/sinew/outcomes", "/sinew/log"];

@@ -3,8 +3,8 @@
 use exoskeleton_model::gait::trial::Trial;
 use proptest::prelude::*;
 
-const FILE: &str = include_str!("../../data/gait_trial_moore2015_s15_pre.csv");
-const EVENTS: &str = include_str!("../../data/gait_trial_moore2015_s15_pre_events.csv");
+const FILE: &str = include_str!("../../../data/gait_trial_moore2015_s15_pre.csv");
+const EVENTS: &str = include_str!("../../../data/gait_trial_moore2015_s15_pre_events.csv");
 
 /// A short trial that is still valid: comments, header and the first 12 seconds.
 fn short() -> String {
