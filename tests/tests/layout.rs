@@ -13,6 +13,8 @@ use serde_json::Value;
 const LAYERS: [&str; 4] = ["sinew-lncl", "sinew-gncl", "sinew-ndl", "sinew-sync"];
 /// The only package that stands on all layers. (`sinew` names some for its reports and for fuzzers.)
 const NODE: &str = "sinew-node";
+/// Its examples stand on a package above it, so nothing runs them.
+const WITH_EXAMPLES_NOT_RUN: &str = "sinew-ndl";
 /// The line of docs/ARCHITECTURE.md above the picture of the packages.
 const MARKER: &str = "<!-- packages:";
 
@@ -240,6 +242,58 @@ fn sibling_folders_import_in_one_direction() {
             panic!("{folder}: {one} and {other} import each other, directly or by others");
         }
     }
+}
+
+/// Returns the sources of a library or a program, without unit tests. A program beside a library is one file.
+fn sources_of(target: &Value) -> Vec<PathBuf> {
+    let source = Path::new(target["src_path"].as_str().expect("it has a source"));
+    let folder = source.parent().expect("a file is in a folder");
+    let is_alone = source.ends_with("main.rs") && !folder.join("lib.rs").exists();
+    if is_alone || source.ends_with("lib.rs") { sources(folder) } else { vec![source.to_owned()] }
+}
+
+/// Returns whether a source has a block of Rust in its documentation.
+fn has_example(text: &str) -> bool {
+    let lines = text.lines().map(str::trim_start);
+    let docs = lines.filter_map(|line| line.strip_prefix("///").or_else(|| line.strip_prefix("//!")));
+    let fences = docs.filter_map(|line| line.trim_start().strip_prefix("```"));
+    // Every second one ends a block.
+    fences.step_by(2).any(|language| language != "text")
+}
+
+#[test]
+fn code_excluded_from_tests_has_no_tests() {
+    let mut excluded = 0;
+    for package in metadata() {
+        for target in package["targets"].as_array().expect("a list of targets") {
+            let kinds = target["kind"].as_array().expect("a list of kinds");
+            let is_library = kinds.iter().any(|kind| kind == "lib" || kind == "rlib");
+            let has_no_tests = (is_library || kinds[0] == "bin") && target["test"] == false;
+            let has_no_examples =
+                is_library && target["doctest"] == false && package["name"] != WITH_EXAMPLES_NOT_RUN;
+            if !has_no_tests && !has_no_examples {
+                continue;
+            }
+            excluded += 1;
+            for source in sources_of(target) {
+                let text = fs::read_to_string(&source).expect("a source is text");
+                let source = source.display();
+                let is_tested = has_no_tests && (text.contains("#[cfg(test)]") || text.contains("#[test]"));
+                assert!(
+                    !is_tested,
+                    "{source}: nothing runs these tests; remove `test = false` in Cargo.toml"
+                );
+                let is_shown = has_no_examples && has_example(&text);
+                assert!(
+                    !is_shown,
+                    "{source}: nothing runs this example; remove `doctest = false` in Cargo.toml"
+                );
+            }
+        }
+    }
+    assert!(excluded > 0, "cargo describes no target that is excluded");
+    assert!(has_example("/// ```text\n/// 1\n/// ```\n/// ```no_run\n/// let a = 1;\n/// ```"));
+    assert!(!has_example("//! ```text\n//! 1\n//! ```"));
 }
 
 #[test]
